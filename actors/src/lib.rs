@@ -1,1 +1,12 @@
-//! Placeholder until the first module lands.
+//! Sinew: an actor runtime for distributed control.
+
+pub mod config;
+mod gncl;
+mod lncl;
+mod ndl;
+mod node;
+mod stores;
+mod sync;
+
+pub use ndl::{LossReason, NodeEvent};
+pub use sync::{RequirementEvent, Waiting};

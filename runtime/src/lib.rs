@@ -1,1 +1,21 @@
-//! Placeholder until the first module lands.
+//! What makes Sinew's actors live: addresses, messages, mailboxes, supervision, time.
+//!
+//! This crate knows no layer and no socket. Read it in this order:
+//!
+//! | module | what it is |
+//! | --- | --- |
+//! | [`tid`] | who: the 64-bit transport ID |
+//! | [`time`] | when: nanoseconds of the monotonic clock |
+//! | [`wire`] | what: header, payload, frames |
+//! | [`outcome`] | and then: what became of a message |
+//! | [`router`] | where to: the table that senders read without a lock |
+//! | [`post`] | events into an actor that outlive it |
+//! | [`supervision`] | who is started, when, and again after a fault |
+
+pub mod outcome;
+pub mod post;
+pub mod router;
+pub mod supervision;
+pub mod tid;
+pub mod time;
+pub mod wire;

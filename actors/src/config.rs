@@ -1,0 +1,138 @@
+//! Configuration of a node: one struct a layer, safe defaults, every fault reported together.
+
+use std::{
+    net::{Ipv4Addr, SocketAddr, SocketAddrV4},
+    path::PathBuf,
+    time::Duration,
+};
+
+use sinew_runtime::tid::NodeAddress;
+
+/// Everything that can be set about a node.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NodeConfig {
+    /// Name of the node, for people: `knee`. 1 to 63 bytes. No default.
+    pub name: String,
+    /// Project that the node belongs to; nodes of other projects are not seen. 1 to 63 bytes. Default `sinew`.
+    pub project: String,
+    /// Address of the node, unique in the project. Default: the address of [`NdlConfig::interface`]; set it by hand
+    /// where several nodes share a host.
+    pub address: Option<NodeAddress>,
+    /// Messages that an application's mailbox holds at most, each class by itself. 1 to 65,536; default 256. Memory:
+    /// the longest payload times this times three, for each application, at the very worst.
+    pub mailbox_capacity: usize,
+    /// Longest payload in bytes. 64 to 64 MiB; default 1 MiB. A peer can make the node hold this much a connection.
+    pub payload_max: usize,
+    /// Local Node Communication Layer.
+    pub lncl: LnclConfig,
+    /// Global Node Communication Layer.
+    pub gncl: GnclConfig,
+    /// Node Discovery Layer.
+    pub ndl: NdlConfig,
+    /// Sync manager.
+    pub sync: SyncConfig,
+}
+
+/// Local Node Communication Layer: the applications of this host.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LnclConfig {
+    /// Path of the unix socket for applications in other processes; at most 100 bytes. Default: none, no such door.
+    pub socket: Option<PathBuf>,
+    /// Connections of other processes at most, one for each registered address. 1 to 4,096; default 256.
+    pub clients_max: usize,
+    /// Applications of the node at most, in all its processes. 1 to 65,536; default 1,024.
+    pub apps_max: usize,
+}
+
+/// Global Node Communication Layer: connections between nodes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct GnclConfig {
+    /// TCP port to listen on, at [`NdlConfig::interface`]. Default 0: any free one; NDL tells the others which.
+    pub port: u16,
+    /// Messages that wait for one peer at most, each class by itself. 1 to 65,536; default 1,024.
+    pub queue_capacity: usize,
+    /// Connections whose peer has not said who it is, at most. 1 to 1,024; default 64.
+    pub strangers_max: usize,
+    /// Time for a handshake. 10 ms to 60 s; default 2 s.
+    pub handshake: Duration,
+    /// First wait before dialling again; doubles to [`redial_max`](Self::redial_max). 1 ms to 10 s; default 10 ms.
+    pub redial_min: Duration,
+    /// Longest wait before dialling again. `redial_min` to 60 s; default 1 s.
+    pub redial_max: Duration,
+}
+
+/// Node Discovery Layer: who is there, who is gone.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NdlConfig {
+    /// Address of the network interface that the node uses. Default: loopback, so that nothing leaves the host.
+    pub interface: Ipv4Addr,
+    /// UDP port for queries and answers. Default 0: any free one; set it where other nodes list this one as a seed.
+    pub port: u16,
+    /// Multicast group of the cyclic query; `None` switches it off. Default 239.255.83.119:6910, never routed
+    /// (time to live 1).
+    pub multicast: Option<SocketAddrV4>,
+    /// Port of multicast DNS; `None` switches it off. Default 5353, the port of RFC 6762.
+    pub mdns_port: Option<u16>,
+    /// UDP addresses of nodes to ask in any case, for networks without multicast. At most 256; default none.
+    pub seeds: Vec<SocketAddr>,
+    /// Time between two queries. 10 ms to 60 s; default 500 ms, the paper's. Detection takes `period` times
+    /// `missed_max`, and up to one period more.
+    pub period: Duration,
+    /// Answers missed in a row after which a node counts as lost. 2 to 100; default 3.
+    pub missed_max: u32,
+    /// Nodes known at most. 1 to 65,536; default 1,024.
+    pub nodes_max: usize,
+}
+
+/// Sync manager: start-up barriers.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SyncConfig {
+    /// Time for each layer to become ready. 10 ms to 10 min; default 10 s. After it the start fails.
+    pub layer_deadline: Duration,
+    /// Time for an application's requirements to be met. 10 ms to 24 h; default 60 s. After it, and every time that
+    /// it passes again, the missing names are reported; the application goes on waiting.
+    pub requirement_deadline: Duration,
+}
+
+impl NodeConfig {
+    /// The defaults for the node called `name`: loopback only.
+    #[must_use]
+    pub fn new(name: impl Into<String>) -> Self {
+        Self {
+            name: name.into(),
+            project: "sinew".to_owned(),
+            address: None,
+            mailbox_capacity: 256,
+            payload_max: 1 << 20,
+            lncl: LnclConfig { socket: None, clients_max: 256, apps_max: 1_024 },
+            gncl: GnclConfig {
+                port: 0,
+                queue_capacity: 1_024,
+                strangers_max: 64,
+                handshake: Duration::from_secs(2),
+                redial_min: Duration::from_millis(10),
+                redial_max: Duration::from_secs(1),
+            },
+            ndl: NdlConfig {
+                interface: Ipv4Addr::LOCALHOST,
+                port: 0,
+                multicast: Some(SocketAddrV4::new(Ipv4Addr::new(239, 255, 83, 119), 6910)),
+                mdns_port: Some(5353),
+                seeds: Vec::new(),
+                period: Duration::from_millis(500),
+                missed_max: 3,
+                nodes_max: 1_024,
+            },
+            sync: SyncConfig {
+                layer_deadline: Duration::from_secs(10),
+                requirement_deadline: Duration::from_secs(60),
+            },
+        }
+    }
+
+    /// The node's address: as set, or that of its interface.
+    #[must_use]
+    pub fn node_address(&self) -> NodeAddress {
+        self.address.unwrap_or_else(|| NodeAddress::from(self.ndl.interface))
+    }
+}

@@ -1,0 +1,18 @@
+//! What LNCL says to the sync manager.
+
+use sinew_runtime::tid::AppAddress;
+
+/// A change of an application of this node.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum AppFact {
+    /// It has an address. Its name, if it has one, and the names that it requires.
+    Registered { app: AppAddress, name: Option<String>, requires: Vec<String> },
+    /// It has started and takes messages.
+    Ready { app: AppAddress },
+    /// It takes no messages: it failed and is not started again yet.
+    Down { app: AppAddress },
+    /// It is gone.
+    Unregistered { app: AppAddress },
+    /// The groups that have members on this node changed.
+    GroupsChanged,
+}

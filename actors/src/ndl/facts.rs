@@ -1,0 +1,77 @@
+//! What NDL says to the other layers and to applications.
+
+use std::net::SocketAddr;
+
+use serde::{Deserialize, Serialize};
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    wire::{Class, Payload},
+};
+
+/// A change in who is there, told to GNCL and to the sync manager.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum MembershipFact {
+    /// A node is there that was not, or is there again in a new life (then `NodeLost` of the old one came before).
+    NodeFound {
+        node: NodeAddress,
+        incarnation: Incarnation,
+        /// Where its GNCL listens.
+        gncl: SocketAddr,
+    },
+    /// A node is not there any more.
+    NodeLost { node: NodeAddress, incarnation: Incarnation, why: LossReason },
+}
+
+/// A change in who is there. Applications that handle this payload get it from their node's NDL.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum NodeEvent {
+    /// A node is there that was not.
+    NodeFound {
+        /// Its address.
+        node: NodeAddress,
+        /// Its name.
+        name: String,
+        /// Which life of it this is.
+        incarnation: Incarnation,
+    },
+    /// A node is not there any more.
+    NodeLost {
+        /// Its address.
+        node: NodeAddress,
+        /// Its name.
+        name: String,
+        /// Which life of it ended.
+        incarnation: Incarnation,
+        /// How this is known.
+        why: LossReason,
+        /// Time since its last sign of life, in microseconds.
+        silent_us: u64,
+    },
+    /// A node is there in a new life: its process ended and was started again.
+    NodeRestarted {
+        /// Its address.
+        node: NodeAddress,
+        /// Its name.
+        name: String,
+        /// Which life of it this is.
+        incarnation: Incarnation,
+    },
+}
+
+impl Payload for NodeEvent {
+    const NAME: &'static str = "sinew.node_event";
+    const CLASS: Class = Class::Control;
+}
+
+/// How a loss was noticed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum LossReason {
+    /// It said goodbye.
+    Left,
+    /// It missed as many answers in a row as the configuration allows.
+    Silent,
+    /// Its connection broke and was refused when dialled again: its process has ended.
+    ConnectionRefused,
+    /// It is there in a new life.
+    Restarted,
+}

@@ -1,0 +1,10 @@
+//! The root of a node: starts its layers in order, then its applications, and stops all of it again.
+
+use sinew_runtime::tid::AppAddress;
+
+/// What the root is told.
+#[derive(Debug)]
+pub(crate) enum RootEvent {
+    /// By the sync manager: all that this application requires is ready.
+    Release { app: AppAddress },
+}

@@ -1,0 +1,208 @@
+//! What became of a message: each confirmed send ends in exactly one [`Outcome`].
+//!
+//! A [`Receipt`] travels with a confirmed message and is settled by whoever decides its fate. A receipt that is
+//! dropped unsettled says [`Outcome::Failed`]: an actor that panics drops the message in its hand, so its sender
+//! learns of it without any further code.
+
+use std::{fmt, sync::Arc};
+
+use serde::{Deserialize, Serialize};
+
+use crate::tid::Tid;
+
+/// The fate of a confirmed message.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum Outcome {
+    /// The destination's handler took it and returned.
+    Delivered,
+    /// It was refused and not handled.
+    Rejected(Rejection),
+    /// Its time to live ran out before it was handled.
+    Expired,
+    /// The destination's handler panicked, or its application ended with the message in hand.
+    Failed,
+    /// The connection to its node was lost before it was sent: it was not handled.
+    PeerLost,
+    /// Its node's connection or process ended after it was sent and before it was confirmed: nobody can say.
+    Unknown,
+}
+
+/// Why a message was refused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum Rejection {
+    /// No application has this TID.
+    NoSuchApplication,
+    /// The node is not known, or not connected yet.
+    NoSuchNode,
+    /// The destination does not handle this kind of payload.
+    UnknownKind,
+    /// The payload is not what its kind says.
+    Malformed,
+    /// The destination's queue is full.
+    QueueFull,
+    /// The payload is longer than the configured limit.
+    TooLong,
+    /// The destination's application has ended.
+    Closed,
+    /// The source TID does not belong to the sender.
+    ForgedSource,
+    /// The handler refused it.
+    ByHandler,
+    /// The request does not make sense: a confirmation of a multicast, for instance.
+    Unsupported,
+}
+
+impl Rejection {
+    const ALL: [Self; 10] = [
+        Self::NoSuchApplication,
+        Self::NoSuchNode,
+        Self::UnknownKind,
+        Self::Malformed,
+        Self::QueueFull,
+        Self::TooLong,
+        Self::Closed,
+        Self::ForgedSource,
+        Self::ByHandler,
+        Self::Unsupported,
+    ];
+}
+
+impl fmt::Display for Rejection {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::NoSuchApplication => "no application has this TID; is it registered and spelled right?",
+            Self::NoSuchNode => "the node is not known or not connected; see its NodeFound event",
+            Self::UnknownKind => "the destination does not handle this kind of payload",
+            Self::Malformed => "the payload is not what its kind says; do both sides use the same type?",
+            Self::QueueFull => {
+                "the destination's queue is full; it handles messages more slowly than they come"
+            }
+            Self::TooLong => "the payload is longer than the configured limit",
+            Self::Closed => "the destination's application has ended",
+            Self::ForgedSource => "the source TID does not belong to the sender",
+            Self::ByHandler => "the destination's handler refused it",
+            Self::Unsupported => "this cannot be asked of this destination",
+        })
+    }
+}
+
+impl Outcome {
+    /// The byte that stands for this outcome on the wire: `0` delivered, `1` expired, `2` failed, `3` peer lost,
+    /// `4` unknown, `16 + n` rejected for the n-th reason in the order of [`Rejection`].
+    #[must_use]
+    pub fn code(self) -> u8 {
+        match self {
+            Self::Delivered => 0,
+            Self::Expired => 1,
+            Self::Failed => 2,
+            Self::PeerLost => 3,
+            Self::Unknown => 4,
+            Self::Rejected(why) => 16 + Rejection::ALL.iter().position(|r| *r == why).map_or(0, |n| n as u8),
+        }
+    }
+
+    /// The outcome that `code` stands for; `None` for a byte that stands for none.
+    #[must_use]
+    pub fn from_code(code: u8) -> Option<Self> {
+        match code {
+            0 => Some(Self::Delivered),
+            1 => Some(Self::Expired),
+            2 => Some(Self::Failed),
+            3 => Some(Self::PeerLost),
+            4 => Some(Self::Unknown),
+            code => Rejection::ALL.get(usize::from(code.checked_sub(16)?)).map(|why| Self::Rejected(*why)),
+        }
+    }
+}
+
+/// Which message a receipt is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Ticket {
+    /// Who sent the message.
+    pub source: Tid,
+    /// Whom it was for.
+    pub destination: Tid,
+    /// The number by which its sender knows it.
+    pub correlation: u64,
+}
+
+/// Carries an outcome back to where a message came from.
+pub trait ReceiptSink: Send + Sync {
+    /// Takes the one outcome of the message that `ticket` names. Called once for each receipt.
+    fn settle(&self, ticket: Ticket, outcome: Outcome);
+}
+
+/// The right and the duty to say what became of one confirmed message.
+#[must_use = "a dropped receipt says Failed"]
+pub struct Receipt {
+    sink: Option<Arc<dyn ReceiptSink>>,
+    ticket: Ticket,
+}
+
+impl Receipt {
+    /// A receipt for the message that `ticket` names, to be settled at `sink`.
+    pub fn new(sink: Arc<dyn ReceiptSink>, ticket: Ticket) -> Self {
+        Self { sink: Some(sink), ticket }
+    }
+
+    /// Says what became of the message.
+    pub fn settle(mut self, outcome: Outcome) {
+        if let Some(sink) = self.sink.take() {
+            sink.settle(self.ticket, outcome);
+        }
+    }
+
+    /// Which message this is for.
+    #[must_use]
+    pub const fn ticket(&self) -> Ticket {
+        self.ticket
+    }
+}
+
+impl Drop for Receipt {
+    fn drop(&mut self) {
+        if let Some(sink) = self.sink.take() {
+            sink.settle(self.ticket, Outcome::Failed);
+        }
+    }
+}
+
+impl fmt::Debug for Receipt {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Receipt({:?})", self.ticket)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Mutex;
+
+    use super::*;
+
+    #[derive(Default)]
+    struct Ledger(Mutex<Vec<Outcome>>);
+
+    impl ReceiptSink for Ledger {
+        fn settle(&self, _: Ticket, outcome: Outcome) {
+            self.0.lock().unwrap().push(outcome);
+        }
+    }
+
+    const TICKET: Ticket = Ticket { source: Tid::NONE, destination: Tid::NONE, correlation: 1 };
+
+    #[test]
+    fn every_receipt_is_settled_exactly_once() {
+        let ledger = Arc::new(Ledger::default());
+        Receipt::new(ledger.clone(), TICKET).settle(Outcome::Delivered);
+        drop(Receipt::new(ledger.clone(), TICKET));
+        assert_eq!(*ledger.0.lock().unwrap(), [Outcome::Delivered, Outcome::Failed]);
+    }
+
+    #[test]
+    fn every_code_means_one_outcome() {
+        let meant: Vec<_> =
+            (0..=u8::MAX).filter_map(|code| Outcome::from_code(code).map(|o| (code, o))).collect();
+        assert_eq!(meant.len(), 5 + Rejection::ALL.len());
+        assert!(meant.iter().all(|(code, outcome)| outcome.code() == *code));
+    }
+}

@@ -1,0 +1,293 @@
+//! Where messages go: the routing table of a node, read by senders without a lock.
+
+use std::{
+    collections::BTreeMap,
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicU64, Ordering},
+    },
+};
+
+use arc_swap::ArcSwap;
+
+use crate::{
+    outcome::Rejection,
+    post::lock,
+    tid::{AppAddress, NodeAddress, Tid},
+    wire::{Flags, Kind, Message},
+};
+
+/// A place that takes messages: a mailbox, a client's socket, the connection to a node.
+pub trait Outlet: Send + Sync {
+    /// Takes the message, or hands it back with the reason. Never blocks.
+    ///
+    /// # Errors
+    /// The message, untouched, and why it was not taken.
+    fn submit(&self, message: Message) -> Result<(), Refused>;
+}
+
+/// A message that an [`Outlet`] did not take.
+#[derive(Debug)]
+pub struct Refused {
+    /// The message, untouched.
+    pub message: Message,
+    /// Why it was not taken.
+    pub why: Rejection,
+}
+
+impl Refused {
+    /// Refuses `message` because of `why`.
+    #[must_use]
+    pub const fn new(message: Message, why: Rejection) -> Self {
+        Self { message, why }
+    }
+}
+
+/// One application's line in the routing table.
+#[derive(Clone)]
+pub struct LocalRoute {
+    /// What takes its messages.
+    pub outlet: Arc<dyn Outlet>,
+    /// The events of layers that it subscribed to: kinds of [`Router::publish`].
+    pub events: Arc<[Kind]>,
+}
+
+#[derive(Clone, Default)]
+struct Table {
+    local: BTreeMap<AppAddress, LocalRoute>,
+    groups: BTreeMap<AppAddress, Vec<AppAddress>>,
+    peers: BTreeMap<NodeAddress, Arc<dyn Outlet>>,
+    remote_groups: BTreeMap<AppAddress, Vec<NodeAddress>>,
+}
+
+/// The routing table of a node. It is owned by the node, so that it outlives every layer.
+pub struct Router {
+    node: NodeAddress,
+    table: ArcSwap<Table>,
+    /// Writers take turns; readers never wait for them.
+    writing: Mutex<()>,
+    refused: AtomicU64,
+}
+
+impl Router {
+    /// The empty table of the node at `node`.
+    #[must_use]
+    pub fn new(node: NodeAddress) -> Self {
+        Self { node, table: ArcSwap::default(), writing: Mutex::new(()), refused: AtomicU64::new(0) }
+    }
+
+    /// The node whose table this is.
+    #[must_use]
+    pub const fn node(&self) -> NodeAddress {
+        self.node
+    }
+
+    /// `tid` with [`NodeAddress::HERE`] replaced by this node's address.
+    #[must_use]
+    pub fn absolute(&self, tid: Tid) -> Tid {
+        if tid.node == NodeAddress::HERE && tid.app != AppAddress::NONE {
+            Tid::new(self.node, tid.app)
+        } else {
+            tid
+        }
+    }
+
+    /// Sends a message from an application of this node. A confirmed message that is refused is also settled so.
+    ///
+    /// # Errors
+    /// Why nobody took the message. For a multicast: why no destination at all took it.
+    pub fn send(&self, mut message: Message) -> Result<(), Rejection> {
+        message.header.destination = self.absolute(message.header.destination);
+        let destination = message.header.destination;
+        let table = self.table.load();
+        let result = if destination.is_single() {
+            Self::send_to_one(&table, self.node, message)
+        } else if message.receipt.is_some() || message.header.flags.has(Flags::ASK) {
+            Err(Refused::new(message, Rejection::Unsupported))
+        } else {
+            self.multicast(&table, message)
+        };
+        self.account(result)
+    }
+
+    /// Hands a message that came from another node to this node's applications: it never leaves the node again.
+    ///
+    /// # Errors
+    /// Why nobody took the message.
+    pub fn deliver(&self, message: Message) -> Result<(), Rejection> {
+        let table = self.table.load();
+        let app = message.header.destination.app;
+        let result = if message.header.destination.is_single() {
+            submit_to(table.local.get(&app).map(|route| &route.outlet), message, Rejection::NoSuchApplication)
+        } else {
+            self.fan_out(&table, app, &message);
+            Ok(())
+        };
+        self.account(result)
+    }
+
+    /// Hands a layer's event to every application of this node that subscribed to its kind.
+    pub fn publish(&self, event: &Message) {
+        let table = self.table.load();
+        for (app, route) in &table.local {
+            if route.events.contains(&event.header.kind) {
+                let mut copy = copy_of(event);
+                copy.header.destination = Tid::new(self.node, *app);
+                // A full mailbox has counted the refusal itself.
+                let _ = self.account(route.outlet.submit(copy));
+            }
+        }
+    }
+
+    /// How many messages nobody took.
+    #[must_use]
+    pub fn refused(&self) -> u64 {
+        self.refused.load(Ordering::Relaxed)
+    }
+
+    fn account(&self, result: Result<(), Refused>) -> Result<(), Rejection> {
+        result.map_err(|refused| {
+            self.refused.fetch_add(1, Ordering::Relaxed);
+            refused.message.reject(refused.why);
+            refused.why
+        })
+    }
+
+    fn send_to_one(table: &Table, here: NodeAddress, message: Message) -> Result<(), Refused> {
+        let Tid { node, app } = message.header.destination;
+        if node == here {
+            let route = table.local.get(&app).map(|route| &route.outlet);
+            submit_to(route, message, Rejection::NoSuchApplication)
+        } else {
+            submit_to(table.peers.get(&node), message, Rejection::NoSuchNode)
+        }
+    }
+
+    /// One copy for each node that has a member, and one for each member here.
+    fn multicast(&self, table: &Table, message: Message) -> Result<(), Refused> {
+        let Tid { node, app } = message.header.destination;
+        let mut taken = 0;
+        if node == self.node || node == NodeAddress::ALL {
+            taken += self.fan_out(table, app, &message);
+        }
+        if node == NodeAddress::ALL && app.is_group() {
+            let members = table.remote_groups.get(&app).map_or(&[][..], Vec::as_slice);
+            let peers = members.iter().filter_map(|member| table.peers.get(member));
+            taken += peers.filter(|peer| peer.submit(copy_of(&message)).is_ok()).count();
+        } else if node == NodeAddress::ALL {
+            taken += table.peers.values().filter(|peer| peer.submit(copy_of(&message)).is_ok()).count();
+        } else if let Some(peer) = table.peers.get(&node) {
+            taken += usize::from(peer.submit(copy_of(&message)).is_ok());
+        }
+        if taken == 0 { Err(Refused::new(message, Rejection::NoSuchApplication)) } else { Ok(()) }
+    }
+
+    /// Copies for the members on this node, except the sender itself; returns how many took theirs.
+    fn fan_out(&self, table: &Table, app: AppAddress, message: &Message) -> usize {
+        let here = self.node;
+        let submit = |(member, outlet): (AppAddress, &Arc<dyn Outlet>)| {
+            let is_sender = here == message.header.source.node && member == message.header.source.app;
+            !is_sender && outlet.submit(copy_of(message)).is_ok()
+        };
+        if app.is_group() {
+            let members = table.groups.get(&app).map_or(&[][..], Vec::as_slice);
+            let routes = members.iter().filter_map(|m| table.local.get(m).map(|route| (*m, &route.outlet)));
+            routes.filter(|route| submit(*route)).count()
+        } else if app == AppAddress::ALL {
+            let apps = table.local.iter().filter(|(app, _)| !app.is_layer());
+            apps.filter(|(app, route)| submit((**app, &route.outlet))).count()
+        } else {
+            // A broadcast to the application that has this address on every node.
+            table.local.get(&app).map_or(0, |route| usize::from(submit((app, &route.outlet))))
+        }
+    }
+
+    fn change(&self, edit: impl FnOnce(&mut Table)) {
+        let _turn = lock(&self.writing);
+        let mut table = Table::clone(&self.table.load());
+        edit(&mut table);
+        self.table.store(Arc::new(table));
+    }
+
+    /// Adds or replaces the route to an application of this node.
+    pub fn set_local(&self, app: AppAddress, route: LocalRoute) {
+        self.change(|table| {
+            table.local.insert(app, route);
+        });
+    }
+
+    /// Removes an application and its memberships.
+    pub fn remove_local(&self, app: AppAddress) {
+        self.change(|table| {
+            table.local.remove(&app);
+            for members in table.groups.values_mut() {
+                members.retain(|member| *member != app);
+            }
+        });
+    }
+
+    /// Makes `app` a member of `group`, or no longer one. Returns whether anything changed.
+    pub fn set_member(&self, group: AppAddress, app: AppAddress, member: bool) -> bool {
+        let mut changed = false;
+        self.change(|table| {
+            let members = table.groups.entry(group).or_default();
+            let was = members.contains(&app);
+            changed = was != member;
+            members.retain(|other| *other != app);
+            if member {
+                members.push(app);
+            }
+        });
+        changed
+    }
+
+    /// Groups that have a member on this node.
+    #[must_use]
+    pub fn groups(&self) -> Vec<AppAddress> {
+        let table = self.table.load();
+        table.groups.iter().filter(|(_, members)| !members.is_empty()).map(|(group, _)| *group).collect()
+    }
+
+    /// Adds or replaces the route to another node.
+    pub fn set_peer(&self, node: NodeAddress, outlet: Arc<dyn Outlet>) {
+        self.change(|table| {
+            table.peers.insert(node, outlet);
+        });
+    }
+
+    /// Removes the route to another node.
+    pub fn remove_peer(&self, node: NodeAddress) {
+        self.change(|table| {
+            table.peers.remove(&node);
+        });
+    }
+
+    /// States which groups have members on another node.
+    pub fn set_remote_groups(&self, node: NodeAddress, groups: &[AppAddress]) {
+        self.change(|table| {
+            for nodes in table.remote_groups.values_mut() {
+                nodes.retain(|other| *other != node);
+            }
+            for group in groups {
+                table.remote_groups.entry(*group).or_default().push(node);
+            }
+            table.remote_groups.retain(|_, nodes| !nodes.is_empty());
+        });
+    }
+}
+
+fn submit_to(
+    outlet: Option<&Arc<dyn Outlet>>,
+    message: Message,
+    otherwise: Rejection,
+) -> Result<(), Refused> {
+    match outlet {
+        Some(outlet) => outlet.submit(message),
+        None => Err(Refused::new(message, otherwise)),
+    }
+}
+
+/// A copy that shares the payload; receipts are never shared.
+fn copy_of(message: &Message) -> Message {
+    Message::new(message.header, message.payload.clone())
+}

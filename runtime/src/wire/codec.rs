@@ -1,0 +1,158 @@
+//! Frames on a byte stream and in datagrams.
+
+use bytes::{Buf, BufMut, Bytes, BytesMut};
+use tokio_util::codec::{Decoder, Encoder};
+
+use crate::wire::{HEADER_LEN, Header, HeaderError, Message};
+
+/// Why a stream of frames cannot go on. The connection is of no use after it.
+#[derive(Debug, thiserror::Error)]
+pub enum FrameError {
+    /// A header that cannot be used.
+    #[error(transparent)]
+    Header(#[from] HeaderError),
+    /// The frame is longer than this node takes.
+    #[error(
+        "a payload of {said} bytes is above this node's limit of {limit}; raise `max_payload_bytes` on both sides"
+    )]
+    TooLong {
+        /// Length in the header.
+        said: usize,
+        /// The limit in force.
+        limit: usize,
+    },
+    /// The connection failed.
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+}
+
+/// Cuts a byte stream into messages and writes messages to one.
+///
+/// The length in a header is checked before memory is reserved for it.
+#[derive(Clone, Copy, Debug)]
+pub struct FrameCodec {
+    payload_max: usize,
+}
+
+impl FrameCodec {
+    /// A codec that takes payloads of at most `payload_max` bytes.
+    #[must_use]
+    pub const fn new(payload_max: usize) -> Self {
+        Self { payload_max }
+    }
+}
+
+impl Decoder for FrameCodec {
+    type Item = Message;
+    type Error = FrameError;
+
+    fn decode(&mut self, source: &mut BytesMut) -> Result<Option<Message>, FrameError> {
+        let Some(start) = source.first_chunk::<8>() else { return Ok(None) };
+        let said = Header::payload_len(start)? as usize;
+        if said > self.payload_max {
+            return Err(FrameError::TooLong { said, limit: self.payload_max });
+        }
+        let whole = HEADER_LEN + said;
+        if source.len() < whole {
+            source.reserve(whole - source.len());
+            return Ok(None);
+        }
+        Ok(Some(split(source.split_to(whole).freeze())?))
+    }
+}
+
+/// Reads the frame that fills `frame` to its last byte.
+fn split(mut frame: Bytes) -> Result<Message, HeaderError> {
+    let Some(bytes) = frame.first_chunk::<HEADER_LEN>().copied() else {
+        return Err(HeaderError::NotAFrame);
+    };
+    frame.advance(HEADER_LEN);
+    Ok(Message::new(Header::decode(&bytes, &frame)?, frame))
+}
+
+impl Encoder<&Message> for FrameCodec {
+    type Error = FrameError;
+
+    fn encode(&mut self, message: &Message, target: &mut BytesMut) -> Result<(), FrameError> {
+        let said = message.payload.len();
+        if said > self.payload_max {
+            return Err(FrameError::TooLong { said, limit: self.payload_max });
+        }
+        target.reserve(HEADER_LEN + said);
+        encode_frame(&message.header, &message.payload, target);
+        Ok(())
+    }
+}
+
+/// Appends one frame to `target`.
+pub fn encode_frame(header: &Header, payload: &[u8], target: &mut BytesMut) {
+    target.put_slice(&header.encode(payload));
+    target.put_slice(payload);
+}
+
+/// Reads a datagram, which must be exactly one frame.
+///
+/// # Errors
+/// What is wrong with the bytes.
+pub fn decode_datagram(bytes: &[u8]) -> Result<Message, HeaderError> {
+    let Some(start) = bytes.first_chunk::<HEADER_LEN>() else { return Err(HeaderError::NotAFrame) };
+    let payload = &bytes[HEADER_LEN..];
+    // The header is checked against the payload before a byte of it is copied.
+    let header = Header::decode(start, payload)?;
+    Ok(Message::new(header, Bytes::copy_from_slice(payload)))
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::{tid::Tid, wire::Kind};
+
+    fn frame(payload: &[u8]) -> BytesMut {
+        let mut bytes = BytesMut::new();
+        encode_frame(&Header::new(Kind::named("test"), Tid::NONE, Tid::BROADCAST), payload, &mut bytes);
+        bytes
+    }
+
+    proptest! {
+        #[test]
+        fn messages_survive_any_cutting_of_the_stream(
+            payloads in proptest::collection::vec(proptest::collection::vec(any::<u8>(), 0..200), 1..8),
+            cut in 1usize..97,
+        ) {
+            let stream: Vec<u8> = payloads.iter().flat_map(|payload| frame(payload).to_vec()).collect();
+            let (mut codec, mut buffer, mut seen) = (FrameCodec::new(1024), BytesMut::new(), Vec::new());
+            for piece in stream.chunks(cut) {
+                buffer.extend_from_slice(piece);
+                while let Some(message) = codec.decode(&mut buffer).unwrap() {
+                    seen.push(message.payload.to_vec());
+                }
+            }
+            prop_assert_eq!(seen, payloads);
+        }
+
+        #[test]
+        fn garbage_is_an_error_or_a_wait_and_never_a_panic(bytes: Vec<u8>) {
+            let mut buffer = BytesMut::from(bytes.as_slice());
+            let _ = FrameCodec::new(1024).decode(&mut buffer);
+            let _ = decode_datagram(&bytes);
+        }
+
+        #[test]
+        fn a_truncated_datagram_is_refused(payload: Vec<u8>, keep in 0.0f64..1.0) {
+            let whole = frame(&payload);
+            let kept = (whole.len() as f64 * keep) as usize;
+            prop_assert!(decode_datagram(&whole[..kept]).is_err());
+        }
+    }
+
+    #[test]
+    fn an_oversized_length_is_refused_before_memory_is_reserved() {
+        let mut buffer = frame(&[]);
+        buffer[4..8].copy_from_slice(&u32::MAX.to_le_bytes());
+        let capacity = buffer.capacity();
+        assert!(matches!(FrameCodec::new(1024).decode(&mut buffer), Err(FrameError::TooLong { .. })));
+        assert_eq!(buffer.capacity(), capacity);
+    }
+}

@@ -1,0 +1,119 @@
+//! Stable ids of payload types.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+/// FNV-1a, 32 bits (Fowler, Noll, Vo; draft-eastlake-fnv section 2): stable in every language, in a dozen lines.
+#[must_use]
+pub const fn fnv1a(bytes: &[u8]) -> u32 {
+    let mut hash: u32 = 0x811c_9dc5;
+    let mut at = 0;
+    while at < bytes.len() {
+        hash = (hash ^ bytes[at] as u32).wrapping_mul(0x0100_0193);
+        at += 1;
+    }
+    hash
+}
+
+/// Stable id of a payload's type.
+///
+/// Ids below `0x8000_0000` belong to Sinew's own layers; a user's kind is the hash of its name with the top bit set.
+/// Two names of one node that hash alike are refused when the second is registered.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Kind(u32);
+
+impl Kind {
+    /// The outcome of a confirmed message: one byte, see [`Outcome::code`](crate::outcome::Outcome::code).
+    pub const OUTCOME: Self = Self(1);
+    /// First frame of a connection between nodes.
+    pub const GNCL_HELLO: Self = Self(0x10);
+    /// Answer to a hello that is accepted.
+    pub const GNCL_WELCOME: Self = Self(0x11);
+    /// Answer to a hello that is not accepted: a sentence that says why.
+    pub const GNCL_REFUSAL: Self = Self(0x12);
+    /// Asks the peer's GNCL actor for a sign of life.
+    pub const GNCL_PING: Self = Self(0x13);
+    /// The sign of life.
+    pub const GNCL_PONG: Self = Self(0x14);
+    /// Orderly end of a connection.
+    pub const GNCL_GOODBYE: Self = Self(0x15);
+    /// A node asks who is there, or whether a known node lives.
+    pub const NDL_QUERY: Self = Self(0x20);
+    /// The matched answer.
+    pub const NDL_ANSWER: Self = Self(0x21);
+    /// A node leaves in order.
+    pub const NDL_LEAVE: Self = Self(0x22);
+    /// The names that a node's applications have, and which of them are ready.
+    pub const SYNC_DIRECTORY: Self = Self(0x30);
+    /// A process asks for a transport address.
+    pub const LNCL_REGISTER: Self = Self(0x40);
+    /// The address it got.
+    pub const LNCL_REGISTERED: Self = Self(0x41);
+    /// Why it got none, or why the connection ends: a sentence.
+    pub const LNCL_REFUSAL: Self = Self(0x42);
+    /// A process gives its address back.
+    pub const LNCL_UNREGISTER: Self = Self(0x43);
+    /// A process joins or leaves a group.
+    pub const LNCL_GROUP: Self = Self(0x44);
+    /// A process asks for the TID of a name.
+    pub const LNCL_RESOLVE: Self = Self(0x45);
+    /// The TID of a name, or none.
+    pub const LNCL_RESOLVED: Self = Self(0x46);
+
+    /// The id of the user's payload type called `name`.
+    #[must_use]
+    pub const fn named(name: &str) -> Self {
+        Self(fnv1a(name.as_bytes()) | 0x8000_0000)
+    }
+
+    /// The id with these 32 bits.
+    #[must_use]
+    pub const fn from_bits(bits: u32) -> Self {
+        Self(bits)
+    }
+
+    /// The 32 bits of this id.
+    #[must_use]
+    pub const fn bits(self) -> u32 {
+        self.0
+    }
+
+    /// Whether this belongs to a user's type, not to a layer.
+    #[must_use]
+    pub const fn is_user(self) -> bool {
+        self.0 >= 0x8000_0000
+    }
+}
+
+impl fmt::Display for Kind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:08x}", self.0)
+    }
+}
+
+impl fmt::Debug for Kind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(self, f)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Test vectors of draft-eastlake-fnv, appendix C.
+    #[test]
+    fn hash_agrees_with_the_published_vectors() {
+        assert_eq!(fnv1a(b""), 0x811c_9dc5);
+        assert_eq!(fnv1a(b"a"), 0xe40c_292c);
+        assert_eq!(fnv1a(b"foobar"), 0xbf9c_f968);
+    }
+
+    #[test]
+    fn named_kinds_never_meet_the_layers_kinds() {
+        assert!(Kind::named("exo.joint_sample").is_user());
+        assert!(!Kind::NDL_QUERY.is_user());
+    }
+}

@@ -1,0 +1,146 @@
+//! A message in memory: header, payload bytes, and the duty to say what became of it.
+
+use std::ops::{Deref, DerefMut};
+
+use bytes::{Bytes, BytesMut};
+use serde::{Serialize, de::DeserializeOwned};
+
+use crate::{
+    outcome::{Outcome, Receipt, Rejection},
+    tid::Tid,
+    wire::{Class, Header, Kind},
+};
+
+/// A type that travels as MessagePack (a map with field names, so that any language can read it).
+///
+/// ```
+/// use serde::{Deserialize, Serialize};
+/// use sinew_runtime::wire::Payload;
+///
+/// #[derive(Serialize, Deserialize)]
+/// struct JointAngle { degrees: f32 }
+///
+/// impl Payload for JointAngle {
+///     const NAME: &'static str = "demo.joint_angle";
+/// }
+/// ```
+pub trait Payload: Serialize + DeserializeOwned + Send + 'static {
+    /// Name of the type, the same in every program: `project.type`.
+    const NAME: &'static str;
+    /// Id of the type on the wire.
+    const KIND: Kind = Kind::named(Self::NAME);
+    /// Class that this type travels in unless the sender says otherwise.
+    const CLASS: Class = Class::Control;
+}
+
+/// Why a payload could not be read. The peer is at fault: its type of this name is another one.
+#[derive(Debug, thiserror::Error)]
+#[error("this is not a {name}: {cause}")]
+pub struct DecodeError {
+    name: &'static str,
+    cause: rmp_serde::decode::Error,
+}
+
+/// A message on its way.
+#[derive(Debug)]
+pub struct Message {
+    /// Who, to whom, what, when.
+    pub header: Header,
+    /// The payload, not copied on its way through a process.
+    pub payload: Bytes,
+    /// Who wants to know what becomes of it; `None` for an unconfirmed message.
+    pub receipt: Option<Receipt>,
+}
+
+impl Message {
+    /// An unconfirmed message.
+    #[must_use]
+    pub const fn new(header: Header, payload: Bytes) -> Self {
+        Self { header, payload, receipt: None }
+    }
+
+    /// A message of the given type, in its own class.
+    ///
+    /// # Panics
+    /// If the type's `Serialize` refuses its own value (a map with two equal keys, say): a fault of the program.
+    #[must_use]
+    pub fn typed<P: Payload>(source: Tid, destination: Tid, value: &P) -> Self {
+        let mut header = Header::new(P::KIND, source, destination);
+        header.class = P::CLASS;
+        Self::new(header, encode(value))
+    }
+
+    /// Reads the payload as a `P`.
+    ///
+    /// # Errors
+    /// The bytes are not a `P`.
+    pub fn decode<P: Payload>(&self) -> Result<P, DecodeError> {
+        rmp_serde::from_slice(&self.payload).map_err(|cause| DecodeError { name: P::NAME, cause })
+    }
+
+    /// Says what became of this message, if anybody wants to know.
+    pub fn settle(&mut self, outcome: Outcome) {
+        if let Some(receipt) = self.receipt.take() {
+            receipt.settle(outcome);
+        }
+    }
+
+    /// Refuses this message.
+    pub fn reject(mut self, why: Rejection) {
+        self.settle(Outcome::Rejected(why));
+    }
+
+    /// Bytes that this message takes in a queue: its header and its payload.
+    #[must_use]
+    pub fn size(&self) -> usize {
+        super::HEADER_LEN + self.payload.len()
+    }
+}
+
+/// The MessagePack form of `value`.
+///
+/// # Panics
+/// If the type's `Serialize` refuses its own value: a fault of the program, found by its first send.
+pub fn encode<P: Payload>(value: &P) -> Bytes {
+    rmp_serde::to_vec_named(value).expect("a payload type can be written as MessagePack").into()
+}
+
+/// Writable memory for a raw payload: what `create_message` lends and `send_message` takes back.
+#[derive(Debug)]
+pub struct MessageBuffer {
+    header: Header,
+    payload: BytesMut,
+}
+
+impl MessageBuffer {
+    /// Zeroed memory for `length` payload bytes.
+    #[must_use]
+    pub fn new(header: Header, length: usize) -> Self {
+        Self { header, payload: BytesMut::zeroed(length) }
+    }
+
+    /// The message, its payload no longer writable.
+    #[must_use]
+    pub fn freeze(self) -> Message {
+        Message::new(self.header, self.payload.freeze())
+    }
+
+    /// The class in which it will travel.
+    pub fn set_class(&mut self, class: Class) {
+        self.header.class = class;
+    }
+}
+
+impl Deref for MessageBuffer {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        &self.payload
+    }
+}
+
+impl DerefMut for MessageBuffer {
+    fn deref_mut(&mut self) -> &mut [u8] {
+        &mut self.payload
+    }
+}

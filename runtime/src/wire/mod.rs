@@ -1,0 +1,14 @@
+//! What travels: one fixed header before every payload, and the rules by which bytes become messages.
+//!
+//! The same frame (header, then payload) is used on unix sockets, on TCP and in datagrams; `docs/protocol/frame.md`
+//! specifies it byte by byte. Nothing here allocates on the word of a peer: lengths are checked first.
+
+mod codec;
+mod header;
+mod kind;
+mod message;
+
+pub use codec::{FrameCodec, FrameError, decode_datagram, encode_frame};
+pub use header::{Class, Flags, HEADER_LEN, Header, HeaderError, MAGIC, VERSION};
+pub use kind::{Kind, fnv1a};
+pub use message::{DecodeError, Message, MessageBuffer, Payload, encode};
