@@ -10,8 +10,10 @@
 //! | [`outcome`] | and then: what became of a message |
 //! | [`router`] | where to: the table that senders read without a lock |
 //! | [`post`] | events into an actor that outlive it |
+//! | [`mailbox`] | messages into an application that outlive it |
 //! | [`supervision`] | who is started, when, and again after a fault |
 
+pub mod mailbox;
 pub mod outcome;
 pub mod post;
 pub mod router;
