@@ -163,9 +163,7 @@ pub enum Order {
 /// Where a child is in its life.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ChildState {
-    /// Waits for its release.
-    Held,
-    /// Does not live.
+    /// Does not live; waits for its turn, or for its release.
     Down,
     /// Failed; is started again at this time.
     BackingOff(Time),
@@ -185,7 +183,7 @@ impl ChildState {
     const fn deadline(self) -> Option<Time> {
         match self {
             Self::BackingOff(at) | Self::Starting(at) | Self::Stopping(at) => Some(at),
-            Self::Held | Self::Down | Self::Ready => None,
+            Self::Down | Self::Ready => None,
         }
     }
 }
@@ -197,6 +195,8 @@ struct Child {
     generation: Generation,
     /// Should live.
     wanted: bool,
+    /// What it requires is ready. Forgotten when it ends, for then its requirements are asked for again.
+    released: bool,
     /// Lives, and must be replaced because a sibling failed.
     stale: bool,
     failures_in_a_row: u32,
@@ -279,10 +279,8 @@ impl Core {
     }
 
     fn released(&mut self, index: ChildIndex) {
-        if let Some(child) = self.children.get_mut(index)
-            && child.state == ChildState::Held
-        {
-            child.state = ChildState::Down;
+        if let Some(child) = self.children.get_mut(index) {
+            child.released = true;
         }
     }
 
@@ -301,10 +299,7 @@ impl Core {
         for index in 0..self.children.len() {
             let Child { state, generation, .. } = self.children[index];
             match state {
-                ChildState::BackingOff(at) if at <= now => {
-                    let held = self.children[index].policy.held;
-                    self.children[index].state = if held { ChildState::Held } else { ChildState::Down };
-                }
+                ChildState::BackingOff(at) if at <= now => self.children[index].state = ChildState::Down,
                 ChildState::Starting(until) if until <= now => {
                     self.orders.push_back(Order::Abandon(index, generation));
                     self.child_ended(now, index, Reason::StartTimeout);
@@ -316,7 +311,6 @@ impl Core {
                 ChildState::BackingOff(_)
                 | ChildState::Starting(_)
                 | ChildState::Stopping(_)
-                | ChildState::Held
                 | ChildState::Down
                 | ChildState::Ready => {}
             }
@@ -326,7 +320,8 @@ impl Core {
     fn child_ended(&mut self, now: Time, index: ChildIndex, reason: Reason) {
         let child = &mut self.children[index];
         let was_asked_to = matches!(child.state, ChildState::Stopping(_));
-        child.state = if child.policy.held { ChildState::Held } else { ChildState::Down };
+        child.state = ChildState::Down;
+        child.released = false;
         self.said_all_ready = false;
         if was_asked_to {
             self.orders.push_back(Order::Failed(index, Reason::Shutdown));
@@ -389,7 +384,7 @@ impl Core {
         }
         self.start_in_order(now);
         let settled =
-            |child: &Child| !child.wanted || matches!(child.state, ChildState::Ready | ChildState::Held);
+            |child: &Child| !child.wanted || child.state == ChildState::Ready || child.waits_for_release();
         if !self.said_all_ready && self.children.iter().any(|c| c.wanted) && self.children.iter().all(settled)
         {
             self.said_all_ready = true;
@@ -418,7 +413,7 @@ impl Core {
         let ordered = self.strategy != Strategy::OneForOne;
         for index in 0..self.children.len() {
             let child = &mut self.children[index];
-            if child.wanted && child.state == ChildState::Down {
+            if child.wanted && child.state == ChildState::Down && !child.waits_for_release() {
                 child.generation += 1;
                 child.state = ChildState::Starting(now + child.policy.start_within);
                 self.orders.push_back(Order::Spawn(index, child.generation));
@@ -432,17 +427,21 @@ impl Core {
 
 impl Child {
     const fn new(policy: Policy) -> Self {
-        let state = if policy.held { ChildState::Held } else { ChildState::Down };
         Self {
             policy,
-            state,
+            state: ChildState::Down,
             generation: 0,
             wanted: false,
+            released: false,
             stale: false,
             failures_in_a_row: 0,
             restarts: 0,
             ready_since: Time::ZERO,
         }
+    }
+
+    fn waits_for_release(&self) -> bool {
+        self.state == ChildState::Down && self.policy.held && !self.released
     }
 
     /// The wait before the next start: doubled by each failure in a row, forgotten after a `healthy` life.

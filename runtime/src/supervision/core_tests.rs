@@ -133,6 +133,19 @@ fn a_held_child_starts_when_it_is_released_and_waits_again_after_a_failure() {
     assert_eq!(orders(&mut core), [Order::Spawn(0, 2)]);
 }
 
+#[test]
+fn a_release_that_comes_during_the_back_off_is_not_forgotten() {
+    let policy = Policy { held: true, ..Policy::default() };
+    let mut core = Core::new(Strategy::OneForOne, Intensity::default(), vec![policy]);
+    core.handle(at(0), Input::Started);
+    core.handle(at(0), Input::Released(0));
+    core.handle(at(1), panicked(0, 1));
+    core.handle(at(1), Input::Released(0));
+    orders(&mut core);
+    core.handle(core.next_wake().unwrap(), Input::TimePassed);
+    assert_eq!(orders(&mut core), [Order::Spawn(0, 2)]);
+}
+
 #[derive(Clone, Debug)]
 enum Step {
     Ready(usize),
