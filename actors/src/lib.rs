@@ -5,8 +5,9 @@ mod gncl;
 mod lncl;
 mod ndl;
 mod node;
+mod refusals;
 mod stores;
 mod sync;
 
 pub use ndl::{LossReason, NodeEvent};
-pub use sync::{RequirementEvent, Waiting};
+pub use sync::{DirectoryEntry, RequirementEvent, Waiting};

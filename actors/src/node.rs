@@ -7,4 +7,7 @@ use sinew_runtime::tid::AppAddress;
 pub(crate) enum RootEvent {
     /// By the sync manager: all that this application requires is ready.
     Release { app: AppAddress },
+    /// By the sync manager: these names require each other in a circle, the first one again at the end. It has logged
+    /// so; none of these applications is released.
+    RequirementCycle { names: Vec<String> },
 }
