@@ -5,6 +5,8 @@ mod gncl;
 mod lncl;
 mod ndl;
 mod node;
+mod outlet;
+mod refusals;
 mod stores;
 mod sync;
 
