@@ -31,10 +31,38 @@ pub(crate) struct Stores {
     pub(crate) clocks: ClockOffsets,
     /// Address of GNCL's listener, known once it listens; announced by NDL. A restarted GNCL binds it again.
     pub(crate) gncl_listen: OnceLock<SocketAddr>,
+    /// GNCL's peers with the messages that wait for them, and what GNCL refused.
+    pub(crate) gncl: gncl::Store,
     /// Who is registered on this node.
     pub(crate) registry: Mutex<lncl::Registry>,
     /// Who is known on other nodes, and what waits for whom.
     pub(crate) sync: Mutex<sync::Core>,
+}
+
+#[cfg(test)]
+impl Stores {
+    /// The stores of a node that has only the layers that a test starts.
+    pub(crate) fn for_test(config: NodeConfig, incarnation: Incarnation) -> Arc<Self> {
+        let node = config.node_address();
+        Arc::new(Self {
+            config,
+            node,
+            incarnation,
+            router: Arc::new(Router::new(node)),
+            posts: Posts {
+                root: Post::new(1_024),
+                lncl: Post::new(1_024),
+                sync: Post::new(1_024),
+                gncl: Post::new(1_024),
+                ndl: Post::new(1_024),
+            },
+            clocks: ClockOffsets::default(),
+            gncl_listen: OnceLock::new(),
+            gncl: gncl::Store::default(),
+            registry: Mutex::default(),
+            sync: Mutex::default(),
+        })
+    }
 }
 
 /// The posts of the layers.
