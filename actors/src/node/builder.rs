@@ -3,14 +3,12 @@
 use std::{
     collections::BTreeSet,
     hash::{BuildHasher, Hasher, RandomState},
-    sync::{Arc, Mutex, OnceLock, mpsc::sync_channel},
+    sync::mpsc::sync_channel,
     time::{Duration, SystemTime},
 };
 
 use sinew_runtime::{
     app::DynApp,
-    post::Post,
-    router::Router,
     tid::{Incarnation, NodeAddress},
 };
 
@@ -20,13 +18,9 @@ use super::{
 };
 use crate::{
     config::{ConfigFaults, NodeConfig},
-    lncl,
-    stores::{ClockOffsets, Posts, Stores},
-    sync::{self, Waiting},
+    stores::Stores,
+    sync::Waiting,
 };
-
-/// Events that wait for a layer at most. A layer that falls this far behind has a fault of its own.
-const POST_CAPACITY: usize = 8_192;
 
 /// Declares a node: its configuration and its applications.
 pub struct NodeBuilder {
@@ -61,6 +55,9 @@ pub enum StartError {
     /// A layer did not become ready.
     #[error("the layers did not start: {0}")]
     Layers(String),
+    /// Applications require each other in a circle: none of them can be the first.
+    #[error("these applications require each other in a circle: {}; take one requirement out", .0.join(" -> "))]
+    Cycle(Vec<String>),
     /// Applications wait for what they require.
     #[error("after {within:?} these still wait:{}", list(.waiting))]
     Waiting {
@@ -75,11 +72,7 @@ pub enum StartError {
 }
 
 fn list(waiting: &[Waiting]) -> String {
-    let line = |waiting: &Waiting| {
-        let missing: Vec<_> = waiting.missing.iter().map(|(name, known)| format!("{name} ({known})")).collect();
-        format!("\n  {} for {:.1} s: {}", waiting.application, waiting.since.as_secs_f32(), missing.join(", "))
-    };
-    waiting.iter().map(line).collect()
+    waiting.iter().map(|waiting| format!("\n  {waiting}")).collect()
 }
 
 impl NodeBuilder {
@@ -134,7 +127,7 @@ impl NodeBuilder {
         }
         let patience = self.config.sync.layer_deadline * 4;
         let incarnation = self.incarnation.unwrap_or_else(wall_clock);
-        let stores = Arc::new(stores(self.config, incarnation));
+        let stores = Stores::new(self.config, incarnation, boot_nonce());
         let handle = NodeHandle { root: stores.posts.root.clone(), stores: stores.clone() };
         let (say_started, started) = sync_channel(1);
         let (say_ended, ended) = sync_channel(1);
@@ -161,26 +154,4 @@ fn wall_clock() -> Incarnation {
 /// A number that no other start of any node has: it tells two nodes with one address apart.
 fn boot_nonce() -> u64 {
     RandomState::new().build_hasher().finish()
-}
-
-fn stores(config: NodeConfig, incarnation: Incarnation) -> Stores {
-    let node = config.node_address();
-    Stores {
-        node,
-        incarnation,
-        boot_nonce: boot_nonce(),
-        router: Arc::new(Router::new(node)),
-        posts: Posts {
-            root: Post::new(POST_CAPACITY),
-            lncl: Post::new(POST_CAPACITY),
-            sync: Post::new(POST_CAPACITY),
-            gncl: Post::new(POST_CAPACITY),
-            ndl: Post::new(POST_CAPACITY),
-        },
-        clocks: ClockOffsets::default(),
-        gncl_listen: OnceLock::new(),
-        registry: Mutex::new(lncl::Registry::default()),
-        sync: Mutex::new(sync::Core::default()),
-        config,
-    }
 }

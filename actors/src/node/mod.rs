@@ -159,7 +159,9 @@ impl NodeHandle {
     pub fn wait_until_running(&self, within: Duration) -> Result<(), StartError> {
         let (say, heard) = std::sync::mpsc::sync_channel(1);
         self.tell(RootEvent::TellWhenRunning(say));
-        heard.recv_timeout(within).map_err(|_| StartError::Waiting { waiting: self.waiting(), within })
+        heard
+            .recv_timeout(within)
+            .unwrap_or_else(|_| Err(StartError::Waiting { waiting: self.waiting(), within }))
     }
 
     fn tell(&self, event: RootEvent) {

@@ -17,7 +17,8 @@ use sinew_runtime::{
     post::Post,
     sender::Sender,
     supervision::{
-        ChildSpec, Input, Launch, Place, Policy, Reason, Strategy, Supervisor, SupervisorFact, Threads,
+        ChildSpec, Input, Launch, Place, Policy, ReadyGate, Reason, Strategy, Supervisor, SupervisorFact,
+        Threads, life,
     },
     tid::{AppAddress, Tid},
 };
@@ -38,6 +39,9 @@ const WAITS_MAX: usize = 1_024;
 pub(crate) enum RootEvent {
     /// By the sync manager: all that this application requires is ready.
     Release { app: AppAddress },
+    /// By the sync manager: these names require each other in a circle, the first one again at the end. None of these
+    /// applications is released.
+    RequirementCycle { names: Vec<String> },
     /// By the layers' supervisor.
     Layers(SupervisorFact),
     /// By the applications' supervisor.
@@ -47,7 +51,7 @@ pub(crate) enum RootEvent {
     /// By the owner or a signal.
     StopOrdered,
     /// By the owner: say when every application runs.
-    TellWhenRunning(SyncSender<()>),
+    TellWhenRunning(SyncSender<Result<(), StartError>>),
 }
 
 struct App {
@@ -76,9 +80,10 @@ struct Root {
     layer_supervisor: Option<Post<Input>>,
     app_supervisor: Option<Post<Input>>,
     last_layer_fault: Option<String>,
+    cycle: Option<Vec<String>>,
     started: Option<SyncSender<Result<(), StartError>>>,
     ended: SyncSender<NodeEnd>,
-    tell_when_running: Vec<SyncSender<()>>,
+    tell_when_running: Vec<SyncSender<Result<(), StartError>>>,
 }
 
 /// The root thread's whole life.
@@ -100,6 +105,7 @@ pub(super) fn run(
         layer_supervisor: None,
         app_supervisor: None,
         last_layer_fault: None,
+        cycle: None,
         started: Some(started),
         ended,
         tell_when_running: Vec::new(),
@@ -137,11 +143,20 @@ fn layers(stores: &Arc<Stores>, deadline: Duration) -> Vec<ChildSpec> {
         launch,
     };
     vec![
-        child("LNCL", Place::IO, lncl::launch(stores.clone())),
-        child("sync manager", "sync", sync::launch(stores.clone())),
-        child("GNCL", Place::IO, gncl::launch(stores.clone())),
-        child("NDL", "ndl", ndl::launch(stores.clone())),
+        child("LNCL", Place::IO, layer(stores, lncl::Lncl::new)),
+        child("sync manager", "sync", layer(stores, sync::SyncManager::new)),
+        child("GNCL", Place::IO, layer(stores, gncl::Gncl::new)),
+        child("NDL", "ndl", layer(stores, ndl::Ndl::new)),
     ]
+}
+
+/// How a layer's actor is made, each time anew.
+fn layer<A>(stores: &Arc<Stores>, make: fn(Arc<Stores>, ReadyGate) -> A) -> Launch
+where
+    A: Actor<Context = Context<A>>,
+{
+    let stores = stores.clone();
+    Arc::new(move |ready| life(Context::new().into_future(make(stores.clone(), ready))))
 }
 
 fn tell(post: &Post<RootEvent>, event: RootEvent) {
@@ -154,6 +169,10 @@ impl StreamHandler<RootEvent> for Root {
     fn handle(&mut self, event: RootEvent, context: &mut Context<Self>) {
         match event {
             RootEvent::Release { app } => self.release(app),
+            RootEvent::RequirementCycle { names } => {
+                self.cycle = Some(names);
+                self.tell_if_running();
+            }
             RootEvent::Layers(fact) => self.layers_said(fact, context),
             RootEvent::Apps(fact) => self.apps_said(fact),
             RootEvent::HeedSignals => self.heed_signals(context),
@@ -292,10 +311,14 @@ impl Root {
 
     fn tell_if_running(&mut self) {
         let is_running = self.app_supervisor.is_some() && self.apps.iter().all(|app| app.running);
-        if is_running {
+        if is_running || self.cycle.is_some() {
             for say in self.tell_when_running.drain(..) {
+                let answer = match &self.cycle {
+                    Some(names) if !is_running => Err(StartError::Cycle(names.clone())),
+                    Some(_) | None => Ok(()),
+                };
                 // Who asked may have stopped waiting.
-                let _ = say.try_send(());
+                let _ = say.try_send(answer);
             }
         }
     }
