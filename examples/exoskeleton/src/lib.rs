@@ -22,4 +22,5 @@ pub mod plant;
 pub mod plot;
 pub mod record;
 pub mod report;
+pub mod run_folder;
 pub mod sensor;

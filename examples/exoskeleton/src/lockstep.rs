@@ -67,7 +67,9 @@ pub enum LockStepError {
     #[error(transparent)]
     Intention(#[from] IntentionError),
     /// A stride is killed that is not walked.
-    #[error("--kill {kill} lies beyond the {strides} strides of the run; use an earlier stride or more strides")]
+    #[error(
+        "--kill {kill} lies beyond the {strides} strides of the run; use an earlier stride or more strides"
+    )]
     KillBeyondRun {
         /// The kill asked for.
         kill: Kill,
@@ -75,7 +77,9 @@ pub enum LockStepError {
         strides: u32,
     },
     /// The run did not reach its last stride in the time it could need.
-    #[error("the run did not finish within {limit_s} s of virtual time; the nodes never became ready together")]
+    #[error(
+        "the run did not finish within {limit_s} s of virtual time; the nodes never became ready together"
+    )]
     NotFinished {
         /// Time limit, seconds.
         limit_s: u64,

@@ -84,7 +84,8 @@ impl Metrics {
             strides_counted,
             rms_deg: rms(&|row, i| row.joints[i].angle_rad - reference_rad(i, row.phase_estimated)),
             rms_intended_deg: rms(&|row, i| row.joints[i].angle_rad - row.joints[i].intended_rad),
-            phase_rms_percent: mean(counted.iter().map(|r| phase_error(r).powi(2)).sum(), counted.len()).sqrt(),
+            phase_rms_percent: mean(counted.iter().map(|r| phase_error(r).powi(2)).sum(), counted.len())
+                .sqrt(),
             phase_max_percent: counted.iter().map(|r| phase_error(r).abs()).fold(0.0, f64::max),
             work_positive_j_per_stride: per_stride(sum(&|r, i| power(r, i).max(0.0) * ROW_S)),
             work_negative_j_per_stride: per_stride(sum(&|r, i| power(r, i).min(0.0) * ROW_S)),
@@ -180,8 +181,9 @@ fn fault_figures(record: &Record, outage: Outage) -> FaultFigures {
         })
     };
     let safe_s = after.iter().find(|r| damped(r)).map(|r| r.t_s);
-    let resumed_s =
-        outage.to_s.and_then(|to_s| after.iter().find(|r| r.t_s >= to_s && r.mode == Some(GaitMode::Walk)).map(|r| r.t_s));
+    let resumed_s = outage.to_s.and_then(|to_s| {
+        after.iter().find(|r| r.t_s >= to_s && r.mode == Some(GaitMode::Walk)).map(|r| r.t_s)
+    });
     let away: Vec<&&Row> = after.iter().take_while(|r| resumed_s.is_none_or(|s| r.t_s < s)).collect();
     FaultFigures {
         outage,

@@ -88,9 +88,10 @@ impl Record {
 }
 
 fn header() -> Vec<String> {
-    let mut names: Vec<String> = ["time_s", "strides_true", "phase_true", "phase_estimated", "confidence", "mode"]
-        .map(str::to_owned)
-        .to_vec();
+    let mut names: Vec<String> =
+        ["time_s", "strides_true", "phase_true", "phase_estimated", "confidence", "mode"]
+            .map(str::to_owned)
+            .to_vec();
     for joint in Joint::ALL {
         for column in ["deg", "deg_s", "intended_deg", "commanded_nm", "applied_nm", "state"] {
             names.push(format!("{joint}_{column}"));

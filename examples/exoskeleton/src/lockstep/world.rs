@@ -100,7 +100,9 @@ impl<'a> World<'a> {
         let Some(kill) = self.config.kill else { return };
         let now_s = self.now_s();
         match self.record.outage {
-            None if self.strides_walked() >= f64::from(kill.stride - 1) && self.record.released_s.is_some() => {
+            None if self.strides_walked() >= f64::from(kill.stride - 1)
+                && self.record.released_s.is_some() =>
+            {
                 self.record.outage = Some(Outage { part: kill.part, from_s: now_s, to_s: None });
                 match kill.part {
                     Part::Central => (self.central, self.last_gait) = (None, None),
@@ -123,7 +125,8 @@ impl<'a> World<'a> {
     /// A new life of central with a new epoch, released again at once: the run resumes by itself.
     fn next_central(&mut self) -> CentralCore {
         self.central_epoch += 1;
-        let mut central = CentralCore::new(CentralConfig { epoch: self.central_epoch, ..self.config.central });
+        let mut central =
+            CentralCore::new(CentralConfig { epoch: self.central_epoch, ..self.config.central });
         central.release();
         central
     }

@@ -12,7 +12,9 @@ use super::{PhaseEstimate, wrapped};
 /// Numbers of the hand-over.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HandOverConfig {
-    /// The oscillator.
+    /// The oscillator. Default: frequency gain 1 and strike gain 0.3 instead of 2 and 0.5. The gains of the domain
+    /// notes were found on a recording; in the closed loop these gave less phase error and less work in the worst
+    /// of 40 seeds (2.3 instead of 2.4 %, 14.9 instead of 15.9 J per stride).
     pub oscillator: OscillatorGains,
     /// Stride duration the clock believes in until it has seen some, seconds.
     pub stride_s: f64,
@@ -29,7 +31,7 @@ pub struct HandOverConfig {
 impl Default for HandOverConfig {
     fn default() -> Self {
         Self {
-            oscillator: OscillatorGains::default(),
+            oscillator: OscillatorGains { frequency: 1.0, strike: 0.3, ..OscillatorGains::default() },
             stride_s: 1.3,
             take_error_max: 0.04,
             lose_error_min: 0.08,
@@ -77,7 +79,9 @@ impl HandOver {
         PhaseEstimate {
             phase: (clock.phase + self.share * wrapped(oscillator.phase - clock.phase)).rem_euclid(1.0),
             rate_hz: blend(clock.rate_hz, oscillator.rate_hz),
-            strike_error: clock.strike_error.map(|error| blend(error, oscillator.strike_error.unwrap_or(error))),
+            strike_error: clock
+                .strike_error
+                .map(|error| blend(error, oscillator.strike_error.unwrap_or(error))),
         }
     }
 
@@ -89,7 +93,8 @@ impl HandOver {
 
     fn judge(&mut self, error: f64) {
         let leads = self.strikes_right >= self.config.strikes_right;
-        let right = if leads { error < self.config.lose_error_min } else { error <= self.config.take_error_max };
+        let right =
+            if leads { error < self.config.lose_error_min } else { error <= self.config.take_error_max };
         self.strikes_right = if right { self.strikes_right.saturating_add(1) } else { 0 };
     }
 }

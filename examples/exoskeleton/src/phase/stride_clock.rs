@@ -38,11 +38,7 @@ impl StrideClock {
         }
         let mean_s = self.mean_s();
         self.phase = self.strikes.since_strike_s().map_or(0.0, |s| (s / mean_s).min(1.0));
-        PhaseEstimate {
-            phase: self.phase.rem_euclid(1.0),
-            rate_hz: 1.0 / mean_s,
-            strike_error,
-        }
+        PhaseEstimate { phase: self.phase.rem_euclid(1.0), rate_hz: 1.0 / mean_s, strike_error }
     }
 
     fn mean_s(&self) -> f64 {

@@ -12,8 +12,9 @@ const PHASE_RMS_MAX_PERCENT: f64 = 3.0;
 const WORK_POSITIVE_J: (f64, f64) = (10.0, 16.0);
 const SATURATION_MAX_PERCENT: f64 = 1.0;
 const READY_SKEW_MAX_MS: f64 = 50.0;
-/// The rate limiter's 2000 Nm/s, with room for rounding only.
-const TORQUE_RATE_MAX_NM_S: f64 = 2000.0 + 1e-6;
+const TORQUE_RATE_MAX_NM_S: f64 = 2000.0;
+/// Share by which a limit may be passed: differences of floating-point numbers, nothing else. Zero stays zero.
+const ROUNDING: f64 = 1e-9;
 const STRIDES_COUNTED_MIN: f64 = 1.0;
 /// Loss noticed within 200 ms and all drives damping within 50 ms more.
 const ALL_SAFE_MAX_MS: f64 = 250.0;
@@ -69,9 +70,12 @@ pub(super) fn check(metrics: &Metrics, killed: bool) -> Vec<LimitCheck> {
 }
 
 fn at_most(name: &str, limit: f64, seen: Option<f64>) -> LimitCheck {
-    let expected = if limit == 0.0 { "exactly 0".to_owned() } else { format!("<= {}", limit.round()) };
-    let expected = if limit.fract() > 1e-3 { format!("<= {limit}") } else { expected };
-    LimitCheck { name: name.to_owned(), expected, seen, held: seen.is_some_and(|seen| seen <= limit) }
+    LimitCheck {
+        name: name.to_owned(),
+        expected: if limit == 0.0 { "exactly 0".to_owned() } else { format!("<= {limit}") },
+        seen,
+        held: seen.is_some_and(|seen| seen <= limit * (1.0 + ROUNDING)),
+    }
 }
 
 fn at_least(name: &str, limit: f64, seen: Option<f64>) -> LimitCheck {

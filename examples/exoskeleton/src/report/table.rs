@@ -21,7 +21,7 @@ fn write_table(out: &mut String, report: &Report) -> std::fmt::Result {
     };
     writeln!(out, "{} strides, {source}, seed {} ({mode})", report.strides, report.seed)?;
     writeln!(out, "{:-<72}", "")?;
-    writeln!(out, "{:32} {:>16} {:>14}  {}", "limit", "expected", "seen", "held")?;
+    writeln!(out, "{:32} {:>16} {:>14}  held", "limit", "expected", "seen")?;
     for limit in &report.limits {
         let seen = limit.seen.map_or_else(|| "never".to_owned(), |seen| format!("{seen:.3}"));
         let held = if limit.held { "yes" } else { "NO" };
