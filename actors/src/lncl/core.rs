@@ -1,0 +1,502 @@
+//! Who is registered on this node. Pure: no socket, no clock.
+
+use std::{collections::BTreeMap, fmt};
+
+use sinew_runtime::{tid::AppAddress, wire::Kind};
+
+use super::AppFact;
+
+/// Longest name in bytes.
+pub(crate) const NAME_MAX: usize = 63;
+/// Names that one application may require, and payload types that it may name, at most.
+pub(crate) const NAMES_MAX: usize = 256;
+/// Addresses of one client process at most.
+pub(crate) const PER_PROCESS_MAX: usize = 256;
+
+/// One connection of another process; never used again in a node's life.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct ClientId(pub(crate) u64);
+
+/// Whom a registration belongs to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Owner {
+    /// The node's own process.
+    Node,
+    /// A connection of the process `pid`.
+    Client { id: ClientId, pid: i32 },
+}
+
+impl fmt::Display for Owner {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Node => f.write_str("the node's own process"),
+            Self::Client { pid, .. } => write!(f, "process {pid}"),
+        }
+    }
+}
+
+/// Which address is asked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Address {
+    /// This one, out of the fixed range.
+    Fixed(AppAddress),
+    /// Any free one of the dynamic range.
+    Dynamic,
+}
+
+/// What an application asks for when it registers.
+#[derive(Clone, Debug)]
+pub(crate) struct Request {
+    /// The address that it wants.
+    pub(crate) address: Address,
+    /// Its name, unique on the node.
+    pub(crate) name: Option<String>,
+    /// The names that it requires.
+    pub(crate) requires: Vec<String>,
+    /// Names of the payload types that it sends or handles, as far as it tells.
+    pub(crate) kinds: Vec<String>,
+    /// Whom it belongs to.
+    pub(crate) owner: Owner,
+}
+
+/// Why an application was not registered. Nothing changed.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum RegisterError {
+    /// The caller's name is empty, too long or has control characters in it.
+    #[error("the name {0:?} cannot be used: 1 to 63 bytes without control characters are allowed")]
+    BadName(String),
+    /// Another application of the node has this name.
+    #[error(
+        "the name '{name}' is taken by application {holder} of {owner}; choose another name or end that one first"
+    )]
+    NameTaken {
+        /// The name.
+        name: String,
+        /// Who has it.
+        holder: AppAddress,
+        /// The process that it is in, in words.
+        owner: String,
+    },
+    /// The address is not one that users may choose.
+    #[error("address {0} is not one to choose: fixed addresses are 1000 to 7fffffff, hexadecimal")]
+    NotFixed(AppAddress),
+    /// Another application of the node has this address.
+    #[error(
+        "address {address} is taken by {holder} of {owner}; choose another address or end that one first"
+    )]
+    AddressTaken {
+        /// The address.
+        address: AppAddress,
+        /// The name of its holder, in words.
+        holder: String,
+        /// The process that it is in, in words.
+        owner: String,
+    },
+    /// The node has as many applications as its configuration allows.
+    #[error("the node has {limit} applications, which is its limit; raise `lncl.apps_max`")]
+    NodeFull {
+        /// The limit in force.
+        limit: usize,
+    },
+    /// The process has as many addresses as one process may have.
+    #[error("process {pid} has {limit} addresses, which is the limit for one process; unregister some")]
+    ProcessFull {
+        /// The process.
+        pid: i32,
+        /// The limit.
+        limit: usize,
+    },
+    /// A list in the request is longer than the limit.
+    #[error("{found} {what} are more than the {limit} that one application may name")]
+    TooMany {
+        /// Which list, in words.
+        what: &'static str,
+        /// Its length.
+        found: usize,
+        /// The limit.
+        limit: usize,
+    },
+    /// Two names of payload types have the same id on the wire.
+    #[error("payload type '{name}' has the same id {kind} as '{other}', already in use; rename one of them")]
+    KindCollision {
+        /// The newcomer.
+        name: String,
+        /// Whom it collides with.
+        other: String,
+        /// The id that they share.
+        kind: Kind,
+    },
+}
+
+#[derive(Debug)]
+struct Entry {
+    name: Option<String>,
+    requires: Vec<String>,
+    owner: Owner,
+    ready: bool,
+}
+
+/// Who is registered on this node. It outlives LNCL's actor.
+#[derive(Debug, Default)]
+pub(crate) struct Registry {
+    apps: BTreeMap<AppAddress, Entry>,
+    names: BTreeMap<String, AppAddress>,
+    /// Kept when an application goes: an id must not change its meaning in a node's life. See [`Registry::claim_kinds`]
+    /// for the bound.
+    kinds: BTreeMap<Kind, String>,
+    next_dynamic: u32,
+    next_client: u64,
+}
+
+impl Registry {
+    /// Registers an application on a node that takes at most `apps_max`.
+    ///
+    /// # Errors
+    /// Why not; nothing changed.
+    pub(crate) fn register(
+        &mut self,
+        request: Request,
+        apps_max: usize,
+    ) -> Result<AppAddress, RegisterError> {
+        check_lists(&request)?;
+        self.check_room(request.owner, apps_max)?;
+        self.check_name(request.name.as_deref())?;
+        let kinds = self.check_kinds(&request.kinds)?;
+        let app = match request.address {
+            Address::Fixed(app) => self.free_fixed(app)?,
+            Address::Dynamic => self.free_dynamic(),
+        };
+        self.claim_kinds(kinds, apps_max);
+        if let Some(name) = &request.name {
+            self.names.insert(name.clone(), app);
+        }
+        let Request { name, requires, owner, .. } = request;
+        self.apps.insert(app, Entry { name, requires, owner, ready: false });
+        Ok(app)
+    }
+
+    /// Removes an application. Returns whether it was there.
+    pub(crate) fn unregister(&mut self, app: AppAddress) -> bool {
+        let Some(entry) = self.apps.remove(&app) else { return false };
+        if let Some(name) = entry.name {
+            self.names.remove(&name);
+        }
+        true
+    }
+
+    /// Removes all that belongs to `owner`, and says what that was.
+    pub(crate) fn remove_owner(&mut self, owner: Owner) -> Vec<AppAddress> {
+        let owned = self.owned_by(|other| other == owner);
+        for app in &owned {
+            self.unregister(*app);
+        }
+        owned
+    }
+
+    /// The applications in other processes.
+    pub(crate) fn in_other_processes(&self) -> Vec<AppAddress> {
+        self.owned_by(|owner| owner != Owner::Node)
+    }
+
+    /// An identity for a new connection.
+    pub(crate) fn new_client(&mut self) -> ClientId {
+        self.next_client += 1;
+        ClientId(self.next_client)
+    }
+
+    /// Notes whether `app` takes messages. Returns whether that is news.
+    pub(crate) fn set_ready(&mut self, app: AppAddress, ready: bool) -> bool {
+        self.apps.get_mut(&app).is_some_and(|entry| std::mem::replace(&mut entry.ready, ready) != ready)
+    }
+
+    /// The application called `name`.
+    pub(crate) fn resolve(&self, name: &str) -> Option<AppAddress> {
+        self.names.get(name).copied()
+    }
+
+    /// The name of `app`, or its address where it has none.
+    pub(crate) fn name_of(&self, app: AppAddress) -> String {
+        let name = self.apps.get(&app).and_then(|entry| entry.name.clone());
+        name.unwrap_or_else(|| app.to_string())
+    }
+
+    /// Whether `app` is in another process.
+    pub(crate) fn is_client(&self, app: AppAddress) -> bool {
+        self.apps.get(&app).is_some_and(|entry| entry.owner != Owner::Node)
+    }
+
+    /// How many applications there are.
+    pub(crate) fn len(&self) -> usize {
+        self.apps.len()
+    }
+
+    /// Everything that a sync manager started anew must be told, in the order of the addresses.
+    pub(crate) fn facts(&self) -> Vec<AppFact> {
+        let mut facts = Vec::new();
+        for (app, entry) in &self.apps {
+            let (name, requires) = (entry.name.clone(), entry.requires.clone());
+            facts.push(AppFact::Registered { app: *app, name, requires });
+            if entry.ready {
+                facts.push(AppFact::Ready { app: *app });
+            }
+        }
+        facts
+    }
+
+    fn owned_by(&self, is_owner: impl Fn(Owner) -> bool) -> Vec<AppAddress> {
+        self.apps.iter().filter(|(_, entry)| is_owner(entry.owner)).map(|(app, _)| *app).collect()
+    }
+
+    fn check_room(&self, owner: Owner, apps_max: usize) -> Result<(), RegisterError> {
+        if self.apps.len() >= apps_max {
+            return Err(RegisterError::NodeFull { limit: apps_max });
+        }
+        let Owner::Client { pid, .. } = owner else { return Ok(()) };
+        let held = self.owned_by(|other| matches!(other, Owner::Client { pid: theirs, .. } if theirs == pid));
+        if held.len() >= PER_PROCESS_MAX {
+            return Err(RegisterError::ProcessFull { pid, limit: PER_PROCESS_MAX });
+        }
+        Ok(())
+    }
+
+    fn check_name(&self, name: Option<&str>) -> Result<(), RegisterError> {
+        let Some(name) = name else { return Ok(()) };
+        check_spelling(name)?;
+        let Some(holder) = self.names.get(name) else { return Ok(()) };
+        let owner = self.owner_in_words(*holder);
+        Err(RegisterError::NameTaken { name: name.to_owned(), holder: *holder, owner })
+    }
+
+    /// The ids of `names`, none of which means anything else.
+    fn check_kinds(&self, names: &[String]) -> Result<BTreeMap<Kind, String>, RegisterError> {
+        let mut claimed = BTreeMap::new();
+        for name in names {
+            let kind = Kind::named(name);
+            let other = self.kinds.get(&kind).or_else(|| claimed.get(&kind));
+            if let Some(other) = other.filter(|other| *other != name) {
+                return Err(RegisterError::KindCollision { name: name.clone(), other: other.clone(), kind });
+            }
+            claimed.insert(kind, name.clone());
+        }
+        Ok(claimed)
+    }
+
+    /// Remembers what these ids mean, up to 16 for each application that the node may have; names past that bound
+    /// are not watched for collisions.
+    fn claim_kinds(&mut self, kinds: BTreeMap<Kind, String>, apps_max: usize) {
+        let bound = apps_max.saturating_mul(16);
+        for (kind, name) in kinds {
+            if self.kinds.len() >= bound {
+                return;
+            }
+            self.kinds.insert(kind, name);
+        }
+    }
+
+    fn free_fixed(&self, app: AppAddress) -> Result<AppAddress, RegisterError> {
+        if !app.is_fixed() {
+            return Err(RegisterError::NotFixed(app));
+        }
+        let Some(entry) = self.apps.get(&app) else { return Ok(app) };
+        let holder =
+            entry.name.as_ref().map_or("an application without a name".to_owned(), |n| format!("'{n}'"));
+        Err(RegisterError::AddressTaken { address: app, holder, owner: entry.owner.to_string() })
+    }
+
+    /// The next free address, round the whole range: one that was given back is not given out again soon, so that a
+    /// late message for its former holder finds nobody and not somebody else.
+    fn free_dynamic(&mut self) -> AppAddress {
+        loop {
+            let index = self.next_dynamic;
+            let Some(app) = AppAddress::dynamic(index) else {
+                self.next_dynamic = 0;
+                continue;
+            };
+            self.next_dynamic += 1;
+            if !self.apps.contains_key(&app) {
+                return app;
+            }
+            // Ends: there are 1.8 billion dynamic addresses, and `apps_max` is far below.
+        }
+    }
+
+    fn owner_in_words(&self, app: AppAddress) -> String {
+        self.apps.get(&app).map_or_else(String::new, |entry| entry.owner.to_string())
+    }
+}
+
+fn check_spelling(name: &str) -> Result<(), RegisterError> {
+    if name.is_empty() || name.len() > NAME_MAX || name.chars().any(char::is_control) {
+        // The name itself may be long; what is told of it is not.
+        return Err(RegisterError::BadName(name.chars().take(NAME_MAX).collect()));
+    }
+    Ok(())
+}
+
+fn check_lists(request: &Request) -> Result<(), RegisterError> {
+    for (what, list) in [("required names", &request.requires), ("payload types", &request.kinds)] {
+        if list.len() > NAMES_MAX {
+            return Err(RegisterError::TooMany { what, found: list.len(), limit: NAMES_MAX });
+        }
+        list.iter().try_for_each(|name| check_spelling(name))?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn request(address: Address, name: Option<&str>) -> Request {
+        let name = name.map(str::to_owned);
+        Request { address, name, requires: Vec::new(), kinds: Vec::new(), owner: Owner::Node }
+    }
+
+    fn client(id: u64, pid: i32) -> Owner {
+        Owner::Client { id: ClientId(id), pid }
+    }
+
+    fn fixed(index: u32) -> Address {
+        Address::Fixed(AppAddress::fixed(index).unwrap())
+    }
+
+    #[test]
+    fn a_taken_name_is_refused_and_its_holder_named() {
+        let mut registry = Registry::default();
+        registry.register(request(fixed(1), Some("knee.sensor")), 9).unwrap();
+        let refusal = registry.register(request(Address::Dynamic, Some("knee.sensor")), 9).unwrap_err();
+        assert_eq!(
+            refusal.to_string(),
+            "the name 'knee.sensor' is taken by application 1001 of the node's own process; choose another name or \
+             end that one first"
+        );
+    }
+
+    #[test]
+    fn a_fixed_address_must_be_in_its_range_and_free() {
+        let mut registry = Registry::default();
+        for wrong in [AppAddress::NDL, AppAddress::NONE, AppAddress::dynamic(0).unwrap(), AppAddress::ALL] {
+            let refusal = registry.register(request(Address::Fixed(wrong), None), 9);
+            assert_eq!(refusal, Err(RegisterError::NotFixed(wrong)));
+        }
+        registry.register(request(fixed(1), None), 9).unwrap();
+        let refusal = registry.register(request(fixed(1), None), 9);
+        assert!(matches!(refusal, Err(RegisterError::AddressTaken { .. })));
+    }
+
+    #[test]
+    fn names_that_nobody_could_read_are_refused() {
+        for name in ["", "line\nbreak", &"x".repeat(64)] {
+            let refusal = Registry::default().register(request(Address::Dynamic, Some(name)), 9);
+            assert!(matches!(refusal, Err(RegisterError::BadName(_))), "{name:?}");
+        }
+    }
+
+    #[test]
+    fn an_address_that_was_given_back_is_not_given_out_at_once() {
+        let mut registry = Registry::default();
+        let first = registry.register(request(Address::Dynamic, None), 9).unwrap();
+        registry.unregister(first);
+        assert_ne!(registry.register(request(Address::Dynamic, None), 9), Ok(first));
+    }
+
+    #[test]
+    fn dynamic_addresses_go_round_their_range() {
+        let mut registry = Registry { next_dynamic: 0x6fff_ffff, ..Registry::default() };
+        let last = registry.register(request(Address::Dynamic, None), 9).unwrap();
+        let first = registry.register(request(Address::Dynamic, None), 9).unwrap();
+        assert_eq!((last.bits(), first.bits()), (0xefff_ffff, 0x8000_0000));
+    }
+
+    #[test]
+    fn a_node_and_a_process_have_their_limits() {
+        let mut registry = Registry::default();
+        for _ in 0..PER_PROCESS_MAX {
+            let owner = Owner::Client { id: registry.new_client(), pid: 7 };
+            registry.register(Request { owner, ..request(Address::Dynamic, None) }, 1_000).unwrap();
+        }
+        let one_more = Request { owner: client(999, 7), ..request(Address::Dynamic, None) };
+        let refusal = registry.register(one_more.clone(), 1_000);
+        assert_eq!(refusal, Err(RegisterError::ProcessFull { pid: 7, limit: PER_PROCESS_MAX }));
+        let refusal = registry.register(Request { owner: client(999, 8), ..one_more }, PER_PROCESS_MAX);
+        assert_eq!(refusal, Err(RegisterError::NodeFull { limit: PER_PROCESS_MAX }));
+    }
+
+    /// "costarring" and "liquid" share their 32-bit FNV-1a, the best known pair of words that does.
+    #[test]
+    fn two_payload_names_with_one_id_are_refused() {
+        assert_eq!(Kind::named("costarring"), Kind::named("liquid"));
+        let with = |kind: &str| Request { kinds: vec![kind.to_owned()], ..request(Address::Dynamic, None) };
+        let mut registry = Registry::default();
+        registry.register(with("liquid"), 9).unwrap();
+        registry.register(with("liquid"), 9).unwrap();
+        let refusal = registry.register(with("costarring"), 9);
+        assert!(matches!(refusal, Err(RegisterError::KindCollision { .. })));
+    }
+
+    #[test]
+    fn a_sync_manager_started_anew_is_told_everything() {
+        let mut registry = Registry::default();
+        let app = registry.register(request(fixed(1), Some("hip")), 9).unwrap();
+        assert!(registry.set_ready(app, true));
+        assert!(!registry.set_ready(app, true), "no news");
+        let (name, requires) = (Some("hip".to_owned()), Vec::new());
+        assert_eq!(registry.facts(), [AppFact::Registered { app, name, requires }, AppFact::Ready { app }]);
+    }
+
+    #[derive(Clone, Debug)]
+    enum Step {
+        Register { fixed: Option<u32>, name: Option<u8>, owner: u64 },
+        Unregister(u32),
+        ClientGone(u64),
+    }
+
+    fn any_step() -> impl Strategy<Value = Step> {
+        prop_oneof![
+            (proptest::option::of(0u32..6), proptest::option::of(0u8..6), 0u64..4)
+                .prop_map(|(fixed, name, owner)| Step::Register { fixed, name, owner }),
+            (0u32..6).prop_map(Step::Unregister),
+            (1u64..4).prop_map(Step::ClientGone),
+        ]
+    }
+
+    fn owner_of(number: u64) -> Owner {
+        if number == 0 { Owner::Node } else { client(number, number as i32) }
+    }
+
+    proptest! {
+        #[test]
+        fn names_and_addresses_have_one_holder_through_any_history(
+            steps in proptest::collection::vec(any_step(), 0..60),
+        ) {
+            let mut registry = Registry::default();
+            for step in steps {
+                match step {
+                    Step::Register { fixed: index, name, owner } => {
+                        let before = registry.len();
+                        let address = index.map_or(Address::Dynamic, fixed);
+                        let name = name.map(|n| n.to_string());
+                        let asked = Request { owner: owner_of(owner), ..request(address, name.as_deref()) };
+                        let grown = usize::from(registry.register(asked, 10).is_ok());
+                        prop_assert_eq!(registry.len(), before + grown);
+                    }
+                    Step::Unregister(index) => {
+                        registry.unregister(AppAddress::fixed(index).unwrap());
+                    }
+                    Step::ClientGone(number) => {
+                        registry.remove_owner(owner_of(number));
+                        prop_assert!(registry.owned_by(|owner| owner == owner_of(number)).is_empty());
+                    }
+                }
+                prop_assert!(registry.len() <= 10);
+                let named: Vec<_> = registry.apps.values().filter_map(|entry| entry.name.clone()).collect();
+                prop_assert_eq!(named.len(), registry.names.len());
+                for (name, app) in &registry.names {
+                    prop_assert_eq!(registry.apps[app].name.as_ref(), Some(name));
+                }
+            }
+        }
+    }
+}

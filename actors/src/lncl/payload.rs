@@ -1,0 +1,93 @@
+//! What LNCL and its clients say to each other; byte by byte in `docs/protocol/lncl.md`.
+
+use bytes::Bytes;
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
+use sinew_runtime::{
+    tid::{AppAddress, NodeAddress, Tid},
+    wire::{Header, Kind, Message},
+};
+
+/// Longest payload of a connection's first frame, in bytes: enough for the longest lists that are allowed.
+pub(crate) const REGISTER_BYTES_MAX: usize = 48 * 1024;
+
+/// A process asks for a transport address.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Register {
+    /// Name of the application.
+    #[serde(default)]
+    pub(crate) name: Option<String>,
+    /// The fixed address that it wants; none = a dynamic one.
+    #[serde(default)]
+    pub(crate) address: Option<AppAddress>,
+    /// The names that it requires.
+    #[serde(default)]
+    pub(crate) requires: Vec<String>,
+    /// The layers' events that it wants.
+    #[serde(default)]
+    pub(crate) events: Vec<Kind>,
+    /// Names of the payload types that it sends or handles, so that a collision of their ids is found.
+    #[serde(default)]
+    pub(crate) kinds: Vec<String>,
+    /// Process id as the client sees it; for people. The node believes the kernel's.
+    #[serde(default)]
+    pub(crate) pid: u32,
+}
+
+/// The address that a process got.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Registered {
+    /// Address of the node.
+    pub(crate) node: NodeAddress,
+    /// Address of the application.
+    pub(crate) app: AppAddress,
+    /// Name of the node.
+    pub(crate) node_name: String,
+    /// Longest payload that the node takes and sends, in bytes.
+    pub(crate) payload_max: u32,
+}
+
+/// Why a registration was refused or a connection ends.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Refusal {
+    /// For people.
+    pub(crate) sentence: String,
+}
+
+/// Joins or leaves a group.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Group {
+    /// The group's address.
+    pub(crate) group: AppAddress,
+    /// Whether to be a member from now on.
+    pub(crate) member: bool,
+}
+
+/// Asks for the TID of a name.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Resolve {
+    /// The name.
+    pub(crate) name: String,
+}
+
+/// The TID of a name.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Resolved {
+    /// Its 64 bits; none = nobody has the name.
+    pub(crate) tid: Option<u64>,
+}
+
+/// The TID of the LNCL of `node`.
+pub(crate) const fn lncl_of(node: NodeAddress) -> Tid {
+    Tid::new(node, AppAddress::LNCL)
+}
+
+/// The frame of a layer's payload.
+pub(crate) fn frame<P: Serialize>(kind: Kind, source: Tid, destination: Tid, payload: &P) -> Message {
+    let bytes = rmp_serde::to_vec_named(payload).expect("these types have no map with equal keys");
+    Message::new(Header::new(kind, source, destination), bytes.into())
+}
+
+/// Reads a layer's payload.
+pub(crate) fn read<P: DeserializeOwned>(payload: &Bytes) -> Result<P, rmp_serde::decode::Error> {
+    rmp_serde::from_slice(payload)
+}
