@@ -64,7 +64,7 @@ impl Stores {
             gncl_listen: OnceLock::new(),
             gncl: gncl::Store::default(),
             registry: Mutex::default(),
-            sync: Mutex::default(),
+            sync: Mutex::new(sync::Core::new(&config, node, incarnation)),
             config,
         })
     }
