@@ -1,4 +1,4 @@
-//! What was refused from outside: counted for each cause, logged once a second at most.
+//! What was refused, counted for each cause, and logged at most once a second for each.
 
 use std::{
     collections::BTreeMap,
@@ -9,44 +9,45 @@ use std::{
 
 use sinew_runtime::time::Time;
 
-/// Time between two log lines of one cause.
+/// A peer that sends rubbish at line rate costs one log line a second, not a full disk.
 const LOG_PERIOD: Duration = Duration::from_secs(1);
 
-/// Counts refusals by cause. Its memory is bounded by the number of causes in the program's text.
+/// Counters of refusals. The causes are literals of this program, so their number is bounded.
 #[derive(Debug, Default)]
 pub(crate) struct Refusals(Mutex<BTreeMap<&'static str, Cause>>);
 
 #[derive(Debug, Default)]
 struct Cause {
     count: u64,
-    suppressed: u64,
     logged: Option<Time>,
+    suppressed: u64,
 }
 
 impl Refusals {
-    /// Counts one refusal for `cause` and logs it, unless the last line of this cause is less than a second old.
+    /// Counts one refusal because of `cause`, and logs it with its `detail` unless that cause was logged within the
+    /// last second.
     pub(crate) fn count(&self, now: Time, cause: &'static str, detail: &dyn Display) {
         let mut causes = self.causes();
         let entry = causes.entry(cause).or_default();
         entry.count += 1;
-        if entry.logged.is_some_and(|last| now.since(last) < LOG_PERIOD) {
+        if entry.logged.is_some_and(|logged| now.since(logged) < LOG_PERIOD) {
             entry.suppressed += 1;
             return;
         }
         entry.logged = Some(now);
         let suppressed = std::mem::take(&mut entry.suppressed);
-        // Logged outside the lock: a slow terminal must not hold up who refuses next.
+        // Whoever reads the log may be slow: nobody waits for it with the lock in hand.
         drop(causes);
-        tracing::warn!(suppressed, "refused, {cause}: {detail}");
+        tracing::warn!(cause, suppressed, "refused: {detail}");
     }
 
-    /// How many refusals there were.
+    /// How much was refused.
     pub(crate) fn total(&self) -> u64 {
         self.causes().values().map(|cause| cause.count).sum()
     }
 
-    /// How many refusals there were for `cause`.
-    pub(crate) fn of(&self, cause: &str) -> u64 {
+    /// How much was refused because of `cause`.
+    pub(crate) fn of(&self, cause: &'static str) -> u64 {
         self.causes().get(cause).map_or(0, |cause| cause.count)
     }
 
@@ -60,12 +61,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_refusal_is_counted_even_when_its_log_line_is_not_written() {
+    fn every_refusal_is_counted_for_its_cause_and_one_a_second_is_logged() {
         let refusals = Refusals::default();
-        for _ in 0..3 {
-            refusals.count(Time::ZERO, "garbage", &"not a frame");
+        for millis in [0, 1, 999, 1_000] {
+            refusals.count(Time::ZERO + Duration::from_millis(millis), "garbage", &"noise");
         }
-        refusals.count(Time::ZERO, "forged source", &"1/2");
-        assert_eq!((refusals.of("garbage"), refusals.of("unheard of"), refusals.total()), (3, 0, 4));
+        refusals.count(Time::ZERO, "too long", &"a whale");
+        assert_eq!((refusals.of("garbage"), refusals.of("too long"), refusals.of("never")), (4, 1, 0));
+        assert_eq!(refusals.total(), 5);
+        let causes = refusals.causes();
+        assert_eq!(
+            (causes["garbage"].suppressed, causes["garbage"].logged),
+            (0, Some(Time::from_nanos(1_000_000_000)))
+        );
     }
 }

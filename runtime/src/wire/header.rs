@@ -85,6 +85,12 @@ impl Flags {
         Self(self.0 | other.0)
     }
 
+    /// These flags except those of `other`.
+    #[must_use]
+    pub const fn without(self, other: Self) -> Self {
+        Self(self.0 & !other.0)
+    }
+
     /// Whether all flags of `other` are set.
     #[must_use]
     pub const fn has(self, other: Self) -> bool {

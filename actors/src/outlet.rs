@@ -1,0 +1,192 @@
+//! The writing half of a connection, which any thread submits messages to.
+//!
+//! The sender's own thread writes to the socket when nothing is queued before it: handing a message over to another
+//! thread costs more than the network does. What the socket does not take goes to a bounded queue, and a drainer on
+//! the layer's thread goes on when the socket is writable again.
+//!
+//! ```text
+//!  submit ──── nothing waits ───────────────────────────► socket
+//!     └─ else ► queue (Control, Stream, Bulk) ► drainer ──►─┘
+//! ```
+//!
+//! All of it stands under one mutex. Receipts are never settled and nobody is woken with it in hand, because whoever
+//! is told may submit to this very outlet.
+
+mod class_queue;
+mod half;
+#[cfg(test)]
+mod tests;
+
+use std::{
+    future::poll_fn,
+    io::{self, IoSlice},
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    task::{Context, Poll},
+};
+
+use sinew_runtime::{
+    outcome::{Outcome, Rejection, Ticket},
+    router::{Outlet, Refused},
+    time::Time,
+    wire::Message,
+};
+use tokio::net::{TcpStream, UnixStream};
+
+use half::{After, Half};
+
+/// A non-blocking socket that can be written to from any thread.
+pub(crate) trait Socket: Send + Sync + 'static {
+    /// Writes what the socket takes at once, from the first byte of `parts` on.
+    ///
+    /// # Errors
+    /// [`io::ErrorKind::WouldBlock`] if it takes nothing now; anything else ends the connection.
+    fn try_write_vectored(&self, parts: &[IoSlice<'_>]) -> io::Result<usize>;
+
+    /// Ready when the socket may take something. For one task only: the drainer.
+    fn poll_writable(&self, cx: &mut Context<'_>) -> Poll<io::Result<()>>;
+}
+
+impl Socket for Arc<TcpStream> {
+    fn try_write_vectored(&self, parts: &[IoSlice<'_>]) -> io::Result<usize> {
+        TcpStream::try_write_vectored(self, parts)
+    }
+
+    fn poll_writable(&self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        self.poll_write_ready(cx)
+    }
+}
+
+impl Socket for Arc<UnixStream> {
+    fn try_write_vectored(&self, parts: &[IoSlice<'_>]) -> io::Result<usize> {
+        UnixStream::try_write_vectored(self, parts)
+    }
+
+    fn poll_writable(&self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        self.poll_write_ready(cx)
+    }
+}
+
+/// The bounds of an outlet.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct OutletLimits {
+    /// Messages that wait at most, each class by itself. When full: refused with [`Rejection::QueueFull`].
+    pub(crate) queue_capacity: usize,
+    /// Confirmed messages at most whose outcome is not known yet, waiting or sent. When full: refused likewise.
+    pub(crate) unconfirmed_max: usize,
+    /// Longest payload in bytes. Longer ones are refused with [`Rejection::TooLong`].
+    pub(crate) payload_max: usize,
+}
+
+/// What became of the messages that an outlet was given.
+///
+/// Nothing leaks: submitted = sent + superseded + expired + lost + refused + waiting.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct OutletCounts {
+    /// Written to a socket to their last byte.
+    pub(crate) sent: u64,
+    /// Stream messages whose place a newer one took.
+    pub(crate) superseded: u64,
+    /// Their time to live ran out before they were sent.
+    pub(crate) expired: u64,
+    /// They waited when the outlet was closed.
+    pub(crate) lost: u64,
+    /// Handed back to their sender.
+    pub(crate) refused: u64,
+}
+
+/// Which of an outlet's connections, one after the other, something is about.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct LinkNumber(u64);
+
+/// The writing half of a connection, and the messages that wait for it. It outlives the connection: while there is
+/// none, messages wait.
+pub(crate) struct StreamOutlet<S> {
+    half: Mutex<Half<S>>,
+}
+
+impl<S: Socket> StreamOutlet<S> {
+    /// An outlet without a connection.
+    pub(crate) fn new(limits: OutletLimits) -> Self {
+        Self { half: Mutex::new(Half::new(limits)) }
+    }
+
+    /// Writes to `socket` from now on: `preface` first, then all that waits. Needs a drainer: [`drain`](Self::drain).
+    ///
+    /// The peer takes payloads of `payload_max` bytes at most.
+    pub(crate) fn connect(&self, socket: S, payload_max: usize, preface: Option<Message>) -> LinkNumber {
+        self.with(|half, after| half.connect(socket, payload_max, preface, after))
+    }
+
+    /// The connection has ended. What was sent and not confirmed has the outcome [`Outcome::Unknown`]; what was not
+    /// sent waits for the next connection. Returns whether the last frame was written whole.
+    pub(crate) fn disconnect(&self, link: LinkNumber) -> bool {
+        self.with(|half, after| half.disconnect(link, after))
+    }
+
+    /// Like [`disconnect`](Self::disconnect), whichever connection it is.
+    pub(crate) fn cut(&self) {
+        self.with(|half, after| half.cut(after));
+    }
+
+    /// There will be no further connection: what waits has the outcome [`Outcome::PeerLost`], and what is submitted
+    /// from now on is refused because of `why`.
+    pub(crate) fn close(&self, why: Rejection) {
+        self.with(|half, after| half.close(why, after));
+    }
+
+    /// The process at the other end has ended, and nothing takes its place: what it had in hand has the outcome
+    /// `in_hand`; what waits, and what is submitted from now on, is refused because of `why`.
+    pub(crate) fn end(&self, in_hand: Outcome, why: Rejection) {
+        self.with(|half, after| half.end(in_hand, why, after));
+    }
+
+    /// Writes what waits whenever the socket takes it. Resolves when this connection cannot be written to any more,
+    /// with the reason. To be run by one task, on the thread whose reactor the socket belongs to.
+    pub(crate) async fn drain(&self, link: LinkNumber) -> io::Error {
+        poll_fn(|cx| self.with(|half, after| half.poll_drain(link, cx, after))).await
+    }
+
+    /// Settles what has expired by `now` while it waited.
+    pub(crate) fn expire(&self, now: Time) {
+        self.with(|half, after| half.expire(now, after));
+    }
+
+    /// The peer says what became of the message that `ticket` names. Returns whether that message was waited for.
+    pub(crate) fn confirm(&self, ticket: Ticket, outcome: Outcome) -> bool {
+        self.with(|half, after| half.confirm(ticket, outcome, after))
+    }
+
+    /// What became of the messages so far.
+    pub(crate) fn counts(&self) -> OutletCounts {
+        self.lock().counts()
+    }
+
+    /// Messages that wait to be sent.
+    pub(crate) fn waiting(&self) -> usize {
+        self.lock().waiting()
+    }
+
+    /// Confirmed messages whose outcome is not known yet.
+    pub(crate) fn unconfirmed(&self) -> usize {
+        self.lock().unconfirmed()
+    }
+
+    /// Runs `step` under the lock, and what it puts off after it.
+    fn with<R>(&self, step: impl FnOnce(&mut Half<S>, &mut After) -> R) -> R {
+        let mut after = After::default();
+        let result = step(&mut self.lock(), &mut after);
+        after.run();
+        result
+    }
+
+    /// No section under this lock can panic half way: all of them leave it whole.
+    fn lock(&self) -> MutexGuard<'_, Half<S>> {
+        self.half.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl<S: Socket> Outlet for StreamOutlet<S> {
+    fn submit(&self, message: Message) -> Result<(), Refused> {
+        self.with(|half, after| half.submit(message, after))
+    }
+}

@@ -1,0 +1,406 @@
+//! What stands under an outlet's mutex: the socket, the frame being written, and all that waits.
+
+use std::{
+    collections::VecDeque,
+    io::{self, IoSlice},
+    task::{Context, Poll, Waker},
+};
+
+use sinew_runtime::{
+    outcome::{Outcome, Receipt, Rejection, Ticket},
+    router::Refused,
+    time::Time,
+    wire::{Class, Flags, HEADER_LEN, Message},
+};
+
+use super::{LinkNumber, OutletCounts, OutletLimits, Socket, class_queue::ClassQueue};
+
+/// Frames that the drainer writes before other tasks of its thread have their turn.
+const WRITES_PER_WAKE: usize = 64;
+
+/// What is done when the lock is free again.
+#[derive(Default)]
+pub(super) struct After {
+    settle: Vec<(Receipt, Outcome)>,
+    wake: Option<Waker>,
+}
+
+impl After {
+    pub(super) fn run(self) {
+        for (receipt, outcome) in self.settle {
+            receipt.settle(outcome);
+        }
+        if let Some(waker) = self.wake {
+            waker.wake();
+        }
+    }
+}
+
+enum Link<S> {
+    Down,
+    Up(S),
+    /// A sender's write failed; the drainer takes the error to the layer.
+    Failed(io::Error),
+    Closed(Rejection),
+}
+
+/// A frame of which the socket has taken the first bytes.
+struct Partial {
+    message: Message,
+    head: [u8; HEADER_LEN],
+    written: usize,
+    /// Belongs to this one connection and to no sender.
+    is_preface: bool,
+}
+
+impl Partial {
+    fn new(message: Message) -> Self {
+        let head = message.header.encode(&message.payload);
+        Self { message, head, written: 0, is_preface: false }
+    }
+
+    /// Writes what the socket takes; returns whether that was all.
+    fn write_to(&mut self, socket: &impl Socket) -> io::Result<bool> {
+        let head = &self.head[self.written.min(HEADER_LEN)..];
+        let payload = &self.message.payload[self.written.saturating_sub(HEADER_LEN)..];
+        self.written += socket.try_write_vectored(&[IoSlice::new(head), IoSlice::new(payload)])?;
+        Ok(self.written == self.message.size())
+    }
+}
+
+/// How a write ended.
+enum Written {
+    Whole,
+    InPart,
+    Broken,
+}
+
+pub(super) struct Half<S> {
+    limits: OutletLimits,
+    payload_max: usize,
+    link: Link<S>,
+    number: u64,
+    partial: Option<Partial>,
+    /// The frame that was being written when the last connection ended. No peer can have handled it: it goes first.
+    interrupted: Option<Message>,
+    queue: ClassQueue,
+    /// Receipts of messages that wait.
+    waiting_receipts: usize,
+    /// No waiting message expires before this.
+    next_expiry: Time,
+    /// Receipts of messages that were sent, oldest first: outcomes come back in about this order.
+    sent_receipts: VecDeque<Receipt>,
+    drainer: Option<Waker>,
+    counts: OutletCounts,
+}
+
+impl<S: Socket> Half<S> {
+    pub(super) fn new(limits: OutletLimits) -> Self {
+        Self {
+            limits,
+            payload_max: limits.payload_max,
+            link: Link::Down,
+            number: 0,
+            partial: None,
+            interrupted: None,
+            queue: ClassQueue::new(limits.queue_capacity),
+            waiting_receipts: 0,
+            next_expiry: Time::MAX,
+            sent_receipts: VecDeque::new(),
+            drainer: None,
+            counts: OutletCounts::default(),
+        }
+    }
+
+    pub(super) fn connect(
+        &mut self,
+        socket: S,
+        payload_max: usize,
+        preface: Option<Message>,
+        after: &mut After,
+    ) -> LinkNumber {
+        self.cut(after);
+        self.number += 1;
+        if !matches!(self.link, Link::Closed(_)) {
+            self.link = Link::Up(socket);
+            self.payload_max = self.limits.payload_max.min(payload_max);
+            self.partial = preface.map(|message| Partial { is_preface: true, ..Partial::new(message) });
+        }
+        LinkNumber(self.number)
+    }
+
+    pub(super) fn cut(&mut self, after: &mut After) {
+        self.disconnect(LinkNumber(self.number), after);
+    }
+
+    pub(super) fn disconnect(&mut self, link: LinkNumber, after: &mut After) -> bool {
+        if link.0 != self.number || matches!(self.link, Link::Closed(_)) {
+            return true;
+        }
+        self.link = Link::Down;
+        after.wake = self.drainer.take();
+        after.settle.extend(self.sent_receipts.drain(..).map(|receipt| (receipt, Outcome::Unknown)));
+        let Some(partial) = self.partial.take() else { return true };
+        self.next_expiry = self.next_expiry.min(expiry_of(&partial.message));
+        if partial.is_preface {
+            // The next connection has its own.
+        } else if partial.message.header.class == Class::Stream {
+            self.put_back(partial.message);
+        } else {
+            self.interrupted = Some(partial.message);
+        }
+        partial.written == 0
+    }
+
+    /// Puts a Stream message back before all others, so that a newer value takes its place.
+    fn put_back(&mut self, oldest: Message) {
+        let rest: Vec<_> = self.queue.drain_all().collect();
+        for message in std::iter::once(oldest).chain(rest) {
+            match self.queue.push(message) {
+                Ok(superseded) => self.counts.superseded += u64::from(superseded.is_some()),
+                // Only Stream can be one too many here, and Stream has no receipts.
+                Err(_) => self.counts.lost += 1,
+            }
+        }
+    }
+
+    pub(super) fn close(&mut self, why: Rejection, after: &mut After) {
+        self.cut(after);
+        self.link = Link::Closed(why);
+        let waiting: Vec<_> = self.interrupted.take().into_iter().chain(self.queue.drain_all()).collect();
+        for message in waiting {
+            self.counts.lost += 1;
+            after.settle.extend(message.receipt.map(|receipt| (receipt, Outcome::PeerLost)));
+        }
+        self.waiting_receipts = 0;
+        self.next_expiry = Time::MAX;
+    }
+
+    pub(super) fn end(&mut self, in_hand: Outcome, why: Rejection, after: &mut After) {
+        after.settle.extend(self.sent_receipts.drain(..).map(|receipt| (receipt, in_hand)));
+        self.disconnect(LinkNumber(self.number), after);
+        let waiting: Vec<_> = self.interrupted.take().into_iter().chain(self.queue.drain_all()).collect();
+        for message in waiting {
+            self.counts.lost += 1;
+            after.settle.extend(message.receipt.map(|receipt| (receipt, Outcome::Rejected(why))));
+        }
+        self.close(why, after);
+    }
+
+    pub(super) fn submit(&mut self, mut message: Message, after: &mut After) -> Result<(), Refused> {
+        if let Err(why) = self.admit(&message) {
+            self.counts.refused += 1;
+            return Err(Refused::new(message, why));
+        }
+        message.header.flags = match message.receipt {
+            Some(_) => message.header.flags.with(Flags::CONFIRM),
+            None => message.header.flags.without(Flags::CONFIRM),
+        };
+        if message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
+            self.expired(message, after);
+            return Ok(());
+        }
+        if self.waiting() > 0 || !matches!(self.link, Link::Up(_)) {
+            return self.enqueue(message, after);
+        }
+        let mut frame = Partial::new(message);
+        self.waiting_receipts += usize::from(frame.message.receipt.is_some());
+        match self.write(&mut frame) {
+            Written::Whole => self.sent(frame),
+            Written::InPart if frame.written > 0 => {
+                self.partial = Some(frame);
+                after.wake = self.drainer.take();
+            }
+            Written::InPart | Written::Broken => return self.requeue(frame, after),
+        }
+        Ok(())
+    }
+
+    /// A frame that was to be written at once and could not be: it waits like any other.
+    fn requeue(&mut self, frame: Partial, after: &mut After) -> Result<(), Refused> {
+        self.waiting_receipts -= usize::from(frame.message.receipt.is_some());
+        self.enqueue(frame.message, after)
+    }
+
+    fn admit(&self, message: &Message) -> Result<(), Rejection> {
+        let confirmed = message.receipt.is_some();
+        if let Link::Closed(why) = self.link {
+            Err(why)
+        } else if message.payload.len() > self.payload_max {
+            Err(Rejection::TooLong)
+        } else if confirmed && message.header.class == Class::Stream {
+            // It may be superseded, and then there is no outcome that tells the truth.
+            Err(Rejection::Unsupported)
+        } else if confirmed && self.unconfirmed() >= self.limits.unconfirmed_max {
+            Err(Rejection::QueueFull)
+        } else {
+            Ok(())
+        }
+    }
+
+    fn enqueue(&mut self, message: Message, after: &mut After) -> Result<(), Refused> {
+        let confirmed = message.receipt.is_some();
+        let expiry = expiry_of(&message);
+        match self.queue.push(message) {
+            Ok(superseded) => self.counts.superseded += u64::from(superseded.is_some()),
+            Err(refused) => {
+                self.counts.refused += 1;
+                return Err(refused);
+            }
+        }
+        self.waiting_receipts += usize::from(confirmed);
+        self.next_expiry = self.next_expiry.min(expiry);
+        after.wake = self.drainer.take();
+        Ok(())
+    }
+
+    fn write(&mut self, frame: &mut Partial) -> Written {
+        let Link::Up(socket) = &self.link else { return Written::Broken };
+        match frame.write_to(socket) {
+            Ok(true) => Written::Whole,
+            Ok(false) => Written::InPart,
+            Err(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted) => {
+                Written::InPart
+            }
+            Err(error) => {
+                self.link = Link::Failed(error);
+                Written::Broken
+            }
+        }
+    }
+
+    fn sent(&mut self, frame: Partial) {
+        self.counts.sent += u64::from(!frame.is_preface);
+        if let Some(receipt) = frame.message.receipt {
+            self.waiting_receipts -= 1;
+            self.sent_receipts.push_back(receipt);
+        }
+    }
+
+    fn expired(&mut self, message: Message, after: &mut After) {
+        self.counts.expired += 1;
+        after.settle.extend(message.receipt.map(|receipt| (receipt, Outcome::Expired)));
+    }
+
+    pub(super) fn poll_drain(
+        &mut self,
+        link: LinkNumber,
+        cx: &mut Context<'_>,
+        after: &mut After,
+    ) -> Poll<io::Error> {
+        for _ in 0..WRITES_PER_WAKE {
+            if let Some(end) = self.end_of(link) {
+                return Poll::Ready(end);
+            }
+            if !self.drainer.as_ref().is_some_and(|waker| waker.will_wake(cx.waker())) {
+                self.drainer = Some(cx.waker().clone());
+            }
+            let Link::Up(socket) = &self.link else { continue };
+            if self.waiting() == 0 {
+                return Poll::Pending;
+            }
+            match socket.poll_writable(cx) {
+                Poll::Pending => return Poll::Pending,
+                Poll::Ready(Err(error)) => self.link = Link::Failed(error),
+                Poll::Ready(Ok(())) => self.write_next(after),
+            }
+        }
+        cx.waker().wake_by_ref();
+        Poll::Pending
+    }
+
+    /// Why the connection `link` cannot be written to, if it cannot.
+    fn end_of(&mut self, link: LinkNumber) -> Option<io::Error> {
+        if link.0 != self.number {
+            return Some(io::ErrorKind::ConnectionAborted.into());
+        }
+        match std::mem::replace(&mut self.link, Link::Down) {
+            Link::Failed(error) => Some(error),
+            Link::Down => Some(io::ErrorKind::NotConnected.into()),
+            link @ Link::Closed(_) => {
+                self.link = link;
+                Some(io::ErrorKind::NotConnected.into())
+            }
+            link @ Link::Up(_) => {
+                self.link = link;
+                None
+            }
+        }
+    }
+
+    fn write_next(&mut self, after: &mut After) {
+        let Some(mut frame) = self.next_frame(after) else { return };
+        match self.write(&mut frame) {
+            Written::Whole => self.sent(frame),
+            Written::InPart | Written::Broken => self.partial = Some(frame),
+        }
+    }
+
+    fn next_frame(&mut self, after: &mut After) -> Option<Partial> {
+        if let Some(partial) = self.partial.take() {
+            return Some(partial);
+        }
+        let message = self.interrupted.take().or_else(|| self.queue.pop())?;
+        if message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
+            self.waiting_receipts -= usize::from(message.receipt.is_some());
+            self.expired(message, after);
+            return None;
+        }
+        Some(Partial::new(message))
+    }
+
+    pub(super) fn expire(&mut self, now: Time, after: &mut After) {
+        if now <= self.next_expiry {
+            return;
+        }
+        self.next_expiry = Time::MAX;
+        if let Some(message) = self.interrupted.take() {
+            self.interrupted = self.keep_or_expire(message, now, after);
+        }
+        let waiting: Vec<_> = self.queue.drain_all().collect();
+        for message in waiting {
+            if let Some(message) = self.keep_or_expire(message, now, after) {
+                let kept = self.queue.push(message);
+                debug_assert!(matches!(kept, Ok(None)), "what was in the queue has room in it");
+            }
+        }
+    }
+
+    fn keep_or_expire(&mut self, message: Message, now: Time, after: &mut After) -> Option<Message> {
+        if message.header.is_expired(now) {
+            self.waiting_receipts -= usize::from(message.receipt.is_some());
+            self.expired(message, after);
+            return None;
+        }
+        self.next_expiry = self.next_expiry.min(expiry_of(&message));
+        Some(message)
+    }
+
+    pub(super) fn confirm(&mut self, ticket: Ticket, outcome: Outcome, after: &mut After) -> bool {
+        let Some(at) = self.sent_receipts.iter().position(|receipt| receipt.ticket() == ticket) else {
+            return false;
+        };
+        after.settle.extend(self.sent_receipts.remove(at).map(|receipt| (receipt, outcome)));
+        true
+    }
+
+    pub(super) fn waiting(&self) -> usize {
+        self.queue.len() + usize::from(self.partial.is_some()) + usize::from(self.interrupted.is_some())
+    }
+
+    pub(super) fn unconfirmed(&self) -> usize {
+        self.sent_receipts.len() + self.waiting_receipts
+    }
+
+    pub(super) const fn counts(&self) -> OutletCounts {
+        self.counts
+    }
+}
+
+/// When the message's time to live runs out.
+fn expiry_of(message: &Message) -> Time {
+    match message.header.time_to_live_us {
+        0 => Time::MAX,
+        micros => message.header.sent + std::time::Duration::from_micros(u64::from(micros)),
+    }
+}
