@@ -134,6 +134,12 @@ impl<S: Socket> StreamOutlet<S> {
         self.with(|half, after| half.close(why, after));
     }
 
+    /// The process at the other end has ended, and nothing takes its place: what it had in hand has the outcome
+    /// `in_hand`; what waits, and what is submitted from now on, is refused because of `why`.
+    pub(crate) fn end(&self, in_hand: Outcome, why: Rejection) {
+        self.with(|half, after| half.end(in_hand, why, after));
+    }
+
     /// Writes what waits whenever the socket takes it. Resolves when this connection cannot be written to any more,
     /// with the reason. To be run by one task, on the thread whose reactor the socket belongs to.
     pub(crate) async fn drain(&self, link: LinkNumber) -> io::Error {

@@ -4,12 +4,10 @@ use std::{collections::BTreeMap, fmt};
 
 use sinew_runtime::{tid::AppAddress, wire::Kind};
 
-use super::AppFact;
-
 /// Longest name in bytes.
 pub(crate) const NAME_MAX: usize = 63;
 /// Names that one application may require, and payload types that it may name, at most.
-pub(crate) const NAMES_MAX: usize = 256;
+pub(crate) const NAMES_MAX: usize = 64;
 /// Addresses of one client process at most.
 pub(crate) const PER_PROCESS_MAX: usize = 256;
 
@@ -131,9 +129,7 @@ pub enum RegisterError {
 #[derive(Debug)]
 struct Entry {
     name: Option<String>,
-    requires: Vec<String>,
     owner: Owner,
-    ready: bool,
 }
 
 /// Who is registered on this node. It outlives LNCL's actor.
@@ -170,8 +166,7 @@ impl Registry {
         if let Some(name) = &request.name {
             self.names.insert(name.clone(), app);
         }
-        let Request { name, requires, owner, .. } = request;
-        self.apps.insert(app, Entry { name, requires, owner, ready: false });
+        self.apps.insert(app, Entry { name: request.name, owner: request.owner });
         Ok(app)
     }
 
@@ -204,11 +199,6 @@ impl Registry {
         ClientId(self.next_client)
     }
 
-    /// Notes whether `app` takes messages. Returns whether that is news.
-    pub(crate) fn set_ready(&mut self, app: AppAddress, ready: bool) -> bool {
-        self.apps.get_mut(&app).is_some_and(|entry| std::mem::replace(&mut entry.ready, ready) != ready)
-    }
-
     /// The application called `name`.
     pub(crate) fn resolve(&self, name: &str) -> Option<AppAddress> {
         self.names.get(name).copied()
@@ -221,26 +211,13 @@ impl Registry {
     }
 
     /// Whether `app` is in another process.
-    pub(crate) fn is_client(&self, app: AppAddress) -> bool {
+    pub(crate) fn is_in_other_process(&self, app: AppAddress) -> bool {
         self.apps.get(&app).is_some_and(|entry| entry.owner != Owner::Node)
     }
 
     /// How many applications there are.
     pub(crate) fn len(&self) -> usize {
         self.apps.len()
-    }
-
-    /// Everything that a sync manager started anew must be told, in the order of the addresses.
-    pub(crate) fn facts(&self) -> Vec<AppFact> {
-        let mut facts = Vec::new();
-        for (app, entry) in &self.apps {
-            let (name, requires) = (entry.name.clone(), entry.requires.clone());
-            facts.push(AppFact::Registered { app: *app, name, requires });
-            if entry.ready {
-                facts.push(AppFact::Ready { app: *app });
-            }
-        }
-        facts
     }
 
     fn owned_by(&self, is_owner: impl Fn(Owner) -> bool) -> Vec<AppAddress> {
@@ -434,16 +411,6 @@ mod tests {
         registry.register(with("liquid"), 9).unwrap();
         let refusal = registry.register(with("costarring"), 9);
         assert!(matches!(refusal, Err(RegisterError::KindCollision { .. })));
-    }
-
-    #[test]
-    fn a_sync_manager_started_anew_is_told_everything() {
-        let mut registry = Registry::default();
-        let app = registry.register(request(fixed(1), Some("hip")), 9).unwrap();
-        assert!(registry.set_ready(app, true));
-        assert!(!registry.set_ready(app, true), "no news");
-        let (name, requires) = (Some("hip".to_owned()), Vec::new());
-        assert_eq!(registry.facts(), [AppFact::Registered { app, name, requires }, AppFact::Ready { app }]);
     }
 
     #[derive(Clone, Debug)]

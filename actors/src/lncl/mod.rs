@@ -1,14 +1,48 @@
 //! LNCL, the Local Node Communication Layer: moves messages between the applications of one node, in one process or
 //! many.
+//!
+//! In one process no message passes through LNCL: it owns the registry and publishes the routes, and a sender's thread
+//! puts its message into the target's mailbox. For other processes LNCL listens at a unix socket, one connection for
+//! each address; a sender's thread writes to the client's socket itself, and LNCL's thread reads what clients send.
+//!
+//! | rule | |
+//! | --- | --- |
+//! | LNCL-1 | A connection's first frame is `LNCL_REGISTER`, complete within 2 s. One connection has one address; when it ends, however it ends, the address, the name and the memberships are free. |
+//! | LNCL-2 | Only processes of the node's own user, and of root, are served; the kernel says who they are. |
+//! | LNCL-3 | A client speaks for its own TID alone. A frame with another source is refused as `ForgedSource` and counted; the connection lives. |
+//! | LNCL-4 | What is no frame, of another version, too long, or not for clients to send ends its connection, with `LNCL_REFUSAL` and a sentence. Nothing else is touched. |
+//! | LNCL-5 | A name has 1 to 63 bytes, no control characters, and one holder on a node. A fixed address is in the fixed range and has one holder. A dynamic address that was given back is not given out again before all others. |
+//! | LNCL-6 | A client that requires names gets `LNCL_REGISTERED` when all of them are ready. Nothing is sent to it before. |
+//! | LNCL-7 | Each confirmed message to a client ends in what the client says of it; as `Failed` if the connection ends while the client has it; as `Rejected(Closed)` if it was not sent yet. |
+//! | LNCL-8 | Two names of payload types with one id are refused where both are told at registration. |
 
+mod actor;
+mod client;
+mod core;
 mod facts;
+mod listener;
+pub(crate) mod payload;
+mod registrar;
+mod server;
+mod session;
+#[cfg(test)]
+pub(crate) mod testing;
+#[cfg(test)]
+mod tests;
 
+pub(crate) use actor::Lncl;
+pub use core::RegisterError;
+pub(crate) use core::Registry;
 pub(crate) use facts::AppFact;
+pub(crate) use registrar::{
+    LocalApp, app_down, app_ready, is_in_other_process, register_local, resolve, set_member, unregister_local,
+};
+
+use sinew_runtime::tid::AppAddress;
 
 /// What LNCL is told.
 #[derive(Debug)]
-pub(crate) enum Event {}
-
-/// Who is registered on this node.
-#[derive(Debug, Default)]
-pub(crate) struct Registry;
+pub(crate) enum Event {
+    /// By the root: all that this application of another process requires is ready.
+    Released { app: AppAddress },
+}

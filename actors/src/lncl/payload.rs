@@ -8,7 +8,7 @@ use sinew_runtime::{
 };
 
 /// Longest payload of a connection's first frame, in bytes: enough for the longest lists that are allowed.
-pub(crate) const REGISTER_BYTES_MAX: usize = 48 * 1024;
+pub(crate) const REGISTER_BYTES_MAX: usize = 16 * 1024;
 
 /// A process asks for a transport address.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

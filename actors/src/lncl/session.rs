@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
     tid::{AppAddress, Tid},
-    wire::{Flags, Kind, Message},
+    wire::{Class, Flags, Kind, Message},
 };
 
 use super::payload::{self, Group, Register, Resolve};
@@ -58,7 +58,7 @@ pub(crate) enum Order {
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum Violation {
     /// The first frame asks for no address.
-    #[error("the first frame must ask for an address (kind {}), not be of kind {0}", Kind::LNCL_REGISTER)]
+    #[error("the first frame must ask for an address (kind {asked}), not be of kind {0}", asked = Kind::LNCL_REGISTER)]
     NotRegistered(Kind),
     /// A second registration on one connection.
     #[error("this connection has an address; open another connection for another address")]
@@ -93,11 +93,6 @@ impl Session {
     /// The barrier has opened for it.
     pub(crate) const fn released(&mut self, tid: Tid) {
         self.phase = Phase::Open(tid);
-    }
-
-    /// Whether it is a member of any group.
-    pub(crate) fn has_groups(&self) -> bool {
-        !self.groups.is_empty()
     }
 
     /// What a frame means.
@@ -171,7 +166,10 @@ fn read_early(message: &Message) -> Result<Order, Violation> {
 
 fn read_data(message: Message) -> Order {
     // The flag belongs to frames of kind OUTCOME alone; a message with it could be taken for one further on.
-    if message.header.flags.has(Flags::OUTCOME) {
+    // Of a Stream the newest wins, so an older one has no outcome of its own.
+    let is_confirmed_stream =
+        message.header.class == Class::Stream && message.header.flags.has(Flags::CONFIRM);
+    if message.header.flags.has(Flags::OUTCOME) || is_confirmed_stream {
         return Order::RefuseMessage { message, why: Rejection::Unsupported };
     }
     Order::Route(message)
@@ -181,13 +179,9 @@ fn read_outcome(message: &Message) -> Result<Order, Violation> {
     let [code] = message.payload[..] else {
         return Err(malformed(message, &format!("{} bytes instead of one", message.payload.len())));
     };
-    let outcome =
-        Outcome::from_code(code).ok_or_else(|| malformed(message, &format!("no outcome has the code {code}")))?;
-    Ok(Order::Settle {
-        source: message.header.destination,
-        correlation: message.header.correlation,
-        outcome,
-    })
+    let outcome = Outcome::from_code(code)
+        .ok_or_else(|| malformed(message, &format!("no outcome has the code {code}")))?;
+    Ok(Order::Settle { source: message.header.destination, correlation: message.header.correlation, outcome })
 }
 
 fn read_resolve(message: &Message) -> Result<Order, Violation> {

@@ -4,7 +4,7 @@ use std::{
     cell::RefCell,
     collections::BTreeMap,
     rc::Rc,
-    sync::{Arc, mpsc::SyncSender},
+    sync::{Arc, atomic::Ordering, mpsc::SyncSender},
     time::Duration,
 };
 
@@ -190,7 +190,11 @@ impl Root {
         match (self.app_index.get(&app), &self.app_supervisor) {
             (Some(index), Some(supervisor)) => order(supervisor, Input::Released(*index)),
             // Not an application of this process: LNCL knows its client.
-            (None, _) => lncl::release(&self.stores, app),
+            (None, _) => {
+                if self.stores.posts.lncl.post(lncl::Event::Released { app }).is_err() {
+                    tracing::error!(%app, "LNCL's post is full; a client's registration ends at its deadline");
+                }
+            }
             (Some(_), None) => tracing::error!(%app, "released before its supervisor was there"),
         }
     }
@@ -263,8 +267,23 @@ impl Root {
         let mailbox = Mailbox::new(config.mailbox_capacity);
         let pending = Pending::new(WAITS_MAX);
         let outlet = Arc::new(AppOutlet { pending: pending.clone(), inbox: mailbox.clone() });
-        let tid = lncl::register_local(&self.stores, app, outlet)
-            .map_err(|error| StartError::Application { name: app.name().to_owned(), why: error.to_string() })?;
+        let kinds = app.kinds();
+        let local = lncl::LocalApp {
+            name: Some(app.name().to_owned()),
+            address: app.address(),
+            requires: app.requires().to_vec(),
+            kinds: kinds
+                .iter()
+                .filter(|(_, name)| *name != "raw")
+                .map(|(_, name)| (*name).to_owned())
+                .collect(),
+            outlet,
+            events: kinds.iter().map(|(kind, _)| *kind).collect(),
+        };
+        let tid = lncl::register_local(&self.stores, local).map_err(|error| StartError::Application {
+            name: app.name().to_owned(),
+            why: error.to_string(),
+        })?;
         let directory = Arc::new(NodeDirectory(self.stores.clone()));
         let sender = Sender::new(tid, self.stores.router.clone(), directory, pending, config.payload_max);
         self.app_index.insert(tid.app, self.apps.len());
@@ -338,6 +357,7 @@ impl Root {
 
     fn stop_layers(&mut self) {
         self.phase = Phase::StoppingLayers;
+        self.stores.leaving.store(true, Ordering::Relaxed);
         match &self.layer_supervisor {
             Some(supervisor) => order(supervisor, Input::StopOrdered),
             // They ended before: what is left is to hear of it.

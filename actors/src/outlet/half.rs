@@ -176,6 +176,17 @@ impl<S: Socket> Half<S> {
         self.next_expiry = Time::MAX;
     }
 
+    pub(super) fn end(&mut self, in_hand: Outcome, why: Rejection, after: &mut After) {
+        after.settle.extend(self.sent_receipts.drain(..).map(|receipt| (receipt, in_hand)));
+        self.cut(after);
+        let waiting: Vec<_> = self.interrupted.take().into_iter().chain(self.queue.drain_all()).collect();
+        for message in waiting {
+            self.counts.lost += 1;
+            after.settle.extend(message.receipt.map(|receipt| (receipt, Outcome::Rejected(why))));
+        }
+        self.close(why, after);
+    }
+
     pub(super) fn submit(&mut self, mut message: Message, after: &mut After) -> Result<(), Refused> {
         if let Err(why) = self.admit(&message) {
             self.counts.refused += 1;

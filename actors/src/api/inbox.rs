@@ -1,0 +1,251 @@
+//! What has come and was not received yet. Pure.
+
+use std::sync::Arc;
+
+use sinew_runtime::{
+    mailbox::ClassQueue,
+    outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
+    tid::Tid,
+    time::Time,
+    wire::{Flags, Kind, Message},
+};
+
+use crate::lncl::payload::{self, Refusal, Resolved};
+
+/// What an endpoint waits for: one thing at a time, since its calls block.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Awaited {
+    /// The outcome of a confirmed message.
+    Outcome,
+    /// The reply to a request, or an outcome which says that there will be none.
+    Reply,
+    /// The TID of a name.
+    Resolved,
+}
+
+/// What came for the one who waits.
+#[derive(Debug)]
+pub(super) enum Answer {
+    Outcome(Outcome),
+    Reply(Message),
+    Resolved(Option<Tid>),
+}
+
+/// What a frame was.
+#[derive(Debug)]
+pub(super) enum Sorted {
+    /// A message; it waits to be received.
+    Message,
+    /// The answer that was awaited.
+    Answer(Answer),
+    /// The node ends the connection, for this reason.
+    Refusal(String),
+    /// Nobody waits for it any more, or this version does not know it.
+    Nothing,
+}
+
+/// Messages that wait to be received, and the rule by which frames become messages or answers.
+pub(super) struct Inbox {
+    queue: ClassQueue,
+    capacity: usize,
+    /// Confirmations of what was received go out here.
+    sink: Arc<dyn ReceiptSink>,
+}
+
+impl Inbox {
+    pub(super) fn new(capacity: usize, sink: Arc<dyn ReceiptSink>) -> Self {
+        Self { queue: ClassQueue::new(capacity), capacity, sink }
+    }
+
+    /// Whether every class has room for one more.
+    pub(super) fn has_room(&self) -> bool {
+        self.queue.len() < self.capacity
+    }
+
+    /// Sorts a frame in. One that finds its class full is refused, and its sender told so if it asked.
+    pub(super) fn sort(&mut self, message: Message, awaited: Option<(u64, Awaited)>) -> Sorted {
+        let header = &message.header;
+        let awaited = awaited.filter(|(number, _)| *number == header.correlation).map(|(_, what)| what);
+        if header.kind.is_user() {
+            return if header.flags.has(Flags::REPLY) {
+                self.sort_reply(message, awaited)
+            } else {
+                self.push(message);
+                Sorted::Message
+            };
+        }
+        match header.kind {
+            Kind::OUTCOME => sort_outcome(&message, awaited),
+            Kind::LNCL_RESOLVED => sort_resolved(&message, awaited),
+            Kind::LNCL_REFUSAL => Sorted::Refusal(
+                payload::read(&message.payload)
+                    .map_or_else(|error| error.to_string(), |refusal: Refusal| refusal.sentence),
+            ),
+            // A node of a later version may say more than we know.
+            _ => Sorted::Nothing,
+        }
+    }
+
+    /// The next message, most urgent class first. What is too old is not handed out.
+    pub(super) fn pop(&mut self, now: Time) -> Option<Message> {
+        loop {
+            let mut message = self.queue.pop()?;
+            if !message.header.is_expired(now) {
+                return Some(message);
+            }
+            message.settle(Outcome::Expired);
+        }
+    }
+
+    /// Refuses all that waits.
+    pub(super) fn close(&mut self) {
+        for message in self.queue.drain_all() {
+            message.reject(Rejection::Closed);
+        }
+    }
+
+    fn sort_reply(&self, message: Message, awaited: Option<Awaited>) -> Sorted {
+        let is_awaited = awaited == Some(Awaited::Reply);
+        let mut message = self.with_receipt(message);
+        message.settle(if is_awaited { Outcome::Delivered } else { Outcome::Expired });
+        if is_awaited { Sorted::Answer(Answer::Reply(message)) } else { Sorted::Nothing }
+    }
+
+    fn push(&mut self, message: Message) {
+        let message = self.with_receipt(message);
+        match self.queue.push(message) {
+            // Of a Stream the newest value wins; Stream messages have no receipts.
+            Ok(_) => {}
+            Err(refused) => refused.message.reject(refused.why),
+        }
+    }
+
+    fn with_receipt(&self, mut message: Message) -> Message {
+        if message.header.flags.has(Flags::CONFIRM) {
+            let (source, destination) = (message.header.source, message.header.destination);
+            let ticket = Ticket { source, destination, correlation: message.header.correlation };
+            message.receipt = Some(Receipt::new(self.sink.clone(), ticket));
+        }
+        message
+    }
+}
+
+fn sort_outcome(message: &Message, awaited: Option<Awaited>) -> Sorted {
+    let outcome = message.payload.first().and_then(|code| Outcome::from_code(*code));
+    match (awaited, outcome) {
+        // The reply follows.
+        (Some(Awaited::Reply), Some(Outcome::Delivered)) => Sorted::Nothing,
+        (Some(Awaited::Outcome | Awaited::Reply), Some(outcome)) => Sorted::Answer(Answer::Outcome(outcome)),
+        (None | Some(Awaited::Resolved), _) | (_, None) => Sorted::Nothing,
+    }
+}
+
+fn sort_resolved(message: &Message, awaited: Option<Awaited>) -> Sorted {
+    match payload::read::<Resolved>(&message.payload) {
+        Ok(resolved) if awaited == Some(Awaited::Resolved) => {
+            Sorted::Answer(Answer::Resolved(resolved.tid.map(Tid::from_bits)))
+        }
+        // The wait ends at its deadline.
+        Ok(_) | Err(_) => Sorted::Nothing,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{sync::Mutex, time::Duration};
+
+    use bytes::Bytes;
+    use proptest::prelude::*;
+    use sinew_runtime::wire::{Class, Header};
+
+    use super::*;
+
+    #[derive(Default)]
+    struct Ledger(Mutex<Vec<(u64, Outcome)>>);
+
+    impl ReceiptSink for Ledger {
+        fn settle(&self, ticket: Ticket, outcome: Outcome) {
+            self.0.lock().unwrap().push((ticket.correlation, outcome));
+        }
+    }
+
+    fn confirmed(correlation: u64) -> Message {
+        let mut header = Header::new(Kind::named("x"), Tid::from_bits(1), Tid::from_bits(2));
+        header.flags = Flags::CONFIRM;
+        header.correlation = correlation;
+        Message::new(header, Bytes::new())
+    }
+
+    fn outcome(correlation: u64, outcome: Outcome) -> Message {
+        let mut header = Header::new(Kind::OUTCOME, Tid::from_bits(2), Tid::from_bits(1));
+        header.flags = Flags::OUTCOME;
+        header.correlation = correlation;
+        Message::new(header, Bytes::copy_from_slice(&[outcome.code()]))
+    }
+
+    #[test]
+    fn a_message_that_finds_no_room_is_refused_and_its_sender_told() {
+        let ledger = Arc::new(Ledger::default());
+        let mut inbox = Inbox::new(1, ledger.clone());
+        inbox.sort(confirmed(1), None);
+        assert!(!inbox.has_room());
+        inbox.sort(confirmed(2), None);
+        assert_eq!(*ledger.0.lock().unwrap(), [(2, Outcome::Rejected(Rejection::QueueFull))]);
+    }
+
+    #[test]
+    fn a_message_that_became_too_old_is_not_handed_out() {
+        let ledger = Arc::new(Ledger::default());
+        let mut inbox = Inbox::new(4, ledger.clone());
+        let mut message = confirmed(1);
+        message.header.time_to_live_us = 10;
+        inbox.sort(message, None);
+        assert!(inbox.pop(Time::ZERO + Duration::from_micros(11)).is_none());
+        assert_eq!(*ledger.0.lock().unwrap(), [(1, Outcome::Expired)]);
+    }
+
+    #[test]
+    fn the_newest_value_of_a_stream_is_the_one_that_is_received() {
+        let mut inbox = Inbox::new(4, Arc::new(Ledger::default()));
+        for value in [1, 2, 3] {
+            let mut header = Header::new(Kind::named("angle"), Tid::from_bits(1), Tid::from_bits(2));
+            header.class = Class::Stream;
+            inbox.sort(Message::new(header, Bytes::copy_from_slice(&[value])), None);
+        }
+        assert_eq!(inbox.pop(Time::ZERO).unwrap().payload[..], [3]);
+        assert!(inbox.pop(Time::ZERO).is_none());
+    }
+
+    #[test]
+    fn an_outcome_reaches_the_one_who_waits_for_it_and_nobody_else() {
+        let mut inbox = Inbox::new(4, Arc::new(Ledger::default()));
+        let awaited = Some((7, Awaited::Outcome));
+        assert!(matches!(inbox.sort(outcome(6, Outcome::Failed), awaited), Sorted::Nothing));
+        let sorted = inbox.sort(outcome(7, Outcome::Failed), awaited);
+        assert!(matches!(sorted, Sorted::Answer(Answer::Outcome(Outcome::Failed))));
+    }
+
+    #[test]
+    fn a_request_that_was_delivered_still_waits_for_its_reply() {
+        let mut inbox = Inbox::new(4, Arc::new(Ledger::default()));
+        let awaited = Some((7, Awaited::Reply));
+        assert!(matches!(inbox.sort(outcome(7, Outcome::Delivered), awaited), Sorted::Nothing));
+        let mut reply = confirmed(7);
+        reply.header.flags = Flags::REPLY;
+        assert!(matches!(inbox.sort(reply, awaited), Sorted::Answer(Answer::Reply(_))));
+    }
+
+    proptest! {
+        #[test]
+        fn anything_that_a_node_may_say_is_sorted(kind: u32, layer in 0u32..0x50, payload: Vec<u8>) {
+            let mut inbox = Inbox::new(4, Arc::new(Ledger::default()));
+            for kind in [kind, layer] {
+                let header = Header::new(Kind::from_bits(kind), Tid::from_bits(1), Tid::from_bits(2));
+                for awaited in [Awaited::Outcome, Awaited::Reply, Awaited::Resolved] {
+                    let message = Message::new(header, Bytes::copy_from_slice(&payload));
+                    inbox.sort(message, Some((0, awaited)));
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,196 @@
+//! The socket to the node: whole frames out, bytes in, each with a bound on the wait.
+
+use std::{
+    io::IoSlice,
+    os::{fd::OwnedFd, unix::net::UnixStream},
+    path::Path,
+    sync::{Arc, Mutex, PoisonError},
+    time::Duration,
+};
+
+use bytes::{Bytes, BytesMut};
+use rustix::{
+    event::{PollFd, PollFlags, Timespec, poll},
+    io::Errno,
+    net::{RecvFlags, SendAncillaryBuffer, SendFlags, Shutdown, recv, sendmsg},
+};
+use sinew_runtime::{
+    outcome::{Outcome, ReceiptSink, Ticket},
+    time::Time,
+    wire::{Flags, FrameCodec, Header, Kind, Message},
+};
+use socket2::{Domain, SockAddr, Socket, Type};
+use tokio_util::codec::Decoder;
+
+use super::ApiError;
+
+/// How long to wait for a place in the queue of a node that does not accept.
+const CONNECT: Duration = Duration::from_secs(2);
+/// Bytes that are read at once.
+const READ_CHUNK: usize = 64 * 1024;
+
+/// Connects to the node that listens at `path`.
+pub(super) fn connect(path: &Path) -> Result<UnixStream, ApiError> {
+    let try_to = || -> std::io::Result<UnixStream> {
+        let socket = Socket::new(Domain::UNIX, Type::STREAM, None)?;
+        // Linux bounds a unix socket's `connect` by the time allowed for sending.
+        socket.set_write_timeout(Some(CONNECT))?;
+        socket.connect(&SockAddr::unix(path)?)?;
+        Ok(UnixStream::from(OwnedFd::from(socket)))
+    };
+    try_to().map_err(|cause| ApiError::NoNode { path: path.to_owned(), cause })
+}
+
+/// The writing half: whoever settles a message writes, from whatever thread.
+#[derive(Debug)]
+pub(super) struct Writer {
+    socket: Arc<UnixStream>,
+    /// Frames go out whole, one after the other.
+    turn: Mutex<()>,
+    patience: Duration,
+}
+
+/// How far a frame came.
+enum Stuck {
+    /// Nothing of it was written.
+    Before,
+    /// Part of it was written: nothing after it would be understood.
+    Within,
+}
+
+impl Writer {
+    pub(super) const fn new(socket: Arc<UnixStream>, patience: Duration) -> Self {
+        Self { socket, turn: Mutex::new(()), patience }
+    }
+
+    /// Writes one frame.
+    pub(super) fn write(&self, message: &Message) -> Result<(), ApiError> {
+        let head = message.header.encode(&message.payload);
+        // A turn that ended in a panic wrote a frame in part, and closed the socket.
+        let _turn = self.turn.lock().unwrap_or_else(PoisonError::into_inner);
+        let whole = message.size();
+        let deadline = Time::now() + self.patience;
+        let mut written = 0;
+        while written < whole {
+            let head = &head[written.min(head.len())..];
+            let payload = &message.payload[written.saturating_sub(whole - message.payload.len())..];
+            let parts = [IoSlice::new(head), IoSlice::new(payload)];
+            match self.write_some(&parts, deadline) {
+                Ok(count) => written += count,
+                Err(error) => {
+                    return Err(self.give_up(error, if written == 0 { Stuck::Before } else { Stuck::Within }));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn write_some(&self, parts: &[IoSlice<'_>], deadline: Time) -> Result<usize, Errno> {
+        let flags = SendFlags::DONTWAIT | SendFlags::NOSIGNAL;
+        loop {
+            match sendmsg(&self.socket, parts, &mut SendAncillaryBuffer::default(), flags) {
+                Err(Errno::INTR) => {}
+                Err(Errno::AGAIN) if wait(&self.socket, PollFlags::OUT, deadline)? => {}
+                result => return result,
+            }
+        }
+    }
+
+    fn give_up(&self, error: Errno, stuck: Stuck) -> ApiError {
+        match (error, stuck) {
+            (Errno::AGAIN, Stuck::Before) => ApiError::Stalled(self.patience),
+            (Errno::AGAIN, Stuck::Within) => {
+                self.close();
+                ApiError::Closed(format!("the node stopped reading for {:?} within a frame", self.patience))
+            }
+            (error, Stuck::Before | Stuck::Within) => ApiError::Closed(error.to_string()),
+        }
+    }
+
+    /// Closes the connection, which gives the address back.
+    pub(super) fn close(&self) {
+        // An error means that it is closed already.
+        let _ = rustix::net::shutdown(&self.socket, Shutdown::Both);
+    }
+}
+
+impl ReceiptSink for Writer {
+    fn settle(&self, ticket: Ticket, outcome: Outcome) {
+        let mut header = Header::new(Kind::OUTCOME, ticket.destination, ticket.source);
+        header.flags = Flags::OUTCOME;
+        header.correlation = ticket.correlation;
+        // If it cannot be said the connection has ended, and the node tells the sender so.
+        let _ = self.write(&Message::new(header, Bytes::copy_from_slice(&[outcome.code()])));
+    }
+}
+
+/// The reading half.
+pub(super) struct Reader {
+    socket: Arc<UnixStream>,
+    codec: FrameCodec,
+    buffer: BytesMut,
+    chunk: Box<[u8]>,
+}
+
+/// What a look at the socket found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Read {
+    /// Bytes came.
+    Some,
+    /// Nothing came.
+    Nothing,
+    /// Nothing will come any more.
+    Ended,
+}
+
+impl Reader {
+    pub(super) fn new(socket: Arc<UnixStream>, payload_max: usize) -> Self {
+        let chunk = vec![0; READ_CHUNK].into();
+        Self { socket, codec: FrameCodec::new(payload_max), buffer: BytesMut::new(), chunk }
+    }
+
+    pub(super) fn set_payload_max(&mut self, payload_max: usize) {
+        self.codec = FrameCodec::new(payload_max);
+    }
+
+    /// The next frame of those that were read.
+    pub(super) fn next(&mut self) -> Result<Option<Message>, ApiError> {
+        Ok(self.codec.decode(&mut self.buffer)?)
+    }
+
+    /// Reads what is there, without waiting.
+    pub(super) fn read(&mut self) -> Read {
+        loop {
+            match recv(&self.socket, &mut self.chunk[..], RecvFlags::DONTWAIT) {
+                Ok((0, _)) => return Read::Ended,
+                Ok((count, _)) => {
+                    self.buffer.extend_from_slice(&self.chunk[..count]);
+                    return Read::Some;
+                }
+                Err(Errno::INTR) => {}
+                Err(Errno::AGAIN) => return Read::Nothing,
+                Err(_) => return Read::Ended,
+            }
+        }
+    }
+
+    /// Waits until there is something to read. Returns whether there is; `false` at the deadline.
+    pub(super) fn wait(&self, deadline: Time) -> bool {
+        // An error shows itself again when the socket is read.
+        wait(&self.socket, PollFlags::IN, deadline).unwrap_or(true)
+    }
+}
+
+/// Waits for the socket; returns whether it is ready, `false` at the deadline. One wake of the calling thread.
+fn wait(socket: &UnixStream, what: PollFlags, deadline: Time) -> Result<bool, Errno> {
+    loop {
+        let left = deadline.since(Time::now());
+        let timeout = Timespec::try_from(left).unwrap_or(Timespec { tv_sec: i64::MAX, tv_nsec: 0 });
+        match poll(&mut [PollFd::new(socket, what)], Some(&timeout)) {
+            Ok(0) if Time::now() >= deadline => return Ok(false),
+            Ok(0) | Err(Errno::INTR) => {}
+            Ok(_) => return Ok(true),
+            Err(error) => return Err(error),
+        }
+    }
+}

@@ -1,0 +1,178 @@
+//! NodeAPI: for applications in processes of their own.
+//!
+//! A program connects to the node on its host through the node's unix socket, registers one or more transport
+//! addresses, and sends and receives on them from plain threads; it needs no async runtime. Each [`Endpoint`] is one
+//! address with one connection, and belongs to one thread at a time.
+//!
+//! | the paper's name | here |
+//! | --- | --- |
+//! | RegisterTransportAddress | [`NodeApi::register_transport_address`] |
+//! | CreateMessage | [`Endpoint::create_message`] |
+//! | SendMessage | [`Endpoint::send_message`]; typed: [`Endpoint::send`], [`send_confirmed`](Endpoint::send_confirmed), [`ask`](Endpoint::ask) |
+//! | ReceiveMessage | [`Endpoint::receive`] |
+//!
+//! ```no_run
+//! use std::time::Duration;
+//!
+//! use serde::{Deserialize, Serialize};
+//! use sinew::api::{NodeApi, Registration};
+//! use sinew_runtime::wire::Payload;
+//!
+//! #[derive(Serialize, Deserialize)]
+//! struct JointAngle { degrees: f32 }
+//!
+//! impl Payload for JointAngle {
+//!     const NAME: &'static str = "demo.joint_angle";
+//! }
+//!
+//! let node = NodeApi::connect("/run/sinew/knee.sock")?;
+//! let mut sensor = node.register_transport_address(Registration::new().name("knee.sensor"))?;
+//! let drive = sensor.resolve("knee.drive", Duration::from_secs(1))?.expect("the drive is registered");
+//! sensor.send(drive, &JointAngle { degrees: 12.5 })?;
+//! while let Some(received) = sensor.receive(Duration::from_millis(10))? {
+//!     println!("{} says something of kind {}", received.source(), received.kind());
+//! }
+//! # Ok::<(), sinew::api::ApiError>(())
+//! ```
+//!
+//! The protocol underneath is `docs/protocol/lncl.md`; it can be spoken from any language.
+
+mod endpoint;
+mod error;
+mod inbox;
+mod link;
+mod received;
+
+use std::{
+    path::{Path, PathBuf},
+    time::Duration,
+};
+
+use sinew_runtime::{
+    tid::AppAddress,
+    wire::{Kind, Payload},
+};
+
+pub use endpoint::Endpoint;
+pub use error::ApiError;
+pub use received::Received;
+
+use crate::lncl::payload::Register;
+
+/// The way to the node of this host, at the path of its socket.
+#[derive(Clone, Debug)]
+pub struct NodeApi {
+    path: PathBuf,
+}
+
+impl NodeApi {
+    /// Looks whether a node listens at `path`: its configuration's `lncl.socket`.
+    ///
+    /// # Errors
+    /// Nobody listens there, or this user may not connect.
+    pub fn connect(path: impl AsRef<Path>) -> Result<Self, ApiError> {
+        let path = path.as_ref().to_owned();
+        link::connect(&path)?;
+        Ok(Self { path })
+    }
+
+    /// Asks for a transport address, and waits until everything that the application requires is ready
+    /// (the paper's RegisterTransportAddress).
+    ///
+    /// A process may have up to 256 addresses, one for each of its threads if it likes.
+    ///
+    /// # Errors
+    /// The node refused, in words; or the deadline passed. Nothing stays registered.
+    pub fn register_transport_address(&self, registration: Registration) -> Result<Endpoint, ApiError> {
+        Endpoint::register(&self.path, registration)
+    }
+}
+
+/// What an application asks for when it registers.
+#[derive(Clone, Debug)]
+pub struct Registration {
+    register: Register,
+    deadline: Duration,
+    inbox_capacity: usize,
+    patience: Duration,
+}
+
+impl Default for Registration {
+    fn default() -> Self {
+        Self {
+            register: Register { pid: std::process::id(), ..Register::default() },
+            deadline: Duration::from_secs(60),
+            inbox_capacity: 256,
+            patience: Duration::from_secs(1),
+        }
+    }
+}
+
+impl Registration {
+    /// Asks for a dynamic address without a name, and requires nothing.
+    #[must_use]
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Asks for a name: 1 to 63 bytes without control characters, unique on the node.
+    #[must_use]
+    pub fn name(mut self, name: impl Into<String>) -> Self {
+        self.register.name = Some(name.into());
+        self
+    }
+
+    /// Asks for this address of the fixed range (`0x1000..=0x7fff_ffff`) instead of a dynamic one.
+    #[must_use]
+    pub const fn fixed(mut self, address: AppAddress) -> Self {
+        self.register.address = Some(address);
+        self
+    }
+
+    /// Adds names that must be ready, on this node or any, before this application is; at most 64.
+    #[must_use]
+    pub fn requires<N: Into<String>>(mut self, names: impl IntoIterator<Item = N>) -> Self {
+        self.register.requires.extend(names.into_iter().map(Into::into));
+        self
+    }
+
+    /// Subscribes to a layer's events: [`NodeEvent`](crate::NodeEvent), [`RequirementEvent`](crate::RequirementEvent).
+    #[must_use]
+    pub fn subscribe<P: Payload>(self) -> Self {
+        self.subscribe_kind(P::KIND)
+    }
+
+    /// Names a payload type that the application sends or handles, so that a collision of its id with another type's
+    /// is found at registration; at most 64.
+    #[must_use]
+    pub fn handles<P: Payload>(mut self) -> Self {
+        self.register.kinds.push(P::NAME.to_owned());
+        self
+    }
+
+    /// How long the registration may take, waiting for what is required included. Default 60 s.
+    #[must_use]
+    pub const fn deadline(mut self, deadline: Duration) -> Self {
+        self.deadline = deadline;
+        self
+    }
+
+    /// How many received messages wait in this process at most, each class by itself. Default 256.
+    #[must_use]
+    pub const fn inbox_capacity(mut self, messages: usize) -> Self {
+        self.inbox_capacity = messages;
+        self
+    }
+
+    /// How long a send waits at most when the node does not take bytes from its socket. Default 1 s.
+    #[must_use]
+    pub const fn patience(mut self, patience: Duration) -> Self {
+        self.patience = patience;
+        self
+    }
+
+    fn subscribe_kind(mut self, kind: Kind) -> Self {
+        self.register.events.push(kind);
+        self
+    }
+}

@@ -1,0 +1,106 @@
+//! A message as an application of another process gets it.
+
+use std::{thread, time::Duration};
+
+use sinew_runtime::{
+    outcome::Outcome,
+    tid::Tid,
+    time::Time,
+    wire::{Class, DecodeError, Flags, Kind, Message, Payload},
+};
+
+/// A message in hand.
+///
+/// If its sender wants to know the outcome it is told when this value is dropped: `Delivered`, or `Failed` if the
+/// thread is panicking then. So a message counts as handled at the end of the scope that handled it, and one that was
+/// in hand at a panic counts as failed. [`settle`](Self::settle) says something else, or says it sooner. The process's
+/// end says `Failed`.
+#[derive(Debug)]
+#[must_use = "a received message that is dropped counts as handled"]
+pub struct Received {
+    message: Message,
+}
+
+impl Received {
+    pub(super) const fn new(message: Message) -> Self {
+        Self { message }
+    }
+
+    /// Who sent it; the sender's node answers for it.
+    #[must_use]
+    pub const fn source(&self) -> Tid {
+        self.message.header.source
+    }
+
+    /// Whom it was sent to: this endpoint, a group, or everybody.
+    #[must_use]
+    pub const fn destination(&self) -> Tid {
+        self.message.header.destination
+    }
+
+    /// Type of the payload.
+    #[must_use]
+    pub const fn kind(&self) -> Kind {
+        self.message.header.kind
+    }
+
+    /// The class in which it travelled.
+    #[must_use]
+    pub const fn class(&self) -> Class {
+        self.message.header.class
+    }
+
+    /// The source's n-th message.
+    #[must_use]
+    pub const fn sequence(&self) -> u64 {
+        self.message.header.sequence
+    }
+
+    /// When it was sent, in this host's clock.
+    #[must_use]
+    pub const fn sent(&self) -> Time {
+        self.message.header.sent
+    }
+
+    /// Time from sending to `now`.
+    #[must_use]
+    pub const fn age(&self, now: Time) -> Duration {
+        now.since(self.message.header.sent)
+    }
+
+    /// Whether the sender waits for a [`reply`](super::Endpoint::reply).
+    #[must_use]
+    pub const fn wants_reply(&self) -> bool {
+        self.message.header.flags.has(Flags::ASK)
+    }
+
+    /// The payload as it came, without a copy.
+    #[must_use]
+    pub fn bytes(&self) -> &[u8] {
+        &self.message.payload
+    }
+
+    /// Reads the payload as a `P`. Compare [`kind`](Self::kind) with `P::KIND` first.
+    ///
+    /// # Errors
+    /// The bytes are not a `P`.
+    pub fn decode<P: Payload>(&self) -> Result<P, DecodeError> {
+        self.message.decode()
+    }
+
+    /// Says what became of the message, if the sender wants to know.
+    pub fn settle(mut self, outcome: Outcome) {
+        self.message.settle(outcome);
+    }
+
+    pub(super) const fn correlation(&self) -> u64 {
+        self.message.header.correlation
+    }
+}
+
+impl Drop for Received {
+    fn drop(&mut self) {
+        let outcome = if thread::panicking() { Outcome::Failed } else { Outcome::Delivered };
+        self.message.settle(outcome);
+    }
+}

@@ -1,0 +1,75 @@
+//! LNCL's shell: opens the door for other processes, and lets applications through the barrier.
+
+use std::{rc::Rc, sync::Arc, time::Duration};
+
+use actix::{Actor, AsyncContext, Context, StreamHandler, fut::WrapFuture};
+use sinew_runtime::{supervision::ReadyGate, time::Time};
+use tokio::net::UnixListener;
+
+use super::{
+    Event,
+    listener::{self, SocketFile},
+    registrar,
+    server::{Server, accept},
+};
+use crate::stores::Stores;
+
+/// Time between two looks at messages that wait for clients that do not read.
+const EXPIRY_PERIOD: Duration = Duration::from_millis(100);
+
+/// The LNCL of a node: a new one after each fault, on the same registry. Connections end with it.
+pub(crate) struct Lncl {
+    server: Rc<Server>,
+    ready: Option<ReadyGate>,
+    /// Removed when this is dropped.
+    file: Option<SocketFile>,
+}
+
+impl Lncl {
+    /// An LNCL on the registry in `stores`; it opens `ready` when other processes can connect.
+    pub(crate) fn new(stores: Arc<Stores>, ready: ReadyGate) -> Self {
+        Self { server: Server::new(stores), ready: Some(ready), file: None }
+    }
+
+    /// Opens the door, if there is to be one.
+    ///
+    /// # Panics
+    /// If the path cannot be had. That is how a layer's start fails: its supervisor reports these words.
+    fn open_door(&mut self, ctx: &mut Context<Self>) {
+        let Some(path) = self.server.stores.config.lncl.socket.clone() else { return };
+        let opened = listener::listen(&path).and_then(|(listener, file)| {
+            let listener = UnixListener::from_std(listener);
+            listener.map(|listener| (listener, file)).map_err(|cause| listener::ListenError::System {
+                doing: "watch",
+                path: path.clone(),
+                cause,
+            })
+        });
+        let (listener, file) = opened.unwrap_or_else(|error| panic!("LNCL cannot start: {error}"));
+        self.file = Some(file);
+        ctx.spawn(accept(self.server.clone(), listener).into_actor(self));
+        tracing::info!(?path, "applications of other processes can connect");
+    }
+}
+
+impl Actor for Lncl {
+    type Context = Context<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        registrar::forget_former_clients(&self.server.stores);
+        ctx.add_stream(self.server.stores.posts.lncl.attach());
+        ctx.run_interval(EXPIRY_PERIOD, |lncl, _| lncl.server.expire(Time::now()));
+        self.open_door(ctx);
+        if let Some(ready) = self.ready.take() {
+            ready.reached();
+        }
+    }
+}
+
+impl StreamHandler<Event> for Lncl {
+    fn handle(&mut self, event: Event, _: &mut Self::Context) {
+        match event {
+            Event::Released { app } => self.server.release(app),
+        }
+    }
+}

@@ -1,0 +1,419 @@
+//! One connection of another process, from its first frame to its end.
+
+use std::{io, ops::ControlFlow, rc::Rc, sync::Arc, time::Duration};
+
+use bytes::{Bytes, BytesMut};
+use rustix::net::Shutdown;
+use sinew_runtime::{
+    outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
+    router::{LocalRoute, Outlet},
+    tid::Tid,
+    time::Time,
+    wire::{Flags, FrameCodec, FrameError, Header, Kind, Message},
+};
+use tokio::net::{UnixStream, unix::UCred};
+use tokio_util::codec::Decoder;
+
+use super::{
+    core::{Address, ClientId, Owner, Request},
+    payload::{self, REGISTER_BYTES_MAX, Refusal, Register, Registered, Resolved},
+    registrar,
+    server::{Server, refuse},
+    session::{Order, Session},
+};
+use crate::{
+    outlet::{LinkNumber, OutletLimits, StreamOutlet},
+    stores::Stores,
+};
+
+/// Time for the first frame.
+const HANDSHAKE: Duration = Duration::from_secs(2);
+/// Time that a client has to take its refusal when earlier messages fill its socket.
+const LAST_WORDS: Duration = Duration::from_millis(100);
+/// Bytes that are read at once.
+const READ_CHUNK: usize = 16 * 1024;
+
+/// The writing half of a client's connection.
+pub(super) type ClientOutlet = StreamOutlet<Arc<UnixStream>>;
+
+/// Why a connection ended.
+#[derive(Debug)]
+enum End {
+    /// It gave its address back.
+    Unregistered,
+    /// The process closed its socket, or ended.
+    HungUp(Option<io::Error>),
+    /// It was refused.
+    Refused(String),
+}
+
+/// Serves one connection to its end.
+pub(super) async fn serve(server: Rc<Server>, stream: UnixStream, credentials: UCred, id: ClientId) {
+    let mut reader = Reader::new(REGISTER_BYTES_MAX);
+    let mut session = Session::new();
+    let register = match tokio::time::timeout(HANDSHAKE, introduce(&mut reader, &stream, &mut session)).await
+    {
+        Ok(Ok(Some(register))) => register,
+        // Whoever only looks whether somebody listens hangs up without a word.
+        Ok(Ok(None)) => return,
+        Ok(Err(why)) => return refuse(&server, &stream, "bad first frame", &why),
+        Err(_) => {
+            let why = format!("no frame came within {HANDSHAKE:?}; the first must be LNCL_REGISTER");
+            return refuse(&server, &stream, "silent stranger", &why);
+        }
+    };
+    let peer = Peer { stream: Arc::new(stream), id, pid: credentials.pid().unwrap_or_default() };
+    let stream = peer.stream.clone();
+    let mut client = match Client::register(server.clone(), peer, register) {
+        Ok(client) => client,
+        Err(why) => return refuse(&server, &stream, "registration", &why),
+    };
+    session.registered(client.tid);
+    let end = match client.wait_at_barrier(&mut reader, &mut session).await {
+        Some(end) => end,
+        None => client.run(&mut reader, &mut session).await,
+    };
+    client.finish(end).await;
+}
+
+/// The first frame; `None` if the peer hung up before it said anything.
+async fn introduce(
+    reader: &mut Reader,
+    stream: &UnixStream,
+    session: &mut Session,
+) -> Result<Option<Register>, String> {
+    let Some(message) = reader.next(stream).await.map_err(|error| error.to_string())? else {
+        return Ok(None);
+    };
+    match session.handle(message) {
+        Order::Register(register) => Ok(Some(register)),
+        Order::End(violation) => Err(violation.to_string()),
+        Order::Route(_)
+        | Order::Settle { .. }
+        | Order::SetMember { .. }
+        | Order::Tell { .. }
+        | Order::Resolve { .. }
+        | Order::RefuseMessage { .. }
+        | Order::Unregister => Err("a stranger can only register".to_owned()),
+    }
+}
+
+/// The other end of a connection.
+struct Peer {
+    stream: Arc<UnixStream>,
+    id: ClientId,
+    /// As the kernel says; 0 where it does not.
+    pid: i32,
+}
+
+impl Peer {
+    const fn owner(&self) -> Owner {
+        Owner::Client { id: self.id, pid: self.pid }
+    }
+}
+
+/// A registered connection. Dropping it takes the registration back, whatever the reason: the end of the peer's
+/// process, of this task, or of LNCL.
+struct Client {
+    server: Rc<Server>,
+    peer: Peer,
+    outlet: Arc<ClientOutlet>,
+    /// Set while messages flow.
+    link: Option<LinkNumber>,
+    tid: Tid,
+    name: String,
+    requires: Vec<String>,
+    events: Arc<[Kind]>,
+    /// Whether the peer knows why its connection ends.
+    has_been_told: bool,
+}
+
+impl Client {
+    fn register(server: Rc<Server>, peer: Peer, asked: Register) -> Result<Self, super::RegisterError> {
+        let Register { name, address, requires, events, kinds, pid: _ } = asked;
+        let address = address.map_or(Address::Dynamic, Address::Fixed);
+        let request = Request { address, name, requires: requires.clone(), kinds, owner: peer.owner() };
+        let app = registrar::register_client(&server.stores, request)?;
+        let tid = Tid::new(server.stores.node, app);
+        let name = registrar::registry(&server.stores).name_of(app);
+        let outlet = Arc::new(StreamOutlet::new(limits(&server.stores)));
+        server.add_outlet(peer.id, outlet.clone());
+        tracing::info!(%tid, name, pid = peer.pid, "an application of another process has registered");
+        let (link, events, has_been_told) = (None, events.into(), false);
+        Ok(Self { server, peer, outlet, link, tid, name, requires, events, has_been_told })
+    }
+
+    /// Holds the client until all that it requires is ready. Returns why its connection ended, if it did.
+    async fn wait_at_barrier(&self, reader: &mut Reader, session: &mut Session) -> Option<End> {
+        // spec: LNCL-6
+        if self.requires.is_empty() {
+            return None;
+        }
+        // The release comes through this very thread, so that it cannot come before somebody waits for it.
+        let released = self.server.wait_for_release(self.tid.app);
+        let early = async {
+            match reader.next(&self.peer.stream).await {
+                Ok(Some(message)) => match session.handle(message) {
+                    Order::Unregister => End::Unregistered,
+                    Order::End(violation) => End::Refused(violation.to_string()),
+                    Order::Register(_)
+                    | Order::Route(_)
+                    | Order::Settle { .. }
+                    | Order::SetMember { .. }
+                    | Order::Tell { .. }
+                    | Order::Resolve { .. }
+                    | Order::RefuseMessage { .. } => End::Refused("wait for LNCL_REGISTERED".to_owned()),
+                },
+                Ok(None) => End::HungUp(None),
+                Err(error) => End::from(error),
+            }
+        };
+        let end = tokio::select! {
+            end = early => Some(end),
+            released = released => released.is_err().then(|| End::Refused("LNCL ended".to_owned())),
+        };
+        self.server.forget_release(self.tid.app);
+        end
+    }
+
+    /// Opens the connection and carries frames both ways.
+    async fn run(&mut self, reader: &mut Reader, session: &mut Session) -> End {
+        let payload_max = self.server.stores.config.payload_max;
+        reader.set_payload_max(payload_max);
+        let link = self.outlet.connect(self.peer.stream.clone(), payload_max, Some(self.registered()));
+        self.link = Some(link);
+        session.released(self.tid);
+        let route = LocalRoute { outlet: self.outlet.clone(), events: self.events.clone() };
+        registrar::open(&self.server.stores, self.tid.app, route);
+        let receive = self.receive(reader, session);
+        tokio::pin!(receive);
+        tokio::select! {
+            end = &mut receive => end,
+            // What it said before it went still counts; it is there already.
+            cause = self.outlet.drain(link) => {
+                tokio::time::timeout(LAST_WORDS, receive).await.unwrap_or(End::HungUp(Some(cause)))
+            }
+        }
+    }
+
+    async fn receive(&self, reader: &mut Reader, session: &mut Session) -> End {
+        loop {
+            let message = match reader.next(&self.peer.stream).await {
+                Ok(Some(message)) => message,
+                Ok(None) => return End::HungUp(None),
+                Err(error) => return End::from(error),
+            };
+            if let ControlFlow::Break(end) = self.obey(session.handle(message)) {
+                return end;
+            }
+        }
+    }
+
+    fn obey(&self, order: Order) -> ControlFlow<End> {
+        match order {
+            Order::Route(message) => self.route(message),
+            Order::Settle { source, correlation, outcome } => self.settle(source, correlation, outcome),
+            Order::SetMember { group, member, confirm } => {
+                registrar::set_member(&self.server.stores, self.tid.app, group, member);
+                if let Some(correlation) = confirm {
+                    self.tell(payload::lncl_of(self.tid.node), correlation, Outcome::Delivered);
+                }
+            }
+            Order::Tell { destination, correlation, outcome } => {
+                self.tell(destination, correlation, outcome);
+            }
+            Order::Resolve { name, correlation } => self.resolve(&name, correlation),
+            Order::RefuseMessage { message, why } => self.refuse_message(&message, why),
+            Order::Unregister => return ControlFlow::Break(End::Unregistered),
+            Order::End(violation) => return ControlFlow::Break(End::Refused(violation.to_string())),
+            Order::Register(_) => {
+                return ControlFlow::Break(End::Refused("registered already".to_owned()));
+            }
+        }
+        ControlFlow::Continue(())
+    }
+
+    fn route(&self, mut message: Message) {
+        let router = &self.server.stores.router;
+        let destination = router.absolute(message.header.destination);
+        let is_confirmed = message.header.flags.has(Flags::CONFIRM);
+        if is_confirmed {
+            let correlation = message.header.correlation;
+            let ticket = Ticket { source: self.tid, destination, correlation };
+            message.receipt = Some(Receipt::new(Arc::new(OutcomeSink(self.outlet.clone())), ticket));
+        }
+        if let Err(why) = router.send(message)
+            && !is_confirmed
+            && destination.is_single()
+        {
+            // The source of a confirmed message knows; a group without members is no fault.
+            let detail = format!("from {} to {destination}: {why}", self.tid);
+            self.server.refusals.count(Time::now(), "unconfirmed message not taken", &detail);
+        }
+    }
+
+    fn settle(&self, source: Tid, correlation: u64, outcome: Outcome) {
+        let ticket = Ticket { source, destination: self.tid, correlation };
+        if !self.outlet.confirm(ticket, outcome) {
+            let detail = format!("{} settles a message {correlation} of {source} that it has not", self.tid);
+            self.server.refusals.count(Time::now(), "outcome of nothing", &detail);
+        }
+    }
+
+    fn resolve(&self, name: &str, correlation: u64) {
+        let tid = registrar::resolve(&self.server.stores, name).map(Tid::bits);
+        let lncl = payload::lncl_of(self.tid.node);
+        let mut answer = payload::frame(Kind::LNCL_RESOLVED, lncl, self.tid, &Resolved { tid });
+        answer.header.correlation = correlation;
+        self.say(answer);
+    }
+
+    fn refuse_message(&self, message: &Message, why: Rejection) {
+        let Header { source, destination, correlation, flags, .. } = message.header;
+        let detail = format!("{} said that {source} sends to {destination}: {why}", self.tid);
+        let cause = if why == Rejection::ForgedSource { "forged source" } else { "unsupported flags" };
+        self.server.refusals.count(Time::now(), cause, &detail);
+        if flags.has(Flags::CONFIRM) {
+            self.tell(destination, correlation, Outcome::Rejected(why));
+        }
+    }
+
+    fn tell(&self, about: Tid, correlation: u64, outcome: Outcome) {
+        self.say(outcome_frame(about, self.tid, correlation, outcome));
+    }
+
+    fn say(&self, message: Message) {
+        if let Err(refused) = self.outlet.submit(message) {
+            let detail = format!("{} does not read its socket: {}", self.tid, refused.why);
+            self.server.refusals.count(Time::now(), "client does not listen", &detail);
+        }
+    }
+
+    fn registered(&self) -> Message {
+        let config = &self.server.stores.config;
+        let payload_max = u32::try_from(config.payload_max).unwrap_or(u32::MAX);
+        let Tid { node, app } = self.tid;
+        let registered = Registered { node, app, node_name: config.name.clone(), payload_max };
+        payload::frame(Kind::LNCL_REGISTERED, payload::lncl_of(node), self.tid, &registered)
+    }
+
+    /// Says the last words, if there are any.
+    async fn finish(mut self, end: End) {
+        self.has_been_told = true;
+        match end {
+            End::Unregistered => self.log("has unregistered"),
+            End::HungUp(None) => self.log("has gone: its process closed the socket, or ended"),
+            End::HungUp(Some(cause)) => self.log(&format!("has gone: {cause}")),
+            End::Refused(sentence) => {
+                let detail = format!("{} ({}): {sentence}", self.name, self.tid);
+                self.server.refusals.count(Time::now(), "protocol violation", &detail);
+                self.say_farewell(sentence).await;
+            }
+        }
+    }
+
+    async fn say_farewell(&self, sentence: String) {
+        self.say(self.refusal(sentence));
+        // Without a link nothing was written yet, and the socket takes a sentence at once.
+        let link = self.link.unwrap_or_else(|| {
+            let payload_max = self.server.stores.config.payload_max;
+            self.outlet.connect(self.peer.stream.clone(), payload_max, None)
+        });
+        if self.outlet.waiting() > 0 {
+            // What the socket does not take in this time is not read by anybody.
+            let _ = tokio::time::timeout(LAST_WORDS, self.outlet.drain(link)).await;
+        }
+    }
+
+    fn refusal(&self, sentence: String) -> Message {
+        let lncl = payload::lncl_of(self.tid.node);
+        payload::frame(Kind::LNCL_REFUSAL, lncl, self.tid, &Refusal { sentence })
+    }
+
+    fn log(&self, what: &str) {
+        tracing::info!(tid = %self.tid, name = self.name, pid = self.peer.pid, "an application of another process {what}");
+    }
+}
+
+impl Drop for Client {
+    fn drop(&mut self) {
+        registrar::owner_gone(&self.server.stores, self.peer.owner());
+        self.server.remove_outlet(self.peer.id);
+        if !self.has_been_told {
+            self.say(self.refusal("the node's LNCL has ended; connect again when it is back".to_owned()));
+        }
+        self.outlet.end(Outcome::Failed, Rejection::Closed);
+        // Senders may hold the outlet, and with it the socket, a little longer; the peer is told now. An error means
+        // that it is closed already.
+        let _ = rustix::net::shutdown(&self.peer.stream, Shutdown::Both);
+    }
+}
+
+impl From<FrameError> for End {
+    fn from(error: FrameError) -> Self {
+        match error {
+            FrameError::Io(cause) => Self::HungUp(Some(cause)),
+            FrameError::Header(_) | FrameError::TooLong { .. } => Self::Refused(error.to_string()),
+        }
+    }
+}
+
+/// Carries outcomes of a client's messages back to it. Any thread settles them, and writes to the socket itself.
+struct OutcomeSink(Arc<ClientOutlet>);
+
+impl ReceiptSink for OutcomeSink {
+    fn settle(&self, ticket: Ticket, outcome: Outcome) {
+        let Ticket { source, destination, correlation } = ticket;
+        // Not taken: the client is gone, or does not read; its own deadline says `Unknown`.
+        let _ = self.0.submit(outcome_frame(destination, source, correlation, outcome));
+    }
+}
+
+fn outcome_frame(about: Tid, client: Tid, correlation: u64, outcome: Outcome) -> Message {
+    let mut header = Header::new(Kind::OUTCOME, about, client);
+    header.flags = Flags::OUTCOME;
+    header.correlation = correlation;
+    Message::new(header, Bytes::copy_from_slice(&[outcome.code()]))
+}
+
+fn limits(stores: &Stores) -> OutletLimits {
+    let config = &stores.config;
+    OutletLimits {
+        queue_capacity: config.mailbox_capacity,
+        unconfirmed_max: config.mailbox_capacity,
+        payload_max: config.payload_max,
+    }
+}
+
+/// The reading half of a connection.
+struct Reader {
+    buffer: BytesMut,
+    codec: FrameCodec,
+}
+
+impl Reader {
+    fn new(payload_max: usize) -> Self {
+        Self { buffer: BytesMut::new(), codec: FrameCodec::new(payload_max) }
+    }
+
+    fn set_payload_max(&mut self, payload_max: usize) {
+        self.codec = FrameCodec::new(payload_max);
+    }
+
+    /// The next frame; `None` when the peer has closed. May be dropped at any time without losing a byte.
+    async fn next(&mut self, stream: &UnixStream) -> Result<Option<Message>, FrameError> {
+        loop {
+            if let Some(message) = self.codec.decode(&mut self.buffer)? {
+                return Ok(Some(message));
+            }
+            stream.readable().await?;
+            self.buffer.reserve(READ_CHUNK);
+            match stream.try_read_buf(&mut self.buffer) {
+                Ok(0) => return Ok(None),
+                Ok(_) => {}
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+                Err(error) => return Err(error.into()),
+            }
+        }
+    }
+}

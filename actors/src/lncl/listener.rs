@@ -1,0 +1,201 @@
+//! The socket file: made, guarded against a second node, removed again.
+
+use std::{
+    fs::{self, DirBuilder, File, Permissions},
+    io,
+    os::{
+        fd::OwnedFd,
+        unix::{
+            fs::{DirBuilderExt, FileTypeExt, MetadataExt, PermissionsExt},
+            net::UnixListener,
+        },
+    },
+    path::{Path, PathBuf},
+};
+
+use rustix::fs::FlockOperation;
+use socket2::{Domain, SockAddr, Socket, Type};
+
+/// Longest path in bytes; the system's limit is 107, and another platform's less.
+const PATH_MAX: usize = 100;
+/// The owner and the group may connect.
+const SOCKET_MODE: u32 = 0o660;
+const DIRECTORY_MODE: u32 = 0o750;
+/// Connections that wait to be accepted; one that comes after that waits in its `connect`.
+const BACKLOG: i32 = 1_024;
+
+/// Why LNCL cannot listen. The environment or the configuration is at fault; nothing changed.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum ListenError {
+    #[error("the path {0:?} is longer than {PATH_MAX} bytes; set a shorter `lncl.socket`")]
+    TooLong(PathBuf),
+    #[error("{0:?} is there and is not a socket; remove it, or set another `lncl.socket`")]
+    NotASocket(PathBuf),
+    #[error("another node listens at {0:?}; stop it, or set another `lncl.socket`")]
+    InUse(PathBuf),
+    #[error("another node is just starting at {0:?}; set another `lncl.socket` for one of them")]
+    Contended(PathBuf),
+    #[error("cannot {doing} {path:?}: {cause}; see to the permissions there, or set another `lncl.socket`")]
+    System { doing: &'static str, path: PathBuf, cause: io::Error },
+}
+
+/// A socket file that is ours; dropping it removes it.
+#[derive(Debug)]
+pub(crate) struct SocketFile {
+    path: PathBuf,
+    /// Device and inode: what another node has put in its place is not ours to remove.
+    identity: (u64, u64),
+}
+
+impl Drop for SocketFile {
+    fn drop(&mut self) {
+        if identity_of(&self.path).is_ok_and(|found| found == self.identity)
+            && let Err(cause) = fs::remove_file(&self.path)
+        {
+            tracing::warn!(path = ?self.path, %cause, "the socket file is left behind; the next start replaces it");
+        }
+    }
+}
+
+/// Listens at `path`. A file that a killed node left is replaced; one that a living node listens at is not.
+///
+/// # Errors
+/// Why not, with what to do about it.
+pub(crate) fn listen(path: &Path) -> Result<(UnixListener, SocketFile), ListenError> {
+    if path.as_os_str().len() > PATH_MAX {
+        return Err(ListenError::TooLong(path.to_owned()));
+    }
+    let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    DirBuilder::new()
+        .recursive(true)
+        .mode(DIRECTORY_MODE)
+        .create(directory)
+        .map_err(system("create the directory", directory))?;
+    // Held while we look and bind: two nodes that start at once must not both find a dead file and replace it.
+    let _turn = take_turn(directory, path)?;
+    remove_if_dead(path)?;
+    let listener = bind(path)?;
+    let identity = identity_of(path).map_err(system("look at", path))?;
+    Ok((listener, SocketFile { path: path.to_owned(), identity }))
+}
+
+fn take_turn(directory: &Path, path: &Path) -> Result<File, ListenError> {
+    let file = File::open(directory).map_err(system("open", directory))?;
+    match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => Ok(file),
+        Err(rustix::io::Errno::WOULDBLOCK) => Err(ListenError::Contended(path.to_owned())),
+        Err(cause) => Err(system("lock", directory)(cause.into())),
+    }
+}
+
+fn remove_if_dead(path: &Path) -> Result<(), ListenError> {
+    let found = match fs::symlink_metadata(path) {
+        Err(cause) if cause.kind() == io::ErrorKind::NotFound => return Ok(()),
+        other => other.map_err(system("look at", path))?,
+    };
+    if !found.file_type().is_socket() {
+        return Err(ListenError::NotASocket(path.to_owned()));
+    }
+    match probe(path) {
+        Err(cause) if cause.kind() == io::ErrorKind::ConnectionRefused => {
+            tracing::info!(?path, "replacing the socket file that a killed node left");
+            fs::remove_file(path).map_err(system("remove", path))
+        }
+        // `WouldBlock`: somebody listens, and its queue of connections is full.
+        Ok(()) => Err(ListenError::InUse(path.to_owned())),
+        Err(cause) if cause.kind() == io::ErrorKind::WouldBlock => Err(ListenError::InUse(path.to_owned())),
+        Err(cause) => Err(system("connect to", path)(cause)),
+    }
+}
+
+/// Connects without waiting, to see whether anybody listens.
+fn probe(path: &Path) -> io::Result<()> {
+    let socket = Socket::new(Domain::UNIX, Type::STREAM, None)?;
+    socket.set_nonblocking(true)?;
+    socket.connect(&SockAddr::unix(path)?)
+}
+
+fn bind(path: &Path) -> Result<UnixListener, ListenError> {
+    let socket = Socket::new(Domain::UNIX, Type::STREAM, None).map_err(system("make a socket for", path))?;
+    let address = SockAddr::unix(path).map_err(system("bind", path))?;
+    socket.bind(&address).map_err(system("bind", path))?;
+    // Before it listens, so that nobody connects under wider permissions.
+    fs::set_permissions(path, Permissions::from_mode(SOCKET_MODE))
+        .map_err(system("set permissions of", path))?;
+    socket.listen(BACKLOG).map_err(system("listen at", path))?;
+    socket.set_nonblocking(true).map_err(system("listen at", path))?;
+    Ok(UnixListener::from(OwnedFd::from(socket)))
+}
+
+fn identity_of(path: &Path) -> io::Result<(u64, u64)> {
+    fs::symlink_metadata(path).map(|found| (found.dev(), found.ino()))
+}
+
+fn system(doing: &'static str, path: &Path) -> impl Fn(io::Error) -> ListenError {
+    move |cause| ListenError::System { doing, path: path.to_owned(), cause }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lncl::testing::TestDirectory;
+
+    #[test]
+    fn a_socket_file_has_narrow_permissions_and_goes_with_its_owner() {
+        let directory = TestDirectory::new();
+        let path = directory.path().join("made/node.sock");
+        let (_listener, file) = listen(&path).unwrap();
+        let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode() & 0o777;
+        assert_eq!(mode(&path), SOCKET_MODE);
+        assert_eq!(mode(path.parent().unwrap()) & !DIRECTORY_MODE, 0);
+        drop(file);
+        assert!(!path.exists());
+    }
+
+    #[test]
+    fn a_file_that_a_killed_node_left_is_replaced() {
+        let directory = TestDirectory::new();
+        let path = directory.path().join("node.sock");
+        let (listener, file) = listen(&path).unwrap();
+        std::mem::forget(file);
+        drop(listener);
+        assert!(path.exists());
+        listen(&path).unwrap();
+    }
+
+    #[test]
+    fn the_place_of_a_living_node_is_not_taken() {
+        let directory = TestDirectory::new();
+        let path = directory.path().join("node.sock");
+        let (_listener, _file) = listen(&path).unwrap();
+        let refusal = listen(&path).unwrap_err();
+        assert!(refusal.to_string().contains("another node listens"), "{refusal}");
+        assert!(path.exists(), "the living node keeps its file");
+    }
+
+    #[test]
+    fn what_is_not_a_socket_is_not_removed() {
+        let directory = TestDirectory::new();
+        let path = directory.path().join("notes.txt");
+        fs::write(&path, "precious").unwrap();
+        assert!(matches!(listen(&path), Err(ListenError::NotASocket(_))));
+        assert_eq!(fs::read_to_string(&path).unwrap(), "precious");
+    }
+
+    #[test]
+    fn a_successors_file_is_not_removed() {
+        let directory = TestDirectory::new();
+        let path = directory.path().join("node.sock");
+        let (_first_listener, first) = listen(&path).unwrap();
+        fs::remove_file(&path).unwrap();
+        let (_second_listener, _second) = listen(&path).unwrap();
+        drop(first);
+        assert!(path.exists());
+    }
+
+    #[test]
+    fn a_path_that_is_too_long_is_refused_in_words() {
+        let refusal = listen(Path::new(&format!("/tmp/{}", "x".repeat(200)))).unwrap_err();
+        assert!(refusal.to_string().contains("lncl.socket"));
+    }
+}

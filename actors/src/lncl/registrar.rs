@@ -1,0 +1,139 @@
+//! Every change of who is on this node: registry, routing table and sync manager are told together.
+//!
+//! The registry's lock is held over all three, so that they see the changes of one address in one order.
+
+use std::sync::{Arc, MutexGuard, PoisonError};
+
+use sinew_runtime::{
+    router::{LocalRoute, Outlet},
+    tid::{AppAddress, Tid},
+    wire::Kind,
+};
+
+use super::{
+    AppFact,
+    core::{Address, Owner, RegisterError, Registry, Request},
+};
+use crate::{stores::Stores, sync};
+
+/// An application in the node's own process, as the root registers it.
+pub(crate) struct LocalApp {
+    /// Its name; `None` for an application that is known by its address alone.
+    pub(crate) name: Option<String>,
+    /// The fixed address that it wants; `None` for a dynamic one.
+    pub(crate) address: Option<AppAddress>,
+    /// The names that it requires.
+    pub(crate) requires: Vec<String>,
+    /// Names of the payload types that it handles, so that a collision of their ids is found.
+    pub(crate) kinds: Vec<String>,
+    /// What takes its messages.
+    pub(crate) outlet: Arc<dyn Outlet>,
+    /// The layers' events that it wants.
+    pub(crate) events: Arc<[Kind]>,
+}
+
+/// Gives an application of the node's own process its address; messages reach its outlet from now on.
+///
+/// # Errors
+/// Why not; nothing changed.
+pub(crate) fn register_local(stores: &Stores, app: LocalApp) -> Result<Tid, RegisterError> {
+    let LocalApp { name, address, requires, kinds, outlet, events } = app;
+    let address = address.map_or(Address::Dynamic, Address::Fixed);
+    let request = Request { address, name: name.clone(), requires, kinds, owner: Owner::Node };
+    let mut registry = registry(stores);
+    let fact_requires = request.requires.clone();
+    let app = registry.register(request, stores.config.lncl.apps_max)?;
+    stores.router.set_local(app, LocalRoute { outlet, events });
+    tell_sync(stores, AppFact::Registered { app, name, requires: fact_requires });
+    Ok(Tid::new(stores.node, app))
+}
+
+/// The application has started and takes messages.
+pub(crate) fn app_ready(stores: &Stores, app: AppAddress) {
+    tell_sync(stores, AppFact::Ready { app });
+}
+
+/// The application has failed and is not started again yet; it keeps its address and its mailbox.
+pub(crate) fn app_down(stores: &Stores, app: AppAddress) {
+    tell_sync(stores, AppFact::Down { app });
+}
+
+/// Takes the address of an application back.
+pub(crate) fn unregister_local(stores: &Stores, app: AppAddress) {
+    let mut registry = registry(stores);
+    if registry.unregister(app) {
+        forget(stores, app);
+    }
+}
+
+/// The TID that has `name` now, on this node or any.
+pub(crate) fn resolve(stores: &Stores, name: &str) -> Option<Tid> {
+    let here = registry(stores).resolve(name).map(|app| Tid::new(stores.node, app));
+    here.or_else(|| lock_sync(stores).resolve(name))
+}
+
+/// Makes `app` a member of `group`, or no longer one.
+pub(crate) fn set_member(stores: &Stores, app: AppAddress, group: AppAddress, member: bool) {
+    if stores.router.set_member(group, app, member) {
+        tell_sync(stores, AppFact::GroupsChanged);
+    }
+}
+
+/// Whether the application at `app` is in another process, so that LNCL holds it at the barrier and not the root.
+pub(crate) fn is_in_other_process(stores: &Stores, app: AppAddress) -> bool {
+    registry(stores).is_in_other_process(app)
+}
+
+/// Gives an application of another process its address. No message reaches it before [`open`].
+pub(super) fn register_client(stores: &Stores, request: Request) -> Result<AppAddress, RegisterError> {
+    let (name, requires) = (request.name.clone(), request.requires.clone());
+    let mut registry = registry(stores);
+    let app = registry.register(request, stores.config.lncl.apps_max)?;
+    tell_sync(stores, AppFact::Registered { app, name, requires });
+    Ok(app)
+}
+
+/// Messages reach the application of another process from now on.
+pub(super) fn open(stores: &Stores, app: AppAddress, route: LocalRoute) {
+    let _registry = registry(stores);
+    stores.router.set_local(app, route);
+    tell_sync(stores, AppFact::Ready { app });
+}
+
+/// Takes back all that belongs to `owner`.
+pub(super) fn owner_gone(stores: &Stores, owner: Owner) {
+    let mut registry = registry(stores);
+    for app in registry.remove_owner(owner) {
+        forget(stores, app);
+    }
+}
+
+/// Takes back what an earlier life of LNCL's actor left: its connections ended with it.
+pub(super) fn forget_former_clients(stores: &Stores) {
+    let mut registry = registry(stores);
+    for app in registry.in_other_processes() {
+        registry.unregister(app);
+        forget(stores, app);
+    }
+}
+
+/// The registry. Every section under this lock leaves it whole before anything else can panic.
+pub(super) fn registry(stores: &Stores) -> MutexGuard<'_, Registry> {
+    stores.registry.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn lock_sync(stores: &Stores) -> MutexGuard<'_, sync::Core> {
+    stores.sync.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn forget(stores: &Stores, app: AppAddress) {
+    stores.router.remove_local(app);
+    tell_sync(stores, AppFact::Unregistered { app });
+}
+
+fn tell_sync(stores: &Stores, fact: AppFact) {
+    if let Err(event) = stores.posts.sync.post(sync::Event::App(fact)) {
+        // Its post is larger than the number of applications; it is full only if the sync manager hangs.
+        tracing::error!(?event, "the sync manager's post is full and this was not told: does it hang?");
+    }
+}

@@ -1,0 +1,167 @@
+//! The door for other processes: accepts connections, and refuses them in words.
+
+use std::{cell::RefCell, collections::BTreeMap, io, rc::Rc, sync::Arc, time::Duration};
+
+use sinew_runtime::{
+    tid::{AppAddress, Tid},
+    time::Time,
+    wire::{Kind, encode_frame},
+};
+use tokio::{
+    net::{UnixListener, UnixStream, unix::UCred},
+    sync::oneshot,
+    task::{JoinError, JoinSet},
+};
+
+use super::{
+    client::{self, ClientOutlet},
+    core::ClientId,
+    payload::{self, Refusal},
+    registrar,
+};
+use crate::{refusals::Refusals, stores::Stores};
+
+/// First and longest wait after `accept` failed: usually the process has no descriptor left, and needs time to get one.
+const ACCEPT_BACKOFF: (Duration, Duration) = (Duration::from_millis(10), Duration::from_millis(100));
+
+/// What the connections of one life of LNCL's actor share. All of them live on its thread.
+pub(super) struct Server {
+    pub(super) stores: Arc<Stores>,
+    pub(super) refusals: Refusals,
+    /// Who waits at the barrier.
+    releases: RefCell<BTreeMap<AppAddress, oneshot::Sender<()>>>,
+    /// The writing halves of the connections, for what expires in them.
+    outlets: RefCell<BTreeMap<ClientId, Arc<ClientOutlet>>>,
+}
+
+impl Server {
+    pub(super) fn new(stores: Arc<Stores>) -> Rc<Self> {
+        let (releases, outlets) = (RefCell::default(), RefCell::default());
+        Rc::new(Self { stores, refusals: Refusals::default(), releases, outlets })
+    }
+
+    /// Resolves when the barrier opens for `app`.
+    pub(super) fn wait_for_release(&self, app: AppAddress) -> oneshot::Receiver<()> {
+        let (sender, receiver) = oneshot::channel();
+        self.releases.borrow_mut().insert(app, sender);
+        receiver
+    }
+
+    /// `app` waits no more.
+    pub(super) fn forget_release(&self, app: AppAddress) {
+        self.releases.borrow_mut().remove(&app);
+    }
+
+    /// Opens the barrier for `app`. One that waits for nothing is not here and is not missed.
+    pub(super) fn release(&self, app: AppAddress) {
+        let waiting = self.releases.borrow_mut().remove(&app);
+        if let Some(waiting) = waiting {
+            // Its connection has ended this very moment if it does not listen.
+            let _ = waiting.send(());
+        }
+    }
+
+    pub(super) fn add_outlet(&self, id: ClientId, outlet: Arc<ClientOutlet>) {
+        self.outlets.borrow_mut().insert(id, outlet);
+    }
+
+    pub(super) fn remove_outlet(&self, id: ClientId) {
+        self.outlets.borrow_mut().remove(&id);
+    }
+
+    /// Settles messages that expired while their client did not read.
+    pub(super) fn expire(&self, now: Time) {
+        for outlet in self.outlets.borrow().values() {
+            outlet.expire(now);
+        }
+    }
+}
+
+/// Accepts connections for ever, each in a task of its own; dropping this future ends them all.
+pub(super) async fn accept(server: Rc<Server>, listener: UnixListener) {
+    let mut clients = JoinSet::new();
+    let mut backoff = ACCEPT_BACKOFF.0;
+    loop {
+        tokio::select! {
+            Some(ended) = clients.join_next() => report(ended),
+            accepted = listener.accept() => match accepted {
+                Ok((stream, _)) => {
+                    backoff = ACCEPT_BACKOFF.0;
+                    admit(&server, stream, &mut clients);
+                }
+                Err(cause) => {
+                    server.refusals.count(Time::now(), "accept failed", &cause);
+                    tokio::time::sleep(backoff).await;
+                    backoff = (backoff * 2).min(ACCEPT_BACKOFF.1);
+                }
+            },
+        }
+    }
+}
+
+/// A connection's task that panicked has taken its registration back on its way down; the others go on.
+fn report(ended: Result<(), JoinError>) {
+    if let Err(panicked) = ended
+        && panicked.is_panic()
+    {
+        tracing::error!("the task of a client's connection panicked; the connection is closed: {panicked}");
+    }
+}
+
+fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) {
+    let limit = server.stores.config.lncl.clients_max;
+    if clients.len() >= limit {
+        let why =
+            format!("the node serves {limit} connections, which is its limit; raise `lncl.clients_max`");
+        return refuse(server, &stream, "too many clients", &why);
+    }
+    match check_credentials(&stream) {
+        Ok(credentials) => {
+            let server = server.clone();
+            let id = registrar::registry(&server.stores).new_client();
+            clients.spawn_local(client::serve(server, stream, credentials, id));
+        }
+        Err(why) => refuse(server, &stream, "credentials", &why),
+    }
+}
+
+fn check_credentials(stream: &UnixStream) -> Result<UCred, String> {
+    let credentials = stream.peer_cred().map_err(|cause: io::Error| format!("who are you? {cause}"))?;
+    let own = rustix::process::geteuid().as_raw();
+    if admits(own, credentials.uid()) {
+        return Ok(credentials);
+    }
+    let theirs = credentials.uid();
+    Err(format!(
+        "user {theirs} may not use this node: it runs as user {own}; run the application as that user"
+    ))
+}
+
+/// spec: LNCL-2: the user that the node runs as, and root.
+const fn admits(own: u32, theirs: u32) -> bool {
+    theirs == own || theirs == 0
+}
+
+/// Counts a refusal and says it to the peer, as far as its socket takes it at once. The connection is closed by
+/// dropping it.
+pub(super) fn refuse(server: &Server, stream: &UnixStream, cause: &'static str, why: &dyn std::fmt::Display) {
+    server.refusals.count(Time::now(), cause, why);
+    let refusal = Refusal { sentence: why.to_string() };
+    let lncl = payload::lncl_of(server.stores.node);
+    let message = payload::frame(Kind::LNCL_REFUSAL, lncl, Tid::NONE, &refusal);
+    let mut bytes = bytes::BytesMut::new();
+    encode_frame(&message.header, &message.payload, &mut bytes);
+    // Whoever does not read its refusal is closed without one.
+    let _ = stream.try_write(&bytes);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_the_nodes_own_user_and_root_are_admitted() {
+        let (node, root, other) = (1000, 0, 1001);
+        assert!(admits(node, node) && admits(node, root) && !admits(node, other) && !admits(root, other));
+    }
+}
