@@ -354,7 +354,7 @@ impl Actor for Gncl {
 
     fn stopping(&mut self, ctx: &mut Self::Context) -> Running {
         // SYNC: Relaxed; the order to stop came through the supervisor's lock, after the flag was set.
-        if self.stores.leaving.load(Ordering::Relaxed) {
+        if self.stores.stopping.load(Ordering::Relaxed) {
             self.input(Input::LeaveRequested, ctx);
         }
         Running::Stop
