@@ -5,6 +5,7 @@ mod gncl;
 mod lncl;
 mod ndl;
 mod node;
+mod refusals;
 mod stores;
 mod sync;
 

@@ -3,7 +3,7 @@
 use std::{
     collections::BTreeMap,
     net::SocketAddr,
-    sync::{Arc, Mutex, OnceLock, PoisonError},
+    sync::{Arc, Mutex, OnceLock, PoisonError, atomic::AtomicBool},
     time::Duration,
 };
 
@@ -33,8 +33,41 @@ pub(crate) struct Stores {
     pub(crate) gncl_listen: OnceLock<SocketAddr>,
     /// Who is registered on this node.
     pub(crate) registry: Mutex<lncl::Registry>,
+    /// Which nodes are there; a restarted NDL goes on with them.
+    pub(crate) ndl: Mutex<ndl::Core>,
     /// Who is known on other nodes, and what waits for whom.
     pub(crate) sync: Mutex<sync::Core>,
+    /// The node stops in order: set by the root before it stops its layers. A layer that ends while this is not set is
+    /// started again, and must not say goodbye to other nodes.
+    pub(crate) stopping: AtomicBool,
+}
+
+#[cfg(test)]
+impl Stores {
+    /// The stores of a node that has only the layers that a test starts.
+    pub(crate) fn for_test(config: NodeConfig, incarnation: Incarnation) -> Arc<Self> {
+        let node = config.node_address();
+        let ndl = Mutex::new(ndl::new_core(&config, node, incarnation));
+        Arc::new(Self {
+            config,
+            node,
+            incarnation,
+            router: Arc::new(Router::new(node)),
+            posts: Posts {
+                root: Post::new(1_024),
+                lncl: Post::new(1_024),
+                sync: Post::new(1_024),
+                gncl: Post::new(1_024),
+                ndl: Post::new(1_024),
+            },
+            clocks: ClockOffsets::default(),
+            gncl_listen: OnceLock::new(),
+            registry: Mutex::default(),
+            ndl,
+            sync: Mutex::default(),
+            stopping: AtomicBool::new(false),
+        })
+    }
 }
 
 /// The posts of the layers.

@@ -1,0 +1,78 @@
+//! What was refused, counted for each cause, and logged at most once a second for each.
+
+use std::{
+    collections::BTreeMap,
+    fmt::Display,
+    sync::{Mutex, MutexGuard, PoisonError},
+    time::Duration,
+};
+
+use sinew_runtime::time::Time;
+
+/// A peer that sends rubbish at line rate costs one log line a second, not a full disk.
+const LOG_PERIOD: Duration = Duration::from_secs(1);
+
+/// Counters of refusals. The causes are literals of this program, so their number is bounded.
+#[derive(Debug, Default)]
+pub(crate) struct Refusals(Mutex<BTreeMap<&'static str, Cause>>);
+
+#[derive(Debug, Default)]
+struct Cause {
+    count: u64,
+    logged: Option<Time>,
+    suppressed: u64,
+}
+
+impl Refusals {
+    /// Counts one refusal because of `cause`, and logs it with its `detail` unless that cause was logged within the
+    /// last second.
+    pub(crate) fn count(&self, now: Time, cause: &'static str, detail: &dyn Display) {
+        let mut causes = self.causes();
+        let entry = causes.entry(cause).or_default();
+        entry.count += 1;
+        if entry.logged.is_some_and(|logged| now.since(logged) < LOG_PERIOD) {
+            entry.suppressed += 1;
+            return;
+        }
+        entry.logged = Some(now);
+        let suppressed = std::mem::take(&mut entry.suppressed);
+        // Whoever reads the log may be slow: nobody waits for it with the lock in hand.
+        drop(causes);
+        tracing::warn!(cause, suppressed, "refused: {detail}");
+    }
+
+    /// How much was refused.
+    pub(crate) fn total(&self) -> u64 {
+        self.causes().values().map(|cause| cause.count).sum()
+    }
+
+    /// How much was refused because of `cause`.
+    pub(crate) fn of(&self, cause: &'static str) -> u64 {
+        self.causes().get(cause).map_or(0, |cause| cause.count)
+    }
+
+    fn causes(&self) -> MutexGuard<'_, BTreeMap<&'static str, Cause>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_refusal_is_counted_for_its_cause_and_one_a_second_is_logged() {
+        let refusals = Refusals::default();
+        for millis in [0, 1, 999, 1_000] {
+            refusals.count(Time::ZERO + Duration::from_millis(millis), "garbage", &"noise");
+        }
+        refusals.count(Time::ZERO, "too long", &"a whale");
+        assert_eq!((refusals.of("garbage"), refusals.of("too long"), refusals.of("never")), (4, 1, 0));
+        assert_eq!(refusals.total(), 5);
+        let causes = refusals.causes();
+        assert_eq!(
+            (causes["garbage"].suppressed, causes["garbage"].logged),
+            (0, Some(Time::from_nanos(1_000_000_000)))
+        );
+    }
+}
