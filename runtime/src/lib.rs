@@ -10,11 +10,20 @@
 //! | [`outcome`] | and then: what became of a message |
 //! | [`router`] | where to: the table that senders read without a lock |
 //! | [`post`] | events into an actor that outlive it |
+//! | [`mailbox`] | messages into an application that outlive it |
+//! | [`pending`], [`sender`] | sending, and waiting for what comes of it |
+//! | [`schedule`] | what an actor does when |
+//! | [`app`] | what an application is |
 //! | [`supervision`] | who is started, when, and again after a fault |
 
+pub mod app;
+pub mod mailbox;
 pub mod outcome;
+pub mod pending;
 pub mod post;
 pub mod router;
+pub mod schedule;
+pub mod sender;
 pub mod supervision;
 pub mod tid;
 pub mod time;

@@ -1,5 +1,25 @@
 //! Supervision: every layer and every application is a supervised actor.
+//!
+//! | file | what it is |
+//! | --- | --- |
+//! | [`core`] | the decisions, pure |
+//! | `supervisor` | the actix actor that carries them out |
+//! | `guard` | the future around each actor: catches its panics, takes its stop order, reports its end |
+//! | `ready` | when an actor may say that it is ready |
+//! | `threads` | where actors live |
 
+pub mod core;
+#[cfg(test)]
+mod core_tests;
+mod guard;
 mod ready;
+mod supervisor;
+mod threads;
 
-pub use ready::{ReadyGate, ReadyPart};
+pub use self::{
+    core::{Input, Policy, Reason, Restart, Strategy},
+    guard::{Life, life},
+    ready::{ReadyGate, ReadyPart},
+    supervisor::{ChildSpec, Launch, Supervisor, SupervisorFact},
+    threads::{Place, Threads},
+};

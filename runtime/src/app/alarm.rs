@@ -1,0 +1,71 @@
+//! Wakes an actor's task at an exact time: a timerfd of its own, not a wheel of milliseconds.
+
+use std::{
+    io,
+    os::fd::OwnedFd,
+    task::{Context, Poll},
+};
+
+use rustix::time::{
+    Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec, timerfd_create, timerfd_settime,
+};
+use tokio::io::unix::AsyncFd;
+
+use crate::time::Time;
+
+/// One timer of the kernel's, on the monotonic clock.
+#[derive(Debug)]
+pub(super) struct Alarm {
+    timer: AsyncFd<OwnedFd>,
+    set_for: Option<Time>,
+}
+
+impl Alarm {
+    /// A timer that is not set, in the reactor of the calling thread.
+    pub(super) fn new() -> io::Result<Self> {
+        let timer =
+            timerfd_create(TimerfdClockId::Monotonic, TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC)?;
+        #[expect(
+            deprecated,
+            reason = "sound for an OwnedFd, whose descriptor never changes; its successor is an unsafe fn, and unsafe code lives in sinew-shm alone"
+        )]
+        let timer = AsyncFd::new(timer)?;
+        Ok(Self { timer, set_for: None })
+    }
+
+    /// Wakes the task at `at`, or soon if that has passed; never if `at` is `None`.
+    pub(super) fn wake_at(&mut self, at: Option<Time>, cx: &mut Context<'_>) -> io::Result<()> {
+        if at != self.set_for {
+            self.set(at)?;
+        }
+        // A readiness that is left over from an earlier setting is cleared, so that the next expiry is an edge.
+        while let Poll::Ready(guard) = self.timer.poll_read_ready(cx) {
+            let mut guard = guard?;
+            let mut expirations = [0; 8];
+            match rustix::io::read(self.timer.get_ref(), &mut expirations) {
+                Ok(_) => {
+                    self.set_for = None;
+                    // The time has come between the caller's look at the clock and now.
+                    cx.waker().wake_by_ref();
+                    guard.clear_ready();
+                }
+                Err(rustix::io::Errno::AGAIN) => guard.clear_ready(),
+                Err(error) => return Err(error.into()),
+            }
+        }
+        Ok(())
+    }
+
+    fn set(&mut self, at: Option<Time>) -> io::Result<()> {
+        // Zero would mean "never" to the kernel; the first nanosecond after boot means "at once".
+        let nanos = at.map_or(0, |at| at.as_nanos().max(1));
+        let value = Timespec {
+            tv_sec: (nanos / 1_000_000_000).cast_signed(),
+            tv_nsec: (nanos % 1_000_000_000).cast_signed(),
+        };
+        let setting = Itimerspec { it_interval: Timespec { tv_sec: 0, tv_nsec: 0 }, it_value: value };
+        timerfd_settime(self.timer.get_ref(), TimerfdTimerFlags::ABSTIME, &setting)?;
+        self.set_for = at;
+        Ok(())
+    }
+}

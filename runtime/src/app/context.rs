@@ -1,0 +1,267 @@
+//! What an application's handlers can do.
+
+use std::time::Duration;
+
+use actix::{
+    Actor, ActorContext, ActorFuture, ActorState, Addr, AsyncContext, Handler, Message, SpawnHandle,
+    dev::{AsyncContextParts, ContextFut, ContextParts, Envelope, OneshotSender, ToEnvelope},
+};
+
+use crate::{
+    app::Delivery,
+    outcome::{Outcome, Rejection},
+    schedule::{Schedule, Tick, TimerId},
+    sender::{Confirmation, Destination, Reply, SendError, Sender},
+    supervision::ReadyGate,
+    tid::Tid,
+    time::Time,
+    wire::{Kind, Payload},
+};
+
+/// The context of an application's actor: actix's, and what Sinew adds to it.
+pub struct AppContext<A: Actor<Context = Self>> {
+    parts: ContextParts<A>,
+    mailbox: Option<actix::dev::Mailbox<A>>,
+    sender: Sender,
+    pub(super) schedule: Schedule<Action<A>>,
+    pub(super) watches: Vec<Watch<A>>,
+    pub(super) ready: Option<ReadyGate>,
+    /// What the handler says of the message in hand, if it does not take it.
+    pub(super) verdict: Option<Outcome>,
+}
+
+pub(super) type Timer<A> = Box<dyn FnMut(&mut A, Tick, &mut <A as Actor>::Context)>;
+
+type Alert<A> = Box<dyn FnMut(&mut A, Silence, &mut <A as Actor>::Context)>;
+
+/// What a deadline is for.
+pub(super) enum Action<A: Actor> {
+    Call(Timer<A>),
+    CheckWatch(WatchId),
+}
+
+/// Names an input watchdog.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct WatchId(pub(super) usize);
+
+/// An input that has gone silent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Silence {
+    /// Who was expected to send; `None` where anybody may.
+    pub source: Option<Tid>,
+    /// What was expected.
+    pub kind: Kind,
+    /// Time since it came last, or since the watchdog was set.
+    pub silent: Duration,
+    /// How much later than its limit this was noticed.
+    pub lateness: Duration,
+}
+
+pub(super) struct Watch<A: Actor> {
+    pub(super) source: Option<Tid>,
+    pub(super) kind: Kind,
+    pub(super) within: Duration,
+    pub(super) last: Time,
+    /// Has been reported and not heard since.
+    pub(super) silent: bool,
+    /// Out while it runs.
+    pub(super) action: Option<Alert<A>>,
+}
+
+impl<A: Actor<Context = Self>> AppContext<A> {
+    pub(super) fn into_life(sender: Sender, ready: ReadyGate, actor: A) -> ContextFut<A, Self> {
+        let mailbox = actix::dev::Mailbox::default();
+        let mut context = Self {
+            parts: ContextParts::new(mailbox.sender_producer()),
+            mailbox: Some(mailbox),
+            sender,
+            schedule: Schedule::default(),
+            watches: Vec::new(),
+            ready: Some(ready),
+            verdict: None,
+        };
+        let mailbox = context.mailbox.take().expect("it was put there three lines above");
+        ContextFut::new(context, actor, mailbox)
+    }
+
+    /// The TID of this application.
+    #[must_use]
+    pub fn tid(&self) -> Tid {
+        self.sender.tid()
+    }
+
+    /// The sending side of this application, for futures and other threads.
+    #[must_use]
+    pub fn sender(&self) -> Sender {
+        self.sender.clone()
+    }
+
+    /// The TID that has `name` now, on any node.
+    #[must_use]
+    pub fn resolve(&self, name: &str) -> Option<Tid> {
+        self.sender.resolve(name)
+    }
+
+    /// Sends a value; see [`Sender::send`].
+    ///
+    /// # Errors
+    /// Nobody took it.
+    pub fn send<'a, P: Payload>(&self, to: impl Into<Destination<'a>>, value: &P) -> Result<(), SendError> {
+        self.sender.send(to, value)
+    }
+
+    /// Sends a value and wants to know what becomes of it; see [`Sender::send_confirmed`].
+    ///
+    /// # Errors
+    /// Nobody took it.
+    pub fn send_confirmed<'a, P: Payload>(
+        &self,
+        to: impl Into<Destination<'a>>,
+        value: &P,
+        within: Duration,
+    ) -> Result<Confirmation, SendError> {
+        self.sender.send_confirmed(to, value, within)
+    }
+
+    /// Sends a request; see [`Sender::ask`].
+    ///
+    /// # Errors
+    /// Nobody took it.
+    pub fn ask<'a, P: Payload, R: Payload>(
+        &self,
+        to: impl Into<Destination<'a>>,
+        request: &P,
+        within: Duration,
+    ) -> Result<Reply<R>, SendError> {
+        self.sender.ask(to, request, within)
+    }
+
+    /// Answers a request.
+    ///
+    /// # Errors
+    /// The sender of `request` waits for no reply, or nobody took the reply.
+    pub fn reply<P, R: Payload>(&self, request: &Delivery<P>, value: &R) -> Result<(), SendError> {
+        let to = request.reply_to().ok_or(SendError::Rejected(Rejection::Unsupported))?;
+        self.sender.reply(to, value)
+    }
+
+    /// Refuses the message in hand: its sender gets `Rejected(ByHandler)` instead of `Delivered`.
+    pub fn reject(&mut self) {
+        self.verdict = Some(Outcome::Rejected(Rejection::ByHandler));
+    }
+
+    /// Becomes a member of the group called `name`.
+    pub fn join(&self, name: &str) {
+        self.sender.join(name);
+    }
+
+    /// Ends the membership in the group called `name`.
+    pub fn leave(&self, name: &str) {
+        self.sender.leave(name);
+    }
+
+    /// Calls `action` once a period, on a grid that begins one period from now. The first argument's
+    /// [`Tick`] says how late it is and how many turns were missed; missed turns are not made up for.
+    pub fn every(
+        &mut self,
+        period: Duration,
+        action: impl FnMut(&mut A, Tick, &mut Self) + 'static,
+    ) -> TimerId {
+        self.schedule.every(Time::now() + period, period, Action::Call(Box::new(action)))
+    }
+
+    /// Calls `action` once, after `delay`.
+    pub fn after(
+        &mut self,
+        delay: Duration,
+        action: impl FnMut(&mut A, Tick, &mut Self) + 'static,
+    ) -> TimerId {
+        self.schedule.once(Time::now() + delay, Action::Call(Box::new(action)))
+    }
+
+    /// Ends a timer from outside its own action.
+    pub fn cancel(&mut self, timer: TimerId) -> bool {
+        self.schedule.cancel(timer)
+    }
+
+    /// Calls `action` when no `P` has come from `source` (from anybody, if `None`) for `within`, counted from now. It is
+    /// called once for each silence; the next `P` that comes begins a new count.
+    pub fn expect<P: Payload>(
+        &mut self,
+        source: Option<Tid>,
+        within: Duration,
+        action: impl FnMut(&mut A, Silence, &mut Self) + 'static,
+    ) -> WatchId {
+        let id = WatchId(self.watches.len());
+        let now = Time::now();
+        let action: Alert<A> = Box::new(action);
+        let watch = Watch { source, kind: P::KIND, within, last: now, silent: false, action: Some(action) };
+        self.watches.push(watch);
+        self.schedule.once(now + within, Action::CheckWatch(id));
+        id
+    }
+
+    /// Keeps this application from being ready until the gate that is returned is reached: for one that has to
+    /// calibrate first. `None` if it is ready already; call it in `started`.
+    pub fn hold_ready(&mut self) -> Option<ReadyGate> {
+        self.ready.take()
+    }
+}
+
+impl<A: Actor<Context = Self>> ActorContext for AppContext<A> {
+    fn stop(&mut self) {
+        self.parts.stop();
+    }
+
+    fn terminate(&mut self) {
+        self.parts.terminate();
+    }
+
+    fn state(&self) -> ActorState {
+        self.parts.state()
+    }
+}
+
+impl<A: Actor<Context = Self>> AsyncContext<A> for AppContext<A> {
+    fn address(&self) -> Addr<A> {
+        self.parts.address()
+    }
+
+    fn spawn<F>(&mut self, future: F) -> SpawnHandle
+    where
+        F: ActorFuture<A, Output = ()> + 'static,
+    {
+        self.parts.spawn(future)
+    }
+
+    fn wait<F>(&mut self, future: F)
+    where
+        F: ActorFuture<A, Output = ()> + 'static,
+    {
+        self.parts.wait(future);
+    }
+
+    fn waiting(&self) -> bool {
+        self.parts.waiting()
+    }
+
+    fn cancel_future(&mut self, handle: SpawnHandle) -> bool {
+        self.parts.cancel_future(handle)
+    }
+}
+
+impl<A: Actor<Context = Self>> AsyncContextParts<A> for AppContext<A> {
+    fn parts(&mut self) -> &mut ContextParts<A> {
+        &mut self.parts
+    }
+}
+
+impl<A, M> ToEnvelope<A, M> for AppContext<A>
+where
+    A: Actor<Context = Self> + Handler<M>,
+    M: Message<Result: Send> + Send + 'static,
+{
+    fn pack(message: M, answer: Option<OneshotSender<M::Result>>) -> Envelope<A> {
+        Envelope::new(message, answer)
+    }
+}

@@ -1,0 +1,213 @@
+//! The heart of a running application: fires what is due, then hands over one message, then looks at the clock again.
+//!
+//! A backlog cannot starve the timers, because they are looked at before every message; nor the stop order or the other
+//! actors of the thread, because a turn is bounded.
+
+use std::{
+    pin::Pin,
+    task::{Context, Poll},
+};
+
+use actix::{Actor, ActorContext, ActorFuture, Handler};
+
+use crate::{
+    app::{AppContext, Delivery, Raw, Silence, WatchId, alarm::Alarm, context::Action},
+    mailbox::MailboxReader,
+    outcome::{Outcome, Rejection},
+    schedule::Due,
+    time::Time,
+    wire::{Kind, Message, Payload},
+};
+
+/// Messages and timers that are handled before the other tasks of the thread have their turn.
+const TURN_MAX: usize = 64;
+
+/// Decodes a payload and calls its handler.
+pub(super) type Dispatch<A> = fn(&mut A, &mut AppContext<A>, &Message, Time) -> Result<(), Rejection>;
+
+/// Calls `Handler<Delivery<P>>`.
+pub(super) fn dispatch_typed<A, P>(
+    actor: &mut A,
+    context: &mut AppContext<A>,
+    message: &Message,
+    now: Time,
+) -> Result<(), Rejection>
+where
+    A: Actor<Context = AppContext<A>> + Handler<Delivery<P>, Result = ()>,
+    P: Payload,
+{
+    let payload = message.decode::<P>().map_err(|error| {
+        tracing::warn!(tid = %context.tid(), source = %message.header.source, %error, "a payload is refused");
+        Rejection::Malformed
+    })?;
+    actor.handle(Delivery::new(payload, &message.header, now), context);
+    Ok(())
+}
+
+/// Calls `Handler<Delivery<Raw>>`.
+pub(super) fn dispatch_raw<A>(
+    actor: &mut A,
+    context: &mut AppContext<A>,
+    message: &Message,
+    now: Time,
+) -> Result<(), Rejection>
+where
+    A: Actor<Context = AppContext<A>> + Handler<Delivery<Raw>, Result = ()>,
+{
+    actor.handle(Delivery::new(Raw(message.payload.clone()), &message.header, now), context);
+    Ok(())
+}
+
+/// The future, spawned into the actor's context, that drives it.
+pub(super) struct Drive<A: Actor<Context = AppContext<A>>> {
+    reader: MailboxReader,
+    handlers: Vec<(Kind, Dispatch<A>)>,
+    alarm: Option<Alarm>,
+}
+
+impl<A: Actor<Context = AppContext<A>>> Drive<A> {
+    pub(super) const fn new(reader: MailboxReader, handlers: Vec<(Kind, Dispatch<A>)>) -> Self {
+        Self { reader, handlers, alarm: None }
+    }
+
+    /// One turn's step. `Ready(true)`: there may be more to do; `Ready(false)`: the application is to end.
+    fn step(&mut self, actor: &mut A, context: &mut AppContext<A>, task: &mut Context<'_>) -> Poll<bool> {
+        let now = Time::now();
+        if let Some(due) = context.schedule.take_due(now) {
+            fire(actor, context, due, now);
+            return Poll::Ready(true);
+        }
+        match self.reader.poll_take(task) {
+            Poll::Ready(Some(message)) => {
+                self.handle(actor, context, message, now);
+                Poll::Ready(true)
+            }
+            Poll::Ready(None) => Poll::Ready(false),
+            Poll::Pending => {
+                self.sleep(context, task);
+                Poll::Pending
+            }
+        }
+    }
+
+    fn handle(&mut self, actor: &mut A, context: &mut AppContext<A>, mut message: Message, now: Time) {
+        let outcome = if message.header.is_expired(now) {
+            Outcome::Expired
+        } else {
+            note_arrival(context, &message, now);
+            self.dispatch(actor, context, &message, now)
+        };
+        self.reader.finish(outcome);
+        message.settle(outcome);
+    }
+
+    fn dispatch(&self, actor: &mut A, context: &mut AppContext<A>, message: &Message, now: Time) -> Outcome {
+        let handler = self.handlers.iter().find(|(kind, _)| *kind == message.header.kind);
+        let Some((_, dispatch)) = handler else {
+            return Outcome::Rejected(Rejection::UnknownKind);
+        };
+        context.verdict = None;
+        match dispatch(actor, context, message, now) {
+            Ok(()) => context.verdict.take().unwrap_or(Outcome::Delivered),
+            Err(why) => Outcome::Rejected(why),
+        }
+    }
+
+    /// Sets the alarm for the next deadline. An application without deadlines has no timer at all.
+    fn sleep(&mut self, context: &AppContext<A>, task: &mut Context<'_>) {
+        let next = context.schedule.next_due();
+        if self.alarm.is_none() && next.is_some() {
+            self.alarm = Some(Alarm::new().expect("a descriptor for a timer; raise `ulimit -n`"));
+        }
+        if let Some(alarm) = &mut self.alarm {
+            alarm.wake_at(next, task).expect("a timerfd that was made takes a time");
+        }
+    }
+}
+
+impl<A: Actor<Context = AppContext<A>>> ActorFuture<A> for Drive<A> {
+    type Output = ();
+
+    fn poll(
+        self: Pin<&mut Self>,
+        actor: &mut A,
+        context: &mut AppContext<A>,
+        task: &mut Context<'_>,
+    ) -> Poll<()> {
+        let this = self.get_mut();
+        if let Some(ready) = context.ready.take() {
+            // `started` has run and did not ask for more time.
+            ready.reached();
+        }
+        for _ in 0..TURN_MAX {
+            // A handler called `stop` or `wait`: actix has to see that before the next message.
+            if actix::AsyncContext::waiting(context) {
+                task.waker().wake_by_ref();
+                return Poll::Pending;
+            }
+            match this.step(actor, context, task) {
+                Poll::Ready(true) => {}
+                Poll::Ready(false) => {
+                    context.stop();
+                    return Poll::Ready(());
+                }
+                Poll::Pending => return Poll::Pending,
+            }
+        }
+        task.waker().wake_by_ref();
+        Poll::Pending
+    }
+}
+
+fn fire<A>(actor: &mut A, context: &mut AppContext<A>, mut due: Due<Action<A>>, now: Time)
+where
+    A: Actor<Context = AppContext<A>>,
+{
+    match &mut due.action {
+        Action::Call(call) => call(actor, due.tick, context),
+        Action::CheckWatch(id) => check_watch(actor, context, *id, now),
+    }
+    context.schedule.put_back(due);
+}
+
+/// Feeds the input watchdogs.
+fn note_arrival<A>(context: &mut AppContext<A>, message: &Message, now: Time)
+where
+    A: Actor<Context = AppContext<A>>,
+{
+    for (index, watch) in context.watches.iter_mut().enumerate() {
+        let is_it = watch.kind == message.header.kind
+            && watch.source.is_none_or(|source| source == message.header.source);
+        if is_it {
+            watch.last = now;
+            if std::mem::take(&mut watch.silent) {
+                // Only now: while it was silent there was no deadline to keep.
+                context.schedule.once(now + watch.within, Action::CheckWatch(WatchId(index)));
+            }
+        }
+    }
+}
+
+fn check_watch<A>(actor: &mut A, context: &mut AppContext<A>, id: WatchId, now: Time)
+where
+    A: Actor<Context = AppContext<A>>,
+{
+    let watch = &mut context.watches[id.0];
+    let deadline = watch.last + watch.within;
+    if now < deadline {
+        // Heard since the deadline was set: one timer a silence, not one a message.
+        context.schedule.once(deadline, Action::CheckWatch(id));
+        return;
+    }
+    watch.silent = true;
+    let silence = Silence {
+        source: watch.source,
+        kind: watch.kind,
+        silent: now.since(watch.last),
+        lateness: now.since(deadline),
+    };
+    if let Some(mut action) = watch.action.take() {
+        action(actor, silence, context);
+        context.watches[id.0].action = Some(action);
+    }
+}

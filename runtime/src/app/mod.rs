@@ -1,0 +1,15 @@
+//! Applications: actix actors that get typed messages, exact periods and input watchdogs.
+//!
+//! An application is any `Actor<Context = AppContext<Self>>`. It says in its [`AppSpec`] which payloads it handles, and
+//! has a `Handler<Delivery<P>>` for each. Everything that actix gives an actor (spawned futures, `run_later`, an
+//! `Addr`) works as usual.
+
+mod alarm;
+mod context;
+mod delivery;
+mod drive;
+mod spec;
+
+pub use context::{AppContext, Silence, WatchId};
+pub use delivery::{Delivery, Raw};
+pub use spec::{AppSpec, AppWiring, DynApp};

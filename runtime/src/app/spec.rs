@@ -1,0 +1,219 @@
+//! What a node must know of an application before it can start it.
+
+use std::{sync::Arc, time::Duration};
+
+use actix::{Actor, AsyncContext, Handler};
+
+use crate::{
+    app::{
+        AppContext, Delivery, Raw,
+        drive::{Dispatch, Drive, dispatch_raw, dispatch_typed},
+    },
+    mailbox::Mailbox,
+    sender::Sender,
+    supervision::{Launch, Place, Policy, Restart, life},
+    tid::AppAddress,
+    wire::{Kind, Payload},
+};
+
+/// Declares an application: how to make its actor, its name, what it handles, what it requires, where it runs.
+///
+/// ```
+/// use actix::{Actor, Handler};
+/// use serde::{Deserialize, Serialize};
+/// use sinew_runtime::{app::{AppContext, AppSpec, Delivery}, wire::Payload};
+///
+/// #[derive(Serialize, Deserialize)]
+/// struct Angle { degrees: f32 }
+/// impl Payload for Angle { const NAME: &'static str = "demo.angle"; }
+///
+/// struct Knee;
+/// impl Actor for Knee { type Context = AppContext<Self>; }
+/// impl Handler<Delivery<Angle>> for Knee {
+///     type Result = ();
+///     fn handle(&mut self, angle: Delivery<Angle>, _: &mut Self::Context) {
+///         println!("{} degrees, {:?} old", angle.degrees, angle.age);
+///     }
+/// }
+///
+/// let spec = AppSpec::new("knee", || Knee).handles::<Angle>().requires(["hip"]).own_thread();
+/// ```
+pub struct AppSpec<A: Actor<Context = AppContext<A>>> {
+    factory: Arc<dyn Fn() -> A + Send + Sync>,
+    handlers: Vec<(Kind, Dispatch<A>)>,
+    common: Common,
+}
+
+#[derive(Clone)]
+struct Common {
+    name: String,
+    address: Option<AppAddress>,
+    requires: Vec<String>,
+    kinds: Vec<(Kind, &'static str)>,
+    policy: Policy,
+    place: Place,
+}
+
+impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
+    /// An application called `name` (1 to 63 bytes, unique on its node). `factory` makes a new actor for its start and
+    /// for each restart. It runs on the thread that the node's applications share, until a place is set.
+    pub fn new(name: impl Into<String>, factory: impl Fn() -> A + Send + Sync + 'static) -> Self {
+        let common = Common {
+            name: name.into(),
+            address: None,
+            requires: Vec::new(),
+            kinds: Vec::new(),
+            policy: Policy { held: true, ..Policy::default() },
+            place: Place::thread("apps"),
+        };
+        Self { factory: Arc::new(factory), handlers: Vec::new(), common }
+    }
+
+    /// It handles payloads of type `P`. Layers' events are payloads too: to handle `NodeEvent` is to subscribe to it.
+    #[must_use]
+    pub fn handles<P: Payload>(mut self) -> Self
+    where
+        A: Handler<Delivery<P>, Result = ()>,
+    {
+        self.handlers.push((P::KIND, dispatch_typed::<A, P>));
+        self.common.kinds.push((P::KIND, P::NAME));
+        self
+    }
+
+    /// It handles the raw bytes of `kind`.
+    #[must_use]
+    pub fn handles_raw(mut self, kind: Kind) -> Self
+    where
+        A: Handler<Delivery<Raw>, Result = ()>,
+    {
+        self.handlers.push((kind, dispatch_raw::<A>));
+        self.common.kinds.push((kind, "raw"));
+        self
+    }
+
+    /// It starts when all these names are ready, on this node or on any other.
+    #[must_use]
+    pub fn requires<N: Into<String>>(mut self, names: impl IntoIterator<Item = N>) -> Self {
+        self.common.requires.extend(names.into_iter().map(Into::into));
+        self
+    }
+
+    /// It has this address instead of one that LNCL chooses; see [`AppAddress::fixed`].
+    #[must_use]
+    pub fn address(mut self, address: AppAddress) -> Self {
+        self.common.address = Some(address);
+        self
+    }
+
+    /// It has a thread of its own: isolation, for one more thread wake each way.
+    #[must_use]
+    pub fn own_thread(mut self) -> Self {
+        self.common.place = Place::thread(self.common.name.clone());
+        self
+    }
+
+    /// It shares the thread that reads the node's sockets: the lowest latency; its handlers must be short.
+    #[must_use]
+    pub fn on_io_thread(mut self) -> Self {
+        self.common.place = Place::thread(Place::IO);
+        self
+    }
+
+    /// It runs in this place: a thread with a name, and perhaps a real-time priority and a CPU.
+    #[must_use]
+    pub fn place(mut self, place: Place) -> Self {
+        self.common.place = place;
+        self
+    }
+
+    /// When it is started again after it ended. Default: always.
+    #[must_use]
+    pub const fn restart(mut self, restart: Restart) -> Self {
+        self.common.policy.restart = restart;
+        self
+    }
+
+    /// Time that it has for its orderly stop. Default 500 ms.
+    #[must_use]
+    pub const fn stop_within(mut self, time: Duration) -> Self {
+        self.common.policy.stop_within = time;
+        self
+    }
+}
+
+/// An [`AppSpec`] whose actor type is no longer named: what a node keeps.
+pub struct DynApp {
+    common: Common,
+    wire: Box<dyn Fn(AppWiring) -> Launch + Send>,
+}
+
+/// What a node gives to an application.
+#[derive(Clone)]
+pub struct AppWiring {
+    /// How it sends.
+    pub sender: Sender,
+    /// What it receives.
+    pub mailbox: Arc<Mailbox>,
+}
+
+impl<A: Actor<Context = AppContext<A>>> From<AppSpec<A>> for DynApp {
+    fn from(spec: AppSpec<A>) -> Self {
+        let AppSpec { factory, handlers, common } = spec;
+        let wire = move |wiring: AppWiring| {
+            let (factory, handlers) = (factory.clone(), handlers.clone());
+            let launch: Launch = Arc::new(move |ready| {
+                let actor = factory();
+                let drive = Drive::new(wiring.mailbox.attach(), handlers.clone());
+                let mut running = AppContext::into_life(wiring.sender.clone(), ready, actor);
+                running.ctx().spawn(drive);
+                life(running)
+            });
+            launch
+        };
+        Self { common, wire: Box::new(wire) }
+    }
+}
+
+impl DynApp {
+    /// Its name.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.common.name
+    }
+
+    /// The fixed address that it wants.
+    #[must_use]
+    pub const fn address(&self) -> Option<AppAddress> {
+        self.common.address
+    }
+
+    /// The names that it requires.
+    #[must_use]
+    pub fn requires(&self) -> &[String] {
+        &self.common.requires
+    }
+
+    /// What it handles: kinds, with the names of their types.
+    #[must_use]
+    pub fn kinds(&self) -> &[(Kind, &'static str)] {
+        &self.common.kinds
+    }
+
+    /// What its supervisor may do with it.
+    #[must_use]
+    pub const fn policy(&self) -> &Policy {
+        &self.common.policy
+    }
+
+    /// Where it runs.
+    #[must_use]
+    pub const fn place(&self) -> &Place {
+        &self.common.place
+    }
+
+    /// How it is started, on the thread of its place, with what its node gives it.
+    #[must_use]
+    pub fn launch(&self, wiring: AppWiring) -> Launch {
+        (self.wire)(wiring)
+    }
+}

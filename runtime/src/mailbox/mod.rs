@@ -1,0 +1,281 @@
+//! Mailboxes: bounded, outside the actor, outliving its restarts.
+//!
+//! A mailbox belongs to a TID, not to an actor. Any thread puts messages in; the present incarnation of the actor takes
+//! them out. When the actor panics the message in its hand ends as `Failed`, the rest stays and goes to the next
+//! incarnation. Queue and waker stand under one mutex, see [`post`](crate::post).
+
+mod queue;
+
+use std::{
+    sync::{Arc, Mutex},
+    task::{Context, Poll, Waker},
+};
+
+pub use queue::ClassQueue;
+
+use crate::{
+    outcome::{Outcome, Rejection},
+    post::lock,
+    router::{Outlet, Refused},
+    wire::{Class, Message},
+};
+
+/// What became of the messages of one class: `taken = delivered + superseded + rejected + expired + failed + waiting`,
+/// `waiting` being those in the queue and the one in hand.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Tally {
+    /// Accepted by the mailbox.
+    pub taken: u64,
+    /// Not accepted: the queue was full, or the application had ended.
+    pub refused: u64,
+    /// Handled.
+    pub delivered: u64,
+    /// Replaced by a newer value.
+    pub superseded: u64,
+    /// Taken, then refused by the application.
+    pub rejected: u64,
+    /// Too old when their turn came.
+    pub expired: u64,
+    /// In the hand of an actor that panicked or ended.
+    pub failed: u64,
+}
+
+impl Tally {
+    fn count(&mut self, outcome: Outcome) {
+        match outcome {
+            Outcome::Delivered => self.delivered += 1,
+            Outcome::Rejected(_) => self.rejected += 1,
+            Outcome::Expired => self.expired += 1,
+            Outcome::Failed | Outcome::PeerLost | Outcome::Unknown => self.failed += 1,
+        }
+    }
+
+    /// Messages whose fate is still open, by the conservation law.
+    #[must_use]
+    pub const fn open(&self) -> u64 {
+        self.taken - self.delivered - self.superseded - self.rejected - self.expired - self.failed
+    }
+}
+
+/// The mailbox of one TID.
+#[derive(Debug)]
+pub struct Mailbox {
+    shared: Mutex<Shared>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    queue: ClassQueue,
+    waker: Option<Waker>,
+    /// Which reader is the present one.
+    epoch: u64,
+    closed: bool,
+    tallies: [Tally; 3],
+    high_water: usize,
+}
+
+impl Mailbox {
+    /// An empty mailbox that holds at most `capacity` messages of each class.
+    #[must_use]
+    pub fn new(capacity: usize) -> Arc<Self> {
+        let shared = Shared {
+            queue: ClassQueue::new(capacity),
+            waker: None,
+            epoch: 0,
+            closed: false,
+            tallies: [Tally::default(); 3],
+            high_water: 0,
+        };
+        Arc::new(Self { shared: Mutex::new(shared) })
+    }
+
+    /// Takes over the reading end for a new incarnation; the former reader is fenced off.
+    #[must_use]
+    pub fn attach(self: &Arc<Self>) -> MailboxReader {
+        let (epoch, former) = {
+            let mut shared = lock(&self.shared);
+            shared.epoch += 1;
+            (shared.epoch, shared.waker.take())
+        };
+        if let Some(waker) = former {
+            waker.wake();
+        }
+        MailboxReader { mailbox: self.clone(), epoch, in_hand: None, finished: None }
+    }
+
+    /// Refuses everything that waits and everything that comes.
+    pub fn close(&self) {
+        let (waiting, waker) = {
+            let mut shared = lock(&self.shared);
+            shared.closed = true;
+            let waiting: Vec<_> = shared.queue.drain_all().collect();
+            for message in &waiting {
+                shared.tallies[message.header.class as usize].rejected += 1;
+            }
+            (waiting, shared.waker.take())
+        };
+        for message in waiting {
+            message.reject(Rejection::Closed);
+        }
+        if let Some(waker) = waker {
+            waker.wake();
+        }
+    }
+
+    /// Messages that wait now.
+    #[must_use]
+    pub fn depth(&self) -> usize {
+        lock(&self.shared).queue.len()
+    }
+
+    /// The most messages that ever waited at once.
+    #[must_use]
+    pub fn high_water(&self) -> usize {
+        lock(&self.shared).high_water
+    }
+
+    /// What became of the messages of `class`.
+    #[must_use]
+    pub fn tally(&self, class: Class) -> Tally {
+        lock(&self.shared).tallies[class as usize]
+    }
+}
+
+impl Outlet for Mailbox {
+    fn submit(&self, message: Message) -> Result<(), Refused> {
+        let class = message.header.class as usize;
+        let waker = {
+            let mut shared = lock(&self.shared);
+            if shared.closed {
+                shared.tallies[class].refused += 1;
+                return Err(Refused::new(message, Rejection::Closed));
+            }
+            if message.receipt.is_some() && message.header.class == Class::Stream {
+                shared.tallies[class].refused += 1;
+                return Err(Refused::new(message, Rejection::Unsupported));
+            }
+            match shared.queue.push(message) {
+                Ok(superseded) => {
+                    shared.tallies[class].taken += 1;
+                    shared.tallies[class].superseded += u64::from(superseded.is_some());
+                }
+                Err(refused) => {
+                    shared.tallies[class].refused += 1;
+                    return Err(refused);
+                }
+            }
+            shared.high_water = shared.high_water.max(shared.queue.len());
+            shared.waker.take()
+        };
+        // Woken outside the lock, so that the woken thread does not run into it.
+        if let Some(waker) = waker {
+            waker.wake();
+        }
+        Ok(())
+    }
+}
+
+/// The reading end of a [`Mailbox`], owned by one incarnation of an actor.
+#[derive(Debug)]
+pub struct MailboxReader {
+    mailbox: Arc<Mailbox>,
+    epoch: u64,
+    in_hand: Option<Class>,
+    finished: Option<(Class, Outcome)>,
+}
+
+impl MailboxReader {
+    /// Takes the next message into the hand. `None` once the mailbox is closed or a later incarnation reads it.
+    pub fn poll_take(&mut self, cx: &mut Context<'_>) -> Poll<Option<Message>> {
+        let mut shared = lock(&self.mailbox.shared);
+        if let Some((class, outcome)) = self.finished.take() {
+            shared.tallies[class as usize].count(outcome);
+        }
+        if shared.epoch != self.epoch {
+            return Poll::Ready(None);
+        }
+        if let Some(message) = shared.queue.pop() {
+            self.in_hand = Some(message.header.class);
+            return Poll::Ready(Some(message));
+        }
+        if shared.closed {
+            return Poll::Ready(None);
+        }
+        shared.waker = Some(cx.waker().clone());
+        Poll::Pending
+    }
+
+    /// The message in hand has ended so. Counted with the next [`poll_take`](Self::poll_take), under its lock.
+    pub fn finish(&mut self, outcome: Outcome) {
+        if let Some(class) = self.in_hand.take() {
+            self.finished = Some((class, outcome));
+        }
+    }
+}
+
+impl Drop for MailboxReader {
+    fn drop(&mut self) {
+        let mut shared = lock(&self.mailbox.shared);
+        if let Some((class, outcome)) = self.finished.take() {
+            shared.tallies[class as usize].count(outcome);
+        }
+        if let Some(class) = self.in_hand.take() {
+            shared.tallies[class as usize].count(Outcome::Failed);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use bytes::Bytes;
+    use futures_util::task::noop_waker;
+
+    use super::*;
+    use crate::{
+        tid::Tid,
+        wire::{Header, Kind},
+    };
+
+    fn message() -> Message {
+        Message::new(Header::new(Kind::named("test"), Tid::NONE, Tid::NONE), Bytes::new())
+    }
+
+    fn take(reader: &mut MailboxReader) -> Poll<Option<Message>> {
+        reader.poll_take(&mut Context::from_waker(&noop_waker()))
+    }
+
+    #[test]
+    fn messages_behind_a_panic_reach_the_next_incarnation() {
+        let mailbox = Mailbox::new(8);
+        mailbox.submit(message()).unwrap();
+        mailbox.submit(message()).unwrap();
+        let mut first = mailbox.attach();
+        assert!(matches!(take(&mut first), Poll::Ready(Some(_))));
+        drop(first); // as the guard does after a panic
+        let mut second = mailbox.attach();
+        assert!(matches!(take(&mut second), Poll::Ready(Some(_))));
+        second.finish(Outcome::Delivered);
+        assert!(take(&mut second).is_pending());
+        let tally = mailbox.tally(Class::Control);
+        assert_eq!((tally.taken, tally.failed, tally.delivered, tally.open()), (2, 1, 1, 0));
+    }
+
+    #[test]
+    fn a_fenced_reader_gets_nothing() {
+        let mailbox = Mailbox::new(8);
+        let mut zombie = mailbox.attach();
+        let _present = mailbox.attach();
+        mailbox.submit(message()).unwrap();
+        assert!(matches!(take(&mut zombie), Poll::Ready(None)));
+    }
+
+    #[test]
+    fn a_closed_mailbox_refuses_what_waits_and_what_comes() {
+        let mailbox = Mailbox::new(8);
+        mailbox.submit(message()).unwrap();
+        mailbox.close();
+        assert_eq!(mailbox.submit(message()).unwrap_err().why, Rejection::Closed);
+        let tally = mailbox.tally(Class::Control);
+        assert_eq!((tally.taken, tally.rejected, tally.refused, tally.open()), (1, 1, 1, 0));
+    }
+}

@@ -1,0 +1,146 @@
+//! Deadlines of one actor, as a pure table: what is due when, and how late it was.
+
+use std::{collections::BTreeMap, time::Duration};
+
+use crate::time::Time;
+
+/// Names one entry of a [`Schedule`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct TimerId(u64);
+
+/// One firing of a timer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Tick {
+    /// When it was due.
+    pub scheduled: Time,
+    /// How long after that it fired.
+    pub lateness: Duration,
+    /// Periods that passed without a firing of their own, because an earlier one took too long.
+    pub missed: u64,
+    /// The n-th firing, from 1.
+    pub number: u64,
+}
+
+/// Entries in the order in which they are due.
+#[derive(Debug)]
+pub struct Schedule<T> {
+    entries: BTreeMap<(Time, TimerId), Entry<T>>,
+    next_id: u64,
+}
+
+#[derive(Debug)]
+struct Entry<T> {
+    action: T,
+    period: Option<Duration>,
+    fired: u64,
+}
+
+/// An entry that is due, taken out of its schedule so that its owner can be lent to the action.
+#[derive(Debug)]
+pub struct Due<T> {
+    /// What is due.
+    pub action: T,
+    /// When, and how late.
+    pub tick: Tick,
+    id: TimerId,
+    entry: (Time, Option<Duration>),
+}
+
+impl<T> Default for Schedule<T> {
+    fn default() -> Self {
+        Self { entries: BTreeMap::new(), next_id: 0 }
+    }
+}
+
+impl<T> Schedule<T> {
+    /// Adds an action that is due once, at `at`.
+    pub fn once(&mut self, at: Time, action: T) -> TimerId {
+        self.insert(at, None, action)
+    }
+
+    /// Adds an action that is due at `first` and each `period` (at least 1 microsecond) after it.
+    pub fn every(&mut self, first: Time, period: Duration, action: T) -> TimerId {
+        self.insert(first, Some(period.max(Duration::from_micros(1))), action)
+    }
+
+    fn insert(&mut self, at: Time, period: Option<Duration>, action: T) -> TimerId {
+        self.next_id += 1;
+        let id = TimerId(self.next_id);
+        self.entries.insert((at, id), Entry { action, period, fired: 0 });
+        id
+    }
+
+    /// Removes an entry. `false` if there is none: it was due once and has fired, or is being fired.
+    pub fn cancel(&mut self, id: TimerId) -> bool {
+        let key = self.entries.keys().find(|(_, other)| *other == id).copied();
+        key.is_some_and(|key| self.entries.remove(&key).is_some())
+    }
+
+    /// When the next entry is due.
+    #[must_use]
+    pub fn next_due(&self) -> Option<Time> {
+        self.entries.first_key_value().map(|((at, _), _)| *at)
+    }
+
+    /// Takes the earliest entry that is due at `now`.
+    pub fn take_due(&mut self, now: Time) -> Option<Due<T>> {
+        if self.next_due()? > now {
+            return None;
+        }
+        let ((scheduled, id), Entry { action, period, fired }) = self.entries.pop_first()?;
+        let lateness = now.since(scheduled);
+        let missed = period.map_or(0, |period| (lateness.as_nanos() / period.as_nanos()) as u64);
+        let tick = Tick { scheduled, lateness, missed, number: fired + 1 };
+        Some(Due { action, tick, id, entry: (scheduled, period) })
+    }
+
+    /// Puts a periodic entry back for its next turn, on the grid of its period: missed turns are skipped, not made up
+    /// for in a burst. An entry that was due once is dropped.
+    pub fn put_back(&mut self, due: Due<T>) {
+        let (scheduled, Some(period)) = due.entry else { return };
+        let turns = u32::try_from(due.tick.missed + 1).unwrap_or(u32::MAX);
+        let next = scheduled + period * turns;
+        self.entries.insert(
+            (next, due.id),
+            Entry { action: due.action, period: Some(period), fired: due.tick.number },
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const fn us(us: u64) -> Time {
+        Time::from_nanos(us * 1_000)
+    }
+
+    #[test]
+    fn a_late_tick_says_so_and_the_grid_is_kept() {
+        let mut schedule = Schedule::default();
+        schedule.every(us(1_000), Duration::from_micros(1_000), ());
+        let due = schedule.take_due(us(1_030)).unwrap();
+        assert_eq!((due.tick.lateness, due.tick.missed), (Duration::from_micros(30), 0));
+        schedule.put_back(due);
+        assert_eq!(schedule.next_due(), Some(us(2_000)));
+    }
+
+    #[test]
+    fn missed_periods_are_counted_and_not_made_up_for() {
+        let mut schedule = Schedule::default();
+        schedule.every(us(1_000), Duration::from_micros(1_000), ());
+        let due = schedule.take_due(us(4_500)).unwrap();
+        assert_eq!(due.tick.missed, 3);
+        schedule.put_back(due);
+        assert_eq!(schedule.next_due(), Some(us(5_000)));
+        assert!(schedule.take_due(us(4_999)).is_none());
+    }
+
+    #[test]
+    fn a_cancelled_entry_never_fires() {
+        let mut schedule = Schedule::default();
+        let id = schedule.once(us(1), ());
+        assert!(schedule.cancel(id));
+        assert!(schedule.take_due(us(9)).is_none());
+    }
+}

@@ -1,0 +1,333 @@
+//! How an application sends: fire and forget, confirmed, or asking.
+
+use std::{
+    marker::PhantomData,
+    pin::Pin,
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
+    task::{Context, Poll, ready},
+    time::Duration,
+};
+
+use crate::{
+    outcome::{Outcome, Receipt, Rejection, Ticket},
+    pending::{Awaited, Pending, Settlement, Wait},
+    router::Router,
+    tid::{AppAddress, Tid},
+    time::Time,
+    wire::{Class, DecodeError, Flags, Header, Kind, Message, MessageBuffer, Payload},
+};
+
+/// What a node knows of names and groups.
+pub trait Directory: Send + Sync {
+    /// The TID that has `name` now, or `None` if nobody has it.
+    fn resolve(&self, name: &str) -> Option<Tid>;
+
+    /// Makes the application at `app` of this node a member of `group`, or no longer one.
+    fn set_member(&self, app: AppAddress, group: AppAddress, member: bool);
+}
+
+/// Whom a message is for: a TID (an application, a group, everybody) or a name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Destination<'a> {
+    /// By address.
+    Tid(Tid),
+    /// By name, looked up in the directory that all nodes share.
+    Name(&'a str),
+}
+
+impl From<Tid> for Destination<'_> {
+    fn from(tid: Tid) -> Self {
+        Self::Tid(tid)
+    }
+}
+
+impl<'a> From<&'a str> for Destination<'a> {
+    fn from(name: &'a str) -> Self {
+        Self::Name(name)
+    }
+}
+
+/// Why a message was not sent. Nothing changed.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum SendError {
+    /// The directory does not know the name.
+    #[error(
+        "no application is called '{0}' now; require it, so that this application starts when it is there"
+    )]
+    UnknownName(String),
+    /// Nobody took the message.
+    #[error("{0}")]
+    Rejected(#[from] Rejection),
+    /// Too many confirmed messages and requests wait for their end.
+    #[error("too many confirmed messages and requests are under way; wait for some to end")]
+    TooManyWaits,
+}
+
+/// Why a request has no reply.
+#[derive(Debug, thiserror::Error)]
+pub enum AskError {
+    /// It was not sent.
+    #[error(transparent)]
+    Send(#[from] SendError),
+    /// It was sent and not handled.
+    #[error("the request ended as {0:?}")]
+    Ended(Outcome),
+    /// No reply came in time. The request may have been handled.
+    #[error("no reply came within {0:?}")]
+    Deadline(Duration),
+    /// What came is not the reply's type.
+    #[error(transparent)]
+    Malformed(#[from] DecodeError),
+}
+
+/// The sending side of one TID. Clones share it; any thread may use it.
+#[derive(Clone)]
+pub struct Sender(Arc<Shared>);
+
+struct Shared {
+    tid: Tid,
+    router: Arc<Router>,
+    directory: Arc<dyn Directory>,
+    pending: Arc<Pending>,
+    sequence: AtomicU64,
+    payload_max: usize,
+}
+
+impl std::fmt::Debug for Sender {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Sender({})", self.0.tid)
+    }
+}
+
+impl Sender {
+    /// The sending side of `tid`. Payloads above `payload_max` bytes are refused.
+    #[must_use]
+    pub fn new(
+        tid: Tid,
+        router: Arc<Router>,
+        directory: Arc<dyn Directory>,
+        pending: Arc<Pending>,
+        payload_max: usize,
+    ) -> Self {
+        Self(Arc::new(Shared { tid, router, directory, pending, sequence: AtomicU64::new(0), payload_max }))
+    }
+
+    /// The TID that this sends from.
+    #[must_use]
+    pub fn tid(&self) -> Tid {
+        self.0.tid
+    }
+
+    /// The TID that has `name` now, on any node.
+    #[must_use]
+    pub fn resolve(&self, name: &str) -> Option<Tid> {
+        self.0.directory.resolve(name)
+    }
+
+    /// Makes this application a member of the group called `name`: what is sent to [`Tid::group`] reaches it.
+    pub fn join(&self, name: &str) {
+        self.0.directory.set_member(self.0.tid.app, AppAddress::group(name), true);
+    }
+
+    /// Ends the membership.
+    pub fn leave(&self, name: &str) {
+        self.0.directory.set_member(self.0.tid.app, AppAddress::group(name), false);
+    }
+
+    /// Sends a value, in the class of its type. Returns when a queue or a socket has taken it.
+    ///
+    /// # Errors
+    /// Nobody took it.
+    pub fn send<'a, P: Payload>(
+        &self,
+        destination: impl Into<Destination<'a>>,
+        value: &P,
+    ) -> Result<(), SendError> {
+        let message = Message::typed(self.0.tid, self.find(destination.into())?, value);
+        self.dispatch(message)
+    }
+
+    /// Sends a value and wants to know what becomes of it: the returned future ends in exactly one [`Outcome`]. The
+    /// message expires where it waits once it is older than `within`; the future ends as [`Outcome::Unknown`] when
+    /// nobody has said anything by then.
+    ///
+    /// # Errors
+    /// Nobody took it.
+    pub fn send_confirmed<'a, P: Payload>(
+        &self,
+        destination: impl Into<Destination<'a>>,
+        value: &P,
+        within: Duration,
+    ) -> Result<Confirmation, SendError> {
+        let mut message = Message::typed(self.0.tid, self.find(destination.into())?, value);
+        if message.header.class == Class::Stream {
+            // Newest wins, so an older one has no fate of its own.
+            return Err(Rejection::Unsupported.into());
+        }
+        let wait = self.expect_answer(&mut message, Awaited::Outcome, within)?;
+        self.dispatch(message)?;
+        Ok(Confirmation(Deadline::new(wait, within)))
+    }
+
+    /// Sends a request; the returned future ends with the reply, an error, or at the deadline.
+    ///
+    /// # Errors
+    /// Nobody took it.
+    pub fn ask<'a, P: Payload, R: Payload>(
+        &self,
+        destination: impl Into<Destination<'a>>,
+        request: &P,
+        within: Duration,
+    ) -> Result<Reply<R>, SendError> {
+        let mut message = Message::typed(self.0.tid, self.find(destination.into())?, request);
+        message.header.class = Class::Control;
+        message.header.flags = Flags::ASK;
+        let wait = self.expect_answer(&mut message, Awaited::Reply, within)?;
+        self.dispatch(message)?;
+        Ok(Reply { deadline: Deadline::new(wait, within), within, reply: PhantomData })
+    }
+
+    /// Answers a request.
+    ///
+    /// # Errors
+    /// Nobody took the reply, or the message asked for none.
+    pub fn reply<R: Payload>(&self, to: ReplyTo, value: &R) -> Result<(), SendError> {
+        let mut message = Message::typed(self.0.tid, to.source, value);
+        message.header.class = Class::Control;
+        message.header.flags = Flags::REPLY;
+        message.header.correlation = to.correlation;
+        self.dispatch(message)
+    }
+
+    /// Writable memory of `length` bytes for a raw payload of `kind` (the paper's CreateMessage).
+    ///
+    /// # Errors
+    /// The name is unknown, or the payload would be too long.
+    pub fn create_message<'a>(
+        &self,
+        destination: impl Into<Destination<'a>>,
+        kind: Kind,
+        length: usize,
+    ) -> Result<MessageBuffer, SendError> {
+        if length > self.0.payload_max {
+            return Err(Rejection::TooLong.into());
+        }
+        let header = Header::new(kind, self.0.tid, self.find(destination.into())?);
+        Ok(MessageBuffer::new(header, length))
+    }
+
+    /// Sends memory that [`create_message`](Self::create_message) lent (the paper's SendMessage).
+    ///
+    /// # Errors
+    /// Nobody took it.
+    pub fn send_message(&self, buffer: MessageBuffer) -> Result<(), SendError> {
+        self.dispatch(buffer.freeze())
+    }
+
+    fn find(&self, destination: Destination<'_>) -> Result<Tid, SendError> {
+        match destination {
+            Destination::Tid(tid) => Ok(tid),
+            Destination::Name(name) => {
+                self.resolve(name).ok_or_else(|| SendError::UnknownName(name.to_owned()))
+            }
+        }
+    }
+
+    fn expect_answer(
+        &self,
+        message: &mut Message,
+        awaited: Awaited,
+        within: Duration,
+    ) -> Result<Wait, SendError> {
+        let wait = self.0.pending.open(awaited).ok_or(SendError::TooManyWaits)?;
+        message.header.flags = message.header.flags.with(Flags::CONFIRM);
+        message.header.correlation = wait.correlation();
+        message.header.time_to_live_us = u32::try_from(within.as_micros()).unwrap_or(u32::MAX).max(1);
+        let destination = self.0.router.absolute(message.header.destination);
+        let ticket = Ticket { source: self.0.tid, destination, correlation: wait.correlation() };
+        message.receipt = Some(Receipt::new(self.0.pending.clone(), ticket));
+        Ok(wait)
+    }
+
+    fn dispatch(&self, mut message: Message) -> Result<(), SendError> {
+        if message.payload.len() > self.0.payload_max {
+            message.reject(Rejection::TooLong);
+            return Err(Rejection::TooLong.into());
+        }
+        message.header.sequence = self.0.sequence.fetch_add(1, Ordering::Relaxed) + 1;
+        message.header.sent = Time::now();
+        Ok(self.0.router.send(message)?)
+    }
+}
+
+/// Where a reply goes: made from the request that it answers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ReplyTo {
+    pub(crate) source: Tid,
+    pub(crate) correlation: u64,
+}
+
+/// A wait with its deadline. The timer is made at the first poll, on the thread that polls.
+#[derive(Debug)]
+struct Deadline {
+    wait: Wait,
+    within: Duration,
+    timer: Option<Pin<Box<tokio::time::Sleep>>>,
+}
+
+impl Deadline {
+    const fn new(wait: Wait, within: Duration) -> Self {
+        Self { wait, within, timer: None }
+    }
+
+    /// What came, or `None` at the deadline.
+    fn poll(&mut self, cx: &mut Context<'_>) -> Poll<Option<Settlement>> {
+        if let Poll::Ready(settlement) = self.wait.poll_settled(cx) {
+            return Poll::Ready(Some(settlement));
+        }
+        let within = self.within;
+        let timer = self.timer.get_or_insert_with(|| Box::pin(tokio::time::sleep(within)));
+        ready!(timer.as_mut().poll(cx));
+        Poll::Ready(None)
+    }
+}
+
+/// The future outcome of a confirmed message.
+#[derive(Debug)]
+#[must_use = "an outcome that nobody reads is no better than an unconfirmed send"]
+pub struct Confirmation(Deadline);
+
+impl Future for Confirmation {
+    type Output = Outcome;
+
+    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Outcome> {
+        Poll::Ready(match ready!(self.0.poll(cx)) {
+            Some(Settlement::Outcome(outcome)) => outcome,
+            Some(Settlement::Reply(_)) | None => Outcome::Unknown,
+        })
+    }
+}
+
+/// The future reply to a request.
+#[derive(Debug)]
+#[must_use = "a reply that nobody reads need not be asked for"]
+pub struct Reply<R> {
+    deadline: Deadline,
+    within: Duration,
+    reply: PhantomData<fn() -> R>,
+}
+
+impl<R: Payload> Future for Reply<R> {
+    type Output = Result<R, AskError>;
+
+    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Self::Output> {
+        Poll::Ready(match ready!(self.deadline.poll(cx)) {
+            Some(Settlement::Reply(message)) => message.decode().map_err(AskError::from),
+            Some(Settlement::Outcome(outcome)) => Err(AskError::Ended(outcome)),
+            None => Err(AskError::Deadline(self.within)),
+        })
+    }
+}

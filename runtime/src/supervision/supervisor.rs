@@ -1,0 +1,196 @@
+//! The supervisor's shell: an actix actor that carries out what its core decides.
+
+use std::{cell::RefCell, panic::AssertUnwindSafe, rc::Rc, sync::Arc};
+
+use actix::{Actor, ActorContext, AsyncContext, Context, SpawnHandle, StreamHandler};
+
+use crate::{
+    post::Post,
+    supervision::{
+        Life, Place, ReadyGate, Reason, Threads,
+        core::{ChildIndex, Core, Generation, Input, Intensity, Order, Policy, Strategy},
+        guard::{Guard, Leash, words},
+    },
+    time::Time,
+};
+
+/// Makes a new instance of a child, on the child's thread. A panic in it is a failed start.
+pub type Launch = Arc<dyn Fn(ReadyGate) -> Box<dyn Life> + Send + Sync>;
+
+/// One child of a supervisor.
+pub struct ChildSpec {
+    /// Its name, for people.
+    pub name: String,
+    /// What its supervisor may do with it.
+    pub policy: Policy,
+    /// Where it runs.
+    pub place: Place,
+    /// How it is made.
+    pub launch: Launch,
+}
+
+/// What a supervisor says to its owner.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum SupervisorFact {
+    /// This child takes messages.
+    Ready(ChildIndex),
+    /// This child failed or was stopped, and is started again if its turn comes.
+    Failed(ChildIndex, Reason),
+    /// This child is gone for good.
+    Gone(ChildIndex, Reason),
+    /// All children that are wanted and released are ready.
+    AllReady,
+    /// No child lives any more.
+    Ended(Reason),
+}
+
+/// Supervises children; ends when none of them lives any more.
+pub struct Supervisor {
+    name: &'static str,
+    core: Core,
+    children: Vec<ChildSpec>,
+    leashes: Vec<Option<Leash>>,
+    threads: Rc<RefCell<Threads>>,
+    post: Post<Input>,
+    listener: Box<dyn FnMut(SupervisorFact)>,
+    alarm: Option<SpawnHandle>,
+}
+
+/// Events that wait for a supervisor at most. Each child causes a handful; only a fault could fill this.
+const POST_CAPACITY: usize = 16_384;
+
+impl Supervisor {
+    /// A supervisor called `name`, and the post through which it hears. `listener` is told of what happens, on the
+    /// supervisor's thread.
+    pub fn new(
+        name: &'static str,
+        strategy: Strategy,
+        children: Vec<ChildSpec>,
+        threads: Rc<RefCell<Threads>>,
+        listener: impl FnMut(SupervisorFact) + 'static,
+    ) -> (Self, Post<Input>) {
+        let policies = children.iter().map(|child| child.policy.clone()).collect();
+        let post = Post::new(POST_CAPACITY);
+        let supervisor = Self {
+            name,
+            core: Core::new(strategy, Intensity::default(), policies),
+            leashes: children.iter().map(|_| None).collect(),
+            children,
+            threads,
+            post: post.clone(),
+            listener: Box::new(listener),
+            alarm: None,
+        };
+        (supervisor, post)
+    }
+
+    fn feed(&mut self, input: Input, context: &mut Context<Self>) {
+        self.core.handle(Time::now(), input);
+        while let Some(order) = self.core.poll() {
+            self.obey(order, context);
+        }
+        if let Some(alarm) = self.alarm.take() {
+            context.cancel_future(alarm);
+        }
+        if let Some(wake) = self.core.next_wake() {
+            let wait = wake.since(Time::now());
+            self.alarm = Some(context.run_later(wait, |this, context| {
+                this.alarm = None;
+                this.feed(Input::TimePassed, context);
+            }));
+        }
+    }
+
+    fn obey(&mut self, order: Order, context: &mut Context<Self>) {
+        match order {
+            Order::Spawn(index, generation) => self.spawn(index, generation),
+            Order::Stop(index, _) => {
+                if let Some(leash) = &self.leashes[index] {
+                    leash.stop();
+                }
+            }
+            Order::Abandon(index, _) => self.abandon(index),
+            Order::Failed(index, reason) => {
+                let child = &self.children[index].name;
+                if reason.is_failure() {
+                    tracing::error!(supervisor = self.name, child, %reason, "a child failed");
+                }
+                (self.listener)(SupervisorFact::Failed(index, reason));
+            }
+            Order::Ready(index) => {
+                tracing::debug!(supervisor = self.name, child = self.children[index].name, "ready");
+                (self.listener)(SupervisorFact::Ready(index));
+            }
+            Order::Gone(index, reason) => {
+                tracing::info!(supervisor = self.name, child = self.children[index].name, %reason, "gone");
+                (self.listener)(SupervisorFact::Gone(index, reason));
+            }
+            Order::AllReady => (self.listener)(SupervisorFact::AllReady),
+            Order::Ended(reason) => {
+                (self.listener)(SupervisorFact::Ended(reason));
+                context.stop();
+            }
+        }
+    }
+
+    fn spawn(&mut self, index: ChildIndex, generation: Generation) {
+        let child = &self.children[index];
+        let leash = Leash::default();
+        self.leashes[index] = Some(leash.clone());
+        let launch = child.launch.clone();
+        let post = self.post.clone();
+        let thread = self.threads.borrow_mut().get(&child.place);
+        let accepted = thread.spawn_fn(move || start(index, generation, &launch, leash, &post));
+        if !accepted {
+            // The thread ended under us: the next start makes a new one.
+            self.threads.borrow_mut().abandon(&child.place);
+            say(&self.post, Input::Ended(index, generation, Reason::Killed));
+        }
+    }
+
+    fn abandon(&mut self, index: ChildIndex) {
+        if let Some(leash) = self.leashes[index].take() {
+            leash.kill();
+        }
+        let child = &self.children[index];
+        tracing::error!(supervisor = self.name, child = child.name, "abandoned with its thread");
+        self.threads.borrow_mut().abandon(&child.place);
+    }
+}
+
+/// Runs on the child's thread.
+fn start(index: ChildIndex, generation: Generation, launch: &Launch, leash: Leash, post: &Post<Input>) {
+    let ready = {
+        let post = post.clone();
+        ReadyGate::new(move || say(&post, Input::BecameReady(index, generation)))
+    };
+    match std::panic::catch_unwind(AssertUnwindSafe(|| launch(ready))) {
+        Ok(life) => {
+            let post = post.clone();
+            let report = Box::new(move |reason| say(&post, Input::Ended(index, generation, reason)));
+            actix_rt::spawn(Guard::new(life, leash, report));
+        }
+        Err(panic) => say(post, Input::Ended(index, generation, Reason::Panic(words(&*panic)))),
+    }
+}
+
+fn say(post: &Post<Input>, input: Input) {
+    if let Err(lost) = post.post(input) {
+        tracing::error!(?lost, "a supervisor's post is full; its deadlines will notice what it was not told");
+    }
+}
+
+impl Actor for Supervisor {
+    type Context = Context<Self>;
+
+    fn started(&mut self, context: &mut Context<Self>) {
+        context.add_stream(self.post.attach());
+        self.feed(Input::Started, context);
+    }
+}
+
+impl StreamHandler<Input> for Supervisor {
+    fn handle(&mut self, input: Input, context: &mut Context<Self>) {
+        self.feed(input, context);
+    }
+}

@@ -1,0 +1,331 @@
+//! Applications under a supervisor, without any layer: delivery, panics, periods, watchdogs, requests, stop.
+
+#![expect(clippy::unwrap_used, reason = "a test says what failed by failing")]
+
+use std::{
+    cell::RefCell,
+    rc::Rc,
+    sync::{
+        Arc,
+        mpsc::{Receiver, SyncSender, sync_channel},
+    },
+    time::Duration,
+};
+
+use actix::{Actor, ActorContext, AsyncContext, Handler, Running, fut::WrapFuture};
+use serde::{Deserialize, Serialize};
+use sinew_runtime::{
+    app::{AppContext, AppSpec, AppWiring, Delivery, DynApp},
+    mailbox::Mailbox,
+    outcome::{Outcome, Rejection},
+    pending::{AppOutlet, Pending},
+    post::Post,
+    router::{LocalRoute, Router},
+    sender::{Directory, Sender},
+    supervision::{ChildSpec, Input, Policy, Strategy, Supervisor, SupervisorFact, Threads},
+    tid::{AppAddress, NodeAddress, Tid},
+    wire::{Class, Payload},
+};
+
+const NODE: NodeAddress = NodeAddress::new(0x7f00_0001);
+/// No test waits longer than this for anything.
+const DEADLINE: Duration = Duration::from_secs(10);
+
+struct Nobody;
+
+impl Directory for Nobody {
+    fn resolve(&self, _: &str) -> Option<Tid> {
+        None
+    }
+
+    fn set_member(&self, _: AppAddress, _: AppAddress, _: bool) {}
+}
+
+#[derive(Serialize, Deserialize)]
+struct Number(u64);
+
+impl Payload for Number {
+    const NAME: &'static str = "test.number";
+    const CLASS: Class = Class::Bulk;
+}
+
+#[derive(Serialize, Deserialize)]
+struct Unheard;
+
+impl Payload for Unheard {
+    const NAME: &'static str = "test.unheard";
+}
+
+/// A root with applications and nothing else, on a thread of its own.
+struct Bench {
+    router: Arc<Router>,
+    mailboxes: Vec<Arc<Mailbox>>,
+    senders: Vec<Sender>,
+    supervisor: Post<Input>,
+    facts: Receiver<SupervisorFact>,
+}
+
+impl Bench {
+    fn start(apps: Vec<DynApp>) -> Self {
+        let router = Arc::new(Router::new(NODE));
+        let (mut children, mut mailboxes, mut senders) = (Vec::new(), Vec::new(), Vec::new());
+        for (index, app) in apps.into_iter().enumerate() {
+            let mailbox = Mailbox::new(64);
+            let pending = Pending::new(64);
+            let address = AppAddress::fixed(index as u32).unwrap();
+            let sender = Sender::new(
+                Tid::new(NODE, address),
+                router.clone(),
+                Arc::new(Nobody),
+                pending.clone(),
+                1 << 20,
+            );
+            let outlet = Arc::new(AppOutlet { pending, inbox: mailbox.clone() });
+            router.set_local(address, LocalRoute { outlet, events: Arc::new([]) });
+            children.push(ChildSpec {
+                name: app.name().to_owned(),
+                policy: Policy { held: false, ..app.policy().clone() },
+                place: app.place().clone(),
+                launch: app.launch(AppWiring { sender: sender.clone(), mailbox: mailbox.clone() }),
+            });
+            mailboxes.push(mailbox);
+            senders.push(sender);
+        }
+        let (say, facts) = sync_channel(1_000);
+        let (give, given) = sync_channel(1);
+        std::thread::spawn(move || run(children, say, give));
+        let supervisor = given.recv_timeout(DEADLINE).expect("the supervisor's post");
+        Self { router, mailboxes, senders, supervisor, facts }
+    }
+
+    fn wait_for(&self, wanted: &SupervisorFact) {
+        loop {
+            let fact = self.facts.recv_timeout(DEADLINE).unwrap_or_else(|_| panic!("no {wanted:?} came"));
+            if fact == *wanted {
+                return;
+            }
+        }
+    }
+
+    fn stop(self) {
+        self.supervisor.post(Input::StopOrdered).unwrap();
+        while !matches!(self.facts.recv_timeout(DEADLINE).expect("the end"), SupervisorFact::Ended(_)) {}
+    }
+}
+
+fn run(children: Vec<ChildSpec>, say: SyncSender<SupervisorFact>, give: SyncSender<Post<Input>>) {
+    let system = actix::System::new();
+    system.block_on(async move {
+        let threads = Rc::new(RefCell::new(Threads::default()));
+        let listener = move |fact: SupervisorFact| {
+            let is_last = matches!(fact, SupervisorFact::Ended(_));
+            say.send(fact).unwrap();
+            if is_last {
+                actix::System::current().stop();
+            }
+        };
+        let (supervisor, post) = Supervisor::new("test", Strategy::OneForOne, children, threads, listener);
+        supervisor.start();
+        give.send(post).unwrap();
+    });
+    system.run().unwrap();
+}
+
+/// Writes down what it gets; panics at 13 and refuses 99.
+struct Scribe(SyncSender<u64>);
+
+impl Actor for Scribe {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<Number>> for Scribe {
+    type Result = ();
+
+    fn handle(&mut self, number: Delivery<Number>, context: &mut Self::Context) {
+        assert!(number.0 != 13, "thirteen");
+        if number.0 == 99 {
+            context.reject();
+            return;
+        }
+        if number.reply_to().is_some() {
+            context.reply(&number, &Number(number.0 * 2)).unwrap();
+        }
+        self.0.send(number.0).unwrap();
+    }
+}
+
+fn scribe() -> (AppSpec<Scribe>, Receiver<u64>) {
+    let (written, read) = sync_channel(1_000);
+    (AppSpec::new("scribe", move || Scribe(written.clone())).handles::<Number>().own_thread(), read)
+}
+
+#[test]
+fn messages_behind_a_panic_reach_the_new_instance_in_order_behind_the_same_tid() {
+    let (spec, read) = scribe();
+    let bench = Bench::start(vec![spec.into()]);
+    bench.wait_for(&SupervisorFact::Ready(0));
+    for number in [1, 13, 2, 3] {
+        bench.senders[0].send(bench.senders[0].tid(), &Number(number)).unwrap();
+    }
+    let seen: Vec<_> = (0..3).map(|_| read.recv_timeout(DEADLINE).expect("a number")).collect();
+    assert_eq!(seen, [1, 2, 3]);
+    let tally = bench.mailboxes[0].tally(Class::Bulk);
+    assert_eq!((tally.taken, tally.failed), (4, 1));
+    bench.stop();
+}
+
+/// Sends what it is told to and writes down what became of it.
+struct Asker {
+    to: Tid,
+    written: SyncSender<String>,
+}
+
+impl Actor for Asker {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        let (sender, to, written) = (context.sender(), self.to, self.written.clone());
+        let story = async move {
+            for number in [7, 13, 99] {
+                let outcome = sender.send_confirmed(to, &Number(number), DEADLINE).unwrap().await;
+                written.send(format!("{outcome:?}")).unwrap();
+            }
+            let unheard = sender.send_confirmed(to, &Unheard, DEADLINE).unwrap().await;
+            assert_eq!(unheard, Outcome::Rejected(Rejection::UnknownKind));
+            let reply = sender.ask::<_, Number>(to, &Number(21), DEADLINE).unwrap().await;
+            written.send(format!("{}", reply.unwrap().0)).unwrap();
+        };
+        context.spawn(story.into_actor(self));
+    }
+}
+
+#[test]
+fn every_confirmed_send_ends_in_one_outcome_and_requests_get_their_reply() {
+    let (spec, _read) = scribe();
+    let (written, told) = sync_channel(10);
+    let to = Tid::new(NODE, AppAddress::fixed(0).unwrap());
+    let asker = AppSpec::new("asker", move || Asker { to, written: written.clone() });
+    let bench = Bench::start(vec![spec.into(), asker.into()]);
+    let told: Vec<_> = (0..4).map(|_| told.recv_timeout(DEADLINE).expect("an outcome")).collect();
+    assert_eq!(told, ["Delivered", "Failed", "Rejected(ByHandler)", "42"]);
+    bench.stop();
+}
+
+/// Ticks each millisecond, and waits for numbers that stay away.
+struct Watcher(SyncSender<&'static str>);
+
+impl Actor for Watcher {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        context.every(Duration::from_millis(1), |this, tick, _| {
+            if tick.number == 5 {
+                this.0.send("five ticks").unwrap();
+            }
+        });
+        context.expect::<Number>(None, Duration::from_millis(20), |this, silence, _| {
+            assert!(silence.silent >= Duration::from_millis(20));
+            this.0.send("silence").unwrap();
+        });
+    }
+
+    fn stopping(&mut self, _: &mut Self::Context) -> Running {
+        self.0.send("stopping").unwrap();
+        Running::Stop
+    }
+}
+
+impl Handler<Delivery<Number>> for Watcher {
+    type Result = ();
+
+    fn handle(&mut self, _: Delivery<Number>, _: &mut Self::Context) {
+        self.0.send("number").unwrap();
+    }
+}
+
+#[test]
+fn periods_tick_and_each_silence_is_told_once() {
+    let (say, heard) = sync_channel(100);
+    let spec = AppSpec::new("watcher", move || Watcher(say.clone())).handles::<Number>();
+    let bench = Bench::start(vec![spec.into()]);
+    let next = || heard.recv_timeout(DEADLINE).expect("the watcher says something");
+    assert_eq!([next(), next()], ["five ticks", "silence"]);
+    bench.senders[0].send(bench.senders[0].tid(), &Number(1)).unwrap();
+    assert_eq!([next(), next()], ["number", "silence"], "the next silence is a new one");
+    bench.stop();
+    assert_eq!(next(), "stopping");
+}
+
+/// Needs three more periods after it was told to stop, as a drive does that ramps its torque down.
+struct Ramp {
+    left: u32,
+    down: SyncSender<()>,
+}
+
+impl Actor for Ramp {
+    type Context = AppContext<Self>;
+
+    fn stopping(&mut self, context: &mut Self::Context) -> Running {
+        if self.left == 0 {
+            return Running::Stop;
+        }
+        context.every(Duration::from_millis(1), |this, _, context| {
+            this.left = this.left.saturating_sub(1);
+            if this.left == 0 {
+                this.down.try_send(()).ok();
+                context.stop();
+            }
+        });
+        Running::Continue
+    }
+}
+
+#[test]
+fn an_application_may_ramp_down_before_it_stops() {
+    let (down, is_down) = sync_channel(1);
+    let spec = AppSpec::new("drive", move || Ramp { left: 3, down: down.clone() });
+    let bench = Bench::start(vec![spec.into()]);
+    bench.wait_for(&SupervisorFact::Ready(0));
+    bench.stop();
+    is_down.recv_timeout(DEADLINE).expect("the ramp ended before the application did");
+}
+
+/// A backlog of slow messages beside a period.
+struct Busy {
+    handled: u64,
+    say: SyncSender<u64>,
+}
+
+impl Actor for Busy {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        context.every(Duration::from_millis(1), |this, tick, _| {
+            if tick.number == 1 {
+                this.say.send(this.handled).unwrap();
+            }
+        });
+    }
+}
+
+impl Handler<Delivery<Number>> for Busy {
+    type Result = ();
+
+    fn handle(&mut self, number: Delivery<Number>, context: &mut Self::Context) {
+        self.handled += 1;
+        // Never lets its mailbox run empty.
+        context.send(context.tid(), &number.payload).unwrap();
+    }
+}
+
+#[test]
+fn a_backlog_that_never_ends_starves_neither_the_periods_nor_the_stop() {
+    let (say, heard) = sync_channel(1);
+    let spec = AppSpec::new("busy", move || Busy { handled: 0, say: say.clone() }).handles::<Number>();
+    let bench = Bench::start(vec![spec.into()]);
+    bench.wait_for(&SupervisorFact::Ready(0));
+    bench.senders[0].send(bench.senders[0].tid(), &Number(1)).unwrap();
+    heard.recv_timeout(DEADLINE).expect("a tick in the middle of the backlog");
+    assert_eq!(bench.router.refused(), 0);
+    bench.stop();
+}
