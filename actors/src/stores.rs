@@ -13,7 +13,7 @@ use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
 };
 
-use crate::{config::NodeConfig, gncl, lncl, ndl, node, sync};
+use crate::{config::NodeConfig, gncl, lncl, ndl, node, refusals::Refusals, sync};
 
 /// What the layers of one node share.
 pub(crate) struct Stores {
@@ -34,6 +34,8 @@ pub(crate) struct Stores {
     pub(crate) clocks: ClockOffsets,
     /// Address of GNCL's listener, known once it listens; announced by NDL. A restarted GNCL binds it again.
     pub(crate) gncl_listen: OnceLock<SocketAddr>,
+    /// What LNCL, the sync manager and NDL's sockets refused.
+    pub(crate) refusals: Arc<Refusals>,
     /// GNCL's peers with the messages that wait for them, and what GNCL refused.
     pub(crate) gncl: gncl::Store,
     /// Which nodes are there; a restarted NDL goes on with them.
@@ -65,6 +67,7 @@ impl Stores {
             },
             clocks: ClockOffsets::default(),
             gncl_listen: OnceLock::new(),
+            refusals: Arc::default(),
             gncl: gncl::Store::default(),
             ndl: Mutex::new(ndl::new_core(&config, node, incarnation)),
             registry: Mutex::default(),
@@ -100,11 +103,11 @@ pub(crate) struct ClockOffsets(Mutex<BTreeMap<NodeAddress, ClockOffset>>);
 
 /// How far a peer's monotonic clock is from ours.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct ClockOffset {
+pub struct ClockOffset {
     /// Their clock minus ours, in nanoseconds.
-    pub(crate) theirs_minus_ours_ns: i64,
+    pub theirs_minus_ours_ns: i64,
     /// The error is at most this: half the round trip of the best sample.
-    pub(crate) bound: Duration,
+    pub bound: Duration,
 }
 
 impl ClockOffsets {
