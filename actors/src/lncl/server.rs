@@ -27,7 +27,7 @@ const ACCEPT_BACKOFF: (Duration, Duration) = (Duration::from_millis(10), Duratio
 /// What the connections of one life of LNCL's actor share. All of them live on its thread.
 pub(super) struct Server {
     pub(super) stores: Arc<Stores>,
-    pub(super) refusals: Refusals,
+    pub(super) refusals: Arc<Refusals>,
     /// Who waits at the barrier.
     releases: RefCell<BTreeMap<AppAddress, oneshot::Sender<()>>>,
     /// The writing halves of the connections, for what expires in them.
@@ -37,7 +37,8 @@ pub(super) struct Server {
 impl Server {
     pub(super) fn new(stores: Arc<Stores>) -> Rc<Self> {
         let (releases, outlets) = (RefCell::default(), RefCell::default());
-        Rc::new(Self { stores, refusals: Refusals::default(), releases, outlets })
+        let refusals = stores.refusals.clone();
+        Rc::new(Self { stores, refusals, releases, outlets })
     }
 
     /// Resolves when the barrier opens for `app`.

@@ -12,7 +12,6 @@ use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, fut::Wrap
 use sinew_runtime::{
     app::{AppWiring, DynApp},
     mailbox::Mailbox,
-    outcome::Rejection,
     pending::{AppOutlet, Pending},
     post::Post,
     sender::Sender,
@@ -20,16 +19,12 @@ use sinew_runtime::{
         ChildSpec, Input, Launch, Place, Policy, ReadyGate, Reason, Strategy, Supervisor, SupervisorFact,
         Threads, life,
     },
-    tid::{AppAddress, Tid},
+    tid::AppAddress,
 };
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::{NodeEnd, StartError, directory::NodeDirectory};
-use crate::{
-    gncl, lncl, ndl,
-    stores::{Stores, lock},
-    sync,
-};
+use crate::{gncl, lncl, ndl, stores::Stores, sync};
 
 /// Confirmed messages and requests of one application under way at most.
 const WAITS_MAX: usize = 1_024;
@@ -146,7 +141,7 @@ fn layers(stores: &Arc<Stores>, deadline: Duration) -> Vec<ChildSpec> {
         child("LNCL", Place::IO, layer(stores, lncl::Lncl::new)),
         child("sync manager", "sync", layer(stores, sync::SyncManager::new)),
         child("GNCL", Place::IO, layer(stores, gncl::Gncl::new)),
-        child("NDL", "ndl", layer(stores, ndl::Ndl::new)),
+        child("NDL", "ndl", layer(stores, ndl::NdlActor::new)),
     ]
 }
 
@@ -195,7 +190,8 @@ impl Root {
                     tracing::error!(%app, "LNCL's post is full; a client's registration ends at its deadline");
                 }
             }
-            (Some(_), None) => tracing::error!(%app, "released before its supervisor was there"),
+            // The node stops: nothing is started any more.
+            (Some(_), None) => {}
         }
     }
 
@@ -357,7 +353,7 @@ impl Root {
 
     fn stop_layers(&mut self) {
         self.phase = Phase::StoppingLayers;
-        self.stores.leaving.store(true, Ordering::Relaxed);
+        self.stores.stopping.store(true, Ordering::Relaxed);
         match &self.layer_supervisor {
             Some(supervisor) => order(supervisor, Input::StopOrdered),
             // They ended before: what is left is to hear of it.
