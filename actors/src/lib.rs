@@ -1,16 +1,75 @@
 //! Sinew: an actor runtime for distributed control.
+//!
+//! Write control logic as actors. Sinew gives each a 64-bit address, starts it when everything that it needs is ready,
+//! carries its messages to any thread, process or machine with a known outcome, restarts it when it fails, and tells it
+//! when the structure of the system changes.
+//!
+//! # The map
+//!
+//! | for | look at |
+//! | --- | --- |
+//! | a node and its life | [`Node`], [`NodeBuilder`], [`config`] |
+//! | an application in the node's process | [`AppSpec`], [`AppContext`], [`Delivery`], [`payload!`] |
+//! | an application in a process of its own | [`NodeApi`], [`Endpoint`] |
+//! | sending | [`Sender`]: `send`, `send_confirmed`, `ask`; [`Outcome`] |
+//! | events | [`NodeEvent`] (who is there), [`RequirementEvent`] (what is ready) |
+//!
+//! `docs/SEMANTICS.md` says on one page what is promised and what is not.
+//!
+//! # The layers
+//!
+//! `lncl/`, `sync/`, `gncl/`, `ndl/` are the paper's layers. Each is a pure core (bytes and events in, bytes and events
+//! out, time and chance as arguments) and a thin actor around it. `node/` is the root that starts, supervises and stops
+//! them; `stores.rs` is the state that outlives them.
 
-pub mod api;
+// The macro `payload!` names this crate as its users do.
+extern crate self as sinew;
+
 pub mod config;
+
+mod api;
 mod gncl;
 mod lncl;
 mod ndl;
 mod node;
 mod outlet;
+mod payload;
 mod refusals;
 mod stores;
 mod sync;
 
-pub use lncl::RegisterError;
+pub use api::{ApiError, Endpoint, NodeApi, Received, Registration};
+pub use config::{ConfigFaults, NodeConfig};
 pub use ndl::{LossReason, NodeEvent};
+pub use node::{Node, NodeBuilder, NodeEnd, NodeHandle, StartError};
+pub use serde;
+pub use sinew_runtime::{
+    app::{AppContext, AppSpec, Delivery, Raw, Silence},
+    outcome::{Outcome, Rejection},
+    schedule::{Tick, TimerId},
+    sender::{AskError, Confirmation, Destination, Reply, SendError, Sender},
+    supervision::{Place, ReadyGate, Restart},
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    time::Time,
+    wire::{Class, Kind, MessageBuffer, Payload},
+};
 pub use sync::{RequirementEvent, Waiting};
+
+/// Everything that an ordinary program needs, in one line: `use sinew::prelude::*;`
+pub mod prelude {
+    pub use std::time::Duration;
+
+    pub use actix::{
+        Actor, ActorContext, ActorFutureExt, AsyncContext, Handler, Running, fut::WrapFuture,
+    };
+
+    pub use crate::{
+        AppAddress, AppContext, AppSpec, Class, Delivery, Node, NodeAddress, NodeBuilder, NodeConfig, NodeEvent,
+        Outcome, Payload, Place, RequirementEvent, Restart, Silence, StartError, Tick, Tid, Time, payload,
+    };
+}
+
+/// The README's program compiles and runs.
+#[cfg(doctest)]
+#[doc = include_str!("../../README.md")]
+struct Readme;

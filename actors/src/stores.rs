@@ -3,7 +3,7 @@
 use std::{
     collections::BTreeMap,
     net::SocketAddr,
-    sync::{Arc, Mutex, OnceLock, PoisonError},
+    sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError},
     time::Duration,
 };
 
@@ -23,6 +23,8 @@ pub(crate) struct Stores {
     pub(crate) node: NodeAddress,
     /// Which life of the node this is.
     pub(crate) incarnation: Incarnation,
+    /// Tells this start of the node from every other of any node.
+    pub(crate) boot_nonce: u64,
     /// Where messages go.
     pub(crate) router: Arc<Router>,
     /// Events into each layer.
@@ -31,10 +33,52 @@ pub(crate) struct Stores {
     pub(crate) clocks: ClockOffsets,
     /// Address of GNCL's listener, known once it listens; announced by NDL. A restarted GNCL binds it again.
     pub(crate) gncl_listen: OnceLock<SocketAddr>,
+    /// GNCL's peers with the messages that wait for them, and what GNCL refused.
+    pub(crate) gncl: gncl::Store,
     /// Who is registered on this node.
     pub(crate) registry: Mutex<lncl::Registry>,
     /// Who is known on other nodes, and what waits for whom.
     pub(crate) sync: Mutex<sync::Core>,
+}
+
+/// Events that wait for a layer at most. A layer that falls this far behind has a fault of its own.
+const POST_CAPACITY: usize = 8_192;
+
+impl Stores {
+    /// The stores of a node that has not started yet. `boot_nonce` is a number that no other start of any node has.
+    pub(crate) fn new(config: NodeConfig, incarnation: Incarnation, boot_nonce: u64) -> Arc<Self> {
+        let node = config.node_address();
+        Arc::new(Self {
+            node,
+            incarnation,
+            boot_nonce,
+            router: Arc::new(Router::new(node)),
+            posts: Posts {
+                root: Post::new(POST_CAPACITY),
+                lncl: Post::new(POST_CAPACITY),
+                sync: Post::new(POST_CAPACITY),
+                gncl: Post::new(POST_CAPACITY),
+                ndl: Post::new(POST_CAPACITY),
+            },
+            clocks: ClockOffsets::default(),
+            gncl_listen: OnceLock::new(),
+            gncl: gncl::Store::default(),
+            registry: Mutex::default(),
+            sync: Mutex::default(),
+            config,
+        })
+    }
+
+    /// The stores of a node that has only the layers that a test starts.
+    #[cfg(test)]
+    pub(crate) fn for_test(config: NodeConfig, incarnation: Incarnation) -> Arc<Self> {
+        Self::new(config, incarnation, incarnation.0)
+    }
+}
+
+/// Locks a mutex whose data are whole at every instant that a panic can strike.
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// The posts of the layers.

@@ -139,6 +139,12 @@ impl Router {
         }
     }
 
+    /// Whether the application of this node at `app` subscribed to events of this kind.
+    #[must_use]
+    pub fn subscribes(&self, app: AppAddress, kind: Kind) -> bool {
+        self.table.load().local.get(&app).is_some_and(|route| route.events.contains(&kind))
+    }
+
     /// How many messages nobody took.
     #[must_use]
     pub fn refused(&self) -> u64 {

@@ -59,6 +59,12 @@ impl From<Ipv4Addr> for NodeAddress {
     }
 }
 
+impl From<[u8; 4]> for NodeAddress {
+    fn from(octets: [u8; 4]) -> Self {
+        Self(u32::from_be_bytes(octets))
+    }
+}
+
 impl fmt::Display for NodeAddress {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {

@@ -1,8 +1,47 @@
 //! GNCL, the Global Node Communication Layer: moves messages between nodes over TCP, in order.
+//!
+//! Its promise: a message to an application of another node goes out on the one connection to that node, in the order
+//! in which its class was submitted; a short break loses nothing that was not sent yet; and a confirmed message has
+//! exactly one outcome, whatever breaks. `docs/protocol/gncl.md` has every byte. The rules, cited in the code:
+//!
+//! | rule | what it says |
+//! | --- | --- |
+//! | GNCL-1 | Whoever NDL finds is dialled at once; both sides may dial, one link remains. |
+//! | GNCL-2 | The dialler's first frame is HELLO, answered by WELCOME or REFUSAL, all within the handshake time. |
+//! | GNCL-3 | What is refused is refused in words, on both sides, counted, and closes that connection only. |
+//! | GNCL-4 | A HELLO that meets an own HELLO on its way is refused by the lower node address and taken by the higher, which drops its own. |
+//! | GNCL-5 | A HELLO from a linked peer replaces the link: the peer knows better that the old one is dead. |
+//! | GNCL-6 | Dials are numbered; a WELCOME voids its sender's dials so far, and a void HELLO is refused. |
+//! | GNCL-7 | A newer incarnation ends all that belongs to the older; an older one is refused. |
+//! | GNCL-8 | After a break both dial again: waits double from `redial_min` to `redial_max`, 20 % jitter, until NodeLost. |
+//! | GNCL-9 | A link on which nothing comes is pinged every second; after 3 unanswered pings it is broken. |
+//! | GNCL-10 | GOODBYE is the last frame of a node that leaves; it is not dialled again until it is found again. |
+//! | GNCL-11 | A frame's source must be on the peer's node and its destination on this one; times are turned into our clock. |
+//! | GNCL-12 | CONFIRM is answered by OUTCOME on the peer's present connection. |
+//! | GNCL-13 | When a connection ends, what was sent and not confirmed is `Unknown`; what was not sent waits until NodeLost. |
+//!
+//! | file | what it is |
+//! | --- | --- |
+//! | `core/` | who dials, who is refused, which link stays: no socket, no clock |
+//! | `peer.rs` | what a peer is to senders: its outlet, which outlives connections and this layer's restarts |
+//! | `link.rs` | the reading half of a connection |
+//! | `inbound.rs` | what is checked before a frame becomes a message of this node |
+//! | `listener.rs` | the accepting socket |
+//! | `actor.rs` | the shell that ties them together |
 
+mod actor;
+mod core;
 mod facts;
+mod inbound;
+mod link;
+mod listener;
+mod peer;
+#[cfg(test)]
+mod tests;
 
+pub(crate) use actor::Gncl;
 pub(crate) use facts::LinkFact;
+pub(crate) use peer::{Peer, Store};
 
 use crate::ndl::MembershipFact;
 
@@ -11,4 +50,6 @@ use crate::ndl::MembershipFact;
 pub(crate) enum Event {
     /// By NDL: who is there.
     Membership(MembershipFact),
+    /// By the root: the node stops in order. Says goodbye to every peer; no connection is made or taken after it.
+    Leave,
 }

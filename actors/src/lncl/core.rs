@@ -59,7 +59,7 @@ pub(crate) struct Request {
 
 /// Why an application was not registered. Nothing changed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum RegisterError {
+pub(crate) enum RegisterError {
     /// The caller's name is empty, too long or has control characters in it.
     #[error("the name {0:?} cannot be used: 1 to 63 bytes without control characters are allowed")]
     BadName(String),
@@ -208,11 +208,6 @@ impl Registry {
     pub(crate) fn name_of(&self, app: AppAddress) -> String {
         let name = self.apps.get(&app).and_then(|entry| entry.name.clone());
         name.unwrap_or_else(|| app.to_string())
-    }
-
-    /// Whether `app` is in another process.
-    pub(crate) fn is_in_other_process(&self, app: AppAddress) -> bool {
-        self.apps.get(&app).is_some_and(|entry| entry.owner != Owner::Node)
     }
 
     /// How many applications there are.

@@ -178,7 +178,7 @@ impl<S: Socket> Half<S> {
 
     pub(super) fn end(&mut self, in_hand: Outcome, why: Rejection, after: &mut After) {
         after.settle.extend(self.sent_receipts.drain(..).map(|receipt| (receipt, in_hand)));
-        self.disconnect(LinkNumber(self.number), after);
+        self.cut(after);
         let waiting: Vec<_> = self.interrupted.take().into_iter().chain(self.queue.drain_all()).collect();
         for message in waiting {
             self.counts.lost += 1;

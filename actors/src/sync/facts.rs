@@ -1,9 +1,12 @@
 //! What the sync manager says to applications and to the node's root.
 
-use std::time::Duration;
+use std::{fmt, time::Duration};
 
 use serde::{Deserialize, Serialize};
-use sinew_runtime::wire::{Class, Payload};
+use sinew_runtime::{
+    tid::Tid,
+    wire::{Class, Payload},
+};
 
 /// A requirement changed. Applications that require something and handle this payload get it from their node's sync
 /// manager.
@@ -21,6 +24,16 @@ pub enum RequirementEvent {
     },
 }
 
+impl RequirementEvent {
+    /// The name that is lost or met.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        match self {
+            Self::Lost { name } | Self::Met { name } => name,
+        }
+    }
+}
+
 impl Payload for RequirementEvent {
     const NAME: &'static str = "sinew.requirement_event";
     const CLASS: Class = Class::Control;
@@ -31,9 +44,31 @@ impl Payload for RequirementEvent {
 pub struct Waiting {
     /// The application's name, or its address where it has none.
     pub application: String,
-    /// The names that are not ready, and the last that is known of each: `never seen`, `registered, not ready`,
-    /// `its node was lost`.
+    /// The names that are not ready, and the last that is known of each: `registered, not ready`, `failed, not ready
+    /// again`, `its node is linked again, its directory has not come yet`, `its link is down`, `its node left`, `its
+    /// node was lost`, `unregistered`, `never seen`, `part of a cycle of requirements`.
     pub missing: Vec<(String, &'static str)>,
     /// How long it has waited.
     pub since: Duration,
+}
+
+impl fmt::Display for Waiting {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} has waited {:.1} s for", self.application, self.since.as_secs_f64())?;
+        for (place, (name, why)) in self.missing.iter().enumerate() {
+            write!(f, "{} {name} ({why})", if place == 0 { "" } else { "," })?;
+        }
+        Ok(())
+    }
+}
+
+/// An application that has a name, on this node or on another.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DirectoryEntry {
+    /// Its name.
+    pub name: String,
+    /// Its address.
+    pub tid: Tid,
+    /// Whether it has started, takes messages, and can be reached now.
+    pub ready: bool,
 }

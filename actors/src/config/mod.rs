@@ -1,4 +1,15 @@
 //! Configuration of a node: one struct a layer, safe defaults, every fault reported together.
+//!
+//! It comes from code ([`NodeConfig::new`]) or from TOML ([`NodeConfig::from_toml`], [`NodeConfig::from_file`]);
+//! `docs/CONFIGURATION.md` has a complete file. Whichever way it came, the same check decides whether it is legal.
+
+mod check;
+mod faults;
+mod file;
+#[cfg(test)]
+mod tests;
+
+pub use faults::{ConfigFault, ConfigFaults};
 
 use std::{
     net::{Ipv4Addr, SocketAddr, SocketAddrV4},
@@ -11,17 +22,19 @@ use sinew_runtime::tid::NodeAddress;
 /// Everything that can be set about a node.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NodeConfig {
-    /// Name of the node, for people: `knee`. 1 to 63 bytes. No default.
+    /// Name of the node, for people: `knee`. 1 to 63 bytes, no control characters. No default.
     pub name: String,
-    /// Project that the node belongs to; nodes of other projects are not seen. 1 to 63 bytes. Default `sinew`.
+    /// Project that the node belongs to; nodes of other projects are not seen. 1 to 63 bytes, no control characters.
+    /// Default `sinew`.
     pub project: String,
-    /// Address of the node, unique in the project. Default: the address of [`NdlConfig::interface`]; set it by hand
-    /// where several nodes share a host.
+    /// Address of the node, unique in the project: not 0.0.0.0 (here) and not 255.255.255.255 (every node). Default: the
+    /// address of [`NdlConfig::interface`]; set it by hand where several nodes share a host.
     pub address: Option<NodeAddress>,
     /// Messages that an application's mailbox holds at most, each class by itself. 1 to 65,536; default 256. Memory:
     /// the longest payload times this times three, for each application, at the very worst.
     pub mailbox_capacity: usize,
-    /// Longest payload in bytes. 64 to 64 MiB; default 1 MiB. A peer can make the node hold this much a connection.
+    /// Longest payload in bytes. 64 to 64 MiB; default 1 MiB. A peer can make the node hold this much a connection. All
+    /// nodes of a project should have the same.
     pub payload_max: usize,
     /// Local Node Communication Layer.
     pub lncl: LnclConfig,
@@ -36,7 +49,7 @@ pub struct NodeConfig {
 /// Local Node Communication Layer: the applications of this host.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LnclConfig {
-    /// Path of the unix socket for applications in other processes; at most 100 bytes. Default: none, no such door.
+    /// Path of the unix socket for applications in other processes; 1 to 100 bytes. Default: none, no such door.
     pub socket: Option<PathBuf>,
     /// Connections of other processes at most, one for each registered address. 1 to 4,096; default 256.
     pub clients_max: usize,
@@ -64,16 +77,18 @@ pub struct GnclConfig {
 /// Node Discovery Layer: who is there, who is gone.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NdlConfig {
-    /// Address of the network interface that the node uses. Default: loopback, so that nothing leaves the host.
+    /// Address of the network interface that the node uses: one address of this host, not 0.0.0.0. Default: loopback,
+    /// so that nothing leaves the host.
     pub interface: Ipv4Addr,
     /// UDP port for queries and answers. Default 0: any free one; set it where other nodes list this one as a seed.
     pub port: u16,
-    /// Multicast group of the cyclic query; `None` switches it off. Default 239.255.83.119:6910, never routed
-    /// (time to live 1).
+    /// Multicast group (224.0.0.0 to 239.255.255.255) and port of the cyclic query; `None` switches it off. Default
+    /// 239.255.83.119:6910, never routed (time to live 1).
     pub multicast: Option<SocketAddrV4>,
     /// Port of multicast DNS; `None` switches it off. Default 5353, the port of RFC 6762.
     pub mdns_port: Option<u16>,
-    /// UDP addresses of nodes to ask in any case, for networks without multicast. At most 256; default none.
+    /// UDP addresses of nodes to ask in any case, for networks without multicast. At most 256, each with a port;
+    /// default none.
     pub seeds: Vec<SocketAddr>,
     /// Time between two queries. 10 ms to 60 s; default 500 ms, the paper's. Detection takes `period` times
     /// `missed_max`, and up to one period more.

@@ -1,0 +1,72 @@
+//! Times of many round trips, and the JSON line that says them.
+
+use std::time::Duration;
+
+use hdrhistogram::Histogram;
+use serde_json::json;
+
+/// Round trips that are not counted.
+pub(crate) const WARM_UP: u64 = 1_000;
+/// Round trips that are.
+pub(crate) const ROUNDS: u64 = 20_000;
+
+/// The times of one run.
+pub(crate) struct Figures(Histogram<u64>);
+
+impl Figures {
+    pub(crate) fn new() -> Self {
+        Self(
+            Histogram::new_with_bounds(1, 10_000_000_000, 3)
+                .expect("bounds of 1 ns to 10 s with three digits"),
+        )
+    }
+
+    pub(crate) fn record(&mut self, time: Duration) {
+        self.0.saturating_record(u64::try_from(time.as_nanos()).unwrap_or(u64::MAX));
+    }
+
+    fn us(&self, quantile: f64) -> f64 {
+        self.0.value_at_quantile(quantile) as f64 / 1_000.0
+    }
+}
+
+/// Prints the line that every bench of Sinew prints.
+pub(crate) fn report(
+    bench: &str,
+    case: &str,
+    payload_bytes: usize,
+    pinning: &str,
+    seen: &Figures,
+    reference: &str,
+    raw: &Figures,
+) {
+    let line = json!({
+        "bench": bench,
+        "case": case,
+        "payload_bytes": payload_bytes,
+        "pinning": pinning,
+        "rounds": seen.0.len(),
+        "p50_us": round(seen.us(0.5)),
+        "p99_us": round(seen.us(0.99)),
+        "p999_us": round(seen.us(0.999)),
+        "max_us": round(seen.us(1.0)),
+        "reference": reference,
+        "reference_p50_us": round(raw.us(0.5)),
+        "reference_p99_us": round(raw.us(0.99)),
+        "ratio_p50": round(seen.us(0.5) / raw.us(0.5)),
+    });
+    println!("{line}");
+}
+
+fn round(value: f64) -> f64 {
+    (value * 100.0).round() / 100.0
+}
+
+/// The machine, in a line.
+pub(crate) fn machine() -> String {
+    let cpus = std::thread::available_parallelism().map_or(0, usize::from);
+    let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let model = info.lines().find_map(|line| line.strip_prefix("model name")).unwrap_or(": unknown");
+    let kernel = std::fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
+    format!("{cpus} CPUs, {}, Linux {}", model.trim_start_matches([':', ' ', '\t']), kernel.trim())
+}

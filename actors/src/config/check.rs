@@ -1,0 +1,198 @@
+//! The legal range of every setting, checked at once for a configuration from code or from TOML.
+
+use std::{
+    net::{Ipv4Addr, SocketAddr, SocketAddrV4},
+    path::Path,
+    time::Duration,
+};
+
+use super::{ConfigFault, ConfigFaults, NodeConfig, faults::quoted};
+use crate::sync::NAME_BYTES_MAX;
+
+/// Longest path of a unix socket in bytes: what every system takes, with the closing zero.
+const SOCKET_BYTES_MAX: usize = 100;
+/// Seeds at most.
+const SEEDS_MAX: usize = 256;
+
+/// A setting that is a number.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Range {
+    /// Its name in a file: `section.key`.
+    pub(super) key: &'static str,
+    /// Smallest legal value.
+    pub(super) low: u64,
+    /// Largest legal value.
+    pub(super) high: u64,
+    unit: &'static str,
+}
+
+const fn range(key: &'static str, low: u64, high: u64, unit: &'static str) -> Range {
+    Range { key, low, high, unit }
+}
+
+pub(super) const MAILBOX_CAPACITY: Range = range("node.mailbox_capacity", 1, 65_536, "messages");
+pub(super) const PAYLOAD_MAX: Range = range("node.payload_max", 64, 64 << 20, "bytes");
+pub(super) const CLIENTS_MAX: Range = range("lncl.clients_max", 1, 4_096, "connections");
+pub(super) const APPS_MAX: Range = range("lncl.apps_max", 1, 65_536, "applications");
+pub(super) const GNCL_PORT: Range = range("gncl.port", 0, 65_535, "(0: any free port)");
+pub(super) const QUEUE_CAPACITY: Range = range("gncl.queue_capacity", 1, 65_536, "messages");
+pub(super) const STRANGERS_MAX: Range = range("gncl.strangers_max", 1, 1_024, "connections");
+pub(super) const HANDSHAKE: Range = range("gncl.handshake_ms", 10, 60_000, "ms");
+pub(super) const REDIAL_MIN: Range = range("gncl.redial_min_ms", 1, 10_000, "ms");
+pub(super) const REDIAL_MAX: Range = range("gncl.redial_max_ms", 1, 60_000, "ms");
+pub(super) const NDL_PORT: Range = range("ndl.port", 0, 65_535, "(0: any free port)");
+pub(super) const MDNS_PORT: Range = range("ndl.mdns_port", 1, 65_535, "or false");
+pub(super) const PERIOD: Range = range("ndl.period_ms", 10, 60_000, "ms");
+pub(super) const MISSED_MAX: Range = range("ndl.missed_max", 2, 100, "answers");
+pub(super) const NODES_MAX: Range = range("ndl.nodes_max", 1, 65_536, "nodes");
+pub(super) const LAYER_DEADLINE: Range = range("sync.layer_deadline_ms", 10, 600_000, "ms");
+pub(super) const REQUIREMENT_DEADLINE: Range = range("sync.requirement_deadline_ms", 10, 86_400_000, "ms");
+
+impl Range {
+    /// The fault that `found` is, where it is outside of this range.
+    pub(super) fn fault(&self, found: String) -> ConfigFault {
+        let Self { key, low, high, unit } = self;
+        let remedy = format!("set {key} to a number from {low} to {high}");
+        fault(key, found, format!("{low} to {high} {unit}"), remedy)
+    }
+
+    fn count(&self, faults: &mut Vec<ConfigFault>, found: usize) {
+        if !(self.low..=self.high).contains(&(found as u64)) {
+            faults.push(self.fault(found.to_string()));
+        }
+    }
+
+    fn time(&self, faults: &mut Vec<ConfigFault>, found: Duration) {
+        if found < Duration::from_millis(self.low) || found > Duration::from_millis(self.high) {
+            faults.push(self.fault(format!("{found:?}")));
+        }
+    }
+}
+
+pub(super) fn fault(
+    key: &str,
+    found: String,
+    legal: impl Into<String>,
+    remedy: impl Into<String>,
+) -> ConfigFault {
+    ConfigFault { key: key.to_owned(), line: None, found, legal: legal.into(), remedy: remedy.into() }
+}
+
+impl NodeConfig {
+    /// Checks every setting and how they go together. A node is built from a checked configuration only.
+    ///
+    /// # Errors
+    /// All faults, not just the first one.
+    ///
+    /// ```
+    /// use sinew::config::NodeConfig;
+    /// let mut config = NodeConfig::new("knee");
+    /// config.ndl.missed_max = 0;
+    /// let faults = config.validate().unwrap_err().to_string();
+    /// assert!(faults.starts_with("ndl.missed_max: found 0; legal is 2 to 100 answers"));
+    /// ```
+    pub fn validate(&self) -> Result<(), ConfigFaults> {
+        let mut faults = Vec::new();
+        self.check_node(&mut faults);
+        self.check_lncl(&mut faults);
+        self.check_gncl(&mut faults);
+        self.check_ndl(&mut faults);
+        LAYER_DEADLINE.time(&mut faults, self.sync.layer_deadline);
+        REQUIREMENT_DEADLINE.time(&mut faults, self.sync.requirement_deadline);
+        ConfigFaults::check(faults)
+    }
+
+    fn check_node(&self, faults: &mut Vec<ConfigFault>) {
+        check_name(faults, "node.name", &self.name);
+        check_name(faults, "node.project", &self.project);
+        if let Some(address) = self.address.filter(|address| !address.is_single()) {
+            let legal = "an address of one node, as in 10.0.0.7";
+            let remedy =
+                "choose one that no other node of the project has, or leave it out for the interface's";
+            faults.push(fault("node.address", quoted(&address.to_string()), legal, remedy));
+        }
+        MAILBOX_CAPACITY.count(faults, self.mailbox_capacity);
+        PAYLOAD_MAX.count(faults, self.payload_max);
+    }
+
+    fn check_lncl(&self, faults: &mut Vec<ConfigFault>) {
+        if let Some(socket) = self.lncl.socket.as_deref().filter(|socket| !is_socket_path(socket)) {
+            let legal = format!("a path of 1 to {SOCKET_BYTES_MAX} bytes, or false");
+            let remedy = "choose a shorter path, as in /run/sinew/knee.sock";
+            faults.push(fault("lncl.socket", quoted(&socket.to_string_lossy()), legal, remedy));
+        }
+        CLIENTS_MAX.count(faults, self.lncl.clients_max);
+        APPS_MAX.count(faults, self.lncl.apps_max);
+    }
+
+    fn check_gncl(&self, faults: &mut Vec<ConfigFault>) {
+        let gncl = &self.gncl;
+        QUEUE_CAPACITY.count(faults, gncl.queue_capacity);
+        STRANGERS_MAX.count(faults, gncl.strangers_max);
+        HANDSHAKE.time(faults, gncl.handshake);
+        REDIAL_MIN.time(faults, gncl.redial_min);
+        let before = faults.len();
+        REDIAL_MAX.time(faults, gncl.redial_max);
+        // A value that is out of its own range is one fault, not two.
+        if faults.len() == before && gncl.redial_max < gncl.redial_min {
+            let legal = format!("gncl.redial_min_ms ({:?}) to {} ms", gncl.redial_min, REDIAL_MAX.high);
+            let remedy = "raise gncl.redial_max_ms or lower gncl.redial_min_ms";
+            faults.push(fault(REDIAL_MAX.key, format!("{:?}", gncl.redial_max), legal, remedy));
+        }
+    }
+
+    fn check_ndl(&self, faults: &mut Vec<ConfigFault>) {
+        let ndl = &self.ndl;
+        if !is_host_address(ndl.interface) {
+            let legal = "one address of this host, as in 127.0.0.1 or 192.168.1.7";
+            let remedy = "name the interface that the other nodes reach (see `ip address`)";
+            faults.push(fault("ndl.interface", quoted(&ndl.interface.to_string()), legal, remedy));
+        }
+        if let Some(group) = ndl.multicast.filter(|group| !is_multicast(group)) {
+            let legal = "a multicast address and a port, as in 239.255.83.119:6910, or false";
+            let remedy = "choose an address from 239.0.0.0 to 239.255.255.255, the same on every node";
+            faults.push(fault("ndl.multicast", quoted(&group.to_string()), legal, remedy));
+        }
+        if ndl.mdns_port == Some(0) {
+            faults.push(MDNS_PORT.fault("0".to_owned()));
+        }
+        check_seeds(faults, &ndl.seeds);
+        PERIOD.time(faults, ndl.period);
+        MISSED_MAX.count(faults, ndl.missed_max as usize);
+        NODES_MAX.count(faults, ndl.nodes_max);
+    }
+}
+
+fn check_name(faults: &mut Vec<ConfigFault>, key: &str, name: &str) {
+    if name.is_empty() || name.len() > NAME_BYTES_MAX || name.chars().any(char::is_control) {
+        let found = if name.is_empty() { "nothing".to_owned() } else { quoted(name) };
+        let legal = format!("a text of 1 to {NAME_BYTES_MAX} bytes without control characters");
+        faults.push(fault(key, found, legal, format!("set {key} to a short name, as in \"knee\"")));
+    }
+}
+
+fn is_socket_path(path: &Path) -> bool {
+    let bytes = path.as_os_str().as_encoded_bytes();
+    (1..=SOCKET_BYTES_MAX).contains(&bytes.len()) && !bytes.contains(&0)
+}
+
+fn is_host_address(address: Ipv4Addr) -> bool {
+    !address.is_unspecified() && !address.is_multicast() && !address.is_broadcast()
+}
+
+fn is_multicast(group: &SocketAddrV4) -> bool {
+    group.ip().is_multicast() && group.port() != 0
+}
+
+fn check_seeds(faults: &mut Vec<ConfigFault>, seeds: &[SocketAddr]) {
+    let legal = format!("at most {SEEDS_MAX} addresses with their ports, as in 192.168.1.7:6911");
+    if seeds.len() > SEEDS_MAX {
+        let remedy = "list a few nodes only: they tell of the others";
+        faults.push(fault("ndl.seeds", format!("{} addresses", seeds.len()), legal.clone(), remedy));
+    }
+    let nowhere = |seed: &&SocketAddr| seed.port() == 0 || seed.ip().is_unspecified();
+    for seed in seeds.iter().take(SEEDS_MAX).filter(nowhere) {
+        let remedy = "write the address of a node and its ndl.port";
+        faults.push(fault("ndl.seeds", quoted(&seed.to_string()), legal.clone(), remedy));
+    }
+}

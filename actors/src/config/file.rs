@@ -1,0 +1,378 @@
+//! Reads a configuration from TOML: knows the keys and their types. What is legal, the check decides.
+
+use std::{
+    collections::BTreeMap,
+    fs::File,
+    io::Read,
+    net::{Ipv4Addr, SocketAddr, SocketAddrV4},
+    ops::Range as Span,
+    path::Path,
+    str::FromStr,
+    time::Duration,
+};
+
+use sinew_runtime::tid::NodeAddress;
+use toml::{
+    Spanned,
+    de::{DeTable, DeValue},
+};
+
+use super::{
+    ConfigFault, ConfigFaults, NodeConfig,
+    check::{self, Range, fault},
+    faults::quoted,
+};
+
+/// Longest configuration file in bytes.
+const FILE_BYTES_MAX: u64 = 1 << 20;
+
+const SECTIONS: [&str; 5] = ["node", "lncl", "gncl", "ndl", "sync"];
+
+/// Every key of every section.
+pub(super) const KEYS: [&str; 24] = [
+    "node.name",
+    "node.project",
+    "node.address",
+    "node.mailbox_capacity",
+    "node.payload_max",
+    "lncl.socket",
+    "lncl.clients_max",
+    "lncl.apps_max",
+    "gncl.port",
+    "gncl.queue_capacity",
+    "gncl.strangers_max",
+    "gncl.handshake_ms",
+    "gncl.redial_min_ms",
+    "gncl.redial_max_ms",
+    "ndl.interface",
+    "ndl.port",
+    "ndl.multicast",
+    "ndl.mdns_port",
+    "ndl.seeds",
+    "ndl.period_ms",
+    "ndl.missed_max",
+    "ndl.nodes_max",
+    "sync.layer_deadline_ms",
+    "sync.requirement_deadline_ms",
+];
+
+impl NodeConfig {
+    /// Reads and checks the configuration in the TOML `text`; what it does not set has its default.
+    ///
+    /// # Errors
+    /// All faults, not just the first one: keys that do not exist, values of another type, values out of range. Text
+    /// that is not TOML is one fault.
+    ///
+    /// ```
+    /// use sinew::config::NodeConfig;
+    /// let config = NodeConfig::from_toml("[node]\nname = 'knee'\n[ndl]\nperiod_ms = 100\n")?;
+    /// assert_eq!(config.ndl.period.as_millis(), 100);
+    ///
+    /// let faults = NodeConfig::from_toml("[node]\nname = 'knee'\n[ndl]\nperoid_ms = 100\n").unwrap_err();
+    /// assert!(faults.to_string().contains("write ndl.period_ms"));
+    /// # Ok::<(), sinew::config::ConfigFaults>(())
+    /// ```
+    pub fn from_toml(text: &str) -> Result<Self, ConfigFaults> {
+        let table = DeTable::parse(text).map_err(|error| ConfigFaults::one(syntax_fault(text, &error)))?;
+        let mut reader = Reader::new(text, table.get_ref());
+        // A name that is not set is a fault, and the check finds it.
+        let mut config = Self::new("");
+        reader.read_node(&mut config);
+        reader.read_lncl(&mut config);
+        reader.read_gncl(&mut config);
+        reader.read_ndl(&mut config);
+        reader.time(&check::LAYER_DEADLINE, &mut config.sync.layer_deadline);
+        reader.time(&check::REQUIREMENT_DEADLINE, &mut config.sync.requirement_deadline);
+        reader.finish(&config)?;
+        Ok(config)
+    }
+
+    /// Reads and checks the configuration in the TOML file at `path`; at most 1 MiB.
+    ///
+    /// # Errors
+    /// All faults, as in [`from_toml`](Self::from_toml). A file that cannot be read is one fault.
+    pub fn from_file(path: impl AsRef<Path>) -> Result<Self, ConfigFaults> {
+        let path = path.as_ref();
+        let text = read_bounded(path).map_err(|found| {
+            let legal = "a text file of at most 1 MiB that this user may read";
+            let remedy = "check its path and its permissions";
+            ConfigFaults::one(fault(&path.display().to_string(), found, legal, remedy))
+        })?;
+        Self::from_toml(&text)
+    }
+}
+
+fn read_bounded(path: &Path) -> Result<String, String> {
+    let file = File::open(path).map_err(|error| error.to_string())?;
+    let mut text = String::new();
+    file.take(FILE_BYTES_MAX + 1).read_to_string(&mut text).map_err(|error| error.to_string())?;
+    if text.len() as u64 > FILE_BYTES_MAX {
+        return Err("a longer file".to_owned());
+    }
+    Ok(text)
+}
+
+fn syntax_fault(text: &str, error: &toml::de::Error) -> ConfigFault {
+    let line = error.span().map(|span| line_of(text, &span));
+    let remedy = "correct this line; docs/CONFIGURATION.md has a complete file";
+    ConfigFault { line, ..fault("syntax", error.message().to_owned(), "TOML (https://toml.io)", remedy) }
+}
+
+/// The line of `text` on which `span` begins, from 1.
+fn line_of(text: &str, span: &Span<usize>) -> usize {
+    let before = text.as_bytes().get(..span.start).unwrap_or_default();
+    1 + before.iter().filter(|byte| **byte == b'\n').count()
+}
+
+/// What stands at `span`, on one line and not longer than that.
+fn shown(text: &str, span: Span<usize>) -> String {
+    const SHOWN_MAX: usize = 80;
+    let raw = text.get(span).unwrap_or_default();
+    let line: String = raw.chars().map(|c| if c.is_control() { ' ' } else { c }).take(SHOWN_MAX).collect();
+    if line.len() < raw.len() { line + "..." } else { line }
+}
+
+/// The values of a file by their full keys, and what is wrong with them so far.
+struct Reader<'t> {
+    text: &'t str,
+    values: BTreeMap<&'static str, &'t Spanned<DeValue<'t>>>,
+    faults: Vec<ConfigFault>,
+}
+
+/// Sorting the file's keys.
+impl<'t> Reader<'t> {
+    fn new(text: &'t str, table: &'t DeTable<'t>) -> Self {
+        let mut reader = Self { text, values: BTreeMap::new(), faults: Vec::new() };
+        for (name, value) in table {
+            let section = SECTIONS.into_iter().find(|section| *section == name.get_ref());
+            match (section, value.get_ref()) {
+                (Some(section), DeValue::Table(table)) => reader.add_section(section, table),
+                (Some(section), _) => {
+                    let legal = format!("a section [{section}]");
+                    let remedy = format!("write [{section}] on a line of its own and its keys below");
+                    reader.reject(section, value, legal, remedy);
+                }
+                (None, DeValue::Table(_)) => reader.unknown(name, name.get_ref(), &SECTIONS),
+                (None, _) => reader.unknown(name, name.get_ref(), &KEYS),
+            }
+        }
+        reader
+    }
+
+    fn add_section(&mut self, section: &'static str, table: &'t DeTable<'t>) {
+        for (name, value) in table {
+            let full = format!("{section}.{}", name.get_ref());
+            match KEYS.into_iter().find(|key| **key == *full) {
+                Some(key) => {
+                    self.values.insert(key, value);
+                }
+                None => self.unknown(name, &full, &KEYS),
+            }
+        }
+    }
+
+    fn unknown<S>(&mut self, place: &Spanned<S>, name: &str, known: &[&'static str]) {
+        let nearest = nearest(name, known);
+        let (kind, remedy) = if known == SECTIONS {
+            ("section", format!("write [{nearest}], the nearest section, or remove it"))
+        } else {
+            ("key", format!("write {nearest}, the nearest key, or remove it"))
+        };
+        let line = Some(line_of(self.text, &place.span()));
+        let key = quoted(name).trim_matches('"').to_owned();
+        let found = format!("a {kind} that does not exist");
+        let legal = format!("a {kind} of docs/CONFIGURATION.md");
+        self.faults.push(ConfigFault { line, ..fault(&key, found, legal, remedy) });
+    }
+
+    fn reject<S>(
+        &mut self,
+        key: &str,
+        value: &Spanned<S>,
+        legal: impl Into<String>,
+        remedy: impl Into<String>,
+    ) {
+        let found = shown(self.text, value.span());
+        let line = Some(line_of(self.text, &value.span()));
+        self.faults.push(ConfigFault { line, ..fault(key, found, legal, remedy) });
+    }
+
+    fn reject_number(&mut self, range: &Range, value: &Spanned<DeValue<'_>>) {
+        let found = shown(self.text, value.span());
+        let line = Some(line_of(self.text, &value.span()));
+        self.faults.push(ConfigFault { line, ..range.fault(found) });
+    }
+
+    /// Adds what the check finds, and says where it stands.
+    fn finish(mut self, config: &NodeConfig) -> Result<(), ConfigFaults> {
+        let checked = config.validate().err().map(ConfigFaults::into_vec).unwrap_or_default();
+        for mut found in checked {
+            // What could not be read has its default, or nothing, and its fault already.
+            if self.faults.iter().all(|fault| fault.key != found.key) {
+                let value = self.values.get(found.key.as_str());
+                found.line = value.map(|value| line_of(self.text, &value.span()));
+                self.faults.push(found);
+            }
+        }
+        self.faults.sort_by_key(|fault| fault.line);
+        ConfigFaults::check(self.faults)
+    }
+}
+
+/// Reading values by their types.
+impl<'t> Reader<'t> {
+    fn integer(&mut self, range: &Range) -> Option<u64> {
+        let value = *self.values.get(range.key)?;
+        let number = value.get_ref().as_integer();
+        let read = number.and_then(|number| u64::from_str_radix(number.as_str(), number.radix()).ok());
+        if read.is_none() {
+            self.reject_number(range, value);
+        }
+        read
+    }
+
+    /// A number into a type that may be too small for it.
+    fn number<T: TryFrom<u64>>(&mut self, range: &Range, target: &mut T) {
+        let Some(integer) = self.integer(range) else { return };
+        match T::try_from(integer) {
+            Ok(number) => *target = number,
+            Err(_) => self.reject_number(range, self.values[range.key]),
+        }
+    }
+
+    fn time(&mut self, range: &Range, target: &mut Duration) {
+        if let Some(millis) = self.integer(range) {
+            *target = Duration::from_millis(millis);
+        }
+    }
+
+    /// A text that is a `T`; the example shows how one looks.
+    fn text<T: FromStr>(&mut self, key: &str, example: &str, target: &mut T) {
+        let Some(value) = self.values.get(key).copied() else { return };
+        match value.get_ref().as_str().map(str::parse) {
+            Some(Ok(read)) => *target = read,
+            Some(Err(_)) | None => {
+                self.reject(
+                    key,
+                    value,
+                    format!("a text like {example}"),
+                    format!("set {key} as in {example}"),
+                );
+            }
+        }
+    }
+
+    /// Whether the value of `key` is `false`: switched off.
+    fn is_off(&self, key: &str) -> bool {
+        self.values.get(key).is_some_and(|value| value.get_ref().as_bool() == Some(false))
+    }
+
+    /// A text that is a `T`, or `false` for none.
+    fn text_or_off<T: FromStr>(&mut self, key: &str, example: &str, target: &mut Option<T>) {
+        if self.is_off(key) {
+            *target = None;
+        } else {
+            let mut read = Found(None);
+            self.text(key, example, &mut read);
+            *target = read.0.or(target.take());
+        }
+    }
+}
+
+/// An optional value that is read like the value itself.
+struct Found<T>(Option<T>);
+
+impl<T: FromStr> FromStr for Found<T> {
+    type Err = T::Err;
+
+    fn from_str(text: &str) -> Result<Self, T::Err> {
+        text.parse().map(|found| Self(Some(found)))
+    }
+}
+
+/// The sections.
+impl Reader<'_> {
+    fn read_node(&mut self, config: &mut NodeConfig) {
+        self.text("node.name", "\"knee\"", &mut config.name);
+        self.text("node.project", "\"sinew\"", &mut config.project);
+        let mut address: Found<NodeAddress> = Found(None);
+        self.text("node.address", "\"10.0.0.7\"", &mut address);
+        config.address = address.0;
+        self.number(&check::MAILBOX_CAPACITY, &mut config.mailbox_capacity);
+        self.number(&check::PAYLOAD_MAX, &mut config.payload_max);
+    }
+
+    fn read_lncl(&mut self, config: &mut NodeConfig) {
+        self.text_or_off("lncl.socket", "\"/run/sinew/knee.sock\" or false", &mut config.lncl.socket);
+        self.number(&check::CLIENTS_MAX, &mut config.lncl.clients_max);
+        self.number(&check::APPS_MAX, &mut config.lncl.apps_max);
+    }
+
+    fn read_gncl(&mut self, config: &mut NodeConfig) {
+        let gncl = &mut config.gncl;
+        self.number(&check::GNCL_PORT, &mut gncl.port);
+        self.number(&check::QUEUE_CAPACITY, &mut gncl.queue_capacity);
+        self.number(&check::STRANGERS_MAX, &mut gncl.strangers_max);
+        self.time(&check::HANDSHAKE, &mut gncl.handshake);
+        self.time(&check::REDIAL_MIN, &mut gncl.redial_min);
+        self.time(&check::REDIAL_MAX, &mut gncl.redial_max);
+    }
+
+    fn read_ndl(&mut self, config: &mut NodeConfig) {
+        let ndl = &mut config.ndl;
+        self.text::<Ipv4Addr>("ndl.interface", "\"192.168.1.7\"", &mut ndl.interface);
+        self.number(&check::NDL_PORT, &mut ndl.port);
+        let example = "\"239.255.83.119:6910\" or false";
+        self.text_or_off::<SocketAddrV4>("ndl.multicast", example, &mut ndl.multicast);
+        if self.is_off("ndl.mdns_port") {
+            ndl.mdns_port = None;
+        } else if let Some(port) = &mut ndl.mdns_port {
+            self.number(&check::MDNS_PORT, port);
+        }
+        self.read_seeds(&mut ndl.seeds);
+        self.time(&check::PERIOD, &mut ndl.period);
+        self.number(&check::MISSED_MAX, &mut ndl.missed_max);
+        self.number(&check::NODES_MAX, &mut ndl.nodes_max);
+    }
+
+    fn read_seeds(&mut self, seeds: &mut Vec<SocketAddr>) {
+        const KEY: &str = "ndl.seeds";
+        const LEGAL: &str = "a list of addresses with their ports";
+        const REMEDY: &str = "set ndl.seeds as in [\"192.168.1.7:6911\"]";
+        let Some(value) = self.values.get(KEY).copied() else { return };
+        let Some(list) = value.get_ref().as_array() else {
+            return self.reject(KEY, value, LEGAL, REMEDY);
+        };
+        for seed in list {
+            match seed.get_ref().as_str().map(str::parse) {
+                Some(Ok(address)) => seeds.push(address),
+                Some(Err(_)) | None => self.reject(KEY, seed, LEGAL, REMEDY),
+            }
+        }
+    }
+}
+
+/// The known name that differs least from `name`. A name without a section is compared with keys without theirs.
+fn nearest(name: &str, known: &[&'static str]) -> &'static str {
+    let distance = |key: &&&'static str| match key.split_once('.') {
+        Some((_, leaf)) if !name.contains('.') => edits(name, leaf),
+        Some(_) | None => edits(name, key),
+    };
+    known.iter().min_by_key(distance).copied().unwrap_or_default()
+}
+
+/// How many letters must be added, removed or replaced to turn `a` into `b` (Levenshtein); of a long `a` its start.
+fn edits(a: &str, b: &str) -> usize {
+    const COMPARED_MAX: usize = 64;
+    let b: Vec<char> = b.chars().collect();
+    let mut row: Vec<usize> = (0..=b.len()).collect();
+    for (i, from) in a.chars().take(COMPARED_MAX).enumerate() {
+        let mut diagonal = std::mem::replace(&mut row[0], i + 1);
+        for (j, to) in b.iter().enumerate() {
+            let replaced = diagonal + usize::from(from != *to);
+            diagonal = row[j + 1];
+            row[j + 1] = replaced.min(diagonal + 1).min(row[j] + 1);
+        }
+    }
+    row[b.len()]
+}

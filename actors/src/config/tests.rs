@@ -1,0 +1,264 @@
+//! What a configuration promises: all of it or all its faults, never a panic.
+
+use std::net::SocketAddr;
+
+use proptest::prelude::*;
+
+use super::{
+    check::{self, Range},
+    file::KEYS,
+    *,
+};
+
+const NAMED: &str = "[node]\nname = \"knee\"\n";
+
+/// The complete file in the documentation.
+fn example() -> &'static str {
+    let text = include_str!("../../../docs/CONFIGURATION.md");
+    let start = text.find("```toml\n").unwrap() + "```toml\n".len();
+    let length = text[start..].find("```").unwrap();
+    &text[start..start + length]
+}
+
+fn faults(text: &str) -> Vec<ConfigFault> {
+    NodeConfig::from_toml(text).map_or_else(ConfigFaults::into_vec, |config| panic!("legal: {config:?}"))
+}
+
+fn only_fault(text: &str) -> ConfigFault {
+    let mut faults = faults(text);
+    assert_eq!(faults.len(), 1, "{faults:?}");
+    faults.remove(0)
+}
+
+/// A file with one setting, and perhaps more lines in that section.
+fn with(key: &str, value: impl std::fmt::Display, more: &str) -> String {
+    let (section, leaf) = key.split_once('.').unwrap();
+    let name = if section == "node" && leaf != "name" { "name = 'knee'\n" } else { "" };
+    let named = if section == "node" { "" } else { NAMED };
+    format!("{named}[{section}]\n{name}{leaf} = {value}\n{more}")
+}
+
+#[test]
+fn the_documented_file_is_the_defaults() {
+    assert_eq!(NodeConfig::from_toml(example()).unwrap(), NodeConfig::new("knee"));
+    assert_eq!(NodeConfig::from_toml(NAMED).unwrap(), NodeConfig::new("knee"));
+}
+
+#[test]
+fn the_documented_file_names_every_key() {
+    for key in KEYS {
+        let leaf = key.split_once('.').unwrap().1;
+        let named = |line: &str| line.trim_start_matches("# ").starts_with(&format!("{leaf} = "));
+        assert!(example().lines().any(named), "{key}");
+    }
+}
+
+#[test]
+fn the_documented_faults_look_like_that() {
+    let text =
+        format!("{NAMED}\n[gncl]\n\nredial_max_ms = 5\n[ndl]\nperoid_ms = 100\nmissed_max = \"three\"\n");
+    let shown = NodeConfig::from_toml(&text).unwrap_err().to_string();
+    assert!(include_str!("../../../docs/CONFIGURATION.md").contains(&shown), "{shown}");
+}
+
+#[test]
+fn every_number_is_legal_at_both_ends_and_not_beyond() {
+    let ranges = [
+        (check::MAILBOX_CAPACITY, ""),
+        (check::PAYLOAD_MAX, ""),
+        (check::CLIENTS_MAX, ""),
+        (check::APPS_MAX, ""),
+        (check::GNCL_PORT, ""),
+        (check::QUEUE_CAPACITY, ""),
+        (check::STRANGERS_MAX, ""),
+        (check::HANDSHAKE, ""),
+        (check::REDIAL_MIN, "redial_max_ms = 60_000"),
+        (check::REDIAL_MAX, "redial_min_ms = 1"),
+        (check::NDL_PORT, ""),
+        (check::MDNS_PORT, ""),
+        (check::PERIOD, ""),
+        (check::MISSED_MAX, ""),
+        (check::NODES_MAX, ""),
+        (check::LAYER_DEADLINE, ""),
+        (check::REQUIREMENT_DEADLINE, ""),
+    ];
+    for (Range { key, low, high, .. }, more) in ranges {
+        assert!(KEYS.contains(&key), "{key}");
+        for legal in [low, high] {
+            let read = NodeConfig::from_toml(&with(key, legal, more));
+            assert!(read.is_ok(), "{key} = {legal}: {read:?}");
+        }
+        let below = i128::from(low) - 1;
+        for illegal in [below.to_string(), (high + 1).to_string(), u128::MAX.to_string(), "'x'".to_owned()] {
+            let fault = only_fault(&with(key, &illegal, more));
+            assert_eq!(fault.key, key, "{illegal}");
+            assert!(fault.legal.contains(&format!("{low} to {high}")), "{fault}");
+            assert!(fault.line.is_some(), "{fault}");
+        }
+    }
+}
+
+#[test]
+fn texts_are_legal_at_both_ends_and_not_beyond() {
+    let name = |bytes| format!("{:?}", "n".repeat(bytes));
+    let cases = [
+        ("node.name", name(0), false),
+        ("node.name", name(1), true),
+        ("node.name", name(63), true),
+        ("node.name", name(64), false),
+        ("node.name", r#""a\nb""#.to_owned(), false),
+        ("node.project", name(0), false),
+        ("node.project", name(63), true),
+        ("node.project", name(64), false),
+        ("node.address", "'0.0.0.1'".to_owned(), true),
+        ("node.address", "'255.255.255.254'".to_owned(), true),
+        ("node.address", "'0.0.0.0'".to_owned(), false),
+        ("node.address", "'*'".to_owned(), false),
+        ("node.address", "'localhost'".to_owned(), false),
+        ("lncl.socket", name(0), false),
+        ("lncl.socket", name(1), true),
+        ("lncl.socket", name(100), true),
+        ("lncl.socket", name(101), false),
+        ("lncl.socket", "false".to_owned(), true),
+        ("lncl.socket", "true".to_owned(), false),
+        ("ndl.interface", "'127.0.0.1'".to_owned(), true),
+        ("ndl.interface", "'0.0.0.0'".to_owned(), false),
+        ("ndl.interface", "'224.0.0.1'".to_owned(), false),
+        ("ndl.multicast", "'224.0.0.0:1'".to_owned(), true),
+        ("ndl.multicast", "'239.255.255.255:65535'".to_owned(), true),
+        ("ndl.multicast", "'223.255.255.255:1'".to_owned(), false),
+        ("ndl.multicast", "'240.0.0.0:1'".to_owned(), false),
+        ("ndl.multicast", "'239.0.0.1:0'".to_owned(), false),
+        ("ndl.multicast", "false".to_owned(), true),
+        ("ndl.multicast", "true".to_owned(), false),
+        ("ndl.mdns_port", "false".to_owned(), true),
+        ("ndl.mdns_port", "true".to_owned(), false),
+        ("ndl.seeds", "[]".to_owned(), true),
+        ("ndl.seeds", format!("{:?}", vec!["10.0.0.7:1"; 256]), true),
+        ("ndl.seeds", format!("{:?}", vec!["10.0.0.7:1"; 257]), false),
+        ("ndl.seeds", "['10.0.0.7:0']".to_owned(), false),
+        ("ndl.seeds", "['10.0.0.7']".to_owned(), false),
+        ("ndl.seeds", "[7]".to_owned(), false),
+        ("ndl.seeds", "'10.0.0.7:1'".to_owned(), false),
+    ];
+    for (key, value, legal) in cases {
+        let read = NodeConfig::from_toml(&with(key, &value, ""));
+        match read {
+            Ok(_) => assert!(legal, "{key} = {value}"),
+            Err(faults) => {
+                let one = matches!(faults.faults(), [fault] if fault.key == key && fault.line.is_some());
+                assert!(!legal && one, "{key} = {value}: {faults}");
+            }
+        }
+    }
+}
+
+#[test]
+fn code_is_checked_like_a_file_and_more_finely() {
+    let mut config = NodeConfig::new("");
+    config.gncl.redial_min = Duration::from_micros(999);
+    config.ndl.period = Duration::from_millis(60_000) + Duration::from_nanos(1);
+    config.ndl.mdns_port = Some(0);
+    config.ndl.seeds = vec![SocketAddr::from(([0, 0, 0, 0], 5))];
+    config.lncl.socket = Some("\0".into());
+    let faults = config.validate().unwrap_err();
+    let keys: Vec<&str> = faults.faults().iter().map(|fault| fault.key.as_str()).collect();
+    let expected =
+        ["node.name", "lncl.socket", "gncl.redial_min_ms", "ndl.mdns_port", "ndl.seeds", "ndl.period_ms"];
+    assert_eq!(keys, expected);
+    assert_eq!(faults.to_string().lines().count(), expected.len(), "one fault a line");
+    assert_eq!(NodeConfig::new("knee").validate(), Ok(()));
+}
+
+#[test]
+fn all_faults_of_a_file_come_together_by_line() {
+    let text =
+        "[node]\nmailbox_capacity = 0\n[ndl]\nperiod_ms = -1\nmissed_max = 1.5\nspeed = 3\n[sink]\nx = 1\n";
+    let found: Vec<_> = faults(text).into_iter().map(|fault| (fault.line, fault.key)).collect();
+    let expected = [
+        (None, "node.name"),
+        (Some(2), "node.mailbox_capacity"),
+        (Some(4), "ndl.period_ms"),
+        (Some(5), "ndl.missed_max"),
+        (Some(6), "ndl.speed"),
+        (Some(7), "sink"),
+    ];
+    assert_eq!(found, expected.map(|(line, key)| (line, key.to_owned())));
+}
+
+#[test]
+fn an_unknown_key_is_told_its_nearest_one() {
+    for (text, nearest) in [
+        ("[ndl]\nperiod = 1", "write ndl.period_ms,"),
+        ("[gncl]\nredial_minimum_ms = 1", "write gncl.redial_min_ms,"),
+        ("[sink]", "write [sync],"),
+        ("ndl = 3", "write [ndl] on a line of its own"),
+    ] {
+        let found = only_fault(&format!("{text}\n{NAMED}"));
+        assert!(found.remedy.starts_with(nearest), "{found}");
+    }
+    assert!(faults("name = 'knee'").iter().any(|fault| fault.remedy.starts_with("write node.name,")));
+}
+
+#[test]
+fn text_that_is_not_toml_is_one_fault_with_its_line() {
+    let found = only_fault("[node]\nname = \n");
+    assert_eq!((found.key.as_str(), found.line), ("syntax", Some(2)));
+}
+
+#[test]
+fn depth_without_end_is_one_fault() {
+    assert_eq!(only_fault(&format!("x = {}", "[".repeat(100_000))).key, "syntax");
+}
+
+#[test]
+fn a_file_that_cannot_be_read_is_one_fault_with_its_path() {
+    let faults = NodeConfig::from_file("/nowhere/knee.toml").unwrap_err();
+    assert!(faults.to_string().starts_with("/nowhere/knee.toml: found No such file"), "{faults}");
+}
+
+proptest! {
+    #[test]
+    fn any_text_is_a_configuration_or_faults(text in any::<String>()) {
+        let _ = NodeConfig::from_toml(&text);
+    }
+
+    #[test]
+    fn any_values_are_a_configuration_or_faults(
+        settings in proptest::collection::btree_map(prop::sample::select(&KEYS[..]), value(), 0..24),
+    ) {
+        let mut text = String::new();
+        for section in ["node", "lncl", "gncl", "ndl", "sync"] {
+            text += &format!("[{section}]\n");
+            for (key, value) in settings.iter().filter(|(key, _)| key.starts_with(&format!("{section}."))) {
+                text += &format!("{} = {value}\n", key.split_once('.').unwrap().1);
+            }
+        }
+        match NodeConfig::from_toml(&text) {
+            Ok(config) => prop_assert_eq!(config.validate(), Ok(())),
+            Err(faults) => prop_assert!(faults.faults().iter().all(|fault| KEYS.contains(&fault.key.as_str()))),
+        }
+    }
+
+    #[test]
+    fn a_damaged_example_is_a_configuration_or_faults(at: prop::sample::Index, with in any::<char>()) {
+        let mut text: Vec<char> = example().chars().collect();
+        let at = at.index(text.len());
+        text[at] = with;
+        let _ = NodeConfig::from_toml(&text.iter().collect::<String>());
+    }
+}
+
+fn value() -> impl Strategy<Value = String> {
+    prop_oneof![
+        any::<i64>().prop_map(|n| n.to_string()),
+        (0u32..70_000).prop_map(|n| n.to_string()),
+        any::<bool>().prop_map(|b| b.to_string()),
+        any::<f64>()
+            .prop_filter("TOML spells these differently", |f| f.is_finite())
+            .prop_map(|f| format!("{f:?}")),
+        "'[ -&(-~]{0,70}'",
+        any::<[u8; 4]>().prop_map(|[a, b, c, d]| format!("'{a}.{b}.{c}.{d}'")),
+        any::<([u8; 4], u16)>().prop_map(|([a, b, c, d], port)| format!("['{a}.{b}.{c}.{d}:{port}']")),
+    ]
+}

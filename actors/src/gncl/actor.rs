@@ -1,0 +1,410 @@
+//! The shell: sockets and timers for the core's orders, events for what they do.
+
+use std::{
+    cell::RefCell,
+    collections::BTreeMap,
+    io,
+    net::{Shutdown, SocketAddr},
+    rc::Rc,
+    sync::Arc,
+    time::Duration,
+};
+
+use actix::{Actor, ActorFutureExt, AsyncContext, Context, SpawnHandle, StreamHandler, fut};
+use sinew_runtime::{
+    post::Post,
+    supervision::ReadyGate,
+    tid::NodeAddress,
+    time::Time,
+    wire::{Kind, Message},
+};
+use socket2::SockRef;
+use tokio::net::TcpStream;
+
+use super::{
+    Event, LinkFact,
+    core::{
+        Attach, ConnectionId, Core, Decline, Input, Introduction, Output, Refusal, Settings, read, write,
+    },
+    inbound::Inbound,
+    link::{self, Mode, News, Reading, SharedMode, What},
+    listener,
+    peer::frame,
+};
+use crate::{config::NodeConfig, ndl, ndl::MembershipFact, outlet::LinkNumber, stores::Stores, sync};
+
+/// How often expired messages are looked for in the queues of peers without a connection.
+const EXPIRY_PERIOD: Duration = Duration::from_millis(50);
+
+/// GNCL's actor.
+pub(crate) struct Gncl {
+    stores: Arc<Stores>,
+    ready: Option<ReadyGate>,
+    core: Core,
+    wires: BTreeMap<ConnectionId, Wire>,
+    alarm: Option<(Time, SpawnHandle)>,
+}
+
+/// One connection and what runs for it.
+struct Wire {
+    socket: Option<Arc<TcpStream>>,
+    mode: SharedMode,
+    /// Which of its peer's connections it is, and what writes there, as long as it is a link.
+    link: Option<(LinkNumber, SpawnHandle)>,
+    /// Whether what was written so far ends with a whole frame, so that words can follow.
+    may_speak: bool,
+    tasks: Vec<SpawnHandle>,
+}
+
+impl Gncl {
+    /// GNCL for the node whose stores these are. `ready` opens when it listens.
+    pub(crate) fn new(stores: Arc<Stores>, ready: ReadyGate) -> Self {
+        let seed = Time::now().as_nanos() ^ u64::from(stores.node.bits());
+        let core = Core::new(settings(&stores), seed);
+        Self { stores, ready: Some(ready), core, wires: BTreeMap::new(), alarm: None }
+    }
+
+    /// Binds the listener: where it was bound before, if this layer was restarted.
+    fn listen(&self) -> io::Result<tokio::net::TcpListener> {
+        let config = &self.stores.config;
+        let configured = SocketAddr::from((config.ndl.interface, config.gncl.port));
+        let listener = listener::listen(*self.stores.gncl_listen.get().unwrap_or(&configured))?;
+        let address = listener.local_addr()?;
+        self.stores.gncl_listen.get_or_init(|| address);
+        Ok(listener)
+    }
+
+    fn input(&mut self, input: Input, ctx: &mut Context<Self>) {
+        // News of life only ever puts the next alarm off.
+        let may_wake_earlier = !matches!(input, Input::Heard(_));
+        self.core.handle(Time::now(), input);
+        while let Some(output) = self.core.poll() {
+            self.obey(output, ctx);
+        }
+        if may_wake_earlier {
+            self.set_alarm(ctx);
+        }
+    }
+
+    fn set_alarm(&mut self, ctx: &mut Context<Self>) {
+        let Some(at) = self.core.next_wake() else { return };
+        match self.alarm {
+            Some((set, _)) if set <= at => return,
+            Some((_, handle)) => drop(ctx.cancel_future(handle)),
+            None => {}
+        }
+        let handle = ctx.run_later(at.since(Time::now()), |actor, ctx| {
+            actor.alarm = None;
+            actor.input(Input::TimePassed, ctx);
+        });
+        self.alarm = Some((at, handle));
+    }
+
+    fn obey(&mut self, output: Output, ctx: &mut Context<Self>) {
+        match output {
+            Output::Dial { connection, address } => self.dial(connection, address, ctx),
+            Output::SendHello(connection, hello) => self.send_hello(connection, &hello, ctx),
+            Output::Attach(attach) => self.attach(attach, ctx),
+            Output::Detach { connection, node } => self.detach(connection, node, ctx),
+            Output::Refuse(connection, refusal) => self.refuse(connection, &refusal, ctx),
+            Output::Close(connection) => self.close(connection, ctx),
+            Output::SendPing(node) => self.send(node, Kind::GNCL_PING),
+            Output::SendPong(node) => self.send(node, Kind::GNCL_PONG),
+            Output::SendGoodbye(node) => self.send(node, Kind::GNCL_GOODBYE),
+            Output::Forget(node) => {
+                self.stores.router.remove_peer(node);
+                self.stores.gncl.forget(node);
+            }
+            Output::Fact(fact) => self.tell(fact),
+            Output::Count { cause, detail } => self.stores.gncl.refusals.count(Time::now(), cause, &detail),
+        }
+    }
+
+    fn dial(&mut self, connection: ConnectionId, address: SocketAddr, ctx: &mut Context<Self>) {
+        let mode = Rc::new(RefCell::new(Mode::Handshake));
+        let reading = Reading { mode: mode.clone(), payload_max: self.stores.config.payload_max };
+        let reader = ctx.add_stream(link::dial(connection, address, reading));
+        self.wires.insert(connection, Wire::new(None, mode, reader));
+    }
+
+    fn accepted(&mut self, socket: TcpStream, ctx: &mut Context<Self>) {
+        let (connection, socket) = (self.core.open(), Arc::new(socket));
+        let mode = Rc::new(RefCell::new(Mode::Handshake));
+        let reading = Reading { mode: mode.clone(), payload_max: self.stores.config.payload_max };
+        let reader = ctx.add_stream(link::read(connection, socket.clone(), reading));
+        self.wires.insert(connection, Wire::new(Some(socket), mode, reader));
+        self.input(Input::Accepted(connection), ctx);
+    }
+
+    fn send_hello(&mut self, connection: ConnectionId, hello: &Introduction, ctx: &mut Context<Self>) {
+        let message = frame(self.stores.node, hello.peer, Kind::GNCL_HELLO, write(hello));
+        self.speak(connection, message, AfterSpeaking::Listen, ctx);
+    }
+
+    fn refuse(&mut self, connection: ConnectionId, refusal: &Refusal, ctx: &mut Context<Self>) {
+        let message = frame(self.stores.node, NodeAddress::HERE, Kind::GNCL_REFUSAL, write(refusal));
+        if let Some(wire) = self.wires.get(&connection) {
+            wire.set_mode(Mode::Discard);
+        }
+        self.speak(connection, message, AfterSpeaking::Hush, ctx);
+    }
+
+    /// Writes a frame on a connection that is not a link.
+    fn speak(
+        &mut self,
+        connection: ConnectionId,
+        words: Message,
+        then: AfterSpeaking,
+        ctx: &mut Context<Self>,
+    ) {
+        let Some(wire) = self.wires.get_mut(&connection) else { return };
+        let (Some(socket), may_speak) = (wire.socket.clone(), wire.may_speak) else { return };
+        let task = async move {
+            if may_speak && link::write_frame(&socket, &words).await.is_err() {
+                // The reader meets the same error, and tells the core.
+                return;
+            }
+            if then == AfterSpeaking::Hush {
+                shut(&socket, Shutdown::Write);
+            }
+        };
+        wire.tasks.push(ctx.spawn(fut::wrap_future(task)));
+    }
+
+    fn attach(&mut self, attach: Attach, ctx: &mut Context<Self>) {
+        let Attach { connection, node, incarnation, payload_max, welcome } = attach;
+        let Some(wire) = self.wires.get_mut(&connection) else { return };
+        let Some(socket) = wire.socket.clone() else { return };
+        let peer = self.stores.gncl.meet(node, incarnation, &self.stores.config);
+        wire.set_mode(Mode::Linked(Inbound { stores: self.stores.clone(), peer: peer.clone() }));
+        let welcome = welcome.map(|words| frame(self.stores.node, node, Kind::GNCL_WELCOME, write(&words)));
+        let payload_max = usize::try_from(payload_max).unwrap_or(usize::MAX);
+        let link = peer.outlet.connect(socket, payload_max, welcome);
+        self.stores.router.set_peer(node, peer.clone());
+        let drainer = fut::wrap_future::<_, Self>(async move { peer.outlet.drain(link).await });
+        let drainer = ctx.spawn(drainer.map(move |_, actor, ctx| actor.ended(connection, ctx)));
+        wire.link = Some((link, drainer));
+    }
+
+    fn detach(&mut self, connection: ConnectionId, node: NodeAddress, ctx: &mut Context<Self>) {
+        let Some(wire) = self.wires.get_mut(&connection) else { return };
+        let Some((link, drainer)) = wire.link.take() else { return };
+        ctx.cancel_future(drainer);
+        if let Some(peer) = self.stores.gncl.peer(node) {
+            wire.may_speak = peer.outlet.disconnect(link);
+        }
+    }
+
+    fn close(&mut self, connection: ConnectionId, ctx: &mut Context<Self>) {
+        let Some(wire) = self.wires.remove(&connection) else { return };
+        let drainer = wire.link.map(|(_, drainer)| drainer);
+        for task in wire.tasks.into_iter().chain(drainer) {
+            ctx.cancel_future(task);
+        }
+        if let Some(socket) = wire.socket {
+            shut(&socket, Shutdown::Both);
+        }
+    }
+
+    /// The connection has ended by itself.
+    fn ended(&mut self, connection: ConnectionId, ctx: &mut Context<Self>) {
+        self.input(Input::Ended(connection), ctx);
+        self.close(connection, ctx);
+    }
+
+    fn send(&self, node: NodeAddress, kind: Kind) {
+        let Some(peer) = self.stores.gncl.peer(node) else { return };
+        let mut message = frame(self.stores.node, node, kind, bytes::Bytes::new());
+        if kind == Kind::GNCL_GOODBYE {
+            // The last class, so that it is the last frame. spec: GNCL-10
+            message.header.class = sinew_runtime::wire::Class::Bulk;
+        }
+        peer.send(message);
+    }
+
+    fn tell(&self, fact: LinkFact) {
+        tracing::info!(?fact, "link");
+        self.post(&self.stores.posts.ndl, ndl::Event::Link(fact));
+        self.post(&self.stores.posts.sync, sync::Event::Link(fact));
+    }
+
+    fn post<E>(&self, post: &Post<E>, event: E) {
+        if post.post(event).is_err() {
+            let detail = "a layer does not read its events; a link's state was not told to it";
+            self.stores.gncl.refusals.count(Time::now(), "post full", &detail);
+        }
+    }
+
+    fn frame_came(&mut self, connection: ConnectionId, message: &Message, ctx: &mut Context<Self>) {
+        let input =
+            self.input_of(connection, message).unwrap_or_else(|decline| Input::Violated(connection, decline));
+        if !matches!(input, Input::Violated(..)) {
+            self.input(Input::Heard(connection), ctx);
+        }
+        self.input(input, ctx);
+    }
+
+    fn input_of(&self, connection: ConnectionId, message: &Message) -> Result<Input, Decline> {
+        let introduction = || -> Result<Introduction, Decline> {
+            let introduction: Introduction = read(&message.payload)?;
+            if introduction.node == message.header.source.node {
+                return Ok(introduction);
+            }
+            Err(Decline::Violation(
+                "the source of this frame is another node than its sender says".to_owned(),
+            ))
+        };
+        match message.header.kind {
+            Kind::GNCL_HELLO => Ok(Input::HelloReceived(connection, introduction()?)),
+            Kind::GNCL_WELCOME => Ok(Input::WelcomeReceived(connection, introduction()?)),
+            Kind::GNCL_REFUSAL => Ok(Input::RefusalReceived(connection, read(&message.payload)?)),
+            Kind::GNCL_PING => Ok(Input::PingReceived(connection)),
+            Kind::GNCL_PONG => Ok(Input::Heard(connection)),
+            Kind::GNCL_GOODBYE => Ok(Input::GoodbyeReceived(connection)),
+            kind => {
+                Err(Decline::Violation(format!("a frame of kind {kind} came before the handshake was over")))
+            }
+        }
+    }
+
+    /// Cuts what a former instance of this layer, or this one, has connected.
+    fn cut_all(&self) {
+        for peer in self.stores.gncl.peers() {
+            peer.outlet.cut();
+        }
+    }
+}
+
+/// What follows a frame that is written on a connection that is not a link.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum AfterSpeaking {
+    Listen,
+    Hush,
+}
+
+impl Wire {
+    fn new(socket: Option<Arc<TcpStream>>, mode: SharedMode, reader: SpawnHandle) -> Self {
+        Self { socket, mode, link: None, may_speak: true, tasks: vec![reader] }
+    }
+
+    fn set_mode(&self, mode: Mode) {
+        *self.mode.borrow_mut() = mode;
+    }
+}
+
+/// Shuts a socket that others may still hold.
+fn shut(socket: &TcpStream, how: Shutdown) {
+    // It fails if the peer was faster, and then there is nothing left to shut.
+    let _ = SockRef::from(socket).shutdown(how);
+}
+
+fn settings(stores: &Stores) -> Settings {
+    let NodeConfig { name, project, payload_max, gncl, ndl, .. } = stores.config.clone();
+    Settings {
+        ours: Introduction {
+            project,
+            node: stores.node,
+            name,
+            incarnation: stores.incarnation,
+            peer: NodeAddress::HERE,
+            dial: 0,
+            payload_max: payload_max as u64,
+            features: Vec::new(),
+        },
+        handshake: gncl.handshake,
+        redial_min: gncl.redial_min,
+        redial_max: gncl.redial_max,
+        strangers_max: gncl.strangers_max,
+        peers_max: ndl.nodes_max,
+        ping_period: Duration::from_secs(1),
+        pings_missed_max: 3,
+        healthy: Duration::from_secs(5),
+        orphan: Duration::from_secs(5),
+    }
+}
+
+impl Actor for Gncl {
+    type Context = Context<Self>;
+
+    fn started(&mut self, ctx: &mut Context<Self>) {
+        let listener = self.listen().unwrap_or_else(|error| {
+            let config = &self.stores.config;
+            let (interface, port) = (config.ndl.interface, config.gncl.port);
+            panic!(
+                "GNCL cannot listen at {interface}:{port}: {error}; is another node using this port? Set `gncl.port` \
+                 to a free one (0 takes any), and `ndl.interface` to an address of this host"
+            )
+        });
+        self.cut_all();
+        for peer in self.stores.gncl.peers() {
+            self.input(Input::Restored { node: peer.node, incarnation: peer.incarnation }, ctx);
+        }
+        ctx.add_stream(listener::accepted(listener));
+        ctx.add_stream(self.stores.posts.gncl.attach());
+        ctx.run_interval(EXPIRY_PERIOD, |actor, _| {
+            let now = Time::now();
+            for peer in actor.stores.gncl.peers() {
+                peer.outlet.expire(now);
+            }
+        });
+        if let Some(ready) = self.ready.take() {
+            ready.reached();
+        }
+    }
+}
+
+impl Drop for Gncl {
+    /// Senders must not go on writing to the sockets of an actor that is gone.
+    fn drop(&mut self) {
+        self.cut_all();
+    }
+}
+
+impl StreamHandler<Event> for Gncl {
+    fn handle(&mut self, event: Event, ctx: &mut Context<Self>) {
+        let input = match event {
+            Event::Membership(MembershipFact::NodeFound { node, incarnation, gncl }) => {
+                Input::NodeFound { node, incarnation, address: gncl }
+            }
+            Event::Membership(MembershipFact::NodeLost { node, incarnation, .. }) => {
+                Input::NodeLost { node, incarnation }
+            }
+            Event::Leave => Input::LeaveRequested,
+        };
+        self.input(input, ctx);
+    }
+}
+
+impl StreamHandler<io::Result<TcpStream>> for Gncl {
+    fn handle(&mut self, accepted: io::Result<TcpStream>, ctx: &mut Context<Self>) {
+        match accepted {
+            Ok(socket) => self.accepted(socket, ctx),
+            Err(error) => self.stores.gncl.refusals.count(Time::now(), "not accepted", &error),
+        }
+    }
+}
+
+impl StreamHandler<News> for Gncl {
+    fn handle(&mut self, news: News, ctx: &mut Context<Self>) {
+        let connection = news.connection;
+        match news.what {
+            What::Connected(socket) => {
+                self.wires.entry(connection).and_modify(|wire| wire.socket = Some(socket));
+                self.input(Input::Connected(connection), ctx);
+            }
+            What::DialFailed(error) => {
+                tracing::debug!(%error, "dial failed");
+                let refused = error.kind() == io::ErrorKind::ConnectionRefused;
+                self.input(Input::DialFailed { connection, refused }, ctx);
+                self.close(connection, ctx);
+            }
+            What::Frame(message) => self.frame_came(connection, &message, ctx),
+            What::Heard => self.input(Input::Heard(connection), ctx),
+            What::Violated(decline) => self.input(Input::Violated(connection, decline), ctx),
+            What::Ended => self.ended(connection, ctx),
+        }
+    }
+
+    /// One connection's end is not the layer's.
+    fn finished(&mut self, _: &mut Context<Self>) {}
+}

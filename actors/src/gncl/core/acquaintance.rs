@@ -1,0 +1,103 @@
+//! What the core knows of one peer: its life, its link, and when to dial it.
+
+use std::{net::SocketAddr, time::Duration};
+
+use sinew_runtime::{tid::Incarnation, time::Time};
+
+use super::{ConnectionId, Settings};
+
+/// What is known of one peer.
+#[derive(Debug)]
+pub(super) struct Acquaintance {
+    /// The newest life of it that was seen.
+    pub(super) incarnation: Incarnation,
+    /// Where to dial it, as long as NDL says that it is there.
+    pub(super) wanted: Option<SocketAddr>,
+    /// The link, if there is one.
+    pub(super) link: Option<Link>,
+    /// Our dial on its way, if there is one.
+    pub(super) dial: Option<ConnectionId>,
+    /// Number of our last dial.
+    pub(super) dial_number: u64,
+    /// Its dials up to this number are void.
+    pub(super) void_dial: u64,
+    /// When to dial again.
+    pub(super) redial_at: Option<Time>,
+    /// The wait before the dial after the next break.
+    pub(super) back_off: Duration,
+    /// When it is forgotten, having said hello without NDL ever telling of it.
+    pub(super) orphan_at: Option<Time>,
+}
+
+/// A connection on which messages flow.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Link {
+    pub(super) connection: ConnectionId,
+    pub(super) since: Time,
+    pub(super) heard: Time,
+    /// Pings since something was heard.
+    pub(super) pings: u32,
+}
+
+impl Acquaintance {
+    pub(super) const fn new(incarnation: Incarnation, settings: &Settings) -> Self {
+        Self {
+            incarnation,
+            wanted: None,
+            link: None,
+            dial: None,
+            dial_number: 0,
+            void_dial: 0,
+            redial_at: None,
+            back_off: settings.redial_min,
+            orphan_at: None,
+        }
+    }
+
+    /// Whether nothing would be lost by forgetting it.
+    pub(super) const fn is_idle(&self) -> bool {
+        self.wanted.is_none() && self.link.is_none() && self.dial.is_none()
+    }
+
+    /// There is no link and no dial on its way: plans the next dial, or the end of the acquaintance.
+    ///
+    /// `chance` is uniform in `0.0..1.0`.
+    pub(super) fn plan(&mut self, now: Time, settings: &Settings, chance: f64) {
+        if self.wanted.is_some() {
+            // spec: GNCL-8
+            self.redial_at = Some(now + self.back_off.mul_f64(0.8 + 0.4 * chance));
+            self.back_off = (self.back_off * 2).min(settings.redial_max);
+        } else {
+            self.orphan_at = Some(now + settings.orphan);
+        }
+    }
+
+    /// A link is there: nothing is planned.
+    pub(super) fn linked(&mut self, connection: ConnectionId, now: Time) {
+        self.link = Some(Link { connection, since: now, heard: now, pings: 0 });
+        self.redial_at = None;
+        self.orphan_at = None;
+    }
+
+    /// Takes the link away; one that was healthy for long resets the back-off.
+    pub(super) fn unlink(&mut self, now: Time, settings: &Settings) -> Option<Link> {
+        let link = self.link.take()?;
+        if now.since(link.since) >= settings.healthy {
+            self.back_off = settings.redial_min;
+        }
+        Some(link)
+    }
+
+    /// When something is to be done about it without further news.
+    pub(super) fn next_wake(&self, settings: &Settings) -> Option<Time> {
+        let ping = self.link.map(|link| link.ping_at(settings));
+        [ping, self.redial_at, self.orphan_at].into_iter().flatten().min()
+    }
+}
+
+impl Link {
+    /// When the next ping is due, or the link counts as broken.
+    pub(super) fn ping_at(&self, settings: &Settings) -> Time {
+        self.heard + settings.ping_period * (self.pings + 1)
+    }
+}

@@ -1,0 +1,257 @@
+//! What happens to one connection until it is a link or gone.
+
+use sinew_runtime::{tid::NodeAddress, time::Time};
+
+use super::{
+    Attach, Connection, ConnectionId, Core, Decline, Introduction, LinkFact, Output, Refusal, Stage,
+    acquaintance::Acquaintance, handshake::check,
+};
+
+impl Core {
+    pub(super) fn accepted(&mut self, now: Time, connection: ConnectionId) {
+        let strangers =
+            self.connections.values().filter(|c| matches!(c.stage, Stage::Stranger | Stage::Leaving));
+        if self.leaving || strangers.count() >= self.settings.strangers_max {
+            self.count(
+                "too many strangers",
+                "a connection was closed at once; see `gncl.strangers_max`".to_owned(),
+            );
+            self.outputs.push_back(Output::Close(connection));
+            return;
+        }
+        self.stage_for_handshake(now, connection, Stage::Stranger);
+    }
+
+    /// Dials a peer that has neither a link nor a dial on its way.
+    pub(super) fn dial(&mut self, now: Time, node: NodeAddress) {
+        let connection = self.open();
+        let Some(peer) = self.peers.get_mut(&node) else { return };
+        let Some(address) = peer.wanted else { return };
+        debug_assert!(peer.link.is_none() && peer.dial.is_none(), "one connection to a peer is enough");
+        peer.redial_at = None;
+        peer.dial = Some(connection);
+        self.stage_for_handshake(now, connection, Stage::Dialling(node));
+        self.outputs.push_back(Output::Dial { connection, address });
+    }
+
+    pub(super) fn connected(&mut self, now: Time, connection: ConnectionId) {
+        let Some(Stage::Dialling(node)) = self.stage(connection) else { return };
+        let Some(peer) = self.peers.get_mut(&node) else { return };
+        // The clock makes the number grow through restarts of this layer as well. spec: GNCL-6
+        peer.dial_number = now.as_nanos().max(peer.dial_number + 1);
+        let hello = Introduction { peer: node, dial: peer.dial_number, ..self.settings.ours.clone() };
+        self.stage_for_handshake(now, connection, Stage::HelloSent(node));
+        self.outputs.push_back(Output::SendHello(connection, hello));
+    }
+
+    pub(super) fn dial_failed(&mut self, now: Time, connection: ConnectionId, refused: bool) {
+        let Some(Stage::Dialling(node)) = self.stage(connection) else { return };
+        self.connections.remove(&connection);
+        if let (true, Some(peer)) = (refused, self.peers.get(&node)) {
+            let incarnation = peer.incarnation;
+            self.fact(LinkFact::DialRefused { node, incarnation });
+        }
+        self.dial_over(now, node);
+    }
+
+    pub(super) fn hello(&mut self, now: Time, connection: ConnectionId, hello: &Introduction) {
+        match self.stage(connection) {
+            Some(Stage::Stranger) => {}
+            Some(Stage::Leaving) | None => return,
+            Some(Stage::Dialling(_) | Stage::HelloSent(_) | Stage::Linked(_)) => {
+                let what = "a HELLO came where none belongs".to_owned();
+                return self.decline(now, connection, &Decline::Violation(what));
+            }
+        }
+        if let Err(decline) = self.judge(hello) {
+            return self.decline(now, connection, &decline);
+        }
+        let node = hello.node;
+        self.meet(now, node, hello.incarnation);
+        // spec: GNCL-4
+        self.drop_dial(node);
+        // spec: GNCL-5
+        self.unlink(now, node);
+        let Some(peer) = self.peers.get_mut(&node) else { return };
+        peer.void_dial = hello.dial;
+        let welcome = Introduction { peer: node, dial: peer.dial_number, ..self.settings.ours.clone() };
+        self.link(now, connection, hello, Some(welcome));
+    }
+
+    /// Whether a hello can be taken.
+    fn judge(&self, hello: &Introduction) -> Result<(), Decline> {
+        if self.leaving {
+            return Err(Decline::Leaving);
+        }
+        check(hello, &self.settings.ours)?;
+        let Some(peer) = self.peers.get(&hello.node) else { return self.room() };
+        // spec: GNCL-7
+        if hello.incarnation < peer.incarnation {
+            return Err(Decline::Stale { theirs: hello.incarnation, known: peer.incarnation });
+        }
+        // spec: GNCL-6
+        let is_void = hello.incarnation == peer.incarnation && hello.dial <= peer.void_dial;
+        // A dial that has not said hello yet loses against one that has. spec: GNCL-4
+        let said_hello = peer.dial.is_some_and(|dial| matches!(self.stage(dial), Some(Stage::HelloSent(_))));
+        if is_void || (said_hello && self.settings.ours.node < hello.node) {
+            return Err(Decline::Duplicate);
+        }
+        Ok(())
+    }
+
+    /// Whether one more peer can be known.
+    fn room(&self) -> Result<(), Decline> {
+        let peers_max = self.settings.peers_max;
+        if self.peers.len() < peers_max || self.peers.values().any(Acquaintance::is_idle) {
+            Ok(())
+        } else {
+            Err(Decline::TooManyPeers { peers_max })
+        }
+    }
+
+    pub(super) fn welcome(&mut self, now: Time, connection: ConnectionId, welcome: &Introduction) {
+        let node = match self.stage(connection) {
+            Some(Stage::HelloSent(node)) => node,
+            Some(Stage::Leaving) | None => return,
+            Some(Stage::Dialling(_) | Stage::Stranger | Stage::Linked(_)) => {
+                let what = "a WELCOME came where none belongs".to_owned();
+                return self.decline(now, connection, &Decline::Violation(what));
+            }
+        };
+        if let Err(decline) = self.judge_welcome(node, welcome) {
+            return self.decline(now, connection, &decline);
+        }
+        self.meet(now, node, welcome.incarnation);
+        let Some(peer) = self.peers.get_mut(&node) else { return };
+        peer.dial = None;
+        peer.void_dial = peer.void_dial.max(welcome.dial);
+        self.link(now, connection, welcome, None);
+    }
+
+    fn judge_welcome(&self, dialled: NodeAddress, welcome: &Introduction) -> Result<(), Decline> {
+        check(welcome, &self.settings.ours)?;
+        if welcome.node != dialled {
+            return Err(Decline::WrongNode { wanted: dialled, ours: welcome.node });
+        }
+        match self.peers.get(&dialled) {
+            Some(peer) if welcome.incarnation < peer.incarnation => {
+                Err(Decline::Stale { theirs: welcome.incarnation, known: peer.incarnation })
+            }
+            Some(_) | None => Ok(()),
+        }
+    }
+
+    fn link(
+        &mut self,
+        now: Time,
+        connection: ConnectionId,
+        theirs: &Introduction,
+        welcome: Option<Introduction>,
+    ) {
+        let (node, incarnation) = (theirs.node, theirs.incarnation);
+        let Some(peer) = self.peers.get_mut(&node) else { return };
+        peer.linked(connection, now);
+        self.connections.insert(connection, Connection { stage: Stage::Linked(node), deadline: Time::MAX });
+        let payload_max = theirs.payload_max;
+        self.outputs.push_back(Output::Attach(Attach {
+            connection,
+            node,
+            incarnation,
+            payload_max,
+            welcome,
+        }));
+        self.fact(LinkFact::LinkUp { node, incarnation });
+    }
+
+    pub(super) fn refused(&mut self, now: Time, connection: ConnectionId, refusal: &Refusal) {
+        let Some(stage) = self.stage(connection) else { return };
+        match stage {
+            Stage::HelloSent(node) | Stage::Linked(node) => {
+                // Two nodes that dial each other at once refuse one of the two: that is how it should be.
+                let cause = if refusal.cause == "duplicate" {
+                    "duplicate at the peer"
+                } else {
+                    "refused by the peer"
+                };
+                self.count(cause, format!("node {node} says: {}", printable(&refusal.sentence)));
+            }
+            Stage::Dialling(_) | Stage::Stranger | Stage::Leaving => {}
+        }
+        self.ended(now, connection);
+        self.outputs.push_back(Output::Close(connection));
+    }
+
+    /// Refuses a connection in words. spec: GNCL-3
+    pub(super) fn decline(&mut self, now: Time, connection: ConnectionId, decline: &Decline) {
+        let Some(stage) = self.stage(connection) else { return };
+        if stage == Stage::Leaving {
+            return;
+        }
+        self.count(decline.cause(), decline.to_string());
+        self.leave_stage(now, connection, stage);
+        self.stage_for_handshake(now, connection, Stage::Leaving);
+        self.outputs.push_back(Output::Refuse(connection, decline.to_refusal()));
+    }
+
+    pub(super) fn ended(&mut self, now: Time, connection: ConnectionId) {
+        if let Some(stage) = self.stage(connection) {
+            self.leave_stage(now, connection, stage);
+        }
+    }
+
+    pub(super) fn timed_out(&mut self, now: Time, connection: ConnectionId, stage: Stage) {
+        match stage {
+            Stage::Stranger | Stage::HelloSent(_) => self.decline(now, connection, &Decline::TooLate),
+            Stage::Dialling(node) => {
+                self.count("dial timed out", format!("node {node} cannot be reached"));
+                self.outputs.push_back(Output::Close(connection));
+                self.ended(now, connection);
+            }
+            Stage::Leaving | Stage::Linked(_) => {
+                self.outputs.push_back(Output::Close(connection));
+                self.ended(now, connection);
+            }
+        }
+    }
+
+    /// The connection is not in `stage` any more: the peer's side of that.
+    fn leave_stage(&mut self, now: Time, connection: ConnectionId, stage: Stage) {
+        match stage {
+            Stage::Dialling(node) | Stage::HelloSent(node) => {
+                self.connections.remove(&connection);
+                self.dial_over(now, node);
+            }
+            Stage::Linked(node) => self.link_over(now, node),
+            Stage::Stranger | Stage::Leaving => {
+                self.connections.remove(&connection);
+            }
+        }
+    }
+
+    fn dial_over(&mut self, now: Time, node: NodeAddress) {
+        let chance = self.chance();
+        if let Some(peer) = self.peers.get_mut(&node) {
+            peer.dial = None;
+            peer.plan(now, &self.settings, chance);
+        }
+    }
+
+    /// Gives up our dial to `node`, if there is one.
+    pub(super) fn drop_dial(&mut self, node: NodeAddress) {
+        let dial = self.peers.get_mut(&node).and_then(|peer| peer.dial.take());
+        if let Some(connection) = dial {
+            self.connections.remove(&connection);
+            self.outputs.push_back(Output::Close(connection));
+        }
+    }
+
+    fn stage_for_handshake(&mut self, now: Time, connection: ConnectionId, stage: Stage) {
+        let deadline = now + self.settings.handshake;
+        self.connections.insert(connection, Connection { stage, deadline });
+    }
+}
+
+/// A peer's words for our log: at most a few lines, and nothing that a terminal would obey.
+fn printable(words: &str) -> String {
+    words.chars().filter(|c| !c.is_control()).take(400).collect()
+}

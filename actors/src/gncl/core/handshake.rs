@@ -1,0 +1,223 @@
+//! What two nodes say to each other first, and why one may refuse the other.
+
+use std::fmt;
+
+use bytes::Bytes;
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
+use sinew_runtime::tid::{Incarnation, NodeAddress};
+
+/// Longest payload in bytes before the handshake is over: a stranger can make us hold no more.
+pub(crate) const HANDSHAKE_PAYLOAD_MAX: usize = 4_096;
+
+/// Longest name of a node or a project, in bytes.
+const NAME_MAX: usize = 63;
+
+/// Payload of HELLO and of WELCOME: who the sender is. Fields that are not known are ignored.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Introduction {
+    /// Project of the sender.
+    pub(crate) project: String,
+    /// Address of the sender.
+    pub(crate) node: NodeAddress,
+    /// Name of the sender, for people.
+    pub(crate) name: String,
+    /// Which life of the sender this is.
+    pub(crate) incarnation: Incarnation,
+    /// Whom the sender wants to talk to.
+    pub(crate) peer: NodeAddress,
+    /// HELLO: number of this dial. WELCOME: number of the sender's last dial to this peer, 0 if none; void are this
+    /// one and all before it.
+    pub(crate) dial: u64,
+    /// Longest payload that the sender takes, in bytes.
+    pub(crate) payload_max: u64,
+    /// Optional abilities of the sender; what both have may be used. None is defined in version 1.
+    #[serde(default)]
+    pub(crate) features: Vec<String>,
+}
+
+/// Payload of REFUSAL.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Refusal {
+    /// One word of the table in `docs/protocol/gncl.md`, for programs.
+    pub(crate) cause: String,
+    /// Why, for people.
+    pub(crate) sentence: String,
+}
+
+/// Why a node does not take another one's word.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Decline {
+    /// The frame or its payload is not what it should be.
+    Violation(String),
+    /// The frames are of another version of the protocol.
+    Version(String),
+    OtherProject {
+        theirs: String,
+        ours: String,
+    },
+    OwnAddress {
+        node: NodeAddress,
+        name: String,
+    },
+    WrongNode {
+        wanted: NodeAddress,
+        ours: NodeAddress,
+    },
+    Stale {
+        theirs: Incarnation,
+        known: Incarnation,
+    },
+    Duplicate,
+    TooManyPeers {
+        peers_max: usize,
+    },
+    TooLate,
+    Leaving,
+}
+
+impl Decline {
+    /// The word that names this cause in a REFUSAL and among the counters.
+    pub(crate) const fn cause(&self) -> &'static str {
+        match self {
+            Self::Violation(_) => "violation",
+            Self::Version(_) => "version",
+            Self::OtherProject { .. } => "other project",
+            Self::OwnAddress { .. } => "own address",
+            Self::WrongNode { .. } => "wrong node",
+            Self::Stale { .. } => "stale incarnation",
+            Self::Duplicate => "duplicate",
+            Self::TooManyPeers { .. } => "too many peers",
+            Self::TooLate => "too late",
+            Self::Leaving => "leaving",
+        }
+    }
+
+    /// The frame's payload.
+    pub(crate) fn to_refusal(&self) -> Refusal {
+        Refusal { cause: self.cause().to_owned(), sentence: self.to_string() }
+    }
+}
+
+impl fmt::Display for Decline {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Violation(what) | Self::Version(what) => f.write_str(what),
+            Self::OtherProject { theirs, ours } => write!(
+                f,
+                "you belong to the project '{theirs}' and I to '{ours}'; give both the same project, or keep them on \
+                 different networks"
+            ),
+            Self::OwnAddress { node, name } => write!(
+                f,
+                "the address {node} is mine and you ('{name}') use it too; give each node its own address"
+            ),
+            Self::WrongNode { wanted, ours } => write!(
+                f,
+                "you want to talk to node {wanted} and I am {ours}; an announcement is out of date or an address is \
+                 given twice"
+            ),
+            Self::Stale { theirs, known } => write!(
+                f,
+                "incarnation {theirs} of your node is over, I know {known}; is an old process still running?"
+            ),
+            Self::Duplicate => {
+                f.write_str("another connection between us is made or being made; keep that one")
+            }
+            Self::TooManyPeers { peers_max } => {
+                write!(f, "I have {peers_max} peers, which is my limit; raise `ndl.nodes_max`")
+            }
+            Self::TooLate => f.write_str("the handshake took longer than `gncl.handshake` allows"),
+            Self::Leaving => f.write_str("this node is being stopped"),
+        }
+    }
+}
+
+/// Checks what does not depend on who is known already.
+pub(crate) fn check(theirs: &Introduction, ours: &Introduction) -> Result<(), Decline> {
+    let long = |name: &str| name.is_empty() || name.len() > NAME_MAX;
+    if long(&theirs.project) || long(&theirs.name) {
+        Err(Decline::Violation(format!("names of projects and nodes have 1 to {NAME_MAX} bytes")))
+    } else if theirs.project != ours.project {
+        Err(Decline::OtherProject { theirs: theirs.project.clone(), ours: ours.project.clone() })
+    } else if !theirs.node.is_single() {
+        Err(Decline::Violation(format!("'{}' is not the address of one node", theirs.node)))
+    } else if theirs.node == ours.node {
+        Err(Decline::OwnAddress { node: ours.node, name: theirs.name.clone() })
+    } else if theirs.peer != ours.node {
+        Err(Decline::WrongNode { wanted: theirs.peer, ours: ours.node })
+    } else {
+        Ok(())
+    }
+}
+
+/// The MessagePack form of a payload of this layer.
+pub(crate) fn write<T: Serialize>(value: &T) -> Bytes {
+    rmp_serde::to_vec_named(value)
+        .expect("structs of strings and numbers can be written as MessagePack")
+        .into()
+}
+
+/// Reads a payload of this layer.
+pub(crate) fn read<T: DeserializeOwned>(payload: &[u8]) -> Result<T, Decline> {
+    rmp_serde::from_slice(payload)
+        .map_err(|cause| Decline::Violation(format!("a payload of GNCL is wrong: {cause}")))
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    pub(crate) fn introduction() -> Introduction {
+        Introduction {
+            project: "exo".to_owned(),
+            node: NodeAddress::new(2),
+            name: "knee".to_owned(),
+            incarnation: Incarnation(1),
+            peer: NodeAddress::new(1),
+            dial: 1,
+            payload_max: 1 << 20,
+            features: Vec::new(),
+        }
+    }
+
+    fn ours() -> Introduction {
+        Introduction { node: NodeAddress::new(1), peer: NodeAddress::new(2), ..introduction() }
+    }
+
+    #[test]
+    fn each_fault_of_a_hello_has_its_own_words() {
+        let cases = [
+            (Introduction { project: "arm".to_owned(), ..introduction() }, "other project"),
+            (Introduction { node: NodeAddress::new(1), ..introduction() }, "own address"),
+            (Introduction { peer: NodeAddress::new(7), ..introduction() }, "wrong node"),
+            (Introduction { node: NodeAddress::ALL, ..introduction() }, "violation"),
+            (Introduction { name: String::new(), ..introduction() }, "violation"),
+            (Introduction { project: "x".repeat(64), ..introduction() }, "violation"),
+        ];
+        for (hello, cause) in cases {
+            assert_eq!(check(&hello, &ours()).unwrap_err().cause(), cause, "{hello:?}");
+        }
+        assert_eq!(check(&introduction(), &ours()), Ok(()));
+    }
+
+    #[test]
+    fn fields_of_a_later_version_are_ignored() {
+        let mut map = std::collections::BTreeMap::from([("colour".to_owned(), serde_json::json!("red"))]);
+        let serde_json::Value::Object(known) = serde_json::to_value(introduction()).unwrap() else {
+            unreachable!()
+        };
+        map.extend(known);
+        assert_eq!(read::<Introduction>(&rmp_serde::to_vec_named(&map).unwrap()), Ok(introduction()));
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes_are_an_introduction_or_a_violation(bytes: Vec<u8>) {
+            if let Err(decline) = read::<Introduction>(&bytes) {
+                prop_assert_eq!(decline.cause(), "violation");
+            }
+        }
+    }
+}

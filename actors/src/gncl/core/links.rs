@@ -1,0 +1,208 @@
+//! What happens to peers and their links.
+
+use std::net::SocketAddr;
+
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
+
+use super::{ConnectionId, Core, LinkFact, Output, Stage, acquaintance::Acquaintance};
+
+impl Core {
+    pub(super) fn found(
+        &mut self,
+        now: Time,
+        node: NodeAddress,
+        incarnation: Incarnation,
+        address: SocketAddr,
+    ) {
+        if self.leaving || node == self.settings.ours.node || !node.is_single() {
+            return;
+        }
+        if self.peers.get(&node).is_some_and(|peer| incarnation < peer.incarnation) {
+            self.count("stale incarnation", format!("NDL found node {node} in a life that is over"));
+            return;
+        }
+        if self.peers.get(&node).is_some_and(|peer| peer.incarnation < incarnation) {
+            // It went to a life that is over.
+            self.drop_dial(node);
+        }
+        self.meet(now, node, incarnation);
+        let Some(peer) = self.peers.get_mut(&node) else {
+            let peers_max = self.settings.peers_max;
+            self.count(
+                "too many peers",
+                format!("node {node} is not dialled; `ndl.nodes_max` is {peers_max}"),
+            );
+            return;
+        };
+        peer.orphan_at = None;
+        peer.wanted = Some(address);
+        if peer.link.is_none() && peer.dial.is_none() {
+            // spec: GNCL-1
+            self.dial(now, node);
+        }
+    }
+
+    pub(super) fn lost(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
+        let Some(peer) = self.peers.get_mut(&node) else { return };
+        if incarnation < peer.incarnation {
+            // The news is about a life that is over anyway.
+            return;
+        }
+        peer.wanted = None;
+        self.forget(now, node);
+    }
+
+    /// A former instance of this layer had this peer: it has some time to come back.
+    pub(super) fn restored(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
+        self.meet(now, node, incarnation);
+        let chance = self.chance();
+        if let Some(peer) = self.peers.get_mut(&node) {
+            peer.plan(now, &self.settings, chance);
+        }
+    }
+
+    /// Makes sure that `node` is known in the life `incarnation`; what belongs to an older one ends. spec: GNCL-7
+    ///
+    /// Does nothing if the table is full.
+    pub(super) fn meet(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
+        if let Some(peer) = self.peers.get(&node) {
+            if peer.incarnation == incarnation {
+                return;
+            }
+            self.unlink(now, node);
+            self.outputs.push_back(Output::Forget(node));
+        } else {
+            self.make_room();
+        }
+        if let Some(peer) = self.peers.get_mut(&node) {
+            peer.incarnation = incarnation;
+            peer.void_dial = 0;
+            peer.back_off = self.settings.redial_min;
+        } else if self.peers.len() < self.settings.peers_max {
+            self.peers.insert(node, Acquaintance::new(incarnation, &self.settings));
+        }
+    }
+
+    /// A full table gives up somebody of whom only a past life is known.
+    fn make_room(&mut self) {
+        if self.peers.len() < self.settings.peers_max {
+            return;
+        }
+        let idle = self.peers.iter().find(|(_, peer)| peer.is_idle()).map(|(node, _)| *node);
+        if let Some(node) = idle {
+            self.peers.remove(&node);
+            self.outputs.push_back(Output::Forget(node));
+        }
+    }
+
+    pub(super) fn heard(&mut self, now: Time, connection: ConnectionId) {
+        let Some(node) = self.linked_node(connection) else { return };
+        if let Some(link) = self.peers.get_mut(&node).and_then(|peer| peer.link.as_mut()) {
+            link.heard = now;
+            link.pings = 0;
+        }
+    }
+
+    pub(super) fn goodbye(&mut self, now: Time, connection: ConnectionId) {
+        // spec: GNCL-10
+        let Some(node) = self.linked_node(connection) else { return };
+        let Some(peer) = self.peers.get_mut(&node) else { return };
+        let incarnation = peer.incarnation;
+        peer.wanted = None;
+        self.fact(LinkFact::PeerLeft { node, incarnation });
+        self.forget(now, node);
+    }
+
+    /// Ends all that there is with `node`; its incarnation stays known, so that no older one comes back.
+    fn forget(&mut self, now: Time, node: NodeAddress) {
+        self.drop_dial(node);
+        self.unlink(now, node);
+        if let Some(peer) = self.peers.get_mut(&node) {
+            peer.redial_at = None;
+            peer.orphan_at = None;
+            peer.back_off = self.settings.redial_min;
+        }
+        self.outputs.push_back(Output::Forget(node));
+    }
+
+    /// The link to `node` is over because its connection is; plans the next one.
+    pub(super) fn link_over(&mut self, now: Time, node: NodeAddress) {
+        let Some(connection) = self.detach(now, node) else { return };
+        self.connections.remove(&connection);
+        let chance = self.chance();
+        if let Some(peer) = self.peers.get_mut(&node) {
+            peer.plan(now, &self.settings, chance);
+        }
+    }
+
+    /// Ends the link to `node`, if there is one, and closes its connection.
+    pub(super) fn unlink(&mut self, now: Time, node: NodeAddress) {
+        if let Some(connection) = self.detach(now, node) {
+            self.connections.remove(&connection);
+            self.outputs.push_back(Output::Close(connection));
+        }
+    }
+
+    fn detach(&mut self, now: Time, node: NodeAddress) -> Option<ConnectionId> {
+        let peer = self.peers.get_mut(&node)?;
+        let incarnation = peer.incarnation;
+        let connection = peer.unlink(now, &self.settings)?.connection;
+        self.outputs.push_back(Output::Detach { connection, node });
+        self.fact(LinkFact::LinkBroken { node, incarnation });
+        Some(connection)
+    }
+
+    /// Something about this peer is due.
+    pub(super) fn peer_due(&mut self, now: Time, node: NodeAddress) {
+        let Some(peer) = self.peers.get_mut(&node) else { return };
+        if peer.orphan_at.is_some_and(|at| at <= now) {
+            self.forget(now, node);
+        } else if peer.redial_at.is_some_and(|at| at <= now) {
+            self.dial(now, node);
+        } else {
+            self.ping_due(now, node);
+        }
+    }
+
+    /// spec: GNCL-9
+    fn ping_due(&mut self, now: Time, node: NodeAddress) {
+        let Some(peer) = self.peers.get_mut(&node) else { return };
+        let Some(link) = peer.link.as_mut().filter(|link| link.ping_at(&self.settings) <= now) else {
+            return;
+        };
+        if link.pings < self.settings.pings_missed_max {
+            link.pings += 1;
+            self.outputs.push_back(Output::SendPing(node));
+            return;
+        }
+        let connection = link.connection;
+        self.count(
+            "silent link",
+            format!("node {node} answers no ping; its GNCL hangs or the way to it is cut"),
+        );
+        self.ended(now, connection);
+        self.outputs.push_back(Output::Close(connection));
+    }
+
+    pub(super) fn leave(&mut self, now: Time) {
+        self.leaving = true;
+        let nodes: Vec<_> = self.peers.keys().copied().collect();
+        for node in nodes {
+            self.drop_dial(node);
+            let Some(peer) = self.peers.get_mut(&node) else { continue };
+            peer.wanted = None;
+            peer.redial_at = None;
+            if peer.link.is_some() {
+                self.outputs.push_back(Output::SendGoodbye(node));
+            }
+        }
+        let strangers: Vec<_> = self.connections.iter().filter(|(_, c)| c.stage == Stage::Stranger).collect();
+        let strangers: Vec<_> = strangers.into_iter().map(|(id, _)| *id).collect();
+        for connection in strangers {
+            self.decline(now, connection, &super::Decline::Leaving);
+        }
+    }
+}

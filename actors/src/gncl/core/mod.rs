@@ -1,0 +1,285 @@
+//! Who is dialled, who is refused, which of several connections stays: GNCL without sockets and clocks.
+//!
+//! **After each [`Core::handle`], drain [`Core::poll`] until it is `None`, then sleep until [`Core::next_wake`].**
+//!
+//! ```text
+//!  dialler    Dialling ── connected ──► HelloSent ── WELCOME ──► Linked
+//!  acceptor   Stranger ── HELLO ──► (WELCOME) ──────────────────► Linked
+//!  either     any of them ── refused ──► Leaving (until the peer has read the words, or the time is over)
+//! ```
+
+mod acquaintance;
+mod connections;
+mod handshake;
+mod links;
+#[cfg(test)]
+mod tests;
+
+use std::{
+    collections::{BTreeMap, VecDeque},
+    net::SocketAddr,
+    time::Duration,
+};
+
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
+
+use super::LinkFact;
+use acquaintance::Acquaintance;
+pub(super) use handshake::{Decline, HANDSHAKE_PAYLOAD_MAX, Introduction, Refusal, read, write};
+
+/// What the core is set to.
+#[derive(Clone, Debug)]
+pub(super) struct Settings {
+    /// Who we are; `peer` and `dial` are filled in for each hello.
+    pub(super) ours: Introduction,
+    /// Time for a handshake, and for a refused peer to read why.
+    pub(super) handshake: Duration,
+    /// First wait before dialling again.
+    pub(super) redial_min: Duration,
+    /// Longest wait before dialling again, before jitter.
+    pub(super) redial_max: Duration,
+    /// Connections at most that are not links, of those that we accepted. Further ones are closed at once.
+    pub(super) strangers_max: usize,
+    /// Peers known at most. Further ones are refused.
+    pub(super) peers_max: usize,
+    /// Silence after which a link is pinged, and time between two pings.
+    pub(super) ping_period: Duration,
+    /// Pings in a row without an answer after which a link is broken.
+    pub(super) pings_missed_max: u32,
+    /// Age of a link from which on its break counts as the first one.
+    pub(super) healthy: Duration,
+    /// Time that a peer's messages are kept without a link, if NDL never told of it.
+    pub(super) orphan: Duration,
+}
+
+/// One TCP connection, made or accepted. Never used twice.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct ConnectionId(u64);
+
+/// What has happened.
+#[derive(Clone, Debug)]
+pub(super) enum Input {
+    /// A former instance of this layer left messages for this peer behind.
+    Restored { node: NodeAddress, incarnation: Incarnation },
+    /// NDL found a node.
+    NodeFound { node: NodeAddress, incarnation: Incarnation, address: SocketAddr },
+    /// NDL lost a node.
+    NodeLost { node: NodeAddress, incarnation: Incarnation },
+    /// The listener accepted a connection; `connection` is from [`Core::open`].
+    Accepted(ConnectionId),
+    /// A dial reached the peer's host.
+    Connected(ConnectionId),
+    /// A dial did not.
+    DialFailed { connection: ConnectionId, refused: bool },
+    /// A first frame came from a dialler.
+    HelloReceived(ConnectionId, Introduction),
+    /// The answer to our hello came.
+    WelcomeReceived(ConnectionId, Introduction),
+    /// The peer does not want this connection.
+    RefusalReceived(ConnectionId, Refusal),
+    /// The peer sent what cannot be used.
+    Violated(ConnectionId, Decline),
+    /// Any frame came on a link.
+    Heard(ConnectionId),
+    /// The peer asked for a sign of life.
+    PingReceived(ConnectionId),
+    /// The peer said goodbye.
+    GoodbyeReceived(ConnectionId),
+    /// The connection ended.
+    Ended(ConnectionId),
+    /// Time has passed, perhaps up to [`Core::next_wake`].
+    TimePassed,
+    /// The node is being stopped in order.
+    LeaveRequested,
+}
+
+/// What is to be done.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Output {
+    /// Connect to `address`; answer with `Connected` or `DialFailed`.
+    Dial { connection: ConnectionId, address: SocketAddr },
+    /// Send a HELLO.
+    SendHello(ConnectionId, Introduction),
+    /// The handshake is over: the peer's messages flow on this connection from now on, after the WELCOME if there is
+    /// one to send.
+    Attach(Attach),
+    /// The peer's messages do not flow on this connection any more. A `Close` or a `Refuse` follows.
+    Detach { connection: ConnectionId, node: NodeAddress },
+    /// Send a REFUSAL, close our direction, and throw away what still comes until the peer closes its own.
+    Refuse(ConnectionId, Refusal),
+    /// Close the connection and forget it. No input about it is expected any more.
+    Close(ConnectionId),
+    /// Send a PING on the link to this node.
+    SendPing(NodeAddress),
+    /// Send a PONG.
+    SendPong(NodeAddress),
+    /// Send a GOODBYE, after all that waits.
+    SendGoodbye(NodeAddress),
+    /// The node, or this life of it, is gone with all that waits for it.
+    Forget(NodeAddress),
+    /// Tell the other layers.
+    Fact(LinkFact),
+    /// Count a refusal, ours or the peer's.
+    Count { cause: &'static str, detail: String },
+}
+
+/// A handshake that has succeeded.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Attach {
+    pub(super) connection: ConnectionId,
+    pub(super) node: NodeAddress,
+    pub(super) incarnation: Incarnation,
+    /// Longest payload that the peer takes, in bytes.
+    pub(super) payload_max: u64,
+    /// To be sent before all else.
+    pub(super) welcome: Option<Introduction>,
+}
+
+/// How far a connection has come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Stage {
+    /// Our dial has not reached the peer's host yet.
+    Dialling(NodeAddress),
+    /// Our hello is on its way.
+    HelloSent(NodeAddress),
+    /// Accepted; has not said who it is.
+    Stranger,
+    /// Messages flow.
+    Linked(NodeAddress),
+    /// Refused; has not closed its side.
+    Leaving,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Connection {
+    stage: Stage,
+    /// When it is given up; never for a link.
+    deadline: Time,
+}
+
+/// All that GNCL knows about connections and peers.
+#[derive(Debug)]
+pub(super) struct Core {
+    settings: Settings,
+    connections: BTreeMap<ConnectionId, Connection>,
+    peers: BTreeMap<NodeAddress, Acquaintance>,
+    outputs: VecDeque<Output>,
+    opened: u64,
+    chance: u64,
+    leaving: bool,
+}
+
+impl Core {
+    /// A core that knows nobody; `seed` decides its jitter.
+    pub(super) const fn new(settings: Settings, seed: u64) -> Self {
+        Self {
+            settings,
+            connections: BTreeMap::new(),
+            peers: BTreeMap::new(),
+            outputs: VecDeque::new(),
+            opened: 0,
+            chance: seed,
+            leaving: false,
+        }
+    }
+
+    /// A name for a connection that was accepted.
+    pub(super) const fn open(&mut self) -> ConnectionId {
+        self.opened += 1;
+        ConnectionId(self.opened)
+    }
+
+    /// Takes note of what happened at `now`.
+    pub(super) fn handle(&mut self, now: Time, input: Input) {
+        match input {
+            Input::Restored { node, incarnation } => self.restored(now, node, incarnation),
+            Input::NodeFound { node, incarnation, address } => self.found(now, node, incarnation, address),
+            Input::NodeLost { node, incarnation } => self.lost(now, node, incarnation),
+            Input::Accepted(connection) => self.accepted(now, connection),
+            Input::Connected(connection) => self.connected(now, connection),
+            Input::DialFailed { connection, refused } => self.dial_failed(now, connection, refused),
+            Input::HelloReceived(connection, hello) => self.hello(now, connection, &hello),
+            Input::WelcomeReceived(connection, welcome) => self.welcome(now, connection, &welcome),
+            Input::RefusalReceived(connection, refusal) => self.refused(now, connection, &refusal),
+            Input::Violated(connection, decline) => self.decline(now, connection, &decline),
+            Input::Heard(connection) => self.heard(now, connection),
+            Input::PingReceived(connection) => {
+                let pong = self.linked_node(connection).map(Output::SendPong);
+                self.outputs.extend(pong);
+            }
+            Input::GoodbyeReceived(connection) => self.goodbye(now, connection),
+            Input::Ended(connection) => self.ended(now, connection),
+            Input::TimePassed => self.time_passed(now),
+            Input::LeaveRequested => self.leave(now),
+        }
+    }
+
+    /// The next thing to do.
+    pub(super) fn poll(&mut self) -> Option<Output> {
+        self.outputs.pop_front()
+    }
+
+    /// When to say [`Input::TimePassed`], if nothing else happens before.
+    pub(super) fn next_wake(&self) -> Option<Time> {
+        let deadlines = self.connections.values().map(|connection| connection.deadline);
+        let peers = self.peers.values().filter_map(|peer| peer.next_wake(&self.settings));
+        deadlines.chain(peers).filter(|at| *at != Time::MAX).min()
+    }
+
+    fn time_passed(&mut self, now: Time) {
+        self.forgive_our_own_lateness(now);
+        let over = self.connections.iter().filter(|(_, connection)| connection.deadline <= now);
+        let over: Vec<_> = over.map(|(id, connection)| (*id, connection.stage)).collect();
+        for (connection, stage) in over {
+            self.timed_out(now, connection, stage);
+        }
+        let due =
+            self.peers.iter().filter(|(_, peer)| peer.next_wake(&self.settings).is_some_and(|at| at <= now));
+        let due: Vec<_> = due.map(|(node, _)| *node).collect();
+        for node in due {
+            self.peer_due(now, node);
+        }
+    }
+
+    /// A node whose own thread was held up may not blame its peers for the silence.
+    fn forgive_our_own_lateness(&mut self, now: Time) {
+        let late = self.next_wake().map_or(Duration::ZERO, |due| now.since(due));
+        if late <= self.settings.ping_period / 2 {
+            return;
+        }
+        for link in self.peers.values_mut().filter_map(|peer| peer.link.as_mut()) {
+            link.heard = link.heard + late;
+        }
+    }
+
+    fn fact(&mut self, fact: LinkFact) {
+        self.outputs.push_back(Output::Fact(fact));
+    }
+
+    fn count(&mut self, cause: &'static str, detail: String) {
+        self.outputs.push_back(Output::Count { cause, detail });
+    }
+
+    fn stage(&self, connection: ConnectionId) -> Option<Stage> {
+        self.connections.get(&connection).map(|connection| connection.stage)
+    }
+
+    fn linked_node(&self, connection: ConnectionId) -> Option<NodeAddress> {
+        match self.stage(connection)? {
+            Stage::Linked(node) => Some(node),
+            Stage::Dialling(_) | Stage::HelloSent(_) | Stage::Stranger | Stage::Leaving => None,
+        }
+    }
+
+    /// The next number of a seeded sequence in `0.0..1.0` (SplitMix64; Steele, Lea, Flood 2014).
+    const fn chance(&mut self) -> f64 {
+        self.chance = self.chance.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.chance;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
+    }
+}

@@ -1,0 +1,273 @@
+//! Two cores on a wire of virtual time: whatever the order of dials, accepts and losses, one link remains.
+
+use proptest::prelude::*;
+
+use super::*;
+
+mod virtual_wire;
+
+use virtual_wire::{Mishap, World, millis};
+
+fn any_mishap() -> impl Strategy<Value = Mishap> {
+    prop_oneof![
+        4 => any::<u64>().prop_map(Mishap::CutOne),
+        2 => (0usize..2).prop_map(Mishap::LayerRestarts),
+        2 => (0usize..2).prop_map(Mishap::NodeRestarts),
+        2 => (0usize..2).prop_map(Mishap::NodeLostAndFound),
+        1 => any::<u64>().prop_map(Mishap::HalfOpen),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 400, ..ProptestConfig::default() })]
+
+    #[test]
+    fn two_nodes_that_find_each_other_at_any_moment_make_one_link_and_never_break_it(
+        seed: u64, first in 0u64..60, second in 0u64..60, delay_max_us in 1u64..40_000,
+    ) {
+        let mut world = World::new(seed, delay_max_us);
+        world.find_each_other_at([millis(first), millis(second)]);
+        // Accept or connect, hello, welcome: three delays. Nobody has to dial a second time.
+        let delays = Duration::from_micros(delay_max_us) * 3;
+        world.run_until(millis(first.max(second)) + delays);
+        prop_assert!(world.is_linked(), "{}", world.story());
+        world.run_until(millis(20_000));
+        prop_assert_eq!(world.agreed_link(), Ok(()), "{}", world.story());
+        for node in &world.nodes {
+            let facts: Vec<_> = node.facts.iter().map(|fact| matches!(fact, LinkFact::LinkUp { .. })).collect();
+            prop_assert_eq!(facts, [true], "one LinkUp and nothing else; {}", world.story());
+        }
+    }
+
+    #[test]
+    fn whatever_breaks_both_end_with_the_same_one_link(
+        seed: u64, delay_max_us in 1u64..40_000,
+        mishaps in proptest::collection::vec((0u64..4_000, any_mishap()), 0..12),
+    ) {
+        let mut world = World::new(seed, delay_max_us);
+        world.find_each_other_at([millis(0), millis(3)]);
+        let mut mishaps = mishaps;
+        mishaps.sort_by_key(|(at, _)| *at);
+        for (at, mishap) in mishaps {
+            world.run_until(millis(at));
+            world.strike(mishap);
+        }
+        world.run_until(millis(40_000));
+        prop_assert_eq!(world.agreed_link(), Ok(()), "{}", world.story());
+    }
+}
+
+const LOW: NodeAddress = NodeAddress::new(1);
+const HIGH: NodeAddress = NodeAddress::new(2);
+
+fn settings(node: NodeAddress, incarnation: u64) -> Settings {
+    Settings {
+        ours: Introduction {
+            project: "exo".to_owned(),
+            node,
+            name: format!("node-{node}"),
+            incarnation: Incarnation(incarnation),
+            peer: NodeAddress::HERE,
+            dial: 0,
+            payload_max: 1 << 20,
+            features: Vec::new(),
+        },
+        handshake: Duration::from_secs(2),
+        redial_min: Duration::from_millis(10),
+        redial_max: Duration::from_secs(1),
+        strangers_max: 3,
+        peers_max: 2,
+        ping_period: Duration::from_secs(1),
+        pings_missed_max: 3,
+        healthy: Duration::from_secs(5),
+        orphan: Duration::from_secs(5),
+    }
+}
+
+fn core() -> Core {
+    Core::new(settings(LOW, 1), 7)
+}
+
+fn outputs(core: &mut Core) -> Vec<Output> {
+    std::iter::from_fn(|| core.poll()).collect()
+}
+
+fn hello_from(node: NodeAddress, incarnation: u64, dial: u64) -> Introduction {
+    Introduction { peer: LOW, dial, ..settings(node, incarnation).ours }
+}
+
+/// Has `core` accept a connection on which `hello` comes.
+fn greet(core: &mut Core, now: Time, hello: Introduction) -> (ConnectionId, Vec<Output>) {
+    let connection = core.open();
+    core.handle(now, Input::Accepted(connection));
+    core.handle(now, Input::HelloReceived(connection, hello));
+    (connection, outputs(core))
+}
+
+fn refusal(outputs: &[Output]) -> Option<&str> {
+    outputs.iter().find_map(|output| match output {
+        Output::Refuse(_, refusal) => Some(refusal.cause.as_str()),
+        _ => None,
+    })
+}
+
+fn address() -> SocketAddr {
+    SocketAddr::from(([127, 0, 0, 1], 7_000))
+}
+
+fn found(incarnation: u64) -> Input {
+    Input::NodeFound { node: HIGH, incarnation: Incarnation(incarnation), address: address() }
+}
+
+#[test]
+fn an_older_life_of_a_peer_is_refused_and_a_newer_one_ends_what_belongs_to_the_older() {
+    let mut core = core();
+    let (old, up) = greet(&mut core, millis(0), hello_from(HIGH, 5, 1));
+    assert!(up.contains(&Output::Fact(LinkFact::LinkUp { node: HIGH, incarnation: Incarnation(5) })));
+
+    let (_, stale) = greet(&mut core, millis(1), hello_from(HIGH, 4, 9));
+    assert_eq!(refusal(&stale), Some("stale incarnation"));
+
+    let (_, newer) = greet(&mut core, millis(2), hello_from(HIGH, 6, 1));
+    let at =
+        |wanted: &Output| newer.iter().position(|output| output == wanted).expect("is among the outputs");
+    let detached = at(&Output::Detach { connection: old, node: HIGH });
+    let forgotten = at(&Output::Forget(HIGH));
+    let up = at(&Output::Fact(LinkFact::LinkUp { node: HIGH, incarnation: Incarnation(6) }));
+    assert!(detached < forgotten && forgotten < up);
+}
+
+#[test]
+fn a_linked_peer_that_says_hello_again_is_believed_and_a_hello_from_before_is_not() {
+    let mut core = core();
+    let (old, _) = greet(&mut core, millis(0), hello_from(HIGH, 1, 10));
+    let (_, again) = greet(&mut core, millis(1), hello_from(HIGH, 1, 11));
+    assert!(again.contains(&Output::Close(old)));
+    let (_, void) = greet(&mut core, millis(2), hello_from(HIGH, 1, 10));
+    assert_eq!(refusal(&void), Some("duplicate"));
+}
+
+#[test]
+fn waits_between_dials_double_from_the_least_to_the_most_with_a_fifth_of_jitter() {
+    let mut core = core();
+    core.handle(millis(0), found(1));
+    let mut expected = Duration::from_millis(10);
+    let mut now = millis(0);
+    for _ in 0..12 {
+        let dial = outputs(&mut core).into_iter().find_map(|output| match output {
+            Output::Dial { connection, .. } => Some(connection),
+            _ => None,
+        });
+        core.handle(now, Input::DialFailed { connection: dial.expect("dials again"), refused: false });
+        let next = core.next_wake().expect("a dial is planned");
+        let wait = next.since(now);
+        assert!(wait >= expected.mul_f64(0.8) && wait <= expected.mul_f64(1.2), "{wait:?} for {expected:?}");
+        expected = (expected * 2).min(Duration::from_secs(1));
+        now = next;
+        core.handle(now, Input::TimePassed);
+    }
+}
+
+#[test]
+fn a_refused_dial_to_a_known_node_is_told_and_a_lost_node_is_dialled_no_more() {
+    let mut core = core();
+    core.handle(millis(0), found(1));
+    let Some(Output::Dial { connection, .. }) = core.poll() else {
+        panic!("a found node is dialled at once")
+    };
+    core.handle(millis(1), Input::DialFailed { connection, refused: true });
+    let told = LinkFact::DialRefused { node: HIGH, incarnation: Incarnation(1) };
+    assert!(outputs(&mut core).contains(&Output::Fact(told)));
+    core.handle(millis(2), Input::NodeLost { node: HIGH, incarnation: Incarnation(1) });
+    assert!(outputs(&mut core).contains(&Output::Forget(HIGH)));
+    assert_eq!(core.next_wake(), None);
+}
+
+/// Lets time pass in `core`, which hears nothing, until it has nothing more to wait for or `end` is reached.
+fn silence(core: &mut Core, end: Time) -> Vec<(Time, Output)> {
+    let mut seen = Vec::new();
+    while let Some(at) = core.next_wake().filter(|at| *at <= end) {
+        core.handle(at, Input::TimePassed);
+        seen.extend(outputs(core).into_iter().map(|output| (at, output)));
+    }
+    seen
+}
+
+#[test]
+fn a_silent_link_is_pinged_three_times_and_then_broken() {
+    let mut core = core();
+    greet(&mut core, millis(0), hello_from(HIGH, 1, 1));
+    let seen = silence(&mut core, millis(4_000));
+    let pings: Vec<_> =
+        seen.iter().filter(|(_, o)| *o == Output::SendPing(HIGH)).map(|(at, _)| *at).collect();
+    assert_eq!(pings, [millis(1_000), millis(2_000), millis(3_000)]);
+    let broken = Output::Fact(LinkFact::LinkBroken { node: HIGH, incarnation: Incarnation(1) });
+    assert!(seen.contains(&(millis(4_000), broken)));
+}
+
+#[test]
+fn a_node_that_was_held_up_itself_does_not_call_its_peer_silent() {
+    let mut core = core();
+    greet(&mut core, millis(0), hello_from(HIGH, 1, 1));
+    core.handle(millis(60_000), Input::TimePassed);
+    assert_eq!(outputs(&mut core), [Output::SendPing(HIGH)]);
+}
+
+#[test]
+fn strangers_are_limited_in_number_and_in_time() {
+    let mut core = core();
+    let strangers: Vec<_> = (0..4).map(|_| core.open()).collect();
+    for stranger in &strangers {
+        core.handle(millis(0), Input::Accepted(*stranger));
+    }
+    assert!(outputs(&mut core).contains(&Output::Close(strangers[3])), "the fourth is one too many");
+    core.handle(millis(2_000), Input::TimePassed);
+    let refused = outputs(&mut core).iter().filter(|output| matches!(output, Output::Refuse(..))).count();
+    assert_eq!(refused, 3);
+    core.handle(millis(4_000), Input::TimePassed);
+    assert_eq!(outputs(&mut core).len(), 3, "who does not go is closed");
+    assert_eq!(core.next_wake(), None);
+}
+
+#[test]
+fn a_full_table_refuses_newcomers_unless_somebody_in_it_is_gone() {
+    let mut core = core();
+    greet(&mut core, millis(0), hello_from(HIGH, 1, 1));
+    greet(&mut core, millis(0), hello_from(NodeAddress::new(3), 1, 1));
+    let (_, refused) = greet(&mut core, millis(1), hello_from(NodeAddress::new(4), 1, 1));
+    assert_eq!(refusal(&refused), Some("too many peers"));
+    core.handle(millis(2), Input::NodeLost { node: HIGH, incarnation: Incarnation(1) });
+    let (_, taken) = greet(&mut core, millis(3), hello_from(NodeAddress::new(4), 1, 1));
+    assert_eq!(refusal(&taken), None);
+}
+
+#[test]
+fn who_says_goodbye_has_left_and_is_not_dialled() {
+    let mut core = core();
+    core.handle(millis(0), found(1));
+    let (link, _) = greet(&mut core, millis(0), hello_from(HIGH, 1, 1));
+    core.handle(millis(1), Input::GoodbyeReceived(link));
+    let left = Output::Fact(LinkFact::PeerLeft { node: HIGH, incarnation: Incarnation(1) });
+    assert!(outputs(&mut core).contains(&left));
+    assert_eq!(core.next_wake(), None);
+}
+
+#[test]
+fn a_node_that_leaves_says_goodbye_and_takes_nobody_any_more() {
+    let mut core = core();
+    greet(&mut core, millis(0), hello_from(HIGH, 1, 1));
+    core.handle(millis(1), Input::LeaveRequested);
+    assert!(outputs(&mut core).contains(&Output::SendGoodbye(HIGH)));
+    let connection = core.open();
+    core.handle(millis(2), Input::Accepted(connection));
+    assert!(outputs(&mut core).contains(&Output::Close(connection)));
+}
+
+#[test]
+fn a_peer_that_nobody_announced_is_forgotten_some_time_after_its_link_broke() {
+    let mut core = core();
+    let (link, _) = greet(&mut core, millis(0), hello_from(HIGH, 1, 1));
+    core.handle(millis(10), Input::Ended(link));
+    outputs(&mut core);
+    assert_eq!(silence(&mut core, Time::MAX), [(millis(5_010), Output::Forget(HIGH))]);
+}

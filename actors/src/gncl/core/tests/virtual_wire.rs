@@ -1,0 +1,357 @@
+//! Two cores, and between them connections whose every delay is drawn from a seed.
+
+use std::fmt::Write;
+
+use super::*;
+
+pub(super) fn millis(millis: u64) -> Time {
+    Time::from_nanos(millis * 1_000_000)
+}
+
+/// What can go wrong.
+#[derive(Clone, Debug)]
+pub(super) enum Mishap {
+    /// One of the present connections breaks; both ends notice, each in its own time.
+    CutOne(u64),
+    /// One of the present connections carries nothing any more, and only the dialler notices that.
+    HalfOpen(u64),
+    /// GNCL of this node is made anew; its sockets close.
+    LayerRestarts(usize),
+    /// The node is made anew, in a new life.
+    NodeRestarts(usize),
+    /// NDL of this node loses sight of the other for a while.
+    NodeLostAndFound(usize),
+}
+
+pub(super) struct Node {
+    core: Core,
+    incarnation: u64,
+    pub(super) facts: Vec<LinkFact>,
+    /// Which end of which pipe a connection is.
+    ends: BTreeMap<ConnectionId, usize>,
+    /// Which life of the core this is: what was on its way to a former one is void.
+    life: u64,
+}
+
+struct Pipe {
+    /// The connection at each node, once it has one.
+    ends: [Option<ConnectionId>; 2],
+    dialler: usize,
+    carries: bool,
+    /// When the last bytes on their way to each node arrive: a pipe keeps the order.
+    last: [Time; 2],
+}
+
+enum Event {
+    Input {
+        node: usize,
+        life: u64,
+        input: Input,
+    },
+    /// Something arrives at the end of a pipe that `node` has, or will have.
+    Arrives {
+        node: usize,
+        pipe: usize,
+        what: Parcel,
+    },
+}
+
+#[derive(Clone)]
+enum Parcel {
+    Accept,
+    Connected,
+    Hello(Introduction),
+    Welcome(Introduction),
+    Refusal(Refusal),
+    Ping,
+    Pong,
+    End,
+}
+
+pub(super) struct World {
+    pub(super) nodes: [Node; 2],
+    now: Time,
+    pipes: Vec<Pipe>,
+    events: BTreeMap<(Time, u64), Event>,
+    posted: u64,
+    random: u64,
+    delay_max_us: u64,
+    story: String,
+}
+
+const ADDRESSES: [NodeAddress; 2] = [LOW, HIGH];
+
+impl World {
+    pub(super) fn new(seed: u64, delay_max_us: u64) -> Self {
+        let node = |n: usize| Node {
+            core: Core::new(settings(ADDRESSES[n], 1), seed ^ n as u64),
+            incarnation: 1,
+            facts: Vec::new(),
+            ends: BTreeMap::new(),
+            life: 0,
+        };
+        Self {
+            nodes: [node(0), node(1)],
+            now: Time::ZERO,
+            pipes: Vec::new(),
+            events: BTreeMap::new(),
+            posted: 0,
+            random: seed,
+            delay_max_us,
+            story: String::new(),
+        }
+    }
+
+    pub(super) fn story(&self) -> &str {
+        &self.story
+    }
+
+    pub(super) fn find_each_other_at(&mut self, at: [Time; 2]) {
+        for (node, at) in at.into_iter().enumerate() {
+            self.told_found(node, at);
+        }
+    }
+
+    pub(super) fn strike(&mut self, mishap: Mishap) {
+        let _ = writeln!(self.story, "{:?} {mishap:?}", self.now);
+        match mishap {
+            Mishap::CutOne(which) => {
+                if let Some(pipe) = self.some_pipe(which) {
+                    self.cut(pipe);
+                }
+            }
+            Mishap::HalfOpen(which) => {
+                if let Some(pipe) = self.some_pipe(which) {
+                    self.pipes[pipe].carries = false;
+                    let dialler = self.pipes[pipe].dialler;
+                    self.post(self.now, Event::Arrives { node: dialler, pipe, what: Parcel::End });
+                }
+            }
+            Mishap::LayerRestarts(node) => self.restart(node),
+            Mishap::NodeRestarts(node) => self.restart_node(node),
+            Mishap::NodeLostAndFound(node) => {
+                let other = 1 - node;
+                let lost = Input::NodeLost {
+                    node: ADDRESSES[other],
+                    incarnation: Incarnation(self.nodes[other].incarnation),
+                };
+                self.input(node, lost);
+                let at = self.now + self.delay() * 10;
+                self.told_found(node, at);
+            }
+        }
+    }
+
+    fn restart_node(&mut self, node: usize) {
+        let (other, old) = (1 - node, self.nodes[node].incarnation);
+        self.nodes[node].incarnation += 1;
+        self.restart(node);
+        // The other's NDL may learn of it before or after the first hello.
+        let (life, at) = (self.nodes[other].life, self.now + self.delay() * 3);
+        let lost = Input::NodeLost { node: ADDRESSES[node], incarnation: Incarnation(old) };
+        self.post(at, Event::Input { node: other, life, input: lost });
+        self.told_found(other, at);
+    }
+
+    fn restart(&mut self, node: usize) {
+        let ends = std::mem::take(&mut self.nodes[node].ends);
+        for pipe in ends.into_values() {
+            self.pipes[pipe].ends[node] = None;
+            self.send_to(1 - node, pipe, Parcel::End);
+        }
+        let seed = self.draw();
+        let lives = &mut self.nodes[node];
+        lives.life += 1;
+        lives.core = Core::new(settings(ADDRESSES[node], lives.incarnation), seed);
+        // Connections of a former life have other names.
+        lives.core.opened = lives.life << 32;
+        let at = self.now + self.delay() * 3;
+        self.told_found(node, at);
+    }
+
+    fn told_found(&mut self, node: usize, at: Time) {
+        let other = 1 - node;
+        let incarnation = Incarnation(self.nodes[other].incarnation);
+        let input = Input::NodeFound { node: ADDRESSES[other], incarnation, address: address() };
+        let life = self.nodes[node].life;
+        self.post(at, Event::Input { node, life, input });
+    }
+
+    fn some_pipe(&self, which: u64) -> Option<usize> {
+        let open: Vec<_> =
+            (0..self.pipes.len()).filter(|p| self.pipes[*p].ends.iter().any(Option::is_some)).collect();
+        open.get(which as usize % open.len().max(1)).copied()
+    }
+
+    fn cut(&mut self, pipe: usize) {
+        self.pipes[pipe].carries = false;
+        for node in 0..2 {
+            let at = self.now + self.delay();
+            self.post(at, Event::Arrives { node, pipe, what: Parcel::End });
+        }
+    }
+
+    pub(super) fn run_until(&mut self, end: Time) {
+        loop {
+            let event = self.events.first_key_value().map(|((at, _), _)| *at);
+            let wakes = [0, 1].map(|n| self.nodes[n].core.next_wake());
+            let next = wakes.into_iter().chain([event]).flatten().min();
+            let Some(next) = next.filter(|at| *at <= end) else { break };
+            self.now = self.now.max(next);
+            if event == Some(next) {
+                let (_, event) = self.events.pop_first().expect("was seen");
+                self.happen(event);
+                continue;
+            }
+            for (node, wake) in wakes.into_iter().enumerate() {
+                if wake == Some(next) {
+                    self.input(node, Input::TimePassed);
+                }
+            }
+        }
+        self.now = end;
+    }
+
+    fn happen(&mut self, event: Event) {
+        match event {
+            Event::Input { node, life, input } => {
+                if life == self.nodes[node].life {
+                    self.input(node, input);
+                }
+            }
+            Event::Arrives { node, pipe, what } => self.arrive(node, pipe, what),
+        }
+    }
+
+    fn arrive(&mut self, node: usize, pipe: usize, what: Parcel) {
+        if matches!(what, Parcel::Accept) {
+            let connection = self.nodes[node].core.open();
+            self.pipes[pipe].ends[node] = Some(connection);
+            self.nodes[node].ends.insert(connection, pipe);
+            return self.input(node, Input::Accepted(connection));
+        }
+        let Some(connection) = self.pipes[pipe].ends[node] else { return };
+        if !self.pipes[pipe].carries && !matches!(what, Parcel::End) {
+            return;
+        }
+        let input = match what {
+            Parcel::Accept => return,
+            Parcel::Connected => Input::Connected(connection),
+            Parcel::Hello(hello) => Input::HelloReceived(connection, hello),
+            Parcel::Welcome(welcome) => Input::WelcomeReceived(connection, welcome),
+            Parcel::Refusal(refusal) => Input::RefusalReceived(connection, refusal),
+            Parcel::Ping => Input::PingReceived(connection),
+            Parcel::Pong => Input::Heard(connection),
+            Parcel::End => {
+                self.drop_end(node, connection);
+                Input::Ended(connection)
+            }
+        };
+        self.input(node, input);
+    }
+
+    fn input(&mut self, node: usize, input: Input) {
+        let _ = writeln!(self.story, "{:?} {node} <- {input:?}", self.now);
+        self.nodes[node].core.handle(self.now, input);
+        while let Some(output) = self.nodes[node].core.poll() {
+            let _ = writeln!(self.story, "{:?} {node} -> {output:?}", self.now);
+            self.obey(node, output);
+        }
+    }
+
+    fn obey(&mut self, node: usize, output: Output) {
+        match output {
+            Output::Dial { connection, .. } => self.dial(node, connection),
+            Output::SendHello(connection, hello) => self.send(node, connection, Parcel::Hello(hello)),
+            Output::Attach(attach) => {
+                if let Some(welcome) = attach.welcome {
+                    self.send(node, attach.connection, Parcel::Welcome(welcome));
+                }
+            }
+            Output::Refuse(connection, refusal) => {
+                self.send(node, connection, Parcel::Refusal(refusal));
+                self.send(node, connection, Parcel::End);
+            }
+            Output::Close(connection) => {
+                self.send(node, connection, Parcel::End);
+                self.drop_end(node, connection);
+            }
+            Output::SendPing(_) => self.send_on_link(node, Parcel::Ping),
+            Output::SendPong(_) => self.send_on_link(node, Parcel::Pong),
+            Output::Fact(fact) => self.nodes[node].facts.push(fact),
+            Output::Detach { .. } | Output::SendGoodbye(_) | Output::Forget(_) | Output::Count { .. } => {}
+        }
+    }
+
+    fn dial(&mut self, node: usize, connection: ConnectionId) {
+        let pipe = self.pipes.len();
+        let mut ends = [None; 2];
+        ends[node] = Some(connection);
+        let accepted = self.now + self.delay();
+        let mut last = [accepted; 2];
+        last[node] = self.now + self.delay();
+        self.pipes.push(Pipe { ends, dialler: node, carries: true, last });
+        self.nodes[node].ends.insert(connection, pipe);
+        self.post(accepted, Event::Arrives { node: 1 - node, pipe, what: Parcel::Accept });
+        self.post(last[node], Event::Arrives { node, pipe, what: Parcel::Connected });
+    }
+
+    fn send_on_link(&mut self, node: usize, what: Parcel) {
+        let link = self.nodes[node].core.peers.get(&ADDRESSES[1 - node]).and_then(|peer| peer.link);
+        if let Some(link) = link {
+            self.send(node, link.connection, what);
+        }
+    }
+
+    fn send(&mut self, node: usize, connection: ConnectionId, what: Parcel) {
+        if let Some(pipe) = self.nodes[node].ends.get(&connection).copied() {
+            self.send_to(1 - node, pipe, what);
+        }
+    }
+
+    fn send_to(&mut self, node: usize, pipe: usize, what: Parcel) {
+        let at = (self.now + self.delay()).max(self.pipes[pipe].last[node]);
+        self.pipes[pipe].last[node] = at;
+        self.post(at, Event::Arrives { node, pipe, what });
+    }
+
+    fn drop_end(&mut self, node: usize, connection: ConnectionId) {
+        if let Some(pipe) = self.nodes[node].ends.remove(&connection) {
+            self.pipes[pipe].ends[node] = None;
+        }
+    }
+
+    fn post(&mut self, at: Time, event: Event) {
+        self.posted += 1;
+        self.events.insert((at, self.posted), event);
+    }
+
+    fn delay(&mut self) -> Duration {
+        let delay = self.draw() % self.delay_max_us;
+        Duration::from_micros(delay)
+    }
+
+    fn draw(&mut self) -> u64 {
+        self.random =
+            self.random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        self.random >> 33
+    }
+
+    /// Whether both have a link.
+    pub(super) fn is_linked(&self) -> bool {
+        self.nodes.iter().all(|node| node.core.peers.values().any(|peer| peer.link.is_some()))
+    }
+
+    /// Whether both have one link, the same, and nothing else.
+    pub(super) fn agreed_link(&self) -> Result<(), String> {
+        let pipes = [0, 1].map(|n| {
+            let node = &self.nodes[n];
+            let link = node.core.peers.get(&ADDRESSES[1 - n])?.link?;
+            (node.core.connections.len() == 1).then(|| node.ends.get(&link.connection).copied())?
+        });
+        match pipes {
+            [Some(a), Some(b)] if a == b => Ok(()),
+            other => Err(format!("linked on pipes {other:?}")),
+        }
+    }
+}

@@ -1,0 +1,93 @@
+//! What is checked before a peer's frame becomes a message of this node. spec: GNCL-11
+
+use std::sync::Arc;
+
+use sinew_runtime::{
+    outcome::{Outcome, Receipt, Rejection, Ticket},
+    tid::NodeAddress,
+    time::Time,
+    wire::{Class, Flags, Message},
+};
+
+use super::peer::Peer;
+use crate::stores::Stores;
+
+/// The way in for the frames of one peer.
+pub(super) struct Inbound {
+    pub(super) stores: Arc<Stores>,
+    pub(super) peer: Arc<Peer>,
+}
+
+impl Inbound {
+    /// Takes a frame that came at `now`: delivers it, settles it, or refuses and counts it.
+    pub(super) fn receive(&self, now: Time, mut message: Message) {
+        let header = message.header;
+        if header.source.node != self.peer.node {
+            // No outcome is sent: the source that it names has not sent it.
+            return self.count(now, "forged source", &message);
+        }
+        if header.flags.has(Flags::OUTCOME) {
+            return self.outcome(now, &message);
+        }
+        self.attach_receipt(&mut message);
+        if header.destination.node != self.stores.node && header.destination.node != NodeAddress::ALL {
+            self.count(now, "not for this node", &message);
+            return message.reject(Rejection::NoSuchNode);
+        }
+        let is_one_of_many = header.class == Class::Stream || !header.destination.is_single();
+        if message.receipt.is_some() && is_one_of_many {
+            self.count(now, "unconfirmable", &message);
+            return message.reject(Rejection::Unsupported);
+        }
+        message.header.sent = self.in_our_clock(now, header.sent);
+        if message.header.is_expired(now) {
+            return message.settle(Outcome::Expired);
+        }
+        // The router counts what nobody takes, and settles it.
+        let _ = self.stores.router.deliver(message);
+    }
+
+    /// The peer's time in our clock; never later than `now`.
+    ///
+    /// As long as nobody has measured the peer's clock, a message counts as sent when it came.
+    fn in_our_clock(&self, now: Time, sent: Time) -> Time {
+        let offset = self.stores.clocks.get(self.peer.node);
+        offset.map_or(now, |offset| sent.shifted(offset.theirs_minus_ours_ns.saturating_neg()).min(now))
+    }
+
+    /// spec: GNCL-12
+    fn attach_receipt(&self, message: &mut Message) {
+        if message.header.flags.has(Flags::CONFIRM) {
+            let ticket = Ticket {
+                source: message.header.source,
+                destination: message.header.destination,
+                correlation: message.header.correlation,
+            };
+            message.receipt = Some(Receipt::new(self.peer.clone(), ticket));
+        }
+    }
+
+    fn outcome(&self, now: Time, message: &Message) {
+        let Message { header, payload, .. } = message;
+        let outcome = match payload[..] {
+            [code] => Outcome::from_code(code),
+            _ => None,
+        };
+        let ticket = Ticket {
+            source: header.destination,
+            destination: header.source,
+            correlation: header.correlation,
+        };
+        match outcome {
+            // One that nobody waits for any more was settled as Unknown when an earlier connection ended.
+            Some(outcome) => drop(self.peer.outlet.confirm(ticket, outcome)),
+            None => self.count(now, "no such outcome", message),
+        }
+    }
+
+    fn count(&self, now: Time, cause: &'static str, message: &Message) {
+        let (header, peer) = (&message.header, self.peer.node);
+        let detail = format!("node {peer} sent a frame from {} to {}", header.source, header.destination);
+        self.stores.gncl.refusals.count(now, cause, &detail);
+    }
+}

@@ -1,0 +1,231 @@
+//! The reading half of a connection: bytes become frames, a bounded number at a time.
+
+use std::{cell::RefCell, io, net::SocketAddr, rc::Rc, sync::Arc};
+
+use bytes::BytesMut;
+use futures_util::{Stream, stream};
+use sinew_runtime::{
+    tid::AppAddress,
+    time::Time,
+    wire::{FrameCodec, FrameError, HeaderError, Kind, Message, encode_frame},
+};
+use tokio::net::TcpStream;
+use tokio_util::codec::Decoder;
+
+use super::{
+    core::{ConnectionId, Decline, HANDSHAKE_PAYLOAD_MAX},
+    inbound::Inbound,
+};
+
+/// Frames that are handled before other tasks of the thread have their turn.
+const FRAMES_PER_WAKE: usize = 64;
+/// Bytes that are asked of the kernel at once, on a link.
+const READ_LEN: usize = 16 << 10;
+
+/// What a connection has to say to the shell.
+#[derive(Debug)]
+pub(super) struct News {
+    pub(super) connection: ConnectionId,
+    pub(super) what: What,
+}
+
+#[derive(Debug)]
+pub(super) enum What {
+    /// The dial succeeded.
+    Connected(Arc<TcpStream>),
+    /// The dial failed.
+    DialFailed(io::Error),
+    /// A frame of GNCL itself.
+    Frame(Message),
+    /// Frames came, and were delivered.
+    Heard,
+    /// Bytes came that cannot be used.
+    Violated(Decline),
+    /// The peer closed the connection, or it failed.
+    Ended,
+}
+
+/// What is done with the frames of a connection.
+pub(super) enum Mode {
+    /// The shell gets them, one by one.
+    Handshake,
+    /// They are messages of this peer.
+    Linked(Inbound),
+    /// Nobody wants them: the peer was refused and may still be sending.
+    Discard,
+}
+
+/// Set by the shell while it handles the news of the connection, before the next frame is looked at.
+pub(super) type SharedMode = Rc<RefCell<Mode>>;
+
+/// Dials `address`, then reads.
+pub(super) fn dial(
+    connection: ConnectionId,
+    address: SocketAddr,
+    reading: Reading,
+) -> impl Stream<Item = News> {
+    news(connection, State::Dialling(address, reading))
+}
+
+/// Reads from a socket that was accepted.
+pub(super) fn read(
+    connection: ConnectionId,
+    socket: Arc<TcpStream>,
+    reading: Reading,
+) -> impl Stream<Item = News> {
+    news(connection, State::Reading(Reader::new(socket, reading)))
+}
+
+/// How a connection is read.
+pub(super) struct Reading {
+    pub(super) mode: SharedMode,
+    /// Longest payload on a link, in bytes.
+    pub(super) payload_max: usize,
+}
+
+enum State {
+    Dialling(SocketAddr, Reading),
+    Reading(Reader),
+    Over,
+}
+
+fn news(connection: ConnectionId, state: State) -> impl Stream<Item = News> {
+    stream::unfold(state, move |state| async move {
+        let (what, state) = match state {
+            State::Dialling(address, reading) => match connect(address).await {
+                Ok(socket) => {
+                    let socket = Arc::new(socket);
+                    (What::Connected(socket.clone()), State::Reading(Reader::new(socket, reading)))
+                }
+                Err(error) => (What::DialFailed(error), State::Over),
+            },
+            State::Reading(mut reader) => match reader.next().await {
+                Some(what) => (what, State::Reading(reader)),
+                None => (What::Ended, State::Over),
+            },
+            State::Over => return None,
+        };
+        Some((News { connection, what }, state))
+    })
+}
+
+async fn connect(address: SocketAddr) -> io::Result<TcpStream> {
+    let socket = TcpStream::connect(address).await?;
+    socket.set_nodelay(true)?;
+    Ok(socket)
+}
+
+/// Writes one frame to a connection that is not a link.
+pub(super) async fn write_frame(socket: &TcpStream, message: &Message) -> io::Result<()> {
+    let mut bytes = BytesMut::with_capacity(message.size());
+    encode_frame(&message.header, &message.payload, &mut bytes);
+    let mut rest = &bytes[..];
+    while !rest.is_empty() {
+        socket.writable().await?;
+        match socket.try_write(rest) {
+            Ok(written) => rest = &rest[written..],
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(())
+}
+
+struct Reader {
+    socket: Arc<TcpStream>,
+    buffer: BytesMut,
+    reading: Reading,
+    /// Frames were delivered of which the shell does not know yet.
+    heard: bool,
+}
+
+/// How a look at the buffer ended.
+enum Look {
+    Tell(What),
+    Again,
+    Empty,
+}
+
+impl Reader {
+    fn new(socket: Arc<TcpStream>, reading: Reading) -> Self {
+        Self { socket, buffer: BytesMut::new(), reading, heard: false }
+    }
+
+    /// What the shell must know next; `None` when the connection has ended.
+    async fn next(&mut self) -> Option<What> {
+        loop {
+            match self.look() {
+                Look::Tell(what) => return Some(what),
+                Look::Again => tokio::task::yield_now().await,
+                Look::Empty if std::mem::take(&mut self.heard) => return Some(What::Heard),
+                Look::Empty => self.fill().await.ok()?,
+            }
+        }
+    }
+
+    fn look(&mut self) -> Look {
+        let mode = self.reading.mode.borrow();
+        let payload_max = match *mode {
+            Mode::Handshake => HANDSHAKE_PAYLOAD_MAX,
+            Mode::Linked(_) => self.reading.payload_max,
+            Mode::Discard => {
+                self.buffer.clear();
+                return Look::Empty;
+            }
+        };
+        for _ in 0..FRAMES_PER_WAKE {
+            match (FrameCodec::new(payload_max).decode(&mut self.buffer), &*mode) {
+                (Ok(Some(message)), Mode::Linked(inbound)) if !is_for_the_shell(&message) => {
+                    self.heard = true;
+                    inbound.receive(Time::now(), message);
+                }
+                (Ok(Some(message)), _) => return Look::Tell(What::Frame(message)),
+                (Ok(None), _) => return Look::Empty,
+                (Err(error), _) => return Look::Tell(What::Violated(decline(&error))),
+            }
+        }
+        Look::Again
+    }
+
+    async fn fill(&mut self) -> io::Result<()> {
+        let room = match *self.reading.mode.borrow() {
+            Mode::Linked(_) => READ_LEN,
+            Mode::Handshake | Mode::Discard => HANDSHAKE_PAYLOAD_MAX,
+        };
+        // A quarter of room left is room enough: copying the rest of a frame for each read would cost more.
+        if self.buffer.capacity() - self.buffer.len() < room / 4 {
+            self.buffer.reserve(room);
+        }
+        loop {
+            self.socket.readable().await?;
+            match self.socket.try_read_buf(&mut self.buffer) {
+                Ok(0) => return Err(io::ErrorKind::UnexpectedEof.into()),
+                Ok(_) => return Ok(()),
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+                Err(error) => return Err(error),
+            }
+        }
+    }
+}
+
+/// Whether this is about the link itself.
+fn is_for_the_shell(message: &Message) -> bool {
+    const KINDS: [Kind; 6] = [
+        Kind::GNCL_HELLO,
+        Kind::GNCL_WELCOME,
+        Kind::GNCL_REFUSAL,
+        Kind::GNCL_PING,
+        Kind::GNCL_PONG,
+        Kind::GNCL_GOODBYE,
+    ];
+    message.header.destination.app == AppAddress::GNCL && KINDS.contains(&message.header.kind)
+}
+
+fn decline(error: &FrameError) -> Decline {
+    match error {
+        FrameError::Header(HeaderError::Version { .. }) => Decline::Version(error.to_string()),
+        FrameError::Header(_) | FrameError::TooLong { .. } | FrameError::Io(_) => {
+            Decline::Violation(error.to_string())
+        }
+    }
+}

@@ -1,0 +1,72 @@
+//! The accepting socket: waits when the system has no more to give, and never spins.
+
+use std::{io, net::SocketAddr, time::Duration};
+
+use futures_util::{Stream, stream};
+use rustix::io::Errno;
+use tokio::net::{TcpListener, TcpSocket, TcpStream};
+
+/// Connections that wait to be accepted at most; the kernel refuses further ones.
+const BACKLOG: u32 = 1_024;
+const BACK_OFF_MIN: Duration = Duration::from_millis(10);
+const BACK_OFF_MAX: Duration = Duration::from_millis(100);
+
+/// Listens at `address`; a former listener's connections may still be closing there.
+///
+/// # Errors
+/// What the system says.
+pub(super) fn listen(address: SocketAddr) -> io::Result<TcpListener> {
+    let socket = if address.is_ipv4() { TcpSocket::new_v4()? } else { TcpSocket::new_v6()? };
+    socket.set_reuseaddr(true)?;
+    socket.bind(address)?;
+    socket.listen(BACKLOG)
+}
+
+/// Each connection that is made to `listener`, and each error that made it wait.
+pub(super) fn accepted(listener: TcpListener) -> impl Stream<Item = io::Result<TcpStream>> {
+    stream::unfold((listener, Duration::ZERO), |(listener, wait)| async move {
+        if wait > Duration::ZERO {
+            tokio::time::sleep(wait).await;
+        }
+        let accepted = listener.accept().await.and_then(|(socket, _)| {
+            socket.set_nodelay(true)?;
+            Ok(socket)
+        });
+        let wait = accepted.as_ref().err().map_or(Duration::ZERO, |error| wait_after(error, wait));
+        Some((accepted, (listener, wait)))
+    })
+}
+
+/// How long to wait after `error`, having waited `before` after the last one.
+fn wait_after(error: &io::Error, before: Duration) -> Duration {
+    match Errno::from_io_error(error) {
+        // The peer gave up before we took it: the next one may be fine.
+        Some(Errno::CONNABORTED | Errno::INTR) => Duration::ZERO,
+        // No descriptors (MFILE, NFILE) or no memory (NOBUFS, NOMEM): the same call would fail at once again. Of an
+        // error that nobody foresaw nothing better is known.
+        Some(_) | None => (before * 2).clamp(BACK_OFF_MIN, BACK_OFF_MAX),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_lack_of_descriptors_or_memory_waits_longer_each_time_and_never_spins() {
+        for errno in [Errno::MFILE, Errno::NFILE, Errno::NOBUFS, Errno::NOMEM] {
+            let error = io::Error::from(errno);
+            let mut waits = vec![wait_after(&error, Duration::ZERO)];
+            for _ in 0..5 {
+                waits.push(wait_after(&error, waits[waits.len() - 1]));
+            }
+            assert_eq!(waits.iter().map(Duration::as_millis).collect::<Vec<_>>(), [10, 20, 40, 80, 100, 100]);
+        }
+    }
+
+    #[test]
+    fn a_peer_that_gave_up_does_not_make_the_next_one_wait() {
+        let error = io::Error::from(Errno::CONNABORTED);
+        assert_eq!(wait_after(&error, BACK_OFF_MAX), Duration::ZERO);
+    }
+}

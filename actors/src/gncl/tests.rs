@@ -1,0 +1,6 @@
+//! Real GNCL actors over loopback, and peers that are written by hand, as another language's would be.
+
+mod bench;
+mod handshakes;
+mod links;
+mod messages;

@@ -1,0 +1,168 @@
+//! Who is taken and who is refused, in which words.
+
+use sinew_runtime::wire::Kind;
+use tokio::net::TcpListener;
+
+use super::bench::{ByHand, NINE, Node, introduction, run, within};
+use crate::gncl::{
+    LinkFact,
+    core::{Introduction, read, write},
+    peer::frame,
+};
+
+#[test]
+fn each_fault_of_a_hello_is_refused_in_words_and_counted() {
+    run(async {
+        let node = Node::start(1).await;
+        let right = introduction(node.address());
+        let cases = [
+            (Introduction { project: "arm".to_owned(), ..right.clone() }, "other project"),
+            (Introduction { peer: NINE, ..right.clone() }, "wrong node"),
+        ];
+        for (hello, cause) in cases {
+            let mut peer = ByHand::dial(&node).await;
+            peer.say(&frame(hello.node, node.address(), Kind::GNCL_HELLO, write(&hello))).await;
+            let refusal = peer.refusal().await;
+            assert_eq!(refusal.cause, cause);
+            assert!(refusal.sentence.len() > 20, "{} is no sentence", refusal.sentence);
+            assert_eq!(node.stores.gncl.refusals.of(cause), 1);
+        }
+    });
+}
+
+#[test]
+fn two_nodes_with_one_address_refuse_each_other_and_name_both() {
+    run(async {
+        let (a, b) =
+            (Node::start(1).await, Node::start_with(1, |config| config.name = "twin".to_owned()).await);
+        let mut peer = ByHand::dial(&a).await;
+        let hello = Introduction {
+            node: b.address(),
+            name: b.stores.config.name.clone(),
+            ..introduction(a.address())
+        };
+        peer.say(&frame(b.address(), a.address(), Kind::GNCL_HELLO, write(&hello))).await;
+        let refusal = peer.refusal().await;
+        assert_eq!(refusal.cause, "own address");
+        assert!(refusal.sentence.contains("0.0.0.1") && refusal.sentence.contains("twin"));
+    });
+}
+
+#[test]
+fn nodes_of_two_projects_both_know_why_there_is_no_link() {
+    run(async {
+        let a = Node::start(1).await;
+        let b = Node::start_with(2, |config| config.project = "arm".to_owned()).await;
+        a.find(b.address(), b.listens_at());
+        b.counted("other project").await;
+        a.counted("refused by the peer").await;
+    });
+}
+
+#[test]
+fn another_version_is_refused_in_words_whoever_dials() {
+    run(async {
+        let node = Node::start(1).await;
+        let mut ours = ByHand::dial(&node).await;
+        let mut hello = b"Sw\x02\x40".to_vec();
+        hello.resize(64, 0);
+        ours.say_bytes(&hello).await;
+        let refusal = ours.refusal().await;
+        assert_eq!(refusal.cause, "version");
+        assert!(refusal.sentence.contains("version 2") && refusal.sentence.contains("version 1"));
+
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        node.find(NINE, listener.local_addr().unwrap());
+        let (socket, _) = within("the node's dial", listener.accept()).await.unwrap();
+        let mut theirs = ByHand::on(socket);
+        assert_eq!(theirs.hear().await.header.kind, Kind::GNCL_HELLO);
+        theirs.say_bytes(&hello).await;
+        assert_eq!(theirs.refusal().await.cause, "version");
+        assert_eq!(node.stores.gncl.refusals.of("version"), 2);
+    });
+}
+
+#[test]
+fn garbage_truncated_and_oversized_frames_cost_their_own_connection_only() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut good = ByHand::linked_to(&mut node).await;
+        let mut inbox = node.app(1);
+        let oversized = {
+            let mut bytes = b"Sw\x01\x40\xff\xff\xff\x7f".to_vec();
+            bytes.resize(64, 0);
+            bytes
+        };
+        let hello = frame(NINE, node.address(), Kind::GNCL_HELLO, write(&introduction(node.address())));
+        let mut damaged = hello.header.encode(&hello.payload).to_vec();
+        damaged.extend_from_slice(&hello.payload);
+        damaged[70] ^= 1;
+        for garbage in [b"GET / HTTP/1.1\r\n\r\n".to_vec(), oversized, damaged] {
+            let mut peer = ByHand::dial(&node).await;
+            peer.say_bytes(&garbage).await;
+            assert_eq!(peer.refusal().await.cause, "violation");
+        }
+        let mut truncated = ByHand::dial(&node).await;
+        truncated.say_bytes(&hello.header.encode(&hello.payload)[..40]).await;
+        drop(truncated);
+        let mut too_early = ByHand::dial(&node).await;
+        too_early.say(&node.message(node.tid(1), b"no hello")).await;
+        assert_eq!(too_early.refusal().await.cause, "violation");
+
+        let mut message = node.message(node.tid(1), b"still here");
+        message.header.source.node = NINE;
+        good.say(&message).await;
+        assert_eq!(&super::bench::next("the message", &mut inbox).await.payload[..], b"still here");
+    });
+}
+
+#[test]
+fn garbage_on_a_link_breaks_that_link_and_it_is_made_again() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut peer = ByHand::linked_to(&mut node).await;
+        peer.say_bytes(&[0xaa; 200]).await;
+        assert_eq!(peer.refusal().await.cause, "violation");
+        node.broken().await;
+        let mut again = ByHand::dial(&node).await;
+        let hello = Introduction { dial: 2, ..introduction(node.address()) };
+        again.say(&frame(NINE, node.address(), Kind::GNCL_HELLO, write(&hello))).await;
+        assert_eq!(again.hear().await.header.kind, Kind::GNCL_WELCOME);
+        node.up().await;
+    });
+}
+
+#[test]
+fn who_says_nothing_is_told_that_it_is_too_late() {
+    run(async {
+        let node =
+            Node::start_with(1, |config| config.gncl.handshake = std::time::Duration::from_millis(50)).await;
+        let silent = ByHand::dial(&node).await;
+        assert_eq!(silent.refusal().await.cause, "too late");
+    });
+}
+
+#[test]
+fn a_dial_to_a_port_where_nobody_listens_is_told_to_ndl() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let nobody = TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
+        node.find(NINE, nobody);
+        assert!(matches!(node.fact().await, LinkFact::DialRefused { node: NINE, .. }));
+    });
+}
+
+#[test]
+fn a_hello_of_ours_carries_who_we_are_and_whom_we_want() {
+    run(async {
+        let node = Node::start(1).await;
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        node.find(NINE, listener.local_addr().unwrap());
+        let (socket, _) = within("the node's dial", listener.accept()).await.unwrap();
+        let hello = ByHand::on(socket).hear().await;
+        let said: Introduction = read(&hello.payload).unwrap();
+        assert_eq!((said.node, said.peer, said.name.as_str()), (node.address(), NINE, "node-1"));
+        assert_eq!(said.payload_max, 1 << 20);
+        assert!(said.dial > 0);
+    });
+}

@@ -1,0 +1,163 @@
+//! What becomes of messages on their way in.
+
+use std::time::Duration;
+
+use sinew_runtime::{
+    outcome::{Outcome, Rejection},
+    tid::{NodeAddress, Tid},
+    time::Time,
+    wire::{Class, Flags, Kind, Message},
+};
+
+use super::bench::{ByHand, NINE, Node, next, pair, run};
+use crate::stores::ClockOffset;
+
+/// A message as the peer that is written by hand sends it.
+fn from_nine(node: &Node, payload: &[u8]) -> Message {
+    let mut message = node.message(node.tid(1), payload);
+    message.header.source.node = NINE;
+    message
+}
+
+#[test]
+fn a_confirmed_message_has_the_outcome_that_its_destination_gives_it() {
+    run(async {
+        let (mut a, b) = pair().await;
+        let mut inbox = b.app(1);
+        for correlation in 1..=2 {
+            a.stores.router.send(a.confirmed(b.tid(1), correlation)).unwrap();
+        }
+        next("the first message", &mut inbox).await.settle(Outcome::Delivered);
+        drop(next("the second message", &mut inbox).await);
+        assert_eq!(next("the first outcome", &mut a.settled).await, (1, Outcome::Delivered));
+        assert_eq!(next("the second outcome", &mut a.settled).await, (2, Outcome::Failed));
+
+        a.stores.router.send(a.confirmed(b.tid(7), 3)).unwrap();
+        let rejected = Outcome::Rejected(Rejection::NoSuchApplication);
+        assert_eq!(next("the third outcome", &mut a.settled).await, (3, rejected));
+    });
+}
+
+#[test]
+fn a_forged_source_is_refused_and_the_link_stays() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut peer = ByHand::linked_to(&mut node).await;
+        let mut inbox = node.app(1);
+        let mut forged = from_nine(&node, b"I am somebody else");
+        forged.header.source.node = NodeAddress::new(8);
+        peer.say(&forged).await;
+        peer.say(&from_nine(&node, b"honest")).await;
+        assert_eq!(&next("the honest message", &mut inbox).await.payload[..], b"honest");
+        assert_eq!(node.stores.gncl.refusals.of("forged source"), 1);
+    });
+}
+
+#[test]
+fn a_message_for_another_node_is_not_carried_on() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut peer = ByHand::linked_to(&mut node).await;
+        let mut astray = from_nine(&node, b"");
+        astray.header.destination.node = NodeAddress::new(8);
+        astray.header.flags = Flags::CONFIRM;
+        astray.header.correlation = 5;
+        peer.say(&astray).await;
+        let outcome = peer.hear().await;
+        assert_eq!((outcome.header.kind, outcome.header.correlation), (Kind::OUTCOME, 5));
+        assert_eq!(outcome.header.destination, astray.header.source);
+        assert_eq!(outcome.payload[..], [Outcome::Rejected(Rejection::NoSuchNode).code()]);
+    });
+}
+
+#[test]
+fn a_broadcast_reaches_every_application_and_cannot_be_confirmed() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut peer = ByHand::linked_to(&mut node).await;
+        let mut inboxes = [node.app(1), node.app(2)];
+        let mut broadcast = from_nine(&node, b"all");
+        broadcast.header.destination = Tid::BROADCAST;
+        peer.say(&broadcast).await;
+        for inbox in &mut inboxes {
+            assert_eq!(&next("the broadcast", inbox).await.payload[..], b"all");
+        }
+        broadcast.header.flags = Flags::CONFIRM;
+        peer.say(&broadcast).await;
+        assert_eq!(peer.hear().await.payload[..], [Outcome::Rejected(Rejection::Unsupported).code()]);
+    });
+}
+
+#[test]
+fn times_are_in_our_clock_and_what_is_too_old_on_arrival_has_expired() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut peer = ByHand::linked_to(&mut node).await;
+        let mut inbox = node.app(1);
+        let hour = 3_600_000_000_000;
+        let offset = ClockOffset { theirs_minus_ours_ns: hour, bound: Duration::ZERO };
+        node.stores.clocks.set(NINE, offset);
+        let sent = Time::now() - Duration::from_secs(1);
+
+        let mut fresh = from_nine(&node, b"fresh");
+        fresh.header.sent = sent.shifted(hour);
+        fresh.header.time_to_live_us = 60_000_000;
+        peer.say(&fresh).await;
+        assert_eq!(next("the fresh message", &mut inbox).await.header.sent, sent);
+
+        let mut old = from_nine(&node, b"old");
+        old.header.sent = sent.shifted(hour);
+        old.header.time_to_live_us = 500_000;
+        old.header.flags = Flags::CONFIRM;
+        peer.say(&old).await;
+        assert_eq!(peer.hear().await.payload[..], [Outcome::Expired.code()]);
+    });
+}
+
+#[test]
+fn without_a_measured_clock_a_message_counts_as_sent_when_it_came() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut peer = ByHand::linked_to(&mut node).await;
+        let mut inbox = node.app(1);
+        let before = Time::now();
+        let mut message = from_nine(&node, b"");
+        message.header.sent = Time::from_nanos(1);
+        message.header.time_to_live_us = 1_000_000;
+        peer.say(&message).await;
+        let came = next("the message", &mut inbox).await.header.sent;
+        assert!(before <= came && came <= Time::now());
+    });
+}
+
+#[test]
+fn asks_and_replies_are_ordinary_messages_whose_marks_are_kept() {
+    run(async {
+        let (a, b) = pair().await;
+        let mut inbox = b.app(1);
+        let mut ask = a.message(b.tid(1), b"?");
+        ask.header.flags = Flags::ASK;
+        ask.header.correlation = 12;
+        ask.header.class = Class::Bulk;
+        a.stores.router.send(ask).unwrap();
+        let there = next("the question", &mut inbox).await.header;
+        assert_eq!((there.flags, there.correlation, there.class), (Flags::ASK, 12, Class::Bulk));
+    });
+}
+
+#[test]
+fn a_large_message_arrives_whole_among_small_ones() {
+    run(async {
+        let (a, b) = pair().await;
+        let mut inbox = b.app(1);
+        let large: Vec<u8> = (0..1_000_000u32).map(|n| n as u8).collect();
+        for payload in [&b"before"[..], &large, b"after"] {
+            a.send(b.tid(1), payload);
+        }
+        for payload in [&b"before"[..], &large, b"after"] {
+            assert!(next("a message", &mut inbox).await.payload[..] == *payload);
+        }
+        let too_long = a.message(b.tid(1), &vec![0; (1 << 20) + 1]);
+        assert_eq!(a.stores.router.send(too_long), Err(Rejection::TooLong));
+    });
+}

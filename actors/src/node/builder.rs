@@ -1,0 +1,157 @@
+//! Declares a node and starts it.
+
+use std::{
+    collections::BTreeSet,
+    hash::{BuildHasher, Hasher, RandomState},
+    sync::mpsc::sync_channel,
+    time::{Duration, SystemTime},
+};
+
+use sinew_runtime::{
+    app::DynApp,
+    tid::{Incarnation, NodeAddress},
+};
+
+use super::{
+    Node, NodeHandle,
+    root::{self, RootEvent},
+};
+use crate::{
+    config::{ConfigFaults, NodeConfig},
+    stores::Stores,
+    sync::Waiting,
+};
+
+/// Declares a node: its configuration and its applications.
+pub struct NodeBuilder {
+    config: NodeConfig,
+    apps: Vec<DynApp>,
+    incarnation: Option<Incarnation>,
+}
+
+impl std::fmt::Debug for NodeBuilder {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "NodeBuilder({}, {} applications)", self.config.name, self.apps.len())
+    }
+}
+
+/// Why a node does not run.
+#[derive(Debug, thiserror::Error)]
+pub enum StartError {
+    /// The configuration has faults; all of them are listed.
+    #[error(transparent)]
+    Config(#[from] ConfigFaults),
+    /// Two applications of the node have the same name.
+    #[error("two applications of this node are called '{0}'; names are unique on a node")]
+    SameName(String),
+    /// An application could not be registered.
+    #[error("application '{name}' cannot be registered: {why}")]
+    Application {
+        /// Its name.
+        name: String,
+        /// Why.
+        why: String,
+    },
+    /// A layer did not become ready.
+    #[error("the layers did not start: {0}")]
+    Layers(String),
+    /// Applications require each other in a circle: none of them can be the first.
+    #[error("these applications require each other in a circle: {}; take one requirement out", .0.join(" -> "))]
+    Cycle(Vec<String>),
+    /// Applications wait for what they require.
+    #[error("after {within:?} these still wait:{}", list(.waiting))]
+    Waiting {
+        /// Who waits for whom.
+        waiting: Vec<Waiting>,
+        /// The time that was given.
+        within: Duration,
+    },
+    /// The operating system gives no thread.
+    #[error("no thread for the node's root: {0}; raise `ulimit -u`")]
+    Thread(#[from] std::io::Error),
+}
+
+fn list(waiting: &[Waiting]) -> String {
+    waiting.iter().map(|waiting| format!("\n  {waiting}")).collect()
+}
+
+impl NodeBuilder {
+    pub(super) fn new(name: String) -> Self {
+        Self { config: NodeConfig::new(name), apps: Vec::new(), incarnation: None }
+    }
+
+    /// Replaces the whole configuration: one read from a file, for instance.
+    #[must_use]
+    pub fn config(mut self, config: NodeConfig) -> Self {
+        self.config = config;
+        self
+    }
+
+    /// Changes the configuration in place.
+    #[must_use]
+    pub fn configure(mut self, change: impl FnOnce(&mut NodeConfig)) -> Self {
+        change(&mut self.config);
+        self
+    }
+
+    /// Sets the node's address. Needed where several nodes share a host.
+    #[must_use]
+    pub fn address(mut self, address: impl Into<NodeAddress>) -> Self {
+        self.config.address = Some(address.into());
+        self
+    }
+
+    /// Sets which life of the node this is, larger than any before it. Default: the wall clock in microseconds.
+    #[must_use]
+    pub const fn incarnation(mut self, incarnation: Incarnation) -> Self {
+        self.incarnation = Some(incarnation);
+        self
+    }
+
+    /// Adds an application.
+    #[must_use]
+    pub fn app(mut self, app: impl Into<DynApp>) -> Self {
+        self.apps.push(app.into());
+        self
+    }
+
+    /// Starts the node. Returns when its layers are ready; its applications start when what they require is ready.
+    ///
+    /// # Errors
+    /// The configuration has faults, an application cannot be registered, or a layer did not become ready.
+    pub fn start(self) -> Result<Node, StartError> {
+        self.config.validate()?;
+        let mut names = BTreeSet::new();
+        if let Some(twice) = self.apps.iter().find(|app| !names.insert(app.name().to_owned())) {
+            return Err(StartError::SameName(twice.name().to_owned()));
+        }
+        let patience = self.config.sync.layer_deadline * 4;
+        let incarnation = self.incarnation.unwrap_or_else(wall_clock);
+        let stores = Stores::new(self.config, incarnation, boot_nonce());
+        let handle = NodeHandle { root: stores.posts.root.clone(), stores: stores.clone() };
+        let (say_started, started) = sync_channel(1);
+        let (say_ended, ended) = sync_channel(1);
+        let apps = self.apps;
+        let thread = std::thread::Builder::new()
+            .name("root".to_owned())
+            .spawn(move || root::run(stores, apps, say_started, say_ended))?;
+        let node = Node { handle, ended, thread: Some(thread) };
+        match started.recv_timeout(patience) {
+            Ok(Ok(())) => Ok(node),
+            // Dropping the node stops what has started.
+            Ok(Err(error)) => Err(error),
+            Err(_) => Err(StartError::Layers(format!("no word from the root in {patience:?}"))),
+        }
+    }
+}
+
+/// A number that grows from one start of a host's node to the next, as long as the host's clock does not go back.
+fn wall_clock() -> Incarnation {
+    let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    Incarnation(u64::try_from(since_1970.as_micros()).unwrap_or(u64::MAX))
+}
+
+/// A number that no other start of any node has: it tells two nodes with one address apart.
+fn boot_nonce() -> u64 {
+    RandomState::new().build_hasher().finish()
+}

@@ -1,0 +1,172 @@
+//! The root of a node: starts its layers in order, then its applications, and stops all of it again.
+//!
+//! ```text
+//! root thread   Root (actix actor)
+//!                 |- layers: rest-for-one   LNCL, sync manager, GNCL, NDL   (the paper's order)
+//!                 `- applications: one-for-one, each held until what it requires is ready
+//! ```
+//!
+//! Stop runs backwards: applications are told first and may bring their outputs to a safe value, then the layers go.
+
+mod builder;
+mod directory;
+mod root;
+
+pub use builder::{NodeBuilder, StartError};
+pub(crate) use root::RootEvent;
+
+use std::{
+    process::ExitCode,
+    sync::{Arc, mpsc::Receiver},
+    time::Duration,
+};
+
+use sinew_runtime::{
+    post::Post,
+    sender::Directory,
+    tid::{Incarnation, NodeAddress, Tid},
+    time::Time,
+};
+
+use crate::{
+    stores::{Stores, lock},
+    sync::Waiting,
+};
+
+/// How a node ended.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum NodeEnd {
+    /// It was told to stop, by its owner or by a signal.
+    Stopped,
+    /// It gave up; why.
+    GaveUp(String),
+}
+
+/// A running node. Dropping it stops it.
+#[derive(Debug)]
+pub struct Node {
+    handle: NodeHandle,
+    ended: Receiver<NodeEnd>,
+    thread: Option<std::thread::JoinHandle<()>>,
+}
+
+/// Asks about a running node and stops it, from any thread.
+#[derive(Clone)]
+pub struct NodeHandle {
+    stores: Arc<Stores>,
+    root: Post<RootEvent>,
+}
+
+impl std::fmt::Debug for NodeHandle {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "NodeHandle({} {})", self.stores.config.name, self.stores.node)
+    }
+}
+
+impl Node {
+    /// Begins the declaration of a node called `name`.
+    #[must_use]
+    pub fn builder(name: impl Into<String>) -> NodeBuilder {
+        NodeBuilder::new(name.into())
+    }
+
+    /// Asks and stops, from any thread.
+    #[must_use]
+    pub fn handle(&self) -> NodeHandle {
+        self.handle.clone()
+    }
+
+    /// The node's address.
+    #[must_use]
+    pub fn address(&self) -> NodeAddress {
+        self.handle.address()
+    }
+
+    /// Stops the node: applications are told, layers go down in reverse order. Returns when all have ended or were
+    /// abandoned, each after its own deadline.
+    pub fn stop(mut self) -> NodeEnd {
+        self.handle.stop();
+        self.wait()
+    }
+
+    /// Runs until SIGINT or SIGTERM, or until the node gives up; then stops in order. Returns the exit code for `main`:
+    /// 0 after an orderly stop, 1 after giving up.
+    pub fn run(mut self) -> ExitCode {
+        self.handle.tell(RootEvent::HeedSignals);
+        match self.wait() {
+            NodeEnd::Stopped => ExitCode::SUCCESS,
+            NodeEnd::GaveUp(why) => {
+                tracing::error!(node = self.handle.stores.config.name, why, "the node gave up");
+                ExitCode::FAILURE
+            }
+        }
+    }
+
+    fn wait(&mut self) -> NodeEnd {
+        let lost = || NodeEnd::GaveUp("the root's thread ended without a word".to_owned());
+        let end = self.ended.recv().unwrap_or_else(|_| lost());
+        if let Some(thread) = self.thread.take() {
+            // It has said its last word; what is left of it is the end of its function.
+            let _ = thread.join();
+        }
+        end
+    }
+}
+
+impl Drop for Node {
+    fn drop(&mut self) {
+        if self.thread.is_some() {
+            self.handle.stop();
+            self.wait();
+        }
+    }
+}
+
+impl NodeHandle {
+    /// The node's address.
+    #[must_use]
+    pub fn address(&self) -> NodeAddress {
+        self.stores.node
+    }
+
+    /// Which life of the node this is.
+    #[must_use]
+    pub fn incarnation(&self) -> Incarnation {
+        self.stores.incarnation
+    }
+
+    /// The TID that has `name` now, on any node.
+    #[must_use]
+    pub fn resolve(&self, name: &str) -> Option<Tid> {
+        directory::NodeDirectory(self.stores.clone()).resolve(name)
+    }
+
+    /// Who waits at the start-up barrier on this node, for whom, and since when.
+    #[must_use]
+    pub fn waiting(&self) -> Vec<Waiting> {
+        lock(&self.stores.sync).waiting(Time::now())
+    }
+
+    /// Tells the node to stop; returns at once.
+    pub fn stop(&self) {
+        self.tell(RootEvent::StopOrdered);
+    }
+
+    /// Waits until every application of this node runs.
+    ///
+    /// # Errors
+    /// Who still waits after `within`, and for whom.
+    pub fn wait_until_running(&self, within: Duration) -> Result<(), StartError> {
+        let (say, heard) = std::sync::mpsc::sync_channel(1);
+        self.tell(RootEvent::TellWhenRunning(say));
+        heard
+            .recv_timeout(within)
+            .unwrap_or_else(|_| Err(StartError::Waiting { waiting: self.waiting(), within }))
+    }
+
+    fn tell(&self, event: RootEvent) {
+        if self.root.post(event).is_err() {
+            tracing::error!(node = self.stores.config.name, "the root's post is full; the order was not given");
+        }
+    }
+}

@@ -1,0 +1,379 @@
+//! The root actor: carries events between the supervisors, the sync manager and the node's owner.
+
+use std::{
+    cell::RefCell,
+    collections::BTreeMap,
+    rc::Rc,
+    sync::{Arc, mpsc::SyncSender},
+    time::Duration,
+};
+
+use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, fut::WrapFuture};
+use sinew_runtime::{
+    app::{AppWiring, DynApp},
+    mailbox::Mailbox,
+    outcome::Rejection,
+    pending::{AppOutlet, Pending},
+    post::Post,
+    sender::Sender,
+    supervision::{
+        ChildSpec, Input, Launch, Place, Policy, ReadyGate, Reason, Strategy, Supervisor, SupervisorFact,
+        Threads, life,
+    },
+    tid::{AppAddress, Tid},
+};
+use tokio::signal::unix::{SignalKind, signal};
+
+use super::{NodeEnd, StartError, directory::NodeDirectory};
+use crate::{
+    gncl, lncl, ndl,
+    stores::{Stores, lock},
+    sync,
+};
+
+/// Confirmed messages and requests of one application under way at most.
+const WAITS_MAX: usize = 1_024;
+
+/// What the root is told.
+#[derive(Debug)]
+pub(crate) enum RootEvent {
+    /// By the sync manager: all that this application requires is ready.
+    Release { app: AppAddress },
+    /// By the sync manager: these names require each other in a circle, the first one again at the end. None of these
+    /// applications is released.
+    RequirementCycle { names: Vec<String> },
+    /// By the layers' supervisor.
+    Layers(SupervisorFact),
+    /// By the applications' supervisor.
+    Apps(SupervisorFact),
+    /// By the owner: stop on SIGINT and SIGTERM.
+    HeedSignals,
+    /// By the owner or a signal.
+    StopOrdered,
+    /// By the owner: say when every application runs.
+    TellWhenRunning(SyncSender<Result<(), StartError>>),
+}
+
+struct App {
+    address: AppAddress,
+    mailbox: Arc<Mailbox>,
+    running: bool,
+}
+
+/// How far the node is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Phase {
+    StartingLayers,
+    Running,
+    StoppingApps,
+    StoppingLayers,
+}
+
+struct Root {
+    stores: Arc<Stores>,
+    threads: Rc<RefCell<Threads>>,
+    phase: Phase,
+    end: NodeEnd,
+    declared: Vec<DynApp>,
+    apps: Vec<App>,
+    app_index: BTreeMap<AppAddress, usize>,
+    layer_supervisor: Option<Post<Input>>,
+    app_supervisor: Option<Post<Input>>,
+    last_layer_fault: Option<String>,
+    cycle: Option<Vec<String>>,
+    started: Option<SyncSender<Result<(), StartError>>>,
+    ended: SyncSender<NodeEnd>,
+    tell_when_running: Vec<SyncSender<Result<(), StartError>>>,
+}
+
+/// The root thread's whole life.
+pub(super) fn run(
+    stores: Arc<Stores>,
+    declared: Vec<DynApp>,
+    started: SyncSender<Result<(), StartError>>,
+    ended: SyncSender<NodeEnd>,
+) {
+    let system = actix::System::new();
+    let threads = Rc::new(RefCell::new(Threads::default()));
+    let root = Root {
+        threads: threads.clone(),
+        phase: Phase::StartingLayers,
+        end: NodeEnd::Stopped,
+        declared,
+        apps: Vec::new(),
+        app_index: BTreeMap::new(),
+        layer_supervisor: None,
+        app_supervisor: None,
+        last_layer_fault: None,
+        cycle: None,
+        started: Some(started),
+        ended,
+        tell_when_running: Vec::new(),
+        stores,
+    };
+    system.block_on(async { root.start() });
+    if let Err(error) = system.run() {
+        tracing::error!(%error, "the root's event loop failed");
+    }
+    threads.borrow_mut().stop();
+}
+
+impl Actor for Root {
+    type Context = Context<Self>;
+
+    fn started(&mut self, context: &mut Context<Self>) {
+        context.add_stream(self.stores.posts.root.attach());
+        let deadline = self.stores.config.sync.layer_deadline;
+        let layers = layers(&self.stores, deadline);
+        let post = self.stores.posts.root.clone();
+        let listener = move |fact| tell(&post, RootEvent::Layers(fact));
+        let (supervisor, post) =
+            Supervisor::new("layers", Strategy::RestForOne, layers, self.threads.clone(), listener);
+        supervisor.start();
+        self.layer_supervisor = Some(post);
+    }
+}
+
+/// The layers in the paper's order of start (section 6).
+fn layers(stores: &Arc<Stores>, deadline: Duration) -> Vec<ChildSpec> {
+    let child = |name: &str, thread: &str, launch: Launch| ChildSpec {
+        name: name.to_owned(),
+        policy: Policy { start_within: deadline, ..Policy::default() },
+        place: Place::thread(thread),
+        launch,
+    };
+    vec![
+        child("LNCL", Place::IO, layer(stores, lncl::Lncl::new)),
+        child("sync manager", "sync", layer(stores, sync::SyncManager::new)),
+        child("GNCL", Place::IO, layer(stores, gncl::Gncl::new)),
+        child("NDL", "ndl", layer(stores, ndl::Ndl::new)),
+    ]
+}
+
+/// How a layer's actor is made, each time anew.
+fn layer<A>(stores: &Arc<Stores>, make: fn(Arc<Stores>, ReadyGate) -> A) -> Launch
+where
+    A: Actor<Context = Context<A>>,
+{
+    let stores = stores.clone();
+    Arc::new(move |ready| life(Context::new().into_future(make(stores.clone(), ready))))
+}
+
+fn tell(post: &Post<RootEvent>, event: RootEvent) {
+    if let Err(lost) = post.post(event) {
+        tracing::error!(?lost, "the root's post is full");
+    }
+}
+
+impl StreamHandler<RootEvent> for Root {
+    fn handle(&mut self, event: RootEvent, context: &mut Context<Self>) {
+        match event {
+            RootEvent::Release { app } => self.release(app),
+            RootEvent::RequirementCycle { names } => {
+                self.cycle = Some(names);
+                self.tell_if_running();
+            }
+            RootEvent::Layers(fact) => self.layers_said(fact, context),
+            RootEvent::Apps(fact) => self.apps_said(fact),
+            RootEvent::HeedSignals => self.heed_signals(context),
+            RootEvent::StopOrdered => self.stop_apps(),
+            RootEvent::TellWhenRunning(say) => {
+                self.tell_when_running.push(say);
+                self.tell_if_running();
+            }
+        }
+    }
+}
+
+impl Root {
+    fn release(&self, app: AppAddress) {
+        match (self.app_index.get(&app), &self.app_supervisor) {
+            (Some(index), Some(supervisor)) => order(supervisor, Input::Released(*index)),
+            // Not an application of this process: LNCL knows its client.
+            (None, _) => lncl::release(&self.stores, app),
+            (Some(_), None) => tracing::error!(%app, "released before its supervisor was there"),
+        }
+    }
+
+    fn layers_said(&mut self, fact: SupervisorFact, context: &mut Context<Self>) {
+        match fact {
+            SupervisorFact::AllReady if self.phase == Phase::StartingLayers => self.start_apps(),
+            SupervisorFact::Failed(_, reason) | SupervisorFact::Gone(_, reason) => {
+                if reason.is_failure() {
+                    self.last_layer_fault = Some(reason.to_string());
+                }
+            }
+            SupervisorFact::Ended(reason) => self.layers_ended(&reason, context),
+            SupervisorFact::AllReady | SupervisorFact::Ready(_) => {}
+        }
+    }
+
+    fn layers_ended(&mut self, reason: &Reason, context: &mut Context<Self>) {
+        if let Reason::GaveUp(why) = reason {
+            self.end = NodeEnd::GaveUp(format!("layers: {why}"));
+        }
+        self.layer_supervisor = None;
+        if let Some(started) = self.started.take() {
+            let why = self.last_layer_fault.take().unwrap_or_else(|| reason.to_string());
+            // The owner may have lost its patience already.
+            let _ = started.send(Err(StartError::Layers(why)));
+        }
+        match self.phase {
+            // Applications without layers: they are told to stop, which brings their outputs to a safe value.
+            Phase::Running => self.stop_apps(),
+            Phase::StoppingApps => {}
+            Phase::StartingLayers | Phase::StoppingLayers => self.finish(context),
+        }
+    }
+
+    fn start_apps(&mut self) {
+        self.phase = Phase::Running;
+        let declared = std::mem::take(&mut self.declared);
+        let registered: Result<Vec<_>, _> = declared.iter().map(|app| self.register(app)).collect();
+        let answer = match registered {
+            Ok(children) => {
+                self.supervise(children);
+                Ok(())
+            }
+            Err(error) => Err(error),
+        };
+        let failed = answer.is_err();
+        if let Some(started) = self.started.take() {
+            // The owner may have lost its patience already; then it stops the node.
+            let _ = started.send(answer);
+        }
+        if failed {
+            self.stop_apps();
+        }
+    }
+
+    fn supervise(&mut self, children: Vec<ChildSpec>) {
+        let post = self.stores.posts.root.clone();
+        let listener = move |fact| tell(&post, RootEvent::Apps(fact));
+        let (supervisor, post) =
+            Supervisor::new("applications", Strategy::OneForOne, children, self.threads.clone(), listener);
+        supervisor.start();
+        self.app_supervisor = Some(post);
+        self.tell_if_running();
+    }
+
+    /// Gives an application its address, its mailbox and its routes.
+    fn register(&mut self, app: &DynApp) -> Result<ChildSpec, StartError> {
+        let config = &self.stores.config;
+        let mailbox = Mailbox::new(config.mailbox_capacity);
+        let pending = Pending::new(WAITS_MAX);
+        let outlet = Arc::new(AppOutlet { pending: pending.clone(), inbox: mailbox.clone() });
+        let tid = lncl::register_local(&self.stores, app, outlet)
+            .map_err(|error| StartError::Application { name: app.name().to_owned(), why: error.to_string() })?;
+        let directory = Arc::new(NodeDirectory(self.stores.clone()));
+        let sender = Sender::new(tid, self.stores.router.clone(), directory, pending, config.payload_max);
+        self.app_index.insert(tid.app, self.apps.len());
+        self.apps.push(App { address: tid.app, mailbox: mailbox.clone(), running: false });
+        Ok(ChildSpec {
+            name: app.name().to_owned(),
+            policy: app.policy().clone(),
+            place: app.place().clone(),
+            launch: app.launch(AppWiring { sender, mailbox }),
+        })
+    }
+
+    fn apps_said(&mut self, fact: SupervisorFact) {
+        match fact {
+            SupervisorFact::Ready(index) => {
+                self.apps[index].running = true;
+                lncl::app_ready(&self.stores, self.apps[index].address);
+                self.tell_if_running();
+            }
+            SupervisorFact::Failed(index, _) => {
+                self.apps[index].running = false;
+                lncl::app_down(&self.stores, self.apps[index].address);
+            }
+            SupervisorFact::Gone(index, _) => {
+                self.apps[index].running = false;
+                self.apps[index].mailbox.close();
+                lncl::unregister_local(&self.stores, self.apps[index].address);
+            }
+            SupervisorFact::AllReady => {}
+            SupervisorFact::Ended(reason) => self.apps_ended(&reason),
+        }
+    }
+
+    fn apps_ended(&mut self, reason: &Reason) {
+        if let Reason::GaveUp(why) = reason {
+            self.end = NodeEnd::GaveUp(format!("applications: {why}"));
+        }
+        self.app_supervisor = None;
+        for app in &self.apps {
+            app.mailbox.close();
+        }
+        self.stop_layers();
+    }
+
+    fn tell_if_running(&mut self) {
+        let is_running = self.app_supervisor.is_some() && self.apps.iter().all(|app| app.running);
+        if is_running || self.cycle.is_some() {
+            for say in self.tell_when_running.drain(..) {
+                let answer = match &self.cycle {
+                    Some(names) if !is_running => Err(StartError::Cycle(names.clone())),
+                    Some(_) | None => Ok(()),
+                };
+                // Who asked may have stopped waiting.
+                let _ = say.try_send(answer);
+            }
+        }
+    }
+
+    fn stop_apps(&mut self) {
+        match self.phase {
+            Phase::StartingLayers | Phase::Running => {}
+            Phase::StoppingApps | Phase::StoppingLayers => return,
+        }
+        tracing::info!(node = self.stores.config.name, "stops");
+        self.phase = Phase::StoppingApps;
+        match &self.app_supervisor {
+            Some(supervisor) => order(supervisor, Input::StopOrdered),
+            None => self.stop_layers(),
+        }
+    }
+
+    fn stop_layers(&mut self) {
+        self.phase = Phase::StoppingLayers;
+        match &self.layer_supervisor {
+            Some(supervisor) => order(supervisor, Input::StopOrdered),
+            // They ended before: what is left is to hear of it.
+            None => tell(&self.stores.posts.root, RootEvent::Layers(SupervisorFact::Ended(Reason::Shutdown))),
+        }
+    }
+
+    fn finish(&self, context: &mut Context<Self>) {
+        // The owner may be gone: then nobody wants to know.
+        let _ = self.ended.try_send(self.end.clone());
+        context.stop();
+        actix::System::current().stop();
+    }
+
+    fn heed_signals(&self, context: &mut Context<Self>) {
+        let post = self.stores.posts.root.clone();
+        let heed = async move {
+            let (Ok(mut interrupt), Ok(mut terminate)) =
+                (signal(SignalKind::interrupt()), signal(SignalKind::terminate()))
+            else {
+                tracing::error!("signals cannot be heeded; stop this node by its handle");
+                return;
+            };
+            let which = tokio::select! {
+                _ = interrupt.recv() => "SIGINT",
+                _ = terminate.recv() => "SIGTERM",
+            };
+            tracing::info!(which, "a signal asks for a stop");
+            tell(&post, RootEvent::StopOrdered);
+        };
+        context.spawn(heed.into_actor(self));
+    }
+}
+
+fn order(supervisor: &Post<Input>, input: Input) {
+    if let Err(lost) = supervisor.post(input) {
+        tracing::error!(?lost, "a supervisor's post is full");
+    }
+}

@@ -1,0 +1,241 @@
+//! The sync manager's shell: carries facts into its core and orders out of it.
+
+use std::sync::{Arc, MutexGuard, PoisonError};
+
+use actix::{Actor, ActorContext, AsyncContext, Context, SpawnHandle, StreamHandler};
+use bytes::Bytes;
+use sinew_runtime::{
+    outcome::{Outcome, Rejection},
+    post::Post,
+    router::{LocalRoute, Outlet, Refused},
+    supervision::ReadyGate,
+    tid::{AppAddress, NodeAddress, Tid},
+    time::Time,
+    wire::{Header, Kind, Message, Payload},
+};
+
+use super::{
+    Event, RequirementEvent,
+    core::{Core, Input, Output},
+};
+use crate::{lncl::AppFact, node::RootEvent, refusals::Refusals, stores::Stores};
+
+/// The sync manager of a node: a new one after each fault, on the same core.
+pub(crate) struct SyncManager {
+    stores: Arc<Stores>,
+    ready: Option<ReadyGate>,
+    refusals: Refusals,
+    /// The timer that is set, and for when.
+    alarm: Option<(Time, SpawnHandle)>,
+}
+
+impl SyncManager {
+    /// A sync manager on the core in `stores`; it opens `ready` when messages reach it.
+    pub(crate) fn new(stores: Arc<Stores>, ready: ReadyGate) -> Self {
+        Self { stores, ready: Some(ready), refusals: Refusals::default(), alarm: None }
+    }
+}
+
+impl Actor for SyncManager {
+    type Context = Context<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        ctx.add_stream(self.stores.posts.sync.attach());
+        let outlet = Arc::new(PostOutlet(self.stores.posts.sync.clone()));
+        self.stores.router.set_local(AppAddress::SYNC, LocalRoute { outlet, events: Arc::new([]) });
+        // A predecessor may have failed between two of the core's orders, or before it heard of the groups.
+        self.take_groups();
+        self.handle(Input::TimePassed, ctx);
+        if let Some(ready) = self.ready.take() {
+            ready.reached();
+        }
+    }
+}
+
+impl StreamHandler<Event> for SyncManager {
+    fn handle(&mut self, event: Event, ctx: &mut Self::Context) {
+        match event {
+            Event::App(fact) => {
+                // Who goes leaves its groups, too.
+                let groups_may_differ = matches!(fact, AppFact::GroupsChanged | AppFact::Unregistered { .. });
+                if groups_may_differ {
+                    self.take_groups();
+                }
+                self.handle(Input::AppChanged(fact), ctx);
+            }
+            Event::Membership(fact) => self.handle(Input::MembershipChanged(fact), ctx),
+            Event::Link(fact) => self.handle(Input::LinkChanged(fact), ctx),
+            Event::Message(message) => self.receive(message, ctx),
+        }
+    }
+
+    /// The post has another reader: this actor was replaced.
+    fn finished(&mut self, ctx: &mut Self::Context) {
+        ctx.stop();
+    }
+}
+
+impl SyncManager {
+    fn core(&self) -> MutexGuard<'_, Core> {
+        self.stores.sync.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn take_groups(&self) {
+        let groups = self.stores.router.groups();
+        self.core().handle(Time::now(), Input::GroupsChanged(groups));
+    }
+
+    fn handle(&mut self, input: Input, ctx: &mut Context<Self>) {
+        self.core().handle(Time::now(), input);
+        // One at a time, and never with the lock in hand: an order may lead to a question to the directory.
+        loop {
+            let Some(output) = self.core().poll() else { break };
+            self.carry_out(output);
+        }
+        self.set_alarm(ctx);
+    }
+
+    /// Takes a peer's list; anything else that is sent here is refused.
+    fn receive(&mut self, mut message: Message, ctx: &mut Context<Self>) {
+        let Tid { node, app } = message.header.source;
+        if message.header.kind != Kind::SYNC_DIRECTORY {
+            let kind = message.header.kind;
+            self.refuse(
+                "kind",
+                &format_args!("{node}/{app} sent kind {kind}; a sync manager takes directories"),
+            );
+            message.reject(Rejection::UnknownKind);
+        } else if app != AppAddress::SYNC || node == self.stores.node {
+            self.refuse("source", &format_args!("{node}/{app} is no other node's sync manager"));
+            message.reject(Rejection::ForgedSource);
+        } else {
+            let payload = message.payload.clone();
+            self.handle(Input::ListReceived { from: node, payload }, ctx);
+            message.settle(Outcome::Delivered);
+        }
+    }
+
+    fn refuse(&self, cause: &'static str, detail: &dyn std::fmt::Display) {
+        self.refusals.count(Time::now(), cause, detail);
+    }
+
+    fn set_alarm(&mut self, ctx: &mut Context<Self>) {
+        let wake = self.core().next_wake();
+        if self.alarm.as_ref().map(|(at, _)| *at) == wake {
+            return;
+        }
+        if let Some((_, former)) = self.alarm.take() {
+            ctx.cancel_future(former);
+        }
+        self.alarm = wake.map(|at| {
+            let timer = ctx.run_later(at.since(Time::now()), |manager, ctx| {
+                manager.alarm = None;
+                manager.handle(Input::TimePassed, ctx);
+            });
+            (at, timer)
+        });
+    }
+}
+
+/// The core's orders.
+impl SyncManager {
+    fn carry_out(&self, output: Output) {
+        match output {
+            Output::Release { app } => {
+                tracing::debug!(%app, "all that it requires is ready");
+                if self.stores.posts.root.post(RootEvent::Release { app }).is_err() {
+                    self.refuse("root", &"the node's root is too busy to start an application; tried again");
+                    self.core().handle(Time::now(), Input::ReleaseNotTaken { app });
+                }
+            }
+            Output::Tell { app, event, why } => self.tell(app, event, why),
+            Output::Publish { to, list } => self.publish(to, list),
+            Output::RouteGroups { node, groups } => self.stores.router.set_remote_groups(node, &groups),
+            Output::Cycle { names } => self.refuse_cycle(names),
+            Output::Overdue(waiting) => tracing::warn!(
+                application = waiting.application,
+                "{waiting}; it goes on waiting. Are these applications started, and spelled right?"
+            ),
+            Output::SameName { name, tids } => tracing::warn!(
+                name,
+                ?tids,
+                "several nodes have an application of this name; whoever asks for the name gets the first of these"
+            ),
+            Output::Refused { cause, detail } => self.refuse(cause, &detail),
+        }
+    }
+
+    /// Tells an application that subscribed to it what became of a requirement.
+    fn tell(&self, app: AppAddress, event: RequirementEvent, why: &'static str) {
+        match &event {
+            RequirementEvent::Lost { name } => {
+                tracing::warn!(%app, name, why, "an application lost what it requires");
+            }
+            RequirementEvent::Met { name } => {
+                tracing::info!(%app, name, "an application's requirement is met again")
+            }
+        }
+        if !self.stores.router.subscribes(app, RequirementEvent::KIND) {
+            return;
+        }
+        let here = self.stores.node;
+        let mut message = Message::typed(self.tid(), Tid::new(here, app), &event);
+        self.stamp(&mut message.header);
+        match self.stores.router.send(message) {
+            Ok(()) => {}
+            Err(Rejection::QueueFull) => {
+                self.refuse(
+                    "mailbox",
+                    &format_args!("{app} is too busy to hear of a requirement; tried again"),
+                );
+                let name = event.name().to_owned();
+                self.core().handle(Time::now(), Input::EventNotTaken { app, name });
+            }
+            Err(why) => {
+                self.refuse("application", &format_args!("{app} was not told of a requirement: {why}"))
+            }
+        }
+    }
+
+    /// Sends the list; where it is not taken, the next one comes within two seconds anyway.
+    fn publish(&self, to: NodeAddress, list: Bytes) {
+        let mut header = Header::new(Kind::SYNC_DIRECTORY, self.tid(), Tid::new(to, AppAddress::SYNC));
+        self.stamp(&mut header);
+        if let Err(why) = self.stores.router.send(Message::new(header, list)) {
+            self.refuse("peer", &format_args!("{to} was not sent this node's directory, tried again: {why}"));
+        }
+    }
+
+    fn refuse_cycle(&self, names: Vec<String>) {
+        let spelled = names.join(" -> ");
+        tracing::error!(
+            "these applications require each other in a circle, so that none of them can ever start: {spelled}; \
+             remove one of these requirements"
+        );
+        if self.stores.posts.root.post(RootEvent::RequirementCycle { names }).is_err() {
+            self.refuse("root", &"the node's root is too busy to hear of a cycle of requirements");
+        }
+    }
+
+    fn tid(&self) -> Tid {
+        Tid::new(self.stores.node, AppAddress::SYNC)
+    }
+
+    fn stamp(&self, header: &mut Header) {
+        header.sequence = self.core().next_sequence();
+        header.sent = Time::now();
+    }
+}
+
+/// Puts messages for the sync manager's TID into its post.
+struct PostOutlet(Post<Event>);
+
+impl Outlet for PostOutlet {
+    fn submit(&self, message: Message) -> Result<(), Refused> {
+        match self.0.post(Event::Message(message)) {
+            Err(Event::Message(message)) => Err(Refused::new(message, Rejection::QueueFull)),
+            // A full post hands back what it was given: a message.
+            Ok(()) | Err(Event::App(_) | Event::Membership(_) | Event::Link(_)) => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,167 @@
+//! The applications of this node, and how far each has come.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::Duration,
+};
+
+use sinew_runtime::{tid::AppAddress, time::Time};
+
+use super::reason::Reason;
+use crate::sync::list::{Entry, Name, REQUIRES_MAX};
+
+/// The applications of this node.
+#[derive(Debug, Default)]
+pub(super) struct Apps {
+    apps: BTreeMap<AppAddress, App>,
+    names: BTreeMap<Name, AppAddress>,
+}
+
+/// One application of this node.
+#[derive(Debug)]
+pub(super) struct App {
+    pub(super) name: Option<Name>,
+    pub(super) requires: Vec<String>,
+    pub(super) state: State,
+    /// Whether its former life failed and this one is not ready yet.
+    pub(super) failed: bool,
+    /// Of what it requires, what it was told is lost.
+    pub(super) lost: BTreeSet<String>,
+}
+
+/// How far an application has come in its present life.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum State {
+    /// It waits at the barrier.
+    Waiting(Wait),
+    /// It may start.
+    Released,
+    /// It has started and takes messages.
+    Ready,
+}
+
+/// A wait at the barrier.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Wait {
+    pub(super) since: Time,
+    /// When it is reported next.
+    pub(super) overdue: Time,
+}
+
+impl Wait {
+    /// A wait that begins now and is reported after `deadline`.
+    pub(super) fn begun(now: Time, deadline: Duration) -> Self {
+        Self { since: now, overdue: now + deadline }
+    }
+}
+
+impl App {
+    pub(super) const fn wait(&self) -> Option<&Wait> {
+        match &self.state {
+            State::Waiting(wait) => Some(wait),
+            State::Released | State::Ready => None,
+        }
+    }
+
+    /// The application's name, or its address where it has none.
+    pub(super) fn title(&self, app: AppAddress) -> String {
+        self.name.as_ref().map_or_else(|| app.to_string(), |name| name.to_string())
+    }
+}
+
+impl Apps {
+    /// A life of `app` begins; one that waits already goes on waiting. Returns the name, if it cannot be had.
+    pub(super) fn register(
+        &mut self,
+        app: AppAddress,
+        name: Option<String>,
+        mut requires: Vec<String>,
+        wait: Wait,
+    ) -> Option<String> {
+        let mut seen = BTreeSet::new();
+        requires.retain(|name| seen.insert(name.clone()));
+        let former = self.remove(app);
+        let wait = former.as_ref().and_then(App::wait).copied().unwrap_or(wait);
+        let (name, refused) = self.claim(app, name);
+        let state = State::Waiting(wait);
+        self.apps.insert(app, App { name, requires, state, failed: false, lost: BTreeSet::new() });
+        refused
+    }
+
+    /// Gives the name to `app` if it is legal and free, or hands it back.
+    fn claim(&mut self, app: AppAddress, name: Option<String>) -> (Option<Name>, Option<String>) {
+        let Some(text) = name else { return (None, None) };
+        match Name::try_from(text.clone()) {
+            Ok(name) if !self.names.contains_key(&name) => {
+                self.names.insert(name.clone(), app);
+                (Some(name), None)
+            }
+            Ok(_) | Err(_) => (None, Some(text)),
+        }
+    }
+
+    pub(super) fn remove(&mut self, app: AppAddress) -> Option<App> {
+        let removed = self.apps.remove(&app)?;
+        if let Some(name) = &removed.name {
+            self.names.remove(name);
+        }
+        Some(removed)
+    }
+
+    pub(super) fn get(&self, app: AppAddress) -> Option<&App> {
+        self.apps.get(&app)
+    }
+
+    pub(super) fn get_mut(&mut self, app: AppAddress) -> Option<&mut App> {
+        self.apps.get_mut(&app)
+    }
+
+    pub(super) fn called(&self, name: &str) -> Option<(AppAddress, &App)> {
+        let app = *self.names.get(name)?;
+        Some((app, self.apps.get(&app)?))
+    }
+
+    pub(super) fn iter(&self) -> impl Iterator<Item = (AppAddress, &App)> {
+        self.apps.iter().map(|(address, app)| (*address, app))
+    }
+
+    pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = (AppAddress, &mut App)> {
+        self.apps.iter_mut().map(|(address, app)| (*address, app))
+    }
+
+    /// The applications that wait, and since when.
+    pub(super) fn waiting(&self) -> impl Iterator<Item = (AppAddress, &App, &Wait)> {
+        self.iter().filter_map(|(address, app)| Some((address, app, app.wait()?)))
+    }
+
+    /// Whether the application called `name` is ready.
+    pub(super) fn is_ready(&self, name: &str) -> bool {
+        self.called(name).is_some_and(|(_, app)| app.state == State::Ready)
+    }
+
+    /// Why the application called `name` is not ready; `None` if it is, or is not here.
+    pub(super) fn why_not(&self, name: &str) -> Option<Reason> {
+        let app = self.called(name)?.1;
+        match app.state {
+            State::Waiting(_) | State::Released if app.failed => Some(Reason::Failed),
+            State::Waiting(_) | State::Released => Some(Reason::NotReady),
+            State::Ready => None,
+        }
+    }
+
+    /// What the node's list says about them.
+    pub(super) fn entries(&self) -> Vec<Entry> {
+        let named = self.names.iter().filter_map(|(name, app)| Some((name, *app, self.apps.get(app)?)));
+        named
+            .map(|(name, address, app)| {
+                let legal = app.requires.iter().filter_map(|name| Name::try_from(name.clone()).ok());
+                Entry {
+                    name: name.clone(),
+                    app: address,
+                    ready: app.state == State::Ready,
+                    requires: legal.take(REQUIRES_MAX).collect(),
+                }
+            })
+            .collect()
+    }
+}

@@ -1,0 +1,539 @@
+//! The sync manager without clock and socket: facts in, orders out.
+//!
+//! After each [`Core::handle`] the shell takes [`Core::poll`] until nothing is left, and comes back with
+//! [`Input::TimePassed`] at [`Core::next_wake`]. Outputs that were not taken stay here, so that an actor that fails
+//! between two of them loses none.
+
+mod apps;
+mod cycles;
+mod peers;
+mod reason;
+#[cfg(test)]
+mod simulation;
+#[cfg(test)]
+mod tests;
+
+use std::{
+    collections::{BTreeMap, BTreeSet, VecDeque},
+    time::Duration,
+};
+
+use bytes::Bytes;
+use sinew_runtime::{
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    time::Time,
+};
+
+use self::{
+    apps::{Apps, State, Wait},
+    cycles::Graph,
+    peers::{Accepted, Peers},
+    reason::Reason,
+};
+use super::{
+    facts::{DirectoryEntry, RequirementEvent, Waiting},
+    list::{ENTRIES_MAX, List},
+};
+use crate::{
+    config::NodeConfig,
+    gncl::LinkFact,
+    lncl::AppFact,
+    ndl::{LossReason, MembershipFact},
+};
+
+/// Time until an output that was not taken is offered again.
+const RETRY: Duration = Duration::from_millis(10);
+/// Names that two nodes have, of which it was said, at most; of more it is not said.
+const SAME_NAMES_MAX: usize = 1_024;
+
+/// What has happened.
+#[derive(Debug)]
+pub(crate) enum Input {
+    /// An application of this node came, became ready, failed, went.
+    AppChanged(AppFact),
+    /// These groups have members on this node now.
+    GroupsChanged(Vec<AppAddress>),
+    /// A node is there, or not any more.
+    MembershipChanged(MembershipFact),
+    /// A node can be reached, or not any more.
+    LinkChanged(LinkFact),
+    /// The sync manager of `from` sent its list.
+    ListReceived { from: NodeAddress, payload: Bytes },
+    /// The root did not take the release of this application.
+    ReleaseNotTaken { app: AppAddress },
+    /// This application did not take an event about the requirement `name`.
+    EventNotTaken { app: AppAddress, name: String },
+    /// The time of [`Core::next_wake`] has come.
+    TimePassed,
+}
+
+/// What is to be done, or to be known.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Output {
+    /// All that this application requires is ready: it may start. Once for each life of it.
+    Release { app: AppAddress },
+    /// Tell a running application that a requirement changed, and why.
+    Tell { app: AppAddress, event: RequirementEvent, why: &'static str },
+    /// Send this list to the sync manager of `to`.
+    Publish { to: NodeAddress, list: Bytes },
+    /// These groups have members on `node`.
+    RouteGroups { node: NodeAddress, groups: Vec<AppAddress> },
+    /// These names require each other in a circle, the first one again at the end: none of them is released.
+    Cycle { names: Vec<String> },
+    /// An application has waited for its deadline, once more.
+    Overdue(Waiting),
+    /// Several nodes have an application of this name; said once. Whoever asks for the name gets the first.
+    SameName { name: String, tids: Vec<Tid> },
+    /// Something was not used.
+    Refused { cause: &'static str, detail: String },
+}
+
+/// Who is known on other nodes, and what waits for whom.
+#[derive(Debug)]
+pub(crate) struct Core {
+    node: NodeAddress,
+    incarnation: Incarnation,
+    requirement_deadline: Duration,
+    list_bytes_max: usize,
+    apps: Apps,
+    groups: Vec<AppAddress>,
+    peers: Peers,
+    /// Of what is required here, what was known at some time.
+    seen: BTreeSet<String>,
+    /// The cycles that stand, each without its closing name.
+    cycles: BTreeSet<Vec<String>>,
+    same_names: BTreeSet<String>,
+    version: u64,
+    /// The present list, once somebody needs it.
+    encoded: Option<Bytes>,
+    /// Outputs that were not taken: the release of an application, or its event about a name.
+    not_taken: BTreeSet<(AppAddress, Option<String>)>,
+    retry: Option<Time>,
+    outputs: VecDeque<Output>,
+    sequence: u64,
+}
+
+impl Core {
+    /// Knows nobody yet. `config` is checked.
+    #[must_use]
+    pub(crate) fn new(config: &NodeConfig, node: NodeAddress, incarnation: Incarnation) -> Self {
+        Self {
+            node,
+            incarnation,
+            requirement_deadline: config.sync.requirement_deadline,
+            list_bytes_max: config.payload_max,
+            apps: Apps::default(),
+            groups: Vec::new(),
+            peers: Peers::new(config.ndl.nodes_max),
+            seen: BTreeSet::new(),
+            cycles: BTreeSet::new(),
+            same_names: BTreeSet::new(),
+            version: 1,
+            encoded: None,
+            not_taken: BTreeSet::new(),
+            retry: None,
+            outputs: VecDeque::new(),
+            sequence: 0,
+        }
+    }
+
+    /// Takes in what has happened.
+    pub(crate) fn handle(&mut self, now: Time, input: Input) {
+        match input {
+            Input::AppChanged(fact) => self.app_changed(now, fact),
+            Input::GroupsChanged(groups) => self.groups_changed(now, groups),
+            Input::MembershipChanged(fact) => self.membership_changed(fact),
+            Input::LinkChanged(fact) => self.link_changed(now, fact),
+            Input::ListReceived { from, payload } => self.list_received(from, &payload),
+            Input::ReleaseNotTaken { app } => self.keep(now, app, None),
+            Input::EventNotTaken { app, name } => self.keep(now, app, Some(name)),
+            Input::TimePassed => {}
+        }
+        self.offer_again(now);
+        self.evaluate();
+        self.report_overdue(now);
+        self.publish(now);
+    }
+
+    /// The next thing to be done; take until there is none.
+    pub(crate) fn poll(&mut self) -> Option<Output> {
+        self.outputs.pop_front()
+    }
+
+    /// When to come back with [`Input::TimePassed`].
+    pub(crate) fn next_wake(&self) -> Option<Time> {
+        let overdue = self.apps.waiting().map(|(_, _, wait)| wait.overdue).min();
+        [self.peers.next_due(), overdue, self.retry].into_iter().flatten().min()
+    }
+
+    /// The TID of the application called `name`: of this node first, else of a linked node, else of a node whose link
+    /// is down; of several nodes the one with the lowest address. It need not be ready. spec: SYNC-6
+    pub(crate) fn resolve(&self, name: &str) -> Option<Tid> {
+        self.all_called(name).into_iter().next()
+    }
+
+    /// Every application that has a name, on this node and on all that are known and not lost, by name and address.
+    pub(crate) fn directory(&self) -> Vec<DirectoryEntry> {
+        let here = self.apps.iter().filter_map(|(address, app)| {
+            let tid = Tid::new(self.node, address);
+            Some((app.name.as_ref()?, tid, app.state == State::Ready))
+        });
+        let mut entries: Vec<_> = here
+            .chain(self.peers.directory())
+            .map(|(name, tid, ready)| DirectoryEntry { name: name.to_string(), tid, ready })
+            .collect();
+        entries.sort_by(|a, b| (&a.name, a.tid).cmp(&(&b.name, b.tid)));
+        entries
+    }
+
+    /// Who waits at the barrier, for what, since when and why.
+    pub(crate) fn waiting(&self, now: Time) -> Vec<Waiting> {
+        self.apps.waiting().map(|(address, _, _)| address).filter_map(|app| self.wait_of(now, app)).collect()
+    }
+
+    /// The number of the sync manager's next message. It counts on when the actor is restarted.
+    pub(crate) const fn next_sequence(&mut self) -> u64 {
+        self.sequence += 1;
+        self.sequence
+    }
+
+    fn all_called(&self, name: &str) -> Vec<Tid> {
+        let here = self.apps.called(name).map(|(app, _)| Tid::new(self.node, app));
+        here.into_iter().chain(self.peers.resolve(name)).collect()
+    }
+
+    fn refuse(&mut self, cause: &'static str, detail: String) {
+        self.outputs.push_back(Output::Refused { cause, detail });
+    }
+}
+
+/// The applications of this node.
+impl Core {
+    fn app_changed(&mut self, now: Time, fact: AppFact) {
+        match fact {
+            AppFact::Registered { app, name, requires } => {
+                let wait = Wait::begun(now, self.requirement_deadline);
+                let refused = self.apps.register(app, name.clone(), requires, wait);
+                if let Some(name) = refused {
+                    self.refuse(
+                        "name",
+                        format!("{app} cannot be called {name:?}: not 1 to 63 bytes, or taken"),
+                    );
+                }
+                self.forget_not_taken(app);
+                self.note_same_name(name.as_deref().unwrap_or_default());
+                self.own_list_changed(now);
+            }
+            AppFact::Ready { app } => self.app_ready(now, app),
+            AppFact::Down { app } => self.app_failed(now, app),
+            AppFact::Unregistered { app } => {
+                self.apps.remove(app);
+                self.forget_not_taken(app);
+                self.own_list_changed(now);
+            }
+            // The shell looks up which they are and says so by `Input::GroupsChanged`.
+            AppFact::GroupsChanged => {}
+        }
+    }
+
+    fn app_ready(&mut self, now: Time, address: AppAddress) {
+        if let Some(app) = self.apps.get_mut(address)
+            && app.state != State::Ready
+        {
+            (app.state, app.failed) = (State::Ready, false);
+            self.own_list_changed(now);
+        }
+    }
+
+    /// It waits again for all that it requires; one that waits already was not started yet and goes on waiting.
+    fn app_failed(&mut self, now: Time, address: AppAddress) {
+        let wait = Wait::begun(now, self.requirement_deadline);
+        if let Some(app) = self.apps.get_mut(address)
+            && app.wait().is_none()
+        {
+            (app.state, app.failed) = (State::Waiting(wait), true);
+            app.lost.clear();
+            self.forget_not_taken(address);
+            self.own_list_changed(now);
+        }
+    }
+
+    fn groups_changed(&mut self, now: Time, mut groups: Vec<AppAddress>) {
+        groups.retain(|group| group.is_group());
+        if self.groups != groups {
+            self.groups = groups;
+            self.own_list_changed(now);
+        }
+    }
+}
+
+/// The other nodes.
+impl Core {
+    fn membership_changed(&mut self, fact: MembershipFact) {
+        match fact {
+            MembershipFact::NodeFound { node, incarnation, .. } => {
+                self.peers.found(node, incarnation);
+                self.route_groups(node);
+            }
+            MembershipFact::NodeLost { node, incarnation, why } => {
+                let reason = match why {
+                    LossReason::Left => Reason::NodeLeft,
+                    LossReason::Silent | LossReason::ConnectionRefused | LossReason::Restarted => {
+                        Reason::NodeLost
+                    }
+                };
+                self.peers.lost(node, incarnation, reason);
+                self.route_groups(node);
+            }
+        }
+    }
+
+    fn link_changed(&mut self, now: Time, fact: LinkFact) {
+        match fact {
+            LinkFact::LinkUp { node, incarnation } => {
+                if !self.peers.link_up(now, node, incarnation) {
+                    self.refuse(
+                        "nodes",
+                        format!("{node} is linked, but `ndl.nodes_max` nodes are known already"),
+                    );
+                }
+                self.route_groups(node);
+            }
+            LinkFact::LinkBroken { node, incarnation } => self.peers.link_broken(node, incarnation),
+            // A link that was refused was down before. Whether its node is lost, NDL says.
+            LinkFact::DialRefused { .. } => {}
+            LinkFact::PeerLeft { node, incarnation } => {
+                self.peers.lost(node, incarnation, Reason::NodeLeft);
+                self.peers.link_broken(node, incarnation);
+                self.route_groups(node);
+            }
+        }
+    }
+
+    fn list_received(&mut self, from: NodeAddress, payload: &[u8]) {
+        if from == self.node || !from.is_single() {
+            return self.refuse("directory", format!("{from} is not another node"));
+        }
+        // A list that is longer than ours may be is not even looked at.
+        if payload.len() > self.list_bytes_max {
+            return self.refuse("directory", format!("{from} sent {} bytes", payload.len()));
+        }
+        match List::parse(payload) {
+            Err(fault) => self.refuse("directory", format!("from {from}: {fault}")),
+            Ok(list) => match self.peers.accept(from, list) {
+                Err(why) => self.refuse("directory", format!("from {from}: {why}")),
+                Ok(Accepted::New) => {
+                    self.route_groups(from);
+                    for name in self.peers.names_of(from) {
+                        self.note_same_name(&name);
+                    }
+                }
+                Ok(Accepted::Same | Accepted::Old) => {}
+            },
+        }
+    }
+
+    fn route_groups(&mut self, node: NodeAddress) {
+        if let Some(groups) = self.peers.changed_groups(node) {
+            self.outputs.push_back(Output::RouteGroups { node, groups });
+        }
+    }
+
+    fn note_same_name(&mut self, name: &str) {
+        let tids = self.all_called(name);
+        if tids.len() > 1 && self.same_names.len() < SAME_NAMES_MAX && self.same_names.insert(name.to_owned())
+        {
+            self.outputs.push_back(Output::SameName { name: name.to_owned(), tids });
+        }
+    }
+
+    fn own_list_changed(&mut self, now: Time) {
+        self.version += 1;
+        self.encoded = None;
+        self.peers.make_due(now);
+    }
+
+    /// Sends the list to whom it is due. spec: SYNC-2
+    fn publish(&mut self, now: Time) {
+        for to in self.peers.take_due(now) {
+            let list = self.encoded();
+            self.outputs.push_back(Output::Publish { to, list });
+        }
+    }
+
+    fn encoded(&mut self) -> Bytes {
+        if let Some(bytes) = &self.encoded {
+            return bytes.clone();
+        }
+        let list = List {
+            incarnation: self.incarnation,
+            version: self.version,
+            entries: self.apps.entries(),
+            groups: self.groups.clone(),
+        };
+        let (bytes, left_out) = list.encode(self.list_bytes_max);
+        if left_out > 0 {
+            let limit = self.list_bytes_max;
+            let detail = format!(
+                "{left_out} applications are not in this node's directory, which has at most {ENTRIES_MAX} entries \
+                 and {limit} bytes: other nodes cannot find them by name; raise `node.payload_max` or use more nodes"
+            );
+            self.refuse("directory full", detail);
+        }
+        self.encoded = Some(bytes.clone());
+        bytes
+    }
+}
+
+/// The barrier.
+impl Core {
+    /// Releases whoever has all that it requires, and tells running applications what they lost or got back.
+    fn evaluate(&mut self) {
+        self.find_cycles();
+        let mut missing = BTreeMap::new();
+        for (address, app) in self.apps.iter().filter(|(_, app)| !app.requires.is_empty()) {
+            let unready: Vec<(String, Reason)> =
+                app.requires.iter().filter_map(|name| Some((name.clone(), self.why_not(name)?))).collect();
+            missing.insert(address, unready);
+        }
+        self.remember_seen(&missing);
+        let in_cycle: BTreeSet<&str> = self.cycles.iter().flatten().map(String::as_str).collect();
+        let mut released = Vec::new();
+        for (address, app) in self.apps.iter_mut() {
+            let unready = missing.remove(&address).unwrap_or_default();
+            if app.wait().is_none() {
+                for (event, why) in changes(&mut app.lost, &app.requires, &unready) {
+                    // What it did not take about this name before is out of date.
+                    self.not_taken.remove(&(address, Some(event.name().to_owned())));
+                    self.outputs.push_back(Output::Tell { app: address, event, why });
+                }
+            } else if unready.is_empty() && !app.name.as_deref().is_some_and(|name| in_cycle.contains(name)) {
+                // spec: SYNC-5
+                app.state = State::Released;
+                released.push(address);
+            }
+        }
+        self.outputs.extend(released.into_iter().map(|app| Output::Release { app }));
+    }
+
+    /// Why `name` is not ready anywhere; `None`: it is.
+    fn why_not(&self, name: &str) -> Option<Reason> {
+        if self.apps.is_ready(name) || self.peers.is_ready(name) {
+            return None;
+        }
+        let unknown = || if self.seen.contains(name) { Reason::Unregistered } else { Reason::NeverSeen };
+        Some(self.apps.why_not(name).or_else(|| self.peers.why_not(name)).unwrap_or_else(unknown))
+    }
+
+    /// Remembers which required names were known at some time, and forgets those that nobody requires any more.
+    fn remember_seen(&mut self, missing: &BTreeMap<AppAddress, Vec<(String, Reason)>>) {
+        let never: BTreeSet<&String> = missing
+            .values()
+            .flatten()
+            .filter(|(_, reason)| *reason == Reason::NeverSeen)
+            .map(|(name, _)| name)
+            .collect();
+        let required = self.apps.iter().flat_map(|(_, app)| &app.requires);
+        self.seen = required.filter(|name| !never.contains(name)).cloned().collect();
+    }
+
+    /// Looks for circles among what waiting applications require. spec: SYNC-7
+    fn find_cycles(&mut self) {
+        let mut starts = Vec::new();
+        for (_, app, _) in self.apps.waiting() {
+            starts.extend(app.requires.iter().cloned());
+        }
+        let providers = |name: &str| {
+            let here = self.apps.called(name).map(|(_, app)| app.requires.clone());
+            here.into_iter().chain(self.peers.requirements(name)).collect()
+        };
+        let cycles =
+            if starts.is_empty() { BTreeSet::new() } else { Graph::reach(starts, providers).cycles() };
+        for cycle in cycles.difference(&self.cycles) {
+            let names = cycle.iter().chain(cycle.first()).cloned().collect();
+            self.outputs.push_back(Output::Cycle { names });
+        }
+        self.cycles = cycles;
+    }
+
+    fn wait_of(&self, now: Time, address: AppAddress) -> Option<Waiting> {
+        let app = self.apps.get(address)?;
+        let since = app.wait()?.since;
+        let in_cycle = |name: &String| self.cycles.iter().any(|cycle| cycle.contains(name));
+        let missing = app.requires.iter().filter_map(|name| {
+            let reason = if in_cycle(name) { Reason::Cycle } else { self.why_not(name)? };
+            Some((name.clone(), reason.words()))
+        });
+        Some(Waiting { application: app.title(address), missing: missing.collect(), since: now.since(since) })
+    }
+
+    /// Reports who has waited for its deadline, and each time that it passes again. spec: SYNC-9
+    fn report_overdue(&mut self, now: Time) {
+        let deadline = self.requirement_deadline;
+        let mut overdue = Vec::new();
+        for (address, app) in self.apps.iter_mut() {
+            if let State::Waiting(wait) = &mut app.state
+                && wait.overdue <= now
+            {
+                wait.overdue = now + deadline;
+                overdue.push(address);
+            }
+        }
+        let reports: Vec<_> = overdue.into_iter().filter_map(|app| self.wait_of(now, app)).collect();
+        self.outputs.extend(reports.into_iter().map(Output::Overdue));
+    }
+
+    /// Keeps an output that was not taken.
+    fn keep(&mut self, now: Time, app: AppAddress, name: Option<String>) {
+        self.not_taken.insert((app, name));
+        self.retry.get_or_insert(now + RETRY);
+    }
+
+    /// Offers again what was not taken, as it is true now: what changed back meanwhile is still told, in its last form.
+    fn offer_again(&mut self, now: Time) {
+        if self.retry.is_none_or(|retry| retry > now) {
+            return;
+        }
+        self.retry = None;
+        for (address, name) in std::mem::take(&mut self.not_taken) {
+            let Some(app) = self.apps.get(address) else { continue };
+            let output = match name {
+                None if app.state == State::Released => Output::Release { app: address },
+                None => continue,
+                Some(name) if app.lost.contains(&name) => {
+                    let why = self.why_not(&name).map_or("ready", Reason::words);
+                    Output::Tell { app: address, event: RequirementEvent::Lost { name }, why }
+                }
+                Some(name) => {
+                    Output::Tell { app: address, event: RequirementEvent::Met { name }, why: "ready" }
+                }
+            };
+            self.outputs.push_back(output);
+        }
+    }
+
+    fn forget_not_taken(&mut self, app: AppAddress) {
+        self.not_taken.retain(|(other, _)| *other != app);
+    }
+}
+
+/// What a running application is told: each requirement whose state differs from what it knows. spec: SYNC-8
+fn changes(
+    lost: &mut BTreeSet<String>,
+    requires: &[String],
+    unready: &[(String, Reason)],
+) -> Vec<(RequirementEvent, &'static str)> {
+    let mut changes = Vec::new();
+    for name in requires {
+        let reason = unready.iter().find(|(other, _)| other == name).map(|(_, reason)| *reason);
+        let name = name.clone();
+        match reason {
+            Some(reason) if lost.insert(name.clone()) => {
+                changes.push((RequirementEvent::Lost { name }, reason.words()));
+            }
+            None if lost.remove(&name) => changes.push((RequirementEvent::Met { name }, "ready")),
+            Some(_) | None => {}
+        }
+    }
+    changes
+}

@@ -1,0 +1,296 @@
+//! What other nodes said about themselves, and whether it still counts.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::Duration,
+};
+
+use sinew_runtime::{
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    time::Time,
+};
+
+use super::reason::Reason;
+use crate::sync::list::{Entry, List, Name};
+
+/// Time between two lists to a peer when nothing changed: the net beneath a list that a full queue refused.
+pub(super) const REPEAT: Duration = Duration::from_secs(2);
+/// Least time between two lists to a peer: a burst of changes costs 200 lists a second, not one each.
+pub(super) const SPACING: Duration = Duration::from_millis(5);
+
+/// The other nodes.
+#[derive(Debug)]
+pub(super) struct Peers {
+    nodes: BTreeMap<NodeAddress, Peer>,
+    /// Which nodes' lists contain a name, so that nobody searches them all.
+    names: BTreeMap<Name, BTreeSet<NodeAddress>>,
+    nodes_max: usize,
+}
+
+#[derive(Debug, Default)]
+struct Peer {
+    /// Which life of it messages can reach now.
+    linked: Option<Incarnation>,
+    /// Why it is not there, if it is not.
+    lost: Option<Reason>,
+    /// Whether it sent a list since the link came up or it was lost.
+    heard: bool,
+    /// Whether the list is about a life that has ended.
+    stale: bool,
+    list: Option<Held>,
+    /// The groups that the routing table has for it.
+    routed: Vec<AppAddress>,
+    /// When our list went to it last.
+    sent: Option<Time>,
+    /// When it goes to it next.
+    due: Time,
+}
+
+#[derive(Debug)]
+struct Held {
+    incarnation: Incarnation,
+    version: u64,
+    entries: BTreeMap<Name, Entry>,
+    groups: Vec<AppAddress>,
+}
+
+impl Peer {
+    /// Whether what it says counts. spec: SYNC-3
+    const fn is_current(&self) -> bool {
+        self.linked.is_some() && self.heard && self.lost.is_none()
+    }
+
+    fn entry(&self, name: &str) -> Option<&Entry> {
+        self.list.as_ref()?.entries.get(name)
+    }
+
+    /// Why an application of it that stands in its list is not ready; `None`: it is.
+    fn why_not(&self, entry: &Entry) -> Option<Reason> {
+        if self.lost.is_some() {
+            self.lost
+        } else if self.linked.is_none() {
+            Some(Reason::LinkDown)
+        } else if !self.heard {
+            Some(Reason::ListAwaited)
+        } else if entry.ready {
+            None
+        } else {
+            Some(Reason::NotReady)
+        }
+    }
+
+    fn wanted_groups(&self) -> &[AppAddress] {
+        match &self.list {
+            Some(list) if self.lost.is_none() && !self.stale => &list.groups,
+            _ => &[],
+        }
+    }
+
+    /// Which life of it is known, by its link or else by its list.
+    fn life(&self) -> Option<Incarnation> {
+        self.linked.or_else(|| self.list.as_ref().map(|list| list.incarnation))
+    }
+
+    /// Whether news about `incarnation` are about a life before the known one.
+    fn is_former(&self, incarnation: Incarnation) -> bool {
+        self.life().is_some_and(|life| incarnation < life)
+    }
+}
+
+/// What became of a list.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Accepted {
+    /// It says something new.
+    New,
+    /// It is the one that is known.
+    Same,
+    /// A newer one is known.
+    Old,
+}
+
+impl Peers {
+    /// Nobody yet, and never more than `nodes_max`.
+    pub(super) const fn new(nodes_max: usize) -> Self {
+        Self { nodes: BTreeMap::new(), names: BTreeMap::new(), nodes_max }
+    }
+
+    /// Messages can flow to this life of `node`; our list goes there first. Returns whether there was room for it.
+    pub(super) fn link_up(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) -> bool {
+        let Some(peer) = self.at(node) else { return false };
+        if peer.list.as_ref().is_some_and(|list| list.incarnation != incarnation) {
+            (peer.heard, peer.stale) = (false, true);
+        }
+        (peer.linked, peer.lost, peer.due) = (Some(incarnation), None, now);
+        true
+    }
+
+    /// Messages cannot flow to this life of `node` any more.
+    pub(super) fn link_broken(&mut self, node: NodeAddress, incarnation: Incarnation) {
+        if let Some(peer) = self.nodes.get_mut(&node)
+            && !peer.is_former(incarnation)
+        {
+            (peer.linked, peer.heard) = (None, false);
+        }
+    }
+
+    /// This life of `node` is over.
+    pub(super) fn lost(&mut self, node: NodeAddress, incarnation: Incarnation, why: Reason) {
+        if let Some(peer) = self.nodes.get_mut(&node)
+            && !peer.is_former(incarnation)
+        {
+            // Who said goodbye is silent afterwards: the first reason stays.
+            (peer.lost, peer.heard) = (peer.lost.or(Some(why)), false);
+        }
+    }
+
+    /// `node` is there.
+    pub(super) fn found(&mut self, node: NodeAddress, incarnation: Incarnation) {
+        if let Some(peer) = self.nodes.get_mut(&node)
+            && !peer.is_former(incarnation)
+        {
+            peer.lost = None;
+        }
+    }
+
+    /// Takes over what `node` says about itself, unless something newer is known. spec: SYNC-1
+    ///
+    /// # Errors
+    /// Why its list is not used.
+    pub(super) fn accept(&mut self, node: NodeAddress, list: List) -> Result<Accepted, &'static str> {
+        let Some(peer) = self.at(node) else {
+            return Err("more nodes than `ndl.nodes_max` publish a directory");
+        };
+        if peer.linked.is_some_and(|life| life != list.incarnation) {
+            return Err("this directory is about another life of its node than the one that is linked");
+        }
+        let known = peer.list.as_ref().filter(|_| !peer.stale).map(|held| (held.incarnation, held.version));
+        match known.map(|known| (list.incarnation, list.version).cmp(&known)) {
+            Some(std::cmp::Ordering::Less) => return Ok(Accepted::Old),
+            Some(std::cmp::Ordering::Equal) => {
+                peer.heard = true;
+                return Ok(Accepted::Same);
+            }
+            Some(std::cmp::Ordering::Greater) | None => {}
+        }
+        self.replace(node, list);
+        Ok(Accepted::New)
+    }
+
+    fn replace(&mut self, node: NodeAddress, list: List) {
+        self.unlist(node);
+        let List { incarnation, version, entries, groups } = list;
+        for entry in &entries {
+            self.names.entry(entry.name.clone()).or_default().insert(node);
+        }
+        let entries = entries.into_iter().map(|entry| (entry.name.clone(), entry)).collect();
+        let peer = self.nodes.entry(node).or_default();
+        (peer.heard, peer.stale) = (true, false);
+        peer.list = Some(Held { incarnation, version, entries, groups });
+    }
+
+    /// Forgets the list of `node`.
+    fn unlist(&mut self, node: NodeAddress) {
+        let former = self.nodes.get_mut(&node).and_then(|peer| peer.list.take());
+        for name in former.into_iter().flat_map(|list| list.entries.into_keys()) {
+            if let Some(nodes) = self.names.get_mut(&name) {
+                nodes.remove(&node);
+                if nodes.is_empty() {
+                    self.names.remove(&name);
+                }
+            }
+        }
+    }
+
+    /// The record of `node`; where the table is full, in place of a node that was lost.
+    fn at(&mut self, node: NodeAddress) -> Option<&mut Peer> {
+        if !self.nodes.contains_key(&node) && self.nodes.len() >= self.nodes_max {
+            let mut lost = self.nodes.iter().filter(|(_, peer)| peer.lost.is_some() && peer.linked.is_none());
+            let forgotten = lost.next().map(|(node, _)| *node)?;
+            self.unlist(forgotten);
+            self.nodes.remove(&forgotten);
+        }
+        Some(self.nodes.entry(node).or_default())
+    }
+
+    /// The applications called `name`, by node address, and why they are not ready.
+    fn called<'a>(&'a self, name: &'a str) -> impl Iterator<Item = (Tid, &'a Peer, &'a Entry)> {
+        self.names.get(name).into_iter().flatten().filter_map(move |node| {
+            let peer = self.nodes.get(node)?;
+            let entry = peer.entry(name)?;
+            Some((Tid::new(*node, entry.app), peer, entry))
+        })
+    }
+
+    /// Whether an application called `name` is ready on a linked node.
+    pub(super) fn is_ready(&self, name: &str) -> bool {
+        self.called(name).any(|(_, peer, entry)| peer.why_not(entry).is_none())
+    }
+
+    /// Why no application called `name` is ready, as far as other nodes know: of several, the nearest to readiness.
+    pub(super) fn why_not(&self, name: &str) -> Option<Reason> {
+        self.called(name).filter_map(|(_, peer, entry)| peer.why_not(entry)).min()
+    }
+
+    /// The requirements of each application called `name` on a linked node.
+    pub(super) fn requirements(&self, name: &str) -> Vec<Vec<String>> {
+        let current = self.called(name).filter(|(_, peer, _)| peer.is_current());
+        current.map(|(_, _, entry)| entry.requires.iter().map(|name| name.to_string()).collect()).collect()
+    }
+
+    /// The applications called `name` on nodes that are not lost: linked nodes first, then by address. spec: SYNC-6
+    pub(super) fn resolve(&self, name: &str) -> Vec<Tid> {
+        let there = self.called(name).filter(|(_, peer, _)| peer.lost.is_none() && !peer.stale);
+        let mut found: Vec<(bool, Tid)> = there.map(|(tid, peer, _)| (peer.linked.is_none(), tid)).collect();
+        found.sort();
+        found.into_iter().map(|(_, tid)| tid).collect()
+    }
+
+    /// Every application of every node that is not lost: name, address, whether it is ready.
+    pub(super) fn directory(&self) -> impl Iterator<Item = (&Name, Tid, bool)> {
+        let there = self.nodes.iter().filter(|(_, peer)| peer.lost.is_none() && !peer.stale);
+        there.flat_map(|(node, peer)| {
+            let entries = peer.list.iter().flat_map(|list| list.entries.values());
+            entries.map(|entry| (&entry.name, Tid::new(*node, entry.app), peer.why_not(entry).is_none()))
+        })
+    }
+
+    /// The names in the list of `node`.
+    pub(super) fn names_of(&self, node: NodeAddress) -> Vec<Name> {
+        let list = self.nodes.get(&node).and_then(|peer| peer.list.as_ref());
+        list.into_iter().flat_map(|list| list.entries.keys().cloned()).collect()
+    }
+
+    /// The groups of `node`, if the routing table does not have them so yet.
+    pub(super) fn changed_groups(&mut self, node: NodeAddress) -> Option<Vec<AppAddress>> {
+        let peer = self.nodes.get_mut(&node)?;
+        let wanted = peer.wanted_groups().to_vec();
+        if peer.routed == wanted {
+            return None;
+        }
+        peer.routed.clone_from(&wanted);
+        Some(wanted)
+    }
+
+    /// Our list changed: it goes to every linked peer, at once or when the least time has passed. spec: SYNC-2
+    pub(super) fn make_due(&mut self, now: Time) {
+        for peer in self.nodes.values_mut() {
+            let earliest = peer.sent.map_or(now, |sent| now.max(sent + SPACING));
+            peer.due = peer.due.min(earliest);
+        }
+    }
+
+    /// The linked peers to which our list goes now.
+    pub(super) fn take_due(&mut self, now: Time) -> Vec<NodeAddress> {
+        let due = self.nodes.iter_mut().filter(|(_, peer)| peer.linked.is_some() && peer.due <= now);
+        due.map(|(node, peer)| {
+            (peer.sent, peer.due) = (Some(now), now + REPEAT);
+            *node
+        })
+        .collect()
+    }
+
+    /// When our list goes to a peer next.
+    pub(super) fn next_due(&self) -> Option<Time> {
+        self.nodes.values().filter(|peer| peer.linked.is_some()).map(|peer| peer.due).min()
+    }
+}

@@ -1,0 +1,305 @@
+//! Several cores that exchange lists over links that break, nodes that restart, applications that come and go in any
+//! order: after quiet, everybody whose requirements can be met runs, and all nodes say the same.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+
+use proptest::prelude::*;
+
+use super::*;
+
+const NODES: usize = 3;
+/// Each node may have these applications; names are `node.app`.
+const APPS: usize = 3;
+
+#[derive(Clone, Debug)]
+enum Step {
+    Register { node: usize, app: usize, requires: BTreeSet<usize> },
+    Start { node: usize, app: usize },
+    Fail { node: usize, app: usize },
+    Unregister { node: usize, app: usize },
+    Cut { link: usize },
+    Restore { link: usize },
+    Lose { link: usize },
+    Restart { node: usize },
+    Deliver { link: usize, count: usize },
+    Pass { millis: u64 },
+}
+
+fn any_step() -> impl Strategy<Value = Step> {
+    let pair = (0..NODES, 0..APPS);
+    let requires = proptest::collection::btree_set(0..NODES * APPS, 0..4);
+    let link = 0..NODES;
+    prop_oneof![
+        4 => (pair.clone(), requires).prop_map(|((node, app), requires)| Step::Register { node, app, requires }),
+        6 => pair.clone().prop_map(|(node, app)| Step::Start { node, app }),
+        2 => pair.clone().prop_map(|(node, app)| Step::Fail { node, app }),
+        1 => pair.prop_map(|(node, app)| Step::Unregister { node, app }),
+        1 => link.clone().prop_map(|link| Step::Cut { link }),
+        2 => link.clone().prop_map(|link| Step::Restore { link }),
+        1 => link.clone().prop_map(|link| Step::Lose { link }),
+        1 => (0..NODES).prop_map(|node| Step::Restart { node }),
+        6 => (link, 1usize..4).prop_map(|(link, count)| Step::Deliver { link, count }),
+        2 => (1u64..3_000).prop_map(|millis| Step::Pass { millis }),
+    ]
+}
+
+/// An application as its own node's root sees it.
+#[derive(Clone, Debug, PartialEq)]
+struct Life {
+    requires: Vec<usize>,
+    released: u32,
+    running: bool,
+}
+
+struct World {
+    now: Time,
+    cores: Vec<Core>,
+    incarnations: Vec<u64>,
+    apps: Vec<BTreeMap<usize, Life>>,
+    up: Vec<bool>,
+    /// Lists on their way, by link and direction.
+    flying: BTreeMap<(usize, bool), VecDeque<Bytes>>,
+}
+
+/// The two ends of a link.
+const fn ends(link: usize) -> (usize, usize) {
+    (link, (link + 1) % NODES)
+}
+
+fn address(node: usize) -> NodeAddress {
+    NodeAddress::new(0x7f00_0001 + node as u32)
+}
+
+fn name(index: usize) -> String {
+    format!("{}.{}", index / APPS, index % APPS)
+}
+
+fn app_address(app: usize) -> AppAddress {
+    AppAddress::fixed(app as u32).unwrap()
+}
+
+impl World {
+    fn new() -> Self {
+        let mut world = Self {
+            now: Time::from_nanos(1),
+            cores: Vec::new(),
+            incarnations: vec![1; NODES],
+            apps: vec![BTreeMap::new(); NODES],
+            up: vec![false; NODES],
+            flying: BTreeMap::new(),
+        };
+        world.cores = (0..NODES).map(|node| world.new_core(node)).collect();
+        world
+    }
+
+    fn new_core(&self, node: usize) -> Core {
+        Core::new(&NodeConfig::new("n"), address(node), Incarnation(self.incarnations[node]))
+    }
+
+    fn tell(&mut self, node: usize, input: Input) {
+        self.cores[node].handle(self.now, input);
+        while let Some(output) = self.cores[node].poll() {
+            self.carry_out(node, output);
+        }
+    }
+
+    fn carry_out(&mut self, node: usize, output: Output) {
+        match output {
+            Output::Release { app } => self.released(node, app),
+            Output::Publish { to, list } => {
+                let to = (to.bits() - address(0).bits()) as usize;
+                let link = (0..NODES).find(|link| [(node, to), (to, node)].contains(&ends(*link))).unwrap();
+                assert!(self.up[link], "a list was sent over a link that is down");
+                self.flying.entry((link, ends(link).0 == node)).or_default().push_back(list);
+            }
+            Output::Tell { app, event, .. } => {
+                let (index, _) = self.life(node, app);
+                assert!(self.apps[node][&index].released == 1, "told before it was released: {event:?}");
+            }
+            Output::Refused { cause, detail } => panic!("refused because of {cause}: {detail}"),
+            Output::RouteGroups { .. }
+            | Output::Cycle { .. }
+            | Output::Overdue(_)
+            | Output::SameName { .. } => {}
+        }
+    }
+
+    fn life(&mut self, node: usize, app: AppAddress) -> (usize, &mut Life) {
+        let index = (0..APPS).find(|index| app_address(*index) == app).unwrap();
+        (index, self.apps[node].get_mut(&index).expect("a release for who is not registered"))
+    }
+
+    /// No release before all is ready, and one for each life.
+    fn released(&mut self, node: usize, app: AppAddress) {
+        let ready: BTreeSet<String> = self.cores[node]
+            .directory()
+            .into_iter()
+            .filter(|entry| entry.ready)
+            .map(|entry| entry.name)
+            .collect();
+        let (_, life) = self.life(node, app);
+        life.released += 1;
+        assert_eq!(life.released, 1, "released twice in one life");
+        for required in &life.requires {
+            assert!(ready.contains(&name(*required)), "{} is not ready", name(*required));
+        }
+    }
+
+    fn step(&mut self, step: Step) {
+        match step {
+            Step::Register { node, app, requires } => self.register(node, app, requires),
+            Step::Start { node, app } => self.start(node, app),
+            Step::Fail { node, app } => {
+                if let Some(life) = self.apps[node].get_mut(&app) {
+                    // One that waits goes on waiting in the same life.
+                    if life.released == 1 {
+                        (life.released, life.running) = (0, false);
+                    }
+                    self.tell(node, Input::AppChanged(AppFact::Down { app: app_address(app) }));
+                }
+            }
+            Step::Unregister { node, app } => {
+                self.apps[node].remove(&app);
+                self.tell(node, Input::AppChanged(AppFact::Unregistered { app: app_address(app) }));
+            }
+            Step::Cut { link } => self.cut(link),
+            Step::Restore { link } => self.restore(link),
+            Step::Lose { link } => {
+                self.cut(link);
+                let why = LossReason::Silent;
+                self.tell_ends(link, |node, incarnation| {
+                    Input::MembershipChanged(MembershipFact::NodeLost { node, incarnation, why })
+                });
+            }
+            Step::Restart { node } => self.restart(node),
+            Step::Deliver { link, count } => {
+                for _ in 0..count {
+                    self.deliver(link, true);
+                    self.deliver(link, false);
+                }
+            }
+            Step::Pass { millis } => self.pass(Duration::from_millis(millis)),
+        }
+    }
+
+    fn register(&mut self, node: usize, app: usize, requires: BTreeSet<usize>) {
+        // Requirements point to smaller numbers only, so that there is no cycle.
+        let index = node * APPS + app;
+        let requires: Vec<usize> = requires.into_iter().filter(|required| *required < index).collect();
+        let life = Life { requires: requires.clone(), released: 0, running: false };
+        self.apps[node].insert(app, life);
+        let requires = requires.into_iter().map(name).collect();
+        let fact = AppFact::Registered { app: app_address(app), name: Some(name(index)), requires };
+        self.tell(node, Input::AppChanged(fact));
+    }
+
+    fn start(&mut self, node: usize, app: usize) {
+        if let Some(life) = self.apps[node].get_mut(&app)
+            && life.released == 1
+            && !life.running
+        {
+            life.running = true;
+            self.tell(node, Input::AppChanged(AppFact::Ready { app: app_address(app) }));
+        }
+    }
+
+    fn tell_ends(&mut self, link: usize, input: impl Fn(NodeAddress, Incarnation) -> Input) {
+        let (a, b) = ends(link);
+        for (node, peer) in [(a, b), (b, a)] {
+            self.tell(node, input(address(peer), Incarnation(self.incarnations[peer])));
+        }
+    }
+
+    fn cut(&mut self, link: usize) {
+        if std::mem::take(&mut self.up[link]) {
+            self.flying.retain(|(other, _), _| *other != link);
+            self.tell_ends(link, |node, incarnation| {
+                Input::LinkChanged(LinkFact::LinkBroken { node, incarnation })
+            });
+        }
+    }
+
+    fn restore(&mut self, link: usize) {
+        if !std::mem::replace(&mut self.up[link], true) {
+            self.tell_ends(link, |node, incarnation| {
+                Input::LinkChanged(LinkFact::LinkUp { node, incarnation })
+            });
+        }
+    }
+
+    fn restart(&mut self, node: usize) {
+        for link in (0..NODES).filter(|link| ends(*link).0 == node || ends(*link).1 == node) {
+            self.cut(link);
+        }
+        self.incarnations[node] += 1;
+        self.apps[node].clear();
+        self.cores[node] = self.new_core(node);
+    }
+
+    fn deliver(&mut self, link: usize, forward: bool) -> bool {
+        let Some(payload) = self.flying.get_mut(&(link, forward)).and_then(VecDeque::pop_front) else {
+            return false;
+        };
+        let (a, b) = ends(link);
+        let (from, to) = if forward { (a, b) } else { (b, a) };
+        self.tell(to, Input::ListReceived { from: address(from), payload });
+        true
+    }
+
+    fn pass(&mut self, time: Duration) {
+        self.now = self.now + time;
+        for node in 0..NODES {
+            self.tell(node, Input::TimePassed);
+        }
+    }
+
+    /// Heals every link and lets everything happen that can.
+    fn settle(&mut self) {
+        (0..NODES).for_each(|link| self.restore(link));
+        for _ in 0..NODES * APPS + 2 {
+            self.pass(peers::SPACING);
+            for link in 0..NODES {
+                while self.deliver(link, true) || self.deliver(link, false) {}
+            }
+            for index in 0..NODES * APPS {
+                self.start(index / APPS, index % APPS);
+            }
+        }
+    }
+
+    /// The applications that can run: all that they require can.
+    fn possible(&self) -> BTreeSet<usize> {
+        let mut possible = BTreeSet::new();
+        for index in 0..NODES * APPS {
+            let life = self.apps[index / APPS].get(&(index % APPS));
+            if life.is_some_and(|life| life.requires.iter().all(|required| possible.contains(required))) {
+                possible.insert(index);
+            }
+        }
+        possible
+    }
+}
+
+proptest! {
+    #[test]
+    fn after_quiet_all_who_can_run_do_and_all_nodes_agree(steps in proptest::collection::vec(any_step(), 0..80)) {
+        let mut world = World::new();
+        steps.into_iter().for_each(|step| world.step(step));
+        world.settle();
+        // Who was released and lost a requirement since is not stopped, so it may run without being possible.
+        for index in world.possible() {
+            let life = &world.apps[index / APPS][&(index % APPS)];
+            prop_assert_eq!((life.released, life.running), (1, true), "{} does not run", name(index));
+        }
+        let directories: Vec<_> = world.cores.iter().map(Core::directory).collect();
+        prop_assert_eq!(&directories[0], &directories[1]);
+        prop_assert_eq!(&directories[0], &directories[2]);
+        let registered: usize = world.apps.iter().map(BTreeMap::len).sum();
+        prop_assert_eq!(directories[0].len(), registered);
+        for entry in &directories[0] {
+            for core in &world.cores {
+                prop_assert_eq!(core.resolve(&entry.name), Some(entry.tid));
+            }
+        }
+    }
+}

@@ -1,0 +1,396 @@
+//! What the sync manager promises, one claim a test.
+
+use std::net::SocketAddr;
+
+use super::{
+    peers::{REPEAT, SPACING},
+    *,
+};
+use crate::sync::list::{Entry, Name};
+
+const HERE: NodeAddress = NodeAddress::new(0x7f00_0001);
+const KNEE: NodeAddress = NodeAddress::new(0x7f00_0002);
+const ANKLE: NodeAddress = NodeAddress::new(0x7f00_0003);
+const LIFE: Incarnation = Incarnation(5);
+const NEXT_LIFE: Incarnation = Incarnation(6);
+
+/// A core and its clock.
+struct Bench {
+    core: Core,
+    now: Time,
+}
+
+impl Bench {
+    fn new() -> Self {
+        let core = Core::new(&NodeConfig::new("hip"), HERE, Incarnation(1));
+        Self { core, now: Time::from_nanos(1_000_000_000) }
+    }
+
+    fn hears(&mut self, input: Input) -> Vec<Output> {
+        self.core.handle(self.now, input);
+        std::iter::from_fn(|| self.core.poll()).collect()
+    }
+
+    fn registers(&mut self, index: u32, name: &str, requires: &[&str]) -> Vec<Output> {
+        let requires = requires.iter().map(|name| (*name).to_owned()).collect();
+        let name = (!name.is_empty()).then(|| name.to_owned());
+        self.hears(Input::AppChanged(AppFact::Registered { app: app(index), name, requires }))
+    }
+
+    fn ready(&mut self, index: u32) -> Vec<Output> {
+        self.hears(Input::AppChanged(AppFact::Ready { app: app(index) }))
+    }
+
+    fn down(&mut self, index: u32) -> Vec<Output> {
+        self.hears(Input::AppChanged(AppFact::Down { app: app(index) }))
+    }
+
+    fn links(&mut self, node: NodeAddress, incarnation: Incarnation) -> Vec<Output> {
+        self.hears(Input::LinkChanged(LinkFact::LinkUp { node, incarnation }))
+    }
+
+    fn breaks(&mut self, node: NodeAddress) -> Vec<Output> {
+        self.hears(Input::LinkChanged(LinkFact::LinkBroken { node, incarnation: LIFE }))
+    }
+
+    fn lost(&mut self, node: NodeAddress, why: LossReason) -> Vec<Output> {
+        let lost = MembershipFact::NodeLost { node, incarnation: LIFE, why };
+        self.hears(Input::MembershipChanged(lost))
+    }
+
+    fn list(&mut self, from: NodeAddress, list: List) -> Vec<Output> {
+        self.hears(Input::ListReceived { from, payload: list.encode(usize::MAX).0 })
+    }
+
+    fn passes(&mut self, time: Duration) -> Vec<Output> {
+        self.now = self.now + time;
+        self.hears(Input::TimePassed)
+    }
+
+    /// The words about what keeps the first waiting application.
+    fn missing(&self) -> Vec<(String, &'static str)> {
+        self.core.waiting(self.now).remove(0).missing
+    }
+}
+
+fn app(index: u32) -> AppAddress {
+    AppAddress::fixed(index).unwrap()
+}
+
+fn list(version: u64, entries: &[(&str, bool, &[&str])]) -> List {
+    let name = |text: &str| Name::try_from(text.to_owned()).unwrap();
+    let entries = (0..).zip(entries).map(|(index, (text, ready, requires))| Entry {
+        name: name(text),
+        app: app(index),
+        ready: *ready,
+        requires: requires.iter().map(|text| name(text)).collect(),
+    });
+    List { incarnation: LIFE, version, entries: entries.collect(), groups: Vec::new() }
+}
+
+fn release(index: u32) -> Output {
+    Output::Release { app: app(index) }
+}
+
+fn lost(index: u32, name: &str, why: &'static str) -> Output {
+    Output::Tell { app: app(index), event: RequirementEvent::Lost { name: name.to_owned() }, why }
+}
+
+fn met(index: u32, name: &str) -> Output {
+    Output::Tell { app: app(index), event: RequirementEvent::Met { name: name.to_owned() }, why: "ready" }
+}
+
+fn published(outputs: &[Output]) -> Vec<List> {
+    let lists = outputs.iter().filter_map(|output| match output {
+        Output::Publish { list, .. } => Some(List::parse(list).unwrap()),
+        _ => None,
+    });
+    lists.collect()
+}
+
+#[test]
+fn who_requires_nothing_is_released_at_once() {
+    assert_eq!(Bench::new().registers(0, "plant", &[]), [release(0)]);
+}
+
+// spec: SYNC-5
+#[test]
+fn an_application_is_released_when_the_last_of_its_requirements_is_ready() {
+    let mut bench = Bench::new();
+    assert_eq!(bench.registers(0, "gait", &["sensor", "knee.drive"]), []);
+    assert_eq!(bench.registers(1, "sensor", &[]), [release(1)]);
+    assert_eq!(bench.ready(1), []);
+    bench.links(KNEE, LIFE);
+    assert_eq!(bench.list(KNEE, list(1, &[("knee.drive", false, &[])])), []);
+    assert_eq!(bench.list(KNEE, list(2, &[("knee.drive", true, &[])])), [release(0)]);
+}
+
+// spec: SYNC-5
+#[test]
+fn a_failed_application_waits_again_and_others_are_told_but_not_stopped() {
+    let mut bench = Bench::new();
+    bench.registers(0, "gait", &["sensor"]);
+    bench.registers(1, "sensor", &[]);
+    bench.ready(1);
+    bench.ready(0);
+    assert_eq!(bench.down(1), [lost(0, "sensor", "failed, not ready again"), release(1)]);
+    assert_eq!(bench.ready(1), [met(0, "sensor")]);
+    assert_eq!(bench.down(0), [release(0)], "all that it requires is ready still");
+    bench.down(1);
+    assert_eq!(bench.registers(0, "gait", &["sensor"]), [], "registered again it is in a new life");
+    assert_eq!(bench.ready(1), [release(0)]);
+}
+
+// spec: SYNC-8
+#[test]
+fn a_running_application_hears_once_of_a_lost_node_and_once_of_its_return() {
+    let mut bench = Bench::new();
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(3, &[("knee.drive", true, &[])]));
+    bench.registers(0, "gait", &["knee.drive"]);
+    bench.ready(0);
+    assert_eq!(bench.breaks(KNEE), [lost(0, "knee.drive", "its link is down")]);
+    assert_eq!(bench.lost(KNEE, LossReason::Silent), []);
+    let back = bench.links(KNEE, NEXT_LIFE);
+    assert!(!back.contains(&met(0, "knee.drive")), "a link alone says nothing about the application");
+    let mut news = list(1, &[("knee.drive", true, &[])]);
+    news.incarnation = NEXT_LIFE;
+    assert_eq!(bench.list(KNEE, news), [met(0, "knee.drive")]);
+}
+
+// spec: SYNC-8
+#[test]
+fn what_a_full_mailbox_did_not_take_is_offered_again_in_its_last_form() {
+    let mut bench = Bench::new();
+    bench.registers(0, "gait", &["sensor"]);
+    bench.registers(1, "sensor", &[]);
+    bench.ready(1);
+    bench.ready(0);
+    bench.down(1);
+    let name = || "sensor".to_owned();
+    assert_eq!(bench.hears(Input::EventNotTaken { app: app(0), name: name() }), []);
+    assert_eq!(bench.passes(RETRY), [lost(0, "sensor", "failed, not ready again")]);
+    bench.hears(Input::EventNotTaken { app: app(0), name: name() });
+    assert_eq!(bench.ready(1), [met(0, "sensor")]);
+    assert_eq!(bench.passes(RETRY), [], "the lost one is out of date");
+    bench.hears(Input::ReleaseNotTaken { app: app(2) });
+    bench.registers(2, "late", &[]);
+    bench.hears(Input::ReleaseNotTaken { app: app(2) });
+    assert_eq!(bench.passes(RETRY), [release(2)]);
+}
+
+// spec: SYNC-9
+#[test]
+fn every_deadline_that_passes_reports_what_is_missing_since_when_and_why() {
+    let mut bench = Bench::new();
+    bench.registers(0, "gait", &["sensor", "knee.drive"]);
+    bench.registers(1, "sensor", &[]);
+    let deadline = bench.core.next_wake().unwrap();
+    assert_eq!(deadline, bench.now + Duration::from_secs(60));
+    let waited = |seconds| {
+        let missing =
+            vec![("sensor".to_owned(), "registered, not ready"), ("knee.drive".to_owned(), "never seen")];
+        Output::Overdue(Waiting {
+            application: "gait".to_owned(),
+            missing,
+            since: Duration::from_secs(seconds),
+        })
+    };
+    assert_eq!(bench.passes(Duration::from_secs(59)), []);
+    assert_eq!(bench.passes(Duration::from_secs(1)), [waited(60)]);
+    assert_eq!(bench.passes(Duration::from_secs(59)), []);
+    assert_eq!(bench.passes(Duration::from_secs(1)), [waited(120)]);
+}
+
+#[test]
+fn the_last_known_reason_is_told_for_each_way_to_be_missing() {
+    let mut bench = Bench::new();
+    bench.registers(0, "gait", &["drive"]);
+    let reason = |bench: &Bench| bench.missing().remove(0).1;
+    assert_eq!(reason(&bench), "never seen");
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("drive", false, &[])]));
+    assert_eq!(reason(&bench), "registered, not ready");
+    bench.breaks(KNEE);
+    assert_eq!(reason(&bench), "its link is down");
+    bench.links(KNEE, LIFE);
+    assert_eq!(reason(&bench), "its node is linked again, its directory has not come yet");
+    bench.list(KNEE, list(2, &[]));
+    assert_eq!(reason(&bench), "unregistered");
+    bench.list(KNEE, list(3, &[("drive", false, &[])]));
+    bench.lost(KNEE, LossReason::Silent);
+    assert_eq!(reason(&bench), "its node was lost");
+    bench.links(KNEE, LIFE);
+    bench.hears(Input::LinkChanged(LinkFact::PeerLeft { node: KNEE, incarnation: LIFE }));
+    bench.lost(KNEE, LossReason::Silent);
+    assert_eq!(reason(&bench), "its node left");
+    bench.registers(1, "drive", &[]);
+    assert_eq!(reason(&bench), "registered, not ready", "what this node knows comes first");
+    bench.down(1);
+    assert_eq!(reason(&bench), "failed, not ready again");
+}
+
+// spec: SYNC-7
+#[test]
+fn a_cycle_is_refused_with_its_names_whoever_came_first() {
+    let mut bench = Bench::new();
+    bench.registers(0, "a", &["b"]);
+    let cycle = Output::Cycle { names: ["a", "b", "a"].map(str::to_owned).to_vec() };
+    assert_eq!(bench.registers(1, "b", &["a"]), [cycle]);
+    assert_eq!(bench.registers(2, "c", &[]), [release(2)], "said once; others start");
+    assert_eq!(bench.missing(), [("b".to_owned(), "part of a cycle of requirements")]);
+    // Without the requirement there is no cycle.
+    bench.hears(Input::AppChanged(AppFact::Unregistered { app: app(1) }));
+    assert_eq!(bench.registers(1, "b", &[]), [release(1)]);
+    assert_eq!(bench.ready(1), [release(0)]);
+}
+
+// spec: SYNC-7
+#[test]
+fn a_cycle_through_two_nodes_is_seen() {
+    let mut bench = Bench::new();
+    bench.links(KNEE, LIFE);
+    bench.registers(0, "hip", &["knee"]);
+    let outputs = bench.list(KNEE, list(1, &[("knee", false, &["hip"])]));
+    assert_eq!(outputs, [Output::Cycle { names: ["hip", "knee", "hip"].map(str::to_owned).to_vec() }]);
+    assert_eq!(
+        bench.list(KNEE, list(2, &[("knee", true, &["hip"])])),
+        [],
+        "refused, even where it runs by chance"
+    );
+    assert_eq!(bench.list(KNEE, list(3, &[("knee", true, &[])])), [release(0)]);
+}
+
+// spec: SYNC-1
+#[test]
+fn the_newest_version_of_the_newest_life_wins() {
+    let mut bench = Bench::new();
+    bench.registers(0, "gait", &["drive"]);
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(2, &[("drive", false, &[])]));
+    assert_eq!(bench.list(KNEE, list(1, &[("drive", true, &[])])), [], "older");
+    let mut other_life = list(9, &[("drive", true, &[])]);
+    other_life.incarnation = NEXT_LIFE;
+    let refused = bench.list(KNEE, other_life.clone());
+    assert!(matches!(refused[..], [Output::Refused { cause: "directory", .. }]), "{refused:?}");
+    bench.links(KNEE, NEXT_LIFE);
+    assert_eq!(bench.list(KNEE, other_life), [release(0)]);
+    assert_eq!(bench.breaks(KNEE), [], "news of the former life");
+    assert!(bench.core.directory()[0].ready);
+}
+
+// spec: SYNC-2
+#[test]
+fn the_whole_list_goes_out_at_link_up_at_each_change_and_every_two_seconds() {
+    let mut bench = Bench::new();
+    bench.registers(0, "gait", &["drive"]);
+    let first = published(&bench.links(KNEE, LIFE));
+    assert_eq!(first.len(), 1);
+    let Entry { name, ready, requires, .. } = &first[0].entries[0];
+    assert_eq!((&**name, *ready, requires.len()), ("gait", false, 1));
+    let outputs = bench.registers(1, "drive", &[]);
+    assert_eq!(published(&outputs), [], "the least time has not passed");
+    let second = published(&bench.passes(SPACING));
+    assert_eq!((second.len(), second[0].entries.len()), (1, 2));
+    assert!(second[0].version > first[0].version);
+    assert_eq!(published(&bench.passes(REPEAT)), second, "unchanged, so with the same version");
+    assert_eq!(bench.core.next_wake(), Some(bench.now + REPEAT));
+    bench.breaks(KNEE);
+    assert_eq!(published(&bench.passes(REPEAT)), []);
+}
+
+// spec: SYNC-6
+#[test]
+fn a_name_belongs_to_this_node_then_to_the_linked_then_to_the_lowest() {
+    let mut bench = Bench::new();
+    for node in [KNEE, ANKLE] {
+        bench.links(node, LIFE);
+    }
+    bench.list(ANKLE, list(1, &[("imu", true, &[])]));
+    let outputs = bench.list(KNEE, list(1, &[("imu", true, &[])]));
+    let tids = vec![Tid::new(KNEE, app(0)), Tid::new(ANKLE, app(0))];
+    assert_eq!(outputs, [Output::SameName { name: "imu".to_owned(), tids }]);
+    assert_eq!(bench.core.resolve("imu"), Some(Tid::new(KNEE, app(0))));
+    bench.breaks(KNEE);
+    assert_eq!(bench.core.resolve("imu"), Some(Tid::new(ANKLE, app(0))));
+    bench.registers(7, "imu", &[]);
+    assert_eq!(bench.core.resolve("imu"), Some(Tid::new(HERE, app(7))));
+    assert_eq!(bench.core.resolve("nobody"), None);
+    bench.hears(Input::AppChanged(AppFact::Unregistered { app: app(7) }));
+    bench.lost(ANKLE, LossReason::Silent);
+    assert_eq!(
+        bench.core.resolve("imu"),
+        Some(Tid::new(KNEE, app(0))),
+        "its link is down, its node is not lost"
+    );
+}
+
+#[test]
+fn groups_of_a_node_are_routed_until_it_is_lost() {
+    let mut bench = Bench::new();
+    let found = MembershipFact::NodeFound {
+        node: KNEE,
+        incarnation: LIFE,
+        gncl: SocketAddr::from(([127, 0, 0, 2], 1)),
+    };
+    let groups = vec![AppAddress::group("drives")];
+    let route = |groups: &[AppAddress]| Output::RouteGroups { node: KNEE, groups: groups.to_vec() };
+    let with_group = |version| List { groups: groups.clone(), ..list(version, &[]) };
+    bench.links(KNEE, LIFE);
+    assert_eq!(bench.list(KNEE, with_group(1)), [route(&groups)]);
+    assert_eq!(bench.breaks(KNEE), []);
+    assert_eq!(bench.lost(KNEE, LossReason::Silent), [route(&[])]);
+    assert_eq!(bench.hears(Input::MembershipChanged(found)), [route(&groups)]);
+    let mine = bench.hears(Input::GroupsChanged(groups.clone()));
+    assert_eq!(published(&mine), [], "not linked");
+    bench.now = bench.now + SPACING;
+    assert_eq!(published(&bench.links(KNEE, LIFE))[0].groups, groups);
+    assert!(bench.links(KNEE, NEXT_LIFE).contains(&route(&[])), "nobody has joined in the new life yet");
+}
+
+// spec: SYNC-4
+#[test]
+fn what_is_not_a_list_is_refused_and_changes_nothing() {
+    let mut bench = Bench::new();
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("drive", true, &[])]));
+    let before = bench.core.directory();
+    let garbage = |from| Input::ListReceived { from, payload: Bytes::from_static(b"\xc1garbage") };
+    let own = Input::ListReceived { from: HERE, payload: list(9, &[]).encode(usize::MAX).0 };
+    let long = Input::ListReceived { from: KNEE, payload: vec![0; (1 << 20) + 1].into() };
+    for input in [garbage(KNEE), garbage(NodeAddress::ALL), own, long] {
+        let outputs = bench.hears(input);
+        assert!(matches!(outputs[..], [Output::Refused { cause: "directory", .. }]), "{outputs:?}");
+    }
+    assert_eq!(bench.core.directory(), before);
+}
+
+#[test]
+fn more_nodes_than_allowed_are_refused_until_one_is_lost() {
+    let mut config = NodeConfig::new("hip");
+    config.ndl.nodes_max = 1;
+    let mut bench = Bench { core: Core::new(&config, HERE, Incarnation(1)), now: Time::ZERO };
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("drive", true, &[])]));
+    assert!(matches!(bench.links(ANKLE, LIFE)[..], [Output::Refused { cause: "nodes", .. }]));
+    bench.breaks(KNEE);
+    bench.lost(KNEE, LossReason::Silent);
+    bench.links(ANKLE, LIFE);
+    assert_eq!(bench.list(ANKLE, list(1, &[])), []);
+    assert_eq!(bench.core.directory(), []);
+}
+
+#[test]
+fn an_application_without_a_name_waits_like_any_other_and_is_in_no_list() {
+    let mut bench = Bench::new();
+    assert_eq!(bench.registers(0, "", &["sensor"]), []);
+    assert_eq!(bench.core.waiting(bench.now)[0].application, "1000");
+    assert_eq!(bench.core.directory(), []);
+    bench.registers(1, "sensor", &[]);
+    assert_eq!(bench.ready(1), [release(0)]);
+    let outputs = bench.registers(2, "sensor", &[]);
+    assert!(
+        matches!(outputs[..], [Output::Refused { cause: "name", .. }, Output::Release { .. }]),
+        "{outputs:?}"
+    );
+}

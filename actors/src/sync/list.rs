@@ -1,0 +1,306 @@
+//! The list that a node publishes about itself: payload of `Kind::SYNC_DIRECTORY`, a MessagePack map.
+//!
+//! A list is parsed once, here, and is legal afterwards: `docs/protocol/sync.md` has the fields and the bounds.
+
+use std::{borrow::Borrow, collections::BTreeSet, fmt, marker::PhantomData, ops::Deref};
+
+use bytes::Bytes;
+use serde::{
+    Deserialize, Deserializer, Serialize,
+    de::{Error as _, SeqAccess, Visitor},
+};
+use sinew_runtime::tid::{AppAddress, Incarnation};
+
+/// Applications in one list at most.
+pub(crate) const ENTRIES_MAX: usize = 1_024;
+/// Groups in one list at most.
+pub(crate) const GROUPS_MAX: usize = 1_024;
+/// Names that one application requires at most, as far as a list says.
+pub(crate) const REQUIRES_MAX: usize = 64;
+/// Longest name in bytes.
+pub(crate) const NAME_BYTES_MAX: usize = 63;
+
+/// What a node says about itself.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct List {
+    /// Which life of the node this is about.
+    pub(crate) incarnation: Incarnation,
+    /// Counts the changes in that life, from 1.
+    pub(crate) version: u64,
+    /// The node's applications that have a name.
+    #[serde(deserialize_with = "at_most::<_, _, ENTRIES_MAX>")]
+    pub(crate) entries: Vec<Entry>,
+    /// The groups that have members on the node.
+    #[serde(default, deserialize_with = "at_most::<_, _, GROUPS_MAX>")]
+    pub(crate) groups: Vec<AppAddress>,
+}
+
+/// One application in a list.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Entry {
+    /// Its name, unique on its node.
+    pub(crate) name: Name,
+    /// Its address on its node.
+    pub(crate) app: AppAddress,
+    /// Whether it has started and takes messages.
+    pub(crate) ready: bool,
+    /// The names that it requires, so that every node can see a cycle.
+    #[serde(default, deserialize_with = "at_most::<_, _, REQUIRES_MAX>")]
+    pub(crate) requires: Vec<Name>,
+}
+
+/// A legal name: 1 to 63 bytes of UTF-8, no control characters (they would forge log lines).
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(try_from = "String")]
+pub(crate) struct Name(String);
+
+impl TryFrom<String> for Name {
+    type Error = &'static str;
+
+    fn try_from(text: String) -> Result<Self, Self::Error> {
+        if text.is_empty() || text.len() > NAME_BYTES_MAX {
+            return Err("a name has 1 to 63 bytes");
+        }
+        if text.chars().any(char::is_control) {
+            return Err("a name has no control characters");
+        }
+        Ok(Self(text))
+    }
+}
+
+impl Deref for Name {
+    type Target = str;
+
+    fn deref(&self) -> &str {
+        &self.0
+    }
+}
+
+impl Borrow<str> for Name {
+    fn borrow(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Display for Name {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+/// Why bytes are not a list that this node uses. The peer is at fault; nothing changed.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum ListError {
+    /// Not the MessagePack map of a list, or outside of its bounds.
+    #[error("this is not a directory: {0}")]
+    Malformed(#[from] rmp_serde::decode::Error),
+    /// The address belongs to no application.
+    #[error("{0} is not an application's address")]
+    Address(AppAddress),
+    /// The address belongs to no group.
+    #[error("{0} is not a group's address")]
+    Group(AppAddress),
+    /// The same name, address or group twice.
+    #[error("{0} stands in it twice")]
+    Twice(String),
+}
+
+impl List {
+    /// Reads a list from a peer's bytes. Allocates no more than the legal bounds, whatever lengths the bytes claim.
+    pub(crate) fn parse(bytes: &[u8]) -> Result<Self, ListError> {
+        // spec: SYNC-4
+        let list: Self = rmp_serde::from_slice(bytes)?;
+        let (mut names, mut apps, mut groups) = (BTreeSet::new(), BTreeSet::new(), BTreeSet::new());
+        for Entry { name, app, .. } in &list.entries {
+            if !(app.is_fixed() || app.is_dynamic()) {
+                return Err(ListError::Address(*app));
+            }
+            if !names.insert(name) || !apps.insert(*app) {
+                return Err(ListError::Twice(format!("{name} ({app})")));
+            }
+        }
+        for group in &list.groups {
+            if !group.is_group() {
+                return Err(ListError::Group(*group));
+            }
+            if !groups.insert(*group) {
+                return Err(ListError::Twice(format!("group {group}")));
+            }
+        }
+        Ok(list)
+    }
+
+    /// The bytes of this list, at most `bytes_max`: entries that do not fit are left out, last ones first. Returns how
+    /// many were.
+    pub(crate) fn encode(mut self, bytes_max: usize) -> (Bytes, usize) {
+        let whole = self.entries.len();
+        self.groups.truncate(GROUPS_MAX);
+        self.entries.truncate(ENTRIES_MAX);
+        loop {
+            let bytes = encode(&self);
+            if bytes.len() <= bytes_max || self.entries.is_empty() {
+                return (bytes.into(), whole - self.entries.len());
+            }
+            self.drop_entries_worth(bytes.len() - bytes_max);
+        }
+    }
+
+    /// Removes entries from the end until they make up `bytes`.
+    fn drop_entries_worth(&mut self, bytes: usize) {
+        let mut freed = 0;
+        while freed < bytes
+            && let Some(entry) = self.entries.pop()
+        {
+            freed += encode(&entry).len();
+        }
+    }
+}
+
+fn encode<T: Serialize>(value: &T) -> Vec<u8> {
+    rmp_serde::to_vec_named(value).expect("maps of numbers, texts and truths into memory cannot fail")
+}
+
+/// Reads a sequence of at most `N` elements and reserves nothing on the word of the sender.
+fn at_most<'de, D, T, const N: usize>(deserializer: D) -> Result<Vec<T>, D::Error>
+where
+    D: Deserializer<'de>,
+    T: Deserialize<'de>,
+{
+    deserializer.deserialize_seq(AtMost::<T, N>(PhantomData))
+}
+
+struct AtMost<T, const N: usize>(PhantomData<T>);
+
+impl<'de, T: Deserialize<'de>, const N: usize> Visitor<'de> for AtMost<T, N> {
+    type Value = Vec<T>;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "a list of at most {N} elements")
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut elements: A) -> Result<Vec<T>, A::Error> {
+        let mut taken = Vec::new();
+        while let Some(element) = elements.next_element()? {
+            if taken.len() == N {
+                return Err(A::Error::custom(format_args!("more than {N} elements")));
+            }
+            taken.push(element);
+        }
+        Ok(taken)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn name(text: &str) -> Name {
+        Name::try_from(text.to_owned()).unwrap()
+    }
+
+    fn entry(index: u32, text: &str) -> Entry {
+        Entry { name: name(text), app: AppAddress::fixed(index).unwrap(), ready: true, requires: Vec::new() }
+    }
+
+    fn list(entries: Vec<Entry>) -> List {
+        List { incarnation: Incarnation(7), version: 1, entries, groups: vec![AppAddress::group("drives")] }
+    }
+
+    fn many(count: u32) -> Vec<Entry> {
+        (0..count).map(|n| entry(n, &format!("app{n}"))).collect()
+    }
+
+    fn any_list() -> impl Strategy<Value = List> {
+        let entry = ("[a-z.]{1,63}", any::<bool>(), proptest::collection::vec("[a-z]{1,8}", 0..4));
+        let entries = proptest::collection::vec(entry, 0..8);
+        (any::<u64>(), any::<u64>(), entries).prop_map(|(incarnation, version, entries)| List {
+            incarnation: Incarnation(incarnation),
+            version,
+            entries: (0u32..)
+                .zip(entries)
+                .map(|(n, (text, ready, requires))| Entry {
+                    name: name(&format!("{n}{}", &text[..text.len().min(60)])),
+                    app: AppAddress::fixed(n).unwrap(),
+                    ready,
+                    requires: requires.iter().map(|text| name(text)).collect(),
+                })
+                .collect(),
+            groups: Vec::new(),
+        })
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_written_is_read_back(list in any_list()) {
+            let (bytes, left_out) = list.clone().encode(usize::MAX);
+            prop_assert_eq!(left_out, 0);
+            prop_assert_eq!(List::parse(&bytes).unwrap(), list);
+        }
+
+        #[test]
+        fn any_bytes_are_a_list_or_an_error(bytes: Vec<u8>) {
+            let _ = List::parse(&bytes);
+        }
+
+        #[test]
+        fn a_damaged_list_is_a_list_or_an_error(list in any_list(), at: prop::sample::Index, byte: u8, cut: prop::sample::Index) {
+            let mut bytes = list.encode(usize::MAX).0.to_vec();
+            let at = at.index(bytes.len());
+            bytes[at] = byte;
+            let _ = List::parse(&bytes);
+            bytes.truncate(cut.index(bytes.len()));
+            let _ = List::parse(&bytes);
+        }
+    }
+
+    #[test]
+    fn lengths_that_are_not_there_reserve_nothing() {
+        // A map with "entries": an array that claims 2^32 - 1 elements.
+        let mut bytes = vec![0x81, 0xa7];
+        bytes.extend_from_slice(b"entries");
+        bytes.extend_from_slice(&[0xdd, 0xff, 0xff, 0xff, 0xff]);
+        assert!(List::parse(&bytes).is_err());
+        assert!(List::parse(&[0x91; 100_000]).is_err(), "depth without end is refused");
+    }
+
+    #[test]
+    fn a_list_holds_its_maximum_of_entries_and_not_one_more() {
+        assert!(List::parse(&encode(&list(many(ENTRIES_MAX as u32)))).is_ok());
+        assert!(List::parse(&encode(&list(many(ENTRIES_MAX as u32 + 1)))).is_err());
+    }
+
+    #[test]
+    fn names_of_1_to_63_bytes_are_legal() {
+        for (text, legal) in
+            [("", false), ("a", true), (&"x".repeat(63), true), (&"x".repeat(64), false), ("a\nb", false)]
+        {
+            assert_eq!(Name::try_from(text.to_owned()).is_ok(), legal, "{text:?}");
+        }
+    }
+
+    #[test]
+    fn doubles_and_foreign_addresses_are_refused() {
+        let mut layer = entry(0, "a");
+        layer.app = AppAddress::SYNC;
+        let mut groups = list(Vec::new());
+        groups.groups.push(groups.groups[0]);
+        let mut no_group = list(Vec::new());
+        no_group.groups.push(AppAddress::fixed(0).unwrap());
+        let same_name = list(vec![entry(0, "a"), entry(1, "a")]);
+        let same_app = list(vec![entry(0, "a"), entry(0, "b")]);
+        for bad in [list(vec![layer]), groups, no_group, same_name, same_app] {
+            assert!(List::parse(&encode(&bad)).is_err(), "{bad:?}");
+        }
+    }
+
+    #[test]
+    fn a_list_above_the_payload_limit_leaves_out_what_does_not_fit() {
+        let (bytes, left_out) = list(many(100)).encode(1_000);
+        let read = List::parse(&bytes).unwrap();
+        assert!(bytes.len() <= 1_000 && bytes.len() > 900, "{}", bytes.len());
+        assert_eq!(read.entries.len() + left_out, 100);
+        assert_eq!(list(many(2_000)).encode(usize::MAX).1, 2_000 - ENTRIES_MAX);
+    }
+}

@@ -1,0 +1,322 @@
+//! The central unit: gait phase from hip sample and foot load, and what the drives shall do.
+//!
+//! ```text
+//!   assembling --- all inputs fresh ---> Hold --- release() ---> Sync --- phase trusted ---> Walk
+//!                                                                 ^                           |
+//!                                 all back and fresh              |   an input or a node lost |
+//!                                 Safe ---------------------------+<--------- Safe <----------+
+//! ```
+//!
+//! While assembling it says nothing, so that no drive becomes ready before all parts are there.
+
+use crate::control::admission::{Admission, Stamped};
+use crate::joint::{Joint, PerJoint};
+use crate::leg::{BODY_MASS_KG, GRAVITY_M_S2};
+use crate::message::{FootLoad, GaitMode, GaitState, JointSample, Stance};
+use crate::phase::PhaseEstimate;
+use crate::phase::heel_strike::CONTACT_BW;
+use crate::phase::oscillator::{Oscillator, OscillatorGains};
+use crate::phase::stride_clock::StrideClock;
+
+/// How the phase is estimated.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Estimator {
+    /// Adaptive oscillator on the hip angle, zeroed by heel strikes.
+    Oscillator(OscillatorGains),
+    /// Time since heel strike over the mean of the last three strides; believes in strides of this many seconds
+    /// until it has seen some.
+    StrideClock {
+        /// First belief, seconds.
+        stride_s: f64,
+    },
+}
+
+/// Numbers of the central unit.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CentralConfig {
+    /// How the phase is estimated.
+    pub estimator: Estimator,
+    /// Oldest input that is used, ns. Default 10 ms.
+    pub input_age_max_ns: u64,
+    /// Heel strikes in a row with a trusted phase before assistance starts or comes back. Default 3.
+    pub strikes_trusted: u32,
+    /// Largest error of the phase at a heel strike that counts as trusted, cycles. Default 0.10.
+    pub strike_error_max: f64,
+    /// Time without a heel strike after which the phase is not trusted any more, seconds. Default 2.5.
+    pub strike_gap_max_s: f64,
+    /// Number of this life of central; larger than that of any life before.
+    pub epoch: u32,
+}
+
+impl Default for CentralConfig {
+    fn default() -> Self {
+        Self {
+            estimator: Estimator::Oscillator(OscillatorGains::default()),
+            input_age_max_ns: 10_000_000,
+            strikes_trusted: 3,
+            strike_error_max: 0.10,
+            strike_gap_max_s: 2.5,
+            epoch: 1,
+        }
+    }
+}
+
+/// What has arrived at central since the last tick, or the newest known of each.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct CentralInput<'a> {
+    /// Samples of the three joints.
+    pub samples: PerJoint<Option<&'a JointSample>>,
+    /// Load under the foot.
+    pub load: Option<&'a FootLoad>,
+}
+
+/// Counters of central since its start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct CentralCounters {
+    /// Ticks done.
+    pub ticks: u64,
+    /// Times an input or a node was lost while released.
+    pub losses: u32,
+    /// Times assistance was allowed.
+    pub walks: u32,
+    /// Heel strikes seen since the start of this life.
+    pub heel_strikes: u32,
+    /// Inputs refused.
+    pub refused: u32,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Stage {
+    Assembling,
+    Held,
+    Syncing,
+    Walking,
+    Lost,
+}
+
+#[derive(Debug, Clone)]
+enum RunningEstimator {
+    Oscillator(Box<Oscillator>),
+    StrideClock(StrideClock),
+}
+
+/// The central unit.
+#[derive(Debug, Clone)]
+pub struct CentralCore {
+    config: CentralConfig,
+    stage: Stage,
+    released: bool,
+    nodes_lost: PerJoint<bool>,
+    samples: PerJoint<Admission<JointSample>>,
+    load: Admission<FootLoad>,
+    estimator: RunningEstimator,
+    estimate: PhaseEstimate,
+    confidence: f64,
+    strikes_good: u32,
+    since_strike_s: f64,
+    last_tick_ns: Option<u64>,
+    seq: u32,
+    counters: CentralCounters,
+}
+
+impl CentralCore {
+    /// A central unit that has heard nobody yet.
+    #[must_use]
+    pub fn new(config: CentralConfig) -> Self {
+        Self {
+            config,
+            stage: Stage::Assembling,
+            released: false,
+            nodes_lost: [false; 3],
+            samples: std::array::from_fn(|_| Admission::new(config.input_age_max_ns)),
+            load: Admission::new(config.input_age_max_ns),
+            estimator: RunningEstimator::cold(config.estimator),
+            estimate: PhaseEstimate { phase: 0.0, rate_hz: 0.0, strike_error: None },
+            confidence: 0.0,
+            strikes_good: 0,
+            since_strike_s: 0.0,
+            last_tick_ns: None,
+            seq: 0,
+            counters: CentralCounters::default(),
+        }
+    }
+
+    /// One period of central. `None` while it still waits for the first word of a part.
+    pub fn tick(&mut self, now_ns: u64, input: &CentralInput<'_>) -> Option<GaitState> {
+        let before_ns = self.last_tick_ns.replace(now_ns).unwrap_or(now_ns);
+        let dt_s = now_ns.saturating_sub(before_ns) as f64 * 1e-9;
+        self.counters.ticks += 1;
+        self.admit(now_ns, input);
+        let complete = self.complete(now_ns);
+        self.judge_stage(complete);
+        if complete && matches!(self.stage, Stage::Syncing | Stage::Walking) {
+            self.estimate_phase(dt_s);
+        }
+        self.judge_trust();
+        self.mode().map(|mode| self.gait_state(now_ns, mode))
+    }
+
+    /// The operator lets the person walk; counts once all parts are there.
+    pub const fn release(&mut self) {
+        self.released = true;
+    }
+
+    /// The operator takes the release back: torque zero from the next tick on.
+    pub const fn hold(&mut self) {
+        self.released = false;
+    }
+
+    /// A layer below has found that a joint's node is gone; need not wait for its samples to age.
+    pub const fn node_lost(&mut self, joint: Joint) {
+        self.nodes_lost[joint.index()] = true;
+    }
+
+    /// The joint's node is there again.
+    pub const fn node_found(&mut self, joint: Joint) {
+        self.nodes_lost[joint.index()] = false;
+    }
+
+    /// Counters since the start.
+    #[must_use]
+    pub const fn counters(&self) -> &CentralCounters {
+        &self.counters
+    }
+
+    /// What the drives are asked to do; `None` while a part was never heard.
+    #[must_use]
+    pub const fn mode(&self) -> Option<GaitMode> {
+        match self.stage {
+            Stage::Assembling => None,
+            Stage::Held => Some(GaitMode::Hold),
+            Stage::Syncing => Some(GaitMode::Sync),
+            Stage::Walking => Some(GaitMode::Walk),
+            Stage::Lost => Some(GaitMode::Safe),
+        }
+    }
+
+    fn admit(&mut self, now_ns: u64, input: &CentralInput<'_>) {
+        for (admission, sample) in self.samples.iter_mut().zip(input.samples) {
+            if let Some(sample) = sample {
+                admission.offer(now_ns, sample);
+            }
+        }
+        if let Some(load) = input.load {
+            self.load.offer(now_ns, load);
+        }
+        self.counters.refused =
+            self.samples.iter().map(|a| a.refused().total()).sum::<u32>() + self.load.refused().total();
+    }
+
+    fn complete(&self, now_ns: u64) -> bool {
+        self.load.fresh(now_ns).is_some()
+            && self.samples.iter().all(|a| a.fresh(now_ns).is_some())
+            && !self.nodes_lost.contains(&true)
+    }
+
+    fn judge_stage(&mut self, complete: bool) {
+        let next = match (self.stage, complete, self.released) {
+            (Stage::Assembling, false, _) => Stage::Assembling,
+            // Not yet released, so nothing was given that would have to be damped: wait for the parts again.
+            (Stage::Held, false, _) => Stage::Assembling,
+            (Stage::Syncing | Stage::Walking | Stage::Lost, false, _) => Stage::Lost,
+            (_, true, false) => Stage::Held,
+            (Stage::Assembling | Stage::Held | Stage::Lost, true, true) => Stage::Syncing,
+            (Stage::Syncing, true, true) => Stage::Syncing,
+            (Stage::Walking, true, true) => Stage::Walking,
+        };
+        if next == Stage::Lost && self.stage != Stage::Lost {
+            self.counters.losses = self.counters.losses.saturating_add(1);
+        }
+        if next == Stage::Syncing && self.stage != Stage::Syncing {
+            self.start_cold();
+        }
+        self.stage = next;
+    }
+
+    /// A new estimator: what was learnt before standing or before a gap is no guide to the phase now.
+    fn start_cold(&mut self) {
+        self.estimator = RunningEstimator::cold(self.config.estimator);
+        self.confidence = 0.0;
+        self.strikes_good = 0;
+        self.since_strike_s = 0.0;
+    }
+
+    fn estimate_phase(&mut self, dt_s: f64) {
+        let (Some(hip), Some(load)) = (self.samples[Joint::Hip.index()].newest(), self.load.newest()) else {
+            return;
+        };
+        let hip_deg = f64::from(hip.angle_rad).to_degrees();
+        let load_bw = load_bw(load);
+        self.estimate = match &mut self.estimator {
+            RunningEstimator::Oscillator(oscillator) => oscillator.tick(hip_deg, load_bw, dt_s),
+            RunningEstimator::StrideClock(clock) => clock.tick(load_bw, dt_s),
+        };
+        self.since_strike_s += dt_s;
+        if let Some(error) = self.estimate.strike_error {
+            self.counters.heel_strikes = self.counters.heel_strikes.saturating_add(1);
+            self.since_strike_s = 0.0;
+            self.confidence = (1.0 - 0.5 * error.abs() / self.config.strike_error_max).clamp(0.0, 1.0);
+            let good = error.abs() <= self.config.strike_error_max;
+            self.strikes_good = if good { self.strikes_good.saturating_add(1) } else { 0 };
+        }
+    }
+
+    fn judge_trust(&mut self) {
+        let overdue = self.since_strike_s > self.config.strike_gap_max_s;
+        if self.stage == Stage::Syncing && self.strikes_good >= self.config.strikes_trusted {
+            self.stage = Stage::Walking;
+            self.counters.walks = self.counters.walks.saturating_add(1);
+        } else if self.stage == Stage::Walking && (overdue || self.confidence <= 0.0) {
+            // The person has stopped or changed step: let go, listen anew.
+            self.stage = Stage::Syncing;
+            self.start_cold();
+        }
+    }
+
+    fn gait_state(&mut self, now_ns: u64, mode: GaitMode) -> GaitState {
+        let seq = self.seq;
+        self.seq = seq.wrapping_add(1);
+        let loaded = self.load.newest().is_some_and(|load| load_bw(load) >= CONTACT_BW);
+        GaitState {
+            seq,
+            t_ns: now_ns,
+            phase: self.estimate.phase as f32,
+            phase_rate_hz: self.estimate.rate_hz as f32,
+            stance: if loaded { Stance::Stance } else { Stance::Swing },
+            mode,
+            confidence: self.confidence as f32,
+            epoch: self.config.epoch,
+        }
+    }
+}
+
+impl RunningEstimator {
+    fn cold(estimator: Estimator) -> Self {
+        match estimator {
+            Estimator::Oscillator(gains) => Self::Oscillator(Box::new(Oscillator::new(gains))),
+            Estimator::StrideClock { stride_s } => Self::StrideClock(StrideClock::new(stride_s)),
+        }
+    }
+}
+
+fn load_bw(load: &FootLoad) -> f64 {
+    f64::from(load.heel_n + load.toe_n) / (BODY_MASS_KG * GRAVITY_M_S2)
+}
+
+impl Stamped for FootLoad {
+    fn t_ns(&self) -> u64 {
+        self.t_ns
+    }
+    fn seq(&self) -> u32 {
+        self.seq
+    }
+    fn epoch(&self) -> u32 {
+        0
+    }
+    fn is_finite(&self) -> bool {
+        self.heel_n.is_finite() && self.toe_n.is_finite()
+    }
+    fn is_plausible(&self) -> bool {
+        (-500.0..=8000.0).contains(&self.heel_n) && (-500.0..=8000.0).contains(&self.toe_n)
+    }
+}

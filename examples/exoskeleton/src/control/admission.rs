@@ -1,0 +1,180 @@
+//! Which inputs a core believes: finite, plausible, newer than the last, young enough. The rest is counted.
+
+use super::faults::RefusedCount;
+use crate::message::{GaitState, JointSample};
+
+/// Jump of a sequence number beyond which it is taken for an older one.
+const SEQUENCE_AHEAD_MAX: u32 = u32::MAX / 2;
+const ANGLE_LARGEST_RAD: f32 = 3.2;
+const VELOCITY_LARGEST_RAD_S: f32 = 50.0;
+const TORQUE_LARGEST_NM: f32 = 500.0;
+const PHASE_RATE_LARGEST_HZ: f32 = 5.0;
+
+/// Something that can be judged before use.
+pub trait Stamped: Copy {
+    /// When it was made, ns.
+    fn t_ns(&self) -> u64;
+    /// Its number; wraps.
+    fn seq(&self) -> u32;
+    /// Life of its sender; newer lives beat older ones whatever the sequence.
+    fn epoch(&self) -> u32;
+    /// Whether all numbers are finite.
+    fn is_finite(&self) -> bool;
+    /// Whether a walking leg can have these values.
+    fn is_plausible(&self) -> bool;
+}
+
+/// Why an input was refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Refusal {
+    NotFinite,
+    OutOfRange,
+    OldSequence,
+    TooOld,
+    FromFuture,
+}
+
+/// Keeps the newest admitted input of one kind.
+#[derive(Debug, Clone)]
+pub struct Admission<T> {
+    age_max_ns: u64,
+    newest: Option<T>,
+    refused: RefusedCount,
+}
+
+impl<T: Stamped> Admission<T> {
+    /// Admits inputs not older than `age_max_ns`.
+    #[must_use]
+    pub const fn new(age_max_ns: u64) -> Self {
+        let refused =
+            RefusedCount { not_finite: 0, out_of_range: 0, old_sequence: 0, too_old: 0, from_future: 0 };
+        Self { age_max_ns, newest: None, refused }
+    }
+
+    /// Judges an input. The one already held may be offered again and again; that is no refusal.
+    /// Returns whether a new input was admitted.
+    pub fn offer(&mut self, now_ns: u64, input: &T) -> bool {
+        if self.is_repeat(input) {
+            return false;
+        }
+        match self.judge(now_ns, input) {
+            Ok(()) => {
+                self.newest = Some(*input);
+                true
+            }
+            Err(refusal) => {
+                self.count(refusal);
+                false
+            }
+        }
+    }
+
+    /// The newest admitted input if it is not older than the limit now.
+    #[must_use]
+    pub fn fresh(&self, now_ns: u64) -> Option<&T> {
+        self.newest.as_ref().filter(|input| now_ns.saturating_sub(input.t_ns()) <= self.age_max_ns)
+    }
+
+    /// The newest admitted input, however old.
+    #[must_use]
+    pub const fn newest(&self) -> Option<&T> {
+        self.newest.as_ref()
+    }
+
+    /// Age of the newest admitted input, ns.
+    #[must_use]
+    pub fn age_ns(&self, now_ns: u64) -> Option<u64> {
+        self.newest.as_ref().map(|input| now_ns.saturating_sub(input.t_ns()))
+    }
+
+    /// Refusals so far.
+    #[must_use]
+    pub const fn refused(&self) -> &RefusedCount {
+        &self.refused
+    }
+
+    fn is_repeat(&self, input: &T) -> bool {
+        self.newest.as_ref().is_some_and(|held| {
+            held.seq() == input.seq() && held.t_ns() == input.t_ns() && held.epoch() == input.epoch()
+        })
+    }
+
+    fn judge(&self, now_ns: u64, input: &T) -> Result<(), Refusal> {
+        if !input.is_finite() {
+            return Err(Refusal::NotFinite);
+        }
+        if !input.is_plausible() {
+            return Err(Refusal::OutOfRange);
+        }
+        if input.t_ns() > now_ns.saturating_add(self.age_max_ns) {
+            return Err(Refusal::FromFuture);
+        }
+        if now_ns.saturating_sub(input.t_ns()) > self.age_max_ns {
+            return Err(Refusal::TooOld);
+        }
+        if self.follows(now_ns, input) { Ok(()) } else { Err(Refusal::OldSequence) }
+    }
+
+    /// Whether the input comes after the one held. A sender without epochs that restarted counts from zero again:
+    /// it is believed once its predecessor is over the age limit and its stamp is later.
+    fn follows(&self, now_ns: u64, input: &T) -> bool {
+        let Some(held) = &self.newest else { return true };
+        if input.epoch() != held.epoch() {
+            return input.epoch() > held.epoch();
+        }
+        let ahead = input.seq().wrapping_sub(held.seq());
+        let later = input.t_ns() > held.t_ns();
+        later && ((1..=SEQUENCE_AHEAD_MAX).contains(&ahead) || self.fresh(now_ns).is_none())
+    }
+
+    const fn count(&mut self, refusal: Refusal) {
+        let counter = match refusal {
+            Refusal::NotFinite => &mut self.refused.not_finite,
+            Refusal::OutOfRange => &mut self.refused.out_of_range,
+            Refusal::OldSequence => &mut self.refused.old_sequence,
+            Refusal::TooOld => &mut self.refused.too_old,
+            Refusal::FromFuture => &mut self.refused.from_future,
+        };
+        *counter = counter.saturating_add(1);
+    }
+}
+
+impl Stamped for JointSample {
+    fn t_ns(&self) -> u64 {
+        self.t_ns
+    }
+    fn seq(&self) -> u32 {
+        self.seq
+    }
+    fn epoch(&self) -> u32 {
+        0
+    }
+    fn is_finite(&self) -> bool {
+        self.angle_rad.is_finite() && self.velocity_rad_s.is_finite() && self.torque_nm.is_finite()
+    }
+    fn is_plausible(&self) -> bool {
+        self.angle_rad.abs() <= ANGLE_LARGEST_RAD
+            && self.velocity_rad_s.abs() <= VELOCITY_LARGEST_RAD_S
+            && self.torque_nm.abs() <= TORQUE_LARGEST_NM
+    }
+}
+
+impl Stamped for GaitState {
+    fn t_ns(&self) -> u64 {
+        self.t_ns
+    }
+    fn seq(&self) -> u32 {
+        self.seq
+    }
+    fn epoch(&self) -> u32 {
+        self.epoch
+    }
+    fn is_finite(&self) -> bool {
+        self.phase.is_finite() && self.phase_rate_hz.is_finite() && self.confidence.is_finite()
+    }
+    fn is_plausible(&self) -> bool {
+        (0.0..=1.0).contains(&self.phase)
+            && self.phase_rate_hz.abs() <= PHASE_RATE_LARGEST_HZ
+            && (0.0..=1.0).contains(&self.confidence)
+    }
+}

@@ -1,0 +1,66 @@
+//! Ramps: the torque's rate limiter and the gain with which assistance comes back.
+
+/// Limits how fast a torque changes; no step ever leaves it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RateLimiter {
+    rate_nm_s: f64,
+    torque_nm: f64,
+}
+
+impl RateLimiter {
+    /// A limiter of `rate_nm_s` (Nm/s) that starts from zero torque.
+    #[must_use]
+    pub const fn new(rate_nm_s: f64) -> Self {
+        Self { rate_nm_s, torque_nm: 0.0 }
+    }
+
+    /// Goes on from a torque that the device already gives, Nm.
+    pub const fn start_from(&mut self, torque_nm: f64) {
+        self.torque_nm = torque_nm;
+    }
+
+    /// Moves toward `target_nm` for `dt_s` and returns the torque reached, Nm.
+    pub fn toward(&mut self, target_nm: f64, dt_s: f64) -> f64 {
+        let step_nm = self.rate_nm_s * dt_s;
+        self.torque_nm += (target_nm - self.torque_nm).clamp(-step_nm, step_nm);
+        self.torque_nm
+    }
+
+    /// The torque last returned, Nm.
+    #[must_use]
+    pub const fn torque_nm(&self) -> f64 {
+        self.torque_nm
+    }
+}
+
+/// Gain 0..1 that rises in a given time while assisting and drops to 0 at once when not.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AssistRamp {
+    rise_s: f64,
+    gain: f64,
+}
+
+impl AssistRamp {
+    /// A ramp that needs `rise_s` seconds from 0 to 1; 0 is no ramp.
+    #[must_use]
+    pub const fn new(rise_s: f64) -> Self {
+        Self { rise_s, gain: 0.0 }
+    }
+
+    /// Rises for `dt_s` and returns the gain.
+    pub fn rise(&mut self, dt_s: f64) -> f64 {
+        self.gain = if self.rise_s > 0.0 { (self.gain + dt_s / self.rise_s).min(1.0) } else { 1.0 };
+        self.gain
+    }
+
+    /// Back to zero; the rate limiter behind keeps the torque from stepping.
+    pub const fn drop_to_zero(&mut self) {
+        self.gain = 0.0;
+    }
+
+    /// The gain, 0..1.
+    #[must_use]
+    pub const fn gain(&self) -> f64 {
+        self.gain
+    }
+}

@@ -1,0 +1,88 @@
+//! The assistance of one joint: a share of the biological moment plus a soft spring and damper on the reference.
+
+use crate::gait::curves;
+use crate::joint::Joint;
+
+/// Numbers of the torque law for one joint.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TorqueLaw {
+    /// The joint whose curves are used.
+    pub joint: Joint,
+    /// Share of the biological moment that the device gives, 0..1. Default 0.4.
+    pub assist: f64,
+    /// Mass of the person, kg; scales the moment curves.
+    pub body_mass_kg: f64,
+    /// Stiffness toward the reference angle, Nm/rad. Default 120 / 100 / 80.
+    pub stiffness_nm_rad: f64,
+    /// Damping toward the reference velocity, Nms/rad. Default 6 / 5 / 3.
+    pub damping_nms_rad: f64,
+    /// Largest torque, Nm. Default 45 / 45 / 60.
+    pub limit_nm: f64,
+}
+
+/// A torque within the limit, and whether the limit was met.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LimitedTorque {
+    /// Torque, Nm.
+    pub torque_nm: f64,
+    /// Whether the law wanted the limit or more.
+    pub saturated: bool,
+}
+
+impl TorqueLaw {
+    /// The law of the domain notes for an 80 kg adult.
+    #[must_use]
+    pub const fn standard(joint: Joint) -> Self {
+        let (stiffness_nm_rad, damping_nms_rad, limit_nm) = match joint {
+            Joint::Hip => (120.0, 6.0, 45.0),
+            Joint::Knee => (100.0, 5.0, 45.0),
+            Joint::Ankle => (80.0, 3.0, 60.0),
+        };
+        Self {
+            joint,
+            assist: 0.4,
+            body_mass_kg: crate::leg::BODY_MASS_KG,
+            stiffness_nm_rad,
+            damping_nms_rad,
+            limit_nm,
+        }
+    }
+
+    /// Torque at the estimated phase (cycles, cycles per second) for the measured angle (rad) and velocity (rad/s).
+    #[must_use]
+    pub fn torque(&self, (phase, rate_hz): (f64, f64), angle_rad: f64, velocity_rad_s: f64) -> LimitedTorque {
+        let reference = curves::angle_rad(self.joint, phase);
+        let wanted = self.assist * self.body_mass_kg * curves::moment_nm_per_kg(self.joint, phase)
+            + self.stiffness_nm_rad * (reference.value - angle_rad)
+            + self.damping_nms_rad * (reference.slope * rate_hz - velocity_rad_s);
+        LimitedTorque {
+            torque_nm: wanted.clamp(-self.limit_nm, self.limit_nm),
+            saturated: wanted.abs() >= self.limit_nm,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn limit_is_never_exceeded() {
+        for joint in Joint::ALL {
+            let law = TorqueLaw::standard(joint);
+            for angle in [-3.0, 0.0, 3.0] {
+                let torque = law.torque((0.5, 0.75), angle, -10.0 * angle);
+                assert!(torque.torque_nm.abs() <= law.limit_nm);
+            }
+        }
+    }
+
+    #[test]
+    fn leg_on_the_reference_gets_its_share_of_the_moment_only() {
+        let law = TorqueLaw::standard(Joint::Ankle);
+        let on = curves::angle_rad(Joint::Ankle, 0.5);
+        let torque = law.torque((0.5, 0.75), on.value, on.slope * 0.75);
+        let share = 0.4 * 80.0 * curves::moment_nm_per_kg(Joint::Ankle, 0.5);
+        assert!((torque.torque_nm - share).abs() < 1e-9 && share < -40.0, "{share}");
+    }
+}
