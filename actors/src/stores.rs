@@ -3,7 +3,7 @@
 use std::{
     collections::BTreeMap,
     net::SocketAddr,
-    sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError},
+    sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, atomic::AtomicBool},
     time::Duration,
 };
 
@@ -25,6 +25,9 @@ pub(crate) struct Stores {
     pub(crate) incarnation: Incarnation,
     /// Tells this start of the node from every other of any node.
     pub(crate) boot_nonce: u64,
+    /// Set by the root before it stops the layers: those that say goodbye to others do so only then, not when one of them
+    /// is restarted.
+    pub(crate) leaving: AtomicBool,
     /// Where messages go.
     pub(crate) router: Arc<Router>,
     /// Events into each layer.
@@ -52,6 +55,7 @@ impl Stores {
             node,
             incarnation,
             boot_nonce,
+            leaving: AtomicBool::new(false),
             router: Arc::new(Router::new(node)),
             posts: Posts {
                 root: Post::new(POST_CAPACITY),
@@ -64,7 +68,7 @@ impl Stores {
             gncl_listen: OnceLock::new(),
             gncl: gncl::Store::default(),
             registry: Mutex::default(),
-            sync: Mutex::default(),
+            sync: Mutex::new(sync::Core::new(&config, node, incarnation)),
             config,
         })
     }

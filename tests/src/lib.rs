@@ -1,1 +1,68 @@
-//! Placeholder until the first module lands.
+//! What the scenarios stand on: programs that are watched line by line, and hosts made of network namespaces.
+
+mod hosts;
+mod program;
+
+pub use hosts::{Host, Hosts};
+pub use program::{Program, node_under_test};
+
+use std::{
+    net::SocketAddrV4,
+    path::PathBuf,
+    sync::atomic::{AtomicU32, Ordering},
+    time::Duration,
+};
+
+/// No scenario waits longer than this for one thing. It is generous: the machine may be busy with other tests.
+pub const DEADLINE: Duration = Duration::from_secs(30);
+
+/// A number that no other test of this run has: this process's id and a count.
+#[must_use]
+pub fn unique() -> u32 {
+    static COUNT: AtomicU32 = AtomicU32::new(0);
+    std::process::id().wrapping_mul(64).wrapping_add(COUNT.fetch_add(1, Ordering::Relaxed))
+}
+
+/// A multicast group and port of this test's own, never routed.
+#[must_use]
+pub fn own_group() -> SocketAddrV4 {
+    let number = unique();
+    let octets = [239, 255, (number >> 8) as u8, number as u8];
+    SocketAddrV4::new(octets.into(), 20_000 + (number % 20_000) as u16)
+}
+
+/// An empty directory of this test's own; the test removes it by dropping the value.
+#[derive(Debug)]
+pub struct OwnDirectory(PathBuf);
+
+impl OwnDirectory {
+    /// Makes the directory.
+    ///
+    /// # Panics
+    /// If the host's directory for temporary files cannot be written to.
+    #[must_use]
+    pub fn new() -> Self {
+        let path = std::env::temp_dir().join(format!("sinew-test-{}", unique()));
+        std::fs::create_dir_all(&path).expect("a directory for temporary files");
+        Self(path)
+    }
+
+    /// A path inside.
+    #[must_use]
+    pub fn join(&self, name: &str) -> PathBuf {
+        self.0.join(name)
+    }
+}
+
+impl Default for OwnDirectory {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Drop for OwnDirectory {
+    fn drop(&mut self) {
+        // A directory for temporary files that stays is no reason to fail a test.
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}

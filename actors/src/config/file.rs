@@ -274,7 +274,9 @@ impl<'t> Reader<'t> {
         } else {
             let mut read = Found(None);
             self.text(key, example, &mut read);
-            *target = read.0.or(target.take());
+            if let Found(Some(found)) = read {
+                *target = Some(found);
+            }
         }
     }
 }

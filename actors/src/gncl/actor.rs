@@ -6,11 +6,11 @@ use std::{
     io,
     net::{Shutdown, SocketAddr},
     rc::Rc,
-    sync::Arc,
+    sync::{Arc, atomic::Ordering},
     time::Duration,
 };
 
-use actix::{Actor, ActorFutureExt, AsyncContext, Context, SpawnHandle, StreamHandler, fut};
+use actix::{Actor, ActorFutureExt, AsyncContext, Context, Running, SpawnHandle, StreamHandler, fut};
 use sinew_runtime::{
     post::Post,
     supervision::ReadyGate,
@@ -351,6 +351,14 @@ impl Actor for Gncl {
             ready.reached();
         }
     }
+
+    fn stopping(&mut self, ctx: &mut Self::Context) -> Running {
+        // SYNC: Relaxed; the order to stop came through the supervisor's lock, after the flag was set.
+        if self.stores.leaving.load(Ordering::Relaxed) {
+            self.input(Input::LeaveRequested, ctx);
+        }
+        Running::Stop
+    }
 }
 
 impl Drop for Gncl {
@@ -369,7 +377,6 @@ impl StreamHandler<Event> for Gncl {
             Event::Membership(MembershipFact::NodeLost { node, incarnation, .. }) => {
                 Input::NodeLost { node, incarnation }
             }
-            Event::Leave => Input::LeaveRequested,
         };
         self.input(input, ctx);
     }

@@ -50,6 +50,4 @@ use crate::ndl::MembershipFact;
 pub(crate) enum Event {
     /// By NDL: who is there.
     Membership(MembershipFact),
-    /// By the root: the node stops in order. Says goodbye to every peer; no connection is made or taken after it.
-    Leave,
 }

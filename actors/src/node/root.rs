@@ -4,7 +4,7 @@ use std::{
     cell::RefCell,
     collections::BTreeMap,
     rc::Rc,
-    sync::{Arc, mpsc::SyncSender},
+    sync::{Arc, atomic::Ordering, mpsc::SyncSender},
     time::Duration,
 };
 
@@ -338,6 +338,7 @@ impl Root {
 
     fn stop_layers(&mut self) {
         self.phase = Phase::StoppingLayers;
+        self.stores.leaving.store(true, Ordering::Relaxed);
         match &self.layer_supervisor {
             Some(supervisor) => order(supervisor, Input::StopOrdered),
             // They ended before: what is left is to hear of it.

@@ -256,6 +256,18 @@ mod tests {
     }
 
     #[test]
+    fn the_documented_bytes_are_a_list() {
+        let text = include_str!("../../../docs/protocol/sync.md");
+        let block = text.split("```").find(|block| block.starts_with("text\n84")).unwrap();
+        let is_byte = |token: &&str| token.len() == 2 && u8::from_str_radix(token, 16).is_ok();
+        let tokens = block.lines().flat_map(|line| line.split_whitespace().take_while(is_byte));
+        let bytes: Vec<u8> = tokens.map(|token| u8::from_str_radix(token, 16).unwrap()).collect();
+        let documented = List { version: 3, groups: Vec::new(), ..list(vec![entry(0, "knee.drive")]) };
+        assert_eq!(encode(&documented), bytes);
+        assert_eq!(List::parse(&bytes).unwrap(), documented);
+    }
+
+    #[test]
     fn lengths_that_are_not_there_reserve_nothing() {
         // A map with "entries": an array that claims 2^32 - 1 elements.
         let mut bytes = vec![0x81, 0xa7];

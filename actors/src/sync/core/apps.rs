@@ -70,6 +70,11 @@ impl App {
 }
 
 impl Apps {
+    /// Whether `app` is registered just so already.
+    pub(super) fn knows(&self, app: AppAddress, name: Option<&str>, requires: &[String]) -> bool {
+        self.apps.get(&app).is_some_and(|app| app.name.as_deref() == name && app.requires == requires)
+    }
+
     /// A life of `app` begins; one that waits already goes on waiting. Returns the name, if it cannot be had.
     pub(super) fn register(
         &mut self,

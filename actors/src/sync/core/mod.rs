@@ -5,6 +5,7 @@
 //! between two of them loses none.
 
 mod apps;
+mod barrier;
 mod cycles;
 mod peers;
 mod reason;
@@ -14,7 +15,7 @@ mod simulation;
 mod tests;
 
 use std::{
-    collections::{BTreeMap, BTreeSet, VecDeque},
+    collections::{BTreeSet, VecDeque},
     time::Duration,
 };
 
@@ -26,7 +27,6 @@ use sinew_runtime::{
 
 use self::{
     apps::{Apps, State, Wait},
-    cycles::Graph,
     peers::{Accepted, Peers},
     reason::Reason,
 };
@@ -41,8 +41,6 @@ use crate::{
     ndl::{LossReason, MembershipFact},
 };
 
-/// Time until an output that was not taken is offered again.
-const RETRY: Duration = Duration::from_millis(10);
 /// Names that two nodes have, of which it was said, at most; of more it is not said.
 const SAME_NAMES_MAX: usize = 1_024;
 
@@ -211,6 +209,9 @@ impl Core {
 impl Core {
     fn app_changed(&mut self, now: Time, fact: AppFact) {
         match fact {
+            // Told again, as after a restart of LNCL: nothing has changed.
+            AppFact::Registered { app, name, requires }
+                if self.apps.knows(app, name.as_deref(), &requires) => {}
             AppFact::Registered { app, name, requires } => {
                 let wait = Wait::begun(now, self.requirement_deadline);
                 let refused = self.apps.register(app, name.clone(), requires, wait);
@@ -383,157 +384,4 @@ impl Core {
         self.encoded = Some(bytes.clone());
         bytes
     }
-}
-
-/// The barrier.
-impl Core {
-    /// Releases whoever has all that it requires, and tells running applications what they lost or got back.
-    fn evaluate(&mut self) {
-        self.find_cycles();
-        let mut missing = BTreeMap::new();
-        for (address, app) in self.apps.iter().filter(|(_, app)| !app.requires.is_empty()) {
-            let unready: Vec<(String, Reason)> =
-                app.requires.iter().filter_map(|name| Some((name.clone(), self.why_not(name)?))).collect();
-            missing.insert(address, unready);
-        }
-        self.remember_seen(&missing);
-        let in_cycle: BTreeSet<&str> = self.cycles.iter().flatten().map(String::as_str).collect();
-        let mut released = Vec::new();
-        for (address, app) in self.apps.iter_mut() {
-            let unready = missing.remove(&address).unwrap_or_default();
-            if app.wait().is_none() {
-                for (event, why) in changes(&mut app.lost, &app.requires, &unready) {
-                    // What it did not take about this name before is out of date.
-                    self.not_taken.remove(&(address, Some(event.name().to_owned())));
-                    self.outputs.push_back(Output::Tell { app: address, event, why });
-                }
-            } else if unready.is_empty() && !app.name.as_deref().is_some_and(|name| in_cycle.contains(name)) {
-                // spec: SYNC-5
-                app.state = State::Released;
-                released.push(address);
-            }
-        }
-        self.outputs.extend(released.into_iter().map(|app| Output::Release { app }));
-    }
-
-    /// Why `name` is not ready anywhere; `None`: it is.
-    fn why_not(&self, name: &str) -> Option<Reason> {
-        if self.apps.is_ready(name) || self.peers.is_ready(name) {
-            return None;
-        }
-        let unknown = || if self.seen.contains(name) { Reason::Unregistered } else { Reason::NeverSeen };
-        Some(self.apps.why_not(name).or_else(|| self.peers.why_not(name)).unwrap_or_else(unknown))
-    }
-
-    /// Remembers which required names were known at some time, and forgets those that nobody requires any more.
-    fn remember_seen(&mut self, missing: &BTreeMap<AppAddress, Vec<(String, Reason)>>) {
-        let never: BTreeSet<&String> = missing
-            .values()
-            .flatten()
-            .filter(|(_, reason)| *reason == Reason::NeverSeen)
-            .map(|(name, _)| name)
-            .collect();
-        let required = self.apps.iter().flat_map(|(_, app)| &app.requires);
-        self.seen = required.filter(|name| !never.contains(name)).cloned().collect();
-    }
-
-    /// Looks for circles among what waiting applications require. spec: SYNC-7
-    fn find_cycles(&mut self) {
-        let mut starts = Vec::new();
-        for (_, app, _) in self.apps.waiting() {
-            starts.extend(app.requires.iter().cloned());
-        }
-        let providers = |name: &str| {
-            let here = self.apps.called(name).map(|(_, app)| app.requires.clone());
-            here.into_iter().chain(self.peers.requirements(name)).collect()
-        };
-        let cycles =
-            if starts.is_empty() { BTreeSet::new() } else { Graph::reach(starts, providers).cycles() };
-        for cycle in cycles.difference(&self.cycles) {
-            let names = cycle.iter().chain(cycle.first()).cloned().collect();
-            self.outputs.push_back(Output::Cycle { names });
-        }
-        self.cycles = cycles;
-    }
-
-    fn wait_of(&self, now: Time, address: AppAddress) -> Option<Waiting> {
-        let app = self.apps.get(address)?;
-        let since = app.wait()?.since;
-        let in_cycle = |name: &String| self.cycles.iter().any(|cycle| cycle.contains(name));
-        let missing = app.requires.iter().filter_map(|name| {
-            let reason = if in_cycle(name) { Reason::Cycle } else { self.why_not(name)? };
-            Some((name.clone(), reason.words()))
-        });
-        Some(Waiting { application: app.title(address), missing: missing.collect(), since: now.since(since) })
-    }
-
-    /// Reports who has waited for its deadline, and each time that it passes again. spec: SYNC-9
-    fn report_overdue(&mut self, now: Time) {
-        let deadline = self.requirement_deadline;
-        let mut overdue = Vec::new();
-        for (address, app) in self.apps.iter_mut() {
-            if let State::Waiting(wait) = &mut app.state
-                && wait.overdue <= now
-            {
-                wait.overdue = now + deadline;
-                overdue.push(address);
-            }
-        }
-        let reports: Vec<_> = overdue.into_iter().filter_map(|app| self.wait_of(now, app)).collect();
-        self.outputs.extend(reports.into_iter().map(Output::Overdue));
-    }
-
-    /// Keeps an output that was not taken.
-    fn keep(&mut self, now: Time, app: AppAddress, name: Option<String>) {
-        self.not_taken.insert((app, name));
-        self.retry.get_or_insert(now + RETRY);
-    }
-
-    /// Offers again what was not taken, as it is true now: what changed back meanwhile is still told, in its last form.
-    fn offer_again(&mut self, now: Time) {
-        if self.retry.is_none_or(|retry| retry > now) {
-            return;
-        }
-        self.retry = None;
-        for (address, name) in std::mem::take(&mut self.not_taken) {
-            let Some(app) = self.apps.get(address) else { continue };
-            let output = match name {
-                None if app.state == State::Released => Output::Release { app: address },
-                None => continue,
-                Some(name) if app.lost.contains(&name) => {
-                    let why = self.why_not(&name).map_or("ready", Reason::words);
-                    Output::Tell { app: address, event: RequirementEvent::Lost { name }, why }
-                }
-                Some(name) => {
-                    Output::Tell { app: address, event: RequirementEvent::Met { name }, why: "ready" }
-                }
-            };
-            self.outputs.push_back(output);
-        }
-    }
-
-    fn forget_not_taken(&mut self, app: AppAddress) {
-        self.not_taken.retain(|(other, _)| *other != app);
-    }
-}
-
-/// What a running application is told: each requirement whose state differs from what it knows. spec: SYNC-8
-fn changes(
-    lost: &mut BTreeSet<String>,
-    requires: &[String],
-    unready: &[(String, Reason)],
-) -> Vec<(RequirementEvent, &'static str)> {
-    let mut changes = Vec::new();
-    for name in requires {
-        let reason = unready.iter().find(|(other, _)| other == name).map(|(_, reason)| *reason);
-        let name = name.clone();
-        match reason {
-            Some(reason) if lost.insert(name.clone()) => {
-                changes.push((RequirementEvent::Lost { name }, reason.words()));
-            }
-            None if lost.remove(&name) => changes.push((RequirementEvent::Met { name }, "ready")),
-            Some(_) | None => {}
-        }
-    }
-    changes
 }

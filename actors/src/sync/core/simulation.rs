@@ -186,8 +186,11 @@ impl World {
         // Requirements point to smaller numbers only, so that there is no cycle.
         let index = node * APPS + app;
         let requires: Vec<usize> = requires.into_iter().filter(|required| *required < index).collect();
-        let life = Life { requires: requires.clone(), released: 0, running: false };
-        self.apps[node].insert(app, life);
+        // Told again, it is no new life.
+        if self.apps[node].get(&app).is_none_or(|life| life.requires != requires) {
+            let life = Life { requires: requires.clone(), released: 0, running: false };
+            self.apps[node].insert(app, life);
+        }
         let requires = requires.into_iter().map(name).collect();
         let fact = AppFact::Registered { app: app_address(app), name: Some(name(index)), requires };
         self.tell(node, Input::AppChanged(fact));

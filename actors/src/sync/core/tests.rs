@@ -3,6 +3,7 @@
 use std::net::SocketAddr;
 
 use super::{
+    barrier::RETRY,
     peers::{REPEAT, SPACING},
     *,
 };
@@ -101,11 +102,13 @@ fn met(index: u32, name: &str) -> Output {
 }
 
 fn published(outputs: &[Output]) -> Vec<List> {
-    let lists = outputs.iter().filter_map(|output| match output {
-        Output::Publish { list, .. } => Some(List::parse(list).unwrap()),
-        _ => None,
-    });
-    lists.collect()
+    let mut lists = Vec::new();
+    for output in outputs {
+        if let Output::Publish { list, .. } = output {
+            lists.push(List::parse(list).unwrap());
+        }
+    }
+    lists
 }
 
 #[test]
@@ -136,9 +139,12 @@ fn a_failed_application_waits_again_and_others_are_told_but_not_stopped() {
     assert_eq!(bench.down(1), [lost(0, "sensor", "failed, not ready again"), release(1)]);
     assert_eq!(bench.ready(1), [met(0, "sensor")]);
     assert_eq!(bench.down(0), [release(0)], "all that it requires is ready still");
+    assert_eq!(bench.registers(0, "gait", &["sensor"]), [], "told again");
     bench.down(1);
-    assert_eq!(bench.registers(0, "gait", &["sensor"]), [], "registered again it is in a new life");
-    assert_eq!(bench.ready(1), [release(0)]);
+    assert_eq!(bench.registers(0, "gait", &["sensor", "sensor.left"]), [], "other requirements: a new life");
+    bench.ready(1);
+    bench.registers(2, "sensor.left", &[]);
+    assert_eq!(bench.ready(2), [release(0)]);
 }
 
 // spec: SYNC-8
@@ -202,6 +208,7 @@ fn every_deadline_that_passes_reports_what_is_missing_since_when_and_why() {
     assert_eq!(bench.passes(Duration::from_secs(1)), [waited(120)]);
 }
 
+// spec: SYNC-3
 #[test]
 fn the_last_known_reason_is_told_for_each_way_to_be_missing() {
     let mut bench = Bench::new();

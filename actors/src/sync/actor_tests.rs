@@ -1,0 +1,238 @@
+//! What the sync manager's actor promises at its edges: posts, routes, messages.
+
+use std::{
+    future::Future,
+    sync::{Arc, Mutex, PoisonError},
+    time::Duration,
+};
+
+use actix::Actor;
+use bytes::Bytes;
+use futures_util::StreamExt;
+use sinew_runtime::{
+    outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
+    post::{Post, PostStream},
+    router::{LocalRoute, Outlet, Refused},
+    supervision::ReadyGate,
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    wire::{Header, Kind, Message, Payload},
+};
+
+use super::{
+    Event, RequirementEvent, SyncManager,
+    list::{Entry, List, Name},
+};
+use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, node::RootEvent, stores::Stores};
+
+const HERE: NodeAddress = NodeAddress::new(0x7f00_0001);
+const KNEE: NodeAddress = NodeAddress::new(0x7f00_0002);
+const LIFE: Incarnation = Incarnation(5);
+const GAIT: AppAddress = AppAddress::new(0x1000);
+
+/// Takes messages into a post, up to its capacity.
+struct Mailbox(Post<Message>);
+
+impl Outlet for Mailbox {
+    fn submit(&self, message: Message) -> Result<(), Refused> {
+        self.0.post(message).map_err(|message| Refused::new(message, Rejection::QueueFull))
+    }
+}
+
+/// A node that has a sync manager only; the rest is played by the test.
+struct Bench {
+    stores: Arc<Stores>,
+    root: PostStream<RootEvent>,
+}
+
+impl Bench {
+    /// Its sync manager is ready.
+    async fn new() -> Self {
+        let stores = Stores::for_test(NodeConfig::new("hip"), Incarnation(1));
+        let root = stores.posts.root.attach();
+        let bench = Self { stores, root };
+        bench.start_manager().await;
+        bench
+    }
+
+    async fn start_manager(&self) {
+        let (say, said) = tokio::sync::oneshot::channel();
+        let gate = ReadyGate::new(move || say.send(()).expect("this test waits for it"));
+        SyncManager::new(self.stores.clone(), gate).start();
+        within("the sync manager is ready", said).await.unwrap();
+    }
+
+    fn tells(&self, event: Event) {
+        self.stores.posts.sync.post(event).unwrap();
+    }
+
+    fn registers_gait(&self) {
+        let requires = vec!["knee.drive".to_owned()];
+        self.tells(Event::App(AppFact::Registered { app: GAIT, name: Some("gait".to_owned()), requires }));
+    }
+
+    /// The knee is linked; what is sent to it can be read.
+    fn links_knee(&self) -> PostStream<Message> {
+        let mailbox = Post::new(64);
+        self.stores.router.set_peer(KNEE, Arc::new(Mailbox(mailbox.clone())));
+        self.tells(Event::Link(LinkFact::LinkUp { node: KNEE, incarnation: LIFE }));
+        mailbox.attach()
+    }
+
+    /// As GNCL hands over what the knee sent.
+    fn knee_says(&self, version: u64, ready: bool) {
+        let name = Name::try_from("knee.drive".to_owned()).unwrap();
+        let entry = Entry { name, app: GAIT, ready, requires: Vec::new() };
+        let list = List { incarnation: LIFE, version, entries: vec![entry], groups: Vec::new() };
+        let from = Tid::new(KNEE, AppAddress::SYNC);
+        self.stores.router.deliver(directory(from, list.encode(usize::MAX).0)).unwrap();
+    }
+
+    async fn released(&mut self) -> AppAddress {
+        match within("a release", self.root.next()).await {
+            Some(RootEvent::Release { app }) => app,
+            other => panic!("{other:?}"),
+        }
+    }
+}
+
+fn directory(from: Tid, payload: Bytes) -> Message {
+    Message::new(Header::new(Kind::SYNC_DIRECTORY, from, Tid::new(HERE, AppAddress::SYNC)), payload)
+}
+
+async fn within<F: Future>(what: &str, future: F) -> F::Output {
+    let waited = tokio::time::timeout(Duration::from_secs(10), future).await;
+    waited.unwrap_or_else(|_| panic!("waited 10 s for: {what}"))
+}
+
+fn run(test: impl Future<Output = ()>) {
+    actix::System::new().block_on(test);
+}
+
+#[test]
+fn an_application_is_released_by_a_list_from_another_node_and_hears_of_its_loss() {
+    run(async {
+        let mut bench = Bench::new().await;
+        let mailbox = Post::new(4);
+        let events: Arc<[Kind]> = Arc::new([RequirementEvent::KIND]);
+        let outlet = Arc::new(Mailbox(mailbox.clone()));
+        bench.stores.router.set_local(GAIT, LocalRoute { outlet, events });
+        let mut inbox = mailbox.attach();
+
+        bench.registers_gait();
+        let mut sent = bench.links_knee();
+        let list = within("this node's list", sent.next()).await.unwrap();
+        assert_eq!(List::parse(&list.payload).unwrap().entries[0].requires.len(), 1);
+        assert_eq!(list.header.source, Tid::new(HERE, AppAddress::SYNC));
+        assert_eq!(list.header.destination, Tid::new(KNEE, AppAddress::SYNC));
+        bench.knee_says(1, true);
+        assert_eq!(bench.released().await, GAIT);
+
+        bench.tells(Event::App(AppFact::Ready { app: GAIT }));
+        bench.knee_says(2, false);
+        let event: RequirementEvent = within("an event", inbox.next()).await.unwrap().decode().unwrap();
+        assert_eq!(event, RequirementEvent::Lost { name: "knee.drive".to_owned() });
+    });
+}
+
+#[test]
+fn an_event_that_a_full_mailbox_did_not_take_comes_when_there_is_room() {
+    run(async {
+        let mut bench = Bench::new().await;
+        let mailbox = Post::new(1);
+        let events: Arc<[Kind]> = Arc::new([RequirementEvent::KIND]);
+        let outlet = Arc::new(Mailbox(mailbox.clone()));
+        bench.stores.router.set_local(GAIT, LocalRoute { outlet, events });
+        bench.registers_gait();
+        let _sent = bench.links_knee();
+        bench.knee_says(1, true);
+        bench.released().await;
+
+        mailbox.post(directory(Tid::NONE, Bytes::new())).unwrap();
+        bench.knee_says(2, false);
+        // The second application is released after the refused event was dealt with: events are handled in order.
+        let second = AppAddress::new(0x1001);
+        bench.tells(Event::App(AppFact::Registered { app: second, name: None, requires: Vec::new() }));
+        assert_eq!(bench.released().await, second);
+        assert_eq!(mailbox.refused(), 1);
+
+        let mut inbox = mailbox.attach();
+        within("the message that was in the way", inbox.next()).await.unwrap();
+        let event: RequirementEvent = within("the event", inbox.next()).await.unwrap().decode().unwrap();
+        assert_eq!(event, RequirementEvent::Lost { name: "knee.drive".to_owned() });
+    });
+}
+
+#[test]
+fn a_restarted_sync_manager_goes_on_where_the_former_one_ended() {
+    run(async {
+        let mut bench = Bench::new().await;
+        bench.registers_gait();
+        let mut sent = bench.links_knee();
+        let first = within("a list from the first", sent.next()).await.unwrap();
+        bench.start_manager().await;
+        bench.knee_says(1, true);
+        assert_eq!(bench.released().await, GAIT);
+        bench.tells(Event::App(AppFact::Ready { app: GAIT }));
+        let second = within("a list from the second", sent.next()).await.unwrap();
+        assert!(second.header.sequence > first.header.sequence);
+    });
+}
+
+#[derive(Default)]
+struct Ledger(Mutex<Vec<Outcome>>);
+
+impl ReceiptSink for Ledger {
+    fn settle(&self, _: Ticket, outcome: Outcome) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(outcome);
+    }
+}
+
+// spec: SYNC-4
+#[test]
+fn what_is_no_directory_of_another_sync_manager_is_refused() {
+    run(async {
+        let mut bench = Bench::new().await;
+        let ledger = Arc::new(Ledger::default());
+        let foreign = Tid::new(KNEE, AppAddress::SYNC);
+        let mut other_kind = directory(foreign, Bytes::new());
+        other_kind.header.kind = Kind::NDL_QUERY;
+        let cases = [
+            other_kind,
+            directory(Tid::new(KNEE, GAIT), Bytes::new()),
+            directory(Tid::new(HERE, AppAddress::SYNC), Bytes::new()),
+            directory(foreign, Bytes::from_static(b"garbage")),
+        ];
+        for mut message in cases {
+            let ticket = Ticket {
+                source: message.header.source,
+                destination: message.header.destination,
+                correlation: 1,
+            };
+            message.receipt = Some(Receipt::new(ledger.clone(), ticket));
+            bench.stores.router.deliver(message).unwrap();
+        }
+        // Released after all of them were handled.
+        bench.tells(Event::App(AppFact::Registered { app: GAIT, name: None, requires: Vec::new() }));
+        assert_eq!(bench.released().await, GAIT);
+        let forged = Outcome::Rejected(Rejection::ForgedSource);
+        let expected = [Outcome::Rejected(Rejection::UnknownKind), forged, forged, Outcome::Delivered];
+        assert_eq!(*ledger.0.lock().unwrap(), expected);
+    });
+}
+
+#[test]
+fn a_cycle_is_told_to_the_root() {
+    run(async {
+        let mut bench = Bench::new().await;
+        let name = |text: &str| Some(text.to_owned());
+        for (index, own, required) in [(0x1000, "a", "b"), (0x1001, "b", "a")] {
+            let app = AppAddress::new(index);
+            let requires = vec![required.to_owned()];
+            bench.tells(Event::App(AppFact::Registered { app, name: name(own), requires }));
+        }
+        match within("the cycle", bench.root.next()).await {
+            Some(RootEvent::RequirementCycle { names }) => assert_eq!(names, ["a", "b", "a"]),
+            other => panic!("{other:?}"),
+        }
+    });
+}

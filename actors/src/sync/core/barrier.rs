@@ -1,0 +1,166 @@
+//! The barrier: who may start, who waits for what, and who is told that something was lost.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::Duration,
+};
+
+use sinew_runtime::{tid::AppAddress, time::Time};
+
+use super::{Core, Output, apps::State, cycles::Graph, reason::Reason};
+use crate::sync::facts::{RequirementEvent, Waiting};
+
+/// Time until an output that was not taken is offered again.
+pub(super) const RETRY: Duration = Duration::from_millis(10);
+
+impl Core {
+    /// Releases whoever has all that it requires, and tells running applications what they lost or got back.
+    pub(super) fn evaluate(&mut self) {
+        self.find_cycles();
+        let mut missing = BTreeMap::new();
+        for (address, app) in self.apps.iter().filter(|(_, app)| !app.requires.is_empty()) {
+            let unready: Vec<(String, Reason)> =
+                app.requires.iter().filter_map(|name| Some((name.clone(), self.why_not(name)?))).collect();
+            missing.insert(address, unready);
+        }
+        self.remember_seen(&missing);
+        let in_cycle: BTreeSet<&str> = self.cycles.iter().flatten().map(String::as_str).collect();
+        let mut released = Vec::new();
+        for (address, app) in self.apps.iter_mut() {
+            let unready = missing.remove(&address).unwrap_or_default();
+            if app.wait().is_none() {
+                for (event, why) in changes(&mut app.lost, &app.requires, &unready) {
+                    // What it did not take about this name before is out of date.
+                    self.not_taken.remove(&(address, Some(event.name().to_owned())));
+                    self.outputs.push_back(Output::Tell { app: address, event, why });
+                }
+            } else if unready.is_empty() && !app.name.as_deref().is_some_and(|name| in_cycle.contains(name)) {
+                // spec: SYNC-5
+                app.state = State::Released;
+                released.push(address);
+            }
+        }
+        self.outputs.extend(released.into_iter().map(|app| Output::Release { app }));
+    }
+
+    /// Why `name` is not ready anywhere; `None`: it is.
+    fn why_not(&self, name: &str) -> Option<Reason> {
+        if self.apps.is_ready(name) || self.peers.is_ready(name) {
+            return None;
+        }
+        let unknown = || if self.seen.contains(name) { Reason::Unregistered } else { Reason::NeverSeen };
+        Some(self.apps.why_not(name).or_else(|| self.peers.why_not(name)).unwrap_or_else(unknown))
+    }
+
+    /// Remembers which required names were known at some time, and forgets those that nobody requires any more.
+    fn remember_seen(&mut self, missing: &BTreeMap<AppAddress, Vec<(String, Reason)>>) {
+        let never: BTreeSet<&String> = missing
+            .values()
+            .flatten()
+            .filter(|(_, reason)| *reason == Reason::NeverSeen)
+            .map(|(name, _)| name)
+            .collect();
+        let required = self.apps.iter().flat_map(|(_, app)| &app.requires);
+        self.seen = required.filter(|name| !never.contains(name)).cloned().collect();
+    }
+
+    /// Looks for circles among what waiting applications require. spec: SYNC-7
+    fn find_cycles(&mut self) {
+        let mut starts = Vec::new();
+        for (_, app, _) in self.apps.waiting() {
+            starts.extend(app.requires.iter().cloned());
+        }
+        let providers = |name: &str| {
+            let here = self.apps.called(name).map(|(_, app)| app.requires.clone());
+            here.into_iter().chain(self.peers.requirements(name)).collect()
+        };
+        let cycles =
+            if starts.is_empty() { BTreeSet::new() } else { Graph::reach(starts, providers).cycles() };
+        for cycle in cycles.difference(&self.cycles) {
+            let names = cycle.iter().chain(cycle.first()).cloned().collect();
+            self.outputs.push_back(Output::Cycle { names });
+        }
+        self.cycles = cycles;
+    }
+
+    pub(super) fn wait_of(&self, now: Time, address: AppAddress) -> Option<Waiting> {
+        let app = self.apps.get(address)?;
+        let since = app.wait()?.since;
+        let in_cycle = |name: &String| self.cycles.iter().any(|cycle| cycle.contains(name));
+        let missing = app.requires.iter().filter_map(|name| {
+            let reason = if in_cycle(name) { Reason::Cycle } else { self.why_not(name)? };
+            Some((name.clone(), reason.words()))
+        });
+        Some(Waiting { application: app.title(address), missing: missing.collect(), since: now.since(since) })
+    }
+
+    /// Reports who has waited for its deadline, and each time that it passes again. spec: SYNC-9
+    pub(super) fn report_overdue(&mut self, now: Time) {
+        let deadline = self.requirement_deadline;
+        let mut overdue = Vec::new();
+        for (address, app) in self.apps.iter_mut() {
+            if let State::Waiting(wait) = &mut app.state
+                && wait.overdue <= now
+            {
+                wait.overdue = now + deadline;
+                overdue.push(address);
+            }
+        }
+        let reports: Vec<_> = overdue.into_iter().filter_map(|app| self.wait_of(now, app)).collect();
+        self.outputs.extend(reports.into_iter().map(Output::Overdue));
+    }
+
+    /// Keeps an output that was not taken.
+    pub(super) fn keep(&mut self, now: Time, app: AppAddress, name: Option<String>) {
+        self.not_taken.insert((app, name));
+        self.retry.get_or_insert(now + RETRY);
+    }
+
+    /// Offers again what was not taken, as it is true now: what changed back meanwhile is still told, in its last form.
+    pub(super) fn offer_again(&mut self, now: Time) {
+        if self.retry.is_none_or(|retry| retry > now) {
+            return;
+        }
+        self.retry = None;
+        for (address, name) in std::mem::take(&mut self.not_taken) {
+            let Some(app) = self.apps.get(address) else { continue };
+            let output = match name {
+                None if app.state == State::Released => Output::Release { app: address },
+                None => continue,
+                Some(name) if app.lost.contains(&name) => {
+                    let why = self.why_not(&name).map_or("ready", Reason::words);
+                    Output::Tell { app: address, event: RequirementEvent::Lost { name }, why }
+                }
+                Some(name) => {
+                    Output::Tell { app: address, event: RequirementEvent::Met { name }, why: "ready" }
+                }
+            };
+            self.outputs.push_back(output);
+        }
+    }
+
+    pub(super) fn forget_not_taken(&mut self, app: AppAddress) {
+        self.not_taken.retain(|(other, _)| *other != app);
+    }
+}
+
+/// What a running application is told: each requirement whose state differs from what it knows. spec: SYNC-8
+fn changes(
+    lost: &mut BTreeSet<String>,
+    requires: &[String],
+    unready: &[(String, Reason)],
+) -> Vec<(RequirementEvent, &'static str)> {
+    let mut changes = Vec::new();
+    for name in requires {
+        let reason = unready.iter().find(|(other, _)| other == name).map(|(_, reason)| *reason);
+        let name = name.clone();
+        match reason {
+            Some(reason) if lost.insert(name.clone()) => {
+                changes.push((RequirementEvent::Lost { name }, reason.words()));
+            }
+            None if lost.remove(&name) => changes.push((RequirementEvent::Met { name }, "ready")),
+            Some(_) | None => {}
+        }
+    }
+    changes
+}

@@ -1,0 +1,97 @@
+//! A node for the scenarios: one application that sends, and says what it sees, one line each.
+//!
+//! `node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME]`
+
+use std::process::ExitCode;
+
+use sinew::prelude::*;
+
+payload!("scenario.count", Bulk => struct Count { number: u64 });
+
+struct Probe {
+    sends_to: Option<String>,
+    sent: u64,
+    last: u64,
+}
+
+impl Actor for Probe {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        println!("started {}", context.tid());
+        let Some(to) = self.sends_to.clone() else { return };
+        context.every(Duration::from_millis(20), move |this, _, context| {
+            // What nobody takes while the network is cut is not counted as sent.
+            if context.send(&*to, &Count { number: this.sent + 1 }).is_ok() {
+                this.sent += 1;
+            }
+        });
+    }
+
+    fn stopping(&mut self, _: &mut Self::Context) -> Running {
+        println!("stopping");
+        Running::Stop
+    }
+}
+
+impl Handler<Delivery<Count>> for Probe {
+    type Result = ();
+
+    fn handle(&mut self, count: Delivery<Count>, _: &mut Self::Context) {
+        println!("count {} from {} after {}", count.number, count.source, self.last);
+        self.last = count.number;
+    }
+}
+
+impl Handler<Delivery<NodeEvent>> for Probe {
+    type Result = ();
+
+    fn handle(&mut self, event: Delivery<NodeEvent>, _: &mut Self::Context) {
+        println!("event {:?}", event.payload);
+    }
+}
+
+impl Handler<Delivery<RequirementEvent>> for Probe {
+    type Result = ();
+
+    fn handle(&mut self, event: Delivery<RequirementEvent>, _: &mut Self::Context) {
+        println!("requirement {:?}", event.payload);
+    }
+}
+
+fn main() -> ExitCode {
+    tracing_subscriber::fmt()
+        .with_env_filter(tracing_subscriber::EnvFilter::from_default_env())
+        .with_writer(std::io::stderr)
+        .init();
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let after = |flag: &str| {
+        let pairs = arguments.windows(2).filter(|pair| pair[0] == flag);
+        pairs.map(|pair| pair[1].clone()).collect::<Vec<_>>()
+    };
+    let config = match NodeConfig::from_file(&arguments[0]) {
+        Ok(config) => config,
+        Err(faults) => {
+            println!("refused {faults}");
+            return ExitCode::FAILURE;
+        }
+    };
+    let sends_to = after("--sends-to").into_iter().next();
+    let name = config.name.clone();
+    let probe = AppSpec::new(name.as_str(), move || Probe { sends_to: sends_to.clone(), sent: 0, last: 0 })
+        .handles::<Count>()
+        .handles::<NodeEvent>()
+        .handles::<RequirementEvent>()
+        .requires(after("--requires"))
+        .own_thread();
+    match Node::builder(name).config(config).app(probe).start() {
+        Ok(node) => {
+            println!("up");
+            node.run()
+        }
+        Err(error) => {
+            println!("refused {error}");
+            ExitCode::FAILURE
+        }
+    }
+}

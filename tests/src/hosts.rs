@@ -1,0 +1,122 @@
+//! Hosts made of network namespaces: each has one interface, all are joined by a bridge in a namespace of its own.
+//!
+//! Nothing is made in the namespace of the machine itself, so nothing can leave it.
+
+use std::{net::Ipv4Addr, path::Path, process::Command};
+
+use crate::unique;
+
+/// Some hosts on one network. The namespaces are removed when this is dropped.
+#[derive(Debug)]
+pub struct Hosts {
+    bridge: Namespace,
+    hosts: Vec<Host>,
+}
+
+/// One host.
+#[derive(Debug)]
+pub struct Host {
+    namespace: Namespace,
+    /// Its address.
+    pub address: Ipv4Addr,
+    /// Its port of the bridge.
+    port: String,
+}
+
+impl Hosts {
+    /// Makes `count` hosts, 10.77.0.1 and up; or says why that is not possible here.
+    ///
+    /// # Errors
+    /// A sentence: no root, no `ip`, or a kernel without namespaces.
+    pub fn new(count: u8) -> Result<Self, String> {
+        let number = unique();
+        let bridge = Namespace::new(format!("sw{number}br"))?;
+        bridge.ip("link add bridge type bridge")?;
+        bridge.ip("link set bridge up")?;
+        let hosts = (1..=count).map(|index| Host::new(number, index, &bridge)).collect::<Result<_, _>>()?;
+        Ok(Self { bridge, hosts })
+    }
+
+    /// The hosts.
+    #[must_use]
+    pub fn all(&self) -> &[Host] {
+        &self.hosts
+    }
+
+    /// Cuts a host's link: its port of the bridge goes down.
+    ///
+    /// # Panics
+    /// If the kernel refuses.
+    pub fn cut(&self, host: usize) {
+        self.set_port(host, "down");
+    }
+
+    /// Joins a cut host again.
+    ///
+    /// # Panics
+    /// If the kernel refuses.
+    pub fn join(&self, host: usize) {
+        self.set_port(host, "up");
+    }
+
+    fn set_port(&self, host: usize, state: &str) {
+        let port = &self.hosts[host].port;
+        self.bridge.ip(&format!("link set {port} {state}")).unwrap_or_else(|error| panic!("{port} {state}: {error}"));
+    }
+}
+
+impl Host {
+    fn new(number: u32, index: u8, bridge: &Namespace) -> Result<Self, String> {
+        let namespace = Namespace::new(format!("sw{number}h{index}"))?;
+        let port = format!("port{index}");
+        let address = Ipv4Addr::new(10, 77, 0, index);
+        bridge.ip(&format!("link add {port} type veth peer name eth0 netns {}", namespace.0))?;
+        bridge.ip(&format!("link set {port} master bridge"))?;
+        bridge.ip(&format!("link set {port} up"))?;
+        namespace.ip("link set lo up")?;
+        namespace.ip(&format!("address add {address}/24 dev eth0"))?;
+        namespace.ip("link set eth0 up")?;
+        Ok(Self { namespace, address, port })
+    }
+
+    /// A command that runs `program` on this host.
+    #[must_use]
+    pub fn command(&self, program: &Path) -> Command {
+        let mut command = Command::new("ip");
+        command.args(["netns", "exec", &self.namespace.0]).arg(program);
+        command
+    }
+}
+
+#[derive(Debug)]
+struct Namespace(String);
+
+impl Namespace {
+    fn new(name: String) -> Result<Self, String> {
+        run(&["netns", "add", &name])?;
+        Ok(Self(name))
+    }
+
+    /// `ip` inside this namespace.
+    fn ip(&self, arguments: &str) -> Result<(), String> {
+        let mut all = vec!["-n", &self.0];
+        all.extend(arguments.split(' '));
+        run(&all)
+    }
+}
+
+impl Drop for Namespace {
+    fn drop(&mut self) {
+        if let Err(error) = run(&["netns", "del", &self.0]) {
+            eprintln!("the namespace {} stays: {error}", self.0);
+        }
+    }
+}
+
+fn run(arguments: &[&str]) -> Result<(), String> {
+    let output = Command::new("ip").args(arguments).output().map_err(|error| format!("no `ip` command: {error}"))?;
+    if output.status.success() {
+        return Ok(());
+    }
+    Err(format!("`ip {}`: {}", arguments.join(" "), String::from_utf8_lossy(&output.stderr).trim()))
+}

@@ -1,0 +1,141 @@
+//! A program of a scenario: started, watched line by line, ended.
+
+use std::{
+    io::{BufRead, BufReader, Write},
+    path::Path,
+    process::{Child, Command, Stdio},
+    sync::mpsc::{Receiver, sync_channel},
+    time::Instant,
+};
+
+use rustix::process::{Pid, Signal, kill_process};
+
+use crate::{DEADLINE, Host};
+
+/// Lines that wait to be looked at, at most; a program that says more than this waits.
+const LINES_MAX: usize = 10_000;
+
+/// A running program. It is killed when this is dropped.
+#[derive(Debug)]
+pub struct Program {
+    name: String,
+    child: Child,
+    lines: Receiver<String>,
+    seen: Vec<String>,
+}
+
+/// The node of the scenarios, on `host` or on this one, with the configuration in `config`.
+#[must_use]
+pub fn node_under_test(host: Option<&Host>, config: &Path, arguments: &[&str]) -> Program {
+    let path = node_program();
+    let mut command = match host {
+        Some(host) => host.command(&path),
+        None => Command::new(&path),
+    };
+    command.arg(config).args(arguments);
+    Program::start(&config.display().to_string(), command)
+}
+
+/// The binary lies beside the tests' own directory.
+fn node_program() -> std::path::PathBuf {
+    let test = std::env::current_exe().expect("a test has a path");
+    let deps = test.parent().expect("it lies in a directory");
+    deps.parent().expect("which lies in the profile's").join("node_under_test")
+}
+
+impl Program {
+    /// Starts it; what it says on its standard output is kept line by line.
+    ///
+    /// # Panics
+    /// If it cannot be started.
+    #[must_use]
+    pub fn start(name: &str, mut command: Command) -> Self {
+        let spawned = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
+        let mut child = spawned.unwrap_or_else(|error| panic!("{name} does not start: {error}"));
+        let output = child.stdout.take().expect("its output is a pipe");
+        let (say, lines) = sync_channel(LINES_MAX);
+        std::thread::spawn(move || {
+            for line in BufReader::new(output).lines().map_while(Result::ok) {
+                if say.send(line).is_err() {
+                    return;
+                }
+            }
+        });
+        Self { name: name.to_owned(), child, lines, seen: Vec::new() }
+    }
+
+    /// Waits for a line that has all these words, among those not yet waited for.
+    ///
+    /// # Panics
+    /// If none comes in time, with what it said instead.
+    pub fn wait_for(&mut self, words: &[&str]) -> String {
+        let until = Instant::now() + DEADLINE;
+        loop {
+            let left = until.saturating_duration_since(Instant::now());
+            let Ok(line) = self.lines.recv_timeout(left) else {
+                panic!("{} did not say {words:?} within {DEADLINE:?}; it said:\n{}", self.name, self.seen.join("\n"));
+            };
+            self.seen.push(line.clone());
+            if words.iter().all(|word| line.contains(word)) {
+                return line;
+            }
+        }
+    }
+
+    /// What it has said so far, as far as it was looked at.
+    #[must_use]
+    pub fn said(&self) -> &[String] {
+        &self.seen
+    }
+
+    /// Its process id.
+    #[must_use]
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Writes a line to its standard input.
+    ///
+    /// # Panics
+    /// If it has ended.
+    pub fn tell(&mut self, line: &str) {
+        let input = self.child.stdin.as_mut().expect("its input is a pipe");
+        writeln!(input, "{line}").unwrap_or_else(|error| panic!("{} does not listen: {error}", self.name));
+    }
+
+    /// Sends it a signal.
+    ///
+    /// # Panics
+    /// If it is no process any more.
+    pub fn signal(&self, signal: Signal) {
+        let id = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw).expect("a process id");
+        kill_process(id, signal).unwrap_or_else(|error| panic!("{} takes no {signal:?}: {error}", self.name));
+    }
+
+    /// Waits for its end; returns its exit code, `None` if a signal ended it.
+    ///
+    /// # Panics
+    /// If it does not end in time.
+    pub fn wait_for_end(&mut self) -> Option<i32> {
+        let until = Instant::now() + DEADLINE;
+        loop {
+            // Its last word is the end of its output.
+            match self.lines.recv_timeout(until.saturating_duration_since(Instant::now())) {
+                Ok(line) => self.seen.push(line),
+                Err(std::sync::mpsc::RecvTimeoutError::Disconnected) => break,
+                Err(std::sync::mpsc::RecvTimeoutError::Timeout) => {
+                    panic!("{} did not end within {DEADLINE:?}; it said:\n{}", self.name, self.seen.join("\n"))
+                }
+            }
+        }
+        self.child.wait().expect("a child can be waited for").code()
+    }
+}
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
