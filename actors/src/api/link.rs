@@ -77,7 +77,9 @@ impl Writer {
             let parts = [IoSlice::new(head), IoSlice::new(payload)];
             match self.write_some(&parts, deadline) {
                 Ok(count) => written += count,
-                Err(error) => return Err(self.give_up(error, if written == 0 { Stuck::Before } else { Stuck::Within })),
+                Err(error) => {
+                    return Err(self.give_up(error, if written == 0 { Stuck::Before } else { Stuck::Within }));
+                }
             }
         }
         Ok(())

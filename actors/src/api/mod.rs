@@ -41,6 +41,8 @@ mod error;
 mod inbox;
 mod link;
 mod received;
+#[cfg(test)]
+mod tests;
 
 use std::{
     path::{Path, PathBuf},

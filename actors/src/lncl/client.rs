@@ -51,7 +51,8 @@ enum End {
 pub(super) async fn serve(server: Rc<Server>, stream: UnixStream, credentials: UCred, id: ClientId) {
     let mut reader = Reader::new(REGISTER_BYTES_MAX);
     let mut session = Session::new();
-    let register = match tokio::time::timeout(HANDSHAKE, introduce(&mut reader, &stream, &mut session)).await {
+    let register = match tokio::time::timeout(HANDSHAKE, introduce(&mut reader, &stream, &mut session)).await
+    {
         Ok(Ok(Some(register))) => register,
         // Whoever only looks whether somebody listens hangs up without a word.
         Ok(Ok(None)) => return,
@@ -128,11 +129,7 @@ struct Client {
 }
 
 impl Client {
-    fn register(
-        server: Rc<Server>,
-        peer: Peer,
-        asked: Register,
-    ) -> Result<Self, super::RegisterError> {
+    fn register(server: Rc<Server>, peer: Peer, asked: Register) -> Result<Self, super::RegisterError> {
         let Register { name, address, requires, events, kinds, pid: _ } = asked;
         let address = address.map_or(Address::Dynamic, Address::Fixed);
         let request = Request { address, name, requires: requires.clone(), kinds, owner: peer.owner() };

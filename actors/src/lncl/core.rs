@@ -1,8 +1,10 @@
 //! Who is registered on this node. Pure: no socket, no clock.
 
-use std::{collections::BTreeMap, fmt};
+use std::{collections::BTreeMap, fmt, sync::Arc};
 
 use sinew_runtime::{tid::AppAddress, wire::Kind};
+
+use crate::refusals::Refusals;
 
 /// Longest name in bytes.
 pub(crate) const NAME_MAX: usize = 63;
@@ -142,6 +144,7 @@ pub(crate) struct Registry {
     kinds: BTreeMap<Kind, String>,
     next_dynamic: u32,
     next_client: u64,
+    refusals: Arc<Refusals>,
 }
 
 impl Registry {
@@ -210,7 +213,13 @@ impl Registry {
         name.unwrap_or_else(|| app.to_string())
     }
 
+    /// What was refused to other processes.
+    pub(crate) fn refusals(&self) -> Arc<Refusals> {
+        self.refusals.clone()
+    }
+
     /// How many applications there are.
+    #[cfg(test)]
     pub(crate) fn len(&self) -> usize {
         self.apps.len()
     }

@@ -120,7 +120,8 @@ fn bind(path: &Path) -> Result<UnixListener, ListenError> {
     let address = SockAddr::unix(path).map_err(system("bind", path))?;
     socket.bind(&address).map_err(system("bind", path))?;
     // Before it listens, so that nobody connects under wider permissions.
-    fs::set_permissions(path, Permissions::from_mode(SOCKET_MODE)).map_err(system("set permissions of", path))?;
+    fs::set_permissions(path, Permissions::from_mode(SOCKET_MODE))
+        .map_err(system("set permissions of", path))?;
     socket.listen(BACKLOG).map_err(system("listen at", path))?;
     socket.set_nonblocking(true).map_err(system("listen at", path))?;
     Ok(UnixListener::from(OwnedFd::from(socket)))

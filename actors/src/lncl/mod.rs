@@ -33,9 +33,7 @@ mod tests;
 pub(crate) use actor::Lncl;
 pub(crate) use core::{RegisterError, Registry};
 pub(crate) use facts::AppFact;
-pub(crate) use registrar::{
-    app_down, app_ready, register_local, release, resolve, set_member, unregister_local,
-};
+pub(crate) use registrar::{app_down, app_ready, register_local, release, unregister_local};
 
 use sinew_runtime::tid::AppAddress;
 

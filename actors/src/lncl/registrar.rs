@@ -36,7 +36,12 @@ pub(crate) fn register_local(
         name: Some(app.name().to_owned()),
         requires: app.requires().to_vec(),
         // A raw kind has no name of its own.
-        kinds: app.kinds().iter().filter(|(k, name)| *k == Kind::named(name)).map(|(_, n)| (*n).to_owned()).collect(),
+        kinds: app
+            .kinds()
+            .iter()
+            .filter(|(k, name)| *k == Kind::named(name))
+            .map(|(_, n)| (*n).to_owned())
+            .collect(),
         owner: Owner::Node,
     };
     let (name, requires) = (request.name.clone(), request.requires.clone());
@@ -73,13 +78,13 @@ pub(crate) fn unregister_local(stores: &Stores, app: AppAddress) {
 }
 
 /// The TID that has `name` now, on this node or any.
-pub(crate) fn resolve(stores: &Stores, name: &str) -> Option<Tid> {
+pub(super) fn resolve(stores: &Stores, name: &str) -> Option<Tid> {
     let here = lock(&stores.registry).resolve(name).map(|app| Tid::new(stores.node, app));
     here.or_else(|| lock(&stores.sync).resolve(name))
 }
 
 /// Makes `app` a member of `group`, or no longer one.
-pub(crate) fn set_member(stores: &Stores, app: AppAddress, group: AppAddress, member: bool) {
+pub(super) fn set_member(stores: &Stores, app: AppAddress, group: AppAddress, member: bool) {
     if stores.router.set_member(group, app, member) {
         tell_sync(stores, AppFact::GroupsChanged);
     }

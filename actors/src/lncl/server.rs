@@ -29,7 +29,7 @@ const ACCEPT_BACKOFF: (Duration, Duration) = (Duration::from_millis(10), Duratio
 /// What the connections of one life of LNCL's actor share. All of them live on its thread.
 pub(super) struct Server {
     pub(super) stores: Arc<Stores>,
-    pub(super) refusals: Refusals,
+    pub(super) refusals: Arc<Refusals>,
     /// Who waits at the barrier.
     releases: RefCell<BTreeMap<AppAddress, oneshot::Sender<()>>>,
     /// The writing halves of the connections, for what expires in them.
@@ -38,8 +38,8 @@ pub(super) struct Server {
 
 impl Server {
     pub(super) fn new(stores: Arc<Stores>) -> Rc<Self> {
-        let (releases, outlets) = (RefCell::default(), RefCell::default());
-        Rc::new(Self { stores, refusals: Refusals::default(), releases, outlets })
+        let refusals = lock(&stores.registry).refusals();
+        Rc::new(Self { stores, refusals, releases: RefCell::default(), outlets: RefCell::default() })
     }
 
     /// Resolves when the barrier opens for `app`.
@@ -113,7 +113,8 @@ fn report(ended: Result<(), JoinError>) {
 fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) {
     let limit = server.stores.config.lncl.clients_max;
     if clients.len() >= limit {
-        let why = format!("the node serves {limit} connections, which is its limit; raise `lncl.clients_max`");
+        let why =
+            format!("the node serves {limit} connections, which is its limit; raise `lncl.clients_max`");
         return refuse(server, &stream, "too many clients", &why);
     }
     match check_credentials(&stream) {
@@ -133,7 +134,9 @@ fn check_credentials(stream: &UnixStream) -> Result<UCred, String> {
         return Ok(credentials);
     }
     let theirs = credentials.uid();
-    Err(format!("user {theirs} may not use this node: it runs as user {own}; run the application as that user"))
+    Err(format!(
+        "user {theirs} may not use this node: it runs as user {own}; run the application as that user"
+    ))
 }
 
 /// spec: LNCL-2: the user that the node runs as, and root.

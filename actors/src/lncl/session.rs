@@ -179,13 +179,9 @@ fn read_outcome(message: &Message) -> Result<Order, Violation> {
     let [code] = message.payload[..] else {
         return Err(malformed(message, &format!("{} bytes instead of one", message.payload.len())));
     };
-    let outcome =
-        Outcome::from_code(code).ok_or_else(|| malformed(message, &format!("no outcome has the code {code}")))?;
-    Ok(Order::Settle {
-        source: message.header.destination,
-        correlation: message.header.correlation,
-        outcome,
-    })
+    let outcome = Outcome::from_code(code)
+        .ok_or_else(|| malformed(message, &format!("no outcome has the code {code}")))?;
+    Ok(Order::Settle { source: message.header.destination, correlation: message.header.correlation, outcome })
 }
 
 fn read_resolve(message: &Message) -> Result<Order, Violation> {

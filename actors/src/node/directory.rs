@@ -24,7 +24,9 @@ impl Directory for NodeDirectory {
         if self.0.router.set_member(group, app, member)
             && self.0.posts.sync.post(sync::Event::App(AppFact::GroupsChanged)).is_err()
         {
-            tracing::warn!("the sync manager's post is full; other nodes learn of the group with its next list");
+            tracing::warn!(
+                "the sync manager's post is full; other nodes learn of the group with its next list"
+            );
         }
     }
 }

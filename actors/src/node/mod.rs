@@ -166,7 +166,10 @@ impl NodeHandle {
 
     fn tell(&self, event: RootEvent) {
         if self.root.post(event).is_err() {
-            tracing::error!(node = self.stores.config.name, "the root's post is full; the order was not given");
+            tracing::error!(
+                node = self.stores.config.name,
+                "the root's post is full; the order was not given"
+            );
         }
     }
 }

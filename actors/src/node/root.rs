@@ -263,8 +263,9 @@ impl Root {
         let mailbox = Mailbox::new(config.mailbox_capacity);
         let pending = Pending::new(WAITS_MAX);
         let outlet = Arc::new(AppOutlet { pending: pending.clone(), inbox: mailbox.clone() });
-        let tid = lncl::register_local(&self.stores, app, outlet)
-            .map_err(|error| StartError::Application { name: app.name().to_owned(), why: error.to_string() })?;
+        let tid = lncl::register_local(&self.stores, app, outlet).map_err(|error| {
+            StartError::Application { name: app.name().to_owned(), why: error.to_string() }
+        })?;
         let directory = Arc::new(NodeDirectory(self.stores.clone()));
         let sender = Sender::new(tid, self.stores.router.clone(), directory, pending, config.payload_max);
         self.app_index.insert(tid.app, self.apps.len());
