@@ -25,9 +25,9 @@
 // The macro `payload!` names this crate as its users do.
 extern crate self as sinew;
 
+pub mod api;
 pub mod config;
 
-mod api;
 mod gncl;
 mod lncl;
 mod ndl;
@@ -40,6 +40,7 @@ mod sync;
 
 pub use api::{ApiError, Endpoint, NodeApi, Received, Registration};
 pub use config::{ConfigFaults, NodeConfig};
+pub use lncl::RegisterError;
 pub use ndl::{LossReason, NodeEvent};
 pub use node::{Node, NodeBuilder, NodeEnd, NodeHandle, StartError};
 pub use serde;
@@ -59,13 +60,12 @@ pub use sync::{RequirementEvent, Waiting};
 pub mod prelude {
     pub use std::time::Duration;
 
-    pub use actix::{
-        Actor, ActorContext, ActorFutureExt, AsyncContext, Handler, Running, fut::WrapFuture,
-    };
+    pub use actix::{Actor, ActorContext, ActorFutureExt, AsyncContext, Handler, Running, fut::WrapFuture};
 
     pub use crate::{
-        AppAddress, AppContext, AppSpec, Class, Delivery, Node, NodeAddress, NodeBuilder, NodeConfig, NodeEvent,
-        Outcome, Payload, Place, RequirementEvent, Restart, Silence, StartError, Tick, Tid, Time, payload,
+        AppAddress, AppContext, AppSpec, Class, Delivery, Node, NodeAddress, NodeBuilder, NodeConfig,
+        NodeEvent, Outcome, Payload, Place, RequirementEvent, Restart, Silence, StartError, Tick, Tid, Time,
+        payload,
     };
 }
 

@@ -12,7 +12,6 @@
 //! All of it stands under one mutex. Receipts are never settled and nobody is woken with it in hand, because whoever
 //! is told may submit to this very outlet.
 
-mod class_queue;
 mod half;
 #[cfg(test)]
 mod tests;
@@ -144,6 +143,11 @@ impl<S: Socket> StreamOutlet<S> {
     /// with the reason. To be run by one task, on the thread whose reactor the socket belongs to.
     pub(crate) async fn drain(&self, link: LinkNumber) -> io::Error {
         poll_fn(|cx| self.with(|half, after| half.poll_drain(link, cx, after))).await
+    }
+
+    /// Sends `last` when nothing waits any more, and takes nothing from now on: [`Rejection::Closed`].
+    pub(crate) fn finish(&self, last: Message) {
+        self.with(|half, after| half.finish(last, after));
     }
 
     /// Settles what has expired by `now` while it waited.

@@ -13,7 +13,7 @@ use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
 };
 
-use crate::{config::NodeConfig, gncl, lncl, ndl, node, sync};
+use crate::{config::NodeConfig, gncl, lncl, ndl, node, refusals::Refusals, sync};
 
 /// What the layers of one node share.
 pub(crate) struct Stores {
@@ -23,11 +23,9 @@ pub(crate) struct Stores {
     pub(crate) node: NodeAddress,
     /// Which life of the node this is.
     pub(crate) incarnation: Incarnation,
-    /// Tells this start of the node from every other of any node.
-    pub(crate) boot_nonce: u64,
     /// Set by the root before it stops the layers: those that say goodbye to others do so only then, not when one of them
     /// is restarted.
-    pub(crate) leaving: AtomicBool,
+    pub(crate) stopping: AtomicBool,
     /// Where messages go.
     pub(crate) router: Arc<Router>,
     /// Events into each layer.
@@ -36,8 +34,12 @@ pub(crate) struct Stores {
     pub(crate) clocks: ClockOffsets,
     /// Address of GNCL's listener, known once it listens; announced by NDL. A restarted GNCL binds it again.
     pub(crate) gncl_listen: OnceLock<SocketAddr>,
+    /// What LNCL, the sync manager and NDL's sockets refused.
+    pub(crate) refusals: Arc<Refusals>,
     /// GNCL's peers with the messages that wait for them, and what GNCL refused.
     pub(crate) gncl: gncl::Store,
+    /// Which nodes are there; a restarted NDL goes on with them.
+    pub(crate) ndl: Mutex<ndl::Core>,
     /// Who is registered on this node.
     pub(crate) registry: Mutex<lncl::Registry>,
     /// Who is known on other nodes, and what waits for whom.
@@ -48,14 +50,13 @@ pub(crate) struct Stores {
 const POST_CAPACITY: usize = 8_192;
 
 impl Stores {
-    /// The stores of a node that has not started yet. `boot_nonce` is a number that no other start of any node has.
-    pub(crate) fn new(config: NodeConfig, incarnation: Incarnation, boot_nonce: u64) -> Arc<Self> {
+    /// The stores of a node that has not started yet.
+    pub(crate) fn new(config: NodeConfig, incarnation: Incarnation) -> Arc<Self> {
         let node = config.node_address();
         Arc::new(Self {
             node,
             incarnation,
-            boot_nonce,
-            leaving: AtomicBool::new(false),
+            stopping: AtomicBool::new(false),
             router: Arc::new(Router::new(node)),
             posts: Posts {
                 root: Post::new(POST_CAPACITY),
@@ -66,7 +67,9 @@ impl Stores {
             },
             clocks: ClockOffsets::default(),
             gncl_listen: OnceLock::new(),
+            refusals: Arc::default(),
             gncl: gncl::Store::default(),
+            ndl: Mutex::new(ndl::new_core(&config, node, incarnation)),
             registry: Mutex::default(),
             sync: Mutex::new(sync::Core::new(&config, node, incarnation)),
             config,
@@ -76,7 +79,7 @@ impl Stores {
     /// The stores of a node that has only the layers that a test starts.
     #[cfg(test)]
     pub(crate) fn for_test(config: NodeConfig, incarnation: Incarnation) -> Arc<Self> {
-        Self::new(config, incarnation, incarnation.0)
+        Self::new(config, incarnation)
     }
 }
 

@@ -61,7 +61,9 @@ impl Hosts {
 
     fn set_port(&self, host: usize, state: &str) {
         let port = &self.hosts[host].port;
-        self.bridge.ip(&format!("link set {port} {state}")).unwrap_or_else(|error| panic!("{port} {state}: {error}"));
+        self.bridge
+            .ip(&format!("link set {port} {state}"))
+            .unwrap_or_else(|error| panic!("{port} {state}: {error}"));
     }
 }
 
@@ -114,7 +116,8 @@ impl Drop for Namespace {
 }
 
 fn run(arguments: &[&str]) -> Result<(), String> {
-    let output = Command::new("ip").args(arguments).output().map_err(|error| format!("no `ip` command: {error}"))?;
+    let output =
+        Command::new("ip").args(arguments).output().map_err(|error| format!("no `ip` command: {error}"))?;
     if output.status.success() {
         return Ok(());
     }

@@ -73,7 +73,11 @@ impl Program {
         loop {
             let left = until.saturating_duration_since(Instant::now());
             let Ok(line) = self.lines.recv_timeout(left) else {
-                panic!("{} did not say {words:?} within {DEADLINE:?}; it said:\n{}", self.name, self.seen.join("\n"));
+                panic!(
+                    "{} did not say {words:?} within {DEADLINE:?}; it said:\n{}",
+                    self.name,
+                    self.seen.join("\n")
+                );
             };
             self.seen.push(line.clone());
             if words.iter().all(|word| line.contains(word)) {
@@ -124,7 +128,11 @@ impl Program {
                 Ok(line) => self.seen.push(line),
                 Err(std::sync::mpsc::RecvTimeoutError::Disconnected) => break,
                 Err(std::sync::mpsc::RecvTimeoutError::Timeout) => {
-                    panic!("{} did not end within {DEADLINE:?}; it said:\n{}", self.name, self.seen.join("\n"))
+                    panic!(
+                        "{} did not end within {DEADLINE:?}; it said:\n{}",
+                        self.name,
+                        self.seen.join("\n")
+                    )
                 }
             }
         }

@@ -297,7 +297,7 @@ fn a_registration_waits_at_the_barrier_and_names_what_it_waits_for() {
     assert_eq!(node.fact(), AppFact::Unregistered { app: given_up });
     let waiting = thread::spawn(move || api.register_transport_address(wanted.deadline(WATCHDOG)));
     let AppFact::Registered { app, .. } = node.fact() else { panic!("no registration") };
-    crate::lncl::release(&node.stores, app);
+    node.release(app);
     assert_eq!(waiting.join().unwrap().unwrap().tid().app, app);
 }
 

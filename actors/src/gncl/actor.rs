@@ -110,7 +110,7 @@ impl Gncl {
             Output::Close(connection) => self.close(connection, ctx),
             Output::SendPing(node) => self.send(node, Kind::GNCL_PING),
             Output::SendPong(node) => self.send(node, Kind::GNCL_PONG),
-            Output::SendGoodbye(node) => self.send(node, Kind::GNCL_GOODBYE),
+            Output::SendGoodbye(node) => self.say_goodbye(node),
             Output::Forget(node) => {
                 self.stores.router.remove_peer(node);
                 self.stores.gncl.forget(node);
@@ -213,13 +213,16 @@ impl Gncl {
     }
 
     fn send(&self, node: NodeAddress, kind: Kind) {
-        let Some(peer) = self.stores.gncl.peer(node) else { return };
-        let mut message = frame(self.stores.node, node, kind, bytes::Bytes::new());
-        if kind == Kind::GNCL_GOODBYE {
-            // The last class, so that it is the last frame. spec: GNCL-10
-            message.header.class = sinew_runtime::wire::Class::Bulk;
+        if let Some(peer) = self.stores.gncl.peer(node) {
+            peer.send(frame(self.stores.node, node, kind, bytes::Bytes::new()));
         }
-        peer.send(message);
+    }
+
+    /// spec: GNCL-10
+    fn say_goodbye(&self, node: NodeAddress) {
+        if let Some(peer) = self.stores.gncl.peer(node) {
+            peer.outlet.finish(frame(self.stores.node, node, Kind::GNCL_GOODBYE, bytes::Bytes::new()));
+        }
     }
 
     fn tell(&self, fact: LinkFact) {
@@ -354,7 +357,7 @@ impl Actor for Gncl {
 
     fn stopping(&mut self, ctx: &mut Self::Context) -> Running {
         // SYNC: Relaxed; the order to stop came through the supervisor's lock, after the flag was set.
-        if self.stores.leaving.load(Ordering::Relaxed) {
+        if self.stores.stopping.load(Ordering::Relaxed) {
             self.input(Input::LeaveRequested, ctx);
         }
         Running::Stop

@@ -29,7 +29,7 @@ pub(super) fn accepted(listener: TcpListener) -> impl Stream<Item = io::Result<T
             tokio::time::sleep(wait).await;
         }
         let accepted = listener.accept().await.and_then(|(socket, _)| {
-            socket.set_nodelay(true)?;
+            super::link::tune(&socket)?;
             Ok(socket)
         });
         let wait = accepted.as_ref().err().map_or(Duration::ZERO, |error| wait_after(error, wait));

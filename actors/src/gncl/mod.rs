@@ -41,7 +41,7 @@ mod tests;
 
 pub(crate) use actor::Gncl;
 pub(crate) use facts::LinkFact;
-pub(crate) use peer::{Peer, Store};
+pub(crate) use peer::Store;
 
 use crate::ndl::MembershipFact;
 

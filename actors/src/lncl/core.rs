@@ -1,10 +1,8 @@
 //! Who is registered on this node. Pure: no socket, no clock.
 
-use std::{collections::BTreeMap, fmt, sync::Arc};
+use std::{collections::BTreeMap, fmt};
 
 use sinew_runtime::{tid::AppAddress, wire::Kind};
-
-use crate::refusals::Refusals;
 
 /// Longest name in bytes.
 pub(crate) const NAME_MAX: usize = 63;
@@ -61,7 +59,7 @@ pub(crate) struct Request {
 
 /// Why an application was not registered. Nothing changed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub(crate) enum RegisterError {
+pub enum RegisterError {
     /// The caller's name is empty, too long or has control characters in it.
     #[error("the name {0:?} cannot be used: 1 to 63 bytes without control characters are allowed")]
     BadName(String),
@@ -144,7 +142,6 @@ pub(crate) struct Registry {
     kinds: BTreeMap<Kind, String>,
     next_dynamic: u32,
     next_client: u64,
-    refusals: Arc<Refusals>,
 }
 
 impl Registry {
@@ -211,11 +208,6 @@ impl Registry {
     pub(crate) fn name_of(&self, app: AppAddress) -> String {
         let name = self.apps.get(&app).and_then(|entry| entry.name.clone());
         name.unwrap_or_else(|| app.to_string())
-    }
-
-    /// What was refused to other processes.
-    pub(crate) fn refusals(&self) -> Arc<Refusals> {
-        self.refusals.clone()
     }
 
     /// How many applications there are.

@@ -31,15 +31,18 @@ pub(crate) mod testing;
 mod tests;
 
 pub(crate) use actor::Lncl;
-pub(crate) use core::{RegisterError, Registry};
+pub use core::RegisterError;
+pub(crate) use core::Registry;
 pub(crate) use facts::AppFact;
-pub(crate) use registrar::{app_down, app_ready, register_local, release, unregister_local};
+pub(crate) use registrar::{
+    LocalApp, app_down, app_ready, register_local, resolve, set_member, unregister_local,
+};
 
 use sinew_runtime::tid::AppAddress;
 
 /// What LNCL is told.
 #[derive(Debug)]
 pub(crate) enum Event {
-    /// By the root, through [`release`]: all that this application of another process requires is ready.
+    /// By the root: all that this application of another process requires is ready.
     Released { app: AppAddress },
 }

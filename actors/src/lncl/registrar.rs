@@ -5,14 +5,13 @@
 use std::sync::Arc;
 
 use sinew_runtime::{
-    app::DynApp,
     router::{LocalRoute, Outlet},
     tid::{AppAddress, Tid},
     wire::Kind,
 };
 
 use super::{
-    AppFact, Event,
+    AppFact,
     core::{Address, Owner, RegisterError, Request},
 };
 use crate::{
@@ -20,43 +19,36 @@ use crate::{
     sync,
 };
 
-/// Gives an application of the node's own process its address; messages reach its `outlet` from now on.
+/// An application in the node's own process, as the root registers it.
+pub(crate) struct LocalApp {
+    /// Its name; `None` for an application that is known by its address alone.
+    pub(crate) name: Option<String>,
+    /// The fixed address that it wants; `None` for a dynamic one.
+    pub(crate) address: Option<AppAddress>,
+    /// The names that it requires.
+    pub(crate) requires: Vec<String>,
+    /// Names of the payload types that it handles, so that a collision of their ids is found.
+    pub(crate) kinds: Vec<String>,
+    /// What takes its messages.
+    pub(crate) outlet: Arc<dyn Outlet>,
+    /// The layers' events that it wants.
+    pub(crate) events: Arc<[Kind]>,
+}
+
+/// Gives an application of the node's own process its address; messages reach its outlet from now on.
 ///
 /// # Errors
 /// Why not; nothing changed.
-pub(crate) fn register_local(
-    stores: &Stores,
-    app: &DynApp,
-    outlet: Arc<dyn Outlet>,
-) -> Result<Tid, RegisterError> {
-    // Publishing looks for the kinds of layers' events only, so the other kinds that it handles do no harm.
-    let events = app.kinds().iter().map(|(kind, _)| *kind).collect();
-    let request = Request {
-        address: app.address().map_or(Address::Dynamic, Address::Fixed),
-        name: Some(app.name().to_owned()),
-        requires: app.requires().to_vec(),
-        // A raw kind has no name of its own.
-        kinds: app
-            .kinds()
-            .iter()
-            .filter(|(k, name)| *k == Kind::named(name))
-            .map(|(_, n)| (*n).to_owned())
-            .collect(),
-        owner: Owner::Node,
-    };
-    let (name, requires) = (request.name.clone(), request.requires.clone());
+pub(crate) fn register_local(stores: &Stores, app: LocalApp) -> Result<Tid, RegisterError> {
+    let LocalApp { name, address, requires, kinds, outlet, events } = app;
+    let address = address.map_or(Address::Dynamic, Address::Fixed);
+    let request = Request { address, name: name.clone(), requires, kinds, owner: Owner::Node };
     let mut registry = lock(&stores.registry);
+    let fact_requires = request.requires.clone();
     let app = registry.register(request, stores.config.lncl.apps_max)?;
     stores.router.set_local(app, LocalRoute { outlet, events });
-    tell_sync(stores, AppFact::Registered { app, name, requires });
+    tell_sync(stores, AppFact::Registered { app, name, requires: fact_requires });
     Ok(Tid::new(stores.node, app))
-}
-
-/// All that the application at `app`, which is in another process, requires is ready.
-pub(crate) fn release(stores: &Stores, app: AppAddress) {
-    if stores.posts.lncl.post(Event::Released { app }).is_err() {
-        tracing::error!(%app, "LNCL's post is full and this release was not told: does LNCL hang?");
-    }
 }
 
 /// The application has started and takes messages.
@@ -78,13 +70,13 @@ pub(crate) fn unregister_local(stores: &Stores, app: AppAddress) {
 }
 
 /// The TID that has `name` now, on this node or any.
-pub(super) fn resolve(stores: &Stores, name: &str) -> Option<Tid> {
+pub(crate) fn resolve(stores: &Stores, name: &str) -> Option<Tid> {
     let here = lock(&stores.registry).resolve(name).map(|app| Tid::new(stores.node, app));
     here.or_else(|| lock(&stores.sync).resolve(name))
 }
 
 /// Makes `app` a member of `group`, or no longer one.
-pub(super) fn set_member(stores: &Stores, app: AppAddress, group: AppAddress, member: bool) {
+pub(crate) fn set_member(stores: &Stores, app: AppAddress, group: AppAddress, member: bool) {
     if stores.router.set_member(group, app, member) {
         tell_sync(stores, AppFact::GroupsChanged);
     }

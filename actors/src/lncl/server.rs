@@ -38,8 +38,9 @@ pub(super) struct Server {
 
 impl Server {
     pub(super) fn new(stores: Arc<Stores>) -> Rc<Self> {
-        let refusals = lock(&stores.registry).refusals();
-        Rc::new(Self { stores, refusals, releases: RefCell::default(), outlets: RefCell::default() })
+        let (releases, outlets) = (RefCell::default(), RefCell::default());
+        let refusals = stores.refusals.clone();
+        Rc::new(Self { stores, refusals, releases, outlets })
     }
 
     /// Resolves when the barrier opens for `app`.

@@ -29,7 +29,7 @@ use tokio::sync::oneshot;
 use tokio_util::codec::Decoder;
 
 use super::{
-    AppFact, Lncl,
+    AppFact, Event, Lncl,
     payload::{self, Refusal, Register, Registered},
 };
 use crate::{NodeConfig, stores::Stores, sync};
@@ -120,18 +120,23 @@ impl TestNode {
         }
     }
 
+    /// Opens the barrier for an application, as the root does.
+    pub(crate) fn release(&self, app: AppAddress) {
+        self.stores.posts.lncl.post(Event::Released { app }).unwrap();
+    }
+
     /// How much was refused for `cause`.
     pub(crate) fn refused(&self, cause: &'static str) -> u64 {
-        self.stores.registry.lock().unwrap().refusals().of(cause)
+        self.stores.refusals.of(cause)
     }
 
     /// An application in the node's process, played by the test.
-    pub(crate) fn local(&self, index: u32) -> LocalApp {
+    pub(crate) fn local(&self, index: u32) -> PlayedApp {
         let app = AppAddress::fixed(index).unwrap();
         let (sender, inbox) = sync_channel(1_024);
         let route = LocalRoute { outlet: Arc::new(Channel(sender)), events: Arc::new([]) };
         self.stores.router.set_local(app, route);
-        LocalApp { tid: Tid::new(self.address(), app), inbox: Mutex::new(inbox) }
+        PlayedApp { tid: Tid::new(self.address(), app), inbox: Mutex::new(inbox) }
     }
 
     /// Sends a value from an application in the node's process and hands out where its outcome will come.
@@ -175,12 +180,12 @@ impl Outlet for Channel {
 }
 
 /// An application in the node's process.
-pub(crate) struct LocalApp {
+pub(crate) struct PlayedApp {
     pub(crate) tid: Tid,
     inbox: Mutex<Receiver<Message>>,
 }
 
-impl LocalApp {
+impl PlayedApp {
     pub(crate) fn next(&self) -> Message {
         self.inbox.lock().unwrap().recv_timeout(WATCHDOG).expect("a message comes")
     }

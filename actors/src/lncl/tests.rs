@@ -188,7 +188,7 @@ fn a_client_is_held_until_all_that_it_requires_is_ready() {
     assert_eq!(requires, ["knee.sensor"]);
     let early = node.send_confirmed(app.tid, Tid::new(node.address(), address), &Angle { degrees: 0.0 });
     assert_eq!(early.recv_timeout(WATCHDOG), Ok(Outcome::Rejected(Rejection::NoSuchApplication)));
-    super::release(&node.stores, address);
+    node.release(address);
     assert_eq!(client.expect_registered().app, address);
     assert_eq!(node.fact(), AppFact::Ready { app: address });
 }

@@ -1,7 +1,50 @@
 //! NDL, the Node Discovery Layer: finds nodes and watches that they exist.
+//!
+//! Its promise: a node that can be reached is known within milliseconds of its start; a node that is gone is known to
+//! be gone within `period` times `missed_max` plus one period, and at once if it said so or if its connection broke
+//! and is refused; a node that is only slow is not lost; and nobody becomes a member by a forged source address.
+//!
+//! `docs/protocol/ndl.md` has the bytes. The rules:
+//!
+//! | rule | |
+//! | --- | --- |
+//! | NDL-1 | A datagram is one frame of at most 1,200 bytes; anything else is refused and counted. |
+//! | NDL-1.1 | Its source TID is the NDL of the node that it announces. |
+//! | NDL-1.2 | Datagrams of other projects, and our own that come back, are ignored. |
+//! | NDL-2 | Everybody is asked, and asks. |
+//! | NDL-2.1 | Each period, and at once at the start: a query to each member, each seed, each candidate, and one to the group. |
+//! | NDL-2.2 | Whoever is heard for the first time is asked at once. |
+//! | NDL-2.3 | So is whoever mDNS resolves. |
+//! | NDL-3 | A query is answered at once, to where it came from; a member's query to the group is not. |
+//! | NDL-3.1 | An answer counts once, if it comes from the address that was asked and quotes the query's correlation id. |
+//! | NDL-3.2 | Such an answer, and nothing else, makes a member. |
+//! | NDL-4 | A member is lost |
+//! | NDL-4.1 | when it missed `missed_max` answers in a row: `Silent`; |
+//! | NDL-4.2 | but nobody is accused in a cycle to which our own timer came late by more than half a period; |
+//! | NDL-4.3 | when its connection broke and is refused: `ConnectionRefused`, until it answers a later query; |
+//! | NDL-4.4 | when it says so, from its own address, in its own life: `Left`. |
+//! | NDL-5 | A node has one life at a time. |
+//! | NDL-5.1 | A higher incarnation replaces a lower one: `NodeRestarted`. |
+//! | NDL-5.2 | A lower one is refused, also after the loss of the higher one. |
+//! | NDL-5.3 | From another address, the newcomer waits up to 100 ms for the former life to show that it lives. |
+//! | NDL-5.4 | If it does, there are two processes with one address: the newcomer is refused, both addresses are logged. |
+//! | NDL-5.5 | A node that finds its own address in use within `missed_max` plus one periods of its start gives up. |
+//! | NDL-6 | Each answer measures the peer's clock; the smallest bound counts, grown by the drift since then. |
+//! | NDL-7 | All memory and all work is bounded. |
+//! | NDL-7.1 | `nodes_max` members, as many candidates, as many that are gone; the oldest candidate makes room. |
+//! | NDL-7.2 | 50 datagrams/s from a stranger's address, 1,000 from all of them, 500 from each member or seed. |
 
+mod actor;
+mod core;
+mod datagram;
 mod facts;
+mod mdns;
+mod socket;
+#[cfg(test)]
+mod tests;
 
+pub(crate) use actor::{NdlActor, new_core};
+pub(crate) use core::Core;
 pub(crate) use facts::MembershipFact;
 pub use facts::{LossReason, NodeEvent};
 

@@ -2,7 +2,6 @@
 
 use std::{
     collections::BTreeSet,
-    hash::{BuildHasher, Hasher, RandomState},
     sync::mpsc::sync_channel,
     time::{Duration, SystemTime},
 };
@@ -12,10 +11,7 @@ use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
 };
 
-use super::{
-    Node, NodeHandle,
-    root::{self, RootEvent},
-};
+use super::{Node, NodeHandle, root};
 use crate::{
     config::{ConfigFaults, NodeConfig},
     stores::Stores,
@@ -127,7 +123,7 @@ impl NodeBuilder {
         }
         let patience = self.config.sync.layer_deadline * 4;
         let incarnation = self.incarnation.unwrap_or_else(wall_clock);
-        let stores = Stores::new(self.config, incarnation, boot_nonce());
+        let stores = Stores::new(self.config, incarnation);
         let handle = NodeHandle { root: stores.posts.root.clone(), stores: stores.clone() };
         let (say_started, started) = sync_channel(1);
         let (say_ended, ended) = sync_channel(1);
@@ -149,9 +145,4 @@ impl NodeBuilder {
 fn wall_clock() -> Incarnation {
     let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     Incarnation(u64::try_from(since_1970.as_micros()).unwrap_or(u64::MAX))
-}
-
-/// A number that no other start of any node has: it tells two nodes with one address apart.
-fn boot_nonce() -> u64 {
-    RandomState::new().build_hasher().finish()
 }

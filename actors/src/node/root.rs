@@ -12,7 +12,6 @@ use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, fut::Wrap
 use sinew_runtime::{
     app::{AppWiring, DynApp},
     mailbox::Mailbox,
-    outcome::Rejection,
     pending::{AppOutlet, Pending},
     post::Post,
     sender::Sender,
@@ -20,16 +19,12 @@ use sinew_runtime::{
         ChildSpec, Input, Launch, Place, Policy, ReadyGate, Reason, Strategy, Supervisor, SupervisorFact,
         Threads, life,
     },
-    tid::{AppAddress, Tid},
+    tid::AppAddress,
 };
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::{NodeEnd, StartError, directory::NodeDirectory};
-use crate::{
-    gncl, lncl, ndl,
-    stores::{Stores, lock},
-    sync,
-};
+use crate::{gncl, lncl, ndl, stores::Stores, sync};
 
 /// Confirmed messages and requests of one application under way at most.
 const WAITS_MAX: usize = 1_024;
@@ -146,7 +141,7 @@ fn layers(stores: &Arc<Stores>, deadline: Duration) -> Vec<ChildSpec> {
         child("LNCL", Place::IO, layer(stores, lncl::Lncl::new)),
         child("sync manager", "sync", layer(stores, sync::SyncManager::new)),
         child("GNCL", Place::IO, layer(stores, gncl::Gncl::new)),
-        child("NDL", "ndl", layer(stores, ndl::Ndl::new)),
+        child("NDL", "ndl", layer(stores, ndl::NdlActor::new)),
     ]
 }
 
@@ -190,7 +185,11 @@ impl Root {
         match (self.app_index.get(&app), &self.app_supervisor) {
             (Some(index), Some(supervisor)) => order(supervisor, Input::Released(*index)),
             // Not an application of this process: LNCL knows its client.
-            (None, _) => lncl::release(&self.stores, app),
+            (None, _) => {
+                if self.stores.posts.lncl.post(lncl::Event::Released { app }).is_err() {
+                    tracing::error!(%app, "LNCL's post is full; a client's registration ends at its deadline");
+                }
+            }
             (Some(_), None) => tracing::error!(%app, "released before its supervisor was there"),
         }
     }
@@ -263,8 +262,22 @@ impl Root {
         let mailbox = Mailbox::new(config.mailbox_capacity);
         let pending = Pending::new(WAITS_MAX);
         let outlet = Arc::new(AppOutlet { pending: pending.clone(), inbox: mailbox.clone() });
-        let tid = lncl::register_local(&self.stores, app, outlet).map_err(|error| {
-            StartError::Application { name: app.name().to_owned(), why: error.to_string() }
+        let kinds = app.kinds();
+        let local = lncl::LocalApp {
+            name: Some(app.name().to_owned()),
+            address: app.address(),
+            requires: app.requires().to_vec(),
+            kinds: kinds
+                .iter()
+                .filter(|(_, name)| *name != "raw")
+                .map(|(_, name)| (*name).to_owned())
+                .collect(),
+            outlet,
+            events: kinds.iter().map(|(kind, _)| *kind).collect(),
+        };
+        let tid = lncl::register_local(&self.stores, local).map_err(|error| StartError::Application {
+            name: app.name().to_owned(),
+            why: error.to_string(),
         })?;
         let directory = Arc::new(NodeDirectory(self.stores.clone()));
         let sender = Sender::new(tid, self.stores.router.clone(), directory, pending, config.payload_max);
@@ -339,7 +352,7 @@ impl Root {
 
     fn stop_layers(&mut self) {
         self.phase = Phase::StoppingLayers;
-        self.stores.leaving.store(true, Ordering::Relaxed);
+        self.stores.stopping.store(true, Ordering::Relaxed);
         match &self.layer_supervisor {
             Some(supervisor) => order(supervisor, Input::StopOrdered),
             // They ended before: what is left is to hear of it.

@@ -7,13 +7,14 @@ use std::{
 };
 
 use sinew_runtime::{
+    mailbox::ClassQueue,
     outcome::{Outcome, Receipt, Rejection, Ticket},
     router::Refused,
     time::Time,
     wire::{Class, Flags, HEADER_LEN, Message},
 };
 
-use super::{LinkNumber, OutletCounts, OutletLimits, Socket, class_queue::ClassQueue};
+use super::{LinkNumber, OutletCounts, OutletLimits, Socket};
 
 /// Frames that the drainer writes before other tasks of its thread have their turn.
 const WRITES_PER_WAKE: usize = 64;
@@ -49,14 +50,14 @@ struct Partial {
     message: Message,
     head: [u8; HEADER_LEN],
     written: usize,
-    /// Belongs to this one connection and to no sender.
-    is_preface: bool,
+    /// The first or the last frame of a connection: it belongs to that one, and to no sender.
+    is_frill: bool,
 }
 
 impl Partial {
     fn new(message: Message) -> Self {
         let head = message.header.encode(&message.payload);
-        Self { message, head, written: 0, is_preface: false }
+        Self { message, head, written: 0, is_frill: false }
     }
 
     /// Writes what the socket takes; returns whether that was all.
@@ -84,6 +85,9 @@ pub(super) struct Half<S> {
     /// The frame that was being written when the last connection ended. No peer can have handled it: it goes first.
     interrupted: Option<Message>,
     queue: ClassQueue,
+    /// What is sent when nothing waits any more; nothing is taken after it.
+    last: Option<Message>,
+    finishing: bool,
     /// Receipts of messages that wait.
     waiting_receipts: usize,
     /// No waiting message expires before this.
@@ -104,6 +108,8 @@ impl<S: Socket> Half<S> {
             partial: None,
             interrupted: None,
             queue: ClassQueue::new(limits.queue_capacity),
+            last: None,
+            finishing: false,
             waiting_receipts: 0,
             next_expiry: Time::MAX,
             sent_receipts: VecDeque::new(),
@@ -124,7 +130,7 @@ impl<S: Socket> Half<S> {
         if !matches!(self.link, Link::Closed(_)) {
             self.link = Link::Up(socket);
             self.payload_max = self.limits.payload_max.min(payload_max);
-            self.partial = preface.map(|message| Partial { is_preface: true, ..Partial::new(message) });
+            self.partial = preface.map(|message| Partial { is_frill: true, ..Partial::new(message) });
         }
         LinkNumber(self.number)
     }
@@ -138,11 +144,12 @@ impl<S: Socket> Half<S> {
             return true;
         }
         self.link = Link::Down;
+        self.last = None;
         after.wake = self.drainer.take();
         after.settle.extend(self.sent_receipts.drain(..).map(|receipt| (receipt, Outcome::Unknown)));
         let Some(partial) = self.partial.take() else { return true };
         self.next_expiry = self.next_expiry.min(expiry_of(&partial.message));
-        if partial.is_preface {
+        if partial.is_frill {
             // The next connection has its own.
         } else if partial.message.header.class == Class::Stream {
             self.put_back(partial.message);
@@ -216,6 +223,15 @@ impl<S: Socket> Half<S> {
         Ok(())
     }
 
+    pub(super) fn finish(&mut self, last: Message, after: &mut After) {
+        self.finishing = true;
+        self.last = Some(last);
+        if self.waiting() == 1 && matches!(self.link, Link::Up(_)) {
+            self.write_next(after);
+        }
+        after.wake = self.drainer.take();
+    }
+
     /// A frame that was to be written at once and could not be: it waits like any other.
     fn requeue(&mut self, frame: Partial, after: &mut After) -> Result<(), Refused> {
         self.waiting_receipts -= usize::from(frame.message.receipt.is_some());
@@ -226,6 +242,8 @@ impl<S: Socket> Half<S> {
         let confirmed = message.receipt.is_some();
         if let Link::Closed(why) = self.link {
             Err(why)
+        } else if self.finishing {
+            Err(Rejection::Closed)
         } else if message.payload.len() > self.payload_max {
             Err(Rejection::TooLong)
         } else if confirmed && message.header.class == Class::Stream {
@@ -270,7 +288,7 @@ impl<S: Socket> Half<S> {
     }
 
     fn sent(&mut self, frame: Partial) {
-        self.counts.sent += u64::from(!frame.is_preface);
+        self.counts.sent += u64::from(!frame.is_frill);
         if let Some(receipt) = frame.message.receipt {
             self.waiting_receipts -= 1;
             self.sent_receipts.push_back(receipt);
@@ -340,7 +358,9 @@ impl<S: Socket> Half<S> {
         if let Some(partial) = self.partial.take() {
             return Some(partial);
         }
-        let message = self.interrupted.take().or_else(|| self.queue.pop())?;
+        let Some(message) = self.interrupted.take().or_else(|| self.queue.pop()) else {
+            return self.last.take().map(|last| Partial { is_frill: true, ..Partial::new(last) });
+        };
         if message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
             self.waiting_receipts -= usize::from(message.receipt.is_some());
             self.expired(message, after);
@@ -385,7 +405,8 @@ impl<S: Socket> Half<S> {
     }
 
     pub(super) fn waiting(&self) -> usize {
-        self.queue.len() + usize::from(self.partial.is_some()) + usize::from(self.interrupted.is_some())
+        let single = [self.partial.is_some(), self.interrupted.is_some(), self.last.is_some()];
+        self.queue.len() + single.into_iter().filter(|waits| *waits).count()
     }
 
     pub(super) fn unconfirmed(&self) -> usize {

@@ -75,7 +75,7 @@ impl Message {
     /// # Errors
     /// The bytes are not a `P`.
     pub fn decode<P: Payload>(&self) -> Result<P, DecodeError> {
-        rmp_serde::from_slice(&self.payload).map_err(|cause| DecodeError { name: P::NAME, cause })
+        decode(&self.payload).map_err(|cause| DecodeError { name: P::NAME, cause })
     }
 
     /// Says what became of this message, if anybody wants to know.
@@ -104,6 +104,22 @@ impl Message {
 pub fn encode<P: Payload>(value: &P) -> Bytes {
     rmp_serde::to_vec_named(value).expect("a payload type can be written as MessagePack").into()
 }
+
+/// Reads a value from its MessagePack form.
+///
+/// Values nested deeper than 64 are refused: rmp-serde's own limit of 1,024 lets a payload of 1,100 bytes, each the
+/// start of a list, overflow the stack of a thread and so end the process.
+///
+/// # Errors
+/// The bytes are not a `T`.
+pub fn decode<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, rmp_serde::decode::Error> {
+    let mut deserializer = rmp_serde::Deserializer::from_read_ref(bytes);
+    deserializer.set_max_depth(DEPTH_MAX);
+    T::deserialize(&mut deserializer)
+}
+
+/// Lists in lists, and so on, in a payload.
+const DEPTH_MAX: usize = 64;
 
 /// Writable memory for a raw payload: what `create_message` lends and `send_message` takes back.
 #[derive(Debug)]
@@ -142,5 +158,30 @@ impl Deref for MessageBuffer {
 impl DerefMut for MessageBuffer {
     fn deref_mut(&mut self) -> &mut [u8] {
         &mut self.payload
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Debug, Serialize, serde::Deserialize)]
+    struct Point {
+        x: f64,
+    }
+
+    impl Payload for Point {
+        const NAME: &'static str = "test.point";
+    }
+
+    #[test]
+    fn a_payload_nested_without_end_is_an_error_and_does_not_overflow_the_stack() {
+        let list_in_list = vec![0x91; 100_000];
+        let mut unknown_field = vec![0x81, 0xa1, b'y'];
+        unknown_field.extend(&list_in_list);
+        for payload in [list_in_list, unknown_field] {
+            let message = Message::new(Header::new(Point::KIND, Tid::NONE, Tid::NONE), payload.into());
+            assert!(message.decode::<Point>().is_err());
+        }
     }
 }

@@ -11,4 +11,4 @@ mod message;
 pub use codec::{FrameCodec, FrameError, decode_datagram, encode_frame};
 pub use header::{Class, Flags, HEADER_LEN, Header, HeaderError, MAGIC, VERSION};
 pub use kind::{Kind, fnv1a};
-pub use message::{DecodeError, Message, MessageBuffer, Payload, encode};
+pub use message::{DecodeError, Message, MessageBuffer, Payload, decode, encode};

@@ -245,6 +245,7 @@ impl Core {
         }
     }
 
+    /// Enters a stage that does not last. spec: GNCL-2
     fn stage_for_handshake(&mut self, now: Time, connection: ConnectionId, stage: Stage) {
         let deadline = now + self.settings.handshake;
         self.connections.insert(connection, Connection { stage, deadline });

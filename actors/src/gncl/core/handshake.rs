@@ -203,6 +203,27 @@ mod tests {
     }
 
     #[test]
+    fn the_documentation_shows_the_bytes_of_a_hello() {
+        let hello = Introduction {
+            project: "exo".to_owned(),
+            node: NodeAddress::new(0x0a00_0007),
+            name: "knee".to_owned(),
+            incarnation: Incarnation(7),
+            peer: NodeAddress::new(0x0a00_0008),
+            dial: 1_000_000,
+            payload_max: 1 << 20,
+            features: Vec::new(),
+        };
+        let page = include_str!("../../../../docs/protocol/gncl.md");
+        let shown = page.split("```text").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
+        // Each line has bytes, then at least two spaces, then what they mean.
+        let bytes = shown.lines().map(|line| line.trim_start().split("  ").next().unwrap_or_default());
+        let bytes: Vec<&str> = bytes.flat_map(str::split_whitespace).collect();
+        let written: Vec<_> = write(&hello).iter().map(|byte| format!("{byte:02x}")).collect();
+        assert_eq!(bytes, written);
+    }
+
+    #[test]
     fn fields_of_a_later_version_are_ignored() {
         let mut map = std::collections::BTreeMap::from([("colour".to_owned(), serde_json::json!("red"))]);
         let serde_json::Value::Object(known) = serde_json::to_value(introduction()).unwrap() else {

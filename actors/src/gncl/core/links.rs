@@ -146,6 +146,7 @@ impl Core {
         }
     }
 
+    /// The peer's messages wait from now on. spec: GNCL-13
     fn detach(&mut self, now: Time, node: NodeAddress) -> Option<ConnectionId> {
         let peer = self.peers.get_mut(&node)?;
         let incarnation = peer.incarnation;

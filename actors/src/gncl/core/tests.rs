@@ -105,9 +105,9 @@ fn greet(core: &mut Core, now: Time, hello: Introduction) -> (ConnectionId, Vec<
 }
 
 fn refusal(outputs: &[Output]) -> Option<&str> {
-    outputs.iter().find_map(|output| match output {
-        Output::Refuse(_, refusal) => Some(refusal.cause.as_str()),
-        _ => None,
+    outputs.iter().find_map(|output| {
+        let Output::Refuse(_, refusal) = output else { return None };
+        Some(refusal.cause.as_str())
     })
 }
 
@@ -154,9 +154,9 @@ fn waits_between_dials_double_from_the_least_to_the_most_with_a_fifth_of_jitter(
     let mut expected = Duration::from_millis(10);
     let mut now = millis(0);
     for _ in 0..12 {
-        let dial = outputs(&mut core).into_iter().find_map(|output| match output {
-            Output::Dial { connection, .. } => Some(connection),
-            _ => None,
+        let dial = outputs(&mut core).into_iter().find_map(|output| {
+            let Output::Dial { connection, .. } = output else { return None };
+            Some(connection)
         });
         core.handle(now, Input::DialFailed { connection: dial.expect("dials again"), refused: false });
         let next = core.next_wake().expect("a dial is planned");

@@ -1,0 +1,361 @@
+//! The thin shell around the membership core: sockets, timer, mDNS, and the ways to other layers.
+
+use std::{
+    hash::{BuildHasher, RandomState},
+    io,
+    net::{SocketAddr, SocketAddrV4},
+    rc::Rc,
+    sync::{Arc, MutexGuard, PoisonError, atomic::Ordering},
+    time::Duration,
+};
+
+use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, WrapFuture};
+use mdns_sd::{DaemonEvent, ServiceEvent};
+use sinew_runtime::{
+    supervision::ReadyGate,
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    time::Time,
+    wire::Message,
+};
+use tokio::sync::Notify;
+
+use super::{
+    Event, MembershipFact, NodeEvent,
+    core::{Core, Epoch, Input, Output, Way},
+    datagram::{Answer, Body, DATAGRAM_MAX, Datagram, encode},
+    mdns::{Mdns, MdnsError},
+    socket,
+};
+use crate::{config::NodeConfig, gncl, refusals::Refusals, stores::Stores, sync};
+
+/// Rest after a failed read, so that a socket that fails for good does not take the whole thread.
+const READ_FAILED_REST: Duration = Duration::from_millis(10);
+/// Time between two attempts to listen to mDNS again.
+const MDNS_REST: Duration = Duration::from_secs(1);
+
+/// The core of a node that has just been started: it knows nobody. For the node's stores.
+pub(crate) fn new_core(config: &NodeConfig, node: NodeAddress, incarnation: Incarnation) -> Core {
+    // The standard library's hasher keys come from the system's random source.
+    let draw = |what: &str| RandomState::new().hash_one(what);
+    let secret = u128::from(draw("upper")) << 64 | u128::from(draw("lower"));
+    Core::new(config, node, incarnation, draw("boot nonce"), secret)
+}
+
+/// The Node Discovery Layer.
+pub(crate) struct NdlActor {
+    stores: Arc<Stores>,
+    ready: Option<ReadyGate>,
+    shell: Option<Rc<Shell>>,
+}
+
+impl NdlActor {
+    /// A new instance; it goes on with the members that the stores hold.
+    pub(crate) const fn new(stores: Arc<Stores>, ready: ReadyGate) -> Self {
+        Self { stores, ready: Some(ready), shell: None }
+    }
+}
+
+impl Actor for NdlActor {
+    type Context = Context<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        ctx.add_stream(self.stores.posts.ndl.attach());
+        let (shell, unicast) = Shell::bind(self.stores.clone()).unwrap_or_else(|words| give_up(&words));
+        let shell = Rc::new(shell);
+        let unicast = tokio::net::UdpSocket::from_std(unicast)
+            .unwrap_or_else(|error| give_up(&format!("NDL's socket cannot be watched: {error}")));
+        ctx.spawn(receive(shell.clone(), unicast, Way::Unicast).into_actor(self));
+        if let Some(group) = shell.join_group() {
+            ctx.spawn(receive(shell.clone(), group, Way::Multicast).into_actor(self));
+        }
+        // The first queries leave here.
+        shell.carry_out();
+        if let Some(mdns) = shell.start_mdns() {
+            ctx.spawn(watch_mdns(mdns.clone()).into_actor(self));
+            ctx.spawn(browse(shell.clone(), mdns).into_actor(self));
+        }
+        ctx.spawn(keep_time(shell.clone()).into_actor(self));
+        self.shell = Some(shell);
+        if let Some(ready) = self.ready.take() {
+            ready.reached();
+        }
+    }
+
+    fn stopped(&mut self, _: &mut Self::Context) {
+        // Only when the node stops: a layer that is started anew must not look like a node that went.
+        if let Some(shell) = &self.shell
+            && self.stores.stopping.load(Ordering::Acquire)
+        {
+            shell.feed(|core, now| core.handle(now, Input::Stopping));
+        }
+    }
+}
+
+impl StreamHandler<Event> for NdlActor {
+    fn handle(&mut self, event: Event, _: &mut Self::Context) {
+        let Event::Link(fact) = event;
+        if let Some(shell) = &self.shell {
+            shell.feed(|core, now| core.handle(now, Input::Link(fact)));
+        }
+    }
+
+    fn finished(&mut self, ctx: &mut Self::Context) {
+        // A later instance reads the post now.
+        ctx.stop();
+    }
+}
+
+/// The start fails: the supervisor reports these words, and tries again within its limit.
+fn give_up(words: &str) -> ! {
+    tracing::error!("{words}");
+    panic!("{words}");
+}
+
+/// What the tasks of one instance share.
+struct Shell {
+    stores: Arc<Stores>,
+    epoch: Epoch,
+    /// Sends at once, whatever the runtime knows of the socket.
+    socket: std::net::UdpSocket,
+    /// The core's next wake is not the one that the timer sleeps for.
+    rewind: Notify,
+    refusals: Refusals,
+}
+
+impl Shell {
+    /// Binds the socket for queries and answers, and starts the core; the socket is returned for reading.
+    fn bind(stores: Arc<Stores>) -> Result<(Self, std::net::UdpSocket), String> {
+        let Some(SocketAddr::V4(gncl)) = stores.gncl_listen.get().copied() else {
+            return Err("NDL has no GNCL to announce: start GNCL, on an IPv4 address, before NDL".to_owned());
+        };
+        let interface = stores.config.ndl.interface;
+        let gncl = if gncl.ip().is_unspecified() { SocketAddrV4::new(interface, gncl.port()) } else { gncl };
+        let unbound = |error: io::Error| {
+            let port = stores.config.ndl.port;
+            format!(
+                "NDL cannot use UDP {interface}:{port}: {error}; set `ndl.interface` to an IPv4 address of this host \
+                 and `ndl.port` to a free port, or to 0 for any"
+            )
+        };
+        let socket = bind_again(&stores).map_err(unbound)?;
+        let udp = socket.local_addr().map_err(unbound)?;
+        let reader = socket.try_clone().map_err(unbound)?;
+        let epoch = lock(&stores).start(Time::now(), udp, gncl);
+        tracing::info!(%udp, %gncl, "NDL asks and answers");
+        let (rewind, refusals) = (Notify::new(), Refusals::default());
+        Ok((Self { stores, epoch, socket, rewind, refusals }, reader))
+    }
+
+    fn join_group(&self) -> Option<tokio::net::UdpSocket> {
+        let ndl = &self.stores.config.ndl;
+        let group = ndl.multicast?;
+        let joined = socket::join_group(group, ndl.interface).and_then(tokio::net::UdpSocket::from_std);
+        joined
+            .inspect_err(|error| {
+                tracing::warn!(
+                    "NDL does not hear multicast {group} on {}: {error}; nodes are found through mDNS and seeds only. \
+                     Set `ndl.interface` to an interface that is up and `ndl.multicast` to a group, or list `ndl.seeds`",
+                    ndl.interface,
+                );
+            })
+            .ok()
+    }
+
+    fn start_mdns(&self) -> Option<Rc<Mdns>> {
+        let port = self.stores.config.ndl.mdns_port?;
+        let (udp, me) = {
+            let core = lock(&self.stores);
+            (core.udp()?, core.announcement().clone())
+        };
+        Mdns::start(port, udp, &me).inspect_err(|error| warn_of_mdns(port, error)).ok().map(Rc::new)
+    }
+
+    /// Gives the core an input and does what it says; `false` when a later instance has taken over.
+    fn feed(&self, input: impl FnOnce(&mut Core, Time)) -> bool {
+        let wake_moved = {
+            let mut core = lock(&self.stores);
+            if !core.is_current(self.epoch) {
+                return false;
+            }
+            let before = core.next_wake();
+            input(&mut core, Time::now());
+            core.next_wake() != before
+        };
+        self.carry_out();
+        if wake_moved {
+            self.rewind.notify_one();
+        }
+        true
+    }
+
+    fn carry_out(&self) {
+        loop {
+            // The lock is not held while an order is carried out.
+            let next = lock(&self.stores).poll();
+            let Some(output) = next else { return };
+            self.obey(output);
+        }
+    }
+
+    fn obey(&self, output: Output) {
+        match output {
+            Output::SendQuery { to, correlation } => self.send_query(to, correlation),
+            Output::SendMulticastQuery { correlation } => {
+                if let Some(group) = self.stores.config.ndl.multicast {
+                    self.send_query(group.into(), correlation);
+                }
+            }
+            Output::SendAnswer { to, node, correlation, query_sent, query_received } => {
+                let announcement = self.me();
+                let (query_sent_ns, query_received_ns) = (query_sent.as_nanos(), query_received.as_nanos());
+                let answer = Answer { announcement, query_sent_ns, query_received_ns };
+                self.send(to, node, correlation, Body::Answer(answer));
+            }
+            Output::SendLeave { to, node } => self.send(to, node, 0, Body::Leave(self.me())),
+            Output::Fact(fact) => self.tell_layers(fact),
+            Output::Event(event) => self.tell_applications(&event),
+            Output::ClockMeasured { node, offset } => self.stores.clocks.set(node, offset),
+            Output::Collision { node, holder, newcomer } => tracing::error!(
+                "node address {node} is used twice: by {holder}, and by {newcomer}, which is not let in; give one of \
+                 them another `address`"
+            ),
+            Output::AddressTaken { holder } => give_up(&format!(
+                "node address {} is used already, by the node that answers at {holder}; set `address` of this node to \
+                 a free one",
+                self.stores.node
+            )),
+            Output::Stalled { late } => tracing::warn!(
+                late_ms = late.as_millis(),
+                "NDL was starved: its own timer came late, so nobody is counted as silent in this cycle"
+            ),
+        }
+    }
+
+    fn me(&self) -> super::datagram::Announcement {
+        lock(&self.stores).announcement().clone()
+    }
+
+    fn send_query(&self, to: SocketAddr, correlation: u64) {
+        self.send(to, NodeAddress::ALL, correlation, Body::Query(self.me()));
+    }
+
+    fn send(&self, to: SocketAddr, node: NodeAddress, correlation: u64, body: Body) {
+        // The send time is taken last: what is between it and the network counts as network.
+        let bytes = encode(&Datagram { correlation, sent: Time::now(), body }, node);
+        if let Err(error) = socket::send(&self.socket, &bytes, to) {
+            self.refusals.count(Time::now(), "NDL datagram not sent", &format_args!("to {to}: {error}"));
+        }
+    }
+
+    fn tell_layers(&self, fact: MembershipFact) {
+        if let MembershipFact::NodeLost { node, .. } = fact {
+            self.stores.clocks.forget(node);
+        }
+        tracing::info!(?fact, "membership");
+        let posts = &self.stores.posts;
+        if let Err(event) = posts.gncl.post(gncl::Event::Membership(fact.clone())) {
+            tracing::error!(?event, "GNCL's post is full: it does not learn this");
+        }
+        if let Err(event) = posts.sync.post(sync::Event::Membership(fact)) {
+            tracing::error!(?event, "the sync manager's post is full: it does not learn this");
+        }
+    }
+
+    fn tell_applications(&self, event: &NodeEvent) {
+        let mut message = Message::typed(Tid::new(self.stores.node, AppAddress::NDL), Tid::NONE, event);
+        message.header.sent = Time::now();
+        self.stores.router.publish(&message);
+    }
+}
+
+fn lock(stores: &Stores) -> MutexGuard<'_, Core> {
+    stores.ndl.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// The port of the configuration; where any will do, the one that a former instance had, so that peers still find us.
+fn bind_again(stores: &Stores) -> io::Result<std::net::UdpSocket> {
+    let ndl = &stores.config.ndl;
+    let former = lock(stores).udp().filter(|_| ndl.port == 0);
+    let again = former.and_then(|former| socket::bind_unicast(ndl.interface, former.port()).ok());
+    again.map_or_else(|| socket::bind_unicast(ndl.interface, ndl.port), Ok)
+}
+
+/// Reads datagrams for as long as this instance is the current one. Answers leave from here.
+async fn receive(shell: Rc<Shell>, socket: tokio::net::UdpSocket, way: Way) {
+    // One byte more than is taken: a longer datagram is noticed, not cut.
+    let mut buffer = [0; DATAGRAM_MAX + 1];
+    loop {
+        match socket.recv_from(&mut buffer).await {
+            Ok((length, from)) => {
+                let bytes = &buffer[..length];
+                if !shell.feed(|core, now| core.receive(now, from, way, bytes)) {
+                    return;
+                }
+            }
+            Err(error) => {
+                shell.refusals.count(Time::now(), "NDL socket not readable", &error);
+                tokio::time::sleep(READ_FAILED_REST).await;
+            }
+        }
+    }
+}
+
+async fn keep_time(shell: Rc<Shell>) {
+    loop {
+        let wake = lock(&shell.stores).next_wake();
+        let Some(wake) = wake else { return };
+        let sleep = tokio::time::sleep(wake.since(Time::now()));
+        tokio::select! {
+            () = sleep => {}
+            () = shell.rewind.notified() => continue,
+        }
+        if !shell.feed(|core, now| core.handle(now, Input::TimePassed)) {
+            return;
+        }
+    }
+}
+
+async fn browse(shell: Rc<Shell>, mdns: Rc<Mdns>) {
+    loop {
+        match mdns.browse() {
+            Ok(events) => {
+                while let Ok(event) = events.recv_async().await {
+                    if !resolved(&shell, &mdns, &event) {
+                        return;
+                    }
+                }
+                // mdns-sd drops a listener that is a thousand events behind.
+                tracing::warn!("NDL missed events of mDNS; listening again");
+            }
+            Err(error) => tracing::warn!("NDL cannot look for nodes through mDNS: {error}; trying again"),
+        }
+        tokio::time::sleep(MDNS_REST).await;
+    }
+}
+
+fn resolved(shell: &Shell, mdns: &Mdns, event: &ServiceEvent) -> bool {
+    // Its other events say what mdns-sd is doing, or that a record is gone: liveness is not its business.
+    let ServiceEvent::ServiceResolved(service) = event else { return true };
+    let addresses = mdns.addresses(service);
+    addresses
+        .into_iter()
+        .all(|address| shell.feed(|core, now| core.handle(now, Input::MdnsResolved { address })))
+}
+
+/// mdns-sd binds its socket in its own thread and reports what fails there.
+async fn watch_mdns(mdns: Rc<Mdns>) {
+    let Ok(events) = mdns.monitor() else { return };
+    let failures = Refusals::default();
+    while let Ok(event) = events.recv_async().await {
+        if let DaemonEvent::Error(error) = event {
+            failures.count(Time::now(), "mDNS reports a fault", &error);
+        }
+    }
+}
+
+fn warn_of_mdns(port: u16, error: &MdnsError) {
+    tracing::warn!(
+        "NDL does not use mDNS on port {port}: {error}; nodes are found through multicast and seeds only. Set \
+         `ndl.mdns_port` to a port that this process may share, or switch it off"
+    );
+}

@@ -1,0 +1,101 @@
+//! An address that NDL talks to: how it was found, what was asked there, and who answers.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use sinew_runtime::{tid::NodeAddress, time::Time};
+
+use super::{
+    Source,
+    budget::{Bucket, KNOWN},
+};
+
+/// Questions to one address that may still be answered: later ones make older ones void.
+const QUESTIONS_MAX: usize = 4;
+
+/// A query that was sent and may be answered.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Question {
+    pub(super) correlation: u64,
+    pub(super) asked: Time,
+}
+
+/// The last few queries to one destination.
+#[derive(Debug, Default)]
+pub(super) struct Questions(VecDeque<Question>);
+
+impl Questions {
+    pub(super) fn push(&mut self, question: Question) {
+        if self.0.len() == QUESTIONS_MAX {
+            self.0.pop_front();
+        }
+        self.0.push_back(question);
+    }
+
+    pub(super) fn has(&self, correlation: u64) -> bool {
+        self.0.iter().any(|question| question.correlation == correlation)
+    }
+
+    /// The question that `correlation` answers; each is answered once.
+    pub(super) fn take(&mut self, correlation: u64) -> Option<Question> {
+        let at = self.0.iter().position(|question| question.correlation == correlation)?;
+        self.0.remove(at)
+    }
+
+    pub(super) fn newest(&self) -> Option<Question> {
+        self.0.back().copied()
+    }
+
+    pub(super) fn clear(&mut self) {
+        self.0.clear();
+    }
+}
+
+/// Who is at an address.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Role {
+    /// Nobody who answered yet; asked this many times in the cycle.
+    Candidate { asked: u32 },
+    /// A member.
+    Member(NodeAddress),
+    /// Nobody any more. It is asked ever more seldom: after `left` cycles, and then after `wait`.
+    Former { node: NodeAddress, wait: u32, left: u32 },
+}
+
+/// An address that NDL talks to.
+#[derive(Debug)]
+pub(super) struct Contact {
+    pub(super) role: Role,
+    /// Listed in the configuration: asked for ever.
+    pub(super) is_seed: bool,
+    /// Since when this address has been known.
+    pub(super) since: Time,
+    pub(super) sources: BTreeMap<Source, Time>,
+    pub(super) questions: Questions,
+    /// Datagrams that it may send; only members and seeds have a budget of their own.
+    pub(super) budget: Bucket,
+    /// Answers to our questions that it may send.
+    pub(super) answers: Bucket,
+}
+
+impl Contact {
+    pub(super) fn new(now: Time, source: Source) -> Self {
+        Self {
+            role: Role::Candidate { asked: 0 },
+            is_seed: source == Source::Seed,
+            since: now,
+            sources: BTreeMap::from([(source, now)]),
+            questions: Questions::default(),
+            budget: Bucket::full(KNOWN, now),
+            answers: Bucket::full(KNOWN, now),
+        }
+    }
+
+    pub(super) const fn is_candidate(&self) -> bool {
+        matches!(self.role, Role::Candidate { .. }) && !self.is_seed
+    }
+
+    /// Whether its datagrams are counted against its own budget, not the strangers'.
+    pub(super) const fn has_own_budget(&self) -> bool {
+        matches!(self.role, Role::Member(_)) || self.is_seed
+    }
+}

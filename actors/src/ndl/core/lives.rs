@@ -1,0 +1,382 @@
+//! Who comes, goes, comes again in a new life, and who has an address that is taken.
+
+use std::{net::SocketAddr, time::Duration};
+
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
+
+use super::{
+    Core, Member, Output, Source,
+    clock::{Exchange, PeerClock},
+    contact::{Contact, Role},
+};
+use crate::{
+    gncl::LinkFact,
+    ndl::{LossReason, MembershipFact, NodeEvent, datagram::Announcement},
+};
+
+/// Longest time that a node has to show that it lives, when another process comes with its address.
+const CHALLENGE_MAX: Duration = Duration::from_millis(100);
+/// Time between two reports that a node address is used twice.
+const COLLISION_REPORT_PERIOD: Duration = Duration::from_secs(10);
+
+/// An answer to a question that was asked at one address: somebody is there and says this.
+#[derive(Clone, Debug)]
+pub(super) struct Proof {
+    pub(super) from: SocketAddr,
+    /// When the question was asked.
+    pub(super) asked: Time,
+    pub(super) announcement: Announcement,
+    pub(super) exchange: Option<Exchange>,
+}
+
+/// A newcomer claims a member's address in a later life. The member has until then to show that it lives.
+#[derive(Debug)]
+pub(super) struct Contest {
+    since: Time,
+    pub(super) until: Time,
+    newcomer: Proof,
+}
+
+/// The last life of a node that is gone.
+#[derive(Debug)]
+pub(super) struct Gone {
+    since: Time,
+    address: SocketAddr,
+    incarnation: Incarnation,
+    boot_nonce: u64,
+}
+
+/// How a node that becomes a member is announced to applications.
+#[derive(Clone, Copy, Debug)]
+enum Arrival {
+    Found,
+    Restarted,
+}
+
+impl Core {
+    /// Somebody proved to be at an address. // spec: NDL-3.2
+    pub(super) fn confirmed(&mut self, now: Time, proof: Proof) {
+        let claimed = &proof.announcement;
+        if claimed.node == self.me.node {
+            self.own_address_used(now, proof.from);
+            return;
+        }
+        self.release_address(now, proof.from, claimed.node);
+        let Some(member) = self.members.get(&claimed.node) else {
+            self.arrive(now, proof);
+            return;
+        };
+        let known = &member.announcement;
+        if known.is_same_life(claimed) {
+            self.alive(now, proof);
+        } else if claimed.incarnation < known.incarnation {
+            self.refuse_stale(now, &proof, known.incarnation);
+        } else if claimed.incarnation == known.incarnation {
+            self.collide(now, claimed.node, member.address, proof.from);
+        } else if member.address == proof.from {
+            // No two processes have one socket address: the former one is gone.
+            self.replace(now, proof);
+        } else {
+            self.contest(now, proof);
+        }
+    }
+
+    /// Another node is where a member was: the member is not.
+    fn release_address(&mut self, now: Time, address: SocketAddr, node: NodeAddress) {
+        let role = self.contacts.get(&address).map(|contact| contact.role);
+        if let Some(Role::Member(other)) = role
+            && other != node
+        {
+            self.lose(now, other, LossReason::Silent);
+        }
+    }
+
+    fn alive(&mut self, now: Time, proof: Proof) {
+        let node = proof.announcement.node;
+        self.settle_contest(now, &proof);
+        let Some(member) = self.members.get_mut(&node) else { return };
+        if member.address != proof.from {
+            // One life at two addresses: it has moved if it does not answer at the first any more.
+            if member.missed == 0 {
+                return;
+            }
+            let former = std::mem::replace(&mut member.address, proof.from);
+            self.drop_contact(now, former);
+            self.contact_at(now, proof.from).role = Role::Member(node);
+        }
+        let Some(member) = self.members.get_mut(&node) else { return };
+        member.heard = now;
+        member.missed = 0;
+        member.is_awaited = false;
+        self.measure(now, node, proof.exchange);
+    }
+
+    /// The member lives, and was asked after the newcomer came: there are two.
+    fn settle_contest(&mut self, now: Time, proof: &Proof) {
+        let node = proof.announcement.node;
+        let holder = self.members.get(&node).map(|member| member.address);
+        if let Some(contest) = self.contests.get(&node)
+            && holder == Some(proof.from)
+            && proof.asked >= contest.since
+        {
+            let newcomer = contest.newcomer.from;
+            self.contests.remove(&node);
+            self.collide(now, node, proof.from, newcomer);
+        }
+    }
+
+    fn measure(&mut self, now: Time, node: NodeAddress, exchange: Option<Exchange>) {
+        let Some(member) = self.members.get_mut(&node) else { return };
+        let Some(exchange) = exchange else { return };
+        if !member.clock.measure(exchange) {
+            let what = format_args!("the times of {node} contradict each other");
+            self.refusals.count(now, "NDL answer with false times", &what);
+            return;
+        }
+        if let Some(offset) = member.clock.offset(now, self.period) {
+            self.outputs.push_back(Output::ClockMeasured { node, offset });
+        }
+    }
+
+    /// Nobody with this address is a member.
+    fn arrive(&mut self, now: Time, proof: Proof) {
+        let claimed = &proof.announcement;
+        let arrival = match self.gone.get(&claimed.node) {
+            None => Arrival::Found,
+            Some(gone) if claimed.incarnation > gone.incarnation => Arrival::Restarted,
+            Some(gone)
+                if claimed.incarnation == gone.incarnation && claimed.boot_nonce == gone.boot_nonce =>
+            {
+                Arrival::Found
+            }
+            Some(gone) => {
+                self.refuse_stale(now, &proof, gone.incarnation);
+                return;
+            }
+        };
+        if self.members.len() >= self.nodes_max {
+            self.refusals.count(now, "more nodes than `ndl.nodes_max`", &proof.from);
+            return;
+        }
+        self.join(now, proof, arrival);
+    }
+
+    // spec: NDL-5.2
+    fn refuse_stale(&self, now: Time, proof: &Proof, known: Incarnation) {
+        let Announcement { node, incarnation, .. } = proof.announcement;
+        let what =
+            format_args!("{node} at {} is in life {incarnation}, and life {known} was seen", proof.from);
+        self.refusals.count(now, "NDL answer of a former life", &what);
+    }
+
+    fn join(&mut self, now: Time, proof: Proof, arrival: Arrival) {
+        let Proof { from, announcement, exchange, .. } = proof;
+        let Announcement { node, incarnation, ref name, .. } = announcement;
+        let name = name.clone();
+        let gncl = SocketAddr::V4(announcement.gncl());
+        if let Some(gone) = self.gone.remove(&node)
+            && gone.address != from
+        {
+            self.forget_former(gone.address, node);
+        }
+        self.contact_at(now, from).role = Role::Member(node);
+        let member = Member {
+            announcement,
+            address: from,
+            heard: now,
+            missed: 0,
+            is_awaited: false,
+            clock: PeerClock::default(),
+            is_link_broken: false,
+        };
+        self.members.insert(node, member);
+        // Before the fact, so that GNCL knows the clock of a peer when it connects.
+        self.measure(now, node, exchange);
+        self.outputs.push_back(Output::Fact(MembershipFact::NodeFound { node, incarnation, gncl }));
+        self.outputs.push_back(Output::Event(match arrival {
+            Arrival::Found => NodeEvent::NodeFound { node, name, incarnation },
+            Arrival::Restarted => NodeEvent::NodeRestarted { node, name, incarnation },
+        }));
+    }
+
+    /// A member is there in a new life. // spec: NDL-5.1
+    fn replace(&mut self, now: Time, proof: Proof) {
+        let node = proof.announcement.node;
+        let Some(former) = self.members.remove(&node) else { return };
+        self.contests.remove(&node);
+        if former.address != proof.from {
+            self.drop_contact(now, former.address);
+        }
+        let incarnation = former.announcement.incarnation;
+        let why = LossReason::Restarted;
+        self.outputs.push_back(Output::Fact(MembershipFact::NodeLost { node, incarnation, why }));
+        self.join(now, proof, Arrival::Restarted);
+    }
+
+    /// A newcomer with a member's address: has the member been restarted, or are there two? // spec: NDL-5.3
+    fn contest(&mut self, now: Time, newcomer: Proof) {
+        let node = newcomer.announcement.node;
+        if self.contests.contains_key(&node) {
+            return;
+        }
+        self.contests.insert(node, Contest { since: now, until: now + self.challenge(), newcomer });
+        self.challenge_member(now, node);
+    }
+
+    fn challenge(&self) -> Duration {
+        self.period.min(CHALLENGE_MAX)
+    }
+
+    fn challenge_member(&mut self, now: Time, node: NodeAddress) {
+        if let Some(address) = self.members.get(&node).map(|member| member.address) {
+            self.ask(now, address);
+        }
+    }
+
+    pub(super) fn decide_contests(&mut self, now: Time) {
+        let due = self.contests.iter().filter(|(_, contest)| contest.until <= now).map(|(node, _)| *node);
+        for node in due.collect::<Vec<_>>() {
+            self.decide_contest(now, node);
+        }
+    }
+
+    fn decide_contest(&mut self, now: Time, node: NodeAddress) {
+        let challenge = self.challenge();
+        let Some(contest) = self.contests.get_mut(&node) else { return };
+        // Starved ourselves, we may not have read the answer yet: ask again. spec: NDL-4.2
+        if now.since(contest.until) > challenge / 2 {
+            contest.since = now;
+            contest.until = now + challenge;
+            self.challenge_member(now, node);
+            return;
+        }
+        if let Some(contest) = self.contests.remove(&node)
+            && self.may_still_be_there(&contest.newcomer)
+        {
+            self.replace(now, contest.newcomer);
+        }
+    }
+
+    // spec: NDL-5.4
+    fn collide(&mut self, now: Time, node: NodeAddress, holder: SocketAddr, newcomer: SocketAddr) {
+        let what =
+            format_args!("{node} is at {holder}; the process at {newcomer} claims the same node address");
+        self.refusals.count(now, "NDL node address used twice", &what);
+        let last = self.collisions_reported.get(&node);
+        if last.is_none_or(|last| now.since(*last) >= COLLISION_REPORT_PERIOD) {
+            self.collisions_reported.insert(node, now);
+            self.outputs.push_back(Output::Collision { node, holder, newcomer });
+        }
+    }
+
+    /// A living process has our own node address. // spec: NDL-5.5
+    fn own_address_used(&mut self, now: Time, other: SocketAddr) {
+        if self.settles.is_some_and(|until| now < until) {
+            // The next start begins anew: the other may be gone by then.
+            self.settles = None;
+            self.cycle_due = None;
+            self.outputs.push_back(Output::AddressTaken { holder: other });
+        } else if let Some(own) = self.udp {
+            self.collide(now, self.me.node, own, other);
+        }
+    }
+
+    /// What GNCL's connections tell. // spec: NDL-4.3
+    pub(super) fn linked(&mut self, now: Time, fact: LinkFact) {
+        let (LinkFact::LinkUp { node, incarnation }
+        | LinkFact::LinkBroken { node, incarnation }
+        | LinkFact::DialRefused { node, incarnation }
+        | LinkFact::PeerLeft { node, incarnation }) = fact;
+        let Some(member) = self.members.get_mut(&node).filter(|m| m.announcement.incarnation == incarnation)
+        else {
+            // About a life that is over for NDL already.
+            return;
+        };
+        match fact {
+            LinkFact::LinkUp { .. } => member.is_link_broken = false,
+            LinkFact::LinkBroken { .. } => member.is_link_broken = true,
+            LinkFact::DialRefused { .. } if member.is_link_broken => {
+                self.lose(now, node, LossReason::ConnectionRefused);
+            }
+            // Never connected: its GNCL may not listen yet.
+            LinkFact::DialRefused { .. } => {}
+            LinkFact::PeerLeft { .. } => self.lose(now, node, LossReason::Left),
+        }
+    }
+
+    /// A member is gone. Answers to earlier questions do not count any more.
+    pub(super) fn lose(&mut self, now: Time, node: NodeAddress, why: LossReason) {
+        let Some(member) = self.members.remove(&node) else { return };
+        let contest = self.contests.remove(&node);
+        self.remember(now, &member);
+        if why == LossReason::Left {
+            self.drop_contact(now, member.address);
+        } else {
+            let contact = self.contact_at(now, member.address);
+            contact.role = Role::Former { node, wait: 1, left: 0 };
+            contact.questions.clear();
+        }
+        let Announcement { incarnation, name, .. } = member.announcement;
+        let silent_us = u64::try_from(now.since(member.heard).as_micros()).unwrap_or(u64::MAX);
+        self.outputs.push_back(Output::Fact(MembershipFact::NodeLost { node, incarnation, why }));
+        self.outputs.push_back(Output::Event(NodeEvent::NodeLost {
+            node,
+            name,
+            incarnation,
+            why,
+            silent_us,
+        }));
+        if why == LossReason::ConnectionRefused {
+            // Perhaps only its GNCL restarts: then it answers this.
+            self.ask(now, member.address);
+        }
+        if let Some(contest) = contest
+            && self.may_still_be_there(&contest.newcomer)
+        {
+            self.arrive(now, contest.newcomer);
+        }
+    }
+
+    /// Whether nobody else has answered at that address since.
+    fn may_still_be_there(&self, proof: &Proof) -> bool {
+        let role = self.contacts.get(&proof.from).map(|contact| contact.role);
+        !matches!(role, Some(Role::Member(other)) if other != proof.announcement.node)
+    }
+
+    /// Keeps the last life of a lost node, so that a former one never comes back. // spec: NDL-7.1
+    fn remember(&mut self, now: Time, member: &Member) {
+        if self.gone.len() >= self.nodes_max
+            && let Some((node, address)) =
+                self.gone.iter().min_by_key(|(_, gone)| gone.since).map(|(node, gone)| (*node, gone.address))
+        {
+            self.gone.remove(&node);
+            self.forget_former(address, node);
+        }
+        let Announcement { node, incarnation, boot_nonce, .. } = member.announcement;
+        self.gone.insert(node, Gone { since: now, address: member.address, incarnation, boot_nonce });
+    }
+
+    fn contact_at(&mut self, now: Time, address: SocketAddr) -> &mut Contact {
+        self.contacts.entry(address).or_insert_with(|| Contact::new(now, Source::Query))
+    }
+
+    /// Nobody that we know is at `address` any more; a seed is still asked.
+    fn drop_contact(&mut self, now: Time, address: SocketAddr) {
+        let Some(contact) = self.contacts.remove(&address) else { return };
+        if contact.is_seed {
+            self.contacts.insert(address, Contact::new(now, Source::Seed));
+        }
+    }
+
+    fn forget_former(&mut self, address: SocketAddr, node: NodeAddress) {
+        if let Some(contact) = self.contacts.get(&address)
+            && matches!(contact.role, Role::Former { node: former, .. } if former == node)
+            && !contact.is_seed
+        {
+            self.contacts.remove(&address);
+        }
+    }
+}

@@ -1,0 +1,338 @@
+//! The membership core: datagrams, link facts and time in; orders to the shell and facts for others out.
+//!
+//! After each input the shell takes [`Core::poll`] until it is empty, then sleeps until [`Core::next_wake`]. The core
+//! outlives the shell: it stands in the node's stores, and a restarted shell goes on with the same members.
+//!
+//! | file | what it decides |
+//! | --- | --- |
+//! | `budget` | what a flood may cost |
+//! | `contact` | an address that is talked to |
+//! | `cycle` | who is asked when, and who missed too much |
+//! | `heard` | what a datagram means, and what it proves |
+//! | `lives` | who comes, goes, comes again, and who has an address that is taken |
+//! | `clock` | how far a peer's clock is from ours |
+
+mod budget;
+mod clock;
+mod contact;
+mod cycle;
+mod heard;
+mod lives;
+#[cfg(test)]
+mod tests;
+mod view;
+
+use std::{
+    collections::{BTreeMap, VecDeque},
+    hash::{DefaultHasher, Hash, Hasher},
+    net::{SocketAddr, SocketAddrV4},
+    time::Duration,
+};
+
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
+
+pub(crate) use self::view::MemberView;
+use self::{
+    budget::Strangers,
+    clock::PeerClock,
+    contact::{Contact, Question, Questions},
+    lives::{Contest, Gone},
+};
+use super::{
+    MembershipFact, NodeEvent,
+    datagram::{Announcement, Answer},
+};
+use crate::{config::NodeConfig, gncl::LinkFact, refusals::Refusals, stores::ClockOffset};
+
+/// What happened.
+#[derive(Clone, Debug)]
+pub(crate) enum Input {
+    /// Somebody asked.
+    QueryReceived { from: SocketAddr, way: Way, correlation: u64, sent: Time, announcement: Announcement },
+    /// Somebody answered; `sent` is in its clock.
+    AnswerReceived { from: SocketAddr, correlation: u64, sent: Time, answer: Answer },
+    /// Somebody said goodbye.
+    LeaveReceived { from: SocketAddr, announcement: Announcement },
+    /// Multicast DNS knows a node of this project at this address.
+    MdnsResolved { address: SocketAddr },
+    /// A connection of GNCL changed.
+    Link(LinkFact),
+    /// It is time for [`Core::next_wake`].
+    TimePassed,
+    /// The node stops in order.
+    Stopping,
+}
+
+/// What is to be done, or has become known.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Output {
+    SendQuery {
+        to: SocketAddr,
+        correlation: u64,
+    },
+    SendMulticastQuery {
+        correlation: u64,
+    },
+    SendAnswer {
+        to: SocketAddr,
+        node: NodeAddress,
+        correlation: u64,
+        query_sent: Time,
+        query_received: Time,
+    },
+    SendLeave {
+        to: SocketAddr,
+        node: NodeAddress,
+    },
+    /// For GNCL and the sync manager.
+    Fact(MembershipFact),
+    /// For applications.
+    Event(NodeEvent),
+    ClockMeasured {
+        node: NodeAddress,
+        offset: ClockOffset,
+    },
+    /// Two living processes have one node address; the newcomer is not made a member.
+    Collision {
+        node: NodeAddress,
+        holder: SocketAddr,
+        newcomer: SocketAddr,
+    },
+    /// This node's own address is another's already: it must not go on.
+    AddressTaken {
+        holder: SocketAddr,
+    },
+    /// Our own timer was this late: nobody was counted as silent.
+    Stalled {
+        late: Duration,
+    },
+}
+
+/// Which way a datagram came.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Way {
+    /// To this node's own address.
+    Unicast,
+    /// To the multicast group.
+    Multicast,
+}
+
+/// How a node was found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Source {
+    /// It is listed in this node's configuration.
+    Seed,
+    /// It spoke in the multicast group, or answered a query there.
+    Multicast,
+    /// Multicast DNS resolved its service.
+    Mdns,
+    /// It found this node first and asked it.
+    Query,
+}
+
+/// Counts as an instance of the shell: an older one that still runs is not listened to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Epoch(u64);
+
+/// A node that answers.
+#[derive(Debug)]
+struct Member {
+    announcement: Announcement,
+    address: SocketAddr,
+    /// Its last sign of life.
+    heard: Time,
+    /// Answers missed in a row.
+    missed: u32,
+    /// The last query of the cycle is not answered yet.
+    is_awaited: bool,
+    clock: PeerClock,
+    /// Its connection ended and did not come back yet.
+    is_link_broken: bool,
+}
+
+/// Who is there.
+#[derive(Debug)]
+pub(crate) struct Core {
+    /// What this node says about itself.
+    me: Announcement,
+    period: Duration,
+    missed_max: u32,
+    nodes_max: usize,
+    seeds: Vec<SocketAddr>,
+    asks_group: bool,
+    /// Makes correlation ids that nobody guesses who has not seen them.
+    secret: u128,
+    questions_asked: u64,
+
+    epoch: u64,
+    /// Our own UDP address; `None` before the first start.
+    udp: Option<SocketAddr>,
+    /// When the next cycle is due; `None` while nothing runs.
+    cycle_due: Option<Time>,
+    /// Until then, a living node with our address means that we are the newcomer.
+    settles: Option<Time>,
+    stall_reported: Option<Time>,
+
+    members: BTreeMap<NodeAddress, Member>,
+    gone: BTreeMap<NodeAddress, Gone>,
+    contests: BTreeMap<NodeAddress, Contest>,
+    contacts: BTreeMap<SocketAddr, Contact>,
+    group_questions: Questions,
+    strangers: Strangers,
+    collisions_reported: BTreeMap<NodeAddress, Time>,
+
+    outputs: VecDeque<Output>,
+    refusals: Refusals,
+    ignored: u64,
+}
+
+impl Core {
+    /// The core of the node at `node` that knows nobody yet. `boot_nonce` and `secret` are random; the second is told
+    /// to nobody.
+    pub(crate) fn new(
+        config: &NodeConfig,
+        node: NodeAddress,
+        incarnation: Incarnation,
+        boot_nonce: u64,
+        secret: u128,
+    ) -> Self {
+        let ndl = &config.ndl;
+        let me = Announcement {
+            project: config.project.clone(),
+            node,
+            name: config.name.clone(),
+            incarnation,
+            boot_nonce,
+            gncl_ip: 0,
+            gncl_port: 0,
+            period_us: u32::try_from(ndl.period.as_micros()).unwrap_or(u32::MAX),
+        };
+        Self {
+            me,
+            period: ndl.period,
+            missed_max: ndl.missed_max,
+            nodes_max: ndl.nodes_max,
+            seeds: ndl.seeds.clone(),
+            asks_group: ndl.multicast.is_some(),
+            secret,
+            questions_asked: 0,
+            epoch: 0,
+            udp: None,
+            cycle_due: None,
+            settles: None,
+            stall_reported: None,
+            members: BTreeMap::new(),
+            gone: BTreeMap::new(),
+            contests: BTreeMap::new(),
+            contacts: BTreeMap::new(),
+            group_questions: Questions::default(),
+            strangers: Strangers::new(Time::ZERO),
+            collisions_reported: BTreeMap::new(),
+            outputs: VecDeque::new(),
+            refusals: Refusals::default(),
+            ignored: 0,
+        }
+    }
+
+    /// A shell has bound its sockets: `udp` is our address for queries, `gncl` that of GNCL's listener. The first
+    /// queries are due at once.
+    pub(crate) fn start(&mut self, now: Time, udp: SocketAddr, gncl: SocketAddrV4) -> Epoch {
+        self.epoch += 1;
+        self.udp = Some(udp);
+        self.me.gncl_ip = gncl.ip().to_bits();
+        self.me.gncl_port = gncl.port();
+        self.begin(now);
+        Epoch(self.epoch)
+    }
+
+    /// Whether `epoch` is that of the newest shell.
+    pub(crate) const fn is_current(&self, epoch: Epoch) -> bool {
+        self.epoch == epoch.0
+    }
+
+    /// Takes in what happened.
+    pub(crate) fn handle(&mut self, now: Time, input: Input) {
+        if self.cycle_due.is_none() {
+            return;
+        }
+        match input {
+            Input::QueryReceived { from, way, correlation, sent, announcement } => {
+                if self.concerns_us(&announcement) {
+                    self.queried(now, from, way, (correlation, sent), &announcement);
+                }
+            }
+            Input::AnswerReceived { from, correlation, sent, answer } => {
+                if self.concerns_us(&answer.announcement) {
+                    self.answered(now, from, (correlation, sent), answer);
+                }
+            }
+            Input::LeaveReceived { from, announcement } => {
+                if self.concerns_us(&announcement) {
+                    self.taken_leave_of(now, from, &announcement);
+                }
+            }
+            Input::MdnsResolved { address } => self.resolved(now, address),
+            Input::Link(fact) => self.linked(now, fact),
+            Input::TimePassed => self.time_passed(now),
+            Input::Stopping => self.leave(),
+        }
+    }
+
+    /// The next order or fact.
+    pub(crate) fn poll(&mut self) -> Option<Output> {
+        self.outputs.pop_front()
+    }
+
+    /// When [`Input::TimePassed`] is due.
+    pub(crate) fn next_wake(&self) -> Option<Time> {
+        self.contests.values().map(|contest| contest.until).chain(self.cycle_due).min()
+    }
+
+    /// What this node says about itself.
+    pub(crate) const fn announcement(&self) -> &Announcement {
+        &self.me
+    }
+
+    /// Our own UDP address, the one that a restarted shell binds again.
+    pub(crate) const fn udp(&self) -> Option<SocketAddr> {
+        self.udp
+    }
+
+    /// What was refused.
+    pub(crate) const fn refusals(&self) -> &Refusals {
+        &self.refusals
+    }
+
+    /// Datagrams of other projects, and our own that came back.
+    pub(crate) const fn ignored(&self) -> u64 {
+        self.ignored
+    }
+
+    /// Asks `to`, whom there is a contact for.
+    fn ask(&mut self, now: Time, to: SocketAddr) {
+        let correlation = self.next_correlation();
+        if let Some(contact) = self.contacts.get_mut(&to) {
+            contact.questions.push(Question { correlation, asked: now });
+            self.outputs.push_back(Output::SendQuery { to, correlation });
+        }
+    }
+
+    /// A number that was not used before and cannot be guessed without the secret.
+    fn next_correlation(&mut self) -> u64 {
+        self.questions_asked += 1;
+        let mut hasher = DefaultHasher::new();
+        (self.secret, self.questions_asked).hash(&mut hasher);
+        hasher.finish()
+    }
+
+    /// Other projects and our own echo are none of our business. // spec: NDL-1.2
+    fn concerns_us(&mut self, announcement: &Announcement) -> bool {
+        let concerns =
+            announcement.project == self.me.project && announcement.boot_nonce != self.me.boot_nonce;
+        self.ignored += u64::from(!concerns);
+        concerns
+    }
+}

@@ -1,0 +1,524 @@
+//! What the rules of NDL promise, one scenario a promise.
+
+use std::net::SocketAddr;
+
+use proptest::prelude::*;
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
+
+use super::world::{PERIOD, Spec, World, ms, node, udp};
+use crate::{
+    gncl::LinkFact,
+    ndl::{
+        LossReason, MembershipFact, NodeEvent,
+        core::{Input, Output, Source, Way},
+        datagram::{Announcement, Answer, Body, Datagram, encode},
+    },
+};
+
+fn bytes(correlation: u64, body: Body) -> Vec<u8> {
+    encode(&Datagram { correlation, sent: Time::ZERO, body }, NodeAddress::ALL).to_vec()
+}
+
+fn stranger(address: u32) -> Announcement {
+    Announcement {
+        project: "p".to_owned(),
+        node: node(address),
+        name: "stranger".to_owned(),
+        incarnation: Incarnation(1),
+        boot_nonce: 0xbad,
+        gncl_ip: 0x0a00_0001,
+        gncl_port: 1,
+        period_us: 500_000,
+    }
+}
+
+#[test]
+fn a_node_that_starts_is_known_within_a_millisecond_and_knows_the_others() {
+    // given: a node in the middle of its period
+    let mut world = World::new();
+    world.start(1, &Spec::of(1));
+    world.run(ms(730));
+    // when
+    world.start(2, &Spec::of(2));
+    // then: five flights at most, of 100 us each
+    world.run_until(ms(1), |world| world.knows(1, 2) && world.knows(2, 1));
+    let found =
+        NodeEvent::NodeFound { node: node(2), name: "node-2".to_owned(), incarnation: Incarnation(1) };
+    assert_eq!(world.at(1).events, [found]);
+    let gncl = SocketAddr::from(([10, 0, 0, 1], 5_002));
+    let fact = MembershipFact::NodeFound { node: node(2), incarnation: Incarnation(1), gncl };
+    assert_eq!(world.at(1).facts, [fact.clone()]);
+    assert_eq!(world.at(1).core.membership(), [fact]);
+}
+
+// spec: NDL-2.1
+#[test]
+fn a_seed_on_one_side_alone_is_enough_for_both() {
+    let mut world = World::new();
+    world.start(1, &Spec { multicast: false, ..Spec::of(1) });
+    world.start(2, &Spec { multicast: false, seeds: vec![udp(1), udp(2)], ..Spec::of(2) });
+    world.run_until(ms(1), |world| world.knows(1, 2) && world.knows(2, 1));
+    let now = world.now;
+    let sources = |index| world.at(index).core.members(now)[0].sources.keys().copied().collect::<Vec<_>>();
+    assert!(sources(2).contains(&Source::Seed));
+    assert_eq!(sources(1), [Source::Query], "who has no source of his own was found by the other");
+}
+
+#[test]
+fn a_seed_that_starts_late_is_found_when_it_starts() {
+    let mut world = World::new();
+    world.start(1, &Spec { multicast: false, seeds: vec![udp(2)], ..Spec::of(1) });
+    world.run(PERIOD * 100);
+    world.start(2, &Spec { multicast: false, ..Spec::of(2) });
+    let took = world.run_until(PERIOD * 2, |world| world.knows(1, 2) && world.knows(2, 1));
+    assert!(took <= PERIOD + ms(1), "{took:?}");
+}
+
+// spec: NDL-2.3
+#[test]
+fn an_address_from_mdns_is_asked_at_once() {
+    let mut world = World::new();
+    world.start(1, &Spec { multicast: false, ..Spec::of(1) });
+    world.start(2, &Spec { multicast: false, ..Spec::of(2) });
+    world.input(1, Input::MdnsResolved { address: udp(2) });
+    world.run_until(ms(1), |world| world.knows(1, 2) && world.knows(2, 1));
+    assert!(world.at(1).core.members(world.now)[0].sources.contains_key(&Source::Mdns));
+}
+
+// spec: NDL-4.1
+#[test]
+fn a_node_is_lost_after_exactly_three_missed_answers() {
+    // given
+    let mut world = World::of_members(2);
+    // when: it dies right after it answered
+    world.run(PERIOD - ms(90));
+    world.kill(2);
+    let missed = |world: &World| world.at(1).core.members.get(&node(2)).map(|member| member.missed);
+    for expected in 0..3 {
+        assert_eq!(missed(&world), Some(expected));
+        world.run_until(PERIOD * 2, |world| missed(world) != Some(expected));
+    }
+    // then
+    assert_eq!(world.losses(1), [(2, LossReason::Silent)]);
+    let [NodeEvent::NodeLost { silent_us, .. }] = world.at(1).events[..] else { panic!("one loss") };
+    assert!((3 * 500_000..=4 * 500_000).contains(&silent_us), "{silent_us} us: within three to four periods");
+}
+
+#[test]
+fn two_missed_answers_are_forgiven_by_the_third() {
+    let mut world = World::of_members(2);
+    world.cut(2, 1);
+    world.run_until(PERIOD * 4, |world| world.at(1).core.members[&node(2)].missed == 2);
+    world.mend();
+    world.run(PERIOD * 4);
+    assert_eq!(world.losses(1), []);
+    assert_eq!(world.at(1).core.members[&node(2)].missed, 0);
+}
+
+// spec: NDL-4.2
+#[test]
+fn a_starved_node_accuses_nobody() {
+    for late_ms in [1, 250, 251, 400, 800, 1_600, 60_000] {
+        // given: it is starved just before a cycle
+        let mut world = World::of_members(3);
+        let due = world.at(1).core.next_wake().unwrap();
+        world.run(due.since(world.now) - ms(1));
+        // when
+        world.stall(1, ms(late_ms + 1));
+        world.run(ms(late_ms) + PERIOD * 4);
+        // then
+        assert_eq!(world.losses(1), [], "after {late_ms} ms");
+        let said = world.at(1).others.clone();
+        assert_eq!(said, if late_ms > 250 { vec![Output::Stalled { late: ms(late_ms) }] } else { vec![] });
+    }
+}
+
+#[test]
+fn a_restarted_shell_goes_on_with_the_members_and_accuses_nobody() {
+    // given: a shell that was away for three periods, its datagrams lost
+    let mut world = World::of_members(2);
+    world.cut(2, 1);
+    world.stall(1, PERIOD * 3);
+    world.run(PERIOD * 3 - ms(1));
+    world.mend();
+    // when
+    world.restart_shell(1);
+    world.run(PERIOD * 8);
+    // then
+    assert_eq!(world.losses(1), []);
+    assert!(world.knows(1, 2));
+}
+
+#[test]
+fn nodes_that_the_network_parted_find_each_other_again_without_any_source() {
+    // given: found through mDNS, which does not repeat itself
+    let mut world = World::new();
+    world.start(1, &Spec { multicast: false, ..Spec::of(1) });
+    world.start(2, &Spec { multicast: false, ..Spec::of(2) });
+    world.input(1, Input::MdnsResolved { address: udp(2) });
+    world.run(ms(1));
+    world.cut(1, 2);
+    world.cut(2, 1);
+    world.run(PERIOD * 100);
+    assert!(!world.knows(1, 2) && !world.knows(2, 1));
+    // when
+    world.mend();
+    // then: within the longest wait, which is 16 periods
+    world.run_until(PERIOD * 18, |world| world.knows(1, 2) && world.knows(2, 1));
+    let found =
+        NodeEvent::NodeFound { node: node(2), name: "node-2".to_owned(), incarnation: Incarnation(1) };
+    assert_eq!(world.at(1).events.last(), Some(&found), "the same life is found, not restarted");
+}
+
+// spec: NDL-4.3
+#[test]
+fn a_broken_and_refused_connection_is_a_loss_at_once() {
+    let mut world = World::of_members(2);
+    let (node, incarnation) = (node(2), Incarnation(1));
+    world.kill(2);
+    world.link(1, LinkFact::DialRefused { node, incarnation });
+    world.link(1, LinkFact::LinkBroken { node, incarnation });
+    assert_eq!(world.losses(1), [], "refused before it was up, or only broken");
+    world.link(1, LinkFact::DialRefused { node, incarnation: Incarnation(0) });
+    assert_eq!(world.losses(1), [], "a former life");
+    world.link(1, LinkFact::DialRefused { node, incarnation });
+    assert_eq!(world.losses(1), [(2, LossReason::ConnectionRefused)]);
+}
+
+#[test]
+fn a_refused_node_that_answers_a_later_question_is_found_again() {
+    // given: an answer to an earlier question is on its way
+    let mut world = World::of_members(2);
+    let (node, incarnation) = (node(2), Incarnation(1));
+    world.link(1, LinkFact::LinkBroken { node, incarnation });
+    world.cut(1, 2);
+    world.link(1, LinkFact::DialRefused { node, incarnation });
+    world.run(ms(1));
+    assert!(!world.knows(1, 2));
+    // when
+    world.mend();
+    // then
+    world.run_until(PERIOD + ms(2), |world| world.knows(1, 2));
+}
+
+// spec: NDL-4.4
+#[test]
+fn a_node_that_says_goodbye_has_left_and_is_found_when_it_comes_again() {
+    let mut world = World::of_members(2);
+    world.input(2, Input::Stopping);
+    world.run(ms(1));
+    assert_eq!(world.losses(1), [(2, LossReason::Left)]);
+    world.restart_shell(2);
+    world.run_until(ms(1), |world| world.knows(1, 2));
+}
+
+#[test]
+fn a_goodbye_with_a_forged_source_or_of_another_life_changes_nothing() {
+    let mut world = World::of_members(2);
+    let mut me = world.at(2).core.announcement().clone();
+    world.forge(udp(3), 1, &bytes(0, Body::Leave(me.clone())));
+    me.boot_nonce += 1;
+    world.forge(udp(2), 1, &bytes(0, Body::Leave(me)));
+    assert_eq!(world.losses(1), []);
+    assert_eq!(world.at(1).core.refusals().of("NDL leave of a stranger"), 2);
+}
+
+#[test]
+fn goodbye_on_the_connection_counts_as_well() {
+    let mut world = World::of_members(2);
+    world.link(1, LinkFact::PeerLeft { node: node(2), incarnation: Incarnation(1) });
+    assert_eq!(world.losses(1), [(2, LossReason::Left)]);
+}
+
+// spec: NDL-3.2
+#[test]
+fn a_query_with_a_forged_source_makes_no_member() {
+    let mut world = World::of_members(1);
+    world.forge(udp(9), 1, &bytes(1, Body::Query(stranger(9))));
+    world.run(PERIOD * 10);
+    assert_eq!(world.at(1).facts, []);
+    assert!(world.at(1).core.contacts.is_empty(), "nobody is asked for ever");
+}
+
+// spec: NDL-3.1
+#[test]
+fn an_answer_counts_only_from_the_address_that_was_asked_and_only_once() {
+    // given: the address of a stranger has been asked
+    let mut world = World::of_members(1);
+    world.forge(udp(9), 1, &bytes(1, Body::Query(stranger(9))));
+    let question = world.at(1).core.contacts[&udp(9)].questions.newest().unwrap();
+    let answer = |correlation| {
+        let answer = Answer { announcement: stranger(9), query_sent_ns: 0, query_received_ns: 0 };
+        bytes(correlation, Body::Answer(answer))
+    };
+    // when: guessed, and from elsewhere
+    world.forge(udp(9), 1, &answer(question.correlation ^ 1));
+    world.forge(udp(8), 1, &answer(question.correlation));
+    // then
+    assert!(!world.knows(1, 9));
+    // when: right, twice
+    world.forge(udp(9), 1, &answer(question.correlation));
+    world.forge(udp(9), 1, &answer(question.correlation));
+    // then
+    assert!(world.knows(1, 9));
+    let refusals = world.at(1).core.refusals();
+    assert_eq!(refusals.of("NDL answer without a question"), 3);
+    assert_eq!(refusals.of("NDL answer with false times"), 1, "its times make no clock");
+    assert!(!world.at(1).clocks.contains_key(&node(9)));
+}
+
+// spec: NDL-5.1
+#[test]
+fn a_restart_is_one_event_for_applications_and_two_facts_for_layers() {
+    for (index, what) in [(2, "at the same port"), (3, "at another port")] {
+        let mut world = World::of_members(2);
+        world.kill(2);
+        world.run(ms(20));
+        world.start(index, &Spec { incarnation: 2, ..Spec::of(2) });
+        world.run_until(ms(150), |world| !world.at(1).events.is_empty());
+        let restarted =
+            NodeEvent::NodeRestarted { node: node(2), name: "node-2".into(), incarnation: Incarnation(2) };
+        assert_eq!(world.at(1).events, [restarted], "{what}");
+        let [lost, found] = &world.at(1).facts[..] else { panic!("{what}: {:?}", world.at(1).facts) };
+        let why = LossReason::Restarted;
+        assert_eq!(*lost, MembershipFact::NodeLost { node: node(2), incarnation: Incarnation(1), why });
+        assert!(matches!(found, MembershipFact::NodeFound { incarnation: Incarnation(2), .. }));
+        world.run(PERIOD * 10);
+        assert_eq!(world.at(1).facts.len(), 2, "{what}: and then all is quiet");
+    }
+}
+
+#[test]
+fn a_new_life_after_a_loss_is_a_restart_too() {
+    let mut world = World::of_members(2);
+    world.kill(2);
+    world.run(PERIOD * 5);
+    world.start(2, &Spec { incarnation: 2, ..Spec::of(2) });
+    world.run(ms(10));
+    assert!(matches!(world.at(1).events[..], [NodeEvent::NodeLost { .. }, NodeEvent::NodeRestarted { .. }]));
+}
+
+// spec: NDL-5.2
+#[test]
+fn a_former_life_is_refused_also_after_the_later_one_is_lost() {
+    let mut world = World::new();
+    world.start(1, &Spec::of(1));
+    world.start(2, &Spec { incarnation: 7, ..Spec::of(2) });
+    world.run(ms(10));
+    world.start(3, &Spec { incarnation: 6, ..Spec::of(2) });
+    world.run(ms(10));
+    assert!(world.at(1).core.refusals().of("NDL answer of a former life") > 0);
+    world.kill(2);
+    world.run(PERIOD * 8);
+    assert!(!world.knows(1, 2));
+}
+
+// spec: NDL-5.4
+#[test]
+fn of_two_living_processes_with_one_address_the_newcomer_is_refused() {
+    for incarnation in [1, 2] {
+        // given: the newcomer knows nothing of the holder
+        let mut world = World::of_members(2);
+        world.cut(2, 3);
+        world.cut(3, 2);
+        // when
+        world.start(3, &Spec { incarnation, ..Spec::of(2) });
+        world.run(PERIOD * 6);
+        // then
+        assert_eq!(world.at(1).facts, [], "life {incarnation}");
+        let collision = Output::Collision { node: node(2), holder: udp(2), newcomer: udp(3) };
+        assert_eq!(world.at(1).others, [collision], "reported once in 10 s");
+        assert!(world.at(1).core.refusals().of("NDL node address used twice") > 1);
+        // when: the holder goes
+        world.kill(2);
+        world.run(PERIOD * 8);
+        // then: a later life takes over, an equal one never does
+        assert_eq!(world.knows(1, 2), incarnation == 2);
+    }
+}
+
+#[test]
+fn a_starved_judge_asks_again_before_a_newcomer_replaces_a_member() {
+    let mut world = World::of_members(2);
+    world.cut(2, 3);
+    world.cut(3, 2);
+    world.start(3, &Spec { incarnation: 2, ..Spec::of(2) });
+    world.run_until(ms(10), |world| !world.at(1).core.contests.is_empty());
+    world.stall(1, ms(200));
+    world.run(PERIOD * 2);
+    assert_eq!(world.at(1).facts, []);
+}
+
+// spec: NDL-5.5
+#[test]
+fn a_newcomer_that_finds_its_own_address_in_use_gives_up_and_the_holder_does_not() {
+    let mut world = World::of_members(2);
+    world.run(PERIOD * 5);
+    world.start(3, &Spec::of(2));
+    world.run(ms(10));
+    assert_eq!(world.at(3).others, [Output::AddressTaken { holder: udp(2) }]);
+    assert_eq!(world.at(3).core.next_wake(), None, "it is silent from now on");
+    assert_eq!(world.at(2).others, [Output::Collision { node: node(2), holder: udp(2), newcomer: udp(3) }]);
+    assert_eq!(world.at(1).facts, []);
+}
+
+// spec: NDL-1.2
+#[test]
+fn other_projects_are_not_seen() {
+    let mut world = World::new();
+    world.start(1, &Spec::of(1));
+    world.start(2, &Spec { project: "q", seeds: vec![udp(1)], ..Spec::of(2) });
+    world.run(PERIOD * 3);
+    assert!(!world.knows(1, 2) && !world.knows(2, 1));
+    assert!(world.at(1).core.ignored() > 0);
+    assert_eq!(world.at(1).core.refusals().total(), 0);
+}
+
+// spec: NDL-7.2
+#[test]
+fn a_flood_costs_a_bounded_number_of_datagrams_and_no_member() {
+    // given
+    let mut world = World::of_members(2);
+    let query = bytes(1, Body::Query(stranger(9)));
+    // when: for four periods, one address writes 50,000 queries a second, with a member's address on half of them
+    for tick in 0..2_000_u64 {
+        for burst in 0..50 {
+            let from = if burst % 2 == 0 { udp(9) } else { udp(2) };
+            world.forge(from, 1, &query);
+        }
+        world.run(ms(1));
+        assert!(world.knows(1, 2), "after {tick} ms");
+    }
+    // then: answers to 50 and 500 a second, and one question for every 10 ms at most
+    assert_eq!(world.losses(1), []);
+    assert!(world.at(1).datagrams_sent < 100 + 500 + 2 * (550 + 200) + 50, "{}", world.at(1).datagrams_sent);
+}
+
+// spec: NDL-7.1
+#[test]
+fn forged_addresses_fill_no_table_and_keep_no_newcomer_out() {
+    let mut world = World::new();
+    world.start(1, &Spec::of(1));
+    for host in 0..5_000_u32 {
+        let from = SocketAddr::from((std::net::Ipv4Addr::from(0x0b00_0000 + host), 7));
+        world.forge(from, 1, &bytes(1, Body::Query(stranger(9))));
+        world.run(ms(1));
+        assert!(world.at(1).core.contacts.len() <= 64);
+    }
+    world.start(2, &Spec::of(2));
+    world.run_until(PERIOD * 2, |world| world.knows(1, 2));
+}
+
+#[test]
+fn no_more_members_than_the_configuration_allows() {
+    let mut world = World::new();
+    world.start(1, &Spec { nodes_max: 3, ..Spec::of(1) });
+    (2..10).for_each(|index| world.start(index, &Spec::of(index.into())));
+    world.run(PERIOD * 3);
+    assert_eq!(world.at(1).core.members.len(), 3);
+    assert!(world.at(1).core.refusals().of("more nodes than `ndl.nodes_max`") > 0);
+}
+
+// spec: NDL-6
+#[test]
+fn clocks_of_two_hosts_are_known_within_half_a_round_trip() {
+    let mut world = World::new();
+    world.start(1, &Spec::of(1));
+    world.start(2, &Spec { clock_ns: -987_654_321_000, ..Spec::of(2) });
+    world.run(ms(10));
+    let offset = world.at(1).clocks[&node(2)];
+    assert_eq!(offset.theirs_minus_ours_ns, -987_654_321_000);
+    assert!(offset.bound <= ms(1), "{offset:?}");
+    assert_eq!(world.at(2).clocks[&node(1)].theirs_minus_ours_ns, 987_654_321_000);
+    let view = &world.at(1).core.members(world.now)[0];
+    assert_eq!(view.round_trip, Some(std::time::Duration::from_micros(200)));
+}
+
+#[test]
+fn thirty_nodes_are_quiet_when_all_know_each_other() {
+    let mut world = World::of_members(30);
+    world.run(PERIOD * 4);
+    for index in 1..=30 {
+        assert_eq!(world.at(index).facts, []);
+        // Each period: a query to and an answer for each of 29, and one to the group of 30.
+        assert!(world.at(index).datagrams_sent <= 5 * (29 * 2 + 30), "{}", world.at(index).datagrams_sent);
+    }
+}
+
+/// Anything that can reach a core, in any order.
+fn any_input() -> impl Strategy<Value = (u64, Input)> {
+    let addresses = (1u16..6).prop_map(udp);
+    let announcement = (1u32..6, 0u64..4, 0u64..4).prop_map(|(address, incarnation, boot_nonce)| {
+        Announcement { incarnation: Incarnation(incarnation), boot_nonce, ..stranger(address) }
+    });
+    let input =
+        (addresses, announcement, 0..7, any::<bool>()).prop_map(|(from, announcement, what, flag)| {
+            let Announcement { node, incarnation, .. } = announcement;
+            match what {
+                0 => {
+                    let way = if flag { Way::Unicast } else { Way::Multicast };
+                    Input::QueryReceived { from, way, correlation: 1, sent: Time::ZERO, announcement }
+                }
+                1 | 2 => {
+                    let answer = Answer { announcement, query_sent_ns: 0, query_received_ns: 0 };
+                    Input::AnswerReceived { from, correlation: 0, sent: Time::ZERO, answer }
+                }
+                3 => Input::LeaveReceived { from, announcement },
+                4 => Input::MdnsResolved { address: from },
+                5 if flag => Input::Link(LinkFact::LinkBroken { node, incarnation }),
+                5 => Input::Link(LinkFact::DialRefused { node, incarnation }),
+                _ => Input::TimePassed,
+            }
+        });
+    (0u64..700, input)
+}
+
+proptest! {
+    /// Whatever happens: layers hear of each life once, found before lost; tables agree; the bounds hold.
+    #[test]
+    fn facts_alternate_and_tables_agree(inputs in proptest::collection::vec(any_input(), 1..200)) {
+        let mut core = Spec { nodes_max: 3, ..Spec::of(1) }.core(99);
+        let mut now = Time::from_nanos(1_000_000_000);
+        core.start(now, udp(0), "10.0.0.1:5".parse().unwrap());
+        let mut there = std::collections::BTreeMap::new();
+        for (gap, input) in inputs {
+            now = now + ms(gap);
+            // Half of the answers are to a question that was really asked.
+            let input = match input {
+                Input::AnswerReceived { from, sent, answer, .. } => {
+                    let question = core.contacts.get(&from).and_then(|contact| contact.questions.newest());
+                    let correlation = question.map_or(0, |question| question.correlation);
+                    Input::AnswerReceived { from, correlation, sent, answer }
+                }
+                other => other,
+            };
+            core.handle(now, input);
+            while let Some(output) = core.poll() {
+                match output {
+                    Output::Fact(MembershipFact::NodeFound { node, incarnation, .. }) => {
+                        prop_assert_eq!(there.insert(node, incarnation), None);
+                    }
+                    Output::Fact(MembershipFact::NodeLost { node, incarnation, .. }) => {
+                        prop_assert_eq!(there.remove(&node), Some(incarnation));
+                    }
+                    Output::AddressTaken { .. } => {
+                        core.start(now, udp(0), "10.0.0.1:5".parse().unwrap());
+                    }
+                    _ => {}
+                }
+            }
+            prop_assert!(core.members.keys().eq(there.keys()));
+            prop_assert!(core.members.len() <= 3 && core.gone.len() <= 3 && core.contacts.len() <= 9);
+            prop_assert!(core.contests.keys().all(|node| core.members.contains_key(node)));
+            prop_assert!(core.members.keys().all(|node| !core.gone.contains_key(node)));
+            for (node, member) in &core.members {
+                let role = core.contacts.get(&member.address).map(|contact| contact.role);
+                prop_assert_eq!(role, Some(super::super::contact::Role::Member(*node)));
+            }
+            prop_assert!(core.next_wake().is_some());
+        }
+    }
+}

@@ -1,0 +1,329 @@
+//! A network of cores in virtual time: datagrams take 100 us, and arrive as bytes.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    net::{Ipv4Addr, SocketAddr, SocketAddrV4},
+    time::Duration,
+};
+
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
+
+use crate::{
+    config::NodeConfig,
+    gncl::LinkFact,
+    ndl::{
+        LossReason, MembershipFact, NodeEvent,
+        core::{Core, Input, Output, Way},
+        datagram::{Answer, Body, Datagram, encode},
+    },
+    stores::ClockOffset,
+};
+
+pub(super) const PERIOD: Duration = Duration::from_millis(500);
+const FLIGHT: Duration = Duration::from_micros(100);
+
+pub(super) fn ms(millis: u64) -> Duration {
+    Duration::from_millis(millis)
+}
+
+/// The UDP address of the `index`-th process.
+pub(super) fn udp(index: u16) -> SocketAddr {
+    SocketAddr::from(([10, 0, 0, 1], 1_000 + index))
+}
+
+pub(super) fn node(address: u32) -> NodeAddress {
+    NodeAddress::new(address)
+}
+
+/// What a process is like.
+#[derive(Clone, Debug)]
+pub(super) struct Spec {
+    pub(super) node: u32,
+    pub(super) incarnation: u64,
+    pub(super) project: &'static str,
+    pub(super) seeds: Vec<SocketAddr>,
+    pub(super) multicast: bool,
+    pub(super) nodes_max: usize,
+    /// Its clock minus the world's.
+    pub(super) clock_ns: i64,
+}
+
+impl Spec {
+    pub(super) fn of(node: u32) -> Self {
+        Self {
+            node,
+            incarnation: 1,
+            project: "p",
+            seeds: Vec::new(),
+            multicast: true,
+            nodes_max: 64,
+            clock_ns: 0,
+        }
+    }
+
+    pub(super) fn core(&self, boot_nonce: u64) -> Core {
+        let mut config = NodeConfig::new(format!("node-{}", self.node));
+        config.project = self.project.to_owned();
+        config.ndl.seeds.clone_from(&self.seeds);
+        config.ndl.nodes_max = self.nodes_max;
+        config.ndl.period = PERIOD;
+        if !self.multicast {
+            config.ndl.multicast = None;
+        }
+        let secret = u128::from(boot_nonce) << 3;
+        Core::new(&config, node(self.node), Incarnation(self.incarnation), boot_nonce, secret)
+    }
+}
+
+/// One process.
+pub(super) struct Process {
+    pub(super) core: Core,
+    clock_ns: i64,
+    is_alive: bool,
+    /// Until then it gets no processor.
+    stalled_until: Time,
+    pub(super) facts: Vec<MembershipFact>,
+    pub(super) events: Vec<NodeEvent>,
+    pub(super) others: Vec<Output>,
+    pub(super) clocks: BTreeMap<NodeAddress, ClockOffset>,
+    pub(super) datagrams_sent: usize,
+}
+
+struct Flying {
+    from: SocketAddr,
+    to: SocketAddr,
+    way: Way,
+    bytes: Vec<u8>,
+}
+
+/// All processes and what flies between them.
+pub(super) struct World {
+    pub(super) now: Time,
+    pub(super) processes: BTreeMap<SocketAddr, Process>,
+    flying: BTreeMap<(Time, u64), Flying>,
+    sequence: u64,
+    cut: BTreeSet<(SocketAddr, SocketAddr)>,
+}
+
+impl World {
+    pub(super) fn new() -> Self {
+        Self {
+            // Later than any clock is behind.
+            now: Time::from_nanos(1_000_000_000_000),
+            processes: BTreeMap::new(),
+            flying: BTreeMap::new(),
+            sequence: 0,
+            cut: BTreeSet::new(),
+        }
+    }
+
+    /// A world in which the nodes 1 to `count`, at `udp` of their numbers, know each other.
+    pub(super) fn of_members(count: u16) -> Self {
+        let mut world = Self::new();
+        (1..=count).for_each(|index| world.start(index, &Spec::of(index.into())));
+        world.run(ms(100));
+        (1..=count).for_each(|index| assert_eq!(world.at(index).core.members.len(), usize::from(count) - 1));
+        world.forget_the_past();
+        world
+    }
+
+    pub(super) fn forget_the_past(&mut self) {
+        for process in self.processes.values_mut() {
+            process.facts.clear();
+            process.events.clear();
+            process.others.clear();
+            process.datagrams_sent = 0;
+        }
+    }
+
+    pub(super) fn start(&mut self, index: u16, spec: &Spec) {
+        let nonce = u64::from(index) << 32 | u64::from(spec.node) << 8 | spec.incarnation;
+        let core = spec.core(nonce);
+        let process = Process {
+            core,
+            clock_ns: spec.clock_ns,
+            is_alive: true,
+            stalled_until: Time::ZERO,
+            facts: Vec::new(),
+            events: Vec::new(),
+            others: Vec::new(),
+            clocks: BTreeMap::new(),
+            datagrams_sent: 0,
+        };
+        self.processes.insert(udp(index), process);
+        self.restart_shell(index);
+    }
+
+    pub(super) fn restart_shell(&mut self, index: u16) {
+        let gncl = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 1), 5_000 + index);
+        self.with(udp(index), |core, now| {
+            core.start(now, udp(index), gncl);
+        });
+    }
+
+    pub(super) fn kill(&mut self, index: u16) {
+        self.process(index).is_alive = false;
+    }
+
+    pub(super) fn stall(&mut self, index: u16, duration: Duration) {
+        let until = self.now + duration;
+        self.process(index).stalled_until = until;
+    }
+
+    /// Datagrams from one to the other are lost.
+    pub(super) fn cut(&mut self, from: u16, to: u16) {
+        self.cut.insert((udp(from), udp(to)));
+    }
+
+    pub(super) fn mend(&mut self) {
+        self.cut.clear();
+    }
+
+    pub(super) fn link(&mut self, index: u16, fact: LinkFact) {
+        self.input(index, Input::Link(fact));
+    }
+
+    pub(super) fn input(&mut self, index: u16, input: Input) {
+        self.with(udp(index), |core, now| core.handle(now, input));
+    }
+
+    /// A datagram that somebody wrote by hand, with whatever source address.
+    pub(super) fn forge(&mut self, from: SocketAddr, to: u16, bytes: &[u8]) {
+        self.with(udp(to), |core, now| core.receive(now, from, Way::Unicast, bytes));
+    }
+
+    pub(super) fn at(&self, index: u16) -> &Process {
+        &self.processes[&udp(index)]
+    }
+
+    pub(super) fn process(&mut self, index: u16) -> &mut Process {
+        self.processes.get_mut(&udp(index)).unwrap()
+    }
+
+    pub(super) fn knows(&self, index: u16, address: u32) -> bool {
+        self.at(index).core.members.contains_key(&node(address))
+    }
+
+    /// Why `index` lost nodes, in order.
+    pub(super) fn losses(&self, index: u16) -> Vec<(u32, LossReason)> {
+        let facts = self.at(index).facts.iter().filter_map(|fact| match fact {
+            MembershipFact::NodeLost { node, why, .. } => Some((node.bits(), *why)),
+            MembershipFact::NodeFound { .. } => None,
+        });
+        facts.collect()
+    }
+
+    /// Runs until `condition` holds, for `limit` at most; how long that took.
+    pub(super) fn run_until(&mut self, limit: Duration, condition: impl Fn(&Self) -> bool) -> Duration {
+        let start = self.now;
+        while !condition(self) {
+            assert!(self.now < start + limit, "did not happen within {limit:?}");
+            self.step(start + limit);
+        }
+        self.now.since(start)
+    }
+
+    pub(super) fn run(&mut self, duration: Duration) {
+        let end = self.now + duration;
+        while self.now < end {
+            self.step(end);
+        }
+    }
+
+    /// Goes to the next event, or to `end` if there is none before it.
+    fn step(&mut self, end: Time) {
+        let arrival = self.flying.keys().next().map(|(time, _)| *time);
+        let wakes = self.processes.iter().filter(|(_, process)| process.is_alive);
+        let wake = wakes
+            .filter_map(|(address, process)| Some((process.wake()?, *address)))
+            .min_by_key(|(time, address)| (*time, *address));
+        let wake_time = wake.map_or(Time::MAX, |(time, _)| time);
+        let next = arrival.unwrap_or(Time::MAX).min(wake_time).max(self.now);
+        if next > end {
+            self.now = end;
+            return;
+        }
+        self.now = next;
+        // A timer goes before a datagram of the same moment: the harder order.
+        match wake {
+            Some((time, address)) if time <= next => {
+                self.with(address, |core, now| core.handle(now, Input::TimePassed));
+            }
+            Some(_) | None => self.land(),
+        }
+    }
+
+    fn land(&mut self) {
+        let Some((_, flying)) = self.flying.pop_first() else { return };
+        let Some(process) = self.processes.get(&flying.to).filter(|process| process.is_alive) else { return };
+        if process.stalled_until > self.now {
+            // It waits in the socket.
+            self.sequence += 1;
+            self.flying.insert((process.stalled_until, self.sequence), flying);
+            return;
+        }
+        self.with(flying.to, |core, now| core.receive(now, flying.from, flying.way, &flying.bytes));
+    }
+
+    fn with(&mut self, address: SocketAddr, act: impl FnOnce(&mut Core, Time)) {
+        let process = self.processes.get_mut(&address).unwrap();
+        let now = self.now.shifted(process.clock_ns);
+        act(&mut process.core, now);
+        while let Some(output) = self.processes.get_mut(&address).unwrap().core.poll() {
+            self.obey(address, now, output);
+        }
+    }
+
+    fn obey(&mut self, from: SocketAddr, now: Time, output: Output) {
+        let process = self.processes.get_mut(&from).unwrap();
+        let me = process.core.announcement().clone();
+        match output {
+            Output::SendQuery { to, correlation } => {
+                self.send(from, to, Datagram { correlation, sent: now, body: Body::Query(me) });
+            }
+            Output::SendMulticastQuery { correlation } => {
+                let bytes =
+                    encode(&Datagram { correlation, sent: now, body: Body::Query(me) }, NodeAddress::ALL);
+                let all: Vec<SocketAddr> = self.processes.keys().copied().collect();
+                all.into_iter().for_each(|to| self.fly(from, to, Way::Multicast, &bytes));
+            }
+            Output::SendAnswer { to, correlation, query_sent, query_received, .. } => {
+                let (query_sent_ns, query_received_ns) = (query_sent.as_nanos(), query_received.as_nanos());
+                let answer = Answer { announcement: me, query_sent_ns, query_received_ns };
+                self.send(from, to, Datagram { correlation, sent: now, body: Body::Answer(answer) });
+            }
+            Output::SendLeave { to, .. } => {
+                self.send(from, to, Datagram { correlation: 0, sent: now, body: Body::Leave(me) });
+            }
+            Output::Fact(fact) => process.facts.push(fact),
+            Output::Event(event) => process.events.push(event),
+            Output::ClockMeasured { node, offset } => drop(process.clocks.insert(node, offset)),
+            other @ (Output::Collision { .. } | Output::AddressTaken { .. } | Output::Stalled { .. }) => {
+                process.others.push(other);
+            }
+        }
+    }
+
+    fn send(&mut self, from: SocketAddr, to: SocketAddr, datagram: Datagram) {
+        self.fly(from, to, Way::Unicast, &encode(&datagram, NodeAddress::ALL));
+    }
+
+    fn fly(&mut self, from: SocketAddr, to: SocketAddr, way: Way, bytes: &[u8]) {
+        self.processes.get_mut(&from).unwrap().datagrams_sent += 1;
+        if !self.cut.contains(&(from, to)) {
+            self.sequence += 1;
+            let flying = Flying { from, to, way, bytes: bytes.to_vec() };
+            self.flying.insert((self.now + FLIGHT, self.sequence), flying);
+        }
+    }
+}
+
+impl Process {
+    /// When its timer wakes it, in the world's time.
+    fn wake(&self) -> Option<Time> {
+        Some(self.core.next_wake()?.shifted(-self.clock_ns).max(self.stalled_until))
+    }
+}

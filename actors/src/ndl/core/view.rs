@@ -1,0 +1,68 @@
+//! What a tool can ask NDL: who is there, how it was found, how it does.
+
+use std::{collections::BTreeMap, net::SocketAddr, time::Duration};
+
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
+
+use super::{Core, Source};
+use crate::{ndl::MembershipFact, stores::ClockOffset};
+
+/// A node that is there.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct MemberView {
+    /// Its address.
+    pub(crate) node: NodeAddress,
+    /// Its name.
+    pub(crate) name: String,
+    /// Which life of it this is.
+    pub(crate) incarnation: Incarnation,
+    /// Where its NDL answers.
+    pub(crate) udp: SocketAddr,
+    /// Where its GNCL listens.
+    pub(crate) gncl: SocketAddr,
+    /// Time between two of its queries.
+    pub(crate) period: Duration,
+    /// How it was found, and when in each way first.
+    pub(crate) sources: BTreeMap<Source, Time>,
+    /// Its last sign of life.
+    pub(crate) heard: Time,
+    /// Answers that it missed in a row.
+    pub(crate) missed: u32,
+    /// Time of the last query and its answer on the network.
+    pub(crate) round_trip: Option<Duration>,
+    /// How far its clock is from ours.
+    pub(crate) offset: Option<ClockOffset>,
+}
+
+impl Core {
+    /// Who is there, in the order of their addresses.
+    pub(crate) fn members(&self, now: Time) -> Vec<MemberView> {
+        let views = self.members.iter().map(|(node, member)| MemberView {
+            node: *node,
+            name: member.announcement.name.clone(),
+            incarnation: member.announcement.incarnation,
+            udp: member.address,
+            gncl: member.announcement.gncl().into(),
+            period: Duration::from_micros(member.announcement.period_us.into()),
+            sources: self.contacts.get(&member.address).map(|c| c.sources.clone()).unwrap_or_default(),
+            heard: member.heard,
+            missed: member.missed,
+            round_trip: member.clock.round_trip(),
+            offset: member.clock.offset(now, Duration::ZERO),
+        });
+        views.collect()
+    }
+
+    /// The facts that a layer would know by now if it had missed none.
+    pub(crate) fn membership(&self) -> Vec<MembershipFact> {
+        let facts = self.members.values().map(|member| MembershipFact::NodeFound {
+            node: member.announcement.node,
+            incarnation: member.announcement.incarnation,
+            gncl: member.announcement.gncl().into(),
+        });
+        facts.collect()
+    }
+}

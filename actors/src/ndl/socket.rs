@@ -1,0 +1,93 @@
+//! NDL's two UDP sockets: one of its own for queries and answers, one in the multicast group.
+
+use std::{
+    io,
+    net::{Ipv4Addr, SocketAddr, SocketAddrV4, UdpSocket},
+};
+
+use socket2::{Domain, Protocol, Socket, Type};
+
+/// Room for the answers of a thousand members, where the system grants it (`net.core.rmem_max`).
+const RECEIVE_BUFFER: usize = 1 << 20;
+
+/// Binds the socket for queries and answers. Multicast leaves by the same interface, for this network only and for
+/// this host, too.
+pub(super) fn bind_unicast(interface: Ipv4Addr, port: u16) -> io::Result<UdpSocket> {
+    // Without address reuse: a port that another process has must be noticed.
+    let socket = udp()?;
+    socket.bind(&SocketAddrV4::new(interface, port).into())?;
+    socket.set_multicast_if_v4(&interface)?;
+    socket.set_multicast_ttl_v4(1)?;
+    socket.set_multicast_loop_v4(true)?;
+    Ok(socket.into())
+}
+
+/// Binds a socket that hears the multicast group on one interface.
+pub(super) fn join_group(group: SocketAddrV4, interface: Ipv4Addr) -> io::Result<UdpSocket> {
+    let socket = udp()?;
+    // Every node of the host hears the group.
+    socket.set_reuse_address(true)?;
+    // Bound to the group's address and deaf to other interfaces, this hears nothing but the group.
+    socket.bind(&group.into())?;
+    #[cfg(target_os = "linux")]
+    socket.set_multicast_all_v4(false)?;
+    socket.join_multicast_v4(group.ip(), &interface)?;
+    Ok(socket.into())
+}
+
+fn udp() -> io::Result<Socket> {
+    let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
+    socket.set_nonblocking(true)?;
+    // The system may grant less; then a burst loses datagrams, which NDL can bear.
+    let _ = socket.set_recv_buffer_size(RECEIVE_BUFFER);
+    Ok(socket)
+}
+
+/// Sends one datagram now or not at all: a full socket loses it, as the network may.
+pub(super) fn send(socket: &UdpSocket, bytes: &[u8], to: SocketAddr) -> io::Result<()> {
+    socket.send_to(bytes, to).map(drop)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    /// The watchdog of a blocking test.
+    const DEADLINE: Duration = Duration::from_secs(10);
+
+    #[test]
+    fn multicast_on_loopback_reaches_every_socket_of_the_group_and_not_another_group() {
+        // given: two listeners of a group, and one of another group at the same port
+        let sender = bind_unicast(Ipv4Addr::LOCALHOST, 0).unwrap();
+        let port = sender.local_addr().unwrap().port();
+        let group = SocketAddrV4::new(Ipv4Addr::new(239, 255, 1, 1), port);
+        let other = SocketAddrV4::new(Ipv4Addr::new(239, 255, 1, 2), port);
+        let listeners = [group, group, other].map(|group| {
+            let socket = join_group(group, Ipv4Addr::LOCALHOST).unwrap();
+            socket.set_nonblocking(false).unwrap();
+            socket.set_read_timeout(Some(DEADLINE)).unwrap();
+            socket
+        });
+        // when
+        send(&sender, b"to the group", group.into()).unwrap();
+        send(&sender, b"to the others", other.into()).unwrap();
+        // then
+        for (listener, expected) in
+            listeners.iter().zip([&b"to the group"[..], &b"to the group"[..], &b"to the others"[..]])
+        {
+            let mut buffer = [0; 64];
+            let (length, from) = listener.recv_from(&mut buffer).unwrap();
+            assert_eq!(&buffer[..length], expected);
+            assert_eq!(from, sender.local_addr().unwrap());
+        }
+    }
+
+    #[test]
+    fn a_port_that_is_in_use_is_noticed() {
+        let first = bind_unicast(Ipv4Addr::LOCALHOST, 0).unwrap();
+        let port = first.local_addr().unwrap().port();
+        assert_eq!(bind_unicast(Ipv4Addr::LOCALHOST, port).unwrap_err().kind(), io::ErrorKind::AddrInUse);
+    }
+}

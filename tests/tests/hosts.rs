@@ -1,0 +1,78 @@
+//! Four nodes on four hosts: found, held at the barrier, talking, cut off, back.
+
+use std::{fmt::Write, net::SocketAddrV4};
+
+use sinew_tests::{Hosts, OwnDirectory, Program, node_under_test, own_group};
+
+const NAMES: [&str; 4] = ["central", "hip", "knee", "ankle"];
+
+/// A node on `host` that discovers by multicast on the hosts' own network.
+fn configuration(directory: &OwnDirectory, index: usize, group: SocketAddrV4) -> std::path::PathBuf {
+    let (name, address) = (NAMES[index], index + 1);
+    let path = directory.join(&format!("{name}.toml"));
+    let mut text = String::new();
+    write!(
+        text,
+        "[node]\nname = \"{name}\"\nproject = \"hosts\"\n\
+         [ndl]\ninterface = \"10.77.0.{address}\"\nmulticast = \"{group}\"\nperiod_ms = 100\n"
+    )
+    .expect("a string takes any text");
+    std::fs::write(&path, text).expect("the test's own directory");
+    path
+}
+
+fn start(
+    hosts: &Hosts,
+    directory: &OwnDirectory,
+    index: usize,
+    group: SocketAddrV4,
+    more: &[&str],
+) -> Program {
+    node_under_test(Some(&hosts.all()[index]), &configuration(directory, index, group), more)
+}
+
+#[test]
+fn four_hosts_find_each_other_wait_talk_and_notice_a_cut_link() {
+    let hosts = match Hosts::new(4) {
+        Ok(hosts) => hosts,
+        Err(why) => {
+            println!("skipped: no hosts can be made here: {why}");
+            return;
+        }
+    };
+    let (directory, group) = (OwnDirectory::new(), own_group());
+
+    // Three are there, and wait for the fourth.
+    let everybody = ["--requires", "hip", "--requires", "knee", "--requires", "ankle", "--sends-to", "ankle"];
+    let mut central = start(&hosts, &directory, 0, group, &everybody);
+    let mut hip = start(&hosts, &directory, 1, group, &[]);
+    let mut knee = start(&hosts, &directory, 2, group, &[]);
+    hip.wait_for(&["NodeFound", "central"]);
+    knee.wait_for(&["NodeFound", "central"]);
+    assert!(central.said().iter().all(|line| !line.contains("started")), "the barrier holds");
+
+    // With it, messages flow.
+    let mut ankle = start(&hosts, &directory, 3, group, &[]);
+    central.wait_for(&["started"]);
+    ankle.wait_for(&["count 1 from 10.77.0.1"]);
+    for node in [&mut hip, &mut knee] {
+        node.wait_for(&["NodeFound", "ankle"]);
+    }
+
+    // Its link is cut: every other node says so, and it says so of every other.
+    hosts.cut(3);
+    for node in [&mut hip, &mut knee, &mut central] {
+        node.wait_for(&["NodeLost", "ankle", "Silent"]);
+    }
+    ankle.wait_for(&["NodeLost", "central"]);
+    central.wait_for(&["requirement", "Lost", "ankle"]);
+
+    // And joined again: found, and talking where it stopped.
+    hosts.join(3);
+    for node in [&mut hip, &mut knee, &mut central] {
+        node.wait_for(&["NodeFound", "ankle"]);
+    }
+    central.wait_for(&["requirement", "Met", "ankle"]);
+    ankle.wait_for(&["NodeFound", "central"]);
+    ankle.wait_for(&["count", "from 10.77.0.1"]);
+}

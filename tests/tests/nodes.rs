@@ -1,0 +1,115 @@
+//! Whole nodes on this host: found, killed, restarted, stopped in order, configured wrongly.
+
+use std::{net::SocketAddrV4, path::PathBuf};
+
+use rustix::process::Signal;
+use sinew_tests::{OwnDirectory, Program, node_under_test, own_group};
+
+/// A node of a scenario: its own address on loopback, the scenario's own multicast group.
+struct Scenario {
+    directory: OwnDirectory,
+    group: SocketAddrV4,
+}
+
+impl Scenario {
+    fn new() -> Self {
+        Self { directory: OwnDirectory::new(), group: own_group() }
+    }
+
+    fn configuration(&self, name: &str, address: u8) -> PathBuf {
+        let path = self.directory.join(&format!("{name}.toml"));
+        let text = format!(
+            "[node]\nname = \"{name}\"\naddress = \"127.0.0.{address}\"\nproject = \"nodes\"\n\
+             [ndl]\nmulticast = \"{}\"\nmdns_port = false\n",
+            self.group
+        );
+        std::fs::write(&path, text).expect("the test's own directory");
+        path
+    }
+
+    fn start(&self, name: &str, address: u8, more: &[&str]) -> Program {
+        node_under_test(None, &self.configuration(name, address), more)
+    }
+}
+
+#[test]
+fn an_application_waits_for_another_nodes_and_its_messages_arrive_in_order() {
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee", "--sends-to", "knee"]);
+    hip.wait_for(&["up"]);
+    let mut knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["started"]);
+    for number in 1..=20 {
+        knee.wait_for(&[&format!("count {number} from 127.0.0.1"), &format!("after {}", number - 1)]);
+    }
+}
+
+#[test]
+fn a_killed_node_is_lost_at_once_and_its_next_life_is_a_restart() {
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &[]);
+    let mut knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["NodeFound", "knee"]);
+    knee.wait_for(&["NodeFound", "hip"]);
+    knee.signal(Signal::KILL);
+    hip.wait_for(&["NodeLost", "knee", "ConnectionRefused"]);
+    let mut knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["NodeRestarted", "knee"]);
+    knee.wait_for(&["NodeFound", "hip"]);
+}
+
+#[test]
+fn a_node_that_is_told_to_stop_tells_its_application_and_says_goodbye() {
+    for signal in [Signal::TERM, Signal::INT] {
+        let scenario = Scenario::new();
+        let mut hip = scenario.start("hip", 1, &[]);
+        let mut knee = scenario.start("knee", 2, &[]);
+        hip.wait_for(&["NodeFound", "knee"]);
+        knee.signal(signal);
+        knee.wait_for(&["stopping"]);
+        assert_eq!(knee.wait_for_end(), Some(0));
+        hip.wait_for(&["NodeLost", "knee", "Left"]);
+    }
+}
+
+#[test]
+fn a_frozen_node_is_lost_and_found_again_when_it_thaws() {
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &[]);
+    let mut knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["NodeFound", "knee"]);
+    knee.wait_for(&["NodeFound", "hip"]);
+    knee.signal(Signal::STOP);
+    hip.wait_for(&["NodeLost", "knee", "Silent"]);
+    knee.signal(Signal::CONT);
+    hip.wait_for(&["NodeFound", "knee"]);
+}
+
+#[test]
+fn a_wrong_configuration_is_refused_with_all_its_faults() {
+    let scenario = Scenario::new();
+    let path = scenario.directory.join("wrong.toml");
+    std::fs::write(&path, "[node]\nname = \"\"\n[ndl]\nperiod_ms = 1\ncolour = \"red\"\n")
+        .expect("own directory");
+    let mut wrong = node_under_test(None, &path, &[]);
+    assert_eq!(wrong.wait_for_end(), Some(1));
+    let said = wrong.said().join("\n");
+    for fault in ["node.name", "ndl.period_ms", "ndl.colour"] {
+        assert!(said.contains(fault), "{fault} is not in:\n{said}");
+    }
+}
+
+#[test]
+fn a_second_node_with_the_same_address_is_not_let_in() {
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &[]);
+    let mut knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["NodeFound", "knee"]);
+    let mut impostor = scenario.start("impostor", 2, &[]);
+    impostor.wait_for(&["up"]);
+    // Whoever it is that the newcomer meets, the two that were there go on.
+    let mut ankle = scenario.start("ankle", 3, &["--requires", "knee", "--sends-to", "knee"]);
+    ankle.wait_for(&["started"]);
+    knee.wait_for(&["count", "from 127.0.0.3"]);
+    assert!(hip.said().iter().all(|line| !line.contains("impostor")));
+}
