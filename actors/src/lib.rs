@@ -41,7 +41,7 @@ mod sync;
 pub use api::{ApiError, Endpoint, NodeApi, Received, Registration};
 pub use config::{ConfigFaults, NodeConfig};
 pub use lncl::RegisterError;
-pub use ndl::{LossReason, NodeEvent};
+pub use ndl::{KnownNode, LossReason, NodeEvent, Source};
 pub use node::{Node, NodeBuilder, NodeEnd, NodeHandle, StartError};
 pub use serde;
 pub use sinew_runtime::{
@@ -54,7 +54,8 @@ pub use sinew_runtime::{
     time::Time,
     wire::{Class, Kind, MessageBuffer, Payload},
 };
-pub use sync::{RequirementEvent, Waiting};
+pub use stores::ClockOffset;
+pub use sync::{DirectoryEntry, RequirementEvent, Waiting};
 
 /// Everything that an ordinary program needs, in one line: `use sinew::prelude::*;`
 pub mod prelude {

@@ -103,11 +103,11 @@ pub(crate) struct ClockOffsets(Mutex<BTreeMap<NodeAddress, ClockOffset>>);
 
 /// How far a peer's monotonic clock is from ours.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct ClockOffset {
+pub struct ClockOffset {
     /// Their clock minus ours, in nanoseconds.
-    pub(crate) theirs_minus_ours_ns: i64,
+    pub theirs_minus_ours_ns: i64,
     /// The error is at most this: half the round trip of the best sample.
-    pub(crate) bound: Duration,
+    pub bound: Duration,
 }
 
 impl ClockOffsets {

@@ -119,7 +119,7 @@ struct Shell {
     socket: std::net::UdpSocket,
     /// The core's next wake is not the one that the timer sleeps for.
     rewind: Notify,
-    refusals: Refusals,
+    refusals: Arc<Refusals>,
 }
 
 impl Shell {
@@ -142,7 +142,7 @@ impl Shell {
         let reader = socket.try_clone().map_err(unbound)?;
         let epoch = lock(&stores).start(Time::now(), udp, gncl);
         tracing::info!(%udp, %gncl, "NDL asks and answers");
-        let (rewind, refusals) = (Notify::new(), Refusals::default());
+        let (rewind, refusals) = (Notify::new(), stores.refusals.clone());
         Ok((Self { stores, epoch, socket, rewind, refusals }, reader))
     }
 

@@ -16,6 +16,7 @@ pub use builder::{NodeBuilder, StartError};
 pub(crate) use root::RootEvent;
 
 use std::{
+    net::SocketAddr,
     process::ExitCode,
     sync::{Arc, mpsc::Receiver},
     time::Duration,
@@ -29,8 +30,9 @@ use sinew_runtime::{
 };
 
 use crate::{
+    ndl::KnownNode,
     stores::{Stores, lock},
-    sync::Waiting,
+    sync::{DirectoryEntry, Waiting},
 };
 
 /// How a node ended.
@@ -145,6 +147,37 @@ impl NodeHandle {
     #[must_use]
     pub fn waiting(&self) -> Vec<Waiting> {
         lock(&self.stores.sync).waiting(Time::now())
+    }
+
+    /// The nodes that are there, as this node's NDL sees them, in the order of their addresses.
+    #[must_use]
+    pub fn members(&self) -> Vec<KnownNode> {
+        lock(&self.stores.ndl).members(Time::now())
+    }
+
+    /// Every application that has a name, on any node that is known.
+    #[must_use]
+    pub fn directory(&self) -> Vec<DirectoryEntry> {
+        lock(&self.stores.sync).directory()
+    }
+
+    /// Where GNCL listens, once it does.
+    #[must_use]
+    pub fn gncl_address(&self) -> Option<SocketAddr> {
+        self.stores.gncl_listen.get().copied()
+    }
+
+    /// Where NDL takes queries and answers, once it does.
+    #[must_use]
+    pub fn ndl_address(&self) -> Option<SocketAddr> {
+        lock(&self.stores.ndl).udp()
+    }
+
+    /// How often something that came from outside was refused, or a message was taken by nobody.
+    #[must_use]
+    pub fn refused(&self) -> u64 {
+        let Stores { refusals, gncl, router, ndl, .. } = &*self.stores;
+        refusals.total() + gncl.refusals.total() + lock(ndl).refusals().total() + router.refused()
     }
 
     /// Tells the node to stop; returns at once.

@@ -24,7 +24,7 @@ use crate::{lncl::AppFact, node::RootEvent, refusals::Refusals, stores::Stores};
 pub(crate) struct SyncManager {
     stores: Arc<Stores>,
     ready: Option<ReadyGate>,
-    refusals: Refusals,
+    refusals: Arc<Refusals>,
     /// The timer that is set, and for when.
     alarm: Option<(Time, SpawnHandle)>,
 }
@@ -32,7 +32,8 @@ pub(crate) struct SyncManager {
 impl SyncManager {
     /// A sync manager on the core in `stores`; it opens `ready` when messages reach it.
     pub(crate) fn new(stores: Arc<Stores>, ready: ReadyGate) -> Self {
-        Self { stores, ready: Some(ready), refusals: Refusals::default(), alarm: None }
+        let refusals = stores.refusals.clone();
+        Self { stores, ready: Some(ready), refusals, alarm: None }
     }
 }
 

@@ -34,7 +34,7 @@ use sinew_runtime::{
     time::Time,
 };
 
-pub(crate) use self::view::MemberView;
+pub use self::view::KnownNode;
 use self::{
     budget::Strangers,
     clock::PeerClock,
@@ -122,7 +122,7 @@ pub(crate) enum Way {
 
 /// How a node was found.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Source {
+pub enum Source {
     /// It is listed in this node's configuration.
     Seed,
     /// It spoke in the multicast group, or answered a query there.

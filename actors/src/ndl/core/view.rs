@@ -12,35 +12,35 @@ use crate::{ndl::MembershipFact, stores::ClockOffset};
 
 /// A node that is there.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct MemberView {
+pub struct KnownNode {
     /// Its address.
-    pub(crate) node: NodeAddress,
+    pub node: NodeAddress,
     /// Its name.
-    pub(crate) name: String,
+    pub name: String,
     /// Which life of it this is.
-    pub(crate) incarnation: Incarnation,
+    pub incarnation: Incarnation,
     /// Where its NDL answers.
-    pub(crate) udp: SocketAddr,
+    pub udp: SocketAddr,
     /// Where its GNCL listens.
-    pub(crate) gncl: SocketAddr,
+    pub gncl: SocketAddr,
     /// Time between two of its queries.
-    pub(crate) period: Duration,
+    pub period: Duration,
     /// How it was found, and when in each way first.
-    pub(crate) sources: BTreeMap<Source, Time>,
+    pub sources: BTreeMap<Source, Time>,
     /// Its last sign of life.
-    pub(crate) heard: Time,
+    pub heard: Time,
     /// Answers that it missed in a row.
-    pub(crate) missed: u32,
+    pub missed: u32,
     /// Time of the last query and its answer on the network.
-    pub(crate) round_trip: Option<Duration>,
+    pub round_trip: Option<Duration>,
     /// How far its clock is from ours.
-    pub(crate) offset: Option<ClockOffset>,
+    pub offset: Option<ClockOffset>,
 }
 
 impl Core {
     /// Who is there, in the order of their addresses.
-    pub(crate) fn members(&self, now: Time) -> Vec<MemberView> {
-        let views = self.members.iter().map(|(node, member)| MemberView {
+    pub(crate) fn members(&self, now: Time) -> Vec<KnownNode> {
+        let views = self.members.iter().map(|(node, member)| KnownNode {
             node: *node,
             name: member.announcement.name.clone(),
             incarnation: member.announcement.incarnation,
