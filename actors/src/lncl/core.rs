@@ -271,8 +271,10 @@ impl Registry {
             return Err(RegisterError::NotFixed(app));
         }
         let Some(entry) = self.apps.get(&app) else { return Ok(app) };
-        let holder =
-            entry.name.as_ref().map_or("an application without a name".to_owned(), |n| format!("'{n}'"));
+        let holder = entry
+            .name
+            .as_ref()
+            .map_or_else(|| "an application without a name".to_owned(), |n| format!("'{n}'"));
         Err(RegisterError::AddressTaken { address: app, holder, owner: entry.owner.to_string() })
     }
 
