@@ -19,6 +19,9 @@ const REFERENCE: Stroke = Stroke::dashed("#555555", 1.6);
 const TRUE_PHASE: Stroke = Stroke::solid("#222222", 2.4);
 const ESTIMATED_PHASE: Stroke = Stroke::solid("#E69F00", 1.6);
 
+/// Gap in the phase error from which on it is drawn as a gap, strides.
+const STRIDES_UNKNOWN_MIN: f64 = 0.05;
+
 const WIDTH: f64 = 1240.0;
 const COLUMN_LEFT: [f64; 3] = [80.0, 480.0, 880.0];
 const COLUMN_WIDTH: f64 = 320.0;
@@ -257,9 +260,17 @@ fn broken_at_wraps(points: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
     broken(points, 50.0)
 }
 
-/// Lifts the pen where an error jumps around half a stride.
+/// Lifts the pen where an error jumps around half a stride, and where there is no estimate for a while.
 fn broken_at_jumps(points: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
-    broken(points, 20.0)
+    let mut out: Vec<(f64, f64)> = Vec::with_capacity(points.len());
+    for point in broken(points, 20.0) {
+        if out.last().is_some_and(|last| point.0 - last.0 > STRIDES_UNKNOWN_MIN) {
+            // A line across the gap would show an error nobody measured.
+            out.push((point.0, f64::NAN));
+        }
+        out.push(point);
+    }
+    out
 }
 
 fn broken(points: Vec<(f64, f64)>, jump: f64) -> Vec<(f64, f64)> {
@@ -278,6 +289,13 @@ mod tests {
     use super::*;
     use crate::intention::Intention;
     use crate::lockstep::{LockStepConfig, run};
+
+    #[test]
+    fn phase_error_is_not_drawn_where_nothing_was_estimated() {
+        let drawn = broken_at_jumps(vec![(6.99, 1.0), (7.0, 1.2), (9.0, 0.1), (9.01, 0.1)]);
+        assert_eq!(drawn.len(), 5);
+        assert!(drawn[2].1.is_nan());
+    }
 
     #[test]
     fn lateness_has_a_panel_only_when_it_was_measured() {
