@@ -307,6 +307,7 @@ impl Core {
     }
 
     /// Datagrams of other projects, and our own that came back.
+    #[cfg(test)]
     pub(crate) const fn ignored(&self) -> u64 {
         self.ignored
     }
