@@ -233,6 +233,7 @@ impl Registry {
     }
 
     fn check_name(&self, name: Option<&str>) -> Result<(), RegisterError> {
+        // spec: LNCL-5
         let Some(name) = name else { return Ok(()) };
         check_spelling(name)?;
         let Some(holder) = self.names.get(name) else { return Ok(()) };
@@ -240,7 +241,7 @@ impl Registry {
         Err(RegisterError::NameTaken { name: name.to_owned(), holder: *holder, owner })
     }
 
-    /// The ids of `names`, none of which means anything else.
+    /// The ids of `names`, none of which means anything else. spec: LNCL-8
     fn check_kinds(&self, names: &[String]) -> Result<BTreeMap<Kind, String>, RegisterError> {
         let mut claimed = BTreeMap::new();
         for name in names {
@@ -279,7 +280,7 @@ impl Registry {
     }
 
     /// The next free address, round the whole range: one that was given back is not given out again soon, so that a
-    /// late message for its former holder finds nobody and not somebody else.
+    /// late message for its former holder finds nobody and not somebody else. spec: LNCL-5
     fn free_dynamic(&mut self) -> AppAddress {
         loop {
             let index = self.next_dynamic;

@@ -340,3 +340,60 @@ impl sinew_runtime::outcome::ReceiptSink for Told {
         self.0.send(outcome).unwrap();
     }
 }
+
+const DOCUMENTATION: &str = include_str!("../../../docs/protocol/lncl.md");
+
+/// The block of the documentation that starts with `fence` after `heading`.
+fn block(heading: &str, fence: &str) -> &'static str {
+    let section = DOCUMENTATION.split_once(heading).expect("the section is there").1;
+    let block = section.split_once(fence).expect("the block begins").1;
+    block.split_once("```").expect("the block ends").0
+}
+
+#[test]
+fn the_bytes_in_the_documentation_are_a_registration() {
+    let node = TestNode::start();
+    let text = block("## The bytes of a registration", "```text");
+    let bytes: Vec<_> = text.split_whitespace().map(|byte| u8::from_str_radix(byte, 16).unwrap()).collect();
+    let mut client = RawClient::connect(&node);
+    client.send_bytes(&bytes);
+    let tid = client.expect_registered();
+    assert_eq!(registrar::resolve(&node.stores, "hip"), Some(tid));
+}
+
+#[test]
+#[ignore = "needs python3, which a machine that builds Sinew need not have"]
+fn the_client_in_the_documentation_answers_and_confirms() {
+    let mut node = TestNode::start();
+    let mut python = std::process::Command::new("python3")
+        .args(["-c", block("## A whole client", "```python"), node.path().to_str().unwrap()])
+        .spawn()
+        .expect("python3 is there");
+    let AppFact::Registered { app, name, .. } = node.fact() else { panic!("no registration") };
+    assert_eq!(name.as_deref(), Some("echo"));
+    assert_eq!(node.fact(), AppFact::Ready { app });
+    let (mut asking, tid) = RawClient::register(&node, &Register::default());
+    node.fact();
+    node.fact();
+    let mut request = confirmed(tid, Tid::new(node.address(), app), 4);
+    request.header.flags = Flags::CONFIRM.with(Flags::ASK);
+    asking.send(&request);
+    let reply = asking.next().unwrap();
+    assert_eq!((reply.header.flags, reply.header.correlation), (Flags::REPLY, 4));
+    assert_eq!(reply.decode::<Angle>().unwrap(), Angle { degrees: 1.0 });
+    assert_eq!(outcome_of(&asking.next().unwrap()), (4, Outcome::Delivered));
+    python.kill().unwrap();
+    python.wait().unwrap();
+    assert_eq!(node.fact(), AppFact::Unregistered { app }, "a killed process is noticed");
+}
+
+#[test]
+fn a_registration_nested_without_end_is_refused() {
+    let node = TestNode::start();
+    let mut payload = vec![0x81, 0xa1, b'y'];
+    payload.extend([0x91; 8_000]);
+    let mut client = RawClient::connect(&node);
+    client.send(&Message::new(Header::new(Kind::LNCL_REGISTER, Tid::NONE, Tid::NONE), payload.into()));
+    assert!(client.expect_refusal().contains("cannot be read"));
+    assert_alive(&node);
+}
