@@ -23,7 +23,7 @@ use super::{
 };
 use crate::{
     outlet::{LinkNumber, OutletLimits, StreamOutlet},
-    stores::Stores,
+    stores::{Stores, lock},
 };
 
 /// Time for the first frame.
@@ -135,7 +135,7 @@ impl Client {
         let request = Request { address, name, requires: requires.clone(), kinds, owner: peer.owner() };
         let app = registrar::register_client(&server.stores, request)?;
         let tid = Tid::new(server.stores.node, app);
-        let name = registrar::registry(&server.stores).name_of(app);
+        let name = lock(&server.stores.registry).name_of(app);
         let outlet = Arc::new(StreamOutlet::new(limits(&server.stores)));
         server.add_outlet(peer.id, outlet.clone());
         tracing::info!(%tid, name, pid = peer.pid, "an application of another process has registered");

@@ -210,12 +210,8 @@ impl Registry {
         name.unwrap_or_else(|| app.to_string())
     }
 
-    /// Whether `app` is in another process.
-    pub(crate) fn is_in_other_process(&self, app: AppAddress) -> bool {
-        self.apps.get(&app).is_some_and(|entry| entry.owner != Owner::Node)
-    }
-
     /// How many applications there are.
+    #[cfg(test)]
     pub(crate) fn len(&self) -> usize {
         self.apps.len()
     }

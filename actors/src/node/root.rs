@@ -190,7 +190,8 @@ impl Root {
                     tracing::error!(%app, "LNCL's post is full; a client's registration ends at its deadline");
                 }
             }
-            (Some(_), None) => tracing::error!(%app, "released before its supervisor was there"),
+            // The node stops: nothing is started any more.
+            (Some(_), None) => {}
         }
     }
 

@@ -14,6 +14,7 @@ use crate::joint::{Joint, PerJoint};
 use crate::leg::{BODY_MASS_KG, GRAVITY_M_S2};
 use crate::message::{FootLoad, GaitMode, GaitState, JointSample, Stance};
 use crate::phase::PhaseEstimate;
+use crate::phase::hand_over::{HandOver, HandOverConfig};
 use crate::phase::heel_strike::CONTACT_BW;
 use crate::phase::oscillator::{Oscillator, OscillatorGains};
 use crate::phase::stride_clock::StrideClock;
@@ -23,6 +24,8 @@ use crate::phase::stride_clock::StrideClock;
 pub enum Estimator {
     /// Adaptive oscillator on the hip angle, zeroed by heel strikes.
     Oscillator(OscillatorGains),
+    /// Stride clock first, oscillator when it has proved itself. The default.
+    HandOver(HandOverConfig),
     /// Time since heel strike over the mean of the last three strides; believes in strides of this many seconds
     /// until it has seen some.
     StrideClock {
@@ -51,7 +54,7 @@ pub struct CentralConfig {
 impl Default for CentralConfig {
     fn default() -> Self {
         Self {
-            estimator: Estimator::Oscillator(OscillatorGains::default()),
+            estimator: Estimator::HandOver(HandOverConfig::default()),
             input_age_max_ns: 10_000_000,
             strikes_trusted: 3,
             strike_error_max: 0.10,
@@ -97,6 +100,7 @@ enum Stage {
 #[derive(Debug, Clone)]
 enum RunningEstimator {
     Oscillator(Box<Oscillator>),
+    HandOver(Box<HandOver>),
     StrideClock(StrideClock),
 }
 
@@ -249,6 +253,7 @@ impl CentralCore {
         let load_bw = load_bw(load);
         self.estimate = match &mut self.estimator {
             RunningEstimator::Oscillator(oscillator) => oscillator.tick(hip_deg, load_bw, dt_s),
+            RunningEstimator::HandOver(both) => both.tick(hip_deg, load_bw, dt_s),
             RunningEstimator::StrideClock(clock) => clock.tick(load_bw, dt_s),
         };
         self.since_strike_s += dt_s;
@@ -294,6 +299,7 @@ impl RunningEstimator {
     fn cold(estimator: Estimator) -> Self {
         match estimator {
             Estimator::Oscillator(gains) => Self::Oscillator(Box::new(Oscillator::new(gains))),
+            Estimator::HandOver(config) => Self::HandOver(Box::new(HandOver::new(config))),
             Estimator::StrideClock { stride_s } => Self::StrideClock(StrideClock::new(stride_s)),
         }
     }

@@ -18,6 +18,8 @@ fn heel_strikes_from_the_stance_column_agree_with_the_event_file() {
         .lines()
         .skip(2)
         .filter_map(|line| line.split(',').nth(3).and_then(|field| field.parse().ok()))
+        // The other events of the last line have no right heel strike beside them.
+        .filter(|time_s: &f64| time_s.is_finite())
         .collect();
     assert_eq!(trial.heel_strikes_s().len(), events.len());
     for (ours, theirs) in trial.heel_strikes_s().iter().zip(&events) {

@@ -1,5 +1,7 @@
 //! Links that break, are made again, and end in order.
 
+use std::sync::atomic::Ordering;
+
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
     tid::Tid,
@@ -7,7 +9,7 @@ use sinew_runtime::{
 };
 
 use super::bench::{ByHand, Cable, NINE, Node, next, pair, run};
-use crate::gncl::{Event, LinkFact, peer::frame};
+use crate::gncl::{LinkFact, peer::frame};
 
 #[test]
 fn two_nodes_that_find_each_other_at_once_have_one_link_and_use_it_both_ways() {
@@ -113,10 +115,11 @@ fn a_silent_peer_is_pinged() {
 #[test]
 fn a_node_that_leaves_says_goodbye_last_and_its_peer_knows_that_it_left() {
     run(async {
-        let (a, mut b) = pair().await;
+        let (mut a, mut b) = pair().await;
         let mut inbox = b.app(1);
         a.send(b.tid(1), b"the last word");
-        a.tell(Event::Leave);
+        a.stores.stopping.store(true, Ordering::Relaxed);
+        a.stop_layer();
         assert_eq!(&next("the last word", &mut inbox).await.payload[..], b"the last word");
         let left = b.fact_that(|fact| !matches!(fact, LinkFact::LinkUp { .. })).await;
         assert!(matches!(left, LinkFact::PeerLeft { node, .. } if node == a.address()));

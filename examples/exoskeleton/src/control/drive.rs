@@ -15,7 +15,7 @@
 use super::admission::Admission;
 use super::faults::{DriveCounters, FaultBits};
 use super::ramp::{AssistRamp, RateLimiter};
-use super::torque_law::TorqueLaw;
+use super::torque_law::{LawPhase, TorqueLaw};
 use crate::joint::Joint;
 use crate::message::{DriveState, DriveStatus, GaitMode, GaitState, JointSample};
 
@@ -35,6 +35,9 @@ pub struct DriveConfig {
     pub safe_damping_nms_rad: f64,
     /// Time in which assistance rises to full, seconds. Default 0.5.
     pub reentry_s: f64,
+    /// Time from a command to its torque, seconds: bus and motor together. The moment is fed forward by as much.
+    /// Default 6 ms: one message and the lag of the simulated device.
+    pub device_lag_s: f64,
     /// Oldest input that is used, ns. Default 10 ms; above 20 ms a stuck torque becomes dangerous.
     pub input_age_max_ns: u64,
 }
@@ -48,6 +51,7 @@ impl DriveConfig {
             rate_limit_nm_s: 2000.0,
             safe_damping_nms_rad: 1.0,
             reentry_s: 0.5,
+            device_lag_s: 0.006,
             input_age_max_ns: 10_000_000,
         }
     }
@@ -126,7 +130,7 @@ impl DriveCore {
         let fresh_sample = self.samples.fresh(now_ns).copied();
         let fresh_gait = self.gait.fresh(now_ns).copied();
         self.judge_state(fresh_sample.is_some(), fresh_gait.map(|g| g.mode));
-        let (target_nm, saturated) = self.target(fresh_sample, fresh_gait, dt_s);
+        let (target_nm, saturated) = self.target((now_ns, dt_s), fresh_sample, fresh_gait);
         let limit_nm = self.config.law.limit_nm;
         let torque_nm = self.limiter.toward(target_nm.clamp(-limit_nm, limit_nm), dt_s);
         self.count(now_ns, saturated, fresh_sample.is_some() && fresh_gait.is_some());
@@ -232,14 +236,18 @@ impl DriveCore {
     }
 
     /// The torque to go to, Nm, and whether the law met its limit.
-    fn target(&mut self, sample: Option<JointSample>, gait: Option<GaitState>, dt_s: f64) -> (f64, bool) {
+    fn target(
+        &mut self,
+        (now_ns, dt_s): (u64, f64),
+        sample: Option<JointSample>,
+        gait: Option<GaitState>,
+    ) -> (f64, bool) {
         match (self.state, sample, gait) {
             (DriveState::Walk, Some(sample), Some(gait)) => {
-                let torque = self.config.law.torque(
-                    (f64::from(gait.phase), f64::from(gait.phase_rate_hz)),
-                    f64::from(sample.angle_rad),
-                    f64::from(sample.velocity_rad_s),
-                );
+                let phase = law_phase(&gait, &sample, now_ns, self.config.device_lag_s);
+                let (angle_rad, velocity_rad_s) =
+                    (f64::from(sample.angle_rad), f64::from(sample.velocity_rad_s));
+                let torque = self.config.law.torque(&phase, angle_rad, velocity_rad_s);
                 (self.ramp.rise(dt_s) * torque.torque_nm, torque.saturated)
             }
             (DriveState::Safe, Some(sample), _) => {
@@ -264,6 +272,18 @@ impl DriveCore {
         }
         let age_ns = self.samples.age_ns(now_ns).max(self.gait.age_ns(now_ns));
         self.age_max_ns = self.age_max_ns.max(age_ns.unwrap_or(0));
+    }
+}
+
+/// Carries the phase from the stamp of the gait state to the stamp of the sample, and to when the torque will act.
+fn law_phase(gait: &GaitState, sample: &JointSample, now_ns: u64, device_lag_s: f64) -> LawPhase {
+    let (phase, rate_hz) = (f64::from(gait.phase), f64::from(gait.phase_rate_hz));
+    let sample_after_s = (sample.t_ns as f64 - gait.t_ns as f64) * 1e-9;
+    let effect_after_s = (now_ns as f64 - gait.t_ns as f64) * 1e-9 + device_lag_s;
+    LawPhase {
+        at_sample: phase + rate_hz * sample_after_s,
+        at_effect: phase + rate_hz * effect_after_s,
+        rate_hz,
     }
 }
 

@@ -20,6 +20,17 @@ pub struct TorqueLaw {
     pub limit_nm: f64,
 }
 
+/// The phase as the law needs it: what is known is a little old, and what is ordered acts a little later.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LawPhase {
+    /// Phase when angle and velocity were measured, cycles: the reference they are compared with.
+    pub at_sample: f64,
+    /// Phase when the torque will act, cycles: the moment that is fed forward.
+    pub at_effect: f64,
+    /// Phase rate, cycles per second.
+    pub rate_hz: f64,
+}
+
 /// A torque within the limit, and whether the limit was met.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LimitedTorque {
@@ -48,13 +59,14 @@ impl TorqueLaw {
         }
     }
 
-    /// Torque at the estimated phase (cycles, cycles per second) for the measured angle (rad) and velocity (rad/s).
+    /// Torque for the measured angle (rad) and velocity (rad/s).
     #[must_use]
-    pub fn torque(&self, (phase, rate_hz): (f64, f64), angle_rad: f64, velocity_rad_s: f64) -> LimitedTorque {
-        let reference = curves::angle_rad(self.joint, phase);
-        let wanted = self.assist * self.body_mass_kg * curves::moment_nm_per_kg(self.joint, phase)
+    pub fn torque(&self, phase: &LawPhase, angle_rad: f64, velocity_rad_s: f64) -> LimitedTorque {
+        let reference = curves::angle_rad(self.joint, phase.at_sample);
+        let moment = curves::moment_nm_per_kg(self.joint, phase.at_effect);
+        let wanted = self.assist * self.body_mass_kg * moment
             + self.stiffness_nm_rad * (reference.value - angle_rad)
-            + self.damping_nms_rad * (reference.slope * rate_hz - velocity_rad_s);
+            + self.damping_nms_rad * (reference.slope * phase.rate_hz - velocity_rad_s);
         LimitedTorque {
             torque_nm: wanted.clamp(-self.limit_nm, self.limit_nm),
             saturated: wanted.abs() >= self.limit_nm,
@@ -66,12 +78,14 @@ impl TorqueLaw {
 mod tests {
     use super::*;
 
+    const HALF_WAY: LawPhase = LawPhase { at_sample: 0.5, at_effect: 0.5, rate_hz: 0.75 };
+
     #[test]
     fn limit_is_never_exceeded() {
         for joint in Joint::ALL {
             let law = TorqueLaw::standard(joint);
             for angle in [-3.0, 0.0, 3.0] {
-                let torque = law.torque((0.5, 0.75), angle, -10.0 * angle);
+                let torque = law.torque(&HALF_WAY, angle, -10.0 * angle);
                 assert!(torque.torque_nm.abs() <= law.limit_nm);
             }
         }
@@ -81,7 +95,7 @@ mod tests {
     fn leg_on_the_reference_gets_its_share_of_the_moment_only() {
         let law = TorqueLaw::standard(Joint::Ankle);
         let on = curves::angle_rad(Joint::Ankle, 0.5);
-        let torque = law.torque((0.5, 0.75), on.value, on.slope * 0.75);
+        let torque = law.torque(&HALF_WAY, on.value, on.slope * 0.75);
         let share = 0.4 * 80.0 * curves::moment_nm_per_kg(Joint::Ankle, 0.5);
         assert!((torque.torque_nm - share).abs() < 1e-9 && share < -40.0, "{share}");
     }

@@ -1,5 +1,6 @@
 //! Where in its stride the leg is: estimators of the gait phase from hip angle and foot load.
 
+pub mod hand_over;
 pub mod heel_strike;
 pub mod oscillator;
 pub mod stride_clock;

@@ -29,20 +29,20 @@ impl StrideClock {
 
     /// Takes the vertical load (body weights), `dt_s` after the last one.
     pub fn tick(&mut self, load_bw: f64, dt_s: f64) -> PhaseEstimate {
-        let phase_before = self.phase;
         let strike = self.strikes.tick(load_bw, dt_s);
         let interval_s = strike.and_then(|s| s.interval_s).filter(|s| *s < STRIDE_LONGEST_S);
+        let strike_error = interval_s.map(|s| 1.0 - s / self.mean_s());
         if let Some(interval_s) = interval_s {
             self.durations_s[self.counted % STRIDES_MEANED] = interval_s;
             self.counted += 1;
         }
-        let mean_s = self.durations_s.iter().sum::<f64>() / STRIDES_MEANED as f64;
+        let mean_s = self.mean_s();
         self.phase = self.strikes.since_strike_s().map_or(0.0, |s| (s / mean_s).min(1.0));
-        PhaseEstimate {
-            phase: self.phase.rem_euclid(1.0),
-            rate_hz: 1.0 / mean_s,
-            strike_error: interval_s.map(|_| super::wrapped(-phase_before)),
-        }
+        PhaseEstimate { phase: self.phase.rem_euclid(1.0), rate_hz: 1.0 / mean_s, strike_error }
+    }
+
+    fn mean_s(&self) -> f64 {
+        self.durations_s.iter().sum::<f64>() / STRIDES_MEANED as f64
     }
 }
 

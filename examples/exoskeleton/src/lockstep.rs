@@ -1,0 +1,109 @@
+//! The whole robot in virtual time: all cores in one thread, each message one millisecond on its way.
+//!
+//! The loop is closed: central listens to the simulated hip, not to a recording. The same configuration gives the
+//! same record bit by bit. Nothing here says anything about real-time performance.
+
+mod world;
+
+use thiserror::Error;
+
+use crate::central::CentralConfig;
+use crate::intention::{Intention, IntentionError};
+use crate::joint::PerJoint;
+use crate::part::Kill;
+use crate::plant::PlantConfig;
+use crate::record::Record;
+use world::World;
+
+/// Period of every core, ns.
+pub const PERIOD_NS: u64 = 1_000_000;
+
+/// What a lock-step run does.
+#[derive(Debug, Clone)]
+pub struct LockStepConfig {
+    /// Strides to walk.
+    pub strides: u32,
+    /// Seed of sensor noise. The intention carries its own.
+    pub seed: u64,
+    /// What the person means to do.
+    pub intention: Intention,
+    /// The plant.
+    pub plant: PlantConfig,
+    /// The central unit.
+    pub central: CentralConfig,
+    /// When each joint's node starts, ms of the run; central starts at 0. The last one is the late node that the
+    /// others wait for.
+    pub start_ms: PerJoint<u64>,
+    /// Time from readiness to release, ms.
+    pub release_after_ms: u64,
+    /// A node to kill.
+    pub kill: Option<Kill>,
+    /// Time until a killed node runs again, ms.
+    pub outage_ms: u64,
+}
+
+impl LockStepConfig {
+    /// The standard run: knee, then ankle, and the hip 2 s late; released half a second after all are ready.
+    #[must_use]
+    pub fn standard(strides: u32, seed: u64, intention: Intention) -> Self {
+        Self {
+            strides,
+            seed,
+            intention,
+            plant: PlantConfig::default(),
+            central: CentralConfig::default(),
+            start_ms: [2000, 150, 400],
+            release_after_ms: 500,
+            kill: None,
+            outage_ms: 1000,
+        }
+    }
+}
+
+/// Why a run could not be done.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum LockStepError {
+    /// The intention does not last.
+    #[error(transparent)]
+    Intention(#[from] IntentionError),
+    /// A stride is killed that is not walked.
+    #[error(
+        "--kill {kill} lies beyond the {strides} strides of the run; use an earlier stride or more strides"
+    )]
+    KillBeyondRun {
+        /// The kill asked for.
+        kill: Kill,
+        /// Strides of the run.
+        strides: u32,
+    },
+    /// The run did not reach its last stride in the time it could need.
+    #[error(
+        "the run did not finish within {limit_s} s of virtual time; the nodes never became ready together"
+    )]
+    NotFinished {
+        /// Time limit, seconds.
+        limit_s: u64,
+    },
+}
+
+/// Runs the robot to its last stride.
+///
+/// # Errors
+/// [`LockStepError`] when the intention is shorter than the run, the kill lies beyond it, or it never finishes.
+pub fn run(config: &LockStepConfig) -> Result<Record, LockStepError> {
+    config.intention.check_strides(config.strides)?;
+    if let Some(kill) = config.kill.filter(|kill| kill.stride > config.strides) {
+        return Err(LockStepError::KillBeyondRun { kill, strides: config.strides });
+    }
+    // No stride is longer than four seconds, no start later than the last scripted one plus a margin.
+    let latest_ms = config.start_ms.iter().max().copied().unwrap_or(0);
+    let limit_s = 60 + latest_ms / 1000 + 4 * u64::from(config.strides);
+    let mut world = World::new(config);
+    for _ in 0..limit_s * 1000 {
+        if world.strides_walked() >= f64::from(config.strides) {
+            return Ok(world.into_record());
+        }
+        world.step();
+    }
+    Err(LockStepError::NotFinished { limit_s })
+}

@@ -1,0 +1,198 @@
+//! Figures from a record: tracking, phase, work, torque, and how a fault went.
+//!
+//! Strides 1 to 6 are for the estimator to settle; figures count from stride 7 on. In a run with a fault they pause
+//! from the fault until two whole strides after assistance has come back.
+
+use crate::gait::curves;
+use crate::joint::{Joint, PerJoint};
+use crate::message::{DriveState, GaitMode};
+use crate::part::Part;
+use crate::phase::wrapped;
+use crate::record::{Outage, Record, Row};
+
+/// First stride that counts, from 0.
+pub const FIRST_STRIDE_COUNTED: f64 = 6.0;
+/// Strides after the return of assistance that do not count.
+const STRIDES_AFTER_RETURN: f64 = 2.0;
+
+/// How a killed node's absence went.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FaultFigures {
+    /// The node and its absence.
+    pub outage: Outage,
+    /// Time from its death until all other drives damped, ms; `None` if they never all did.
+    pub all_safe_after_ms: Option<f64>,
+    /// Time from its return until central let assistance come back, seconds; `None` if it never did.
+    pub resumed_after_s: Option<f64>,
+    /// Greatest deviation from the intended angle from the death until the return of assistance, degrees.
+    pub deviation_max_deg: PerJoint<f64>,
+}
+
+/// Figures of a run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Metrics {
+    /// Strides that counted.
+    pub strides_counted: f64,
+    /// RMS of the angle against the reference at the estimated phase, degrees.
+    pub rms_deg: PerJoint<f64>,
+    /// RMS of the angle against what the person means to do, degrees.
+    pub rms_intended_deg: PerJoint<f64>,
+    /// RMS of the phase error, per cent of a stride.
+    pub phase_rms_percent: f64,
+    /// Greatest phase error, per cent of a stride.
+    pub phase_max_percent: f64,
+    /// Work the devices put into the leg, J per stride.
+    pub work_positive_j_per_stride: PerJoint<f64>,
+    /// Work the devices took out of the leg (negative), J per stride.
+    pub work_negative_j_per_stride: PerJoint<f64>,
+    /// Greatest torque given, Nm.
+    pub torque_peak_nm: PerJoint<f64>,
+    /// Share of the time in which the torque law met its limit, per cent.
+    pub saturation_percent: PerJoint<f64>,
+    /// Fastest change of the commanded torque in the whole run, Nm/s.
+    pub torque_rate_max_nm_s: f64,
+    /// Greatest torque, commanded or given, before walking was released, Nm.
+    pub torque_before_release_nm: f64,
+    /// Time the first node waited until all drives were ready, seconds; `None` if they never were.
+    pub barrier_held_s: Option<f64>,
+    /// Time between the first and the last drive to be ready, ms; `None` if one never was.
+    pub ready_skew_ms: Option<f64>,
+    /// Strides until assistance was first allowed; `None` if it never was.
+    pub assisted_from_stride: Option<f64>,
+    /// The killed node, if one was.
+    pub fault: Option<FaultFigures>,
+}
+
+impl Metrics {
+    /// Computes all figures.
+    #[must_use]
+    pub fn of(record: &Record) -> Self {
+        let fault = record.outage.map(|outage| fault_figures(record, outage));
+        let counted = counted_rows(record, fault.as_ref());
+        let strides_counted = strides_in(&counted);
+        let per_stride = |sum: PerJoint<f64>| sum.map(|x| x / strides_counted.max(f64::MIN_POSITIVE));
+        let power = |row: &Row, i: usize| row.joints[i].applied_nm * row.joints[i].velocity_rad_s;
+        let sum = |f: &dyn Fn(&Row, usize) -> f64| -> PerJoint<f64> {
+            std::array::from_fn(|i| counted.iter().map(|row| f(row, i)).sum())
+        };
+        let rms = |f: &dyn Fn(&Row, usize) -> f64| {
+            sum(&|row, i| f(row, i).to_degrees().powi(2)).map(|x| mean(x, counted.len()).sqrt())
+        };
+        let phase_error = |row: &Row| 100.0 * wrapped(row.phase_estimated - row.strides_true);
+        let (held_s, skew_ms) = barrier(record);
+        Self {
+            strides_counted,
+            rms_deg: rms(&|row, i| row.joints[i].angle_rad - reference_rad(i, row.phase_estimated)),
+            rms_intended_deg: rms(&|row, i| row.joints[i].angle_rad - row.joints[i].intended_rad),
+            phase_rms_percent: mean(counted.iter().map(|r| phase_error(r).powi(2)).sum(), counted.len())
+                .sqrt(),
+            phase_max_percent: counted.iter().map(|r| phase_error(r).abs()).fold(0.0, f64::max),
+            work_positive_j_per_stride: per_stride(sum(&|r, i| power(r, i).max(0.0) * ROW_S)),
+            work_negative_j_per_stride: per_stride(sum(&|r, i| power(r, i).min(0.0) * ROW_S)),
+            torque_peak_nm: std::array::from_fn(|i| {
+                counted.iter().map(|r| r.joints[i].applied_nm.abs()).fold(0.0, f64::max)
+            }),
+            saturation_percent: sum(&|r, i| f64::from(u8::from(r.joints[i].saturated)))
+                .map(|x| 100.0 * mean(x, counted.len())),
+            torque_rate_max_nm_s: torque_rate_max(record),
+            torque_before_release_nm: torque_before_release(record),
+            barrier_held_s: held_s,
+            ready_skew_ms: skew_ms,
+            assisted_from_stride: record
+                .rows
+                .iter()
+                .find(|r| r.mode == Some(GaitMode::Walk))
+                .map(|r| r.strides_true),
+            fault,
+        }
+    }
+}
+
+/// Duration of a row, seconds.
+const ROW_S: f64 = 1e-3;
+
+fn reference_rad(joint: usize, phase: f64) -> f64 {
+    curves::angle_rad(Joint::ALL[joint], phase).value
+}
+
+/// The rows that count; see the top of this file.
+fn counted_rows<'a>(record: &'a Record, fault: Option<&FaultFigures>) -> Vec<&'a Row> {
+    let pause = fault.map(|fault| {
+        let resumed_s = fault.outage.to_s.zip(fault.resumed_after_s).map(|(to_s, after_s)| to_s + after_s);
+        let resumed_strides = resumed_s
+            .and_then(|s| record.rows.iter().find(|r| r.t_s >= s))
+            .map_or(f64::INFINITY, |r| r.strides_true.ceil() + STRIDES_AFTER_RETURN);
+        (fault.outage.from_s, resumed_strides)
+    });
+    record
+        .rows
+        .iter()
+        .filter(|r| r.walking && r.strides_true >= FIRST_STRIDE_COUNTED)
+        .filter(|r| pause.is_none_or(|(from_s, strides)| r.t_s < from_s || r.strides_true >= strides))
+        .collect()
+}
+
+/// Strides covered by rows that may have gaps between them.
+fn strides_in(rows: &[&Row]) -> f64 {
+    rows.windows(2)
+        .map(|pair| pair[1].strides_true - pair[0].strides_true)
+        .filter(|advance| *advance < 0.01)
+        .sum()
+}
+
+fn mean(sum: f64, count: usize) -> f64 {
+    if count == 0 { f64::NAN } else { sum / count as f64 }
+}
+
+fn torque_rate_max(record: &Record) -> f64 {
+    let mut fastest = 0.0_f64;
+    for pair in record.rows.windows(2) {
+        for i in 0..3 {
+            if let (Some(a), Some(b)) = (pair[0].joints[i].commanded_nm, pair[1].joints[i].commanded_nm) {
+                fastest = fastest.max((b - a).abs() / ROW_S);
+            }
+        }
+    }
+    fastest
+}
+
+fn torque_before_release(record: &Record) -> f64 {
+    let released_s = record.released_s.unwrap_or(f64::INFINITY);
+    record
+        .rows
+        .iter()
+        .take_while(|row| row.t_s <= released_s)
+        .flat_map(|row| row.joints)
+        .map(|joint| joint.applied_nm.abs().max(joint.commanded_nm.map_or(0.0, f64::abs)))
+        .fold(0.0, f64::max)
+}
+
+fn barrier(record: &Record) -> (Option<f64>, Option<f64>) {
+    let [Some(hip), Some(knee), Some(ankle)] = record.ready_s else { return (None, None) };
+    let (first, last) = (hip.min(knee).min(ankle), hip.max(knee).max(ankle));
+    (Some(last - record.first_start_s), Some(1000.0 * (last - first)))
+}
+
+fn fault_figures(record: &Record, outage: Outage) -> FaultFigures {
+    let after: Vec<&Row> = record.rows.iter().filter(|r| r.t_s >= outage.from_s).collect();
+    let damped = |row: &Row| {
+        Joint::ALL.into_iter().all(|joint| {
+            Part::Joint(joint) == outage.part || row.joints[joint.index()].state == Some(DriveState::Safe)
+        })
+    };
+    let safe_s = after.iter().find(|r| damped(r)).map(|r| r.t_s);
+    let resumed_s = outage.to_s.and_then(|to_s| {
+        after.iter().find(|r| r.t_s >= to_s && r.mode == Some(GaitMode::Walk)).map(|r| r.t_s)
+    });
+    let away: Vec<&&Row> = after.iter().take_while(|r| resumed_s.is_none_or(|s| r.t_s < s)).collect();
+    FaultFigures {
+        outage,
+        all_safe_after_ms: safe_s.map(|s| 1000.0 * (s - outage.from_s)),
+        resumed_after_s: outage.to_s.zip(resumed_s).map(|(to_s, resumed_s)| resumed_s - to_s),
+        deviation_max_deg: std::array::from_fn(|i| {
+            away.iter()
+                .map(|r| (r.joints[i].angle_rad - r.joints[i].intended_rad).abs().to_degrees())
+                .fold(0.0, f64::max)
+        }),
+    }
+}

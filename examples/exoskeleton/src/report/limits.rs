@@ -1,0 +1,97 @@
+//! The limits a run must hold: class C (any machine, functional) of steps 1 and 2 of the demonstration, and of the
+//! fault steps when a node is killed.
+
+use serde::Serialize;
+
+use crate::joint::Joint;
+use crate::metrics::Metrics;
+
+/// Largest RMS against the reference, degrees: hip, knee, ankle.
+const RMS_MAX_DEG: [f64; 3] = [2.0, 2.5, 3.0];
+const PHASE_RMS_MAX_PERCENT: f64 = 3.0;
+const WORK_POSITIVE_J: (f64, f64) = (10.0, 16.0);
+const SATURATION_MAX_PERCENT: f64 = 1.0;
+const READY_SKEW_MAX_MS: f64 = 50.0;
+const TORQUE_RATE_MAX_NM_S: f64 = 2000.0;
+/// Share by which a limit may be passed: differences of floating-point numbers, nothing else. Zero stays zero.
+const ROUNDING: f64 = 1e-9;
+const STRIDES_COUNTED_MIN: f64 = 1.0;
+/// Loss noticed within 200 ms and all drives damping within 50 ms more.
+const ALL_SAFE_MAX_MS: f64 = 250.0;
+
+/// One limit: what was expected, what was seen.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct LimitCheck {
+    /// What is limited, with its unit.
+    pub name: String,
+    /// What is expected, in words.
+    pub expected: String,
+    /// What was seen; `null` when it never happened.
+    pub seen: Option<f64>,
+    /// Whether the limit held.
+    pub held: bool,
+}
+
+/// Checks all limits that apply.
+pub(super) fn check(metrics: &Metrics, killed: bool) -> Vec<LimitCheck> {
+    let mut checks = vec![
+        at_most("torque before release, Nm", 0.0, Some(metrics.torque_before_release_nm)),
+        at_most("spread of READY, ms", READY_SKEW_MAX_MS, metrics.ready_skew_ms),
+        at_least("strides that count", STRIDES_COUNTED_MIN, Some(metrics.strides_counted)),
+        at_most("phase RMS, %", PHASE_RMS_MAX_PERCENT, Some(metrics.phase_rms_percent)),
+    ];
+    for joint in Joint::ALL {
+        let i = joint.index();
+        checks.push(at_most(&format!("{joint} RMS, deg"), RMS_MAX_DEG[i], Some(metrics.rms_deg[i])));
+    }
+    checks.push(within(
+        "work into the leg, J/stride",
+        WORK_POSITIVE_J,
+        metrics.work_positive_j_per_stride.iter().sum(),
+    ));
+    for joint in Joint::ALL {
+        let seen = metrics.saturation_percent[joint.index()];
+        checks.push(LimitCheck {
+            name: format!("{joint} at torque limit, %"),
+            expected: format!("< {SATURATION_MAX_PERCENT}"),
+            seen: Some(seen),
+            held: seen < SATURATION_MAX_PERCENT,
+        });
+    }
+    checks.push(at_most("torque rate, Nm/s", TORQUE_RATE_MAX_NM_S, Some(metrics.torque_rate_max_nm_s)));
+    if killed {
+        let fault = metrics.fault.as_ref();
+        let safe_ms = fault.and_then(|f| f.all_safe_after_ms);
+        checks.push(at_most("loss to all others SAFE, ms", ALL_SAFE_MAX_MS, safe_ms));
+        let resumed = fault.and_then(|f| f.resumed_after_s);
+        checks.push(at_least("assistance came back after, s", 0.0, resumed));
+    }
+    checks
+}
+
+fn at_most(name: &str, limit: f64, seen: Option<f64>) -> LimitCheck {
+    LimitCheck {
+        name: name.to_owned(),
+        expected: if limit == 0.0 { "exactly 0".to_owned() } else { format!("<= {limit}") },
+        seen,
+        held: seen.is_some_and(|seen| seen <= limit * (1.0 + ROUNDING)),
+    }
+}
+
+fn at_least(name: &str, limit: f64, seen: Option<f64>) -> LimitCheck {
+    LimitCheck {
+        name: name.to_owned(),
+        expected: format!(">= {limit}"),
+        seen,
+        held: seen.is_some_and(|seen| seen >= limit),
+    }
+}
+
+fn within(name: &str, (low, high): (f64, f64), seen: f64) -> LimitCheck {
+    LimitCheck {
+        name: name.to_owned(),
+        expected: format!("{low}..{high}"),
+        seen: Some(seen),
+        held: (low..=high).contains(&seen),
+    }
+}
