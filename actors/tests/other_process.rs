@@ -1,5 +1,7 @@
 //! A whole node and an application in a process of its own, which waits, works, and is killed.
 
+#![expect(clippy::unwrap_used, reason = "a test says what failed by failing")]
+
 use std::{
     path::{Path, PathBuf},
     process::{Child, Command},
