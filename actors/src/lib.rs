@@ -42,7 +42,8 @@ pub use api::{ApiError, Endpoint, NodeApi, Received, Registration};
 pub use config::{ConfigFaults, NodeConfig};
 pub use lncl::RegisterError;
 pub use ndl::{KnownNode, LossReason, NodeEvent, Source};
-pub use node::{Node, NodeBuilder, NodeEnd, NodeHandle, StartError};
+pub use node::{Node, NodeBuilder, NodeEnd, NodeHandle, StartError, Traffic};
+pub use outlet::OutletCounts;
 pub use serde;
 pub use sinew_runtime::{
     app::{AppContext, AppSpec, Delivery, Raw, Silence},

@@ -80,17 +80,17 @@ pub(crate) struct OutletLimits {
 ///
 /// Nothing leaks: submitted = sent + superseded + expired + lost + refused + waiting.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct OutletCounts {
+pub struct OutletCounts {
     /// Written to a socket to their last byte.
-    pub(crate) sent: u64,
+    pub sent: u64,
     /// Stream messages whose place a newer one took.
-    pub(crate) superseded: u64,
+    pub superseded: u64,
     /// Their time to live ran out before they were sent.
-    pub(crate) expired: u64,
+    pub expired: u64,
     /// They waited when the outlet was closed.
-    pub(crate) lost: u64,
+    pub lost: u64,
     /// Handed back to their sender.
-    pub(crate) refused: u64,
+    pub refused: u64,
 }
 
 /// Which of an outlet's connections, one after the other, something is about.

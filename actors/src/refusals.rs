@@ -47,6 +47,7 @@ impl Refusals {
     }
 
     /// How much was refused because of `cause`.
+    #[cfg(test)]
     pub(crate) fn of(&self, cause: &'static str) -> u64 {
         self.causes().get(cause).map_or(0, |cause| cause.count)
     }

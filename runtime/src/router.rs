@@ -229,6 +229,7 @@ impl Router {
             for members in table.groups.values_mut() {
                 members.retain(|member| *member != app);
             }
+            table.groups.retain(|_, members| !members.is_empty());
         });
     }
 
@@ -243,6 +244,8 @@ impl Router {
             if member {
                 members.push(app);
             }
+            // Whoever joins and leaves groups without end must not fill the table with empty ones.
+            table.groups.retain(|_, members| !members.is_empty());
         });
         changed
     }
@@ -251,7 +254,7 @@ impl Router {
     #[must_use]
     pub fn groups(&self) -> Vec<AppAddress> {
         let table = self.table.load();
-        table.groups.iter().filter(|(_, members)| !members.is_empty()).map(|(group, _)| *group).collect()
+        table.groups.keys().copied().collect()
     }
 
     /// Adds or replaces the route to another node.

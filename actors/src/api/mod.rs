@@ -15,8 +15,7 @@
 //! use std::time::Duration;
 //!
 //! use serde::{Deserialize, Serialize};
-//! use sinew::api::{NodeApi, Registration};
-//! use sinew_runtime::wire::Payload;
+//! use sinew::{NodeApi, Payload, Registration};
 //!
 //! #[derive(Serialize, Deserialize)]
 //! struct JointAngle { degrees: f32 }
@@ -32,7 +31,7 @@
 //! while let Some(received) = sensor.receive(Duration::from_millis(10))? {
 //!     println!("{} says something of kind {}", received.source(), received.kind());
 //! }
-//! # Ok::<(), sinew::api::ApiError>(())
+//! # Ok::<(), sinew::ApiError>(())
 //! ```
 //!
 //! The protocol underneath is `docs/protocol/lncl.md`; it can be spoken from any language.
@@ -42,6 +41,8 @@ mod error;
 mod inbox;
 mod link;
 mod received;
+#[cfg(test)]
+mod tests;
 
 use std::{
     path::{Path, PathBuf},

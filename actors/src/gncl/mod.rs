@@ -41,7 +41,7 @@ mod tests;
 
 pub(crate) use actor::Gncl;
 pub(crate) use facts::LinkFact;
-pub(crate) use peer::Store;
+pub(crate) use peer::{Peer, Store};
 
 use crate::ndl::MembershipFact;
 

@@ -23,7 +23,7 @@ use super::{
 };
 use crate::{
     outlet::{LinkNumber, OutletLimits, StreamOutlet},
-    stores::Stores,
+    stores::{Stores, lock},
 };
 
 /// Time for the first frame.
@@ -51,6 +51,7 @@ enum End {
 pub(super) async fn serve(server: Rc<Server>, stream: UnixStream, credentials: UCred, id: ClientId) {
     let mut reader = Reader::new(REGISTER_BYTES_MAX);
     let mut session = Session::new();
+    // spec: LNCL-1
     let register = match tokio::time::timeout(HANDSHAKE, introduce(&mut reader, &stream, &mut session)).await
     {
         Ok(Ok(Some(register))) => register,
@@ -135,7 +136,7 @@ impl Client {
         let request = Request { address, name, requires: requires.clone(), kinds, owner: peer.owner() };
         let app = registrar::register_client(&server.stores, request)?;
         let tid = Tid::new(server.stores.node, app);
-        let name = registrar::registry(&server.stores).name_of(app);
+        let name = lock(&server.stores.registry).name_of(app);
         let outlet = Arc::new(StreamOutlet::new(limits(&server.stores)));
         server.add_outlet(peer.id, outlet.clone());
         tracing::info!(%tid, name, pid = peer.pid, "an application of another process has registered");
@@ -304,6 +305,7 @@ impl Client {
             End::Unregistered => self.log("has unregistered"),
             End::HungUp(None) => self.log("has gone: its process closed the socket, or ended"),
             End::HungUp(Some(cause)) => self.log(&format!("has gone: {cause}")),
+            // spec: LNCL-4
             End::Refused(sentence) => {
                 let detail = format!("{} ({}): {sentence}", self.name, self.tid);
                 self.server.refusals.count(Time::now(), "protocol violation", &detail);
@@ -342,6 +344,7 @@ impl Drop for Client {
         if !self.has_been_told {
             self.say(self.refusal("the node's LNCL has ended; connect again when it is back".to_owned()));
         }
+        // spec: LNCL-7
         self.outlet.end(Outcome::Failed, Rejection::Closed);
         // Senders may hold the outlet, and with it the socket, a little longer; the peer is told now. An error means
         // that it is closed already.

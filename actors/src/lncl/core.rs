@@ -210,12 +210,8 @@ impl Registry {
         name.unwrap_or_else(|| app.to_string())
     }
 
-    /// Whether `app` is in another process.
-    pub(crate) fn is_in_other_process(&self, app: AppAddress) -> bool {
-        self.apps.get(&app).is_some_and(|entry| entry.owner != Owner::Node)
-    }
-
     /// How many applications there are.
+    #[cfg(test)]
     pub(crate) fn len(&self) -> usize {
         self.apps.len()
     }
@@ -237,6 +233,7 @@ impl Registry {
     }
 
     fn check_name(&self, name: Option<&str>) -> Result<(), RegisterError> {
+        // spec: LNCL-5
         let Some(name) = name else { return Ok(()) };
         check_spelling(name)?;
         let Some(holder) = self.names.get(name) else { return Ok(()) };
@@ -244,7 +241,7 @@ impl Registry {
         Err(RegisterError::NameTaken { name: name.to_owned(), holder: *holder, owner })
     }
 
-    /// The ids of `names`, none of which means anything else.
+    /// The ids of `names`, none of which means anything else. spec: LNCL-8
     fn check_kinds(&self, names: &[String]) -> Result<BTreeMap<Kind, String>, RegisterError> {
         let mut claimed = BTreeMap::new();
         for name in names {
@@ -275,13 +272,15 @@ impl Registry {
             return Err(RegisterError::NotFixed(app));
         }
         let Some(entry) = self.apps.get(&app) else { return Ok(app) };
-        let holder =
-            entry.name.as_ref().map_or("an application without a name".to_owned(), |n| format!("'{n}'"));
+        let holder = entry
+            .name
+            .as_ref()
+            .map_or_else(|| "an application without a name".to_owned(), |n| format!("'{n}'"));
         Err(RegisterError::AddressTaken { address: app, holder, owner: entry.owner.to_string() })
     }
 
     /// The next free address, round the whole range: one that was given back is not given out again soon, so that a
-    /// late message for its former holder finds nobody and not somebody else.
+    /// late message for its former holder finds nobody and not somebody else. spec: LNCL-5
     fn free_dynamic(&mut self) -> AppAddress {
         loop {
             let index = self.next_dynamic;

@@ -65,7 +65,8 @@ pub(crate) fn listen(path: &Path) -> Result<(UnixListener, SocketFile), ListenEr
     if path.as_os_str().len() > PATH_MAX {
         return Err(ListenError::TooLong(path.to_owned()));
     }
-    let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let directory =
+        path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
     DirBuilder::new()
         .recursive(true)
         .mode(DIRECTORY_MODE)

@@ -35,7 +35,7 @@ pub use core::RegisterError;
 pub(crate) use core::Registry;
 pub(crate) use facts::AppFact;
 pub(crate) use registrar::{
-    LocalApp, app_down, app_ready, is_in_other_process, register_local, resolve, set_member, unregister_local,
+    LocalApp, app_down, app_ready, register_local, resolve, set_member, unregister_local,
 };
 
 use sinew_runtime::tid::AppAddress;

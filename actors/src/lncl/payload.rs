@@ -4,7 +4,7 @@ use bytes::Bytes;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use sinew_runtime::{
     tid::{AppAddress, NodeAddress, Tid},
-    wire::{Header, Kind, Message},
+    wire::{Header, Kind, Message, decode},
 };
 
 /// Longest payload of a connection's first frame, in bytes: enough for the longest lists that are allowed.
@@ -89,5 +89,5 @@ pub(crate) fn frame<P: Serialize>(kind: Kind, source: Tid, destination: Tid, pay
 
 /// Reads a layer's payload.
 pub(crate) fn read<P: DeserializeOwned>(payload: &Bytes) -> Result<P, rmp_serde::decode::Error> {
-    rmp_serde::from_slice(payload)
+    decode(payload)
 }

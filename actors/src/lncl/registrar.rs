@@ -2,7 +2,7 @@
 //!
 //! The registry's lock is held over all three, so that they see the changes of one address in one order.
 
-use std::sync::{Arc, MutexGuard, PoisonError};
+use std::sync::Arc;
 
 use sinew_runtime::{
     router::{LocalRoute, Outlet},
@@ -12,9 +12,12 @@ use sinew_runtime::{
 
 use super::{
     AppFact,
-    core::{Address, Owner, RegisterError, Registry, Request},
+    core::{Address, Owner, RegisterError, Request},
 };
-use crate::{stores::Stores, sync};
+use crate::{
+    stores::{Stores, lock},
+    sync,
+};
 
 /// An application in the node's own process, as the root registers it.
 pub(crate) struct LocalApp {
@@ -40,7 +43,7 @@ pub(crate) fn register_local(stores: &Stores, app: LocalApp) -> Result<Tid, Regi
     let LocalApp { name, address, requires, kinds, outlet, events } = app;
     let address = address.map_or(Address::Dynamic, Address::Fixed);
     let request = Request { address, name: name.clone(), requires, kinds, owner: Owner::Node };
-    let mut registry = registry(stores);
+    let mut registry = lock(&stores.registry);
     let fact_requires = request.requires.clone();
     let app = registry.register(request, stores.config.lncl.apps_max)?;
     stores.router.set_local(app, LocalRoute { outlet, events });
@@ -60,7 +63,7 @@ pub(crate) fn app_down(stores: &Stores, app: AppAddress) {
 
 /// Takes the address of an application back.
 pub(crate) fn unregister_local(stores: &Stores, app: AppAddress) {
-    let mut registry = registry(stores);
+    let mut registry = lock(&stores.registry);
     if registry.unregister(app) {
         forget(stores, app);
     }
@@ -68,8 +71,8 @@ pub(crate) fn unregister_local(stores: &Stores, app: AppAddress) {
 
 /// The TID that has `name` now, on this node or any.
 pub(crate) fn resolve(stores: &Stores, name: &str) -> Option<Tid> {
-    let here = registry(stores).resolve(name).map(|app| Tid::new(stores.node, app));
-    here.or_else(|| lock_sync(stores).resolve(name))
+    let here = lock(&stores.registry).resolve(name).map(|app| Tid::new(stores.node, app));
+    here.or_else(|| lock(&stores.sync).resolve(name))
 }
 
 /// Makes `app` a member of `group`, or no longer one.
@@ -79,15 +82,10 @@ pub(crate) fn set_member(stores: &Stores, app: AppAddress, group: AppAddress, me
     }
 }
 
-/// Whether the application at `app` is in another process, so that LNCL holds it at the barrier and not the root.
-pub(crate) fn is_in_other_process(stores: &Stores, app: AppAddress) -> bool {
-    registry(stores).is_in_other_process(app)
-}
-
 /// Gives an application of another process its address. No message reaches it before [`open`].
 pub(super) fn register_client(stores: &Stores, request: Request) -> Result<AppAddress, RegisterError> {
     let (name, requires) = (request.name.clone(), request.requires.clone());
-    let mut registry = registry(stores);
+    let mut registry = lock(&stores.registry);
     let app = registry.register(request, stores.config.lncl.apps_max)?;
     tell_sync(stores, AppFact::Registered { app, name, requires });
     Ok(app)
@@ -95,14 +93,14 @@ pub(super) fn register_client(stores: &Stores, request: Request) -> Result<AppAd
 
 /// Messages reach the application of another process from now on.
 pub(super) fn open(stores: &Stores, app: AppAddress, route: LocalRoute) {
-    let _registry = registry(stores);
+    let _registry = lock(&stores.registry);
     stores.router.set_local(app, route);
     tell_sync(stores, AppFact::Ready { app });
 }
 
 /// Takes back all that belongs to `owner`.
 pub(super) fn owner_gone(stores: &Stores, owner: Owner) {
-    let mut registry = registry(stores);
+    let mut registry = lock(&stores.registry);
     for app in registry.remove_owner(owner) {
         forget(stores, app);
     }
@@ -110,20 +108,11 @@ pub(super) fn owner_gone(stores: &Stores, owner: Owner) {
 
 /// Takes back what an earlier life of LNCL's actor left: its connections ended with it.
 pub(super) fn forget_former_clients(stores: &Stores) {
-    let mut registry = registry(stores);
+    let mut registry = lock(&stores.registry);
     for app in registry.in_other_processes() {
         registry.unregister(app);
         forget(stores, app);
     }
-}
-
-/// The registry. Every section under this lock leaves it whole before anything else can panic.
-pub(super) fn registry(stores: &Stores) -> MutexGuard<'_, Registry> {
-    stores.registry.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-fn lock_sync(stores: &Stores) -> MutexGuard<'_, sync::Core> {
-    stores.sync.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn forget(stores: &Stores, app: AppAddress) {
@@ -133,7 +122,7 @@ fn forget(stores: &Stores, app: AppAddress) {
 
 fn tell_sync(stores: &Stores, fact: AppFact) {
     if let Err(event) = stores.posts.sync.post(sync::Event::App(fact)) {
-        // Its post is larger than the number of applications; it is full only if the sync manager hangs.
+        // Thousands of events wait for it then, so it has stood still for long.
         tracing::error!(?event, "the sync manager's post is full and this was not told: does it hang?");
     }
 }

@@ -17,9 +17,11 @@ use super::{
     client::{self, ClientOutlet},
     core::ClientId,
     payload::{self, Refusal},
-    registrar,
 };
-use crate::{refusals::Refusals, stores::Stores};
+use crate::{
+    refusals::Refusals,
+    stores::{Stores, lock},
+};
 
 /// First and longest wait after `accept` failed: usually the process has no descriptor left, and needs time to get one.
 const ACCEPT_BACKOFF: (Duration, Duration) = (Duration::from_millis(10), Duration::from_millis(100));
@@ -119,7 +121,7 @@ fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) {
     match check_credentials(&stream) {
         Ok(credentials) => {
             let server = server.clone();
-            let id = registrar::registry(&server.stores).new_client();
+            let id = lock(&server.stores.registry).new_client();
             clients.spawn_local(client::serve(server, stream, credentials, id));
         }
         Err(why) => refuse(server, &stream, "credentials", &why),

@@ -1,1 +1,399 @@
+//! A real door, with clients spoken by hand: what a client in another language meets.
 
+use std::{sync::Arc, time::Duration};
+
+use bytes::Bytes;
+use proptest::{prelude::*, strategy::ValueTree, test_runner::TestRunner};
+use serde::{Deserialize, Serialize};
+use sinew_runtime::{
+    outcome::{Outcome, Rejection},
+    tid::{AppAddress, Tid},
+    wire::{Class, Flags, HEADER_LEN, Header, Kind, Message, Payload},
+};
+
+use super::{
+    AppFact,
+    payload::{self, Group, Register, Resolve, Resolved},
+    registrar,
+    testing::{RawClient, TestNode, WATCHDOG},
+};
+
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Angle {
+    degrees: f32,
+}
+
+impl Payload for Angle {
+    const NAME: &'static str = "test.angle";
+}
+
+fn named(name: &str) -> Register {
+    Register { name: Some(name.to_owned()), ..Register::default() }
+}
+
+fn requiring(name: &str) -> Register {
+    Register { requires: vec![name.to_owned()], ..Register::default() }
+}
+
+fn confirmed(source: Tid, destination: Tid, correlation: u64) -> Message {
+    let mut message = Message::typed(source, destination, &Angle { degrees: 1.0 });
+    message.header.flags = Flags::CONFIRM;
+    message.header.correlation = correlation;
+    message
+}
+
+fn outcome_of(message: &Message) -> (u64, Outcome) {
+    assert_eq!((message.header.kind, message.header.flags), (Kind::OUTCOME, Flags::OUTCOME), "{message:?}");
+    (message.header.correlation, Outcome::from_code(message.payload[0]).unwrap())
+}
+
+/// After whatever happened to others, a newcomer is served.
+fn assert_alive(node: &TestNode) {
+    RawClient::register(node, &Register::default());
+}
+
+#[test]
+fn garbage_is_refused_in_words_and_nothing_else_is_touched() {
+    let node = TestNode::start();
+    let (mut bystander, tid) = RawClient::register(&node, &named("bystander"));
+    let mut client = RawClient::connect(&node);
+    client.send_bytes(&[b'x'; 200]);
+    assert!(client.expect_refusal().contains("not a Sinew frame"));
+    assert_eq!(node.refused("bad first frame"), 1);
+    let app = node.local(1);
+    bystander.send(&confirmed(tid, app.tid, 1));
+    assert_eq!(app.next().decode::<Angle>().unwrap(), Angle { degrees: 1.0 });
+    assert_alive(&node);
+}
+
+#[test]
+fn another_version_is_refused_in_words() {
+    let node = TestNode::start();
+    let mut client = RawClient::connect(&node);
+    let mut bytes = Header::new(Kind::LNCL_REGISTER, Tid::NONE, Tid::NONE).encode(&[]);
+    bytes[2] = 9;
+    client.send_bytes(&bytes);
+    assert!(client.expect_refusal().contains("version 9"));
+    assert_alive(&node);
+}
+
+#[test]
+fn an_oversized_frame_is_refused_before_and_after_registration() {
+    let node = TestNode::start();
+    let mut bytes = Header::new(Kind::named("x"), Tid::NONE, Tid::NONE).encode(&[]);
+    bytes[4..8].copy_from_slice(&u32::MAX.to_le_bytes());
+    let mut stranger = RawClient::connect(&node);
+    stranger.send_bytes(&bytes);
+    assert!(stranger.expect_refusal().contains("above this node's limit"));
+    let (mut client, _) = RawClient::register(&node, &Register::default());
+    client.send_bytes(&bytes);
+    assert!(client.expect_refusal().contains("above this node's limit"));
+    assert_alive(&node);
+}
+
+#[test]
+fn a_storm_of_garbage_leaves_the_node_alive() {
+    let node = TestNode::start();
+    let mut runner = TestRunner::deterministic();
+    for _ in 0..50 {
+        let noise = proptest::collection::vec(any::<u8>(), 0..600).new_tree(&mut runner).unwrap().current();
+        let (mut registered, _) = RawClient::register(&node, &Register::default());
+        registered.send_bytes(&noise);
+        RawClient::connect(&node).send_bytes(&noise);
+    }
+    assert_alive(&node);
+}
+
+#[test]
+fn a_silent_stranger_is_sent_away() {
+    let node = TestNode::start();
+    let refusal = RawClient::connect(&node).expect_refusal();
+    assert!(refusal.contains("LNCL_REGISTER"), "{refusal}");
+}
+
+#[test]
+fn one_connection_too_many_is_refused_in_words() {
+    let node = TestNode::start_with(|config| config.lncl.clients_max = 1);
+    let (_first, _) = RawClient::register(&node, &Register::default());
+    assert!(RawClient::connect(&node).expect_refusal().contains("lncl.clients_max"));
+}
+
+#[test]
+fn a_forged_source_is_refused_and_counted_and_its_connection_lives() {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let (mut client, tid) = RawClient::register(&node, &Register::default());
+    client.send(&confirmed(app.tid, app.tid, 1));
+    let answer = client.next().unwrap();
+    assert_eq!(outcome_of(&answer), (1, Outcome::Rejected(Rejection::ForgedSource)));
+    assert_eq!(node.refused("forged source"), 1);
+    client.send(&confirmed(tid, app.tid, 2));
+    let mut message = app.next();
+    assert_eq!((message.header.source, message.header.correlation), (tid, 2), "only the honest one came");
+    message.settle(Outcome::Delivered);
+    assert_eq!(outcome_of(&client.next().unwrap()), (2, Outcome::Delivered));
+}
+
+#[test]
+fn a_layers_frame_from_an_application_ends_its_connection() {
+    let mut node = TestNode::start();
+    let (mut client, tid) = RawClient::register(&node, &Register::default());
+    client.send(&Message::new(Header::new(Kind::SYNC_DIRECTORY, tid, tid), Bytes::new()));
+    assert!(client.expect_refusal().contains("may not send"));
+    assert!(matches!(node.fact(), AppFact::Registered { app, .. } if app == tid.app));
+    assert_eq!(node.fact(), AppFact::Ready { app: tid.app });
+    assert_eq!(node.fact(), AppFact::Unregistered { app: tid.app });
+}
+
+#[test]
+fn a_hang_up_frees_the_name_and_fails_what_was_in_hand() {
+    let mut node = TestNode::start();
+    let app = node.local(1);
+    let (mut client, tid) = RawClient::register(&node, &named("drive"));
+    let outcome = node.send_confirmed(app.tid, tid, &Angle { degrees: 2.0 });
+    assert_eq!(client.next().unwrap().decode::<Angle>().unwrap(), Angle { degrees: 2.0 });
+    drop(client);
+    assert_eq!(outcome.recv_timeout(WATCHDOG), Ok(Outcome::Failed));
+    assert!(matches!(node.fact(), AppFact::Registered { .. }));
+    assert!(matches!(node.fact(), AppFact::Ready { .. }));
+    assert_eq!(node.fact(), AppFact::Unregistered { app: tid.app });
+    let later = node.send_confirmed(app.tid, tid, &Angle { degrees: 3.0 });
+    assert_eq!(later.recv_timeout(WATCHDOG), Ok(Outcome::Rejected(Rejection::NoSuchApplication)));
+    RawClient::register(&node, &named("drive"));
+}
+
+#[test]
+fn an_outcome_comes_back_from_a_client() {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let (mut client, tid) = RawClient::register(&node, &Register::default());
+    let outcome = node.send_confirmed(app.tid, tid, &Angle { degrees: 2.0 });
+    let message = client.next().unwrap();
+    assert!(message.header.flags.has(Flags::CONFIRM));
+    let mut answer = Header::new(Kind::OUTCOME, tid, message.header.source);
+    answer.flags = Flags::OUTCOME;
+    answer.correlation = message.header.correlation;
+    let code = Outcome::Rejected(Rejection::ByHandler).code();
+    client.send(&Message::new(answer, Bytes::copy_from_slice(&[code])));
+    assert_eq!(outcome.recv_timeout(WATCHDOG), Ok(Outcome::Rejected(Rejection::ByHandler)));
+}
+
+#[test]
+fn a_client_is_held_until_all_that_it_requires_is_ready() {
+    let mut node = TestNode::start();
+    let app = node.local(1);
+    let mut client = RawClient::connect(&node);
+    client.ask_for_address(&requiring("knee.sensor"));
+    let AppFact::Registered { app: address, requires, .. } = node.fact() else { panic!("no registration") };
+    assert_eq!(requires, ["knee.sensor"]);
+    let early = node.send_confirmed(app.tid, Tid::new(node.address(), address), &Angle { degrees: 0.0 });
+    assert_eq!(early.recv_timeout(WATCHDOG), Ok(Outcome::Rejected(Rejection::NoSuchApplication)));
+    node.release(address);
+    assert_eq!(client.expect_registered().app, address);
+    assert_eq!(node.fact(), AppFact::Ready { app: address });
+}
+
+#[test]
+fn a_client_may_leave_while_it_waits_at_the_barrier() {
+    let mut node = TestNode::start();
+    for say_goodbye in [true, false] {
+        let mut client = RawClient::connect(&node);
+        client.ask_for_address(&requiring("knee.sensor"));
+        let AppFact::Registered { app, .. } = node.fact() else { panic!("no registration") };
+        if say_goodbye {
+            client
+                .send(&Message::new(Header::new(Kind::LNCL_UNREGISTER, Tid::NONE, Tid::NONE), Bytes::new()));
+            assert!(client.next().is_none());
+        } else {
+            drop(client);
+        }
+        assert_eq!(node.fact(), AppFact::Unregistered { app });
+    }
+}
+
+#[test]
+fn a_subscriber_gets_the_layers_events_and_others_do_not() {
+    let node = TestNode::start();
+    let event = crate::LossReason::Silent;
+    let (mut subscriber, tid) =
+        RawClient::register(&node, &Register { events: vec![Angle::KIND], ..Register::default() });
+    let (mut other, other_tid) = RawClient::register(&node, &Register::default());
+    let ndl = Tid::new(node.address(), AppAddress::NDL);
+    node.stores.router.publish(&Message::typed(ndl, Tid::NONE, &Angle { degrees: 9.0 }));
+    let got = subscriber.next().unwrap();
+    assert_eq!((got.header.source, got.header.destination), (ndl, tid), "{event:?}");
+    // What comes first to the other is what is sent to it afterwards.
+    node.stores.router.send(Message::typed(ndl, other_tid, &Angle { degrees: 1.0 })).unwrap();
+    assert_eq!(other.next().unwrap().decode::<Angle>().unwrap(), Angle { degrees: 1.0 });
+}
+
+#[test]
+fn groups_are_joined_and_left_with_a_confirmation() {
+    let mut node = TestNode::start();
+    let (mut client, tid) = RawClient::register(&node, &Register::default());
+    let group = AppAddress::group("drives");
+    node.fact();
+    node.fact();
+    for member in [true, false] {
+        let lncl = payload::lncl_of(node.address());
+        let mut asked = payload::frame(Kind::LNCL_GROUP, tid, lncl, &Group { group, member });
+        asked.header.flags = Flags::CONFIRM;
+        asked.header.correlation = 5;
+        client.send(&asked);
+        assert_eq!(outcome_of(&client.next().unwrap()), (5, Outcome::Delivered));
+        assert_eq!(node.fact(), AppFact::GroupsChanged);
+        assert_eq!(node.stores.router.groups().contains(&group), member);
+    }
+}
+
+#[test]
+fn names_resolve_to_tids() {
+    let node = TestNode::start();
+    let (mut client, tid) = RawClient::register(&node, &named("hip"));
+    for (name, expected) in [("hip", Some(tid.bits())), ("nobody", None)] {
+        let asked = Resolve { name: name.to_owned() };
+        let mut asked = payload::frame(Kind::LNCL_RESOLVE, tid, Tid::NONE, &asked);
+        asked.header.correlation = 3;
+        client.send(&asked);
+        let answer = client.next().unwrap();
+        assert_eq!((answer.header.kind, answer.header.correlation), (Kind::LNCL_RESOLVED, 3));
+        assert_eq!(payload::read::<Resolved>(&answer.payload).unwrap().tid, expected);
+    }
+}
+
+#[test]
+fn what_a_slow_client_has_not_read_waits_and_comes_in_order() {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let (mut client, tid) = RawClient::register(&node, &Register::default());
+    // Far more than a socket holds, and less than the queue does.
+    let count = 200_u32;
+    for number in 0..count {
+        let mut header = Header::new(Kind::named("blob"), app.tid, tid);
+        header.class = Class::Bulk;
+        let mut payload = vec![0; 8_192];
+        payload[..4].copy_from_slice(&number.to_le_bytes());
+        node.stores.router.send(Message::new(header, payload.into())).unwrap();
+    }
+    for number in 0..count {
+        assert_eq!(client.next().unwrap().payload[..4], number.to_le_bytes());
+    }
+}
+
+#[test]
+fn a_client_that_never_reads_costs_a_bounded_queue() {
+    let node = TestNode::start_with(|config| config.mailbox_capacity = 4);
+    let app = node.local(1);
+    let (_client, tid) = RawClient::register(&node, &Register::default());
+    let mut refused = 0;
+    // The socket takes some hundred kilobytes.
+    for _ in 0..200 {
+        let header = Header::new(Kind::named("blob"), app.tid, tid);
+        let result = node.stores.router.send(Message::new(header, vec![0; 8_192].into()));
+        refused += u32::from(result == Err(Rejection::QueueFull));
+    }
+    assert!(refused > 0);
+    assert_alive(&node);
+}
+
+#[test]
+fn the_end_of_lncl_is_told_and_frees_what_it_served() {
+    let mut node = TestNode::start();
+    let (mut client, tid) = RawClient::register(&node, &named("drive"));
+    node.stop();
+    assert!(client.expect_refusal().contains("has ended"));
+    assert!(registrar::resolve(&node.stores, "drive").is_none());
+    let later = node.send_confirmed(Tid::NONE, tid, &Angle { degrees: 0.0 });
+    assert_eq!(later.recv_timeout(WATCHDOG), Ok(Outcome::Rejected(Rejection::NoSuchApplication)));
+    assert!(!node.path().exists());
+}
+
+#[test]
+fn what_expires_while_a_client_does_not_read_is_said_to_its_sender() {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let (_client, tid) = RawClient::register(&node, &Register::default());
+    // Given: the socket is full.
+    while node.stores.router.send(filler(app.tid, tid)).is_ok() {}
+    // When: a message with a time to live waits in another class.
+    let (outcome, receiver) = std::sync::mpsc::sync_channel(1);
+    let mut message = confirmed(app.tid, tid, 1);
+    message.header.sent = sinew_runtime::time::Time::now();
+    message.header.time_to_live_us = u32::try_from(Duration::from_millis(5).as_micros()).unwrap();
+    let ticket = sinew_runtime::outcome::Ticket { source: app.tid, destination: tid, correlation: 1 };
+    message.receipt = Some(sinew_runtime::outcome::Receipt::new(Arc::new(Told(outcome)), ticket));
+    node.stores.router.send(message).unwrap();
+    // Then
+    assert_eq!(receiver.recv_timeout(WATCHDOG), Ok(Outcome::Expired));
+}
+
+fn filler(source: Tid, destination: Tid) -> Message {
+    let mut header = Header::new(Kind::named("blob"), source, destination);
+    header.class = Class::Bulk;
+    Message::new(header, vec![0; 8_192 - HEADER_LEN].into())
+}
+
+struct Told(std::sync::mpsc::SyncSender<Outcome>);
+
+impl sinew_runtime::outcome::ReceiptSink for Told {
+    fn settle(&self, _: sinew_runtime::outcome::Ticket, outcome: Outcome) {
+        self.0.send(outcome).unwrap();
+    }
+}
+
+const DOCUMENTATION: &str = include_str!("../../../docs/protocol/lncl.md");
+
+/// The block of the documentation that starts with `fence` after `heading`.
+fn block(heading: &str, fence: &str) -> &'static str {
+    let section = DOCUMENTATION.split_once(heading).expect("the section is there").1;
+    let block = section.split_once(fence).expect("the block begins").1;
+    block.split_once("```").expect("the block ends").0
+}
+
+#[test]
+fn the_bytes_in_the_documentation_are_a_registration() {
+    let node = TestNode::start();
+    let text = block("## The bytes of a registration", "```text");
+    let bytes: Vec<_> = text.split_whitespace().map(|byte| u8::from_str_radix(byte, 16).unwrap()).collect();
+    let mut client = RawClient::connect(&node);
+    client.send_bytes(&bytes);
+    let tid = client.expect_registered();
+    assert_eq!(registrar::resolve(&node.stores, "hip"), Some(tid));
+}
+
+#[test]
+#[ignore = "needs python3, which a machine that builds Sinew need not have"]
+fn the_client_in_the_documentation_answers_and_confirms() {
+    let mut node = TestNode::start();
+    let mut python = std::process::Command::new("python3")
+        .args(["-c", block("## A whole client", "```python"), node.path().to_str().unwrap()])
+        .spawn()
+        .expect("python3 is there");
+    let AppFact::Registered { app, name, .. } = node.fact() else { panic!("no registration") };
+    assert_eq!(name.as_deref(), Some("echo"));
+    assert_eq!(node.fact(), AppFact::Ready { app });
+    let (mut asking, tid) = RawClient::register(&node, &Register::default());
+    node.fact();
+    node.fact();
+    let mut request = confirmed(tid, Tid::new(node.address(), app), 4);
+    request.header.flags = Flags::CONFIRM.with(Flags::ASK);
+    asking.send(&request);
+    let reply = asking.next().unwrap();
+    assert_eq!((reply.header.flags, reply.header.correlation), (Flags::REPLY, 4));
+    assert_eq!(reply.decode::<Angle>().unwrap(), Angle { degrees: 1.0 });
+    assert_eq!(outcome_of(&asking.next().unwrap()), (4, Outcome::Delivered));
+    python.kill().unwrap();
+    python.wait().unwrap();
+    assert_eq!(node.fact(), AppFact::Unregistered { app }, "a killed process is noticed");
+}
+
+#[test]
+fn a_registration_nested_without_end_is_refused() {
+    let node = TestNode::start();
+    let mut payload = vec![0x81, 0xa1, b'y'];
+    payload.extend([0x91; 8_000]);
+    let mut client = RawClient::connect(&node);
+    client.send(&Message::new(Header::new(Kind::LNCL_REGISTER, Tid::NONE, Tid::NONE), payload.into()));
+    assert!(client.expect_refusal().contains("cannot be read"));
+    assert_alive(&node);
+}

@@ -268,7 +268,7 @@ impl Shell {
     }
 }
 
-fn lock(stores: &Stores) -> MutexGuard<'_, Core> {
+pub(super) fn lock(stores: &Stores) -> MutexGuard<'_, Core> {
     stores.ndl.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -358,4 +358,10 @@ fn warn_of_mdns(port: u16, error: &MdnsError) {
         "NDL does not use mDNS on port {port}: {error}; nodes are found through multicast and seeds only. Set \
          `ndl.mdns_port` to a port that this process may share, or switch it off"
     );
+}
+
+/// Binds what a start binds, for its words.
+#[cfg(test)]
+pub(super) fn start_words(stores: Arc<Stores>) -> Result<(), String> {
+    Shell::bind(stores).map(drop)
 }

@@ -96,3 +96,38 @@ fn service(udp: SocketAddr, me: &Announcement) -> Result<ServiceInfo, MdnsError>
     service.set_requires_probe(false);
     Ok(service)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::{net::UdpSocket, time::Duration};
+
+    use sinew_runtime::tid::{Incarnation, NodeAddress};
+
+    use super::*;
+
+    #[test]
+    fn the_daemons_thread_ends_when_its_owner_does() {
+        // given
+        let port = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        let me = Announcement {
+            project: "sinew".to_owned(),
+            node: NodeAddress::new(1),
+            // Cut to its 40 bytes within a character.
+            name: "x".to_owned() + &"ä".repeat(31),
+            incarnation: Incarnation(1),
+            boot_nonce: 1,
+            gncl_ip: 0,
+            gncl_port: 0,
+            period_us: 0,
+        };
+        let mdns = Mdns::start(port, "127.0.0.1:9".parse().unwrap(), &me).unwrap();
+        let events = mdns.monitor().unwrap();
+        // when
+        drop(mdns);
+        // then
+        while let Ok(event) = events.recv_timeout(Duration::from_secs(10)) {
+            assert!(!matches!(event, DaemonEvent::Error(_)), "{event:?}");
+        }
+        assert!(events.is_disconnected(), "waited 10 s for the daemon to end");
+    }
+}

@@ -1,1 +1,331 @@
+//! Real NDL actors over the loopback interface, each test in a multicast group and on ports of its own.
 
+use std::{
+    net::{Ipv4Addr, SocketAddr, SocketAddrV4, UdpSocket},
+    sync::{
+        Arc,
+        atomic::{AtomicU8, Ordering},
+    },
+    time::Duration,
+};
+
+use actix::{Actor, Arbiter, System};
+use futures_util::StreamExt;
+use sinew_runtime::{
+    outcome::Rejection,
+    post::{Post, PostStream},
+    router::{LocalRoute, Outlet, Refused},
+    supervision::ReadyGate,
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    time::Time,
+    wire::{Message, Payload},
+};
+
+use super::{LossReason, MembershipFact, NdlActor, NodeEvent, Source, actor::lock};
+use crate::{config::NdlConfig, config::NodeConfig, gncl, stores::Stores};
+
+const LOOPBACK: Ipv4Addr = Ipv4Addr::LOCALHOST;
+
+async fn within<T>(what: &str, future: impl Future<Output = T>) -> T {
+    let waited = tokio::time::timeout(Duration::from_secs(10), future).await;
+    waited.unwrap_or_else(|_| panic!("waited 10 s for {what}"))
+}
+
+/// A UDP port that is free now.
+fn free_port() -> u16 {
+    UdpSocket::bind((LOOPBACK, 0)).unwrap().local_addr().unwrap().port()
+}
+
+/// A group that no other test of this process has, at a port that no other process has.
+fn own_group() -> SocketAddrV4 {
+    static NEXT: AtomicU8 = AtomicU8::new(1);
+    SocketAddrV4::new(Ipv4Addr::new(239, 255, 77, NEXT.fetch_add(1, Ordering::Relaxed)), free_port())
+}
+
+/// No source of addresses at all.
+fn alone(ndl: &mut NdlConfig) {
+    ndl.multicast = None;
+    ndl.mdns_port = None;
+}
+
+/// An application that takes every event.
+struct Inbox(Post<Message>);
+
+impl Outlet for Inbox {
+    fn submit(&self, message: Message) -> Result<(), Refused> {
+        self.0.post(message).map_err(|message| Refused::new(message, Rejection::QueueFull))
+    }
+}
+
+/// A node with NDL and no other layer.
+struct Node {
+    stores: Arc<Stores>,
+    layer: Option<Arbiter>,
+    facts: PostStream<gncl::Event>,
+    events: PostStream<Message>,
+}
+
+impl Node {
+    async fn start(number: u32, set: impl FnOnce(&mut NdlConfig)) -> Self {
+        Self::start_life(number, 1, set).await
+    }
+
+    async fn start_life(number: u32, incarnation: u64, set: impl FnOnce(&mut NdlConfig)) -> Self {
+        let mut node = Self::new(number, incarnation, set);
+        node.start_layer().await;
+        node
+    }
+
+    fn new(number: u32, incarnation: u64, set: impl FnOnce(&mut NdlConfig)) -> Self {
+        let mut config = NodeConfig::new(format!("node-{number}"));
+        config.address = Some(NodeAddress::new(number));
+        alone(&mut config.ndl);
+        set(&mut config.ndl);
+        let stores = Stores::for_test(config, Incarnation(incarnation));
+        stores.gncl_listen.set(gncl_of(number)).unwrap();
+        let (inbox, facts) = (Post::new(1_000), stores.posts.gncl.attach());
+        let events = inbox.attach();
+        let route = LocalRoute { outlet: Arc::new(Inbox(inbox)), events: Arc::new([NodeEvent::KIND]) };
+        stores.router.set_local(AppAddress::new(0x1000), route);
+        Self { stores, layer: None, facts, events }
+    }
+
+    async fn start_layer(&mut self) {
+        let (say, ready) = tokio::sync::oneshot::channel();
+        let gate = ReadyGate::new(move || say.send(()).expect("the test waits"));
+        let (stores, layer) = (self.stores.clone(), Arbiter::new());
+        layer.spawn_fn(move || drop(NdlActor::new(stores, gate).start()));
+        within("NDL to be ready", ready).await.expect("NDL says that it is ready");
+        self.layer = Some(layer);
+    }
+
+    /// Ends the layer as a crash would: its thread goes, with all that ran on it.
+    fn end_layer(&mut self) {
+        if let Some(layer) = self.layer.take() {
+            layer.stop();
+            layer.join().expect("the layer's thread ends without a panic");
+        }
+    }
+
+    fn udp(&self) -> SocketAddr {
+        lock(&self.stores).udp().expect("NDL has bound its socket")
+    }
+
+    async fn fact(&mut self, what: &str) -> MembershipFact {
+        let event = within(what, self.facts.next()).await.expect("nobody else reads this post");
+        let gncl::Event::Membership(fact) = event;
+        fact
+    }
+
+    async fn finds(&mut self, other: &Self) {
+        let (node, incarnation) = (other.stores.node, other.stores.incarnation);
+        let found = MembershipFact::NodeFound { node, incarnation, gncl: gncl_of(node.bits()) };
+        assert_eq!(self.fact(&format!("node {node} to be found")).await, found);
+    }
+
+    async fn loses(&mut self, other: &Self, reason: LossReason) {
+        let (node, incarnation) = (other.stores.node, other.stores.incarnation);
+        let lost = MembershipFact::NodeLost { node, incarnation, why: reason };
+        assert_eq!(self.fact(&format!("node {node} to be lost")).await, lost);
+    }
+
+    async fn event(&mut self) -> Message {
+        within("an event", self.events.next()).await.expect("nobody else reads this inbox")
+    }
+
+    fn sources(&self) -> Vec<Source> {
+        let members = lock(&self.stores).members(Time::now());
+        members.iter().flat_map(|member| member.sources.keys().copied()).collect()
+    }
+}
+
+impl Drop for Node {
+    fn drop(&mut self) {
+        self.end_layer();
+    }
+}
+
+fn gncl_of(number: u32) -> SocketAddr {
+    SocketAddr::from((LOOPBACK, 40_000 + number as u16))
+}
+
+fn run(test: impl Future<Output = ()>) {
+    System::new().block_on(test);
+}
+
+#[test]
+fn two_nodes_find_each_other_by_multicast_alone_and_know_their_clocks() {
+    run(async {
+        let group = own_group();
+        let mut first = Node::start(1, |ndl| ndl.multicast = Some(group)).await;
+        let mut second = Node::start(2, |ndl| ndl.multicast = Some(group)).await;
+        first.finds(&second).await;
+        second.finds(&first).await;
+        assert!(first.sources().contains(&Source::Multicast), "{:?}", first.sources());
+        // One host has one clock: what is measured is the error, and it keeps to its bound.
+        let offset = first.stores.clocks.get(second.stores.node).expect("measured before the fact is told");
+        assert!(offset.theirs_minus_ours_ns.unsigned_abs() as u128 <= offset.bound.as_nanos(), "{offset:?}");
+    });
+}
+
+#[test]
+fn two_nodes_find_each_other_by_one_seed_alone() {
+    run(async {
+        let mut first = Node::start(1, |_| {}).await;
+        let seed = first.udp();
+        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
+        first.finds(&second).await;
+        second.finds(&first).await;
+        assert_eq!(first.sources(), [Source::Query]);
+        assert!(second.sources().contains(&Source::Seed));
+    });
+}
+
+#[test]
+fn two_nodes_find_each_other_by_mdns_alone() {
+    run(async {
+        let port = free_port();
+        let mut first = Node::start(1, |ndl| ndl.mdns_port = Some(port)).await;
+        let mut second = Node::start(2, |ndl| ndl.mdns_port = Some(port)).await;
+        first.finds(&second).await;
+        second.finds(&first).await;
+        let sources = [first.sources(), second.sources()].concat();
+        assert!(sources.contains(&Source::Mdns), "{sources:?}");
+    });
+}
+
+#[test]
+fn an_application_hears_who_comes_and_who_falls_silent() {
+    run(async {
+        // given
+        let mut first = Node::start(1, |ndl| ndl.period = Duration::from_millis(50)).await;
+        let seed = first.udp();
+        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
+        first.finds(&second).await;
+        let found = first.event().await;
+        assert_eq!(found.header.source, Tid::new(first.stores.node, AppAddress::NDL));
+        let (node, incarnation) = (second.stores.node, Incarnation(1));
+        let expected = NodeEvent::NodeFound { node, name: "node-2".to_owned(), incarnation };
+        assert_eq!(found.decode::<NodeEvent>().unwrap(), expected);
+        // when: it ends without a word
+        second.end_layer();
+        // then
+        first.loses(&second, LossReason::Silent).await;
+        let lost: NodeEvent = first.event().await.decode().unwrap();
+        assert!(matches!(lost, NodeEvent::NodeLost { why: LossReason::Silent, .. }), "{lost:?}");
+        assert_eq!(first.stores.clocks.get(second.stores.node), None);
+    });
+}
+
+#[test]
+fn a_node_that_stops_says_goodbye_and_a_later_life_is_a_restart() {
+    run(async {
+        // given: a period so long that only the goodbye can tell
+        let mut first = Node::start(1, |ndl| ndl.period = Duration::from_secs(60)).await;
+        let seed = first.udp();
+        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
+        first.finds(&second).await;
+        drop(first.event().await);
+        second.finds(&first).await;
+        // when
+        second.stores.stopping.store(true, Ordering::Relaxed);
+        second.end_layer();
+        // then
+        first.loses(&second, LossReason::Left).await;
+        drop(first.event().await);
+        // when
+        let third = Node::start_life(2, 2, |ndl| ndl.seeds = vec![seed]).await;
+        // then
+        first.finds(&third).await;
+        let event: NodeEvent = first.event().await.decode().unwrap();
+        assert!(matches!(event, NodeEvent::NodeRestarted { incarnation: Incarnation(2), .. }), "{event:?}");
+    });
+}
+
+#[test]
+fn nobody_notices_that_the_layer_of_a_node_is_restarted() {
+    run(async {
+        // given
+        let mut first = Node::start(1, |_| {}).await;
+        let seed = first.udp();
+        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
+        first.finds(&second).await;
+        second.finds(&first).await;
+        // when
+        let before = second.udp();
+        second.end_layer();
+        second.start_layer().await;
+        // then: the next thing that either hears of is a third node
+        assert_eq!(second.udp(), before);
+        let seeds = vec![seed, before];
+        let third = Node::start(3, |ndl| ndl.seeds = seeds).await;
+        first.finds(&third).await;
+        second.finds(&third).await;
+        assert_eq!(lock(&second.stores).members(Time::now()).len(), 2);
+    });
+}
+
+#[test]
+fn a_later_instance_ends_the_former_one_and_takes_over() {
+    run(async {
+        let mut first = Node::start(1, |_| {}).await;
+        let former = first.layer.take();
+        first.start_layer().await;
+        // The former one still holds the port; the later one has another, and is the one that is found.
+        let seed = first.udp();
+        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
+        second.finds(&first).await;
+        first.finds(&second).await;
+        if let Some(former) = former {
+            former.stop();
+            former.join().unwrap();
+        }
+    });
+}
+
+#[test]
+fn a_flood_of_rubbish_is_refused_and_keeps_nobody_out() {
+    run(async {
+        // given
+        let mut first = Node::start(1, |_| {}).await;
+        let target = first.udp();
+        // when: garbage, cut frames and oversized datagrams, as fast as a thread can write them
+        let flood = std::thread::spawn(move || {
+            let socket = UdpSocket::bind((LOOPBACK, 0)).unwrap();
+            for length in (0..30_000).map(|round| round % 1_400) {
+                // A full buffer is what a flood is about.
+                let _ = socket.send_to(&vec![b'S'; length], target);
+            }
+        });
+        let mut second = Node::start(2, |ndl| ndl.seeds = vec![target]).await;
+        // then
+        second.finds(&first).await;
+        first.finds(&second).await;
+        flood.join().unwrap();
+        assert!(lock(&first.stores).refusals().total() > 0);
+    });
+}
+
+#[test]
+fn a_group_that_cannot_be_joined_leaves_the_other_sources() {
+    run(async {
+        let no_group = SocketAddrV4::new(Ipv4Addr::new(203, 0, 113, 1), 9);
+        let mut first = Node::start(1, |ndl| ndl.multicast = Some(no_group)).await;
+        let seed = first.udp();
+        let second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
+        first.finds(&second).await;
+    });
+}
+
+#[test]
+fn what_cannot_be_had_is_named_with_its_place_and_remedy() {
+    let words = |node: &Node| super::actor::start_words(node.stores.clone()).unwrap_err();
+    // A port that somebody has.
+    let taken = UdpSocket::bind((LOOPBACK, 0)).unwrap();
+    let port = taken.local_addr().unwrap().port();
+    let said = words(&Node::new(1, 1, |ndl| ndl.port = port));
+    assert!(said.contains(&format!("127.0.0.1:{port}")) && said.contains("`ndl.port`"), "{said}");
+    // An interface that is not there: 192.0.2.0/24 is for documentation.
+    let said = words(&Node::new(1, 1, |ndl| ndl.interface = Ipv4Addr::new(192, 0, 2, 1)));
+    assert!(said.contains("192.0.2.1:0") && said.contains("`ndl.interface`"), "{said}");
+}

@@ -30,7 +30,9 @@ use sinew_runtime::{
 };
 
 use crate::{
+    gncl::Peer,
     ndl::KnownNode,
+    outlet::OutletCounts,
     stores::{Stores, lock},
     sync::{DirectoryEntry, Waiting},
 };
@@ -50,6 +52,20 @@ pub struct Node {
     handle: NodeHandle,
     ended: Receiver<NodeEnd>,
     thread: Option<std::thread::JoinHandle<()>>,
+}
+
+/// What became of the messages to another node, from the link with its present life on. Nothing leaks: submitted =
+/// sent + superseded + expired + lost + refused + waiting.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Traffic {
+    /// The other node.
+    pub node: NodeAddress,
+    /// What became of them.
+    pub counts: OutletCounts,
+    /// Those that wait to be sent.
+    pub waiting: usize,
+    /// Confirmed ones whose outcome is not known yet.
+    pub unconfirmed: usize,
 }
 
 /// Asks about a running node and stops it, from any thread.
@@ -159,6 +175,18 @@ impl NodeHandle {
     #[must_use]
     pub fn directory(&self) -> Vec<DirectoryEntry> {
         lock(&self.stores.sync).directory()
+    }
+
+    /// What became of the messages to each node that is linked or expected back.
+    #[must_use]
+    pub fn traffic(&self) -> Vec<Traffic> {
+        let traffic = |peer: Arc<Peer>| Traffic {
+            node: peer.node,
+            counts: peer.outlet.counts(),
+            waiting: peer.outlet.waiting(),
+            unconfirmed: peer.outlet.unconfirmed(),
+        };
+        self.stores.gncl.peers().into_iter().map(traffic).collect()
     }
 
     /// Where GNCL listens, once it does.

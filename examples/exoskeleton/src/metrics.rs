@@ -68,7 +68,8 @@ impl Metrics {
     #[must_use]
     pub fn of(record: &Record) -> Self {
         let fault = record.outage.map(|outage| fault_figures(record, outage));
-        let counted = counted_rows(record, fault.as_ref());
+        let counting = Counting::with(record, fault.as_ref());
+        let counted: Vec<&Row> = record.rows.iter().filter(|row| counting.counts(row)).collect();
         let strides_counted = strides_in(&counted);
         let per_stride = |sum: PerJoint<f64>| sum.map(|x| x / strides_counted.max(f64::MIN_POSITIVE));
         let power = |row: &Row, i: usize| row.joints[i].applied_nm * row.joints[i].velocity_rad_s;
@@ -115,21 +116,39 @@ fn reference_rad(joint: usize, phase: f64) -> f64 {
     curves::angle_rad(Joint::ALL[joint], phase).value
 }
 
-/// The rows that count; see the top of this file.
-fn counted_rows<'a>(record: &'a Record, fault: Option<&FaultFigures>) -> Vec<&'a Row> {
-    let pause = fault.map(|fault| {
-        let resumed_s = fault.outage.to_s.zip(fault.resumed_after_s).map(|(to_s, after_s)| to_s + after_s);
-        let resumed_strides = resumed_s
-            .and_then(|s| record.rows.iter().find(|r| r.t_s >= s))
-            .map_or(f64::INFINITY, |r| r.strides_true.ceil() + STRIDES_AFTER_RETURN);
-        (fault.outage.from_s, resumed_strides)
-    });
-    record
-        .rows
-        .iter()
-        .filter(|r| r.walking && r.strides_true >= FIRST_STRIDE_COUNTED)
-        .filter(|r| pause.is_none_or(|(from_s, strides)| r.t_s < from_s || r.strides_true >= strides))
-        .collect()
+/// Which rows count; see the top of this file.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Counting {
+    /// Death of a node (seconds of the run), and the stride from which figures count again.
+    pause: Option<(f64, f64)>,
+}
+
+impl Counting {
+    /// The rule for this record.
+    #[must_use]
+    pub fn of(record: &Record) -> Self {
+        Self::with(record, record.outage.map(|outage| fault_figures(record, outage)).as_ref())
+    }
+
+    /// Whether the figures of this row count.
+    #[must_use]
+    pub fn counts(&self, row: &Row) -> bool {
+        let paused =
+            self.pause.is_some_and(|(from_s, stride)| row.t_s >= from_s && row.strides_true < stride);
+        row.walking && row.strides_true >= FIRST_STRIDE_COUNTED && !paused
+    }
+
+    fn with(record: &Record, fault: Option<&FaultFigures>) -> Self {
+        let pause = fault.map(|fault| {
+            let resumed_s =
+                fault.outage.to_s.zip(fault.resumed_after_s).map(|(to_s, after_s)| to_s + after_s);
+            let from_stride = resumed_s
+                .and_then(|s| record.rows.iter().find(|r| r.t_s >= s))
+                .map_or(f64::INFINITY, |r| r.strides_true.ceil() + STRIDES_AFTER_RETURN);
+            (fault.outage.from_s, from_stride)
+        });
+        Self { pause }
+    }
 }
 
 /// Strides covered by rows that may have gaps between them.

@@ -155,4 +155,21 @@ mod tests {
         assert!(matches!(FrameCodec::new(1024).decode(&mut buffer), Err(FrameError::TooLong { .. })));
         assert_eq!(buffer.capacity(), capacity);
     }
+
+    /// The example at the end of `docs/protocol/frame.md`.
+    #[test]
+    fn the_documented_frame_is_what_is_written() {
+        let mut header = Header::new(
+            Kind::named("demo.angle"),
+            "10.0.0.7/1001".parse().unwrap(),
+            "10.0.0.8/1002".parse().unwrap(),
+        );
+        (header.sequence, header.sent) = (1, crate::time::Time::from_nanos(1_000_000_000));
+        let mut bytes = BytesMut::new();
+        encode_frame(&header, b"\x81\xa7degrees\x01", &mut bytes);
+        let hex: Vec<_> = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
+        let lines: Vec<_> = hex.chunks(16).map(|line| line.join(" ")).collect();
+        let page = include_str!("../../../docs/protocol/frame.md");
+        assert!(page.contains(&lines.join("\n")), "the page should show:\n{}", lines.join("\n"));
+    }
 }

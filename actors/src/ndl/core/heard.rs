@@ -8,7 +8,7 @@ use std::net::SocketAddr;
 use sinew_runtime::time::Time;
 
 use super::{
-    Core, Input, Output, Source, Way,
+    Core, Input, Output, Query, Source, Way,
     clock::Exchange,
     contact::{Contact, Question},
     lives::Proof,
@@ -37,7 +37,9 @@ impl Core {
         };
         let (correlation, sent) = (datagram.correlation, datagram.sent);
         let input = match datagram.body {
-            Body::Query(announcement) => Input::QueryReceived { from, way, correlation, sent, announcement },
+            Body::Query(announcement) => {
+                Input::QueryReceived(Query { from, way, correlation, sent, announcement })
+            }
             Body::Answer(answer) => Input::AnswerReceived { from, correlation, sent, answer },
             Body::Leave(announcement) => Input::LeaveReceived { from, announcement },
         };
@@ -60,19 +62,13 @@ impl Core {
     }
 
     // spec: NDL-3
-    pub(super) fn queried(
-        &mut self,
-        now: Time,
-        from: SocketAddr,
-        way: Way,
-        (correlation, query_sent): (u64, Time),
-        announcement: &Announcement,
-    ) {
+    pub(super) fn queried(&mut self, now: Time, query: &Query) {
+        let Query { from, way, correlation, sent: query_sent, ref announcement } = *query;
         // A member's question to everybody is not for us: it asks us by ourselves, too.
         if way == Way::Unicast || !self.is_member_at(from, announcement) {
-            let node = announcement.node;
+            let (to, node) = (from, announcement.node);
             self.outputs.push_back(Output::SendAnswer {
-                to: from,
+                to,
                 node,
                 correlation,
                 query_sent,

@@ -32,6 +32,12 @@ pub(super) struct Proof {
     pub(super) exchange: Option<Exchange>,
 }
 
+impl Proof {
+    fn is_of(&self, other: &Announcement) -> bool {
+        self.announcement.node == other.node && self.announcement.is_same_life(other)
+    }
+}
+
 /// A newcomer claims a member's address in a later life. The member has until then to show that it lives.
 #[derive(Debug)]
 pub(super) struct Contest {
@@ -60,6 +66,9 @@ impl Core {
     /// Somebody proved to be at an address. // spec: NDL-3.2
     pub(super) fn confirmed(&mut self, now: Time, proof: Proof) {
         let claimed = &proof.announcement;
+        // A newcomer whose address turns out to be another's has none to come from.
+        self.contests
+            .retain(|_, contest| contest.newcomer.from != proof.from || contest.newcomer.is_of(claimed));
         if claimed.node == self.me.node {
             self.own_address_used(now, proof.from);
             return;
@@ -253,9 +262,7 @@ impl Core {
             self.challenge_member(now, node);
             return;
         }
-        if let Some(contest) = self.contests.remove(&node)
-            && self.may_still_be_there(&contest.newcomer)
-        {
+        if let Some(contest) = self.contests.remove(&node) {
             self.replace(now, contest.newcomer);
         }
     }
@@ -333,17 +340,9 @@ impl Core {
             // Perhaps only its GNCL restarts: then it answers this.
             self.ask(now, member.address);
         }
-        if let Some(contest) = contest
-            && self.may_still_be_there(&contest.newcomer)
-        {
+        if let Some(contest) = contest {
             self.arrive(now, contest.newcomer);
         }
-    }
-
-    /// Whether nobody else has answered at that address since.
-    fn may_still_be_there(&self, proof: &Proof) -> bool {
-        let role = self.contacts.get(&proof.from).map(|contact| contact.role);
-        !matches!(role, Some(Role::Member(other)) if other != proof.announcement.node)
     }
 
     /// Keeps the last life of a lost node, so that a former one never comes back. // spec: NDL-7.1

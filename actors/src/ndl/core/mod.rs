@@ -51,7 +51,7 @@ use crate::{config::NodeConfig, gncl::LinkFact, refusals::Refusals, stores::Cloc
 #[derive(Clone, Debug)]
 pub(crate) enum Input {
     /// Somebody asked.
-    QueryReceived { from: SocketAddr, way: Way, correlation: u64, sent: Time, announcement: Announcement },
+    QueryReceived(Query),
     /// Somebody answered; `sent` is in its clock.
     AnswerReceived { from: SocketAddr, correlation: u64, sent: Time, answer: Answer },
     /// Somebody said goodbye.
@@ -109,6 +109,16 @@ pub(crate) enum Output {
     Stalled {
         late: Duration,
     },
+}
+
+/// A query that somebody sent; `sent` is in its clock.
+#[derive(Clone, Debug)]
+pub(crate) struct Query {
+    pub(crate) from: SocketAddr,
+    pub(crate) way: Way,
+    pub(crate) correlation: u64,
+    pub(crate) sent: Time,
+    pub(crate) announcement: Announcement,
 }
 
 /// Which way a datagram came.
@@ -186,7 +196,6 @@ pub(crate) struct Core {
 
     outputs: VecDeque<Output>,
     refusals: Refusals,
-    ignored: u64,
 }
 
 impl Core {
@@ -233,7 +242,6 @@ impl Core {
             collisions_reported: BTreeMap::new(),
             outputs: VecDeque::new(),
             refusals: Refusals::default(),
-            ignored: 0,
         }
     }
 
@@ -259,9 +267,9 @@ impl Core {
             return;
         }
         match input {
-            Input::QueryReceived { from, way, correlation, sent, announcement } => {
-                if self.concerns_us(&announcement) {
-                    self.queried(now, from, way, (correlation, sent), &announcement);
+            Input::QueryReceived(query) => {
+                if self.concerns_us(&query.announcement) {
+                    self.queried(now, &query);
                 }
             }
             Input::AnswerReceived { from, correlation, sent, answer } => {
@@ -306,11 +314,6 @@ impl Core {
         &self.refusals
     }
 
-    /// Datagrams of other projects, and our own that came back.
-    pub(crate) const fn ignored(&self) -> u64 {
-        self.ignored
-    }
-
     /// Asks `to`, whom there is a contact for.
     fn ask(&mut self, now: Time, to: SocketAddr) {
         let correlation = self.next_correlation();
@@ -329,10 +332,7 @@ impl Core {
     }
 
     /// Other projects and our own echo are none of our business. // spec: NDL-1.2
-    fn concerns_us(&mut self, announcement: &Announcement) -> bool {
-        let concerns =
-            announcement.project == self.me.project && announcement.boot_nonce != self.me.boot_nonce;
-        self.ignored += u64::from(!concerns);
-        concerns
+    fn concerns_us(&self, announcement: &Announcement) -> bool {
+        announcement.project == self.me.project && announcement.boot_nonce != self.me.boot_nonce
     }
 }

@@ -1,4 +1,5 @@
 //! Whole conversations of cores on a simulated network, in virtual time.
 
+mod properties;
 mod scenarios;
 mod world;

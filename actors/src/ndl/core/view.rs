@@ -8,7 +8,7 @@ use sinew_runtime::{
 };
 
 use super::{Core, Source};
-use crate::{ndl::MembershipFact, stores::ClockOffset};
+use crate::stores::ClockOffset;
 
 /// A node that is there.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -54,15 +54,5 @@ impl Core {
             offset: member.clock.offset(now, Duration::ZERO),
         });
         views.collect()
-    }
-
-    /// The facts that a layer would know by now if it had missed none.
-    pub(crate) fn membership(&self) -> Vec<MembershipFact> {
-        let facts = self.members.values().map(|member| MembershipFact::NodeFound {
-            node: member.announcement.node,
-            incarnation: member.announcement.incarnation,
-            gncl: member.announcement.gncl().into(),
-        });
-        facts.collect()
     }
 }

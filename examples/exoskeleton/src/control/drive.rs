@@ -10,7 +10,8 @@
 //! ```
 //!
 //! Invariants, each with a test: the torque is exactly 0.0 until `Walk` was reached once; it never exceeds the limit;
-//! it never changes faster than the rate limit; what is stale or refused never reaches the torque law.
+//! it never changes faster than the rate limit; what is stale or refused never reaches the torque law. One exception
+//! to the first: a device that still holds a torque from an earlier life of its drive is ramped to zero, not stepped.
 
 use super::admission::Admission;
 use super::faults::{DriveCounters, FaultBits};

@@ -98,14 +98,14 @@ impl Canvas {
     pub(super) fn legend_line(&mut self, (x, y): (f64, f64), stroke: Stroke, text: &str) -> f64 {
         self.path(&format!("M{x:.1} {:.1}h26", y - 4.0), stroke);
         self.label((x + 33.0, y), 12.5, Anchor::Start, text);
-        x + 33.0 + 7.1 * text.chars().count() as f64 + 20.0
+        x + 33.0 + 6.9 * text.chars().count() as f64 + 8.0
     }
 
     /// A sample of an area with its meaning; returns the x at which the next one may begin.
     pub(super) fn legend_area(&mut self, (x, y): (f64, f64), color: &str, text: &str) -> f64 {
         self.add(&format!(r#"<rect x="{x:.1}" y="{:.1}" width="26" height="11" fill="{color}"/>"#, y - 10.0));
         self.label((x + 33.0, y), 12.5, Anchor::Start, text);
-        x + 33.0 + 7.1 * text.chars().count() as f64 + 20.0
+        x + 33.0 + 6.9 * text.chars().count() as f64 + 8.0
     }
 
     pub(super) fn frame(&mut self, panel: &Panel<'_>) {

@@ -1,7 +1,7 @@
 //! The figure of a run: angles against the reference band, torques, phase, and loop lateness when it was measured.
 
 use super::canvas::{Anchor, Axis, Canvas, Panel, Stroke};
-use super::strides;
+use super::strides::{self, Strides};
 use crate::control::torque_law::TorqueLaw;
 use crate::gait::band::Band;
 use crate::gait::curves;
@@ -13,9 +13,14 @@ use crate::record::{Record, Row};
 /// Colours of Okabe and Ito, told apart with any colour vision: blue, vermilion, green.
 const JOINT_COLORS: [&str; 3] = ["#0072B2", "#D55E00", "#009E73"];
 const BAND_COLOR: &str = "#d9d9d9";
+/// Strides in and after a fault: reddish purple of the same set.
+const FAULT_COLOR: &str = "#CC79A7";
 const REFERENCE: Stroke = Stroke::dashed("#555555", 1.6);
 const TRUE_PHASE: Stroke = Stroke::solid("#222222", 2.4);
 const ESTIMATED_PHASE: Stroke = Stroke::solid("#E69F00", 1.6);
+
+/// Gap in the phase error from which on it is drawn as a gap, strides.
+const STRIDES_UNKNOWN_MIN: f64 = 0.05;
 
 const WIDTH: f64 = 1240.0;
 const COLUMN_LEFT: [f64; 3] = [80.0, 480.0, 880.0];
@@ -57,7 +62,7 @@ pub fn figure(figure: &Figure<'_>) -> String {
     let mut canvas = Canvas::new(WIDTH, height + 90.0);
     canvas.heading((30.0, 38.0), 21.0, figure.title);
     canvas.label((30.0, 62.0), 13.5, Anchor::Start, figure.caption);
-    legend(&mut canvas);
+    legend(&mut canvas, figure.record.outage.is_some());
     let band = Band::built_in();
     for joint in Joint::ALL {
         angle_panel(&mut canvas, figure.record, &band, joint);
@@ -72,12 +77,15 @@ pub fn figure(figure: &Figure<'_>) -> String {
     canvas.finish()
 }
 
-fn legend(canvas: &mut Canvas) {
+fn legend(canvas: &mut Canvas, with_fault: bool) {
     let y = 98.0;
     let mut x = canvas.legend_line((30.0, y), Stroke::solid("#444444", 2.6), "mean of strides 7 and later");
     x = canvas.legend_line((x, y), Stroke::faint("#444444", 0.9, 0.45), "each stride");
-    x = canvas.legend_line((x, y), REFERENCE, "recorded mean");
-    canvas.legend_area((x, y), BAND_COLOR, "\u{b1} 1 SD, 53 recorded strides of one adult");
+    x = canvas.legend_line((x, y), REFERENCE, "recorded mean (torque: 40 % of the moment)");
+    x = canvas.legend_area((x, y), BAND_COLOR, "\u{b1} 1 SD, 53 recorded strides of one adult");
+    if with_fault {
+        canvas.legend_line((x, y), Stroke::faint(FAULT_COLOR, 1.4, 0.8), "around the fault");
+    }
 }
 
 fn footer(canvas: &mut Canvas, y: f64) {
@@ -95,7 +103,7 @@ fn angle_panel(canvas: &mut Canvas, record: &Record, band: &Band, joint: Joint) 
         .enumerate()
         .map(|(i, p)| (percent(i), p.mean_deg - p.deviation_deg, p.mean_deg + p.deviation_deg))
         .collect();
-    let all = strides.iter().flatten().copied().chain(edges.iter().flat_map(|(_, low, high)| [*low, *high]));
+    let all = strides.all().chain(edges.iter().flat_map(|(_, low, high)| [*low, *high]));
     let title = match joint {
         Joint::Hip => "Hip angle (flexion +)",
         Joint::Knee => "Knee angle (flexion +)",
@@ -119,7 +127,7 @@ fn torque_panel(canvas: &mut Canvas, record: &Record, joint: Joint) {
             (i as f64, law.assist * law.body_mass_kg * moment)
         })
         .collect();
-    let all = strides.iter().flatten().copied().chain(share.iter().map(|(_, y)| *y));
+    let all = strides.all().chain(share.iter().map(|(_, y)| *y));
     let title = match joint {
         Joint::Hip => "Hip torque of the device",
         Joint::Knee => "Knee torque of the device",
@@ -129,25 +137,20 @@ fn torque_panel(canvas: &mut Canvas, record: &Record, joint: Joint) {
     canvas.frame(&panel);
     draw_strides(canvas, &panel, joint, &strides);
     canvas.line(&panel, &share, REFERENCE);
-    if joint == Joint::Hip {
-        canvas.label(
-            (panel.area.0 + panel.area.2, TORQUE_TOP - 10.0),
-            11.5,
-            Anchor::End,
-            "dashed: 40 % of recorded moment",
-        );
-    }
 }
 
-fn draw_strides(canvas: &mut Canvas, panel: &Panel<'_>, joint: Joint, strides: &[Vec<f64>]) {
+fn draw_strides(canvas: &mut Canvas, panel: &Panel<'_>, joint: Joint, strides: &Strides) {
     let color = JOINT_COLORS[joint.index()];
     let points = |curve: &[f64]| -> Vec<(f64, f64)> {
         curve.iter().enumerate().map(|(i, y)| (i as f64, *y)).collect()
     };
-    for stride in strides {
+    for stride in &strides.uncounted {
+        canvas.line(panel, &points(stride), Stroke::faint(FAULT_COLOR, 1.0, 0.45));
+    }
+    for stride in &strides.counted {
         canvas.line(panel, &points(stride), Stroke::faint(color, 0.9, 0.30));
     }
-    canvas.line(panel, &points(&strides::mean(strides)), Stroke::solid(color, 2.6));
+    canvas.line(panel, &points(&strides::mean(&strides.counted)), Stroke::solid(color, 2.6));
 }
 
 fn cycle_panel<'a>(joint: Joint, top: f64, title: &'a str, y: Axis<'a>) -> Panel<'a> {
@@ -181,7 +184,8 @@ fn phase_panel(canvas: &mut Canvas, record: &Record) {
     canvas.legend_line((x, PHASE_TOP - 10.0), ESTIMATED_PHASE, "estimated");
 }
 
-/// Phase error over all strides, with the limit and the start of assistance.
+/// Phase error over all strides, with the limit and the start of assistance. While the estimator has no
+/// trust in itself there is nothing to draw.
 fn error_panel(canvas: &mut Canvas, record: &Record) {
     let panel = Panel {
         area: (680.0, PHASE_TOP, 520.0, LOW_ROW_HEIGHT),
@@ -191,21 +195,34 @@ fn error_panel(canvas: &mut Canvas, record: &Record) {
     };
     canvas.frame(&panel);
     canvas.band(&panel, &[(0.0, -3.0, 3.0), (f64::from(record.strides), -3.0, 3.0)], BAND_COLOR);
-    let assisted = |row: &&Row| row.mode == Some(GaitMode::Walk);
-    if let Some(row) = record.rows.iter().find(assisted) {
-        let x = row.strides_true;
-        canvas.line(&panel, &[(x, -15.0), (x, 15.0)], Stroke::dashed(JOINT_COLORS[2], 1.6));
-        let place = (panel.area.0 + panel.area.2 * x / f64::from(record.strides) + 6.0, PHASE_TOP + 14.0);
-        canvas.label(place, 12.0, Anchor::Start, "assistance begins");
+    for (stride, text, height) in moments(record) {
+        canvas.line(&panel, &[(stride, -15.0), (stride, 15.0)], Stroke::dashed("#606060", 1.3));
+        let x = panel.area.0 + panel.area.2 * stride / f64::from(record.strides) + 6.0;
+        canvas.label((x, PHASE_TOP + height), 12.0, Anchor::Start, &text);
     }
     let errors: Vec<(f64, f64)> = record
         .rows
         .iter()
-        .filter(|row| row.walking && row.mode.is_some())
+        .filter(|row| row.walking && row.confidence > 0.0 && row.mode != Some(GaitMode::Safe))
         .step_by(5)
         .map(|row| (row.strides_true, 100.0 * wrapped(row.phase_estimated - row.strides_true)))
         .collect();
     canvas.line(&panel, &broken_at_jumps(errors), ESTIMATED_PHASE);
+}
+
+/// Strides at which something happened, what it was, and how far below the panel's top its text stands.
+fn moments(record: &Record) -> Vec<(f64, String, f64)> {
+    let stride_at = |t_s: f64| record.rows.iter().find(|r| r.t_s >= t_s).map(|r| r.strides_true);
+    let assisted_after = |t_s: f64| {
+        record.rows.iter().find(|r| r.t_s >= t_s && r.mode == Some(GaitMode::Walk)).map(|r| r.strides_true)
+    };
+    let mut moments = Vec::new();
+    moments.extend(assisted_after(0.0).map(|stride| (stride, "assistance".to_owned(), 14.0)));
+    let Some(outage) = record.outage else { return moments };
+    moments.extend(stride_at(outage.from_s).map(|stride| (stride, format!("{} killed", outage.part), 30.0)));
+    let resumed = outage.to_s.and_then(assisted_after);
+    moments.extend(resumed.map(|stride| (stride, "assistance again".to_owned(), 14.0)));
+    moments
 }
 
 fn lateness_panel(canvas: &mut Canvas, lateness: &Lateness) {
@@ -243,9 +260,17 @@ fn broken_at_wraps(points: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
     broken(points, 50.0)
 }
 
-/// Lifts the pen where an error jumps around half a stride.
+/// Lifts the pen where an error jumps around half a stride, and where there is no estimate for a while.
 fn broken_at_jumps(points: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
-    broken(points, 20.0)
+    let mut out: Vec<(f64, f64)> = Vec::with_capacity(points.len());
+    for point in broken(points, 20.0) {
+        if out.last().is_some_and(|last| point.0 - last.0 > STRIDES_UNKNOWN_MIN) {
+            // A line across the gap would show an error nobody measured.
+            out.push((point.0, f64::NAN));
+        }
+        out.push(point);
+    }
+    out
 }
 
 fn broken(points: Vec<(f64, f64)>, jump: f64) -> Vec<(f64, f64)> {
@@ -257,4 +282,28 @@ fn broken(points: Vec<(f64, f64)>, jump: f64) -> Vec<(f64, f64)> {
         out.push(point);
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::intention::Intention;
+    use crate::lockstep::{LockStepConfig, run};
+
+    #[test]
+    fn phase_error_is_not_drawn_where_nothing_was_estimated() {
+        let drawn = broken_at_jumps(vec![(6.99, 1.0), (7.0, 1.2), (9.0, 0.1), (9.01, 0.1)]);
+        assert_eq!(drawn.len(), 5);
+        assert!(drawn[2].1.is_nan());
+    }
+
+    #[test]
+    fn lateness_has_a_panel_only_when_it_was_measured() {
+        let record = run(&LockStepConfig::standard(8, 1, Intention::from_curves(1))).unwrap();
+        let lateness = Lateness { bucket_us: 10.0, counts: vec![20_000, 900, 30, 0, 1] };
+        let text = |lateness| figure(&Figure { record: &record, title: "t", caption: "c", lateness });
+        assert!(text(Some(&lateness)).contains("Loop lateness"));
+        assert!(!text(None).contains("Loop lateness"));
+        assert!(!text(None).contains("NaN"));
+    }
 }

@@ -1,0 +1,342 @@
+//! NodeAPI against a real LNCL: what a program in a process of its own sees.
+
+use std::{thread, time::Duration};
+
+use serde::{Deserialize, Serialize};
+use sinew_runtime::{
+    outcome::{Outcome, Rejection},
+    tid::{AppAddress, Tid},
+    time::Time,
+    wire::{Class, Flags, Kind, Message, Payload},
+};
+
+use super::{ApiError, Endpoint, NodeApi, Registration};
+use crate::lncl::{
+    AppFact,
+    testing::{TestDirectory, TestNode, WATCHDOG},
+};
+
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Torque {
+    newton_metres: f32,
+}
+
+impl Payload for Torque {
+    const NAME: &'static str = "test.torque";
+}
+
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Doubled {
+    newton_metres: f32,
+}
+
+impl Payload for Doubled {
+    const NAME: &'static str = "test.doubled";
+}
+
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Setpoint(u32);
+
+impl Payload for Setpoint {
+    const NAME: &'static str = "test.setpoint";
+    const CLASS: Class = Class::Stream;
+}
+
+const TORQUE: Torque = Torque { newton_metres: 2.5 };
+
+fn register(node: &TestNode, registration: Registration) -> Endpoint {
+    let api = NodeApi::connect(node.path()).unwrap();
+    api.register_transport_address(registration).unwrap()
+}
+
+fn refusal(node: &TestNode, registration: Registration) -> String {
+    let api = NodeApi::connect(node.path()).unwrap();
+    match api.register_transport_address(registration) {
+        Err(ApiError::Refused(sentence)) => sentence,
+        other => panic!("{other:?} instead of a refusal"),
+    }
+}
+
+#[test]
+fn addresses_are_fixed_or_dynamic_and_names_have_one_holder() {
+    let node = TestNode::start();
+    let fixed = AppAddress::fixed(7).unwrap();
+    let first = register(&node, Registration::new().name("knee").fixed(fixed));
+    assert_eq!(first.tid(), Tid::new(node.address(), fixed));
+    assert_eq!((first.node_name(), first.payload_max()), ("test", 1 << 20));
+    let second = register(&node, Registration::new());
+    assert!(second.tid().app.is_dynamic());
+    let pid = std::process::id();
+    let why = refusal(&node, Registration::new().name("knee"));
+    assert!(why.contains(&format!("'knee' is taken by application {fixed} of process {pid}")), "{why}");
+    let why = refusal(&node, Registration::new().fixed(fixed));
+    assert!(why.contains("is taken by 'knee'"), "{why}");
+    let why = refusal(&node, Registration::new().fixed(AppAddress::NDL));
+    assert!(why.contains("fixed addresses are"), "{why}");
+}
+
+#[test]
+fn without_a_node_the_error_says_where_it_was_looked_for() {
+    let directory = TestDirectory::new();
+    let error = NodeApi::connect(directory.path().join("nobody.sock")).unwrap_err();
+    assert!(error.to_string().contains("nobody.sock"), "{error}");
+}
+
+#[test]
+fn messages_go_to_and_fro_between_processes() {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let mut endpoint = register(&node, Registration::new());
+    endpoint.send(app.tid, &TORQUE).unwrap();
+    let message = app.next();
+    assert_eq!((message.header.source, message.header.sequence), (endpoint.tid(), 1));
+    assert_eq!(message.decode::<Torque>().unwrap(), TORQUE);
+    node.stores.router.send(Message::typed(app.tid, endpoint.tid(), &TORQUE)).unwrap();
+    let received = endpoint.receive(WATCHDOG).unwrap().expect("a message");
+    assert_eq!((received.source(), received.kind()), (app.tid, Torque::KIND));
+    assert_eq!(received.decode::<Torque>().unwrap(), TORQUE);
+    assert!(received.age(Time::MAX) > Duration::ZERO);
+    assert!(endpoint.receive(Duration::ZERO).unwrap().is_none());
+}
+
+#[test]
+fn raw_memory_is_lent_filled_and_sent() {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let mut endpoint = register(&node, Registration::new());
+    let kind = Kind::named("test.raw");
+    let mut buffer = endpoint.create_message(app.tid, kind, 100_000).unwrap();
+    buffer[99_999] = 7;
+    endpoint.send_message(buffer).unwrap();
+    let message = app.next();
+    assert_eq!((message.header.kind, message.payload.len(), message.payload[99_999]), (kind, 100_000, 7));
+    let too_long = endpoint.create_message(app.tid, kind, endpoint.payload_max() + 1);
+    assert!(matches!(too_long, Err(ApiError::TooLong { .. })));
+}
+
+#[test]
+fn a_confirmed_message_ends_in_what_its_receiver_says() {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let mut endpoint = register(&node, Registration::new());
+    for said in [Outcome::Delivered, Outcome::Rejected(Rejection::ByHandler), Outcome::Failed] {
+        let told = thread::scope(|scope| {
+            scope.spawn(|| app.next().settle(said));
+            endpoint.send_confirmed(app.tid, &TORQUE, WATCHDOG).unwrap()
+        });
+        assert_eq!(told, said);
+    }
+    let nobody = Tid::new(node.address(), AppAddress::new(0x7777));
+    let told = endpoint.send_confirmed(nobody, &TORQUE, WATCHDOG).unwrap();
+    assert_eq!(told, Outcome::Rejected(Rejection::NoSuchApplication));
+    let told = endpoint.send_confirmed(app.tid, &Setpoint(1), WATCHDOG).unwrap();
+    assert_eq!(told, Outcome::Rejected(Rejection::Unsupported), "of a Stream the newest wins");
+}
+
+#[test]
+fn an_outcome_that_nobody_says_is_unknown_at_the_deadline() {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let mut endpoint = register(&node, Registration::new());
+    let told = endpoint.send_confirmed(app.tid, &TORQUE, Duration::from_millis(1)).unwrap();
+    assert_eq!(told, Outcome::Unknown);
+    // The late outcome of the first is not taken for the second's.
+    app.next().settle(Outcome::Delivered);
+    let told = thread::scope(|scope| {
+        scope.spawn(|| app.next().settle(Outcome::Failed));
+        endpoint.send_confirmed(app.tid, &TORQUE, WATCHDOG).unwrap()
+    });
+    assert_eq!(told, Outcome::Failed);
+}
+
+#[test]
+fn messages_that_come_while_an_outcome_is_awaited_are_received_afterwards() {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let mut endpoint = register(&node, Registration::new());
+    let tid = endpoint.tid();
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            let mut message = app.next();
+            node.stores.router.send(Message::typed(app.tid, tid, &TORQUE)).unwrap();
+            message.settle(Outcome::Delivered);
+        });
+        assert_eq!(endpoint.send_confirmed(app.tid, &TORQUE, WATCHDOG).unwrap(), Outcome::Delivered);
+    });
+    assert!(endpoint.receive(Duration::ZERO).unwrap().is_some());
+}
+
+#[test]
+fn two_endpoints_of_one_process_ask_and_reply() {
+    let node = TestNode::start();
+    let mut asking = register(&node, Registration::new());
+    let mut replying = register(&node, Registration::new());
+    let to = replying.tid();
+    let thread = thread::spawn(move || {
+        let request = replying.receive(WATCHDOG).unwrap().expect("a request");
+        assert!(request.wants_reply());
+        let Torque { newton_metres } = request.decode().unwrap();
+        replying.reply(&request, &Doubled { newton_metres: 2.0 * newton_metres }).unwrap();
+    });
+    let reply: Doubled = asking.ask(to, &TORQUE, WATCHDOG).unwrap();
+    assert_eq!(reply, Doubled { newton_metres: 5.0 });
+    thread.join().unwrap();
+}
+
+#[test]
+fn a_request_that_cannot_be_handled_ends_at_once() {
+    let node = TestNode::start();
+    let mut endpoint = register(&node, Registration::new());
+    let nobody = Tid::new(node.address(), AppAddress::new(0x7777));
+    let error = endpoint.ask::<_, Doubled>(nobody, &TORQUE, WATCHDOG).unwrap_err();
+    assert!(matches!(error, ApiError::Ended(Outcome::Rejected(Rejection::NoSuchApplication))), "{error}");
+}
+
+#[test]
+fn what_asks_for_no_reply_gets_none() {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let mut endpoint = register(&node, Registration::new());
+    node.stores.router.send(Message::typed(app.tid, endpoint.tid(), &TORQUE)).unwrap();
+    let received = endpoint.receive(WATCHDOG).unwrap().expect("a message");
+    assert!(matches!(endpoint.reply(&received, &TORQUE), Err(ApiError::NotAsked)));
+}
+
+#[test]
+fn a_received_message_counts_as_handled_when_it_is_dropped() {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let mut endpoint = register(&node, Registration::new());
+    let tid = endpoint.tid();
+    let outcome = node.send_confirmed(app.tid, tid, &TORQUE);
+    drop(endpoint.receive(WATCHDOG).unwrap().expect("a message"));
+    assert_eq!(outcome.recv_timeout(WATCHDOG), Ok(Outcome::Delivered));
+    let outcome = node.send_confirmed(app.tid, tid, &TORQUE);
+    endpoint.receive(WATCHDOG).unwrap().expect("a message").settle(Outcome::Rejected(Rejection::Malformed));
+    assert_eq!(outcome.recv_timeout(WATCHDOG), Ok(Outcome::Rejected(Rejection::Malformed)));
+}
+
+#[test]
+fn a_message_that_is_in_hand_at_a_panic_has_failed() {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let mut endpoint = register(&node, Registration::new());
+    let outcome = node.send_confirmed(app.tid, endpoint.tid(), &TORQUE);
+    let thread = thread::spawn(move || {
+        let _in_hand = endpoint.receive(WATCHDOG).unwrap().expect("a message");
+        panic!("this is the panic that the test asks for");
+    });
+    assert!(thread.join().is_err());
+    assert_eq!(outcome.recv_timeout(WATCHDOG), Ok(Outcome::Failed));
+}
+
+#[test]
+fn what_waited_in_a_dropped_endpoint_was_not_handled() {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let mut endpoint = register(&node, Registration::new());
+    let first = node.send_confirmed(app.tid, endpoint.tid(), &TORQUE);
+    let second = node.send_confirmed(app.tid, endpoint.tid(), &TORQUE);
+    // Both have come with one look at the socket.
+    drop(endpoint.receive(WATCHDOG).unwrap().expect("a message"));
+    drop(endpoint);
+    assert_eq!(first.recv_timeout(WATCHDOG), Ok(Outcome::Delivered));
+    assert_eq!(second.recv_timeout(WATCHDOG), Ok(Outcome::Rejected(Rejection::Closed)));
+}
+
+#[test]
+fn of_a_stream_only_the_newest_value_is_received() {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let mut endpoint = register(&node, Registration::new());
+    for value in 0..10 {
+        node.stores.router.send(Message::typed(app.tid, endpoint.tid(), &Setpoint(value))).unwrap();
+    }
+    let received = endpoint.receive(WATCHDOG).unwrap().expect("a message");
+    assert_eq!(received.decode::<Setpoint>().unwrap(), Setpoint(9));
+    assert!(endpoint.receive(Duration::ZERO).unwrap().is_none());
+}
+
+#[test]
+fn a_member_gets_what_is_sent_to_its_group_until_it_leaves() {
+    let node = TestNode::start();
+    let mut member = register(&node, Registration::new());
+    let mut sender = register(&node, Registration::new());
+    let group = Tid::group("drives");
+    member.join("drives").unwrap();
+    sender.send(group, &TORQUE).unwrap();
+    assert_eq!(member.receive(WATCHDOG).unwrap().expect("a message").destination(), group);
+    member.leave("drives").unwrap();
+    sender.send(group, &TORQUE).unwrap();
+    // What the sender says directly comes after what it said to the group.
+    sender.send(member.tid(), &TORQUE).unwrap();
+    assert_eq!(member.receive(WATCHDOG).unwrap().expect("a message").destination(), member.tid());
+}
+
+#[test]
+fn names_resolve_and_are_free_when_unregister_returns() {
+    let node = TestNode::start();
+    let mut endpoint = register(&node, Registration::new());
+    assert_eq!(endpoint.resolve("hip", WATCHDOG).unwrap(), None);
+    let hip = register(&node, Registration::new().name("hip"));
+    assert_eq!(endpoint.resolve("hip", WATCHDOG).unwrap(), Some(hip.tid()));
+    hip.unregister().unwrap();
+    assert_eq!(endpoint.resolve("hip", WATCHDOG).unwrap(), None);
+    register(&node, Registration::new().name("hip"));
+}
+
+#[test]
+fn a_registration_waits_at_the_barrier_and_names_what_it_waits_for() {
+    let mut node = TestNode::start();
+    let api = NodeApi::connect(node.path()).unwrap();
+    let wanted = Registration::new().requires(["knee.sensor", "central.gait"]);
+    let error =
+        api.register_transport_address(wanted.clone().deadline(Duration::from_millis(1))).unwrap_err();
+    assert!(error.to_string().contains("knee.sensor, central.gait"), "{error}");
+    let AppFact::Registered { app: given_up, .. } = node.fact() else { panic!("no registration") };
+    assert_eq!(node.fact(), AppFact::Unregistered { app: given_up });
+    let waiting = thread::spawn(move || api.register_transport_address(wanted.deadline(WATCHDOG)));
+    let AppFact::Registered { app, .. } = node.fact() else { panic!("no registration") };
+    node.release(app);
+    assert_eq!(waiting.join().unwrap().unwrap().tid().app, app);
+}
+
+#[test]
+fn the_end_of_the_node_is_an_error_with_its_reason() {
+    let mut node = TestNode::start();
+    let mut endpoint = register(&node, Registration::new());
+    node.stop();
+    let error = endpoint.receive(WATCHDOG).unwrap_err();
+    assert!(error.to_string().contains("LNCL has ended"), "{error}");
+    let error = endpoint.send(Tid::NONE, &TORQUE).unwrap_err();
+    assert!(error.to_string().contains("LNCL has ended"), "{error}");
+}
+
+#[test]
+fn every_thread_may_have_an_address_of_its_own() {
+    let node = TestNode::start();
+    let api = NodeApi::connect(node.path()).unwrap();
+    let app = node.local(1);
+    thread::scope(|scope| {
+        for _ in 0..8 {
+            scope.spawn(|| {
+                let mut endpoint = api.register_transport_address(Registration::new()).unwrap();
+                let kind = Kind::named("test.raw");
+                for number in 0..100_u64 {
+                    let mut buffer = endpoint.create_message(app.tid, kind, 8).unwrap();
+                    buffer.copy_from_slice(&number.to_le_bytes());
+                    endpoint.send_message(buffer).unwrap();
+                }
+            });
+        }
+        let mut next = std::collections::BTreeMap::<Tid, u64>::new();
+        for _ in 0..800 {
+            let message = app.next();
+            let expected = next.entry(message.header.source).or_default();
+            assert_eq!(message.payload[..], expected.to_le_bytes(), "in order for each source");
+            *expected += 1;
+            assert!(!message.header.flags.has(Flags::CONFIRM));
+        }
+        assert_eq!(next.len(), 8);
+    });
+}

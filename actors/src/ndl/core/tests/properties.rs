@@ -1,0 +1,103 @@
+//! What holds whatever happens.
+
+use std::{
+    collections::BTreeMap,
+    net::{Ipv4Addr, SocketAddrV4},
+};
+
+use proptest::prelude::*;
+use sinew_runtime::{tid::Incarnation, time::Time};
+
+use super::{
+    scenarios::stranger,
+    world::{Spec, ms, udp},
+};
+use crate::{
+    gncl::LinkFact,
+    ndl::{
+        MembershipFact,
+        core::{Core, Input, Output, Query, Way, contact::Role},
+        datagram::{Announcement, Answer},
+    },
+};
+
+const GNCL: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 1), 5);
+
+/// Anything that can reach a core, in any order.
+fn any_input() -> impl Strategy<Value = (u64, Input)> {
+    let addresses = (1u16..6).prop_map(udp);
+    let announcement = (1u32..6, 0u64..4, 0u64..4).prop_map(|(address, incarnation, boot_nonce)| {
+        Announcement { incarnation: Incarnation(incarnation), boot_nonce, ..stranger(address) }
+    });
+    let input =
+        (addresses, announcement, 0..7, any::<bool>()).prop_map(|(from, announcement, what, flag)| {
+            let Announcement { node, incarnation, .. } = announcement;
+            match what {
+                0 => {
+                    let way = if flag { Way::Unicast } else { Way::Multicast };
+                    Input::QueryReceived(Query { from, way, correlation: 1, sent: Time::ZERO, announcement })
+                }
+                1 | 2 => {
+                    let answer = Answer { announcement, query_sent_ns: 0, query_received_ns: 0 };
+                    Input::AnswerReceived { from, correlation: 0, sent: Time::ZERO, answer }
+                }
+                3 => Input::LeaveReceived { from, announcement },
+                4 => Input::MdnsResolved { address: from },
+                5 if flag => Input::Link(LinkFact::LinkBroken { node, incarnation }),
+                5 => Input::Link(LinkFact::DialRefused { node, incarnation }),
+                _ => Input::TimePassed,
+            }
+        });
+    (0u64..700, input)
+}
+
+/// Makes an answer one to a question that was really asked, where there is one.
+fn to_a_question(core: &Core, mut input: Input) -> Input {
+    if let Input::AnswerReceived { from, correlation, .. } = &mut input
+        && let Some(question) = core.contacts.get(from).and_then(|contact| contact.questions.newest())
+    {
+        *correlation = question.correlation;
+    }
+    input
+}
+
+proptest! {
+    /// Whatever happens: layers hear of each life once, found before lost; tables agree; the bounds hold.
+    #[test]
+    fn facts_alternate_and_tables_agree(inputs in proptest::collection::vec(any_input(), 1..200)) {
+        let mut core = Spec { nodes_max: 3, ..Spec::of(1) }.core(99);
+        let mut now = Time::from_nanos(1_000_000_000);
+        core.start(now, udp(0), GNCL);
+        let mut there = BTreeMap::new();
+        for (gap, input) in inputs {
+            now = now + ms(gap);
+            let input = to_a_question(&core, input);
+            core.handle(now, input);
+            while let Some(output) = core.poll() {
+                match output {
+                    Output::Fact(MembershipFact::NodeFound { node, incarnation, .. }) => {
+                        prop_assert_eq!(there.insert(node, incarnation), None);
+                    }
+                    Output::Fact(MembershipFact::NodeLost { node, incarnation, .. }) => {
+                        prop_assert_eq!(there.remove(&node), Some(incarnation));
+                    }
+                    Output::AddressTaken { .. } => {
+                        core.start(now, udp(0), GNCL);
+                    }
+                    Output::SendQuery { .. } | Output::SendMulticastQuery { .. } | Output::SendAnswer { .. }
+                    | Output::SendLeave { .. } | Output::Event(_) | Output::ClockMeasured { .. }
+                    | Output::Collision { .. } | Output::Stalled { .. } => {}
+                }
+            }
+            prop_assert!(core.members.keys().eq(there.keys()));
+            prop_assert!(core.members.len() <= 3 && core.gone.len() <= 3 && core.contacts.len() <= 9);
+            prop_assert!(core.contests.keys().all(|node| core.members.contains_key(node)));
+            prop_assert!(core.members.keys().all(|node| !core.gone.contains_key(node)));
+            for (node, member) in &core.members {
+                let role = core.contacts.get(&member.address).map(|contact| contact.role);
+                prop_assert_eq!(role, Some(Role::Member(*node)));
+            }
+            prop_assert!(core.next_wake().is_some());
+        }
+    }
+}

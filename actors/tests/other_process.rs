@@ -1,0 +1,144 @@
+//! A whole node and an application in a process of its own, which waits, works, and is killed.
+
+#![expect(clippy::unwrap_used, reason = "a test says what failed by failing")]
+
+use std::{
+    path::{Path, PathBuf},
+    process::{Child, Command},
+    sync::mpsc::{Receiver, SyncSender, sync_channel},
+    time::Duration,
+};
+
+use sinew::{NodeApi, Registration, prelude::*};
+
+const WATCHDOG: Duration = Duration::from_secs(20);
+const SOCKET: &str = "SINEW_TEST_SOCKET";
+
+payload!("test.angle" => struct Angle { degrees: f32 });
+payload!("test.twice" => struct Twice { degrees: f32 });
+
+/// In the node's process: requires the sensor, and tells the test what it sees.
+struct Drive(SyncSender<String>);
+
+impl Actor for Drive {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, _: &mut Self::Context) {
+        self.0.send("started".to_owned()).unwrap();
+    }
+}
+
+impl Handler<Delivery<Angle>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, angle: Delivery<Angle>, context: &mut Self::Context) {
+        context.reply(&angle, &Twice { degrees: 2.0 * angle.degrees }).unwrap();
+        self.0.send(format!("angle {}", angle.degrees)).unwrap();
+    }
+}
+
+impl Handler<Delivery<RequirementEvent>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, event: Delivery<RequirementEvent>, _: &mut Self::Context) {
+        self.0.send(format!("{:?}", event.payload)).unwrap();
+    }
+}
+
+fn start_node(socket: &Path) -> (Node, Receiver<String>) {
+    let (sender, seen) = sync_channel(64);
+    let drive = AppSpec::new("drive", move || Drive(sender.clone()))
+        .requires(["sensor"])
+        .handles::<Angle>()
+        .handles::<RequirementEvent>();
+    let node = Node::builder("knee")
+        .configure(|config| {
+            config.lncl.socket = Some(socket.to_owned());
+            config.ndl.multicast = None;
+            config.ndl.mdns_port = None;
+        })
+        .app(drive)
+        .start()
+        .unwrap();
+    (node, seen)
+}
+
+/// Runs `role` below in a process of its own.
+fn start_process(role: &str, socket: &Path) -> Child {
+    Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", role, "--ignored", "--nocapture"])
+        .env(SOCKET, socket)
+        .spawn()
+        .unwrap()
+}
+
+fn expect(seen: &Receiver<String>, what: &str) {
+    let found = seen.recv_timeout(WATCHDOG).unwrap_or_else(|_| panic!("waited for {what:?}"));
+    assert!(found.starts_with(what), "{found:?} instead of {what:?}");
+}
+
+struct Directory(PathBuf);
+
+impl Drop for Directory {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}
+
+#[test]
+fn an_application_in_another_process_is_waited_for_heard_and_missed_when_it_is_killed() {
+    let directory = Directory(std::env::temp_dir().join(format!("sinew-process-{}", std::process::id())));
+    let socket = directory.0.join("knee.sock");
+    let (node, seen) = start_node(&socket);
+    assert!(seen.try_recv().is_err(), "the drive does not start before the sensor is there");
+
+    let mut sensor = start_process("sensor", &socket);
+    expect(&seen, "started");
+    expect(&seen, "angle 12.5");
+
+    // `kill` is SIGKILL: the process says nothing more.
+    sensor.kill().unwrap();
+    sensor.wait().unwrap();
+    expect(&seen, "Lost { name: \"sensor\" }");
+
+    let mut sensor = start_process("sensor", &socket);
+    // The sync manager says the one and the sensor the other, in any order.
+    let mut both = [seen.recv_timeout(WATCHDOG).unwrap(), seen.recv_timeout(WATCHDOG).unwrap()];
+    both.sort();
+    assert_eq!(both, ["Met { name: \"sensor\" }", "angle 12.5"]);
+    sensor.kill().unwrap();
+    sensor.wait().unwrap();
+    node.stop();
+    assert!(!socket.exists());
+}
+
+#[test]
+fn an_application_in_another_process_waits_for_one_in_the_nodes() {
+    let directory = Directory(std::env::temp_dir().join(format!("sinew-waits-{}", std::process::id())));
+    let socket = directory.0.join("knee.sock");
+    let (node, seen) = start_node(&socket);
+    let api = NodeApi::connect(&socket).unwrap();
+    // Given: what it requires waits itself, for a sensor that is not there.
+    let hip = Registration::new().name("hip").requires(["drive"]);
+    let early = api.register_transport_address(hip.clone().deadline(Duration::from_millis(50)));
+    assert!(early.unwrap_err().to_string().contains("drive"));
+    // When: the sensor comes.
+    let _sensor = api.register_transport_address(Registration::new().name("sensor")).unwrap();
+    expect(&seen, "started");
+    // Then
+    api.register_transport_address(hip.deadline(WATCHDOG)).unwrap();
+    node.stop();
+}
+
+#[test]
+#[ignore = "a process of the test above, not a test"]
+fn sensor() {
+    let Some(socket) = std::env::var_os(SOCKET) else { return };
+    let api = NodeApi::connect(socket).unwrap();
+    let mut sensor = api.register_transport_address(Registration::new().name("sensor")).unwrap();
+    let drive = sensor.resolve("drive", WATCHDOG).unwrap().expect("the drive is registered");
+    let twice: Twice = sensor.ask(drive, &Angle { degrees: 12.5 }, WATCHDOG).unwrap();
+    assert_eq!(twice.degrees, 25.0);
+    // Until it is killed; the end of the node ends it, too.
+    while sensor.receive(WATCHDOG).is_ok() {}
+}

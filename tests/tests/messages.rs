@@ -1,0 +1,197 @@
+//! What messages do between two nodes of one process: requests, outcomes, groups, broadcasts, ages, order by class.
+
+use std::{
+    net::SocketAddrV4,
+    sync::mpsc::{Receiver, SyncSender, sync_channel},
+};
+
+use sinew::{Rejection, prelude::*};
+use sinew_tests::{DEADLINE, own_group};
+
+payload!("messages.question", Control => struct Question { number: u64 });
+payload!("messages.answer", Control => struct Answer { number: u64 });
+payload!("messages.word", Bulk => struct Word { text: String });
+payload!("messages.unheard", Control => struct Unheard;);
+
+/// A node of a pair that finds only the other.
+fn node(name: &str, address: u8, group: SocketAddrV4) -> NodeBuilder {
+    Node::builder(name).address([127, 0, 0, address]).configure(|config| {
+        config.ndl.multicast = Some(group);
+        config.ndl.mdns_port = None;
+    })
+}
+
+/// Doubles numbers, refuses 99, panics at 13; says which words it heard.
+struct Oracle(SyncSender<String>);
+
+impl Actor for Oracle {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        context.join("listeners");
+    }
+}
+
+impl Handler<Delivery<Question>> for Oracle {
+    type Result = ();
+
+    fn handle(&mut self, question: Delivery<Question>, context: &mut Self::Context) {
+        assert!(question.number != 13, "thirteen");
+        if question.number == 99 {
+            context.reject();
+        } else if question.reply_to().is_some() {
+            context.reply(&question, &Answer { number: question.number * 2 }).expect("the asker waits");
+        }
+    }
+}
+
+impl Handler<Delivery<Word>> for Oracle {
+    type Result = ();
+
+    fn handle(&mut self, word: Delivery<Word>, _: &mut Self::Context) {
+        assert!(word.age < DEADLINE, "{:?}", word.age);
+        self.0.send(word.payload.text).expect("the test listens");
+    }
+}
+
+fn oracle(name: &str) -> (AppSpec<Oracle>, Receiver<String>) {
+    let (say, heard) = sync_channel(1_000);
+    let spec = AppSpec::new(name, move || Oracle(say.clone())).handles::<Question>().handles::<Word>();
+    (spec, heard)
+}
+
+/// Runs a story in an actor's own future and says when it is told.
+struct Teller<F> {
+    story: F,
+    told: SyncSender<()>,
+}
+
+impl<F: AsyncFn(sinew::Sender) + Clone + Unpin + 'static> Actor for Teller<F> {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        let (story, sender, told) = (self.story.clone(), context.sender(), self.told.clone());
+        let telling = async move {
+            story(sender).await;
+            told.send(()).expect("the test waits");
+        };
+        context.spawn(telling.into_actor(self));
+    }
+}
+
+/// Two nodes: the story is told on the first, once the applications on the second are ready.
+fn tell<F>(second: impl FnOnce(NodeBuilder) -> NodeBuilder, requires: &[&str], story: F) -> (Node, Node)
+where
+    F: AsyncFn(sinew::Sender) + Clone + Send + Sync + Unpin + 'static,
+{
+    let group = own_group();
+    let (told, is_told) = sync_channel(1);
+    let teller = AppSpec::new("teller", move || Teller { story: story.clone(), told: told.clone() });
+    let there = second(node("there", 2, group)).start().expect("a node");
+    let here = node("here", 1, group).app(teller.requires(requires.iter().copied())).start().expect("a node");
+    if is_told.recv_timeout(DEADLINE).is_err() {
+        panic!("the story was not told; who waits: {:?}", here.handle().waiting());
+    }
+    (here, there)
+}
+
+#[test]
+fn requests_to_another_node_are_answered_and_every_confirmed_send_has_its_outcome() {
+    let (spec, _heard) = oracle("oracle");
+    tell(
+        |node| node.app(spec),
+        &["oracle"],
+        async |sender: sinew::Sender| {
+            let ask =
+                sender.ask::<_, Answer>("oracle", &Question { number: 21 }, DEADLINE).expect("it is sent");
+            assert_eq!(ask.await.expect("a reply").number, 42);
+            let outcome = async |number| {
+                let sent = sender.send_confirmed("oracle", &Question { number }, DEADLINE);
+                sent.expect("it is sent").await
+            };
+            assert_eq!(outcome(1).await, Outcome::Delivered);
+            assert_eq!(outcome(99).await, Outcome::Rejected(Rejection::ByHandler));
+            assert_eq!(outcome(13).await, Outcome::Failed);
+            assert_eq!(outcome(2).await, Outcome::Delivered, "by the new instance behind the same TID");
+            let unheard = sender.send_confirmed("oracle", &Unheard, DEADLINE).expect("it is sent").await;
+            assert_eq!(unheard, Outcome::Rejected(Rejection::UnknownKind));
+            let nobody = Tid::new([127, 0, 0, 2].into(), AppAddress::fixed(7).expect("a fixed address"));
+            let lost = sender.send_confirmed(nobody, &Unheard, DEADLINE).expect("it is sent").await;
+            assert_eq!(lost, Outcome::Rejected(Rejection::NoSuchApplication));
+        },
+    );
+}
+
+#[test]
+fn a_group_and_a_broadcast_reach_each_member_on_every_node_once() {
+    let ((first, at_first), (second, at_second)) = (oracle("first"), oracle("second"));
+    let (here, there) = tell(
+        |node| node.app(first).app(second),
+        &["first", "second"],
+        async |sender: sinew::Sender| {
+            let word = |text: &str| Word { text: text.to_owned() };
+            // The membership follows the readiness by one list; until then nobody takes the message.
+            while sender.send(Tid::group("listeners"), &word("group")).is_err() {
+                actix::clock::sleep(Duration::from_millis(1)).await;
+            }
+            sender.send(Tid::BROADCAST, &word("everybody")).expect("somebody takes it");
+        },
+    );
+    for heard in [at_first, at_second] {
+        let words = [heard.recv_timeout(DEADLINE), heard.recv_timeout(DEADLINE)];
+        assert_eq!(words, [Ok("group".to_owned()), Ok("everybody".to_owned())]);
+        assert_eq!(heard.try_recv().ok(), None);
+    }
+    let sent = here.handle().traffic();
+    assert_eq!(sent.len(), 1, "one peer");
+    drop((here, there));
+}
+
+#[test]
+fn a_thousand_messages_arrive_once_and_in_order() {
+    let (spec, heard) = oracle("oracle");
+    tell(
+        |node| node.configure(|config| config.mailbox_capacity = 2_000).app(spec),
+        &["oracle"],
+        async |sender: sinew::Sender| {
+            for number in 0..1_000 {
+                sender.send("oracle", &Word { text: number.to_string() }).expect("it is sent");
+            }
+        },
+    );
+    for number in 0..1_000 {
+        assert_eq!(heard.recv_timeout(DEADLINE), Ok(number.to_string()));
+    }
+}
+
+#[test]
+fn requirements_in_a_circle_are_refused_with_the_circle_spelled_out() {
+    let (first, _a) = oracle("first");
+    let (second, _b) = oracle("second");
+    let node = node("circle", 1, own_group()).app(first.requires(["second"])).app(second.requires(["first"]));
+    let node = node.start().expect("the layers start");
+    let error = node.handle().wait_until_running(DEADLINE).expect_err("nobody can be the first");
+    let words = error.to_string();
+    assert!(
+        words.contains("first -> second -> first") || words.contains("second -> first -> second"),
+        "{words}"
+    );
+}
+
+#[test]
+fn who_waits_for_whom_can_be_asked() {
+    let (spec, _heard) = oracle("oracle");
+    let node = node("alone", 1, own_group()).app(spec.requires(["never"])).start().expect("the layers start");
+    let error = node.handle().wait_until_running(Duration::from_millis(50)).expect_err("it waits");
+    let words = error.to_string();
+    assert!(words.contains("oracle") && words.contains("never (never seen)"), "{words}");
+}
+
+#[test]
+fn a_port_in_use_fails_the_start_in_words() {
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
+    let port = taken.local_addr().expect("it is bound").port();
+    let node = node("late", 1, own_group()).configure(|config| config.gncl.port = port);
+    let words = node.start().expect_err("the port is taken").to_string();
+    assert!(words.contains(&port.to_string()) && words.contains("gncl.port"), "{words}");
+}
