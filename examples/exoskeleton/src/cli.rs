@@ -1,19 +1,27 @@
 //! Arguments, and which run they mean.
 
 mod lock_step;
+mod node;
+mod real_time;
 
 use std::path::PathBuf;
+use std::process::ExitCode;
 
-use clap::Parser;
+use clap::{Parser, Subcommand};
 use exoskeleton::gait::trial::TrialError;
 use exoskeleton::lockstep::LockStepError;
 use exoskeleton::part::Kill;
+use exoskeleton::robot::launch::LaunchError;
+use exoskeleton::robot::node::NodeError;
 use thiserror::Error;
 
 /// A powered leg of four nodes and a simulated person.
 #[derive(Debug, Parser)]
-#[command(version)]
+#[command(version, args_conflicts_with_subcommands = true)]
 pub(crate) struct Arguments {
+    /// One part alone instead of the whole robot on this host.
+    #[command(subcommand)]
+    part: Option<PartCommand>,
     /// Virtual time in one thread, bit-identical for a seed; says nothing about real-time performance.
     #[arg(long)]
     pub(crate) lock_step: bool,
@@ -35,18 +43,32 @@ pub(crate) struct Arguments {
     /// Silence after which a device damps by itself, ms; without it a device holds its last torque.
     #[arg(long, value_name = "MS")]
     pub(crate) device_watchdog: Option<u64>,
+    /// Thread of the control loops: `io`, which reads the sockets too, or `own`. Real time only.
+    #[arg(long, value_name = "THREAD", default_value = "io")]
+    pub(crate) control_thread: real_time::ThreadArgument,
+    /// `SCHED_FIFO` priority of the control loops, 1 to 99; wants `--control-thread own`. Real time only.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=99))]
+    pub(crate) realtime_priority: Option<u8>,
     /// Folder for the run folders.
     #[arg(long, value_name = "DIR", default_value = "runs")]
     pub(crate) runs: PathBuf,
 }
 
+#[derive(Debug, Subcommand)]
+enum PartCommand {
+    /// Runs one part of the robot until SIGINT or SIGTERM, so that it can be spread over several hosts.
+    Node(node::NodeArguments),
+}
+
 /// How a run ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy)]
 pub(crate) enum Verdict {
     /// All limits held.
     LimitsHeld,
     /// At least one limit did not hold.
     LimitBroken,
+    /// One part ran alone and has ended.
+    NodeEnded(ExitCode),
 }
 
 /// Why there was no run.
@@ -66,12 +88,22 @@ pub(crate) enum RunError {
     /// A result could not be written.
     #[error("{0}")]
     Write(#[from] std::io::Error),
-    /// Nothing runs in real time yet.
-    #[error("the real-time run over five processes is not built yet; use --lock-step")]
-    RealTimeMissing,
+    /// The robot did not walk in real time.
+    #[error(transparent)]
+    Launch(#[from] LaunchError),
+    /// A part of the robot did not run.
+    #[error(transparent)]
+    Node(#[from] NodeError),
+    /// A device watchdog of no use.
+    #[error("--device-watchdog {0}: give 1 to 10000 ms, or leave it out for none")]
+    Watchdog(u64),
 }
 
 /// Does what the arguments say.
 pub(crate) fn run(arguments: &Arguments) -> Result<Verdict, RunError> {
-    if arguments.lock_step { lock_step::run(arguments) } else { Err(RunError::RealTimeMissing) }
+    match &arguments.part {
+        Some(PartCommand::Node(part)) => node::run(part),
+        None if arguments.lock_step => lock_step::run(arguments),
+        None => real_time::run(arguments),
+    }
 }

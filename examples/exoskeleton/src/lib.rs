@@ -22,5 +22,6 @@ pub mod plant;
 pub mod plot;
 pub mod record;
 pub mod report;
+pub mod robot;
 pub mod run_folder;
 pub mod sensor;

@@ -1,0 +1,298 @@
+//! What travels between a joint's applications and its motor device: two small datagrams of fixed size.
+//!
+//! Little-endian; the last four bytes are the CRC-32 (IEEE) of all before them.
+//!
+//! ```text
+//! offset  0        3     4        5      6      7      8        12        20
+//!         "SXD"    kind  version  joint  flags  state  seq u32  t_ns u64  numbers f64 ...  crc u32
+//!
+//! word     32 bytes  'W'  to the device    flags: 1 torque given, 2 released, 4 at its limit
+//!                         state: of the drive; numbers: torque Nm
+//! reading  64 bytes  'R'  from the device  flags: 1 the device's watchdog has taken over, 2 a sole is attached
+//!                         numbers: angle rad, velocity rad/s, torque Nm, heel N, toe N
+//! ```
+//!
+//! A word without torque asks for readings and commands nothing.
+
+use thiserror::Error;
+
+use crate::joint::Joint;
+use crate::message::DriveState;
+use crate::plant::{DeviceReading, FootReading};
+
+/// Bytes of a word.
+pub const WORD_BYTES: usize = 32;
+/// Bytes of a reading.
+pub const READING_BYTES: usize = 64;
+
+const MAGIC: [u8; 3] = *b"SXD";
+const VERSION: u8 = 1;
+const NUMBERS_AT: usize = 20;
+const CRC_BYTES: usize = 4;
+
+/// What a drive or sensor tells its device.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Word {
+    /// The joint.
+    pub joint: Joint,
+    /// Counts up by one with each word of a sender, wraps.
+    pub seq: u32,
+    /// When it was sent, ns of the sender's clock.
+    pub t_ns: u64,
+    /// Torque to give, Nm; `None`: no command, only a wish for readings.
+    pub torque_nm: Option<f64>,
+    /// Whether walking is released.
+    pub released: bool,
+    /// Whether the torque law met its limit.
+    pub saturated: bool,
+    /// State of the drive.
+    pub state: DriveState,
+}
+
+/// What a device tells.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Reading {
+    /// The joint.
+    pub joint: Joint,
+    /// Counts up by one with each reading, wraps.
+    pub seq: u32,
+    /// When it was read, ns of the device's clock.
+    pub t_ns: u64,
+    /// The device.
+    pub device: DeviceReading,
+    /// The sole; at the ankle only.
+    pub foot: Option<FootReading>,
+}
+
+/// Why bytes are no datagram of ours. Their sender is at fault; they are counted and dropped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+pub enum DatagramFault {
+    /// Not of the fixed size.
+    #[error("it has {0} bytes")]
+    Length(usize),
+    /// Does not begin as ours do, or is of the other kind.
+    #[error("it is no datagram of this kind")]
+    Kind,
+    /// Another version.
+    #[error("it is of version {0}")]
+    Version(u8),
+    /// Damaged.
+    #[error("its check sum is wrong")]
+    Damaged,
+    /// Names no joint.
+    #[error("there is no joint {0}")]
+    Joint(u8),
+    /// Names no state.
+    #[error("there is no drive state {0}")]
+    State(u8),
+    /// A number is infinite or none.
+    #[error("a number in it is not finite")]
+    NotFinite,
+}
+
+/// The part that both kinds share.
+struct Head {
+    kind: u8,
+    joint: Joint,
+    flags: u8,
+    state: u8,
+    seq: u32,
+    t_ns: u64,
+}
+
+impl Word {
+    const KIND: u8 = b'W';
+    const TORQUE: u8 = 1;
+    const RELEASED: u8 = 1 << 1;
+    const SATURATED: u8 = 1 << 2;
+
+    /// Its bytes.
+    #[must_use]
+    pub fn encode(&self) -> [u8; WORD_BYTES] {
+        let flags = flag(self.torque_nm.is_some(), Self::TORQUE)
+            | flag(self.released, Self::RELEASED)
+            | flag(self.saturated, Self::SATURATED);
+        let state = self.state.into();
+        let head = Head { kind: Self::KIND, joint: self.joint, flags, state, seq: self.seq, t_ns: self.t_ns };
+        write(&head, &[self.torque_nm.unwrap_or(0.0)])
+    }
+
+    /// Reads bytes.
+    ///
+    /// # Errors
+    /// They are no word.
+    pub fn decode(bytes: &[u8]) -> Result<Self, DatagramFault> {
+        let (head, [torque_nm]) = read::<WORD_BYTES, 1>(bytes, Self::KIND)?;
+        Ok(Self {
+            joint: head.joint,
+            seq: head.seq,
+            t_ns: head.t_ns,
+            torque_nm: (head.flags & Self::TORQUE != 0).then_some(torque_nm),
+            released: head.flags & Self::RELEASED != 0,
+            saturated: head.flags & Self::SATURATED != 0,
+            state: DriveState::try_from(head.state).map_err(|_| DatagramFault::State(head.state))?,
+        })
+    }
+}
+
+impl Reading {
+    const KIND: u8 = b'R';
+    const WATCHDOG: u8 = 1;
+    const SOLE: u8 = 1 << 1;
+
+    /// Its bytes.
+    #[must_use]
+    pub fn encode(&self) -> [u8; READING_BYTES] {
+        let flags = flag(self.device.watchdog_active, Self::WATCHDOG) | flag(self.foot.is_some(), Self::SOLE);
+        let head =
+            Head { kind: Self::KIND, joint: self.joint, flags, state: 0, seq: self.seq, t_ns: self.t_ns };
+        let foot = self.foot.unwrap_or_default();
+        let device = &self.device;
+        write(&head, &[device.angle_rad, device.velocity_rad_s, device.torque_nm, foot.heel_n, foot.toe_n])
+    }
+
+    /// Reads bytes.
+    ///
+    /// # Errors
+    /// They are no reading.
+    pub fn decode(bytes: &[u8]) -> Result<Self, DatagramFault> {
+        let (head, [angle_rad, velocity_rad_s, torque_nm, heel_n, toe_n]) =
+            read::<READING_BYTES, 5>(bytes, Self::KIND)?;
+        let watchdog_active = head.flags & Self::WATCHDOG != 0;
+        Ok(Self {
+            joint: head.joint,
+            seq: head.seq,
+            t_ns: head.t_ns,
+            device: DeviceReading { angle_rad, velocity_rad_s, torque_nm, watchdog_active },
+            foot: (head.flags & Self::SOLE != 0).then_some(FootReading { heel_n, toe_n }),
+        })
+    }
+}
+
+const fn flag(set: bool, bit: u8) -> u8 {
+    if set { bit } else { 0 }
+}
+
+fn write<const BYTES: usize>(head: &Head, numbers: &[f64]) -> [u8; BYTES] {
+    let mut bytes = [0; BYTES];
+    bytes[..3].copy_from_slice(&MAGIC);
+    bytes[3] = head.kind;
+    bytes[4] = VERSION;
+    bytes[5] = head.joint.index() as u8;
+    bytes[6] = head.flags;
+    bytes[7] = head.state;
+    bytes[8..12].copy_from_slice(&head.seq.to_le_bytes());
+    bytes[12..NUMBERS_AT].copy_from_slice(&head.t_ns.to_le_bytes());
+    for (place, number) in bytes[NUMBERS_AT..BYTES - CRC_BYTES].chunks_exact_mut(8).zip(numbers) {
+        place.copy_from_slice(&number.to_le_bytes());
+    }
+    let crc = crc32fast::hash(&bytes[..BYTES - CRC_BYTES]);
+    bytes[BYTES - CRC_BYTES..].copy_from_slice(&crc.to_le_bytes());
+    bytes
+}
+
+fn read<const BYTES: usize, const NUMBERS: usize>(
+    bytes: &[u8],
+    kind: u8,
+) -> Result<(Head, [f64; NUMBERS]), DatagramFault> {
+    let bytes: &[u8; BYTES] = bytes.try_into().map_err(|_| DatagramFault::Length(bytes.len()))?;
+    if bytes[..3] != MAGIC || bytes[3] != kind {
+        return Err(DatagramFault::Kind);
+    }
+    if bytes[4] != VERSION {
+        return Err(DatagramFault::Version(bytes[4]));
+    }
+    let (checked, crc) = bytes.split_at(BYTES - CRC_BYTES);
+    if crc32fast::hash(checked).to_le_bytes() != *crc {
+        return Err(DatagramFault::Damaged);
+    }
+    let joint = *Joint::ALL.get(usize::from(bytes[5])).ok_or(DatagramFault::Joint(bytes[5]))?;
+    let numbers: [f64; NUMBERS] = std::array::from_fn(|i| {
+        f64::from_le_bytes(eight(&bytes[NUMBERS_AT + 8 * i..NUMBERS_AT + 8 * i + 8]))
+    });
+    if !numbers.iter().all(|number| number.is_finite()) {
+        return Err(DatagramFault::NotFinite);
+    }
+    let seq = u32::from_le_bytes([bytes[8], bytes[9], bytes[10], bytes[11]]);
+    let t_ns = u64::from_le_bytes(eight(&bytes[12..NUMBERS_AT]));
+    Ok((Head { kind, joint, flags: bytes[6], state: bytes[7], seq, t_ns }, numbers))
+}
+
+fn eight(bytes: &[u8]) -> [u8; 8] {
+    bytes.try_into().expect("every caller cuts eight bytes")
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn word(seq: u32, t_ns: u64, torque_nm: Option<f64>, state: u8) -> Word {
+        let state = DriveState::try_from(state).unwrap();
+        Word {
+            joint: Joint::Knee,
+            seq,
+            t_ns,
+            torque_nm,
+            released: seq % 2 == 0,
+            saturated: seq % 3 == 0,
+            state,
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes_are_a_datagram_or_a_fault(bytes in prop::collection::vec(any::<u8>(), 0..100)) {
+            let _ = Word::decode(&bytes);
+            let _ = Reading::decode(&bytes);
+        }
+
+        #[test]
+        fn any_bytes_with_a_right_check_sum_are_a_datagram_or_a_fault(bytes: [u8; WORD_BYTES]) {
+            let mut bytes = bytes;
+            bytes[..5].copy_from_slice(&[b'S', b'X', b'D', b'W', VERSION]);
+            let crc = crc32fast::hash(&bytes[..WORD_BYTES - CRC_BYTES]);
+            bytes[WORD_BYTES - CRC_BYTES..].copy_from_slice(&crc.to_le_bytes());
+            if let Ok(word) = Word::decode(&bytes) {
+                prop_assert!(word.torque_nm.is_none_or(f64::is_finite));
+            }
+        }
+
+        #[test]
+        fn word_reads_back(seq: u32, t_ns: u64, torque_nm in prop::option::of(-500.0..500.0), state in 0u8..5) {
+            let word = word(seq, t_ns, torque_nm, state);
+            prop_assert_eq!(Word::decode(&word.encode()), Ok(word));
+        }
+
+        #[test]
+        fn one_damaged_byte_is_noticed(at in 0..WORD_BYTES, by in 1u8..=255) {
+            let mut bytes = word(1, 2, Some(3.0), 2).encode();
+            bytes[at] ^= by;
+            prop_assert!(Word::decode(&bytes).is_err());
+        }
+    }
+
+    #[test]
+    fn reading_reads_back_with_and_without_a_sole() {
+        let device =
+            DeviceReading { angle_rad: 0.1, velocity_rad_s: -2.0, torque_nm: 3.5, watchdog_active: true };
+        for foot in [None, Some(FootReading { heel_n: 400.0, toe_n: 0.5 })] {
+            let reading = Reading { joint: Joint::Ankle, seq: u32::MAX, t_ns: 7, device, foot };
+            assert_eq!(Reading::decode(&reading.encode()), Ok(reading));
+        }
+    }
+
+    #[test]
+    fn torque_that_is_not_a_number_is_refused() {
+        let bytes = Word { torque_nm: Some(f64::NAN), ..word(1, 2, None, 1) }.encode();
+        assert_eq!(Word::decode(&bytes), Err(DatagramFault::NotFinite));
+    }
+
+    #[test]
+    fn reading_is_no_word() {
+        let reading =
+            Reading { joint: Joint::Hip, seq: 1, t_ns: 2, device: DeviceReading::default(), foot: None };
+        assert_eq!(Word::decode(&reading.encode()[..WORD_BYTES]), Err(DatagramFault::Kind));
+    }
+}

@@ -1,0 +1,207 @@
+//! The application `X.drive`: the shell around [`DriveCore`].
+//!
+//! It starts when the three sensors and central's gait are ready, and sends nothing to the device before. Inputs carry
+//! the time at which they were sent, in this host's clock ([`Delivery::sent`]). Silence of an input is noticed twice,
+//! independently: by the core, which refuses what is older than 10 ms in the tick in which it would use it, and by the
+//! runtime's input watchdogs, which write it down. When it is told to stop, the torque ramps to zero first.
+
+use std::path::{Path, PathBuf};
+
+use sinew::prelude::*;
+
+use super::PERIOD;
+use super::device::{DriveCommand, JointDevice};
+use super::edges::{DRIVES, GAIT, STATUS, drive_name, sensor_name};
+use super::figures::LoopFigures;
+use super::sensor::DeviceMaker;
+use super::trace::{DriveRow, EventRow, Trace};
+use crate::control::drive::{DriveConfig, DriveCore, DriveOutput};
+use crate::joint::Joint;
+use crate::message::{GaitMode, GaitState, JointSample};
+
+/// Silence of an input that is noticed.
+const SILENCE_MAX: Duration = Duration::from_millis(10);
+/// Ticks between two statuses: 200 statuses a second.
+const STATUS_TICKS: u64 = 5;
+
+/// What a drive is made with, in each of its lives.
+#[derive(Clone)]
+pub struct DriveParts {
+    /// The joint.
+    pub joint: Joint,
+    /// The way to its device.
+    pub device: DeviceMaker,
+    /// Where its ticks go.
+    pub trace: Trace<DriveRow>,
+    /// Where it writes down what happens once.
+    pub events: Trace<EventRow>,
+    /// Where it leaves its figures at its end, as JSON.
+    pub figures: Option<PathBuf>,
+}
+
+/// The drive of one joint.
+pub struct Drive {
+    parts: DriveParts,
+    core: DriveCore,
+    device: Box<dyn JointDevice>,
+    sample: Option<JointSample>,
+    gait: Option<GaitState>,
+    ticked_at: Option<Time>,
+    figures: LoopFigures,
+    stopping: bool,
+}
+
+/// Declares the drive of a joint.
+#[must_use]
+pub fn spec(parts: DriveParts, place: Place) -> AppSpec<Drive> {
+    let sensors = Joint::ALL.map(sensor_name);
+    AppSpec::new(drive_name(parts.joint), move || Drive::new(parts.clone()))
+        .handles::<JointSample>()
+        .handles::<GaitState>()
+        .requires(sensors)
+        .requires([GAIT])
+        .place(place)
+}
+
+impl Drive {
+    fn new(parts: DriveParts) -> Self {
+        Self {
+            core: DriveCore::new(DriveConfig::standard(parts.joint)),
+            device: (parts.device)(),
+            parts,
+            sample: None,
+            gait: None,
+            ticked_at: None,
+            figures: LoopFigures::default(),
+            stopping: false,
+        }
+    }
+
+    fn tick(&mut self, tick: Tick, context: &mut AppContext<Self>) {
+        let now = Time::now();
+        let output = self.core.tick(now.as_nanos(), self.sample.as_ref(), self.gait.as_ref());
+        if let Some(torque_nm) = output.command_nm {
+            let released = self.gait.is_some_and(|gait| gait.mode != GaitMode::Hold);
+            let (saturated, state) = (output.saturated, output.state);
+            self.device.command(now, &DriveCommand { torque_nm, released, saturated, state });
+        }
+        self.note(now, tick, &output);
+        if tick.number.is_multiple_of(STATUS_TICKS) {
+            // Nobody may want to know.
+            let _ = context.send(Tid::group(STATUS), &self.core.status(now.as_nanos()));
+        }
+        if self.stopping && self.at_rest(&output) {
+            context.stop();
+        }
+    }
+
+    fn at_rest(&self, output: &DriveOutput) -> bool {
+        output.command_nm.is_none_or(|torque_nm| torque_nm == 0.0)
+    }
+
+    fn note(&mut self, now: Time, tick: Tick, output: &DriveOutput) {
+        let row = DriveRow {
+            t_ns: now.as_nanos(),
+            late_us: micros(tick.lateness),
+            period_us: self.ticked_at.map_or(0, |at| micros(now.since(at))),
+            sample_age_us: output.sample_age_ns.map(|ns| micros(Duration::from_nanos(ns))),
+            gait_age_us: output.gait_age_ns.map(|ns| micros(Duration::from_nanos(ns))),
+            state: output.state,
+            torque_nm: output.command_nm,
+        };
+        self.ticked_at = Some(now);
+        self.figures.note(&row);
+        self.parts.trace.note(row);
+    }
+
+    fn note_silence(&self, input: &str, silence: Silence) {
+        let (joint, silent) = (self.parts.joint, silence.silent);
+        tracing::warn!(%joint, input, ?silent, lateness = ?silence.lateness, "an input is silent");
+        self.parts.events.note(EventRow {
+            t_ns: Time::now().as_nanos(),
+            what: "input_silent".to_owned(),
+            whom: input.to_owned(),
+            how: format!("nothing for {silent:?}"),
+        });
+    }
+
+    fn tell_figures(&self) {
+        let (joint, counters, summary) = (self.parts.joint, *self.core.counters(), self.figures.summary());
+        tracing::info!(
+            %joint,
+            ticks = summary.ticks,
+            period_p999_us = summary.period_us.p999,
+            gait_age_p999_us = summary.gait_age_us.p999,
+            deadline_misses = summary.deadline_misses,
+            safe_entries = counters.safe_entries,
+            samples_refused = counters.samples_refused.total(),
+            gait_refused = counters.gait_refused.total(),
+            "the drive ends"
+        );
+        if let Some(path) = &self.parts.figures
+            && let Err(error) = write_json(path, &summary)
+        {
+            tracing::error!(path = %path.display(), %error, "the figures cannot be written");
+        }
+    }
+}
+
+fn write_json(path: &Path, value: &impl serde::Serialize) -> std::io::Result<()> {
+    std::fs::write(path, serde_json::to_string_pretty(value).map_err(std::io::Error::other)?)
+}
+
+/// Whole microseconds; more than an hour is an hour and a bit.
+pub(super) fn micros(time: Duration) -> u32 {
+    u32::try_from(time.as_micros()).unwrap_or(u32::MAX)
+}
+
+impl Actor for Drive {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        tracing::info!(joint = %self.parts.joint, "the barrier is open: the drive starts");
+        context.join(DRIVES);
+        context.every(PERIOD, Self::tick);
+    }
+
+    fn stopping(&mut self, _: &mut Self::Context) -> Running {
+        if self.stopping {
+            return Running::Stop;
+        }
+        self.stopping = true;
+        self.core.emergency_stop();
+        // The ticks go on until the torque is zero.
+        Running::Continue
+    }
+
+    fn stopped(&mut self, _: &mut Self::Context) {
+        self.tell_figures();
+    }
+}
+
+impl Handler<Delivery<JointSample>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, sample: Delivery<JointSample>, context: &mut Self::Context) {
+        if self.sample.is_none() {
+            // From the first one on: before it there is nothing that could fall silent.
+            context.expect::<JointSample>(None, SILENCE_MAX, |this, silence, _| {
+                this.note_silence("joint sample", silence);
+            });
+        }
+        self.sample = Some(JointSample { t_ns: sample.sent.as_nanos(), ..sample.payload });
+    }
+}
+
+impl Handler<Delivery<GaitState>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, gait: Delivery<GaitState>, context: &mut Self::Context) {
+        if self.gait.is_none() {
+            context.expect::<GaitState>(None, SILENCE_MAX, |this, silence, _| {
+                this.note_silence("gait state", silence);
+            });
+        }
+        self.gait = Some(GaitState { t_ns: gait.sent.as_nanos(), ..gait.payload });
+    }
+}

@@ -1,0 +1,110 @@
+//! What crosses an edge between applications: classes and names of the messages, names of applications and groups.
+
+use sinew::prelude::{Actor, AppContext, Class, Payload, Tid, Time, payload};
+
+use crate::joint::Joint;
+use crate::message::{DriveStatus, FootLoad, GaitMode, GaitState, JointSample};
+
+/// Name of the application that estimates the phase.
+pub const GAIT: &str = "central.gait";
+/// Group of the drives: central's word to all three.
+pub const DRIVES: &str = "exo.drives";
+/// Group of those who want to know how things stand.
+pub const STATUS: &str = "exo.status";
+
+/// Time between two looks at the directory, ns.
+const LOOK_PERIOD_NS: u128 = 100_000_000;
+
+impl Payload for JointSample {
+    const NAME: &'static str = "exo.joint_sample";
+    const CLASS: Class = Class::Stream;
+}
+
+impl Payload for FootLoad {
+    const NAME: &'static str = "exo.foot_load";
+    const CLASS: Class = Class::Stream;
+}
+
+impl Payload for GaitState {
+    const NAME: &'static str = "exo.gait_state";
+    const CLASS: Class = Class::Stream;
+}
+
+impl Payload for DriveStatus {
+    const NAME: &'static str = "exo.drive_status";
+    const CLASS: Class = Class::Stream;
+}
+
+payload!("exo.release" =>
+    /// From the coordinator to central's gait: the person may walk.
+    #[derive(Debug, Clone, Copy)]
+    pub struct Release {}
+);
+
+payload!("exo.gait_status", Stream =>
+    /// From central to the group `exo.status`, 20 times a second.
+    #[derive(Debug, Clone, Copy)]
+    pub struct GaitStatus {
+        /// Estimated phase, cycles 0..1.
+        pub phase: f32,
+        /// Trust in the phase, 0..1.
+        pub confidence: f32,
+        /// What the drives are asked to do; none while a part was never heard.
+        pub mode: Option<GaitMode>,
+        /// Greatest lateness of a tick since the last status, us.
+        pub late_max_us: u32,
+    }
+);
+
+payload!("exo.barrier_status", Stream =>
+    /// From each node to the group `exo.status`, 10 times a second: who of its applications waits for whom.
+    #[derive(Debug, Clone)]
+    pub struct BarrierStatus {
+        /// A sentence for each application that waits.
+        pub waiting: Vec<String>,
+    }
+);
+
+/// Name of a joint's sensor.
+#[must_use]
+pub fn sensor_name(joint: Joint) -> String {
+    format!("{joint}.sensor")
+}
+
+/// Name of a joint's drive.
+#[must_use]
+pub fn drive_name(joint: Joint) -> String {
+    format!("{joint}.drive")
+}
+
+/// The joint whose sensor has this name.
+#[must_use]
+pub fn joint_of_sensor(name: &str) -> Option<Joint> {
+    Joint::ALL.into_iter().find(|joint| name.strip_suffix(".sensor") == Some(joint.name()))
+}
+
+/// Somebody who is sent to a thousand times a second: the directory is asked ten times a second.
+#[derive(Debug)]
+pub(super) struct Addressee {
+    name: String,
+    tid: Option<Tid>,
+    looked_at: Option<Time>,
+}
+
+impl Addressee {
+    pub(super) const fn new(name: String) -> Self {
+        Self { name, tid: None, looked_at: None }
+    }
+
+    /// Where it is now; `None` while nobody has the name.
+    pub(super) fn at<A>(&mut self, now: Time, context: &AppContext<A>) -> Option<Tid>
+    where
+        A: Actor<Context = AppContext<A>>,
+    {
+        if self.looked_at.is_none_or(|at| now.since(at).as_nanos() >= LOOK_PERIOD_NS) {
+            self.looked_at = Some(now);
+            self.tid = context.resolve(&self.name);
+        }
+        self.tid
+    }
+}

@@ -1,0 +1,209 @@
+//! The application `central.gait`: the shell around [`CentralCore`].
+//!
+//! It starts when the three sensors are ready, and is ready itself when all inputs are fresh. That a joint is gone it
+//! hears in three ways, and the first counts: its samples are older than 10 ms, its node is lost, its sensor is.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use sinew::prelude::*;
+use sinew::{NodeAddress, ReadyGate};
+
+use super::PERIOD;
+use super::drive::micros;
+use super::edges::{DRIVES, GAIT, GaitStatus, Release, STATUS, joint_of_sensor, sensor_name};
+use super::trace::{GaitRow, Trace};
+use crate::central::{CentralConfig, CentralCore, CentralInput};
+use crate::joint::{Joint, PerJoint};
+use crate::message::{FootLoad, GaitState, JointSample};
+
+/// Ticks between two statuses: 20 a second.
+const STATUS_TICKS: u64 = 50;
+
+/// What the gait application is made with, in each of its lives.
+#[derive(Clone)]
+pub struct GaitParts {
+    /// Addresses of the joint nodes.
+    pub joints: PerJoint<NodeAddress>,
+    /// Epoch of the next life: begins at the node's incarnation in seconds, so that it grows over restarts of the node
+    /// and of the application.
+    pub epoch: Arc<AtomicU32>,
+    /// Where its ticks go.
+    pub trace: Trace<GaitRow>,
+}
+
+/// How a joint is known to be gone.
+#[derive(Debug, Clone, Copy, Default)]
+struct Gone {
+    node: bool,
+    sensor: bool,
+}
+
+/// The gait application.
+pub struct Gait {
+    parts: GaitParts,
+    core: CentralCore,
+    samples: PerJoint<Option<JointSample>>,
+    load: Option<FootLoad>,
+    gone: PerJoint<Gone>,
+    ready: Option<ReadyGate>,
+    late_max: Duration,
+}
+
+/// Declares the gait application.
+#[must_use]
+pub fn spec(parts: GaitParts, place: Place) -> AppSpec<Gait> {
+    AppSpec::new(GAIT, move || Gait::new(parts.clone()))
+        .handles::<JointSample>()
+        .handles::<FootLoad>()
+        .handles::<Release>()
+        .handles::<NodeEvent>()
+        .handles::<RequirementEvent>()
+        .requires(Joint::ALL.map(sensor_name))
+        .place(place)
+}
+
+impl Gait {
+    fn new(parts: GaitParts) -> Self {
+        // Only its growth matters.
+        let epoch = parts.epoch.fetch_add(1, Ordering::Relaxed);
+        Self {
+            parts,
+            core: CentralCore::new(CentralConfig { epoch, ..CentralConfig::default() }),
+            samples: [None; 3],
+            load: None,
+            gone: [Gone::default(); 3],
+            ready: None,
+            late_max: Duration::ZERO,
+        }
+    }
+
+    fn tick(&mut self, tick: Tick, context: &AppContext<Self>) {
+        let now = Time::now();
+        let input =
+            CentralInput { samples: self.samples.each_ref().map(Option::as_ref), load: self.load.as_ref() };
+        let state = self.core.tick(now.as_nanos(), &input);
+        if let Some(state) = &state {
+            // Before a drive has joined there is nobody to hear it.
+            let _ = context.send(Tid::group(DRIVES), state);
+            if let Some(gate) = self.ready.take() {
+                gate.reached();
+            }
+        }
+        self.note(now, tick, state.as_ref());
+        self.late_max = self.late_max.max(tick.lateness);
+        if tick.number.is_multiple_of(STATUS_TICKS) {
+            let status = self.status(state.as_ref());
+            let _ = context.send(Tid::group(STATUS), &status);
+        }
+    }
+
+    fn note(&self, now: Time, tick: Tick, state: Option<&GaitState>) {
+        self.parts.trace.note(GaitRow {
+            t_ns: now.as_nanos(),
+            late_us: micros(tick.lateness),
+            phase: state.map_or(0.0, |state| state.phase),
+            confidence: state.map_or(0.0, |state| state.confidence),
+            mode: state.map(|state| state.mode),
+        });
+    }
+
+    fn status(&mut self, state: Option<&GaitState>) -> GaitStatus {
+        GaitStatus {
+            phase: state.map_or(0.0, |state| state.phase),
+            confidence: state.map_or(0.0, |state| state.confidence),
+            mode: state.map(|state| state.mode),
+            late_max_us: micros(std::mem::take(&mut self.late_max)),
+        }
+    }
+
+    fn joint_at(&self, node: NodeAddress) -> Option<Joint> {
+        Joint::ALL.into_iter().find(|joint| self.parts.joints[joint.index()] == node)
+    }
+
+    fn learn(&mut self, joint: Joint, change: impl FnOnce(&mut Gone)) {
+        let gone = &mut self.gone[joint.index()];
+        change(gone);
+        if gone.node || gone.sensor {
+            self.core.node_lost(joint);
+        } else {
+            self.core.node_found(joint);
+        }
+    }
+}
+
+impl Actor for Gait {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        tracing::info!("the barrier is open: central's gait starts");
+        self.ready = context.hold_ready();
+        context.every(PERIOD, |this, tick, context| this.tick(tick, context));
+    }
+}
+
+impl Handler<Delivery<JointSample>> for Gait {
+    type Result = ();
+
+    fn handle(&mut self, sample: Delivery<JointSample>, context: &mut Self::Context) {
+        match self.joint_at(sample.source.node) {
+            Some(joint) => {
+                let sample = JointSample { t_ns: sample.sent.as_nanos(), ..sample.payload };
+                self.samples[joint.index()] = Some(sample);
+            }
+            None => context.reject(),
+        }
+    }
+}
+
+impl Handler<Delivery<FootLoad>> for Gait {
+    type Result = ();
+
+    fn handle(&mut self, load: Delivery<FootLoad>, context: &mut Self::Context) {
+        if self.joint_at(load.source.node) == Some(Joint::Ankle) {
+            self.load = Some(FootLoad { t_ns: load.sent.as_nanos(), ..load.payload });
+        } else {
+            context.reject();
+        }
+    }
+}
+
+impl Handler<Delivery<Release>> for Gait {
+    type Result = ();
+
+    fn handle(&mut self, release: Delivery<Release>, _: &mut Self::Context) {
+        tracing::info!(by = %release.source, "walking is released");
+        self.core.release();
+    }
+}
+
+impl Handler<Delivery<NodeEvent>> for Gait {
+    type Result = ();
+
+    fn handle(&mut self, event: Delivery<NodeEvent>, _: &mut Self::Context) {
+        match event.payload {
+            NodeEvent::NodeLost { node, .. } => {
+                if let Some(joint) = self.joint_at(node) {
+                    self.learn(joint, |gone| gone.node = true);
+                }
+            }
+            NodeEvent::NodeFound { node, .. } | NodeEvent::NodeRestarted { node, .. } => {
+                if let Some(joint) = self.joint_at(node) {
+                    self.learn(joint, |gone| gone.node = false);
+                }
+            }
+        }
+    }
+}
+
+impl Handler<Delivery<RequirementEvent>> for Gait {
+    type Result = ();
+
+    fn handle(&mut self, event: Delivery<RequirementEvent>, _: &mut Self::Context) {
+        let Some(joint) = joint_of_sensor(event.name()) else { return };
+        match event.payload {
+            RequirementEvent::Lost { .. } => self.learn(joint, |gone| gone.sensor = true),
+            RequirementEvent::Met { .. } => self.learn(joint, |gone| gone.sensor = false),
+        }
+    }
+}

@@ -1,0 +1,152 @@
+//! The processes of a run: started, watched, killed, stopped, by their ids and nobody else's.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::{self, BufRead, BufReader};
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::sync::mpsc::SyncSender;
+use std::time::Duration;
+
+use rustix::process::{Pid, Signal, kill_process};
+use sinew::Time;
+
+use super::LaunchError;
+use crate::robot::role::Role;
+
+/// Time that a process has for its orderly end.
+const STOP_PATIENCE: Duration = Duration::from_secs(5);
+const STOP_LOOK_PERIOD: Duration = Duration::from_millis(10);
+/// Lines of a log that are shown when its process died.
+const LAST_WORDS: usize = 8;
+/// The unit of CPU times in `/proc`; the same on every architecture that Linux shows to programs today.
+const CLOCK_TICKS_PER_S: f64 = 100.0;
+
+/// When it was looked, and the CPU seconds that each process had used.
+pub(super) type CpuTimes = (Time, BTreeMap<&'static str, f64>);
+
+/// Five processes at most, one of each role.
+pub(super) struct Children {
+    program: PathBuf,
+    topology: PathBuf,
+    folder: PathBuf,
+    running: BTreeMap<Role, Child>,
+}
+
+impl Children {
+    pub(super) fn new(topology: PathBuf, folder: PathBuf) -> io::Result<Self> {
+        Ok(Self { program: std::env::current_exe()?, topology, folder, running: BTreeMap::new() })
+    }
+
+    /// Starts a process. It stops when its standard input ends, which is when this process ends, however it does.
+    pub(super) fn start(&mut self, role: Role, say_line: &SyncSender<String>) -> Result<(), LaunchError> {
+        let log = File::options().create(true).append(true).open(self.log(role))?;
+        let mut command = Command::new(&self.program);
+        command.args(["node", role.name(), "--stop-with-stdin", "--topology"]).arg(&self.topology);
+        command.arg("--run-dir").arg(&self.folder);
+        let is_plant = role == Role::Plant;
+        let stdout = if is_plant { Stdio::piped() } else { Stdio::null() };
+        let mut child = command.stdin(Stdio::piped()).stdout(stdout).stderr(log).spawn()?;
+        if let Some(out) = child.stdout.take() {
+            let say_line = say_line.clone();
+            std::thread::Builder::new().name("plant-lines".to_owned()).spawn(move || {
+                // Ends with the plant. A launcher that does not listen any more is about to stop it.
+                BufReader::new(out)
+                    .lines()
+                    .map_while(Result::ok)
+                    .for_each(|line| drop(say_line.try_send(line)));
+            })?;
+        }
+        self.running.insert(role, child);
+        Ok(())
+    }
+
+    /// Whether all still run.
+    pub(super) fn check(&mut self) -> Result<(), LaunchError> {
+        for (role, child) in &mut self.running {
+            if let Some(status) = child.try_wait()? {
+                let (role, log) = (*role, self.folder.join(format!("{role}.log")));
+                let text = fs::read_to_string(&log).unwrap_or_default();
+                let lines: Vec<&str> = text.lines().collect();
+                let words = lines[lines.len().saturating_sub(LAST_WORDS)..].join("\n");
+                let log = log.display().to_string();
+                return Err(LaunchError::Died { role, status: status.to_string(), log, words });
+            }
+        }
+        Ok(())
+    }
+
+    /// Kills a process as a power cut would; returns when.
+    pub(super) fn kill(&mut self, role: Role) -> Time {
+        let at = Time::now();
+        if let Some(mut child) = self.running.remove(&role) {
+            // It may have ended by itself in this moment.
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+        at
+    }
+
+    /// CPU seconds used so far, by this process too.
+    pub(super) fn cpu_times(&self) -> CpuTimes {
+        let children = self.running.iter().map(|(role, child)| (role.name(), child.id()));
+        let all = children.chain([("launcher", std::process::id())]);
+        (Time::now(), all.filter_map(|(name, id)| Some((name, cpu_seconds(id)?))).collect())
+    }
+
+    /// Stops the nodes, then the plant. What does not end in time is killed.
+    pub(super) fn stop(&mut self) {
+        let plant = self.running.remove(&Role::Plant);
+        let mut nodes: Vec<Child> = std::mem::take(&mut self.running).into_values().collect();
+        stop_all(&mut nodes);
+        stop_all(&mut plant.into_iter().collect::<Vec<_>>());
+    }
+
+    fn log(&self, role: Role) -> PathBuf {
+        self.folder.join(format!("{role}.log"))
+    }
+}
+
+impl Drop for Children {
+    fn drop(&mut self) {
+        self.stop();
+    }
+}
+
+fn stop_all(children: &mut Vec<Child>) {
+    for child in children.iter() {
+        // It may have ended by itself.
+        let _ = kill_process(Pid::from_child(child), Signal::TERM);
+    }
+    let deadline = Time::now() + STOP_PATIENCE;
+    while !children.is_empty() && Time::now() < deadline {
+        children.retain_mut(|child| matches!(child.try_wait(), Ok(None)));
+        std::thread::sleep(STOP_LOOK_PERIOD);
+    }
+    for child in children.iter_mut() {
+        eprintln!("process {} did not end within {STOP_PATIENCE:?}; it is killed", child.id());
+        let _ = child.kill();
+        let _ = child.wait();
+    }
+    children.clear();
+}
+
+/// From `/proc/PID/stat`: user and system time, the 14th and 15th fields; the second is the name, in parentheses.
+fn cpu_seconds(id: u32) -> Option<f64> {
+    let text = fs::read_to_string(format!("/proc/{id}/stat")).ok()?;
+    let after_name = text.rsplit_once(')')?.1;
+    let mut fields = after_name.split_ascii_whitespace().skip(11);
+    let ticks = |field: Option<&str>| field?.parse::<f64>().ok();
+    Some((ticks(fields.next())? + ticks(fields.next())?) / CLOCK_TICKS_PER_S)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cpu_time_of_a_process_is_read() {
+        assert!(cpu_seconds(std::process::id()).is_some_and(|seconds| seconds < 10_000.0));
+        assert_eq!(cpu_seconds(u32::MAX), None);
+    }
+}

@@ -1,0 +1,247 @@
+//! From the traces of all processes to one record and its figures.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::path::Path;
+
+use serde::Serialize;
+use sinew::Time;
+
+use super::children::CpuTimes;
+use crate::joint::{Joint, PerJoint};
+use crate::message::DriveState;
+use crate::part::Part;
+use crate::plot::Lateness;
+use crate::record::{JointRow, Outage, Record, Row};
+use crate::report::{MeasuredTiming, PercentilesUs};
+use crate::robot::figures::{LoopFigures, LoopSummary, percentiles_of};
+use crate::robot::trace::{DriveRow, EventRow, GaitRow, PlantRow, read_lives};
+
+/// A word of central that is older than this says nothing about now, ns.
+const NEWS_NS: u64 = 5_000_000;
+
+/// A kill, in the host's clock.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct KillTimes {
+    pub(super) part: Part,
+    pub(super) from: Time,
+    pub(super) to: Option<Time>,
+}
+
+/// What the launcher saw of the run, in the host's clock.
+#[derive(Debug, Default)]
+pub(super) struct RunTimes {
+    pub(super) strides: u32,
+    pub(super) first_start: Option<Time>,
+    pub(super) stop: Time,
+    pub(super) outage: Option<KillTimes>,
+    pub(super) cpu_from: Option<CpuTimes>,
+    pub(super) cpu_to: Option<CpuTimes>,
+}
+
+/// What only a real-time run can say.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RealTimeFigures {
+    /// The drives' loops, all three together, from the first readiness to the last stride.
+    pub drives: LoopSummary,
+    /// Lateness of central's loop, us.
+    pub central_late_us: PercentilesUs,
+    /// Lateness of the plant's loop, us.
+    pub plant_late_us: PercentilesUs,
+    /// CPU time of each process while walking, per cent of one CPU.
+    pub cpu_percent: BTreeMap<String, f64>,
+    /// All of them, per cent of one CPU.
+    pub cpu_percent_total: f64,
+    /// How the death of a node was noticed, if one was killed.
+    pub kill: Option<KillFigures>,
+}
+
+/// How the death of a node was noticed: times since the kill, ms; `null` where it was not.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct KillFigures {
+    /// Until each other drive damped.
+    pub safe_after_ms: BTreeMap<String, Option<f64>>,
+    /// Until each other node's discovery said `NodeLost`.
+    pub node_lost_after_ms: BTreeMap<String, Option<f64>>,
+}
+
+/// All that the traces hold.
+pub(super) struct Collected {
+    pub(super) record: Record,
+    pub(super) timing: MeasuredTiming,
+    pub(super) lateness: Lateness,
+    pub(super) torque_rate_max_nm_s: f64,
+    pub(super) figures: RealTimeFigures,
+}
+
+struct Traces {
+    plant: Vec<PlantRow>,
+    gait: Vec<GaitRow>,
+    drives: PerJoint<Vec<Vec<DriveRow>>>,
+    events: BTreeMap<Part, Vec<EventRow>>,
+}
+
+impl Traces {
+    fn read(folder: &Path, stop: Time) -> io::Result<Self> {
+        let until = stop.as_nanos();
+        let [hip, knee, ankle] = Joint::ALL.map(|joint| read_lives::<DriveRow>(folder, joint.name()));
+        let mut drives = [hip?, knee?, ankle?];
+        drives.iter_mut().flatten().for_each(|life| life.retain(|row| row.t_ns <= until));
+        let mut events = BTreeMap::new();
+        for part in Part::ALL {
+            events
+                .insert(part, read_lives(folder, &format!("{part}-events"))?.into_iter().flatten().collect());
+        }
+        Ok(Self {
+            plant: up_to(read_lives(folder, "plant")?, |row: &PlantRow| row.t_ns <= until),
+            gait: up_to(read_lives(folder, Part::Central.name())?, |row: &GaitRow| row.t_ns <= until),
+            drives,
+            events,
+        })
+    }
+}
+
+/// All lives in one, without what came after the stop order.
+fn up_to<R>(lives: Vec<Vec<R>>, holds: impl Fn(&R) -> bool) -> Vec<R> {
+    lives.into_iter().flatten().filter(|row| holds(row)).collect()
+}
+
+impl Collected {
+    pub(super) fn read(folder: &Path, times: &RunTimes) -> io::Result<Self> {
+        let traces = Traces::read(folder, times.stop)?;
+        let mut loops = LoopFigures::default();
+        for life in traces.drives.iter().flatten() {
+            life.iter().filter(|row| row.state != DriveState::Init).for_each(|row| loops.note(row));
+        }
+        let summary = loops.summary();
+        Ok(Self {
+            record: record(&traces, times),
+            timing: MeasuredTiming {
+                period_us: summary.period_us,
+                age_us: summary.gait_age_us,
+                deadline_misses: summary.deadline_misses,
+            },
+            lateness: loops.lateness(),
+            torque_rate_max_nm_s: torque_rate_max(&traces.drives),
+            figures: figures(&traces, times, summary),
+        })
+    }
+}
+
+fn record(traces: &Traces, times: &RunTimes) -> Record {
+    let start_ns = times.first_start.unwrap_or(Time::ZERO).as_nanos();
+    let seconds = |t_ns: u64| (i128::from(t_ns) - i128::from(start_ns)) as f64 * 1e-9;
+    let is_ready = |row: &&DriveRow| row.state == DriveState::Ready;
+    let ready_s = traces
+        .drives
+        .each_ref()
+        .map(|lives| lives.iter().flatten().find(is_ready).map(|row| seconds(row.t_ns)));
+    let outage = times.outage.map(|kill| Outage {
+        part: kill.part,
+        from_s: seconds(kill.from.as_nanos()),
+        to_s: kill.to.map(|to| seconds(to.as_nanos())),
+    });
+    let mut newest = traces.gait.iter().peekable();
+    let mut gait = None;
+    let rows: Vec<Row> = traces
+        .plant
+        .iter()
+        .map(|plant| {
+            while let Some(row) = newest.next_if(|row| row.t_ns <= plant.t_ns) {
+                gait = Some(row);
+            }
+            row(seconds(plant.t_ns), plant, gait.filter(|row| plant.t_ns - row.t_ns <= NEWS_NS))
+        })
+        .collect();
+    Record {
+        strides: times.strides,
+        first_start_s: 0.0,
+        ready_s,
+        released_s: rows.iter().find(|row| row.walking).map(|row| row.t_s),
+        outage,
+        rows,
+    }
+}
+
+fn row(t_s: f64, plant: &PlantRow, gait: Option<&GaitRow>) -> Row {
+    Row {
+        t_s,
+        strides_true: plant.strides,
+        walking: plant.walking,
+        phase_estimated: gait.map_or(0.0, |gait| f64::from(gait.phase)),
+        confidence: gait.map_or(0.0, |gait| f64::from(gait.confidence)),
+        mode: gait.and_then(|gait| gait.mode),
+        joints: std::array::from_fn(|i| JointRow {
+            angle_rad: plant.angle_rad[i],
+            velocity_rad_s: plant.velocity_rad_s[i],
+            intended_rad: plant.intended_rad[i],
+            commanded_nm: plant.commanded_nm[i],
+            applied_nm: plant.applied_nm[i],
+            saturated: plant.saturated[i],
+            state: plant.state[i],
+        }),
+    }
+}
+
+/// In the drives' own time: a tick that comes late may move the torque further, at the same rate.
+fn torque_rate_max(drives: &PerJoint<Vec<Vec<DriveRow>>>) -> f64 {
+    let rate = |pair: &[DriveRow]| {
+        let (before, after) = (pair[0].torque_nm?, pair[1].torque_nm?);
+        let dt_s = pair[1].t_ns.checked_sub(pair[0].t_ns).filter(|dt_ns| *dt_ns > 0)? as f64 * 1e-9;
+        Some((after - before).abs() / dt_s)
+    };
+    drives.iter().flatten().flat_map(|life| life.windows(2).filter_map(rate)).fold(0.0, f64::max)
+}
+
+fn figures(traces: &Traces, times: &RunTimes, drives: LoopSummary) -> RealTimeFigures {
+    let cpu_percent = cpu_percent(times);
+    RealTimeFigures {
+        drives,
+        central_late_us: percentiles_of(traces.gait.iter().map(|row| row.late_us)),
+        plant_late_us: percentiles_of(traces.plant.iter().map(|row| row.late_us)),
+        cpu_percent_total: cpu_percent.values().sum(),
+        cpu_percent,
+        kill: times.outage.map(|kill| kill_figures(traces, kill)),
+    }
+}
+
+fn cpu_percent(times: &RunTimes) -> BTreeMap<String, f64> {
+    let (Some((from, used_before)), Some((to, used))) = (&times.cpu_from, &times.cpu_to) else {
+        return BTreeMap::new();
+    };
+    let seconds = to.since(*from).as_secs_f64().max(1e-3);
+    let share = |name: &str, used: f64| {
+        // A process that was started again began at zero.
+        let before = used_before.get(name).copied().filter(|before| *before <= used).unwrap_or(0.0);
+        100.0 * (used - before) / seconds
+    };
+    used.iter().map(|(name, used)| ((*name).to_owned(), share(name, *used))).collect()
+}
+
+fn kill_figures(traces: &Traces, kill: KillTimes) -> KillFigures {
+    let from_ns = kill.from.as_nanos();
+    let after_ms = |t_ns: u64| (t_ns - from_ns) as f64 * 1e-6;
+    let safe = |joint: Joint| {
+        let rows = traces.drives[joint.index()].iter().flatten();
+        let first = rows.filter(|row| row.t_ns >= from_ns).find(|row| row.state == DriveState::Safe);
+        first.map(|row| after_ms(row.t_ns))
+    };
+    let lost = |part: Part| {
+        let events = traces.events.get(&part)?.iter();
+        let mut after = events.filter(|event| event.t_ns >= from_ns);
+        let first = after.find(|event| event.what == "node_lost" && event.whom == kill.part.name());
+        first.map(|event| after_ms(event.t_ns))
+    };
+    KillFigures {
+        safe_after_ms: Joint::ALL
+            .into_iter()
+            .filter(|joint| Part::Joint(*joint) != kill.part)
+            .map(|joint| (joint.name().to_owned(), safe(joint)))
+            .collect(),
+        node_lost_after_ms: Part::ALL
+            .into_iter()
+            .filter(|part| *part != kill.part)
+            .map(|part| (part.name().to_owned(), lost(part)))
+            .collect(),
+    }
+}

@@ -1,0 +1,161 @@
+//! The status screen: a picture ten times a second on a terminal, a line for each change elsewhere.
+
+use std::io::{self, IsTerminal, Write};
+
+use sinew::Time;
+
+use super::console::View;
+use crate::joint::Joint;
+
+const BAR: usize = 30;
+const UP_AND_CLEAR: &str = "\x1b[1A\x1b[2K";
+
+pub(super) struct Screen {
+    is_terminal: bool,
+    strides: u32,
+    began: Time,
+    /// Lines of the picture that stands on the terminal.
+    drawn: usize,
+    told: Told,
+}
+
+/// What was told last, where only changes are.
+#[derive(Default)]
+struct Told {
+    waiting: Vec<String>,
+    strides: Option<u32>,
+    states: String,
+}
+
+impl Screen {
+    pub(super) fn new(strides: u32, began: Time) -> Self {
+        let is_terminal = io::stdout().is_terminal();
+        Self { is_terminal, strides, began, drawn: 0, told: Told::default() }
+    }
+
+    /// A line that stays.
+    pub(super) fn say(&mut self, line: &str) {
+        let time = self.time();
+        let clear = self.clear();
+        write(&format!("{clear}{time} {line}\n"));
+    }
+
+    /// How things stand.
+    pub(super) fn show(&mut self, view: &View, strides: Option<u32>) {
+        if self.is_terminal {
+            let lines = self.picture(view, strides);
+            let clear = self.clear();
+            self.drawn = lines.len();
+            write(&format!("{clear}{}\n", lines.join("\n")));
+        } else {
+            self.tell_changes(view, strides);
+        }
+    }
+
+    /// Takes the picture away.
+    pub(super) fn close(&mut self) {
+        let clear = self.clear();
+        write(&clear);
+    }
+
+    fn clear(&mut self) -> String {
+        UP_AND_CLEAR.repeat(std::mem::take(&mut self.drawn))
+    }
+
+    fn time(&self) -> String {
+        format!("{:6.1} s", Time::now().since(self.began).as_secs_f64())
+    }
+
+    fn tell_changes(&mut self, view: &View, strides: Option<u32>) {
+        // Without the times, which change always.
+        let waiting: Vec<String> = view.waiting().iter().map(|words| untimed(words)).collect();
+        if waiting != self.told.waiting {
+            waiting.iter().for_each(|line| self.say(line));
+            self.told.waiting = waiting;
+        }
+        let states = states(view);
+        if states != self.told.states {
+            self.say(&states);
+            self.told.states = states;
+        }
+        if strides != self.told.strides {
+            self.told.strides = strides;
+            let stride = strides.unwrap_or(0) + 1;
+            if stride <= self.strides {
+                self.say(&format!("stride {stride} of {}", self.strides));
+            }
+        }
+    }
+
+    fn picture(&self, view: &View, strides: Option<u32>) -> Vec<String> {
+        let mut lines = vec![format!("{}  four nodes and a plant on this host", self.time())];
+        lines.extend(view.waiting().into_iter().map(|line| format!("  barrier: {line}")));
+        lines.push(match view.gait() {
+            None => "  central  -".to_owned(),
+            Some(gait) => format!(
+                "  central  {:5}  phase [{}] {:3.0} %  trust {:.2}  loop late {:.1} ms at most",
+                gait.mode.map_or_else(|| "-".to_owned(), |mode| format!("{mode:?}")),
+                bar(gait.phase),
+                100.0 * gait.phase,
+                gait.confidence,
+                f64::from(gait.late_max_us) / 1000.0
+            ),
+        });
+        lines.extend(Joint::ALL.map(|joint| match view.drive(joint) {
+            None => format!("  {joint:7}  -"),
+            Some(drive) => format!(
+                "  {joint:7}  {:5}  {:+6.1} Nm  inputs {:.1} ms old at most  {} ticks without them",
+                format!("{:?}", drive.state),
+                drive.torque_nm,
+                f64::from(drive.age_max_us) / 1000.0,
+                drive.misses
+            ),
+        }));
+        lines.push(match strides {
+            None => "  standing".to_owned(),
+            Some(strides) => format!("  stride {} of {}", (strides + 1).min(self.strides), self.strides),
+        });
+        lines
+    }
+}
+
+fn states(view: &View) -> String {
+    let central =
+        view.gait().and_then(|gait| gait.mode).map_or_else(|| "-".to_owned(), |mode| format!("{mode:?}"));
+    let drives = Joint::ALL.map(|joint| {
+        let state = view.drive(joint).map_or_else(|| "-".to_owned(), |drive| format!("{:?}", drive.state));
+        format!("{joint} {state}")
+    });
+    format!("central {central}, {}", drives.join(", "))
+}
+
+/// "X has waited 1.3 s for Y" without the time.
+fn untimed(words: &str) -> String {
+    match (words.split_once(" has waited "), words.split_once(" for ")) {
+        (Some((who, _)), Some((_, whom))) => format!("{who} waits for {whom}"),
+        (Some(_) | None, Some(_) | None) => words.to_owned(),
+    }
+}
+
+fn bar(phase: f32) -> String {
+    let full = ((phase.clamp(0.0, 1.0) * BAR as f32) as usize).min(BAR);
+    format!("{}{}", "#".repeat(full), ".".repeat(BAR - full))
+}
+
+/// Nobody may look.
+fn write(text: &str) {
+    let mut out = io::stdout().lock();
+    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn waiting_is_told_without_its_time() {
+        let words = "knee.drive has waited 1.3 s for hip.sensor (never seen)";
+        assert_eq!(untimed(words), "knee.drive waits for hip.sensor (never seen)");
+        assert_eq!(untimed("something else"), "something else");
+    }
+}

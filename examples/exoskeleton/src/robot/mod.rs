@@ -1,0 +1,46 @@
+//! The robot in real time: five processes that walk a leg at 1 kHz.
+//!
+//! ```text
+//!              central                                       hip, knee, ankle, each
+//!   +-----------------------------+   JointSample    +---------------------------------+
+//!   | central.gait  1 kHz         | <--------------- | X.sensor  1 kHz                 |
+//!   |   requires the sensors      |   FootLoad       |   requires nothing;             |
+//!   |                             |                  |   ready at its first reading    |
+//!   |                             |                  |      | JointSample              |
+//!   |                             |   GaitState      |      v                          |
+//!   |                             | ---------------> | X.drive   1 kHz                 |
+//!   |                             |  exo.drives      |   requires the three sensors    |
+//!   | central.coordinator         |                  |   and central.gait              |
+//!   |   requires the drives,      | <--------------- |                                 |
+//!   |   then releases             |  DriveStatus     |                                 |
+//!   +-----------------------------+  exo.status      +---------------------------------+
+//!             | NodeAPI                                   ^ readings   | torque   (UDP)
+//!             v                                           |            v
+//!        status screen                               plant: the leg, its person, three motors
+//! ```
+//!
+//! Read it in this order: [`topology`] (who is where), [`device`] and [`datagram`] (the seam to the hardware),
+//! [`sensor`], [`drive`], [`gait`], [`coordinator`], [`watch`] (the applications: thin shells around the cores),
+//! [`node`] (a process with some of them), [`plant`] (the process that stands for hardware and person), [`launch`] (all
+//! five on this host). [`trace`] is what each leaves behind.
+
+pub mod coordinator;
+pub mod datagram;
+pub mod device;
+pub mod drive;
+pub mod edges;
+pub mod figures;
+pub mod gait;
+pub mod launch;
+pub mod node;
+pub mod plant;
+pub mod role;
+pub mod sensor;
+pub mod topology;
+pub mod trace;
+pub mod watch;
+
+use std::time::Duration;
+
+/// Period of every control loop.
+pub const PERIOD: Duration = Duration::from_millis(1);

@@ -1,0 +1,217 @@
+//! One process of the robot, alone: `exoskeleton node ROLE --topology FILE`.
+
+use std::io::{self, Read};
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::{Arc, OnceLock};
+use std::time::SystemTime;
+
+use sinew::Incarnation;
+use sinew::prelude::*;
+use thiserror::Error;
+
+use super::device::{JointDevice, UdpDevice};
+use super::drive::DriveParts;
+use super::gait::GaitParts;
+use super::plant::{self, PlantError};
+use super::role::Role;
+use super::sensor::DeviceMaker;
+use super::topology::{ControlThread, Topology, TopologyFaults};
+use super::trace::{EventRow, Recording, TraceRow};
+use super::watch::WatchParts;
+use super::{coordinator, drive, gait, sensor, watch};
+use crate::joint::Joint;
+use crate::part::Part;
+
+/// What to run.
+#[derive(Debug, Clone)]
+pub struct NodeOptions {
+    /// Which process.
+    pub role: Role,
+    /// The topology file.
+    pub topology: PathBuf,
+    /// Where it leaves its traces; `None`: nowhere.
+    pub run_dir: Option<PathBuf>,
+    /// Whether it stops in order when its standard input ends: so that it dies with whoever started it.
+    pub stop_with_stdin: bool,
+}
+
+/// Why a process of the robot does not run.
+#[derive(Debug, Error)]
+pub enum NodeError {
+    /// The topology is of no use.
+    #[error("{path}: {faults}")]
+    Topology {
+        /// The file.
+        path: String,
+        /// What is wrong with it.
+        faults: TopologyFaults,
+    },
+    /// A trace cannot be begun.
+    #[error("no trace can be written: {0}")]
+    Trace(io::Error),
+    /// The node does not start.
+    #[error(transparent)]
+    Start(#[from] StartError),
+    /// The plant does not start, or ended early.
+    #[error(transparent)]
+    Plant(#[from] PlantError),
+    /// The system gives no thread.
+    #[error("no thread: {0}; raise `ulimit -u`")]
+    Thread(io::Error),
+}
+
+/// Runs a process of the robot until SIGINT or SIGTERM.
+///
+/// # Errors
+/// It did not start, or the plant ended early.
+pub fn run(options: &NodeOptions) -> Result<ExitCode, NodeError> {
+    let topology = Topology::read(&options.topology)
+        .map_err(|faults| NodeError::Topology { path: options.topology.display().to_string(), faults })?;
+    match options.role {
+        Role::Node(part) => run_node(part, &topology, options),
+        Role::Plant => {
+            let stop = Arc::new(AtomicBool::new(false));
+            stop_on_signals(stop.clone())?;
+            if options.stop_with_stdin {
+                let stop = stop.clone();
+                // SYNC: Relaxed, the flag carries nothing but itself.
+                when_stdin_ends(move || stop.store(true, Ordering::Relaxed))?;
+            }
+            plant::run(&topology.plant, options.run_dir.as_deref(), &stop)?;
+            Ok(ExitCode::SUCCESS)
+        }
+    }
+}
+
+/// The node's builder with everything that its part of the robot needs.
+fn run_node(part: Part, topology: &Topology, options: &NodeOptions) -> Result<ExitCode, NodeError> {
+    let incarnation = incarnation();
+    let events = record::<EventRow>(options, &format!("{part}-events"))?;
+    let watched = Arc::new(OnceLock::new());
+    let watch = watch::spec(part, WatchParts { node: watched.clone(), events: events.trace() });
+    let builder =
+        Node::builder(part.name()).config(topology.node_config(part)).incarnation(incarnation).app(watch);
+    let code = match part {
+        Part::Central => {
+            let trace = record(options, part.name())?;
+            let epoch = Arc::new(AtomicU32::new((incarnation.0 / 1_000_000) as u32));
+            let joints = topology.joints.each_ref().map(|place| place.address);
+            let parts = GaitParts { joints, epoch, trace: trace.trace() };
+            let builder = builder.app(gait::spec(parts, place(topology))).app(coordinator::spec());
+            let code = start_and_run(builder, &watched, options)?;
+            tell_lost_rows(trace.finish());
+            code
+        }
+        Part::Joint(joint) => {
+            let trace = record(options, part.name())?;
+            let device = device_maker(joint, topology);
+            let parts = DriveParts {
+                joint,
+                device: device.clone(),
+                trace: trace.trace(),
+                events: events.trace(),
+                figures: options.run_dir.as_ref().map(|folder| folder.join(format!("{joint}-figures.json"))),
+            };
+            let builder = builder
+                .app(sensor::spec(joint, device, place(topology)))
+                .app(drive::spec(parts, place(topology)));
+            let code = start_and_run(builder, &watched, options)?;
+            tell_lost_rows(trace.finish());
+            code
+        }
+    };
+    tell_lost_rows(events.finish());
+    Ok(code)
+}
+
+fn start_and_run(
+    builder: NodeBuilder,
+    watched: &OnceLock<sinew::NodeHandle>,
+    options: &NodeOptions,
+) -> Result<ExitCode, NodeError> {
+    let node = builder.start()?;
+    let handle = node.handle();
+    // Nobody else sets it.
+    let _ = watched.set(handle.clone());
+    if options.stop_with_stdin {
+        when_stdin_ends(move || handle.stop())?;
+    }
+    Ok(node.run())
+}
+
+fn record<R: TraceRow>(options: &NodeOptions, name: &str) -> Result<Recording<R>, NodeError> {
+    Recording::begin(options.run_dir.as_deref(), name).map_err(NodeError::Trace)
+}
+
+fn tell_lost_rows(lost: u64) {
+    if lost > 0 {
+        tracing::warn!(lost, "rows of a trace were lost: the disk was too slow");
+    }
+}
+
+fn place(topology: &Topology) -> Place {
+    let control = topology.control;
+    let place = match control.thread {
+        ControlThread::Io => Place::thread(Place::IO),
+        ControlThread::Own => Place::thread("control"),
+    };
+    match control.realtime_priority {
+        Some(priority) => place.realtime(priority),
+        None => place,
+    }
+}
+
+fn device_maker(joint: Joint, topology: &Topology) -> DeviceMaker {
+    let plant = topology.plant.address;
+    Arc::new(move || -> Box<dyn JointDevice> {
+        // The application fails with these words, and its supervisor tries again within its limit.
+        let device = UdpDevice::connect(joint, plant).unwrap_or_else(|e| {
+            panic!("no way to the {joint} device at {plant}: {e}; is this host's route to it up?")
+        });
+        Box::new(device)
+    })
+}
+
+/// Larger than that of any life before, as long as the host's clock does not go back.
+fn incarnation() -> Incarnation {
+    let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    Incarnation(u64::try_from(since_1970.as_micros()).unwrap_or(u64::MAX))
+}
+
+fn when_stdin_ends(act: impl FnOnce() + Send + 'static) -> Result<(), NodeError> {
+    let wait = move || {
+        let mut byte = [0];
+        // Whoever started this says nothing; an error is an end too.
+        while matches!(io::stdin().read(&mut byte), Ok(1)) {}
+        act();
+    };
+    std::thread::Builder::new().name("stdin".to_owned()).spawn(wait).map_err(NodeError::Thread)?;
+    Ok(())
+}
+
+/// For the plant, which is no node and has no runtime that heeds signals.
+fn stop_on_signals(stop: Arc<AtomicBool>) -> Result<(), NodeError> {
+    use tokio::signal::unix::{SignalKind, signal};
+    let runtime =
+        tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(NodeError::Thread)?;
+    let wait = move || {
+        runtime.block_on(async {
+            let (Ok(mut interrupt), Ok(mut terminate)) =
+                (signal(SignalKind::interrupt()), signal(SignalKind::terminate()))
+            else {
+                tracing::error!("signals cannot be heeded: they will end the plant at once");
+                return;
+            };
+            tokio::select! {
+                _ = interrupt.recv() => {}
+                _ = terminate.recv() => {}
+            }
+            // SYNC: Relaxed, the flag carries nothing but itself.
+            stop.store(true, Ordering::Relaxed);
+        });
+    };
+    std::thread::Builder::new().name("signals".to_owned()).spawn(wait).map_err(NodeError::Thread)?;
+    Ok(())
+}

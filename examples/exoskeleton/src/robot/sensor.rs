@@ -1,0 +1,101 @@
+//! The application `X.sensor`: reads the device each millisecond and tells its own drive and central.
+//!
+//! It is ready when the first reading came. A reading is told once, never again with a newer stamp: when the device
+//! falls silent so does the sensor, and silence is what its listeners watch for.
+
+use std::sync::Arc;
+
+use sinew::ReadyGate;
+use sinew::prelude::*;
+
+use super::PERIOD;
+use super::device::JointDevice;
+use super::edges::{Addressee, GAIT, drive_name, sensor_name};
+use crate::joint::Joint;
+use crate::message::{FootLoad, JointSample};
+use crate::sensor::{SensorConfig, SensorCore};
+
+/// Silence of the device that is worth a line in the log.
+const SILENCE_MAX: Duration = Duration::from_millis(10);
+
+/// Makes the way to a joint's device, anew for each life of an application.
+pub type DeviceMaker = Arc<dyn Fn() -> Box<dyn JointDevice> + Send + Sync>;
+
+/// The sensor of one joint.
+pub struct Sensor {
+    joint: Joint,
+    core: SensorCore,
+    device: Box<dyn JointDevice>,
+    drive: Addressee,
+    gait: Addressee,
+    ready: Option<ReadyGate>,
+    read_at: Option<Time>,
+    silent: bool,
+}
+
+/// Declares the sensor of `joint`.
+#[must_use]
+pub fn spec(joint: Joint, device: DeviceMaker, place: Place) -> AppSpec<Sensor> {
+    AppSpec::new(sensor_name(joint), move || Sensor::new(joint, device())).place(place)
+}
+
+impl Sensor {
+    fn new(joint: Joint, device: Box<dyn JointDevice>) -> Self {
+        Self {
+            joint,
+            core: SensorCore::new(SensorConfig::default()),
+            device,
+            drive: Addressee::new(drive_name(joint)),
+            gait: Addressee::new(GAIT.to_owned()),
+            ready: None,
+            read_at: None,
+            silent: false,
+        }
+    }
+
+    fn tick(&mut self, context: &AppContext<Self>) {
+        let now = Time::now();
+        let Some(reading) = self.device.read_newest(now) else {
+            self.judge_silence(now);
+            return;
+        };
+        self.read_at = Some(now);
+        self.silent = false;
+        let t_ns = now.as_nanos();
+        let sample = self.core.sample(t_ns, &reading.device);
+        let load = reading.foot.map(|foot| self.core.foot_load(t_ns, &foot));
+        self.tell(now, &sample, load.as_ref(), context);
+        if let Some(gate) = self.ready.take() {
+            gate.reached();
+        }
+    }
+
+    /// To whom it cannot be told now it is not told: both know silence when they hear it.
+    fn tell(&mut self, now: Time, sample: &JointSample, load: Option<&FootLoad>, context: &AppContext<Self>) {
+        if let Some(drive) = self.drive.at(now, context) {
+            let _ = context.send(drive, sample);
+        }
+        let Some(gait) = self.gait.at(now, context) else { return };
+        let _ = context.send(gait, sample);
+        if let Some(load) = load {
+            let _ = context.send(gait, load);
+        }
+    }
+
+    fn judge_silence(&mut self, now: Time) {
+        let lasts = self.read_at.is_some_and(|at| now.since(at) > SILENCE_MAX);
+        if lasts && !self.silent {
+            self.silent = true;
+            tracing::warn!(joint = %self.joint, "the device is silent; so is its sensor");
+        }
+    }
+}
+
+impl Actor for Sensor {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        self.ready = context.hold_ready();
+        context.every(PERIOD, |this, _, context| this.tick(context));
+    }
+}

@@ -1,0 +1,169 @@
+//! Which node of the robot is where: `topology.toml`, read once, with all its faults told together.
+
+mod file;
+mod free;
+
+use std::fmt;
+use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use sinew::{NodeAddress, NodeConfig};
+use thiserror::Error;
+
+use crate::joint::{Joint, PerJoint};
+use crate::part::Part;
+
+pub use free::for_this_host;
+
+/// Port of multicast DNS (RFC 6762).
+const MDNS_PORT: u16 = 5353;
+
+/// Where everything of one robot is.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Topology {
+    /// Name that keeps this robot's nodes apart from those of others. 1 to 63 bytes.
+    pub project: String,
+    /// How nodes find each other.
+    pub discovery: Discovery,
+    /// How the control loops run.
+    pub control: Control,
+    /// The central node.
+    pub central: NodePlace,
+    /// The joint nodes.
+    pub joints: PerJoint<NodePlace>,
+    /// Path of central's socket for the status screen; `None`: no such door.
+    pub console: Option<PathBuf>,
+    /// The plant.
+    pub plant: PlantPlace,
+}
+
+/// How nodes find each other.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Discovery {
+    /// Group and port of the cyclic query; `None`: off.
+    pub multicast: Option<SocketAddrV4>,
+    /// Whether multicast DNS is used too.
+    pub mdns: bool,
+    /// Time between two queries. 10 ms to 60 s; default 500 ms.
+    pub period: Duration,
+    /// Missed answers in a row after which a node counts as lost. 2 to 100; default 3.
+    pub missed_max: u32,
+}
+
+/// The thread that a node's control loops run on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ControlThread {
+    /// The one that reads the node's sockets: no thread wake between the network and the loop.
+    Io,
+    /// One of its own: the network cannot hold the loop up, for one more wake a message.
+    Own,
+}
+
+/// How the control loops run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Control {
+    /// On which thread.
+    pub thread: ControlThread,
+    /// `SCHED_FIFO` priority of that thread, 1 to 99; only for a thread of its own.
+    pub realtime_priority: Option<u8>,
+}
+
+/// Where a node is.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NodePlace {
+    /// Its address in the project.
+    pub address: NodeAddress,
+    /// Address of the network interface that it uses.
+    pub interface: Ipv4Addr,
+    /// UDP port of its discovery; 0: any free one. Set it where others list this node as a seed.
+    pub port: u16,
+    /// UDP addresses of nodes to ask in any case.
+    pub seeds: Vec<SocketAddr>,
+}
+
+/// Where the plant is and who is in it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PlantPlace {
+    /// UDP address of its devices.
+    pub address: SocketAddr,
+    /// Silence after which a device damps by itself; `None`: it holds its last torque for ever.
+    pub device_watchdog: Option<Duration>,
+    /// Seed of stride variation and sensor noise.
+    pub seed: u64,
+    /// A recorded trial to walk; `None`: the built-in curves.
+    pub trial: Option<PathBuf>,
+}
+
+/// Everything that is wrong with a topology. The user is at fault; nothing was started.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub struct TopologyFaults(pub Vec<String>);
+
+impl fmt::Display for TopologyFaults {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let faults = if self.0.len() == 1 { "fault" } else { "faults" };
+        write!(f, "the topology has {} {faults}:", self.0.len())?;
+        self.0.iter().try_for_each(|fault| write!(f, "\n  - {fault}"))
+    }
+}
+
+impl Topology {
+    /// Reads a topology file.
+    ///
+    /// # Errors
+    /// All that is wrong with it, each with its place and a remedy.
+    pub fn read(path: &Path) -> Result<Self, TopologyFaults> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|e| TopologyFaults(vec![format!("{} cannot be read: {e}", path.display())]))?;
+        Self::parse(&text)
+    }
+
+    /// Reads a topology from its text.
+    ///
+    /// # Errors
+    /// All that is wrong with it, each with its place and a remedy.
+    pub fn parse(text: &str) -> Result<Self, TopologyFaults> {
+        file::parse(text)
+    }
+
+    /// The text that reads back as this topology.
+    #[must_use]
+    pub fn to_toml(&self) -> String {
+        file::write(self)
+    }
+
+    /// Where a node is.
+    #[must_use]
+    pub const fn place(&self, part: Part) -> &NodePlace {
+        match part {
+            Part::Central => &self.central,
+            Part::Joint(joint) => &self.joints[joint.index()],
+        }
+    }
+
+    /// The joint whose node has this address.
+    #[must_use]
+    pub fn joint_at(&self, address: NodeAddress) -> Option<Joint> {
+        Joint::ALL.into_iter().find(|joint| self.joints[joint.index()].address == address)
+    }
+
+    /// The configuration of a node.
+    #[must_use]
+    pub fn node_config(&self, part: Part) -> NodeConfig {
+        let place = self.place(part);
+        let mut config = NodeConfig::new(part.name());
+        config.project.clone_from(&self.project);
+        config.address = Some(place.address);
+        config.ndl.interface = place.interface;
+        config.ndl.port = place.port;
+        config.ndl.seeds.clone_from(&place.seeds);
+        config.ndl.multicast = self.discovery.multicast;
+        config.ndl.mdns_port = self.discovery.mdns.then_some(MDNS_PORT);
+        config.ndl.period = self.discovery.period;
+        config.ndl.missed_max = self.discovery.missed_max;
+        if part == Part::Central {
+            config.lncl.socket.clone_from(&self.console);
+        }
+        config
+    }
+}
