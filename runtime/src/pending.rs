@@ -10,6 +10,7 @@ use crate::{
     outcome::{Outcome, ReceiptSink, Ticket},
     post::lock,
     router::{Outlet, Refused},
+    tid::Tid,
     wire::{Flags, Kind, Message},
 };
 
@@ -29,6 +30,8 @@ struct Inner {
 #[derive(Debug)]
 struct Slot {
     awaited: Awaited,
+    /// Who may answer: whoever was asked. Set when the message's destination is known.
+    from: Tid,
     waker: Option<Waker>,
     settled: Option<Settlement>,
 }
@@ -58,15 +61,15 @@ impl Pending {
         Arc::new(Self { inner: Mutex::new(Inner { next: 1, slots: BTreeMap::new() }), capacity })
     }
 
-    /// Opens a wait; its number is the message's correlation. `None` if too many are open.
-    pub fn open(self: &Arc<Self>, awaited: Awaited) -> Option<Wait> {
+    /// Opens a wait for what `from` says; its number is the message's correlation. `None` if too many are open.
+    pub fn open(self: &Arc<Self>, awaited: Awaited, from: Tid) -> Option<Wait> {
         let mut inner = lock(&self.inner);
         if inner.slots.len() >= self.capacity {
             return None;
         }
         let id = inner.next;
         inner.next += 1;
-        inner.slots.insert(id, Slot { awaited, waker: None, settled: None });
+        inner.slots.insert(id, Slot { awaited, from, waker: None, settled: None });
         Some(Wait { pending: self.clone(), id })
     }
 
@@ -75,22 +78,22 @@ impl Pending {
     /// # Errors
     /// The message, which is neither a reply nor an outcome.
     pub fn intercept(&self, message: Message) -> Result<(), Message> {
-        let correlation = message.header.correlation;
+        let (correlation, from) = (message.header.correlation, message.header.source);
         if message.header.flags.has(Flags::REPLY) {
-            self.settle_with(correlation, Settlement::Reply(message));
+            self.settle_with(correlation, from, Settlement::Reply(message));
             return Ok(());
         }
         if message.header.flags.has(Flags::OUTCOME) && message.header.kind == Kind::OUTCOME {
             // A byte that means nothing is no outcome; the wait ends at its deadline.
             if let Some(outcome) = message.payload.first().and_then(|code| Outcome::from_code(*code)) {
-                self.settle_with(correlation, Settlement::Outcome(outcome));
+                self.settle_with(correlation, from, Settlement::Outcome(outcome));
             }
             return Ok(());
         }
         Err(message)
     }
 
-    fn settle_with(&self, id: u64, settlement: Settlement) {
+    fn settle_with(&self, id: u64, from: Tid, settlement: Settlement) {
         let waker = {
             let mut inner = lock(&self.inner);
             // Nobody waits any more: the deadline passed, or the asking incarnation is gone.
@@ -100,7 +103,8 @@ impl Pending {
                 (Settlement::Outcome(outcome), Awaited::Reply) => *outcome != Outcome::Delivered,
                 (Settlement::Reply(_), Awaited::Outcome) => false,
             };
-            if !is_answer || slot.settled.is_some() {
+            // Nobody answers for another.
+            if !is_answer || slot.from != from || slot.settled.is_some() {
                 return;
             }
             slot.settled = Some(settlement);
@@ -114,7 +118,7 @@ impl Pending {
 
 impl ReceiptSink for Pending {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
-        self.settle_with(ticket.correlation, Settlement::Outcome(outcome));
+        self.settle_with(ticket.correlation, ticket.destination, Settlement::Outcome(outcome));
     }
 }
 
@@ -175,7 +179,7 @@ mod tests {
     use futures_util::task::noop_waker;
 
     use super::*;
-    use crate::tid::Tid;
+    use crate::wire::Header;
 
     fn ticket(wait: &Wait) -> Ticket {
         Ticket { source: Tid::NONE, destination: Tid::NONE, correlation: wait.correlation() }
@@ -188,7 +192,7 @@ mod tests {
     #[test]
     fn a_delivered_request_still_waits_for_its_reply_but_a_failed_one_does_not() {
         let pending = Pending::new(4);
-        let wait = pending.open(Awaited::Reply).unwrap();
+        let wait = pending.open(Awaited::Reply, Tid::NONE).unwrap();
         pending.settle(ticket(&wait), Outcome::Delivered);
         assert!(poll(&wait).is_pending());
         pending.settle(ticket(&wait), Outcome::Failed);
@@ -196,20 +200,35 @@ mod tests {
     }
 
     #[test]
+    fn nobody_answers_a_request_that_was_put_to_another() {
+        let pending = Pending::new(4);
+        let wait = pending.open(Awaited::Reply, Tid::from_bits(7)).unwrap();
+        let reply = |source| {
+            let mut header = Header::new(Kind::named("reply"), Tid::from_bits(source), Tid::NONE);
+            (header.flags, header.correlation) = (Flags::REPLY, wait.correlation());
+            Message::new(header, bytes::Bytes::new())
+        };
+        pending.intercept(reply(8)).unwrap();
+        assert!(poll(&wait).is_pending());
+        pending.intercept(reply(7)).unwrap();
+        assert!(matches!(poll(&wait), Poll::Ready(Settlement::Reply(_))));
+    }
+
+    #[test]
     fn waits_are_bounded_and_dropping_one_makes_room() {
         let pending = Pending::new(1);
-        let wait = pending.open(Awaited::Outcome).unwrap();
-        assert!(pending.open(Awaited::Outcome).is_none());
+        let wait = pending.open(Awaited::Outcome, Tid::NONE).unwrap();
+        assert!(pending.open(Awaited::Outcome, Tid::NONE).is_none());
         drop(wait);
-        assert!(pending.open(Awaited::Outcome).is_some());
+        assert!(pending.open(Awaited::Outcome, Tid::NONE).is_some());
     }
 
     #[test]
     fn an_answer_that_comes_too_late_is_nobodys() {
         let pending = Pending::new(1);
-        let late = ticket(&pending.open(Awaited::Outcome).unwrap());
+        let late = ticket(&pending.open(Awaited::Outcome, Tid::NONE).unwrap());
         pending.settle(late, Outcome::Delivered);
-        let wait = pending.open(Awaited::Outcome).unwrap();
+        let wait = pending.open(Awaited::Outcome, Tid::NONE).unwrap();
         assert!(poll(&wait).is_pending(), "numbers are never used twice");
     }
 }

@@ -242,11 +242,11 @@ impl Sender {
         awaited: Awaited,
         within: Duration,
     ) -> Result<Wait, SendError> {
-        let wait = self.0.pending.open(awaited).ok_or(SendError::TooManyWaits)?;
+        let destination = self.0.router.absolute(message.header.destination);
+        let wait = self.0.pending.open(awaited, destination).ok_or(SendError::TooManyWaits)?;
         message.header.flags = message.header.flags.with(Flags::CONFIRM);
         message.header.correlation = wait.correlation();
         message.header.time_to_live_us = u32::try_from(within.as_micros()).unwrap_or(u32::MAX).max(1);
-        let destination = self.0.router.absolute(message.header.destination);
         let ticket = Ticket { source: self.0.tid, destination, correlation: wait.correlation() };
         message.receipt = Some(Receipt::new(self.0.pending.clone(), ticket));
         Ok(wait)

@@ -22,6 +22,8 @@ pub struct Program {
     child: Child,
     lines: Receiver<String>,
     seen: Vec<String>,
+    /// Lines that nobody has waited for yet, oldest first.
+    unclaimed: Vec<String>,
 }
 
 /// The node of the scenarios, on `host` or on this one, with the configuration in `config`.
@@ -61,14 +63,18 @@ impl Program {
                 }
             }
         });
-        Self { name: name.to_owned(), child, lines, seen: Vec::new() }
+        Self { name: name.to_owned(), child, lines, seen: Vec::new(), unclaimed: Vec::new() }
     }
 
-    /// Waits for a line that has all these words, among those not yet waited for.
+    /// Waits for a line that has all these words. Each line can be waited for once; different lines in any order.
     ///
     /// # Panics
     /// If none comes in time, with what it said instead.
     pub fn wait_for(&mut self, words: &[&str]) -> String {
+        let is_it = |line: &String| words.iter().all(|word| line.contains(word));
+        if let Some(at) = self.unclaimed.iter().position(is_it) {
+            return self.unclaimed.remove(at);
+        }
         let until = Instant::now() + DEADLINE;
         loop {
             let left = until.saturating_duration_since(Instant::now());
@@ -80,9 +86,10 @@ impl Program {
                 );
             };
             self.seen.push(line.clone());
-            if words.iter().all(|word| line.contains(word)) {
+            if is_it(&line) {
                 return line;
             }
+            self.unclaimed.push(line);
         }
     }
 

@@ -79,7 +79,8 @@ impl<F: AsyncFn(sinew::Sender) + Clone + Unpin + 'static> Actor for Teller<F> {
     }
 }
 
-/// Two nodes: the story is told on the first, once the applications on the second are ready.
+/// Two nodes: the story is told on the first, once the applications on the second are ready. Dropping them stops them.
+#[must_use]
 fn tell<F>(second: impl FnOnce(NodeBuilder) -> NodeBuilder, requires: &[&str], story: F) -> (Node, Node)
 where
     F: AsyncFn(sinew::Sender) + Clone + Send + Sync + Unpin + 'static,
@@ -98,7 +99,7 @@ where
 #[test]
 fn requests_to_another_node_are_answered_and_every_confirmed_send_has_its_outcome() {
     let (spec, _heard) = oracle("oracle");
-    tell(
+    let _nodes = tell(
         |node| node.app(spec),
         &["oracle"],
         async |sender: sinew::Sender| {
@@ -150,7 +151,7 @@ fn a_group_and_a_broadcast_reach_each_member_on_every_node_once() {
 #[test]
 fn a_thousand_messages_arrive_once_and_in_order() {
     let (spec, heard) = oracle("oracle");
-    tell(
+    let _nodes = tell(
         |node| node.configure(|config| config.mailbox_capacity = 2_000).app(spec),
         &["oracle"],
         async |sender: sinew::Sender| {

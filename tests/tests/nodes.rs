@@ -47,10 +47,10 @@ fn an_application_waits_for_another_nodes_and_its_messages_arrive_in_order() {
 #[test]
 fn a_killed_node_is_lost_at_once_and_its_next_life_is_a_restart() {
     let scenario = Scenario::new();
-    let mut hip = scenario.start("hip", 1, &[]);
-    let mut knee = scenario.start("knee", 2, &[]);
-    hip.wait_for(&["NodeFound", "knee"]);
-    knee.wait_for(&["NodeFound", "hip"]);
+    // That it has started proves that the two are connected.
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee"]);
+    let knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["started"]);
     knee.signal(Signal::KILL);
     hip.wait_for(&["NodeLost", "knee", "ConnectionRefused"]);
     let mut knee = scenario.start("knee", 2, &[]);

@@ -9,7 +9,7 @@ use rustix::thread::{CpuSet, sched_setaffinity};
 
 use crate::{
     ROLE,
-    measure::{Figures, report},
+    measure::{Figures, Run, report},
     raw, sinew_ends,
 };
 
@@ -156,7 +156,15 @@ pub(crate) fn measure(name: &str, pinning: &str) {
         Path::TwoNodesIo => (two_nodes("node_io", bytes, pinning), raw_pair("raw_tcp", bytes, pinning)),
         Path::TwoNodesOwn => (two_nodes("node_own", bytes, pinning), raw_pair("raw_tcp", bytes, pinning)),
     };
-    report("paths", case.name, bytes, pinning.name(), &seen, case.reference, &reference);
+    report(&Run {
+        bench: "paths",
+        case: case.name,
+        payload_bytes: bytes,
+        pinning: pinning.name(),
+        seen: &seen,
+        reference: case.reference,
+        raw: &reference,
+    });
 }
 
 /// The echoing end, in a process of its own: prints a line when it can be reached, ends when its input does.

@@ -30,16 +30,20 @@ impl Figures {
     }
 }
 
+/// What a line is about.
+pub(crate) struct Run<'a> {
+    pub(crate) bench: &'a str,
+    pub(crate) case: &'a str,
+    pub(crate) payload_bytes: usize,
+    pub(crate) pinning: &'a str,
+    pub(crate) seen: &'a Figures,
+    pub(crate) reference: &'a str,
+    pub(crate) raw: &'a Figures,
+}
+
 /// Prints the line that every bench of Sinew prints.
-pub(crate) fn report(
-    bench: &str,
-    case: &str,
-    payload_bytes: usize,
-    pinning: &str,
-    seen: &Figures,
-    reference: &str,
-    raw: &Figures,
-) {
+pub(crate) fn report(run: &Run<'_>) {
+    let Run { bench, case, payload_bytes, pinning, seen, reference, raw } = run;
     let line = json!({
         "bench": bench,
         "case": case,

@@ -31,7 +31,14 @@ use super::{
     listener,
     peer::frame,
 };
-use crate::{config::NodeConfig, ndl, ndl::MembershipFact, outlet::LinkNumber, stores::Stores, sync};
+use crate::{
+    config::NodeConfig,
+    ndl,
+    ndl::MembershipFact,
+    outlet::LinkNumber,
+    stores::{Stores, lock},
+    sync,
+};
 
 /// How often expired messages are looked for in the queues of peers without a connection.
 const EXPIRY_PERIOD: Duration = Duration::from_millis(50);
@@ -64,14 +71,18 @@ impl Gncl {
         Self { stores, ready: Some(ready), core, wires: BTreeMap::new(), alarm: None }
     }
 
-    /// Binds the listener: where it was bound before, if this layer was restarted.
+    /// The listener: the one that is open already, if this layer was restarted.
     fn listen(&self) -> io::Result<tokio::net::TcpListener> {
+        let mut kept = lock(&self.stores.gncl.listener);
+        if let Some(listener) = &*kept {
+            return tokio::net::TcpListener::from_std(listener.try_clone()?);
+        }
         let config = &self.stores.config;
-        let configured = SocketAddr::from((config.ndl.interface, config.gncl.port));
-        let listener = listener::listen(*self.stores.gncl_listen.get().unwrap_or(&configured))?;
+        let listener = listener::listen((config.ndl.interface, config.gncl.port).into())?;
         let address = listener.local_addr()?;
+        *kept = Some(listener.try_clone()?);
         self.stores.gncl_listen.get_or_init(|| address);
-        Ok(listener)
+        tokio::net::TcpListener::from_std(listener)
     }
 
     fn input(&mut self, input: Input, ctx: &mut Context<Self>) {
@@ -359,6 +370,7 @@ impl Actor for Gncl {
         // SYNC: Relaxed; the order to stop came through the supervisor's lock, after the flag was set.
         if self.stores.stopping.load(Ordering::Relaxed) {
             self.input(Input::LeaveRequested, ctx);
+            lock(&self.stores.gncl.listener).take();
         }
         Running::Stop
     }

@@ -4,22 +4,24 @@ use std::{io, net::SocketAddr, time::Duration};
 
 use futures_util::{Stream, stream};
 use rustix::io::Errno;
-use tokio::net::{TcpListener, TcpSocket, TcpStream};
+use socket2::{Domain, Socket, Type};
+use tokio::net::{TcpListener, TcpStream};
 
 /// Connections that wait to be accepted at most; the kernel refuses further ones.
-const BACKLOG: u32 = 1_024;
+const BACKLOG: i32 = 1_024;
 const BACK_OFF_MIN: Duration = Duration::from_millis(10);
 const BACK_OFF_MAX: Duration = Duration::from_millis(100);
 
-/// Listens at `address`; a former listener's connections may still be closing there.
+/// Listens at `address`; connections of a former process may still be closing there.
 ///
 /// # Errors
 /// What the system says.
-pub(super) fn listen(address: SocketAddr) -> io::Result<TcpListener> {
-    let socket = if address.is_ipv4() { TcpSocket::new_v4()? } else { TcpSocket::new_v6()? };
-    socket.set_reuseaddr(true)?;
-    socket.bind(address)?;
-    socket.listen(BACKLOG)
+pub(super) fn listen(address: SocketAddr) -> io::Result<std::net::TcpListener> {
+    let socket = Socket::new(Domain::for_address(address), Type::STREAM.nonblocking().cloexec(), None)?;
+    socket.set_reuse_address(true)?;
+    socket.bind(&address.into())?;
+    socket.listen(BACKLOG)?;
+    Ok(socket.into())
 }
 
 /// Each connection that is made to `listener`, and each error that made it wait.

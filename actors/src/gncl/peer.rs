@@ -97,6 +97,9 @@ pub(super) fn frame(here: NodeAddress, node: NodeAddress, kind: Kind, payload: B
 #[derive(Default)]
 pub(crate) struct Store {
     peers: Mutex<BTreeMap<NodeAddress, Arc<Peer>>>,
+    /// The socket that listens. It stays open while this layer is restarted: a peer that is refused would say that this
+    /// node is lost.
+    pub(super) listener: Mutex<Option<std::net::TcpListener>>,
     /// What GNCL refused, and why.
     pub(crate) refusals: Arc<Refusals>,
 }

@@ -2,6 +2,7 @@
 
 use std::{
     collections::BTreeSet,
+    process::ExitCode,
     sync::mpsc::sync_channel,
     time::{Duration, SystemTime},
 };
@@ -11,7 +12,10 @@ use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
 };
 
-use super::{Node, NodeHandle, root};
+use super::{
+    Node, NodeHandle,
+    root::{self, RootEvent},
+};
 use crate::{
     config::{ConfigFaults, NodeConfig},
     stores::Stores,
@@ -23,6 +27,7 @@ pub struct NodeBuilder {
     config: NodeConfig,
     apps: Vec<DynApp>,
     incarnation: Option<Incarnation>,
+    heed_signals: bool,
 }
 
 impl std::fmt::Debug for NodeBuilder {
@@ -73,7 +78,7 @@ fn list(waiting: &[Waiting]) -> String {
 
 impl NodeBuilder {
     pub(super) fn new(name: String) -> Self {
-        Self { config: NodeConfig::new(name), apps: Vec::new(), incarnation: None }
+        Self { config: NodeConfig::new(name), apps: Vec::new(), incarnation: None, heed_signals: false }
     }
 
     /// Replaces the whole configuration: one read from a file, for instance.
@@ -104,6 +109,28 @@ impl NodeBuilder {
         self
     }
 
+    /// SIGINT and SIGTERM stop the node in order, from before its first application starts. For a process that is this
+    /// node; what `run` does too, but only from when it is called.
+    #[must_use]
+    pub const fn heed_signals(mut self) -> Self {
+        self.heed_signals = true;
+        self
+    }
+
+    /// Starts the node and runs it until it ends: all that the `main` of a node's program has to do. Returns the exit
+    /// code: 0 after an orderly stop, 1 if it did not start or gave up; the reason is logged and written to the standard
+    /// error.
+    pub fn run(self) -> ExitCode {
+        match self.heed_signals().start() {
+            Ok(node) => node.run(),
+            Err(error) => {
+                tracing::error!(%error, "the node did not start");
+                eprintln!("{error}");
+                ExitCode::FAILURE
+            }
+        }
+    }
+
     /// Adds an application.
     #[must_use]
     pub fn app(mut self, app: impl Into<DynApp>) -> Self {
@@ -127,7 +154,10 @@ impl NodeBuilder {
         let handle = NodeHandle { root: stores.posts.root.clone(), stores: stores.clone() };
         let (say_started, started) = sync_channel(1);
         let (say_ended, ended) = sync_channel(1);
-        let apps = self.apps;
+        let (apps, heed_signals) = (self.apps, self.heed_signals);
+        if heed_signals && handle.root.post(RootEvent::HeedSignals).is_err() {
+            return Err(StartError::Layers("the root's post is full before it was read".to_owned()));
+        }
         let thread = std::thread::Builder::new()
             .name("root".to_owned())
             .spawn(move || root::run(stores, apps, say_started, say_ended))?;

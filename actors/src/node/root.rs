@@ -79,6 +79,7 @@ struct Root {
     started: Option<SyncSender<Result<(), StartError>>>,
     ended: SyncSender<NodeEnd>,
     tell_when_running: Vec<SyncSender<Result<(), StartError>>>,
+    heeds_signals: bool,
 }
 
 /// The root thread's whole life.
@@ -104,6 +105,7 @@ pub(super) fn run(
         started: Some(started),
         ended,
         tell_when_running: Vec::new(),
+        heeds_signals: false,
         stores,
     };
     system.block_on(async { root.start() });
@@ -117,6 +119,7 @@ impl Actor for Root {
     type Context = Context<Self>;
 
     fn started(&mut self, context: &mut Context<Self>) {
+        // First of all what is in the post already: perhaps an order to heed signals.
         context.add_stream(self.stores.posts.root.attach());
         let deadline = self.stores.config.sync.layer_deadline;
         let layers = layers(&self.stores, deadline);
@@ -368,15 +371,18 @@ impl Root {
         actix::System::current().stop();
     }
 
-    fn heed_signals(&self, context: &mut Context<Self>) {
+    fn heed_signals(&mut self, context: &mut Context<Self>) {
+        if std::mem::replace(&mut self.heeds_signals, true) {
+            return;
+        }
         let post = self.stores.posts.root.clone();
+        let (Ok(mut interrupt), Ok(mut terminate)) =
+            (signal(SignalKind::interrupt()), signal(SignalKind::terminate()))
+        else {
+            tracing::error!("signals cannot be heeded; stop this node by its handle");
+            return;
+        };
         let heed = async move {
-            let (Ok(mut interrupt), Ok(mut terminate)) =
-                (signal(SignalKind::interrupt()), signal(SignalKind::terminate()))
-            else {
-                tracing::error!("signals cannot be heeded; stop this node by its handle");
-                return;
-            };
             let which = tokio::select! {
                 _ = interrupt.recv() => "SIGINT",
                 _ = terminate.recv() => "SIGTERM",

@@ -109,7 +109,7 @@ impl List {
     /// Reads a list from a peer's bytes. Allocates no more than the legal bounds, whatever lengths the bytes claim.
     pub(crate) fn parse(bytes: &[u8]) -> Result<Self, ListError> {
         // spec: SYNC-4
-        let list: Self = rmp_serde::from_slice(bytes)?;
+        let list: Self = sinew_runtime::wire::decode(bytes)?;
         let (mut names, mut apps, mut groups) = (BTreeSet::new(), BTreeSet::new(), BTreeSet::new());
         for Entry { name, app, .. } in &list.entries {
             if !(app.is_fixed() || app.is_dynamic()) {

@@ -84,7 +84,7 @@ fn main() -> ExitCode {
         .handles::<RequirementEvent>()
         .requires(after("--requires"))
         .own_thread();
-    match Node::builder(name).config(config).app(probe).start() {
+    match Node::builder(name).config(config).app(probe).heed_signals().start() {
         Ok(node) => {
             println!("up");
             node.run()

@@ -159,7 +159,7 @@ pub(crate) fn write<T: Serialize>(value: &T) -> Bytes {
 
 /// Reads a payload of this layer.
 pub(crate) fn read<T: DeserializeOwned>(payload: &[u8]) -> Result<T, Decline> {
-    rmp_serde::from_slice(payload)
+    sinew_runtime::wire::decode(payload)
         .map_err(|cause| Decline::Violation(format!("a payload of GNCL is wrong: {cause}")))
 }
 

@@ -70,7 +70,7 @@ impl Core {
         self.contests
             .retain(|_, contest| contest.newcomer.from != proof.from || contest.newcomer.is_of(claimed));
         if claimed.node == self.me.node {
-            self.own_address_used(now, proof.from);
+            self.own_address_used(now, proof.from, proof.announcement.incarnation);
             return;
         }
         self.release_address(now, proof.from, claimed.node);
@@ -280,8 +280,12 @@ impl Core {
     }
 
     /// A living process has our own node address. // spec: NDL-5.5
-    fn own_address_used(&mut self, now: Time, other: SocketAddr) {
-        if self.settles.is_some_and(|until| now < until) {
+    fn own_address_used(&mut self, now: Time, other: SocketAddr, incarnation: Incarnation) {
+        let Some(settles) = self.settles else { return };
+        // Two that start together: the later life gives up at once, the earlier one only if the other stays.
+        let is_later = incarnation <= self.me.incarnation;
+        let is_nearly_settled = now + self.period > settles;
+        if now < settles && (is_later || is_nearly_settled) {
             // The next start begins anew: the other may be gone by then.
             self.settles = None;
             self.cycle_due = None;

@@ -363,6 +363,22 @@ fn a_newcomer_that_finds_its_own_address_in_use_gives_up_and_the_holder_does_not
     assert_eq!(world.at(1).facts, []);
 }
 
+// spec: NDL-5.5
+#[test]
+fn of_two_that_start_together_with_one_address_the_later_life_gives_up_alone() {
+    let mut world = World::new();
+    world.start(1, &Spec::of(1));
+    world.start(2, &Spec::of(2));
+    world.start(3, &Spec { incarnation: 2, ..Spec::of(2) });
+    world.run(PERIOD * 6);
+    let gave_up = |world: &World, index| {
+        world.at(index).others.iter().any(|output| matches!(output, Output::AddressTaken { .. }))
+    };
+    assert!(gave_up(&world, 3));
+    assert!(!gave_up(&world, 2));
+    assert!(world.knows(1, 2));
+}
+
 // spec: NDL-1.2
 #[test]
 fn other_projects_are_not_seen() {
