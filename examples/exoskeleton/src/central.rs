@@ -7,6 +7,9 @@
 //!                                 Safe ---------------------------+<--------- Safe <----------+
 //! ```
 //!
+//! A silence of at most a tenth of a second, a hiccup of a host, does not make the phase unknown: from `Safe` it goes
+//! back to `Walk` at once, and the drives' ramps bring assistance back.
+//!
 //! While assembling it says nothing, so that no drive becomes ready before all parts are there.
 
 use crate::control::admission::{Admission, Stamped};
@@ -18,6 +21,9 @@ use crate::phase::hand_over::{HandOver, HandOverConfig};
 use crate::phase::heel_strike::CONTACT_BW;
 use crate::phase::oscillator::{Oscillator, OscillatorGains};
 use crate::phase::stride_clock::StrideClock;
+
+/// Longest time that the estimator is moved on with what was heard at its end, seconds.
+const TICK_LONGEST_S: f64 = 0.005;
 
 /// How the phase is estimated.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -47,6 +53,9 @@ pub struct CentralConfig {
     pub strike_error_max: f64,
     /// Time without a heel strike after which the phase is not trusted any more, seconds. Default 2.5.
     pub strike_gap_max_s: f64,
+    /// Longest silence of an input over which the phase is still believed, seconds; after a longer one the estimator
+    /// starts cold. Default 0.1. The drives damp from the first stale tick on in any case.
+    pub gap_coast_max_s: f64,
     /// Number of this life of central; larger than that of any life before.
     pub epoch: u32,
 }
@@ -59,6 +68,7 @@ impl Default for CentralConfig {
             strikes_trusted: 3,
             strike_error_max: 0.10,
             strike_gap_max_s: 2.5,
+            gap_coast_max_s: 0.1,
             epoch: 1,
         }
     }
@@ -119,6 +129,10 @@ pub struct CentralCore {
     strikes_good: u32,
     since_strike_s: f64,
     last_tick_ns: Option<u64>,
+    /// Time for which the estimator has heard nothing, seconds.
+    unheard_s: f64,
+    /// Whether assistance was on when an input was lost.
+    lost_in_walk: bool,
     seq: u32,
     counters: CentralCounters,
 }
@@ -140,6 +154,8 @@ impl CentralCore {
             strikes_good: 0,
             since_strike_s: 0.0,
             last_tick_ns: None,
+            unheard_s: 0.0,
+            lost_in_walk: false,
             seq: 0,
             counters: CentralCounters::default(),
         }
@@ -152,8 +168,10 @@ impl CentralCore {
         self.counters.ticks += 1;
         self.admit(now_ns, input);
         let complete = self.complete(now_ns);
+        self.unheard_s += dt_s;
         self.judge_stage(complete);
         if complete && matches!(self.stage, Stage::Syncing | Stage::Walking) {
+            let dt_s = self.coast();
             self.estimate_phase(dt_s);
         }
         self.judge_trust();
@@ -224,11 +242,17 @@ impl CentralCore {
             (Stage::Held, false, _) => Stage::Assembling,
             (Stage::Syncing | Stage::Walking | Stage::Lost, false, _) => Stage::Lost,
             (_, true, false) => Stage::Held,
+            (Stage::Lost, true, true)
+                if self.lost_in_walk && self.unheard_s <= self.config.gap_coast_max_s =>
+            {
+                Stage::Walking
+            }
             (Stage::Assembling | Stage::Held | Stage::Lost, true, true) => Stage::Syncing,
             (Stage::Syncing, true, true) => Stage::Syncing,
             (Stage::Walking, true, true) => Stage::Walking,
         };
         if next == Stage::Lost && self.stage != Stage::Lost {
+            self.lost_in_walk = self.stage == Stage::Walking;
             self.counters.losses = self.counters.losses.saturating_add(1);
         }
         if next == Stage::Syncing && self.stage != Stage::Syncing {
@@ -243,6 +267,22 @@ impl CentralCore {
         self.confidence = 0.0;
         self.strikes_good = 0;
         self.since_strike_s = 0.0;
+        self.unheard_s = 0.0;
+    }
+
+    /// Carries the estimator over the time in which it heard nothing, but for the last tick's; returns that.
+    fn coast(&mut self) -> f64 {
+        let unheard_s = std::mem::take(&mut self.unheard_s);
+        let coasted_s = (unheard_s - TICK_LONGEST_S).max(0.0);
+        if coasted_s > 0.0 {
+            match &mut self.estimator {
+                RunningEstimator::Oscillator(oscillator) => oscillator.coast(coasted_s),
+                RunningEstimator::HandOver(both) => both.coast(coasted_s),
+                RunningEstimator::StrideClock(clock) => clock.coast(coasted_s),
+            }
+            self.since_strike_s += coasted_s;
+        }
+        unheard_s - coasted_s
     }
 
     fn estimate_phase(&mut self, dt_s: f64) {

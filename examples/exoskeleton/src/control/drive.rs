@@ -20,8 +20,8 @@ use super::torque_law::{LawPhase, TorqueLaw};
 use crate::joint::Joint;
 use crate::message::{DriveState, DriveStatus, GaitMode, GaitState, JointSample};
 
-/// Longest time for which the rate limiter moves in one tick, ns; a late tick does not earn a step.
-const TICK_LONGEST_NS: u64 = 5_000_000;
+/// Longest time for which the rate limiter moves in one tick, seconds; a late tick does not earn a step.
+const TICK_LONGEST_S: f64 = 0.005;
 /// A device torque below this at start counts as zero, Nm.
 const HELD_TORQUE_MIN_NM: f32 = 0.5;
 
@@ -127,10 +127,11 @@ impl DriveCore {
         gait: Option<&GaitState>,
     ) -> DriveOutput {
         self.admit(now_ns, sample, gait);
-        let dt_s = self.elapsed_s(now_ns);
+        let elapsed_s = self.elapsed_s(now_ns);
+        let dt_s = elapsed_s.min(TICK_LONGEST_S);
         let fresh_sample = self.samples.fresh(now_ns).copied();
         let fresh_gait = self.gait.fresh(now_ns).copied();
-        self.judge_state(fresh_sample.is_some(), fresh_gait.map(|g| g.mode));
+        self.judge_state(elapsed_s, fresh_sample.is_some(), fresh_gait.map(|g| g.mode));
         let (target_nm, saturated) = self.target((now_ns, dt_s), fresh_sample, fresh_gait);
         let limit_nm = self.config.law.limit_nm;
         let torque_nm = self.limiter.toward(target_nm.clamp(-limit_nm, limit_nm), dt_s);
@@ -219,10 +220,10 @@ impl DriveCore {
 
     fn elapsed_s(&mut self, now_ns: u64) -> f64 {
         let before_ns = self.last_tick_ns.replace(now_ns).unwrap_or(now_ns);
-        now_ns.saturating_sub(before_ns).min(TICK_LONGEST_NS) as f64 * 1e-9
+        now_ns.saturating_sub(before_ns) as f64 * 1e-9
     }
 
-    fn judge_state(&mut self, sample_fresh: bool, mode: Option<GaitMode>) {
+    fn judge_state(&mut self, elapsed_s: f64, sample_fresh: bool, mode: Option<GaitMode>) {
         let next = next_state(self.state, sample_fresh, mode);
         if self.state == DriveState::Walk && next == DriveState::Safe {
             self.counters.safe_entries = self.counters.safe_entries.saturating_add(1);
@@ -230,8 +231,10 @@ impl DriveCore {
                 self.faults.insert(FaultBits::INPUT_LOST);
             }
         }
-        if next != DriveState::Walk {
-            self.ramp.drop_to_zero();
+        match next {
+            DriveState::Walk => {}
+            DriveState::Safe => self.ramp.fall(elapsed_s),
+            DriveState::Init | DriveState::Ready | DriveState::EStop => self.ramp.drop_to_zero(),
         }
         self.state = next;
     }

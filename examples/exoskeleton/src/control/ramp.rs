@@ -33,7 +33,10 @@ impl RateLimiter {
     }
 }
 
-/// Gain 0..1 that rises in a given time while assisting and drops to 0 at once when not.
+/// Time in which the gain falls from 1 to 0 while damping, seconds: a hiccup does not cost the whole rise.
+const FALL_S: f64 = 0.1;
+
+/// Gain 0..1 that rises in a given time while assisting, falls fast while damping, and drops to 0 otherwise.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AssistRamp {
     rise_s: f64,
@@ -51,6 +54,11 @@ impl AssistRamp {
     pub fn rise(&mut self, dt_s: f64) -> f64 {
         self.gain = if self.rise_s > 0.0 { (self.gain + dt_s / self.rise_s).min(1.0) } else { 1.0 };
         self.gain
+    }
+
+    /// Falls for `dt_s`. What the torque does meanwhile is not its affair; it is where assistance begins again.
+    pub fn fall(&mut self, dt_s: f64) {
+        self.gain = (self.gain - dt_s / FALL_S).max(0.0);
     }
 
     /// Back to zero; the rate limiter behind keeps the torque from stepping.

@@ -86,6 +86,12 @@ impl HandOver {
         }
     }
 
+    /// Lets time pass in which nothing was heard.
+    pub fn coast(&mut self, dt_s: f64) {
+        self.clock.coast(dt_s);
+        self.oscillator.coast(dt_s);
+    }
+
     /// Share of the oscillator in the phase, 0..1.
     #[must_use]
     pub const fn oscillator_share(&self) -> f64 {

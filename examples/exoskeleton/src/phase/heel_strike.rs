@@ -31,6 +31,11 @@ impl HeelStrikeDetector {
         None
     }
 
+    /// Lets time pass in which nothing was heard.
+    pub fn coast(&mut self, dt_s: f64) {
+        self.since_strike_s = self.since_strike_s.map(|s| s + dt_s);
+    }
+
     /// Time since the last heel strike, seconds; `None` before the first.
     #[must_use]
     pub const fn since_strike_s(&self) -> Option<f64> {

@@ -84,6 +84,14 @@ impl Oscillator {
         }
     }
 
+    /// Lets time pass in which nothing was heard: it swings on at its rate and learns nothing.
+    pub fn coast(&mut self, dt_s: f64) {
+        for (k, phase) in self.phase_rad.iter_mut().enumerate() {
+            *phase += dt_s * (k + 1) as f64 * self.rate_rad_s;
+        }
+        self.strikes.coast(dt_s);
+    }
+
     /// Time since the last heel strike, seconds; `None` before the first.
     #[must_use]
     pub const fn since_strike_s(&self) -> Option<f64> {
@@ -130,6 +138,26 @@ mod tests {
     use crate::gait::curves;
     use crate::joint::Joint;
     use crate::phase::wrapped;
+
+    #[test]
+    fn oscillator_that_heard_nothing_for_a_tenth_of_a_second_still_knows_the_phase() {
+        let mut oscillator = Oscillator::new(OscillatorGains::default());
+        let mut ms = 0;
+        while ms < 16_000 {
+            ms += 1;
+            if ms == 14_300 {
+                oscillator.coast(0.1);
+                ms += 100;
+            }
+            let strides = f64::from(ms) * 1e-3 / curves::STRIDE_MEAN_S;
+            let hip_deg = curves::angle_rad(Joint::Hip, strides).value.to_degrees();
+            let estimate = oscillator.tick(hip_deg, curves::vertical_load_bw(strides), 1e-3);
+            if strides > 6.0 {
+                let error = wrapped(estimate.phase - strides);
+                assert!(error.abs() < 0.06, "{error} at stride {strides}");
+            }
+        }
+    }
 
     #[test]
     fn cold_oscillator_knows_the_phase_after_six_strides() {

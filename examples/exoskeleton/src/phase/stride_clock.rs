@@ -41,6 +41,11 @@ impl StrideClock {
         PhaseEstimate { phase: self.phase.rem_euclid(1.0), rate_hz: 1.0 / mean_s, strike_error }
     }
 
+    /// Lets time pass in which nothing was heard.
+    pub fn coast(&mut self, dt_s: f64) {
+        self.strikes.coast(dt_s);
+    }
+
     fn mean_s(&self) -> f64 {
         self.durations_s.iter().sum::<f64>() / STRIDES_MEANED as f64
     }

@@ -21,7 +21,7 @@ const RETRY_PERIOD: Duration = Duration::from_millis(100);
 /// Longest time until an order to stop is seen.
 const RECEIVE_PERIOD: Duration = Duration::from_millis(100);
 /// Older news is no news.
-const NEWS: Duration = Duration::from_millis(500);
+const NEWS: Duration = Duration::from_millis(250);
 
 /// The newest that was heard.
 #[derive(Debug, Clone, Default)]
@@ -39,7 +39,7 @@ pub(super) struct Console {
 }
 
 impl View {
-    /// Who waits for whom, as told within the last half second.
+    /// Who waits for whom, as told within the last quarter of a second.
     pub(super) fn waiting(&self) -> Vec<String> {
         self.barrier
             .values()

@@ -70,7 +70,11 @@ impl Screen {
         // Without the times, which change always.
         let waiting: Vec<String> = view.waiting().iter().map(|words| untimed(words)).collect();
         if waiting != self.told.waiting {
-            waiting.iter().for_each(|line| self.say(line));
+            for line in
+                waiting.iter().filter(|line| !self.told.waiting.contains(line)).cloned().collect::<Vec<_>>()
+            {
+                self.say(&line);
+            }
             self.told.waiting = waiting;
         }
         let states = states(view);

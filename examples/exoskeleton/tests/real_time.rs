@@ -1,0 +1,116 @@
+//! The built program as its users run it. Nothing here is an assertion about timing.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::mpsc::sync_channel;
+use std::time::Duration;
+
+use exoskeleton::robot::topology::{Topology, for_this_host};
+use rustix::process::{Pid, Signal, kill_process};
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_exoskeleton");
+const DEADLINE: Duration = Duration::from_secs(60);
+
+/// A folder of this test's own.
+fn folder(name: &str) -> PathBuf {
+    let folder = std::env::temp_dir().join(format!("exoskeleton-test-{name}-{}", std::process::id()));
+    let _ = std::fs::remove_dir_all(&folder);
+    std::fs::create_dir_all(&folder).unwrap();
+    folder
+}
+
+fn start(arguments: &[&str]) -> Child {
+    let mut command = Command::new(PROGRAM);
+    command.args(arguments).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    command.spawn().expect("the program that was just built starts")
+}
+
+/// Closes its standard input and waits for its end.
+fn end(child: Child, what: &str) -> Output {
+    let id = Pid::from_child(&child);
+    let (say, heard) = sync_channel(1);
+    std::thread::spawn(move || say.send(child.wait_with_output()));
+    heard.recv_timeout(DEADLINE).map(Result::unwrap).unwrap_or_else(|_| {
+        let _ = kill_process(id, Signal::KILL);
+        panic!("{what} within {DEADLINE:?}");
+    })
+}
+
+fn topology_file(folder: &Path, text: &str) -> String {
+    let path = folder.join("topology.toml");
+    std::fs::File::create(&path).and_then(|mut file| file.write_all(text.as_bytes())).unwrap();
+    path.display().to_string()
+}
+
+fn topology_of_this_test() -> Topology {
+    let mut topology = for_this_host(1).unwrap();
+    topology.console = None;
+    topology
+}
+
+#[test]
+fn five_processes_wait_for_the_late_one_without_torque_and_then_walk() {
+    let (folder, runs) = (folder("walk"), "runs");
+    let report = folder.join("report.json");
+    let runs = folder.join(runs);
+    let arguments =
+        ["--strides", "8", "--runs", runs.to_str().unwrap(), "--report", report.to_str().unwrap()];
+
+    let output = end(start(&arguments), "the walk ends");
+
+    let told = String::from_utf8_lossy(&output.stdout);
+    let failed = String::from_utf8_lossy(&output.stderr);
+    assert!(told.contains("waits for hip.sensor"), "the late hip is waited for:\n{told}\n{failed}");
+    assert!(told.contains("stride 8 of 8"), "{told}\n{failed}");
+    // Whether limits hold depends on the machine; that it walked does not.
+    assert!(matches!(output.status.code(), Some(0 | 2)), "{:?}\n{told}\n{failed}", output.status);
+    let report: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(report).unwrap()).unwrap();
+    assert_eq!(report["barrier"]["torque_before_release_nm"], 0.0);
+    assert!(report["barrier"]["held_s"].as_f64().unwrap() > 1.0, "{report}");
+    assert!(report["timing_measured"].as_bool().unwrap());
+    std::fs::remove_dir_all(&folder).unwrap();
+}
+
+#[test]
+fn node_with_a_bad_topology_is_refused_in_words_with_exit_code_1() {
+    let folder = folder("refused");
+    let text = topology_of_this_test().to_toml().replacen("127.0.0.3", "127.0.0.2", 1);
+    let file = topology_file(&folder, &text);
+
+    let output = end(start(&["node", "hip", "--topology", &file]), "the node is refused");
+
+    let words = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{words}");
+    assert!(words.contains("another node's already"), "{words}");
+    std::fs::remove_dir_all(&folder).unwrap();
+}
+
+#[test]
+fn node_and_plant_alone_end_in_order_when_their_starter_does() {
+    let folder = folder("alone");
+    let file = topology_file(&folder, &topology_of_this_test().to_toml());
+    for role in ["plant", "hip", "central"] {
+        let child = start(&["node", role, "--stop-with-stdin", "--topology", &file]);
+        let output = end(child, role);
+        let words = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(0), "{role}: {words}");
+    }
+    std::fs::remove_dir_all(&folder).unwrap();
+}
+
+#[test]
+fn second_plant_at_the_same_address_says_what_is_wrong() {
+    let folder = folder("twice");
+    let taken = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    let mut topology = topology_of_this_test();
+    topology.plant.address = taken.local_addr().unwrap();
+    let file = topology_file(&folder, &topology.to_toml());
+
+    let output = end(start(&["node", "plant", "--topology", &file]), "the plant is refused");
+
+    let words = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{words}");
+    assert!(words.contains("is another plant running"), "{words}");
+    std::fs::remove_dir_all(&folder).unwrap();
+}

@@ -1,0 +1,93 @@
+//! Topology files: what is read, what is refused, in which words.
+
+use std::path::Path;
+
+use exoskeleton::joint::Joint;
+use exoskeleton::part::Part;
+use exoskeleton::robot::topology::{ControlThread, Topology, for_this_host};
+use proptest::prelude::*;
+
+const EXAMPLE: &str = include_str!("../topology.toml");
+
+/// The example with one text replaced, which must be in it.
+fn with(old: &str, new: &str) -> String {
+    assert!(EXAMPLE.contains(old), "{old}");
+    EXAMPLE.replacen(old, new, 1)
+}
+
+fn faults(text: &str) -> Vec<String> {
+    Topology::parse(text).expect_err("a fault").0
+}
+
+#[test]
+fn example_file_is_a_topology_and_says_what_its_comments_say() {
+    let topology = Topology::parse(EXAMPLE).unwrap();
+    assert_eq!(topology.control.thread, ControlThread::Io);
+    assert_eq!(topology.joint_at([10, 0, 0, 3].into()), Some(Joint::Knee));
+    let config = topology.node_config(Part::Central);
+    assert_eq!((config.project.as_str(), config.ndl.period.as_millis()), ("my-leg", 500));
+    assert_eq!(config.lncl.socket.as_deref(), Some(Path::new("/tmp/exoskeleton.socket")));
+    assert_eq!(topology.node_config(Part::Joint(Joint::Hip)).lncl.socket, None);
+}
+
+#[test]
+fn topology_of_a_run_on_this_host_reads_back_from_its_file() {
+    let topology = for_this_host(7).unwrap();
+    assert_eq!(Topology::parse(&topology.to_toml()), Ok(topology));
+}
+
+#[test]
+fn all_faults_are_told_together() {
+    let text = EXAMPLE
+        .replacen("\"my-leg\"", "\"\"", 1)
+        .replacen("address = \"10.0.0.2\"", "address = \"10.0.0.300\"", 1)
+        .replacen("address = \"10.0.0.3\"", "address = \"10.0.0.1\"", 1)
+        .replacen("period_ms = 500", "period_ms = 5", 1)
+        .replacen("10.0.0.9:6920", "10.0.0.9", 1);
+    let told = faults(&text).join("\n");
+    for expected in ["project", "hip.address", "knee.address", "discovery.period_ms", "plant.address"] {
+        assert!(told.contains(expected), "{expected} is missing in:\n{told}");
+    }
+}
+
+#[test]
+fn nodes_that_could_never_meet_are_refused() {
+    let off = with("multicast = \"239.255.83.119:6910\"", "multicast = \"off\"").replacen(
+        "mdns = true",
+        "mdns = false",
+        1,
+    );
+    assert!(faults(&off)[0].contains("cannot find each other"));
+    let mixed = with("interface = \"10.0.0.1\"", "interface = \"127.0.0.1\"");
+    assert!(faults(&mixed)[0].contains("loopback"));
+}
+
+#[test]
+fn priority_of_the_network_thread_is_refused() {
+    let text = with("# realtime_priority = 50 ", "realtime_priority = 50 #");
+    assert!(faults(&text)[0].contains("control.thread = \"own\""));
+    let own = text.replacen("thread = \"io\" ", "thread = \"own\"", 1);
+    assert_eq!(Topology::parse(&own).unwrap().control.realtime_priority, Some(50));
+}
+
+#[test]
+fn key_that_does_not_exist_is_named() {
+    assert!(faults(&with("mdns = true", "mdsn = true"))[0].contains("mdsn"));
+}
+
+#[test]
+fn seed_without_a_port_and_console_at_a_joint_are_refused() {
+    assert!(faults(&with("10.0.0.1:6911", "10.0.0.1:0"))[0].contains("port 0"));
+    let console = with("address = \"10.0.0.2\"", "address = \"10.0.0.2\"\nconsole = \"/tmp/x\"");
+    assert!(faults(&console)[0].contains("central only"));
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn any_damage_to_the_example_gives_a_topology_or_faults(at in 0usize..3000, junk in "\\PC{0,12}") {
+        let at = EXAMPLE.char_indices().map(|(at, _)| at).nth(at).unwrap_or(0);
+        let _ = Topology::parse(&format!("{}{junk}{}", &EXAMPLE[..at], &EXAMPLE[at..]));
+    }
+}
