@@ -7,8 +7,8 @@
 //!                                 Safe ---------------------------+<--------- Safe <----------+
 //! ```
 //!
-//! A silence of at most a tenth of a second, a hiccup of a host, does not make the phase unknown: from `Safe` it goes
-//! back to `Walk` at once, and the drives' ramps bring assistance back.
+//! A silence of at most a quarter of a second, a hiccup of a host, does not make the phase unknown: from `Safe` it goes
+//! back at once to what it did before, and the drives' ramps bring assistance back.
 //!
 //! While assembling it says nothing, so that no drive becomes ready before all parts are there.
 
@@ -54,7 +54,7 @@ pub struct CentralConfig {
     /// Time without a heel strike after which the phase is not trusted any more, seconds. Default 2.5.
     pub strike_gap_max_s: f64,
     /// Longest silence of an input over which the phase is still believed, seconds; after a longer one the estimator
-    /// starts cold. Default 0.1. The drives damp from the first stale tick on in any case.
+    /// starts cold. Default 0.25, a fifth of a stride. The drives damp from the first stale tick on in any case.
     pub gap_coast_max_s: f64,
     /// Number of this life of central; larger than that of any life before.
     pub epoch: u32,
@@ -68,7 +68,7 @@ impl Default for CentralConfig {
             strikes_trusted: 3,
             strike_error_max: 0.10,
             strike_gap_max_s: 2.5,
-            gap_coast_max_s: 0.1,
+            gap_coast_max_s: 0.25,
             epoch: 1,
         }
     }
@@ -131,8 +131,8 @@ pub struct CentralCore {
     last_tick_ns: Option<u64>,
     /// Time for which the estimator has heard nothing, seconds.
     unheard_s: f64,
-    /// Whether assistance was on when an input was lost.
-    lost_in_walk: bool,
+    /// What it did when an input was lost.
+    lost_from: Stage,
     seq: u32,
     counters: CentralCounters,
 }
@@ -155,7 +155,7 @@ impl CentralCore {
             since_strike_s: 0.0,
             last_tick_ns: None,
             unheard_s: 0.0,
-            lost_in_walk: false,
+            lost_from: Stage::Assembling,
             seq: 0,
             counters: CentralCounters::default(),
         }
@@ -236,26 +236,23 @@ impl CentralCore {
     }
 
     fn judge_stage(&mut self, complete: bool) {
+        let is_hiccup = self.stage == Stage::Lost && self.unheard_s <= self.config.gap_coast_max_s;
         let next = match (self.stage, complete, self.released) {
             (Stage::Assembling, false, _) => Stage::Assembling,
             // Not yet released, so nothing was given that would have to be damped: wait for the parts again.
             (Stage::Held, false, _) => Stage::Assembling,
             (Stage::Syncing | Stage::Walking | Stage::Lost, false, _) => Stage::Lost,
             (_, true, false) => Stage::Held,
-            (Stage::Lost, true, true)
-                if self.lost_in_walk && self.unheard_s <= self.config.gap_coast_max_s =>
-            {
-                Stage::Walking
-            }
+            (Stage::Lost, true, true) if is_hiccup => self.lost_from,
             (Stage::Assembling | Stage::Held | Stage::Lost, true, true) => Stage::Syncing,
             (Stage::Syncing, true, true) => Stage::Syncing,
             (Stage::Walking, true, true) => Stage::Walking,
         };
         if next == Stage::Lost && self.stage != Stage::Lost {
-            self.lost_in_walk = self.stage == Stage::Walking;
+            self.lost_from = self.stage;
             self.counters.losses = self.counters.losses.saturating_add(1);
         }
-        if next == Stage::Syncing && self.stage != Stage::Syncing {
+        if next == Stage::Syncing && self.stage != Stage::Syncing && !is_hiccup {
             self.start_cold();
         }
         self.stage = next;

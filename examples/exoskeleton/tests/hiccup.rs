@@ -17,10 +17,14 @@ struct Walk {
 }
 
 impl Walk {
-    fn begun() -> Self {
+    fn standing() -> Self {
         let mut central = CentralCore::new(CentralConfig::default());
         central.release();
-        let mut walk = Self { central, intention: Intention::from_curves(3), ms: 0 };
+        Self { central, intention: Intention::from_curves(3), ms: 0 }
+    }
+
+    fn begun() -> Self {
+        let mut walk = Self::standing();
         for _ in 0..10_000 {
             walk.hear();
         }
@@ -78,9 +82,30 @@ fn central_that_stood_still_itself_walks_on_with_the_phase_known() {
 }
 
 #[test]
-fn silence_of_200_ms_makes_the_phase_unknown() {
+fn silence_of_30_ms_does_not_begin_the_settling_anew() {
+    fn settled(walk: &mut Walk) -> u64 {
+        while walk.central.mode() != Some(GaitMode::Walk) {
+            walk.hear();
+        }
+        walk.ms
+    }
+    let undisturbed = settled(&mut Walk::standing());
+    let mut walk = Walk::standing();
+    for _ in 0..undisturbed - 2_000 {
+        walk.hear();
+    }
+    for _ in 0..30 {
+        walk.hear_nothing();
+    }
+    walk.hear();
+    assert_eq!(walk.central.mode(), Some(GaitMode::Sync));
+    assert_eq!(settled(&mut walk), undisturbed);
+}
+
+#[test]
+fn silence_of_300_ms_makes_the_phase_unknown() {
     let mut walk = Walk::begun();
-    for _ in 0..200 {
+    for _ in 0..300 {
         walk.hear_nothing();
     }
     walk.hear();
