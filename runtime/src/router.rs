@@ -48,7 +48,7 @@ impl Refused {
 pub struct LocalRoute {
     /// What takes its messages.
     pub outlet: Arc<dyn Outlet>,
-    /// The events of layers that it subscribed to: kinds of [`Router::publish`].
+    /// What it handles, as far as it told: a layer's event that is among it, it gets.
     pub events: Arc<[Kind]>,
 }
 
@@ -124,19 +124,6 @@ impl Router {
             Ok(())
         };
         self.account(result)
-    }
-
-    /// Hands a layer's event to every application of this node that subscribed to its kind.
-    pub fn publish(&self, event: &Message) {
-        let table = self.table.load();
-        for (app, route) in &table.local {
-            if route.events.contains(&event.header.kind) {
-                let mut copy = copy_of(event);
-                copy.header.destination = Tid::new(self.node, *app);
-                // A full mailbox has counted the refusal itself.
-                let _ = self.account(route.outlet.submit(copy));
-            }
-        }
     }
 
     /// Whether the application of this node at `app` subscribed to events of this kind.

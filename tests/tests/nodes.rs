@@ -65,6 +65,7 @@ fn a_node_that_is_told_to_stop_tells_its_application_and_says_goodbye() {
         let mut hip = scenario.start("hip", 1, &[]);
         let mut knee = scenario.start("knee", 2, &[]);
         hip.wait_for(&["NodeFound", "knee"]);
+        knee.wait_for(&["started"]);
         knee.signal(signal);
         knee.wait_for(&["stopping"]);
         assert_eq!(knee.wait_for_end(), Some(0));

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use sinew_runtime::{
     router::{LocalRoute, Outlet},
     tid::{AppAddress, Tid},
-    wire::Kind,
+    wire::{Kind, Payload},
 };
 
 use super::{
@@ -15,6 +15,7 @@ use super::{
     core::{Address, Owner, RegisterError, Request},
 };
 use crate::{
+    ndl::{self, NodeEvent},
     stores::{Stores, lock},
     sync,
 };
@@ -53,12 +54,12 @@ pub(crate) fn register_local(stores: &Stores, app: LocalApp) -> Result<Tid, Regi
 
 /// The application has started and takes messages.
 pub(crate) fn app_ready(stores: &Stores, app: AppAddress) {
-    tell_sync(stores, AppFact::Ready { app });
+    tell(stores, AppFact::Ready { app });
 }
 
 /// The application has failed and is not started again yet; it keeps its address and its mailbox.
 pub(crate) fn app_down(stores: &Stores, app: AppAddress) {
-    tell_sync(stores, AppFact::Down { app });
+    tell(stores, AppFact::Down { app });
 }
 
 /// Takes the address of an application back.
@@ -95,7 +96,7 @@ pub(super) fn register_client(stores: &Stores, request: Request) -> Result<AppAd
 pub(super) fn open(stores: &Stores, app: AppAddress, route: LocalRoute) {
     let _registry = lock(&stores.registry);
     stores.router.set_local(app, route);
-    tell_sync(stores, AppFact::Ready { app });
+    tell(stores, AppFact::Ready { app });
 }
 
 /// Takes back all that belongs to `owner`.
@@ -116,8 +117,22 @@ pub(super) fn forget_former_clients(stores: &Stores) {
 }
 
 fn forget(stores: &Stores, app: AppAddress) {
+    // Told first: afterwards nobody knows any more what it subscribed to.
+    tell(stores, AppFact::Unregistered { app });
     stores.router.remove_local(app);
-    tell_sync(stores, AppFact::Unregistered { app });
+}
+
+/// Tells the sync manager, and NDL where the application wants to know who is there.
+fn tell(stores: &Stores, fact: AppFact) {
+    let (AppFact::Ready { app } | AppFact::Down { app } | AppFact::Unregistered { app }) = fact else {
+        tell_sync(stores, fact);
+        return;
+    };
+    let wants_nodes = stores.router.subscribes(app, NodeEvent::KIND);
+    if wants_nodes && stores.posts.ndl.post(ndl::Event::App(fact.clone())).is_err() {
+        tracing::error!(?fact, "NDL's post is full and this was not told: does it hang?");
+    }
+    tell_sync(stores, fact);
 }
 
 fn tell_sync(stores: &Stores, fact: AppFact) {

@@ -3,6 +3,7 @@
 use std::{sync::Arc, time::Duration};
 
 use bytes::Bytes;
+use futures_util::{FutureExt, StreamExt};
 use proptest::{prelude::*, strategy::ValueTree, test_runner::TestRunner};
 use serde::{Deserialize, Serialize};
 use sinew_runtime::{
@@ -17,6 +18,7 @@ use super::{
     registrar,
     testing::{RawClient, TestNode, WATCHDOG},
 };
+use crate::ndl::{self, NodeEvent};
 
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Angle {
@@ -212,19 +214,20 @@ fn a_client_may_leave_while_it_waits_at_the_barrier() {
 }
 
 #[test]
-fn a_subscriber_gets_the_layers_events_and_others_do_not() {
-    let node = TestNode::start();
-    let event = crate::LossReason::Silent;
-    let (mut subscriber, tid) =
-        RawClient::register(&node, &Register { events: vec![Angle::KIND], ..Register::default() });
-    let (mut other, other_tid) = RawClient::register(&node, &Register::default());
-    let ndl = Tid::new(node.address(), AppAddress::NDL);
-    node.stores.router.publish(&Message::typed(ndl, Tid::NONE, &Angle { degrees: 9.0 }));
-    let got = subscriber.next().unwrap();
-    assert_eq!((got.header.source, got.header.destination), (ndl, tid), "{event:?}");
-    // What comes first to the other is what is sent to it afterwards.
-    node.stores.router.send(Message::typed(ndl, other_tid, &Angle { degrees: 1.0 })).unwrap();
-    assert_eq!(other.next().unwrap().decode::<Angle>().unwrap(), Angle { degrees: 1.0 });
+fn who_subscribes_to_node_events_is_told_to_ndl_and_others_are_not() {
+    let mut node = TestNode::start();
+    let mut heard = node.stores.posts.ndl.attach();
+    let (_other, _) = RawClient::register(&node, &Register::default());
+    let (subscriber, tid) =
+        RawClient::register(&node, &Register { events: vec![NodeEvent::KIND], ..Register::default() });
+    drop(subscriber);
+    let mut next = || match heard.next().now_or_never() {
+        Some(Some(ndl::Event::App(fact))) => fact,
+        other => panic!("NDL was told {other:?}"),
+    };
+    assert_eq!(next(), AppFact::Ready { app: tid.app });
+    while node.fact() != (AppFact::Unregistered { app: tid.app }) {}
+    assert_eq!(next(), AppFact::Unregistered { app: tid.app });
 }
 
 #[test]

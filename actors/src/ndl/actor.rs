@@ -93,9 +93,12 @@ impl Actor for NdlActor {
 
 impl StreamHandler<Event> for NdlActor {
     fn handle(&mut self, event: Event, _: &mut Self::Context) {
-        let Event::Link(fact) = event;
+        let input = match event {
+            Event::Link(fact) => Input::Link(fact),
+            Event::App(fact) => Input::AppChanged(fact),
+        };
         if let Some(shell) = &self.shell {
-            shell.feed(|core, now| core.handle(now, Input::Link(fact)));
+            shell.feed(|core, now| core.handle(now, input));
         }
     }
 
@@ -213,7 +216,7 @@ impl Shell {
             }
             Output::SendLeave { to, node } => self.send(to, node, 0, Body::Leave(self.me())),
             Output::Fact(fact) => self.tell_layers(fact),
-            Output::Event(event) => self.tell_applications(&event),
+            Output::Event { to, event } => self.tell_applications(&to, &event),
             Output::ClockMeasured { node, offset } => self.stores.clocks.set(node, offset),
             Output::Collision { node, holder, newcomer } => tracing::error!(
                 "node address {node} is used twice: by {holder}, and by {newcomer}, which is not let in; give one of \
@@ -261,10 +264,16 @@ impl Shell {
         }
     }
 
-    fn tell_applications(&self, event: &NodeEvent) {
-        let mut message = Message::typed(Tid::new(self.stores.node, AppAddress::NDL), Tid::NONE, event);
-        message.header.sent = Time::now();
-        self.stores.router.publish(&message);
+    fn tell_applications(&self, to: &[AppAddress], event: &NodeEvent) {
+        let here = self.stores.node;
+        for app in to {
+            let mut message = Message::typed(Tid::new(here, AppAddress::NDL), Tid::new(here, *app), event);
+            message.header.sent = Time::now();
+            if let Err(why) = self.stores.router.send(message) {
+                let what = format_args!("{app} does not learn of {event:?}: {why}");
+                self.refusals.count(Time::now(), "event not taken by an application", &what);
+            }
+        }
     }
 }
 

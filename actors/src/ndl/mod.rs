@@ -33,6 +33,7 @@
 //! | NDL-7 | All memory and all work is bounded. |
 //! | NDL-7.1 | `nodes_max` members, as many candidates, as many that are gone; the oldest candidate makes room. |
 //! | NDL-7.2 | 50 datagrams/s from a stranger's address, 1,000 from all of them, 500 from each member or seed. |
+//! | NDL-8 | An application that wants to know hears first of every member that is there, then of each change, once. |
 
 mod actor;
 mod core;
@@ -49,11 +50,13 @@ pub use core::{KnownNode, Source};
 pub(crate) use facts::MembershipFact;
 pub use facts::{LossReason, NodeEvent};
 
-use crate::gncl::LinkFact;
+use crate::{gncl::LinkFact, lncl::AppFact};
 
 /// What NDL is told.
 #[derive(Debug)]
 pub(crate) enum Event {
     /// By GNCL: a connection came, broke, or cannot be made again.
     Link(LinkFact),
+    /// By LNCL: an application that handles [`NodeEvent`] became ready, failed, went.
+    App(AppFact),
 }

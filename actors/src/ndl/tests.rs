@@ -22,7 +22,7 @@ use sinew_runtime::{
 };
 
 use super::{LossReason, MembershipFact, NdlActor, NodeEvent, Source, actor::lock};
-use crate::{config::NdlConfig, config::NodeConfig, gncl, stores::Stores};
+use crate::{config::NdlConfig, config::NodeConfig, gncl, lncl, stores::Stores};
 
 const LOOPBACK: Ipv4Addr = Ipv4Addr::LOCALHOST;
 
@@ -87,6 +87,7 @@ impl Node {
         let events = inbox.attach();
         let route = LocalRoute { outlet: Arc::new(Inbox(inbox)), events: Arc::new([NodeEvent::KIND]) };
         stores.router.set_local(AppAddress::new(0x1000), route);
+        lncl::app_ready(&stores, AppAddress::new(0x1000));
         Self { stores, layer: None, facts, events }
     }
 

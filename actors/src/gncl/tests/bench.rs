@@ -139,6 +139,7 @@ impl Node {
     pub(super) async fn fact(&mut self) -> LinkFact {
         match next("a fact about a link", &mut self.facts).await {
             ndl::Event::Link(fact) => fact,
+            ndl::Event::App(fact) => panic!("GNCL told NDL of an application: {fact:?}"),
         }
     }
 

@@ -205,10 +205,10 @@ impl Core {
         // Before the fact, so that GNCL knows the clock of a peer when it connects.
         self.measure(now, node, exchange);
         self.outputs.push_back(Output::Fact(MembershipFact::NodeFound { node, incarnation, gncl }));
-        self.outputs.push_back(Output::Event(match arrival {
+        self.publish(match arrival {
             Arrival::Found => NodeEvent::NodeFound { node, name, incarnation },
             Arrival::Restarted => NodeEvent::NodeRestarted { node, name, incarnation },
-        }));
+        });
     }
 
     /// A member is there in a new life. // spec: NDL-5.1
@@ -333,13 +333,7 @@ impl Core {
         let Announcement { incarnation, name, .. } = member.announcement;
         let silent_us = u64::try_from(now.since(member.heard).as_micros()).unwrap_or(u64::MAX);
         self.outputs.push_back(Output::Fact(MembershipFact::NodeLost { node, incarnation, why }));
-        self.outputs.push_back(Output::Event(NodeEvent::NodeLost {
-            node,
-            name,
-            incarnation,
-            why,
-            silent_us,
-        }));
+        self.publish(NodeEvent::NodeLost { node, name, incarnation, why, silent_us });
         if why == LossReason::ConnectionRefused {
             // Perhaps only its GNCL restarts: then it answers this.
             self.ask(now, member.address);

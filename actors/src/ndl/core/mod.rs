@@ -23,14 +23,14 @@ mod tests;
 mod view;
 
 use std::{
-    collections::{BTreeMap, VecDeque},
+    collections::{BTreeMap, BTreeSet, VecDeque},
     hash::{DefaultHasher, Hash, Hasher},
     net::{SocketAddr, SocketAddrV4},
     time::Duration,
 };
 
 use sinew_runtime::{
-    tid::{Incarnation, NodeAddress},
+    tid::{AppAddress, Incarnation, NodeAddress},
     time::Time,
 };
 
@@ -45,7 +45,7 @@ use super::{
     MembershipFact, NodeEvent,
     datagram::{Announcement, Answer},
 };
-use crate::{config::NodeConfig, gncl::LinkFact, refusals::Refusals, stores::ClockOffset};
+use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, refusals::Refusals, stores::ClockOffset};
 
 /// What happened.
 #[derive(Clone, Debug)]
@@ -64,6 +64,8 @@ pub(crate) enum Input {
     TimePassed,
     /// The node stops in order.
     Stopping,
+    /// An application that handles [`NodeEvent`] became ready, failed, went.
+    AppChanged(AppFact),
 }
 
 /// What is to be done, or has become known.
@@ -89,8 +91,11 @@ pub(crate) enum Output {
     },
     /// For GNCL and the sync manager.
     Fact(MembershipFact),
-    /// For applications.
-    Event(NodeEvent),
+    /// For these applications.
+    Event {
+        to: Vec<AppAddress>,
+        event: NodeEvent,
+    },
     ClockMeasured {
         node: NodeAddress,
         offset: ClockOffset,
@@ -194,6 +199,8 @@ pub(crate) struct Core {
     strangers: Strangers,
     collisions_reported: BTreeMap<NodeAddress, Time>,
 
+    /// Applications that hear of changes.
+    subscribers: BTreeSet<AppAddress>,
     outputs: VecDeque<Output>,
     refusals: Refusals,
 }
@@ -240,6 +247,7 @@ impl Core {
             group_questions: Questions::default(),
             strangers: Strangers::new(Time::ZERO),
             collisions_reported: BTreeMap::new(),
+            subscribers: BTreeSet::new(),
             outputs: VecDeque::new(),
             refusals: Refusals::default(),
         }
@@ -263,6 +271,10 @@ impl Core {
 
     /// Takes in what happened.
     pub(crate) fn handle(&mut self, now: Time, input: Input) {
+        if let Input::AppChanged(fact) = input {
+            self.app_changed(&fact);
+            return;
+        }
         if self.cycle_due.is_none() {
             return;
         }
@@ -286,7 +298,32 @@ impl Core {
             Input::Link(fact) => self.linked(now, fact),
             Input::TimePassed => self.time_passed(now),
             Input::Stopping => self.leave(),
+            Input::AppChanged(_) => unreachable!("it was taken above, whether NDL runs or not"),
         }
+    }
+
+    /// An application hears of changes from when it is ready, and first of all who is there. // spec: NDL-8
+    fn app_changed(&mut self, fact: &AppFact) {
+        match *fact {
+            AppFact::Ready { app } => {
+                self.subscribers.insert(app);
+                for member in self.members.values() {
+                    let Announcement { node, incarnation, ref name, .. } = member.announcement;
+                    let event = NodeEvent::NodeFound { node, incarnation, name: name.clone() };
+                    self.outputs.push_back(Output::Event { to: vec![app], event });
+                }
+            }
+            AppFact::Down { app } | AppFact::Unregistered { app } => {
+                self.subscribers.remove(&app);
+            }
+            AppFact::Registered { .. } | AppFact::GroupsChanged => {}
+        }
+    }
+
+    /// Tells every application that subscribed.
+    fn publish(&mut self, event: NodeEvent) {
+        let to = self.subscribers.iter().copied().collect();
+        self.outputs.push_back(Output::Event { to, event });
     }
 
     /// The next order or fact.

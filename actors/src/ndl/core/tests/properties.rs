@@ -85,7 +85,7 @@ proptest! {
                         core.start(now, udp(0), GNCL);
                     }
                     Output::SendQuery { .. } | Output::SendMulticastQuery { .. } | Output::SendAnswer { .. }
-                    | Output::SendLeave { .. } | Output::Event(_) | Output::ClockMeasured { .. }
+                    | Output::SendLeave { .. } | Output::Event { .. } | Output::ClockMeasured { .. }
                     | Output::Collision { .. } | Output::Stalled { .. } => {}
                 }
             }

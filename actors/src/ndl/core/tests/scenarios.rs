@@ -3,13 +3,14 @@
 use std::net::SocketAddr;
 
 use sinew_runtime::{
-    tid::{Incarnation, NodeAddress},
+    tid::{AppAddress, Incarnation, NodeAddress},
     time::Time,
 };
 
 use super::world::{PERIOD, Spec, World, ms, node, udp};
 use crate::{
     gncl::LinkFact,
+    lncl::AppFact,
     ndl::{
         LossReason, MembershipFact, NodeEvent,
         core::{Input, Output, Source},
@@ -377,6 +378,20 @@ fn of_two_that_start_together_with_one_address_the_later_life_gives_up_alone() {
     assert!(gave_up(&world, 3));
     assert!(!gave_up(&world, 2));
     assert!(world.knows(1, 2));
+}
+
+// spec: NDL-8
+#[test]
+fn an_application_that_comes_late_hears_of_everybody_who_is_there_and_then_of_changes() {
+    let mut world = World::of_members(3);
+    let before = world.at(1).events.len();
+    let late = AppAddress::fixed(7).unwrap();
+    world.with(udp(1), |core, now| core.handle(now, Input::AppChanged(AppFact::Ready { app: late })));
+    let found: Vec<_> = world.at(1).events[before..].to_vec();
+    assert!(
+        matches!(&found[..], [NodeEvent::NodeFound { node: a, .. }, NodeEvent::NodeFound { node: b, .. }]
+        if *a == node(2) && *b == node(3))
+    );
 }
 
 // spec: NDL-1.2

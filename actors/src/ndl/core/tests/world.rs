@@ -7,13 +7,14 @@ use std::{
 };
 
 use sinew_runtime::{
-    tid::{Incarnation, NodeAddress},
+    tid::{AppAddress, Incarnation, NodeAddress},
     time::Time,
 };
 
 use crate::{
     config::NodeConfig,
     gncl::LinkFact,
+    lncl::AppFact,
     ndl::{
         LossReason, MembershipFact, NodeEvent,
         core::{Core, Input, Output, Way},
@@ -21,6 +22,9 @@ use crate::{
     },
     stores::ClockOffset,
 };
+
+/// The application of each process that hears of changes.
+const APP: AppAddress = AppAddress::new(0x1000);
 
 pub(super) const PERIOD: Duration = Duration::from_millis(500);
 const FLIGHT: Duration = Duration::from_micros(100);
@@ -155,6 +159,7 @@ impl World {
         };
         self.processes.insert(udp(index), process);
         self.restart_shell(index);
+        self.with(udp(index), |core, now| core.handle(now, Input::AppChanged(AppFact::Ready { app: APP })));
     }
 
     pub(super) fn restart_shell(&mut self, index: u16) {
@@ -268,7 +273,7 @@ impl World {
         self.with(flying.to, |core, now| core.receive(now, flying.from, flying.way, &flying.bytes));
     }
 
-    fn with(&mut self, address: SocketAddr, act: impl FnOnce(&mut Core, Time)) {
+    pub(super) fn with(&mut self, address: SocketAddr, act: impl FnOnce(&mut Core, Time)) {
         let process = self.processes.get_mut(&address).unwrap();
         let now = self.now.shifted(process.clock_ns);
         act(&mut process.core, now);
@@ -299,7 +304,7 @@ impl World {
                 self.send(from, to, Datagram { correlation: 0, sent: now, body: Body::Leave(me) });
             }
             Output::Fact(fact) => process.facts.push(fact),
-            Output::Event(event) => process.events.push(event),
+            Output::Event { event, .. } => process.events.push(event),
             Output::ClockMeasured { node, offset } => drop(process.clocks.insert(node, offset)),
             other @ (Output::Collision { .. } | Output::AddressTaken { .. } | Output::Stalled { .. }) => {
                 process.others.push(other);
