@@ -1,6 +1,5 @@
 //! The built program as its users run it. Nothing here is an assertion about timing.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::mpsc::sync_channel;
@@ -16,7 +15,7 @@ const DEADLINE: Duration = Duration::from_secs(60);
 fn folder(name: &str) -> PathBuf {
     let folder = std::env::temp_dir().join(format!("exoskeleton-test-{name}-{}", std::process::id()));
     let _ = std::fs::remove_dir_all(&folder);
-    std::fs::create_dir_all(&folder).unwrap();
+    std::fs::create_dir_all(&folder).expect("a folder for this test");
     folder
 }
 
@@ -39,21 +38,20 @@ fn end(child: Child, what: &str) -> Output {
 
 fn topology_file(folder: &Path, text: &str) -> String {
     let path = folder.join("topology.toml");
-    std::fs::File::create(&path).and_then(|mut file| file.write_all(text.as_bytes())).unwrap();
+    std::fs::write(&path, text).expect("a file in this test's folder");
     path.display().to_string()
 }
 
 fn topology_of_this_test() -> Topology {
-    let mut topology = for_this_host(1).unwrap();
+    let mut topology = for_this_host(1).expect("free ports");
     topology.console = None;
     topology
 }
 
 #[test]
 fn five_processes_wait_for_the_late_one_without_torque_and_then_walk() {
-    let (folder, runs) = (folder("walk"), "runs");
-    let report = folder.join("report.json");
-    let runs = folder.join(runs);
+    let folder = folder("walk");
+    let (report, runs) = (folder.join("report.json"), folder.join("runs"));
     let arguments =
         ["--strides", "8", "--runs", runs.to_str().unwrap(), "--report", report.to_str().unwrap()];
 

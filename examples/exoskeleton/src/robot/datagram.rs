@@ -235,8 +235,8 @@ mod tests {
             seq,
             t_ns,
             torque_nm,
-            released: seq % 2 == 0,
-            saturated: seq % 3 == 0,
+            released: seq.is_multiple_of(2),
+            saturated: seq.is_multiple_of(3),
             state,
         }
     }
