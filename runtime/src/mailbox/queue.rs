@@ -16,7 +16,7 @@ const PASSED_OVER_MAX: u32 = 32;
 ///
 /// - Control and Bulk keep the order in which they came.
 /// - Stream keeps one message for each source and kind: a newer one takes the place of the older, and its turn.
-/// - A lane that was passed over [32 times](PASSED_OVER_MAX) has one turn.
+/// - A lane that was passed over 32 times has one turn.
 /// - A full lane refuses; it never drops.
 #[derive(Debug)]
 pub struct ClassQueue {

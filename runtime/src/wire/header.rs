@@ -98,7 +98,7 @@ impl Flags {
     }
 }
 
-/// The header of a message; see the [module](self) for its bytes.
+/// The header of a message; `docs/protocol/frame.md` has its bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header {
     /// Type of the payload.
