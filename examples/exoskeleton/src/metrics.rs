@@ -1,19 +1,22 @@
 //! Figures from a record: tracking, phase, work, torque, and how a fault went.
 //!
 //! Strides 1 to 6 are for the estimator to settle; figures count from stride 7 on. In a run with a fault they pause
-//! from the fault until two whole strides after assistance has come back.
+//! from the fault until two whole strides after assistance has come back. In a real-time run they pause too in a stride
+//! in which the host stood still, and in the next one: that is the machine's fault and not the robot's.
 
 use crate::gait::curves;
 use crate::joint::{Joint, PerJoint};
 use crate::message::{DriveState, GaitMode};
 use crate::part::Part;
 use crate::phase::wrapped;
-use crate::record::{Outage, Record, Row};
+use crate::record::{Outage, Record, Row, Stall};
 
 /// First stride that counts, from 0.
 pub const FIRST_STRIDE_COUNTED: f64 = 6.0;
 /// Strides after the return of assistance that do not count.
 const STRIDES_AFTER_RETURN: f64 = 2.0;
+/// Strides after the one in which the host stood still that do not count.
+const STRIDES_AFTER_STALL: f64 = 1.0;
 
 /// How a killed node's absence went.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -117,10 +120,10 @@ fn reference_rad(joint: usize, phase: f64) -> f64 {
 }
 
 /// Which rows count; see the top of this file.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Counting {
-    /// Death of a node (seconds of the run), and the stride from which figures count again.
-    pause: Option<(f64, f64)>,
+    /// Death of a node or a stall of the host (seconds of the run), and the stride from which figures count again.
+    pauses: Vec<(f64, f64)>,
 }
 
 impl Counting {
@@ -134,20 +137,21 @@ impl Counting {
     #[must_use]
     pub fn counts(&self, row: &Row) -> bool {
         let paused =
-            self.pause.is_some_and(|(from_s, stride)| row.t_s >= from_s && row.strides_true < stride);
+            self.pauses.iter().any(|(from_s, stride)| row.t_s >= *from_s && row.strides_true < *stride);
         row.walking && row.strides_true >= FIRST_STRIDE_COUNTED && !paused
     }
 
     fn with(record: &Record, fault: Option<&FaultFigures>) -> Self {
-        let pause = fault.map(|fault| {
+        let whole_stride_after =
+            |s: f64| record.rows.iter().find(|r| r.t_s >= s).map_or(f64::INFINITY, |r| r.strides_true.ceil());
+        let fault = fault.map(|fault| {
             let resumed_s =
                 fault.outage.to_s.zip(fault.resumed_after_s).map(|(to_s, after_s)| to_s + after_s);
-            let from_stride = resumed_s
-                .and_then(|s| record.rows.iter().find(|r| r.t_s >= s))
-                .map_or(f64::INFINITY, |r| r.strides_true.ceil() + STRIDES_AFTER_RETURN);
+            let from_stride = resumed_s.map_or(f64::INFINITY, whole_stride_after) + STRIDES_AFTER_RETURN;
             (fault.outage.from_s, from_stride)
         });
-        Self { pause }
+        let stall = |stall: &Stall| (stall.from_s, whole_stride_after(stall.to_s) + STRIDES_AFTER_STALL);
+        Self { pauses: fault.into_iter().chain(record.stalls.iter().map(stall)).collect() }
     }
 }
 

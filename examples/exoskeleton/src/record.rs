@@ -55,6 +55,15 @@ pub struct Outage {
     pub to_s: Option<f64>,
 }
 
+/// A time in which the host stood still and the leg did not; only in real time.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
+pub struct Stall {
+    /// From when, seconds of the run.
+    pub from_s: f64,
+    /// Until when, seconds of the run.
+    pub to_s: f64,
+}
+
 /// A whole run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Record {
@@ -68,6 +77,8 @@ pub struct Record {
     pub released_s: Option<f64>,
     /// A node that was killed on purpose.
     pub outage: Option<Outage>,
+    /// Times in which the host stood still.
+    pub stalls: Vec<Stall>,
     /// Rows at 1 kHz, rising in time.
     pub rows: Vec<Row>,
 }

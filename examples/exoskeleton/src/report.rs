@@ -161,7 +161,7 @@ impl Report {
     /// The report on a run; `timing` only from a real-time run.
     #[must_use]
     pub fn of(run: &RunDescription, metrics: &Metrics, timing: Option<&MeasuredTiming>) -> Self {
-        let limits = limits::check(metrics, run.kill.is_some());
+        let limits = limits::check(metrics, run);
         Self {
             mode: run.mode,
             strides: run.strides,

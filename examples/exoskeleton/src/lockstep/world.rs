@@ -60,6 +60,7 @@ impl<'a> World<'a> {
                 ready_s: [None; 3],
                 released_s: None,
                 outage: None,
+                stalls: Vec::new(),
                 rows: Vec::new(),
             },
         }

@@ -10,15 +10,19 @@ use sinew::Time;
 use super::children::CpuTimes;
 use crate::joint::{Joint, PerJoint};
 use crate::message::DriveState;
+use crate::metrics::Metrics;
 use crate::part::Part;
 use crate::plot::Lateness;
-use crate::record::{JointRow, Outage, Record, Row};
+use crate::record::{JointRow, Outage, Record, Row, Stall};
 use crate::report::{MeasuredTiming, PercentilesUs};
 use crate::robot::figures::{LoopFigures, LoopSummary, percentiles_of};
 use crate::robot::trace::{DriveRow, EventRow, GaitRow, PlantRow, read_lives};
 
 /// A word of central that is older than this says nothing about now, ns.
 const NEWS_NS: u64 = 5_000_000;
+
+/// The plant shares nothing with the nodes but the host. When it is this late the host stood still, us.
+const STALL_US: u32 = 20_000;
 
 /// A kill, in the host's clock.
 #[derive(Debug, Clone, Copy)]
@@ -52,6 +56,10 @@ pub struct RealTimeFigures {
     pub cpu_percent: BTreeMap<String, f64>,
     /// All of them, per cent of one CPU.
     pub cpu_percent_total: f64,
+    /// Times in which the host stood still for more than 20 ms, seconds of the run. Strides around them do not count.
+    pub stalls: Vec<Stall>,
+    /// The figures if those strides counted too; `null` without stalls.
+    pub with_stalls: Option<StalledFigures>,
     /// How the death of a node was noticed, if one was killed.
     pub kill: Option<KillFigures>,
 }
@@ -63,6 +71,15 @@ pub struct KillFigures {
     pub safe_after_ms: BTreeMap<String, Option<f64>>,
     /// Until each other node's discovery said `NodeLost`.
     pub node_lost_after_ms: BTreeMap<String, Option<f64>>,
+}
+
+/// What the stalls of the host did to the walk.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct StalledFigures {
+    /// RMS against the reference, degrees: hip, knee, ankle.
+    pub rms_deg: PerJoint<f64>,
+    /// RMS of the phase error, per cent.
+    pub phase_rms_percent: f64,
 }
 
 /// All that the traces hold.
@@ -114,8 +131,10 @@ impl Collected {
             life.iter().filter(|row| row.state != DriveState::Init).for_each(|row| loops.note(row));
         }
         let summary = loops.summary();
+        let record = record(&traces, times);
         Ok(Self {
-            record: record(&traces, times),
+            figures: figures(&traces, times, summary, &record),
+            record,
             timing: MeasuredTiming {
                 period_us: summary.period_us,
                 age_us: summary.gait_age_us,
@@ -123,7 +142,6 @@ impl Collected {
             },
             lateness: loops.lateness(),
             torque_rate_max_nm_s: torque_rate_max(&traces.drives),
-            figures: figures(&traces, times, summary),
         })
     }
 }
@@ -159,8 +177,22 @@ fn record(traces: &Traces, times: &RunTimes) -> Record {
         ready_s,
         released_s: rows.iter().find(|row| row.walking).map(|row| row.t_s),
         outage,
+        stalls: stalls(&traces.plant, seconds),
         rows,
     }
+}
+
+/// The steps that a late plant makes up at once were all due while the host stood still.
+fn stalls(plant: &[PlantRow], seconds: impl Fn(u64) -> f64) -> Vec<Stall> {
+    let mut stalls: Vec<Stall> = Vec::new();
+    for row in plant.iter().filter(|row| row.late_us > STALL_US) {
+        let (from_s, to_s) = (seconds(row.t_ns), seconds(row.t_ns + u64::from(row.late_us) * 1000));
+        match stalls.last_mut() {
+            Some(last) if from_s <= last.to_s => last.to_s = last.to_s.max(to_s),
+            Some(_) | None => stalls.push(Stall { from_s, to_s }),
+        }
+    }
+    stalls
 }
 
 fn row(t_s: f64, plant: &PlantRow, gait: Option<&GaitRow>) -> Row {
@@ -193,7 +225,7 @@ fn torque_rate_max(drives: &PerJoint<Vec<Vec<DriveRow>>>) -> f64 {
     drives.iter().flatten().flat_map(|life| life.windows(2).filter_map(rate)).fold(0.0, f64::max)
 }
 
-fn figures(traces: &Traces, times: &RunTimes, drives: LoopSummary) -> RealTimeFigures {
+fn figures(traces: &Traces, times: &RunTimes, drives: LoopSummary, record: &Record) -> RealTimeFigures {
     let cpu_percent = cpu_percent(times);
     RealTimeFigures {
         drives,
@@ -201,6 +233,11 @@ fn figures(traces: &Traces, times: &RunTimes, drives: LoopSummary) -> RealTimeFi
         plant_late_us: percentiles_of(traces.plant.iter().map(|row| row.late_us)),
         cpu_percent_total: cpu_percent.values().sum(),
         cpu_percent,
+        stalls: record.stalls.clone(),
+        with_stalls: (!record.stalls.is_empty()).then(|| {
+            let all = Metrics::of(&Record { stalls: Vec::new(), ..record.clone() });
+            StalledFigures { rms_deg: all.rms_deg, phase_rms_percent: all.phase_rms_percent }
+        }),
         kill: times.outage.map(|kill| kill_figures(traces, kill)),
     }
 }
