@@ -9,6 +9,9 @@ use crate::joint::Joint;
 
 const BAR: usize = 30;
 const UP_AND_CLEAR: &str = "\x1b[1A\x1b[2K";
+/// Long lines end at the terminal's edge: a wrapped one would be two to take away.
+const CLIP: &str = "\x1b[?7l";
+const WRAP: &str = "\x1b[?7h";
 
 pub(super) struct Screen {
     is_terminal: bool,
@@ -46,7 +49,7 @@ impl Screen {
             let lines = self.picture(view, strides);
             let clear = self.clear();
             self.drawn = lines.len();
-            write(&format!("{clear}{}\n", lines.join("\n")));
+            write(&format!("{clear}{CLIP}{}\n{WRAP}", lines.join("\n")));
         } else {
             self.tell_changes(view, strides);
         }
@@ -106,9 +109,10 @@ impl Screen {
             ),
         });
         lines.extend(Joint::ALL.map(|joint| match view.drive(joint) {
-            None => format!("  {joint:7}  -"),
+            None => format!("  {:7}  -", joint.name()),
             Some(drive) => format!(
-                "  {joint:7}  {:5}  {:+6.1} Nm  inputs {:.1} ms old at most  {} ticks without them",
+                "  {:7}  {:5}  {:+6.1} Nm  inputs {:.1} ms old at most  {} ticks without them",
+                joint.name(),
                 format!("{:?}", drive.state),
                 drive.torque_nm,
                 f64::from(drive.age_max_us) / 1000.0,
