@@ -1,8 +1,8 @@
 //! Figures from a record: tracking, phase, work, torque, and how a fault went.
 //!
 //! Strides 1 to 6 are for the estimator to settle; figures count from stride 7 on. In a run with a fault they pause
-//! from the fault until two whole strides after assistance has come back. In a real-time run they pause too in a stride
-//! in which the host stood still, and in the next one: that is the machine's fault and not the robot's.
+//! from the fault until two whole strides after assistance has come back. Strides in which the host of a real-time run
+//! stood still count like all others; what the figures were without them is asked for by [`Metrics::without_stalls`].
 
 use crate::gait::curves;
 use crate::joint::{Joint, PerJoint};
@@ -70,8 +70,18 @@ impl Metrics {
     /// Computes all figures.
     #[must_use]
     pub fn of(record: &Record) -> Self {
+        Self::leaving_out(record, &[])
+    }
+
+    /// What the figures were without the strides around stalls of the host: for an explanation, not for a judgement.
+    #[must_use]
+    pub fn without_stalls(record: &Record) -> Self {
+        Self::leaving_out(record, &record.stalls)
+    }
+
+    fn leaving_out(record: &Record, stalls: &[Stall]) -> Self {
         let fault = record.outage.map(|outage| fault_figures(record, outage));
-        let counting = Counting::with(record, fault.as_ref());
+        let counting = Counting::with(record, fault.as_ref(), stalls);
         let counted: Vec<&Row> = record.rows.iter().filter(|row| counting.counts(row)).collect();
         let strides_counted = strides_in(&counted);
         let per_stride = |sum: PerJoint<f64>| sum.map(|x| x / strides_counted.max(f64::MIN_POSITIVE));
@@ -122,7 +132,8 @@ fn reference_rad(joint: usize, phase: f64) -> f64 {
 /// Which rows count; see the top of this file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Counting {
-    /// Death of a node or a stall of the host (seconds of the run), and the stride from which figures count again.
+    /// Death of a node, or a stall of the host that is left out (seconds of the run), and the stride from which figures
+    /// count again.
     pauses: Vec<(f64, f64)>,
 }
 
@@ -130,7 +141,7 @@ impl Counting {
     /// The rule for this record.
     #[must_use]
     pub fn of(record: &Record) -> Self {
-        Self::with(record, record.outage.map(|outage| fault_figures(record, outage)).as_ref())
+        Self::with(record, record.outage.map(|outage| fault_figures(record, outage)).as_ref(), &[])
     }
 
     /// Whether the figures of this row count.
@@ -141,7 +152,7 @@ impl Counting {
         row.walking && row.strides_true >= FIRST_STRIDE_COUNTED && !paused
     }
 
-    fn with(record: &Record, fault: Option<&FaultFigures>) -> Self {
+    fn with(record: &Record, fault: Option<&FaultFigures>, stalls: &[Stall]) -> Self {
         let whole_stride_after =
             |s: f64| record.rows.iter().find(|r| r.t_s >= s).map_or(f64::INFINITY, |r| r.strides_true.ceil());
         let fault = fault.map(|fault| {
@@ -151,7 +162,7 @@ impl Counting {
             (fault.outage.from_s, from_stride)
         });
         let stall = |stall: &Stall| (stall.from_s, whole_stride_after(stall.to_s) + STRIDES_AFTER_STALL);
-        Self { pauses: fault.into_iter().chain(record.stalls.iter().map(stall)).collect() }
+        Self { pauses: fault.into_iter().chain(stalls.iter().map(stall)).collect() }
     }
 }
 

@@ -75,15 +75,17 @@ fn words(figures: &RealTimeFigures) -> String {
     let each: Vec<String> =
         figures.cpu_percent.iter().map(|(name, share)| format!("{name} {share:.0}")).collect();
     text += &format!("CPU: {:.0} % of one ({})\n", figures.cpu_percent_total, each.join(", "));
-    if let Some(with) = figures.with_stalls {
+    if let Some(without) = figures.without_stalls {
         let each: Vec<String> = figures
             .stalls
             .iter()
             .map(|stall| format!("{:.0} ms at {:.1} s", 1000.0 * (stall.to_s - stall.from_s), stall.from_s))
             .collect();
-        let ([hip, knee, ankle], phase) = (with.rms_deg, with.phase_rms_percent);
-        text += &format!("the host stood still: {}; strides around that do not count\n", each.join(", "));
-        text += &format!("  with them: RMS {hip:.2} / {knee:.2} / {ankle:.2} deg, phase {phase:.2} %\n");
+        let ([hip, knee, ankle], phase) = (without.rms_deg, without.phase_rms_percent);
+        text += &format!("the host stood still: {}\n", each.join(", "));
+        text += &format!(
+            "  without the strides around that: RMS {hip:.2} / {knee:.2} / {ankle:.2} deg, phase {phase:.2} %\n"
+        );
     }
     if let Some(kill) = &figures.kill {
         for (what, times) in [("SAFE", &kill.safe_after_ms), ("NodeLost", &kill.node_lost_after_ms)] {

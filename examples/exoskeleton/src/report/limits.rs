@@ -5,7 +5,7 @@ use serde::Serialize;
 
 use super::RunDescription;
 use crate::joint::Joint;
-use crate::metrics::{FIRST_STRIDE_COUNTED, Metrics};
+use crate::metrics::Metrics;
 
 /// Largest RMS against the reference, degrees: hip, knee, ankle.
 const RMS_MAX_DEG: [f64; 3] = [2.0, 2.5, 3.0];
@@ -16,10 +16,8 @@ const READY_SKEW_MAX_MS: f64 = 50.0;
 const TORQUE_RATE_MAX_NM_S: f64 = 2000.0;
 /// Share by which a limit may be passed: differences of floating-point numbers, nothing else. Zero stays zero.
 const ROUNDING: f64 = 1e-9;
-/// With a kill one stride before or after it is enough; else half of those from stride 7 on, so that a host that stands
-/// still now and then cannot leave so few that they prove nothing.
+/// With a kill one stride before or after it is enough.
 const STRIDES_COUNTED_MIN: f64 = 1.0;
-const SHARE_COUNTED_MIN: f64 = 0.5;
 /// Loss noticed within 200 ms and all drives damping within 50 ms more.
 const ALL_SAFE_MAX_MS: f64 = 250.0;
 
@@ -39,13 +37,14 @@ pub struct LimitCheck {
 /// Checks all limits that apply.
 pub(super) fn check(metrics: &Metrics, run: &RunDescription) -> Vec<LimitCheck> {
     let killed = run.kill.is_some();
-    let countable = f64::from(run.strides) - FIRST_STRIDE_COUNTED;
-    let counted_min =
-        if killed { STRIDES_COUNTED_MIN } else { (SHARE_COUNTED_MIN * countable).max(STRIDES_COUNTED_MIN) };
     let mut checks = vec![
         at_most("torque before release, Nm", 0.0, Some(metrics.torque_before_release_nm)),
         at_most("spread of READY, ms", READY_SKEW_MAX_MS, metrics.ready_skew_ms),
-        at_least("strides that count", counted_min, Some((metrics.strides_counted * 100.0).round() / 100.0)),
+        at_least(
+            "strides that count",
+            STRIDES_COUNTED_MIN,
+            Some((metrics.strides_counted * 100.0).round() / 100.0),
+        ),
         at_most("phase RMS, %", PHASE_RMS_MAX_PERCENT, Some(metrics.phase_rms_percent)),
     ];
     for joint in Joint::ALL {

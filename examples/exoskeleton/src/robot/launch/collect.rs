@@ -56,10 +56,10 @@ pub struct RealTimeFigures {
     pub cpu_percent: BTreeMap<String, f64>,
     /// All of them, per cent of one CPU.
     pub cpu_percent_total: f64,
-    /// Times in which the host stood still for more than 20 ms, seconds of the run. Strides around them do not count.
+    /// Times in which the host stood still for more than 20 ms, seconds of the run. They count.
     pub stalls: Vec<Stall>,
-    /// The figures if those strides counted too; `null` without stalls.
-    pub with_stalls: Option<StalledFigures>,
+    /// The figures if those strides did not count, to explain a broken limit; `null` without stalls.
+    pub without_stalls: Option<UnstalledFigures>,
     /// How the death of a node was noticed, if one was killed.
     pub kill: Option<KillFigures>,
 }
@@ -73,9 +73,9 @@ pub struct KillFigures {
     pub node_lost_after_ms: BTreeMap<String, Option<f64>>,
 }
 
-/// What the stalls of the host did to the walk.
+/// What the walk was outside the stalls of the host.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct StalledFigures {
+pub struct UnstalledFigures {
     /// RMS against the reference, degrees: hip, knee, ankle.
     pub rms_deg: PerJoint<f64>,
     /// RMS of the phase error, per cent.
@@ -234,9 +234,9 @@ fn figures(traces: &Traces, times: &RunTimes, drives: LoopSummary, record: &Reco
         cpu_percent_total: cpu_percent.values().sum(),
         cpu_percent,
         stalls: record.stalls.clone(),
-        with_stalls: (!record.stalls.is_empty()).then(|| {
-            let all = Metrics::of(&Record { stalls: Vec::new(), ..record.clone() });
-            StalledFigures { rms_deg: all.rms_deg, phase_rms_percent: all.phase_rms_percent }
+        without_stalls: (!record.stalls.is_empty()).then(|| {
+            let rest = Metrics::without_stalls(record);
+            UnstalledFigures { rms_deg: rest.rms_deg, phase_rms_percent: rest.phase_rms_percent }
         }),
         kill: times.outage.map(|kill| kill_figures(traces, kill)),
     }
