@@ -329,3 +329,66 @@ fn a_backlog_that_never_ends_starves_neither_the_periods_nor_the_stop() {
     assert_eq!(bench.router.refused(), 0);
     bench.stop();
 }
+
+/// Each turn of its period takes longer than the period.
+struct Overrun(SyncSender<u64>);
+
+impl Actor for Overrun {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        context.every(Duration::from_micros(100), |_, _, _| {
+            let until = std::time::Instant::now() + Duration::from_micros(300);
+            while std::time::Instant::now() < until {
+                std::hint::spin_loop();
+            }
+        });
+    }
+}
+
+impl Handler<Delivery<Number>> for Overrun {
+    type Result = ();
+
+    fn handle(&mut self, number: Delivery<Number>, _: &mut Self::Context) {
+        self.0.send(number.0).unwrap();
+    }
+}
+
+#[test]
+fn a_handler_that_overruns_its_period_does_not_shut_the_mailbox_out() {
+    let (say, heard) = sync_channel(10);
+    let spec = AppSpec::new("overrun", move || Overrun(say.clone())).handles::<Number>();
+    let bench = Bench::start(vec![spec.into()]);
+    bench.wait_for(&SupervisorFact::Ready(0));
+    for number in 0..10 {
+        bench.senders[0].send(bench.senders[0].tid(), &Number(number)).unwrap();
+    }
+    for number in 0..10 {
+        assert_eq!(heard.recv_timeout(DEADLINE), Ok(number));
+    }
+    bench.stop();
+}
+
+#[test]
+fn bytes_that_are_no_payload_do_not_feed_the_input_watchdog() {
+    let (say, heard) = sync_channel(100);
+    let spec = AppSpec::new("watcher", move || Watcher(say.clone())).handles::<Number>();
+    let bench = Bench::start(vec![spec.into()]);
+    bench.wait_for(&SupervisorFact::Ready(0));
+    let (sender, stop) = (bench.senders[0].clone(), Arc::new(std::sync::atomic::AtomicBool::new(false)));
+    let rubbish = {
+        let stop = stop.clone();
+        std::thread::spawn(move || {
+            while !stop.load(std::sync::atomic::Ordering::Relaxed) {
+                let mut garbage = sender.create_message(sender.tid(), Number::KIND, 3).unwrap();
+                garbage.fill(0xc1); // the one byte that MessagePack never uses
+                sender.send_message(garbage).unwrap();
+                std::thread::sleep(Duration::from_millis(1)); // the pace of the rubbish
+            }
+        })
+    };
+    while heard.recv_timeout(DEADLINE).expect("the watcher says something") != "silence" {}
+    stop.store(true, std::sync::atomic::Ordering::Relaxed);
+    rubbish.join().unwrap();
+    bench.stop();
+}

@@ -15,7 +15,7 @@ use crate::{
     supervision::ReadyGate,
     tid::Tid,
     time::Time,
-    wire::{Kind, Payload},
+    wire::{DecodeError, Kind, Payload},
 };
 
 /// The context of an application's actor: actix's, and what Sinew adds to it.
@@ -26,6 +26,8 @@ pub struct AppContext<A: Actor<Context = Self>> {
     pub(super) schedule: Schedule<Action<A>>,
     pub(super) watches: Vec<Watch<A>>,
     pub(super) ready: Option<ReadyGate>,
+    /// When a payload that cannot be read was last logged.
+    warned: Option<Time>,
     /// What the handler says of the message in hand, if it does not take it.
     pub(super) verdict: Option<Outcome>,
 }
@@ -78,6 +80,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
             schedule: Schedule::default(),
             watches: Vec::new(),
             ready: Some(ready),
+            warned: None,
             verdict: None,
         };
         let mailbox = context.mailbox.take().expect("it was put there three lines above");
@@ -148,6 +151,14 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     /// Refuses the message in hand: its sender gets `Rejected(ByHandler)` instead of `Delivered`.
     pub fn reject(&mut self) {
         self.verdict = Some(Outcome::Rejected(Rejection::ByHandler));
+    }
+
+    /// Logs a payload that cannot be read, once a second at most: the mailbox counts them all.
+    pub(super) fn warn_of_payload(&mut self, source: Tid, error: &DecodeError, now: Time) {
+        if self.warned.is_none_or(|last| now.since(last) >= Duration::from_secs(1)) {
+            self.warned = Some(now);
+            tracing::warn!(tid = %self.tid(), %source, %error, "payloads are refused");
+        }
     }
 
     /// Becomes a member of the group called `name`.

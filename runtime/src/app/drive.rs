@@ -37,9 +37,11 @@ where
     P: Payload,
 {
     let payload = message.decode::<P>().map_err(|error| {
-        tracing::warn!(tid = %context.tid(), source = %message.header.source, %error, "a payload is refused");
+        context.warn_of_payload(message.header.source, &error, now);
         Rejection::Malformed
     })?;
+    // Only now: bytes that are no `P` are no sign of life of its sender.
+    note_arrival(context, message, now);
     actor.handle(Delivery::new(payload, &message.header, now), context);
     Ok(())
 }
@@ -54,6 +56,7 @@ pub(super) fn dispatch_raw<A>(
 where
     A: Actor<Context = AppContext<A>> + Handler<Delivery<Raw>, Result = ()>,
 {
+    note_arrival(context, message, now);
     actor.handle(Delivery::new(Raw(message.payload.clone()), &message.header, now), context);
     Ok(())
 }
@@ -63,17 +66,23 @@ pub(super) struct Drive<A: Actor<Context = AppContext<A>>> {
     reader: MailboxReader,
     handlers: Vec<(Kind, Dispatch<A>)>,
     alarm: Option<Alarm>,
+    /// A timer had the last step: a waiting message has the next one, so that a handler that overruns its period does not
+    /// shut the mailbox out.
+    timer_was_last: bool,
 }
 
 impl<A: Actor<Context = AppContext<A>>> Drive<A> {
     pub(super) const fn new(reader: MailboxReader, handlers: Vec<(Kind, Dispatch<A>)>) -> Self {
-        Self { reader, handlers, alarm: None }
+        Self { reader, handlers, alarm: None, timer_was_last: false }
     }
 
     /// One turn's step. `Ready(true)`: there may be more to do; `Ready(false)`: the application is to end.
     fn step(&mut self, actor: &mut A, context: &mut AppContext<A>, task: &mut Context<'_>) -> Poll<bool> {
         let now = Time::now();
-        if let Some(due) = context.schedule.take_due(now) {
+        if !std::mem::replace(&mut self.timer_was_last, false)
+            && let Some(due) = context.schedule.take_due(now)
+        {
+            self.timer_was_last = true;
             fire(actor, context, due, now);
             return Poll::Ready(true);
         }
@@ -83,6 +92,7 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
                 Poll::Ready(true)
             }
             Poll::Ready(None) => Poll::Ready(false),
+            Poll::Pending if context.schedule.next_due().is_some_and(|due| due <= now) => Poll::Ready(true),
             Poll::Pending => {
                 self.sleep(context, task);
                 Poll::Pending
@@ -94,7 +104,6 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         let outcome = if message.header.is_expired(now) {
             Outcome::Expired
         } else {
-            note_arrival(context, &message, now);
             self.dispatch(actor, context, &message, now)
         };
         self.reader.finish(outcome);

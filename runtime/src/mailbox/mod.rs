@@ -17,6 +17,7 @@ use crate::{
     outcome::{Outcome, Rejection},
     post::lock,
     router::{Outlet, Refused},
+    time::Time,
     wire::{Class, Message},
 };
 
@@ -72,6 +73,16 @@ struct Shared {
     closed: bool,
     tallies: [Tally; 3],
     high_water: usize,
+}
+
+impl Shared {
+    fn expire(&mut self, now: Time) -> Vec<Message> {
+        let expired = self.queue.take_expired(now);
+        for message in &expired {
+            self.tallies[message.header.class as usize].expired += 1;
+        }
+        expired
+    }
 }
 
 impl Mailbox {
@@ -144,7 +155,8 @@ impl Mailbox {
 impl Outlet for Mailbox {
     fn submit(&self, message: Message) -> Result<(), Refused> {
         let class = message.header.class as usize;
-        let waker = {
+        let mut expired = Vec::new();
+        let taken = {
             let mut shared = lock(&self.shared);
             if shared.closed {
                 shared.tallies[class].refused += 1;
@@ -154,24 +166,29 @@ impl Outlet for Mailbox {
                 shared.tallies[class].refused += 1;
                 return Err(Refused::new(message, Rejection::Unsupported));
             }
-            match shared.queue.push(message) {
+            let pushed = shared.queue.push(message).or_else(|refused| {
+                // An application that waits for its start takes nothing out: what has expired makes room.
+                expired = shared.expire(Time::now());
+                shared.queue.push(refused.message)
+            });
+            match pushed {
                 Ok(superseded) => {
                     shared.tallies[class].taken += 1;
                     shared.tallies[class].superseded += u64::from(superseded.is_some());
+                    shared.high_water = shared.high_water.max(shared.queue.len());
+                    Ok(shared.waker.take())
                 }
                 Err(refused) => {
                     shared.tallies[class].refused += 1;
-                    return Err(refused);
+                    Err(refused)
                 }
             }
-            shared.high_water = shared.high_water.max(shared.queue.len());
-            shared.waker.take()
         };
-        // Woken outside the lock, so that the woken thread does not run into it.
-        if let Some(waker) = waker {
-            waker.wake();
+        // Settled and woken outside the lock, so that nobody who is told runs into it.
+        for mut message in expired {
+            message.settle(Outcome::Expired);
         }
-        Ok(())
+        taken.map(|waker| waker.into_iter().for_each(Waker::wake))
     }
 }
 
@@ -267,6 +284,18 @@ mod tests {
         let _present = mailbox.attach();
         mailbox.submit(message()).unwrap();
         assert!(matches!(take(&mut zombie), Poll::Ready(None)));
+    }
+
+    #[test]
+    fn what_has_expired_makes_room_in_a_full_mailbox_that_nobody_reads() {
+        let mailbox = Mailbox::new(1);
+        let mut old = message();
+        (old.header.sent, old.header.time_to_live_us) = (Time::from_nanos(1), 1);
+        mailbox.submit(old).unwrap();
+        mailbox.submit(message()).unwrap();
+        assert_eq!(mailbox.submit(message()).unwrap_err().why, Rejection::QueueFull);
+        let tally = mailbox.tally(Class::Control);
+        assert_eq!((tally.taken, tally.expired, tally.refused, tally.open()), (2, 1, 1, 1));
     }
 
     #[test]

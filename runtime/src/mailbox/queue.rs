@@ -5,6 +5,7 @@ use std::collections::VecDeque;
 use crate::{
     outcome::Rejection,
     router::Refused,
+    time::Time,
     wire::{Class, Message},
 };
 
@@ -23,13 +24,20 @@ pub struct ClassQueue {
     lanes: [VecDeque<Message>; 3],
     passed_over: [u32; 3],
     capacity: usize,
+    /// Nothing that waits expires before this.
+    earliest_expiry: Time,
 }
 
 impl ClassQueue {
     /// An empty queue that holds at most `capacity` messages of each class.
     #[must_use]
     pub fn new(capacity: usize) -> Self {
-        Self { lanes: [const { VecDeque::new() }; 3], passed_over: [0; 3], capacity }
+        Self {
+            lanes: [const { VecDeque::new() }; 3],
+            passed_over: [0; 3],
+            capacity,
+            earliest_expiry: Time::MAX,
+        }
     }
 
     /// Takes a message. Returns the older Stream message that it replaced, if any.
@@ -45,12 +53,14 @@ impl ClassQueue {
                     && other.header.destination == message.header.destination
             };
             if let Some(older) = lane.iter_mut().find(same) {
+                self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
                 return Ok(Some(std::mem::replace(older, message)));
             }
         }
         if lane.len() >= self.capacity {
             return Err(Refused::new(message, Rejection::QueueFull));
         }
+        self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
         lane.push_back(message);
         Ok(None)
     }
@@ -68,6 +78,26 @@ impl ClassQueue {
             }
         }
         self.lanes[chosen].pop_front()
+    }
+
+    /// Takes out what has expired by `now`. Costs nothing as long as nothing can have.
+    pub fn take_expired(&mut self, now: Time) -> Vec<Message> {
+        let mut expired = Vec::new();
+        if now <= self.earliest_expiry {
+            return expired;
+        }
+        self.earliest_expiry = Time::MAX;
+        for lane in &mut self.lanes {
+            for message in std::mem::take(lane) {
+                if message.header.is_expired(now) {
+                    expired.push(message);
+                } else {
+                    self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
+                    lane.push_back(message);
+                }
+            }
+        }
+        expired
     }
 
     /// Messages that wait.

@@ -141,7 +141,16 @@ impl Header {
     /// Whether the time to live has run out at `now`.
     #[must_use]
     pub fn is_expired(&self, now: Time) -> bool {
-        self.time_to_live_us != 0 && now > self.sent + Duration::from_micros(u64::from(self.time_to_live_us))
+        now > self.expiry()
+    }
+
+    /// When the time to live runs out; [`Time::MAX`] if it never does.
+    #[must_use]
+    pub fn expiry(&self) -> Time {
+        match self.time_to_live_us {
+            0 => Time::MAX,
+            micros => self.sent + Duration::from_micros(u64::from(micros)),
+        }
     }
 
     /// Writes the frame's first 64 bytes for `payload`.
