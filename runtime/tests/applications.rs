@@ -392,3 +392,31 @@ fn bytes_that_are_no_payload_do_not_feed_the_input_watchdog() {
     rubbish.join().unwrap();
     bench.stop();
 }
+
+/// Never becomes ready.
+struct Hesitant;
+
+impl Actor for Hesitant {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        // Kept by nobody, and so never reached.
+        drop(context.hold_ready());
+    }
+}
+
+#[test]
+fn one_that_never_becomes_ready_leaves_the_others_on_its_thread_alone() {
+    let (spec, read) = scribe();
+    let place = sinew_runtime::supervision::Place::thread("shared");
+    let hesitant =
+        AppSpec::new("hesitant", || Hesitant).start_within(Duration::from_millis(20)).place(place.clone());
+    let bench = Bench::start(vec![spec.place(place).into(), hesitant.into()]);
+    bench.wait_for(&SupervisorFact::Ready(0));
+    for _ in 0..2 {
+        bench.wait_for(&SupervisorFact::Failed(1, sinew_runtime::supervision::Reason::StartTimeout));
+    }
+    bench.senders[0].send(bench.senders[0].tid(), &Number(1)).unwrap();
+    assert_eq!(read.recv_timeout(DEADLINE), Ok(1));
+    bench.stop();
+}

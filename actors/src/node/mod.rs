@@ -114,7 +114,9 @@ impl Node {
         match self.wait() {
             NodeEnd::Stopped => ExitCode::SUCCESS,
             NodeEnd::GaveUp(why) => {
-                tracing::error!(node = self.handle.stores.config.name, why, "the node gave up");
+                let name = &self.handle.stores.config.name;
+                tracing::error!(node = name, why, "the node gave up");
+                eprintln!("node {name} gave up: {why}");
                 ExitCode::FAILURE
             }
         }

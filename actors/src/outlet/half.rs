@@ -4,6 +4,7 @@ use std::{
     collections::VecDeque,
     io::{self, IoSlice},
     task::{Context, Poll, Waker},
+    time::Duration,
 };
 
 use sinew_runtime::{
@@ -16,6 +17,8 @@ use sinew_runtime::{
 
 use super::{LinkNumber, OutletCounts, OutletLimits, Socket};
 
+/// Time after a sent message's time to live in which its outcome may still come.
+const OUTCOME_GRACE: Duration = Duration::from_secs(1);
 /// Frames that the drainer writes before other tasks of its thread have their turn.
 const WRITES_PER_WAKE: usize = 64;
 
@@ -93,7 +96,7 @@ pub(super) struct Half<S> {
     /// No waiting message expires before this.
     next_expiry: Time,
     /// Receipts of messages that were sent, oldest first: outcomes come back in about this order.
-    sent_receipts: VecDeque<Receipt>,
+    sent_receipts: VecDeque<(Receipt, Time)>,
     drainer: Option<Waker>,
     counts: OutletCounts,
 }
@@ -146,9 +149,9 @@ impl<S: Socket> Half<S> {
         self.link = Link::Down;
         self.last = None;
         after.wake = self.drainer.take();
-        after.settle.extend(self.sent_receipts.drain(..).map(|receipt| (receipt, Outcome::Unknown)));
+        after.settle.extend(self.sent_receipts.drain(..).map(|(receipt, _)| (receipt, Outcome::Unknown)));
         let Some(partial) = self.partial.take() else { return true };
-        self.next_expiry = self.next_expiry.min(expiry_of(&partial.message));
+        self.next_expiry = self.next_expiry.min(partial.message.header.expiry());
         if partial.is_frill {
             // The next connection has its own.
         } else if partial.message.header.class == Class::Stream {
@@ -184,7 +187,7 @@ impl<S: Socket> Half<S> {
     }
 
     pub(super) fn end(&mut self, in_hand: Outcome, why: Rejection, after: &mut After) {
-        after.settle.extend(self.sent_receipts.drain(..).map(|receipt| (receipt, in_hand)));
+        after.settle.extend(self.sent_receipts.drain(..).map(|(receipt, _)| (receipt, in_hand)));
         self.cut(after);
         let waiting: Vec<_> = self.interrupted.take().into_iter().chain(self.queue.drain_all()).collect();
         for message in waiting {
@@ -258,7 +261,7 @@ impl<S: Socket> Half<S> {
 
     fn enqueue(&mut self, message: Message, after: &mut After) -> Result<(), Refused> {
         let confirmed = message.receipt.is_some();
-        let expiry = expiry_of(&message);
+        let expiry = message.header.expiry();
         match self.queue.push(message) {
             Ok(superseded) => self.counts.superseded += u64::from(superseded.is_some()),
             Err(refused) => {
@@ -289,9 +292,10 @@ impl<S: Socket> Half<S> {
 
     fn sent(&mut self, frame: Partial) {
         self.counts.sent += u64::from(!frame.is_frill);
+        let expiry = frame.message.header.expiry();
         if let Some(receipt) = frame.message.receipt {
             self.waiting_receipts -= 1;
-            self.sent_receipts.push_back(receipt);
+            self.sent_receipts.push_back((receipt, expiry));
         }
     }
 
@@ -369,7 +373,22 @@ impl<S: Socket> Half<S> {
         Some(Partial::new(message))
     }
 
+    /// Outcomes that are long overdue do not come any more; their places are needed. By then the senders have stopped
+    /// waiting.
+    fn give_up_overdue(&mut self, now: Time, after: &mut After) {
+        while let Some(at) = self
+            .sent_receipts
+            .iter()
+            .position(|(_, expiry)| *expiry != Time::MAX && now > *expiry + OUTCOME_GRACE)
+        {
+            after
+                .settle
+                .extend(self.sent_receipts.remove(at).map(|(receipt, _)| (receipt, Outcome::Unknown)));
+        }
+    }
+
     pub(super) fn expire(&mut self, now: Time, after: &mut After) {
+        self.give_up_overdue(now, after);
         if now <= self.next_expiry {
             return;
         }
@@ -392,15 +411,15 @@ impl<S: Socket> Half<S> {
             self.expired(message, after);
             return None;
         }
-        self.next_expiry = self.next_expiry.min(expiry_of(&message));
+        self.next_expiry = self.next_expiry.min(message.header.expiry());
         Some(message)
     }
 
     pub(super) fn confirm(&mut self, ticket: Ticket, outcome: Outcome, after: &mut After) -> bool {
-        let Some(at) = self.sent_receipts.iter().position(|receipt| receipt.ticket() == ticket) else {
+        let Some(at) = self.sent_receipts.iter().position(|(receipt, _)| receipt.ticket() == ticket) else {
             return false;
         };
-        after.settle.extend(self.sent_receipts.remove(at).map(|receipt| (receipt, outcome)));
+        after.settle.extend(self.sent_receipts.remove(at).map(|(receipt, _)| (receipt, outcome)));
         true
     }
 
@@ -415,13 +434,5 @@ impl<S: Socket> Half<S> {
 
     pub(super) const fn counts(&self) -> OutletCounts {
         self.counts
-    }
-}
-
-/// When the message's time to live runs out.
-fn expiry_of(message: &Message) -> Time {
-    match message.header.time_to_live_us {
-        0 => Time::MAX,
-        micros => message.header.sent + std::time::Duration::from_micros(u64::from(micros)),
     }
 }

@@ -133,6 +133,14 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self
     }
 
+    /// Time that it has to become ready once it is started. Default 10 s; after it the start has failed and is tried again.
+    /// One that holds its readiness (`hold_ready`) for a device that may be off sets what it is willing to wait.
+    #[must_use]
+    pub const fn start_within(mut self, time: Duration) -> Self {
+        self.common.policy.start_within = time;
+        self
+    }
+
     /// Time that it has for its orderly stop. Default 500 ms.
     #[must_use]
     pub const fn stop_within(mut self, time: Duration) -> Self {

@@ -66,6 +66,8 @@ pub(super) struct Leash(Arc<Mutex<LeashState>>);
 struct LeashState {
     stop: bool,
     kill: bool,
+    /// The actor is gone.
+    ended: bool,
     waker: Option<Waker>,
 }
 
@@ -78,6 +80,11 @@ impl Leash {
     /// Takes the actor's life the next time that its thread is free.
     pub(super) fn kill(&self) {
         self.pull(|state| state.kill = true);
+    }
+
+    /// Whether the actor is gone.
+    pub(super) fn has_ended(&self) -> bool {
+        lock(&self.0).ended
     }
 
     fn pull(&self, order: impl FnOnce(&mut LeashState)) {
@@ -108,6 +115,7 @@ impl Guard {
         if let Some(life) = self.life.take() {
             bury(life);
         }
+        lock(&self.leash.0).ended = true;
         if let Some(report) = self.report.take() {
             report(reason);
         }

@@ -1,6 +1,6 @@
 //! The supervisor's shell: an actix actor that carries out what its core decides.
 
-use std::{cell::RefCell, panic::AssertUnwindSafe, rc::Rc, sync::Arc};
+use std::{cell::RefCell, panic::AssertUnwindSafe, rc::Rc, sync::Arc, time::Duration};
 
 use actix::{Actor, ActorContext, AsyncContext, Context, SpawnHandle, StreamHandler};
 
@@ -58,6 +58,8 @@ pub struct Supervisor {
 
 /// Events that wait for a supervisor at most. Each child causes a handful; only a fault could fill this.
 const POST_CAPACITY: usize = 16_384;
+/// Time in which a thread that does not hang lets go a child whose life is taken.
+const LETTING_GO: Duration = Duration::from_millis(200);
 
 impl Supervisor {
     /// A supervisor called `name`, and the post through which it hears. `listener` is told of what happens, on the
@@ -109,7 +111,7 @@ impl Supervisor {
                     leash.stop();
                 }
             }
-            Order::Abandon(index, _) => self.abandon(index),
+            Order::Abandon(index, _) => self.abandon(index, context),
             Order::Failed(index, reason) => {
                 let child = &self.children[index].name;
                 if reason.is_failure() {
@@ -148,13 +150,18 @@ impl Supervisor {
         }
     }
 
-    fn abandon(&mut self, index: ChildIndex) {
-        if let Some(leash) = self.leashes[index].take() {
-            leash.kill();
-        }
-        let child = &self.children[index];
-        tracing::error!(supervisor = self.name, child = child.name, "abandoned with its thread");
-        self.threads.borrow_mut().abandon(&child.place);
+    /// Takes a child's life. Its thread may have other tenants: it is given up only if it does not let the child go.
+    fn abandon(&mut self, index: ChildIndex, context: &mut Context<Self>) {
+        let Some(leash) = self.leashes[index].take() else { return };
+        leash.kill();
+        tracing::error!(supervisor = self.name, child = self.children[index].name, "its life is taken");
+        context.run_later(LETTING_GO, move |this, _| {
+            if !leash.has_ended() {
+                let ChildSpec { name, place, .. } = &this.children[index];
+                tracing::error!(child = name, thread = place.thread, "a thread hangs and is given up");
+                this.threads.borrow_mut().abandon(place);
+            }
+        });
     }
 }
 
