@@ -74,6 +74,19 @@ pub(crate) enum Verdict {
 /// Why there was no run.
 #[derive(Debug, Error)]
 pub(crate) enum RunError {
+    /// Too few strides are left after the kill.
+    #[error(
+        "--kill {kill}: assistance is back about six strides later and two more do not count, so --strides {strides} \
+         leaves nothing to judge; ask for --strides {least} or kill earlier"
+    )]
+    KillTooLate {
+        /// What was asked for.
+        kill: String,
+        /// Strides asked for.
+        strides: u32,
+        /// Strides that leave something to judge.
+        least: u32,
+    },
     /// The trial is not usable.
     #[error("--trial {path}: {reason}")]
     Trial {
@@ -99,8 +112,19 @@ pub(crate) enum RunError {
     Watchdog(u64),
 }
 
+/// Strides 1 to 6 never count; of the others those before the kill, and those two strides after assistance is back.
+fn check_kill(arguments: &Arguments) -> Result<(), RunError> {
+    let Some(kill) = &arguments.kill else { return Ok(()) };
+    let least = kill.stride + 8;
+    if kill.stride >= 8 && kill.stride < arguments.strides || arguments.strides >= least {
+        return Ok(());
+    }
+    Err(RunError::KillTooLate { kill: kill.to_string(), strides: arguments.strides, least })
+}
+
 /// Does what the arguments say.
 pub(crate) fn run(arguments: &Arguments) -> Result<Verdict, RunError> {
+    check_kill(arguments)?;
     match &arguments.part {
         Some(PartCommand::Node(part)) => node::run(part),
         None if arguments.lock_step => lock_step::run(arguments),

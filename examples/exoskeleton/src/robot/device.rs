@@ -13,8 +13,8 @@ use crate::message::DriveState;
 
 /// Time between two wishes for readings, ns.
 const WISH_PERIOD_NS: u64 = 100_000_000;
-/// Datagrams looked at in one call; the rest waits for the next.
-const READS_MAX: usize = 32;
+/// Datagrams looked at in one call: more than the socket's buffer holds after any pause, and still a bound.
+const READS_MAX: usize = 4_096;
 
 /// What a drive says to its device each millisecond.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -103,6 +103,7 @@ impl JointDevice for UdpDevice {
         for _ in 0..READS_MAX {
             match self.socket.recv(&mut buffer) {
                 Ok(length) => match Reading::decode(&buffer[..length]) {
+                    // All that wait are read: after a pause the first of them are old.
                     Ok(reading) if reading.joint == self.joint => newest = Some(reading),
                     Ok(_) | Err(_) => self.refused += 1,
                 },

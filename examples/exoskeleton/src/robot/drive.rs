@@ -1,23 +1,26 @@
 //! The application `X.drive`: the shell around [`DriveCore`].
 //!
-//! It starts when the three sensors and central's gait are ready, and sends nothing to the device before. Inputs carry
+//! It starts when its own sensor is ready, so that a new instance of a drive that failed can bring the torque that its
+//! device still holds to zero, whoever else is missing. It is ready when central's gait is heard too, which speaks only
+//! when all three sensors do; until then, and until walking is released, the torque is zero. Inputs carry
 //! the time at which they were sent, in this host's clock ([`Delivery::sent`]). Silence of an input is noticed twice,
 //! independently: by the core, which refuses what is older than 10 ms in the tick in which it would use it, and by the
 //! runtime's input watchdogs, which write it down. When it is told to stop, the torque ramps to zero first.
 
 use std::path::{Path, PathBuf};
 
+use sinew::ReadyGate;
 use sinew::prelude::*;
 
 use super::PERIOD;
 use super::device::{DriveCommand, JointDevice};
-use super::edges::{DRIVES, GAIT, STATUS, drive_name, sensor_name};
+use super::edges::{AS_LONG_AS_IT_TAKES, Addressee, DRIVES, GAIT, STATUS, drive_name, sensor_name};
 use super::figures::LoopFigures;
 use super::sensor::DeviceMaker;
 use super::trace::{DriveRow, EventRow, Trace};
 use crate::control::drive::{DriveConfig, DriveCore, DriveOutput};
 use crate::joint::Joint;
-use crate::message::{GaitMode, GaitState, JointSample};
+use crate::message::{DriveState, GaitMode, GaitState, JointSample};
 
 /// Silence of an input that is noticed.
 const SILENCE_MAX: Duration = Duration::from_millis(10);
@@ -49,17 +52,22 @@ pub struct Drive {
     ticked_at: Option<Time>,
     figures: LoopFigures,
     stopping: bool,
+    /// Whom the inputs are believed from.
+    sensor: Addressee,
+    central: Addressee,
+    /// Reached when all inputs are there for the first time.
+    ready: Option<ReadyGate>,
 }
 
 /// Declares the drive of a joint.
 #[must_use]
 pub fn spec(parts: DriveParts, place: Place) -> AppSpec<Drive> {
-    let sensors = Joint::ALL.map(sensor_name);
+    let sensor = sensor_name(parts.joint);
     AppSpec::new(drive_name(parts.joint), move || Drive::new(parts.clone()))
         .handles::<JointSample>()
         .handles::<GaitState>()
-        .requires(sensors)
-        .requires([GAIT])
+        .requires([sensor])
+        .start_within(AS_LONG_AS_IT_TAKES)
         .place(place)
 }
 
@@ -68,6 +76,9 @@ impl Drive {
         Self {
             core: DriveCore::new(DriveConfig::standard(parts.joint)),
             device: (parts.device)(),
+            sensor: Addressee::new(sensor_name(parts.joint)),
+            central: Addressee::new(GAIT.to_owned()),
+            ready: None,
             parts,
             sample: None,
             gait: None,
@@ -85,12 +96,24 @@ impl Drive {
             let (saturated, state) = (output.saturated, output.state);
             self.device.command(now, &DriveCommand { torque_nm, released, saturated, state });
         }
+        if output.state != DriveState::Init
+            && let Some(gate) = self.ready.take()
+        {
+            tracing::info!(joint = %self.parts.joint, "all parts are heard: the drive is ready");
+            gate.reached();
+        }
         self.note(now, tick, &output);
         if tick.number.is_multiple_of(STATUS_TICKS) {
             // Nobody may want to know.
             let _ = context.send(Tid::group(STATUS), &self.core.status(now.as_nanos()));
         }
         if self.stopping && self.at_rest(&output) {
+            if output.command_nm.is_none() {
+                // Never heard: it may hold a torque all the same, from an earlier life of this drive.
+                let state = output.state;
+                self.device
+                    .command(now, &DriveCommand { torque_nm: 0.0, released: false, saturated: false, state });
+            }
             context.stop();
         }
     }
@@ -159,7 +182,7 @@ impl Actor for Drive {
     type Context = AppContext<Self>;
 
     fn started(&mut self, context: &mut Self::Context) {
-        tracing::info!(joint = %self.parts.joint, "the barrier is open: the drive starts");
+        self.ready = context.hold_ready();
         context.join(DRIVES);
         context.every(PERIOD, Self::tick);
     }
@@ -183,6 +206,10 @@ impl Handler<Delivery<JointSample>> for Drive {
     type Result = ();
 
     fn handle(&mut self, sample: Delivery<JointSample>, context: &mut Self::Context) {
+        if self.sensor.at(Time::now(), context) != Some(sample.source) {
+            context.reject();
+            return;
+        }
         if self.sample.is_none() {
             // From the first one on: before it there is nothing that could fall silent.
             context.expect::<JointSample>(None, SILENCE_MAX, |this, silence, _| {
@@ -197,6 +224,10 @@ impl Handler<Delivery<GaitState>> for Drive {
     type Result = ();
 
     fn handle(&mut self, gait: Delivery<GaitState>, context: &mut Self::Context) {
+        if self.central.at(Time::now(), context) != Some(gait.source) {
+            context.reject();
+            return;
+        }
         if self.gait.is_none() {
             context.expect::<GaitState>(None, SILENCE_MAX, |this, silence, _| {
                 this.note_silence("gait state", silence);

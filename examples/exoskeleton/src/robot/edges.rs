@@ -1,9 +1,12 @@
 //! What crosses an edge between applications: classes and names of the messages, names of applications and groups.
 
-use sinew::prelude::{Actor, AppContext, Class, Payload, Tid, Time, payload};
+use sinew::prelude::{Actor, AppContext, Class, Duration, Payload, Tid, Time, payload};
 
 use crate::joint::Joint;
 use crate::message::{DriveStatus, FootLoad, GaitMode, GaitState, JointSample};
+
+/// A start that waits for other parts of the robot is no fault, however long it takes.
+pub(super) const AS_LONG_AS_IT_TAKES: Duration = Duration::from_secs(7 * 24 * 3600);
 
 /// Name of the application that estimates the phase.
 pub const GAIT: &str = "central.gait";

@@ -11,7 +11,9 @@ use sinew::{NodeAddress, ReadyGate};
 
 use super::PERIOD;
 use super::drive::micros;
-use super::edges::{DRIVES, GAIT, GaitStatus, Release, STATUS, joint_of_sensor, sensor_name};
+use super::edges::{
+    AS_LONG_AS_IT_TAKES, DRIVES, GAIT, GaitStatus, Release, STATUS, joint_of_sensor, sensor_name,
+};
 use super::trace::{GaitRow, Trace};
 use crate::central::{CentralConfig, CentralCore, CentralInput};
 use crate::joint::{Joint, PerJoint};
@@ -60,6 +62,7 @@ pub fn spec(parts: GaitParts, place: Place) -> AppSpec<Gait> {
         .handles::<NodeEvent>()
         .handles::<RequirementEvent>()
         .requires(Joint::ALL.map(sensor_name))
+        .start_within(AS_LONG_AS_IT_TAKES)
         .place(place)
 }
 
@@ -171,7 +174,12 @@ impl Handler<Delivery<FootLoad>> for Gait {
 impl Handler<Delivery<Release>> for Gait {
     type Result = ();
 
-    fn handle(&mut self, release: Delivery<Release>, _: &mut Self::Context) {
+    fn handle(&mut self, release: Delivery<Release>, context: &mut Self::Context) {
+        // Only by somebody on central itself.
+        if release.source.node != context.tid().node {
+            context.reject();
+            return;
+        }
         tracing::info!(by = %release.source, "walking is released");
         self.core.release();
     }

@@ -10,7 +10,7 @@ use sinew::prelude::*;
 
 use super::PERIOD;
 use super::device::JointDevice;
-use super::edges::{Addressee, GAIT, drive_name, sensor_name};
+use super::edges::{AS_LONG_AS_IT_TAKES, Addressee, GAIT, drive_name, sensor_name};
 use crate::joint::Joint;
 use crate::message::{FootLoad, JointSample};
 use crate::sensor::{SensorConfig, SensorCore};
@@ -36,7 +36,9 @@ pub struct Sensor {
 /// Declares the sensor of `joint`.
 #[must_use]
 pub fn spec(joint: Joint, device: DeviceMaker, place: Place) -> AppSpec<Sensor> {
-    AppSpec::new(sensor_name(joint), move || Sensor::new(joint, device())).place(place)
+    AppSpec::new(sensor_name(joint), move || Sensor::new(joint, device()))
+        .start_within(AS_LONG_AS_IT_TAKES)
+        .place(place)
 }
 
 impl Sensor {
