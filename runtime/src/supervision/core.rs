@@ -45,8 +45,14 @@ pub enum Reason {
     Panic(String),
     /// It did not become ready in its time.
     StartTimeout,
-    /// It did not stop in its time, or its thread was gone.
+    /// It did not come back in its progress budget; who says so, since when, and in what.
+    Hung(String),
+    /// It did not stop in its time.
     Killed,
+    /// The thread under it ended.
+    ThreadEnded,
+    /// The process that it was ended; its exit code or the signal, in words.
+    ProcessEnded(String),
     /// A supervisor gave up; why.
     GaveUp(String),
 }
@@ -66,7 +72,10 @@ impl std::fmt::Display for Reason {
             Self::Shutdown => f.write_str("was told to stop"),
             Self::Panic(said) => write!(f, "panicked: {said}"),
             Self::StartTimeout => f.write_str("did not become ready in its time"),
+            Self::Hung(what) => write!(f, "hung: {what}"),
             Self::Killed => f.write_str("did not stop in its time"),
+            Self::ThreadEnded => f.write_str("lost its thread"),
+            Self::ProcessEnded(how) => write!(f, "its process ended: {how}"),
             Self::GaveUp(why) => f.write_str(why),
         }
     }
@@ -85,6 +94,9 @@ pub struct Policy {
     pub backoff_min: Duration,
     /// Longest wait before a restart. Default 2 s.
     pub backoff_max: Duration,
+    /// Longest time that one turn (a handler, a timer, `started`) may take before the actor counts as hung. Default 1 s;
+    /// `None`: it may take as long as it likes.
+    pub progress_within: Option<Duration>,
     /// Whether it waits for its release before its first start and after each failure. Default no.
     pub held: bool,
 }
@@ -97,6 +109,7 @@ impl Default for Policy {
             stop_within: Duration::from_millis(500),
             backoff_min: Duration::from_millis(1),
             backoff_max: Duration::from_secs(2),
+            progress_within: Some(Duration::from_secs(1)),
             held: false,
         }
     }
@@ -131,6 +144,8 @@ pub enum Input {
     Released(ChildIndex),
     /// This child takes messages.
     BecameReady(ChildIndex, Generation),
+    /// This child does not come back: the reason says what it is in. Its life is taken.
+    Hung(ChildIndex, Generation, Reason),
     /// This child is gone.
     Ended(ChildIndex, Generation, Reason),
     /// A deadline may have passed.
@@ -245,6 +260,12 @@ impl Core {
             Input::StopOrdered => self.end(Reason::Shutdown),
             Input::Released(index) => self.released(index),
             Input::BecameReady(index, generation) => self.became_ready(now, index, generation),
+            Input::Hung(index, generation, reason) => {
+                if self.is_present(index, generation) {
+                    self.orders.push_back(Order::Abandon(index, generation));
+                    self.child_ended(now, index, reason);
+                }
+            }
             Input::Ended(index, generation, reason) => {
                 if self.is_present(index, generation) {
                     self.child_ended(now, index, reason);

@@ -210,7 +210,11 @@ impl World {
         match input {
             Input::BecameReady(index, _) => self.ready[*index] = true,
             Input::Ended(index, ..) => self.gone(*index),
-            Input::Started | Input::Released(_) | Input::TimePassed | Input::StopOrdered => {}
+            Input::Hung(..)
+            | Input::Started
+            | Input::Released(_)
+            | Input::TimePassed
+            | Input::StopOrdered => {}
         }
     }
 

@@ -172,7 +172,7 @@ impl Future for Guard {
 impl Drop for Guard {
     fn drop(&mut self) {
         // The arbiter's thread ends with the actor still in it.
-        self.end(Reason::Killed);
+        self.end(Reason::ThreadEnded);
     }
 }
 

@@ -146,7 +146,7 @@ impl Supervisor {
         if !accepted {
             // The thread ended under us: the next start makes a new one.
             self.threads.borrow_mut().abandon(&child.place);
-            say(&self.post, Input::Ended(index, generation, Reason::Killed));
+            say(&self.post, Input::Ended(index, generation, Reason::ThreadEnded));
         }
     }
 
