@@ -22,7 +22,7 @@ use sinew_runtime::{
     post::Post,
     router::{LocalRoute, Router},
     sender::{Directory, Sender},
-    supervision::{ChildSpec, Input, Policy, Strategy, Supervisor, SupervisorFact, Threads},
+    supervision::{ChildId, ChildSpec, Input, Policy, Strategy, Supervisor, SupervisorFact, Threads},
     tid::{AppAddress, NodeAddress, Tid},
     wire::{Class, Payload},
 };
@@ -83,6 +83,7 @@ impl Bench {
             let outlet = Arc::new(AppOutlet { pending, inbox: mailbox.clone() });
             router.set_local(address, LocalRoute { outlet, events: Arc::new([]) });
             children.push(ChildSpec {
+                id: ChildId(index as u64),
                 name: app.name().to_owned(),
                 policy: Policy { held: false, ..app.policy().clone() },
                 place: app.place().clone(),
@@ -163,7 +164,7 @@ fn scribe() -> (AppSpec<Scribe>, Receiver<u64>) {
 fn messages_behind_a_panic_reach_the_new_instance_in_order_behind_the_same_tid() {
     let (spec, read) = scribe();
     let bench = Bench::start(vec![spec.into()]);
-    bench.wait_for(&SupervisorFact::Ready(0));
+    bench.wait_for(&SupervisorFact::Ready(ChildId(0)));
     for number in [1, 13, 2, 3] {
         bench.senders[0].send(bench.senders[0].tid(), &Number(number)).unwrap();
     }
@@ -285,7 +286,7 @@ fn an_application_may_ramp_down_before_it_stops() {
     let (down, is_down) = sync_channel(1);
     let spec = AppSpec::new("drive", move || Ramp { left: 3, down: down.clone() });
     let bench = Bench::start(vec![spec.into()]);
-    bench.wait_for(&SupervisorFact::Ready(0));
+    bench.wait_for(&SupervisorFact::Ready(ChildId(0)));
     bench.stop();
     is_down.recv_timeout(DEADLINE).expect("the ramp ended before the application did");
 }
@@ -323,7 +324,7 @@ fn a_backlog_that_never_ends_starves_neither_the_periods_nor_the_stop() {
     let (say, heard) = sync_channel(1);
     let spec = AppSpec::new("busy", move || Busy { handled: 0, say: say.clone() }).handles::<Number>();
     let bench = Bench::start(vec![spec.into()]);
-    bench.wait_for(&SupervisorFact::Ready(0));
+    bench.wait_for(&SupervisorFact::Ready(ChildId(0)));
     bench.senders[0].send(bench.senders[0].tid(), &Number(1)).unwrap();
     heard.recv_timeout(DEADLINE).expect("a tick in the middle of the backlog");
     assert_eq!(bench.router.refused(), 0);
@@ -359,7 +360,7 @@ fn a_handler_that_overruns_its_period_does_not_shut_the_mailbox_out() {
     let (say, heard) = sync_channel(10);
     let spec = AppSpec::new("overrun", move || Overrun(say.clone())).handles::<Number>();
     let bench = Bench::start(vec![spec.into()]);
-    bench.wait_for(&SupervisorFact::Ready(0));
+    bench.wait_for(&SupervisorFact::Ready(ChildId(0)));
     for number in 0..10 {
         bench.senders[0].send(bench.senders[0].tid(), &Number(number)).unwrap();
     }
@@ -374,7 +375,7 @@ fn bytes_that_are_no_payload_do_not_feed_the_input_watchdog() {
     let (say, heard) = sync_channel(100);
     let spec = AppSpec::new("watcher", move || Watcher(say.clone())).handles::<Number>();
     let bench = Bench::start(vec![spec.into()]);
-    bench.wait_for(&SupervisorFact::Ready(0));
+    bench.wait_for(&SupervisorFact::Ready(ChildId(0)));
     let (sender, stop) = (bench.senders[0].clone(), Arc::new(std::sync::atomic::AtomicBool::new(false)));
     let rubbish = {
         let stop = stop.clone();
@@ -412,9 +413,9 @@ fn one_that_never_becomes_ready_leaves_the_others_on_its_thread_alone() {
     let hesitant =
         AppSpec::new("hesitant", || Hesitant).start_within(Duration::from_millis(20)).place(place.clone());
     let bench = Bench::start(vec![spec.place(place).into(), hesitant.into()]);
-    bench.wait_for(&SupervisorFact::Ready(0));
+    bench.wait_for(&SupervisorFact::Ready(ChildId(0)));
     for _ in 0..2 {
-        bench.wait_for(&SupervisorFact::Failed(1, sinew_runtime::supervision::Reason::StartTimeout));
+        bench.wait_for(&SupervisorFact::Failed(ChildId(1), sinew_runtime::supervision::Reason::StartTimeout));
     }
     bench.senders[0].send(bench.senders[0].tid(), &Number(1)).unwrap();
     assert_eq!(read.recv_timeout(DEADLINE), Ok(1));

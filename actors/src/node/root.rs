@@ -16,8 +16,8 @@ use sinew_runtime::{
     post::Post,
     sender::Sender,
     supervision::{
-        ChildSpec, Input, Launch, Place, Policy, ReadyGate, Reason, Strategy, Supervisor, SupervisorFact,
-        Threads, life,
+        ChildId, ChildIds, ChildSpec, Input, Launch, Place, Policy, ReadyGate, Reason, Strategy, Supervisor,
+        SupervisorFact, Threads, life,
     },
     tid::AppAddress,
 };
@@ -70,8 +70,9 @@ struct Root {
     phase: Phase,
     end: NodeEnd,
     declared: Vec<DynApp>,
-    apps: Vec<App>,
-    app_index: BTreeMap<AppAddress, usize>,
+    child_ids: ChildIds,
+    apps: BTreeMap<ChildId, App>,
+    app_ids: BTreeMap<AppAddress, ChildId>,
     layer_supervisor: Option<Post<Input>>,
     app_supervisor: Option<Post<Input>>,
     last_layer_fault: Option<String>,
@@ -96,8 +97,9 @@ pub(super) fn run(
         phase: Phase::StartingLayers,
         end: NodeEnd::Stopped,
         declared,
-        apps: Vec::new(),
-        app_index: BTreeMap::new(),
+        child_ids: ChildIds::default(),
+        apps: BTreeMap::new(),
+        app_ids: BTreeMap::new(),
         layer_supervisor: None,
         app_supervisor: None,
         last_layer_fault: None,
@@ -122,7 +124,7 @@ impl Actor for Root {
         // First of all what is in the post already: perhaps an order to heed signals.
         context.add_stream(self.stores.posts.root.attach());
         let deadline = self.stores.config.sync.layer_deadline;
-        let layers = layers(&self.stores, deadline);
+        let layers = layers(&self.stores, &self.child_ids, deadline);
         let post = self.stores.posts.root.clone();
         let listener = move |fact| tell(&post, RootEvent::Layers(fact));
         let (supervisor, post) =
@@ -133,8 +135,9 @@ impl Actor for Root {
 }
 
 /// The layers in the paper's order of start (section 6).
-fn layers(stores: &Arc<Stores>, deadline: Duration) -> Vec<ChildSpec> {
+fn layers(stores: &Arc<Stores>, ids: &ChildIds, deadline: Duration) -> Vec<ChildSpec> {
     let child = |name: &str, thread: &str, launch: Launch| ChildSpec {
+        id: ids.next(),
         name: name.to_owned(),
         policy: Policy { start_within: deadline, ..Policy::default() },
         place: Place::thread(thread),
@@ -185,8 +188,8 @@ impl StreamHandler<RootEvent> for Root {
 
 impl Root {
     fn release(&self, app: AppAddress) {
-        match (self.app_index.get(&app), &self.app_supervisor) {
-            (Some(index), Some(supervisor)) => order(supervisor, Input::Released(*index)),
+        match (self.app_ids.get(&app), &self.app_supervisor) {
+            (Some(id), Some(supervisor)) => order(supervisor, Input::Released(*id)),
             // Not an application of this process: LNCL knows its client.
             (None, _) => {
                 if self.stores.posts.lncl.post(lncl::Event::Released { app }).is_err() {
@@ -285,9 +288,11 @@ impl Root {
         })?;
         let directory = Arc::new(NodeDirectory(self.stores.clone()));
         let sender = Sender::new(tid, self.stores.router.clone(), directory, pending, config.payload_max);
-        self.app_index.insert(tid.app, self.apps.len());
-        self.apps.push(App { address: tid.app, mailbox: mailbox.clone(), running: false });
+        let id = self.child_ids.next();
+        self.app_ids.insert(tid.app, id);
+        self.apps.insert(id, App { address: tid.app, mailbox: mailbox.clone(), running: false });
         Ok(ChildSpec {
+            id,
             name: app.name().to_owned(),
             policy: app.policy().clone(),
             place: app.place().clone(),
@@ -297,19 +302,25 @@ impl Root {
 
     fn apps_said(&mut self, fact: SupervisorFact) {
         match fact {
-            SupervisorFact::Ready(index) => {
-                self.apps[index].running = true;
-                lncl::app_ready(&self.stores, self.apps[index].address);
-                self.tell_if_running();
+            SupervisorFact::Ready(id) => {
+                if let Some(app) = self.apps.get_mut(&id) {
+                    app.running = true;
+                    lncl::app_ready(&self.stores, app.address);
+                    self.tell_if_running();
+                }
             }
-            SupervisorFact::Failed(index, _) => {
-                self.apps[index].running = false;
-                lncl::app_down(&self.stores, self.apps[index].address);
+            SupervisorFact::Failed(id, _) => {
+                if let Some(app) = self.apps.get_mut(&id) {
+                    app.running = false;
+                    lncl::app_down(&self.stores, app.address);
+                }
             }
-            SupervisorFact::Gone(index, _) => {
-                self.apps[index].running = false;
-                self.apps[index].mailbox.close();
-                lncl::unregister_local(&self.stores, self.apps[index].address);
+            SupervisorFact::Gone(id, _) => {
+                if let Some(app) = self.apps.get_mut(&id) {
+                    app.running = false;
+                    app.mailbox.close();
+                    lncl::unregister_local(&self.stores, app.address);
+                }
             }
             SupervisorFact::AllReady => {}
             SupervisorFact::Ended(reason) => self.apps_ended(&reason),
@@ -321,14 +332,14 @@ impl Root {
             self.end = NodeEnd::GaveUp(format!("applications: {why}"));
         }
         self.app_supervisor = None;
-        for app in &self.apps {
+        for app in self.apps.values() {
             app.mailbox.close();
         }
         self.stop_layers();
     }
 
     fn tell_if_running(&mut self) {
-        let is_running = self.app_supervisor.is_some() && self.apps.iter().all(|app| app.running);
+        let is_running = self.app_supervisor.is_some() && self.apps.values().all(|app| app.running);
         if is_running || self.cycle.is_some() {
             for say in self.tell_when_running.drain(..) {
                 let answer = match &self.cycle {

@@ -9,15 +9,13 @@
 //! | `threads` | where actors live |
 
 pub mod core;
-#[cfg(test)]
-mod core_tests;
 mod guard;
 mod ready;
 mod supervisor;
 mod threads;
 
 pub use self::{
-    core::{Input, Policy, Reason, Restart, Strategy},
+    core::{ChildId, ChildIds, Input, Policy, Reason, Restart, Strategy},
     guard::{Life, life},
     ready::{ReadyGate, ReadyPart},
     supervisor::{ChildSpec, Launch, Supervisor, SupervisorFact},

@@ -1,6 +1,6 @@
 //! The supervisor's shell: an actix actor that carries out what its core decides.
 
-use std::{cell::RefCell, panic::AssertUnwindSafe, rc::Rc, sync::Arc, time::Duration};
+use std::{cell::RefCell, collections::BTreeMap, panic::AssertUnwindSafe, rc::Rc, sync::Arc, time::Duration};
 
 use actix::{Actor, ActorContext, AsyncContext, Context, SpawnHandle, StreamHandler};
 
@@ -8,7 +8,7 @@ use crate::{
     post::Post,
     supervision::{
         Life, Place, ReadyGate, Reason, Threads,
-        core::{ChildIndex, Core, Generation, Input, Intensity, Order, Policy, Strategy},
+        core::{ChildId, Core, Generation, Input, Intensity, Order, Policy, Strategy},
         guard::{Guard, Leash, words},
     },
     time::Time,
@@ -19,6 +19,8 @@ pub type Launch = Arc<dyn Fn(ReadyGate) -> Box<dyn Life> + Send + Sync>;
 
 /// One child of a supervisor.
 pub struct ChildSpec {
+    /// Which child of its node it is.
+    pub id: ChildId,
     /// Its name, for people.
     pub name: String,
     /// What its supervisor may do with it.
@@ -33,23 +35,28 @@ pub struct ChildSpec {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum SupervisorFact {
     /// This child takes messages.
-    Ready(ChildIndex),
+    Ready(ChildId),
     /// This child failed or was stopped, and is started again if its turn comes.
-    Failed(ChildIndex, Reason),
+    Failed(ChildId, Reason),
     /// This child is gone for good.
-    Gone(ChildIndex, Reason),
+    Gone(ChildId, Reason),
     /// All children that are wanted and released are ready.
     AllReady,
     /// No child lives any more.
     Ended(Reason),
 }
 
+/// A child's declaration, and what holds its present life.
+struct Child {
+    spec: ChildSpec,
+    leash: Option<Leash>,
+}
+
 /// Supervises children; ends when none of them lives any more.
 pub struct Supervisor {
     name: &'static str,
     core: Core,
-    children: Vec<ChildSpec>,
-    leashes: Vec<Option<Leash>>,
+    children: BTreeMap<ChildId, Child>,
     threads: Rc<RefCell<Threads>>,
     post: Post<Input>,
     listener: Box<dyn FnMut(SupervisorFact)>,
@@ -71,13 +78,12 @@ impl Supervisor {
         threads: Rc<RefCell<Threads>>,
         listener: impl FnMut(SupervisorFact) + 'static,
     ) -> (Self, Post<Input>) {
-        let policies = children.iter().map(|child| child.policy.clone()).collect();
+        let policies = children.iter().map(|child| (child.id, child.policy.clone())).collect();
         let post = Post::new(POST_CAPACITY);
         let supervisor = Self {
             name,
             core: Core::new(strategy, Intensity::default(), policies),
-            leashes: children.iter().map(|_| None).collect(),
-            children,
+            children: children.into_iter().map(|spec| (spec.id, Child { spec, leash: None })).collect(),
             threads,
             post: post.clone(),
             listener: Box::new(listener),
@@ -105,27 +111,26 @@ impl Supervisor {
 
     fn obey(&mut self, order: Order, context: &mut Context<Self>) {
         match order {
-            Order::Spawn(index, generation) => self.spawn(index, generation),
-            Order::Stop(index, _) => {
-                if let Some(leash) = &self.leashes[index] {
+            Order::Spawn(id, generation) => self.spawn(id, generation),
+            Order::Stop(id, _) => {
+                if let Some(leash) = self.children.get(&id).and_then(|child| child.leash.as_ref()) {
                     leash.stop();
                 }
             }
-            Order::Abandon(index, _) => self.abandon(index, context),
-            Order::Failed(index, reason) => {
-                let child = &self.children[index].name;
+            Order::Abandon(id, _) => self.abandon(id, context),
+            Order::Failed(id, reason) => {
                 if reason.is_failure() {
-                    tracing::error!(supervisor = self.name, child, %reason, "a child failed");
+                    tracing::error!(supervisor = self.name, child = self.name_of(id), %reason, "a child failed");
                 }
-                (self.listener)(SupervisorFact::Failed(index, reason));
+                (self.listener)(SupervisorFact::Failed(id, reason));
             }
-            Order::Ready(index) => {
-                tracing::debug!(supervisor = self.name, child = self.children[index].name, "ready");
-                (self.listener)(SupervisorFact::Ready(index));
+            Order::Ready(id) => {
+                tracing::debug!(supervisor = self.name, child = self.name_of(id), "ready");
+                (self.listener)(SupervisorFact::Ready(id));
             }
-            Order::Gone(index, reason) => {
-                tracing::info!(supervisor = self.name, child = self.children[index].name, %reason, "gone");
-                (self.listener)(SupervisorFact::Gone(index, reason));
+            Order::Gone(id, reason) => {
+                tracing::info!(supervisor = self.name, child = self.name_of(id), %reason, "gone");
+                (self.listener)(SupervisorFact::Gone(id, reason));
             }
             Order::AllReady => (self.listener)(SupervisorFact::AllReady),
             Order::Ended(reason) => {
@@ -135,49 +140,54 @@ impl Supervisor {
         }
     }
 
-    fn spawn(&mut self, index: ChildIndex, generation: Generation) {
-        let child = &self.children[index];
+    fn name_of(&self, id: ChildId) -> &str {
+        self.children.get(&id).map_or("unknown", |child| &child.spec.name)
+    }
+
+    fn spawn(&mut self, id: ChildId, generation: Generation) {
+        let Some(Child { spec, leash: held }) = self.children.get_mut(&id) else { return };
         let leash = Leash::default();
-        self.leashes[index] = Some(leash.clone());
-        let launch = child.launch.clone();
+        *held = Some(leash.clone());
+        let launch = spec.launch.clone();
         let post = self.post.clone();
-        let thread = self.threads.borrow_mut().get(&child.place);
-        let accepted = thread.spawn_fn(move || start(index, generation, &launch, leash, &post));
+        let thread = self.threads.borrow_mut().get(&spec.place);
+        let accepted = thread.spawn_fn(move || start(id, generation, &launch, leash, &post));
         if !accepted {
             // The thread ended under us: the next start makes a new one.
-            self.threads.borrow_mut().abandon(&child.place);
-            say(&self.post, Input::Ended(index, generation, Reason::ThreadEnded));
+            self.threads.borrow_mut().abandon(&spec.place);
+            say(&self.post, Input::Ended(id, generation, Reason::ThreadEnded));
         }
     }
 
     /// Takes a child's life. Its thread may have other tenants: it is given up only if it does not let the child go.
-    fn abandon(&mut self, index: ChildIndex, context: &mut Context<Self>) {
-        let Some(leash) = self.leashes[index].take() else { return };
+    fn abandon(&mut self, id: ChildId, context: &mut Context<Self>) {
+        let Some(Child { spec, leash }) = self.children.get_mut(&id) else { return };
+        let Some(leash) = leash.take() else { return };
         leash.kill();
-        tracing::error!(supervisor = self.name, child = self.children[index].name, "its life is taken");
+        tracing::error!(supervisor = self.name, child = spec.name, "its life is taken");
+        let (name, place) = (spec.name.clone(), spec.place.clone());
         context.run_later(LETTING_GO, move |this, _| {
             if !leash.has_ended() {
-                let ChildSpec { name, place, .. } = &this.children[index];
                 tracing::error!(child = name, thread = place.thread, "a thread hangs and is given up");
-                this.threads.borrow_mut().abandon(place);
+                this.threads.borrow_mut().abandon(&place);
             }
         });
     }
 }
 
 /// Runs on the child's thread.
-fn start(index: ChildIndex, generation: Generation, launch: &Launch, leash: Leash, post: &Post<Input>) {
+fn start(id: ChildId, generation: Generation, launch: &Launch, leash: Leash, post: &Post<Input>) {
     let ready = {
         let post = post.clone();
-        ReadyGate::new(move || say(&post, Input::BecameReady(index, generation)))
+        ReadyGate::new(move || say(&post, Input::BecameReady(id, generation)))
     };
     match std::panic::catch_unwind(AssertUnwindSafe(|| launch(ready))) {
         Ok(life) => {
             let post = post.clone();
-            let report = Box::new(move |reason| say(&post, Input::Ended(index, generation, reason)));
+            let report = Box::new(move |reason| say(&post, Input::Ended(id, generation, reason)));
             actix_rt::spawn(Guard::new(life, leash, report));
         }
-        Err(panic) => say(post, Input::Ended(index, generation, Reason::Panic(words(&*panic)))),
+        Err(panic) => say(post, Input::Ended(id, generation, Reason::Panic(words(&*panic)))),
     }
 }
 
