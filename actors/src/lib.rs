@@ -38,6 +38,9 @@ mod refusals;
 mod stores;
 mod sync;
 
+#[cfg(feature = "fault-points")]
+pub use sinew_runtime::supervision::fault;
+
 pub use api::{ApiError, Endpoint, NodeApi, Received, Registration};
 pub use config::{ConfigFaults, NodeConfig};
 pub use lncl::RegisterError;

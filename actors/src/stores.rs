@@ -44,6 +44,9 @@ pub(crate) struct Stores {
     pub(crate) registry: Mutex<lncl::Registry>,
     /// Who is known on other nodes, and what waits for whom.
     pub(crate) sync: Mutex<sync::Core>,
+    /// Where faults strike on purpose.
+    #[cfg(feature = "fault-points")]
+    pub(crate) faults: sinew_runtime::supervision::fault::FaultPoints,
 }
 
 /// Events that wait for a layer at most. A layer that falls this far behind has a fault of its own.
@@ -73,6 +76,8 @@ impl Stores {
             registry: Mutex::default(),
             sync: Mutex::new(sync::Core::new(&config, node, incarnation)),
             config,
+            #[cfg(feature = "fault-points")]
+            faults: sinew_runtime::supervision::fault::FaultPoints::default(),
         })
     }
 

@@ -111,6 +111,9 @@ impl<E> Stream for PostStream<E> {
             shared.waker = Some(cx.waker().clone());
             return Poll::Pending;
         }
+        drop(shared);
+        #[cfg(feature = "fault-points")]
+        crate::supervision::fault::strike();
         Poll::Ready(next)
     }
 }

@@ -1,9 +1,15 @@
-//! What the scenarios stand on: programs that are watched line by line, and hosts made of network namespaces.
+//! What the scenarios stand on: puppets that do as they are told and write down what they saw, programs that are watched
+//! line by line, and hosts made of network namespaces.
 
+mod ground;
 mod hosts;
+mod log;
 mod program;
+pub mod puppet;
 
+pub use ground::{Ground, all_run, ready_for, sees};
 pub use hosts::{Host, Hosts};
+pub use log::{Log, until};
 pub use program::{Program, node_under_test};
 
 use std::{

@@ -28,6 +28,8 @@ pub struct NodeBuilder {
     apps: Vec<DynApp>,
     incarnation: Option<Incarnation>,
     heed_signals: bool,
+    #[cfg(feature = "fault-points")]
+    pub(super) faults: Vec<String>,
 }
 
 impl std::fmt::Debug for NodeBuilder {
@@ -67,6 +69,10 @@ pub enum StartError {
         /// The time that was given.
         within: Duration,
     },
+    /// A fault that was to strike on purpose cannot.
+    #[cfg(feature = "fault-points")]
+    #[error(transparent)]
+    Fault(#[from] sinew_runtime::supervision::fault::FaultError),
     /// The operating system gives no thread.
     #[error("no thread for the node's root: {0}; raise `ulimit -u`")]
     Thread(#[from] std::io::Error),
@@ -78,7 +84,14 @@ fn list(waiting: &[Waiting]) -> String {
 
 impl NodeBuilder {
     pub(super) fn new(name: String) -> Self {
-        Self { config: NodeConfig::new(name), apps: Vec::new(), incarnation: None, heed_signals: false }
+        Self {
+            config: NodeConfig::new(name),
+            apps: Vec::new(),
+            incarnation: None,
+            heed_signals: false,
+            #[cfg(feature = "fault-points")]
+            faults: Vec::new(),
+        }
     }
 
     /// Replaces the whole configuration: one read from a file, for instance.
@@ -151,6 +164,14 @@ impl NodeBuilder {
         let patience = self.config.sync.layer_deadline * 4;
         let incarnation = self.incarnation.unwrap_or_else(wall_clock);
         let stores = Stores::new(self.config, incarnation);
+        #[cfg(feature = "fault-points")]
+        super::faults::plan(&stores, &self.faults, &self.apps)?;
+        #[cfg(not(feature = "fault-points"))]
+        if std::env::var_os("SINEW_FAULTS").is_some() {
+            tracing::warn!(
+                "SINEW_FAULTS is ignored: this program was built without the feature `fault-points`"
+            );
+        }
         let handle = NodeHandle { root: stores.posts.root.clone(), stores: stores.clone() };
         let (say_started, started) = sync_channel(1);
         let (say_ended, ended) = sync_channel(1);

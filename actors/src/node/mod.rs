@@ -10,6 +10,8 @@
 
 mod builder;
 mod directory;
+#[cfg(feature = "fault-points")]
+mod faults;
 mod root;
 
 pub use builder::{NodeBuilder, StartError};

@@ -134,20 +134,26 @@ impl Actor for Root {
     }
 }
 
-/// The layers in the paper's order of start (section 6).
+/// The layers' names, in the paper's order of start (section 6).
+pub(super) const LAYERS: [&str; 4] = ["LNCL", "sync manager", "GNCL", "NDL"];
+
+/// The layers in that order.
 fn layers(stores: &Arc<Stores>, ids: &ChildIds, deadline: Duration) -> Vec<ChildSpec> {
     let child = |name: &str, thread: &str, launch: Launch| ChildSpec {
         id: ids.next(),
         name: name.to_owned(),
         policy: Policy { start_within: deadline, ..Policy::default() },
         place: Place::thread(thread),
+        #[cfg(feature = "fault-points")]
+        launch: stores.faults.arm(name, launch),
+        #[cfg(not(feature = "fault-points"))]
         launch,
     };
     vec![
-        child("LNCL", Place::IO, layer(stores, lncl::Lncl::new)),
-        child("sync manager", "sync", layer(stores, sync::SyncManager::new)),
-        child("GNCL", Place::IO, layer(stores, gncl::Gncl::new)),
-        child("NDL", "ndl", layer(stores, ndl::NdlActor::new)),
+        child(LAYERS[0], Place::IO, layer(stores, lncl::Lncl::new)),
+        child(LAYERS[1], "sync", layer(stores, sync::SyncManager::new)),
+        child(LAYERS[2], Place::IO, layer(stores, gncl::Gncl::new)),
+        child(LAYERS[3], "ndl", layer(stores, ndl::NdlActor::new)),
     ]
 }
 
@@ -291,12 +297,15 @@ impl Root {
         let id = self.child_ids.next();
         self.app_ids.insert(tid.app, id);
         self.apps.insert(id, App { address: tid.app, mailbox: mailbox.clone(), running: false });
+        let launch = app.launch(AppWiring { sender, mailbox });
+        #[cfg(feature = "fault-points")]
+        let launch = super::faults::arm(&self.stores, app, launch);
         Ok(ChildSpec {
             id,
             name: app.name().to_owned(),
             policy: app.policy().clone(),
             place: app.place().clone(),
-            launch: app.launch(AppWiring { sender, mailbox }),
+            launch,
         })
     }
 

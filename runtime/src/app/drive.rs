@@ -116,6 +116,10 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
             return Outcome::Rejected(Rejection::UnknownKind);
         };
         context.verdict = None;
+        #[cfg(feature = "fault-points")]
+        if crate::supervision::fault::strike_message() {
+            context.stop();
+        }
         match dispatch(actor, context, message, now) {
             Ok(()) => context.verdict.take().unwrap_or(Outcome::Delivered),
             Err(why) => Outcome::Rejected(why),

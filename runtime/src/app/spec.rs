@@ -52,6 +52,8 @@ struct Common {
     kinds: Vec<(Kind, &'static str)>,
     policy: Policy,
     place: Place,
+    #[cfg(feature = "fault-points")]
+    faults: Vec<crate::supervision::fault::Fault>,
 }
 
 impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
@@ -65,6 +67,8 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
             kinds: Vec::new(),
             policy: Policy { held: true, ..Policy::default() },
             place: Place::thread("apps"),
+            #[cfg(feature = "fault-points")]
+            faults: Vec::new(),
         };
         Self { factory: Arc::new(factory), handlers: Vec::new(), common }
     }
@@ -123,6 +127,14 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     #[must_use]
     pub fn place(mut self, place: Place) -> Self {
         self.common.place = place;
+        self
+    }
+
+    /// A fault strikes it, in all its lives together. Only with the feature `fault-points`.
+    #[cfg(feature = "fault-points")]
+    #[must_use]
+    pub fn fault(mut self, fault: crate::supervision::fault::Fault) -> Self {
+        self.common.faults.push(fault);
         self
     }
 
@@ -217,6 +229,13 @@ impl DynApp {
     #[must_use]
     pub const fn place(&self) -> &Place {
         &self.common.place
+    }
+
+    /// The faults that strike it.
+    #[cfg(feature = "fault-points")]
+    #[must_use]
+    pub fn faults(&self) -> &[crate::supervision::fault::Fault] {
+        &self.common.faults
     }
 
     /// How it is started, on the thread of its place, with what its node gives it.

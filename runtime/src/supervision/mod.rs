@@ -7,8 +7,11 @@
 //! | `guard` | the future around each actor: catches its panics, takes its stop order, reports its end |
 //! | `ready` | when an actor may say that it is ready |
 //! | `threads` | where actors live |
+//! | `fault` | faults on purpose, with the feature `fault-points` only |
 
 pub mod core;
+#[cfg(feature = "fault-points")]
+pub mod fault;
 mod guard;
 mod ready;
 mod supervisor;

@@ -1,0 +1,10 @@
+//! Faults on real nodes: what happens, and what does not. One binary, one module a theme.
+
+mod points;
+
+use sinew::fault::Fault;
+
+/// A fault, as one would write it.
+fn fault(text: &str) -> Fault {
+    text.parse().unwrap_or_else(|error| panic!("{error}"))
+}
