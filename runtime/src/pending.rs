@@ -58,7 +58,14 @@ impl Pending {
     /// An empty table for at most `capacity` waits at once.
     #[must_use]
     pub fn new(capacity: usize) -> Arc<Self> {
-        Arc::new(Self { inner: Mutex::new(Inner { next: 1, slots: BTreeMap::new() }), capacity })
+        Self::numbered_from(1, capacity)
+    }
+
+    /// An empty table whose first wait has this number: for a process that takes another's place, so that no late answer
+    /// to the former is taken for one to its own.
+    #[must_use]
+    pub fn numbered_from(first: u64, capacity: usize) -> Arc<Self> {
+        Arc::new(Self { inner: Mutex::new(Inner { next: first, slots: BTreeMap::new() }), capacity })
     }
 
     /// Opens a wait for what `from` says; its number is the message's correlation. `None` if too many are open.

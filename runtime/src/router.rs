@@ -67,13 +67,28 @@ pub struct Router {
     /// Writers take turns; readers never wait for them.
     writing: Mutex<()>,
     refused: AtomicU64,
+    /// Where everything goes, in a process that knows no route itself.
+    uplink: Option<Arc<dyn Outlet>>,
 }
 
 impl Router {
     /// The empty table of the node at `node`.
     #[must_use]
     pub fn new(node: NodeAddress) -> Self {
-        Self { node, table: ArcSwap::default(), writing: Mutex::new(()), refused: AtomicU64::new(0) }
+        Self {
+            node,
+            table: ArcSwap::default(),
+            writing: Mutex::new(()),
+            refused: AtomicU64::new(0),
+            uplink: None,
+        }
+    }
+
+    /// The table of a process that is not the node itself: everything goes out through `uplink` to the node at `node`,
+    /// which knows the routes.
+    #[must_use]
+    pub fn through(node: NodeAddress, uplink: Arc<dyn Outlet>) -> Self {
+        Self { uplink: Some(uplink), ..Self::new(node) }
     }
 
     /// The node whose table this is.
@@ -99,6 +114,9 @@ impl Router {
     pub fn send(&self, mut message: Message) -> Result<(), Rejection> {
         message.header.destination = self.absolute(message.header.destination);
         let destination = message.header.destination;
+        if let Some(uplink) = &self.uplink {
+            return self.account(Self::send_up(&**uplink, message));
+        }
         let table = self.table.load();
         let result = if destination.is_single() {
             Self::send_to_one(&table, self.node, message)
@@ -144,6 +162,15 @@ impl Router {
             refused.message.reject(refused.why);
             refused.why
         })
+    }
+
+    fn send_up(uplink: &dyn Outlet, message: Message) -> Result<(), Refused> {
+        if !message.header.destination.is_single()
+            && (message.receipt.is_some() || message.header.flags.has(Flags::ASK))
+        {
+            return Err(Refused::new(message, Rejection::Unsupported));
+        }
+        uplink.submit(message)
     }
 
     fn send_to_one(table: &Table, here: NodeAddress, message: Message) -> Result<(), Refused> {

@@ -115,6 +115,13 @@ impl Sender {
         Self(Arc::new(Shared { tid, router, directory, pending, sequence: AtomicU64::new(0), payload_max }))
     }
 
+    /// Counts its messages on from the `last` that a former sending side of this TID sent.
+    #[must_use]
+    pub fn counting_on_from(self, last: u64) -> Self {
+        self.0.sequence.store(last, Ordering::Relaxed);
+        self
+    }
+
     /// The TID that this sends from.
     #[must_use]
     pub fn tid(&self) -> Tid {

@@ -116,6 +116,14 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self
     }
 
+    /// It has a process of its own, a child of the node's: nothing that it does harms the node, and it can be killed. See
+    /// [`Place::process`].
+    #[must_use]
+    pub fn own_process(mut self) -> Self {
+        self.common.place = Place::process();
+        self
+    }
+
     /// It shares the thread that reads the node's sockets: the lowest latency; its handlers must be short.
     #[must_use]
     pub fn on_io_thread(mut self) -> Self {

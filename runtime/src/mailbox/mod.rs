@@ -4,14 +4,18 @@
 //! them out. When the actor panics the message in its hand ends as `Failed`, the rest stays and goes to the next
 //! incarnation. Queue and waker stand under one mutex, see [`post`](crate::post).
 
+mod lender;
 mod queue;
+mod source;
 
 use std::{
     sync::{Arc, Mutex},
     task::{Context, Poll, Waker},
 };
 
+pub use lender::Lender;
 pub use queue::ClassQueue;
+pub use source::Source;
 
 use crate::{
     outcome::{Outcome, Rejection},
@@ -62,6 +66,8 @@ impl Tally {
 #[derive(Debug)]
 pub struct Mailbox {
     shared: Mutex<Shared>,
+    /// Where its messages wait, if not here.
+    source: Option<Arc<dyn Source>>,
 }
 
 #[derive(Debug)]
@@ -89,6 +95,16 @@ impl Mailbox {
     /// An empty mailbox that holds at most `capacity` messages of each class.
     #[must_use]
     pub fn new(capacity: usize) -> Arc<Self> {
+        Arc::new(Self::with_source(capacity, None))
+    }
+
+    /// The mailbox of a process that hosts one application: its reader takes from `source`.
+    #[must_use]
+    pub fn fed_by(source: Arc<dyn Source>) -> Arc<Self> {
+        Arc::new(Self::with_source(0, Some(source)))
+    }
+
+    fn with_source(capacity: usize, source: Option<Arc<dyn Source>>) -> Self {
         let shared = Shared {
             queue: ClassQueue::new(capacity),
             waker: None,
@@ -97,7 +113,7 @@ impl Mailbox {
             tallies: [Tally::default(); 3],
             high_water: 0,
         };
-        Arc::new(Self { shared: Mutex::new(shared) })
+        Self { shared: Mutex::new(shared), source }
     }
 
     /// Takes over the reading end for a new incarnation; the former reader is fenced off.
@@ -204,6 +220,13 @@ pub struct MailboxReader {
 impl MailboxReader {
     /// Takes the next message into the hand. `None` once the mailbox is closed or a later incarnation reads it.
     pub fn poll_take(&mut self, cx: &mut Context<'_>) -> Poll<Option<Message>> {
+        if let Some(source) = &self.mailbox.source {
+            let taken = source.poll_take(cx);
+            if let Poll::Ready(Some(message)) = &taken {
+                self.in_hand = Some(message.header.class);
+            }
+            return taken;
+        }
         let mut shared = lock(&self.mailbox.shared);
         if let Some((class, outcome)) = self.finished.take() {
             shared.tallies[class as usize].count(outcome);
@@ -224,14 +247,19 @@ impl MailboxReader {
 
     /// The message in hand has ended so. Counted with the next [`poll_take`](Self::poll_take), under its lock.
     pub fn finish(&mut self, outcome: Outcome) {
-        if let Some(class) = self.in_hand.take() {
-            self.finished = Some((class, outcome));
+        let Some(class) = self.in_hand.take() else { return };
+        match &self.mailbox.source {
+            Some(source) => source.finish(outcome),
+            None => self.finished = Some((class, outcome)),
         }
     }
 }
 
 impl Drop for MailboxReader {
     fn drop(&mut self) {
+        if let Some(source) = self.mailbox.source.as_ref().filter(|_| self.in_hand.is_some()) {
+            source.finish(Outcome::Failed);
+        }
         let mut shared = lock(&self.mailbox.shared);
         if let Some((class, outcome)) = self.finished.take() {
             shared.tallies[class as usize].count(outcome);

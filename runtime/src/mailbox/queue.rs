@@ -65,6 +65,24 @@ impl ClassQueue {
         Ok(None)
     }
 
+    /// Puts a message back that was popped, before all others of its class, whatever the bound. Hands it back if it is
+    /// of a Stream whose newer value waits here.
+    pub fn put_back(&mut self, message: Message) -> Option<Message> {
+        let lane = &mut self.lanes[message.header.class as usize];
+        let header = &message.header;
+        let is_newer = |other: &Message| {
+            other.header.source == header.source
+                && other.header.kind == header.kind
+                && other.header.destination == header.destination
+        };
+        if header.class == Class::Stream && lane.iter().any(is_newer) {
+            return Some(message);
+        }
+        self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
+        lane.push_front(message);
+        None
+    }
+
     /// The next message to handle.
     pub fn pop(&mut self) -> Option<Message> {
         let first = self.lanes.iter().position(|lane| !lane.is_empty())?;

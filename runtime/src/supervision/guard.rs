@@ -17,8 +17,8 @@ use crate::{post::lock, supervision::Reason};
 
 /// A running actor of any type, as its guard sees it.
 pub trait Life {
-    /// Lets it run.
-    fn poll(&mut self, cx: &mut Context<'_>) -> Poll<()>;
+    /// Lets it run. Ready when it has ended, with how.
+    fn poll(&mut self, cx: &mut Context<'_>) -> Poll<Reason>;
     /// Asks it to stop; actix then asks its `stopping`.
     fn stop(&mut self);
     /// Makes sure that dropping it runs no more of its code than its `Drop`.
@@ -35,8 +35,8 @@ where
     C: AsyncContextParts<A> + Unpin,
     A: Actor<Context = C>,
 {
-    fn poll(&mut self, cx: &mut Context<'_>) -> Poll<()> {
-        Pin::new(&mut self.0).poll(cx)
+    fn poll(&mut self, cx: &mut Context<'_>) -> Poll<Reason> {
+        Pin::new(&mut self.0).poll(cx).map(|()| Reason::Normal)
     }
 
     fn stop(&mut self) {
@@ -157,8 +157,8 @@ impl Future for Guard {
         }));
         match polled {
             Ok(Poll::Pending) => Poll::Pending,
-            Ok(Poll::Ready(())) => {
-                self.end(Reason::Normal);
+            Ok(Poll::Ready(reason)) => {
+                self.end(reason);
                 Poll::Ready(())
             }
             Err(panic) => {

@@ -5,10 +5,12 @@
 //! | [`core`] | the decisions, pure |
 //! | `supervisor` | the actix actor that carries them out |
 //! | `guard` | the future around each actor: catches its panics, takes its stop order, reports its end |
+//! | `alone` | one actor under a guard and under no supervisor |
 //! | `ready` | when an actor may say that it is ready |
 //! | `threads` | where actors live |
 //! | `fault` | faults on purpose, with the feature `fault-points` only |
 
+mod alone;
 pub mod core;
 #[cfg(feature = "fault-points")]
 pub mod fault;
@@ -18,6 +20,7 @@ mod supervisor;
 mod threads;
 
 pub use self::{
+    alone::{AloneHandle, alone},
     core::{ChildId, ChildIds, Input, Policy, Reason, Restart, Strategy},
     guard::{Life, life},
     ready::{ReadyGate, ReadyPart},

@@ -17,6 +17,8 @@ pub struct Place {
     pub realtime_priority: Option<u8>,
     /// The one CPU that the thread may run on.
     pub cpu: Option<usize>,
+    /// The thread is in a process of its own, a child of the node's.
+    pub own_process: bool,
 }
 
 impl Place {
@@ -26,7 +28,13 @@ impl Place {
     /// The thread called `name`, scheduled like any other.
     #[must_use]
     pub fn thread(name: impl Into<String>) -> Self {
-        Self { thread: name.into(), realtime_priority: None, cpu: None }
+        Self { thread: name.into(), realtime_priority: None, cpu: None, own_process: false }
+    }
+
+    /// A process of its own, a child of the node's: its thread is called like the application.
+    #[must_use]
+    pub const fn process() -> Self {
+        Self { thread: String::new(), realtime_priority: None, cpu: None, own_process: true }
     }
 
     /// The same thread under SCHED_FIFO with this priority, 1 to 99.
@@ -43,8 +51,8 @@ impl Place {
         self
     }
 
-    /// Called on the thread itself, when it is new.
-    fn prepare(&self) {
+    /// Makes the calling thread, which is new, the thread of this place.
+    pub fn prepare(&self) {
         let name: Vec<u8> = self.thread.bytes().filter(|byte| *byte != 0).take(15).collect();
         if let Ok(name) = CString::new(name) {
             // Only for people who look at the process; nothing depends on it.

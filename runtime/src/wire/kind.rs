@@ -62,6 +62,31 @@ impl Kind {
     /// The TID of a name, or none.
     pub const LNCL_RESOLVED: Self = Self(0x46);
 
+    /// A node tells the process that it started for an application who it is: the first frame.
+    pub const HOST_WELCOME: Self = Self(0x50);
+    /// The application in that process is ready.
+    pub const HOST_READY: Self = Self(0x51);
+    /// It has ended with one message and takes the next into its hand.
+    pub const HOST_TURN: Self = Self(0x52);
+    /// The node asks it to stop in order.
+    pub const HOST_STOP: Self = Self(0x53);
+    /// It has ended, and how; its process ends next.
+    pub const HOST_ENDED: Self = Self(0x54);
+    /// A sign of life.
+    pub const HOST_BEAT: Self = Self(0x55);
+    /// It does not come back in its progress budget, and what it is in.
+    pub const HOST_HUNG: Self = Self(0x56);
+    /// It asks who has a name, and wants to be told when that changes.
+    pub const HOST_LOOK: Self = Self(0x57);
+    /// Who has some names now.
+    pub const HOST_NAMES: Self = Self(0x58);
+
+    /// Whether this is said only between a node and a process that it started.
+    #[must_use]
+    pub const fn is_host(self) -> bool {
+        matches!(self.0, 0x50..0x60)
+    }
+
     /// The id of the user's payload type called `name`.
     #[must_use]
     pub const fn named(name: &str) -> Self {

@@ -14,7 +14,7 @@ use std::{
 use super::{Fault, FaultError, FaultKind, FaultMoment};
 use crate::{
     post::lock,
-    supervision::{Launch, Life, ReadyGate},
+    supervision::{Launch, Life, ReadyGate, Reason},
     time::Time,
 };
 
@@ -271,7 +271,7 @@ struct FaultyLife {
 }
 
 impl Life for FaultyLife {
-    fn poll(&mut self, cx: &mut Context<'_>) -> Poll<()> {
+    fn poll(&mut self, cx: &mut Context<'_>) -> Poll<Reason> {
         let _entered = Entered::new(&self.point);
         self.point.turns(cx.waker());
         let polled = self.inner.poll(cx);

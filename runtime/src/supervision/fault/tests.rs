@@ -11,7 +11,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::{
     post::{Post, PostStream},
-    supervision::{Launch, Life, ReadyGate},
+    supervision::{Launch, Life, ReadyGate, Reason},
 };
 
 fn fault(text: &str) -> Fault {
@@ -97,7 +97,7 @@ proptest! {
 struct Clerk(PostStream<u32>, Arc<Mutex<Vec<Option<u32>>>>);
 
 impl Life for Clerk {
-    fn poll(&mut self, cx: &mut Context<'_>) -> Poll<()> {
+    fn poll(&mut self, cx: &mut Context<'_>) -> Poll<Reason> {
         while let Poll::Ready(Some(event)) = self.0.poll_next_unpin(cx) {
             self.1.lock().expect("one thread").push(Some(event));
         }

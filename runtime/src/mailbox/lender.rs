@@ -1,0 +1,136 @@
+//! The reading end of a mailbox whose actor is in another process: several messages are out at once.
+//!
+//! What is lent stays counted as open until it is settled or given back, so that the conservation law of a
+//! [`Tally`](super::Tally) holds across the death of the borrower.
+
+use std::{sync::Arc, task::Waker};
+
+use super::Mailbox;
+use crate::{
+    outcome::{Outcome, Rejection},
+    post::lock,
+    wire::{Class, Message},
+};
+
+/// Lends the messages of a [`Mailbox`]. The latest one made is the present reader; earlier ones get nothing.
+#[derive(Debug)]
+pub struct Lender {
+    mailbox: Arc<Mailbox>,
+    epoch: u64,
+}
+
+impl Mailbox {
+    /// Takes over the reading end for a borrower in another process; the former reader is fenced off.
+    #[must_use]
+    pub fn lend(self: &Arc<Self>) -> Lender {
+        Lender { epoch: self.attach().epoch, mailbox: self.clone() }
+    }
+}
+
+impl Lender {
+    /// The next message, if one waits.
+    #[must_use]
+    pub fn take(&self) -> Option<Message> {
+        let mut shared = lock(&self.mailbox.shared);
+        if shared.epoch == self.epoch { shared.queue.pop() } else { None }
+    }
+
+    /// A lent message of this class has ended so.
+    pub fn settle(&self, class: Class, outcome: Outcome) {
+        lock(&self.mailbox.shared).tallies[class as usize].count(outcome);
+    }
+
+    /// A newer value took the place of a lent message of this class.
+    pub fn supersede(&self, class: Class) {
+        lock(&self.mailbox.shared).tallies[class as usize].superseded += 1;
+    }
+
+    /// Gives back what was lent and never handled, oldest first: it is the next to be taken, in the same order.
+    pub fn give_back(&self, lent: Vec<Message>) {
+        let mut refused = Vec::new();
+        let waker = {
+            let mut shared = lock(&self.mailbox.shared);
+            for message in lent.into_iter().rev() {
+                let class = message.header.class as usize;
+                if shared.closed {
+                    shared.tallies[class].rejected += 1;
+                    refused.push(message);
+                } else if shared.queue.put_back(message).is_some() {
+                    shared.tallies[class].superseded += 1;
+                }
+            }
+            shared.high_water = shared.high_water.max(shared.queue.len());
+            shared.waker.take()
+        };
+        // Told outside the lock, so that nobody who is told runs into it.
+        for message in refused {
+            message.reject(Rejection::Closed);
+        }
+        waker.into_iter().for_each(Waker::wake);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use bytes::Bytes;
+
+    use super::*;
+    use crate::{
+        router::Outlet,
+        tid::Tid,
+        wire::{Header, Kind},
+    };
+
+    fn message(class: Class, sequence: u64) -> Message {
+        let mut header = Header::new(Kind::named("test"), Tid::NONE, Tid::NONE);
+        (header.class, header.sequence) = (class, sequence);
+        Message::new(header, Bytes::new())
+    }
+
+    fn sequences(lender: &Lender) -> Vec<u64> {
+        std::iter::from_fn(|| lender.take()).map(|message| message.header.sequence).collect()
+    }
+
+    #[test]
+    fn what_is_given_back_comes_first_and_in_order_to_the_next_reader() {
+        let mailbox = Mailbox::new(4);
+        for number in 1..=4 {
+            mailbox.submit(message(Class::Bulk, number)).unwrap();
+        }
+        let first = mailbox.lend();
+        let lent: Vec<_> = (0..3).filter_map(|_| first.take()).collect();
+        let mut lent = lent.into_iter();
+        drop(lent.next());
+        first.settle(Class::Bulk, Outcome::Failed);
+        first.give_back(lent.collect());
+        let second = mailbox.lend();
+        assert!(first.take().is_none(), "the former reader is fenced off");
+        assert_eq!(sequences(&second), [2, 3, 4]);
+        let tally = mailbox.tally(Class::Bulk);
+        assert_eq!((tally.taken, tally.failed, tally.open()), (4, 1, 3));
+    }
+
+    #[test]
+    fn of_a_stream_that_is_given_back_the_newer_value_that_waits_wins() {
+        let mailbox = Mailbox::new(4);
+        mailbox.submit(message(Class::Stream, 1)).unwrap();
+        let lender = mailbox.lend();
+        let older = lender.take().unwrap();
+        mailbox.submit(message(Class::Stream, 2)).unwrap();
+        lender.give_back(vec![older]);
+        assert_eq!(sequences(&lender), [2]);
+        assert_eq!(mailbox.tally(Class::Stream).superseded, 1);
+    }
+
+    #[test]
+    fn what_is_given_back_to_a_closed_mailbox_is_refused() {
+        let mailbox = Mailbox::new(4);
+        mailbox.submit(message(Class::Control, 1)).unwrap();
+        let lender = mailbox.lend();
+        let lent = lender.take().unwrap();
+        mailbox.close();
+        lender.give_back(vec![lent]);
+        let tally = mailbox.tally(Class::Control);
+        assert_eq!((tally.taken, tally.rejected, tally.open()), (1, 1, 0));
+    }
+}

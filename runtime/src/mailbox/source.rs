@@ -1,0 +1,17 @@
+//! A mailbox whose messages wait elsewhere: in the node, for the process that hosts an application.
+
+use std::{
+    fmt::Debug,
+    task::{Context, Poll},
+};
+
+use crate::{outcome::Outcome, wire::Message};
+
+/// Where a mailbox's reader takes its messages from, one at a time.
+pub trait Source: Debug + Send + Sync {
+    /// Takes the next message into the hand. `None` once there will be none.
+    fn poll_take(&self, cx: &mut Context<'_>) -> Poll<Option<Message>>;
+
+    /// The message in hand has ended so.
+    fn finish(&self, outcome: Outcome);
+}
