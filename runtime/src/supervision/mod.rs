@@ -21,7 +21,7 @@ mod threads;
 
 pub use self::{
     alone::{AloneHandle, alone},
-    core::{ChildId, ChildIds, Input, Policy, Reason, Restart, Strategy},
+    core::{AutoShutdown, ChildId, ChildIds, Flags, Input, Intensity, Policy, Reason, Restart, Strategy},
     guard::{Life, life},
     ready::{ReadyGate, ReadyPart},
     supervisor::{ChildSpec, Launch, Supervisor, SupervisorFact},

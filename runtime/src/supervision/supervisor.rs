@@ -8,7 +8,7 @@ use crate::{
     post::Post,
     supervision::{
         Life, Place, ReadyGate, Reason, Threads,
-        core::{ChildId, Core, Generation, Input, Intensity, Order, Policy, Strategy},
+        core::{ChildId, Core, Flags, Generation, Input, Order, Policy},
         guard::{Guard, Leash, words},
     },
     time::Time,
@@ -73,7 +73,7 @@ impl Supervisor {
     /// supervisor's thread.
     pub fn new(
         name: &'static str,
-        strategy: Strategy,
+        flags: impl Into<Flags>,
         children: Vec<ChildSpec>,
         threads: Rc<RefCell<Threads>>,
         listener: impl FnMut(SupervisorFact) + 'static,
@@ -82,7 +82,7 @@ impl Supervisor {
         let post = Post::new(POST_CAPACITY);
         let supervisor = Self {
             name,
-            core: Core::new(strategy, Intensity::default(), policies),
+            core: Core::new(flags.into(), seed(), policies),
             children: children.into_iter().map(|spec| (spec.id, Child { spec, leash: None })).collect(),
             threads,
             post: post.clone(),
@@ -132,6 +132,8 @@ impl Supervisor {
                 tracing::info!(supervisor = self.name, child = self.name_of(id), %reason, "gone");
                 (self.listener)(SupervisorFact::Gone(id, reason));
             }
+            // Commands come to this shell with supervisors that are built at run time.
+            Order::Deleted(_) | Order::Done(..) | Order::Refused(..) => {}
             Order::AllReady => (self.listener)(SupervisorFact::AllReady),
             Order::Ended(reason) => {
                 (self.listener)(SupervisorFact::Ended(reason));
@@ -173,6 +175,11 @@ impl Supervisor {
             }
         });
     }
+}
+
+/// Chance from the operating system: nodes that are one program and start at one instant wait for different times.
+fn seed() -> u64 {
+    std::hash::BuildHasher::hash_one(&std::hash::RandomState::new(), 0_u8)
 }
 
 /// Runs on the child's thread.

@@ -2,13 +2,13 @@
 
 use std::time::Duration;
 
-use super::{ChildId, Generation, Policy};
+use super::{ChildId, Generation, Policy, Reason, Restart};
 use crate::time::Time;
 
 /// Where a child is in its life.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ChildState {
-    /// Does not live; waits for its turn, or for its release.
+    /// Does not live; waits for its turn, or for its release, or is not wanted.
     Down,
     /// Failed; is started again at this time.
     BackingOff(Time),
@@ -33,12 +33,32 @@ impl ChildState {
     }
 }
 
+/// What a supervisor knows of a child, for who asks.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ChildView {
+    /// Where it is in its life.
+    pub state: ChildState,
+    /// Since when.
+    pub since: Time,
+    /// Which life it is.
+    pub generation: Generation,
+    /// How often it was started again.
+    pub restarts: u64,
+    /// How its last life ended.
+    pub last_reason: Option<Reason>,
+    /// Whether it should live. One that is down and should not was terminated or has ended by itself.
+    pub wanted: bool,
+    /// Whether its release is what it waits for.
+    pub waits_for_release: bool,
+}
+
 /// What a supervisor remembers of a child.
 #[derive(Debug)]
 pub(super) struct Child {
     pub(super) id: ChildId,
     pub(super) policy: Policy,
     pub(super) state: ChildState,
+    pub(super) since: Time,
     pub(super) generation: Generation,
     /// Should live.
     pub(super) wanted: bool,
@@ -46,25 +66,42 @@ pub(super) struct Child {
     pub(super) released: bool,
     /// Lives, and must be replaced because a sibling failed.
     pub(super) stale: bool,
+    /// Commands to terminate it that were not answered yet.
+    pub(super) terminations: u32,
     pub(super) failures_in_a_row: u32,
-    pub(super) restarts: u64,
+    /// How often it was started.
+    pub(super) starts: u64,
     pub(super) ready_since: Time,
+    pub(super) last_reason: Option<Reason>,
 }
 
 impl Child {
-    pub(super) const fn new(id: ChildId, policy: Policy) -> Self {
+    /// A child whose first life will follow `generation`.
+    pub(super) const fn new(id: ChildId, policy: Policy, generation: Generation) -> Self {
         Self {
             id,
             policy,
             state: ChildState::Down,
-            generation: 0,
+            since: Time::ZERO,
+            generation,
             wanted: false,
             released: false,
             stale: false,
+            terminations: 0,
             failures_in_a_row: 0,
-            restarts: 0,
+            starts: 0,
             ready_since: Time::ZERO,
+            last_reason: None,
         }
+    }
+
+    pub(super) const fn enter(&mut self, state: ChildState, now: Time) {
+        self.state = state;
+        self.since = now;
+    }
+
+    pub(super) fn is_temporary(&self) -> bool {
+        self.policy.restart == Restart::Temporary
     }
 
     pub(super) fn waits_for_release(&self) -> bool {
@@ -79,5 +116,17 @@ impl Child {
         let doublings = self.failures_in_a_row.min(20);
         self.failures_in_a_row += 1;
         self.policy.backoff_min.saturating_mul(1 << doublings).min(self.policy.backoff_max)
+    }
+
+    pub(super) fn view(&self) -> ChildView {
+        ChildView {
+            state: self.state,
+            since: self.since,
+            generation: self.generation,
+            restarts: self.starts.saturating_sub(1),
+            last_reason: self.last_reason.clone(),
+            wanted: self.wanted,
+            waits_for_release: self.wanted && self.waits_for_release(),
+        }
     }
 }

@@ -1,6 +1,6 @@
 //! What a supervisor is told, and what it orders.
 
-use super::{ChildId, Generation, Reason};
+use super::{ChildId, Generation, Policy, Reason};
 
 /// What a supervisor is told.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -19,6 +19,47 @@ pub enum Input {
     TimePassed,
     /// Stop the children, last first.
     StopOrdered,
+    /// Take this child in, after the others, and start it in its turn.
+    AddChild(ChildId, Policy),
+    /// Stop this child and do not start it again. It is kept, unless it is temporary: then it is forgotten.
+    TerminateChild(ChildId),
+    /// Start this child again, which was terminated or has ended by itself.
+    RestartChild(ChildId),
+    /// Forget this child, which was terminated or has ended by itself.
+    DeleteChild(ChildId),
+}
+
+/// What a supervisor was asked to do with a child at run time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Command {
+    /// [`Input::AddChild`].
+    Add,
+    /// [`Input::TerminateChild`].
+    Terminate,
+    /// [`Input::RestartChild`].
+    Restart,
+    /// [`Input::DeleteChild`].
+    Delete,
+}
+
+/// Why a command is not carried out. Nothing has changed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Refusal {
+    /// The supervisor has no such child.
+    #[error("there is no such child")]
+    Unknown,
+    /// The supervisor has a child of this id already.
+    #[error("this child is there already")]
+    Present,
+    /// The child lives, or is about to be started.
+    #[error("the child runs; terminate it first")]
+    Running,
+    /// The child failed and is about to be started again.
+    #[error("the child is being restarted; terminate it first")]
+    Restarting,
+    /// The supervisor stops all its children.
+    #[error("its supervisor ends")]
+    Ending,
 }
 
 /// What a supervisor orders its shell to do, and what it says to others.
@@ -30,14 +71,21 @@ pub enum Order {
     Stop(ChildId, Generation),
     /// Take this child's life without waiting for it.
     Abandon(ChildId, Generation),
-    /// For others: this child failed.
+    /// For others: this child failed or was stopped, and is started again if its turn comes.
     Failed(ChildId, Reason),
     /// For others: this child is ready.
     Ready(ChildId),
-    /// For others: this child is gone and will not be started again.
+    /// For others: this child is gone. It is not started again unless by a command, or together with its group.
     Gone(ChildId, Reason),
+    /// For others: this child is forgotten.
+    Deleted(ChildId),
     /// For others: every child that is wanted and not held is ready. Said again after each restart.
     AllReady,
+    /// For who asked: the command is carried out. A terminated child has ended; a child that was added or restarted has its
+    /// start before it.
+    Done(Command, ChildId),
+    /// For who asked: the command is not carried out.
+    Refused(Command, ChildId, Refusal),
     /// For others: no child lives any more, and why. The last order.
     Ended(Reason),
 }

@@ -1,41 +1,68 @@
 //! The supervisor's decisions, as a pure state machine: (history, now, event) to orders.
 //!
 //! Erlang/OTP's vocabulary and rules (stdlib, module `supervisor`): restart types, strategies, restart intensity over a
-//! window, ordered start, stop in reverse order. Added to them: readiness (a child is started when those before it have
-//! said Ready), a deadline on every wait, exponential back-off, and children that are held until they are released.
+//! window, ordered start, stop in reverse order, significant children, children added and removed at run time. Added to
+//! them: readiness (a child is started when those before it have said Ready), a deadline on every wait, exponential
+//! back-off with jitter, children that are held until they are released, and a bound on lives that were taken and did not
+//! let go. Left out: one-for-one's `simple` form.
 //!
 //! After every [`handle`](Core::handle) the shell drains [`poll`](Core::poll) until nothing is left, then sleeps until
 //! [`next_wake`](Core::next_wake). Every event carries the generation of the child that it speaks of; an event of an
 //! earlier generation is ignored.
+//!
+//! | file | what it is |
+//! | --- | --- |
+//! | `policy` | what the supervisor may do |
+//! | `event` | what it is told, what it orders |
+//! | `child` | what it remembers of one child |
+//! | `restart` | what follows when a child has ended |
+//! | `commands` | children added, terminated, restarted, deleted |
+//! | `reconcile` | stops and starts, in order |
 
 mod child;
+mod commands;
 mod event;
 mod id;
+#[cfg(test)]
+mod model;
 mod policy;
 mod reason;
 mod reconcile;
 mod restart;
 #[cfg(test)]
+mod simulation;
+#[cfg(test)]
+mod table;
+#[cfg(test)]
 mod tests;
+mod window;
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 
 use child::Child;
-pub use child::ChildState;
-pub use event::{Input, Order};
+pub use child::{ChildState, ChildView};
+pub use event::{Command, Input, Order, Refusal};
 pub use id::{ChildId, ChildIds, Generation};
-pub use policy::{Intensity, Policy, Restart, Strategy};
+pub use policy::{AutoShutdown, Flags, Intensity, Policy, Restart, Strategy};
 pub use reason::Reason;
+use window::{Chance, Window};
 
 use crate::time::Time;
 
 /// A supervisor's memory; see the [module](self).
 #[derive(Debug)]
 pub struct Core {
-    strategy: Strategy,
-    intensity: Intensity,
+    flags: Flags,
+    chance: Chance,
     children: Vec<Child>,
-    restarts: VecDeque<Time>,
+    restarts: Window,
+    /// Restarts because a child lost its thread.
+    losses: Window,
+    /// Lives that were taken and have not ended yet.
+    abandoned: BTreeSet<(ChildId, Generation)>,
+    /// The highest generation that any child had.
+    last_generation: Generation,
+    started: bool,
     /// Set once the children are to end.
     ending: Option<Reason>,
     ended: bool,
@@ -44,44 +71,68 @@ pub struct Core {
 }
 
 impl Core {
-    /// A supervisor of these children, in the order of their start.
+    /// A supervisor of these children, in the order of their start. `seed` makes the chance in its waits.
     #[must_use]
-    pub fn new(strategy: Strategy, intensity: Intensity, children: Vec<(ChildId, Policy)>) -> Self {
-        let children = children.into_iter().map(|(id, policy)| Child::new(id, policy)).collect();
-        Self {
-            strategy,
-            intensity,
-            children,
-            restarts: VecDeque::new(),
+    pub fn new(flags: Flags, seed: u64, children: Vec<(ChildId, Policy)>) -> Self {
+        let mut core = Self {
+            flags,
+            chance: Chance(seed),
+            children: Vec::new(),
+            restarts: Window::default(),
+            losses: Window::default(),
+            abandoned: BTreeSet::new(),
+            last_generation: 0,
+            started: false,
             ending: None,
             ended: false,
             said_all_ready: false,
             orders: VecDeque::new(),
-        }
+        };
+        core.take_in(children);
+        core
+    }
+
+    /// The same supervisor in its next life, with these children. It has forgotten everything but which lives of theirs were
+    /// before, and which of those have not let go.
+    #[must_use]
+    pub fn renewed(&self, children: Vec<(ChildId, Policy)>) -> Self {
+        let mut core = Self::new(self.flags, self.chance.0, Vec::new());
+        core.last_generation = self.last_generation;
+        core.abandoned.clone_from(&self.abandoned);
+        core.take_in(children);
+        core
+    }
+
+    fn take_in(&mut self, children: Vec<(ChildId, Policy)>) {
+        let before = self.last_generation;
+        self.children = children.into_iter().map(|(id, policy)| Child::new(id, policy, before)).collect();
     }
 
     /// Takes an event. Then drain [`poll`](Self::poll).
     pub fn handle(&mut self, now: Time, input: Input) {
         if self.ended {
-            return;
+            return self.refuse_after_the_end(&input);
         }
         match input {
-            Input::Started => self.children.iter_mut().for_each(|child| child.wanted = true),
-            Input::StopOrdered => self.end(Reason::Shutdown),
+            Input::Started => self.start(),
+            Input::StopOrdered => self.end(now, Reason::Shutdown),
             Input::Released(id) => self.released(id),
             Input::BecameReady(id, generation) => self.became_ready(now, id, generation),
             Input::Hung(id, generation, reason) => {
                 if let Some(index) = self.alive(id, generation) {
-                    self.orders.push_back(Order::Abandon(id, generation));
-                    self.child_ended(now, index, reason);
+                    self.abandon(now, index, reason);
                 }
             }
-            Input::Ended(id, generation, reason) => {
-                if let Some(index) = self.alive(id, generation) {
-                    self.child_ended(now, index, reason);
-                }
-            }
+            Input::Ended(id, generation, reason) => match self.alive(id, generation) {
+                Some(index) => self.child_ended(now, index, reason),
+                // Perhaps one whose life was taken: it has let go at last.
+                None => _ = self.abandoned.remove(&(id, generation)),
+            },
             Input::TimePassed => {}
+            Input::AddChild(id, policy) => self.add(id, policy),
+            Input::TerminateChild(id) => self.terminate(now, id),
+            Input::RestartChild(id) => self.restart_terminated(id),
+            Input::DeleteChild(id) => self.delete(id),
         }
         self.expire(now);
         self.reconcile(now);
@@ -98,11 +149,39 @@ impl Core {
         self.children.iter().filter_map(|child| child.state.deadline()).min()
     }
 
-    /// Where a child is in its life, which life it is, and how often it was restarted.
+    /// The children, in the order of their start.
+    pub fn children(&self) -> impl Iterator<Item = ChildId> + '_ {
+        self.children.iter().map(|child| child.id)
+    }
+
+    /// What is known of a child.
     #[must_use]
-    pub fn child(&self, id: ChildId) -> Option<(ChildState, Generation, u64)> {
-        let child = &self.children[self.position(id)?];
-        Some((child.state, child.generation, child.restarts))
+    pub fn child(&self, id: ChildId) -> Option<ChildView> {
+        Some(self.children[self.position(id)?].view())
+    }
+
+    /// How it treats its children.
+    #[must_use]
+    pub const fn flags(&self) -> &Flags {
+        &self.flags
+    }
+
+    /// Restarts in the window that ends now.
+    #[must_use]
+    pub fn restarts_in_window(&self, now: Time) -> usize {
+        self.restarts.count(now, self.flags.intensity.window)
+    }
+
+    /// Lives that were taken and have not let go.
+    #[must_use]
+    pub fn abandoned(&self) -> usize {
+        self.abandoned.len()
+    }
+
+    /// Whether it stops its children, or has.
+    #[must_use]
+    pub const fn is_ending(&self) -> bool {
+        self.ending.is_some()
     }
 
     fn position(&self, id: ChildId) -> Option<usize> {
@@ -116,6 +195,12 @@ impl Core {
         (child.generation == generation && child.state.is_alive()).then_some(index)
     }
 
+    fn start(&mut self) {
+        if !std::mem::replace(&mut self.started, true) && self.ending.is_none() {
+            self.children.iter_mut().for_each(|child| child.wanted = true);
+        }
+    }
+
     fn released(&mut self, id: ChildId) {
         if let Some(index) = self.position(id) {
             self.children[index].released = true;
@@ -126,7 +211,7 @@ impl Core {
         if let Some(index) = self.alive(id, generation)
             && let ChildState::Starting(_) = self.children[index].state
         {
-            self.children[index].state = ChildState::Ready;
+            self.children[index].enter(ChildState::Ready, now);
             self.children[index].ready_since = now;
             self.orders.push_back(Order::Ready(id));
         }
@@ -134,23 +219,15 @@ impl Core {
 
     /// Lets every wait end whose time is over.
     fn expire(&mut self, now: Time) {
-        for index in 0..self.children.len() {
-            let Child { id, state, generation, .. } = self.children[index];
-            match state {
-                ChildState::BackingOff(at) if at <= now => self.children[index].state = ChildState::Down,
-                ChildState::Starting(until) if until <= now => {
-                    self.orders.push_back(Order::Abandon(id, generation));
-                    self.child_ended(now, index, Reason::StartTimeout);
+        let over = |child: &Child| child.state.deadline().is_some_and(|deadline| deadline <= now);
+        // Ends: what is done with a child takes it out of the state whose time was over.
+        while let Some(index) = self.children.iter().position(over) {
+            match self.children[index].state {
+                ChildState::Starting(_) => self.abandon(now, index, Reason::StartTimeout),
+                ChildState::Stopping(_) => self.abandon(now, index, Reason::Killed),
+                ChildState::BackingOff(_) | ChildState::Down | ChildState::Ready => {
+                    self.children[index].enter(ChildState::Down, now);
                 }
-                ChildState::Stopping(until) if until <= now => {
-                    self.orders.push_back(Order::Abandon(id, generation));
-                    self.child_ended(now, index, Reason::Killed);
-                }
-                ChildState::BackingOff(_)
-                | ChildState::Starting(_)
-                | ChildState::Stopping(_)
-                | ChildState::Down
-                | ChildState::Ready => {}
             }
         }
     }

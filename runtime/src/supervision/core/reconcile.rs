@@ -1,12 +1,11 @@
-//! Brings the children nearer to what is wanted.
+//! Brings the children nearer to what is wanted: stops, then starts.
 
-use super::{Child, ChildState, Core, Order, Strategy};
+use super::{Child, ChildState, Core, Order};
 use crate::time::Time;
 
 impl Core {
-    /// Brings the children nearer to what is wanted: stops first, then starts.
     pub(super) fn reconcile(&mut self, now: Time) {
-        if self.stop_the_last_unwanted(now) {
+        if self.stop_the_unwanted(now) {
             return;
         }
         if let Some(why) = self.ending.clone() {
@@ -17,42 +16,64 @@ impl Core {
         self.start_in_order(now);
         let settled =
             |child: &Child| !child.wanted || child.state == ChildState::Ready || child.waits_for_release();
-        if !self.said_all_ready && self.children.iter().any(|c| c.wanted) && self.children.iter().all(settled)
-        {
+        if self.started && !self.said_all_ready && self.children.iter().all(settled) {
             self.said_all_ready = true;
             self.orders.push_back(Order::AllReady);
         }
     }
 
-    /// Stops one child at a time, last first. Returns whether one is still alive that should not be.
+    /// Stops whom it must. Returns whether nothing may be started until they have ended.
+    fn stop_the_unwanted(&mut self, now: Time) -> bool {
+        if self.flags.strategy.is_ordered() || self.ending.is_some() {
+            return self.stop_the_last_unwanted(now);
+        }
+        // Each child is on its own: one that takes its time to stop keeps nobody waiting.
+        for index in (0..self.children.len()).rev() {
+            if self.children[index].is_unwanted() {
+                self.stop(index, now);
+            }
+        }
+        false
+    }
+
+    /// Stops one child at a time, last first.
     fn stop_the_last_unwanted(&mut self, now: Time) -> bool {
-        let unwanted = |child: &Child| child.state.is_alive() && (child.stale || !child.wanted);
-        let Some(index) = self.children.iter().rposition(unwanted) else {
-            // Stale children whose life ended are replaced by their next start.
-            self.children.iter_mut().for_each(|child| child.stale = false);
-            return false;
-        };
+        let last = self.children.iter().rposition(Child::is_unwanted);
+        if let Some(index) = last {
+            self.stop(index, now);
+        }
+        last.is_some()
+    }
+
+    fn stop(&mut self, index: usize, now: Time) {
         let child = &mut self.children[index];
         if !matches!(child.state, ChildState::Stopping(_)) {
-            child.state = ChildState::Stopping(now + child.policy.stop_within);
+            child.enter(ChildState::Stopping(now + child.policy.stop_within), now);
             self.orders.push_back(Order::Stop(child.id, child.generation));
         }
-        true
     }
 
     /// Starts whom it can: in order where the strategy ties children to those before them, else all at once.
     fn start_in_order(&mut self, now: Time) {
-        let ordered = self.strategy != Strategy::OneForOne;
-        for index in 0..self.children.len() {
-            let child = &mut self.children[index];
+        let ordered = self.flags.strategy.is_ordered();
+        for child in &mut self.children {
             if child.wanted && child.state == ChildState::Down && !child.waits_for_release() {
                 child.generation += 1;
-                child.state = ChildState::Starting(now + child.policy.start_within);
+                child.starts += 1;
+                child.enter(ChildState::Starting(now + child.policy.start_within), now);
+                self.last_generation = self.last_generation.max(child.generation);
                 self.orders.push_back(Order::Spawn(child.id, child.generation));
             }
             if ordered && child.wanted && child.state != ChildState::Ready {
                 return;
             }
         }
+    }
+}
+
+impl Child {
+    /// Lives, and should not, or not this life of it.
+    fn is_unwanted(&self) -> bool {
+        self.state.is_alive() && (self.stale || !self.wanted)
     }
 }

@@ -1,62 +1,135 @@
 //! What follows when a child has ended: nothing, a restart, or the end of all.
 
-use super::{ChildState, Core, Intensity, Order, Reason, Restart, Strategy};
+use super::{AutoShutdown, ChildState, Core, Intensity, Order, Reason, Restart, Strategy};
 use crate::time::Time;
 
 impl Core {
+    /// Takes the life of a child that does not answer. More such lives than allowed, and the supervisor gives up.
+    pub(super) fn abandon(&mut self, now: Time, index: usize, reason: Reason) {
+        let (id, generation) = (self.children[index].id, self.children[index].generation);
+        self.orders.push_back(Order::Abandon(id, generation));
+        self.abandoned.insert((id, generation));
+        self.child_ended(now, index, reason);
+        let (lives, max) = (self.abandoned.len(), self.flags.abandoned_max);
+        if lives > max {
+            let why = format!("{lives} lives were taken and have not let go of their threads; {max} may");
+            self.end(now, Reason::GaveUp(why));
+        }
+    }
+
     pub(super) fn child_ended(&mut self, now: Time, index: usize, reason: Reason) {
         let child = &mut self.children[index];
-        let id = child.id;
-        let was_asked_to = matches!(child.state, ChildState::Stopping(_));
-        child.state = ChildState::Down;
+        let was_to_end = child.stale || !child.wanted || matches!(child.state, ChildState::Stopping(_));
+        child.enter(ChildState::Down, now);
         child.released = false;
+        child.stale = false;
+        child.last_reason = Some(reason.clone());
         self.said_all_ready = false;
-        if was_asked_to {
-            self.orders.push_back(Order::Failed(id, Reason::Shutdown));
-            return;
+        if was_to_end {
+            self.ended_as_ordered(index, reason);
+        } else {
+            self.ended_by_itself(now, index, reason);
         }
+    }
+
+    /// By a command, with its group, or with all.
+    fn ended_as_ordered(&mut self, index: usize, reason: Reason) {
+        let child = &mut self.children[index];
+        let (id, terminations) = (child.id, std::mem::take(&mut child.terminations));
+        let (wanted, forget) = (child.wanted, child.is_temporary() && self.ending.is_none());
+        let reason = if reason == Reason::Normal { Reason::Shutdown } else { reason };
+        if wanted || self.ending.is_some() {
+            self.orders.push_back(Order::Failed(id, reason));
+        } else {
+            self.orders.push_back(Order::Gone(id, reason));
+        }
+        if forget {
+            self.forget(index);
+        }
+        self.answer_terminations(id, terminations);
+    }
+
+    fn ended_by_itself(&mut self, now: Time, index: usize, reason: Reason) {
+        let child = &mut self.children[index];
         let again = match child.policy.restart {
             Restart::Permanent => true,
             Restart::Transient => reason.is_failure(),
             Restart::Temporary => false,
         };
-        if !again || !child.wanted {
-            child.wanted = false;
-            self.orders.push_back(Order::Gone(id, reason));
+        if again {
+            self.orders.push_back(Order::Failed(child.id, reason.clone()));
+            self.restart(now, index, &reason);
             return;
         }
-        self.orders.push_back(Order::Failed(id, reason.clone()));
-        self.restart(now, index, &reason);
+        child.wanted = false;
+        let (significant, forget) = (child.policy.significant, child.is_temporary());
+        self.orders.push_back(Order::Gone(child.id, reason));
+        if forget {
+            self.forget(index);
+        }
+        if significant {
+            self.significant_ended(now);
+        }
+    }
+
+    /// The end of a significant child may be the end of all.
+    fn significant_ended(&mut self, now: Time) {
+        let ends = match self.flags.auto_shutdown {
+            AutoShutdown::Never => false,
+            AutoShutdown::AnySignificant => true,
+            AutoShutdown::AllSignificant => {
+                let works = |child: &super::Child| child.policy.significant && child.wanted;
+                !self.children.iter().any(works)
+            }
+        };
+        if ends {
+            self.end(now, Reason::Shutdown);
+        }
     }
 
     fn restart(&mut self, now: Time, index: usize, reason: &Reason) {
-        self.restarts.push_back(now);
-        while self.restarts.front().is_some_and(|at| now.since(*at) > self.intensity.window) {
-            self.restarts.pop_front();
-        }
-        if self.restarts.len() > self.intensity.restarts_max {
-            let Intensity { restarts_max, window } = self.intensity;
-            self.end(Reason::GaveUp(format!(
-                "more than {restarts_max} restarts in {} s; the last child to fail {reason}",
-                window.as_secs_f32()
-            )));
+        let Intensity { restarts_max, losses_max, window } = self.flags.intensity;
+        let lost_its_thread = *reason == Reason::ThreadEnded;
+        let (counted, max, what) = match lost_its_thread {
+            true => (&mut self.losses, losses_max, "lost threads"),
+            false => (&mut self.restarts, restarts_max, "restarts"),
+        };
+        if counted.add(now, max, window) {
+            let seconds = window.as_secs_f32();
+            let why = format!("more than {max} {what} in {seconds} s; the last child to fail {reason}");
+            self.end(now, Reason::GaveUp(why));
             return;
         }
-        let wait = self.children[index].next_backoff(now, self.intensity.window);
-        self.children[index].state = ChildState::BackingOff(now + wait);
-        self.children[index].restarts += 1;
-        let others = match self.strategy {
-            Strategy::OneForOne => 0..0,
+        let wait = self.children[index].next_backoff(now, window);
+        let wait = self.chance.jitter(wait);
+        self.children[index].enter(ChildState::BackingOff(now + wait), now);
+        self.restart_group_of(index);
+    }
+
+    /// Those who go with a child that is restarted: they are stopped, then started in order. Among them are, as in OTP, those
+    /// who were terminated before; not those who are temporary.
+    fn restart_group_of(&mut self, index: usize) {
+        let others = match self.flags.strategy {
+            Strategy::OneForOne => return,
             Strategy::RestForOne => index + 1..self.children.len(),
             Strategy::OneForAll => 0..self.children.len(),
         };
         for other in others.filter(|other| *other != index) {
-            self.children[other].stale = self.children[other].state.is_alive();
+            let child = &mut self.children[other];
+            child.stale = child.state.is_alive();
+            // A temporary one has done its work when its group is stopped; if it waits for its first start, it has not.
+            child.wanted = if child.is_temporary() { child.wanted && !child.stale } else { true };
         }
     }
 
-    pub(super) fn end(&mut self, why: Reason) {
+    /// Ends all children. The first reason counts.
+    pub(super) fn end(&mut self, now: Time, why: Reason) {
         self.ending.get_or_insert(why);
-        self.children.iter_mut().for_each(|child| child.wanted = false);
+        for child in &mut self.children {
+            child.wanted = false;
+            if let ChildState::BackingOff(_) = child.state {
+                child.enter(ChildState::Down, now);
+            }
+        }
     }
 }

@@ -1,4 +1,6 @@
-use proptest::prelude::{Just, ProptestConfig, prop_oneof, proptest};
+//! Claims about single decisions. All histories are in `simulation`, all states in `table`.
+
+use std::time::Duration;
 
 use super::*;
 use crate::time::Time;
@@ -10,11 +12,8 @@ fn at(ms: u64) -> Time {
 }
 
 fn supervisor(strategy: Strategy, children: usize) -> Core {
-    let mut core = Core::new(
-        strategy,
-        Intensity::default(),
-        (0..children).map(|index| (child(index), Policy::default())).collect(),
-    );
+    let mut core =
+        Core::new(strategy.into(), 0, (0..children).map(|index| (child(index), Policy::default())).collect());
     core.handle(at(0), Input::Started);
     core
 }
@@ -131,7 +130,7 @@ fn stop_runs_backwards_and_abandons_who_does_not_obey() {
 #[test]
 fn a_held_child_starts_when_it_is_released_and_waits_again_after_a_failure() {
     let policy = Policy { held: true, ..Policy::default() };
-    let mut core = Core::new(Strategy::OneForOne, Intensity::default(), vec![(ChildId(0), policy)]);
+    let mut core = Core::new(Strategy::OneForOne.into(), 0, vec![(ChildId(0), policy)]);
     core.handle(at(0), Input::Started);
     assert_eq!(orders(&mut core), [Order::AllReady]);
     core.handle(at(1), Input::Released(ChildId(0)));
@@ -147,7 +146,7 @@ fn a_held_child_starts_when_it_is_released_and_waits_again_after_a_failure() {
 #[test]
 fn a_release_that_comes_during_the_back_off_is_not_forgotten() {
     let policy = Policy { held: true, ..Policy::default() };
-    let mut core = Core::new(Strategy::OneForOne, Intensity::default(), vec![(ChildId(0), policy)]);
+    let mut core = Core::new(Strategy::OneForOne.into(), 0, vec![(ChildId(0), policy)]);
     core.handle(at(0), Input::Started);
     core.handle(at(0), Input::Released(ChildId(0)));
     core.handle(at(1), panicked(0, 1));
@@ -157,112 +156,112 @@ fn a_release_that_comes_during_the_back_off_is_not_forgotten() {
     assert_eq!(orders(&mut core), [Order::Spawn(ChildId(0), 2)]);
 }
 
-#[derive(Clone, Debug)]
-enum Step {
-    Ready(usize),
-    Panic(usize),
-    Normal(usize),
-    Wait(u64),
-    Stop,
+fn core_of(flags: Flags, policies: &[Policy]) -> Core {
+    let children =
+        policies.iter().enumerate().map(|(index, policy)| (child(index), policy.clone())).collect();
+    let mut core = Core::new(flags, 0, children);
+    core.handle(at(0), Input::Started);
+    all_ready(&mut core, policies.len());
+    core
 }
 
-fn any_step() -> impl proptest::strategy::Strategy<Value = Step> {
-    use proptest::strategy::Strategy as _;
-    prop_oneof![
-        6 => (0usize..4).prop_map(Step::Ready),
-        2 => (0usize..4).prop_map(Step::Panic),
-        1 => (0usize..4).prop_map(Step::Normal),
-        4 => (0u64..12_000).prop_map(Step::Wait),
-        1 => Just(Step::Stop),
-    ]
+fn of(restart: Restart) -> Policy {
+    Policy { restart, ..Policy::default() }
 }
 
-proptest! {
-    #![proptest_config(ProptestConfig::with_cases(2_000))]
-    #[test]
-    fn any_history_keeps_the_rules(
-        kind in 0usize..3,
-        steps in proptest::collection::vec(any_step(), 0..80),
-    ) {
-        let strategy = [Strategy::OneForOne, Strategy::RestForOne, Strategy::OneForAll][kind];
-        let mut core = supervisor(strategy, 4);
-        let mut world = World::default();
-        let mut now = 0;
-        world.obey(&mut core, strategy);
-        for step in steps {
-            let alive = |index: usize| world.alive[index];
-            let input = match step {
-                Step::Ready(index) => alive(index).map(|g| Input::BecameReady(child(index), g)),
-                Step::Panic(index) => alive(index).map(|g| panicked(index, g)),
-                Step::Normal(index) => alive(index).map(|g| Input::Ended(child(index), g, Reason::Normal)),
-                Step::Wait(ms) => { now += ms; Some(Input::TimePassed) }
-                Step::Stop => Some(Input::StopOrdered),
-            };
-            if let Some(input) = input {
-                world.hear(&input);
-                core.handle(at(now), input);
-                world.obey(&mut core, strategy);
-            }
-        }
-    }
+#[test]
+fn a_terminated_child_stays_down_until_it_is_restarted_and_a_deleted_one_is_forgotten() {
+    let mut core = core_of(Flags::default(), &[of(Restart::Permanent)]);
+    core.handle(at(1), Input::TerminateChild(child(0)));
+    assert_eq!(orders(&mut core), [Order::Stop(child(0), 1)]);
+    core.handle(at(2), Input::Ended(child(0), 1, Reason::Normal));
+    let stopped = [Order::Gone(child(0), Reason::Shutdown), Order::Done(Command::Terminate, child(0))];
+    assert_eq!(orders(&mut core)[..2], stopped);
+    core.handle(at(3), Input::RestartChild(child(0)));
+    assert_eq!(orders(&mut core), [Order::Done(Command::Restart, child(0)), Order::Spawn(child(0), 2)]);
+    core.handle(at(4), Input::DeleteChild(child(0)));
+    assert_eq!(orders(&mut core), [Order::Refused(Command::Delete, child(0), Refusal::Running)]);
 }
 
-/// A direct model of what lives; it panics where an order breaks a rule.
-#[derive(Default)]
-struct World {
-    alive: [Option<u64>; 4],
-    ready: [bool; 4],
-    stopping: [bool; 4],
-    ended: bool,
+#[test]
+fn one_that_takes_its_time_to_stop_keeps_no_independent_sibling_waiting() {
+    let mut core = core_of(Flags::default(), &[of(Restart::Permanent), of(Restart::Permanent)]);
+    core.handle(at(1), Input::TerminateChild(child(1)));
+    core.handle(at(1), panicked(0, 1));
+    orders(&mut core);
+    core.handle(at(2), Input::TimePassed);
+    assert_eq!(orders(&mut core), [Order::Spawn(child(0), 2)]);
 }
 
-impl World {
-    fn hear(&mut self, input: &Input) {
-        match input {
-            Input::BecameReady(id, _) => self.ready[id.0 as usize] = true,
-            Input::Ended(id, ..) => self.gone(id.0 as usize),
-            Input::Hung(..)
-            | Input::Started
-            | Input::Released(_)
-            | Input::TimePassed
-            | Input::StopOrdered => {}
-        }
-    }
+#[test]
+fn the_end_of_the_last_significant_child_is_the_end_of_all() {
+    let flags = Flags { auto_shutdown: AutoShutdown::AllSignificant, ..Flags::default() };
+    let works = Policy { significant: true, ..of(Restart::Transient) };
+    let mut core = core_of(flags, &[works.clone(), works, of(Restart::Permanent)]);
+    core.handle(at(1), Input::Ended(child(0), 1, Reason::Normal));
+    assert!(!orders(&mut core).contains(&Order::Stop(child(2), 1)), "one still works");
+    core.handle(at(2), Input::Ended(child(1), 1, Reason::Normal));
+    assert!(orders(&mut core).contains(&Order::Stop(child(2), 1)));
+    core.handle(at(3), Input::Ended(child(2), 1, Reason::Normal));
+    assert_eq!(orders(&mut core).pop(), Some(Order::Ended(Reason::Shutdown)));
+}
 
-    fn gone(&mut self, index: usize) {
-        (self.alive[index], self.ready[index], self.stopping[index]) = (None, false, false);
-    }
+#[test]
+fn a_temporary_child_that_is_stopped_with_its_group_has_done_its_work() {
+    // Found by the simulation: it counted as working until it had stopped, and its supervisor lived on with nothing to do.
+    let flags = Flags { auto_shutdown: AutoShutdown::AllSignificant, ..Strategy::RestForOne.into() };
+    let works = |restart| Policy { significant: true, ..of(restart) };
+    let mut core =
+        core_of(flags, &[works(Restart::Transient), of(Restart::Permanent), works(Restart::Temporary)]);
+    core.handle(at(1), panicked(1, 1));
+    core.handle(at(1), Input::Ended(child(0), 1, Reason::Normal));
+    core.handle(at(1), Input::Ended(child(2), 1, Reason::Normal));
+    assert_eq!(orders(&mut core).pop(), Some(Order::Ended(Reason::Shutdown)));
+}
 
-    fn obey(&mut self, core: &mut Core, strategy: Strategy) {
-        while let Some(order) = core.poll() {
-            assert!(!self.ended, "an order after the last one: {order:?}");
-            match order {
-                Order::Spawn(id, generation) => {
-                    let index = id.0 as usize;
-                    assert!(self.alive[index].is_none(), "two lives of one child");
-                    assert!(
-                        strategy == Strategy::OneForOne || self.ready[..index].iter().all(|ready| *ready),
-                        "started before those it depends on"
-                    );
-                    self.alive[index] = Some(generation);
-                }
-                Order::Stop(id, generation) => {
-                    let index = id.0 as usize;
-                    assert_eq!(self.alive[index], Some(generation));
-                    assert!(!self.stopping.contains(&true), "one stop at a time");
-                    self.stopping[index] = true;
-                }
-                Order::Abandon(id, generation) => {
-                    let index = id.0 as usize;
-                    assert_eq!(self.alive[index], Some(generation));
-                    self.gone(index);
-                }
-                Order::Ended(_) => {
-                    assert_eq!(self.alive, [None; 4]);
-                    self.ended = true;
-                }
-                Order::Failed(..) | Order::Ready(_) | Order::Gone(..) | Order::AllReady => {}
-            }
-        }
+#[test]
+fn who_lost_its_thread_through_a_neighbour_does_not_pay_for_it() {
+    let flags =
+        Flags { intensity: Intensity { restarts_max: 0, ..Intensity::default() }, ..Flags::default() };
+    let mut core = core_of(flags, &[of(Restart::Permanent)]);
+    core.handle(at(1), Input::Ended(child(0), 1, Reason::ThreadEnded));
+    core.handle(core.next_wake().unwrap(), Input::TimePassed);
+    assert_eq!(orders(&mut core).pop(), Some(Order::Spawn(child(0), 2)));
+    core.handle(at(5), panicked(0, 2));
+    assert!(matches!(orders(&mut core).pop(), Some(Order::Ended(Reason::GaveUp(_)))));
+}
+
+#[test]
+fn more_lives_that_do_not_let_go_than_allowed_end_it_and_one_that_let_go_does_not_count() {
+    let flags = Flags { abandoned_max: 1, ..Flags::default() };
+    let mut core = core_of(flags, &[of(Restart::Permanent)]);
+    let hung = |generation| Input::Hung(child(0), generation, Reason::Hung("busy".into()));
+    for generation in 1..=2 {
+        core.handle(at(generation * 100), hung(generation));
+        core.handle(at(generation * 100 + 1), Input::Ended(child(0), generation, Reason::Killed));
+        core.handle(at(generation * 100 + 50), Input::TimePassed);
+        assert!(!core.is_ending());
     }
+    core.handle(at(300), hung(3));
+    core.handle(at(350), Input::TimePassed);
+    assert!(!core.is_ending());
+    core.handle(at(400), hung(4));
+    assert!(
+        matches!(orders(&mut core).pop(), Some(Order::Ended(Reason::GaveUp(why))) if why.contains("let go"))
+    );
+}
+
+#[test]
+fn the_same_seed_gives_the_same_waits_and_others_give_others() {
+    let wait = |seed| {
+        let policy = Policy { backoff_min: Duration::from_millis(100), ..Policy::default() };
+        let mut core = Core::new(Flags::default(), seed, vec![(child(0), policy)]);
+        core.handle(at(0), Input::Started);
+        core.handle(at(0), panicked(0, 1));
+        core.next_wake().unwrap().since(at(0))
+    };
+    assert_eq!(wait(7), wait(7));
+    let waits: BTreeSet<_> = (0..100).map(wait).collect();
+    assert!(waits.len() > 50);
+    assert!(waits.iter().all(|wait| (75..=100).contains(&wait.as_millis())), "{waits:?}");
 }

@@ -1,0 +1,528 @@
+//! OTP's rules, written down a second time and directly: what a supervisor has to order after each event. Slow and plain; it
+//! shares nothing with the core but the vocabulary. Each rule cites the manual of stdlib's `supervisor`, or says that it is
+//! one of Sinew's own.
+
+use std::time::Duration;
+
+use super::{
+    AutoShutdown, ChildId, Command, Flags, Generation, Input, Order, Policy, Reason, Refusal, Restart,
+    Strategy,
+};
+use crate::time::Time;
+
+/// OTP's `pid()`, `undefined` and `restarting`, with the wishes that Sinew adds.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Pid {
+    /// Terminated, or ended by itself.
+    Undefined,
+    /// To be started when its turn comes.
+    Due,
+    /// Failed; not to be started before.
+    Restarting(Time),
+    /// Lives: which life, until when it has to be ready.
+    Starting(Generation, Time),
+    Up(Generation),
+    /// Was told to stop; until when.
+    Stopping(Generation, Time),
+}
+
+#[derive(Clone, Debug)]
+struct Child {
+    id: ChildId,
+    policy: Policy,
+    pid: Pid,
+    lives: Generation,
+    released: bool,
+    /// What is to become of it once its present life has ended. `None`: what its restart type says.
+    fate: Option<Fate>,
+    asked: usize,
+    in_a_row: u32,
+    up_since: Option<Time>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Fate {
+    /// Its group is restarted.
+    StartAgain,
+    /// A command said so, or the end of all.
+    StayDown,
+}
+
+/// The rules as a machine that predicts orders.
+pub(super) struct Model {
+    flags: Flags,
+    children: Vec<Child>,
+    /// When restarts were counted, all of them.
+    counted: Vec<Time>,
+    lost: Vec<Time>,
+    taken: Vec<(ChildId, Generation)>,
+    started: bool,
+    ending: Option<End>,
+    ended: bool,
+    settled: bool,
+    expected: Vec<Order>,
+}
+
+/// Why all children are to end. The words of giving up are not predicted.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum End {
+    Shutdown,
+    GaveUp,
+}
+
+impl Child {
+    fn alive(&self) -> Option<Generation> {
+        match self.pid {
+            Pid::Starting(life, _) | Pid::Up(life) | Pid::Stopping(life, _) => Some(life),
+            Pid::Undefined | Pid::Due | Pid::Restarting(_) => None,
+        }
+    }
+
+    /// Sinew: a held child waits for its release. One that waits keeps those after it waiting, but not the word that all
+    /// are ready.
+    fn held_back(&self) -> bool {
+        self.pid == Pid::Due && self.policy.held && !self.released
+    }
+}
+
+/// "A permanent child process is always restarted. A temporary child process is never restarted. A transient child process is
+/// restarted only if it terminates abnormally, that is, with an exit reason other than normal, shutdown, or {shutdown,Term}."
+fn is_restarted(restart: Restart, reason: &Reason) -> bool {
+    match (restart, reason) {
+        (Restart::Permanent, _) => true,
+        (Restart::Temporary, _) | (Restart::Transient, Reason::Normal | Reason::Shutdown) => false,
+        (
+            Restart::Transient,
+            Reason::Panic(_)
+            | Reason::StartTimeout
+            | Reason::Hung(_)
+            | Reason::Killed
+            | Reason::ThreadEnded
+            | Reason::ProcessEnded(_)
+            | Reason::GaveUp(_),
+        ) => true,
+    }
+}
+
+/// "one_for_one: only that process is restarted. rest_for_one: the rest of the child processes (those after it in start
+/// order) are terminated; then it and all after it are restarted. one_for_all: all others are terminated, then all are
+/// restarted."
+fn goes_with(strategy: Strategy, failed: usize, other: usize) -> bool {
+    match strategy {
+        Strategy::OneForOne => false,
+        Strategy::RestForOne => other > failed,
+        Strategy::OneForAll => other != failed,
+    }
+}
+
+/// "If more than MaxR restarts occur within MaxT seconds, the supervisor terminates all the child processes and then itself."
+fn too_many(times: &[Time], max: usize, window: Duration) -> bool {
+    let now = *times.last().expect("the one that was just counted");
+    times.iter().filter(|at| now.since(**at) <= window).count() > max
+}
+
+impl Model {
+    pub(super) fn new(flags: Flags, children: Vec<(ChildId, Policy)>) -> Self {
+        let mut model = Self {
+            flags,
+            children: Vec::new(),
+            counted: Vec::new(),
+            lost: Vec::new(),
+            taken: Vec::new(),
+            started: false,
+            ending: None,
+            ended: false,
+            settled: false,
+            expected: Vec::new(),
+        };
+        children.into_iter().for_each(|(id, policy)| model.append(id, policy, Pid::Undefined));
+        model
+    }
+
+    fn append(&mut self, id: ChildId, policy: Policy, pid: Pid) {
+        let (fate, up_since) = (None, None);
+        let child =
+            Child { id, policy, pid, lives: 0, released: false, fate, asked: 0, in_a_row: 0, up_since };
+        self.children.push(child);
+    }
+
+    /// What the supervisor has to order. `restart_at`: when it says that it will start this child again; that this lies in
+    /// the limits of the back-off is checked here.
+    pub(super) fn step(
+        &mut self,
+        now: Time,
+        input: &Input,
+        restart_at: &dyn Fn(ChildId) -> Option<Time>,
+    ) -> Vec<Order> {
+        if self.ended {
+            if let Some((command, id)) = command(input) {
+                self.say(Order::Refused(command, id, Refusal::Ending));
+            }
+            return std::mem::take(&mut self.expected);
+        }
+        self.hear(now, input, restart_at);
+        self.let_time_pass(now, restart_at);
+        self.act(now);
+        std::mem::take(&mut self.expected)
+    }
+
+    fn hear(&mut self, now: Time, input: &Input, restart_at: &dyn Fn(ChildId) -> Option<Time>) {
+        if let Some((command, id)) = command(input) {
+            return self.obey(command, id, input);
+        }
+        match input {
+            Input::Started => {
+                if !self.started && self.ending.is_none() {
+                    self.children.iter_mut().for_each(|child| child.pid = Pid::Due);
+                }
+                self.started = true;
+            }
+            Input::StopOrdered => self.finish(End::Shutdown),
+            Input::Released(id) => {
+                self.children.iter_mut().filter(|c| c.id == *id).for_each(|c| c.released = true);
+            }
+            Input::BecameReady(id, life) => {
+                let found = self.children.iter_mut().find(|c| c.id == *id);
+                if let Some(child) = found
+                    && let Pid::Starting(current, _) = child.pid
+                    && current == *life
+                {
+                    (child.pid, child.up_since) = (Pid::Up(current), Some(now));
+                    self.say(Order::Ready(*id));
+                }
+            }
+            Input::Hung(id, life, reason) => {
+                if let Some(index) = self.index(*id, *life) {
+                    self.take_life(now, index, reason, restart_at);
+                }
+            }
+            Input::Ended(id, life, reason) => match self.index(*id, *life) {
+                Some(index) => self.exit(now, index, reason, restart_at),
+                None => self.taken.retain(|taken| *taken != (*id, *life)),
+            },
+            Input::TimePassed
+            | Input::AddChild(..)
+            | Input::TerminateChild(_)
+            | Input::RestartChild(_)
+            | Input::DeleteChild(_) => {}
+        }
+    }
+
+    fn index(&self, id: ChildId, life: Generation) -> Option<usize> {
+        self.children.iter().position(|child| child.id == id && child.alive() == Some(life))
+    }
+
+    fn say(&mut self, order: Order) {
+        self.expected.push(order);
+    }
+
+    /// Sinew: every wait has a deadline; the first child in order whose time is over comes first.
+    fn let_time_pass(&mut self, now: Time, restart_at: &dyn Fn(ChildId) -> Option<Time>) {
+        loop {
+            let late = self.children.iter().position(|child| match child.pid {
+                Pid::Restarting(at) | Pid::Starting(_, at) | Pid::Stopping(_, at) => at <= now,
+                Pid::Undefined | Pid::Due | Pid::Up(_) => false,
+            });
+            let Some(index) = late else { return };
+            match self.children[index].pid {
+                Pid::Starting(..) => self.take_life(now, index, &Reason::StartTimeout, restart_at),
+                Pid::Stopping(..) => self.take_life(now, index, &Reason::Killed, restart_at),
+                Pid::Undefined | Pid::Due | Pid::Restarting(_) | Pid::Up(_) => {
+                    self.children[index].pid = Pid::Due;
+                }
+            }
+        }
+    }
+
+    /// Sinew: a life that is taken keeps its thread until it lets go; more than so many, and the supervisor gives up.
+    fn take_life(
+        &mut self,
+        now: Time,
+        index: usize,
+        reason: &Reason,
+        restart_at: &dyn Fn(ChildId) -> Option<Time>,
+    ) {
+        let child = &self.children[index];
+        let taken = (child.id, child.alive().expect("only the living are taken"));
+        self.say(Order::Abandon(taken.0, taken.1));
+        self.taken.push(taken);
+        self.exit(now, index, reason, restart_at);
+        if self.taken.len() > self.flags.abandoned_max {
+            self.finish(End::GaveUp);
+        }
+    }
+
+    /// OTP's `handle_info({'EXIT', Pid, Reason})`.
+    fn exit(
+        &mut self,
+        now: Time,
+        index: usize,
+        reason: &Reason,
+        restart_at: &dyn Fn(ChildId) -> Option<Time>,
+    ) {
+        self.settled = false;
+        let child = &mut self.children[index];
+        child.released = false;
+        let (id, restart) = (child.id, child.policy.restart);
+        if let Some(fate) = child.fate.take() {
+            return self.exit_as_ordered(index, fate, reason);
+        }
+        child.pid = Pid::Undefined;
+        if is_restarted(restart, reason) {
+            self.say(Order::Failed(id, reason.clone()));
+            return self.restart(now, index, reason, restart_at);
+        }
+        self.say(Order::Gone(id, reason.clone()));
+        let significant = child_is_significant(&self.children[index]);
+        self.drop_if_temporary(index);
+        if significant {
+            self.auto_shutdown();
+        }
+    }
+
+    /// "a temporary child process is never restarted (even when the supervisor's restart strategy is rest_for_one or
+    /// one_for_all and a sibling's death causes the temporary process to be terminated)"
+    fn exit_as_ordered(&mut self, index: usize, fate: Fate, reason: &Reason) {
+        let said = if *reason == Reason::Normal { Reason::Shutdown } else { reason.clone() };
+        let child = &mut self.children[index];
+        let (id, asked) = (child.id, std::mem::take(&mut child.asked));
+        let again = fate == Fate::StartAgain && child.policy.restart != Restart::Temporary;
+        child.pid = if again { Pid::Due } else { Pid::Undefined };
+        if again || self.ending.is_some() {
+            self.say(Order::Failed(id, said));
+        } else {
+            self.say(Order::Gone(id, said));
+            self.drop_if_temporary(index);
+        }
+        (0..asked).for_each(|_| self.say(Order::Done(Command::Terminate, id)));
+    }
+
+    /// "if it is a temporary child process, the child specification is deleted"
+    fn drop_if_temporary(&mut self, index: usize) {
+        if self.children[index].policy.restart == Restart::Temporary {
+            let child = self.children.remove(index);
+            self.say(Order::Deleted(child.id));
+        }
+    }
+
+    fn restart(
+        &mut self,
+        now: Time,
+        index: usize,
+        reason: &Reason,
+        restart_at: &dyn Fn(ChildId) -> Option<Time>,
+    ) {
+        let intensity = self.flags.intensity;
+        // Sinew: who lost its thread is not at fault; such restarts have a limit of their own.
+        let (times, max) = match reason {
+            Reason::ThreadEnded => (&mut self.lost, intensity.losses_max),
+            Reason::Normal
+            | Reason::Shutdown
+            | Reason::Panic(_)
+            | Reason::StartTimeout
+            | Reason::Hung(_)
+            | Reason::Killed
+            | Reason::ProcessEnded(_)
+            | Reason::GaveUp(_) => (&mut self.counted, intensity.restarts_max),
+        };
+        times.push(now);
+        if too_many(times, max, intensity.window) {
+            return self.finish(End::GaveUp);
+        }
+        let wait = self.children[index].longest_wait(now, intensity.window);
+        let at = restart_at(self.children[index].id).unwrap_or(now + wait);
+        assert!(at <= now + wait, "back-off longer than {wait:?}");
+        assert!(at >= now + wait * 3 / 4, "back-off shorter than three quarters of {wait:?}");
+        self.children[index].pid = Pid::Restarting(at);
+        for other in 0..self.children.len() {
+            if goes_with(self.flags.strategy, index, other) {
+                self.children[other].go_with_the_group();
+            }
+        }
+    }
+
+    /// "any_significant: the supervisor automatically shuts itself down when any significant child terminates, that is, when
+    /// a transient significant child terminates normally or when a temporary significant child terminates normally or
+    /// abnormally. all_significant: when all significant children have terminated."
+    fn auto_shutdown(&mut self) {
+        let over = match self.flags.auto_shutdown {
+            AutoShutdown::Never => false,
+            AutoShutdown::AnySignificant => true,
+            AutoShutdown::AllSignificant => {
+                self.children.iter().filter(|child| child_is_significant(child)).all(|child| !child.works())
+            }
+        };
+        if over {
+            self.finish(End::Shutdown);
+        }
+    }
+
+    fn finish(&mut self, end: End) {
+        self.ending.get_or_insert(end);
+        for child in &mut self.children {
+            match child.alive() {
+                Some(_) => child.fate = Some(Fate::StayDown),
+                None => child.pid = Pid::Undefined,
+            }
+        }
+    }
+
+    fn obey(&mut self, command: Command, id: ChildId, input: &Input) {
+        let found = self.children.iter().position(|child| child.id == id);
+        let refusal = match (command, found) {
+            _ if self.ending.is_some() => Some(Refusal::Ending),
+            (Command::Add, Some(_)) => Some(Refusal::Present),
+            (Command::Add, None) => None,
+            (Command::Terminate | Command::Restart | Command::Delete, None) => Some(Refusal::Unknown),
+            (Command::Terminate, Some(_)) => None,
+            // "{error, running}", "{error, restarting}"
+            (Command::Restart | Command::Delete, Some(index)) => match self.children[index].pid {
+                Pid::Undefined => None,
+                Pid::Restarting(_) => Some(Refusal::Restarting),
+                Pid::Due | Pid::Starting(..) | Pid::Up(_) | Pid::Stopping(..) => Some(Refusal::Running),
+            },
+        };
+        if let Some(refusal) = refusal {
+            return self.say(Order::Refused(command, id, refusal));
+        }
+        let pid = if self.started { Pid::Due } else { Pid::Undefined };
+        match (input, found) {
+            (Input::AddChild(_, policy), _) => self.append(id, policy.clone(), pid),
+            (Input::TerminateChild(_), Some(index)) => return self.terminate(index),
+            (Input::RestartChild(_), Some(index)) => self.children[index].pid = Pid::Due,
+            (Input::DeleteChild(_), Some(index)) => {
+                self.children.remove(index);
+                self.say(Order::Deleted(id));
+            }
+            other => unreachable!("{other:?} was refused"),
+        }
+        self.settled &= command == Command::Delete;
+        self.say(Order::Done(command, id));
+    }
+
+    /// "the process, if any, is terminated and, unless it is a temporary child, the child specification is kept"
+    fn terminate(&mut self, index: usize) {
+        let child = &mut self.children[index];
+        let id = child.id;
+        match child.pid {
+            Pid::Starting(..) | Pid::Up(_) | Pid::Stopping(..) => {
+                child.asked += 1;
+                child.fate = Some(Fate::StayDown);
+                return;
+            }
+            Pid::Due | Pid::Restarting(_) => self.say(Order::Gone(id, Reason::Shutdown)),
+            Pid::Undefined => {}
+        }
+        self.children[index].pid = Pid::Undefined;
+        self.drop_if_temporary(index);
+        self.say(Order::Done(Command::Terminate, id));
+    }
+
+    /// "When the supervisor terminates children, it does so in reverse start order"; it starts them in start order.
+    fn act(&mut self, now: Time) {
+        let together = self.flags.strategy != Strategy::OneForOne;
+        let mut blocked = false;
+        for index in (0..self.children.len()).rev() {
+            let child = &mut self.children[index];
+            // A group is stopped one by one; alone, each stops when it is told to.
+            let waits = blocked && (together || self.ending.is_some());
+            let (Some(_), Some(life)) = (child.fate, child.alive()) else { continue };
+            if !waits && !matches!(child.pid, Pid::Stopping(..)) {
+                child.pid = Pid::Stopping(life, now + child.policy.stop_within);
+                let order = Order::Stop(child.id, life);
+                self.say(order);
+            }
+            blocked = true;
+        }
+        if blocked && (together || self.ending.is_some()) {
+            return;
+        }
+        match self.ending {
+            Some(end) => {
+                self.ended = true;
+                let words = String::new();
+                self.say(Order::Ended(if end == End::Shutdown {
+                    Reason::Shutdown
+                } else {
+                    Reason::GaveUp(words)
+                }));
+            }
+            None => self.start_who_is_due(now, together),
+        }
+    }
+
+    fn start_who_is_due(&mut self, now: Time, together: bool) {
+        for index in 0..self.children.len() {
+            let child = &mut self.children[index];
+            if child.pid == Pid::Due && !child.held_back() {
+                child.lives += 1;
+                child.pid = Pid::Starting(child.lives, now + child.policy.start_within);
+                let order = Order::Spawn(child.id, child.lives);
+                self.say(order);
+            }
+            let child = &self.children[index];
+            if together && !matches!(child.pid, Pid::Up(_) | Pid::Undefined) {
+                break;
+            }
+        }
+        let rests = |child: &Child| matches!(child.pid, Pid::Up(_) | Pid::Undefined) || child.held_back();
+        let leaves = |child: &Child| child.fate == Some(Fate::StayDown);
+        if self.started && !self.settled && self.children.iter().all(|child| rests(child) || leaves(child)) {
+            self.settled = true;
+            self.say(Order::AllReady);
+        }
+    }
+
+    /// What must hold between events, whatever came before.
+    pub(super) fn is_ended(&self) -> bool {
+        self.ended
+    }
+}
+
+fn child_is_significant(child: &Child) -> bool {
+    child.policy.significant
+}
+
+impl Child {
+    /// Is one whose end counts as the end of work: lives for itself, or will.
+    fn works(&self) -> bool {
+        self.pid != Pid::Undefined && self.fate != Some(Fate::StayDown)
+    }
+
+    fn go_with_the_group(&mut self) {
+        let temporary = self.policy.restart == Restart::Temporary;
+        match (self.pid, temporary) {
+            // "the child process can later be restarted by the supervisor"
+            (Pid::Undefined, false) => self.pid = Pid::Due,
+            (Pid::Undefined | Pid::Due | Pid::Restarting(_), _) => {}
+            (Pid::Starting(..) | Pid::Up(_) | Pid::Stopping(..), true) => self.fate = Some(Fate::StayDown),
+            (Pid::Starting(..) | Pid::Up(_) | Pid::Stopping(..), false) => self.fate = Some(Fate::StartAgain),
+        }
+    }
+
+    /// Sinew: doubled by each failure in a row, forgotten after a life of more than a window.
+    fn longest_wait(&mut self, now: Time, window: Duration) -> Duration {
+        if self.up_since.is_some_and(|since| now.since(since) > window) {
+            self.in_a_row = 0;
+        }
+        let wait = (0..self.in_a_row).fold(self.policy.backoff_min, |wait, _| wait.saturating_mul(2));
+        self.in_a_row += 1;
+        wait.min(self.policy.backoff_max)
+    }
+}
+
+fn command(input: &Input) -> Option<(Command, ChildId)> {
+    match input {
+        Input::AddChild(id, _) => Some((Command::Add, *id)),
+        Input::TerminateChild(id) => Some((Command::Terminate, *id)),
+        Input::RestartChild(id) => Some((Command::Restart, *id)),
+        Input::DeleteChild(id) => Some((Command::Delete, *id)),
+        Input::Started
+        | Input::Released(_)
+        | Input::BecameReady(..)
+        | Input::Hung(..)
+        | Input::Ended(..)
+        | Input::TimePassed
+        | Input::StopOrdered => None,
+    }
+}

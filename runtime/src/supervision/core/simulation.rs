@@ -1,0 +1,295 @@
+//! Random histories of a supervisor, each order checked against the [model](super::model) and against the world.
+
+use std::{collections::BTreeMap, time::Duration};
+
+use super::{model::Model, window::Chance, *};
+
+/// Histories in an ordinary run.
+const HISTORIES: u64 = 50_000;
+/// How many instead; `docs/TESTING.md` has the command.
+const HISTORIES_VARIABLE: &str = "SINEW_HISTORIES";
+const STEPS_MAX: u64 = 80;
+
+#[test]
+fn any_history_gives_the_orders_that_the_rules_of_otp_give() {
+    let asked_for = std::env::var(HISTORIES_VARIABLE).ok();
+    let histories = asked_for.map_or(HISTORIES, |text| text.parse().expect("a number of histories"));
+    let mut seen = Seen::default();
+    for seed in 0..histories {
+        History::new(seed).run(&mut seen);
+    }
+    println!("{histories} histories: {seen:?}");
+    seen.must_cover_everything();
+}
+
+/// What came up, so that a generator that tries nothing is noticed.
+#[derive(Debug, Default)]
+struct Seen {
+    inputs: u64,
+    orders: u64,
+    restarts: u64,
+    gave_up: u64,
+    shut_down: u64,
+    done: u64,
+    refused: u64,
+    abandoned: u64,
+}
+
+impl Seen {
+    fn note(&mut self, order: &Order) {
+        self.orders += 1;
+        match order {
+            Order::Spawn(_, generation) => self.restarts += u64::from(*generation > 1),
+            Order::Abandon(..) => self.abandoned += 1,
+            Order::Done(..) => self.done += 1,
+            Order::Refused(..) => self.refused += 1,
+            Order::Ended(Reason::GaveUp(_)) => self.gave_up += 1,
+            Order::Ended(_) => self.shut_down += 1,
+            Order::Stop(..)
+            | Order::Failed(..)
+            | Order::Ready(_)
+            | Order::Gone(..)
+            | Order::Deleted(_)
+            | Order::AllReady => {}
+        }
+    }
+
+    fn must_cover_everything(&self) {
+        let Self { restarts, gave_up, shut_down, done, refused, abandoned, .. } = self;
+        let rarest = [restarts, gave_up, shut_down, done, refused, abandoned].into_iter().min();
+        assert!(rarest.is_some_and(|count| *count > 1_000), "something was hardly tried: {self:?}");
+    }
+}
+
+/// What lives, as a shell would see it. Panics where an order is against nature.
+#[derive(Default)]
+struct World {
+    alive: BTreeMap<ChildId, Generation>,
+    /// Taken, and may report their end late.
+    taken: Vec<(ChildId, Generation)>,
+    ended: bool,
+}
+
+impl World {
+    fn obey(&mut self, order: &Order) {
+        assert!(!self.ended || matches!(order, Order::Refused(..)), "an order after the last one: {order:?}");
+        match order {
+            Order::Spawn(id, generation) => {
+                assert!(self.alive.insert(*id, *generation).is_none(), "two lives of one child");
+            }
+            Order::Stop(id, generation) => assert_eq!(self.alive.get(id), Some(generation)),
+            Order::Abandon(id, generation) => {
+                assert_eq!(self.alive.remove(id), Some(*generation));
+                self.taken.push((*id, *generation));
+            }
+            Order::Ended(_) => {
+                assert!(self.alive.is_empty(), "ended with {:?} alive", self.alive);
+                self.ended = true;
+            }
+            Order::Failed(id, _) | Order::Gone(id, _) | Order::Deleted(id) => {
+                assert!(!self.alive.contains_key(id), "an end was said of one that lives");
+            }
+            Order::Ready(_) | Order::AllReady | Order::Done(..) | Order::Refused(..) => {}
+        }
+    }
+}
+
+struct History {
+    seed: u64,
+    chance: Chance,
+    now: Time,
+    next_id: u64,
+    core: Core,
+    model: Model,
+    world: World,
+    told: Vec<(Time, Input)>,
+}
+
+impl History {
+    fn new(seed: u64) -> Self {
+        let mut chance = Chance(seed.wrapping_mul(0x2545_f491_4f6c_dd1d));
+        let flags = any_flags(&mut chance);
+        let count = chance.below(6);
+        let children: Vec<_> = (0..count).map(|id| (ChildId(id), any_policy(&mut chance))).collect();
+        Self {
+            seed,
+            chance,
+            now: Time::from_nanos(1_000_000),
+            next_id: count,
+            core: Core::new(flags, seed, children.clone()),
+            model: Model::new(flags, children),
+            world: World::default(),
+            told: Vec::new(),
+        }
+    }
+
+    fn run(mut self, seen: &mut Seen) {
+        let steps = 1 + self.chance.below(STEPS_MAX);
+        self.tell(Input::Started, seen);
+        for _ in 0..steps {
+            if self.world.ended && self.chance.below(3) > 0 {
+                break;
+            }
+            let input = self.any_input();
+            self.tell(input, seen);
+        }
+        // Whatever came before: told to stop, and given time, it ends.
+        self.tell(Input::StopOrdered, seen);
+        for _ in 0..=self.next_id {
+            if let Some(wake) = self.core.next_wake() {
+                self.now = self.now.max(wake);
+            }
+            self.tell(Input::TimePassed, seen);
+        }
+        assert!(self.model.is_ended() && self.world.ended, "does not end: {}", self.story());
+    }
+
+    fn tell(&mut self, input: Input, seen: &mut Seen) {
+        seen.inputs += 1;
+        self.told.push((self.now, input.clone()));
+        if let Input::Ended(id, generation, _) = &input {
+            if self.world.alive.get(id) == Some(generation) {
+                self.world.alive.remove(id);
+            }
+            self.world.taken.retain(|taken| taken != &(*id, *generation));
+        }
+        self.core.handle(self.now, input.clone());
+        let ordered: Vec<Order> = std::iter::from_fn(|| self.core.poll()).collect();
+        for order in &ordered {
+            seen.note(order);
+            self.world.obey(order);
+        }
+        let core = &self.core;
+        let restart_at = |id| match core.child(id)?.state {
+            ChildState::BackingOff(at) => Some(at),
+            ChildState::Down | ChildState::Starting(_) | ChildState::Ready | ChildState::Stopping(_) => None,
+        };
+        let expected = self.model.step(self.now, &input, &restart_at);
+        let same =
+            ordered.len() == expected.len() && ordered.iter().zip(&expected).all(|(a, b)| is_same(a, b));
+        assert!(same, "the rules say\n  {expected:?}\nand the core\n  {ordered:?}\nafter{}", self.story());
+    }
+
+    fn story(&self) -> String {
+        let told: String =
+            self.told.iter().map(|(at, input)| format!("\n  {:?} {input:?}", at.since(Time::ZERO))).collect();
+        format!("{told}\nwith {:?}, seed {}", self.core.flags(), self.seed)
+    }
+
+    fn any_input(&mut self) -> Input {
+        match self.chance.below(100) {
+            0..30 => self.some_life_is_ready(),
+            30..40 => {
+                let (id, generation) = self.any_life();
+                Input::Ended(id, generation, any_reason(&mut self.chance))
+            }
+            40..42 => {
+                let (id, generation) = self.any_life();
+                Input::Hung(id, generation, Reason::Hung(String::new()))
+            }
+            42..50 => Input::Released(self.any_id()),
+            50..56 => Input::TerminateChild(self.any_id()),
+            56..63 => Input::RestartChild(self.any_id()),
+            63..67 => Input::DeleteChild(self.any_id()),
+            67..71 => {
+                let present = self.core.children().next().filter(|_| self.chance.below(5) == 0);
+                let id = present.unwrap_or(ChildId(self.next_id));
+                self.next_id += u64::from(present.is_none());
+                Input::AddChild(id, any_policy(&mut self.chance))
+            }
+            71..72 if self.chance.below(4) == 0 => Input::StopOrdered,
+            72..75 => match self.world.taken.last() {
+                Some((id, generation)) => Input::Ended(*id, *generation, Reason::Killed),
+                None => Input::Started,
+            },
+            _ => self.some_time_passes(),
+        }
+    }
+
+    fn some_life_is_ready(&mut self) -> Input {
+        let starts = |(id, _): &&(ChildId, Generation)| {
+            matches!(self.core.child(*id).map(|child| child.state), Some(ChildState::Starting(_)))
+        };
+        let alive: Vec<_> = self.world.alive.iter().map(|(id, generation)| (*id, *generation)).collect();
+        let (id, generation) = match alive.iter().find(starts) {
+            Some(life) if self.chance.below(5) > 0 => *life,
+            Some(_) | None => self.any_life(),
+        };
+        Input::BecameReady(id, generation)
+    }
+
+    fn some_time_passes(&mut self) -> Input {
+        let step = Duration::from_millis([1, 5, 5, 40, 300][self.chance.below(5) as usize]);
+        let wake = self.core.next_wake().filter(|_| self.chance.below(2) > 0);
+        self.now = wake.unwrap_or(self.now + step).max(self.now);
+        Input::TimePassed
+    }
+
+    fn any_id(&mut self) -> ChildId {
+        let unknown = self.next_id == 0 || self.chance.below(10) == 0;
+        ChildId(self.chance.below(self.next_id + u64::from(unknown)))
+    }
+
+    /// Mostly one that lives; sometimes one that did, or does not yet.
+    fn any_life(&mut self) -> (ChildId, Generation) {
+        let alive: Vec<_> = self.world.alive.iter().map(|(id, generation)| (*id, *generation)).collect();
+        if alive.is_empty() || self.chance.below(12) == 0 {
+            return (self.any_id(), self.chance.below(4));
+        }
+        alive[self.chance.below(alive.len() as u64) as usize]
+    }
+}
+
+fn is_same(ordered: &Order, expected: &Order) -> bool {
+    match (ordered, expected) {
+        // The words are for people.
+        (Order::Ended(Reason::GaveUp(_)), Order::Ended(Reason::GaveUp(_))) => true,
+        _ => ordered == expected,
+    }
+}
+
+impl Chance {
+    fn below(&mut self, bound: u64) -> u64 {
+        self.next() % bound
+    }
+}
+
+fn any_flags(chance: &mut Chance) -> Flags {
+    let strategies = [Strategy::OneForOne, Strategy::RestForOne, Strategy::OneForAll];
+    let shutdowns = [AutoShutdown::Never, AutoShutdown::AnySignificant, AutoShutdown::AllSignificant];
+    Flags {
+        strategy: strategies[chance.below(3) as usize],
+        intensity: Intensity {
+            restarts_max: chance.below(12) as usize,
+            losses_max: chance.below(6) as usize,
+            // Some as long as a step of time: a restart exactly one window ago counts.
+            window: Duration::from_millis([5, 40, 300, 1_000, 5_000][chance.below(5) as usize]),
+        },
+        auto_shutdown: shutdowns[chance.below(3) as usize],
+        abandoned_max: chance.below(8) as usize,
+    }
+}
+
+fn any_policy(chance: &mut Chance) -> Policy {
+    let restarts = [Restart::Permanent, Restart::Permanent, Restart::Transient, Restart::Temporary];
+    Policy {
+        restart: restarts[chance.below(4) as usize],
+        significant: chance.below(3) == 0,
+        start_within: Duration::from_millis(1 + chance.below(5_000)),
+        stop_within: Duration::from_millis(1 + chance.below(500)),
+        backoff_min: Duration::from_millis(chance.below(4)),
+        backoff_max: Duration::from_millis(3 + chance.below(100)),
+        held: chance.below(4) == 0,
+        ..Policy::default()
+    }
+}
+
+fn any_reason(chance: &mut Chance) -> Reason {
+    match chance.below(8) {
+        0 | 1 => Reason::Normal,
+        2 => Reason::Shutdown,
+        3 => Reason::ThreadEnded,
+        4 => Reason::ProcessEnded(String::new()),
+        _ => Reason::Panic(String::new()),
+    }
+}
