@@ -33,6 +33,12 @@ struct Shared<E> {
     epoch: u64,
     waker: Option<Waker>,
     refused: u64,
+    /// A copy of the event that the reader handles now, where it wants that.
+    in_hand: Option<E>,
+    /// The first event in the queue was in the hand of a reader that failed.
+    first_is_second_try: bool,
+    /// The same of the event in hand.
+    in_hand_is_second_try: bool,
 }
 
 impl<E> Clone for Post<E> {
@@ -45,7 +51,16 @@ impl<E> Post<E> {
     /// An empty post that holds at most `capacity` events.
     #[must_use]
     pub fn new(capacity: usize) -> Self {
-        let shared = Shared { queue: VecDeque::new(), capacity, epoch: 0, waker: None, refused: 0 };
+        let shared = Shared {
+            queue: VecDeque::new(),
+            capacity,
+            epoch: 0,
+            waker: None,
+            refused: 0,
+            in_hand: None,
+            first_is_second_try: false,
+            in_hand_is_second_try: false,
+        };
         Self { shared: Arc::new(Mutex::new(shared)) }
     }
 
@@ -76,18 +91,59 @@ impl<E> Post<E> {
         lock(&self.shared).refused
     }
 
-    /// Takes over the reading end: a stream that ends when a later reader attaches.
+    /// Takes over the reading end: a stream that ends when a later reader attaches. An event that is in the hand of a
+    /// reader when it fails is lost.
     #[must_use]
     pub fn attach(&self) -> PostStream<E> {
-        let mut shared = lock(&self.shared);
-        shared.epoch += 1;
-        let stream = PostStream { shared: self.shared.clone(), epoch: shared.epoch };
-        let former = shared.waker.take();
-        drop(shared);
+        self.attach_as(None)
+    }
+
+    /// The same for events that must not be lost: of the one in the reader's hand the post keeps what `keep` makes of it.
+    /// When the reader fails, the next one gets that first, and so gets it twice if it failed late. An event on which a
+    /// second reader fails too is dropped, and logged: it must not take all its successors along.
+    #[must_use]
+    pub fn attach_keeping(&self, keep: fn(&E) -> E) -> PostStream<E> {
+        self.attach_as(Some(keep))
+    }
+
+    fn attach_as(&self, keep: Option<fn(&E) -> E>) -> PostStream<E> {
+        let (epoch, former, dropped) = {
+            let mut shared = lock(&self.shared);
+            shared.epoch += 1;
+            (shared.epoch, shared.waker.take(), shared.give_back())
+        };
         if let Some(waker) = former {
             waker.wake();
         }
-        stream
+        if dropped.is_some() {
+            tracing::error!("an event on which two readers failed is dropped");
+        }
+        PostStream { shared: self.shared.clone(), epoch, keep }
+    }
+}
+
+impl<E> Shared<E> {
+    /// Puts the event in the hand of a reader that failed back to the front, beyond the capacity by this one; or returns
+    /// it, if that was done before.
+    fn give_back(&mut self) -> Option<E> {
+        let event = self.in_hand.take()?;
+        if self.in_hand_is_second_try {
+            return Some(event);
+        }
+        self.queue.push_front(event);
+        self.first_is_second_try = true;
+        None
+    }
+
+    /// The next event, and what was kept of the one before it, which is handled.
+    fn take(&mut self, keep: Option<fn(&E) -> E>) -> (Option<E>, Option<E>) {
+        let handled = self.in_hand.take();
+        let next = self.queue.pop_front();
+        if let (Some(keep), Some(event)) = (keep, &next) {
+            self.in_hand = Some(keep(event));
+            self.in_hand_is_second_try = std::mem::take(&mut self.first_is_second_try);
+        }
+        (next, handled)
     }
 }
 
@@ -96,6 +152,7 @@ impl<E> Post<E> {
 pub struct PostStream<E> {
     shared: Arc<Mutex<Shared<E>>>,
     epoch: u64,
+    keep: Option<fn(&E) -> E>,
 }
 
 impl<E> Stream for PostStream<E> {
@@ -106,12 +163,16 @@ impl<E> Stream for PostStream<E> {
         if shared.epoch != self.epoch {
             return Poll::Ready(None);
         }
-        let next = shared.queue.pop_front();
+        let (next, handled) = shared.take(self.keep);
         if next.is_none() {
             shared.waker = Some(cx.waker().clone());
+        }
+        // Dropped outside the lock, like everything that is not the post's own.
+        drop(shared);
+        drop(handled);
+        if next.is_none() {
             return Poll::Pending;
         }
-        drop(shared);
         #[cfg(feature = "fault-points")]
         crate::supervision::fault::strike();
         Poll::Ready(next)
@@ -142,5 +203,29 @@ mod tests {
         let mut second = post.attach();
         assert_eq!(first.next().now_or_never(), Some(None), "the former reader is fenced off");
         assert_eq!(second.next().now_or_never(), Some(Some(2)));
+    }
+
+    #[test]
+    fn an_event_in_the_hand_of_one_that_failed_reaches_the_next_one_first_and_no_third() {
+        let post = Post::new(4);
+        let read = |stream: &mut PostStream<i32>| stream.next().now_or_never().flatten();
+        [1, 2, 3].into_iter().for_each(|event| post.post(event).unwrap());
+        let mut first = post.attach_keeping(Clone::clone);
+        assert_eq!([read(&mut first), read(&mut first)], [Some(1), Some(2)]);
+        let mut second = post.attach_keeping(Clone::clone);
+        assert_eq!(read(&mut second), Some(2), "the first one failed with it in its hand");
+        let mut third = post.attach_keeping(Clone::clone);
+        assert_eq!(read(&mut third), Some(3), "two have failed on it");
+        assert_eq!(read(&mut third), None);
+        let mut fourth = post.attach_keeping(Clone::clone);
+        assert_eq!(read(&mut fourth), None, "the last event was handled: the third one came for more");
+    }
+
+    #[test]
+    fn an_event_may_be_tried_twice_after_another_was_tried_twice() {
+        let post = Post::new(4);
+        let read = || post.attach_keeping(Clone::clone).next().now_or_never().flatten();
+        [1, 2].into_iter().for_each(|event| post.post(event).unwrap());
+        assert_eq!([read(), read(), read(), read(), read()], [Some(1), Some(1), Some(2), Some(2), None]);
     }
 }

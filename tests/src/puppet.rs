@@ -6,6 +6,7 @@ use std::sync::{
     mpsc::sync_channel,
 };
 
+use actix::StreamHandler;
 use sinew::{Sender, prelude::*};
 
 use crate::{DEADLINE, Log};
@@ -240,6 +241,12 @@ impl Handler<Delivery<Value>> for Puppet {
     }
 }
 
+impl StreamHandler<u64> for Puppet {
+    fn handle(&mut self, number: u64, context: &mut Self::Context) {
+        self.got(number, context);
+    }
+}
+
 impl Handler<Delivery<NodeEvent>> for Puppet {
     type Result = ();
 
@@ -254,6 +261,12 @@ impl Handler<Delivery<RequirementEvent>> for Puppet {
     fn handle(&mut self, event: Delivery<RequirementEvent>, _: &mut Self::Context) {
         self.log.write(Seen::Requirement(event.payload));
     }
+}
+
+/// Waits until a puppet got so many messages, over all its lives; returns their numbers in order.
+#[track_caller]
+pub fn wait_for_numbers(log: &Log<Seen>, count: usize) -> Vec<u64> {
+    log.wait(&format!("message {count}"), |seen| Some(numbers(seen)).filter(|got| got.len() >= count))
 }
 
 /// How many lives a puppet began so far.
@@ -310,6 +323,17 @@ impl DeskKey {
 pub fn wait<F: Future>(future: F) -> F::Output {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build();
     runtime.expect("a reactor with nothing but a timer").block_on(future)
+}
+
+/// Sends jobs with these numbers, unconfirmed.
+///
+/// # Panics
+/// If one is not taken.
+#[track_caller]
+pub fn send_jobs(sender: &Sender, to: &str, numbers: impl IntoIterator<Item = u64>) {
+    for number in numbers {
+        sender.send(to, &Job { number }).unwrap_or_else(|error| panic!("job {number}: {error}"));
+    }
 }
 
 /// What became of a job that is sent now.

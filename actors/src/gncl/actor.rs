@@ -34,7 +34,7 @@ use super::{
 use crate::{
     config::NodeConfig,
     ndl,
-    ndl::MembershipFact,
+    ndl::{KnownNode, MembershipFact},
     outlet::LinkNumber,
     stores::{Stores, lock},
     sync,
@@ -353,8 +353,13 @@ impl Actor for Gncl {
         for peer in self.stores.gncl.peers() {
             self.input(Input::Restored { node: peer.node, incarnation: peer.incarnation }, ctx);
         }
+        // NDL tells each change once, and a former instance may have had the last one in its hand.
+        let members = lock(&self.stores.ndl).members(Time::now());
+        for KnownNode { node, incarnation, gncl: address, .. } in members {
+            self.input(Input::NodeFound { node, incarnation, address }, ctx);
+        }
         ctx.add_stream(listener::accepted(listener));
-        ctx.add_stream(self.stores.posts.gncl.attach());
+        ctx.add_stream(self.stores.posts.gncl.attach_keeping(Clone::clone));
         ctx.run_interval(EXPIRY_PERIOD, |actor, _| {
             let now = Time::now();
             for peer in actor.stores.gncl.peers() {

@@ -46,7 +46,7 @@ pub(crate) use peer::{Peer, Store};
 use crate::ndl::MembershipFact;
 
 /// What GNCL is told.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) enum Event {
     /// By NDL: who is there.
     Membership(MembershipFact),

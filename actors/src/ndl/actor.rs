@@ -59,7 +59,7 @@ impl Actor for NdlActor {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        ctx.add_stream(self.stores.posts.ndl.attach());
+        ctx.add_stream(self.stores.posts.ndl.attach_keeping(Clone::clone));
         let (shell, unicast) = Shell::bind(self.stores.clone()).unwrap_or_else(|words| give_up(&words));
         let shell = Rc::new(shell);
         let unicast = tokio::net::UdpSocket::from_std(unicast)

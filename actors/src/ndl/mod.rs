@@ -53,7 +53,7 @@ pub use facts::{LossReason, NodeEvent};
 use crate::{gncl::LinkFact, lncl::AppFact};
 
 /// What NDL is told.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) enum Event {
     /// By GNCL: a connection came, broke, or cannot be made again.
     Link(LinkFact),

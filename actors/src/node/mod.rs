@@ -109,6 +109,11 @@ impl Node {
         self.wait()
     }
 
+    /// Waits until the node ends by itself or is stopped through a handle; returns how it ended.
+    pub fn wait_for_end(mut self) -> NodeEnd {
+        self.wait()
+    }
+
     /// Runs until SIGINT or SIGTERM, or until the node gives up; then stops in order. Returns the exit code for `main`:
     /// 0 after an orderly stop, 1 after giving up.
     pub fn run(mut self) -> ExitCode {

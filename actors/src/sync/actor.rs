@@ -41,7 +41,7 @@ impl Actor for SyncManager {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        ctx.add_stream(self.stores.posts.sync.attach());
+        ctx.add_stream(self.stores.posts.sync.attach_keeping(Event::copy));
         let outlet = Arc::new(PostOutlet(self.stores.posts.sync.clone()));
         self.stores.router.set_local(AppAddress::SYNC, LocalRoute { outlet, events: Arc::new([]) });
         // A predecessor may have failed between two of the core's orders, or before it heard of the groups.

@@ -44,3 +44,15 @@ pub(crate) enum Event {
     /// A message for the sync manager's TID, from another node's.
     Message(Message),
 }
+
+impl Event {
+    /// The same event; of a message without its receipt, which is never shared.
+    fn copy(&self) -> Self {
+        match self {
+            Self::App(fact) => Self::App(fact.clone()),
+            Self::Membership(fact) => Self::Membership(fact.clone()),
+            Self::Link(fact) => Self::Link(*fact),
+            Self::Message(message) => Self::Message(Message::new(message.header, message.payload.clone())),
+        }
+    }
+}

@@ -1,5 +1,8 @@
 //! Faults on real nodes: what happens, and what does not. One binary, one module a theme.
 
+mod layers;
+mod mailboxes;
+mod panics;
 mod points;
 
 use sinew::fault::Fault;
