@@ -7,20 +7,32 @@
 //!                                 Safe ---------------------------+<--------- Safe <----------+
 //! ```
 //!
+//! `stop()` goes to `Stop` from anywhere, and so does a drive that says that it was stopped. It is latched: only `reset()`
+//! leaves it, for `assembling`, and walking has to be released anew; a release pressed meanwhile is refused.
+//!
+//! Whether a longer loss ends in `Sync` by itself or waits in `Hold` for the operator's release says
+//! [`CentralConfig::resume`]. A drive that does not assist though it is asked to does not stop the others: its joint is
+//! flagged as degraded.
+//!
 //! A silence of at most a quarter of a second, a hiccup of a host, does not make the phase unknown: from `Safe` it goes
 //! back at once to what it did before, and the drives' ramps bring assistance back.
 //!
 //! While assembling it says nothing, so that no drive becomes ready before all parts are there.
 
+mod drives;
+
 use crate::control::admission::{Admission, Stamped};
 use crate::joint::{Joint, PerJoint};
 use crate::leg::{BODY_MASS_KG, GRAVITY_M_S2};
-use crate::message::{FootLoad, GaitMode, GaitState, JointSample, Stance};
+use crate::message::{DriveStatus, FootLoad, GaitMode, GaitState, JointSample, Stance};
 use crate::phase::PhaseEstimate;
 use crate::phase::hand_over::{HandOver, HandOverConfig};
 use crate::phase::heel_strike::CONTACT_BW;
 use crate::phase::oscillator::{Oscillator, OscillatorGains};
 use crate::phase::stride_clock::StrideClock;
+use drives::Drives;
+
+pub use drives::bit;
 
 /// Longest time that the estimator is moved on with what was heard at its end, seconds.
 const TICK_LONGEST_S: f64 = 0.005;
@@ -40,6 +52,20 @@ pub enum Estimator {
     },
 }
 
+/// What happens when all parts are back after one was lost.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Resume {
+    /// Walking goes on by itself.
+    ByItself,
+    /// Nothing moves until the operator releases anew. The default.
+    ByOperator,
+}
+
+/// A release that was not taken; nothing has changed. The e-stop was pressed and not yet reset.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("the e-stop is latched: reset it first, central and then the drives")]
+pub struct StillStopped;
+
 /// Numbers of the central unit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CentralConfig {
@@ -56,6 +82,11 @@ pub struct CentralConfig {
     /// Longest silence of an input over which the phase is still believed, seconds; after a longer one the estimator
     /// starts cold. Default 0.25, a fifth of a stride. The drives damp from the first stale tick on in any case.
     pub gap_coast_max_s: f64,
+    /// How it goes on after a loss.
+    pub resume: Resume,
+    /// Longest time without a word of a drive that it assists, while it is asked to, before its joint counts as
+    /// degraded, seconds. Default 0.025: five statuses.
+    pub drive_silence_max_s: f64,
     /// Number of this life of central; larger than that of any life before.
     pub epoch: u32,
 }
@@ -69,6 +100,8 @@ impl Default for CentralConfig {
             strike_error_max: 0.10,
             strike_gap_max_s: 2.5,
             gap_coast_max_s: 0.25,
+            resume: Resume::ByOperator,
+            drive_silence_max_s: 0.025,
             epoch: 1,
         }
     }
@@ -105,6 +138,7 @@ enum Stage {
     Syncing,
     Walking,
     Lost,
+    Stopped,
 }
 
 #[derive(Debug, Clone)]
@@ -121,6 +155,7 @@ pub struct CentralCore {
     stage: Stage,
     released: bool,
     nodes_lost: PerJoint<bool>,
+    drives: Drives,
     samples: PerJoint<Admission<JointSample>>,
     load: Admission<FootLoad>,
     estimator: RunningEstimator,
@@ -146,6 +181,7 @@ impl CentralCore {
             stage: Stage::Assembling,
             released: false,
             nodes_lost: [false; 3],
+            drives: Drives::new(config.drive_silence_max_s),
             samples: std::array::from_fn(|_| Admission::new(config.input_age_max_ns)),
             load: Admission::new(config.input_age_max_ns),
             estimator: RunningEstimator::cold(config.estimator),
@@ -175,12 +211,45 @@ impl CentralCore {
             self.estimate_phase(dt_s);
         }
         self.judge_trust();
+        self.drives.tick(dt_s, self.stage == Stage::Walking);
         self.mode().map(|mode| self.gait_state(now_ns, mode))
     }
 
     /// The operator lets the person walk; counts once all parts are there.
-    pub const fn release(&mut self) {
+    ///
+    /// # Errors
+    /// The e-stop was pressed and not reset, here or at a drive.
+    pub fn release(&mut self) -> Result<(), StillStopped> {
+        if self.stage == Stage::Stopped || self.drives.any_stopped() {
+            return Err(StillStopped);
+        }
         self.released = true;
+        Ok(())
+    }
+
+    /// Somebody has pressed the e-stop: the drives are told to stop from the next tick on, until [`CentralCore::reset`].
+    /// A software e-stop; not a safety function.
+    pub const fn stop(&mut self) {
+        self.stage = Stage::Stopped;
+        self.released = false;
+    }
+
+    /// The operator takes the e-stop back. All parts have to be there and walking has to be released anew.
+    pub fn reset(&mut self) {
+        if self.stage == Stage::Stopped {
+            self.stage = Stage::Assembling;
+        }
+    }
+
+    /// A drive has told how it is.
+    pub const fn drive_heard(&mut self, joint: Joint, status: &DriveStatus) {
+        self.drives.heard(joint, status);
+    }
+
+    /// Joints that walk without their drive's help: bit 0 hip, bit 1 knee, bit 2 ankle.
+    #[must_use]
+    pub fn degraded(&self) -> u8 {
+        self.drives.degraded()
     }
 
     /// The operator takes the release back: torque zero from the next tick on.
@@ -213,6 +282,7 @@ impl CentralCore {
             Stage::Syncing => Some(GaitMode::Sync),
             Stage::Walking => Some(GaitMode::Walk),
             Stage::Lost => Some(GaitMode::Safe),
+            Stage::Stopped => Some(GaitMode::Stop),
         }
     }
 
@@ -237,7 +307,14 @@ impl CentralCore {
 
     fn judge_stage(&mut self, complete: bool) {
         let is_hiccup = self.stage == Stage::Lost && self.unheard_s <= self.config.gap_coast_max_s;
+        if self.drives.any_stopped() {
+            self.heed_stopped_drive();
+        }
+        if self.stage == Stage::Lost && !is_hiccup && self.config.resume == Resume::ByOperator {
+            self.released = false;
+        }
         let next = match (self.stage, complete, self.released) {
+            (Stage::Stopped, _, _) => Stage::Stopped,
             (Stage::Assembling, false, _) => Stage::Assembling,
             // Not yet released, so nothing was given that would have to be damped: wait for the parts again.
             (Stage::Held, false, _) => Stage::Assembling,
@@ -256,6 +333,15 @@ impl CentralCore {
             self.start_cold();
         }
         self.stage = next;
+    }
+
+    /// One drive was stopped and this did not hear of it, or was started since: all are stopped. Where nothing was
+    /// released yet it is enough that nothing will be.
+    const fn heed_stopped_drive(&mut self) {
+        match self.stage {
+            Stage::Syncing | Stage::Walking | Stage::Lost => self.stop(),
+            Stage::Assembling | Stage::Held | Stage::Stopped => self.released = false,
+        }
     }
 
     /// A new estimator: what was learnt before standing or before a gap is no guide to the phase now.
@@ -328,6 +414,7 @@ impl CentralCore {
             mode,
             confidence: self.confidence as f32,
             epoch: self.config.epoch,
+            degraded: self.drives.degraded(),
         }
     }
 }

@@ -7,9 +7,9 @@ mod world;
 
 use thiserror::Error;
 
-use crate::central::CentralConfig;
+use crate::central::{CentralConfig, Resume};
 use crate::intention::{Intention, IntentionError};
-use crate::joint::PerJoint;
+use crate::joint::{Joint, PerJoint};
 use crate::part::Kill;
 use crate::plant::PlantConfig;
 use crate::record::Record;
@@ -17,6 +17,17 @@ use world::World;
 
 /// Period of every core, ns.
 pub const PERIOD_NS: u64 = 1_000_000;
+
+/// The death of one drive alone: its sensor and its node live on, and it is started again.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DriveDeath {
+    /// Whose drive.
+    pub joint: Joint,
+    /// The true strides at which it dies, counted from 0: the whole part, and the phase within.
+    pub at_strides: f64,
+    /// Time until it runs again, ms.
+    pub outage_ms: u64,
+}
 
 /// What a lock-step run does.
 #[derive(Debug, Clone)]
@@ -40,6 +51,8 @@ pub struct LockStepConfig {
     pub kill: Option<Kill>,
     /// Time until a killed node runs again, ms.
     pub outage_ms: u64,
+    /// A drive to kill without its node.
+    pub drive_death: Option<DriveDeath>,
 }
 
 impl LockStepConfig {
@@ -51,11 +64,12 @@ impl LockStepConfig {
             seed,
             intention,
             plant: PlantConfig::default(),
-            central: CentralConfig::default(),
+            central: CentralConfig { resume: Resume::ByItself, ..CentralConfig::default() },
             start_ms: [2000, 150, 400],
             release_after_ms: 500,
             kill: None,
             outage_ms: 1000,
+            drive_death: None,
         }
     }
 }

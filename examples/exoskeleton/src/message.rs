@@ -58,6 +58,8 @@ pub enum GaitMode {
     Walk,
     /// A part is missing: damp softly (3).
     Safe,
+    /// The e-stop was pressed: torque to zero, and stay there until reset (4).
+    Stop,
 }
 
 /// From central to the three drives, each millisecond.
@@ -78,6 +80,23 @@ pub struct GaitState {
     /// Trust in the phase, 0..1; 1 is full.
     pub confidence: f32,
     /// Grows with each new start of central; older ones are refused.
+    pub epoch: u32,
+    /// Joints that walk without their drive's help; bit 0 hip, bit 1 knee, bit 2 ankle.
+    pub degraded: u8,
+}
+
+/// From central or the operator to a drive, at will: the moment to feed forward in place of the drive's own curve.
+///
+/// A drive uses it for at most 10 ms, and only when it is close to what the drive itself holds right at that phase.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct TorqueSet {
+    /// Counts up by one with each message, wraps.
+    pub seq: u32,
+    /// When it was computed, ns.
+    pub t_ns: u64,
+    /// Moment to feed forward, Nm.
+    pub torque_nm: f32,
+    /// Grows with each new start of its sender; older ones are refused.
     pub epoch: u32,
 }
 
@@ -136,5 +155,5 @@ macro_rules! wire_byte {
 }
 
 wire_byte!(Stance: 0 => Swing, 1 => Stance);
-wire_byte!(GaitMode: 0 => Hold, 1 => Sync, 2 => Walk, 3 => Safe);
+wire_byte!(GaitMode: 0 => Hold, 1 => Sync, 2 => Walk, 3 => Safe, 4 => Stop);
 wire_byte!(DriveState: 0 => Init, 1 => Ready, 2 => Walk, 3 => Safe, 4 => EStop);

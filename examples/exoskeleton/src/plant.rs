@@ -117,6 +117,8 @@ pub struct PlantTruth {
     pub leg: LegState,
     /// Torques that the devices give, Nm.
     pub applied_nm: PerJoint<f64>,
+    /// Which devices damp by their own watchdogs.
+    pub watchdog_active: PerJoint<bool>,
 }
 
 /// The plant.
@@ -184,6 +186,7 @@ impl PlantCore {
             intended: self.intended(),
             leg: self.state,
             applied_nm: self.devices.map(|d| d.applied_nm),
+            watchdog_active: self.devices.map(|d| d.watchdog_active(&self.config)),
         }
     }
 

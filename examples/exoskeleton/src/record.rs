@@ -40,6 +40,8 @@ pub struct Row {
     pub confidence: f64,
     /// What central asks for; `None` while it says nothing.
     pub mode: Option<GaitMode>,
+    /// Joints that central says walk without their drive's help; bit 0 hip, bit 1 knee, bit 2 ankle.
+    pub degraded: u8,
     /// The three joints.
     pub joints: PerJoint<JointRow>,
 }

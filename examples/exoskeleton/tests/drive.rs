@@ -1,8 +1,10 @@
 //! The drive: its invariants under every input, and its state machine.
 
-use exoskeleton::control::drive::{DriveConfig, DriveCore, DriveOutput};
+use exoskeleton::control::drive::{DriveConfig, DriveCore, DriveOutput, ResetRefusal};
+use exoskeleton::control::faults::FaultBits;
+use exoskeleton::control::torque_law::TorqueLaw;
 use exoskeleton::joint::Joint;
-use exoskeleton::message::{DriveState, GaitMode, GaitState, JointSample, Stance};
+use exoskeleton::message::{DriveState, GaitMode, GaitState, JointSample, Stance, TorqueSet};
 use proptest::prelude::*;
 
 const MS: u64 = 1_000_000;
@@ -29,6 +31,7 @@ fn gait(ms: u64, mode: GaitMode) -> GaitState {
         mode,
         confidence: 1.0,
         epoch: 1,
+        degraded: 0,
     }
 }
 
@@ -118,7 +121,7 @@ fn emergency_stop_reaches_zero_in_fifty_ms_and_only_reset_leaves_it() {
     let output = feed(&mut drive, 1000..1050, GaitMode::Walk);
     assert_eq!((output.state, output.command_nm), (DriveState::EStop, Some(0.0)));
     assert_eq!(feed(&mut drive, 1050..1500, GaitMode::Walk).state, DriveState::EStop);
-    drive.reset();
+    drive.reset(1500 * MS).expect("at rest");
     assert_eq!(feed(&mut drive, 1500..1510, GaitMode::Hold).state, DriveState::Ready);
 }
 
@@ -198,17 +201,129 @@ fn status_tells_the_state_and_starts_a_new_maximum_of_the_age() {
     assert_eq!(drive.status(1008 * MS).age_max_us, 0);
 }
 
+/// The drive's own feed-forward at the phase of [`gait`], where the ankle pushes off: about -47 Nm.
+fn own_nm() -> f32 {
+    TorqueLaw::standard(Joint::Ankle).feed_forward_nm(0.5 + 0.75 * 0.006) as f32
+}
+
+fn torque_set(ms: u64, torque_nm: f32) -> TorqueSet {
+    TorqueSet { seq: ms as u32, t_ns: ms * MS, torque_nm, epoch: 1 }
+}
+
+#[test]
+fn torque_from_outside_is_used_while_it_is_young_and_near_to_the_own_one() {
+    let mut drive = walking();
+    let before = feed(&mut drive, 1000..1001, GaitMode::Walk).command_nm.unwrap();
+    assert!(drive.command(1001 * MS, &torque_set(1001, own_nm() + 8.0)));
+    let with = feed(&mut drive, 1001..1010, GaitMode::Walk).command_nm.unwrap();
+    assert!((with - before - 8.0).abs() < 0.5, "{before} {with}");
+    // It was said once and not again.
+    let after = feed(&mut drive, 1010..1030, GaitMode::Walk).command_nm.unwrap();
+    assert!((after - before).abs() < 0.1, "{before} {after}");
+    assert!(!drive.faults().contains(FaultBits::COMMAND_REFUSED));
+}
+
+#[test]
+fn insane_torques_from_outside_are_refused_counted_flagged_and_change_nothing() {
+    let mut drive = walking();
+    let before = feed(&mut drive, 1000..1001, GaitMode::Walk).command_nm.unwrap();
+    assert!(drive.command(1001 * MS, &torque_set(1001, own_nm())));
+    feed(&mut drive, 1001..1007, GaitMode::Walk);
+    for bad in [
+        torque_set(1002, f32::NAN),
+        torque_set(1003, 500.0),
+        torque_set(1004, -own_nm()),
+        TorqueSet { seq: 900, ..torque_set(1005, own_nm()) },
+        TorqueSet { epoch: 0, ..torque_set(1006, own_nm()) },
+        TorqueSet { t_ns: 900 * MS, ..torque_set(1007, own_nm()) },
+    ] {
+        assert!(!drive.command(1007 * MS, &bad), "{bad:?}");
+    }
+    let refused = drive.counters().commands_refused;
+    assert_eq!((refused.not_finite, refused.out_of_range, refused.opposed), (1, 1, 1));
+    assert_eq!((refused.old_sequence, refused.too_old, refused.total()), (2, 1, 6));
+    assert_eq!(drive.counters().commands_admitted, 1);
+    let after = feed(&mut drive, 1007..1012, GaitMode::Walk).command_nm.unwrap();
+    assert!((after - before).abs() < 0.1, "{before} {after}");
+    assert!(drive.faults().contains(FaultBits::COMMAND_REFUSED));
+}
+
+#[test]
+fn stop_of_central_latches_the_drive_and_it_stays_so_while_central_says_stop() {
+    let mut drive = walking();
+    let output = feed(&mut drive, 1000..1050, GaitMode::Stop);
+    assert_eq!((output.state, output.command_nm), (DriveState::EStop, Some(0.0)));
+    assert!(drive.faults().contains(FaultBits::STOPPED));
+    assert_eq!(drive.reset(1050 * MS), Err(ResetRefusal::CentralStopped));
+    assert_eq!(feed(&mut drive, 1050..1100, GaitMode::Walk).state, DriveState::EStop);
+    assert_eq!(drive.reset(1100 * MS), Ok(()));
+    assert_eq!(drive.faults(), FaultBits(0));
+    assert_eq!(feed(&mut drive, 1100..1101, GaitMode::Hold).state, DriveState::Ready);
+}
+
+#[test]
+fn stop_is_heard_though_the_joint_sample_is_missing() {
+    let mut drive = walking();
+    let outputs = (1000..1100).map(|ms| drive.tick(ms * MS, None, Some(&gait(ms, GaitMode::Stop))));
+    assert_eq!(outputs.last().map(|output| output.state), Some(DriveState::EStop));
+}
+
+#[test]
+fn reset_before_the_torque_is_zero_is_refused() {
+    let mut drive = walking();
+    drive.emergency_stop();
+    feed(&mut drive, 1000..1003, GaitMode::Hold);
+    assert_eq!(drive.reset(1003 * MS), Err(ResetRefusal::NotAtRest));
+    assert_eq!(drive.state(), DriveState::EStop);
+}
+
+#[test]
+fn orderly_end_of_a_drive_is_no_e_stop_for_the_others() {
+    let mut drive = walking();
+    drive.let_go();
+    assert_eq!(feed(&mut drive, 1000..1050, GaitMode::Walk).command_nm, Some(0.0));
+    assert!(!drive.faults().contains(FaultBits::STOPPED));
+}
+
+#[test]
+fn drive_that_was_away_alone_is_back_in_a_fifth_of_a_second() {
+    let mut drive = drive();
+    let early = feed(&mut drive, 0..102, GaitMode::Walk);
+    assert!((early.assist_gain - 0.5).abs() < 0.02, "{}", early.assist_gain);
+    assert!((feed(&mut drive, 102..203, GaitMode::Walk).assist_gain - 1.0).abs() < 1e-9);
+}
+
+#[test]
+fn drive_that_was_frozen_uses_nothing_stale_and_goes_on_from_what_its_device_gives() {
+    let mut drive = walking();
+    // The process stands still for 300 ms; its device damps by itself meanwhile and gives 1.5 Nm.
+    let thawed = drive.tick(1300 * MS, Some(&sample(1001)), Some(&gait(1001, GaitMode::Walk)));
+    assert_eq!((thawed.state, thawed.command_nm), (DriveState::Safe, None));
+    assert_eq!(drive.counters().pauses, 1);
+    let damping = JointSample { torque_nm: -1.5, ..sample(1301) };
+    let output = drive.tick(1301 * MS, Some(&damping), Some(&gait(1301, GaitMode::Walk)));
+    assert_eq!(output.state, DriveState::Walk);
+    let first = output.command_nm.unwrap();
+    assert!((first + 1.5).abs() <= 2.0, "{first}");
+}
+
 fn any_mode() -> impl Strategy<Value = GaitMode> {
-    prop_oneof![Just(GaitMode::Hold), Just(GaitMode::Sync), Just(GaitMode::Walk), Just(GaitMode::Safe)]
+    prop_oneof![
+        Just(GaitMode::Hold),
+        Just(GaitMode::Sync),
+        Just(GaitMode::Walk),
+        Just(GaitMode::Safe),
+        Just(GaitMode::Stop)
+    ]
 }
 
 /// Step of time (ns), a sample and a gait state that may be garbage, and a die for stop and reset.
-type AnyTick = (u64, Option<[f32; 3]>, Option<(f32, f32, GaitMode, u32)>, u8);
+type AnyTick = (u64, Option<[f32; 2]>, Option<(f32, f32, GaitMode, u32)>, u8);
 
 /// A tick with anything in it.
 fn any_tick() -> impl Strategy<Value = AnyTick> {
     let rough = prop_oneof![4 => -1.0f32..2.0, 1 => any::<f32>()];
-    let values = [rough.clone(), rough.clone(), rough.clone()];
+    let values = [rough.clone(), rough.clone()];
     (
         0u64..12 * MS,
         prop::option::weighted(0.8, values),
@@ -229,9 +344,9 @@ proptest! {
         let (mut now_ns, mut walked, mut before) = (0, false, None::<f64>);
         for (seq, (step_ns, values, gait_values, chance)) in (0u32..).zip(ticks) {
             now_ns += step_ns;
-            if chance < 4 { drive.emergency_stop() } else if chance < 8 { drive.reset() }
-            let sample = values.map(|[angle_rad, velocity_rad_s, torque]| JointSample {
-                seq, t_ns: now_ns, angle_rad, velocity_rad_s, torque_nm: torque.clamp(-0.4, 0.4), ..sample(0)
+            if chance < 4 { drive.emergency_stop() } else if chance < 8 { let _ = drive.reset(now_ns); }
+            let sample = values.map(|[angle_rad, velocity_rad_s]| JointSample {
+                seq, t_ns: now_ns, angle_rad, velocity_rad_s, torque_nm: before.unwrap_or(0.0) as f32, ..sample(0)
             });
             let gait = gait_values.map(|(phase, phase_rate_hz, mode, epoch)| GaitState {
                 seq, t_ns: now_ns, phase, phase_rate_hz, epoch, ..gait(0, mode)
@@ -242,7 +357,7 @@ proptest! {
                 prop_assert!(torque.abs() <= config.law.limit_nm);
                 prop_assert!(walked || torque == 0.0);
                 let change = (torque - before.unwrap_or(0.0)).abs();
-                prop_assert!(change <= config.rate_limit_nm_s * step_ns as f64 * 1e-9 + 1e-9, "{change}");
+                prop_assert!(change <= config.rate_limit_nm_s * step_ns as f64 * 1e-9 + 1e-5, "{change}");
             }
             before = output.command_nm.or(before);
         }

@@ -111,7 +111,7 @@ impl Robot {
             sensors: Joint::ALL.map(|_| SensorCore::new(sensor)),
             drives: Joint::ALL.map(|joint| {
                 let standard = DriveConfig::standard(joint);
-                DriveCore::new(DriveConfig { reentry_s: 0.0, device_lag_s: 0.0, ..standard })
+                DriveCore::new(DriveConfig { reentry_s: 0.0, rejoin_s: 0.0, device_lag_s: 0.0, ..standard })
             }),
             commands_nm: [None; 3],
         }
@@ -128,6 +128,7 @@ impl Robot {
             mode: GaitMode::Walk,
             confidence: 1.0,
             epoch: 1,
+            degraded: 0,
         };
         let readings = plant.read();
         for i in 0..3 {

@@ -1,6 +1,6 @@
 //! A host that stands still for a moment: the drives damp at once, and assistance comes back where it was.
 
-use exoskeleton::central::{CentralConfig, CentralCore, CentralInput};
+use exoskeleton::central::{CentralConfig, CentralCore, CentralInput, Resume};
 use exoskeleton::control::drive::{DriveConfig, DriveCore};
 use exoskeleton::intention::Intention;
 use exoskeleton::joint::Joint;
@@ -18,8 +18,9 @@ struct Walk {
 
 impl Walk {
     fn standing() -> Self {
-        let mut central = CentralCore::new(CentralConfig::default());
-        central.release();
+        let mut central =
+            CentralCore::new(CentralConfig { resume: Resume::ByItself, ..CentralConfig::default() });
+        central.release().expect("nobody pressed the e-stop");
         Self { central, intention: Intention::from_curves(3), ms: 0 }
     }
 
@@ -133,6 +134,7 @@ fn gain_after(silent_ms: u64) -> f64 {
         mode: GaitMode::Walk,
         confidence: 1.0,
         epoch: 1,
+        degraded: 0,
     };
     for ms in 1..=1000 {
         drive.tick(ms * MS, Some(&sample(ms)), Some(&gait(ms)));

@@ -2,10 +2,11 @@
 
 use std::sync::Arc;
 
+use exoskeleton::central::bit;
 use exoskeleton::gait::trial::Trial;
 use exoskeleton::intention::{Intention, IntentionError};
 use exoskeleton::joint::Joint;
-use exoskeleton::lockstep::{LockStepConfig, LockStepError, run};
+use exoskeleton::lockstep::{DriveDeath, LockStepConfig, LockStepError, run};
 use exoskeleton::message::DriveState;
 use exoskeleton::metrics::Metrics;
 use exoskeleton::part::{Kill, Part};
@@ -179,4 +180,49 @@ fn report_has_the_promised_fields_and_no_real_time_figures() {
         assert!(json.pointer(unmeasured).is_some_and(serde_json::Value::is_null), "{unmeasured}");
     }
     assert!(json["passed"].is_boolean() && json["timing_measured"] == false);
+}
+
+/// The drive of `joint` dies at `phase` of the ninth stride and is back 400 ms later.
+fn drive_dies(joint: Joint, phase: f64, watchdog_ms: Option<u64>) -> Record {
+    let death = DriveDeath { joint, at_strides: 8.0 + phase, outage_ms: 400 };
+    let mut config = LockStepConfig { drive_death: Some(death), ..curves(11, 1) };
+    config.plant.watchdog_ns = watchdog_ms.map(|ms| ms * 1_000_000);
+    run(&config).expect("a run that ends")
+}
+
+/// Greatest deviation of a joint from what the person means to do, in the stride after the death, degrees.
+fn deviation_deg(record: &Record, joint: Joint, phase: f64) -> f64 {
+    let deviation = |row: &exoskeleton::record::Row| {
+        let joint = &row.joints[joint.index()];
+        (joint.angle_rad - joint.intended_rad).abs().to_degrees()
+    };
+    let window = 8.0 + phase..9.0 + phase;
+    record.rows.iter().filter(|row| window.contains(&row.strides_true)).map(deviation).fold(0.0, f64::max)
+}
+
+#[test]
+fn death_of_the_knee_drive_leaves_hip_and_ankle_walking_and_flags_the_knee() {
+    for phase in [0.12, 0.40, 0.62, 0.75] {
+        let record = drive_dies(Joint::Knee, phase, Some(8));
+        let after = |row: &&exoskeleton::record::Row| row.strides_true > 8.0 + phase;
+        for joint in [Joint::Hip, Joint::Ankle] {
+            let walks =
+                |row: &exoskeleton::record::Row| row.joints[joint.index()].state == Some(DriveState::Walk);
+            assert!(record.rows.iter().filter(after).all(walks), "{joint} at {phase}");
+        }
+        let flagged: Vec<u8> = record.rows.iter().filter(after).map(|row| row.degraded).collect();
+        assert!(flagged.contains(&bit(Joint::Knee)), "{phase}");
+        assert!(flagged.iter().all(|bits| bits & !bit(Joint::Knee) == 0), "{phase}");
+        assert_eq!(flagged.last(), Some(&0), "{phase}");
+        assert!(deviation_deg(&record, Joint::Knee, phase) <= 10.0, "{phase}");
+    }
+}
+
+#[test]
+fn stuck_torque_of_a_dead_ankle_drive_is_what_its_devices_watchdog_is_for() {
+    let phase = 0.60;
+    let protected = deviation_deg(&drive_dies(Joint::Ankle, phase, Some(8)), Joint::Ankle, phase);
+    let unprotected = deviation_deg(&drive_dies(Joint::Ankle, phase, None), Joint::Ankle, phase);
+    assert!(protected <= 12.0, "{protected} deg");
+    assert!(unprotected > 12.0 && unprotected > 2.0 * protected, "{unprotected} deg");
 }

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use exoskeleton::report;
 use exoskeleton::robot::launch::{self, LaunchOptions, RealTimeFigures, Walk};
-use exoskeleton::robot::topology::{Control, ControlThread};
+use exoskeleton::robot::topology::{Control, ControlThread, ReleaseBy};
 
 use super::{Arguments, RunError, Verdict};
 
@@ -51,7 +51,11 @@ fn options(arguments: &Arguments) -> Result<LaunchOptions, RunError> {
         trial: arguments.trial.clone(),
         kill: arguments.kill,
         device_watchdog,
-        control: Control { thread, realtime_priority: arguments.realtime_priority },
+        control: Control {
+            thread,
+            realtime_priority: arguments.realtime_priority,
+            release: ReleaseBy::Itself,
+        },
         runs: arguments.runs.clone(),
     })
 }

@@ -1,13 +1,15 @@
 //! Which inputs a core believes: finite, plausible, newer than the last, young enough. The rest is counted.
 
 use super::faults::RefusedCount;
-use crate::message::{GaitState, JointSample};
+use crate::message::{GaitState, JointSample, TorqueSet};
 
 /// Jump of a sequence number beyond which it is taken for an older one.
 const SEQUENCE_AHEAD_MAX: u32 = u32::MAX / 2;
 const ANGLE_LARGEST_RAD: f32 = 3.2;
 const VELOCITY_LARGEST_RAD_S: f32 = 50.0;
 const TORQUE_LARGEST_NM: f32 = 500.0;
+/// Above what any of the devices may give.
+const COMMAND_LARGEST_NM: f32 = 60.0;
 const PHASE_RATE_LARGEST_HZ: f32 = 5.0;
 
 /// Something that can be judged before use.
@@ -46,8 +48,14 @@ impl<T: Stamped> Admission<T> {
     /// Admits inputs not older than `age_max_ns`.
     #[must_use]
     pub const fn new(age_max_ns: u64) -> Self {
-        let refused =
-            RefusedCount { not_finite: 0, out_of_range: 0, old_sequence: 0, too_old: 0, from_future: 0 };
+        let refused = RefusedCount {
+            not_finite: 0,
+            out_of_range: 0,
+            old_sequence: 0,
+            too_old: 0,
+            from_future: 0,
+            opposed: 0,
+        };
         Self { age_max_ns, newest: None, refused }
     }
 
@@ -67,6 +75,11 @@ impl<T: Stamped> Admission<T> {
                 false
             }
         }
+    }
+
+    /// Refuses an input that is sane in itself and yet the opposite of what must be done now.
+    pub const fn refuse_opposed(&mut self) {
+        self.refused.opposed = self.refused.opposed.saturating_add(1);
     }
 
     /// The newest admitted input if it is not older than the limit now.
@@ -176,5 +189,23 @@ impl Stamped for GaitState {
         (0.0..=1.0).contains(&self.phase)
             && self.phase_rate_hz.abs() <= PHASE_RATE_LARGEST_HZ
             && (0.0..=1.0).contains(&self.confidence)
+    }
+}
+
+impl Stamped for TorqueSet {
+    fn t_ns(&self) -> u64 {
+        self.t_ns
+    }
+    fn seq(&self) -> u32 {
+        self.seq
+    }
+    fn epoch(&self) -> u32 {
+        self.epoch
+    }
+    fn is_finite(&self) -> bool {
+        self.torque_nm.is_finite()
+    }
+    fn is_plausible(&self) -> bool {
+        self.torque_nm.abs() <= COMMAND_LARGEST_NM
     }
 }

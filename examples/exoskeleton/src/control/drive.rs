@@ -6,24 +6,28 @@
 //!                                 ^             |
 //!                  inputs fresh,  |             | input older than 10 ms, or mode Safe
 //!                  mode not Safe  +--- Safe <---+        (the same tick)
-//!   any state --- emergency_stop() ---> EStop --- reset() ---> Init
+//!   any state --- emergency_stop(), or mode Stop ---> EStop --- reset() ---> Init
 //! ```
 //!
 //! Invariants, each with a test: the torque is exactly 0.0 until `Walk` was reached once; it never exceeds the limit;
-//! it never changes faster than the rate limit; what is stale or refused never reaches the torque law. One exception
-//! to the first: a device that still holds a torque from an earlier life of its drive is ramped to zero, not stepped.
+//! it never changes faster than the rate limit; what is stale or refused never reaches the torque law; nothing but a
+//! reset leaves `EStop`. One exception to the first: a device that still holds a torque from an earlier life of its
+//! drive is ramped to zero, not stepped. The same after a pause of the drive itself, whose device may have damped by
+//! itself meanwhile: it goes on from what the device says that it gives.
 
-use super::admission::Admission;
+use thiserror::Error;
+
+use super::admission::{Admission, Stamped};
 use super::faults::{DriveCounters, FaultBits};
 use super::ramp::{AssistRamp, RateLimiter};
 use super::torque_law::{LawPhase, TorqueLaw};
 use crate::joint::Joint;
-use crate::message::{DriveState, DriveStatus, GaitMode, GaitState, JointSample};
+use crate::message::{DriveState, DriveStatus, GaitMode, GaitState, JointSample, TorqueSet};
 
 /// Longest time for which the rate limiter moves in one tick, seconds; a late tick does not earn a step.
 const TICK_LONGEST_S: f64 = 0.005;
 /// A device torque below this at start counts as zero, Nm.
-const HELD_TORQUE_MIN_NM: f32 = 0.5;
+const HELD_TORQUE_MIN_NM: f64 = 0.5;
 
 /// Numbers of one drive.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -34,13 +38,21 @@ pub struct DriveConfig {
     pub rate_limit_nm_s: f64,
     /// Damping in the safe state, Nms/rad. Default 1: more would brake the swing, none would let it fall.
     pub safe_damping_nms_rad: f64,
-    /// Time in which assistance rises to full, seconds. Default 0.5.
+    /// Time in which assistance rises to full after it was interrupted for the whole leg, seconds. Default 0.5.
     pub reentry_s: f64,
+    /// Time in which it rises to full when only this drive was away and the others walked on, seconds. Default 0.2: a
+    /// joint without help is the greater harm.
+    pub rejoin_s: f64,
     /// Time from a command to its torque, seconds: bus and motor together. The moment is fed forward by as much.
     /// Default 6 ms: one message and the lag of the simulated device.
     pub device_lag_s: f64,
     /// Oldest input that is used, ns. Default 10 ms; above 20 ms a stuck torque becomes dangerous.
     pub input_age_max_ns: u64,
+    /// Longest pause between two ticks over which the drive knows what its device gives, ns. Default 6 ms; shorter than
+    /// the watchdog of any device.
+    pub pause_max_ns: u64,
+    /// Farthest that a torque set from outside may be from what this drive would feed forward itself, Nm. Default 10.
+    pub command_apart_max_nm: f64,
 }
 
 impl DriveConfig {
@@ -52,8 +64,11 @@ impl DriveConfig {
             rate_limit_nm_s: 2000.0,
             safe_damping_nms_rad: 1.0,
             reentry_s: 0.5,
+            rejoin_s: 0.2,
             device_lag_s: 0.006,
             input_age_max_ns: 10_000_000,
+            pause_max_ns: 6_000_000,
+            command_apart_max_nm: 10.0,
         }
     }
 }
@@ -75,6 +90,17 @@ pub struct DriveOutput {
     pub gait_age_ns: Option<u64>,
 }
 
+/// Why a drive stays stopped. The caller is too early; nothing has changed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+pub enum ResetRefusal {
+    /// The torque is still on its way to zero.
+    #[error("the torque is not zero yet; wait 50 ms")]
+    NotAtRest,
+    /// Central is stopped itself.
+    #[error("central still says stop; reset it first")]
+    CentralStopped,
+}
+
 /// The drive of one joint.
 #[derive(Debug, Clone)]
 pub struct DriveCore {
@@ -82,10 +108,13 @@ pub struct DriveCore {
     state: DriveState,
     samples: Admission<JointSample>,
     gait: Admission<GaitState>,
+    commands: Admission<TorqueSet>,
     limiter: RateLimiter,
     ramp: AssistRamp,
     last_tick_ns: Option<u64>,
     device_heard: bool,
+    /// Whether assistance was interrupted by central since it was last full; else only this drive was away.
+    interrupted: bool,
     counters: DriveCounters,
     faults: FaultBits,
     age_max_ns: u64,
@@ -101,10 +130,12 @@ impl DriveCore {
             state: DriveState::Init,
             samples: Admission::new(config.input_age_max_ns),
             gait: Admission::new(config.input_age_max_ns),
+            commands: Admission::new(config.input_age_max_ns),
             limiter: RateLimiter::new(config.rate_limit_nm_s),
             ramp: AssistRamp::new(config.reentry_s),
             last_tick_ns: None,
             device_heard: false,
+            interrupted: false,
             counters: DriveCounters {
                 ticks: 0,
                 misses: 0,
@@ -112,6 +143,9 @@ impl DriveCore {
                 safe_entries: 0,
                 samples_refused: *Admission::<JointSample>::new(0).refused(),
                 gait_refused: *Admission::<GaitState>::new(0).refused(),
+                commands_admitted: 0,
+                commands_refused: *Admission::<TorqueSet>::new(0).refused(),
+                pauses: 0,
             },
             faults: FaultBits(0),
             age_max_ns: 0,
@@ -126,18 +160,21 @@ impl DriveCore {
         sample: Option<&JointSample>,
         gait: Option<&GaitState>,
     ) -> DriveOutput {
-        self.admit(now_ns, sample, gait);
         let elapsed_s = self.elapsed_s(now_ns);
+        self.doubt_after_pause(elapsed_s);
+        self.admit(now_ns, sample, gait);
         let dt_s = elapsed_s.min(TICK_LONGEST_S);
         let fresh_sample = self.samples.fresh(now_ns).copied();
         let fresh_gait = self.gait.fresh(now_ns).copied();
         self.judge_state(elapsed_s, fresh_sample.is_some(), fresh_gait.map(|g| g.mode));
         let (target_nm, saturated) = self.target((now_ns, dt_s), fresh_sample, fresh_gait);
         let limit_nm = self.config.law.limit_nm;
-        let torque_nm = self.limiter.toward(target_nm.clamp(-limit_nm, limit_nm), dt_s);
+        // While it is not known what the device gives there is nothing to go on from.
+        let command_nm =
+            self.device_heard.then(|| self.limiter.toward(target_nm.clamp(-limit_nm, limit_nm), dt_s));
         self.count(now_ns, saturated, fresh_sample.is_some() && fresh_gait.is_some());
         DriveOutput {
-            command_nm: self.device_heard.then_some(torque_nm),
+            command_nm,
             state: self.state,
             saturated,
             assist_gain: self.ramp.gain(),
@@ -149,15 +186,54 @@ impl DriveCore {
     /// Stops: from the next tick on the torque ramps to zero, and stays zero until [`DriveCore::reset`].
     /// A software e-stop; not a safety function.
     pub fn emergency_stop(&mut self) {
-        self.state = DriveState::EStop;
-        self.ramp.drop_to_zero();
+        self.let_go();
         self.faults.insert(FaultBits::STOPPED);
     }
 
+    /// The orderly end of a drive: as an e-stop, but nobody has pressed one.
+    pub const fn let_go(&mut self) {
+        self.state = DriveState::EStop;
+        self.ramp.drop_to_zero();
+    }
+
     /// Leaves `EStop` for `Init` and clears the fault bits. Nothing else leaves `EStop`.
-    pub const fn reset(&mut self) {
-        self.state = DriveState::Init;
+    ///
+    /// # Errors
+    /// The drive is not at rest, or central still says stop.
+    pub fn reset(&mut self, now_ns: u64) -> Result<(), ResetRefusal> {
+        if self.state == DriveState::EStop {
+            if self.limiter.torque_nm() != 0.0 {
+                return Err(ResetRefusal::NotAtRest);
+            }
+            if self.gait.fresh(now_ns).is_some_and(|gait| gait.mode == GaitMode::Stop) {
+                return Err(ResetRefusal::CentralStopped);
+            }
+            self.state = DriveState::Init;
+        }
         self.faults = FaultBits(0);
+        Ok(())
+    }
+
+    /// Takes a moment to feed forward in place of its own for the next 10 ms; returns whether it is believed.
+    ///
+    /// It has to be finite, within limits, newer than the last, young, and near to what this drive would do itself at
+    /// this phase: the right sign is what a drive knows best. What is refused is counted and sets a fault bit.
+    pub fn command(&mut self, now_ns: u64, command: &TorqueSet) -> bool {
+        let own_nm = self.own_feed_forward_nm(now_ns);
+        let apart_nm = (f64::from(command.torque_nm) - own_nm).abs();
+        let is_sane = Stamped::is_finite(command) && command.is_plausible();
+        let admitted = if is_sane && apart_nm > self.config.command_apart_max_nm {
+            self.commands.refuse_opposed();
+            false
+        } else {
+            self.commands.offer(now_ns, command)
+        };
+        self.counters.commands_admitted += u32::from(admitted);
+        if self.commands.refused().total() > self.counters.commands_refused.total() {
+            self.faults.insert(FaultBits::COMMAND_REFUSED);
+        }
+        self.counters.commands_refused = *self.commands.refused();
+        admitted
     }
 
     /// State of the drive.
@@ -194,27 +270,50 @@ impl DriveCore {
         status
     }
 
+    /// After a pause the device may have damped by itself: what it gives is asked anew, and until it is known nothing
+    /// is commanded.
+    fn doubt_after_pause(&mut self, elapsed_s: f64) {
+        if self.device_heard && elapsed_s > self.config.pause_max_ns as f64 * 1e-9 {
+            self.device_heard = false;
+            self.counters.pauses = self.counters.pauses.saturating_add(1);
+        }
+    }
+
+    /// What this drive would feed forward now; 0 where no phase is known.
+    fn own_feed_forward_nm(&self, now_ns: u64) -> f64 {
+        let Some(gait) = self.gait.fresh(now_ns) else { return 0.0 };
+        let ahead_s = now_ns.saturating_sub(gait.t_ns) as f64 * 1e-9 + self.config.device_lag_s;
+        self.config.law.feed_forward_nm(f64::from(gait.phase) + f64::from(gait.phase_rate_hz) * ahead_s)
+    }
+
     fn admit(&mut self, now_ns: u64, sample: Option<&JointSample>, gait: Option<&GaitState>) {
         if let Some(sample) = sample {
             let admitted = self.samples.offer(now_ns, sample);
             if admitted && !self.device_heard {
                 self.device_heard = true;
-                // A device that still holds a torque from an earlier life of this drive is ramped, not stepped.
-                if sample.torque_nm.abs() >= HELD_TORQUE_MIN_NM {
-                    self.limiter.start_from(f64::from(sample.torque_nm));
-                }
+                self.go_on_from(f64::from(sample.torque_nm));
             }
         }
         if let Some(gait) = gait {
             self.gait.offer(now_ns, gait);
         }
-        self.counters.samples_refused = *self.samples.refused();
-        self.counters.gait_refused = *self.gait.refused();
-        if self.counters.samples_refused.total() > 0 {
+        if self.samples.refused().total() > self.counters.samples_refused.total() {
             self.faults.insert(FaultBits::SAMPLE_REFUSED);
         }
-        if self.counters.gait_refused.total() > 0 {
+        if self.gait.refused().total() > self.counters.gait_refused.total() {
             self.faults.insert(FaultBits::GAIT_REFUSED);
+        }
+        self.counters.samples_refused = *self.samples.refused();
+        self.counters.gait_refused = *self.gait.refused();
+    }
+
+    /// A device that holds a torque, from an earlier life of this drive or by its own watchdog, is ramped, not stepped.
+    fn go_on_from(&mut self, held_nm: f64) {
+        let limit_nm = self.config.law.limit_nm;
+        if held_nm.abs() >= HELD_TORQUE_MIN_NM {
+            self.limiter.start_from(held_nm.clamp(-limit_nm, limit_nm));
+        } else if self.limiter.torque_nm() != 0.0 {
+            self.limiter.start_from(held_nm);
         }
     }
 
@@ -225,6 +324,14 @@ impl DriveCore {
 
     fn judge_state(&mut self, elapsed_s: f64, sample_fresh: bool, mode: Option<GaitMode>) {
         let next = next_state(self.state, sample_fresh, mode);
+        if mode == Some(GaitMode::Stop) {
+            self.faults.insert(FaultBits::STOPPED);
+        }
+        self.interrupted |= mode.is_some_and(|mode| mode != GaitMode::Walk);
+        if next == DriveState::Walk && self.state != DriveState::Walk {
+            let config = &self.config;
+            self.ramp.rise_in(if self.interrupted { config.reentry_s } else { config.rejoin_s });
+        }
         if self.state == DriveState::Walk && next == DriveState::Safe {
             self.counters.safe_entries = self.counters.safe_entries.saturating_add(1);
             if mode != Some(GaitMode::Safe) {
@@ -251,8 +358,13 @@ impl DriveCore {
                 let phase = law_phase(&gait, &sample, now_ns, self.config.device_lag_s);
                 let (angle_rad, velocity_rad_s) =
                     (f64::from(sample.angle_rad), f64::from(sample.velocity_rad_s));
-                let torque = self.config.law.torque(&phase, angle_rad, velocity_rad_s);
-                (self.ramp.rise(dt_s) * torque.torque_nm, torque.saturated)
+                let feed_forward_nm = self.feed_forward_nm(now_ns, &phase);
+                let law = &self.config.law;
+                let torque = law.torque_around(feed_forward_nm, &phase, angle_rad, velocity_rad_s);
+                let gain = self.ramp.rise(dt_s);
+                // Full assistance: whatever interrupted it is over.
+                self.interrupted &= gain < 1.0;
+                (gain * torque.torque_nm, torque.saturated)
             }
             (DriveState::Safe, Some(sample), _) => {
                 (-self.config.safe_damping_nms_rad * f64::from(sample.velocity_rad_s), false)
@@ -262,6 +374,16 @@ impl DriveCore {
             | (DriveState::Walk | DriveState::Init | DriveState::Ready | DriveState::EStop, _, _) => {
                 (0.0, false)
             }
+        }
+    }
+
+    /// The moment to feed forward, Nm: its own, or one from outside that is young and still near to it.
+    fn feed_forward_nm(&self, now_ns: u64, phase: &LawPhase) -> f64 {
+        let own_nm = self.config.law.feed_forward_nm(phase.at_effect);
+        let apart_nm = self.config.command_apart_max_nm;
+        match self.commands.fresh(now_ns) {
+            Some(command) => f64::from(command.torque_nm).clamp(own_nm - apart_nm, own_nm + apart_nm),
+            None => own_nm,
         }
     }
 
@@ -293,9 +415,12 @@ fn law_phase(gait: &GaitState, sample: &JointSample, now_ns: u64, device_lag_s: 
 
 /// The whole table of the state machine. `mode` is `None` when there is no fresh gait state.
 fn next_state(state: DriveState, sample_fresh: bool, mode: Option<GaitMode>) -> DriveState {
+    if state == DriveState::EStop || mode == Some(GaitMode::Stop) {
+        return DriveState::EStop;
+    }
     let mode = mode.filter(|_| sample_fresh);
     match (state, mode) {
-        (DriveState::EStop, _) => DriveState::EStop,
+        (DriveState::EStop, _) | (_, Some(GaitMode::Stop)) => DriveState::EStop,
         (DriveState::Init, None) => DriveState::Init,
         // A drive that never walked and loses an input waits again; it gives no torque either way.
         (DriveState::Ready, None) => DriveState::Init,

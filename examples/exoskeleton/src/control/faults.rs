@@ -15,6 +15,8 @@ impl FaultBits {
     pub const SATURATED: Self = Self(1 << 3);
     /// The e-stop was pressed.
     pub const STOPPED: Self = Self(1 << 4);
+    /// A torque set from outside was refused.
+    pub const COMMAND_REFUSED: Self = Self(1 << 5);
 
     /// Sets the bits of `other` too.
     pub const fn insert(&mut self, other: Self) {
@@ -41,13 +43,20 @@ pub struct RefusedCount {
     pub too_old: u32,
     /// Stamped later than now: clocks disagree.
     pub from_future: u32,
+    /// The opposite of what must be done at this phase.
+    pub opposed: u32,
 }
 
 impl RefusedCount {
     /// All refusals together.
     #[must_use]
     pub const fn total(&self) -> u32 {
-        self.not_finite + self.out_of_range + self.old_sequence + self.too_old + self.from_future
+        self.not_finite
+            + self.out_of_range
+            + self.old_sequence
+            + self.too_old
+            + self.from_future
+            + self.opposed
     }
 }
 
@@ -66,4 +75,10 @@ pub struct DriveCounters {
     pub samples_refused: RefusedCount,
     /// Refused gait states.
     pub gait_refused: RefusedCount,
+    /// Torques from outside that were admitted.
+    pub commands_admitted: u32,
+    /// Refused torques from outside.
+    pub commands_refused: RefusedCount,
+    /// Pauses after which the drive asked its device what it gives.
+    pub pauses: u32,
 }

@@ -50,6 +50,11 @@ impl AssistRamp {
         Self { rise_s, gain: 0.0 }
     }
 
+    /// From now on rises from 0 to 1 in this many seconds.
+    pub const fn rise_in(&mut self, rise_s: f64) {
+        self.rise_s = rise_s;
+    }
+
     /// Rises for `dt_s` and returns the gain.
     pub fn rise(&mut self, dt_s: f64) -> f64 {
         self.gain = if self.rise_s > 0.0 { (self.gain + dt_s / self.rise_s).min(1.0) } else { 1.0 };

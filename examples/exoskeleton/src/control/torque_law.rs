@@ -62,9 +62,26 @@ impl TorqueLaw {
     /// Torque for the measured angle (rad) and velocity (rad/s).
     #[must_use]
     pub fn torque(&self, phase: &LawPhase, angle_rad: f64, velocity_rad_s: f64) -> LimitedTorque {
+        self.torque_around(self.feed_forward_nm(phase.at_effect), phase, angle_rad, velocity_rad_s)
+    }
+
+    /// The share of the biological moment that is fed forward at a phase, Nm.
+    #[must_use]
+    pub fn feed_forward_nm(&self, phase: f64) -> f64 {
+        self.assist * self.body_mass_kg * curves::moment_nm_per_kg(self.joint, phase)
+    }
+
+    /// As [`TorqueLaw::torque`], around another fed-forward moment, Nm.
+    #[must_use]
+    pub fn torque_around(
+        &self,
+        feed_forward_nm: f64,
+        phase: &LawPhase,
+        angle_rad: f64,
+        velocity_rad_s: f64,
+    ) -> LimitedTorque {
         let reference = curves::angle_rad(self.joint, phase.at_sample);
-        let moment = curves::moment_nm_per_kg(self.joint, phase.at_effect);
-        let wanted = self.assist * self.body_mass_kg * moment
+        let wanted = feed_forward_nm
             + self.stiffness_nm_rad * (reference.value - angle_rad)
             + self.damping_nms_rad * (reference.slope * phase.rate_hz - velocity_rad_s);
         LimitedTorque {

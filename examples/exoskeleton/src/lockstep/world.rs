@@ -4,16 +4,20 @@ use super::{LockStepConfig, PERIOD_NS};
 use crate::central::{CentralConfig, CentralCore, CentralInput};
 use crate::control::drive::{DriveConfig, DriveCore, DriveOutput};
 use crate::joint::{Joint, PerJoint};
-use crate::message::{DriveState, FootLoad, GaitState, JointSample};
+use crate::message::{DriveState, DriveStatus, FootLoad, GaitState, JointSample};
 use crate::part::Part;
 use crate::plant::{PlantCore, PlantReadings};
 use crate::record::{JointRow, Outage, Record, Row};
 use crate::sensor::{SensorConfig, SensorCore};
 
-/// Sensor and drive of one joint: they live and die together.
+/// 200 statuses a second.
+const STATUS_PERIOD_MS: u64 = 5;
+
+/// Sensor and drive of one joint.
 struct JointNode {
     sensor: SensorCore,
-    drive: DriveCore,
+    /// None: it died alone.
+    drive: Option<DriveCore>,
 }
 
 /// Everything sent in one millisecond; it arrives in the next.
@@ -23,6 +27,7 @@ struct Mail {
     load: Option<FootLoad>,
     gait: Option<GaitState>,
     commands_nm: PerJoint<Option<f64>>,
+    statuses: PerJoint<Option<DriveStatus>>,
 }
 
 pub(super) struct World<'a> {
@@ -36,6 +41,8 @@ pub(super) struct World<'a> {
     last_gait: Option<GaitState>,
     in_flight: Mail,
     release_at_ms: Option<u64>,
+    /// When the drive that dies alone died, ms.
+    drive_died_ms: Option<u64>,
     record: Record,
 }
 
@@ -54,6 +61,7 @@ impl<'a> World<'a> {
             last_gait: None,
             in_flight: Mail::default(),
             release_at_ms: None,
+            drive_died_ms: None,
             record: Record {
                 strides: config.strides,
                 first_start_s: 0.0,
@@ -78,6 +86,7 @@ impl<'a> World<'a> {
     pub(super) fn step(&mut self) {
         self.start_nodes();
         self.kill_and_restart();
+        self.kill_drive_and_restart();
         self.release();
         let now_ns = self.t_ms * PERIOD_NS;
         let arrived = std::mem::take(&mut self.in_flight);
@@ -123,12 +132,28 @@ impl<'a> World<'a> {
         }
     }
 
+    fn kill_drive_and_restart(&mut self) {
+        let Some(death) = self.config.drive_death else { return };
+        let walked = self.strides_walked();
+        let Some(node) = &mut self.joints[death.joint.index()] else { return };
+        match self.drive_died_ms {
+            None if walked >= death.at_strides => {
+                self.drive_died_ms = Some(self.t_ms);
+                node.drive = None;
+            }
+            Some(died_ms) if node.drive.is_none() && self.t_ms >= died_ms + death.outage_ms => {
+                node.drive = Some(DriveCore::new(DriveConfig::standard(death.joint)));
+            }
+            None | Some(_) => {}
+        }
+    }
+
     /// A new life of central with a new epoch, released again at once: the run resumes by itself.
     fn next_central(&mut self) -> CentralCore {
         self.central_epoch += 1;
         let mut central =
             CentralCore::new(CentralConfig { epoch: self.central_epoch, ..self.config.central });
-        central.release();
+        central.release().expect("a new central has not been stopped");
         central
     }
 
@@ -139,7 +164,7 @@ impl<'a> World<'a> {
         }
         if self.release_at_ms == Some(self.t_ms) {
             if let Some(central) = &mut self.central {
-                central.release();
+                central.release().expect("nobody presses the e-stop here");
             }
             self.plant.start_walking();
             self.record.released_s = Some(self.now_s());
@@ -163,6 +188,11 @@ impl<'a> World<'a> {
             samples: std::array::from_fn(|i| arrived.samples[i].as_ref()),
             load: arrived.load.as_ref(),
         };
+        for joint in Joint::ALL {
+            if let Some(status) = &arrived.statuses[joint.index()] {
+                central.drive_heard(joint, status);
+            }
+        }
         self.last_gait = central.tick(now_ns, &input);
         self.in_flight.gait = self.last_gait;
     }
@@ -171,9 +201,12 @@ impl<'a> World<'a> {
         let mut outputs = [None; 3];
         for joint in Joint::ALL {
             let i = joint.index();
-            let Some(node) = &mut self.joints[i] else { continue };
-            let output = node.drive.tick(now_ns, arrived.samples[i].as_ref(), arrived.gait.as_ref());
+            let Some(drive) = self.joints[i].as_mut().and_then(|node| node.drive.as_mut()) else { continue };
+            let output = drive.tick(now_ns, arrived.samples[i].as_ref(), arrived.gait.as_ref());
             self.in_flight.commands_nm[i] = output.command_nm;
+            if self.t_ms.is_multiple_of(STATUS_PERIOD_MS) {
+                self.in_flight.statuses[i] = Some(drive.status(now_ns));
+            }
             if output.state == DriveState::Ready && self.record.ready_s[i].is_none() {
                 self.record.ready_s[i] = Some(self.t_ms as f64 * 1e-3);
             }
@@ -200,6 +233,7 @@ impl<'a> World<'a> {
             phase_estimated: self.last_gait.map_or(0.0, |g| f64::from(g.phase)),
             confidence: self.last_gait.map_or(0.0, |g| f64::from(g.confidence)),
             mode: self.last_gait.map(|g| g.mode),
+            degraded: self.last_gait.map_or(0, |g| g.degraded),
             joints,
         });
     }
@@ -213,7 +247,7 @@ impl JointNode {
     fn new(joint: Joint) -> Self {
         Self {
             sensor: SensorCore::new(SensorConfig::default()),
-            drive: DriveCore::new(DriveConfig::standard(joint)),
+            drive: Some(DriveCore::new(DriveConfig::standard(joint))),
         }
     }
 }

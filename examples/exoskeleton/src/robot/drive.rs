@@ -14,13 +14,15 @@ use sinew::prelude::*;
 
 use super::PERIOD;
 use super::device::{DriveCommand, JointDevice};
-use super::edges::{AS_LONG_AS_IT_TAKES, Addressee, DRIVES, GAIT, STATUS, drive_name, sensor_name};
+use super::edges::{
+    AS_LONG_AS_IT_TAKES, Addressee, DRIVES, EmergencyStop, GAIT, Reset, STATUS, STOP, drive_name, sensor_name,
+};
 use super::figures::LoopFigures;
 use super::sensor::DeviceMaker;
 use super::trace::{DriveRow, EventRow, Trace};
 use crate::control::drive::{DriveConfig, DriveCore, DriveOutput};
 use crate::joint::Joint;
-use crate::message::{DriveState, GaitMode, GaitState, JointSample};
+use crate::message::{DriveState, GaitMode, GaitState, JointSample, TorqueSet};
 
 /// Silence of an input that is noticed.
 const SILENCE_MAX: Duration = Duration::from_millis(10);
@@ -66,6 +68,9 @@ pub fn spec(parts: DriveParts, place: Place) -> AppSpec<Drive> {
     AppSpec::new(drive_name(parts.joint), move || Drive::new(parts.clone()))
         .handles::<JointSample>()
         .handles::<GaitState>()
+        .handles::<TorqueSet>()
+        .handles::<EmergencyStop>()
+        .handles::<Reset>()
         .requires([sensor])
         .start_within(AS_LONG_AS_IT_TAKES)
         .place(place)
@@ -92,7 +97,8 @@ impl Drive {
         let now = Time::now();
         let output = self.core.tick(now.as_nanos(), self.sample.as_ref(), self.gait.as_ref());
         if let Some(torque_nm) = output.command_nm {
-            let released = self.gait.is_some_and(|gait| gait.mode != GaitMode::Hold);
+            let released =
+                self.gait.is_some_and(|gait| !matches!(gait.mode, GaitMode::Hold | GaitMode::Stop));
             let (saturated, state) = (output.saturated, output.state);
             self.device.command(now, &DriveCommand { torque_nm, released, saturated, state });
         }
@@ -104,8 +110,12 @@ impl Drive {
         }
         self.note(now, tick, &output);
         if tick.number.is_multiple_of(STATUS_TICKS) {
+            let status = self.core.status(now.as_nanos());
             // Nobody may want to know.
-            let _ = context.send(Tid::group(STATUS), &self.core.status(now.as_nanos()));
+            let _ = context.send(Tid::group(STATUS), &status);
+            if let Some(central) = self.central.at(now, context) {
+                let _ = context.send(central, &status);
+            }
         }
         if self.stopping && self.at_rest(&output) {
             if output.command_nm.is_none() {
@@ -131,21 +141,26 @@ impl Drive {
             gait_age_us: output.gait_age_ns.map(|ns| micros(Duration::from_nanos(ns))),
             state: output.state,
             torque_nm: output.command_nm,
+            assist_gain: output.assist_gain,
+            faults: self.core.faults().0,
+            commands_refused: self.core.counters().commands_refused.total(),
+            commands_admitted: self.core.counters().commands_admitted,
         };
         self.ticked_at = Some(now);
         self.figures.note(&row);
         self.parts.trace.note(row);
     }
 
+    /// Writes down what happened once, now.
+    fn note_event(&self, what: &str, whom: &str, how: String) {
+        let (what, whom) = (what.to_owned(), whom.to_owned());
+        self.parts.events.note(EventRow { t_ns: Time::now().as_nanos(), what, whom, how });
+    }
+
     fn note_silence(&self, input: &str, silence: Silence) {
         let (joint, silent) = (self.parts.joint, silence.silent);
         tracing::warn!(%joint, input, ?silent, lateness = ?silence.lateness, "an input is silent");
-        self.parts.events.note(EventRow {
-            t_ns: Time::now().as_nanos(),
-            what: "input_silent".to_owned(),
-            whom: input.to_owned(),
-            how: format!("nothing for {silent:?}"),
-        });
+        self.note_event("input_silent", input, format!("nothing for {silent:?}"));
     }
 
     fn tell_figures(&self) {
@@ -159,6 +174,8 @@ impl Drive {
             safe_entries = counters.safe_entries,
             samples_refused = counters.samples_refused.total(),
             gait_refused = counters.gait_refused.total(),
+            commands_refused = ?counters.commands_refused,
+            pauses = counters.pauses,
             "the drive ends"
         );
         if let Some(path) = &self.parts.figures
@@ -184,6 +201,7 @@ impl Actor for Drive {
     fn started(&mut self, context: &mut Self::Context) {
         self.ready = context.hold_ready();
         context.join(DRIVES);
+        context.join(STOP);
         context.every(PERIOD, Self::tick);
     }
 
@@ -192,7 +210,7 @@ impl Actor for Drive {
             return Running::Stop;
         }
         self.stopping = true;
-        self.core.emergency_stop();
+        self.core.let_go();
         // The ticks go on until the torque is zero.
         Running::Continue
     }
@@ -234,5 +252,52 @@ impl Handler<Delivery<GaitState>> for Drive {
             });
         }
         self.gait = Some(GaitState { t_ns: gait.sent.as_nanos(), ..gait.payload });
+    }
+}
+
+impl Handler<Delivery<TorqueSet>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, command: Delivery<TorqueSet>, context: &mut Self::Context) {
+        let now = Time::now();
+        let central = self.central.at(now, context);
+        if central.map(|central| central.node) != Some(command.source.node) {
+            context.reject();
+            return;
+        }
+        let set = TorqueSet { t_ns: command.sent.as_nanos(), ..command.payload };
+        if !self.core.command(now.as_nanos(), &set) {
+            context.reject();
+        }
+    }
+}
+
+impl Handler<Delivery<EmergencyStop>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, stop: Delivery<EmergencyStop>, _: &mut Self::Context) {
+        // From anybody: to stop needs no right.
+        tracing::warn!(joint = %self.parts.joint, by = %stop.source, "the e-stop was pressed");
+        self.core.emergency_stop();
+        self.note_event("e_stop", &stop.source.to_string(), String::new());
+    }
+}
+
+impl Handler<Delivery<Reset>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, reset: Delivery<Reset>, context: &mut Self::Context) {
+        let now = Time::now();
+        if self.central.at(now, context).map(|central| central.node) != Some(reset.source.node) {
+            context.reject();
+            return;
+        }
+        match self.core.reset(now.as_nanos()) {
+            Ok(()) => self.note_event("reset", &reset.source.to_string(), String::new()),
+            Err(refusal) => {
+                tracing::warn!(joint = %self.parts.joint, %refusal, "the e-stop stays");
+                context.reject();
+            }
+        }
     }
 }

@@ -3,7 +3,7 @@
 use sinew::prelude::{Actor, AppContext, Class, Duration, Payload, Tid, Time, payload};
 
 use crate::joint::Joint;
-use crate::message::{DriveStatus, FootLoad, GaitMode, GaitState, JointSample};
+use crate::message::{DriveStatus, FootLoad, GaitMode, GaitState, JointSample, TorqueSet};
 
 /// A start that waits for other parts of the robot is no fault, however long it takes.
 pub(super) const AS_LONG_AS_IT_TAKES: Duration = Duration::from_secs(7 * 24 * 3600);
@@ -12,6 +12,8 @@ pub(super) const AS_LONG_AS_IT_TAKES: Duration = Duration::from_secs(7 * 24 * 36
 pub const GAIT: &str = "central.gait";
 /// Group of the drives: central's word to all three.
 pub const DRIVES: &str = "exo.drives";
+/// Group of those who stop when the e-stop is pressed: the drives and central's gait.
+pub const STOP: &str = "exo.stop";
 /// Group of those who want to know how things stand.
 pub const STATUS: &str = "exo.status";
 
@@ -33,15 +35,33 @@ impl Payload for GaitState {
     const CLASS: Class = Class::Stream;
 }
 
+impl Payload for TorqueSet {
+    const NAME: &'static str = "exo.torque_set";
+    const CLASS: Class = Class::Stream;
+}
+
 impl Payload for DriveStatus {
     const NAME: &'static str = "exo.drive_status";
     const CLASS: Class = Class::Stream;
 }
 
 payload!("exo.release" =>
-    /// From the coordinator to central's gait: the person may walk.
+    /// From the coordinator or the operator to central's gait: the person may walk. Refused while the e-stop is latched.
     #[derive(Debug, Clone, Copy)]
     pub struct Release {}
+);
+
+payload!("exo.emergency_stop" =>
+    /// From anybody to the group `exo.stop`: torque to zero, and stay there. Software, not a safety function.
+    #[derive(Debug, Clone, Copy)]
+    pub struct EmergencyStop {}
+);
+
+payload!("exo.reset" =>
+    /// From the operator to central's gait, then to each drive: the e-stop is taken back. A drive refuses it while its
+    /// torque is not zero and while central says stop.
+    #[derive(Debug, Clone, Copy)]
+    pub struct Reset {}
 );
 
 payload!("exo.gait_status", Stream =>
@@ -54,6 +74,8 @@ payload!("exo.gait_status", Stream =>
         pub confidence: f32,
         /// What the drives are asked to do; none while a part was never heard.
         pub mode: Option<GaitMode>,
+        /// Joints whose drives do not help; bit 0 hip, bit 1 knee, bit 2 ankle.
+        pub degraded: u8,
         /// Greatest lateness of a tick since the last status, us.
         pub late_max_us: u32,
     }

@@ -12,12 +12,13 @@ use sinew::{NodeAddress, ReadyGate};
 use super::PERIOD;
 use super::drive::micros;
 use super::edges::{
-    AS_LONG_AS_IT_TAKES, DRIVES, GAIT, GaitStatus, Release, STATUS, joint_of_sensor, sensor_name,
+    AS_LONG_AS_IT_TAKES, DRIVES, EmergencyStop, GAIT, GaitStatus, Release, Reset, STATUS, STOP,
+    joint_of_sensor, sensor_name,
 };
-use super::trace::{GaitRow, Trace};
-use crate::central::{CentralConfig, CentralCore, CentralInput};
+use super::trace::{EventRow, GaitRow, Trace};
+use crate::central::{CentralConfig, CentralCore, CentralInput, Resume, bit};
 use crate::joint::{Joint, PerJoint};
-use crate::message::{FootLoad, GaitState, JointSample};
+use crate::message::{DriveStatus, FootLoad, GaitState, JointSample};
 
 /// Ticks between two statuses: 20 a second.
 const STATUS_TICKS: u64 = 50;
@@ -32,6 +33,10 @@ pub struct GaitParts {
     pub epoch: Arc<AtomicU32>,
     /// Where its ticks go.
     pub trace: Trace<GaitRow>,
+    /// Where it writes down what happens once.
+    pub events: Trace<EventRow>,
+    /// How it goes on after a loss.
+    pub resume: Resume,
 }
 
 /// How a joint is known to be gone.
@@ -50,6 +55,8 @@ pub struct Gait {
     gone: PerJoint<Gone>,
     ready: Option<ReadyGate>,
     late_max: Duration,
+    /// Joints that were flagged as degraded last.
+    degraded: u8,
 }
 
 /// Declares the gait application.
@@ -58,7 +65,10 @@ pub fn spec(parts: GaitParts, place: Place) -> AppSpec<Gait> {
     AppSpec::new(GAIT, move || Gait::new(parts.clone()))
         .handles::<JointSample>()
         .handles::<FootLoad>()
+        .handles::<DriveStatus>()
         .handles::<Release>()
+        .handles::<EmergencyStop>()
+        .handles::<Reset>()
         .handles::<NodeEvent>()
         .handles::<RequirementEvent>()
         .requires(Joint::ALL.map(sensor_name))
@@ -70,14 +80,16 @@ impl Gait {
     fn new(parts: GaitParts) -> Self {
         // Only its growth matters.
         let epoch = parts.epoch.fetch_add(1, Ordering::Relaxed);
+        let resume = parts.resume;
         Self {
             parts,
-            core: CentralCore::new(CentralConfig { epoch, ..CentralConfig::default() }),
+            core: CentralCore::new(CentralConfig { epoch, resume, ..CentralConfig::default() }),
             samples: [None; 3],
             load: None,
             gone: [Gone::default(); 3],
             ready: None,
             late_max: Duration::ZERO,
+            degraded: 0,
         }
     }
 
@@ -93,6 +105,7 @@ impl Gait {
                 gate.reached();
             }
         }
+        self.flag_degraded();
         self.note(now, tick, state.as_ref());
         self.late_max = self.late_max.max(tick.lateness);
         if tick.number.is_multiple_of(STATUS_TICKS) {
@@ -108,6 +121,7 @@ impl Gait {
             phase: state.map_or(0.0, |state| state.phase),
             confidence: state.map_or(0.0, |state| state.confidence),
             mode: state.map(|state| state.mode),
+            degraded: self.degraded,
         });
     }
 
@@ -116,8 +130,26 @@ impl Gait {
             phase: state.map_or(0.0, |state| state.phase),
             confidence: state.map_or(0.0, |state| state.confidence),
             mode: state.map(|state| state.mode),
+            degraded: self.degraded,
             late_max_us: micros(std::mem::take(&mut self.late_max)),
         }
+    }
+
+    /// Tells once that a joint walks without its drive's help, and once that it does not any more.
+    fn flag_degraded(&mut self) {
+        let degraded = self.core.degraded();
+        let changed = std::mem::replace(&mut self.degraded, degraded) ^ degraded;
+        for joint in Joint::ALL.into_iter().filter(|joint| changed & bit(*joint) != 0) {
+            let what = if degraded & bit(joint) != 0 { "degraded" } else { "assisted_again" };
+            tracing::warn!(%joint, what, "a drive that is asked to assist changes");
+            self.note_event(what, joint.name());
+        }
+    }
+
+    fn note_event(&self, what: &str, whom: &str) {
+        let t_ns = Time::now().as_nanos();
+        let (what, whom) = (what.to_owned(), whom.to_owned());
+        self.parts.events.note(EventRow { t_ns, what, whom, how: String::new() });
     }
 
     fn joint_at(&self, node: NodeAddress) -> Option<Joint> {
@@ -141,6 +173,7 @@ impl Actor for Gait {
     fn started(&mut self, context: &mut Self::Context) {
         tracing::info!("the barrier is open: central's gait starts");
         self.ready = context.hold_ready();
+        context.join(STOP);
         context.every(PERIOD, |this, tick, context| this.tick(tick, context));
     }
 }
@@ -180,8 +213,50 @@ impl Handler<Delivery<Release>> for Gait {
             context.reject();
             return;
         }
-        tracing::info!(by = %release.source, "walking is released");
-        self.core.release();
+        match self.core.release() {
+            Ok(()) => tracing::info!(by = %release.source, "walking is released"),
+            Err(refusal) => {
+                tracing::warn!(by = %release.source, %refusal, "walking is not released");
+                context.reject();
+            }
+        }
+    }
+}
+
+impl Handler<Delivery<EmergencyStop>> for Gait {
+    type Result = ();
+
+    fn handle(&mut self, stop: Delivery<EmergencyStop>, _: &mut Self::Context) {
+        // From anybody: to stop needs no right.
+        tracing::warn!(by = %stop.source, "the e-stop was pressed");
+        self.core.stop();
+        self.note_event("e_stop", &stop.source.to_string());
+    }
+}
+
+impl Handler<Delivery<Reset>> for Gait {
+    type Result = ();
+
+    fn handle(&mut self, reset: Delivery<Reset>, context: &mut Self::Context) {
+        // Only by somebody on central itself.
+        if reset.source.node != context.tid().node {
+            context.reject();
+            return;
+        }
+        tracing::info!(by = %reset.source, "the e-stop is taken back");
+        self.core.reset();
+        self.note_event("reset", &reset.source.to_string());
+    }
+}
+
+impl Handler<Delivery<DriveStatus>> for Gait {
+    type Result = ();
+
+    fn handle(&mut self, status: Delivery<DriveStatus>, context: &mut Self::Context) {
+        match self.joint_at(status.source.node) {
+            Some(joint) => self.core.drive_heard(joint, &status.payload),
+            None => context.reject(),
+        }
     }
 }
 

@@ -17,10 +17,11 @@ use super::gait::GaitParts;
 use super::plant::{self, PlantError};
 use super::role::Role;
 use super::sensor::DeviceMaker;
-use super::topology::{ControlThread, Topology, TopologyFaults};
+use super::topology::{ControlThread, ReleaseBy, Topology, TopologyFaults};
 use super::trace::{EventRow, Recording, TraceRow};
 use super::watch::WatchParts;
 use super::{coordinator, drive, gait, sensor, watch};
+use crate::central::Resume;
 use crate::joint::Joint;
 use crate::part::Part;
 
@@ -98,8 +99,17 @@ fn run_node(part: Part, topology: &Topology, options: &NodeOptions) -> Result<Ex
             let trace = record(options, part.name())?;
             let epoch = Arc::new(AtomicU32::new((incarnation.0 / 1_000_000) as u32));
             let joints = topology.joints.each_ref().map(|place| place.address);
-            let parts = GaitParts { joints, epoch, trace: trace.trace() };
-            let builder = builder.app(gait::spec(parts, place(topology))).app(coordinator::spec());
+            let release = topology.control.release;
+            let resume = match release {
+                ReleaseBy::Itself => Resume::ByItself,
+                ReleaseBy::Operator => Resume::ByOperator,
+            };
+            let parts = GaitParts { joints, epoch, trace: trace.trace(), events: events.trace(), resume };
+            let builder = builder.app(gait::spec(parts, place(topology)));
+            let builder = match release {
+                ReleaseBy::Itself => builder.app(coordinator::spec()),
+                ReleaseBy::Operator => builder,
+            };
             let code = start_and_run(builder, &watched, options)?;
             tell_lost_rows(trace.finish());
             code

@@ -166,6 +166,7 @@ impl Plant {
             commanded_nm: heard.map(|heard| heard.map(|heard| heard.torque_nm)),
             state: heard.map(|heard| heard.map(|heard| heard.word.state)),
             saturated: heard.map(|heard| heard.is_some_and(|heard| heard.word.saturated)),
+            watchdog: truth.watchdog_active,
         });
     }
 

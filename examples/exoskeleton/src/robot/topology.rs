@@ -67,6 +67,18 @@ pub struct Control {
     pub thread: ControlThread,
     /// `SCHED_FIFO` priority of that thread, 1 to 99; only for a thread of its own.
     pub realtime_priority: Option<u8>,
+    /// Who lets the person walk.
+    pub release: ReleaseBy,
+}
+
+/// Who lets the person walk, at the start and after the loss of a part.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ReleaseBy {
+    /// The coordinator presses the button half a second after all drives have started, and after a loss the walk goes
+    /// on by itself: for a simulation.
+    Itself,
+    /// Somebody at central, each time. The default.
+    Operator,
 }
 
 /// Where a node is.

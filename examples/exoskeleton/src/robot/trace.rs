@@ -58,6 +58,8 @@ pub struct PlantRow {
     pub state: PerJoint<Option<DriveState>>,
     /// Which drives' torque laws met their limits.
     pub saturated: PerJoint<bool>,
+    /// Which devices damp by themselves.
+    pub watchdog: PerJoint<bool>,
 }
 
 impl TraceRow for PlantRow {
@@ -65,7 +67,7 @@ impl TraceRow for PlantRow {
         hip_rad,knee_rad,ankle_rad,hip_rad_s,knee_rad_s,ankle_rad_s,\
         hip_intended_rad,knee_intended_rad,ankle_intended_rad,hip_applied_nm,knee_applied_nm,ankle_applied_nm,\
         hip_commanded_nm,knee_commanded_nm,ankle_commanded_nm,hip_state,knee_state,ankle_state,\
-        hip_saturated,knee_saturated,ankle_saturated";
+        hip_saturated,knee_saturated,ankle_saturated,hip_watchdog,knee_watchdog,ankle_watchdog";
 }
 
 /// What a drive did in one tick.
@@ -85,10 +87,19 @@ pub struct DriveRow {
     pub state: DriveState,
     /// Torque commanded, Nm.
     pub torque_nm: Option<f64>,
+    /// Gain of assistance, 0..1.
+    pub assist_gain: f64,
+    /// Bits of `FaultBits`.
+    pub faults: u16,
+    /// Torques from outside that were refused so far.
+    pub commands_refused: u32,
+    /// Torques from outside that were believed so far.
+    pub commands_admitted: u32,
 }
 
 impl TraceRow for DriveRow {
-    const HEADER: &'static str = "t_ns,late_us,period_us,sample_age_us,gait_age_us,state,torque_nm";
+    const HEADER: &'static str = "t_ns,late_us,period_us,sample_age_us,gait_age_us,state,torque_nm,assist_gain,faults,\
+        commands_refused,commands_admitted";
 }
 
 /// What central did in one tick.
@@ -104,10 +115,12 @@ pub struct GaitRow {
     pub confidence: f32,
     /// What the drives were asked to do; none while central said nothing.
     pub mode: Option<GaitMode>,
+    /// Joints whose drives do not help; bit 0 hip, bit 1 knee, bit 2 ankle.
+    pub degraded: u8,
 }
 
 impl TraceRow for GaitRow {
-    const HEADER: &'static str = "t_ns,late_us,phase,confidence,mode";
+    const HEADER: &'static str = "t_ns,late_us,phase,confidence,mode,degraded";
 }
 
 /// Something that happened once.
@@ -290,6 +303,7 @@ mod tests {
             commanded_nm: [None, Some(7.0), None],
             state: [Some(DriveState::Walk), None, Some(DriveState::Safe)],
             saturated: [false, true, false],
+            watchdog: [true, false, false],
         };
         for strides in [1.5, 2.5] {
             let recording = Recording::begin(Some(&folder), "plant").unwrap();
@@ -308,7 +322,7 @@ mod tests {
     #[test]
     fn row_that_was_cut_off_is_left_out() {
         let folder = folder("cut");
-        let text = format!("{}\n1,2,0.5,1.0,2\n2,3,0.", GaitRow::HEADER);
+        let text = format!("{}\n1,2,0.5,1.0,2,0\n2,3,0.", GaitRow::HEADER);
         std::fs::write(folder.join("central-1.csv"), text).unwrap();
         let lives: Vec<Vec<GaitRow>> = read_lives(&folder, "central").unwrap();
         assert_eq!(lives[0].len(), 1);

@@ -203,6 +203,7 @@ fn row(t_s: f64, plant: &PlantRow, gait: Option<&GaitRow>) -> Row {
         phase_estimated: gait.map_or(0.0, |gait| f64::from(gait.phase)),
         confidence: gait.map_or(0.0, |gait| f64::from(gait.confidence)),
         mode: gait.and_then(|gait| gait.mode),
+        degraded: gait.map_or(0, |gait| gait.degraded),
         joints: std::array::from_fn(|i| JointRow {
             angle_rad: plant.angle_rad[i],
             velocity_rad_s: plant.velocity_rad_s[i],

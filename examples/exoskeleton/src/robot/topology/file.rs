@@ -10,7 +10,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use sinew::NodeAddress;
 
-use super::{Control, ControlThread, Discovery, NodePlace, PlantPlace, Topology, TopologyFaults};
+use super::{Control, ControlThread, Discovery, NodePlace, PlantPlace, ReleaseBy, Topology, TopologyFaults};
 use crate::joint::Joint;
 use crate::part::Part;
 
@@ -54,6 +54,7 @@ impl Default for DiscoveryTable {
 struct ControlTable {
     thread: Option<String>,
     realtime_priority: Option<u64>,
+    release: Option<String>,
 }
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -201,7 +202,15 @@ fn control(faults: &mut Faults, table: &ControlTable) -> Control {
         });
     }
     let realtime_priority = table.realtime_priority.and_then(|priority| u8::try_from(priority).ok());
-    Control { thread, realtime_priority }
+    let release = match table.release.as_deref() {
+        Some("itself") => ReleaseBy::Itself,
+        None | Some("operator") => ReleaseBy::Operator,
+        Some(other) => {
+            faults.0.push(format!("control.release = \"{other}\" is none; write \"operator\" or \"itself\""));
+            ReleaseBy::Operator
+        }
+    };
+    Control { thread, realtime_priority, release }
 }
 
 fn plant(faults: &mut Faults, table: PlantTable) -> Option<PlantPlace> {
@@ -257,6 +266,10 @@ pub(super) fn write(topology: &Topology) -> String {
         ControlThread::Io => "io",
         ControlThread::Own => "own",
     };
+    let release = match control.release {
+        ReleaseBy::Itself => "itself",
+        ReleaseBy::Operator => "operator",
+    };
     let file = File {
         project: topology.project.clone(),
         discovery: DiscoveryTable {
@@ -268,6 +281,7 @@ pub(super) fn write(topology: &Topology) -> String {
         control: ControlTable {
             thread: Some(thread.to_owned()),
             realtime_priority: control.realtime_priority.map(u64::from),
+            release: Some(release.to_owned()),
         },
         central: node(Part::Central),
         hip: node(Part::Joint(Joint::Hip)),

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use sinew::NodeAddress;
 
-use super::{Control, ControlThread, Discovery, NodePlace, PlantPlace, Topology};
+use super::{Control, ControlThread, Discovery, NodePlace, PlantPlace, ReleaseBy, Topology};
 
 /// A topology on loopback with a project name, a multicast port and a plant port of its own.
 ///
@@ -33,7 +33,7 @@ pub fn for_this_host(seed: u64) -> io::Result<Topology> {
             period: Duration::from_millis(500),
             missed_max: 3,
         },
-        control: Control { thread: ControlThread::Io, realtime_priority: None },
+        control: Control { thread: ControlThread::Io, realtime_priority: None, release: ReleaseBy::Itself },
         central: node(1),
         joints: [node(2), node(3), node(4)],
         console: Some(console_path(id)),

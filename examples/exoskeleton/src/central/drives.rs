@@ -1,0 +1,57 @@
+//! What central knows of the three drives: who helps, who does not, who was stopped.
+
+use crate::control::faults::FaultBits;
+use crate::joint::{Joint, PerJoint};
+use crate::message::{DriveState, DriveStatus};
+
+/// Time that one tick adds to a silence at most, seconds: when central itself was held up it has heard nobody.
+const TICK_LONGEST_S: f64 = 0.005;
+
+/// The drives as central sees them.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Drives {
+    silence_max_s: f64,
+    /// Time since a drive said that it assists, seconds.
+    unassisted_s: PerJoint<f64>,
+    /// Whether it said that its e-stop was pressed.
+    stopped: PerJoint<bool>,
+}
+
+impl Drives {
+    pub(super) const fn new(silence_max_s: f64) -> Self {
+        Self { silence_max_s, unassisted_s: [0.0; 3], stopped: [false; 3] }
+    }
+
+    /// A drive has told how it is.
+    pub(super) const fn heard(&mut self, joint: Joint, status: &DriveStatus) {
+        self.stopped[joint.index()] = FaultBits(status.faults).contains(FaultBits::STOPPED);
+        if matches!(status.state, DriveState::Walk) {
+            self.unassisted_s[joint.index()] = 0.0;
+        }
+    }
+
+    /// Time has passed; a drive that is not asked to assist owes nothing.
+    pub(super) fn tick(&mut self, dt_s: f64, assistance_is_due: bool) {
+        for silence_s in &mut self.unassisted_s {
+            *silence_s = if assistance_is_due { *silence_s + dt_s.min(TICK_LONGEST_S) } else { 0.0 };
+        }
+    }
+
+    /// Joints that walk without their drive's help: bit 0 hip, bit 1 knee, bit 2 ankle.
+    pub(super) fn degraded(&self) -> u8 {
+        Joint::ALL
+            .into_iter()
+            .filter(|joint| self.unassisted_s[joint.index()] > self.silence_max_s)
+            .fold(0, |bits, joint| bits | bit(joint))
+    }
+
+    pub(super) fn any_stopped(&self) -> bool {
+        self.stopped.contains(&true)
+    }
+}
+
+/// The bit of a joint in `GaitState::degraded`.
+#[must_use]
+pub const fn bit(joint: Joint) -> u8 {
+    1 << joint.index()
+}
