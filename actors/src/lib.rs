@@ -10,7 +10,8 @@
 //! | --- | --- |
 //! | a node and its life | [`Node`], [`NodeBuilder`], [`config`] |
 //! | an application in the node's process | [`AppSpec`], [`AppContext`], [`Delivery`], [`payload!`] |
-//! | an application in a process of its own | [`NodeApi`], [`Endpoint`] |
+//! | the same in a process of its own, started and restarted by the node | [`AppSpec::own_process`], [`Place::process`] |
+//! | an application in a process that the node did not start | [`NodeApi`], [`Endpoint`] |
 //! | sending | [`Sender`]: `send`, `send_confirmed`, `ask`; [`Outcome`] |
 //! | events | [`NodeEvent`] (who is there), [`RequirementEvent`] (what is ready) |
 //!
@@ -34,6 +35,7 @@ mod ndl;
 mod node;
 mod outlet;
 mod payload;
+mod process;
 mod refusals;
 mod stores;
 mod sync;

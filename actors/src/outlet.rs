@@ -150,6 +150,19 @@ impl<S: Socket> StreamOutlet<S> {
         self.with(|half, after| half.finish(last, after));
     }
 
+    /// Takes a frame that goes ahead of all that waits, behind those taken so before it. At most `waiting_max` wait.
+    ///
+    /// # Errors
+    /// The frame: there is no connection, or too many wait.
+    pub(crate) fn submit_urgent(&self, message: Message, waiting_max: usize) -> Result<(), Refused> {
+        self.with(|half, after| half.submit_urgent(message, waiting_max, after))
+    }
+
+    /// Urgent frames that the socket has not taken to their last byte. They end with the connection.
+    pub(crate) fn urgent_left(&self) -> usize {
+        self.lock().urgent_left()
+    }
+
     /// Settles what has expired by `now` while it waited.
     pub(crate) fn expire(&self, now: Time) {
         self.with(|half, after| half.expire(now, after));

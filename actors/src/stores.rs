@@ -42,6 +42,8 @@ pub(crate) struct Stores {
     pub(crate) ndl: Mutex<ndl::Core>,
     /// Who is registered on this node.
     pub(crate) registry: Mutex<lncl::Registry>,
+    /// Counts the changes of who has which name, on this node or any.
+    pub(crate) directory_changes: tokio::sync::watch::Sender<u64>,
     /// Who is known on other nodes, and what waits for whom.
     pub(crate) sync: Mutex<sync::Core>,
     /// Where faults strike on purpose.
@@ -74,6 +76,7 @@ impl Stores {
             gncl: gncl::Store::default(),
             ndl: Mutex::new(ndl::new_core(&config, node, incarnation)),
             registry: Mutex::default(),
+            directory_changes: tokio::sync::watch::Sender::default(),
             sync: Mutex::new(sync::Core::new(&config, node, incarnation)),
             config,
             #[cfg(feature = "fault-points")]

@@ -5,12 +5,14 @@ mod ground;
 mod hosts;
 mod log;
 mod program;
+
+pub mod orders;
 pub mod puppet;
 
 pub use ground::{Ground, all_run, ready_for, sees};
 pub use hosts::{Host, Hosts};
 pub use log::{Log, until};
-pub use program::{Program, node_under_test};
+pub use program::{Program, node_under_test, process_under_test};
 
 use std::{
     net::SocketAddrV4,

@@ -29,7 +29,7 @@ pub struct Program {
 /// The node of the scenarios, on `host` or on this one, with the configuration in `config`.
 #[must_use]
 pub fn node_under_test(host: Option<&Host>, config: &Path, arguments: &[&str]) -> Program {
-    let path = node_program();
+    let path = program("node_under_test");
     let mut command = match host {
         Some(host) => host.command(&path),
         None => Command::new(&path),
@@ -38,11 +38,19 @@ pub fn node_under_test(host: Option<&Host>, config: &Path, arguments: &[&str]) -
     Program::start(&config.display().to_string(), command)
 }
 
+/// The node of the scenarios of applications in processes of their own, with the configuration in `config`.
+#[must_use]
+pub fn process_under_test(config: &Path, arguments: &[&str]) -> Program {
+    let mut command = Command::new(program("process_under_test"));
+    command.arg(config).args(arguments);
+    Program::start(&config.display().to_string(), command)
+}
+
 /// The binary lies beside the tests' own directory.
-fn node_program() -> std::path::PathBuf {
+fn program(name: &str) -> std::path::PathBuf {
     let test = std::env::current_exe().expect("a test has a path");
     let deps = test.parent().expect("it lies in a directory");
-    deps.parent().expect("which lies in the profile's").join("node_under_test")
+    deps.parent().expect("which lies in the profile's").join(name)
 }
 
 impl Program {

@@ -2,21 +2,21 @@
 
 use std::{io, ops::ControlFlow, rc::Rc, sync::Arc, time::Duration};
 
-use bytes::{Bytes, BytesMut};
+use bytes::Bytes;
 use rustix::net::Shutdown;
 use sinew_runtime::{
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     router::{LocalRoute, Outlet},
     tid::Tid,
     time::Time,
-    wire::{Flags, FrameCodec, FrameError, Header, Kind, Message},
+    wire::{Flags, FrameError, Header, Kind, Message},
 };
 use tokio::net::{UnixStream, unix::UCred};
-use tokio_util::codec::Decoder;
 
 use super::{
     core::{Address, ClientId, Owner, Request},
     payload::{self, REGISTER_BYTES_MAX, Refusal, Register, Registered, Resolved},
+    reader::Reader,
     registrar,
     server::{Server, refuse},
     session::{Order, Session},
@@ -30,8 +30,6 @@ use crate::{
 const HANDSHAKE: Duration = Duration::from_secs(2);
 /// Time that a client has to take its refusal when earlier messages fill its socket.
 const LAST_WORDS: Duration = Duration::from_millis(100);
-/// Bytes that are read at once.
-const READ_CHUNK: usize = 16 * 1024;
 
 /// The writing half of a client's connection.
 pub(super) type ClientOutlet = StreamOutlet<Arc<UnixStream>>;
@@ -385,38 +383,5 @@ fn limits(stores: &Stores) -> OutletLimits {
         queue_capacity: config.mailbox_capacity,
         unconfirmed_max: config.mailbox_capacity,
         payload_max: config.payload_max,
-    }
-}
-
-/// The reading half of a connection.
-struct Reader {
-    buffer: BytesMut,
-    codec: FrameCodec,
-}
-
-impl Reader {
-    fn new(payload_max: usize) -> Self {
-        Self { buffer: BytesMut::new(), codec: FrameCodec::new(payload_max) }
-    }
-
-    fn set_payload_max(&mut self, payload_max: usize) {
-        self.codec = FrameCodec::new(payload_max);
-    }
-
-    /// The next frame; `None` when the peer has closed. May be dropped at any time without losing a byte.
-    async fn next(&mut self, stream: &UnixStream) -> Result<Option<Message>, FrameError> {
-        loop {
-            if let Some(message) = self.codec.decode(&mut self.buffer)? {
-                return Ok(Some(message));
-            }
-            stream.readable().await?;
-            self.buffer.reserve(READ_CHUNK);
-            match stream.try_read_buf(&mut self.buffer) {
-                Ok(0) => return Ok(None),
-                Ok(_) => {}
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
-                Err(error) => return Err(error.into()),
-            }
-        }
     }
 }

@@ -22,9 +22,10 @@ mod core;
 mod facts;
 mod listener;
 pub(crate) mod payload;
+mod reader;
 mod registrar;
 mod server;
-mod session;
+pub(crate) mod session;
 #[cfg(test)]
 pub(crate) mod testing;
 #[cfg(test)]
@@ -34,6 +35,7 @@ pub(crate) use actor::Lncl;
 pub use core::RegisterError;
 pub(crate) use core::Registry;
 pub(crate) use facts::AppFact;
+pub(crate) use reader::Reader;
 pub(crate) use registrar::{
     LocalApp, app_down, app_ready, register_local, resolve, set_member, unregister_local,
 };

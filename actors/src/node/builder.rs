@@ -18,6 +18,7 @@ use super::{
 };
 use crate::{
     config::{ConfigFaults, NodeConfig},
+    process,
     stores::Stores,
     sync::Waiting,
 };
@@ -153,10 +154,16 @@ impl NodeBuilder {
 
     /// Starts the node. Returns when its layers are ready; its applications start when what they require is ready.
     ///
+    /// An application of the node that has a [process of its own](sinew_runtime::app::AppSpec::own_process) is this
+    /// program, started again with the same arguments: there this function does not return but runs the application, and
+    /// the builders of other nodes start nothing. What the program does before this line it does in that process too, so
+    /// keep it short there, and do not read the standard input.
+    ///
     /// # Errors
     /// The configuration has faults, an application cannot be registered, or a layer did not become ready.
-    pub fn start(self) -> Result<Node, StartError> {
+    pub fn start(mut self) -> Result<Node, StartError> {
         self.config.validate()?;
+        let is_bystander = process::is_bystander(&self.config, &mut self.apps);
         let mut names = BTreeSet::new();
         if let Some(twice) = self.apps.iter().find(|app| !names.insert(app.name().to_owned())) {
             return Err(StartError::SameName(twice.name().to_owned()));
@@ -172,9 +179,12 @@ impl NodeBuilder {
                 "SINEW_FAULTS is ignored: this program was built without the feature `fault-points`"
             );
         }
-        let handle = NodeHandle { root: stores.posts.root.clone(), stores: stores.clone() };
+        let handle = NodeHandle { root: stores.posts.root.clone(), stores: stores.clone(), is_bystander };
         let (say_started, started) = sync_channel(1);
         let (say_ended, ended) = sync_channel(1);
+        if is_bystander {
+            return Ok(Node { handle, ended, thread: None });
+        }
         let (apps, heed_signals) = (self.apps, self.heed_signals);
         if heed_signals && handle.root.post(RootEvent::HeedSignals).is_err() {
             return Err(StartError::Layers("the root's post is full before it was read".to_owned()));

@@ -15,7 +15,7 @@ mod faults;
 mod root;
 
 pub use builder::{NodeBuilder, StartError};
-pub(crate) use root::RootEvent;
+pub(crate) use root::{RootEvent, WAITS_MAX};
 
 use std::{
     net::SocketAddr,
@@ -75,6 +75,8 @@ pub struct Traffic {
 pub struct NodeHandle {
     stores: Arc<Stores>,
     root: Post<RootEvent>,
+    /// There is no node: this process hosts an application of another one.
+    is_bystander: bool,
 }
 
 impl std::fmt::Debug for NodeHandle {
@@ -117,6 +119,9 @@ impl Node {
     /// Runs until SIGINT or SIGTERM, or until the node gives up; then stops in order. Returns the exit code for `main`:
     /// 0 after an orderly stop, 1 after giving up.
     pub fn run(mut self) -> ExitCode {
+        if self.handle.is_bystander {
+            wait_for_ever();
+        }
         self.handle.tell(RootEvent::HeedSignals);
         match self.wait() {
             NodeEnd::Stopped => ExitCode::SUCCESS,
@@ -130,6 +135,9 @@ impl Node {
     }
 
     fn wait(&mut self) -> NodeEnd {
+        if self.handle.is_bystander {
+            return NodeEnd::Stopped;
+        }
         let lost = || NodeEnd::GaveUp("the root's thread ended without a word".to_owned());
         let end = self.ended.recv().unwrap_or_else(|_| lost());
         if let Some(thread) = self.thread.take() {
@@ -137,6 +145,13 @@ impl Node {
             let _ = thread.join();
         }
         end
+    }
+}
+
+/// Another builder of this program hosts an application; the process ends with it.
+fn wait_for_ever() -> ! {
+    loop {
+        std::thread::park();
     }
 }
 
@@ -227,6 +242,9 @@ impl NodeHandle {
     /// # Errors
     /// Who still waits after `within`, and for whom.
     pub fn wait_until_running(&self, within: Duration) -> Result<(), StartError> {
+        if self.is_bystander {
+            return Ok(());
+        }
         let (say, heard) = std::sync::mpsc::sync_channel(1);
         self.tell(RootEvent::TellWhenRunning(say));
         heard

@@ -14,6 +14,7 @@ use sinew_runtime::{
     mailbox::Mailbox,
     pending::{AppOutlet, Pending},
     post::Post,
+    router::Outlet,
     sender::Sender,
     supervision::{
         ChildId, ChildIds, ChildSpec, Input, Launch, Place, Policy, ReadyGate, Reason, Strategy, Supervisor,
@@ -24,10 +25,10 @@ use sinew_runtime::{
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::{NodeEnd, StartError, directory::NodeDirectory};
-use crate::{gncl, lncl, ndl, stores::Stores, sync};
+use crate::{gncl, lncl, ndl, process, stores::Stores, sync};
 
 /// Confirmed messages and requests of one application under way at most.
-const WAITS_MAX: usize = 1_024;
+pub(crate) const WAITS_MAX: usize = 1_024;
 
 /// What the root is told.
 #[derive(Debug)]
@@ -274,7 +275,11 @@ impl Root {
         let config = &self.stores.config;
         let mailbox = Mailbox::new(config.mailbox_capacity);
         let pending = Pending::new(WAITS_MAX);
-        let outlet = Arc::new(AppOutlet { pending: pending.clone(), inbox: mailbox.clone() });
+        let hosted = app.place().own_process.then(|| process::Link::new(&self.stores, mailbox.clone()));
+        let outlet: Arc<dyn Outlet> = match &hosted {
+            Some(link) => link.clone(),
+            None => Arc::new(AppOutlet { pending: pending.clone(), inbox: mailbox.clone() }),
+        };
         let kinds = app.kinds();
         let local = lncl::LocalApp {
             name: Some(app.name().to_owned()),
@@ -297,16 +302,13 @@ impl Root {
         let id = self.child_ids.next();
         self.app_ids.insert(tid.app, id);
         self.apps.insert(id, App { address: tid.app, mailbox: mailbox.clone(), running: false });
-        let launch = app.launch(AppWiring { sender, mailbox });
+        let (place, launch) = match hosted {
+            Some(link) => (Place::thread(Place::IO), link.launch(&self.stores, tid, app)),
+            None => (app.place().clone(), app.launch(AppWiring { sender, mailbox })),
+        };
         #[cfg(feature = "fault-points")]
         let launch = super::faults::arm(&self.stores, app, launch);
-        Ok(ChildSpec {
-            id,
-            name: app.name().to_owned(),
-            policy: app.policy().clone(),
-            place: app.place().clone(),
-            launch,
-        })
+        Ok(ChildSpec { id, name: app.name().to_owned(), policy: app.policy().clone(), place, launch })
     }
 
     fn apps_said(&mut self, fact: SupervisorFact) {

@@ -88,6 +88,8 @@ pub(super) struct Half<S> {
     /// The frame that was being written when the last connection ended. No peer can have handled it: it goes first.
     interrupted: Option<Message>,
     queue: ClassQueue,
+    /// Frames that go ahead of the queue, in their order.
+    urgent: VecDeque<Message>,
     /// What is sent when nothing waits any more; nothing is taken after it.
     last: Option<Message>,
     finishing: bool,
@@ -111,6 +113,7 @@ impl<S: Socket> Half<S> {
             partial: None,
             interrupted: None,
             queue: ClassQueue::new(limits.queue_capacity),
+            urgent: VecDeque::new(),
             last: None,
             finishing: false,
             waiting_receipts: 0,
@@ -148,6 +151,7 @@ impl<S: Socket> Half<S> {
         }
         self.link = Link::Down;
         self.last = None;
+        self.urgent.clear();
         after.wake = self.drainer.take();
         after.settle.extend(self.sent_receipts.drain(..).map(|(receipt, _)| (receipt, Outcome::Unknown)));
         let Some(partial) = self.partial.take() else { return true };
@@ -224,6 +228,33 @@ impl<S: Socket> Half<S> {
             Written::InPart | Written::Broken => return self.requeue(frame, after),
         }
         Ok(())
+    }
+
+    pub(super) fn submit_urgent(
+        &mut self,
+        message: Message,
+        waiting_max: usize,
+        after: &mut After,
+    ) -> Result<(), Refused> {
+        if !matches!(self.link, Link::Up(_)) {
+            return Err(Refused::new(message, Rejection::Closed));
+        }
+        if self.urgent.len() >= waiting_max {
+            return Err(Refused::new(message, Rejection::QueueFull));
+        }
+        self.urgent.push_back(message);
+        if self.partial.is_none() && self.urgent.len() == 1 {
+            self.write_next(after);
+        }
+        if self.urgent_left() > 0 {
+            after.wake = self.drainer.take();
+        }
+        Ok(())
+    }
+
+    /// Urgent frames that the socket has not taken to their last byte.
+    pub(super) fn urgent_left(&self) -> usize {
+        self.urgent.len() + usize::from(self.partial.as_ref().is_some_and(|partial| partial.is_frill))
     }
 
     pub(super) fn finish(&mut self, last: Message, after: &mut After) {
@@ -362,6 +393,9 @@ impl<S: Socket> Half<S> {
         if let Some(partial) = self.partial.take() {
             return Some(partial);
         }
+        if let Some(urgent) = self.urgent.pop_front() {
+            return Some(Partial { is_frill: true, ..Partial::new(urgent) });
+        }
         let Some(message) = self.interrupted.take().or_else(|| self.queue.pop()) else {
             return self.last.take().map(|last| Partial { is_frill: true, ..Partial::new(last) });
         };
@@ -425,7 +459,7 @@ impl<S: Socket> Half<S> {
 
     pub(super) fn waiting(&self) -> usize {
         let single = [self.partial.is_some(), self.interrupted.is_some(), self.last.is_some()];
-        self.queue.len() + single.into_iter().filter(|waits| *waits).count()
+        self.queue.len() + self.urgent.len() + single.into_iter().filter(|waits| *waits).count()
     }
 
     pub(super) fn unconfirmed(&self) -> usize {

@@ -93,6 +93,7 @@ impl SyncManager {
             let Some(output) = self.core().poll() else { break };
             self.carry_out(output);
         }
+        self.stores.directory_changes.send_modify(|count| *count += 1);
         self.set_alarm(ctx);
     }
 

@@ -1,0 +1,167 @@
+//! Runs one application in a process of its own, then ends the process.
+
+use std::{
+    future::poll_fn,
+    io::{self, Read},
+    os::unix::net::UnixStream as StdStream,
+    sync::Arc,
+    time::Duration,
+};
+
+use sinew_runtime::{
+    app::{AppWiring, DynApp},
+    mailbox::Mailbox,
+    supervision::{Place, ReadyGate, Reason, alone},
+    tid::Tid,
+    time::Time,
+    wire::{FrameCodec, HEADER_LEN, Header, Kind},
+};
+use tokio::{
+    net::UnixStream,
+    signal::unix::{SignalKind, signal},
+    time::MissedTickBehavior,
+};
+use tokio_util::codec::Decoder;
+
+use super::{
+    role::{Hosting, die},
+    wire::Wire,
+    words::{self, Ending, Welcome},
+};
+use crate::{config::NodeConfig, lncl::payload};
+
+/// Time that the node has for its first words.
+const WELCOME: Duration = Duration::from_secs(10);
+/// Time that the node has to take the last words.
+const LAST_WORDS: Duration = Duration::from_millis(100);
+/// Longest time between two looks at what has expired.
+const EXPIRING: Duration = Duration::from_millis(250);
+/// Longest first frame: the names that one application may require, at their longest, and a little more.
+const WELCOME_BYTES_MAX: usize = 64 * 1024;
+
+/// Hosts the application, then ends this process.
+pub(super) fn host(config: &NodeConfig, apps: Vec<DynApp>, hosting: Hosting) -> ! {
+    let Hosting { app: name, socket } = hosting;
+    let Some(app) = apps.into_iter().find(|app| app.name() == name) else {
+        eprintln!(
+            "this program, started again to host '{name}', declared no such application of node {}",
+            config.name
+        );
+        std::process::exit(2);
+    };
+    let config = config.clone();
+    let thread = std::thread::Builder::new().name(name.clone());
+    // A thread of its own, because the caller's may have a runtime already.
+    let hosted = thread.spawn(move || run(&config, &app, socket));
+    match hosted.map(std::thread::JoinHandle::join) {
+        Ok(Ok(Ok(()))) => std::process::exit(0),
+        Ok(Ok(Err(error))) => {
+            eprintln!("the process that hosts '{name}' has no connection to its node: {error}")
+        }
+        // The panic has been told by the panic hook.
+        Ok(Err(_)) => {}
+        Err(error) => eprintln!("no thread for '{name}': {error}; raise `ulimit -u`"),
+    }
+    std::process::exit(1)
+}
+
+fn run(config: &NodeConfig, app: &DynApp, mut socket: StdStream) -> io::Result<()> {
+    let welcome = read_welcome(&mut socket)?;
+    socket.set_nonblocking(true)?;
+    let place = Place { thread: app.name().to_owned(), ..app.place().clone() };
+    place.prepare();
+    let system = actix::System::new();
+    system.block_on(live(config, app, socket, welcome))
+}
+
+/// Reads the first frame and not a byte more.
+fn read_welcome(socket: &mut StdStream) -> io::Result<Welcome> {
+    socket.set_read_timeout(Some(WELCOME))?;
+    let mut codec = FrameCodec::new(WELCOME_BYTES_MAX);
+    let mut buffer = bytes::BytesMut::new();
+    let mut wanted = HEADER_LEN;
+    let fault = |what: String| io::Error::new(io::ErrorKind::InvalidData, what);
+    loop {
+        let at = buffer.len();
+        buffer.resize(at + wanted, 0);
+        socket.read_exact(&mut buffer[at..])?;
+        if let Some(start) = buffer.first_chunk::<8>()
+            && at == 0
+        {
+            wanted = Header::payload_len(start).map_err(|error| fault(error.to_string()))? as usize;
+        }
+        if let Some(message) = codec.decode(&mut buffer).map_err(|error| fault(error.to_string()))? {
+            if message.header.kind != Kind::HOST_WELCOME {
+                return Err(fault(format!("the node's first frame is of kind {}", message.header.kind)));
+            }
+            return payload::read(&message.payload).map_err(|error| fault(error.to_string()));
+        }
+    }
+}
+
+async fn live(config: &NodeConfig, app: &DynApp, socket: StdStream, welcome: Welcome) -> io::Result<()> {
+    let socket = Arc::new(UnixStream::from_std(socket)?);
+    let (sequence, beat_us, tid) = (welcome.sequence, welcome.beat_us, Tid::from_bits(welcome.tid));
+    let wire = Wire::new(config, socket, welcome);
+    wire.say_kind(Kind::HOST_BEAT);
+    serve(&wire, beat_us);
+    let sender = wire.sender(sequence, config.payload_max);
+    let wiring = AppWiring { sender, mailbox: Mailbox::fed_by(wire.clone()) };
+    let saying = wire.clone();
+    let ready = ReadyGate::new(move || saying.say_kind(Kind::HOST_READY));
+    let (handle, ended) = alone(&app.launch(wiring), ready);
+    let stopping = wire.clone();
+    actix_rt::spawn(async move {
+        loop {
+            stop_asked(&stopping).await;
+            handle.stop();
+        }
+    });
+    let reason = ended.await;
+    say_last(&wire, tid, &reason).await;
+    Ok(())
+}
+
+/// Keeps the connection going beside the application, on its thread.
+fn serve(wire: &Arc<Wire>, beat_us: u64) {
+    let (draining, reading, telling, beating) = (wire.clone(), wire.clone(), wire.clone(), wire.clone());
+    actix_rt::spawn(async move {
+        draining.drain().await;
+        die();
+    });
+    actix_rt::spawn(async move { reading.read().await });
+    actix_rt::spawn(async move { poll_fn(|cx| telling.poll_tell(cx)).await });
+    actix_rt::spawn(async move { beat(&beating, beat_us).await });
+}
+
+/// Gives signs of life, and lets expire what the node does not read.
+async fn beat(wire: &Wire, period_us: u64) {
+    let period = if period_us == 0 { EXPIRING } else { Duration::from_micros(period_us).min(EXPIRING) };
+    let mut interval = tokio::time::interval(period);
+    interval.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        interval.tick().await;
+        wire.expire(Time::now());
+        if period_us != 0 && wire.has_said_all() {
+            wire.say_kind(Kind::HOST_BEAT);
+        }
+    }
+}
+
+/// Resolves when the node, or whoever sends this process a SIGTERM, asks for an orderly stop.
+async fn stop_asked(wire: &Wire) {
+    let Ok(mut terminate) = signal(SignalKind::terminate()) else { return wire.stop_asked().await };
+    tokio::select! {
+        () = wire.stop_asked() => {}
+        _ = terminate.recv() => tracing::info!("SIGTERM asks for a stop"),
+    }
+}
+
+async fn say_last(wire: &Wire, tid: Tid, reason: &Reason) {
+    wire.tell_last();
+    wire.say(words::frame(Kind::HOST_ENDED, tid, payload::lncl_of(tid.node), &Ending::from(reason)));
+    let until = Time::now() + LAST_WORDS;
+    while !wire.has_sent_all() && Time::now() < until {
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+}

@@ -1,0 +1,476 @@
+//! The child under supervision, as its supervisor's guard sees it: started, listened to, stopped, killed.
+
+use std::{
+    io,
+    os::fd::OwnedFd,
+    pin::Pin,
+    rc::Rc,
+    sync::Arc,
+    task::{Context, Poll},
+    time::Duration,
+};
+
+use rustix::process::{Signal, WaitIdStatus, pidfd_send_signal};
+use sinew_runtime::{
+    outcome::{Rejection, Ticket},
+    supervision::{Life, ReadyGate, Reason},
+    tid::Tid,
+    time::Time,
+    wire::{Flags, FrameError, Kind, Message},
+};
+use tokio::{
+    io::unix::AsyncFd,
+    net::UnixStream,
+    sync::{Notify, watch},
+    time::{Instant, timeout},
+};
+
+use super::{
+    link::Link,
+    names::KnownNames,
+    spawn::{self, Started},
+    words::{self, Ending, Look, Names, Turn, Welcome},
+};
+use crate::{
+    lncl::{
+        self, Reader, payload,
+        session::{Order, Session},
+    },
+    outlet::LinkNumber,
+    stores::Stores,
+};
+
+/// Time that a process has to end once it has said that it does, or was killed.
+const ENDING: Duration = Duration::from_secs(1);
+/// Numbers of waits for each process of a TID: more than it can use up.
+const WAITS_PER_LIFE: u64 = 1 << 40;
+
+/// An application that is hosted in a process of its own.
+pub(super) struct Hosted {
+    pub(super) stores: Arc<Stores>,
+    pub(super) link: Arc<Link>,
+    pub(super) tid: Tid,
+    pub(super) name: String,
+    pub(super) requires: Vec<String>,
+    pub(super) progress_within: Option<Duration>,
+}
+
+/// One process of it, to be guarded.
+pub(super) fn process_life(hosted: Arc<Hosted>, ready: ReadyGate) -> Box<dyn Life> {
+    let stop = Rc::new(Notify::new());
+    Box::new(ProcessLife { run: Box::pin(run(hosted, ready, stop.clone())), stop })
+}
+
+struct ProcessLife {
+    run: Pin<Box<dyn Future<Output = Reason>>>,
+    stop: Rc<Notify>,
+}
+
+impl Life for ProcessLife {
+    fn poll(&mut self, cx: &mut Context<'_>) -> Poll<Reason> {
+        self.run.as_mut().poll(cx)
+    }
+
+    fn stop(&mut self) {
+        self.stop.notify_one();
+    }
+
+    fn terminate(&mut self) {
+        // Dropping it kills the process; no code of the actor's is in this one.
+    }
+}
+
+async fn run(hosted: Arc<Hosted>, ready: ReadyGate, stop: Rc<Notify>) -> Reason {
+    let started = match spawn::start(hosted.variable()).await {
+        Ok(started) => started,
+        Err(why) => return Reason::ProcessEnded(format!("it could not be started: {why}")),
+    };
+    let Started { pid, pidfd, socket } = started;
+    let process = match Process::new(pidfd) {
+        Ok(process) => process,
+        Err(why) => return Reason::ProcessEnded(format!("it could not be watched: {why}")),
+    };
+    tracing::debug!(app = hosted.name, pid = pid.as_raw_nonzero(), "a process was started");
+    match Child::new(hosted, ready, socket) {
+        Ok(mut child) => child.accompany(&process, &stop).await,
+        Err(why) => Reason::ProcessEnded(format!("it could not be listened to: {why}")),
+    }
+}
+
+impl Hosted {
+    fn variable(&self) -> String {
+        let parent = std::process::id();
+        let node = self.stores.node.bits();
+        // No name has a line's end in it.
+        format!("{parent}\n{node}\n{}\n{}", self.stores.config.name, self.name)
+    }
+}
+
+/// The process itself. Dropping it kills it.
+struct Process {
+    pidfd: AsyncFd<Arc<OwnedFd>>,
+}
+
+impl Process {
+    fn new(pidfd: Arc<OwnedFd>) -> io::Result<Self> {
+        let doomed = pidfd.clone();
+        #[expect(
+            deprecated,
+            reason = "sound for an OwnedFd, whose descriptor never changes; its successor is an unsafe fn, and unsafe code lives in sinew-shm alone"
+        )]
+        AsyncFd::new(pidfd).map(|pidfd| Self { pidfd }).inspect_err(|_| {
+            let _ = pidfd_send_signal(&doomed, Signal::KILL);
+            spawn::reap(doomed);
+        })
+    }
+
+    fn kill(&self) {
+        // An error says that it has ended.
+        let _ = pidfd_send_signal(self.pidfd.get_ref(), Signal::KILL);
+    }
+
+    /// Resolves when it has ended. It is reaped then.
+    async fn ended(&self) -> String {
+        loop {
+            // An error of the reactor's means that nothing will be told by it: what can be known is asked for.
+            let guard = self.pidfd.readable().await;
+            match spawn::ending_of(self.pidfd.get_ref()) {
+                Ok(Some(status)) => return in_words(&status),
+                Err(cause) => return format!("how is not known: {cause}; does the program ignore SIGCHLD?"),
+                Ok(None) => {}
+            }
+            match guard {
+                Ok(mut guard) => guard.clear_ready(),
+                Err(cause) => return format!("it cannot be watched: {cause}"),
+            }
+        }
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        self.kill();
+        spawn::reap(self.pidfd.get_ref().clone());
+    }
+}
+
+/// The other end of the sockets, as long as the process lives.
+struct Child {
+    hosted: Arc<Hosted>,
+    ready: Option<ReadyGate>,
+    stream: Arc<UnixStream>,
+    reader: Reader,
+    session: Session,
+    names: KnownNames,
+    number: LinkNumber,
+    said: Option<Reason>,
+    heard: Option<Instant>,
+}
+
+impl Drop for Child {
+    fn drop(&mut self) {
+        self.hosted.link.disconnect(self.number);
+    }
+}
+
+/// What ended the listening.
+enum Silence {
+    /// The process has ended, in words.
+    Ended(String),
+    /// It has said its last word, or nothing more can be heard of it.
+    Closed(Option<FrameError>),
+    /// It is at fault.
+    Fault(Reason),
+}
+
+impl Child {
+    fn new(
+        hosted: Arc<Hosted>,
+        ready: ReadyGate,
+        socket: std::os::unix::net::UnixStream,
+    ) -> io::Result<Self> {
+        socket.set_nonblocking(true)?;
+        let stream = Arc::new(UnixStream::from_std(socket)?);
+        let (tid, node) = (hosted.tid, payload::lncl_of(hosted.tid.node));
+        let mut names = KnownNames::default();
+        let known = hosted.requires.iter().map(|name| names.look(&hosted.stores, name.clone())).collect();
+        let welcome = Welcome {
+            tid: tid.bits(),
+            first_wait: hosted.link.begin_life() * WAITS_PER_LIFE,
+            sequence: hosted.link.sequence(),
+            beat_us: hosted.progress_within.map_or(0, |within| in_micros(within / 4).max(1)),
+            names: known,
+        };
+        let welcome = words::frame(Kind::HOST_WELCOME, node, tid, &welcome);
+        let number = hosted.link.connect(stream.clone(), welcome);
+        let mut session = Session::new();
+        session.released(tid);
+        let reader = Reader::new(hosted.stores.config.payload_max);
+        let ready = Some(ready);
+        Ok(Self { hosted, ready, stream, reader, session, names, number, said: None, heard: None })
+    }
+
+    /// Stays with the process until it has ended, and says how.
+    async fn accompany(&mut self, process: &Process, stop: &Notify) -> Reason {
+        match self.listen(process, stop).await {
+            Silence::Ended(words) => {
+                self.hear_the_rest().await;
+                self.said.take().unwrap_or(Reason::ProcessEnded(words))
+            }
+            Silence::Closed(cause) => {
+                let words = match timeout(ENDING, process.ended()).await {
+                    Ok(words) => words,
+                    Err(_) => {
+                        process.kill();
+                        let cause = cause.map_or_else(String::new, |cause| format!(" ({cause})"));
+                        format!("it closed its connection{cause} and was killed")
+                    }
+                };
+                self.said.take().unwrap_or(Reason::ProcessEnded(words))
+            }
+            Silence::Fault(reason) => {
+                process.kill();
+                // The next process finds this one's devices and ports free.
+                let _ = timeout(ENDING, process.ended()).await;
+                reason
+            }
+        }
+    }
+
+    async fn listen(&mut self, process: &Process, stop: &Notify) -> Silence {
+        let link = self.hosted.link.clone();
+        let drain = link.drain(self.number);
+        let ended = process.ended();
+        tokio::pin!(drain, ended);
+        let mut drained = false;
+        let mut changes = self.hosted.stores.directory_changes.subscribe();
+        let mut watch = Watch::new(self.hosted.progress_within);
+        loop {
+            tokio::select! {
+                frame = self.reader.next(&self.stream) => match frame {
+                    Ok(Some(message)) => {
+                        if let Err(fault) = self.obey(message) {
+                            return Silence::Fault(fault);
+                        }
+                    }
+                    Ok(None) => return Silence::Closed(None),
+                    Err(cause) => return Silence::Closed(Some(cause)),
+                },
+                // Its last words are there already.
+                _ = &mut drain, if !drained => drained = true,
+                words = &mut ended => return Silence::Ended(words),
+                () = stop.notified() => self.say(words::bare(Kind::HOST_STOP, Tid::NONE, self.hosted.tid)),
+                () = link.nudged() => {
+                    self.tell_names();
+                    link.hand_over_held();
+                }
+                () = changed(&mut changes) => self.tell_names(),
+                now = watch.tick() => {
+                    if let Some(reason) = watch.judge(now, &mut self.heard) {
+                        return Silence::Fault(reason);
+                    }
+                }
+            }
+        }
+    }
+
+    /// What it said before it ended counts.
+    async fn hear_the_rest(&mut self) {
+        let rest = async {
+            while let Ok(Some(message)) = self.reader.next(&self.stream).await {
+                if self.obey(message).is_err() {
+                    return;
+                }
+            }
+        };
+        // Its end of the sockets is closed, unless a process that it has forked holds it.
+        let _ = timeout(ENDING / 10, rest).await;
+    }
+
+    fn obey(&mut self, message: Message) -> Result<(), Reason> {
+        self.heard = Some(Instant::now());
+        let fault = |what: &dyn std::fmt::Display| Reason::ProcessEnded(format!("it was killed: {what}"));
+        match message.header.kind {
+            Kind::HOST_BEAT => {}
+            Kind::HOST_TURN => {
+                let turn = Turn::read(&message).ok_or_else(|| fault(&"it sent a turn that is none"))?;
+                self.hosted.link.turn(turn).map_err(|error| fault(&error))?;
+            }
+            Kind::HOST_READY => {
+                if let Some(ready) = self.ready.take() {
+                    ready.reached();
+                }
+            }
+            Kind::HOST_ENDED => {
+                let ending: Ending = payload::read(&message.payload).map_err(|error| fault(&error))?;
+                self.said = Some(ending.into());
+            }
+            Kind::HOST_HUNG => {
+                let what: Ending = payload::read(&message.payload).map_err(|error| fault(&error))?;
+                let Ending::Other(what) = what else { return Err(fault(&"it hangs in nothing")) };
+                return Err(Reason::Hung(what));
+            }
+            Kind::HOST_LOOK => {
+                let Look { name } = payload::read(&message.payload).map_err(|error| fault(&error))?;
+                let names = vec![self.names.look(&self.hosted.stores, name)];
+                self.tell(names);
+            }
+            // Not an enum of ours: an open set of numbers.
+            _ => return self.obey_like_a_client(message).map_err(|what| fault(&what)),
+        }
+        Ok(())
+    }
+
+    /// What an application of any other process may say, too.
+    fn obey_like_a_client(&mut self, message: Message) -> Result<(), String> {
+        let Hosted { stores, tid, .. } = &*self.hosted;
+        match self.session.handle(message) {
+            Order::Route(message) => self.route(message),
+            Order::SetMember { group, member, .. } => lncl::set_member(stores, tid.app, group, member),
+            Order::RefuseMessage { message, why } => {
+                let detail =
+                    format!("{tid} sent {} to {}: {why}", message.header.kind, message.header.destination);
+                stores.refusals.count(Time::now(), "message of a hosted application", &detail);
+            }
+            Order::Tell { outcome, .. } => {
+                stores.refusals.count(
+                    Time::now(),
+                    "membership of a hosted application",
+                    &format!("{tid}: {outcome:?}"),
+                );
+            }
+            Order::End(violation) => return Err(violation.to_string()),
+            Order::Register(_) | Order::Settle { .. } | Order::Resolve { .. } | Order::Unregister => {
+                return Err("it said what only a client of LNCL says".to_owned());
+            }
+        }
+        Ok(())
+    }
+
+    fn route(&self, mut message: Message) {
+        let Hosted { stores, tid, link, .. } = &*self.hosted;
+        link.note(&message.header);
+        let destination = stores.router.absolute(message.header.destination);
+        let is_confirmed = message.header.flags.has(Flags::CONFIRM);
+        if is_confirmed {
+            let correlation = message.header.correlation;
+            message.receipt = Some(link.receipt(Ticket { source: *tid, destination, correlation }));
+        }
+        if let Err(why) = stores.router.send(message)
+            && !is_confirmed
+            && destination.is_single()
+        {
+            // The source of a confirmed message knows; a group without members is no fault.
+            let detail = format!("from {tid} to {destination}: {why}");
+            stores.refusals.count(Time::now(), "unconfirmed message not taken", &detail);
+        }
+    }
+
+    fn tell_names(&mut self) {
+        let changed = self.names.changed(&self.hosted.stores);
+        if !changed.is_empty() {
+            self.tell(changed);
+        }
+    }
+
+    fn tell(&self, names: Vec<words::Name>) {
+        let node = payload::lncl_of(self.hosted.tid.node);
+        self.say(words::frame(Kind::HOST_NAMES, node, self.hosted.tid, &Names { names }));
+    }
+
+    fn say(&self, message: Message) {
+        match self.hosted.link.say(message) {
+            // Closed: it is about to end.
+            Ok(()) | Err(sinew_runtime::router::Refused { why: Rejection::Closed, .. }) => {}
+            Err(refused) => {
+                let detail = format!("{} does not read its socket: {}", self.hosted.tid, refused.why);
+                self.hosted.stores.refusals.count(Time::now(), "hosted application does not listen", &detail);
+            }
+        }
+    }
+}
+
+/// Resolves when the directory may have changed.
+async fn changed(changes: &mut watch::Receiver<u64>) {
+    if changes.changed().await.is_err() {
+        // The stores outlive this.
+        std::future::pending().await
+    }
+}
+
+/// Looks whether the child still gives signs of life.
+struct Watch {
+    within: Option<Duration>,
+    /// When it looked last.
+    looked: Instant,
+}
+
+impl Watch {
+    fn new(within: Option<Duration>) -> Self {
+        Self { within, looked: Instant::now() }
+    }
+
+    fn period(&self) -> Duration {
+        self.within.map_or(Duration::MAX, |within| (within / 8).max(Duration::from_millis(1)))
+    }
+
+    /// Resolves when it is time to look.
+    async fn tick(&self) -> Instant {
+        if self.within.is_none() {
+            return std::future::pending().await;
+        }
+        tokio::time::sleep_until(self.looked + self.period()).await;
+        Instant::now()
+    }
+
+    /// Whether the child, of which something was `heard` last then, hangs.
+    fn judge(&mut self, now: Instant, heard: &mut Option<Instant>) -> Option<Reason> {
+        let lateness = now - (self.looked + self.period());
+        self.looked = now;
+        let (within, last) = (self.within?, (*heard)?);
+        if lateness > self.period() {
+            // It was this node that stood still: what came meanwhile has not been read.
+            *heard = Some((last + lateness).min(now));
+            return None;
+        }
+        let silent = now.saturating_duration_since(last);
+        (silent > within).then(|| {
+            let silent = silent.as_millis();
+            Reason::Hung(format!("no sign of life of its process for {silent} ms: a handler that does not return, or the process was stopped"))
+        })
+    }
+}
+
+fn in_micros(time: Duration) -> u64 {
+    u64::try_from(time.as_micros()).unwrap_or(u64::MAX)
+}
+
+fn in_words(status: &WaitIdStatus) -> String {
+    if let Some(code) = status.exit_status() {
+        return format!("exit code {code}");
+    }
+    let dumped = if status.dumped() { ", core dumped" } else { "" };
+    match status.terminating_signal() {
+        Some(number) => format!("killed by signal {number} ({}){dumped}", signal_name(number)),
+        None => "nobody knows how".to_owned(),
+    }
+}
+
+fn signal_name(number: i32) -> &'static str {
+    match Signal::from_named_raw(number) {
+        Some(Signal::KILL) => "SIGKILL",
+        Some(Signal::SEGV) => "SIGSEGV",
+        Some(Signal::ABORT) => "SIGABRT",
+        Some(Signal::BUS) => "SIGBUS",
+        Some(Signal::ILL) => "SIGILL",
+        Some(Signal::FPE) => "SIGFPE",
+        Some(Signal::TERM) => "SIGTERM",
+        Some(Signal::INT) => "SIGINT",
+        Some(Signal::HUP) => "SIGHUP",
+        Some(Signal::QUIT) => "SIGQUIT",
+        Some(Signal::TRAP) => "SIGTRAP",
+        Some(Signal::SYS) => "SIGSYS",
+        Some(Signal::XCPU) => "SIGXCPU",
+        Some(_) | None => "see `kill -l`",
+    }
+}

@@ -1,0 +1,60 @@
+//! Applications in processes of their own, children of the node's: the same code, chosen by placement.
+//!
+//! ```text
+//!   node                                             child
+//!   mailbox of the TID ─ window ─┐               ┌─ inbox ── actor
+//!                                ├─ socket pair ─┤
+//!   router ◄─────────────────────┘               └─ outlet ◄─ Sender
+//! ```
+//!
+//! The node starts its own program again. In that process the builder of the node hosts the one application and starts
+//! nothing else. The TID and its mailbox stay in the node; the child is the actor. The two talk over a pair of sockets
+//! that nobody else can reach; what they say is in `docs/protocol/process.md`.
+//!
+//! | file | side | what it is |
+//! | --- | --- | --- |
+//! | `words` | both | what the two say to each other |
+//! | `window` | node | which messages the child has, and what becomes of them when it dies; pure |
+//! | `link` | node | carries messages to the child from any thread |
+//! | `names` | node | which names the child wants to know |
+//! | `life` | node | the child under supervision: started, listened to, stopped, killed |
+//! | `spawn` | node | starts processes and reaps them |
+//! | `role` | child | whether this process is a node or such a child |
+//! | `host` | child | runs the application |
+//! | `inbox` | child | where the application's messages come from |
+//! | `wire` | child | reads what the node says |
+
+mod host;
+mod inbox;
+mod life;
+mod link;
+mod names;
+mod role;
+mod spawn;
+mod window;
+mod wire;
+mod words;
+
+pub(crate) use link::Link;
+
+use role::{Role, role};
+
+use sinew_runtime::app::DynApp;
+
+use crate::config::NodeConfig;
+
+/// What the builder of a node does instead of starting it, if this process hosts an application. Returns whether it
+/// is to do nothing; does not return if it is to host.
+pub(crate) fn is_bystander(config: &NodeConfig, apps: &mut Vec<DynApp>) -> bool {
+    match role(config) {
+        Role::Node => {
+            if apps.iter().any(|app| app.place().own_process) {
+                // Now, so that processes inherit priority and CPUs of the caller and not of one of the node's threads.
+                spawn::begin_spawning();
+            }
+            false
+        }
+        Role::Bystander => true,
+        Role::Host(hosting) => host::host(config, std::mem::take(apps), hosting),
+    }
+}

@@ -1,0 +1,151 @@
+//! Starts processes, and reaps those that nobody waits for.
+//!
+//! One thread does both, for as long as this program runs. The kernel counts the thread that starts a process as its
+//! parent: when that thread ends, the process is killed (`PR_SET_PDEATHSIG`). A node's own threads are given up when they
+//! hang; this one runs no code of any actor.
+
+use std::{
+    ffi::OsString,
+    os::{
+        fd::{AsFd, OwnedFd},
+        unix::{net::UnixStream, process::CommandExt},
+    },
+    process::{Command, Stdio},
+    sync::{
+        Arc, OnceLock,
+        mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel},
+    },
+    time::Duration,
+};
+
+use rustix::process::{
+    Pid, PidfdFlags, Signal, WaitId, WaitIdOptions, WaitIdStatus, pidfd_open, pidfd_send_signal, waitid,
+};
+use tokio::sync::oneshot;
+
+use super::words::VARIABLE;
+
+/// Orders that wait for the thread at most. When full: a start fails and is tried again, and a process that was killed
+/// stays in the kernel's table.
+const ORDERS_MAX: usize = 1_024;
+/// Time between two looks at processes that were killed and have not ended.
+const REAPING: Duration = Duration::from_millis(2);
+
+/// A process that has just been started.
+pub(super) struct Started {
+    pub(super) pid: Pid,
+    /// It owns the process: whoever drops it reaps it before, or hands it to [`reap`].
+    pub(super) pidfd: Arc<OwnedFd>,
+    pub(super) socket: UnixStream,
+}
+
+enum Order {
+    /// Start this program again with this value of the variable.
+    Start {
+        variable: String,
+        answer: oneshot::Sender<Result<Started, String>>,
+    },
+    Reap(Arc<OwnedFd>),
+}
+
+/// Begins the thread, so that processes inherit priority and CPUs of the calling one and not of one of the node's.
+pub(super) fn begin_spawning() {
+    // What is wrong is said when a process is to be started.
+    let _ = thread();
+}
+
+/// Starts this program again, as a host.
+pub(super) async fn start(variable: String) -> Result<Started, String> {
+    let (answer, started) = oneshot::channel();
+    order(Order::Start { variable, answer })?;
+    started.await.map_err(|_| "the thread that starts processes has ended".to_owned())?
+}
+
+/// Takes care of the end of a process that was killed.
+pub(super) fn reap(pidfd: Arc<OwnedFd>) {
+    if !has_been_reaped(&pidfd)
+        && let Err(why) = order(Order::Reap(pidfd))
+    {
+        tracing::error!(why, "a process that was killed is not reaped");
+    }
+}
+
+/// How a process has ended; `None` if it has not, or if that cannot be known.
+pub(super) fn ending_of(pidfd: &OwnedFd) -> rustix::io::Result<Option<WaitIdStatus>> {
+    waitid(WaitId::PidFd(pidfd.as_fd()), WaitIdOptions::EXITED | WaitIdOptions::NOHANG)
+}
+
+fn order(order: Order) -> Result<(), String> {
+    match thread().as_ref().map(|orders| orders.try_send(order)) {
+        Ok(Ok(())) => Ok(()),
+        Ok(Err(TrySendError::Full(_))) => Err("too many processes are to be started at once".to_owned()),
+        Ok(Err(TrySendError::Disconnected(_))) => Err("the thread for it has ended".to_owned()),
+        Err(why) => Err(format!("there is no thread for it: {why}; raise `ulimit -u`")),
+    }
+}
+
+fn thread() -> &'static std::io::Result<SyncSender<Order>> {
+    static THREAD: OnceLock<std::io::Result<SyncSender<Order>>> = OnceLock::new();
+    THREAD.get_or_init(|| {
+        let (orders, inbox) = sync_channel(ORDERS_MAX);
+        let thread = std::thread::Builder::new().name("processes".to_owned());
+        thread.spawn(move || run(&inbox)).map(|_| orders)
+    })
+}
+
+fn run(inbox: &Receiver<Order>) {
+    let mut doomed: Vec<Arc<OwnedFd>> = Vec::new();
+    loop {
+        let order = if doomed.is_empty() {
+            inbox.recv().map_err(RecvTimeoutError::from)
+        } else {
+            inbox.recv_timeout(REAPING)
+        };
+        match order {
+            Ok(Order::Start { variable, answer }) => {
+                if let Err(Ok(unwanted)) = answer.send(start_now(&variable)) {
+                    // Who ordered it is gone: it was told to stop, or failed.
+                    let _ = pidfd_send_signal(&unwanted.pidfd, Signal::KILL);
+                    doomed.push(unwanted.pidfd);
+                }
+            }
+            Ok(Order::Reap(pidfd)) => doomed.push(pidfd),
+            Err(RecvTimeoutError::Timeout) => {}
+            Err(RecvTimeoutError::Disconnected) => return,
+        }
+        doomed.retain(|pidfd| !has_been_reaped(pidfd));
+    }
+}
+
+fn has_been_reaped(pidfd: &OwnedFd) -> bool {
+    // An error says that it is nobody's child any more.
+    !matches!(ending_of(pidfd), Ok(None))
+}
+
+fn start_now(variable: &str) -> Result<Started, String> {
+    let fault = |doing: &'static str| move |cause: std::io::Error| format!("{doing}: {cause}");
+    let (socket, theirs) = UnixStream::pair().map_err(fault("no pair of sockets; raise `ulimit -n`"))?;
+    let mut arguments = std::env::args_os();
+    // Not by its path: the file there may be another one by now.
+    let mut command = Command::new("/proc/self/exe");
+    let child = command
+        .arg0(arguments.next().unwrap_or_else(|| OsString::from("sinew")))
+        .args(arguments)
+        .env(VARIABLE, variable)
+        .stdin(Stdio::from(OwnedFd::from(theirs)))
+        // Ctrl-C is for the node, which then stops its applications in order.
+        .process_group(0)
+        .spawn()
+        .map_err(fault("this program cannot be started again"))?;
+    let pid = Pid::from_child(&child);
+    // It is our child and has not been waited for, so nobody else has its id.
+    match pidfd_open(pid, PidfdFlags::empty()) {
+        Ok(pidfd) => Ok(Started { pid, pidfd: Arc::new(pidfd), socket }),
+        Err(cause) => {
+            let mut child = child;
+            let _ = child.kill();
+            let _ = child.wait();
+            Err(format!("no descriptor for the process: {cause}; raise `ulimit -n`"))
+        }
+    }
+}

@@ -1,0 +1,200 @@
+//! A node for the scenarios of applications in processes of their own.
+//!
+//! `process_under_test CONFIG.toml [--place thread|process|io] [--progress MILLISECONDS] [--dies-at-start CODE]`
+//!
+//! The application `drive` does as it is told (`Order`), and says what it sees, one line each.
+
+use std::process::ExitCode;
+
+use rustix::process::{Signal, getpid, kill_process};
+use sinew::prelude::*;
+use sinew_tests::orders::{Count, Level, Me, Order, Who};
+
+#[derive(Default)]
+struct Drive {
+    counts: Vec<u64>,
+}
+
+fn say(what: &str) {
+    println!("{} {what}", std::process::id());
+}
+
+impl Actor for Drive {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        say(&format!("started {}", context.tid()));
+        context.expect::<Level>(None, Duration::from_millis(50), |_, _, _| say("silence"));
+    }
+
+    fn stopping(&mut self, context: &mut Self::Context) -> Running {
+        if self.counts.contains(&u64::MAX) {
+            say("stopping");
+            return Running::Stop;
+        }
+        say("ramping down");
+        self.counts.push(u64::MAX);
+        context.after(Duration::from_millis(20), |_, _, context| context.stop());
+        Running::Continue
+    }
+}
+
+impl Handler<Delivery<Count>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, count: Delivery<Count>, _: &mut Self::Context) {
+        self.counts.push(count.number);
+    }
+}
+
+impl Handler<Delivery<Level>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, level: Delivery<Level>, _: &mut Self::Context) {
+        say(&format!("level {}", level.value));
+    }
+}
+
+impl Handler<Delivery<Who>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, who: Delivery<Who>, context: &mut Self::Context) {
+        let me = Me { pid: std::process::id(), counts: self.counts.clone() };
+        if let Err(error) = context.reply(&who, &me) {
+            say(&format!("no reply: {error}"));
+        }
+    }
+}
+
+impl Handler<Delivery<NodeEvent>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, event: Delivery<NodeEvent>, _: &mut Self::Context) {
+        say(&format!("event {:?}", event.payload));
+    }
+}
+
+impl Handler<Delivery<RequirementEvent>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, event: Delivery<RequirementEvent>, context: &mut Self::Context) {
+        let name = event.name();
+        say(&format!("requirement {:?}, {name} is {:?}", event.payload, context.resolve(name)));
+    }
+}
+
+impl Handler<Delivery<Order>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, order: Delivery<Order>, context: &mut Self::Context) {
+        match order.payload {
+            Order::Panic => panic!("this is the panic that the scenario asks for"),
+            Order::Stop => context.stop(),
+            Order::Hold(millis) => {
+                say("holds");
+                std::thread::sleep(Duration::from_millis(millis));
+            }
+            Order::Hang => loop {
+                std::thread::park();
+            },
+            Order::Exit(code) => std::process::exit(code),
+            Order::Abort => std::process::abort(),
+            Order::OverflowTheStack => say(&format!("{}", overflow(&[0; 1024]))),
+            Order::Kill => signal_myself(Signal::KILL),
+            Order::Segfault => {
+                // The first one meets the handler that Rust has for stack overflows.
+                signal_myself(Signal::SEGV);
+                signal_myself(Signal::SEGV);
+            }
+            Order::Refuse => context.reject(),
+            Order::Join(group) => context.join(&group),
+            Order::Leave(group) => context.leave(&group),
+            Order::Send(to, number) => send(context, &to, number),
+            Order::Ask(whom) => ask(context, &whom),
+            Order::StartACommand => {
+                let status = std::process::Command::new("true").status();
+                say(&format!("command {status:?}"));
+            }
+        }
+    }
+}
+
+fn signal_myself(signal: Signal) {
+    kill_process(getpid(), signal).expect("a process may signal itself");
+}
+
+#[expect(unconditional_recursion, reason = "it is what is asked for")]
+fn overflow(frame: &[u8; 1024]) -> u8 {
+    let mut next = *frame;
+    next[0] = next[0].wrapping_add(1);
+    overflow(std::hint::black_box(&next)).wrapping_add(next[1])
+}
+
+fn send(context: &mut AppContext<Drive>, to: &str, number: u64) {
+    match context.send_confirmed(to, &Count { number }, Duration::from_secs(10)) {
+        Ok(confirmation) => {
+            let wait =
+                confirmation.into_actor(&Drive::default()).map(move |outcome, _: &mut Drive, _: &mut _| {
+                    say(&format!("sent {number}: {outcome:?}"));
+                });
+            context.spawn(wait);
+        }
+        Err(error) => say(&format!("not sent {number}: {error}")),
+    }
+}
+
+fn ask(context: &mut AppContext<Drive>, whom: &str) {
+    match context.ask::<_, Me>(whom, &Who {}, Duration::from_secs(10)) {
+        Ok(reply) => {
+            let wait = reply.into_actor(&Drive::default()).map(|me, _: &mut Drive, _: &mut _| match me {
+                Ok(me) => say(&format!("answer {:?}", me.counts)),
+                Err(error) => say(&format!("no answer: {error}")),
+            });
+            context.spawn(wait);
+        }
+        Err(error) => say(&format!("not asked: {error}")),
+    }
+}
+
+fn main() -> ExitCode {
+    tracing_subscriber::fmt()
+        .with_env_filter(tracing_subscriber::EnvFilter::from_default_env())
+        .with_writer(std::io::stderr)
+        .init();
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let after = |flag: &str| {
+        let mut pairs = arguments.windows(2).filter(|pair| pair[0] == flag);
+        pairs.next().map(|pair| pair[1].clone())
+    };
+    let config = NodeConfig::from_file(&arguments[0]).expect("a scenario's configuration");
+    let dies_with = after("--dies-at-start").map(|code| code.parse().expect("an exit code"));
+    let drive = move || {
+        if let Some(code) = dies_with {
+            std::process::exit(code);
+        }
+        Drive::default()
+    };
+    let mut drive = AppSpec::new("drive", drive)
+        .handles::<Count>()
+        .handles::<Level>()
+        .handles::<Who>()
+        .handles::<Order>()
+        .handles::<NodeEvent>()
+        .handles::<RequirementEvent>()
+        .requires(after("--requires"));
+    drive = match after("--place").as_deref() {
+        None | Some("process") => drive.own_process(),
+        Some("thread") => drive.own_thread(),
+        Some(_) => drive.on_io_thread(),
+    };
+    match Node::builder(config.name.clone()).config(config).app(drive).heed_signals().start() {
+        Ok(node) => {
+            say("up");
+            node.run()
+        }
+        Err(error) => {
+            say(&format!("refused {error}"));
+            ExitCode::FAILURE
+        }
+    }
+}
