@@ -51,7 +51,7 @@ pub use node::{Node, NodeBuilder, NodeEnd, NodeHandle, StartError, Traffic};
 pub use outlet::OutletCounts;
 pub use serde;
 pub use sinew_runtime::{
-    app::{AppContext, AppSpec, Delivery, Raw, Silence},
+    app::{AppContext, AppSpec, Away, Delivery, LastWill, Raw, Silence},
     outcome::{Outcome, Rejection},
     schedule::{Tick, TimerId},
     sender::{AskError, Confirmation, Destination, Reply, SendError, Sender},
@@ -70,9 +70,9 @@ pub mod prelude {
     pub use actix::{Actor, ActorContext, ActorFutureExt, AsyncContext, Handler, Running, fut::WrapFuture};
 
     pub use crate::{
-        AppAddress, AppContext, AppSpec, Class, Delivery, Node, NodeAddress, NodeBuilder, NodeConfig,
-        NodeEvent, Outcome, Payload, Place, RequirementEvent, Restart, Silence, StartError, Tick, Tid, Time,
-        payload,
+        AppAddress, AppContext, AppSpec, Away, Class, Delivery, LastWill, Node, NodeAddress, NodeBuilder,
+        NodeConfig, NodeEvent, Outcome, Payload, Place, RequirementEvent, Restart, Silence, StartError, Tick,
+        Tid, Time, payload,
     };
 }
 

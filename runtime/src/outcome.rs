@@ -50,10 +50,12 @@ pub enum Rejection {
     ByHandler,
     /// The request does not make sense: a confirmation of a multicast, for instance.
     Unsupported,
+    /// The destination's application has ended, is not ready again, and wants no message kept for it meanwhile.
+    Away,
 }
 
 impl Rejection {
-    const ALL: [Self; 10] = [
+    const ALL: [Self; 11] = [
         Self::NoSuchApplication,
         Self::NoSuchNode,
         Self::UnknownKind,
@@ -64,6 +66,7 @@ impl Rejection {
         Self::ForgedSource,
         Self::ByHandler,
         Self::Unsupported,
+        Self::Away,
     ];
 }
 
@@ -84,6 +87,7 @@ impl fmt::Display for Rejection {
             Self::ForgedSource => "the source TID does not belong to the sender",
             Self::ByHandler => "the destination's handler refused it",
             Self::Unsupported => "this cannot be asked of this destination",
+            Self::Away => "the destination's application is away: it ended and is not ready again",
         })
     }
 }

@@ -11,6 +11,8 @@ use std::{
     time::Duration,
 };
 
+use bytes::Bytes;
+
 use crate::{
     outcome::{Outcome, Receipt, Rejection, Ticket},
     pending::{Awaited, Pending, Settlement, Wait},
@@ -232,6 +234,19 @@ impl Sender {
     /// Nobody took it.
     pub fn send_message(&self, buffer: MessageBuffer) -> Result<(), SendError> {
         self.dispatch(buffer.freeze())
+    }
+
+    /// Sends a payload that was encoded before.
+    pub(crate) fn send_bytes(
+        &self,
+        destination: Destination<'_>,
+        kind: Kind,
+        class: Class,
+        payload: Bytes,
+    ) -> Result<(), SendError> {
+        let mut header = Header::new(kind, self.0.tid, self.find(destination)?);
+        header.class = class;
+        self.dispatch(Message::new(header, payload))
     }
 
     fn find(&self, destination: Destination<'_>) -> Result<Tid, SendError> {

@@ -8,6 +8,7 @@
 //!
 //! Stop runs backwards: applications are told first and may bring their outputs to a safe value, then the layers go.
 
+mod absences;
 mod builder;
 mod directory;
 #[cfg(feature = "fault-points")]

@@ -24,7 +24,7 @@ use sinew_runtime::{
 };
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::{NodeEnd, StartError, directory::NodeDirectory};
+use super::{NodeEnd, StartError, absences::Absences, directory::NodeDirectory};
 use crate::{gncl, lncl, ndl, process, stores::Stores, sync};
 
 /// Confirmed messages and requests of one application under way at most.
@@ -74,6 +74,7 @@ struct Root {
     child_ids: ChildIds,
     apps: BTreeMap<ChildId, App>,
     app_ids: BTreeMap<AppAddress, ChildId>,
+    absences: Absences,
     layer_supervisor: Option<Post<Input>>,
     app_supervisor: Option<Post<Input>>,
     last_layer_fault: Option<String>,
@@ -101,6 +102,7 @@ pub(super) fn run(
         child_ids: ChildIds::default(),
         apps: BTreeMap::new(),
         app_ids: BTreeMap::new(),
+        absences: Absences::default(),
         layer_supervisor: None,
         app_supervisor: None,
         last_layer_fault: None,
@@ -262,7 +264,12 @@ impl Root {
 
     fn supervise(&mut self, children: Vec<ChildSpec>) {
         let post = self.stores.posts.root.clone();
-        let listener = move |fact| tell(&post, RootEvent::Apps(fact));
+        let absences = self.absences.clone();
+        let listener = move |fact| {
+            // At once, not through the post: a new life must not be started before.
+            absences.hear(&fact);
+            tell(&post, RootEvent::Apps(fact));
+        };
         let (supervisor, post) =
             Supervisor::new("applications", Strategy::OneForOne, children, self.threads.clone(), listener);
         supervisor.start();
@@ -273,6 +280,9 @@ impl Root {
     /// Gives an application its address, its mailbox and its routes.
     fn register(&mut self, app: &DynApp) -> Result<ChildSpec, StartError> {
         let config = &self.stores.config;
+        if let Some(why) = app.fault() {
+            return Err(StartError::Application { name: app.name().to_owned(), why });
+        }
         let mailbox = Mailbox::new(config.mailbox_capacity);
         let pending = Pending::new(WAITS_MAX);
         let hosted = app.place().own_process.then(|| process::Link::new(&self.stores, mailbox.clone()));
@@ -302,9 +312,11 @@ impl Root {
         let id = self.child_ids.next();
         self.app_ids.insert(tid.app, id);
         self.apps.insert(id, App { address: tid.app, mailbox: mailbox.clone(), running: false });
+        let wiring = AppWiring { sender, mailbox };
+        self.absences.keep(id, app.absence(wiring.clone()));
         let (place, launch) = match hosted {
             Some(link) => (Place::thread(Place::IO), link.launch(&self.stores, tid, app)),
-            None => (app.place().clone(), app.launch(AppWiring { sender, mailbox })),
+            None => (app.place().clone(), app.launch(wiring)),
         };
         #[cfg(feature = "fault-points")]
         let launch = super::faults::arm(&self.stores, app, launch);

@@ -5,11 +5,13 @@
 //! `Addr`) works as usual.
 
 mod alarm;
+mod away;
 mod context;
 mod delivery;
 mod drive;
 mod spec;
 
+pub use away::{Absence, Away, Heir, LastWill, WILLS_MAX, Will};
 pub use context::{AppContext, Silence, WatchId};
 pub use delivery::{Delivery, Raw};
 pub use spec::{AppSpec, AppWiring, DynApp};

@@ -6,7 +6,7 @@ use actix::{Actor, AsyncContext, Handler};
 
 use crate::{
     app::{
-        AppContext, Delivery, Raw,
+        Absence, AppContext, Away, Delivery, Raw, WILLS_MAX, Will,
         drive::{Dispatch, Drive, dispatch_raw, dispatch_typed},
     },
     mailbox::Mailbox,
@@ -37,21 +37,27 @@ use crate::{
 /// }
 ///
 /// let spec = AppSpec::new("knee", || Knee).handles::<Angle>().requires(["hip"]).own_thread();
+///
+/// // A setpoint that waited for a restart would be stale; and who follows this one is told that it died.
+/// use sinew_runtime::{app::Away, tid::Tid};
+/// let spec = spec.while_away(Away::Drop).last_will(Tid::group("followers"), &Angle { degrees: 0.0 });
 /// ```
 pub struct AppSpec<A: Actor<Context = AppContext<A>>> {
     factory: Arc<dyn Fn() -> A + Send + Sync>,
     handlers: Vec<(Kind, Dispatch<A>)>,
-    common: Common,
+    pub(super) common: Common,
 }
 
 #[derive(Clone)]
-struct Common {
+pub(super) struct Common {
     name: String,
     address: Option<AppAddress>,
     requires: Vec<String>,
     kinds: Vec<(Kind, &'static str)>,
     policy: Policy,
     place: Place,
+    pub(super) away: Away,
+    pub(super) wills: Vec<Will>,
     #[cfg(feature = "fault-points")]
     faults: Vec<crate::supervision::fault::Fault>,
 }
@@ -67,6 +73,8 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
             kinds: Vec::new(),
             policy: Policy { held: true, ..Policy::default() },
             place: Place::thread("apps"),
+            away: Away::default(),
+            wills: Vec::new(),
             #[cfg(feature = "fault-points")]
             faults: Vec::new(),
         };
@@ -244,6 +252,26 @@ impl DynApp {
     #[must_use]
     pub fn faults(&self) -> &[crate::supervision::fault::Fault] {
         &self.common.faults
+    }
+
+    /// What is sent on its behalf when it has ended.
+    #[must_use]
+    pub fn wills(&self) -> &[Will] {
+        &self.common.wills
+    }
+
+    /// What is wrong with its declaration, in words.
+    #[must_use]
+    pub fn fault(&self) -> Option<String> {
+        let wills = self.common.wills.len();
+        (wills > WILLS_MAX)
+            .then(|| format!("{wills} last wills are more than the {WILLS_MAX} that it may have"))
+    }
+
+    /// What its node keeps for the time that it is away.
+    #[must_use]
+    pub fn absence(&self, wiring: AppWiring) -> Absence {
+        Absence::new(wiring, self.common.away, self.common.wills.clone())
     }
 
     /// How it is started, on the thread of its place, with what its node gives it.

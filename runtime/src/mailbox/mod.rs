@@ -31,7 +31,7 @@ use crate::{
 pub struct Tally {
     /// Accepted by the mailbox.
     pub taken: u64,
-    /// Not accepted: the queue was full, or the application had ended.
+    /// Not accepted: the queue was full, the application had ended, or it was away and keeps nothing.
     pub refused: u64,
     /// Handled.
     pub delivered: u64,
@@ -77,11 +77,22 @@ struct Shared {
     /// Which reader is the present one.
     epoch: u64,
     closed: bool,
+    /// The application is away and wants nothing kept for it.
+    refuses: bool,
     tallies: [Tally; 3],
     high_water: usize,
 }
 
 impl Shared {
+    /// Takes out everything that waits, to be refused.
+    fn empty(&mut self) -> Vec<Message> {
+        let waiting: Vec<_> = self.queue.drain_all().collect();
+        for message in &waiting {
+            self.tallies[message.header.class as usize].rejected += 1;
+        }
+        waiting
+    }
+
     fn expire(&mut self, now: Time) -> Vec<Message> {
         let expired = self.queue.take_expired(now);
         for message in &expired {
@@ -110,6 +121,7 @@ impl Mailbox {
             waker: None,
             epoch: 0,
             closed: false,
+            refuses: false,
             tallies: [Tally::default(); 3],
             high_water: 0,
         };
@@ -135,11 +147,7 @@ impl Mailbox {
         let (waiting, waker) = {
             let mut shared = lock(&self.shared);
             shared.closed = true;
-            let waiting: Vec<_> = shared.queue.drain_all().collect();
-            for message in &waiting {
-                shared.tallies[message.header.class as usize].rejected += 1;
-            }
-            (waiting, shared.waker.take())
+            (shared.empty(), shared.waker.take())
         };
         for message in waiting {
             message.reject(Rejection::Closed);
@@ -147,6 +155,23 @@ impl Mailbox {
         if let Some(waker) = waker {
             waker.wake();
         }
+    }
+
+    /// The application is away: refuses everything that waits and everything that comes, until it [is back](Self::is_back).
+    pub fn refuse_while_away(&self) {
+        let waiting = {
+            let mut shared = lock(&self.shared);
+            shared.refuses = true;
+            shared.empty()
+        };
+        for message in waiting {
+            message.reject(Rejection::Away);
+        }
+    }
+
+    /// The application is ready again.
+    pub fn is_back(&self) {
+        lock(&self.shared).refuses = false;
     }
 
     /// Messages that wait now.
@@ -177,6 +202,10 @@ impl Outlet for Mailbox {
             if shared.closed {
                 shared.tallies[class].refused += 1;
                 return Err(Refused::new(message, Rejection::Closed));
+            }
+            if shared.refuses {
+                shared.tallies[class].refused += 1;
+                return Err(Refused::new(message, Rejection::Away));
             }
             if message.receipt.is_some() && message.header.class == Class::Stream {
                 shared.tallies[class].refused += 1;
@@ -324,6 +353,18 @@ mod tests {
         assert_eq!(mailbox.submit(message()).unwrap_err().why, Rejection::QueueFull);
         let tally = mailbox.tally(Class::Control);
         assert_eq!((tally.taken, tally.expired, tally.refused, tally.open()), (2, 1, 1, 1));
+    }
+
+    #[test]
+    fn a_mailbox_whose_application_is_away_and_keeps_nothing_refuses_until_it_is_back() {
+        let mailbox = Mailbox::new(8);
+        mailbox.submit(message()).unwrap();
+        mailbox.refuse_while_away();
+        assert_eq!(mailbox.submit(message()).unwrap_err().why, Rejection::Away);
+        mailbox.is_back();
+        mailbox.submit(message()).unwrap();
+        let tally = mailbox.tally(Class::Control);
+        assert_eq!((tally.taken, tally.rejected, tally.refused, tally.open()), (2, 1, 1, 1));
     }
 
     #[test]
