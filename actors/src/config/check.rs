@@ -47,6 +47,11 @@ pub(super) const MISSED_MAX: Range = range("ndl.missed_max", 2, 100, "answers");
 pub(super) const NODES_MAX: Range = range("ndl.nodes_max", 1, 65_536, "nodes");
 pub(super) const LAYER_DEADLINE: Range = range("sync.layer_deadline_ms", 10, 600_000, "ms");
 pub(super) const REQUIREMENT_DEADLINE: Range = range("sync.requirement_deadline_ms", 10, 86_400_000, "ms");
+pub(super) const LAYER_RESTARTS_MAX: Range =
+    range("supervision.layer_restarts_max", 0, 1_000_000, "restarts");
+pub(super) const LAYER_WINDOW: Range = range("supervision.layer_window_ms", 1, 3_600_000, "ms");
+pub(super) const APP_RESTARTS_MAX: Range = range("supervision.app_restarts_max", 0, 1_000_000, "restarts");
+pub(super) const APP_WINDOW: Range = range("supervision.app_window_ms", 1, 3_600_000, "ms");
 
 impl Range {
     /// The fault that `found` is, where it is outside of this range.
@@ -99,6 +104,10 @@ impl NodeConfig {
         self.check_ndl(&mut faults);
         LAYER_DEADLINE.time(&mut faults, self.sync.layer_deadline);
         REQUIREMENT_DEADLINE.time(&mut faults, self.sync.requirement_deadline);
+        LAYER_RESTARTS_MAX.count(&mut faults, self.supervision.layer_restarts_max);
+        LAYER_WINDOW.time(&mut faults, self.supervision.layer_window);
+        APP_RESTARTS_MAX.count(&mut faults, self.supervision.app_restarts_max);
+        APP_WINDOW.time(&mut faults, self.supervision.app_window);
         ConfigFaults::check(faults)
     }
 

@@ -26,10 +26,10 @@ use super::{
 /// Longest configuration file in bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
-const SECTIONS: [&str; 5] = ["node", "lncl", "gncl", "ndl", "sync"];
+const SECTIONS: [&str; 6] = ["node", "lncl", "gncl", "ndl", "sync", "supervision"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 24] = [
+pub(super) const KEYS: [&str; 28] = [
     "node.name",
     "node.project",
     "node.address",
@@ -54,6 +54,10 @@ pub(super) const KEYS: [&str; 24] = [
     "ndl.nodes_max",
     "sync.layer_deadline_ms",
     "sync.requirement_deadline_ms",
+    "supervision.layer_restarts_max",
+    "supervision.layer_window_ms",
+    "supervision.app_restarts_max",
+    "supervision.app_window_ms",
 ];
 
 impl NodeConfig {
@@ -83,6 +87,7 @@ impl NodeConfig {
         reader.read_ndl(&mut config);
         reader.time(&check::LAYER_DEADLINE, &mut config.sync.layer_deadline);
         reader.time(&check::REQUIREMENT_DEADLINE, &mut config.sync.requirement_deadline);
+        reader.read_supervision(&mut config);
         reader.finish(&config)?;
         Ok(config)
     }
@@ -335,6 +340,14 @@ impl Reader<'_> {
         self.time(&check::PERIOD, &mut ndl.period);
         self.number(&check::MISSED_MAX, &mut ndl.missed_max);
         self.number(&check::NODES_MAX, &mut ndl.nodes_max);
+    }
+
+    fn read_supervision(&mut self, config: &mut NodeConfig) {
+        let supervision = &mut config.supervision;
+        self.number(&check::LAYER_RESTARTS_MAX, &mut supervision.layer_restarts_max);
+        self.time(&check::LAYER_WINDOW, &mut supervision.layer_window);
+        self.number(&check::APP_RESTARTS_MAX, &mut supervision.app_restarts_max);
+        self.time(&check::APP_WINDOW, &mut supervision.app_window);
     }
 
     fn read_seeds(&mut self, seeds: &mut Vec<SocketAddr>) {

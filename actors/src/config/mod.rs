@@ -17,7 +17,10 @@ use std::{
     time::Duration,
 };
 
-use sinew_runtime::tid::NodeAddress;
+use sinew_runtime::{
+    supervision::{self, Flags, Intensity},
+    tid::NodeAddress,
+};
 
 /// Everything that can be set about a node.
 #[derive(Clone, Debug, PartialEq)]
@@ -44,6 +47,8 @@ pub struct NodeConfig {
     pub ndl: NdlConfig,
     /// Sync manager.
     pub sync: SyncConfig,
+    /// How many restarts are too many.
+    pub supervision: SupervisionConfig,
 }
 
 /// Local Node Communication Layer: the applications of this host.
@@ -109,6 +114,41 @@ pub struct SyncConfig {
     pub requirement_deadline: Duration,
 }
 
+/// Restart intensity: how many restarts are too many, for the layers and for the applications that the node supervises.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SupervisionConfig {
+    /// Restarts of layers that failed, all together, in one window; at one more the node ends in order. 0 to 1,000,000;
+    /// default 5. More keeps a node alive that does not get better.
+    pub layer_restarts_max: usize,
+    /// The window for layers. 1 ms to 1 h; default 10 s. A layer that lived longer than this begins its back-off anew: a
+    /// short one restarts what fails rarely at once.
+    pub layer_window: Duration,
+    /// The same for applications. 0 to 1,000,000; default 5.
+    pub app_restarts_max: usize,
+    /// The window for applications. 1 ms to 1 h; default 10 s.
+    pub app_window: Duration,
+}
+
+impl SupervisionConfig {
+    /// How the layers are supervised: each stands on those before it.
+    pub(crate) fn layers(&self) -> Flags {
+        flags(supervision::Strategy::RestForOne, self.layer_restarts_max, self.layer_window)
+    }
+
+    /// How the applications are supervised.
+    pub(crate) fn apps(&self) -> Flags {
+        flags(supervision::Strategy::OneForOne, self.app_restarts_max, self.app_window)
+    }
+}
+
+fn flags(strategy: supervision::Strategy, restarts_max: usize, window: Duration) -> Flags {
+    Flags {
+        strategy,
+        intensity: Intensity { restarts_max, window, ..Intensity::default() },
+        ..Flags::default()
+    }
+}
+
 impl NodeConfig {
     /// The defaults for the node called `name`: loopback only.
     #[must_use]
@@ -141,6 +181,12 @@ impl NodeConfig {
             sync: SyncConfig {
                 layer_deadline: Duration::from_secs(10),
                 requirement_deadline: Duration::from_secs(60),
+            },
+            supervision: SupervisionConfig {
+                layer_restarts_max: 5,
+                layer_window: Duration::from_secs(10),
+                app_restarts_max: 5,
+                app_window: Duration::from_secs(10),
             },
         }
     }

@@ -81,6 +81,10 @@ fn every_number_is_legal_at_both_ends_and_not_beyond() {
         (check::NODES_MAX, ""),
         (check::LAYER_DEADLINE, ""),
         (check::REQUIREMENT_DEADLINE, ""),
+        (check::LAYER_RESTARTS_MAX, ""),
+        (check::LAYER_WINDOW, ""),
+        (check::APP_RESTARTS_MAX, ""),
+        (check::APP_WINDOW, ""),
     ];
     for (Range { key, low, high, .. }, more) in ranges {
         assert!(KEYS.contains(&key), "{key}");

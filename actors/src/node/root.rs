@@ -17,7 +17,7 @@ use sinew_runtime::{
     router::Outlet,
     sender::Sender,
     supervision::{
-        ChildId, ChildIds, ChildSpec, Input, Launch, Place, Policy, ReadyGate, Reason, Strategy, Supervisor,
+        ChildId, ChildIds, ChildSpec, Input, Launch, Place, Policy, ReadyGate, Reason, Supervisor,
         SupervisorFact, Threads, life,
     },
     tid::AppAddress,
@@ -130,8 +130,13 @@ impl Actor for Root {
         let layers = layers(&self.stores, &self.child_ids, deadline);
         let post = self.stores.posts.root.clone();
         let listener = move |fact| tell(&post, RootEvent::Layers(fact));
-        let (supervisor, post) =
-            Supervisor::new("layers", Strategy::RestForOne, layers, self.threads.clone(), listener);
+        let (supervisor, post) = Supervisor::new(
+            "layers",
+            self.stores.config.supervision.layers(),
+            layers,
+            self.threads.clone(),
+            listener,
+        );
         supervisor.start();
         self.layer_supervisor = Some(post);
     }
@@ -270,8 +275,13 @@ impl Root {
             absences.hear(&fact);
             tell(&post, RootEvent::Apps(fact));
         };
-        let (supervisor, post) =
-            Supervisor::new("applications", Strategy::OneForOne, children, self.threads.clone(), listener);
+        let (supervisor, post) = Supervisor::new(
+            "applications",
+            self.stores.config.supervision.apps(),
+            children,
+            self.threads.clone(),
+            listener,
+        );
         supervisor.start();
         self.app_supervisor = Some(post);
         self.tell_if_running();
