@@ -27,9 +27,11 @@ impl Ground {
     /// An empty network. What its nodes log is shown with `RUST_LOG=sinew=debug`.
     #[must_use]
     pub fn new() -> Self {
-        let filter = tracing_subscriber::EnvFilter::from_default_env();
-        // Another scenario of this process may have done it.
-        let _ = tracing_subscriber::fmt().with_env_filter(filter).with_test_writer().try_init();
+        if std::env::var_os("RUST_LOG").is_some() {
+            let filter = tracing_subscriber::EnvFilter::from_default_env();
+            // Another scenario of this process may have done it.
+            let _ = tracing_subscriber::fmt().with_env_filter(filter).with_test_writer().try_init();
+        }
         Self { group: own_group(), addresses: AtomicU8::new(1) }
     }
 

@@ -3,6 +3,7 @@
 
 mod ground;
 mod hosts;
+pub mod load;
 mod log;
 mod program;
 

@@ -1,6 +1,7 @@
 //! Faults on real nodes: what happens, and what does not. One binary, one module a theme.
 
 mod layers;
+mod load;
 mod mailboxes;
 mod panics;
 mod points;

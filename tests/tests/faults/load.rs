@@ -1,0 +1,18 @@
+//! Layers that die under load, in short: the long form is the program `layer_panics`.
+
+use std::time::Duration;
+
+use sinew_tests::load::{Plan, run};
+
+#[test]
+fn forty_layer_panics_under_load_lose_nothing_within_a_node_and_tell_no_lie_between_nodes() {
+    let plan =
+        Plan { panics: 40, in_process: 5_000, between_nodes: 1_000, spacing: Duration::from_millis(15) };
+    let report = run(plan);
+    assert!(report.in_process.is_perfect(), "{report}");
+    assert!(report.in_process.confirmed > 0, "{report}");
+    assert!(report.between_nodes.is_true(), "{report}");
+    assert_eq!(report.restarted, 0, "{report}");
+    let ndl = report.layers.iter().find(|layer| layer.name == "NDL").expect("it is one");
+    assert_eq!(ndl.lost, 0, "NDL is not on the way of a message");
+}
