@@ -1,0 +1,178 @@
+//! The reading half of a ring: the function that meets whatever the peer has written.
+
+use std::sync::atomic::Ordering;
+
+use super::sleep::{Sleep, Waking};
+use crate::{
+    error::Corrupt,
+    layout::{Capacity, MARK_BYTES, Mark, Word, record_bytes},
+    memory::{OwnHeader, Peer, fence},
+    wait::Armed,
+};
+
+/// A message in the ring. Its bytes lie within the ring, whatever the peer does from now on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Record {
+    /// Where its bytes begin in the ring.
+    pub(crate) position: u32,
+    /// How many they are.
+    pub(crate) length: u32,
+    /// What this side will have taken when it is released.
+    end: u32,
+}
+
+/// What the reading half knows. It trusts nothing but its own counts.
+#[derive(Debug)]
+pub(crate) struct ConsumerCore<O, P> {
+    pub(crate) own: O,
+    pub(crate) peer: P,
+    capacity: Capacity,
+    /// Bytes ever taken.
+    head: u32,
+    /// Bytes that the producer was last seen to have published; always at most `capacity` ahead of `head`.
+    tail_seen: u32,
+    sleep: Sleep,
+    waking: Waking,
+    corrupt: Option<Corrupt>,
+}
+
+impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
+    pub(crate) fn new(own: O, peer: P, capacity: Capacity) -> Self {
+        Self {
+            own,
+            peer,
+            capacity,
+            head: 0,
+            tail_seen: 0,
+            sleep: Sleep::new(Word::ConsumerSleep),
+            waking: Waking::new(Word::ProducerSleep),
+            corrupt: None,
+        }
+    }
+
+    pub(crate) const fn capacity(&self) -> Capacity {
+        self.capacity
+    }
+
+    /// What the producer was last seen to have published: what a sleeper sleeps on.
+    pub(crate) const fn tail_seen(&self) -> u32 {
+        self.tail_seen
+    }
+
+    /// The oldest message that was not released, if there is any.
+    pub(crate) fn next(&mut self) -> Result<Option<Record>, Corrupt> {
+        if let Some(corrupt) = self.corrupt {
+            return Err(corrupt);
+        }
+        let found = self.find();
+        if let Err(corrupt) = found {
+            self.corrupt = Some(corrupt);
+        }
+        found
+    }
+
+    /// Gives a message's memory back to the producer. True when the producer sleeps and has to be woken.
+    pub(crate) fn release(&mut self, record: Record) -> bool {
+        self.head = record.end;
+        // SYNC: this side's reads of the record are over for who reads this head and fences: `ProducerCore::look`.
+        self.own.store(Word::Head, self.head, Ordering::Release);
+        self.waking.is_owed(&self.peer)
+    }
+
+    /// Announces sleep until there is a message.
+    pub(crate) fn arm(&mut self) -> Result<Armed, Corrupt> {
+        self.sleep.announce(&self.own);
+        match self.next() {
+            Ok(None) => Ok(Armed::Sleep),
+            Ok(Some(_)) => {
+                self.sleep.end(&self.own);
+                Ok(Armed::Ready)
+            }
+            Err(corrupt) => {
+                self.sleep.end(&self.own);
+                Err(corrupt)
+            }
+        }
+    }
+
+    /// Says that this side is awake again.
+    pub(crate) fn disarm(&mut self) {
+        self.sleep.end(&self.own);
+    }
+
+    /// Whether the producer has published something since it was last looked at.
+    pub(crate) fn has_moved(&self) -> bool {
+        self.peer.load(Word::Tail) != self.tail_seen
+    }
+
+    /// As if so much had been published and taken already.
+    #[cfg(all(test, not(loom)))]
+    pub(super) fn start_at(&mut self, count: u32) {
+        (self.head, self.tail_seen) = (count, count);
+        self.own.store(Word::Head, count, Ordering::Relaxed);
+    }
+
+    fn find(&mut self) -> Result<Option<Record>, Corrupt> {
+        if self.tail_seen == self.head {
+            self.look()?;
+            if self.tail_seen == self.head {
+                return Ok(None);
+            }
+        }
+        match self.mark_at(self.head)? {
+            Mark::Message(length) => self.message(self.head, length).map(Some),
+            Mark::Skip => self.message_after_skip().map(Some),
+        }
+    }
+
+    /// A skip leads to the ring's beginning, where a message is: a producer publishes both at once.
+    fn message_after_skip(&self) -> Result<Record, Corrupt> {
+        let (skipped, published) = (self.capacity.rest(self.head), self.published(self.head));
+        let corrupt = Corrupt::Skip { skipped, published };
+        // Not less: at least a mark follows. And no skip of the whole ring, which no message can need.
+        if skipped >= published || skipped == self.capacity.bytes() {
+            return Err(corrupt);
+        }
+        let start = self.head.wrapping_add(skipped);
+        match self.mark_at(start)? {
+            Mark::Message(length) => self.message(start, length),
+            Mark::Skip => Err(corrupt),
+        }
+    }
+
+    fn message(&self, start: u32, length: u32) -> Result<Record, Corrupt> {
+        let room = self.published(start).min(self.capacity.rest(start));
+        match record_bytes(length) {
+            Some(record) if record <= room => Ok(Record {
+                position: self.capacity.position(start) + MARK_BYTES,
+                length,
+                end: start.wrapping_add(record),
+            }),
+            _ => Err(Corrupt::Length { length, room }),
+        }
+    }
+
+    /// What lies between `start` and the tail.
+    const fn published(&self, start: u32) -> u32 {
+        self.tail_seen.wrapping_sub(start)
+    }
+
+    /// Reads a mark once. Counts are multiples of 8, and so are positions.
+    fn mark_at(&self, count: u32) -> Result<Mark, Corrupt> {
+        let bits = self.peer.mark(self.capacity.position(count));
+        Mark::from_bits(bits).ok_or(Corrupt::Mark(bits))
+    }
+
+    /// Reads the producer's tail once and believes it only if it lies between the last one and the ring's capacity.
+    fn look(&mut self) -> Result<(), Corrupt> {
+        let tail = self.peer.load(Word::Tail);
+        // SYNC: the bytes of all records before this tail are visible: the store of tail in `ProducerCore::publish`.
+        fence(Ordering::Acquire);
+        let (moved, known) = (tail.wrapping_sub(self.tail_seen), self.tail_seen.wrapping_sub(self.head));
+        if moved > self.capacity.bytes() - known || !tail.is_multiple_of(MARK_BYTES) {
+            return Err(Corrupt::Tail { tail, seen: self.tail_seen });
+        }
+        self.tail_seen = tail;
+        Ok(())
+    }
+}

@@ -1,0 +1,177 @@
+//! Every interleaving, and every value that a processor may show meanwhile, of the ring's atomics.
+//!
+//! `RUSTFLAGS="--cfg loom" cargo test --release -p sinew-shm --lib --target-dir target/loom core::loom`
+
+use loom::{
+    sync::{Condvar, Mutex},
+    thread,
+};
+use std::sync::Arc;
+
+use super::model::{Receiver, Sender, fill, read, ring};
+use crate::{layout::Capacity, wait::Armed};
+
+/// What a futex or an eventfd does: a ring before the sleep is not lost, rings are not counted.
+#[derive(Default)]
+struct Bell {
+    rung: Mutex<bool>,
+    changed: Condvar,
+}
+
+impl Bell {
+    fn new() -> Arc<Self> {
+        Arc::new(Self { rung: Mutex::new(false), changed: Condvar::new() })
+    }
+
+    fn ring(&self) {
+        *self.rung.lock().unwrap() = true;
+        self.changed.notify_one();
+    }
+
+    fn sleep(&self) {
+        let mut rung = self.rung.lock().unwrap();
+        while !*rung {
+            rung = self.changed.wait(rung).unwrap();
+        }
+        *rung = false;
+    }
+}
+
+fn send(sender: &mut Sender, bytes: usize, number: u64) -> bool {
+    let reserved = sender.reserve(bytes).expect("the model leaves room");
+    fill(sender, reserved, number);
+    sender.publish()
+}
+
+/// Takes one message if there is any: its words, and whether the sender has to be woken.
+fn take(receiver: &mut Receiver) -> Option<(Vec<u64>, bool)> {
+    let record = receiver.next().expect("an honest peer")?;
+    let words = read(receiver, record);
+    Some((words, receiver.release(record)))
+}
+
+fn take_sleeping(receiver: &mut Receiver, bell: &Bell) -> (Vec<u64>, bool) {
+    loop {
+        if let Some(taken) = take(receiver) {
+            return taken;
+        }
+        if receiver.arm().expect("an honest peer") == Armed::Sleep {
+            bell.sleep();
+            receiver.disarm();
+        }
+    }
+}
+
+#[test]
+fn a_message_that_is_seen_is_seen_whole() {
+    loom::model(|| {
+        let (mut sender, mut receiver) = ring(Capacity::tiny(64));
+        let sending = thread::spawn(move || {
+            send(&mut sender, 16, 7);
+            send(&mut sender, 8, 8);
+        });
+        let mut seen = Vec::new();
+        for _ in 0..2 {
+            if let Some((words, _)) = take(&mut receiver) {
+                seen.push(words);
+            }
+        }
+        let sent = [vec![7, 7], vec![8]];
+        assert_eq!(seen, sent[..seen.len()]);
+        sending.join().unwrap();
+    });
+}
+
+#[test]
+fn memory_that_is_used_again_is_no_longer_read() {
+    loom::model(|| {
+        // 32 bytes: two messages of 8. The third takes the place of the first, as soon as that is released.
+        let (mut sender, mut receiver) = ring(Capacity::tiny(32));
+        send(&mut sender, 8, 1);
+        send(&mut sender, 8, 2);
+        let sending = thread::spawn(move || {
+            if let Ok(reserved) = sender.reserve(8) {
+                fill(&sender, reserved, 3);
+                sender.publish();
+            }
+        });
+        let first = take(&mut receiver).expect("it was published before");
+        let second = take(&mut receiver).expect("it was published before");
+        assert_eq!((first.0, second.0), (vec![1], vec![2]));
+        sending.join().unwrap();
+        if let Some((third, _)) = take(&mut receiver) {
+            assert_eq!(third, [3]);
+        }
+    });
+}
+
+#[test]
+fn a_consumer_that_sleeps_is_woken_for_every_message() {
+    loom::model(|| {
+        let (mut sender, mut receiver) = ring(Capacity::tiny(64));
+        let bell = Bell::new();
+        let button = Arc::clone(&bell);
+        let sending = thread::spawn(move || {
+            for number in 1..=2 {
+                if send(&mut sender, 8, number) {
+                    button.ring();
+                }
+            }
+        });
+        // A lost wake is a deadlock, which loom reports.
+        assert_eq!(take_sleeping(&mut receiver, &bell).0, [1]);
+        assert_eq!(take_sleeping(&mut receiver, &bell).0, [2]);
+        sending.join().unwrap();
+    });
+}
+
+#[test]
+fn a_producer_that_sleeps_is_woken_for_room() {
+    loom::model(|| {
+        let (mut sender, mut receiver) = ring(Capacity::tiny(32));
+        send(&mut sender, 8, 1);
+        send(&mut sender, 8, 2);
+        let bell = Bell::new();
+        let button = Arc::clone(&bell);
+        let receiving = thread::spawn(move || {
+            let (words, owed) = take(&mut receiver).expect("it was published before");
+            assert_eq!(words, [1]);
+            if owed {
+                button.ring();
+            }
+            receiver
+        });
+        while sender.reserve(8).is_err() {
+            if sender.arm(8).expect("an honest peer") == Armed::Sleep {
+                bell.sleep();
+                sender.disarm();
+            }
+        }
+        let reserved = sender.reserved().expect("just reserved");
+        fill(&sender, reserved, 3);
+        sender.publish();
+        let mut receiver = receiving.join().unwrap();
+        assert_eq!(take(&mut receiver).expect("the second").0, [2]);
+        assert_eq!(take(&mut receiver).expect("the third").0, [3]);
+    });
+}
+
+#[test]
+fn a_loan_that_is_given_back_is_never_seen() {
+    loom::model(|| {
+        let (mut sender, mut receiver) = ring(Capacity::tiny(64));
+        let sending = thread::spawn(move || {
+            let reserved = sender.reserve(16).expect("an empty ring");
+            fill(&sender, reserved, 666);
+            sender.give_back();
+            send(&mut sender, 8, 1);
+        });
+        if let Some((words, _)) = take(&mut receiver) {
+            assert_eq!(words, [1]);
+        }
+        sending.join().unwrap();
+        if let Some((words, _)) = take(&mut receiver) {
+            assert_eq!(words, [1]);
+        }
+    });
+}

@@ -1,0 +1,91 @@
+//! A region as plain atomics, for tests of the protocol: shared by both sides, who keep to what is theirs.
+
+use std::sync::{Arc, atomic::Ordering};
+
+#[cfg(loom)]
+use loom::sync::atomic::{AtomicU32, AtomicU64};
+#[cfg(not(loom))]
+use std::sync::atomic::{AtomicU32, AtomicU64};
+
+use super::{ConsumerCore, ProducerCore, Record, producer::Reserved};
+use crate::{
+    layout::{Capacity, Word},
+    memory::{OwnHeader, OwnRing, Peer},
+};
+
+/// One side's region.
+#[derive(Debug)]
+pub(super) struct Side {
+    words: [AtomicU32; 4],
+    ring: Vec<AtomicU64>,
+}
+
+pub(super) type Shared = Arc<Side>;
+pub(super) type Sender = ProducerCore<Shared, Shared>;
+pub(super) type Receiver = ConsumerCore<Shared, Shared>;
+
+impl Side {
+    pub(super) fn new(capacity: Capacity) -> Shared {
+        let words = std::array::from_fn(|_| AtomicU32::new(0));
+        let ring = (0..capacity.bytes() / 8).map(|_| AtomicU64::new(0)).collect();
+        Arc::new(Self { words, ring })
+    }
+
+    pub(super) const fn word(&self, word: Word) -> &AtomicU32 {
+        match word {
+            Word::Tail => &self.words[0],
+            Word::Head => &self.words[1],
+            Word::ConsumerSleep => &self.words[2],
+            Word::ProducerSleep => &self.words[3],
+        }
+    }
+
+    pub(super) fn cell(&self, position: u32) -> &AtomicU64 {
+        &self.ring[position as usize / 8]
+    }
+}
+
+impl OwnHeader for Shared {
+    fn store(&self, word: Word, value: u32, order: Ordering) {
+        self.word(word).store(value, order);
+    }
+}
+
+impl OwnRing for Shared {
+    fn put_mark(&mut self, position: u32, bits: u64) {
+        self.cell(position).store(bits, Ordering::Relaxed);
+    }
+}
+
+impl Peer for Shared {
+    fn load(&self, word: Word) -> u32 {
+        self.word(word).load(Ordering::Relaxed)
+    }
+
+    fn mark(&self, position: u32) -> u64 {
+        self.cell(position).load(Ordering::Relaxed)
+    }
+}
+
+/// A ring from one side to another.
+pub(super) fn ring(capacity: Capacity) -> (Sender, Receiver) {
+    let (source, target) = (Side::new(capacity), Side::new(capacity));
+    let sender = ProducerCore::new(Arc::clone(&source), Arc::clone(&target), capacity);
+    (sender, ConsumerCore::new(target, source, capacity))
+}
+
+/// Writes one number into every word of a reserved message.
+pub(super) fn fill(sender: &Sender, reserved: Reserved, number: u64) {
+    let start = sender.payload_position(reserved);
+    for position in (start..start + reserved.length).step_by(8) {
+        sender.own.cell(position).store(number, Ordering::Relaxed);
+    }
+}
+
+/// The words of a message.
+pub(super) fn read(receiver: &Receiver, record: Record) -> Vec<u64> {
+    (record.position..record.position + record.length)
+        .step_by(8)
+        .map(|position| receiver.peer.cell(position).load(Ordering::Relaxed))
+        .collect()
+}

@@ -1,0 +1,203 @@
+//! The writing half of a ring.
+
+use std::sync::atomic::Ordering;
+
+use super::sleep::{Sleep, Waking};
+use crate::{
+    error::{Corrupt, LoanError},
+    layout::{Capacity, MARK_BYTES, Mark, Word, record_bytes},
+    memory::{OwnRing, Peer, fence},
+    wait::Armed,
+};
+
+/// Room for one message that is not published yet.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Reserved {
+    /// Bytes to the ring's end that are left empty before it.
+    skip: u32,
+    /// Bytes of the message.
+    pub(crate) length: u32,
+}
+
+/// What the writing half knows. It trusts nothing but its own counts.
+#[derive(Debug)]
+pub(crate) struct ProducerCore<O, P> {
+    pub(crate) own: O,
+    pub(crate) peer: P,
+    capacity: Capacity,
+    /// Bytes ever published.
+    tail: u32,
+    /// Bytes that the consumer was last seen to have taken; always at most `capacity` behind `tail`.
+    head_seen: u32,
+    reserved: Option<Reserved>,
+    sleep: Sleep,
+    waking: Waking,
+    corrupt: Option<Corrupt>,
+}
+
+impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
+    pub(crate) fn new(own: O, peer: P, capacity: Capacity) -> Self {
+        Self {
+            own,
+            peer,
+            capacity,
+            tail: 0,
+            head_seen: 0,
+            reserved: None,
+            sleep: Sleep::new(Word::ProducerSleep),
+            waking: Waking::new(Word::ConsumerSleep),
+            corrupt: None,
+        }
+    }
+
+    pub(crate) const fn capacity(&self) -> Capacity {
+        self.capacity
+    }
+
+    /// What the peer was caught at.
+    pub(crate) const fn corrupt(&self) -> Option<Corrupt> {
+        self.corrupt
+    }
+
+    /// What the consumer was last seen to have taken: what a sleeper sleeps on.
+    pub(crate) const fn head_seen(&self) -> u32 {
+        self.head_seen
+    }
+
+    /// The room that is reserved, if any.
+    pub(crate) const fn reserved(&self) -> Option<Reserved> {
+        self.reserved
+    }
+
+    /// Reserves room for a message of `length` bytes. Room that was reserved before and not published is forgotten.
+    pub(crate) fn reserve(&mut self, length: usize) -> Result<Reserved, LoanError> {
+        self.intact()?;
+        self.reserved = None;
+        let (length, record) = self.record_for(length)?;
+        let rest = self.capacity.rest(self.tail);
+        let skip = if record > rest { rest } else { 0 };
+        if record + skip > self.free() {
+            self.look()?;
+        }
+        if record + skip > self.free() {
+            return Err(LoanError::Full { asked: length as usize, free: self.longest_now() });
+        }
+        let reserved = Reserved { skip, length };
+        self.reserved = Some(reserved);
+        Ok(reserved)
+    }
+
+    /// Where the reserved message's bytes are in the ring.
+    pub(crate) const fn payload_position(&self, reserved: Reserved) -> u32 {
+        self.capacity.position(self.tail.wrapping_add(reserved.skip)) + MARK_BYTES
+    }
+
+    /// Makes the reserved message shorter than it was asked for.
+    pub(crate) fn shorten(&mut self, length: u32) {
+        if let Some(reserved) = &mut self.reserved {
+            reserved.length = reserved.length.min(length);
+        }
+    }
+
+    /// Makes the reserved room a message. True when the consumer sleeps and has to be woken.
+    pub(crate) fn publish(&mut self) -> bool {
+        let Some(Reserved { skip, length }) = self.reserved.take() else {
+            return false;
+        };
+        if skip > 0 {
+            self.own.put_mark(self.capacity.position(self.tail), Mark::Skip.to_bits());
+        }
+        let start = self.tail.wrapping_add(skip);
+        self.own.put_mark(self.capacity.position(start), Mark::Message(length).to_bits());
+        let record = record_bytes(length).expect("it was counted when it was reserved");
+        self.tail = start.wrapping_add(record);
+        // SYNC: the record's bytes become visible to who reads this tail and fences: `ConsumerCore::look`.
+        self.own.store(Word::Tail, self.tail, Ordering::Release);
+        self.waking.is_owed(&self.peer)
+    }
+
+    /// Gives the reserved room back: it was never seen by anyone.
+    pub(crate) fn give_back(&mut self) {
+        self.reserved = None;
+    }
+
+    /// Announces sleep until there is room for `length` bytes.
+    pub(crate) fn arm(&mut self, length: usize) -> Result<Armed, LoanError> {
+        self.sleep.announce(&self.own);
+        let found = self.intact().map_err(LoanError::from).and_then(|()| self.look_for_room(length));
+        match found {
+            Ok(false) => Ok(Armed::Sleep),
+            Ok(true) => {
+                self.sleep.end(&self.own);
+                Ok(Armed::Ready)
+            }
+            Err(error) => {
+                self.sleep.end(&self.own);
+                Err(error)
+            }
+        }
+    }
+
+    /// Says that this side is awake again.
+    pub(crate) fn disarm(&mut self) {
+        self.sleep.end(&self.own);
+    }
+
+    /// Whether the consumer has taken something since it was last looked at.
+    pub(crate) fn has_moved(&self) -> bool {
+        self.peer.load(Word::Head) != self.head_seen
+    }
+
+    /// As if so much had been published and taken already.
+    #[cfg(all(test, not(loom)))]
+    pub(super) fn start_at(&mut self, count: u32) {
+        (self.tail, self.head_seen) = (count, count);
+        self.own.store(Word::Tail, count, Ordering::Relaxed);
+    }
+
+    fn look_for_room(&mut self, length: usize) -> Result<bool, LoanError> {
+        self.look()?;
+        let (_, record) = self.record_for(length)?;
+        let rest = self.capacity.rest(self.tail);
+        let skip = if record > rest { rest } else { 0 };
+        Ok(record + skip <= self.free())
+    }
+
+    fn record_for(&self, asked: usize) -> Result<(u32, u32), LoanError> {
+        let max = self.capacity.payload_max();
+        let fits = u32::try_from(asked).ok().filter(|length| *length <= max);
+        fits.and_then(|length| record_bytes(length).map(|record| (length, record)))
+            .ok_or(LoanError::TooLong { asked, max: max as usize })
+    }
+
+    const fn free(&self) -> u32 {
+        self.capacity.bytes() - self.tail.wrapping_sub(self.head_seen)
+    }
+
+    /// The longest message that fits now, before or after the ring's end.
+    fn longest_now(&self) -> usize {
+        let (free, rest) = (self.free(), self.capacity.rest(self.tail));
+        let before = free.min(rest).saturating_sub(MARK_BYTES);
+        let after = free.saturating_sub(rest).saturating_sub(MARK_BYTES);
+        before.max(after).min(self.capacity.payload_max()) as usize
+    }
+
+    /// Reads the consumer's head once and believes it only if it lies between the last one and the tail.
+    fn look(&mut self) -> Result<(), Corrupt> {
+        let head = self.peer.load(Word::Head);
+        // SYNC: the consumer's reads of what it took are over: its store of head in `ConsumerCore::release`.
+        fence(Ordering::Acquire);
+        let (moved, most) = (head.wrapping_sub(self.head_seen), self.tail.wrapping_sub(self.head_seen));
+        if moved > most || !head.is_multiple_of(MARK_BYTES) {
+            let corrupt = Corrupt::Head { head, seen: self.head_seen, tail: self.tail };
+            self.corrupt = Some(corrupt);
+            return Err(corrupt);
+        }
+        self.head_seen = head;
+        Ok(())
+    }
+
+    fn intact(&self) -> Result<(), Corrupt> {
+        self.corrupt.map_or(Ok(()), Err)
+    }
+}

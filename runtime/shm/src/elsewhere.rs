@@ -1,0 +1,125 @@
+//! Platforms without sealed shared memory: making a region is refused in words, and nothing else can be reached.
+
+use std::{
+    convert::Infallible,
+    io,
+    os::fd::{BorrowedFd, OwnedFd},
+    sync::atomic::{AtomicU32, Ordering},
+};
+
+use crate::{
+    bell::{BellKind, BellPair, Doorbell},
+    error::{CreateError, PassError, RefusedOffer},
+    layout::{Capacity, Word},
+    memory::{OwnHeader, OwnRing, Peer},
+    offer::Offer,
+};
+
+pub(crate) fn send(_: &Offer, _: BorrowedFd<'_>) -> Result<(), PassError> {
+    Err(PassError::System(io::ErrorKind::Unsupported.into()))
+}
+
+pub(crate) fn receive(_: BorrowedFd<'_>) -> Result<Result<Offer, RefusedOffer>, PassError> {
+    Err(PassError::System(io::ErrorKind::Unsupported.into()))
+}
+
+pub(crate) fn create(_: Capacity) -> Result<(OwnMemory, OwnedFd), CreateError> {
+    Err(CreateError::Unsupported)
+}
+
+pub(crate) fn adopt(_: OwnedFd, _: Capacity) -> Result<PeerMemory, RefusedOffer> {
+    Err(RefusedOffer::Unsupported)
+}
+
+pub(crate) fn bell_pair(_: BellKind) -> Result<BellPair, CreateError> {
+    Err(CreateError::Unsupported)
+}
+
+pub(crate) fn button(_: BellKind, _: Option<OwnedFd>) -> Result<Box<dyn Doorbell>, RefusedOffer> {
+    Err(RefusedOffer::Unsupported)
+}
+
+/// There is none.
+#[derive(Debug)]
+pub(crate) struct OwnMemory(Infallible);
+
+impl OwnMemory {
+    pub(crate) fn split(self) -> (OwnHeaderMemory, OwnRingMemory) {
+        match self.0 {}
+    }
+
+    #[cfg(any(test, feature = "hostile-peer"))]
+    pub(crate) fn scribble(&mut self, _: u32, _: u32) {
+        match self.0 {}
+    }
+}
+
+/// There is none.
+#[derive(Debug)]
+pub(crate) struct OwnHeaderMemory(Infallible);
+
+impl OwnHeaderMemory {
+    pub(crate) fn futex(&self, _: Word) -> &AtomicU32 {
+        match self.0 {}
+    }
+}
+
+impl OwnHeader for OwnHeaderMemory {
+    fn store(&self, _: Word, _: u32, _: Ordering) {
+        match self.0 {}
+    }
+}
+
+/// There is none.
+#[derive(Debug)]
+pub(crate) struct OwnRingMemory(Infallible);
+
+impl OwnRingMemory {
+    pub(crate) fn futex(&self, _: Word) -> &AtomicU32 {
+        match self.0 {}
+    }
+
+    pub(crate) fn bytes(&self, _: u32, _: u32) -> &[u8] {
+        match self.0 {}
+    }
+
+    pub(crate) fn bytes_mut(&mut self, _: u32, _: u32) -> &mut [u8] {
+        match self.0 {}
+    }
+}
+
+impl OwnHeader for OwnRingMemory {
+    fn store(&self, _: Word, _: u32, _: Ordering) {
+        match self.0 {}
+    }
+}
+
+impl OwnRing for OwnRingMemory {
+    fn put_mark(&mut self, _: u32, _: u64) {
+        match self.0 {}
+    }
+}
+
+/// There is none.
+#[derive(Clone, Debug)]
+pub(crate) struct PeerMemory(Infallible);
+
+impl PeerMemory {
+    pub(crate) fn futex(&self, _: Word) -> &AtomicU32 {
+        match self.0 {}
+    }
+
+    pub(crate) fn copy_out(&self, _: usize, _: &mut [u8]) {
+        match self.0 {}
+    }
+}
+
+impl Peer for PeerMemory {
+    fn load(&self, _: Word) -> u32 {
+        match self.0 {}
+    }
+
+    fn mark(&self, _: u32) -> u64 {
+        match self.0 {}
+    }
+}

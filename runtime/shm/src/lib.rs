@@ -1,0 +1,66 @@
+//! Message rings in shared memory between two processes that need not trust each other.
+//!
+//! Each side makes one [`Region`]: a sealed piece of memory that only it can write and the other can only read. It holds
+//! the ring of the messages that this side sends and this side's few header words. Both sides exchange an [`Offer`] over a
+//! unix socket, check what they got, and have a [`Producer`] and a [`Consumer`]:
+//!
+//! ```
+//! use std::time::{Duration, Instant};
+//! use sinew_shm::{BellKind, Capacity, Region, Terms, Wait};
+//!
+//! let capacity = Capacity::new(64 * 1024)?;
+//! let (left, left_offer) = Region::create(capacity, BellKind::Futex)?;
+//! let (right, right_offer) = Region::create(capacity, BellKind::Futex)?;
+//! // Between processes: `left_offer.send(&socket)` here, `Offer::receive(&socket)` there.
+//! let (mut producer, _) = left.connect(right_offer, &Terms::default())?;
+//! let (_, mut consumer) = right.connect(left_offer, &Terms::default())?;
+//!
+//! let mut loan = producer.loan(5)?;          // memory in the ring
+//! loan.copy_from_slice(b"hello");
+//! loan.publish();                            // now it is a message; dropped instead, it would be given back
+//!
+//! let wait = Wait::until(Instant::now() + Duration::from_secs(1));
+//! let lent = consumer.receive_before(&wait)?;
+//! assert_eq!(lent.to_vec(), b"hello");       // its memory is given back to the producer when `lent` is dropped
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
+//! What a hostile peer can do at worst: send wrong bytes, be silent, take no messages, or make this side say [`Corrupt`].
+//! It cannot make this side read or write outside the ring, crash, hang or grow. The reasons are in
+//! `docs/decisions/0010-shared-memory.md`.
+//!
+//! No tokio, no actor, no layer is known here. A reactor waits for [`Consumer::fd`] after [`Consumer::arm`].
+
+#![cfg_attr(
+    not(target_os = "linux"),
+    expect(dead_code, reason = "without sealed memory nothing behind `Region::create` is reached")
+)]
+
+mod bell;
+mod consumer;
+mod core;
+mod error;
+mod layout;
+mod memory;
+mod offer;
+mod producer;
+mod region;
+mod spin;
+mod wait;
+
+#[cfg(target_os = "linux")]
+#[path = "linux/mod.rs"]
+mod platform;
+#[cfg(not(target_os = "linux"))]
+#[path = "elsewhere.rs"]
+mod platform;
+
+pub use bell::BellKind;
+pub use consumer::{Consumer, Lent, LentReader};
+pub use error::{Corrupt, CreateError, LoanError, PassError, ReceiveError, RefusedOffer, RoomError};
+pub use layout::{Capacity, CapacityError};
+pub use offer::{OFFER_BYTES, Offer};
+pub use producer::{Loan, Producer};
+pub use region::{Region, Terms};
+pub use spin::Spin;
+pub use wait::{Armed, HangUp, Wait};

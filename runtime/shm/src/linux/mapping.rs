@@ -1,0 +1,220 @@
+//! Mapped regions as typed memory. **All of Sinew's unsafe code about shared memory is in this file**, in four blocks.
+//!
+//! They rest on these facts:
+//!
+//! - M1. `MmapRaw` keeps `len()` bytes mapped at `as_ptr()`, page-aligned, until it is dropped; it is not dropped while any
+//!   of the types here lives (`Arc`). `Mapping::new` checks that `len()` is header plus ring.
+//! - M2. The file behind it cannot shrink or be punched: it has the seals SHRINK and FUTURE_WRITE, set by `memfd::create` or
+//!   checked by `memfd::adopt`. So every byte stays there and no access is a bus error.
+//! - M3. An own region is written by this process only: nobody else can map it writable or write to it (seal FUTURE_WRITE,
+//!   set before its descriptor leaves this process).
+//! - M4. Of an own region, the header is touched only as atomics, and the ring only through the one `OwnRingMemory` that
+//!   `OwnMemory::split` makes of it: it is neither `Clone` nor `Copy`.
+//! - M5. Of a peer's region, which changes at any time, everything is touched only by relaxed atomic loads of 4 or 8 aligned
+//!   bytes, each place always in the same size: header 4, ring 8. These are defined on read-only mappings too.
+
+use std::{
+    slice,
+    sync::{
+        Arc,
+        atomic::{AtomicU32, AtomicU64, Ordering},
+    },
+};
+
+use memmap2::MmapRaw;
+
+use crate::{
+    layout::{Capacity, HEADER_BYTES, MAGIC, VERSION, Word},
+    memory::{OwnHeader, OwnRing, Peer},
+};
+
+/// A region in this process's address space.
+#[derive(Debug)]
+pub(super) struct Mapping {
+    raw: MmapRaw,
+    ring_bytes: usize,
+}
+
+impl Mapping {
+    /// A region of this capacity; `None` when the mapping has another size.
+    pub(super) fn new(raw: MmapRaw, capacity: Capacity) -> Option<Self> {
+        let ring_bytes = capacity.bytes() as usize;
+        (raw.len() == HEADER_BYTES + ring_bytes).then_some(Self { raw, ring_bytes })
+    }
+
+    fn header(&self) -> &[AtomicU32] {
+        let start = self.raw.as_ptr().cast::<AtomicU32>();
+        // SAFETY: M1: so many bytes are mapped there and aligned to a page; M4 and M5: all access to them in this process
+        // is atomic and of this size. Through a read-only mapping `PeerMemory` and `identity` only load, relaxed.
+        unsafe { slice::from_raw_parts(start, HEADER_BYTES / size_of::<AtomicU32>()) }
+    }
+
+    fn ring_words(&self) -> &[AtomicU64] {
+        let start = self.raw.as_ptr().wrapping_add(HEADER_BYTES).cast::<AtomicU64>();
+        // SAFETY: M1: so many bytes are mapped there, and the header's length keeps the alignment; M5: all access to them
+        // in this process is atomic and of this size, since only `PeerMemory`, which has no other access, calls this.
+        unsafe { slice::from_raw_parts(start, self.ring_bytes / size_of::<AtomicU64>()) }
+    }
+
+    /// What the first words say: magic, version, capacity. Each is read once.
+    pub(super) fn identity(&self) -> (u64, u32, u32) {
+        let word = |index: usize| self.header()[index].load(Ordering::Relaxed);
+        (u64::from(word(0)) | u64::from(word(1)) << 32, word(2), word(3))
+    }
+}
+
+/// This side's region before it is connected.
+#[derive(Debug)]
+pub(crate) struct OwnMemory(Arc<Mapping>);
+
+impl OwnMemory {
+    /// Takes a writable mapping of zeros and writes the identity into it.
+    ///
+    /// The caller has made the file, and seals it (M2, M3) before the peer gets it.
+    pub(super) fn new(mapping: Mapping) -> Self {
+        let header = mapping.header();
+        let capacity = u32::try_from(mapping.ring_bytes).expect("a capacity has 32 bits");
+        let words = [MAGIC as u32, (MAGIC >> 32) as u32, VERSION, capacity];
+        for (place, word) in header.iter().zip(words) {
+            place.store(word, Ordering::Relaxed);
+        }
+        Self(Arc::new(mapping))
+    }
+
+    /// The header, for the consumer; header and ring, for the producer. There is one of each (M4).
+    pub(crate) fn split(self) -> (OwnHeaderMemory, OwnRingMemory) {
+        (OwnHeaderMemory(Arc::clone(&self.0)), OwnRingMemory(OwnHeaderMemory(self.0)))
+    }
+
+    #[cfg(any(test, feature = "hostile-peer"))]
+    pub(crate) fn scribble(&mut self, place: u32, value: u32) {
+        let place = place as usize % (self.0.raw.len() / 4);
+        match place.checked_sub(HEADER_BYTES / 4) {
+            None => self.0.header()[place].store(value, Ordering::Relaxed),
+            Some(word) => {
+                // A view for this call only; nobody else has one before `split`.
+                let mut ring = OwnRingMemory(OwnHeaderMemory(Arc::clone(&self.0)));
+                let position = u32::try_from(word * 4).expect("a capacity has 32 bits");
+                ring.bytes_mut(position, 4).copy_from_slice(&value.to_ne_bytes());
+            }
+        }
+    }
+}
+
+/// The header of this side's region.
+#[derive(Debug)]
+pub(crate) struct OwnHeaderMemory(Arc<Mapping>);
+
+impl OwnHeaderMemory {
+    /// The word as a futex, to wake who sleeps on it.
+    pub(crate) fn futex(&self, word: Word) -> &AtomicU32 {
+        &self.0.header()[word.index()]
+    }
+}
+
+impl OwnHeader for OwnHeaderMemory {
+    fn store(&self, word: Word, value: u32, order: Ordering) {
+        self.futex(word).store(value, order);
+    }
+}
+
+/// The ring of this side's region, and its header.
+#[derive(Debug)]
+pub(crate) struct OwnRingMemory(OwnHeaderMemory);
+
+impl OwnRingMemory {
+    /// The word as a futex, to wake who sleeps on it.
+    pub(crate) fn futex(&self, word: Word) -> &AtomicU32 {
+        self.0.futex(word)
+    }
+
+    /// Bytes of the ring.
+    pub(crate) fn bytes(&self, position: u32, length: u32) -> &[u8] {
+        let mapping = &self.0.0;
+        let start = mapping.raw.as_ptr().wrapping_add(HEADER_BYTES);
+        // SAFETY: M1: so many bytes are mapped there; M3 and M4: nobody writes them while `self` is borrowed.
+        let ring = unsafe { slice::from_raw_parts(start, mapping.ring_bytes) };
+        &ring[position as usize..][..length as usize]
+    }
+
+    /// Bytes of the ring, to be written. The peer may read them at any time, which changes nothing for this side.
+    pub(crate) fn bytes_mut(&mut self, position: u32, length: u32) -> &mut [u8] {
+        let mapping = &self.0.0;
+        let start = mapping.raw.as_mut_ptr().wrapping_add(HEADER_BYTES);
+        // SAFETY: M1: so many bytes are mapped there, writable as this is an own region; M3 and M4: nobody else in this
+        // process has them while `self` is borrowed, nobody else at all writes them.
+        let ring = unsafe { slice::from_raw_parts_mut(start, mapping.ring_bytes) };
+        &mut ring[position as usize..][..length as usize]
+    }
+}
+
+#[cfg(test)]
+impl OwnRingMemory {
+    /// The same memory as a peer sees it. Nobody writes it any more.
+    pub(super) fn into_peer(self) -> PeerMemory {
+        PeerMemory(self.0.0)
+    }
+}
+
+impl OwnHeader for OwnRingMemory {
+    fn store(&self, word: Word, value: u32, order: Ordering) {
+        self.0.store(word, value, order);
+    }
+}
+
+impl OwnRing for OwnRingMemory {
+    fn put_mark(&mut self, position: u32, bits: u64) {
+        self.bytes_mut(position, 8).copy_from_slice(&bits.to_ne_bytes());
+    }
+}
+
+/// The peer's region: read-only, and never to be believed.
+#[derive(Clone, Debug)]
+pub(crate) struct PeerMemory(Arc<Mapping>);
+
+impl PeerMemory {
+    pub(super) fn new(mapping: Mapping) -> Self {
+        Self(Arc::new(mapping))
+    }
+
+    /// The word as a futex, to sleep on.
+    pub(crate) fn futex(&self, word: Word) -> &AtomicU32 {
+        &self.0.header()[word.index()]
+    }
+
+    /// Copies bytes of the ring, each read once, in words of 8: no instruction in it can be torn apart by the compiler, and
+    /// what the peer does meanwhile decides only which bytes are copied.
+    ///
+    /// # Panics
+    /// When the bytes do not lie within the ring: the core has checked that they do.
+    pub(crate) fn copy_out(&self, position: usize, target: &mut [u8]) {
+        let words = &self.0.ring_words()[position / 8..(position + target.len()).div_ceil(8)];
+        let skew = position % 8;
+        let (lead, target) = target.split_at_mut(target.len().min((8 - skew) % 8));
+        let words = if lead.is_empty() {
+            words
+        } else {
+            let word = words[0].load(Ordering::Relaxed).to_ne_bytes();
+            lead.copy_from_slice(&word[skew..][..lead.len()]);
+            &words[1..]
+        };
+        let (whole, tail) = target.as_chunks_mut::<8>();
+        for (bytes, word) in whole.iter_mut().zip(words) {
+            *bytes = word.load(Ordering::Relaxed).to_ne_bytes();
+        }
+        if !tail.is_empty() {
+            let word = words[whole.len()].load(Ordering::Relaxed).to_ne_bytes();
+            tail.copy_from_slice(&word[..tail.len()]);
+        }
+    }
+}
+
+impl Peer for PeerMemory {
+    fn load(&self, word: Word) -> u32 {
+        self.futex(word).load(Ordering::Relaxed)
+    }
+
+    fn mark(&self, position: u32) -> u64 {
+        self.0.ring_words()[position as usize / 8].load(Ordering::Relaxed)
+    }
+}

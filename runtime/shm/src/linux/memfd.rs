@@ -1,0 +1,90 @@
+//! Memory without a name, sealed: making one's own, and checking a peer's before it is mapped.
+
+use std::{io, os::fd::OwnedFd};
+
+use memmap2::MmapOptions;
+use rustix::{
+    fs::{
+        FallocateFlags, MemfdFlags, SealFlags, fallocate, fcntl_add_seals, fcntl_get_seals, fstat, fstatfs,
+        ftruncate, memfd_create,
+    },
+    io::Errno,
+};
+
+use super::mapping::{Mapping, OwnMemory, PeerMemory};
+use crate::{
+    error::{CreateError, RefusedOffer},
+    layout::{Capacity, MAGIC, VERSION},
+};
+
+/// What tmpfs, and so every ordinary memfd, says that it is. Memory in huge pages says something else.
+const TMPFS_MAGIC: i64 = 0x0102_1994;
+
+/// Without these a peer could pull memory away from under this side: cut it, or punch holes (FUTURE_WRITE), or unseal it.
+const NEEDED: SealFlags =
+    SealFlags::SHRINK.union(SealFlags::GROW).union(SealFlags::FUTURE_WRITE).union(SealFlags::SEAL);
+
+/// Makes a region: all of its memory is there from now on, and nobody but this mapping can write it.
+pub(crate) fn create(capacity: Capacity) -> Result<(OwnMemory, OwnedFd), CreateError> {
+    let step = |step| move |errno: Errno| CreateError::System { step, cause: errno.into() };
+    let memory = unnamed().map_err(step("making memory (memfd_create)"))?;
+    let bytes = capacity.region_bytes();
+    ftruncate(&memory, bytes).map_err(step("sizing memory (ftruncate)"))?;
+    // Now, and not at the first touch: running out of memory is an error here, and a bus error there.
+    fallocate(&memory, FallocateFlags::empty(), 0, bytes).map_err(step("reserving memory (fallocate)"))?;
+    let mapped = |cause| CreateError::System { step: "mapping memory (mmap)", cause };
+    let raw = options(capacity).and_then(|options| options.map_raw(&memory)).map_err(mapped)?;
+    let mapping = Mapping::new(raw, capacity).ok_or_else(|| mapped(io::ErrorKind::InvalidData.into()))?;
+    let own = OwnMemory::new(mapping);
+    fcntl_add_seals(&memory, NEEDED).map_err(step("sealing memory (F_ADD_SEALS)"))?;
+    Ok((own, memory))
+}
+
+/// Not executable where the system knows that (Linux 6.3).
+fn unnamed() -> Result<OwnedFd, Errno> {
+    let flags = MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING;
+    match memfd_create("sinew-ring", flags | MemfdFlags::NOEXEC_SEAL) {
+        Err(Errno::INVAL) => memfd_create("sinew-ring", flags),
+        other => other,
+    }
+}
+
+/// Maps a peer's region read-only, if it is one.
+///
+/// The order matters: reading the seals is answered by the kernel itself for every kind of file, while asking a file system
+/// of the peer's own for a size could take for ever.
+pub(crate) fn adopt(memory: OwnedFd, capacity: Capacity) -> Result<PeerMemory, RefusedOffer> {
+    let step = |step| move |errno: Errno| RefusedOffer::System { step, cause: errno.into() };
+    let seals = fcntl_get_seals(&memory).map_err(|_| RefusedOffer::Kind)?;
+    if !seals.contains(NEEDED) {
+        return Err(RefusedOffer::Seals(format!("{:?}", NEEDED.difference(seals))));
+    }
+    let kind = fstatfs(&memory).map_err(step("asking for the kind of the offered memory (fstatfs)"))?.f_type;
+    if kind != TMPFS_MAGIC {
+        return Err(RefusedOffer::Kind);
+    }
+    let stat = fstat(&memory).map_err(step("asking for the size of the offered memory (fstat)"))?;
+    let (expected, got) = (capacity.region_bytes(), u64::try_from(stat.st_size).unwrap_or(0));
+    if got != expected {
+        return Err(RefusedOffer::Size { got, expected });
+    }
+    let allocated = u64::try_from(stat.st_blocks).unwrap_or(0).saturating_mul(512);
+    if allocated < expected {
+        return Err(RefusedOffer::Holes { allocated, expected });
+    }
+    let mapped = |cause| RefusedOffer::System { step: "mapping the offered memory (mmap)", cause };
+    let raw = options(capacity).and_then(|options| options.map_raw_read_only(&memory)).map_err(mapped)?;
+    let mapping = Mapping::new(raw, capacity).ok_or_else(|| mapped(io::ErrorKind::InvalidData.into()))?;
+    if mapping.identity() != (MAGIC, VERSION, capacity.bytes()) {
+        return Err(RefusedOffer::Identity);
+    }
+    Ok(PeerMemory::new(mapping))
+}
+
+/// Mapped with all its pages: the first message meets no page fault.
+fn options(capacity: Capacity) -> io::Result<MmapOptions> {
+    let bytes = usize::try_from(capacity.region_bytes()).map_err(|_| io::ErrorKind::OutOfMemory)?;
+    let mut options = MmapOptions::new();
+    options.len(bytes).populate();
+    Ok(options)
+}

@@ -1,0 +1,131 @@
+//! What a side tells the other: its memory and its bells, as descriptors and a few plain bytes.
+
+use std::os::fd::{AsFd, OwnedFd};
+
+use crate::{
+    bell::BellKind,
+    error::{PassError, RefusedOffer},
+    layout::{Capacity, MAGIC, VERSION},
+    platform,
+};
+
+/// Length of [`Offer::to_bytes`].
+pub const OFFER_BYTES: usize = 24;
+
+/// A region as its peer gets it. Made by [`crate::Region::create`], taken by [`crate::Region::connect`].
+///
+/// Its bytes, little-endian: magic (8, `SINEWSHM`), version (4), kind of bell (1), zero (3), capacity of the ring (8).
+/// Its descriptors, in this order: the memory; unless the bell is a futex, the bell for messages and the bell for room.
+#[derive(Debug)]
+pub struct Offer {
+    pub(crate) capacity: Capacity,
+    pub(crate) bell: BellKind,
+    pub(crate) descriptors: Vec<OwnedFd>,
+}
+
+impl Offer {
+    /// The most descriptors an offer has.
+    pub const DESCRIPTORS_MAX: usize = 3;
+
+    /// Bytes of the ring that is offered.
+    #[must_use]
+    pub const fn capacity(&self) -> Capacity {
+        self.capacity
+    }
+
+    /// How the side that offers wants to be woken.
+    #[must_use]
+    pub const fn bell(&self) -> BellKind {
+        self.bell
+    }
+
+    /// The plain part, for a caller with a frame of its own around it.
+    #[must_use]
+    pub fn to_bytes(&self) -> [u8; OFFER_BYTES] {
+        let mut bytes = [0; OFFER_BYTES];
+        bytes[..8].copy_from_slice(&MAGIC.to_le_bytes());
+        bytes[8..12].copy_from_slice(&VERSION.to_le_bytes());
+        bytes[12] = self.bell.number();
+        bytes[16..].copy_from_slice(&u64::from(self.capacity.bytes()).to_le_bytes());
+        bytes
+    }
+
+    /// The descriptors, to be passed with the plain part and in this order.
+    #[must_use]
+    pub fn descriptors(&self) -> &[OwnedFd] {
+        &self.descriptors
+    }
+
+    /// Sends it over a unix socket: one message with its descriptors beside it. Once it has arrived, this side's copy can be
+    /// dropped.
+    ///
+    /// # Errors
+    /// [`PassError::System`], also when a socket that does not block is full.
+    pub fn send(&self, socket: impl AsFd) -> Result<(), PassError> {
+        platform::send(self, socket.as_fd())
+    }
+
+    /// Takes one from a unix socket, on which nothing else may come before it. Descriptors that do not belong to an offer
+    /// are closed; closing what a peer has sent can block (a file on a file system of the peer's own), so this is not for
+    /// a thread that may not.
+    ///
+    /// # Errors
+    /// The outer one when nothing whole came; the inner one when it is no offer.
+    pub fn receive(socket: impl AsFd) -> Result<Result<Self, RefusedOffer>, PassError> {
+        platform::receive(socket.as_fd())
+    }
+
+    /// An offer from what the peer sent. The descriptors are looked at when it is connected.
+    ///
+    /// # Errors
+    /// When the bytes are no offer, or the number of descriptors is not what they ask for.
+    pub fn from_parts(bytes: &[u8; OFFER_BYTES], descriptors: Vec<OwnedFd>) -> Result<Self, RefusedOffer> {
+        let (magic, version) = (u64::from_le_bytes(take(bytes, 0)), u32::from_le_bytes(take(bytes, 8)));
+        if magic != MAGIC {
+            return Err(RefusedOffer::Magic);
+        }
+        if version != VERSION {
+            return Err(RefusedOffer::Version { theirs: version, ours: VERSION });
+        }
+        let bell = BellKind::numbered(bytes[12]).ok_or(RefusedOffer::UnknownBell(bytes[12]))?;
+        let capacity = Capacity::new(u64::from_le_bytes(take(bytes, 16)))
+            .map_err(|error| RefusedOffer::Capacity(error.0))?;
+        let expected = 1 + 2 * bell.descriptors();
+        if descriptors.len() != expected {
+            return Err(RefusedOffer::Descriptors { got: descriptors.len(), expected });
+        }
+        Ok(Self { capacity, bell, descriptors })
+    }
+}
+
+fn take<const N: usize>(bytes: &[u8; OFFER_BYTES], from: usize) -> [u8; N] {
+    std::array::from_fn(|index| bytes[from + index])
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn any_bytes_are_an_offer_or_an_error(bytes: [u8; OFFER_BYTES], like_ours: bool) {
+            let mut bytes = bytes;
+            if like_ours {
+                bytes[..8].copy_from_slice(&MAGIC.to_le_bytes());
+                bytes[8..12].copy_from_slice(&VERSION.to_le_bytes());
+            }
+            prop_assert!(Offer::from_parts(&bytes, Vec::new()).is_err(), "no offer comes without memory");
+        }
+    }
+
+    #[test]
+    fn another_version_is_refused_with_both_versions() {
+        let offer = Offer { capacity: Capacity::MIN, bell: BellKind::Futex, descriptors: Vec::new() };
+        let mut bytes = offer.to_bytes();
+        bytes[8] = 9;
+        let refused = Offer::from_parts(&bytes, Vec::new()).expect_err("version 9 is not known");
+        assert_eq!(refused.to_string(), "the peer's layout has version 9, this one 1");
+    }
+}

@@ -1,0 +1,225 @@
+//! Sending: room in the ring is lent, written in place, and published or given back.
+
+use std::{
+    fmt,
+    ops::{Deref, DerefMut},
+    os::fd::BorrowedFd,
+    time::Instant,
+};
+
+use crate::{
+    bell::{Doorbell, Sleeping, Woken},
+    core::{ProducerCore, producer::Reserved},
+    error::{Corrupt, LoanError, RoomError},
+    layout::Word,
+    platform::{OwnRingMemory, PeerMemory},
+    spin::{Spin, Spinner},
+    wait::{Armed, Wait},
+};
+
+/// The sending end of a connection: one thread at a time.
+pub struct Producer {
+    core: ProducerCore<OwnRingMemory, PeerMemory>,
+    room: Box<dyn Doorbell>,
+    message_button: Box<dyn Doorbell>,
+    spinner: Spinner,
+}
+
+impl Producer {
+    pub(crate) fn new(
+        core: ProducerCore<OwnRingMemory, PeerMemory>,
+        room: Box<dyn Doorbell>,
+        message_button: Box<dyn Doorbell>,
+    ) -> Self {
+        Self { core, room, message_button, spinner: Spinner::new(Spin::Off) }
+    }
+
+    /// What this end does before it sleeps in [`Producer::loan_before`]. [`Spin::Off`] at first.
+    pub const fn set_spin(&mut self, spin: Spin) {
+        self.spinner = Spinner::new(spin);
+    }
+
+    /// The longest message, in bytes: half the ring, less 8.
+    #[must_use]
+    pub const fn payload_max(&self) -> usize {
+        self.core.capacity().payload_max() as usize
+    }
+
+    /// Lends memory in the ring for a message of so many bytes. What is in it is left over from earlier messages to the
+    /// same peer. Nobody sees it before [`Loan::publish`]; dropped, it is given back.
+    ///
+    /// # Errors
+    /// [`LoanError::Full`] when the peer has not taken enough yet: nothing changed.
+    pub fn loan(&mut self, length: usize) -> Result<Loan<'_>, LoanError> {
+        let reserved = self.core.reserve(length)?;
+        Ok(Loan { producer: self, reserved })
+    }
+
+    /// As [`Producer::loan`], and waits for room.
+    ///
+    /// # Errors
+    /// [`RoomError::TimedOut`] at the deadline, [`RoomError::HungUp`] when the peer is gone.
+    pub fn loan_before(&mut self, length: usize, wait: &Wait<'_>) -> Result<Loan<'_>, RoomError> {
+        let reserved = self.await_room(length, wait)?;
+        Ok(Loan { producer: self, reserved })
+    }
+
+    /// Takes up again what [`Loan::set_aside`] left.
+    pub const fn resume(&mut self) -> Option<Loan<'_>> {
+        match self.core.reserved() {
+            Some(reserved) => Some(Loan { producer: self, reserved }),
+            None => None,
+        }
+    }
+
+    /// Copies a message into the ring and publishes it.
+    ///
+    /// # Errors
+    /// As [`Producer::loan`].
+    pub fn send(&mut self, payload: &[u8]) -> Result<(), LoanError> {
+        let mut loan = self.loan(payload.len())?;
+        loan.copy_from_slice(payload);
+        loan.publish();
+        Ok(())
+    }
+
+    /// Announces that a reactor is about to wait for [`Producer::fd`] until there is room for `length` bytes. Followed by
+    /// [`Producer::disarm`] in any case but [`Armed::Ready`].
+    ///
+    /// # Errors
+    /// [`LoanError::TooLong`] or [`LoanError::Corrupt`]; never `Full`.
+    pub fn arm(&mut self, length: usize) -> Result<Armed, LoanError> {
+        self.core.arm(length)
+    }
+
+    /// Says that the reactor is awake, and forgets the rings so far.
+    pub fn disarm(&mut self) {
+        self.core.disarm();
+        self.room.drain();
+    }
+
+    /// What a reactor waits for (readable) while armed; `None` for a futex.
+    #[must_use]
+    pub fn fd(&self) -> Option<BorrowedFd<'_>> {
+        self.room.fd()
+    }
+
+    fn await_room(&mut self, length: usize, wait: &Wait<'_>) -> Result<Reserved, RoomError> {
+        if let Some(reserved) = self.room_now(length)? {
+            return Ok(reserved);
+        }
+        let started = self.spinner.learns().then(Instant::now);
+        let reserved = self.spin_or_sleep(length, wait)?;
+        if let Some(started) = started {
+            self.spinner.learn(started.elapsed());
+        }
+        Ok(reserved)
+    }
+
+    fn spin_or_sleep(&mut self, length: usize, wait: &Wait<'_>) -> Result<Reserved, RoomError> {
+        if wait.spin(self.spinner.begin(), || self.core.has_moved())
+            && let Some(reserved) = self.room_now(length)?
+        {
+            return Ok(reserved);
+        }
+        loop {
+            let ended = match self.core.arm(length) {
+                Ok(Armed::Sleep) => self.sleep(wait)?,
+                Ok(Armed::Ready) => Woken::Rung,
+                Err(LoanError::Corrupt(corrupt)) => return Err(corrupt.into()),
+                Err(LoanError::TooLong { asked, max } | LoanError::Full { asked, free: max }) => {
+                    return Err(RoomError::TooLong { asked, max });
+                }
+            };
+            if let Some(reserved) = self.room_now(length)? {
+                return Ok(reserved);
+            }
+            match ended {
+                Woken::Rung => {}
+                Woken::TimedOut => return Err(RoomError::TimedOut),
+                Woken::HungUp => return Err(RoomError::HungUp),
+            }
+        }
+    }
+
+    fn sleep(&mut self, wait: &Wait<'_>) -> Result<Woken, RoomError> {
+        let sleeping = Sleeping { word: self.core.peer.futex(Word::Head), seen: self.core.head_seen(), wait };
+        let ended = self.room.sleep(&sleeping);
+        self.core.disarm();
+        ended.map_err(RoomError::System)
+    }
+
+    fn room_now(&mut self, length: usize) -> Result<Option<Reserved>, RoomError> {
+        match self.core.reserve(length) {
+            Ok(reserved) => Ok(Some(reserved)),
+            Err(LoanError::Full { .. }) => Ok(None),
+            Err(LoanError::TooLong { asked, max }) => Err(RoomError::TooLong { asked, max }),
+            Err(LoanError::Corrupt(corrupt)) => Err(corrupt.into()),
+        }
+    }
+
+    /// Whether the peer was caught writing nonsense by this end.
+    #[must_use]
+    pub const fn corrupt(&self) -> Option<Corrupt> {
+        self.core.corrupt()
+    }
+}
+
+impl fmt::Debug for Producer {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Producer").field("core", &self.core).finish_non_exhaustive()
+    }
+}
+
+/// Memory in the ring for one message, as bytes that only this side can write.
+#[derive(Debug)]
+pub struct Loan<'a> {
+    producer: &'a mut Producer,
+    reserved: Reserved,
+}
+
+impl Loan<'_> {
+    /// Makes it a message. The peer is woken if it sleeps: then, and only then, this is a system call.
+    pub fn publish(self) {
+        let producer = &mut *self.producer;
+        if producer.core.publish() {
+            producer.message_button.ring(producer.core.own.futex(Word::Tail));
+        }
+    }
+
+    /// Makes it shorter: what was asked for was an upper bound. A longer length changes nothing.
+    pub fn truncate(&mut self, length: usize) {
+        let shorter = u32::try_from(length).unwrap_or(u32::MAX).min(self.reserved.length);
+        self.producer.core.shorten(shorter);
+        self.reserved.length = shorter;
+    }
+
+    /// Keeps the memory without the borrow, until [`Producer::resume`] takes it up or another loan takes its place.
+    pub fn set_aside(self) {
+        // Its drop would give the memory back. Nothing else is in it but a borrow.
+        std::mem::forget(self);
+    }
+}
+
+impl Deref for Loan<'_> {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        let position = self.producer.core.payload_position(self.reserved);
+        self.producer.core.own.bytes(position, self.reserved.length)
+    }
+}
+
+impl DerefMut for Loan<'_> {
+    fn deref_mut(&mut self) -> &mut [u8] {
+        let position = self.producer.core.payload_position(self.reserved);
+        self.producer.core.own.bytes_mut(position, self.reserved.length)
+    }
+}
+
+impl Drop for Loan<'_> {
+    fn drop(&mut self) {
+        // After `publish` nothing is reserved any more.
+        self.producer.core.give_back();
+    }
+}

@@ -1,0 +1,93 @@
+//! A side's own memory, and how two sides come together.
+
+use crate::{
+    bell::{BellKind, BellPair, Doorbell},
+    consumer::Consumer,
+    core::{ConsumerCore, ProducerCore},
+    error::{CreateError, RefusedOffer},
+    layout::Capacity,
+    offer::Offer,
+    platform,
+    producer::Producer,
+};
+
+/// One side's memory: the ring of what it sends, and its header. Only this side can write it, ever: the system sees to that.
+pub struct Region {
+    pub(crate) capacity: Capacity,
+    own: platform::OwnMemory,
+    message: Box<dyn Doorbell>,
+    room: Box<dyn Doorbell>,
+}
+
+/// What this side accepts from a peer.
+#[derive(Clone, Debug)]
+pub struct Terms {
+    /// The largest ring of the peer's that this side maps. Its memory is the peer's, its addresses are this side's.
+    pub capacity_max: Capacity,
+    /// How the peer may ask to be woken. [`BellKind::EventFd`] is for trusted peers.
+    pub bells: Vec<BellKind>,
+}
+
+impl Default for Terms {
+    /// 16 MiB, and no bell that could block.
+    fn default() -> Self {
+        Self {
+            capacity_max: Capacity::new(16 * 1024 * 1024).expect("a power of two within the limits"),
+            bells: vec![BellKind::Futex, BellKind::Socket],
+        }
+    }
+}
+
+impl Region {
+    /// Makes memory for a ring of this capacity, filled with zeros and sealed, and what the peer needs to use it. `bell` is
+    /// how this side wants to be woken. There is no name in any file system, and all is gone when both sides are.
+    ///
+    /// # Errors
+    /// [`CreateError::Unsupported`] where there is no sealed memory; else what the system said.
+    pub fn create(capacity: Capacity, bell: BellKind) -> Result<(Self, Offer), CreateError> {
+        let (own, memory) = platform::create(capacity)?;
+        let BellPair { ear: message, button: message_button } = platform::bell_pair(bell)?;
+        let BellPair { ear: room, button: room_button } = platform::bell_pair(bell)?;
+        let descriptors = [Some(memory), message_button, room_button].into_iter().flatten().collect();
+        Ok((Self { capacity, own, message, room }, Offer { capacity, bell, descriptors }))
+    }
+
+    /// Maps what the peer offers, if it is what it has to be. The region is used up either way.
+    ///
+    /// # Errors
+    /// Whose fault and what; then nothing of the offer is kept.
+    pub fn connect(self, peer: Offer, terms: &Terms) -> Result<(Producer, Consumer), RefusedOffer> {
+        let Offer { capacity: theirs, bell, descriptors } = peer;
+        if theirs > terms.capacity_max {
+            return Err(RefusedOffer::TooLarge { offered: theirs, allowed: terms.capacity_max });
+        }
+        if !terms.bells.contains(&bell) {
+            return Err(RefusedOffer::Bell(bell));
+        }
+        let mut descriptors = descriptors.into_iter();
+        let memory = descriptors.next().ok_or(RefusedOffer::Descriptors { got: 0, expected: 1 })?;
+        let peer = platform::adopt(memory, theirs)?;
+        let message_button = platform::button(bell, descriptors.next())?;
+        let room_button = platform::button(bell, descriptors.next())?;
+        let (header, ring) = self.own.split();
+        let producer = ProducerCore::new(ring, peer.clone(), self.capacity);
+        let consumer = ConsumerCore::new(header, peer, theirs);
+        Ok((
+            Producer::new(producer, self.room, message_button),
+            Consumer::new(consumer, self.message, room_button),
+        ))
+    }
+
+    /// Writes any value at any place: what a hostile peer does. `place` counts 32-bit words from the region's beginning
+    /// and is taken modulo their number.
+    #[cfg(any(test, feature = "hostile-peer"))]
+    pub fn scribble(&mut self, place: u32, value: u32) {
+        self.own.scribble(place, value);
+    }
+}
+
+impl std::fmt::Debug for Region {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Region").field("capacity", &self.capacity).finish_non_exhaustive()
+    }
+}

@@ -1,0 +1,322 @@
+//! Two sides in one process, over real sealed memory: the connection as a user has it.
+#![cfg(target_os = "linux")]
+
+use std::{
+    io::Read,
+    os::{
+        fd::{AsFd, OwnedFd},
+        unix::net::UnixStream,
+    },
+    sync::mpsc::sync_channel,
+    thread,
+    time::{Duration, Instant},
+};
+
+use sinew_shm::{
+    Armed, BellKind, Capacity, Consumer, HangUp, LoanError, Offer, PassError, Producer, ReceiveError,
+    RefusedOffer, Region, RoomError, Spin, Terms, Wait,
+};
+
+const BELLS: [BellKind; 3] = [BellKind::Futex, BellKind::EventFd, BellKind::Socket];
+
+fn terms() -> Terms {
+    Terms { bells: BELLS.to_vec(), ..Terms::default() }
+}
+
+/// One direction of a connection; the other one's ends are returned too, as a connection lives as long as its parts.
+fn pair(capacity: u64, bell: BellKind) -> (Producer, Consumer, (Consumer, Producer)) {
+    let capacity = Capacity::new(capacity).expect("a power of two");
+    let (left, left_offer) = Region::create(capacity, bell).expect("a region");
+    let (right, right_offer) = Region::create(capacity, bell).expect("a region");
+    let (producer, left_consumer) = left.connect(right_offer, &terms()).expect("an honest offer");
+    let (right_producer, consumer) = right.connect(left_offer, &terms()).expect("an honest offer");
+    (producer, consumer, (left_consumer, right_producer))
+}
+
+fn soon() -> Wait<'static> {
+    Wait::until(Instant::now() + Duration::from_secs(20))
+}
+
+#[test]
+fn messages_arrive_whole_and_in_order_whatever_their_length_bell_and_spin() {
+    for bell in BELLS {
+        for spin in [
+            Spin::Off,
+            Spin::For(Duration::from_micros(20)),
+            Spin::Adaptive { max: Duration::from_micros(50) },
+        ] {
+            // given: a ring that wraps every few messages
+            let (mut producer, mut consumer, _rest) = pair(4096, bell);
+            producer.set_spin(spin);
+            consumer.set_spin(spin);
+            let lengths = || (0..3_000_usize).map(|number| number * 7919 % 2041);
+            let sending = thread::spawn(move || {
+                for (number, length) in lengths().enumerate() {
+                    let mut loan = producer.loan_before(length, &soon()).expect("room in time");
+                    loan.fill(number as u8);
+                    loan.publish();
+                }
+                producer
+            });
+            // when, then
+            for (number, length) in lengths().enumerate() {
+                let lent = consumer.receive_before(&soon()).expect("a message in time");
+                assert_eq!(lent.to_vec(), vec![number as u8; length], "{bell} {spin:?} {number}");
+            }
+            let producer = sending.join().expect("no panic");
+            assert_eq!((producer.corrupt(), consumer.receive().expect("honest").is_none()), (None, true));
+        }
+    }
+}
+
+#[test]
+fn a_loan_is_memory_in_the_ring_that_nobody_sees_until_it_is_published() {
+    let (mut producer, mut consumer, _rest) = pair(4096, BellKind::Futex);
+    // given: one dropped, one cut short, one set aside
+    producer.loan(100).expect("room").fill(1);
+    let mut loan = producer.loan(100).expect("room");
+    loan[..3].copy_from_slice(b"abc");
+    loan.truncate(3);
+    loan.truncate(50);
+    loan.publish();
+    let mut loan = producer.loan(2).expect("room");
+    loan.copy_from_slice(b"xy");
+    loan.set_aside();
+    // then
+    assert_eq!(consumer.receive().expect("honest").expect("published").to_vec(), b"abc");
+    assert!(consumer.receive().expect("honest").is_none());
+    // when
+    producer.resume().expect("it was set aside").publish();
+    assert!(producer.resume().is_none());
+    // then
+    assert_eq!(consumer.receive().expect("honest").expect("published").to_vec(), b"xy");
+}
+
+#[test]
+fn a_message_is_lent_again_until_its_lending_has_ended() {
+    let (mut producer, mut consumer, _rest) = pair(4096, BellKind::Futex);
+    producer.send(b"once").expect("room");
+    std::mem::forget(consumer.receive().expect("honest"));
+    assert_eq!(consumer.receive().expect("honest").expect("not released").to_vec(), b"once");
+    assert!(consumer.receive().expect("honest").is_none());
+}
+
+#[test]
+fn a_message_is_read_in_pieces_and_from_anywhere() {
+    let (mut producer, mut consumer, _rest) = pair(4096, BellKind::Futex);
+    let sent: Vec<u8> = (0..=255).collect();
+    producer.send(&sent).expect("room");
+    let lent = consumer.receive().expect("honest").expect("published");
+    let (mut three, mut rest, mut all) = ([0; 3], Vec::new(), vec![9]);
+    let mut reader = lent.reader();
+    reader.read_exact(&mut three).expect("256 bytes are there");
+    reader.read_to_end(&mut rest).expect("it does not fail");
+    lent.append_to(&mut all);
+    assert_eq!((&three[..], &rest[..]), (&sent[..3], &sent[3..]));
+    assert_eq!((all[0], &all[1..]), (9, &sent[..]));
+    assert_eq!((lent.copy_at(250, &mut [0; 9]), lent.copy_at(256, &mut [0; 9]), lent.len()), (6, 0, 256));
+}
+
+#[test]
+fn a_full_ring_says_what_would_fit_and_no_message_is_longer_than_half_of_it() {
+    let (mut producer, mut consumer, _rest) = pair(4096, BellKind::Futex);
+    assert_eq!((producer.payload_max(), consumer.payload_max()), (2040, 2040));
+    assert_eq!(producer.loan(2041).map(drop), Err(LoanError::TooLong { asked: 2041, max: 2040 }));
+    // given
+    producer.send(&[0; 2040]).expect("an empty ring");
+    producer.send(&[0; 1000]).expect("room");
+    // then
+    assert_eq!(producer.loan(2000).map(drop), Err(LoanError::Full { asked: 2000, free: 1032 }));
+    producer.send(&[0; 1032]).expect("what it said");
+    assert_eq!(producer.loan(0).map(drop), Err(LoanError::Full { asked: 0, free: 0 }));
+    // when
+    drop(consumer.receive().expect("honest").expect("published"));
+    // then
+    producer.send(&[0; 2040]).expect("room again");
+}
+
+#[test]
+fn waiting_ends_at_its_deadline_with_every_bell() {
+    for bell in BELLS {
+        let (mut producer, mut consumer, _rest) = pair(4096, bell);
+        let wait = || Wait::until(Instant::now() + Duration::from_millis(30));
+        let start = Instant::now();
+        assert!(matches!(consumer.receive_before(&wait()), Err(ReceiveError::TimedOut)), "{bell}");
+        assert!(start.elapsed() >= Duration::from_millis(30), "not before: {bell}");
+        producer.send(&[0; 2040]).expect("room");
+        producer.send(&[0; 2040]).expect("room");
+        let start = Instant::now();
+        assert!(matches!(producer.loan_before(1, &wait()), Err(RoomError::TimedOut)), "{bell}");
+        assert!(start.elapsed() >= Duration::from_millis(30), "not before: {bell}");
+        assert!(matches!(producer.loan_before(9999, &wait()), Err(RoomError::TooLong { .. })), "{bell}");
+    }
+}
+
+#[test]
+fn who_sleeps_is_woken_by_a_message_and_by_room_with_every_bell() {
+    for bell in BELLS {
+        let (mut producer, mut consumer, _rest) = pair(4096, bell);
+        let (asleep, was_asleep) = sync_channel(0);
+        let receiving = thread::spawn(move || {
+            for _ in 0..50 {
+                asleep.send(()).expect("the test waits");
+                // Its end is the claim: without a wake this times out.
+                assert_eq!(consumer.receive_before(&soon()).expect("woken").to_vec(), [5; 2040]);
+            }
+        });
+        for _ in 0..50 {
+            was_asleep.recv().expect("the receiver lives");
+            producer.loan_before(2040, &soon()).expect("woken for room").fill(5);
+            producer.send(&[5; 2040]).expect("given back just now");
+        }
+        receiving.join().expect("every wait ended with a message");
+    }
+}
+
+#[test]
+fn a_reactor_is_told_by_a_descriptor_and_never_sleeps_on_a_message() {
+    for bell in [BellKind::EventFd, BellKind::Socket] {
+        let (mut producer, mut consumer, _rest) = pair(4096, bell);
+        let readable = |fd: std::os::fd::BorrowedFd<'_>| {
+            let mut fds = [rustix::event::PollFd::from_borrowed_fd(fd, rustix::event::PollFlags::IN)];
+            rustix::event::poll(&mut fds, Some(&rustix::fs::Timespec { tv_sec: 0, tv_nsec: 0 }))
+                .expect("poll")
+                == 1
+        };
+        // when nobody sleeps, then nothing rings
+        producer.send(b"1").expect("room");
+        assert!(!readable(consumer.fd().expect("it has one")));
+        assert_eq!(consumer.arm().expect("honest"), Armed::Ready);
+        drop(consumer.receive().expect("honest").expect("published"));
+        // when armed, then rung once
+        assert_eq!(consumer.arm().expect("honest"), Armed::Sleep);
+        producer.send(b"2").expect("room");
+        producer.send(b"3").expect("room");
+        assert!(readable(consumer.fd().expect("it has one")), "{bell}");
+        consumer.disarm();
+        assert!(!readable(consumer.fd().expect("it has one")), "{bell}");
+        // the same for room
+        producer.send(&[0; 2000]).expect("room");
+        producer.send(&[0; 1900]).expect("room");
+        assert_eq!(producer.arm(2000).expect("honest"), Armed::Sleep);
+        while consumer.receive().expect("honest").is_some() {}
+        assert!(readable(producer.fd().expect("it has one")), "{bell}");
+        producer.disarm();
+        assert_eq!(producer.arm(2000).expect("honest"), Armed::Ready);
+    }
+    assert!(pair(4096, BellKind::Futex).1.fd().is_none());
+}
+
+#[test]
+fn a_peer_that_is_gone_is_noticed_after_its_last_message() {
+    for bell in BELLS {
+        // given
+        let (mut producer, mut consumer, rest) = pair(4096, bell);
+        let (ours, theirs) = UnixStream::pair().expect("a pair");
+        producer.send(b"last words").expect("room");
+        // when
+        drop((producer, rest, theirs));
+        // then
+        let wait = soon().or_hang_up(HangUp::Socket(ours.as_fd()));
+        assert_eq!(consumer.receive_before(&wait).expect("still there").to_vec(), b"last words");
+        assert!(matches!(consumer.receive_before(&wait), Err(ReceiveError::HungUp)), "{bell}");
+    }
+}
+
+#[test]
+fn an_offer_passes_over_a_socket() {
+    for bell in BELLS {
+        // given
+        let (left, right) = UnixStream::pair().expect("a pair");
+        let (here, offer) = Region::create(Capacity::MIN, bell).expect("a region");
+        offer.send(&left).expect("an empty socket");
+        drop(offer);
+        // when: the other side takes it and answers with its own
+        let taken = Offer::receive(&right).expect("whole").expect("an offer");
+        assert_eq!((taken.capacity(), taken.bell()), (Capacity::MIN, bell));
+        let (there, answer) = Region::create(Capacity::MIN, bell).expect("a region");
+        answer.send(&right).expect("an empty socket");
+        let answer = Offer::receive(&left).expect("whole").expect("an offer");
+        // then
+        let (mut producer, _consumer) = here.connect(answer, &terms()).expect("honest");
+        let (_producer, mut consumer) = there.connect(taken, &terms()).expect("honest");
+        producer.send(b"through").expect("room");
+        assert_eq!(consumer.receive().expect("honest").expect("published").to_vec(), b"through");
+    }
+}
+
+#[test]
+fn what_is_no_whole_offer_is_refused() {
+    use std::io::Write;
+    let (mut left, right) = UnixStream::pair().expect("a pair");
+    left.write_all(b"SINEWSHM").expect("room");
+    assert!(matches!(
+        Offer::receive(&right),
+        Err(PassError::Broken { bytes: 8, descriptors: 0, cut: false })
+    ));
+    left.write_all(&[0; 24]).expect("room");
+    assert!(matches!(Offer::receive(&right), Ok(Err(RefusedOffer::Magic))));
+    let (_region, offer) = Region::create(Capacity::MIN, BellKind::Socket).expect("a region");
+    left.write_all(&offer.to_bytes()).expect("room");
+    let refused = Offer::receive(&right).expect("whole").expect_err("without its descriptors");
+    assert!(matches!(refused, RefusedOffer::Descriptors { got: 0, expected: 3 }), "{refused}");
+    drop(left);
+    assert!(matches!(Offer::receive(&right), Err(PassError::Closed)));
+}
+
+#[test]
+fn terms_bound_what_a_peer_can_ask_for() {
+    // given
+    let region = || Region::create(Capacity::MIN, BellKind::Futex).expect("a region").0;
+    let offer = |capacity, bell| Region::create(capacity, bell).expect("a region").1;
+    let small = Terms { capacity_max: Capacity::MIN, ..Terms::default() };
+    let larger = Capacity::new(8192).expect("a power of two");
+    // when, then
+    let refused = region().connect(offer(larger, BellKind::Futex), &small).expect_err("too large");
+    assert!(matches!(refused, RefusedOffer::TooLarge { offered, .. } if offered == larger));
+    let refused =
+        region().connect(offer(Capacity::MIN, BellKind::EventFd), &small).expect_err("it could block");
+    assert!(matches!(refused, RefusedOffer::Bell(BellKind::EventFd)));
+}
+
+#[test]
+fn a_descriptor_that_is_no_bell_is_refused() {
+    for bell in [BellKind::EventFd, BellKind::Socket] {
+        let (_theirs, offer) = Region::create(Capacity::MIN, bell).expect("a region");
+        let null = || OwnedFd::from(std::fs::File::open("/dev/null").expect("it is there"));
+        let memory = offer.descriptors()[0].try_clone().expect("a descriptor");
+        let forged =
+            Offer::from_parts(&offer.to_bytes(), vec![memory, null(), null()]).expect("it looks like one");
+        let (region, _) = Region::create(Capacity::MIN, bell).expect("a region");
+        let refused = region.connect(forged, &terms()).expect_err("no bell");
+        assert!(matches!(refused, RefusedOffer::NotABell(kind) if kind == bell), "{refused}");
+    }
+}
+
+/// Why [`BellKind::EventFd`] is for trusted peers only. The system's behaviour, not this package's.
+#[test]
+fn an_eventfd_that_a_peer_filled_blocks_its_ringer_and_a_socket_does_not() {
+    use rustix::fs::{OFlags, fcntl_setfl};
+    let (_theirs, offer) = Region::create(Capacity::MIN, BellKind::EventFd).expect("a region");
+    let bell = offer.descriptors()[1].try_clone().expect("a descriptor");
+    fcntl_setfl(&bell, OFlags::empty()).expect("flags are shared by all who have it");
+    rustix::io::write(&bell, &(u64::MAX - 1).to_ne_bytes()).expect("it was empty");
+    let (done, is_done) = sync_channel(1);
+    let shared = bell.try_clone().expect("a descriptor");
+    let ringing = thread::spawn(move || {
+        let written = rustix::io::write(&shared, &1_u64.to_ne_bytes());
+        done.send(written).expect("the test waits");
+    });
+    assert!(is_done.recv_timeout(Duration::from_millis(100)).is_err(), "it blocks");
+    rustix::io::read(&bell, &mut [0; 8]).expect("it was full");
+    assert!(is_done.recv().expect("it goes on").is_ok());
+    ringing.join().expect("no panic");
+    // A socket: never drained, made blocking by the peer, rung ten thousand times.
+    let (mut producer, mut consumer, _rest) = pair(4096, BellKind::Socket);
+    fcntl_setfl(consumer.fd().expect("it has one"), OFlags::empty()).expect("its own end");
+    for _ in 0..10_000 {
+        assert_eq!(consumer.arm().expect("honest"), Armed::Sleep);
+        producer.send(b"!").expect("room");
+        drop(consumer.receive().expect("honest").expect("published"));
+    }
+}
