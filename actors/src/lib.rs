@@ -51,7 +51,7 @@ pub use node::{Node, NodeBuilder, NodeEnd, NodeHandle, StartError, Traffic};
 pub use outlet::OutletCounts;
 pub use serde;
 pub use sinew_runtime::{
-    app::{AppContext, AppSpec, Away, Delivery, LastWill, Raw, Silence},
+    app::{AppContext, AppSpec, Away, Delivery, LastWill, Raw, RequirementEvent, RequirementPolicy, Silence},
     outcome::{Outcome, Rejection},
     schedule::{Tick, TimerId},
     sender::{AskError, Confirmation, Destination, Reply, SendError, Sender},
@@ -61,7 +61,7 @@ pub use sinew_runtime::{
     wire::{Class, Kind, MessageBuffer, Payload},
 };
 pub use stores::ClockOffset;
-pub use sync::{DirectoryEntry, RequirementEvent, Waiting};
+pub use sync::{DirectoryEntry, Waiting};
 
 /// Everything that an ordinary program needs, in one line: `use sinew::prelude::*;`
 pub mod prelude {
@@ -71,8 +71,8 @@ pub mod prelude {
 
     pub use crate::{
         AppAddress, AppContext, AppSpec, Away, Class, Delivery, LastWill, Node, NodeAddress, NodeBuilder,
-        NodeConfig, NodeEvent, Outcome, Payload, Place, RequirementEvent, Restart, Silence, StartError, Tick,
-        Tid, Time, payload,
+        NodeConfig, NodeEvent, Outcome, Payload, Place, RequirementEvent, RequirementPolicy, Restart,
+        Silence, StartError, Tick, Tid, Time, payload,
     };
 }
 

@@ -94,6 +94,21 @@ impl<T> Schedule<T> {
         Some(Due { action, tick, id, entry: (scheduled, period) })
     }
 
+    /// Periodic entries that are due by `now` are next due after it, on their grid: the turns between are neither made up
+    /// for nor counted as missed. Entries that are due once stay due.
+    pub fn skip_to(&mut self, now: Time) {
+        let is_late = |at: &Time, entry: &Entry<T>| *at <= now && entry.period.is_some();
+        let late: Vec<_> =
+            self.entries.iter().filter(|((at, _), entry)| is_late(at, entry)).map(|(key, _)| *key).collect();
+        for (at, id) in late {
+            let Some(entry) = self.entries.remove(&(at, id)) else { continue };
+            let period = entry.period.unwrap_or_default();
+            let turns = now.since(at).as_nanos() / period.as_nanos().max(1) + 1;
+            let next = at + period * u32::try_from(turns).unwrap_or(u32::MAX);
+            self.entries.insert((next, id), entry);
+        }
+    }
+
     /// Puts a periodic entry back for its next turn, on the grid of its period: missed turns are skipped, not made up
     /// for in a burst. An entry that was due once is dropped.
     pub fn put_back(&mut self, due: Due<T>) {
@@ -134,6 +149,19 @@ mod tests {
         schedule.put_back(due);
         assert_eq!(schedule.next_due(), Some(us(5_000)));
         assert!(schedule.take_due(us(4_999)).is_none());
+    }
+
+    #[test]
+    fn after_a_pause_periods_go_on_on_their_grid_and_single_entries_are_due() {
+        let mut schedule = Schedule::default();
+        schedule.every(us(1_000), Duration::from_micros(1_000), 'p');
+        schedule.once(us(1_500), 'o');
+        schedule.skip_to(us(4_500));
+        let due = schedule.take_due(us(4_500)).unwrap();
+        assert_eq!((due.action, due.tick.lateness), ('o', Duration::from_micros(3_000)));
+        assert!(schedule.take_due(us(4_999)).is_none());
+        let due = schedule.take_due(us(5_000)).unwrap();
+        assert_eq!((due.action, due.tick.missed, due.tick.number), ('p', 0, 1));
     }
 
     #[test]

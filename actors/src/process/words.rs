@@ -72,7 +72,7 @@ pub(super) enum Ending {
 impl From<&Reason> for Ending {
     fn from(reason: &Reason) -> Self {
         match reason {
-            Reason::Normal | Reason::Shutdown => Self::Normal,
+            Reason::Normal | Reason::Shutdown | Reason::RequirementLost(_) => Self::Normal,
             Reason::Panic(said) => Self::Panic(said.clone()),
             other @ (Reason::StartTimeout
             | Reason::Hung(_)

@@ -5,6 +5,7 @@ use std::sync::{Arc, MutexGuard, PoisonError};
 use actix::{Actor, ActorContext, AsyncContext, Context, SpawnHandle, StreamHandler};
 use bytes::Bytes;
 use sinew_runtime::{
+    app::RequirementEvent,
     outcome::{Outcome, Rejection},
     post::Post,
     router::{LocalRoute, Outlet, Refused},
@@ -15,7 +16,7 @@ use sinew_runtime::{
 };
 
 use super::{
-    Event, RequirementEvent,
+    Event,
     core::{Core, Input, Output},
 };
 use crate::{lncl::AppFact, node::RootEvent, refusals::Refusals, stores::Stores};

@@ -10,6 +10,7 @@ use actix::Actor;
 use bytes::Bytes;
 use futures_util::StreamExt;
 use sinew_runtime::{
+    app::RequirementEvent,
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     post::{Post, PostStream},
     router::{LocalRoute, Outlet, Refused},
@@ -19,7 +20,7 @@ use sinew_runtime::{
 };
 
 use super::{
-    Event, RequirementEvent, SyncManager,
+    Event, SyncManager,
     list::{Entry, List, Name},
 };
 use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, node::RootEvent, stores::Stores};

@@ -2,42 +2,7 @@
 
 use std::{fmt, time::Duration};
 
-use serde::{Deserialize, Serialize};
-use sinew_runtime::{
-    tid::Tid,
-    wire::{Class, Payload},
-};
-
-/// A requirement changed. Applications that require something and handle this payload get it from their node's sync
-/// manager.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub enum RequirementEvent {
-    /// What this application requires is not ready any more.
-    Lost {
-        /// The name that it requires.
-        name: String,
-    },
-    /// It is ready again.
-    Met {
-        /// The name that it requires.
-        name: String,
-    },
-}
-
-impl RequirementEvent {
-    /// The name that is lost or met.
-    #[must_use]
-    pub fn name(&self) -> &str {
-        match self {
-            Self::Lost { name } | Self::Met { name } => name,
-        }
-    }
-}
-
-impl Payload for RequirementEvent {
-    const NAME: &'static str = "sinew.requirement_event";
-    const CLASS: Class = Class::Control;
-}
+use sinew_runtime::tid::Tid;
 
 /// An application that waits at the start-up barrier.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -25,7 +25,7 @@ mod list;
 
 pub(crate) use actor::SyncManager;
 pub(crate) use core::Core;
-pub use facts::{DirectoryEntry, RequirementEvent, Waiting};
+pub use facts::{DirectoryEntry, Waiting};
 pub(crate) use list::NAME_BYTES_MAX;
 
 use sinew_runtime::wire::Message;

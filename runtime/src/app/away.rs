@@ -165,6 +165,7 @@ impl Absence {
     pub fn begins(&self, reason: &Reason) {
         // SYNC: Relaxed; begins, ends and the timer between them run on one thread.
         let turn = self.turn.fetch_add(1, Ordering::Relaxed) + 1;
+        self.mailbox.forget_events();
         match self.away {
             Away::Hold => {}
             Away::Drop => self.mailbox.refuse_while_away(),

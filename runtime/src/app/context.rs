@@ -212,6 +212,15 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         id
     }
 
+    /// A pause from `since` until `now` is over: periods go on on their grid, and input watchdogs count as if it had not
+    /// been.
+    pub(super) fn resume(&mut self, since: Time, now: Time) {
+        self.schedule.skip_to(now);
+        for watch in &mut self.watches {
+            watch.last = watch.last + now.since(since);
+        }
+    }
+
     /// Keeps this application from being ready until the gate that is returned is reached: for one that has to
     /// calibrate first. `None` if it is ready already; call it in `started`.
     pub fn hold_ready(&mut self) -> Option<ReadyGate> {

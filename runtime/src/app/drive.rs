@@ -11,7 +11,12 @@ use std::{
 use actix::{Actor, ActorContext, ActorFuture, Handler};
 
 use crate::{
-    app::{AppContext, Delivery, Raw, Silence, WatchId, alarm::Alarm, context::Action},
+    app::{
+        AppContext, Delivery, Raw, Silence, WatchId,
+        alarm::Alarm,
+        context::Action,
+        requirement::{Requirements, event_in},
+    },
     mailbox::MailboxReader,
     outcome::{Outcome, Rejection},
     schedule::Due,
@@ -65,6 +70,7 @@ where
 pub(super) struct Drive<A: Actor<Context = AppContext<A>>> {
     reader: MailboxReader,
     handlers: Vec<(Kind, Dispatch<A>)>,
+    requirements: Requirements<A>,
     alarm: Option<Alarm>,
     /// A timer had the last step: a waiting message has the next one, so that a handler that overruns its period does not
     /// shut the mailbox out.
@@ -72,13 +78,20 @@ pub(super) struct Drive<A: Actor<Context = AppContext<A>>> {
 }
 
 impl<A: Actor<Context = AppContext<A>>> Drive<A> {
-    pub(super) const fn new(reader: MailboxReader, handlers: Vec<(Kind, Dispatch<A>)>) -> Self {
-        Self { reader, handlers, alarm: None, timer_was_last: false }
+    pub(super) const fn new(
+        reader: MailboxReader,
+        handlers: Vec<(Kind, Dispatch<A>)>,
+        requirements: Requirements<A>,
+    ) -> Self {
+        Self { reader, handlers, requirements, alarm: None, timer_was_last: false }
     }
 
     /// One turn's step. `Ready(true)`: there may be more to do; `Ready(false)`: the application is to end.
     fn step(&mut self, actor: &mut A, context: &mut AppContext<A>, task: &mut Context<'_>) -> Poll<bool> {
         let now = Time::now();
+        if self.requirements.is_paused() {
+            return self.step_paused(actor, context, task, now);
+        }
         if !std::mem::replace(&mut self.timer_was_last, false)
             && let Some(due) = context.schedule.take_due(now)
         {
@@ -100,6 +113,23 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         }
     }
 
+    /// The same in a pause: nothing but the layers' events.
+    fn step_paused(
+        &mut self,
+        actor: &mut A,
+        context: &mut AppContext<A>,
+        task: &mut Context<'_>,
+        now: Time,
+    ) -> Poll<bool> {
+        self.reader.poll_event(task).map(|event| match event {
+            Some(event) => {
+                self.handle(actor, context, event, now);
+                true
+            }
+            None => false,
+        })
+    }
+
     fn handle(&mut self, actor: &mut A, context: &mut AppContext<A>, mut message: Message, now: Time) {
         let outcome = if message.header.is_expired(now) {
             Outcome::Expired
@@ -110,10 +140,24 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         message.settle(outcome);
     }
 
-    fn dispatch(&self, actor: &mut A, context: &mut AppContext<A>, message: &Message, now: Time) -> Outcome {
+    fn dispatch(
+        &mut self,
+        actor: &mut A,
+        context: &mut AppContext<A>,
+        message: &Message,
+        now: Time,
+    ) -> Outcome {
+        let event = event_in(context, message);
+        if let Some(event) = &event
+            && !self.requirements.take(actor, context, event, now)
+        {
+            return Outcome::Delivered;
+        }
         let handler = self.handlers.iter().find(|(kind, _)| *kind == message.header.kind);
         let Some((_, dispatch)) = handler else {
-            return Outcome::Rejected(Rejection::UnknownKind);
+            // An event that nobody handles has served its policy.
+            let served = event.map(|_| Outcome::Delivered);
+            return served.unwrap_or(Outcome::Rejected(Rejection::UnknownKind));
         };
         context.verdict = None;
         #[cfg(feature = "fault-points")]

@@ -9,9 +9,11 @@ mod away;
 mod context;
 mod delivery;
 mod drive;
+mod requirement;
 mod spec;
 
 pub use away::{Absence, Away, Heir, LastWill, WILLS_MAX, Will};
 pub use context::{AppContext, Silence, WatchId};
 pub use delivery::{Delivery, Raw};
+pub use requirement::{RequirementEvent, RequirementPolicy};
 pub use spec::{AppSpec, AppWiring, DynApp};

@@ -6,8 +6,9 @@ use actix::{Actor, AsyncContext, Handler};
 
 use crate::{
     app::{
-        Absence, AppContext, Away, Delivery, Raw, WILLS_MAX, Will,
+        Absence, AppContext, Away, Delivery, Raw, RequirementEvent, RequirementPolicy, WILLS_MAX, Will,
         drive::{Dispatch, Drive, dispatch_raw, dispatch_typed},
+        requirement::{Parting, PartingLife, Requirements, SafeState},
     },
     mailbox::Mailbox,
     sender::Sender,
@@ -46,6 +47,7 @@ pub struct AppSpec<A: Actor<Context = AppContext<A>>> {
     factory: Arc<dyn Fn() -> A + Send + Sync>,
     handlers: Vec<(Kind, Dispatch<A>)>,
     pub(super) common: Common,
+    pub(super) safe_state: Option<SafeState<A>>,
 }
 
 #[derive(Clone)]
@@ -58,6 +60,8 @@ pub(super) struct Common {
     place: Place,
     pub(super) away: Away,
     pub(super) wills: Vec<Will>,
+    pub(super) on_lost: RequirementPolicy,
+    has_safe_state: bool,
     #[cfg(feature = "fault-points")]
     faults: Vec<crate::supervision::fault::Fault>,
 }
@@ -75,10 +79,12 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
             place: Place::thread("apps"),
             away: Away::default(),
             wills: Vec::new(),
+            on_lost: RequirementPolicy::default(),
+            has_safe_state: false,
             #[cfg(feature = "fault-points")]
             faults: Vec::new(),
         };
-        Self { factory: Arc::new(factory), handlers: Vec::new(), common }
+        Self { factory: Arc::new(factory), handlers: Vec::new(), common, safe_state: None }
     }
 
     /// It handles payloads of type `P`. Layers' events are payloads too: to handle `NodeEvent` is to subscribe to it.
@@ -177,6 +183,16 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     }
 }
 
+impl Common {
+    /// Subscribes it to what its policy needs to know.
+    fn hear_of_requirements(&mut self) {
+        let told = (RequirementEvent::KIND, RequirementEvent::NAME);
+        if self.on_lost != RequirementPolicy::CarryOn && !self.kinds.contains(&told) {
+            self.kinds.push(told);
+        }
+    }
+}
+
 /// An [`AppSpec`] whose actor type is no longer named: what a node keeps.
 pub struct DynApp {
     common: Common,
@@ -194,15 +210,20 @@ pub struct AppWiring {
 
 impl<A: Actor<Context = AppContext<A>>> From<AppSpec<A>> for DynApp {
     fn from(spec: AppSpec<A>) -> Self {
-        let AppSpec { factory, handlers, common } = spec;
+        let AppSpec { factory, handlers, mut common, safe_state } = spec;
+        let on_lost = common.on_lost;
+        common.hear_of_requirements();
+        common.has_safe_state = safe_state.is_some();
         let wire = move |wiring: AppWiring| {
-            let (factory, handlers) = (factory.clone(), handlers.clone());
+            let (factory, handlers, safe_state) = (factory.clone(), handlers.clone(), safe_state.clone());
             let launch: Launch = Arc::new(move |ready| {
                 let actor = factory();
-                let drive = Drive::new(wiring.mailbox.attach(), handlers.clone());
+                let parting = Parting::default();
+                let requirements = Requirements::new(on_lost, safe_state.clone(), parting.clone());
+                let drive = Drive::new(wiring.mailbox.attach(), handlers.clone(), requirements);
                 let mut running = AppContext::into_life(wiring.sender.clone(), ready, actor);
                 running.ctx().spawn(drive);
-                life(running)
+                Box::new(PartingLife { life: life(running), parting })
             });
             launch
         };
@@ -263,9 +284,23 @@ impl DynApp {
     /// What is wrong with its declaration, in words.
     #[must_use]
     pub fn fault(&self) -> Option<String> {
-        let wills = self.common.wills.len();
-        (wills > WILLS_MAX)
-            .then(|| format!("{wills} last wills are more than the {WILLS_MAX} that it may have"))
+        let Common { wills, on_lost, has_safe_state, place, .. } = &self.common;
+        if wills.len() > WILLS_MAX {
+            let wills = wills.len();
+            return Some(format!("{wills} last wills are more than the {WILLS_MAX} that it may have"));
+        }
+        match on_lost {
+            RequirementPolicy::SafeState if !has_safe_state => {
+                Some("it goes to its safe state and has none; declare it with `safe_state`".to_owned())
+            }
+            RequirementPolicy::Pause | RequirementPolicy::Restart if place.own_process => Some(format!(
+                "`RequirementPolicy::{on_lost:?}` is not there for an application in a process of its own"
+            )),
+            RequirementPolicy::CarryOn
+            | RequirementPolicy::Pause
+            | RequirementPolicy::SafeState
+            | RequirementPolicy::Restart => None,
+        }
     }
 
     /// What its node keeps for the time that it is away.

@@ -32,7 +32,7 @@ impl Lender {
     #[must_use]
     pub fn take(&self) -> Option<Message> {
         let mut shared = lock(&self.mailbox.shared);
-        if shared.epoch == self.epoch { shared.queue.pop() } else { None }
+        if shared.epoch == self.epoch { shared.next() } else { None }
     }
 
     /// A lent message of this class has ended so.
@@ -52,7 +52,7 @@ impl Lender {
             let mut shared = lock(&self.mailbox.shared);
             for message in lent.into_iter().rev() {
                 let class = message.header.class as usize;
-                if shared.closed {
+                if shared.closed || shared.refuses {
                     shared.tallies[class].rejected += 1;
                     refused.push(message);
                 } else if shared.queue.put_back(message).is_some() {
@@ -63,8 +63,9 @@ impl Lender {
             shared.waker.take()
         };
         // Told outside the lock, so that nobody who is told runs into it.
+        let why = if self.mailbox.is_closed() { Rejection::Closed } else { Rejection::Away };
         for message in refused {
-            message.reject(Rejection::Closed);
+            message.reject(why);
         }
         waker.into_iter().for_each(Waker::wake);
     }

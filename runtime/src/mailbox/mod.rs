@@ -9,6 +9,7 @@ mod queue;
 mod source;
 
 use std::{
+    collections::VecDeque,
     sync::{Arc, Mutex},
     task::{Context, Poll, Waker},
 };
@@ -22,7 +23,7 @@ use crate::{
     post::lock,
     router::{Outlet, Refused},
     time::Time,
-    wire::{Class, Message},
+    wire::{Class, Header, Message},
 };
 
 /// What became of the messages of one class: `taken = delivered + superseded + rejected + expired + failed + waiting`,
@@ -73,6 +74,11 @@ pub struct Mailbox {
 #[derive(Debug)]
 struct Shared {
     queue: ClassQueue,
+    /// What this node's layers say: ahead of everything else.
+    events: VecDeque<Message>,
+    capacity: usize,
+    /// The reader takes nothing but events, and is not woken for anything else.
+    paused: bool,
     waker: Option<Waker>,
     /// Which reader is the present one.
     epoch: u64,
@@ -86,11 +92,41 @@ struct Shared {
 impl Shared {
     /// Takes out everything that waits, to be refused.
     fn empty(&mut self) -> Vec<Message> {
-        let waiting: Vec<_> = self.queue.drain_all().collect();
+        let waiting = self.queue.drain_all().collect();
+        self.rejected(waiting)
+    }
+
+    /// Takes out every event.
+    fn take_events(&mut self) -> Vec<Message> {
+        let events = std::mem::take(&mut self.events);
+        self.rejected(events.into())
+    }
+
+    fn rejected(&mut self, waiting: Vec<Message>) -> Vec<Message> {
         for message in &waiting {
             self.tallies[message.header.class as usize].rejected += 1;
         }
         waiting
+    }
+
+    fn next(&mut self) -> Option<Message> {
+        self.events.pop_front().or_else(|| self.queue.pop())
+    }
+
+    fn waiting(&self) -> usize {
+        self.events.len() + self.queue.len()
+    }
+
+    fn submit_event(&mut self, event: Message) -> Result<Option<Waker>, Refused> {
+        let tally = &mut self.tallies[event.header.class as usize];
+        if self.events.len() >= self.capacity {
+            tally.refused += 1;
+            return Err(Refused::new(event, Rejection::QueueFull));
+        }
+        tally.taken += 1;
+        self.events.push_back(event);
+        self.high_water = self.high_water.max(self.waiting());
+        Ok(self.waker.take())
     }
 
     fn expire(&mut self, now: Time) -> Vec<Message> {
@@ -118,6 +154,9 @@ impl Mailbox {
     fn with_source(capacity: usize, source: Option<Arc<dyn Source>>) -> Self {
         let shared = Shared {
             queue: ClassQueue::new(capacity),
+            events: VecDeque::new(),
+            capacity,
+            paused: false,
             waker: None,
             epoch: 0,
             closed: false,
@@ -134,6 +173,7 @@ impl Mailbox {
         let (epoch, former) = {
             let mut shared = lock(&self.shared);
             shared.epoch += 1;
+            shared.paused = false;
             (shared.epoch, shared.waker.take())
         };
         if let Some(waker) = former {
@@ -147,7 +187,9 @@ impl Mailbox {
         let (waiting, waker) = {
             let mut shared = lock(&self.shared);
             shared.closed = true;
-            (shared.empty(), shared.waker.take())
+            let mut waiting = shared.take_events();
+            waiting.extend(shared.empty());
+            (waiting, shared.waker.take())
         };
         for message in waiting {
             message.reject(Rejection::Closed);
@@ -169,15 +211,27 @@ impl Mailbox {
         }
     }
 
+    /// Drops the layers' events that wait: the life that they were for has ended.
+    pub fn forget_events(&self) {
+        let events = lock(&self.shared).take_events();
+        for event in events {
+            event.reject(Rejection::Away);
+        }
+    }
+
     /// The application is ready again.
     pub fn is_back(&self) {
         lock(&self.shared).refuses = false;
     }
 
+    fn is_closed(&self) -> bool {
+        lock(&self.shared).closed
+    }
+
     /// Messages that wait now.
     #[must_use]
     pub fn depth(&self) -> usize {
-        lock(&self.shared).queue.len()
+        lock(&self.shared).waiting()
     }
 
     /// The most messages that ever waited at once.
@@ -197,11 +251,18 @@ impl Outlet for Mailbox {
     fn submit(&self, message: Message) -> Result<(), Refused> {
         let class = message.header.class as usize;
         let mut expired = Vec::new();
+        let is_event = is_event(&message.header);
         let taken = {
             let mut shared = lock(&self.shared);
             if shared.closed {
                 shared.tallies[class].refused += 1;
                 return Err(Refused::new(message, Rejection::Closed));
+            }
+            if is_event {
+                let waker = shared.submit_event(message)?;
+                drop(shared);
+                waker.into_iter().for_each(Waker::wake);
+                return Ok(());
             }
             if shared.refuses {
                 shared.tallies[class].refused += 1;
@@ -220,8 +281,8 @@ impl Outlet for Mailbox {
                 Ok(superseded) => {
                     shared.tallies[class].taken += 1;
                     shared.tallies[class].superseded += u64::from(superseded.is_some());
-                    shared.high_water = shared.high_water.max(shared.queue.len());
-                    Ok(shared.waker.take())
+                    shared.high_water = shared.high_water.max(shared.waiting());
+                    Ok(if shared.paused { None } else { shared.waker.take() })
                 }
                 Err(refused) => {
                     shared.tallies[class].refused += 1;
@@ -235,6 +296,11 @@ impl Outlet for Mailbox {
         }
         taken.map(|waker| waker.into_iter().for_each(Waker::wake))
     }
+}
+
+/// Whether one of the node's own layers says something to an application of it: who is there, what it requires, who died.
+fn is_event(header: &Header) -> bool {
+    header.source.app.is_layer() && header.source.node == header.destination.node && header.kind.is_user()
 }
 
 /// The reading end of a [`Mailbox`], owned by one incarnation of an actor.
@@ -263,13 +329,35 @@ impl MailboxReader {
         if shared.epoch != self.epoch {
             return Poll::Ready(None);
         }
-        if let Some(message) = shared.queue.pop() {
+        shared.paused = false;
+        if let Some(message) = shared.next() {
             self.in_hand = Some(message.header.class);
             return Poll::Ready(Some(message));
         }
         if shared.closed {
             return Poll::Ready(None);
         }
+        shared.waker = Some(cx.waker().clone());
+        Poll::Pending
+    }
+
+    /// The same for the layers' events alone; everything else is left where it is.
+    pub fn poll_event(&mut self, cx: &mut Context<'_>) -> Poll<Option<Message>> {
+        let mut shared = lock(&self.mailbox.shared);
+        if let Some((class, outcome)) = self.finished.take() {
+            shared.tallies[class as usize].count(outcome);
+        }
+        if shared.epoch != self.epoch {
+            return Poll::Ready(None);
+        }
+        if let Some(event) = shared.events.pop_front() {
+            self.in_hand = Some(event.header.class);
+            return Poll::Ready(Some(event));
+        }
+        if shared.closed {
+            return Poll::Ready(None);
+        }
+        shared.paused = true;
         shared.waker = Some(cx.waker().clone());
         Poll::Pending
     }
@@ -353,6 +441,22 @@ mod tests {
         assert_eq!(mailbox.submit(message()).unwrap_err().why, Rejection::QueueFull);
         let tally = mailbox.tally(Class::Control);
         assert_eq!((tally.taken, tally.expired, tally.refused, tally.open()), (2, 1, 1, 1));
+    }
+
+    #[test]
+    fn the_layers_events_go_ahead_of_everything_and_alone_in_a_pause() {
+        let mailbox = Mailbox::new(8);
+        let mut event = message();
+        event.header.source = Tid::new(Tid::NONE.node, crate::tid::AppAddress::SYNC);
+        let (kind, source) = (event.header.kind, event.header.source);
+        mailbox.submit(message()).unwrap();
+        mailbox.submit(event).unwrap();
+        let mut reader = mailbox.attach();
+        let mut poll_event = || reader.poll_event(&mut Context::from_waker(&noop_waker()));
+        let Poll::Ready(Some(first)) = poll_event() else { panic!("the event") };
+        assert_eq!((first.header.kind, first.header.source), (kind, source));
+        assert!(poll_event().is_pending());
+        assert!(matches!(take(&mut reader), Poll::Ready(Some(_))));
     }
 
     #[test]

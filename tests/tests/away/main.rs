@@ -1,4 +1,5 @@
 //! What others learn of a death, and what happens meanwhile. One binary, one module a theme.
 
 mod absence;
+mod requirements;
 mod wills;

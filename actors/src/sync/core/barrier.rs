@@ -5,10 +5,10 @@ use std::{
     time::Duration,
 };
 
-use sinew_runtime::{tid::AppAddress, time::Time};
+use sinew_runtime::{app::RequirementEvent, tid::AppAddress, time::Time};
 
 use super::{Core, Output, apps::State, cycles::Graph, reason::Reason};
-use crate::sync::facts::{RequirementEvent, Waiting};
+use crate::sync::facts::Waiting;
 
 /// Time until an output that was not taken is offered again.
 pub(super) const RETRY: Duration = Duration::from_millis(10);

@@ -21,6 +21,7 @@ use std::{
 
 use bytes::Bytes;
 use sinew_runtime::{
+    app::RequirementEvent,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
 };
@@ -31,7 +32,7 @@ use self::{
     reason::Reason,
 };
 use super::{
-    facts::{DirectoryEntry, RequirementEvent, Waiting},
+    facts::{DirectoryEntry, Waiting},
     list::{ENTRIES_MAX, List},
 };
 use crate::{
@@ -252,8 +253,8 @@ impl Core {
         if let Some(app) = self.apps.get_mut(address)
             && app.wait().is_none()
         {
+            // What it was told is lost stays so: an event may still be on its way, and its next life has to hear the end of it.
             (app.state, app.failed) = (State::Waiting(wait), true);
-            app.lost.clear();
             self.forget_not_taken(address);
             self.own_list_changed(now);
         }

@@ -166,6 +166,20 @@ fn a_running_application_hears_once_of_a_lost_node_and_once_of_its_return() {
 
 // spec: SYNC-8
 #[test]
+fn an_application_that_failed_with_a_requirement_lost_is_told_in_its_next_life_that_it_is_met() {
+    let mut bench = Bench::new();
+    bench.registers(0, "gait", &["sensor"]);
+    bench.registers(1, "sensor", &[]);
+    bench.ready(1);
+    bench.ready(0);
+    bench.down(1);
+    assert_eq!(bench.down(0), []);
+    assert_eq!(bench.ready(1), [release(0)]);
+    assert_eq!(bench.ready(0), [met(0, "sensor")]);
+}
+
+// spec: SYNC-8
+#[test]
 fn what_a_full_mailbox_did_not_take_is_offered_again_in_its_last_form() {
     let mut bench = Bench::new();
     bench.registers(0, "gait", &["sensor"]);

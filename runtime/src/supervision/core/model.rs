@@ -99,6 +99,7 @@ fn is_restarted(restart: Restart, reason: &Reason) -> bool {
             | Reason::Killed
             | Reason::ThreadEnded
             | Reason::ProcessEnded(_)
+            | Reason::RequirementLost(_)
             | Reason::GaveUp(_),
         ) => true,
     }
@@ -267,6 +268,11 @@ impl Model {
         if let Some(fate) = child.fate.take() {
             return self.exit_as_ordered(index, fate, reason);
         }
+        if let Reason::RequirementLost(_) = reason {
+            // Sinew: it did not fail, and waits for its release again.
+            child.pid = Pid::Due;
+            return self.say(Order::Failed(id, reason.clone()));
+        }
         child.pid = Pid::Undefined;
         if is_restarted(restart, reason) {
             self.say(Order::Failed(id, reason.clone()));
@@ -323,6 +329,7 @@ impl Model {
             | Reason::Hung(_)
             | Reason::Killed
             | Reason::ProcessEnded(_)
+            | Reason::RequirementLost(_)
             | Reason::GaveUp(_) => (&mut self.counted, intensity.restarts_max),
         };
         times.push(now);

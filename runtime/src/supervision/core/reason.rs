@@ -19,6 +19,8 @@ pub enum Reason {
     ThreadEnded,
     /// The process that it was ended; its exit code or the signal, in words.
     ProcessEnded(String),
+    /// It stopped in order because it lost what it requires, to be started again when that is there; the name.
+    RequirementLost(String),
     /// A supervisor gave up; why.
     GaveUp(String),
 }
@@ -27,7 +29,7 @@ impl Reason {
     /// Whether this counts as a failure.
     #[must_use]
     pub const fn is_failure(&self) -> bool {
-        !matches!(self, Self::Normal | Self::Shutdown)
+        !matches!(self, Self::Normal | Self::Shutdown | Self::RequirementLost(_))
     }
 }
 
@@ -42,6 +44,7 @@ impl std::fmt::Display for Reason {
             Self::Killed => f.write_str("did not stop in its time"),
             Self::ThreadEnded => f.write_str("lost its thread"),
             Self::ProcessEnded(how) => write!(f, "its process ended: {how}"),
+            Self::RequirementLost(name) => write!(f, "stopped because it lost what it requires: {name}"),
             Self::GaveUp(why) => f.write_str(why),
         }
     }

@@ -51,6 +51,11 @@ impl Core {
 
     fn ended_by_itself(&mut self, now: Time, index: usize, reason: Reason) {
         let child = &mut self.children[index];
+        if let Reason::RequirementLost(_) = reason {
+            // It waits to be released again, whatever its restart type: it did not fail, and has not done its work.
+            self.orders.push_back(Order::Failed(child.id, reason));
+            return;
+        }
         let again = match child.policy.restart {
             Restart::Permanent => true,
             Restart::Transient => reason.is_failure(),

@@ -290,6 +290,7 @@ fn any_reason(chance: &mut Chance) -> Reason {
         2 => Reason::Shutdown,
         3 => Reason::ThreadEnded,
         4 => Reason::ProcessEnded(String::new()),
+        5 => Reason::RequirementLost(String::new()),
         _ => Reason::Panic(String::new()),
     }
 }
