@@ -13,6 +13,8 @@ use std::{
 
 use futures_util::Stream;
 
+use crate::supervision::vitals::Vitals;
+
 /// Locks a mutex whose data are valid at every instant that a panic can strike.
 ///
 /// All of this crate's lock sections leave their data whole before they call anything that may panic.
@@ -67,8 +69,12 @@ impl<E> Post<E> {
     /// Posts an event.
     ///
     /// # Errors
-    /// The event itself, if the post is full. It is counted.
+    /// The event itself, if the post is full (it is counted), or if the actor that posts it was replaced.
     pub fn post(&self, event: E) -> Result<(), E> {
+        if Vitals::is_present_over() {
+            // A layer that was replaced has nothing more to say.
+            return Err(event);
+        }
         let waker = {
             let mut shared = lock(&self.shared);
             if shared.queue.len() >= shared.capacity {
@@ -118,7 +124,7 @@ impl<E> Post<E> {
         if dropped.is_some() {
             tracing::error!("an event on which two readers failed is dropped");
         }
-        PostStream { shared: self.shared.clone(), epoch, keep }
+        PostStream { shared: self.shared.clone(), epoch, keep, reader: Vitals::present() }
     }
 }
 
@@ -153,12 +159,20 @@ pub struct PostStream<E> {
     shared: Arc<Mutex<Shared<E>>>,
     epoch: u64,
     keep: Option<fn(&E) -> E>,
+    /// The incarnation that reads it.
+    reader: Option<Arc<Vitals>>,
 }
 
 impl<E> Stream for PostStream<E> {
     type Item = E;
 
     fn poll_next(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<E>> {
+        if let Some(reader) = &self.reader
+            && reader.is_over()
+        {
+            // Hung, and replaced meanwhile: what waits here is for its successor.
+            reader.leave();
+        }
         let mut shared = lock(&self.shared);
         if shared.epoch != self.epoch {
             return Poll::Ready(None);

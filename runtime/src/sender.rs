@@ -17,6 +17,7 @@ use crate::{
     outcome::{Outcome, Receipt, Rejection, Ticket},
     pending::{Awaited, Pending, Settlement, Wait},
     router::Router,
+    supervision::vitals::Vitals,
     tid::{AppAddress, Tid},
     time::Time,
     wire::{Class, DecodeError, Flags, Header, Kind, Message, MessageBuffer, Payload},
@@ -63,6 +64,9 @@ pub enum SendError {
     /// Nobody took the message.
     #[error("{0}")]
     Rejected(#[from] Rejection),
+    /// The sender was replaced: its application hung, or did not stop in its time. A later life speaks for this TID.
+    #[error("this life of the application is over; a later one speaks for it")]
+    Over,
     /// Too many confirmed messages and requests wait for their end.
     #[error("too many confirmed messages and requests are under way; wait for some to end")]
     TooManyWaits,
@@ -87,7 +91,11 @@ pub enum AskError {
 
 /// The sending side of one TID. Clones share it; any thread may use it.
 #[derive(Clone)]
-pub struct Sender(Arc<Shared>);
+pub struct Sender {
+    shared: Arc<Shared>,
+    /// The life of the application that sends with this; `None` where nobody takes lives.
+    life: Option<Arc<Vitals>>,
+}
 
 struct Shared {
     tid: Tid,
@@ -100,7 +108,7 @@ struct Shared {
 
 impl std::fmt::Debug for Sender {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "Sender({})", self.0.tid)
+        write!(f, "Sender({})", self.shared.tid)
     }
 }
 
@@ -114,36 +122,54 @@ impl Sender {
         pending: Arc<Pending>,
         payload_max: usize,
     ) -> Self {
-        Self(Arc::new(Shared { tid, router, directory, pending, sequence: AtomicU64::new(0), payload_max }))
+        let sequence = AtomicU64::new(0);
+        let shared = Arc::new(Shared { tid, router, directory, pending, sequence, payload_max });
+        Self { shared, life: None }
+    }
+
+    /// The same sending side for one life of its application: with that, it is over.
+    #[must_use]
+    pub(crate) fn in_life(&self, life: Arc<Vitals>) -> Self {
+        Self { shared: self.shared.clone(), life: Some(life) }
+    }
+
+    fn is_over(&self) -> bool {
+        self.life.as_ref().is_some_and(|life| life.is_over())
     }
 
     /// Counts its messages on from the `last` that a former sending side of this TID sent.
     #[must_use]
     pub fn counting_on_from(self, last: u64) -> Self {
-        self.0.sequence.store(last, Ordering::Relaxed);
+        self.shared.sequence.store(last, Ordering::Relaxed);
         self
     }
 
     /// The TID that this sends from.
     #[must_use]
     pub fn tid(&self) -> Tid {
-        self.0.tid
+        self.shared.tid
     }
 
     /// The TID that has `name` now, on any node.
     #[must_use]
     pub fn resolve(&self, name: &str) -> Option<Tid> {
-        self.0.directory.resolve(name)
+        self.shared.directory.resolve(name)
     }
 
     /// Makes this application a member of the group called `name`: what is sent to [`Tid::group`] reaches it.
     pub fn join(&self, name: &str) {
-        self.0.directory.set_member(self.0.tid.app, AppAddress::group(name), true);
+        self.set_member(name, true);
     }
 
     /// Ends the membership.
     pub fn leave(&self, name: &str) {
-        self.0.directory.set_member(self.0.tid.app, AppAddress::group(name), false);
+        self.set_member(name, false);
+    }
+
+    fn set_member(&self, name: &str, member: bool) {
+        if !self.is_over() {
+            self.shared.directory.set_member(self.shared.tid.app, AppAddress::group(name), member);
+        }
     }
 
     /// Sends a value, in the class of its type. Returns when a queue or a socket has taken it.
@@ -155,7 +181,7 @@ impl Sender {
         destination: impl Into<Destination<'a>>,
         value: &P,
     ) -> Result<(), SendError> {
-        let message = Message::typed(self.0.tid, self.find(destination.into())?, value);
+        let message = Message::typed(self.shared.tid, self.find(destination.into())?, value);
         self.dispatch(message)
     }
 
@@ -171,7 +197,7 @@ impl Sender {
         value: &P,
         within: Duration,
     ) -> Result<Confirmation, SendError> {
-        let mut message = Message::typed(self.0.tid, self.find(destination.into())?, value);
+        let mut message = Message::typed(self.shared.tid, self.find(destination.into())?, value);
         if message.header.class == Class::Stream {
             // Newest wins, so an older one has no fate of its own.
             return Err(Rejection::Unsupported.into());
@@ -191,7 +217,7 @@ impl Sender {
         request: &P,
         within: Duration,
     ) -> Result<Reply<R>, SendError> {
-        let mut message = Message::typed(self.0.tid, self.find(destination.into())?, request);
+        let mut message = Message::typed(self.shared.tid, self.find(destination.into())?, request);
         message.header.class = Class::Control;
         message.header.flags = Flags::ASK;
         let wait = self.expect_answer(&mut message, Awaited::Reply, within)?;
@@ -204,7 +230,7 @@ impl Sender {
     /// # Errors
     /// Nobody took the reply, or the message asked for none.
     pub fn reply<R: Payload>(&self, to: ReplyTo, value: &R) -> Result<(), SendError> {
-        let mut message = Message::typed(self.0.tid, to.source, value);
+        let mut message = Message::typed(self.shared.tid, to.source, value);
         message.header.class = Class::Control;
         message.header.flags = Flags::REPLY;
         message.header.correlation = to.correlation;
@@ -221,10 +247,10 @@ impl Sender {
         kind: Kind,
         length: usize,
     ) -> Result<MessageBuffer, SendError> {
-        if length > self.0.payload_max {
+        if length > self.shared.payload_max {
             return Err(Rejection::TooLong.into());
         }
-        let header = Header::new(kind, self.0.tid, self.find(destination.into())?);
+        let header = Header::new(kind, self.shared.tid, self.find(destination.into())?);
         Ok(MessageBuffer::new(header, length))
     }
 
@@ -244,7 +270,7 @@ impl Sender {
         class: Class,
         payload: Bytes,
     ) -> Result<(), SendError> {
-        let mut header = Header::new(kind, self.0.tid, self.find(destination)?);
+        let mut header = Header::new(kind, self.shared.tid, self.find(destination)?);
         header.class = class;
         self.dispatch(Message::new(header, payload))
     }
@@ -264,24 +290,28 @@ impl Sender {
         awaited: Awaited,
         within: Duration,
     ) -> Result<Wait, SendError> {
-        let destination = self.0.router.absolute(message.header.destination);
-        let wait = self.0.pending.open(awaited, destination).ok_or(SendError::TooManyWaits)?;
+        let destination = self.shared.router.absolute(message.header.destination);
+        let wait = self.shared.pending.open(awaited, destination).ok_or(SendError::TooManyWaits)?;
         message.header.flags = message.header.flags.with(Flags::CONFIRM);
         message.header.correlation = wait.correlation();
         message.header.time_to_live_us = u32::try_from(within.as_micros()).unwrap_or(u32::MAX).max(1);
-        let ticket = Ticket { source: self.0.tid, destination, correlation: wait.correlation() };
-        message.receipt = Some(Receipt::new(self.0.pending.clone(), ticket));
+        let ticket = Ticket { source: self.shared.tid, destination, correlation: wait.correlation() };
+        message.receipt = Some(Receipt::new(self.shared.pending.clone(), ticket));
         Ok(wait)
     }
 
     fn dispatch(&self, mut message: Message) -> Result<(), SendError> {
-        if message.payload.len() > self.0.payload_max {
+        if self.is_over() {
+            message.reject(Rejection::Closed);
+            return Err(SendError::Over);
+        }
+        if message.payload.len() > self.shared.payload_max {
             message.reject(Rejection::TooLong);
             return Err(Rejection::TooLong.into());
         }
-        message.header.sequence = self.0.sequence.fetch_add(1, Ordering::Relaxed) + 1;
+        message.header.sequence = self.shared.sequence.fetch_add(1, Ordering::Relaxed) + 1;
         message.header.sent = Time::now();
-        Ok(self.0.router.send(message)?)
+        Ok(self.shared.router.send(message)?)
     }
 }
 

@@ -5,6 +5,7 @@
 
 use std::{
     pin::Pin,
+    sync::Arc,
     task::{Context, Poll},
 };
 
@@ -20,6 +21,7 @@ use crate::{
     mailbox::MailboxReader,
     outcome::{Outcome, Rejection},
     schedule::Due,
+    supervision::vitals::{Doing, Vitals},
     time::Time,
     wire::{Kind, Message, Payload},
 };
@@ -71,6 +73,8 @@ pub(super) struct Drive<A: Actor<Context = AppContext<A>>> {
     reader: MailboxReader,
     handlers: Vec<(Kind, Dispatch<A>)>,
     requirements: Requirements<A>,
+    /// What others see of this incarnation.
+    vitals: Arc<Vitals>,
     alarm: Option<Alarm>,
     /// A timer had the last step: a waiting message has the next one, so that a handler that overruns its period does not
     /// shut the mailbox out.
@@ -82,8 +86,30 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         reader: MailboxReader,
         handlers: Vec<(Kind, Dispatch<A>)>,
         requirements: Requirements<A>,
+        vitals: Arc<Vitals>,
     ) -> Self {
-        Self { reader, handlers, requirements, alarm: None, timer_was_last: false }
+        Self { reader, handlers, requirements, vitals, alarm: None, timer_was_last: false }
+    }
+
+    /// Steps until there is nothing more to do, or others must have their turn.
+    fn steps(&mut self, actor: &mut A, context: &mut AppContext<A>, task: &mut Context<'_>) -> Poll<()> {
+        for _ in 0..TURN_MAX {
+            // A handler called `stop` or `wait`: actix has to see that before the next message.
+            if actix::AsyncContext::waiting(context) {
+                task.waker().wake_by_ref();
+                return Poll::Pending;
+            }
+            match self.step(actor, context, task) {
+                Poll::Ready(true) => {}
+                Poll::Ready(false) => {
+                    context.stop();
+                    return Poll::Ready(());
+                }
+                Poll::Pending => return Poll::Pending,
+            }
+        }
+        task.waker().wake_by_ref();
+        Poll::Pending
     }
 
     /// One turn's step. `Ready(true)`: there may be more to do; `Ready(false)`: the application is to end.
@@ -96,7 +122,10 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
             && let Some(due) = context.schedule.take_due(now)
         {
             self.timer_was_last = true;
+            self.reader.count();
+            self.vitals.begins(Doing::Timer, Some(now));
             fire(actor, context, due, now);
+            self.leave_if_over();
             return Poll::Ready(true);
         }
         match self.reader.poll_take(task) {
@@ -131,13 +160,28 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
     }
 
     fn handle(&mut self, actor: &mut A, context: &mut AppContext<A>, mut message: Message, now: Time) {
-        let outcome = if message.header.is_expired(now) {
-            Outcome::Expired
-        } else {
-            self.dispatch(actor, context, &message, now)
-        };
+        if message.header.is_expired(now) {
+            self.reader.finish(Outcome::Expired);
+            message.settle(Outcome::Expired);
+            return;
+        }
+        self.vitals.begins(Doing::Message(message.header.kind), Some(now));
+        let is_confirmed = message.receipt.take().map(|receipt| self.vitals.hold(receipt)).is_some();
+        // One that was fenced off while it took this message must not begin with it.
+        self.leave_if_over();
+        let outcome = self.dispatch(actor, context, &message, now);
+        self.leave_if_over();
         self.reader.finish(outcome);
-        message.settle(outcome);
+        if is_confirmed {
+            self.vitals.settle(outcome);
+        }
+    }
+
+    /// A life that was taken while its thread was in the actor's own code goes no further.
+    fn leave_if_over(&self) {
+        if self.vitals.is_over() {
+            self.vitals.leave();
+        }
     }
 
     fn dispatch(
@@ -196,23 +240,11 @@ impl<A: Actor<Context = AppContext<A>>> ActorFuture<A> for Drive<A> {
             // `started` has run and did not ask for more time.
             ready.reached();
         }
-        for _ in 0..TURN_MAX {
-            // A handler called `stop` or `wait`: actix has to see that before the next message.
-            if actix::AsyncContext::waiting(context) {
-                task.waker().wake_by_ref();
-                return Poll::Pending;
-            }
-            match this.step(actor, context, task) {
-                Poll::Ready(true) => {}
-                Poll::Ready(false) => {
-                    context.stop();
-                    return Poll::Ready(());
-                }
-                Poll::Pending => return Poll::Pending,
-            }
-        }
-        task.waker().wake_by_ref();
-        Poll::Pending
+        let polled = this.steps(actor, context, task);
+        // What runs next in this turn is nothing that was taken here.
+        this.reader.count();
+        this.vitals.begins(Doing::Task, None);
+        polled
     }
 }
 

@@ -12,7 +12,7 @@ use crate::{
     },
     mailbox::Mailbox,
     sender::Sender,
-    supervision::{Launch, Place, Policy, Restart, life},
+    supervision::{Launch, Place, Policy, Restart, life, vitals::Vitals},
     tid::AppAddress,
     wire::{Kind, Payload},
 };
@@ -175,6 +175,14 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self
     }
 
+    /// Longest time that one turn (a handler, a timer, `started`) may take, and that it may leave its messages waiting while
+    /// it waits for something else. After it the application counts as hung and is replaced. Default 1 s.
+    #[must_use]
+    pub const fn progress_within(mut self, time: Duration) -> Self {
+        self.common.policy.progress_within = Some(time);
+        self
+    }
+
     /// Time that it has for its orderly stop. Default 500 ms.
     #[must_use]
     pub const fn stop_within(mut self, time: Duration) -> Self {
@@ -214,14 +222,21 @@ impl<A: Actor<Context = AppContext<A>>> From<AppSpec<A>> for DynApp {
         let on_lost = common.on_lost;
         common.hear_of_requirements();
         common.has_safe_state = safe_state.is_some();
+        let kinds: Arc<[_]> = common.kinds.clone().into();
         let wire = move |wiring: AppWiring| {
             let (factory, handlers, safe_state) = (factory.clone(), handlers.clone(), safe_state.clone());
+            let kinds = kinds.clone();
             let launch: Launch = Arc::new(move |ready| {
                 let actor = factory();
+                // A launch outside of a guard has nobody who would take its life.
+                let vitals = Vitals::present().unwrap_or_else(|| Vitals::new("unguarded"));
+                let reader = wiring.mailbox.attach();
+                vitals.reads(wiring.mailbox.clone(), reader.epoch(), kinds.clone());
+                let sender = wiring.sender.in_life(vitals.clone());
                 let parting = Parting::default();
                 let requirements = Requirements::new(on_lost, safe_state.clone(), parting.clone());
-                let drive = Drive::new(wiring.mailbox.attach(), handlers.clone(), requirements);
-                let mut running = AppContext::into_life(wiring.sender.clone(), ready, actor);
+                let drive = Drive::new(reader, handlers.clone(), requirements, vitals);
+                let mut running = AppContext::into_life(sender, ready, actor);
                 running.ctx().spawn(drive);
                 Box::new(PartingLife { life: life(running), parting })
             });

@@ -10,7 +10,7 @@ mod source;
 
 use std::{
     collections::VecDeque,
-    sync::{Arc, Mutex},
+    sync::{Arc, Mutex, TryLockError},
     task::{Context, Poll, Waker},
 };
 
@@ -82,6 +82,10 @@ struct Shared {
     waker: Option<Waker>,
     /// Which reader is the present one.
     epoch: u64,
+    /// Class of the message in the present reader's hand.
+    in_hand: Option<Class>,
+    /// Messages taken out so far.
+    taken_out: u64,
     closed: bool,
     /// The application is away and wants nothing kept for it.
     refuses: bool,
@@ -129,6 +133,28 @@ impl Shared {
         Ok(self.waker.take())
     }
 
+    const fn hands_out(&mut self, message: &Message) -> Option<Class> {
+        self.taken_out += 1;
+        self.in_hand = Some(message.header.class);
+        self.in_hand
+    }
+
+    /// The message in the reader's hand has ended so.
+    fn count(&mut self, finished: Option<(Class, Outcome)>) {
+        if let Some((class, outcome)) = finished {
+            self.tallies[class as usize].count(outcome);
+            self.in_hand = None;
+        }
+    }
+
+    /// Fences the present reader off; what it has in its hand has failed.
+    fn next_reader(&mut self) {
+        self.epoch += 1;
+        if let Some(class) = self.in_hand.take() {
+            self.tallies[class as usize].count(Outcome::Failed);
+        }
+    }
+
     fn expire(&mut self, now: Time) -> Vec<Message> {
         let expired = self.queue.take_expired(now);
         for message in &expired {
@@ -159,6 +185,8 @@ impl Mailbox {
             paused: false,
             waker: None,
             epoch: 0,
+            in_hand: None,
+            taken_out: 0,
             closed: false,
             refuses: false,
             tallies: [Tally::default(); 3],
@@ -172,7 +200,7 @@ impl Mailbox {
     pub fn attach(self: &Arc<Self>) -> MailboxReader {
         let (epoch, former) = {
             let mut shared = lock(&self.shared);
-            shared.epoch += 1;
+            shared.next_reader();
             shared.paused = false;
             (shared.epoch, shared.waker.take())
         };
@@ -180,6 +208,26 @@ impl Mailbox {
             waker.wake();
         }
         MailboxReader { mailbox: self.clone(), epoch, in_hand: None, finished: None }
+    }
+
+    /// Fences reader number `epoch` off, if it is the present one. What waits is kept for the next.
+    pub(crate) fn detach(&self, epoch: u64) {
+        let mut shared = lock(&self.shared);
+        if shared.epoch == epoch {
+            shared.next_reader();
+        }
+    }
+
+    /// Messages that wait to be taken, and how many were taken out so far; `None` if somebody is at it this very moment.
+    pub(crate) fn backlog(&self) -> Option<(usize, u64)> {
+        let shared = match self.shared.try_lock() {
+            Ok(shared) => shared,
+            Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
+            Err(TryLockError::WouldBlock) => return None,
+        };
+        // In a pause only the layers' events are to be taken.
+        let waiting = if shared.paused { shared.events.len() } else { shared.waiting() };
+        Some((waiting, shared.taken_out))
     }
 
     /// Refuses everything that waits and everything that comes.
@@ -323,15 +371,13 @@ impl MailboxReader {
             return taken;
         }
         let mut shared = lock(&self.mailbox.shared);
-        if let Some((class, outcome)) = self.finished.take() {
-            shared.tallies[class as usize].count(outcome);
-        }
         if shared.epoch != self.epoch {
             return Poll::Ready(None);
         }
+        shared.count(self.finished.take());
         shared.paused = false;
         if let Some(message) = shared.next() {
-            self.in_hand = Some(message.header.class);
+            self.in_hand = shared.hands_out(&message);
             return Poll::Ready(Some(message));
         }
         if shared.closed {
@@ -344,14 +390,12 @@ impl MailboxReader {
     /// The same for the layers' events alone; everything else is left where it is.
     pub fn poll_event(&mut self, cx: &mut Context<'_>) -> Poll<Option<Message>> {
         let mut shared = lock(&self.mailbox.shared);
-        if let Some((class, outcome)) = self.finished.take() {
-            shared.tallies[class as usize].count(outcome);
-        }
         if shared.epoch != self.epoch {
             return Poll::Ready(None);
         }
+        shared.count(self.finished.take());
         if let Some(event) = shared.events.pop_front() {
-            self.in_hand = Some(event.header.class);
+            self.in_hand = shared.hands_out(&event);
             return Poll::Ready(Some(event));
         }
         if shared.closed {
@@ -362,7 +406,8 @@ impl MailboxReader {
         Poll::Pending
     }
 
-    /// The message in hand has ended so. Counted with the next [`poll_take`](Self::poll_take), under its lock.
+    /// The message in hand has ended so. Counted with the next [`poll_take`](Self::poll_take), under its lock, or by
+    /// [`count`](Self::count).
     pub fn finish(&mut self, outcome: Outcome) {
         let Some(class) = self.in_hand.take() else { return };
         match &self.mailbox.source {
@@ -372,17 +417,33 @@ impl MailboxReader {
     }
 }
 
+impl MailboxReader {
+    /// Counts the message that has ended now, before code runs that may not come back: one that is fenced off in it has
+    /// nothing in its hand.
+    pub(crate) fn count(&mut self) {
+        if self.finished.is_some() {
+            let mut shared = lock(&self.mailbox.shared);
+            if shared.epoch == self.epoch {
+                shared.count(self.finished.take());
+            }
+        }
+    }
+
+    /// Which reader of its mailbox this is.
+    pub(crate) const fn epoch(&self) -> u64 {
+        self.epoch
+    }
+}
+
 impl Drop for MailboxReader {
     fn drop(&mut self) {
         if let Some(source) = self.mailbox.source.as_ref().filter(|_| self.in_hand.is_some()) {
             source.finish(Outcome::Failed);
         }
         let mut shared = lock(&self.mailbox.shared);
-        if let Some((class, outcome)) = self.finished.take() {
-            shared.tallies[class as usize].count(outcome);
-        }
-        if let Some(class) = self.in_hand.take() {
-            shared.tallies[class as usize].count(Outcome::Failed);
+        if shared.epoch == self.epoch {
+            shared.count(self.finished.take());
+            shared.count(self.in_hand.take().map(|class| (class, Outcome::Failed)));
         }
     }
 }
@@ -429,6 +490,36 @@ mod tests {
         let _present = mailbox.attach();
         mailbox.submit(message()).unwrap();
         assert!(matches!(take(&mut zombie), Poll::Ready(None)));
+    }
+
+    #[test]
+    fn what_a_reader_has_in_its_hand_when_it_is_fenced_off_has_failed_whatever_it_says_later() {
+        let mailbox = Mailbox::new(8);
+        mailbox.submit(message()).unwrap();
+        mailbox.submit(message()).unwrap();
+        let mut zombie = mailbox.attach();
+        assert!(matches!(take(&mut zombie), Poll::Ready(Some(_))));
+        zombie.finish(Outcome::Delivered);
+        assert!(matches!(take(&mut zombie), Poll::Ready(Some(_))));
+        mailbox.detach(zombie.epoch());
+        let told = |mailbox: &Mailbox| {
+            let tally = mailbox.tally(Class::Control);
+            (tally.delivered, tally.failed, tally.open())
+        };
+        assert_eq!(told(&mailbox), (1, 1, 0));
+        zombie.finish(Outcome::Delivered);
+        drop(zombie);
+        assert_eq!(told(&mailbox), (1, 1, 0));
+    }
+
+    #[test]
+    fn a_reader_that_is_not_the_present_one_cannot_be_fenced_off() {
+        let mailbox = Mailbox::new(8);
+        let former = mailbox.attach().epoch();
+        let mut present = mailbox.attach();
+        mailbox.detach(former);
+        mailbox.submit(message()).unwrap();
+        assert!(matches!(take(&mut present), Poll::Ready(Some(_))));
     }
 
     #[test]

@@ -1,17 +1,27 @@
 //! One actor under a guard and under no supervisor: what a process that hosts a single application runs.
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Mutex;
 
 use tokio::sync::oneshot;
 
 use super::{
     Launch, ReadyGate, Reason,
-    guard::{Guard, Leash, words},
+    guard::Guard,
+    panics::install_hook,
+    tenant::{Fate, Tenant},
+    vitals::Vitals,
 };
+use crate::post::lock;
 
 /// Stops an actor that was started [`alone`].
-#[derive(Clone, Debug)]
-pub struct AloneHandle(Leash);
+#[derive(Clone)]
+pub struct AloneHandle(Tenant);
+
+impl std::fmt::Debug for AloneHandle {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "AloneHandle({})", self.0.vitals().name())
+    }
+}
 
 impl AloneHandle {
     /// Asks the actor to stop; its `stopping` may say that it goes on for a while.
@@ -22,17 +32,19 @@ impl AloneHandle {
 
 /// Makes an actor on the calling thread, which is an arbiter's or a system's. The future ends with it, and says how.
 pub fn alone(launch: &Launch, ready: ReadyGate) -> (AloneHandle, impl Future<Output = Reason> + use<>) {
-    let leash = Leash::default();
+    install_hook();
     let (say, ended) = oneshot::channel();
-    let report: Box<dyn FnOnce(Reason) + Send> = Box::new(move |reason| {
-        // Whoever does not wait for the end does not want to know.
-        let _ = say.send(reason);
-    });
-    match catch_unwind(AssertUnwindSafe(|| launch(ready))) {
-        Ok(life) => {
-            actix_rt::spawn(Guard::new(life, leash.clone(), report));
+    let say = Mutex::new(Some(say));
+    let report = Box::new(move |fate| {
+        let (Fate::Hung(reason) | Fate::Ended(reason)) = fate;
+        if let Some(say) = lock(&say).take() {
+            // Whoever does not wait for the end does not want to know.
+            let _ = say.send(reason);
         }
-        Err(panic) => report(Reason::Panic(words(&*panic))),
+    });
+    let tenant = Tenant::new(Vitals::new("alone"), None, None, report);
+    if let Some(guard) = Guard::make(launch, ready, tenant.clone()) {
+        actix_rt::spawn(guard);
     }
-    (AloneHandle(leash), async { ended.await.unwrap_or(Reason::ThreadEnded) })
+    (AloneHandle(tenant), async { ended.await.unwrap_or(Reason::ThreadEnded) })
 }

@@ -1,11 +1,10 @@
 //! The guard around a supervised actor: catches its panics, takes its stop order, and says how it ended.
 
 use std::{
-    any::Any,
     panic::{AssertUnwindSafe, catch_unwind},
     pin::Pin,
-    sync::{Arc, Mutex},
-    task::{Context, Poll, Waker},
+    sync::Arc,
+    task::{Context, Poll},
 };
 
 use actix::{
@@ -13,7 +12,13 @@ use actix::{
     dev::{AsyncContextParts, ContextFut},
 };
 
-use crate::{post::lock, supervision::Reason};
+use super::{
+    Launch, ReadyGate, Reason,
+    panics::words,
+    tenant::{Fate, Tenant},
+    vitals::{Doing, Over, Vitals},
+};
+use crate::{outcome::Outcome, time::Time};
 
 /// A running actor of any type, as its guard sees it.
 pub trait Life {
@@ -58,66 +63,59 @@ where
     Box::new(ActixLife(actor))
 }
 
-/// How a supervisor reaches an actor from another thread. Not through the actor's queue: that may be full, or unread.
-#[derive(Clone, Debug, Default)]
-pub(super) struct Leash(Arc<Mutex<LeashState>>);
-
-#[derive(Debug, Default)]
-struct LeashState {
-    stop: bool,
-    kill: bool,
-    /// The actor is gone.
-    ended: bool,
-    waker: Option<Waker>,
-}
-
-impl Leash {
-    /// Asks the actor to stop.
-    pub(super) fn stop(&self) {
-        self.pull(|state| state.stop = true);
-    }
-
-    /// Takes the actor's life the next time that its thread is free.
-    pub(super) fn kill(&self) {
-        self.pull(|state| state.kill = true);
-    }
-
-    /// Whether the actor is gone.
-    pub(super) fn has_ended(&self) -> bool {
-        lock(&self.0).ended
-    }
-
-    fn pull(&self, order: impl FnOnce(&mut LeashState)) {
-        let waker = {
-            let mut state = lock(&self.0);
-            order(&mut state);
-            state.waker.take()
-        };
-        if let Some(waker) = waker {
-            waker.wake();
-        }
-    }
-}
-
 /// The guarded actor: a future that never panics and reports its end exactly once.
 pub(super) struct Guard {
     life: Option<Box<dyn Life>>,
-    leash: Leash,
-    report: Option<Box<dyn FnOnce(Reason) + Send>>,
+    tenant: Tenant,
+    /// Out while the actor has its turn.
+    vitals: Option<Arc<Vitals>>,
+    was_polled: bool,
+    has_reported: bool,
 }
 
 impl Guard {
-    pub(super) fn new(life: Box<dyn Life>, leash: Leash, report: Box<dyn FnOnce(Reason) + Send>) -> Self {
-        Self { life: Some(life), leash, report: Some(report) }
+    /// Makes an actor, on its thread. `None` if its code panicked, which is reported.
+    pub(super) fn make(launch: &Launch, ready: ReadyGate, tenant: Tenant) -> Option<Self> {
+        let vitals = Some(tenant.vitals().clone());
+        let mut guard = Self { life: None, tenant, vitals, was_polled: false, has_reported: false };
+        let made = Vitals::turn(&mut guard.vitals, Doing::Start, || {
+            catch_unwind(AssertUnwindSafe(|| launch(ready)))
+        });
+        match made {
+            Ok(life) => {
+                guard.life = Some(life);
+                Some(guard)
+            }
+            Err(panic) => {
+                guard.end(Reason::Panic(words(panic)));
+                None
+            }
+        }
+    }
+
+    /// What a turn is called until something in it has a better name.
+    const fn doing(&self, stops: bool) -> Doing {
+        match (self.was_polled, stops) {
+            (_, true) => Doing::Stop,
+            (false, false) => Doing::Start,
+            (true, false) => Doing::Task,
+        }
     }
 
     fn end(&mut self, reason: Reason) {
         if let Some(life) = self.life.take() {
-            bury(life);
+            Vitals::turn(&mut self.vitals, Doing::Drop, || bury(life));
         }
-        lock(&self.leash.0).ended = true;
-        if let Some(report) = self.report.take() {
-            report(reason);
+        if !std::mem::replace(&mut self.has_reported, true) {
+            let vitals = self.tenant.vitals();
+            // A message in the hand of one that panicked was settled by nobody.
+            vitals.settle(Outcome::Failed);
+            vitals.set_gone();
+            if let Some(since) = self.tenant.holds_its_thread() {
+                let (actor, away) = (vitals.name(), Time::now().since(since));
+                tracing::warn!(actor, ?away, "came back too late: it is dropped, and its thread ends");
+            }
+            self.tenant.report(Fate::Ended(reason));
         }
     }
 }
@@ -129,9 +127,7 @@ fn bury(mut life: Box<dyn Life>) {
         drop(life);
     }));
     if let Err(panic) = buried {
-        tracing::error!(said = words(&*panic), "an actor panicked while it was dropped");
-        // Dropping what a panic carries may panic too; there is nothing left to be done about that.
-        let _ = catch_unwind(AssertUnwindSafe(|| drop(panic)));
+        tracing::error!(said = words(panic), "an actor panicked while it was dropped");
     }
 }
 
@@ -139,33 +135,32 @@ impl Future for Guard {
     type Output = ();
 
     fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<()> {
-        let (stop, kill) = {
-            let mut state = lock(&self.leash.0);
-            state.waker = Some(cx.waker().clone());
-            (std::mem::take(&mut state.stop), state.kill)
-        };
-        if kill {
-            self.end(Reason::Killed);
+        let this = &mut *self;
+        let told = this.tenant.told(cx.waker());
+        if told.kill {
+            this.end(Reason::Killed);
             return Poll::Ready(());
         }
-        let Some(life) = &mut self.life else { return Poll::Ready(()) };
-        let polled = catch_unwind(AssertUnwindSafe(|| {
-            if stop {
-                life.stop();
-            }
-            life.poll(cx)
-        }));
-        match polled {
-            Ok(Poll::Pending) => Poll::Pending,
-            Ok(Poll::Ready(reason)) => {
-                self.end(reason);
-                Poll::Ready(())
-            }
-            Err(panic) => {
-                self.end(Reason::Panic(words(&*panic)));
-                Poll::Ready(())
-            }
-        }
+        let doing = this.doing(told.stop);
+        this.was_polled = true;
+        let Some(life) = &mut this.life else { return Poll::Ready(()) };
+        let polled = Vitals::turn(&mut this.vitals, doing, || {
+            catch_unwind(AssertUnwindSafe(|| {
+                if told.stop {
+                    life.stop();
+                }
+                life.poll(cx)
+            }))
+        });
+        let reason = match polled {
+            Ok(Poll::Pending) if !this.tenant.vitals().is_over() => return Poll::Pending,
+            Ok(Poll::Pending) => Reason::Killed,
+            Err(panic) if panic.is::<Over>() => Reason::Killed,
+            Ok(Poll::Ready(reason)) => reason,
+            Err(panic) => Reason::Panic(words(panic)),
+        };
+        this.end(reason);
+        Poll::Ready(())
     }
 }
 
@@ -174,11 +169,4 @@ impl Drop for Guard {
         // The arbiter's thread ends with the actor still in it.
         self.end(Reason::ThreadEnded);
     }
-}
-
-/// What a panic said.
-pub(super) fn words(panic: &(dyn Any + Send)) -> String {
-    let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
-    text.or_else(|| panic.downcast_ref::<String>().cloned())
-        .unwrap_or_else(|| "something that is not text".to_owned())
 }

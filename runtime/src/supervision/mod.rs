@@ -8,6 +8,10 @@
 //! | `alone` | one actor under a guard and under no supervisor |
 //! | `ready` | when an actor may say that it is ready |
 //! | `threads` | where actors live |
+//! | `tenant` | one life of an actor, as its supervisor, its thread and the watchdog hold it |
+//! | `vitals` | its signs of life, and its fence |
+//! | `watchdog` | who does not come back |
+//! | `panics` | where a panic was |
 //! | `fault` | faults on purpose, with the feature `fault-points` only |
 
 mod alone;
@@ -15,14 +19,19 @@ pub mod core;
 #[cfg(feature = "fault-points")]
 pub mod fault;
 mod guard;
+mod panics;
 mod ready;
 mod supervisor;
+mod tenant;
 mod threads;
+pub(crate) mod vitals;
+mod watchdog;
 
 pub use self::{
     alone::{AloneHandle, alone},
     core::{AutoShutdown, ChildId, ChildIds, Flags, Input, Intensity, Policy, Reason, Restart, Strategy},
     guard::{Life, life},
+    panics::UNWINDS,
     ready::{ReadyGate, ReadyPart},
     supervisor::{ChildSpec, Launch, Supervisor, SupervisorFact},
     threads::{Place, Threads},

@@ -1,6 +1,6 @@
 //! The supervisor's shell: an actix actor that carries out what its core decides.
 
-use std::{cell::RefCell, collections::BTreeMap, panic::AssertUnwindSafe, rc::Rc, sync::Arc, time::Duration};
+use std::{cell::RefCell, collections::BTreeMap, rc::Rc, sync::Arc, time::Duration};
 
 use actix::{Actor, ActorContext, AsyncContext, Context, SpawnHandle, StreamHandler};
 
@@ -9,7 +9,10 @@ use crate::{
     supervision::{
         Life, Place, ReadyGate, Reason, Threads,
         core::{ChildId, Core, Flags, Generation, Input, Order, Policy},
-        guard::{Guard, Leash, words},
+        guard::Guard,
+        panics::install_hook,
+        tenant::{Fate, Tenant},
+        vitals::Vitals,
     },
     time::Time,
 };
@@ -49,7 +52,7 @@ pub enum SupervisorFact {
 /// A child's declaration, and what holds its present life.
 struct Child {
     spec: ChildSpec,
-    leash: Option<Leash>,
+    tenant: Option<Tenant>,
 }
 
 /// Supervises children; ends when none of them lives any more.
@@ -83,7 +86,7 @@ impl Supervisor {
         let supervisor = Self {
             name,
             core: Core::new(flags.into(), seed(), policies),
-            children: children.into_iter().map(|spec| (spec.id, Child { spec, leash: None })).collect(),
+            children: children.into_iter().map(|spec| (spec.id, Child { spec, tenant: None })).collect(),
             threads,
             post: post.clone(),
             listener: Box::new(listener),
@@ -113,8 +116,8 @@ impl Supervisor {
         match order {
             Order::Spawn(id, generation) => self.spawn(id, generation),
             Order::Stop(id, _) => {
-                if let Some(leash) = self.children.get(&id).and_then(|child| child.leash.as_ref()) {
-                    leash.stop();
+                if let Some(tenant) = self.children.get(&id).and_then(|child| child.tenant.as_ref()) {
+                    tenant.stop();
                 }
             }
             Order::Abandon(id, _) => self.abandon(id, context),
@@ -147,31 +150,50 @@ impl Supervisor {
     }
 
     fn spawn(&mut self, id: ChildId, generation: Generation) {
-        let Some(Child { spec, leash: held }) = self.children.get_mut(&id) else { return };
-        let leash = Leash::default();
-        *held = Some(leash.clone());
-        let launch = spec.launch.clone();
+        install_hook();
+        let Some(Child { spec, tenant: held }) = self.children.get_mut(&id) else { return };
+        let mut threads = self.threads.borrow_mut();
         let post = self.post.clone();
-        let thread = self.threads.borrow_mut().get(&spec.place);
-        let accepted = thread.spawn_fn(move || start(id, generation, &launch, leash, &post));
-        if !accepted {
-            // The thread ended under us: the next start makes a new one.
-            self.threads.borrow_mut().abandon(&spec.place);
-            say(&self.post, Input::Ended(id, generation, Reason::ThreadEnded));
-        }
+        let (thread, seat) = match threads.get(&spec.place) {
+            Ok(found) => found,
+            Err(error) => {
+                let why = format!("there is no thread for it: {error}; raise `ulimit -u` and `ulimit -n`");
+                return say(&post, Input::Ended(id, generation, Reason::GaveUp(why)));
+            }
+        };
+        let report = Box::new(move |fate| match fate {
+            Fate::Hung(reason) => say(&post, Input::Hung(id, generation, reason)),
+            Fate::Ended(reason) => say(&post, Input::Ended(id, generation, reason)),
+        });
+        let vitals = Vitals::new(&*spec.name);
+        let tenant = Tenant::new(vitals, Some(seat), spec.policy.progress_within, report);
+        threads.settle(&tenant);
+        *held = Some(tenant.clone());
+        let ready = {
+            let (post, vitals) = (self.post.clone(), tenant.vitals().clone());
+            ReadyGate::new(move || {
+                vitals.set_ready();
+                say(&post, Input::BecameReady(id, generation));
+            })
+        };
+        let (launch, unborn) = (spec.launch.clone(), Unborn(Some(tenant)));
+        // A thread that has ended drops this, which is reported: the next start makes a new thread.
+        thread.spawn_fn(move || start(&launch, ready, unborn));
     }
 
     /// Takes a child's life. Its thread may have other tenants: it is given up only if it does not let the child go.
     fn abandon(&mut self, id: ChildId, context: &mut Context<Self>) {
-        let Some(Child { spec, leash }) = self.children.get_mut(&id) else { return };
-        let Some(leash) = leash.take() else { return };
-        leash.kill();
+        let Some(Child { spec, tenant }) = self.children.get_mut(&id) else { return };
+        let Some(tenant) = tenant.take() else { return };
         tracing::error!(supervisor = self.name, child = spec.name, "its life is taken");
-        let (name, place) = (spec.name.clone(), spec.place.clone());
+        tenant.kill();
+        if tenant.holds_its_thread().is_some() {
+            self.threads.borrow_mut().give_up(&tenant);
+            return;
+        }
         context.run_later(LETTING_GO, move |this, _| {
-            if !leash.has_ended() {
-                tracing::error!(child = name, thread = place.thread, "a thread hangs and is given up");
-                this.threads.borrow_mut().abandon(&place);
+            if !tenant.has_ended() {
+                this.threads.borrow_mut().give_up(&tenant);
             }
         });
     }
@@ -183,24 +205,32 @@ fn seed() -> u64 {
 }
 
 /// Runs on the child's thread.
-fn start(id: ChildId, generation: Generation, launch: &Launch, leash: Leash, post: &Post<Input>) {
-    let ready = {
-        let post = post.clone();
-        ReadyGate::new(move || say(&post, Input::BecameReady(id, generation)))
-    };
-    match std::panic::catch_unwind(AssertUnwindSafe(|| launch(ready))) {
-        Ok(life) => {
-            let post = post.clone();
-            let report = Box::new(move |reason| say(&post, Input::Ended(id, generation, reason)));
-            actix_rt::spawn(Guard::new(life, leash, report));
+fn start(launch: &Launch, ready: ReadyGate, mut unborn: Unborn) {
+    if let Some(tenant) = unborn.0.take()
+        && let Some(guard) = Guard::make(launch, ready, tenant)
+    {
+        actix_rt::spawn(guard);
+    }
+}
+
+/// A child whose thread has not come to it yet, and perhaps never will.
+struct Unborn(Option<Tenant>);
+
+impl Drop for Unborn {
+    fn drop(&mut self) {
+        if let Some(tenant) = self.0.take() {
+            tenant.vitals().set_gone();
+            tenant.report(Fate::Ended(Reason::ThreadEnded));
         }
-        Err(panic) => say(post, Input::Ended(id, generation, Reason::Panic(words(&*panic)))),
     }
 }
 
 fn say(post: &Post<Input>, input: Input) {
     if let Err(lost) = post.post(input) {
-        tracing::error!(?lost, "a supervisor's post is full; its deadlines will notice what it was not told");
+        tracing::error!(
+            ?lost,
+            "a supervisor was not told: its post is full, or who told it was replaced; its deadlines will notice"
+        );
     }
 }
 

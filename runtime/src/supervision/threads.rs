@@ -1,12 +1,27 @@
 //! The threads that actors live on, by name.
 
-use std::{collections::BTreeMap, ffi::CString};
+use std::{
+    cell::RefCell,
+    collections::BTreeMap,
+    ffi::CString,
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicBool, AtomicI32, AtomicUsize, Ordering},
+    },
+};
 
 use actix_rt::{Arbiter, ArbiterHandle};
 use thread_priority::{
-    RealtimeThreadSchedulePolicy, ThreadPriority, ThreadSchedulePolicy, set_thread_priority_and_policy,
-    thread_native_id,
+    NormalThreadSchedulePolicy, RealtimeThreadSchedulePolicy, ThreadId, ThreadPriority, ThreadSchedulePolicy,
+    set_thread_priority_and_policy, thread_native_id,
 };
+
+use super::{
+    Reason,
+    tenant::{Fate, Tenant, WeakTenant},
+    watchdog::Watchdog,
+};
+use crate::post::lock;
 
 /// Where an actor runs: a thread with a name. Actors with the same name share it.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -73,18 +88,7 @@ impl Place {
     }
 
     fn make_realtime(&self, priority: u8) {
-        let Ok(level) = priority.try_into() else {
-            tracing::warn!(
-                thread = self.thread,
-                priority,
-                "a real-time priority is 1 to 99; the thread has none"
-            );
-            return;
-        };
-        let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
-        let set =
-            set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(level), policy);
-        if let Err(error) = set {
+        if let Err(error) = make_realtime(priority) {
             tracing::warn!(
                 thread = self.thread,
                 priority,
@@ -95,38 +99,184 @@ impl Place {
     }
 }
 
+/// Puts the calling thread under SCHED_FIFO with this priority, 1 to 99.
+pub(super) fn make_realtime(priority: u8) -> Result<(), thread_priority::Error> {
+    let level = priority
+        .try_into()
+        .map_err(|_| thread_priority::Error::Priority("a real-time priority is 1 to 99"))?;
+    let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
+    set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(level), policy)
+}
+
+/// One thread of a node, from its making to its end.
+#[derive(Debug)]
+pub(super) struct Seat {
+    name: String,
+    /// The kernel's number of the thread, while it lives.
+    tid: AtomicI32,
+    /// What a thread's priority is set by. Held by whoever sets it, so that the thread does not end meanwhile.
+    native: Mutex<Option<ThreadId>>,
+    given_up: AtomicBool,
+    /// Who lives on it.
+    tenants: Mutex<Vec<WeakTenant>>,
+    /// Threads of the node that were given up and have not ended.
+    abandoned: Arc<AtomicUsize>,
+}
+
+impl Seat {
+    fn new(place: &Place, abandoned: Arc<AtomicUsize>) -> Arc<Self> {
+        Arc::new(Self {
+            name: place.thread.clone(),
+            tid: AtomicI32::new(0),
+            native: Mutex::new(None),
+            given_up: AtomicBool::new(false),
+            tenants: Mutex::default(),
+            abandoned,
+        })
+    }
+
+    /// The kernel's number of the thread; `None` before its first and after its last breath.
+    pub(super) fn tid(&self) -> Option<i32> {
+        Some(self.tid.load(Ordering::Relaxed)).filter(|tid| *tid > 0)
+    }
+
+    /// Counts the thread among those that were given up, once. `None` if it was before, or has ended.
+    fn set_given_up(&self) -> Option<usize> {
+        // Under this lock, which the thread takes when it ends: it is counted down as often as up.
+        let native = lock(&self.native);
+        if native.is_none() || self.given_up.swap(true, Ordering::AcqRel) {
+            return None;
+        }
+        Some(self.abandoned.fetch_add(1, Ordering::AcqRel) + 1)
+    }
+
+    /// Lets the thread run only when the CPU has nothing else to do, whatever priority it had.
+    pub(super) fn demote(&self) {
+        let native = lock(&self.native);
+        if let Some(native) = *native {
+            let policy = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Idle);
+            // A system that refuses this has the thread go on as before: nothing here depends on it.
+            let _ = set_thread_priority_and_policy(native, ThreadPriority::Min, policy);
+        }
+    }
+
+    /// Whether another of its tenants is in the middle of a turn.
+    pub(super) fn is_busy_with_another_than(&self, tenant: &Tenant) -> bool {
+        let tenants = lock(&self.tenants);
+        tenants
+            .iter()
+            .filter_map(WeakTenant::living)
+            .any(|other| !Arc::ptr_eq(other.vitals(), tenant.vitals()) && other.vitals().sight().is_busy())
+    }
+
+    fn add(&self, tenant: &Tenant) {
+        let mut tenants = lock(&self.tenants);
+        tenants.retain(|tenant| tenant.living().is_some());
+        tenants.push(tenant.downgrade());
+    }
+
+    /// Sits down on the calling thread.
+    fn occupy(self: Arc<Self>) {
+        self.tid.store(rustix::thread::gettid().as_raw_nonzero().get(), Ordering::Relaxed);
+        *lock(&self.native) = Some(thread_native_id());
+        OCCUPIED.set(Some(Occupied(self)));
+    }
+}
+
+thread_local! {
+    /// The seat of this thread, which is told when the thread ends.
+    static OCCUPIED: RefCell<Option<Occupied>> = const { RefCell::new(None) };
+}
+
+struct Occupied(Arc<Seat>);
+
+impl Drop for Occupied {
+    fn drop(&mut self) {
+        self.0.tid.store(0, Ordering::Relaxed);
+        let mut native = lock(&self.0.native);
+        *native = None;
+        if self.0.given_up.load(Ordering::Acquire) {
+            self.0.abandoned.fetch_sub(1, Ordering::AcqRel);
+        }
+    }
+}
+
 /// The threads of a node. Made when the first actor needs them; used on the node's root thread only.
 #[derive(Debug, Default)]
 pub struct Threads {
-    arbiters: BTreeMap<String, Arbiter>,
+    arbiters: BTreeMap<String, (Arbiter, Arc<Seat>)>,
+    watchdog: Watchdog,
+    abandoned: Arc<AtomicUsize>,
 }
 
 impl Threads {
-    /// The thread of `place`.
-    pub(super) fn get(&mut self, place: &Place) -> ArbiterHandle {
-        let make = || {
-            let place = place.clone();
-            Arbiter::with_tokio_rt(move || {
-                place.prepare();
-                tokio::runtime::Builder::new_current_thread()
-                    .enable_all()
-                    .build()
-                    .expect("descriptors for a reactor; raise `ulimit -n`")
-            })
-        };
-        self.arbiters.entry(place.thread.clone()).or_insert_with(make).handle()
+    /// The thread of `place`, a new one if it has none that lives.
+    ///
+    /// # Errors
+    /// The system gives no thread, or no descriptors for its reactor.
+    pub(super) fn get(&mut self, place: &Place) -> std::io::Result<(ArbiterHandle, Arc<Seat>)> {
+        self.arbiters.retain(|_, (arbiter, _)| arbiter.alive());
+        if let Some((arbiter, seat)) = self.arbiters.get(&place.thread) {
+            return Ok((arbiter.handle(), seat.clone()));
+        }
+        let seat = Seat::new(place, self.abandoned.clone());
+        let (prepared, occupied) = (place.clone(), seat.clone());
+        let arbiter = Arbiter::try_with_tokio_rt(move || {
+            prepared.prepare();
+            occupied.occupy();
+            tokio::runtime::Builder::new_current_thread().enable_all().build()
+        })?;
+        let handle = arbiter.handle();
+        self.arbiters.insert(place.thread.clone(), (arbiter, seat.clone()));
+        Ok((handle, seat))
     }
 
-    /// Gives a thread up: it ends when what runs on it lets it; the next actor of this place gets a new one.
-    pub(super) fn abandon(&mut self, place: &Place) {
-        if let Some(arbiter) = self.arbiters.remove(&place.thread) {
+    /// A life moves in: its thread knows it, and the watchdog watches it.
+    pub(super) fn settle(&self, tenant: &Tenant) {
+        if let Some(seat) = tenant.seat() {
+            seat.add(tenant);
+        }
+        self.watchdog.watch(tenant);
+    }
+
+    /// Gives up the thread that `hung` does not let go: it ends when it comes back; the next actor of this place gets a new
+    /// one. Its other tenants are lost with it.
+    pub(super) fn give_up(&mut self, hung: &Tenant) {
+        let Some(seat) = hung.seat() else { return };
+        let Some(abandoned) = seat.set_given_up() else { return };
+        seat.demote();
+        let neighbours: Vec<_> = lock(&seat.tenants)
+            .iter()
+            .filter_map(WeakTenant::living)
+            .filter(|other| !Arc::ptr_eq(other.vitals(), hung.vitals()))
+            .collect();
+        let (thread, child) = (&seat.name, hung.vitals().name());
+        tracing::error!(
+            child,
+            thread,
+            abandoned,
+            neighbours = neighbours.len(),
+            "a thread hangs and is given up"
+        );
+        for neighbour in neighbours {
+            neighbour.kill();
+            neighbour.report(Fate::Ended(Reason::ThreadEnded));
+        }
+        let is_present = self.arbiters.get(thread).is_some_and(|(_, present)| Arc::ptr_eq(present, seat));
+        if is_present && let Some((arbiter, _)) = self.arbiters.remove(thread) {
             arbiter.stop();
         }
     }
 
+    /// Threads that were given up and have not ended.
+    #[must_use]
+    pub fn abandoned(&self) -> usize {
+        self.abandoned.load(Ordering::Acquire)
+    }
+
     /// Ends all threads.
     pub fn stop(&mut self) {
-        for arbiter in std::mem::take(&mut self.arbiters).into_values() {
+        for (arbiter, _) in std::mem::take(&mut self.arbiters).into_values() {
             arbiter.stop();
         }
     }

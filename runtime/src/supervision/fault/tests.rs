@@ -135,7 +135,7 @@ impl Office {
 
     fn start(&self) -> Result<Box<dyn Life>, String> {
         let start = std::panic::AssertUnwindSafe(|| (self.launch)(ReadyGate::new(|| {})));
-        std::panic::catch_unwind(start).map_err(|panic| crate::supervision::guard::words(&*panic))
+        std::panic::catch_unwind(start).map_err(crate::supervision::panics::words)
     }
 
     /// Whether it panicked on these.

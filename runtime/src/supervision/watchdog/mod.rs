@@ -1,0 +1,255 @@
+//! The watchdog: one thread that looks at every actor of a node, and says who does not come back.
+//!
+//! It reads what the actors' threads write (`vitals`), judges (`suspect`, pure), and accuses: the life is fenced at once,
+//! its thread is demoted, its supervisor is told. It logs nothing and takes no lock that an actor's code could hold, so
+//! that what hangs an actor does not hang it.
+
+mod processor;
+mod suspect;
+
+use std::{
+    panic::{AssertUnwindSafe, catch_unwind},
+    sync::{
+        Arc, Mutex, Once, Weak,
+        atomic::{AtomicUsize, Ordering},
+    },
+    thread::JoinHandle,
+    time::Duration,
+};
+
+use processor::sample;
+use suspect::{Hang, Look, Stall, StallSuspect, TurnSuspect};
+
+use super::{
+    Reason,
+    panics::words,
+    tenant::{Fate, Tenant},
+    threads::make_realtime,
+};
+use crate::{post::lock, time::Time};
+
+/// Time between two looks at most.
+const PERIOD_MAX: Duration = Duration::from_millis(5);
+/// Time between two looks at least, however small a budget is.
+const PERIOD_MIN: Duration = Duration::from_millis(1);
+/// Lateness that is the system's ordinary one.
+const LATENESS: Duration = Duration::from_millis(1);
+/// Above every actor: it runs for microseconds at a time.
+const PRIORITY: u8 = 95;
+/// Lives that are watched at once at most. One more lives unwatched, and that is said.
+const WATCHED_MAX: usize = 4_096;
+
+/// The watchdog of a node. Its thread is made when the first life is to be watched, and ends with this.
+#[derive(Debug, Default)]
+pub(super) struct Watchdog {
+    shared: Arc<Shared>,
+    thread: Mutex<Option<JoinHandle<()>>>,
+}
+
+#[derive(Default)]
+struct Shared {
+    arrivals: Mutex<Vec<Watched>>,
+    /// Held by the thread while it looks; outlives it.
+    table: Mutex<Vec<Watched>>,
+    count: AtomicUsize,
+}
+
+impl std::fmt::Debug for Shared {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{} lives", self.count.load(Ordering::Relaxed))
+    }
+}
+
+impl Watchdog {
+    /// Watches a life until it ends, if it has a budget.
+    pub(super) fn watch(&self, tenant: &Tenant) {
+        let Some(budget) = tenant.progress_within() else { return };
+        if self.shared.count.fetch_add(1, Ordering::Relaxed) >= WATCHED_MAX {
+            self.shared.count.fetch_sub(1, Ordering::Relaxed);
+            let name = tenant.vitals().name();
+            tracing::error!(name, WATCHED_MAX, "the watchdog's table is full; nobody sees if this one hangs");
+            return;
+        }
+        lock(&self.shared.arrivals).push(Watched::new(tenant.clone(), budget));
+        self.wake();
+    }
+
+    /// Wakes the thread; makes one if there is none that lives.
+    fn wake(&self) {
+        let mut thread = lock(&self.thread);
+        if let Some(thread) = thread.as_ref().filter(|thread| !thread.is_finished()) {
+            return thread.thread().unpark();
+        }
+        let shared = Arc::downgrade(&self.shared);
+        match std::thread::Builder::new().name("watchdog".to_owned()).spawn(move || run(&shared)) {
+            Ok(new) => *thread = Some(new),
+            Err(error) => tracing::error!(%error, "no thread for the watchdog; nobody sees who hangs"),
+        }
+    }
+}
+
+impl Drop for Watchdog {
+    fn drop(&mut self) {
+        // The thread sees that nobody is left to report to.
+        self.shared = Arc::default();
+        if let Some(thread) = lock(&self.thread).as_ref() {
+            thread.thread().unpark();
+        }
+    }
+}
+
+fn run(shared: &Weak<Shared>) {
+    if let Err(error) = make_realtime(PRIORITY) {
+        static SAID: Once = Once::new();
+        SAID.call_once(|| {
+            tracing::warn!(
+                ?error,
+                "the watchdog has no real-time priority: on a busy CPU it notices a hang late; allow it with `ulimit -r 99`"
+            );
+        });
+    }
+    let mut due = Time::now();
+    while let Some(shared) = shared.upgrade() {
+        // A fault in here must not leave the node without a watchdog.
+        let looked = catch_unwind(AssertUnwindSafe(|| shared.look(due)));
+        let next = looked.unwrap_or_else(|panic| {
+            tracing::error!(said = words(panic), "the watchdog panicked, and goes on");
+            Some(Time::now() + PERIOD_MAX)
+        });
+        // Whoever owns this must be able to end it while it sleeps.
+        drop(shared);
+        match next {
+            Some(next) => {
+                due = next;
+                std::thread::park_timeout(next.since(Time::now()));
+            }
+            None => {
+                std::thread::park();
+                due = Time::now();
+            }
+        }
+    }
+}
+
+impl Shared {
+    /// One look at everybody. Returns when the next is due; `None` if there is nobody.
+    fn look(&self, due: Time) -> Option<Time> {
+        let now = Time::now();
+        let late = Some(now.since(due)).filter(|late| *late > LATENESS).unwrap_or_default();
+        let mut table = lock(&self.table);
+        table.append(&mut lock(&self.arrivals));
+        let period = table.iter().map(|watched| watched.period).min()?;
+        let before = table.len();
+        table.retain_mut(|watched| look_at(watched, now, late, period));
+        self.count.fetch_sub(before - table.len(), Ordering::Relaxed);
+        let deadline = table.iter().filter_map(Watched::deadline).min();
+        // One that is over already waits for a CPU, or has just been seen: it is looked at again after a period.
+        let deadline = deadline.filter(|deadline| *deadline > now);
+        Some(deadline.map_or(now + period, |deadline| deadline.min(now + period)))
+    }
+}
+
+/// Looks at one life. Returns whether it is to be watched further.
+fn look_at(watched: &mut Watched, now: Time, late: Duration, period: Duration) -> bool {
+    let vitals = watched.tenant.vitals();
+    if vitals.is_gone() || vitals.is_over() {
+        return false;
+    }
+    match catch_unwind(AssertUnwindSafe(|| watched.look(now, late, period))) {
+        Ok(goes_on) => goes_on,
+        Err(panic) => {
+            let name = watched.tenant.vitals().name();
+            tracing::error!(name, said = words(panic), "the watchdog panicked over this one and leaves it");
+            false
+        }
+    }
+}
+
+/// One life that is watched.
+struct Watched {
+    tenant: Tenant,
+    budget: Duration,
+    period: Duration,
+    turn: TurnSuspect,
+    stall: StallSuspect,
+}
+
+impl Watched {
+    fn new(tenant: Tenant, budget: Duration) -> Self {
+        let period = (budget / 10).clamp(PERIOD_MIN, PERIOD_MAX);
+        Self { tenant, budget, period, turn: TurnSuspect::new(budget), stall: StallSuspect::new(budget) }
+    }
+
+    fn deadline(&self) -> Option<Time> {
+        self.turn.deadline(self.tenant.vitals().sight())
+    }
+
+    fn look(&mut self, now: Time, late: Duration, period: Duration) -> bool {
+        let vitals = self.tenant.vitals();
+        let look = Look { now, late, sight: vitals.sight() };
+        let seat = self.tenant.seat().cloned();
+        let cpu = || sample(seat.as_ref()?.tid()?);
+        if let Some(hang) = self.turn.look(look, period, cpu) {
+            let what = format!("{} has not come back", vitals.words(look.sight.doing));
+            self.accuse(hang, &what, true);
+            return false;
+        }
+        self.look_for_stall(look, cpu)
+    }
+
+    fn look_for_stall(&mut self, look: Look, cpu: impl FnOnce() -> Option<processor::Sample>) -> bool {
+        let vitals = self.tenant.vitals();
+        if !vitals.should_take() {
+            self.stall.calm(look.now);
+            return true;
+        }
+        // Nothing where somebody is in the mailbox this very moment: then things go on.
+        let Some((waiting, taken)) = vitals.backlog() else { return true };
+        match self.stall.look(look, waiting, taken, cpu) {
+            Stall::None => true,
+            Stall::Probe => {
+                self.tenant.wake();
+                true
+            }
+            Stall::Waits(hang) => {
+                let what = format!("waits on a future; {waiting} messages wait for it");
+                self.accuse(hang, &what, false);
+                false
+            }
+            Stall::ThreadIsAway(_) if self.is_neighbours_fault() => {
+                self.stall.calm(look.now);
+                true
+            }
+            Stall::ThreadIsAway(hang) => {
+                let what = format!(
+                    "its thread does not come back from something that is no actor's; {waiting} messages wait"
+                );
+                self.accuse(hang, &what, true);
+                false
+            }
+        }
+    }
+
+    fn is_neighbours_fault(&self) -> bool {
+        self.tenant.seat().is_some_and(|seat| seat.is_busy_with_another_than(&self.tenant))
+    }
+
+    /// Fences the life, says so, and only then does what may take time.
+    fn accuse(&self, hang: Hang, what: &str, holds_its_thread: bool) {
+        let Hang { since, lasted, excused } = hang;
+        let vitals = self.tenant.vitals();
+        vitals.fence();
+        if holds_its_thread {
+            self.tenant.set_holds_its_thread(since);
+        }
+        let mut words = format!("{what}, since {since:?}, for {lasted:.1?} of {:?} allowed", self.budget);
+        if !excused.is_zero() {
+            words.push_str(&format!(" (without {excused:.1?} in which it had no CPU)"));
+        }
+        self.tenant.report(Fate::Hung(Reason::Hung(words)));
+        if holds_its_thread && let Some(seat) = self.tenant.seat() {
+            seat.demote();
+        }
+        vitals.empty_hands();
+    }
+}

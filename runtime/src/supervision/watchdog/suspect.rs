@@ -1,0 +1,189 @@
+//! The watchdog's judgement of one actor, pure: what was seen at each look, to who hangs.
+//!
+//! Nobody is accused for time in which he was given no CPU: neither for the watchdog's own lateness (the process was
+//! stopped, the host stood still) nor for what the kernel says his thread waited for its turn.
+
+use std::time::Duration;
+
+use super::processor::{Condition, Sample};
+use crate::{supervision::vitals::Sight, time::Time};
+
+/// Looks before the end of a budget at which the CPU's account is read, so that the last of them has one to compare with.
+const LAST_LOOKS: u32 = 4;
+
+/// One look at an actor.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Look {
+    pub(super) now: Time,
+    /// How much later than intended this look is.
+    pub(super) late: Duration,
+    pub(super) sight: Sight,
+}
+
+/// Who does not come back.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Hang {
+    pub(super) since: Time,
+    pub(super) lasted: Duration,
+    /// Of that, time that it was not given.
+    pub(super) excused: Duration,
+}
+
+/// Time that was not given to a thread, since its account was opened.
+#[derive(Clone, Copy, Debug, Default)]
+struct Account {
+    late: Duration,
+    first: Option<Sample>,
+    last: Option<Sample>,
+}
+
+impl Account {
+    /// Whether the thread waits for a CPU at this moment.
+    fn enter(&mut self, sample: Option<Sample>) -> bool {
+        let Some(sample) = sample else { return false };
+        let former = self.last.replace(sample);
+        self.first.get_or_insert(sample);
+        match sample.condition {
+            Condition::Stopped => true,
+            Condition::Runnable => {
+                former.is_some_and(|former| (former.ran, former.waited) == (sample.ran, sample.waited))
+            }
+            Condition::Blocked => false,
+        }
+    }
+
+    fn excused(&self) -> Duration {
+        let waited = match (self.first, self.last) {
+            (Some(first), Some(last)) => last.waited.saturating_sub(first.waited),
+            (None, _) | (_, None) => 0,
+        };
+        self.late + Duration::from_nanos(waited)
+    }
+}
+
+/// Watches one turn after the other.
+#[derive(Debug)]
+pub(super) struct TurnSuspect {
+    budget: Duration,
+    turn: u64,
+    first_seen: Time,
+    looks: u32,
+    account: Account,
+}
+
+impl TurnSuspect {
+    pub(super) fn new(budget: Duration) -> Self {
+        Self { budget, turn: 0, first_seen: Time::ZERO, looks: 0, account: Account::default() }
+    }
+
+    /// Takes a look. `sample` reads the CPU's account; it is called only when that matters.
+    pub(super) fn look(
+        &mut self,
+        look: Look,
+        period: Duration,
+        sample: impl FnOnce() -> Option<Sample>,
+    ) -> Option<Hang> {
+        let Look { now, late, sight } = look;
+        if sight.turn != self.turn || !sight.is_busy() {
+            let account = Account { late, ..Account::default() };
+            *self = Self { turn: sight.turn, first_seen: now, looks: 0, account, ..*self };
+            return None;
+        }
+        self.looks = self.looks.saturating_add(1);
+        self.account.late += late;
+        let since = sight.begun.unwrap_or(self.first_seen);
+        let lasted = now.since(since);
+        if self.looks > 1 && lasted + period * LAST_LOOKS < self.budget {
+            return None;
+        }
+        let waits_for_cpu = self.account.enter(sample());
+        let excused = self.account.excused();
+        let hangs = lasted >= self.budget + excused && !waits_for_cpu;
+        hangs.then_some(Hang { since, lasted, excused })
+    }
+
+    /// When the turn that was seen last is too long.
+    pub(super) fn deadline(&self, sight: Sight) -> Option<Time> {
+        let begun = sight.begun.unwrap_or(self.first_seen);
+        let is_same = sight.is_busy() && sight.turn == self.turn;
+        is_same.then(|| begun + self.budget + self.account.excused())
+    }
+}
+
+/// What the watchdog does about an actor for which messages wait.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Stall {
+    /// Nothing.
+    None,
+    /// Wakes it, to see whether its thread comes to it.
+    Probe,
+    /// It had its turn and takes nothing: it waits for something else. So many messages wait since then.
+    Waits(Hang),
+    /// Its thread did not come to it.
+    ThreadIsAway(Hang),
+}
+
+/// Watches whether an actor for which messages wait takes any.
+#[derive(Debug)]
+pub(super) struct StallSuspect {
+    budget: Duration,
+    /// `None` before the first look.
+    taken: Option<u64>,
+    since: Time,
+    probed: Option<u64>,
+    account: Account,
+}
+
+impl StallSuspect {
+    pub(super) fn new(budget: Duration) -> Self {
+        Self { budget, taken: None, since: Time::ZERO, probed: None, account: Account::default() }
+    }
+
+    /// Takes a look at an actor that should take messages; `waiting` wait and `taken` were taken so far.
+    pub(super) fn look(
+        &mut self,
+        look: Look,
+        waiting: usize,
+        taken: u64,
+        sample: impl FnOnce() -> Option<Sample>,
+    ) -> Stall {
+        let Look { now, late, sight } = look;
+        if waiting == 0 || self.taken != Some(taken) {
+            self.taken = Some(taken);
+            self.calm(now);
+            return Stall::None;
+        }
+        self.account.late += late;
+        let lasted = now.since(self.since);
+        let Some(probed) = self.probed else {
+            if lasted < self.budget / 2 {
+                return Stall::None;
+            }
+            self.probed = Some(sight.turn);
+            self.account.enter(sample());
+            return Stall::Probe;
+        };
+        if lasted < self.budget + self.account.late || sight.is_busy() {
+            // A turn that does not end is judged as such.
+            return Stall::None;
+        }
+        let hang = |excused| Hang { since: self.since, lasted, excused };
+        if sight.turn >= probed + 2 {
+            return Stall::Waits(hang(self.account.late));
+        }
+        let waits_for_cpu = self.account.enter(sample());
+        let excused = self.account.excused();
+        if waits_for_cpu || lasted < self.budget + excused {
+            return Stall::None;
+        }
+        Stall::ThreadIsAway(hang(excused))
+    }
+
+    /// Begins anew: whatever there was has an excuse.
+    pub(super) fn calm(&mut self, now: Time) {
+        (self.since, self.probed, self.account) = (now, None, Account::default());
+    }
+}
+
+#[cfg(test)]
+mod tests;
