@@ -47,7 +47,7 @@ pub use api::{ApiError, Endpoint, NodeApi, Received, Registration};
 pub use config::{ConfigFaults, NodeConfig};
 pub use lncl::RegisterError;
 pub use ndl::{KnownNode, LossReason, NodeEvent, Source};
-pub use node::{Node, NodeBuilder, NodeEnd, NodeHandle, StartError, Traffic};
+pub use node::{CommandError, Node, NodeBuilder, NodeEnd, NodeHandle, StartError, SupervisorSpec, Traffic};
 pub use outlet::OutletCounts;
 pub use serde;
 pub use sinew_runtime::{
@@ -55,7 +55,7 @@ pub use sinew_runtime::{
     outcome::{Outcome, Rejection},
     schedule::{Tick, TimerId},
     sender::{AskError, Confirmation, Destination, Reply, SendError, Sender},
-    supervision::{Place, ReadyGate, Restart},
+    supervision::{AutoShutdown, Place, ReadyGate, Reason, Refusal, Restart, Strategy},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
     wire::{Class, Kind, MessageBuffer, Payload},
@@ -70,9 +70,9 @@ pub mod prelude {
     pub use actix::{Actor, ActorContext, ActorFutureExt, AsyncContext, Handler, Running, fut::WrapFuture};
 
     pub use crate::{
-        AppAddress, AppContext, AppSpec, Away, Class, Delivery, LastWill, Node, NodeAddress, NodeBuilder,
-        NodeConfig, NodeEvent, Outcome, Payload, Place, RequirementEvent, RequirementPolicy, Restart,
-        Silence, StartError, Tick, Tid, Time, payload,
+        AppAddress, AppContext, AppSpec, AutoShutdown, Away, Class, Delivery, LastWill, Node, NodeAddress,
+        NodeBuilder, NodeConfig, NodeEvent, Outcome, Payload, Place, RequirementEvent, RequirementPolicy,
+        Restart, Silence, StartError, Strategy, SupervisorSpec, Tick, Tid, Time, payload,
     };
 }
 

@@ -30,7 +30,12 @@ impl Absences {
                     absence.begins(reason);
                 }
             }
-            SupervisorFact::AllReady | SupervisorFact::Ended(_) => {}
+            SupervisorFact::Deleted(id) => _ = self.0.borrow_mut().remove(id),
+            SupervisorFact::Starting(..)
+            | SupervisorFact::AllReady
+            | SupervisorFact::Done(..)
+            | SupervisorFact::Refused(..)
+            | SupervisorFact::Ended(_) => {}
         }
     }
 

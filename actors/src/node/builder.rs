@@ -1,7 +1,6 @@
 //! Declares a node and starts it.
 
 use std::{
-    collections::BTreeSet,
     process::ExitCode,
     sync::mpsc::sync_channel,
     time::{Duration, SystemTime},
@@ -9,12 +8,14 @@ use std::{
 
 use sinew_runtime::{
     app::DynApp,
+    supervision::{AutoShutdown, Flags},
     tid::{Incarnation, NodeAddress},
 };
 
 use super::{
     Node, NodeHandle,
     root::{self, RootEvent},
+    supervisor_spec::SupervisorSpec,
 };
 use crate::{
     config::{ConfigFaults, NodeConfig},
@@ -26,7 +27,7 @@ use crate::{
 /// Declares a node: its configuration and its applications.
 pub struct NodeBuilder {
     config: NodeConfig,
-    apps: Vec<DynApp>,
+    tree: SupervisorSpec,
     incarnation: Option<Incarnation>,
     heed_signals: bool,
     #[cfg(feature = "fault-points")]
@@ -35,7 +36,7 @@ pub struct NodeBuilder {
 
 impl std::fmt::Debug for NodeBuilder {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "NodeBuilder({}, {} applications)", self.config.name, self.apps.len())
+        write!(f, "NodeBuilder({}, {} applications)", self.config.name, self.tree.apps().len())
     }
 }
 
@@ -45,8 +46,8 @@ pub enum StartError {
     /// The configuration has faults; all of them are listed.
     #[error(transparent)]
     Config(#[from] ConfigFaults),
-    /// Two applications of the node have the same name.
-    #[error("two applications of this node are called '{0}'; names are unique on a node")]
+    /// Two children of the node have the same name.
+    #[error("two applications or supervisors of this node are called '{0}'; names are unique on a node")]
     SameName(String),
     /// An application could not be registered.
     #[error("application '{name}' cannot be registered: {why}")]
@@ -62,6 +63,22 @@ pub enum StartError {
     /// Applications require each other in a circle: none of them can be the first.
     #[error("these applications require each other in a circle: {}; take one requirement out", .0.join(" -> "))]
     Cycle(Vec<String>),
+    /// Applications wait for each other, some because their supervisor starts them in order.
+    #[error("these applications wait for each other in a circle, by the order of their start and by what they require: {}; change the order, or take a requirement out", .0.join(" -> "))]
+    OrderCycle(Vec<String>),
+    /// A child is significant and permanent.
+    #[error("'{0}' is significant, but permanent: it never ends for good; make it transient or temporary")]
+    PermanentSignificant(String),
+    /// A child is significant for a supervisor that does not end with it.
+    #[error(
+        "'{child}' is significant, but its supervisor '{supervisor}' never ends with its children; set `auto_shutdown`"
+    )]
+    SignificantForNobody {
+        /// The child.
+        child: String,
+        /// Its supervisor.
+        supervisor: String,
+    },
     /// Applications wait for what they require.
     #[error("after {within:?} these still wait:{}", list(.waiting))]
     Waiting {
@@ -87,7 +104,7 @@ impl NodeBuilder {
     pub(super) fn new(name: String) -> Self {
         Self {
             config: NodeConfig::new(name),
-            apps: Vec::new(),
+            tree: SupervisorSpec::new("applications"),
             incarnation: None,
             heed_signals: false,
             #[cfg(feature = "fault-points")]
@@ -148,7 +165,23 @@ impl NodeBuilder {
     /// Adds an application.
     #[must_use]
     pub fn app(mut self, app: impl Into<DynApp>) -> Self {
-        self.apps.push(app.into());
+        self.tree = self.tree.app(app);
+        self
+    }
+
+    /// Adds a supervisor with children of its own, beside the applications that are added here: to the node's own supervisor
+    /// it is one child more.
+    #[must_use]
+    pub fn supervisor(mut self, spec: SupervisorSpec) -> Self {
+        self.tree = self.tree.supervisor(spec);
+        self
+    }
+
+    /// Whether the node stops, in order, when the significant ones of the children added here have done their work. Default:
+    /// never.
+    #[must_use]
+    pub fn auto_shutdown(mut self, auto_shutdown: AutoShutdown) -> Self {
+        self.tree = self.tree.auto_shutdown(auto_shutdown);
         self
     }
 
@@ -163,16 +196,15 @@ impl NodeBuilder {
     /// The configuration has faults, an application cannot be registered, or a layer did not become ready.
     pub fn start(mut self) -> Result<Node, StartError> {
         self.config.validate()?;
-        let is_bystander = process::is_bystander(&self.config, &mut self.apps);
-        let mut names = BTreeSet::new();
-        if let Some(twice) = self.apps.iter().find(|app| !names.insert(app.name().to_owned())) {
-            return Err(StartError::SameName(twice.name().to_owned()));
-        }
+        let is_bystander = process::is_bystander(&self.config, &mut self.tree);
+        let auto_shutdown = self.tree.flags.auto_shutdown;
+        self.tree.flags = Flags { auto_shutdown, ..self.config.supervision.apps() };
+        self.tree.check()?;
         let patience = self.config.sync.layer_deadline * 4;
         let incarnation = self.incarnation.unwrap_or_else(wall_clock);
         let stores = Stores::new(self.config, incarnation);
         #[cfg(feature = "fault-points")]
-        super::faults::plan(&stores, &self.faults, &self.apps)?;
+        super::faults::plan(&stores, &self.faults, &self.tree.apps())?;
         #[cfg(not(feature = "fault-points"))]
         if std::env::var_os("SINEW_FAULTS").is_some() {
             tracing::warn!(
@@ -185,13 +217,13 @@ impl NodeBuilder {
         if is_bystander {
             return Ok(Node { handle, ended, thread: None });
         }
-        let (apps, heed_signals) = (self.apps, self.heed_signals);
+        let (tree, heed_signals) = (self.tree, self.heed_signals);
         if heed_signals && handle.root.post(RootEvent::HeedSignals).is_err() {
             return Err(StartError::Layers("the root's post is full before it was read".to_owned()));
         }
         let thread = std::thread::Builder::new()
             .name("root".to_owned())
-            .spawn(move || root::run(stores, apps, say_started, say_ended))?;
+            .spawn(move || root::run(stores, tree, say_started, say_ended))?;
         let node = Node { handle, ended, thread: Some(thread) };
         match started.recv_timeout(patience) {
             Ok(Ok(())) => Ok(node),

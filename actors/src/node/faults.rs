@@ -44,13 +44,13 @@ impl NodeHandle {
 }
 
 /// Reads and keeps what was planned for a node with these applications.
-pub(super) fn plan(stores: &Stores, texts: &[String], apps: &[DynApp]) -> Result<(), FaultError> {
+pub(super) fn plan(stores: &Stores, texts: &[String], apps: &[&DynApp]) -> Result<(), FaultError> {
     let is_known = |name: &str| LAYERS.contains(&name) || apps.iter().any(|app| app.name() == name);
     for text in texts {
         for (name, fault) in text.parse::<FaultPlan>()?.faults() {
             let name = full_name(name);
             if !is_known(name) {
-                let apps: Vec<_> = apps.iter().map(DynApp::name).collect();
+                let apps: Vec<_> = apps.iter().map(|app| app.name()).collect();
                 let why = format!(
                     "this node has the layers {} and the applications {}",
                     LAYERS.join(", "),

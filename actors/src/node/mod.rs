@@ -4,19 +4,26 @@
 //! root thread   Root (actix actor)
 //!                 |- layers: rest-for-one   LNCL, sync manager, GNCL, NDL   (the paper's order)
 //!                 `- applications: one-for-one, each held until what it requires is ready
+//!                      |- supervisors that the user declares, with applications and supervisors below them
+//!                      `- applications
 //! ```
 //!
 //! Stop runs backwards: applications are told first and may bring their outputs to a safe value, then the layers go.
 
 mod absences;
+mod apps;
 mod builder;
+mod commands;
 mod directory;
 #[cfg(feature = "fault-points")]
 mod faults;
 mod root;
+mod supervisor_spec;
 
 pub use builder::{NodeBuilder, StartError};
+pub use commands::CommandError;
 pub(crate) use root::{RootEvent, WAITS_MAX};
+pub use supervisor_spec::SupervisorSpec;
 
 use std::{
     net::SocketAddr,

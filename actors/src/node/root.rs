@@ -2,7 +2,6 @@
 
 use std::{
     cell::RefCell,
-    collections::BTreeMap,
     rc::Rc,
     sync::{Arc, atomic::Ordering, mpsc::SyncSender},
     time::Duration,
@@ -17,14 +16,21 @@ use sinew_runtime::{
     router::Outlet,
     sender::Sender,
     supervision::{
-        ChildId, ChildIds, ChildSpec, Input, Launch, Place, Policy, ReadyGate, Reason, Supervisor,
-        SupervisorFact, Threads, life,
+        ChildIds, ChildSpec, Input, Launch, Place, PlannedChild, Policy, ReadyGate, Reason, Roster,
+        Supervisor, SupervisorFact, SupervisorPlan, Threads, life,
     },
     tid::AppAddress,
 };
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::{NodeEnd, StartError, absences::Absences, directory::NodeDirectory};
+use super::{
+    NodeEnd, StartError,
+    absences::Absences,
+    apps::Apps,
+    commands::{Answers, Ordered},
+    directory::NodeDirectory,
+    supervisor_spec::{Member, SupervisorSpec},
+};
 use crate::{gncl, lncl, ndl, process, stores::Stores, sync};
 
 /// Confirmed messages and requests of one application under way at most.
@@ -46,37 +52,33 @@ pub(crate) enum RootEvent {
     HeedSignals,
     /// By the owner or a signal.
     StopOrdered,
+    /// By the owner: add, stop, start again or remove a child.
+    Ordered(Ordered),
     /// By the owner: say when every application runs.
     TellWhenRunning(SyncSender<Result<(), StartError>>),
 }
 
-struct App {
-    address: AppAddress,
-    mailbox: Arc<Mailbox>,
-    running: bool,
-}
-
 /// How far the node is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Phase {
+pub(super) enum Phase {
     StartingLayers,
     Running,
     StoppingApps,
     StoppingLayers,
 }
 
-struct Root {
-    stores: Arc<Stores>,
+pub(super) struct Root {
+    pub(super) stores: Arc<Stores>,
     threads: Rc<RefCell<Threads>>,
-    phase: Phase,
+    pub(super) phase: Phase,
     end: NodeEnd,
-    declared: Vec<DynApp>,
+    declared: Option<SupervisorSpec>,
     child_ids: ChildIds,
-    apps: BTreeMap<ChildId, App>,
-    app_ids: BTreeMap<AppAddress, ChildId>,
+    pub(super) apps: Apps,
     absences: Absences,
-    layer_supervisor: Option<Post<Input>>,
-    app_supervisor: Option<Post<Input>>,
+    pub(super) answers: Answers,
+    pub(super) layer_supervisor: Option<Roster>,
+    pub(super) app_supervisor: Option<Roster>,
     last_layer_fault: Option<String>,
     cycle: Option<Vec<String>>,
     started: Option<SyncSender<Result<(), StartError>>>,
@@ -88,7 +90,7 @@ struct Root {
 /// The root thread's whole life.
 pub(super) fn run(
     stores: Arc<Stores>,
-    declared: Vec<DynApp>,
+    declared: SupervisorSpec,
     started: SyncSender<Result<(), StartError>>,
     ended: SyncSender<NodeEnd>,
 ) {
@@ -98,11 +100,11 @@ pub(super) fn run(
         threads: threads.clone(),
         phase: Phase::StartingLayers,
         end: NodeEnd::Stopped,
-        declared,
+        declared: Some(declared),
         child_ids: ChildIds::default(),
-        apps: BTreeMap::new(),
-        app_ids: BTreeMap::new(),
+        apps: Apps::default(),
         absences: Absences::default(),
+        answers: Answers::default(),
         layer_supervisor: None,
         app_supervisor: None,
         last_layer_fault: None,
@@ -130,15 +132,15 @@ impl Actor for Root {
         let layers = layers(&self.stores, &self.child_ids, deadline);
         let post = self.stores.posts.root.clone();
         let listener = move |fact| tell(&post, RootEvent::Layers(fact));
-        let (supervisor, post) = Supervisor::new(
-            "layers",
-            self.stores.config.supervision.layers(),
-            layers,
-            self.threads.clone(),
-            listener,
-        );
+        let plan = SupervisorPlan {
+            id: self.child_ids.next(),
+            name: "layers".to_owned(),
+            flags: self.stores.config.supervision.layers(),
+            children: layers.into_iter().map(PlannedChild::Worker).collect(),
+        };
+        let supervisor = Supervisor::of(plan, self.threads.clone(), listener);
+        self.layer_supervisor = Some(supervisor.roster());
         supervisor.start();
-        self.layer_supervisor = Some(post);
     }
 }
 
@@ -150,6 +152,7 @@ fn layers(stores: &Arc<Stores>, ids: &ChildIds, deadline: Duration) -> Vec<Child
     let child = |name: &str, thread: &str, launch: Launch| ChildSpec {
         id: ids.next(),
         name: name.to_owned(),
+        tid: None,
         policy: Policy { start_within: deadline, ..Policy::default() },
         place: Place::thread(thread),
         #[cfg(feature = "fault-points")]
@@ -190,6 +193,7 @@ impl StreamHandler<RootEvent> for Root {
             }
             RootEvent::Layers(fact) => self.layers_said(fact, context),
             RootEvent::Apps(fact) => self.apps_said(fact),
+            RootEvent::Ordered(ordered) => self.ordered(ordered),
             RootEvent::HeedSignals => self.heed_signals(context),
             RootEvent::StopOrdered => self.stop_apps(),
             RootEvent::TellWhenRunning(say) => {
@@ -202,8 +206,8 @@ impl StreamHandler<RootEvent> for Root {
 
 impl Root {
     fn release(&self, app: AppAddress) {
-        match (self.app_ids.get(&app), &self.app_supervisor) {
-            (Some(id), Some(supervisor)) => order(supervisor, Input::Released(*id)),
+        match (self.apps.with_address(app), &self.app_supervisor) {
+            (Some(id), Some(supervisor)) => order(supervisor, Input::Released(id)),
             // Not an application of this process: LNCL knows its client.
             (None, _) => {
                 if self.stores.posts.lncl.post(lncl::Event::Released { app }).is_err() {
@@ -224,7 +228,12 @@ impl Root {
                 }
             }
             SupervisorFact::Ended(reason) => self.layers_ended(&reason, context),
-            SupervisorFact::AllReady | SupervisorFact::Ready(_) => {}
+            SupervisorFact::AllReady
+            | SupervisorFact::Starting(..)
+            | SupervisorFact::Ready(_)
+            | SupervisorFact::Deleted(_)
+            | SupervisorFact::Done(..)
+            | SupervisorFact::Refused(..) => {}
         }
     }
 
@@ -248,11 +257,10 @@ impl Root {
 
     fn start_apps(&mut self) {
         self.phase = Phase::Running;
-        let declared = std::mem::take(&mut self.declared);
-        let registered: Result<Vec<_>, _> = declared.iter().map(|app| self.register(app)).collect();
-        let answer = match registered {
-            Ok(children) => {
-                self.supervise(children);
+        let declared = self.declared.take().map(|spec| self.plan(spec).map(|(plan, _)| plan));
+        let answer = match declared.transpose() {
+            Ok(plan) => {
+                plan.into_iter().for_each(|plan| self.supervise(plan));
                 Ok(())
             }
             Err(error) => Err(error),
@@ -267,28 +275,41 @@ impl Root {
         }
     }
 
-    fn supervise(&mut self, children: Vec<ChildSpec>) {
+    /// Registers the applications of a supervisor and of all below it.
+    fn plan(&mut self, spec: SupervisorSpec) -> Result<(SupervisorPlan, Policy), StartError> {
+        let SupervisorSpec { name, flags, policy, members } = spec;
+        let id = self.child_ids.next();
+        self.apps.add_supervisor(id, &name);
+        let mut children = Vec::new();
+        for member in members {
+            children.push(match member {
+                Member::App(app) => PlannedChild::Worker(self.register(&app)?),
+                Member::Supervisor(below) => {
+                    let (plan, policy) = self.plan(below)?;
+                    PlannedChild::Supervisor(plan, policy)
+                }
+            });
+        }
+        Ok((SupervisorPlan { id, name, flags, children }, policy))
+    }
+
+    fn supervise(&mut self, plan: SupervisorPlan) {
         let post = self.stores.posts.root.clone();
-        let absences = self.absences.clone();
+        let (absences, apps, stores) = (self.absences.clone(), self.apps.clone(), self.stores.clone());
         let listener = move |fact| {
-            // At once, not through the post: a new life must not be started before.
+            // At once, not through the post: before the next thing happens.
             absences.hear(&fact);
+            apps.hear(&stores, &fact);
             tell(&post, RootEvent::Apps(fact));
         };
-        let (supervisor, post) = Supervisor::new(
-            "applications",
-            self.stores.config.supervision.apps(),
-            children,
-            self.threads.clone(),
-            listener,
-        );
+        let supervisor = Supervisor::of(plan, self.threads.clone(), listener);
+        self.app_supervisor = Some(supervisor.roster());
         supervisor.start();
-        self.app_supervisor = Some(post);
         self.tell_if_running();
     }
 
     /// Gives an application its address, its mailbox and its routes.
-    fn register(&mut self, app: &DynApp) -> Result<ChildSpec, StartError> {
+    pub(super) fn register(&mut self, app: &DynApp) -> Result<ChildSpec, StartError> {
         let config = &self.stores.config;
         if let Some(why) = app.fault() {
             return Err(StartError::Application { name: app.name().to_owned(), why });
@@ -320,8 +341,7 @@ impl Root {
         let directory = Arc::new(NodeDirectory(self.stores.clone()));
         let sender = Sender::new(tid, self.stores.router.clone(), directory, pending, config.payload_max);
         let id = self.child_ids.next();
-        self.app_ids.insert(tid.app, id);
-        self.apps.insert(id, App { address: tid.app, mailbox: mailbox.clone(), running: false });
+        self.apps.add(id, app.name(), tid, mailbox.clone());
         let wiring = AppWiring { sender, mailbox };
         self.absences.keep(id, app.absence(wiring.clone()));
         let (place, launch) = match hosted {
@@ -330,32 +350,21 @@ impl Root {
         };
         #[cfg(feature = "fault-points")]
         let launch = super::faults::arm(&self.stores, app, launch);
-        Ok(ChildSpec { id, name: app.name().to_owned(), policy: app.policy().clone(), place, launch })
+        let (name, policy) = (app.name().to_owned(), app.policy().clone());
+        Ok(ChildSpec { id, name, tid: Some(tid), policy, place, launch })
     }
 
     fn apps_said(&mut self, fact: SupervisorFact) {
+        self.answered(&fact);
         match fact {
-            SupervisorFact::Ready(id) => {
-                if let Some(app) = self.apps.get_mut(&id) {
-                    app.running = true;
-                    lncl::app_ready(&self.stores, app.address);
-                    self.tell_if_running();
-                }
-            }
-            SupervisorFact::Failed(id, _) => {
-                if let Some(app) = self.apps.get_mut(&id) {
-                    app.running = false;
-                    lncl::app_down(&self.stores, app.address);
-                }
-            }
-            SupervisorFact::Gone(id, _) => {
-                if let Some(app) = self.apps.get_mut(&id) {
-                    app.running = false;
-                    app.mailbox.close();
-                    lncl::unregister_local(&self.stores, app.address);
-                }
-            }
-            SupervisorFact::AllReady => {}
+            SupervisorFact::Ready(_)
+            | SupervisorFact::Gone(..)
+            | SupervisorFact::Deleted(_)
+            | SupervisorFact::Refused(..) => self.tell_if_running(),
+            SupervisorFact::Starting(..)
+            | SupervisorFact::Failed(..)
+            | SupervisorFact::AllReady
+            | SupervisorFact::Done(..) => {}
             SupervisorFact::Ended(reason) => self.apps_ended(&reason),
         }
     }
@@ -365,14 +374,13 @@ impl Root {
             self.end = NodeEnd::GaveUp(format!("applications: {why}"));
         }
         self.app_supervisor = None;
-        for app in self.apps.values() {
-            app.mailbox.close();
-        }
+        self.answer_all_that_wait();
+        self.apps.close();
         self.stop_layers();
     }
 
     fn tell_if_running(&mut self) {
-        let is_running = self.app_supervisor.is_some() && self.apps.values().all(|app| app.running);
+        let is_running = self.app_supervisor.is_some() && self.apps.all_run();
         if is_running || self.cycle.is_some() {
             for say in self.tell_when_running.drain(..) {
                 let answer = match &self.cycle {
@@ -438,8 +446,8 @@ impl Root {
     }
 }
 
-fn order(supervisor: &Post<Input>, input: Input) {
-    if let Err(lost) = supervisor.post(input) {
+fn order(supervisor: &Roster, input: Input) {
+    if let Err(lost) = supervisor.tell(input) {
         tracing::error!(?lost, "a supervisor's post is full");
     }
 }

@@ -39,22 +39,23 @@ pub(crate) use link::Link;
 
 use role::{Role, role};
 
-use sinew_runtime::app::DynApp;
-
-use crate::config::NodeConfig;
+use crate::{config::NodeConfig, node::SupervisorSpec};
 
 /// What the builder of a node does instead of starting it, if this process hosts an application. Returns whether it
 /// is to do nothing; does not return if it is to host.
-pub(crate) fn is_bystander(config: &NodeConfig, apps: &mut Vec<DynApp>) -> bool {
+pub(crate) fn is_bystander(config: &NodeConfig, tree: &mut SupervisorSpec) -> bool {
     match role(config) {
         Role::Node => {
-            if apps.iter().any(|app| app.place().own_process) {
+            if tree.apps().iter().any(|app| app.place().own_process) {
                 // Now, so that processes inherit priority and CPUs of the caller and not of one of the node's threads.
                 spawn::begin_spawning();
             }
             false
         }
         Role::Bystander => true,
-        Role::Host(hosting) => host::host(config, std::mem::take(apps), hosting),
+        Role::Host(hosting) => {
+            let tree = std::mem::replace(tree, SupervisorSpec::new(""));
+            host::host(config, tree.into_apps(), hosting)
+        }
     }
 }

@@ -167,6 +167,23 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self
     }
 
+    /// Its end may be the end of its supervisor; see [`AutoShutdown`](crate::supervision::AutoShutdown). For one that is
+    /// transient or temporary.
+    #[must_use]
+    pub const fn significant(mut self) -> Self {
+        self.common.policy.significant = true;
+        self
+    }
+
+    /// The wait before it is started again: `min` at first, doubled by each failure in a row up to `max`, then shortened by
+    /// chance by up to a quarter. Default 1 ms to 2 s.
+    #[must_use]
+    pub const fn backoff(mut self, min: Duration, max: Duration) -> Self {
+        self.common.policy.backoff_min = min;
+        self.common.policy.backoff_max = max;
+        self
+    }
+
     /// Time that it has to become ready once it is started. Default 10 s; after it the start has failed and is tried again.
     /// One that holds its readiness (`hold_ready`) for a device that may be off sets what it is willing to wait.
     #[must_use]

@@ -276,6 +276,11 @@ impl Mailbox {
         lock(&self.shared).closed
     }
 
+    /// Takes messages again, after it was [closed](Self::close).
+    pub fn reopen(&self) {
+        lock(&self.shared).closed = false;
+    }
+
     /// Messages that wait now.
     #[must_use]
     pub fn depth(&self) -> usize {

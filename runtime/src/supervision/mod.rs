@@ -6,6 +6,7 @@
 //! | `supervisor` | the actix actor that carries them out |
 //! | `guard` | the future around each actor: catches its panics, takes its stop order, reports its end |
 //! | `alone` | one actor under a guard and under no supervisor |
+//! | `roster` | who is supervised, for the supervisor's owner |
 //! | `ready` | when an actor may say that it is ready |
 //! | `threads` | where actors live |
 //! | `tenant` | one life of an actor, as its supervisor, its thread and the watchdog hold it |
@@ -21,6 +22,7 @@ pub mod fault;
 mod guard;
 mod panics;
 mod ready;
+mod roster;
 mod supervisor;
 mod tenant;
 mod threads;
@@ -29,10 +31,14 @@ mod watchdog;
 
 pub use self::{
     alone::{AloneHandle, alone},
-    core::{AutoShutdown, ChildId, ChildIds, Flags, Input, Intensity, Policy, Reason, Restart, Strategy},
+    core::{
+        AutoShutdown, ChildId, ChildIds, Command, Flags, Generation, Input, Intensity, Policy, Reason,
+        Refusal, Restart, Strategy,
+    },
     guard::{Life, life},
     panics::UNWINDS,
     ready::{ReadyGate, ReadyPart},
-    supervisor::{ChildSpec, Launch, Supervisor, SupervisorFact},
+    roster::{Listed, Roster},
+    supervisor::{ChildSpec, Launch, PlannedChild, Supervisor, SupervisorFact, SupervisorPlan},
     threads::{Place, Threads},
 };

@@ -7,13 +7,14 @@ use actix::{Actor, ActorContext, AsyncContext, Context, SpawnHandle, StreamHandl
 use crate::{
     post::Post,
     supervision::{
-        Life, Place, ReadyGate, Reason, Threads,
-        core::{ChildId, Core, Flags, Generation, Input, Order, Policy},
+        Life, Place, ReadyGate, Reason, Roster, Threads,
+        core::{ChildId, Command, Flags, Generation, Input, Order, Policy, Refusal},
         guard::Guard,
         panics::install_hook,
         tenant::{Fate, Tenant},
         vitals::Vitals,
     },
+    tid::Tid,
     time::Time,
 };
 
@@ -26,6 +27,8 @@ pub struct ChildSpec {
     pub id: ChildId,
     /// Its name, for people.
     pub name: String,
+    /// Its address, if it has one; for people, too.
+    pub tid: Option<Tid>,
     /// What its supervisor may do with it.
     pub policy: Policy,
     /// Where it runs.
@@ -34,17 +37,45 @@ pub struct ChildSpec {
     pub launch: Launch,
 }
 
+/// A supervisor to be.
+pub struct SupervisorPlan {
+    /// Which child of its node it is.
+    pub id: ChildId,
+    /// Its name, for people.
+    pub name: String,
+    /// How it treats its children.
+    pub flags: Flags,
+    /// Its children, in the order of their start.
+    pub children: Vec<PlannedChild>,
+}
+
+/// A child to be.
+pub enum PlannedChild {
+    /// An actor.
+    Worker(ChildSpec),
+    /// A supervisor, and what its parent may do with it; its deadlines are those of its children.
+    Supervisor(SupervisorPlan, Policy),
+}
+
 /// What a supervisor says to its owner.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum SupervisorFact {
+    /// A new life of this child is about to be started. Said before it is.
+    Starting(ChildId, Generation),
     /// This child takes messages.
     Ready(ChildId),
     /// This child failed or was stopped, and is started again if its turn comes.
     Failed(ChildId, Reason),
-    /// This child is gone for good.
+    /// This child is gone. It is not started again unless by a command, or together with its group.
     Gone(ChildId, Reason),
-    /// All children that are wanted and released are ready.
+    /// This child is forgotten.
+    Deleted(ChildId),
+    /// All children that are wanted are ready.
     AllReady,
+    /// A command is carried out.
+    Done(Command, ChildId),
+    /// A command is not carried out.
+    Refused(Command, ChildId, Refusal),
     /// No child lives any more.
     Ended(Reason),
 }
@@ -57,8 +88,7 @@ struct Child {
 
 /// Supervises children; ends when none of them lives any more.
 pub struct Supervisor {
-    name: &'static str,
-    core: Core,
+    roster: Roster,
     children: BTreeMap<ChildId, Child>,
     threads: Rc<RefCell<Threads>>,
     post: Post<Input>,
@@ -72,38 +102,64 @@ const POST_CAPACITY: usize = 16_384;
 const LETTING_GO: Duration = Duration::from_millis(200);
 
 impl Supervisor {
-    /// A supervisor called `name`, and the post through which it hears. `listener` is told of what happens, on the
-    /// supervisor's thread.
+    /// A supervisor called `name` of children that are no supervisors, and the post through which it hears; see
+    /// [`of`](Self::of).
     pub fn new(
-        name: &'static str,
+        name: &str,
         flags: impl Into<Flags>,
         children: Vec<ChildSpec>,
         threads: Rc<RefCell<Threads>>,
         listener: impl FnMut(SupervisorFact) + 'static,
     ) -> (Self, Post<Input>) {
-        let policies = children.iter().map(|child| (child.id, child.policy.clone())).collect();
-        let post = Post::new(POST_CAPACITY);
-        let supervisor = Self {
-            name,
-            core: Core::new(flags.into(), seed(), policies),
-            children: children.into_iter().map(|spec| (spec.id, Child { spec, tenant: None })).collect(),
-            threads,
-            post: post.clone(),
-            listener: Box::new(listener),
-            alarm: None,
+        let plan = SupervisorPlan {
+            // Nobody's child: any id that no child has.
+            id: ChildId(u64::MAX),
+            name: name.to_owned(),
+            flags: flags.into(),
+            children: children.into_iter().map(PlannedChild::Worker).collect(),
         };
+        let supervisor = Self::of(plan, threads, listener);
+        let post = supervisor.post.clone();
         (supervisor, post)
     }
 
+    /// A tree of supervisors, all of them in this one actor. `listener` is told of what happens, on the supervisor's thread
+    /// and at once: before the next thing happens.
+    pub fn of(
+        plan: SupervisorPlan,
+        threads: Rc<RefCell<Threads>>,
+        listener: impl FnMut(SupervisorFact) + 'static,
+    ) -> Self {
+        let post = Post::new(POST_CAPACITY);
+        let (roster, workers) = Roster::new(plan, seed(), post.clone());
+        Self {
+            roster,
+            children: workers.into_iter().map(|spec| (spec.id, Child { spec, tenant: None })).collect(),
+            threads,
+            post,
+            listener: Box::new(listener),
+            alarm: None,
+        }
+    }
+
+    /// Who is supervised, for the owner.
+    #[must_use]
+    pub fn roster(&self) -> Roster {
+        self.roster.clone()
+    }
+
     fn feed(&mut self, input: Input, context: &mut Context<Self>) {
-        self.core.handle(Time::now(), input);
-        while let Some(order) = self.core.poll() {
+        self.decide(input);
+        loop {
+            let next = self.roster.tree.borrow_mut().poll();
+            let Some(order) = next else { break };
             self.obey(order, context);
         }
         if let Some(alarm) = self.alarm.take() {
             context.cancel_future(alarm);
         }
-        if let Some(wake) = self.core.next_wake() {
+        let next_wake = self.roster.tree.borrow().next_wake();
+        if let Some(wake) = next_wake {
             let wait = wake.since(Time::now());
             self.alarm = Some(context.run_later(wait, |this, context| {
                 this.alarm = None;
@@ -112,41 +168,117 @@ impl Supervisor {
         }
     }
 
+    fn decide(&mut self, input: Input) {
+        let now = Time::now();
+        let arrival = match &input {
+            Input::AddChild(id, _) => self.roster.take_arrival(*id),
+            Input::Started
+            | Input::Released(_)
+            | Input::BecameReady(..)
+            | Input::Hung(..)
+            | Input::Ended(..)
+            | Input::TimePassed
+            | Input::StopOrdered
+            | Input::TerminateChild(_)
+            | Input::RestartChild(_)
+            | Input::DeleteChild(_) => None,
+        };
+        let mut tree = self.roster.tree.borrow_mut();
+        match arrival {
+            Some((under, spec)) => {
+                let (id, policy) = (spec.id, spec.policy.clone());
+                self.children.insert(id, Child { spec, tenant: None });
+                tree.add(now, under, id, policy);
+            }
+            None => tree.handle(now, input),
+        }
+    }
+
     fn obey(&mut self, order: Order, context: &mut Context<Self>) {
         match order {
-            Order::Spawn(id, generation) => self.spawn(id, generation),
+            Order::Spawn(id, generation) => {
+                self.note(id, "starting");
+                (self.listener)(SupervisorFact::Starting(id, generation));
+                self.spawn(id, generation);
+            }
             Order::Stop(id, _) => {
+                self.note(id, "told to stop");
                 if let Some(tenant) = self.children.get(&id).and_then(|child| child.tenant.as_ref()) {
                     tenant.stop();
                 }
             }
             Order::Abandon(id, _) => self.abandon(id, context),
             Order::Failed(id, reason) => {
-                if reason.is_failure() {
-                    tracing::error!(supervisor = self.name, child = self.name_of(id), %reason, "a child failed");
-                }
+                let reason = self.in_words(reason);
+                self.note_end(id, &reason);
                 (self.listener)(SupervisorFact::Failed(id, reason));
             }
             Order::Ready(id) => {
-                tracing::debug!(supervisor = self.name, child = self.name_of(id), "ready");
+                self.note(id, "ready");
                 (self.listener)(SupervisorFact::Ready(id));
             }
             Order::Gone(id, reason) => {
-                tracing::info!(supervisor = self.name, child = self.name_of(id), %reason, "gone");
+                let reason = self.in_words(reason);
+                self.note_end(id, &reason);
                 (self.listener)(SupervisorFact::Gone(id, reason));
             }
-            // Commands come to this shell with supervisors that are built at run time.
-            Order::Deleted(_) | Order::Done(..) | Order::Refused(..) => {}
+            Order::Deleted(id) => {
+                self.note(id, "deleted");
+                self.forget(id);
+                (self.listener)(SupervisorFact::Deleted(id));
+            }
+            Order::Done(command, id) => (self.listener)(SupervisorFact::Done(command, id)),
+            Order::Refused(command, id, why) => {
+                if command == Command::Add && why != Refusal::Present {
+                    self.forget(id);
+                }
+                (self.listener)(SupervisorFact::Refused(command, id, why));
+            }
             Order::AllReady => (self.listener)(SupervisorFact::AllReady),
             Order::Ended(reason) => {
+                let reason = self.in_words(reason);
                 (self.listener)(SupervisorFact::Ended(reason));
                 context.stop();
             }
         }
     }
 
-    fn name_of(&self, id: ChildId) -> &str {
-        self.children.get(&id).map_or("unknown", |child| &child.spec.name)
+    fn forget(&mut self, id: ChildId) {
+        self.children.remove(&id);
+        self.roster.strike(id);
+    }
+
+    fn in_words(&self, reason: Reason) -> Reason {
+        if let Reason::GaveUp(why) = reason {
+            return Reason::GaveUp(self.roster.in_words(&why));
+        }
+        reason
+    }
+
+    /// One event for each change, for whoever reads them.
+    fn note(&self, id: ChildId, what: &'static str) {
+        let (supervisor, tid) = (self.roster.supervisor_of(id), self.tid_of(id));
+        let (generation, restarts) = self.life_of(id);
+        tracing::debug!(supervisor, child = self.roster.name(id), tid, generation, restarts, "{what}");
+    }
+
+    fn note_end(&self, id: ChildId, reason: &Reason) {
+        let (supervisor, tid) = (self.roster.supervisor_of(id), self.tid_of(id));
+        let (child, (generation, restarts)) = (self.roster.name(id), self.life_of(id));
+        if reason.is_failure() {
+            tracing::error!(supervisor, child, tid, generation, restarts, %reason, "a child failed");
+        } else {
+            tracing::info!(supervisor, child, tid, generation, restarts, %reason, "a child ended");
+        }
+    }
+
+    fn tid_of(&self, id: ChildId) -> Option<String> {
+        self.children.get(&id).and_then(|child| child.spec.tid).map(|tid| tid.to_string())
+    }
+
+    fn life_of(&self, id: ChildId) -> (Generation, u64) {
+        let child = self.roster.tree.borrow().child(id);
+        child.map_or((0, 0), |child| (child.generation, child.restarts))
     }
 
     fn spawn(&mut self, id: ChildId, generation: Generation) {
@@ -185,7 +317,7 @@ impl Supervisor {
     fn abandon(&mut self, id: ChildId, context: &mut Context<Self>) {
         let Some(Child { spec, tenant }) = self.children.get_mut(&id) else { return };
         let Some(tenant) = tenant.take() else { return };
-        tracing::error!(supervisor = self.name, child = spec.name, "its life is taken");
+        tracing::error!(supervisor = self.roster.supervisor_of(id), child = spec.name, "its life is taken");
         tenant.kill();
         if tenant.holds_its_thread().is_some() {
             self.threads.borrow_mut().give_up(&tenant);

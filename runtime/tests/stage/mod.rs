@@ -70,6 +70,7 @@ impl Stage {
             router.set_local(address, LocalRoute { outlet, events: Arc::new([]) });
             children.push(ChildSpec {
                 id: ChildId(index as u64),
+                tid: None,
                 name: app.name().to_owned(),
                 policy: Policy { held: false, ..app.policy().clone() },
                 place: app.place().clone(),

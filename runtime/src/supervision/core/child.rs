@@ -95,6 +95,15 @@ impl Child {
         }
     }
 
+    /// What the next life of its supervisor takes over: the past, for who asks, and a release that came since.
+    pub(super) fn renew(&mut self, former: Option<&Self>) {
+        let Some(former) = former else { return };
+        self.released = former.released;
+        self.starts = former.starts;
+        self.last_reason.clone_from(&former.last_reason);
+        self.since = former.since;
+    }
+
     pub(super) const fn enter(&mut self, state: ChildState, now: Time) {
         self.state = state;
         self.since = now;

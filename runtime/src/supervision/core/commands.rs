@@ -101,21 +101,13 @@ impl Core {
         self.orders.push_back(Order::Refused(command, id, refusal));
     }
 
-    /// All that is said after the end: that a command comes too late.
-    pub(super) fn refuse_after_the_end(&mut self, input: &Input) {
-        let (command, id) = match input {
-            Input::AddChild(id, _) => (Command::Add, *id),
-            Input::TerminateChild(id) => (Command::Terminate, *id),
-            Input::RestartChild(id) => (Command::Restart, *id),
-            Input::DeleteChild(id) => (Command::Delete, *id),
-            Input::Started
-            | Input::Released(_)
-            | Input::BecameReady(..)
-            | Input::Hung(..)
-            | Input::Ended(..)
-            | Input::TimePassed
-            | Input::StopOrdered => return,
-        };
-        self.refuse(command, id, Refusal::Ending);
+    /// After the end a command comes too late; and a release is kept for the next life.
+    pub(super) fn hear_after_the_end(&mut self, input: &Input) {
+        if let Input::Released(id) = input {
+            self.released(*id);
+        }
+        if let Some((command, id)) = input.command() {
+            self.refuse(command, id, Refusal::Ending);
+        }
     }
 }

@@ -29,6 +29,26 @@ pub enum Input {
     DeleteChild(ChildId),
 }
 
+impl Input {
+    /// Which command it is, and for whom, if it is one.
+    #[must_use]
+    pub const fn command(&self) -> Option<(Command, ChildId)> {
+        match self {
+            Self::AddChild(id, _) => Some((Command::Add, *id)),
+            Self::TerminateChild(id) => Some((Command::Terminate, *id)),
+            Self::RestartChild(id) => Some((Command::Restart, *id)),
+            Self::DeleteChild(id) => Some((Command::Delete, *id)),
+            Self::Started
+            | Self::Released(_)
+            | Self::BecameReady(..)
+            | Self::Hung(..)
+            | Self::Ended(..)
+            | Self::TimePassed
+            | Self::StopOrdered => None,
+        }
+    }
+}
+
 /// What a supervisor was asked to do with a child at run time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Command {
@@ -79,7 +99,7 @@ pub enum Order {
     Gone(ChildId, Reason),
     /// For others: this child is forgotten.
     Deleted(ChildId),
-    /// For others: every child that is wanted and not held is ready. Said again after each restart.
+    /// For others: every child that is wanted is ready. Said again after each restart.
     AllReady,
     /// For who asked: the command is carried out. A terminated child has ended; a child that was added or restarted has its
     /// start before it.

@@ -18,6 +18,7 @@
 //! | `restart` | what follows when a child has ended |
 //! | `commands` | children added, terminated, restarted, deleted |
 //! | `reconcile` | stops and starts, in order |
+//! | `tree` | supervisors in supervisors |
 
 mod child;
 mod commands;
@@ -35,6 +36,9 @@ mod simulation;
 mod table;
 #[cfg(test)]
 mod tests;
+mod tree;
+#[cfg(test)]
+mod tree_tests;
 mod window;
 
 use std::collections::{BTreeSet, VecDeque};
@@ -45,6 +49,7 @@ pub use event::{Command, Input, Order, Refusal};
 pub use id::{ChildId, ChildIds, Generation};
 pub use policy::{AutoShutdown, Flags, Intensity, Policy, Restart, Strategy};
 pub use reason::Reason;
+pub use tree::{BranchView, Plan, Planned, Tree};
 use window::{Chance, Window};
 
 use crate::time::Time;
@@ -93,13 +98,16 @@ impl Core {
     }
 
     /// The same supervisor in its next life, with these children. It has forgotten everything but which lives of theirs were
-    /// before, and which of those have not let go.
+    /// before, which of those have not let go, and who was released since.
     #[must_use]
     pub fn renewed(&self, children: Vec<(ChildId, Policy)>) -> Self {
         let mut core = Self::new(self.flags, self.chance.0, Vec::new());
         core.last_generation = self.last_generation;
         core.abandoned.clone_from(&self.abandoned);
         core.take_in(children);
+        for child in &mut core.children {
+            child.renew(self.children.iter().find(|former| former.id == child.id));
+        }
         core
     }
 
@@ -111,7 +119,7 @@ impl Core {
     /// Takes an event. Then drain [`poll`](Self::poll).
     pub fn handle(&mut self, now: Time, input: Input) {
         if self.ended {
-            return self.refuse_after_the_end(&input);
+            return self.hear_after_the_end(&input);
         }
         match input {
             Input::Started => self.start(),
@@ -182,6 +190,12 @@ impl Core {
     #[must_use]
     pub const fn is_ending(&self) -> bool {
         self.ending.is_some()
+    }
+
+    /// Whether it has said its last word.
+    #[must_use]
+    pub const fn has_ended(&self) -> bool {
+        self.ended
     }
 
     fn position(&self, id: ChildId) -> Option<usize> {

@@ -78,8 +78,7 @@ impl Child {
         }
     }
 
-    /// Sinew: a held child waits for its release. One that waits keeps those after it waiting, but not the word that all
-    /// are ready.
+    /// Sinew: a held child waits for its release, and those after it, where they are started in order, with it.
     fn held_back(&self) -> bool {
         self.pid == Pid::Due && self.policy.held && !self.released
     }
@@ -156,7 +155,7 @@ impl Model {
         restart_at: &dyn Fn(ChildId) -> Option<Time>,
     ) -> Vec<Order> {
         if self.ended {
-            if let Some((command, id)) = command(input) {
+            if let Some((command, id)) = input.command() {
                 self.say(Order::Refused(command, id, Refusal::Ending));
             }
             return std::mem::take(&mut self.expected);
@@ -168,7 +167,7 @@ impl Model {
     }
 
     fn hear(&mut self, now: Time, input: &Input, restart_at: &dyn Fn(ChildId) -> Option<Time>) {
-        if let Some((command, id)) = command(input) {
+        if let Some((command, id)) = input.command() {
             return self.obey(command, id, input);
         }
         match input {
@@ -454,7 +453,8 @@ impl Model {
                     Reason::GaveUp(words)
                 }));
             }
-            None => self.start_who_is_due(now, together),
+            None if self.started => self.start_who_is_due(now, together),
+            None => {}
         }
     }
 
@@ -472,9 +472,9 @@ impl Model {
                 break;
             }
         }
-        let rests = |child: &Child| matches!(child.pid, Pid::Up(_) | Pid::Undefined) || child.held_back();
+        let rests = |child: &Child| matches!(child.pid, Pid::Up(_) | Pid::Undefined);
         let leaves = |child: &Child| child.fate == Some(Fate::StayDown);
-        if self.started && !self.settled && self.children.iter().all(|child| rests(child) || leaves(child)) {
+        if !self.settled && self.children.iter().all(|child| rests(child) || leaves(child)) {
             self.settled = true;
             self.say(Order::AllReady);
         }
@@ -515,21 +515,5 @@ impl Child {
         let wait = (0..self.in_a_row).fold(self.policy.backoff_min, |wait, _| wait.saturating_mul(2));
         self.in_a_row += 1;
         wait.min(self.policy.backoff_max)
-    }
-}
-
-fn command(input: &Input) -> Option<(Command, ChildId)> {
-    match input {
-        Input::AddChild(id, _) => Some((Command::Add, *id)),
-        Input::TerminateChild(id) => Some((Command::Terminate, *id)),
-        Input::RestartChild(id) => Some((Command::Restart, *id)),
-        Input::DeleteChild(id) => Some((Command::Delete, *id)),
-        Input::Started
-        | Input::Released(_)
-        | Input::BecameReady(..)
-        | Input::Hung(..)
-        | Input::Ended(..)
-        | Input::TimePassed
-        | Input::StopOrdered => None,
     }
 }

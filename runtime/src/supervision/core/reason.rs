@@ -45,7 +45,7 @@ impl std::fmt::Display for Reason {
             Self::ThreadEnded => f.write_str("lost its thread"),
             Self::ProcessEnded(how) => write!(f, "its process ended: {how}"),
             Self::RequirementLost(name) => write!(f, "stopped because it lost what it requires: {name}"),
-            Self::GaveUp(why) => f.write_str(why),
+            Self::GaveUp(why) => write!(f, "gave up: {why}"),
         }
     }
 }

@@ -13,10 +13,12 @@ impl Core {
             self.orders.push_back(Order::Ended(why));
             return;
         }
+        if !self.started {
+            return;
+        }
         self.start_in_order(now);
-        let settled =
-            |child: &Child| !child.wanted || child.state == ChildState::Ready || child.waits_for_release();
-        if self.started && !self.said_all_ready && self.children.iter().all(settled) {
+        let settled = |child: &Child| !child.wanted || child.state == ChildState::Ready;
+        if !self.said_all_ready && self.children.iter().all(settled) {
             self.said_all_ready = true;
             self.orders.push_back(Order::AllReady);
         }

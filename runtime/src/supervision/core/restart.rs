@@ -100,8 +100,8 @@ impl Core {
             false => (&mut self.restarts, restarts_max, "restarts"),
         };
         if counted.add(now, max, window) {
-            let seconds = window.as_secs_f32();
-            let why = format!("more than {max} {what} in {seconds} s; the last child to fail {reason}");
+            let (seconds, id) = (window.as_secs_f32(), self.children[index].id);
+            let why = format!("more than {max} {what} in {seconds} s, the last by {id}, which {reason}");
             self.end(now, Reason::GaveUp(why));
             return;
         }

@@ -125,8 +125,10 @@ impl History {
 
     fn run(mut self, seen: &mut Seen) {
         let steps = 1 + self.chance.below(STEPS_MAX);
-        self.tell(Input::Started, seen);
-        for _ in 0..steps {
+        for step in 0..steps {
+            if step == 0 && self.chance.below(10) > 0 {
+                self.tell(Input::Started, seen);
+            }
             if self.world.ended && self.chance.below(3) > 0 {
                 break;
             }

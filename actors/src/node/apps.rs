@@ -1,0 +1,129 @@
+//! The applications of a node, as its root knows them.
+//!
+//! A supervisor tells what happens at once and in order: an application's mailbox is open again before its next life begins,
+//! and closed as soon as it is known that none follows.
+
+use std::{cell::RefCell, collections::BTreeMap, rc::Rc, sync::Arc};
+
+use sinew_runtime::{
+    mailbox::Mailbox,
+    supervision::{ChildId, SupervisorFact},
+    tid::{AppAddress, Tid},
+};
+
+use crate::{lncl, stores::Stores};
+
+/// Who the children of the applications' supervisors are. Clones are the same table.
+#[derive(Clone, Default)]
+pub(super) struct Apps(Rc<RefCell<Table>>);
+
+#[derive(Default)]
+struct Table {
+    apps: BTreeMap<ChildId, App>,
+    by_address: BTreeMap<AppAddress, ChildId>,
+    /// Names of applications and of supervisors.
+    names: BTreeMap<String, ChildId>,
+}
+
+struct App {
+    tid: Tid,
+    mailbox: Arc<Mailbox>,
+    progress: Progress,
+}
+
+/// How far an application is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Progress {
+    /// Waits for what it requires, or starts.
+    Coming,
+    Running,
+    /// Has ended, and does not come back by itself.
+    Gone,
+}
+
+impl Apps {
+    /// An application that has its address and its mailbox and is not started yet.
+    pub(super) fn add(&self, id: ChildId, name: &str, tid: Tid, mailbox: Arc<Mailbox>) {
+        let mut table = self.0.borrow_mut();
+        table.by_address.insert(tid.app, id);
+        table.names.insert(name.to_owned(), id);
+        table.apps.insert(id, App { tid, mailbox, progress: Progress::Coming });
+    }
+
+    /// A supervisor of applications.
+    pub(super) fn add_supervisor(&self, id: ChildId, name: &str) {
+        self.0.borrow_mut().names.insert(name.to_owned(), id);
+    }
+
+    /// Who has this name.
+    pub(super) fn named(&self, name: &str) -> Option<ChildId> {
+        self.0.borrow().names.get(name).copied()
+    }
+
+    /// Who has this address.
+    pub(super) fn with_address(&self, address: AppAddress) -> Option<ChildId> {
+        self.0.borrow().by_address.get(&address).copied()
+    }
+
+    /// Whether this is an application.
+    pub(super) fn contains(&self, id: ChildId) -> bool {
+        self.0.borrow().apps.contains_key(&id)
+    }
+
+    /// Whether every application runs that has not ended for good.
+    pub(super) fn all_run(&self) -> bool {
+        self.0.borrow().apps.values().all(|app| app.progress != Progress::Coming)
+    }
+
+    /// Nobody takes messages any more.
+    pub(super) fn close(&self) {
+        self.0.borrow().apps.values().for_each(|app| app.mailbox.close());
+    }
+
+    /// What a supervisor says, as it says it.
+    pub(super) fn hear(&self, stores: &Stores, fact: &SupervisorFact) {
+        match fact {
+            SupervisorFact::Starting(id, _) => self.change(*id, |app| {
+                if app.progress == Progress::Gone {
+                    app.mailbox.reopen();
+                }
+                app.progress = Progress::Coming;
+            }),
+            SupervisorFact::Ready(id) => self.change(*id, |app| {
+                app.progress = Progress::Running;
+                lncl::app_ready(stores, app.tid.app);
+            }),
+            SupervisorFact::Failed(id, _) => self.change(*id, |app| {
+                app.progress = Progress::Coming;
+                lncl::app_down(stores, app.tid.app);
+            }),
+            SupervisorFact::Gone(id, _) => self.change(*id, |app| {
+                app.progress = Progress::Gone;
+                app.mailbox.close();
+                lncl::app_down(stores, app.tid.app);
+            }),
+            SupervisorFact::Deleted(id) => self.remove(stores, *id),
+            SupervisorFact::AllReady
+            | SupervisorFact::Done(..)
+            | SupervisorFact::Refused(..)
+            | SupervisorFact::Ended(_) => {}
+        }
+    }
+
+    fn change(&self, id: ChildId, change: impl FnOnce(&mut App)) {
+        if let Some(app) = self.0.borrow_mut().apps.get_mut(&id) {
+            change(app);
+        }
+    }
+
+    /// Takes name, address and mailbox back.
+    pub(super) fn remove(&self, stores: &Stores, id: ChildId) {
+        let mut table = self.0.borrow_mut();
+        table.names.retain(|_, named| *named != id);
+        if let Some(app) = table.apps.remove(&id) {
+            table.by_address.remove(&app.tid.app);
+            app.mailbox.close();
+            lncl::unregister_local(stores, app.tid.app);
+        }
+    }
+}

@@ -1,0 +1,345 @@
+//! A supervisor as a user declares it: its strategy, its limits, its children.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::Duration,
+};
+
+use sinew_runtime::{
+    app::DynApp,
+    supervision::{AutoShutdown, Flags, Intensity, Policy, Restart, Strategy},
+};
+
+use super::StartError;
+
+/// Declares a supervisor: who is restarted when one of its children fails, how often, and who its children are. Children are
+/// applications and supervisors, in the order of their start; they are stopped in the reverse order.
+///
+/// Three actors of a leg that make sense together only, so that one that fails takes the others with it. The leg may fail twice
+/// in ten seconds; at the third time it gives up, its own supervisor makes it anew, and that one's limit counts:
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// payload!("demo.angle" => struct Angle { degrees: f32 });
+///
+/// struct Motor;
+/// struct Controller;
+/// struct Encoder;
+/// impl Actor for Motor { type Context = AppContext<Self>; }
+/// impl Actor for Controller { type Context = AppContext<Self>; }
+/// impl Actor for Encoder {
+///     type Context = AppContext<Self>;
+///     fn started(&mut self, ctx: &mut Self::Context) {
+///         let _ = ctx.send("controller", &Angle { degrees: 42.0 });
+///     }
+/// }
+/// impl Handler<Delivery<Angle>> for Controller {
+///     type Result = ();
+///     fn handle(&mut self, angle: Delivery<Angle>, _: &mut Self::Context) {
+///         assert!(angle.degrees < 90.0, "no knee bends like this");
+///     }
+/// }
+///
+/// let leg = SupervisorSpec::new("leg")
+///     .strategy(Strategy::OneForAll)
+///     .intensity(2, Duration::from_secs(10))
+///     .app(AppSpec::new("motor", || Motor))
+///     .app(AppSpec::new("controller", || Controller).handles::<Angle>())
+///     .app(AppSpec::new("encoder", || Encoder));
+/// # let alone = |config: &mut NodeConfig| (config.ndl.multicast, config.ndl.mdns_port) = (None, None);
+/// let node = Node::builder("left").address([127, 0, 0, 33]).supervisor(leg)
+/// #   .configure(alone)
+///     .start()?;
+/// node.handle().wait_until_running(Duration::from_secs(10))?;
+/// node.handle().stop_app("leg")?;
+/// node.stop();
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Debug)]
+pub struct SupervisorSpec {
+    pub(super) name: String,
+    pub(super) flags: Flags,
+    pub(super) policy: Policy,
+    pub(super) members: Vec<Member>,
+}
+
+/// A child, in the place of its start.
+pub(super) enum Member {
+    App(DynApp),
+    Supervisor(SupervisorSpec),
+}
+
+impl std::fmt::Debug for Member {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::App(app) => f.write_str(app.name()),
+            Self::Supervisor(spec) => spec.fmt(f),
+        }
+    }
+}
+
+impl SupervisorSpec {
+    /// A supervisor called `name` (unique among the applications and supervisors of its node) without children.
+    pub fn new(name: impl Into<String>) -> Self {
+        Self { name: name.into(), flags: Flags::default(), policy: Policy::default(), members: Vec::new() }
+    }
+
+    /// Who is restarted when one child fails. Default: that one alone. With the two others, children are also started in
+    /// order, each when the one before it is ready.
+    #[must_use]
+    pub const fn strategy(mut self, strategy: Strategy) -> Self {
+        self.flags.strategy = strategy;
+        self
+    }
+
+    /// How many restarts may be in one window; one more, and the supervisor stops its children and gives up, which for its own
+    /// supervisor is the failure of a child. Default: 5 in 10 s.
+    #[must_use]
+    pub const fn intensity(mut self, restarts_max: usize, window: Duration) -> Self {
+        self.flags.intensity =
+            Intensity { restarts_max, window, losses_max: self.flags.intensity.losses_max };
+        self
+    }
+
+    /// Whether it ends when its significant children have done their work. Default: never.
+    #[must_use]
+    pub const fn auto_shutdown(mut self, auto_shutdown: AutoShutdown) -> Self {
+        self.flags.auto_shutdown = auto_shutdown;
+        self
+    }
+
+    /// How many lives that were taken, because they hung or did not stop, may keep their threads; one more, and it gives up.
+    /// Default: 3.
+    #[must_use]
+    pub const fn abandoned_max(mut self, lives: usize) -> Self {
+        self.flags.abandoned_max = lives;
+        self
+    }
+
+    /// When it is started again by its own supervisor, with a fresh set of its children. Default: always.
+    #[must_use]
+    pub const fn restart(mut self, restart: Restart) -> Self {
+        self.policy.restart = restart;
+        self
+    }
+
+    /// Its end may be the end of its own supervisor; see [`AutoShutdown`].
+    #[must_use]
+    pub const fn significant(mut self) -> Self {
+        self.policy.significant = true;
+        self
+    }
+
+    /// Adds an application as the last child.
+    #[must_use]
+    pub fn app(mut self, app: impl Into<DynApp>) -> Self {
+        self.members.push(Member::App(app.into()));
+        self
+    }
+
+    /// Adds a supervisor as the last child.
+    #[must_use]
+    pub fn supervisor(mut self, spec: Self) -> Self {
+        self.members.push(Member::Supervisor(spec));
+        self
+    }
+
+    /// The applications of this supervisor and of all below it, in the order of their start.
+    pub(crate) fn apps(&self) -> Vec<&DynApp> {
+        self.members.iter().flat_map(Member::apps).collect()
+    }
+
+    /// The same, taken out.
+    pub(crate) fn into_apps(self) -> Vec<DynApp> {
+        let taken = |member| match member {
+            Member::App(app) => vec![app],
+            Member::Supervisor(below) => below.into_apps(),
+        };
+        self.members.into_iter().flat_map(taken).collect()
+    }
+
+    /// Finds what can be found wrong before anything starts.
+    pub(super) fn check(&self) -> Result<(), StartError> {
+        let mut names = BTreeSet::new();
+        self.check_names(&mut names)?;
+        self.check_significance()?;
+        let mut edges = Edges::default();
+        self.enter(&mut edges);
+        edges.check()
+    }
+
+    fn check_names<'a>(&'a self, names: &mut BTreeSet<&'a str>) -> Result<(), StartError> {
+        for member in &self.members {
+            if !names.insert(member.name()) {
+                return Err(StartError::SameName(member.name().to_owned()));
+            }
+            if let Member::Supervisor(below) = member {
+                below.check_names(names)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// As in OTP: significance that can have no effect is a mistake.
+    fn check_significance(&self) -> Result<(), StartError> {
+        for member in &self.members {
+            let policy = member.policy();
+            if policy.significant && policy.restart == Restart::Permanent {
+                return Err(StartError::PermanentSignificant(member.name().to_owned()));
+            }
+            if policy.significant && self.flags.auto_shutdown == AutoShutdown::Never {
+                let (child, supervisor) = (member.name().to_owned(), self.name.clone());
+                return Err(StartError::SignificantForNobody { child, supervisor });
+            }
+            if let Member::Supervisor(below) = member {
+                below.check_significance()?;
+            }
+        }
+        Ok(())
+    }
+
+    fn enter<'a>(&'a self, edges: &mut Edges<'a>) {
+        for member in &self.members {
+            match member {
+                Member::App(app) => {
+                    edges.requires.insert(app.name(), app.requires().iter().map(String::as_str).collect());
+                }
+                Member::Supervisor(below) => below.enter(edges),
+            }
+        }
+        if self.flags.strategy == Strategy::OneForOne {
+            return;
+        }
+        for (before, after) in self.members.iter().zip(self.members.iter().skip(1)) {
+            for app in after.apps() {
+                let follows = before.apps().into_iter().map(|earlier| (app.name(), earlier.name()));
+                edges.follows.extend(follows);
+            }
+        }
+    }
+}
+
+impl Member {
+    fn name(&self) -> &str {
+        match self {
+            Self::App(app) => app.name(),
+            Self::Supervisor(spec) => &spec.name,
+        }
+    }
+
+    fn policy(&self) -> &Policy {
+        match self {
+            Self::App(app) => app.policy(),
+            Self::Supervisor(spec) => &spec.policy,
+        }
+    }
+
+    fn apps(&self) -> Vec<&DynApp> {
+        match self {
+            Self::App(app) => vec![app],
+            Self::Supervisor(below) => below.apps(),
+        }
+    }
+}
+
+/// Who waits for whom on this node: by what it requires, and by the order of start.
+#[derive(Default)]
+struct Edges<'a> {
+    requires: BTreeMap<&'a str, Vec<&'a str>>,
+    follows: Vec<(&'a str, &'a str)>,
+}
+
+impl<'a> Edges<'a> {
+    /// Circles by requirements alone are found by the sync manager, which knows other nodes too.
+    fn check(&self) -> Result<(), StartError> {
+        for (after, before) in &self.follows {
+            if let Some(path) = self.path(before, after) {
+                let mut names = vec![(*after).to_owned()];
+                names.extend(path.into_iter().map(str::to_owned));
+                return Err(StartError::OrderCycle(names));
+            }
+        }
+        Ok(())
+    }
+
+    /// How `from` comes to wait for `to`, if it does: both ends included.
+    fn path(&self, from: &'a str, to: &'a str) -> Option<Vec<&'a str>> {
+        let mut reached = BTreeMap::from([(from, from)]);
+        let mut next = vec![from];
+        while let Some(name) = next.pop() {
+            let required = self.requires.get(name).into_iter().flatten().copied();
+            let before = self.follows.iter().filter(|(after, _)| *after == name).map(|(_, before)| *before);
+            for other in required.chain(before) {
+                if reached.contains_key(other) {
+                    continue;
+                }
+                reached.insert(other, name);
+                next.push(other);
+            }
+        }
+        let mut path = vec![*reached.get_key_value(to)?.0];
+        while let Some(name) = path.last().filter(|name| **name != from) {
+            path.push(reached[name]);
+        }
+        path.reverse();
+        Some(path)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use actix::Actor;
+    use sinew_runtime::app::{AppContext, AppSpec};
+
+    use super::*;
+
+    struct Idle;
+
+    impl Actor for Idle {
+        type Context = AppContext<Self>;
+    }
+
+    fn app(name: &str) -> AppSpec<Idle> {
+        AppSpec::new(name, || Idle)
+    }
+
+    fn ordered(name: &str) -> SupervisorSpec {
+        SupervisorSpec::new(name).strategy(Strategy::RestForOne)
+    }
+
+    #[test]
+    fn one_that_requires_who_is_started_after_it_is_found_before_the_start() {
+        let below = ordered("leg").app(app("a")).app(app("b"));
+        let spec = ordered("all").app(app("first").requires(["b"])).supervisor(below);
+        let error = spec.check().expect_err("nobody of these can be first");
+        assert_eq!(
+            error.to_string(),
+            "these applications wait for each other in a circle, by the order of their start and by what they require: \
+             b -> a -> first -> b; change the order, or take a requirement out"
+        );
+    }
+
+    #[test]
+    fn requirements_along_the_order_are_no_circle() {
+        let spec =
+            ordered("all").app(app("a")).app(app("b").requires(["a"])).app(app("c").requires(["a", "x"]));
+        assert!(spec.check().is_ok());
+    }
+
+    #[test]
+    fn a_name_is_unique_on_all_floors() {
+        let spec = SupervisorSpec::new("all").app(app("a")).supervisor(SupervisorSpec::new("a"));
+        assert!(matches!(spec.check(), Err(StartError::SameName(name)) if name == "a"));
+    }
+
+    #[test]
+    fn significance_without_effect_is_a_mistake() {
+        let never = SupervisorSpec::new("all").app(app("a").restart(Restart::Transient).significant());
+        assert!(matches!(never.check(), Err(StartError::SignificantForNobody { .. })));
+        let permanent = SupervisorSpec::new("all")
+            .auto_shutdown(AutoShutdown::AnySignificant)
+            .app(app("a").significant());
+        assert!(matches!(permanent.check(), Err(StartError::PermanentSignificant(_))));
+    }
+}

@@ -1,0 +1,267 @@
+//! Supervisors that a user builds, on real nodes: strategies, escalation, children that come and go while the node runs.
+
+use std::sync::Mutex;
+
+use sinew::{CommandError, NodeEnd, Refusal, Rejection, prelude::*};
+use sinew_tests::{
+    DEADLINE, Ground, Log, all_run,
+    puppet::{Job, Puppet, Seen, Stage, desk, lives, outcome_of_job},
+    until,
+};
+
+/// A puppet that panics over message 13, and writes the beginning of each life into a log that it shares.
+fn member(name: &'static str, order: &Log<String>) -> (AppSpec<Puppet>, Log<Seen>) {
+    let (begun, told) = (order.clone(), order.clone());
+    Stage::new()
+        .started(move |puppet, _| begun.write(format!("{name} {}", puppet.life)))
+        .got(|puppet, _| assert!(puppet.number != 13, "thirteen"))
+        .stopping(move |_, _| {
+            told.write(format!("stop {name}"));
+            Running::Stop
+        })
+        .app(name)
+}
+
+fn begun(order: &Log<String>) -> Vec<String> {
+    order.all().into_iter().filter(|line| !line.starts_with("stop")).collect()
+}
+
+#[test]
+fn one_for_all_starts_in_order_and_takes_all_siblings_with_the_one_that_fails() {
+    let order = Log::default();
+    let [(a, _), (b, _), (c, _)] = ["a", "b", "c"].map(|name| member(name, &order));
+    let (desk, key) = desk("desk");
+    let leg = SupervisorSpec::new("leg").strategy(Strategy::OneForAll).app(a).app(b).app(c);
+    let node = Ground::new().node("node").supervisor(leg).app(desk).start().expect("a node");
+    all_run(&[&node]);
+    assert_eq!(begun(&order), ["a 1", "b 1", "c 1"]);
+    assert_eq!(outcome_of_job(&key.sender(), "b", 13), Outcome::Failed);
+    order.wait_for("c 2".to_owned());
+    assert_eq!(order.all()[3..], ["stop c", "stop a", "a 2", "b 2", "c 2"]);
+}
+
+#[test]
+fn rest_for_one_leaves_those_before_alone() {
+    let order = Log::default();
+    let [(a, _), (b, _), (c, _)] = ["a", "b", "c"].map(|name| member(name, &order));
+    let (desk, key) = desk("desk");
+    let leg = SupervisorSpec::new("leg").strategy(Strategy::RestForOne).app(a).app(b).app(c);
+    let node = Ground::new().node("node").supervisor(leg).app(desk).start().expect("a node");
+    all_run(&[&node]);
+    let sender = key.sender();
+    assert_eq!(outcome_of_job(&sender, "b", 13), Outcome::Failed);
+    order.wait_for("c 2".to_owned());
+    assert_eq!(order.all()[3..], ["stop c", "b 2", "c 2"]);
+    assert_eq!(outcome_of_job(&sender, "a", 1), Outcome::Delivered);
+}
+
+#[test]
+fn one_that_holds_its_readiness_keeps_those_after_it_from_starting() {
+    let order = Log::default();
+    let (open, opened) = std::sync::mpsc::sync_channel::<()>(1);
+    let opened = Mutex::new(Some(opened));
+    let (slow, slow_log) = Stage::new()
+        .started(move |puppet, context| {
+            let gate = context.hold_ready().expect("asked for once in this life");
+            let opened = opened.lock().unwrap().take().expect("it has one life");
+            std::thread::spawn(move || {
+                opened.recv_timeout(DEADLINE).expect("the test opens it");
+                gate.reached();
+            });
+            puppet.say("holds");
+        })
+        .app("slow");
+    let (next, _) = member("next", &order);
+    let leg = SupervisorSpec::new("leg").strategy(Strategy::RestForOne).app(slow).app(next);
+    let node = Ground::new().node("node").supervisor(leg).start().expect("a node");
+    slow_log.wait_for(Seen::Said(1, "holds"));
+    // What requires nothing is released at once, so that only the order can hold it.
+    until("the barrier is open", || node.handle().waiting().is_empty().then_some(()));
+    assert_eq!(begun(&order), [""; 0]);
+    open.send(()).unwrap();
+    all_run(&[&node]);
+    assert_eq!(begun(&order), ["next 1"]);
+}
+
+#[test]
+fn a_supervisor_that_gives_up_is_restarted_with_a_fresh_set_and_its_neighbours_live_on() {
+    let order = Log::default();
+    let [(a, _), (b, _), (outside, outside_log)] = ["a", "b", "outside"].map(|name| member(name, &order));
+    let (desk, key) = desk("desk");
+    let leg = SupervisorSpec::new("leg").intensity(1, DEADLINE).app(a).app(b);
+    let node = Ground::new().node("node").supervisor(leg).app(outside).app(desk).start().expect("a node");
+    all_run(&[&node]);
+    let sender = key.sender();
+    assert_eq!(outcome_of_job(&sender, "a", 13), Outcome::Failed);
+    order.wait_for("a 2".to_owned());
+    assert_eq!(outcome_of_job(&sender, "a", 13), Outcome::Failed);
+    for line in ["stop b", "a 3", "b 2"] {
+        order.wait_for(line.to_owned());
+    }
+    assert_eq!(outcome_of_job(&sender, "a", 1), Outcome::Delivered);
+    assert_eq!(lives(&outside_log), 1);
+}
+
+#[test]
+fn escalation_ends_the_node_and_says_who_failed_on_each_floor() {
+    let order = Log::default();
+    let (knee, _) = Stage::new().started(|_, _| panic!("no bus")).app("knee");
+    let (other, _) = member("other", &order);
+    let leg = SupervisorSpec::new("leg").intensity(1, DEADLINE).app(knee);
+    let node = Ground::new().node("node").app(other).supervisor(leg);
+    let node = node.configure(|config| config.supervision.app_restarts_max = 1).start();
+    let NodeEnd::GaveUp(why) = node.expect("its layers start").wait_for_end() else {
+        panic!("it stopped as if nothing had been");
+    };
+    assert!(why.contains("'leg'") && why.contains("'knee'") && why.contains("no bus"), "{why}");
+    assert!(order.all().contains(&"stop other".to_owned()), "who still lives is told");
+}
+
+#[test]
+fn stop_runs_backwards_through_all_floors() {
+    let order = Log::default();
+    let [(a, _), (b, _), (c, _), (d, _)] = ["a", "b", "c", "d"].map(|name| member(name, &order));
+    let toes = SupervisorSpec::new("toes").app(c);
+    let leg = SupervisorSpec::new("leg").app(b).supervisor(toes);
+    let node = Ground::new().node("node").app(a).supervisor(leg).app(d).start().expect("a node");
+    all_run(&[&node]);
+    assert_eq!(node.stop(), NodeEnd::Stopped);
+    assert_eq!(order.all()[4..], ["stop d", "stop c", "stop b", "stop a"]);
+}
+
+#[test]
+fn an_application_added_at_run_time_is_one_like_all_others() {
+    let order = Log::default();
+    let (desk, key) = desk("desk");
+    let node = Ground::new().node("node").app(desk).supervisor(SupervisorSpec::new("leg")).start();
+    let node = node.expect("a node");
+    let sender = key.sender();
+    let (late, _) = member("late", &order);
+    node.handle().add_app(late.requires(["desk"]), Some("leg")).expect("it is taken in");
+    all_run(&[&node]);
+    assert_eq!(outcome_of_job(&sender, "late", 1), Outcome::Delivered);
+    assert_eq!(outcome_of_job(&sender, "late", 13), Outcome::Failed);
+    order.wait_for("late 2".to_owned());
+    assert_eq!(outcome_of_job(&sender, "late", 2), Outcome::Delivered);
+}
+
+#[test]
+fn an_application_that_cannot_be_added_leaves_nothing_behind_and_the_error_says_why() {
+    let order = Log::default();
+    let node = Ground::new().node("node").app(member("first", &order).0).start().expect("a node");
+    let handle = node.handle();
+    let words = |result: Result<(), CommandError>| result.expect_err("it is refused").to_string();
+    let same = words(handle.add_app(member("first", &order).0, None));
+    assert!(same.contains("names are unique"), "{same}");
+    let nobody = words(handle.add_app(member("second", &order).0, Some("leg")));
+    assert!(nobody.contains("called 'leg'"), "{nobody}");
+    let no_supervisor = words(handle.add_app(member("second", &order).0, Some("first")));
+    assert!(no_supervisor.contains("'first' is an application"), "{no_supervisor}");
+    assert_eq!(handle.resolve("second"), None);
+    handle.add_app(member("second", &order).0, None).expect("now it is taken in");
+    all_run(&[&node]);
+}
+
+#[test]
+fn a_stopped_application_refuses_messages_keeps_its_tid_and_comes_back_when_it_is_told_to() {
+    let order = Log::default();
+    let ((app, log), (desk, key)) = (member("app", &order), desk("desk"));
+    let node = Ground::new().node("node").app(app).app(desk).start().expect("a node");
+    all_run(&[&node]);
+    let (handle, sender) = (node.handle(), key.sender());
+    let tid = handle.resolve("app").expect("it is there");
+    handle.stop_app("app").expect("it stops");
+    assert!(order.all().contains(&"stop app".to_owned()), "in order, before the answer comes");
+    let refused = sender.send(tid, &Job { number: 1 }).expect_err("nobody takes it");
+    assert!(refused.to_string().contains(&Rejection::Closed.to_string()), "{refused}");
+    handle.wait_until_running(DEADLINE).expect("one that is not to run is not waited for");
+    handle.restart_app("app").expect("it is started again");
+    log.wait_for(Seen::Started(2));
+    assert_eq!(handle.resolve("app"), Some(tid));
+    assert_eq!(outcome_of_job(&sender, "app", 2), Outcome::Delivered);
+}
+
+#[test]
+fn only_a_stopped_application_can_be_restarted_or_removed_and_a_removed_one_frees_its_name() {
+    let order = Log::default();
+    let node = Ground::new().node("node").app(member("app", &order).0).start().expect("a node");
+    all_run(&[&node]);
+    let handle = node.handle();
+    for refused in [handle.restart_app("app"), handle.remove_app("app")] {
+        assert!(matches!(refused, Err(CommandError::Refused { why: Refusal::Running, .. })), "{refused:?}");
+    }
+    handle.stop_app("app").expect("it stops");
+    handle.remove_app("app").expect("it is removed");
+    assert!(matches!(handle.restart_app("app"), Err(CommandError::Unknown(name)) if name == "app"));
+    until("the name is free", || handle.resolve("app").is_none().then_some(()));
+    handle.add_app(member("app", &order).0, None).expect("another one of this name");
+    all_run(&[&node]);
+}
+
+#[test]
+fn a_stopped_supervisor_has_stopped_its_children_and_brings_them_back() {
+    let order = Log::default();
+    let [(a, _), (b, _)] = ["a", "b"].map(|name| member(name, &order));
+    let leg = SupervisorSpec::new("leg").app(a).app(b);
+    let node = Ground::new().node("node").supervisor(leg).start().expect("a node");
+    all_run(&[&node]);
+    node.handle().stop_app("leg").expect("it stops");
+    assert_eq!(order.all()[2..], ["stop b", "stop a"]);
+    node.handle().restart_app("leg").expect("it is started again");
+    order.wait_for("a 2".to_owned());
+    order.wait_for("b 2".to_owned());
+    all_run(&[&node]);
+}
+
+#[test]
+fn the_end_of_a_significant_application_is_the_end_of_the_node_in_order() {
+    let order = Log::default();
+    let (job, _) = Stage::new().got(|_, context| context.stop()).app("job");
+    let ((other, _), (desk, key)) = (member("other", &order), desk("desk"));
+    let node = Ground::new()
+        .node("node")
+        .auto_shutdown(AutoShutdown::AnySignificant)
+        .app(other)
+        .app(job.restart(Restart::Transient).significant())
+        .app(desk)
+        .start()
+        .expect("a node");
+    all_run(&[&node]);
+    key.sender().send("job", &Job { number: 1 }).expect("it is there");
+    assert_eq!(node.wait_for_end(), NodeEnd::Stopped);
+    assert!(order.all().contains(&"stop other".to_owned()));
+}
+
+#[test]
+fn one_that_had_done_its_work_comes_back_with_its_group_and_takes_messages() {
+    let order = Log::default();
+    let (job, job_log) = Stage::new()
+        .got(|puppet, context| {
+            if puppet.life == 1 {
+                context.stop();
+            }
+        })
+        .app("job");
+    let ((other, _), (desk, key)) = (member("other", &order), desk("desk"));
+    let pair = SupervisorSpec::new("pair").strategy(Strategy::OneForAll);
+    let pair = pair.app(other).app(job.restart(Restart::Transient));
+    let node = Ground::new().node("node").supervisor(pair).app(desk).start().expect("a node");
+    all_run(&[&node]);
+    let sender = key.sender();
+    sender.send("job", &Job { number: 1 }).expect("it is there");
+    job_log.wait_for(Seen::Dropped(1));
+    until("its mailbox is closed", || sender.send("job", &Job { number: 2 }).is_err().then_some(()));
+    assert_eq!(outcome_of_job(&sender, "other", 13), Outcome::Failed);
+    job_log.wait_for(Seen::Started(2));
+    assert_eq!(outcome_of_job(&sender, "job", 3), Outcome::Delivered);
+}
+
+#[test]
+fn a_node_that_has_ended_answers_no_command() {
+    let order = Log::default();
+    let node = Ground::new().node("node").app(member("app", &order).0).start().expect("a node");
+    let handle = node.handle();
+    node.stop();
+    assert!(matches!(handle.stop_app("app"), Err(CommandError::NotRunning)));
+    assert!(matches!(handle.add_app(member("b", &order).0, None), Err(CommandError::NotRunning)));
+}
