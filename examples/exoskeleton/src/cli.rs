@@ -1,5 +1,6 @@
 //! Arguments, and which run they mean.
 
+mod faults;
 mod lock_step;
 mod node;
 mod real_time;
@@ -12,6 +13,7 @@ use exoskeleton::gait::trial::TrialError;
 use exoskeleton::lockstep::LockStepError;
 use exoskeleton::part::Kill;
 use exoskeleton::robot::launch::LaunchError;
+use exoskeleton::robot::launch::faults::FaultError;
 use exoskeleton::robot::node::NodeError;
 use thiserror::Error;
 
@@ -19,9 +21,9 @@ use thiserror::Error;
 #[derive(Debug, Parser)]
 #[command(version, args_conflicts_with_subcommands = true)]
 pub(crate) struct Arguments {
-    /// One part alone instead of the whole robot on this host.
+    /// One part alone, or the robot under faults, instead of a walk of the whole robot on this host.
     #[command(subcommand)]
-    part: Option<PartCommand>,
+    command: Option<SubCommand>,
     /// Virtual time in one thread, bit-identical for a seed; says nothing about real-time performance.
     #[arg(long)]
     pub(crate) lock_step: bool,
@@ -55,9 +57,10 @@ pub(crate) struct Arguments {
 }
 
 #[derive(Debug, Subcommand)]
-enum PartCommand {
+enum SubCommand {
     /// Runs one part of the robot until SIGINT or SIGTERM, so that it can be spread over several hosts.
     Node(node::NodeArguments),
+    Faults(faults::FaultArguments),
 }
 
 /// How a run ended.
@@ -107,6 +110,12 @@ pub(crate) enum RunError {
     /// A part of the robot did not run.
     #[error(transparent)]
     Node(#[from] NodeError),
+    /// The robot did not walk under faults.
+    #[error(transparent)]
+    Faults(#[from] FaultError),
+    /// A phase that no stride has.
+    #[error("--phases {0}: a phase is at least 0 and less than 1")]
+    Phase(f64),
     /// A device watchdog of no use.
     #[error("--device-watchdog {0}: give 1 to 10000 ms, or leave it out for none")]
     Watchdog(u64),
@@ -125,9 +134,15 @@ fn check_kill(arguments: &Arguments) -> Result<(), RunError> {
 /// Does what the arguments say.
 pub(crate) fn run(arguments: &Arguments) -> Result<Verdict, RunError> {
     check_kill(arguments)?;
-    match &arguments.part {
-        Some(PartCommand::Node(part)) => node::run(part),
+    match &arguments.command {
+        Some(SubCommand::Node(part)) => node::run(part),
+        Some(SubCommand::Faults(arguments)) => faults::run(arguments),
         None if arguments.lock_step => lock_step::run(arguments),
         None => real_time::run(arguments),
     }
+}
+
+/// An error of the system, with the file it happened at.
+fn at(path: &std::path::Path, error: &std::io::Error) -> std::io::Error {
+    std::io::Error::new(error.kind(), format!("cannot write {}: {error}", path.display()))
 }

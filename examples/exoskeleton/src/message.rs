@@ -133,6 +133,10 @@ pub struct DriveStatus {
     pub age_max_us: u32,
     /// Ticks without fresh inputs since the start.
     pub misses: u32,
+    /// Torques from outside that were taken since the start.
+    pub commands_taken: u32,
+    /// Torques from outside that were refused since the start.
+    pub commands_refused: u32,
 }
 
 macro_rules! wire_byte {

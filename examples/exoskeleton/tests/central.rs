@@ -49,8 +49,17 @@ impl Walk {
         let (t_ns, seq) = (self.ms * MS, self.ms as u32);
         for (joint, says) in Joint::ALL.into_iter().zip(self.says) {
             let Some((state, faults)) = says.filter(|_| seq.is_multiple_of(5)) else { continue };
-            let (faults, torque_nm, age_max_us, misses) = (faults.0, 0.0, 0, 0);
-            let status = DriveStatus { seq, t_ns, state, faults, torque_nm, age_max_us, misses };
+            let status = DriveStatus {
+                seq,
+                t_ns,
+                state,
+                faults: faults.0,
+                torque_nm: 0.0,
+                age_max_us: 0,
+                misses: 0,
+                commands_taken: 0,
+                commands_refused: 0,
+            };
             self.central.drive_heard(joint, &status);
         }
         let intended = self.intention.at(self.ms as f64 * 1e-3);

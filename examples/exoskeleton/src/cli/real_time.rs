@@ -1,6 +1,5 @@
 //! A run in real time from the command line.
 
-use std::path::Path;
 use std::time::Duration;
 
 use exoskeleton::report;
@@ -26,7 +25,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Verdict, RunError> {
     let json = json(&walk)?;
     std::fs::write(walk.folder.join("report.json"), &json)?;
     if let Some(path) = &arguments.report {
-        std::fs::write(path, &json).map_err(|e| at(path, &e))?;
+        std::fs::write(path, &json).map_err(|e| super::at(path, &e))?;
     }
     println!(
         "written: {}/ gait.svg, run.csv, report.json, and each process's trace and log",
@@ -102,8 +101,4 @@ fn words(figures: &RealTimeFigures) -> String {
 
 fn after(ms: Option<f64>) -> String {
     ms.map_or_else(|| "never".to_owned(), |ms| format!("{ms:.1} ms"))
-}
-
-fn at(path: &Path, error: &std::io::Error) -> std::io::Error {
-    std::io::Error::new(error.kind(), format!("cannot write {}: {error}", path.display()))
 }

@@ -264,6 +264,8 @@ impl DriveCore {
             torque_nm: self.limiter.torque_nm() as f32,
             age_max_us: u32::try_from(self.age_max_ns / 1000).unwrap_or(u32::MAX),
             misses: self.counters.misses,
+            commands_taken: self.counters.commands_admitted,
+            commands_refused: self.counters.commands_refused.total(),
         };
         self.status_seq = self.status_seq.wrapping_add(1);
         self.age_max_ns = 0;

@@ -133,6 +133,8 @@ impl Drive {
     }
 
     fn note(&mut self, now: Time, tick: Tick, output: &DriveOutput) {
+        let counters = self.core.counters();
+        let refused = counters.commands_refused;
         let row = DriveRow {
             t_ns: now.as_nanos(),
             late_us: micros(tick.lateness),
@@ -143,8 +145,11 @@ impl Drive {
             torque_nm: output.command_nm,
             assist_gain: output.assist_gain,
             faults: self.core.faults().0,
-            commands_refused: self.core.counters().commands_refused.total(),
-            commands_admitted: self.core.counters().commands_admitted,
+            commands_taken: counters.commands_admitted,
+            refused_not_finite: refused.not_finite,
+            refused_out_of_range: refused.out_of_range,
+            refused_old: refused.old_sequence + refused.too_old,
+            refused_opposed: refused.opposed,
         };
         self.ticked_at = Some(now);
         self.figures.note(&row);

@@ -3,6 +3,7 @@
 mod children;
 mod collect;
 mod console;
+pub mod faults;
 mod plan;
 mod screen;
 

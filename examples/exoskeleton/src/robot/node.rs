@@ -17,7 +17,7 @@ use super::gait::GaitParts;
 use super::plant::{self, PlantError};
 use super::role::Role;
 use super::sensor::DeviceMaker;
-use super::topology::{ControlThread, ReleaseBy, Topology, TopologyFaults};
+use super::topology::{ControlThread, DrivePlace, ReleaseBy, Topology, TopologyFaults};
 use super::trace::{EventRow, Recording, TraceRow};
 use super::watch::WatchParts;
 use super::{coordinator, drive, gait, sensor, watch};
@@ -125,8 +125,8 @@ fn run_node(part: Part, topology: &Topology, options: &NodeOptions) -> Result<Ex
                 figures: options.run_dir.as_ref().map(|folder| folder.join(format!("{joint}-figures.json"))),
             };
             let builder = builder
-                .app(sensor::spec(joint, device, place(topology)))
-                .app(drive::spec(parts, place(topology)));
+                .app(sensor::spec(joint, device, events.trace(), place(topology)))
+                .app(drive::spec(parts, drive_place(joint, topology)));
             let code = start_and_run(builder, &watched, options)?;
             tell_lost_rows(trace.finish());
             code
@@ -170,6 +170,16 @@ fn place(topology: &Topology) -> Place {
     match control.realtime_priority {
         Some(priority) => place.realtime(priority),
         None => place,
+    }
+}
+
+fn drive_place(joint: Joint, topology: &Topology) -> Place {
+    match topology.joints[joint.index()].drive {
+        DrivePlace::Node => place(topology),
+        DrivePlace::Process => match topology.control.realtime_priority {
+            Some(priority) => Place::process().realtime(priority),
+            None => Place::process(),
+        },
     }
 }
 

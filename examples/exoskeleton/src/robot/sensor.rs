@@ -11,6 +11,7 @@ use sinew::prelude::*;
 use super::PERIOD;
 use super::device::JointDevice;
 use super::edges::{AS_LONG_AS_IT_TAKES, Addressee, GAIT, drive_name, sensor_name};
+use super::trace::{EventRow, Trace};
 use crate::joint::Joint;
 use crate::message::{FootLoad, JointSample};
 use crate::sensor::{SensorConfig, SensorCore};
@@ -20,6 +21,11 @@ const SILENCE_MAX: Duration = Duration::from_millis(10);
 
 /// Makes the way to a joint's device, anew for each life of an application.
 pub type DeviceMaker = Arc<dyn Fn() -> Box<dyn JointDevice> + Send + Sync>;
+
+/// A tick that is later than this is written down, for whoever wonders why samples were old.
+const LATE_MAX: Duration = Duration::from_millis(5);
+/// What it is written down as.
+pub const SENSOR_LATE: &str = "sensor_late";
 
 /// The sensor of one joint.
 pub struct Sensor {
@@ -31,18 +37,19 @@ pub struct Sensor {
     ready: Option<ReadyGate>,
     read_at: Option<Time>,
     silent: bool,
+    events: Trace<EventRow>,
 }
 
 /// Declares the sensor of `joint`.
 #[must_use]
-pub fn spec(joint: Joint, device: DeviceMaker, place: Place) -> AppSpec<Sensor> {
-    AppSpec::new(sensor_name(joint), move || Sensor::new(joint, device()))
+pub fn spec(joint: Joint, device: DeviceMaker, events: Trace<EventRow>, place: Place) -> AppSpec<Sensor> {
+    AppSpec::new(sensor_name(joint), move || Sensor::new(joint, device(), events.clone()))
         .start_within(AS_LONG_AS_IT_TAKES)
         .place(place)
 }
 
 impl Sensor {
-    fn new(joint: Joint, device: Box<dyn JointDevice>) -> Self {
+    fn new(joint: Joint, device: Box<dyn JointDevice>, events: Trace<EventRow>) -> Self {
         Self {
             joint,
             core: SensorCore::new(SensorConfig::default()),
@@ -52,11 +59,13 @@ impl Sensor {
             ready: None,
             read_at: None,
             silent: false,
+            events,
         }
     }
 
-    fn tick(&mut self, context: &AppContext<Self>) {
+    fn tick(&mut self, tick: Tick, context: &AppContext<Self>) {
         let now = Time::now();
+        self.note_lateness(now, tick.lateness);
         let Some(reading) = self.device.read_newest(now) else {
             self.judge_silence(now);
             return;
@@ -84,6 +93,13 @@ impl Sensor {
         }
     }
 
+    fn note_lateness(&self, now: Time, lateness: Duration) {
+        if lateness > LATE_MAX {
+            let (what, whom) = (SENSOR_LATE.to_owned(), self.joint.name().to_owned());
+            self.events.note(EventRow { t_ns: now.as_nanos(), what, whom, how: format!("{lateness:?}") });
+        }
+    }
+
     fn judge_silence(&mut self, now: Time) {
         let lasts = self.read_at.is_some_and(|at| now.since(at) > SILENCE_MAX);
         if lasts && !self.silent {
@@ -98,6 +114,6 @@ impl Actor for Sensor {
 
     fn started(&mut self, context: &mut Self::Context) {
         self.ready = context.hold_ready();
-        context.every(PERIOD, |this, _, context| this.tick(context));
+        context.every(PERIOD, |this, tick, context| this.tick(tick, context));
     }
 }

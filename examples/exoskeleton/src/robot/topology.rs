@@ -92,6 +92,17 @@ pub struct NodePlace {
     pub port: u16,
     /// UDP addresses of nodes to ask in any case.
     pub seeds: Vec<SocketAddr>,
+    /// Where the drive of a joint runs; of no meaning at central.
+    pub drive: DrivePlace,
+}
+
+/// Where the drive of a joint runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DrivePlace {
+    /// In its node's process, on the thread of the control loops. The default: the lowest latency.
+    Node,
+    /// In a process of its own, a child of the node's: whatever becomes of it, the sensor beside it goes on.
+    Process,
 }
 
 /// Where the plant is and who is in it.

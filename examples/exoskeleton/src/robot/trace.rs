@@ -91,15 +91,21 @@ pub struct DriveRow {
     pub assist_gain: f64,
     /// Bits of `FaultBits`.
     pub faults: u16,
-    /// Torques from outside that were refused so far.
-    pub commands_refused: u32,
-    /// Torques from outside that were believed so far.
-    pub commands_admitted: u32,
+    /// Torques from outside that were taken so far.
+    pub commands_taken: u32,
+    /// Torques from outside refused so far: no numbers.
+    pub refused_not_finite: u32,
+    /// Above every limit.
+    pub refused_out_of_range: u32,
+    /// Of an old sequence number, or over the age limit.
+    pub refused_old: u32,
+    /// The opposite of what must be done.
+    pub refused_opposed: u32,
 }
 
 impl TraceRow for DriveRow {
     const HEADER: &'static str = "t_ns,late_us,period_us,sample_age_us,gait_age_us,state,torque_nm,assist_gain,faults,\
-        commands_refused,commands_admitted";
+        commands_taken,refused_not_finite,refused_out_of_range,refused_old,refused_opposed";
 }
 
 /// What central did in one tick.

@@ -51,8 +51,10 @@ impl Handler<Delivery<NodeEvent>> for Watch {
 
     fn handle(&mut self, event: Delivery<NodeEvent>, _: &mut Self::Context) {
         let (what, whom, how) = match event.payload {
-            NodeEvent::NodeFound { name, .. } => ("node_found", name, String::new()),
-            NodeEvent::NodeRestarted { name, .. } => ("node_restarted", name, String::new()),
+            NodeEvent::NodeFound { name, incarnation, .. } => ("node_found", name, incarnation.0.to_string()),
+            NodeEvent::NodeRestarted { name, incarnation, .. } => {
+                ("node_restarted", name, incarnation.0.to_string())
+            }
             NodeEvent::NodeLost { name, why, silent_us, .. } => {
                 ("node_lost", name, format!("{why:?}, silent for {silent_us} us"))
             }

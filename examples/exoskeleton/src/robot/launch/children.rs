@@ -87,6 +87,14 @@ impl Children {
         at
     }
 
+    /// The processes that a process of the run has started itself: those of its node's applications.
+    pub(super) fn children_of(&self, role: Role) -> Vec<Pid> {
+        let Some(parent) = self.running.get(&role).map(Child::id) else { return Vec::new() };
+        let Ok(entries) = fs::read_dir("/proc") else { return Vec::new() };
+        let ids = entries.flatten().filter_map(|entry| entry.file_name().to_str()?.parse::<i32>().ok());
+        ids.filter(|id| parent_of(*id) == Some(parent)).filter_map(Pid::from_raw).collect()
+    }
+
     /// CPU seconds used so far, by this process too.
     pub(super) fn cpu_times(&self) -> CpuTimes {
         let children = self.running.iter().map(|(role, child)| (role.name(), child.id()));
@@ -129,6 +137,12 @@ fn stop_all(children: &mut Vec<Child>) {
         let _ = child.wait();
     }
     children.clear();
+}
+
+/// From `/proc/PID/stat`: the fourth field.
+fn parent_of(id: i32) -> Option<u32> {
+    let text = fs::read_to_string(format!("/proc/{id}/stat")).ok()?;
+    text.rsplit_once(')')?.1.split_ascii_whitespace().nth(1)?.parse().ok()
 }
 
 /// From `/proc/PID/stat`: user and system time, the 14th and 15th fields; the second is the name, in parentheses.

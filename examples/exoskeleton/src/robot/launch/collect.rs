@@ -91,15 +91,17 @@ pub(super) struct Collected {
     pub(super) figures: RealTimeFigures,
 }
 
-struct Traces {
-    plant: Vec<PlantRow>,
-    gait: Vec<GaitRow>,
-    drives: PerJoint<Vec<Vec<DriveRow>>>,
-    events: BTreeMap<Part, Vec<EventRow>>,
+/// What all processes wrote, up to the stop order.
+pub(super) struct Traces {
+    pub(super) plant: Vec<PlantRow>,
+    pub(super) gait: Vec<GaitRow>,
+    /// The rows of each drive, life by life.
+    pub(super) drives: PerJoint<Vec<Vec<DriveRow>>>,
+    pub(super) events: BTreeMap<Part, Vec<EventRow>>,
 }
 
 impl Traces {
-    fn read(folder: &Path, stop: Time) -> io::Result<Self> {
+    pub(super) fn read(folder: &Path, stop: Time) -> io::Result<Self> {
         let until = stop.as_nanos();
         let [hip, knee, ankle] = Joint::ALL.map(|joint| read_lives::<DriveRow>(folder, joint.name()));
         let mut drives = [hip?, knee?, ankle?];

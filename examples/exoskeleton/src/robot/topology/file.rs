@@ -10,7 +10,9 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use sinew::NodeAddress;
 
-use super::{Control, ControlThread, Discovery, NodePlace, PlantPlace, ReleaseBy, Topology, TopologyFaults};
+use super::{
+    Control, ControlThread, Discovery, DrivePlace, NodePlace, PlantPlace, ReleaseBy, Topology, TopologyFaults,
+};
 use crate::joint::Joint;
 use crate::part::Part;
 
@@ -68,6 +70,8 @@ struct NodeTable {
     seeds: Vec<String>,
     /// The door for the status screen; at central only.
     console: Option<PathBuf>,
+    /// Where the drive runs; at a joint only.
+    drive: Option<String>,
 }
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -138,7 +142,23 @@ fn node(faults: &mut Faults, part: Part, table: &NodeTable) -> Option<NodePlace>
     }
     let seeds = seeds(faults, &format!("{part}.seeds"), &table.seeds);
     check_console(faults, part, table.console.as_ref());
-    Some(NodePlace { address: NodeAddress::from(address?), interface: interface?, port: table.port, seeds })
+    let drive = drive_place(faults, part, table.drive.as_deref());
+    let (address, port) = (NodeAddress::from(address?), table.port);
+    Some(NodePlace { address, interface: interface?, port, seeds, drive })
+}
+
+fn drive_place(faults: &mut Faults, part: Part, text: Option<&str>) -> DrivePlace {
+    faults.note(part != Part::Central || text.is_none(), || {
+        "central.drive: central has none; take it out here".to_owned()
+    });
+    match text {
+        None | Some("node") => DrivePlace::Node,
+        Some("process") => DrivePlace::Process,
+        Some(other) => {
+            faults.0.push(format!("{part}.drive = \"{other}\" is none; write \"node\" or \"process\""));
+            DrivePlace::Node
+        }
+    }
 }
 
 fn seeds(faults: &mut Faults, place: &str, texts: &[String]) -> Vec<SocketAddr> {
@@ -259,6 +279,10 @@ pub(super) fn write(topology: &Topology) -> String {
             port: place.port,
             seeds: place.seeds.iter().map(ToString::to_string).collect(),
             console: topology.console.clone().filter(|_| part == Part::Central),
+            drive: match place.drive {
+                DrivePlace::Process if part != Part::Central => Some("process".to_owned()),
+                DrivePlace::Process | DrivePlace::Node => None,
+            },
         }
     };
     let (discovery, control, plant) = (&topology.discovery, &topology.control, &topology.plant);

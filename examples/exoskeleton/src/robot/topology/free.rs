@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use sinew::NodeAddress;
 
-use super::{Control, ControlThread, Discovery, NodePlace, PlantPlace, ReleaseBy, Topology};
+use super::{Control, ControlThread, Discovery, DrivePlace, NodePlace, PlantPlace, ReleaseBy, Topology};
 
 /// A topology on loopback with a project name, a multicast port and a plant port of its own.
 ///
@@ -24,6 +24,7 @@ pub fn for_this_host(seed: u64) -> io::Result<Topology> {
         interface: Ipv4Addr::LOCALHOST,
         port: 0,
         seeds: Vec::new(),
+        drive: DrivePlace::Node,
     };
     Ok(Topology {
         project: format!("exoskeleton-{id}"),

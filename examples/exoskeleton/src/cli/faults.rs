@@ -1,0 +1,91 @@
+//! The faults of the demonstration from the command line.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use exoskeleton::robot::launch::faults::{self, FaultOptions, FaultReport, Step};
+
+use super::{RunError, Verdict};
+
+/// Injects the faults of steps 4 to 9 and 11 of the demonstration into a walking robot and says what came of them.
+///
+/// Five processes walk on this host until the phase is found and assistance has risen. Then one fault after the other
+/// is injected at a phase of the stride, and the traces of all processes are held against what is claimed:
+///
+/// 4 kill -9 of the process of the knee's drive | 5 the same process hangs (SIGSTOP, SIGCONT) | 6 the knee's node is
+/// pulled (SIGKILL) | 7 it returns | 8 e-stop (software, not a safety function) | 9 insane commands | 11 central is killed
+///
+/// The table has what is expected of each class of machine: A real-time kernel and isolated core, B plain Linux and
+/// idle, C any machine. Times are held against class C; what concerns function has to hold on every machine.
+///
+/// Exit code 0: everything held. 1: no robot walked. 2: an argument is wrong. 3: something did not hold.
+#[derive(Debug, clap::Args)]
+#[command(verbatim_doc_comment)]
+pub(super) struct FaultArguments {
+    /// Only these steps, for example 4,6.
+    #[arg(long, value_delimiter = ',', value_name = "STEPS")]
+    only: Vec<Step>,
+    /// Phases of the stride at which the knee's drive is killed, 0 to 1.
+    #[arg(long, value_delimiter = ',', value_name = "PHASES", default_value = "0.12,0.40,0.62,0.75")]
+    phases: Vec<f64>,
+    /// Seed of stride variation and sensor noise.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Folder for the run folders.
+    #[arg(long, value_name = "DIR", default_value = "runs")]
+    runs: PathBuf,
+    /// Write the report as JSON to this file too.
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
+    /// Silence after which a device damps by itself, ms.
+    #[arg(long, value_name = "MS", default_value_t = 8, value_parser = clap::value_parser!(u64).range(1..=10_000))]
+    device_watchdog: u64,
+    /// For machines that others share: one phase, and only what has to hold on every machine counts for the exit code.
+    #[arg(long)]
+    short: bool,
+}
+
+/// Runs, prints the table, writes the report.
+pub(super) fn run(arguments: &FaultArguments) -> Result<Verdict, RunError> {
+    let report = faults::run(&options(arguments)?)?;
+    print!("{}", faults::table(&report.claims));
+    let json = serde_json::to_string_pretty(&serde_json::json!({ "faults": report }))
+        .map_err(std::io::Error::other)?;
+    for path in arguments.report.iter().chain([&report.folder.join("report.json")]) {
+        std::fs::write(path, json.clone() + "\n").map_err(|e| super::at(path, &e))?;
+    }
+    print!("{}", words(&report));
+    let held = if arguments.short { report.functional_held } else { report.passed };
+    Ok(if held { Verdict::LimitsHeld } else { Verdict::LimitBroken })
+}
+
+fn options(arguments: &FaultArguments) -> Result<FaultOptions, RunError> {
+    let steps = if arguments.only.is_empty() { Step::ALL.to_vec() } else { arguments.only.clone() };
+    if let Some(phase) = arguments.phases.iter().find(|phase| !(0.0..1.0).contains(*phase)) {
+        return Err(RunError::Phase(*phase));
+    }
+    Ok(FaultOptions {
+        steps,
+        phases: if arguments.short { vec![0.62] } else { arguments.phases.clone() },
+        seed: arguments.seed,
+        device_watchdog: Duration::from_millis(arguments.device_watchdog),
+        runs: arguments.runs.clone(),
+    })
+}
+
+fn words(report: &FaultReport) -> String {
+    let mut text: String = report.skipped.iter().map(|words| format!("left out: {words}\n")).collect();
+    text.extend(report.failures.iter().map(|words| format!("failed: {words}\n")));
+    let counted = |functional: bool| {
+        let claims = || report.claims.iter().filter(|claim| claim.expected.is_functional() == functional);
+        format!("{} of {}", claims().filter(|claim| claim.held).count(), claims().count())
+    };
+    text += &format!(
+        "held: {} claims about function, {} times within class C\nwritten: {}/ report.json, and each process's trace \
+         and log\n",
+        counted(true),
+        counted(false),
+        report.folder.display()
+    );
+    text
+}

@@ -1,0 +1,213 @@
+//! What a step claims: what is expected on each class of machine, and what was seen.
+//!
+//! Class A: real-time kernel, isolated core. Class B: plain Linux, idle. Class C: any machine, also a shared one.
+
+use std::fmt::Write;
+
+use serde::Serialize;
+
+use super::step::Step;
+
+/// Share by which a limit may be passed: differences of floating-point numbers, nothing else.
+const ROUNDING: f64 = 1e-9;
+/// No limit: told, and that is all.
+pub(super) const REPORTED: f64 = f64::INFINITY;
+
+/// One claim, and whether it held.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Claim {
+    /// The step.
+    pub step: Step,
+    /// Which of several injections of the step, for example `phase 0.62`; empty when there is one.
+    pub at: String,
+    /// What is claimed, with its unit.
+    pub name: String,
+    /// What is expected.
+    pub expected: Expected,
+    /// What was seen; `null` when it never happened.
+    pub seen: Option<f64>,
+    /// Whether it held; a time: for class C.
+    pub held: bool,
+}
+
+/// What is expected of a figure.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Expected {
+    /// A time or a way: at most this much, by class of machine.
+    Timing {
+        /// Real-time kernel, isolated core.
+        a: f64,
+        /// Plain Linux, idle.
+        b: f64,
+        /// Any machine; infinite (`null` in JSON) where it is only reported there.
+        c: f64,
+    },
+    /// On every machine: at most this much.
+    AtMost(f64),
+    /// On every machine: at least this much.
+    AtLeast(f64),
+    /// On every machine: exactly this.
+    Exactly(f64),
+    /// Told, and expected to be nothing in particular.
+    Told,
+}
+
+impl Expected {
+    /// Whether it has to hold on every machine.
+    #[must_use]
+    pub const fn is_functional(self) -> bool {
+        match self {
+            Self::Timing { .. } | Self::Told => false,
+            Self::AtMost(_) | Self::AtLeast(_) | Self::Exactly(_) => true,
+        }
+    }
+
+    fn holds(self, seen: Option<f64>) -> bool {
+        match (self, seen) {
+            (Self::Told, _) => true,
+            (Self::Timing { c: limit, .. } | Self::AtMost(limit), Some(seen)) => within(seen, limit),
+            (Self::AtLeast(limit), Some(seen)) => seen >= limit,
+            (Self::Exactly(value), Some(seen)) => seen == value,
+            (Self::Timing { .. } | Self::AtMost(_) | Self::AtLeast(_) | Self::Exactly(_), None) => false,
+        }
+    }
+
+    /// The classes of machine for which what was seen is good enough.
+    fn classes(self, seen: Option<f64>) -> &'static str {
+        let Some(seen) = seen else { return if self == Self::Told { "" } else { "NO" } };
+        match self {
+            Self::Told => "",
+            Self::Timing { a, .. } if within(seen, a) => "A B C",
+            Self::Timing { b, .. } if within(seen, b) => "- B C",
+            Self::Timing { c, .. } if within(seen, c) => "- - C",
+            Self::AtMost(_) | Self::AtLeast(_) | Self::Exactly(_) if self.holds(Some(seen)) => "yes",
+            Self::Timing { .. } | Self::AtMost(_) | Self::AtLeast(_) | Self::Exactly(_) => "NO",
+        }
+    }
+
+    fn words(self) -> String {
+        match self {
+            Self::Timing { a, b, c: REPORTED } => format!("{a} / {b} / report"),
+            Self::Timing { a, b, c } => format!("{a} / {b} / {c}"),
+            Self::AtMost(limit) => format!("<= {limit}"),
+            Self::AtLeast(limit) => format!(">= {limit}"),
+            Self::Exactly(value) => format!("{value}"),
+            Self::Told => String::new(),
+        }
+    }
+}
+
+fn within(seen: f64, limit: f64) -> bool {
+    seen <= limit * (1.0 + ROUNDING)
+}
+
+/// Collects the claims of one injection.
+#[derive(Debug)]
+pub(super) struct Claims<'a> {
+    step: Step,
+    at: &'a str,
+    out: &'a mut Vec<Claim>,
+}
+
+impl<'a> Claims<'a> {
+    pub(super) const fn new(step: Step, at: &'a str, out: &'a mut Vec<Claim>) -> Self {
+        Self { step, at, out }
+    }
+
+    /// A time or a way that depends on the machine.
+    pub(super) fn timing(&mut self, name: &str, [a, b, c]: [f64; 3], seen: Option<f64>) {
+        self.add(name, Expected::Timing { a, b, c }, seen);
+    }
+
+    pub(super) fn at_most(&mut self, name: &str, limit: f64, seen: impl Into<Option<f64>>) {
+        self.add(name, Expected::AtMost(limit), seen.into());
+    }
+
+    pub(super) fn at_least(&mut self, name: &str, limit: f64, seen: impl Into<Option<f64>>) {
+        self.add(name, Expected::AtLeast(limit), seen.into());
+    }
+
+    /// A count that has to be this one.
+    pub(super) fn exactly(&mut self, name: &str, value: usize, seen: usize) {
+        self.add(name, Expected::Exactly(value as f64), Some(seen as f64));
+    }
+
+    /// A yes or no that has to be yes: 1.
+    pub(super) fn is_so(&mut self, name: &str, seen: bool) {
+        self.exactly(name, 1, usize::from(seen));
+    }
+
+    pub(super) fn told(&mut self, name: &str, seen: Option<f64>) {
+        self.add(name, Expected::Told, seen);
+    }
+
+    fn add(&mut self, name: &str, expected: Expected, seen: Option<f64>) {
+        // A number that is none is no evidence, and JSON has no word for it.
+        let seen = seen.filter(|seen| seen.is_finite());
+        let held = expected.holds(seen);
+        let (step, at, name) = (self.step, self.at.to_owned(), name.to_owned());
+        self.out.push(Claim { step, at, name, expected, seen, held });
+    }
+}
+
+/// The claims as a table for people, lines of at most 100 characters.
+#[must_use]
+pub fn table(claims: &[Claim]) -> String {
+    let mut text = String::new();
+    // Writing to a String cannot fail.
+    let _ = write_table(&mut text, claims);
+    text
+}
+
+fn write_table(out: &mut String, claims: &[Claim]) -> std::fmt::Result {
+    writeln!(out, "{:-<100}", "")?;
+    writeln!(out, "{:60} {:>17} {:>10}  holds", "step and claim", "expected A/B/C", "seen")?;
+    let mut told = None;
+    for claim in claims {
+        let heading = (claim.step, claim.at.as_str());
+        if told != Some(heading) {
+            told = Some(heading);
+            let at = if claim.at.is_empty() { String::new() } else { format!(", {}", claim.at) };
+            writeln!(out, "{:>2}  {}{at}", claim.step, claim.step.words())?;
+        }
+        let seen = claim.seen.map_or_else(|| "never".to_owned(), number);
+        let (expected, classes) = (claim.expected.words(), claim.expected.classes(claim.seen));
+        writeln!(out, "    {:56} {expected:>17} {seen:>10}  {classes}", claim.name)?;
+    }
+    writeln!(out, "{:-<100}", "")
+}
+
+fn number(seen: f64) -> String {
+    if seen.fract() == 0.0 { format!("{seen:.0}") } else { format!("{seen:.2}") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LIMITS: Expected = Expected::Timing { a: 10.0, b: 20.0, c: 100.0 };
+
+    #[test]
+    fn time_names_the_classes_that_it_is_good_enough_for() {
+        let classes = [9.0, 20.0, 99.0, 101.0].map(|seen| LIMITS.classes(Some(seen)));
+        assert_eq!(classes, ["A B C", "- B C", "- - C", "NO"]);
+        assert!(LIMITS.holds(Some(100.0)) && !LIMITS.holds(Some(100.1)));
+    }
+
+    #[test]
+    fn what_was_never_seen_holds_nothing() {
+        for expected in [LIMITS, Expected::AtMost(1.0), Expected::AtLeast(0.0), Expected::Exactly(0.0)] {
+            assert!(!expected.holds(None));
+            assert_eq!(expected.classes(None), "NO");
+        }
+    }
+
+    #[test]
+    fn number_that_is_none_is_no_evidence() {
+        let mut out = Vec::new();
+        Claims::new(Step::KillDrive, "", &mut out).at_most("torque, Nm", 45.0, f64::NAN);
+        assert!(!out[0].held && out[0].seen.is_none());
+        assert!(table(&out).contains("never"));
+    }
+}

@@ -1,0 +1,320 @@
+//! What the traces of a run say about a span of time.
+
+use std::io;
+use std::ops::Range;
+use std::path::Path;
+
+use sinew::Time;
+
+use crate::control::torque_law::TorqueLaw;
+use crate::joint::Joint;
+use crate::message::DriveState;
+use crate::part::Part;
+use crate::robot::launch::collect::Traces;
+use crate::robot::sensor::SENSOR_LATE;
+use crate::robot::trace::{DriveRow, EventRow, GaitRow, PlantRow};
+
+/// A loop that is later than this was held up by its host, us.
+const STALL_US: u32 = 5_000;
+/// A stall explains what happens this long before and after a late tick: messages wait that long too.
+const STALL_AROUND_NS: u64 = 60_000_000;
+/// Half a step of the devices' torque.
+const ROUNDING_NM: f64 = 0.02;
+/// From entering the safe state to soft damping, ns: 60 Nm at 2000 Nm/s, and late ticks.
+const SAFE_RAMP_NS: u64 = 80_000_000;
+const SAFE_DAMPING_NMS_RAD: f64 = 1.0;
+const SAFE_SLACK_NM: f64 = 1.0;
+/// How far around a tick the velocity is looked for that it may have damped against.
+const VELOCITY_AROUND_NS: u64 = 30_000_000;
+
+/// A span of the host's clock, ns.
+pub(super) type Span = Range<u64>;
+
+/// All that was written.
+pub(super) struct Evidence {
+    traces: Traces,
+    /// When a loop was held up by the host, ns.
+    stalls: Vec<u64>,
+}
+
+/// Milliseconds from `from` to `t_ns`.
+pub(super) fn ms_after(from: Time, t_ns: u64) -> f64 {
+    (t_ns as f64 - from.as_nanos() as f64) * 1e-6
+}
+
+/// From one moment to another.
+pub(super) const fn span(from: Time, to: Time) -> Span {
+    from.as_nanos()..to.as_nanos()
+}
+
+impl Evidence {
+    pub(super) fn read(folder: &Path, stop: Time) -> io::Result<Self> {
+        let traces = Traces::read(folder, stop)?;
+        let late = |t_ns: u64, late_us: u32| (late_us > STALL_US).then_some(t_ns);
+        let mut stalls: Vec<u64> =
+            traces.plant.iter().filter_map(|row| late(row.t_ns, row.late_us)).collect();
+        stalls.extend(traces.gait.iter().filter_map(|row| late(row.t_ns, row.late_us)));
+        stalls.extend(traces.drives.iter().flatten().flatten().filter_map(|row| late(row.t_ns, row.late_us)));
+        let events = traces.events.values().flatten();
+        stalls.extend(events.filter(|event| event.what == SENSOR_LATE).map(|event| event.t_ns));
+        stalls.sort_unstable();
+        Ok(Self { traces, stalls })
+    }
+
+    pub(super) fn plant(&self, span: Span) -> &[PlantRow] {
+        cut(&self.traces.plant, span, |row| row.t_ns)
+    }
+
+    pub(super) fn gait(&self, span: Span) -> &[GaitRow] {
+        cut(&self.traces.gait, span, |row| row.t_ns)
+    }
+
+    /// Rows of all lives of a drive.
+    pub(super) fn drive(&self, joint: Joint, span: Span) -> impl Iterator<Item = &DriveRow> {
+        let lives = &self.traces.drives[joint.index()];
+        lives.iter().flat_map(move |life| cut(life, span.clone(), |row| row.t_ns))
+    }
+
+    /// Lives of drives that began in the span.
+    pub(super) fn lives_begun(&self, span: &Span) -> usize {
+        let begun = |life: &&Vec<DriveRow>| life.first().is_some_and(|row| span.contains(&row.t_ns));
+        self.traces.drives.iter().flatten().filter(begun).count()
+    }
+
+    pub(super) fn events(&self, part: Part, span: Span) -> impl Iterator<Item = &EventRow> {
+        let events = self.traces.events.get(&part).map_or(&[][..], Vec::as_slice);
+        events.iter().filter(move |event| span.contains(&event.t_ns))
+    }
+
+    /// Whether the host stood still around this moment.
+    pub(super) fn stalled_around(&self, t_ns: u64) -> bool {
+        let i = self.stalls.partition_point(|at| at + STALL_AROUND_NS < t_ns);
+        self.stalls.get(i).is_some_and(|at| *at <= t_ns + STALL_AROUND_NS)
+    }
+
+    /// Milliseconds from `from` until the drive is in `state`.
+    pub(super) fn state_after_ms(&self, joint: Joint, from: Time, state: DriveState) -> Option<f64> {
+        let first = self.drive(joint, from.as_nanos()..u64::MAX).find(|row| row.state == state);
+        first.map(|row| ms_after(from, row.t_ns))
+    }
+
+    /// Milliseconds until a drive first commands an assisting torque in a span in which it begins anew, or goes on.
+    pub(super) fn output_after_ms(&self, joint: Joint, span: Span) -> Option<f64> {
+        let from = Time::from_nanos(span.start);
+        let mut was_away = false;
+        for row in self.drive(joint, span) {
+            // The rows before the fault was felt: it had been told to die and did not know it.
+            was_away |= row.state != DriveState::Walk || row.torque_nm.is_none();
+            if was_away && row.state == DriveState::Walk && row.torque_nm.is_some() {
+                return Some(ms_after(from, row.t_ns));
+            }
+        }
+        None
+    }
+
+    /// Ticks more than 2 ms late.
+    pub(super) fn misses(&self, joints: &[Joint], span: &Span) -> usize {
+        let late = |joint: &Joint| self.drive(*joint, span.clone()).filter(|row| row.late_us > 2_000).count();
+        joints.iter().map(late).sum()
+    }
+
+    /// Milliseconds from `from` until the device of a joint damps by its own watchdog.
+    pub(super) fn watchdog_after_ms(&self, joint: Joint, span: Span) -> Option<f64> {
+        let from = Time::from_nanos(span.start);
+        let first = self.plant(span).iter().find(|row| row.watchdog[joint.index()]);
+        first.map(|row| ms_after(from, row.t_ns))
+    }
+
+    /// Milliseconds from `from` until the discovery of `part` says that `lost` is lost.
+    pub(super) fn node_lost_after_ms(&self, part: Part, lost: Part, span: Span) -> Option<f64> {
+        let from = Time::from_nanos(span.start);
+        let mut events = self.events(part, span);
+        let first = events.find(|event| event.what == "node_lost" && event.whom == lost.name());
+        first.map(|event| ms_after(from, event.t_ns))
+    }
+
+    /// Times that a drive left `Walk` for `Safe` though the host did not stand still.
+    pub(super) fn unexplained_safe(&self, joints: &[Joint], span: &Span) -> usize {
+        let entered = |joint: &Joint| {
+            let rows: Vec<&DriveRow> = self.drive(*joint, span.clone()).collect();
+            let entries = rows.windows(2).filter(|pair| {
+                pair[0].state == DriveState::Walk
+                    && pair[1].state == DriveState::Safe
+                    && !self.stalled_around(pair[1].t_ns)
+            });
+            entries.count()
+        };
+        joints.iter().map(entered).sum()
+    }
+
+    /// Share of the ticks of these drives in `state`, per cent, of the one that has the least; without those around a
+    /// stall of the host.
+    pub(super) fn share_in_percent(&self, state: DriveState, joints: &[Joint], span: &Span) -> f64 {
+        let share = |joint: &Joint| {
+            let rows = self.drive(*joint, span.clone()).filter(|row| !self.stalled_around(row.t_ns));
+            let (mut all, mut others) = (0_u32, 0_u32);
+            for row in rows {
+                all += 1;
+                others += u32::from(row.state != state);
+            }
+            100.0 - 100.0 * f64::from(others) / f64::from(all.max(1))
+        };
+        joints.iter().map(share).fold(100.0, f64::min)
+    }
+
+    /// Ticks of these drives in another state than `state`.
+    pub(super) fn ticks_not_in(&self, state: DriveState, joints: &[Joint], span: &Span) -> usize {
+        let others =
+            |joint: &Joint| self.drive(*joint, span.clone()).filter(|row| row.state != state).count();
+        joints.iter().map(others).sum()
+    }
+
+    /// Greatest torque that any drive commanded, Nm. Not right after a stall of the host: then the device has damped by
+    /// itself, and what it gives is ramped to zero.
+    pub(super) fn torque_max_nm(&self, span: &Span) -> f64 {
+        Joint::ALL
+            .into_iter()
+            .flat_map(|joint| self.drive(joint, span.clone()))
+            .filter(|row| !self.stalled_around(row.t_ns))
+            .filter_map(|row| row.torque_nm)
+            .map(f64::abs)
+            .fold(0.0, f64::max)
+    }
+
+    /// Greatest gain of assistance of any drive, 0..1.
+    pub(super) fn gain_max(&self, span: &Span) -> f64 {
+        let rows = Joint::ALL.into_iter().flat_map(|joint| self.drive(joint, span.clone()));
+        rows.map(|row| row.assist_gain).fold(0.0, f64::max)
+    }
+
+    /// Fastest change of a torque in the drives' own time, Nm/s; a life that begins asks its device first.
+    pub(super) fn torque_rate_max_nm_s(&self, span: &Span) -> f64 {
+        let rate = |pair: &[DriveRow]| {
+            let change = (pair[1].torque_nm? - pair[0].torque_nm?).abs();
+            let dt_ns = pair[1].t_ns.checked_sub(pair[0].t_ns).filter(|dt_ns| *dt_ns > 0)?;
+            Some(change / (dt_ns as f64 * 1e-9))
+        };
+        let lives = self.traces.drives.iter().flatten();
+        lives
+            .flat_map(|life| cut(life, span.clone(), |row| row.t_ns).windows(2).filter_map(rate))
+            .fold(0.0, f64::max)
+    }
+
+    /// Greatest change of a torque that a device gives, within a millisecond, Nm. Not around a stall of the host, after
+    /// which the plant makes many milliseconds of one.
+    pub(super) fn device_step_max_nm(&self, span: Span) -> f64 {
+        let step = |pair: &[PlantRow]| {
+            let steps = pair[0].applied_nm.iter().zip(pair[1].applied_nm).map(|(a, b)| (b - a).abs());
+            steps.fold(0.0, f64::max)
+        };
+        let pairs = self.plant(span).windows(2).filter(|pair| !self.stalled_around(pair[1].t_ns));
+        pairs.map(step).fold(0.0, f64::max)
+    }
+
+    /// Samples of a device above its limit, or of a command above it.
+    pub(super) fn above_limit(&self, span: &Span) -> usize {
+        let limit = |joint: Joint| TorqueLaw::standard(joint).limit_nm + ROUNDING_NM;
+        let given = self.plant(span.clone()).iter().map(|row| {
+            Joint::ALL.into_iter().filter(|joint| row.applied_nm[joint.index()].abs() > limit(*joint)).count()
+        });
+        let commanded = Joint::ALL.into_iter().map(|joint| {
+            let above = |row: &&DriveRow| row.torque_nm.is_some_and(|torque| torque.abs() > limit(joint));
+            self.drive(joint, span.clone()).filter(above).count()
+        });
+        given.sum::<usize>() + commanded.sum::<usize>()
+    }
+
+    /// Samples of a device that are no number.
+    pub(super) fn not_finite(&self, span: &Span) -> usize {
+        let given = self.plant(span.clone()).iter().flat_map(|row| row.applied_nm);
+        let commanded = Joint::ALL.into_iter().flat_map(|joint| self.drive(joint, span.clone()));
+        given.filter(|torque| !torque.is_finite()).count()
+            + commanded.filter_map(|row| row.torque_nm).filter(|torque| !torque.is_finite()).count()
+    }
+
+    /// Ticks of a safe drive, once its ramp is over, with more than soft damping and 1 Nm.
+    pub(super) fn undamped(&self, joints: &[Joint], span: &Span) -> usize {
+        joints.iter().map(|joint| self.undamped_ticks(*joint, span)).sum()
+    }
+
+    fn undamped_ticks(&self, joint: Joint, span: &Span) -> usize {
+        let mut since = None;
+        let mut count = 0;
+        for row in self.drive(joint, span.clone()) {
+            if row.state != DriveState::Safe {
+                since = None;
+                continue;
+            }
+            let safe_since = *since.get_or_insert(row.t_ns);
+            let ramp_is_over = row.t_ns - safe_since > SAFE_RAMP_NS;
+            let torque_nm = row.torque_nm.unwrap_or(0.0).abs();
+            count += usize::from(ramp_is_over && torque_nm > self.damping_max_nm(joint, row.t_ns));
+        }
+        count
+    }
+
+    /// Samples of a device that damps by itself, once its ramp is over, with more than soft damping and 1 Nm.
+    pub(super) fn undamped_device(&self, joint: Joint, span: Span) -> usize {
+        let rows = self.plant(span);
+        let Some(since) = rows.iter().find(|row| row.watchdog[joint.index()]).map(|row| row.t_ns) else {
+            return rows.len();
+        };
+        let damps = rows
+            .iter()
+            .filter(|row| row.t_ns > since + SAFE_RAMP_NS)
+            .take_while(|row| row.watchdog[joint.index()]);
+        damps.filter(|row| row.applied_nm[joint.index()].abs() > self.damping_max_nm(joint, row.t_ns)).count()
+    }
+
+    fn damping_max_nm(&self, joint: Joint, t_ns: u64) -> f64 {
+        let around = t_ns.saturating_sub(VELOCITY_AROUND_NS)..t_ns + VELOCITY_AROUND_NS;
+        let fastest = self.plant(around).iter().map(|row| row.velocity_rad_s[joint.index()].abs());
+        SAFE_DAMPING_NMS_RAD * fastest.fold(0.0, f64::max) + SAFE_SLACK_NM
+    }
+
+    /// Greatest deviation of a joint from what the person means to do, degrees.
+    pub(super) fn deviation_max_deg(&self, joint: Joint, span: Span) -> Option<f64> {
+        let i = joint.index();
+        let deviations = self.plant(span).iter().map(|row| row.angle_rad[i] - row.intended_rad[i]);
+        deviations.map(|deviation| deviation.abs().to_degrees()).reduce(f64::max)
+    }
+
+    /// RMS of the deviation of a joint from what the person means to do, degrees.
+    pub(super) fn deviation_rms_deg(&self, joint: Joint, span: Span) -> Option<f64> {
+        let (i, rows) = (joint.index(), self.plant(span));
+        let square = |row: &PlantRow| (row.angle_rad[i] - row.intended_rad[i]).to_degrees().powi(2);
+        let sum: f64 = rows.iter().map(square).sum();
+        (!rows.is_empty()).then(|| (sum / rows.len() as f64).sqrt())
+    }
+
+    /// True phase at a moment, cycles.
+    pub(super) fn phase_at(&self, at: Time) -> Option<f64> {
+        let rows = self.plant(at.as_nanos()..u64::MAX);
+        rows.first().map(|row| row.strides.rem_euclid(1.0))
+    }
+
+    /// How quickly assistance rose at its quickest, in each life from none until it was full for the first time, as the
+    /// milliseconds from none to full; `None`: it never rose.
+    pub(super) fn ramp_ms(&self, joints: &[Joint], span: &Span) -> Option<f64> {
+        let rise_per_ms = |pair: &[DriveRow]| {
+            let dt_ns = pair[1].t_ns.checked_sub(pair[0].t_ns).filter(|dt_ns| *dt_ns > 0)?;
+            Some((pair[1].assist_gain - pair[0].assist_gain) / (dt_ns as f64 * 1e-6))
+        };
+        let mut quickest = 0.0;
+        for life in joints.iter().flat_map(|joint| &self.traces.drives[joint.index()]) {
+            let rows = cut(life, span.clone(), |row| row.t_ns);
+            let Some(from) = rows.iter().position(|row| row.assist_gain <= 0.0) else { continue };
+            let rising =
+                rows[from..].split_inclusive(|row| row.assist_gain >= 1.0).next().unwrap_or_default();
+            quickest = rising.windows(2).filter_map(rise_per_ms).fold(quickest, f64::max);
+        }
+        (quickest > 0.0).then(|| 1.0 / quickest)
+    }
+}
+
+/// The rows of a span; rows rise in time.
+fn cut<R>(rows: &[R], span: Span, t_ns: impl Fn(&R) -> u64) -> &[R] {
+    let from = rows.partition_point(|row| t_ns(row) < span.start);
+    let to = rows.partition_point(|row| t_ns(row) < span.end);
+    &rows[from..to.max(from)]
+}

@@ -1,0 +1,257 @@
+//! A robot under test: started, released, walked until it has converged, and watched while faults are injected.
+
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::time::Duration;
+
+use rustix::process::Pid;
+use sinew::Time;
+
+use super::operator::Operator;
+use super::{FaultError, say};
+use crate::joint::Joint;
+use crate::message::{DriveState, GaitMode};
+use crate::part::Part;
+use crate::robot::launch::children::Children;
+use crate::robot::launch::console::{Console, View};
+use crate::robot::launch::{BARRIER_PATIENCE, LINES_MAX};
+use crate::robot::role::Role;
+use crate::robot::topology::Topology;
+
+/// Time between two looks at how things stand.
+const LOOK_PERIOD: Duration = Duration::from_millis(5);
+/// From the release to assistance: four strides as a rule, more when the phase is hard to find.
+const WALK_PATIENCE: Duration = Duration::from_secs(40);
+/// Time for which the leg is held before the operator wonders.
+const HELD_PATIENCE: Duration = Duration::from_secs(1);
+/// Strides that are walked until everything is well at a phase.
+const TRIES_MAX: u32 = 10;
+/// Strides with full assistance before the first fault.
+const STRIDES_CONVERGED: u32 = 3;
+/// Time in which assistance has risen to full.
+const RAMP: Duration = Duration::from_millis(600);
+
+/// A running robot.
+pub(super) struct Robot {
+    children: Children,
+    say_line: SyncSender<String>,
+    lines: Receiver<String>,
+    console: Console,
+    operator: Option<Operator>,
+    socket: PathBuf,
+    stride: Option<Stride>,
+}
+
+/// The stride that is being walked.
+#[derive(Debug, Clone, Copy)]
+struct Stride {
+    number: u32,
+    began: Time,
+    /// How long the one before took.
+    lasts: Option<Duration>,
+}
+
+impl Robot {
+    /// Starts all five processes at once.
+    pub(super) fn start(topology: &Topology, folder: &Path) -> Result<Self, FaultError> {
+        let file = folder.join("topology.toml");
+        std::fs::write(&file, topology.to_toml())?;
+        let (say_line, lines) = sync_channel(LINES_MAX);
+        let socket = topology.console.clone().expect("a topology for this host has a console");
+        let mut robot = Self {
+            children: Children::new(file, folder.to_owned())?,
+            say_line,
+            lines,
+            console: Console::start(topology)?,
+            operator: None,
+            socket,
+            stride: None,
+        };
+        for role in Role::ALL {
+            robot.start_role(role)?;
+        }
+        Ok(robot)
+    }
+
+    /// Starts a process that is not there.
+    pub(super) fn start_role(&mut self, role: Role) -> Result<Time, FaultError> {
+        let at = Time::now();
+        self.children.start(role, &self.say_line)?;
+        Ok(at)
+    }
+
+    /// Kills a process as a power cut would; returns when.
+    pub(super) fn kill(&mut self, role: Role) -> Time {
+        if role == Role::Node(Part::Central) {
+            self.operator = None;
+        }
+        self.children.kill(role)
+    }
+
+    /// The process of a joint's drive, a child of its node's.
+    pub(super) fn drive_process(&self, joint: Joint) -> Result<Pid, FaultError> {
+        let children = self.children.children_of(Role::Node(Part::Joint(joint)));
+        children.into_iter().next().ok_or(FaultError::NoProcess(joint))
+    }
+
+    /// The operator, connected to central.
+    pub(super) fn operator(&mut self) -> Result<&mut Operator, FaultError> {
+        if self.operator.is_none() {
+            self.operator = Some(Operator::connect(&self.socket)?);
+        }
+        Ok(self.operator.as_mut().expect("it was just made"))
+    }
+
+    /// How things stand.
+    pub(super) fn view(&self) -> View {
+        self.console.view()
+    }
+
+    /// Waits for the barrier: all parts are there and the leg is held with zero torque.
+    pub(super) fn wait_held(&mut self) -> Result<Time, FaultError> {
+        self.wait_until("all parts are there and the leg is held", BARRIER_PATIENCE, is_held)
+    }
+
+    /// The operator presses "walk", until it is taken; returns when.
+    pub(super) fn release(&mut self) -> Result<Time, FaultError> {
+        let outcome = self.operator()?.release()?;
+        if outcome != sinew::Outcome::Delivered {
+            return Err(FaultError::NotReleased(outcome));
+        }
+        Ok(Time::now())
+    }
+
+    /// Waits until all drives assist, fully, and some strides more; returns when they began to.
+    pub(super) fn wait_converged(&mut self) -> Result<Time, FaultError> {
+        let began = self.wait_walking()?;
+        self.pass_until(Time::now() + RAMP)?;
+        self.wait_strides(STRIDES_CONVERGED)?;
+        self.wait_walking()?;
+        Ok(began)
+    }
+
+    /// Waits until all drives assist. On a host that stands still for longer than central may coast, walking has to be
+    /// released anew, and the operator does.
+    pub(super) fn wait_walking(&mut self) -> Result<Time, FaultError> {
+        let deadline = Time::now() + WALK_PATIENCE;
+        let mut held_since = None;
+        loop {
+            self.pass(LOOK_PERIOD)?;
+            let now = Time::now();
+            let view = self.console.view();
+            if is_walking(&view) {
+                return Ok(now);
+            }
+            if !is_held(&view) {
+                held_since = None;
+            } else if now.since(*held_since.get_or_insert(now)) > HELD_PATIENCE {
+                say("  the host stood still for too long and the leg is held; the operator releases anew");
+                self.release()?;
+                held_since = None;
+            }
+            if now > deadline {
+                return Err(FaultError::Never("all drives assist".to_owned(), WALK_PATIENCE));
+            }
+        }
+    }
+
+    /// Waits until the person is at `phase` of a stride while all drives assist.
+    pub(super) fn walk_to_phase(&mut self, phase: f64) -> Result<(), FaultError> {
+        for _ in 0..TRIES_MAX {
+            self.wait_walking()?;
+            self.wait_phase(phase)?;
+            if is_walking(&self.console.view()) {
+                return Ok(());
+            }
+        }
+        Err(FaultError::Never(format!("all drives assist at phase {phase}"), WALK_PATIENCE))
+    }
+
+    /// Waits for the begin of the `count`-th stride from now on.
+    pub(super) fn wait_strides(&mut self, count: u32) -> Result<(), FaultError> {
+        let from = self.stride.map_or(0, |stride| stride.number);
+        let deadline = Time::now() + WALK_PATIENCE;
+        while self.stride.is_none_or(|stride| stride.number < from + count) {
+            self.pass(LOOK_PERIOD)?;
+            if Time::now() > deadline {
+                return Err(FaultError::Never("the next stride".to_owned(), WALK_PATIENCE));
+            }
+        }
+        Ok(())
+    }
+
+    /// Waits until the person is at `phase` of a stride: by the clock, from the begin of a stride and the length of
+    /// the one before.
+    fn wait_phase(&mut self, phase: f64) -> Result<(), FaultError> {
+        self.wait_strides(1)?;
+        let Some(Stride { began, lasts: Some(lasts), .. }) = self.stride else {
+            return Err(FaultError::Never("a whole stride".to_owned(), WALK_PATIENCE));
+        };
+        self.pass_until(began + lasts.mul_f64(phase))
+    }
+
+    /// Waits until `holds` of what is heard; returns when.
+    pub(super) fn wait_until(
+        &mut self,
+        what: &str,
+        patience: Duration,
+        mut holds: impl FnMut(&View) -> bool,
+    ) -> Result<Time, FaultError> {
+        let deadline = Time::now() + patience;
+        loop {
+            self.pass(LOOK_PERIOD)?;
+            let view = self.console.view();
+            if holds(&view) {
+                return Ok(Time::now());
+            }
+            if Time::now() > deadline {
+                let waiting = view.waiting().join("; ");
+                return Err(FaultError::Never(format!("{what} ({waiting})"), patience));
+            }
+        }
+    }
+
+    /// Lets time pass while the strides are counted and the processes watched.
+    pub(super) fn pass_until(&mut self, until: Time) -> Result<(), FaultError> {
+        while Time::now() < until {
+            self.pass(until.since(Time::now()).min(LOOK_PERIOD))?;
+        }
+        Ok(())
+    }
+
+    fn pass(&mut self, time: Duration) -> Result<(), FaultError> {
+        let until = Time::now() + time;
+        while let Ok(line) = self.lines.recv_timeout(until.since(Time::now())) {
+            self.heed(&line);
+        }
+        Ok(self.children.check()?)
+    }
+
+    /// A line of the plant's: a stride begins.
+    fn heed(&mut self, line: &str) {
+        let number = line.strip_prefix("stride ").and_then(|number| number.parse::<u32>().ok());
+        let Some(number) = number else { return };
+        let began = Time::now();
+        let lasts = self.stride.map(|last| began.since(last.began));
+        self.stride = Some(Stride { number, began, lasts });
+    }
+
+    /// Stops everybody in order.
+    pub(super) fn end(mut self) {
+        say("the robot is stopped");
+        self.operator = None;
+        self.console.stop();
+        self.children.stop();
+    }
+}
+
+fn is_held(view: &View) -> bool {
+    let ready = |joint| view.drive(joint).is_some_and(|drive| drive.state == DriveState::Ready);
+    view.gait().is_some_and(|gait| gait.mode == Some(GaitMode::Hold)) && Joint::ALL.into_iter().all(ready)
+}
+
+fn is_walking(view: &View) -> bool {
+    let walks = |joint| view.drive(joint).is_some_and(|drive| drive.state == DriveState::Walk);
+    view.gait().is_some_and(|gait| gait.mode == Some(GaitMode::Walk) && gait.degraded == 0)
+        && Joint::ALL.into_iter().all(walks)
+}

@@ -1,0 +1,332 @@
+//! What is done in each step: when which fault is injected, and what the operator does about it. Nothing is judged here.
+
+use std::io;
+use std::time::Duration;
+
+use rustix::process::{Signal, kill_process};
+use sinew::{Outcome, Time};
+
+use super::operator::Word;
+use super::robot::Robot;
+use super::step::Step;
+use super::{FaultError, say};
+use crate::joint::Joint;
+use crate::message::{DriveState, GaitMode};
+use crate::part::Part;
+use crate::robot::role::Role;
+
+/// The node that is pulled.
+const KNEE: Role = Role::Node(Part::Joint(Joint::Knee));
+const CENTRAL: Role = Role::Node(Part::Central);
+/// Phase of a stride at which a node is pulled.
+const PULL_PHASE: f64 = 0.62;
+/// Phase at which central is killed.
+const CENTRAL_PHASE: f64 = 0.30;
+/// Phase at which the e-stop is pressed: the ankle pushes off, so there is a torque to take away.
+const STOP_PHASE: f64 = 0.50;
+/// Phase in which the ankle's own moment is about zero, so that zero is a sane torque.
+const QUIET_PHASE: f64 = 0.78;
+/// Phase from which on the ankle gives 30 Nm and more, so that the same with the other sign is insane.
+const PUSH_PHASE: f64 = 0.36;
+/// Phase at which the process of a drive hangs.
+const HANG_PHASE: f64 = 0.62;
+/// How long it hangs when it is let go on: less than its node's patience.
+const HANG: Duration = Duration::from_millis(400);
+/// From assistance to full assistance of one drive, and a little.
+const REJOINED: Duration = Duration::from_millis(500);
+/// How long a node is away.
+const OUTAGE: Duration = Duration::from_secs(1);
+/// How long it is watched that nothing moves.
+const STILL: Duration = Duration::from_secs(1);
+/// Time for things to happen that are looked at afterwards.
+const AFTERMATH: Duration = Duration::from_millis(300);
+/// Words of a kind at least and at most, and the time between them.
+const WORDS: u32 = 10;
+const WORDS_MAX: u32 = 500;
+const WORD_PERIOD: Duration = Duration::from_millis(3);
+const RESET_PATIENCE: Duration = Duration::from_secs(10);
+
+/// One injected fault and what came of it, in the host's clock.
+#[derive(Debug, Clone)]
+pub(super) struct Injection {
+    pub(super) step: Step,
+    /// Which of several of the step.
+    pub(super) label: String,
+    /// When the fault was injected.
+    pub(super) at: Time,
+    /// When it was over and the robot walked as before.
+    pub(super) until: Time,
+    /// What else happened when.
+    pub(super) marks: Vec<(Mark, Time)>,
+    /// What the operator saw.
+    pub(super) seen: Vec<(Seen, bool)>,
+}
+
+/// A moment within a step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Mark {
+    /// What was killed is started again.
+    Started,
+    /// What was stopped goes on.
+    Continued,
+    /// All parts are there, the leg is held.
+    Held,
+    /// The operator has released walking.
+    Released,
+    /// The drives assist again.
+    Walking,
+    /// The operator tried to release walking in spite of the e-stop.
+    ResumeTried,
+    /// The operator has begun to take the e-stop back.
+    ResetBegun,
+    /// Sane torques are given, from here on.
+    Sane,
+    /// Insane ones of a kind, from here on.
+    NotANumber,
+    /// 500 Nm.
+    TooMuch,
+    /// The sign is wrong.
+    Reversed,
+    /// The sequence number is of long ago.
+    OldSequence,
+    /// Somebody pretends to be central.
+    Stranger,
+    /// The insane words are over.
+    WordsOver,
+}
+
+/// What the operator saw at once.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Seen {
+    /// The release was refused while the e-stop was latched.
+    ResumeRefused,
+    /// Central and all drives have taken the reset.
+    ResetTaken,
+}
+
+impl Injection {
+    fn begun(step: Step, label: &str, at: Time) -> Self {
+        say(&format!(
+            "step {step}: {}{}",
+            step.words(),
+            if label.is_empty() { String::new() } else { format!(", {label}") }
+        ));
+        Self { step, label: label.to_owned(), at, until: at, marks: Vec::new(), seen: Vec::new() }
+    }
+
+    fn mark(&mut self, mark: Mark, at: Time) {
+        self.marks.push((mark, at));
+    }
+
+    /// When something happened; the begin of the injection when it did not.
+    pub(super) fn when(&self, mark: Mark) -> Option<Time> {
+        self.marks.iter().find(|(marked, _)| *marked == mark).map(|(_, at)| *at)
+    }
+
+    /// How long the fault of this step had lasted when the step began, ns: a node returns after its outage.
+    pub(super) const fn away_ns(&self) -> u64 {
+        match self.step {
+            Step::ReturnNode => OUTAGE.as_nanos() as u64,
+            Step::KillDrive
+            | Step::HangDrive
+            | Step::PullNode
+            | Step::EmergencyStop
+            | Step::InsaneCommands
+            | Step::KillCentral => 0,
+        }
+    }
+
+    pub(super) fn has_seen(&self, what: Seen) -> bool {
+        self.seen.contains(&(what, true))
+    }
+}
+
+/// A robot that stands, all parts there, until it has walked enough for faults.
+pub(super) fn walk_until_converged(robot: &mut Robot) -> Result<(), FaultError> {
+    robot.wait_held()?;
+    robot.release()?;
+    say("released; walking until it has converged");
+    robot.wait_converged()?;
+    Ok(())
+}
+
+/// Does `step`. What was injected is in `out`, also when the robot did not get over it. `also` are the steps that come
+/// later: a node that is pulled comes back in the next one.
+pub(super) fn perform(
+    robot: &mut Robot,
+    step: Step,
+    phases: &[f64],
+    out: &mut Vec<Injection>,
+) -> Result<(), FaultError> {
+    match step {
+        Step::KillDrive => phases.iter().try_for_each(|phase| kill_drive(robot, *phase, out)),
+        Step::HangDrive => {
+            hang_drive(robot, out)?;
+            hang_drive_for_good(robot, out)
+        }
+        Step::PullNode => pull_node(robot, out),
+        Step::ReturnNode => return_node(robot, out),
+        Step::EmergencyStop => emergency_stop(robot, out),
+        Step::InsaneCommands => insane_commands(robot, out),
+        Step::KillCentral => kill_central(robot, out),
+    }
+}
+
+/// The process of the knee's drive is killed; its node starts another.
+fn kill_drive(robot: &mut Robot, phase: f64, out: &mut Vec<Injection>) -> Result<(), FaultError> {
+    let process = robot.drive_process(Joint::Knee)?;
+    robot.walk_to_phase(phase)?;
+    let at = Time::now();
+    kill_process(process, Signal::KILL).map_err(io::Error::from)?;
+    out.push(Injection::begun(Step::KillDrive, "SIGKILL", at));
+    rejoin(robot, out)
+}
+
+/// The process of the knee's drive hangs, and goes on after a while.
+fn hang_drive(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), FaultError> {
+    let process = robot.drive_process(Joint::Knee)?;
+    robot.walk_to_phase(HANG_PHASE)?;
+    let at = Time::now();
+    kill_process(process, Signal::STOP).map_err(io::Error::from)?;
+    out.push(Injection::begun(Step::HangDrive, "SIGSTOP, SIGCONT", at));
+    robot.pass_until(at + HANG)?;
+    let injection = out.last_mut().expect("it was just pushed");
+    injection.mark(Mark::Continued, Time::now());
+    // It may have been replaced meanwhile; then there is nobody to go on.
+    let _ = kill_process(process, Signal::CONT);
+    rejoin(robot, out)
+}
+
+/// The process of the knee's drive hangs for good; its node kills it and starts another.
+fn hang_drive_for_good(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), FaultError> {
+    let process = robot.drive_process(Joint::Knee)?;
+    robot.walk_to_phase(HANG_PHASE)?;
+    let at = Time::now();
+    kill_process(process, Signal::STOP).map_err(io::Error::from)?;
+    out.push(Injection::begun(Step::HangDrive, "SIGSTOP for good", at));
+    rejoin(robot, out)
+}
+
+/// Until the drive assists again, fully.
+fn rejoin(robot: &mut Robot, out: &mut [Injection]) -> Result<(), FaultError> {
+    let injection = out.last_mut().expect("it was just pushed");
+    robot.pass_until(injection.at + AFTERMATH)?;
+    injection.mark(Mark::Walking, robot.wait_walking()?);
+    robot.pass_until(Time::now() + REJOINED)?;
+    robot.wait_walking()?;
+    injection.until = Time::now();
+    Ok(())
+}
+
+/// The process of the knee's node is killed as a power cut would; it stays away.
+fn pull_node(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), FaultError> {
+    robot.walk_to_phase(PULL_PHASE)?;
+    let at = robot.kill(KNEE);
+    let mut injection = Injection::begun(Step::PullNode, "SIGKILL", at);
+    injection.until = at + OUTAGE;
+    out.push(injection);
+    robot.pass_until(at + OUTAGE)
+}
+
+/// It is started again, and nothing moves until the operator says so.
+fn return_node(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), FaultError> {
+    let at = robot.start_role(KNEE)?;
+    out.push(Injection::begun(Step::ReturnNode, "", at));
+    let injection = out.last_mut().expect("it was just pushed");
+    injection.mark(Mark::Started, at);
+    hold_and_release(robot, injection)
+}
+
+/// From all parts being there to walking: a second in which nothing moves, the release, the ramp, two strides.
+fn hold_and_release(robot: &mut Robot, injection: &mut Injection) -> Result<(), FaultError> {
+    let held = robot.wait_held()?;
+    injection.mark(Mark::Held, held);
+    robot.pass_until(held + STILL)?;
+    injection.mark(Mark::Released, Time::now());
+    robot.release()?;
+    say("  nothing moved; the operator releases");
+    injection.mark(Mark::Walking, robot.wait_converged()?);
+    injection.until = Time::now();
+    Ok(())
+}
+
+fn emergency_stop(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), FaultError> {
+    robot.operator()?;
+    robot.walk_to_phase(STOP_PHASE)?;
+    let at = Time::now();
+    robot.operator()?.stop()?;
+    out.push(Injection::begun(Step::EmergencyStop, "", at));
+    let injection = out.last_mut().expect("it was just pushed");
+    robot.pass_until(at + AFTERMATH)?;
+    injection.mark(Mark::ResumeTried, Time::now());
+    let outcome = robot.operator()?.release()?;
+    injection.seen.push((Seen::ResumeRefused, matches!(outcome, Outcome::Rejected(_))));
+    say(&format!("  resume was pressed in spite of it: {outcome:?}"));
+    robot.pass_until(Time::now() + STILL)?;
+    injection.mark(Mark::ResetBegun, Time::now());
+    let taken = robot.operator()?.reset()?;
+    injection.seen.push((Seen::ResetTaken, taken));
+    robot.wait_until("the e-stop is taken back", RESET_PATIENCE, |view| {
+        view.gait().is_some_and(|gait| gait.mode != Some(GaitMode::Stop))
+            && Joint::ALL
+                .into_iter()
+                .all(|joint| view.drive(joint).is_some_and(|drive| drive.state != DriveState::EStop))
+    })?;
+    hold_and_release(robot, injection)
+}
+
+fn insane_commands(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), FaultError> {
+    robot.operator()?;
+    robot.walk_to_phase(QUIET_PHASE)?;
+    let at = Time::now();
+    out.push(Injection::begun(Step::InsaneCommands, "ankle", at));
+    let injection = out.last_mut().expect("it was just pushed");
+    give(robot, injection, Mark::Sane, &[Word::Torque(0.0)])?;
+    // A number of long ago is one only right after one of now.
+    give(robot, injection, Mark::OldSequence, &[Word::Torque(0.0), Word::OldSequence(5.0)])?;
+    robot.walk_to_phase(PUSH_PHASE)?;
+    give(robot, injection, Mark::NotANumber, &[Word::Torque(f32::NAN)])?;
+    give(robot, injection, Mark::TooMuch, &[Word::Torque(500.0)])?;
+    give(robot, injection, Mark::Reversed, &[Word::Torque(40.0)])?;
+    injection.mark(Mark::Stranger, Time::now());
+    for _ in 0..WORDS {
+        robot.operator()?.pretend_to_be_central()?;
+        robot.pass_until(Time::now() + WORD_PERIOD)?;
+    }
+    robot.pass_until(Time::now() + AFTERMATH)?;
+    injection.mark(Mark::WordsOver, Time::now());
+    robot.wait_converged()?;
+    injection.until = Time::now();
+    Ok(())
+}
+
+/// Gives the words over and over until the drive has counted one of the kind: of a stream the newest wins, so that a
+/// word may be overtaken by the next.
+fn give(robot: &mut Robot, injection: &mut Injection, kind: Mark, words: &[Word]) -> Result<(), FaultError> {
+    let counted = |robot: &Robot| {
+        let drive = robot.view().drive(Joint::Ankle);
+        drive.map(|drive| if kind == Mark::Sane { drive.commands_taken } else { drive.commands_refused })
+    };
+    let before = counted(robot);
+    injection.mark(kind, Time::now());
+    for number in 1..=WORDS_MAX {
+        for word in words {
+            robot.operator()?.set_torque(Joint::Ankle, *word)?;
+        }
+        robot.pass_until(Time::now() + WORD_PERIOD)?;
+        if number >= WORDS && counted(robot) > before {
+            break;
+        }
+    }
+    robot.pass_until(Time::now() + 4 * WORD_PERIOD)
+}
+
+fn kill_central(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), FaultError> {
+    robot.walk_to_phase(CENTRAL_PHASE)?;
+    let at = robot.kill(CENTRAL);
+    out.push(Injection::begun(Step::KillCentral, "SIGKILL", at));
+    let injection = out.last_mut().expect("it was just pushed");
+    robot.pass_until(at + OUTAGE)?;
+    injection.mark(Mark::Started, robot.start_role(CENTRAL)?);
+    hold_and_release(robot, injection)
+}

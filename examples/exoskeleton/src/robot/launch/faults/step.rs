@@ -1,0 +1,97 @@
+//! The steps of the demonstration that inject a fault.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::Serialize;
+
+/// A step, by its number in the demonstration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(into = "u8")]
+pub enum Step {
+    /// 4: the process of the knee's drive is killed.
+    KillDrive,
+    /// 5: the process of the knee's drive hangs.
+    HangDrive,
+    /// 6: the knee's node is pulled.
+    PullNode,
+    /// 7: the knee's node returns.
+    ReturnNode,
+    /// 8: the e-stop is pressed.
+    EmergencyStop,
+    /// 9: insane commands.
+    InsaneCommands,
+    /// 11: the central unit is killed.
+    KillCentral,
+}
+
+impl Step {
+    /// All of them, in order.
+    pub const ALL: [Self; 7] = [
+        Self::KillDrive,
+        Self::HangDrive,
+        Self::PullNode,
+        Self::ReturnNode,
+        Self::EmergencyStop,
+        Self::InsaneCommands,
+        Self::KillCentral,
+    ];
+
+    /// What it does, in a few words.
+    #[must_use]
+    pub const fn words(self) -> &'static str {
+        match self {
+            Self::KillDrive => "the process of the knee's drive is killed",
+            Self::HangDrive => "the process of the knee's drive hangs",
+            Self::PullNode => "the knee's node is pulled",
+            Self::ReturnNode => "the knee's node returns",
+            Self::EmergencyStop => "the e-stop is pressed",
+            Self::InsaneCommands => "insane commands are given",
+            Self::KillCentral => "the central unit is killed",
+        }
+    }
+}
+
+impl From<Step> for u8 {
+    fn from(step: Step) -> Self {
+        match step {
+            Step::KillDrive => 4,
+            Step::HangDrive => 5,
+            Step::PullNode => 6,
+            Step::ReturnNode => 7,
+            Step::EmergencyStop => 8,
+            Step::InsaneCommands => 9,
+            Step::KillCentral => 11,
+        }
+    }
+}
+
+impl fmt::Display for Step {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        u8::from(*self).fmt(f)
+    }
+}
+
+impl FromStr for Step {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        Self::ALL
+            .into_iter()
+            .find(|step| step.to_string() == text.trim())
+            .ok_or_else(|| format!("`{text}` is no step here; choose from 4, 5, 6, 7, 8, 9, 11"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn step_reads_back_from_its_number_and_ten_is_none() {
+        for step in Step::ALL {
+            assert_eq!(step.to_string().parse(), Ok(step));
+        }
+        assert!("10".parse::<Step>().is_err_and(|words| words.contains("11")));
+    }
+}
