@@ -207,7 +207,7 @@ fn one_that_waits_for_ever_while_messages_wait_is_remade_and_no_thread_is_lost()
     let what = hung(stage.wait_failed(0));
     assert!(what.contains("waits on a future; 1 messages wait"), "{what}");
     assert_eq!(next(&read), "2: 1");
-    stage.wait_abandoned(0);
+    assert_eq!(stage.most_abandoned(), 0);
     stage.stop();
 }
 

@@ -5,9 +5,10 @@ use std::{
     rc::Rc,
     sync::{
         Arc,
+        atomic::{AtomicUsize, Ordering},
         mpsc::{Receiver, SyncSender, sync_channel},
     },
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use actix::Actor;
@@ -19,8 +20,12 @@ use sinew_runtime::{
     post::Post,
     router::{LocalRoute, Router},
     sender::{Directory, Sender},
-    supervision::{ChildId, ChildSpec, Input, Policy, Reason, Strategy, Supervisor, SupervisorFact, Threads},
+    supervision::{
+        ChildId, ChildSpec, Flags, Input, Intensity, Place, Policy, Reason, Supervisor, SupervisorFact,
+        Threads,
+    },
     tid::{AppAddress, NodeAddress, Tid},
+    time::Time,
     wire::{Class, Payload},
 };
 
@@ -52,12 +57,32 @@ pub(crate) struct Stage {
     pub(crate) mailboxes: Vec<Arc<Mailbox>>,
     pub(crate) senders: Vec<Sender>,
     supervisor: Post<Input>,
-    facts: Receiver<SupervisorFact>,
-    abandoned: Receiver<usize>,
+    facts: Receiver<(Time, SupervisorFact)>,
+    abandoned: Arc<Abandoned>,
+}
+
+/// Threads that are given up and have not ended.
+#[derive(Debug, Default)]
+struct Abandoned {
+    now: AtomicUsize,
+    at_most: AtomicUsize,
+}
+
+/// How forgiving the supervisor is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Patience {
+    /// As by default.
+    Default,
+    /// It restarts without end, each time after the first wait of the default; under SCHED_FIFO, where granted.
+    Endless,
 }
 
 impl Stage {
     pub(crate) fn start(apps: Vec<DynApp>) -> Self {
+        Self::start_with(apps, Patience::Default)
+    }
+
+    pub(crate) fn start_with(apps: Vec<DynApp>, patience: Patience) -> Self {
         let router = Arc::new(Router::new(NODE));
         let (mut children, mut mailboxes, mut senders) = (Vec::new(), Vec::new(), Vec::new());
         for (index, app) in apps.into_iter().enumerate() {
@@ -72,7 +97,7 @@ impl Stage {
                 id: ChildId(index as u64),
                 tid: None,
                 name: app.name().to_owned(),
-                policy: Policy { held: false, ..app.policy().clone() },
+                policy: patience.policy(app.policy()),
                 place: app.place().clone(),
                 launch: app.launch(AppWiring { sender: sender.clone(), mailbox: mailbox.clone() }),
             });
@@ -80,9 +105,16 @@ impl Stage {
             senders.push(sender);
         }
         let (say, facts) = sync_channel(1_000);
-        let (count, abandoned) = sync_channel(1_000);
+        let abandoned = Arc::new(Abandoned::default());
+        let counts = abandoned.clone();
         let (give, given) = sync_channel(1);
-        std::thread::spawn(move || run(children, say, count, give));
+        std::thread::spawn(move || {
+            if patience == Patience::Endless {
+                // A bench shares its machine with others.
+                Place::thread("root").realtime(60).prepare();
+            }
+            run(children, patience.flags(), say, counts, give);
+        });
         let supervisor = given.recv_timeout(DEADLINE).expect("the supervisor's post");
         Self { mailboxes, senders, supervisor, facts, abandoned }
     }
@@ -92,20 +124,33 @@ impl Stage {
         sender.send(sender.tid(), &Number(number)).expect("the mailbox takes it");
     }
 
-    pub(crate) fn next_fact(&self) -> SupervisorFact {
+    /// What the supervisor says next, and when it said it.
+    pub(crate) fn next_fact_at(&self) -> (Time, SupervisorFact) {
         self.facts.recv_timeout(DEADLINE).expect("the supervisor says something")
+    }
+
+    pub(crate) fn next_fact(&self) -> SupervisorFact {
+        self.next_fact_at().1
     }
 
     pub(crate) fn wait_ready(&self, child: u64) {
         while self.next_fact() != SupervisorFact::Ready(ChildId(child)) {}
     }
 
+    /// Who fails next, and why.
+    pub(crate) fn next_failed(&self) -> (u64, Reason) {
+        loop {
+            if let SupervisorFact::Failed(ChildId(id), reason) = self.next_fact() {
+                return (id, reason);
+            }
+        }
+    }
+
     /// Why this child failed next.
     pub(crate) fn wait_failed(&self, child: u64) -> Reason {
         loop {
-            if let SupervisorFact::Failed(ChildId(id), reason) = self.next_fact()
-                && id == child
-            {
+            let (id, reason) = self.next_failed();
+            if id == child {
                 return reason;
             }
         }
@@ -113,7 +158,16 @@ impl Stage {
 
     /// Waits until so many threads are given up and have not ended.
     pub(crate) fn wait_abandoned(&self, wanted: usize) {
-        while self.abandoned.recv_timeout(DEADLINE).expect("the count is as wanted, at last") != wanted {}
+        let until = Instant::now() + DEADLINE;
+        while self.abandoned.now.load(Ordering::Relaxed) != wanted {
+            assert!(Instant::now() < until, "never {wanted} threads that are given up");
+            std::thread::sleep(Duration::from_millis(1)); // the pace of the question
+        }
+    }
+
+    /// The most threads that were given up at once so far.
+    pub(crate) fn most_abandoned(&self) -> usize {
+        self.abandoned.at_most.load(Ordering::Relaxed)
     }
 
     pub(crate) fn stop(self) -> Reason {
@@ -132,10 +186,31 @@ impl Stage {
     }
 }
 
+impl Patience {
+    fn policy(self, declared: &Policy) -> Policy {
+        let policy = Policy { held: false, ..declared.clone() };
+        match self {
+            Self::Default => policy,
+            Self::Endless => Policy { backoff_max: policy.backoff_min, ..policy },
+        }
+    }
+
+    fn flags(self) -> Flags {
+        match self {
+            Self::Default => Flags::default(),
+            Self::Endless => Flags {
+                intensity: Intensity { restarts_max: 1_000_000, ..Intensity::default() },
+                ..Flags::default()
+            },
+        }
+    }
+}
+
 fn run(
     children: Vec<ChildSpec>,
-    say: SyncSender<SupervisorFact>,
-    count: SyncSender<usize>,
+    flags: Flags,
+    say: SyncSender<(Time, SupervisorFact)>,
+    counts: Arc<Abandoned>,
     give: SyncSender<Post<Input>>,
 ) {
     let system = actix::System::new();
@@ -144,19 +219,20 @@ fn run(
         let counted = threads.clone();
         actix::spawn(async move {
             loop {
-                // Nobody reads it in most tests: then it fills up and the rest is lost.
-                let _ = count.try_send(counted.borrow().abandoned());
-                tokio::time::sleep(Duration::from_millis(20)).await;
+                let now = counted.borrow().abandoned();
+                counts.now.store(now, Ordering::Relaxed);
+                counts.at_most.fetch_max(now, Ordering::Relaxed);
+                tokio::time::sleep(Duration::from_millis(1)).await;
             }
         });
         let listener = move |fact: SupervisorFact| {
             let is_last = matches!(fact, SupervisorFact::Ended(_));
-            say.send(fact).unwrap();
+            say.send((Time::now(), fact)).unwrap();
             if is_last {
                 actix::System::current().stop();
             }
         };
-        let (supervisor, post) = Supervisor::new("test", Strategy::OneForOne, children, threads, listener);
+        let (supervisor, post) = Supervisor::new("test", flags, children, threads, listener);
         supervisor.start();
         give.send(post).unwrap();
     });

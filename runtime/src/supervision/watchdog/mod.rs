@@ -253,3 +253,48 @@ impl Watched {
         vitals.empty_hands();
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc::sync_channel;
+
+    use super::*;
+    use crate::supervision::{
+        tenant::Report,
+        vitals::{Doing, Vitals},
+    };
+
+    /// A life in the middle of a turn that began long ago.
+    fn hung(report: Report) -> Tenant {
+        let vitals = Vitals::new("hung");
+        vitals.begins(Doing::Timer, Some(Time::from_nanos(1)));
+        Tenant::new(vitals, None, Some(Duration::from_millis(20)), report)
+    }
+
+    #[test]
+    fn a_watchdog_that_panics_over_one_goes_on_with_the_others() {
+        let watchdog = Watchdog::default();
+        let (say, heard) = sync_channel(1);
+        watchdog.watch(&hung(Box::new(|_| panic!("whoever hears of it panics"))));
+        let told = hung(Box::new(move |fate| say.send(format!("{fate:?}")).expect("it is waited for")));
+        watchdog.watch(&told);
+        let fate = heard.recv_timeout(Duration::from_secs(20)).expect("the other one is accused");
+        assert!(fate.contains("in a timer has not come back"), "{fate}");
+        assert!(told.vitals().is_over());
+    }
+
+    #[test]
+    fn a_life_that_has_ended_or_has_no_budget_is_not_accused() {
+        let watchdog = Watchdog::default();
+        let accused = || -> Report { Box::new(|fate| panic!("{fate:?}")) };
+        let gone = hung(accused());
+        gone.vitals().set_gone();
+        let free = Tenant::new(hung(accused()).vitals().clone(), None, None, accused());
+        watchdog.watch(&gone);
+        watchdog.watch(&free);
+        let (say, heard) = sync_channel(1);
+        watchdog.watch(&hung(Box::new(move |_| say.send(()).expect("it is waited for"))));
+        heard.recv_timeout(Duration::from_secs(20)).expect("one that came after them is accused");
+        assert!(!gone.vitals().is_over() && !free.vitals().is_over());
+    }
+}
