@@ -3,16 +3,16 @@
 use std::{
     fmt, io,
     os::fd::{BorrowedFd, OwnedFd},
-    sync::atomic::AtomicU32,
 };
 
-use crate::wait::Wait;
+use crate::wait::Waiting;
 
 /// How a side wants to be woken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum BellKind {
-    /// A futex on the word that changes. No descriptor; the quickest for a thread that blocks. Ringing never blocks.
+    /// A futex in a page that both sides write. The quickest for a thread that blocks; nothing for a reactor. Ringing never
+    /// blocks.
     Futex,
     /// An eventfd for each direction: for a reactor. **Only for a peer that is trusted to leave it alone**: who has the
     /// descriptor can make it blocking and full, and then the next ring blocks.
@@ -22,11 +22,11 @@ pub enum BellKind {
 }
 
 impl BellKind {
-    /// Descriptors of one bell.
+    /// Descriptors of a region's two bells.
     pub(crate) const fn descriptors(self) -> usize {
         match self {
-            Self::Futex => 0,
-            Self::EventFd | Self::Socket => 1,
+            Self::Futex => 1,
+            Self::EventFd | Self::Socket => 2,
         }
     }
 
@@ -58,19 +58,11 @@ impl fmt::Display for BellKind {
     }
 }
 
-/// Both ends of a bell: the waiting side keeps one, the ringing side gets the other.
-pub(crate) struct BellPair {
-    pub(crate) ear: Box<dyn Doorbell>,
-    pub(crate) button: Option<OwnedFd>,
-}
-
-/// What a sleep is about.
-pub(crate) struct Sleeping<'a> {
-    /// The word in the peer's region that changes.
-    pub(crate) word: &'a AtomicU32,
-    /// What it was when this side decided to sleep.
-    pub(crate) seen: u32,
-    pub(crate) wait: &'a Wait<'a>,
+/// A region's two bells: the waiting side keeps the ears, the ringing side gets the buttons.
+pub(crate) struct Bells {
+    pub(crate) message: Box<dyn Doorbell>,
+    pub(crate) room: Box<dyn Doorbell>,
+    pub(crate) buttons: Vec<OwnedFd>,
 }
 
 /// Why a sleep ended.
@@ -82,14 +74,21 @@ pub(crate) enum Woken {
     HungUp,
 }
 
-/// One end of a bell. The side that waits calls `sleep`, the side that rings calls `ring`.
-pub(crate) trait Doorbell: Send {
-    /// Wakes who sleeps on `word`, which is in this side's region. Never blocks. A peer that is gone is no error here: that
-    /// shows elsewhere.
-    fn ring(&self, word: &AtomicU32);
+/// What was heard of a bell before its ear's owner announced its sleep: a ring after this ends the sleep.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Heard(pub(crate) u32);
 
-    /// Sleeps until rung, until the wait's deadline, or until the peer is gone. May end early without a reason.
-    fn sleep(&self, sleeping: &Sleeping<'_>) -> io::Result<Woken>;
+/// One end of a bell. The side that waits calls `listen`, announces its sleep, and calls `sleep`; the side that rings calls
+/// `ring`.
+pub(crate) trait Doorbell: Send {
+    /// Wakes who sleeps. Never blocks. A peer that is gone is no error here: that shows elsewhere.
+    fn ring(&self);
+
+    /// What was heard so far; before the sleep is announced.
+    fn listen(&self) -> Heard;
+
+    /// Sleeps until rung after `heard`, until the wait's deadline, or until the peer is gone. May end early without a reason.
+    fn sleep(&self, heard: Heard, waiting: &Waiting<'_>) -> io::Result<Woken>;
 
     /// What a reactor waits for; `None` when there is no such thing.
     fn fd(&self) -> Option<BorrowedFd<'_>>;

@@ -3,13 +3,12 @@
 use std::{fmt, io, os::fd::BorrowedFd, time::Instant};
 
 use crate::{
-    bell::{Doorbell, Sleeping, Woken},
+    bell::{Doorbell, Heard, Woken},
     core::{ConsumerCore, Record},
     error::{Corrupt, ReceiveError},
-    layout::Word,
     platform::{OwnHeaderMemory, PeerMemory},
     spin::{Spin, Spinner},
-    wait::{Armed, Wait},
+    wait::{Armed, Wait, Waiting, spin},
 };
 
 /// The receiving end of a connection: one thread at a time.
@@ -91,14 +90,16 @@ impl Consumer {
     }
 
     fn spin_or_sleep(&mut self, wait: &Wait<'_>) -> Result<Record, ReceiveError> {
-        if wait.spin(self.spinner.begin(), || self.core.has_moved())
+        if spin(self.spinner.begin(), || self.core.has_moved())
             && let Some(record) = self.core.next()?
         {
             return Ok(record);
         }
+        let waiting = wait.begin(Instant::now());
         loop {
+            let heard = self.message.listen();
             let ended = match self.core.arm()? {
-                Armed::Sleep => self.sleep(wait)?,
+                Armed::Sleep => self.sleep(heard, &waiting)?,
                 Armed::Ready => Woken::Rung,
             };
             // What was published before the end of the wait, or of the peer, is still a message.
@@ -113,9 +114,8 @@ impl Consumer {
         }
     }
 
-    fn sleep(&mut self, wait: &Wait<'_>) -> Result<Woken, ReceiveError> {
-        let sleeping = Sleeping { word: self.core.peer.futex(Word::Tail), seen: self.core.tail_seen(), wait };
-        let ended = self.message.sleep(&sleeping);
+    fn sleep(&mut self, heard: Heard, waiting: &Waiting<'_>) -> Result<Woken, ReceiveError> {
+        let ended = self.message.sleep(heard, waiting);
         self.core.disarm();
         ended.map_err(ReceiveError::System)
     }
@@ -190,7 +190,7 @@ impl Drop for Lent<'_> {
     fn drop(&mut self) {
         let consumer = &mut *self.consumer;
         if consumer.core.release(self.record) {
-            consumer.room_button.ring(consumer.core.own.futex(Word::Head));
+            consumer.room_button.ring();
         }
     }
 }

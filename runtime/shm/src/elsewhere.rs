@@ -4,11 +4,11 @@ use std::{
     convert::Infallible,
     io,
     os::fd::{BorrowedFd, OwnedFd},
-    sync::atomic::{AtomicU32, Ordering},
+    sync::atomic::Ordering,
 };
 
 use crate::{
-    bell::{BellKind, BellPair, Doorbell},
+    bell::{BellKind, Bells, Doorbell},
     error::{CreateError, PassError, RefusedOffer},
     layout::{Capacity, Word},
     memory::{OwnHeader, OwnRing, Peer},
@@ -31,11 +31,14 @@ pub(crate) fn adopt(_: OwnedFd, _: Capacity) -> Result<PeerMemory, RefusedOffer>
     Err(RefusedOffer::Unsupported)
 }
 
-pub(crate) fn bell_pair(_: BellKind) -> Result<BellPair, CreateError> {
+pub(crate) fn bells(_: BellKind) -> Result<Bells, CreateError> {
     Err(CreateError::Unsupported)
 }
 
-pub(crate) fn button(_: BellKind, _: Option<OwnedFd>) -> Result<Box<dyn Doorbell>, RefusedOffer> {
+/// For messages, and for room.
+type Buttons = (Box<dyn Doorbell>, Box<dyn Doorbell>);
+
+pub(crate) fn buttons(_: BellKind, _: Vec<OwnedFd>) -> Result<Buttons, RefusedOffer> {
     Err(RefusedOffer::Unsupported)
 }
 
@@ -58,12 +61,6 @@ impl OwnMemory {
 #[derive(Debug)]
 pub(crate) struct OwnHeaderMemory(Infallible);
 
-impl OwnHeaderMemory {
-    pub(crate) fn futex(&self, _: Word) -> &AtomicU32 {
-        match self.0 {}
-    }
-}
-
 impl OwnHeader for OwnHeaderMemory {
     fn store(&self, _: Word, _: u32, _: Ordering) {
         match self.0 {}
@@ -75,10 +72,6 @@ impl OwnHeader for OwnHeaderMemory {
 pub(crate) struct OwnRingMemory(Infallible);
 
 impl OwnRingMemory {
-    pub(crate) fn futex(&self, _: Word) -> &AtomicU32 {
-        match self.0 {}
-    }
-
     pub(crate) fn bytes(&self, _: u32, _: u32) -> &[u8] {
         match self.0 {}
     }
@@ -105,10 +98,6 @@ impl OwnRing for OwnRingMemory {
 pub(crate) struct PeerMemory(Infallible);
 
 impl PeerMemory {
-    pub(crate) fn futex(&self, _: Word) -> &AtomicU32 {
-        match self.0 {}
-    }
-
     pub(crate) fn copy_out(&self, _: usize, _: &mut [u8]) {
         match self.0 {}
     }

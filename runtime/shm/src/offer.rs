@@ -15,7 +15,8 @@ pub const OFFER_BYTES: usize = 24;
 /// A region as its peer gets it. Made by [`crate::Region::create`], taken by [`crate::Region::connect`].
 ///
 /// Its bytes, little-endian: magic (8, `SINEWSHM`), version (4), kind of bell (1), zero (3), capacity of the ring (8).
-/// Its descriptors, in this order: the memory; unless the bell is a futex, the bell for messages and the bell for room.
+/// Its descriptors, in this order: the memory; then for a futex the page with both bells, else the bell for messages and the
+/// bell for room.
 #[derive(Debug)]
 pub struct Offer {
     pub(crate) capacity: Capacity,
@@ -90,7 +91,7 @@ impl Offer {
         let bell = BellKind::numbered(bytes[12]).ok_or(RefusedOffer::UnknownBell(bytes[12]))?;
         let capacity = Capacity::new(u64::from_le_bytes(take(bytes, 16)))
             .map_err(|error| RefusedOffer::Capacity(error.0))?;
-        let expected = 1 + 2 * bell.descriptors();
+        let expected = 1 + bell.descriptors();
         if descriptors.len() != expected {
             return Err(RefusedOffer::Descriptors { got: descriptors.len(), expected });
         }

@@ -8,13 +8,12 @@ use std::{
 };
 
 use crate::{
-    bell::{Doorbell, Sleeping, Woken},
+    bell::{Doorbell, Heard, Woken},
     core::{ProducerCore, producer::Reserved},
     error::{Corrupt, LoanError, RoomError},
-    layout::Word,
     platform::{OwnRingMemory, PeerMemory},
     spin::{Spin, Spinner},
-    wait::{Armed, Wait},
+    wait::{Armed, Wait, Waiting, spin},
 };
 
 /// The sending end of a connection: one thread at a time.
@@ -117,14 +116,16 @@ impl Producer {
     }
 
     fn spin_or_sleep(&mut self, length: usize, wait: &Wait<'_>) -> Result<Reserved, RoomError> {
-        if wait.spin(self.spinner.begin(), || self.core.has_moved())
+        if spin(self.spinner.begin(), || self.core.has_moved())
             && let Some(reserved) = self.room_now(length)?
         {
             return Ok(reserved);
         }
+        let waiting = wait.begin(Instant::now());
         loop {
+            let heard = self.room.listen();
             let ended = match self.core.arm(length) {
-                Ok(Armed::Sleep) => self.sleep(wait)?,
+                Ok(Armed::Sleep) => self.sleep(heard, &waiting)?,
                 Ok(Armed::Ready) => Woken::Rung,
                 Err(LoanError::Corrupt(corrupt)) => return Err(corrupt.into()),
                 Err(LoanError::TooLong { asked, max } | LoanError::Full { asked, free: max }) => {
@@ -142,9 +143,8 @@ impl Producer {
         }
     }
 
-    fn sleep(&mut self, wait: &Wait<'_>) -> Result<Woken, RoomError> {
-        let sleeping = Sleeping { word: self.core.peer.futex(Word::Head), seen: self.core.head_seen(), wait };
-        let ended = self.room.sleep(&sleeping);
+    fn sleep(&mut self, heard: Heard, waiting: &Waiting<'_>) -> Result<Woken, RoomError> {
+        let ended = self.room.sleep(heard, waiting);
         self.core.disarm();
         ended.map_err(RoomError::System)
     }
@@ -183,7 +183,7 @@ impl Loan<'_> {
     pub fn publish(self) {
         let producer = &mut *self.producer;
         if producer.core.publish() {
-            producer.message_button.ring(producer.core.own.futex(Word::Tail));
+            producer.message_button.ring();
         }
     }
 

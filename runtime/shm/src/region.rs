@@ -1,7 +1,7 @@
 //! A side's own memory, and how two sides come together.
 
 use crate::{
-    bell::{BellKind, BellPair, Doorbell},
+    bell::{BellKind, Bells, Doorbell},
     consumer::Consumer,
     core::{ConsumerCore, ProducerCore},
     error::{CreateError, RefusedOffer},
@@ -46,9 +46,8 @@ impl Region {
     /// [`CreateError::Unsupported`] where there is no sealed memory; else what the system said.
     pub fn create(capacity: Capacity, bell: BellKind) -> Result<(Self, Offer), CreateError> {
         let (own, memory) = platform::create(capacity)?;
-        let BellPair { ear: message, button: message_button } = platform::bell_pair(bell)?;
-        let BellPair { ear: room, button: room_button } = platform::bell_pair(bell)?;
-        let descriptors = [Some(memory), message_button, room_button].into_iter().flatten().collect();
+        let Bells { message, room, buttons } = platform::bells(bell)?;
+        let descriptors = [memory].into_iter().chain(buttons).collect();
         Ok((Self { capacity, own, message, room }, Offer { capacity, bell, descriptors }))
     }
 
@@ -67,8 +66,7 @@ impl Region {
         let mut descriptors = descriptors.into_iter();
         let memory = descriptors.next().ok_or(RefusedOffer::Descriptors { got: 0, expected: 1 })?;
         let peer = platform::adopt(memory, theirs)?;
-        let message_button = platform::button(bell, descriptors.next())?;
-        let room_button = platform::button(bell, descriptors.next())?;
+        let (message_button, room_button) = platform::buttons(bell, descriptors.collect())?;
         let (header, ring) = self.own.split();
         let producer = ProducerCore::new(ring, peer.clone(), self.capacity);
         let consumer = ConsumerCore::new(header, peer, theirs);

@@ -8,11 +8,21 @@ use std::{
 /// Reading the clock costs as much as a few looks at memory.
 const LOOKS_A_CLOCK: u32 = 32;
 
+/// Longer than any machine runs.
+const AGES: Duration = Duration::from_secs(1 << 32);
+
 /// What a thread that waits is told by: a deadline always, the peer's end if it can be seen.
 #[derive(Clone, Copy, Debug)]
 pub struct Wait<'a> {
-    until: Instant,
+    end: End,
     hang_up: Option<HangUp<'a>>,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum End {
+    At(Instant),
+    /// From the moment on at which there is nothing: who finds something at once need not read the clock.
+    After(Duration),
 }
 
 /// A descriptor on which the peer's end shows. The memory itself does not tell.
@@ -28,7 +38,13 @@ impl<'a> Wait<'a> {
     /// Waits until then at most. A time that is past means: look, and do not wait.
     #[must_use]
     pub const fn until(deadline: Instant) -> Self {
-        Self { until: deadline, hang_up: None }
+        Self { end: End::At(deadline), hang_up: None }
+    }
+
+    /// Waits for so long at most.
+    #[must_use]
+    pub const fn within(time: Duration) -> Self {
+        Self { end: End::After(time), hang_up: None }
     }
 
     /// Ends early when the peer does.
@@ -37,34 +53,47 @@ impl<'a> Wait<'a> {
         Self { hang_up: Some(hang_up), ..self }
     }
 
-    /// Looks until `ready`, for `budget` at most and not beyond the deadline. Whether it was ready.
-    pub(crate) fn spin(&self, budget: Duration, ready: impl Fn() -> bool) -> bool {
-        if budget.is_zero() {
-            return false;
-        }
-        let mut end = None;
-        loop {
-            for _ in 0..LOOKS_A_CLOCK {
-                if ready() {
-                    return true;
-                }
-                std::hint::spin_loop();
-            }
-            let now = Instant::now();
-            let end = *end.get_or_insert_with(|| self.until.min(now + budget));
-            if now >= end {
-                return false;
-            }
-        }
+    /// The wait begins now.
+    pub(crate) fn begin(&self, now: Instant) -> Waiting<'a> {
+        let until = match self.end {
+            End::At(deadline) => deadline,
+            // Later than time goes is as late as makes no difference.
+            End::After(time) => now.checked_add(time).unwrap_or_else(|| now + AGES),
+        };
+        Waiting { until, hang_up: self.hang_up }
     }
+}
 
-    pub(crate) const fn hang_up(&self) -> Option<HangUp<'a>> {
-        self.hang_up
-    }
+/// A wait that has begun.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Waiting<'a> {
+    until: Instant,
+    pub(crate) hang_up: Option<HangUp<'a>>,
+}
 
+impl Waiting<'_> {
     /// What is left, from `now` on.
     pub(crate) fn left(&self, now: Instant) -> Duration {
         self.until.saturating_duration_since(now)
+    }
+}
+
+/// Looks until `ready`, for `budget` at most. Whether it was ready. The first looks come before the clock is read.
+pub(crate) fn spin(budget: Duration, ready: impl Fn() -> bool) -> bool {
+    if budget.is_zero() {
+        return false;
+    }
+    let mut start = None;
+    loop {
+        for _ in 0..LOOKS_A_CLOCK {
+            if ready() {
+                return true;
+            }
+            std::hint::spin_loop();
+        }
+        if start.get_or_insert_with(Instant::now).elapsed() >= budget {
+            return false;
+        }
     }
 }
 

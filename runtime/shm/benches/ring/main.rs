@@ -1,2 +1,36 @@
-//! Round trips.
-fn main() {}
+//! Round trips through rings in shared memory, beside bare references of the same run.
+//!
+//! `cargo bench -p sinew-shm --bench ring [-- WORD...]` prints one JSON line a case: those whose name holds every WORD. Two
+//! processes; both on one CPU, or one CPU each; back to back, or one round trip every millisecond. The reference runs right
+//! before its case. Times are microseconds, there and back. Nothing here asserts a time.
+//!
+//! References: a ring of four slots with a futex that is woken for every message, or polled without one, written by hand in
+//! `bare.rs`, without checks; and a unix stream socket.
+
+#[cfg(target_os = "linux")]
+mod bare;
+#[cfg(target_os = "linux")]
+mod case;
+#[cfg(target_os = "linux")]
+mod measure;
+#[cfg(target_os = "linux")]
+mod ours;
+#[cfg(target_os = "linux")]
+mod stream;
+
+#[cfg(target_os = "linux")]
+fn main() {
+    if let Ok(role) = std::env::var(case::ROLE) {
+        return case::echo(&role);
+    }
+    eprintln!("machine: {}", measure::machine());
+    let words: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with('-')).collect();
+    case::all()
+        .filter(|case| words.iter().all(|word| case.name().contains(word.as_str())))
+        .for_each(case::run);
+}
+
+#[cfg(not(target_os = "linux"))]
+fn main() {
+    eprintln!("no sealed shared memory here");
+}

@@ -54,11 +54,6 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
         self.capacity
     }
 
-    /// What the producer was last seen to have published: what a sleeper sleeps on.
-    pub(crate) const fn tail_seen(&self) -> u32 {
-        self.tail_seen
-    }
-
     /// The oldest message that was not released, if there is any.
     pub(crate) fn next(&mut self) -> Result<Option<Record>, Corrupt> {
         if let Some(corrupt) = self.corrupt {

@@ -2,38 +2,44 @@
 //!
 //! `RUSTFLAGS="--cfg loom" cargo test --release -p sinew-shm --lib --target-dir target/loom core::loom`
 
+use std::sync::{Arc, atomic::Ordering};
+
 use loom::{
-    sync::{Condvar, Mutex},
+    sync::{Condvar, Mutex, atomic::AtomicU32},
     thread,
 };
-use std::sync::Arc;
 
 use super::model::{Receiver, Sender, fill, read, ring};
 use crate::{layout::Capacity, wait::Armed};
 
-/// What a futex or an eventfd does: a ring before the sleep is not lost, rings are not counted.
-#[derive(Default)]
+/// What a futex does, and a descriptor: rung after it was listened to, a sleep ends. The lock is the system's.
 struct Bell {
-    rung: Mutex<bool>,
-    changed: Condvar,
+    word: AtomicU32,
+    sleepers: Mutex<()>,
+    woken: Condvar,
 }
 
 impl Bell {
     fn new() -> Arc<Self> {
-        Arc::new(Self { rung: Mutex::new(false), changed: Condvar::new() })
+        Arc::new(Self { word: AtomicU32::new(0), sleepers: Mutex::new(()), woken: Condvar::new() })
     }
 
     fn ring(&self) {
-        *self.rung.lock().unwrap() = true;
-        self.changed.notify_one();
+        self.word.fetch_add(1, Ordering::Release);
+        let sleepers = self.sleepers.lock().unwrap();
+        self.woken.notify_one();
+        drop(sleepers);
     }
 
-    fn sleep(&self) {
-        let mut rung = self.rung.lock().unwrap();
-        while !*rung {
-            rung = self.changed.wait(rung).unwrap();
+    fn listen(&self) -> u32 {
+        self.word.load(Ordering::Acquire)
+    }
+
+    fn sleep(&self, heard: u32) {
+        let sleepers = self.sleepers.lock().unwrap();
+        if self.word.load(Ordering::Relaxed) == heard {
+            drop(self.woken.wait(sleepers).unwrap());
         }
-        *rung = false;
     }
 }
 
@@ -55,8 +61,9 @@ fn take_sleeping(receiver: &mut Receiver, bell: &Bell) -> (Vec<u64>, bool) {
         if let Some(taken) = take(receiver) {
             return taken;
         }
+        let heard = bell.listen();
         if receiver.arm().expect("an honest peer") == Armed::Sleep {
-            bell.sleep();
+            bell.sleep(heard);
             receiver.disarm();
         }
     }
@@ -142,8 +149,9 @@ fn a_producer_that_sleeps_is_woken_for_room() {
             receiver
         });
         while sender.reserve(8).is_err() {
+            let heard = bell.listen();
             if sender.arm(8).expect("an honest peer") == Armed::Sleep {
-                bell.sleep();
+                bell.sleep(heard);
                 sender.disarm();
             }
         }

@@ -59,11 +59,6 @@ impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
         self.corrupt
     }
 
-    /// What the consumer was last seen to have taken: what a sleeper sleeps on.
-    pub(crate) const fn head_seen(&self) -> u32 {
-        self.head_seen
-    }
-
     /// The room that is reserved, if any.
     pub(crate) const fn reserved(&self) -> Option<Reserved> {
         self.reserved

@@ -1,9 +1,12 @@
-//! The three bells: a futex on the word that changes, an eventfd, a pair of sockets.
+//! The three bells: a futex, an eventfd, a pair of sockets.
 
 use std::{
     io::{self, IoSliceMut},
     os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd},
-    sync::atomic::AtomicU32,
+    sync::{
+        Arc,
+        atomic::{AtomicU32, Ordering},
+    },
     time::{Duration, Instant},
 };
 
@@ -15,44 +18,80 @@ use rustix::{
     thread::futex,
 };
 
+use super::{
+    mapping::Mapping,
+    memfd::{adopt_page, create_page},
+};
 use crate::{
-    bell::{BellKind, BellPair, Doorbell, Sleeping, Woken},
+    bell::{BellKind, Bells, Doorbell, Heard, Woken},
     error::{CreateError, RefusedOffer},
-    wait::{HangUp, Wait},
+    wait::{HangUp, Waiting},
 };
 
-/// Both ends of a bell of this kind.
-pub(crate) fn bell_pair(kind: BellKind) -> Result<BellPair, CreateError> {
+/// For messages, and for room.
+type Both = (Box<dyn Doorbell>, Box<dyn Doorbell>);
+
+/// A region's bells.
+pub(crate) fn bells(kind: BellKind) -> Result<Bells, CreateError> {
     let made = match kind {
-        BellKind::Futex => Ok(BellPair { ear: Box::new(FutexBell), button: None }),
-        BellKind::EventFd => event_pair(),
-        BellKind::Socket => socket_pair(),
+        BellKind::Futex => futexes(),
+        BellKind::EventFd => pair_of(event),
+        BellKind::Socket => pair_of(socket),
     };
-    made.map_err(|errno| CreateError::System { step: "making a bell", cause: errno.into() })
+    made.map_err(|cause| CreateError::System { step: "making bells", cause })
 }
 
-fn event_pair() -> Result<BellPair, Errno> {
+fn futexes() -> io::Result<Bells> {
+    let (page, memory) = create_page()?;
+    let (message, room) = on_page(page);
+    Ok(Bells { message, room, buttons: vec![memory] })
+}
+
+fn on_page(page: Mapping) -> Both {
+    let page = Arc::new(page);
+    let bell = |index| Box::new(FutexBell { page: Arc::clone(&page), index });
+    (bell(MESSAGE_WORD), bell(ROOM_WORD))
+}
+
+fn pair_of<T: Doorbell + 'static>(make: fn() -> Result<(T, OwnedFd), Errno>) -> io::Result<Bells> {
+    let ((message, message_button), (room, room_button)) = (make()?, make()?);
+    let buttons = vec![message_button, room_button];
+    Ok(Bells { message: Box::new(message), room: Box::new(room), buttons })
+}
+
+fn event() -> Result<(EventBell, OwnedFd), Errno> {
     let ear = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
     let button = rustix::io::fcntl_dupfd_cloexec(&ear, 0)?;
-    Ok(BellPair { ear: Box::new(EventBell(ear)), button: Some(button) })
+    Ok((EventBell(ear), button))
 }
 
-fn socket_pair() -> Result<BellPair, Errno> {
+fn socket() -> Result<(SocketBell, OwnedFd), Errno> {
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
     let (ear, button) = socketpair(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
-    Ok(BellPair { ear: Box::new(SocketBell(ear)), button: Some(button) })
+    Ok((SocketBell(ear), button))
 }
 
-/// The peer's bell, to be rung by this side, if the descriptor is one.
-pub(crate) fn button(kind: BellKind, fd: Option<OwnedFd>) -> Result<Box<dyn Doorbell>, RefusedOffer> {
-    match (kind, fd) {
-        (BellKind::Futex, _) => Ok(Box::new(FutexBell)),
-        (BellKind::EventFd, Some(fd)) if is_eventfd(&fd)? => Ok(Box::new(EventBell(fd))),
-        (BellKind::Socket, Some(fd)) if sockopt::socket_domain(&fd) == Ok(AddressFamily::UNIX) => {
-            Ok(Box::new(SocketBell(fd)))
+/// The peer's bells, to be rung by this side, if the descriptors are such.
+pub(crate) fn buttons(kind: BellKind, fds: Vec<OwnedFd>) -> Result<Both, RefusedOffer> {
+    let mut fds = fds.into_iter();
+    match (kind, fds.next(), fds.next()) {
+        (BellKind::Futex, Some(fd), None) => {
+            let page = adopt_page(&fd)
+                .map_err(|cause| RefusedOffer::System { step: "mapping the offered page of bells", cause })?;
+            page.map(on_page).ok_or(RefusedOffer::NotABell(kind))
         }
-        (BellKind::EventFd | BellKind::Socket, _) => Err(RefusedOffer::NotABell(kind)),
+        (BellKind::EventFd, Some(message), Some(room)) if is_eventfd(&message)? && is_eventfd(&room)? => {
+            Ok((Box::new(EventBell(message)), Box::new(EventBell(room))))
+        }
+        (BellKind::Socket, Some(message), Some(room)) if is_unix(&message) && is_unix(&room) => {
+            Ok((Box::new(SocketBell(message)), Box::new(SocketBell(room))))
+        }
+        (BellKind::Futex | BellKind::EventFd | BellKind::Socket, _, _) => Err(RefusedOffer::NotABell(kind)),
     }
+}
+
+fn is_unix(fd: &OwnedFd) -> bool {
+    sockopt::socket_domain(fd) == Ok(AddressFamily::UNIX)
 }
 
 fn is_eventfd(fd: &OwnedFd) -> Result<bool, RefusedOffer> {
@@ -68,26 +107,47 @@ fn is_eventfd(fd: &OwnedFd) -> Result<bool, RefusedOffer> {
 /// once.
 const HANG_UP_LOOK: Duration = Duration::from_millis(20);
 
-struct FutexBell;
+const MESSAGE_WORD: usize = 0;
+const ROOM_WORD: usize = 32;
+
+/// A word that each ring changes, in a page that both sides write.
+///
+/// Not the tail or head itself: the sleeper's mapping of those is read-only, and a futex on a read-only mapping costs half a
+/// microsecond more each time. What a hostile peer writes here ends sleeps early, or lets its own rings go unheard.
+struct FutexBell {
+    page: Arc<Mapping>,
+    index: usize,
+}
+
+impl FutexBell {
+    fn word(&self) -> &AtomicU32 {
+        self.page.shared_word(self.index)
+    }
+}
 
 impl Doorbell for FutexBell {
-    fn ring(&self, word: &AtomicU32) {
+    fn ring(&self) {
+        // SYNC: who hears this ring in `listen` also sees what it was rung for.
+        self.word().fetch_add(1, Ordering::Release);
         // Not private: the sleeper is in another process. It can fail only for a bad address, which this is not.
-        let _ = futex::wake(word, futex::Flags::empty(), 1);
+        let _ = futex::wake(self.word(), futex::Flags::empty(), 1);
     }
 
-    fn sleep(&self, sleeping: &Sleeping<'_>) -> io::Result<Woken> {
-        let Sleeping { word, seen, wait } = sleeping;
+    fn listen(&self) -> Heard {
+        Heard(self.word().load(Ordering::Acquire))
+    }
+
+    fn sleep(&self, heard: Heard, waiting: &Waiting<'_>) -> io::Result<Woken> {
         loop {
-            let left = wait.left(Instant::now());
-            let now = wait.hang_up().map_or(left, |_| left.min(HANG_UP_LOOK));
-            match futex::wait(word, futex::Flags::empty(), *seen, Some(&timespec(now))) {
-                // The word has changed before the sleep; a signal came. The caller looks again.
+            let left = waiting.left(Instant::now());
+            let now = waiting.hang_up.map_or(left, |_| left.min(HANG_UP_LOOK));
+            match futex::wait(self.word(), futex::Flags::empty(), heard.0, Some(&timespec(now))) {
+                // Rung before the sleep; a signal came. The caller looks again.
                 Ok(()) | Err(Errno::AGAIN | Errno::INTR) => return Ok(Woken::Rung),
                 Err(Errno::TIMEDOUT) => {}
                 Err(errno) => return Err(errno.into()),
             }
-            if has_hung_up(wait)? {
+            if has_hung_up(waiting)? {
                 return Ok(Woken::HungUp);
             }
             if now == left {
@@ -105,16 +165,23 @@ impl Doorbell for FutexBell {
     }
 }
 
+/// A descriptor keeps a ring until it is drained.
+const HEARD_IN_THE_DESCRIPTOR: Heard = Heard(0);
+
 struct EventBell(OwnedFd);
 
 impl Doorbell for EventBell {
-    fn ring(&self, _word: &AtomicU32) {
+    fn ring(&self) {
         // Full means that it is rung already.
         let _ = rustix::io::write(&self.0, &1_u64.to_ne_bytes());
     }
 
-    fn sleep(&self, sleeping: &Sleeping<'_>) -> io::Result<Woken> {
-        poll_for(self, sleeping.wait)
+    fn listen(&self) -> Heard {
+        HEARD_IN_THE_DESCRIPTOR
+    }
+
+    fn sleep(&self, _: Heard, waiting: &Waiting<'_>) -> io::Result<Woken> {
+        poll_for(self, waiting)
     }
 
     fn fd(&self) -> Option<BorrowedFd<'_>> {
@@ -137,13 +204,17 @@ impl Doorbell for EventBell {
 struct SocketBell(OwnedFd);
 
 impl Doorbell for SocketBell {
-    fn ring(&self, _word: &AtomicU32) {
+    fn ring(&self) {
         // Full means that it is rung already; closed means that nobody waits.
         let _ = send(&self.0, &[1], SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
     }
 
-    fn sleep(&self, sleeping: &Sleeping<'_>) -> io::Result<Woken> {
-        poll_for(self, sleeping.wait)
+    fn listen(&self) -> Heard {
+        HEARD_IN_THE_DESCRIPTOR
+    }
+
+    fn sleep(&self, _: Heard, waiting: &Waiting<'_>) -> io::Result<Woken> {
+        poll_for(self, waiting)
     }
 
     fn fd(&self) -> Option<BorrowedFd<'_>> {
@@ -158,14 +229,14 @@ impl Doorbell for SocketBell {
 }
 
 /// Waits for a bell's descriptor and for the peer's end.
-fn poll_for(bell: &impl Doorbell, wait: &Wait<'_>) -> io::Result<Woken> {
+fn poll_for(bell: &impl Doorbell, waiting: &Waiting<'_>) -> io::Result<Woken> {
     let Some(fd) = bell.fd() else {
         return Ok(Woken::Rung);
     };
-    let left = timespec(wait.left(Instant::now()));
+    let left = timespec(waiting.left(Instant::now()));
     let ear = PollFd::from_borrowed_fd(fd, PollFlags::IN);
-    let mut fds = [ear.clone(), wait.hang_up().map_or(ear, end_of)];
-    let count = if wait.hang_up().is_some() { 2 } else { 1 };
+    let mut fds = [ear.clone(), waiting.hang_up.map_or(ear, end_of)];
+    let count = if waiting.hang_up.is_some() { 2 } else { 1 };
     match poll(&mut fds[..count], Some(&left)) {
         Ok(0) => Ok(Woken::TimedOut),
         Ok(_) if fds[0].revents().contains(PollFlags::IN) && !hangs_up(fds[0].revents()) => {
@@ -190,8 +261,8 @@ fn end_of(hang_up: HangUp<'_>) -> PollFd<'_> {
     }
 }
 
-fn has_hung_up(wait: &Wait<'_>) -> io::Result<bool> {
-    let Some(hang_up) = wait.hang_up() else {
+fn has_hung_up(waiting: &Waiting<'_>) -> io::Result<bool> {
+    let Some(hang_up) = waiting.hang_up else {
         return Ok(false);
     };
     match poll(&mut [end_of(hang_up)], Some(&timespec(Duration::ZERO))) {

@@ -12,6 +12,8 @@
 //!   `OwnMemory::split` makes of it: it is neither `Clone` nor `Copy`.
 //! - M5. Of a peer's region, which changes at any time, everything is touched only by relaxed atomic loads of 4 or 8 aligned
 //!   bytes, each place always in the same size: header 4, ring 8. These are defined on read-only mappings too.
+//! - M6. A page of bells is written by both sides, and touched only as atomics of 4 bytes. It cannot shrink (seal SHRINK); a
+//!   hole in it reads as zeros.
 
 use std::{
     slice,
@@ -44,7 +46,7 @@ impl Mapping {
 
     fn header(&self) -> &[AtomicU32] {
         let start = self.raw.as_ptr().cast::<AtomicU32>();
-        // SAFETY: M1: so many bytes are mapped there and aligned to a page; M4 and M5: all access to them in this process
+        // SAFETY: M1: so many bytes are mapped there and aligned to a page; M4, M5 and M6: all access to them in this process
         // is atomic and of this size. Through a read-only mapping `PeerMemory` and `identity` only load, relaxed.
         unsafe { slice::from_raw_parts(start, HEADER_BYTES / size_of::<AtomicU32>()) }
     }
@@ -54,6 +56,16 @@ impl Mapping {
         // SAFETY: M1: so many bytes are mapped there, and the header's length keeps the alignment; M5: all access to them
         // in this process is atomic and of this size, since only `PeerMemory`, which has no other access, calls this.
         unsafe { slice::from_raw_parts(start, self.ring_bytes / size_of::<AtomicU64>()) }
+    }
+
+    /// A page of words without a ring; `None` when the mapping has another size.
+    pub(super) fn page(raw: MmapRaw) -> Option<Self> {
+        (raw.len() == HEADER_BYTES).then_some(Self { raw, ring_bytes: 0 })
+    }
+
+    /// A word of a page that both sides write.
+    pub(super) fn shared_word(&self, index: usize) -> &AtomicU32 {
+        &self.header()[index]
     }
 
     /// What the first words say: magic, version, capacity. Each is read once.
@@ -106,15 +118,14 @@ impl OwnMemory {
 pub(crate) struct OwnHeaderMemory(Arc<Mapping>);
 
 impl OwnHeaderMemory {
-    /// The word as a futex, to wake who sleeps on it.
-    pub(crate) fn futex(&self, word: Word) -> &AtomicU32 {
+    fn word(&self, word: Word) -> &AtomicU32 {
         &self.0.header()[word.index()]
     }
 }
 
 impl OwnHeader for OwnHeaderMemory {
     fn store(&self, word: Word, value: u32, order: Ordering) {
-        self.futex(word).store(value, order);
+        self.word(word).store(value, order);
     }
 }
 
@@ -123,11 +134,6 @@ impl OwnHeader for OwnHeaderMemory {
 pub(crate) struct OwnRingMemory(OwnHeaderMemory);
 
 impl OwnRingMemory {
-    /// The word as a futex, to wake who sleeps on it.
-    pub(crate) fn futex(&self, word: Word) -> &AtomicU32 {
-        self.0.futex(word)
-    }
-
     /// Bytes of the ring.
     pub(crate) fn bytes(&self, position: u32, length: u32) -> &[u8] {
         let mapping = &self.0.0;
@@ -177,11 +183,6 @@ impl PeerMemory {
         Self(Arc::new(mapping))
     }
 
-    /// The word as a futex, to sleep on.
-    pub(crate) fn futex(&self, word: Word) -> &AtomicU32 {
-        &self.0.header()[word.index()]
-    }
-
     /// Copies bytes of the ring, each read once, in words of 8: no instruction in it can be torn apart by the compiler, and
     /// what the peer does meanwhile decides only which bytes are copied.
     ///
@@ -211,7 +212,7 @@ impl PeerMemory {
 
 impl Peer for PeerMemory {
     fn load(&self, word: Word) -> u32 {
-        self.futex(word).load(Ordering::Relaxed)
+        self.0.header()[word.index()].load(Ordering::Relaxed)
     }
 
     fn mark(&self, position: u32) -> u64 {

@@ -14,7 +14,7 @@ use rustix::{
 use super::mapping::{Mapping, OwnMemory, PeerMemory};
 use crate::{
     error::{CreateError, RefusedOffer},
-    layout::{Capacity, MAGIC, VERSION},
+    layout::{Capacity, HEADER_BYTES, MAGIC, VERSION},
 };
 
 /// What tmpfs, and so every ordinary memfd, says that it is. Memory in huge pages says something else.
@@ -79,6 +79,28 @@ pub(crate) fn adopt(memory: OwnedFd, capacity: Capacity) -> Result<PeerMemory, R
         return Err(RefusedOffer::Identity);
     }
     Ok(PeerMemory::new(mapping))
+}
+
+/// What both sides write and neither believes can still not be cut.
+const NEEDED_OF_PAGE: SealFlags = SealFlags::SHRINK.union(SealFlags::GROW).union(SealFlags::SEAL);
+
+/// Makes a page of bells: both sides write it.
+pub(super) fn create_page() -> io::Result<(Mapping, OwnedFd)> {
+    let memory = unnamed()?;
+    ftruncate(&memory, HEADER_BYTES as u64)?;
+    fallocate(&memory, FallocateFlags::empty(), 0, HEADER_BYTES as u64)?;
+    fcntl_add_seals(&memory, NEEDED_OF_PAGE)?;
+    let mapping = Mapping::page(MmapOptions::new().len(HEADER_BYTES).populate().map_raw(&memory)?);
+    Ok((mapping.ok_or(io::ErrorKind::InvalidData)?, memory))
+}
+
+/// Maps a peer's page of bells, if it is one; `None` if not.
+pub(super) fn adopt_page(memory: &OwnedFd) -> io::Result<Option<Mapping>> {
+    let sealed = fcntl_get_seals(memory).is_ok_and(|seals| seals.contains(NEEDED_OF_PAGE));
+    if !sealed || fstatfs(memory)?.f_type != TMPFS_MAGIC || fstat(memory)?.st_size != HEADER_BYTES as i64 {
+        return Ok(None);
+    }
+    Ok(Mapping::page(MmapOptions::new().len(HEADER_BYTES).populate().map_raw(memory)?))
 }
 
 /// Mapped with all its pages: the first message meets no page fault.

@@ -1,0 +1,212 @@
+//! The cases: which end, which payload, which CPUs, which pace, which reference; and the two processes of each.
+
+use std::{
+    os::{fd::OwnedFd, unix::net::UnixStream},
+    process::{Child, Command, Stdio},
+};
+
+use rustix::thread::{CpuSet, sched_setaffinity};
+
+use crate::{
+    bare,
+    measure::{Figures, Pace, Run, report},
+    ours, stream,
+};
+
+/// The environment variable that makes this program the echoing end.
+pub(crate) const ROLE: &str = "SINEW_RING_ROLE";
+
+/// How messages travel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Kind {
+    Futex,
+    EventFd,
+    Socket,
+    Spin,
+    Adaptive,
+    BareFutex,
+    BarePoll,
+    UnixStream,
+}
+
+impl Kind {
+    const OURS: [Self; 5] = [Self::Futex, Self::EventFd, Self::Socket, Self::Spin, Self::Adaptive];
+    const ALL: [Self; 8] = [
+        Self::Futex,
+        Self::EventFd,
+        Self::Socket,
+        Self::Spin,
+        Self::Adaptive,
+        Self::BareFutex,
+        Self::BarePoll,
+        Self::UnixStream,
+    ];
+
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Futex => "shm_futex",
+            Self::EventFd => "shm_eventfd",
+            Self::Socket => "shm_socket",
+            Self::Spin => "shm_spin",
+            Self::Adaptive => "shm_adaptive",
+            Self::BareFutex => "bare_futex",
+            Self::BarePoll => "bare_poll",
+            Self::UnixStream => "raw_unix_stream",
+        }
+    }
+
+    const fn references(self) -> &'static [Self] {
+        match self {
+            Self::Futex => &[Self::BareFutex, Self::UnixStream],
+            Self::EventFd => &[Self::BareFutex],
+            Self::Socket => &[Self::UnixStream],
+            Self::Spin | Self::Adaptive => &[Self::BarePoll],
+            Self::BareFutex | Self::BarePoll | Self::UnixStream => &[],
+        }
+    }
+
+    /// Who looks without sleeping needs the other one to have another CPU.
+    const fn spins(self) -> bool {
+        matches!(self, Self::Spin | Self::Adaptive | Self::BarePoll)
+    }
+}
+
+/// Which CPUs the two ends use.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Pinning {
+    OneCpu,
+    OneCpuEach,
+}
+
+impl Pinning {
+    const fn name(self) -> &'static str {
+        match self {
+            Self::OneCpu => "one_cpu",
+            Self::OneCpuEach => "one_cpu_each",
+        }
+    }
+
+    const fn cpu_of_echo(self) -> usize {
+        match self {
+            Self::OneCpu => 0,
+            Self::OneCpuEach => 1,
+        }
+    }
+}
+
+/// One line of the output.
+#[derive(Clone, Copy)]
+pub(crate) struct Case {
+    kind: Kind,
+    reference: Kind,
+    payload_bytes: usize,
+    pinning: Pinning,
+    pace: Pace,
+}
+
+impl Case {
+    pub(crate) fn name(&self) -> String {
+        let Self { kind, reference, payload_bytes, pinning, pace } = self;
+        let (kind, reference) = (kind.name(), reference.name());
+        format!("{kind} {reference} {payload_bytes}B {} {}", pinning.name(), pace.name())
+    }
+}
+
+pub(crate) fn all() -> impl Iterator<Item = Case> {
+    let places = [Pinning::OneCpu, Pinning::OneCpuEach].into_iter();
+    let paces = [Pace::BackToBack, Pace::EveryMillisecond];
+    places
+        .flat_map(move |pinning| paces.map(|pace| (pinning, pace)))
+        .flat_map(|(pinning, pace)| [8, 64, 1000, 65_536].map(|bytes| (pinning, pace, bytes)))
+        // At a millisecond's pace the payload hardly shows; one will do.
+        .filter(|(_, pace, bytes)| *pace == Pace::BackToBack || *bytes == 1000)
+        .flat_map(|(pinning, pace, payload_bytes)| {
+            let pairs =
+                Kind::OURS.into_iter().flat_map(|kind| kind.references().iter().map(move |r| (kind, *r)));
+            pairs.map(move |(kind, reference)| Case { kind, reference, payload_bytes, pinning, pace })
+        })
+        .filter(|case| !(case.kind.spins() && case.pinning == Pinning::OneCpu))
+}
+
+pub(crate) fn run(case: Case) {
+    let Case { kind, reference, payload_bytes, pinning, pace } = case;
+    let raw = figures(reference, case);
+    let seen = figures(kind, case);
+    report(&Run {
+        case: kind.name(),
+        payload_bytes,
+        pinning: pinning.name(),
+        pace,
+        seen: &seen,
+        reference: reference.name(),
+        raw: &raw,
+    });
+}
+
+fn figures(kind: Kind, case: Case) -> Figures {
+    pin(0);
+    let (socket, theirs) = UnixStream::pair().expect("a pair of sockets");
+    let (bytes, pace) = (case.payload_bytes, case.pace);
+    match kind {
+        Kind::BareFutex | Kind::BarePoll => {
+            let memory = bare::memory(bytes);
+            let _echo = Echo::start(kind, case, theirs, bare::number(&memory));
+            bare::measure(&memory, kind == Kind::BarePoll, bytes, pace)
+        }
+        Kind::UnixStream => {
+            let _echo = Echo::start(kind, case, theirs, 0);
+            stream::measure(socket, bytes, pace)
+        }
+        Kind::Futex | Kind::EventFd | Kind::Socket | Kind::Spin | Kind::Adaptive => {
+            let _echo = Echo::start(kind, case, theirs, 0);
+            ours::measure(kind, &socket, bytes, pace)
+        }
+    }
+}
+
+/// The echoing end, in a process of its own, with the socket as its input.
+pub(crate) fn echo(role: &str) {
+    let words: Vec<&str> = role.split(' ').collect();
+    let number =
+        |index: usize| words[index].parse::<usize>().expect("a number that this program wrote itself");
+    let kind = Kind::ALL.into_iter().find(|kind| kind.name() == words[0]);
+    let (kind, bytes) = (kind.expect("a name that this program wrote itself"), number(1));
+    pin(number(2));
+    match kind {
+        Kind::BareFutex | Kind::BarePoll => bare::echo(number(3), kind == Kind::BarePoll, bytes),
+        Kind::UnixStream => stream::echo(bytes),
+        Kind::Futex | Kind::EventFd | Kind::Socket | Kind::Spin | Kind::Adaptive => ours::echo(kind, bytes),
+    }
+}
+
+fn pin(cpu: usize) {
+    let mut set = CpuSet::new();
+    set.set(cpu);
+    if let Err(error) = sched_setaffinity(None, &set) {
+        eprintln!("not pinned to CPU {cpu}: {error}");
+    }
+}
+
+/// Another process of this program; it is ended when this is dropped.
+struct Echo(Child);
+
+impl Echo {
+    fn start(kind: Kind, case: Case, socket: UnixStream, memory: i32) -> Self {
+        let program = std::env::current_exe().expect("this program has a path");
+        let role = format!("{} {} {} {memory}", kind.name(), case.payload_bytes, case.pinning.cpu_of_echo());
+        let child = Command::new(program)
+            .env(ROLE, role)
+            .stdin(Stdio::from(OwnedFd::from(socket)))
+            .spawn()
+            .expect("a process for the other end");
+        Self(child)
+    }
+}
+
+impl Drop for Echo {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
