@@ -46,8 +46,12 @@ pub fn process_under_test(config: &Path, arguments: &[&str]) -> Program {
     Program::start(&config.display().to_string(), command)
 }
 
-/// The binary lies beside the tests' own directory.
-fn program(name: &str) -> std::path::PathBuf {
+/// The path of one of this package's programs, which lies beside the tests' own directory.
+///
+/// # Panics
+/// If this process has no path.
+#[must_use]
+pub fn program(name: &str) -> std::path::PathBuf {
     let test = std::env::current_exe().expect("a test has a path");
     let deps = test.parent().expect("it lies in a directory");
     deps.parent().expect("which lies in the profile's").join(name)

@@ -196,6 +196,8 @@ impl NodeBuilder {
     /// The configuration has faults, an application cannot be registered, or a layer did not become ready.
     pub fn start(mut self) -> Result<Node, StartError> {
         self.config.validate()?;
+        #[cfg(feature = "fault-points")]
+        let planned = super::faults::read(&self.faults, &mut self.tree)?;
         let is_bystander = process::is_bystander(&self.config, &mut self.tree);
         let auto_shutdown = self.tree.flags.auto_shutdown;
         self.tree.flags = Flags { auto_shutdown, ..self.config.supervision.apps() };
@@ -204,7 +206,7 @@ impl NodeBuilder {
         let incarnation = self.incarnation.unwrap_or_else(wall_clock);
         let stores = Stores::new(self.config, incarnation);
         #[cfg(feature = "fault-points")]
-        super::faults::plan(&stores, &self.faults, &self.tree.apps())?;
+        super::faults::keep(&stores, &planned)?;
         #[cfg(not(feature = "fault-points"))]
         if std::env::var_os("SINEW_FAULTS").is_some() {
             tracing::warn!(

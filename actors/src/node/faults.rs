@@ -4,11 +4,11 @@ use sinew_runtime::{
     app::DynApp,
     supervision::{
         Launch,
-        fault::{Fault, FaultError, FaultPlan, Lives},
+        fault::{Fault, FaultError, FaultPlan, FaultPoints, Lives},
     },
 };
 
-use super::{NodeBuilder, NodeHandle, root::LAYERS};
+use super::{NodeBuilder, NodeHandle, SupervisorSpec, root::LAYERS};
 use crate::stores::Stores;
 
 /// The environment's plan: for every node of the process, so that it may name actors of others.
@@ -43,44 +43,71 @@ impl NodeHandle {
     }
 }
 
-/// Reads and keeps what was planned for a node with these applications.
-pub(super) fn plan(stores: &Stores, texts: &[String], apps: &[&DynApp]) -> Result<(), FaultError> {
-    let is_known = |name: &str| LAYERS.contains(&name) || apps.iter().any(|app| app.name() == name);
+/// Reads what was planned for a node with these applications. They keep their own, and take it along into a process of
+/// their own; what is left is for the layers, and for actors that the environment names and this node may not have.
+pub(super) fn read(texts: &[String], tree: &mut SupervisorSpec) -> Result<Vec<(String, Fault)>, FaultError> {
+    let mut others = Vec::new();
+    let mut planned = Vec::new();
     for text in texts {
         for (name, fault) in text.parse::<FaultPlan>()?.faults() {
-            let name = full_name(name);
-            if !is_known(name) {
-                let apps: Vec<_> = apps.iter().map(|app| app.name()).collect();
-                let why = format!(
-                    "this node has the layers {} and the applications {}",
-                    LAYERS.join(", "),
-                    apps.join(", ")
-                );
-                return Err(FaultError { fault: format!("{name}:{fault}"), why });
-            }
-            keep(stores, name, fault)?;
+            check_name(full_name(name), fault, &tree.apps())?;
+            planned.push((full_name(name).to_owned(), fault.clone()));
         }
     }
-    let environment = std::env::var(VARIABLE).unwrap_or_default();
-    for (name, fault) in environment.parse::<FaultPlan>()?.faults() {
-        keep(stores, full_name(name), fault)?;
+    let environment: FaultPlan = std::env::var(VARIABLE).unwrap_or_default().parse()?;
+    planned
+        .extend(environment.faults().iter().map(|(name, fault)| (full_name(name).to_owned(), fault.clone())));
+    for (name, fault) in planned {
+        match tree.app_mut(&name) {
+            Some(app) => app.plan_fault(fault),
+            None => others.push((name, fault)),
+        }
     }
-    Ok(())
+    Ok(others)
 }
 
-/// The launch of an application, with the faults of its own declaration and those of its node around it.
+fn check_name(name: &str, fault: &Fault, apps: &[&DynApp]) -> Result<(), FaultError> {
+    if LAYERS.contains(&name) || apps.iter().any(|app| app.name() == name) {
+        return Ok(());
+    }
+    let apps: Vec<_> = apps.iter().map(|app| app.name()).collect();
+    let (layers, apps) = (LAYERS.join(", "), apps.join(", "));
+    let why = format!("this node has the layers {layers} and the applications {apps}");
+    Err(FaultError { fault: format!("{name}:{fault}"), why })
+}
+
+/// Keeps the faults that are no application's.
+pub(super) fn keep(stores: &Stores, faults: &[(String, Fault)]) -> Result<(), FaultError> {
+    let mut keep = faults.iter();
+    keep.try_for_each(|(name, fault)| plan(&stores.faults, name, fault))
+}
+
+/// The launch of an application, with its faults around it. One that has a process of its own takes its faults there;
+/// here stays what is injected.
 pub(super) fn arm(stores: &Stores, app: &DynApp, launch: Launch) -> Launch {
+    if app.place().own_process {
+        return stores.faults.arm(app.name(), launch);
+    }
+    arm_at(&stores.faults, app, launch)
+}
+
+/// The same in the process of the application: its events are counted in each process anew.
+pub(crate) fn arm_alone(app: &DynApp, launch: Launch) -> Launch {
+    arm_at(&FaultPoints::default(), app, launch)
+}
+
+fn arm_at(points: &FaultPoints, app: &DynApp, launch: Launch) -> Launch {
     for fault in app.faults() {
-        if let Err(error) = keep(stores, app.name(), fault) {
+        if let Err(error) = plan(points, app.name(), fault) {
             tracing::error!(%error, "a fault is not planned");
         }
     }
-    stores.faults.arm(app.name(), launch)
+    points.arm(app.name(), launch)
 }
 
-fn keep(stores: &Stores, name: &str, fault: &Fault) -> Result<(), FaultError> {
-    tracing::warn!(node = stores.config.name, actor = name, %fault, "a fault is planned");
-    stores.faults.plan(name, fault.clone())
+fn plan(points: &FaultPoints, name: &str, fault: &Fault) -> Result<(), FaultError> {
+    tracing::warn!(actor = name, %fault, "a fault is planned");
+    points.plan(name, fault.clone())
 }
 
 fn full_name(name: &str) -> &str {

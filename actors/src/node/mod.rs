@@ -22,6 +22,8 @@ mod supervisor_spec;
 
 pub use builder::{NodeBuilder, StartError};
 pub use commands::CommandError;
+#[cfg(feature = "fault-points")]
+pub(crate) use faults::arm_alone;
 pub(crate) use root::{RootEvent, WAITS_MAX};
 pub use supervisor_spec::SupervisorSpec;
 

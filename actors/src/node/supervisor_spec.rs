@@ -159,6 +159,15 @@ impl SupervisorSpec {
         self.members.into_iter().flat_map(taken).collect()
     }
 
+    /// The application called `name`, here or below.
+    #[cfg(feature = "fault-points")]
+    pub(super) fn app_mut(&mut self, name: &str) -> Option<&mut DynApp> {
+        self.members.iter_mut().find_map(|member| match member {
+            Member::App(app) => (app.name() == name).then_some(app),
+            Member::Supervisor(below) => below.app_mut(name),
+        })
+    }
+
     /// Finds what can be found wrong before anything starts.
     pub(super) fn check(&self) -> Result<(), StartError> {
         let mut names = BTreeSet::new();

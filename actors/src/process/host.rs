@@ -109,7 +109,10 @@ async fn live(config: &NodeConfig, app: &DynApp, socket: StdStream, welcome: Wel
     let wiring = AppWiring { sender, mailbox: Mailbox::fed_by(wire.clone()) };
     let saying = wire.clone();
     let ready = ReadyGate::new(move || saying.say_kind(Kind::HOST_READY));
-    let (handle, ended) = alone(&app.launch(wiring), ready);
+    let launch = app.launch(wiring);
+    #[cfg(feature = "fault-points")]
+    let launch = crate::node::arm_alone(app, launch);
+    let (handle, ended) = alone(&launch, ready);
     let stopping = wire.clone();
     actix_rt::spawn(async move {
         loop {

@@ -7,6 +7,7 @@ use std::{
     pin::Pin,
     sync::Arc,
     task::{Context, Poll},
+    time::Duration,
 };
 
 use actix::{Actor, ActorContext, ActorFuture, Handler};
@@ -28,6 +29,9 @@ use crate::{
 
 /// Messages and timers that are handled before the other tasks of the thread have their turn.
 const TURN_MAX: usize = 64;
+/// Time after which no further message or timer is begun in this turn: of slow ones 64 would keep the others, and the
+/// order to stop, waiting for seconds.
+const TURN_LONGEST: Duration = Duration::from_millis(1);
 
 /// Decodes a payload and calls its handler.
 pub(super) type Dispatch<A> = fn(&mut A, &mut AppContext<A>, &Message, Time) -> Result<(), Rejection>;
@@ -79,6 +83,8 @@ pub(super) struct Drive<A: Actor<Context = AppContext<A>>> {
     /// A timer had the last step: a waiting message has the next one, so that a handler that overruns its period does not
     /// shut the mailbox out.
     timer_was_last: bool,
+    /// When the present turn had its first step.
+    turn_began: Option<Time>,
 }
 
 impl<A: Actor<Context = AppContext<A>>> Drive<A> {
@@ -88,11 +94,12 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         requirements: Requirements<A>,
         vitals: Arc<Vitals>,
     ) -> Self {
-        Self { reader, handlers, requirements, vitals, alarm: None, timer_was_last: false }
+        Self { reader, handlers, requirements, vitals, alarm: None, timer_was_last: false, turn_began: None }
     }
 
     /// Steps until there is nothing more to do, or others must have their turn.
     fn steps(&mut self, actor: &mut A, context: &mut AppContext<A>, task: &mut Context<'_>) -> Poll<()> {
+        self.turn_began = None;
         for _ in 0..TURN_MAX {
             // A handler called `stop` or `wait`: actix has to see that before the next message.
             if actix::AsyncContext::waiting(context) {
@@ -115,6 +122,10 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
     /// One turn's step. `Ready(true)`: there may be more to do; `Ready(false)`: the application is to end.
     fn step(&mut self, actor: &mut A, context: &mut AppContext<A>, task: &mut Context<'_>) -> Poll<bool> {
         let now = Time::now();
+        if now.since(*self.turn_began.get_or_insert(now)) >= TURN_LONGEST {
+            task.waker().wake_by_ref();
+            return Poll::Pending;
+        }
         if self.requirements.is_paused() {
             return self.step_paused(actor, context, task, now);
         }

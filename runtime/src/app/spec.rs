@@ -300,6 +300,12 @@ impl DynApp {
         &self.common.place
     }
 
+    /// One more fault strikes it.
+    #[cfg(feature = "fault-points")]
+    pub fn plan_fault(&mut self, fault: crate::supervision::fault::Fault) {
+        self.common.faults.push(fault);
+    }
+
     /// The faults that strike it.
     #[cfg(feature = "fault-points")]
     #[must_use]

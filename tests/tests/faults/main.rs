@@ -1,10 +1,13 @@
 //! Faults on real nodes: what happens, and what does not. One binary, one module a theme.
 
+mod ends;
+mod hangs;
 mod layers;
 mod load;
 mod mailboxes;
 mod panics;
 mod points;
+mod processes;
 
 use sinew::fault::Fault;
 

@@ -1,0 +1,201 @@
+//! How fast a whole node recovers: from a panic of an application and of each layer, a hang, a killed process.
+//!
+//! `cargo run --release -p sinew-tests --bin recovery [--trials N]`
+//!
+//! One JSON line for each kind of fault, then a table. Exit code 3: a limit is broken.
+
+use std::{process::ExitCode, time::Duration};
+
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::json;
+use sinew::{NodeHandle, Sender, fault::Fault, prelude::*};
+use sinew_tests::{
+    DEADLINE, Ground, Log, all_run,
+    load::{LAYERS, Times},
+    orders::{Me, Who},
+    puppet::{Job, Seen, Stage, desk, wait},
+    ready_for,
+};
+
+/// The hung application's budget; what is printed is the time beyond it.
+const BUDGET: Duration = Duration::from_millis(20);
+
+/// One kind of fault.
+struct Row {
+    what: String,
+    times: Times,
+    limit: Duration,
+}
+
+fn main() -> ExitCode {
+    // Hundreds of panics would fill the terminal.
+    std::panic::set_hook(Box::new(|_| {}));
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let trials = match &arguments[..] {
+        [] => 200,
+        [flag, number] if flag == "--trials" => number.parse().expect("--trials takes a number"),
+        _ => panic!("usage: recovery [--trials N]"),
+    };
+    // First: the process of the application is this program, started again, and does not come further than this.
+    let mut rows = vec![killed_process(trials)];
+    rows.extend(panics(trials));
+    rows.push(hang(trials));
+    print(&rows)
+}
+
+fn print(rows: &[Row]) -> ExitCode {
+    for Row { what, times, limit } in rows {
+        let mut json = times.json();
+        (json["bench"], json["what"], json["limit_p99_ms"]) =
+            (json!("recovery"), json!(what), json!(limit.as_secs_f64() * 1e3));
+        println!("{json}");
+    }
+    println!("{:<44} {:>6} {:>9} {:>9} {:>9} {:>9}", "", "trials", "p50 ms", "p99 ms", "max ms", "limit ms");
+    let mut code = ExitCode::SUCCESS;
+    for Row { what, times, limit } in rows {
+        let broken = times.percentile(0.99) > *limit;
+        let word = if broken { "  BROKEN" } else { "" };
+        println!("{what:<44} {times} {:>9.0}{word}", limit.as_secs_f64() * 1e3);
+        if broken {
+            code = ExitCode::from(3);
+        }
+    }
+    code
+}
+
+/// A node that may restart for ever, and whose back-off begins anew after each life.
+fn node(name: &str) -> NodeBuilder {
+    Ground::new().node(name).configure(|config| {
+        let supervision = &mut config.supervision;
+        (supervision.app_restarts_max, supervision.layer_restarts_max) = (1_000_000, 1_000_000);
+        (supervision.app_window, supervision.layer_window) =
+            (Duration::from_millis(1), Duration::from_millis(1));
+    })
+}
+
+/// A life that is longer than the window of [`node`].
+fn live() {
+    std::thread::sleep(Duration::from_millis(4));
+}
+
+/// Lets an actor panic; returns the time from its panic to its next Ready.
+fn panic_to_ready(node: &NodeHandle, name: &str) -> Duration {
+    let before = node.lives(name).expect("it is there").readies;
+    node.inject(name, Fault::panic()).expect("it is there");
+    ready_for(node, name, before + 1);
+    let lives = node.lives(name).expect("it is there");
+    lives.ready.expect("it is ready").since(lives.struck.expect("it was struck"))
+}
+
+/// Panics of an application and of the layers of one node.
+fn panics(trials: usize) -> Vec<Row> {
+    let ((puppet, _log), (desk, key)) = (Stage::new().app("puppet"), desk("desk"));
+    let node = node("panics").app(puppet).app(desk).start().expect("a node");
+    all_run(&[&node]);
+    let (handle, sender) = (node.handle(), key.sender());
+    let mut rows = vec![
+        row(
+            "application panic to Ready",
+            5,
+            (0..trials).map(|_| {
+                live();
+                panic_to_ready(&handle, "puppet")
+            }),
+        ),
+        row(
+            "application panic to next message handled",
+            5,
+            (0..trials).map(|_| {
+                live();
+                panic_to_delivery(&handle, &sender)
+            }),
+        ),
+    ];
+    for layer in LAYERS {
+        let times = (0..trials.div_ceil(LAYERS.len())).map(|_| {
+            live();
+            let ndl = handle.lives("NDL").expect("every node has it").readies;
+            let time = panic_to_ready(&handle, layer);
+            ready_for(&handle, "NDL", ndl + 1);
+            time
+        });
+        rows.push(row(&format!("{layer} panic to Ready"), 10, times));
+    }
+    rows
+}
+
+fn row(what: &str, limit_ms: u64, trials: impl Iterator<Item = Duration>) -> Row {
+    let mut times = Times::default();
+    trials.for_each(|time| times.note(time));
+    Row { what: what.to_owned(), times, limit: Duration::from_millis(limit_ms) }
+}
+
+/// A message that is sent at the moment of the panic is handled by the next life.
+fn panic_to_delivery(node: &NodeHandle, sender: &Sender) -> Duration {
+    node.inject("puppet", Fault::panic().at_event(1)).expect("it is there");
+    sender.send("puppet", &Job { number: 1 }).expect("it has room");
+    let sent = sender.send_confirmed("puppet", &Job { number: 2 }, DEADLINE).expect("it has room");
+    assert_eq!(wait(sent), Outcome::Delivered);
+    Time::now().since(node.lives("puppet").and_then(|lives| lives.struck).expect("it was struck"))
+}
+
+/// A handler that does not come back is reported: its last will is sent at that moment.
+fn hang(trials: usize) -> Row {
+    let ((puppet, log), (heir, inherits)) = (Stage::new().app("puppet"), Stage::new().app("heir"));
+    let puppet = puppet.progress_within(BUDGET).last_will("heir", &Job { number: 1 });
+    let node = node("hangs").app(heir).app(puppet).start().expect("a node");
+    all_run(&[&node]);
+    let handle = node.handle();
+    let times = (1..=trials).map(|trial| {
+        let before = handle.lives("puppet").expect("it is there").readies;
+        handle.inject("puppet", Fault::hang(BUDGET * 3)).expect("it is there");
+        let heard = heard(&inherits, trial);
+        ready_for(&handle, "puppet", before + 1);
+        let struck = handle.lives("puppet").and_then(|lives| lives.struck).expect("it was struck");
+        // Its thread lets go of it when it comes back.
+        log.wait_for_many(Seen::Dropped(trial as u64), 1);
+        heard.since(struck).saturating_sub(BUDGET)
+    });
+    row("hang reported, beyond its budget of 20 ms", 10, times)
+}
+
+fn heard(inherits: &Log<Seen>, trial: usize) -> Time {
+    inherits.wait_for_many(Seen::Got(1, 1), trial);
+    Time::now()
+}
+
+/// Says which process it is.
+struct Clerk;
+
+impl Actor for Clerk {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<Who>> for Clerk {
+    type Result = ();
+
+    fn handle(&mut self, who: Delivery<Who>, context: &mut Self::Context) {
+        // Whoever asked may have stopped waiting.
+        let _ = context.reply(&who, &Me { pid: std::process::id(), counts: Vec::new() });
+    }
+}
+
+/// An application in a process of its own that is killed.
+fn killed_process(trials: usize) -> Row {
+    let (desk, key) = desk("desk");
+    let app = AppSpec::new("drive", || Clerk).handles::<Who>().own_process();
+    let node = node("processes").app(app).app(desk).start().expect("a node");
+    all_run(&[&node]);
+    let (handle, sender) = (node.handle(), key.sender());
+    let times = (0..trials).map(|_| {
+        let asked = sender.ask::<_, Me>("drive", &Who {}, DEADLINE).expect("it is sent");
+        let me = wait(asked).expect("it answers");
+        let before = handle.lives("drive").expect("it is there").readies;
+        let pid = i32::try_from(me.pid).ok().and_then(Pid::from_raw).expect("a process id");
+        let killed = Time::now();
+        kill_process(pid, Signal::KILL).expect("it is alive");
+        ready_for(&handle, "drive", before + 1);
+        handle.lives("drive").and_then(|lives| lives.ready).expect("it is ready").since(killed)
+    });
+    row("SIGKILL of an application's process to Ready", 50, times)
+}
