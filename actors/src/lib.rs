@@ -13,7 +13,7 @@
 //! | the same in a process of its own, started and restarted by the node | [`AppSpec::own_process`], [`Place::process`] |
 //! | an application in a process that the node did not start | [`NodeApi`], [`Endpoint`] |
 //! | sending | [`Sender`]: `send`, `send_confirmed`, `ask`; [`Outcome`] |
-//! | events | [`NodeEvent`] (who is there), [`RequirementEvent`] (what is ready) |
+//! | events | [`NodeEvent`] (who is there), [`RequirementEvent`] (what is ready), [`Down`] (who ended, and why) |
 //!
 //! `docs/SEMANTICS.md` says on one page what is promised and what is not.
 //!
@@ -31,6 +31,7 @@ pub mod config;
 
 mod gncl;
 mod lncl;
+mod monitors;
 mod ndl;
 mod node;
 mod outlet;
@@ -52,6 +53,7 @@ pub use outlet::OutletCounts;
 pub use serde;
 pub use sinew_runtime::{
     app::{AppContext, AppSpec, Away, Delivery, LastWill, Raw, RequirementEvent, RequirementPolicy, Silence},
+    monitor::{Down, DownClass, MonitorError, MonitorId},
     outcome::{Outcome, Rejection},
     schedule::{Tick, TimerId},
     sender::{AskError, Confirmation, Destination, Reply, SendError, Sender},
@@ -70,9 +72,9 @@ pub mod prelude {
     pub use actix::{Actor, ActorContext, ActorFutureExt, AsyncContext, Handler, Running, fut::WrapFuture};
 
     pub use crate::{
-        AppAddress, AppContext, AppSpec, AutoShutdown, Away, Class, Delivery, LastWill, Node, NodeAddress,
-        NodeBuilder, NodeConfig, NodeEvent, Outcome, Payload, Place, RequirementEvent, RequirementPolicy,
-        Restart, Silence, StartError, Strategy, SupervisorSpec, Tick, Tid, Time, payload,
+        AppAddress, AppContext, AppSpec, AutoShutdown, Away, Class, Delivery, Down, LastWill, Node,
+        NodeAddress, NodeBuilder, NodeConfig, NodeEvent, Outcome, Payload, Place, RequirementEvent,
+        RequirementPolicy, Restart, Silence, StartError, Strategy, SupervisorSpec, Tick, Tid, Time, payload,
     };
 }
 

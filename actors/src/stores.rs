@@ -13,7 +13,7 @@ use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
 };
 
-use crate::{config::NodeConfig, gncl, lncl, ndl, node, refusals::Refusals, sync};
+use crate::{config::NodeConfig, gncl, lncl, monitors, ndl, node, refusals::Refusals, sync};
 
 /// What the layers of one node share.
 pub(crate) struct Stores {
@@ -46,6 +46,8 @@ pub(crate) struct Stores {
     pub(crate) directory_changes: tokio::sync::watch::Sender<u64>,
     /// Who is known on other nodes, and what waits for whom.
     pub(crate) sync: Mutex<sync::Core>,
+    /// Who watches whom.
+    pub(crate) monitors: Mutex<monitors::Core>,
     /// Where faults strike on purpose.
     #[cfg(feature = "fault-points")]
     pub(crate) faults: sinew_runtime::supervision::fault::FaultPoints,
@@ -78,6 +80,7 @@ impl Stores {
             registry: Mutex::default(),
             directory_changes: tokio::sync::watch::Sender::default(),
             sync: Mutex::new(sync::Core::new(&config, node, incarnation)),
+            monitors: Mutex::new(monitors::Core::new(node, incarnation, config.ndl.nodes_max)),
             config,
             #[cfg(feature = "fault-points")]
             faults: sinew_runtime::supervision::fault::FaultPoints::default(),

@@ -11,6 +11,7 @@
 //! | [`router`] | where to: the table that senders read without a lock |
 //! | [`post`] | events into an actor that outlive it |
 //! | [`mailbox`] | messages into an application that outlive it |
+//! | [`monitor`] | who is told of an end |
 //! | [`pending`], [`sender`] | sending, and waiting for what comes of it |
 //! | [`schedule`] | what an actor does when |
 //! | [`app`] | what an application is |
@@ -18,6 +19,7 @@
 
 pub mod app;
 pub mod mailbox;
+pub mod monitor;
 pub mod outcome;
 pub mod pending;
 pub mod post;

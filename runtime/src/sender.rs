@@ -14,6 +14,7 @@ use std::{
 use bytes::Bytes;
 
 use crate::{
+    monitor::{MonitorError, MonitorId},
     outcome::{Outcome, Receipt, Rejection, Ticket},
     pending::{Awaited, Pending, Settlement, Wait},
     router::Router,
@@ -30,6 +31,21 @@ pub trait Directory: Send + Sync {
 
     /// Makes the application at `app` of this node a member of `group`, or no longer one.
     fn set_member(&self, app: AppAddress, group: AppAddress, member: bool);
+
+    /// Lets the application at `watcher` of this node watch the present life of `target`.
+    ///
+    /// # Errors
+    /// Why not; nothing changed.
+    fn monitor(&self, watcher: AppAddress, target: Tid) -> Result<MonitorId, MonitorError> {
+        let _ = (watcher, target);
+        Err(MonitorError::Unsupported)
+    }
+
+    /// Ends a monitor of `watcher`. `false` if there is none, or if it has spoken already.
+    fn demonitor(&self, watcher: AppAddress, monitor: MonitorId) -> bool {
+        let _ = (watcher, monitor);
+        false
+    }
 }
 
 /// Whom a message is for: a TID (an application, a group, everybody) or a name.
@@ -170,6 +186,24 @@ impl Sender {
         if !self.is_over() {
             self.shared.directory.set_member(self.shared.tid.app, AppAddress::group(name), member);
         }
+    }
+
+    /// Watches the present life of the application at `tid`, on any node: when it ends, its node is lost, or nobody has the
+    /// TID, this application gets one [`Down`](crate::monitor::Down). The monitor ends with this application's own life.
+    ///
+    /// # Errors
+    /// The TID is not that of an application, or the bounds of [`MonitorError`] are reached.
+    pub fn monitor(&self, tid: Tid) -> Result<MonitorId, MonitorError> {
+        if self.is_over() {
+            return Err(MonitorError::LifeOver);
+        }
+        self.shared.directory.monitor(self.shared.tid.app, self.shared.router.absolute(tid))
+    }
+
+    /// Ends a monitor. `false` if it has spoken already: its [`Down`](crate::monitor::Down) may wait in the mailbox.
+    #[must_use]
+    pub fn demonitor(&self, monitor: MonitorId) -> bool {
+        self.shared.directory.demonitor(self.shared.tid.app, monitor)
     }
 
     /// Sends a value, in the class of its type. Returns when a queue or a socket has taken it.

@@ -5,6 +5,7 @@ use std::{io, ops::ControlFlow, rc::Rc, sync::Arc, time::Duration};
 use bytes::Bytes;
 use rustix::net::Shutdown;
 use sinew_runtime::{
+    monitor::DownClass,
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     router::{LocalRoute, Outlet},
     tid::Tid,
@@ -22,6 +23,7 @@ use super::{
     session::{Order, Session},
 };
 use crate::{
+    monitors::Cause,
     outlet::{LinkNumber, OutletLimits, StreamOutlet},
     stores::{Stores, lock},
 };
@@ -125,6 +127,8 @@ struct Client {
     events: Arc<[Kind]>,
     /// Whether the peer knows why its connection ends.
     has_been_told: bool,
+    /// How it ends, as far as it is known.
+    cause: Cause,
 }
 
 impl Client {
@@ -139,7 +143,8 @@ impl Client {
         server.add_outlet(peer.id, outlet.clone());
         tracing::info!(%tid, name, pid = peer.pid, "an application of another process has registered");
         let (link, events, has_been_told) = (None, events.into(), false);
-        Ok(Self { server, peer, outlet, link, tid, name, requires, events, has_been_told })
+        let cause = Cause::new(DownClass::Killed, registrar::LNCL_ENDED);
+        Ok(Self { server, peer, outlet, link, tid, name, requires, events, has_been_told, cause })
     }
 
     /// Holds the client until all that it requires is ready. Returns why its connection ended, if it did.
@@ -299,6 +304,7 @@ impl Client {
     /// Says the last words, if there are any.
     async fn finish(mut self, end: End) {
         self.has_been_told = true;
+        self.cause = end.cause();
         match end {
             End::Unregistered => self.log("has unregistered"),
             End::HungUp(None) => self.log("has gone: its process closed the socket, or ended"),
@@ -337,7 +343,7 @@ impl Client {
 
 impl Drop for Client {
     fn drop(&mut self) {
-        registrar::owner_gone(&self.server.stores, self.peer.owner());
+        registrar::owner_gone(&self.server.stores, self.peer.owner(), &self.cause);
         self.server.remove_outlet(self.peer.id);
         if !self.has_been_told {
             self.say(self.refusal("the node's LNCL has ended; connect again when it is back".to_owned()));
@@ -347,6 +353,21 @@ impl Drop for Client {
         // Senders may hold the outlet, and with it the socket, a little longer; the peer is told now. An error means
         // that it is closed already.
         let _ = rustix::net::shutdown(&self.peer.stream, Shutdown::Both);
+    }
+}
+
+impl End {
+    /// What those are told who watch the application.
+    fn cause(&self) -> Cause {
+        match self {
+            Self::Unregistered => Cause::new(DownClass::Normal, "it unregistered"),
+            Self::HungUp(_) => {
+                Cause::new(DownClass::ProcessEnded, "its process ended, or closed its connection")
+            }
+            Self::Refused(sentence) => {
+                Cause::new(DownClass::Killed, format!("its connection was ended: {sentence}"))
+            }
+        }
     }
 }
 

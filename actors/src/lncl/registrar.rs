@@ -5,6 +5,7 @@
 use std::sync::Arc;
 
 use sinew_runtime::{
+    monitor::DownClass,
     router::{LocalRoute, Outlet},
     tid::{AppAddress, Tid},
     wire::{Kind, Payload},
@@ -15,10 +16,14 @@ use super::{
     core::{Address, Owner, RegisterError, Request},
 };
 use crate::{
+    monitors::{self, Cause},
     ndl::{self, NodeEvent},
     stores::{Stores, lock},
     sync,
 };
+
+/// Why an application of another process is gone when LNCL is.
+pub(super) const LNCL_ENDED: &str = "its connection ended with its node's LNCL";
 
 /// An application in the node's own process, as the root registers it.
 pub(crate) struct LocalApp {
@@ -48,6 +53,7 @@ pub(crate) fn register_local(stores: &Stores, app: LocalApp) -> Result<Tid, Regi
     let fact_requires = request.requires.clone();
     let app = registry.register(request, stores.config.lncl.apps_max)?;
     stores.router.set_local(app, LocalRoute { outlet, events });
+    monitors::note(stores, monitors::Input::Began { app });
     tell_sync(stores, AppFact::Registered { app, name, requires: fact_requires });
     Ok(Tid::new(stores.node, app))
 }
@@ -66,7 +72,8 @@ pub(crate) fn app_down(stores: &Stores, app: AppAddress) {
 pub(crate) fn unregister_local(stores: &Stores, app: AppAddress) {
     let mut registry = lock(&stores.registry);
     if registry.unregister(app) {
-        forget(stores, app);
+        // Its supervisor has said why before; who did not start has never lived.
+        forget(stores, app, Cause::new(DownClass::Shutdown, "it is not run any more"));
     }
 }
 
@@ -88,6 +95,7 @@ pub(super) fn register_client(stores: &Stores, request: Request) -> Result<AppAd
     let (name, requires) = (request.name.clone(), request.requires.clone());
     let mut registry = lock(&stores.registry);
     let app = registry.register(request, stores.config.lncl.apps_max)?;
+    monitors::note(stores, monitors::Input::Began { app });
     tell_sync(stores, AppFact::Registered { app, name, requires });
     Ok(app)
 }
@@ -99,11 +107,11 @@ pub(super) fn open(stores: &Stores, app: AppAddress, route: LocalRoute) {
     tell(stores, AppFact::Ready { app });
 }
 
-/// Takes back all that belongs to `owner`.
-pub(super) fn owner_gone(stores: &Stores, owner: Owner) {
+/// Takes back all that belongs to `owner`, which ended so.
+pub(super) fn owner_gone(stores: &Stores, owner: Owner, cause: &Cause) {
     let mut registry = lock(&stores.registry);
     for app in registry.remove_owner(owner) {
-        forget(stores, app);
+        forget(stores, app, cause.clone());
     }
 }
 
@@ -112,11 +120,12 @@ pub(super) fn forget_former_clients(stores: &Stores) {
     let mut registry = lock(&stores.registry);
     for app in registry.in_other_processes() {
         registry.unregister(app);
-        forget(stores, app);
+        forget(stores, app, Cause::new(DownClass::Killed, LNCL_ENDED));
     }
 }
 
-fn forget(stores: &Stores, app: AppAddress) {
+fn forget(stores: &Stores, app: AppAddress, cause: Cause) {
+    monitors::note(stores, monitors::Input::Ended { app, cause, is_gone: true });
     // Told first: afterwards nobody knows any more what it subscribed to.
     tell(stores, AppFact::Unregistered { app });
     stores.router.remove_local(app);

@@ -116,7 +116,10 @@ impl TestNode {
         let next = runtime.block_on(async { tokio::time::timeout(WATCHDOG, self.facts.next()).await });
         match next.expect("LNCL tells the sync manager something").expect("the post lives") {
             sync::Event::App(fact) => fact,
-            other @ (sync::Event::Membership(_) | sync::Event::Link(_) | sync::Event::Message(_)) => {
+            other @ (sync::Event::Membership(_)
+            | sync::Event::Link(_)
+            | sync::Event::Monitors
+            | sync::Event::Message(_)) => {
                 panic!("LNCL said {other:?}")
             }
         }

@@ -1,20 +1,30 @@
 //! The ends and returns of this node's applications, acted on the moment that their supervisor says so.
 
-use std::{cell::RefCell, collections::BTreeMap, rc::Rc};
+use std::{cell::RefCell, collections::BTreeMap, rc::Rc, sync::Arc};
 
 use sinew_runtime::{
     app::Absence,
     supervision::{ChildId, SupervisorFact},
 };
 
+use crate::{monitors, stores::Stores};
+
 /// What is kept of each application for the time that it is away. Clones share it.
-#[derive(Clone, Default)]
-pub(super) struct Absences(Rc<RefCell<BTreeMap<ChildId, Absence>>>);
+#[derive(Clone)]
+pub(super) struct Absences {
+    apps: Rc<RefCell<BTreeMap<ChildId, Absence>>>,
+    stores: Arc<Stores>,
+}
 
 impl Absences {
+    /// Nobody's yet.
+    pub(super) fn new(stores: Arc<Stores>) -> Self {
+        Self { apps: Rc::default(), stores }
+    }
+
     /// The application `id` is supervised from now on.
     pub(super) fn keep(&self, id: ChildId, absence: Absence) {
-        self.0.borrow_mut().insert(id, absence);
+        self.apps.borrow_mut().insert(id, absence);
     }
 
     /// Called by the supervisor itself, before it does anything else about the child.
@@ -28,11 +38,20 @@ impl Absences {
             SupervisorFact::Failed(id, reason) | SupervisorFact::Gone(id, reason) => {
                 if let Some(absence) = self.of(*id) {
                     absence.begins(reason);
+                    let is_gone = matches!(fact, SupervisorFact::Gone(..));
+                    let app = absence.tid().app;
+                    let ended = monitors::Input::Ended { app, cause: reason.into(), is_gone };
+                    monitors::feed(&self.stores, ended);
                 }
             }
-            SupervisorFact::Deleted(id) => _ = self.0.borrow_mut().remove(id),
-            SupervisorFact::Starting(..)
-            | SupervisorFact::AllReady
+            SupervisorFact::Deleted(id) => _ = self.apps.borrow_mut().remove(id),
+            SupervisorFact::Starting(id, _) => {
+                // One that was gone may be started again by a command; of any other this says nothing new.
+                if let Some(absence) = self.of(*id) {
+                    monitors::feed(&self.stores, monitors::Input::Began { app: absence.tid().app });
+                }
+            }
+            SupervisorFact::AllReady
             | SupervisorFact::Done(..)
             | SupervisorFact::Refused(..)
             | SupervisorFact::Ended(_) => {}
@@ -41,6 +60,6 @@ impl Absences {
 
     /// A copy, so that nothing is borrowed while its messages are sent.
     fn of(&self, id: ChildId) -> Option<Absence> {
-        self.0.borrow().get(&id).cloned()
+        self.apps.borrow().get(&id).cloned()
     }
 }

@@ -103,7 +103,7 @@ pub(super) fn run(
         declared: Some(declared),
         child_ids: ChildIds::default(),
         apps: Apps::default(),
-        absences: Absences::default(),
+        absences: Absences::new(stores.clone()),
         answers: Answers::default(),
         layer_supervisor: None,
         app_supervisor: None,

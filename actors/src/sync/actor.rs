@@ -19,7 +19,7 @@ use super::{
     Event,
     core::{Core, Input, Output},
 };
-use crate::{lncl::AppFact, node::RootEvent, refusals::Refusals, stores::Stores};
+use crate::{lncl::AppFact, monitors, node::RootEvent, refusals::Refusals, stores::Stores};
 
 /// The sync manager of a node: a new one after each fault, on the same core.
 pub(crate) struct SyncManager {
@@ -47,6 +47,7 @@ impl Actor for SyncManager {
         self.stores.router.set_local(AppAddress::SYNC, LocalRoute { outlet, events: Arc::new([]) });
         // A predecessor may have failed between two of the core's orders, or before it heard of the groups.
         self.take_groups();
+        monitors::feed(&self.stores, monitors::Input::TimePassed);
         self.handle(Input::TimePassed, ctx);
         if let Some(ready) = self.ready.take() {
             ready.reached();
@@ -65,8 +66,20 @@ impl StreamHandler<Event> for SyncManager {
                 }
                 self.handle(Input::AppChanged(fact), ctx);
             }
-            Event::Membership(fact) => self.handle(Input::MembershipChanged(fact), ctx),
-            Event::Link(fact) => self.handle(Input::LinkChanged(fact), ctx),
+            Event::Membership(fact) => {
+                monitors::feed(&self.stores, (&fact).into());
+                self.handle(Input::MembershipChanged(fact), ctx);
+            }
+            Event::Link(fact) => {
+                if let Some(input) = monitors::Input::of_link(fact) {
+                    monitors::feed(&self.stores, input);
+                }
+                self.handle(Input::LinkChanged(fact), ctx);
+            }
+            Event::Monitors => {
+                monitors::drain(&self.stores);
+                self.set_alarm(ctx);
+            }
             Event::Message(message) => self.receive(message, ctx),
         }
     }
@@ -101,7 +114,8 @@ impl SyncManager {
     /// Takes a peer's list; anything else that is sent here is refused.
     fn receive(&mut self, mut message: Message, ctx: &mut Context<Self>) {
         let Tid { node, app } = message.header.source;
-        if message.header.kind != Kind::SYNC_DIRECTORY {
+        let is_about_lives = matches!(message.header.kind, Kind::SYNC_WATCH | Kind::SYNC_LIVES);
+        if message.header.kind != Kind::SYNC_DIRECTORY && !is_about_lives {
             let kind = message.header.kind;
             self.refuse(
                 "kind",
@@ -111,6 +125,11 @@ impl SyncManager {
         } else if app != AppAddress::SYNC || node == self.stores.node {
             self.refuse("source", &format_args!("{node}/{app} is no other node's sync manager"));
             message.reject(Rejection::ForgedSource);
+        } else if is_about_lives {
+            if let Err(fault) = monitors::receive(&self.stores, node, &message) {
+                self.refuse("lives", &fault);
+            }
+            message.settle(Outcome::Delivered);
         } else {
             let payload = message.payload.clone();
             self.handle(Input::ListReceived { from: node, payload }, ctx);
@@ -123,7 +142,8 @@ impl SyncManager {
     }
 
     fn set_alarm(&mut self, ctx: &mut Context<Self>) {
-        let wake = self.core().next_wake();
+        let monitors = monitors::next_wake(&self.stores);
+        let wake = [self.core().next_wake(), monitors].into_iter().flatten().min();
         if self.alarm.as_ref().map(|(at, _)| *at) == wake {
             return;
         }
@@ -133,6 +153,7 @@ impl SyncManager {
         self.alarm = wake.map(|at| {
             let timer = ctx.run_later(at.since(Time::now()), |manager, ctx| {
                 manager.alarm = None;
+                monitors::feed(&manager.stores, monitors::Input::TimePassed);
                 manager.handle(Input::TimePassed, ctx);
             });
             (at, timer)
@@ -238,7 +259,7 @@ impl Outlet for PostOutlet {
         match self.0.post(Event::Message(message)) {
             Err(Event::Message(message)) => Err(Refused::new(message, Rejection::QueueFull)),
             // A full post hands back what it was given: a message.
-            Ok(()) | Err(Event::App(_) | Event::Membership(_) | Event::Link(_)) => Ok(()),
+            Ok(()) | Err(Event::App(_) | Event::Membership(_) | Event::Link(_) | Event::Monitors) => Ok(()),
         }
     }
 }

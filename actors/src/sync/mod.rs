@@ -26,7 +26,7 @@ mod list;
 pub(crate) use actor::SyncManager;
 pub(crate) use core::Core;
 pub use facts::{DirectoryEntry, Waiting};
-pub(crate) use list::NAME_BYTES_MAX;
+pub(crate) use list::{NAME_BYTES_MAX, at_most};
 
 use sinew_runtime::wire::Message;
 
@@ -41,6 +41,8 @@ pub(crate) enum Event {
     Membership(MembershipFact),
     /// By GNCL: whom messages can reach.
     Link(LinkFact),
+    /// By whoever changed a monitor or a life: there are orders to carry out, or a time to set.
+    Monitors,
     /// A message for the sync manager's TID, from another node's.
     Message(Message),
 }
@@ -52,6 +54,7 @@ impl Event {
             Self::App(fact) => Self::App(fact.clone()),
             Self::Membership(fact) => Self::Membership(fact.clone()),
             Self::Link(fact) => Self::Link(*fact),
+            Self::Monitors => Self::Monitors,
             Self::Message(message) => Self::Message(Message::new(message.header, message.payload.clone())),
         }
     }

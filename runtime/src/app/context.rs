@@ -9,6 +9,7 @@ use actix::{
 
 use crate::{
     app::Delivery,
+    monitor::{MonitorError, MonitorId},
     outcome::{Outcome, Rejection},
     schedule::{Schedule, Tick, TimerId},
     sender::{Confirmation, Destination, Reply, SendError, Sender},
@@ -103,6 +104,19 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     #[must_use]
     pub fn resolve(&self, name: &str) -> Option<Tid> {
         self.sender.resolve(name)
+    }
+
+    /// Watches the present life of the application at `tid`; see [`Sender::monitor`].
+    ///
+    /// # Errors
+    /// The TID is not that of an application, or there are too many monitors.
+    pub fn monitor(&self, tid: Tid) -> Result<MonitorId, MonitorError> {
+        self.sender.monitor(tid)
+    }
+
+    /// Ends a monitor; see [`Sender::demonitor`].
+    pub fn demonitor(&self, monitor: MonitorId) -> bool {
+        self.sender.demonitor(monitor)
     }
 
     /// Sends a value; see [`Sender::send`].

@@ -47,6 +47,10 @@ impl Kind {
     pub const NDL_LEAVE: Self = Self(0x22);
     /// The names that a node's applications have, and which of them are ready.
     pub const SYNC_DIRECTORY: Self = Self(0x30);
+    /// A node says whose applications' lives it watches on the receiver's node.
+    pub const SYNC_WATCH: Self = Self(0x31);
+    /// Which life each of them is in, and how the last one ended.
+    pub const SYNC_LIVES: Self = Self(0x32);
     /// A process asks for a transport address.
     pub const LNCL_REGISTER: Self = Self(0x40);
     /// The address it got.

@@ -1,0 +1,273 @@
+//! The monitors of this node's applications, and the other nodes that they reach to.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::Duration,
+};
+
+use sinew_runtime::{
+    monitor::MonitorId,
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    time::Time,
+};
+
+use super::{Cause, LifeState, ORPHAN, REPEAT, SPACING, nobody};
+
+/// The watching side.
+#[derive(Debug)]
+pub(super) struct Watching {
+    monitors: BTreeMap<MonitorId, Monitor>,
+    by_target: BTreeMap<Tid, BTreeSet<MonitorId>>,
+    peers: BTreeMap<NodeAddress, Peer>,
+    nodes_max: usize,
+    next: u64,
+}
+
+#[derive(Debug)]
+struct Monitor {
+    watcher: AppAddress,
+    target: Tid,
+    since: Time,
+    /// The life that it watches, once that is known.
+    life: Option<u64>,
+    /// The newest word about its target that was taken into account.
+    seen: u64,
+}
+
+/// Another node, as far as it is known.
+#[derive(Debug, Default)]
+pub(super) struct Peer {
+    /// The life of it that is known.
+    life: Incarnation,
+    is_found: bool,
+    is_linked: bool,
+    /// When it counts as lost, if its link does not come back.
+    orphan: Option<Time>,
+    version: u64,
+    sent: Option<Time>,
+    /// When it is told whom we watch there.
+    due: Option<Time>,
+}
+
+impl Watching {
+    pub(super) const fn new(nodes_max: usize) -> Self {
+        Self {
+            monitors: BTreeMap::new(),
+            by_target: BTreeMap::new(),
+            peers: BTreeMap::new(),
+            nodes_max,
+            next: 0,
+        }
+    }
+
+    pub(super) fn add(&mut self, watcher: AppAddress, target: Tid, now: Time) -> MonitorId {
+        self.next += 1;
+        let id = MonitorId(self.next);
+        self.monitors.insert(id, Monitor { watcher, target, since: now, life: None, seen: 0 });
+        self.by_target.entry(target).or_default().insert(id);
+        id
+    }
+
+    pub(super) fn establish(&mut self, id: MonitorId, life: u64) {
+        if let Some(monitor) = self.monitors.get_mut(&id) {
+            monitor.life = Some(life);
+        }
+    }
+
+    /// Removes a monitor; returns whose it was and whom it watched.
+    pub(super) fn remove(&mut self, id: MonitorId) -> Option<(AppAddress, Tid)> {
+        let Monitor { watcher, target, .. } = self.monitors.remove(&id)?;
+        if let Some(ids) = self.by_target.get_mut(&target) {
+            ids.remove(&id);
+            if ids.is_empty() {
+                self.by_target.remove(&target);
+            }
+        }
+        Some((watcher, target))
+    }
+
+    pub(super) fn remove_of(&mut self, watcher: AppAddress, id: MonitorId) -> Option<Tid> {
+        let is_its = self.monitors.get(&id).is_some_and(|monitor| monitor.watcher == watcher);
+        if is_its { self.remove(id).map(|(_, target)| target) } else { None }
+    }
+
+    /// Removes all monitors of `watcher`; returns whom they watched.
+    pub(super) fn remove_watcher(&mut self, watcher: AppAddress) -> Vec<Tid> {
+        let its = self.monitors.iter().filter(|(_, monitor)| monitor.watcher == watcher);
+        let ids: Vec<_> = its.map(|(id, _)| *id).collect();
+        ids.into_iter().filter_map(|id| self.remove(id)).map(|(_, target)| target).collect()
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.monitors.len()
+    }
+
+    pub(super) fn count_of(&self, watcher: AppAddress) -> usize {
+        self.monitors.values().filter(|monitor| monitor.watcher == watcher).count()
+    }
+
+    pub(super) fn is_watched(&self, target: Tid) -> bool {
+        self.by_target.contains_key(&target)
+    }
+
+    /// The monitors on `target`.
+    pub(super) fn of(&self, target: Tid) -> Vec<MonitorId> {
+        self.by_target.get(&target).into_iter().flatten().copied().collect()
+    }
+
+    fn targets(&self, node: NodeAddress) -> impl Iterator<Item = (&Tid, &BTreeSet<MonitorId>)> {
+        let first = Tid::new(node, AppAddress::NONE);
+        let last = Tid::new(node, AppAddress::ALL);
+        self.by_target.range(first..=last)
+    }
+
+    pub(super) fn targets_on(&self, node: NodeAddress) -> usize {
+        self.targets(node).count()
+    }
+
+    /// The monitors on applications of `node`.
+    pub(super) fn on(&self, node: NodeAddress) -> Vec<MonitorId> {
+        self.targets(node).flat_map(|(_, ids)| ids).copied().collect()
+    }
+
+    /// Takes the word about a monitor's target. Returns why it ends, if it does.
+    pub(super) fn judge(
+        &mut self,
+        id: MonitorId,
+        version: u64,
+        state: &LifeState,
+        now: Time,
+    ) -> Option<Cause> {
+        let monitor = self.monitors.get_mut(&id)?;
+        if version <= monitor.seen {
+            return None;
+        }
+        monitor.seen = version;
+        let ended = || state.ended.as_ref().map_or_else(nobody, |ended| ended.cause.clone());
+        match monitor.life {
+            Some(life) if state.life == life => None,
+            Some(_) => Some(ended()),
+            None => {
+                // spec: MON-4: the younger life may have begun after the monitor was set.
+                let is_younger = Duration::from_micros(state.age_us) < now.since(monitor.since);
+                match (state.life, is_younger && state.ended.is_some()) {
+                    (_, true) => Some(ended()),
+                    (0, false) => Some(nobody()),
+                    (life, false) => {
+                        monitor.life = Some(life);
+                        None
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// The other nodes.
+impl Watching {
+    fn at(&mut self, node: NodeAddress) -> Option<&mut Peer> {
+        if !self.peers.contains_key(&node) && self.peers.len() >= self.nodes_max {
+            return None;
+        }
+        Some(self.peers.entry(node).or_default())
+    }
+
+    /// Whether a monitor there could be about this life of `node`, and not about a later one.
+    pub(super) fn is_about(&self, node: NodeAddress, life: Incarnation) -> bool {
+        self.peers.get(&node).is_some_and(|peer| peer.life <= life)
+    }
+
+    /// The life of `node` that was known until now, if it is an earlier one than `incarnation`.
+    pub(super) fn former_life(&self, node: NodeAddress, incarnation: Incarnation) -> Option<Incarnation> {
+        self.peers.get(&node).map(|peer| peer.life).filter(|life| *life < incarnation)
+    }
+
+    pub(super) fn linked(&self, node: NodeAddress) -> Option<Incarnation> {
+        self.peers.get(&node).filter(|peer| peer.is_linked).map(|peer| peer.life)
+    }
+
+    pub(super) fn found(&mut self, node: NodeAddress, incarnation: Incarnation) {
+        if let Some(peer) = self.at(node) {
+            peer.life = peer.life.max(incarnation);
+            (peer.is_found, peer.orphan) = (true, None);
+        }
+    }
+
+    /// This life of `node` is over; who watched there was told.
+    pub(super) fn lost(&mut self, node: NodeAddress, incarnation: Incarnation) {
+        if let Some(peer) = self.peers.get_mut(&node)
+            && peer.life <= incarnation
+        {
+            if peer.is_linked {
+                // The link will break, or the node is found again behind it.
+                peer.is_found = false;
+            } else {
+                self.peers.remove(&node);
+            }
+        }
+    }
+
+    pub(super) fn link_up(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
+        let is_watched = self.targets_on(node) > 0;
+        if let Some(peer) = self.at(node) {
+            peer.life = peer.life.max(incarnation);
+            (peer.is_linked, peer.orphan) = (true, None);
+            if is_watched {
+                peer.due = Some(now);
+            }
+        }
+    }
+
+    pub(super) fn link_broken(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
+        if let Some(peer) = self.peers.get_mut(&node)
+            && peer.life <= incarnation
+        {
+            (peer.is_linked, peer.due) = (false, None);
+            if !peer.is_found {
+                peer.orphan = Some(now + ORPHAN);
+            }
+        }
+    }
+
+    /// The nodes that are forgotten now, because nobody found them and their link did not come back.
+    pub(super) fn orphans(&mut self, now: Time) -> Vec<NodeAddress> {
+        let over = |peer: &Peer| peer.orphan.is_some_and(|at| at <= now);
+        let orphans: Vec<_> =
+            self.peers.iter().filter(|(_, peer)| over(peer)).map(|(node, _)| *node).collect();
+        for node in &orphans {
+            self.peers.remove(node);
+        }
+        orphans
+    }
+
+    /// Whom we watch on `node` changed: it is told soon. `false` if the node is not known.
+    pub(super) fn make_due(&mut self, node: NodeAddress, now: Time) -> bool {
+        let Some(peer) = self.peers.get_mut(&node) else { return false };
+        if peer.is_linked {
+            let earliest = peer.sent.map_or(now, |sent| now.max(sent + SPACING));
+            peer.due = Some(peer.due.map_or(earliest, |due| due.min(earliest)));
+        }
+        peer.is_linked || peer.is_found
+    }
+
+    /// Whom to tell now: node, version, whom we watch there.
+    pub(super) fn take_due(&mut self, now: Time) -> Vec<(NodeAddress, u64, Vec<AppAddress>)> {
+        let due = |peer: &Peer| peer.is_linked && peer.due.is_some_and(|due| due <= now);
+        let nodes: Vec<_> = self.peers.iter().filter(|(_, peer)| due(peer)).map(|(node, _)| *node).collect();
+        let mut told = Vec::new();
+        for node in nodes {
+            let apps: Vec<_> = self.targets(node).map(|(target, _)| target.app).collect();
+            let Some(peer) = self.peers.get_mut(&node) else { continue };
+            peer.version += 1;
+            peer.sent = Some(now);
+            peer.due = (!apps.is_empty()).then(|| now + REPEAT);
+            told.push((node, peer.version, apps));
+        }
+        told
+    }
+
+    pub(super) fn next_due(&self) -> Option<Time> {
+        let due = |peer: &Peer| [peer.due, peer.orphan].into_iter().flatten().min();
+        self.peers.values().filter_map(due).min()
+    }
+}

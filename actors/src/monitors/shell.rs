@@ -1,0 +1,144 @@
+//! Carries the core's orders out, on whatever thread has news for it.
+
+use sinew_runtime::{
+    monitor::Down,
+    outcome::Rejection,
+    tid::{AppAddress, NodeAddress, Tid},
+    time::Time,
+    wire::{Header, Kind, Message, Payload, decode},
+};
+
+use super::{
+    core::{Core, Input, Output},
+    words::write,
+};
+use crate::{
+    gncl::LinkFact,
+    ndl::{LossReason, MembershipFact},
+    stores::{Stores, lock},
+    sync,
+};
+
+impl From<&MembershipFact> for Input {
+    fn from(fact: &MembershipFact) -> Self {
+        match *fact {
+            MembershipFact::NodeFound { node, incarnation, .. } => Self::NodeFound { node, incarnation },
+            MembershipFact::NodeLost { node, incarnation, why } => {
+                let why = match why {
+                    LossReason::Left => "its node left",
+                    LossReason::Silent => "its node was lost: it is silent",
+                    LossReason::ConnectionRefused => "its node was lost: its process ended",
+                    LossReason::Restarted => "its node was restarted",
+                };
+                Self::NodeLost { node, incarnation, why }
+            }
+        }
+    }
+}
+
+impl Input {
+    /// What a link's change is to monitors; `None`: nothing.
+    pub(crate) const fn of_link(fact: LinkFact) -> Option<Self> {
+        match fact {
+            LinkFact::LinkUp { node, incarnation } => Some(Self::LinkUp { node, incarnation }),
+            LinkFact::LinkBroken { node, incarnation } => Some(Self::LinkBroken { node, incarnation }),
+            LinkFact::PeerLeft { node, incarnation } => {
+                Some(Self::NodeLost { node, incarnation, why: "its node left" })
+            }
+            LinkFact::DialRefused { .. } => None,
+        }
+    }
+}
+
+/// Tells the core what has happened and carries out what follows. Not for who holds a lock of the node's: messages are
+/// sent.
+pub(crate) fn feed(stores: &Stores, input: Input) {
+    change(stores, |core| core.handle(Time::now(), input));
+}
+
+/// Changes the core and carries out what follows.
+pub(crate) fn change<T>(stores: &Stores, change: impl FnOnce(&mut Core) -> T) -> T {
+    let (said, is_earlier) = {
+        let mut core = lock(&stores.monitors);
+        let before = core.next_wake();
+        let said = change(&mut core);
+        (said, core.next_wake().is_some_and(|wake| before.is_none_or(|before| wake < before)))
+    };
+    drain(stores);
+    if is_earlier {
+        poke(stores);
+    }
+    said
+}
+
+/// The same for who holds a lock: what follows is carried out by the sync manager.
+pub(crate) fn note(stores: &Stores, input: Input) {
+    let has_orders = {
+        let mut core = lock(&stores.monitors);
+        core.handle(Time::now(), input);
+        core.has_orders()
+    };
+    if has_orders {
+        poke(stores);
+    }
+}
+
+/// Carries out what the core orders.
+pub(crate) fn drain(stores: &Stores) {
+    loop {
+        let Some(output) = lock(&stores.monitors).poll() else { return };
+        match output {
+            Output::Tell { watcher, down } => tell(stores, watcher, down),
+            Output::Watch { to, watch } => say(stores, to, Kind::SYNC_WATCH, write(&watch)),
+            Output::Lives { to, lives } => say(stores, to, Kind::SYNC_LIVES, write(&lives)),
+        }
+    }
+}
+
+/// When the sync manager has to say that time has passed.
+pub(crate) fn next_wake(stores: &Stores) -> Option<Time> {
+    lock(&stores.monitors).next_wake()
+}
+
+/// Takes a frame of another node's sync manager.
+///
+/// # Errors
+/// What is wrong with it, in words.
+pub(crate) fn receive(stores: &Stores, from: NodeAddress, message: &Message) -> Result<(), String> {
+    let in_words = |error: rmp_serde::decode::Error| format!("from {from}: {error}");
+    let input = match message.header.kind {
+        Kind::SYNC_WATCH => Input::Watch { from, watch: decode(&message.payload).map_err(in_words)? },
+        Kind::SYNC_LIVES => Input::Lives { from, lives: decode(&message.payload).map_err(in_words)? },
+        kind => return Err(format!("{from} sent kind {kind}")),
+    };
+    feed(stores, input);
+    Ok(())
+}
+
+fn poke(stores: &Stores) {
+    if stores.posts.sync.post(sync::Event::Monitors).is_err() {
+        tracing::error!("the sync manager's post is full; monitors are looked at late: does it hang?");
+    }
+}
+
+fn tell(stores: &Stores, watcher: AppAddress, down: Down) {
+    let mut message =
+        Message::new(header(stores, Down::KIND, stores.node, watcher), sinew_runtime::wire::encode(&down));
+    message.header.class = Down::CLASS;
+    if let Err(Rejection::QueueFull) = stores.router.send(message) {
+        // Any other refusal says that the watcher is gone, and its monitors go with it.
+        feed(stores, Input::NotTaken { watcher, down });
+    }
+}
+
+fn say(stores: &Stores, to: NodeAddress, kind: Kind, payload: bytes::Bytes) {
+    // Not taken: it is said again within 2 s, and when the link is back.
+    let _ = stores.router.send(Message::new(header(stores, kind, to, AppAddress::SYNC), payload));
+}
+
+fn header(stores: &Stores, kind: Kind, node: NodeAddress, app: AppAddress) -> Header {
+    let mut header = Header::new(kind, Tid::new(stores.node, AppAddress::SYNC), Tid::new(node, app));
+    header.sequence = lock(&stores.sync).next_sequence();
+    header.sent = Time::now();
+    header
+}

@@ -1,0 +1,408 @@
+//! What monitors promise: claims, and two nodes with an unreliable link between them against who really lives.
+
+use std::{
+    collections::{BTreeMap, VecDeque},
+    time::Duration,
+};
+
+use proptest::prelude::*;
+use sinew_runtime::{
+    monitor::{Down, DownClass, MonitorError, MonitorId},
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    time::Time,
+};
+
+use super::{
+    Cause, Core, Input,
+    core::{MONITORS_MAX, Output, PER_WATCHER_MAX, REPEAT, RETRY},
+};
+
+const HERE: NodeAddress = NodeAddress::new(0x7f00_0001);
+const THERE: NodeAddress = NodeAddress::new(0x7f00_0002);
+const LIFE: Incarnation = Incarnation(5);
+
+fn app(index: u32) -> AppAddress {
+    AppAddress::fixed(index).unwrap()
+}
+
+fn panicked() -> Cause {
+    Cause::new(DownClass::Panic, "panicked: its end")
+}
+
+fn ended(index: u32, is_gone: bool) -> Input {
+    Input::Ended { app: app(index), cause: panicked(), is_gone }
+}
+
+/// A core and its clock.
+struct Bench {
+    core: Core,
+    now: Time,
+}
+
+impl Bench {
+    fn new() -> Self {
+        Self { core: Core::new(HERE, LIFE, 4), now: Time::from_nanos(1_000_000_000) }
+    }
+
+    fn hears(&mut self, input: Input) -> Vec<Output> {
+        self.core.handle(self.now, input);
+        std::iter::from_fn(|| self.core.poll()).collect()
+    }
+
+    fn monitors(&mut self, watcher: u32, target: Tid) -> (Result<MonitorId, MonitorError>, Vec<Output>) {
+        let set = self.core.monitor(self.now, app(watcher), target);
+        (set, std::iter::from_fn(|| self.core.poll()).collect())
+    }
+}
+
+fn downs(outputs: &[Output]) -> Vec<(AppAddress, Down)> {
+    let down = |output: &Output| match output {
+        Output::Tell { watcher, down } => Some((*watcher, down.clone())),
+        Output::Watch { .. } | Output::Lives { .. } => None,
+    };
+    outputs.iter().filter_map(down).collect()
+}
+
+fn classes(outputs: &[Output]) -> Vec<DownClass> {
+    downs(outputs).into_iter().map(|(_, down)| down.class).collect()
+}
+
+// spec: MON-1
+#[test]
+fn the_end_of_a_life_is_told_once_to_each_who_watches_it() {
+    let mut bench = Bench::new();
+    bench.hears(Input::Began { app: app(0) });
+    let first = bench.monitors(1, Tid::new(HERE, app(0))).0.unwrap();
+    let second = bench.monitors(2, Tid::new(HERE, app(0))).0.unwrap();
+    let told = downs(&bench.hears(ended(0, false)));
+    let down = |monitor| Down {
+        monitor,
+        tid: Tid::new(HERE, app(0)),
+        class: DownClass::Panic,
+        why: "panicked: its end".to_owned(),
+    };
+    assert_eq!(told, [(app(1), down(first)), (app(2), down(second))]);
+    assert_eq!(bench.hears(ended(0, false)), [], "of the next life nobody wanted to know");
+}
+
+// spec: MON-2
+#[test]
+fn who_is_not_there_is_told_at_once() {
+    let mut bench = Bench::new();
+    let (_, outputs) = bench.monitors(1, Tid::new(HERE, app(0)));
+    assert_eq!(classes(&outputs), [DownClass::NoSuchAddress]);
+    let (_, outputs) = bench.monitors(1, Tid::new(THERE, app(0)));
+    assert_eq!(classes(&outputs), [DownClass::NodeLost]);
+    for many in [Tid::group("drives"), Tid::BROADCAST, Tid::new(THERE, AppAddress::SYNC)] {
+        assert_eq!(bench.monitors(1, many).0, Err(MonitorError::NotOne(many)));
+    }
+}
+
+// spec: MON-3
+#[test]
+fn a_node_that_is_lost_ends_all_its_lives_and_one_that_is_only_cut_off_none() {
+    let mut bench = Bench::new();
+    bench.hears(Input::NodeFound { node: THERE, incarnation: LIFE });
+    bench.hears(Input::LinkUp { node: THERE, incarnation: LIFE });
+    bench.monitors(1, Tid::new(THERE, app(0))).0.unwrap();
+    assert_eq!(downs(&bench.hears(Input::LinkBroken { node: THERE, incarnation: LIFE })), []);
+    let former = Input::NodeLost { node: THERE, incarnation: Incarnation(4), why: "an earlier life" };
+    assert_eq!(downs(&bench.hears(former)), []);
+    let lost = Input::NodeLost { node: THERE, incarnation: LIFE, why: "its node left" };
+    assert_eq!(classes(&bench.hears(lost.clone())), [DownClass::NodeLost]);
+    assert_eq!(downs(&bench.hears(lost)), []);
+}
+
+// spec: MON-3
+#[test]
+fn a_node_in_a_new_life_has_lost_the_old_one_whoever_says_so_first() {
+    let mut bench = Bench::new();
+    bench.hears(Input::LinkUp { node: THERE, incarnation: LIFE });
+    bench.monitors(1, Tid::new(THERE, app(0))).0.unwrap();
+    let again = bench.hears(Input::LinkUp { node: THERE, incarnation: Incarnation(6) });
+    assert_eq!(classes(&again), [DownClass::NodeLost]);
+    bench.monitors(1, Tid::new(THERE, app(0))).0.unwrap();
+    let late = Input::NodeLost { node: THERE, incarnation: LIFE, why: "its node was restarted" };
+    assert_eq!(downs(&bench.hears(late)), [], "it is about the life before");
+}
+
+// spec: MON-5
+#[test]
+fn the_monitors_of_a_watcher_end_with_its_life() {
+    let mut bench = Bench::new();
+    for index in [0, 1] {
+        bench.hears(Input::Began { app: app(index) });
+    }
+    bench.monitors(1, Tid::new(HERE, app(0))).0.unwrap();
+    bench.hears(ended(1, false));
+    assert_eq!(bench.hears(ended(0, false)), []);
+}
+
+#[test]
+fn who_demonitors_is_told_nothing_and_what_is_another_ones_stays() {
+    let mut bench = Bench::new();
+    bench.hears(Input::Began { app: app(0) });
+    let kept = bench.monitors(1, Tid::new(HERE, app(0))).0.unwrap();
+    let ended_one = bench.monitors(1, Tid::new(HERE, app(0))).0.unwrap();
+    assert!(!bench.core.demonitor(bench.now, app(2), kept));
+    assert!(bench.core.demonitor(bench.now, app(1), ended_one));
+    let told = downs(&bench.hears(ended(0, true)));
+    assert_eq!(told.into_iter().map(|(_, down)| down.monitor).collect::<Vec<_>>(), [kept]);
+    assert!(!bench.core.demonitor(bench.now, app(1), kept), "it has spoken");
+}
+
+// spec: MON-6
+#[test]
+fn monitors_are_bounded_and_what_a_mailbox_did_not_take_counts_until_it_does() {
+    let mut bench = Bench::new();
+    bench.hears(Input::Began { app: app(0) });
+    let target = Tid::new(HERE, app(0));
+    for _ in 0..PER_WATCHER_MAX {
+        bench.monitors(1, target).0.unwrap();
+    }
+    assert_eq!(bench.monitors(1, target).0, Err(MonitorError::TooMany(PER_WATCHER_MAX)));
+    let told = downs(&bench.hears(ended(0, false)));
+    assert_eq!(told.len(), PER_WATCHER_MAX);
+    for (watcher, down) in told {
+        bench.hears(Input::NotTaken { watcher, down });
+    }
+    assert_eq!(bench.monitors(1, target).0, Err(MonitorError::TooMany(PER_WATCHER_MAX)));
+    bench.now = bench.now + RETRY;
+    assert_eq!(downs(&bench.hears(Input::TimePassed)).len(), PER_WATCHER_MAX);
+    bench.monitors(1, target).0.unwrap();
+    for number in 1..MONITORS_MAX {
+        bench.monitors(2 + number as u32 / 200, target).0.unwrap();
+    }
+    assert_eq!(bench.monitors(99, target).0, Err(MonitorError::NodeFull(MONITORS_MAX)));
+}
+
+/// What happens in a history.
+#[derive(Clone, Copy, Debug)]
+enum Act {
+    Begin(u32),
+    Restart(u32),
+    Go(u32),
+    Monitor(u32),
+    Demonitor(prop::sample::Index),
+    Cut,
+    Heal,
+    Deliver,
+    Wait(u64),
+    /// The watcher's mailbox takes nothing now, or takes again.
+    Full(bool),
+}
+
+fn any_act() -> impl Strategy<Value = Act> {
+    prop_oneof![
+        (0u32..3).prop_map(Act::Begin),
+        (0u32..3).prop_map(Act::Restart),
+        (0u32..3).prop_map(Act::Go),
+        (0u32..3).prop_map(Act::Monitor),
+        (0u32..3).prop_map(Act::Monitor),
+        any::<prop::sample::Index>().prop_map(Act::Demonitor),
+        Just(Act::Cut),
+        Just(Act::Heal),
+        Just(Act::Deliver),
+        Just(Act::Deliver),
+        (1u64..5_000).prop_map(Act::Wait),
+        any::<bool>().prop_map(Act::Full),
+    ]
+}
+
+/// Two nodes, a link between them, and who really lives.
+struct World {
+    cores: [Core; 2],
+    now: Time,
+    linked: bool,
+    /// Frames under way, with when they were sent; to the node of that index.
+    frames: VecDeque<(usize, Time, Input)>,
+    slowest: Duration,
+    full: bool,
+    /// The targets' real lives: when each began.
+    lives: BTreeMap<u32, (u64, Time)>,
+    count: u64,
+    monitors: BTreeMap<MonitorId, Set>,
+}
+
+/// A monitor, and what became of it.
+struct Set {
+    index: u32,
+    /// The real life that it watches: which, and when it began.
+    life: Option<(u64, Time)>,
+    at: Time,
+    was_ended: bool,
+    told: u32,
+}
+
+const WATCHER: usize = 0;
+const TARGETS: usize = 1;
+
+impl World {
+    fn new() -> Self {
+        let cores = [Core::new(HERE, LIFE, 4), Core::new(THERE, LIFE, 4)];
+        let mut world = Self {
+            cores,
+            now: Time::from_nanos(1_000_000_000),
+            linked: false,
+            frames: VecDeque::new(),
+            slowest: Duration::ZERO,
+            full: false,
+            lives: BTreeMap::new(),
+            count: 0,
+            monitors: BTreeMap::new(),
+        };
+        for (at, other) in [(WATCHER, THERE), (TARGETS, HERE)] {
+            world.hears(at, Input::NodeFound { node: other, incarnation: LIFE });
+        }
+        world
+    }
+
+    fn hears(&mut self, at: usize, input: Input) {
+        self.cores[at].handle(self.now, input);
+        self.drain(at);
+    }
+
+    fn drain(&mut self, at: usize) {
+        let (from, to) = ([HERE, THERE][at], 1 - at);
+        while let Some(output) = self.cores[at].poll() {
+            match output {
+                Output::Watch { watch, .. } if self.linked => {
+                    self.frames.push_back((to, self.now, Input::Watch { from, watch }));
+                }
+                Output::Lives { lives, .. } if self.linked => {
+                    self.frames.push_back((to, self.now, Input::Lives { from, lives }));
+                }
+                Output::Watch { .. } | Output::Lives { .. } => {}
+                Output::Tell { watcher, down } if self.full => {
+                    self.cores[at].handle(self.now, Input::NotTaken { watcher, down });
+                }
+                Output::Tell { down, .. } => {
+                    self.monitors.get_mut(&down.monitor).expect("it was set").told += 1;
+                }
+            }
+        }
+    }
+
+    fn acts(&mut self, act: Act) {
+        self.now = self.now + Duration::from_micros(10);
+        match act {
+            Act::Begin(index) => {
+                if !self.lives.contains_key(&index) {
+                    self.begins(index);
+                    self.hears(TARGETS, Input::Began { app: app(index) });
+                }
+            }
+            Act::Restart(index) => {
+                if self.lives.contains_key(&index) {
+                    self.begins(index);
+                    self.hears(TARGETS, ended(index, false));
+                }
+            }
+            Act::Go(index) => {
+                self.lives.remove(&index);
+                self.hears(TARGETS, ended(index, true));
+            }
+            Act::Monitor(index) => self.monitor(index),
+            Act::Demonitor(which) => {
+                if !self.monitors.is_empty() {
+                    let id = *which.get(&self.monitors.keys().copied().collect::<Vec<_>>());
+                    if self.cores[WATCHER].demonitor(self.now, app(9), id) {
+                        self.monitors.get_mut(&id).expect("it was set").was_ended = true;
+                    }
+                    self.drain(WATCHER);
+                }
+            }
+            Act::Cut => self.cut(),
+            Act::Heal => self.heal(),
+            Act::Deliver => self.deliver(),
+            Act::Wait(millis) => self.wait(Duration::from_millis(millis)),
+            Act::Full(full) => self.full = full,
+        }
+    }
+
+    fn begins(&mut self, index: u32) {
+        self.count += 1;
+        self.lives.insert(index, (self.count, self.now));
+    }
+
+    fn monitor(&mut self, index: u32) {
+        let set = self.cores[WATCHER].monitor(self.now, app(9), Tid::new(THERE, app(index)));
+        if let Ok(id) = set {
+            let life = self.lives.get(&index).copied();
+            self.monitors.insert(id, Set { index, life, at: self.now, was_ended: false, told: 0 });
+        }
+        self.drain(WATCHER);
+    }
+
+    fn cut(&mut self) {
+        self.frames.clear();
+        if std::mem::replace(&mut self.linked, false) {
+            self.hears(WATCHER, Input::LinkBroken { node: THERE, incarnation: LIFE });
+            self.hears(TARGETS, Input::LinkBroken { node: HERE, incarnation: LIFE });
+        }
+    }
+
+    fn heal(&mut self) {
+        if !std::mem::replace(&mut self.linked, true) {
+            self.hears(TARGETS, Input::LinkUp { node: HERE, incarnation: LIFE });
+            self.hears(WATCHER, Input::LinkUp { node: THERE, incarnation: LIFE });
+        }
+    }
+
+    fn deliver(&mut self) {
+        if let Some((to, sent, input)) = self.frames.pop_front() {
+            self.slowest = self.slowest.max(self.now.since(sent));
+            self.hears(to, input);
+        }
+    }
+
+    fn wait(&mut self, time: Duration) {
+        let until = self.now + time;
+        loop {
+            let wakes = self.cores.iter().filter_map(Core::next_wake);
+            let Some(wake) = wakes.min().filter(|wake| *wake <= until) else { break };
+            self.now = self.now.max(wake);
+            for at in [WATCHER, TARGETS] {
+                self.hears(at, Input::TimePassed);
+            }
+        }
+        self.now = until;
+    }
+
+    fn settle(&mut self) {
+        self.full = false;
+        self.heal();
+        for _ in 0..4 {
+            self.wait(REPEAT);
+            while !self.frames.is_empty() {
+                self.deliver();
+            }
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(500))]
+    #[test]
+    fn every_end_is_told_once_and_no_life_is_buried_alive(acts in prop::collection::vec(any_act(), 1..80)) {
+        let mut world = World::new();
+        for act in acts {
+            world.acts(act);
+            prop_assert!(world.monitors.values().all(|set| set.told <= 1));
+        }
+        world.settle();
+        for (id, Set { index, life, at, was_ended, told }) in &world.monitors {
+            let now = world.lives.get(index);
+            let lives_on = life.is_some() && now.map(|life| life.0) == life.map(|life| life.0);
+            if *was_ended {
+                prop_assert_eq!(*told, 0, "{:?} was ended by its watcher", id);
+            } else if lives_on {
+                // A life that began within one transit of the monitor may be taken for a younger one.
+                let is_old = life.is_some_and(|(_, began)| at.since(began) > world.slowest);
+                prop_assert!(!is_old || *told == 0, "{id:?} buried a life");
+            } else if life.is_some() {
+                prop_assert_eq!(*told, 1, "{:?} missed an end", id);
+            }
+        }
+    }
+}

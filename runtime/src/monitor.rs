@@ -1,0 +1,101 @@
+//! Monitors: who is told when a life of another application ends, and why. In OTP's sense.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    supervision::Reason,
+    tid::Tid,
+    wire::{Class, Payload},
+};
+
+/// Names one monitor; never used twice in a node's life.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct MonitorId(pub u64);
+
+/// Which kind of end it was.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum DownClass {
+    /// It ended by itself, in order.
+    Normal,
+    /// It was told to stop, or stopped because it lost what it requires.
+    Shutdown,
+    /// It panicked.
+    Panic,
+    /// It did not come back in its progress budget.
+    Hung,
+    /// Its life was taken: it missed a deadline, or lost what it ran on.
+    Killed,
+    /// Its process ended.
+    ProcessEnded,
+    /// Its node was lost, left, or is not known. Whether the application lives is not known.
+    NodeLost,
+    /// Nobody has this TID.
+    NoSuchAddress,
+}
+
+impl DownClass {
+    /// The class of a life's end.
+    #[must_use]
+    pub const fn of(reason: &Reason) -> Self {
+        match reason {
+            Reason::Normal => Self::Normal,
+            Reason::Shutdown | Reason::RequirementLost(_) | Reason::GaveUp(_) => Self::Shutdown,
+            Reason::Panic(_) => Self::Panic,
+            Reason::Hung(_) => Self::Hung,
+            Reason::Killed | Reason::StartTimeout | Reason::ThreadEnded => Self::Killed,
+            Reason::ProcessEnded(_) => Self::ProcessEnded,
+        }
+    }
+}
+
+/// What a monitor says, once: the life that was watched has ended. The watcher handles it with `handles::<Down>()`; it
+/// goes ahead of every message that waits. A restart behind the same TID is an end, too; who wants to watch the next
+/// life monitors again.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Down {
+    /// Which monitor.
+    pub monitor: MonitorId,
+    /// Who was watched.
+    pub tid: Tid,
+    /// Which kind of end it was.
+    pub class: DownClass,
+    /// The reason in words, at most 256 bytes.
+    pub why: String,
+}
+
+impl Payload for Down {
+    const NAME: &'static str = "sinew.down";
+    const CLASS: Class = Class::Control;
+}
+
+impl fmt::Display for Down {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} {}", self.tid, self.why)
+    }
+}
+
+/// Why a monitor was not set. Nothing changed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum MonitorError {
+    /// This is not the TID of one application: a layer, a group, everybody.
+    #[error("{0} is not the TID of one application")]
+    NotOne(Tid),
+    /// This application has as many monitors as it may have.
+    #[error("this application has {0} monitors, which is the limit; demonitor some")]
+    TooMany(usize),
+    /// The node has as many monitors as it may have.
+    #[error("the node has {0} monitors, which is the limit")]
+    NodeFull(usize),
+    /// As many applications of that node are watched from here as may be.
+    #[error("{0} applications of that node are watched from here, which is the limit")]
+    PeerFull(usize),
+    /// This life of the application was taken.
+    #[error("this life of the application is over; a later one speaks for it")]
+    LifeOver,
+    /// Not from here: an application in a process of its own cannot monitor others.
+    #[error("an application in a process of its own cannot monitor others")]
+    Unsupported,
+}
