@@ -48,7 +48,10 @@ pub use api::{ApiError, Endpoint, NodeApi, Received, Registration};
 pub use config::{ConfigFaults, NodeConfig};
 pub use lncl::RegisterError;
 pub use ndl::{KnownNode, LossReason, NodeEvent, Source};
-pub use node::{CommandError, Node, NodeBuilder, NodeEnd, NodeHandle, StartError, SupervisorSpec, Traffic};
+pub use node::{
+    CommandError, LifeState, MailboxState, Node, NodeBuilder, NodeEnd, NodeHandle, StartError, Supervised,
+    Supervises, SupervisionTree, SupervisorSpec, Traffic,
+};
 pub use outlet::OutletCounts;
 pub use serde;
 pub use sinew_runtime::{

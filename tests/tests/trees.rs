@@ -2,7 +2,7 @@
 
 use std::sync::Mutex;
 
-use sinew::{CommandError, NodeEnd, Refusal, Rejection, prelude::*};
+use sinew::{CommandError, LifeState, NodeEnd, Refusal, Rejection, Supervised, prelude::*};
 use sinew_tests::{
     DEADLINE, Ground, Log, all_run,
     puppet::{Job, Puppet, Seen, Stage, desk, lives, outcome_of_job},
@@ -264,4 +264,63 @@ fn a_node_that_has_ended_answers_no_command() {
     node.stop();
     assert!(matches!(handle.stop_app("app"), Err(CommandError::NotRunning)));
     assert!(matches!(handle.add_app(member("b", &order).0, None), Err(CommandError::NotRunning)));
+}
+
+#[test]
+fn the_tree_says_who_is_there_in_which_life_and_why_the_last_one_ended() {
+    let order = Log::default();
+    let ((knee, log), (desk, key)) = (member("knee", &order), desk("desk"));
+    let waits = member("waits", &order).0.requires(["nobody"]);
+    let leg = SupervisorSpec::new("leg").strategy(Strategy::RestForOne).app(knee).app(waits);
+    let node = Ground::new().node("node").app(desk).supervisor(leg).start().expect("a node");
+    log.wait_for(Seen::Started(1));
+    let handle = node.handle();
+    assert_eq!(outcome_of_job(&key.sender(), "knee", 13), Outcome::Failed);
+    let tree = until("knee is ready in its second life", || {
+        let is_back = |knee: &Supervised| knee.generation == 2 && knee.state == LifeState::Ready;
+        handle.tree().ok().filter(|tree| tree.find("knee").is_some_and(is_back))
+    });
+    let knee = tree.find("knee").expect("it is there");
+    assert_eq!((knee.generation, knee.restarts, knee.tid), (2, 1, handle.resolve("knee")));
+    assert!(
+        knee.last_reason.as_ref().is_some_and(|reason| reason.to_string().contains("thirteen")),
+        "{tree}"
+    );
+    assert_eq!(knee.place.as_deref(), Some("knee"));
+    assert_eq!(knee.mailbox.map(|mailbox| (mailbox.depth, mailbox.high_water)), Some((0, 1)));
+    assert_eq!(tree.find("waits").map(|app| app.state), Some(LifeState::WaitsForRequirements));
+    let leg = tree.find("leg").and_then(|leg| leg.supervises.as_ref()).expect("it is a supervisor");
+    assert_eq!((leg.children.len(), leg.restarts_in_window), (2, 1));
+    assert!(tree.find("GNCL").is_some_and(|layer| layer.state == LifeState::Ready), "{tree}");
+    let shown = tree.to_string();
+    assert!(shown.contains("\n   `- leg: ") && shown.contains("\n      |- knee: ready"), "{shown}");
+}
+
+#[test]
+fn the_tree_is_told_while_an_application_does_not_come_back() {
+    let (wake, sleep) = std::sync::mpsc::sync_channel::<()>(1);
+    let sleep = Mutex::new(Some(sleep));
+    let (sleeper, log) = Stage::new()
+        .got(move |_, _| {
+            if let Some(sleep) = sleep.lock().unwrap().take() {
+                // Over when the test is.
+                _ = sleep.recv_timeout(DEADLINE);
+            }
+        })
+        .app("sleeper");
+    let (desk, key) = desk("desk");
+    let node = Ground::new()
+        .node("node")
+        .app(sleeper.progress_within(DEADLINE * 2))
+        .app(desk)
+        .start()
+        .expect("a node");
+    let sender = key.sender();
+    until("it is there", || sender.send("sleeper", &Job { number: 1 }).ok());
+    log.wait_for(Seen::Got(1, 1));
+    sender.send("sleeper", &Job { number: 2 }).expect("there is room");
+    let tree = node.handle().tree().expect("the root answers");
+    let depth = tree.find("sleeper").and_then(|app| app.mailbox).map(|mailbox| mailbox.depth);
+    assert_eq!(depth, Some(1), "{tree}");
+    drop(wake);
 }

@@ -6,6 +6,7 @@
 use std::{cell::RefCell, collections::BTreeMap, rc::Rc, sync::Arc};
 
 use sinew_runtime::{
+    app::DynApp,
     mailbox::Mailbox,
     supervision::{ChildId, SupervisorFact},
     tid::{AppAddress, Tid},
@@ -28,6 +29,7 @@ struct Table {
 struct App {
     tid: Tid,
     mailbox: Arc<Mailbox>,
+    own_process: bool,
     progress: Progress,
 }
 
@@ -43,11 +45,12 @@ enum Progress {
 
 impl Apps {
     /// An application that has its address and its mailbox and is not started yet.
-    pub(super) fn add(&self, id: ChildId, name: &str, tid: Tid, mailbox: Arc<Mailbox>) {
+    pub(super) fn add(&self, id: ChildId, app: &DynApp, tid: Tid, mailbox: Arc<Mailbox>) {
         let mut table = self.0.borrow_mut();
         table.by_address.insert(tid.app, id);
-        table.names.insert(name.to_owned(), id);
-        table.apps.insert(id, App { tid, mailbox, progress: Progress::Coming });
+        table.names.insert(app.name().to_owned(), id);
+        let own_process = app.place().own_process;
+        table.apps.insert(id, App { tid, mailbox, own_process, progress: Progress::Coming });
     }
 
     /// A supervisor of applications.
@@ -68,6 +71,11 @@ impl Apps {
     /// Whether this is an application.
     pub(super) fn contains(&self, id: ChildId) -> bool {
         self.0.borrow().apps.contains_key(&id)
+    }
+
+    /// Its mailbox, and whether it has a process of its own.
+    pub(super) fn mailbox(&self, id: ChildId) -> Option<(Arc<Mailbox>, bool)> {
+        self.0.borrow().apps.get(&id).map(|app| (app.mailbox.clone(), app.own_process))
     }
 
     /// Whether every application runs that has not ended for good.

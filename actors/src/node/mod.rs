@@ -19,6 +19,7 @@ mod directory;
 mod faults;
 mod root;
 mod supervisor_spec;
+mod tree;
 
 pub use builder::{NodeBuilder, StartError};
 pub use commands::CommandError;
@@ -26,6 +27,7 @@ pub use commands::CommandError;
 pub(crate) use faults::arm_alone;
 pub(crate) use root::{RootEvent, WAITS_MAX};
 pub use supervisor_spec::SupervisorSpec;
+pub use tree::{LifeState, MailboxState, Supervised, Supervises, SupervisionTree};
 
 use std::{
     net::SocketAddr,

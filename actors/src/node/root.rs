@@ -20,6 +20,7 @@ use sinew_runtime::{
         Supervisor, SupervisorFact, SupervisorPlan, Threads, life,
     },
     tid::AppAddress,
+    time::Time,
 };
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -30,6 +31,7 @@ use super::{
     commands::{Answers, Ordered},
     directory::NodeDirectory,
     supervisor_spec::{Member, SupervisorSpec},
+    tree::SupervisionTree,
 };
 use crate::{gncl, lncl, ndl, process, stores::Stores, sync};
 
@@ -54,6 +56,8 @@ pub(crate) enum RootEvent {
     StopOrdered,
     /// By the owner: add, stop, start again or remove a child.
     Ordered(Ordered),
+    /// By the owner: say who is supervised.
+    TellTree(SyncSender<SupervisionTree>),
     /// By the owner: say when every application runs.
     TellWhenRunning(SyncSender<Result<(), StartError>>),
 }
@@ -71,6 +75,7 @@ pub(super) struct Root {
     pub(super) stores: Arc<Stores>,
     threads: Rc<RefCell<Threads>>,
     pub(super) phase: Phase,
+    pub(super) began: Time,
     end: NodeEnd,
     declared: Option<SupervisorSpec>,
     child_ids: ChildIds,
@@ -99,6 +104,7 @@ pub(super) fn run(
     let root = Root {
         threads: threads.clone(),
         phase: Phase::StartingLayers,
+        began: Time::now(),
         end: NodeEnd::Stopped,
         declared: Some(declared),
         child_ids: ChildIds::default(),
@@ -147,6 +153,12 @@ impl Actor for Root {
 /// The layers' names, in the paper's order of start (section 6).
 pub(super) const LAYERS: [&str; 4] = ["LNCL", "sync manager", "GNCL", "NDL"];
 
+/// What a layer failed of, for who started the node. Most often it is not a fault of the layer, but of what it was given.
+fn in_one_line(layer: &str, reason: &Reason) -> String {
+    let why = if let Reason::Panic(said) = reason { said.clone() } else { reason.to_string() };
+    format!("{layer}: {}", why.split_whitespace().collect::<Vec<_>>().join(" "))
+}
+
 /// The layers in that order.
 fn layers(stores: &Arc<Stores>, ids: &ChildIds, deadline: Duration) -> Vec<ChildSpec> {
     let child = |name: &str, thread: &str, launch: Launch| ChildSpec {
@@ -194,6 +206,8 @@ impl StreamHandler<RootEvent> for Root {
             RootEvent::Layers(fact) => self.layers_said(fact, context),
             RootEvent::Apps(fact) => self.apps_said(fact),
             RootEvent::Ordered(ordered) => self.ordered(ordered),
+            // Who asked may have stopped waiting.
+            RootEvent::TellTree(answer) => _ = answer.try_send(self.tree()),
             RootEvent::HeedSignals => self.heed_signals(context),
             RootEvent::StopOrdered => self.stop_apps(),
             RootEvent::TellWhenRunning(say) => {
@@ -222,11 +236,11 @@ impl Root {
     fn layers_said(&mut self, fact: SupervisorFact, context: &mut Context<Self>) {
         match fact {
             SupervisorFact::AllReady if self.phase == Phase::StartingLayers => self.start_apps(),
-            SupervisorFact::Failed(_, reason) | SupervisorFact::Gone(_, reason) => {
-                if reason.is_failure() {
-                    self.last_layer_fault = Some(reason.to_string());
-                }
+            SupervisorFact::Failed(id, reason) | SupervisorFact::Gone(id, reason) if reason.is_failure() => {
+                let who = self.layer_supervisor.as_ref().and_then(|roster| roster.who(id));
+                self.last_layer_fault = who.map(|who| in_one_line(&who.name, &reason));
             }
+            SupervisorFact::Failed(..) | SupervisorFact::Gone(..) => {}
             SupervisorFact::Ended(reason) => self.layers_ended(&reason, context),
             SupervisorFact::AllReady
             | SupervisorFact::Starting(..)
@@ -341,7 +355,7 @@ impl Root {
         let directory = Arc::new(NodeDirectory(self.stores.clone()));
         let sender = Sender::new(tid, self.stores.router.clone(), directory, pending, config.payload_max);
         let id = self.child_ids.next();
-        self.apps.add(id, app.name(), tid, mailbox.clone());
+        self.apps.add(id, app, tid, mailbox.clone());
         let wiring = AppWiring { sender, mailbox };
         self.absences.keep(id, app.absence(wiring.clone()));
         let (place, launch) = match hosted {
@@ -449,5 +463,21 @@ impl Root {
 fn order(supervisor: &Roster, input: Input) {
     if let Err(lost) = supervisor.tell(input) {
         tracing::error!(?lost, "a supervisor's post is full");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_layer_failed_of_is_one_line_that_begins_with_its_name() {
+        let panic =
+            Reason::Panic("address 127.0.0.1 is used already;\n    set `address` at ndl.rs:1".to_owned());
+        assert_eq!(
+            in_one_line("NDL", &panic),
+            "NDL: address 127.0.0.1 is used already; set `address` at ndl.rs:1"
+        );
+        assert_eq!(in_one_line("GNCL", &Reason::StartTimeout), "GNCL: did not become ready in its time");
     }
 }

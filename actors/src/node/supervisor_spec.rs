@@ -52,7 +52,7 @@ use super::StartError;
 /// #   .configure(alone)
 ///     .start()?;
 /// node.handle().wait_until_running(Duration::from_secs(10))?;
-/// node.handle().stop_app("leg")?;
+/// println!("{}", node.handle().tree()?);
 /// node.stop();
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```

@@ -32,8 +32,8 @@ mod watchdog;
 pub use self::{
     alone::{AloneHandle, alone},
     core::{
-        AutoShutdown, ChildId, ChildIds, Command, Flags, Generation, Input, Intensity, Policy, Reason,
-        Refusal, Restart, Strategy,
+        AutoShutdown, BranchView, ChildId, ChildIds, ChildState, ChildView, Command, Flags, Generation,
+        Input, Intensity, Policy, Reason, Refusal, Restart, Strategy,
     },
     guard::{Life, life},
     panics::UNWINDS,

@@ -6,7 +6,7 @@ use crate::{
     post::Post,
     supervision::{
         ChildSpec, Place,
-        core::{BranchView, ChildId, Input, Plan, Planned, Policy, Tree},
+        core::{BranchView, ChildId, Input, Plan, Planned, Policy, Reason, Tree},
         supervisor::{PlannedChild, SupervisorPlan},
     },
     tid::Tid,
@@ -104,12 +104,14 @@ impl Roster {
     }
 
     /// Replaces ids by names in what a supervisor says of why it gave up.
-    pub(super) fn in_words(&self, why: &str) -> String {
+    #[must_use]
+    pub fn name_children(&self, reason: Reason) -> Reason {
+        let Reason::GaveUp(why) = reason else { return reason };
         let listed = self.listed.borrow();
         let with_name = |text: String, (id, listed): (&ChildId, &Listed)| {
             text.replace(&format!(" {id},"), &format!(" '{}',", listed.name))
         };
-        listed.iter().fold(why.to_owned(), with_name)
+        Reason::GaveUp(listed.iter().fold(why, with_name))
     }
 
     pub(super) fn take_arrival(&self, id: ChildId) -> Option<(ChildId, ChildSpec)> {

@@ -209,7 +209,7 @@ impl Supervisor {
             }
             Order::Abandon(id, _) => self.abandon(id, context),
             Order::Failed(id, reason) => {
-                let reason = self.in_words(reason);
+                let reason = self.roster.name_children(reason);
                 self.note_end(id, &reason);
                 (self.listener)(SupervisorFact::Failed(id, reason));
             }
@@ -218,7 +218,7 @@ impl Supervisor {
                 (self.listener)(SupervisorFact::Ready(id));
             }
             Order::Gone(id, reason) => {
-                let reason = self.in_words(reason);
+                let reason = self.roster.name_children(reason);
                 self.note_end(id, &reason);
                 (self.listener)(SupervisorFact::Gone(id, reason));
             }
@@ -236,7 +236,7 @@ impl Supervisor {
             }
             Order::AllReady => (self.listener)(SupervisorFact::AllReady),
             Order::Ended(reason) => {
-                let reason = self.in_words(reason);
+                let reason = self.roster.name_children(reason);
                 (self.listener)(SupervisorFact::Ended(reason));
                 context.stop();
             }
@@ -246,13 +246,6 @@ impl Supervisor {
     fn forget(&mut self, id: ChildId) {
         self.children.remove(&id);
         self.roster.strike(id);
-    }
-
-    fn in_words(&self, reason: Reason) -> Reason {
-        if let Reason::GaveUp(why) = reason {
-            return Reason::GaveUp(self.roster.in_words(&why));
-        }
-        reason
     }
 
     /// One event for each change, for whoever reads them.
