@@ -86,7 +86,7 @@ impl Stage {
         let router = Arc::new(Router::new(NODE));
         let (mut children, mut mailboxes, mut senders) = (Vec::new(), Vec::new(), Vec::new());
         for (index, app) in apps.into_iter().enumerate() {
-            let mailbox = Mailbox::new(64);
+            let mailbox = Mailbox::new(patience.mailbox_capacity());
             let pending = Pending::new(64);
             let address = AppAddress::fixed(index as u32).unwrap();
             let tid = Tid::new(NODE, address);
@@ -192,6 +192,13 @@ impl Patience {
         match self {
             Self::Default => policy,
             Self::Endless => Policy { backoff_max: policy.backoff_min, ..policy },
+        }
+    }
+
+    const fn mailbox_capacity(self) -> usize {
+        match self {
+            Self::Default => 64,
+            Self::Endless => 65_536,
         }
     }
 
