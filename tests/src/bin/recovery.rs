@@ -104,7 +104,7 @@ fn panics(trials: usize) -> Vec<Row> {
         ),
         row(
             "application panic to next message handled",
-            5,
+            10,
             (0..trials).map(|_| {
                 live();
                 panic_to_delivery(&handle, &sender)

@@ -2,7 +2,10 @@
 
 use std::time::Duration;
 
-use sinew_tests::load::{Plan, run};
+use sinew_tests::{
+    load::{Plan, run},
+    program,
+};
 
 #[test]
 fn forty_layer_panics_under_load_lose_nothing_within_a_node_and_tell_no_lie_between_nodes() {
@@ -15,4 +18,12 @@ fn forty_layer_panics_under_load_lose_nothing_within_a_node_and_tell_no_lie_betw
     assert_eq!(report.restarted, 0, "{report}");
     let ndl = report.layers.iter().find(|layer| layer.name == "NDL").expect("it is one");
     assert_eq!(ndl.lost, 0, "NDL is not on the way of a message");
+}
+
+/// In a process of its own: what other tests of this one hold would be counted as well.
+#[test]
+fn three_hundred_restarts_keep_no_memory_no_descriptor_and_no_thread() {
+    let output = std::process::Command::new(program("growth")).args(["--restarts", "300"]).output();
+    let output = output.expect("it is built with the tests");
+    assert!(output.status.success(), "{output:?}");
 }

@@ -1,6 +1,7 @@
 //! Faults on real nodes: what happens, and what does not. One binary, one module a theme.
 
 mod ends;
+mod groups;
 mod hangs;
 mod layers;
 mod load;
