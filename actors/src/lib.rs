@@ -40,6 +40,7 @@ mod process;
 mod refusals;
 mod stores;
 mod sync;
+mod wills;
 
 #[cfg(feature = "fault-points")]
 pub use sinew_runtime::supervision::fault;

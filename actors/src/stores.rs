@@ -13,7 +13,7 @@ use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
 };
 
-use crate::{config::NodeConfig, gncl, lncl, monitors, ndl, node, refusals::Refusals, sync};
+use crate::{config::NodeConfig, gncl, lncl, monitors, ndl, node, refusals::Refusals, sync, wills};
 
 /// What the layers of one node share.
 pub(crate) struct Stores {
@@ -48,6 +48,8 @@ pub(crate) struct Stores {
     pub(crate) sync: Mutex<sync::Core>,
     /// Who watches whom.
     pub(crate) monitors: Mutex<monitors::Core>,
+    /// The last wills of applications, held for other nodes and by them.
+    pub(crate) wills: Mutex<wills::Core>,
     /// Where faults strike on purpose.
     #[cfg(feature = "fault-points")]
     pub(crate) faults: sinew_runtime::supervision::fault::FaultPoints,
@@ -81,6 +83,7 @@ impl Stores {
             directory_changes: tokio::sync::watch::Sender::default(),
             sync: Mutex::new(sync::Core::new(&config, node, incarnation)),
             monitors: Mutex::new(monitors::Core::new(node, incarnation, config.ndl.nodes_max)),
+            wills: Mutex::new(wills::Core::new(incarnation, config.ndl.nodes_max)),
             config,
             #[cfg(feature = "fault-points")]
             faults: sinew_runtime::supervision::fault::FaultPoints::default(),

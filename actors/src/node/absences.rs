@@ -7,7 +7,7 @@ use sinew_runtime::{
     supervision::{ChildId, SupervisorFact},
 };
 
-use crate::{monitors, stores::Stores};
+use crate::{monitors, stores::Stores, wills};
 
 /// What is kept of each application for the time that it is away. Clones share it.
 #[derive(Clone)]
@@ -33,6 +33,8 @@ impl Absences {
             SupervisorFact::Ready(id) => {
                 if let Some(absence) = self.of(*id) {
                     absence.ends();
+                    let (app, wills) = (absence.tid().app, absence.wills());
+                    wills::feed(&self.stores, wills::Input::Lives { app, wills });
                 }
             }
             SupervisorFact::Failed(id, reason) | SupervisorFact::Gone(id, reason) => {
@@ -42,6 +44,7 @@ impl Absences {
                     let app = absence.tid().app;
                     let ended = monitors::Input::Ended { app, cause: reason.into(), is_gone };
                     monitors::feed(&self.stores, ended);
+                    wills::feed(&self.stores, wills::Input::Ended { app });
                 }
             }
             SupervisorFact::Deleted(id) => _ = self.apps.borrow_mut().remove(id),

@@ -19,7 +19,7 @@ use super::{
     Event,
     core::{Core, Input, Output},
 };
-use crate::{lncl::AppFact, monitors, node::RootEvent, refusals::Refusals, stores::Stores};
+use crate::{lncl::AppFact, monitors, node::RootEvent, refusals::Refusals, stores::Stores, wills};
 
 /// The sync manager of a node: a new one after each fault, on the same core.
 pub(crate) struct SyncManager {
@@ -48,6 +48,7 @@ impl Actor for SyncManager {
         // A predecessor may have failed between two of the core's orders, or before it heard of the groups.
         self.take_groups();
         monitors::feed(&self.stores, monitors::Input::TimePassed);
+        wills::feed(&self.stores, wills::Input::TimePassed);
         self.handle(Input::TimePassed, ctx);
         if let Some(ready) = self.ready.take() {
             ready.reached();
@@ -68,11 +69,17 @@ impl StreamHandler<Event> for SyncManager {
             }
             Event::Membership(fact) => {
                 monitors::feed(&self.stores, (&fact).into());
+                if let Some(input) = wills::Input::of_membership(&fact) {
+                    wills::feed(&self.stores, input);
+                }
                 self.handle(Input::MembershipChanged(fact), ctx);
             }
             Event::Link(fact) => {
                 if let Some(input) = monitors::Input::of_link(fact) {
                     monitors::feed(&self.stores, input);
+                }
+                if let Some(input) = wills::Input::of_link(fact) {
+                    wills::feed(&self.stores, input);
                 }
                 self.handle(Input::LinkChanged(fact), ctx);
             }
@@ -114,7 +121,8 @@ impl SyncManager {
     /// Takes a peer's list; anything else that is sent here is refused.
     fn receive(&mut self, mut message: Message, ctx: &mut Context<Self>) {
         let Tid { node, app } = message.header.source;
-        let is_about_lives = matches!(message.header.kind, Kind::SYNC_WATCH | Kind::SYNC_LIVES);
+        let is_about_lives =
+            matches!(message.header.kind, Kind::SYNC_WATCH | Kind::SYNC_LIVES | Kind::SYNC_WILLS);
         if message.header.kind != Kind::SYNC_DIRECTORY && !is_about_lives {
             let kind = message.header.kind;
             self.refuse(
@@ -126,7 +134,12 @@ impl SyncManager {
             self.refuse("source", &format_args!("{node}/{app} is no other node's sync manager"));
             message.reject(Rejection::ForgedSource);
         } else if is_about_lives {
-            if let Err(fault) = monitors::receive(&self.stores, node, &message) {
+            let received = if message.header.kind == Kind::SYNC_WILLS {
+                wills::receive(&self.stores, node, &message)
+            } else {
+                monitors::receive(&self.stores, node, &message)
+            };
+            if let Err(fault) = received {
                 self.refuse("lives", &fault);
             }
             message.settle(Outcome::Delivered);
@@ -143,7 +156,8 @@ impl SyncManager {
 
     fn set_alarm(&mut self, ctx: &mut Context<Self>) {
         let monitors = monitors::next_wake(&self.stores);
-        let wake = [self.core().next_wake(), monitors].into_iter().flatten().min();
+        let wills = wills::next_wake(&self.stores);
+        let wake = [self.core().next_wake(), monitors, wills].into_iter().flatten().min();
         if self.alarm.as_ref().map(|(at, _)| *at) == wake {
             return;
         }
@@ -154,6 +168,7 @@ impl SyncManager {
             let timer = ctx.run_later(at.since(Time::now()), |manager, ctx| {
                 manager.alarm = None;
                 monitors::feed(&manager.stores, monitors::Input::TimePassed);
+                wills::feed(&manager.stores, wills::Input::TimePassed);
                 manager.handle(Input::TimePassed, ctx);
             });
             (at, timer)

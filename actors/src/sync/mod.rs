@@ -26,7 +26,7 @@ mod list;
 pub(crate) use actor::SyncManager;
 pub(crate) use core::Core;
 pub use facts::{DirectoryEntry, Waiting};
-pub(crate) use list::{NAME_BYTES_MAX, at_most};
+pub(crate) use list::{NAME_BYTES_MAX, Name, at_most};
 
 use sinew_runtime::wire::Message;
 

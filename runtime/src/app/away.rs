@@ -158,6 +158,12 @@ impl Absence {
         self.sender.tid()
     }
 
+    /// Its last wills.
+    #[must_use]
+    pub fn wills(&self) -> Arc<[Will]> {
+        self.wills.clone()
+    }
+
     /// Its life has ended: its mailbox does as declared, and its last wills are sent, each once. They come after all that
     /// this life has sent in the same class. A will that nobody takes is logged, and counted by the router.
     ///

@@ -51,6 +51,8 @@ impl Kind {
     pub const SYNC_WATCH: Self = Self(0x31);
     /// Which life each of them is in, and how the last one ended.
     pub const SYNC_LIVES: Self = Self(0x32);
+    /// The last wills of a node's applications, to be held.
+    pub const SYNC_WILLS: Self = Self(0x33);
     /// A process asks for a transport address.
     pub const LNCL_REGISTER: Self = Self(0x40);
     /// The address it got.

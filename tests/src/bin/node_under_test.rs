@@ -1,6 +1,8 @@
 //! A node for the scenarios: one application that sends, and says what it sees, one line each.
 //!
-//! `node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME]`
+//! `node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--will NAME]...`
+//!
+//! A will is a count of 1,000,000.
 
 use std::process::ExitCode;
 
@@ -78,12 +80,16 @@ fn main() -> ExitCode {
     };
     let sends_to = after("--sends-to").into_iter().next();
     let name = config.name.clone();
-    let probe = AppSpec::new(name.as_str(), move || Probe { sends_to: sends_to.clone(), sent: 0, last: 0 })
-        .handles::<Count>()
-        .handles::<NodeEvent>()
-        .handles::<RequirementEvent>()
-        .requires(after("--requires"))
-        .own_thread();
+    let mut probe =
+        AppSpec::new(name.as_str(), move || Probe { sends_to: sends_to.clone(), sent: 0, last: 0 })
+            .handles::<Count>()
+            .handles::<NodeEvent>()
+            .handles::<RequirementEvent>()
+            .requires(after("--requires"))
+            .own_thread();
+    for heir in after("--will") {
+        probe = probe.last_will(heir.as_str(), &Count { number: 1_000_000 });
+    }
     match Node::builder(name).config(config).app(probe).heed_signals().start() {
         Ok(node) => {
             println!("up");

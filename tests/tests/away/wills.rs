@@ -5,9 +5,10 @@ use std::{
     time::Duration,
 };
 
+use rustix::process::Signal;
 use sinew::{Sender, StartError, prelude::*};
 use sinew_tests::{
-    Ground, Log, all_run,
+    Ground, Log, OwnDirectory, Program, all_run, node_under_test, own_group,
     puppet::{Job, Order, Puppet, Seen, Stage, desk, lives, numbers, outcome_of_job},
 };
 
@@ -171,4 +172,49 @@ fn the_time_from_a_death_to_its_will_is_printed() {
     all.sort_unstable();
     let (half, most) = (all[DEATHS / 2] / 1_000, all[DEATHS * 99 / 100] / 1_000);
     println!("death to will received, {DEATHS} deaths: p50 {half} us, p99 {most} us");
+}
+
+/// The hip on 127.0.0.1 is the heir of the knee on 127.0.0.2, and of the ankle on 127.0.0.3.
+struct Processes {
+    directory: OwnDirectory,
+    group: std::net::SocketAddrV4,
+}
+
+impl Processes {
+    fn start(&self, name: &str, address: u8, more: &[&str]) -> Program {
+        let path = self.directory.join(&format!("{name}.toml"));
+        let text = format!(
+            "[node]\nname = \"{name}\"\naddress = \"127.0.0.{address}\"\nproject = \"wills\"\n\
+             [ndl]\nmulticast = \"{}\"\nmdns_port = false\n",
+            self.group
+        );
+        std::fs::write(&path, text).expect("the test's own directory");
+        node_under_test(None, &path, more)
+    }
+}
+
+#[test]
+fn the_wills_of_a_killed_node_are_executed_by_the_others_and_those_of_one_that_stops_are_not() {
+    let processes = Processes { directory: OwnDirectory::new(), group: own_group() };
+    // That the hip has started proves that it knows the others, and their wills.
+    let mut hip = processes.start("hip", 1, &["--requires", "knee", "--requires", "ankle"]);
+    let knee = processes.start("knee", 2, &["--will", "hip", "--will", "ankle", "--will", "nobody"]);
+    let mut ankle = processes.start("ankle", 3, &["--will", "hip", "--requires", "knee"]);
+    hip.wait_for(&["started"]);
+    ankle.wait_for(&["started"]);
+    knee.signal(Signal::KILL);
+    hip.wait_for(&["count 1000000 from 127.0.0.2"]);
+    ankle.wait_for(&["count 1000000 from 127.0.0.2"]);
+    // The next life of the knee has wills, too.
+    let knee = processes.start("knee", 2, &["--will", "hip"]);
+    hip.wait_for(&["Met", "knee"]);
+    knee.signal(Signal::KILL);
+    hip.wait_for(&["count 1000000 from 127.0.0.2"]);
+    hip.wait_for(&["NodeLost", "knee"]);
+    ankle.signal(Signal::TERM);
+    hip.wait_for(&["NodeLost", "ankle", "Left"]);
+    let _knee = processes.start("knee", 2, &[]);
+    hip.wait_for(&["Met", "knee"]);
+    let is_will = |line: &&String| line.contains("count 1000000");
+    assert_eq!(hip.said().iter().filter(is_will).count(), 2, "{:?}", hip.said());
 }

@@ -1,0 +1,117 @@
+//! Carries the core's orders out, on whatever thread has news for it. Not for who holds a lock of the node's.
+
+use sinew_runtime::{
+    app::Heir,
+    tid::{AppAddress, NodeAddress, Tid},
+    time::Time,
+    wire::{Header, Kind, Message, decode},
+};
+
+use super::{
+    core::{Input, Output},
+    words::{HeldWill, Testament},
+};
+use crate::{
+    gncl::LinkFact,
+    ndl::{LossReason, MembershipFact},
+    stores::{Stores, lock},
+    sync,
+};
+
+impl Input {
+    /// What a change of who is there is to wills; `None`: nothing.
+    pub(crate) const fn of_membership(fact: &MembershipFact) -> Option<Self> {
+        match *fact {
+            MembershipFact::NodeFound { .. } => None,
+            MembershipFact::NodeLost { node, incarnation, why: LossReason::Left } => {
+                Some(Self::NodeLeft { node, incarnation })
+            }
+            MembershipFact::NodeLost {
+                node,
+                incarnation,
+                why: LossReason::Silent | LossReason::ConnectionRefused | LossReason::Restarted,
+            } => Some(Self::NodeLost { node, incarnation }),
+        }
+    }
+
+    /// What a link's change is to wills; `None`: nothing.
+    pub(crate) const fn of_link(fact: LinkFact) -> Option<Self> {
+        match fact {
+            LinkFact::LinkUp { node, incarnation } => Some(Self::LinkUp { node, incarnation }),
+            LinkFact::LinkBroken { node, incarnation } => Some(Self::LinkBroken { node, incarnation }),
+            LinkFact::PeerLeft { node, incarnation } => Some(Self::NodeLeft { node, incarnation }),
+            LinkFact::DialRefused { .. } => None,
+        }
+    }
+}
+
+/// Tells the core what has happened and carries out what follows.
+pub(crate) fn feed(stores: &Stores, input: Input) {
+    let is_earlier = {
+        let mut core = lock(&stores.wills);
+        let before = core.next_wake();
+        core.handle(Time::now(), input);
+        core.next_wake().is_some_and(|wake| before.is_none_or(|before| wake < before))
+    };
+    loop {
+        let Some(output) = lock(&stores.wills).poll() else { break };
+        match output {
+            Output::Tell { to, testament } => tell(stores, to, &testament),
+            Output::Execute { node, will } => execute(stores, node, &will),
+        }
+    }
+    if is_earlier && stores.posts.sync.post(sync::Event::Monitors).is_err() {
+        tracing::error!("the sync manager's post is full; wills are told late: does it hang?");
+    }
+}
+
+/// When the sync manager has to say that time has passed.
+pub(crate) fn next_wake(stores: &Stores) -> Option<Time> {
+    lock(&stores.wills).next_wake()
+}
+
+/// Takes the wills of another node.
+///
+/// # Errors
+/// What is wrong with them, in words.
+pub(crate) fn receive(stores: &Stores, from: NodeAddress, message: &Message) -> Result<(), String> {
+    let testament: Testament =
+        decode(&message.payload).map_err(|error| format!("from {from}, wills: {error}"))?;
+    if !testament.wills.iter().all(|will| will.is_legal() && will.heir().is_some()) {
+        return Err(format!("from {from}, wills: one of them is not what a will may be"));
+    }
+    feed(stores, Input::Told { from, testament });
+    Ok(())
+}
+
+fn tell(stores: &Stores, to: NodeAddress, testament: &Testament) {
+    let payload = rmp_serde::to_vec_named(testament).expect("these types have no map with equal keys");
+    let source = Tid::new(stores.node, AppAddress::SYNC);
+    let mut header = Header::new(Kind::SYNC_WILLS, source, Tid::new(to, AppAddress::SYNC));
+    header.sequence = lock(&stores.sync).next_sequence();
+    header.sent = Time::now();
+    // Not taken: it is told again within 2 s, and when the link is back.
+    let _ = stores.router.send(Message::new(header, payload.into()));
+}
+
+/// Hands the will to those of our own applications that it is for.
+fn execute(stores: &Stores, node: NodeAddress, will: &HeldWill) {
+    let (Some(heir), Some(class)) = (will.heir(), will.class()) else { return };
+    let destination = match &heir {
+        Heir::Name(name) => {
+            // One of another name's node is that node's business.
+            let Some(app) = lock(&stores.registry).resolve(name) else { return };
+            Tid::new(stores.node, app)
+        }
+        // HERE was the lost node itself.
+        Heir::Tid(tid) if tid.node == stores.node || tid.node == NodeAddress::ALL => *tid,
+        Heir::Tid(_) => return,
+    };
+    let mut header = Header::new(will.kind, Tid::new(node, will.app), destination);
+    header.class = class;
+    header.sent = Time::now();
+    tracing::warn!(source = %header.source, %destination, "the last will of an application of a lost node");
+    if let Err(why) = stores.router.deliver(Message::new(header, will.payload())) {
+        tracing::error!(source = %header.source, %destination, %why, "a last will was not taken");
+    }
+}

@@ -1,0 +1,131 @@
+//! What holding wills promises, one claim a test.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use sinew_runtime::{
+    app::{Heir, LastWill, Will},
+    tid::{AppAddress, Incarnation, NodeAddress},
+    time::Time,
+    wire::{Class, Kind},
+};
+
+use super::{
+    Core, Input,
+    core::{Output, REPEAT},
+    words::{HeldWill, PAYLOAD_MAX, Testament, WILLS_MAX},
+};
+
+const THERE: NodeAddress = NodeAddress::new(0x7f00_0002);
+const LIFE: Incarnation = Incarnation(5);
+const NEXT_LIFE: Incarnation = Incarnation(6);
+const UP: Input = Input::LinkUp { node: THERE, incarnation: LIFE };
+const LOST: Input = Input::NodeLost { node: THERE, incarnation: LIFE };
+
+fn app(index: u32) -> AppAddress {
+    AppAddress::fixed(index).unwrap()
+}
+
+fn will(length: usize) -> Will {
+    Will {
+        heir: Heir::Name("drive".to_owned()),
+        kind: Kind::named("stop"),
+        class: Class::Control,
+        payload: Bytes::from(vec![0; length]),
+        when: LastWill::OnDeath,
+    }
+}
+
+fn held() -> HeldWill {
+    HeldWill::new(app(0), &will(3)).unwrap()
+}
+
+fn told(incarnation: Incarnation, version: u64) -> Input {
+    Input::Told { from: THERE, testament: Testament { incarnation, version, wills: vec![held()] } }
+}
+
+struct Bench {
+    core: Core,
+    now: Time,
+}
+
+impl Bench {
+    fn new() -> Self {
+        Self { core: Core::new(LIFE, 4), now: Time::from_nanos(1_000_000_000) }
+    }
+
+    fn hears(&mut self, input: Input) -> Vec<Output> {
+        self.core.handle(self.now, input);
+        std::iter::from_fn(|| self.core.poll()).collect()
+    }
+}
+
+fn executed(outputs: &[Output]) -> usize {
+    outputs.iter().filter(|output| matches!(output, Output::Execute { .. })).count()
+}
+
+// spec: WILL-2
+#[test]
+fn a_lost_nodes_wills_are_executed_once_for_each_loss_and_those_of_one_that_left_not() {
+    let mut bench = Bench::new();
+    bench.hears(UP);
+    bench.hears(told(LIFE, 1));
+    let former = Input::NodeLost { node: THERE, incarnation: Incarnation(4) };
+    assert_eq!(executed(&bench.hears(former)), 0);
+    assert_eq!(executed(&bench.hears(LOST)), 1);
+    assert_eq!(executed(&bench.hears(LOST)), 0);
+    // It was only frozen, and is lost again.
+    bench.hears(told(LIFE, 2));
+    assert_eq!(executed(&bench.hears(LOST)), 1);
+    bench.hears(told(LIFE, 3));
+    assert_eq!(executed(&bench.hears(Input::NodeLeft { node: THERE, incarnation: LIFE })), 0);
+    assert_eq!(executed(&bench.hears(LOST)), 0);
+}
+
+// spec: WILL-3
+#[test]
+fn a_new_life_of_a_node_executes_the_wills_of_the_old_one_once_whoever_says_so_first() {
+    for news in [Input::LinkUp { node: THERE, incarnation: NEXT_LIFE }, told(NEXT_LIFE, 1)] {
+        let mut bench = Bench::new();
+        bench.hears(UP);
+        bench.hears(told(LIFE, 7));
+        assert_eq!(executed(&bench.hears(news.clone())), 1, "{news:?}");
+        assert_eq!(executed(&bench.hears(LOST)), 0, "{news:?}");
+    }
+}
+
+#[test]
+fn a_cut_link_executes_nothing_and_an_older_list_changes_nothing() {
+    let mut bench = Bench::new();
+    bench.hears(UP);
+    bench.hears(told(LIFE, 2));
+    let empty = Testament { incarnation: LIFE, version: 1, wills: Vec::new() };
+    bench.hears(Input::Told { from: THERE, testament: empty });
+    assert_eq!(executed(&bench.hears(Input::LinkBroken { node: THERE, incarnation: LIFE })), 0);
+    assert_eq!(executed(&bench.hears(LOST)), 1);
+}
+
+// spec: WILL-1, WILL-4
+#[test]
+fn the_wills_of_those_who_live_are_told_at_each_change_and_again_within_bounds() {
+    let mut bench = Bench::new();
+    assert_eq!(bench.hears(UP), [], "there are none");
+    let wills: Arc<[Will]> = Arc::new([will(3), will(PAYLOAD_MAX + 1)]);
+    let lives = bench.hears(Input::Lives { app: app(0), wills: wills.clone() });
+    let list = |version, wills| {
+        [Output::Tell { to: THERE, testament: Testament { incarnation: LIFE, version, wills } }]
+    };
+    assert_eq!(lives, list(1, vec![held()]));
+    bench.now = bench.now + REPEAT;
+    assert_eq!(bench.hears(Input::TimePassed), list(2, vec![held()]));
+    bench.now = bench.now + REPEAT / 2;
+    assert_eq!(bench.hears(Input::Ended { app: app(0) }), list(3, Vec::new()));
+    bench.now = bench.now + REPEAT * 2;
+    assert_eq!(bench.hears(Input::TimePassed), []);
+    for index in 0..WILLS_MAX as u32 + 1 {
+        bench.hears(Input::Lives { app: app(index), wills: wills.clone() });
+    }
+    bench.now = bench.now + REPEAT;
+    let Some(Output::Tell { testament, .. }) = bench.hears(Input::TimePassed).pop() else { panic!("a list") };
+    assert_eq!(testament.wills.len(), WILLS_MAX);
+}
