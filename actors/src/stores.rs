@@ -12,6 +12,7 @@ use sinew_runtime::{
     router::Router,
     tid::{Incarnation, NodeAddress},
 };
+use tokio::sync::watch;
 
 use crate::{config::NodeConfig, gncl, lncl, monitors, ndl, node, refusals::Refusals, sync, wills};
 
@@ -43,7 +44,7 @@ pub(crate) struct Stores {
     /// Who is registered on this node.
     pub(crate) registry: Mutex<lncl::Registry>,
     /// Counts the changes of who has which name, on this node or any.
-    pub(crate) directory_changes: tokio::sync::watch::Sender<u64>,
+    pub(crate) directory_changes: watch::Sender<u64>,
     /// Who is known on other nodes, and what waits for whom.
     pub(crate) sync: Mutex<sync::Core>,
     /// Who watches whom.
@@ -80,7 +81,7 @@ impl Stores {
             gncl: gncl::Store::default(),
             ndl: Mutex::new(ndl::new_core(&config, node, incarnation)),
             registry: Mutex::default(),
-            directory_changes: tokio::sync::watch::Sender::default(),
+            directory_changes: watch::Sender::default(),
             sync: Mutex::new(sync::Core::new(&config, node, incarnation)),
             monitors: Mutex::new(monitors::Core::new(node, incarnation, config.ndl.nodes_max)),
             wills: Mutex::new(wills::Core::new(incarnation, config.ndl.nodes_max)),
@@ -88,6 +89,12 @@ impl Stores {
             #[cfg(feature = "fault-points")]
             faults: sinew_runtime::supervision::fault::FaultPoints::default(),
         })
+    }
+
+    /// Somebody has a name that he had not, or has it no more, on this node or another. Said after the change and before
+    /// whoever caused it hears that it is done.
+    pub(crate) fn directory_has_changed(&self) {
+        self.directory_changes.send_modify(|count| *count += 1);
     }
 
     /// The stores of a node that has only the layers that a test starts.

@@ -153,11 +153,16 @@ impl Sender {
         self.life.as_ref().is_some_and(|life| life.is_over())
     }
 
-    /// Counts its messages on from the `last` that a former sending side of this TID sent.
+    /// Sequence of the last message that was sent from the TID, as far as this side of it knows.
     #[must_use]
-    pub fn counting_on_from(self, last: u64) -> Self {
-        self.shared.sequence.store(last, Ordering::Relaxed);
-        self
+    pub fn last_sequence(&self) -> u64 {
+        self.shared.sequence.load(Ordering::Relaxed)
+    }
+
+    /// Another sending side of the TID, in another process, has sent messages up to this sequence: this one counts on
+    /// from there.
+    pub fn count_on_from(&self, last: u64) {
+        self.shared.sequence.fetch_max(last, Ordering::Relaxed);
     }
 
     /// The TID that this sends from.

@@ -69,6 +69,8 @@ payload!("process.order" =>
         Send(String, u64),
         /// Ask the application of this name who it is, and write down the answer.
         Ask(String),
+        /// Send these bytes, in this very order, to the application of this name.
+        Echo(String, #[serde(with = "serde_bytes")] Vec<u8>),
         /// Start a command that ends at once, and write down how it ended.
         StartACommand,
     }

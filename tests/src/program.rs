@@ -38,10 +38,12 @@ pub fn node_under_test(host: Option<&Host>, config: &Path, arguments: &[&str]) -
     Program::start(&config.display().to_string(), command)
 }
 
-/// The node of the scenarios of applications in processes of their own, with the configuration in `config`.
+/// The node of the scenarios of applications in processes of their own, with the configuration in `config`. What it says
+/// on its standard error is kept, too.
 #[must_use]
 pub fn process_under_test(config: &Path, arguments: &[&str]) -> Program {
-    let mut command = Command::new(program("process_under_test"));
+    let mut command = Command::new("sh");
+    command.args(["-c", r#"exec "$0" "$@" 2>&1"#]).arg(program("process_under_test"));
     command.arg(config).args(arguments);
     Program::start(&config.display().to_string(), command)
 }

@@ -145,6 +145,7 @@ fn tell(stores: &Stores, fact: AppFact) {
 }
 
 fn tell_sync(stores: &Stores, fact: AppFact) {
+    stores.directory_has_changed();
     if let Err(event) = stores.posts.sync.post(sync::Event::App(fact)) {
         // Thousands of events wait for it then, so it has stood still for long.
         tracing::error!(?event, "the sync manager's post is full and this was not told: does it hang?");

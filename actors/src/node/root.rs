@@ -359,7 +359,7 @@ impl Root {
         let wiring = AppWiring { sender, mailbox };
         self.absences.keep(id, app.absence(wiring.clone()));
         let (place, launch) = match hosted {
-            Some(link) => (Place::thread(Place::IO), link.launch(&self.stores, tid, app)),
+            Some(link) => (Place::thread(Place::IO), link.launch(&self.stores, wiring.sender, app)),
             None => (app.place().clone(), app.launch(wiring)),
         };
         #[cfg(feature = "fault-points")]

@@ -1,12 +1,13 @@
 //! Where a hosted application's messages come from: those that the node has handed over and the actor has not taken.
 
 use std::{
+    collections::VecDeque,
     sync::Arc,
     task::{Context, Poll, Waker},
 };
 
 use sinew_runtime::{
-    mailbox::ClassQueue,
+    mailbox::{ClassQueue, is_event},
     outcome::{Outcome, Receipt, ReceiptSink, Ticket},
     wire::Message,
 };
@@ -17,6 +18,8 @@ use super::words::{Fate, Turn, WINDOW};
 #[derive(Debug)]
 pub(super) struct Inbox {
     queue: ClassQueue,
+    /// What the node's layers say: ahead of everything else. The node's window bounds them.
+    events: VecDeque<Message>,
     /// Number of the last message that came.
     last: u64,
     in_hand: Option<u64>,
@@ -32,6 +35,7 @@ impl Inbox {
     pub(super) fn new() -> Self {
         Self {
             queue: ClassQueue::new(WINDOW),
+            events: VecDeque::new(),
             last: 0,
             in_hand: None,
             done: None,
@@ -49,7 +53,12 @@ impl Inbox {
         // The number goes with the message as a receipt that tells nobody.
         let ticket =
             Ticket { source: header.source, destination: header.destination, correlation: self.last };
+        let is_event = is_event(header);
         message.receipt = Some(Receipt::new(self.mute.clone(), ticket));
+        if is_event {
+            self.events.push_back(message);
+            return (None, self.reader.take());
+        }
         let gone = match self.queue.push(message) {
             Ok(superseded) => {
                 superseded.as_ref().and_then(number_of).map(|number| (number, Fate::Superseded))
@@ -66,7 +75,21 @@ impl Inbox {
         if self.claimed.is_some() {
             return None;
         }
-        self.claimed = self.queue.pop();
+        self.claimed = self.events.pop_front().or_else(|| self.queue.pop());
+        self.tell_claim()
+    }
+
+    /// The same for the layers' events alone.
+    pub(super) fn claim_event(&mut self) -> Option<Turn> {
+        // Who takes events alone began so with an event in his hand: nothing else is claimed.
+        if self.claimed.is_some() {
+            return None;
+        }
+        self.claimed = self.events.pop_front();
+        self.tell_claim()
+    }
+
+    fn tell_claim(&mut self) -> Option<Turn> {
         let taken = self.claimed.as_ref().and_then(number_of);
         let done = self.done.take();
         (done.is_some() || taken.is_some()).then_some(Turn { done, taken })

@@ -10,7 +10,10 @@ use std::{
     time::Duration,
 };
 
-use rustix::process::{Signal, WaitIdStatus, pidfd_send_signal};
+use rustix::{
+    event::{PollFd, PollFlags, Timespec, poll},
+    process::{Signal, WaitIdStatus, pidfd_send_signal},
+};
 use sinew_runtime::{
     outcome::{Rejection, Ticket},
     supervision::{Life, ReadyGate, Reason},
@@ -26,7 +29,7 @@ use tokio::{
 };
 
 use super::{
-    link::Link,
+    link::{LastWords, Link},
     names::KnownNames,
     spawn::{self, Started},
     words::{self, Ending, Look, Names, Turn, Welcome},
@@ -42,6 +45,9 @@ use crate::{
 
 /// Time that a process has to end once it has said that it does, or was killed.
 const ENDING: Duration = Duration::from_secs(1);
+/// Time that a killed process has to end while the node's thread waits for it. It takes a fraction of a millisecond; what
+/// takes longer hangs in the kernel.
+const DYING: Duration = Duration::from_millis(20);
 /// Numbers of waits for each process of a TID: more than it can use up.
 const WAITS_PER_LIFE: u64 = 1 << 40;
 
@@ -91,8 +97,8 @@ async fn run(hosted: Arc<Hosted>, ready: ReadyGate, stop: Rc<Notify>) -> Reason 
         Err(why) => return Reason::ProcessEnded(format!("it could not be watched: {why}")),
     };
     tracing::debug!(app = hosted.name, pid = pid.as_raw_nonzero(), "a process was started");
-    match Child::new(hosted, ready, socket) {
-        Ok(mut child) => child.accompany(&process, &stop).await,
+    match Child::new(hosted, Rc::new(process), ready, socket) {
+        Ok(mut child) => child.accompany(&stop).await,
         Err(why) => Reason::ProcessEnded(format!("it could not be listened to: {why}")),
     }
 }
@@ -129,6 +135,18 @@ impl Process {
         let _ = pidfd_send_signal(self.pidfd.get_ref(), Signal::KILL);
     }
 
+    /// Waits for its end, for this time at most. For where nothing else can wait.
+    fn ends_at_once(&self, within: Duration) -> bool {
+        let within = Timespec { tv_sec: 0, tv_nsec: i64::from(within.subsec_nanos()) };
+        let ended = poll(&mut [PollFd::new(self.pidfd.get_ref(), PollFlags::IN)], Some(&within));
+        ended == Ok(1) && !matches!(spawn::ending_of(self.pidfd.get_ref()), Ok(None))
+    }
+
+    /// How it has ended, if it does so in time.
+    async fn ends_within(&self, time: Duration) -> Option<String> {
+        timeout(time, self.ended()).await.ok()
+    }
+
     /// Resolves when it has ended. It is reaped then.
     async fn ended(&self) -> String {
         loop {
@@ -157,6 +175,8 @@ impl Drop for Process {
 /// The other end of the sockets, as long as the process lives.
 struct Child {
     hosted: Arc<Hosted>,
+    process: Rc<Process>,
+    is_buried: bool,
     ready: Option<ReadyGate>,
     stream: Arc<UnixStream>,
     reader: Reader,
@@ -169,7 +189,12 @@ struct Child {
 
 impl Drop for Child {
     fn drop(&mut self) {
-        self.hosted.link.disconnect(self.number);
+        // Its supervisor does not wait for its end: it was not ready, or did not stop, in its time.
+        if !self.is_buried {
+            self.process.kill();
+            let is_dead = self.process.ends_at_once(DYING);
+            self.bury(is_dead);
+        }
     }
 }
 
@@ -177,8 +202,8 @@ impl Drop for Child {
 enum Silence {
     /// The process has ended, in words.
     Ended(String),
-    /// It has said its last word, or nothing more can be heard of it.
-    Closed(Option<FrameError>),
+    /// It has closed its connection.
+    Closed,
     /// It is at fault.
     Fault(Reason),
 }
@@ -186,12 +211,15 @@ enum Silence {
 impl Child {
     fn new(
         hosted: Arc<Hosted>,
+        process: Rc<Process>,
         ready: ReadyGate,
         socket: std::os::unix::net::UnixStream,
     ) -> io::Result<Self> {
         socket.set_nonblocking(true)?;
         let stream = Arc::new(UnixStream::from_std(socket)?);
         let (tid, node) = (hosted.tid, payload::lncl_of(hosted.tid.node));
+        // Before the names are looked up: a change in between is told twice and not never.
+        let directory = hosted.stores.directory_changes.subscribe();
         let mut names = KnownNames::default();
         let known = hosted.requires.iter().map(|name| names.look(&hosted.stores, name.clone())).collect();
         let welcome = Welcome {
@@ -202,38 +230,45 @@ impl Child {
             names: known,
         };
         let welcome = words::frame(Kind::HOST_WELCOME, node, tid, &welcome);
-        let number = hosted.link.connect(stream.clone(), welcome);
+        let number = hosted.link.connect(stream.clone(), welcome, directory);
         let mut session = Session::new();
         session.released(tid);
         let reader = Reader::new(hosted.stores.config.payload_max);
         let ready = Some(ready);
-        Ok(Self { hosted, ready, stream, reader, session, names, number, said: None, heard: None })
+        Ok(Self {
+            hosted,
+            process,
+            is_buried: false,
+            ready,
+            stream,
+            reader,
+            session,
+            names,
+            number,
+            said: None,
+            heard: None,
+        })
     }
 
     /// Stays with the process until it has ended, and says how.
-    async fn accompany(&mut self, process: &Process, stop: &Notify) -> Reason {
-        match self.listen(process, stop).await {
-            Silence::Ended(words) => {
-                self.hear_the_rest().await;
-                self.said.take().unwrap_or(Reason::ProcessEnded(words))
-            }
-            Silence::Closed(cause) => {
-                let words = match timeout(ENDING, process.ended()).await {
-                    Ok(words) => words,
-                    Err(_) => {
-                        process.kill();
-                        let cause = cause.map_or_else(String::new, |cause| format!(" ({cause})"));
-                        format!("it closed its connection{cause} and was killed")
-                    }
-                };
-                self.said.take().unwrap_or(Reason::ProcessEnded(words))
-            }
-            Silence::Fault(reason) => {
-                process.kill();
-                // The next process finds this one's devices and ports free.
-                let _ = timeout(ENDING, process.ended()).await;
-                reason
-            }
+    async fn accompany(&mut self, stop: &Notify) -> Reason {
+        let process = self.process.clone();
+        let silence = self.listen(&process, stop).await;
+        let mut words = match &silence {
+            Silence::Ended(words) => Some(words.clone()),
+            Silence::Closed => process.ends_within(ENDING).await,
+            Silence::Fault(_) => None,
+        };
+        if words.is_none() {
+            process.kill();
+            // The next process finds this one's devices and ports free.
+            words = process.ends_within(ENDING).await;
+        }
+        self.bury(words.is_some());
+        let words = words.unwrap_or_else(|| "it was killed and has not ended yet".to_owned());
+        match silence {
+            Silence::Fault(reason) => reason,
+            Silence::Ended(_) | Silence::Closed => self.said.take().unwrap_or(Reason::ProcessEnded(words)),
         }
     }
 
@@ -253,8 +288,11 @@ impl Child {
                             return Silence::Fault(fault);
                         }
                     }
-                    Ok(None) => return Silence::Closed(None),
-                    Err(cause) => return Silence::Closed(Some(cause)),
+                    // A reset says that it died with words of ours unread.
+                    Ok(None) | Err(FrameError::Io(_)) => return Silence::Closed,
+                    Err(cause @ (FrameError::Header(_) | FrameError::TooLong { .. })) => {
+                        return Silence::Fault(Reason::ProcessEnded(format!("it was killed: {cause}")));
+                    }
                 },
                 // Its last words are there already.
                 _ = &mut drain, if !drained => drained = true,
@@ -275,16 +313,25 @@ impl Child {
     }
 
     /// What it said before it ended counts.
-    async fn hear_the_rest(&mut self) {
-        let rest = async {
-            while let Ok(Some(message)) = self.reader.next(&self.stream).await {
-                if self.obey(message).is_err() {
-                    return;
+    fn bury(&mut self, is_dead: bool) {
+        self.is_buried = true;
+        let last_words = if is_dead && self.hear_the_rest() { LastWords::Heard } else { LastWords::Unheard };
+        self.hosted.link.disconnect(self.number, last_words);
+    }
+
+    /// Returns whether all of it could be read.
+    fn hear_the_rest(&mut self) -> bool {
+        loop {
+            match self.reader.next_of_the_dead(&self.stream) {
+                Ok(None) => return true,
+                Ok(Some(message)) => {
+                    if self.obey(message).is_err() {
+                        return false;
+                    }
                 }
+                Err(_) => return false,
             }
-        };
-        // Its end of the sockets is closed, unless a process that it has forked holds it.
-        let _ = timeout(ENDING / 10, rest).await;
+        }
     }
 
     fn obey(&mut self, message: Message) -> Result<(), Reason> {
@@ -367,6 +414,7 @@ impl Child {
     }
 
     fn tell_names(&mut self) {
+        self.hosted.link.directory_is_told();
         let changed = self.names.changed(&self.hosted.stores);
         if !changed.is_empty() {
             self.tell(changed);

@@ -14,16 +14,19 @@ use sinew_runtime::{
     mailbox::{Lender, Mailbox},
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     router::{Outlet, Refused},
+    sender::Sender,
     supervision::Launch,
-    tid::{NodeAddress, Tid},
     wire::{Flags, Header, Kind, Message},
 };
-use tokio::{net::UnixStream, sync::Notify};
+use tokio::{
+    net::UnixStream,
+    sync::{Notify, watch},
+};
 
 use super::{
     life::{Hosted, process_life},
-    window::{NoSuchMessage, Window},
-    words::{Fate, Turn, WINDOW},
+    window::{Left, NoSuchMessage, Window},
+    words::{EVENTS_MAX, Fate, Turn, WINDOW},
 };
 use crate::{
     outlet::{LinkNumber, OutletLimits, StreamOutlet},
@@ -36,18 +39,27 @@ const EXPRESS_MAX: usize = 2_048;
 
 /// The node's end of an application that is in a process of its own.
 pub(crate) struct Link {
-    node: NodeAddress,
     mailbox: Arc<Mailbox>,
     payload_max: usize,
     outlet: StreamOutlet<Arc<UnixStream>>,
     present: Mutex<Option<Present>>,
     /// Which process of this TID is the present one.
     lives: AtomicU64,
-    /// Sequence of the last message that came from the TID.
-    sequence: AtomicU64,
-    /// A layer's message waits until the child knows what has changed.
+    /// A message waits until the child knows which names have changed.
     nudge: Notify,
-    tid: OnceLock<Tid>,
+    /// The node's own sending side of the TID.
+    sender: OnceLock<Sender>,
+}
+
+const WINDOW_AND_EVENTS: usize = WINDOW + EVENTS_MAX;
+
+/// Whether the node knows all that a process has said.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum LastWords {
+    /// It is dead, and what it had written is read.
+    Heard,
+    /// It may not be dead yet, or has written what nobody can read.
+    Unheard,
 }
 
 /// The child that lives now.
@@ -55,7 +67,9 @@ struct Present {
     number: LinkNumber,
     lender: Lender,
     window: Window,
-    /// A layer's message: names that changed go before it.
+    /// Tells of changes of the directory that the child has not been told of.
+    directory: watch::Receiver<u64>,
+    /// A message that came after such a change: its sender may know of it, so the child must.
     held: Option<Message>,
 }
 
@@ -69,25 +83,22 @@ impl Link {
             payload_max: config.payload_max,
         };
         Arc::new(Self {
-            node: stores.node,
             mailbox,
             payload_max: config.payload_max,
             outlet: StreamOutlet::new(limits),
             present: Mutex::new(None),
             lives: AtomicU64::new(0),
-            sequence: AtomicU64::new(0),
             nudge: Notify::new(),
-            tid: OnceLock::new(),
+            sender: OnceLock::new(),
         })
     }
 
-    /// How the application's process is started, each time anew.
-    pub(crate) fn launch(self: &Arc<Self>, stores: &Arc<Stores>, tid: Tid, app: &DynApp) -> Launch {
-        self.tid.get_or_init(|| tid);
+    /// How the application's process is started, each time anew. `sender` is the node's own sending side of its TID.
+    pub(crate) fn launch(self: &Arc<Self>, stores: &Arc<Stores>, sender: Sender, app: &DynApp) -> Launch {
         let hosted = Arc::new(Hosted {
             stores: stores.clone(),
             link: self.clone(),
-            tid,
+            tid: self.sender.get_or_init(|| sender).tid(),
             name: app.name().to_owned(),
             requires: app.requires().to_vec(),
             progress_within: app.policy().progress_within,
@@ -102,30 +113,45 @@ impl Link {
 
     /// Sequence of the last message that came from the TID.
     pub(super) fn sequence(&self) -> u64 {
-        self.sequence.load(Ordering::Relaxed)
+        self.sender.get().map_or(0, Sender::last_sequence)
     }
 
     /// Messages go to the process behind `socket` from now on, `welcome` first.
-    pub(super) fn connect(&self, socket: Arc<UnixStream>, welcome: Message) -> LinkNumber {
+    pub(super) fn connect(
+        &self,
+        socket: Arc<UnixStream>,
+        welcome: Message,
+        directory: watch::Receiver<u64>,
+    ) -> LinkNumber {
+        // A former process whose supervisor did not wait for its end.
+        self.end(lock(&self.present).take(), LastWords::Unheard);
         let number = self.outlet.connect(socket, self.payload_max, Some(welcome));
         let (window, held) = (Window::default(), None);
-        *lock(&self.present) = Some(Present { number, lender: self.mailbox.lend(), window, held });
+        *lock(&self.present) = Some(Present { number, lender: self.mailbox.lend(), window, directory, held });
         self.pump();
         number
     }
 
-    /// The process is gone: what was in its hand has failed, what it did not touch waits for the next one.
-    pub(super) fn disconnect(&self, number: LinkNumber) {
-        let Some(Present { lender, mut window, held, .. }) =
-            lock(&self.present).take_if(|present| present.number == number)
-        else {
-            return;
-        };
+    /// The process is gone. What was in its hand has failed; what it did not touch waits for the next one.
+    pub(super) fn disconnect(&self, number: LinkNumber, last_words: LastWords) {
+        let gone = lock(&self.present).take_if(|present| present.number == number);
+        self.end(gone, last_words);
+    }
+
+    fn end(&self, gone: Option<Present>, last_words: LastWords) {
+        let Some(Present { number, lender, mut window, held, .. }) = gone else { return };
         self.outlet.disconnect(number);
-        let mut left = window.end();
-        left.untouched.extend(held);
-        lender.give_back(left.untouched);
-        if let Some(mut message) = left.in_hand {
+        let Left { in_hand, mut untouched } = window.end();
+        let touched = match last_words {
+            LastWords::Heard => in_hand.into_iter().collect(),
+            // Nobody can say which of them it has handled; none is handled twice.
+            LastWords::Unheard => {
+                in_hand.into_iter().chain(std::mem::take(&mut untouched)).collect::<Vec<_>>()
+            }
+        };
+        untouched.extend(held);
+        lender.give_back(untouched);
+        for mut message in touched {
             lender.settle(message.header.class, Outcome::Failed);
             message.settle(Outcome::Failed);
         }
@@ -144,12 +170,19 @@ impl Link {
         .await
     }
 
-    /// Resolves when a layer's message waits for [`hand_over_held`](Self::hand_over_held).
+    /// Resolves when a message waits for [`hand_over_held`](Self::hand_over_held).
     pub(super) async fn nudged(&self) {
         self.nudge.notified().await;
     }
 
-    /// The child knows all names' changes by now: a layer's message may go.
+    /// The child is about to be told of all changes up to now.
+    pub(super) fn directory_is_told(&self) {
+        if let Some(present) = &mut *lock(&self.present) {
+            present.directory.mark_unchanged();
+        }
+    }
+
+    /// The child knows all that had changed when the message that waits came: it may go.
     pub(super) fn hand_over_held(&self) {
         if let Some(present) = &mut *lock(&self.present)
             && let Some(message) = present.held.take()
@@ -194,17 +227,24 @@ impl Link {
 
     /// Notes that the TID has sent this message.
     pub(super) fn note(&self, header: &Header) {
-        self.sequence.fetch_max(header.sequence, Ordering::Relaxed);
+        if let Some(sender) = self.sender.get() {
+            sender.count_on_from(header.sequence);
+        }
     }
 
     /// Hands over what the child has room for.
     fn pump(&self) {
         let mut present = lock(&self.present);
         let Some(present) = &mut *present else { return };
-        while present.held.is_none() && present.window.len() < WINDOW && self.outlet.urgent_left() == 0 {
-            let Some(message) = present.lender.take() else { return };
-            let Tid { node, app } = message.header.source;
-            if node == self.node && app.is_layer() {
+        while present.held.is_none() && self.outlet.urgent_left() == 0 {
+            let next = match present.window.len() {
+                0..WINDOW => present.lender.take(),
+                WINDOW..WINDOW_AND_EVENTS => present.lender.take_event(),
+                _ => None,
+            };
+            let Some(message) = next else { return };
+            // It has not changed either where nobody can tell any more.
+            if present.directory.has_changed().unwrap_or(false) {
                 present.held = Some(message);
                 self.nudge.notify_one();
             } else {

@@ -34,7 +34,7 @@ use tokio_util::codec::Decoder;
 use super::{
     inbox::Inbox,
     role::die,
-    words::{self, Look, Name, Names, Welcome},
+    words::{self, Look, Name, Names, Turn, Welcome},
 };
 use crate::{
     config::NodeConfig,
@@ -108,7 +108,8 @@ impl Wire {
     pub(super) fn sender(self: &Arc<Self>, sequence: u64, payload_max: usize) -> Sender {
         let router = Arc::new(Router::through(self.tid.node, self.outlet.clone()));
         let sender = Sender::new(self.tid, router, self.clone(), self.pending.clone(), payload_max);
-        sender.counting_on_from(sequence)
+        sender.count_on_from(sequence);
+        sender
     }
 
     /// Writes what waits whenever the node reads. Ends when the node is gone.
@@ -236,6 +237,19 @@ impl Wire {
         }
     }
 
+    fn poll_claimed(
+        &self,
+        claim: impl FnOnce(&mut Inbox) -> Option<Turn>,
+        cx: &Context<'_>,
+    ) -> Poll<Option<Message>> {
+        self.look();
+        let mut inbox = lock(&self.inbox);
+        if let Some(turn) = claim(&mut inbox) {
+            self.say(turn.frame(self.tid));
+        }
+        inbox.poll_claimed(self.has_said_all(), cx).map(Some)
+    }
+
     fn known(&self, name: &str) -> Option<Option<Tid>> {
         let mut names = lock(&self.names);
         let Name { tid, watched, .. } = names.get(name)?;
@@ -250,12 +264,11 @@ impl Wire {
 
 impl Source for Wire {
     fn poll_take(&self, cx: &mut Context<'_>) -> Poll<Option<Message>> {
-        self.look();
-        let mut inbox = lock(&self.inbox);
-        if let Some(turn) = inbox.claim() {
-            self.say(turn.frame(self.tid));
-        }
-        inbox.poll_claimed(self.has_said_all(), cx).map(Some)
+        self.poll_claimed(Inbox::claim, cx)
+    }
+
+    fn poll_event(&self, cx: &mut Context<'_>) -> Poll<Option<Message>> {
+        self.poll_claimed(Inbox::claim_event, cx)
     }
 
     fn finish(&self, outcome: Outcome) {

@@ -15,6 +15,8 @@ use crate::lncl::payload;
 pub(super) const VARIABLE: &str = "SINEW_HOST";
 /// Messages that the child has and has not handled, at most.
 pub(super) const WINDOW: usize = 32;
+/// Events of the node's layers that it may have beyond that: they go past a child that takes nothing else.
+pub(super) const EVENTS_MAX: usize = 32;
 /// Names that a child may ask for, at most; further ones it has to ask for again each time.
 pub(super) const NAMES_MAX: usize = 1_024;
 
@@ -65,6 +67,8 @@ pub(super) enum Ending {
     Normal,
     /// It panicked; what it said.
     Panic(String),
+    /// It lost what it requires and is to be started again when that is there; the name.
+    RequirementLost(String),
     /// Something else, in words.
     Other(String),
 }
@@ -72,7 +76,8 @@ pub(super) enum Ending {
 impl From<&Reason> for Ending {
     fn from(reason: &Reason) -> Self {
         match reason {
-            Reason::Normal | Reason::Shutdown | Reason::RequirementLost(_) => Self::Normal,
+            Reason::Normal | Reason::Shutdown => Self::Normal,
+            Reason::RequirementLost(name) => Self::RequirementLost(name.clone()),
             Reason::Panic(said) => Self::Panic(said.clone()),
             other @ (Reason::StartTimeout
             | Reason::Hung(_)
@@ -89,6 +94,7 @@ impl From<Ending> for Reason {
         match ending {
             Ending::Normal => Self::Normal,
             Ending::Panic(said) => Self::Panic(said),
+            Ending::RequirementLost(name) => Self::RequirementLost(name),
             Ending::Other(what) => Self::ProcessEnded(what),
         }
     }

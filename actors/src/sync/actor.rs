@@ -109,12 +109,12 @@ impl SyncManager {
 
     fn handle(&mut self, input: Input, ctx: &mut Context<Self>) {
         self.core().handle(Time::now(), input);
+        self.stores.directory_has_changed();
         // One at a time, and never with the lock in hand: an order may lead to a question to the directory.
         loop {
             let Some(output) = self.core().poll() else { break };
             self.carry_out(output);
         }
-        self.stores.directory_changes.send_modify(|count| *count += 1);
         self.set_alarm(ctx);
     }
 

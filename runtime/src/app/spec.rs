@@ -322,7 +322,7 @@ impl DynApp {
     /// What is wrong with its declaration, in words.
     #[must_use]
     pub fn fault(&self) -> Option<String> {
-        let Common { wills, on_lost, has_safe_state, place, .. } = &self.common;
+        let Common { wills, on_lost, has_safe_state, .. } = &self.common;
         if wills.len() > WILLS_MAX {
             let wills = wills.len();
             return Some(format!("{wills} last wills are more than the {WILLS_MAX} that it may have"));
@@ -331,9 +331,6 @@ impl DynApp {
             RequirementPolicy::SafeState if !has_safe_state => {
                 Some("it goes to its safe state and has none; declare it with `safe_state`".to_owned())
             }
-            RequirementPolicy::Pause | RequirementPolicy::Restart if place.own_process => Some(format!(
-                "`RequirementPolicy::{on_lost:?}` is not there for an application in a process of its own"
-            )),
             RequirementPolicy::CarryOn
             | RequirementPolicy::Pause
             | RequirementPolicy::SafeState

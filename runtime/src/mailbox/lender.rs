@@ -5,7 +5,7 @@
 
 use std::{sync::Arc, task::Waker};
 
-use super::Mailbox;
+use super::{Mailbox, is_event};
 use crate::{
     outcome::{Outcome, Rejection},
     post::lock,
@@ -35,6 +35,13 @@ impl Lender {
         if shared.epoch == self.epoch { shared.next() } else { None }
     }
 
+    /// The next of the layers' events, if one waits.
+    #[must_use]
+    pub fn take_event(&self) -> Option<Message> {
+        let mut shared = lock(&self.mailbox.shared);
+        if shared.epoch == self.epoch { shared.events.pop_front() } else { None }
+    }
+
     /// A lent message of this class has ended so.
     pub fn settle(&self, class: Class, outcome: Outcome) {
         lock(&self.mailbox.shared).tallies[class as usize].count(outcome);
@@ -45,26 +52,31 @@ impl Lender {
         lock(&self.mailbox.shared).tallies[class as usize].superseded += 1;
     }
 
-    /// Gives back what was lent and never handled, oldest first: it is the next to be taken, in the same order.
+    /// Gives back what was lent and never handled, oldest first: it is the next to be taken, in the same order. The
+    /// layers' events were for the life that has ended; they are dropped.
     pub fn give_back(&self, lent: Vec<Message>) {
         let mut refused = Vec::new();
         let waker = {
             let mut shared = lock(&self.mailbox.shared);
+            let refuses = match (shared.closed, shared.refuses) {
+                (true, _) => Some(Rejection::Closed),
+                (false, true) => Some(Rejection::Away),
+                (false, false) => None,
+            };
             for message in lent.into_iter().rev() {
                 let class = message.header.class as usize;
-                if shared.closed || shared.refuses {
+                if let Some(why) = refuses.or_else(|| is_event(&message.header).then_some(Rejection::Away)) {
                     shared.tallies[class].rejected += 1;
-                    refused.push(message);
+                    refused.push((message, why));
                 } else if shared.queue.put_back(message).is_some() {
                     shared.tallies[class].superseded += 1;
                 }
             }
-            shared.high_water = shared.high_water.max(shared.queue.len());
+            shared.high_water = shared.high_water.max(shared.waiting());
             shared.waker.take()
         };
         // Told outside the lock, so that nobody who is told runs into it.
-        let why = if self.mailbox.is_closed() { Rejection::Closed } else { Rejection::Away };
-        for message in refused {
+        for (message, why) in refused {
             message.reject(why);
         }
         waker.into_iter().for_each(Waker::wake);
@@ -124,14 +136,16 @@ mod tests {
     }
 
     #[test]
-    fn what_is_given_back_to_a_closed_mailbox_is_refused() {
-        let mailbox = Mailbox::new(4);
-        mailbox.submit(message(Class::Control, 1)).unwrap();
-        let lender = mailbox.lend();
-        let lent = lender.take().unwrap();
-        mailbox.close();
-        lender.give_back(vec![lent]);
-        let tally = mailbox.tally(Class::Control);
-        assert_eq!((tally.taken, tally.rejected, tally.open()), (1, 1, 0));
+    fn what_is_given_back_to_a_mailbox_that_keeps_nothing_is_refused() {
+        for stop in [Mailbox::close, Mailbox::refuse_while_away] {
+            let mailbox = Mailbox::new(4);
+            mailbox.submit(message(Class::Control, 1)).unwrap();
+            let lender = mailbox.lend();
+            let lent = lender.take().unwrap();
+            stop(&mailbox);
+            lender.give_back(vec![lent]);
+            let tally = mailbox.tally(Class::Control);
+            assert_eq!((tally.taken, tally.rejected, tally.open()), (1, 1, 0));
+        }
     }
 }

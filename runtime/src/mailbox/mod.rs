@@ -272,10 +272,6 @@ impl Mailbox {
         lock(&self.shared).refuses = false;
     }
 
-    fn is_closed(&self) -> bool {
-        lock(&self.shared).closed
-    }
-
     /// Takes messages again, after it was [closed](Self::close).
     pub fn reopen(&self) {
         lock(&self.shared).closed = false;
@@ -352,7 +348,8 @@ impl Outlet for Mailbox {
 }
 
 /// Whether one of the node's own layers says something to an application of it: who is there, what it requires, who died.
-fn is_event(header: &Header) -> bool {
+#[must_use]
+pub fn is_event(header: &Header) -> bool {
     header.source.app.is_layer() && header.source.node == header.destination.node && header.kind.is_user()
 }
 
@@ -394,6 +391,13 @@ impl MailboxReader {
 
     /// The same for the layers' events alone; everything else is left where it is.
     pub fn poll_event(&mut self, cx: &mut Context<'_>) -> Poll<Option<Message>> {
+        if let Some(source) = &self.mailbox.source {
+            let taken = source.poll_event(cx);
+            if let Poll::Ready(Some(event)) = &taken {
+                self.in_hand = Some(event.header.class);
+            }
+            return taken;
+        }
         let mut shared = lock(&self.mailbox.shared);
         if shared.epoch != self.epoch {
             return Poll::Ready(None);

@@ -12,6 +12,9 @@ pub trait Source: Debug + Send + Sync {
     /// Takes the next message into the hand. `None` once there will be none.
     fn poll_take(&self, cx: &mut Context<'_>) -> Poll<Option<Message>>;
 
+    /// The same for the layers' events alone; everything else is left where it is.
+    fn poll_event(&self, cx: &mut Context<'_>) -> Poll<Option<Message>>;
+
     /// The message in hand has ended so.
     fn finish(&self, outcome: Outcome);
 }

@@ -1,6 +1,7 @@
 //! A node for the scenarios of applications in processes of their own.
 //!
-//! `process_under_test CONFIG.toml [--place thread|process|io] [--progress MILLISECONDS] [--dies-at-start CODE]`
+//! `process_under_test CONFIG.toml [--place thread|process|io] [--requires NAME] [--on-lost pause|restart]
+//! [--dies-at-start CODE]`
 //!
 //! The application `drive` does as it is told (`Order`), and says what it sees, one line each.
 
@@ -101,16 +102,17 @@ impl Handler<Delivery<Order>> for Drive {
             Order::Abort => std::process::abort(),
             Order::OverflowTheStack => say(&format!("{}", overflow(&[0; 1024]))),
             Order::Kill => signal_myself(Signal::KILL),
-            Order::Segfault => {
-                // The first one meets the handler that Rust has for stack overflows.
-                signal_myself(Signal::SEGV);
-                signal_myself(Signal::SEGV);
-            }
+            Order::Segfault => signal_myself(Signal::SEGV),
             Order::Refuse => context.reject(),
             Order::Join(group) => context.join(&group),
             Order::Leave(group) => context.leave(&group),
             Order::Send(to, number) => send(context, &to, number),
             Order::Ask(whom) => ask(context, &whom),
+            Order::Echo(ref to, _) => {
+                if let Err(error) = context.send(&**to, &order.payload) {
+                    say(&format!("no echo: {error}"));
+                }
+            }
             Order::StartACommand => {
                 let status = std::process::Command::new("true").status();
                 say(&format!("command {status:?}"));
@@ -119,8 +121,13 @@ impl Handler<Delivery<Order>> for Drive {
     }
 }
 
-fn signal_myself(signal: Signal) {
-    kill_process(getpid(), signal).expect("a process may signal itself");
+/// Does not return: another thread may take the signal, a moment later. The first SIGSEGV may meet the handler that Rust has
+/// for stack overflows, the second one does not.
+fn signal_myself(signal: Signal) -> ! {
+    loop {
+        kill_process(getpid(), signal).expect("a process may signal itself");
+        std::thread::sleep(Duration::from_millis(1));
+    }
 }
 
 #[expect(unconditional_recursion, reason = "it is what is asked for")]
@@ -182,6 +189,11 @@ fn main() -> ExitCode {
         .handles::<NodeEvent>()
         .handles::<RequirementEvent>()
         .requires(after("--requires"));
+    drive = match after("--on-lost").as_deref() {
+        None => drive,
+        Some("pause") => drive.on_requirement_lost(RequirementPolicy::Pause),
+        Some(_) => drive.on_requirement_lost(RequirementPolicy::Restart),
+    };
     drive = match after("--place").as_deref() {
         None | Some("process") => drive.own_process(),
         Some("thread") => drive.own_thread(),
@@ -189,7 +201,7 @@ fn main() -> ExitCode {
     };
     match Node::builder(config.name.clone()).config(config).app(drive).heed_signals().start() {
         Ok(node) => {
-            say("up");
+            say("is up");
             node.run()
         }
         Err(error) => {

@@ -1,0 +1,182 @@
+//! Every way in which a process ends, or does not; and never an orphan.
+
+use std::{fs, time::Duration};
+
+use rustix::process::Signal;
+use sinew::Outcome;
+use sinew_tests::{OwnDirectory, orders::Order, process_under_test};
+
+use crate::scenario::{Scenario, Watched, configuration, signal};
+
+#[test]
+fn an_application_in_a_process_of_its_own_answers_from_there() {
+    let mut scenario = Scenario::start(&[]);
+    let me = scenario.who();
+    assert_ne!(me.pid, scenario.node.id());
+    let thread = Scenario::start(&["--place", "thread"]).who();
+    assert_ne!(thread.pid, me.pid);
+}
+
+#[test]
+fn a_killed_process_is_replaced_and_the_messages_behind_are_kept_in_order() {
+    let mut scenario = Scenario::start(&[]);
+    let first = scenario.who();
+    scenario.order(Order::Hold(500));
+    scenario.node.wait_for(&["holds"]);
+    (1..=200).for_each(|number| scenario.count(number));
+    signal(first.pid, Signal::KILL);
+    assert_eq!(scenario.count_confirmed(201), Outcome::Delivered);
+    let second = scenario.who();
+    assert_ne!(second.pid, first.pid);
+    assert_eq!(second.counts, (1..=201).collect::<Vec<_>>());
+    scenario.node.wait_for(&["a child failed", "killed by signal 9 (SIGKILL)"]);
+}
+
+#[test]
+fn every_death_is_survived_and_named_and_fails_the_message_in_hand() {
+    let deaths = [
+        (Order::Exit(3), "its process ended: exit code 3"),
+        (Order::Abort, "killed by signal 6 (SIGABRT)"),
+        (Order::OverflowTheStack, "killed by signal 6 (SIGABRT)"),
+        (Order::Kill, "killed by signal 9 (SIGKILL)"),
+        (Order::Segfault, "killed by signal 11 (SIGSEGV)"),
+    ];
+    let mut scenario = Scenario::start(&[]);
+    for (order, words) in deaths {
+        let process = Watched::new(scenario.who().pid);
+        assert_eq!(scenario.order_confirmed(order), Outcome::Failed);
+        process.wait_for_end();
+        scenario.node.wait_for(&["a child failed", words]);
+    }
+    assert_eq!(scenario.count_confirmed(1), Outcome::Delivered);
+}
+
+#[test]
+fn a_handler_that_does_not_return_is_killed_and_replaced() {
+    let mut scenario = Scenario::start(&[]);
+    let process = Watched::new(scenario.who().pid);
+    assert_eq!(scenario.order_confirmed(Order::Hang), Outcome::Failed);
+    process.wait_for_end();
+    scenario.node.wait_for(&["a child failed", "hung:"]);
+    assert_eq!(scenario.count_confirmed(1), Outcome::Delivered);
+}
+
+#[test]
+fn a_process_that_was_stopped_is_killed_and_replaced() {
+    let mut scenario = Scenario::start(&[]);
+    let pid = scenario.who().pid;
+    let process = Watched::new(pid);
+    signal(pid, Signal::STOP);
+    process.wait_for_end();
+    scenario.node.wait_for(&["a child failed", "hung: no sign of life"]);
+    assert_ne!(scenario.who().pid, pid);
+}
+
+#[test]
+fn a_process_that_is_only_busy_is_let_alone() {
+    let mut scenario = Scenario::start(&[]);
+    let pid = scenario.who().pid;
+    // Twice its progress budget in all, and no single turn above it.
+    (0..20).for_each(|_| scenario.order(Order::Hold(100)));
+    assert_eq!(scenario.who().pid, pid);
+}
+
+#[test]
+fn a_node_that_was_stopped_does_not_accuse_its_processes_when_it_wakes() {
+    let mut scenario = Scenario::start(&[]);
+    let pid = scenario.who().pid;
+    for _ in 0..3 {
+        scenario.node.signal(Signal::STOP);
+        // Longer than the progress budget of the application.
+        std::thread::sleep(Duration::from_millis(1_500));
+        scenario.node.signal(Signal::CONT);
+        assert_eq!(scenario.count_confirmed(1), Outcome::Delivered);
+    }
+    assert_eq!(scenario.who().pid, pid);
+}
+
+#[test]
+fn a_process_dies_with_its_node_whatever_it_does() {
+    let busy = [None, Some(Order::Hold(60_000)), Some(Order::Hang)];
+    for order in busy {
+        let mut scenario = Scenario::start(&[]);
+        let process = Watched::new(scenario.who().pid);
+        order.into_iter().for_each(|order| scenario.order(order));
+        scenario.node.signal(Signal::KILL);
+        process.wait_for_end();
+    }
+}
+
+#[test]
+fn a_stopped_process_dies_with_its_node_too() {
+    let mut scenario = Scenario::start(&[]);
+    let pid = scenario.who().pid;
+    let process = Watched::new(pid);
+    signal(pid, Signal::STOP);
+    scenario.node.signal(Signal::KILL);
+    process.wait_for_end();
+}
+
+#[test]
+fn a_process_that_does_not_stop_in_its_time_is_killed() {
+    let mut scenario = Scenario::start(&[]);
+    let process = Watched::new(scenario.who().pid);
+    scenario.order(Order::Hold(900));
+    scenario.node.wait_for(&["holds"]);
+    scenario.node.signal(Signal::TERM);
+    process.wait_for_end();
+    assert_eq!(scenario.node.wait_for_end(), Some(0));
+}
+
+#[test]
+fn a_process_that_dies_at_each_start_makes_the_node_give_up_and_say_of_what() {
+    let directory = OwnDirectory::new();
+    let mut node = process_under_test(&configuration(&directory, ""), &["--dies-at-start", "3"]);
+    node.wait_for(&["gave up", "applications: more than 5 restarts", "its process ended: exit code 3"]);
+    assert_eq!(node.wait_for_end(), Some(1));
+}
+
+#[test]
+fn a_command_that_the_application_starts_is_no_host() {
+    let mut scenario = Scenario::start(&[]);
+    scenario.order(Order::StartACommand);
+    scenario.node.wait_for(&["command Ok(ExitStatus(unix_wait_status(0)))"]);
+    assert_eq!(scenario.count_confirmed(1), Outcome::Delivered);
+}
+
+#[test]
+fn two_hundred_deaths_leave_nothing_behind() {
+    let intensity = "[supervision]\napp_restarts_max = 1000\napp_window_ms = 1\n";
+    let mut scenario = Scenario::start_with(intensity, &[]);
+    let node = scenario.node.id();
+    let die = |scenario: &mut Scenario| {
+        let pid = scenario.who().pid;
+        let process = Watched::new(pid);
+        signal(pid, Signal::KILL);
+        process.wait_for_end();
+        pid
+    };
+    // The first ones make what stays: threads, their stacks and descriptors.
+    for _ in 0..5 {
+        die(&mut scenario);
+    }
+    scenario.who();
+    let before = descriptors(node);
+    let pids: Vec<_> = (0..200).map(|_| die(&mut scenario)).collect();
+    scenario.who();
+    assert_eq!(descriptors(node), before);
+    let left: Vec<_> = pids.iter().filter(|pid| parent_of(**pid) == Some(node)).collect();
+    assert!(left.is_empty(), "zombies: {left:?}");
+}
+
+fn descriptors(process: u32) -> usize {
+    fs::read_dir(format!("/proc/{process}/fd")).expect("it lives").count()
+}
+
+/// The parent of a process that is in the kernel's table, alive or not.
+fn parent_of(process: u32) -> Option<u32> {
+    let stat = fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
+    // The name in parentheses may have anything in it.
+    let (_, rest) = stat.rsplit_once(')')?;
+    rest.split_whitespace().nth(1)?.parse().ok()
+}

@@ -1,0 +1,262 @@
+//! The same application in a thread and in a process of its own: what can be observed is the same.
+
+use std::time::Duration;
+
+use rustix::process::Signal;
+use sinew::{Kind, Outcome, Registration, Rejection, Tid, payload};
+use sinew_tests::{
+    DEADLINE,
+    orders::{Count, Level, Me, Order, Who},
+};
+
+use crate::scenario::Scenario;
+
+/// Each claim is tried with the application in every place.
+macro_rules! in_every_place {
+    ($($claim:ident)+) => {
+        mod in_a_thread { $( #[test] fn $claim() { super::$claim("thread"); } )+ }
+        mod in_a_process { $( #[test] fn $claim() { super::$claim("process"); } )+ }
+    };
+}
+
+in_every_place! {
+    messages_of_a_class_are_handled_in_order
+    outcomes_are_what_the_handler_made_of_the_message
+    a_message_that_waits_too_long_expires
+    of_a_stream_that_waits_the_newest_value_is_handled
+    urgent_messages_overtake_those_that_wait
+    a_panic_fails_the_message_in_hand_and_keeps_those_behind
+    an_application_that_stops_ramps_down_and_is_started_again
+    it_sends_with_known_outcomes_and_asks
+    it_is_a_member_of_a_group_until_it_leaves_and_across_restarts
+    an_input_that_goes_silent_is_noticed
+    a_lost_requirement_is_told_and_its_name_resolves_anew
+    it_pauses_until_what_it_requires_is_back_whatever_waits
+    it_is_started_anew_when_what_it_requires_is_back
+    large_messages_go_both_ways
+    a_node_that_is_told_to_stop_lets_it_ramp_down
+}
+
+fn start(place: &str) -> Scenario {
+    Scenario::start(&["--place", place])
+}
+
+fn messages_of_a_class_are_handled_in_order(place: &str) {
+    let mut scenario = start(place);
+    for hundred in 0..5 {
+        (1..100).for_each(|number| scenario.count(100 * hundred + number));
+        // The mailbox holds 256.
+        assert_eq!(scenario.count_confirmed(100 * (hundred + 1)), Outcome::Delivered);
+    }
+    assert_eq!(scenario.who().counts, (1..=500).collect::<Vec<_>>());
+}
+
+payload!("process.unknown" => struct Unknown {});
+
+fn outcomes_are_what_the_handler_made_of_the_message(place: &str) {
+    let mut scenario = start(place);
+    assert_eq!(scenario.count_confirmed(1), Outcome::Delivered);
+    assert_eq!(scenario.order_confirmed(Order::Refuse), Outcome::Rejected(Rejection::ByHandler));
+    let (endpoint, drive) = (&mut scenario.endpoint, scenario.drive);
+    let told = endpoint.send_confirmed(drive, &Unknown {}, DEADLINE).expect("the node takes it");
+    assert_eq!(told, Outcome::Rejected(Rejection::UnknownKind));
+    assert_eq!(scenario.order_confirmed(Order::Panic), Outcome::Failed);
+    assert_eq!(scenario.count_confirmed(2), Outcome::Delivered);
+}
+
+fn a_message_that_waits_too_long_expires(place: &str) {
+    let mut scenario = start(place);
+    scenario.order(Order::Hold(300));
+    scenario.node.wait_for(&["holds"]);
+    let (endpoint, drive) = (&mut scenario.endpoint, scenario.drive);
+    let told = endpoint
+        .send_confirmed(drive, &Count { number: 1 }, Duration::from_millis(1))
+        .expect("the node takes it");
+    assert!(matches!(told, Outcome::Unknown | Outcome::Expired), "{told:?}");
+    assert_eq!(scenario.who().counts, [0; 0], "it was not handled");
+}
+
+fn of_a_stream_that_waits_the_newest_value_is_handled(place: &str) {
+    let mut scenario = start(place);
+    scenario.order(Order::Hold(300));
+    scenario.node.wait_for(&["holds"]);
+    for value in 1..=1_000 {
+        scenario.endpoint.send(scenario.drive, &Level { value }).expect("the node takes it");
+    }
+    scenario.node.wait_for(&["level 1000"]);
+    let levels = scenario.node.said().iter().filter(|line| line.contains("level")).count();
+    assert!(levels < 500, "{levels} of 1000 values were handled, although all came while one handler ran");
+}
+
+fn urgent_messages_overtake_those_that_wait(place: &str) {
+    let mut scenario = start(place);
+    scenario.order(Order::Hold(300));
+    scenario.node.wait_for(&["holds"]);
+    (1..=200).for_each(|number| scenario.count(number));
+    let handled = scenario.who().counts.len();
+    assert!(handled <= 32, "{handled} of 200 messages that yield were handled before an urgent one");
+}
+
+fn a_panic_fails_the_message_in_hand_and_keeps_those_behind(place: &str) {
+    let mut scenario = start(place);
+    scenario.count_confirmed(1);
+    scenario.order(Order::Hold(300));
+    scenario.node.wait_for(&["holds"]);
+    scenario.order(Order::Panic);
+    (2..=200).for_each(|number| scenario.count(number));
+    assert_eq!(scenario.count_confirmed(201), Outcome::Delivered);
+    assert_eq!(scenario.who().counts, (2..=201).collect::<Vec<_>>(), "of the new instance");
+    scenario.node.wait_for(&["a child failed", "panicked: this is the panic that the scenario asks for"]);
+}
+
+fn an_application_that_stops_ramps_down_and_is_started_again(place: &str) {
+    let mut scenario = start(place);
+    scenario.order(Order::Stop);
+    scenario.node.wait_for(&["ramping down"]);
+    scenario.node.wait_for(&["stopping"]);
+    scenario.node.wait_for(&["started"]);
+    scenario.node.wait_for(&["started"]);
+    assert_eq!(scenario.count_confirmed(1), Outcome::Delivered);
+}
+
+fn it_sends_with_known_outcomes_and_asks(place: &str) {
+    let mut scenario = start(place);
+    scenario.order(Order::Send("test".to_owned(), 7));
+    let received = scenario.endpoint.receive(DEADLINE).expect("the node is there").expect("a number");
+    assert_eq!(
+        (received.source(), received.decode::<Count>().expect("a number").number),
+        (scenario.drive, 7)
+    );
+    drop(received);
+    scenario.node.wait_for(&["sent 7: Delivered"]);
+    scenario.order(Order::Ask("test".to_owned()));
+    let question = scenario.endpoint.receive(DEADLINE).expect("the node is there").expect("a question");
+    assert_eq!(question.kind(), Kind::named("process.who"));
+    scenario.endpoint.reply(&question, &Me { pid: 0, counts: vec![4, 2] }).expect("the node takes it");
+    scenario.node.wait_for(&["answer [4, 2]"]);
+    scenario.order(Order::Send("nobody".to_owned(), 8));
+    scenario.node.wait_for(&["not sent 8: no application is called 'nobody'"]);
+    let mut nobody = scenario
+        .api
+        .register_transport_address(Registration::new().name("nobody"))
+        .expect("the node takes it");
+    scenario.order(Order::Send("nobody".to_owned(), 9));
+    assert_eq!(
+        nobody
+            .receive(DEADLINE)
+            .expect("the node is there")
+            .expect("a number")
+            .decode::<Count>()
+            .expect("a number")
+            .number,
+        9
+    );
+    scenario.node.wait_for(&["sent 9: Delivered"]);
+}
+
+fn it_is_a_member_of_a_group_until_it_leaves_and_across_restarts(place: &str) {
+    let mut scenario = start(place);
+    let group = Tid::group("drives");
+    let send = |scenario: &mut Scenario, value| {
+        scenario.endpoint.send(group, &Level { value }).expect("the node takes it")
+    };
+    // Handled means that the node has heard of it: what it sends comes in order.
+    let heard = |scenario: &mut Scenario| {
+        scenario.order(Order::Send("test".to_owned(), 1));
+        drop(scenario.endpoint.receive(DEADLINE).expect("the node is there").expect("a number"));
+    };
+    scenario.order(Order::Join("drives".to_owned()));
+    heard(&mut scenario);
+    send(&mut scenario, 1);
+    scenario.node.wait_for(&["level 1"]);
+    assert_eq!(scenario.order_confirmed(Order::Panic), Outcome::Failed);
+    send(&mut scenario, 2);
+    scenario.node.wait_for(&["level 2"]);
+    scenario.order(Order::Leave("drives".to_owned()));
+    heard(&mut scenario);
+    send(&mut scenario, 3);
+    scenario.endpoint.send(scenario.drive, &Level { value: 4 }).expect("the node takes it");
+    scenario.node.wait_for(&["level 4"]);
+    assert!(scenario.node.said().iter().all(|line| !line.contains("level 3")));
+}
+
+fn an_input_that_goes_silent_is_noticed(place: &str) {
+    let mut scenario = start(place);
+    scenario.node.wait_for(&["silence"]);
+    scenario.endpoint.send(scenario.drive, &Level { value: 1 }).expect("the node takes it");
+    scenario.node.wait_for(&["level 1"]);
+    scenario.node.wait_for(&["silence"]);
+}
+
+fn a_lost_requirement_is_told_and_its_name_resolves_anew(place: &str) {
+    let mut scenario = Scenario::start_requiring("helper", &["--place", place]);
+    let former = scenario.helper.take().expect("it was required");
+    let former_tid = former.tid();
+    former.unregister().expect("the node takes it");
+    scenario.node.wait_for(&["requirement Lost", "helper is None"]);
+    let helper = scenario
+        .api
+        .register_transport_address(Registration::new().name("helper"))
+        .expect("the node takes it");
+    assert_ne!(helper.tid(), former_tid);
+    scenario.node.wait_for(&["requirement Met", &format!("helper is Some({:?})", helper.tid())]);
+}
+
+fn it_pauses_until_what_it_requires_is_back_whatever_waits(place: &str) {
+    let mut scenario = Scenario::start_requiring("helper", &["--place", place, "--on-lost", "pause"]);
+    scenario.helper.take().expect("it was required").unregister().expect("the node answers");
+    scenario.node.wait_for(&["requirement Lost"]);
+    (1..=100).for_each(|number| scenario.count(number));
+    let paused = scenario.endpoint.send_confirmed(scenario.drive, &Order::Refuse, Duration::from_millis(100));
+    assert!(matches!(paused, Ok(Outcome::Unknown | Outcome::Expired)), "{paused:?}");
+    let helper = scenario.api.register_transport_address(Registration::new().name("helper"));
+    scenario.node.wait_for(&["requirement Met"]);
+    assert_eq!(scenario.count_confirmed(101), Outcome::Delivered);
+    assert_eq!(scenario.who().counts, (1..=101).collect::<Vec<_>>());
+    drop(helper);
+}
+
+fn it_is_started_anew_when_what_it_requires_is_back(place: &str) {
+    let mut scenario = Scenario::start_requiring("helper", &["--place", place, "--on-lost", "restart"]);
+    scenario.node.wait_for(&["started"]);
+    scenario.helper.take().expect("it was required").unregister().expect("the node answers");
+    scenario.node.wait_for(&["stopping"]);
+    scenario.count(1);
+    let helper = scenario.api.register_transport_address(Registration::new().name("helper"));
+    scenario.node.wait_for(&["started"]);
+    assert_eq!(scenario.count_confirmed(2), Outcome::Delivered);
+    assert_eq!(scenario.who().counts, [1, 2]);
+    assert!(scenario.node.said().iter().all(|line| !line.contains("a child failed")));
+    drop(helper);
+}
+
+fn large_messages_go_both_ways(place: &str) {
+    let mut scenario = start(place);
+    let drive = scenario.drive;
+    for length in [1_000, 100_000, 1_000_000] {
+        let payload = vec![7; length];
+        for _ in 0..20 {
+            scenario
+                .endpoint
+                .send(drive, &Order::Echo("test".to_owned(), payload.clone()))
+                .expect("the node takes it");
+        }
+        for _ in 0..20 {
+            let echo = scenario.endpoint.receive(DEADLINE).expect("the node is there").expect("an echo");
+            let Order::Echo(_, bytes) = echo.decode().expect("an order") else { panic!("another order") };
+            assert!(bytes == payload);
+        }
+    }
+    assert_eq!(
+        scenario.endpoint.ask::<_, Me>(drive, &Who {}, DEADLINE).expect("the node takes it").counts,
+        [0; 0]
+    );
+}
+
+fn a_node_that_is_told_to_stop_lets_it_ramp_down(place: &str) {
+    let mut scenario = start(place);
+    scenario.node.signal(Signal::TERM);
+    scenario.node.wait_for(&["ramping down"]);
+    scenario.node.wait_for(&["stopping"]);
+    assert_eq!(scenario.node.wait_for_end(), Some(0));
+}

@@ -1,0 +1,117 @@
+//! A node whose application does as it is told, and an endpoint that tells it.
+
+use std::path::PathBuf;
+
+use rustix::{
+    event::{PollFd, PollFlags, Timespec, poll},
+    process::{Pid, PidfdFlags, Signal, kill_process, pidfd_open},
+};
+use sinew::{Endpoint, NodeApi, Outcome, Registration, Tid};
+use sinew_tests::{
+    DEADLINE, OwnDirectory, Program,
+    orders::{Count, Me, Order, Who},
+    own_group, process_under_test,
+};
+
+/// A node with its application `drive`, and an endpoint called `test`.
+pub(crate) struct Scenario {
+    pub(crate) node: Program,
+    pub(crate) api: NodeApi,
+    pub(crate) endpoint: Endpoint,
+    pub(crate) drive: Tid,
+    /// What the application requires.
+    pub(crate) helper: Option<Endpoint>,
+    // Last: removed when nobody uses it.
+    _directory: OwnDirectory,
+}
+
+impl Scenario {
+    pub(crate) fn start(arguments: &[&str]) -> Self {
+        Self::start_all("", None, arguments)
+    }
+
+    /// The application requires an endpoint of this name, which is there.
+    pub(crate) fn start_requiring(name: &str, arguments: &[&str]) -> Self {
+        Self::start_all("", Some(name), &[arguments, &["--requires", name]].concat())
+    }
+
+    /// With `more` in its configuration.
+    pub(crate) fn start_with(more: &str, arguments: &[&str]) -> Self {
+        Self::start_all(more, None, arguments)
+    }
+
+    fn start_all(more: &str, required: Option<&str>, arguments: &[&str]) -> Self {
+        let directory = OwnDirectory::new();
+        let mut node = process_under_test(&configuration(&directory, more), arguments);
+        node.wait_for(&["is up"]);
+        let api = NodeApi::connect(directory.join("robot.sock")).expect("the node is up");
+        let helper = required.map(|name| {
+            let registration = Registration::new().name(name);
+            api.register_transport_address(registration).expect("the name is free")
+        });
+        let wanted = Registration::new().name("test").requires(["drive"]).deadline(DEADLINE);
+        let mut endpoint = api.register_transport_address(wanted).expect("the drive becomes ready");
+        let drive = endpoint.resolve("drive", DEADLINE).expect("the node answers").expect("it is ready");
+        Self { node, api, endpoint, drive, helper, _directory: directory }
+    }
+
+    /// Asks the application who it is. All counts before it, too: they are asked for in the same class.
+    pub(crate) fn who(&mut self) -> Me {
+        self.endpoint.ask(self.drive, &Who {}, DEADLINE).expect("the drive answers")
+    }
+
+    pub(crate) fn order(&mut self, order: Order) {
+        self.endpoint.send(self.drive, &order).expect("the node takes it");
+    }
+
+    /// Gives an order whose handler does not return as it should; returns what is told of it.
+    pub(crate) fn order_confirmed(&mut self, order: Order) -> Outcome {
+        self.endpoint.send_confirmed(self.drive, &order, DEADLINE).expect("the node answers")
+    }
+
+    /// What was sent before it in its class has been handled then.
+    pub(crate) fn count_confirmed(&mut self, number: u64) -> Outcome {
+        let told = self.endpoint.send_confirmed(self.drive, &Count { number }, DEADLINE);
+        told.expect("the node answers")
+    }
+
+    pub(crate) fn count(&mut self, number: u64) {
+        self.endpoint.send(self.drive, &Count { number }).expect("the node takes it");
+    }
+}
+
+pub(crate) fn configuration(directory: &OwnDirectory, more: &str) -> PathBuf {
+    let (path, socket) = (directory.join("robot.toml"), directory.join("robot.sock"));
+    let text = format!(
+        "[node]\nname = \"robot\"\naddress = \"127.0.0.1\"\nproject = \"processes\"\n\
+         [lncl]\nsocket = \"{}\"\n[ndl]\nmulticast = \"{}\"\nmdns_port = false\n{more}",
+        socket.display(),
+        own_group()
+    );
+    std::fs::write(&path, text).expect("the test's own directory");
+    path
+}
+
+pub(crate) fn process(id: u32) -> Pid {
+    i32::try_from(id).ok().and_then(Pid::from_raw).expect("a process id")
+}
+
+pub(crate) fn signal(id: u32, signal: Signal) {
+    kill_process(process(id), signal).expect("it is alive");
+}
+
+/// A process that somebody else started, held by a descriptor: its id cannot be given to another meanwhile.
+pub(crate) struct Watched(std::os::fd::OwnedFd);
+
+impl Watched {
+    pub(crate) fn new(id: u32) -> Self {
+        Self(pidfd_open(process(id), PidfdFlags::empty()).expect("it is alive"))
+    }
+
+    /// Waits until it has ended.
+    pub(crate) fn wait_for_end(&self) {
+        let deadline = Timespec { tv_sec: DEADLINE.as_secs().cast_signed(), tv_nsec: 0 };
+        let ended = poll(&mut [PollFd::new(&self.0, PollFlags::IN)], Some(&deadline));
+        assert_eq!(ended, Ok(1), "the process lives on after {DEADLINE:?}");
+    }
+}
