@@ -20,8 +20,9 @@ use crate::lncl::payload::{self, Group, Refusal, Registered, Resolve};
 const PROMPT: Duration = Duration::from_secs(2);
 /// Longest payload before the node has said how long they may be.
 const GREETING_BYTES_MAX: usize = 64 * 1024;
-/// Chunks of 64 KiB that are read before the caller has its turn.
-const READS_PER_LOOK: usize = 16;
+/// Chunks of 64 KiB that are read before the caller has its turn. In tests each read is the last of its look: a message
+/// that ends with it must not be left lying until more comes.
+const READS_PER_LOOK: usize = if cfg!(test) { 1 } else { 16 };
 const LNCL: Tid = payload::lncl_of(NodeAddress::HERE);
 
 /// A registered transport address: sends and receives, from one thread at a time.
@@ -331,16 +332,12 @@ impl Endpoint {
         awaited: Option<(u64, Awaited)>,
         when_full: WhenFull,
     ) -> Result<Option<Answer>, ApiError> {
-        for _ in 0..READS_PER_LOOK {
-            while when_full == WhenFull::Refuse || self.inbox.has_room() {
-                let Some(message) = self.reader.next()? else { break };
-                match self.inbox.sort(message, awaited) {
-                    Sorted::Answer(answer) => return Ok(Some(answer)),
-                    Sorted::Refusal(sentence) => self.ended = Some(sentence),
-                    Sorted::Message | Sorted::Nothing => {}
-                }
+        for read in 0.. {
+            if let Some(answer) = self.sort_in(awaited, when_full)? {
+                return Ok(Some(answer));
             }
-            if when_full == WhenFull::Leave && !self.inbox.has_room() {
+            let is_full = when_full == WhenFull::Leave && !self.inbox.has_room();
+            if is_full || read == READS_PER_LOOK {
                 return Ok(None);
             }
             match self.reader.read() {
@@ -350,6 +347,23 @@ impl Endpoint {
                     self.ended.get_or_insert_with(|| "the node closed it, or ended".to_owned());
                     return Ok(None);
                 }
+            }
+        }
+        Ok(None)
+    }
+
+    /// Sorts in what has been read.
+    fn sort_in(
+        &mut self,
+        awaited: Option<(u64, Awaited)>,
+        when_full: WhenFull,
+    ) -> Result<Option<Answer>, ApiError> {
+        while when_full == WhenFull::Refuse || self.inbox.has_room() {
+            let Some(message) = self.reader.next()? else { break };
+            match self.inbox.sort(message, awaited) {
+                Sorted::Answer(answer) => return Ok(Some(answer)),
+                Sorted::Refusal(sentence) => self.ended = Some(sentence),
+                Sorted::Message | Sorted::Nothing => {}
             }
         }
         Ok(None)
