@@ -163,6 +163,11 @@ impl Program {
 
 impl Drop for Program {
     fn drop(&mut self) {
+        if std::thread::panicking() {
+            // Its last lines may say why.
+            self.seen.extend(self.lines.try_iter());
+            eprintln!("{} said:\n{}", self.name, self.seen.join("\n"));
+        }
         // It may have ended by itself.
         let _ = self.child.kill();
         let _ = self.child.wait();

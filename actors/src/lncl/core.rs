@@ -204,6 +204,11 @@ impl Registry {
         self.names.get(name).copied()
     }
 
+    /// Every name that is taken on this node.
+    pub(crate) fn names(&self) -> impl Iterator<Item = String> + '_ {
+        self.names.keys().cloned()
+    }
+
     /// The name of `app`, or its address where it has none.
     pub(crate) fn name_of(&self, app: AppAddress) -> String {
         let name = self.apps.get(&app).and_then(|entry| entry.name.clone());

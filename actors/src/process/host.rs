@@ -26,7 +26,7 @@ use tokio_util::codec::Decoder;
 use super::{
     role::{Hosting, die},
     wire::Wire,
-    words::{self, Ending, Welcome},
+    words::{self, Ending, WORDS_BYTES_MAX, Welcome},
 };
 use crate::{config::NodeConfig, lncl::payload};
 
@@ -36,8 +36,6 @@ const WELCOME: Duration = Duration::from_secs(10);
 const LAST_WORDS: Duration = Duration::from_millis(100);
 /// Longest time between two looks at what has expired.
 const EXPIRING: Duration = Duration::from_millis(250);
-/// Longest first frame: the names that one application may require, at their longest, and a little more.
-const WELCOME_BYTES_MAX: usize = 64 * 1024;
 
 /// Hosts the application, then ends this process.
 pub(super) fn host(config: &NodeConfig, apps: Vec<DynApp>, hosting: Hosting) -> ! {
@@ -77,7 +75,7 @@ fn run(config: &NodeConfig, app: &DynApp, mut socket: StdStream) -> io::Result<(
 /// Reads the first frame and not a byte more.
 fn read_welcome(socket: &mut StdStream) -> io::Result<Welcome> {
     socket.set_read_timeout(Some(WELCOME))?;
-    let mut codec = FrameCodec::new(WELCOME_BYTES_MAX);
+    let mut codec = FrameCodec::new(WORDS_BYTES_MAX);
     let mut buffer = bytes::BytesMut::new();
     let mut wanted = HEADER_LEN;
     let fault = |what: String| io::Error::new(io::ErrorKind::InvalidData, what);

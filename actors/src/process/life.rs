@@ -32,7 +32,7 @@ use super::{
     link::{LastWords, Link},
     names::KnownNames,
     spawn::{self, Started},
-    words::{self, Ending, Look, Names, Turn, Welcome},
+    words::{self, Ending, Look, Names, Turn, WORDS_BYTES_MAX, Welcome},
 };
 use crate::{
     lncl::{
@@ -57,7 +57,6 @@ pub(super) struct Hosted {
     pub(super) link: Arc<Link>,
     pub(super) tid: Tid,
     pub(super) name: String,
-    pub(super) requires: Vec<String>,
     pub(super) progress_within: Option<Duration>,
 }
 
@@ -221,7 +220,7 @@ impl Child {
         // Before the names are looked up: a change in between is told twice and not never.
         let directory = hosted.stores.directory_changes.subscribe();
         let mut names = KnownNames::default();
-        let known = hosted.requires.iter().map(|name| names.look(&hosted.stores, name.clone())).collect();
+        let known = names.changes(&hosted.stores).unwrap_or_default();
         let welcome = Welcome {
             tid: tid.bits(),
             first_wait: hosted.link.begin_life() * WAITS_PER_LIFE,
@@ -233,7 +232,7 @@ impl Child {
         let number = hosted.link.connect(stream.clone(), welcome, directory);
         let mut session = Session::new();
         session.released(tid);
-        let reader = Reader::new(hosted.stores.config.payload_max);
+        let reader = Reader::new(hosted.stores.config.payload_max.max(WORDS_BYTES_MAX));
         let ready = Some(ready);
         Ok(Self {
             hosted,
@@ -359,8 +358,8 @@ impl Child {
             }
             Kind::HOST_LOOK => {
                 let Look { name } = payload::read(&message.payload).map_err(|error| fault(&error))?;
-                let names = vec![self.names.look(&self.hosted.stores, name)];
-                self.tell(names);
+                let names = self.names.look(&self.hosted.stores, name);
+                self.tell(&names);
             }
             // Not an enum of ours: an open set of numbers.
             _ => return self.obey_like_a_client(message).map_err(|what| fault(&what)),
@@ -415,15 +414,14 @@ impl Child {
 
     fn tell_names(&mut self) {
         self.hosted.link.directory_is_told();
-        let changed = self.names.changed(&self.hosted.stores);
-        if !changed.is_empty() {
-            self.tell(changed);
+        if let Some(changes) = self.names.changes(&self.hosted.stores) {
+            self.tell(&changes);
         }
     }
 
-    fn tell(&self, names: Vec<words::Name>) {
+    fn tell(&self, names: &Names) {
         let node = payload::lncl_of(self.hosted.tid.node);
-        self.say(words::frame(Kind::HOST_NAMES, node, self.hosted.tid, &Names { names }));
+        self.say(words::frame(Kind::HOST_NAMES, node, self.hosted.tid, names));
     }
 
     fn say(&self, message: Message) {

@@ -100,7 +100,6 @@ impl Link {
             link: self.clone(),
             tid: self.sender.get_or_init(|| sender).tid(),
             name: app.name().to_owned(),
-            requires: app.requires().to_vec(),
             progress_within: app.policy().progress_within,
         });
         Arc::new(move |ready| process_life(hosted.clone(), ready))

@@ -1,37 +1,67 @@
-//! Which names a child wants to know, and which of them it has to be told of.
+//! The copy of the directory that a child has, so that it need not ask.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use sinew_runtime::tid::Tid;
 
-use super::words::{NAMES_MAX, Name};
-use crate::{lncl, stores::Stores};
+use super::words::{NAMES_MAX, Name, Names};
+use crate::{
+    lncl,
+    stores::{Stores, lock},
+};
 
-/// The names that a child knows, as it knows them. At most [`NAMES_MAX`].
+/// What a child knows of the directory. All of it up to [`NAMES_MAX`] names; beyond that, the names that it asked for.
 #[derive(Debug, Default)]
-pub(super) struct KnownNames(BTreeMap<String, Option<u64>>);
+pub(super) struct KnownNames {
+    known: BTreeMap<String, Option<u64>>,
+    complete: bool,
+}
 
 impl KnownNames {
-    /// Answers the child's question after a name.
-    pub(super) fn look(&mut self, stores: &Stores, name: String) -> Name {
-        let tid = lncl::resolve(stores, &name).map(Tid::bits);
-        let watched = self.0.len() < NAMES_MAX || self.0.contains_key(&name);
-        if watched {
-            self.0.insert(name.clone(), tid);
+    /// What the child has to be told, if anything has changed.
+    pub(super) fn changes(&mut self, stores: &Stores) -> Option<Names> {
+        let all = all_names(stores);
+        let complete = all.len() <= NAMES_MAX;
+        let mut names = Vec::new();
+        if complete {
+            self.known.retain(|name, _| {
+                let stays = all.contains(name);
+                if !stays {
+                    names.push(Name { name: name.clone(), tid: None, watched: true });
+                }
+                stays
+            });
+            for name in all {
+                self.known.entry(name).or_insert(None);
+            }
         }
-        Name { name, tid, watched }
-    }
-
-    /// The names whose holder is another one than the child knows.
-    pub(super) fn changed(&mut self, stores: &Stores) -> Vec<Name> {
-        let mut changed = Vec::new();
-        for (name, known) in &mut self.0 {
+        for (name, known) in &mut self.known {
             let tid = lncl::resolve(stores, name).map(Tid::bits);
             if tid != *known {
                 *known = tid;
-                changed.push(Name { name: name.clone(), tid, watched: true });
+                names.push(Name { name: name.clone(), tid, watched: true });
             }
         }
-        changed
+        let is_news = !names.is_empty() || complete != self.complete;
+        self.complete = complete;
+        is_news.then_some(Names { names, complete })
     }
+
+    /// Answers the child's question after a name.
+    pub(super) fn look(&mut self, stores: &Stores, name: String) -> Names {
+        let tid = lncl::resolve(stores, &name).map(Tid::bits);
+        let watched = self.known.len() < NAMES_MAX || self.known.contains_key(&name);
+        if watched {
+            self.known.insert(name.clone(), tid);
+        }
+        Names { names: vec![Name { name, tid, watched }], complete: self.complete }
+    }
+}
+
+fn all_names(stores: &Stores) -> BTreeSet<String> {
+    let directory = lock(&stores.sync).directory();
+    let mut names: BTreeSet<_> = directory.into_iter().map(|entry| entry.name).collect();
+    // The sync manager hears of these a moment later.
+    names.extend(lock(&stores.registry).names());
+    names
 }

@@ -34,7 +34,7 @@ use tokio_util::codec::Decoder;
 use super::{
     inbox::Inbox,
     role::die,
-    words::{self, Look, Name, Names, Turn, Welcome},
+    words::{self, Look, Name, Names, Turn, WORDS_BYTES_MAX, Welcome},
 };
 use crate::{
     config::NodeConfig,
@@ -48,8 +48,8 @@ use crate::{
 const READ_CHUNK: usize = 16 * 1024;
 /// Chunks that are read before the caller has its turn.
 const READS_PER_LOOK: usize = 16;
-/// Longest time that a question for a name takes.
-const LOOKING: Duration = Duration::from_millis(100);
+/// Longest time that a question for a name takes. Asked only where the directory is larger than the copy of it.
+const LOOKING: Duration = Duration::from_millis(250);
 /// Frames that wait for the node to read at most. There are fewer: turns of one window, and orders of one thread.
 const URGENT_MAX: usize = 1_024;
 
@@ -62,8 +62,41 @@ pub(super) struct Wire {
     pending: Arc<Pending>,
     incoming: Mutex<Incoming>,
     inbox: Mutex<Inbox>,
-    names: Mutex<BTreeMap<String, Name>>,
+    names: Mutex<KnownNames>,
     stop: Notify,
+}
+
+/// What this process knows of the directory.
+#[derive(Default)]
+struct KnownNames {
+    names: BTreeMap<String, Name>,
+    complete: bool,
+}
+
+impl KnownNames {
+    fn take(&mut self, Names { names, complete }: Names) {
+        for name in names {
+            if complete && name.tid.is_none() {
+                self.names.remove(&name.name);
+            } else {
+                self.names.insert(name.name.clone(), name);
+            }
+        }
+        self.complete = complete;
+    }
+
+    /// Who has `name`, if that is known.
+    fn get(&mut self, name: &str) -> Option<Option<Tid>> {
+        let Some(Name { tid, watched, .. }) = self.names.get(name) else {
+            return self.complete.then_some(None);
+        };
+        let (tid, watched) = (tid.map(Tid::from_bits), *watched);
+        if !watched {
+            // Nobody tells when it changes: the next question is put to the node again.
+            self.names.remove(name);
+        }
+        Some(tid)
+    }
 }
 
 struct Incoming {
@@ -89,8 +122,9 @@ impl Wire {
         let outlet = Arc::new(StreamOutlet::new(limits));
         let link = outlet.connect(socket.clone(), config.payload_max, None);
         let chunk = vec![0; READ_CHUNK].into_boxed_slice();
-        let codec = FrameCodec::new(config.payload_max);
-        let names = welcome.names.into_iter().map(|name| (name.name.clone(), name)).collect();
+        let codec = FrameCodec::new(config.payload_max.max(WORDS_BYTES_MAX));
+        let mut names = KnownNames::default();
+        names.take(welcome.names);
         Arc::new(Self {
             tid: Tid::from_bits(welcome.tid),
             socket,
@@ -227,8 +261,8 @@ impl Wire {
         } else if header.kind == Kind::HOST_STOP {
             self.stop.notify_one();
         } else if header.kind == Kind::HOST_NAMES {
-            if let Ok(Names { names }) = payload::read(&message.payload) {
-                lock(&self.names).extend(names.into_iter().map(|name| (name.name.clone(), name)));
+            if let Ok(names) = payload::read(&message.payload) {
+                lock(&self.names).take(names);
             }
         } else {
             let (turn, waker) = lock(&self.inbox).push(message);
@@ -248,17 +282,6 @@ impl Wire {
             self.say(turn.frame(self.tid));
         }
         inbox.poll_claimed(self.has_said_all(), cx).map(Some)
-    }
-
-    fn known(&self, name: &str) -> Option<Option<Tid>> {
-        let mut names = lock(&self.names);
-        let Name { tid, watched, .. } = names.get(name)?;
-        let (tid, watched) = (tid.map(Tid::from_bits), *watched);
-        if !watched {
-            // Nobody tells when it changes: the next question is put to the node again.
-            names.remove(name);
-        }
-        Some(tid)
     }
 }
 
@@ -281,7 +304,7 @@ impl Directory for Wire {
     fn resolve(&self, name: &str) -> Option<Tid> {
         // What has come may change the answer.
         self.look();
-        if let Some(known) = self.known(name) {
+        if let Some(known) = lock(&self.names).get(name) {
             return known;
         }
         self.say(words::frame(Kind::HOST_LOOK, self.tid, Tid::NONE, &Look { name: name.to_owned() }));
@@ -296,7 +319,7 @@ impl Directory for Wire {
             // An error is a signal that came: the clock is asked again.
             let _ = poll(&mut [PollFd::new(&*self.socket, PollFlags::IN)], Some(&wait));
             self.look();
-            if let Some(known) = self.known(name) {
+            if let Some(known) = lock(&self.names).get(name) {
                 return known;
             }
         }

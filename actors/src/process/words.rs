@@ -17,7 +17,8 @@ pub(super) const VARIABLE: &str = "SINEW_HOST";
 pub(super) const WINDOW: usize = 32;
 /// Events of the node's layers that it may have beyond that: they go past a child that takes nothing else.
 pub(super) const EVENTS_MAX: usize = 32;
-/// Names that a child may ask for, at most; further ones it has to ask for again each time.
+/// Names of the directory that a child has a copy of, at most. If there are more it asks, and so many are told when they
+/// change; further ones it has to ask for each time.
 pub(super) const NAMES_MAX: usize = 1_024;
 
 /// The node's first words.
@@ -31,8 +32,8 @@ pub(super) struct Welcome {
     pub(super) sequence: u64,
     /// Time between two signs of life, in microseconds; 0 = none are wanted.
     pub(super) beat_us: u64,
-    /// Who has the names that the application requires.
-    pub(super) names: Vec<Name>,
+    /// Who has which name.
+    pub(super) names: Names,
 }
 
 /// Who has a name.
@@ -47,11 +48,18 @@ pub(super) struct Name {
 }
 
 /// Who has some names now.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Names {
     /// Those that were asked for, or have changed.
     pub(super) names: Vec<Name>,
+    /// Whether nobody has any name but those that the child was told.
+    pub(super) complete: bool,
 }
+
+/// Longest frame of these, in bytes, whatever the longest payload of a message is: as many names as there may be.
+pub(super) const WORDS_BYTES_MAX: usize = 256 * 1024;
+/// Longest text in them, in bytes; longer ones are cut.
+pub(super) const TEXT_BYTES_MAX: usize = 4 * 1024;
 
 /// Asks who has a name.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -78,15 +86,19 @@ impl From<&Reason> for Ending {
         match reason {
             Reason::Normal | Reason::Shutdown => Self::Normal,
             Reason::RequirementLost(name) => Self::RequirementLost(name.clone()),
-            Reason::Panic(said) => Self::Panic(said.clone()),
+            Reason::Panic(said) => Self::Panic(cut(said)),
             other @ (Reason::StartTimeout
             | Reason::Hung(_)
             | Reason::Killed
             | Reason::ThreadEnded
             | Reason::ProcessEnded(_)
-            | Reason::GaveUp(_)) => Self::Other(other.to_string()),
+            | Reason::GaveUp(_)) => Self::Other(cut(&other.to_string())),
         }
     }
+}
+
+fn cut(text: &str) -> String {
+    text[..text.floor_char_boundary(TEXT_BYTES_MAX)].to_owned()
 }
 
 impl From<Ending> for Reason {

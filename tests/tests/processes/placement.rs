@@ -233,15 +233,16 @@ fn it_is_started_anew_when_what_it_requires_is_back(place: &str) {
 fn large_messages_go_both_ways(place: &str) {
     let mut scenario = start(place);
     let drive = scenario.drive;
-    for length in [1_000, 100_000, 1_000_000] {
+    // More than the window, more than a socket holds, and almost the longest.
+    for (length, count) in [(1_000, 100), (100_000, 20), (1_000_000, 3)] {
         let payload = vec![7; length];
-        for _ in 0..20 {
+        for _ in 0..count {
             scenario
                 .endpoint
                 .send(drive, &Order::Echo("test".to_owned(), payload.clone()))
                 .expect("the node takes it");
         }
-        for _ in 0..20 {
+        for _ in 0..count {
             let echo = scenario.endpoint.receive(DEADLINE).expect("the node is there").expect("an echo");
             let Order::Echo(_, bytes) = echo.decode().expect("an order") else { panic!("another order") };
             assert!(bytes == payload);
