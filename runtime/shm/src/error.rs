@@ -31,7 +31,7 @@ pub enum Corrupt {
     /// A record begins with what is no mark.
     #[error("a record begins with {0:#018x}")]
     Mark(u64),
-    /// A message would reach beyond what was published, or beyond the ring's end.
+    /// A message would reach beyond what was published, or beyond the ring's end, or is longer than half the ring.
     #[error("a message of {length} bytes where {room} bytes are left")]
     Length {
         /// What the peer wrote.

@@ -40,6 +40,8 @@ mod bell;
 mod consumer;
 mod core;
 mod error;
+#[cfg(all(target_os = "linux", any(test, feature = "hostile-peer"), not(any(loom, miri))))]
+pub mod hostile;
 mod layout;
 mod memory;
 mod offer;

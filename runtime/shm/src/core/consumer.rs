@@ -136,7 +136,8 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
     }
 
     fn message(&self, start: u32, length: u32) -> Result<Record, Corrupt> {
-        let room = self.published(start).min(self.capacity.rest(start));
+        let most = self.capacity.payload_max() + MARK_BYTES;
+        let room = self.published(start).min(self.capacity.rest(start)).min(most);
         match record_bytes(length) {
             Some(record) if record <= room => Ok(Record {
                 position: self.capacity.position(start) + MARK_BYTES,

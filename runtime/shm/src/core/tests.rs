@@ -134,6 +134,7 @@ proptest! {
             for _ in 0..40 {
                 let Ok(Some(record)) = receiver.next() else { break };
                 prop_assert!(record.position >= 8 && record.position + record.length <= capacity.bytes());
+                prop_assert!(record.length <= capacity.payload_max());
                 receiver.release(record);
             }
             for length in [0, 8, 100] {
@@ -225,6 +226,15 @@ fn a_tail_or_head_that_goes_back_or_too_far_is_corrupt() {
         assert_eq!(refused, Err(LoanError::Corrupt(error)), "{head}");
         assert_eq!(sender.reserve(8), Err(LoanError::Corrupt(error)), "and from then on always");
     }
+}
+
+/// Found by the hostile peer: such a message lay within the ring, but buffers of `payload_max` bytes were too short for it.
+#[test]
+fn a_message_longer_than_half_the_ring_is_corrupt_although_it_fits() {
+    let (sender, mut receiver) = ring(Capacity::tiny(64));
+    sender.own.cell(0).store(Mark::Message(32).to_bits(), Ordering::Relaxed);
+    sender.own.word(Word::Tail).store(40, Ordering::Relaxed);
+    assert_eq!(receiver.next(), Err(Corrupt::Length { length: 32, room: 32 }));
 }
 
 #[test]

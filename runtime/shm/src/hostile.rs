@@ -1,0 +1,376 @@
+//! A peer that writes what it likes into all that it may write, while this side uses the connection. For tests, and for the
+//! example `hostile`; never in a robot.
+
+use std::{
+    collections::BTreeMap,
+    os::fd::OwnedFd,
+    sync::atomic::{AtomicBool, Ordering},
+    thread,
+    time::Duration,
+};
+
+use rustix::fs::{FallocateFlags, fallocate, ftruncate};
+
+use crate::{
+    BellKind, Capacity, Consumer, Corrupt, LoanError, Offer, Producer, ReceiveError, Region, RoomError,
+    Terms, Wait,
+    layout::{HEADER_BYTES, Mark, Word},
+    memory::Peer,
+    platform,
+};
+
+/// What came of an assault.
+#[derive(Clone, Debug, Default)]
+pub struct Tally {
+    /// Connections.
+    pub lives: u64,
+    /// Messages that were taken, forged ones mostly.
+    pub taken: u64,
+    /// Messages that were published.
+    pub published: u64,
+    /// Waits that ended at their deadline.
+    pub timed_out: u64,
+    /// Writes of the hostile side.
+    pub writes: u64,
+    /// How often the peer was caught, by what it was caught at.
+    pub caught: BTreeMap<&'static str, u64>,
+}
+
+impl Tally {
+    fn catch(&mut self, corrupt: Corrupt) {
+        let name = match corrupt {
+            Corrupt::Tail { .. } => "tail",
+            Corrupt::Head { .. } => "head",
+            Corrupt::Mark(_) => "mark",
+            Corrupt::Length { .. } => "length",
+            Corrupt::Skip { .. } => "skip",
+        };
+        *self.caught.entry(name).or_default() += 1;
+    }
+}
+
+/// Numbers that a seed decides: xorshift64*.
+#[derive(Clone, Debug)]
+pub(crate) struct Dice(u64);
+
+impl Dice {
+    pub(crate) const fn new(seed: u64) -> Self {
+        Self(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1)
+    }
+
+    fn next(&mut self) -> u64 {
+        self.0 ^= self.0 >> 12;
+        self.0 ^= self.0 << 25;
+        self.0 ^= self.0 >> 27;
+        self.0.wrapping_mul(0x2545_F491_4F6C_DD1D)
+    }
+
+    fn below(&mut self, limit: u32) -> u32 {
+        (self.next() >> 32) as u32 % limit
+    }
+}
+
+/// Connects to a hostile peer and uses the connection, so many times. Same seed, same intentions; which of them meet is up
+/// to the scheduler.
+///
+/// # Panics
+/// When this side is harmed: a message beyond its bounds, or an error that no peer should be able to cause.
+#[must_use]
+pub fn assault(seed: u64, lives: u64) -> Tally {
+    let mut tally = Tally::default();
+    for life in 0..lives {
+        let mut dice = Dice::new(seed ^ life << 20);
+        one_life(&mut dice, &mut tally);
+    }
+    tally
+}
+
+fn one_life(dice: &mut Dice, tally: &mut Tally) {
+    let bells = [BellKind::Futex, BellKind::EventFd, BellKind::Socket];
+    let bell = bells[dice.below(3) as usize];
+    let capacity = Capacity::new(4096 << dice.below(3)).expect("a power of two");
+    let (ours, our_offer) = Region::create(capacity, bell).expect("a region");
+    let (theirs, their_offer) = Region::create(capacity, bell).expect("a region");
+    let keys = [&our_offer, &their_offer].map(|offer| duplicate(&offer.descriptors()[0])).into();
+    let terms = Terms { bells: bells.to_vec(), ..Terms::default() };
+    let (producer, consumer) = ours.connect(their_offer, &terms).expect("honest so far");
+    // Of 64 writes so many are wild; the others are what an honest peer might write, to get further.
+    let wild = [0, 1, 1, 8, 64][dice.below(5) as usize];
+    let attacker = Attacker::new(theirs, our_offer, keys, dice.clone(), wild);
+    let caught_before = tally.caught.values().sum::<u64>();
+    let over = AtomicBool::new(false);
+    thread::scope(|scope| {
+        let attack = scope.spawn(|| attacker.attack_until(&over));
+        let ends = EndsIt(&over);
+        use_connection(producer, consumer, dice, tally);
+        drop(ends);
+        tally.writes += attack.join().expect("the attacker has no claims that could fail");
+    });
+    let caught = tally.caught.values().sum::<u64>() - caught_before;
+    assert!(wild > 0 || caught == 0, "an honest peer is never accused: {:?}", tally.caught);
+    tally.lives += 1;
+}
+
+/// Ends the attack also when this side panics: else nobody would hear of it.
+struct EndsIt<'a>(&'a AtomicBool);
+
+impl Drop for EndsIt<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+fn duplicate(fd: &OwnedFd) -> OwnedFd {
+    fd.try_clone().expect("a descriptor")
+}
+
+/// What an application does, in any order, until the peer is caught by both halves or there was enough of it.
+fn use_connection(mut producer: Producer, mut consumer: Consumer, dice: &mut Dice, tally: &mut Tally) {
+    let mut caught = (false, false);
+    for _ in 0..3_000 {
+        if dice.below(2) == 0 {
+            caught.0 |= receive(&mut consumer, dice, tally, caught.0);
+        } else {
+            caught.1 |= send(&mut producer, dice, tally, caught.1);
+        }
+        if caught == (true, true) {
+            return;
+        }
+    }
+}
+
+/// Whether the peer was caught.
+fn receive(consumer: &mut Consumer, dice: &mut Dice, tally: &mut Tally, known: bool) -> bool {
+    let max = consumer.payload_max();
+    let found = match dice.below(16) {
+        0 => match consumer.receive_before(&shortly(dice)) {
+            Ok(lent) => Ok(Some(lent)),
+            Err(ReceiveError::Corrupt(corrupt)) => Err(corrupt),
+            // A bell's other end is in the attacker's hands too.
+            Err(ReceiveError::TimedOut | ReceiveError::HungUp) => {
+                tally.timed_out += 1;
+                Ok(None)
+            }
+            Err(ReceiveError::System(error)) => panic!("no peer can cause this: {error}"),
+        },
+        1 => {
+            let armed = consumer.arm();
+            consumer.disarm();
+            armed.map(|_| None)
+        }
+        _ => consumer.receive(),
+    };
+    match found {
+        Ok(None) => false,
+        Ok(Some(lent)) => {
+            assert!(lent.len() <= max, "{} bytes where {max} is the most", lent.len());
+            assert_eq!(lent.to_vec().len(), lent.len());
+            tally.taken += 1;
+            false
+        }
+        Err(corrupt) => {
+            if !known {
+                tally.catch(corrupt);
+            }
+            true
+        }
+    }
+}
+
+/// Whether the peer was caught.
+fn send(producer: &mut Producer, dice: &mut Dice, tally: &mut Tally, known: bool) -> bool {
+    let length = dice.below(producer.payload_max() as u32 + 1) as usize;
+    let room = match dice.below(16) {
+        0 => producer.loan_before(length, &shortly(dice)),
+        1 => {
+            let armed = producer.arm(length);
+            producer.disarm();
+            if let Err(LoanError::Corrupt(corrupt)) = armed {
+                Err(corrupt.into())
+            } else {
+                Err(RoomError::TimedOut)
+            }
+        }
+        _ => match producer.loan(length) {
+            Ok(loan) => Ok(loan),
+            Err(LoanError::Full { .. }) => Err(RoomError::TimedOut),
+            Err(LoanError::Corrupt(corrupt)) => Err(corrupt.into()),
+            Err(LoanError::TooLong { .. }) => panic!("it was not asked for more than the most"),
+        },
+    };
+    match room {
+        Ok(mut loan) => {
+            assert_eq!(loan.len(), length);
+            loan.fill(0xEE);
+            assert!(loan.iter().all(|byte| *byte == 0xEE), "nobody else writes here");
+            loan.publish();
+            tally.published += 1;
+            false
+        }
+        Err(RoomError::TimedOut | RoomError::HungUp) => {
+            tally.timed_out += 1;
+            false
+        }
+        Err(RoomError::Corrupt(corrupt)) => {
+            if !known {
+                tally.catch(corrupt);
+            }
+            true
+        }
+        Err(error @ (RoomError::TooLong { .. } | RoomError::System(_))) => {
+            panic!("no peer can cause this: {error}")
+        }
+    }
+}
+
+fn shortly(dice: &mut Dice) -> Wait<'static> {
+    Wait::within(Duration::from_micros(u64::from(dice.below(300))))
+}
+
+/// The other side: its own memory to write, this side's to try to.
+struct Attacker {
+    region: Region,
+    /// What it sees of this side.
+    victim: platform::PeerMemory,
+    /// Descriptors of this side's and its own memory.
+    keys: Vec<OwnedFd>,
+    buttons: [Box<dyn crate::bell::Doorbell>; 2],
+    dice: Dice,
+    wild: u32,
+    tail: u32,
+    head: u32,
+}
+
+impl Attacker {
+    fn new(region: Region, victim: Offer, keys: Vec<OwnedFd>, dice: Dice, wild: u32) -> Self {
+        let mut fds = victim.descriptors.into_iter();
+        let memory = platform::adopt(fds.next().expect("it comes first"), victim.capacity);
+        let (message, room) = platform::buttons(victim.bell, fds.collect()).expect("honest bells");
+        let victim = memory.expect("honest memory");
+        Self { region, victim, keys, buttons: [message, room], dice, wild, tail: 0, head: 0 }
+    }
+
+    fn attack_until(mut self, over: &AtomicBool) -> u64 {
+        let mut writes = 0;
+        while !over.load(Ordering::Relaxed) {
+            if self.dice.below(64) < self.wild {
+                self.write_anything();
+            } else {
+                self.write_something_likely();
+            }
+            writes += 1;
+        }
+        writes
+    }
+
+    fn write_anything(&mut self) {
+        let (place, value) = (self.dice.next() as u32, self.dice.next() as u32);
+        match self.dice.below(8) {
+            0 => self.region.scribble(Word::Tail.index() as u32, value),
+            1 => self.region.scribble(Word::Head.index() as u32, value),
+            2 => self.try_the_keys(value),
+            _ => self.region.scribble(place, value),
+        }
+    }
+
+    /// What the seals must not let through. That they do not is another test's claim; here it must harm nobody.
+    fn try_the_keys(&self, value: u32) {
+        for key in &self.keys {
+            let hole = FallocateFlags::PUNCH_HOLE | FallocateFlags::KEEP_SIZE;
+            let refused = [
+                ftruncate(key, u64::from(value % 8192)).is_err(),
+                fallocate(key, hole, 0, 4096).is_err(),
+                rustix::io::pwrite(key, &value.to_ne_bytes(), u64::from(value % 4096)).is_err(),
+            ];
+            assert_eq!(refused, [true; 3], "a sealed memory lets nothing through");
+        }
+    }
+
+    fn write_something_likely(&mut self) {
+        let small = self.dice.below(600);
+        match self.dice.below(12) {
+            0..4 => self.publish(small),
+            4..6 => self.take(),
+            6 => self.region.scribble(Word::ConsumerSleep.index() as u32, small),
+            7 => self.region.scribble(Word::ProducerSleep.index() as u32, small),
+            8 => self.buttons[small as usize % 2].ring(),
+            _ if self.wild == 0 => {}
+            9 => self.change_a_mark(Mark::Message(small * 9)),
+            10 => self.change_a_mark(Mark::Skip),
+            // Bytes of some message, perhaps while it is copied.
+            _ => {
+                let place = HEADER_BYTES as u32 / 4 + self.dice.below(self.region.capacity.bytes() / 4);
+                self.region.scribble(place, small);
+            }
+        }
+    }
+
+    /// As an honest producer does.
+    fn publish(&mut self, length: u32) {
+        let capacity = self.region.capacity;
+        let record = crate::layout::record_bytes(length).expect("it is small");
+        let rest = capacity.rest(self.tail);
+        let skip = if record > rest { rest } else { 0 };
+        if self.tail.wrapping_sub(self.victim.load(Word::Head)) + skip + record > capacity.bytes() {
+            return;
+        }
+        // Nor does anything keep it from writing there before the victim has read, but this.
+        std::sync::atomic::fence(Ordering::Acquire);
+        if skip > 0 {
+            self.put_mark(capacity.position(self.tail), Mark::Skip);
+        }
+        let start = self.tail.wrapping_add(skip);
+        self.put_mark(capacity.position(start), Mark::Message(length));
+        self.tail = start.wrapping_add(record);
+        // Nothing here keeps a processor from showing the tail before the mark but this.
+        std::sync::atomic::fence(Ordering::Release);
+        self.region.scribble(Word::Tail.index() as u32, self.tail);
+    }
+
+    /// As an honest consumer does, in any pieces.
+    fn take(&mut self) {
+        let untaken = self.victim.load(Word::Tail).wrapping_sub(self.head);
+        self.head = self.head.wrapping_add(self.dice.below(untaken + 1) & !7);
+        self.region.scribble(Word::Head.index() as u32, self.head);
+    }
+
+    /// Any, or the one that the victim reads next.
+    fn change_a_mark(&mut self, mark: Mark) {
+        let capacity = self.region.capacity;
+        let position = match self.dice.below(2) {
+            0 => self.dice.below(capacity.bytes() / 8) * 8,
+            _ => capacity.position(self.victim.load(Word::Head)),
+        };
+        self.put_mark(position, mark);
+    }
+
+    fn put_mark(&mut self, position: u32, mark: Mark) {
+        let place = (HEADER_BYTES as u32 + position) / 4;
+        let bits = mark.to_bits();
+        self.region.scribble(place, bits as u32);
+        self.region.scribble(place + 1, (bits >> 32) as u32);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_peer_that_writes_what_it_likes_harms_nobody_and_is_caught_in_every_way() {
+        let mut all = Tally::default();
+        for seed in 0..40 {
+            let tally = assault(seed, 10);
+            all.taken += tally.taken;
+            all.published += tally.published;
+            tally.caught.into_iter().for_each(|(name, times)| *all.caught.entry(name).or_default() += times);
+        }
+        let ways: Vec<&str> = all.caught.keys().copied().collect();
+        assert_eq!(
+            ways,
+            ["head", "length", "mark", "skip", "tail"],
+            "the attack reaches every check: {all:?}"
+        );
+        assert!(all.taken > 0 && all.published > 0, "and what lies behind them: {all:?}");
+    }
+}
