@@ -23,6 +23,8 @@ pub struct JointRow {
     pub saturated: bool,
     /// State of the drive; `None` while its node does not run.
     pub state: Option<DriveState>,
+    /// Whether the device damps by its own watchdog.
+    pub watchdog: bool,
 }
 
 /// One millisecond of a run.

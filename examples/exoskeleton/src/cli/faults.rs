@@ -1,9 +1,10 @@
 //! The faults of the demonstration from the command line.
 
 use std::path::PathBuf;
+use std::str::FromStr;
 use std::time::Duration;
 
-use exoskeleton::robot::launch::faults::{self, FaultOptions, FaultReport, Step};
+use exoskeleton::robot::launch::faults::{self, ContrastRun, FaultOptions, FaultReport, Step};
 
 use super::{RunError, Verdict};
 
@@ -15,6 +16,9 @@ use super::{RunError, Verdict};
 /// 4 kill -9 of the process of the knee's drive | 5 the same process hangs (SIGSTOP, SIGCONT) | 6 the knee's node is
 /// pulled (SIGKILL) | 7 it returns | 8 e-stop (software, not a safety function) | 9 insane commands | 11 central is killed
 ///
+/// In the end the contrast: the ankle's drive falls silent at push-off, with and without a device watchdog; faults.svg in
+/// the run folder has both beside each other.
+///
 /// The table has what is expected of each class of machine: A real-time kernel and isolated core, B plain Linux and
 /// idle, C any machine. Times are held against class C; what concerns function has to hold on every machine.
 ///
@@ -22,9 +26,9 @@ use super::{RunError, Verdict};
 #[derive(Debug, clap::Args)]
 #[command(verbatim_doc_comment)]
 pub(super) struct FaultArguments {
-    /// Only these steps, for example 4,6.
+    /// Only these of 4, 5, 6, 7, 8, 9, 11 and contrast, for example 4,6,contrast.
     #[arg(long, value_delimiter = ',', value_name = "STEPS")]
-    only: Vec<Step>,
+    only: Vec<Item>,
     /// Phases of the stride at which the knee's drive is killed, 0 to 1.
     #[arg(long, value_delimiter = ',', value_name = "PHASES", default_value = "0.12,0.40,0.62,0.75")]
     phases: Vec<f64>,
@@ -40,9 +44,22 @@ pub(super) struct FaultArguments {
     /// Silence after which a device damps by itself, ms.
     #[arg(long, value_name = "MS", default_value_t = 8, value_parser = clap::value_parser!(u64).range(1..=10_000))]
     device_watchdog: u64,
-    /// For machines that others share: one phase, and only what has to hold on every machine counts for the exit code.
+    /// For machines that others share: one phase, the contrast in virtual time, and only what has to hold on every
+    /// machine counts for the exit code.
     #[arg(long)]
     short: bool,
+}
+
+/// A step, or the contrast.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Item(Option<Step>);
+
+impl FromStr for Item {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text.trim() == "contrast" { Ok(Self(None)) } else { text.parse().map(Some).map(Self) }
+    }
 }
 
 /// Runs, prints the table, writes the report.
@@ -60,7 +77,10 @@ pub(super) fn run(arguments: &FaultArguments) -> Result<Verdict, RunError> {
 }
 
 fn options(arguments: &FaultArguments) -> Result<FaultOptions, RunError> {
-    let steps = if arguments.only.is_empty() { Step::ALL.to_vec() } else { arguments.only.clone() };
+    let only = &arguments.only;
+    let steps =
+        if only.is_empty() { Step::ALL.to_vec() } else { only.iter().filter_map(|item| item.0).collect() };
+    let with_contrast = only.is_empty() || only.contains(&Item(None));
     if let Some(phase) = arguments.phases.iter().find(|phase| !(0.0..1.0).contains(*phase)) {
         return Err(RunError::Phase(*phase));
     }
@@ -69,6 +89,11 @@ fn options(arguments: &FaultArguments) -> Result<FaultOptions, RunError> {
         phases: if arguments.short { vec![0.62] } else { arguments.phases.clone() },
         seed: arguments.seed,
         device_watchdog: Duration::from_millis(arguments.device_watchdog),
+        contrast: with_contrast.then_some(if arguments.short {
+            ContrastRun::LockStep
+        } else {
+            ContrastRun::RealTime
+        }),
         runs: arguments.runs.clone(),
     })
 }
@@ -81,8 +106,8 @@ fn words(report: &FaultReport) -> String {
         format!("{} of {}", claims().filter(|claim| claim.held).count(), claims().count())
     };
     text += &format!(
-        "held: {} claims about function, {} times within class C\nwritten: {}/ report.json, and each process's trace \
-         and log\n",
+        "held: {} claims about function, {} times within class C\nwritten: {}/ faults.svg, report.json, and each \
+         process's trace and log\n",
         counted(true),
         counted(false),
         report.folder.display()

@@ -225,6 +225,7 @@ impl<'a> World<'a> {
             applied_nm: truth.applied_nm[i],
             saturated: outputs[i].is_some_and(|o| o.saturated),
             state: outputs[i].map(|o| o.state),
+            watchdog: truth.watchdog_active[i],
         });
         self.record.rows.push(Row {
             t_s: self.now_s(),

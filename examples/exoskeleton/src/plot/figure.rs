@@ -12,9 +12,9 @@ use crate::record::{Record, Row};
 
 /// Colours of Okabe and Ito, told apart with any colour vision: blue, vermilion, green.
 const JOINT_COLORS: [&str; 3] = ["#0072B2", "#D55E00", "#009E73"];
-const BAND_COLOR: &str = "#d9d9d9";
+pub(super) const BAND_COLOR: &str = "#d9d9d9";
 /// Strides in and after a fault: reddish purple of the same set.
-const FAULT_COLOR: &str = "#CC79A7";
+pub(super) const FAULT_COLOR: &str = "#CC79A7";
 const REFERENCE: Stroke = Stroke::dashed("#555555", 1.6);
 const TRUE_PHASE: Stroke = Stroke::solid("#222222", 2.4);
 const ESTIMATED_PHASE: Stroke = Stroke::solid("#E69F00", 1.6);
@@ -244,7 +244,7 @@ fn lateness_panel(canvas: &mut Canvas, lateness: &Lateness) {
 }
 
 /// Range of the values with a margin of 6 %.
-fn range<'a>(values: impl Iterator<Item = f64>, label: &'a str) -> Axis<'a> {
+pub(super) fn range<'a>(values: impl Iterator<Item = f64>, label: &'a str) -> Axis<'a> {
     let (low, high) = values
         .filter(|v| v.is_finite())
         .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));

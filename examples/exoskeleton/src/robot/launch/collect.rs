@@ -214,6 +214,7 @@ fn row(t_s: f64, plant: &PlantRow, gait: Option<&GaitRow>) -> Row {
             applied_nm: plant.applied_nm[i],
             saturated: plant.saturated[i],
             state: plant.state[i],
+            watchdog: plant.watchdog[i],
         }),
     }
 }

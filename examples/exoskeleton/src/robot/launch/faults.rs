@@ -4,6 +4,7 @@
 //! afterwards and makes [`claim`]s of them. Nothing is judged while the robot walks, so that nothing disturbs it.
 
 mod claim;
+mod contrast;
 mod evidence;
 mod judge;
 mod operator;
@@ -21,6 +22,8 @@ use thiserror::Error;
 
 use super::{LaunchError, new_folder};
 use crate::joint::Joint;
+use crate::lockstep::LockStepError;
+use crate::plot;
 use crate::robot::topology::{self, DrivePlace, ReleaseBy, Topology};
 use evidence::Evidence;
 use robot::Robot;
@@ -44,8 +47,19 @@ pub struct FaultOptions {
     pub seed: u64,
     /// Silence after which a device damps by itself.
     pub device_watchdog: Duration,
+    /// How the contrast is run; none: not.
+    pub contrast: Option<ContrastRun>,
     /// Folder for the run folders.
     pub runs: PathBuf,
+}
+
+/// How the contrast is run: the ankle's drive falls silent, with and without a device watchdog.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ContrastRun {
+    /// Two robots more, in real time.
+    RealTime,
+    /// In virtual time, for machines that others share.
+    LockStep,
 }
 
 /// What came of it.
@@ -78,6 +92,9 @@ pub enum FaultError {
     /// A process ended that nobody had told to.
     #[error(transparent)]
     Launch(#[from] LaunchError),
+    /// The run in virtual time could not be done.
+    #[error(transparent)]
+    LockStep(#[from] LockStepError),
     /// The operator is not heard.
     #[error(transparent)]
     Operator(#[from] OperatorError),
@@ -117,6 +134,10 @@ pub fn run(options: &FaultOptions) -> Result<FaultReport, FaultError> {
         let folder = folder.join(format!("robot-{number}"));
         std::fs::create_dir(&folder)?;
         left = one_robot(options, &folder, left, &mut report)?;
+    }
+    if let Some(how) = options.contrast {
+        let contrast = contrast::run(options, how, &folder, &mut report.claims)?;
+        std::fs::write(folder.join("faults.svg"), plot::contrast(&contrast))?;
     }
     let held = |functional_only: bool| {
         let mut claims = report.claims.iter();

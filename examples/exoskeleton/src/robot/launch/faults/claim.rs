@@ -16,8 +16,8 @@ pub(super) const REPORTED: f64 = f64::INFINITY;
 /// One claim, and whether it held.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Claim {
-    /// The step.
-    pub step: Step,
+    /// The step; `null`: the contrast between a device with and one without a watchdog.
+    pub step: Option<Step>,
     /// Which of several injections of the step, for example `phase 0.62`; empty when there is one.
     pub at: String,
     /// What is claimed, with its unit.
@@ -105,14 +105,32 @@ fn within(seen: f64, limit: f64) -> bool {
 /// Collects the claims of one injection.
 #[derive(Debug)]
 pub(super) struct Claims<'a> {
-    step: Step,
+    step: Option<Step>,
     at: &'a str,
     out: &'a mut Vec<Claim>,
 }
 
 impl<'a> Claims<'a> {
     pub(super) const fn new(step: Step, at: &'a str, out: &'a mut Vec<Claim>) -> Self {
-        Self { step, at, out }
+        Self { step: Some(step), at, out }
+    }
+
+    /// The claims of the contrast.
+    pub(super) const fn contrast(out: &'a mut Vec<Claim>) -> Self {
+        Self { step: None, at: "", out }
+    }
+
+    /// A deviation of the contrast: in virtual time it is the same on every machine, in real time it is not.
+    pub(super) fn add_deviation(&mut self, name: &str, expected: Expected, is_real_time: bool, seen: f64) {
+        let expected = match expected {
+            Expected::AtMost(limit) if is_real_time => Expected::Timing { a: limit, b: limit, c: limit },
+            Expected::AtMost(_)
+            | Expected::AtLeast(_)
+            | Expected::Exactly(_)
+            | Expected::Timing { .. }
+            | Expected::Told => expected,
+        };
+        self.add(name, expected, Some(seen));
     }
 
     /// A time or a way that depends on the machine.
@@ -169,7 +187,10 @@ fn write_table(out: &mut String, claims: &[Claim]) -> std::fmt::Result {
         if told != Some(heading) {
             told = Some(heading);
             let at = if claim.at.is_empty() { String::new() } else { format!(", {}", claim.at) };
-            writeln!(out, "{:>2}  {}{at}", claim.step, claim.step.words())?;
+            match claim.step {
+                Some(step) => writeln!(out, "{step:>2}  {}{at}", step.words())?,
+                None => writeln!(out, " -  contrast: the ankle's drive falls silent at push-off for 400 ms")?,
+            }
         }
         let seen = claim.seen.map_or_else(|| "never".to_owned(), number);
         let (expected, classes) = (claim.expected.words(), claim.expected.classes(claim.seen));

@@ -253,15 +253,10 @@ fn emergency_stop(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Inje
     let heard = all(Joint::ALL.map(|joint| evidence.state_after_ms(joint, at, DriveState::EStop)));
     claims.timing("heard by all drives after, ms", STOP_HEARD_MS, heard);
     let reset = injection.when(Mark::ResetBegun).unwrap_or(injection.until);
-    let torque_ends = {
-        let above = |row: &&PlantRow| {
-            row.applied_nm.iter().any(|torque| torque.abs() >= STOPPED_BELOW_NM)
-                && !evidence.stalled_around(row.t_ns)
-        };
-        let last = evidence.plant(span(at, reset)).iter().rfind(above);
-        last.map(|row| ms_after(at, row.t_ns))
-    };
-    claims.timing("no torque of 0.1 Nm or more after, ms", STOPPED_MS, torque_ends);
+    let is_still = |row: &&PlantRow| row.applied_nm.iter().all(|torque| torque.abs() < STOPPED_BELOW_NM);
+    let still = evidence.plant(span(at, reset)).iter().find(is_still);
+    let torque_ends = still.map(|row| ms_after(at, row.t_ns));
+    claims.timing("all torques below 0.1 Nm after, ms", STOPPED_MS, torque_ends);
     let latched = span(later(at, heard), reset);
     let left = evidence.ticks_not_in(DriveState::EStop, &Joint::ALL, &latched);
     claims.exactly("ticks of a drive that is not stopped, until reset", 0, left);
