@@ -8,7 +8,7 @@ use std::{
 
 use sinew_runtime::{
     app::DynApp,
-    supervision::{AutoShutdown, Flags},
+    supervision::{AutoShutdown, Flags, UNWINDS},
     tid::{Incarnation, NodeAddress},
 };
 
@@ -30,6 +30,7 @@ pub struct NodeBuilder {
     tree: SupervisorSpec,
     incarnation: Option<Incarnation>,
     heed_signals: bool,
+    accept_abort_on_panic: bool,
     #[cfg(feature = "fault-points")]
     pub(super) faults: Vec<String>,
 }
@@ -91,6 +92,12 @@ pub enum StartError {
     #[cfg(feature = "fault-points")]
     #[error(transparent)]
     Fault(#[from] sinew_runtime::supervision::fault::FaultError),
+    /// The program was built with `panic = "abort"`: its first panic ends the process, whatever supervisors there are.
+    #[error(
+        "this program ends with its first panic, and no supervisor can help: take `panic = \"abort\"` out of its Cargo \
+         profile, or say `accept_abort_on_panic()` where that is what you want"
+    )]
+    AbortsOnPanic,
     /// The operating system gives no thread.
     #[error("no thread for the node's root: {0}; raise `ulimit -u`")]
     Thread(#[from] std::io::Error),
@@ -107,6 +114,7 @@ impl NodeBuilder {
             tree: SupervisorSpec::new("applications"),
             incarnation: None,
             heed_signals: false,
+            accept_abort_on_panic: false,
             #[cfg(feature = "fault-points")]
             faults: Vec::new(),
         }
@@ -145,6 +153,14 @@ impl NodeBuilder {
     #[must_use]
     pub const fn heed_signals(mut self) -> Self {
         self.heed_signals = true;
+        self
+    }
+
+    /// Starts even in a program that was built with `panic = "abort"`. Its first panic, in any actor, then ends the whole node
+    /// at once: nothing is restarted, nobody is told, and what the outputs do is the devices' business.
+    #[must_use]
+    pub const fn accept_abort_on_panic(mut self) -> Self {
+        self.accept_abort_on_panic = true;
         self
     }
 
@@ -196,6 +212,7 @@ impl NodeBuilder {
     /// The configuration has faults, an application cannot be registered, or a layer did not become ready.
     pub fn start(mut self) -> Result<Node, StartError> {
         self.config.validate()?;
+        check_panics(UNWINDS, self.accept_abort_on_panic)?;
         #[cfg(feature = "fault-points")]
         let planned = super::faults::read(&self.faults, &mut self.tree)?;
         let is_bystander = process::is_bystander(&self.config, &mut self.tree);
@@ -240,4 +257,35 @@ impl NodeBuilder {
 fn wall_clock() -> Incarnation {
     let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     Incarnation(u64::try_from(since_1970.as_micros()).unwrap_or(u64::MAX))
+}
+
+/// Refuses a program that no supervisor can help, unless its owner wants it so.
+fn check_panics(unwinds: bool, accepted: bool) -> Result<(), StartError> {
+    if unwinds {
+        return Ok(());
+    }
+    if accepted {
+        tracing::warn!(
+            "this program ends with its first panic: no supervisor of this node restarts what panics"
+        );
+        return Ok(());
+    }
+    Err(StartError::AbortsOnPanic)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_program_that_aborts_on_panic_has_no_node_unless_that_is_accepted() {
+        assert!(matches!(check_panics(false, false), Err(StartError::AbortsOnPanic)));
+        assert!(check_panics(false, true).is_ok() && check_panics(true, false).is_ok());
+    }
+
+    #[test]
+    fn a_program_that_unwinds_is_known_as_one() {
+        // Tests are always built so; a program with `panic = "abort"` was tried by hand (docs/decisions/0011).
+        const { assert!(UNWINDS) };
+    }
 }

@@ -36,6 +36,11 @@ impl NodeHandle {
         self.stores.faults.inject(name, fault)
     }
 
+    /// Makes the root of the node panic: the one fault that ends it.
+    pub fn fail_root(&self) {
+        self.tell(super::RootEvent::Fail);
+    }
+
     /// How often the actor called `name` was started and became ready, if this node has one of this name.
     #[must_use]
     pub fn lives(&self, name: &str) -> Option<Lives> {

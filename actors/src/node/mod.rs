@@ -20,6 +20,7 @@ mod faults;
 mod root;
 mod supervisor_spec;
 mod tree;
+mod wind_up;
 
 pub use builder::{NodeBuilder, StartError};
 pub use commands::CommandError;

@@ -32,6 +32,7 @@ use super::{
     directory::NodeDirectory,
     supervisor_spec::{Member, SupervisorSpec},
     tree::SupervisionTree,
+    wind_up::{self, Branch, Heirs},
 };
 use crate::{gncl, lncl, ndl, process, stores::Stores, sync};
 
@@ -58,6 +59,9 @@ pub(crate) enum RootEvent {
     Ordered(Ordered),
     /// By the owner: say who is supervised.
     TellTree(SyncSender<SupervisionTree>),
+    /// By a test: panic.
+    #[cfg(feature = "fault-points")]
+    Fail,
     /// By the owner: say when every application runs.
     TellWhenRunning(SyncSender<Result<(), StartError>>),
 }
@@ -74,6 +78,7 @@ pub(super) enum Phase {
 pub(super) struct Root {
     pub(super) stores: Arc<Stores>,
     threads: Rc<RefCell<Threads>>,
+    heirs: Heirs,
     pub(super) phase: Phase,
     pub(super) began: Time,
     end: NodeEnd,
@@ -100,9 +105,12 @@ pub(super) fn run(
     ended: SyncSender<NodeEnd>,
 ) {
     let system = actix::System::new();
+    let heirs = Heirs::default();
+    let (kept, last_word) = (stores.clone(), ended.clone());
     let threads = Rc::new(RefCell::new(Threads::default()));
     let root = Root {
         threads: threads.clone(),
+        heirs: heirs.clone(),
         phase: Phase::StartingLayers,
         began: Time::now(),
         end: NodeEnd::Stopped,
@@ -121,7 +129,7 @@ pub(super) fn run(
         heeds_signals: false,
         stores,
     };
-    system.block_on(async { root.start() });
+    system.block_on(async { wind_up::oversee(root, heirs, kept, last_word) });
     if let Err(error) = system.run() {
         tracing::error!(%error, "the root's event loop failed");
     }
@@ -145,8 +153,8 @@ impl Actor for Root {
             children: layers.into_iter().map(PlannedChild::Worker).collect(),
         };
         let supervisor = Supervisor::of(plan, self.threads.clone(), listener);
-        self.layer_supervisor = Some(supervisor.roster());
-        supervisor.start();
+        let roster = self.heirs.run(Branch::Layers, supervisor, &self.stores, RootEvent::Layers);
+        self.layer_supervisor = Some(roster);
     }
 }
 
@@ -210,6 +218,8 @@ impl StreamHandler<RootEvent> for Root {
             RootEvent::TellTree(answer) => _ = answer.try_send(self.tree()),
             RootEvent::HeedSignals => self.heed_signals(context),
             RootEvent::StopOrdered => self.stop_apps(),
+            #[cfg(feature = "fault-points")]
+            RootEvent::Fail => panic!("a fault was planned for the root"),
             RootEvent::TellWhenRunning(say) => {
                 self.tell_when_running.push(say);
                 self.tell_if_running();
@@ -317,8 +327,8 @@ impl Root {
             tell(&post, RootEvent::Apps(fact));
         };
         let supervisor = Supervisor::of(plan, self.threads.clone(), listener);
-        self.app_supervisor = Some(supervisor.roster());
-        supervisor.start();
+        let roster = self.heirs.run(Branch::Apps, supervisor, &self.stores, RootEvent::Apps);
+        self.app_supervisor = Some(roster);
         self.tell_if_running();
     }
 

@@ -1,12 +1,14 @@
-//! One actor under a guard and under no supervisor: what a process that hosts a single application runs.
+//! One actor under a guard and under no supervisor: what a process that hosts a single application runs, and those who
+//! supervise.
 
 use std::sync::Mutex;
 
+use actix::{Actor, Context};
 use tokio::sync::oneshot;
 
 use super::{
     Launch, ReadyGate, Reason,
-    guard::Guard,
+    guard::{Guard, life},
     panics::install_hook,
     tenant::{Fate, Tenant},
     vitals::Vitals,
@@ -32,6 +34,25 @@ impl AloneHandle {
 
 /// Makes an actor on the calling thread, which is an arbiter's or a system's. The future ends with it, and says how.
 pub fn alone(launch: &Launch, ready: ReadyGate) -> (AloneHandle, impl Future<Output = Reason> + use<>) {
+    let (tenant, ended) = tenant("alone");
+    if let Some(guard) = Guard::make(launch, ready, tenant.clone()) {
+        actix_rt::spawn(guard);
+    }
+    (AloneHandle(tenant), ended)
+}
+
+/// Runs an actor that supervises others, and is supervised by nobody, on the calling thread. The future ends with it, and
+/// says how: a panic in it must not go unnoticed.
+pub fn overseen<A>(name: &str, actor: A) -> impl Future<Output = Reason> + use<A>
+where
+    A: Actor<Context = Context<A>>,
+{
+    let (tenant, ended) = tenant(name);
+    actix_rt::spawn(Guard::around(Some(life(Context::new().into_future(actor))), tenant));
+    ended
+}
+
+fn tenant(name: &str) -> (Tenant, impl Future<Output = Reason> + use<>) {
     install_hook();
     let (say, ended) = oneshot::channel();
     let say = Mutex::new(Some(say));
@@ -42,9 +63,6 @@ pub fn alone(launch: &Launch, ready: ReadyGate) -> (AloneHandle, impl Future<Out
             let _ = say.send(reason);
         }
     });
-    let tenant = Tenant::new(Vitals::new("alone"), None, None, report);
-    if let Some(guard) = Guard::make(launch, ready, tenant.clone()) {
-        actix_rt::spawn(guard);
-    }
-    (AloneHandle(tenant), async { ended.await.unwrap_or(Reason::ThreadEnded) })
+    let tenant = Tenant::new(Vitals::new(name), None, None, report);
+    (tenant, async { ended.await.unwrap_or(Reason::ThreadEnded) })
 }

@@ -74,10 +74,15 @@ pub(super) struct Guard {
 }
 
 impl Guard {
+    /// Guards an actor that is made.
+    pub(super) fn around(life: Option<Box<dyn Life>>, tenant: Tenant) -> Self {
+        let vitals = Some(tenant.vitals().clone());
+        Self { life, tenant, vitals, was_polled: false, has_reported: false }
+    }
+
     /// Makes an actor, on its thread. `None` if its code panicked, which is reported.
     pub(super) fn make(launch: &Launch, ready: ReadyGate, tenant: Tenant) -> Option<Self> {
-        let vitals = Some(tenant.vitals().clone());
-        let mut guard = Self { life: None, tenant, vitals, was_polled: false, has_reported: false };
+        let mut guard = Self::around(None, tenant);
         let made = Vitals::turn(&mut guard.vitals, Doing::Start, || {
             catch_unwind(AssertUnwindSafe(|| launch(ready)))
         });

@@ -359,6 +359,15 @@ fn say(post: &Post<Input>, input: Input) {
     }
 }
 
+impl Drop for Supervisor {
+    fn drop(&mut self) {
+        // None lives after an orderly end. After a panic of its own nobody is left who would hear of them: they are told.
+        for tenant in self.children.values().filter_map(|child| child.tenant.as_ref()) {
+            tenant.stop();
+        }
+    }
+}
+
 impl Actor for Supervisor {
     type Context = Context<Self>;
 
