@@ -210,3 +210,26 @@ fn the_monitors_of_a_watcher_end_with_its_life_and_it_is_told_nothing_after_it_d
     // The others are older: what they would say would have been said before.
     eye.told_once(&[kept]);
 }
+
+#[test]
+fn a_life_that_hangs_is_told_as_hung_and_its_will_is_sent_for_it() {
+    // Given: the first life never comes back from its first message
+    let ((target, log), (watcher, eye), (desk, key)) = (target(), watcher(), desk("desk"));
+    let target = target
+        .progress_within(Duration::from_millis(100))
+        .fault("hang@1".parse::<Fault>().expect("it can be read"));
+    let ((heir, seen), will) = (Stage::new().app("heir"), Job { number: 1_000_000 });
+    let node =
+        Ground::new().node("node").app(target.last_will("heir", &will)).app(watcher).app(heir).app(desk);
+    let node = node.start().expect("a node");
+    all_run(&[&node]);
+    let monitor = eye.watch(node.handle().resolve("target").expect("it is registered"));
+    // When
+    key.sender().send("target", &Job { number: 1 }).expect("it has room");
+    // Then
+    let down = eye.down(monitor);
+    assert_eq!(down.class, DownClass::Hung, "{down}");
+    seen.wait_for(Seen::Got(1, will.number));
+    log.wait_for(Seen::Started(2));
+    eye.told_once(&[monitor]);
+}
