@@ -241,7 +241,12 @@ impl CentralCore {
         }
     }
 
-    /// A drive has told how it is.
+    /// The life of a drive has ended, which a layer below knows at once; need not wait for its silence.
+    pub const fn drive_ended(&mut self, joint: Joint, now_ns: u64) {
+        self.drives.ended(joint, now_ns);
+    }
+
+    /// A drive has told how it is; its stamp is in the clock of the ticks.
     pub const fn drive_heard(&mut self, joint: Joint, status: &DriveStatus) {
         self.drives.heard(joint, status);
     }

@@ -171,6 +171,29 @@ fn drive_that_falls_silent_is_flagged_as_degraded_and_the_others_walk_on() {
 }
 
 #[test]
+fn drive_whose_end_is_told_is_degraded_at_once_until_its_next_life_assists() {
+    let mut walk = Walk::begun(Resume::ByOperator);
+    walk.hear(1);
+    walk.central.drive_ended(Joint::Knee, walk.ms * MS);
+    walk.says[Joint::Knee.index()] = None;
+    let state = walk.hear(1);
+    assert_eq!((state.mode, state.degraded), (GaitMode::Walk, bit(Joint::Knee)));
+    walk.says[Joint::Knee.index()] = Some((DriveState::Init, FaultBits(0)));
+    assert_eq!(walk.hear(10).degraded, bit(Joint::Knee));
+    walk.says[Joint::Knee.index()] = Some((DriveState::Walk, FaultBits(0)));
+    assert_eq!(walk.hear(10).degraded, 0);
+}
+
+#[test]
+fn last_words_of_a_dead_drive_are_no_sign_of_the_next() {
+    let mut walk = Walk::begun(Resume::ByOperator);
+    // It is told a little later than the words that are still on their way were sent.
+    walk.central.drive_ended(Joint::Knee, (walk.ms + 10) * MS);
+    assert_eq!(walk.hear(9).degraded, bit(Joint::Knee));
+    assert_eq!(walk.hear(11).degraded, 0);
+}
+
+#[test]
 fn drive_that_does_not_assist_though_it_speaks_is_degraded_too() {
     let mut walk = Walk::begun(Resume::ByOperator);
     walk.says[Joint::Hip.index()] = Some((DriveState::Safe, FaultBits::INPUT_LOST));

@@ -15,15 +15,26 @@ pub(super) struct Drives {
     unassisted_s: PerJoint<f64>,
     /// Whether it said that its e-stop was pressed.
     stopped: PerJoint<bool>,
+    /// When its last life is known to have ended, ns: what it said before is no sign of the next one.
+    ended_ns: PerJoint<u64>,
 }
 
 impl Drives {
     pub(super) const fn new(silence_max_s: f64) -> Self {
-        Self { silence_max_s, unassisted_s: [0.0; 3], stopped: [false; 3] }
+        Self { silence_max_s, unassisted_s: [0.0; 3], stopped: [false; 3], ended_ns: [0; 3] }
+    }
+
+    /// The life of a drive has ended; it is degraded until its next one says that it assists.
+    pub(super) const fn ended(&mut self, joint: Joint, now_ns: u64) {
+        self.ended_ns[joint.index()] = now_ns;
+        self.unassisted_s[joint.index()] = f64::INFINITY;
     }
 
     /// A drive has told how it is.
     pub(super) const fn heard(&mut self, joint: Joint, status: &DriveStatus) {
+        if status.t_ns <= self.ended_ns[joint.index()] {
+            return;
+        }
         self.stopped[joint.index()] = FaultBits(status.faults).contains(FaultBits::STOPPED);
         if matches!(status.state, DriveState::Walk) {
             self.unassisted_s[joint.index()] = 0.0;

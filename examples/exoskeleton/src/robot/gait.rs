@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use sinew::prelude::*;
-use sinew::{NodeAddress, ReadyGate};
+use sinew::{Down, NodeAddress, ReadyGate};
 
 use super::PERIOD;
 use super::drive::micros;
@@ -57,6 +57,8 @@ pub struct Gait {
     late_max: Duration,
     /// Joints that were flagged as degraded last.
     degraded: u8,
+    /// Joints of whose drives this is told the end.
+    monitored: PerJoint<bool>,
 }
 
 /// Declares the gait application.
@@ -66,6 +68,7 @@ pub fn spec(parts: GaitParts, place: Place) -> AppSpec<Gait> {
         .handles::<JointSample>()
         .handles::<FootLoad>()
         .handles::<DriveStatus>()
+        .handles::<Down>()
         .handles::<Release>()
         .handles::<EmergencyStop>()
         .handles::<Reset>()
@@ -90,6 +93,7 @@ impl Gait {
             ready: None,
             late_max: Duration::ZERO,
             degraded: 0,
+            monitored: [false; 3],
         }
     }
 
@@ -254,9 +258,27 @@ impl Handler<Delivery<DriveStatus>> for Gait {
 
     fn handle(&mut self, status: Delivery<DriveStatus>, context: &mut Self::Context) {
         match self.joint_at(status.source.node) {
-            Some(joint) => self.core.drive_heard(joint, &status.payload),
+            Some(joint) => {
+                let monitored = &mut self.monitored[joint.index()];
+                // Without a monitor its silence is noticed all the same, 25 ms later.
+                *monitored = *monitored || context.monitor(status.source).is_ok();
+                let t_ns = status.sent.as_nanos();
+                self.core.drive_heard(joint, &DriveStatus { t_ns, ..status.payload });
+            }
             None => context.reject(),
         }
+    }
+}
+
+impl Handler<Delivery<Down>> for Gait {
+    type Result = ();
+
+    fn handle(&mut self, down: Delivery<Down>, _: &mut Self::Context) {
+        let Some(joint) = self.joint_at(down.payload.tid.node) else { return };
+        tracing::warn!(%joint, why = %down.payload, "a drive has ended");
+        // The next life is watched from its first word on.
+        self.monitored[joint.index()] = false;
+        self.core.drive_ended(joint, Time::now().as_nanos());
     }
 }
 

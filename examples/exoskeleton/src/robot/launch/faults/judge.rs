@@ -105,13 +105,14 @@ fn drive_away(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injectio
         0,
         evidence.undamped_device(Joint::Knee, whole.clone()),
     );
-    let flagged = evidence.gait(whole.clone()).iter().find(|row| row.degraded == bit(Joint::Knee));
+    let flagged = evidence.gait(whole.clone()).iter().find(|row| row.degraded & bit(Joint::Knee) != 0);
     claims.told("central flags the knee as degraded after, ms", flagged.map(|row| ms_after(at, row.t_ns)));
     let back = injection.when(Mark::Continued).map_or(whole.start, Time::as_nanos)..whole.end;
     let away_ms = evidence.output_after_ms(Joint::Knee, back.clone()).map(|ms| ms + ms_after(at, back.start));
-    // A drive that is back before central wonders is no news.
-    let is_news = away_ms.is_none_or(|ms| ms > FLAGGED_AFTER_MS);
-    claims.is_so("the knee is flagged, if it is away for 50 ms", flagged.is_some() || !is_news);
+    // The end of a life is told at once; a hang that is over before central wonders is no news.
+    let is_told = injection.step == Step::KillDrive && !evidence.stalled_around(at.as_nanos());
+    let is_news = is_told || away_ms.is_none_or(|ms| ms > FLAGGED_AFTER_MS);
+    claims.is_so("the knee is flagged, if it died or was away for 50 ms", flagged.is_some() || !is_news);
     let not_the_knee =
         |row: &&GaitRow| row.degraded & !bit(Joint::Knee) != 0 && !evidence.stalled_around(row.t_ns);
     let others_flagged = evidence.gait(whole.clone()).iter().filter(not_the_knee).count();
