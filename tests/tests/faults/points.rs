@@ -101,3 +101,34 @@ fn a_hang_ends_and_what_waited_is_handled() {
     }
     log.wait_for(Seen::Got(1, 3));
 }
+
+#[test]
+fn the_tree_says_who_failed_how_often_and_why() {
+    let (puppet, log) = Stage::new().app("puppet");
+    let node = Ground::new().node("node").app(puppet).start().expect("a node");
+    all_run(&[&node]);
+    let handle = node.handle();
+    for life in 2..=3 {
+        handle.inject("puppet", Fault::panic()).expect("it is there");
+        log.wait_for(Seen::Started(life));
+    }
+    handle.inject("GNCL", Fault::panic()).expect("every node has it");
+    let of = |name: &str| {
+        let tree = handle.tree().expect("it runs");
+        let supervisors = tree.supervisors.into_iter().filter_map(|supervisor| supervisor.supervises);
+        let child = supervisors.flat_map(|below| below.children).find(|child| child.name == name);
+        let child = child.expect("it is supervised");
+        (child.generation, child.restarts, child.last_reason)
+    };
+    let is = |name: &str, generation: u64, restarts: u64, words: &str| {
+        until(&format!("the tree shows {name} in life {generation} for `{words}`"), || {
+            let (life, again, reason) = of(name);
+            let said = reason.is_some_and(|reason| reason.to_string().contains(words));
+            (life == generation && again == restarts && said).then_some(())
+        });
+    };
+    is("puppet", 3, 2, "a fault was planned");
+    is("GNCL", 2, 1, "a fault was planned");
+    is("NDL", 2, 1, "told to stop");
+    assert_eq!(of("LNCL"), (1, 0, None), "those before it are left alone");
+}

@@ -23,7 +23,9 @@ impl Core {
         child.enter(ChildState::Down, now);
         child.released = false;
         child.stale = false;
-        child.last_reason = Some(reason.clone());
+        // Whoever is told to stop ends in order: that it did so is not its own doing.
+        let is_order = was_to_end && reason == Reason::Normal;
+        child.last_reason = Some(if is_order { Reason::Shutdown } else { reason.clone() });
         self.said_all_ready = false;
         if was_to_end {
             self.ended_as_ordered(index, reason);
