@@ -11,7 +11,7 @@ use std::{
 use sinew_runtime::{
     app::{AppWiring, DynApp},
     mailbox::Mailbox,
-    supervision::{Place, ReadyGate, Reason, alone},
+    supervision::{Alone, Place, ReadyGate, Reason, alone},
     tid::Tid,
     time::Time,
     wire::{FrameCodec, HEADER_LEN, Header, Kind},
@@ -66,8 +66,7 @@ pub(super) fn host(config: &NodeConfig, apps: Vec<DynApp>, hosting: Hosting) -> 
 fn run(config: &NodeConfig, app: &DynApp, mut socket: StdStream) -> io::Result<()> {
     let welcome = read_welcome(&mut socket)?;
     socket.set_nonblocking(true)?;
-    let place = Place { thread: app.name().to_owned(), ..app.place().clone() };
-    place.prepare();
+    place(app).prepare();
     let system = actix::System::new();
     system.block_on(live(config, app, socket, welcome))
 }
@@ -102,7 +101,10 @@ async fn live(config: &NodeConfig, app: &DynApp, socket: StdStream, welcome: Wel
     let (sequence, beat_us, tid) = (welcome.sequence, welcome.beat_us, Tid::from_bits(welcome.tid));
     let wire = Wire::new(config, socket, welcome);
     wire.say_kind(Kind::HOST_BEAT);
-    serve(&wire, beat_us);
+    serve(&wire);
+    if beat_us > 0 {
+        beat_apart(&wire, Duration::from_micros(beat_us))?;
+    }
     let sender = wire.sender(sequence, config.payload_max);
     let wiring = AppWiring { sender, mailbox: Mailbox::fed_by(wire.clone()) };
     let saying = wire.clone();
@@ -110,7 +112,7 @@ async fn live(config: &NodeConfig, app: &DynApp, socket: StdStream, welcome: Wel
     let launch = app.launch(wiring);
     #[cfg(feature = "fault-points")]
     let launch = crate::node::arm_alone(app, launch);
-    let (handle, ended) = alone(&launch, ready);
+    let (handle, ended) = alone(&launch, ready, watched(app, &wire, tid));
     let stopping = wire.clone();
     actix_rt::spawn(async move {
         loop {
@@ -124,29 +126,55 @@ async fn live(config: &NodeConfig, app: &DynApp, socket: StdStream, welcome: Wel
 }
 
 /// Keeps the connection going beside the application, on its thread.
-fn serve(wire: &Arc<Wire>, beat_us: u64) {
-    let (draining, reading, telling, beating) = (wire.clone(), wire.clone(), wire.clone(), wire.clone());
+fn serve(wire: &Arc<Wire>) {
+    let (draining, reading, telling, expiring) = (wire.clone(), wire.clone(), wire.clone(), wire.clone());
     actix_rt::spawn(async move {
         draining.drain().await;
         die();
     });
     actix_rt::spawn(async move { reading.read().await });
     actix_rt::spawn(async move { poll_fn(|cx| telling.poll_tell(cx)).await });
-    actix_rt::spawn(async move { beat(&beating, beat_us).await });
+    actix_rt::spawn(async move {
+        let mut interval = tokio::time::interval(EXPIRING);
+        interval.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            interval.tick().await;
+            expiring.expire(Time::now());
+        }
+    });
 }
 
-/// Gives signs of life, and lets expire what the node does not read.
-async fn beat(wire: &Wire, period_us: u64) {
-    let period = if period_us == 0 { EXPIRING } else { Duration::from_micros(period_us).min(EXPIRING) };
-    let mut interval = tokio::time::interval(period);
-    interval.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    loop {
-        interval.tick().await;
-        wire.expire(Time::now());
-        if period_us != 0 && wire.has_said_all() {
-            wire.say_kind(Kind::HOST_BEAT);
+/// Gives signs of life of the process, on a thread of its own: whether the application comes back in its time is judged by
+/// the watchdog here, which knows in what it is, and whether it was given a CPU.
+fn beat_apart(wire: &Arc<Wire>, period: Duration) -> io::Result<()> {
+    let wire = wire.clone();
+    let beat = move || {
+        loop {
+            std::thread::sleep(period);
+            if wire.has_said_all() {
+                wire.say_kind(Kind::HOST_BEAT);
+            }
         }
+    };
+    std::thread::Builder::new().name("beat".to_owned()).spawn(beat).map(drop)
+}
+
+/// How the application is watched: the node kills its process when it hangs.
+fn watched(app: &DynApp, wire: &Arc<Wire>, tid: Tid) -> Alone {
+    let wire = wire.clone();
+    let on_hung = move |reason: &Reason| {
+        wire.say(words::frame(Kind::HOST_HUNG, tid, payload::lncl_of(tid.node), &Ending::from(reason)));
+    };
+    Alone {
+        name: app.name().to_owned(),
+        place: place(app),
+        progress_within: app.policy().progress_within,
+        on_hung: Box::new(on_hung),
     }
+}
+
+fn place(app: &DynApp) -> Place {
+    Place { thread: app.name().to_owned(), ..app.place().clone() }
 }
 
 /// Resolves when the node, or whoever sends this process a SIGTERM, asks for an orderly stop.

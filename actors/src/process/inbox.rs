@@ -23,6 +23,10 @@ pub(super) struct Inbox {
     /// Number of the last message that came.
     last: u64,
     in_hand: Option<u64>,
+    /// Messages that went into the hand so far.
+    taken: u64,
+    /// The actor takes nothing but the layers' events.
+    paused: bool,
     done: Option<(u64, Fate)>,
     /// Goes into the hand when the node has been told so.
     claimed: Option<Message>,
@@ -38,6 +42,8 @@ impl Inbox {
             events: VecDeque::new(),
             last: 0,
             in_hand: None,
+            taken: 0,
+            paused: false,
             done: None,
             claimed: None,
             reader: None,
@@ -72,6 +78,7 @@ impl Inbox {
 
     /// Claims the next message, if one waits and none is claimed. Returns what to tell the node before it is handled.
     pub(super) fn claim(&mut self) -> Option<Turn> {
+        self.paused = false;
         if self.claimed.is_some() {
             return None;
         }
@@ -81,6 +88,7 @@ impl Inbox {
 
     /// The same for the layers' events alone.
     pub(super) fn claim_event(&mut self) -> Option<Turn> {
+        self.paused = true;
         // Who takes events alone began so with an event in his hand: nothing else is claimed.
         if self.claimed.is_some() {
             return None;
@@ -100,6 +108,7 @@ impl Inbox {
         match self.claimed.take_if(|_| told) {
             Some(mut message) => {
                 self.in_hand = number_of(&message);
+                self.taken += 1;
                 message.receipt = None;
                 Poll::Ready(message)
             }
@@ -108,6 +117,13 @@ impl Inbox {
                 Poll::Pending
             }
         }
+    }
+
+    /// Messages that wait to be taken, and how many were taken so far.
+    pub(super) fn backlog(&self) -> (usize, u64) {
+        let queued = if self.paused { 0 } else { self.queue.len() };
+        // One that is claimed waits for the node, and not for the actor.
+        (self.events.len() + queued, self.taken)
     }
 
     /// The message in hand has ended so. Returns whom to wake, if nobody asks for the next message.

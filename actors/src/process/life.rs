@@ -352,9 +352,8 @@ impl Child {
                 self.said = Some(ending.into());
             }
             Kind::HOST_HUNG => {
-                let what: Ending = payload::read(&message.payload).map_err(|error| fault(&error))?;
-                let Ending::Other(what) = what else { return Err(fault(&"it hangs in nothing")) };
-                return Err(Reason::Hung(what));
+                let ending: Ending = payload::read(&message.payload).map_err(|error| fault(&error))?;
+                return Err(ending.into());
             }
             Kind::HOST_LOOK => {
                 let Look { name } = payload::read(&message.payload).map_err(|error| fault(&error))?;
@@ -482,7 +481,9 @@ impl Watch {
         let silent = now.saturating_duration_since(last);
         (silent > within).then(|| {
             let silent = silent.as_millis();
-            Reason::Hung(format!("no sign of life of its process for {silent} ms: a handler that does not return, or the process was stopped"))
+            Reason::Hung(format!(
+                "no sign of life of its process for {silent} ms: it was stopped, or has no CPU"
+            ))
         })
     }
 }

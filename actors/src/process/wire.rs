@@ -7,7 +7,7 @@ use std::{
     collections::BTreeMap,
     future::poll_fn,
     io,
-    sync::{Arc, Mutex},
+    sync::{Arc, Mutex, TryLockError},
     task::{Context, Poll, Waker},
     time::Duration,
 };
@@ -292,6 +292,14 @@ impl Source for Wire {
 
     fn poll_event(&self, cx: &mut Context<'_>) -> Poll<Option<Message>> {
         self.poll_claimed(Inbox::claim_event, cx)
+    }
+
+    fn backlog(&self) -> Option<(usize, u64)> {
+        match self.inbox.try_lock() {
+            Ok(inbox) => Some(inbox.backlog()),
+            Err(TryLockError::Poisoned(poisoned)) => Some(poisoned.into_inner().backlog()),
+            Err(TryLockError::WouldBlock) => None,
+        }
     }
 
     fn finish(&self, outcome: Outcome) {

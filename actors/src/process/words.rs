@@ -77,6 +77,8 @@ pub(super) enum Ending {
     Panic(String),
     /// It lost what it requires and is to be started again when that is there; the name.
     RequirementLost(String),
+    /// It does not come back; in what.
+    Hung(String),
     /// Something else, in words.
     Other(String),
 }
@@ -87,8 +89,8 @@ impl From<&Reason> for Ending {
             Reason::Normal | Reason::Shutdown => Self::Normal,
             Reason::RequirementLost(name) => Self::RequirementLost(name.clone()),
             Reason::Panic(said) => Self::Panic(cut(said)),
+            Reason::Hung(what) => Self::Hung(cut(what)),
             other @ (Reason::StartTimeout
-            | Reason::Hung(_)
             | Reason::Killed
             | Reason::ThreadEnded
             | Reason::ProcessEnded(_)
@@ -107,6 +109,7 @@ impl From<Ending> for Reason {
             Ending::Normal => Self::Normal,
             Ending::Panic(said) => Self::Panic(said),
             Ending::RequirementLost(name) => Self::RequirementLost(name),
+            Ending::Hung(what) => Self::Hung(what),
             Ending::Other(what) => Self::ProcessEnded(what),
         }
     }

@@ -220,6 +220,9 @@ impl Mailbox {
 
     /// Messages that wait to be taken, and how many were taken out so far; `None` if somebody is at it this very moment.
     pub(crate) fn backlog(&self) -> Option<(usize, u64)> {
+        if let Some(source) = &self.source {
+            return source.backlog();
+        }
         let shared = match self.shared.try_lock() {
             Ok(shared) => shared,
             Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),

@@ -15,6 +15,9 @@ pub trait Source: Debug + Send + Sync {
     /// The same for the layers' events alone; everything else is left where it is.
     fn poll_event(&self, cx: &mut Context<'_>) -> Poll<Option<Message>>;
 
+    /// Messages that wait to be taken, and how many were taken so far; `None` if somebody is at it this very moment.
+    fn backlog(&self) -> Option<(usize, u64)>;
+
     /// The message in hand has ended so.
     fn finish(&self, outcome: Outcome);
 }

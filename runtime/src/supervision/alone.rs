@@ -1,7 +1,10 @@
 //! One actor under a guard and under no supervisor: what a process that hosts a single application runs, and those who
 //! supervise.
 
-use std::sync::Mutex;
+use std::{
+    sync::{Arc, Mutex},
+    time::Duration,
+};
 
 use actix::{Actor, Context};
 use tokio::sync::oneshot;
@@ -10,35 +13,73 @@ use super::{
     Launch, ReadyGate, Reason,
     guard::{Guard, life},
     panics::install_hook,
-    tenant::{Fate, Tenant},
+    tenant::{Fate, Report, Tenant},
+    threads::{Place, Seat},
     vitals::Vitals,
+    watchdog::Watchdog,
 };
 use crate::post::lock;
 
-/// Stops an actor that was started [`alone`].
+/// How an actor that has no supervisor is watched.
+pub struct Alone {
+    /// Its name, for people.
+    pub name: String,
+    /// The calling thread's place.
+    pub place: Place,
+    /// Longest time that one turn may take; `None`: as long as it likes.
+    pub progress_within: Option<Duration>,
+    /// Called from another thread when the actor does not come back, with who does not, since when and in what. It is then
+    /// over: it sends nothing and takes nothing any more.
+    pub on_hung: Box<dyn Fn(&Reason) + Send + Sync>,
+}
+
+impl std::fmt::Debug for Alone {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Alone({} {:?})", self.name, self.progress_within)
+    }
+}
+
+/// Stops an actor that was started [`alone`]. While it lives the actor is watched.
 #[derive(Clone)]
-pub struct AloneHandle(Tenant);
+pub struct AloneHandle {
+    tenant: Tenant,
+    _watchdog: Arc<Watchdog>,
+}
 
 impl std::fmt::Debug for AloneHandle {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "AloneHandle({})", self.0.vitals().name())
+        write!(f, "AloneHandle({})", self.tenant.vitals().name())
     }
 }
 
 impl AloneHandle {
     /// Asks the actor to stop; its `stopping` may say that it goes on for a while.
     pub fn stop(&self) {
-        self.0.stop();
+        self.tenant.stop();
     }
 }
 
-/// Makes an actor on the calling thread, which is an arbiter's or a system's. The future ends with it, and says how.
-pub fn alone(launch: &Launch, ready: ReadyGate) -> (AloneHandle, impl Future<Output = Reason> + use<>) {
-    let (tenant, ended) = tenant("alone");
+/// Makes an actor on the calling thread, which is a system's of actix. The future ends with it, and says how.
+pub fn alone(
+    launch: &Launch,
+    ready: ReadyGate,
+    alone: Alone,
+) -> (AloneHandle, impl Future<Output = Reason> + use<>) {
+    let Alone { name, place, progress_within, on_hung } = alone;
+    let (report, ended) = report(on_hung);
+    let vitals = Vitals::new(name);
+    let seat = Seat::of_this_thread(&place);
+    let tenant = Tenant::new(vitals.clone(), Some(seat), progress_within, report);
+    let watchdog = Arc::new(Watchdog::default());
+    watchdog.watch(&tenant);
+    let ready = ReadyGate::new(move || {
+        vitals.set_ready();
+        ready.reached();
+    });
     if let Some(guard) = Guard::make(launch, ready, tenant.clone()) {
         actix_rt::spawn(guard);
     }
-    (AloneHandle(tenant), ended)
+    (AloneHandle { tenant, _watchdog: watchdog }, ended)
 }
 
 /// Runs an actor that supervises others, and is supervised by nobody, on the calling thread. The future ends with it, and
@@ -47,22 +88,26 @@ pub fn overseen<A>(name: &str, actor: A) -> impl Future<Output = Reason> + use<A
 where
     A: Actor<Context = Context<A>>,
 {
-    let (tenant, ended) = tenant(name);
+    // Nobody watches it, so nobody says that it hangs.
+    let (report, ended) = report(Box::new(|_| {}));
+    let tenant = Tenant::new(Vitals::new(name), None, None, report);
     actix_rt::spawn(Guard::around(Some(life(Context::new().into_future(actor))), tenant));
     ended
 }
 
-fn tenant(name: &str) -> (Tenant, impl Future<Output = Reason> + use<>) {
+/// Takes what befalls a life; the future ends with its end.
+fn report(on_hung: Box<dyn Fn(&Reason) + Send + Sync>) -> (Report, impl Future<Output = Reason>) {
     install_hook();
     let (say, ended) = oneshot::channel();
     let say = Mutex::new(Some(say));
-    let report = Box::new(move |fate| {
-        let (Fate::Hung(reason) | Fate::Ended(reason)) = fate;
-        if let Some(say) = lock(&say).take() {
-            // Whoever does not wait for the end does not want to know.
-            let _ = say.send(reason);
+    let report: Report = Box::new(move |fate| match fate {
+        Fate::Hung(reason) => on_hung(&reason),
+        Fate::Ended(reason) => {
+            if let Some(say) = lock(&say).take() {
+                // Whoever does not wait for the end does not want to know.
+                let _ = say.send(reason);
+            }
         }
     });
-    let tenant = Tenant::new(Vitals::new(name), None, None, report);
-    (tenant, async { ended.await.unwrap_or(Reason::ThreadEnded) })
+    (report, async { ended.await.unwrap_or(Reason::ThreadEnded) })
 }

@@ -30,7 +30,7 @@ pub(crate) mod vitals;
 mod watchdog;
 
 pub use self::{
-    alone::{AloneHandle, alone, overseen},
+    alone::{Alone, AloneHandle, alone, overseen},
     core::{
         AutoShutdown, BranchView, ChildId, ChildIds, ChildState, ChildView, Command, Flags, Generation,
         Input, Intensity, Policy, Reason, Refusal, Restart, Strategy,

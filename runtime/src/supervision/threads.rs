@@ -135,6 +135,13 @@ impl Seat {
         })
     }
 
+    /// The seat of the calling thread, which is no node's: nobody gives it up.
+    pub(super) fn of_this_thread(place: &Place) -> Arc<Self> {
+        let seat = Self::new(place, Arc::default());
+        seat.clone().occupy();
+        seat
+    }
+
     /// The kernel's number of the thread; `None` before its first and after its last breath.
     pub(super) fn tid(&self) -> Option<i32> {
         Some(self.tid.load(Ordering::Relaxed)).filter(|tid| *tid > 0)

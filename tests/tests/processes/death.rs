@@ -57,7 +57,7 @@ fn a_handler_that_does_not_return_is_killed_and_replaced() {
     let process = Watched::new(scenario.who().pid);
     assert_eq!(scenario.order_confirmed(Order::Hang), Outcome::Failed);
     process.wait_for_end();
-    scenario.node.wait_for(&["a child failed", "hung:"]);
+    scenario.node.wait_for(&["a child failed", "hung: in its handler of `process.order` has not come back"]);
     assert_eq!(scenario.count_confirmed(1), Outcome::Delivered);
 }
 
