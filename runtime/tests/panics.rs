@@ -153,13 +153,14 @@ fn end_of(whereabouts: Where) -> Reason {
     stage.wait_ready(0);
     stage.send(0, 1);
     assert_eq!(read.recv_timeout(DEADLINE).expect("the successor works"), "2: 1");
-    assert_eq!(stage.most_abandoned(), 0);
+    assert_eq!(stage.most_abandoned(), 0, "{reason}");
     assert_eq!(stage.stop(), Reason::Shutdown);
     reason
 }
 
 fn assert_panicked(whereabouts: Where, said: &str) {
-    let Reason::Panic(words) = end_of(whereabouts) else { panic!("no panic in {whereabouts:?}") };
+    let end = end_of(whereabouts);
+    let Reason::Panic(words) = end else { panic!("no panic in {whereabouts:?}: {end}") };
     let (seen, place) = words.rsplit_once(" at ").unwrap_or_else(|| panic!("no place: {words}"));
     assert_eq!(seen, said);
     assert!(place.starts_with("runtime/tests/panics.rs:"), "{place}");

@@ -7,7 +7,7 @@ use std::{
     sync::Once,
 };
 
-use super::vitals::Vitals;
+use super::vitals::{Doing, Vitals};
 
 /// Whether this program unwinds from a panic. One that is built with `panic = "abort"` ends with its first panic, whatever
 /// supervisors it has. Cargo builds every crate of a program with the same strategy, so this crate's is the program's.
@@ -40,7 +40,10 @@ fn remember(info: &PanicHookInfo<'_>) {
     });
     let thread = rustix::thread::gettid().as_raw_nonzero();
     match Vitals::present() {
-        Some(vitals) => tracing::error!(actor = vitals.name(), thread, "{}", sentence(info)),
+        Some(vitals) => {
+            vitals.begins(Doing::Panic, None);
+            tracing::error!(actor = vitals.name(), thread, "{}", sentence(info));
+        }
         // Not within an actor's turn: a task or a thread that somebody spawned and nobody supervises.
         None => tracing::error!(thread, "outside of any supervised actor's turn: {}", sentence(info)),
     }

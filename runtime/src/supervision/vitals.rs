@@ -35,6 +35,8 @@ pub(crate) enum Doing {
     Stop,
     /// It is dropped.
     Drop,
+    /// It panicked: the panic hook runs, which may look up a whole backtrace, and then destructors.
+    Panic,
 }
 
 impl Doing {
@@ -47,6 +49,7 @@ impl Doing {
             Self::Task => 3 << 32,
             Self::Stop => 4 << 32,
             Self::Drop => 5 << 32,
+            Self::Panic => 6 << 32,
         }
     }
 
@@ -57,6 +60,7 @@ impl Doing {
             2 => Self::Timer,
             4 => Self::Stop,
             5 => Self::Drop,
+            6 => Self::Panic,
             _ => Self::Task,
         }
     }
@@ -206,6 +210,7 @@ impl Vitals {
             Doing::Task => "in a future or stream of its own".to_owned(),
             Doing::Stop => "in its `stopping` or `stopped`".to_owned(),
             Doing::Drop => "in its `drop`".to_owned(),
+            Doing::Panic => "in a panic of its own".to_owned(),
         }
     }
 
@@ -311,7 +316,8 @@ mod tests {
     #[test]
     fn every_doing_is_read_as_it_was_written() {
         let message = Doing::Message(Kind::from_bits(u32::MAX));
-        for doing in [Doing::Start, message, Doing::Timer, Doing::Task, Doing::Stop, Doing::Drop] {
+        let others = [Doing::Start, Doing::Timer, Doing::Task, Doing::Stop, Doing::Drop, Doing::Panic];
+        for doing in others.into_iter().chain([message]) {
             assert_eq!(Doing::from_code(doing.code()), doing);
         }
     }

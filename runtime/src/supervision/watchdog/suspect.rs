@@ -6,10 +6,16 @@
 use std::time::Duration;
 
 use super::processor::{Condition, Sample};
-use crate::{supervision::vitals::Sight, time::Time};
+use crate::{
+    supervision::vitals::{Doing, Sight},
+    time::Time,
+};
 
 /// Looks before the end of a budget at which the CPU's account is read, so that the last of them has one to compare with.
 const LAST_LOOKS: u32 = 4;
+
+/// Time for a panic at least: its hook may look up and print a backtrace, which takes a second in a debug build.
+const PANIC_WITHIN: Duration = Duration::from_secs(10);
 
 /// One look at an actor.
 #[derive(Clone, Copy, Debug)]
@@ -98,15 +104,20 @@ impl TurnSuspect {
         }
         let waits_for_cpu = self.account.enter(sample());
         let excused = self.account.excused();
-        let hangs = lasted >= self.budget + excused && !waits_for_cpu;
+        let hangs = lasted >= self.budget_of(sight) + excused && !waits_for_cpu;
         hangs.then_some(Hang { since, lasted, excused })
+    }
+
+    /// One that panicked is on its way out, and has time for it.
+    fn budget_of(&self, sight: Sight) -> Duration {
+        if sight.doing == Doing::Panic { self.budget.max(PANIC_WITHIN) } else { self.budget }
     }
 
     /// When the turn that was seen last is too long.
     pub(super) fn deadline(&self, sight: Sight) -> Option<Time> {
         let begun = sight.begun.unwrap_or(self.first_seen);
         let is_same = sight.is_busy() && sight.turn == self.turn;
-        is_same.then(|| begun + self.budget + self.account.excused())
+        is_same.then(|| begun + self.budget_of(sight) + self.account.excused())
     }
 }
 
@@ -163,6 +174,8 @@ impl StallSuspect {
             self.account.enter(sample());
             return Stall::Probe;
         };
+        // At each look from here on: whoever gets a CPU and loses it again waits for it now, whatever he had before.
+        let waits_for_cpu = self.account.enter(sample());
         if lasted < self.budget + self.account.late || sight.is_busy() {
             // A turn that does not end is judged as such.
             return Stall::None;
@@ -171,7 +184,6 @@ impl StallSuspect {
         if sight.turn >= probed + 2 {
             return Stall::Waits(hang(self.account.late));
         }
-        let waits_for_cpu = self.account.enter(sample());
         let excused = self.account.excused();
         if waits_for_cpu || lasted < self.budget + excused {
             return Stall::None;

@@ -155,3 +155,24 @@ fn one_that_takes_messages_or_has_none_is_left_alone() {
     assert_eq!(stall(|_| 2, |now| now / 90, 3, |_| None).1, None);
     assert_eq!(stall(|_| 2, |_| 7, 0, |_| None), (None, None));
 }
+
+#[test]
+fn one_whose_thread_gets_a_moment_of_cpu_and_waits_again_is_not_called_away() {
+    // Woken by the probe at 50 ms it runs for a moment, and from then on another has its CPU.
+    let rarely = |now| match now {
+        0..55 => cpu(0, 0, Condition::Blocked),
+        _ => cpu(1, 0, Condition::Runnable),
+    };
+    assert_eq!(stall(|_| 2, |_| 7, 3, rarely).1, None);
+}
+
+#[test]
+fn a_panic_has_time_to_print_its_backtrace_and_not_for_ever() {
+    let mut suspect = TurnSuspect::new(BUDGET);
+    let sight = Sight { turn: 1, doing: Doing::Panic, begun: None };
+    let accused = (0..4_000).map(|look| look * 5).find(|now| {
+        let look = on_time(*now, sight);
+        suspect.look(look, PERIOD, || cpu(0, 0, Condition::Blocked)).is_some()
+    });
+    assert_eq!(accused, Some(10_000));
+}
