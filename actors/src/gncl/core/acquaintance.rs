@@ -11,6 +11,8 @@ use super::{ConnectionId, Settings};
 pub(super) struct Acquaintance {
     /// The newest life of it that was seen.
     pub(super) incarnation: Incarnation,
+    /// The life of it that NDL told of last.
+    pub(super) found: Option<Incarnation>,
     /// Where to dial it, as long as NDL says that it is there.
     pub(super) wanted: Option<SocketAddr>,
     /// The link, if there is one.
@@ -43,6 +45,7 @@ impl Acquaintance {
     pub(super) const fn new(incarnation: Incarnation, settings: &Settings) -> Self {
         Self {
             incarnation,
+            found: None,
             wanted: None,
             link: None,
             dial: None,
@@ -52,6 +55,11 @@ impl Acquaintance {
             back_off: settings.redial_min,
             orphan_at: None,
         }
+    }
+
+    /// The life of it that is there, as long as NDL says so.
+    pub(super) fn vouched(&self) -> Option<Incarnation> {
+        self.found.filter(|_| self.wanted.is_some())
     }
 
     /// Whether nothing would be lost by forgetting it.

@@ -89,6 +89,9 @@ impl Core {
         if hello.incarnation < peer.incarnation {
             return Err(Decline::Stale { theirs: hello.incarnation, known: peer.incarnation });
         }
+        if peer.vouched().is_some_and(|present| hello.incarnation > present) {
+            return Err(Decline::Contested { node: hello.node });
+        }
         // spec: GNCL-6
         let is_void = hello.incarnation == peer.incarnation && hello.dial <= peer.void_dial;
         // A dial that has not said hello yet loses against one that has. spec: GNCL-4
@@ -136,6 +139,9 @@ impl Core {
         match self.peers.get(&dialled) {
             Some(peer) if welcome.incarnation < peer.incarnation => {
                 Err(Decline::Stale { theirs: welcome.incarnation, known: peer.incarnation })
+            }
+            Some(peer) if peer.vouched().is_some_and(|present| welcome.incarnation > present) => {
+                Err(Decline::Contested { node: dialled })
             }
             Some(_) | None => Ok(()),
         }

@@ -67,6 +67,9 @@ pub(crate) enum Decline {
         theirs: Incarnation,
         known: Incarnation,
     },
+    Contested {
+        node: NodeAddress,
+    },
     Duplicate,
     TooManyPeers {
         peers_max: usize,
@@ -85,6 +88,7 @@ impl Decline {
             Self::OwnAddress { .. } => "own address",
             Self::WrongNode { .. } => "wrong node",
             Self::Stale { .. } => "stale incarnation",
+            Self::Contested { .. } => "contested",
             Self::Duplicate => "duplicate",
             Self::TooManyPeers { .. } => "too many peers",
             Self::TooLate => "too late",
@@ -119,6 +123,11 @@ impl fmt::Display for Decline {
             Self::Stale { theirs, known } => write!(
                 f,
                 "incarnation {theirs} of your node is over, I know {known}; is an old process still running?"
+            ),
+            Self::Contested { node } => write!(
+                f,
+                "an earlier process still answers as node {node}; wait until it is found to be gone, or give each its own \
+                 address"
             ),
             Self::Duplicate => {
                 f.write_str("another connection between us is made or being made; keep that one")

@@ -20,12 +20,13 @@ impl Core {
         if self.leaving || node == self.settings.ours.node || !node.is_single() {
             return;
         }
-        if self.peers.get(&node).is_some_and(|peer| incarnation < peer.incarnation) {
+        // A life that only said hello is no proof: another process may use the node's address. spec: GNCL-7
+        if self.peers.get(&node).is_some_and(|peer| peer.found.is_some_and(|found| incarnation < found)) {
             self.count("stale incarnation", format!("NDL found node {node} in a life that is over"));
             return;
         }
-        if self.peers.get(&node).is_some_and(|peer| peer.incarnation < incarnation) {
-            // It went to a life that is over.
+        if self.peers.get(&node).is_some_and(|peer| peer.incarnation != incarnation) {
+            // It went to another life.
             self.drop_dial(node);
         }
         self.meet(now, node, incarnation);
@@ -38,6 +39,7 @@ impl Core {
             return;
         };
         peer.orphan_at = None;
+        peer.found = Some(incarnation);
         peer.wanted = Some(address);
         if peer.link.is_none() && peer.dial.is_none() {
             // spec: GNCL-1

@@ -271,3 +271,34 @@ fn a_peer_that_nobody_announced_is_forgotten_some_time_after_its_link_broke() {
     outputs(&mut core);
     assert_eq!(silence(&mut core, Time::MAX), [(millis(5_010), Output::Forget(HIGH))]);
 }
+
+#[test]
+fn a_second_process_with_a_members_address_does_not_take_the_members_place() {
+    let mut core = core();
+    core.handle(millis(0), found(5));
+    outputs(&mut core);
+    let (_, up) = greet(&mut core, millis(1), hello_from(HIGH, 5, 1));
+    assert!(up.contains(&Output::Fact(LinkFact::LinkUp { node: HIGH, incarnation: Incarnation(5) })));
+
+    let (_, second) = greet(&mut core, millis(2), hello_from(HIGH, 6, 1));
+    assert_eq!(refusal(&second), Some("contested"));
+    assert!(!second.iter().any(|output| matches!(output, Output::Detach { .. })), "{second:?}");
+
+    // Once NDL has found that the former life is over, the later one is welcome.
+    core.handle(millis(3), Input::NodeLost { node: HIGH, incarnation: Incarnation(5) });
+    outputs(&mut core);
+    let (_, later) = greet(&mut core, millis(4), hello_from(HIGH, 6, 2));
+    assert!(later.contains(&Output::Fact(LinkFact::LinkUp { node: HIGH, incarnation: Incarnation(6) })));
+}
+
+#[test]
+fn the_life_that_ndl_finds_takes_the_place_of_one_that_only_said_hello() {
+    let mut core = core();
+    let (impostor, _) = greet(&mut core, millis(0), hello_from(HIGH, 6, 1));
+    core.handle(millis(1), found(5));
+    let out = outputs(&mut core);
+    assert!(out.contains(&Output::Close(impostor)), "{out:?}");
+    assert!(out.iter().any(|output| matches!(output, Output::Dial { .. })), "{out:?}");
+    let (_, real) = greet(&mut core, millis(2), hello_from(HIGH, 5, 1));
+    assert!(real.contains(&Output::Fact(LinkFact::LinkUp { node: HIGH, incarnation: Incarnation(5) })));
+}
