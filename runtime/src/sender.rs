@@ -24,6 +24,9 @@ use crate::{
     wire::{Class, DecodeError, Flags, Header, Kind, Message, MessageBuffer, Payload},
 };
 
+/// Messages that one process can send at most in its life: at a million a second it is twelve days.
+const SEQUENCES_PER_LIFE: u64 = 1 << 40;
+
 /// What a node knows of names and groups.
 pub trait Directory: Send + Sync {
     /// The TID that has `name` now, or `None` if nobody has it.
@@ -160,9 +163,14 @@ impl Sender {
     }
 
     /// Another sending side of the TID, in another process, has sent messages up to this sequence: this one counts on
-    /// from there.
-    pub fn count_on_from(&self, last: u64) {
-        self.shared.sequence.fetch_max(last, Ordering::Relaxed);
+    /// from there. Returns whether that can be: a number that no process reaches in one life is not taken.
+    pub fn count_on_from(&self, last: u64) -> bool {
+        let present = self.shared.sequence.load(Ordering::Relaxed);
+        let is_plausible = last <= present.saturating_add(SEQUENCES_PER_LIFE);
+        if is_plausible {
+            self.shared.sequence.fetch_max(last, Ordering::Relaxed);
+        }
+        is_plausible
     }
 
     /// The TID that this sends from.
@@ -348,7 +356,7 @@ impl Sender {
             message.reject(Rejection::TooLong);
             return Err(Rejection::TooLong.into());
         }
-        message.header.sequence = self.shared.sequence.fetch_add(1, Ordering::Relaxed) + 1;
+        message.header.sequence = self.shared.sequence.fetch_add(1, Ordering::Relaxed).wrapping_add(1);
         message.header.sent = Time::now();
         Ok(self.shared.router.send(message)?)
     }

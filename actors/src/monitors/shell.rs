@@ -83,6 +83,19 @@ pub(crate) fn note(stores: &Stores, input: Input) {
     }
 }
 
+/// Notes what has happened while the orders are being carried out.
+fn note_undrained(stores: &Stores, input: Input) {
+    let is_earlier = {
+        let mut core = lock(&stores.monitors);
+        let before = core.next_wake();
+        core.handle(Time::now(), input);
+        core.next_wake().is_some_and(|wake| before.is_none_or(|before| wake < before))
+    };
+    if is_earlier {
+        poke(stores);
+    }
+}
+
 /// Carries out what the core orders.
 pub(crate) fn drain(stores: &Stores) {
     loop {
@@ -127,7 +140,8 @@ fn tell(stores: &Stores, watcher: AppAddress, down: Down) {
     message.header.class = Down::CLASS;
     if let Err(Rejection::QueueFull) = stores.router.send(message) {
         // Any other refusal says that the watcher is gone, and its monitors go with it.
-        feed(stores, Input::NotTaken { watcher, down });
+        // What follows is carried out by whoever drains now, not within this: a thousand of these are no deep stack.
+        note_undrained(stores, Input::NotTaken { watcher, down });
     }
 }
 

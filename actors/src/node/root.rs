@@ -16,7 +16,7 @@ use sinew_runtime::{
     router::Outlet,
     sender::Sender,
     supervision::{
-        ChildIds, ChildSpec, Input, Launch, Place, PlannedChild, Policy, ReadyGate, Reason, Roster,
+        ChildId, ChildIds, ChildSpec, Input, Launch, Place, PlannedChild, Policy, ReadyGate, Reason, Roster,
         Supervisor, SupervisorFact, SupervisorPlan, Threads, life,
     },
     tid::AppAddress,
@@ -75,6 +75,13 @@ pub(super) enum Phase {
     StoppingLayers,
 }
 
+/// Names that require each other in a circle, the first one again at the end.
+struct Cycle {
+    names: Vec<String>,
+    /// Those of them that are applications of this node.
+    ours: Vec<ChildId>,
+}
+
 pub(super) struct Root {
     pub(super) stores: Arc<Stores>,
     threads: Rc<RefCell<Threads>>,
@@ -90,7 +97,7 @@ pub(super) struct Root {
     pub(super) layer_supervisor: Option<Roster>,
     pub(super) app_supervisor: Option<Roster>,
     last_layer_fault: Option<String>,
-    cycle: Option<Vec<String>>,
+    cycle: Option<Cycle>,
     started: Option<SyncSender<Result<(), StartError>>>,
     ended: SyncSender<NodeEnd>,
     tell_when_running: Vec<SyncSender<Result<(), StartError>>>,
@@ -208,7 +215,8 @@ impl StreamHandler<RootEvent> for Root {
         match event {
             RootEvent::Release { app } => self.release(app),
             RootEvent::RequirementCycle { names } => {
-                self.cycle = Some(names);
+                let ours = names.iter().filter_map(|name| self.apps.named(name)).collect();
+                self.cycle = Some(Cycle { names, ours });
                 self.tell_if_running();
             }
             RootEvent::Layers(fact) => self.layers_said(fact, context),
@@ -405,10 +413,12 @@ impl Root {
 
     fn tell_if_running(&mut self) {
         let is_running = self.app_supervisor.is_some() && self.apps.all_run();
+        // Once one of them is removed, the circle is open.
+        self.cycle.take_if(|cycle| !cycle.ours.iter().all(|id| self.apps.contains(*id)));
         if is_running || self.cycle.is_some() {
             for say in self.tell_when_running.drain(..) {
                 let answer = match &self.cycle {
-                    Some(names) if !is_running => Err(StartError::Cycle(names.clone())),
+                    Some(cycle) if !is_running => Err(StartError::Cycle(cycle.names.clone())),
                     Some(_) | None => Ok(()),
                 };
                 // Who asked may have stopped waiting.

@@ -16,7 +16,7 @@ use rustix::{
 };
 use sinew_runtime::{
     outcome::{Rejection, Ticket},
-    supervision::{Life, ReadyGate, Reason},
+    supervision::{self, Life, ReadyGate, Reason},
     tid::Tid,
     time::Time,
     wire::{Flags, FrameError, Kind, Message},
@@ -119,6 +119,12 @@ struct Process {
 impl Process {
     fn new(pidfd: Arc<OwnedFd>) -> io::Result<Self> {
         let doomed = pidfd.clone();
+        let fenced = pidfd.clone();
+        // Its supervisor does not wait for the thread that listens to it: that may hang on somebody else's account.
+        supervision::at_fence(move || {
+            // An error says that it has ended.
+            let _ = pidfd_send_signal(&fenced, Signal::KILL);
+        });
         #[expect(
             deprecated,
             reason = "sound for an OwnedFd, whose descriptor never changes; its successor is an unsafe fn, and unsafe code lives in sinew-shm alone"
@@ -314,7 +320,12 @@ impl Child {
     /// What it said before it ended counts.
     fn bury(&mut self, is_dead: bool) {
         self.is_buried = true;
-        let last_words = if is_dead && self.hear_the_rest() { LastWords::Heard } else { LastWords::Unheard };
+        // Fenced, it has a successor already: late words of it would come between that one's.
+        let last_words = if is_dead && !supervision::is_fenced() && self.hear_the_rest() {
+            LastWords::Heard
+        } else {
+            LastWords::Unheard
+        };
         self.hosted.link.disconnect(self.number, last_words);
     }
 
@@ -370,7 +381,10 @@ impl Child {
     fn obey_like_a_client(&mut self, message: Message) -> Result<(), String> {
         let Hosted { stores, tid, .. } = &*self.hosted;
         match self.session.handle(message) {
-            Order::Route(message) => self.route(message),
+            Order::Route(message) if self.hosted.link.note(&message.header) => self.route(message),
+            Order::Route(message) => {
+                return Err(format!("its message number {} is out of reach", message.header.sequence));
+            }
             Order::SetMember { group, member, .. } => lncl::set_member(stores, tid.app, group, member),
             Order::RefuseMessage { message, why } => {
                 let detail =
@@ -394,7 +408,6 @@ impl Child {
 
     fn route(&self, mut message: Message) {
         let Hosted { stores, tid, link, .. } = &*self.hosted;
-        link.note(&message.header);
         let destination = stores.router.absolute(message.header.destination);
         let is_confirmed = message.header.flags.has(Flags::CONFIRM);
         if is_confirmed {

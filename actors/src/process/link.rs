@@ -224,11 +224,9 @@ impl Link {
         Receipt::new(Arc::new(OutcomeSink(self.clone())), ticket)
     }
 
-    /// Notes that the TID has sent this message.
-    pub(super) fn note(&self, header: &Header) {
-        if let Some(sender) = self.sender.get() {
-            sender.count_on_from(header.sequence);
-        }
+    /// Notes that the TID has sent this message. Returns whether its number can be true.
+    pub(super) fn note(&self, header: &Header) -> bool {
+        self.sender.get().is_none_or(|sender| sender.count_on_from(header.sequence))
     }
 
     /// Hands over what the child has room for.

@@ -418,8 +418,8 @@ impl MailboxReader {
         Poll::Pending
     }
 
-    /// The message in hand has ended so. Counted with the next [`poll_take`](Self::poll_take), under its lock, or by
-    /// [`count`](Self::count).
+    /// The message in hand has ended so. Counted with the next [`poll_take`](Self::poll_take), under its lock, or when
+    /// this reader is dropped.
     pub fn finish(&mut self, outcome: Outcome) {
         let Some(class) = self.in_hand.take() else { return };
         match &self.mailbox.source {

@@ -115,6 +115,8 @@ impl Guard {
             let vitals = self.tenant.vitals();
             // A message in the hand of one that panicked was settled by nobody.
             vitals.settle(Outcome::Failed);
+            // Who holds its sender on another thread does not speak beside its next life.
+            vitals.fence();
             vitals.set_gone();
             if let Some(since) = self.tenant.holds_its_thread() {
                 let (actor, away) = (vitals.name(), Time::now().since(since));

@@ -41,4 +41,5 @@ pub use self::{
     roster::{Listed, Roster},
     supervisor::{ChildSpec, Launch, PlannedChild, Supervisor, SupervisorFact, SupervisorPlan},
     threads::{Place, Threads},
+    vitals::{at_fence, is_fenced},
 };

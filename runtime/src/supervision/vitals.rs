@@ -107,7 +107,11 @@ pub(crate) struct Vitals {
     /// Says what became of the message in the actor's hand.
     hand: Mutex<Option<Receipt>>,
     inbox: OnceLock<Inbox>,
+    /// What else ends with it at its fence, whatever its thread does.
+    at_fence: Mutex<Option<AtFence>>,
 }
+
+type AtFence = Box<dyn FnOnce() + Send>;
 
 impl fmt::Debug for Vitals {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -135,6 +139,7 @@ impl Vitals {
             gone: AtomicBool::new(false),
             hand: Mutex::new(None),
             inbox: OnceLock::new(),
+            at_fence: Mutex::new(None),
         })
     }
 
@@ -174,8 +179,10 @@ impl Vitals {
     /// A turn begins, or the next thing in it. On the actor's thread only.
     pub(crate) fn begins(&self, doing: Doing, now: Option<Time>) {
         let next = (self.turn.load(Ordering::Relaxed) + 1) | 1;
-        // SYNC: the number first, so that whoever sees what is done next sees that it is another turn; pairs with `sight`.
-        self.turn.store(next, Ordering::Relaxed);
+        // SYNC: the former turn's begin goes before the number comes, and the number before what is done: whoever sees this
+        // number twice sees nothing of the former turn between; pairs with `sight`.
+        self.begun.store(0, Ordering::Relaxed);
+        self.turn.store(next, Ordering::Release);
         self.doing.store(doing.code(), Ordering::Release);
         self.begun.store(now.map_or(0, Time::as_nanos), Ordering::Release);
     }
@@ -188,11 +195,13 @@ impl Vitals {
 
     /// What the actor does now.
     pub(super) fn sight(&self) -> Sight {
-        // SYNC: what it does first, its number then: a number that stays the same makes the rest true.
+        // SYNC: its number before and after: the same number makes what is read between true of that turn; pairs with `begins`.
+        let before = self.turn.load(Ordering::Acquire);
         let doing = Doing::from_code(self.doing.load(Ordering::Acquire));
         let begun = self.begun.load(Ordering::Acquire);
         let turn = self.turn.load(Ordering::Acquire);
-        Sight { turn, doing, begun: (begun > 0).then(|| Time::from_nanos(begun)) }
+        let is_known = before == turn && begun > 0;
+        Sight { turn, doing, begun: is_known.then(|| Time::from_nanos(begun)) }
     }
 
     /// What it does, in words.
@@ -270,6 +279,21 @@ impl Vitals {
     /// From now on it does nothing any more: it sends nothing, takes nothing, and no timer of its fires.
     pub(super) fn fence(&self) {
         self.over.store(true, Ordering::SeqCst);
+        let action = lock(&self.at_fence).take();
+        if let Some(action) = action {
+            action();
+        }
+    }
+
+    /// Does this at the fence, on the thread that fences: at once if that was before. `action` is short and never panics.
+    fn do_at_fence(&self, action: AtFence) {
+        *lock(&self.at_fence) = Some(action);
+        // The fence may have come between.
+        if self.is_over()
+            && let Some(action) = lock(&self.at_fence).take()
+        {
+            action();
+        }
     }
 
     /// Takes what it has in its hand and its place at the mailbox. After the fence; whoever waits is told `Failed`.
@@ -287,6 +311,21 @@ impl Vitals {
         // No panic hook is called: nothing went wrong that has not been said.
         std::panic::resume_unwind(Box::new(Over))
     }
+}
+
+/// Does this when the incarnation that has its turn on the calling thread is fenced: its life was taken, and whoever took it
+/// does not wait for its thread. Replaces what was to be done before; without an incarnation it is never done. `action` is
+/// short and does not panic; it runs on the thread that takes the life.
+pub fn at_fence(action: impl FnOnce() + Send + 'static) {
+    if let Some(vitals) = Vitals::present() {
+        vitals.do_at_fence(Box::new(action));
+    }
+}
+
+/// Whether the incarnation that has its turn on the calling thread was fenced: it has a successor, or will have one.
+#[must_use]
+pub fn is_fenced() -> bool {
+    Vitals::is_present_over()
 }
 
 /// What ends the turn of an incarnation that is to do nothing any more.

@@ -63,7 +63,7 @@ struct Branch {
     life: Generation,
 }
 
-/// The decisions of a tree of supervisors; see the [module](self).
+/// The decisions of a tree of supervisors.
 #[derive(Debug)]
 pub struct Tree {
     top: ChildId,
