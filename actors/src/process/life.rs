@@ -124,6 +124,7 @@ impl Process {
         supervision::at_fence(move || {
             // An error says that it has ended.
             let _ = pidfd_send_signal(&fenced, Signal::KILL);
+            spawn::reap(fenced);
         });
         #[expect(
             deprecated,
