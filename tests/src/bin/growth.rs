@@ -122,6 +122,8 @@ impl Field {
         let (mut done, mut turn) = (0, 0);
         while done < count {
             turn += 1;
+            // A life longer than the window: otherwise the waits before the restarts would double each time.
+            std::thread::sleep(Duration::from_millis(2));
             done += match kind {
                 "applications" => self.fail_apps(),
                 "layers" => self.fail_layer(turn),

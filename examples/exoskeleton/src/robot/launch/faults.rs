@@ -1,7 +1,7 @@
 //! `exoskeleton faults`: the robot walks, a fault is injected, and what happens is held against what is claimed.
 //!
-//! [`step`] says which faults, [`script`] injects them and does what an operator would, [`judge`] reads the traces
-//! afterwards and makes [`claim`]s of them. Nothing is judged while the robot walks, so that nothing disturbs it.
+//! `step` says which faults, `script` injects them and does what an operator would, `judge` reads the traces
+//! afterwards and makes `claim`s of them. Nothing is judged while the robot walks, so that nothing disturbs it.
 
 mod claim;
 mod contrast;
