@@ -190,7 +190,11 @@ async fn say_last(wire: &Wire, tid: Tid, reason: &Reason) {
     wire.tell_last();
     wire.say(words::frame(Kind::HOST_ENDED, tid, payload::lncl_of(tid.node), &Ending::from(reason)));
     let until = Time::now() + LAST_WORDS;
-    while !wire.has_sent_all() && Time::now() < until {
+    while !wire.has_sent_all() {
+        if Time::now() >= until {
+            tracing::warn!(%tid, waited = ?LAST_WORDS, "the node does not read this application's last words; it ends without them");
+            return;
+        }
         tokio::time::sleep(Duration::from_millis(1)).await;
     }
 }

@@ -18,12 +18,14 @@
 //! | `link` | node | carries messages to the child from any thread |
 //! | `names` | node | which names the child wants to know |
 //! | `life` | node | the child under supervision: started, listened to, stopped, killed |
+//! | `held` | node | one process by its descriptor: killed, waited for, and how it ended |
 //! | `spawn` | node | starts processes and reaps them |
 //! | `role` | child | whether this process is a node or such a child |
 //! | `host` | child | runs the application |
 //! | `inbox` | child | where the application's messages come from |
 //! | `wire` | child | reads what the node says |
 
+mod held;
 mod host;
 mod inbox;
 mod life;

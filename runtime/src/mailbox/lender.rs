@@ -23,7 +23,7 @@ impl Mailbox {
     /// Takes over the reading end for a borrower in another process; the former reader is fenced off.
     #[must_use]
     pub fn lend(self: &Arc<Self>) -> Lender {
-        Lender { epoch: self.attach().epoch, mailbox: self.clone() }
+        Lender { epoch: self.attach().epoch(), mailbox: self.clone() }
     }
 }
 

@@ -6,17 +6,21 @@
 
 mod lender;
 mod queue;
+mod reader;
 mod source;
+mod tally;
 
 use std::{
     collections::VecDeque,
     sync::{Arc, Mutex, TryLockError},
-    task::{Context, Poll, Waker},
+    task::Waker,
 };
 
 pub use lender::Lender;
 pub use queue::ClassQueue;
+pub use reader::MailboxReader;
 pub use source::Source;
+pub use tally::Tally;
 
 use crate::{
     outcome::{Outcome, Rejection},
@@ -25,43 +29,6 @@ use crate::{
     time::Time,
     wire::{Class, Header, Message},
 };
-
-/// What became of the messages of one class: `taken = delivered + superseded + rejected + expired + failed + waiting`,
-/// `waiting` being those in the queue and the one in hand.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Tally {
-    /// Accepted by the mailbox.
-    pub taken: u64,
-    /// Not accepted: the queue was full, the application had ended, or it was away and keeps nothing.
-    pub refused: u64,
-    /// Handled.
-    pub delivered: u64,
-    /// Replaced by a newer value.
-    pub superseded: u64,
-    /// Taken, then refused by the application.
-    pub rejected: u64,
-    /// Too old when their turn came.
-    pub expired: u64,
-    /// In the hand of an actor that panicked or ended.
-    pub failed: u64,
-}
-
-impl Tally {
-    fn count(&mut self, outcome: Outcome) {
-        match outcome {
-            Outcome::Delivered => self.delivered += 1,
-            Outcome::Rejected(_) => self.rejected += 1,
-            Outcome::Expired => self.expired += 1,
-            Outcome::Failed | Outcome::PeerLost | Outcome::Unknown => self.failed += 1,
-        }
-    }
-
-    /// Messages whose fate is still open, by the conservation law.
-    #[must_use]
-    pub const fn open(&self) -> u64 {
-        self.taken - self.delivered - self.superseded - self.rejected - self.expired - self.failed
-    }
-}
 
 /// The mailbox of one TID.
 #[derive(Debug)]
@@ -207,7 +174,7 @@ impl Mailbox {
         if let Some(waker) = former {
             waker.wake();
         }
-        MailboxReader { mailbox: self.clone(), epoch, in_hand: None, finished: None }
+        MailboxReader::new(self.clone(), epoch)
     }
 
     /// Fences reader number `epoch` off, if it is the present one. What waits is kept for the next.
@@ -356,112 +323,10 @@ pub fn is_event(header: &Header) -> bool {
     header.source.app.is_layer() && header.source.node == header.destination.node && header.kind.is_user()
 }
 
-/// The reading end of a [`Mailbox`], owned by one incarnation of an actor.
-#[derive(Debug)]
-pub struct MailboxReader {
-    mailbox: Arc<Mailbox>,
-    epoch: u64,
-    in_hand: Option<Class>,
-    finished: Option<(Class, Outcome)>,
-}
-
-impl MailboxReader {
-    /// Takes the next message into the hand. `None` once the mailbox is closed or a later incarnation reads it.
-    pub fn poll_take(&mut self, cx: &mut Context<'_>) -> Poll<Option<Message>> {
-        if let Some(source) = &self.mailbox.source {
-            let taken = source.poll_take(cx);
-            if let Poll::Ready(Some(message)) = &taken {
-                self.in_hand = Some(message.header.class);
-            }
-            return taken;
-        }
-        let mut shared = lock(&self.mailbox.shared);
-        if shared.epoch != self.epoch {
-            return Poll::Ready(None);
-        }
-        shared.count(self.finished.take());
-        shared.paused = false;
-        if let Some(message) = shared.next() {
-            self.in_hand = shared.hands_out(&message);
-            return Poll::Ready(Some(message));
-        }
-        if shared.closed {
-            return Poll::Ready(None);
-        }
-        shared.waker = Some(cx.waker().clone());
-        Poll::Pending
-    }
-
-    /// The same for the layers' events alone; everything else is left where it is.
-    pub fn poll_event(&mut self, cx: &mut Context<'_>) -> Poll<Option<Message>> {
-        if let Some(source) = &self.mailbox.source {
-            let taken = source.poll_event(cx);
-            if let Poll::Ready(Some(event)) = &taken {
-                self.in_hand = Some(event.header.class);
-            }
-            return taken;
-        }
-        let mut shared = lock(&self.mailbox.shared);
-        if shared.epoch != self.epoch {
-            return Poll::Ready(None);
-        }
-        shared.count(self.finished.take());
-        if let Some(event) = shared.events.pop_front() {
-            self.in_hand = shared.hands_out(&event);
-            return Poll::Ready(Some(event));
-        }
-        if shared.closed {
-            return Poll::Ready(None);
-        }
-        shared.paused = true;
-        shared.waker = Some(cx.waker().clone());
-        Poll::Pending
-    }
-
-    /// The message in hand has ended so. Counted with the next [`poll_take`](Self::poll_take), under its lock, or when
-    /// this reader is dropped.
-    pub fn finish(&mut self, outcome: Outcome) {
-        let Some(class) = self.in_hand.take() else { return };
-        match &self.mailbox.source {
-            Some(source) => source.finish(outcome),
-            None => self.finished = Some((class, outcome)),
-        }
-    }
-}
-
-impl MailboxReader {
-    /// Counts the message that has ended now, before code runs that may not come back: one that is fenced off in it has
-    /// nothing in its hand.
-    pub(crate) fn count(&mut self) {
-        if self.finished.is_some() {
-            let mut shared = lock(&self.mailbox.shared);
-            if shared.epoch == self.epoch {
-                shared.count(self.finished.take());
-            }
-        }
-    }
-
-    /// Which reader of its mailbox this is.
-    pub(crate) const fn epoch(&self) -> u64 {
-        self.epoch
-    }
-}
-
-impl Drop for MailboxReader {
-    fn drop(&mut self) {
-        if let Some(source) = self.mailbox.source.as_ref().filter(|_| self.in_hand.is_some()) {
-            source.finish(Outcome::Failed);
-        }
-        let mut shared = lock(&self.mailbox.shared);
-        if shared.epoch == self.epoch {
-            shared.count(self.finished.take());
-            shared.count(self.in_hand.take().map(|class| (class, Outcome::Failed)));
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use std::task::{Context, Poll};
+
     use bytes::Bytes;
     use futures_util::task::noop_waker;
 

@@ -1,0 +1,109 @@
+//! One process, held by its descriptor: killed, waited for, and how it ended in words.
+
+use std::{io, os::fd::OwnedFd, sync::Arc, time::Duration};
+
+use rustix::{
+    event::{PollFd, PollFlags, Timespec, poll},
+    process::{Signal, WaitIdStatus, pidfd_send_signal},
+};
+use sinew_runtime::supervision;
+use tokio::{io::unix::AsyncFd, time::timeout};
+
+use super::spawn;
+
+/// The process itself. Dropping it kills it.
+pub(super) struct Process {
+    pidfd: AsyncFd<Arc<OwnedFd>>,
+}
+
+impl Process {
+    pub(super) fn new(pidfd: Arc<OwnedFd>) -> io::Result<Self> {
+        let doomed = pidfd.clone();
+        let fenced = pidfd.clone();
+        // Its supervisor does not wait for the thread that listens to it: that may hang on somebody else's account.
+        supervision::at_fence(move || {
+            // An error says that it has ended.
+            let _ = pidfd_send_signal(&fenced, Signal::KILL);
+            spawn::reap(fenced);
+        });
+        #[expect(
+            deprecated,
+            reason = "sound for an OwnedFd, whose descriptor never changes; its successor is an unsafe fn, and unsafe code lives in sinew-shm alone"
+        )]
+        AsyncFd::new(pidfd).map(|pidfd| Self { pidfd }).inspect_err(|_| {
+            let _ = pidfd_send_signal(&doomed, Signal::KILL);
+            spawn::reap(doomed);
+        })
+    }
+
+    pub(super) fn kill(&self) {
+        // An error says that it has ended.
+        let _ = pidfd_send_signal(self.pidfd.get_ref(), Signal::KILL);
+    }
+
+    /// Waits for its end, for this time at most. For where nothing else can wait.
+    pub(super) fn ends_at_once(&self, within: Duration) -> bool {
+        let within = Timespec { tv_sec: 0, tv_nsec: i64::from(within.subsec_nanos()) };
+        let ended = poll(&mut [PollFd::new(self.pidfd.get_ref(), PollFlags::IN)], Some(&within));
+        ended == Ok(1) && !matches!(spawn::ending_of(self.pidfd.get_ref()), Ok(None))
+    }
+
+    /// How it has ended, if it does so in time.
+    pub(super) async fn ends_within(&self, time: Duration) -> Option<String> {
+        timeout(time, self.ended()).await.ok()
+    }
+
+    /// Resolves when it has ended. It is reaped then.
+    pub(super) async fn ended(&self) -> String {
+        loop {
+            // An error of the reactor's means that nothing will be told by it: what can be known is asked for.
+            let guard = self.pidfd.readable().await;
+            match spawn::ending_of(self.pidfd.get_ref()) {
+                Ok(Some(status)) => return in_words(&status),
+                Err(cause) => return format!("how is not known: {cause}; does the program ignore SIGCHLD?"),
+                Ok(None) => {}
+            }
+            match guard {
+                Ok(mut guard) => guard.clear_ready(),
+                Err(cause) => return format!("it cannot be watched: {cause}"),
+            }
+        }
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        self.kill();
+        spawn::reap(self.pidfd.get_ref().clone());
+    }
+}
+
+fn in_words(status: &WaitIdStatus) -> String {
+    if let Some(code) = status.exit_status() {
+        return format!("exit code {code}");
+    }
+    let dumped = if status.dumped() { ", core dumped" } else { "" };
+    match status.terminating_signal() {
+        Some(number) => format!("killed by signal {number} ({}){dumped}", signal_name(number)),
+        None => "nobody knows how".to_owned(),
+    }
+}
+
+fn signal_name(number: i32) -> &'static str {
+    match Signal::from_named_raw(number) {
+        Some(Signal::KILL) => "SIGKILL",
+        Some(Signal::SEGV) => "SIGSEGV",
+        Some(Signal::ABORT) => "SIGABRT",
+        Some(Signal::BUS) => "SIGBUS",
+        Some(Signal::ILL) => "SIGILL",
+        Some(Signal::FPE) => "SIGFPE",
+        Some(Signal::TERM) => "SIGTERM",
+        Some(Signal::INT) => "SIGINT",
+        Some(Signal::HUP) => "SIGHUP",
+        Some(Signal::QUIT) => "SIGQUIT",
+        Some(Signal::TRAP) => "SIGTRAP",
+        Some(Signal::SYS) => "SIGSYS",
+        Some(Signal::XCPU) => "SIGXCPU",
+        Some(_) | None => "see `kill -l`",
+    }
+}
