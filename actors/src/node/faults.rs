@@ -8,7 +8,7 @@ use sinew_runtime::{
     },
 };
 
-use super::{NodeBuilder, NodeHandle, SupervisorSpec, root::LAYERS};
+use super::{NodeBuilder, NodeHandle, SupervisorSpec, layers::LAYERS};
 use crate::stores::Stores;
 
 /// The environment's plan: for every node of the process, so that it may name actors of others.

@@ -17,6 +17,7 @@ mod commands;
 mod directory;
 #[cfg(feature = "fault-points")]
 mod faults;
+mod layers;
 mod root;
 mod supervisor_spec;
 mod tree;

@@ -4,7 +4,6 @@ use std::{
     cell::RefCell,
     rc::Rc,
     sync::{Arc, atomic::Ordering, mpsc::SyncSender},
-    time::Duration,
 };
 
 use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, fut::WrapFuture};
@@ -16,8 +15,8 @@ use sinew_runtime::{
     router::Outlet,
     sender::Sender,
     supervision::{
-        ChildId, ChildIds, ChildSpec, Input, Launch, Place, PlannedChild, Policy, ReadyGate, Reason, Roster,
-        Supervisor, SupervisorFact, SupervisorPlan, Threads, life,
+        ChildId, ChildIds, ChildSpec, Input, Place, PlannedChild, Policy, Reason, Roster, Supervisor,
+        SupervisorFact, SupervisorPlan, Threads,
     },
     tid::AppAddress,
     time::Time,
@@ -30,11 +29,12 @@ use super::{
     apps::Apps,
     commands::{Answers, Ordered},
     directory::NodeDirectory,
+    layers,
     supervisor_spec::{Member, SupervisorSpec},
     tree::SupervisionTree,
     wind_up::{self, Branch, Heirs},
 };
-use crate::{gncl, lncl, ndl, process, stores::Stores, sync};
+use crate::{lncl, process, stores::Stores};
 
 /// Confirmed messages and requests of one application under way at most.
 pub(crate) const WAITS_MAX: usize = 1_024;
@@ -150,7 +150,7 @@ impl Actor for Root {
         // First of all what is in the post already: perhaps an order to heed signals.
         context.add_stream(self.stores.posts.root.attach());
         let deadline = self.stores.config.sync.layer_deadline;
-        let layers = layers(&self.stores, &self.child_ids, deadline);
+        let layers = layers::specs(&self.stores, &self.child_ids, deadline);
         let post = self.stores.posts.root.clone();
         let listener = move |fact| tell(&post, RootEvent::Layers(fact));
         let plan = SupervisorPlan {
@@ -163,45 +163,6 @@ impl Actor for Root {
         let roster = self.heirs.run(Branch::Layers, supervisor, &self.stores, RootEvent::Layers);
         self.layer_supervisor = Some(roster);
     }
-}
-
-/// The layers' names, in the paper's order of start (section 6).
-pub(super) const LAYERS: [&str; 4] = ["LNCL", "sync manager", "GNCL", "NDL"];
-
-/// What a layer failed of, for who started the node. Most often it is not a fault of the layer, but of what it was given.
-fn in_one_line(layer: &str, reason: &Reason) -> String {
-    let why = if let Reason::Panic(said) = reason { said.clone() } else { reason.to_string() };
-    format!("{layer}: {}", why.split_whitespace().collect::<Vec<_>>().join(" "))
-}
-
-/// The layers in that order.
-fn layers(stores: &Arc<Stores>, ids: &ChildIds, deadline: Duration) -> Vec<ChildSpec> {
-    let child = |name: &str, thread: &str, launch: Launch| ChildSpec {
-        id: ids.next(),
-        name: name.to_owned(),
-        tid: None,
-        policy: Policy { start_within: deadline, ..Policy::default() },
-        place: Place::thread(thread),
-        #[cfg(feature = "fault-points")]
-        launch: stores.faults.arm(name, launch),
-        #[cfg(not(feature = "fault-points"))]
-        launch,
-    };
-    vec![
-        child(LAYERS[0], Place::IO, layer(stores, lncl::Lncl::new)),
-        child(LAYERS[1], "sync", layer(stores, sync::SyncManager::new)),
-        child(LAYERS[2], Place::IO, layer(stores, gncl::Gncl::new)),
-        child(LAYERS[3], "ndl", layer(stores, ndl::NdlActor::new)),
-    ]
-}
-
-/// How a layer's actor is made, each time anew.
-fn layer<A>(stores: &Arc<Stores>, make: fn(Arc<Stores>, ReadyGate) -> A) -> Launch
-where
-    A: Actor<Context = Context<A>>,
-{
-    let stores = stores.clone();
-    Arc::new(move |ready| life(Context::new().into_future(make(stores.clone(), ready))))
 }
 
 fn tell(post: &Post<RootEvent>, event: RootEvent) {
@@ -256,7 +217,7 @@ impl Root {
             SupervisorFact::AllReady if self.phase == Phase::StartingLayers => self.start_apps(),
             SupervisorFact::Failed(id, reason) | SupervisorFact::Gone(id, reason) if reason.is_failure() => {
                 let who = self.layer_supervisor.as_ref().and_then(|roster| roster.who(id));
-                self.last_layer_fault = who.map(|who| in_one_line(&who.name, &reason));
+                self.last_layer_fault = who.map(|who| layers::fault_in_one_line(&who.name, &reason));
             }
             SupervisorFact::Failed(..) | SupervisorFact::Gone(..) => {}
             SupervisorFact::Ended(reason) => self.layers_ended(&reason, context),
@@ -483,21 +444,5 @@ impl Root {
 fn order(supervisor: &Roster, input: Input) {
     if let Err(lost) = supervisor.tell(input) {
         tracing::error!(?lost, "a supervisor's post is full");
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_a_layer_failed_of_is_one_line_that_begins_with_its_name() {
-        let panic =
-            Reason::Panic("address 127.0.0.1 is used already;\n    set `address` at ndl.rs:1".to_owned());
-        assert_eq!(
-            in_one_line("NDL", &panic),
-            "NDL: address 127.0.0.1 is used already; set `address` at ndl.rs:1"
-        );
-        assert_eq!(in_one_line("GNCL", &Reason::StartTimeout), "GNCL: did not become ready in its time");
     }
 }

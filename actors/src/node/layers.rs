@@ -1,0 +1,66 @@
+//! The layers of a node, as children of its supervisor.
+
+use std::{sync::Arc, time::Duration};
+
+use actix::{Actor, Context};
+use sinew_runtime::supervision::{ChildIds, ChildSpec, Launch, Place, Policy, ReadyGate, Reason, life};
+
+use crate::{gncl, lncl, ndl, stores::Stores, sync};
+
+/// The layers' names, in the paper's order of start (section 6).
+pub(super) const LAYERS: [&str; 4] = ["LNCL", "sync manager", "GNCL", "NDL"];
+
+/// The layers in that order.
+pub(super) fn specs(stores: &Arc<Stores>, ids: &ChildIds, deadline: Duration) -> Vec<ChildSpec> {
+    let child = |name: &str, thread: &str, launch: Launch| ChildSpec {
+        id: ids.next(),
+        name: name.to_owned(),
+        tid: None,
+        policy: Policy { start_within: deadline, ..Policy::default() },
+        place: Place::thread(thread),
+        #[cfg(feature = "fault-points")]
+        launch: stores.faults.arm(name, launch),
+        #[cfg(not(feature = "fault-points"))]
+        launch,
+    };
+    vec![
+        child(LAYERS[0], Place::IO, layer(stores, lncl::Lncl::new)),
+        child(LAYERS[1], "sync", layer(stores, sync::SyncManager::new)),
+        child(LAYERS[2], Place::IO, layer(stores, gncl::Gncl::new)),
+        child(LAYERS[3], "ndl", layer(stores, ndl::NdlActor::new)),
+    ]
+}
+
+/// How a layer's actor is made, each time anew.
+fn layer<A>(stores: &Arc<Stores>, make: fn(Arc<Stores>, ReadyGate) -> A) -> Launch
+where
+    A: Actor<Context = Context<A>>,
+{
+    let stores = stores.clone();
+    Arc::new(move |ready| life(Context::new().into_future(make(stores.clone(), ready))))
+}
+
+/// What a layer failed of, for who started the node. Most often it is not a fault of the layer, but of what it was given.
+pub(super) fn fault_in_one_line(layer: &str, reason: &Reason) -> String {
+    let why = if let Reason::Panic(said) = reason { said.clone() } else { reason.to_string() };
+    format!("{layer}: {}", why.split_whitespace().collect::<Vec<_>>().join(" "))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_layer_failed_of_is_one_line_that_begins_with_its_name() {
+        let panic =
+            Reason::Panic("address 127.0.0.1 is used already;\n    set `address` at ndl.rs:1".to_owned());
+        assert_eq!(
+            fault_in_one_line("NDL", &panic),
+            "NDL: address 127.0.0.1 is used already; set `address` at ndl.rs:1"
+        );
+        assert_eq!(
+            fault_in_one_line("GNCL", &Reason::StartTimeout),
+            "GNCL: did not become ready in its time"
+        );
+    }
+}
