@@ -8,10 +8,11 @@ use std::{cell::RefCell, collections::BTreeMap, rc::Rc, sync::Arc};
 use sinew_runtime::{
     app::DynApp,
     mailbox::Mailbox,
-    supervision::{ChildId, SupervisorFact},
+    supervision::{ChildId, Place, SupervisorFact},
     tid::{AppAddress, Tid},
 };
 
+use super::{StartError, places};
 use crate::{lncl, stores::Stores};
 
 /// Who the children of the applications' supervisors are. Clones are the same table.
@@ -27,9 +28,10 @@ struct Table {
 }
 
 struct App {
+    name: String,
     tid: Tid,
     mailbox: Arc<Mailbox>,
-    own_process: bool,
+    place: Place,
     progress: Progress,
 }
 
@@ -49,8 +51,8 @@ impl Apps {
         let mut table = self.0.borrow_mut();
         table.by_address.insert(tid.app, id);
         table.names.insert(app.name().to_owned(), id);
-        let own_process = app.place().own_process;
-        table.apps.insert(id, App { tid, mailbox, own_process, progress: Progress::Coming });
+        let (name, place) = (app.name().to_owned(), app.place().clone());
+        table.apps.insert(id, App { name, tid, mailbox, place, progress: Progress::Coming });
     }
 
     /// A supervisor of applications.
@@ -75,7 +77,14 @@ impl Apps {
 
     /// Its mailbox, and whether it has a process of its own.
     pub(super) fn mailbox(&self, id: ChildId) -> Option<(Arc<Mailbox>, bool)> {
-        self.0.borrow().apps.get(&id).map(|app| (app.mailbox.clone(), app.own_process))
+        self.0.borrow().apps.get(&id).map(|app| (app.mailbox.clone(), app.place.own_process))
+    }
+
+    /// Refuses one that wants a thread to be what it cannot be for those that are there.
+    pub(super) fn check_place(&self, app: &DynApp) -> Result<(), StartError> {
+        let table = self.0.borrow();
+        let places = table.apps.values().map(|other| (&*other.name, &other.place));
+        places::check(app.name(), app.place(), places)
     }
 
     /// Whether every application runs that has not ended for good.

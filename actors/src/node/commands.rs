@@ -167,6 +167,7 @@ impl Root {
         if self.apps.named(app.name()).is_some() {
             return Err(StartError::SameName(app.name().to_owned()).into());
         }
+        self.apps.check_place(app)?;
         let spec = self.register(app)?;
         let id = spec.id;
         if roster.bring(under, spec).is_err() {

@@ -12,22 +12,22 @@ pub(super) const LAYERS: [&str; 4] = ["LNCL", "sync manager", "GNCL", "NDL"];
 
 /// The layers in that order.
 pub(super) fn specs(stores: &Arc<Stores>, ids: &ChildIds, deadline: Duration) -> Vec<ChildSpec> {
-    let child = |name: &str, thread: &str, launch: Launch| ChildSpec {
+    let child = |name: &str, place: Place, launch: Launch| ChildSpec {
         id: ids.next(),
         name: name.to_owned(),
         tid: None,
         policy: Policy { start_within: deadline, ..Policy::default() },
-        place: Place::thread(thread),
+        place,
         #[cfg(feature = "fault-points")]
         launch: stores.faults.arm(name, launch),
         #[cfg(not(feature = "fault-points"))]
         launch,
     };
     vec![
-        child(LAYERS[0], Place::IO, layer(stores, lncl::Lncl::new)),
-        child(LAYERS[1], "sync", layer(stores, sync::SyncManager::new)),
-        child(LAYERS[2], Place::IO, layer(stores, gncl::Gncl::new)),
-        child(LAYERS[3], "ndl", layer(stores, ndl::NdlActor::new)),
+        child(LAYERS[0], Place::io(), layer(stores, lncl::Lncl::new)),
+        child(LAYERS[1], Place::layer("sync"), layer(stores, sync::SyncManager::new)),
+        child(LAYERS[2], Place::io(), layer(stores, gncl::Gncl::new)),
+        child(LAYERS[3], Place::layer("ndl"), layer(stores, ndl::NdlActor::new)),
     ]
 }
 

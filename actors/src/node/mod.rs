@@ -18,6 +18,7 @@ mod directory;
 #[cfg(feature = "fault-points")]
 mod faults;
 mod layers;
+mod places;
 mod root;
 mod supervisor_spec;
 mod tree;

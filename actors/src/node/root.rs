@@ -338,7 +338,7 @@ impl Root {
         let wiring = AppWiring { sender, mailbox };
         self.absences.keep(id, app.absence(wiring.clone()));
         let (place, launch) = match hosted {
-            Some(link) => (Place::thread(Place::IO), link.launch(&self.stores, wiring.sender, app)),
+            Some(link) => (Place::io(), link.launch(&self.stores, wiring.sender, app)),
             None => (app.place().clone(), app.launch(wiring)),
         };
         #[cfg(feature = "fault-points")]

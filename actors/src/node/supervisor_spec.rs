@@ -10,7 +10,7 @@ use sinew_runtime::{
     supervision::{AutoShutdown, Flags, Intensity, Policy, Restart, Strategy},
 };
 
-use super::StartError;
+use super::{StartError, places};
 
 /// Declares a supervisor: who is restarted when one of its children fails, how often, and who its children are. Children are
 /// applications and supervisors, in the order of their start; they are stopped in the reverse order.
@@ -173,6 +173,7 @@ impl SupervisorSpec {
         let mut names = BTreeSet::new();
         self.check_names(&mut names)?;
         self.check_significance()?;
+        self.check_places()?;
         let mut edges = Edges::default();
         self.enter(&mut edges);
         edges.check()
@@ -186,6 +187,15 @@ impl SupervisorSpec {
             if let Member::Supervisor(below) = member {
                 below.check_names(names)?;
             }
+        }
+        Ok(())
+    }
+
+    fn check_places(&self) -> Result<(), StartError> {
+        let apps = self.apps();
+        for (index, app) in apps.iter().enumerate() {
+            let before = apps[..index].iter().map(|other| (other.name(), other.place()));
+            places::check(app.name(), app.place(), before)?;
         }
         Ok(())
     }

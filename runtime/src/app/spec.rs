@@ -125,30 +125,28 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
 
     /// It has a thread of its own: isolation, for one more thread wake each way.
     #[must_use]
-    pub fn own_thread(mut self) -> Self {
-        self.common.place = Place::thread(self.common.name.clone());
-        self
+    pub fn own_thread(self) -> Self {
+        self.place(Place::own_thread())
     }
 
     /// It has a process of its own, a child of the node's: nothing that it does harms the node, and it can be killed. See
     /// [`Place::process`].
     #[must_use]
-    pub fn own_process(mut self) -> Self {
-        self.common.place = Place::process();
-        self
+    pub fn own_process(self) -> Self {
+        self.place(Place::process())
     }
 
     /// It shares the thread that reads the node's sockets: the lowest latency; its handlers must be short.
     #[must_use]
-    pub fn on_io_thread(mut self) -> Self {
-        self.common.place = Place::thread(Place::IO);
-        self
+    pub fn on_io_thread(self) -> Self {
+        self.place(Place::io())
     }
 
-    /// It runs in this place: a thread with a name, and perhaps a real-time priority and a CPU.
+    /// It runs in this place: a thread with a name, and perhaps a real-time priority and a CPU. A node in which two ask
+    /// for different priorities or CPUs of one thread does not start.
     #[must_use]
     pub fn place(mut self, place: Place) -> Self {
-        self.common.place = place;
+        self.common.place = place.of_application(&self.common.name);
         self
     }
 

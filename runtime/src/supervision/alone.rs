@@ -13,8 +13,9 @@ use super::{
     Launch, ReadyGate, Reason,
     guard::{Guard, life},
     panics::install_hook,
+    place::Place,
     tenant::{Fate, Report, Tenant},
-    threads::{Place, Seat},
+    threads::Seat,
     vitals::Vitals,
     watchdog::Watchdog,
 };

@@ -8,6 +8,7 @@
 //! | `alone` | one actor under a guard and under no supervisor |
 //! | `roster` | who is supervised, for the supervisor's owner |
 //! | `ready` | when an actor may say that it is ready |
+//! | `place` | where an actor is to run |
 //! | `threads` | where actors live |
 //! | `tenant` | one life of an actor, as its supervisor, its thread and the watchdog hold it |
 //! | `vitals` | its signs of life, and its fence |
@@ -21,6 +22,7 @@ pub mod core;
 pub mod fault;
 mod guard;
 mod panics;
+mod place;
 mod ready;
 mod roster;
 mod supervisor;
@@ -37,9 +39,10 @@ pub use self::{
     },
     guard::{Life, life},
     panics::UNWINDS,
+    place::{Owner, Place},
     ready::{ReadyGate, ReadyPart},
     roster::{Listed, Roster},
     supervisor::{ChildSpec, Launch, PlannedChild, Supervisor, SupervisorFact, SupervisorPlan},
-    threads::{Place, Threads},
+    threads::Threads,
     vitals::{at_fence, is_fenced},
 };

@@ -244,7 +244,9 @@ impl Supervisor {
     }
 
     fn forget(&mut self, id: ChildId) {
-        self.children.remove(&id);
+        if let Some(child) = self.children.remove(&id) {
+            self.threads.borrow_mut().leave(&child.spec.place);
+        }
         self.roster.strike(id);
     }
 
@@ -281,10 +283,7 @@ impl Supervisor {
         let post = self.post.clone();
         let (thread, seat) = match threads.get(&spec.place) {
             Ok(found) => found,
-            Err(error) => {
-                let why = format!("there is no thread for it: {error}; raise `ulimit -u` and `ulimit -n`");
-                return say(&post, Input::Ended(id, generation, Reason::GaveUp(why)));
-            }
+            Err(why) => return say(&post, Input::Ended(id, generation, Reason::GaveUp(why))),
         };
         let report = Box::new(move |fate| match fate {
             Fate::Hung(reason) => say(&post, Input::Hung(id, generation, reason)),

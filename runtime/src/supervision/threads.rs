@@ -3,7 +3,6 @@
 use std::{
     cell::RefCell,
     collections::BTreeMap,
-    ffi::CString,
     sync::{
         Arc, Mutex,
         atomic::{AtomicBool, AtomicI32, AtomicUsize, Ordering},
@@ -12,106 +11,22 @@ use std::{
 
 use actix_rt::{Arbiter, ArbiterHandle};
 use thread_priority::{
-    NormalThreadSchedulePolicy, RealtimeThreadSchedulePolicy, ThreadId, ThreadPriority, ThreadSchedulePolicy,
+    NormalThreadSchedulePolicy, ThreadId, ThreadPriority, ThreadSchedulePolicy,
     set_thread_priority_and_policy, thread_native_id,
 };
 
 use super::{
-    Reason,
+    Place, Reason,
+    place::Owner,
     tenant::{Fate, Tenant, WeakTenant},
     watchdog::Watchdog,
 };
 use crate::post::lock;
 
-/// Where an actor runs: a thread with a name. Actors with the same name share it.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Place {
-    /// Name of the thread; the kernel shows its first 15 bytes.
-    pub thread: String,
-    /// SCHED_FIFO priority, 1 to 99. Where the system refuses it, the node says so once and goes on without.
-    pub realtime_priority: Option<u8>,
-    /// The one CPU that the thread may run on.
-    pub cpu: Option<usize>,
-    /// The thread is in a process of its own, a child of the node's.
-    pub own_process: bool,
-}
-
-impl Place {
-    /// Name of the thread that reads the node's sockets.
-    pub const IO: &'static str = "io";
-
-    /// The thread called `name`, scheduled like any other.
-    #[must_use]
-    pub fn thread(name: impl Into<String>) -> Self {
-        Self { thread: name.into(), realtime_priority: None, cpu: None, own_process: false }
-    }
-
-    /// A process of its own, a child of the node's: its thread is called like the application.
-    #[must_use]
-    pub const fn process() -> Self {
-        Self { thread: String::new(), realtime_priority: None, cpu: None, own_process: true }
-    }
-
-    /// The same thread under SCHED_FIFO with this priority, 1 to 99.
-    #[must_use]
-    pub const fn realtime(mut self, priority: u8) -> Self {
-        self.realtime_priority = Some(priority);
-        self
-    }
-
-    /// The same thread on one CPU only.
-    #[must_use]
-    pub const fn on_cpu(mut self, cpu: usize) -> Self {
-        self.cpu = Some(cpu);
-        self
-    }
-
-    /// Makes the calling thread, which is new, the thread of this place.
-    pub fn prepare(&self) {
-        let name: Vec<u8> = self.thread.bytes().filter(|byte| *byte != 0).take(15).collect();
-        if let Ok(name) = CString::new(name) {
-            // Only for people who look at the process; nothing depends on it.
-            let _ = rustix::thread::set_name(&name);
-        }
-        if let Some(cpu) = self.cpu {
-            let mut set = rustix::thread::CpuSet::new();
-            if cpu < rustix::thread::CpuSet::MAX_CPU {
-                set.set(cpu);
-            }
-            if let Err(error) = rustix::thread::sched_setaffinity(None, &set) {
-                tracing::warn!(thread = self.thread, cpu, %error, "the thread stays on any CPU; does this one exist?");
-            }
-        }
-        if let Some(priority) = self.realtime_priority {
-            self.make_realtime(priority);
-        }
-    }
-
-    fn make_realtime(&self, priority: u8) {
-        if let Err(error) = make_realtime(priority) {
-            tracing::warn!(
-                thread = self.thread,
-                priority,
-                ?error,
-                "the system refuses a real-time priority; allow it with `ulimit -r 99` or `setcap cap_sys_nice+ep` on the program"
-            );
-        }
-    }
-}
-
-/// Puts the calling thread under SCHED_FIFO with this priority, 1 to 99.
-pub(super) fn make_realtime(priority: u8) -> Result<(), thread_priority::Error> {
-    let level = priority
-        .try_into()
-        .map_err(|_| thread_priority::Error::Priority("a real-time priority is 1 to 99"))?;
-    let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
-    set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(level), policy)
-}
-
 /// One thread of a node, from its making to its end.
 #[derive(Debug)]
 pub(super) struct Seat {
-    name: String,
+    place: Place,
     /// The kernel's number of the thread, while it lives.
     tid: AtomicI32,
     /// What a thread's priority is set by. Held by whoever sets it, so that the thread does not end meanwhile.
@@ -126,7 +41,7 @@ pub(super) struct Seat {
 impl Seat {
     fn new(place: &Place, abandoned: Arc<AtomicUsize>) -> Arc<Self> {
         Arc::new(Self {
-            name: place.thread.clone(),
+            place: place.clone(),
             tid: AtomicI32::new(0),
             native: Mutex::new(None),
             given_up: AtomicBool::new(false),
@@ -211,7 +126,7 @@ impl Drop for Occupied {
 /// The threads of a node. Made when the first actor needs them; used on the node's root thread only.
 #[derive(Debug, Default)]
 pub struct Threads {
-    arbiters: BTreeMap<String, (Arbiter, Arc<Seat>)>,
+    arbiters: BTreeMap<(Owner, String), (Arbiter, Arc<Seat>)>,
     watchdog: Watchdog,
     abandoned: Arc<AtomicUsize>,
 }
@@ -220,12 +135,21 @@ impl Threads {
     /// The thread of `place`, a new one if it has none that lives.
     ///
     /// # Errors
-    /// The system gives no thread, or no descriptors for its reactor.
-    pub(super) fn get(&mut self, place: &Place) -> std::io::Result<(ArbiterHandle, Arc<Seat>)> {
+    /// In words: the system gives no thread, or no descriptors for its reactor; or the thread has another real-time
+    /// priority or CPU than `place` asks for.
+    pub(super) fn get(&mut self, place: &Place) -> Result<(ArbiterHandle, Arc<Seat>), String> {
         self.arbiters.retain(|_, (arbiter, _)| arbiter.alive());
-        if let Some((arbiter, seat)) = self.arbiters.get(&place.thread) {
-            return Ok((arbiter.handle(), seat.clone()));
+        if let Some((arbiter, seat)) = self.arbiters.get(&place.key()) {
+            return match seat.place.clash(place) {
+                None => Ok((arbiter.handle(), seat.clone())),
+                Some(why) => Err(format!("{why}; give all who live there the same")),
+            };
         }
+        let made = self.make(place);
+        made.map_err(|error| format!("there is no thread for it: {error}; raise `ulimit -u` and `ulimit -n`"))
+    }
+
+    fn make(&mut self, place: &Place) -> std::io::Result<(ArbiterHandle, Arc<Seat>)> {
         let seat = Seat::new(place, self.abandoned.clone());
         let (prepared, occupied) = (place.clone(), seat.clone());
         let arbiter = Arbiter::try_with_tokio_rt(move || {
@@ -234,8 +158,22 @@ impl Threads {
             tokio::runtime::Builder::new_current_thread().enable_all().build()
         })?;
         let handle = arbiter.handle();
-        self.arbiters.insert(place.thread.clone(), (arbiter, seat.clone()));
+        self.arbiters.insert(place.key(), (arbiter, seat.clone()));
         Ok((handle, seat))
+    }
+
+    /// Somebody who lived at `place` will never again: its thread ends, unless it has other tenants.
+    pub(super) fn leave(&mut self, place: &Place) {
+        let is_empty = |seat: &Seat| lock(&seat.tenants).iter().all(|tenant| tenant.living().is_none());
+        if self.arbiters.get(&place.key()).is_some_and(|(_, seat)| is_empty(seat)) {
+            self.end(&place.key());
+        }
+    }
+
+    fn end(&mut self, key: &(Owner, String)) {
+        if let Some((arbiter, _)) = self.arbiters.remove(key) {
+            arbiter.stop();
+        }
     }
 
     /// A life moves in: its thread knows it, and the watchdog watches it.
@@ -257,7 +195,7 @@ impl Threads {
             .filter_map(WeakTenant::living)
             .filter(|other| !Arc::ptr_eq(other.vitals(), hung.vitals()))
             .collect();
-        let (thread, child) = (&seat.name, hung.vitals().name());
+        let (thread, child) = (&seat.place.thread, hung.vitals().name());
         tracing::error!(
             child,
             thread,
@@ -269,9 +207,9 @@ impl Threads {
             neighbour.kill();
             neighbour.report(Fate::Ended(Reason::ThreadEnded));
         }
-        let is_present = self.arbiters.get(thread).is_some_and(|(_, present)| Arc::ptr_eq(present, seat));
-        if is_present && let Some((arbiter, _)) = self.arbiters.remove(thread) {
-            arbiter.stop();
+        let key = seat.place.key();
+        if self.arbiters.get(&key).is_some_and(|(_, present)| Arc::ptr_eq(present, seat)) {
+            self.end(&key);
         }
     }
 

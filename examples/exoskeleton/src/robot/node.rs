@@ -164,7 +164,7 @@ fn tell_lost_rows(lost: u64) {
 fn place(topology: &Topology) -> Place {
     let control = topology.control;
     let place = match control.thread {
-        ControlThread::Io => Place::thread(Place::IO),
+        ControlThread::Io => Place::io(),
         ControlThread::Own => Place::thread("control"),
     };
     match control.realtime_priority {

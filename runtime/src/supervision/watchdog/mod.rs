@@ -23,8 +23,8 @@ use suspect::{Hang, Look, Stall, StallSuspect, TurnSuspect};
 use super::{
     Reason,
     panics::words,
+    place::make_realtime,
     tenant::{Fate, Tenant},
-    threads::make_realtime,
 };
 use crate::{post::lock, time::Time};
 

@@ -1,0 +1,56 @@
+//! Whether the threads that applications ask for can be as they ask.
+
+use sinew_runtime::supervision::Place;
+
+use super::StartError;
+
+/// Refuses the application `name` if it asks for a thread that has another priority or CPU: the node's own, or for one of
+/// `others`.
+pub(super) fn check<'a>(
+    name: &str,
+    place: &Place,
+    others: impl IntoIterator<Item = (&'a str, &'a Place)>,
+) -> Result<(), StartError> {
+    let clash = match Place::io().clash(place) {
+        Some(why) => {
+            Some(format!("{why}; it is the node's: take `Place::thread` or `Place::own_thread` for that"))
+        }
+        None => others.into_iter().find_map(|(other, theirs)| {
+            let why = theirs.clash(place)?;
+            Some(format!(
+                "{why}: so '{other}' asked before it; give both the same, or one of them another thread"
+            ))
+        }),
+    };
+    clash.map_or(Ok(()), |why| Err(StartError::Application { name: name.to_owned(), why }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_wants_the_nodes_thread_to_be_another_is_told_what_to_take_instead() {
+        let words = |place| check("control", &place, []).expect_err("it is refused").to_string();
+        assert_eq!(
+            words(Place::io().realtime(50)),
+            "application 'control' cannot be registered: the thread 'io' has no real-time priority on any CPU, and cannot \
+             have real-time priority 50 on any CPU as well; it is the node's: take `Place::thread` or `Place::own_thread` \
+             for that"
+        );
+        for place in [Place::io(), Place::thread("io").realtime(50), Place::process().realtime(50)] {
+            assert!(check("control", &place, []).is_ok(), "{place:?}");
+        }
+    }
+
+    #[test]
+    fn two_that_want_one_thread_to_be_different_are_both_named() {
+        let fast = Place::thread("leg").realtime(50);
+        let others = [("apps", &Place::thread("apps")), ("knee", &fast)];
+        let error =
+            check("hip", &Place::thread("leg"), others).expect_err("one of them would have been lost");
+        let words = error.to_string();
+        assert!(words.contains("'hip'") && words.contains("'knee' asked before it"), "{words}");
+        assert!(check("hip", &fast, others).is_ok());
+    }
+}

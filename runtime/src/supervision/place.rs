@@ -1,0 +1,189 @@
+//! Where an actor runs: a thread with a name, or a process of its own.
+
+use std::ffi::CString;
+
+use thread_priority::{
+    RealtimeThreadSchedulePolicy, ThreadPriority, ThreadSchedulePolicy, set_thread_priority_and_policy,
+    thread_native_id,
+};
+
+/// Where an actor runs: a thread with a name. Actors that name the same one share it; what they ask of it besides must be the
+/// same, too.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Place {
+    /// Name of the thread; the kernel shows its first 15 bytes.
+    pub thread: String,
+    /// Whose thread it is.
+    pub owner: Owner,
+    /// SCHED_FIFO priority, 1 to 99. Where the system refuses it, the node says so once and goes on without.
+    pub realtime_priority: Option<u8>,
+    /// The one CPU that the thread may run on.
+    pub cpu: Option<usize>,
+    /// The thread is in a process of its own, a child of the node's.
+    pub own_process: bool,
+}
+
+/// Whose a thread is. Threads of the same name and of different owners are different threads: nobody comes to live on another
+/// one's because he happens to be called like it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Owner {
+    /// The node's: its layers live there, and on the one that reads its sockets whoever asks for [`Place::io`].
+    Node,
+    /// Everybody's who names it.
+    Everybody,
+    /// The application's that it is called like, and nobody else's.
+    Application,
+}
+
+impl Place {
+    const fn of(owner: Owner, thread: String) -> Self {
+        Self { thread, owner, realtime_priority: None, cpu: None, own_process: false }
+    }
+
+    /// The thread called `name`, scheduled like any other, shared by all who name it. Those that name none share the one called
+    /// `apps`.
+    #[must_use]
+    pub fn thread(name: impl Into<String>) -> Self {
+        Self::of(Owner::Everybody, name.into())
+    }
+
+    /// A thread that is shared with nobody, called like the application that has it: its declaration fills the name in.
+    #[must_use]
+    pub const fn own_thread() -> Self {
+        Self::of(Owner::Application, String::new())
+    }
+
+    /// The place of the application called `name`.
+    #[must_use]
+    pub(crate) fn of_application(mut self, name: &str) -> Self {
+        if self.owner == Owner::Application {
+            name.clone_into(&mut self.thread);
+        }
+        self
+    }
+
+    /// The thread that reads the node's sockets. Its priority and its CPU are the node's.
+    #[must_use]
+    pub fn io() -> Self {
+        Self::layer("io")
+    }
+
+    /// A thread for layers of the node.
+    #[must_use]
+    pub fn layer(name: impl Into<String>) -> Self {
+        Self::of(Owner::Node, name.into())
+    }
+
+    /// A process of its own, a child of the node's: its thread is called like the application.
+    #[must_use]
+    pub const fn process() -> Self {
+        let mut place = Self::own_thread();
+        place.own_process = true;
+        place
+    }
+
+    /// The same thread under SCHED_FIFO with this priority, 1 to 99.
+    #[must_use]
+    pub const fn realtime(mut self, priority: u8) -> Self {
+        self.realtime_priority = Some(priority);
+        self
+    }
+
+    /// The same thread on one CPU only.
+    #[must_use]
+    pub const fn on_cpu(mut self, cpu: usize) -> Self {
+        self.cpu = Some(cpu);
+        self
+    }
+
+    /// Which thread of a node this is.
+    pub(super) fn key(&self) -> (Owner, String) {
+        (self.owner, self.thread.clone())
+    }
+
+    /// What is wrong with `other`, if it names this thread and asks for another priority or CPU. In words, without a remedy.
+    #[must_use]
+    pub fn clash(&self, other: &Self) -> Option<String> {
+        let is_same =
+            (self.owner, &self.thread, self.own_process) == (other.owner, &other.thread, other.own_process);
+        let wants_the_same = (self.realtime_priority, self.cpu) == (other.realtime_priority, other.cpu);
+        // Each process has its own thread.
+        if self.own_process || !is_same || wants_the_same {
+            return None;
+        }
+        let (thread, has, asked) = (&self.thread, self.scheduling(), other.scheduling());
+        Some(format!("the thread '{thread}' has {has}, and cannot have {asked} as well"))
+    }
+
+    fn scheduling(&self) -> String {
+        let priority = match self.realtime_priority {
+            Some(priority) => format!("real-time priority {priority}"),
+            None => "no real-time priority".to_owned(),
+        };
+        match self.cpu {
+            Some(cpu) => format!("{priority} on CPU {cpu}"),
+            None => format!("{priority} on any CPU"),
+        }
+    }
+
+    /// Makes the calling thread, which is new, the thread of this place.
+    pub fn prepare(&self) {
+        let name: Vec<u8> = self.thread.bytes().filter(|byte| *byte != 0).take(15).collect();
+        if let Ok(name) = CString::new(name) {
+            // Only for people who look at the process; nothing depends on it.
+            let _ = rustix::thread::set_name(&name);
+        }
+        if let Some(cpu) = self.cpu {
+            let mut set = rustix::thread::CpuSet::new();
+            if cpu < rustix::thread::CpuSet::MAX_CPU {
+                set.set(cpu);
+            }
+            if let Err(error) = rustix::thread::sched_setaffinity(None, &set) {
+                tracing::warn!(thread = self.thread, cpu, %error, "the thread stays on any CPU; does this one exist?");
+            }
+        }
+        if let Some(priority) = self.realtime_priority {
+            self.make_realtime(priority);
+        }
+    }
+
+    fn make_realtime(&self, priority: u8) {
+        if let Err(error) = make_realtime(priority) {
+            tracing::warn!(
+                thread = self.thread,
+                priority,
+                ?error,
+                "the system refuses a real-time priority; allow it with `ulimit -r 99` or `setcap cap_sys_nice+ep` on the program"
+            );
+        }
+    }
+}
+
+/// Puts the calling thread under SCHED_FIFO with this priority, 1 to 99.
+pub(super) fn make_realtime(priority: u8) -> Result<(), thread_priority::Error> {
+    let level = priority
+        .try_into()
+        .map_err(|_| thread_priority::Error::Priority("a real-time priority is 1 to 99"))?;
+    let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
+    set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(level), policy)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_thread_that_two_name_has_one_priority_and_one_cpu() {
+        let leg = || Place::thread("leg");
+        let words = leg().realtime(40).clash(&leg().on_cpu(1)).expect("they ask for different things");
+        assert_eq!(
+            words,
+            "the thread 'leg' has real-time priority 40 on any CPU, and cannot have no real-time priority on CPU 1 as well"
+        );
+        assert_eq!(leg().realtime(40).clash(&leg().realtime(40)), None);
+        assert_eq!(leg().clash(&Place::thread("arm").realtime(40)), None);
+        let own = Place::own_thread().of_application("leg").realtime(40);
+        assert_eq!(leg().clash(&own), None, "that is another thread");
+        assert_eq!(Place::process().clash(&Place::process().realtime(40)), None, "each has its own");
+    }
+}
