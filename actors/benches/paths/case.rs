@@ -6,12 +6,9 @@ use std::{
 };
 
 use rustix::thread::{CpuSet, sched_setaffinity};
+use sinew_figures::{Beside, Figures};
 
-use crate::{
-    ROLE,
-    measure::{Figures, Run, report},
-    raw, sinew_ends,
-};
+use crate::{ROLE, raw, sinew_ends};
 
 /// One path, measured against one reference.
 pub(crate) struct Case {
@@ -156,15 +153,17 @@ pub(crate) fn measure(name: &str, pinning: &str) {
         Path::TwoNodesIo => (two_nodes("node_io", bytes, pinning), raw_pair("raw_tcp", bytes, pinning)),
         Path::TwoNodesOwn => (two_nodes("node_own", bytes, pinning), raw_pair("raw_tcp", bytes, pinning)),
     };
-    report(&Run {
+    Beside {
         bench: "paths",
         case: case.name,
         payload_bytes: bytes,
         pinning: pinning.name(),
+        pace: "back_to_back",
         seen: &seen,
         reference: case.reference,
         raw: &reference,
-    });
+    }
+    .report();
 }
 
 /// The echoing end, in a process of its own: prints a line when it can be reached, ends when its input does.

@@ -5,7 +5,6 @@
 //! microseconds, there and back. Nothing here asserts a time.
 
 mod case;
-mod measure;
 mod raw;
 mod sinew_ends;
 
@@ -15,14 +14,17 @@ use case::{CASES, Case, Pinning};
 
 /// The role of a process that this program starts of itself.
 const ROLE: &str = "SINEW_PATHS_ROLE";
+/// Round trips that are not counted.
+const WARM_UP: u64 = 1_000;
+/// Round trips that are.
+const ROUNDS: u64 = 20_000;
 
 fn main() -> ExitCode {
     if let Ok(role) = std::env::var(ROLE) {
         return play(&role);
     }
     let wanted: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with('-')).collect();
-    let machine = measure::machine();
-    eprintln!("machine: {machine}");
+    eprintln!("machine: {}", sinew_figures::machine());
     let mut failed = false;
     for case in CASES.iter().filter(|case| wanted.is_empty() || wanted.iter().any(|w| case.name.contains(w)))
     {

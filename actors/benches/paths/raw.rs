@@ -10,11 +10,9 @@ use std::{
 
 use actix::{Actor, Context, Handler, Message};
 use actix_rt::Arbiter;
+use sinew_figures::Figures;
 
-use crate::{
-    case::Pinning,
-    measure::{Figures, ROUNDS, WARM_UP},
-};
+use crate::{ROUNDS, WARM_UP, case::Pinning};
 
 /// Echoes on a unix stream at `path`: blocks of the length that comes first.
 pub(crate) fn echo_unix(path: &str) {

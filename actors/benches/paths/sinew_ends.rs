@@ -10,10 +10,11 @@ use std::{
 
 use serde::{Deserialize, Serialize};
 use sinew::{NodeApi, Registration, prelude::*};
+use sinew_figures::Figures;
 
 use crate::{
+    ROUNDS, WARM_UP,
     case::{Echo, Pinning},
-    measure::{Figures, ROUNDS, WARM_UP},
 };
 
 /// No wait of this bench is longer.

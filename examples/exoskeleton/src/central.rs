@@ -21,7 +21,7 @@
 
 mod drives;
 
-use crate::control::admission::{Admission, Stamped};
+use crate::control::admission::{Admission, Stamp, Stamped};
 use crate::joint::{Joint, PerJoint};
 use crate::leg::{BODY_MASS_KG, GRAVITY_M_S2};
 use crate::message::{DriveStatus, FootLoad, GaitMode, GaitState, JointSample, Stance};
@@ -439,14 +439,8 @@ fn load_bw(load: &FootLoad) -> f64 {
 }
 
 impl Stamped for FootLoad {
-    fn t_ns(&self) -> u64 {
-        self.t_ns
-    }
-    fn seq(&self) -> u32 {
-        self.seq
-    }
-    fn epoch(&self) -> u32 {
-        0
+    fn stamp(&self) -> Stamp {
+        Stamp { t_ns: self.t_ns, seq: self.seq, epoch: 0 }
     }
     fn is_finite(&self) -> bool {
         self.heel_n.is_finite() && self.toe_n.is_finite()

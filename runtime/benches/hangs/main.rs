@@ -7,8 +7,6 @@
 
 #![expect(clippy::unwrap_used, reason = "a bench says what failed by failing")]
 
-#[path = "../figures/mod.rs"]
-mod figures;
 #[path = "../../tests/stage/mod.rs"]
 #[expect(dead_code, reason = "the tests need more of it")]
 mod stage;
@@ -22,7 +20,7 @@ use std::{
 };
 
 use actix::{Actor, AsyncContext, Handler, fut::WrapFuture};
-use figures::{Figures, Line, head, report};
+use sinew_figures::{Alone, Figures, head};
 use sinew_runtime::{
     app::{AppContext, AppSpec, Delivery},
     supervision::{ChildId, Place, Reason, SupervisorFact},
@@ -158,14 +156,9 @@ fn run(case: &Case) {
     let noticing =
         if fault == Fault::Panic { "from the panic to its report" } else { "report past the budget" };
     let bench = "hangs";
-    report(&Line {
-        bench,
-        case: case.name,
-        figure: noticing,
-        seen: &noticed,
-        counts: &[("over_10_ms", late)],
-    });
-    report(&Line { bench, case: case.name, figure: "from the report to Ready", seen: &ready, counts: &[] });
+    Alone { bench, case: case.name, figure: noticing, seen: &noticed, counts: &[("over_10_ms", late)] }
+        .report();
+    Alone { bench, case: case.name, figure: "from the report to Ready", seen: &ready, counts: &[] }.report();
     stage.stop();
 }
 

@@ -8,8 +8,6 @@
 
 #![expect(clippy::unwrap_used, reason = "a bench says what failed by failing")]
 
-#[path = "../figures/mod.rs"]
-mod figures;
 mod reader;
 #[path = "../../tests/stage/mod.rs"]
 #[expect(dead_code, reason = "the tests need more of it")]
@@ -24,8 +22,8 @@ use std::{
     time::Duration,
 };
 
-use figures::{Figures, Line, head, report};
 use reader::{Queue, READER_CPU, Reader, Seen};
+use sinew_figures::{Alone, Figures, head};
 use sinew_runtime::{supervision::Place, time::Time};
 
 /// Time of one case.
@@ -95,13 +93,8 @@ fn fed(case: &str, queue: Queue, load: Load) {
         ("ordinary_sent", ordinary_sent.load(Ordering::Relaxed)),
         ("refused", probes_refused.load(Ordering::Relaxed)),
     ];
-    report(&Line {
-        bench: "mailbox",
-        case,
-        figure: "from sending to handling",
-        seen: &ages,
-        counts: &counts,
-    });
+    Alone { bench: "mailbox", case, figure: "from sending to handling", seen: &ages, counts: &counts }
+        .report();
 }
 
 /// An ordinary thread on the reader's CPU.
@@ -170,6 +163,6 @@ fn backlog(case: &str, queue: Queue) {
     }
     let bench = "mailbox";
     let lateness = lateness.unwrap();
-    report(&Line { bench, case, figure: "lateness of a 1 ms period", seen: &lateness, counts: &[] });
-    report(&Line { bench, case, figure: "from the stop order to the end", seen: &stopping, counts: &[] });
+    Alone { bench, case, figure: "lateness of a 1 ms period", seen: &lateness, counts: &[] }.report();
+    Alone { bench, case, figure: "from the stop order to the end", seen: &stopping, counts: &[] }.report();
 }

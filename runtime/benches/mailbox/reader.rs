@@ -9,16 +9,14 @@ use std::{
 };
 
 use actix::{Actor, ActorContext, Addr, AsyncContext, Context, Handler, Message};
+use sinew_figures::Figures;
 use sinew_runtime::{
     app::{AppContext, AppSpec, Delivery},
     supervision::Place,
     time::Time,
 };
 
-use super::{
-    figures::Figures,
-    stage::{Number, Patience, Stage},
-};
+use super::stage::{Number, Patience, Stage};
 
 pub(super) const READER_CPU: usize = 0;
 /// Ends the measurement: it answers with what it saw.

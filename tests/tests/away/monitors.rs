@@ -84,6 +84,28 @@ fn target() -> (AppSpec<Puppet>, Log<Seen>) {
     Stage::new().got(act).app("target")
 }
 
+/// A watcher here, and its target there, with a desk beside it.
+struct Across {
+    there: Node,
+    here: Node,
+    eye: Eye,
+    sender: Sender,
+    tid: Tid,
+    log: Log<Seen>,
+}
+
+impl Across {
+    fn start() -> Self {
+        let ground = Ground::new();
+        let ((target, log), (watcher, eye), (desk, key)) = (target(), watcher(), desk("desk"));
+        let there = ground.node("there").app(target).app(desk).start().expect("a node");
+        let here = ground.node("here").app(watcher.requires(["target"])).start().expect("a node");
+        all_run(&[&there, &here]);
+        let tid = there.handle().resolve("target").expect("it is registered");
+        Self { there, here, eye, sender: key.sender(), tid, log }
+    }
+}
+
 #[test]
 fn the_end_of_each_life_on_this_node_is_told_once_with_its_reason() {
     let ((target, log), (watcher, eye), (desk, key)) = (target(), watcher(), desk("desk"));
@@ -109,12 +131,7 @@ fn the_end_of_each_life_on_this_node_is_told_once_with_its_reason() {
 
 #[test]
 fn the_end_of_a_life_on_another_node_is_told_once_with_its_reason() {
-    let ground = Ground::new();
-    let ((target, log), (watcher, eye), (desk, key)) = (target(), watcher(), desk("desk"));
-    let there = ground.node("there").app(target).app(desk).start().expect("a node");
-    let here = ground.node("here").app(watcher.requires(["target"])).start().expect("a node");
-    all_run(&[&there, &here]);
-    let (sender, tid) = (key.sender(), there.handle().resolve("target").expect("it is registered"));
+    let Across { there, here: _here, eye, sender, tid, log } = Across::start();
     let mut all = Vec::new();
     for life in 1..=5 {
         log.wait_for(Seen::Started(life));
@@ -142,12 +159,7 @@ fn the_end_of_a_life_on_another_node_is_told_once_with_its_reason() {
 
 #[test]
 fn layers_that_fail_and_a_link_that_is_cut_end_no_life_and_hide_no_end() {
-    let ground = Ground::new();
-    let ((target, log), (watcher, eye), (desk, key)) = (target(), watcher(), desk("desk"));
-    let there = ground.node("there").app(target).app(desk).start().expect("a node");
-    let here = ground.node("here").app(watcher.requires(["target"])).start().expect("a node");
-    all_run(&[&there, &here]);
-    let (sender, tid) = (key.sender(), there.handle().resolve("target").expect("it is registered"));
+    let Across { there, here, eye, sender, tid, log } = Across::start();
     let mut all = Vec::new();
     for (life, layer) in [(1, "GNCL"), (2, "sync"), (3, "GNCL")] {
         for node in [&here, &there] {
@@ -191,13 +203,8 @@ fn the_end_of_another_process_and_its_orderly_leave_are_told() {
 
 #[test]
 fn the_monitors_of_a_watcher_end_with_its_life_and_it_is_told_nothing_after_it_demonitors() {
-    let ground = Ground::new();
-    let ((target, log), (watcher, eye), (desk, key)) = (target(), watcher(), desk("desk"));
-    let there = ground.node("there").app(target).app(desk).start().expect("a node");
-    let here = ground.node("here").app(watcher.requires(["target"])).start().expect("a node");
-    all_run(&[&there, &here]);
+    let Across { there, here, eye, sender, tid, log } = Across::start();
     sees(&there.handle(), here.address());
-    let (sender, tid) = (key.sender(), there.handle().resolve("target").expect("it is registered"));
     let _of_its_first_life = eye.watch(tid);
     assert_eq!(outcome_of_job(&eye.sender(), "watcher", 1), Outcome::Failed);
     eye.sender.wait("its second life", |all| (all.len() == 2).then_some(()));

@@ -7,6 +7,8 @@ use sinew_tests::{
     ready_for, until,
 };
 
+use crate::node_with_a_puppet_that_fails_at_each_job;
+
 fn gave_up(node: Node) -> String {
     match node.wait_for_end() {
         NodeEnd::GaveUp(why) => why,
@@ -141,12 +143,7 @@ fn an_application_that_never_ends_its_ramp_is_ended_when_its_time_is_over_and_th
 
 #[test]
 fn a_node_that_is_told_to_stop_in_the_middle_of_restarts_stops() {
-    let stage = Stage::new().got(|_, _| panic!("each one"));
-    let ((puppet, log), (desk, key)) = (stage.app("puppet"), desk("desk"));
-    let node = Ground::new().node("node").configure(|config| config.supervision.app_restarts_max = 1_000);
-    let node = node.app(puppet).app(desk).start().expect("a node");
-    all_run(&[&node]);
-    let sender = key.sender();
+    let (node, log, sender) = node_with_a_puppet_that_fails_at_each_job();
     send_jobs(&sender, "puppet", 0..200);
     log.wait_for(Seen::Started(3));
     assert_eq!(node.stop(), NodeEnd::Stopped);

@@ -7,6 +7,8 @@ use sinew_tests::{
     ready_for, until,
 };
 
+use crate::node_with_a_puppet_that_fails_at_each_job;
+
 /// Three puppets under one supervisor, and what they write down.
 fn leg(strategy: Strategy) -> (SupervisorSpec, [Log<Seen>; 3]) {
     let [a, b, c] = ["a", "b", "c"].map(member);
@@ -104,12 +106,7 @@ fn an_application_that_is_added_while_the_layers_die_comes_up_and_is_found() {
 
 #[test]
 fn an_application_that_is_removed_while_it_fails_is_gone_and_its_name_is_free() {
-    let stage = Stage::new().got(|_, _| panic!("each one"));
-    let ((puppet, log), (desk, key)) = (stage.app("puppet"), desk("desk"));
-    let node = Ground::new().node("node").configure(|config| config.supervision.app_restarts_max = 1_000);
-    let node = node.app(puppet).app(desk).start().expect("a node");
-    all_run(&[&node]);
-    let sender = key.sender();
+    let (node, log, sender) = node_with_a_puppet_that_fails_at_each_job();
     send_jobs(&sender, "puppet", 0..100);
     log.wait_for(Seen::Started(2));
     node.handle().stop_app("puppet").expect("it is there");

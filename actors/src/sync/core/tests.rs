@@ -27,6 +27,16 @@ impl Bench {
         Self { core, now: Time::from_nanos(1_000_000_000) }
     }
 
+    /// Application 0 is "gait" and requires "sensor", which is application 1; both are ready.
+    fn where_gait_runs_with_its_sensor() -> Self {
+        let mut bench = Self::new();
+        bench.registers(0, "gait", &["sensor"]);
+        bench.registers(1, "sensor", &[]);
+        bench.ready(1);
+        bench.ready(0);
+        bench
+    }
+
     fn hears(&mut self, input: Input) -> Vec<Output> {
         self.core.handle(self.now, input);
         std::iter::from_fn(|| self.core.poll()).collect()
@@ -131,11 +141,7 @@ fn an_application_is_released_when_the_last_of_its_requirements_is_ready() {
 // spec: SYNC-5
 #[test]
 fn a_failed_application_waits_again_and_others_are_told_but_not_stopped() {
-    let mut bench = Bench::new();
-    bench.registers(0, "gait", &["sensor"]);
-    bench.registers(1, "sensor", &[]);
-    bench.ready(1);
-    bench.ready(0);
+    let mut bench = Bench::where_gait_runs_with_its_sensor();
     assert_eq!(bench.down(1), [lost(0, "sensor", "failed, not ready again"), release(1)]);
     assert_eq!(bench.ready(1), [met(0, "sensor")]);
     assert_eq!(bench.down(0), [release(0)], "all that it requires is ready still");
@@ -167,11 +173,7 @@ fn a_running_application_hears_once_of_a_lost_node_and_once_of_its_return() {
 // spec: SYNC-8
 #[test]
 fn an_application_that_failed_with_a_requirement_lost_is_told_in_its_next_life_that_it_is_met() {
-    let mut bench = Bench::new();
-    bench.registers(0, "gait", &["sensor"]);
-    bench.registers(1, "sensor", &[]);
-    bench.ready(1);
-    bench.ready(0);
+    let mut bench = Bench::where_gait_runs_with_its_sensor();
     bench.down(1);
     assert_eq!(bench.down(0), []);
     assert_eq!(bench.ready(1), [release(0)]);
@@ -181,11 +183,7 @@ fn an_application_that_failed_with_a_requirement_lost_is_told_in_its_next_life_t
 // spec: SYNC-8
 #[test]
 fn what_a_full_mailbox_did_not_take_is_offered_again_in_its_last_form() {
-    let mut bench = Bench::new();
-    bench.registers(0, "gait", &["sensor"]);
-    bench.registers(1, "sensor", &[]);
-    bench.ready(1);
-    bench.ready(0);
+    let mut bench = Bench::where_gait_runs_with_its_sensor();
     bench.down(1);
     let name = || "sensor".to_owned();
     assert_eq!(bench.hears(Input::EventNotTaken { app: app(0), name: name() }), []);

@@ -12,14 +12,21 @@ const TORQUE_LARGEST_NM: f32 = 500.0;
 const COMMAND_LARGEST_NM: f32 = 60.0;
 const PHASE_RATE_LARGEST_HZ: f32 = 5.0;
 
+/// Where an input stands among those of its sender.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Stamp {
+    /// When it was made, ns.
+    pub t_ns: u64,
+    /// Its number; wraps.
+    pub seq: u32,
+    /// Life of its sender; newer lives beat older ones whatever the sequence. 0 where the sender does not tell.
+    pub epoch: u32,
+}
+
 /// Something that can be judged before use.
 pub trait Stamped: Copy {
-    /// When it was made, ns.
-    fn t_ns(&self) -> u64;
-    /// Its number; wraps.
-    fn seq(&self) -> u32;
-    /// Life of its sender; newer lives beat older ones whatever the sequence.
-    fn epoch(&self) -> u32;
+    /// When it was made, and as which.
+    fn stamp(&self) -> Stamp;
     /// Whether all numbers are finite.
     fn is_finite(&self) -> bool;
     /// Whether a walking leg can have these values.
@@ -85,7 +92,7 @@ impl<T: Stamped> Admission<T> {
     /// The newest admitted input if it is not older than the limit now.
     #[must_use]
     pub fn fresh(&self, now_ns: u64) -> Option<&T> {
-        self.newest.as_ref().filter(|input| now_ns.saturating_sub(input.t_ns()) <= self.age_max_ns)
+        self.newest.as_ref().filter(|input| now_ns.saturating_sub(input.stamp().t_ns) <= self.age_max_ns)
     }
 
     /// The newest admitted input, however old.
@@ -97,7 +104,7 @@ impl<T: Stamped> Admission<T> {
     /// Age of the newest admitted input, ns.
     #[must_use]
     pub fn age_ns(&self, now_ns: u64) -> Option<u64> {
-        self.newest.as_ref().map(|input| now_ns.saturating_sub(input.t_ns()))
+        self.newest.as_ref().map(|input| now_ns.saturating_sub(input.stamp().t_ns))
     }
 
     /// Refusals so far.
@@ -107,9 +114,7 @@ impl<T: Stamped> Admission<T> {
     }
 
     fn is_repeat(&self, input: &T) -> bool {
-        self.newest.as_ref().is_some_and(|held| {
-            held.seq() == input.seq() && held.t_ns() == input.t_ns() && held.epoch() == input.epoch()
-        })
+        self.newest.as_ref().is_some_and(|held| held.stamp() == input.stamp())
     }
 
     fn judge(&self, now_ns: u64, input: &T) -> Result<(), Refusal> {
@@ -119,10 +124,11 @@ impl<T: Stamped> Admission<T> {
         if !input.is_plausible() {
             return Err(Refusal::OutOfRange);
         }
-        if input.t_ns() > now_ns.saturating_add(self.age_max_ns) {
+        let made_ns = input.stamp().t_ns;
+        if made_ns > now_ns.saturating_add(self.age_max_ns) {
             return Err(Refusal::FromFuture);
         }
-        if now_ns.saturating_sub(input.t_ns()) > self.age_max_ns {
+        if now_ns.saturating_sub(made_ns) > self.age_max_ns {
             return Err(Refusal::TooOld);
         }
         if self.follows(now_ns, input) { Ok(()) } else { Err(Refusal::OldSequence) }
@@ -132,11 +138,12 @@ impl<T: Stamped> Admission<T> {
     /// it is believed once its predecessor is over the age limit and its stamp is later.
     fn follows(&self, now_ns: u64, input: &T) -> bool {
         let Some(held) = &self.newest else { return true };
-        if input.epoch() != held.epoch() {
-            return input.epoch() > held.epoch();
+        let (input, held) = (input.stamp(), held.stamp());
+        if input.epoch != held.epoch {
+            return input.epoch > held.epoch;
         }
-        let ahead = input.seq().wrapping_sub(held.seq());
-        let later = input.t_ns() > held.t_ns();
+        let ahead = input.seq.wrapping_sub(held.seq);
+        let later = input.t_ns > held.t_ns;
         later && ((1..=SEQUENCE_AHEAD_MAX).contains(&ahead) || self.fresh(now_ns).is_none())
     }
 
@@ -153,14 +160,8 @@ impl<T: Stamped> Admission<T> {
 }
 
 impl Stamped for JointSample {
-    fn t_ns(&self) -> u64 {
-        self.t_ns
-    }
-    fn seq(&self) -> u32 {
-        self.seq
-    }
-    fn epoch(&self) -> u32 {
-        0
+    fn stamp(&self) -> Stamp {
+        Stamp { t_ns: self.t_ns, seq: self.seq, epoch: 0 }
     }
     fn is_finite(&self) -> bool {
         self.angle_rad.is_finite() && self.velocity_rad_s.is_finite() && self.torque_nm.is_finite()
@@ -173,14 +174,8 @@ impl Stamped for JointSample {
 }
 
 impl Stamped for GaitState {
-    fn t_ns(&self) -> u64 {
-        self.t_ns
-    }
-    fn seq(&self) -> u32 {
-        self.seq
-    }
-    fn epoch(&self) -> u32 {
-        self.epoch
+    fn stamp(&self) -> Stamp {
+        Stamp { t_ns: self.t_ns, seq: self.seq, epoch: self.epoch }
     }
     fn is_finite(&self) -> bool {
         self.phase.is_finite() && self.phase_rate_hz.is_finite() && self.confidence.is_finite()
@@ -193,14 +188,8 @@ impl Stamped for GaitState {
 }
 
 impl Stamped for TorqueSet {
-    fn t_ns(&self) -> u64 {
-        self.t_ns
-    }
-    fn seq(&self) -> u32 {
-        self.seq
-    }
-    fn epoch(&self) -> u32 {
-        self.epoch
+    fn stamp(&self) -> Stamp {
+        Stamp { t_ns: self.t_ns, seq: self.seq, epoch: self.epoch }
     }
     fn is_finite(&self) -> bool {
         self.torque_nm.is_finite()

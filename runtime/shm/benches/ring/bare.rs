@@ -11,8 +11,9 @@ use rustix::{
     fs::{MemfdFlags, ftruncate, memfd_create},
     thread::futex::{self, Flags},
 };
+use sinew_figures::Figures;
 
-use crate::measure::{Figures, Pace};
+use crate::pace::Pace;
 
 const SLOTS: usize = 4;
 const COUNT_BYTES: usize = 128;
@@ -33,7 +34,7 @@ pub(crate) fn measure(memory: &OwnedFd, polls: bool, bytes: usize, pace: Pace) -
     let (mut there, mut back) =
         (Direction::new(&map, 0, polls, bytes), Direction::new(&map, 1, polls, bytes));
     let mut buffer = vec![7; bytes];
-    Figures::of(pace, || {
+    pace.time(|| {
         there.send(&buffer);
         back.receive(&mut buffer);
     })

@@ -6,12 +6,9 @@ use std::{
 };
 
 use rustix::thread::{CpuSet, sched_setaffinity};
+use sinew_figures::{Beside, Figures};
 
-use crate::{
-    bare,
-    measure::{Figures, Pace, Run, report},
-    ours, stream,
-};
+use crate::{bare, ours, pace::Pace, stream};
 
 /// The environment variable that makes this program the echoing end.
 pub(crate) const ROLE: &str = "SINEW_RING_ROLE";
@@ -132,15 +129,17 @@ pub(crate) fn run(case: Case) {
     let Case { kind, reference, payload_bytes, pinning, pace } = case;
     let raw = figures(reference, case);
     let seen = figures(kind, case);
-    report(&Run {
+    Beside {
+        bench: "ring",
         case: kind.name(),
         payload_bytes,
         pinning: pinning.name(),
-        pace,
+        pace: pace.name(),
         seen: &seen,
         reference: reference.name(),
         raw: &raw,
-    });
+    }
+    .report();
 }
 
 fn figures(kind: Kind, case: Case) -> Figures {

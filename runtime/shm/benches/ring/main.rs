@@ -12,9 +12,9 @@ mod bare;
 #[cfg(target_os = "linux")]
 mod case;
 #[cfg(target_os = "linux")]
-mod measure;
-#[cfg(target_os = "linux")]
 mod ours;
+#[cfg(target_os = "linux")]
+mod pace;
 #[cfg(target_os = "linux")]
 mod stream;
 
@@ -23,7 +23,7 @@ fn main() {
     if let Ok(role) = std::env::var(case::ROLE) {
         return case::echo(&role);
     }
-    eprintln!("machine: {}", measure::machine());
+    eprintln!("machine: {}", sinew_figures::machine());
     let words: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with('-')).collect();
     case::all()
         .filter(|case| words.iter().all(|word| case.name().contains(word.as_str())))

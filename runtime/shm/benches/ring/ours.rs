@@ -5,17 +5,15 @@ use std::{
     time::Duration,
 };
 
+use sinew_figures::Figures;
 use sinew_shm::{BellKind, Capacity, Consumer, Offer, Producer, Region, Spin, Terms, Wait};
 
-use crate::{
-    case::Kind,
-    measure::{Figures, Pace},
-};
+use crate::{case::Kind, pace::Pace};
 
 pub(crate) fn measure(kind: Kind, socket: &UnixStream, bytes: usize, pace: Pace) -> Figures {
     let (mut producer, mut consumer) = connect(kind, socket);
     let mut buffer = vec![7; bytes];
-    Figures::of(pace, || {
+    pace.time(|| {
         let mut loan = producer.loan(bytes).expect("one message at a time fits");
         loan.copy_from_slice(&buffer);
         loan.publish();

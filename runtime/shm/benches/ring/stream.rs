@@ -5,11 +5,13 @@ use std::{
     os::unix::net::UnixStream,
 };
 
-use crate::measure::{Figures, Pace};
+use sinew_figures::Figures;
+
+use crate::pace::Pace;
 
 pub(crate) fn measure(mut socket: UnixStream, bytes: usize, pace: Pace) -> Figures {
     let mut buffer = vec![7; bytes];
-    Figures::of(pace, || {
+    pace.time(|| {
         socket.write_all(&buffer).expect("the echo reads");
         socket.read_exact(&mut buffer).expect("the echo answers");
     })

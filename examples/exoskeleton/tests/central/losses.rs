@@ -1,85 +1,11 @@
-//! Central: what it does about an e-stop, a loss, and a drive that does not help.
+//! What central does about an e-stop, a loss, and a drive that does not help.
 
-use exoskeleton::central::{CentralConfig, CentralCore, CentralInput, Resume, StillStopped, bit};
+use exoskeleton::central::{Resume, StillStopped, bit};
 use exoskeleton::control::faults::FaultBits;
-use exoskeleton::intention::Intention;
 use exoskeleton::joint::Joint;
-use exoskeleton::message::{DriveState, DriveStatus, FootLoad, GaitMode, GaitState, JointSample};
+use exoskeleton::message::{DriveState, GaitMode};
 
-const MS: u64 = 1_000_000;
-
-/// A leg that walks as intended, heard by central.
-struct Walk {
-    central: CentralCore,
-    intention: Intention,
-    ms: u64,
-    /// What the drives say; none: nothing.
-    says: [Option<(DriveState, FaultBits)>; 3],
-}
-
-impl Walk {
-    fn new(resume: Resume) -> Self {
-        let central = CentralCore::new(CentralConfig { resume, ..CentralConfig::default() });
-        let says = [Some((DriveState::Ready, FaultBits(0))); 3];
-        Self { central, intention: Intention::from_curves(3), ms: 0, says }
-    }
-
-    /// A central that was released and lets the drives assist.
-    fn begun(resume: Resume) -> Self {
-        let mut walk = Self::new(resume);
-        walk.hear(10);
-        walk.central.release().expect("nobody pressed the e-stop");
-        walk.hear(9_990);
-        walk.says = [Some((DriveState::Walk, FaultBits(0))); 3];
-        assert_eq!(walk.hear(10).mode, GaitMode::Walk);
-        walk
-    }
-
-    /// Milliseconds in which central hears everybody; the last state.
-    fn hear(&mut self, ms: u64) -> GaitState {
-        (0..ms).map(|_| self.tick(true)).last().flatten().expect("all parts are there")
-    }
-
-    fn hear_nothing(&mut self, ms: u64) -> Option<GaitMode> {
-        (0..ms).map(|_| self.tick(false)).last().flatten().map(|state| state.mode)
-    }
-
-    fn tick(&mut self, heard: bool) -> Option<GaitState> {
-        self.ms += 1;
-        let (t_ns, seq) = (self.ms * MS, self.ms as u32);
-        for (joint, says) in Joint::ALL.into_iter().zip(self.says) {
-            let Some((state, faults)) = says.filter(|_| seq.is_multiple_of(5)) else { continue };
-            let status = DriveStatus {
-                seq,
-                t_ns,
-                state,
-                faults: faults.0,
-                torque_nm: 0.0,
-                age_max_us: 0,
-                misses: 0,
-                commands_taken: 0,
-                commands_refused: 0,
-            };
-            self.central.drive_heard(joint, &status);
-        }
-        let intended = self.intention.at(self.ms as f64 * 1e-3);
-        let samples = Joint::ALL.map(|joint| JointSample {
-            seq,
-            t_ns,
-            angle_rad: intended.angle_rad[joint.index()] as f32,
-            velocity_rad_s: 0.0,
-            torque_nm: 0.0,
-            temperature_c: 30,
-            flags: 0,
-        });
-        let load_n = intended.vertical_load_bw * 80.0 * 9.81;
-        let load = FootLoad { seq, t_ns, heel_n: load_n as f32, toe_n: 0.0 };
-        let input = CentralInput { samples: samples.each_ref().map(Some), load: Some(&load) };
-        self.central.tick(t_ns, if heard { &input } else { &EMPTY })
-    }
-}
-
-const EMPTY: CentralInput<'_> = CentralInput { samples: [None; 3], load: None };
+use crate::{MS, walk::Walk};
 
 #[test]
 fn e_stop_is_latched_and_only_a_reset_and_a_new_release_lead_back_to_walking() {

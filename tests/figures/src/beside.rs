@@ -1,0 +1,52 @@
+//! A case beside its reference, as a JSON line.
+
+use serde_json::json;
+
+use crate::{Figures, round};
+
+/// Round trips of one case, and of the reference that ran right before it.
+#[derive(Debug)]
+pub struct Beside<'a> {
+    /// The bench.
+    pub bench: &'a str,
+    /// The case.
+    pub case: &'a str,
+    /// What a message carries, in bytes.
+    pub payload_bytes: usize,
+    /// Which CPUs the two ends use.
+    pub pinning: &'a str,
+    /// How round trips follow each other.
+    pub pace: &'a str,
+    /// The case's times.
+    pub seen: &'a Figures,
+    /// What it stands beside.
+    pub reference: &'a str,
+    /// The reference's times.
+    pub raw: &'a Figures,
+}
+
+impl Beside<'_> {
+    /// Prints the line.
+    pub fn report(&self) {
+        let Self { bench, case, payload_bytes, pinning, pace, seen, reference, raw } = self;
+        let [p50, p99, p999, max] = seen.quantiles_us(3);
+        let [reference_p50, reference_p99, ..] = raw.quantiles_us(3);
+        let line = json!({
+            "bench": bench,
+            "case": case,
+            "payload_bytes": payload_bytes,
+            "pinning": pinning,
+            "pace": pace,
+            "rounds": seen.rounds(),
+            "p50_us": p50,
+            "p99_us": p99,
+            "p999_us": p999,
+            "max_us": max,
+            "reference": reference,
+            "reference_p50_us": reference_p50,
+            "reference_p99_us": reference_p99,
+            "ratio_p50": round(seen.us(0.5) / raw.us(0.5), 3),
+        });
+        println!("{line}");
+    }
+}

@@ -1,0 +1,72 @@
+//! Times of many runs, and the lines in which Sinew's benches say them: [`Beside`] where a reference of the same run stands
+//! next to the case, [`Alone`] where none does. JSON lines are on the standard output, all else is on the standard error.
+
+mod alone;
+mod beside;
+
+pub use alone::{Alone, head};
+pub use beside::Beside;
+
+use std::time::Duration;
+
+use hdrhistogram::Histogram;
+
+/// The times of one run: 1 ns to 60 s, with three digits.
+#[derive(Debug)]
+pub struct Figures(Histogram<u64>);
+
+impl Figures {
+    /// No times yet.
+    ///
+    /// # Panics
+    /// Never: its bounds are legal.
+    #[must_use]
+    pub fn new() -> Self {
+        Self(Histogram::new_with_bounds(1, 60_000_000_000, 3).expect("1 ns to 60 s with three digits"))
+    }
+
+    /// Counts one time; one that is longer than 60 s counts as 60 s.
+    pub fn record(&mut self, time: Duration) {
+        self.0.saturating_record(u64::try_from(time.as_nanos()).unwrap_or(u64::MAX).max(1));
+    }
+
+    /// How many times were counted.
+    #[must_use]
+    pub fn rounds(&self) -> u64 {
+        self.0.len()
+    }
+
+    /// The time that this share of all do not exceed, in microseconds.
+    fn us(&self, quantile: f64) -> f64 {
+        self.0.value_at_quantile(quantile) as f64 / 1_000.0
+    }
+
+    /// p50, p99, p99.9 and the maximum, in microseconds with this many digits after the point.
+    fn quantiles_us(&self, digits: i32) -> [f64; 4] {
+        [0.5, 0.99, 0.999, 1.0].map(|quantile| round(self.us(quantile), digits))
+    }
+}
+
+impl Default for Figures {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+fn round(value: f64, digits: i32) -> f64 {
+    let unit = 10_f64.powi(digits);
+    (value * unit).round() / unit
+}
+
+/// The machine and how busy it is, in a line.
+#[must_use]
+pub fn machine() -> String {
+    let cpus = std::thread::available_parallelism().map_or(0, usize::from);
+    let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let model = info.lines().find_map(|line| line.strip_prefix("model name")).unwrap_or(": unknown");
+    let model = model.trim_start_matches([':', ' ', '\t']);
+    let kernel = std::fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
+    let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
+    let load = load.split(' ').next().unwrap_or("unknown");
+    format!("{cpus} CPUs, {model}, Linux {}, load {load}", kernel.trim())
+}
