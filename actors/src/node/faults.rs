@@ -41,6 +41,11 @@ impl NodeHandle {
         self.tell(super::RootEvent::Fail);
     }
 
+    /// Makes the supervisor of all applications panic.
+    pub fn fail_supervisor(&self) {
+        self.tell(super::RootEvent::FailSupervisor);
+    }
+
     /// How often the actor called `name` was started and became ready, if this node has one of this name.
     #[must_use]
     pub fn lives(&self, name: &str) -> Option<Lives> {

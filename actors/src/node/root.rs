@@ -62,6 +62,9 @@ pub(crate) enum RootEvent {
     /// By a test: panic.
     #[cfg(feature = "fault-points")]
     Fail,
+    /// By a test: let the applications' supervisor panic.
+    #[cfg(feature = "fault-points")]
+    FailSupervisor,
     /// By the owner: say when every application runs.
     TellWhenRunning(SyncSender<Result<(), StartError>>),
 }
@@ -189,6 +192,8 @@ impl StreamHandler<RootEvent> for Root {
             RootEvent::StopOrdered => self.stop_apps(),
             #[cfg(feature = "fault-points")]
             RootEvent::Fail => panic!("a fault was planned for the root"),
+            #[cfg(feature = "fault-points")]
+            RootEvent::FailSupervisor => self.app_supervisor.iter().for_each(Roster::fail),
             RootEvent::TellWhenRunning(say) => {
                 self.tell_when_running.push(say);
                 self.tell_if_running();

@@ -34,7 +34,8 @@ pub(super) enum Branch {
 }
 
 impl Heirs {
-    /// Runs a supervisor of the root's. If it fails itself, `event` says to the root that all of them have ended.
+    /// Runs a supervisor of the root's. If it fails itself, `event` says to the root that all of them have ended: when they
+    /// have, and all that follows from their ends is done while the node can still speak.
     pub(super) fn run(
         &self,
         branch: Branch,
@@ -44,12 +45,12 @@ impl Heirs {
     ) -> Roster {
         let (roster, root) = (supervisor.roster(), stores.posts.root.clone());
         self.0.borrow_mut().push((branch, roster.clone()));
-        let ended = overseen("supervisor", supervisor);
+        let ended = supervisor.oversee();
         actix_rt::spawn(async move {
             let reason = ended.await;
             if reason.is_failure() {
                 let why = format!("their supervisor {reason}");
-                tracing::error!(?branch, why, "a supervisor failed itself");
+                tracing::error!(?branch, why, "all that it supervised have ended");
                 if root.post(event(SupervisorFact::Ended(Reason::GaveUp(why)))).is_err() {
                     tracing::error!("the root's post is full");
                 }

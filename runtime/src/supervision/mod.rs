@@ -6,6 +6,7 @@
 //! | `supervisor` | the actix actor that carries them out |
 //! | `guard` | the future around each actor: catches its panics, takes its stop order, reports its end |
 //! | `alone` | one actor under a guard and under no supervisor |
+//! | `orphans` | what becomes of the children of a supervisor that fails itself |
 //! | `roster` | who is supervised, for the supervisor's owner |
 //! | `ready` | when an actor may say that it is ready |
 //! | `place` | where an actor is to run |
@@ -21,6 +22,7 @@ pub mod core;
 #[cfg(feature = "fault-points")]
 pub mod fault;
 mod guard;
+mod orphans;
 mod panics;
 mod place;
 mod ready;

@@ -31,6 +31,9 @@ pub struct Roster {
     listed: Rc<RefCell<BTreeMap<ChildId, Listed>>>,
     arrivals: Rc<RefCell<BTreeMap<ChildId, (ChildId, ChildSpec)>>>,
     post: Post<Input>,
+    /// A test wants the supervisor to panic.
+    #[cfg(feature = "fault-points")]
+    fails: Rc<std::cell::Cell<bool>>,
 }
 
 impl std::fmt::Debug for Roster {
@@ -49,6 +52,8 @@ impl Roster {
             listed: Rc::new(RefCell::new(listed)),
             arrivals: Rc::default(),
             post,
+            #[cfg(feature = "fault-points")]
+            fails: Rc::default(),
         };
         (roster, workers)
     }
@@ -78,6 +83,20 @@ impl Roster {
     /// Its post is full; the input is given back.
     pub fn tell(&self, input: Input) -> Result<(), Input> {
         self.post.post(input)
+    }
+
+    /// Makes the supervisor itself panic.
+    #[cfg(feature = "fault-points")]
+    pub fn fail(&self) {
+        self.fails.set(true);
+        // A full post is read all the same.
+        let _ = self.tell(Input::TimePassed);
+    }
+
+    /// Panics if that is wanted.
+    #[cfg(feature = "fault-points")]
+    pub(super) fn strike(&self) {
+        assert!(!self.fails.get(), "a fault was planned for a supervisor");
     }
 
     /// What is known of all children.
@@ -120,7 +139,7 @@ impl Roster {
         Some((under, spec))
     }
 
-    pub(super) fn strike(&self, id: ChildId) {
+    pub(super) fn remove(&self, id: ChildId) {
         self.listed.borrow_mut().remove(&id);
     }
 }

@@ -1,6 +1,6 @@
 //! The supervisor's shell: an actix actor that carries out what its core decides.
 
-use std::{cell::RefCell, collections::BTreeMap, rc::Rc, sync::Arc, time::Duration};
+use std::{cell::RefCell, collections::BTreeMap, rc::Rc, sync::Arc};
 
 use actix::{Actor, ActorContext, AsyncContext, Context, SpawnHandle, StreamHandler};
 
@@ -8,8 +8,10 @@ use crate::{
     post::Post,
     supervision::{
         Life, Place, ReadyGate, Reason, Roster, Threads,
+        alone::overseen,
         core::{ChildId, Command, Flags, Generation, Input, Order, Policy, Refusal},
         guard::Guard,
+        orphans::{LETTING_GO, Legacy, Listener, Orphan, Orphans},
         panics::install_hook,
         tenant::{Fate, Tenant},
         vitals::Vitals,
@@ -84,6 +86,22 @@ pub enum SupervisorFact {
 struct Child {
     spec: ChildSpec,
     tenant: Option<Tenant>,
+    /// Nobody was told yet that this life has ended.
+    is_owed: bool,
+}
+
+impl Child {
+    const fn new(spec: ChildSpec) -> Self {
+        Self { spec, tenant: None, is_owed: false }
+    }
+}
+
+/// How far a supervisor is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Progress {
+    Planned,
+    Runs,
+    HasEnded,
 }
 
 /// Supervises children; ends when none of them lives any more.
@@ -92,14 +110,15 @@ pub struct Supervisor {
     children: BTreeMap<ChildId, Child>,
     threads: Rc<RefCell<Threads>>,
     post: Post<Input>,
-    listener: Box<dyn FnMut(SupervisorFact)>,
+    listener: Listener,
     alarm: Option<SpawnHandle>,
+    progress: Progress,
+    /// Who takes its children over if it fails, where somebody does.
+    heir: Option<Legacy>,
 }
 
 /// Events that wait for a supervisor at most. Each child causes a handful; only a fault could fill this.
 const POST_CAPACITY: usize = 16_384;
-/// Time in which a thread that does not hang lets go a child whose life is taken.
-const LETTING_GO: Duration = Duration::from_millis(200);
 
 impl Supervisor {
     /// A supervisor called `name` of children that are no supervisors, and the post through which it hears; see
@@ -134,11 +153,32 @@ impl Supervisor {
         let (roster, workers) = Roster::new(plan, seed(), post.clone());
         Self {
             roster,
-            children: workers.into_iter().map(|spec| (spec.id, Child { spec, tenant: None })).collect(),
+            children: workers.into_iter().map(|spec| (spec.id, Child::new(spec))).collect(),
             threads,
             post,
             listener: Box::new(listener),
             alarm: None,
+            progress: Progress::Planned,
+            heir: None,
+        }
+    }
+
+    /// Runs the supervisor on the calling thread, which is an arbiter's of actix. The future ends with it, and says how. If
+    /// it fails itself, its children are told to stop, each has the time for it that it was declared with, and the listener
+    /// is told of each end, as of a failure; the future ends then. Whoever drops the future takes their lives.
+    pub fn oversee(mut self) -> impl Future<Output = Reason> + use<> {
+        let legacy = Legacy::default();
+        self.heir = Some(legacy.clone());
+        let ended = overseen("supervisor", self);
+        async move {
+            let reason = ended.await;
+            let left = legacy.take();
+            if let Some(mut left) = left {
+                let why = Reason::GaveUp(format!("its supervisor {reason}"));
+                tracing::error!(%reason, "a supervisor failed itself; its children are told to stop");
+                left.end_all(&why).await;
+            }
+            reason
         }
     }
 
@@ -149,6 +189,8 @@ impl Supervisor {
     }
 
     fn feed(&mut self, input: Input, context: &mut Context<Self>) {
+        #[cfg(feature = "fault-points")]
+        self.roster.strike();
         self.decide(input);
         loop {
             let next = self.roster.tree.borrow_mut().poll();
@@ -187,7 +229,7 @@ impl Supervisor {
         match arrival {
             Some((under, spec)) => {
                 let (id, policy) = (spec.id, spec.policy.clone());
-                self.children.insert(id, Child { spec, tenant: None });
+                self.children.insert(id, Child::new(spec));
                 tree.add(now, under, id, policy);
             }
             None => tree.handle(now, input),
@@ -212,6 +254,7 @@ impl Supervisor {
                 let reason = self.roster.name_children(reason);
                 self.note_end(id, &reason);
                 (self.listener)(SupervisorFact::Failed(id, reason));
+                self.settle(id);
             }
             Order::Ready(id) => {
                 self.note(id, "ready");
@@ -221,6 +264,7 @@ impl Supervisor {
                 let reason = self.roster.name_children(reason);
                 self.note_end(id, &reason);
                 (self.listener)(SupervisorFact::Gone(id, reason));
+                self.settle(id);
             }
             Order::Deleted(id) => {
                 self.note(id, "deleted");
@@ -237,9 +281,17 @@ impl Supervisor {
             Order::AllReady => (self.listener)(SupervisorFact::AllReady),
             Order::Ended(reason) => {
                 let reason = self.roster.name_children(reason);
+                self.progress = Progress::HasEnded;
                 (self.listener)(SupervisorFact::Ended(reason));
                 context.stop();
             }
+        }
+    }
+
+    /// The end of this child's life is told: now, because whoever is told may panic, and is told again then.
+    fn settle(&mut self, id: ChildId) {
+        if let Some(child) = self.children.get_mut(&id) {
+            child.is_owed = false;
         }
     }
 
@@ -247,7 +299,7 @@ impl Supervisor {
         if let Some(child) = self.children.remove(&id) {
             self.threads.borrow_mut().leave(&child.spec.place);
         }
-        self.roster.strike(id);
+        self.roster.remove(id);
     }
 
     /// One event for each change, for whoever reads them.
@@ -278,7 +330,7 @@ impl Supervisor {
 
     fn spawn(&mut self, id: ChildId, generation: Generation) {
         install_hook();
-        let Some(Child { spec, tenant: held }) = self.children.get_mut(&id) else { return };
+        let Some(Child { spec, tenant: held, is_owed }) = self.children.get_mut(&id) else { return };
         let mut threads = self.threads.borrow_mut();
         let post = self.post.clone();
         let (thread, seat) = match threads.get(&spec.place) {
@@ -292,7 +344,7 @@ impl Supervisor {
         let vitals = Vitals::new(&*spec.name);
         let tenant = Tenant::new(vitals, Some(seat), spec.policy.progress_within, report);
         threads.settle(&tenant);
-        *held = Some(tenant.clone());
+        (*held, *is_owed) = (Some(tenant.clone()), true);
         let ready = {
             let (post, vitals) = (self.post.clone(), tenant.vitals().clone());
             ReadyGate::new(move || {
@@ -307,7 +359,7 @@ impl Supervisor {
 
     /// Takes a child's life. Its thread may have other tenants: it is given up only if it does not let the child go.
     fn abandon(&mut self, id: ChildId, context: &mut Context<Self>) {
-        let Some(Child { spec, tenant }) = self.children.get_mut(&id) else { return };
+        let Some(Child { spec, tenant, .. }) = self.children.get_mut(&id) else { return };
         let Some(tenant) = tenant.take() else { return };
         tracing::error!(supervisor = self.roster.supervisor_of(id), child = spec.name, "its life is taken");
         tenant.kill();
@@ -360,9 +412,22 @@ fn say(post: &Post<Input>, input: Input) {
 
 impl Drop for Supervisor {
     fn drop(&mut self) {
-        // None lives after an orderly end. After a panic of its own nobody is left who would hear of them: they are told.
-        for tenant in self.children.values().filter_map(|child| child.tenant.as_ref()) {
-            tenant.stop();
+        match self.progress {
+            // None lives.
+            Progress::Planned | Progress::HasEnded => return,
+            // It panicked, or somebody dropped it: nobody decides for its children any more.
+            Progress::Runs => {}
+        }
+        let orphan = |(id, child): (ChildId, Child)| {
+            let tenant = child.tenant.filter(|_| child.is_owed)?;
+            Some((id, Orphan { tenant, stop_within: child.spec.policy.stop_within }))
+        };
+        let children = std::mem::take(&mut self.children).into_iter().filter_map(orphan);
+        let listener = std::mem::replace(&mut self.listener, Box::new(|_| {}));
+        let orphans = Orphans::take_over(children, self.threads.clone(), self.post.clone(), listener);
+        match &self.heir {
+            Some(heir) => _ = heir.replace(Some(orphans)),
+            None => orphans.end_apart(),
         }
     }
 }
@@ -371,6 +436,7 @@ impl Actor for Supervisor {
     type Context = Context<Self>;
 
     fn started(&mut self, context: &mut Context<Self>) {
+        self.progress = Progress::Runs;
         context.add_stream(self.post.attach());
         self.feed(Input::Started, context);
     }

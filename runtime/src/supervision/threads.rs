@@ -226,3 +226,10 @@ impl Threads {
         }
     }
 }
+
+impl Drop for Threads {
+    fn drop(&mut self) {
+        // Nobody is left who could end them, or would hear who hangs.
+        self.stop();
+    }
+}

@@ -6,7 +6,7 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew::{Sender, StartError, prelude::*};
+use sinew::{NodeEnd, Sender, StartError, prelude::*};
 use sinew_tests::{
     Ground, Log, OwnDirectory, Program, all_run, node_under_test, own_group,
     puppet::{Job, Order, Puppet, Seen, Stage, desk, lives, numbers, outcome_of_job},
@@ -126,6 +126,31 @@ fn a_will_reaches_another_node_behind_all_that_the_dead_one_sent() {
     kill(&key.sender(), &log);
     seen.wait_for(Seen::Got(1, WILL.number));
     assert_eq!(numbers(&seen.all()), (1..=100).chain([WILL.number]).collect::<Vec<_>>());
+}
+
+#[test]
+fn wills_are_sent_when_the_supervisor_of_the_applications_fails_itself() {
+    let ground = Ground::new();
+    // One that ends in order when it is told to, and one that does not end in its time.
+    let (hung, _) = Stage::new().stopping(|_, _| Running::Continue).app("hung");
+    let hung = hung
+        .requires(["heir"])
+        .stop_within(Duration::from_millis(50))
+        .last_will("heir", &Order { number: 7 });
+    let ((mortal, log), (heir, seen)) = (mortal(0), heir());
+    let mortal = mortal.requires(["heir"]).last_will("heir", &WILL);
+    let there = ground.node("there").app(heir).start().expect("a node");
+    let here = ground.node("here").app(mortal).app(hung).start().expect("a node");
+    all_run(&[&there, &here]);
+    here.handle().fail_supervisor();
+    seen.wait_for(Seen::Got(1, WILL.number));
+    seen.wait_for(Seen::Got(1, 7));
+    assert!(log.all().ends_with(&[Seen::Stopping(1), Seen::Dropped(1)]), "it was told: {:?}", log.all());
+    let NodeEnd::GaveUp(why) = here.wait_for_end() else { panic!("it gave up") };
+    assert!(why.contains("their supervisor panicked: a fault was planned for a supervisor"), "{why}");
+    // The goodbye of a node that ends in order is no second reason for them.
+    sinew_tests::until("the node is gone", || there.handle().members().is_empty().then_some(()));
+    assert_eq!((wills(&seen), numbers(&seen.all()).len()), (1, 2));
 }
 
 #[test]

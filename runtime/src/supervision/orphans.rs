@@ -1,0 +1,191 @@
+//! Children whose supervisor is gone without an end of its own: told to stop, waited for, and their lives taken if need be.
+//!
+//! Nobody decides for them any more, so nothing is decided: each has the time to stop that it was declared with, then its
+//! life is taken. Whoever listened to their supervisor hears of each end, as of any other.
+
+use std::{
+    cell::RefCell,
+    collections::BTreeMap,
+    panic::{AssertUnwindSafe, catch_unwind},
+    rc::Rc,
+    time::Duration,
+};
+
+use futures_util::{FutureExt, StreamExt};
+use tokio::time::{Instant, timeout_at};
+
+use super::{
+    Reason, SupervisorFact, Threads,
+    core::{ChildId, Input},
+    panics::words,
+    tenant::Tenant,
+};
+use crate::post::Post;
+
+/// Time in which a thread that does not hang lets go a child whose life is taken.
+pub(super) const LETTING_GO: Duration = Duration::from_millis(200);
+
+/// Whoever is told what happens to a supervisor's children.
+pub(super) type Listener = Box<dyn FnMut(SupervisorFact)>;
+
+/// Where a supervisor that fails leaves its children, for whoever oversees it.
+pub(super) type Legacy = Rc<RefCell<Option<Orphans>>>;
+
+/// A child whose end nobody was told of.
+pub(super) struct Orphan {
+    pub(super) tenant: Tenant,
+    pub(super) stop_within: Duration,
+}
+
+/// All children of a supervisor that are left. Dropping them takes their lives.
+pub(super) struct Orphans {
+    left: BTreeMap<ChildId, (Orphan, Grace)>,
+    threads: Rc<RefCell<Threads>>,
+    post: Post<Input>,
+    listener: Listener,
+}
+
+/// How long a child has what it has.
+#[derive(Clone, Copy)]
+enum Grace {
+    /// It was told to stop, and has until then.
+    Stops(Instant),
+    /// Its life is taken and its end is told; its thread has until then.
+    LetsGo(Instant),
+}
+
+impl Grace {
+    const fn ends(self) -> Instant {
+        match self {
+            Self::Stops(ends) | Self::LetsGo(ends) => ends,
+        }
+    }
+}
+
+impl Orphans {
+    /// Takes the children over, and tells each to stop.
+    pub(super) fn take_over(
+        orphans: impl Iterator<Item = (ChildId, Orphan)>,
+        threads: Rc<RefCell<Threads>>,
+        post: Post<Input>,
+        listener: Listener,
+    ) -> Self {
+        let now = Instant::now();
+        let tell = |(id, orphan): (ChildId, Orphan)| {
+            orphan.tenant.stop();
+            let grace = Grace::Stops(now + orphan.stop_within);
+            (id, (orphan, grace))
+        };
+        Self { left: orphans.map(tell).collect(), threads, post, listener }
+    }
+
+    /// Sees to it that all of them end, on the calling thread, with nobody who waits for that.
+    pub(super) fn end_apart(mut self) {
+        let has_a_loop =
+            actix_rt::Arbiter::try_current().is_some() && tokio::runtime::Handle::try_current().is_ok();
+        if has_a_loop {
+            actix_rt::spawn(async move {
+                let why = Reason::GaveUp("its supervisor was dropped".to_owned());
+                self.end_all(&why).await;
+                self.tell(SupervisorFact::Ended(why));
+            });
+        }
+        // Without one the thread ends, and nobody can wait: dropped here, they have no time at all.
+    }
+
+    /// Waits until each has ended or its time is over; `listener` is told of each. An end in order is none here: `why` their
+    /// supervisor failed is why they end.
+    pub(super) async fn end_all(&mut self, why: &Reason) {
+        let mut events = self.post.attach();
+        while let Some(Some(event)) = events.next().now_or_never() {
+            self.hear(event, why);
+        }
+        self.bury(why);
+        while let Some(next) = self.left.values().map(|(_, grace)| grace.ends()).min() {
+            match timeout_at(next, events.next()).await {
+                Ok(Some(event)) => self.hear(event, why),
+                // Another reader came, which nobody makes: dropped, they have no time any more.
+                Ok(None) => return,
+                Err(_) => self.time_is_over(Instant::now(), why),
+            }
+        }
+    }
+
+    fn hear(&mut self, event: Input, why: &Reason) {
+        let (Input::Ended(id, _, reason) | Input::Hung(id, _, reason)) = event else { return };
+        let Some((Orphan { tenant, .. }, grace)) = self.left.get(&id) else { return };
+        match grace {
+            // What is told of a former life is told late: this one can still act.
+            _ if !tenant.vitals().is_over() => {}
+            Grace::Stops(_) => {
+                let reason = if reason.is_failure() { reason } else { why.clone() };
+                self.lose(id, reason);
+            }
+            Grace::LetsGo(_) if tenant.has_ended() => _ = self.left.remove(&id),
+            Grace::LetsGo(_) => {}
+        }
+    }
+
+    /// Those that ended without a word that anybody has heard.
+    fn bury(&mut self, why: &Reason) {
+        let ended: Vec<_> = self.left.iter().filter(|(_, (orphan, _))| orphan.tenant.has_ended()).collect();
+        for id in ended.into_iter().map(|(id, _)| *id).collect::<Vec<_>>() {
+            self.lose(id, why.clone());
+        }
+    }
+
+    fn time_is_over(&mut self, now: Instant, why: &Reason) {
+        let over = self.left.iter().filter(|(_, (_, grace))| grace.ends() <= now);
+        for (id, grace) in over.map(|(id, (_, grace))| (*id, *grace)).collect::<Vec<_>>() {
+            match grace {
+                Grace::Stops(_) => {
+                    let has_ended = self.left.get(&id).is_some_and(|(orphan, _)| orphan.tenant.has_ended());
+                    self.lose(id, if has_ended { why.clone() } else { Reason::Killed });
+                }
+                Grace::LetsGo(_) => {
+                    if let Some((orphan, _)) = self.left.remove(&id) {
+                        self.give_up(&orphan.tenant);
+                    }
+                }
+            }
+        }
+    }
+
+    /// It does nothing any more, and that is told. What is left of it is its thread's business, for a while.
+    fn lose(&mut self, id: ChildId, reason: Reason) {
+        let Some((orphan, _)) = self.left.remove(&id) else { return };
+        orphan.tenant.kill();
+        tracing::warn!(child = orphan.tenant.vitals().name(), %reason, "ended without its supervisor");
+        self.tell(SupervisorFact::Gone(id, reason));
+        if orphan.tenant.holds_its_thread().is_some() {
+            self.give_up(&orphan.tenant);
+        } else if !orphan.tenant.has_ended() {
+            self.left.insert(id, (orphan, Grace::LetsGo(Instant::now() + LETTING_GO)));
+        }
+    }
+
+    fn give_up(&self, tenant: &Tenant) {
+        if !tenant.has_ended() {
+            self.threads.borrow_mut().give_up(tenant);
+        }
+    }
+
+    /// Whoever listens may be why the supervisor failed.
+    fn tell(&mut self, fact: SupervisorFact) {
+        if let Err(panic) = catch_unwind(AssertUnwindSafe(|| (self.listener)(fact))) {
+            tracing::error!(
+                said = words(panic),
+                "whoever listens to a supervisor panicked, and is told the rest"
+            );
+        }
+    }
+}
+
+impl Drop for Orphans {
+    fn drop(&mut self) {
+        for (orphan, _) in self.left.values() {
+            // One that has ended takes no notice.
+            orphan.tenant.kill();
+        }
+    }
+}
