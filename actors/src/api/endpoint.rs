@@ -147,16 +147,7 @@ impl Endpoint {
         value: &P,
         within: Duration,
     ) -> Result<Outcome, ApiError> {
-        let mut message = Message::typed(self.tid, destination, value);
-        if message.header.class == Class::Stream {
-            // Of a Stream the newest wins, so an older one has no outcome of its own.
-            return Ok(Outcome::Rejected(Rejection::Unsupported));
-        }
-        message.header.time_to_live_us = in_micros(within);
-        match self.request(message, Awaited::Outcome, Flags::CONFIRM, within)? {
-            Some(Answer::Outcome(outcome)) => Ok(outcome),
-            Some(Answer::Reply(_) | Answer::Resolved(_)) | None => Ok(Outcome::Unknown),
-        }
+        self.confirm(Message::typed(self.tid, destination, value), within)
     }
 
     /// Sends a request and waits for the reply.
@@ -169,14 +160,7 @@ impl Endpoint {
         request: &P,
         within: Duration,
     ) -> Result<R, ApiError> {
-        let mut message = Message::typed(self.tid, destination, request);
-        message.header.class = Class::Control;
-        message.header.time_to_live_us = in_micros(within);
-        match self.request(message, Awaited::Reply, Flags::CONFIRM.with(Flags::ASK), within)? {
-            Some(Answer::Reply(reply)) => Ok(reply.decode()?),
-            Some(Answer::Outcome(outcome)) => Err(ApiError::Ended(outcome)),
-            Some(Answer::Resolved(_)) | None => Err(ApiError::NoReply(within)),
-        }
+        Ok(self.await_reply(Message::typed(self.tid, destination, request), within)?.decode()?)
     }
 
     /// Answers a request.
@@ -184,14 +168,7 @@ impl Endpoint {
     /// # Errors
     /// The message asks for no reply, or the reply was not sent.
     pub fn reply<R: Payload>(&mut self, request: &Received, value: &R) -> Result<(), ApiError> {
-        if !request.wants_reply() {
-            return Err(ApiError::NotAsked);
-        }
-        let mut message = Message::typed(self.tid, request.source(), value);
-        message.header.class = Class::Control;
-        message.header.flags = Flags::REPLY;
-        message.header.correlation = request.correlation();
-        self.dispatch(message)
+        self.answer(request, Message::typed(self.tid, request.source(), value))
     }
 
     /// Waits for a message, at most `within` this time; `None` if none came (the paper's ReceiveMessage). Control
@@ -272,6 +249,46 @@ impl Endpoint {
             Some(Answer::Outcome(outcome)) => Err(ApiError::Ended(outcome)),
             Some(Answer::Reply(_) | Answer::Resolved(_)) | None => Err(ApiError::NoAnswer(PROMPT)),
         }
+    }
+
+    /// Sends `message` and waits for its outcome.
+    pub(super) fn confirm(&mut self, mut message: Message, within: Duration) -> Result<Outcome, ApiError> {
+        if message.header.class == Class::Stream {
+            // Of a Stream the newest wins, so an older one has no outcome of its own.
+            return Ok(Outcome::Rejected(Rejection::Unsupported));
+        }
+        message.header.time_to_live_us = in_micros(within);
+        match self.request(message, Awaited::Outcome, Flags::CONFIRM, within)? {
+            Some(Answer::Outcome(outcome)) => Ok(outcome),
+            Some(Answer::Reply(_) | Answer::Resolved(_)) | None => Ok(Outcome::Unknown),
+        }
+    }
+
+    /// Sends `message` as a request and waits for the reply.
+    pub(super) fn await_reply(
+        &mut self,
+        mut message: Message,
+        within: Duration,
+    ) -> Result<Message, ApiError> {
+        message.header.class = Class::Control;
+        message.header.time_to_live_us = in_micros(within);
+        match self.request(message, Awaited::Reply, Flags::CONFIRM.with(Flags::ASK), within)? {
+            Some(Answer::Reply(reply)) => Ok(reply),
+            Some(Answer::Outcome(outcome)) => Err(ApiError::Ended(outcome)),
+            Some(Answer::Resolved(_)) | None => Err(ApiError::NoReply(within)),
+        }
+    }
+
+    /// Sends `message` as the reply to `request`.
+    pub(super) fn answer(&mut self, request: &Received, mut message: Message) -> Result<(), ApiError> {
+        if !request.wants_reply() {
+            return Err(ApiError::NotAsked);
+        }
+        message.header.destination = request.source();
+        message.header.class = Class::Control;
+        message.header.flags = Flags::REPLY;
+        message.header.correlation = request.correlation();
+        self.dispatch(message)
     }
 
     /// Sends `message` and waits for its answer; `None` at the deadline.

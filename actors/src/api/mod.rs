@@ -8,7 +8,7 @@
 //! | --- | --- |
 //! | RegisterTransportAddress | [`NodeApi::register_transport_address`] |
 //! | CreateMessage | [`Endpoint::create_message`] |
-//! | SendMessage | [`Endpoint::send_message`]; typed: [`Endpoint::send`], [`send_confirmed`](Endpoint::send_confirmed), [`ask`](Endpoint::ask) |
+//! | SendMessage | [`Endpoint::send_message`], [`send_message_confirmed`](Endpoint::send_message_confirmed), [`ask_message`](Endpoint::ask_message); typed: [`Endpoint::send`], [`send_confirmed`](Endpoint::send_confirmed), [`ask`](Endpoint::ask) |
 //! | ReceiveMessage | [`Endpoint::receive`] |
 //!
 //! ```no_run
@@ -40,6 +40,7 @@ mod endpoint;
 mod error;
 mod inbox;
 mod link;
+mod raw;
 mod received;
 #[cfg(test)]
 mod tests;
@@ -148,6 +149,13 @@ impl Registration {
     #[must_use]
     pub fn handles<P: Payload>(mut self) -> Self {
         self.register.kinds.push(P::NAME.to_owned());
+        self
+    }
+
+    /// The same for a type that Rust does not know, by its name.
+    #[must_use]
+    pub fn handles_named(mut self, name: impl Into<String>) -> Self {
+        self.register.kinds.push(name.into());
         self
     }
 

@@ -115,6 +115,33 @@ fn raw_memory_is_lent_filled_and_sent() {
 }
 
 #[test]
+fn raw_memory_is_confirmed_asked_with_and_replied_with() {
+    let node = TestNode::start();
+    let mut asking = register(&node, Registration::new().handles_named("test.raw"));
+    let mut replying = register(&node, Registration::new());
+    let (to, kind) = (replying.tid(), Kind::named("test.raw"));
+    let thread = thread::spawn(move || {
+        replying
+            .receive(WATCHDOG)
+            .unwrap()
+            .expect("a message")
+            .settle(Outcome::Rejected(Rejection::ByHandler));
+        let request = replying.receive(WATCHDOG).unwrap().expect("a request");
+        let mut reply = replying.create_message(Tid::NONE, kind, 1).unwrap();
+        reply[0] = request.bytes()[0] + 1;
+        replying.reply_message(&request, reply).unwrap();
+    });
+    let mut buffer = asking.create_message(to, kind, 1).unwrap();
+    buffer[0] = 6;
+    let outcome = asking.send_message_confirmed(buffer, WATCHDOG).unwrap();
+    assert_eq!(outcome, Outcome::Rejected(Rejection::ByHandler));
+    let mut buffer = asking.create_message(to, kind, 1).unwrap();
+    buffer[0] = 7;
+    assert_eq!(asking.ask_message(buffer, WATCHDOG).unwrap().bytes(), [8]);
+    thread.join().unwrap();
+}
+
+#[test]
 fn a_confirmed_message_ends_in_what_its_receiver_says() {
     let node = TestNode::start();
     let app = node.local(1);
