@@ -1,0 +1,54 @@
+//! Processes that speak to a node through its door, and what is claimed of them whatever happens to one of them.
+//!
+//! A program that proves a claim is its own cast: it starts itself again, with `--role`, for each process that it needs.
+//!
+//! | file | what it is |
+//! | --- | --- |
+//! | `stage` | a node in a process of its own, a directory, and how the processes of the cast are started |
+//! | `performer` | such a process, as its director sees it: lines in and out, signals |
+//! | `door` | the role of the node |
+//! | `poster` | a role: 8 addresses that send to all others in every class, and tell the ledger |
+//! | `entry`, `ledger` | what posters tell, and what became of every message |
+//! | `conservation` | the claim: what was sent has one fate that is true, whoever is killed |
+
+pub mod conservation;
+mod door;
+pub mod entry;
+pub mod ledger;
+mod performer;
+mod poster;
+mod stage;
+
+use std::process::ExitCode;
+
+pub use self::{
+    performer::Performer,
+    stage::{Stage, StageLimits},
+};
+
+/// Plays the role that this process was started for; `None` if it is the director.
+#[must_use]
+pub fn play() -> Option<ExitCode> {
+    let mut arguments = std::env::args().skip(1);
+    if arguments.next().as_deref() != Some("--role") {
+        return None;
+    }
+    let role = arguments.next().unwrap_or_default();
+    let arguments: Vec<String> = arguments.collect();
+    match &*role {
+        "door" => door::play(&arguments),
+        "poster" => poster::play(&arguments),
+        _ => panic!("nobody plays {role:?}"),
+    }
+    Some(ExitCode::SUCCESS)
+}
+
+/// Says one line to the director. One write: what a killed process has said, it has said whole.
+fn say(line: &dyn std::fmt::Display) {
+    println!("{line}");
+}
+
+/// The lines that the director says, until it says no more.
+fn told() -> impl Iterator<Item = String> {
+    std::io::stdin().lines().map_while(Result::ok)
+}

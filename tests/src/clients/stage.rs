@@ -1,0 +1,125 @@
+//! A node in a process of its own, a directory that belongs to nobody else, and a cast that is started in it.
+
+use std::{
+    path::{Path, PathBuf},
+    sync::mpsc::{Receiver, sync_channel},
+};
+
+use super::Performer;
+use crate::{DEADLINE, OwnDirectory};
+
+/// What the node may hold.
+#[derive(Clone, Copy, Debug)]
+pub struct StageLimits {
+    /// `node.mailbox_capacity`.
+    pub mailbox_capacity: usize,
+    /// `node.payload_max`.
+    pub payload_max: usize,
+    /// `lncl.clients_max`.
+    pub clients_max: usize,
+}
+
+/// Where a proof takes place.
+#[derive(Debug)]
+pub struct Stage {
+    program: PathBuf,
+    /// Ends before its directory does.
+    node: Performer,
+    answers: Receiver<String>,
+    directory: OwnDirectory,
+}
+
+impl Stage {
+    /// Starts the node. `program` is one whose `main` calls [`play`](super::play) first.
+    ///
+    /// # Panics
+    /// If it does not start.
+    #[must_use]
+    pub fn new(program: &Path, limits: StageLimits) -> Self {
+        let directory = OwnDirectory::new();
+        for name in ["run", "tmp"] {
+            std::fs::create_dir(directory.join(name)).expect("the test's own directory");
+        }
+        let (socket, config) = (directory.join("run").join("node.sock"), directory.join("node.toml"));
+        let StageLimits { mailbox_capacity, payload_max, clients_max } = limits;
+        let text = format!(
+            "[node]\nname = \"stage\"\nmailbox_capacity = {mailbox_capacity}\npayload_max = {payload_max}\n\
+             [lncl]\nsocket = {socket:?}\nclients_max = {clients_max}\n[ndl]\nmulticast = false\nmdns_port = false\n"
+        );
+        std::fs::write(&config, text).expect("the test's own directory");
+        let (say, answers) = sync_channel(64);
+        let arguments = [config.display().to_string()];
+        let node = Performer::start(program, "door", &arguments, &directory.join("tmp"), move |line| {
+            // Nobody waits for its answers any more when the stage is gone.
+            let _ = say.send(line.to_owned());
+        });
+        let stage = Self { program: program.to_owned(), node, answers, directory };
+        stage.wait_for("open");
+        stage
+    }
+
+    fn wait_for(&self, word: &str) -> String {
+        let answer = self.answers.recv_timeout(DEADLINE).unwrap_or_else(|_| panic!("the node says {word:?}"));
+        answer
+            .strip_prefix(word)
+            .unwrap_or_else(|| panic!("{answer:?} instead of {word:?}"))
+            .trim()
+            .to_owned()
+    }
+
+    /// Starts a process in this role; each line that it says is given to `hear`. Its first argument is the socket.
+    pub fn start(
+        &self,
+        role: &str,
+        arguments: &[String],
+        hear: impl FnMut(&str) + Send + 'static,
+    ) -> Performer {
+        let socket = self.socket().display().to_string();
+        let arguments: Vec<String> = [socket].into_iter().chain(arguments.iter().cloned()).collect();
+        Performer::start(&self.program, role, &arguments, &self.directory.join("tmp"), hear)
+    }
+
+    /// The path of the node's socket.
+    #[must_use]
+    pub fn socket(&self) -> PathBuf {
+        self.directory.join("run").join("node.sock")
+    }
+
+    /// The process id of the node.
+    #[must_use]
+    pub fn node_id(&self) -> u32 {
+        self.node.id()
+    }
+
+    /// How much the node has refused so far.
+    ///
+    /// # Panics
+    /// If it does not say.
+    pub fn refused(&mut self) -> u64 {
+        self.node.tell("refused");
+        self.wait_for("refused").parse().expect("a number")
+    }
+
+    /// The files in the directories that the node and the cast may write to: beside the socket, and temporary ones.
+    #[must_use]
+    pub fn files(&self) -> Vec<PathBuf> {
+        let list =
+            |name: &str| std::fs::read_dir(self.directory.join(name)).expect("the stage's own directory");
+        let mut files: Vec<_> =
+            ["run", "tmp"].iter().flat_map(|name| list(name)).flatten().map(|entry| entry.path()).collect();
+        files.sort();
+        files
+    }
+
+    /// Ends the node in order.
+    ///
+    /// # Panics
+    /// If it does not, or not in order, or leaves a file behind.
+    pub fn end(self) {
+        let Self { node, directory, .. } = self;
+        let status = node.end();
+        assert!(status.success(), "the node ended with {status}");
+        let left = std::fs::read_dir(directory.join("run")).expect("the stage's own directory").count();
+        assert_eq!(left, 0, "files are left beside the socket");
+    }
+}

@@ -1,0 +1,3 @@
+//! Processes that speak to a node through its door: killed, stopped, hostile. One binary, one module a claim.
+
+mod conservation;
