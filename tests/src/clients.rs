@@ -9,21 +9,32 @@
 //! | `door` | the role of the node |
 //! | `poster` | a role: 8 addresses that send to all others in every class, and tell the ledger |
 //! | `entry`, `ledger` | what posters tell, and what became of every message |
+//! | `steady` | the roles of those who are not to feel it: one asks and measures, one answers, one takes what comes |
+//! | `victim` | the role of a process that is killed with loans in its hands |
+//! | `held` | what a process has of the host |
 //! | `conservation` | the claim: what was sent has one fate that is true, whoever is killed |
+//! | `kills` | the claim: a killed process leaves nothing behind, and the others do not feel it |
 
 pub mod conservation;
 mod door;
 pub mod entry;
+mod held;
+pub mod kills;
 pub mod ledger;
 mod performer;
 mod poster;
+mod registration;
 mod stage;
+mod steady;
+mod victim;
 
 use std::process::ExitCode;
 
 pub use self::{
+    held::Held,
     performer::Performer,
     stage::{Stage, StageLimits},
+    steady::Window,
 };
 
 /// Plays the role that this process was started for; `None` if it is the director.
@@ -38,6 +49,9 @@ pub fn play() -> Option<ExitCode> {
     match &*role {
         "door" => door::play(&arguments),
         "poster" => poster::play(&arguments),
+        "pinger" => steady::play_pinger(&arguments),
+        "taker" => steady::play_taker(&arguments),
+        "victim" => victim::play(&arguments),
         _ => panic!("nobody plays {role:?}"),
     }
     Some(ExitCode::SUCCESS)

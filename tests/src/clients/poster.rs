@@ -6,19 +6,19 @@ use std::{
     collections::BTreeMap,
     sync::atomic::{AtomicU8, Ordering},
     thread,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use sinew::{
-    ApiError, AppAddress, Class, Endpoint, NodeApi, Outcome, Received, Registration, Rejection, Tid, Time,
-    payload,
+    ApiError, Class, Endpoint, NodeApi, Outcome, Received, Registration, Rejection, Tid, Time, payload,
 };
 
 use super::{
     entry::{Entry, Poster, Way},
+    registration::{address, register},
     say, told,
 };
-use crate::{DEADLINE, dice::Dice};
+use crate::dice::Dice;
 
 /// Posters of one process.
 pub(super) const POSTERS: Poster = 8;
@@ -70,11 +70,6 @@ pub(super) fn play(arguments: &[String]) {
     STAGE.store(END, Ordering::Relaxed);
 }
 
-/// The address of a poster.
-fn address(poster: Poster) -> AppAddress {
-    AppAddress::fixed(u32::from(poster)).expect("the range is wide")
-}
-
 /// Whether a poster waits for messages, and not for outcomes.
 const fn is_handler(poster: Poster) -> bool {
     poster.is_multiple_of(2)
@@ -93,23 +88,11 @@ struct Letters {
 
 impl Letters {
     fn register(api: &NodeApi, me: Poster, all: Poster, life: u32, dice: Dice) -> Self {
-        let until = Instant::now() + DEADLINE;
-        loop {
-            let registration = Registration::new().fixed(address(me)).inbox_capacity(CAPACITY);
-            match api.register_transport_address(registration) {
-                Ok(endpoint) => {
-                    let numbers = BTreeMap::new();
-                    let this = Self { endpoint, me, all, life, dice, numbers };
-                    this.tell(&Entry::Up(Time::now()));
-                    return this;
-                }
-                // The node has not seen yet that the life before was killed.
-                Err(ApiError::Refused(_)) if Instant::now() < until => {
-                    thread::sleep(Duration::from_millis(1));
-                }
-                Err(error) => panic!("poster {me} gets no address: {error}"),
-            }
-        }
+        let registration = Registration::new().fixed(address(me)).inbox_capacity(CAPACITY);
+        let endpoint = register(api, &registration);
+        let this = Self { endpoint, me, all, life, dice, numbers: BTreeMap::new() };
+        this.tell(&Entry::Up(Time::now()));
+        this
     }
 
     fn tell(&self, entry: &Entry) {

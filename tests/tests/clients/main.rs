@@ -1,3 +1,4 @@
 //! Processes that speak to a node through its door: killed, stopped, hostile. One binary, one module a claim.
 
 mod conservation;
+mod kills;

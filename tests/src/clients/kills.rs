@@ -1,0 +1,242 @@
+//! The claim: processes that are killed at any instant, with loans in their hands, leave nothing behind, and the others do not
+//! feel it.
+
+use std::{
+    collections::BTreeSet,
+    fmt,
+    path::PathBuf,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+        mpsc::{Receiver, sync_channel},
+    },
+    thread,
+    time::{Duration, Instant},
+};
+
+use super::{
+    Performer, Stage, StageLimits,
+    held::{Held, files_of_the_host},
+    steady::{ECHO, SINK, Window},
+};
+use crate::{DEADLINE, dice::Dice, until};
+
+/// Processes that are killed.
+const VICTIMS: u16 = 4;
+/// Kills before anything is measured.
+const WARM_UP: u32 = 20;
+/// Growth of the memory of one process that its allocator may have for itself.
+const GROWTH_MAX_KIB: u64 = 2 * 1024;
+
+/// What is to be done.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    /// A program whose `main` calls [`play`](super::play) first.
+    pub program: PathBuf,
+    /// How often a process is killed.
+    pub kills: u32,
+    /// Mean time between two kills.
+    pub spacing: Duration,
+    /// How long it is measured without kills, and with processes that end in order.
+    pub reference: Duration,
+    /// Decides who is killed when.
+    pub seed: u64,
+}
+
+/// What was seen.
+#[derive(Debug)]
+pub struct Report {
+    kills: u32,
+    seconds: f64,
+    /// Killed while all its addresses held messages that they had received, and lent memory.
+    pub held_loans: u32,
+    /// Of each process that lives on: before and after the kills.
+    pub held: Vec<(&'static str, Held, Held)>,
+    /// Round trips of others: nobody is killed; as many end in order; the kills.
+    pub windows: [Window; 3],
+    /// Files that were not there before.
+    pub left: Vec<PathBuf>,
+}
+
+impl Report {
+    /// Everything was given back, nothing was left, and everybody was served.
+    #[must_use]
+    pub fn holds(&self) -> bool {
+        let is_back = |(_, before, after): &(&str, Held, Held)| {
+            after.is_back_at(before) && after.proportional_kib <= before.proportional_kib + GROWTH_MAX_KIB
+        };
+        self.left.is_empty()
+            && self.held.iter().all(is_back)
+            && self.windows.iter().all(|window| window.failed == 0)
+    }
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { kills, seconds, held_loans, held, windows, left } = self;
+        writeln!(f, "{kills} kills in {seconds:.1} s; {held_loans} of them while every address held loans")?;
+        for (who, before, after) in held {
+            writeln!(f, "{who:<8} before {before}\n{:<8} after  {after}", "")?;
+        }
+        for (what, window) in ["nobody is killed", "they end in order", "they are killed"].iter().zip(windows)
+        {
+            writeln!(f, "{what:<18} {window}")?;
+        }
+        let ratio = |index: usize| windows[2].p99_us as f64 / windows[index].p99_us.max(1) as f64;
+        writeln!(
+            f,
+            "p99 with kills: {:.2} of that without, {:.2} of that with orderly ends",
+            ratio(0),
+            ratio(1)
+        )?;
+        write!(
+            f,
+            "expected: descriptors and mappings back to the start, at most {GROWTH_MAX_KIB} KiB more, no file left, no \
+             round trip failed; seen: {}, files left: {left:?}",
+            if self.holds() { "so" } else { "NOT SO" }
+        )
+    }
+}
+
+struct Cast {
+    plan: Plan,
+    stage: Stage,
+    steady: Vec<(&'static str, Performer)>,
+    answers: Receiver<String>,
+    victims: Vec<Option<(Performer, Arc<AtomicBool>)>>,
+    started: u64,
+    dice: Dice,
+    held_loans: u32,
+}
+
+/// How a victim ends.
+#[derive(Clone, Copy)]
+enum End {
+    Killed,
+    InOrder,
+}
+
+impl Cast {
+    fn new(plan: Plan) -> Self {
+        let limits = StageLimits { mailbox_capacity: 256, payload_max: 1 << 20, clients_max: 256 };
+        let stage = Stage::new(&plan.program, limits);
+        let (say, answers) = sync_channel(64);
+        let start = |role: &'static str, arguments: &[&str]| {
+            let say = say.clone();
+            let arguments: Vec<_> = arguments.iter().map(|&argument| argument.to_owned()).collect();
+            // Nobody hears it any more when the director has gone.
+            let performer = stage.start(role, &arguments, move |line| drop(say.send(line.to_owned())));
+            assert_eq!(answers.recv_timeout(DEADLINE).as_deref(), Ok("up"), "{role} comes up");
+            performer
+        };
+        let steady = vec![
+            (ECHO, start("taker", &[ECHO])),
+            (SINK, start("taker", &[SINK])),
+            ("pinger", start("pinger", &[])),
+        ];
+        let (dice, victims) = (Dice::new(plan.seed), (0..VICTIMS).map(|_| None).collect());
+        let mut cast = Self { plan, stage, steady, answers, victims, started: 0, dice, held_loans: 0 };
+        (0..VICTIMS).for_each(|victim| cast.start(victim));
+        cast
+    }
+
+    fn start(&mut self, victim: u16) {
+        self.started += 1;
+        let holds = Arc::new(AtomicBool::new(false));
+        let arguments = [victim.into(), VICTIMS.into(), self.plan.seed ^ self.started];
+        let arguments = arguments.map(|number: u64| number.to_string());
+        let says_so = holds.clone();
+        let hear = move |line: &str| says_so.store(line == "holds", Ordering::Relaxed);
+        let performer = self.stage.start("victim", &arguments, hear);
+        self.victims[usize::from(victim)] = Some((performer, holds));
+    }
+
+    fn end(&mut self, victim: u16, how: End) {
+        let Some((performer, holds)) = self.victims[usize::from(victim)].take() else { return };
+        match how {
+            End::Killed => performer.kill(),
+            End::InOrder => drop(performer.end()),
+        }
+        self.held_loans += u32::from(holds.load(Ordering::Relaxed));
+    }
+
+    fn end_some(&mut self, times: u32, how: End) {
+        for _ in 0..times {
+            thread::sleep(self.dice.time_below(self.plan.spacing * 2));
+            let victim = self.dice.below(VICTIMS.into()) as u16;
+            self.end(victim, how);
+            self.start(victim);
+        }
+    }
+
+    /// What the pinger measured since the last one; at least one round trip.
+    fn window(&mut self) -> Window {
+        until("a round trip ends", || {
+            self.steady.last_mut().expect("it is the pinger").1.tell("window");
+            let window = Window::read(&self.answers.recv_timeout(DEADLINE).expect("the pinger answers"));
+            (window.count + window.failed > 0).then_some(window)
+        })
+    }
+
+    /// What everybody holds who lives on, when all victims are gone.
+    fn held_at_rest(&mut self, before: Option<&[Held]>) -> Vec<Held> {
+        (0..VICTIMS).for_each(|victim| self.end(victim, End::Killed));
+        let processes: Vec<u32> =
+            [self.stage.node_id()].into_iter().chain(self.steady.iter().map(|(_, one)| one.id())).collect();
+        let now = || -> Vec<Held> { processes.iter().map(|process| Held::of(*process)).collect() };
+        let end = Instant::now() + DEADLINE;
+        let is_back = |now: &[Held]| {
+            before.is_none_or(|before| now.iter().zip(before).all(|(now, before)| now.is_back_at(before)))
+        };
+        // What is counted before it came to rest may only be too much, and that only the first time.
+        thread::sleep(Duration::from_millis(500));
+        while !is_back(&now()) && Instant::now() < end {
+            thread::sleep(Duration::from_millis(20));
+        }
+        now()
+    }
+
+    fn files(&self) -> BTreeSet<PathBuf> {
+        files_of_the_host().into_iter().chain(self.stage.files()).collect()
+    }
+}
+
+/// Kills processes and says what that left.
+///
+/// # Panics
+/// If one does not start, or those that are not killed end.
+#[must_use]
+pub fn run(plan: Plan) -> Report {
+    let (kills, reference) = (plan.kills, plan.reference);
+    let mut cast = Cast::new(plan);
+    cast.end_some(WARM_UP, End::Killed);
+    let before = cast.held_at_rest(None);
+    let files = cast.files();
+    (0..VICTIMS).for_each(|victim| cast.start(victim));
+    thread::sleep(cast.plan.spacing * 2);
+
+    cast.window();
+    thread::sleep(reference);
+    let nobody = cast.window();
+    let in_order = u32::try_from(reference.as_millis() / cast.plan.spacing.as_millis().max(1)).unwrap_or(1);
+    cast.end_some(in_order.clamp(1, kills), End::InOrder);
+    let in_order = cast.window();
+    cast.held_loans = 0;
+    let began = Instant::now();
+    cast.end_some(kills, End::Killed);
+    let killed = cast.window();
+    let (seconds, held_loans) = (began.elapsed().as_secs_f64(), cast.held_loans);
+
+    let after = cast.held_at_rest(Some(&before));
+    let left = cast.files().difference(&files).cloned().collect();
+    let names = ["node"].into_iter().chain(cast.steady.iter().map(|(name, _)| *name));
+    let held = names.zip(before.into_iter().zip(after)).map(|(name, (before, after))| (name, before, after));
+    let held = held.collect();
+    // The one that asks first.
+    for (who, performer) in cast.steady.into_iter().rev() {
+        let status = performer.end();
+        assert!(status.success(), "{who} ended with {status}");
+    }
+    cast.stage.end();
+    Report { kills, seconds, held_loans, held, windows: [nobody, in_order, killed], left }
+}
