@@ -2,7 +2,7 @@
 
 use std::{
     collections::BTreeMap,
-    net::SocketAddr,
+    net::{SocketAddr, UdpSocket},
     sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, atomic::AtomicBool},
     time::Duration,
 };
@@ -39,8 +39,12 @@ pub(crate) struct Stores {
     pub(crate) refusals: Arc<Refusals>,
     /// GNCL's peers with the messages that wait for them, and what GNCL refused.
     pub(crate) gncl: gncl::Store,
+    /// NDL's socket for queries and answers. It stays open while this layer is restarted: whoever knows it still finds us.
+    pub(crate) ndl_socket: Mutex<Option<UdpSocket>>,
     /// Which nodes are there; a restarted NDL goes on with them.
     pub(crate) ndl: Mutex<ndl::Core>,
+    /// Where other processes come in.
+    pub(crate) door: lncl::Door,
     /// Who is registered on this node.
     pub(crate) registry: Mutex<lncl::Registry>,
     /// Counts the changes of who has which name, on this node or any.
@@ -79,7 +83,9 @@ impl Stores {
             gncl_listen: OnceLock::new(),
             refusals: Arc::default(),
             gncl: gncl::Store::default(),
+            ndl_socket: Mutex::default(),
             ndl: Mutex::new(ndl::new_core(&config, node, incarnation)),
+            door: lncl::Door::default(),
             registry: Mutex::default(),
             directory_changes: watch::Sender::default(),
             sync: Mutex::new(sync::Core::new(&config, node, incarnation)),
@@ -89,6 +95,13 @@ impl Stores {
             #[cfg(feature = "fault-points")]
             faults: sinew_runtime::supervision::fault::FaultPoints::default(),
         })
+    }
+
+    /// The node has ended: what it was reached by is free for another one, even where a thread that hangs still holds it.
+    pub(crate) fn close(&self) {
+        self.door.close();
+        self.gncl.close();
+        lock(&self.ndl_socket).take();
     }
 
     /// Somebody has a name that he had not, or has it no more, on this node or another. Said after the change and before

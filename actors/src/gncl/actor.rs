@@ -375,7 +375,7 @@ impl Actor for Gncl {
         // SYNC: Relaxed; the order to stop came through the supervisor's lock, after the flag was set.
         if self.stores.stopping.load(Ordering::Relaxed) {
             self.input(Input::LeaveRequested, ctx);
-            lock(&self.stores.gncl.listener).take();
+            self.stores.gncl.close();
         }
         Running::Stop
     }

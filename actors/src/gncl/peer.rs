@@ -2,6 +2,7 @@
 
 use std::{
     collections::BTreeMap,
+    net::Shutdown,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
 };
 
@@ -13,12 +14,14 @@ use sinew_runtime::{
     time::Time,
     wire::{Flags, Header, Kind, Message},
 };
+use socket2::SockRef;
 use tokio::net::TcpStream;
 
 use crate::{
     config::NodeConfig,
     outlet::{OutletLimits, StreamOutlet},
     refusals::Refusals,
+    stores::lock,
 };
 
 /// One life of another node, from its first link until it is forgotten.
@@ -133,6 +136,14 @@ impl Store {
         // Closed without the lock: whoever is told of an outcome may ask for a peer.
         if let Some(peer) = peer {
             peer.outlet.close(Rejection::NoSuchNode);
+        }
+    }
+
+    /// Nobody connects any more, and the port is free, whoever still holds the socket.
+    pub(crate) fn close(&self) {
+        if let Some(listener) = lock(&self.listener).take() {
+            // An error says that it does not listen any more.
+            let _ = SockRef::from(&listener).shutdown(Shutdown::Both);
         }
     }
 

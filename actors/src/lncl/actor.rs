@@ -1,14 +1,18 @@
 //! LNCL's shell: opens the door for other processes, and lets applications through the barrier.
 
-use std::{rc::Rc, sync::Arc, time::Duration};
+use std::{
+    rc::Rc,
+    sync::{Arc, atomic::Ordering},
+    time::Duration,
+};
 
-use actix::{Actor, AsyncContext, Context, StreamHandler, fut::WrapFuture};
+use actix::{Actor, AsyncContext, Context, Running, StreamHandler, fut::WrapFuture};
 use sinew_runtime::{supervision::ReadyGate, time::Time};
 use tokio::net::UnixListener;
 
 use super::{
     Event,
-    listener::{self, SocketFile},
+    listener::ListenError,
     registrar,
     server::{Server, accept},
 };
@@ -21,14 +25,12 @@ const EXPIRY_PERIOD: Duration = Duration::from_millis(100);
 pub(crate) struct Lncl {
     server: Rc<Server>,
     ready: Option<ReadyGate>,
-    /// Removed when this is dropped.
-    file: Option<SocketFile>,
 }
 
 impl Lncl {
     /// An LNCL on the registry in `stores`; it opens `ready` when other processes can connect.
     pub(crate) fn new(stores: Arc<Stores>, ready: ReadyGate) -> Self {
-        Self { server: Server::new(stores), ready: Some(ready), file: None }
+        Self { server: Server::new(stores), ready: Some(ready) }
     }
 
     /// Opens the door, if there is to be one.
@@ -37,16 +39,10 @@ impl Lncl {
     /// If the path cannot be had. That is how a layer's start fails: its supervisor reports these words.
     fn open_door(&mut self, ctx: &mut Context<Self>) {
         let Some(path) = self.server.stores.config.lncl.socket.clone() else { return };
-        let opened = listener::listen(&path).and_then(|(listener, file)| {
-            let listener = UnixListener::from_std(listener);
-            listener.map(|listener| (listener, file)).map_err(|cause| listener::ListenError::System {
-                doing: "watch",
-                path: path.clone(),
-                cause,
-            })
-        });
-        let (listener, file) = opened.unwrap_or_else(|error| panic!("LNCL cannot start: {error}"));
-        self.file = Some(file);
+        let in_words = |cause| ListenError::System { doing: "watch", path: path.clone(), cause };
+        let opened = self.server.stores.door.open(&path);
+        let opened = opened.and_then(|listener| UnixListener::from_std(listener).map_err(in_words));
+        let listener = opened.unwrap_or_else(|error| panic!("LNCL cannot start: {error}"));
         ctx.spawn(accept(self.server.clone(), listener).into_actor(self));
         tracing::info!(?path, "applications of other processes can connect");
     }
@@ -57,12 +53,21 @@ impl Actor for Lncl {
 
     fn started(&mut self, ctx: &mut Self::Context) {
         registrar::forget_former_clients(&self.server.stores);
+        self.server.stores.door.hang_up();
         ctx.add_stream(self.server.stores.posts.lncl.attach());
         ctx.run_interval(EXPIRY_PERIOD, |lncl, _| lncl.server.expire(Time::now()));
         self.open_door(ctx);
         if let Some(ready) = self.ready.take() {
             ready.reached();
         }
+    }
+
+    fn stopping(&mut self, _: &mut Self::Context) -> Running {
+        // Only when the node stops: those who come while this layer is restarted wait for its next life.
+        if self.server.stores.stopping.load(Ordering::Relaxed) {
+            self.server.stores.door.close();
+        }
+        Running::Stop
     }
 }
 

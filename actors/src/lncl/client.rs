@@ -48,7 +48,7 @@ enum End {
 }
 
 /// Serves one connection to its end.
-pub(super) async fn serve(server: Rc<Server>, stream: UnixStream, credentials: UCred, id: ClientId) {
+pub(super) async fn serve(server: Rc<Server>, stream: Arc<UnixStream>, credentials: UCred, id: ClientId) {
     let mut reader = Reader::new(REGISTER_BYTES_MAX);
     let mut session = Session::new();
     // spec: LNCL-1
@@ -63,8 +63,7 @@ pub(super) async fn serve(server: Rc<Server>, stream: UnixStream, credentials: U
             return refuse(&server, &stream, "silent stranger", &why);
         }
     };
-    let peer = Peer { stream: Arc::new(stream), id, pid: credentials.pid().unwrap_or_default() };
-    let stream = peer.stream.clone();
+    let peer = Peer { stream: stream.clone(), id, pid: credentials.pid().unwrap_or_default() };
     let mut client = match Client::register(server.clone(), peer, register) {
         Ok(client) => client,
         Err(why) => return refuse(&server, &stream, "registration", &why),

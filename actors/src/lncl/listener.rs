@@ -47,9 +47,16 @@ pub(crate) struct SocketFile {
     identity: (u64, u64),
 }
 
+impl SocketFile {
+    /// Whether it still lies where it was made.
+    pub(super) fn is_there(&self) -> bool {
+        identity_of(&self.path).is_ok_and(|found| found == self.identity)
+    }
+}
+
 impl Drop for SocketFile {
     fn drop(&mut self) {
-        if identity_of(&self.path).is_ok_and(|found| found == self.identity)
+        if self.is_there()
             && let Err(cause) = fs::remove_file(&self.path)
         {
             tracing::warn!(path = ?self.path, %cause, "the socket file is left behind; the next start replaces it");

@@ -19,6 +19,7 @@
 mod actor;
 mod client;
 mod core;
+mod door;
 mod facts;
 mod listener;
 pub(crate) mod payload;
@@ -34,6 +35,7 @@ mod tests;
 pub(crate) use actor::Lncl;
 pub use core::RegisterError;
 pub(crate) use core::Registry;
+pub(crate) use door::Door;
 pub(crate) use facts::AppFact;
 pub(crate) use reader::Reader;
 pub(crate) use registrar::{

@@ -65,6 +65,7 @@ impl Server {
     }
 
     pub(super) fn add_outlet(&self, id: ClientId, outlet: Arc<ClientOutlet>) {
+        self.stores.door.add_outlet(id, &outlet);
         self.outlets.borrow_mut().insert(id, outlet);
     }
 
@@ -122,7 +123,12 @@ fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) {
         Ok(credentials) => {
             let server = server.clone();
             let id = lock(&server.stores.registry).new_client();
-            clients.spawn_local(client::serve(server, stream, credentials, id));
+            let stream = Arc::new(stream);
+            server.stores.door.admit(id, &stream);
+            clients.spawn_local(async move {
+                client::serve(server.clone(), stream, credentials, id).await;
+                server.stores.door.dismiss(id);
+            });
         }
         Err(why) => refuse(server, &stream, "credentials", &why),
     }

@@ -108,6 +108,8 @@ impl TestNode {
         if let Some(thread) = self.thread.take() {
             thread.join().unwrap();
         }
+        // As the root does.
+        self.stores.close();
     }
 
     /// The next thing that LNCL says to the sync manager.

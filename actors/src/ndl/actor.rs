@@ -26,7 +26,13 @@ use super::{
     mdns::{Mdns, MdnsError},
     socket,
 };
-use crate::{config::NodeConfig, gncl, refusals::Refusals, stores::Stores, sync};
+use crate::{
+    config::NodeConfig,
+    gncl,
+    refusals::Refusals,
+    stores::{self, Stores},
+    sync,
+};
 
 /// Rest after a failed read, so that a socket that fails for good does not take the whole thread.
 const READ_FAILED_REST: Duration = Duration::from_millis(10);
@@ -87,6 +93,7 @@ impl Actor for NdlActor {
             && self.stores.stopping.load(Ordering::Acquire)
         {
             shell.feed(|core, now| core.handle(now, Input::Stopping));
+            stores::lock(&self.stores.ndl_socket).take();
         }
     }
 }
@@ -140,7 +147,7 @@ impl Shell {
                  and `ndl.port` to a free port, or to 0 for any"
             )
         };
-        let socket = bind_again(&stores).map_err(unbound)?;
+        let socket = open_socket(&stores).map_err(unbound)?;
         let udp = socket.local_addr().map_err(unbound)?;
         let reader = socket.try_clone().map_err(unbound)?;
         let epoch = lock(&stores).start(Time::now(), udp, gncl);
@@ -281,12 +288,17 @@ pub(super) fn lock(stores: &Stores) -> MutexGuard<'_, Core> {
     stores.ndl.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// The port of the configuration; where any will do, the one that a former instance had, so that peers still find us.
-fn bind_again(stores: &Stores) -> io::Result<std::net::UdpSocket> {
+/// The socket that is open already, if this layer was restarted: a former instance that hangs still has it, so that nobody
+/// could bind its port again.
+fn open_socket(stores: &Stores) -> io::Result<std::net::UdpSocket> {
+    let mut kept = stores::lock(&stores.ndl_socket);
+    if let Some(socket) = &*kept {
+        return socket.try_clone();
+    }
     let ndl = &stores.config.ndl;
-    let former = lock(stores).udp().filter(|_| ndl.port == 0);
-    let again = former.and_then(|former| socket::bind_unicast(ndl.interface, former.port()).ok());
-    again.map_or_else(|| socket::bind_unicast(ndl.interface, ndl.port), Ok)
+    let socket = socket::bind_unicast(ndl.interface, ndl.port)?;
+    *kept = Some(socket.try_clone()?);
+    Ok(socket)
 }
 
 /// Reads datagrams for as long as this instance is the current one. Answers leave from here.

@@ -417,6 +417,7 @@ impl Root {
     }
 
     fn finish(&self, context: &mut Context<Self>) {
+        self.stores.close();
         // The owner may be gone: then nobody wants to know.
         let _ = self.ended.try_send(self.end.clone());
         context.stop();

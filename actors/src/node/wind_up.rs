@@ -82,6 +82,7 @@ pub(super) fn oversee(root: Root, heirs: Heirs, stores: Arc<Stores>, ended: Sync
         stores.stopping.store(true, Ordering::Relaxed);
         heirs.stop(Branch::Layers);
         wait(&mut events, Branch::Layers, &heirs).await;
+        stores.close();
         // The owner may be gone: then nobody wants to know.
         let _ = ended.try_send(NodeEnd::GaveUp(format!("the root {reason}")));
         actix::System::current().stop();

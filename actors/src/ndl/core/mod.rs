@@ -341,7 +341,7 @@ impl Core {
         &self.me
     }
 
-    /// Our own UDP address, the one that a restarted shell binds again.
+    /// Our own UDP address.
     pub(crate) const fn udp(&self) -> Option<SocketAddr> {
         self.udp
     }
