@@ -1,7 +1,7 @@
 //! What an application waits for: outcomes of its confirmed messages and replies to its requests.
 
 use std::{
-    collections::BTreeMap,
+    collections::HashMap,
     sync::{Arc, Mutex},
     task::{Context, Poll, Waker},
 };
@@ -11,7 +11,7 @@ use crate::{
     post::lock,
     router::{Outlet, Refused},
     tid::Tid,
-    wire::{Flags, Kind, Message},
+    wire::{Flags, Header, Kind, Message},
 };
 
 /// The table of what one application waits for. It outlives the application's incarnations.
@@ -24,7 +24,8 @@ pub struct Pending {
 #[derive(Debug)]
 struct Inner {
     next: u64,
-    slots: BTreeMap<u64, Slot>,
+    /// Not a tree: that would allocate whenever the first wait is opened.
+    slots: HashMap<u64, Slot>,
 }
 
 #[derive(Debug)]
@@ -65,7 +66,7 @@ impl Pending {
     /// to the former is taken for one to its own.
     #[must_use]
     pub fn numbered_from(first: u64, capacity: usize) -> Arc<Self> {
-        Arc::new(Self { inner: Mutex::new(Inner { next: first, slots: BTreeMap::new() }), capacity })
+        Arc::new(Self { inner: Mutex::new(Inner { next: first, slots: HashMap::new() }), capacity })
     }
 
     /// Opens a wait for what `from` says; its number is the message's correlation. `None` if too many are open.
@@ -164,6 +165,11 @@ impl Drop for Wait {
     }
 }
 
+/// Whether this may be what somebody waits for: looked at first, for most messages are not, and moving one costs as much.
+const fn is_answer(header: &Header) -> bool {
+    header.flags.has(Flags::REPLY) || header.flags.has(Flags::OUTCOME)
+}
+
 /// An application's outlet: answers go to its waits, all else to its mailbox.
 pub struct AppOutlet<O> {
     /// What the application waits for.
@@ -174,6 +180,9 @@ pub struct AppOutlet<O> {
 
 impl<O: Outlet> Outlet for AppOutlet<O> {
     fn submit(&self, message: Message) -> Result<(), Refused> {
+        if !is_answer(&message.header) {
+            return self.inbox.submit(message);
+        }
         match self.pending.intercept(message) {
             Ok(()) => Ok(()),
             Err(message) => self.inbox.submit(message),
@@ -186,7 +195,6 @@ mod tests {
     use futures_util::task::noop_waker;
 
     use super::*;
-    use crate::wire::Header;
 
     fn ticket(wait: &Wait) -> Ticket {
         Ticket { source: Tid::NONE, destination: Tid::NONE, correlation: wait.correlation() }

@@ -12,7 +12,7 @@ use actix::{Actor, Context, Handler, Message};
 use actix_rt::Arbiter;
 use sinew_figures::Figures;
 
-use crate::{ROUNDS, WARM_UP, case::Pinning};
+use crate::{WARM_UP, case::Pinning, rounds};
 
 /// Echoes on a unix stream at `path`: blocks of the length that comes first.
 pub(crate) fn echo_unix(path: &str) {
@@ -48,18 +48,18 @@ fn echo(mut stream: impl Read + Write) {
 /// Round trips against an echo.
 pub(crate) fn measure(kind: &str, path: &Path, line: &str, bytes: usize) -> Figures {
     if kind == "raw_unix" {
-        rounds(UnixStream::connect(path).expect("the echo listens"), bytes)
+        round_trips(UnixStream::connect(path).expect("the echo listens"), bytes)
     } else {
         let stream = TcpStream::connect(line).expect("the echo listens");
         stream.set_nodelay(true).expect("TCP has no delay");
-        rounds(stream, bytes)
+        round_trips(stream, bytes)
     }
 }
 
-fn rounds(mut stream: impl Read + Write, bytes: usize) -> Figures {
+fn round_trips(mut stream: impl Read + Write, bytes: usize) -> Figures {
     let (mut figures, mut buffer) = (Figures::new(), vec![7; bytes]);
     stream.write_all(&(bytes as u64).to_le_bytes()).expect("the echo reads");
-    for round in 0..WARM_UP + ROUNDS {
+    for round in 0..WARM_UP + rounds() {
         let start = Instant::now();
         stream.write_all(&buffer).expect("the echo reads");
         stream.read_exact(&mut buffer).expect("the echo answers");
@@ -100,7 +100,7 @@ pub(crate) fn actix_send(bytes: usize, pinning: Pinning, same_arbiter: bool) -> 
         let (give, given) = tokio::sync::oneshot::channel();
         first.spawn(async move {
             let mut figures = Figures::new();
-            for round in 0..WARM_UP + ROUNDS {
+            for round in 0..WARM_UP + rounds() {
                 let start = Instant::now();
                 let block = bare.send(Block(vec![7; bytes])).await.expect("the actor lives");
                 assert_eq!(block.len(), bytes);

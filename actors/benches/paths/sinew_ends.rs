@@ -13,8 +13,9 @@ use sinew::{NodeApi, Registration, prelude::*};
 use sinew_figures::Figures;
 
 use crate::{
-    ROUNDS, WARM_UP,
+    WARM_UP,
     case::{Echo, Pinning},
+    rounds,
 };
 
 /// No wait of this bench is longer.
@@ -59,6 +60,7 @@ struct Pinger {
     to: Option<Tid>,
     bytes: usize,
     round: u64,
+    rounds: u64,
     sent: Instant,
     figures: Option<Figures>,
     done: SyncSender<Figures>,
@@ -66,7 +68,15 @@ struct Pinger {
 
 impl Pinger {
     fn new(bytes: usize, done: SyncSender<Figures>) -> Self {
-        Self { to: None, bytes, round: 0, sent: Instant::now(), figures: Some(Figures::new()), done }
+        Self {
+            to: None,
+            bytes,
+            round: 0,
+            rounds: rounds(),
+            sent: Instant::now(),
+            figures: Some(Figures::new()),
+            done,
+        }
     }
 
     fn ping(&mut self, context: &AppContext<Self>) {
@@ -96,7 +106,7 @@ impl Handler<Delivery<Back>> for Pinger {
             figures.record(self.sent.elapsed());
         }
         self.round += 1;
-        if self.round < WARM_UP + ROUNDS {
+        if self.round < WARM_UP + self.rounds {
             self.ping(context);
         } else if let Some(figures) = self.figures.take() {
             self.done.send(figures).expect("somebody waits for the figures");

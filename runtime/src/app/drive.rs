@@ -139,7 +139,7 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
             self.leave_if_over();
             return Poll::Ready(true);
         }
-        match self.reader.poll_take(task) {
+        match &mut self.reader.poll_take(task) {
             Poll::Ready(Some(message)) => {
                 self.handle(actor, context, message, now);
                 Poll::Ready(true)
@@ -162,15 +162,15 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         now: Time,
     ) -> Poll<bool> {
         self.reader.poll_event(task).map(|event| match event {
-            Some(event) => {
-                self.handle(actor, context, event, now);
+            Some(mut event) => {
+                self.handle(actor, context, &mut event, now);
                 true
             }
             None => false,
         })
     }
 
-    fn handle(&mut self, actor: &mut A, context: &mut AppContext<A>, mut message: Message, now: Time) {
+    fn handle(&mut self, actor: &mut A, context: &mut AppContext<A>, message: &mut Message, now: Time) {
         if message.header.is_expired(now) {
             self.reader.finish(Outcome::Expired);
             message.settle(Outcome::Expired);
@@ -180,7 +180,7 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         let is_confirmed = message.receipt.take().map(|receipt| self.vitals.hold(receipt)).is_some();
         // One that was fenced off while it took this message must not begin with it.
         self.leave_if_over();
-        let outcome = self.dispatch(actor, context, &message, now);
+        let outcome = self.dispatch(actor, context, message, now);
         self.leave_if_over();
         self.reader.finish(outcome);
         if is_confirmed {

@@ -81,7 +81,7 @@ impl Shared {
     }
 
     fn next(&mut self) -> Option<Message> {
-        self.events.pop_front().or_else(|| self.queue.pop())
+        if self.events.is_empty() { self.queue.pop() } else { self.events.pop_front() }
     }
 
     fn waiting(&self) -> usize {
@@ -291,12 +291,11 @@ impl Outlet for Mailbox {
                 shared.tallies[class].refused += 1;
                 return Err(Refused::new(message, Rejection::Unsupported));
             }
-            let pushed = shared.queue.push(message).or_else(|refused| {
+            if !shared.queue.has_room_for(&message.header) {
                 // An application that waits for its start takes nothing out: what has expired makes room.
                 expired = shared.expire(Time::now());
-                shared.queue.push(refused.message)
-            });
-            match pushed {
+            }
+            match shared.queue.push(message) {
                 Ok(superseded) => {
                     shared.tallies[class].taken += 1;
                     shared.tallies[class].superseded += u64::from(superseded.is_some());

@@ -6,7 +6,7 @@ use crate::{
     outcome::Rejection,
     router::Refused,
     time::Time,
-    wire::{Class, Message},
+    wire::{Class, Header, Message},
 };
 
 /// So many messages of more urgent classes pass a waiting one before it has its turn: urgent traffic that never ends
@@ -46,16 +46,11 @@ impl ClassQueue {
     /// The message itself, if the lane of its class is full.
     pub fn push(&mut self, message: Message) -> Result<Option<Message>, Refused> {
         let lane = &mut self.lanes[message.header.class as usize];
-        if message.header.class == Class::Stream {
-            let same = |other: &&mut Message| {
-                other.header.source == message.header.source
-                    && other.header.kind == message.header.kind
-                    && other.header.destination == message.header.destination
-            };
-            if let Some(older) = lane.iter_mut().find(same) {
-                self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
-                return Ok(Some(std::mem::replace(older, message)));
-            }
+        if message.header.class == Class::Stream
+            && let Some(older) = lane.iter_mut().find(|other| is_same_stream(&other.header, &message.header))
+        {
+            self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
+            return Ok(Some(std::mem::replace(older, message)));
         }
         if lane.len() >= self.capacity {
             return Err(Refused::new(message, Rejection::QueueFull));
@@ -65,17 +60,20 @@ impl ClassQueue {
         Ok(None)
     }
 
+    /// Whether [`push`](Self::push) would take a message with this header.
+    #[must_use]
+    pub fn has_room_for(&self, header: &Header) -> bool {
+        let lane = &self.lanes[header.class as usize];
+        lane.len() < self.capacity
+            || header.class == Class::Stream && lane.iter().any(|other| is_same_stream(&other.header, header))
+    }
+
     /// Puts a message back that was popped, before all others of its class, whatever the bound. Hands it back if it is
     /// of a Stream whose newer value waits here.
     pub fn put_back(&mut self, message: Message) -> Option<Message> {
         let lane = &mut self.lanes[message.header.class as usize];
         let header = &message.header;
-        let is_newer = |other: &Message| {
-            other.header.source == header.source
-                && other.header.kind == header.kind
-                && other.header.destination == header.destination
-        };
-        if header.class == Class::Stream && lane.iter().any(is_newer) {
+        if header.class == Class::Stream && lane.iter().any(|newer| is_same_stream(&newer.header, header)) {
             return Some(message);
         }
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
@@ -134,6 +132,11 @@ impl ClassQueue {
     pub fn drain_all(&mut self) -> impl Iterator<Item = Message> + '_ {
         self.lanes.iter_mut().flat_map(|lane| lane.drain(..))
     }
+}
+
+/// Whether the newer of the two takes the place of the older, both being of class Stream.
+fn is_same_stream(one: &Header, other: &Header) -> bool {
+    one.source == other.source && one.kind == other.kind && one.destination == other.destination
 }
 
 #[cfg(test)]

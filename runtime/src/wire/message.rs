@@ -8,7 +8,7 @@ use serde::{Serialize, de::DeserializeOwned};
 use crate::{
     outcome::{Outcome, Receipt, Rejection},
     tid::Tid,
-    wire::{Class, Header, Kind},
+    wire::{Class, Header, Kind, memory},
 };
 
 /// A type that travels as MessagePack (a map with field names, so that any language can read it).
@@ -102,7 +102,8 @@ impl Message {
 /// # Panics
 /// If the type's `Serialize` refuses its own value: a fault of the program, found by its first send.
 pub fn encode<P: Payload>(value: &P) -> Bytes {
-    rmp_serde::to_vec_named(value).expect("a payload type can be written as MessagePack").into()
+    memory::written(|writer| rmp_serde::encode::write_named(writer, value))
+        .expect("a payload type can be written as MessagePack")
 }
 
 /// Reads a value from its MessagePack form.
@@ -132,7 +133,7 @@ impl MessageBuffer {
     /// Zeroed memory for `length` payload bytes.
     #[must_use]
     pub fn new(header: Header, length: usize) -> Self {
-        Self { header, payload: BytesMut::zeroed(length) }
+        Self { header, payload: memory::zeroed(length) }
     }
 
     /// The message, its payload no longer writable.

@@ -6,6 +6,7 @@
 mod codec;
 mod header;
 mod kind;
+mod memory;
 mod message;
 
 pub use codec::{FrameCodec, FrameError, decode_datagram, encode_frame};

@@ -42,7 +42,7 @@ impl Payload for Number {
     const CLASS: Class = Class::Bulk;
 }
 
-struct Nobody;
+pub(crate) struct Nobody;
 
 impl Directory for Nobody {
     fn resolve(&self, _: &str) -> Option<Tid> {
