@@ -42,6 +42,8 @@ mod inbox;
 mod link;
 mod raw;
 mod received;
+#[expect(dead_code, reason = "direct links follow")]
+mod routes;
 #[cfg(test)]
 mod tests;
 

@@ -16,6 +16,7 @@ use tokio::net::{UnixStream, unix::UCred};
 
 use super::{
     core::{Address, ClientId, Owner, Request},
+    introductions::Marks,
     payload::{self, REGISTER_BYTES_MAX, Refusal, Register, Registered, Resolved},
     reader::Reader,
     registrar,
@@ -32,6 +33,9 @@ use crate::{
 const HANDSHAKE: Duration = Duration::from_secs(2);
 /// Time that a client has to take its refusal when earlier messages fill its socket.
 const LAST_WORDS: Duration = Duration::from_millis(100);
+
+/// Time until a mark is passed on again that found no room.
+const MARK_AGAIN: Duration = Duration::from_millis(2);
 
 /// The writing half of a client's connection.
 pub(super) type ClientOutlet = StreamOutlet<Arc<UnixStream>>;
@@ -93,6 +97,8 @@ async fn introduce(
         | Order::SetMember { .. }
         | Order::Tell { .. }
         | Order::Resolve { .. }
+        | Order::Introduce { .. }
+        | Order::Switch { .. }
         | Order::RefuseMessage { .. }
         | Order::Unregister => Err("a stranger can only register".to_owned()),
     }
@@ -132,7 +138,7 @@ struct Client {
 
 impl Client {
     fn register(server: Rc<Server>, peer: Peer, asked: Register) -> Result<Self, super::RegisterError> {
-        let Register { name, address, requires, events, kinds, pid: _ } = asked;
+        let Register { name, address, requires, events, kinds, pid: _, direct: _ } = asked;
         let address = address.map_or(Address::Dynamic, Address::Fixed);
         let request = Request { address, name, requires: requires.clone(), kinds, owner: peer.owner() };
         let app = registrar::register_client(&server.stores, request)?;
@@ -165,6 +171,8 @@ impl Client {
                     | Order::SetMember { .. }
                     | Order::Tell { .. }
                     | Order::Resolve { .. }
+                    | Order::Introduce { .. }
+                    | Order::Switch { .. }
                     | Order::RefuseMessage { .. } => End::Refused("wait for LNCL_REGISTERED".to_owned()),
                 },
                 Ok(None) => End::HungUp(None),
@@ -226,6 +234,8 @@ impl Client {
                 self.tell(destination, correlation, outcome);
             }
             Order::Resolve { name, correlation } => self.resolve(&name, correlation),
+            Order::Introduce { to, correlation } => self.introduce(to, correlation),
+            Order::Switch { to, number, correlation } => self.switch(to, number, correlation),
             Order::RefuseMessage { message, why } => self.refuse_message(&message, why),
             Order::Unregister => return ControlFlow::Break(End::Unregistered),
             Order::End(violation) => return ControlFlow::Break(End::Refused(violation.to_string())),
@@ -269,6 +279,25 @@ impl Client {
         let mut answer = payload::frame(Kind::LNCL_RESOLVED, lncl, self.tid, &Resolved { tid });
         answer.header.correlation = correlation;
         self.say(answer);
+    }
+
+    fn introduce(&self, to: Tid, correlation: u64) {
+        let number = lock(&self.server.stores.registry).new_link();
+        let to = self.server.stores.router.absolute(to);
+        if let Err(why) = self.server.introductions.introduce(self.tid, to, number, correlation) {
+            self.tell(to, correlation, Outcome::Rejected(why));
+        }
+    }
+
+    // spec: LNCL-11
+    fn switch(&self, to: Tid, number: u64, correlation: u64) {
+        let to = self.server.stores.router.absolute(to);
+        let ticket = Ticket { source: self.tid, destination: to, correlation };
+        let receipt = Receipt::new(Arc::new(OutcomeSink(self.outlet.clone())), ticket);
+        match self.server.introductions.marks(self.tid, to, number, receipt) {
+            Ok(marks) => pass_on(marks),
+            Err((receipt, why)) => receipt.settle(Outcome::Rejected(why)),
+        }
     }
 
     fn refuse_message(&self, message: &Message, why: Rejection) {
@@ -376,6 +405,18 @@ impl From<FrameError> for End {
             FrameError::Io(cause) => Self::HungUp(Some(cause)),
             FrameError::Header(_) | FrameError::TooLong { .. } => Self::Refused(error.to_string()),
         }
+    }
+}
+
+/// Passes marks on, now or, where there is no room, as soon as there is.
+fn pass_on(mut marks: Marks) {
+    if marks.pass_on() {
+        tokio::task::spawn_local(async move {
+            // Ends when there is room, or the client's outlet has ended.
+            while marks.pass_on() {
+                tokio::time::sleep(MARK_AGAIN).await;
+            }
+        });
     }
 }
 

@@ -142,6 +142,7 @@ pub(crate) struct Registry {
     kinds: BTreeMap<Kind, String>,
     next_dynamic: u32,
     next_client: u64,
+    next_link: u64,
 }
 
 impl Registry {
@@ -197,6 +198,12 @@ impl Registry {
     pub(crate) fn new_client(&mut self) -> ClientId {
         self.next_client += 1;
         ClientId(self.next_client)
+    }
+
+    /// A number for a new link between two applications; never used again in a node's life.
+    pub(crate) fn new_link(&mut self) -> u64 {
+        self.next_link += 1;
+        self.next_link
     }
 
     /// The application called `name`.

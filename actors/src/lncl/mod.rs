@@ -21,6 +21,8 @@ mod client;
 mod core;
 mod door;
 mod facts;
+#[cfg_attr(not(test), expect(dead_code, reason = "direct links follow"))]
+mod introductions;
 mod listener;
 pub(crate) mod payload;
 mod reader;

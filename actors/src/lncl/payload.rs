@@ -31,6 +31,9 @@ pub(crate) struct Register {
     /// Process id as the client sees it; for people. The node believes the kernel's.
     #[serde(default)]
     pub(crate) pid: u32,
+    /// Whether others of the node may be introduced to it, to send to it directly.
+    #[serde(default)]
+    pub(crate) direct: bool,
 }
 
 /// The address that a process got.
@@ -74,6 +77,33 @@ pub(crate) struct Resolve {
 pub(crate) struct Resolved {
     /// Its 64 bits; none = nobody has the name.
     pub(crate) tid: Option<u64>,
+}
+
+/// Asks for a direct link.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Introduce {
+    /// 64 bits of the TID of the other side.
+    pub(crate) to: u64,
+}
+
+/// Both sides of a direct link are told so: first the one that is asked for it, then the one that asks.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Introduction {
+    /// 64 bits of the TID of the other side.
+    pub(crate) peer: u64,
+    /// The other side's process, as the kernel says.
+    pub(crate) pid: u32,
+    /// The link's number; it stands beside the link's socket, too.
+    pub(crate) number: u64,
+}
+
+/// From here on the source sends to its peer on their link only.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Switch {
+    /// 64 bits of the TID of the other side, as the source sees it.
+    pub(crate) peer: u64,
+    /// The link's number.
+    pub(crate) number: u64,
 }
 
 /// The TID of the LNCL of `node`.

@@ -16,6 +16,7 @@ use tokio::{
 use super::{
     client::{self, ClientOutlet},
     core::ClientId,
+    introductions::Introductions,
     payload::{self, Refusal},
 };
 use crate::{
@@ -30,6 +31,8 @@ const ACCEPT_BACKOFF: (Duration, Duration) = (Duration::from_millis(10), Duratio
 pub(super) struct Server {
     pub(super) stores: Arc<Stores>,
     pub(super) refusals: Arc<Refusals>,
+    /// Who may be introduced to whom.
+    pub(super) introductions: Introductions,
     /// Who waits at the barrier.
     releases: RefCell<BTreeMap<AppAddress, oneshot::Sender<()>>>,
     /// The writing halves of the connections, for what expires in them.
@@ -40,7 +43,7 @@ impl Server {
     pub(super) fn new(stores: Arc<Stores>) -> Rc<Self> {
         let (releases, outlets) = (RefCell::default(), RefCell::default());
         let refusals = stores.refusals.clone();
-        Rc::new(Self { stores, refusals, releases, outlets })
+        Rc::new(Self { stores, refusals, introductions: Introductions::default(), releases, outlets })
     }
 
     /// Resolves when the barrier opens for `app`.

@@ -8,7 +8,7 @@ use sinew_runtime::{
     wire::{Class, Flags, Kind, Message},
 };
 
-use super::payload::{self, Group, Register, Resolve};
+use super::payload::{self, Group, Introduce, Register, Resolve, Switch};
 
 /// Groups that one client may be a member of.
 pub(crate) const GROUPS_MAX: usize = 256;
@@ -46,6 +46,10 @@ pub(crate) enum Order {
     Tell { destination: Tid, correlation: u64, outcome: Outcome },
     /// Tell the client the TID of `name`.
     Resolve { name: String, correlation: u64 },
+    /// Introduce the client to `to`, or tell it why not.
+    Introduce { to: Tid, correlation: u64 },
+    /// Tell `to`, behind all that the client has sent to it, that the client goes on on their link `number`.
+    Switch { to: Tid, number: u64, correlation: u64 },
     /// Count this and, if the client asked, tell it so; the connection goes on.
     RefuseMessage { message: Message, why: Rejection },
     /// The client leaves in order.
@@ -118,6 +122,8 @@ impl Session {
             Kind::OUTCOME => read_outcome(&message),
             Kind::LNCL_GROUP => self.read_group(&message),
             Kind::LNCL_RESOLVE => read_resolve(&message),
+            Kind::LNCL_INTRODUCE => read_introduce(&message),
+            Kind::LNCL_SWITCH => read_switch(&message),
             Kind::LNCL_UNREGISTER => Ok(Order::Unregister),
             Kind::LNCL_REGISTER => Err(Violation::RegisteredTwice),
             // Not an enum of ours: an open set of numbers.
@@ -187,6 +193,16 @@ fn read_outcome(message: &Message) -> Result<Order, Violation> {
 fn read_resolve(message: &Message) -> Result<Order, Violation> {
     let Resolve { name } = read_payload(message)?;
     Ok(Order::Resolve { name, correlation: message.header.correlation })
+}
+
+fn read_introduce(message: &Message) -> Result<Order, Violation> {
+    let Introduce { to } = read_payload(message)?;
+    Ok(Order::Introduce { to: Tid::from_bits(to), correlation: message.header.correlation })
+}
+
+fn read_switch(message: &Message) -> Result<Order, Violation> {
+    let Switch { peer, number } = read_payload(message)?;
+    Ok(Order::Switch { to: Tid::from_bits(peer), number, correlation: message.header.correlation })
 }
 
 fn read_payload<P: serde::de::DeserializeOwned>(message: &Message) -> Result<P, Violation> {

@@ -328,7 +328,12 @@ impl Child {
                 );
             }
             Order::End(violation) => return Err(violation.to_string()),
-            Order::Register(_) | Order::Settle { .. } | Order::Resolve { .. } | Order::Unregister => {
+            Order::Register(_)
+            | Order::Settle { .. }
+            | Order::Resolve { .. }
+            | Order::Introduce { .. }
+            | Order::Switch { .. }
+            | Order::Unregister => {
                 return Err("it said what only a client of LNCL says".to_owned());
             }
         }

@@ -67,6 +67,14 @@ impl Kind {
     pub const LNCL_RESOLVE: Self = Self(0x45);
     /// The TID of a name, or none.
     pub const LNCL_RESOLVED: Self = Self(0x46);
+    /// A process asks for a direct link to an application of another process.
+    pub const LNCL_INTRODUCE: Self = Self(0x48);
+    /// It is asked for one; the link's socket comes beside it.
+    pub const LNCL_INTRODUCTION: Self = Self(0x49);
+    /// The other side has agreed; the link's socket comes beside it.
+    pub const LNCL_INTRODUCED: Self = Self(0x4a);
+    /// From here on a process sends to another one on their link only.
+    pub const LNCL_SWITCH: Self = Self(0x4b);
 
     /// A node tells the process that it started for an application who it is: the first frame.
     pub const HOST_WELCOME: Self = Self(0x50);
