@@ -10,19 +10,23 @@
 //! | `poster` | a role: 8 addresses that send to all others in every class, and tell the ledger |
 //! | `entry`, `ledger` | what posters tell, and what became of every message |
 //! | `steady` | the roles of those who are not to feel it: one asks and measures, one answers, one takes what comes |
+//! | `recorder` | the role of one that is stopped: says what it got |
 //! | `victim` | the role of a process that is killed with loans in its hands |
 //! | `held` | what a process has of the host |
 //! | `conservation` | the claim: what was sent has one fate that is true, whoever is killed |
 //! | `kills` | the claim: a killed process leaves nothing behind, and the others do not feel it |
+//! | `hostile` | the claim: whatever a client does, the node lives within its bounds and serves the others |
 
 pub mod conservation;
 mod door;
 pub mod entry;
 mod held;
+pub mod hostile;
 pub mod kills;
 pub mod ledger;
 mod performer;
 mod poster;
+mod recorder;
 mod registration;
 mod stage;
 mod steady;
@@ -49,7 +53,10 @@ pub fn play() -> Option<ExitCode> {
     match &*role {
         "door" => door::play(&arguments),
         "poster" => poster::play(&arguments),
+        "attacker" => hostile::play_attacker(&arguments),
+        "sleeper" => hostile::play_sleeper(&arguments),
         "pinger" => steady::play_pinger(&arguments),
+        "recorder" => recorder::play(&arguments),
         "taker" => steady::play_taker(&arguments),
         "victim" => victim::play(&arguments),
         _ => panic!("nobody plays {role:?}"),

@@ -1,4 +1,6 @@
 //! Processes that speak to a node through its door: killed, stopped, hostile. One binary, one module a claim.
 
 mod conservation;
+mod hostile;
 mod kills;
+mod stopped;

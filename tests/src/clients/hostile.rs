@@ -1,0 +1,253 @@
+//! The claim: whatever a client does, the node lives within its bounds, serves the others, and counts what it refuses.
+//!
+//! | file | what it is |
+//! | --- | --- |
+//! | `stranger` | a connection by hand |
+//! | `tricks` | what a hostile client does |
+
+mod stranger;
+mod tricks;
+
+use std::{
+    fmt,
+    path::{Path, PathBuf},
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicBool, Ordering},
+        mpsc::{Receiver, sync_channel},
+    },
+    thread,
+    time::{Duration, Instant},
+};
+
+use rustix::process::{Signal, getpid, kill_process};
+use sinew::Kind;
+
+use self::{
+    stranger::{Frame, Stranger},
+    tricks::{Attacker, Tally},
+};
+use super::{
+    Performer, Stage, StageLimits,
+    held::Held,
+    say,
+    steady::{ECHO, Window},
+    told,
+};
+use crate::{DEADLINE, dice::Dice, until};
+
+/// Attackers at a time.
+const ATTACKERS: u64 = 2;
+/// How long an attacker lives; some are killed before.
+const LIFE: Duration = Duration::from_secs(2);
+/// How often the node's memory is looked at.
+const LOOK: Duration = Duration::from_millis(50);
+const LIMITS: StageLimits = StageLimits { mailbox_capacity: 32, payload_max: 16 * 1024, clients_max: 64 };
+
+/// What is to be done.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    /// A program whose `main` calls [`play`](super::play) first.
+    pub program: PathBuf,
+    /// How long.
+    pub lasts: Duration,
+    /// Decides what is tried.
+    pub seed: u64,
+}
+
+/// What was seen.
+#[derive(Debug)]
+pub struct Report {
+    seconds: f64,
+    tally: Tally,
+    /// What the node refused.
+    pub refused: u64,
+    /// The most of the node's memory at any look, above the start.
+    pub grown_kib: u64,
+    held: (Held, Held),
+    windows: [Window; 2],
+}
+
+impl Report {
+    /// The most that the node may hold for all clients: full queues, a frame that is being read, the reading itself.
+    #[must_use]
+    pub const fn bound_kib() -> u64 {
+        let StageLimits { mailbox_capacity, payload_max, clients_max } = LIMITS;
+        let queues = 3 * mailbox_capacity * (payload_max + 512);
+        let reading = 2 * (payload_max + 16 * 1024);
+        // The node's own application is like one client more.
+        ((clients_max + 1) * (queues + reading) / 1024) as u64
+    }
+
+    /// The node lived within its bound, served the others, counted every refusal that it told, and gave all back.
+    #[must_use]
+    pub fn holds(&self) -> bool {
+        self.refused >= self.tally.refused
+            && self.tally.refused > 0
+            && self.grown_kib <= Self::bound_kib()
+            && self.held.1.is_back_at(&self.held.0)
+            && self.windows.iter().all(|window| window.failed == 0)
+    }
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { seconds, tally, refused, grown_kib, held, windows } = self;
+        let Tally { tricks, connections, bytes, refused: told } = tally;
+        writeln!(f, "{seconds:.1} s, {tricks} tricks on {connections} connections, {bytes} bytes taken")?;
+        writeln!(f, "refusals: {told} told to the hostile ones, {refused} counted by the node")?;
+        writeln!(f, "node before {}\n     after  {}", held.0, held.1)?;
+        writeln!(f, "node grown by {grown_kib} KiB at most; its bound is {} KiB", Self::bound_kib())?;
+        writeln!(f, "others, alone        {}\nothers, under attack {}", windows[0], windows[1])?;
+        write!(
+            f,
+            "expected: the node lives, within its bound, all given back, no round trip failed, every refusal counted; seen: {}",
+            if self.holds() { "so" } else { "NOT SO" }
+        )
+    }
+}
+
+/// The role of an attacker, `SOCKET SEED MILLISECONDS`: tells what it did at its end.
+pub(super) fn play_attacker(arguments: &[String]) {
+    let number = |index: usize| arguments[index].parse::<u64>().expect("a number");
+    let end = Instant::now() + Duration::from_millis(number(2));
+    let mut attacker = Attacker::new(Path::new(&arguments[0]), Dice::new(number(1)));
+    while Instant::now() < end {
+        attacker.play_one();
+    }
+    let Tally { tricks, connections, bytes, refused } = attacker.tally;
+    say(&format!("{tricks} {connections} {bytes} {refused}"));
+}
+
+/// The role of one that stops in mid-frame, `SOCKET`: stops itself, and goes on where it was if it is let.
+pub(super) fn play_sleeper(arguments: &[String]) {
+    let socket = Path::new(&arguments[0]);
+    let frame = Frame::new(
+        &sinew_runtime::wire::Header::new(Kind::named("x"), sinew::Tid::NONE, sinew::Tid::BROADCAST),
+        vec![7; 5_000],
+    );
+    // The node may have no place for it just now.
+    if let Ok(Some(mut stranger)) = Stranger::register(socket)
+        && stranger.write(&frame.bytes()[..3_000]).is_ok()
+    {
+        kill_process(getpid(), Signal::STOP).expect("a process may signal itself");
+        let _ = stranger.write(&frame.bytes()[3_000..]);
+    }
+    told().for_each(drop);
+}
+
+struct Cast {
+    plan: Plan,
+    stage: Stage,
+    echo: Performer,
+    pinger: Performer,
+    answers: Receiver<String>,
+    tally: Arc<Mutex<Tally>>,
+    dice: Dice,
+}
+
+impl Cast {
+    fn new(plan: Plan) -> Self {
+        let stage = Stage::new(&plan.program, LIMITS);
+        let (say, answers) = sync_channel(64);
+        let start = |role: &str, arguments: &[String]| {
+            let say = say.clone();
+            // Nobody hears it any more when the director has gone.
+            let performer = stage.start(role, arguments, move |line| drop(say.send(line.to_owned())));
+            assert_eq!(answers.recv_timeout(DEADLINE).as_deref(), Ok("up"), "{role} comes up");
+            performer
+        };
+        let (echo, pinger) = (start("taker", &[ECHO.to_owned()]), start("pinger", &[]));
+        let dice = Dice::new(plan.seed);
+        Self { plan, stage, echo, pinger, answers, tally: Arc::default(), dice }
+    }
+
+    /// What the others measured since the last one; at least one round trip.
+    fn window(&mut self) -> Window {
+        until("a round trip ends", || {
+            self.pinger.tell("window");
+            let window = Window::read(&self.answers.recv_timeout(DEADLINE).expect("the pinger answers"));
+            (window.count + window.failed > 0).then_some(window)
+        })
+    }
+
+    fn start_attacker(&mut self) -> Performer {
+        let tally = self.tally.clone();
+        let arguments = [self.dice.roll().to_string(), LIFE.as_millis().to_string()];
+        self.stage.start("attacker", &arguments, move |line| {
+            let numbers: Vec<u64> =
+                line.split_whitespace().map(|word| word.parse().expect("a number")).collect();
+            let mut tally = tally.lock().unwrap_or_else(PoisonError::into_inner);
+            tally.tricks += numbers[0];
+            tally.connections += numbers[1];
+            tally.bytes += numbers[2];
+            tally.refused += numbers[3];
+        })
+    }
+
+    /// Attackers, and one that sleeps, again and again.
+    fn attack(&mut self) {
+        let end = Instant::now() + self.plan.lasts;
+        while Instant::now() < end {
+            let sleeper = self.stage.start("sleeper", &[], |_| {});
+            let attackers: Vec<_> = (0..ATTACKERS).map(|_| self.start_attacker()).collect();
+            thread::sleep(LIFE.mul_f64(0.5));
+            sleeper.signal(Signal::CONT);
+            for attacker in attackers {
+                if self.dice.once_in(4) {
+                    attacker.kill();
+                } else {
+                    let status = attacker.end();
+                    assert!(status.success(), "an attacker ended with {status}");
+                }
+            }
+            sleeper.signal(Signal::CONT);
+            drop(sleeper);
+        }
+    }
+}
+
+/// Looks at a process's memory until it is told not to; returns the most that it had.
+fn watch(process: u32, over: &AtomicBool) -> u64 {
+    let mut most = 0;
+    while !over.load(Ordering::Relaxed) {
+        most = most.max(Held::of(process).proportional_kib);
+        thread::sleep(LOOK);
+    }
+    most
+}
+
+/// Lets hostile clients do what they like, and says what the node made of it.
+///
+/// # Panics
+/// If the node or one of the others ends.
+#[must_use]
+pub fn run(plan: Plan) -> Report {
+    let mut cast = Cast::new(plan);
+    let node = cast.stage.node_id();
+    cast.window();
+    thread::sleep(cast.plan.lasts / 8);
+    let alone = cast.window();
+    let (before, over, began) = (Held::of(node), AtomicBool::new(false), Instant::now());
+    let most = thread::scope(|scope| {
+        let watching = scope.spawn(|| watch(node, &over));
+        cast.attack();
+        over.store(true, Ordering::Relaxed);
+        watching.join().expect("it only looks")
+    });
+    let attacked = cast.window();
+    let end = Instant::now() + DEADLINE;
+    while !Held::of(node).is_back_at(&before) && Instant::now() < end {
+        thread::sleep(LOOK);
+    }
+    let (seconds, refused, held) =
+        (began.elapsed().as_secs_f64(), cast.stage.refused(), (before, Held::of(node)));
+    let tally = *cast.tally.lock().unwrap_or_else(PoisonError::into_inner);
+    for one in [cast.pinger, cast.echo] {
+        let status = one.end();
+        assert!(status.success(), "one of the others ended with {status}");
+    }
+    cast.stage.end();
+    let grown_kib = most.max(held.1.proportional_kib).saturating_sub(before.proportional_kib);
+    Report { seconds, tally, refused, grown_kib, held, windows: [alone, attacked] }
+}

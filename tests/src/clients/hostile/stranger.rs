@@ -1,0 +1,124 @@
+//! A connection to a node by hand, as somebody would make it who means no good: any bytes, any order.
+
+use std::{
+    io::{self, IoSlice, Read, Write},
+    mem::MaybeUninit,
+    os::{
+        fd::{AsFd, BorrowedFd, OwnedFd},
+        unix::net::UnixStream,
+    },
+    path::Path,
+    time::Duration,
+};
+
+use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
+use sinew::{AppAddress, Kind, NodeAddress, Tid};
+use sinew_runtime::wire::{Header, encode};
+
+/// Nothing is waited for longer than this: whoever is hostile has more to do.
+const PATIENCE: Duration = Duration::from_millis(300);
+const HEADER_BYTES: usize = 64;
+/// Descriptors that are passed at once, at most.
+const DESCRIPTORS_MAX: usize = 16;
+
+/// A frame that may be wrong.
+#[derive(Clone, Debug)]
+pub(super) struct Frame {
+    pub(super) header: [u8; HEADER_BYTES],
+    pub(super) payload: Vec<u8>,
+}
+
+impl Frame {
+    pub(super) fn new(header: &Header, payload: Vec<u8>) -> Self {
+        Self { header: header.encode(&payload), payload }
+    }
+
+    /// A frame of LNCL's own.
+    pub(super) fn of_lncl<P: sinew::Payload>(kind: Kind, source: Tid, payload: &P) -> Self {
+        let lncl = Tid::new(NodeAddress::HERE, AppAddress::LNCL);
+        Self::new(&Header::new(kind, source, lncl), encode(payload).to_vec())
+    }
+
+    /// With a checksum that is right, whatever else is wrong.
+    pub(super) fn sealed(mut self) -> Self {
+        let mut crc = crc32fast::Hasher::new();
+        crc.update(&self.header[..60]);
+        crc.update(&self.payload);
+        self.header[60..].copy_from_slice(&crc.finalize().to_le_bytes());
+        self
+    }
+
+    pub(super) fn bytes(&self) -> Vec<u8> {
+        [&self.header[..], &self.payload].concat()
+    }
+}
+
+/// What the node says.
+#[derive(Debug)]
+pub(super) struct Said {
+    pub(super) kind: Kind,
+    pub(super) source: u64,
+    pub(super) correlation: u64,
+    pub(super) payload: Vec<u8>,
+}
+
+/// A connection.
+#[derive(Debug)]
+pub(super) struct Stranger {
+    pub(super) stream: UnixStream,
+    pub(super) tid: Tid,
+}
+
+impl Stranger {
+    /// Connects, and says nothing.
+    pub(super) fn connect(socket: &Path) -> io::Result<Self> {
+        let stream = UnixStream::connect(socket)?;
+        stream.set_read_timeout(Some(PATIENCE))?;
+        stream.set_write_timeout(Some(PATIENCE))?;
+        Ok(Self { stream, tid: Tid::NONE })
+    }
+
+    /// Connects and gets any address, as an honest client would. `None` if the node has none to give.
+    pub(super) fn register(socket: &Path) -> io::Result<Option<Self>> {
+        let mut stranger = Self::connect(socket)?;
+        let lncl = Tid::new(NodeAddress::HERE, AppAddress::LNCL);
+        let header = Header::new(Kind::LNCL_REGISTER, Tid::NONE, lncl);
+        stranger.write(&Frame::new(&header, vec![0x80]).bytes())?;
+        let Some(said) = stranger.read()? else { return Ok(None) };
+        // The destination of its first frame is the address.
+        stranger.tid = Tid::from_bits(said.source);
+        Ok((said.kind == Kind::LNCL_REGISTERED).then_some(stranger))
+    }
+
+    pub(super) fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
+        self.stream.write_all(bytes)
+    }
+
+    /// Writes the bytes with descriptors beside them.
+    pub(super) fn pass(&self, bytes: &[u8], descriptors: &[OwnedFd]) -> io::Result<()> {
+        let descriptors: Vec<BorrowedFd<'_>> =
+            descriptors.iter().take(DESCRIPTORS_MAX).map(AsFd::as_fd).collect();
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(DESCRIPTORS_MAX))];
+        let mut control = SendAncillaryBuffer::new(&mut space);
+        assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)), "the space is for as many");
+        sendmsg(&self.stream, &[IoSlice::new(bytes)], &mut control, SendFlags::NOSIGNAL)?;
+        Ok(())
+    }
+
+    /// The next frame; `None` at the end of the connection.
+    pub(super) fn read(&mut self) -> io::Result<Option<Said>> {
+        let mut header = [0; HEADER_BYTES];
+        match self.stream.read_exact(&mut header) {
+            Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => return Ok(None),
+            result => result?,
+        }
+        let number = |at: usize, bytes: usize| {
+            header[at..at + bytes].iter().rev().fold(0, |number: u64, byte| number << 8 | u64::from(*byte))
+        };
+        let mut payload = vec![0; number(4, 4) as usize];
+        self.stream.read_exact(&mut payload)?;
+        let kind = Kind::from_bits(number(8, 4) as u32);
+        let source = if kind == Kind::LNCL_REGISTERED { number(24, 8) } else { number(16, 8) };
+        Ok(Some(Said { kind, source, correlation: number(40, 8), payload }))
+    }
+}

@@ -1,0 +1,344 @@
+//! What a hostile client does to a node, one trick after the other.
+
+use std::{
+    fs::File,
+    io,
+    net::Shutdown,
+    os::fd::OwnedFd,
+    path::{Path, PathBuf},
+    thread,
+    time::Duration,
+};
+
+use rustix::fs::{MemfdFlags, memfd_create};
+use sinew::{AppAddress, Class, Kind, NodeAddress, Outcome, Payload as _, Rejection, Tid, payload};
+use sinew_runtime::wire::{Flags, Header, encode};
+
+use super::stranger::{Frame, Stranger};
+use crate::{dice::Dice, puppet::Order};
+
+payload!("hostile.registration" => struct Wishes {
+    name: Option<String>,
+    address: Option<u32>,
+    requires: Vec<String>,
+    events: Vec<u32>,
+    kinds: Vec<String>,
+});
+payload!("hostile.membership" => struct Membership { group: u32, member: bool });
+payload!("hostile.name" => struct Name { name: String });
+
+/// What the attacks came to, as the attacker sees it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Tally {
+    /// Tricks that were played.
+    pub(super) tricks: u64,
+    /// Connections that were made.
+    pub(super) connections: u64,
+    /// Bytes that the node took.
+    pub(super) bytes: u64,
+    /// Refusals that the node told.
+    pub(super) refused: u64,
+}
+
+/// A hostile client of the node at a socket.
+pub(super) struct Attacker {
+    socket: PathBuf,
+    dice: Dice,
+    /// Connections that stay silent, in mid-frame or before the first one.
+    silent: Vec<Stranger>,
+    pub(super) tally: Tally,
+}
+
+type Trick = fn(&mut Attacker) -> io::Result<()>;
+
+/// Connections that are kept in mid-frame.
+const SILENT_MAX: usize = 16;
+
+impl Attacker {
+    pub(super) fn new(socket: &Path, dice: Dice) -> Self {
+        Self { socket: socket.to_owned(), dice, silent: Vec::new(), tally: Tally::default() }
+    }
+
+    /// Plays one trick. What the node answers to it, or that it closes, is no error.
+    pub(super) fn play_one(&mut self) {
+        const TRICKS: [Trick; 10] = [
+            Attacker::garbage,
+            Attacker::mutants,
+            Attacker::forged_sources,
+            Attacker::odd_descriptors,
+            Attacker::deaf,
+            Attacker::crowd,
+            Attacker::half_a_frame,
+            Attacker::wishes,
+            Attacker::too_early,
+            Attacker::false_outcomes,
+        ];
+        self.tally.tricks += 1;
+        let trick = TRICKS[self.dice.below(TRICKS.len() as u32) as usize];
+        // The node may end the connection at any point of a trick, and has no place for one now and then.
+        let _ = trick(self);
+    }
+
+    fn connect(&mut self) -> io::Result<Stranger> {
+        self.tally.connections += 1;
+        Stranger::connect(&self.socket)
+    }
+
+    fn register(&mut self) -> io::Result<Stranger> {
+        self.tally.connections += 1;
+        let registered = Stranger::register(&self.socket)?;
+        if registered.is_none() {
+            self.tally.refused += 1;
+        }
+        registered.ok_or_else(|| io::ErrorKind::ConnectionRefused.into())
+    }
+
+    fn write(&mut self, stranger: &mut Stranger, bytes: &[u8]) -> io::Result<()> {
+        stranger.write(bytes)?;
+        self.tally.bytes += bytes.len() as u64;
+        Ok(())
+    }
+
+    /// Reads what the node has to say, and counts refusals: of the connection, and of messages.
+    fn listen(&mut self, stranger: &mut Stranger) -> io::Result<()> {
+        // The node closes, too, when it has said all that it has to say.
+        stranger.stream.shutdown(Shutdown::Write)?;
+        let forged = Outcome::Rejected(Rejection::ForgedSource).code();
+        while let Some(said) = stranger.read()? {
+            let is_refused = said.kind == Kind::LNCL_REFUSAL
+                || said.kind == Kind::OUTCOME && said.payload == [forged] && said.correlation == FORGED;
+            self.tally.refused += u64::from(is_refused);
+        }
+        Ok(())
+    }
+
+    fn header(&mut self, source: Tid, destination: Tid) -> Header {
+        let mut header = Header::new(Order::KIND, source, destination);
+        header.class = [Class::Control, Class::Stream, Class::Bulk][self.dice.below(3) as usize];
+        header
+    }
+
+    /// Bytes that mean nothing, before and after a registration.
+    fn garbage(&mut self) -> io::Result<()> {
+        let mut stranger = if self.dice.once_in(2) { self.connect()? } else { self.register()? };
+        for _ in 0..1 + self.dice.below(4) {
+            let length = 1 + self.dice.below(4_096) as usize;
+            let bytes = self.dice.bytes(length);
+            self.write(&mut stranger, &bytes)?;
+        }
+        self.listen(&mut stranger)
+    }
+
+    /// Frames of which some bytes are others than they should be; the checksum is right for most.
+    fn mutants(&mut self) -> io::Result<()> {
+        let mut stranger = self.register()?;
+        for _ in 0..1 + self.dice.below(32) {
+            let to = self.anybody(stranger.tid);
+            let header = self.header(stranger.tid, to);
+            let length = self.dice.below(200) as usize;
+            let mut frame = Frame::new(&header, self.dice.bytes(length));
+            for _ in 0..self.dice.below(4) {
+                // The magic and the version mostly stay: else nothing behind them is reached.
+                let at = if self.dice.once_in(16) { self.dice.below(60) } else { 4 + self.dice.below(56) };
+                frame.header[at as usize] = self.dice.roll() as u8;
+            }
+            if !self.dice.once_in(4) {
+                frame = frame.sealed();
+            }
+            self.write(&mut stranger, &frame.bytes())?;
+        }
+        self.listen(&mut stranger)
+    }
+
+    /// Messages in the name of others.
+    fn forged_sources(&mut self) -> io::Result<()> {
+        let mut stranger = self.register()?;
+        for _ in 0..1 + self.dice.below(64) {
+            let source = self.anybody(stranger.tid);
+            let destination = self.anybody(stranger.tid);
+            let mut header = self.header(source, destination);
+            header.class = Class::Control;
+            header.flags = Flags::CONFIRM;
+            header.correlation = FORGED;
+            let payload = encode(&Order { number: 666 }).to_vec();
+            self.write(&mut stranger, &Frame::new(&header, payload).bytes())?;
+        }
+        self.listen(&mut stranger)
+    }
+
+    /// Descriptors that nobody asked for, where one might look for them and where not.
+    fn odd_descriptors(&mut self) -> io::Result<()> {
+        let mut stranger = if self.dice.once_in(3) { self.connect()? } else { self.register()? };
+        for _ in 0..1 + self.dice.below(6) {
+            let descriptors: io::Result<Vec<_>> =
+                (0..1 + self.dice.below(6)).map(|_| self.odd_descriptor(&stranger)).collect();
+            let bytes = match self.dice.below(3) {
+                0 => [&b"SINEWSHM"[..], &self.dice.bytes(16)].concat(),
+                1 => Frame::of_lncl(Kind::LNCL_REGISTER, Tid::NONE, &Name { name: "x".to_owned() }).bytes(),
+                _ => self.dice.bytes(24),
+            };
+            stranger.pass(&bytes, &descriptors?)?;
+        }
+        self.listen(&mut stranger)
+    }
+
+    fn odd_descriptor(&mut self, stranger: &Stranger) -> io::Result<OwnedFd> {
+        Ok(match self.dice.below(6) {
+            0 => File::open("/dev/zero")?.into(),
+            1 => File::open("/")?.into(),
+            // A socket that keeps itself alive.
+            2 => stranger.stream.try_clone()?.into(),
+            3 => self.connect()?.stream.into(),
+            4 => memfd_create("odd", MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING)?,
+            _ => {
+                let memory = memfd_create("odd", MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING)?;
+                rustix::fs::ftruncate(&memory, u64::from(self.dice.below(1 << 20)))?;
+                memory
+            }
+        })
+    }
+
+    /// Asks and asks, and never reads an answer. What it writes to itself comes back to it.
+    fn deaf(&mut self) -> io::Result<()> {
+        let mut stranger = self.register()?;
+        let witness = self.witness(&mut stranger)?;
+        let length = self.dice.below(16_000) as usize;
+        let for_me = Frame::new(&self.header(stranger.tid, stranger.tid), self.dice.bytes(length));
+        for number in 0..2_000 {
+            let mut header = Header::new(Order::KIND, stranger.tid, witness);
+            header.flags = Flags::ASK.with(Flags::CONFIRM);
+            header.correlation = number;
+            let payload = encode(&Order { number }).to_vec();
+            self.write(&mut stranger, &Frame::new(&header, payload).bytes())?;
+            self.write(&mut stranger, &for_me.bytes())?;
+        }
+        thread::sleep(self.dice.time_below(Duration::from_millis(200)));
+        Ok(())
+    }
+
+    /// More connections than the node has places.
+    fn crowd(&mut self) -> io::Result<()> {
+        let mut crowd = Vec::new();
+        for _ in 0..200 {
+            crowd.push(self.connect()?);
+        }
+        thread::sleep(self.dice.time_below(Duration::from_millis(50)));
+        for mut stranger in crowd {
+            // Those that have a place are told nothing.
+            stranger.stream.set_nonblocking(true)?;
+            let _ = self.listen(&mut stranger);
+        }
+        Ok(())
+    }
+
+    /// Begins a frame, and says no more for long.
+    fn half_a_frame(&mut self) -> io::Result<()> {
+        let mut stranger = if self.dice.once_in(2) { self.connect()? } else { self.register()? };
+        let to = self.anybody(stranger.tid);
+        let whole = Frame::new(&self.header(stranger.tid, to), self.dice.bytes(1_000)).bytes();
+        let some = &whole[..self.dice.below(whole.len() as u32) as usize];
+        self.write(&mut stranger, some)?;
+        if self.silent.len() >= SILENT_MAX {
+            let at = self.dice.below(SILENT_MAX as u32) as usize;
+            self.silent.swap_remove(at);
+        }
+        self.silent.push(stranger);
+        Ok(())
+    }
+
+    /// Registrations that nobody can grant, and all that one can ask for besides.
+    fn wishes(&mut self) -> io::Result<()> {
+        let mut stranger = self.connect()?;
+        let name = match self.dice.below(5) {
+            0 => None,
+            1 => Some("echo".to_owned()),
+            2 => Some("x".repeat(self.dice.below(300) as usize)),
+            3 => Some("\u{7}\n\u{0}".to_owned()),
+            _ => Some(format!("wish {}", self.dice.roll())),
+        };
+        let wishes = Wishes {
+            name,
+            address: self.dice.once_in(2).then(|| self.dice.roll() as u32),
+            requires: (0..self.dice.below(80) / 70 * 70).map(|number| number.to_string()).collect(),
+            events: (0..self.dice.below(100)).map(|_| self.dice.roll() as u32).collect(),
+            kinds: (0..self.dice.below(70)).map(|_| format!("kind {}", self.dice.below(100))).collect(),
+        };
+        let frame = Frame::of_lncl(Kind::LNCL_REGISTER, Tid::NONE, &wishes);
+        self.write(&mut stranger, &frame.bytes())?;
+        let Some(said) = stranger.read()? else { return Ok(()) };
+        if said.kind == Kind::LNCL_REFUSAL {
+            self.tally.refused += 1;
+            return Ok(());
+        }
+        let me = Tid::from_bits(said.source);
+        for _ in 0..self.dice.below(400) {
+            let group = if self.dice.once_in(8) { 7 } else { 0xF000_0000 | self.dice.roll() as u32 };
+            let membership = Membership { group, member: !self.dice.once_in(4) };
+            let frame = if self.dice.once_in(2) {
+                Frame::of_lncl(Kind::LNCL_GROUP, me, &membership)
+            } else {
+                Frame::of_lncl(Kind::LNCL_RESOLVE, me, &Name { name: "witness".repeat(3) })
+            };
+            self.write(&mut stranger, &frame.bytes())?;
+        }
+        self.listen(&mut stranger)
+    }
+
+    /// Messages before the barrier has opened; it waits for one who never comes.
+    fn too_early(&mut self) -> io::Result<()> {
+        let mut stranger = self.connect()?;
+        let wishes = Wishes {
+            name: None,
+            address: None,
+            requires: vec!["nobody".to_owned()],
+            events: Vec::new(),
+            kinds: Vec::new(),
+        };
+        let frame = Frame::of_lncl(Kind::LNCL_REGISTER, Tid::NONE, &wishes);
+        self.write(&mut stranger, &frame.bytes())?;
+        let header = self.header(Tid::NONE, Tid::BROADCAST);
+        self.write(&mut stranger, &Frame::new(&header, Vec::new()).bytes())?;
+        self.listen(&mut stranger)
+    }
+
+    /// Says what became of messages that it never had, or not like this.
+    fn false_outcomes(&mut self) -> io::Result<()> {
+        let mut stranger = self.register()?;
+        for _ in 0..1 + self.dice.below(100) {
+            let to = self.anybody(stranger.tid);
+            let mut header = Header::new(Kind::OUTCOME, stranger.tid, to);
+            header.flags = Flags::OUTCOME;
+            header.correlation = u64::from(self.dice.below(50));
+            let code = if self.dice.once_in(64) { 99 } else { self.dice.below(5) as u8 };
+            self.write(&mut stranger, &Frame::new(&header, vec![code]).bytes())?;
+        }
+        self.listen(&mut stranger)
+    }
+
+    /// The node's own application.
+    fn witness(&mut self, stranger: &mut Stranger) -> io::Result<Tid> {
+        let name = Name { name: crate::clients::door::WITNESS.to_owned() };
+        let question = Frame::of_lncl(Kind::LNCL_RESOLVE, stranger.tid, &name);
+        self.write(stranger, &question.bytes())?;
+        let said = stranger.read()?.ok_or(io::ErrorKind::UnexpectedEof)?;
+        // The map ends with the 64 bits.
+        let bits = said.payload.last_chunk().map_or(0, |bits| u64::from_be_bytes(*bits));
+        Ok(Tid::from_bits(bits))
+    }
+
+    /// Somebody who is there, or was, or never will be; a group, everybody, a layer, another node.
+    fn anybody(&mut self, me: Tid) -> Tid {
+        let node = if self.dice.once_in(8) { NodeAddress::new(self.dice.roll() as u32) } else { me.node };
+        let app = match self.dice.below(6) {
+            0 => AppAddress::new(self.dice.roll() as u32),
+            1 => AppAddress::new(self.dice.below(6)),
+            2 => AppAddress::ALL,
+            3 => AppAddress::group("clerks"),
+            _ => AppAddress::dynamic(self.dice.below(16)).unwrap_or(AppAddress::LNCL),
+        };
+        Tid::new(node, app)
+    }
+}
+
+/// The correlation of a forged message: what is refused with it was refused because of its source.
+const FORGED: u64 = 0x0F0F_0666;

@@ -1,0 +1,167 @@
+//! A client that is stopped only fills what is its own.
+
+use std::time::Duration;
+
+use rustix::process::Signal;
+use sinew::{ApiError, Endpoint, NodeApi, Payload, Registration, prelude::*};
+use sinew_tests::{
+    DEADLINE, Log,
+    clients::{Held, Performer, Stage, StageLimits, Window},
+    program,
+    puppet::{Job, Order, Value},
+    until,
+};
+
+const CAPACITY: usize = 64;
+/// So many of each class are sent to the one that is stopped: more than socket, ring and queue hold.
+const ROUNDS: u64 = 4_000;
+/// What the node may hold for it: three full queues of small messages, and as much again for their places in memory.
+const BOUND_KIB: u64 = 3 * CAPACITY as u64 + 2 * 1024;
+
+struct Scene {
+    stage: Stage,
+    others: [Performer; 2],
+    stopped: Performer,
+    /// Round trips of the others.
+    windows: Log<Window>,
+    /// What the one that was stopped got.
+    got: Log<(String, u64)>,
+    sender: Endpoint,
+    to: Tid,
+}
+
+impl Scene {
+    fn new() -> Self {
+        let limits = StageLimits { mailbox_capacity: CAPACITY, payload_max: 64 * 1024, clients_max: 16 };
+        let stage = Stage::new(&program("client_kills"), limits);
+        let (ups, windows, got) = (Log::default(), Log::default(), Log::default());
+        let up = |role: &str, arguments: &[&str], count: usize, hear: Box<dyn Fn(&str) + Send>| {
+            let arguments: Vec<_> = arguments.iter().map(|&argument| argument.to_owned()).collect();
+            let says = ups.clone();
+            let performer = stage
+                .start(role, &arguments, move |line| if line == "up" { says.write(()) } else { hear(line) });
+            ups.wait_for_many((), count);
+            performer
+        };
+        let echo = up("taker", &["echo"], 1, Box::new(|_| {}));
+        let measured: Log<Window> = windows.clone();
+        let pinger = up("pinger", &[], 2, Box::new(move |line| measured.write(Window::read(line))));
+        let recorded: Log<(String, u64)> = got.clone();
+        let stopped = up(
+            "recorder",
+            &["stopped"],
+            3,
+            Box::new(move |line| {
+                let (class, number) = line.split_once(' ').expect("a class and a number");
+                recorded.write((class.to_owned(), number.parse().expect("a number")));
+            }),
+        );
+        let api = NodeApi::connect(stage.socket()).expect("the door is open");
+        // Short: a ring of its own that is full is no reason to wait here.
+        let registration = Registration::new().patience(Duration::from_millis(1));
+        let mut sender = api.register_transport_address(registration).expect("an address");
+        let to = sender.resolve("stopped", DEADLINE).expect("the node answers").expect("it is registered");
+        Self { stage, others: [echo, pinger], stopped, windows, got, sender, to }
+    }
+
+    /// Round trips of the others from now on, until there were some.
+    fn others_flow(&mut self) -> Window {
+        self.others[1].tell("window");
+        self.windows.wait("the first window", |seen| (!seen.is_empty()).then_some(()));
+        until("round trips of the others", || {
+            let before = self.windows.all().len();
+            self.others[1].tell("window");
+            let window = self.windows.wait("the next window", |seen| seen.get(before).copied());
+            (window.count >= 20).then_some(window)
+        })
+    }
+
+    fn numbers(&self, class: &str) -> Vec<u64> {
+        self.got.all().into_iter().filter(|(of, _)| of == class).map(|(_, number)| number).collect()
+    }
+
+    fn wait_for(&self, class: &str, number: u64) {
+        self.got.wait_for((class.to_owned(), number));
+    }
+
+    /// Whether it was taken; only that there is no room may keep it from being.
+    fn send<P: Payload>(&mut self, value: &P) -> bool {
+        match self.sender.send(self.to, value) {
+            Ok(()) => true,
+            Err(ApiError::Stalled(_)) => false,
+            Err(error) => panic!("{error}"),
+        }
+    }
+
+    /// Refused at once, and the sender told so.
+    fn assert_full<P: Payload>(&mut self, value: &P) {
+        match self.sender.send_confirmed(self.to, value, DEADLINE) {
+            Ok(Outcome::Rejected(sinew::Rejection::QueueFull)) | Err(ApiError::Stalled(_)) => {}
+            other => panic!("{:?} to a full queue ends as {other:?}", P::NAME),
+        }
+    }
+
+    /// Sends until it is handled: there is room again.
+    fn send_until_delivered<P: Payload>(&mut self, value: &P) {
+        until("it is delivered", || match self.sender.send_confirmed(self.to, value, DEADLINE) {
+            Ok(Outcome::Delivered) => Some(()),
+            Ok(Outcome::Rejected(sinew::Rejection::QueueFull)) | Err(ApiError::Stalled(_)) => None,
+            other => panic!("it ends as {other:?}"),
+        });
+    }
+
+    fn end(self) {
+        let Self { stage, others: [echo, pinger], stopped, .. } = self;
+        for performer in [pinger, echo, stopped] {
+            assert!(performer.end().success());
+        }
+        stage.end();
+    }
+}
+
+/// From 1 on, without a gap.
+fn is_unbroken(numbers: &[u64]) -> bool {
+    numbers.iter().copied().eq(1..=numbers.len() as u64)
+}
+
+#[test]
+fn a_stopped_client_fills_what_is_its_own_and_gets_what_its_classes_promise_when_it_goes_on() {
+    // Given: one that is stopped, and a pair of others.
+    let mut scene = Scene::new();
+    let before = Held::of(scene.stage.node_id());
+    scene.stopped.signal(Signal::STOP);
+
+    // When: more is sent to it than there is room for.
+    for number in 1..=ROUNDS {
+        scene.send(&Job { number });
+        scene.send(&Value { number });
+        scene.send(&Order { number });
+    }
+
+    // Then: whoever asks is told, the others are served, and the node holds no more than it may.
+    scene.assert_full(&Job { number: ROUNDS + 1 });
+    scene.assert_full(&Order { number: ROUNDS + 1 });
+    let window = scene.others_flow();
+    assert_eq!(window.failed, 0, "{window}");
+    let held = Held::of(scene.stage.node_id());
+    let grown = held.proportional_kib.saturating_sub(before.proportional_kib);
+    assert!(grown <= BOUND_KIB, "the node has grown by {grown} KiB of {BOUND_KIB}: {held}");
+    assert_eq!(scene.got.all().len(), 0, "it is stopped");
+
+    // And when it goes on, it gets the oldest of what is ordered, and the newest value.
+    scene.stopped.signal(Signal::CONT);
+    scene.wait_for("stream", ROUNDS);
+    scene.send_until_delivered(&Order { number: ROUNDS + 2 });
+    scene.send_until_delivered(&Job { number: ROUNDS + 2 });
+    let [mut control, stream, mut bulk] = ["control", "stream", "bulk"].map(|class| scene.numbers(class));
+    assert_eq!([control.pop(), bulk.pop()], [Some(ROUNDS + 2); 2]);
+    assert!(is_unbroken(&control) && is_unbroken(&bulk), "the oldest, in order: {control:?} {bulk:?}");
+    assert!(control.len() >= CAPACITY && bulk.len() >= CAPACITY, "{} {}", control.len(), bulk.len());
+    assert!(stream.is_sorted() && stream.last() == Some(&ROUNDS), "the newest is the last: {stream:?}");
+    assert!(stream.len() < ROUNDS as usize, "a newer value takes the place of one that waits");
+    let all = scene.got.all();
+    let place = |class: &str, number| all.iter().position(|(of, one)| of == class && *one == number);
+    let last_control = place("control", control.len() as u64);
+    assert!(last_control < place("bulk", bulk.len() as u64), "Control goes ahead of Bulk where both wait");
+    scene.end();
+}
