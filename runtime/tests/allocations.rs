@@ -94,7 +94,7 @@ impl Player {
 
     fn returns(&mut self, to: Tid, context: &AppContext<Self>) {
         self.rounds += 1;
-        if self.rounds > WARM_UP && self.rounds % WINDOW == 0 {
+        if self.rounds > WARM_UP && self.rounds.is_multiple_of(WINDOW) {
             let now = allocated();
             self.least = self.least.min(now - self.before);
         }
@@ -103,7 +103,7 @@ impl Player {
             let _ = self.say.try_send(self.least);
             return;
         }
-        if self.rounds % WINDOW == 0 {
+        if self.rounds.is_multiple_of(WINDOW) {
             self.before = allocated();
         }
         send(&context.sender(), to, self.what);
@@ -220,9 +220,9 @@ fn a_message_to_a_group_is_written_once_and_costs_no_memory() {
         let taken = take();
         let places: BTreeSet<_> = taken
             .iter()
-            .map(|taken| match taken {
-                Poll::Ready(Some(message)) => message.payload.as_ptr() as usize,
-                other => panic!("each has a message: {other:?}"),
+            .map(|taken| {
+                let Poll::Ready(Some(message)) = taken else { panic!("each has a message: {taken:?}") };
+                message.payload.as_ptr() as usize
             })
             .collect();
         assert_eq!((taken.len(), places.len()), (3, 1));
