@@ -38,6 +38,7 @@ mod outlet;
 mod payload;
 mod process;
 mod refusals;
+mod ring;
 mod stores;
 mod sync;
 mod wills;
@@ -45,7 +46,7 @@ mod wills;
 #[cfg(feature = "fault-points")]
 pub use sinew_runtime::supervision::fault;
 
-pub use api::{ApiError, Endpoint, NodeApi, Received, Registration};
+pub use api::{ApiError, Endpoint, NodeApi, Received, Registration, Transport};
 pub use config::{ConfigFaults, NodeConfig};
 pub use lncl::RegisterError;
 pub use ndl::{KnownNode, LossReason, NodeEvent, Source};
@@ -66,6 +67,7 @@ pub use sinew_runtime::{
     time::Time,
     wire::{Class, Kind, MessageBuffer, Payload},
 };
+pub use sinew_shm::Spin;
 pub use stores::ClockOffset;
 pub use sync::{DirectoryEntry, Waiting};
 

@@ -27,40 +27,58 @@ use sinew_runtime::{
     outcome::{Outcome, Rejection, Ticket},
     router::{Outlet, Refused},
     time::Time,
-    wire::Message,
+    wire::{Checksum, Message},
 };
 use tokio::net::{TcpStream, UnixStream};
 
 use half::{After, Half};
 
-/// A non-blocking socket that can be written to from any thread.
-pub(crate) trait Socket: Send + Sync + 'static {
+/// A non-blocking socket, or what is like one, that can be written to from any thread.
+pub(crate) trait Socket: Send + 'static {
+    /// What its frames have for a checksum.
+    fn checksum(&self) -> Checksum {
+        Checksum::Crc
+    }
+
     /// Writes what the socket takes at once, from the first byte of `parts` on.
     ///
     /// # Errors
     /// [`io::ErrorKind::WouldBlock`] if it takes nothing now; anything else ends the connection.
-    fn try_write_vectored(&self, parts: &[IoSlice<'_>]) -> io::Result<usize>;
+    fn try_write_vectored(&mut self, parts: &[IoSlice<'_>]) -> io::Result<usize>;
+
+    /// Bytes that were ever written and bytes that the peer has taken, in one count, where that can be known.
+    fn account(&mut self) -> Account {
+        Account { written: 0, taken: u64::MAX }
+    }
 
     /// Ready when the socket may take something. For one task only: the drainer.
-    fn poll_writable(&self, cx: &mut Context<'_>) -> Poll<io::Result<()>>;
+    fn poll_writable(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>>;
+}
+
+/// How far the peer has come with what was written. A frame that was written before `taken` may have been handled; one
+/// after it was not.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Account {
+    pub(crate) written: u64,
+    pub(crate) taken: u64,
 }
 
 impl Socket for Arc<TcpStream> {
-    fn try_write_vectored(&self, parts: &[IoSlice<'_>]) -> io::Result<usize> {
+    fn try_write_vectored(&mut self, parts: &[IoSlice<'_>]) -> io::Result<usize> {
         TcpStream::try_write_vectored(self, parts)
     }
 
-    fn poll_writable(&self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+    fn poll_writable(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
         self.poll_write_ready(cx)
     }
 }
 
 impl Socket for Arc<UnixStream> {
-    fn try_write_vectored(&self, parts: &[IoSlice<'_>]) -> io::Result<usize> {
+    fn try_write_vectored(&mut self, parts: &[IoSlice<'_>]) -> io::Result<usize> {
         UnixStream::try_write_vectored(self, parts)
     }
 
-    fn poll_writable(&self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+    fn poll_writable(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
         self.poll_write_ready(cx)
     }
 }

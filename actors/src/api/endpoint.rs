@@ -12,17 +12,17 @@ use sinew_runtime::{
 use super::{
     ApiError, Received, Registration,
     inbox::{Answer, Awaited, Inbox, Sorted},
-    link::{self, Read, Reader, Writer},
+    link::{self, Link, Read, Reader, Writer},
 };
-use crate::lncl::payload::{self, Group, Refusal, Registered, Resolve};
+use crate::lncl::payload::{self, Group, Registered, Resolve};
 
 /// Time that the node has to answer what it answers at once.
 const PROMPT: Duration = Duration::from_secs(2);
-/// Longest payload before the node has said how long they may be.
-const GREETING_BYTES_MAX: usize = 64 * 1024;
 /// Chunks of 64 KiB that are read before the caller has its turn. In tests each read is the last of its look: a message
 /// that ends with it must not be left lying until more comes.
 const READS_PER_LOOK: usize = if cfg!(test) { 1 } else { 16 };
+/// Looks for the last words of a node that has gone.
+const LAST_LOOKS: usize = 64;
 const LNCL: Tid = payload::lncl_of(NodeAddress::HERE);
 
 /// A registered transport address: sends and receives, from one thread at a time.
@@ -58,25 +58,20 @@ enum WhenFull {
 
 impl Endpoint {
     pub(super) fn register(path: &Path, registration: Registration) -> Result<Self, ApiError> {
-        let Registration { register, deadline, inbox_capacity, patience } = registration;
-        let socket = Arc::new(link::connect(path)?);
-        let writer = Arc::new(Writer::new(socket.clone(), patience));
-        let mut reader = Reader::new(socket, GREETING_BYTES_MAX);
-        writer.write(&payload::frame(Kind::LNCL_REGISTER, Tid::NONE, LNCL, &register))?;
-        let Some(registered) = await_registered(&mut reader, Time::now() + deadline)? else {
+        let Registration { register, deadline, inbox_capacity, link } = registration;
+        let Some(link) = link::open(path, &register, Time::now() + deadline, link)? else {
             return Err(match register.requires {
                 requires if requires.is_empty() => ApiError::NoAnswer(deadline),
                 requires => ApiError::Waiting { requires, waited: deadline },
             });
         };
-        let Registered { node, app, node_name, payload_max } = registered;
-        let payload_max = payload_max as usize;
-        reader.set_payload_max(payload_max);
+        let Link { registered, writer, reader } = link;
+        let Registered { node, app, node_name, payload_max, ring: _ } = registered;
         let inbox = Inbox::new(inbox_capacity, writer.clone());
         Ok(Self {
             tid: Tid::new(node, app),
             node_name,
-            payload_max,
+            payload_max: payload_max as usize,
             writer,
             reader,
             inbox,
@@ -187,10 +182,11 @@ impl Endpoint {
             if let Some(why) = &self.ended {
                 return Err(ApiError::Closed(why.clone()));
             }
-            // The clock is asked too: a flood keeps the socket readable for ever.
-            if Time::now() >= deadline || !self.reader.wait(deadline) {
+            // The clock is asked by us: a flood keeps the link readable for ever.
+            if Time::now() >= deadline {
                 return Ok(None);
             }
+            self.reader.wait(deadline);
         }
     }
 
@@ -235,9 +231,13 @@ impl Endpoint {
         while self.ended.is_none() {
             self.take_in(None, WhenFull::Refuse)?;
             self.inbox.close();
-            if self.ended.is_none() && (Time::now() >= deadline || !self.reader.wait(deadline)) {
+            if self.ended.is_some() {
+                break;
+            }
+            if Time::now() >= deadline {
                 return Err(ApiError::NoAnswer(PROMPT));
             }
+            self.reader.wait(deadline);
         }
         Ok(())
     }
@@ -311,10 +311,11 @@ impl Endpoint {
             if let Some(why) = &self.ended {
                 return Err(ApiError::Closed(why.clone()));
             }
-            // The clock is asked too: a flood keeps the socket readable for ever.
-            if Time::now() >= deadline || !self.reader.wait(deadline) {
+            // The clock is asked by us: a flood keeps the link readable for ever.
+            if Time::now() >= deadline {
                 return Ok(None);
             }
+            self.reader.wait(deadline);
         }
     }
 
@@ -323,6 +324,9 @@ impl Endpoint {
         self.sequence += 1;
         message.header.sequence = self.sequence;
         message.header.sent = Time::now();
+        if self.reader.has_ended(message.header.sent) {
+            return Err(self.explain(ApiError::Closed("the node has gone".to_owned())));
+        }
         self.writer.write(&message).map_err(|error| self.explain(error))
     }
 
@@ -331,8 +335,12 @@ impl Endpoint {
         if !matches!(error, ApiError::Closed(_)) {
             return error;
         }
-        // The error to tell is the first one.
-        let _ = self.take_in(None, WhenFull::Refuse);
+        for _ in 0..LAST_LOOKS {
+            // The error to tell is the first one.
+            if self.ended.is_some() || self.take_in(None, WhenFull::Refuse).is_err() {
+                break;
+            }
+        }
         self.ended.clone().map_or(error, ApiError::Closed)
     }
 
@@ -349,6 +357,7 @@ impl Endpoint {
         awaited: Option<(u64, Awaited)>,
         when_full: WhenFull,
     ) -> Result<Option<Answer>, ApiError> {
+        self.writer.pay();
         for read in 0.. {
             if let Some(answer) = self.sort_in(awaited, when_full)? {
                 return Ok(Some(answer));
@@ -360,8 +369,8 @@ impl Endpoint {
             match self.reader.read() {
                 Read::Some => {}
                 Read::Nothing => return Ok(None),
-                Read::Ended => {
-                    self.ended.get_or_insert_with(|| "the node closed it, or ended".to_owned());
+                Read::Ended(why) => {
+                    self.ended.get_or_insert(why);
                     return Ok(None);
                 }
             }
@@ -389,37 +398,11 @@ impl Endpoint {
 
 impl Drop for Endpoint {
     fn drop(&mut self) {
+        // What has come and was not looked at is refused, too. An error ends the connection, as this does.
+        let _ = self.take_in(None, WhenFull::Refuse);
         self.inbox.close();
         // A message that is still in some thread's hand ends as `Failed`.
         self.writer.close();
-    }
-}
-
-/// Waits for the node's first frame; `None` at the deadline.
-fn await_registered(reader: &mut Reader, deadline: Time) -> Result<Option<Registered>, ApiError> {
-    loop {
-        if let Some(message) = reader.next()? {
-            return read_greeting(&message).map(Some);
-        }
-        match reader.read() {
-            Read::Some => {}
-            Read::Ended => return Err(ApiError::Closed("the node closed it without a word".to_owned())),
-            Read::Nothing if !reader.wait(deadline) => return Ok(None),
-            Read::Nothing => {}
-        }
-    }
-}
-
-fn read_greeting(message: &Message) -> Result<Registered, ApiError> {
-    let unreadable = |error: rmp_serde::decode::Error| ApiError::Closed(error.to_string());
-    match message.header.kind {
-        Kind::LNCL_REGISTERED => payload::read(&message.payload).map_err(unreadable),
-        Kind::LNCL_REFUSAL => {
-            let refusal: Refusal = payload::read(&message.payload).map_err(unreadable)?;
-            Err(ApiError::Refused(refusal.sentence))
-        }
-        // Not an enum of ours: an open set of numbers.
-        kind => Err(ApiError::Closed(format!("the node's first frame has kind {kind}"))),
     }
 }
 

@@ -38,6 +38,9 @@ pub enum ApiError {
     /// The node takes no bytes. This message was not sent; it may be tried again.
     #[error("the node has taken no bytes for {0:?}; the message was not sent")]
     Stalled(Duration),
+    /// A message that was lent was neither sent nor dropped. The caller is at fault; nothing was sent.
+    #[error("memory for a message is lent; send that message or drop it first")]
+    Lent,
     /// The payload is above the node's limit. The caller is at fault; nothing was sent.
     #[error("a payload of {length} bytes is above the node's limit of {limit}; raise `payload_max`")]
     TooLong {

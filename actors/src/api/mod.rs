@@ -56,11 +56,14 @@ use sinew_runtime::{
     tid::AppAddress,
     wire::{Kind, Payload},
 };
+use sinew_shm::Spin;
 
 pub use endpoint::Endpoint;
 pub use error::ApiError;
+pub use link::Transport;
 pub use received::Received;
 
+use self::link::LinkOptions;
 use crate::lncl::payload::Register;
 
 /// The way to the node of this host, at the path of its socket.
@@ -98,7 +101,7 @@ pub struct Registration {
     register: Register,
     deadline: Duration,
     inbox_capacity: usize,
-    patience: Duration,
+    link: LinkOptions,
 }
 
 impl Default for Registration {
@@ -107,7 +110,11 @@ impl Default for Registration {
             register: Register { pid: std::process::id(), ..Register::default() },
             deadline: Duration::from_secs(60),
             inbox_capacity: 256,
-            patience: Duration::from_secs(1),
+            link: LinkOptions {
+                transport: Transport::Ring,
+                spin: Spin::Off,
+                patience: Duration::from_secs(1),
+            },
         }
     }
 }
@@ -175,10 +182,25 @@ impl Registration {
         self
     }
 
-    /// How long a send waits at most when the node does not take bytes from its socket. Default 1 s.
+    /// How long a send waits at most while the node takes nothing. Default 1 s.
     #[must_use]
     pub const fn patience(mut self, patience: Duration) -> Self {
-        self.patience = patience;
+        self.link.patience = patience;
+        self
+    }
+
+    /// What carries the messages between this process and the node. Default [`Transport::Ring`].
+    #[must_use]
+    pub const fn transport(mut self, transport: Transport) -> Self {
+        self.link.transport = transport;
+        self
+    }
+
+    /// What the thread does before it sleeps at a ring: looks for a while, or sleeps at once. Looking keeps a CPU busy and
+    /// saves the wake, which is most of a short message's way. Default [`Spin::Off`].
+    #[must_use]
+    pub const fn spin(mut self, spin: Spin) -> Self {
+        self.link.spin = spin;
         self
     }
 

@@ -34,6 +34,7 @@ pub(super) const MAILBOX_CAPACITY: Range = range("node.mailbox_capacity", 1, 65_
 pub(super) const PAYLOAD_MAX: Range = range("node.payload_max", 64, 64 << 20, "bytes");
 pub(super) const CLIENTS_MAX: Range = range("lncl.clients_max", 1, 4_096, "connections");
 pub(super) const APPS_MAX: Range = range("lncl.apps_max", 1, 65_536, "applications");
+pub(super) const RING_BYTES: Range = range("lncl.ring_bytes", 4 << 10, 16 << 20, "bytes");
 pub(super) const GNCL_PORT: Range = range("gncl.port", 0, 65_535, "(0: any free port)");
 pub(super) const QUEUE_CAPACITY: Range = range("gncl.queue_capacity", 1, 65_536, "messages");
 pub(super) const STRANGERS_MAX: Range = range("gncl.strangers_max", 1, 1_024, "connections");
@@ -132,6 +133,7 @@ impl NodeConfig {
         }
         CLIENTS_MAX.count(faults, self.lncl.clients_max);
         APPS_MAX.count(faults, self.lncl.apps_max);
+        RING_BYTES.count(faults, self.lncl.ring_bytes);
     }
 
     fn check_gncl(&self, faults: &mut Vec<ConfigFault>) {

@@ -29,7 +29,7 @@ const FILE_BYTES_MAX: u64 = 1 << 20;
 const SECTIONS: [&str; 6] = ["node", "lncl", "gncl", "ndl", "sync", "supervision"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 28] = [
+pub(super) const KEYS: [&str; 29] = [
     "node.name",
     "node.project",
     "node.address",
@@ -38,6 +38,7 @@ pub(super) const KEYS: [&str; 28] = [
     "lncl.socket",
     "lncl.clients_max",
     "lncl.apps_max",
+    "lncl.ring_bytes",
     "gncl.port",
     "gncl.queue_capacity",
     "gncl.strangers_max",
@@ -313,6 +314,7 @@ impl Reader<'_> {
         self.text_or_off("lncl.socket", "\"/run/sinew/knee.sock\" or false", &mut config.lncl.socket);
         self.number(&check::CLIENTS_MAX, &mut config.lncl.clients_max);
         self.number(&check::APPS_MAX, &mut config.lncl.apps_max);
+        self.number(&check::RING_BYTES, &mut config.lncl.ring_bytes);
     }
 
     fn read_gncl(&mut self, config: &mut NodeConfig) {

@@ -60,6 +60,10 @@ pub struct LnclConfig {
     pub clients_max: usize,
     /// Applications of the node at most, in all its processes. 1 to 65,536; default 1,024.
     pub apps_max: usize,
+    /// Bytes of the ring in shared memory for each direction of a connection of another process; the next power of two
+    /// is taken. Half of it is the longest message that goes in one piece, and the whole is what a client that does not
+    /// read costs. 4 KiB to 16 MiB; default 256 KiB.
+    pub ring_bytes: usize,
 }
 
 /// Global Node Communication Layer: connections between nodes.
@@ -159,7 +163,7 @@ impl NodeConfig {
             address: None,
             mailbox_capacity: 256,
             payload_max: 1 << 20,
-            lncl: LnclConfig { socket: None, clients_max: 256, apps_max: 1_024 },
+            lncl: LnclConfig { socket: None, clients_max: 256, apps_max: 1_024, ring_bytes: 256 * 1_024 },
             gncl: GnclConfig {
                 port: 0,
                 queue_capacity: 1_024,

@@ -2,7 +2,7 @@
 
 use std::{io, ops::ControlFlow, rc::Rc, sync::Arc, time::Duration};
 
-use bytes::Bytes;
+use bytes::{Bytes, BytesMut};
 use rustix::net::Shutdown;
 use sinew_runtime::{
     monitor::DownClass,
@@ -10,13 +10,15 @@ use sinew_runtime::{
     router::{LocalRoute, Outlet},
     tid::Tid,
     time::Time,
-    wire::{Flags, FrameError, Header, Kind, Message},
+    wire::{Flags, FrameError, Header, Kind, Message, encode_frame},
 };
+use sinew_shm::PassError;
 use tokio::net::{UnixStream, unix::UCred};
 
 use super::{
     core::{Address, ClientId, Owner, Request},
     introductions::Marks,
+    link::{self, ClientReader, ClientSocket, LinkError},
     payload::{self, REGISTER_BYTES_MAX, Refusal, Register, Registered, Resolved},
     reader::Reader,
     registrar,
@@ -26,6 +28,7 @@ use super::{
 use crate::{
     monitors::Cause,
     outlet::{LinkNumber, OutletLimits, StreamOutlet},
+    ring::{ExchangeError, RingError},
     stores::{Stores, lock},
 };
 
@@ -38,7 +41,7 @@ const LAST_WORDS: Duration = Duration::from_millis(100);
 const MARK_AGAIN: Duration = Duration::from_millis(2);
 
 /// The writing half of a client's connection.
-pub(super) type ClientOutlet = StreamOutlet<Arc<UnixStream>>;
+pub(super) type ClientOutlet = StreamOutlet<ClientSocket>;
 
 /// Why a connection ended.
 #[derive(Debug)]
@@ -75,7 +78,7 @@ pub(super) async fn serve(server: Rc<Server>, stream: Arc<UnixStream>, credentia
     session.registered(client.tid);
     let end = match client.wait_at_barrier(&mut reader, &mut session).await {
         Some(end) => end,
-        None => client.run(&mut reader, &mut session).await,
+        None => client.run(reader, &mut session).await,
     };
     client.finish(end).await;
 }
@@ -118,6 +121,16 @@ impl Peer {
     }
 }
 
+/// Whether a connection has rings.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Ring {
+    None,
+    /// The client can.
+    Asked,
+    /// The client was told so: the socket carries descriptors, and last words.
+    Told,
+}
+
 /// A registered connection. Dropping it takes the registration back, whatever the reason: the end of the peer's
 /// process, of this task, or of LNCL.
 struct Client {
@@ -130,6 +143,8 @@ struct Client {
     name: String,
     requires: Vec<String>,
     events: Arc<[Kind]>,
+    /// Whether the peer can use rings; later, whether it was told that it does.
+    ring: Ring,
     /// Whether the peer knows why its connection ends.
     has_been_told: bool,
     /// How it ends, as far as it is known.
@@ -138,7 +153,7 @@ struct Client {
 
 impl Client {
     fn register(server: Rc<Server>, peer: Peer, asked: Register) -> Result<Self, super::RegisterError> {
-        let Register { name, address, requires, events, kinds, pid: _, direct: _ } = asked;
+        let Register { name, address, requires, events, kinds, pid: _, direct: _, ring } = asked;
         let address = address.map_or(Address::Dynamic, Address::Fixed);
         let request = Request { address, name, requires: requires.clone(), kinds, owner: peer.owner() };
         let app = registrar::register_client(&server.stores, request)?;
@@ -149,7 +164,8 @@ impl Client {
         tracing::info!(%tid, name, pid = peer.pid, "an application of another process has registered");
         let (link, events, has_been_told) = (None, events.into(), false);
         let cause = Cause::new(DownClass::Killed, registrar::LNCL_ENDED);
-        Ok(Self { server, peer, outlet, link, tid, name, requires, events, has_been_told, cause })
+        let ring = if ring { Ring::Asked } else { Ring::None };
+        Ok(Self { server, peer, outlet, link, tid, name, requires, events, ring, has_been_told, cause })
     }
 
     /// Holds the client until all that it requires is ready. Returns why its connection ended, if it did.
@@ -188,26 +204,54 @@ impl Client {
     }
 
     /// Opens the connection and carries frames both ways.
-    async fn run(&mut self, reader: &mut Reader, session: &mut Session) -> End {
-        let payload_max = self.server.stores.config.payload_max;
-        reader.set_payload_max(payload_max);
-        let link = self.outlet.connect(self.peer.stream.clone(), payload_max, Some(self.registered()));
-        self.link = Some(link);
+    async fn run(&mut self, reader: Reader, session: &mut Session) -> End {
+        // What is sent to it from now on waits in the outlet. So whoever knows that it is registered can send to it.
         session.released(self.tid);
         let route = LocalRoute { outlet: self.outlet.clone(), events: self.events.clone() };
         registrar::open(&self.server.stores, self.tid.app, route);
-        let receive = self.receive(reader, session);
+        let (mut reader, link) = match self.open_link(reader).await {
+            Ok(opened) => opened,
+            Err(end) => return end,
+        };
+        self.link = Some(link);
+        let receive = self.receive(&mut reader, session);
         tokio::pin!(receive);
         tokio::select! {
             end = &mut receive => end,
             // What it said before it went still counts; it is there already.
             cause = self.outlet.drain(link) => {
-                tokio::time::timeout(LAST_WORDS, receive).await.unwrap_or(End::HungUp(Some(cause)))
+                tokio::time::timeout(LAST_WORDS, receive).await.unwrap_or_else(|_| End::of_write(cause))
             }
         }
     }
 
-    async fn receive(&self, reader: &mut Reader, session: &mut Session) -> End {
+    /// Tells the client its address, and agrees with it on what carries the messages.
+    async fn open_link(&mut self, mut reader: Reader) -> Result<(ClientReader, LinkNumber), End> {
+        let config = &self.server.stores.config;
+        let payload_max = config.payload_max;
+        let ring_bytes = config.lncl.ring_bytes;
+        let ring = (self.ring == Ring::Asked).then(|| link::prepare(ring_bytes)).flatten();
+        let Some((capacity, exchange)) = ring else {
+            reader.set_payload_max(payload_max);
+            let socket = ClientSocket::Plain(self.peer.stream.clone());
+            let link = self.outlet.connect(socket, payload_max, Some(self.registered(None)));
+            return Ok((ClientReader::Plain(reader), link));
+        };
+        write_now(&self.peer.stream, &self.registered(Some(capacity.bytes())))?;
+        self.ring = Ring::Told;
+        let exchange = link::exchange(exchange, &self.peer.stream, payload_max);
+        let (socket, reader) = match tokio::time::timeout(HANDSHAKE, exchange).await {
+            Ok(Ok(both)) => both,
+            Ok(Err(ExchangeError::Pass(PassError::Closed))) => return Err(End::HungUp(None)),
+            Ok(Err(why)) => return Err(End::Refused(why.to_string())),
+            Err(_) => {
+                return Err(End::Refused(format!("no offer of shared memory came within {HANDSHAKE:?}")));
+            }
+        };
+        Ok((reader, self.outlet.connect(socket, payload_max, None)))
+    }
+
+    async fn receive(&self, reader: &mut ClientReader, session: &mut Session) -> End {
         loop {
             let message = match reader.next(&self.peer.stream).await {
                 Ok(Some(message)) => message,
@@ -321,11 +365,11 @@ impl Client {
         }
     }
 
-    fn registered(&self) -> Message {
+    fn registered(&self, ring: Option<u32>) -> Message {
         let config = &self.server.stores.config;
         let payload_max = u32::try_from(config.payload_max).unwrap_or(u32::MAX);
         let Tid { node, app } = self.tid;
-        let registered = Registered { node, app, node_name: config.name.clone(), payload_max };
+        let registered = Registered { node, app, node_name: config.name.clone(), payload_max, ring };
         payload::frame(Kind::LNCL_REGISTERED, payload::lncl_of(node), self.tid, &registered)
     }
 
@@ -347,15 +391,29 @@ impl Client {
     }
 
     async fn say_farewell(&self, sentence: String) {
+        if self.ring == Ring::Told {
+            return self.say_last(sentence);
+        }
         self.say(self.refusal(sentence));
         // Without a link nothing was written yet, and the socket takes a sentence at once.
         let link = self.link.unwrap_or_else(|| {
             let payload_max = self.server.stores.config.payload_max;
-            self.outlet.connect(self.peer.stream.clone(), payload_max, None)
+            self.outlet.connect(ClientSocket::Plain(self.peer.stream.clone()), payload_max, None)
         });
         if self.outlet.waiting() > 0 {
             // What the socket does not take in this time is not read by anybody.
             let _ = tokio::time::timeout(LAST_WORDS, self.outlet.drain(link)).await;
+        }
+    }
+
+    /// Says why it ends, without waiting.
+    fn say_last(&self, sentence: String) {
+        let refusal = self.refusal(sentence);
+        match self.ring {
+            Ring::None | Ring::Asked => self.say(refusal),
+            // The ring may be full or not there yet, and nothing but these words ever goes into the socket. Whoever is
+            // gone need not hear them.
+            Ring::Told => drop(write_now(&self.peer.stream, &refusal)),
         }
     }
 
@@ -374,13 +432,13 @@ impl Drop for Client {
         registrar::owner_gone(&self.server.stores, self.peer.owner(), &self.cause);
         self.server.remove_outlet(self.peer.id);
         if !self.has_been_told {
-            self.say(self.refusal("the node's LNCL has ended; connect again when it is back".to_owned()));
+            self.say_last("the node's LNCL has ended; connect again when it is back".to_owned());
         }
-        // spec: LNCL-7
-        self.outlet.end(Outcome::Failed, Rejection::Closed);
         // Senders may hold the outlet, and with it the socket, a little longer; the peer is told now. An error means
         // that it is closed already.
         let _ = rustix::net::shutdown(&self.peer.stream, Shutdown::Both);
+        // spec: LNCL-7. A peer that sleeps at a ring is woken by its end.
+        self.outlet.end(Outcome::Failed, Rejection::Closed);
     }
 }
 
@@ -394,6 +452,28 @@ impl End {
             }
             Self::Refused(sentence) => {
                 Cause::new(DownClass::Killed, format!("its connection was ended: {sentence}"))
+            }
+        }
+    }
+}
+
+impl End {
+    /// The end of a connection that could not be written to.
+    fn of_write(cause: io::Error) -> Self {
+        if cause.kind() == io::ErrorKind::InvalidData {
+            Self::Refused(cause.to_string())
+        } else {
+            Self::HungUp(Some(cause))
+        }
+    }
+}
+
+impl From<LinkError> for End {
+    fn from(error: LinkError) -> Self {
+        match error {
+            LinkError::Ring(RingError::Frame(error)) => error.into(),
+            LinkError::Ring(RingError::Corrupt(_)) | LinkError::StrayBytes => {
+                Self::Refused(error.to_string())
             }
         }
     }
@@ -417,6 +497,17 @@ fn pass_on(mut marks: Marks) {
                 tokio::time::sleep(MARK_AGAIN).await;
             }
         });
+    }
+}
+
+/// Writes a frame that the socket has room for: the first one.
+fn write_now(stream: &UnixStream, message: &Message) -> Result<(), End> {
+    let mut bytes = BytesMut::new();
+    encode_frame(&message.header, &message.payload, &mut bytes);
+    match stream.try_write(&bytes) {
+        Ok(count) if count == bytes.len() => Ok(()),
+        Ok(_) => Err(End::HungUp(None)),
+        Err(cause) => Err(End::HungUp(Some(cause))),
     }
 }
 

@@ -23,6 +23,7 @@ mod door;
 mod facts;
 #[cfg_attr(not(test), expect(dead_code, reason = "direct links follow"))]
 mod introductions;
+mod link;
 mod listener;
 pub(crate) mod payload;
 mod reader;

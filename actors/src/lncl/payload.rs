@@ -34,6 +34,9 @@ pub(crate) struct Register {
     /// Whether others of the node may be introduced to it, to send to it directly.
     #[serde(default)]
     pub(crate) direct: bool,
+    /// Whether it can use rings in shared memory.
+    #[serde(default)]
+    pub(crate) ring: bool,
 }
 
 /// The address that a process got.
@@ -47,6 +50,9 @@ pub(crate) struct Registered {
     pub(crate) node_name: String,
     /// Longest payload that the node takes and sends, in bytes.
     pub(crate) payload_max: u32,
+    /// Bytes of the ring that each side offers next; none = everything goes through the socket.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) ring: Option<u32>,
 }
 
 /// Why a registration was refused or a connection ends.

@@ -12,7 +12,7 @@ use sinew_runtime::{
     outcome::{Outcome, Receipt, Rejection, Ticket},
     router::Refused,
     time::Time,
-    wire::{Class, Flags, HEADER_LEN, Message},
+    wire::{Checksum, Class, Flags, HEADER_LEN, Message},
 };
 
 use super::{LinkNumber, OutletCounts, OutletLimits, Socket};
@@ -58,18 +58,26 @@ struct Partial {
 }
 
 impl Partial {
-    fn new(message: Message) -> Self {
-        let head = message.header.encode(&message.payload);
+    fn new(message: Message, checksum: Checksum) -> Self {
+        let head = checksum.encode(&message.header, &message.payload);
         Self { message, head, written: 0, is_frill: false }
     }
 
     /// Writes what the socket takes; returns whether that was all.
-    fn write_to(&mut self, socket: &impl Socket) -> io::Result<bool> {
+    fn write_to(&mut self, socket: &mut impl Socket) -> io::Result<bool> {
         let head = &self.head[self.written.min(HEADER_LEN)..];
         let payload = &self.message.payload[self.written.saturating_sub(HEADER_LEN)..];
         self.written += socket.try_write_vectored(&[IoSlice::new(head), IoSlice::new(payload)])?;
         Ok(self.written == self.message.size())
     }
+}
+
+/// A message whose outcome the peer owes.
+struct Sent {
+    receipt: Receipt,
+    expiry: Time,
+    /// The connection's account when it was written.
+    written: u64,
 }
 
 /// How a write ended.
@@ -98,7 +106,7 @@ pub(super) struct Half<S> {
     /// No waiting message expires before this.
     next_expiry: Time,
     /// Receipts of messages that were sent, oldest first: outcomes come back in about this order.
-    sent_receipts: VecDeque<(Receipt, Time)>,
+    sent_receipts: VecDeque<Sent>,
     drainer: Option<Waker>,
     counts: OutletCounts,
 }
@@ -136,7 +144,7 @@ impl<S: Socket> Half<S> {
         if !matches!(self.link, Link::Closed(_)) {
             self.link = Link::Up(socket);
             self.payload_max = self.limits.payload_max.min(payload_max);
-            self.partial = preface.map(|message| Partial { is_frill: true, ..Partial::new(message) });
+            self.partial = preface.map(|message| self.frill(message));
         }
         LinkNumber(self.number)
     }
@@ -153,7 +161,7 @@ impl<S: Socket> Half<S> {
         self.last = None;
         self.urgent.clear();
         after.wake = self.drainer.take();
-        after.settle.extend(self.sent_receipts.drain(..).map(|(receipt, _)| (receipt, Outcome::Unknown)));
+        after.settle.extend(self.sent_receipts.drain(..).map(|sent| (sent.receipt, Outcome::Unknown)));
         let Some(partial) = self.partial.take() else { return true };
         self.next_expiry = self.next_expiry.min(partial.message.header.expiry());
         if partial.is_frill {
@@ -191,7 +199,11 @@ impl<S: Socket> Half<S> {
     }
 
     pub(super) fn end(&mut self, in_hand: Outcome, why: Rejection, after: &mut After) {
-        after.settle.extend(self.sent_receipts.drain(..).map(|(receipt, _)| (receipt, in_hand)));
+        let taken = if let Link::Up(socket) = &mut self.link { socket.account().taken } else { u64::MAX };
+        after.settle.extend(self.sent_receipts.drain(..).map(|Sent { receipt, written, .. }| {
+            // What lay in its memory untaken was not handled.
+            (receipt, if written > taken { Outcome::Rejected(why) } else { in_hand })
+        }));
         self.cut(after);
         let waiting: Vec<_> = self.interrupted.take().into_iter().chain(self.queue.drain_all()).collect();
         for message in waiting {
@@ -217,7 +229,7 @@ impl<S: Socket> Half<S> {
         if self.waiting() > 0 || !matches!(self.link, Link::Up(_)) {
             return self.enqueue(message, after);
         }
-        let mut frame = Partial::new(message);
+        let mut frame = self.frame(message);
         self.waiting_receipts += usize::from(frame.message.receipt.is_some());
         match self.write(&mut frame) {
             Written::Whole => self.sent(frame),
@@ -306,8 +318,22 @@ impl<S: Socket> Half<S> {
         Ok(())
     }
 
+    /// A message as it goes to the connection that there is now.
+    fn frame(&self, message: Message) -> Partial {
+        let checksum = match &self.link {
+            Link::Up(socket) => socket.checksum(),
+            // It is not written; whoever writes it later makes it a frame again.
+            Link::Down | Link::Failed(_) | Link::Closed(_) => Checksum::Crc,
+        };
+        Partial::new(message, checksum)
+    }
+
+    fn frill(&self, message: Message) -> Partial {
+        Partial { is_frill: true, ..self.frame(message) }
+    }
+
     fn write(&mut self, frame: &mut Partial) -> Written {
-        let Link::Up(socket) = &self.link else { return Written::Broken };
+        let Link::Up(socket) = &mut self.link else { return Written::Broken };
         match frame.write_to(socket) {
             Ok(true) => Written::Whole,
             Ok(false) => Written::InPart,
@@ -326,7 +352,8 @@ impl<S: Socket> Half<S> {
         let expiry = frame.message.header.expiry();
         if let Some(receipt) = frame.message.receipt {
             self.waiting_receipts -= 1;
-            self.sent_receipts.push_back((receipt, expiry));
+            let written = if let Link::Up(socket) = &mut self.link { socket.account().written } else { 0 };
+            self.sent_receipts.push_back(Sent { receipt, expiry, written });
         }
     }
 
@@ -348,10 +375,10 @@ impl<S: Socket> Half<S> {
             if !self.drainer.as_ref().is_some_and(|waker| waker.will_wake(cx.waker())) {
                 self.drainer = Some(cx.waker().clone());
             }
-            let Link::Up(socket) = &self.link else { continue };
             if self.waiting() == 0 {
                 return Poll::Pending;
             }
+            let Link::Up(socket) = &mut self.link else { continue };
             match socket.poll_writable(cx) {
                 Poll::Pending => return Poll::Pending,
                 Poll::Ready(Err(error)) => self.link = Link::Failed(error),
@@ -394,17 +421,17 @@ impl<S: Socket> Half<S> {
             return Some(partial);
         }
         if let Some(urgent) = self.urgent.pop_front() {
-            return Some(Partial { is_frill: true, ..Partial::new(urgent) });
+            return Some(self.frill(urgent));
         }
         let Some(message) = self.interrupted.take().or_else(|| self.queue.pop()) else {
-            return self.last.take().map(|last| Partial { is_frill: true, ..Partial::new(last) });
+            return self.last.take().map(|last| self.frill(last));
         };
         if message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
             self.waiting_receipts -= usize::from(message.receipt.is_some());
             self.expired(message, after);
             return None;
         }
-        Some(Partial::new(message))
+        Some(self.frame(message))
     }
 
     /// Outcomes that are long overdue do not come any more; their places are needed. By then the senders have stopped
@@ -413,11 +440,9 @@ impl<S: Socket> Half<S> {
         while let Some(at) = self
             .sent_receipts
             .iter()
-            .position(|(_, expiry)| *expiry != Time::MAX && now > *expiry + OUTCOME_GRACE)
+            .position(|sent| sent.expiry != Time::MAX && now > sent.expiry + OUTCOME_GRACE)
         {
-            after
-                .settle
-                .extend(self.sent_receipts.remove(at).map(|(receipt, _)| (receipt, Outcome::Unknown)));
+            after.settle.extend(self.sent_receipts.remove(at).map(|sent| (sent.receipt, Outcome::Unknown)));
         }
     }
 
@@ -450,10 +475,10 @@ impl<S: Socket> Half<S> {
     }
 
     pub(super) fn confirm(&mut self, ticket: Ticket, outcome: Outcome, after: &mut After) -> bool {
-        let Some(at) = self.sent_receipts.iter().position(|(receipt, _)| receipt.ticket() == ticket) else {
+        let Some(at) = self.sent_receipts.iter().position(|sent| sent.receipt.ticket() == ticket) else {
             return false;
         };
-        after.settle.extend(self.sent_receipts.remove(at).map(|(receipt, _)| (receipt, outcome)));
+        after.settle.extend(self.sent_receipts.remove(at).map(|sent| (sent.receipt, outcome)));
         true
     }
 

@@ -31,7 +31,7 @@ struct Wire {
 }
 
 impl Socket for Arc<Wire> {
-    fn try_write_vectored(&self, parts: &[IoSlice<'_>]) -> io::Result<usize> {
+    fn try_write_vectored(&mut self, parts: &[IoSlice<'_>]) -> io::Result<usize> {
         if self.fails.load(Ordering::Relaxed) {
             return Err(io::ErrorKind::BrokenPipe.into());
         }
@@ -45,7 +45,7 @@ impl Socket for Arc<Wire> {
         Ok(taken)
     }
 
-    fn poll_writable(&self, _: &mut Context<'_>) -> Poll<io::Result<()>> {
+    fn poll_writable(&mut self, _: &mut Context<'_>) -> Poll<io::Result<()>> {
         if self.room.load(Ordering::Relaxed) > 0 { Poll::Ready(Ok(())) } else { Poll::Pending }
     }
 }

@@ -3,6 +3,7 @@
 use std::{
     fmt, io,
     os::fd::{BorrowedFd, OwnedFd},
+    sync::atomic::AtomicU32,
 };
 
 use crate::wait::Waiting;
@@ -89,6 +90,11 @@ pub(crate) trait Doorbell: Send {
 
     /// Sleeps until rung after `heard`, until the wait's deadline, or until the peer is gone. May end early without a reason.
     fn sleep(&self, heard: Heard, waiting: &Waiting<'_>) -> io::Result<Woken>;
+
+    /// The word that a ring changes; `None` when there is no such thing.
+    fn word(&self) -> Option<&AtomicU32> {
+        None
+    }
 
     /// What a reactor waits for; `None` when there is no such thing.
     fn fd(&self) -> Option<BorrowedFd<'_>>;

@@ -56,6 +56,23 @@ impl Consumer {
         Ok(Lent { consumer: self, record })
     }
 
+    /// Whether there is a message. It stays there.
+    ///
+    /// # Errors
+    /// As [`Consumer::receive`].
+    pub fn is_ready(&mut self) -> Result<bool, Corrupt> {
+        Ok(self.core.next()?.is_some())
+    }
+
+    /// Whether the producer has published something since it was last looked at.
+    pub(crate) fn has_moved(&self) -> bool {
+        self.core.has_moved()
+    }
+
+    pub(crate) fn message_bell(&self) -> &dyn Doorbell {
+        &*self.message
+    }
+
     /// Announces that a reactor is about to wait for [`Consumer::fd`]. Followed by [`Consumer::disarm`] in any case but
     /// [`Armed::Ready`].
     ///

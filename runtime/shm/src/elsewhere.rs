@@ -5,14 +5,16 @@ use std::{
     io,
     os::fd::{BorrowedFd, OwnedFd},
     sync::atomic::Ordering,
+    time::Duration,
 };
 
 use crate::{
-    bell::{BellKind, Bells, Doorbell},
+    bell::{BellKind, Bells, Doorbell, Heard, Woken},
     error::{CreateError, PassError, RefusedOffer},
     layout::{Capacity, Word},
     memory::{OwnHeader, OwnRing, Peer},
     offer::Offer,
+    wait::HangUp,
 };
 
 pub(crate) fn send(_: &Offer, _: BorrowedFd<'_>) -> Result<(), PassError> {
@@ -40,6 +42,27 @@ type Buttons = (Box<dyn Doorbell>, Box<dyn Doorbell>);
 
 pub(crate) fn buttons(_: BellKind, _: Vec<OwnedFd>) -> Result<Buttons, RefusedOffer> {
     Err(RefusedOffer::Unsupported)
+}
+
+pub(crate) fn has_ended(_: HangUp<'_>) -> io::Result<bool> {
+    Err(io::ErrorKind::Unsupported.into())
+}
+
+/// There are none.
+pub(crate) struct Ears;
+
+impl Ears {
+    pub(crate) const fn new() -> Self {
+        Self
+    }
+
+    pub(crate) fn add(&mut self, _: &dyn Doorbell, _: Heard) -> bool {
+        false
+    }
+
+    pub(crate) fn sleep(&self, _: Duration) -> io::Result<Woken> {
+        Err(io::ErrorKind::Unsupported.into())
+    }
 }
 
 /// There is none.

@@ -90,6 +90,23 @@ pub enum ReceiveError {
     System(#[source] io::Error),
 }
 
+/// Why waiting for several consumers ended without any.
+#[derive(Debug, Error)]
+pub enum AnyError {
+    /// The fault of the peer at this index.
+    #[error("{cause}")]
+    Corrupt {
+        /// Which of those that were waited for.
+        index: usize,
+        /// What it wrote.
+        #[source]
+        cause: Corrupt,
+    },
+    /// The environment's fault: the system refused to wait.
+    #[error("waiting for messages: {0}")]
+    System(#[source] io::Error),
+}
+
 /// Why waiting for room ended without any.
 #[derive(Debug, Error)]
 pub enum RoomError {

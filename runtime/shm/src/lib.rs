@@ -36,6 +36,7 @@
     expect(dead_code, reason = "without sealed memory nothing behind `Region::create` is reached")
 )]
 
+mod any;
 mod bell;
 mod consumer;
 mod core;
@@ -57,12 +58,18 @@ mod platform;
 #[path = "elsewhere.rs"]
 mod platform;
 
+pub use any::{Any, ENDS_MAX, Ends, Waiter};
 pub use bell::BellKind;
 pub use consumer::{Consumer, Lent, LentReader};
-pub use error::{Corrupt, CreateError, LoanError, PassError, ReceiveError, RefusedOffer, RoomError};
+pub use error::{
+    AnyError, Corrupt, CreateError, LoanError, PassError, ReceiveError, RefusedOffer, RoomError,
+};
 pub use layout::{Capacity, CapacityError};
 pub use offer::{OFFER_BYTES, Offer};
 pub use producer::{Loan, Producer};
 pub use region::{Region, Terms};
 pub use spin::Spin;
 pub use wait::{Armed, HangUp, Wait};
+
+/// Whether this platform has sealed shared memory; without it [`Region::create`] is refused.
+pub const SUPPORTED: bool = cfg!(target_os = "linux");

@@ -103,6 +103,25 @@ impl Producer {
         self.room.fd()
     }
 
+    /// Bytes of the ring that were ever used for messages; wraps. What this grows by with a message is that message's.
+    #[must_use]
+    pub const fn published(&self) -> u32 {
+        self.core.published()
+    }
+
+    /// Bytes of those that the peer has not taken yet. A message among them was not read by an honest peer.
+    ///
+    /// # Errors
+    /// The peer's fault: its count cannot be.
+    pub fn untaken(&mut self) -> Result<u32, Corrupt> {
+        self.core.untaken()
+    }
+
+    /// Wakes the peer without a message, so that it looks whether this side is still there. For who is about to go.
+    pub fn ring(&self) {
+        self.message_button.ring();
+    }
+
     fn await_room(&mut self, length: usize, wait: &Wait<'_>) -> Result<Reserved, RoomError> {
         if let Some(reserved) = self.room_now(length)? {
             return Ok(reserved);

@@ -32,13 +32,47 @@ pub enum FrameError {
 #[derive(Clone, Copy, Debug)]
 pub struct FrameCodec {
     payload_max: usize,
+    checksum: Checksum,
+}
+
+/// What a frame's last four header bytes are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Checksum {
+    /// The CRC-32 of header and payload: the bytes went over a wire.
+    Crc,
+    /// Zero, and not looked at: the bytes stayed in memory.
+    None,
+}
+
+impl Checksum {
+    /// The first 64 bytes of a frame.
+    #[must_use]
+    pub fn encode(self, header: &Header, payload: &[u8]) -> [u8; HEADER_LEN] {
+        match self {
+            Self::Crc => header.encode(payload),
+            Self::None => header.encode_in_memory(payload.len()),
+        }
+    }
+
+    fn decode(self, bytes: &[u8; HEADER_LEN], payload: &[u8]) -> Result<Header, HeaderError> {
+        match self {
+            Self::Crc => Header::decode(bytes, payload),
+            Self::None => Header::decode_in_memory(bytes),
+        }
+    }
 }
 
 impl FrameCodec {
     /// A codec that takes payloads of at most `payload_max` bytes.
     #[must_use]
     pub const fn new(payload_max: usize) -> Self {
-        Self { payload_max }
+        Self { payload_max, checksum: Checksum::Crc }
+    }
+
+    /// A codec for frames that stay in memory: without checksums.
+    #[must_use]
+    pub const fn in_memory(payload_max: usize) -> Self {
+        Self { payload_max, checksum: Checksum::None }
     }
 }
 
@@ -57,17 +91,17 @@ impl Decoder for FrameCodec {
             source.reserve(whole - source.len());
             return Ok(None);
         }
-        Ok(Some(split(source.split_to(whole).freeze())?))
+        Ok(Some(split(source.split_to(whole).freeze(), self.checksum)?))
     }
 }
 
 /// Reads the frame that fills `frame` to its last byte.
-fn split(mut frame: Bytes) -> Result<Message, HeaderError> {
+fn split(mut frame: Bytes, checksum: Checksum) -> Result<Message, HeaderError> {
     let Some(bytes) = frame.first_chunk::<HEADER_LEN>().copied() else {
         return Err(HeaderError::NotAFrame);
     };
     frame.advance(HEADER_LEN);
-    Ok(Message::new(Header::decode(&bytes, &frame)?, frame))
+    Ok(Message::new(checksum.decode(&bytes, &frame)?, frame))
 }
 
 impl Encoder<&Message> for FrameCodec {
@@ -79,7 +113,8 @@ impl Encoder<&Message> for FrameCodec {
             return Err(FrameError::TooLong { said, limit: self.payload_max });
         }
         target.reserve(HEADER_LEN + said);
-        encode_frame(&message.header, &message.payload, target);
+        target.put_slice(&self.checksum.encode(&message.header, &message.payload));
+        target.put_slice(&message.payload);
         Ok(())
     }
 }
@@ -130,6 +165,16 @@ mod tests {
                 }
             }
             prop_assert_eq!(seen, payloads);
+        }
+
+        #[test]
+        fn frames_in_memory_are_read_without_a_checksum_and_garbage_is_no_panic(payload: Vec<u8>, noise: Vec<u8>) {
+            let mut codec = FrameCodec::in_memory(1 << 20);
+            let (mut buffer, header) = (BytesMut::new(), Header::new(Kind::named("test"), Tid::NONE, Tid::BROADCAST));
+            codec.encode(&Message::new(header, payload.clone().into()), &mut buffer).unwrap();
+            prop_assert_eq!(&buffer[60..64], &[0; 4]);
+            prop_assert_eq!(codec.decode(&mut buffer).unwrap().expect("a whole frame").payload.to_vec(), payload);
+            let _ = codec.decode(&mut BytesMut::from(noise.as_slice()));
         }
 
         #[test]

@@ -9,7 +9,7 @@ mod kind;
 mod memory;
 mod message;
 
-pub use codec::{FrameCodec, FrameError, decode_datagram, encode_frame};
+pub use codec::{Checksum, FrameCodec, FrameError, decode_datagram, encode_frame};
 pub use header::{Class, Flags, HEADER_LEN, Header, HeaderError, MAGIC, VERSION};
 pub use kind::{Kind, fnv1a};
 pub use message::{DecodeError, Message, MessageBuffer, Payload, decode, encode};

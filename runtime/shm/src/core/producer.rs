@@ -138,6 +138,17 @@ impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
         self.sleep.end(&self.own);
     }
 
+    /// Bytes ever published, with all that lies between messages; wraps.
+    pub(crate) const fn published(&self) -> u32 {
+        self.tail
+    }
+
+    /// Bytes that are published and not taken.
+    pub(crate) fn untaken(&mut self) -> Result<u32, Corrupt> {
+        self.look()?;
+        Ok(self.tail.wrapping_sub(self.head_seen))
+    }
+
     /// Whether the consumer has taken something since it was last looked at.
     pub(crate) fn has_moved(&self) -> bool {
         self.peer.load(Word::Head) != self.head_seen

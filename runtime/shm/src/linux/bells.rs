@@ -120,34 +120,38 @@ struct FutexBell {
 }
 
 impl FutexBell {
-    fn word(&self) -> &AtomicU32 {
+    fn counter(&self) -> &AtomicU32 {
         self.page.shared_word(self.index)
     }
 }
 
 impl Doorbell for FutexBell {
+    fn word(&self) -> Option<&AtomicU32> {
+        Some(self.counter())
+    }
+
     fn ring(&self) {
         // SYNC: who hears this ring in `listen` also sees what it was rung for.
-        self.word().fetch_add(1, Ordering::Release);
+        self.counter().fetch_add(1, Ordering::Release);
         // Not private: the sleeper is in another process. It can fail only for a bad address, which this is not.
-        let _ = futex::wake(self.word(), futex::Flags::empty(), 1);
+        let _ = futex::wake(self.counter(), futex::Flags::empty(), 1);
     }
 
     fn listen(&self) -> Heard {
-        Heard(self.word().load(Ordering::Acquire))
+        Heard(self.counter().load(Ordering::Acquire))
     }
 
     fn sleep(&self, heard: Heard, waiting: &Waiting<'_>) -> io::Result<Woken> {
         loop {
             let left = waiting.left(Instant::now());
             let now = waiting.hang_up.map_or(left, |_| left.min(HANG_UP_LOOK));
-            match futex::wait(self.word(), futex::Flags::empty(), heard.0, Some(&timespec(now))) {
+            match futex::wait(self.counter(), futex::Flags::empty(), heard.0, Some(&timespec(now))) {
                 // Rung before the sleep; a signal came. The caller looks again.
                 Ok(()) | Err(Errno::AGAIN | Errno::INTR) => return Ok(Woken::Rung),
                 Err(Errno::TIMEDOUT) => {}
                 Err(errno) => return Err(errno.into()),
             }
-            if has_hung_up(waiting)? {
+            if waiting.hang_up.map_or(Ok(false), has_ended)? {
                 return Ok(Woken::HungUp);
             }
             if now == left {
@@ -261,10 +265,8 @@ fn end_of(hang_up: HangUp<'_>) -> PollFd<'_> {
     }
 }
 
-fn has_hung_up(waiting: &Waiting<'_>) -> io::Result<bool> {
-    let Some(hang_up) = waiting.hang_up else {
-        return Ok(false);
-    };
+/// Whether the peer is gone. Does not wait.
+pub(crate) fn has_ended(hang_up: HangUp<'_>) -> io::Result<bool> {
     match poll(&mut [end_of(hang_up)], Some(&timespec(Duration::ZERO))) {
         Ok(count) => Ok(count > 0),
         Err(Errno::INTR) => Ok(false),
@@ -273,7 +275,7 @@ fn has_hung_up(waiting: &Waiting<'_>) -> io::Result<bool> {
 }
 
 /// Far more than a lifetime is a lifetime.
-fn timespec(time: Duration) -> Timespec {
+pub(super) fn timespec(time: Duration) -> Timespec {
     Timespec {
         tv_sec: i64::try_from(time.as_secs()).unwrap_or(i64::MAX).min(1 << 32),
         tv_nsec: i64::from(time.subsec_nanos()),

@@ -1,13 +1,15 @@
 //! Linux: sealed memfds, futexes, eventfds.
 
 mod bells;
+mod ears;
 mod mapping;
 mod memfd;
 mod passing;
 #[cfg(test)]
 mod tests;
 
-pub(crate) use bells::{bells, buttons};
+pub(crate) use bells::{bells, buttons, has_ended};
+pub(crate) use ears::Ears;
 pub(crate) use mapping::{OwnHeaderMemory, OwnMemory, OwnRingMemory, PeerMemory};
 pub(crate) use memfd::{adopt, create};
 pub(crate) use passing::{receive, send};

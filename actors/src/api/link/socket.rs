@@ -1,9 +1,8 @@
-//! The socket to the node: whole frames out, bytes in, each with a bound on the wait.
+//! The plain socket to the node.
 
 use std::{
     io::IoSlice,
-    os::{fd::OwnedFd, unix::net::UnixStream},
-    path::Path,
+    os::unix::net::UnixStream,
     sync::{Arc, Mutex, PoisonError},
     time::Duration,
 };
@@ -19,31 +18,17 @@ use sinew_runtime::{
     time::Time,
     wire::{Flags, FrameCodec, Header, Kind, Message},
 };
-use socket2::{Domain, SockAddr, Socket, Type};
 use tokio_util::codec::Decoder;
 
-use super::ApiError;
+use super::{CLOSED, Read};
+use crate::api::ApiError;
 
-/// How long to wait for a place in the queue of a node that does not accept.
-const CONNECT: Duration = Duration::from_secs(2);
 /// Bytes that are read at once.
 const READ_CHUNK: usize = 64 * 1024;
 
-/// Connects to the node that listens at `path`.
-pub(super) fn connect(path: &Path) -> Result<UnixStream, ApiError> {
-    let try_to = || -> std::io::Result<UnixStream> {
-        let socket = Socket::new(Domain::UNIX, Type::STREAM, None)?;
-        // Linux bounds a unix socket's `connect` by the time allowed for sending.
-        socket.set_write_timeout(Some(CONNECT))?;
-        socket.connect(&SockAddr::unix(path)?)?;
-        Ok(UnixStream::from(OwnedFd::from(socket)))
-    };
-    try_to().map_err(|cause| ApiError::NoNode { path: path.to_owned(), cause })
-}
-
 /// The writing half: whoever settles a message writes, from whatever thread.
 #[derive(Debug)]
-pub(super) struct Writer {
+pub(in crate::api) struct Writer {
     socket: Arc<UnixStream>,
     /// Frames go out whole, one after the other.
     turn: Mutex<()>,
@@ -59,12 +44,12 @@ enum Stuck {
 }
 
 impl Writer {
-    pub(super) const fn new(socket: Arc<UnixStream>, patience: Duration) -> Self {
+    pub(in crate::api) const fn new(socket: Arc<UnixStream>, patience: Duration) -> Self {
         Self { socket, turn: Mutex::new(()), patience }
     }
 
     /// Writes one frame.
-    pub(super) fn write(&self, message: &Message) -> Result<(), ApiError> {
+    pub(in crate::api) fn write(&self, message: &Message) -> Result<(), ApiError> {
         let head = message.header.encode(&message.payload);
         // A turn that ended in a panic wrote a frame in part, and closed the socket.
         let _turn = self.turn.lock().unwrap_or_else(PoisonError::into_inner);
@@ -108,7 +93,7 @@ impl Writer {
     }
 
     /// Closes the connection, which gives the address back.
-    pub(super) fn close(&self) {
+    pub(in crate::api) fn close(&self) {
         // An error means that it is closed already.
         let _ = rustix::net::shutdown(&self.socket, Shutdown::Both);
     }
@@ -125,64 +110,55 @@ impl ReceiptSink for Writer {
 }
 
 /// The reading half.
-pub(super) struct Reader {
+pub(in crate::api) struct Reader {
     socket: Arc<UnixStream>,
     codec: FrameCodec,
     buffer: BytesMut,
     chunk: Box<[u8]>,
 }
 
-/// What a look at the socket found.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Read {
-    /// Bytes came.
-    Some,
-    /// Nothing came.
-    Nothing,
-    /// Nothing will come any more.
-    Ended,
-}
-
 impl Reader {
-    pub(super) fn new(socket: Arc<UnixStream>, payload_max: usize) -> Self {
+    pub(in crate::api) fn new(socket: Arc<UnixStream>, payload_max: usize) -> Self {
         let chunk = vec![0; READ_CHUNK].into();
         Self { socket, codec: FrameCodec::new(payload_max), buffer: BytesMut::new(), chunk }
     }
 
-    pub(super) fn set_payload_max(&mut self, payload_max: usize) {
-        self.codec = FrameCodec::new(payload_max);
-    }
-
     /// The next frame of those that were read.
-    pub(super) fn next(&mut self) -> Result<Option<Message>, ApiError> {
+    pub(in crate::api) fn next(&mut self) -> Result<Option<Message>, ApiError> {
         Ok(self.codec.decode(&mut self.buffer)?)
     }
 
     /// Reads what is there, without waiting.
-    pub(super) fn read(&mut self) -> Read {
+    pub(in crate::api) fn read(&mut self) -> Read {
         loop {
             match recv(&self.socket, &mut self.chunk[..], RecvFlags::DONTWAIT) {
-                Ok((0, _)) => return Read::Ended,
+                Ok((0, _)) => return Read::Ended(CLOSED.to_owned()),
                 Ok((count, _)) => {
                     self.buffer.extend_from_slice(&self.chunk[..count]);
                     return Read::Some;
                 }
                 Err(Errno::INTR) => {}
                 Err(Errno::AGAIN) => return Read::Nothing,
-                Err(_) => return Read::Ended,
+                Err(_) => return Read::Ended(CLOSED.to_owned()),
             }
         }
     }
 
-    /// Waits until there is something to read. Returns whether there is; `false` at the deadline.
-    pub(super) fn wait(&self, deadline: Time) -> bool {
+    /// Waits until there is something to read, or until the deadline.
+    pub(in crate::api) fn wait(&self, deadline: Time) {
         // An error shows itself again when the socket is read.
-        wait(&self.socket, PollFlags::IN, deadline).unwrap_or(true)
+        let _ = wait(&self.socket, PollFlags::IN, deadline);
     }
 }
 
+/// Whether the other end is closed. Does not wait.
+pub(super) fn has_hung_up(socket: &UnixStream) -> bool {
+    let nothing = Timespec { tv_sec: 0, tv_nsec: 0 };
+    poll(&mut [PollFd::new(socket, PollFlags::RDHUP)], Some(&nothing)).is_ok_and(|count| count > 0)
+}
+
 /// Waits for the socket; returns whether it is ready, `false` at the deadline. One wake of the calling thread.
-fn wait(socket: &UnixStream, what: PollFlags, deadline: Time) -> Result<bool, Errno> {
+pub(super) fn wait(socket: &UnixStream, what: PollFlags, deadline: Time) -> Result<bool, Errno> {
     loop {
         let left = deadline.since(Time::now());
         let timeout = Timespec::try_from(left).unwrap_or(Timespec { tv_sec: i64::MAX, tv_nsec: 0 });

@@ -1,0 +1,173 @@
+//! The way to the node: whole frames out, bytes in, each with a bound on the wait. Two ways behind one: a plain socket, or
+//! a ring each way in shared memory with the socket beside it, which then tells the node's end.
+
+mod greeting;
+pub(super) mod ring;
+pub(super) mod socket;
+
+use std::{
+    os::{fd::OwnedFd, unix::net::UnixStream},
+    path::Path,
+    sync::Arc,
+    time::Duration,
+};
+
+use sinew_runtime::{
+    outcome::{Outcome, ReceiptSink, Ticket},
+    time::Time,
+    wire::Message,
+};
+use sinew_shm::Spin;
+use socket2::{Domain, SockAddr, Socket, Type};
+
+use super::ApiError;
+use crate::lncl::payload::{Register, Registered};
+
+pub(super) use greeting::open;
+
+/// How long to wait for a place in the queue of a node that does not accept.
+const CONNECT: Duration = Duration::from_secs(2);
+
+/// What carries an endpoint's messages to its node and back.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Transport {
+    /// A ring in shared memory for each direction: one copy and, at most, one wake a message. Where the system or the
+    /// node has none it is the socket, which a line of the log says.
+    #[default]
+    Ring,
+    /// The unix socket alone.
+    Socket,
+}
+
+/// How a link is to be.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct LinkOptions {
+    pub(super) transport: Transport,
+    pub(super) spin: Spin,
+    /// How long a send waits for room.
+    pub(super) patience: Duration,
+}
+
+/// A registered link.
+pub(super) struct Link {
+    pub(super) registered: Registered,
+    pub(super) writer: Arc<Writer>,
+    pub(super) reader: Reader,
+}
+
+/// Connects to the node that listens at `path`.
+pub(super) fn connect(path: &Path) -> Result<UnixStream, ApiError> {
+    let try_to = || -> std::io::Result<UnixStream> {
+        let socket = Socket::new(Domain::UNIX, Type::STREAM, None)?;
+        // Linux bounds a unix socket's `connect` by the time allowed for sending.
+        socket.set_write_timeout(Some(CONNECT))?;
+        socket.connect(&SockAddr::unix(path)?)?;
+        socket.set_nonblocking(true)?;
+        Ok(UnixStream::from(OwnedFd::from(socket)))
+    };
+    try_to().map_err(|cause| ApiError::NoNode { path: path.to_owned(), cause })
+}
+
+/// The writing half: whoever settles a message writes, from whatever thread.
+#[derive(Debug)]
+pub(super) enum Writer {
+    Socket(socket::Writer),
+    Ring(ring::Writer),
+}
+
+impl Writer {
+    /// Writes one frame.
+    pub(super) fn write(&self, message: &Message) -> Result<(), ApiError> {
+        match self {
+            Self::Socket(writer) => writer.write(message),
+            Self::Ring(writer) => writer.write(message),
+        }
+    }
+
+    /// Writes the outcomes that found no room when they were said, as far as there is room now. Never waits.
+    pub(super) fn pay(&self) {
+        match self {
+            // A socket's writer waits for room.
+            Self::Socket(_) => {}
+            Self::Ring(writer) => writer.pay(),
+        }
+    }
+
+    /// Closes the connection, which gives the address back.
+    pub(super) fn close(&self) {
+        match self {
+            Self::Socket(writer) => writer.close(),
+            Self::Ring(writer) => writer.close(),
+        }
+    }
+}
+
+impl ReceiptSink for Writer {
+    fn settle(&self, ticket: Ticket, outcome: Outcome) {
+        match self {
+            Self::Socket(writer) => writer.settle(ticket, outcome),
+            Self::Ring(writer) => writer.settle(ticket, outcome),
+        }
+    }
+}
+
+/// The reading half.
+pub(super) enum Reader {
+    Socket(socket::Reader),
+    Ring(Box<ring::Reader>),
+}
+
+/// What a look at the link found.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Read {
+    /// Bytes came.
+    Some,
+    /// Nothing came.
+    Nothing,
+    /// Nothing will come any more, for this reason.
+    Ended(String),
+}
+
+impl Reader {
+    /// The next frame of those that were read.
+    pub(super) fn next(&mut self) -> Result<Option<Message>, ApiError> {
+        match self {
+            Self::Socket(reader) => reader.next(),
+            Self::Ring(reader) => reader.next(),
+        }
+    }
+
+    /// Reads what is there, without waiting.
+    pub(super) fn read(&mut self) -> Read {
+        match self {
+            Self::Socket(reader) => reader.read(),
+            Self::Ring(reader) => reader.read(),
+        }
+    }
+
+    /// Whether the node was seen to be gone; what it said before can still be read.
+    pub(super) fn has_ended(&mut self, now: Time) -> bool {
+        match self {
+            // Writing to it says so.
+            Self::Socket(_) => false,
+            Self::Ring(reader) => reader.has_ended(now),
+        }
+    }
+
+    /// Waits until there is something to read, or to do, until `deadline` at most. May end early without a reason. One
+    /// wake of the calling thread.
+    pub(super) fn wait(&mut self, deadline: Time) {
+        match self {
+            Self::Socket(reader) => reader.wait(deadline),
+            Self::Ring(reader) => reader.wait(deadline),
+        }
+    }
+}
+
+/// What a node that is no more there says.
+const CLOSED: &str = "the node closed it, or ended";
+
+/// What is asked of the node, of which the link's own part is not the caller's to fill in.
+fn asked(register: &Register, transport: Transport) -> Register {
+    Register { ring: transport == Transport::Ring && ring::is_available(), ..register.clone() }
+}

@@ -1,0 +1,293 @@
+//! A ring each way in shared memory, and a socket that tells the other end's end.
+
+use std::{
+    collections::VecDeque,
+    io::IoSlice,
+    os::{fd::AsFd, unix::net::UnixStream},
+    sync::{Arc, Mutex, OnceLock, PoisonError, TryLockError},
+    time::{Duration, Instant},
+};
+
+use bytes::{Bytes, BytesMut};
+use rustix::{
+    event::PollFlags,
+    net::{RecvFlags, Shutdown, recv},
+};
+use sinew_runtime::{
+    outcome::{Outcome, ReceiptSink, Ticket},
+    time::Time,
+    wire::{Flags, FrameCodec, HEADER_LEN, Header, Kind, Message},
+};
+use sinew_shm::{
+    Any, BellKind, Capacity, Consumer, Ends, HangUp, LoanError, Producer, Region, RoomError, Spin, Wait,
+    Waiter,
+};
+use tokio_util::codec::Decoder;
+
+use super::{CLOSED, LinkOptions, Read, socket};
+use crate::{
+    api::ApiError,
+    lncl::payload::{self, Refusal},
+    ring::{self, Exchange, ExchangeError, RingFrames, Taken},
+};
+
+/// Bytes that are taken from a ring at once.
+const ENOUGH: usize = 64 * 1024;
+/// Outcomes that wait for room at most. One more is not said: its sender counts it as Unknown at its own deadline.
+const OWED_MAX: usize = 4_096;
+/// Longest sentence, with its frame, that a node takes leave with.
+const LAST_WORDS_BYTES_MAX: usize = 4_096;
+/// Longest sleep at a ring: then what other threads owe is paid, and the socket is looked at.
+const NAP: Duration = Duration::from_millis(20);
+
+/// Whether this process can have rings; found out once.
+pub(super) fn is_available() -> bool {
+    static AVAILABLE: OnceLock<bool> = OnceLock::new();
+    *AVAILABLE.get_or_init(|| match Region::create(Capacity::MIN, BellKind::Futex) {
+        Ok(_) => true,
+        Err(why) => {
+            tracing::warn!(%why, "messages to the node go through its socket");
+            false
+        }
+    })
+}
+
+/// Exchanges offers with the other end of `socket`, until the deadline at most.
+pub(in crate::api) fn exchange(
+    socket: &UnixStream,
+    ring_bytes: u32,
+    deadline: Time,
+) -> Result<(Producer, Consumer), ApiError> {
+    let closed = |error: ExchangeError| ApiError::Closed(error.to_string());
+    let exchange = Exchange::prepare(ring::capacity(ring_bytes as usize), BellKind::Futex).map_err(closed)?;
+    exchange.offer(socket).map_err(closed)?;
+    loop {
+        if let Some(theirs) = Exchange::receive(socket).map_err(closed)? {
+            return exchange.finish(theirs).map_err(closed);
+        }
+        if !socket::wait(socket, PollFlags::IN, deadline)
+            .map_err(|error| ApiError::Closed(error.to_string()))?
+        {
+            return Err(ApiError::Closed("it offered no shared memory in time".to_owned()));
+        }
+    }
+}
+
+/// The writing half.
+#[derive(Debug)]
+pub(in crate::api) struct Writer {
+    socket: Arc<UnixStream>,
+    /// `None` while a message is lent. Frames go out whole, one after the other. Boxed, since it moves with each loan.
+    producer: Mutex<Option<Box<Producer>>>,
+    /// Outcomes that found no room, or the ring lent, when they were said.
+    owed: Mutex<VecDeque<Message>>,
+    patience: Duration,
+}
+
+impl Writer {
+    pub(super) fn new(socket: Arc<UnixStream>, mut producer: Producer, options: LinkOptions) -> Self {
+        producer.set_spin(options.spin);
+        let (producer, owed) = (Mutex::new(Some(Box::new(producer))), Mutex::default());
+        Self { socket, producer, owed, patience: options.patience }
+    }
+
+    /// Writes one frame; waits for room as long as the link's patience lasts.
+    pub(in crate::api) fn write(&self, message: &Message) -> Result<(), ApiError> {
+        let head = message.header.encode_in_memory(message.payload.len());
+        let mut producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
+        let written = match producer.as_deref_mut() {
+            Some(producer) => self.write_to(producer, &head, &message.payload),
+            None => Err(ApiError::Lent),
+        };
+        drop(producer);
+        self.pay();
+        written
+    }
+
+    fn write_to(&self, producer: &mut Producer, head: &[u8], payload: &[u8]) -> Result<(), ApiError> {
+        let whole = HEADER_LEN + payload.len();
+        let mut written = 0;
+        while written < whole {
+            let parts = [
+                IoSlice::new(&head[written.min(HEADER_LEN)..]),
+                IoSlice::new(&payload[written.saturating_sub(HEADER_LEN)..]),
+            ];
+            written += self.write_some(producer, &parts).map_err(|error| self.give_up(&error, written))?;
+        }
+        Ok(())
+    }
+
+    /// Writes one record and waits for room if there is none.
+    fn write_some(&self, producer: &mut Producer, parts: &[IoSlice<'_>]) -> Result<usize, RoomError> {
+        let length = ring::piece(producer, parts.iter().map(|part| part.len()).sum());
+        let wait = Wait::within(self.patience).or_hang_up(HangUp::Socket(self.socket.as_fd()));
+        let mut loan = producer.loan_before(length, &wait)?;
+        ring::gather(parts, &mut loan);
+        loan.publish();
+        Ok(length)
+    }
+
+    fn give_up(&self, error: &RoomError, written: usize) -> ApiError {
+        match error {
+            RoomError::TimedOut if written == 0 => ApiError::Stalled(self.patience),
+            RoomError::TimedOut => {
+                self.close();
+                ApiError::Closed(format!("the node stopped reading for {:?} within a frame", self.patience))
+            }
+            RoomError::HungUp => ApiError::Closed(CLOSED.to_owned()),
+            RoomError::TooLong { .. } | RoomError::Corrupt(_) | RoomError::System(_) => {
+                self.close();
+                ApiError::Closed(error.to_string())
+            }
+        }
+    }
+
+    /// Writes what is owed, as far as there is room. Never waits: who has the ring now pays when it is done.
+    pub(in crate::api) fn pay(&self) {
+        while self.owes() {
+            let mut producer = match self.producer.try_lock() {
+                Ok(producer) => producer,
+                Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
+                Err(TryLockError::WouldBlock) => return,
+            };
+            let Some(producer) = producer.as_deref_mut() else { return };
+            if !self.pay_with(producer) {
+                return;
+            }
+        }
+    }
+
+    /// Whether all was paid.
+    fn pay_with(&self, producer: &mut Producer) -> bool {
+        let mut owed = self.owed.lock().unwrap_or_else(PoisonError::into_inner);
+        while let Some(message) = owed.front() {
+            let head = message.header.encode_in_memory(message.payload.len());
+            match ring::write(producer, &[IoSlice::new(&head), IoSlice::new(&message.payload)]) {
+                Ok(_) => drop(owed.pop_front()),
+                Err(LoanError::Full { .. }) => return false,
+                // The link is of no more use, which shows when it is read.
+                Err(LoanError::TooLong { .. } | LoanError::Corrupt(_)) => owed.clear(),
+            }
+        }
+        true
+    }
+
+    fn owes(&self) -> bool {
+        !self.owed.lock().unwrap_or_else(PoisonError::into_inner).is_empty()
+    }
+
+    /// Closes the connection, which gives the address back.
+    pub(in crate::api) fn close(&self) {
+        // An error means that it is closed already.
+        let _ = rustix::net::shutdown(&self.socket, Shutdown::Both);
+    }
+}
+
+impl ReceiptSink for Writer {
+    fn settle(&self, ticket: Ticket, outcome: Outcome) {
+        let mut header = Header::new(Kind::OUTCOME, ticket.destination, ticket.source);
+        header.flags = Flags::OUTCOME;
+        header.correlation = ticket.correlation;
+        let mut owed = self.owed.lock().unwrap_or_else(PoisonError::into_inner);
+        if owed.len() < OWED_MAX {
+            owed.push_back(Message::new(header, Bytes::copy_from_slice(&[outcome.code()])));
+        }
+        drop(owed);
+        self.pay();
+    }
+}
+
+/// Why the node has closed the socket: its words are the only bytes that a ring's socket ever carries.
+fn last_words(socket: &UnixStream) -> String {
+    let mut buffer = BytesMut::zeroed(LAST_WORDS_BYTES_MAX);
+    let count = recv(socket, &mut buffer[..], RecvFlags::DONTWAIT).map_or(0, |(count, _)| count);
+    buffer.truncate(count);
+    let refusal = FrameCodec::new(LAST_WORDS_BYTES_MAX).decode(&mut buffer).ok().flatten();
+    let refusal = refusal.filter(|message| message.header.kind == Kind::LNCL_REFUSAL);
+    let sentence = refusal.and_then(|message| payload::read::<Refusal>(&message.payload).ok());
+    sentence.map_or_else(|| CLOSED.to_owned(), |refusal| refusal.sentence)
+}
+
+/// The reading half.
+pub(in crate::api) struct Reader {
+    end: End,
+    frames: RingFrames,
+    waiter: Waiter,
+    /// When the socket is looked at again.
+    look_at: Time,
+    /// Why nothing will come any more, once what is there was taken.
+    ended: Option<String>,
+}
+
+/// What is waited for.
+struct End {
+    socket: Arc<UnixStream>,
+    consumer: Consumer,
+}
+
+impl Ends for End {
+    fn count(&self) -> usize {
+        1
+    }
+
+    fn consumer(&self, _: usize) -> &Consumer {
+        &self.consumer
+    }
+
+    fn consumer_mut(&mut self, _: usize) -> &mut Consumer {
+        &mut self.consumer
+    }
+
+    fn hang_up(&self, _: usize) -> Option<HangUp<'_>> {
+        Some(HangUp::Socket(self.socket.as_fd()))
+    }
+}
+
+impl Reader {
+    pub(super) fn new(socket: Arc<UnixStream>, consumer: Consumer, payload_max: usize, spin: Spin) -> Self {
+        let (end, frames) = (End { socket, consumer }, RingFrames::new(payload_max));
+        Self { end, frames, waiter: Waiter::new(spin), look_at: Time::ZERO, ended: None }
+    }
+
+    /// The next frame of those that were taken.
+    pub(super) fn next(&mut self) -> Result<Option<Message>, ApiError> {
+        Ok(self.frames.next()?)
+    }
+
+    /// Takes what is there, without waiting.
+    pub(super) fn read(&mut self) -> Read {
+        match self.frames.take(&mut self.end.consumer, ENOUGH) {
+            Err(corrupt) => Read::Ended(format!("shared memory holds what it cannot: {corrupt}")),
+            Ok(Taken::Some) => Read::Some,
+            Ok(Taken::Nothing) => match self.ended.clone() {
+                Some(why) => Read::Ended(why),
+                // What was published before the end is taken by the next look.
+                None if self.has_ended(Time::now()) => Read::Some,
+                None => Read::Nothing,
+            },
+        }
+    }
+
+    /// Whether the node is gone. A caller that never waits has to learn it, too, and a ring takes messages for the dead;
+    /// so the socket is looked at now and then.
+    pub(super) fn has_ended(&mut self, now: Time) -> bool {
+        if self.ended.is_none() && now >= self.look_at {
+            self.look_at = now + NAP;
+            self.ended = socket::has_hung_up(&self.end.socket).then(|| last_words(&self.end.socket));
+        }
+        self.ended.is_some()
+    }
+
+    /// Waits for a message, the node's end, or a nap's length.
+    pub(super) fn wait(&mut self, deadline: Time) {
+        if self.ended.is_some() {
+            return;
+        }
+        let left = deadline.since(Time::now()).min(NAP);
+        match self.waiter.wait(&mut self.end, Instant::now() + left) {
+            Ok(Any::Message(_) | Any::TimedOut) => {}
+            Ok(Any::HungUp(_)) => self.ended = Some(last_words(&self.end.socket)),
+            Err(error) => self.ended = Some(error.to_string()),
+        }
+    }
+}

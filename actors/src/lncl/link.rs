@@ -1,0 +1,291 @@
+//! The node's end of a client's link: the plain socket, or a ring each way beside it.
+
+use std::{
+    io::{self, IoSlice},
+    os::fd::{AsRawFd, RawFd},
+    sync::Arc,
+    task::{Context, Poll},
+};
+
+use sinew_runtime::wire::{Checksum, FrameError, Message};
+use sinew_shm::{Armed, BellKind, Capacity, Consumer, LoanError, PassError, Producer};
+use tokio::{
+    io::{Interest, unix::AsyncFd},
+    net::UnixStream,
+};
+
+use super::reader::Reader;
+use crate::{
+    outlet::{Account, Socket},
+    ring::{self, Exchange, ExchangeError, RingError, RingFrames, Taken},
+};
+
+/// Looks at one client's ring before others have their turn.
+const LOOKS_A_TURN: usize = 64;
+/// Bytes that are taken from a ring at once.
+const ENOUGH: usize = 16 * 1024;
+
+/// Why a link cannot be read any more.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum LinkError {
+    /// What came cannot be read.
+    #[error(transparent)]
+    Ring(#[from] RingError),
+    #[error("the socket of a link with rings carries descriptors only, not bytes")]
+    StrayBytes,
+}
+
+impl From<FrameError> for LinkError {
+    fn from(error: FrameError) -> Self {
+        Self::Ring(error.into())
+    }
+}
+
+/// Makes the node's half of the rings; `None` where the system has no memory for it, which is said once a link.
+pub(super) fn prepare(ring_bytes: usize) -> Option<(Capacity, Exchange)> {
+    let capacity = ring::capacity(ring_bytes);
+    match Exchange::prepare(capacity, BellKind::Socket) {
+        Ok(exchange) => Some((capacity, exchange)),
+        Err(why) => {
+            tracing::warn!(%why, "a client that asked for rings gets a plain socket");
+            None
+        }
+    }
+}
+
+/// Exchanges offers with the client. Ends with its offer, or never; the caller has a deadline.
+pub(super) async fn exchange(
+    exchange: Exchange,
+    stream: &UnixStream,
+    payload_max: usize,
+) -> Result<(ClientSocket, ClientReader), ExchangeError> {
+    exchange.offer(stream)?;
+    let theirs = loop {
+        stream.readable().await.map_err(PassError::System)?;
+        let took = stream.try_io(Interest::READABLE, || match Exchange::receive(stream) {
+            Ok(Some(offer)) => Ok(Ok(offer)),
+            Ok(None) => Err(io::ErrorKind::WouldBlock.into()),
+            Err(error) => Ok(Err(error)),
+        });
+        match took {
+            Ok(offer) => break offer?,
+            Err(cause) if cause.kind() == io::ErrorKind::WouldBlock => {}
+            Err(cause) => return Err(PassError::System(cause).into()),
+        }
+    };
+    let (producer, consumer) = exchange.finish(theirs)?;
+    let socket = RingSocket { producer: watch(Out(producer))?, wanted: 0, written: 0 };
+    let consumer = watch(In(consumer))?;
+    let reader = RingReader { consumer, frames: RingFrames::new(payload_max), looks: 0, has_hung_up: false };
+    Ok((ClientSocket::Ring(socket), ClientReader::Ring(reader)))
+}
+
+/// Has the reactor of the calling thread listen to a bell.
+fn watch<B: AsRawFd>(bell: B) -> Result<AsyncFd<B>, ExchangeError> {
+    #[expect(
+        deprecated,
+        reason = "sound for the two types below, whose bell keeps its descriptor; its successor is an unsafe fn, and unsafe code lives in sinew-shm alone"
+    )]
+    let watched = AsyncFd::with_interest(bell, Interest::READABLE);
+    watched.map_err(|cause| PassError::System(cause).into())
+}
+
+/// The writing half.
+pub(super) enum ClientSocket {
+    Plain(Arc<UnixStream>),
+    Ring(RingSocket),
+}
+
+impl Socket for ClientSocket {
+    fn checksum(&self) -> Checksum {
+        match self {
+            Self::Plain(_) => Checksum::Crc,
+            Self::Ring(_) => Checksum::None,
+        }
+    }
+
+    fn try_write_vectored(&mut self, parts: &[IoSlice<'_>]) -> io::Result<usize> {
+        match self {
+            Self::Plain(stream) => stream.try_write_vectored(parts),
+            Self::Ring(ring) => ring.try_write_vectored(parts),
+        }
+    }
+
+    fn account(&mut self) -> Account {
+        match self {
+            Self::Plain(stream) => stream.account(),
+            Self::Ring(ring) => ring.account(),
+        }
+    }
+
+    fn poll_writable(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        match self {
+            Self::Plain(stream) => stream.poll_writable(cx),
+            Self::Ring(ring) => ring.poll_writable(cx),
+        }
+    }
+}
+
+/// A producer whose bell for room the reactor watches.
+struct Out(Producer);
+
+impl AsRawFd for Out {
+    fn as_raw_fd(&self) -> RawFd {
+        self.0.fd().expect("a socket bell has a descriptor").as_raw_fd()
+    }
+}
+
+/// A consumer whose bell for messages the reactor watches.
+struct In(Consumer);
+
+impl AsRawFd for In {
+    fn as_raw_fd(&self) -> RawFd {
+        self.0.fd().expect("a socket bell has a descriptor").as_raw_fd()
+    }
+}
+
+/// The ring to a client. Who writes has the outlet's lock; nobody ever waits here.
+pub(super) struct RingSocket {
+    producer: AsyncFd<Out>,
+    /// The record for which there was no room.
+    wanted: usize,
+    /// Bytes of the ring that were ever used.
+    written: u64,
+}
+
+impl RingSocket {
+    fn try_write_vectored(&mut self, parts: &[IoSlice<'_>]) -> io::Result<usize> {
+        let producer = &mut self.producer.get_mut().0;
+        let before = producer.published();
+        let written = ring::write(producer, parts);
+        self.written += u64::from(producer.published().wrapping_sub(before));
+        written.map_err(|error| match error {
+            LoanError::Full { asked, .. } => {
+                self.wanted = asked;
+                io::ErrorKind::WouldBlock.into()
+            }
+            error @ (LoanError::TooLong { .. } | LoanError::Corrupt(_)) => corrupt(error),
+        })
+    }
+
+    fn account(&mut self) -> Account {
+        let written = self.written;
+        // Nothing is known of what a peer that writes nonsense has read.
+        let untaken = self.producer.get_mut().0.untaken().unwrap_or(0);
+        Account { written, taken: written - u64::from(untaken) }
+    }
+
+    fn poll_writable(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        loop {
+            match self.producer.get_mut().0.arm(self.wanted) {
+                Ok(Armed::Ready) => return Poll::Ready(Ok(())),
+                Ok(Armed::Sleep) => {}
+                Err(error) => return Poll::Ready(Err(corrupt(error))),
+            }
+            let Poll::Ready(rung) = self.producer.poll_read_ready_mut(cx) else { return Poll::Pending };
+            let mut rung = rung?;
+            if rung.ready().is_read_closed() {
+                return Poll::Ready(Err(io::ErrorKind::BrokenPipe.into()));
+            }
+            rung.clear_ready();
+            rung.get_inner_mut().0.disarm();
+        }
+    }
+}
+
+impl Drop for RingSocket {
+    fn drop(&mut self) {
+        // A client that sleeps sees then that its socket has hung up.
+        self.producer.get_ref().0.ring();
+    }
+}
+
+fn corrupt(error: LoanError) -> io::Error {
+    io::Error::new(io::ErrorKind::InvalidData, format!("shared memory holds what it cannot: {error}"))
+}
+
+/// The reading half.
+pub(super) enum ClientReader {
+    Plain(Reader),
+    Ring(RingReader),
+}
+
+impl ClientReader {
+    /// The next frame; `None` when the peer has closed. May be dropped at any time without losing a byte.
+    pub(super) async fn next(&mut self, stream: &UnixStream) -> Result<Option<Message>, LinkError> {
+        match self {
+            Self::Plain(reader) => Ok(reader.next(stream).await?),
+            Self::Ring(reader) => reader.next(stream).await,
+        }
+    }
+}
+
+/// The ring from a client.
+pub(super) struct RingReader {
+    consumer: AsyncFd<In>,
+    frames: RingFrames,
+    /// Frames and looks since others had their turn.
+    looks: usize,
+    /// Its process is gone; what it said before still counts.
+    has_hung_up: bool,
+}
+
+impl RingReader {
+    async fn next(&mut self, stream: &UnixStream) -> Result<Option<Message>, LinkError> {
+        loop {
+            self.looks += 1;
+            if self.looks > LOOKS_A_TURN {
+                // Before the frame is taken: this may be dropped while it waits.
+                tokio::task::yield_now().await;
+                self.looks = 0;
+            }
+            if let Some(message) = self.frames.next()? {
+                return Ok(Some(message));
+            }
+            let consumer = &mut self.consumer.get_mut().0;
+            match self.frames.take(consumer, ENOUGH).map_err(RingError::from)? {
+                Taken::Some => {}
+                Taken::Nothing if self.has_hung_up => return Ok(None),
+                Taken::Nothing => self.wait(stream).await?,
+            }
+        }
+    }
+
+    /// Waits until there may be something in the ring, or the peer is gone.
+    async fn wait(&mut self, stream: &UnixStream) -> Result<(), LinkError> {
+        self.looks = 0;
+        if self.consumer.get_mut().0.arm().map_err(RingError::from)? == Armed::Ready {
+            return Ok(());
+        }
+        tokio::select! {
+            biased;
+            rung = self.consumer.readable_mut() => match rung {
+                // The bell goes with its process, like the socket.
+                Ok(rung) if rung.ready().is_read_closed() => self.has_hung_up = true,
+                Ok(mut rung) => rung.clear_ready(),
+                Err(_) => self.has_hung_up = true,
+            },
+            heard = hear(stream) => {
+                heard?;
+                self.has_hung_up = true;
+            }
+        }
+        self.consumer.get_mut().0.disarm();
+        Ok(())
+    }
+}
+
+/// Resolves when the peer has closed the socket, or its process has ended.
+async fn hear(stream: &UnixStream) -> Result<(), LinkError> {
+    loop {
+        if stream.readable().await.is_err() {
+            return Ok(());
+        }
+        match stream.try_read(&mut [0]) {
+            Ok(0) => return Ok(()),
+            Ok(_) => return Err(LinkError::StrayBytes),
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+            Err(_) => return Ok(()),
+        }
+    }
+}

@@ -1,0 +1,159 @@
+//! Frames through rings in shared memory: what both ends of a link do, the node's and the client's.
+//!
+//! What goes through a ring is the byte stream that would go through the socket: the records' bytes one after the other
+//! are frames, without checksums. A frame that fits into half the ring is one record, so that it can be written in place
+//! and is read in one go; a longer one comes in pieces.
+
+use std::{
+    io::{self, IoSlice},
+    os::fd::AsFd,
+};
+
+use bytes::BytesMut;
+use sinew_runtime::wire::{FrameCodec, FrameError, Message};
+use sinew_shm::{
+    BellKind, Capacity, Consumer, Corrupt, CreateError, LoanError, Offer, PassError, Producer, RefusedOffer,
+    Region, Terms,
+};
+use tokio_util::codec::Decoder;
+
+/// Records that one look takes at most: a peer may cut its frames as small as it likes.
+const RECORDS_A_LOOK: usize = 64;
+
+/// Why two ends did not come together. The caller falls back to the socket, or ends the link.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum ExchangeError {
+    /// The environment's fault.
+    #[error("no shared memory: {0}")]
+    Create(#[from] CreateError),
+    /// The peer's fault or its end.
+    #[error("no offer of shared memory: {0}")]
+    Pass(#[from] PassError),
+    /// The peer's fault.
+    #[error("the peer's offer of shared memory is refused: {0}")]
+    Refused(#[from] RefusedOffer),
+}
+
+/// The exchange of offers over a socket, on which nothing else comes meanwhile. Both ends do the same, in any order.
+#[derive(Debug)]
+pub(crate) struct Exchange {
+    region: Region,
+    offer: Offer,
+    terms: Terms,
+}
+
+impl Exchange {
+    /// Makes this side's memory. The peer's ring may be as large as this side's.
+    pub(crate) fn prepare(capacity: Capacity, bell: BellKind) -> Result<Self, ExchangeError> {
+        let (region, offer) = Region::create(capacity, bell)?;
+        Ok(Self { region, offer, terms: Terms { capacity_max: capacity, ..Terms::default() } })
+    }
+
+    /// Offers it to the peer.
+    pub(crate) fn offer(&self, socket: impl AsFd) -> Result<(), ExchangeError> {
+        Ok(self.offer.send(socket)?)
+    }
+
+    /// Takes the peer's offer from a socket that does not block; `None` if it is not there yet.
+    pub(crate) fn receive(socket: impl AsFd) -> Result<Option<Offer>, ExchangeError> {
+        match Offer::receive(socket) {
+            Ok(offer) => Ok(Some(offer?)),
+            Err(PassError::System(cause)) if cause.kind() == io::ErrorKind::WouldBlock => Ok(None),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    /// Maps what the peer has offered.
+    pub(crate) fn finish(self, theirs: Offer) -> Result<(Producer, Consumer), ExchangeError> {
+        Ok(self.region.connect(theirs, &self.terms)?)
+    }
+}
+
+/// A ring's capacity for messages around `bytes`: the next power of two within the limits.
+pub(crate) fn capacity(bytes: usize) -> Capacity {
+    let wanted = u64::try_from(bytes).unwrap_or(u64::MAX);
+    let bytes = wanted.clamp(Capacity::MIN.bytes().into(), Capacity::MAX.bytes().into());
+    Capacity::new(bytes.next_power_of_two()).expect("a power of two within the limits")
+}
+
+/// How much of `total` bytes goes into one record.
+pub(crate) const fn piece(producer: &Producer, total: usize) -> usize {
+    let most = producer.payload_max();
+    // A quarter of the ring, so that one side writes while the other reads.
+    if total <= most { total } else { most / 2 }
+}
+
+/// Writes one record from the beginning of `parts`; how many bytes that was.
+///
+/// # Errors
+/// [`LoanError::Full`] when there is no room for it now.
+pub(crate) fn write(producer: &mut Producer, parts: &[IoSlice<'_>]) -> Result<usize, LoanError> {
+    let total = parts.iter().map(|part| part.len()).sum();
+    let length = piece(producer, total);
+    let mut loan = producer.loan(length)?;
+    gather(parts, &mut loan);
+    loan.publish();
+    Ok(length)
+}
+
+/// Fills `target` from the beginning of `parts`, which are at least as long.
+pub(crate) fn gather(parts: &[IoSlice<'_>], mut target: &mut [u8]) {
+    for part in parts {
+        let count = part.len().min(target.len());
+        target[..count].copy_from_slice(&part[..count]);
+        target = &mut target[count..];
+    }
+}
+
+/// Why a ring cannot be read any more. The peer's fault.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum RingError {
+    #[error("shared memory holds what it cannot: {0}")]
+    Corrupt(#[from] Corrupt),
+    #[error(transparent)]
+    Frame(#[from] FrameError),
+}
+
+/// What a look at a ring found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Taken {
+    /// Bytes; there may be more.
+    Some,
+    /// Nothing.
+    Nothing,
+}
+
+/// Frames out of a ring.
+#[derive(Debug)]
+pub(crate) struct RingFrames {
+    codec: FrameCodec,
+    buffer: BytesMut,
+}
+
+impl RingFrames {
+    /// Takes payloads of at most `payload_max` bytes.
+    pub(crate) fn new(payload_max: usize) -> Self {
+        Self { codec: FrameCodec::in_memory(payload_max), buffer: BytesMut::new() }
+    }
+
+    /// The next frame of what was taken.
+    pub(crate) fn next(&mut self) -> Result<Option<Message>, FrameError> {
+        self.codec.decode(&mut self.buffer)
+    }
+
+    /// Takes records, without waiting, until there are about `enough` bytes. Each byte is read once.
+    pub(crate) fn take(&mut self, consumer: &mut Consumer, enough: usize) -> Result<Taken, Corrupt> {
+        let mut taken = Taken::Nothing;
+        for _ in 0..RECORDS_A_LOOK {
+            let Some(lent) = consumer.receive()? else { break };
+            let before = self.buffer.len();
+            self.buffer.resize(before + lent.len(), 0);
+            lent.copy_to(&mut self.buffer[before..]);
+            taken = Taken::Some;
+            if self.buffer.len() >= enough {
+                break;
+            }
+        }
+        Ok(taken)
+    }
+}

@@ -1,0 +1,84 @@
+//! Sleeping on several futexes at once.
+
+use std::{io, sync::atomic::AtomicU32, time::Duration};
+
+use rustix::{
+    fs::Timespec,
+    io::Errno,
+    thread::{
+        ClockId,
+        futex::{self, WaitFlags, WaitPtr, WaitvFlags},
+    },
+    time::clock_gettime,
+};
+
+use super::bells::timespec;
+use crate::{
+    any::ENDS_MAX,
+    bell::{Doorbell, Heard, Woken},
+};
+
+/// How long to sleep on one futex of several where the system cannot wait for all (before Linux 5.16).
+const TURN: Duration = Duration::from_millis(1);
+
+/// Bells that were listened to and are slept on.
+pub(crate) struct Ears<'a> {
+    first: Option<(&'a AtomicU32, u32)>,
+    waits: [futex::Wait; ENDS_MAX],
+    count: usize,
+}
+
+impl<'a> Ears<'a> {
+    pub(crate) const fn new() -> Self {
+        Self { first: None, waits: [futex::Wait::new(); ENDS_MAX], count: 0 }
+    }
+
+    /// Adds one of which this was heard. False when it has no futex, or there are too many.
+    pub(crate) fn add(&mut self, bell: &'a dyn Doorbell, heard: Heard) -> bool {
+        let (Some(word), Some(wait)) = (bell.word(), self.waits.get_mut(self.count)) else {
+            return false;
+        };
+        wait.val = u64::from(heard.0);
+        wait.uaddr = WaitPtr::new(word.as_ptr().cast());
+        // Not private: who rings is in another process.
+        wait.flags = WaitFlags::SIZE_U32;
+        self.first.get_or_insert((word, heard.0));
+        self.count += 1;
+        true
+    }
+
+    /// Sleeps until one of them rings after it was listened to, or `left` has passed. May end early without a reason.
+    pub(crate) fn sleep(&self, left: Duration) -> io::Result<Woken> {
+        let slept = match self.first {
+            None => return Ok(Woken::TimedOut),
+            // One is quicker alone.
+            Some((word, heard)) if self.count == 1 => sleep_on(word, heard, left),
+            Some((word, heard)) => match self.sleep_on_all(left) {
+                Err(Errno::NOSYS) => sleep_on(word, heard, left.min(TURN)),
+                other => other,
+            },
+        };
+        match slept {
+            // Rung before the sleep; a signal came. The caller looks again.
+            Ok(()) | Err(Errno::AGAIN | Errno::INTR) => Ok(Woken::Rung),
+            Err(Errno::TIMEDOUT) => Ok(Woken::TimedOut),
+            Err(errno) => Err(errno.into()),
+        }
+    }
+
+    fn sleep_on_all(&self, left: Duration) -> Result<(), Errno> {
+        let until = after(clock_gettime(ClockId::Monotonic), left);
+        futex::waitv(&self.waits[..self.count], WaitvFlags::empty(), Some(&until), ClockId::Monotonic)?;
+        Ok(())
+    }
+}
+
+fn sleep_on(word: &AtomicU32, heard: u32, left: Duration) -> Result<(), Errno> {
+    futex::wait(word, futex::Flags::empty(), heard, Some(&timespec(left)))
+}
+
+fn after(now: Timespec, left: Duration) -> Timespec {
+    let left = timespec(left);
+    let nanos = now.tv_nsec + left.tv_nsec;
+    Timespec { tv_sec: now.tv_sec + left.tv_sec + nanos / 1_000_000_000, tv_nsec: nanos % 1_000_000_000 }
+}
