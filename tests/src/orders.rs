@@ -71,6 +71,8 @@ payload!("process.order" =>
         Ask(String),
         /// Send these bytes, in this very order, to the application of this name.
         Echo(String, #[serde(with = "serde_bytes")] Vec<u8>),
+        /// Count its messages as if it had sent more than anybody can, and send one to the application of this name.
+        ForgeNumbers(String),
         /// Start a command that ends at once, and write down how it ended.
         StartACommand,
     }

@@ -2,6 +2,8 @@
 
 #[path = "processes/death.rs"]
 mod death;
+#[path = "processes/fence.rs"]
+mod fence;
 #[path = "processes/placement.rs"]
 mod placement;
 #[path = "processes/scenario.rs"]

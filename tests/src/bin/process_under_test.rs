@@ -1,11 +1,17 @@
 //! A node for the scenarios of applications in processes of their own.
 //!
 //! `process_under_test CONFIG.toml [--place thread|process|io] [--requires NAME] [--on-lost pause|restart]
-//! [--dies-at-start CODE]`
+//! [--dies-at-start CODE] [--neighbour-hangs MILLIS] [--talks] [--stays]`
 //!
-//! The application `drive` does as it is told (`Order`), and says what it sees, one line each.
+//! The application `drive` does as it is told (`Order`), and says what it sees, one line each. With a neighbour there is another
+//! one on the `io` thread, which blocks that thread a moment after its start for so long; if for 0 ms, each life of it for ever.
+//! A drive that talks tells its number to an application `witness` all the time, which says whom it heard. A program that
+//! stays goes on after the end of its node, until its standard input ends.
 
-use std::process::ExitCode;
+use std::{
+    process::ExitCode,
+    sync::atomic::{AtomicU64, Ordering},
+};
 
 use rustix::process::{Signal, getpid, kill_process};
 use sinew::prelude::*;
@@ -14,6 +20,7 @@ use sinew_tests::orders::{Count, Level, Me, Order, Who};
 #[derive(Default)]
 struct Drive {
     counts: Vec<u64>,
+    talks: bool,
 }
 
 fn say(what: &str) {
@@ -26,6 +33,12 @@ impl Actor for Drive {
     fn started(&mut self, context: &mut Self::Context) {
         say(&format!("started {}", context.tid()));
         context.expect::<Level>(None, Duration::from_millis(50), |_, _, _| say("silence"));
+        if self.talks {
+            context.every(Duration::from_millis(2), |_, _, context| {
+                // What the node does not take is not heard.
+                let _ = context.send("witness", &Count { number: u64::from(std::process::id()) });
+            });
+        }
     }
 
     fn stopping(&mut self, context: &mut Self::Context) -> Running {
@@ -113,6 +126,13 @@ impl Handler<Delivery<Order>> for Drive {
                     say(&format!("no echo: {error}"));
                 }
             }
+            Order::ForgeNumbers(ref to) => {
+                let sender = context.sender();
+                while sender.count_on_from(sender.last_sequence().saturating_add(1 << 40))
+                    && sender.last_sequence() < u64::MAX / 2
+                {}
+                send(context, to, 0);
+            }
             Order::StartACommand => {
                 let status = std::process::Command::new("true").status();
                 say(&format!("command {status:?}"));
@@ -163,6 +183,61 @@ fn ask(context: &mut AppContext<Drive>, whom: &str) {
     }
 }
 
+/// Blocks its thread in a timer.
+struct Neighbour(Duration);
+
+impl Actor for Neighbour {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        static LIVES: AtomicU64 = AtomicU64::new(0);
+        let (time, is_first) = (self.0, LIVES.fetch_add(1, Ordering::Relaxed) == 0);
+        context.after(Duration::from_millis(200), move |_, _, _| {
+            if time.is_zero() {
+                say("hangs");
+                std::thread::park_timeout(Duration::MAX);
+            } else if is_first {
+                say("hangs");
+                std::thread::sleep(time);
+                say("comes back");
+            }
+        });
+    }
+}
+
+fn neighbour(time: Duration) -> AppSpec<Neighbour> {
+    AppSpec::new("neighbour", move || Neighbour(time))
+        .requires(["drive"])
+        .on_io_thread()
+        .progress_within(Duration::from_millis(100))
+}
+
+/// Says whom it heard.
+struct Witness;
+
+impl Actor for Witness {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<Count>> for Witness {
+    type Result = ();
+
+    fn handle(&mut self, count: Delivery<Count>, _: &mut Self::Context) {
+        say(&format!("heard {} in {}", count.number, count.sequence));
+    }
+}
+
+/// Runs the node to its end, and the program beyond it if it `stays`.
+fn run(node: Node, stays: bool) -> ExitCode {
+    let code = node.run();
+    if stays {
+        say("node has ended");
+        // Whoever started this program ends it so.
+        let _ = std::io::stdin().read_line(&mut String::new());
+    }
+    code
+}
+
 fn main() -> ExitCode {
     tracing_subscriber::fmt()
         .with_env_filter(tracing_subscriber::EnvFilter::from_default_env())
@@ -175,11 +250,13 @@ fn main() -> ExitCode {
     };
     let config = NodeConfig::from_file(&arguments[0]).expect("a scenario's configuration");
     let dies_with = after("--dies-at-start").map(|code| code.parse().expect("an exit code"));
+    let is_set = |flag: &str| arguments.iter().any(|argument| argument == flag);
+    let (talks, stays) = (is_set("--talks"), is_set("--stays"));
     let drive = move || {
         if let Some(code) = dies_with {
             std::process::exit(code);
         }
-        Drive::default()
+        Drive { talks, ..Drive::default() }
     };
     let mut drive = AppSpec::new("drive", drive)
         .handles::<Count>()
@@ -199,10 +276,17 @@ fn main() -> ExitCode {
         Some("thread") => drive.own_thread(),
         Some(_) => drive.on_io_thread(),
     };
-    match Node::builder(config.name.clone()).config(config).app(drive).heed_signals().start() {
+    let mut builder = Node::builder(config.name.clone()).config(config).app(drive).heed_signals();
+    if talks {
+        builder = builder.app(AppSpec::new("witness", || Witness).handles::<Count>().own_thread());
+    }
+    if let Some(millis) = after("--neighbour-hangs") {
+        builder = builder.app(neighbour(Duration::from_millis(millis.parse().expect("a time"))));
+    }
+    match builder.start() {
         Ok(node) => {
             say("is up");
-            node.run()
+            run(node, stays)
         }
         Err(error) => {
             say(&format!("refused {error}"));

@@ -1,8 +1,11 @@
 //! Panics in every place of an application's life.
 
-use std::panic::panic_any;
+use std::{
+    panic::panic_any,
+    sync::{Arc, Mutex},
+};
 
-use sinew::{Rejection, Sender, prelude::*};
+use sinew::{Rejection, SendError, Sender, prelude::*};
 use sinew_runtime::{app::DynApp, post::Post};
 use sinew_tests::{
     DEADLINE, Ground, Log, all_run,
@@ -241,6 +244,28 @@ fn a_panic_on_the_thread_of_the_sockets_does_not_cut_the_node_off() {
 }
 
 #[test]
+fn a_sender_that_is_held_past_a_panic_sends_nothing_beside_the_next_life() {
+    let held = Arc::new(Mutex::new(Vec::new()));
+    let holds = held.clone();
+    let stage = Stage::new()
+        .started(move |_, context| holds.lock().expect("nobody panics with it").push(context.sender()))
+        .got(|puppet, _| assert!(puppet.number != 13, "thirteen"));
+    let ((puppet, log), (witness, seen), (desk, key)) =
+        (stage.app("puppet"), Stage::new().app("witness"), desk("desk"));
+    let node = Ground::new().node("node").app(puppet).app(witness).app(desk).start().expect("a node");
+    all_run(&[&node]);
+    let senders = || held.lock().expect("nobody panics with it").clone();
+    // As from a thread of the application's own, which goes on after it.
+    senders()[0].send("witness", &Job { number: 1 }).expect("it has room");
+    assert_eq!(outcome_of_job(&key.sender(), "puppet", 13), Outcome::Failed);
+    log.wait_for(Seen::Started(2));
+    let refused = senders()[0].send("witness", &Job { number: 2 });
+    assert!(matches!(refused, Err(SendError::Over)), "{refused:?}");
+    senders()[1].send("witness", &Job { number: 3 }).expect("it has room");
+    assert_eq!(wait_for_numbers(&seen, 2), [1, 3]);
+}
+
+#[test]
 fn a_temporary_application_that_panics_is_gone_and_its_senders_are_told_so() {
     let stage = Stage::new().got(|puppet, _| assert!(puppet.number != 13, "thirteen"));
     let (node, sender, log) = perform(stage, |app| app.restart(Restart::Temporary));
@@ -250,7 +275,7 @@ fn a_temporary_application_that_panics_is_gone_and_its_senders_are_told_so() {
     until("its name is free", || sender.resolve("puppet").is_none().then_some(()));
     let refused = sender.send(tid, &Job { number: 1 }).expect_err("nobody is there");
     assert!(
-        matches!(refused, sinew::SendError::Rejected(Rejection::NoSuchApplication | Rejection::Closed)),
+        matches!(refused, SendError::Rejected(Rejection::NoSuchApplication | Rejection::Closed)),
         "{refused:?}"
     );
     assert_eq!(lives(&log), 1);

@@ -6,6 +6,7 @@ use rustix::process::Signal;
 use sinew::Outcome;
 use sinew_tests::{OwnDirectory, orders::Order, process_under_test};
 
+use crate::fence::parent_of;
 use crate::scenario::{Scenario, Watched, configuration, signal};
 
 #[test]
@@ -171,12 +172,4 @@ fn two_hundred_deaths_leave_nothing_behind() {
 
 fn descriptors(process: u32) -> usize {
     fs::read_dir(format!("/proc/{process}/fd")).expect("it lives").count()
-}
-
-/// The parent of a process that is in the kernel's table, alive or not.
-fn parent_of(process: u32) -> Option<u32> {
-    let stat = fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
-    // The name in parentheses may have anything in it.
-    let (_, rest) = stat.rsplit_once(')')?;
-    rest.split_whitespace().nth(1)?.parse().ok()
 }
