@@ -160,7 +160,8 @@ impl Core {
             Input::LinkBroken { node, incarnation } => self.watching.link_broken(now, node, incarnation),
             Input::Watch { from, watch } => self.watch_received(now, from, watch),
             Input::Lives { from, lives } => self.lives_received(now, from, &lives),
-            Input::NotTaken { watcher, down } => self.keep(now, watcher, down),
+            // Nothing is offered again here: others are being told, and whoever tells them would not come to an end.
+            Input::NotTaken { watcher, down } => return self.keep(now, watcher, down),
             Input::TimePassed => {}
         }
         self.offer_again(now);

@@ -156,3 +156,75 @@ fn header(stores: &Stores, kind: Kind, node: NodeAddress, app: AppAddress) -> He
     header.sent = Time::now();
     header
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::{
+        Arc,
+        atomic::{AtomicUsize, Ordering},
+    };
+
+    use sinew_runtime::{
+        monitor::DownClass,
+        router::{LocalRoute, Outlet, Refused},
+        tid::Incarnation,
+    };
+
+    use super::*;
+    use crate::{
+        config::NodeConfig,
+        monitors::{Cause, core::PER_WATCHER_MAX},
+    };
+
+    const WATCHERS: u32 = 15;
+
+    /// A mailbox that is full, and between which addresses of the stack it was asked.
+    #[derive(Default)]
+    struct Full {
+        refused: AtomicUsize,
+        deepest: AtomicUsize,
+        highest: AtomicUsize,
+    }
+
+    impl Outlet for Full {
+        fn submit(&self, message: Message) -> Result<(), Refused> {
+            let mark = 0_u8;
+            let at = std::ptr::from_ref(&mark).addr();
+            self.refused.fetch_add(1, Ordering::Relaxed);
+            self.highest.fetch_max(at, Ordering::Relaxed);
+            // So that the least value is the first: the stack grows downwards.
+            self.deepest.fetch_max(usize::MAX - at, Ordering::Relaxed);
+            Err(Refused::new(message, Rejection::QueueFull))
+        }
+    }
+
+    /// All these monitors end at once, and nobody has room: each refusal is an event of its own while the rest is told.
+    fn ends_that_nobody_takes() -> Arc<Full> {
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let (target, full) = (AppAddress::fixed(0).expect("a fixed one"), Arc::new(Full::default()));
+        feed(&stores, Input::Began { app: target });
+        for index in 1..=WATCHERS {
+            let watcher = AppAddress::fixed(index).expect("a fixed one");
+            stores.router.set_local(watcher, LocalRoute { outlet: full.clone(), events: Arc::new([]) });
+            for _ in 0..PER_WATCHER_MAX {
+                let set =
+                    change(&stores, |core| core.monitor(Time::now(), watcher, Tid::new(stores.node, target)));
+                set.expect("there is room for so many");
+            }
+        }
+        let cause = Cause::new(DownClass::Panic, "its end");
+        feed(&stores, Input::Ended { app: target, cause, is_gone: true });
+        full
+    }
+
+    #[test]
+    fn ends_that_no_watcher_has_room_for_need_no_deeper_stack_than_one() {
+        // Room enough, so that a stack that is too deep fails this test and no other.
+        let thread = std::thread::Builder::new().stack_size(1 << 28).spawn(ends_that_nobody_takes);
+        let full = thread.expect("a thread").join().expect("it does not panic");
+        assert_eq!(full.refused.load(Ordering::Relaxed), WATCHERS as usize * PER_WATCHER_MAX);
+        let deepest = usize::MAX - full.deepest.load(Ordering::Relaxed);
+        let depth = full.highest.load(Ordering::Relaxed) - deepest;
+        assert!(depth < 16 * 1024, "{depth} bytes of stack between the first refusal and the deepest one");
+    }
+}

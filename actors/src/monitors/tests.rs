@@ -15,6 +15,7 @@ use sinew_runtime::{
 use super::{
     Cause, Core, Input,
     core::{MONITORS_MAX, Output, PER_WATCHER_MAX, REPEAT, RETRY},
+    words::Watch,
 };
 
 const HERE: NodeAddress = NodeAddress::new(0x7f00_0001);
@@ -83,6 +84,24 @@ fn the_end_of_a_life_is_told_once_to_each_who_watches_it() {
     };
     assert_eq!(told, [(app(1), down(first)), (app(2), down(second))]);
     assert_eq!(bench.hears(ended(0, false)), [], "of the next life nobody wanted to know");
+}
+
+// spec: MON-7
+#[test]
+fn an_address_that_was_used_again_is_remembered_for_its_last_end() {
+    let mut bench = Bench::new();
+    // Given: one that is gone twice, and then as many others as are remembered beside it
+    for index in [0].into_iter().chain(0..1_024) {
+        bench.hears(Input::Began { app: app(index) });
+        bench.hears(ended(index, true));
+    }
+    // When
+    let watch = Watch { incarnation: LIFE, version: 1, apps: vec![app(0)] };
+    let told = bench.hears(Input::Watch { from: THERE, watch });
+    // Then
+    let [Output::Lives { lives, .. }] = &told[..] else { panic!("{told:?}") };
+    let cause = lives.lives[0].ended.as_ref().map(|ended| ended.cause.class);
+    assert_eq!(cause, Some(DownClass::Panic));
 }
 
 // spec: MON-2

@@ -4,7 +4,7 @@ use std::{cell::RefCell, collections::BTreeMap, rc::Rc, sync::Arc};
 
 use sinew_runtime::{
     app::Absence,
-    supervision::{ChildId, SupervisorFact},
+    supervision::{ChildId, Command, SupervisorFact},
 };
 
 use crate::{monitors, stores::Stores, wills};
@@ -27,6 +27,11 @@ impl Absences {
         self.apps.borrow_mut().insert(id, absence);
     }
 
+    /// It is not supervised any more, or has never been.
+    pub(super) fn forget(&self, id: ChildId) {
+        self.apps.borrow_mut().remove(&id);
+    }
+
     /// Called by the supervisor itself, before it does anything else about the child.
     pub(super) fn hear(&self, fact: &SupervisorFact) {
         match fact {
@@ -47,7 +52,7 @@ impl Absences {
                     wills::feed(&self.stores, wills::Input::Ended { app });
                 }
             }
-            SupervisorFact::Deleted(id) => _ = self.apps.borrow_mut().remove(id),
+            SupervisorFact::Deleted(id) | SupervisorFact::Refused(Command::Add, id, _) => self.forget(*id),
             SupervisorFact::Starting(id, _) => {
                 // One that was gone may be started again by a command; of any other this says nothing new.
                 if let Some(absence) = self.of(*id) {
@@ -64,5 +69,39 @@ impl Absences {
     /// A copy, so that nothing is borrowed while its messages are sent.
     fn of(&self, id: ChildId) -> Option<Absence> {
         self.apps.borrow().get(&id).cloned()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew_runtime::{
+        app::{AppSpec, AppWiring, DynApp},
+        mailbox::Mailbox,
+        pending::Pending,
+        sender::Sender,
+        supervision::{ChildIds, Refusal},
+        tid::{AppAddress, Incarnation, Tid},
+    };
+
+    use super::*;
+    use crate::{config::NodeConfig, node::directory::NodeDirectory};
+
+    struct Nothing;
+
+    impl actix::Actor for Nothing {
+        type Context = sinew_runtime::app::AppContext<Self>;
+    }
+
+    #[test]
+    fn nothing_is_kept_of_an_application_that_was_not_taken_in() {
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let (absences, id) = (Absences::new(stores.clone()), ChildIds::default().next());
+        let tid = Tid::new(stores.node, AppAddress::fixed(1).expect("a fixed one"));
+        let directory = Arc::new(NodeDirectory(stores.clone()));
+        let sender = Sender::new(tid, stores.router.clone(), directory, Pending::new(1), 1_024);
+        let wiring = AppWiring { sender, mailbox: Mailbox::new(1) };
+        absences.keep(id, DynApp::from(AppSpec::new("late", || Nothing)).absence(wiring));
+        absences.hear(&SupervisorFact::Refused(Command::Add, id, Refusal::Ending));
+        assert!(absences.of(id).is_none());
     }
 }

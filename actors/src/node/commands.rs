@@ -172,6 +172,7 @@ impl Root {
         let id = spec.id;
         if roster.bring(under, spec).is_err() {
             self.apps.remove(&self.stores, id);
+            self.absences.forget(id);
             return Err(CommandError::NotRunning);
         }
         Ok(id)

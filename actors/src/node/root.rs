@@ -95,7 +95,7 @@ pub(super) struct Root {
     declared: Option<SupervisorSpec>,
     child_ids: ChildIds,
     pub(super) apps: Apps,
-    absences: Absences,
+    pub(super) absences: Absences,
     pub(super) answers: Answers,
     pub(super) layer_supervisor: Option<Roster>,
     pub(super) app_supervisor: Option<Roster>,

@@ -123,7 +123,9 @@ impl Link {
         directory: watch::Receiver<u64>,
     ) -> LinkNumber {
         // A former process whose supervisor did not wait for its end.
-        self.end(lock(&self.present).take(), LastWords::Unheard);
+        let former = lock(&self.present).take();
+        // Without the lock, because whoever is told may send to this very TID.
+        self.end(former, LastWords::Unheard);
         let number = self.outlet.connect(socket, self.payload_max, Some(welcome));
         let (window, held) = (Window::default(), None);
         *lock(&self.present) = Some(Present { number, lender: self.mailbox.lend(), window, directory, held });
@@ -289,5 +291,70 @@ impl ReceiptSink for OutcomeSink {
         // Not taken: the child is gone, or does not read; its own deadline says `Unknown`. A later process of this TID
         // has other correlations.
         let _ = self.0.say(Message::new(header, Bytes::copy_from_slice(&[outcome.code()])));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{sync::mpsc::sync_channel, time::Duration};
+
+    use sinew_runtime::{
+        tid::{AppAddress, Incarnation, NodeAddress, Tid},
+        wire::HEADER_LEN,
+    };
+    use tokio::io::AsyncReadExt;
+
+    use super::*;
+    use crate::{config::NodeConfig, process::words};
+
+    /// Sends to the TID whose message has ended, from within.
+    struct SendsAgain(Arc<Link>);
+
+    impl ReceiptSink for SendsAgain {
+        fn settle(&self, ticket: Ticket, outcome: Outcome) {
+            assert_eq!(outcome, Outcome::Failed);
+            let again = Message::new(
+                Header::new(Kind::named("again"), ticket.source, ticket.destination),
+                Bytes::new(),
+            );
+            self.0.submit(again).expect("there is room");
+        }
+    }
+
+    #[test]
+    fn whoever_is_told_that_a_former_process_failed_may_send_to_it_at_once() {
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let mailbox = Mailbox::new(8);
+        let link = Link::new(&stores, mailbox.clone());
+        let tid = Tid::new(NodeAddress::HERE, AppAddress::fixed(1).expect("a fixed one"));
+        let (say, said) = sync_channel(1);
+        std::thread::spawn(move || {
+            let runtime =
+                tokio::runtime::Builder::new_current_thread().enable_io().build().expect("a reactor");
+            let _entered = runtime.enter();
+            let (first, process) = UnixStream::pair().expect("a pair of sockets");
+            let (second, _other) = UnixStream::pair().expect("another");
+            let connect = |socket| {
+                let welcome = words::bare(Kind::HOST_WELCOME, Tid::NONE, tid);
+                link.connect(Arc::new(socket), welcome, stores.directory_changes.subscribe())
+            };
+            let number = connect(first);
+            let mut message = Message::new(Header::new(Kind::named("first"), tid, tid), Bytes::new());
+            let ticket = Ticket { source: tid, destination: tid, correlation: 1 };
+            message.receipt = Some(Receipt::new(Arc::new(SendsAgain(link.clone())), ticket));
+            link.submit(message).expect("there is room");
+            let (mut process, mut frames) = (process, [0; 2 * HEADER_LEN]);
+            let taken = async {
+                tokio::select! {
+                    error = link.drain(number) => panic!("the process reads: {error}"),
+                    read = process.read_exact(&mut frames) => read.expect("the welcome and the message"),
+                }
+            };
+            runtime.block_on(taken);
+            // Its supervisor has not waited for the end of the first one.
+            connect(second);
+            say.send(()).expect("it is waited for");
+        });
+        said.recv_timeout(Duration::from_secs(10)).expect("whoever is told is told without a lock");
     }
 }

@@ -59,6 +59,10 @@ impl Watched {
         }
         let number = self.new_life();
         let ended = self.gone.remove(&app).map(|(ended, _)| ended);
+        if ended.is_some() {
+            // Its next end is remembered for as long as any other.
+            self.gone_order.retain(|gone| *gone != app);
+        }
         self.lives.insert(app, Life { number, began: now, ended });
     }
 
