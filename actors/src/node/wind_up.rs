@@ -19,7 +19,7 @@ use super::{
 };
 use crate::stores::Stores;
 
-/// Time that the applications, and then the layers, have to end when the root has failed.
+/// Time that the applications, and then the layers, have to end when the root has failed, beyond what each was declared with.
 const WIND_UP_WITHIN: Duration = Duration::from_secs(5);
 
 /// The supervisors of a node, for who has to end it without its root.
@@ -59,6 +59,12 @@ impl Heirs {
         roster
     }
 
+    /// Time that the children of this branch have to stop, if there is one.
+    fn stop_within(&self, wanted: Branch) -> Option<Duration> {
+        let branches = self.0.borrow();
+        branches.iter().find(|(branch, _)| *branch == wanted).map(|(_, roster)| roster.stop_within())
+    }
+
     fn stop(&self, wanted: Branch) {
         for (_, roster) in self.0.borrow().iter().filter(|(branch, _)| *branch == wanted) {
             // One that ended before reads no more orders.
@@ -89,11 +95,9 @@ pub(super) fn oversee(root: Root, heirs: Heirs, stores: Arc<Stores>, ended: Sync
     });
 }
 
-/// Waits until this branch has ended, if there is one, and not for ever.
+/// Waits until this branch has ended, if there is one, and not for ever: its supervisor keeps the time of each child.
 async fn wait(events: &mut PostStream<RootEvent>, wanted: Branch, heirs: &Heirs) {
-    if !heirs.0.borrow().iter().any(|(branch, _)| *branch == wanted) {
-        return;
-    }
+    let Some(within) = heirs.stop_within(wanted) else { return };
     let end = async {
         while let Some(event) = events.next().await {
             let is_end = match wanted {
@@ -106,7 +110,7 @@ async fn wait(events: &mut PostStream<RootEvent>, wanted: Branch, heirs: &Heirs)
             }
         }
     };
-    if tokio::time::timeout(WIND_UP_WITHIN, end).await.is_err() {
+    if tokio::time::timeout(within.saturating_add(WIND_UP_WITHIN), end).await.is_err() {
         tracing::error!(?wanted, "they did not end in their time; the process has to end them");
     }
 }

@@ -1,6 +1,6 @@
 //! Who is supervised: shared by a supervisor and its owner, who live on one thread.
 
-use std::{cell::RefCell, collections::BTreeMap, rc::Rc};
+use std::{cell::RefCell, collections::BTreeMap, rc::Rc, time::Duration};
 
 use crate::{
     post::Post,
@@ -22,6 +22,8 @@ pub struct Listed {
     pub tid: Option<Tid>,
     /// Where it runs; `None` for a supervisor, which runs on its owner's thread.
     pub place: Option<Place>,
+    /// Time that it has to stop; none for a supervisor, whose children have theirs.
+    pub stop_within: Duration,
 }
 
 /// The children of a supervisor and of those below it. Clones are the same roster.
@@ -105,6 +107,13 @@ impl Roster {
         self.tree.borrow().view(now)
     }
 
+    /// Time that all children have to stop, one after the other.
+    #[must_use]
+    pub fn stop_within(&self) -> Duration {
+        let each = self.listed.borrow();
+        each.values().fold(Duration::ZERO, |sum, child| sum.saturating_add(child.stop_within))
+    }
+
     /// Who a child is.
     #[must_use]
     pub fn who(&self, id: ChildId) -> Option<Listed> {
@@ -145,7 +154,12 @@ impl Roster {
 }
 
 fn listed(spec: &ChildSpec) -> Listed {
-    Listed { name: spec.name.clone(), tid: spec.tid, place: Some(spec.place.clone()) }
+    Listed {
+        name: spec.name.clone(),
+        tid: spec.tid,
+        place: Some(spec.place.clone()),
+        stop_within: spec.policy.stop_within,
+    }
 }
 
 /// Lists a plan's children; gives the plan without what only the shell needs.
@@ -168,7 +182,7 @@ fn enter(
             }
         });
     }
-    let supervisor = Listed { name: plan.name, tid: None, place: None };
+    let supervisor = Listed { name: plan.name, tid: None, place: None, stop_within: Duration::ZERO };
     listed_children.insert(plan.id, supervisor);
     Plan { id: plan.id, flags: plan.flags, children }
 }

@@ -6,7 +6,7 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew::{NodeEnd, Sender, StartError, prelude::*};
+use sinew::{NodeEnd, Sender, StartError, fault::Fault, prelude::*};
 use sinew_tests::{
     Ground, Log, OwnDirectory, Program, all_run, node_under_test, own_group,
     puppet::{Job, Order, Puppet, Seen, Stage, desk, lives, numbers, outcome_of_job},
@@ -151,6 +151,23 @@ fn wills_are_sent_when_the_supervisor_of_the_applications_fails_itself() {
     // The goodbye of a node that ends in order is no second reason for them.
     sinew_tests::until("the node is gone", || there.handle().members().is_empty().then_some(()));
     assert_eq!((wills(&seen), numbers(&seen.all()).len()), (1, 2));
+}
+
+/// Nobody is left on that node who could send them, and nobody who says goodbye.
+#[test]
+fn wills_of_a_node_whose_layers_have_given_up_are_executed_by_the_others() {
+    let ground = Ground::new();
+    let ((mortal, log), (heir, seen)) = (mortal(0), heir());
+    let mortal = mortal.last_will("heir", &WILL);
+    let there = ground.node("there").app(heir.requires(["mortal"])).start().expect("a node");
+    let here = ground.node("here").configure(|config| config.supervision.layer_restarts_max = 0);
+    let here = here.app(mortal).start().expect("a node");
+    all_run(&[&here, &there]);
+    here.handle().inject("NDL", Fault::panic()).expect("every node has it");
+    seen.wait_for(Seen::Got(1, WILL.number));
+    assert!(matches!(here.wait_for_end(), NodeEnd::GaveUp(_)));
+    assert!(log.all().contains(&Seen::Stopping(1)), "it was told to stop as well");
+    assert_eq!(wills(&seen), 1);
 }
 
 #[test]
