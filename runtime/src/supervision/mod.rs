@@ -4,6 +4,7 @@
 //! | --- | --- |
 //! | [`core`] | the decisions, pure |
 //! | `supervisor` | the actix actor that carries them out |
+//! | `child` | one child as its supervisor's shell holds it |
 //! | `guard` | the future around each actor: catches its panics, takes its stop order, reports its end |
 //! | `alone` | one actor under a guard and under no supervisor |
 //! | `orphans` | what becomes of the children of a supervisor that fails itself |
@@ -18,6 +19,7 @@
 //! | `fault` | faults on purpose, with the feature `fault-points` only |
 
 mod alone;
+mod child;
 pub mod core;
 #[cfg(feature = "fault-points")]
 pub mod fault;

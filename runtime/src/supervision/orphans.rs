@@ -12,15 +12,16 @@ use std::{
 };
 
 use futures_util::{FutureExt, StreamExt};
-use tokio::time::{Instant, timeout_at};
+use tokio::time::timeout;
 
 use super::{
     Reason, SupervisorFact, Threads,
     core::{ChildId, Input},
     panics::words,
     tenant::Tenant,
+    watchdog::Reprieve,
 };
-use crate::post::Post;
+use crate::{post::Post, time::Time};
 
 /// Time in which a thread that does not hang lets go a child whose life is taken.
 pub(super) const LETTING_GO: Duration = Duration::from_millis(200);
@@ -39,26 +40,42 @@ pub(super) struct Orphan {
 
 /// All children of a supervisor that are left. Dropping them takes their lives.
 pub(super) struct Orphans {
-    left: BTreeMap<ChildId, (Orphan, Grace)>,
+    left: BTreeMap<ChildId, Left>,
     threads: Rc<RefCell<Threads>>,
     post: Post<Input>,
     listener: Listener,
 }
 
-/// How long a child has what it has.
-#[derive(Clone, Copy)]
-enum Grace {
-    /// It was told to stop, and has until then.
-    Stops(Instant),
-    /// Its life is taken and its end is told; its thread has until then.
-    LetsGo(Instant),
+/// One that is left, and how long it has for what it does.
+struct Left {
+    tenant: Tenant,
+    does: Does,
+    until: Time,
+    reprieve: Reprieve,
 }
 
-impl Grace {
-    const fn ends(self) -> Instant {
-        match self {
-            Self::Stops(ends) | Self::LetsGo(ends) => ends,
+#[derive(Clone, Copy)]
+enum Does {
+    /// It was told to stop.
+    Stop,
+    /// Its life is taken and its end is told; its thread is to let it go.
+    LetGo,
+}
+
+impl Left {
+    fn new(tenant: Tenant, does: Does, within: Duration, threads: &Threads) -> Self {
+        let reprieve = threads.reprieve(&tenant, within);
+        Self { tenant, does, until: Time::now() + within, reprieve }
+    }
+
+    /// Whether its time is over. Who was not given it has more.
+    fn is_late(&mut self, now: Time) -> bool {
+        if self.until > now {
+            return false;
         }
+        let later = if self.tenant.has_ended() { None } else { self.reprieve.until(self.until, now, false) };
+        self.until = later.unwrap_or(self.until);
+        later.is_none()
     }
 }
 
@@ -70,13 +87,12 @@ impl Orphans {
         post: Post<Input>,
         listener: Listener,
     ) -> Self {
-        let now = Instant::now();
-        let tell = |(id, orphan): (ChildId, Orphan)| {
-            orphan.tenant.stop();
-            let grace = Grace::Stops(now + orphan.stop_within);
-            (id, (orphan, grace))
+        let tell = |(id, Orphan { tenant, stop_within }): (ChildId, Orphan)| {
+            tenant.stop();
+            (id, Left::new(tenant, Does::Stop, stop_within, &threads.borrow()))
         };
-        Self { left: orphans.map(tell).collect(), threads, post, listener }
+        let left = orphans.map(tell).collect();
+        Self { left, threads, post, listener }
     }
 
     /// Sees to it that all of them end, on the calling thread, with nobody who waits for that.
@@ -101,50 +117,51 @@ impl Orphans {
             self.hear(event, why);
         }
         self.bury(why);
-        while let Some(next) = self.left.values().map(|(_, grace)| grace.ends()).min() {
-            match timeout_at(next, events.next()).await {
+        while let Some(next) = self.left.values().map(|left| left.until).min() {
+            match timeout(next.since(Time::now()), events.next()).await {
                 Ok(Some(event)) => self.hear(event, why),
                 // Another reader came, which nobody makes: dropped, they have no time any more.
                 Ok(None) => return,
-                Err(_) => self.time_is_over(Instant::now(), why),
+                Err(_) => self.time_is_over(Time::now(), why),
             }
         }
     }
 
     fn hear(&mut self, event: Input, why: &Reason) {
         let (Input::Ended(id, _, reason) | Input::Hung(id, _, reason)) = event else { return };
-        let Some((Orphan { tenant, .. }, grace)) = self.left.get(&id) else { return };
-        match grace {
+        let Some(Left { tenant, does, .. }) = self.left.get(&id) else { return };
+        match does {
             // What is told of a former life is told late: this one can still act.
             _ if !tenant.vitals().is_over() => {}
-            Grace::Stops(_) => {
+            Does::Stop => {
                 let reason = if reason.is_failure() { reason } else { why.clone() };
                 self.lose(id, reason);
             }
-            Grace::LetsGo(_) if tenant.has_ended() => _ = self.left.remove(&id),
-            Grace::LetsGo(_) => {}
+            Does::LetGo if tenant.has_ended() => _ = self.left.remove(&id),
+            Does::LetGo => {}
         }
     }
 
     /// Those that ended without a word that anybody has heard.
     fn bury(&mut self, why: &Reason) {
-        let ended: Vec<_> = self.left.iter().filter(|(_, (orphan, _))| orphan.tenant.has_ended()).collect();
-        for id in ended.into_iter().map(|(id, _)| *id).collect::<Vec<_>>() {
+        let ended = self.left.iter().filter(|(_, left)| left.tenant.has_ended());
+        for id in ended.map(|(id, _)| *id).collect::<Vec<_>>() {
             self.lose(id, why.clone());
         }
     }
 
-    fn time_is_over(&mut self, now: Instant, why: &Reason) {
-        let over = self.left.iter().filter(|(_, (_, grace))| grace.ends() <= now);
-        for (id, grace) in over.map(|(id, (_, grace))| (*id, *grace)).collect::<Vec<_>>() {
-            match grace {
-                Grace::Stops(_) => {
-                    let has_ended = self.left.get(&id).is_some_and(|(orphan, _)| orphan.tenant.has_ended());
+    fn time_is_over(&mut self, now: Time, why: &Reason) {
+        let late =
+            self.left.iter_mut().filter_map(|(id, left)| left.is_late(now).then_some((*id, left.does)));
+        for (id, does) in late.collect::<Vec<_>>() {
+            match does {
+                Does::Stop => {
+                    let has_ended = self.left.get(&id).is_some_and(|left| left.tenant.has_ended());
                     self.lose(id, if has_ended { why.clone() } else { Reason::Killed });
                 }
-                Grace::LetsGo(_) => {
-                    if let Some((orphan, _)) = self.left.remove(&id) {
-                        self.give_up(&orphan.tenant);
+                Does::LetGo => {
+                    if let Some(left) = self.left.remove(&id) {
+                        self.give_up(&left.tenant);
                     }
                 }
             }
@@ -153,14 +170,15 @@ impl Orphans {
 
     /// It does nothing any more, and that is told. What is left of it is its thread's business, for a while.
     fn lose(&mut self, id: ChildId, reason: Reason) {
-        let Some((orphan, _)) = self.left.remove(&id) else { return };
-        orphan.tenant.kill();
-        tracing::warn!(child = orphan.tenant.vitals().name(), %reason, "ended without its supervisor");
+        let Some(Left { tenant, .. }) = self.left.remove(&id) else { return };
+        tenant.kill();
+        tracing::warn!(child = tenant.vitals().name(), %reason, "ended without its supervisor");
         self.tell(SupervisorFact::Gone(id, reason));
-        if orphan.tenant.holds_its_thread().is_some() {
-            self.give_up(&orphan.tenant);
-        } else if !orphan.tenant.has_ended() {
-            self.left.insert(id, (orphan, Grace::LetsGo(Instant::now() + LETTING_GO)));
+        if tenant.holds_its_thread().is_some() {
+            self.give_up(&tenant);
+        } else if !tenant.has_ended() {
+            let left = Left::new(tenant, Does::LetGo, LETTING_GO, &self.threads.borrow());
+            self.left.insert(id, left);
         }
     }
 
@@ -183,9 +201,9 @@ impl Orphans {
 
 impl Drop for Orphans {
     fn drop(&mut self) {
-        for (orphan, _) in self.left.values() {
+        for left in self.left.values() {
             // One that has ended takes no notice.
-            orphan.tenant.kill();
+            left.tenant.kill();
         }
     }
 }

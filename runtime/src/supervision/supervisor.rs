@@ -9,12 +9,14 @@ use crate::{
     supervision::{
         Life, Place, ReadyGate, Reason, Roster, Threads,
         alone::overseen,
+        child::Child,
         core::{ChildId, Command, Flags, Generation, Input, Order, Policy, Refusal},
         guard::Guard,
         orphans::{LETTING_GO, Legacy, Listener, Orphan, Orphans},
         panics::install_hook,
         tenant::{Fate, Tenant},
         vitals::Vitals,
+        watchdog::Reprieve,
     },
     tid::Tid,
     time::Time,
@@ -80,20 +82,6 @@ pub enum SupervisorFact {
     Refused(Command, ChildId, Refusal),
     /// No child lives any more.
     Ended(Reason),
-}
-
-/// A child's declaration, and what holds its present life.
-struct Child {
-    spec: ChildSpec,
-    tenant: Option<Tenant>,
-    /// Nobody was told yet that this life has ended.
-    is_owed: bool,
-}
-
-impl Child {
-    const fn new(spec: ChildSpec) -> Self {
-        Self { spec, tenant: None, is_owed: false }
-    }
 }
 
 /// How far a supervisor is.
@@ -210,8 +198,23 @@ impl Supervisor {
         }
     }
 
+    /// Whoever's time is over and was not given to it has more of it.
+    fn reprieve_the_late(&mut self, now: Time) {
+        let mut tree = self.roster.tree.borrow_mut();
+        if tree.next_wake().is_none_or(|wake| wake > now) {
+            return;
+        }
+        for (id, child) in &mut self.children {
+            let Some(view) = tree.child(*id) else { continue };
+            if let Some(until) = child.reprieved(view.state, now) {
+                tree.handle(now, Input::Reprieved(*id, view.generation, until));
+            }
+        }
+    }
+
     fn decide(&mut self, input: Input) {
         let now = Time::now();
+        self.reprieve_the_late(now);
         let arrival = match &input {
             Input::AddChild(id, _) => self.roster.take_arrival(*id),
             Input::Started
@@ -219,6 +222,7 @@ impl Supervisor {
             | Input::BecameReady(..)
             | Input::Hung(..)
             | Input::Ended(..)
+            | Input::Reprieved(..)
             | Input::TimePassed
             | Input::StopOrdered
             | Input::TerminateChild(_)
@@ -245,7 +249,8 @@ impl Supervisor {
             }
             Order::Stop(id, _) => {
                 self.note(id, "told to stop");
-                if let Some(tenant) = self.children.get(&id).and_then(|child| child.tenant.as_ref()) {
+                if let Some(Child { spec, tenant: Some(tenant), reprieve, .. }) = self.children.get_mut(&id) {
+                    *reprieve = Some(self.threads.borrow().reprieve(tenant, spec.policy.stop_within));
                     tenant.stop();
                 }
             }
@@ -258,6 +263,9 @@ impl Supervisor {
             }
             Order::Ready(id) => {
                 self.note(id, "ready");
+                if let Some(child) = self.children.get_mut(&id) {
+                    child.reprieve = None;
+                }
                 (self.listener)(SupervisorFact::Ready(id));
             }
             Order::Gone(id, reason) => {
@@ -292,6 +300,7 @@ impl Supervisor {
     fn settle(&mut self, id: ChildId) {
         if let Some(child) = self.children.get_mut(&id) {
             child.is_owed = false;
+            child.reprieve = None;
         }
     }
 
@@ -330,7 +339,9 @@ impl Supervisor {
 
     fn spawn(&mut self, id: ChildId, generation: Generation) {
         install_hook();
-        let Some(Child { spec, tenant: held, is_owed }) = self.children.get_mut(&id) else { return };
+        let Some(Child { spec, tenant: held, reprieve, is_owed }) = self.children.get_mut(&id) else {
+            return;
+        };
         let mut threads = self.threads.borrow_mut();
         let post = self.post.clone();
         let (thread, seat) = match threads.get(&spec.place) {
@@ -344,6 +355,7 @@ impl Supervisor {
         let vitals = Vitals::new(&*spec.name);
         let tenant = Tenant::new(vitals, Some(seat), spec.policy.progress_within, report);
         threads.settle(&tenant);
+        *reprieve = Some(threads.reprieve(&tenant, spec.policy.start_within));
         (*held, *is_owed) = (Some(tenant.clone()), true);
         let ready = {
             let (post, vitals) = (self.post.clone(), tenant.vitals().clone());
@@ -367,12 +379,22 @@ impl Supervisor {
             self.threads.borrow_mut().give_up(&tenant);
             return;
         }
-        context.run_later(LETTING_GO, move |this, _| {
-            if !tenant.has_ended() {
-                this.threads.borrow_mut().give_up(&tenant);
-            }
-        });
+        let reprieve = self.threads.borrow().reprieve(&tenant, LETTING_GO);
+        let_go(tenant, reprieve, Time::now() + LETTING_GO, context);
     }
+}
+
+/// Gives up the thread of a life that was taken and has not ended by `deadline`.
+fn let_go(tenant: Tenant, mut reprieve: Reprieve, deadline: Time, context: &mut Context<Supervisor>) {
+    context.run_later(deadline.since(Time::now()), move |this, context| {
+        if tenant.has_ended() {
+            return;
+        }
+        match reprieve.until(deadline, Time::now(), false) {
+            Some(later) => let_go(tenant, reprieve, later, context),
+            None => this.threads.borrow_mut().give_up(&tenant),
+        }
+    });
 }
 
 /// Chance from the operating system: nodes that are one program and start at one instant wait for different times.

@@ -7,6 +7,7 @@ use std::{
         Arc, Mutex,
         atomic::{AtomicBool, AtomicI32, AtomicUsize, Ordering},
     },
+    time::Duration,
 };
 
 use actix_rt::{Arbiter, ArbiterHandle};
@@ -19,7 +20,7 @@ use super::{
     Place, Reason,
     place::Owner,
     tenant::{Fate, Tenant, WeakTenant},
-    watchdog::Watchdog,
+    watchdog::{Reprieve, Watchdog},
 };
 use crate::post::lock;
 
@@ -182,6 +183,11 @@ impl Threads {
             seat.add(tenant);
         }
         self.watchdog.watch(tenant);
+    }
+
+    /// A life has so much time for something, from now on.
+    pub(super) fn reprieve(&self, tenant: &Tenant, within: Duration) -> Reprieve {
+        self.watchdog.reprieve(tenant, within)
     }
 
     /// Gives up the thread that `hung` does not let go: it ends when it comes back; the next actor of this place gets a new

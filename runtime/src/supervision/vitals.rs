@@ -242,6 +242,10 @@ impl Vitals {
         self.stopping.store(true, Ordering::Relaxed);
     }
 
+    pub(super) fn is_ready(&self) -> bool {
+        self.ready.load(Ordering::Relaxed)
+    }
+
     /// Whether it should take messages: it is ready and was not told to stop.
     pub(super) fn should_take(&self) -> bool {
         self.ready.load(Ordering::Relaxed) && !self.stopping.load(Ordering::Relaxed)

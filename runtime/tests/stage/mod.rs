@@ -170,9 +170,13 @@ impl Stage {
         self.abandoned.at_most.load(Ordering::Relaxed)
     }
 
-    pub(crate) fn stop(self) -> Reason {
+    pub(crate) fn order_stop(&self) {
         // One that has given up by itself reads no more orders.
         let _ = self.supervisor.post(Input::StopOrdered);
+    }
+
+    pub(crate) fn stop(self) -> Reason {
+        self.order_stop();
         self.wait_end()
     }
 

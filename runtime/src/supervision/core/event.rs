@@ -1,6 +1,7 @@
 //! What a supervisor is told, and what it orders.
 
 use super::{ChildId, Generation, Policy, Reason};
+use crate::time::Time;
 
 /// What a supervisor is told.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -15,6 +16,9 @@ pub enum Input {
     Hung(ChildId, Generation, Reason),
     /// This child is gone.
     Ended(ChildId, Generation, Reason),
+    /// This life was not given all of its time to start or to stop: it has until then. Judges no deadline, so that several may
+    /// be reprieved before the next event does.
+    Reprieved(ChildId, Generation, Time),
     /// A deadline may have passed.
     TimePassed,
     /// Stop the children, last first.
@@ -43,6 +47,7 @@ impl Input {
             | Self::BecameReady(..)
             | Self::Hung(..)
             | Self::Ended(..)
+            | Self::Reprieved(..)
             | Self::TimePassed
             | Self::StopOrdered => None,
         }

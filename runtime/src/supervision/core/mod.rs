@@ -136,6 +136,7 @@ impl Core {
                 // Perhaps one whose life was taken: it has let go at last.
                 None => _ = self.abandoned.remove(&(id, generation)),
             },
+            Input::Reprieved(id, generation, until) => return self.reprieve(id, generation, until),
             Input::TimePassed => {}
             Input::AddChild(id, policy) => self.add(id, policy),
             Input::TerminateChild(id) => self.terminate(now, id),
@@ -228,6 +229,16 @@ impl Core {
             self.children[index].enter(ChildState::Ready, now);
             self.children[index].ready_since = now;
             self.orders.push_back(Order::Ready(id));
+        }
+    }
+
+    fn reprieve(&mut self, id: ChildId, generation: Generation, until: Time) {
+        let Some(index) = self.alive(id, generation) else { return };
+        match &mut self.children[index].state {
+            ChildState::Starting(deadline) | ChildState::Stopping(deadline) => {
+                *deadline = until.max(*deadline);
+            }
+            ChildState::Down | ChildState::BackingOff(_) | ChildState::Ready => {}
         }
     }
 

@@ -161,6 +161,9 @@ impl Model {
             return std::mem::take(&mut self.expected);
         }
         self.hear(now, input, restart_at);
+        if let Input::Reprieved(..) = input {
+            return std::mem::take(&mut self.expected);
+        }
         self.let_time_pass(now, restart_at);
         self.act(now);
         std::mem::take(&mut self.expected)
@@ -200,6 +203,14 @@ impl Model {
                 Some(index) => self.exit(now, index, reason, restart_at),
                 None => self.taken.retain(|taken| *taken != (*id, *life)),
             },
+            // Sinew: a deadline is later by the time that was not given.
+            Input::Reprieved(id, life, until) => {
+                if let Some(index) = self.index(*id, *life)
+                    && let Pid::Starting(_, at) | Pid::Stopping(_, at) = &mut self.children[index].pid
+                {
+                    *at = (*at).max(*until);
+                }
+            }
             Input::TimePassed
             | Input::AddChild(..)
             | Input::TerminateChild(_)

@@ -204,6 +204,12 @@ impl History {
                 Some((id, generation)) => Input::Ended(*id, *generation, Reason::Killed),
                 None => Input::Started,
             },
+            75..78 => {
+                let (id, generation) = self.any_life();
+                // Some are over already, which gives nothing.
+                let until = self.now + Duration::from_millis(self.chance.below(200));
+                Input::Reprieved(id, generation, until)
+            }
             _ => self.some_time_passes(),
         }
     }

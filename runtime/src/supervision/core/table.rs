@@ -83,6 +83,7 @@ fn inputs() -> Vec<(&'static str, Time, Input)> {
         ("Ended, panic", NOW, Input::Ended(CHILD, 1, panic())),
         ("Ended, thread", NOW, Input::Ended(CHILD, 1, Reason::ThreadEnded)),
         ("Ended, an earlier life", NOW, Input::Ended(CHILD, 0, panic())),
+        ("Reprieved", NOW, Input::Reprieved(CHILD, 1, LATER + Duration::from_nanos(1))),
         ("TimePassed, too early", NOW, Input::TimePassed),
         ("TimePassed, late", LATER, Input::TimePassed),
         ("StopOrdered", NOW, Input::StopOrdered),

@@ -114,6 +114,22 @@ fn a_child_that_never_becomes_ready_is_abandoned_and_tried_again() {
 }
 
 #[test]
+fn one_that_was_not_given_its_time_has_more_of_it_and_not_without_end() {
+    let mut core = supervisor(Strategy::RestForOne, 2);
+    all_ready(&mut core, 2);
+    core.handle(at(10), Input::StopOrdered);
+    orders(&mut core);
+    let (deadline, later) = (core.next_wake().unwrap(), core.next_wake().unwrap() + Duration::from_secs(1));
+    core.handle(deadline, Input::Reprieved(ChildId(1), 1, later));
+    core.handle(deadline, Input::Reprieved(ChildId(1), 1, deadline));
+    core.handle(deadline, Input::Reprieved(ChildId(1), 0, later + Duration::from_secs(1)));
+    core.handle(deadline, Input::TimePassed);
+    assert_eq!((orders(&mut core), core.next_wake()), (vec![], Some(later)));
+    core.handle(later, Input::TimePassed);
+    assert_eq!(orders(&mut core)[0], Order::Abandon(ChildId(1), 1));
+}
+
+#[test]
 fn stop_runs_backwards_and_abandons_who_does_not_obey() {
     let mut core = supervisor(Strategy::RestForOne, 2);
     all_ready(&mut core, 2);

@@ -116,12 +116,16 @@ impl Tree {
                 due.into_iter().for_each(|id| self.tell(now, id, Input::TimePassed));
             }
             // How a supervisor is, its own core says and nobody else.
-            Input::BecameReady(id, _) | Input::Hung(id, ..) | Input::Ended(id, ..)
+            Input::BecameReady(id, _)
+            | Input::Hung(id, ..)
+            | Input::Ended(id, ..)
+            | Input::Reprieved(id, ..)
                 if self.branches.contains_key(id) => {}
             Input::Released(id)
             | Input::BecameReady(id, _)
             | Input::Hung(id, ..)
             | Input::Ended(id, ..)
+            | Input::Reprieved(id, ..)
             | Input::AddChild(id, _)
             | Input::TerminateChild(id)
             | Input::RestartChild(id)

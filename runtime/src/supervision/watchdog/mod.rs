@@ -4,7 +4,10 @@
 //! its thread is demoted, its supervisor is told. It logs nothing and takes no lock that an actor's code could hold, so
 //! that what hangs an actor does not hang it.
 
+mod account;
+mod lateness;
 mod processor;
+mod reprieve;
 mod suspect;
 
 use std::{
@@ -17,7 +20,9 @@ use std::{
     time::Duration,
 };
 
+use lateness::Lateness;
 use processor::sample;
+pub(super) use reprieve::Reprieve;
 use suspect::{Hang, Look, Stall, StallSuspect, TurnSuspect};
 
 use super::{
@@ -32,8 +37,6 @@ use crate::{post::lock, time::Time};
 const PERIOD_MAX: Duration = Duration::from_millis(5);
 /// Time between two looks at least, however small a budget is.
 const PERIOD_MIN: Duration = Duration::from_millis(1);
-/// Lateness that is the system's ordinary one.
-const LATENESS: Duration = Duration::from_millis(1);
 /// Above every actor: it runs for microseconds at a time.
 const PRIORITY: u8 = 95;
 /// Lives that are watched at once at most. One more lives unwatched, and that is said.
@@ -52,6 +55,7 @@ struct Shared {
     /// Held by the thread while it looks; outlives it.
     table: Mutex<Vec<Watched>>,
     count: AtomicUsize,
+    lateness: Arc<Lateness>,
 }
 
 impl std::fmt::Debug for Shared {
@@ -72,6 +76,13 @@ impl Watchdog {
         }
         lock(&self.shared.arrivals).push(Watched::new(tenant.clone(), budget));
         self.wake();
+    }
+
+    /// Begins to keep an account of what this life is given of the time that it has for something from now on.
+    pub(super) fn reprieve(&self, tenant: &Tenant, within: Duration) -> Reprieve {
+        let reprieve = Reprieve::new(tenant.clone(), within, self.shared.lateness.clone());
+        self.wake();
+        reprieve
     }
 
     /// Wakes the thread; makes one if there is none that lives.
@@ -108,37 +119,32 @@ fn run(shared: &Weak<Shared>) {
             );
         });
     }
-    let mut due = Time::now();
     while let Some(shared) = shared.upgrade() {
         // A fault in here must not leave the node without a watchdog.
-        let looked = catch_unwind(AssertUnwindSafe(|| shared.look(due)));
+        let looked = catch_unwind(AssertUnwindSafe(|| shared.look()));
         let next = looked.unwrap_or_else(|panic| {
             tracing::error!(said = words(panic), "the watchdog panicked, and goes on");
             Some(Time::now() + PERIOD_MAX)
         });
+        shared.lateness.is_due(next);
         // Whoever owns this must be able to end it while it sleeps.
         drop(shared);
         match next {
-            Some(next) => {
-                due = next;
-                std::thread::park_timeout(next.since(Time::now()));
-            }
-            None => {
-                std::thread::park();
-                due = Time::now();
-            }
+            Some(next) => std::thread::park_timeout(next.since(Time::now())),
+            None => std::thread::park(),
         }
     }
 }
 
 impl Shared {
     /// One look at everybody. Returns when the next is due; `None` if there is nobody.
-    fn look(&self, due: Time) -> Option<Time> {
+    fn look(&self) -> Option<Time> {
         let now = Time::now();
-        let late = Some(now.since(due)).filter(|late| *late > LATENESS).unwrap_or_default();
+        let late = self.lateness.looks(now);
         let mut table = lock(&self.table);
         table.append(&mut lock(&self.arrivals));
-        let period = table.iter().map(|watched| watched.period).min()?;
+        let reading = self.lateness.has_readers().then_some(PERIOD_MAX);
+        let period = table.iter().map(|watched| watched.period).chain(reading).min()?;
         let before = table.len();
         table.retain_mut(|watched| look_at(watched, now, late, period));
         self.count.fetch_sub(before - table.len(), Ordering::Relaxed);

@@ -5,7 +5,7 @@
 
 use std::time::Duration;
 
-use super::processor::{Condition, Sample};
+use super::{account::Account, processor::Sample};
 use crate::{
     supervision::vitals::{Doing, Sight},
     time::Time,
@@ -35,38 +35,6 @@ pub(super) struct Hang {
     pub(super) excused: Duration,
 }
 
-/// Time that was not given to a thread, since its account was opened.
-#[derive(Clone, Copy, Debug, Default)]
-struct Account {
-    late: Duration,
-    first: Option<Sample>,
-    last: Option<Sample>,
-}
-
-impl Account {
-    /// Whether the thread waits for a CPU at this moment.
-    fn enter(&mut self, sample: Option<Sample>) -> bool {
-        let Some(sample) = sample else { return false };
-        let former = self.last.replace(sample);
-        self.first.get_or_insert(sample);
-        match sample.condition {
-            Condition::Stopped => true,
-            Condition::Runnable => {
-                former.is_some_and(|former| (former.ran, former.waited) == (sample.ran, sample.waited))
-            }
-            Condition::Blocked => false,
-        }
-    }
-
-    fn excused(&self) -> Duration {
-        let waited = match (self.first, self.last) {
-            (Some(first), Some(last)) => last.waited.saturating_sub(first.waited),
-            (None, _) | (_, None) => 0,
-        };
-        self.late + Duration::from_nanos(waited)
-    }
-}
-
 /// Watches one turn after the other.
 #[derive(Debug)]
 pub(super) struct TurnSuspect {
@@ -91,7 +59,7 @@ impl TurnSuspect {
     ) -> Option<Hang> {
         let Look { now, late, sight } = look;
         if sight.turn != self.turn || !sight.is_busy() {
-            let account = Account { late, ..Account::default() };
+            let account = Account::opened(late);
             *self = Self { turn: sight.turn, first_seen: now, looks: 0, account, ..*self };
             return None;
         }

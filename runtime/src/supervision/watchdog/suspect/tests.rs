@@ -1,7 +1,7 @@
 //! Who is accused, and who has an excuse.
 
 use super::*;
-use crate::supervision::vitals::Doing;
+use crate::supervision::{vitals::Doing, watchdog::processor::Condition};
 
 const MS: Duration = Duration::from_millis(1);
 const PERIOD: Duration = Duration::from_millis(5);

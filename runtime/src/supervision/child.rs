@@ -1,0 +1,32 @@
+//! One child of a supervisor, as its shell holds it.
+
+use super::{ChildSpec, ChildState, tenant::Tenant, watchdog::Reprieve};
+use crate::time::Time;
+
+/// A child's declaration, and what holds its present life.
+pub(super) struct Child {
+    pub(super) spec: ChildSpec,
+    pub(super) tenant: Option<Tenant>,
+    /// What it was given of the time that it has to start or to stop.
+    pub(super) reprieve: Option<Reprieve>,
+    /// Nobody was told yet that this life has ended.
+    pub(super) is_owed: bool,
+}
+
+impl Child {
+    pub(super) const fn new(spec: ChildSpec) -> Self {
+        Self { spec, tenant: None, reprieve: None, is_owed: false }
+    }
+
+    /// Until when it has more time, if this is over.
+    pub(super) fn reprieved(&mut self, state: ChildState, now: Time) -> Option<Time> {
+        let vitals = self.tenant.as_ref()?.vitals();
+        let (deadline, is_done) = match state {
+            ChildState::Starting(deadline) => (deadline, vitals.is_ready() || vitals.is_gone()),
+            ChildState::Stopping(deadline) => (deadline, vitals.is_gone()),
+            ChildState::Down | ChildState::BackingOff(_) | ChildState::Ready => return None,
+        };
+        let is_over = deadline <= now;
+        self.reprieve.as_mut().filter(|_| is_over)?.until(deadline, now, is_done)
+    }
+}

@@ -1,0 +1,48 @@
+//! The account of the time that a thread was not given: by the system's clock, and by the kernel's word.
+
+use std::time::Duration;
+
+use super::processor::{Condition, Sample};
+
+/// Time that was not given to a thread, since its account was opened.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Account {
+    /// Lateness of the watchdog itself.
+    pub(super) late: Duration,
+    first: Option<Sample>,
+    last: Option<Sample>,
+}
+
+impl Account {
+    /// An account that begins with this lateness.
+    pub(super) fn opened(late: Duration) -> Self {
+        Self { late, ..Self::default() }
+    }
+
+    /// Whether the thread waits for a CPU at this moment.
+    pub(super) fn enter(&mut self, sample: Option<Sample>) -> bool {
+        let Some(sample) = sample else { return false };
+        let former = self.last.replace(sample);
+        self.first.get_or_insert(sample);
+        match sample.condition {
+            Condition::Stopped => true,
+            Condition::Runnable => {
+                former.is_some_and(|former| (former.ran, former.waited) == (sample.ran, sample.waited))
+            }
+            Condition::Blocked => false,
+        }
+    }
+
+    pub(super) fn excused(&self) -> Duration {
+        self.late + self.waited()
+    }
+
+    /// Time for which it waited for a CPU.
+    pub(super) fn waited(&self) -> Duration {
+        let waited = match (self.first, self.last) {
+            (Some(first), Some(last)) => last.waited.saturating_sub(first.waited),
+            (None, _) | (_, None) => 0,
+        };
+        Duration::from_nanos(waited)
+    }
+}

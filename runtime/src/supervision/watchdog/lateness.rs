@@ -1,0 +1,95 @@
+//! How late the watchdog comes to its looks, summed up: time in which the process was stopped, or the host stood still.
+
+use std::{
+    sync::{
+        Mutex,
+        atomic::{AtomicUsize, Ordering},
+    },
+    time::Duration,
+};
+
+use super::PERIOD_MAX;
+use crate::{post::lock, time::Time};
+
+/// Lateness that is the system's ordinary one.
+const ORDINARY: Duration = Duration::from_millis(1);
+
+/// The watchdog's lateness. It is kept up to date while there is somebody who reads it.
+#[derive(Debug, Default)]
+pub(super) struct Lateness {
+    state: Mutex<State>,
+    readers: AtomicUsize,
+}
+
+#[derive(Clone, Copy, Debug, Default)]
+struct State {
+    sum: Duration,
+    /// When the next look is due; `None` if none is.
+    due: Option<Time>,
+}
+
+impl State {
+    fn late(&self, now: Time) -> Duration {
+        let late = self.due.map_or(Duration::ZERO, |due| now.since(due));
+        Some(late).filter(|late| *late > ORDINARY).unwrap_or_default()
+    }
+}
+
+impl Lateness {
+    /// The watchdog looks. Returns how late it is.
+    pub(super) fn looks(&self, now: Time) -> Duration {
+        let mut state = lock(&self.state);
+        let late = state.late(now);
+        // It may stand still before it can say when the next one is due.
+        *state = State { sum: state.sum + late, due: Some(now + PERIOD_MAX) };
+        late
+    }
+
+    /// The next look is due then.
+    pub(super) fn is_due(&self, at: Option<Time>) {
+        lock(&self.state).due = at;
+    }
+
+    /// All lateness so far, that of a look which is overdue at this moment too.
+    pub(super) fn sum(&self, now: Time) -> Duration {
+        let state = *lock(&self.state);
+        state.sum + state.late(now)
+    }
+
+    pub(super) fn has_readers(&self) -> bool {
+        self.readers.load(Ordering::Relaxed) > 0
+    }
+
+    /// Somebody reads it from now on. The watchdog is woken after this: its look is due.
+    pub(super) fn add_reader(&self, now: Time) {
+        self.readers.fetch_add(1, Ordering::Relaxed);
+        lock(&self.state).due.get_or_insert(now + PERIOD_MAX);
+    }
+
+    pub(super) fn remove_reader(&self) {
+        self.readers.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const fn ms(ms: u64) -> Time {
+        Time::from_nanos(ms * 1_000_000)
+    }
+
+    #[test]
+    fn a_look_that_is_overdue_counts_before_it_comes_and_once() {
+        let lateness = Lateness::default();
+        lateness.is_due(Some(ms(5)));
+        assert_eq!(lateness.sum(ms(6)), Duration::ZERO, "the ordinary lateness");
+        assert_eq!(lateness.sum(ms(305)), Duration::from_millis(300));
+        assert_eq!(lateness.looks(ms(405)), Duration::from_millis(400));
+        assert_eq!(lateness.sum(ms(510)), Duration::from_millis(500), "the next one may never come");
+        lateness.is_due(None);
+        assert_eq!(lateness.sum(ms(9_999)), Duration::from_millis(400), "it sleeps until it is needed");
+        lateness.add_reader(ms(9_995));
+        assert_eq!(lateness.sum(ms(10_100)), Duration::from_millis(500), "it does not come when it is");
+    }
+}
