@@ -1,0 +1,611 @@
+#ifndef SINEW_H
+#define SINEW_H
+
+/*
+ * Sinew: NodeAPI for C and C++. Written from the source of bindings/c; do not edit.
+ *
+ * An application connects to the node of its host, gets a transport address (an endpoint), and sends and receives
+ * messages on it. bindings/c/README.md has a first program; docs/SEMANTICS.md says what is promised of messages.
+ *
+ * Threads.  An endpoint is one thread's at a time: a call on it while another thread is in one returns
+ *   SINEW_ERROR_BUSY and does nothing. Different endpoints are independent: take one for each thread. Functions
+ *   without an endpoint may be called by any thread at any time. The sentence of sinew_last_error is the thread's own.
+ * Pointers.  NULL is refused where it is not said to be legal. Any other pointer must point to what its type says, for
+ *   the length of the call. Endpoints and messages are looked up, not followed: one that was unregistered, sent,
+ *   discarded or settled is refused. The `bytes` of a message are good until then, and not after.
+ * Out.  What is given back through a pointer is set if the function returns SINEW_OK, and else left as it was, unless
+ *   the function says more.
+ * Time.  All times are nanoseconds, as their names say; UINT64_MAX waits for ever.
+ * Texts.  UTF-8 with a length. Texts that the library hands out end with a zero and are not to be freed.
+ * Panics.  A fault of the library ends as SINEW_ERROR_PANIC and never leaves it. The endpoint on which it happened can
+ *   only be unregistered; everything else goes on.
+ * fork.  A child of fork may not use its parent's endpoints: they return SINEW_ERROR_FORKED there. It may register its
+ *   own if it may call malloc, that is if the parent had one thread. While a child lives that has not called exec, the
+ *   node does not see the parent's end: the child has its connections, too. Endpoints do not survive exec.
+ * Sizes.  sinew_options carries its size and may grow; all other structs and all numbers stay as they are as long as
+ *   SINEW_ABI does.
+ */
+
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+/**
+ * The version of this header's structs and functions. It grows when a program must be compiled anew.
+ */
+#define SINEW_ABI 1
+
+/**
+ * Bytes that any TID's text needs, its zero included: `255.255.255.255/ffffffff`.
+ */
+#define SINEW_TID_TEXT 32
+
+/**
+ * For `events` of `sinew_options`: `sinew.node_event`, nodes that are found, lost, restarted.
+ */
+#define SINEW_NODE_EVENTS 1
+
+/**
+ * For `events` of `sinew_options`: `sinew.requirement_event`, what is required is lost or there again.
+ */
+#define SINEW_REQUIREMENT_EVENTS 2
+
+/**
+ * What a call came to. Negative: an error, and `sinew_last_error` has a sentence about it.
+ */
+enum sinew_status
+#if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+  : int32_t
+#endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+ {
+    /**
+     * It is done.
+     */
+    SINEW_OK = 0,
+    /**
+     * No error, but nothing to hand out: no message came in time, or nobody has the name.
+     */
+    SINEW_NOTHING = 1,
+    /**
+     * An argument is NULL, no UTF-8, too long, or none of its legal values. Nothing was done.
+     */
+    SINEW_ERROR_INVALID_ARGUMENT = -1,
+    /**
+     * No node listens at the path, or this user may not connect. Nothing was done.
+     */
+    SINEW_ERROR_NO_NODE = -2,
+    /**
+     * The node refused the registration, in words. Nothing is registered.
+     */
+    SINEW_ERROR_REFUSED = -3,
+    /**
+     * What is required was not ready at the deadline. Nothing is registered.
+     */
+    SINEW_ERROR_WAITING = -4,
+    /**
+     * The node did not answer in time. Whether it did what was asked is not known.
+     */
+    SINEW_ERROR_NO_ANSWER = -5,
+    /**
+     * The connection to the node has ended, and the registration with it: unregister, then register again.
+     */
+    SINEW_ERROR_CLOSED = -6,
+    /**
+     * The node takes no bytes. The message was not sent; it may be made and sent again.
+     */
+    SINEW_ERROR_STALLED = -7,
+    /**
+     * The payload is longer than `sinew_payload_max`. Nothing was sent.
+     */
+    SINEW_ERROR_TOO_LONG = -8,
+    /**
+     * A request was not handled, or a group not joined. The outcome and the sentence say why.
+     */
+    SINEW_ERROR_NOT_HANDLED = -9,
+    /**
+     * No reply came in time. The request may have been handled.
+     */
+    SINEW_ERROR_NO_REPLY = -10,
+    /**
+     * The message asks for no reply. Nothing was sent.
+     */
+    SINEW_ERROR_NOT_ASKED = -11,
+    /**
+     * What came is not what its kind says.
+     */
+    SINEW_ERROR_MALFORMED = -12,
+    /**
+     * This is no endpoint: it was unregistered, or never registered. Nothing was done.
+     */
+    SINEW_ERROR_NO_SUCH_ENDPOINT = -13,
+    /**
+     * Another thread is in a call on this endpoint. Nothing was done.
+     */
+    SINEW_ERROR_BUSY = -14,
+    /**
+     * This is no message of this endpoint: it was sent, discarded or settled already. Nothing was done.
+     */
+    SINEW_ERROR_NO_SUCH_MESSAGE = -15,
+    /**
+     * Too many endpoints in this process, or too many messages in hand. Nothing was done.
+     */
+    SINEW_ERROR_TOO_MANY = -16,
+    /**
+     * The endpoint belongs to the process that this one was forked from. Nothing was done.
+     */
+    SINEW_ERROR_FORKED = -17,
+    /**
+     * A fault of this library. The endpoint can only be unregistered; all others go on.
+     */
+    SINEW_ERROR_PANIC = -18,
+};
+#ifndef __cplusplus
+#if __STDC_VERSION__ >= 202311L
+typedef enum sinew_status sinew_status;
+#else
+typedef int32_t sinew_status;
+#endif // __STDC_VERSION__ >= 202311L
+#endif // __cplusplus
+
+/**
+ * What became of a message.
+ */
+enum sinew_outcome
+#if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+  : int32_t
+#endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+ {
+    /**
+     * The destination has handled it.
+     */
+    SINEW_DELIVERED = 0,
+    /**
+     * Its time ran out before it was handled.
+     */
+    SINEW_EXPIRED = 1,
+    /**
+     * The destination failed, or ended with the message in hand.
+     */
+    SINEW_FAILED = 2,
+    /**
+     * The connection to its node was lost before it was sent: it was not handled.
+     */
+    SINEW_PEER_LOST = 3,
+    /**
+     * Nobody can say.
+     */
+    SINEW_UNKNOWN = 4,
+    /**
+     * Not handled: no application has this TID.
+     */
+    SINEW_REJECTED_NO_SUCH_APPLICATION = 16,
+    /**
+     * Not handled: the node is not known or not connected.
+     */
+    SINEW_REJECTED_NO_SUCH_NODE = 17,
+    /**
+     * Not handled: the destination does not handle this kind.
+     */
+    SINEW_REJECTED_UNKNOWN_KIND = 18,
+    /**
+     * Not handled: the payload is not what its kind says.
+     */
+    SINEW_REJECTED_MALFORMED = 19,
+    /**
+     * Not handled: a queue was full.
+     */
+    SINEW_REJECTED_QUEUE_FULL = 20,
+    /**
+     * Not handled: too long.
+     */
+    SINEW_REJECTED_TOO_LONG = 21,
+    /**
+     * Not handled: the application has ended.
+     */
+    SINEW_REJECTED_CLOSED = 22,
+    /**
+     * Not handled: the source is not the sender's.
+     */
+    SINEW_REJECTED_FORGED_SOURCE = 23,
+    /**
+     * Not handled: the handler refused it.
+     */
+    SINEW_REJECTED_BY_HANDLER = 24,
+    /**
+     * Not handled: this cannot be asked of this destination.
+     */
+    SINEW_REJECTED_UNSUPPORTED = 25,
+    /**
+     * Not handled: the application has ended and is not ready again.
+     */
+    SINEW_REJECTED_AWAY = 26,
+};
+#ifndef __cplusplus
+#if __STDC_VERSION__ >= 202311L
+typedef enum sinew_outcome sinew_outcome;
+#else
+typedef int32_t sinew_outcome;
+#endif // __STDC_VERSION__ >= 202311L
+#endif // __cplusplus
+
+/**
+ * How urgent a message is, and what a newer one does to an older.
+ */
+enum sinew_message_class
+#if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+  : int32_t
+#endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+ {
+    /**
+     * In order, and ahead of all else.
+     */
+    SINEW_CONTROL = 0,
+    /**
+     * Of each source and kind only the newest value: a late setpoint is a hazard. Cannot be confirmed.
+     */
+    SINEW_STREAM = 1,
+    /**
+     * In order; gives way to the others.
+     */
+    SINEW_BULK = 2,
+};
+#ifndef __cplusplus
+#if __STDC_VERSION__ >= 202311L
+typedef enum sinew_message_class sinew_message_class;
+#else
+typedef int32_t sinew_message_class;
+#endif // __STDC_VERSION__ >= 202311L
+#endif // __cplusplus
+
+/**
+ * An endpoint: a transport address of this process. Only pointers to it are handed out.
+ */
+typedef struct sinew_endpoint sinew_endpoint;
+
+/**
+ * A text: UTF-8, not ended by a zero. `SINEW_TEXT("...")` makes one of a literal, `sinew_text_of` of a C string.
+ */
+typedef struct sinew_text {
+    /**
+     * Its first byte; may be NULL if the length is 0.
+     */
+    const char *bytes;
+    /**
+     * Its length in bytes, a zero at its end not counted.
+     */
+    size_t length;
+} sinew_text;
+
+/**
+ * What an application asks for when it registers. Set all of it to zero, then `size`, then what is wanted; zero means the
+ * default everywhere. It grows at its end only: a program that was compiled with a shorter one is served as before.
+ */
+typedef struct sinew_options {
+    /**
+     * `sizeof(sinew_options)`, by which the library knows what the program was compiled with.
+     */
+    size_t size;
+    /**
+     * The name, 1 to 63 bytes without control characters, unique on the node. Default: none.
+     */
+    struct sinew_text name;
+    /**
+     * Names that must be ready, on this node or any, before this application is. At most 64. Default: none.
+     */
+    const struct sinew_text *required;
+    /**
+     * How many.
+     */
+    size_t required_count;
+    /**
+     * Names of the payload types that the application sends or handles, so that two which hash alike are found at
+     * registration. At most 64. Default: none.
+     */
+    const struct sinew_text *handled;
+    /**
+     * How many.
+     */
+    size_t handled_count;
+    /**
+     * A fixed address, `0x1000` to `0x7fffffff`. Default: a dynamic one.
+     */
+    uint32_t fixed_address;
+    /**
+     * The events of the node's layers to be received: `SINEW_NODE_EVENTS`, `SINEW_REQUIREMENT_EVENTS`. Default: none.
+     */
+    uint32_t events;
+    /**
+     * How long the registration may take, waiting for what is required included. Default: 60 s.
+     */
+    uint64_t deadline_ns;
+    /**
+     * How long a send waits at most while the node takes no bytes. Default: 1 s.
+     */
+    uint64_t patience_ns;
+    /**
+     * How many received messages wait in this process at most, each class by itself. Default: 256.
+     */
+    size_t inbox_capacity;
+} sinew_options;
+
+/**
+ * A transport ID (TID): the node's address in the upper half, the application's in the lower. 0 is nobody.
+ */
+typedef uint64_t sinew_tid;
+
+/**
+ * Type of a payload: see `sinew_kind_named`.
+ */
+typedef uint32_t sinew_kind;
+
+/**
+ * A message that is being made. `bytes` is writable until it is sent or discarded; do not change the other fields.
+ */
+typedef struct sinew_message {
+    /**
+     * Its payload, all zeros at first.
+     */
+    uint8_t *bytes;
+    /**
+     * Length of the payload in bytes.
+     */
+    size_t length;
+    /**
+     * For the library: by this it knows the message again.
+     */
+    uint64_t token;
+} sinew_message;
+
+/**
+ * A message that was received. `bytes` is readable until it is settled; do not change the fields.
+ */
+typedef struct sinew_received {
+    /**
+     * Its payload.
+     */
+    const uint8_t *bytes;
+    /**
+     * Length of the payload in bytes.
+     */
+    size_t length;
+    /**
+     * Who sent it; the sender's node answers for it.
+     */
+    sinew_tid source;
+    /**
+     * Whom it was sent to: this endpoint, a group, or everybody.
+     */
+    sinew_tid destination;
+    /**
+     * The source's n-th message, from 1.
+     */
+    uint64_t sequence;
+    /**
+     * When it was sent, on the clock of `sinew_now_ns`.
+     */
+    uint64_t sent_ns;
+    /**
+     * For the library: by this it knows the message again.
+     */
+    uint64_t token;
+    /**
+     * Type of the payload: compare it with `sinew_kind_named`.
+     */
+    sinew_kind kind;
+    /**
+     * One of `sinew_message_class`.
+     */
+    uint8_t message_class;
+    /**
+     * Whether the sender waits for `sinew_reply`.
+     */
+    bool wants_reply;
+    /**
+     * Zero.
+     */
+    uint8_t reserved[2];
+} sinew_received;
+
+#ifdef __cplusplus
+extern "C" {
+#endif // __cplusplus
+
+/**
+ * The `SINEW_ABI` that the library was built with. A program that loads the library at run time compares.
+ */
+uint32_t sinew_abi(void);
+
+/**
+ * Connects to the node whose configuration's `lncl.socket` is `socket`, asks for a transport address, and waits until
+ * everything that is required is ready (the paper's RegisterTransportAddress). `options` may be NULL: a dynamic address,
+ * no name. Any thread; blocks until the deadline of the options at most.
+ *
+ * The endpoint is one thread's at a time. A process may have 256.
+ */
+sinew_status sinew_register_transport_address(struct sinew_text socket,
+                                              const struct sinew_options *options,
+                                              struct sinew_endpoint **endpoint);
+
+/**
+ * Gives the address back, and waits until the node has taken it, 2 s at most: then the name is free. Whatever it returns,
+ * but for `SINEW_ERROR_BUSY` and `SINEW_ERROR_FORKED`, the endpoint is gone and `*endpoint` is NULL. Messages that were
+ * received and not settled end as Failed; messages that were made and not sent are discarded; the memory of both is gone.
+ */
+sinew_status sinew_unregister(struct sinew_endpoint **endpoint);
+
+/**
+ * The address that was registered; 0 if this is no endpoint or another thread is in a call on it.
+ */
+sinew_tid sinew_endpoint_tid(const struct sinew_endpoint *endpoint);
+
+/**
+ * Longest payload that the node takes, in bytes; 0 if this is no endpoint or another thread is in a call on it.
+ */
+size_t sinew_payload_max(const struct sinew_endpoint *endpoint);
+
+/**
+ * The name of the node, ended by a zero, until the endpoint is unregistered; NULL if this is no endpoint or another thread
+ * is in a call on it.
+ */
+const char *sinew_node_name(const struct sinew_endpoint *endpoint);
+
+/**
+ * Asks who has `name` now, on any node; waits `within_ns` at most. `SINEW_NOTHING` and a `*tid` of 0 if nobody has it.
+ */
+sinew_status sinew_resolve(struct sinew_endpoint *endpoint,
+                           struct sinew_text name,
+                           uint64_t within_ns,
+                           sinew_tid *tid);
+
+/**
+ * Joins a group: what is sent to `sinew_group` of this name reaches this endpoint from now on. Waits 2 s at most.
+ */
+sinew_status sinew_join_group(struct sinew_endpoint *endpoint,
+                              struct sinew_text name);
+
+/**
+ * Leaves a group. Waits 2 s at most.
+ */
+sinew_status sinew_leave_group(struct sinew_endpoint *endpoint, struct sinew_text name);
+
+/**
+ * The members of the group called `name`, on every node; 0 if it is no text.
+ */
+sinew_tid sinew_group(struct sinew_text name);
+
+/**
+ * The kind of the payload type called `name`, the same in every program and language; 0 if it is no text.
+ */
+sinew_kind sinew_kind_named(struct sinew_text name);
+
+/**
+ * The TID that is written in `text`, as in `10.0.0.7/1001`.
+ */
+sinew_status sinew_tid_parse(struct sinew_text text, sinew_tid *tid);
+
+/**
+ * Writes a TID as text, ended by a zero, into `capacity` bytes; `SINEW_TID_TEXT` are always enough.
+ */
+sinew_status sinew_tid_text(sinew_tid tid, char *text, size_t capacity);
+
+/**
+ * The present moment in nanoseconds of the host's monotonic clock: the clock of `sent_ns`.
+ */
+uint64_t sinew_now_ns(void);
+
+/**
+ * Lends `length` writable bytes, all zeros, for a payload of `kind` to `destination` (the paper's CreateMessage).
+ * `message_class` is one of `sinew_message_class`. Up to 64 messages may be in the making. Does not block.
+ */
+sinew_status sinew_create_message(struct sinew_endpoint *endpoint,
+                                  sinew_tid destination,
+                                  sinew_kind kind,
+                                  int32_t message_class,
+                                  size_t length,
+                                  struct sinew_message *message);
+
+/**
+ * Gives a message back that is not to be sent. `*message` is all zeros then. Does not block.
+ */
+sinew_status sinew_discard_message(struct sinew_endpoint *endpoint, struct sinew_message *message);
+
+/**
+ * Sends a message (the paper's SendMessage). What becomes of it is not told. If it is this endpoint's it is gone when this
+ * returns, sent or not: `*message` is all zeros then. Blocks for the `patience_ns` of the options at most.
+ */
+sinew_status sinew_send_message(struct sinew_endpoint *endpoint,
+                                struct sinew_message *message);
+
+/**
+ * Lends, copies and sends in one call. `bytes` may be NULL if `length` is 0. Blocks as `sinew_send_message`.
+ */
+sinew_status sinew_send_bytes(struct sinew_endpoint *endpoint,
+                              sinew_tid destination,
+                              sinew_kind kind,
+                              int32_t message_class,
+                              const uint8_t *bytes,
+                              size_t length);
+
+/**
+ * Sends a message and waits for what becomes of it; `SINEW_UNKNOWN` when nobody has said so after `within_ns`. The message
+ * expires where it waits when it is older. `*outcome` is set if this returns `SINEW_OK`. The message is gone as with
+ * `sinew_send_message`. What comes meanwhile waits to be received.
+ */
+sinew_status sinew_send_message_confirmed(struct sinew_endpoint *endpoint,
+                                          struct sinew_message *message,
+                                          uint64_t within_ns,
+                                          sinew_outcome *outcome);
+
+/**
+ * Sends a message as a request, in class Control, and waits for the reply, `within_ns` at most. `*reply` is set if this
+ * returns `SINEW_OK`; settle it when it has been read. If it returns `SINEW_ERROR_NOT_HANDLED` and `outcome` is not NULL,
+ * `*outcome` says what became of the request. The message is gone as with `sinew_send_message`.
+ */
+sinew_status sinew_ask(struct sinew_endpoint *endpoint,
+                       struct sinew_message *message,
+                       uint64_t within_ns,
+                       struct sinew_received *reply,
+                       sinew_outcome *outcome);
+
+/**
+ * Sends a message as the reply to a request in hand; it goes to who asked, whatever destination it was created for. The
+ * request is still to be settled. The message is gone as with `sinew_send_message`.
+ */
+sinew_status sinew_reply(struct sinew_endpoint *endpoint,
+                         const struct sinew_received *request,
+                         struct sinew_message *message);
+
+/**
+ * Waits for a message, `within_ns` at most; `SINEW_NOTHING` if none came (the paper's ReceiveMessage). Control comes first,
+ * then Stream, of which only the newest value of each source and kind, then Bulk. `*received` is set if this returns
+ * `SINEW_OK`; settle it when it has been handled. Up to 1024 may be in hand.
+ *
+ * Signals do not end the wait: a loop that is to end at one takes a short `within_ns` and looks each time.
+ */
+sinew_status sinew_receive_message(struct sinew_endpoint *endpoint,
+                                   uint64_t within_ns,
+                                   struct sinew_received *received);
+
+/**
+ * Says what became of a message in hand, which its sender is told if it asked, and gives its memory back. `outcome` is
+ * `SINEW_DELIVERED` if it was handled, `SINEW_FAILED`, or one of the rejections. `*received` is all zeros then.
+ */
+sinew_status sinew_settle_message(struct sinew_endpoint *endpoint,
+                                  struct sinew_received *received,
+                                  int32_t outcome);
+
+/**
+ * A text for a status: what it means in general. Never NULL. Any thread.
+ */
+const char *sinew_status_text(int32_t status);
+
+/**
+ * A sentence about the last error of the calling thread: what was wrong this time, and what to do. Never NULL; empty if
+ * there was no error. It stays until the thread's next error.
+ */
+const char *sinew_last_error(void);
+
+/**
+ * A text for an outcome. Never NULL. Any thread.
+ */
+const char *sinew_outcome_text(int32_t outcome);
+
+#ifdef __cplusplus
+}  // extern "C"
+#endif  // __cplusplus
+
+/** A text of a string literal. C only: in C++ take sinew.hpp, or sinew_text_of. */
+#define SINEW_TEXT(literal) ((sinew_text){ "" literal, sizeof(literal) - 1 })
+
+/** A text of a C string; of none if it is NULL. */
+static inline sinew_text sinew_text_of(const char *string)
+{
+    sinew_text text;
+    text.bytes = string;
+    text.length = string ? strlen(string) : 0;
+    return text;
+}
+
+#endif /* SINEW_H */

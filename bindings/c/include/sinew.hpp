@@ -1,0 +1,327 @@
+// Sinew: NodeAPI for C++17 and later, on top of sinew.h, which says what is promised. Header only.
+//
+// Errors are exceptions of type sinew::error. A program that goes on with an endpoint that has ended, or with a message that
+// was not sent, moves a limb by chance; an exception cannot be overlooked, a status can. What belongs to the ordinary course
+// of a control loop is no error and throws nothing: no message in time (std::optional), a name that nobody has
+// (std::optional), a message that was not handled (its outcome). Programs without exceptions take sinew.h.
+//
+// Everything here belongs to one thread at a time, with the endpoint that it came from.
+#ifndef SINEW_HPP
+#define SINEW_HPP
+
+#include "sinew.h"
+
+#include <chrono>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <exception>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <string_view>
+#include <type_traits>
+#include <utility>
+#include <vector>
+
+#if !defined(__cpp_exceptions)
+#error "sinew.hpp reports errors by exceptions; take sinew.h with -fno-exceptions"
+#endif
+
+namespace sinew {
+
+using tid = sinew_tid;
+using kind = sinew_kind;
+using duration = std::chrono::nanoseconds;
+
+/// A call that failed: which status, and the library's sentence about it.
+class error : public std::runtime_error {
+public:
+    explicit error(sinew_status status) : std::runtime_error(sinew_last_error()), status_(status) {}
+    sinew_status status() const noexcept { return status_; }
+
+private:
+    sinew_status status_;
+};
+
+namespace detail {
+
+inline sinew_status check(sinew_status status)
+{
+    if (status < 0)
+        throw error(status);
+    return status;
+}
+
+inline sinew_text text(std::string_view view) noexcept
+{
+    sinew_text text;
+    text.bytes = view.data();
+    text.length = view.size();
+    return text;
+}
+
+inline std::uint64_t nanoseconds(duration within) noexcept
+{
+    return within.count() < 0 ? 0 : static_cast<std::uint64_t>(within.count());
+}
+
+} // namespace detail
+
+/// The kind of the payload type called `name`.
+inline kind kind_named(std::string_view name) { return sinew_kind_named(detail::text(name)); }
+
+/// The members of the group called `name`, on every node.
+inline tid group(std::string_view name) { return sinew_group(detail::text(name)); }
+
+/// A TID as text, as in `10.0.0.7/1001`.
+inline std::string to_string(tid address)
+{
+    char text[SINEW_TID_TEXT];
+    detail::check(sinew_tid_text(address, text, sizeof text));
+    return text;
+}
+
+/// What an application asks for when it registers; what is left as it is has the default of sinew_options.
+struct options {
+    std::string name;
+    std::vector<std::string> required;
+    std::vector<std::string> handled;
+    std::uint32_t fixed_address = 0;
+    std::uint32_t events = 0;
+    duration deadline{};
+    duration patience{};
+    std::size_t inbox_capacity = 0;
+};
+
+/// A message that is being made: a container of writable bytes. One that is not sent is discarded at its end.
+class message {
+public:
+    message(message &&other) noexcept
+        : endpoint_(other.endpoint_), raw_(std::exchange(other.raw_, sinew_message{})) {}
+    message &operator=(message &&other) noexcept
+    {
+        std::swap(endpoint_, other.endpoint_);
+        std::swap(raw_, other.raw_);
+        return *this;
+    }
+    ~message()
+    {
+        if (raw_.token != 0)
+            (void)sinew_discard_message(endpoint_, &raw_);
+    }
+
+    std::uint8_t *data() noexcept { return raw_.bytes; }
+    std::size_t size() const noexcept { return raw_.length; }
+    std::uint8_t *begin() noexcept { return data(); }
+    std::uint8_t *end() noexcept { return data() + size(); }
+
+private:
+    friend class endpoint;
+    explicit message(sinew_endpoint *endpoint) noexcept : endpoint_(endpoint), raw_{} {}
+
+    sinew_endpoint *endpoint_;
+    sinew_message raw_;
+};
+
+/// A message that was received: a container of readable bytes. At its end it counts as handled, or as failed if that end
+/// is an exception's doing; settle says something else, or says it sooner.
+class received {
+public:
+    received(received &&other) noexcept
+        : endpoint_(other.endpoint_), raw_(std::exchange(other.raw_, sinew_received{})), exceptions_(other.exceptions_) {}
+    received &operator=(received &&other) noexcept
+    {
+        std::swap(endpoint_, other.endpoint_);
+        std::swap(raw_, other.raw_);
+        std::swap(exceptions_, other.exceptions_);
+        return *this;
+    }
+    ~received()
+    {
+        if (raw_.token == 0)
+            return;
+        const bool failed = std::uncaught_exceptions() > exceptions_;
+        (void)sinew_settle_message(endpoint_, &raw_, failed ? SINEW_FAILED : SINEW_DELIVERED);
+    }
+
+    const std::uint8_t *data() const noexcept { return raw_.bytes; }
+    std::size_t size() const noexcept { return raw_.length; }
+    const std::uint8_t *begin() const noexcept { return data(); }
+    const std::uint8_t *end() const noexcept { return data() + size(); }
+
+    tid source() const noexcept { return raw_.source; }
+    tid destination() const noexcept { return raw_.destination; }
+    sinew::kind kind() const noexcept { return raw_.kind; }
+    std::uint64_t sequence() const noexcept { return raw_.sequence; }
+    bool wants_reply() const noexcept { return raw_.wants_reply; }
+    /// Time since it was sent.
+    duration age() const noexcept
+    {
+        const std::uint64_t now = sinew_now_ns();
+        return duration(now > raw_.sent_ns ? static_cast<std::int64_t>(now - raw_.sent_ns) : 0);
+    }
+
+    /// The payload as a plain struct; nothing if it has another size.
+    template <class T> std::optional<T> as() const
+    {
+        static_assert(std::is_trivially_copyable_v<T>, "only a plain struct can be copied out of bytes");
+        if (size() != sizeof(T))
+            return std::nullopt;
+        T value;
+        std::memcpy(&value, data(), sizeof(T));
+        return value;
+    }
+
+    /// Says what became of it, and gives its bytes back.
+    void settle(sinew_outcome outcome) { detail::check(sinew_settle_message(endpoint_, &raw_, outcome)); }
+
+private:
+    friend class endpoint;
+    explicit received(sinew_endpoint *endpoint) noexcept : endpoint_(endpoint), raw_{} {}
+
+    sinew_endpoint *endpoint_;
+    sinew_received raw_;
+    int exceptions_ = std::uncaught_exceptions();
+};
+
+/// A transport address of this process. Its end gives the address back.
+class endpoint {
+public:
+    /// Registers at the node whose socket is at `socket`, and waits until everything that is required is ready.
+    explicit endpoint(std::string_view socket, const options &wanted = {})
+    {
+        const auto required = texts(wanted.required), handled = texts(wanted.handled);
+        sinew_options raw{};
+        raw.size = sizeof raw;
+        raw.name = detail::text(wanted.name);
+        raw.required = required.data();
+        raw.required_count = required.size();
+        raw.handled = handled.data();
+        raw.handled_count = handled.size();
+        raw.fixed_address = wanted.fixed_address;
+        raw.events = wanted.events;
+        raw.deadline_ns = detail::nanoseconds(wanted.deadline);
+        raw.patience_ns = detail::nanoseconds(wanted.patience);
+        raw.inbox_capacity = wanted.inbox_capacity;
+        detail::check(sinew_register_transport_address(detail::text(socket), &raw, &raw_));
+    }
+    endpoint(endpoint &&other) noexcept : raw_(std::exchange(other.raw_, nullptr)) {}
+    endpoint &operator=(endpoint &&other) noexcept
+    {
+        std::swap(raw_, other.raw_);
+        return *this;
+    }
+    ~endpoint()
+    {
+        if (raw_ != nullptr)
+            (void)sinew_unregister(&raw_);
+    }
+
+    tid address() const noexcept { return sinew_endpoint_tid(raw_); }
+    std::size_t payload_max() const noexcept { return sinew_payload_max(raw_); }
+    std::string node_name() const
+    {
+        const char *name = sinew_node_name(raw_);
+        return name != nullptr ? name : "";
+    }
+
+    /// Lends writable bytes, all zeros, for a message.
+    message create(tid destination, kind what, std::size_t length, sinew_message_class how = SINEW_CONTROL)
+    {
+        message created(raw_);
+        detail::check(sinew_create_message(raw_, destination, what, how, length, &created.raw_));
+        return created;
+    }
+
+    /// Sends a message; what becomes of it is not told.
+    void send(message &&made) { detail::check(sinew_send_message(raw_, &made.raw_)); }
+    /// Sends a plain struct.
+    template <class T> void send(tid destination, kind what, const T &value, sinew_message_class how = SINEW_CONTROL)
+    {
+        send(filled(destination, what, value, how));
+    }
+
+    /// Sends a message and waits for what becomes of it; SINEW_UNKNOWN when nobody has said so in time.
+    [[nodiscard]] sinew_outcome confirm(message &&made, duration within)
+    {
+        sinew_outcome outcome = SINEW_UNKNOWN;
+        detail::check(sinew_send_message_confirmed(raw_, &made.raw_, detail::nanoseconds(within), &outcome));
+        return outcome;
+    }
+    /// Sends a plain struct and waits for what becomes of it.
+    template <class T> [[nodiscard]] sinew_outcome confirm(tid destination, kind what, const T &value, duration within)
+    {
+        return confirm(filled(destination, what, value, SINEW_CONTROL), within);
+    }
+
+    /// Sends a request and waits for the reply.
+    received ask(message &&made, duration within)
+    {
+        received reply(raw_);
+        detail::check(sinew_ask(raw_, &made.raw_, detail::nanoseconds(within), &reply.raw_, nullptr));
+        return reply;
+    }
+    /// Sends a plain struct as a request and waits for the reply.
+    template <class T> received ask(tid destination, kind what, const T &value, duration within)
+    {
+        return ask(filled(destination, what, value, SINEW_CONTROL), within);
+    }
+
+    /// Replies to a request.
+    void reply(const received &request, message &&made) { detail::check(sinew_reply(raw_, &request.raw_, &made.raw_)); }
+    /// Replies with a plain struct.
+    template <class T> void reply(const received &request, kind what, const T &value)
+    {
+        reply(request, filled(request.source(), what, value, SINEW_CONTROL));
+    }
+
+    /// Waits for a message; nothing if none came in time.
+    [[nodiscard]] std::optional<received> receive(duration within)
+    {
+        received came(raw_);
+        const sinew_status status = sinew_receive_message(raw_, detail::nanoseconds(within), &came.raw_);
+        if (detail::check(status) == SINEW_NOTHING)
+            return std::nullopt;
+        return came;
+    }
+
+    /// Who has a name now, on any node; nothing if nobody has.
+    [[nodiscard]] std::optional<tid> resolve(std::string_view name, duration within)
+    {
+        tid found = 0;
+        const sinew_status status = sinew_resolve(raw_, detail::text(name), detail::nanoseconds(within), &found);
+        if (detail::check(status) == SINEW_NOTHING)
+            return std::nullopt;
+        return found;
+    }
+
+    void join(std::string_view name) { detail::check(sinew_join_group(raw_, detail::text(name))); }
+    void leave(std::string_view name) { detail::check(sinew_leave_group(raw_, detail::text(name))); }
+
+    /// Gives the address back and waits until the node has taken it: then the name is free.
+    void unregister() { detail::check(sinew_unregister(&raw_)); }
+
+private:
+    static std::vector<sinew_text> texts(const std::vector<std::string> &strings)
+    {
+        std::vector<sinew_text> texts;
+        for (const std::string &string : strings)
+            texts.push_back(detail::text(string));
+        return texts;
+    }
+
+    template <class T> message filled(tid destination, kind what, const T &value, sinew_message_class how)
+    {
+        static_assert(std::is_trivially_copyable_v<T>, "only a plain struct can be sent as its bytes");
+        message made = create(destination, what, sizeof value, how);
+        std::memcpy(made.data(), &value, sizeof value);
+        return made;
+    }
+
+    sinew_endpoint *raw_ = nullptr;
+};
+
+} // namespace sinew
+
+#endif // SINEW_HPP

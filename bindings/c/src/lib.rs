@@ -1,0 +1,39 @@
+//! NodeAPI for C and C++. What it promises is said in `include/sinew.h`, which is written from this source, and in
+//! `README.md`.
+//!
+//! | file | what is there |
+//! | --- | --- |
+//! | `border.rs` | what every call passes: panics are caught, errors become a number and a sentence, NULL is refused |
+//! | `table.rs` | handles: numbers that are looked up, never followed; one thread at a time |
+//! | `session.rs`, `hand.rs` | an endpoint with the messages that the program in C has in hand |
+//! | `fork.rs` | a child of `fork` is told apart |
+//! | `registration.rs`, `sending.rs`, `receiving.rs`, `naming.rs`, `words.rs` | the functions |
+//! | `options.rs`, `text.rs`, `message.rs`, `status.rs` | the types |
+//!
+//! All modules are private: the functions are reached through C only, whose programs must keep what the header asks of
+//! every pointer. That is the one thing that the unsafe blocks here stand on; what can be checked is checked.
+
+// In this order the functions stand in the header.
+mod registration;
+
+mod naming;
+
+mod sending;
+
+mod receiving;
+
+mod words;
+
+mod options;
+
+mod message;
+
+mod text;
+
+mod status;
+
+mod border;
+mod fork;
+mod hand;
+mod session;
+mod table;

@@ -1,0 +1,123 @@
+//! Messages as C sees them: where the bytes are, and a number by which the library knows them again.
+
+use sinew::{Class, Tid};
+
+/// A transport ID (TID): the node's address in the upper half, the application's in the lower. 0 is nobody.
+pub type TidBits = u64;
+
+/// Type of a payload: see `sinew_kind_named`.
+pub type KindBits = u32;
+
+/// An endpoint: a transport address of this process. Only pointers to it are handed out.
+#[derive(Debug)]
+pub struct Endpoint {
+    _opaque: (),
+}
+
+/// How urgent a message is, and what a newer one does to an older.
+#[derive(Clone, Copy, Debug)]
+#[repr(i32)]
+#[allow(
+    clippy::enum_variant_names,
+    dead_code,
+    reason = "these are the names in C, which hands their numbers in"
+)]
+pub enum MessageClass {
+    /// In order, and ahead of all else.
+    SinewControl = 0,
+    /// Of each source and kind only the newest value: a late setpoint is a hazard. Cannot be confirmed.
+    SinewStream = 1,
+    /// In order; gives way to the others.
+    SinewBulk = 2,
+}
+
+/// A message that is being made. `bytes` is writable until it is sent or discarded; do not change the other fields.
+#[derive(Clone, Copy, Debug)]
+#[repr(C)]
+pub struct Message {
+    /// Its payload, all zeros at first.
+    pub bytes: *mut u8,
+    /// Length of the payload in bytes.
+    pub length: usize,
+    /// For the library: by this it knows the message again.
+    pub token: u64,
+}
+
+/// A message that was received. `bytes` is readable until it is settled; do not change the fields.
+#[derive(Clone, Copy, Debug)]
+#[repr(C)]
+pub struct Received {
+    /// Its payload.
+    pub bytes: *const u8,
+    /// Length of the payload in bytes.
+    pub length: usize,
+    /// Who sent it; the sender's node answers for it.
+    pub source: TidBits,
+    /// Whom it was sent to: this endpoint, a group, or everybody.
+    pub destination: TidBits,
+    /// The source's n-th message, from 1.
+    pub sequence: u64,
+    /// When it was sent, on the clock of `sinew_now_ns`.
+    pub sent_ns: u64,
+    /// For the library: by this it knows the message again.
+    pub token: u64,
+    /// Type of the payload: compare it with `sinew_kind_named`.
+    pub kind: KindBits,
+    /// One of `sinew_message_class`.
+    pub message_class: u8,
+    /// Whether the sender waits for `sinew_reply`.
+    pub wants_reply: bool,
+    /// Zero.
+    pub reserved: [u8; 2],
+}
+
+impl Message {
+    /// What is left in the caller's memory when the library has taken the message.
+    pub(crate) const GONE: Self = Self { bytes: std::ptr::null_mut(), length: 0, token: 0 };
+}
+
+impl Received {
+    /// As [`Message::GONE`].
+    pub(crate) const GONE: Self = Self {
+        bytes: std::ptr::null(),
+        length: 0,
+        source: Tid::NONE.bits(),
+        destination: Tid::NONE.bits(),
+        sequence: 0,
+        sent_ns: 0,
+        token: 0,
+        kind: 0,
+        message_class: 0,
+        wants_reply: false,
+        reserved: [0; 2],
+    };
+
+    pub(crate) fn of(received: &sinew::Received, token: u64) -> Self {
+        Self {
+            bytes: received.bytes().as_ptr(),
+            length: received.bytes().len(),
+            source: received.source().bits(),
+            destination: received.destination().bits(),
+            sequence: received.sequence(),
+            sent_ns: received.sent().as_nanos(),
+            token,
+            kind: received.kind().bits(),
+            message_class: code_of(received.class()),
+            wants_reply: received.wants_reply(),
+            reserved: [0; 2],
+        }
+    }
+}
+
+/// The class with this number.
+pub(crate) fn class_of(code: i32) -> Option<Class> {
+    [Class::Control, Class::Stream, Class::Bulk].into_iter().find(|class| i32::from(code_of(*class)) == code)
+}
+
+const fn code_of(class: Class) -> u8 {
+    match class {
+        Class::Control => MessageClass::SinewControl as u8,
+        Class::Stream => MessageClass::SinewStream as u8,
+        Class::Bulk => MessageClass::SinewBulk as u8,
+    }
+}

@@ -1,0 +1,47 @@
+//! Messages in: handed out, and settled.
+
+use std::{mem::MaybeUninit, time::Duration};
+
+use crate::{
+    border::{call, present, write},
+    message::{Endpoint, Received},
+    registration::with,
+    status::{Fault, Status},
+    words::outcome_of,
+};
+
+/// Waits for a message, `within_ns` at most; `SINEW_NOTHING` if none came (the paper's ReceiveMessage). Control comes first,
+/// then Stream, of which only the newest value of each source and kind, then Bulk. `*received` is set if this returns
+/// `SINEW_OK`; settle it when it has been handled. Up to 1024 may be in hand.
+///
+/// Signals do not end the wait: a loop that is to end at one takes a short `within_ns` and looks each time.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_receive_message(
+    endpoint: *mut Endpoint,
+    within_ns: u64,
+    received: Option<&mut MaybeUninit<Received>>,
+) -> Status {
+    call(|| {
+        let received = present(received, "received")?;
+        match with(endpoint, |session| session.receive(Duration::from_nanos(within_ns)))? {
+            Some(message) => Ok(write(received, message)),
+            None => Ok(Status::SinewNothing),
+        }
+    })
+}
+
+/// Says what became of a message in hand, which its sender is told if it asked, and gives its memory back. `outcome` is
+/// `SINEW_DELIVERED` if it was handled, `SINEW_FAILED`, or one of the rejections. `*received` is all zeros then.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_settle_message(
+    endpoint: *mut Endpoint,
+    received: Option<&mut Received>,
+    outcome: i32,
+) -> Status {
+    call(|| {
+        let received = present(received, "received")?;
+        let outcome = outcome_of(outcome)
+            .ok_or_else(|| Fault::argument(format!("`outcome` is {outcome}: take one of sinew_outcome")))?;
+        with(endpoint, |session| session.settle(received, outcome)).map(|()| Status::SinewOk)
+    })
+}

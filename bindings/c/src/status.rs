@@ -1,0 +1,222 @@
+//! What a call came to: a number, a text for each number, and a sentence about this one case.
+
+use std::{cell::RefCell, ffi::CStr, ffi::CString};
+
+use sinew::ApiError;
+
+/// What a call came to. Negative: an error, and `sinew_last_error` has a sentence about it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(i32)]
+#[allow(
+    clippy::enum_variant_names,
+    dead_code,
+    reason = "these are the names in C, which has no other name spaces, and C may hand them back"
+)]
+pub enum Status {
+    /// It is done.
+    SinewOk = 0,
+    /// No error, but nothing to hand out: no message came in time, or nobody has the name.
+    SinewNothing = 1,
+    /// An argument is NULL, no UTF-8, too long, or none of its legal values. Nothing was done.
+    SinewErrorInvalidArgument = -1,
+    /// No node listens at the path, or this user may not connect. Nothing was done.
+    SinewErrorNoNode = -2,
+    /// The node refused the registration, in words. Nothing is registered.
+    SinewErrorRefused = -3,
+    /// What is required was not ready at the deadline. Nothing is registered.
+    SinewErrorWaiting = -4,
+    /// The node did not answer in time. Whether it did what was asked is not known.
+    SinewErrorNoAnswer = -5,
+    /// The connection to the node has ended, and the registration with it: unregister, then register again.
+    SinewErrorClosed = -6,
+    /// The node takes no bytes. The message was not sent; it may be made and sent again.
+    SinewErrorStalled = -7,
+    /// The payload is longer than `sinew_payload_max`. Nothing was sent.
+    SinewErrorTooLong = -8,
+    /// A request was not handled, or a group not joined. The outcome and the sentence say why.
+    SinewErrorNotHandled = -9,
+    /// No reply came in time. The request may have been handled.
+    SinewErrorNoReply = -10,
+    /// The message asks for no reply. Nothing was sent.
+    SinewErrorNotAsked = -11,
+    /// What came is not what its kind says.
+    SinewErrorMalformed = -12,
+    /// This is no endpoint: it was unregistered, or never registered. Nothing was done.
+    SinewErrorNoSuchEndpoint = -13,
+    /// Another thread is in a call on this endpoint. Nothing was done.
+    SinewErrorBusy = -14,
+    /// This is no message of this endpoint: it was sent, discarded or settled already. Nothing was done.
+    SinewErrorNoSuchMessage = -15,
+    /// Too many endpoints in this process, or too many messages in hand. Nothing was done.
+    SinewErrorTooMany = -16,
+    /// The endpoint belongs to the process that this one was forked from. Nothing was done.
+    SinewErrorForked = -17,
+    /// A fault of this library. The endpoint can only be unregistered; all others go on.
+    SinewErrorPanic = -18,
+}
+
+impl Status {
+    const ALL: [Self; 20] = [
+        Self::SinewOk,
+        Self::SinewNothing,
+        Self::SinewErrorInvalidArgument,
+        Self::SinewErrorNoNode,
+        Self::SinewErrorRefused,
+        Self::SinewErrorWaiting,
+        Self::SinewErrorNoAnswer,
+        Self::SinewErrorClosed,
+        Self::SinewErrorStalled,
+        Self::SinewErrorTooLong,
+        Self::SinewErrorNotHandled,
+        Self::SinewErrorNoReply,
+        Self::SinewErrorNotAsked,
+        Self::SinewErrorMalformed,
+        Self::SinewErrorNoSuchEndpoint,
+        Self::SinewErrorBusy,
+        Self::SinewErrorNoSuchMessage,
+        Self::SinewErrorTooMany,
+        Self::SinewErrorForked,
+        Self::SinewErrorPanic,
+    ];
+
+    /// The text for a number; for one that is no status it says so.
+    pub(crate) fn text_of(code: i32) -> &'static CStr {
+        let status = Self::ALL.iter().find(|status| **status as i32 == code);
+        status.map_or(c"no status of this library", |status| status.text())
+    }
+
+    const fn text(self) -> &'static CStr {
+        match self {
+            Self::SinewOk => c"done",
+            Self::SinewNothing => c"nothing came, or nobody has the name",
+            Self::SinewErrorInvalidArgument => {
+                c"an argument is NULL, no UTF-8, too long, or none of its legal values"
+            }
+            Self::SinewErrorNoNode => {
+                c"no node can be reached at this path; does it run, with this path as its `lncl.socket`?"
+            }
+            Self::SinewErrorRefused => c"the node refused the registration",
+            Self::SinewErrorWaiting => c"what is required was not ready at the deadline",
+            Self::SinewErrorNoAnswer => c"the node did not answer in time; does it hang?",
+            Self::SinewErrorClosed => c"the connection to the node has ended; register again",
+            Self::SinewErrorStalled => c"the node takes no bytes; the message was not sent",
+            Self::SinewErrorTooLong => c"the payload is above the node's limit; raise `payload_max`",
+            Self::SinewErrorNotHandled => c"it was not handled",
+            Self::SinewErrorNoReply => c"no reply came in time",
+            Self::SinewErrorNotAsked => c"the message asks for no reply",
+            Self::SinewErrorMalformed => {
+                c"what came is not what its kind says; do both sides use the same type?"
+            }
+            Self::SinewErrorNoSuchEndpoint => {
+                c"this is no endpoint; was it unregistered, or never registered?"
+            }
+            Self::SinewErrorBusy => {
+                c"another thread is in a call on this endpoint; register one endpoint for each thread"
+            }
+            Self::SinewErrorNoSuchMessage => {
+                c"this is no message of this endpoint; was it sent, discarded or settled already?"
+            }
+            Self::SinewErrorTooMany => c"too many endpoints in this process, or too many messages in hand",
+            Self::SinewErrorForked => {
+                c"this endpoint belongs to the process that this one was forked from; register an own one"
+            }
+            Self::SinewErrorPanic => {
+                c"a fault of this library; the endpoint can only be unregistered; please report it"
+            }
+        }
+    }
+}
+
+/// Why a call failed.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct Fault {
+    pub(crate) status: Status,
+    sentence: String,
+}
+
+impl Fault {
+    pub(crate) fn new(status: Status, sentence: impl Into<String>) -> Self {
+        Self { status, sentence: sentence.into() }
+    }
+
+    /// With the text of the number alone.
+    pub(crate) fn plain(status: Status) -> Self {
+        Self::new(status, status.text().to_string_lossy())
+    }
+
+    pub(crate) fn argument(sentence: impl Into<String>) -> Self {
+        Self::new(Status::SinewErrorInvalidArgument, sentence)
+    }
+
+    /// Keeps the sentence for `sinew_last_error` of this thread.
+    pub(crate) fn tell(self) -> Status {
+        let mut bytes = self.sentence.into_bytes();
+        // What a peer said may have any bytes.
+        bytes.retain(|byte| *byte != 0);
+        let sentence = CString::new(bytes).expect("its zeros are taken out");
+        // A thread that is ending keeps no sentence; the status is told in any case.
+        let _ = LAST.try_with(|last| last.replace(sentence));
+        self.status
+    }
+}
+
+impl From<ApiError> for Fault {
+    #[allow(
+        clippy::wildcard_enum_match_arm,
+        reason = "the caller is at fault in what has no number of its own"
+    )]
+    fn from(error: ApiError) -> Self {
+        let sentence = error.to_string();
+        let status = match error {
+            ApiError::NoNode { .. } => Status::SinewErrorNoNode,
+            ApiError::Refused(_) => Status::SinewErrorRefused,
+            ApiError::Waiting { .. } => Status::SinewErrorWaiting,
+            ApiError::NoAnswer(_) => Status::SinewErrorNoAnswer,
+            ApiError::Closed(_) | ApiError::Frame(_) => Status::SinewErrorClosed,
+            ApiError::Stalled(_) => Status::SinewErrorStalled,
+            ApiError::TooLong { .. } => Status::SinewErrorTooLong,
+            ApiError::Ended(_) => Status::SinewErrorNotHandled,
+            ApiError::NoReply(_) => Status::SinewErrorNoReply,
+            ApiError::Malformed(_) => Status::SinewErrorMalformed,
+            error if is_not_asked(&error) => Status::SinewErrorNotAsked,
+            _ => Status::SinewErrorInvalidArgument,
+        };
+        Self::new(status, sentence)
+    }
+}
+
+const fn is_not_asked(error: &ApiError) -> bool {
+    matches!(error, ApiError::NotAsked)
+}
+
+thread_local! {
+    static LAST: RefCell<CString> = RefCell::default();
+}
+
+/// The sentence about this thread's last error; empty if there was none. It stays where it is until the next one.
+pub(crate) fn last_sentence() -> *const std::ffi::c_char {
+    LAST.try_with(|last| last.borrow().as_ptr()).unwrap_or(c"".as_ptr())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+
+    use super::*;
+
+    #[test]
+    fn every_status_has_a_number_and_a_text_of_its_own() {
+        let numbers: HashSet<_> = Status::ALL.iter().map(|status| *status as i32).collect();
+        let texts: HashSet<_> = numbers.iter().map(|number| Status::text_of(*number)).collect();
+        assert_eq!((numbers.len(), texts.len()), (Status::ALL.len(), Status::ALL.len()));
+        assert!(!texts.contains(Status::text_of(1_000)));
+    }
+
+    #[test]
+    fn a_sentence_with_zeros_in_it_is_told_without_them() {
+        Fault::new(Status::SinewErrorRefused, "no\0 way").tell();
+        // SAFETY: the sentence is a C string that stays until this thread's next fault.
+        let told = unsafe { CStr::from_ptr(last_sentence()) };
+        assert_eq!(told, c"no way");
+    }
+}

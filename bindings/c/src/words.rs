@@ -1,0 +1,136 @@
+//! Outcomes as numbers, and a text for everything that has a number.
+
+use std::ffi::{CStr, c_char};
+
+use sinew::Rejection;
+
+use crate::status::{Status, last_sentence};
+
+/// What became of a message.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(i32)]
+#[allow(clippy::enum_variant_names, reason = "these are the names in C, which has no other name spaces")]
+pub enum Outcome {
+    /// The destination has handled it.
+    SinewDelivered = 0,
+    /// Its time ran out before it was handled.
+    SinewExpired = 1,
+    /// The destination failed, or ended with the message in hand.
+    SinewFailed = 2,
+    /// The connection to its node was lost before it was sent: it was not handled.
+    SinewPeerLost = 3,
+    /// Nobody can say.
+    SinewUnknown = 4,
+    /// Not handled: no application has this TID.
+    SinewRejectedNoSuchApplication = 16,
+    /// Not handled: the node is not known or not connected.
+    SinewRejectedNoSuchNode = 17,
+    /// Not handled: the destination does not handle this kind.
+    SinewRejectedUnknownKind = 18,
+    /// Not handled: the payload is not what its kind says.
+    SinewRejectedMalformed = 19,
+    /// Not handled: a queue was full.
+    SinewRejectedQueueFull = 20,
+    /// Not handled: too long.
+    SinewRejectedTooLong = 21,
+    /// Not handled: the application has ended.
+    SinewRejectedClosed = 22,
+    /// Not handled: the source is not the sender's.
+    SinewRejectedForgedSource = 23,
+    /// Not handled: the handler refused it.
+    SinewRejectedByHandler = 24,
+    /// Not handled: this cannot be asked of this destination.
+    SinewRejectedUnsupported = 25,
+    /// Not handled: the application has ended and is not ready again.
+    SinewRejectedAway = 26,
+}
+
+/// A text for a status: what it means in general. Never NULL. Any thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_status_text(status: i32) -> *const c_char {
+    Status::text_of(status).as_ptr()
+}
+
+/// A sentence about the last error of the calling thread: what was wrong this time, and what to do. Never NULL; empty if
+/// there was no error. It stays until the thread's next error.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_last_error() -> *const c_char {
+    last_sentence()
+}
+
+/// A text for an outcome. Never NULL. Any thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_outcome_text(outcome: i32) -> *const c_char {
+    outcome_of(outcome).map_or(c"no outcome", text_of).as_ptr()
+}
+
+pub(crate) fn outcome_of(code: i32) -> Option<sinew::Outcome> {
+    sinew::Outcome::from_code(u8::try_from(code).ok()?)
+}
+
+pub(crate) const fn code_of(outcome: sinew::Outcome) -> Outcome {
+    match outcome {
+        sinew::Outcome::Delivered => Outcome::SinewDelivered,
+        sinew::Outcome::Expired => Outcome::SinewExpired,
+        sinew::Outcome::Failed => Outcome::SinewFailed,
+        sinew::Outcome::PeerLost => Outcome::SinewPeerLost,
+        sinew::Outcome::Unknown => Outcome::SinewUnknown,
+        sinew::Outcome::Rejected(why) => match why {
+            Rejection::NoSuchApplication => Outcome::SinewRejectedNoSuchApplication,
+            Rejection::NoSuchNode => Outcome::SinewRejectedNoSuchNode,
+            Rejection::UnknownKind => Outcome::SinewRejectedUnknownKind,
+            Rejection::Malformed => Outcome::SinewRejectedMalformed,
+            Rejection::QueueFull => Outcome::SinewRejectedQueueFull,
+            Rejection::TooLong => Outcome::SinewRejectedTooLong,
+            Rejection::Closed => Outcome::SinewRejectedClosed,
+            Rejection::ForgedSource => Outcome::SinewRejectedForgedSource,
+            Rejection::ByHandler => Outcome::SinewRejectedByHandler,
+            Rejection::Unsupported => Outcome::SinewRejectedUnsupported,
+            Rejection::Away => Outcome::SinewRejectedAway,
+        },
+    }
+}
+
+const fn text_of(outcome: sinew::Outcome) -> &'static CStr {
+    match code_of(outcome) {
+        Outcome::SinewDelivered => c"delivered: the destination has handled it",
+        Outcome::SinewExpired => c"expired before it was handled",
+        Outcome::SinewFailed => c"failed: the destination ended, or failed, with the message in hand",
+        Outcome::SinewPeerLost => c"not sent: the connection to its node was lost",
+        Outcome::SinewUnknown => c"unknown: nobody can say what became of it",
+        Outcome::SinewRejectedNoSuchApplication => {
+            c"not handled: no application has this TID; is it registered and spelled right?"
+        }
+        Outcome::SinewRejectedNoSuchNode => c"not handled: the node is not known or not connected",
+        Outcome::SinewRejectedUnknownKind => c"not handled: the destination does not handle this kind",
+        Outcome::SinewRejectedMalformed => {
+            c"not handled: the payload is not what its kind says; do both sides use the same type?"
+        }
+        Outcome::SinewRejectedQueueFull => {
+            c"not handled: a queue was full; the destination is slower than messages come"
+        }
+        Outcome::SinewRejectedTooLong => c"not handled: the payload is longer than the configured limit",
+        Outcome::SinewRejectedClosed => c"not handled: the destination's application has ended",
+        Outcome::SinewRejectedForgedSource => c"not handled: the source TID is not the sender's",
+        Outcome::SinewRejectedByHandler => c"not handled: the destination's handler refused it",
+        Outcome::SinewRejectedUnsupported => c"not handled: this cannot be asked of this destination",
+        Outcome::SinewRejectedAway => {
+            c"not handled: the destination's application has ended and is not ready again"
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_outcome_has_the_number_that_it_has_on_the_wire() {
+        let outcomes: Vec<_> = (0..=i32::from(u8::MAX)).filter_map(outcome_of).collect();
+        assert_eq!(outcomes.len(), 16);
+        for outcome in outcomes {
+            assert_eq!(code_of(outcome) as i32, i32::from(outcome.code()), "{outcome:?}");
+        }
+        assert_eq!((outcome_of(-1), outcome_of(5), outcome_of(256)), (None, None, None));
+    }
+}

@@ -1,0 +1,35 @@
+//! The header and the README that are checked in are what the source says.
+
+use std::path::Path;
+
+/// Writes the header instead of comparing it.
+const BLESS: &str = "SINEW_BLESS";
+
+#[test]
+fn the_header_is_what_the_source_says() {
+    let package = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let path = package.join("include/sinew.h");
+    let config = cbindgen::Config::from_file(package.join("cbindgen.toml")).unwrap();
+    let mut header = Vec::new();
+    cbindgen::Builder::new().with_crate(package).with_config(config).generate().unwrap().write(&mut header);
+    let header = String::from_utf8(header).unwrap();
+    if std::env::var_os(BLESS).is_some() {
+        std::fs::write(&path, &header).unwrap();
+    }
+    let checked_in = std::fs::read_to_string(&path).unwrap_or_default();
+    let differs = header.lines().zip(checked_in.lines()).find(|(says, is)| says != is);
+    assert!(
+        header == checked_in,
+        "include/sinew.h is not what the source says (first difference: {differs:?}); write it anew by \
+         `{BLESS}=1 cargo test -p sinew-c --test header`"
+    );
+}
+
+#[test]
+fn the_readme_shows_the_example_as_it_is() {
+    let package = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let readme = std::fs::read_to_string(package.join("README.md")).unwrap();
+    let example = std::fs::read_to_string(package.join("examples/drive.cpp")).unwrap();
+    assert!(readme.contains(&format!("```cpp\n{example}```")), "README.md shows another examples/drive.cpp");
+    assert!(example.lines().count() <= 30, "it is called a program of 30 lines");
+}

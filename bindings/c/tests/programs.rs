@@ -1,0 +1,178 @@
+//! Programs in C and C++, compiled as a user would, against a node in a process of its own.
+
+#[path = "programs/ground.rs"]
+mod ground;
+
+use ground::{C, CPP, CPP20, Ground, WATCHDOG, is_there};
+use rustix::process::Signal;
+use serde::{Deserialize, Serialize};
+use sinew::{Endpoint, Kind, NodeApi, Outcome, Payload, Registration, RequirementEvent, Tid};
+
+/// As in `programs/holder.c`: its map, written by hand there.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Torque {
+    newton_metres: f32,
+}
+
+impl Payload for Torque {
+    const NAME: &'static str = "test.torque";
+}
+
+fn endpoint(ground: &Ground, registration: Registration) -> Endpoint {
+    let node = NodeApi::connect(ground.socket()).expect("the node is up");
+    node.register_transport_address(registration.deadline(WATCHDOG)).expect("nothing is in the way")
+}
+
+fn resolve(endpoint: &mut Endpoint, name: &str) -> Tid {
+    endpoint.resolve(name, WATCHDOG).expect("the node answers").expect("it is registered")
+}
+
+#[test]
+fn the_sensor_in_c_and_the_drive_in_cpp_find_each_other_and_walk() {
+    if !is_there("gcc") || !is_there("g++") {
+        return;
+    }
+    let ground = Ground::new();
+    let mut drive = ground.start(&CPP.shared("examples/drive.cpp", &ground), &[]);
+    let mut sensor = ground.start(&C.shared("examples/sensor.c", &ground), &["200"]);
+    sensor.wait_for(&["last angle: delivered"]);
+    sensor.wait_for(&["the drive of node knee is at number 200"]);
+    assert_eq!(sensor.wait_for_end(), Some(0));
+    drive.wait_for(&["last angle was number 200"]);
+    assert_eq!(drive.wait_for_end(), Some(0));
+}
+
+#[test]
+fn the_library_can_be_linked_statically_and_the_wrapper_compiled_as_cpp20() {
+    if !is_there("gcc") || !is_there("g++") {
+        return;
+    }
+    let ground = Ground::new();
+    let mut drive = ground.start(&CPP20.shared("examples/drive.cpp", &ground), &[]);
+    let mut sensor = ground.start(&C.static_("examples/sensor.c", &ground), &["3"]);
+    assert_eq!(sensor.wait_for_end(), Some(0));
+    drive.wait_for(&["last angle was number 3"]);
+}
+
+#[test]
+fn c_is_driven_by_rust() {
+    if !is_there("gcc") {
+        return;
+    }
+    let ground = Ground::new();
+    let mut drive = endpoint(&ground, Registration::new().name("knee.drive"));
+    let mut sensor = ground.start(&C.shared("examples/sensor.c", &ground), &["50"]);
+    let mut last = (0.0, 0);
+    loop {
+        let message = drive.receive(WATCHDOG).unwrap().expect("an angle, or the question at the end");
+        if message.wants_reply() {
+            assert_eq!(message.kind(), Kind::named("demo.drive_report"));
+            let mut report = drive.create_message(message.source(), message.kind(), 8).unwrap();
+            report[..4].copy_from_slice(&f32::to_ne_bytes(last.0));
+            report[4..].copy_from_slice(&u32::to_ne_bytes(last.1));
+            drive.reply_message(&message, report).unwrap();
+            break;
+        }
+        assert_eq!(message.kind(), Kind::named("demo.joint_angle"));
+        let (degrees, number) = message.bytes().split_at(4);
+        let number = u32::from_ne_bytes(number.try_into().unwrap());
+        // The last one is Control, which overtakes what waits of the Stream.
+        if number > last.1 {
+            last = (f32::from_ne_bytes(degrees.try_into().unwrap()), number);
+        }
+    }
+    assert_eq!(last, (0.0, 50));
+    sensor.wait_for(&["the drive of node knee is at number 50"]);
+    assert_eq!(sensor.wait_for_end(), Some(0));
+}
+
+#[test]
+fn a_type_of_rust_is_read_and_written_by_c() {
+    if !is_there("gcc") {
+        return;
+    }
+    let ground = Ground::new();
+    let mut holder = ground.start(&C.shared("tests/programs/holder.c", &ground), &[]);
+    holder.wait_for(&["ready"]);
+    let mut asking = endpoint(&ground, Registration::new());
+    let to = resolve(&mut asking, "holder");
+    let doubled: Torque = asking.ask(to, &Torque { newton_metres: 2.5 }, WATCHDOG).unwrap();
+    assert_eq!(doubled, Torque { newton_metres: 5.0 });
+}
+
+#[test]
+fn the_death_of_a_process_in_c_is_noticed_and_what_it_had_in_hand_has_failed() {
+    if !is_there("gcc") {
+        return;
+    }
+    let ground = Ground::new();
+    let mut holder = ground.start(&C.shared("tests/programs/holder.c", &ground), &[]);
+    holder.wait_for(&["ready"]);
+    let mut watching =
+        endpoint(&ground, Registration::new().requires(["holder"]).subscribe::<RequirementEvent>());
+    let to = resolve(&mut watching, "holder");
+    let socket = ground.socket();
+    let sending = std::thread::spawn(move || {
+        let node = NodeApi::connect(socket).unwrap();
+        let mut sender = node.register_transport_address(Registration::new()).unwrap();
+        let message = sender.create_message(to, Kind::named("test.held"), 3).unwrap();
+        sender.send_message_confirmed(message, WATCHDOG).unwrap()
+    });
+    holder.wait_for(&["held 3 bytes"]);
+    holder.signal(Signal::KILL);
+    assert_eq!(sending.join().unwrap(), Outcome::Failed);
+    let event = watching.receive(WATCHDOG).unwrap().expect("an event");
+    assert!(matches!(event.decode().unwrap(), RequirementEvent::Lost { .. }), "{event:?}");
+    assert_eq!(watching.resolve("holder", WATCHDOG).unwrap(), None);
+}
+
+#[test]
+fn a_program_in_c_is_told_of_its_nodes_death() {
+    if !is_there("gcc") {
+        return;
+    }
+    let ground = Ground::new();
+    let mut holder = ground.start(&C.shared("tests/programs/holder.c", &ground), &[]);
+    holder.wait_for(&["ready"]);
+    ground.node.signal(Signal::KILL);
+    holder.wait_for(&["receive", "-6", "the connection to the node has ended"]);
+    assert_eq!(holder.wait_for_end(), Some(1));
+}
+
+#[test]
+fn what_c_does_wrong_is_refused_in_words() {
+    if !is_there("gcc") {
+        return;
+    }
+    let ground = Ground::new();
+    let mut misuse = ground.start(&C.shared("tests/programs/misuse.c", &ground), &[]);
+    misuse.wait_for(&["all refused"]);
+    assert_eq!(misuse.wait_for_end(), Some(0));
+}
+
+#[test]
+fn the_wrapper_in_cpp_settles_at_the_end_of_a_scope_and_throws_errors() {
+    if !is_there("g++") {
+        return;
+    }
+    let ground = Ground::new();
+    let mut wrapper = ground.start(&CPP.shared("tests/programs/wrapper.cpp", &ground), &[]);
+    wrapper.wait_for(&["all well"]);
+    assert_eq!(wrapper.wait_for_end(), Some(0));
+}
+
+#[test]
+fn valgrind_finds_no_error_and_no_leak() {
+    if !is_there("gcc") || !is_there("valgrind") {
+        return;
+    }
+    let ground = Ground::new();
+    let program = C.shared("tests/programs/misuse.c", &ground);
+    let valgrind =
+        ["valgrind", "--leak-check=full", "--show-leak-kinds=definite,indirect", "--error-exitcode=99"];
+    let mut watched = ground.start_under(&valgrind, &program, &[]);
+    let end = watched.wait_for_end();
+    let said = watched.said().join("\n");
+    assert_eq!(end, Some(0), "{said}");
+    println!("{said}");
+}

@@ -1,0 +1,114 @@
+//! What the programs in C and C++ stand on: a compiler, a node in a process of its own, and a directory.
+
+use std::{
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+use sinew_tests::{OwnDirectory, Program, own_group};
+
+/// Time for what has to happen anyway, as on a loaded machine.
+pub(crate) const WATCHDOG: std::time::Duration = sinew_tests::DEADLINE;
+
+/// How strict the compilers are.
+const STRICT: [&str; 4] = ["-Wall", "-Wextra", "-Werror", "-pedantic"];
+
+/// A compiler, as the user would call it.
+#[derive(Clone, Copy)]
+pub(crate) struct Compiler {
+    command: &'static str,
+    standard: &'static str,
+}
+
+pub(crate) const C: Compiler = Compiler { command: "gcc", standard: "-std=c11" };
+pub(crate) const CPP: Compiler = Compiler { command: "g++", standard: "-std=c++17" };
+pub(crate) const CPP20: Compiler = Compiler { command: "g++", standard: "-std=c++20" };
+
+/// Where the library is: beside this test, which is linked with it.
+fn library_directory() -> PathBuf {
+    let test = std::env::current_exe().expect("a test has a path");
+    test.parent().expect("it lies in a directory").to_owned()
+}
+
+impl Compiler {
+    /// Compiles a source of this package and links it with the shared library.
+    pub(crate) fn shared(self, source: &str, ground: &Ground) -> PathBuf {
+        let library = library_directory();
+        let path = format!("-Wl,-rpath,{}", library.display());
+        let search = format!("-L{}", library.display());
+        self.compile(source, ground, &[&search, "-lsinew_c", &path, "-lm", "-pthread"])
+    }
+
+    /// The same with the static library.
+    pub(crate) fn static_(self, source: &str, ground: &Ground) -> PathBuf {
+        let library = library_directory().join("libsinew_c.a").display().to_string();
+        self.compile(source, ground, &[&library, "-lm", "-lpthread", "-ldl"])
+    }
+
+    fn compile(self, source: &str, ground: &Ground, link: &[&str]) -> PathBuf {
+        let package = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let source = package.join(source);
+        let program = ground.directory.join(&source.file_stem().expect("a source").to_string_lossy());
+        let mut command = Command::new(self.command);
+        command.arg(self.standard).args(STRICT).arg("-g").arg("-I").arg(package.join("include"));
+        command.arg(source).args(link).arg("-o").arg(&program);
+        let output = command.output().expect("the compiler runs: it did before");
+        let says = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{command:?} says:\n{says}");
+        program
+    }
+}
+
+/// Whether a command is there. If not, says that the test is skipped, and why.
+pub(crate) fn is_there(command: &str) -> bool {
+    let is_there = Command::new(command).arg("--version").output().is_ok();
+    if !is_there {
+        println!("skipped: there is no `{command}` on this machine");
+    }
+    is_there
+}
+
+/// A node in a process of its own, and a directory for its socket and for the programs.
+pub(crate) struct Ground {
+    pub(crate) node: Program,
+    directory: OwnDirectory,
+}
+
+impl Ground {
+    pub(crate) fn new() -> Self {
+        let directory = OwnDirectory::new();
+        let config = directory.join("node.toml");
+        let socket = directory.join("node.sock");
+        let group = own_group();
+        let lines = format!(
+            "[node]\nname = \"knee\"\npayload_max = 65536\n[lncl]\nsocket = \"{}\"\n[ndl]\nmulticast = \"{group}\"\nmdns_port = false\n",
+            socket.display()
+        );
+        std::fs::write(&config, lines).expect("the test's own directory can be written to");
+        let mut command = Command::new(env!("CARGO_BIN_EXE_sinew-node"));
+        command.arg(&config);
+        let mut node = Program::start("sinew-node", command);
+        node.wait_for(&["up"]);
+        Self { node, directory }
+    }
+
+    /// Where the node listens.
+    pub(crate) fn socket(&self) -> PathBuf {
+        self.directory.join("node.sock")
+    }
+
+    /// Starts a program that gets the node's socket as its first argument.
+    pub(crate) fn start(&self, program: &Path, arguments: &[&str]) -> Program {
+        self.start_under(&[], program, arguments)
+    }
+
+    /// The same under another program. What they say on their standard errors is kept, too.
+    pub(crate) fn start_under(&self, over: &[&str], program: &Path, arguments: &[&str]) -> Program {
+        let mut command = Command::new("sh");
+        command.args(["-c", r#"exec "$@" 2>&1"#, "sh"]).args(over).arg(program);
+        command.arg(self.socket()).args(arguments);
+        // Cargo's own search path may lead to the library of an earlier build.
+        command.env_remove("LD_LIBRARY_PATH");
+        Program::start(&program.display().to_string(), command)
+    }
+}

@@ -1,0 +1,220 @@
+/* Does what a program should not, and looks that each is refused, with a sentence that says why. */
+#define _POSIX_C_SOURCE 200809L
+
+#include <sinew.h>
+
+#include <pthread.h>
+#include <sched.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#define SECOND UINT64_C(1000000000)
+#define EXPECT(status, wanted) expect(__LINE__, #status, (status), (wanted), "")
+#define EXPECT_WORDS(status, wanted, words) expect(__LINE__, #status, (status), (wanted), (words))
+
+static void expect(int line, const char *what, int got, int wanted, const char *words)
+{
+    if (got == wanted && strstr(sinew_last_error(), words))
+        return;
+    printf("line %d: %s is %d (%s), not %d; '%s' should say '%s'\n", line, what, got, sinew_status_text(got), wanted,
+           sinew_last_error(), words);
+    exit(EXIT_FAILURE);
+}
+
+static sinew_text node;
+static sinew_kind kind;
+
+static sinew_endpoint *new_endpoint(void)
+{
+    sinew_endpoint *endpoint = NULL;
+    EXPECT(sinew_register_transport_address(node, NULL, &endpoint), SINEW_OK);
+    return endpoint;
+}
+
+static sinew_message new_message(sinew_endpoint *endpoint, sinew_tid to, size_t length)
+{
+    sinew_message message;
+    EXPECT(sinew_create_message(endpoint, to, kind, SINEW_CONTROL, length, &message), SINEW_OK);
+    return message;
+}
+
+static void null_arguments(sinew_endpoint *endpoint)
+{
+    sinew_message message = new_message(endpoint, 1, 1);
+    sinew_received received;
+    sinew_tid tid;
+    sinew_text no_text = { NULL, 3 };
+    EXPECT_WORDS(sinew_register_transport_address(node, NULL, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`endpoint` is NULL");
+    EXPECT_WORDS(sinew_register_transport_address(no_text, NULL, &endpoint), SINEW_ERROR_INVALID_ARGUMENT, "`socket`");
+    EXPECT_WORDS(sinew_unregister(NULL), SINEW_ERROR_INVALID_ARGUMENT, "`endpoint` is NULL");
+    EXPECT_WORDS(sinew_create_message(endpoint, 1, kind, 0, 1, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`message` is NULL");
+    EXPECT_WORDS(sinew_create_message(NULL, 1, kind, 0, 1, &message), SINEW_ERROR_INVALID_ARGUMENT, "`endpoint` is NULL");
+    EXPECT_WORDS(sinew_send_message(endpoint, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`message` is NULL");
+    EXPECT_WORDS(sinew_send_message_confirmed(endpoint, &message, 1, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`outcome`");
+    EXPECT_WORDS(sinew_ask(endpoint, &message, 1, NULL, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`reply` is NULL");
+    EXPECT_WORDS(sinew_reply(endpoint, NULL, &message), SINEW_ERROR_INVALID_ARGUMENT, "`request` is NULL");
+    EXPECT_WORDS(sinew_send_bytes(endpoint, 1, kind, 0, NULL, 5), SINEW_ERROR_INVALID_ARGUMENT, "`bytes` is NULL");
+    EXPECT_WORDS(sinew_receive_message(endpoint, 0, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`received` is NULL");
+    EXPECT_WORDS(sinew_receive_message(NULL, 0, &received), SINEW_ERROR_INVALID_ARGUMENT, "`endpoint` is NULL");
+    EXPECT_WORDS(sinew_settle_message(endpoint, NULL, 0), SINEW_ERROR_INVALID_ARGUMENT, "`received` is NULL");
+    EXPECT_WORDS(sinew_resolve(endpoint, no_text, 1, &tid), SINEW_ERROR_INVALID_ARGUMENT, "`name` is NULL");
+    EXPECT_WORDS(sinew_resolve(endpoint, node, 1, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`tid` is NULL");
+    EXPECT_WORDS(sinew_join_group(NULL, node), SINEW_ERROR_INVALID_ARGUMENT, "`endpoint` is NULL");
+    EXPECT_WORDS(sinew_tid_text(1, NULL, 9), SINEW_ERROR_INVALID_ARGUMENT, "`text` is NULL");
+    EXPECT(sinew_endpoint_tid(NULL) == 0, 1);
+    EXPECT(sinew_payload_max(NULL) == 0, 1);
+    EXPECT(sinew_node_name(NULL) == NULL, 1);
+    EXPECT(sinew_discard_message(endpoint, &message), SINEW_OK);
+}
+
+static void wrong_values(sinew_endpoint *endpoint)
+{
+    sinew_message message;
+    sinew_endpoint *other;
+    sinew_tid tid;
+    char text[8];
+    sinew_text latin1 = { "kn\xf6" "chel", 7 };
+    sinew_options options = { .size = 0 };
+    EXPECT_WORDS(sinew_register_transport_address(node, &options, &other), SINEW_ERROR_INVALID_ARGUMENT, "sizeof");
+    options.size = sizeof options;
+    options.name = latin1;
+    EXPECT_WORDS(sinew_register_transport_address(node, &options, &other), SINEW_ERROR_INVALID_ARGUMENT, "UTF-8");
+    EXPECT_WORDS(sinew_register_transport_address(SINEW_TEXT("/nowhere/knee.sock"), NULL, &other), SINEW_ERROR_NO_NODE,
+                 "\"/nowhere/knee.sock\"");
+    options.name = SINEW_TEXT("line\nbreak");
+    EXPECT_WORDS(sinew_register_transport_address(node, &options, &other), SINEW_ERROR_REFUSED, "the node refused");
+    options.name = SINEW_TEXT("waits");
+    options.required = &node;
+    options.required_count = 1;
+    options.deadline_ns = 1000000;
+    EXPECT_WORDS(sinew_register_transport_address(node, &options, &other), SINEW_ERROR_WAITING, "still waiting for");
+    EXPECT_WORDS(sinew_create_message(endpoint, 1, kind, 3, 1, &message), SINEW_ERROR_INVALID_ARGUMENT, "`message_class`");
+    EXPECT_WORDS(sinew_create_message(endpoint, 1, 7, 0, 1, &message), SINEW_ERROR_INVALID_ARGUMENT, "sinew_kind_named");
+    EXPECT_WORDS(sinew_create_message(endpoint, 1, kind, 0, sinew_payload_max(endpoint) + 1, &message),
+                 SINEW_ERROR_TOO_LONG, "65536");
+    EXPECT_WORDS(sinew_tid_parse(SINEW_TEXT("knee"), &tid), SINEW_ERROR_INVALID_ARGUMENT, "node/application");
+    EXPECT_WORDS(sinew_tid_text(1, text, 3), SINEW_ERROR_INVALID_ARGUMENT, "`capacity`");
+    EXPECT(sinew_tid_parse(SINEW_TEXT("10.0.0.7/1001"), &tid), SINEW_OK);
+    EXPECT(tid == UINT64_C(0x0a00000700001001), 1);
+    EXPECT(sinew_resolve(endpoint, SINEW_TEXT("nobody"), SECOND, &tid), SINEW_NOTHING);
+    EXPECT(tid == 0, 1);
+}
+
+/* A message can be sent, discarded or settled once, and a message of another endpoint not at all. */
+static void used_twice(sinew_endpoint *endpoint)
+{
+    sinew_endpoint *other = new_endpoint();
+    sinew_message message = new_message(endpoint, sinew_endpoint_tid(endpoint), 1), copy = message;
+    sinew_received received, received_copy, reply;
+    sinew_outcome outcome = SINEW_UNKNOWN;
+    EXPECT(sinew_send_message(other, &message), SINEW_ERROR_NO_SUCH_MESSAGE);
+    EXPECT(sinew_send_message(endpoint, &message), SINEW_OK);
+    EXPECT(message.bytes == NULL && message.token == 0, 1);
+    EXPECT_WORDS(sinew_send_message(endpoint, &message), SINEW_ERROR_NO_SUCH_MESSAGE, "sent");
+    EXPECT(sinew_send_message(endpoint, &copy), SINEW_ERROR_NO_SUCH_MESSAGE);
+    EXPECT(sinew_discard_message(endpoint, &copy), SINEW_ERROR_NO_SUCH_MESSAGE);
+    EXPECT(sinew_receive_message(endpoint, 10 * SECOND, &received), SINEW_OK);
+    received_copy = received;
+    message = new_message(endpoint, received.source, 1);
+    EXPECT(sinew_reply(endpoint, &received, &message), SINEW_ERROR_NOT_ASKED);
+    EXPECT_WORDS(sinew_settle_message(endpoint, &received, 99), SINEW_ERROR_INVALID_ARGUMENT, "`outcome`");
+    EXPECT(sinew_settle_message(endpoint, &received, SINEW_DELIVERED), SINEW_OK);
+    EXPECT(sinew_settle_message(endpoint, &received_copy, SINEW_DELIVERED), SINEW_ERROR_NO_SUCH_MESSAGE);
+    message = new_message(endpoint, UINT64_C(0x7777), 1);
+    EXPECT_WORDS(sinew_ask(endpoint, &message, SECOND, &reply, &outcome), SINEW_ERROR_NOT_HANDLED, "NoSuchApplication");
+    EXPECT(outcome, SINEW_REJECTED_NO_SUCH_APPLICATION);
+    EXPECT(sinew_unregister(&other), SINEW_OK);
+}
+
+/* So many may be in the making, and what is not sent goes with the endpoint. */
+static void too_many(void)
+{
+    sinew_endpoint *endpoint = new_endpoint(), *copy = endpoint;
+    sinew_message message;
+    sinew_endpoint *garbage = (sinew_endpoint *)(void *)&message;
+    for (int made = 0; made < 64; made++)
+        (void)new_message(endpoint, 1, 100);
+    EXPECT_WORDS(sinew_create_message(endpoint, 1, kind, 0, 1, &message), SINEW_ERROR_TOO_MANY, "64 messages");
+    EXPECT(sinew_unregister(&endpoint), SINEW_OK);
+    EXPECT(endpoint == NULL, 1);
+    EXPECT_WORDS(sinew_unregister(&copy), SINEW_ERROR_NO_SUCH_ENDPOINT, "unregistered");
+    EXPECT(sinew_receive_message(copy, 0, NULL), SINEW_ERROR_INVALID_ARGUMENT);
+    EXPECT(sinew_create_message(copy, 1, kind, 0, 1, &message), SINEW_ERROR_NO_SUCH_ENDPOINT);
+    EXPECT(sinew_create_message(garbage, 1, kind, 0, 1, &message), SINEW_ERROR_NO_SUCH_ENDPOINT);
+}
+
+/* Waits for one message, as soon as the endpoint is free for it. */
+static void *receive_one(void *endpoint)
+{
+    sinew_received received;
+    sinew_status status;
+    while ((status = sinew_receive_message(endpoint, 20 * SECOND, &received)) == SINEW_ERROR_BUSY)
+        sched_yield();
+    EXPECT(status, SINEW_OK);
+    EXPECT(sinew_settle_message(endpoint, &received, SINEW_DELIVERED), SINEW_OK);
+    return NULL;
+}
+
+static void two_threads(sinew_endpoint *endpoint)
+{
+    sinew_endpoint *shared = new_endpoint(), *still = shared;
+    sinew_tid to = sinew_endpoint_tid(shared);
+    sinew_message message;
+    sinew_status status;
+    pthread_t thread;
+    if (pthread_create(&thread, NULL, receive_one, shared) != 0)
+        exit(EXIT_FAILURE);
+    /* Until the thread is in its call, ours go through; a message that cannot be discarded goes with the endpoint. */
+    while ((status = sinew_create_message(shared, to, kind, 0, 1, &message)) == SINEW_OK)
+        if (sinew_discard_message(shared, &message) != SINEW_OK)
+            sched_yield();
+    EXPECT_WORDS(status, SINEW_ERROR_BUSY, "one endpoint for each thread");
+    EXPECT(sinew_unregister(&still), SINEW_ERROR_BUSY);
+    EXPECT(still == shared, 1);
+    EXPECT(sinew_send_bytes(endpoint, to, kind, SINEW_CONTROL, NULL, 0), SINEW_OK);
+    pthread_join(thread, NULL);
+    EXPECT(sinew_unregister(&shared), SINEW_OK);
+}
+
+/* The child has the same memory and the same connection, and may use neither. */
+static void forked(sinew_endpoint *endpoint)
+{
+    int status = -1;
+    pid_t child;
+    fflush(stdout);
+    child = fork();
+    if (child == 0) {
+        sinew_endpoint *copy = endpoint;
+        sinew_message message;
+        EXPECT_WORDS(sinew_create_message(endpoint, 1, kind, 0, 1, &message), SINEW_ERROR_FORKED, "forked");
+        EXPECT(sinew_unregister(&copy), SINEW_ERROR_FORKED);
+        copy = new_endpoint();
+        EXPECT(sinew_unregister(&copy), SINEW_OK);
+        fflush(stdout);
+        _exit(0);
+    }
+    waitpid(child, &status, 0);
+    EXPECT(status, 0);
+    EXPECT(sinew_send_bytes(endpoint, 1, kind, SINEW_CONTROL, NULL, 0), SINEW_OK);
+}
+
+int main(int argc, char **argv)
+{
+    sinew_endpoint *endpoint;
+    if (argc < 2 || sinew_abi() != SINEW_ABI)
+        return EXIT_FAILURE;
+    node = sinew_text_of(argv[1]);
+    kind = sinew_kind_named(SINEW_TEXT("test.misuse"));
+    endpoint = new_endpoint();
+    null_arguments(endpoint);
+    wrong_values(endpoint);
+    used_twice(endpoint);
+    too_many();
+    two_threads(endpoint);
+    forked(endpoint);
+    EXPECT(sinew_unregister(&endpoint), SINEW_OK);
+    printf("all refused\n");
+    return EXIT_SUCCESS;
+}
