@@ -16,6 +16,9 @@ use super::{RunError, Verdict};
 /// 4 kill -9 of the process of the knee's drive | 5 the same process hangs (SIGSTOP, SIGCONT) | 6 the knee's node is
 /// pulled (SIGKILL) | 7 it returns | 8 e-stop (software, not a safety function) | 9 insane commands | 11 central is killed
 ///
+/// Where root and network namespaces are to be had, 6 and 7 are done once more with the link of the knee's node, on a
+/// second robot with a host for each process (link-down); elsewhere the report says why not.
+///
 /// In the end the contrast: the ankle's drive falls silent at push-off, with and without a device watchdog; faults.svg in
 /// the run folder has both beside each other.
 ///
@@ -26,7 +29,7 @@ use super::{RunError, Verdict};
 #[derive(Debug, clap::Args)]
 #[command(verbatim_doc_comment)]
 pub(super) struct FaultArguments {
-    /// Only these of 4, 5, 6, 7, 8, 9, 11 and contrast, for example 4,6,contrast.
+    /// Only these of 4, 5, 6, 7, 8, 9, 11, link-down and contrast, for example 4,6,contrast.
     #[arg(long, value_delimiter = ',', value_name = "STEPS")]
     only: Vec<Item>,
     /// Phases of the stride at which the knee's drive is killed, 0 to 1.
@@ -44,21 +47,29 @@ pub(super) struct FaultArguments {
     /// Silence after which a device damps by itself, ms.
     #[arg(long, value_name = "MS", default_value_t = 8, value_parser = clap::value_parser!(u64).range(1..=10_000))]
     device_watchdog: u64,
-    /// For machines that others share: one phase, the contrast in virtual time, and only what has to hold on every
-    /// machine counts for the exit code.
+    /// For machines that others share: one phase, no link-down, the contrast in virtual time, and only what has to hold
+    /// on every machine counts for the exit code.
     #[arg(long)]
     short: bool,
 }
 
-/// A step, or the contrast.
+/// What can be asked for by itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Item(Option<Step>);
+enum Item {
+    Step(Step),
+    LinkDown,
+    Contrast,
+}
 
 impl FromStr for Item {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        if text.trim() == "contrast" { Ok(Self(None)) } else { text.parse().map(Some).map(Self) }
+        match text.trim() {
+            "contrast" => Ok(Self::Contrast),
+            "link-down" => Ok(Self::LinkDown),
+            number => number.parse().map(Self::Step),
+        }
     }
 }
 
@@ -78,9 +89,12 @@ pub(super) fn run(arguments: &FaultArguments) -> Result<Verdict, RunError> {
 
 fn options(arguments: &FaultArguments) -> Result<FaultOptions, RunError> {
     let only = &arguments.only;
-    let steps =
-        if only.is_empty() { Step::ALL.to_vec() } else { only.iter().filter_map(|item| item.0).collect() };
-    let with_contrast = only.is_empty() || only.contains(&Item(None));
+    let step = |item: &Item| match item {
+        Item::Step(step) => Some(*step),
+        Item::LinkDown | Item::Contrast => None,
+    };
+    let steps = if only.is_empty() { Step::ALL.to_vec() } else { only.iter().filter_map(step).collect() };
+    let with_contrast = only.is_empty() || only.contains(&Item::Contrast);
     if let Some(phase) = arguments.phases.iter().find(|phase| !(0.0..1.0).contains(*phase)) {
         return Err(RunError::Phase(*phase));
     }
@@ -89,6 +103,7 @@ fn options(arguments: &FaultArguments) -> Result<FaultOptions, RunError> {
         phases: if arguments.short { vec![0.62] } else { arguments.phases.clone() },
         seed: arguments.seed,
         device_watchdog: Duration::from_millis(arguments.device_watchdog),
+        link_down: only.is_empty() && !arguments.short || only.contains(&Item::LinkDown),
         contrast: with_contrast.then_some(if arguments.short {
             ContrastRun::LockStep
         } else {
@@ -105,8 +120,9 @@ fn words(report: &FaultReport) -> String {
         let claims = || report.claims.iter().filter(|claim| claim.expected.is_functional() == functional);
         format!("{} of {}", claims().filter(|claim| claim.held).count(), claims().count())
     };
+    let picture = if report.claims.iter().any(|claim| claim.step.is_none()) { "faults.svg, " } else { "" };
     text += &format!(
-        "held: {} claims about function, {} times within class C\nwritten: {}/ faults.svg, report.json, and each \
+        "held: {} claims about function, {} times within class C\nwritten: {}/ {picture}report.json, and each \
          process's trace and log\n",
         counted(true),
         counted(false),

@@ -4,6 +4,7 @@ mod children;
 mod collect;
 mod console;
 pub mod faults;
+mod hosts;
 mod plan;
 mod screen;
 
@@ -222,7 +223,7 @@ impl<'a> Launch<'a> {
         Ok(Self {
             options,
             plan: Plan::shuffled(options.seed, now),
-            children: Children::new(file, folder.to_owned())?,
+            children: Children::new(file, folder.to_owned(), None)?,
             lines,
             say_line,
             console: Console::start(topology)?,

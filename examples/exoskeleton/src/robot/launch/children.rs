@@ -12,6 +12,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use sinew::Time;
 
 use super::LaunchError;
+use super::hosts::{Hosts, Link};
 use crate::robot::role::Role;
 
 /// Time that a process has for its orderly end.
@@ -30,12 +31,14 @@ pub(super) struct Children {
     program: PathBuf,
     topology: PathBuf,
     folder: PathBuf,
+    /// None: all of them on this host.
+    hosts: Option<Hosts>,
     running: BTreeMap<Role, Child>,
 }
 
 impl Children {
-    pub(super) fn new(topology: PathBuf, folder: PathBuf) -> io::Result<Self> {
-        Ok(Self { program: std::env::current_exe()?, topology, folder, running: BTreeMap::new() })
+    pub(super) fn new(topology: PathBuf, folder: PathBuf, hosts: Option<Hosts>) -> io::Result<Self> {
+        Ok(Self { program: std::env::current_exe()?, topology, folder, hosts, running: BTreeMap::new() })
     }
 
     /// Starts a process. It stops when its standard input ends, which is when this process ends, however it does.
@@ -46,7 +49,11 @@ impl Children {
         command.arg("--run-dir").arg(&self.folder);
         let is_plant = role == Role::Plant;
         let stdout = if is_plant { Stdio::piped() } else { Stdio::null() };
-        let mut child = command.stdin(Stdio::piped()).stdout(stdout).stderr(log).spawn()?;
+        command.stdin(Stdio::piped()).stdout(stdout).stderr(log);
+        let mut child = match &self.hosts {
+            Some(hosts) => hosts.spawn(role, &mut command)?,
+            None => command.spawn()?,
+        };
         if let Some(out) = child.stdout.take() {
             let say_line = say_line.clone();
             std::thread::Builder::new().name("plant-lines".to_owned()).spawn(move || {
@@ -85,6 +92,19 @@ impl Children {
             let _ = child.wait();
         }
         at
+    }
+
+    /// Cuts the host of a process off from the other nodes, or joins it again; returns when.
+    ///
+    /// # Errors
+    /// All processes share this host, or its switch is gone.
+    pub(super) fn set_link(&mut self, role: Role, link: Link) -> io::Result<Time> {
+        let Some(hosts) = &mut self.hosts else {
+            return Err(io::Error::other("all processes share this host: there is no link between them"));
+        };
+        let at = Time::now();
+        hosts.set(role, link)?;
+        Ok(at)
     }
 
     /// The processes that a process of the run has started itself: those of its node's applications.

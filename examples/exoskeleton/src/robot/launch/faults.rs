@@ -13,17 +13,21 @@ mod script;
 mod step;
 
 use std::io;
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use serde::Serialize;
-use sinew::{Outcome, Time};
+use sinew::{NodeAddress, Outcome, Time};
 use thiserror::Error;
 
+use super::hosts::Hosts;
 use super::{LaunchError, new_folder};
 use crate::joint::Joint;
 use crate::lockstep::LockStepError;
+use crate::part::Part;
 use crate::plot;
+use crate::robot::role::Role;
 use crate::robot::topology::{self, DrivePlace, ReleaseBy, Topology};
 use evidence::Evidence;
 use robot::Robot;
@@ -35,6 +39,8 @@ pub use step::Step;
 
 /// Time for the last rows to reach the disk before a robot is stopped.
 const SETTLE: Duration = Duration::from_millis(300);
+/// Time between two queries of nodes that have a link to lose. Not less: a busy host answers late.
+const LINK_PERIOD: Duration = Duration::from_millis(30);
 
 /// Which faults to inject into what.
 #[derive(Debug, Clone)]
@@ -47,6 +53,9 @@ pub struct FaultOptions {
     pub seed: u64,
     /// Silence after which a device damps by itself.
     pub device_watchdog: Duration,
+    /// Whether the node is also pulled by its link, on hosts made of network namespaces; where they cannot be made the
+    /// report says so.
+    pub link_down: bool,
     /// How the contrast is run; none: not.
     pub contrast: Option<ContrastRun>,
     /// Folder for the run folders.
@@ -133,8 +142,16 @@ pub fn run(options: &FaultOptions) -> Result<FaultReport, FaultError> {
         }
         let folder = folder.join(format!("robot-{number}"));
         std::fs::create_dir(&folder)?;
-        left = one_robot(options, &folder, left, &mut report)?;
+        let robot = Robot::start(&topology(options)?, None, &folder)?;
+        left = one_robot(options, robot, &folder, left, &mut report)?;
     }
+    if options.link_down {
+        on_hosts(options, &folder, &mut report);
+    } else if options.steps.contains(&Step::PullNode) {
+        let words = "steps 6 and 7 with a link that is cut: not asked for, see --only link-down";
+        report.skipped.push(words.to_owned());
+    }
+    report.claims.sort_by_key(|claim| claim.step.map_or(u8::MAX, u8::from));
     if let Some(how) = options.contrast {
         let contrast = contrast::run(options, how, &folder, &mut report.claims)?;
         std::fs::write(folder.join("faults.svg"), plot::contrast(&contrast))?;
@@ -148,14 +165,35 @@ pub fn run(options: &FaultOptions) -> Result<FaultReport, FaultError> {
     Ok(report)
 }
 
+/// The steps that take a link to cut: a robot with a host for each process.
+fn on_hosts(options: &FaultOptions, folder: &Path, report: &mut FaultReport) {
+    let hosts = match Hosts::new() {
+        Ok(hosts) => hosts,
+        Err(why) => {
+            let words = format!("steps 6 and 7 with a link that is cut: no hosts can be made here, {why}");
+            say(&words);
+            report.skipped.push(words);
+            return;
+        }
+    };
+    let folder = folder.join("robot-on-hosts");
+    let walked = std::fs::create_dir(&folder).map_err(FaultError::from).and_then(|()| {
+        let robot = Robot::start(&topology_on_hosts(options)?, Some(hosts), &folder)?;
+        one_robot(options, robot, &folder, &Step::ON_HOSTS, report)
+    });
+    if let Err(error) = walked {
+        report.failures.push(format!("steps 6 and 7 with a link that is cut: {error}"));
+    }
+}
+
 /// Walks a robot through the steps until one is too much for it; the steps that are left then.
 fn one_robot<'a>(
     options: &FaultOptions,
+    mut robot: Robot,
     folder: &Path,
     steps: &'a [Step],
     report: &mut FaultReport,
 ) -> Result<&'a [Step], FaultError> {
-    let mut robot = Robot::start(&topology(options)?, folder)?;
     script::walk_until_converged(&mut robot)?;
     let mut injections: Vec<(Injection, Option<String>)> = Vec::new();
     let mut left = steps;
@@ -195,6 +233,22 @@ fn topology(options: &FaultOptions) -> io::Result<Topology> {
     topology.control.release = ReleaseBy::Operator;
     topology.plant.device_watchdog = Some(options.device_watchdog);
     topology.joints[Joint::Knee.index()].drive = DrivePlace::Process;
+    Ok(topology)
+}
+
+/// Each process on its host. Who is cut off without a word is lost after three to four silent periods: these are short.
+fn topology_on_hosts(options: &FaultOptions) -> io::Result<Topology> {
+    let mut topology = topology(options)?;
+    topology.discovery.period = LINK_PERIOD;
+    for part in Part::ALL {
+        let address = Hosts::address_of(Role::Node(part));
+        let place = match part {
+            Part::Central => &mut topology.central,
+            Part::Joint(joint) => &mut topology.joints[joint.index()],
+        };
+        (place.address, place.interface) = (NodeAddress::from(address), address);
+    }
+    topology.plant.address.set_ip(IpAddr::V4(Hosts::device_address_of(Role::Plant)));
     Ok(topology)
 }
 

@@ -102,7 +102,7 @@ fn real_time(
 ) -> Result<(Vec<ContrastPoint>, Option<f64>), FaultError> {
     let folder = folder.join(if watchdog.is_some() { "contrast-on" } else { "contrast-off" });
     std::fs::create_dir(&folder)?;
-    let mut robot = Robot::start(&topology(options, watchdog)?, &folder)?;
+    let mut robot = Robot::start(&topology(options, watchdog)?, None, &folder)?;
     script::walk_until_converged(&mut robot)?;
     let drive = robot.drive_process(JOINT)?;
     robot.walk_to_phase(PHASE)?;

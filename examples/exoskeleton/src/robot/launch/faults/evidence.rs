@@ -27,6 +27,10 @@ const SAFE_SLACK_NM: f64 = 1.0;
 /// How far around a tick the velocity is looked for that it may have damped against.
 const VELOCITY_AROUND_NS: u64 = 30_000_000;
 
+/// From a loss to the last tick that may believe something of before it, ns: inputs of 10 ms, twice on the way through
+/// central, and ticks that are late.
+pub(super) const SAFE_AT_LATEST_NS: u64 = 50_000_000;
+
 /// A span of the host's clock, ns.
 pub(super) type Span = Range<u64>;
 
@@ -96,6 +100,15 @@ impl Evidence {
     pub(super) fn state_after_ms(&self, joint: Joint, from: Time, state: DriveState) -> Option<f64> {
         let first = self.drive(joint, from.as_nanos()..u64::MAX).find(|row| row.state == state);
         first.map(|row| ms_after(from, row.t_ns))
+    }
+
+    /// Milliseconds from a loss until the drive is safe because of it. One that was safe already, since its host stood still,
+    /// may walk for a last moment: what it heard before the loss is not old yet.
+    pub(super) fn safe_after_ms(&self, joint: Joint, from: Time) -> Option<f64> {
+        let soon = from.as_nanos()..from.as_nanos() + SAFE_AT_LATEST_NS;
+        let unsafe_at = self.drive(joint, soon).filter(|row| row.state != DriveState::Safe).last();
+        let since = unsafe_at.map_or(from, |row| Time::from_nanos(row.t_ns));
+        self.state_after_ms(joint, since, DriveState::Safe).map(|ms| ms + ms_after(from, since.as_nanos()))
     }
 
     /// Milliseconds until a drive first commands an assisting torque in a span in which it begins anew, or goes on.

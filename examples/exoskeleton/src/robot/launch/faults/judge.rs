@@ -3,7 +3,7 @@
 use sinew::Time;
 
 use super::claim::{Claim, Claims, REPORTED};
-use super::evidence::{Evidence, Span, ms_after, span};
+use super::evidence::{Evidence, SAFE_AT_LATEST_NS, Span, ms_after, span};
 use super::script::{Injection, Mark, Seen};
 use super::step::Step;
 use crate::central::bit;
@@ -68,6 +68,8 @@ pub(super) fn judge(evidence: &Evidence, injection: &Injection, failure: Option<
         Step::EmergencyStop => emergency_stop(&mut claims, evidence, injection),
         Step::InsaneCommands => insane_commands(&mut claims, evidence, injection),
         Step::KillCentral => kill_central(&mut claims, evidence, injection),
+        Step::CutLink => cut_link(&mut claims, evidence, injection),
+        Step::JoinLink => join_link(&mut claims, evidence, injection),
     }
     let whole = span(injection.at, injection.until);
     claims.exactly("samples with a torque above the limit", 0, evidence.above_limit(&whole));
@@ -170,16 +172,12 @@ fn came_back(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection
 
 fn pull_node(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection) {
     let knee = Part::Joint(Joint::Knee);
-    let (at, away) = (injection.at, span(injection.at, injection.until));
+    let away = span(injection.at, injection.until);
     let others = [Joint::Hip, Joint::Ankle];
     loss_of(claims, evidence, knee, &others, &away);
     let damped = evidence.watchdog_after_ms(Joint::Knee, away.clone());
     claims.timing("the knee's device damps by itself after, ms", LOST_MS, damped);
-    let safe = all(others.map(|joint| evidence.state_after_ms(joint, at, DriveState::Safe)));
-    let safe = span(later(at, safe), injection.until);
-    let left = evidence.ticks_not_in(DriveState::Safe, &others, &safe);
-    claims.exactly("ticks of hip and ankle out of SAFE while it is away", 0, left);
-    claims.exactly("ticks with more than b*qd + 1 Nm, hip and ankle", 0, evidence.undamped(&others, &safe));
+    stay_safe(claims, evidence, &others, &away);
     claims.exactly("samples with more than that, knee", 0, evidence.undamped_device(Joint::Knee, away));
 }
 
@@ -189,21 +187,60 @@ fn loss_of(claims: &mut Claims<'_>, evidence: &Evidence, lost: Part, drives: &[J
     let noticed = all(peers.map(|part| evidence.node_lost_after_ms(part, lost, away.clone())));
     claims.timing("NODE_LOST at every other node after, ms", LOST_MS, noticed);
     let from = Time::from_nanos(away.start);
-    let safe = all(drives.iter().map(|joint| evidence.state_after_ms(*joint, from, DriveState::Safe)));
+    let safe = all(drives.iter().map(|joint| evidence.safe_after_ms(*joint, from)));
     claims.timing("their drives SAFE after, ms", SAFE_MS, safe);
 }
 
 fn return_node(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection) {
-    let (at, whole) = (injection.at, span(injection.at, injection.until));
-    let ready = evidence.state_after_ms(Joint::Knee, at, DriveState::Ready);
+    let ready = evidence.state_after_ms(Joint::Knee, injection.at, DriveState::Ready);
     claims.timing("READY after its start, s", REJOIN_S, ready.map(|ms| ms * 1e-3));
-    let incarnation = |span: Span| {
+    let [before, now] = epochs_of_the_knee(evidence, injection);
+    claims.is_so("it joins with a new epoch", before.zip(now).is_some_and(|(before, now)| now > before));
+    back_to_walking(claims, evidence, injection);
+}
+
+/// The life in which central found the knee's node last before this step, and in it.
+fn epochs_of_the_knee(evidence: &Evidence, injection: &Injection) -> [Option<u64>; 2] {
+    let whole = span(injection.at, injection.until);
+    [0..whole.start, whole].map(|span| {
         let events = evidence.events(Part::Central, span);
         let found = events.filter(|event| event.whom == "knee" && event.what != "node_lost");
-        found.filter_map(|event| event.how.parse::<u64>().ok()).last()
-    };
-    let (before, now) = (incarnation(0..whole.start), incarnation(whole));
-    claims.is_so("it joins with a new epoch", before.zip(now).is_some_and(|(before, now)| now > before));
+        found.filter_map(|event| event.how.parse().ok()).last()
+    })
+}
+
+/// Nobody has died: each side has lost the other.
+fn cut_link(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection) {
+    let knee = Part::Joint(Joint::Knee);
+    let away = span(injection.at, injection.until);
+    loss_of(claims, evidence, knee, &[Joint::Hip, Joint::Ankle], &away);
+    let alone = evidence.safe_after_ms(Joint::Knee, injection.at);
+    claims.timing("the isolated knee SAFE by its own timer after, ms", LOST_MS, alone);
+    let others = Part::ALL.into_iter().filter(|part| *part != knee);
+    let noticed = all(others.map(|part| evidence.node_lost_after_ms(knee, part, away.clone())));
+    claims.timing("NODE_LOST of every other at the knee after, ms", LOST_MS, noticed);
+    stay_safe(claims, evidence, &Joint::ALL, &away);
+    claims.exactly("drives that were started anew", 0, evidence.lives_begun(&away));
+}
+
+/// These drives are safe and stay so for as long as somebody is away.
+fn stay_safe(claims: &mut Claims<'_>, evidence: &Evidence, drives: &[Joint], away: &Span) {
+    let safe = away.start + SAFE_AT_LATEST_NS..away.end;
+    let left = evidence.ticks_not_in(DriveState::Safe, drives, &safe);
+    claims.exactly("ticks out of SAFE from 50 ms on, while it is away", 0, left);
+    claims.exactly("their ticks with more than b*qd + 1 Nm", 0, evidence.undamped(drives, &safe));
+}
+
+fn join_link(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection) {
+    let ready = evidence.state_after_ms(Joint::Knee, injection.at, DriveState::Ready);
+    claims.timing("READY after its link came back, s", REJOIN_S, ready.map(|ms| ms * 1e-3));
+    let [before, now] = epochs_of_the_knee(evidence, injection);
+    claims.is_so("it joins with the epoch that it had", now.is_some() && now == before);
+    claims.exactly(
+        "drives that were started anew",
+        0,
+        evidence.lives_begun(&span(injection.at, injection.until)),
+    );
     back_to_walking(claims, evidence, injection);
 }
 
@@ -307,11 +344,7 @@ fn kill_central(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Inject
     let started = injection.when(Mark::Started).unwrap_or(injection.until);
     let (at, away) = (injection.at, span(injection.at, started));
     loss_of(claims, evidence, Part::Central, &Joint::ALL, &away);
-    let safe = all(Joint::ALL.map(|joint| evidence.state_after_ms(joint, at, DriveState::Safe)));
-    let safe = span(later(at, safe), started);
-    let left = evidence.ticks_not_in(DriveState::Safe, &Joint::ALL, &safe);
-    claims.exactly("ticks of a drive out of SAFE while it is away", 0, left);
-    claims.exactly("ticks with more than b*qd + 1 Nm", 0, evidence.undamped(&Joint::ALL, &safe));
+    stay_safe(claims, evidence, &Joint::ALL, &away);
     claims.exactly("drives that were started anew", 0, evidence.lives_begun(&span(at, injection.until)));
     let held = injection.when(Mark::Held).map(|held| held.since(started).as_secs_f64());
     claims.timing("barrier passed again after its start, s", REJOIN_S, held);

@@ -14,6 +14,7 @@ use crate::message::{DriveState, GaitMode};
 use crate::part::Part;
 use crate::robot::launch::children::Children;
 use crate::robot::launch::console::{Console, View};
+use crate::robot::launch::hosts::{Hosts, Link};
 use crate::robot::launch::{BARRIER_PATIENCE, LINES_MAX};
 use crate::robot::role::Role;
 use crate::robot::topology::Topology;
@@ -52,14 +53,18 @@ struct Stride {
 }
 
 impl Robot {
-    /// Starts all five processes at once.
-    pub(super) fn start(topology: &Topology, folder: &Path) -> Result<Self, FaultError> {
+    /// Starts all five processes at once; without hosts of their own all on this one.
+    pub(super) fn start(
+        topology: &Topology,
+        hosts: Option<Hosts>,
+        folder: &Path,
+    ) -> Result<Self, FaultError> {
         let file = folder.join("topology.toml");
         std::fs::write(&file, topology.to_toml())?;
         let (say_line, lines) = sync_channel(LINES_MAX);
         let socket = topology.console.clone().expect("a topology for this host has a console");
         let mut robot = Self {
-            children: Children::new(file, folder.to_owned())?,
+            children: Children::new(file, folder.to_owned(), hosts)?,
             say_line,
             lines,
             console: Console::start(topology)?,
@@ -86,6 +91,11 @@ impl Robot {
             self.operator = None;
         }
         self.children.kill(role)
+    }
+
+    /// Cuts the link of a joint's node to the others, or joins it again; returns when.
+    pub(super) fn set_link(&mut self, joint: Joint, link: Link) -> Result<Time, FaultError> {
+        Ok(self.children.set_link(Role::Node(Part::Joint(joint)), link)?)
     }
 
     /// The process of a joint's drive, a child of its node's.

@@ -13,6 +13,7 @@ use super::{FaultError, say};
 use crate::joint::Joint;
 use crate::message::{DriveState, GaitMode};
 use crate::part::Part;
+use crate::robot::launch::hosts::Link;
 use crate::robot::role::Role;
 
 /// The node that is pulled.
@@ -126,13 +127,14 @@ impl Injection {
     /// How long the fault of this step had lasted when the step began, ns: a node returns after its outage.
     pub(super) const fn away_ns(&self) -> u64 {
         match self.step {
-            Step::ReturnNode => OUTAGE.as_nanos() as u64,
+            Step::ReturnNode | Step::JoinLink => OUTAGE.as_nanos() as u64,
             Step::KillDrive
             | Step::HangDrive
             | Step::PullNode
             | Step::EmergencyStop
             | Step::InsaneCommands
-            | Step::KillCentral => 0,
+            | Step::KillCentral
+            | Step::CutLink => 0,
         }
     }
 
@@ -169,6 +171,8 @@ pub(super) fn perform(
         Step::EmergencyStop => emergency_stop(robot, out),
         Step::InsaneCommands => insane_commands(robot, out),
         Step::KillCentral => kill_central(robot, out),
+        Step::CutLink => cut_link(robot, out),
+        Step::JoinLink => join_link(robot, out),
     }
 }
 
@@ -235,6 +239,23 @@ fn return_node(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), FaultE
     let injection = out.last_mut().expect("it was just pushed");
     injection.mark(Mark::Started, at);
     hold_and_release(robot, injection)
+}
+
+/// The knee's node lives and reaches its device, and nobody hears it.
+fn cut_link(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), FaultError> {
+    robot.walk_to_phase(PULL_PHASE)?;
+    let at = robot.set_link(Joint::Knee, Link::Down)?;
+    let mut injection = Injection::begun(Step::CutLink, "link down", at);
+    injection.until = at + OUTAGE;
+    out.push(injection);
+    robot.pass_until(at + OUTAGE)
+}
+
+/// It is heard again, and nothing moves until the operator says so.
+fn join_link(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), FaultError> {
+    let at = robot.set_link(Joint::Knee, Link::Up)?;
+    out.push(Injection::begun(Step::JoinLink, "link up", at));
+    hold_and_release(robot, out.last_mut().expect("it was just pushed"))
 }
 
 /// From all parts being there to walking: a second in which nothing moves, the release, the ramp, two strides.

@@ -23,10 +23,14 @@ pub enum Step {
     InsaneCommands,
     /// 11: the central unit is killed.
     KillCentral,
+    /// 6 too: the link of the knee's node is cut, on a robot whose nodes have hosts of their own.
+    CutLink,
+    /// 7 too: it is joined again.
+    JoinLink,
 }
 
 impl Step {
-    /// All of them, in order.
+    /// Those of a robot on one host, in order.
     pub const ALL: [Self; 7] = [
         Self::KillDrive,
         Self::HangDrive,
@@ -36,6 +40,9 @@ impl Step {
         Self::InsaneCommands,
         Self::KillCentral,
     ];
+
+    /// Those of a robot whose nodes have hosts of their own.
+    pub(super) const ON_HOSTS: [Self; 2] = [Self::CutLink, Self::JoinLink];
 
     /// What it does, in a few words.
     #[must_use]
@@ -48,6 +55,8 @@ impl Step {
             Self::EmergencyStop => "the e-stop is pressed",
             Self::InsaneCommands => "insane commands are given",
             Self::KillCentral => "the central unit is killed",
+            Self::CutLink => "the link of the knee's node is cut",
+            Self::JoinLink => "its link is joined again",
         }
     }
 }
@@ -57,8 +66,8 @@ impl From<Step> for u8 {
         match step {
             Step::KillDrive => 4,
             Step::HangDrive => 5,
-            Step::PullNode => 6,
-            Step::ReturnNode => 7,
+            Step::PullNode | Step::CutLink => 6,
+            Step::ReturnNode | Step::JoinLink => 7,
             Step::EmergencyStop => 8,
             Step::InsaneCommands => 9,
             Step::KillCentral => 11,
@@ -91,6 +100,9 @@ mod tests {
     fn step_reads_back_from_its_number_and_ten_is_none() {
         for step in Step::ALL {
             assert_eq!(step.to_string().parse(), Ok(step));
+        }
+        for (step, same) in Step::ON_HOSTS.into_iter().zip([Step::PullNode, Step::ReturnNode]) {
+            assert_eq!(step.to_string(), same.to_string());
         }
         assert!("10".parse::<Step>().is_err_and(|words| words.contains("11")));
     }

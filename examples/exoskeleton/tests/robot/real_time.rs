@@ -1,40 +1,10 @@
-//! The built program as its users run it. Nothing here is an assertion about timing.
+//! The robot walks; its parts alone start, end and refuse.
 
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
-use std::sync::mpsc::sync_channel;
-use std::time::Duration;
+use std::path::Path;
 
 use exoskeleton::robot::topology::{Topology, for_this_host};
-use rustix::process::{Pid, Signal, kill_process};
 
-const PROGRAM: &str = env!("CARGO_BIN_EXE_exoskeleton");
-const DEADLINE: Duration = Duration::from_secs(60);
-
-/// A folder of this test's own.
-fn folder(name: &str) -> PathBuf {
-    let folder = std::env::temp_dir().join(format!("exoskeleton-test-{name}-{}", std::process::id()));
-    let _ = std::fs::remove_dir_all(&folder);
-    std::fs::create_dir_all(&folder).expect("a folder for this test");
-    folder
-}
-
-fn start(arguments: &[&str]) -> Child {
-    let mut command = Command::new(PROGRAM);
-    command.args(arguments).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
-    command.spawn().expect("the program that was just built starts")
-}
-
-/// Closes its standard input and waits for its end.
-fn end(child: Child, what: &str) -> Output {
-    let id = Pid::from_child(&child);
-    let (say, heard) = sync_channel(1);
-    std::thread::spawn(move || say.send(child.wait_with_output()));
-    heard.recv_timeout(DEADLINE).map(Result::unwrap).unwrap_or_else(|_| {
-        let _ = kill_process(id, Signal::KILL);
-        panic!("{what} within {DEADLINE:?}");
-    })
-}
+use crate::{alone, end, folder, start};
 
 fn topology_file(folder: &Path, text: &str) -> String {
     let path = folder.join("topology.toml");
@@ -50,6 +20,7 @@ fn topology_of_this_test() -> Topology {
 
 #[test]
 fn five_processes_wait_for_the_late_one_without_torque_and_then_walk() {
+    let _alone = alone();
     let folder = folder("walk");
     let (report, runs) = (folder.join("report.json"), folder.join("runs"));
     let arguments =
