@@ -191,6 +191,7 @@ impl Letters {
             | ApiError::TooLong { .. }
             | ApiError::Ended(_)
             | ApiError::NoReply(_)
+            | ApiError::Lent
             | ApiError::NotAsked
             | ApiError::Malformed(_)
             | ApiError::Frame(_) => Entry::Broken(format!("number {number} to {way:?}: {error}")),
