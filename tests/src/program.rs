@@ -173,3 +173,20 @@ impl Drop for Program {
         let _ = self.child.wait();
     }
 }
+
+/// Waits until every thread of a process that was sent `SIGSTOP` stands still: each takes the signal when it comes to it,
+/// not before the call that sends it returns.
+///
+/// # Panics
+/// If they do not within [`crate::DEADLINE`].
+pub fn wait_until_frozen(process: u32) {
+    crate::until("all its threads stand still", || is_frozen(process).then_some(()));
+}
+
+fn is_frozen(process: u32) -> bool {
+    let tasks = std::fs::read_dir(format!("/proc/{process}/task")).expect("it is there");
+    tasks.flatten().all(|task| {
+        let status = std::fs::read_to_string(task.path().join("stat")).unwrap_or_default();
+        status.rsplit_once(')').is_some_and(|(_, rest)| rest.trim_start().starts_with('T'))
+    })
+}

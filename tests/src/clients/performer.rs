@@ -73,6 +73,15 @@ impl Performer {
         kill_process(id, signal).unwrap_or_else(|error| panic!("{} takes no {signal:?}: {error}", self.role));
     }
 
+    /// Stops it, and returns when it stands still.
+    ///
+    /// # Panics
+    /// If it is no process any more.
+    pub fn freeze(&self) {
+        self.signal(Signal::STOP);
+        crate::wait_until_frozen(self.child.id());
+    }
+
     /// Kills it, and returns when it is gone and all that it said was heard.
     ///
     /// # Panics

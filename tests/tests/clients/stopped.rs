@@ -132,7 +132,7 @@ fn a_stopped_client_fills_what_is_its_own_and_gets_what_its_classes_promise_when
     // Given: one that is stopped, and a pair of others.
     let mut scene = Scene::new();
     let before = Held::of(scene.stage.node_id());
-    scene.stopped.signal(Signal::STOP);
+    scene.stopped.freeze();
 
     // When: more is sent to it than there is room for.
     for number in 1..=ROUNDS {

@@ -9,7 +9,7 @@ use sinew_tests::{
     orders::{Count, Me, Who},
     program,
     puppet::{Seen, Stage, desk},
-    until,
+    until, wait_until_frozen,
 };
 
 /// Processes of one scenario, and the network that a node of this process may share with them.
@@ -91,15 +91,6 @@ fn an_application_that_fails_too_often_ends_its_process_with_code_1_and_the_othe
     hip.wait_for(&["NodeLost", "knee", "Left"]);
 }
 
-/// The signal is taken by each thread when it comes to it: not before the call that sends it returns.
-fn is_frozen(process: u32) -> bool {
-    let tasks = std::fs::read_dir(format!("/proc/{process}/task")).expect("it is there");
-    tasks.flatten().all(|task| {
-        let status = std::fs::read_to_string(task.path().join("stat")).unwrap_or_default();
-        status.rsplit_once(')').is_some_and(|(_, rest)| rest.trim_start().starts_with('T'))
-    })
-}
-
 #[test]
 fn a_process_killed_under_confirmed_traffic_leaves_no_message_without_an_outcome() {
     let scenario = Scenario::new();
@@ -112,7 +103,7 @@ fn a_process_killed_under_confirmed_traffic_leaves_no_message_without_an_outcome
     until("it is reached", || sender.send(tid, &payload()).ok());
     // Frozen: what is sent now cannot be answered any more.
     knee.signal(Signal::STOP);
-    until("all its threads stand still", || is_frozen(knee.id()).then_some(()));
+    wait_until_frozen(knee.id());
     let sent: Vec<_> =
         (0..100).filter_map(|_| sender.send_confirmed(tid, &payload(), DEADLINE).ok()).collect();
     assert!(!sent.is_empty());
