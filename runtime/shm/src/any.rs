@@ -178,3 +178,45 @@ fn hung_up(ends: &impl Ends) -> Result<Option<usize>, AnyError> {
     }
     Ok(None)
 }
+
+#[cfg(all(test, target_os = "linux", not(any(loom, miri))))]
+mod tests {
+    use super::*;
+    use crate::{BellKind, Capacity, Corrupt, Region, Terms, layout::Word};
+
+    struct One(Consumer);
+
+    impl Ends for One {
+        fn count(&self) -> usize {
+            1
+        }
+
+        fn consumer(&self, _: usize) -> &Consumer {
+            &self.0
+        }
+
+        fn consumer_mut(&mut self, _: usize) -> &mut Consumer {
+            &mut self.0
+        }
+
+        fn hang_up(&self, _: usize) -> Option<HangUp<'_>> {
+            None
+        }
+    }
+
+    #[test]
+    fn a_peer_that_writes_nonsense_is_named() {
+        // given
+        let (mut hostile, offer) = Region::create(Capacity::MIN, BellKind::Futex).expect("a region");
+        let (side, _offer) = Region::create(Capacity::MIN, BellKind::Futex).expect("a region");
+        let (_producer, consumer) = side.connect(offer, &Terms::default()).expect("an honest offer");
+        // when: a tail that is no multiple of 8
+        hostile.scribble(u32::try_from(Word::Tail.index()).expect("a small number"), 3);
+        // then
+        let ended = Waiter::new(Spin::Off).wait(&mut One(consumer), Instant::now() + Duration::from_secs(20));
+        assert!(matches!(
+            ended,
+            Err(AnyError::Corrupt { index: 0, cause: Corrupt::Tail { tail: 3, seen: 0 } })
+        ));
+    }
+}

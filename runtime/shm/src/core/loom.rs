@@ -183,3 +183,75 @@ fn a_loan_that_is_given_back_is_never_seen() {
         }
     });
 }
+
+/// What a sleeper on several futexes sleeps on: it is woken by any of them that rings after it was listened to.
+struct Bells {
+    words: [AtomicU32; 2],
+    sleepers: Mutex<()>,
+    woken: Condvar,
+}
+
+impl Bells {
+    fn ring(&self, index: usize) {
+        self.words[index].fetch_add(1, Ordering::Release);
+        let sleepers = self.sleepers.lock().unwrap();
+        self.woken.notify_one();
+        drop(sleepers);
+    }
+
+    fn listen(&self) -> [u32; 2] {
+        [self.words[0].load(Ordering::Acquire), self.words[1].load(Ordering::Acquire)]
+    }
+
+    fn sleep(&self, heard: [u32; 2]) {
+        let sleepers = self.sleepers.lock().unwrap();
+        if (0..2).all(|index| self.words[index].load(Ordering::Relaxed) == heard[index]) {
+            drop(self.woken.wait(sleepers).unwrap());
+        }
+    }
+}
+
+/// The order of steps of `any.rs`: listen to all, announce to all, sleep, withdraw from all.
+fn take_sleeping_any(receivers: &mut [Receiver; 2], bells: &Bells) -> Vec<u64> {
+    loop {
+        for receiver in receivers.iter_mut() {
+            if let Some((words, _)) = take(receiver) {
+                return words;
+            }
+        }
+        let heard = bells.listen();
+        let ready = receivers.iter_mut().position(|receiver| receiver.arm().unwrap() == Armed::Ready);
+        if ready.is_none() {
+            bells.sleep(heard);
+        }
+        for receiver in receivers.iter_mut().take(ready.unwrap_or(2)) {
+            receiver.disarm();
+        }
+    }
+}
+
+#[test]
+fn who_sleeps_at_two_rings_is_woken_for_every_message_of_either() {
+    loom::model(|| {
+        let (mut first, first_end) = ring(Capacity::tiny(64));
+        let (mut second, second_end) = ring(Capacity::tiny(64));
+        let words = [AtomicU32::new(0), AtomicU32::new(0)];
+        let bells = Arc::new(Bells { words, sleepers: Mutex::new(()), woken: Condvar::new() });
+        let buttons = Arc::clone(&bells);
+        let sending = thread::spawn(move || {
+            if send(&mut second, 8, 2) {
+                buttons.ring(1);
+            }
+            if send(&mut first, 8, 1) {
+                buttons.ring(0);
+            }
+        });
+        let mut receivers = [first_end, second_end];
+        // A lost wake is a deadlock, which loom reports.
+        let mut taken =
+            vec![take_sleeping_any(&mut receivers, &bells), take_sleeping_any(&mut receivers, &bells)];
+        taken.sort();
+        assert_eq!(taken, [[1], [2]]);
+        sending.join().unwrap();
+    });
+}
