@@ -10,7 +10,7 @@ use sinew_runtime::{
 };
 
 use super::{
-    ApiError, Received, Registration,
+    ApiError, Received, Registration, Transport,
     inbox::{Answer, Awaited, Inbox, Sorted},
     link::{self, Link, Read, Reader, Writer},
 };
@@ -85,6 +85,12 @@ impl Endpoint {
     #[must_use]
     pub const fn tid(&self) -> Tid {
         self.tid
+    }
+
+    /// What carries the messages: what was asked for, or the socket where the system or the node has no rings.
+    #[must_use]
+    pub fn transport(&self) -> Transport {
+        self.writer.transport()
     }
 
     /// The name of the node.

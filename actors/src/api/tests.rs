@@ -10,7 +10,7 @@ use sinew_runtime::{
     wire::{Class, Flags, Kind, Message, Payload},
 };
 
-use super::{ApiError, Endpoint, NodeApi, Registration};
+use super::{ApiError, Endpoint, NodeApi, Registration, Transport};
 use crate::lncl::{
     AppFact,
     testing::{TestDirectory, TestNode, WATCHDOG},
@@ -44,6 +44,44 @@ impl Payload for Setpoint {
 
 const TORQUE: Torque = Torque { newton_metres: 2.5 };
 
+/// Every claim of NodeAPI holds whatever carries the messages.
+macro_rules! on_every_transport {
+    ($($claim:ident)*) => {
+        mod ring {
+            $(#[test] fn $claim() { super::$claim(super::Transport::Ring) })*
+        }
+        mod socket {
+            $(#[test] fn $claim() { super::$claim(super::Transport::Socket) })*
+        }
+    };
+}
+
+on_every_transport! {
+    addresses_are_fixed_or_dynamic_and_names_have_one_holder
+    messages_go_to_and_fro_between_processes
+    raw_memory_is_lent_filled_and_sent
+    raw_memory_is_confirmed_asked_with_and_replied_with
+    a_confirmed_message_ends_in_what_its_receiver_says
+    an_outcome_that_nobody_says_is_unknown_at_the_deadline
+    messages_that_come_while_an_outcome_is_awaited_are_received_afterwards
+    two_endpoints_of_one_process_ask_and_reply
+    a_request_that_cannot_be_handled_ends_at_once
+    what_asks_for_no_reply_gets_none
+    a_received_message_counts_as_handled_when_it_is_dropped
+    a_message_that_is_in_hand_at_a_panic_has_failed
+    what_waited_in_a_dropped_endpoint_was_not_handled
+    of_a_stream_only_the_newest_value_is_received
+    a_member_gets_what_is_sent_to_its_group_until_it_leaves
+    names_resolve_and_are_free_when_unregister_returns
+    a_registration_waits_at_the_barrier_and_names_what_it_waits_for
+    the_end_of_the_node_is_an_error_with_its_reason
+    every_thread_may_have_an_address_of_its_own
+}
+
+fn on(transport: Transport) -> Registration {
+    Registration::new().transport(transport)
+}
+
 fn register(node: &TestNode, registration: Registration) -> Endpoint {
     let api = NodeApi::connect(node.path()).unwrap();
     api.register_transport_address(registration).unwrap()
@@ -57,21 +95,21 @@ fn refusal(node: &TestNode, registration: Registration) -> String {
     }
 }
 
-#[test]
-fn addresses_are_fixed_or_dynamic_and_names_have_one_holder() {
+fn addresses_are_fixed_or_dynamic_and_names_have_one_holder(transport: Transport) {
     let node = TestNode::start();
     let fixed = AppAddress::fixed(7).unwrap();
-    let first = register(&node, Registration::new().name("knee").fixed(fixed));
+    let first = register(&node, on(transport).name("knee").fixed(fixed));
+    assert_eq!(first.transport(), transport);
     assert_eq!(first.tid(), Tid::new(node.address(), fixed));
     assert_eq!((first.node_name(), first.payload_max()), ("test", 1 << 20));
-    let second = register(&node, Registration::new());
+    let second = register(&node, on(transport));
     assert!(second.tid().app.is_dynamic());
     let pid = std::process::id();
-    let why = refusal(&node, Registration::new().name("knee"));
+    let why = refusal(&node, on(transport).name("knee"));
     assert!(why.contains(&format!("'knee' is taken by application {fixed} of process {pid}")), "{why}");
-    let why = refusal(&node, Registration::new().fixed(fixed));
+    let why = refusal(&node, on(transport).fixed(fixed));
     assert!(why.contains("is taken by 'knee'"), "{why}");
-    let why = refusal(&node, Registration::new().fixed(AppAddress::NDL));
+    let why = refusal(&node, on(transport).fixed(AppAddress::NDL));
     assert!(why.contains("fixed addresses are"), "{why}");
 }
 
@@ -82,11 +120,10 @@ fn without_a_node_the_error_says_where_it_was_looked_for() {
     assert!(error.to_string().contains("nobody.sock"), "{error}");
 }
 
-#[test]
-fn messages_go_to_and_fro_between_processes() {
+fn messages_go_to_and_fro_between_processes(transport: Transport) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, Registration::new());
+    let mut endpoint = register(&node, on(transport));
     endpoint.send(app.tid, &TORQUE).unwrap();
     let message = app.next();
     assert_eq!((message.header.source, message.header.sequence), (endpoint.tid(), 1));
@@ -99,11 +136,10 @@ fn messages_go_to_and_fro_between_processes() {
     assert!(endpoint.receive(Duration::ZERO).unwrap().is_none());
 }
 
-#[test]
-fn raw_memory_is_lent_filled_and_sent() {
+fn raw_memory_is_lent_filled_and_sent(transport: Transport) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, Registration::new());
+    let mut endpoint = register(&node, on(transport));
     let kind = Kind::named("test.raw");
     let mut buffer = endpoint.create_message(app.tid, kind, 100_000).unwrap();
     buffer[99_999] = 7;
@@ -114,11 +150,10 @@ fn raw_memory_is_lent_filled_and_sent() {
     assert!(matches!(too_long, Err(ApiError::TooLong { .. })));
 }
 
-#[test]
-fn raw_memory_is_confirmed_asked_with_and_replied_with() {
+fn raw_memory_is_confirmed_asked_with_and_replied_with(transport: Transport) {
     let node = TestNode::start();
-    let mut asking = register(&node, Registration::new().handles_named("test.raw"));
-    let mut replying = register(&node, Registration::new());
+    let mut asking = register(&node, on(transport).handles_named("test.raw"));
+    let mut replying = register(&node, on(transport));
     let (to, kind) = (replying.tid(), Kind::named("test.raw"));
     let thread = thread::spawn(move || {
         replying
@@ -141,11 +176,10 @@ fn raw_memory_is_confirmed_asked_with_and_replied_with() {
     thread.join().unwrap();
 }
 
-#[test]
-fn a_confirmed_message_ends_in_what_its_receiver_says() {
+fn a_confirmed_message_ends_in_what_its_receiver_says(transport: Transport) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, Registration::new());
+    let mut endpoint = register(&node, on(transport));
     for said in [Outcome::Delivered, Outcome::Rejected(Rejection::ByHandler), Outcome::Failed] {
         let told = thread::scope(|scope| {
             scope.spawn(|| app.next().settle(said));
@@ -160,11 +194,10 @@ fn a_confirmed_message_ends_in_what_its_receiver_says() {
     assert_eq!(told, Outcome::Rejected(Rejection::Unsupported), "of a Stream the newest wins");
 }
 
-#[test]
-fn an_outcome_that_nobody_says_is_unknown_at_the_deadline() {
+fn an_outcome_that_nobody_says_is_unknown_at_the_deadline(transport: Transport) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, Registration::new());
+    let mut endpoint = register(&node, on(transport));
     let told = endpoint.send_confirmed(app.tid, &TORQUE, Duration::from_millis(1)).unwrap();
     assert_eq!(told, Outcome::Unknown);
     // The late outcome of the first is not taken for the second's.
@@ -176,11 +209,10 @@ fn an_outcome_that_nobody_says_is_unknown_at_the_deadline() {
     assert_eq!(told, Outcome::Failed);
 }
 
-#[test]
-fn messages_that_come_while_an_outcome_is_awaited_are_received_afterwards() {
+fn messages_that_come_while_an_outcome_is_awaited_are_received_afterwards(transport: Transport) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, Registration::new());
+    let mut endpoint = register(&node, on(transport));
     let tid = endpoint.tid();
     thread::scope(|scope| {
         scope.spawn(|| {
@@ -193,11 +225,10 @@ fn messages_that_come_while_an_outcome_is_awaited_are_received_afterwards() {
     assert!(endpoint.receive(Duration::ZERO).unwrap().is_some());
 }
 
-#[test]
-fn two_endpoints_of_one_process_ask_and_reply() {
+fn two_endpoints_of_one_process_ask_and_reply(transport: Transport) {
     let node = TestNode::start();
-    let mut asking = register(&node, Registration::new());
-    let mut replying = register(&node, Registration::new());
+    let mut asking = register(&node, on(transport));
+    let mut replying = register(&node, on(transport));
     let to = replying.tid();
     let thread = thread::spawn(move || {
         let request = replying.receive(WATCHDOG).unwrap().expect("a request");
@@ -210,30 +241,27 @@ fn two_endpoints_of_one_process_ask_and_reply() {
     thread.join().unwrap();
 }
 
-#[test]
-fn a_request_that_cannot_be_handled_ends_at_once() {
+fn a_request_that_cannot_be_handled_ends_at_once(transport: Transport) {
     let node = TestNode::start();
-    let mut endpoint = register(&node, Registration::new());
+    let mut endpoint = register(&node, on(transport));
     let nobody = Tid::new(node.address(), AppAddress::new(0x7777));
     let error = endpoint.ask::<_, Doubled>(nobody, &TORQUE, WATCHDOG).unwrap_err();
     assert!(matches!(error, ApiError::Ended(Outcome::Rejected(Rejection::NoSuchApplication))), "{error}");
 }
 
-#[test]
-fn what_asks_for_no_reply_gets_none() {
+fn what_asks_for_no_reply_gets_none(transport: Transport) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, Registration::new());
+    let mut endpoint = register(&node, on(transport));
     node.stores.router.send(Message::typed(app.tid, endpoint.tid(), &TORQUE)).unwrap();
     let received = endpoint.receive(WATCHDOG).unwrap().expect("a message");
     assert!(matches!(endpoint.reply(&received, &TORQUE), Err(ApiError::NotAsked)));
 }
 
-#[test]
-fn a_received_message_counts_as_handled_when_it_is_dropped() {
+fn a_received_message_counts_as_handled_when_it_is_dropped(transport: Transport) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, Registration::new());
+    let mut endpoint = register(&node, on(transport));
     let tid = endpoint.tid();
     let outcome = node.send_confirmed(app.tid, tid, &TORQUE);
     drop(endpoint.receive(WATCHDOG).unwrap().expect("a message"));
@@ -243,11 +271,10 @@ fn a_received_message_counts_as_handled_when_it_is_dropped() {
     assert_eq!(outcome.recv_timeout(WATCHDOG), Ok(Outcome::Rejected(Rejection::Malformed)));
 }
 
-#[test]
-fn a_message_that_is_in_hand_at_a_panic_has_failed() {
+fn a_message_that_is_in_hand_at_a_panic_has_failed(transport: Transport) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, Registration::new());
+    let mut endpoint = register(&node, on(transport));
     let outcome = node.send_confirmed(app.tid, endpoint.tid(), &TORQUE);
     let thread = thread::spawn(move || {
         let _in_hand = endpoint.receive(WATCHDOG).unwrap().expect("a message");
@@ -257,11 +284,10 @@ fn a_message_that_is_in_hand_at_a_panic_has_failed() {
     assert_eq!(outcome.recv_timeout(WATCHDOG), Ok(Outcome::Failed));
 }
 
-#[test]
-fn what_waited_in_a_dropped_endpoint_was_not_handled() {
+fn what_waited_in_a_dropped_endpoint_was_not_handled(transport: Transport) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, Registration::new());
+    let mut endpoint = register(&node, on(transport));
     let first = node.send_confirmed(app.tid, endpoint.tid(), &TORQUE);
     let second = node.send_confirmed(app.tid, endpoint.tid(), &TORQUE);
     // Both have come with one look at the socket.
@@ -271,11 +297,10 @@ fn what_waited_in_a_dropped_endpoint_was_not_handled() {
     assert_eq!(second.recv_timeout(WATCHDOG), Ok(Outcome::Rejected(Rejection::Closed)));
 }
 
-#[test]
-fn of_a_stream_only_the_newest_value_is_received() {
+fn of_a_stream_only_the_newest_value_is_received(transport: Transport) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, Registration::new());
+    let mut endpoint = register(&node, on(transport));
     for value in 0..10 {
         node.stores.router.send(Message::typed(app.tid, endpoint.tid(), &Setpoint(value))).unwrap();
     }
@@ -284,11 +309,10 @@ fn of_a_stream_only_the_newest_value_is_received() {
     assert!(endpoint.receive(Duration::ZERO).unwrap().is_none());
 }
 
-#[test]
-fn a_member_gets_what_is_sent_to_its_group_until_it_leaves() {
+fn a_member_gets_what_is_sent_to_its_group_until_it_leaves(transport: Transport) {
     let node = TestNode::start();
-    let mut member = register(&node, Registration::new());
-    let mut sender = register(&node, Registration::new());
+    let mut member = register(&node, on(transport));
+    let mut sender = register(&node, on(transport));
     let group = Tid::group("drives");
     member.join("drives").unwrap();
     sender.send(group, &TORQUE).unwrap();
@@ -300,23 +324,21 @@ fn a_member_gets_what_is_sent_to_its_group_until_it_leaves() {
     assert_eq!(member.receive(WATCHDOG).unwrap().expect("a message").destination(), member.tid());
 }
 
-#[test]
-fn names_resolve_and_are_free_when_unregister_returns() {
+fn names_resolve_and_are_free_when_unregister_returns(transport: Transport) {
     let node = TestNode::start();
-    let mut endpoint = register(&node, Registration::new());
+    let mut endpoint = register(&node, on(transport));
     assert_eq!(endpoint.resolve("hip", WATCHDOG).unwrap(), None);
-    let hip = register(&node, Registration::new().name("hip"));
+    let hip = register(&node, on(transport).name("hip"));
     assert_eq!(endpoint.resolve("hip", WATCHDOG).unwrap(), Some(hip.tid()));
     hip.unregister().unwrap();
     assert_eq!(endpoint.resolve("hip", WATCHDOG).unwrap(), None);
-    register(&node, Registration::new().name("hip"));
+    register(&node, on(transport).name("hip"));
 }
 
-#[test]
-fn a_registration_waits_at_the_barrier_and_names_what_it_waits_for() {
+fn a_registration_waits_at_the_barrier_and_names_what_it_waits_for(transport: Transport) {
     let mut node = TestNode::start();
     let api = NodeApi::connect(node.path()).unwrap();
-    let wanted = Registration::new().requires(["knee.sensor", "central.gait"]);
+    let wanted = on(transport).requires(["knee.sensor", "central.gait"]);
     let error =
         api.register_transport_address(wanted.clone().deadline(Duration::from_millis(1))).unwrap_err();
     assert!(error.to_string().contains("knee.sensor, central.gait"), "{error}");
@@ -328,10 +350,9 @@ fn a_registration_waits_at_the_barrier_and_names_what_it_waits_for() {
     assert_eq!(waiting.join().unwrap().unwrap().tid().app, app);
 }
 
-#[test]
-fn the_end_of_the_node_is_an_error_with_its_reason() {
+fn the_end_of_the_node_is_an_error_with_its_reason(transport: Transport) {
     let mut node = TestNode::start();
-    let mut endpoint = register(&node, Registration::new());
+    let mut endpoint = register(&node, on(transport));
     node.stop();
     let error = endpoint.receive(WATCHDOG).unwrap_err();
     assert!(error.to_string().contains("LNCL has ended"), "{error}");
@@ -339,15 +360,14 @@ fn the_end_of_the_node_is_an_error_with_its_reason() {
     assert!(error.to_string().contains("LNCL has ended"), "{error}");
 }
 
-#[test]
-fn every_thread_may_have_an_address_of_its_own() {
+fn every_thread_may_have_an_address_of_its_own(transport: Transport) {
     let node = TestNode::start();
     let api = NodeApi::connect(node.path()).unwrap();
     let app = node.local(1);
     thread::scope(|scope| {
         for _ in 0..8 {
             scope.spawn(|| {
-                let mut endpoint = api.register_transport_address(Registration::new()).unwrap();
+                let mut endpoint = api.register_transport_address(on(transport)).unwrap();
                 let kind = Kind::named("test.raw");
                 for number in 0..100_u64 {
                     let mut buffer = endpoint.create_message(app.tid, kind, 8).unwrap();

@@ -76,6 +76,13 @@ pub(super) enum Writer {
 }
 
 impl Writer {
+    pub(super) const fn transport(&self) -> Transport {
+        match self {
+            Self::Socket(_) => Transport::Socket,
+            Self::Ring(_) => Transport::Ring,
+        }
+    }
+
     /// Writes one frame.
     pub(super) fn write(&self, message: &Message) -> Result<(), ApiError> {
         match self {
