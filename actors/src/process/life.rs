@@ -23,7 +23,7 @@ use tokio::{
 };
 
 use super::{
-    held::Process,
+    held::{Process, is_dead},
     link::{LastWords, Link},
     names::KnownNames,
     spawn::{self, Started},
@@ -40,8 +40,8 @@ use crate::{
 
 /// Time that a process has to end once it has said that it does, or was killed.
 const ENDING: Duration = Duration::from_secs(1);
-/// Time that a killed process has to end while the node's thread waits for it. It takes a fraction of a millisecond; what
-/// takes longer hangs in the kernel.
+/// Time that a killed process has to end while a thread of the node's waits for it that ends itself. It takes a fraction of a
+/// millisecond; what takes longer has much memory to give back, or hangs in the kernel.
 const DYING: Duration = Duration::from_millis(20);
 /// Numbers of waits for each process of a TID: more than it can use up.
 const WAITS_PER_LIFE: u64 = 1 << 40;
@@ -81,6 +81,15 @@ impl Life for ProcessLife {
 }
 
 async fn run(hosted: Arc<Hosted>, ready: ReadyGate, stop: Rc<Notify>) -> Reason {
+    // This process finds the devices and ports of the one before it free.
+    if let Some(former) = hosted.link.take_former()
+        && !is_dead(former, ENDING).await
+    {
+        tracing::warn!(
+            app = hosted.name,
+            "its former process was killed and has not ended; another one is started beside it"
+        );
+    }
     let started = match spawn::start(hosted.variable()).await {
         Ok(started) => started,
         Err(why) => return Reason::ProcessEnded(format!("it could not be started: {why}")),
@@ -123,12 +132,17 @@ struct Child {
 
 impl Drop for Child {
     fn drop(&mut self) {
-        // Its supervisor does not wait for its end: it was not ready, or did not stop, in its time.
-        if !self.is_buried {
-            self.process.kill();
-            let is_dead = self.process.ends_at_once(DYING);
-            self.bury(is_dead);
+        if self.is_buried {
+            return;
         }
+        self.process.kill();
+        // Fenced, its supervisor does not wait for its end: it was not ready, or did not stop, in its time. What it still says
+        // counts no more. This thread goes on with others; whoever comes next waits.
+        let is_dead = !supervision::is_fenced() && self.process.ends_at_once(DYING);
+        if !is_dead {
+            self.hosted.link.set_former(self.process.pidfd());
+        }
+        self.bury(is_dead);
     }
 }
 
@@ -249,7 +263,7 @@ impl Child {
     /// What it said before it ended counts.
     fn bury(&mut self, is_dead: bool) {
         self.is_buried = true;
-        // Fenced, it has a successor already: late words of it would come between that one's.
+        // Fenced, it is known as dead already: late words of it would come behind its will, or between its successor's.
         let last_words = if is_dead && !supervision::is_fenced() && self.hear_the_rest() {
             LastWords::Heard
         } else {

@@ -3,9 +3,12 @@
 //! The sender's own thread writes to the child's socket when the child has room and nothing waits. What it does not take
 //! stays in the mailbox, where classes and newest values keep their meaning.
 
-use std::sync::{
-    Arc, Mutex, OnceLock,
-    atomic::{AtomicU64, Ordering},
+use std::{
+    os::fd::OwnedFd,
+    sync::{
+        Arc, Mutex, OnceLock,
+        atomic::{AtomicU64, Ordering},
+    },
 };
 
 use bytes::Bytes;
@@ -45,6 +48,8 @@ pub(crate) struct Link {
     present: Mutex<Option<Present>>,
     /// Which process of this TID is the present one.
     lives: AtomicU64,
+    /// The process before it, if that was killed and nobody has seen its end.
+    former: Mutex<Option<Arc<OwnedFd>>>,
     /// A message waits until the child knows which names have changed.
     nudge: Notify,
     /// The node's own sending side of the TID.
@@ -88,6 +93,7 @@ impl Link {
             outlet: StreamOutlet::new(limits),
             present: Mutex::new(None),
             lives: AtomicU64::new(0),
+            former: Mutex::new(None),
             nudge: Notify::new(),
             sender: OnceLock::new(),
         })
@@ -108,6 +114,16 @@ impl Link {
     /// Which process of this TID the next one is, from 1.
     pub(super) fn begin_life(&self) -> u64 {
         self.lives.fetch_add(1, Ordering::Relaxed) + 1
+    }
+
+    /// This process was killed, and nobody waits for its end.
+    pub(super) fn set_former(&self, pidfd: Arc<OwnedFd>) {
+        *lock(&self.former) = Some(pidfd);
+    }
+
+    /// The process whose end nobody has seen, for the next one to wait for.
+    pub(super) fn take_former(&self) -> Option<Arc<OwnedFd>> {
+        lock(&self.former).take()
     }
 
     /// Sequence of the last message that came from the TID.

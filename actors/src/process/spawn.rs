@@ -28,8 +28,9 @@ use super::words::VARIABLE;
 /// Orders that wait for the thread at most. When full: a start fails and is tried again, and a process that was killed
 /// stays in the kernel's table.
 const ORDERS_MAX: usize = 1_024;
-/// Time between two looks at processes that were killed and have not ended.
-const REAPING: Duration = Duration::from_millis(2);
+/// Time between two looks at processes that were killed and have not ended: the first one, doubled up to the last.
+const REAPING_MIN: Duration = Duration::from_millis(2);
+const REAPING_MAX: Duration = Duration::from_millis(256);
 
 /// A process that has just been started.
 pub(super) struct Started {
@@ -95,12 +96,14 @@ fn thread() -> &'static std::io::Result<SyncSender<Order>> {
 
 fn run(inbox: &Receiver<Order>) {
     let mut doomed: Vec<Arc<OwnedFd>> = Vec::new();
+    let mut pause = REAPING_MIN;
     loop {
         let order = if doomed.is_empty() {
             inbox.recv().map_err(RecvTimeoutError::from)
         } else {
-            inbox.recv_timeout(REAPING)
+            inbox.recv_timeout(pause)
         };
+        pause = if order.is_ok() { REAPING_MIN } else { (pause * 2).min(REAPING_MAX) };
         match order {
             Ok(Order::Start { variable, answer }) => {
                 if let Err(Ok(unwanted)) = answer.send(start_now(&variable)) {

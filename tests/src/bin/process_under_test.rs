@@ -1,7 +1,8 @@
 //! A node for the scenarios of applications in processes of their own.
 //!
 //! `process_under_test CONFIG.toml [--place thread|process|io] [--requires NAME] [--on-lost pause|restart]
-//! [--dies-at-start CODE] [--neighbour-hangs MILLIS] [--talks] [--stays]`
+//! [--dies-at-start CODE] [--neighbour-hangs MILLIS] [--talks] [--stays]
+//! [--swells-at-start MIB]`
 //!
 //! The application `drive` does as it is told (`Order`), and says what it sees, one line each. With a neighbour there is another
 //! one on the `io` thread, which blocks that thread a moment after its start for so long; if for 0 ms, each life of it for ever.
@@ -21,10 +22,29 @@ use sinew_tests::orders::{Count, Level, Me, Order, Who};
 struct Drive {
     counts: Vec<u64>,
     talks: bool,
+    /// How much memory it takes at its start, in MiB; it is never ready then.
+    swells: Option<usize>,
 }
 
 fn say(what: &str) {
     println!("{} {what}", std::process::id());
+}
+
+/// Other processes of its node's that have not ended.
+fn brothers() -> usize {
+    let parent = std::os::unix::process::parent_id().to_string();
+    let is_brother = |process: std::fs::DirEntry| {
+        let stat = std::fs::read_to_string(process.path().join("stat")).ok()?;
+        // The name before it may have blanks of its own.
+        let (_, after_name) = stat.rsplit_once(')')?;
+        let words: Vec<&str> = after_name.split_ascii_whitespace().collect();
+        let has_ended = matches!(*words.first()?, "Z" | "X");
+        // Not by the name `self`.
+        let id: u32 = process.file_name().to_str()?.parse().ok()?;
+        (*words.get(1)? == parent && id != std::process::id() && !has_ended).then_some(())
+    };
+    let processes = std::fs::read_dir("/proc").expect("it is always there");
+    processes.filter_map(|process| is_brother(process.ok()?)).count()
 }
 
 impl Actor for Drive {
@@ -38,6 +58,12 @@ impl Actor for Drive {
                 // What the node does not take is not heard.
                 let _ = context.send("witness", &Count { number: u64::from(std::process::id()) });
             });
+        }
+        if let Some(mib) = self.swells {
+            say(if brothers() == 0 { "process has no brother" } else { "process has a brother" });
+            // A process that has much to give back takes its time to die.
+            std::mem::forget((vec![1_u8; mib << 20], context.hold_ready()));
+            say("has swollen");
         }
     }
 
@@ -252,11 +278,12 @@ fn main() -> ExitCode {
     let dies_with = after("--dies-at-start").map(|code| code.parse().expect("an exit code"));
     let is_set = |flag: &str| arguments.iter().any(|argument| argument == flag);
     let (talks, stays) = (is_set("--talks"), is_set("--stays"));
+    let swells: Option<usize> = after("--swells-at-start").map(|mib| mib.parse().expect("a number of MiB"));
     let drive = move || {
         if let Some(code) = dies_with {
             std::process::exit(code);
         }
-        Drive { talks, ..Drive::default() }
+        Drive { talks, swells, ..Drive::default() }
     };
     let mut drive = AppSpec::new("drive", drive)
         .handles::<Count>()
@@ -266,6 +293,9 @@ fn main() -> ExitCode {
         .handles::<NodeEvent>()
         .handles::<RequirementEvent>()
         .requires(after("--requires"));
+    if swells.is_some() {
+        drive = drive.start_within(Duration::from_secs(1));
+    }
     drive = match after("--on-lost").as_deref() {
         None => drive,
         Some("pause") => drive.on_requirement_lost(RequirementPolicy::Pause),

@@ -138,6 +138,17 @@ fn a_process_that_dies_at_each_start_makes_the_node_give_up_and_say_of_what() {
 }
 
 #[test]
+fn the_next_process_begins_when_the_one_that_was_killed_has_ended_however_long_that_takes() {
+    let directory = OwnDirectory::new();
+    // Never ready, each is killed when its time is over, and has half a gibibyte to give back.
+    let mut node = process_under_test(&configuration(&directory, ""), &["--swells-at-start", "512"]);
+    for _ in 0..3 {
+        let line = node.wait_for(&["process has"]);
+        assert!(line.ends_with("has no brother"), "its devices and ports may be in use: {line}");
+    }
+}
+
+#[test]
 fn a_command_that_the_application_starts_is_no_host() {
     let mut scenario = Scenario::start(&[]);
     scenario.order(Order::StartACommand);
