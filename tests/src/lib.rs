@@ -25,7 +25,7 @@ use std::{
 };
 
 /// No scenario waits longer than this for one thing. It is generous: the machine may be busy with other tests.
-pub const DEADLINE: Duration = Duration::from_secs(30);
+pub const DEADLINE: Duration = Duration::from_secs(60);
 
 /// A number that no other test of this run has: this process's id and a count.
 #[must_use]

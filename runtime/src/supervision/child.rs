@@ -22,8 +22,8 @@ impl Child {
     pub(super) fn reprieved(&mut self, state: ChildState, now: Time) -> Option<Time> {
         let vitals = self.tenant.as_ref()?.vitals();
         let (deadline, is_done) = match state {
-            ChildState::Starting(deadline) => (deadline, vitals.is_ready() || vitals.is_gone()),
-            ChildState::Stopping(deadline) => (deadline, vitals.is_gone()),
+            ChildState::Starting(deadline) => (deadline, vitals.is_ready() || vitals.is_leaving()),
+            ChildState::Stopping(deadline) => (deadline, vitals.is_leaving()),
             ChildState::Down | ChildState::BackingOff(_) | ChildState::Ready => return None,
         };
         let is_over = deadline <= now;

@@ -73,7 +73,9 @@ impl Left {
         if self.until > now {
             return false;
         }
-        let later = if self.tenant.has_ended() { None } else { self.reprieve.until(self.until, now, false) };
+        let is_leaving = self.tenant.vitals().is_leaving();
+        let later =
+            if self.tenant.has_ended() { None } else { self.reprieve.until(self.until, now, is_leaving) };
         self.until = later.unwrap_or(self.until);
         later.is_none()
     }

@@ -4,7 +4,10 @@ use std::{
     any::Any,
     cell::RefCell,
     panic::{AssertUnwindSafe, PanicHookInfo, catch_unwind},
-    sync::Once,
+    sync::{
+        Once,
+        atomic::{AtomicU64, Ordering},
+    },
 };
 
 use super::vitals::{Doing, Vitals};
@@ -18,6 +21,14 @@ thread_local! {
     static LAST: RefCell<Option<String>> = const { RefCell::new(None) };
 }
 
+/// Panics that were told to whoever listens, with their backtraces. One at a time: all others wait.
+static TOLD: AtomicU64 = AtomicU64::new(0);
+
+/// How many panics were told so far: while it grows, whoever panics waits for his turn.
+pub(super) fn told() -> u64 {
+    TOLD.load(Ordering::Relaxed)
+}
+
 /// Makes panics remember where they were. The hook that was there before is called as before.
 pub(super) fn install_hook() {
     static INSTALLED: Once = Once::new();
@@ -26,6 +37,7 @@ pub(super) fn install_hook() {
         std::panic::set_hook(Box::new(move |info| {
             remember(info);
             former(info);
+            TOLD.fetch_add(1, Ordering::Relaxed);
         }));
     });
 }

@@ -390,7 +390,7 @@ fn let_go(tenant: Tenant, mut reprieve: Reprieve, deadline: Time, context: &mut 
         if tenant.has_ended() {
             return;
         }
-        match reprieve.until(deadline, Time::now(), false) {
+        match reprieve.until(deadline, Time::now(), tenant.vitals().is_leaving()) {
             Some(later) => let_go(tenant, reprieve, later, context),
             None => this.threads.borrow_mut().give_up(&tenant),
         }

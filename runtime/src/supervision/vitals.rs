@@ -255,6 +255,13 @@ impl Vitals {
         self.gone.store(true, Ordering::Release);
     }
 
+    /// Whether it is on its way out, for which it has more time than to do anything else: it panics, or is gone and its supervisor
+    /// has not heard of it.
+    pub(super) fn is_leaving(&self) -> bool {
+        let sight = self.sight();
+        self.is_gone() || (sight.is_busy() && sight.doing == Doing::Panic)
+    }
+
     /// Whether nothing of it is left.
     pub(super) fn is_gone(&self) -> bool {
         self.gone.load(Ordering::Acquire)

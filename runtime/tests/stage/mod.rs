@@ -30,7 +30,7 @@ use sinew_runtime::{
 };
 
 /// No test waits longer than this for anything.
-pub(crate) const DEADLINE: Duration = Duration::from_secs(20);
+pub(crate) const DEADLINE: Duration = Duration::from_secs(60);
 
 const NODE: NodeAddress = NodeAddress::new(0x7f00_0001);
 

@@ -27,7 +27,7 @@ use suspect::{Hang, Look, Stall, StallSuspect, TurnSuspect};
 
 use super::{
     Reason,
-    panics::words,
+    panics::{told, words},
     place::make_realtime,
     tenant::{Fate, Tenant},
 };
@@ -192,7 +192,7 @@ impl Watched {
 
     fn look(&mut self, now: Time, late: Duration, period: Duration) -> bool {
         let vitals = self.tenant.vitals();
-        let look = Look { now, late, sight: vitals.sight() };
+        let look = Look { now, late, panics: told(), sight: vitals.sight() };
         let seat = self.tenant.seat().cloned();
         let cpu = || sample(seat.as_ref()?.tid()?);
         if let Some(hang) = self.turn.look(look, period, cpu) {
@@ -248,7 +248,7 @@ impl Watched {
         if holds_its_thread {
             self.tenant.set_holds_its_thread(since);
         }
-        let mut words = format!("{what}, since {since:?}, for {lasted:.1?} of {:?} allowed", self.budget);
+        let mut words = format!("{what}, for {lasted:.1?} of {:?} allowed", self.budget);
         if !excused.is_zero() {
             words.push_str(&format!(" (without {excused:.1?} in which it had no CPU)"));
         }
