@@ -11,6 +11,8 @@ pub(crate) enum AppFact {
     Ready { app: AppAddress },
     /// It takes no messages: it failed and is not started again yet.
     Down { app: AppAddress },
+    /// It takes no messages: it was stopped, or has ended in order.
+    Stopped { app: AppAddress },
     /// It is gone.
     Unregistered { app: AppAddress },
     /// The groups that have members on this node changed.

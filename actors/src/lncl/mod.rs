@@ -42,7 +42,7 @@ pub(crate) use door::Door;
 pub(crate) use facts::AppFact;
 pub(crate) use reader::Reader;
 pub(crate) use registrar::{
-    LocalApp, app_down, app_ready, register_local, resolve, set_member, unregister_local,
+    LocalApp, app_down, app_ready, app_stopped, register_local, resolve, set_member, unregister_local,
 };
 
 use sinew_runtime::tid::AppAddress;

@@ -68,6 +68,11 @@ pub(crate) fn app_down(stores: &Stores, app: AppAddress) {
     tell(stores, AppFact::Down { app });
 }
 
+/// The application was stopped or has ended in order; it keeps its address.
+pub(crate) fn app_stopped(stores: &Stores, app: AppAddress) {
+    tell(stores, AppFact::Stopped { app });
+}
+
 /// Takes the address of an application back.
 pub(crate) fn unregister_local(stores: &Stores, app: AppAddress) {
     let mut registry = lock(&stores.registry);
@@ -133,7 +138,11 @@ fn forget(stores: &Stores, app: AppAddress, cause: Cause) {
 
 /// Tells the sync manager, and NDL where the application wants to know who is there.
 fn tell(stores: &Stores, fact: AppFact) {
-    let (AppFact::Ready { app } | AppFact::Down { app } | AppFact::Unregistered { app }) = fact else {
+    let (AppFact::Ready { app }
+    | AppFact::Down { app }
+    | AppFact::Stopped { app }
+    | AppFact::Unregistered { app }) = fact
+    else {
         tell_sync(stores, fact);
         return;
     };

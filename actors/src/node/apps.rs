@@ -6,9 +6,9 @@
 use std::{cell::RefCell, collections::BTreeMap, rc::Rc, sync::Arc};
 
 use sinew_runtime::{
-    app::DynApp,
+    app::{DynApp, RequirementPolicy},
     mailbox::Mailbox,
-    supervision::{ChildId, Place, SupervisorFact},
+    supervision::{ChildId, Place, Reason, SupervisorFact},
     tid::{AppAddress, Tid},
 };
 
@@ -32,6 +32,7 @@ struct App {
     tid: Tid,
     mailbox: Arc<Mailbox>,
     place: Place,
+    on_lost: RequirementPolicy,
     progress: Progress,
 }
 
@@ -45,6 +46,16 @@ enum Progress {
     Gone,
 }
 
+impl App {
+    fn tell_end(&self, stores: &Stores, reason: &Reason) {
+        if reason.is_failure() {
+            lncl::app_down(stores, self.tid.app);
+        } else {
+            lncl::app_stopped(stores, self.tid.app);
+        }
+    }
+}
+
 impl Apps {
     /// An application that has its address and its mailbox and is not started yet.
     pub(super) fn add(&self, id: ChildId, app: &DynApp, tid: Tid, mailbox: Arc<Mailbox>) {
@@ -52,7 +63,8 @@ impl Apps {
         table.by_address.insert(tid.app, id);
         table.names.insert(app.name().to_owned(), id);
         let (name, place) = (app.name().to_owned(), app.place().clone());
-        table.apps.insert(id, App { name, tid, mailbox, place, progress: Progress::Coming });
+        let (on_lost, progress) = (app.requirement_policy(), Progress::Coming);
+        table.apps.insert(id, App { name, tid, mailbox, place, on_lost, progress });
     }
 
     /// A supervisor of applications.
@@ -78,6 +90,11 @@ impl Apps {
     /// Its mailbox, and whether it has a process of its own.
     pub(super) fn mailbox(&self, id: ChildId) -> Option<(Arc<Mailbox>, bool)> {
         self.0.borrow().apps.get(&id).map(|app| (app.mailbox.clone(), app.place.own_process))
+    }
+
+    /// Whether it pauses when it loses what it requires.
+    pub(super) fn pauses(&self, id: ChildId) -> bool {
+        self.0.borrow().apps.get(&id).is_some_and(|app| app.on_lost == RequirementPolicy::Pause)
     }
 
     /// Refuses one that wants a thread to be what it cannot be for those that are there.
@@ -110,14 +127,14 @@ impl Apps {
                 app.progress = Progress::Running;
                 lncl::app_ready(stores, app.tid.app);
             }),
-            SupervisorFact::Failed(id, _) => self.change(*id, |app| {
+            SupervisorFact::Failed(id, reason) => self.change(*id, |app| {
                 app.progress = Progress::Coming;
-                lncl::app_down(stores, app.tid.app);
+                app.tell_end(stores, reason);
             }),
-            SupervisorFact::Gone(id, _) => self.change(*id, |app| {
+            SupervisorFact::Gone(id, reason) => self.change(*id, |app| {
                 app.progress = Progress::Gone;
                 app.mailbox.close();
-                lncl::app_down(stores, app.tid.app);
+                app.tell_end(stores, reason);
             }),
             SupervisorFact::Deleted(id) => self.remove(stores, *id),
             SupervisorFact::AllReady

@@ -12,6 +12,7 @@ use super::{
     CommandError, NodeHandle,
     root::{Root, RootEvent},
 };
+use crate::stores::lock;
 
 /// Time for the root's answer. It waits for nobody, so that this is over only if the root itself hangs.
 const WITHIN: Duration = Duration::from_secs(10);
@@ -47,6 +48,11 @@ pub struct Supervised {
     pub place: Option<String>,
     /// What waits for it; `None` where there is no mailbox.
     pub mailbox: Option<MailboxState>,
+    /// The names that it lacks of those that it requires, and why each is not ready: before its start what it waits for, later
+    /// what it lost.
+    pub missing: Vec<(String, &'static str)>,
+    /// Former lives of it that were taken, because they hung or did not stop, and have not let go of their threads.
+    pub abandoned: usize,
     /// Whom it supervises, if it is a supervisor.
     pub supervises: Option<Supervises>,
 }
@@ -64,6 +70,8 @@ pub enum LifeState {
     Starts,
     /// It is ready.
     Ready,
+    /// It is ready, has lost what it requires, and was declared to pause then.
+    Paused,
     /// It was told to stop.
     Stops,
     /// It was stopped or has ended, and is not started again by itself.
@@ -148,6 +156,8 @@ impl Root {
             last_reason: None,
             place: None,
             mailbox: None,
+            missing: Vec::new(),
+            abandoned: 0,
             supervises: Some(self.supervises(roster, now, view)),
         }
     }
@@ -173,10 +183,13 @@ impl Root {
         let (mailbox, own_process) = self.apps.mailbox(id).unzip();
         let thread = who.as_ref().and_then(|who| who.place.as_ref()).map(|place| place.thread.clone());
         let place = if own_process == Some(true) { Some("own process".to_owned()) } else { thread };
+        let tid = who.as_ref().and_then(|who| who.tid);
+        let missing = tid.map(|tid| lock(&self.stores.sync).missing(now, tid.app)).unwrap_or_default();
+        let is_paused = !missing.is_empty() && self.apps.pauses(id);
         Supervised {
-            tid: who.as_ref().and_then(|who| who.tid),
+            tid,
             name: who.map_or_else(|| id.to_string(), |who| who.name),
-            state: state(&view),
+            state: state(&view, is_paused),
             // One that was never started has waited since the node's start.
             since: now.since(view.since.max(self.began)),
             generation: view.generation,
@@ -185,18 +198,21 @@ impl Root {
             place,
             mailbox: mailbox
                 .map(|mailbox| MailboxState { depth: mailbox.depth(), high_water: mailbox.high_water() }),
+            missing,
+            abandoned: view.abandoned,
             supervises: below.map(|below| self.supervises(roster, now, below)),
         }
     }
 }
 
-fn state(view: &ChildView) -> LifeState {
+fn state(view: &ChildView, is_paused: bool) -> LifeState {
     match view.state {
         ChildState::Down if view.waits_for_release => LifeState::WaitsForRequirements,
         ChildState::Down if view.wanted => LifeState::WaitsForItsTurn,
         ChildState::Down => LifeState::Down,
         ChildState::BackingOff(_) => LifeState::BacksOff,
         ChildState::Starting(_) => LifeState::Starts,
+        ChildState::Ready if is_paused => LifeState::Paused,
         ChildState::Ready => LifeState::Ready,
         ChildState::Stopping(_) => LifeState::Stops,
     }
@@ -210,6 +226,7 @@ impl fmt::Display for LifeState {
             Self::BacksOff => "backs off",
             Self::Starts => "starts",
             Self::Ready => "ready",
+            Self::Paused => "paused",
             Self::Stops => "stops",
             Self::Down => "down",
         })
@@ -256,13 +273,25 @@ impl fmt::Display for Supervised {
         if let Some(MailboxState { depth, high_water }) = self.mailbox {
             write!(f, ", mailbox {depth} (at most {high_water})")?;
         }
-        let Some(Supervises { flags, restarts_in_window, .. }) = &self.supervises else { return Ok(()) };
+        for (name, why) in &self.missing {
+            write!(f, ", without {name} ({why})")?;
+        }
+        if self.abandoned > 0 {
+            write!(f, ", {} former lives keep their threads", self.abandoned)?;
+        }
+        let Some(Supervises { flags, restarts_in_window, abandoned, .. }) = &self.supervises else {
+            return Ok(());
+        };
         let strategy = match flags.strategy {
             Strategy::OneForOne => "one-for-one",
             Strategy::RestForOne => "rest-for-one",
             Strategy::OneForAll => "one-for-all",
         };
         let (max, window) = (flags.intensity.restarts_max, flags.intensity.window.as_secs_f32());
-        write!(f, ", {strategy}, {restarts_in_window} of {max} restarts in {window} s")
+        write!(f, ", {strategy}, {restarts_in_window} of {max} restarts in {window} s")?;
+        if *abandoned > 0 {
+            write!(f, ", {abandoned} of {} lives that keep their threads", flags.abandoned_max)?;
+        }
+        Ok(())
     }
 }

@@ -17,7 +17,7 @@ use sinew_runtime::{
 
 use super::{
     Event,
-    core::{Core, Input, Output},
+    core::{Core, Input, Output, Reason},
 };
 use crate::{lncl::AppFact, monitors, node::RootEvent, refusals::Refusals, stores::Stores, wills};
 
@@ -205,9 +205,14 @@ impl SyncManager {
     }
 
     /// Tells an application that subscribed to it what became of a requirement.
-    fn tell(&self, app: AppAddress, event: RequirementEvent, why: &'static str) {
+    fn tell(&self, app: AppAddress, event: RequirementEvent, why: Option<Reason>) {
         match &event {
+            RequirementEvent::Lost { name } if why.is_some_and(Reason::is_orderly) => {
+                let why = why.map(Reason::words);
+                tracing::info!(%app, name, why, "what an application requires was stopped in order");
+            }
             RequirementEvent::Lost { name } => {
+                let why = why.map_or("it is ready again by now", Reason::words);
                 tracing::warn!(%app, name, why, "an application lost what it requires");
             }
             RequirementEvent::Met { name } => {

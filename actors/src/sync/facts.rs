@@ -10,7 +10,7 @@ pub struct Waiting {
     /// The application's name, or its address where it has none.
     pub application: String,
     /// The names that are not ready, and the last that is known of each: `registered, not ready`, `failed, not ready
-    /// again`, `its node is linked again, its directory has not come yet`, `its link is down`, `its node left`, `its
+    /// again`, `stopped in order, not ready again`, `its node has restarted, its directory has not come yet`, `its node is linked again, its directory has not come yet`, `its link is down`, `its node left`, `its
     /// node was lost`, `unregistered`, `never seen`, `part of a cycle of requirements`.
     pub missing: Vec<(String, &'static str)>,
     /// How long it has waited.

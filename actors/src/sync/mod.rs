@@ -13,7 +13,7 @@
 //! | SYNC-5 | An application is released once in each of its lives, when every name that it requires is ready. A life begins when it registers (not so again) and when it fails. |
 //! | SYNC-6 | A name belongs to the application of this node; else to that of a linked node; else to that of a node whose link is down. Of several nodes the lowest address wins. Any application of the name satisfies a requirement. |
 //! | SYNC-7 | Applications that require each other in a circle are not released, whoever came first; the circle is spelled out. Those that run already are not stopped. |
-//! | SYNC-8 | A released application is told when a requirement is lost and when it is met again, each once, in that order, as far as its mailbox takes it; what it does not take is offered again every 10 ms in its last form. |
+//! | SYNC-8 | A released application is told when a requirement is lost and when it is met again, each once, in that order, as far as its mailbox takes it; what it does not take is offered again every 10 ms in its last form. That nobody can hear of a requirement (its link is down, or up without a list, and its node neither lost nor restarted) is told after 50 ms. |
 //! | SYNC-9 | A wait that reaches its deadline is reported with what is missing, since when and why; again each time that the deadline passes. The wait goes on. |
 
 mod actor;

@@ -131,6 +131,11 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
 
     /// It has a process of its own, a child of the node's: nothing that it does harms the node, and it can be killed. See
     /// [`Place::process`].
+    ///
+    /// That process is this program, started again with the same arguments for each life of the application: its `main` runs again,
+    /// up to the line that starts the node, which does not return there. Whatever comes before that line happens in each such
+    /// process as well, so keep it short, and leave to the application itself what only one process can have (a port, a
+    /// device, a file that is written). It can do all that it can in a thread, but `monitor` others.
     #[must_use]
     pub fn own_process(self) -> Self {
         self.place(Place::process())
@@ -158,7 +163,9 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self
     }
 
-    /// When it is started again after it ended. Default: always.
+    /// When it is started again after it ended. Default: always. A node cannot tell a fault that will pass from one that will not
+    /// (a device that is not there, a configuration that is wrong): a start that fails is tried again, too, until its supervisor
+    /// has had its fill of restarts; by default that is the sixth failure within ten seconds.
     #[must_use]
     pub const fn restart(mut self, restart: Restart) -> Self {
         self.common.policy.restart = restart;
@@ -309,6 +316,12 @@ impl DynApp {
     #[must_use]
     pub fn faults(&self) -> &[crate::supervision::fault::Fault] {
         &self.common.faults
+    }
+
+    /// What it does when it loses what it requires.
+    #[must_use]
+    pub const fn requirement_policy(&self) -> RequirementPolicy {
+        self.common.on_lost
     }
 
     /// What is sent on its behalf when it has ended.

@@ -9,7 +9,7 @@ use std::{
     time::Duration,
 };
 
-use sinew::{Endpoint, NodeApi, Registration, Sender, StartError, prelude::*};
+use sinew::{Endpoint, LifeState, NodeApi, Registration, Sender, StartError, prelude::*};
 use sinew_tests::{
     DEADLINE, Ground, Log, OwnDirectory, all_run,
     puppet::{Job, Order, Puppet, Seen, Stage, desk, numbers},
@@ -93,6 +93,27 @@ fn an_application_that_pauses_handles_no_message_and_no_period_until_all_is_met_
     }
     let ticks = all.iter().filter(|seen| **seen == Seen::Said(1, "tick")).count();
     log.wait_for_many(Seen::Said(1, "tick"), ticks + 3);
+}
+
+#[test]
+fn the_tree_shows_who_is_paused_and_why_and_who_was_stopped_is_not_said_to_have_failed() {
+    let ((walker, log), (anchor, _)) = (Stage::new().app("walker"), Stage::new().app("anchor"));
+    let walker = walker.requires(["anchor"]).on_requirement_lost(RequirementPolicy::Pause);
+    let node = Ground::new().node("node").app(anchor).app(walker).start().expect("a node");
+    all_run(&[&node]);
+    log.wait_for(Seen::Started(1));
+    let walker = || node.handle().tree().ok()?.find("walker").cloned();
+    let is = |state, missing: &[(String, &str)]| {
+        walker().filter(|walker| walker.state == state && walker.missing == missing)
+    };
+    until("it runs and lacks nothing", || is(LifeState::Ready, &[]));
+    node.handle().stop_app("anchor").expect("it is there");
+    let why = ("anchor".to_owned(), "stopped in order, not ready again");
+    let shown = until("it is paused", || is(LifeState::Paused, std::slice::from_ref(&why))).to_string();
+    assert!(shown.starts_with("walker: paused for "), "{shown}");
+    assert!(shown.contains(", without anchor (stopped in order, not ready again)"), "{shown}");
+    node.handle().restart_app("anchor").expect("it was stopped");
+    until("it goes on", || is(LifeState::Ready, &[]));
 }
 
 #[test]

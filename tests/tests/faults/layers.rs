@@ -74,9 +74,12 @@ impl Pair {
         self.nobody_is_lost();
     }
 
-    /// The same, but that a link that breaks may take a requirement away until it is back.
+    /// The same, but that a link that is down for long may take a requirement away until it is back; not from whoever is on the
+    /// node of what it requires.
     #[track_caller]
     fn nobody_is_lost(&self) {
+        let at_home = self.witnesses[1].all();
+        assert!(!at_home.iter().any(|seen| matches!(seen, Seen::Requirement(_))), "{at_home:?}");
         for log in &self.witnesses {
             let name = || "puppet".to_owned();
             let (lost, met) =

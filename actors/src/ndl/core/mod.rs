@@ -313,7 +313,7 @@ impl Core {
                     self.outputs.push_back(Output::Event { to: vec![app], event });
                 }
             }
-            AppFact::Down { app } | AppFact::Unregistered { app } => {
+            AppFact::Down { app } | AppFact::Stopped { app } | AppFact::Unregistered { app } => {
                 self.subscribers.remove(&app);
             }
             AppFact::Registered { .. } | AppFact::GroupsChanged => {}

@@ -23,10 +23,12 @@ pub(super) struct App {
     pub(super) name: Option<Name>,
     pub(super) requires: Vec<String>,
     pub(super) state: State,
-    /// Whether its former life failed and this one is not ready yet.
-    pub(super) failed: bool,
+    /// How its former life ended, while this one is not ready yet.
+    pub(super) ended: Option<Reason>,
     /// Of what it requires, what it was told is lost.
     pub(super) lost: BTreeSet<String>,
+    /// Of what it requires, what nobody can hear of, and until when that is not told.
+    pub(super) silent: BTreeMap<String, Time>,
 }
 
 /// How far an application has come in its present life.
@@ -89,7 +91,8 @@ impl Apps {
         let wait = former.as_ref().and_then(App::wait).copied().unwrap_or(wait);
         let (name, refused) = self.claim(app, name);
         let state = State::Waiting(wait);
-        self.apps.insert(app, App { name, requires, state, failed: false, lost: BTreeSet::new() });
+        let (ended, lost, silent) = (None, BTreeSet::new(), BTreeMap::new());
+        self.apps.insert(app, App { name, requires, state, ended, lost, silent });
         refused
     }
 
@@ -148,8 +151,7 @@ impl Apps {
     pub(super) fn why_not(&self, name: &str) -> Option<Reason> {
         let app = self.called(name)?.1;
         match app.state {
-            State::Waiting(_) | State::Released if app.failed => Some(Reason::Failed),
-            State::Waiting(_) | State::Released => Some(Reason::NotReady),
+            State::Waiting(_) | State::Released => Some(app.ended.unwrap_or(Reason::NotReady)),
             State::Ready => None,
         }
     }

@@ -7,15 +7,22 @@ use std::{
 
 use sinew_runtime::{app::RequirementEvent, tid::AppAddress, time::Time};
 
-use super::{Core, Output, apps::State, cycles::Graph, reason::Reason};
+use super::{
+    Core, Output, Reason,
+    apps::{App, State},
+    cycles::Graph,
+};
 use crate::sync::facts::Waiting;
 
+/// Time for which a requirement may be out of hearing, its node not lost, before a running application is told. A layer that is
+/// restarted, here or there, is heard of again within a few milliseconds; the application behind it has not stopped meanwhile.
+pub(super) const SILENCE: Duration = Duration::from_millis(50);
 /// Time until an output that was not taken is offered again.
 pub(super) const RETRY: Duration = Duration::from_millis(10);
 
 impl Core {
     /// Releases whoever has all that it requires, and tells running applications what they lost or got back.
-    pub(super) fn evaluate(&mut self) {
+    pub(super) fn evaluate(&mut self, now: Time) {
         self.find_cycles();
         let mut missing = BTreeMap::new();
         for (address, app) in self.apps.iter().filter(|(_, app)| !app.requires.is_empty()) {
@@ -29,7 +36,7 @@ impl Core {
         for (address, app) in self.apps.iter_mut() {
             let unready = missing.remove(&address).unwrap_or_default();
             if app.wait().is_none() {
-                for (event, why) in changes(&mut app.lost, &app.requires, &unready) {
+                for (event, why) in changes(now, app, &unready) {
                     // What it did not take about this name before is out of date.
                     self.not_taken.remove(&(address, Some(event.name().to_owned())));
                     self.outputs.push_back(Output::Tell { app: address, event, why });
@@ -44,7 +51,7 @@ impl Core {
     }
 
     /// Why `name` is not ready anywhere; `None`: it is.
-    fn why_not(&self, name: &str) -> Option<Reason> {
+    pub(super) fn why_not(&self, name: &str) -> Option<Reason> {
         if self.apps.is_ready(name) || self.peers.is_ready(name) {
             return None;
         }
@@ -128,12 +135,10 @@ impl Core {
                 None if app.state == State::Released => Output::Release { app: address },
                 None => continue,
                 Some(name) if app.lost.contains(&name) => {
-                    let why = self.why_not(&name).map_or("ready", Reason::words);
+                    let why = self.why_not(&name);
                     Output::Tell { app: address, event: RequirementEvent::Lost { name }, why }
                 }
-                Some(name) => {
-                    Output::Tell { app: address, event: RequirementEvent::Met { name }, why: "ready" }
-                }
+                Some(name) => Output::Tell { app: address, event: RequirementEvent::Met { name }, why: None },
             };
             self.outputs.push_back(output);
         }
@@ -146,20 +151,30 @@ impl Core {
 
 /// What a running application is told: each requirement whose state differs from what it knows. spec: SYNC-8
 fn changes(
-    lost: &mut BTreeSet<String>,
-    requires: &[String],
+    now: Time,
+    app: &mut App,
     unready: &[(String, Reason)],
-) -> Vec<(RequirementEvent, &'static str)> {
+) -> Vec<(RequirementEvent, Option<Reason>)> {
+    let App { requires, lost, silent, .. } = app;
     let mut changes = Vec::new();
-    for name in requires {
+    for name in requires.iter() {
         let reason = unready.iter().find(|(other, _)| other == name).map(|(_, reason)| *reason);
-        let name = name.clone();
+        let is_told = lost.contains(name);
         match reason {
-            Some(reason) if lost.insert(name.clone()) => {
-                changes.push((RequirementEvent::Lost { name }, reason.words()));
+            Some(_) if is_told => {}
+            Some(reason)
+                if reason.is_silence() && now < *silent.entry(name.clone()).or_insert(now + SILENCE) => {}
+            Some(reason) => {
+                silent.remove(name);
+                lost.insert(name.clone());
+                changes.push((RequirementEvent::Lost { name: name.clone() }, Some(reason)));
             }
-            None if lost.remove(&name) => changes.push((RequirementEvent::Met { name }, "ready")),
-            Some(_) | None => {}
+            None => {
+                silent.remove(name);
+                if lost.remove(name) {
+                    changes.push((RequirementEvent::Met { name: name.clone() }, None));
+                }
+            }
         }
     }
     changes

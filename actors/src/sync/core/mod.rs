@@ -26,10 +26,10 @@ use sinew_runtime::{
     time::Time,
 };
 
+pub(crate) use self::reason::Reason;
 use self::{
     apps::{Apps, State, Wait},
     peers::{Accepted, Peers},
-    reason::Reason,
 };
 use super::{
     facts::{DirectoryEntry, Waiting},
@@ -71,8 +71,8 @@ pub(crate) enum Input {
 pub(crate) enum Output {
     /// All that this application requires is ready: it may start. Once for each life of it.
     Release { app: AppAddress },
-    /// Tell a running application that a requirement changed, and why.
-    Tell { app: AppAddress, event: RequirementEvent, why: &'static str },
+    /// Tell a running application that a requirement changed; of one that is lost, why.
+    Tell { app: AppAddress, event: RequirementEvent, why: Option<Reason> },
     /// Send this list to the sync manager of `to`.
     Publish { to: NodeAddress, list: Bytes },
     /// These groups have members on `node`.
@@ -149,7 +149,7 @@ impl Core {
             Input::TimePassed => {}
         }
         self.offer_again(now);
-        self.evaluate();
+        self.evaluate(now);
         self.report_overdue(now);
         self.publish(now);
     }
@@ -162,7 +162,8 @@ impl Core {
     /// When to come back with [`Input::TimePassed`].
     pub(crate) fn next_wake(&self) -> Option<Time> {
         let overdue = self.apps.waiting().map(|(_, _, wait)| wait.overdue).min();
-        [self.peers.next_due(), overdue, self.retry].into_iter().flatten().min()
+        let silent = self.apps.iter().flat_map(|(_, app)| app.silent.values().copied()).min();
+        [self.peers.next_due(), overdue, self.retry, silent].into_iter().flatten().min()
     }
 
     /// The TID of the application called `name`: of this node first, else of a linked node, else of a node whose link
@@ -196,6 +197,15 @@ impl Core {
         self.sequence
     }
 
+    /// What this application lacks of what it requires, and why: what it waits for or, when it runs, what it was told is lost.
+    pub(crate) fn missing(&self, now: Time, address: AppAddress) -> Vec<(String, &'static str)> {
+        if let Some(waiting) = self.wait_of(now, address) {
+            return waiting.missing;
+        }
+        let lost = self.apps.get(address).into_iter().flat_map(|app| &app.lost);
+        lost.filter_map(|name| Some((name.clone(), self.why_not(name)?.words()))).collect()
+    }
+
     fn all_called(&self, name: &str) -> Vec<Tid> {
         let here = self.apps.called(name).map(|(app, _)| Tid::new(self.node, app));
         here.into_iter().chain(self.peers.resolve(name)).collect()
@@ -227,7 +237,8 @@ impl Core {
                 self.own_list_changed(now);
             }
             AppFact::Ready { app } => self.app_ready(now, app),
-            AppFact::Down { app } => self.app_failed(now, app),
+            AppFact::Down { app } => self.app_ended(now, app, Reason::Failed),
+            AppFact::Stopped { app } => self.app_ended(now, app, Reason::Stopped),
             AppFact::Unregistered { app } => {
                 self.apps.remove(app);
                 self.forget_not_taken(app);
@@ -242,19 +253,20 @@ impl Core {
         if let Some(app) = self.apps.get_mut(address)
             && app.state != State::Ready
         {
-            (app.state, app.failed) = (State::Ready, false);
+            (app.state, app.ended) = (State::Ready, None);
             self.own_list_changed(now);
         }
     }
 
     /// It waits again for all that it requires; one that waits already was not started yet and goes on waiting.
-    fn app_failed(&mut self, now: Time, address: AppAddress) {
+    fn app_ended(&mut self, now: Time, address: AppAddress, how: Reason) {
         let wait = Wait::begun(now, self.requirement_deadline);
         if let Some(app) = self.apps.get_mut(address)
             && app.wait().is_none()
         {
             // What it was told is lost stays so: an event may still be on its way, and its next life has to hear the end of it.
-            (app.state, app.failed) = (State::Waiting(wait), true);
+            (app.state, app.ended) = (State::Waiting(wait), Some(how));
+            app.silent.clear();
             self.forget_not_taken(address);
             self.own_list_changed(now);
         }

@@ -68,6 +68,8 @@ impl Peer {
     fn why_not(&self, entry: &Entry) -> Option<Reason> {
         if self.lost.is_some() {
             self.lost
+        } else if self.stale {
+            Some(Reason::NodeRestarted)
         } else if self.linked.is_none() {
             Some(Reason::LinkDown)
         } else if !self.heard {

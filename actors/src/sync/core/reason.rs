@@ -2,10 +2,12 @@
 
 /// The last that is known of a name that is not ready; the nearest to readiness comes first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Reason {
+pub(crate) enum Reason {
     NotReady,
     Failed,
+    Stopped,
     ListAwaited,
+    NodeRestarted,
     LinkDown,
     NodeLeft,
     NodeLost,
@@ -16,17 +18,50 @@ pub(super) enum Reason {
 
 impl Reason {
     /// The words of `Waiting::missing`.
-    pub(super) const fn words(self) -> &'static str {
+    pub(crate) const fn words(self) -> &'static str {
         match self {
             Self::NotReady => "registered, not ready",
             Self::Failed => "failed, not ready again",
+            Self::Stopped => "stopped in order, not ready again",
             Self::ListAwaited => "its node is linked again, its directory has not come yet",
+            Self::NodeRestarted => "its node has restarted, its directory has not come yet",
             Self::LinkDown => "its link is down",
             Self::NodeLeft => "its node left",
             Self::NodeLost => "its node was lost",
             Self::Unregistered => "unregistered",
             Self::NeverSeen => "never seen",
             Self::Cycle => "part of a cycle of requirements",
+        }
+    }
+
+    /// Whether nothing has failed: somebody wanted it so.
+    pub(crate) const fn is_orderly(self) -> bool {
+        match self {
+            Self::Stopped | Self::NodeLeft | Self::Unregistered => true,
+            Self::NotReady
+            | Self::Failed
+            | Self::ListAwaited
+            | Self::NodeRestarted
+            | Self::LinkDown
+            | Self::NodeLost
+            | Self::NeverSeen
+            | Self::Cycle => false,
+        }
+    }
+
+    /// Whether it says nothing about the application itself, only that nobody can hear of it at this moment.
+    pub(super) const fn is_silence(self) -> bool {
+        match self {
+            Self::ListAwaited | Self::LinkDown => true,
+            Self::NotReady
+            | Self::Failed
+            | Self::Stopped
+            | Self::NodeRestarted
+            | Self::NodeLeft
+            | Self::NodeLost
+            | Self::Unregistered
+            | Self::NeverSeen
+            | Self::Cycle => false,
         }
     }
 }

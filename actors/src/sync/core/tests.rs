@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 
 use super::{
-    barrier::RETRY,
+    barrier::{RETRY, SILENCE},
     peers::{REPEAT, SPACING},
     *,
 };
@@ -103,12 +103,13 @@ fn release(index: u32) -> Output {
     Output::Release { app: app(index) }
 }
 
-fn lost(index: u32, name: &str, why: &'static str) -> Output {
-    Output::Tell { app: app(index), event: RequirementEvent::Lost { name: name.to_owned() }, why }
+fn lost(index: u32, name: &str, why: Reason) -> Output {
+    let event = RequirementEvent::Lost { name: name.to_owned() };
+    Output::Tell { app: app(index), event, why: Some(why) }
 }
 
 fn met(index: u32, name: &str) -> Output {
-    Output::Tell { app: app(index), event: RequirementEvent::Met { name: name.to_owned() }, why: "ready" }
+    Output::Tell { app: app(index), event: RequirementEvent::Met { name: name.to_owned() }, why: None }
 }
 
 fn published(outputs: &[Output]) -> Vec<List> {
@@ -142,7 +143,7 @@ fn an_application_is_released_when_the_last_of_its_requirements_is_ready() {
 #[test]
 fn a_failed_application_waits_again_and_others_are_told_but_not_stopped() {
     let mut bench = Bench::where_gait_runs_with_its_sensor();
-    assert_eq!(bench.down(1), [lost(0, "sensor", "failed, not ready again"), release(1)]);
+    assert_eq!(bench.down(1), [lost(0, "sensor", Reason::Failed), release(1)]);
     assert_eq!(bench.ready(1), [met(0, "sensor")]);
     assert_eq!(bench.down(0), [release(0)], "all that it requires is ready still");
     assert_eq!(bench.registers(0, "gait", &["sensor"]), [], "told again");
@@ -161,13 +162,72 @@ fn a_running_application_hears_once_of_a_lost_node_and_once_of_its_return() {
     bench.list(KNEE, list(3, &[("knee.drive", true, &[])]));
     bench.registers(0, "gait", &["knee.drive"]);
     bench.ready(0);
-    assert_eq!(bench.breaks(KNEE), [lost(0, "knee.drive", "its link is down")]);
-    assert_eq!(bench.lost(KNEE, LossReason::Silent), []);
+    assert_eq!(bench.lost(KNEE, LossReason::Silent), [lost(0, "knee.drive", Reason::NodeLost)]);
+    assert_eq!(bench.breaks(KNEE), []);
     let back = bench.links(KNEE, NEXT_LIFE);
     assert!(!back.contains(&met(0, "knee.drive")), "a link alone says nothing about the application");
     let mut news = list(1, &[("knee.drive", true, &[])]);
     news.incarnation = NEXT_LIFE;
     assert_eq!(bench.list(KNEE, news), [met(0, "knee.drive")]);
+}
+
+/// Application 0 is "gait", runs, and requires "knee.drive", which is ready on the node of the knee.
+fn where_gait_runs_with_a_drive_elsewhere() -> Bench {
+    let mut bench = Bench::new();
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(3, &[("knee.drive", true, &[])]));
+    bench.registers(0, "gait", &["knee.drive"]);
+    bench.ready(0);
+    bench
+}
+
+// spec: SYNC-8
+#[test]
+fn a_layer_that_restarts_is_heard_of_again_before_anybody_is_told_of_a_loss() {
+    let mut bench = where_gait_runs_with_a_drive_elsewhere();
+    assert_eq!(bench.breaks(KNEE), []);
+    assert_eq!(bench.passes(SILENCE / 3), []);
+    assert_eq!(published(&bench.links(KNEE, LIFE)).len(), 1);
+    assert_eq!(bench.passes(SILENCE / 3), [], "its list has not come yet");
+    assert_eq!(bench.list(KNEE, list(3, &[("knee.drive", true, &[])])), []);
+    let told: Vec<_> =
+        bench.passes(REPEAT).into_iter().filter(|out| matches!(out, Output::Tell { .. })).collect();
+    assert_eq!(told, []);
+}
+
+// spec: SYNC-8
+#[test]
+fn a_link_that_stays_down_is_a_loss_and_so_is_at_once_what_is_known_of_the_application() {
+    let mut bench = where_gait_runs_with_a_drive_elsewhere();
+    bench.breaks(KNEE);
+    assert_eq!(bench.core.next_wake(), Some(bench.now + SILENCE));
+    assert_eq!(bench.passes(SILENCE), [lost(0, "knee.drive", Reason::LinkDown)]);
+    let mut bench = where_gait_runs_with_a_drive_elsewhere();
+    bench.breaks(KNEE);
+    assert_eq!(bench.lost(KNEE, LossReason::ConnectionRefused), [lost(0, "knee.drive", Reason::NodeLost)]);
+    let mut bench = where_gait_runs_with_a_drive_elsewhere();
+    bench.breaks(KNEE);
+    bench.links(KNEE, LIFE);
+    assert_eq!(
+        bench.list(KNEE, list(4, &[("knee.drive", false, &[])])),
+        [lost(0, "knee.drive", Reason::NotReady)]
+    );
+    let mut bench = where_gait_runs_with_a_drive_elsewhere();
+    bench.breaks(KNEE);
+    assert!(bench.links(KNEE, NEXT_LIFE).contains(&lost(0, "knee.drive", Reason::NodeRestarted)));
+}
+
+// spec: SYNC-8
+#[test]
+fn one_that_was_stopped_in_order_is_not_said_to_have_failed() {
+    let mut bench = Bench::where_gait_runs_with_its_sensor();
+    let stopped = bench.hears(Input::AppChanged(AppFact::Stopped { app: app(1) }));
+    assert_eq!(stopped, [lost(0, "sensor", Reason::Stopped), release(1)]);
+    assert!(Reason::Stopped.is_orderly() && !Reason::Failed.is_orderly());
+    assert_eq!(
+        bench.core.missing(bench.now, app(0)),
+        [("sensor".to_owned(), "stopped in order, not ready again")]
+    );
 }
 
 // spec: SYNC-8
@@ -187,7 +247,7 @@ fn what_a_full_mailbox_did_not_take_is_offered_again_in_its_last_form() {
     bench.down(1);
     let name = || "sensor".to_owned();
     assert_eq!(bench.hears(Input::EventNotTaken { app: app(0), name: name() }), []);
-    assert_eq!(bench.passes(RETRY), [lost(0, "sensor", "failed, not ready again")]);
+    assert_eq!(bench.passes(RETRY), [lost(0, "sensor", Reason::Failed)]);
     bench.hears(Input::EventNotTaken { app: app(0), name: name() });
     assert_eq!(bench.ready(1), [met(0, "sensor")]);
     assert_eq!(bench.passes(RETRY), [], "the lost one is out of date");

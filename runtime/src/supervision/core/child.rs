@@ -50,6 +50,8 @@ pub struct ChildView {
     pub wanted: bool,
     /// Whether its release is what it waits for.
     pub waits_for_release: bool,
+    /// Former lives of it that were taken and have not let go of their threads.
+    pub abandoned: usize,
 }
 
 /// What a supervisor remembers of a child.
@@ -127,7 +129,7 @@ impl Child {
         self.policy.backoff_min.saturating_mul(1 << doublings).min(self.policy.backoff_max)
     }
 
-    pub(super) fn view(&self) -> ChildView {
+    pub(super) fn view(&self, abandoned: usize) -> ChildView {
         ChildView {
             state: self.state,
             since: self.since,
@@ -136,6 +138,7 @@ impl Child {
             last_reason: self.last_reason.clone(),
             wanted: self.wanted,
             waits_for_release: self.wanted && self.waits_for_release(),
+            abandoned,
         }
     }
 }

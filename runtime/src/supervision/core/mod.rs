@@ -166,7 +166,8 @@ impl Core {
     /// What is known of a child.
     #[must_use]
     pub fn child(&self, id: ChildId) -> Option<ChildView> {
-        Some(self.children[self.position(id)?].view())
+        let abandoned = self.abandoned.iter().filter(|(child, _)| *child == id).count();
+        Some(self.children[self.position(id)?].view(abandoned))
     }
 
     /// How it treats its children.

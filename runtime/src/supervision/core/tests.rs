@@ -127,6 +127,10 @@ fn one_that_was_not_given_its_time_has_more_of_it_and_not_without_end() {
     assert_eq!((orders(&mut core), core.next_wake()), (vec![], Some(later)));
     core.handle(later, Input::TimePassed);
     assert_eq!(orders(&mut core)[0], Order::Abandon(ChildId(1), 1));
+    let kept = |core: &Core| core.child(ChildId(1)).map(|child| child.abandoned);
+    assert_eq!(kept(&core), Some(1), "it keeps its thread");
+    core.handle(later, Input::Ended(ChildId(1), 1, Reason::Killed));
+    assert_eq!(kept(&core), Some(0));
 }
 
 #[test]
