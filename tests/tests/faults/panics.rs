@@ -248,7 +248,10 @@ fn a_sender_that_is_held_past_a_panic_sends_nothing_beside_the_next_life() {
     let held = Arc::new(Mutex::new(Vec::new()));
     let holds = held.clone();
     let stage = Stage::new()
-        .started(move |_, context| holds.lock().expect("nobody panics with it").push(context.sender()))
+        .started(move |puppet, context| {
+            holds.lock().expect("nobody panics with it").push(context.sender());
+            puppet.say("holds it");
+        })
         .got(|puppet, _| assert!(puppet.number != 13, "thirteen"));
     let ((puppet, log), (witness, seen), (desk, key)) =
         (stage.app("puppet"), Stage::new().app("witness"), desk("desk"));
@@ -258,7 +261,7 @@ fn a_sender_that_is_held_past_a_panic_sends_nothing_beside_the_next_life() {
     // As from a thread of the application's own, which goes on after it.
     senders()[0].send("witness", &Job { number: 1 }).expect("it has room");
     assert_eq!(outcome_of_job(&key.sender(), "puppet", 13), Outcome::Failed);
-    log.wait_for(Seen::Started(2));
+    log.wait_for(Seen::Said(2, "holds it"));
     let refused = senders()[0].send("witness", &Job { number: 2 });
     assert!(matches!(refused, Err(SendError::Over)), "{refused:?}");
     senders()[1].send("witness", &Job { number: 3 }).expect("it has room");
