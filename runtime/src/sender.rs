@@ -162,11 +162,11 @@ impl Sender {
         self.shared.sequence.load(Ordering::Relaxed)
     }
 
-    /// Another sending side of the TID, in another process, has sent messages up to this sequence: this one counts on
-    /// from there. Returns whether that can be: a number that no process reaches in one life is not taken.
-    pub fn count_on_from(&self, last: u64) -> bool {
-        let present = self.shared.sequence.load(Ordering::Relaxed);
-        let is_plausible = last <= present.saturating_add(SEQUENCES_PER_LIFE);
+    /// Another sending side of the TID, in another process that began behind the sequence `began`, has sent messages up to
+    /// `last`: this one counts on from there. Returns whether that can be: a number that no process reaches in one life is
+    /// not taken.
+    pub fn count_on_from(&self, last: u64, began: u64) -> bool {
+        let is_plausible = last <= began.saturating_add(SEQUENCES_PER_LIFE);
         if is_plausible {
             self.shared.sequence.fetch_max(last, Ordering::Relaxed);
         }

@@ -50,6 +50,8 @@ pub(crate) struct Link {
     lives: AtomicU64,
     /// The process before it, if that was killed and nobody has seen its end.
     former: Mutex<Option<Arc<OwnedFd>>>,
+    /// Sequence of the last message that came from the TID before that one.
+    began: AtomicU64,
     /// A message waits until the child knows which names have changed.
     nudge: Notify,
     /// The node's own sending side of the TID.
@@ -94,6 +96,7 @@ impl Link {
             present: Mutex::new(None),
             lives: AtomicU64::new(0),
             former: Mutex::new(None),
+            began: AtomicU64::new(0),
             nudge: Notify::new(),
             sender: OnceLock::new(),
         })
@@ -113,6 +116,7 @@ impl Link {
 
     /// Which process of this TID the next one is, from 1.
     pub(super) fn begin_life(&self) -> u64 {
+        self.began.store(self.sequence(), Ordering::Relaxed);
         self.lives.fetch_add(1, Ordering::Relaxed) + 1
     }
 
@@ -244,7 +248,8 @@ impl Link {
 
     /// Notes that the TID has sent this message. Returns whether its number can be true.
     pub(super) fn note(&self, header: &Header) -> bool {
-        self.sender.get().is_none_or(|sender| sender.count_on_from(header.sequence))
+        let began = self.began.load(Ordering::Relaxed);
+        self.sender.get().is_none_or(|sender| sender.count_on_from(header.sequence, began))
     }
 
     /// Hands over what the child has room for.
@@ -315,6 +320,8 @@ mod tests {
     use std::{sync::mpsc::sync_channel, time::Duration};
 
     use sinew_runtime::{
+        pending::Pending,
+        sender::Directory,
         tid::{AppAddress, Incarnation, NodeAddress, Tid},
         wire::HEADER_LEN,
     };
@@ -322,6 +329,16 @@ mod tests {
 
     use super::*;
     use crate::{config::NodeConfig, process::words};
+
+    struct Nobody;
+
+    impl Directory for Nobody {
+        fn resolve(&self, _: &str) -> Option<Tid> {
+            None
+        }
+
+        fn set_member(&self, _: AppAddress, _: AppAddress, _: bool) {}
+    }
 
     /// Sends to the TID whose message has ended, from within.
     struct SendsAgain(Arc<Link>);
@@ -335,6 +352,25 @@ mod tests {
             );
             self.0.submit(again).expect("there is room");
         }
+    }
+
+    #[test]
+    fn a_process_cannot_count_beyond_its_reach_step_by_step_either() {
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let link = Link::new(&stores, Mailbox::new(8));
+        let tid = Tid::new(NodeAddress::HERE, AppAddress::fixed(1).expect("a fixed one"));
+        let sender = Sender::new(tid, stores.router.clone(), Arc::new(Nobody), Pending::new(1), 1_024);
+        assert!(link.sender.set(sender).is_ok());
+        let says = |sequence| {
+            let mut header = Header::new(Kind::named("first"), tid, tid);
+            header.sequence = sequence;
+            link.note(&header)
+        };
+        link.begin_life();
+        assert!(says(1) && says(1 << 40) && !says((1 << 40) + 1) && !says(u64::MAX));
+        link.begin_life();
+        assert!(says((1 << 40) + 1), "the next one counts on from there");
+        assert_eq!(link.sequence(), (1 << 40) + 1);
     }
 
     #[test]

@@ -143,7 +143,7 @@ impl Wire {
         let router = Arc::new(Router::through(self.tid.node, self.outlet.clone()));
         let sender = Sender::new(self.tid, router, self.clone(), self.pending.clone(), payload_max);
         // The node's word is not doubted.
-        let _ = sender.count_on_from(sequence);
+        let _ = sender.count_on_from(sequence, sequence);
         sender
     }
 
