@@ -37,6 +37,8 @@
 )]
 
 mod any;
+#[cfg(all(target_os = "linux", feature = "bare-ring", not(loom)))]
+pub mod bare;
 mod bell;
 mod consumer;
 mod core;

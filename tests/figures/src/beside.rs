@@ -26,11 +26,18 @@ pub struct Beside<'a> {
 }
 
 impl Beside<'_> {
-    /// Prints the line.
+    /// Prints the head of the table whose rows [`report`](Self::report) prints.
+    pub fn head() {
+        eprintln!("| case | payload | CPUs | pace | p50 | p99 | p99.9 | max | reference | its p50 | ratio |");
+        eprintln!("| --- | ---: | --- | --- | ---: | ---: | ---: | ---: | --- | ---: | ---: |");
+    }
+
+    /// Prints the line, and a row of a table for a page of documentation.
     pub fn report(&self) {
         let Self { bench, case, payload_bytes, pinning, pace, seen, reference, raw } = self;
         let [p50, p99, p999, max] = seen.quantiles_us(3);
         let [reference_p50, reference_p99, ..] = raw.quantiles_us(3);
+        let ratio = seen.us(0.5) / raw.us(0.5);
         let line = json!({
             "bench": bench,
             "case": case,
@@ -45,8 +52,11 @@ impl Beside<'_> {
             "reference": reference,
             "reference_p50_us": reference_p50,
             "reference_p99_us": reference_p99,
-            "ratio_p50": round(seen.us(0.5) / raw.us(0.5), 3),
+            "ratio_p50": round(ratio, 3),
         });
         println!("{line}");
+        eprintln!(
+            "| {case} | {payload_bytes} | {pinning} | {pace} | {p50:.2} | {p99:.2} | {p999:.2} | {max:.1} | {reference} | {reference_p50:.2} | {ratio:.2} |"
+        );
     }
 }

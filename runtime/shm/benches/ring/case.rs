@@ -7,6 +7,7 @@ use std::{
 
 use rustix::thread::{CpuSet, sched_setaffinity};
 use sinew_figures::{Beside, Figures};
+use sinew_shm::bare::{End, Waiting, memory};
 
 use crate::{bare, ours, pace::Pace, stream};
 
@@ -60,6 +61,11 @@ impl Kind {
             Self::Spin | Self::Adaptive => &[Self::BarePoll],
             Self::BareFutex | Self::BarePoll | Self::UnixStream => &[],
         }
+    }
+
+    /// How the bare ring's ends wait.
+    const fn waiting(self) -> Waiting {
+        if self.spins() { Waiting::Poll } else { Waiting::Futex }
     }
 
     /// Who looks without sleeping needs the other one to have another CPU.
@@ -148,22 +154,23 @@ fn figures(kind: Kind, case: Case) -> Figures {
     let (bytes, pace) = (case.payload_bytes, case.pace);
     match kind {
         Kind::BareFutex | Kind::BarePoll => {
-            let memory = bare::memory(bytes);
-            let _echo = Echo::start(kind, case, theirs, bare::number(&memory));
-            bare::measure(&memory, kind == Kind::BarePoll, bytes, pace)
+            let memory = memory(bytes);
+            let end = End::first(&memory, bytes, kind.waiting());
+            let _echo = Echo::start(kind, case, memory);
+            bare::measure(end, bytes, pace)
         }
         Kind::UnixStream => {
-            let _echo = Echo::start(kind, case, theirs, 0);
+            let _echo = Echo::start(kind, case, theirs.into());
             stream::measure(socket, bytes, pace)
         }
         Kind::Futex | Kind::EventFd | Kind::Socket | Kind::Spin | Kind::Adaptive => {
-            let _echo = Echo::start(kind, case, theirs, 0);
+            let _echo = Echo::start(kind, case, theirs.into());
             ours::measure(kind, &socket, bytes, pace)
         }
     }
 }
 
-/// The echoing end, in a process of its own, with the socket as its input.
+/// The echoing end, in a process of its own, with the socket or the memory as its input.
 pub(crate) fn echo(role: &str) {
     let words: Vec<&str> = role.split(' ').collect();
     let number =
@@ -172,7 +179,9 @@ pub(crate) fn echo(role: &str) {
     let (kind, bytes) = (kind.expect("a name that this program wrote itself"), number(1));
     pin(number(2));
     match kind {
-        Kind::BareFutex | Kind::BarePoll => bare::echo(number(3), kind == Kind::BarePoll, bytes),
+        Kind::BareFutex | Kind::BarePoll => {
+            bare::echo(End::second(rustix::stdio::stdin(), bytes, kind.waiting()), bytes);
+        }
         Kind::UnixStream => stream::echo(bytes),
         Kind::Futex | Kind::EventFd | Kind::Socket | Kind::Spin | Kind::Adaptive => ours::echo(kind, bytes),
     }
@@ -190,12 +199,12 @@ fn pin(cpu: usize) {
 struct Echo(Child);
 
 impl Echo {
-    fn start(kind: Kind, case: Case, socket: UnixStream, memory: i32) -> Self {
+    fn start(kind: Kind, case: Case, input: OwnedFd) -> Self {
         let program = std::env::current_exe().expect("this program has a path");
-        let role = format!("{} {} {} {memory}", kind.name(), case.payload_bytes, case.pinning.cpu_of_echo());
+        let role = format!("{} {} {}", kind.name(), case.payload_bytes, case.pinning.cpu_of_echo());
         let child = Command::new(program)
             .env(ROLE, role)
-            .stdin(Stdio::from(OwnedFd::from(socket)))
+            .stdin(Stdio::from(input))
             .spawn()
             .expect("a process for the other end");
         Self(child)

@@ -1,0 +1,341 @@
+//! The cases: by which way, what, on which CPUs, how often; and the roles of the processes that take part.
+
+use std::{
+    process::{ExitCode, Stdio},
+    thread,
+    time::{Duration, Instant},
+};
+
+use sinew_figures::{Alone, Beside, Figures};
+
+use crate::{
+    crowds, ends,
+    processes::{self, End, Pinning},
+    raw,
+};
+
+/// The mean of the paper's Table 1, in nanoseconds.
+const PAPER_MEAN_NS: u64 = 46_200;
+
+/// How messages travel between the two applications.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Way {
+    /// A unix socket from each to the node.
+    Socket,
+    /// Rings from each to the node.
+    Ring,
+    /// The same, the applications looking before they sleep.
+    RingSpin,
+}
+
+impl Way {
+    const ALL: [Self; 3] = [Self::Socket, Self::Ring, Self::RingSpin];
+
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Socket => "socket",
+            Self::Ring => "ring",
+            Self::RingSpin => "ring_spin",
+        }
+    }
+
+    const fn references(self) -> &'static [Reference] {
+        match self {
+            Self::Socket | Self::Ring => {
+                &[Reference::BareFutex, Reference::UnixStream, Reference::Iceoryx2Event]
+            }
+            Self::RingSpin => &[Reference::BarePoll, Reference::Iceoryx2Poll],
+        }
+    }
+
+    /// Who looks without sleeping needs the other one to have another CPU.
+    const fn spins(self) -> bool {
+        match self {
+            Self::Socket | Self::Ring => false,
+            Self::RingSpin => true,
+        }
+    }
+}
+
+/// What a way is measured beside.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Reference {
+    BareFutex,
+    BarePoll,
+    UnixStream,
+    Iceoryx2Event,
+    Iceoryx2Poll,
+}
+
+impl Reference {
+    const ALL: [Self; 5] =
+        [Self::BareFutex, Self::BarePoll, Self::UnixStream, Self::Iceoryx2Event, Self::Iceoryx2Poll];
+
+    pub(crate) const fn name(self) -> &'static str {
+        match self {
+            Self::BareFutex => "bare_futex",
+            Self::BarePoll => "bare_poll",
+            Self::UnixStream => "raw_unix_stream",
+            Self::Iceoryx2Event => "iceoryx2_event",
+            Self::Iceoryx2Poll => "iceoryx2_poll",
+        }
+    }
+
+    /// Whether it can be had: a peer's program only if it was named.
+    fn is_there(self) -> bool {
+        match self {
+            Self::BareFutex | Self::BarePoll | Self::UnixStream => true,
+            Self::Iceoryx2Event | Self::Iceoryx2Poll => std::env::var_os(raw::PEER).is_some(),
+        }
+    }
+}
+
+/// What is measured.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum What {
+    RoundTrips { bytes: usize, pace: Pace },
+    TableOne,
+    FanIn,
+    Flood,
+}
+
+/// How round trips follow each other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Pace {
+    BackToBack,
+    EveryMillisecond,
+}
+
+impl Pace {
+    const fn name(self) -> &'static str {
+        match self {
+            Self::BackToBack => "back_to_back",
+            Self::EveryMillisecond => "1khz",
+        }
+    }
+}
+
+/// How many round trips, at which pace.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Rounds {
+    pace: Pace,
+    /// Not counted.
+    pub(crate) warm_up: u32,
+    pub(crate) counted: u32,
+}
+
+impl Rounds {
+    const fn of(bytes: usize, pace: Pace, is_short: bool) -> Self {
+        let (warm_up, counted) = match pace {
+            Pace::EveryMillisecond => (50, 1_500),
+            Pace::BackToBack if bytes > 100_000 => (50, 500),
+            Pace::BackToBack if bytes > 10_000 => (200, 4_000),
+            Pace::BackToBack => (1_000, 20_000),
+        };
+        let part = if is_short { 10 } else { 1 };
+        Self { pace, warm_up, counted: counted / part }
+    }
+
+    /// The pause before each.
+    pub(crate) const fn pause_us(self) -> u64 {
+        match self.pace {
+            Pace::BackToBack => 0,
+            Pace::EveryMillisecond => 1_000,
+        }
+    }
+
+    /// The times of these round trips.
+    pub(crate) fn time(self, mut round_trip: impl FnMut()) -> Figures {
+        let mut times = Figures::new();
+        for round in 0..self.warm_up + self.counted {
+            if self.pause_us() > 0 {
+                thread::sleep(Duration::from_micros(self.pause_us()));
+            }
+            let start = Instant::now();
+            round_trip();
+            let time = start.elapsed();
+            if round >= self.warm_up {
+                times.record(time);
+            }
+        }
+        times
+    }
+}
+
+/// One way, one thing to measure, some CPUs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Case {
+    way: Way,
+    what: What,
+    pinning: Pinning,
+}
+
+/// Every case, or those of a short run.
+pub(crate) fn all(is_short: bool) -> impl Iterator<Item = Case> {
+    let back_to_back = |bytes| What::RoundTrips { bytes, pace: Pace::BackToBack };
+    let paced = What::RoundTrips { bytes: 1000, pace: Pace::EveryMillisecond };
+    let mut things = vec![back_to_back(1000), paced, What::TableOne, What::FanIn, What::Flood];
+    if !is_short {
+        things.extend([8, 65_536, 1 << 20].map(back_to_back));
+    }
+    Pinning::ALL
+        .into_iter()
+        .flat_map(|pinning| Way::ALL.map(|way| (way, pinning)))
+        .filter(|(way, pinning)| !(way.spins() && *pinning == Pinning::OneCpu))
+        .flat_map(move |(way, pinning)| {
+            things.clone().into_iter().map(move |what| Case { way, what, pinning })
+        })
+}
+
+impl Case {
+    pub(crate) fn name(&self) -> String {
+        let (way, pinning) = (self.way.name(), self.pinning.name());
+        match self.what {
+            What::RoundTrips { bytes, pace } => format!("{way}-{bytes}B-{}-{pinning}", pace.name()),
+            What::TableOne => format!("{way}-table_1-{pinning}"),
+            What::FanIn => format!("{way}-fan_in-{pinning}"),
+            What::Flood => format!("{way}-flood-{pinning}"),
+        }
+    }
+
+    /// Runs it in a process of its own. Returns whether that went well.
+    pub(crate) fn run(self, is_short: bool) -> bool {
+        let role = format!("measure {}", self.name());
+        let status = processes::command(&role, is_short).stdin(Stdio::null()).status();
+        let is_well = status.is_ok_and(|status| status.success());
+        if !is_well {
+            eprintln!("{} failed", self.name());
+        }
+        is_well
+    }
+
+    fn measure(self, is_short: bool) {
+        self.pinning.pin(End::Measuring);
+        match self.what {
+            What::RoundTrips { bytes, pace } => self.round_trips(bytes, pace, is_short),
+            What::TableOne => self.table_one(),
+            What::FanIn => self.fan_in(if is_short { 150 } else { 1_500 }),
+            What::Flood => self.flood(if is_short { 20_480 } else { 204_800 }),
+        }
+    }
+
+    fn round_trips(self, bytes: usize, pace: Pace, is_short: bool) {
+        let rounds = Rounds::of(bytes, pace, is_short);
+        let references = self.way.references().iter().filter(|reference| reference.is_there());
+        let raws: Vec<_> = references
+            .map(|reference| (reference.name(), raw::round_trips(*reference, bytes, rounds, self.pinning)))
+            .collect();
+        let seen = ends::round_trips(self.way, bytes, rounds, self.pinning);
+        for (reference, raw) in &raws {
+            Beside {
+                bench: "lncl",
+                case: self.way.name(),
+                payload_bytes: bytes,
+                pinning: self.pinning.name(),
+                pace: pace.name(),
+                seen: &seen,
+                reference,
+                raw,
+            }
+            .report();
+        }
+    }
+
+    fn table_one(self) {
+        let crowds::Ages { figures, mean_ns, first_ns } = ends::table_one(self.way, self.pinning);
+        let counts = [("mean_ns", mean_ns), ("first_ns", first_ns), ("paper_mean_ns", PAPER_MEAN_NS)];
+        self.report("one way", &figures, &counts);
+    }
+
+    fn fan_in(self, packets: u64) {
+        let raw = raw::fan_in(packets, self.pinning);
+        let (seen, lost) = crowds::fan_in(self.way, packets, self.pinning);
+        Beside {
+            bench: "lncl",
+            case: &format!("{}_fan_in", self.way.name()),
+            payload_bytes: crowds::PACKET,
+            pinning: self.pinning.name(),
+            pace: "8 at 1khz",
+            seen: &seen,
+            reference: "raw_unix_stream",
+            raw: &raw,
+        }
+        .report();
+        assert_eq!(lost, 0, "packets that never came");
+    }
+
+    fn flood(self, packets: u64) {
+        let raw = raw::flood(packets, self.pinning);
+        let (windows, seen) = crowds::flood(self.way, packets, self.pinning);
+        let counts = [
+            ("messages_per_second", seen as u64),
+            ("raw_unix_stream_per_second", raw as u64),
+            ("percent_of_raw", (100.0 * seen / raw) as u64),
+        ];
+        self.report("32 sent to answered", &windows, &counts);
+    }
+
+    fn report(self, figure: &str, seen: &Figures, counts: &[(&str, u64)]) {
+        Alone { bench: "lncl", case: &self.name(), figure, seen, counts }.report();
+    }
+}
+
+/// Plays the part that another process of this program gave this one.
+pub(crate) fn play(role: &str) -> ExitCode {
+    let words: Vec<&str> = role.split(' ').collect();
+    match words[..] {
+        ["measure", name] => {
+            let is_short = processes::is_short();
+            let case = all(is_short).find(|case| case.name() == name);
+            case.expect("a name that this program wrote itself").measure(is_short);
+        }
+        ["node", pinning, socket] => {
+            raw::pin(pinning, End::Other);
+            ends::node(socket);
+        }
+        ["echo", way, pinning, socket] => {
+            raw::pin(pinning, End::Echoing);
+            ends::echo(way_named(way), socket);
+        }
+        ["sink", way, pinning, socket] => {
+            raw::pin(pinning, End::Echoing);
+            crowds::sink(way_named(way), socket);
+        }
+        ["sender", way, pinning, socket, packets] => {
+            raw::pin(pinning, End::Other);
+            crowds::send(way_named(way), socket, number(packets));
+        }
+        ["raw_echo", reference, bytes, pinning] => {
+            raw::pin(pinning, End::Echoing);
+            let found = Reference::ALL.into_iter().find(|known| known.name() == reference);
+            let reference = found.expect("a name that this program wrote itself");
+            raw::echo(reference, number(bytes) as usize);
+        }
+        ["raw_sink", pinning] => {
+            raw::pin(pinning, End::Echoing);
+            raw::sink();
+        }
+        ["raw_sender", packets, pinning] => {
+            raw::pin(pinning, End::Other);
+            raw::send(number(packets));
+        }
+        _ => {
+            eprintln!("no such role: {role}");
+            return ExitCode::FAILURE;
+        }
+    }
+    ExitCode::SUCCESS
+}
+
+fn number(word: &str) -> u64 {
+    word.parse().expect("a number that this program wrote itself")
+}
+
+fn way_named(name: &str) -> Way {
+    Way::ALL.into_iter().find(|way| way.name() == name).expect("a name that this program wrote itself")
+}
+
+/// The words by which another process plays this way's part.
+pub(crate) fn role(part: &str, way: Way, pinning: Pinning, socket: &str) -> String {
+    format!("{part} {} {} {socket}", way.name(), pinning.name())
+}

@@ -1,0 +1,141 @@
+//! Many messages at once: eight senders to one, and as many as go through.
+
+use std::{
+    thread,
+    time::{Duration, Instant},
+};
+
+use sinew_figures::Figures;
+use sinew_runtime::{time::Time, wire::Kind};
+
+use crate::{
+    case::{Way, role},
+    ends::{DEADLINE, Home, register},
+    processes::{Pinning, Process, say_there},
+};
+
+/// Bytes of a packet.
+pub(crate) const PACKET: usize = 1000;
+/// Packets of a flood that are under way at most.
+pub(crate) const WINDOW: u64 = 128;
+/// Packets of a flood that are answered together.
+pub(crate) const ANSWERED_EACH: u64 = 32;
+/// Processes that send to one.
+pub(crate) const SENDERS: usize = 8;
+
+const BLOCK: Kind = Kind::named("lncl.block");
+const ANSWER: Kind = Kind::named("lncl.answer");
+const BEGIN: Kind = Kind::named("lncl.begin");
+
+/// How old packets were when they were received.
+pub(crate) struct Ages {
+    pub(crate) figures: Figures,
+    pub(crate) mean_ns: u64,
+    pub(crate) first_ns: u64,
+}
+
+impl Ages {
+    /// Of these ages in nanoseconds.
+    pub(crate) fn of(ages: &[u64]) -> Self {
+        let mut figures = Figures::new();
+        ages.iter().for_each(|age| figures.record(Duration::from_nanos(*age)));
+        let mean_ns = ages.iter().sum::<u64>() / ages.len().max(1) as u64;
+        Self { figures, mean_ns, first_ns: ages.first().copied().unwrap_or_default() }
+    }
+}
+
+/// Sends so many packets, one every millisecond on a grid.
+pub(crate) fn paced(packets: u64, mut send: impl FnMut()) {
+    let mut next = Instant::now();
+    for _ in 0..packets {
+        next += Duration::from_millis(1);
+        thread::sleep(next.saturating_duration_since(Instant::now()));
+        send();
+    }
+}
+
+/// The ages of what eight processes send to one, and how many never came.
+pub(crate) fn fan_in(way: Way, packets: u64, pinning: Pinning) -> (Figures, u64) {
+    let home = Home::start(pinning);
+    let mut endpoint = register(way, home.socket(), "sink");
+    let role = format!("{} {packets}", role("sender", way, pinning, home.socket()));
+    let senders: Vec<_> = (0..SENDERS).map(|_| Process::start(&role)).collect();
+    let expected = packets * SENDERS as u64;
+    // Each has sent its first one, which asks to begin: now that all are there, they may.
+    let mut waiting = Vec::new();
+    while waiting.len() < SENDERS {
+        let asks = endpoint.receive(DEADLINE).expect("the node lives").expect("the senders are there");
+        waiting.push(asks.source());
+    }
+    for sender in waiting {
+        let begin = endpoint.create_message(sender, BEGIN, 1).expect("short");
+        endpoint.send_message(begin).expect("the node takes it");
+    }
+    let mut figures = Figures::new();
+    while figures.rounds() < expected {
+        let Some(packet) = endpoint.receive(DEADLINE).expect("the node lives") else { break };
+        figures.record(packet.age(Time::now()));
+    }
+    drop(senders);
+    let lost = expected - figures.rounds();
+    (figures, lost)
+}
+
+/// One sender of the eight.
+pub(crate) fn send(way: Way, socket: &str, packets: u64) {
+    let mut endpoint = register(way, socket, &format!("sender-{}", std::process::id()));
+    say_there();
+    let sink = endpoint.resolve("sink", DEADLINE).expect("the node lives").expect("it is registered");
+    let asks = endpoint.create_message(sink, BEGIN, 1).expect("short");
+    endpoint.send_message(asks).expect("the node takes it");
+    let _begin = endpoint.receive(DEADLINE).expect("the node lives").expect("the word to begin");
+    paced(packets, || {
+        let mut packet = endpoint.create_message(sink, BLOCK, PACKET).expect("not too long");
+        packet.fill(7);
+        endpoint.send_message(packet).expect("the node takes it");
+    });
+    // The address would go with this process before all is received.
+    let _none = endpoint.receive(DEADLINE);
+}
+
+/// The times from the first packet of each 32 to their answer, and how many packets went through a second.
+pub(crate) fn flood(way: Way, packets: u64, pinning: Pinning) -> (Figures, f64) {
+    let home = Home::start(pinning);
+    let _sink = Process::start(&role("sink", way, pinning, home.socket()));
+    let mut endpoint = register(way, home.socket(), "flood");
+    let sink = endpoint.resolve("sink", DEADLINE).expect("the node lives").expect("it is registered");
+    let (mut figures, mut answered, mut begun) = (Figures::new(), 0, Vec::new());
+    let start = Instant::now();
+    let mut sent = 0;
+    while answered < packets {
+        if sent < packets && sent - answered < WINDOW {
+            if sent.is_multiple_of(ANSWERED_EACH) {
+                begun.push(Instant::now());
+            }
+            let mut packet = endpoint.create_message(sink, BLOCK, PACKET).expect("not too long");
+            packet.fill(7);
+            endpoint.send_message(packet).expect("the node takes it");
+            sent += 1;
+        } else {
+            let _answer = endpoint.receive(DEADLINE).expect("the node lives").expect("the sink answers");
+            figures.record(begun[(answered / ANSWERED_EACH) as usize].elapsed());
+            answered += ANSWERED_EACH;
+        }
+    }
+    (figures, packets as f64 / start.elapsed().as_secs_f64())
+}
+
+/// The sink of a flood: until the measuring end ends this process.
+pub(crate) fn sink(way: Way, socket: &str) {
+    let (mut endpoint, mut taken) = (register(way, socket, "sink"), 0_u64);
+    say_there();
+    while let Some(packet) = endpoint.receive(DEADLINE).expect("the node lives") {
+        taken += 1;
+        let source = packet.source();
+        drop(packet);
+        if taken.is_multiple_of(ANSWERED_EACH) {
+            let answer = endpoint.create_message(source, ANSWER, 8).expect("short");
+            endpoint.send_message(answer).expect("the node takes it");
+        }
+    }
+}

@@ -1,0 +1,132 @@
+//! Sinew's ends: the node, and two applications in processes of their own, by the blocking NodeAPI.
+
+use std::{path::PathBuf, time::Duration};
+
+use sinew::{Endpoint, NodeApi, Registration, Spin, Transport, prelude::*};
+use sinew_figures::Figures;
+use sinew_runtime::{time::Time, wire::Kind};
+
+use crate::{
+    case::{Rounds, Way, role},
+    crowds::{Ages, PACKET},
+    processes::{Pinning, Process, await_end, say_there},
+};
+
+/// No wait of this bench is longer.
+pub(crate) const DEADLINE: Duration = Duration::from_secs(20);
+/// How long who looks before he sleeps does so: longer than any round trip.
+const LOOKS: Duration = Duration::from_secs(1);
+/// What is sent back as it came.
+const BLOCK: Kind = Kind::named("lncl.block");
+/// What is sent back with its age in its first bytes.
+const AGED: Kind = Kind::named("lncl.aged");
+/// Packets of the paper's Table 1.
+const TABLE_ONE: usize = 1024;
+
+/// The node of a case, in a process of its own.
+pub(crate) struct Home {
+    _process: Process,
+    socket: PathBuf,
+}
+
+impl Home {
+    pub(crate) fn start(pinning: Pinning) -> Self {
+        let socket = std::env::temp_dir().join(format!("sinew-bench-lncl-{}", std::process::id()));
+        let process = Process::start(&format!("node {} {}", pinning.name(), socket.display()));
+        Self { _process: process, socket }
+    }
+
+    pub(crate) fn socket(&self) -> &str {
+        self.socket.to_str().expect("a path of this program's own")
+    }
+}
+
+impl Drop for Home {
+    fn drop(&mut self) {
+        // Left by the node, which is killed.
+        let _ = std::fs::remove_file(&self.socket);
+    }
+}
+
+/// The node: until the measuring end ends this process.
+pub(crate) fn node(socket: &str) {
+    let node = Node::builder("lncl").configure(|config| {
+        config.lncl.socket = Some(socket.into());
+        config.ndl.multicast = None;
+        config.ndl.mdns_port = None;
+    });
+    let _node = node.start().expect("a node");
+    say_there();
+    await_end();
+}
+
+/// The address called `name`, whose messages go this way.
+pub(crate) fn register(way: Way, socket: &str, name: &str) -> Endpoint {
+    let registration = match way {
+        Way::Socket => Registration::new().transport(Transport::Socket),
+        Way::Ring => Registration::new(),
+        Way::RingSpin => Registration::new().spin(Spin::For(LOOKS)),
+    };
+    let api = NodeApi::connect(socket).expect("the node's door");
+    api.register_transport_address(registration.name(name)).expect("an address")
+}
+
+/// The application that echoes: until the measuring end ends this process.
+pub(crate) fn echo(way: Way, socket: &str) {
+    let mut endpoint = register(way, socket, "echo");
+    say_there();
+    while let Some(received) = endpoint.receive(DEADLINE).expect("the node lives") {
+        let (to, bytes) = (received.source(), received.bytes());
+        let mut back =
+            endpoint.create_message(to, received.kind(), bytes.len()).expect("as long as what came");
+        back.copy_from_slice(bytes);
+        if received.kind() == AGED {
+            let age = received.age(Time::now());
+            back[..8].copy_from_slice(&(age.as_nanos() as u64).to_le_bytes());
+        }
+        endpoint.send_message(back).expect("the node takes it");
+    }
+}
+
+/// The application that measures, and the one that echoes.
+struct Pair {
+    endpoint: Endpoint,
+    to: Tid,
+    _echo: Process,
+    _home: Home,
+}
+
+impl Pair {
+    fn start(way: Way, pinning: Pinning) -> Self {
+        let home = Home::start(pinning);
+        let echo = Process::start(&role("echo", way, pinning, home.socket()));
+        let mut endpoint = register(way, home.socket(), "ping");
+        let to = endpoint.resolve("echo", DEADLINE).expect("the node lives").expect("it is registered");
+        Self { endpoint, to, _echo: echo, _home: home }
+    }
+
+    /// Sends `buffer`, and fills it with what comes back.
+    fn round_trip(&mut self, kind: Kind, buffer: &mut [u8]) {
+        let mut block = self.endpoint.create_message(self.to, kind, buffer.len()).expect("not too long");
+        block.copy_from_slice(buffer);
+        self.endpoint.send_message(block).expect("the node takes it");
+        let back = self.endpoint.receive(DEADLINE).expect("the node lives").expect("the echo answers");
+        buffer.copy_from_slice(back.bytes());
+    }
+}
+
+/// Round trips between two applications.
+pub(crate) fn round_trips(way: Way, bytes: usize, rounds: Rounds, pinning: Pinning) -> Figures {
+    let (mut pair, mut buffer) = (Pair::start(way, pinning), vec![7; bytes]);
+    rounds.time(|| pair.round_trip(BLOCK, &mut buffer))
+}
+
+/// The paper's test: how old each of the first 1024 packets is when it is received.
+pub(crate) fn table_one(way: Way, pinning: Pinning) -> Ages {
+    let (mut pair, mut packet) = (Pair::start(way, pinning), vec![7; PACKET]);
+    let ages = (0..TABLE_ONE).map(|_| {
+        pair.round_trip(AGED, &mut packet);
+        packet.first_chunk().map_or(0, |bytes| u64::from_le_bytes(*bytes))
+    });
+    Ages::of(&ages.collect::<Vec<_>>())
+}

@@ -1,0 +1,47 @@
+//! What a message between two processes of one node costs, beside raw references of the same run.
+//!
+//! `cargo bench -p sinew --bench lncl [-- [--short] WORD...]` runs the cases whose name holds every WORD, each in fresh
+//! processes: a node, and the two applications in processes of their own, which speak through LNCL by the blocking NodeAPI.
+//! JSON lines are on the standard output, the same as rows of a table on the standard error; `--short` does a tenth of the
+//! rounds of the cases at 1000 bytes. Times are microseconds. Nothing here asserts a time.
+//!
+//! - Round trips at 8 B to 1 MiB, back to back; at 1000 B also one every millisecond.
+//! - `table_1`: the paper's test, 1024 packets of 1000 bytes, one way, the first ones included.
+//! - `fan_in`: eight processes send to one, each 1000 bytes every millisecond, one way.
+//! - `flood`: 1000 bytes as fast as a window of 128 unanswered ones lets it.
+//!
+//! Each three times: wherever the scheduler likes, all on one CPU, and one CPU for each application (the node has none of its
+//! own then). References: a hand-written ring in shared memory without any check, woken by a futex or polled
+//! (`sinew_shm::bare`); a unix stream socket between the two; and iceoryx2, if `SINEW_PEER_ICEORYX2` is the path of the program
+//! that `cargo build --release --manifest-path tests/peers/iceoryx2/Cargo.toml` makes.
+
+#[cfg(target_os = "linux")]
+mod case;
+#[cfg(target_os = "linux")]
+mod crowds;
+#[cfg(target_os = "linux")]
+mod ends;
+#[cfg(target_os = "linux")]
+mod processes;
+#[cfg(target_os = "linux")]
+mod raw;
+
+#[cfg(target_os = "linux")]
+fn main() -> std::process::ExitCode {
+    if let Ok(role) = std::env::var(processes::ROLE) {
+        return case::play(&role);
+    }
+    eprintln!("machine: {}", sinew_figures::machine());
+    sinew_figures::Beside::head();
+    let words: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with('-')).collect();
+    let is_short = std::env::args().any(|arg| arg == "--short");
+    let wanted =
+        case::all(is_short).filter(|case| words.iter().all(|word| case.name().contains(word.as_str())));
+    let failed = wanted.filter(|case| !case.run(is_short)).count();
+    if failed == 0 { std::process::ExitCode::SUCCESS } else { std::process::ExitCode::FAILURE }
+}
+
+#[cfg(not(target_os = "linux"))]
+fn main() {
+    eprintln!("no sealed shared memory here");
+}

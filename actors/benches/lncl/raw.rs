@@ -1,0 +1,188 @@
+//! The references: bare rings and bare sockets, the same payload the same way.
+
+use std::{
+    io::{Read, Write},
+    os::unix::net::UnixStream,
+    process::{Command, Stdio},
+    time::{Duration, Instant},
+};
+
+use rustix::{
+    event::{PollFd, PollFlags, poll},
+    io::dup,
+    stdio::stdin,
+};
+use sinew_figures::Figures;
+use sinew_runtime::time::Time;
+use sinew_shm::bare::{self, Waiting};
+
+use crate::{
+    case::{Reference, Rounds},
+    crowds::{ANSWERED_EACH, PACKET, SENDERS, WINDOW, paced},
+    processes::{End, Pinning, Process, say_there},
+};
+
+/// The environment variable that names the program of `tests/peers/iceoryx2`.
+pub(crate) const PEER: &str = "SINEW_PEER_ICEORYX2";
+
+/// Round trips of a reference.
+pub(crate) fn round_trips(reference: Reference, bytes: usize, rounds: Rounds, pinning: Pinning) -> Figures {
+    let role = format!("raw_echo {} {bytes} {}", reference.name(), pinning.name());
+    let mut buffer = vec![7; bytes];
+    match reference {
+        Reference::BareFutex | Reference::BarePoll => {
+            let memory = bare::memory(bytes);
+            let mut end = bare::End::first(&memory, bytes, waiting(reference));
+            let _echo = Process::start_on(&role, memory);
+            rounds.time(|| {
+                end.send(&buffer);
+                end.receive(&mut buffer);
+            })
+        }
+        Reference::Iceoryx2Event => peer("event", bytes, rounds, pinning),
+        Reference::Iceoryx2Poll => peer("poll", bytes, rounds, pinning),
+        Reference::UnixStream => {
+            let (mut socket, theirs) = UnixStream::pair().expect("a pair of sockets");
+            let _echo = Process::start_on(&role, theirs.into());
+            rounds.time(|| {
+                socket.write_all(&buffer).expect("the echo reads");
+                socket.read_exact(&mut buffer).expect("the echo answers");
+            })
+        }
+    }
+}
+
+/// The echoing end: until the measuring end ends this process.
+pub(crate) fn echo(reference: Reference, bytes: usize) {
+    let mut buffer = vec![0; bytes];
+    match reference {
+        Reference::BareFutex | Reference::BarePoll => {
+            let mut end = bare::End::second(stdin(), bytes, waiting(reference));
+            say_there();
+            loop {
+                end.receive(&mut buffer);
+                end.send(&buffer);
+            }
+        }
+        Reference::Iceoryx2Event | Reference::Iceoryx2Poll => unreachable!("it has a program of its own"),
+        Reference::UnixStream => {
+            let mut socket = input();
+            say_there();
+            while socket.read_exact(&mut buffer).and_then(|()| socket.write_all(&buffer)).is_ok() {}
+        }
+    }
+}
+
+const fn waiting(reference: Reference) -> Waiting {
+    match reference {
+        Reference::BarePoll | Reference::Iceoryx2Poll => Waiting::Poll,
+        Reference::BareFutex | Reference::UnixStream | Reference::Iceoryx2Event => Waiting::Futex,
+    }
+}
+
+/// What `tests/peers/iceoryx2` prints: the time of each round trip in nanoseconds.
+fn peer(waits: &str, bytes: usize, rounds: Rounds, pinning: Pinning) -> Figures {
+    let cpu = |end| pinning.cpu(end).map_or_else(|| "-".to_owned(), |cpu| cpu.to_string());
+    let numbers = [bytes as u64, rounds.warm_up.into(), rounds.counted.into(), rounds.pause_us()];
+    let output = Command::new(std::env::var_os(PEER).expect("it was there when the cases were chosen"))
+        .arg(waits)
+        .args(numbers.map(|number| number.to_string()))
+        .args([cpu(End::Measuring), cpu(End::Echoing)])
+        .stderr(Stdio::null())
+        .output()
+        .expect("the peer's program can be started");
+    assert!(output.status.success(), "the peer failed: {:?}", output.status);
+    let mut figures = Figures::new();
+    let lines = str::from_utf8(&output.stdout).expect("numbers").lines();
+    lines.for_each(|line| figures.record(Duration::from_nanos(line.parse().expect("a number"))));
+    figures
+}
+
+/// The socket that this process was given as its input.
+fn input() -> UnixStream {
+    dup(stdin()).expect("the socket is the input").into()
+}
+
+/// Packets a second that a unix stream carries, answered as those of a flood are.
+pub(crate) fn flood(packets: u64, pinning: Pinning) -> f64 {
+    let (mut socket, theirs) = UnixStream::pair().expect("a pair of sockets");
+    let _sink = Process::start_on(&format!("raw_sink {}", pinning.name()), theirs.into());
+    let (packet, mut answered) = ([7; PACKET], 0);
+    let start = Instant::now();
+    for sent in 0..packets {
+        while sent - answered >= WINDOW {
+            socket.read_exact(&mut [0; 8]).expect("the sink answers");
+            answered += ANSWERED_EACH;
+        }
+        socket.write_all(&packet).expect("the sink reads");
+    }
+    while answered < packets {
+        socket.read_exact(&mut [0; 8]).expect("the sink answers");
+        answered += ANSWERED_EACH;
+    }
+    packets as f64 / start.elapsed().as_secs_f64()
+}
+
+/// The sink of a flood: until the measuring end ends this process.
+pub(crate) fn sink() {
+    let (mut socket, mut packet, mut taken) = (input(), [0; PACKET], 0_u64);
+    say_there();
+    while socket.read_exact(&mut packet).is_ok() {
+        taken += 1;
+        if taken.is_multiple_of(ANSWERED_EACH) && socket.write_all(&taken.to_le_bytes()).is_err() {
+            return;
+        }
+    }
+}
+
+/// The ages of what eight processes send over a unix stream each.
+pub(crate) fn fan_in(packets: u64, pinning: Pinning) -> Figures {
+    let role = format!("raw_sender {packets} {}", pinning.name());
+    let (mut sockets, mut senders) = (Vec::new(), Vec::new());
+    for _ in 0..SENDERS {
+        let (socket, theirs) = UnixStream::pair().expect("a pair of sockets");
+        senders.push(Process::start_on(&role, theirs.into()));
+        sockets.push(socket);
+    }
+    for socket in &mut sockets {
+        socket.write_all(b"go").expect("the sender waits");
+    }
+    let mut figures = Figures::new();
+    while figures.rounds() < packets * SENDERS as u64 {
+        let mut fds: Vec<_> = sockets.iter().map(|socket| PollFd::new(socket, PollFlags::IN)).collect();
+        poll(&mut fds, None).expect("sockets can be polled");
+        let mut ready =
+            fds.iter().map(|fd| fd.revents().contains(PollFlags::IN)).collect::<Vec<_>>().into_iter();
+        // One that has ended was read to its end.
+        sockets.retain_mut(|socket| ready.next() != Some(true) || read_packet(socket, &mut figures));
+    }
+    senders.into_iter().for_each(Process::wait);
+    figures
+}
+
+/// Reads a packet and records its age. Returns whether there was one.
+fn read_packet(socket: &mut UnixStream, figures: &mut Figures) -> bool {
+    let mut packet = [0; PACKET];
+    let is_there = socket.read_exact(&mut packet).is_ok();
+    if is_there {
+        let sent = packet.first_chunk().map_or(0, |bytes| u64::from_le_bytes(*bytes));
+        figures.record(Time::now().since(Time::from_nanos(sent)));
+    }
+    is_there
+}
+
+/// One sender of the eight.
+pub(crate) fn send(packets: u64) {
+    let (mut socket, mut packet) = (input(), [7; PACKET]);
+    say_there();
+    socket.read_exact(&mut [0; 2]).expect("the word to begin");
+    paced(packets, || {
+        packet[..8].copy_from_slice(&Time::now().as_nanos().to_le_bytes());
+        socket.write_all(&packet).expect("the sink reads");
+    });
+}
+
+/// Pins a reference's other end.
+pub(crate) fn pin(pinning: &str, end: End) {
+    Pinning::named(pinning).pin(end);
+}
