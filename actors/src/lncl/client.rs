@@ -237,6 +237,7 @@ impl Client {
             let link = self.outlet.connect(socket, payload_max, Some(self.registered(None)));
             return Ok((ClientReader::Plain(reader), link));
         };
+        // spec: LNCL-9
         write_now(&self.peer.stream, &self.registered(Some(capacity.bytes())))?;
         self.ring = Ring::Told;
         let exchange = link::exchange(exchange, &self.peer.stream, payload_max);

@@ -3,7 +3,8 @@
 //!
 //! In one process no message passes through LNCL: it owns the registry and publishes the routes, and a sender's thread
 //! puts its message into the target's mailbox. For other processes LNCL listens at a unix socket, one connection for
-//! each address; a sender's thread writes to the client's socket itself, and LNCL's thread reads what clients send.
+//! each address, with a ring in shared memory each way where both can; a sender's thread writes into the client's ring
+//! itself, and LNCL's thread reads what clients send.
 //!
 //! | rule | |
 //! | --- | --- |
@@ -13,8 +14,9 @@
 //! | LNCL-4 | What is no frame, of another version, too long, or not for clients to send ends its connection, with `LNCL_REFUSAL` and a sentence. Nothing else is touched. |
 //! | LNCL-5 | A name has 1 to 63 bytes, no control characters, and one holder on a node. A fixed address is in the fixed range and has one holder. A dynamic address that was given back is not given out again before all others. |
 //! | LNCL-6 | A client that requires names gets `LNCL_REGISTERED` when all of them are ready. Nothing is sent to it before. |
-//! | LNCL-7 | Each confirmed message to a client ends in what the client says of it; as `Failed` if the connection ends while the client has it; as `Rejected(Closed)` if it was not sent yet. |
+//! | LNCL-7 | Each confirmed message to a client ends in what the client says of it; as `Failed` if the connection ends while the client has it; as `Rejected(Closed)` if it was not sent yet, or lay in its ring untaken. |
 //! | LNCL-8 | Two names of payload types with one id are refused where both are told at registration. |
+//! | LNCL-9 | A client that can, and says so, gets a ring in shared memory for each direction; the socket then carries descriptors and last words only, and tells either side's end. |
 
 mod actor;
 mod client;
