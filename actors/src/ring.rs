@@ -32,6 +32,9 @@ pub(crate) enum ExchangeError {
     /// The peer's fault.
     #[error("the peer's offer of shared memory is refused: {0}")]
     Refused(#[from] RefusedOffer),
+    /// The peer's fault: it says that it has offered something.
+    #[error("the peer has offered no shared memory")]
+    Missing,
 }
 
 /// The exchange of offers over a socket, on which nothing else comes meanwhile. Both ends do the same, in any order.

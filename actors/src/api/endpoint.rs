@@ -11,10 +11,15 @@ use sinew_runtime::{
 
 use super::{
     ApiError, Received, Registration, Transport,
+    direct::{Came, Direct, Everything, Sent, Terms, ToNode},
     inbox::{Answer, Awaited, Inbox, Sorted},
     link::{self, Link, Read, Reader, Writer},
+    routes::LinkNumber,
 };
-use crate::lncl::payload::{self, Group, Registered, Resolve};
+use crate::{
+    lncl::payload::{self, Group, Registered, Resolve},
+    ring::Taken,
+};
 
 /// Time that the node has to answer what it answers at once.
 const PROMPT: Duration = Duration::from_secs(2);
@@ -34,9 +39,11 @@ pub struct Endpoint {
     payload_max: usize,
     writer: Arc<Writer>,
     reader: Reader,
+    /// Links to other processes that the node is not on the way of.
+    pub(super) direct: Direct,
     inbox: Inbox,
     sequence: u64,
-    correlation: u64,
+    pub(super) correlation: u64,
     /// Why the connection has ended, once it has.
     ended: Option<String>,
 }
@@ -58,15 +65,22 @@ enum WhenFull {
 
 impl Endpoint {
     pub(super) fn register(path: &Path, registration: Registration) -> Result<Self, ApiError> {
-        let Registration { register, deadline, inbox_capacity, link } = registration;
-        let Some(link) = link::open(path, &register, Time::now() + deadline, link)? else {
+        let Registration { register, deadline, inbox_capacity, link: options } = registration;
+        let Some(link) = link::open(path, &register, Time::now() + deadline, options)? else {
             return Err(match register.requires {
                 requires if requires.is_empty() => ApiError::NoAnswer(deadline),
                 requires => ApiError::Waiting { requires, waited: deadline },
             });
         };
         let Link { registered, writer, reader } = link;
-        let Registered { node, app, node_name, payload_max, ring: _ } = registered;
+        let Registered { node, app, node_name, payload_max, ring } = registered;
+        let control = reader.control().filter(|_| register.direct);
+        let terms = Terms {
+            own: Tid::new(node, app),
+            ring_bytes: ring.unwrap_or_default() as usize,
+            payload_max: payload_max as usize,
+            options,
+        };
         let inbox = Inbox::new(inbox_capacity, writer.clone());
         Ok(Self {
             tid: Tid::new(node, app),
@@ -74,6 +88,7 @@ impl Endpoint {
             payload_max: payload_max as usize,
             writer,
             reader,
+            direct: Direct::new(terms, control),
             inbox,
             sequence: 0,
             correlation: 0,
@@ -125,7 +140,7 @@ impl Endpoint {
     /// # Errors
     /// It was not sent.
     pub fn send_message(&mut self, buffer: MessageBuffer) -> Result<(), ApiError> {
-        self.dispatch(buffer.freeze())
+        self.dispatch(buffer.freeze()).map(drop)
     }
 
     /// Sends a value, in the class of its type. Returns when the socket to the node has taken it.
@@ -133,7 +148,7 @@ impl Endpoint {
     /// # Errors
     /// It was not sent.
     pub fn send<P: Payload>(&mut self, destination: Tid, value: &P) -> Result<(), ApiError> {
-        self.dispatch(Message::typed(self.tid, destination, value))
+        self.dispatch(Message::typed(self.tid, destination, value)).map(drop)
     }
 
     /// Sends a value and waits for what becomes of it: [`Outcome::Unknown`] when nobody has said so `within` this
@@ -192,7 +207,7 @@ impl Endpoint {
             if Time::now() >= deadline {
                 return Ok(None);
             }
-            self.reader.wait(deadline);
+            self.wait(deadline);
         }
     }
 
@@ -243,7 +258,7 @@ impl Endpoint {
             if Time::now() >= deadline {
                 return Err(ApiError::NoAnswer(PROMPT));
             }
-            self.reader.wait(deadline);
+            self.wait(deadline);
         }
         Ok(())
     }
@@ -294,7 +309,7 @@ impl Endpoint {
         message.header.class = Class::Control;
         message.header.flags = Flags::REPLY;
         message.header.correlation = request.correlation();
-        self.dispatch(message)
+        self.dispatch(message).map(drop)
     }
 
     /// Sends `message` and waits for its answer; `None` at the deadline.
@@ -308,11 +323,17 @@ impl Endpoint {
         self.correlation += 1;
         message.header.correlation = self.correlation;
         message.header.flags = message.header.flags.with(flags);
-        let (number, deadline) = (self.correlation, Time::now() + within);
-        self.dispatch(message)?;
+        let of = self.absolute(message.header.destination);
+        let wanted = Wanted { number: self.correlation, what: awaited, of };
+        let deadline = Time::now() + within;
+        let way = self.dispatch(message)?;
         loop {
-            if let Some(answer) = self.take_in(Some((number, awaited)), WhenFull::Refuse)? {
+            if let Some(answer) = self.take_in(Some(wanted), WhenFull::Refuse)? {
                 return Ok(Some(answer));
+            }
+            // spec: LNCL-7. The link has ended with the message in the peer's hand.
+            if way.is_some_and(|link| !self.direct.has(link)) {
+                return Ok(Some(Answer::Outcome(Outcome::Failed)));
             }
             if let Some(why) = &self.ended {
                 return Err(ApiError::Closed(why.clone()));
@@ -321,19 +342,44 @@ impl Endpoint {
             if Time::now() >= deadline {
                 return Ok(None);
             }
-            self.reader.wait(deadline);
+            self.wait(deadline);
         }
     }
 
-    fn dispatch(&mut self, mut message: Message) -> Result<(), ApiError> {
+    /// Sends `message` the way that is right now; the link, if it did not go through the node.
+    fn dispatch(&mut self, mut message: Message) -> Result<Option<LinkNumber>, ApiError> {
         self.check_length(message.payload.len())?;
         self.sequence += 1;
         message.header.sequence = self.sequence;
-        message.header.sent = Time::now();
-        if self.reader.has_ended(message.header.sent) {
+        let now = Time::now();
+        message.header.sent = now;
+        let destination = self.absolute(message.header.destination);
+        let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
+        self.direct.look(now, &mut node);
+        if self.direct.is_asking(now) {
+            // Who only sends looks here for the answer. What it cannot sort in, or read, shows when it receives.
+            let _ = self.take_in_from_node(None, WhenFull::Leave);
+        }
+        let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
+        if let Some(link) = self.direct.way(destination, now, &mut node) {
+            message.header.destination = destination;
+            match self.direct.send(link, message, now)? {
+                Sent::Taken => return Ok(Some(link)),
+                Sent::Gone(back) => message = back,
+            }
+        }
+        if self.reader.has_ended(now) {
             return Err(self.explain(ApiError::Closed("the node has gone".to_owned())));
         }
-        self.writer.write(&message).map_err(|error| self.explain(error))
+        self.writer.write(&message).map(|()| None).map_err(|error| self.explain(error))
+    }
+
+    const fn absolute(&self, destination: Tid) -> Tid {
+        if matches!(destination.node, NodeAddress::HERE) {
+            Tid::new(self.tid.node, destination.app)
+        } else {
+            destination
+        }
     }
 
     /// What the node said before it closed the connection says more than a broken pipe does.
@@ -358,14 +404,27 @@ impl Endpoint {
     }
 
     /// Sorts in what has come so far, without waiting. Returns the answer that is awaited, if it was there.
-    fn take_in(
+    fn take_in(&mut self, wanted: Option<Wanted>, when_full: WhenFull) -> Result<Option<Answer>, ApiError> {
+        // The node first: there a peer may say that from now on its link is read.
+        let answer = self.take_in_from_node(wanted, when_full)?;
+        if answer.is_some() || self.direct.is_empty() {
+            return Ok(answer);
+        }
+        let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
+        self.direct.look(Time::now(), &mut node);
+        // From the last one on: one that ends makes no other one's turn go by.
+        let links = (0..self.direct.open.len()).rev();
+        Ok(links.into_iter().find_map(|index| self.take_in_from_link(index, wanted, when_full)))
+    }
+
+    fn take_in_from_node(
         &mut self,
-        awaited: Option<(u64, Awaited)>,
+        wanted: Option<Wanted>,
         when_full: WhenFull,
     ) -> Result<Option<Answer>, ApiError> {
         self.writer.pay();
         for read in 0.. {
-            if let Some(answer) = self.sort_in(awaited, when_full)? {
+            if let Some(answer) = self.sort_in(wanted, when_full)? {
                 return Ok(Some(answer));
             }
             let is_full = when_full == WhenFull::Leave && !self.inbox.has_room();
@@ -384,21 +443,98 @@ impl Endpoint {
         Ok(None)
     }
 
-    /// Sorts in what has been read.
-    fn sort_in(
-        &mut self,
-        awaited: Option<(u64, Awaited)>,
-        when_full: WhenFull,
-    ) -> Result<Option<Answer>, ApiError> {
+    /// Sorts in what has been read from the node.
+    fn sort_in(&mut self, wanted: Option<Wanted>, when_full: WhenFull) -> Result<Option<Answer>, ApiError> {
         while when_full == WhenFull::Refuse || self.inbox.has_room() {
             let Some(message) = self.reader.next()? else { break };
-            match self.inbox.sort(message, awaited) {
+            let Some(message) = self.heed(message, wanted) else { continue };
+            match self.inbox.sort(message, wanted.map(Wanted::at_node)) {
                 Sorted::Answer(answer) => return Ok(Some(answer)),
                 Sorted::Refusal(sentence) => self.ended = Some(sentence),
                 Sorted::Message | Sorted::Nothing => {}
             }
         }
         Ok(None)
+    }
+
+    /// Hands back what is not about direct links.
+    fn heed(&mut self, message: Message, wanted: Option<Wanted>) -> Option<Message> {
+        let Header { kind, correlation, .. } = message.header;
+        if kind.is_user() || wanted.is_some_and(|wanted| wanted.number == correlation) {
+            return Some(message);
+        }
+        let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
+        self.direct.heed(message, Time::now(), &mut node)
+    }
+
+    /// Sorts in what has come so far on an open link.
+    fn take_in_from_link(
+        &mut self,
+        index: usize,
+        wanted: Option<Wanted>,
+        when_full: WhenFull,
+    ) -> Option<Answer> {
+        for read in 0.. {
+            while when_full == WhenFull::Refuse || self.inbox.has_room() {
+                let link = &mut self.direct.open[index];
+                let awaited = wanted.and_then(|wanted| wanted.on_link_with(link.peer));
+                match link.next() {
+                    Ok(Came::Nothing) => break,
+                    Ok(Came::Refused) => {}
+                    Ok(Came::Message(message)) => {
+                        if let Sorted::Answer(answer) = self.inbox.sort_from(&link.sink, message, awaited) {
+                            return Some(answer);
+                        }
+                    }
+                    Err(why) => return self.direct.fail(index, &why),
+                }
+            }
+            let is_full = when_full == WhenFull::Leave && !self.inbox.has_room();
+            if is_full || read == READS_PER_LOOK {
+                return None;
+            }
+            match self.direct.open[index].take() {
+                Ok(Taken::Some) => {}
+                Ok(Taken::Nothing) => return None,
+                Err(why) => return self.direct.fail(index, &why),
+            }
+        }
+        None
+    }
+
+    /// Waits until something comes, from the node or from a link, or until there is something to do.
+    fn wait(&mut self, deadline: Time) {
+        match &mut self.reader {
+            Reader::Ring(reader) if !self.direct.open.is_empty() => {
+                let deadline = self.direct.wake_by(deadline);
+                let links = &mut self.direct.open[..];
+                let ended = reader.wait_for_all(deadline, |node| Everything { node, links });
+                reader.note(&ended);
+                self.direct.note(&ended);
+            }
+            Reader::Ring(_) | Reader::Socket(_) => self.reader.wait(deadline),
+        }
+    }
+}
+
+/// The answer that a call waits for.
+#[derive(Clone, Copy)]
+struct Wanted {
+    number: u64,
+    what: Awaited,
+    /// Who says it.
+    of: Tid,
+}
+
+impl Wanted {
+    /// What the node passes on is from whom it says it is.
+    const fn at_node(self) -> (u64, Awaited) {
+        (self.number, self.what)
+    }
+
+    /// On its own link nobody answers for others.
+    fn on_link_with(self, peer: Tid) -> Option<(u64, Awaited)> {
+        (peer == self.of).then_some((self.number, self.what))
     }
 }
 

@@ -62,15 +62,26 @@ impl Inbox {
         self.queue.len() < self.capacity
     }
 
-    /// Sorts a frame in. One that finds its class full is refused, and its sender told so if it asked.
+    /// Sorts a frame of the node in. One that finds its class full is refused, and its sender told so if it asked.
     pub(super) fn sort(&mut self, message: Message, awaited: Option<(u64, Awaited)>) -> Sorted {
+        let sink = self.sink.clone();
+        self.sort_from(&sink, message, awaited)
+    }
+
+    /// As [`sort`](Self::sort), for a frame that came where `sink` goes back.
+    pub(super) fn sort_from(
+        &mut self,
+        sink: &Arc<dyn ReceiptSink>,
+        message: Message,
+        awaited: Option<(u64, Awaited)>,
+    ) -> Sorted {
         let header = &message.header;
         let awaited = awaited.filter(|(number, _)| *number == header.correlation).map(|(_, what)| what);
         if header.kind.is_user() {
             return if header.flags.has(Flags::REPLY) {
-                self.sort_reply(message, awaited)
+                sort_reply(with_receipt(sink, message), awaited)
             } else {
-                self.push(message);
+                self.push(with_receipt(sink, message));
                 Sorted::Message
             };
         }
@@ -104,30 +115,28 @@ impl Inbox {
         }
     }
 
-    fn sort_reply(&self, message: Message, awaited: Option<Awaited>) -> Sorted {
-        let is_awaited = awaited == Some(Awaited::Reply);
-        let mut message = self.with_receipt(message);
-        message.settle(if is_awaited { Outcome::Delivered } else { Outcome::Expired });
-        if is_awaited { Sorted::Answer(Answer::Reply(message)) } else { Sorted::Nothing }
-    }
-
     fn push(&mut self, message: Message) {
-        let message = self.with_receipt(message);
         match self.queue.push(message) {
             // Of a Stream the newest value wins; Stream messages have no receipts.
             Ok(_) => {}
             Err(refused) => refused.message.reject(refused.why),
         }
     }
+}
 
-    fn with_receipt(&self, mut message: Message) -> Message {
-        if message.header.flags.has(Flags::CONFIRM) {
-            let (source, destination) = (message.header.source, message.header.destination);
-            let ticket = Ticket { source, destination, correlation: message.header.correlation };
-            message.receipt = Some(Receipt::new(self.sink.clone(), ticket));
-        }
-        message
+fn with_receipt(sink: &Arc<dyn ReceiptSink>, mut message: Message) -> Message {
+    if message.header.flags.has(Flags::CONFIRM) {
+        let (source, destination) = (message.header.source, message.header.destination);
+        let ticket = Ticket { source, destination, correlation: message.header.correlation };
+        message.receipt = Some(Receipt::new(sink.clone(), ticket));
     }
+    message
+}
+
+fn sort_reply(mut message: Message, awaited: Option<Awaited>) -> Sorted {
+    let is_awaited = awaited == Some(Awaited::Reply);
+    message.settle(if is_awaited { Outcome::Delivered } else { Outcome::Expired });
+    if is_awaited { Sorted::Answer(Answer::Reply(message)) } else { Sorted::Nothing }
 }
 
 fn sort_outcome(message: &Message, awaited: Option<Awaited>) -> Sorted {

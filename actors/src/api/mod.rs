@@ -36,13 +36,13 @@
 //!
 //! The protocol underneath is `docs/protocol/lncl.md`; it can be spoken from any language.
 
+mod direct;
 mod endpoint;
 mod error;
 mod inbox;
 mod link;
 mod raw;
 mod received;
-#[expect(dead_code, reason = "direct links follow")]
 mod routes;
 #[cfg(test)]
 mod tests;
@@ -107,7 +107,7 @@ pub struct Registration {
 impl Default for Registration {
     fn default() -> Self {
         Self {
-            register: Register { pid: std::process::id(), ..Register::default() },
+            register: Register { pid: std::process::id(), direct: true, ..Register::default() },
             deadline: Duration::from_secs(60),
             inbox_capacity: 256,
             link: LinkOptions {
@@ -186,6 +186,16 @@ impl Registration {
     #[must_use]
     pub const fn patience(mut self, patience: Duration) -> Self {
         self.link.patience = patience;
+        self
+    }
+
+    /// Whether messages to and from other processes of the node may go directly, through rings of their own, where LNCL
+    /// introduces the two; else all of them go through the node. A link is made at the first message to another process. It
+    /// costs a ring of each side, and some time in the call in which it is made. Default true; only with
+    /// [`Transport::Ring`].
+    #[must_use]
+    pub const fn direct(mut self, direct: bool) -> Self {
+        self.register.direct = direct;
         self
     }
 

@@ -242,16 +242,18 @@ impl Routes {
         self.set(peer, Peer::Offered { number, marks: Marks::default(), gone: None });
     }
 
-    /// The link stands, and our SWITCH is said as `correlation`, behind all that went through the node so far. The
-    /// peer's ring is open if its SWITCH was what made the link.
-    pub(super) fn connected(&mut self, peer: Tid, number: LinkNumber, correlation: u64) {
+    /// The link stands, and our SWITCH is said, behind all that went through the node so far; where there was no room for
+    /// it now, it is later. The peer's ring is open if its SWITCH was what made the link.
+    pub(super) fn connected(&mut self, peer: Tid, number: LinkNumber, said: Option<u64>, now: Time) {
         let (theirs, gone) = match self.peers.get(&peer) {
             Some(Peer::Offered { gone, .. }) => (Theirs::Open, *gone),
             Some(Peer::Refused { .. } | Peer::Asked { .. } | Peer::Direct { .. }) | None => {
                 (Theirs::Held(Marks::default()), None)
             }
         };
-        self.set(peer, Peer::Direct { number, switch: Switch::Said { correlation }, theirs, gone });
+        let later = Switch::ToSay { at: now + SWITCH_AGAIN };
+        let switch = said.map_or(later, |correlation| Switch::Said { correlation });
+        self.set(peer, Peer::Direct { number, switch, theirs, gone });
     }
 
     /// A mark of `peer`'s SWITCH has come.
@@ -367,7 +369,13 @@ impl Routes {
         }
     }
 
+    /// Whether LNCL has been asked and has not answered.
+    pub(super) fn is_asking(&self) -> bool {
+        self.peers.values().any(|peer| matches!(peer, Peer::Asked { .. }))
+    }
+
     /// Whether the ring of `peer` is read.
+    #[cfg(test)]
     pub(super) fn is_open(&self, peer: Tid) -> bool {
         matches!(self.peers.get(&peer), Some(Peer::Direct { theirs: Theirs::Open, .. }))
     }

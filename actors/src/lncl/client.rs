@@ -17,7 +17,7 @@ use tokio::net::{UnixStream, unix::UCred};
 
 use super::{
     core::{Address, ClientId, Owner, Request},
-    introductions::Marks,
+    introductions::{Marks, Party},
     link::{self, ClientReader, ClientSocket, LinkError},
     payload::{self, REGISTER_BYTES_MAX, Refusal, Register, Registered, Resolved},
     reader::Reader,
@@ -145,6 +145,8 @@ struct Client {
     events: Arc<[Kind]>,
     /// Whether the peer can use rings; later, whether it was told that it does.
     ring: Ring,
+    /// Whether others may be introduced to it.
+    wants_links: bool,
     /// Whether the peer knows why its connection ends.
     has_been_told: bool,
     /// How it ends, as far as it is known.
@@ -153,7 +155,7 @@ struct Client {
 
 impl Client {
     fn register(server: Rc<Server>, peer: Peer, asked: Register) -> Result<Self, super::RegisterError> {
-        let Register { name, address, requires, events, kinds, pid: _, direct: _, ring } = asked;
+        let Register { name, address, requires, events, kinds, pid: _, direct, ring } = asked;
         let address = address.map_or(Address::Dynamic, Address::Fixed);
         let request = Request { address, name, requires: requires.clone(), kinds, owner: peer.owner() };
         let app = registrar::register_client(&server.stores, request)?;
@@ -165,7 +167,21 @@ impl Client {
         let (link, events, has_been_told) = (None, events.into(), false);
         let cause = Cause::new(DownClass::Killed, registrar::LNCL_ENDED);
         let ring = if ring { Ring::Asked } else { Ring::None };
-        Ok(Self { server, peer, outlet, link, tid, name, requires, events, ring, has_been_told, cause })
+        let wants_links = direct;
+        Ok(Self {
+            server,
+            peer,
+            outlet,
+            link,
+            tid,
+            name,
+            requires,
+            events,
+            ring,
+            wants_links,
+            has_been_told,
+            cause,
+        })
     }
 
     /// Holds the client until all that it requires is ready. Returns why its connection ended, if it did.
@@ -249,7 +265,18 @@ impl Client {
                 return Err(End::Refused(format!("no offer of shared memory came within {HANDSHAKE:?}")));
             }
         };
-        Ok((reader, self.outlet.connect(socket, payload_max, None)))
+        let link = self.outlet.connect(socket, payload_max, None);
+        self.let_meet_others();
+        Ok((reader, link))
+    }
+
+    /// Its socket takes descriptors from now on.
+    fn let_meet_others(&self) {
+        if self.wants_links {
+            let pid = u32::try_from(self.peer.pid).unwrap_or_default();
+            let party = Party::new(self.tid, pid, self.outlet.clone(), self.peer.stream.clone());
+            self.server.introductions.add(party);
+        }
     }
 
     async fn receive(&self, reader: &mut ClientReader, session: &mut Session) -> End {
@@ -430,6 +457,7 @@ impl Client {
 
 impl Drop for Client {
     fn drop(&mut self) {
+        self.server.introductions.remove(self.tid.app);
         registrar::owner_gone(&self.server.stores, self.peer.owner(), &self.cause);
         self.server.remove_outlet(self.peer.id);
         if !self.has_been_told {

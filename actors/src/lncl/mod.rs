@@ -23,7 +23,6 @@ mod client;
 mod core;
 mod door;
 mod facts;
-#[cfg_attr(not(test), expect(dead_code, reason = "direct links follow"))]
 mod introductions;
 mod link;
 mod listener;

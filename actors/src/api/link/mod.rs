@@ -91,6 +91,15 @@ impl Writer {
         }
     }
 
+    /// Writes one frame if there is room for it now, and the link is one of rings.
+    pub(super) fn try_write(&self, message: &Message) -> bool {
+        match self {
+            Self::Socket(_) => false,
+            // An error shows itself again when the ring is read.
+            Self::Ring(writer) => writer.try_write(message).unwrap_or(false),
+        }
+    }
+
     /// Writes the outcomes that found no room when they were said, as far as there is room now. Never waits.
     pub(super) fn pay(&self) {
         match self {
@@ -149,6 +158,14 @@ impl Reader {
         match self {
             Self::Socket(reader) => reader.read(),
             Self::Ring(reader) => reader.read(),
+        }
+    }
+
+    /// The socket beside the rings, if there are rings.
+    pub(super) fn control(&self) -> Option<Arc<UnixStream>> {
+        match self {
+            Self::Socket(_) => None,
+            Self::Ring(reader) => Some(reader.socket()),
         }
     }
 

@@ -19,8 +19,8 @@ use sinew_runtime::{
     wire::{Flags, FrameCodec, HEADER_LEN, Header, Kind, Message},
 };
 use sinew_shm::{
-    Any, BellKind, Capacity, Consumer, Ends, HangUp, LoanError, Producer, Region, RoomError, Spin, Wait,
-    Waiter,
+    Any, AnyError, BellKind, Capacity, Consumer, Ends, HangUp, LoanError, Producer, Region, RoomError, Spin,
+    Wait, Waiter,
 };
 use tokio_util::codec::Decoder;
 
@@ -32,13 +32,13 @@ use crate::{
 };
 
 /// Bytes that are taken from a ring at once.
-const ENOUGH: usize = 64 * 1024;
+pub(in crate::api) const ENOUGH: usize = 64 * 1024;
 /// Outcomes that wait for room at most. One more is not said: its sender counts it as Unknown at its own deadline.
 const OWED_MAX: usize = 4_096;
 /// Longest sentence, with its frame, that a node takes leave with.
 const LAST_WORDS_BYTES_MAX: usize = 4_096;
 /// Longest sleep at a ring: then what other threads owe is paid, and the socket is looked at.
-const NAP: Duration = Duration::from_millis(20);
+pub(in crate::api) const NAP: Duration = Duration::from_millis(20);
 
 /// Whether this process can have rings; found out once.
 pub(super) fn is_available() -> bool {
@@ -85,7 +85,7 @@ pub(in crate::api) struct Writer {
 }
 
 impl Writer {
-    pub(super) fn new(socket: Arc<UnixStream>, mut producer: Producer, options: LinkOptions) -> Self {
+    pub(in crate::api) fn new(socket: Arc<UnixStream>, mut producer: Producer, options: LinkOptions) -> Self {
         producer.set_spin(options.spin);
         let (producer, owed) = (Mutex::new(Some(Box::new(producer))), Mutex::default());
         Self { socket, producer, owed, patience: options.patience }
@@ -102,6 +102,43 @@ impl Writer {
         drop(producer);
         self.pay();
         written
+    }
+
+    /// Writes one frame if there is room for all of it now; returns whether there was.
+    pub(in crate::api) fn try_write(&self, message: &Message) -> Result<bool, ApiError> {
+        self.pay();
+        let head = message.header.encode_in_memory(message.payload.len());
+        let mut producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(producer) = producer.as_deref_mut() else { return Ok(false) };
+        let parts = [IoSlice::new(&head), IoSlice::new(&message.payload)];
+        if ring::piece(producer, message.size()) < message.size() {
+            // One that goes in pieces can wait for room half way.
+            return self.write_to(producer, &head, &message.payload).map(|()| true);
+        }
+        match ring::write(producer, &parts) {
+            Ok(_) => Ok(true),
+            Err(LoanError::Full { .. }) => Ok(false),
+            Err(error @ (LoanError::TooLong { .. } | LoanError::Corrupt(_))) => {
+                self.close();
+                Err(ApiError::Closed(error.to_string()))
+            }
+        }
+    }
+
+    /// Writes what is no frame.
+    #[cfg(test)]
+    pub(in crate::api) fn write_garbage(&self) {
+        let mut producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
+        let producer = producer.as_deref_mut().expect("nothing is lent");
+        ring::write(producer, &[IoSlice::new(&[7; 200])]).expect("there is room");
+    }
+
+    /// Rings the peer's bell: it may sleep, and the socket has been closed.
+    pub(in crate::api) fn wake_peer(&self) {
+        let producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(producer) = producer.as_deref() {
+            producer.ring();
+        }
     }
 
     fn write_to(&self, producer: &mut Producer, head: &[u8], payload: &[u8]) -> Result<(), ApiError> {
@@ -172,7 +209,7 @@ impl Writer {
         true
     }
 
-    fn owes(&self) -> bool {
+    pub(in crate::api) fn owes(&self) -> bool {
         !self.owed.lock().unwrap_or_else(PoisonError::into_inner).is_empty()
     }
 
@@ -220,7 +257,7 @@ pub(in crate::api) struct Reader {
 }
 
 /// What is waited for.
-struct End {
+pub(in crate::api) struct End {
     socket: Arc<UnixStream>,
     consumer: Consumer,
 }
@@ -284,10 +321,35 @@ impl Reader {
             return;
         }
         let left = deadline.since(Time::now()).min(NAP);
-        match self.waiter.wait(&mut self.end, Instant::now() + left) {
-            Ok(Any::Message(_) | Any::TimedOut) => {}
-            Ok(Any::HungUp(_)) => self.ended = Some(last_words(&self.end.socket)),
-            Err(error) => self.ended = Some(error.to_string()),
+        let ended = self.waiter.wait(&mut self.end, Instant::now() + left);
+        self.note(&ended);
+    }
+
+    /// As [`wait`](Self::wait), for the ends that `all` makes of the node's, which is the first, and others.
+    pub(in crate::api) fn wait_for_all<'a, E: Ends>(
+        &'a mut self,
+        deadline: Time,
+        all: impl FnOnce(&'a mut End) -> E,
+    ) -> Result<Any, AnyError> {
+        let left = deadline.since(Time::now()).min(NAP);
+        let mut ends = all(&mut self.end);
+        self.waiter.wait(&mut ends, Instant::now() + left)
+    }
+
+    /// What the end of a wait says about the node.
+    pub(in crate::api) fn note(&mut self, ended: &Result<Any, AnyError>) {
+        match ended {
+            Ok(Any::HungUp(0)) => self.ended = Some(last_words(&self.end.socket)),
+            Ok(Any::Message(_) | Any::TimedOut | Any::HungUp(_))
+            | Err(AnyError::Corrupt { index: 1.., .. }) => {}
+            Err(error @ (AnyError::Corrupt { .. } | AnyError::System(_))) => {
+                self.ended = Some(error.to_string())
+            }
         }
+    }
+
+    /// The socket beside the ring.
+    pub(in crate::api) fn socket(&self) -> Arc<UnixStream> {
+        self.end.socket.clone()
     }
 }

@@ -152,7 +152,7 @@ impl Reader {
 }
 
 /// Whether the other end is closed. Does not wait.
-pub(super) fn has_hung_up(socket: &UnixStream) -> bool {
+pub(in crate::api) fn has_hung_up(socket: &UnixStream) -> bool {
     let nothing = Timespec { tv_sec: 0, tv_nsec: 0 };
     poll(&mut [PollFd::new(socket, PollFlags::RDHUP)], Some(&nothing)).is_ok_and(|count| count > 0)
 }

@@ -334,7 +334,7 @@ impl World {
                     Marked::Connect { confirm } => {
                         assert!(self.other_end(number, tid(at)).offered, "it is offered before the SWITCH");
                         self.end_mut(number, tid(at)).connected = true;
-                        self.say_switch(at, source, number, Routes::connected);
+                        self.connect(at, source, number);
                         confirm.map(|number| (number, Outcome::Delivered))
                     }
                     Marked::Open { confirm } => confirm.map(|number| (number, Outcome::Delivered)),
@@ -401,20 +401,22 @@ impl World {
         }
         self.end_mut(number, own).offered = true;
         self.end_mut(number, own).connected = true;
-        self.say_switch(at, peer, number, Routes::connected);
+        self.connect(at, peer, number);
     }
 
-    fn say_switch(
-        &mut self,
-        at: usize,
-        peer: Tid,
-        number: LinkNumber,
-        note: impl FnOnce(&mut Routes, Tid, LinkNumber, u64),
-    ) {
+    /// As [`say_switch`](Self::say_switch) for a link that stands from now on; sometimes there is no room for it yet.
+    fn connect(&mut self, at: usize, peer: Tid, number: LinkNumber) {
+        let is_full = self.apps[at].to_node.len() >= PIPE;
+        let said = (!is_full).then(|| self.say_switch(at, peer, number));
+        let now = self.now;
+        self.apps[at].routes.connected(peer, number, said, now);
+    }
+
+    fn say_switch(&mut self, at: usize, peer: Tid, number: LinkNumber) -> u64 {
         let app = &mut self.apps[at];
         let correlation = app.correlate();
         app.to_node.push_back(layer(Kind::LNCL_SWITCH, app.tid, peer, number.0, correlation));
-        note(&mut app.routes, peer, number, correlation);
+        correlation
     }
 
     /// An application looks at its links: who has gone, what is to be said again.
@@ -440,9 +442,8 @@ impl World {
             }
         }
         while let Some((peer, number)) = self.apps[at].routes.switch_due(now) {
-            self.say_switch(at, peer, number, |routes, peer, _, correlation| {
-                routes.switched(peer, correlation);
-            });
+            let correlation = self.say_switch(at, peer, number);
+            self.apps[at].routes.switched(peer, correlation);
         }
     }
 
