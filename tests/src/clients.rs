@@ -8,6 +8,7 @@
 //! | `performer` | such a process, as its director sees it: lines in and out, signals |
 //! | `door` | the role of the node |
 //! | `poster` | a role: 8 addresses that send to all others in every class, and tell the ledger |
+//! | `resident` | posters that are applications of the node's own process |
 //! | `entry`, `ledger` | what posters tell, and what became of every message |
 //! | `steady` | the roles of those who are not to feel it: one asks and measures, one answers, one takes what comes |
 //! | `recorder` | the role of one that is stopped: says what it got |
@@ -28,6 +29,7 @@ mod performer;
 mod poster;
 mod recorder;
 mod registration;
+mod resident;
 mod stage;
 mod steady;
 mod victim;
@@ -50,6 +52,9 @@ pub fn play() -> Option<ExitCode> {
     }
     let role = arguments.next().unwrap_or_default();
     let arguments: Vec<String> = arguments.collect();
+    if role != "door" {
+        end_with_the_first_panic();
+    }
     match &*role {
         "door" => door::play(&arguments),
         "poster" => poster::play(&arguments),
@@ -62,6 +67,15 @@ pub fn play() -> Option<ExitCode> {
         _ => panic!("nobody plays {role:?}"),
     }
     Some(ExitCode::SUCCESS)
+}
+
+/// What a thread of the cast panics of is the end of its process, so that the director notices. A node lives on.
+fn end_with_the_first_panic() {
+    let say = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |panic| {
+        say(panic);
+        std::process::exit(101);
+    }));
 }
 
 /// Says one line to the director. One write: what a killed process has said, it has said whole.

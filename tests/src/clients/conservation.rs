@@ -1,5 +1,5 @@
-//! The claim: of what 8 processes with 64 addresses send each other, every message has one fate that is true, whichever of
-//! the processes are killed.
+//! The claim: of what 8 processes with 64 addresses send each other, and applications of the node besides, every message has
+//! one fate that is true, whichever of the processes are killed.
 
 use std::{
     fmt,
@@ -15,6 +15,9 @@ use super::{
     poster::{CAPACITY, POSTERS},
 };
 use crate::{dice::Dice, until};
+
+/// Posters in the node's own process, besides those in processes of their own.
+const RESIDENTS: Poster = 8;
 
 /// What is to be done.
 #[derive(Clone, Debug)]
@@ -79,9 +82,14 @@ struct Cast {
 impl Cast {
     fn new(plan: Plan) -> Self {
         let limits = StageLimits { mailbox_capacity: CAPACITY, payload_max: 1 << 20, clients_max: 256 };
-        let stage = Stage::new(&plan.program, limits);
+        let (ledger, first) = (Shared::default(), plan.processes * POSTERS);
+        let arguments =
+            [u64::from(first), u64::from(first + RESIDENTS), plan.seed].map(|number| number.to_string());
+        let residents = ledger.clone();
+        let stage =
+            Stage::with_residents(&plan.program, limits, &arguments, move |line| note(&residents, 1, line));
         let lives = (0..plan.processes).map(|_| (0, None)).collect();
-        let mut cast = Self { plan, stage, ledger: Shared::default(), lives };
+        let mut cast = Self { plan, stage, ledger, lives };
         (0..cast.plan.processes).for_each(|process| cast.start(process));
         cast
     }
@@ -91,15 +99,20 @@ impl Cast {
         let place = &mut self.lives[usize::from(process)];
         place.0 += 1;
         let (life, ledger) = (place.0, self.ledger.clone());
-        let arguments = [u64::from(process), life.into(), u64::from(processes * POSTERS), seed];
+        let all = processes * POSTERS + RESIDENTS;
+        let arguments = [u64::from(process), life.into(), all.into(), seed];
         let arguments = arguments.map(|number| number.to_string());
         place.1 = Some(self.stage.start("poster", &arguments, move |line| note(&ledger, life, line)));
     }
 
     fn kill(&mut self, process: Poster) {
         let place = &mut self.lives[usize::from(process)];
-        place.1.take().expect("it was started").kill();
+        let lived = place.1.take().expect("it was started").kill();
         let mut ledger = lock(&self.ledger);
+        if !lived {
+            let why = Entry::Broken("its process ended by itself".to_owned());
+            ledger.note(process * POSTERS, place.0, why);
+        }
         posters_of(process).for_each(|poster| ledger.killed(poster, place.0));
     }
 
@@ -128,6 +141,7 @@ impl Cast {
         for (_, performer) in &mut self.lives {
             performer.as_mut().expect("it was started").tell("quiet");
         }
+        self.stage.quiet();
         until("the posters send no more", || lock(&self.ledger).is_quiet().then_some(()));
         // What is on its way after that is in the report.
         let end = Instant::now() + crate::DEADLINE;

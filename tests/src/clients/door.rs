@@ -2,7 +2,7 @@
 
 use sinew::prelude::*;
 
-use super::{say, told};
+use super::{entry::Poster, poster, resident, say, told};
 use crate::{DEADLINE, puppet::Order};
 
 /// The name of the node's own application, which answers every [`Order`] with the same.
@@ -25,6 +25,7 @@ impl Handler<Delivery<Order>> for Witness {
     }
 }
 
+/// `CONFIGURATION [FIRST_POSTER POSTERS_IN_ALL SEED]`: posters from the first one on live in this process.
 pub(super) fn play(arguments: &[String]) {
     tracing_subscriber::fmt()
         .with_env_filter(tracing_subscriber::EnvFilter::from_default_env())
@@ -32,11 +33,19 @@ pub(super) fn play(arguments: &[String]) {
         .init();
     let config = NodeConfig::from_file(&arguments[0]).expect("the stage's configuration");
     let witness = AppSpec::new(WITNESS, || Witness).handles::<Order>().own_thread();
-    let node = Node::builder(config.name.clone()).config(config).app(witness).start().expect("a node");
+    let mut builder = Node::builder(config.name.clone()).config(config).app(witness);
+    let numbers: Vec<u64> = arguments[1..].iter().map(|word| word.parse().expect("a number")).collect();
+    if let &[first, all, seed] = &numbers[..] {
+        for me in first..all {
+            builder = builder.app(resident::app(me as Poster, all as Poster, seed));
+        }
+    }
+    let node = builder.start().expect("a node");
     node.handle().wait_until_running(DEADLINE).expect("it requires nothing");
     say(&"open");
     for question in told() {
         match &*question {
+            "quiet" => poster::be_quiet(),
             "refused" => say(&format!("refused {}", node.handle().refused())),
             _ => panic!("{question:?} is nothing that the node answers"),
         }

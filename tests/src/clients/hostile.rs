@@ -3,8 +3,10 @@
 //! | file | what it is |
 //! | --- | --- |
 //! | `stranger` | a connection by hand |
+//! | `ring` | the hostile end of a link with rings |
 //! | `tricks` | what a hostile client does |
 
+mod ring;
 mod stranger;
 mod tricks;
 
@@ -195,7 +197,8 @@ impl Cast {
             sleeper.signal(Signal::CONT);
             for attacker in attackers {
                 if self.dice.once_in(4) {
-                    attacker.kill();
+                    // It may be over by now.
+                    let _ = attacker.kill();
                 } else {
                     let status = attacker.end();
                     assert!(status.success(), "an attacker ended with {status}");
@@ -204,6 +207,15 @@ impl Cast {
             sleeper.signal(Signal::CONT);
             drop(sleeper);
         }
+    }
+}
+
+/// Ends the look also when the attack panics: else nobody would hear of it.
+struct EndsIt<'a>(&'a AtomicBool);
+
+impl Drop for EndsIt<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
     }
 }
 
@@ -231,8 +243,9 @@ pub fn run(plan: Plan) -> Report {
     let (before, over, began) = (Held::of(node), AtomicBool::new(false), Instant::now());
     let most = thread::scope(|scope| {
         let watching = scope.spawn(|| watch(node, &over));
+        let ends = EndsIt(&over);
         cast.attack();
-        over.store(true, Ordering::Relaxed);
+        drop(ends);
         watching.join().expect("it only looks")
     });
     let attacked = cast.window();

@@ -50,6 +50,8 @@ pub struct Report {
     seconds: f64,
     /// Killed while all its addresses held messages that they had received, and lent memory.
     pub held_loans: u32,
+    /// Ended by themselves, which none should have.
+    pub ended_by_themselves: u32,
     /// Of each process that lives on: before and after the kills.
     pub held: Vec<(&'static str, Held, Held)>,
     /// Round trips of others: nobody is killed; as many end in order; the kills.
@@ -66,6 +68,7 @@ impl Report {
             after.is_back_at(before) && after.proportional_kib <= before.proportional_kib + GROWTH_MAX_KIB
         };
         self.left.is_empty()
+            && self.ended_by_themselves == 0
             && self.held.iter().all(is_back)
             && self.windows.iter().all(|window| window.failed == 0)
     }
@@ -73,8 +76,9 @@ impl Report {
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { kills, seconds, held_loans, held, windows, left } = self;
+        let Self { kills, seconds, held_loans, ended_by_themselves, held, windows, left } = self;
         writeln!(f, "{kills} kills in {seconds:.1} s; {held_loans} of them while every address held loans")?;
+        writeln!(f, "{ended_by_themselves} processes ended by themselves")?;
         for (who, before, after) in held {
             writeln!(f, "{who:<8} before {before}\n{:<8} after  {after}", "")?;
         }
@@ -107,6 +111,7 @@ struct Cast {
     started: u64,
     dice: Dice,
     held_loans: u32,
+    ended_by_themselves: u32,
 }
 
 /// How a victim ends.
@@ -135,7 +140,17 @@ impl Cast {
             ("pinger", start("pinger", &[])),
         ];
         let (dice, victims) = (Dice::new(plan.seed), (0..VICTIMS).map(|_| None).collect());
-        let mut cast = Self { plan, stage, steady, answers, victims, started: 0, dice, held_loans: 0 };
+        let mut cast = Self {
+            plan,
+            stage,
+            steady,
+            answers,
+            victims,
+            started: 0,
+            dice,
+            held_loans: 0,
+            ended_by_themselves: 0,
+        };
         (0..VICTIMS).for_each(|victim| cast.start(victim));
         cast
     }
@@ -154,8 +169,8 @@ impl Cast {
     fn end(&mut self, victim: u16, how: End) {
         let Some((performer, holds)) = self.victims[usize::from(victim)].take() else { return };
         match how {
-            End::Killed => performer.kill(),
-            End::InOrder => drop(performer.end()),
+            End::Killed => self.ended_by_themselves += u32::from(!performer.kill()),
+            End::InOrder => self.ended_by_themselves += u32::from(!performer.end().success()),
         }
         self.held_loans += u32::from(holds.load(Ordering::Relaxed));
     }
@@ -226,6 +241,7 @@ pub fn run(plan: Plan) -> Report {
     cast.end_some(kills, End::Killed);
     let killed = cast.window();
     let (seconds, held_loans) = (began.elapsed().as_secs_f64(), cast.held_loans);
+    let ended_by_themselves = cast.ended_by_themselves;
 
     let after = cast.held_at_rest(Some(&before));
     let left = cast.files().difference(&files).cloned().collect();
@@ -238,5 +254,13 @@ pub fn run(plan: Plan) -> Report {
         assert!(status.success(), "{who} ended with {status}");
     }
     cast.stage.end();
-    Report { kills, seconds, held_loans, held, windows: [nobody, in_order, killed], left }
+    Report {
+        kills,
+        seconds,
+        held_loans,
+        ended_by_themselves,
+        held,
+        windows: [nobody, in_order, killed],
+        left,
+    }
 }

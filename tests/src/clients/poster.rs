@@ -9,13 +9,11 @@ use std::{
     time::Duration,
 };
 
-use sinew::{
-    ApiError, Class, Endpoint, NodeApi, Outcome, Received, Registration, Rejection, Tid, Time, payload,
-};
+use sinew::{ApiError, Class, Endpoint, NodeApi, Outcome, Received, Rejection, Tid, Time, payload};
 
 use super::{
     entry::{Entry, Poster, Way},
-    registration::{address, register},
+    registration::{address, register, wishes},
     say, told,
 };
 use crate::dice::Dice;
@@ -38,11 +36,11 @@ const END: u8 = 2;
 macro_rules! letter {
     ($type:ident, $name:literal, $class:ident) => {
         payload!($name, $class =>
-            struct $type {
-                life: u32,
-                number: u64,
+            pub(super) struct $type {
+                pub(super) life: u32,
+                pub(super) number: u64,
                 #[serde(with = "serde_bytes")]
-                body: Vec<u8>,
+                pub(super) body: Vec<u8>,
             }
         );
     };
@@ -64,7 +62,7 @@ pub(super) fn play(arguments: &[String]) {
     }
     for order in told() {
         assert_eq!(order, "quiet");
-        STAGE.store(QUIET, Ordering::Relaxed);
+        be_quiet();
     }
     // The addresses are given back by the end of the process.
     STAGE.store(END, Ordering::Relaxed);
@@ -73,6 +71,31 @@ pub(super) fn play(arguments: &[String]) {
 /// Whether a poster waits for messages, and not for outcomes.
 const fn is_handler(poster: Poster) -> bool {
     poster.is_multiple_of(2)
+}
+
+/// Small ones mostly; now and then one that fits no socket buffer and no half of a ring.
+pub(super) fn body(dice: &mut Dice, number: u64) -> Vec<u8> {
+    let length = match dice.below(512) {
+        0 => dice.below(400_000),
+        1..16 => dice.below(20_000),
+        _ => dice.below(300),
+    };
+    vec![number as u8; length as usize]
+}
+
+/// How long an outcome is waited for.
+pub(super) fn within(dice: &mut Dice) -> Duration {
+    Duration::from_millis(u64::from(5 + dice.below(300)))
+}
+
+/// Whether this process is to send.
+pub(super) fn is_posting() -> bool {
+    STAGE.load(Ordering::Relaxed) == POSTING
+}
+
+/// The posters of this process send no more.
+pub(super) fn be_quiet() {
+    STAGE.store(QUIET, Ordering::Relaxed);
 }
 
 struct Letters {
@@ -88,7 +111,7 @@ struct Letters {
 
 impl Letters {
     fn register(api: &NodeApi, me: Poster, all: Poster, life: u32, dice: Dice) -> Self {
-        let registration = Registration::new().fixed(address(me)).inbox_capacity(CAPACITY);
+        let registration = wishes().fixed(address(me)).inbox_capacity(CAPACITY);
         let endpoint = register(api, &registration);
         let this = Self { endpoint, me, all, life, dice, numbers: BTreeMap::new() };
         this.tell(&Entry::Up(Time::now()));
@@ -96,11 +119,14 @@ impl Letters {
     }
 
     fn tell(&self, entry: &Entry) {
+        if let Entry::Broken(why) = entry {
+            eprintln!("poster {} in life {}: {why}", self.me, self.life);
+        }
         say(&format!("{} {entry}", self.me));
     }
 
     fn work(mut self) {
-        while STAGE.load(Ordering::Relaxed) == POSTING {
+        while is_posting() {
             if is_handler(self.me) || self.dice.once_in(4) {
                 self.send_some();
             } else {
@@ -127,16 +153,6 @@ impl Letters {
         *number
     }
 
-    /// Small ones mostly; now and then one that fits no socket buffer and no half of a ring.
-    fn body(&mut self, number: u64) -> Vec<u8> {
-        let length = match self.dice.below(512) {
-            0 => self.dice.below(400_000),
-            1..16 => self.dice.below(20_000),
-            _ => self.dice.below(300),
-        };
-        vec![number as u8; length as usize]
-    }
-
     fn send_some(&mut self) {
         let class = [Class::Control, Class::Stream, Class::Bulk][self.dice.below(3) as usize];
         let (way, tid) = self.somewhere(class);
@@ -145,7 +161,7 @@ impl Letters {
         self.tell(&Entry::Sends(way, first, count, Time::now()));
         for _ in 0..count {
             let number = self.next_number(way);
-            let body = self.body(number);
+            let body = body(&mut self.dice, number);
             let life = self.life;
             let sent = match class {
                 Class::Control => self.endpoint.send(tid, &Wire { life, number, body }),
@@ -165,8 +181,8 @@ impl Letters {
             (way, tid) = self.somewhere(class);
         }
         let number = self.next_number(way);
-        let (life, body) = (self.life, self.body(number));
-        let within = Duration::from_millis(u64::from(5 + self.dice.below(300)));
+        let (life, body) = (self.life, body(&mut self.dice, number));
+        let within = within(&mut self.dice);
         self.tell(&Entry::Asks(way, number, Time::now()));
         let outcome = if class == Class::Control {
             self.endpoint.send_confirmed(tid, &Wire { life, number, body }, within)

@@ -9,15 +9,18 @@ use std::{
     time::Duration,
 };
 
-use sinew::{Endpoint, NodeApi, Payload as _, Registration};
+use sinew::{Endpoint, NodeApi, Payload as _};
 
-use super::{registration::register, say, told};
+use super::{
+    registration::{register, wishes},
+    say, told,
+};
 use crate::puppet::{Job, Order, Value};
 
 /// `SOCKET NAME`
 pub(super) fn play(arguments: &[String]) {
     let api = NodeApi::connect(&arguments[0]).expect("the door is open");
-    let endpoint = register(&api, &Registration::new().name(&*arguments[1]));
+    let endpoint = register(&api, &wishes().name(&*arguments[1]));
     let over = Arc::new(AtomicBool::new(false));
     let ends = over.clone();
     let recorder = thread::spawn(move || record(endpoint, &ends));

@@ -5,13 +5,28 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew::{ApiError, AppAddress, Endpoint, NodeApi, Registration};
+use sinew::{ApiError, AppAddress, Endpoint, NodeApi, Registration, Transport};
 
 use crate::DEADLINE;
+
+/// The environment's word for what carries messages: `socket` or `ring`; else what is usual.
+const TRANSPORT: &str = "SINEW_TEST_TRANSPORT";
 
 /// The fixed address number `index`.
 pub(super) fn address(index: u16) -> AppAddress {
     AppAddress::fixed(u32::from(index)).expect("the range is wide")
+}
+
+/// What every process of the cast asks for, if it asks for nothing else. Its patience is long: where there are more threads
+/// than processors, a node that is not run for a second hangs as little as its clients do.
+pub(super) fn wishes() -> Registration {
+    let registration = Registration::new().patience(DEADLINE);
+    match std::env::var(TRANSPORT).as_deref() {
+        Ok("socket") => registration.transport(Transport::Socket),
+        Ok("ring") => registration.transport(Transport::Ring),
+        Ok(other) => panic!("{TRANSPORT} is {other:?}, neither \"socket\" nor \"ring\""),
+        Err(_) => registration,
+    }
 }
 
 /// Registers; an address that a killed life has is there for this one when the node has seen that death.

@@ -36,6 +36,16 @@ impl Stage {
     /// If it does not start.
     #[must_use]
     pub fn new(program: &Path, limits: StageLimits) -> Self {
+        Self::with_residents(program, limits, &[], |_| {})
+    }
+
+    /// The same, with posters in the node's own process: these arguments, and whoever hears what they tell.
+    pub(super) fn with_residents(
+        program: &Path,
+        limits: StageLimits,
+        residents: &[String],
+        mut hear: impl FnMut(&str) + Send + 'static,
+    ) -> Self {
         let directory = OwnDirectory::new();
         for name in ["run", "tmp"] {
             std::fs::create_dir(directory.join(name)).expect("the test's own directory");
@@ -48,8 +58,12 @@ impl Stage {
         );
         std::fs::write(&config, text).expect("the test's own directory");
         let (say, answers) = sync_channel(64);
-        let arguments = [config.display().to_string()];
+        let arguments: Vec<_> =
+            [config.display().to_string()].into_iter().chain(residents.iter().cloned()).collect();
         let node = Performer::start(program, "door", &arguments, &directory.join("tmp"), move |line| {
+            if line.starts_with(|first: char| first.is_ascii_digit()) {
+                return hear(line);
+            }
             // Nobody waits for its answers any more when the stage is gone.
             let _ = say.send(line.to_owned());
         });
@@ -89,6 +103,11 @@ impl Stage {
     #[must_use]
     pub fn node_id(&self) -> u32 {
         self.node.id()
+    }
+
+    /// Tells the posters in the node's own process to send no more.
+    pub(super) fn quiet(&mut self) {
+        self.node.tell("quiet");
     }
 
     /// How much the node has refused so far.

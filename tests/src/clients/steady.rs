@@ -11,9 +11,12 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew::{Endpoint, NodeApi, Payload as _, Registration};
+use sinew::{Endpoint, NodeApi, Payload as _};
 
-use super::{registration::register, say, told};
+use super::{
+    registration::{register, wishes},
+    say, told,
+};
 use crate::{DEADLINE, puppet::Order};
 
 /// The name of the one that answers.
@@ -73,7 +76,7 @@ impl fmt::Display for Window {
 /// `SOCKET`: asks the echo, and says what it measured since it was last told to (`window`).
 pub(super) fn play_pinger(arguments: &[String]) {
     let api = NodeApi::connect(&arguments[0]).expect("the door is open");
-    let mut endpoint = register(&api, &Registration::new().requires([ECHO]));
+    let mut endpoint = register(&api, &wishes().requires([ECHO]));
     let echo = endpoint.resolve(ECHO, DEADLINE).expect("the node answers").expect("it is ready");
     let measured: Arc<Mutex<(Vec<Duration>, u64)>> = Arc::default();
     let measuring = measured.clone();
@@ -109,7 +112,7 @@ pub(super) fn play_pinger(arguments: &[String]) {
 /// `SOCKET NAME`: answers questions, and lets go of everything else.
 pub(super) fn play_taker(arguments: &[String]) {
     let api = NodeApi::connect(&arguments[0]).expect("the door is open");
-    let endpoint = register(&api, &Registration::new().name(&*arguments[1]));
+    let endpoint = register(&api, &wishes().name(&*arguments[1]));
     let over = Arc::new(AtomicBool::new(false));
     let ends = over.clone();
     let taker = thread::spawn(move || take(endpoint, &ends));

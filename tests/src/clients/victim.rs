@@ -7,10 +7,10 @@ use std::{
     time::Duration,
 };
 
-use sinew::{Endpoint, Kind, NodeApi, Received, Registration, Tid};
+use sinew::{Endpoint, Kind, NodeApi, Received, Tid};
 
 use super::{
-    registration::{address, register},
+    registration::{address, register, wishes},
     say,
     steady::{ECHO, SINK},
     told,
@@ -52,7 +52,7 @@ struct Victim {
 
 impl Victim {
     fn register(api: &NodeApi, me: u16, all: u16, dice: Dice) -> Self {
-        let mut endpoint = register(api, &Registration::new().fixed(address(me)));
+        let mut endpoint = register(api, &wishes().fixed(address(me)));
         let node = endpoint.tid().node;
         let mut others: Vec<Tid> =
             (0..all).filter(|other| *other != me).map(|other| Tid::new(node, address(other))).collect();

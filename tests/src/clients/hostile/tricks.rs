@@ -14,7 +14,10 @@ use rustix::fs::{MemfdFlags, memfd_create};
 use sinew::{AppAddress, Class, Kind, NodeAddress, Outcome, Payload as _, Rejection, Tid, payload};
 use sinew_runtime::wire::{Flags, Header, encode};
 
-use super::stranger::{Frame, Stranger};
+use super::{
+    ring::{HostileRing, ask_for_rings},
+    stranger::{Frame, Stranger},
+};
 use crate::{dice::Dice, puppet::Order};
 
 payload!("hostile.registration" => struct Wishes {
@@ -61,7 +64,7 @@ impl Attacker {
 
     /// Plays one trick. What the node answers to it, or that it closes, is no error.
     pub(super) fn play_one(&mut self) {
-        const TRICKS: [Trick; 10] = [
+        const TRICKS: [Trick; 13] = [
             Attacker::garbage,
             Attacker::mutants,
             Attacker::forged_sources,
@@ -72,6 +75,9 @@ impl Attacker {
             Attacker::wishes,
             Attacker::too_early,
             Attacker::false_outcomes,
+            Attacker::lying_ring,
+            Attacker::deaf_ring,
+            Attacker::odd_offers,
         ];
         self.tally.tricks += 1;
         let trick = TRICKS[self.dice.below(TRICKS.len() as u32) as usize];
@@ -312,6 +318,76 @@ impl Attacker {
             let code = if self.dice.once_in(64) { 99 } else { self.dice.below(5) as u8 };
             self.write(&mut stranger, &Frame::new(&header, vec![code]).bytes())?;
         }
+        self.listen(&mut stranger)
+    }
+
+    /// Frames through a ring, and lies about the ring between them.
+    fn lying_ring(&mut self) -> io::Result<()> {
+        self.tally.connections += 1;
+        let mut ring = HostileRing::join(&self.socket)?;
+        // Of so many steps one is a lie; the others lead deeper into what an honest client may do.
+        let truths = [1, 4, 32, 1_000][self.dice.below(4) as usize];
+        for _ in 0..500 {
+            if self.dice.once_in(truths) {
+                ring.lie(&mut self.dice)?;
+                continue;
+            }
+            let me = ring.stranger.tid;
+            let source = if self.dice.once_in(16) { self.anybody(me) } else { me };
+            let to = self.anybody(me);
+            let length = self.dice.below(2_000) as usize;
+            let frame = Frame::new(&self.header(source, to), self.dice.bytes(length)).bytes();
+            let cut = if self.dice.once_in(16) { self.dice.below(60) as usize } else { frame.len() };
+            // In one piece, or in two.
+            let taken =
+                ring.publish(&frame[..cut])? && (cut == frame.len() || ring.publish(&frame[cut..])?);
+            self.tally.bytes += if taken { frame.len() as u64 } else { 0 };
+            if !taken {
+                thread::sleep(Duration::from_millis(1));
+            }
+            if self.dice.once_in(4) {
+                ring.take()?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Asks through a ring, and takes no answer from the other one.
+    fn deaf_ring(&mut self) -> io::Result<()> {
+        self.tally.connections += 1;
+        let mut ring = HostileRing::join(&self.socket)?;
+        let me = ring.stranger.tid;
+        let length = self.dice.below(16_000) as usize;
+        let to_me = Frame::new(&self.header(me, me), self.dice.bytes(length)).bytes();
+        for _ in 0..2_000 {
+            if ring.publish(&to_me)? {
+                self.tally.bytes += to_me.len() as u64;
+            } else {
+                thread::sleep(Duration::from_micros(100));
+            }
+        }
+        thread::sleep(self.dice.time_below(Duration::from_millis(200)));
+        Ok(())
+    }
+
+    /// What is no offer, where an offer is expected; or none.
+    fn odd_offers(&mut self) -> io::Result<()> {
+        self.tally.connections += 1;
+        let (mut stranger, theirs, _) = ask_for_rings(&self.socket)?;
+        let mut bytes = theirs.to_bytes().to_vec();
+        match self.dice.below(4) {
+            // Its own memory, back.
+            0 => return theirs.send(&stranger.stream).map_err(io::Error::other),
+            1 => {
+                let at = self.dice.below(24) as usize;
+                bytes[at] = self.dice.roll() as u8;
+            }
+            2 => bytes.truncate(self.dice.below(24) as usize + 1),
+            _ => {}
+        }
+        let descriptors: io::Result<Vec<_>> =
+            (0..1 + self.dice.below(6)).map(|_| self.odd_descriptor(&stranger)).collect();
+        stranger.pass(&bytes, &descriptors?)?;
         self.listen(&mut stranger)
     }
 

@@ -1,0 +1,160 @@
+//! The hostile end of a link with rings: writes what it likes into all that it may write. The layout is in
+//! `docs/decisions/0010-shared-memory.md`.
+
+use std::{io, os::fd::OwnedFd, path::Path};
+
+use rustix::{
+    fs::{FallocateFlags, fallocate, ftruncate},
+    io::{pread, pwrite},
+    net::{SendFlags, send},
+};
+use sinew::{Kind, Tid, payload};
+use sinew_runtime::wire::decode;
+use sinew_shm::{BellKind, Capacity, Offer, Region};
+
+use super::stranger::{Frame, Stranger};
+use crate::dice::Dice;
+
+payload!("hostile.ring" => struct WithRing { ring: bool });
+
+/// What is looked at of the node's answer.
+#[derive(serde::Deserialize)]
+struct Answer {
+    #[serde(default)]
+    ring: Option<u32>,
+}
+
+/// Words of a region, by their place in it.
+const TAIL: u32 = 128 / 4;
+const HEAD: u32 = 256 / 4;
+const SLEEPS: [u32; 2] = [384 / 4, 512 / 4];
+const HEADER_BYTES: u32 = 4096;
+const MESSAGE: u32 = 0xDA7A_0001;
+const SKIP: [u32; 2] = [0, 0x5C1B_0002];
+
+/// A link whose node has offered its memory.
+pub(super) struct HostileRing {
+    pub(super) stranger: Stranger,
+    capacity: u32,
+    region: Region,
+    /// What the node has offered: its memory, its bells.
+    victim: Offer,
+    /// A second descriptor of the own memory, for what the seals must not let through.
+    key: OwnedFd,
+    tail: u32,
+}
+
+/// Registers and asks for rings; returns the length of a ring.
+pub(super) fn ask_for_rings(socket: &Path) -> io::Result<(Stranger, Offer, Capacity)> {
+    let mut stranger = Stranger::connect(socket)?;
+    let wish = Frame::of_lncl(Kind::LNCL_REGISTER, Tid::NONE, &WithRing { ring: true });
+    stranger.write(&wish.bytes())?;
+    let said = stranger.read()?.ok_or(io::ErrorKind::UnexpectedEof)?;
+    stranger.tid = Tid::from_bits(said.source);
+    let answer: Answer = decode(&said.payload).map_err(io::Error::other)?;
+    // A refusal has no such field, nor has the answer of a node without rings.
+    let bytes = answer.ring.ok_or(io::ErrorKind::Unsupported)?;
+    let capacity = Capacity::new(u64::from(bytes).next_power_of_two()).map_err(io::Error::other)?;
+    let offer = Offer::receive(&stranger.stream).map_err(io::Error::other)?.map_err(io::Error::other)?;
+    Ok((stranger, offer, capacity))
+}
+
+impl HostileRing {
+    /// A link as an honest client makes it.
+    pub(super) fn join(socket: &Path) -> io::Result<Self> {
+        let (stranger, victim, capacity) = ask_for_rings(socket)?;
+        let (region, offer) = Region::create(capacity, BellKind::Socket).map_err(io::Error::other)?;
+        let key = offer.descriptors()[0].try_clone()?;
+        offer.send(&stranger.stream).map_err(io::Error::other)?;
+        Ok(Self { stranger, capacity: capacity.bytes(), region, victim, key, tail: 0 })
+    }
+
+    /// A word of the node's memory.
+    fn read_word(&self, place: u32) -> io::Result<u32> {
+        let mut word = [0; 4];
+        pread(&self.victim.descriptors()[0], &mut word, u64::from(place * 4))?;
+        Ok(u32::from_le_bytes(word))
+    }
+
+    fn put_mark(&mut self, position: u32, mark: [u32; 2]) {
+        let place = (HEADER_BYTES + position % self.capacity) / 4;
+        self.region.scribble(place, mark[0]);
+        self.region.scribble(place + 1, mark[1]);
+    }
+
+    /// Publishes a record as an honest client does; `false` if the node has not taken enough yet.
+    pub(super) fn publish(&mut self, bytes: &[u8]) -> io::Result<bool> {
+        let length = u32::try_from(bytes.len()).map_err(io::Error::other)?;
+        let record = 8 + length.next_multiple_of(8);
+        let rest = self.capacity - self.tail % self.capacity;
+        let skip = if record > rest { rest } else { 0 };
+        let untaken = self.tail.wrapping_sub(self.read_word(HEAD)?);
+        if untaken.saturating_add(skip + record) > self.capacity {
+            return Ok(false);
+        }
+        if skip > 0 {
+            self.put_mark(self.tail, SKIP);
+        }
+        let start = self.tail.wrapping_add(skip);
+        for (word, chunk) in (0..).zip(bytes.chunks(4)) {
+            let place = (HEADER_BYTES + start % self.capacity) / 4 + 2 + word;
+            let value = chunk.iter().rev().fold(0, |value, byte| value << 8 | u32::from(*byte));
+            self.region.scribble(place, value);
+        }
+        self.put_mark(start, [length, MESSAGE]);
+        self.tail = start.wrapping_add(record);
+        // What was written before is seen before, or not; whoever is hostile does not care.
+        self.region.scribble(TAIL, self.tail);
+        self.press(1)?;
+        Ok(true)
+    }
+
+    /// Takes all that the node has published, unread.
+    pub(super) fn take(&mut self) -> io::Result<()> {
+        let head = self.read_word(TAIL)?;
+        self.region.scribble(HEAD, head);
+        self.press(2)
+    }
+
+    /// Rings one of the node's bells.
+    fn press(&self, bell: usize) -> io::Result<()> {
+        let Some(button) = self.victim.descriptors().get(bell) else { return Ok(()) };
+        match send(button, &[1], SendFlags::DONTWAIT | SendFlags::NOSIGNAL) {
+            // It has been rung often enough.
+            Ok(_) | Err(rustix::io::Errno::AGAIN) => Ok(()),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    /// One thing that no honest client does.
+    pub(super) fn lie(&mut self, dice: &mut Dice) -> io::Result<()> {
+        let (value, small) = (dice.roll() as u32, dice.below(600));
+        match dice.below(10) {
+            0 => self.region.scribble(TAIL, value),
+            1 => self.region.scribble(HEAD, value),
+            2 => self.region.scribble(TAIL, self.tail.wrapping_add(small)),
+            3 => self.put_mark(self.tail, [value, MESSAGE]),
+            4 => self.put_mark(self.read_word(HEAD)?, [small, MESSAGE]),
+            5 => self.put_mark(self.read_word(HEAD)?, SKIP),
+            6 => self.region.scribble(SLEEPS[small as usize % 2], value),
+            7 => (0..small).try_for_each(|_| self.press(1 + small as usize % 2))?,
+            8 => self.try_the_keys(value),
+            // Any place: bytes of some message, perhaps while they are read.
+            _ => self.region.scribble(value, dice.roll() as u32),
+        }
+        self.press(1 + small as usize % 2)
+    }
+
+    /// What the seals must not let through.
+    fn try_the_keys(&self, value: u32) {
+        for key in [&self.key, &self.victim.descriptors()[0]] {
+            let hole = FallocateFlags::PUNCH_HOLE | FallocateFlags::KEEP_SIZE;
+            let refused = [
+                ftruncate(key, u64::from(value % 8192)).is_err(),
+                fallocate(key, hole, 0, 4096).is_err(),
+                pwrite(key, &value.to_ne_bytes(), u64::from(value % 4096)).is_err(),
+            ];
+            assert_eq!(refused, [true; 3], "a sealed memory lets nothing through");
+        }
+    }
+}
