@@ -1,7 +1,7 @@
 //! Lets 8 processes with 64 addresses send each other messages of every class while they are killed at random, and says
 //! what became of every one.
 //!
-//! `cargo run --release -p sinew-tests --bin conservation [--kills N] [--spacing-ms N] [--seed N]`
+//! `cargo run --release -p sinew-tests --bin conservation [--kills N] [--spacing-ms N] [--pause-ms N] [--seed N]`
 //!
 //! Exit code 1: a message was lost in silence, double or out of order, or a confirmed one had no outcome or a false one.
 
@@ -26,6 +26,7 @@ fn main() -> ExitCode {
         processes: 8,
         kills: u32::try_from(number("--kills", 200)).expect("not that many"),
         spacing: Duration::from_millis(number("--spacing-ms", 250)),
+        pause: Duration::from_millis(number("--pause-ms", 6)),
         seed: number("--seed", u64::from(std::process::id())),
     });
     println!("{report}");

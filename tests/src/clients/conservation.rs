@@ -30,6 +30,8 @@ pub struct Plan {
     pub kills: u32,
     /// Mean time between two kills.
     pub spacing: Duration,
+    /// How long a poster waits for messages before it sends again, at most.
+    pub pause: Duration,
     /// Decides who is killed when, and who sends what to whom.
     pub seed: u64,
 }
@@ -95,12 +97,12 @@ impl Cast {
     }
 
     fn start(&mut self, process: Poster) {
-        let Plan { processes, seed, .. } = self.plan;
+        let Plan { processes, seed, pause, .. } = self.plan;
         let place = &mut self.lives[usize::from(process)];
         place.0 += 1;
         let (life, ledger) = (place.0, self.ledger.clone());
         let all = processes * POSTERS + RESIDENTS;
-        let arguments = [u64::from(process), life.into(), all.into(), seed];
+        let arguments = [u64::from(process), life.into(), all.into(), seed, pause.as_millis() as u64];
         let arguments = arguments.map(|number| number.to_string());
         place.1 = Some(self.stage.start("poster", &arguments, move |line| note(&ledger, life, line)));
     }

@@ -95,8 +95,9 @@ impl Report {
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { seconds, tally, refused, grown_kib, held, windows } = self;
-        let Tally { tricks, connections, bytes, refused: told } = tally;
+        let Tally { tricks, connections, bytes, refused: told, rings, lies } = tally;
         writeln!(f, "{seconds:.1} s, {tricks} tricks on {connections} connections, {bytes} bytes taken")?;
+        writeln!(f, "{rings} links with rings, {lies} lies written into their memory")?;
         writeln!(f, "refusals: {told} told to the hostile ones, {refused} counted by the node")?;
         writeln!(f, "node before {}\n     after  {}", held.0, held.1)?;
         writeln!(f, "node grown by {grown_kib} KiB at most; its bound is {} KiB", Self::bound_kib())?;
@@ -117,8 +118,8 @@ pub(super) fn play_attacker(arguments: &[String]) {
     while Instant::now() < end {
         attacker.play_one();
     }
-    let Tally { tricks, connections, bytes, refused } = attacker.tally;
-    say(&format!("{tricks} {connections} {bytes} {refused}"));
+    let Tally { tricks, connections, bytes, refused, rings, lies } = attacker.tally;
+    say(&format!("{tricks} {connections} {bytes} {refused} {rings} {lies}"));
 }
 
 /// The role of one that stops in mid-frame, `SOCKET`: stops itself, and goes on where it was if it is let.
@@ -184,6 +185,8 @@ impl Cast {
             tally.connections += numbers[1];
             tally.bytes += numbers[2];
             tally.refused += numbers[3];
+            tally.rings += numbers[4];
+            tally.lies += numbers[5];
         })
     }
 

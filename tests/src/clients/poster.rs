@@ -49,7 +49,7 @@ letter!(Wire, "poster.control", Control);
 letter!(Card, "poster.stream", Stream);
 letter!(Parcel, "poster.bulk", Bulk);
 
-/// `SOCKET PROCESS LIFE POSTERS_IN_ALL SEED`
+/// `SOCKET PROCESS LIFE POSTERS_IN_ALL SEED PAUSE_MS`
 pub(super) fn play(arguments: &[String]) {
     let number = |index: usize| arguments[index].parse::<u64>().expect("a number");
     let (process, life) = (number(1) as Poster, number(2) as u32);
@@ -58,7 +58,8 @@ pub(super) fn play(arguments: &[String]) {
     for index in 0..POSTERS {
         let (api, me) = (api.clone(), process * POSTERS + index);
         let dice = Dice::new(number(4) ^ u64::from(me) << 40 ^ u64::from(life) << 20);
-        thread::spawn(move || Letters::register(&api, me, all, life, dice).work());
+        let pause = Duration::from_millis(number(5));
+        thread::spawn(move || Letters::register(&api, me, all, life, dice).work(pause));
     }
     for order in told() {
         assert_eq!(order, "quiet");
@@ -125,14 +126,14 @@ impl Letters {
         say(&format!("{} {entry}", self.me));
     }
 
-    fn work(mut self) {
+    fn work(mut self, pause: Duration) {
         while is_posting() {
             if is_handler(self.me) || self.dice.once_in(4) {
                 self.send_some();
             } else {
                 self.ask_one();
             }
-            let within = self.dice.time_below(Duration::from_millis(6));
+            let within = self.dice.time_below(pause);
             self.handle_some(within);
         }
         self.tell(&Entry::Quiet);

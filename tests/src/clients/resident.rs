@@ -11,10 +11,10 @@ use super::{
     registration::address,
     say,
 };
-use crate::dice::Dice;
+use crate::{DEADLINE, dice::Dice};
 
 /// Time between two turns of a poster.
-const TURN: Duration = Duration::from_millis(4);
+const TURN: Duration = Duration::from_millis(10);
 /// Outcomes that it waits for at a time, at most.
 const WAITS_MAX: usize = 32;
 
@@ -33,6 +33,8 @@ pub(super) fn app(me: Poster, all: Poster, seed: u64) -> AppSpec<Resident> {
         .handles::<Wire>()
         .handles::<Card>()
         .handles::<Parcel>()
+        // The director may be slow to hear what it tells.
+        .progress_within(DEADLINE)
         .place(Place::thread(format!("posters {}", me % 2)))
 }
 

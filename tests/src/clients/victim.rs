@@ -25,7 +25,7 @@ pub(super) const ADDRESSES: u16 = 4;
 /// Messages in hand, at most.
 const HELD_MAX: usize = 32;
 /// How long a message is waited for, and lent memory held, at most.
-const WHILE: Duration = Duration::from_millis(4);
+const WHILE: Duration = Duration::from_millis(8);
 /// What is written to memory that was lent and is never sent.
 const SCRAP: &str = "victim.scrap";
 

@@ -7,7 +7,7 @@ use std::{
     os::fd::OwnedFd,
     path::{Path, PathBuf},
     thread,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use rustix::fs::{MemfdFlags, memfd_create};
@@ -41,6 +41,10 @@ pub(super) struct Tally {
     pub(super) bytes: u64,
     /// Refusals that the node told.
     pub(super) refused: u64,
+    /// Links with rings.
+    pub(super) rings: u64,
+    /// What was written into rings' memory that no honest client writes there.
+    pub(super) lies: u64,
 }
 
 /// A hostile client of the node at a socket.
@@ -54,6 +58,8 @@ pub(super) struct Attacker {
 
 type Trick = fn(&mut Attacker) -> io::Result<()>;
 
+/// No trick goes on for longer; each of its calls has a bound of its own.
+const TRICK: Duration = Duration::from_millis(500);
 /// Connections that are kept in mid-frame.
 const SILENT_MAX: usize = 16;
 
@@ -210,7 +216,8 @@ impl Attacker {
         let witness = self.witness(&mut stranger)?;
         let length = self.dice.below(16_000) as usize;
         let for_me = Frame::new(&self.header(stranger.tid, stranger.tid), self.dice.bytes(length));
-        for number in 0..2_000 {
+        let end = Instant::now() + TRICK;
+        for number in (0..2_000).take_while(|_| Instant::now() < end) {
             let mut header = Header::new(Order::KIND, stranger.tid, witness);
             header.flags = Flags::ASK.with(Flags::CONFIRM);
             header.correlation = number;
@@ -225,7 +232,8 @@ impl Attacker {
     /// More connections than the node has places.
     fn crowd(&mut self) -> io::Result<()> {
         let mut crowd = Vec::new();
-        for _ in 0..200 {
+        let end = Instant::now() + TRICK;
+        for _ in (0..200).take_while(|_| Instant::now() < end) {
             crowd.push(self.connect()?);
         }
         thread::sleep(self.dice.time_below(Duration::from_millis(50)));
@@ -321,15 +329,23 @@ impl Attacker {
         self.listen(&mut stranger)
     }
 
+    fn join_ring(&mut self) -> io::Result<HostileRing> {
+        self.tally.connections += 1;
+        let ring = HostileRing::join(&self.socket)?;
+        self.tally.rings += 1;
+        Ok(ring)
+    }
+
     /// Frames through a ring, and lies about the ring between them.
     fn lying_ring(&mut self) -> io::Result<()> {
-        self.tally.connections += 1;
-        let mut ring = HostileRing::join(&self.socket)?;
+        let mut ring = self.join_ring()?;
         // Of so many steps one is a lie; the others lead deeper into what an honest client may do.
         let truths = [1, 4, 32, 1_000][self.dice.below(4) as usize];
-        for _ in 0..500 {
+        let end = Instant::now() + TRICK;
+        for _ in (0..500).take_while(|_| Instant::now() < end) {
             if self.dice.once_in(truths) {
                 ring.lie(&mut self.dice)?;
+                self.tally.lies += 1;
                 continue;
             }
             let me = ring.stranger.tid;
@@ -354,12 +370,12 @@ impl Attacker {
 
     /// Asks through a ring, and takes no answer from the other one.
     fn deaf_ring(&mut self) -> io::Result<()> {
-        self.tally.connections += 1;
-        let mut ring = HostileRing::join(&self.socket)?;
+        let mut ring = self.join_ring()?;
         let me = ring.stranger.tid;
-        let length = self.dice.below(16_000) as usize;
+        let length = self.dice.below(4_000) as usize;
         let to_me = Frame::new(&self.header(me, me), self.dice.bytes(length)).bytes();
-        for _ in 0..2_000 {
+        let end = Instant::now() + TRICK;
+        for _ in (0..500).take_while(|_| Instant::now() < end) {
             if ring.publish(&to_me)? {
                 self.tally.bytes += to_me.len() as u64;
             } else {
