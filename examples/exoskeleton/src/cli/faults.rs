@@ -19,8 +19,8 @@ use super::{RunError, Verdict};
 /// Where root and network namespaces are to be had, 6 and 7 are done once more with the link of the knee's node, on a
 /// second robot with a host for each process (link-down); elsewhere the report says why not.
 ///
-/// In the end the contrast: the ankle's drive falls silent at push-off, with and without a device watchdog; faults.svg in
-/// the run folder has both beside each other.
+/// In the end the contrast: the ankle's drive hangs at push-off (SIGSTOP; a killed one would be back too soon to show it),
+/// with and without a device watchdog; faults.svg in the run folder has both beside each other.
 ///
 /// The table has what is expected of each class of machine: A real-time kernel and isolated core, B plain Linux and
 /// idle, C any machine. Times are held against class C; what concerns function has to hold on every machine.

@@ -19,7 +19,8 @@ use crate::record::Row;
 use crate::robot::topology::{DrivePlace, Topology};
 use crate::robot::trace::PlantRow;
 
-/// The ankle still pushes with about 19 Nm, of the 47 of a moment ago, and is about to leave the ground.
+/// The ankle still pushes with 17 Nm, of the 47 of a moment ago, and is about to leave the ground. Earlier the model's person
+/// sinks without the torque, which a watchdog cannot help; see the README.
 pub(super) const PHASE: f64 = 0.60;
 /// How long the drive is silent: as long as one takes to come back that nobody supervises.
 const SILENCE: Duration = Duration::from_millis(400);
@@ -71,11 +72,11 @@ pub(super) fn run(
         joint: JOINT,
         title: "The ankle's drive falls silent at push-off, with and without a device watchdog".to_owned(),
         caption: format!(
-            "{}, seed {}; silent for {} ms from phase {PHASE:.2} on. A device holds its last torque unless it has a \
-             watchdog, here of {} ms.",
-            if real_time { "Real time" } else { "Lock-step in virtual time" },
-            options.seed,
+            "{} for {} ms from phase {PHASE:.2} on, seed {}. A device holds its last torque unless it has a watchdog, \
+             here of {} ms.",
+            if real_time { "Real time: its process is stopped" } else { "Virtual time: it is silent" },
             SILENCE.as_millis(),
+            options.seed,
             options.device_watchdog.as_millis()
         ),
         sides,

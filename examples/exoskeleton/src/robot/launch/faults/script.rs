@@ -37,6 +37,8 @@ const HANG: Duration = Duration::from_millis(400);
 const REJOINED: Duration = Duration::from_millis(500);
 /// How long a node is away.
 const OUTAGE: Duration = Duration::from_secs(1);
+/// How long it is watched after a release whether it walks as before: five seconds are allowed, the last stride counts whole.
+const WATCHED: Duration = Duration::from_millis(6_500);
 /// How long it is watched that nothing moves.
 const STILL: Duration = Duration::from_secs(1);
 /// Time for things to happen that are looked at afterwards.
@@ -258,7 +260,7 @@ fn join_link(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), FaultErr
     hold_and_release(robot, out.last_mut().expect("it was just pushed"))
 }
 
-/// From all parts being there to walking: a second in which nothing moves, the release, the ramp, two strides.
+/// From all parts being there to walking: a second in which nothing moves, the release, the ramp, three strides or more.
 fn hold_and_release(robot: &mut Robot, injection: &mut Injection) -> Result<(), FaultError> {
     let held = robot.wait_held()?;
     injection.mark(Mark::Held, held);
@@ -266,7 +268,9 @@ fn hold_and_release(robot: &mut Robot, injection: &mut Injection) -> Result<(), 
     injection.mark(Mark::Released, Time::now());
     robot.release()?;
     say("  nothing moved; the operator releases");
-    injection.mark(Mark::Walking, robot.wait_converged()?);
+    let walking = robot.wait_converged()?;
+    injection.mark(Mark::Walking, walking);
+    robot.pass_until(walking + WATCHED)?;
     injection.until = Time::now();
     Ok(())
 }
