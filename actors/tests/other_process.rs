@@ -9,7 +9,7 @@ use std::{
     time::Duration,
 };
 
-use sinew::{NodeApi, Registration, prelude::*};
+use sinew::{ApiError, NodeApi, Registration, Transport, prelude::*};
 
 const WATCHDOG: Duration = Duration::from_secs(20);
 const SOCKET: &str = "SINEW_TEST_SOCKET";
@@ -128,6 +128,83 @@ fn an_application_in_another_process_waits_for_one_in_the_nodes() {
     // Then
     api.register_transport_address(hip.deadline(WATCHDOG)).unwrap();
     node.stop();
+}
+
+/// Asks `look` again until it finds something.
+fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
+    let deadline = std::time::Instant::now() + WATCHDOG;
+    loop {
+        if let Some(found) = look() {
+            return found;
+        }
+        assert!(std::time::Instant::now() < deadline, "waited for {what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+fn comes_back_to_a_killed_node(transport: Transport) {
+    // Given: a node in a process of its own, and an endpoint here
+    let name = format!("sinew-returns-{transport:?}-{}", std::process::id());
+    let directory = Directory(std::env::temp_dir().join(name));
+    let socket = directory.0.join("knee.sock");
+    let mut node = start_process("lone_node", &socket);
+    let api = until("the node", || NodeApi::connect(&socket).ok());
+    let registration = Registration::new().name("drive").transport(transport);
+    let mut endpoint = api.register_transport_address(registration).unwrap();
+    let tid = endpoint.tid();
+    // When
+    node.kill().unwrap();
+    node.wait().unwrap();
+    // Then: it is said once by `receive`, and by each send
+    let told = until("word of the node's end", || endpoint.receive(Duration::from_millis(5)).err());
+    assert!(matches!(told, ApiError::Away(_)), "{told}");
+    let told = endpoint.send(tid, &Angle { degrees: 1.0 }).unwrap_err();
+    assert!(matches!(told, ApiError::Away(_)), "{told}");
+    assert!(endpoint.receive(Duration::from_millis(5)).unwrap().is_none(), "it waits for the node's return");
+    assert_eq!(endpoint.registrations(), 1);
+    // When
+    let mut node = start_process("lone_node", &socket);
+    // Then: it is back behind its name and address, for whoever sends to it
+    until("the endpoint's return", || {
+        endpoint.receive(Duration::from_millis(50)).unwrap();
+        (endpoint.registrations() == 2).then_some(())
+    });
+    assert_eq!(endpoint.tid(), tid);
+    assert_eq!(endpoint.resolve("drive", WATCHDOG).unwrap(), Some(tid));
+    let mut other = api.register_transport_address(Registration::new().transport(transport)).unwrap();
+    other.send(tid, &Angle { degrees: 2.0 }).unwrap();
+    assert_eq!(
+        endpoint.receive(WATCHDOG).unwrap().expect("a message").decode::<Angle>().unwrap().degrees,
+        2.0
+    );
+    node.kill().unwrap();
+    node.wait().unwrap();
+}
+
+#[test]
+fn an_endpoint_at_rings_comes_back_to_a_node_that_was_killed_and_started_again() {
+    comes_back_to_a_killed_node(Transport::Ring);
+}
+
+#[test]
+fn an_endpoint_at_a_socket_comes_back_to_a_node_that_was_killed_and_started_again() {
+    comes_back_to_a_killed_node(Transport::Socket);
+}
+
+#[test]
+#[ignore = "a process of the tests above, not a test"]
+fn lone_node() {
+    let Some(socket) = std::env::var_os(SOCKET) else { return };
+    let _node = Node::builder("knee")
+        .configure(|config| {
+            config.lncl.socket = Some(socket.into());
+            config.ndl.multicast = None;
+            config.ndl.mdns_port = None;
+        })
+        .start()
+        .unwrap();
+    // Until it is killed; not for ever if the test is.
+    std::thread::sleep(2 * WATCHDOG);
 }
 
 #[test]

@@ -7,7 +7,11 @@ mod standing;
 #[cfg(test)]
 mod tests;
 
-use std::{os::unix::net::UnixStream, sync::Arc, time::Duration};
+use std::{
+    os::unix::net::UnixStream,
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use rustix::net::Shutdown;
 use sinew_runtime::{
@@ -16,7 +20,7 @@ use sinew_runtime::{
     time::Time,
     wire::{Flags, Kind, Message},
 };
-use sinew_shm::{Any, AnyError, BellKind, Offer};
+use sinew_shm::{Any, AnyError, BellKind, Offer, Spin, Waiter};
 
 use super::{
     ApiError,
@@ -28,11 +32,11 @@ use super::{
     routes::{Answered, Directness, Farewell, Left, LinkNumber, Marked, Routes, Way},
 };
 use crate::{
-    lncl::payload::{self, Introduce, Introduction, Switch},
+    lncl::payload::{self, Introduce, Introduction, Registered, Switch},
     ring::{self as rings, Exchange, ExchangeError, RingError},
 };
 
-use standing::Pair;
+use standing::{Alone, Pair};
 pub(super) use standing::{Came, Everything, Standing};
 
 /// Time until it is looked again whether there is room for what is owed to a peer.
@@ -86,6 +90,17 @@ pub(super) enum Sent {
 pub(super) struct ToNode<'a> {
     pub(super) writer: &'a Arc<Writer>,
     pub(super) correlation: &'a mut u64,
+}
+
+impl Terms {
+    pub(super) fn of(registered: &Registered, options: LinkOptions) -> Self {
+        Self {
+            own: Tid::new(registered.node, registered.app),
+            ring_bytes: registered.ring.unwrap_or_default() as usize,
+            payload_max: registered.payload_max as usize,
+            options,
+        }
+    }
 }
 
 impl ToNode<'_> {
@@ -367,9 +382,26 @@ impl Direct {
     }
 
     /// The connection to the node has ended; another one may follow.
-    #[expect(dead_code, reason = "for when a client registers again")]
     pub(super) fn node_has_ended(&mut self, now: Time) {
         self.routes.node_has_ended(now);
+    }
+
+    /// The same life of the node is back, with another connection; the links stand.
+    pub(super) fn node_is_back(&mut self, control: Option<Arc<UnixStream>>) {
+        self.control = control;
+    }
+
+    /// Waits until something comes on an open link, for `left` at most. May end early without a reason.
+    pub(super) fn wait(&mut self, left: Duration) {
+        let deadline = self.wake_by(Time::now() + left);
+        let until = Instant::now() + deadline.since(Time::now());
+        let ended = Waiter::new(Spin::Off).wait(&mut Alone(&mut self.open), until);
+        let at = |index: usize| index + 1;
+        self.note(&match ended {
+            Ok(Any::HungUp(index)) => Ok(Any::HungUp(at(index))),
+            Err(AnyError::Corrupt { index, cause }) => Err(AnyError::Corrupt { index: at(index), cause }),
+            other @ (Ok(Any::Message(_) | Any::TimedOut) | Err(AnyError::System(_))) => other,
+        });
     }
 
     /// Ends the links whose peers have gone and have nothing left to say.

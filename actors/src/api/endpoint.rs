@@ -13,7 +13,8 @@ use super::{
     ApiError, Received, Registration, Transport,
     direct::{Came, Direct, Everything, Sent, Terms, ToNode},
     inbox::{Answer, Awaited, Inbox, Sorted},
-    link::{self, Link, Read, Reader, Writer},
+    link::{Ended, Greeting, Link, Read, Reader, Writer},
+    returning::Home,
     routes::LinkNumber,
 };
 use crate::{
@@ -28,24 +29,25 @@ const PROMPT: Duration = Duration::from_secs(2);
 const READS_PER_LOOK: usize = if cfg!(test) { 1 } else { 16 };
 /// Looks for the last words of a node that has gone.
 const LAST_LOOKS: usize = 64;
-const LNCL: Tid = payload::lncl_of(NodeAddress::HERE);
+pub(super) const LNCL: Tid = payload::lncl_of(NodeAddress::HERE);
 
 /// A registered transport address: sends and receives, from one thread at a time.
 ///
 /// Dropping it gives the address back at once; [`unregister`](Self::unregister) waits until the node has taken it.
 pub struct Endpoint {
-    tid: Tid,
-    node_name: String,
-    payload_max: usize,
-    writer: Arc<Writer>,
-    reader: Reader,
+    pub(super) tid: Tid,
+    pub(super) node_name: String,
+    pub(super) payload_max: usize,
+    pub(super) writer: Arc<Writer>,
+    pub(super) reader: Reader,
     /// Links to other processes that the node is not on the way of.
     pub(super) direct: Direct,
-    inbox: Inbox,
+    pub(super) inbox: Inbox,
     sequence: u64,
     pub(super) correlation: u64,
     /// Why the connection has ended, once it has.
-    ended: Option<String>,
+    pub(super) ended: Option<Ended>,
+    pub(super) home: Home,
 }
 
 impl std::fmt::Debug for Endpoint {
@@ -65,23 +67,19 @@ enum WhenFull {
 
 impl Endpoint {
     pub(super) fn register(path: &Path, registration: Registration) -> Result<Self, ApiError> {
-        let Registration { register, deadline, inbox_capacity, link: options } = registration;
-        let Some(link) = link::open(path, &register, Time::now() + deadline, options)? else {
+        let Registration { mut register, deadline, inbox_capacity, link: options, returning } = registration;
+        let Some(link) = Greeting::begin(path, &register, options)?.wait(Time::now() + deadline)? else {
             return Err(match register.requires {
                 requires if requires.is_empty() => ApiError::NoAnswer(deadline),
                 requires => ApiError::Waiting { requires, waited: deadline },
             });
         };
-        let Link { registered, writer, reader } = link;
-        let Registered { node, app, node_name, payload_max, ring } = registered;
+        let Link { registered, writer, reader, node: node_process } = link;
+        let terms = Terms::of(&registered, options);
+        let Registered { node, app, node_name, payload_max, ring: _ } = registered;
         let control = reader.control().filter(|_| register.direct);
-        let terms = Terms {
-            own: Tid::new(node, app),
-            ring_bytes: ring.unwrap_or_default() as usize,
-            payload_max: payload_max as usize,
-            options,
-        };
         let inbox = Inbox::new(inbox_capacity, writer.clone());
+        register.former = Some(app);
         Ok(Self {
             tid: Tid::new(node, app),
             node_name,
@@ -93,6 +91,7 @@ impl Endpoint {
             sequence: 0,
             correlation: 0,
             ended: None,
+            home: Home::new(path.to_owned(), register, options, returning, node_process),
         })
     }
 
@@ -156,7 +155,7 @@ impl Endpoint {
     /// [received](Self::receive).
     ///
     /// # Errors
-    /// It was not sent, or the connection ended before the outcome was known.
+    /// It was not sent. If the connection ends before the outcome is known that is [`Outcome::Unknown`].
     pub fn send_confirmed<P: Payload>(
         &mut self,
         destination: Tid,
@@ -190,6 +189,9 @@ impl Endpoint {
     /// Waits for a message, at most `within` this time; `None` if none came (the paper's ReceiveMessage). Control
     /// comes first, then Stream, of which only the newest value of each source and kind, then Bulk.
     ///
+    /// When the connection has ended, through no fault of this endpoint, it registers again: the first call says so with
+    /// [`ApiError::Away`], each later one waits for the node's return as for a message.
+    ///
     /// # Errors
     /// The connection has ended, and everything that came before was received.
     pub fn receive(&mut self, within: Duration) -> Result<Option<Received>, ApiError> {
@@ -200,8 +202,13 @@ impl Endpoint {
             if let Some(message) = self.inbox.pop(Time::now()) {
                 return Ok(Some(Received::new(message)));
             }
-            if let Some(why) = &self.ended {
-                return Err(ApiError::Closed(why.clone()));
+            if let Some(ended) = self.ended.clone() {
+                self.tell(&ended)?;
+                if Time::now() >= deadline {
+                    return Ok(None);
+                }
+                self.await_return(deadline);
+                continue;
             }
             // The clock is asked by us: a flood keeps the link readable for ever.
             if Time::now() >= deadline {
@@ -209,6 +216,13 @@ impl Endpoint {
             }
             self.wait(deadline);
         }
+    }
+
+    /// How often this endpoint has registered: 1, and one more each time that it came back after its connection had
+    /// ended. Its address may be another one since then if somebody else has got the former one.
+    #[must_use]
+    pub const fn registrations(&self) -> u64 {
+        self.home.registrations
     }
 
     /// Joins the group called `name`: what is sent to [`Tid::group`] reaches this endpoint from now on.
@@ -246,6 +260,10 @@ impl Endpoint {
     /// The node did not answer. The address is given back in any case.
     pub fn unregister(mut self) -> Result<(), ApiError> {
         self.inbox.close();
+        if self.ended.is_some() {
+            // The connection has taken the address with it.
+            return Ok(());
+        }
         let goodbye = Message::new(Header::new(Kind::LNCL_UNREGISTER, self.tid, LNCL), bytes::Bytes::new());
         self.writer.write(&goodbye)?;
         let deadline = Time::now() + PROMPT;
@@ -266,7 +284,14 @@ impl Endpoint {
     fn set_member(&mut self, group: AppAddress, member: bool) -> Result<(), ApiError> {
         let message = payload::frame(Kind::LNCL_GROUP, self.tid, LNCL, &Group { group, member });
         match self.request(message, Awaited::Outcome, Flags::CONFIRM, PROMPT)? {
-            Some(Answer::Outcome(Outcome::Delivered)) => Ok(()),
+            Some(Answer::Outcome(Outcome::Delivered)) => {
+                if member {
+                    self.home.groups.insert(group);
+                } else {
+                    self.home.groups.remove(&group);
+                }
+                Ok(())
+            }
             Some(Answer::Outcome(outcome)) => Err(ApiError::Ended(outcome)),
             Some(Answer::Reply(_) | Answer::Resolved(_)) | None => Err(ApiError::NoAnswer(PROMPT)),
         }
@@ -335,8 +360,9 @@ impl Endpoint {
             if way.is_some_and(|link| !self.direct.has(link)) {
                 return Ok(Some(Answer::Outcome(Outcome::Failed)));
             }
-            if let Some(why) = &self.ended {
-                return Err(ApiError::Closed(why.clone()));
+            if way.is_none() && self.ended.is_some() {
+                // Nobody can say any more.
+                return Ok(Some(Answer::Outcome(Outcome::Unknown)));
             }
             // The clock is asked by us: a flood keeps the link readable for ever.
             if Time::now() >= deadline {
@@ -348,7 +374,10 @@ impl Endpoint {
 
     /// Sends `message` the way that is right now; the link, if it did not go through the node.
     fn dispatch(&mut self, mut message: Message) -> Result<Option<LinkNumber>, ApiError> {
+        self.try_return();
         self.check_length(message.payload.len())?;
+        // A new connection may have another address.
+        message.header.source = self.tid;
         self.sequence += 1;
         message.header.sequence = self.sequence;
         let now = Time::now();
@@ -368,6 +397,7 @@ impl Endpoint {
                 Sent::Gone(back) => message = back,
             }
         }
+        self.be_there()?;
         if self.reader.has_ended(now) {
             return Err(self.explain(ApiError::Closed("the node has gone".to_owned())));
         }
@@ -393,7 +423,7 @@ impl Endpoint {
                 break;
             }
         }
-        self.ended.clone().map_or(error, ApiError::Closed)
+        self.ended.as_ref().map_or(error, |ended| self.gone(ended))
     }
 
     fn check_length(&self, length: usize) -> Result<(), ApiError> {
@@ -434,8 +464,8 @@ impl Endpoint {
             match self.reader.read() {
                 Read::Some => {}
                 Read::Nothing => return Ok(None),
-                Read::Ended(why) => {
-                    self.ended.get_or_insert(why);
+                Read::Ended(ended) => {
+                    self.end(ended);
                     return Ok(None);
                 }
             }
@@ -450,7 +480,7 @@ impl Endpoint {
             let Some(message) = self.heed(message, wanted) else { continue };
             match self.inbox.sort(message, wanted.map(Wanted::at_node)) {
                 Sorted::Answer(answer) => return Ok(Some(answer)),
-                Sorted::Refusal(sentence) => self.ended = Some(sentence),
+                Sorted::Refusal(refusal) => self.end(refusal.into()),
                 Sorted::Message | Sorted::Nothing => {}
             }
         }

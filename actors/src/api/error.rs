@@ -35,6 +35,10 @@ pub enum ApiError {
     /// The connection has ended, and the registration with it; register again.
     #[error("the connection to the node has ended: {0}")]
     Closed(String),
+    /// The connection has ended through no fault of this endpoint, which registers again by itself while it is used: each
+    /// send tries, and [`receive`](super::Endpoint::receive) waits for it. A message of this call was not sent.
+    #[error("the connection to the node has ended: {0}; the endpoint registers again by itself")]
+    Away(String),
     /// The node takes no bytes. This message was not sent; it may be tried again.
     #[error("the node has taken no bytes for {0:?}; the message was not sent")]
     Stalled(Duration),

@@ -39,7 +39,7 @@ pub(super) enum Sorted {
     /// The answer that was awaited.
     Answer(Answer),
     /// The node ends the connection, for this reason.
-    Refusal(String),
+    Refusal(Refusal),
     /// Nobody waits for it any more, or this version does not know it.
     Nothing,
 }
@@ -55,6 +55,11 @@ pub(super) struct Inbox {
 impl Inbox {
     pub(super) fn new(capacity: usize, sink: Arc<dyn ReceiptSink>) -> Self {
         Self { queue: ClassQueue::new(capacity), capacity, sink }
+    }
+
+    /// Confirms what comes from now on over another connection.
+    pub(super) fn set_sink(&mut self, sink: Arc<dyn ReceiptSink>) {
+        self.sink = sink;
     }
 
     /// Whether every class has room for one more.
@@ -90,7 +95,7 @@ impl Inbox {
             Kind::LNCL_RESOLVED => sort_resolved(&message, awaited),
             Kind::LNCL_REFUSAL => Sorted::Refusal(
                 payload::read(&message.payload)
-                    .map_or_else(|error| error.to_string(), |refusal: Refusal| refusal.sentence),
+                    .unwrap_or_else(|error| Refusal { sentence: error.to_string(), again: false }),
             ),
             // A node of a later version may say more than we know.
             _ => Sorted::Nothing,

@@ -43,6 +43,7 @@ mod inbox;
 mod link;
 mod raw;
 mod received;
+mod returning;
 mod routes;
 #[cfg(test)]
 mod tests;
@@ -63,7 +64,7 @@ pub use error::ApiError;
 pub use link::Transport;
 pub use received::Received;
 
-use self::link::LinkOptions;
+use self::{link::LinkOptions, returning::Returning};
 use crate::lncl::payload::Register;
 
 /// The way to the node of this host, at the path of its socket.
@@ -102,6 +103,7 @@ pub struct Registration {
     deadline: Duration,
     inbox_capacity: usize,
     link: LinkOptions,
+    returning: Returning,
 }
 
 impl Default for Registration {
@@ -115,6 +117,7 @@ impl Default for Registration {
                 spin: Spin::Off,
                 patience: Duration::from_secs(1),
             },
+            returning: Returning::Always,
         }
     }
 }
@@ -196,6 +199,14 @@ impl Registration {
     #[must_use]
     pub const fn direct(mut self, direct: bool) -> Self {
         self.register.direct = direct;
+        self
+    }
+
+    /// Does not register again when the connection has ended: then every call says [`ApiError::Closed`]. Without this the
+    /// endpoint comes back by itself, under the same name, to the same address if it is free, and to its groups.
+    #[must_use]
+    pub const fn for_one_connection(mut self) -> Self {
+        self.returning = Returning::Never;
         self
     }
 

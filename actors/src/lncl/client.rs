@@ -155,8 +155,9 @@ struct Client {
 
 impl Client {
     fn register(server: Rc<Server>, peer: Peer, asked: Register) -> Result<Self, super::RegisterError> {
-        let Register { name, address, requires, events, kinds, pid: _, direct, ring } = asked;
-        let address = address.map_or(Address::Dynamic, Address::Fixed);
+        let Register { name, address, requires, events, kinds, pid: _, direct, ring, former } = asked;
+        let any = former.map_or(Address::Dynamic, Address::Former);
+        let address = address.map_or(any, Address::Fixed);
         let request = Request { address, name, requires: requires.clone(), kinds, owner: peer.owner() };
         let app = registrar::register_client(&server.stores, request)?;
         let tid = Tid::new(server.stores.node, app);
@@ -420,9 +421,9 @@ impl Client {
 
     async fn say_farewell(&self, sentence: String) {
         if self.ring == Ring::Told {
-            return self.say_last(sentence);
+            return self.say_last(sentence, false);
         }
-        self.say(self.refusal(sentence));
+        self.say(self.refusal(sentence, false));
         // Without a link nothing was written yet, and the socket takes a sentence at once.
         let link = self.link.unwrap_or_else(|| {
             let payload_max = self.server.stores.config.payload_max;
@@ -435,8 +436,8 @@ impl Client {
     }
 
     /// Says why it ends, without waiting.
-    fn say_last(&self, sentence: String) {
-        let refusal = self.refusal(sentence);
+    fn say_last(&self, sentence: String, again: bool) {
+        let refusal = self.refusal(sentence, again);
         match self.ring {
             Ring::None | Ring::Asked => self.say(refusal),
             // The ring may be full or not there yet, and nothing but these words ever goes into the socket. Whoever is
@@ -445,9 +446,9 @@ impl Client {
         }
     }
 
-    fn refusal(&self, sentence: String) -> Message {
+    fn refusal(&self, sentence: String, again: bool) -> Message {
         let lncl = payload::lncl_of(self.tid.node);
-        payload::frame(Kind::LNCL_REFUSAL, lncl, self.tid, &Refusal { sentence })
+        payload::frame(Kind::LNCL_REFUSAL, lncl, self.tid, &Refusal { sentence, again })
     }
 
     fn log(&self, what: &str) {
@@ -461,7 +462,7 @@ impl Drop for Client {
         registrar::owner_gone(&self.server.stores, self.peer.owner(), &self.cause);
         self.server.remove_outlet(self.peer.id);
         if !self.has_been_told {
-            self.say_last("the node's LNCL has ended; connect again when it is back".to_owned());
+            self.say_last("the node's LNCL has ended; connect again when it is back".to_owned(), true);
         }
         // Senders may hold the outlet, and with it the socket, a little longer; the peer is told now. An error means
         // that it is closed already.

@@ -40,6 +40,8 @@ pub(crate) enum Address {
     Fixed(AppAddress),
     /// Any free one of the dynamic range.
     Dynamic,
+    /// This one of the dynamic range, which it had before; any free one if somebody else has it.
+    Former(AppAddress),
 }
 
 /// What an application asks for when it registers.
@@ -161,7 +163,8 @@ impl Registry {
         let kinds = self.check_kinds(&request.kinds)?;
         let app = match request.address {
             Address::Fixed(app) => self.free_fixed(app)?,
-            Address::Dynamic => self.free_dynamic(),
+            Address::Former(app) if app.is_dynamic() && !self.apps.contains_key(&app) => app,
+            Address::Dynamic | Address::Former(_) => self.free_dynamic(),
         };
         self.claim_kinds(kinds, apps_max);
         if let Some(name) = &request.name {
@@ -388,6 +391,18 @@ mod tests {
         let first = registry.register(request(Address::Dynamic, None), 9).unwrap();
         registry.unregister(first);
         assert_ne!(registry.register(request(Address::Dynamic, None), 9), Ok(first));
+    }
+
+    #[test]
+    fn who_comes_back_gets_its_former_dynamic_address_if_that_is_free() {
+        let mut registry = Registry::default();
+        let former = registry.register(request(Address::Dynamic, None), 9).unwrap();
+        registry.unregister(former);
+        assert_eq!(registry.register(request(Address::Former(former), None), 9), Ok(former));
+        let other = registry.register(request(Address::Former(former), None), 9).unwrap();
+        assert!(other.is_dynamic() && other != former);
+        let never_dynamic = registry.register(request(Address::Former(AppAddress::NDL), None), 9).unwrap();
+        assert!(never_dynamic.is_dynamic());
     }
 
     #[test]

@@ -79,12 +79,12 @@ impl Door {
     pub(super) fn hang_up(&self) {
         let connections = std::mem::take(&mut *lock(&self.connections));
         for Connection { stream, outlet } in connections.into_values() {
-            // spec: LNCL-7
-            if let Some(outlet) = outlet.upgrade() {
-                outlet.end(Outcome::Failed, Rejection::Closed);
-            }
             if let Some(stream) = stream.upgrade() {
                 shut(&*stream);
+            }
+            // spec: LNCL-7. A peer that sleeps at a ring is woken by its end.
+            if let Some(outlet) = outlet.upgrade() {
+                outlet.end(Outcome::Failed, Rejection::Closed);
             }
         }
     }

@@ -37,6 +37,9 @@ pub(crate) struct Register {
     /// Whether it can use rings in shared memory.
     #[serde(default)]
     pub(crate) ring: bool,
+    /// The dynamic address that it had before its connection ended; given to it again if it is free.
+    #[serde(default)]
+    pub(crate) former: Option<AppAddress>,
 }
 
 /// The address that a process got.
@@ -60,6 +63,9 @@ pub(crate) struct Registered {
 pub(crate) struct Refusal {
     /// For people.
     pub(crate) sentence: String,
+    /// Whether the client may register again, since the fault is not its own.
+    #[serde(default)]
+    pub(crate) again: bool,
 }
 
 /// Joins or leaves a group.

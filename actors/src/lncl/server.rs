@@ -158,7 +158,7 @@ const fn admits(own: u32, theirs: u32) -> bool {
 /// dropping it.
 pub(super) fn refuse(server: &Server, stream: &UnixStream, cause: &'static str, why: &dyn std::fmt::Display) {
     server.refusals.count(Time::now(), cause, why);
-    let refusal = Refusal { sentence: why.to_string() };
+    let refusal = Refusal { sentence: why.to_string(), again: false };
     let lncl = payload::lncl_of(server.stores.node);
     let message = payload::frame(Kind::LNCL_REFUSAL, lncl, Tid::NONE, &refusal);
     let mut bytes = bytes::BytesMut::new();

@@ -172,7 +172,8 @@ impl From<ApiError> for Fault {
             ApiError::Refused(_) => Status::SinewErrorRefused,
             ApiError::Waiting { .. } => Status::SinewErrorWaiting,
             ApiError::NoAnswer(_) => Status::SinewErrorNoAnswer,
-            ApiError::Closed(_) | ApiError::Frame(_) => Status::SinewErrorClosed,
+            // The endpoint comes back while it is used; the message of this call was not sent.
+            ApiError::Away(_) | ApiError::Closed(_) | ApiError::Frame(_) => Status::SinewErrorClosed,
             ApiError::Stalled(_) => Status::SinewErrorStalled,
             ApiError::TooLong { .. } => Status::SinewErrorTooLong,
             ApiError::Ended(_) => Status::SinewErrorNotHandled,

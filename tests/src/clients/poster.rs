@@ -201,6 +201,7 @@ impl Letters {
         let entry = match error {
             ApiError::Stalled(_) => Entry::NotSent(way, number),
             ApiError::Closed(_)
+            | ApiError::Away(_)
             | ApiError::NoNode { .. }
             | ApiError::Refused(_)
             | ApiError::Waiting { .. }

@@ -10,6 +10,7 @@ mod mailboxes;
 mod panics;
 mod points;
 mod processes;
+mod returns;
 
 use sinew::{Sender, fault::Fault, prelude::*};
 use sinew_tests::{

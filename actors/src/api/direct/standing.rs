@@ -164,6 +164,27 @@ impl Drop for Standing {
     }
 }
 
+/// The open links, to be waited for while there is no node.
+pub(super) struct Alone<'a>(pub(super) &'a mut [Standing]);
+
+impl Ends for Alone<'_> {
+    fn count(&self) -> usize {
+        self.0.len()
+    }
+
+    fn consumer(&self, index: usize) -> &Consumer {
+        &self.0[index].consumer
+    }
+
+    fn consumer_mut(&mut self, index: usize) -> &mut Consumer {
+        &mut self.0[index].consumer
+    }
+
+    fn hang_up(&self, index: usize) -> Option<HangUp<'_>> {
+        Some(HangUp::Socket(self.0[index].socket.as_fd()))
+    }
+}
+
 /// The node's ring and those of the open links, to be waited for together.
 pub(in crate::api) struct Everything<'a> {
     pub(in crate::api) node: &'a mut End,

@@ -11,7 +11,7 @@ use rustix::{
 use sinew_runtime::{
     tid::{NodeAddress, Tid},
     time::Time,
-    wire::{FrameCodec, HEADER_LEN, Header, HeaderError, Kind, Message},
+    wire::{FrameCodec, FrameError, HEADER_LEN, Header, HeaderError, Kind, Message},
 };
 use tokio_util::codec::Decoder;
 
@@ -26,66 +26,85 @@ const EXCHANGE: Duration = Duration::from_secs(2);
 /// Longest payload before the node has said how long they may be.
 const GREETING_BYTES_MAX: usize = 64 * 1024;
 
-/// Connects and registers; `None` if the node has not answered by the deadline.
-pub(in crate::api) fn open(
-    path: &Path,
-    register: &Register,
-    deadline: Time,
+/// A registration that the node has not answered yet.
+pub(in crate::api) struct Greeting {
+    socket: Arc<UnixStream>,
     options: LinkOptions,
-) -> Result<Option<Link>, ApiError> {
-    let socket = Arc::new(connect(path)?);
-    let plain = socket::Writer::new(socket.clone(), options.patience);
-    let lncl = payload::lncl_of(NodeAddress::HERE);
-    let asked = asked(register, options.transport);
-    plain.write(&payload::frame(Kind::LNCL_REGISTER, Tid::NONE, lncl, &asked))?;
-    let Some(registered) = greeting(&socket, deadline)?.map(|message| read_greeting(&message)).transpose()?
-    else {
-        return Ok(None);
-    };
-    let payload_max = registered.payload_max as usize;
-    let (writer, reader) = match registered.ring {
-        None => (Writer::Socket(plain), Reader::Socket(socket::Reader::new(socket, payload_max))),
-        Some(ring_bytes) => {
-            let (producer, consumer) = ring::exchange(&socket, ring_bytes, Time::now() + EXCHANGE)?;
-            let reader = ring::Reader::new(socket.clone(), consumer, payload_max, options.spin);
-            (Writer::Ring(ring::Writer::new(socket, producer, options)), Reader::Ring(Box::new(reader)))
+    /// The answer, as far as it has come, and no byte more: descriptors may come with the next.
+    frame: BytesMut,
+    filled: usize,
+}
+
+impl Greeting {
+    /// Connects, and asks for an address.
+    pub(in crate::api) fn begin(
+        path: &Path,
+        register: &Register,
+        options: LinkOptions,
+    ) -> Result<Self, ApiError> {
+        let socket = Arc::new(connect(path)?);
+        let lncl = payload::lncl_of(NodeAddress::HERE);
+        let asked = asked(register, options.transport);
+        let frame = payload::frame(Kind::LNCL_REGISTER, Tid::NONE, lncl, &asked);
+        socket::Writer::new(socket.clone(), options.patience).write(&frame)?;
+        Ok(Self { socket, options, frame: BytesMut::zeroed(HEADER_LEN), filled: 0 })
+    }
+
+    /// Waits for the answer; `None` if the node has not given it by the deadline. May be called again then.
+    pub(in crate::api) fn wait(&mut self, deadline: Time) -> Result<Option<Link>, ApiError> {
+        if !self.fill(deadline)? {
+            return Ok(None);
         }
-    };
-    Ok(Some(Link { registered, writer: Arc::new(writer), reader }))
-}
-
-/// Reads the node's first frame and no byte more, since descriptors may come with the next; `None` at the deadline.
-fn greeting(socket: &UnixStream, deadline: Time) -> Result<Option<Message>, ApiError> {
-    let mut frame = BytesMut::zeroed(HEADER_LEN);
-    if !read_exactly(socket, &mut frame, deadline)? {
-        return Ok(None);
-    }
-    let start = frame.first_chunk().ok_or(HeaderError::NotAFrame).and_then(Header::payload_len);
-    let length = start.map_err(sinew_runtime::wire::FrameError::from)? as usize;
-    frame.resize(HEADER_LEN + length.min(GREETING_BYTES_MAX), 0);
-    if !read_exactly(socket, &mut frame[HEADER_LEN..], deadline)? {
-        return Ok(None);
-    }
-    Ok(FrameCodec::new(GREETING_BYTES_MAX).decode(&mut frame)?)
-}
-
-/// Whether all of it has come by the deadline.
-fn read_exactly(socket: &UnixStream, mut target: &mut [u8], deadline: Time) -> Result<bool, ApiError> {
-    while !target.is_empty() {
-        match recv(socket, &mut *target, RecvFlags::DONTWAIT) {
-            Ok((0, _)) => return Err(ApiError::Closed("the node closed it without a word".to_owned())),
-            Ok((count, _)) => target = &mut target[count..],
-            Err(Errno::INTR) => {}
-            Err(Errno::AGAIN) => {
-                let is_ready = socket::wait(socket, PollFlags::IN, deadline);
-                if !is_ready.map_err(|error| ApiError::Closed(error.to_string()))? {
-                    return Ok(false);
-                }
+        if self.frame.len() == HEADER_LEN {
+            let start = self.frame.first_chunk().ok_or(HeaderError::NotAFrame).and_then(Header::payload_len);
+            let length = start.map_err(FrameError::from)? as usize;
+            self.frame.resize(HEADER_LEN + length.min(GREETING_BYTES_MAX), 0);
+            if !self.fill(deadline)? {
+                return Ok(None);
             }
-            Err(error) => return Err(ApiError::Closed(error.to_string())),
         }
+        let unreadable = || ApiError::Closed("the node's first frame cannot be read".to_owned());
+        let message = FrameCodec::new(GREETING_BYTES_MAX).decode(&mut self.frame)?.ok_or_else(unreadable)?;
+        self.finish(read_greeting(&message)?).map(Some)
     }
-    Ok(true)
+
+    /// Agrees with the node on what carries the messages.
+    fn finish(&self, registered: Registered) -> Result<Link, ApiError> {
+        let (socket, options) = (self.socket.clone(), self.options);
+        let node = rustix::net::sockopt::socket_peercred(&socket).ok().map(|credentials| credentials.pid);
+        let payload_max = registered.payload_max as usize;
+        let (writer, reader) = match registered.ring {
+            None => {
+                let writer = socket::Writer::new(socket.clone(), options.patience);
+                (Writer::Socket(writer), Reader::Socket(socket::Reader::new(socket, payload_max)))
+            }
+            Some(ring_bytes) => {
+                let (producer, consumer) = ring::exchange(&socket, ring_bytes, Time::now() + EXCHANGE)?;
+                let reader = ring::Reader::new(socket.clone(), consumer, payload_max, options.spin);
+                (Writer::Ring(ring::Writer::new(socket, producer, options)), Reader::Ring(Box::new(reader)))
+            }
+        };
+        Ok(Link { registered, writer: Arc::new(writer), reader, node })
+    }
+
+    /// Whether all that is wanted has come by the deadline.
+    fn fill(&mut self, deadline: Time) -> Result<bool, ApiError> {
+        while self.filled < self.frame.len() {
+            match recv(&self.socket, &mut self.frame[self.filled..], RecvFlags::DONTWAIT) {
+                Ok((0, _)) => return Err(ApiError::Closed("the node closed it without a word".to_owned())),
+                Ok((count, _)) => self.filled += count,
+                Err(Errno::INTR) => {}
+                Err(Errno::AGAIN) => {
+                    let is_ready = socket::wait(&self.socket, PollFlags::IN, deadline);
+                    if !is_ready.map_err(|error| ApiError::Closed(error.to_string()))? {
+                        return Ok(false);
+                    }
+                }
+                Err(error) => return Err(ApiError::Closed(error.to_string())),
+            }
+        }
+        Ok(true)
+    }
 }
 
 fn read_greeting(message: &Message) -> Result<Registered, ApiError> {

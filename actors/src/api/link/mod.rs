@@ -12,6 +12,7 @@ use std::{
     time::Duration,
 };
 
+use rustix::process::Pid;
 use sinew_runtime::{
     outcome::{Outcome, ReceiptSink, Ticket},
     time::Time,
@@ -21,9 +22,9 @@ use sinew_shm::Spin;
 use socket2::{Domain, SockAddr, Socket, Type};
 
 use super::ApiError;
-use crate::lncl::payload::{Register, Registered};
+use crate::lncl::payload::{Refusal, Register, Registered};
 
-pub(super) use greeting::open;
+pub(super) use greeting::Greeting;
 
 /// How long to wait for a place in the queue of a node that does not accept.
 const CONNECT: Duration = Duration::from_secs(2);
@@ -53,6 +54,8 @@ pub(super) struct Link {
     pub(super) registered: Registered,
     pub(super) writer: Arc<Writer>,
     pub(super) reader: Reader,
+    /// The node's process, as the kernel says.
+    pub(super) node: Option<Pid>,
 }
 
 /// Connects to the node that listens at `path`.
@@ -141,7 +144,33 @@ pub(super) enum Read {
     /// Nothing came.
     Nothing,
     /// Nothing will come any more, for this reason.
-    Ended(String),
+    Ended(Ended),
+}
+
+/// Why a link has ended.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Ended {
+    pub(super) why: String,
+    /// Whether the client may register again: the fault is not its own.
+    pub(super) again: bool,
+}
+
+impl Ended {
+    /// What a node that is no more there says.
+    fn silently() -> Self {
+        Self { why: "the node closed it, or ended".to_owned(), again: true }
+    }
+
+    /// The node writes nonsense, or the system refuses.
+    fn for_good(why: String) -> Self {
+        Self { why, again: false }
+    }
+}
+
+impl From<Refusal> for Ended {
+    fn from(refusal: Refusal) -> Self {
+        Self { why: refusal.sentence, again: refusal.again }
+    }
 }
 
 impl Reader {
@@ -187,9 +216,6 @@ impl Reader {
         }
     }
 }
-
-/// What a node that is no more there says.
-const CLOSED: &str = "the node closed it, or ended";
 
 /// What is asked of the node, of which the link's own part is not the caller's to fill in.
 fn asked(register: &Register, transport: Transport) -> Register {

@@ -24,7 +24,7 @@ use sinew_shm::{
 };
 use tokio_util::codec::Decoder;
 
-use super::{CLOSED, LinkOptions, Read, socket};
+use super::{Ended, LinkOptions, Read, socket};
 use crate::{
     api::ApiError,
     lncl::payload::{self, Refusal},
@@ -171,7 +171,7 @@ impl Writer {
                 self.close();
                 ApiError::Closed(format!("the node stopped reading for {:?} within a frame", self.patience))
             }
-            RoomError::HungUp => ApiError::Closed(CLOSED.to_owned()),
+            RoomError::HungUp => ApiError::Closed(Ended::silently().why),
             RoomError::TooLong { .. } | RoomError::Corrupt(_) | RoomError::System(_) => {
                 self.close();
                 ApiError::Closed(error.to_string())
@@ -235,14 +235,14 @@ impl ReceiptSink for Writer {
 }
 
 /// Why the node has closed the socket: its words are the only bytes that a ring's socket ever carries.
-fn last_words(socket: &UnixStream) -> String {
+fn last_words(socket: &UnixStream) -> Ended {
     let mut buffer = BytesMut::zeroed(LAST_WORDS_BYTES_MAX);
     let count = recv(socket, &mut buffer[..], RecvFlags::DONTWAIT).map_or(0, |(count, _)| count);
     buffer.truncate(count);
     let refusal = FrameCodec::new(LAST_WORDS_BYTES_MAX).decode(&mut buffer).ok().flatten();
     let refusal = refusal.filter(|message| message.header.kind == Kind::LNCL_REFUSAL);
     let sentence = refusal.and_then(|message| payload::read::<Refusal>(&message.payload).ok());
-    sentence.map_or_else(|| CLOSED.to_owned(), |refusal| refusal.sentence)
+    sentence.map_or_else(Ended::silently, Ended::from)
 }
 
 /// The reading half.
@@ -253,7 +253,7 @@ pub(in crate::api) struct Reader {
     /// When the socket is looked at again.
     look_at: Time,
     /// Why nothing will come any more, once what is there was taken.
-    ended: Option<String>,
+    ended: Option<Ended>,
 }
 
 /// What is waited for.
@@ -294,7 +294,9 @@ impl Reader {
     /// Takes what is there, without waiting.
     pub(super) fn read(&mut self) -> Read {
         match self.frames.take(&mut self.end.consumer, ENOUGH) {
-            Err(corrupt) => Read::Ended(format!("shared memory holds what it cannot: {corrupt}")),
+            Err(corrupt) => {
+                Read::Ended(Ended::for_good(format!("shared memory holds what it cannot: {corrupt}")))
+            }
             Ok(Taken::Some) => Read::Some,
             Ok(Taken::Nothing) => match self.ended.clone() {
                 Some(why) => Read::Ended(why),
@@ -343,7 +345,7 @@ impl Reader {
             Ok(Any::Message(_) | Any::TimedOut | Any::HungUp(_))
             | Err(AnyError::Corrupt { index: 1.., .. }) => {}
             Err(error @ (AnyError::Corrupt { .. } | AnyError::System(_))) => {
-                self.ended = Some(error.to_string())
+                self.ended = Some(Ended::for_good(error.to_string()))
             }
         }
     }

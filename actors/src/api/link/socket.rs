@@ -20,7 +20,7 @@ use sinew_runtime::{
 };
 use tokio_util::codec::Decoder;
 
-use super::{CLOSED, Read};
+use super::{Ended, Read};
 use crate::api::ApiError;
 
 /// Bytes that are read at once.
@@ -132,14 +132,14 @@ impl Reader {
     pub(in crate::api) fn read(&mut self) -> Read {
         loop {
             match recv(&self.socket, &mut self.chunk[..], RecvFlags::DONTWAIT) {
-                Ok((0, _)) => return Read::Ended(CLOSED.to_owned()),
+                Ok((0, _)) => return Read::Ended(Ended::silently()),
                 Ok((count, _)) => {
                     self.buffer.extend_from_slice(&self.chunk[..count]);
                     return Read::Some;
                 }
                 Err(Errno::INTR) => {}
                 Err(Errno::AGAIN) => return Read::Nothing,
-                Err(_) => return Read::Ended(CLOSED.to_owned()),
+                Err(_) => return Read::Ended(Ended::silently()),
             }
         }
     }

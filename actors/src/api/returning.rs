@@ -1,0 +1,205 @@
+//! Coming back: an endpoint whose connection ended registers again, within the calls of its user.
+//!
+//! There is no thread for it. [`receive`](Endpoint::receive) waits for the node's return as it waits for a message; a send
+//! tries once, without waiting. Between two tries there is a pause, from 10 ms doubling to 1 s.
+
+use std::{collections::BTreeSet, path::PathBuf, thread, time::Duration};
+
+use rustix::process::Pid;
+use sinew_runtime::{
+    tid::{AppAddress, Tid},
+    time::Time,
+    wire::{Kind, Message},
+};
+
+use super::{
+    ApiError, Endpoint,
+    direct::{Direct, Terms},
+    endpoint::LNCL,
+    link::{Ended, Greeting, Link, LinkOptions},
+};
+use crate::lncl::payload::{self, Group, Register};
+
+/// First and longest pause between two tries.
+const PAUSE: (Duration, Duration) = (Duration::from_millis(10), Duration::from_secs(1));
+
+/// Whether an endpoint registers again when its connection has ended through no fault of its own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Returning {
+    Always,
+    Never,
+}
+
+/// What an endpoint needs to register again, and how far it is with it.
+pub(super) struct Home {
+    pub(super) path: PathBuf,
+    pub(super) register: Register,
+    pub(super) options: LinkOptions,
+    pub(super) returning: Returning,
+    /// The groups that it is a member of.
+    pub(super) groups: BTreeSet<AppAddress>,
+    /// How often it has registered.
+    pub(super) registrations: u64,
+    /// The node's process, as the kernel says.
+    node: Option<Pid>,
+    way: Option<Way>,
+}
+
+/// On the way back.
+struct Way {
+    pause: Duration,
+    /// When the next try is due.
+    next: Time,
+    /// The try that the node has not answered yet.
+    greeting: Option<Greeting>,
+    /// Whether `receive` has told the caller.
+    is_told: bool,
+}
+
+impl Home {
+    pub(super) const fn new(
+        path: PathBuf,
+        register: Register,
+        options: LinkOptions,
+        returning: Returning,
+        node: Option<Pid>,
+    ) -> Self {
+        Self {
+            path,
+            register,
+            options,
+            returning,
+            groups: BTreeSet::new(),
+            registrations: 1,
+            node,
+            way: None,
+        }
+    }
+
+    /// The way back, which begins with the first question for it.
+    fn way(&mut self) -> &mut Way {
+        let fresh = || Way { pause: PAUSE.0, next: Time::ZERO, greeting: None, is_told: false };
+        self.way.get_or_insert_with(fresh)
+    }
+
+    /// Tries to register; `None` if it has not come to that by the deadline, or the next try is not due.
+    fn knock(&mut self, until: Time) -> Option<Link> {
+        let (path, register, options) = (self.path.clone(), self.register.clone(), self.options);
+        let way = self.way();
+        if way.greeting.is_none() && Time::now() < way.next {
+            return None;
+        }
+        let answer = match way.greeting.take() {
+            Some(greeting) => Ok(greeting),
+            None => Greeting::begin(&path, &register, options),
+        };
+        let answer = answer.and_then(|mut greeting| match greeting.wait(until)? {
+            None => {
+                way.greeting = Some(greeting);
+                Ok(None)
+            }
+            link => Ok(link),
+        });
+        answer.unwrap_or_else(|why| {
+            tracing::debug!(%why, "not registered again yet");
+            way.next = Time::now() + way.pause;
+            way.pause = (way.pause * 2).min(PAUSE.1);
+            None
+        })
+    }
+}
+
+impl Endpoint {
+    /// The error of a call that finds the connection ended.
+    pub(super) fn gone(&self, ended: &Ended) -> ApiError {
+        if self.returns(ended) {
+            ApiError::Away(ended.why.clone())
+        } else {
+            ApiError::Closed(ended.why.clone())
+        }
+    }
+
+    const fn returns(&self, ended: &Ended) -> bool {
+        ended.again && matches!(self.home.returning, Returning::Always)
+    }
+
+    /// The connection to the node has ended. What is told is the first reason.
+    pub(super) fn end(&mut self, ended: Ended) {
+        if self.ended.is_none() {
+            self.ended = Some(ended);
+            self.direct.node_has_ended(Time::now());
+        }
+    }
+
+    /// Whether there is a connection to the node.
+    pub(super) fn be_there(&self) -> Result<(), ApiError> {
+        self.ended.as_ref().map_or(Ok(()), |ended| Err(self.gone(ended)))
+    }
+
+    /// Comes back if that takes no waiting.
+    pub(super) fn try_return(&mut self) {
+        if let Some(ended) = &self.ended
+            && self.returns(ended)
+            && let Some(link) = self.home.knock(Time::now())
+        {
+            self.arrive(link);
+        }
+    }
+
+    /// Tells the caller of the end: once if the endpoint comes back, always if it does not.
+    pub(super) fn tell(&mut self, ended: &Ended) -> Result<(), ApiError> {
+        if self.returns(ended) && std::mem::replace(&mut self.home.way().is_told, true) {
+            return Ok(());
+        }
+        Err(self.gone(ended))
+    }
+
+    /// Comes back, or waits until the next try, until something comes on a direct link, or until `deadline`.
+    pub(super) fn await_return(&mut self, deadline: Time) {
+        let has_links = !self.direct.open.is_empty();
+        let now = Time::now();
+        if let Some(link) = self.home.knock(if has_links { now } else { deadline }) {
+            return self.arrive(link);
+        }
+        let way = self.home.way();
+        let due = if way.greeting.is_some() { now + PAUSE.0 } else { way.next };
+        let left = due.min(deadline).since(Time::now());
+        if has_links {
+            self.direct.wait(left);
+        } else {
+            thread::sleep(left);
+        }
+    }
+
+    /// Goes on with a new connection, as a member of the same groups.
+    fn arrive(&mut self, link: Link) {
+        let Link { registered, writer, reader, node } = link;
+        let is_same_node = node.is_some() && node == self.home.node;
+        self.home.node = node;
+        let control = reader.control().filter(|_| self.home.register.direct);
+        let own = Tid::new(registered.node, registered.app);
+        if is_same_node && own == self.tid {
+            self.direct.node_is_back(control);
+        } else {
+            // Another life of the node counts its links anew, and another address has none.
+            self.direct = Direct::new(Terms::of(&registered, self.home.options), control);
+        }
+        self.tid = own;
+        self.home.register.former = Some(registered.app);
+        self.payload_max = registered.payload_max as usize;
+        self.node_name = registered.node_name;
+        self.inbox.set_sink(writer.clone());
+        (self.writer, self.reader) = (writer, reader);
+        (self.ended, self.home.way) = (None, None);
+        self.home.registrations += 1;
+        for group in &self.home.groups {
+            let membership = Group { group: *group, member: true };
+            let message: Message = payload::frame(Kind::LNCL_GROUP, self.tid, LNCL, &membership);
+            if let Err(why) = self.writer.write(&message) {
+                // Half a return is none.
+                self.writer.close();
+                return self.end(Ended { why: why.to_string(), again: true });
+            }
+        }
+    }
+}

@@ -1,0 +1,66 @@
+//! Endpoints that come back by themselves when LNCL was restarted.
+
+use std::thread;
+
+use sinew::{ApiError, Endpoint, NodeApi, Registration, Transport, fault::Fault, prelude::*};
+use sinew_tests::{DEADLINE, Ground, OwnDirectory, all_run, puppet::Job, ready_for, until};
+
+/// Receives, and answers nobody, until the endpoint has registered `times`.
+fn come_back(endpoint: &mut Endpoint, times: u64) {
+    until("the endpoint is back", || {
+        match endpoint.receive(Duration::from_millis(20)) {
+            // It says once that its connection has ended.
+            Ok(None) | Err(ApiError::Away(_)) => {}
+            other => panic!("{other:?}"),
+        }
+        (endpoint.registrations() == times).then_some(())
+    });
+}
+
+fn comes_back(transport: Transport) {
+    // Given: two endpoints, one of them in a group, and a message in flight between them
+    let directory = OwnDirectory::new();
+    let socket = directory.join("node.sock");
+    let door = socket.clone();
+    let node = Ground::new().node("node").configure(|config| config.lncl.socket = Some(door));
+    let node = node.start().expect("a node");
+    all_run(&[&node]);
+    let api = NodeApi::connect(&socket).expect("somebody listens");
+    let register = |name: &str| {
+        let registration = Registration::new().name(name).transport(transport);
+        api.register_transport_address(registration).expect("the name is free")
+    };
+    let (mut drive, mut hip) = (register("drive"), register("hip"));
+    let (drive_tid, hip_tid) = (drive.tid(), hip.tid());
+    drive.join("drives").expect("there is room in it");
+    let asking = thread::spawn(move || {
+        let outcome = hip.send_confirmed(drive_tid, &Job { number: 1 }, DEADLINE);
+        (hip, outcome)
+    });
+    let in_hand = drive.receive(DEADLINE).expect("the node is there").expect("a message in time");
+    // When
+    node.handle().inject("LNCL", Fault::panic()).expect("every node has it");
+    ready_for(&node.handle(), "LNCL", 2);
+    // Then: nobody can say any more what became of the message
+    let (mut hip, outcome) = asking.join().expect("no panic");
+    assert!(matches!(outcome, Ok(Outcome::Unknown | Outcome::Failed)), "{outcome:?}");
+    in_hand.settle(Outcome::Delivered);
+    // Then: both are back behind the same names and addresses, and in their groups
+    come_back(&mut drive, 2);
+    come_back(&mut hip, 2);
+    assert_eq!((drive.tid(), hip.tid()), (drive_tid, hip_tid));
+    assert_eq!(hip.resolve("drive", DEADLINE).expect("an answer"), Some(drive_tid));
+    hip.send(Tid::group("drives"), &Job { number: 2 }).expect("there is room");
+    let received = drive.receive(DEADLINE).expect("the node is there").expect("a message in time");
+    assert_eq!(received.decode::<Job>().expect("a job").number, 2);
+}
+
+#[test]
+fn endpoints_at_rings_come_back_when_lncl_panics() {
+    comes_back(Transport::Ring);
+}
+
+#[test]
+fn endpoints_at_sockets_come_back_when_lncl_panics() {
+    comes_back(Transport::Socket);
+}
