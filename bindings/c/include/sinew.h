@@ -53,6 +53,21 @@
 #define SINEW_REQUIREMENT_EVENTS 2
 
 /**
+ * For `links` of `sinew_options`: through the unix socket alone, no shared memory.
+ */
+#define SINEW_SOCKET_ONLY 1
+
+/**
+ * For `links` of `sinew_options`: all through the node, no direct link to another process.
+ */
+#define SINEW_THROUGH_NODE 2
+
+/**
+ * For `links` of `sinew_options`: `spin_ns` is the longest to look; it looks as long as messages lately took to come.
+ */
+#define SINEW_SPIN_ADAPTIVE 4
+
+/**
  * What a call came to. Negative: an error, and `sinew_last_error` has a sentence about it.
  */
 enum sinew_status
@@ -140,6 +155,10 @@ enum sinew_status
      * A fault of this library. The endpoint can only be unregistered; all others go on.
      */
     SINEW_ERROR_PANIC = -18,
+    /**
+     * Memory for a message is lent in place; send or discard that message first. Nothing was sent.
+     */
+    SINEW_ERROR_LENT = -19,
 };
 #ifndef __cplusplus
 #if __STDC_VERSION__ >= 202311L
@@ -328,6 +347,20 @@ typedef struct sinew_options {
      * How many received messages wait in this process at most, each class by itself. Default: 256.
      */
     size_t inbox_capacity;
+    /**
+     * How long a waiting thread looks before it sleeps. Looking keeps a CPU busy and saves the wake, which is most of a
+     * short message's way: for a thread with a CPU of its own. Default: it sleeps at once.
+     */
+    uint64_t spin_ns;
+    /**
+     * What carries the messages: `SINEW_SOCKET_ONLY`, `SINEW_THROUGH_NODE`, `SINEW_SPIN_ADAPTIVE`. Default: shared memory
+     * where the system has it, and direct links.
+     */
+    uint32_t links;
+    /**
+     * Zero.
+     */
+    uint32_t reserved;
 } sinew_options;
 
 /**

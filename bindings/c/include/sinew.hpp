@@ -92,6 +92,8 @@ struct options {
     duration deadline{};
     duration patience{};
     std::size_t inbox_capacity = 0;
+    duration spin{};
+    std::uint32_t links = 0;
 };
 
 /// A message that is being made: a container of writable bytes. One that is not sent is discarded at its end.
@@ -204,6 +206,8 @@ public:
         raw.deadline_ns = detail::nanoseconds(wanted.deadline);
         raw.patience_ns = detail::nanoseconds(wanted.patience);
         raw.inbox_capacity = wanted.inbox_capacity;
+        raw.spin_ns = detail::nanoseconds(wanted.spin);
+        raw.links = wanted.links;
         detail::check(sinew_register_transport_address(detail::text(socket), &raw, &raw_));
     }
     endpoint(endpoint &&other) noexcept : raw_(std::exchange(other.raw_, nullptr)) {}

@@ -2,7 +2,7 @@
 
 use std::{mem::MaybeUninit, ptr, time::Duration};
 
-use sinew::{AppAddress, NodeEvent, Registration, RequirementEvent};
+use sinew::{AppAddress, NodeEvent, Registration, RequirementEvent, Spin, Transport};
 
 use crate::{
     status::Fault,
@@ -13,6 +13,12 @@ use crate::{
 pub const SINEW_NODE_EVENTS: u32 = 1;
 /// For `events` of `sinew_options`: `sinew.requirement_event`, what is required is lost or there again.
 pub const SINEW_REQUIREMENT_EVENTS: u32 = 2;
+/// For `links` of `sinew_options`: through the unix socket alone, no shared memory.
+pub const SINEW_SOCKET_ONLY: u32 = 1;
+/// For `links` of `sinew_options`: all through the node, no direct link to another process.
+pub const SINEW_THROUGH_NODE: u32 = 2;
+/// For `links` of `sinew_options`: `spin_ns` is the longest to look; it looks as long as messages lately took to come.
+pub const SINEW_SPIN_ADAPTIVE: u32 = 4;
 
 /// What an application asks for when it registers. Set all of it to zero, then `size`, then what is wanted; zero means the
 /// default everywhere. It grows at its end only: a program that was compiled with a shorter one is served as before.
@@ -42,6 +48,14 @@ pub struct Options {
     pub patience_ns: u64,
     /// How many received messages wait in this process at most, each class by itself. Default: 256.
     pub inbox_capacity: usize,
+    /// How long a waiting thread looks before it sleeps. Looking keeps a CPU busy and saves the wake, which is most of a
+    /// short message's way: for a thread with a CPU of its own. Default: it sleeps at once.
+    pub spin_ns: u64,
+    /// What carries the messages: `SINEW_SOCKET_ONLY`, `SINEW_THROUGH_NODE`, `SINEW_SPIN_ADAPTIVE`. Default: shared memory
+    /// where the system has it, and direct links.
+    pub links: u32,
+    /// Zero.
+    pub reserved: u32,
 }
 
 /// What says how long the rest is.
@@ -92,7 +106,7 @@ impl Options {
         for kind in text::read_all(self.handled, self.handled_count, "options.handled")? {
             registration = registration.handles_named(kind);
         }
-        self.with_limits(self.with_events(registration)?)
+        self.with_links(self.with_limits(self.with_events(registration)?)?)
     }
 
     fn with_events(&self, mut registration: Registration) -> Result<Registration, Fault> {
@@ -106,6 +120,26 @@ impl Options {
             registration = registration.subscribe::<RequirementEvent>();
         }
         Ok(registration)
+    }
+
+    fn with_links(&self, mut registration: Registration) -> Result<Registration, Fault> {
+        if self.links & !(SINEW_SOCKET_ONLY | SINEW_THROUGH_NODE | SINEW_SPIN_ADAPTIVE) != 0
+            || self.reserved != 0
+        {
+            return Err(Fault::argument(format!("`options.links` is {:#x}: no such links", self.links)));
+        }
+        if self.links & SINEW_SOCKET_ONLY != 0 {
+            registration = registration.transport(Transport::Socket);
+        }
+        if self.links & SINEW_THROUGH_NODE != 0 {
+            registration = registration.direct(false);
+        }
+        let longest = Duration::from_nanos(self.spin_ns);
+        Ok(match (self.spin_ns, self.links & SINEW_SPIN_ADAPTIVE) {
+            (0, _) => registration,
+            (_, 0) => registration.spin(Spin::For(longest)),
+            (_, _) => registration.spin(Spin::Adaptive { max: longest }),
+        })
     }
 
     fn with_limits(&self, mut registration: Registration) -> Result<Registration, Fault> {
@@ -183,9 +217,22 @@ mod tests {
     }
 
     #[test]
+    fn links_are_chosen() {
+        let mut options = zeroed(size_of::<Options>());
+        (options.links, options.spin_ns) = (SINEW_SOCKET_ONLY | SINEW_SPIN_ADAPTIVE, 5_000);
+        let asked = format!("{:?}", options.registration().unwrap());
+        let max = Duration::from_micros(5);
+        let wanted = Registration::new().transport(Transport::Socket).spin(Spin::Adaptive { max });
+        assert_eq!(asked, format!("{wanted:?}"));
+    }
+
+    #[test]
     fn what_does_not_exist_cannot_be_asked_for() {
         let mut options = zeroed(size_of::<Options>());
         options.events = 4;
+        assert!(options.registration().is_err());
+        let mut options = zeroed(size_of::<Options>());
+        options.links = 8;
         assert!(options.registration().is_err());
         let mut options = zeroed(size_of::<Options>());
         options.inbox_capacity = INBOX_MAX + 1;

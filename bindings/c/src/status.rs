@@ -53,10 +53,12 @@ pub enum Status {
     SinewErrorForked = -17,
     /// A fault of this library. The endpoint can only be unregistered; all others go on.
     SinewErrorPanic = -18,
+    /// Memory for a message is lent in place; send or discard that message first. Nothing was sent.
+    SinewErrorLent = -19,
 }
 
 impl Status {
-    const ALL: [Self; 20] = [
+    const ALL: [Self; 21] = [
         Self::SinewOk,
         Self::SinewNothing,
         Self::SinewErrorInvalidArgument,
@@ -77,6 +79,7 @@ impl Status {
         Self::SinewErrorTooMany,
         Self::SinewErrorForked,
         Self::SinewErrorPanic,
+        Self::SinewErrorLent,
     ];
 
     /// The text for a number; for one that is no status it says so.
@@ -120,6 +123,9 @@ impl Status {
             Self::SinewErrorForked => {
                 c"this endpoint belongs to the process that this one was forked from; register an own one"
             }
+            Self::SinewErrorLent => {
+                c"memory for a message is lent in place; send or discard that message first"
+            }
             Self::SinewErrorPanic => {
                 c"a fault of this library; the endpoint can only be unregistered; please report it"
             }
@@ -161,10 +167,6 @@ impl Fault {
 }
 
 impl From<ApiError> for Fault {
-    #[allow(
-        clippy::wildcard_enum_match_arm,
-        reason = "the caller is at fault in what has no number of its own"
-    )]
     fn from(error: ApiError) -> Self {
         let sentence = error.to_string();
         let status = match error {
@@ -179,15 +181,11 @@ impl From<ApiError> for Fault {
             ApiError::Ended(_) => Status::SinewErrorNotHandled,
             ApiError::NoReply(_) => Status::SinewErrorNoReply,
             ApiError::Malformed(_) => Status::SinewErrorMalformed,
-            error if is_not_asked(&error) => Status::SinewErrorNotAsked,
-            _ => Status::SinewErrorInvalidArgument,
+            ApiError::NotAsked => Status::SinewErrorNotAsked,
+            ApiError::Lent => Status::SinewErrorLent,
         };
         Self::new(status, sentence)
     }
-}
-
-const fn is_not_asked(error: &ApiError) -> bool {
-    matches!(error, ApiError::NotAsked)
 }
 
 thread_local! {

@@ -82,6 +82,7 @@ static void groups_and_names(const char *socket)
     sinew::options options;
     options.name = "member";
     options.handled = {"test.wrapper"};
+    options.links = SINEW_SOCKET_ONLY;
     sinew::endpoint member(socket, options), sender(socket);
     EXPECT(sender.resolve("member", 10s) == member.address());
     EXPECT(member.node_name() == "knee");
