@@ -4,6 +4,7 @@
 //! has a `Handler<Delivery<P>>` for each. Everything that actix gives an actor (spawned futures, `run_later`, an
 //! `Addr`) works as usual.
 
+#[cfg_attr(not(target_os = "linux"), path = "alarm_elsewhere.rs")]
 mod alarm;
 mod away;
 mod context;

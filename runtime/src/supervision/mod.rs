@@ -16,14 +16,19 @@
 //! | `vitals` | its signs of life, and its fence |
 //! | `watchdog` | who does not come back |
 //! | `panics` | where a panic was |
+//! | `linux`, `elsewhere` | what the system does for a thread |
 //! | `fault` | faults on purpose, with the feature `fault-points` only |
 
 mod alone;
 mod child;
 pub mod core;
+#[cfg(not(target_os = "linux"))]
+mod elsewhere;
 #[cfg(feature = "fault-points")]
 pub mod fault;
 mod guard;
+#[cfg(target_os = "linux")]
+mod linux;
 mod orphans;
 mod panics;
 mod place;
@@ -35,6 +40,10 @@ mod threads;
 pub(crate) mod vitals;
 mod watchdog;
 
+#[cfg(not(target_os = "linux"))]
+use self::elsewhere as system;
+#[cfg(target_os = "linux")]
+use self::linux as system;
 pub use self::{
     alone::{Alone, AloneHandle, alone, overseen},
     core::{

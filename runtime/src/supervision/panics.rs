@@ -10,7 +10,10 @@ use std::{
     },
 };
 
-use super::vitals::{Doing, Vitals};
+use super::{
+    system,
+    vitals::{Doing, Vitals},
+};
 
 /// Whether this program unwinds from a panic. One that is built with `panic = "abort"` ends with its first panic, whatever
 /// supervisors it has. Cargo builds every crate of a program with the same strategy, so this crate's is the program's.
@@ -50,7 +53,7 @@ fn remember(info: &PanicHookInfo<'_>) {
             *last = place;
         }
     });
-    let thread = rustix::thread::gettid().as_raw_nonzero();
+    let thread = system::thread_id();
     match Vitals::present() {
         Some(vitals) => {
             vitals.begins(Doing::Panic, None);

@@ -7,6 +7,8 @@ use thread_priority::{
     thread_native_id,
 };
 
+use super::system;
+
 /// Where an actor runs: a thread with a name. Actors that name the same one share it; what they ask of it besides must be the
 /// same, too.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -130,17 +132,12 @@ impl Place {
     pub fn prepare(&self) {
         let name: Vec<u8> = self.thread.bytes().filter(|byte| *byte != 0).take(15).collect();
         if let Ok(name) = CString::new(name) {
-            // Only for people who look at the process; nothing depends on it.
-            let _ = rustix::thread::set_name(&name);
+            system::name_thread(&name);
         }
-        if let Some(cpu) = self.cpu {
-            let mut set = rustix::thread::CpuSet::new();
-            if cpu < rustix::thread::CpuSet::MAX_CPU {
-                set.set(cpu);
-            }
-            if let Err(error) = rustix::thread::sched_setaffinity(None, &set) {
-                tracing::warn!(thread = self.thread, cpu, %error, "the thread stays on any CPU; does this one exist?");
-            }
+        if let Some(cpu) = self.cpu
+            && let Err(error) = system::keep_on(cpu)
+        {
+            tracing::warn!(thread = self.thread, cpu, %error, "the thread stays on any CPU; does this one exist?");
         }
         if let Some(priority) = self.realtime_priority {
             self.make_realtime(priority);

@@ -11,14 +11,12 @@ use std::{
 };
 
 use actix_rt::{Arbiter, ArbiterHandle};
-use thread_priority::{
-    NormalThreadSchedulePolicy, ThreadId, ThreadPriority, ThreadSchedulePolicy,
-    set_thread_priority_and_policy, thread_native_id,
-};
+use thread_priority::{ThreadId, ThreadPriority, set_thread_priority_and_policy, thread_native_id};
 
 use super::{
     Place, Reason,
     place::Owner,
+    system,
     tenant::{Fate, Tenant, WeakTenant},
     watchdog::{Reprieve, Watchdog},
 };
@@ -77,9 +75,8 @@ impl Seat {
     pub(super) fn demote(&self) {
         let native = lock(&self.native);
         if let Some(native) = *native {
-            let policy = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Idle);
             // A system that refuses this has the thread go on as before: nothing here depends on it.
-            let _ = set_thread_priority_and_policy(native, ThreadPriority::Min, policy);
+            let _ = set_thread_priority_and_policy(native, ThreadPriority::Min, system::IDLE);
         }
     }
 
@@ -100,7 +97,7 @@ impl Seat {
 
     /// Sits down on the calling thread.
     fn occupy(self: Arc<Self>) {
-        self.tid.store(rustix::thread::gettid().as_raw_nonzero().get(), Ordering::Relaxed);
+        self.tid.store(system::thread_id(), Ordering::Relaxed);
         *lock(&self.native) = Some(thread_native_id());
         OCCUPIED.set(Some(Occupied(self)));
     }

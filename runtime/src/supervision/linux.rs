@@ -1,0 +1,28 @@
+//! What only Linux does for a thread: a number, a name for people, one CPU, idle scheduling.
+
+use std::ffi::CStr;
+
+use rustix::thread::{CpuSet, gettid, sched_setaffinity, set_name};
+use thread_priority::{NormalThreadSchedulePolicy, ThreadSchedulePolicy};
+
+/// Under this a thread runs only when the CPU has nothing else to do.
+pub(super) const IDLE: ThreadSchedulePolicy = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Idle);
+
+/// The kernel's number of the calling thread.
+pub(super) fn thread_id() -> i32 {
+    gettid().as_raw_nonzero().get()
+}
+
+/// Names the calling thread, for people who look at the process; nothing depends on it.
+pub(super) fn name_thread(name: &CStr) {
+    let _ = set_name(name);
+}
+
+/// Keeps the calling thread on one CPU.
+pub(super) fn keep_on(cpu: usize) -> std::io::Result<()> {
+    let mut set = CpuSet::new();
+    if cpu < CpuSet::MAX_CPU {
+        set.set(cpu);
+    }
+    Ok(sched_setaffinity(None, &set)?)
+}
