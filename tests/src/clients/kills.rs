@@ -203,8 +203,15 @@ impl Cast {
         let is_back = |now: &[Held]| {
             before.is_none_or(|before| now.iter().zip(before).all(|(now, before)| now.is_back_at(before)))
         };
-        // What is counted before it came to rest may only be too much, and that only the first time.
-        thread::sleep(Duration::from_millis(500));
+        // Links that are being made or ended count as neither.
+        let mut last = Vec::new();
+        until("nobody holds more or less than before", || {
+            thread::sleep(Duration::from_millis(300));
+            let counts: Vec<_> = now().iter().map(|held| (held.descriptors, held.memories)).collect();
+            let rests = counts == last;
+            last = counts;
+            rests.then_some(())
+        });
         while !is_back(&now()) && Instant::now() < end {
             thread::sleep(Duration::from_millis(20));
         }
@@ -225,6 +232,7 @@ pub fn run(plan: Plan) -> Report {
     let (kills, reference) = (plan.kills, plan.reference);
     let mut cast = Cast::new(plan);
     cast.end_some(WARM_UP, End::Killed);
+    cast.window();
     let before = cast.held_at_rest(None);
     let files = cast.files();
     (0..VICTIMS).for_each(|victim| cast.start(victim));

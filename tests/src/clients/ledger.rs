@@ -230,7 +230,15 @@ impl Ledger {
             }
             for number in 1..=track.sent {
                 match self.fate(*source, *way, track, number) {
-                    Ok(fate) => account.add(way.class, fate),
+                    Ok(fate) => {
+                        account.add(way.class, fate);
+                        if fate == Fate::InFlight {
+                            let Track { sent, runs, .. } = track;
+                            account.tell(format!(
+                                "on its way: {number} of {sent}, {source:?} to {way:?}, which got {runs:?}"
+                            ));
+                        }
+                    }
                     Err(fault) => account.fault(format!("{source:?} to {way:?}, number {number}: {fault}")),
                 }
                 account.handled += u64::from(track.handled.has(number));
@@ -338,8 +346,12 @@ impl Account {
 
     fn fault(&mut self, fault: String) {
         self.faults += 1;
+        self.tell(format!("FAULT {fault}"));
+    }
+
+    fn tell(&mut self, what: String) {
         if self.told.len() < FAULTS_TOLD {
-            self.told.push(fault);
+            self.told.push(what);
         }
     }
 
@@ -375,7 +387,7 @@ impl fmt::Display for Account {
             let [control, stream, bulk] = [Class::Control, Class::Stream, Class::Bulk].map(count);
             writeln!(f, "{:<20} {control:>10} {stream:>10} {bulk:>10}", format!("{fate:?}"))?;
         }
-        self.told.iter().try_for_each(|fault| writeln!(f, "FAULT {fault}"))
+        self.told.iter().try_for_each(|fault| writeln!(f, "{fault}"))
     }
 }
 
