@@ -93,8 +93,13 @@ impl Reference {
 /// What is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum What {
-    RoundTrips { bytes: usize, pace: Pace },
+    RoundTrips {
+        bytes: usize,
+        pace: Pace,
+    },
     TableOne,
+    /// The same with the receiver in C++.
+    TableOneCpp,
     FanIn,
     Flood,
 }
@@ -175,6 +180,9 @@ pub(crate) fn all(is_short: bool) -> impl Iterator<Item = Case> {
     let back_to_back = |bytes| What::RoundTrips { bytes, pace: Pace::BackToBack };
     let paced = What::RoundTrips { bytes: 1000, pace: Pace::EveryMillisecond };
     let mut things = vec![back_to_back(1000), paced, What::TableOne, What::FanIn, What::Flood];
+    if std::env::var_os(ends::CPP_ECHO).is_some() {
+        things.push(What::TableOneCpp);
+    }
     if !is_short {
         things.extend([8, 65_536, 1 << 20].map(back_to_back));
     }
@@ -185,6 +193,8 @@ pub(crate) fn all(is_short: bool) -> impl Iterator<Item = Case> {
         .flat_map(move |(way, pinning)| {
             things.clone().into_iter().map(move |what| Case { way, what, pinning })
         })
+        // In C++ there is the default way alone.
+        .filter(|case| case.what != What::TableOneCpp || case.way == Way::Ring)
 }
 
 impl Case {
@@ -193,6 +203,7 @@ impl Case {
         match self.what {
             What::RoundTrips { bytes, pace } => format!("{way}-{bytes}B-{}-{pinning}", pace.name()),
             What::TableOne => format!("{way}-table_1-{pinning}"),
+            What::TableOneCpp => format!("{way}-table_1_cpp-{pinning}"),
             What::FanIn => format!("{way}-fan_in-{pinning}"),
             What::Flood => format!("{way}-flood-{pinning}"),
         }
@@ -213,7 +224,8 @@ impl Case {
         self.pinning.pin(End::Measuring);
         match self.what {
             What::RoundTrips { bytes, pace } => self.round_trips(bytes, pace, is_short),
-            What::TableOne => self.table_one(),
+            What::TableOne => self.table_one("echo"),
+            What::TableOneCpp => self.table_one("cpp_echo"),
             What::FanIn => self.fan_in(if is_short { 150 } else { 1_500 }),
             What::Flood => self.flood(if is_short { 20_480 } else { 204_800 }),
         }
@@ -241,8 +253,8 @@ impl Case {
         }
     }
 
-    fn table_one(self) {
-        let crowds::Ages { figures, mean_ns, first_ns } = ends::table_one(self.way, self.pinning);
+    fn table_one(self, echo: &str) {
+        let crowds::Ages { figures, mean_ns, first_ns } = ends::table_one(self.way, self.pinning, echo);
         let counts = [("mean_ns", mean_ns), ("first_ns", first_ns), ("paper_mean_ns", PAPER_MEAN_NS)];
         self.report("one way", &figures, &counts);
     }
@@ -296,6 +308,10 @@ pub(crate) fn play(role: &str) -> ExitCode {
         ["echo", way, pinning, socket] => {
             raw::pin(pinning, End::Echoing);
             ends::echo(way_named(way), socket);
+        }
+        ["cpp_echo", _, pinning, socket] => {
+            raw::pin(pinning, End::Echoing);
+            ends::become_cpp_echo(socket);
         }
         ["sink", way, pinning, socket] => {
             raw::pin(pinning, End::Echoing);

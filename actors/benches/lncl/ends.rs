@@ -1,6 +1,6 @@
 //! Sinew's ends: the node, and two applications in processes of their own, by the blocking NodeAPI.
 
-use std::{path::PathBuf, time::Duration};
+use std::{os::unix::process::CommandExt, path::PathBuf, process::Command, time::Duration};
 
 use sinew::{Endpoint, NodeApi, Registration, Spin, Transport, prelude::*};
 use sinew_figures::Figures;
@@ -88,6 +88,15 @@ pub(crate) fn echo(way: Way, socket: &str) {
     }
 }
 
+/// The environment variable that names the program that `echo.cpp` was compiled to.
+pub(crate) const CPP_ECHO: &str = "SINEW_CPP_ECHO";
+
+/// The same in C++, in this process's place.
+pub(crate) fn become_cpp_echo(socket: &str) {
+    let program = std::env::var_os(CPP_ECHO).expect("it was there when the cases were chosen");
+    panic!("no echo in C++: {}", Command::new(program).arg(socket).exec());
+}
+
 /// The application that measures, and the one that echoes.
 struct Pair {
     endpoint: Endpoint,
@@ -97,9 +106,9 @@ struct Pair {
 }
 
 impl Pair {
-    fn start(way: Way, pinning: Pinning) -> Self {
+    fn start(way: Way, pinning: Pinning, echo: &str) -> Self {
         let home = Home::start(pinning);
-        let echo = Process::start(&role("echo", way, pinning, home.socket()));
+        let echo = Process::start(&role(echo, way, pinning, home.socket()));
         let mut endpoint = register(way, home.socket(), "ping");
         let to = endpoint.resolve("echo", DEADLINE).expect("the node lives").expect("it is registered");
         Self { endpoint, to, _echo: echo, _home: home }
@@ -117,13 +126,13 @@ impl Pair {
 
 /// Round trips between two applications.
 pub(crate) fn round_trips(way: Way, bytes: usize, rounds: Rounds, pinning: Pinning) -> Figures {
-    let (mut pair, mut buffer) = (Pair::start(way, pinning), vec![7; bytes]);
+    let (mut pair, mut buffer) = (Pair::start(way, pinning, "echo"), vec![7; bytes]);
     rounds.time(|| pair.round_trip(BLOCK, &mut buffer))
 }
 
 /// The paper's test: how old each of the first 1024 packets is when it is received.
-pub(crate) fn table_one(way: Way, pinning: Pinning) -> Ages {
-    let (mut pair, mut packet) = (Pair::start(way, pinning), vec![7; PACKET]);
+pub(crate) fn table_one(way: Way, pinning: Pinning, echo: &str) -> Ages {
+    let (mut pair, mut packet) = (Pair::start(way, pinning, echo), vec![7; PACKET]);
     let ages = (0..TABLE_ONE).map(|_| {
         pair.round_trip(AGED, &mut packet);
         packet.first_chunk().map_or(0, |bytes| u64::from_le_bytes(*bytes))
