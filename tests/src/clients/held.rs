@@ -9,8 +9,9 @@ pub struct Held {
     pub descriptors: usize,
     /// Mappings of memory that has no file.
     pub memories: usize,
-    /// Its share of the memory that it has mapped.
-    pub proportional_kib: u64,
+    /// What it has touched of memory that has no file: its own, and rings. Not its share of the program's text, which grows when
+    /// another process of the same program ends.
+    pub own_kib: u64,
     /// The memory that it has mapped and touched.
     pub resident_kib: u64,
 }
@@ -20,16 +21,16 @@ impl Held {
     #[must_use]
     pub fn of(process: u32) -> Self {
         let read = |name: &str| fs::read_to_string(format!("/proc/{process}/{name}")).unwrap_or_default();
-        let rollup = read("smaps_rollup");
+        let status = read("status");
         let kib = |name: &str| {
-            let line = rollup.lines().find(|line| line.starts_with(name));
+            let line = status.lines().find(|line| line.starts_with(name));
             line.and_then(|line| line.split_whitespace().nth(1)?.parse().ok()).unwrap_or_default()
         };
         Self {
             descriptors: fs::read_dir(format!("/proc/{process}/fd")).map_or(0, Iterator::count),
             memories: read("maps").lines().filter(|line| line.contains("memfd:")).count(),
-            proportional_kib: kib("Pss:"),
-            resident_kib: kib("Rss:"),
+            own_kib: kib("RssAnon:") + kib("RssShmem:"),
+            resident_kib: kib("VmRSS:"),
         }
     }
 
@@ -42,10 +43,10 @@ impl Held {
 
 impl fmt::Display for Held {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { descriptors, memories, proportional_kib, resident_kib } = self;
+        let Self { descriptors, memories, own_kib, resident_kib } = self;
         write!(
             f,
-            "{descriptors:>4} descriptors {memories:>4} memory files mapped {proportional_kib:>7} KiB (PSS) {resident_kib:>7} KiB (RSS)"
+            "{descriptors:>4} descriptors {memories:>4} memory files mapped {own_kib:>7} KiB without a file {resident_kib:>7} KiB (RSS)"
         )
     }
 }

@@ -226,7 +226,7 @@ impl Drop for EndsIt<'_> {
 fn watch(process: u32, over: &AtomicBool) -> u64 {
     let mut most = 0;
     while !over.load(Ordering::Relaxed) {
-        most = most.max(Held::of(process).proportional_kib);
+        most = most.max(Held::of(process).own_kib);
         thread::sleep(LOOK);
     }
     most
@@ -264,6 +264,6 @@ pub fn run(plan: Plan) -> Report {
         assert!(status.success(), "one of the others ended with {status}");
     }
     cast.stage.end();
-    let grown_kib = most.max(held.1.proportional_kib).saturating_sub(before.proportional_kib);
+    let grown_kib = most.max(held.1.own_kib).saturating_sub(before.own_kib);
     Report { seconds, tally, refused, grown_kib, held, windows: [alone, attacked] }
 }

@@ -65,7 +65,7 @@ impl Report {
     #[must_use]
     pub fn holds(&self) -> bool {
         let is_back = |(_, before, after): &(&str, Held, Held)| {
-            after.is_back_at(before) && after.proportional_kib <= before.proportional_kib + GROWTH_MAX_KIB
+            after.is_back_at(before) && after.own_kib <= before.own_kib + GROWTH_MAX_KIB
         };
         self.left.is_empty()
             && self.ended_by_themselves == 0

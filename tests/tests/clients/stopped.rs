@@ -147,7 +147,7 @@ fn a_stopped_client_fills_what_is_its_own_and_gets_what_its_classes_promise_when
     let window = scene.others_flow();
     assert_eq!(window.failed, 0, "{window}");
     let held = Held::of(scene.stage.node_id());
-    let grown = held.proportional_kib.saturating_sub(before.proportional_kib);
+    let grown = held.own_kib.saturating_sub(before.own_kib);
     assert!(grown <= BOUND_KIB, "the node has grown by {grown} KiB of {BOUND_KIB}: {held}");
     assert_eq!(scene.got.all().len(), 0, "it is stopped");
 

@@ -236,7 +236,13 @@ fn each_class_comes_in_order_across_the_switch() {
     let (mut one, mut other) = (endpoint(&node), endpoint(&node));
     let to = other.tid();
     let sending = thread::spawn(move || {
+        let deadline = Time::now() + WATCHDOG;
         for number in 1..=2_000_u64 {
+            // The first go through the node. The link stands before the last, however quick they are.
+            while number == 1_000 && !one.direct.open.iter().any(|link| link.peer == to) {
+                assert!(Time::now() < deadline, "waited for a link to {to}");
+                assert!(one.receive(Duration::from_millis(1)).unwrap().is_none());
+            }
             one.send(to, &Counted(number)).unwrap();
             one.send(to, &Hurried(number)).unwrap();
             // It has to look to learn that the link stands.
