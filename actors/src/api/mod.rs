@@ -109,7 +109,7 @@ pub struct Registration {
 impl Default for Registration {
     fn default() -> Self {
         Self {
-            register: Register { pid: std::process::id(), direct: true, ..Register::default() },
+            register: Register { pid: std::process::id(), ..Register::default() },
             deadline: Duration::from_secs(60),
             inbox_capacity: 256,
             link: LinkOptions {
@@ -193,9 +193,9 @@ impl Registration {
     }
 
     /// Whether messages to and from other processes of the node may go directly, through rings of their own, where LNCL
-    /// introduces the two; else all of them go through the node. A link is made at the first message to another process. It
-    /// costs a ring of each side, and some time in the call in which it is made. Default true; only with
-    /// [`Transport::Ring`].
+    /// introduces the two and both want it; else all of them go through the node. A link is made at the first message to
+    /// another process. It costs a ring of each side, allocated at once, and some time in the call in which it is made.
+    /// Default false; only with [`Transport::Ring`].
     #[must_use]
     pub const fn direct(mut self, direct: bool) -> Self {
         self.register.direct = direct;

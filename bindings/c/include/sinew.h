@@ -58,9 +58,9 @@
 #define SINEW_SOCKET_ONLY 1
 
 /**
- * For `links` of `sinew_options`: all through the node, no direct link to another process.
+ * For `links` of `sinew_options`: direct links to other processes that ask for them too.
  */
-#define SINEW_THROUGH_NODE 2
+#define SINEW_DIRECT 2
 
 /**
  * For `links` of `sinew_options`: `spin_ns` is the longest to look; it looks as long as messages lately took to come.
@@ -353,8 +353,8 @@ typedef struct sinew_options {
      */
     uint64_t spin_ns;
     /**
-     * What carries the messages: `SINEW_SOCKET_ONLY`, `SINEW_THROUGH_NODE`, `SINEW_SPIN_ADAPTIVE`. Default: shared memory
-     * where the system has it, and direct links.
+     * What carries the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT`, `SINEW_SPIN_ADAPTIVE`. Default: shared memory
+     * where the system has it, all through the node.
      */
     uint32_t links;
     /**

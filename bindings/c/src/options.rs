@@ -15,8 +15,8 @@ pub const SINEW_NODE_EVENTS: u32 = 1;
 pub const SINEW_REQUIREMENT_EVENTS: u32 = 2;
 /// For `links` of `sinew_options`: through the unix socket alone, no shared memory.
 pub const SINEW_SOCKET_ONLY: u32 = 1;
-/// For `links` of `sinew_options`: all through the node, no direct link to another process.
-pub const SINEW_THROUGH_NODE: u32 = 2;
+/// For `links` of `sinew_options`: direct links to other processes that ask for them too.
+pub const SINEW_DIRECT: u32 = 2;
 /// For `links` of `sinew_options`: `spin_ns` is the longest to look; it looks as long as messages lately took to come.
 pub const SINEW_SPIN_ADAPTIVE: u32 = 4;
 
@@ -51,8 +51,8 @@ pub struct Options {
     /// How long a waiting thread looks before it sleeps. Looking keeps a CPU busy and saves the wake, which is most of a
     /// short message's way: for a thread with a CPU of its own. Default: it sleeps at once.
     pub spin_ns: u64,
-    /// What carries the messages: `SINEW_SOCKET_ONLY`, `SINEW_THROUGH_NODE`, `SINEW_SPIN_ADAPTIVE`. Default: shared memory
-    /// where the system has it, and direct links.
+    /// What carries the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT`, `SINEW_SPIN_ADAPTIVE`. Default: shared memory
+    /// where the system has it, all through the node.
     pub links: u32,
     /// Zero.
     pub reserved: u32,
@@ -123,16 +123,14 @@ impl Options {
     }
 
     fn with_links(&self, mut registration: Registration) -> Result<Registration, Fault> {
-        if self.links & !(SINEW_SOCKET_ONLY | SINEW_THROUGH_NODE | SINEW_SPIN_ADAPTIVE) != 0
-            || self.reserved != 0
-        {
+        if self.links & !(SINEW_SOCKET_ONLY | SINEW_DIRECT | SINEW_SPIN_ADAPTIVE) != 0 || self.reserved != 0 {
             return Err(Fault::argument(format!("`options.links` is {:#x}: no such links", self.links)));
         }
         if self.links & SINEW_SOCKET_ONLY != 0 {
             registration = registration.transport(Transport::Socket);
         }
-        if self.links & SINEW_THROUGH_NODE != 0 {
-            registration = registration.direct(false);
+        if self.links & SINEW_DIRECT != 0 {
+            registration = registration.direct(true);
         }
         let longest = Duration::from_nanos(self.spin_ns);
         Ok(match (self.spin_ns, self.links & SINEW_SPIN_ADAPTIVE) {

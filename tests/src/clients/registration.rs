@@ -9,7 +9,7 @@ use sinew::{ApiError, AppAddress, Endpoint, NodeApi, Registration, Transport};
 
 use crate::DEADLINE;
 
-/// The environment's word for what carries messages: `socket` or `ring`; else what is usual.
+/// The environment's word for what carries messages: `socket`, `ring`, or `direct` (rings, and direct links); else what is usual.
 const TRANSPORT: &str = "SINEW_TEST_TRANSPORT";
 
 /// The fixed address number `index`.
@@ -24,7 +24,8 @@ pub(super) fn wishes() -> Registration {
     match std::env::var(TRANSPORT).as_deref() {
         Ok("socket") => registration.transport(Transport::Socket),
         Ok("ring") => registration.transport(Transport::Ring),
-        Ok(other) => panic!("{TRANSPORT} is {other:?}, neither \"socket\" nor \"ring\""),
+        Ok("direct") => registration.transport(Transport::Ring).direct(true),
+        Ok(other) => panic!("{TRANSPORT} is {other:?}: none of socket, ring, direct"),
         Err(_) => registration,
     }
 }

@@ -110,7 +110,7 @@ pub(super) fn play_pinger(arguments: &[String]) {
 /// `SOCKET NAME`: answers questions, and lets go of everything else.
 pub(super) fn play_taker(arguments: &[String]) {
     let api = NodeApi::connect(&arguments[0]).expect("the door is open");
-    let endpoint = register(&api, &wishes().name(&*arguments[1]));
+    let endpoint = register(&api, &wishes().direct(true).name(&*arguments[1]));
     let over = Arc::new(AtomicBool::new(false));
     let ends = over.clone();
     let taker = thread::spawn(move || take(endpoint, &ends));

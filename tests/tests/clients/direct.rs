@@ -32,7 +32,8 @@ impl Scene {
         let ups = Log::default();
         let echo = start_echo(&stage, &ups, 1);
         let api = NodeApi::connect(stage.socket()).expect("the door is open");
-        let mut asking = api.register_transport_address(Registration::new()).expect("an address");
+        let mut asking =
+            api.register_transport_address(Registration::new().direct(true)).expect("an address");
         let to = asking.resolve("echo", DEADLINE).expect("the node answers").expect("it is registered");
         Self { stage, echo, asking, to, ups }
     }

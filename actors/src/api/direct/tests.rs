@@ -53,7 +53,7 @@ fn register(node: &TestNode, registration: Registration) -> Endpoint {
 }
 
 fn endpoint(node: &TestNode) -> Endpoint {
-    register(node, Registration::new())
+    register(node, Registration::new().direct(true))
 }
 
 fn has_link(from: &Endpoint, to: &Endpoint) -> bool {
@@ -341,7 +341,7 @@ fn of_a_stream_the_newest_value_waits_for_room_in_the_ring() {
 #[test]
 fn a_peer_that_takes_nothing_costs_a_sender_its_patience_and_not_the_link() {
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let mut one = register(&node, Registration::new().patience(Duration::from_millis(10)));
+    let mut one = register(&node, Registration::new().direct(true).patience(Duration::from_millis(10)));
     let mut other = endpoint(&node);
     link(&mut one, &mut other);
     let mut taken = 0;
