@@ -24,35 +24,38 @@ pub(crate) enum Way {
     Socket,
     /// Rings from each to the node.
     Ring,
+    /// Rings from each to the other, once they are introduced.
+    Direct,
     /// The same, the applications looking before they sleep.
-    RingSpin,
+    DirectSpin,
 }
 
 impl Way {
-    const ALL: [Self; 3] = [Self::Socket, Self::Ring, Self::RingSpin];
+    const ALL: [Self; 4] = [Self::Socket, Self::Ring, Self::Direct, Self::DirectSpin];
 
     const fn name(self) -> &'static str {
         match self {
             Self::Socket => "socket",
             Self::Ring => "ring",
-            Self::RingSpin => "ring_spin",
+            Self::Direct => "direct",
+            Self::DirectSpin => "direct_spin",
         }
     }
 
     const fn references(self) -> &'static [Reference] {
         match self {
-            Self::Socket | Self::Ring => {
+            Self::Socket | Self::Ring | Self::Direct => {
                 &[Reference::BareFutex, Reference::UnixStream, Reference::Iceoryx2Event]
             }
-            Self::RingSpin => &[Reference::BarePoll, Reference::Iceoryx2Poll],
+            Self::DirectSpin => &[Reference::BarePoll, Reference::Iceoryx2Poll],
         }
     }
 
     /// Who looks without sleeping needs the other one to have another CPU.
     const fn spins(self) -> bool {
         match self {
-            Self::Socket | Self::Ring => false,
-            Self::RingSpin => true,
+            Self::Socket | Self::Ring | Self::Direct => false,
+            Self::DirectSpin => true,
         }
     }
 }

@@ -64,8 +64,9 @@ pub(crate) fn node(socket: &str) {
 pub(crate) fn register(way: Way, socket: &str, name: &str) -> Endpoint {
     let registration = match way {
         Way::Socket => Registration::new().transport(Transport::Socket),
-        Way::Ring => Registration::new().direct(true),
-        Way::RingSpin => Registration::new().direct(true).spin(Spin::For(LOOKS)),
+        Way::Ring => Registration::new(),
+        Way::Direct => Registration::new().direct(true),
+        Way::DirectSpin => Registration::new().direct(true).spin(Spin::For(LOOKS)),
     };
     let api = NodeApi::connect(socket).expect("the node's door");
     api.register_transport_address(registration.name(name)).expect("an address")
