@@ -342,13 +342,18 @@ impl Root {
         self.apps.add(id, app, tid, mailbox.clone());
         let wiring = AppWiring { sender, mailbox };
         self.absences.keep(id, app.absence(wiring.clone()));
+        let mut policy = app.policy().clone();
+        if hosted.is_some() && policy.progress_within.is_some() {
+            // Its process is held to it. The link shares a thread with the node's layers, and is judged as they are.
+            policy.progress_within = Policy::default().progress_within;
+        }
         let (place, launch) = match hosted {
             Some(link) => (Place::io(), link.launch(&self.stores, wiring.sender, app)),
             None => (app.place().clone(), app.launch(wiring)),
         };
         #[cfg(feature = "fault-points")]
         let launch = super::faults::arm(&self.stores, app, launch);
-        let (name, policy) = (app.name().to_owned(), app.policy().clone());
+        let name = app.name().to_owned();
         Ok(ChildSpec { id, name, tid: Some(tid), policy, place, launch })
     }
 

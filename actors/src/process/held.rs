@@ -58,7 +58,7 @@ impl Process {
         timeout(time, self.ended()).await.ok()
     }
 
-    /// Resolves when it has ended. It is reaped then.
+    /// Resolves when it has ended. It is reaped when this is dropped.
     pub(super) async fn ended(&self) -> String {
         loop {
             // An error of the reactor's means that nothing will be told by it: what can be known is asked for.

@@ -25,7 +25,7 @@ use tokio::sync::oneshot;
 
 use super::words::VARIABLE;
 
-/// Orders that wait for the thread at most. When full: a start fails and is tried again, and a process that was killed
+/// Orders that wait for the thread at most. When full: a start fails and is tried again, and a process that has ended
 /// stays in the kernel's table.
 const ORDERS_MAX: usize = 1_024;
 /// Time between two looks at processes that were killed and have not ended: the first one, doubled up to the last.
@@ -35,7 +35,7 @@ const REAPING_MAX: Duration = Duration::from_millis(256);
 /// A process that has just been started.
 pub(super) struct Started {
     pub(super) pid: Pid,
-    /// It owns the process: whoever drops it reaps it before, or hands it to [`reap`].
+    /// It owns the process: whoever drops it hands it to [`reap`].
     pub(super) pidfd: Arc<OwnedFd>,
     pub(super) socket: UnixStream,
 }
@@ -62,18 +62,18 @@ pub(super) async fn start(variable: String) -> Result<Started, String> {
     started.await.map_err(|_| "the thread that starts processes has ended".to_owned())?
 }
 
-/// Takes care of the end of a process that was killed.
+/// Reaps a process that has ended, or was killed. Not on the calling thread: the kernel may take its time to clear away what
+/// it knows of the process, longer than a thread of the node's may stand still.
 pub(super) fn reap(pidfd: Arc<OwnedFd>) {
-    if !has_been_reaped(&pidfd)
-        && let Err(why) = order(Order::Reap(pidfd))
-    {
-        tracing::error!(why, "a process that was killed is not reaped");
+    if let Err(why) = order(Order::Reap(pidfd)) {
+        tracing::error!(why, "a process that has ended is not reaped");
     }
 }
 
-/// How a process has ended; `None` if it has not, or if that cannot be known.
+/// How a process has ended; `None` if it has not, or if that cannot be known. It is left to be reaped.
 pub(super) fn ending_of(pidfd: &OwnedFd) -> rustix::io::Result<Option<WaitIdStatus>> {
-    waitid(WaitId::PidFd(pidfd.as_fd()), WaitIdOptions::EXITED | WaitIdOptions::NOHANG)
+    let look = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
+    waitid(WaitId::PidFd(pidfd.as_fd()), look)
 }
 
 fn order(order: Order) -> Result<(), String> {
@@ -121,8 +121,9 @@ fn run(inbox: &Receiver<Order>) {
 }
 
 fn has_been_reaped(pidfd: &OwnedFd) -> bool {
+    let reaped = waitid(WaitId::PidFd(pidfd.as_fd()), WaitIdOptions::EXITED | WaitIdOptions::NOHANG);
     // An error says that it is nobody's child any more.
-    !matches!(ending_of(pidfd), Ok(None))
+    !matches!(reaped, Ok(None))
 }
 
 fn start_now(variable: &str) -> Result<Started, String> {
@@ -150,5 +151,27 @@ fn start_now(variable: &str) -> Result<Started, String> {
             let _ = child.wait();
             Err(format!("no descriptor for the process: {cause}; raise `ulimit -n`"))
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rustix::event::{PollFd, PollFlags, poll};
+
+    use super::*;
+
+    #[test]
+    #[expect(clippy::zombie_processes, reason = "reaping it is what is tried")]
+    fn who_looks_how_a_process_has_ended_leaves_it_to_be_reaped() {
+        let child = Command::new("true").spawn().expect("a program that every system has");
+        let pid = Pid::from_child(&child);
+        let pidfd = pidfd_open(pid, PidfdFlags::empty()).expect("it is a child of ours");
+        poll(&mut [PollFd::new(&pidfd, PollFlags::IN)], None).expect("it ends");
+        for _ in 0..2 {
+            let status = ending_of(&pidfd).expect("it is not reaped yet").expect("it has ended");
+            assert_eq!(status.exit_status(), Some(0));
+        }
+        assert!(has_been_reaped(&pidfd));
+        assert!(ending_of(&pidfd).is_err(), "there is nothing left of it");
     }
 }
