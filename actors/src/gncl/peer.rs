@@ -12,7 +12,7 @@ use sinew_runtime::{
     router::{Outlet, Refused},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
-    wire::{Flags, Header, Kind, Message},
+    wire::{Header, Kind, Message},
 };
 use socket2::SockRef;
 use tokio::net::TcpStream;
@@ -66,27 +66,10 @@ impl Outlet for Peer {
 /// The outcome of a message that came from this peer goes back to it. spec: GNCL-12
 impl ReceiptSink for Peer {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
-        let mut header = Header::new(Kind::OUTCOME, ticket.destination, ticket.source);
-        header.flags = Flags::OUTCOME;
-        header.correlation = ticket.correlation;
-        header.sent = Time::now();
-        self.send(Message::new(header, code_of(outcome)));
+        let mut said = Message::outcome(ticket, outcome);
+        said.header.sent = Time::now();
+        self.send(said);
     }
-}
-
-/// The payload of an OUTCOME, without asking for memory.
-fn code_of(outcome: Outcome) -> Bytes {
-    static CODES: [u8; 256] = {
-        let mut codes = [0; 256];
-        let mut code = 0;
-        while code < codes.len() {
-            codes[code] = code as u8;
-            code += 1;
-        }
-        codes
-    };
-    let at = usize::from(outcome.code());
-    Bytes::from_static(&CODES[at..=at])
 }
 
 /// A frame from this node's GNCL to that of `node`.

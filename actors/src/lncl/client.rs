@@ -2,7 +2,7 @@
 
 use std::{io, ops::ControlFlow, rc::Rc, sync::Arc, time::Duration};
 
-use bytes::{Bytes, BytesMut};
+use bytes::BytesMut;
 use rustix::net::Shutdown;
 use sinew_runtime::{
     monitor::DownClass,
@@ -384,7 +384,8 @@ impl Client {
     }
 
     fn tell(&self, about: Tid, correlation: u64, outcome: Outcome) {
-        self.say(outcome_frame(about, self.tid, correlation, outcome));
+        let ticket = Ticket { source: self.tid, destination: about, correlation };
+        self.say(Message::outcome(ticket, outcome));
     }
 
     fn say(&self, message: Message) {
@@ -546,17 +547,9 @@ struct OutcomeSink(Arc<ClientOutlet>);
 
 impl ReceiptSink for OutcomeSink {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
-        let Ticket { source, destination, correlation } = ticket;
         // Not taken: the client is gone, or does not read; its own deadline says `Unknown`.
-        let _ = self.0.submit(outcome_frame(destination, source, correlation, outcome));
+        let _ = self.0.submit(Message::outcome(ticket, outcome));
     }
-}
-
-fn outcome_frame(about: Tid, client: Tid, correlation: u64, outcome: Outcome) -> Message {
-    let mut header = Header::new(Kind::OUTCOME, about, client);
-    header.flags = Flags::OUTCOME;
-    header.correlation = correlation;
-    Message::new(header, Bytes::copy_from_slice(&[outcome.code()]))
 }
 
 fn limits(stores: &Stores) -> OutletLimits {

@@ -15,7 +15,6 @@ use std::{
     },
 };
 
-use bytes::Bytes;
 use rustix::{
     io::Errno,
     net::{
@@ -27,7 +26,7 @@ use sinew_runtime::{
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     router::Outlet,
     tid::{AppAddress, Tid},
-    wire::{Class, Flags, Header, Kind, Message},
+    wire::{Class, Flags, Kind, Message},
 };
 
 use super::payload::{self, Introduction, Switch};
@@ -222,9 +221,7 @@ fn told(kind: Kind, to: &Party, peer: &Party, number: u64) -> Message {
 }
 
 fn outcome_frame(about: Tid, to: Tid, outcome: Outcome) -> Message {
-    let mut header = Header::new(Kind::OUTCOME, about, to);
-    header.flags = Flags::OUTCOME;
-    Message::new(header, Bytes::copy_from_slice(&[outcome.code()]))
+    Message::outcome(Ticket { source: to, destination: about, correlation: 0 }, outcome)
 }
 
 fn pair() -> Result<(OwnedFd, OwnedFd), Errno> {

@@ -11,7 +11,6 @@ use std::{
     },
 };
 
-use bytes::Bytes;
 use sinew_runtime::{
     app::DynApp,
     mailbox::{Lender, Mailbox},
@@ -306,12 +305,9 @@ struct OutcomeSink(Arc<Link>);
 
 impl ReceiptSink for OutcomeSink {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
-        let mut header = Header::new(Kind::OUTCOME, ticket.destination, ticket.source);
-        header.flags = Flags::OUTCOME;
-        header.correlation = ticket.correlation;
         // Not taken: the child is gone, or does not read; its own deadline says `Unknown`. A later process of this TID
         // has other correlations.
-        let _ = self.0.say(Message::new(header, Bytes::copy_from_slice(&[outcome.code()])));
+        let _ = self.0.say(Message::outcome(ticket, outcome));
     }
 }
 
@@ -319,6 +315,7 @@ impl ReceiptSink for OutcomeSink {
 mod tests {
     use std::{sync::mpsc::sync_channel, time::Duration};
 
+    use bytes::Bytes;
     use sinew_runtime::{
         pending::Pending,
         sender::Directory,

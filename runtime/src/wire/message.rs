@@ -6,9 +6,9 @@ use bytes::{Bytes, BytesMut};
 use serde::{Serialize, de::DeserializeOwned};
 
 use crate::{
-    outcome::{Outcome, Receipt, Rejection},
+    outcome::{Outcome, Receipt, Rejection, Ticket},
     tid::Tid,
-    wire::{Class, Header, Kind, memory},
+    wire::{Class, Flags, Header, Kind, memory},
 };
 
 /// A type that travels as MessagePack (a map with field names, so that any language can read it).
@@ -59,6 +59,15 @@ impl Message {
         Self { header, payload, receipt: None }
     }
 
+    /// What became of the message that `ticket` names, for the one who sent it. Takes no memory.
+    #[must_use]
+    pub fn outcome(ticket: Ticket, outcome: Outcome) -> Self {
+        let mut header = Header::new(Kind::OUTCOME, ticket.destination, ticket.source);
+        header.flags = Flags::OUTCOME;
+        header.correlation = ticket.correlation;
+        Self::new(header, code_of(outcome))
+    }
+
     /// A message of the given type, in its own class.
     ///
     /// # Panics
@@ -95,6 +104,21 @@ impl Message {
     pub fn size(&self) -> usize {
         super::HEADER_LEN + self.payload.len()
     }
+}
+
+/// The payload of an OUTCOME, without asking for memory.
+fn code_of(outcome: Outcome) -> Bytes {
+    static CODES: [u8; 256] = {
+        let mut codes = [0; 256];
+        let mut code = 0;
+        while code < codes.len() {
+            codes[code] = code as u8;
+            code += 1;
+        }
+        codes
+    };
+    let at = usize::from(outcome.code());
+    Bytes::from_static(&CODES[at..=at])
 }
 
 /// The MessagePack form of `value`.

@@ -8,7 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use bytes::{Bytes, BytesMut};
+use bytes::BytesMut;
 use rustix::{
     event::PollFlags,
     net::{RecvFlags, Shutdown, recv},
@@ -16,7 +16,7 @@ use rustix::{
 use sinew_runtime::{
     outcome::{Outcome, ReceiptSink, Ticket},
     time::Time,
-    wire::{Flags, FrameCodec, HEADER_LEN, Header, Kind, Message},
+    wire::{FrameCodec, HEADER_LEN, Kind, Message},
 };
 use sinew_shm::{
     Any, AnyError, BellKind, Capacity, Consumer, Ends, HangUp, LoanError, Producer, Region, RoomError, Spin,
@@ -222,12 +222,9 @@ impl Writer {
 
 impl ReceiptSink for Writer {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
-        let mut header = Header::new(Kind::OUTCOME, ticket.destination, ticket.source);
-        header.flags = Flags::OUTCOME;
-        header.correlation = ticket.correlation;
         let mut owed = self.owed.lock().unwrap_or_else(PoisonError::into_inner);
         if owed.len() < OWED_MAX {
-            owed.push_back(Message::new(header, Bytes::copy_from_slice(&[outcome.code()])));
+            owed.push_back(Message::outcome(ticket, outcome));
         }
         drop(owed);
         self.pay();

@@ -7,7 +7,7 @@ use std::{
     time::Duration,
 };
 
-use bytes::{Bytes, BytesMut};
+use bytes::BytesMut;
 use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
     io::Errno,
@@ -16,7 +16,7 @@ use rustix::{
 use sinew_runtime::{
     outcome::{Outcome, ReceiptSink, Ticket},
     time::Time,
-    wire::{Flags, FrameCodec, Header, Kind, Message},
+    wire::{FrameCodec, Message},
 };
 use tokio_util::codec::Decoder;
 
@@ -101,11 +101,8 @@ impl Writer {
 
 impl ReceiptSink for Writer {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
-        let mut header = Header::new(Kind::OUTCOME, ticket.destination, ticket.source);
-        header.flags = Flags::OUTCOME;
-        header.correlation = ticket.correlation;
         // If it cannot be said the connection has ended, and the node tells the sender so.
-        let _ = self.write(&Message::new(header, Bytes::copy_from_slice(&[outcome.code()])));
+        let _ = self.write(&Message::outcome(ticket, outcome));
     }
 }
 
