@@ -3,32 +3,24 @@
 use std::{path::Path, sync::Arc, time::Duration};
 
 use sinew_runtime::{
-    outcome::{Outcome, Rejection},
+    outcome::Outcome,
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
-    wire::{Class, Flags, Header, Kind, Message, MessageBuffer, Payload},
+    wire::{Flags, Header, Kind, Message, MessageBuffer, Payload},
 };
 
 use super::{
     ApiError, Received, Registration, Transport,
-    direct::{Came, Direct, Everything, Sent, Terms, ToNode},
-    inbox::{Answer, Awaited, Inbox, Sorted},
-    link::{Ended, Greeting, Link, Read, Reader, Writer},
+    direct::{Direct, Terms},
+    inbox::{Answer, Awaited, Inbox},
+    incoming::WhenFull,
+    link::{Ended, Greeting, Link, Reader, Writer},
     returning::Home,
-    routes::LinkNumber,
 };
-use crate::{
-    lncl::payload::{self, Group, Registered, Resolve},
-    ring::Taken,
-};
+use crate::lncl::payload::{self, Group, Registered, Resolve};
 
 /// Time that the node has to answer what it answers at once.
 const PROMPT: Duration = Duration::from_secs(2);
-/// Chunks of 64 KiB that are read before the caller has its turn. In tests each read is the last of its look: a message
-/// that ends with it must not be left lying until more comes.
-const READS_PER_LOOK: usize = if cfg!(test) { 1 } else { 16 };
-/// Looks for the last words of a node that has gone.
-const LAST_LOOKS: usize = 64;
 pub(super) const LNCL: Tid = payload::lncl_of(NodeAddress::HERE);
 
 /// A registered transport address: sends and receives, from one thread at a time.
@@ -43,7 +35,7 @@ pub struct Endpoint {
     /// Links to other processes that the node is not on the way of.
     pub(super) direct: Direct,
     pub(super) inbox: Inbox,
-    sequence: u64,
+    pub(super) sequence: u64,
     pub(super) correlation: u64,
     /// Why the connection has ended, once it has.
     pub(super) ended: Option<Ended>,
@@ -55,16 +47,6 @@ impl std::fmt::Debug for Endpoint {
         write!(f, "Endpoint({})", self.tid)
     }
 }
-
-/// What to do with messages that find the inbox full.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum WhenFull {
-    /// They stay in the socket: somebody is about to make room.
-    Leave,
-    /// They are refused: the answer that is waited for may be behind them.
-    Refuse,
-}
-
 impl Endpoint {
     pub(super) fn register(path: &Path, registration: Registration) -> Result<Self, ApiError> {
         let Registration { mut register, deadline, inbox_capacity, link: options, returning } = registration;
@@ -296,276 +278,6 @@ impl Endpoint {
             Some(Answer::Reply(_) | Answer::Resolved(_)) | None => Err(ApiError::NoAnswer(PROMPT)),
         }
     }
-
-    /// Sends `message` and waits for its outcome.
-    pub(super) fn confirm(&mut self, mut message: Message, within: Duration) -> Result<Outcome, ApiError> {
-        if message.header.class == Class::Stream {
-            // Of a Stream the newest wins, so an older one has no outcome of its own.
-            return Ok(Outcome::Rejected(Rejection::Unsupported));
-        }
-        message.header.time_to_live_us = in_micros(within);
-        match self.request(message, Awaited::Outcome, Flags::CONFIRM, within)? {
-            Some(Answer::Outcome(outcome)) => Ok(outcome),
-            Some(Answer::Reply(_) | Answer::Resolved(_)) | None => Ok(Outcome::Unknown),
-        }
-    }
-
-    /// Sends `message` as a request and waits for the reply.
-    pub(super) fn await_reply(
-        &mut self,
-        mut message: Message,
-        within: Duration,
-    ) -> Result<Message, ApiError> {
-        message.header.class = Class::Control;
-        message.header.time_to_live_us = in_micros(within);
-        match self.request(message, Awaited::Reply, Flags::CONFIRM.with(Flags::ASK), within)? {
-            Some(Answer::Reply(reply)) => Ok(reply),
-            Some(Answer::Outcome(outcome)) => Err(ApiError::Ended(outcome)),
-            Some(Answer::Resolved(_)) | None => Err(ApiError::NoReply(within)),
-        }
-    }
-
-    /// Sends `message` as the reply to `request`.
-    pub(super) fn answer(&mut self, request: &Received, mut message: Message) -> Result<(), ApiError> {
-        if !request.wants_reply() {
-            return Err(ApiError::NotAsked);
-        }
-        message.header.destination = request.source();
-        message.header.class = Class::Control;
-        message.header.flags = Flags::REPLY;
-        message.header.correlation = request.correlation();
-        self.dispatch(message).map(drop)
-    }
-
-    /// Sends `message` and waits for its answer; `None` at the deadline.
-    fn request(
-        &mut self,
-        mut message: Message,
-        awaited: Awaited,
-        flags: Flags,
-        within: Duration,
-    ) -> Result<Option<Answer>, ApiError> {
-        self.correlation += 1;
-        message.header.correlation = self.correlation;
-        message.header.flags = message.header.flags.with(flags);
-        let of = self.absolute(message.header.destination);
-        let wanted = Wanted { number: self.correlation, what: awaited, of };
-        let deadline = Time::now() + within;
-        let way = self.dispatch(message)?;
-        loop {
-            if let Some(answer) = self.take_in(Some(wanted), WhenFull::Refuse)? {
-                return Ok(Some(answer));
-            }
-            // spec: LNCL-7. The link has ended with the message in the peer's hand.
-            if way.is_some_and(|link| !self.direct.has(link)) {
-                return Ok(Some(Answer::Outcome(Outcome::Failed)));
-            }
-            if way.is_none() && self.ended.is_some() {
-                // Nobody can say any more.
-                return Ok(Some(Answer::Outcome(Outcome::Unknown)));
-            }
-            // The clock is asked by us: a flood keeps the link readable for ever.
-            if Time::now() >= deadline {
-                return Ok(None);
-            }
-            self.wait(deadline);
-        }
-    }
-
-    /// Sends `message` the way that is right now; the link, if it did not go through the node.
-    fn dispatch(&mut self, mut message: Message) -> Result<Option<LinkNumber>, ApiError> {
-        self.try_return();
-        self.check_length(message.payload.len())?;
-        // A new connection may have another address.
-        message.header.source = self.tid;
-        self.sequence += 1;
-        message.header.sequence = self.sequence;
-        let now = Time::now();
-        message.header.sent = now;
-        let destination = self.absolute(message.header.destination);
-        let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
-        self.direct.look(now, &mut node);
-        if self.direct.is_asking(now) {
-            // Who only sends looks here for the answer. What it cannot sort in, or read, shows when it receives.
-            let _ = self.take_in_from_node(None, WhenFull::Leave);
-        }
-        let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
-        if let Some(link) = self.direct.way(destination, now, &mut node) {
-            message.header.destination = destination;
-            match self.direct.send(link, message, now)? {
-                Sent::Taken => return Ok(Some(link)),
-                Sent::Gone(back) => message = back,
-            }
-        }
-        self.be_there()?;
-        if self.reader.has_ended(now) {
-            return Err(self.explain(ApiError::Closed("the node has gone".to_owned())));
-        }
-        self.writer.write(&message).map(|()| None).map_err(|error| self.explain(error))
-    }
-
-    const fn absolute(&self, destination: Tid) -> Tid {
-        if matches!(destination.node, NodeAddress::HERE) {
-            Tid::new(self.tid.node, destination.app)
-        } else {
-            destination
-        }
-    }
-
-    /// What the node said before it closed the connection says more than a broken pipe does.
-    fn explain(&mut self, error: ApiError) -> ApiError {
-        if !matches!(error, ApiError::Closed(_)) {
-            return error;
-        }
-        for _ in 0..LAST_LOOKS {
-            // The error to tell is the first one.
-            if self.ended.is_some() || self.take_in(None, WhenFull::Refuse).is_err() {
-                break;
-            }
-        }
-        self.ended.as_ref().map_or(error, |ended| self.gone(ended))
-    }
-
-    fn check_length(&self, length: usize) -> Result<(), ApiError> {
-        if length > self.payload_max {
-            return Err(ApiError::TooLong { length, limit: self.payload_max });
-        }
-        Ok(())
-    }
-
-    /// Sorts in what has come so far, without waiting. Returns the answer that is awaited, if it was there.
-    fn take_in(&mut self, wanted: Option<Wanted>, when_full: WhenFull) -> Result<Option<Answer>, ApiError> {
-        // The node first: there a peer may say that from now on its link is read.
-        let answer = self.take_in_from_node(wanted, when_full)?;
-        if answer.is_some() || self.direct.is_empty() {
-            return Ok(answer);
-        }
-        let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
-        self.direct.look(Time::now(), &mut node);
-        // From the last one on: one that ends makes no other one's turn go by.
-        let links = (0..self.direct.open.len()).rev();
-        Ok(links.into_iter().find_map(|index| self.take_in_from_link(index, wanted, when_full)))
-    }
-
-    fn take_in_from_node(
-        &mut self,
-        wanted: Option<Wanted>,
-        when_full: WhenFull,
-    ) -> Result<Option<Answer>, ApiError> {
-        self.writer.pay();
-        for read in 0.. {
-            if let Some(answer) = self.sort_in(wanted, when_full)? {
-                return Ok(Some(answer));
-            }
-            let is_full = when_full == WhenFull::Leave && !self.inbox.has_room();
-            if is_full || read == READS_PER_LOOK {
-                return Ok(None);
-            }
-            match self.reader.read() {
-                Read::Some => {}
-                Read::Nothing => return Ok(None),
-                Read::Ended(ended) => {
-                    self.end(ended);
-                    return Ok(None);
-                }
-            }
-        }
-        Ok(None)
-    }
-
-    /// Sorts in what has been read from the node.
-    fn sort_in(&mut self, wanted: Option<Wanted>, when_full: WhenFull) -> Result<Option<Answer>, ApiError> {
-        while when_full == WhenFull::Refuse || self.inbox.has_room() {
-            let Some(message) = self.reader.next()? else { break };
-            let Some(message) = self.heed(message, wanted) else { continue };
-            match self.inbox.sort(message, wanted.map(Wanted::at_node)) {
-                Sorted::Answer(answer) => return Ok(Some(answer)),
-                Sorted::Refusal(refusal) => self.end(refusal.into()),
-                Sorted::Message | Sorted::Nothing => {}
-            }
-        }
-        Ok(None)
-    }
-
-    /// Hands back what is not about direct links.
-    fn heed(&mut self, message: Message, wanted: Option<Wanted>) -> Option<Message> {
-        let Header { kind, correlation, .. } = message.header;
-        if kind.is_user() || wanted.is_some_and(|wanted| wanted.number == correlation) {
-            return Some(message);
-        }
-        let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
-        self.direct.heed(message, Time::now(), &mut node)
-    }
-
-    /// Sorts in what has come so far on an open link.
-    fn take_in_from_link(
-        &mut self,
-        index: usize,
-        wanted: Option<Wanted>,
-        when_full: WhenFull,
-    ) -> Option<Answer> {
-        for read in 0.. {
-            while when_full == WhenFull::Refuse || self.inbox.has_room() {
-                let link = &mut self.direct.open[index];
-                let awaited = wanted.and_then(|wanted| wanted.on_link_with(link.peer));
-                match link.next() {
-                    Ok(Came::Nothing) => break,
-                    Ok(Came::Refused) => {}
-                    Ok(Came::Message(message)) => {
-                        if let Sorted::Answer(answer) = self.inbox.sort_from(&link.sink, message, awaited) {
-                            return Some(answer);
-                        }
-                    }
-                    Err(why) => return self.direct.fail(index, &why),
-                }
-            }
-            let is_full = when_full == WhenFull::Leave && !self.inbox.has_room();
-            if is_full || read == READS_PER_LOOK {
-                return None;
-            }
-            match self.direct.open[index].take() {
-                Ok(Taken::Some) => {}
-                Ok(Taken::Nothing) => return None,
-                Err(why) => return self.direct.fail(index, &why),
-            }
-        }
-        None
-    }
-
-    /// Waits until something comes, from the node or from a link, or until there is something to do.
-    fn wait(&mut self, deadline: Time) {
-        match &mut self.reader {
-            Reader::Ring(reader) if !self.direct.open.is_empty() => {
-                let deadline = self.direct.wake_by(deadline);
-                let links = &mut self.direct.open[..];
-                let ended = reader.wait_for_all(deadline, |node| Everything { node, links });
-                reader.note(&ended);
-                self.direct.note(&ended);
-            }
-            Reader::Ring(_) | Reader::Socket(_) => self.reader.wait(deadline),
-        }
-    }
-}
-
-/// The answer that a call waits for.
-#[derive(Clone, Copy)]
-struct Wanted {
-    number: u64,
-    what: Awaited,
-    /// Who says it.
-    of: Tid,
-}
-
-impl Wanted {
-    /// What the node passes on is from whom it says it is.
-    const fn at_node(self) -> (u64, Awaited) {
-        (self.number, self.what)
-    }
-
-    /// On its own link nobody answers for others.
-    fn on_link_with(self, peer: Tid) -> Option<(u64, Awaited)> {
-        (peer == self.of).then_some((self.number, self.what))
-    }
 }
 
 impl Drop for Endpoint {
@@ -576,9 +288,4 @@ impl Drop for Endpoint {
         // A message that is still in some thread's hand ends as `Failed`.
         self.writer.close();
     }
-}
-
-/// At least one: zero would mean for ever.
-fn in_micros(within: Duration) -> u32 {
-    u32::try_from(within.as_micros()).unwrap_or(u32::MAX).max(1)
 }

@@ -1,0 +1,168 @@
+//! Messages on their way in: from the node and from direct links, without waiting; and the wait.
+
+use sinew_runtime::{
+    tid::Tid,
+    time::Time,
+    wire::{Header, Message},
+};
+
+use super::{
+    ApiError, Endpoint,
+    direct::{Came, Everything, ToNode},
+    inbox::{Answer, Awaited, Sorted},
+    link::{Read, Reader},
+};
+use crate::ring::Taken;
+
+/// Chunks of 64 KiB that are read before the caller has its turn. In tests each read is the last of its look: a message
+/// that ends with it must not be left lying until more comes.
+const READS_PER_LOOK: usize = if cfg!(test) { 1 } else { 16 };
+
+/// What to do with messages that find the inbox full.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum WhenFull {
+    /// They stay in the socket: somebody is about to make room.
+    Leave,
+    /// They are refused: the answer that is waited for may be behind them.
+    Refuse,
+}
+
+impl Endpoint {
+    /// Sorts in what has come so far, without waiting. Returns the answer that is awaited, if it was there.
+    pub(super) fn take_in(
+        &mut self,
+        wanted: Option<Wanted>,
+        when_full: WhenFull,
+    ) -> Result<Option<Answer>, ApiError> {
+        // The node first: there a peer may say that from now on its link is read.
+        let answer = self.take_in_from_node(wanted, when_full)?;
+        if answer.is_some() || self.direct.is_empty() {
+            return Ok(answer);
+        }
+        let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
+        self.direct.look(Time::now(), &mut node);
+        // From the last one on: one that ends makes no other one's turn go by.
+        let links = (0..self.direct.open.len()).rev();
+        Ok(links.into_iter().find_map(|index| self.take_in_from_link(index, wanted, when_full)))
+    }
+
+    pub(super) fn take_in_from_node(
+        &mut self,
+        wanted: Option<Wanted>,
+        when_full: WhenFull,
+    ) -> Result<Option<Answer>, ApiError> {
+        self.writer.pay();
+        for read in 0.. {
+            if let Some(answer) = self.sort_in(wanted, when_full)? {
+                return Ok(Some(answer));
+            }
+            let is_full = when_full == WhenFull::Leave && !self.inbox.has_room();
+            if is_full || read == READS_PER_LOOK {
+                return Ok(None);
+            }
+            match self.reader.read() {
+                Read::Some => {}
+                Read::Nothing => return Ok(None),
+                Read::Ended(ended) => {
+                    self.end(ended);
+                    return Ok(None);
+                }
+            }
+        }
+        Ok(None)
+    }
+
+    /// Sorts in what has been read from the node.
+    fn sort_in(&mut self, wanted: Option<Wanted>, when_full: WhenFull) -> Result<Option<Answer>, ApiError> {
+        while when_full == WhenFull::Refuse || self.inbox.has_room() {
+            let Some(message) = self.reader.next()? else { break };
+            let Some(message) = self.heed(message, wanted) else { continue };
+            match self.inbox.sort(message, wanted.map(Wanted::at_node)) {
+                Sorted::Answer(answer) => return Ok(Some(answer)),
+                Sorted::Refusal(refusal) => self.end(refusal.into()),
+                Sorted::Message | Sorted::Nothing => {}
+            }
+        }
+        Ok(None)
+    }
+
+    /// Hands back what is not about direct links.
+    fn heed(&mut self, message: Message, wanted: Option<Wanted>) -> Option<Message> {
+        let Header { kind, correlation, .. } = message.header;
+        if kind.is_user() || wanted.is_some_and(|wanted| wanted.number == correlation) {
+            return Some(message);
+        }
+        let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
+        self.direct.heed(message, Time::now(), &mut node)
+    }
+
+    /// Sorts in what has come so far on an open link.
+    fn take_in_from_link(
+        &mut self,
+        index: usize,
+        wanted: Option<Wanted>,
+        when_full: WhenFull,
+    ) -> Option<Answer> {
+        for read in 0.. {
+            while when_full == WhenFull::Refuse || self.inbox.has_room() {
+                let link = &mut self.direct.open[index];
+                let awaited = wanted.and_then(|wanted| wanted.on_link_with(link.peer));
+                match link.next() {
+                    Ok(Came::Nothing) => break,
+                    Ok(Came::Refused) => {}
+                    Ok(Came::Message(message)) => {
+                        if let Sorted::Answer(answer) = self.inbox.sort_from(&link.sink, message, awaited) {
+                            return Some(answer);
+                        }
+                    }
+                    Err(why) => return self.direct.fail(index, &why),
+                }
+            }
+            let is_full = when_full == WhenFull::Leave && !self.inbox.has_room();
+            if is_full || read == READS_PER_LOOK {
+                return None;
+            }
+            match self.direct.open[index].take() {
+                Ok(Taken::Some) => {}
+                Ok(Taken::Nothing) => return None,
+                Err(why) => return self.direct.fail(index, &why),
+            }
+        }
+        None
+    }
+
+    /// Waits until something comes, from the node or from a link, or until there is something to do.
+    pub(super) fn wait(&mut self, deadline: Time) {
+        match &mut self.reader {
+            Reader::Ring(reader) if !self.direct.open.is_empty() => {
+                let deadline = self.direct.wake_by(deadline);
+                let links = &mut self.direct.open[..];
+                let ended = reader.wait_for_all(deadline, |node| Everything { node, links });
+                reader.note(&ended);
+                self.direct.note(&ended);
+            }
+            Reader::Ring(_) | Reader::Socket(_) => self.reader.wait(deadline),
+        }
+    }
+}
+
+/// The answer that a call waits for.
+#[derive(Clone, Copy)]
+pub(super) struct Wanted {
+    pub(super) number: u64,
+    pub(super) what: Awaited,
+    /// Who says it.
+    pub(super) of: Tid,
+}
+
+impl Wanted {
+    /// What the node passes on is from whom it says it is.
+    const fn at_node(self) -> (u64, Awaited) {
+        (self.number, self.what)
+    }
+
+    /// On its own link nobody answers for others.
+    fn on_link_with(self, peer: Tid) -> Option<(u64, Awaited)> {
+        (peer == self.of).then_some((self.number, self.what))
+    }
+}

@@ -1,0 +1,164 @@
+//! Messages on their way out: the way that is right now, and what is waited for then.
+
+use std::time::Duration;
+
+use sinew_runtime::{
+    outcome::{Outcome, Rejection},
+    tid::{NodeAddress, Tid},
+    time::Time,
+    wire::{Class, Flags, Message},
+};
+
+use super::{
+    ApiError, Endpoint, Received,
+    direct::{Sent, ToNode},
+    inbox::{Answer, Awaited},
+    incoming::{Wanted, WhenFull},
+    routes::LinkNumber,
+};
+
+/// Looks for the last words of a node that has gone.
+const LAST_LOOKS: usize = 64;
+
+impl Endpoint {
+    /// Sends `message` and waits for its outcome.
+    pub(super) fn confirm(&mut self, mut message: Message, within: Duration) -> Result<Outcome, ApiError> {
+        if message.header.class == Class::Stream {
+            // Of a Stream the newest wins, so an older one has no outcome of its own.
+            return Ok(Outcome::Rejected(Rejection::Unsupported));
+        }
+        message.header.time_to_live_us = in_micros(within);
+        match self.request(message, Awaited::Outcome, Flags::CONFIRM, within)? {
+            Some(Answer::Outcome(outcome)) => Ok(outcome),
+            Some(Answer::Reply(_) | Answer::Resolved(_)) | None => Ok(Outcome::Unknown),
+        }
+    }
+
+    /// Sends `message` as a request and waits for the reply.
+    pub(super) fn await_reply(
+        &mut self,
+        mut message: Message,
+        within: Duration,
+    ) -> Result<Message, ApiError> {
+        message.header.class = Class::Control;
+        message.header.time_to_live_us = in_micros(within);
+        match self.request(message, Awaited::Reply, Flags::CONFIRM.with(Flags::ASK), within)? {
+            Some(Answer::Reply(reply)) => Ok(reply),
+            Some(Answer::Outcome(outcome)) => Err(ApiError::Ended(outcome)),
+            Some(Answer::Resolved(_)) | None => Err(ApiError::NoReply(within)),
+        }
+    }
+
+    /// Sends `message` as the reply to `request`.
+    pub(super) fn answer(&mut self, request: &Received, mut message: Message) -> Result<(), ApiError> {
+        if !request.wants_reply() {
+            return Err(ApiError::NotAsked);
+        }
+        message.header.destination = request.source();
+        message.header.class = Class::Control;
+        message.header.flags = Flags::REPLY;
+        message.header.correlation = request.correlation();
+        self.dispatch(message).map(drop)
+    }
+
+    /// Sends `message` and waits for its answer; `None` at the deadline.
+    pub(super) fn request(
+        &mut self,
+        mut message: Message,
+        awaited: Awaited,
+        flags: Flags,
+        within: Duration,
+    ) -> Result<Option<Answer>, ApiError> {
+        self.correlation += 1;
+        message.header.correlation = self.correlation;
+        message.header.flags = message.header.flags.with(flags);
+        let of = self.absolute(message.header.destination);
+        let wanted = Wanted { number: self.correlation, what: awaited, of };
+        let deadline = Time::now() + within;
+        let way = self.dispatch(message)?;
+        loop {
+            if let Some(answer) = self.take_in(Some(wanted), WhenFull::Refuse)? {
+                return Ok(Some(answer));
+            }
+            // spec: LNCL-7. The link has ended with the message in the peer's hand.
+            if way.is_some_and(|link| !self.direct.has(link)) {
+                return Ok(Some(Answer::Outcome(Outcome::Failed)));
+            }
+            if way.is_none() && self.ended.is_some() {
+                // Nobody can say any more.
+                return Ok(Some(Answer::Outcome(Outcome::Unknown)));
+            }
+            // The clock is asked by us: a flood keeps the link readable for ever.
+            if Time::now() >= deadline {
+                return Ok(None);
+            }
+            self.wait(deadline);
+        }
+    }
+
+    /// Sends `message` the way that is right now; the link, if it did not go through the node.
+    pub(super) fn dispatch(&mut self, mut message: Message) -> Result<Option<LinkNumber>, ApiError> {
+        self.try_return();
+        self.check_length(message.payload.len())?;
+        // A new connection may have another address.
+        message.header.source = self.tid;
+        self.sequence += 1;
+        message.header.sequence = self.sequence;
+        let now = Time::now();
+        message.header.sent = now;
+        let destination = self.absolute(message.header.destination);
+        let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
+        self.direct.look(now, &mut node);
+        if self.direct.is_asking(now) {
+            // Who only sends looks here for the answer. What it cannot sort in, or read, shows when it receives.
+            let _ = self.take_in_from_node(None, WhenFull::Leave);
+        }
+        let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
+        if let Some(link) = self.direct.way(destination, now, &mut node) {
+            message.header.destination = destination;
+            match self.direct.send(link, message, now)? {
+                Sent::Taken => return Ok(Some(link)),
+                Sent::Gone(back) => message = back,
+            }
+        }
+        self.be_there()?;
+        if self.reader.has_ended(now) {
+            return Err(self.explain(ApiError::Closed("the node has gone".to_owned())));
+        }
+        self.writer.write(&message).map(|()| None).map_err(|error| self.explain(error))
+    }
+
+    pub(super) const fn absolute(&self, destination: Tid) -> Tid {
+        if matches!(destination.node, NodeAddress::HERE) {
+            Tid::new(self.tid.node, destination.app)
+        } else {
+            destination
+        }
+    }
+
+    /// What the node said before it closed the connection says more than a broken pipe does.
+    fn explain(&mut self, error: ApiError) -> ApiError {
+        if !matches!(error, ApiError::Closed(_)) {
+            return error;
+        }
+        for _ in 0..LAST_LOOKS {
+            // The error to tell is the first one.
+            if self.ended.is_some() || self.take_in(None, WhenFull::Refuse).is_err() {
+                break;
+            }
+        }
+        self.ended.as_ref().map_or(error, |ended| self.gone(ended))
+    }
+
+    pub(super) fn check_length(&self, length: usize) -> Result<(), ApiError> {
+        if length > self.payload_max {
+            return Err(ApiError::TooLong { length, limit: self.payload_max });
+        }
+        Ok(())
+    }
+}
+
+/// At least one: zero would mean for ever.
+fn in_micros(within: Duration) -> u32 {
+    u32::try_from(within.as_micros()).unwrap_or(u32::MAX).max(1)
+}
