@@ -1,33 +1,48 @@
 //! Kills processes at random instants, under load, while they hold loans, and says what the others hold after it, how long
 //! their messages took, and what is left in the file system.
 //!
-//! `cargo run --release -p sinew-tests --bin client_kills [--kills N] [--spacing-ms N] [--reference-ms N] [--seed N]`
+//! `cargo run --release -p sinew-tests --bin client_kills [OPTIONS]`; `--help` names them.
 //!
 //! Exit code 1: something was not given back, a file was left, or a message of others was lost.
 
 use std::{process::ExitCode, time::Duration};
 
+use clap::Parser;
 use sinew_tests::clients::{
     kills::{Plan, run},
     play,
 };
 
+/// Kills processes at random instants, under load, while they hold loans.
+///
+/// The environment variable SINEW_TEST_TRANSPORT chooses their way: `socket`, `ring` (default) or `direct`.
+#[derive(Parser)]
+struct Arguments {
+    /// How many processes are killed.
+    #[arg(long, default_value_t = 1_000)]
+    kills: u32,
+    /// From one kill to the next, in milliseconds.
+    #[arg(long, default_value_t = 40)]
+    spacing_ms: u64,
+    /// How long the others are measured with nobody killed, before and after, in milliseconds.
+    #[arg(long, default_value_t = 10_000)]
+    reference_ms: u64,
+    /// What all chance comes from; another one each time if it is not given.
+    #[arg(long, default_value_t = u64::from(std::process::id()))]
+    seed: u64,
+}
+
 fn main() -> ExitCode {
     if let Some(code) = play() {
         return code;
     }
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let number = |flag: &str, otherwise: u64| {
-        let after = arguments.iter().skip_while(|argument| *argument != flag).nth(1);
-        after.map_or(otherwise, |value| value.parse().unwrap_or_else(|_| panic!("{flag} takes a number")))
-    };
-    let seed = number("--seed", u64::from(std::process::id()));
+    let Arguments { kills, spacing_ms, reference_ms, seed } = Arguments::parse();
     println!("seed {seed}");
     let report = run(Plan {
         program: std::env::current_exe().expect("a program has a path"),
-        kills: u32::try_from(number("--kills", 1_000)).expect("not that many"),
-        spacing: Duration::from_millis(number("--spacing-ms", 40)),
-        reference: Duration::from_millis(number("--reference-ms", 10_000)),
+        kills,
+        spacing: Duration::from_millis(spacing_ms),
+        reference: Duration::from_millis(reference_ms),
         seed,
     });
     println!("{report}");

@@ -6,6 +6,7 @@
 
 use std::{process::ExitCode, time::Duration};
 
+use clap::Parser;
 use serde_json::json;
 use sinew::{NodeHandle, fault::Fault, prelude::*};
 use sinew_tests::{
@@ -156,15 +157,18 @@ fn readies(node: &NodeHandle, name: &str) -> u64 {
     node.lives(name).expect("it is there").readies
 }
 
+/// Restarts applications and layers, and says what grew.
+#[derive(Parser)]
+struct Arguments {
+    /// How many restarts, over all.
+    #[arg(long, default_value_t = 10_000)]
+    restarts: u64,
+}
+
 fn main() -> ExitCode {
     // Thousands of panics would fill the terminal.
     std::panic::set_hook(Box::new(|_| {}));
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let restarts: u64 = match &arguments[..] {
-        [] => 10_000,
-        [flag, number] if flag == "--restarts" => number.parse().expect("--restarts takes a number"),
-        _ => panic!("usage: growth [--restarts N]"),
-    };
+    let Arguments { restarts } = Arguments::parse();
     let field = Field::new();
     field.restart((restarts / 5).max(100), "both");
     let first = field.held_at_rest(None);

@@ -1,30 +1,42 @@
 //! Lets hostile clients do to a node what they like, and says what it held, how others were served, and what it refused.
 //!
-//! `cargo run --release -p sinew-tests --bin hostile_client [--minutes N] [--seconds N] [--seed N]`
+//! `cargo run --release -p sinew-tests --bin hostile_client [OPTIONS]`; `--help` names them.
 //!
 //! Exit code 1: the node went beyond its bound, gave something not back, did not serve the others, or refused in silence.
 
 use std::{process::ExitCode, time::Duration};
 
+use clap::Parser;
 use sinew_tests::clients::{
     hostile::{Plan, run},
     play,
 };
 
+/// Lets hostile clients do to a node what they like, for the minutes and seconds together, 5 seconds at least.
+///
+/// The environment variable SINEW_TEST_TRANSPORT chooses the others' way: `socket`, `ring` (default) or `direct`.
+#[derive(Parser)]
+struct Arguments {
+    /// How many minutes.
+    #[arg(long, default_value_t = 0)]
+    minutes: u64,
+    /// And how many seconds.
+    #[arg(long, default_value_t = 0)]
+    seconds: u64,
+    /// What all chance comes from; another one each time if it is not given.
+    #[arg(long, default_value_t = u64::from(std::process::id()))]
+    seed: u64,
+}
+
 fn main() -> ExitCode {
     if let Some(code) = play() {
         return code;
     }
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let number = |flag: &str, otherwise: u64| {
-        let after = arguments.iter().skip_while(|argument| *argument != flag).nth(1);
-        after.map_or(otherwise, |value| value.parse().unwrap_or_else(|_| panic!("{flag} takes a number")))
-    };
-    let seed = number("--seed", u64::from(std::process::id()));
+    let Arguments { minutes, seconds, seed } = Arguments::parse();
     println!("seed {seed}");
     let report = run(Plan {
         program: std::env::current_exe().expect("a program has a path"),
-        lasts: Duration::from_secs(number("--minutes", 0) * 60 + number("--seconds", 0).max(5)),
+        lasts: Duration::from_secs((minutes * 60 + seconds).max(5)),
         seed,
     });
     println!("{report}");

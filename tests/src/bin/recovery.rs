@@ -6,6 +6,7 @@
 
 use std::{process::ExitCode, time::Duration};
 
+use clap::Parser;
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::json;
 use sinew::{NodeHandle, Sender, fault::Fault, prelude::*};
@@ -27,15 +28,18 @@ struct Row {
     limit: Duration,
 }
 
+/// Measures how fast a node recovers from a panic, a hang and a kill.
+#[derive(Parser)]
+struct Arguments {
+    /// How often each fault is tried.
+    #[arg(long, default_value_t = 200)]
+    trials: usize,
+}
+
 fn main() -> ExitCode {
     // Hundreds of panics would fill the terminal.
     std::panic::set_hook(Box::new(|_| {}));
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let trials = match &arguments[..] {
-        [] => 200,
-        [flag, number] if flag == "--trials" => number.parse().expect("--trials takes a number"),
-        _ => panic!("usage: recovery [--trials N]"),
-    };
+    let Arguments { trials } = Arguments::parse();
     // First: the process of the application is this program, started again, and does not come further than this.
     let mut rows = vec![killed_process(trials)];
     rows.extend(panics(trials));
