@@ -6,13 +6,9 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew_figures::{Alone, Beside, Figures};
+use sinew_figures::{Alone, Beside, End, Figures, Pinning};
 
-use crate::{
-    crowds, ends,
-    processes::{self, End, Pinning},
-    raw,
-};
+use crate::{crowds, ends, processes, raw};
 
 /// The mean of the paper's Table 1, in nanoseconds.
 const PAPER_MEAN_NS: u64 = 46_200;

@@ -5,13 +5,13 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew_figures::Figures;
+use sinew_figures::{Figures, Pinning};
 use sinew_runtime::{time::Time, wire::Kind};
 
 use crate::{
     case::{Way, role},
     ends::{DEADLINE, Home, register},
-    processes::{Pinning, Process, say_there},
+    processes::{Process, say_there},
 };
 
 /// Bytes of a packet.

@@ -3,13 +3,13 @@
 use std::{os::unix::process::CommandExt, path::PathBuf, process::Command, time::Duration};
 
 use sinew::{Endpoint, NodeApi, Registration, Spin, Transport, prelude::*};
-use sinew_figures::Figures;
+use sinew_figures::{Figures, Pinning};
 use sinew_runtime::{time::Time, wire::Kind};
 
 use crate::{
     case::{Rounds, Way, role},
     crowds::{Ages, PACKET},
-    processes::{Pinning, Process, await_end, say_there},
+    processes::{Process, await_end, say_there},
 };
 
 /// No wait of this bench is longer.

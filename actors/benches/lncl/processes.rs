@@ -6,8 +6,6 @@ use std::{
     process::{Child, ChildStdout, Command, Stdio},
 };
 
-use rustix::thread::{CpuSet, sched_setaffinity};
-
 /// The environment variable that gives this program a role.
 pub(crate) const ROLE: &str = "SINEW_LNCL_ROLE";
 /// The one that makes a run short.
@@ -85,66 +83,4 @@ pub(crate) fn say_there() {
 /// Until the process that started this one closes the pipe, or ends this one.
 pub(crate) fn await_end() {
     let _ = std::io::stdin().read(&mut [0]);
-}
-
-/// More than a machine of ours has.
-const CPUS_MAX: usize = 256;
-
-/// Which CPUs the processes use.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Pinning {
-    Anywhere,
-    OneCpu,
-    OneCpuEach,
-}
-
-/// Who is to be pinned.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum End {
-    Measuring,
-    Echoing,
-    /// The node, and the senders of a crowd.
-    Other,
-}
-
-impl Pinning {
-    pub(crate) const ALL: [Self; 3] = [Self::Anywhere, Self::OneCpu, Self::OneCpuEach];
-
-    pub(crate) const fn name(self) -> &'static str {
-        match self {
-            Self::Anywhere => "anywhere",
-            Self::OneCpu => "one_cpu",
-            Self::OneCpuEach => "one_cpu_each",
-        }
-    }
-
-    pub(crate) fn named(name: &str) -> Self {
-        let found = Self::ALL.into_iter().find(|pinning| pinning.name() == name);
-        found.expect("a name that this program wrote itself")
-    }
-
-    /// The CPU of this end, if it has a certain one.
-    pub(crate) const fn cpu(self, end: End) -> Option<usize> {
-        match (self, end) {
-            (Self::Anywhere, _) | (Self::OneCpuEach, End::Other) => None,
-            (Self::OneCpu, _) | (Self::OneCpuEach, End::Measuring) => Some(0),
-            (Self::OneCpuEach, End::Echoing) => Some(1),
-        }
-    }
-
-    /// Keeps the calling thread, and the threads and processes that it makes, on the CPUs of this end.
-    pub(crate) fn pin(self, end: End) {
-        if self == Self::Anywhere {
-            return;
-        }
-        let mut set = CpuSet::new();
-        match self.cpu(end) {
-            Some(cpu) => set.set(cpu),
-            // The mask of the measuring end was inherited, which is too narrow; what the machine lacks is left out.
-            None => (0..CPUS_MAX).for_each(|cpu| set.set(cpu)),
-        }
-        if let Err(error) = sched_setaffinity(None, &set) {
-            eprintln!("not pinned as {self:?} wants {end:?}: {error}");
-        }
-    }
 }

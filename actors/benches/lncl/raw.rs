@@ -12,14 +12,14 @@ use rustix::{
     io::dup,
     stdio::stdin,
 };
-use sinew_figures::Figures;
+use sinew_figures::{End, Figures, Pinning};
 use sinew_runtime::time::Time;
 use sinew_shm::bare::{self, Waiting};
 
 use crate::{
     case::{Reference, Rounds},
     crowds::{ANSWERED_EACH, PACKET, SENDERS, WINDOW, paced},
-    processes::{End, Pinning, Process, say_there},
+    processes::{Process, say_there},
 };
 
 /// The environment variable that names the program of `tests/peers/iceoryx2`.

@@ -5,8 +5,7 @@ use std::{
     process::{Child, Command, Stdio},
 };
 
-use rustix::thread::{CpuSet, sched_setaffinity};
-use sinew_figures::{Beside, Figures};
+use sinew_figures::{Beside, End, Figures, Pinning};
 
 use crate::{ROLE, raw, sinew_ends};
 
@@ -90,53 +89,6 @@ pub(crate) const CASES: &[Case] = &[
     },
 ];
 
-/// Which CPUs the two ends may use.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Pinning {
-    Anywhere,
-    OneCpu,
-    OneCpuEach,
-}
-
-impl Pinning {
-    pub(crate) const ALL: [Self; 3] = [Self::Anywhere, Self::OneCpu, Self::OneCpuEach];
-
-    pub(crate) const fn name(self) -> &'static str {
-        match self {
-            Self::Anywhere => "anywhere",
-            Self::OneCpu => "one_cpu",
-            Self::OneCpuEach => "one_cpu_each",
-        }
-    }
-
-    fn named(name: &str) -> Self {
-        Self::ALL
-            .into_iter()
-            .find(|pinning| pinning.name() == name)
-            .expect("a name that this program wrote itself")
-    }
-
-    /// The CPU of this end, if it has a certain one.
-    pub(crate) const fn cpu(self, end: usize) -> Option<usize> {
-        match self {
-            Self::Anywhere => None,
-            Self::OneCpu => Some(0),
-            Self::OneCpuEach => Some(end),
-        }
-    }
-
-    /// Keeps the calling thread, and the threads that it makes, on the CPU of this end.
-    pub(crate) fn pin(self, end: usize) {
-        if let Some(cpu) = self.cpu(end) {
-            let mut set = CpuSet::new();
-            set.set(cpu);
-            if let Err(error) = sched_setaffinity(None, &set) {
-                eprintln!("not pinned to CPU {cpu}: {error}");
-            }
-        }
-    }
-}
-
 /// The measuring end.
 pub(crate) fn measure(name: &str, pinning: &str) {
     let case = CASES.iter().find(|case| case.name == name).expect("a name that this program wrote itself");
@@ -169,7 +121,7 @@ pub(crate) fn measure(name: &str, pinning: &str) {
 /// The echoing end, in a process of its own: prints a line when it can be reached, ends when its input does.
 pub(crate) fn echo(kind: &str, pinning: &str, at: &str) {
     let pinning = Pinning::named(pinning);
-    pinning.pin(1);
+    pinning.pin(End::Echoing);
     match kind {
         "raw_unix" => raw::echo_unix(at),
         "raw_tcp" => raw::echo_tcp(),
@@ -214,7 +166,7 @@ impl Drop for Echo {
 fn raw_pair(kind: &str, bytes: usize, pinning: Pinning) -> Figures {
     let path = std::env::temp_dir().join(format!("sinew-paths-raw-{}", std::process::id()));
     let echo = Echo::start(kind, &path.to_string_lossy(), pinning);
-    pinning.pin(0);
+    pinning.pin(End::Measuring);
     let figures = raw::measure(kind, &path, &echo.line, bytes);
     // Left by the echo, which was killed.
     let _ = std::fs::remove_file(path);
@@ -222,13 +174,13 @@ fn raw_pair(kind: &str, bytes: usize, pinning: Pinning) -> Figures {
 }
 
 fn two_processes(bytes: usize, pinning: Pinning) -> Figures {
-    pinning.pin(0);
+    pinning.pin(End::Measuring);
     let path = std::env::temp_dir().join(format!("sinew-paths-lncl-{}", std::process::id()));
     sinew_ends::through_lncl(&path, bytes, || Echo::start("endpoint", &path.to_string_lossy(), pinning))
 }
 
 fn two_nodes(kind: &str, bytes: usize, pinning: Pinning) -> Figures {
-    pinning.pin(0);
+    pinning.pin(End::Measuring);
     let group =
         format!("239.255.83.{}:{}", std::process::id() % 200 + 1, 20_000 + std::process::id() % 20_000);
     let _echo = Echo::start(kind, &group, pinning);

@@ -10,7 +10,8 @@ mod sinew_ends;
 
 use std::process::{Command, ExitCode, Stdio};
 
-use case::{CASES, Case, Pinning};
+use case::{CASES, Case};
+use sinew_figures::Pinning;
 
 /// The role of a process that this program starts of itself.
 const ROLE: &str = "SINEW_PATHS_ROLE";

@@ -10,9 +10,9 @@ use std::{
 
 use actix::{Actor, Context, Handler, Message};
 use actix_rt::Arbiter;
-use sinew_figures::Figures;
+use sinew_figures::{End, Figures, Pinning};
 
-use crate::{WARM_UP, case::Pinning, rounds};
+use crate::{WARM_UP, rounds};
 
 /// Echoes on a unix stream at `path`: blocks of the length that comes first.
 pub(crate) fn echo_unix(path: &str) {
@@ -94,7 +94,7 @@ impl Handler<Block> for Bare {
 pub(crate) fn actix_send(bytes: usize, pinning: Pinning, same_arbiter: bool) -> Figures {
     let system = actix::System::new();
     system.block_on(async move {
-        let (first, second) = (arbiter(pinning, 0), arbiter(pinning, 1));
+        let (first, second) = (arbiter(pinning, End::Measuring), arbiter(pinning, End::Echoing));
         let there = if same_arbiter { first.handle() } else { second.handle() };
         let bare = Bare::start_in_arbiter(&there, |_| Bare);
         let (give, given) = tokio::sync::oneshot::channel();
@@ -115,7 +115,7 @@ pub(crate) fn actix_send(bytes: usize, pinning: Pinning, same_arbiter: bool) -> 
     })
 }
 
-fn arbiter(pinning: Pinning, end: usize) -> Arbiter {
+fn arbiter(pinning: Pinning, end: End) -> Arbiter {
     Arbiter::with_tokio_rt(move || {
         pinning.pin(end);
         tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a reactor")

@@ -10,13 +10,9 @@ use std::{
 
 use serde::{Deserialize, Serialize};
 use sinew::{NodeApi, Registration, prelude::*};
-use sinew_figures::Figures;
+use sinew_figures::{End, Figures, Pinning};
 
-use crate::{
-    WARM_UP,
-    case::{Echo, Pinning},
-    rounds,
-};
+use crate::{WARM_UP, case::Echo, rounds};
 
 /// No wait of this bench is longer.
 const DEADLINE: Duration = Duration::from_secs(60);
@@ -141,8 +137,9 @@ pub(crate) fn in_process(bytes: usize, pinning: Pinning, same_thread: bool) -> F
         None => Place::thread(name),
     };
     let (ping, figures) = pinger(bytes);
-    let there = if same_thread { place("ping", 0) } else { place("echo", 1) };
-    let node = alone("paths").app(echoer().place(there)).app(ping.place(place("ping", 0))).start();
+    let there = if same_thread { place("ping", End::Measuring) } else { place("echo", End::Echoing) };
+    let node =
+        alone("paths").app(echoer().place(there)).app(ping.place(place("ping", End::Measuring))).start();
     let node = node.expect("a node");
     let figures = figures.recv_timeout(DEADLINE).expect("the rounds end");
     node.stop();

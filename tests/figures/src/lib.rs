@@ -3,9 +3,11 @@
 
 mod alone;
 mod beside;
+mod pinning;
 
 pub use alone::{Alone, head};
 pub use beside::Beside;
+pub use pinning::{End, Pinning};
 
 use std::time::Duration;
 

@@ -5,8 +5,7 @@ use std::{
     process::{Child, Command, Stdio},
 };
 
-use rustix::thread::{CpuSet, sched_setaffinity};
-use sinew_figures::{Beside, Figures};
+use sinew_figures::{Beside, End as Side, Figures, Pinning};
 use sinew_shm::bare::{End, Waiting, memory};
 
 use crate::{bare, ours, pace::Pace, stream};
@@ -74,29 +73,6 @@ impl Kind {
     }
 }
 
-/// Which CPUs the two ends use.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Pinning {
-    OneCpu,
-    OneCpuEach,
-}
-
-impl Pinning {
-    const fn name(self) -> &'static str {
-        match self {
-            Self::OneCpu => "one_cpu",
-            Self::OneCpuEach => "one_cpu_each",
-        }
-    }
-
-    const fn cpu_of_echo(self) -> usize {
-        match self {
-            Self::OneCpu => 0,
-            Self::OneCpuEach => 1,
-        }
-    }
-}
-
 /// One line of the output.
 #[derive(Clone, Copy)]
 pub(crate) struct Case {
@@ -149,7 +125,7 @@ pub(crate) fn run(case: Case) {
 }
 
 fn figures(kind: Kind, case: Case) -> Figures {
-    pin(0);
+    case.pinning.pin(Side::Measuring);
     let (socket, theirs) = UnixStream::pair().expect("a pair of sockets");
     let (bytes, pace) = (case.payload_bytes, case.pace);
     match kind {
@@ -177,7 +153,7 @@ pub(crate) fn echo(role: &str) {
         |index: usize| words[index].parse::<usize>().expect("a number that this program wrote itself");
     let kind = Kind::ALL.into_iter().find(|kind| kind.name() == words[0]);
     let (kind, bytes) = (kind.expect("a name that this program wrote itself"), number(1));
-    pin(number(2));
+    Pinning::named(words[2]).pin(Side::Echoing);
     match kind {
         Kind::BareFutex | Kind::BarePoll => {
             bare::echo(End::second(rustix::stdio::stdin(), bytes, kind.waiting()), bytes);
@@ -187,21 +163,13 @@ pub(crate) fn echo(role: &str) {
     }
 }
 
-fn pin(cpu: usize) {
-    let mut set = CpuSet::new();
-    set.set(cpu);
-    if let Err(error) = sched_setaffinity(None, &set) {
-        eprintln!("not pinned to CPU {cpu}: {error}");
-    }
-}
-
 /// Another process of this program; it is ended when this is dropped.
 struct Echo(Child);
 
 impl Echo {
     fn start(kind: Kind, case: Case, input: OwnedFd) -> Self {
         let program = std::env::current_exe().expect("this program has a path");
-        let role = format!("{} {} {}", kind.name(), case.payload_bytes, case.pinning.cpu_of_echo());
+        let role = format!("{} {} {}", kind.name(), case.payload_bytes, case.pinning.name());
         let child = Command::new(program)
             .env(ROLE, role)
             .stdin(Stdio::from(input))
