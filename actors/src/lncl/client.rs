@@ -1,25 +1,27 @@
 //! One connection of another process, from its first frame to its end.
 
-use std::{io, ops::ControlFlow, rc::Rc, sync::Arc, time::Duration};
+mod end;
+mod orders;
+
+use std::{ops::ControlFlow, rc::Rc, sync::Arc, time::Duration};
 
 use bytes::BytesMut;
-use rustix::net::Shutdown;
 use sinew_runtime::{
     monitor::DownClass,
-    outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     router::{LocalRoute, Outlet},
     tid::Tid,
     time::Time,
-    wire::{Flags, FrameError, Header, Kind, Message, encode_frame},
+    wire::{Kind, Message, encode_frame},
 };
 use sinew_shm::PassError;
 use tokio::net::{UnixStream, unix::UCred};
 
+use self::end::{End, LAST_WORDS};
 use super::{
     core::{Address, ClientId, Owner, Request},
-    introductions::{Marks, Party},
-    link::{self, ClientReader, ClientSocket, LinkError},
-    payload::{self, REGISTER_BYTES_MAX, Refusal, Register, Registered, Resolved},
+    introductions::Party,
+    link::{self, ClientReader, ClientSocket},
+    payload::{self, REGISTER_BYTES_MAX, Register, Registered},
     reader::Reader,
     registrar,
     server::{Server, refuse},
@@ -28,31 +30,15 @@ use super::{
 use crate::{
     monitors::Cause,
     outlet::{LinkNumber, OutletLimits, StreamOutlet},
-    ring::{ExchangeError, RingError},
+    ring::ExchangeError,
     stores::{Stores, lock},
 };
 
 /// Time for the first frame.
 const HANDSHAKE: Duration = Duration::from_secs(2);
-/// Time that a client has to take its refusal when earlier messages fill its socket.
-const LAST_WORDS: Duration = Duration::from_millis(100);
-
-/// Time until a mark is passed on again that found no room.
-const MARK_AGAIN: Duration = Duration::from_millis(2);
 
 /// The writing half of a client's connection.
 pub(super) type ClientOutlet = StreamOutlet<ClientSocket>;
-
-/// Why a connection ended.
-#[derive(Debug)]
-enum End {
-    /// It gave its address back.
-    Unregistered,
-    /// The process closed its socket, or ended.
-    HungUp(Option<io::Error>),
-    /// It was refused.
-    Refused(String),
-}
 
 /// Serves one connection to its end.
 pub(super) async fn serve(server: Rc<Server>, stream: Arc<UnixStream>, credentials: UCred, id: ClientId) {
@@ -293,101 +279,6 @@ impl Client {
         }
     }
 
-    fn obey(&self, order: Order) -> ControlFlow<End> {
-        match order {
-            Order::Route(message) => self.route(message),
-            Order::Settle { source, correlation, outcome } => self.settle(source, correlation, outcome),
-            Order::SetMember { group, member, confirm } => {
-                registrar::set_member(&self.server.stores, self.tid.app, group, member);
-                if let Some(correlation) = confirm {
-                    self.tell(payload::lncl_of(self.tid.node), correlation, Outcome::Delivered);
-                }
-            }
-            Order::Tell { destination, correlation, outcome } => {
-                self.tell(destination, correlation, outcome);
-            }
-            Order::Resolve { name, correlation } => self.resolve(&name, correlation),
-            Order::Introduce { to, correlation } => self.introduce(to, correlation),
-            Order::Switch { to, number, correlation } => self.switch(to, number, correlation),
-            Order::RefuseMessage { message, why } => self.refuse_message(&message, why),
-            Order::Unregister => return ControlFlow::Break(End::Unregistered),
-            Order::End(violation) => return ControlFlow::Break(End::Refused(violation.to_string())),
-            Order::Register(_) => {
-                return ControlFlow::Break(End::Refused("registered already".to_owned()));
-            }
-        }
-        ControlFlow::Continue(())
-    }
-
-    fn route(&self, mut message: Message) {
-        let router = &self.server.stores.router;
-        let destination = router.absolute(message.header.destination);
-        let is_confirmed = message.header.flags.has(Flags::CONFIRM);
-        if is_confirmed {
-            let correlation = message.header.correlation;
-            let ticket = Ticket { source: self.tid, destination, correlation };
-            message.receipt = Some(Receipt::new(Arc::new(OutcomeSink(self.outlet.clone())), ticket));
-        }
-        if let Err(why) = router.send(message)
-            && !is_confirmed
-            && destination.is_single()
-        {
-            // The source of a confirmed message knows; a group without members is no fault.
-            let detail = format!("from {} to {destination}: {why}", self.tid);
-            self.server.refusals.count(Time::now(), "unconfirmed message not taken", &detail);
-        }
-    }
-
-    fn settle(&self, source: Tid, correlation: u64, outcome: Outcome) {
-        let ticket = Ticket { source, destination: self.tid, correlation };
-        if !self.outlet.confirm(ticket, outcome) {
-            let detail = format!("{} settles a message {correlation} of {source} that it has not", self.tid);
-            self.server.refusals.count(Time::now(), "outcome of nothing", &detail);
-        }
-    }
-
-    fn resolve(&self, name: &str, correlation: u64) {
-        let tid = registrar::resolve(&self.server.stores, name).map(Tid::bits);
-        let lncl = payload::lncl_of(self.tid.node);
-        let mut answer = payload::frame(Kind::LNCL_RESOLVED, lncl, self.tid, &Resolved { tid });
-        answer.header.correlation = correlation;
-        self.say(answer);
-    }
-
-    fn introduce(&self, to: Tid, correlation: u64) {
-        let number = lock(&self.server.stores.registry).new_link();
-        let to = self.server.stores.router.absolute(to);
-        if let Err(why) = self.server.introductions.introduce(self.tid, to, number, correlation) {
-            self.tell(to, correlation, Outcome::Rejected(why));
-        }
-    }
-
-    // spec: LNCL-11
-    fn switch(&self, to: Tid, number: u64, correlation: u64) {
-        let to = self.server.stores.router.absolute(to);
-        let ticket = Ticket { source: self.tid, destination: to, correlation };
-        let receipt = Receipt::new(Arc::new(OutcomeSink(self.outlet.clone())), ticket);
-        match self.server.introductions.marks(self.tid, to, number, receipt) {
-            Ok(marks) => pass_on(marks),
-            Err((receipt, why)) => receipt.settle(Outcome::Rejected(why)),
-        }
-    }
-
-    fn refuse_message(&self, message: &Message, why: Rejection) {
-        let Header { source, destination, correlation, flags, .. } = message.header;
-        let detail = format!("{} said that {source} sends to {destination}: {why}", self.tid);
-        let cause = if why == Rejection::ForgedSource { "forged source" } else { "unsupported flags" };
-        self.server.refusals.count(Time::now(), cause, &detail);
-        if flags.has(Flags::CONFIRM) {
-            self.tell(destination, correlation, Outcome::Rejected(why));
-        }
-    }
-
-    fn tell(&self, about: Tid, correlation: u64, outcome: Outcome) {
-        let ticket = Ticket { source: self.tid, destination: about, correlation };
-        self.say(Message::outcome(ticket, outcome));
-    }
-
     fn say(&self, message: Message) {
         if let Err(refused) = self.outlet.submit(message) {
             let detail = format!("{} does not read its socket: {}", self.tid, refused.why);
@@ -402,133 +293,6 @@ impl Client {
         let registered = Registered { node, app, node_name: config.name.clone(), payload_max, ring };
         payload::frame(Kind::LNCL_REGISTERED, payload::lncl_of(node), self.tid, &registered)
     }
-
-    /// Says the last words, if there are any.
-    async fn finish(mut self, end: End) {
-        self.has_been_told = true;
-        self.cause = end.cause();
-        match end {
-            End::Unregistered => self.log("has unregistered"),
-            End::HungUp(None) => self.log("has gone: its process closed the socket, or ended"),
-            End::HungUp(Some(cause)) => self.log(&format!("has gone: {cause}")),
-            // spec: LNCL-4
-            End::Refused(sentence) => {
-                let detail = format!("{} ({}): {sentence}", self.name, self.tid);
-                self.server.refusals.count(Time::now(), "protocol violation", &detail);
-                self.say_farewell(sentence).await;
-            }
-        }
-    }
-
-    async fn say_farewell(&self, sentence: String) {
-        if self.ring == Ring::Told {
-            return self.say_last(sentence, false);
-        }
-        self.say(self.refusal(sentence, false));
-        // Without a link nothing was written yet, and the socket takes a sentence at once.
-        let link = self.link.unwrap_or_else(|| {
-            let payload_max = self.server.stores.config.payload_max;
-            self.outlet.connect(ClientSocket::Plain(self.peer.stream.clone()), payload_max, None)
-        });
-        if self.outlet.waiting() > 0 {
-            // What the socket does not take in this time is not read by anybody.
-            let _ = tokio::time::timeout(LAST_WORDS, self.outlet.drain(link)).await;
-        }
-    }
-
-    /// Says why it ends, without waiting.
-    fn say_last(&self, sentence: String, again: bool) {
-        let refusal = self.refusal(sentence, again);
-        match self.ring {
-            Ring::None | Ring::Asked => self.say(refusal),
-            // The ring may be full or not there yet, and nothing but these words ever goes into the socket. Whoever is
-            // gone need not hear them.
-            Ring::Told => drop(write_now(&self.peer.stream, &refusal)),
-        }
-    }
-
-    fn refusal(&self, sentence: String, again: bool) -> Message {
-        let lncl = payload::lncl_of(self.tid.node);
-        payload::frame(Kind::LNCL_REFUSAL, lncl, self.tid, &Refusal { sentence, again })
-    }
-
-    fn log(&self, what: &str) {
-        tracing::info!(tid = %self.tid, name = self.name, pid = self.peer.pid, "an application of another process {what}");
-    }
-}
-
-impl Drop for Client {
-    fn drop(&mut self) {
-        self.server.introductions.remove(self.tid.app);
-        registrar::owner_gone(&self.server.stores, self.peer.owner(), &self.cause);
-        self.server.remove_outlet(self.peer.id);
-        if !self.has_been_told {
-            self.say_last("the node's LNCL has ended; connect again when it is back".to_owned(), true);
-        }
-        // Senders may hold the outlet, and with it the socket, a little longer; the peer is told now. An error means
-        // that it is closed already.
-        let _ = rustix::net::shutdown(&self.peer.stream, Shutdown::Both);
-        // spec: LNCL-7. A peer that sleeps at a ring is woken by its end.
-        self.outlet.end(Outcome::Failed, Rejection::Closed);
-    }
-}
-
-impl End {
-    /// What those are told who watch the application.
-    fn cause(&self) -> Cause {
-        match self {
-            Self::Unregistered => Cause::new(DownClass::Normal, "it unregistered"),
-            Self::HungUp(_) => {
-                Cause::new(DownClass::ProcessEnded, "its process ended, or closed its connection")
-            }
-            Self::Refused(sentence) => {
-                Cause::new(DownClass::Killed, format!("its connection was ended: {sentence}"))
-            }
-        }
-    }
-}
-
-impl End {
-    /// The end of a connection that could not be written to.
-    fn of_write(cause: io::Error) -> Self {
-        if cause.kind() == io::ErrorKind::InvalidData {
-            Self::Refused(cause.to_string())
-        } else {
-            Self::HungUp(Some(cause))
-        }
-    }
-}
-
-impl From<LinkError> for End {
-    fn from(error: LinkError) -> Self {
-        match error {
-            LinkError::Ring(RingError::Frame(error)) => error.into(),
-            LinkError::Ring(RingError::Corrupt(_)) | LinkError::StrayBytes => {
-                Self::Refused(error.to_string())
-            }
-        }
-    }
-}
-
-impl From<FrameError> for End {
-    fn from(error: FrameError) -> Self {
-        match error {
-            FrameError::Io(cause) => Self::HungUp(Some(cause)),
-            FrameError::Header(_) | FrameError::TooLong { .. } => Self::Refused(error.to_string()),
-        }
-    }
-}
-
-/// Passes marks on, now or, where there is no room, as soon as there is.
-fn pass_on(mut marks: Marks) {
-    if marks.pass_on() {
-        tokio::task::spawn_local(async move {
-            // Ends when there is room, or the client's outlet has ended.
-            while marks.pass_on() {
-                tokio::time::sleep(MARK_AGAIN).await;
-            }
-        });
-    }
 }
 
 /// Writes a frame that the socket has room for: the first one.
@@ -539,16 +303,6 @@ fn write_now(stream: &UnixStream, message: &Message) -> Result<(), End> {
         Ok(count) if count == bytes.len() => Ok(()),
         Ok(_) => Err(End::HungUp(None)),
         Err(cause) => Err(End::HungUp(Some(cause))),
-    }
-}
-
-/// Carries outcomes of a client's messages back to it. Any thread settles them, and writes to the socket itself.
-struct OutcomeSink(Arc<ClientOutlet>);
-
-impl ReceiptSink for OutcomeSink {
-    fn settle(&self, ticket: Ticket, outcome: Outcome) {
-        // Not taken: the client is gone, or does not read; its own deadline says `Unknown`.
-        let _ = self.0.submit(Message::outcome(ticket, outcome));
     }
 }
 

@@ -1,0 +1,150 @@
+//! The end of a client's connection: why, what others are told of it, and the last words to the client itself.
+
+use std::{io, time::Duration};
+
+use rustix::net::Shutdown;
+use sinew_runtime::{
+    monitor::DownClass,
+    outcome::{Outcome, Rejection},
+    time::Time,
+    wire::{FrameError, Kind, Message},
+};
+
+use super::{
+    super::{
+        link::{ClientSocket, LinkError},
+        payload::{self, Refusal},
+        registrar,
+    },
+    Client, Ring, write_now,
+};
+use crate::{monitors::Cause, ring::RingError};
+
+/// Time that a client has to take its refusal when earlier messages fill its socket.
+pub(super) const LAST_WORDS: Duration = Duration::from_millis(100);
+
+/// Why a connection ended.
+#[derive(Debug)]
+pub(super) enum End {
+    /// It gave its address back.
+    Unregistered,
+    /// The process closed its socket, or ended.
+    HungUp(Option<io::Error>),
+    /// It was refused.
+    Refused(String),
+}
+
+impl End {
+    /// What those are told who watch the application.
+    pub(super) fn cause(&self) -> Cause {
+        match self {
+            Self::Unregistered => Cause::new(DownClass::Normal, "it unregistered"),
+            Self::HungUp(_) => {
+                Cause::new(DownClass::ProcessEnded, "its process ended, or closed its connection")
+            }
+            Self::Refused(sentence) => {
+                Cause::new(DownClass::Killed, format!("its connection was ended: {sentence}"))
+            }
+        }
+    }
+
+    /// The end of a connection that could not be written to.
+    pub(super) fn of_write(cause: io::Error) -> Self {
+        if cause.kind() == io::ErrorKind::InvalidData {
+            Self::Refused(cause.to_string())
+        } else {
+            Self::HungUp(Some(cause))
+        }
+    }
+}
+
+impl From<LinkError> for End {
+    fn from(error: LinkError) -> Self {
+        match error {
+            LinkError::Ring(RingError::Frame(error)) => error.into(),
+            LinkError::Ring(RingError::Corrupt(_)) | LinkError::StrayBytes => {
+                Self::Refused(error.to_string())
+            }
+        }
+    }
+}
+
+impl From<FrameError> for End {
+    fn from(error: FrameError) -> Self {
+        match error {
+            FrameError::Io(cause) => Self::HungUp(Some(cause)),
+            FrameError::Header(_) | FrameError::TooLong { .. } => Self::Refused(error.to_string()),
+        }
+    }
+}
+
+impl Client {
+    /// Says the last words, if there are any.
+    pub(super) async fn finish(mut self, end: End) {
+        self.has_been_told = true;
+        self.cause = end.cause();
+        match end {
+            End::Unregistered => self.log("has unregistered"),
+            End::HungUp(None) => self.log("has gone: its process closed the socket, or ended"),
+            End::HungUp(Some(cause)) => self.log(&format!("has gone: {cause}")),
+            // spec: LNCL-4
+            End::Refused(sentence) => {
+                let detail = format!("{} ({}): {sentence}", self.name, self.tid);
+                self.server.refusals.count(Time::now(), "protocol violation", &detail);
+                self.say_farewell(sentence).await;
+            }
+        }
+    }
+
+    async fn say_farewell(&self, sentence: String) {
+        if self.ring == Ring::Told {
+            return self.say_last(sentence, false);
+        }
+        self.say(self.refusal(sentence, false));
+        // Without a link nothing was written yet, and the socket takes a sentence at once.
+        let link = self.link.unwrap_or_else(|| {
+            let payload_max = self.server.stores.config.payload_max;
+            self.outlet.connect(ClientSocket::Plain(self.peer.stream.clone()), payload_max, None)
+        });
+        if self.outlet.waiting() > 0 {
+            // What the socket does not take in this time is not read by anybody.
+            let _ = tokio::time::timeout(LAST_WORDS, self.outlet.drain(link)).await;
+        }
+    }
+
+    /// Says why it ends, without waiting.
+    fn say_last(&self, sentence: String, again: bool) {
+        let refusal = self.refusal(sentence, again);
+        match self.ring {
+            Ring::None | Ring::Asked => self.say(refusal),
+            // The ring may be full or not there yet, and nothing but these words ever goes into the socket. Whoever is
+            // gone need not hear them.
+            Ring::Told => drop(write_now(&self.peer.stream, &refusal)),
+        }
+    }
+
+    fn refusal(&self, sentence: String, again: bool) -> Message {
+        let lncl = payload::lncl_of(self.tid.node);
+        payload::frame(Kind::LNCL_REFUSAL, lncl, self.tid, &Refusal { sentence, again })
+    }
+
+    fn log(&self, what: &str) {
+        tracing::info!(tid = %self.tid, name = self.name, pid = self.peer.pid, "an application of another process {what}");
+    }
+}
+
+impl Drop for Client {
+    fn drop(&mut self) {
+        self.server.introductions.remove(self.tid.app);
+        registrar::owner_gone(&self.server.stores, self.peer.owner(), &self.cause);
+        self.server.remove_outlet(self.peer.id);
+        if !self.has_been_told {
+            self.say_last("the node's LNCL has ended; connect again when it is back".to_owned(), true);
+        }
+        // Senders may hold the outlet, and with it the socket, a little longer; the peer is told now. An error means
+        // that it is closed already.
+        let _ = rustix::net::shutdown(&self.peer.stream, Shutdown::Both);
+        // spec: LNCL-7. A peer that sleeps at a ring is woken by its end.
+        self.outlet.end(Outcome::Failed, Rejection::Closed);
+    }
+}

@@ -1,0 +1,146 @@
+//! What a client's connection does with the orders of its session.
+
+use std::{ops::ControlFlow, sync::Arc, time::Duration};
+
+use sinew_runtime::{
+    outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
+    router::Outlet,
+    tid::Tid,
+    time::Time,
+    wire::{Flags, Header, Kind, Message},
+};
+
+use super::{
+    super::{
+        introductions::Marks,
+        payload::{self, Resolved},
+        registrar,
+        session::Order,
+    },
+    Client, ClientOutlet,
+    end::End,
+};
+use crate::stores::lock;
+
+/// Time until a mark is passed on again that found no room.
+const MARK_AGAIN: Duration = Duration::from_millis(2);
+
+impl Client {
+    /// Carries an order out; the end of the connection, if that is what it asks for.
+    pub(super) fn obey(&self, order: Order) -> ControlFlow<End> {
+        match order {
+            Order::Route(message) => self.route(message),
+            Order::Settle { source, correlation, outcome } => self.settle(source, correlation, outcome),
+            Order::SetMember { group, member, confirm } => {
+                registrar::set_member(&self.server.stores, self.tid.app, group, member);
+                if let Some(correlation) = confirm {
+                    self.tell(payload::lncl_of(self.tid.node), correlation, Outcome::Delivered);
+                }
+            }
+            Order::Tell { destination, correlation, outcome } => {
+                self.tell(destination, correlation, outcome);
+            }
+            Order::Resolve { name, correlation } => self.resolve(&name, correlation),
+            Order::Introduce { to, correlation } => self.introduce(to, correlation),
+            Order::Switch { to, number, correlation } => self.switch(to, number, correlation),
+            Order::RefuseMessage { message, why } => self.refuse_message(&message, why),
+            Order::Unregister => return ControlFlow::Break(End::Unregistered),
+            Order::End(violation) => return ControlFlow::Break(End::Refused(violation.to_string())),
+            Order::Register(_) => {
+                return ControlFlow::Break(End::Refused("registered already".to_owned()));
+            }
+        }
+        ControlFlow::Continue(())
+    }
+
+    fn route(&self, mut message: Message) {
+        let router = &self.server.stores.router;
+        let destination = router.absolute(message.header.destination);
+        let is_confirmed = message.header.flags.has(Flags::CONFIRM);
+        if is_confirmed {
+            let correlation = message.header.correlation;
+            let ticket = Ticket { source: self.tid, destination, correlation };
+            message.receipt = Some(Receipt::new(Arc::new(OutcomeSink(self.outlet.clone())), ticket));
+        }
+        if let Err(why) = router.send(message)
+            && !is_confirmed
+            && destination.is_single()
+        {
+            // The source of a confirmed message knows; a group without members is no fault.
+            let detail = format!("from {} to {destination}: {why}", self.tid);
+            self.server.refusals.count(Time::now(), "unconfirmed message not taken", &detail);
+        }
+    }
+
+    fn settle(&self, source: Tid, correlation: u64, outcome: Outcome) {
+        let ticket = Ticket { source, destination: self.tid, correlation };
+        if !self.outlet.confirm(ticket, outcome) {
+            let detail = format!("{} settles a message {correlation} of {source} that it has not", self.tid);
+            self.server.refusals.count(Time::now(), "outcome of nothing", &detail);
+        }
+    }
+
+    fn resolve(&self, name: &str, correlation: u64) {
+        let tid = registrar::resolve(&self.server.stores, name).map(Tid::bits);
+        let lncl = payload::lncl_of(self.tid.node);
+        let mut answer = payload::frame(Kind::LNCL_RESOLVED, lncl, self.tid, &Resolved { tid });
+        answer.header.correlation = correlation;
+        self.say(answer);
+    }
+
+    fn introduce(&self, to: Tid, correlation: u64) {
+        let number = lock(&self.server.stores.registry).new_link();
+        let to = self.server.stores.router.absolute(to);
+        if let Err(why) = self.server.introductions.introduce(self.tid, to, number, correlation) {
+            self.tell(to, correlation, Outcome::Rejected(why));
+        }
+    }
+
+    // spec: LNCL-11
+    fn switch(&self, to: Tid, number: u64, correlation: u64) {
+        let to = self.server.stores.router.absolute(to);
+        let ticket = Ticket { source: self.tid, destination: to, correlation };
+        let receipt = Receipt::new(Arc::new(OutcomeSink(self.outlet.clone())), ticket);
+        match self.server.introductions.marks(self.tid, to, number, receipt) {
+            Ok(marks) => pass_on(marks),
+            Err((receipt, why)) => receipt.settle(Outcome::Rejected(why)),
+        }
+    }
+
+    fn refuse_message(&self, message: &Message, why: Rejection) {
+        let Header { source, destination, correlation, flags, .. } = message.header;
+        let detail = format!("{} said that {source} sends to {destination}: {why}", self.tid);
+        let cause = if why == Rejection::ForgedSource { "forged source" } else { "unsupported flags" };
+        self.server.refusals.count(Time::now(), cause, &detail);
+        if flags.has(Flags::CONFIRM) {
+            self.tell(destination, correlation, Outcome::Rejected(why));
+        }
+    }
+
+    fn tell(&self, about: Tid, correlation: u64, outcome: Outcome) {
+        let ticket = Ticket { source: self.tid, destination: about, correlation };
+        self.say(Message::outcome(ticket, outcome));
+    }
+}
+
+/// Passes marks on, now or, where there is no room, as soon as there is.
+fn pass_on(mut marks: Marks) {
+    if marks.pass_on() {
+        tokio::task::spawn_local(async move {
+            // Ends when there is room, or the client's outlet has ended.
+            while marks.pass_on() {
+                tokio::time::sleep(MARK_AGAIN).await;
+            }
+        });
+    }
+}
+
+/// Carries outcomes of a client's messages back to it. Any thread settles them, and writes to the socket itself.
+struct OutcomeSink(Arc<ClientOutlet>);
+
+impl ReceiptSink for OutcomeSink {
+    fn settle(&self, ticket: Ticket, outcome: Outcome) {
+        // Not taken: the client is gone, or does not read; its own deadline says `Unknown`.
+        let _ = self.0.submit(Message::outcome(ticket, outcome));
+    }
+}
