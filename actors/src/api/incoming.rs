@@ -3,7 +3,7 @@
 use sinew_runtime::{
     tid::Tid,
     time::Time,
-    wire::{Header, Message},
+    wire::{Header, Kind, Message},
 };
 
 use super::{
@@ -89,7 +89,10 @@ impl Endpoint {
     /// Hands back what is not about direct links.
     fn heed(&mut self, message: Message, wanted: Option<Wanted>) -> Option<Message> {
         let Header { kind, correlation, .. } = message.header;
-        if kind.is_user() || wanted.is_some_and(|wanted| wanted.number == correlation) {
+        // The number alone says nothing: a mark and an introduction carry numbers that others have given.
+        let is_answer = matches!(kind, Kind::OUTCOME | Kind::LNCL_RESOLVED)
+            && wanted.is_some_and(|wanted| wanted.number == correlation);
+        if kind.is_user() || is_answer {
             return Some(message);
         }
         let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };

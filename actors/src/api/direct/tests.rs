@@ -267,6 +267,35 @@ fn each_class_comes_in_order_across_the_switch() {
     assert!(has_link(&other, &one), "they have switched");
 }
 
+/// Marks carry a number of their sender's, introductions one of LNCL's: neither is an answer to who waits for that number.
+#[test]
+fn a_link_is_made_while_one_side_waits_for_an_answer_by_the_same_number_as_the_link_is_talked_of() {
+    for what_the_peer_says_next in [1, 2] {
+        // given: one waits for an outcome
+        let node = TestNode::start();
+        let (mut one, mut other) = (endpoint(&node), endpoint(&node));
+        let app = node.local(1);
+        one.correlation = 40;
+        // Its introduction is asked for by one number, its SWITCH is said by the next.
+        other.correlation = 40 + 1 - what_the_peer_says_next;
+        let (to, asked) = (one.tid(), app.tid);
+        thread::scope(|scope| {
+            let waiting = scope.spawn(|| one.send_confirmed(asked, &Counted(1), WATCHDOG).unwrap());
+            let mut message = app.next();
+            // when
+            let deadline = Time::now() + WATCHDOG / 2;
+            other.send(to, &Counted(2)).unwrap();
+            while !other.direct.open.iter().any(|link| link.peer == to) {
+                assert!(Time::now() < deadline, "waited for a link with {to}");
+                drop(other.receive(Duration::from_millis(1)).unwrap());
+            }
+            // then
+            message.settle(Outcome::Delivered);
+            assert_eq!(waiting.join().unwrap(), Outcome::Delivered);
+        });
+    }
+}
+
 #[test]
 fn what_a_peer_said_before_it_went_is_received_and_then_it_has_gone() {
     let node = TestNode::start();
