@@ -46,7 +46,7 @@ mod wills;
 #[cfg(feature = "fault-points")]
 pub use sinew_runtime::supervision::fault;
 
-pub use api::{ApiError, Endpoint, NodeApi, Received, Registration, Transport};
+pub use api::{ApiError, Endpoint, LentMessage, NodeApi, Received, Registration, Transport};
 pub use config::{ConfigFaults, NodeConfig};
 pub use lncl::RegisterError;
 pub use ndl::{KnownNode, LossReason, NodeEvent, Source};

@@ -8,7 +8,11 @@ use std::{
 
 use sinew_figures::{Alone, Beside, End, Figures, Pinning};
 
-use crate::{crowds, ends, processes, raw};
+use crate::{
+    crowds,
+    ends::{self, Memory},
+    processes, raw,
+};
 
 /// The mean of the paper's Table 1, in nanoseconds.
 const PAPER_MEAN_NS: u64 = 46_200;
@@ -96,6 +100,10 @@ enum What {
         bytes: usize,
         pace: Pace,
     },
+    /// Round trips of what is written in the ring, beside those of what is copied into it.
+    Loan {
+        bytes: usize,
+    },
     TableOne,
     /// The same with the receiver in C++.
     TableOneCpp,
@@ -182,6 +190,7 @@ pub(crate) fn all(is_short: bool) -> impl Iterator<Item = Case> {
     if std::env::var_os(ends::CPP_ECHO).is_some() {
         things.push(What::TableOneCpp);
     }
+    things.extend([65_536, 1 << 20].map(|bytes| What::Loan { bytes }));
     if !is_short {
         things.extend([8, 65_536, 1 << 20].map(back_to_back));
     }
@@ -192,6 +201,8 @@ pub(crate) fn all(is_short: bool) -> impl Iterator<Item = Case> {
         .flat_map(move |(way, pinning)| {
             things.clone().into_iter().map(move |what| Case { way, what, pinning })
         })
+        // A socket lends nothing.
+        .filter(|case| !(matches!(case.what, What::Loan { .. }) && case.way == Way::Socket))
         // In C++ there is the default way alone.
         .filter(|case| case.what != What::TableOneCpp || case.way == Way::Ring)
 }
@@ -201,6 +212,7 @@ impl Case {
         let (way, pinning) = (self.way.name(), self.pinning.name());
         match self.what {
             What::RoundTrips { bytes, pace } => format!("{way}-{bytes}B-{}-{pinning}", pace.name()),
+            What::Loan { bytes } => format!("{way}-{bytes}B-loan-{pinning}"),
             What::TableOne => format!("{way}-table_1-{pinning}"),
             What::TableOneCpp => format!("{way}-table_1_cpp-{pinning}"),
             What::FanIn => format!("{way}-fan_in-{pinning}"),
@@ -223,6 +235,7 @@ impl Case {
         self.pinning.pin(End::Measuring);
         match self.what {
             What::RoundTrips { bytes, pace } => self.round_trips(bytes, pace, is_short),
+            What::Loan { bytes } => self.loan(bytes, is_short),
             What::TableOne => self.table_one("echo"),
             What::TableOneCpp => self.table_one("cpp_echo"),
             What::FanIn => self.fan_in(if is_short { 150 } else { 1_500 }),
@@ -250,6 +263,24 @@ impl Case {
             }
             .report();
         }
+    }
+
+    fn loan(self, bytes: usize, is_short: bool) {
+        let rounds = Rounds::of(bytes, Pace::BackToBack, is_short);
+        let (copied, _) = ends::loans(self.way, Memory::Copied, bytes, rounds, self.pinning);
+        let (seen, is_in_place) = ends::loans(self.way, Memory::Lent, bytes, rounds, self.pinning);
+        assert!(is_in_place, "the ring is long enough, and empty");
+        Beside {
+            bench: "lncl",
+            case: &format!("{}_loan", self.way.name()),
+            payload_bytes: bytes,
+            pinning: self.pinning.name(),
+            pace: Pace::BackToBack.name(),
+            seen: &seen,
+            reference: "the same copied",
+            raw: &copied,
+        }
+        .report();
     }
 
     fn table_one(self, echo: &str) {
@@ -300,13 +331,17 @@ pub(crate) fn play(role: &str) -> ExitCode {
             let case = all(is_short).find(|case| case.name() == name);
             case.expect("a name that this program wrote itself").measure(is_short);
         }
-        ["node", pinning, socket] => {
+        ["node", pinning, socket, ring_bytes] => {
             raw::pin(pinning, End::Other);
-            ends::node(socket);
+            ends::node(socket, number(ring_bytes) as usize);
         }
         ["echo", way, pinning, socket] => {
             raw::pin(pinning, End::Echoing);
-            ends::echo(way_named(way), socket);
+            ends::echo(way_named(way), Memory::Lent, socket);
+        }
+        ["echo_copied", way, pinning, socket] => {
+            raw::pin(pinning, End::Echoing);
+            ends::echo(way_named(way), Memory::Copied, socket);
         }
         ["cpp_echo", _, pinning, socket] => {
             raw::pin(pinning, End::Echoing);

@@ -2,7 +2,7 @@
 
 use std::{os::unix::process::CommandExt, path::PathBuf, process::Command, time::Duration};
 
-use sinew::{Endpoint, NodeApi, Registration, Spin, Transport, prelude::*};
+use sinew::{Endpoint, LentMessage, NodeApi, Registration, Spin, Transport, prelude::*};
 use sinew_figures::{Figures, Pinning};
 use sinew_runtime::{time::Time, wire::Kind};
 
@@ -16,6 +16,10 @@ use crate::{
 pub(crate) const DEADLINE: Duration = Duration::from_secs(20);
 /// How long who looks before he sleeps does so: longer than any round trip.
 const LOOKS: Duration = Duration::from_secs(1);
+/// Bytes of a ring, as a node has them that was told nothing.
+const RING_BYTES: usize = 256 * 1024;
+/// Bytes of a ring that takes the longest message in one piece.
+const LONG_RING_BYTES: usize = 4 * 1024 * 1024;
 /// What is sent back as it came.
 const BLOCK: Kind = Kind::named("lncl.block");
 /// What is sent back with its age in its first bytes.
@@ -31,8 +35,12 @@ pub(crate) struct Home {
 
 impl Home {
     pub(crate) fn start(pinning: Pinning) -> Self {
+        Self::with_rings(pinning, RING_BYTES)
+    }
+
+    fn with_rings(pinning: Pinning, ring_bytes: usize) -> Self {
         let socket = std::env::temp_dir().join(format!("sinew-bench-lncl-{}", std::process::id()));
-        let process = Process::start(&format!("node {} {}", pinning.name(), socket.display()));
+        let process = Process::start(&format!("node {} {} {ring_bytes}", pinning.name(), socket.display()));
         Self { _process: process, socket }
     }
 
@@ -49,9 +57,10 @@ impl Drop for Home {
 }
 
 /// The node: until the measuring end ends this process.
-pub(crate) fn node(socket: &str) {
+pub(crate) fn node(socket: &str, ring_bytes: usize) {
     let node = Node::builder("lncl").configure(|config| {
         config.lncl.socket = Some(socket.into());
+        config.lncl.ring_bytes = ring_bytes;
         config.ndl.multicast = None;
         config.ndl.mdns_port = None;
     });
@@ -72,14 +81,33 @@ pub(crate) fn register(way: Way, socket: &str, name: &str) -> Endpoint {
     api.register_transport_address(registration.name(name)).expect("an address")
 }
 
+/// Where a payload is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Memory {
+    /// In the ring, if that is possible.
+    Lent,
+    /// In memory of its own, from which it is copied when it is sent.
+    Copied,
+}
+
+impl Memory {
+    fn create(self, endpoint: &mut Endpoint, to: Tid, kind: Kind, length: usize) -> LentMessage {
+        // While one is lent there is no other one in the ring.
+        let taken =
+            (self == Self::Copied).then(|| endpoint.create_message(to, kind, 0).expect("it is short"));
+        let message = endpoint.create_message(to, kind, length).expect("not too long");
+        drop(taken);
+        message
+    }
+}
+
 /// The application that echoes: until the measuring end ends this process.
-pub(crate) fn echo(way: Way, socket: &str) {
+pub(crate) fn echo(way: Way, memory: Memory, socket: &str) {
     let mut endpoint = register(way, socket, "echo");
     say_there();
     while let Some(received) = endpoint.receive(DEADLINE).expect("the node lives") {
         let (to, bytes) = (received.source(), received.bytes());
-        let mut back =
-            endpoint.create_message(to, received.kind(), bytes.len()).expect("as long as what came");
+        let mut back = memory.create(&mut endpoint, to, received.kind(), bytes.len());
         back.copy_from_slice(bytes);
         if received.kind() == AGED {
             let age = received.age(Time::now());
@@ -102,22 +130,26 @@ pub(crate) fn become_cpp_echo(socket: &str) {
 struct Pair {
     endpoint: Endpoint,
     to: Tid,
+    memory: Memory,
     _echo: Process,
     _home: Home,
 }
 
 impl Pair {
     fn start(way: Way, pinning: Pinning, echo: &str) -> Self {
-        let home = Home::start(pinning);
+        Self::at(Home::start(pinning), way, pinning, echo)
+    }
+
+    fn at(home: Home, way: Way, pinning: Pinning, echo: &str) -> Self {
         let echo = Process::start(&role(echo, way, pinning, home.socket()));
         let mut endpoint = register(way, home.socket(), "ping");
         let to = endpoint.resolve("echo", DEADLINE).expect("the node lives").expect("it is registered");
-        Self { endpoint, to, _echo: echo, _home: home }
+        Self { endpoint, to, memory: Memory::Lent, _echo: echo, _home: home }
     }
 
     /// Sends `buffer`, and fills it with what comes back.
     fn round_trip(&mut self, kind: Kind, buffer: &mut [u8]) {
-        let mut block = self.endpoint.create_message(self.to, kind, buffer.len()).expect("not too long");
+        let mut block = self.memory.create(&mut self.endpoint, self.to, kind, buffer.len());
         block.copy_from_slice(buffer);
         self.endpoint.send_message(block).expect("the node takes it");
         let back = self.endpoint.receive(DEADLINE).expect("the node lives").expect("the echo answers");
@@ -129,6 +161,26 @@ impl Pair {
 pub(crate) fn round_trips(way: Way, bytes: usize, rounds: Rounds, pinning: Pinning) -> Figures {
     let (mut pair, mut buffer) = (Pair::start(way, pinning, "echo"), vec![7; bytes]);
     rounds.time(|| pair.round_trip(BLOCK, &mut buffer))
+}
+
+/// The same through rings that take it in one piece, and whether it was written in place.
+pub(crate) fn loans(
+    way: Way,
+    memory: Memory,
+    bytes: usize,
+    rounds: Rounds,
+    pinning: Pinning,
+) -> (Figures, bool) {
+    let home = Home::with_rings(pinning, LONG_RING_BYTES);
+    let echo = match memory {
+        Memory::Lent => "echo",
+        Memory::Copied => "echo_copied",
+    };
+    let mut pair = Pair { memory, ..Pair::at(home, way, pinning, echo) };
+    let mut buffer = vec![7; bytes];
+    let figures = rounds.time(|| pair.round_trip(BLOCK, &mut buffer));
+    let last = memory.create(&mut pair.endpoint, pair.to, BLOCK, bytes);
+    (figures, last.is_in_place())
 }
 
 /// The paper's test: how old each of the first 1024 packets is when it is received.

@@ -6,6 +6,7 @@
 //! rounds of the cases at 1000 bytes. Times are microseconds. Nothing here asserts a time.
 //!
 //! - Round trips at 8 B to 1 MiB, back to back; at 1000 B also one every millisecond.
+//! - `loan`: the same at 64 KiB and 1 MiB through rings that take them in one piece, written in the ring, beside copied into it.
 //! - `table_1`: the paper's test, 1024 packets of 1000 bytes, one way, the first ones included.
 //!   With the receiver in C++ too if `SINEW_CPP_ECHO` is the path of what `echo.cpp` was compiled to, as in `bindings/c/README.md`.
 //! - `fan_in`: eight processes send to one, each 1000 bytes every millisecond, one way.

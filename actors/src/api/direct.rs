@@ -24,8 +24,10 @@ use sinew_shm::{Any, AnyError, BellKind, Offer, Spin, Waiter};
 
 use super::{
     ApiError,
+    lent::Draft,
     link::{
         LinkOptions, Writer,
+        loan::InRing,
         ring::{self, NAP},
         socket,
     },
@@ -83,7 +85,7 @@ pub(super) enum Sent {
     /// It is in the ring, or waits for room as the newest of its Stream.
     Taken,
     /// The peer has gone.
-    Gone(Message),
+    Gone(Draft),
 }
 
 /// The node's link, and the numbers by which this endpoint knows what it has asked.
@@ -154,25 +156,32 @@ impl Direct {
         }
     }
 
+    /// Lends room in the ring of a link; `None` if there is none now.
+    pub(super) fn lend(&mut self, number: LinkNumber, length: usize) -> Option<InRing> {
+        self.standing(number)?.writer.lend(length)
+    }
+
     /// Sends on a link.
     ///
     /// # Errors
     /// [`ApiError::Stalled`]: the peer takes nothing; or it is too long for its rings.
-    pub(super) fn send(&mut self, number: LinkNumber, message: Message, now: Time) -> Result<Sent, ApiError> {
-        let links = self.open.iter_mut().chain(&mut self.held);
-        let Some(link) = links.into_iter().find(|link| link.number == number) else {
-            return Ok(Sent::Gone(message));
-        };
-        match link.send(message) {
-            Err((ApiError::Closed(_), message)) => {
+    pub(super) fn send(&mut self, number: LinkNumber, draft: Draft, now: Time) -> Result<Sent, ApiError> {
+        let Some(link) = self.standing(number) else { return Ok(Sent::Gone(draft)) };
+        match link.send_draft(draft) {
+            Err((ApiError::Closed(_), draft)) => {
                 // Its last words are read before it is forgotten.
-                let _ = self.routes.hung_up(link.peer, Left::Something, now);
+                let peer = link.peer;
+                let _ = self.routes.hung_up(peer, Left::Something, now);
                 self.look_at = now;
-                Ok(Sent::Gone(message))
+                Ok(Sent::Gone(draft))
             }
             Err((error, _)) => Err(error),
             Ok(()) => Ok(Sent::Taken),
         }
+    }
+
+    fn standing(&mut self, number: LinkNumber) -> Option<&mut Standing> {
+        self.open.iter_mut().chain(&mut self.held).find(|link| link.number == number)
     }
 
     /// Whether this link has not ended.

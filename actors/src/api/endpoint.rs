@@ -6,7 +6,7 @@ use sinew_runtime::{
     outcome::Outcome,
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
-    wire::{Flags, Header, Kind, Message, MessageBuffer, Payload},
+    wire::{Flags, Header, Kind, Message, Payload},
 };
 
 use super::{
@@ -14,6 +14,7 @@ use super::{
     direct::{Direct, Terms},
     inbox::{Answer, Awaited, Inbox},
     incoming::WhenFull,
+    lent::LentMessage,
     link::{Ended, Greeting, Link, Reader, Writer},
     returning::Home,
 };
@@ -101,27 +102,28 @@ impl Endpoint {
         self.payload_max
     }
 
-    /// Writable memory of `length` bytes for a raw payload of `kind` (the paper's CreateMessage).
+    /// Writable memory of `length` bytes, all zeros, for a raw payload of `kind` (the paper's CreateMessage): in the ring
+    /// itself where that is possible, see [`LentMessage`]. Never waits.
     ///
     /// # Errors
     /// It would be longer than the node takes.
     pub fn create_message(
-        &self,
+        &mut self,
         destination: Tid,
         kind: Kind,
         length: usize,
-    ) -> Result<MessageBuffer, ApiError> {
+    ) -> Result<LentMessage, ApiError> {
         self.check_length(length)?;
-        Ok(MessageBuffer::new(Header::new(kind, self.tid, destination), length))
+        Ok(self.lend(Header::new(kind, self.tid, destination), length))
     }
 
-    /// Sends memory that [`create_message`](Self::create_message) lent (the paper's SendMessage). Returns when the
-    /// socket to the node has taken it; what becomes of it then is not told.
+    /// Sends memory that [`create_message`](Self::create_message) lent (the paper's SendMessage), without a copy if it lies
+    /// in the ring. Returns when the ring, or the socket to the node, has it; what becomes of it then is not told.
     ///
     /// # Errors
-    /// It was not sent.
-    pub fn send_message(&mut self, buffer: MessageBuffer) -> Result<(), ApiError> {
-        self.dispatch(buffer.freeze()).map(drop)
+    /// It was not sent, and its memory is given back. [`ApiError::Lent`]: another one lies in the ring.
+    pub fn send_message(&mut self, message: LentMessage) -> Result<(), ApiError> {
+        self.dispatch(message).map(drop)
     }
 
     /// Sends a value, in the class of its type. Returns when the socket to the node has taken it.

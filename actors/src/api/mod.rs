@@ -41,6 +41,7 @@ mod endpoint;
 mod error;
 mod inbox;
 mod incoming;
+mod lent;
 mod link;
 mod outgoing;
 mod raw;
@@ -63,6 +64,7 @@ use sinew_shm::Spin;
 
 pub use endpoint::Endpoint;
 pub use error::ApiError;
+pub use lent::LentMessage;
 pub use link::Transport;
 pub use received::Received;
 

@@ -6,7 +6,7 @@ use sinew_runtime::{
     outcome::{Outcome, Rejection},
     tid::{NodeAddress, Tid},
     time::Time,
-    wire::{Class, Flags, Message},
+    wire::{Class, Flags, Header, Message},
 };
 
 use super::{
@@ -14,6 +14,7 @@ use super::{
     direct::{Sent, ToNode},
     inbox::{Answer, Awaited},
     incoming::{Wanted, WhenFull},
+    lent::{Draft, LentMessage},
     routes::LinkNumber,
 };
 
@@ -22,7 +23,12 @@ const LAST_LOOKS: usize = 64;
 
 impl Endpoint {
     /// Sends `message` and waits for its outcome.
-    pub(super) fn confirm(&mut self, mut message: Message, within: Duration) -> Result<Outcome, ApiError> {
+    pub(super) fn confirm(
+        &mut self,
+        message: impl Into<Draft>,
+        within: Duration,
+    ) -> Result<Outcome, ApiError> {
+        let mut message = message.into();
         if message.header.class == Class::Stream {
             // Of a Stream the newest wins, so an older one has no outcome of its own.
             return Ok(Outcome::Rejected(Rejection::Unsupported));
@@ -37,9 +43,10 @@ impl Endpoint {
     /// Sends `message` as a request and waits for the reply.
     pub(super) fn await_reply(
         &mut self,
-        mut message: Message,
+        message: impl Into<Draft>,
         within: Duration,
     ) -> Result<Message, ApiError> {
+        let mut message = message.into();
         message.header.class = Class::Control;
         message.header.time_to_live_us = in_micros(within);
         match self.request(message, Awaited::Reply, Flags::CONFIRM.with(Flags::ASK), within)? {
@@ -50,10 +57,11 @@ impl Endpoint {
     }
 
     /// Sends `message` as the reply to `request`.
-    pub(super) fn answer(&mut self, request: &Received, mut message: Message) -> Result<(), ApiError> {
+    pub(super) fn answer(&mut self, request: &Received, message: impl Into<Draft>) -> Result<(), ApiError> {
         if !request.wants_reply() {
             return Err(ApiError::NotAsked);
         }
+        let mut message = message.into();
         message.header.destination = request.source();
         message.header.class = Class::Control;
         message.header.flags = Flags::REPLY;
@@ -64,11 +72,12 @@ impl Endpoint {
     /// Sends `message` and waits for its answer; `None` at the deadline.
     pub(super) fn request(
         &mut self,
-        mut message: Message,
+        message: impl Into<Draft>,
         awaited: Awaited,
         flags: Flags,
         within: Duration,
     ) -> Result<Option<Answer>, ApiError> {
+        let mut message = message.into();
         self.correlation += 1;
         message.header.correlation = self.correlation;
         message.header.flags = message.header.flags.with(flags);
@@ -96,17 +105,47 @@ impl Endpoint {
         }
     }
 
+    /// Lends memory for a payload of `length` bytes: in the ring that a message to `destination` goes into now, if it can.
+    pub(super) fn lend(&mut self, header: Header, length: usize) -> LentMessage {
+        let way = self.way(self.absolute(header.destination), Time::now());
+        let room = match way {
+            Some(link) => self.direct.lend(link, length),
+            None => self.writer.lend(length),
+        };
+        match room {
+            Some(room) => LentMessage::in_ring(header, room),
+            None => LentMessage::new(header, length),
+        }
+    }
+
     /// Sends `message` the way that is right now; the link, if it did not go through the node.
-    pub(super) fn dispatch(&mut self, mut message: Message) -> Result<Option<LinkNumber>, ApiError> {
+    pub(super) fn dispatch(&mut self, message: impl Into<Draft>) -> Result<Option<LinkNumber>, ApiError> {
+        let mut draft = message.into();
         self.try_return();
-        self.check_length(message.payload.len())?;
+        self.check_length(draft.payload.len())?;
         // A new connection may have another address.
-        message.header.source = self.tid;
+        draft.header.source = self.tid;
         self.sequence += 1;
-        message.header.sequence = self.sequence;
+        draft.header.sequence = self.sequence;
         let now = Time::now();
-        message.header.sent = now;
-        let destination = self.absolute(message.header.destination);
+        draft.header.sent = now;
+        let destination = self.absolute(draft.header.destination);
+        if let Some(link) = self.way(destination, now) {
+            draft.header.destination = destination;
+            match self.direct.send(link, draft, now)? {
+                Sent::Taken => return Ok(Some(link)),
+                Sent::Gone(back) => draft = back,
+            }
+        }
+        self.be_there()?;
+        if self.reader.has_ended(now) {
+            return Err(self.explain(ApiError::Closed("the node has gone".to_owned())));
+        }
+        self.writer.send(draft).map(|()| None).map_err(|error| self.explain(error))
+    }
+
+    /// The link on which a message to `destination` goes now; `None` for the way through the node.
+    fn way(&mut self, destination: Tid, now: Time) -> Option<LinkNumber> {
         let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
         self.direct.look(now, &mut node);
         if self.direct.is_asking(now) {
@@ -114,18 +153,7 @@ impl Endpoint {
             let _ = self.take_in_from_node(None, WhenFull::Leave);
         }
         let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
-        if let Some(link) = self.direct.way(destination, now, &mut node) {
-            message.header.destination = destination;
-            match self.direct.send(link, message, now)? {
-                Sent::Taken => return Ok(Some(link)),
-                Sent::Gone(back) => message = back,
-            }
-        }
-        self.be_there()?;
-        if self.reader.has_ended(now) {
-            return Err(self.explain(ApiError::Closed("the node has gone".to_owned())));
-        }
-        self.writer.write(&message).map(|()| None).map_err(|error| self.explain(error))
+        self.direct.way(destination, now, &mut node)
     }
 
     pub(super) const fn absolute(&self, destination: Tid) -> Tid {

@@ -2,9 +2,9 @@
 
 use std::time::Duration;
 
-use sinew_runtime::{outcome::Outcome, wire::MessageBuffer};
+use sinew_runtime::outcome::Outcome;
 
-use super::{ApiError, Endpoint, Received};
+use super::{ApiError, Endpoint, LentMessage, Received};
 
 impl Endpoint {
     /// As [`send_confirmed`](Self::send_confirmed), for memory that [`create_message`](Self::create_message) lent.
@@ -13,18 +13,18 @@ impl Endpoint {
     /// It was not sent, or the connection ended before the outcome was known.
     pub fn send_message_confirmed(
         &mut self,
-        buffer: MessageBuffer,
+        message: LentMessage,
         within: Duration,
     ) -> Result<Outcome, ApiError> {
-        self.confirm(buffer.freeze(), within)
+        self.confirm(message, within)
     }
 
     /// As [`ask`](Self::ask), for memory that [`create_message`](Self::create_message) lent; it travels as Control.
     ///
     /// # Errors
     /// It was not sent or not handled, or no reply came `within` this time.
-    pub fn ask_message(&mut self, buffer: MessageBuffer, within: Duration) -> Result<Received, ApiError> {
-        self.await_reply(buffer.freeze(), within).map(Received::new)
+    pub fn ask_message(&mut self, message: LentMessage, within: Duration) -> Result<Received, ApiError> {
+        self.await_reply(message, within).map(Received::new)
     }
 
     /// As [`reply`](Self::reply), for memory that [`create_message`](Self::create_message) lent. It goes to who asked,
@@ -32,7 +32,7 @@ impl Endpoint {
     ///
     /// # Errors
     /// The message asks for no reply, or the reply was not sent.
-    pub fn reply_message(&mut self, request: &Received, buffer: MessageBuffer) -> Result<(), ApiError> {
-        self.answer(request, buffer.freeze())
+    pub fn reply_message(&mut self, request: &Received, message: LentMessage) -> Result<(), ApiError> {
+        self.answer(request, message)
     }
 }

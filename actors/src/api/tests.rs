@@ -17,7 +17,7 @@ use crate::lncl::{
 };
 
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
-struct Torque {
+pub(super) struct Torque {
     newton_metres: f32,
 }
 
@@ -42,7 +42,7 @@ impl Payload for Setpoint {
     const CLASS: Class = Class::Stream;
 }
 
-const TORQUE: Torque = Torque { newton_metres: 2.5 };
+pub(super) const TORQUE: Torque = Torque { newton_metres: 2.5 };
 
 /// Every claim of NodeAPI holds whatever carries the messages.
 macro_rules! on_every_transport {

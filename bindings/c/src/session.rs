@@ -2,7 +2,7 @@
 
 use std::{ffi::CString, time::Duration};
 
-use sinew::{ApiError, Kind, MessageBuffer, Outcome, Tid};
+use sinew::{ApiError, Kind, LentMessage, Outcome, Tid};
 
 use crate::{
     hand::Hand,
@@ -19,7 +19,7 @@ const RECEIVED_MAX: usize = 1024;
 pub(crate) struct Session {
     endpoint: sinew::Endpoint,
     node_name: CString,
-    made: Hand<MessageBuffer>,
+    made: Hand<LentMessage>,
     received: Hand<sinew::Received>,
 }
 
@@ -134,7 +134,7 @@ impl Session {
         Ok(self.endpoint.unregister()?)
     }
 
-    fn take(&mut self, message: &mut Message) -> Result<MessageBuffer, Fault> {
+    fn take(&mut self, message: &mut Message) -> Result<LentMessage, Fault> {
         let Some(buffer) = self.made.give(message.token) else { return Err(no_such("the message")) };
         *message = Message::GONE;
         Ok(buffer)

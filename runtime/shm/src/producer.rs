@@ -71,6 +71,26 @@ impl Producer {
         }
     }
 
+    /// The memory that [`Loan::set_aside`] left; empty if there is none.
+    #[must_use]
+    pub fn aside(&self) -> &[u8] {
+        let reserved = self.core.reserved();
+        reserved.map_or(&[], |reserved| {
+            self.core.own.bytes(self.core.payload_position(reserved), reserved.length)
+        })
+    }
+
+    /// The same, to be written.
+    pub fn aside_mut(&mut self) -> &mut [u8] {
+        match self.core.reserved() {
+            Some(reserved) => {
+                let position = self.core.payload_position(reserved);
+                self.core.own.bytes_mut(position, reserved.length)
+            }
+            None => &mut [],
+        }
+    }
+
     /// Copies a message into the ring and publishes it.
     ///
     /// # Errors

@@ -48,6 +48,8 @@ struct Victim {
     held: VecDeque<Received>,
     dice: Dice,
     number: u64,
+    /// Until it has held both.
+    says_so: bool,
 }
 
 impl Victim {
@@ -59,21 +61,16 @@ impl Victim {
         for name in [ECHO, SINK] {
             others.extend(endpoint.resolve(name, crate::DEADLINE).expect("the node answers"));
         }
-        Self { endpoint, others, held: VecDeque::new(), dice, number: 0 }
+        Self { endpoint, others, held: VecDeque::new(), dice, number: 0, says_so: true }
     }
 
     fn work(mut self) {
-        let mut says_so = true;
         loop {
             for _ in 0..2 {
                 self.send_one();
             }
             self.hold_some();
             self.hold_a_loan();
-            if says_so && !self.held.is_empty() {
-                says_so = false;
-                say_that_one_more_holds();
-            }
         }
     }
 
@@ -108,12 +105,17 @@ impl Victim {
         }
     }
 
-    /// Memory that was created, is written to, and is not sent.
+    /// Memory in the ring that was created, is written to, and is not sent.
     fn hold_a_loan(&mut self) {
         let (to, length) = (self.somewhere(), self.dice.below(20_000) as usize);
         let while_held = self.dice.time_below(WHILE);
         let mut loan = self.endpoint.create_message(to, Kind::named(SCRAP), length).expect("it is not long");
         loan.fill(0xAB);
+        // A ring that is full for a moment lends nothing.
+        if self.says_so && loan.is_in_place() && !self.held.is_empty() {
+            self.says_so = false;
+            say_that_one_more_holds();
+        }
         thread::sleep(while_held);
     }
 }

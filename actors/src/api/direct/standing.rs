@@ -16,6 +16,7 @@ use super::hang_up;
 use crate::{
     api::{
         ApiError,
+        lent::{Content, Draft},
         link::ring::{self, ENOUGH, End},
         routes::LinkNumber,
     },
@@ -73,6 +74,25 @@ impl Standing {
             frames,
             parked: Vec::new(),
             has_forged: false,
+        }
+    }
+
+    /// Sends a message: in place if it lies in this link's ring, else as [`send`](Self::send) does.
+    pub(super) fn send_draft(&mut self, draft: Draft) -> Result<(), (ApiError, Draft)> {
+        let Draft { header, payload } = draft;
+        match payload {
+            Content::InRing(loan) if loan.is_of(&self.writer) => {
+                if header.class == Class::Stream {
+                    // It is the newest: an older one that waits must not come later.
+                    self.parked.retain(|older| older.header.kind != header.kind);
+                }
+                loan.publish(&header);
+                Ok(())
+            }
+            payload @ (Content::Bytes(_) | Content::InRing(_)) => {
+                let message = Draft { header, payload }.into_message();
+                self.send(message).map_err(|(error, message)| (error, message.into()))
+            }
         }
     }
 

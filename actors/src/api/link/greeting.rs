@@ -81,7 +81,8 @@ impl Greeting {
             Some(ring_bytes) => {
                 let (producer, consumer) = ring::exchange(&socket, ring_bytes, Time::now() + EXCHANGE)?;
                 let reader = ring::Reader::new(socket.clone(), consumer, payload_max, options.spin);
-                (Writer::Ring(ring::Writer::new(socket, producer, options)), Reader::Ring(Box::new(reader)))
+                let writer = Arc::new(ring::Writer::new(socket, producer, options));
+                (Writer::Ring(writer), Reader::Ring(Box::new(reader)))
             }
         };
         Ok(Link { registered, writer: Arc::new(writer), reader, node })

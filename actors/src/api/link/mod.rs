@@ -2,6 +2,7 @@
 //! a ring each way in shared memory with the socket beside it, which then tells the node's end.
 
 mod greeting;
+pub(super) mod loan;
 pub(super) mod ring;
 pub(super) mod socket;
 
@@ -21,10 +22,14 @@ use sinew_runtime::{
 use sinew_shm::Spin;
 use socket2::{Domain, SockAddr, Socket, Type};
 
-use super::ApiError;
+use super::{
+    ApiError,
+    lent::{Content, Draft},
+};
 use crate::lncl::payload::{Refusal, Register, Registered};
 
 pub(super) use greeting::Greeting;
+use loan::InRing;
 
 /// How long to wait for a place in the queue of a node that does not accept.
 const CONNECT: Duration = Duration::from_secs(2);
@@ -75,7 +80,7 @@ pub(super) fn connect(path: &Path) -> Result<UnixStream, ApiError> {
 #[derive(Debug)]
 pub(super) enum Writer {
     Socket(socket::Writer),
-    Ring(ring::Writer),
+    Ring(Arc<ring::Writer>),
 }
 
 impl Writer {
@@ -91,6 +96,27 @@ impl Writer {
         match self {
             Self::Socket(writer) => writer.write(message),
             Self::Ring(writer) => writer.write(message),
+        }
+    }
+
+    /// Lends room for a payload of `length` bytes where it will travel from; `None` if there is none now.
+    pub(super) fn lend(&self, length: usize) -> Option<InRing> {
+        match self {
+            Self::Socket(_) => None,
+            Self::Ring(writer) => writer.lend(length),
+        }
+    }
+
+    /// Writes the frame of a draft: in place if its payload is in this very ring.
+    pub(super) fn send(&self, draft: Draft) -> Result<(), ApiError> {
+        match (self, draft.payload) {
+            (Self::Ring(writer), Content::InRing(loan)) if loan.is_of(writer) => {
+                loan.publish(&draft.header);
+                Ok(())
+            }
+            (Self::Ring(_) | Self::Socket(_), payload) => {
+                self.write(&Message::new(draft.header, payload.into_bytes()))
+            }
         }
     }
 

@@ -125,6 +125,22 @@ impl Writer {
         }
     }
 
+    /// Takes the ring out, with room for `length` bytes set aside; `None` if there is no room now, or the ring is lent.
+    pub(super) fn take_out(&self, length: usize) -> Option<Box<Producer>> {
+        // What is owed would wait for as long as the loan lasts.
+        self.pay();
+        let mut place = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
+        // An error shows itself again when the message is sent.
+        place.as_deref_mut()?.loan(length).ok()?.set_aside();
+        place.take()
+    }
+
+    /// Takes the ring back, and pays what was said meanwhile.
+    pub(super) fn put_back(&self, producer: Box<Producer>) {
+        *self.producer.lock().unwrap_or_else(PoisonError::into_inner) = Some(producer);
+        self.pay();
+    }
+
     /// Writes what is no frame.
     #[cfg(test)]
     pub(in crate::api) fn write_garbage(&self) {
