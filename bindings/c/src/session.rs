@@ -128,6 +128,8 @@ impl Session {
 
     /// Gives the address back. What is in hand has not been handled to its end, and fails.
     pub(crate) fn unregister(mut self) -> Result<(), Fault> {
+        // One of these may lie in the ring, through which the rest is said.
+        self.made.empty().for_each(drop);
         for message in self.received.empty() {
             message.settle(Outcome::Failed);
         }
