@@ -33,6 +33,7 @@ static void send_angle(sinew_endpoint *sensor, sinew_tid drive, uint32_t number)
     sinew_message message;
     sinew_kind kind = sinew_kind_named(SINEW_TEXT("demo.joint_angle"));
     check(sinew_create_message(sensor, drive, kind, SINEW_STREAM, sizeof angle, &message), "create");
+    /* Into the memory that the drive's side reads: sending copies nothing. */
     memcpy(message.bytes, &angle, sizeof angle);
     check(sinew_send_message(sensor, &message), "send");
 }

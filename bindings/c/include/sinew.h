@@ -12,14 +12,16 @@
  *   without an endpoint may be called by any thread at any time. The sentence of sinew_last_error is the thread's own.
  * Pointers.  NULL is refused where it is not said to be legal. Any other pointer must point to what its type says, for
  *   the length of the call. Endpoints and messages are looked up, not followed: one that was unregistered, sent,
- *   discarded or settled is refused. The `bytes` of a message are good until then, and not after.
+ *   discarded or settled is refused. The `bytes` of a message are good until then, and not after. Between two calls any
+ *   one thread may write or read them.
  * Out.  What is given back through a pointer is set if the function returns SINEW_OK, and else left as it was, unless
  *   the function says more.
  * Time.  All times are nanoseconds, as their names say; UINT64_MAX waits for ever.
  * Texts.  UTF-8 with a length. Texts that the library hands out end with a zero and are not to be freed.
  * Panics.  A fault of the library ends as SINEW_ERROR_PANIC and never leaves it. The endpoint on which it happened can
  *   only be unregistered; everything else goes on.
- * fork.  A child of fork may not use its parent's endpoints: they return SINEW_ERROR_FORKED there. It may register its
+ * fork.  A child of fork may not use its parent's endpoints: they return SINEW_ERROR_FORKED there; nor may it write the
+ *   bytes of its parent's messages, which may be shared memory. It may register its
  *   own if it may call malloc, that is if the parent had one thread. While a child lives that has not called exec, the
  *   node does not see the parent's end: the child has its connections, too. Endpoints do not survive exec.
  * Sizes.  sinew_options carries its size and may grow; all other structs and all numbers stay as they are as long as
@@ -159,6 +161,11 @@ enum sinew_status
      * Memory for a message is lent in place; send or discard that message first. Nothing was sent.
      */
     SINEW_ERROR_LENT = -19,
+    /**
+     * The connection to the node has ended, through no fault of this endpoint, which registers again by itself while it is
+     * used: go on. Each send tries, and `sinew_receive_message`, which says this once, waits for it. The message was not sent.
+     */
+    SINEW_ERROR_AWAY = -20,
 };
 #ifndef __cplusplus
 #if __STDC_VERSION__ >= 202311L
@@ -531,6 +538,11 @@ uint64_t sinew_now_ns(void);
 /**
  * Lends `length` writable bytes, all zeros, for a payload of `kind` to `destination` (the paper's CreateMessage).
  * `message_class` is one of `sinew_message_class`. Up to 64 messages may be in the making. Does not block.
+ *
+ * The bytes lie in the shared memory from which they are read, if there is room and no other message of this endpoint in
+ * the making lies there already: then sending copies nothing. Until it is sent or discarded, sending anything else the same
+ * way returns `SINEW_ERROR_LENT`, and what `sinew_settle_message` says waits: so write it at once. Else they are ordinary
+ * memory. If the process is killed meanwhile, nobody notices more than its end.
  */
 sinew_status sinew_create_message(struct sinew_endpoint *endpoint,
                                   sinew_tid destination,

@@ -15,6 +15,11 @@ use crate::{
 
 /// Lends `length` writable bytes, all zeros, for a payload of `kind` to `destination` (the paper's CreateMessage).
 /// `message_class` is one of `sinew_message_class`. Up to 64 messages may be in the making. Does not block.
+///
+/// The bytes lie in the shared memory from which they are read, if there is room and no other message of this endpoint in
+/// the making lies there already: then sending copies nothing. Until it is sent or discarded, sending anything else the same
+/// way returns `SINEW_ERROR_LENT`, and what `sinew_settle_message` says waits: so write it at once. Else they are ordinary
+/// memory. If the process is killed meanwhile, nobody notices more than its end.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_create_message(
     endpoint: *mut Endpoint,

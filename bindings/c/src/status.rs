@@ -55,10 +55,13 @@ pub enum Status {
     SinewErrorPanic = -18,
     /// Memory for a message is lent in place; send or discard that message first. Nothing was sent.
     SinewErrorLent = -19,
+    /// The connection to the node has ended, through no fault of this endpoint, which registers again by itself while it is
+    /// used: go on. Each send tries, and `sinew_receive_message`, which says this once, waits for it. The message was not sent.
+    SinewErrorAway = -20,
 }
 
 impl Status {
-    const ALL: [Self; 21] = [
+    const ALL: [Self; 22] = [
         Self::SinewOk,
         Self::SinewNothing,
         Self::SinewErrorInvalidArgument,
@@ -80,6 +83,7 @@ impl Status {
         Self::SinewErrorForked,
         Self::SinewErrorPanic,
         Self::SinewErrorLent,
+        Self::SinewErrorAway,
     ];
 
     /// The text for a number; for one that is no status it says so.
@@ -125,6 +129,9 @@ impl Status {
             }
             Self::SinewErrorLent => {
                 c"memory for a message is lent in place; send or discard that message first"
+            }
+            Self::SinewErrorAway => {
+                c"the connection to the node has ended; the endpoint registers again by itself while it is used"
             }
             Self::SinewErrorPanic => {
                 c"a fault of this library; the endpoint can only be unregistered; please report it"
@@ -174,8 +181,8 @@ impl From<ApiError> for Fault {
             ApiError::Refused(_) => Status::SinewErrorRefused,
             ApiError::Waiting { .. } => Status::SinewErrorWaiting,
             ApiError::NoAnswer(_) => Status::SinewErrorNoAnswer,
-            // The endpoint comes back while it is used; the message of this call was not sent.
-            ApiError::Away(_) | ApiError::Closed(_) | ApiError::Frame(_) => Status::SinewErrorClosed,
+            ApiError::Away(_) => Status::SinewErrorAway,
+            ApiError::Closed(_) | ApiError::Frame(_) => Status::SinewErrorClosed,
             ApiError::Stalled(_) => Status::SinewErrorStalled,
             ApiError::TooLong { .. } => Status::SinewErrorTooLong,
             ApiError::Ended(_) => Status::SinewErrorNotHandled,

@@ -127,16 +127,20 @@ fn the_death_of_a_process_in_c_is_noticed_and_what_it_had_in_hand_has_failed() {
 }
 
 #[test]
-fn a_program_in_c_is_told_of_its_nodes_death() {
+fn a_program_in_c_is_told_of_its_nodes_death_and_comes_back_with_it() {
     if !is_there("gcc") {
         return;
     }
-    let ground = Ground::new();
+    let mut ground = Ground::new();
     let mut holder = ground.start(&C.shared("tests/programs/holder.c", &ground), &[]);
     holder.wait_for(&["ready"]);
     ground.node.signal(Signal::KILL);
-    holder.wait_for(&["receive", "-6", "the connection to the node has ended"]);
-    assert_eq!(holder.wait_for_end(), Some(1));
+    holder.wait_for(&["away", "the connection to the node has ended", "registers again by itself"]);
+    ground.start_node_again();
+    let mut asking = endpoint(&ground, Registration::new().requires(["holder"]));
+    let to = resolve(&mut asking, "holder");
+    let doubled: Torque = asking.ask(to, &Torque { newton_metres: 2.5 }, WATCHDOG).unwrap();
+    assert_eq!(doubled, Torque { newton_metres: 5.0 });
 }
 
 #[test]

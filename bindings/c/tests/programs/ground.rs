@@ -68,6 +68,14 @@ pub(crate) fn is_there(command: &str) -> bool {
     is_there
 }
 
+fn start_node(config: &Path) -> Program {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sinew-node"));
+    command.arg(config);
+    let mut node = Program::start("sinew-node", command);
+    node.wait_for(&["up"]);
+    node
+}
+
 /// A node in a process of its own, and a directory for its socket and for the programs.
 pub(crate) struct Ground {
     pub(crate) node: Program,
@@ -85,11 +93,12 @@ impl Ground {
             socket.display()
         );
         std::fs::write(&config, lines).expect("the test's own directory can be written to");
-        let mut command = Command::new(env!("CARGO_BIN_EXE_sinew-node"));
-        command.arg(&config);
-        let mut node = Program::start("sinew-node", command);
-        node.wait_for(&["up"]);
-        Self { node, directory }
+        Self { node: start_node(&config), directory }
+    }
+
+    /// After its node has ended.
+    pub(crate) fn start_node_again(&mut self) {
+        self.node = start_node(&self.directory.join("node.toml"));
     }
 
     /// Where the node listens.

@@ -59,6 +59,11 @@ int main(int argc, char **argv)
     fflush(stdout);
     while (count < MAX_HELD) {
         status = sinew_receive_message(holder, UINT64_MAX, &held[count]);
+        if (status == SINEW_ERROR_AWAY) {
+            printf("away: %s\n", sinew_last_error());
+            fflush(stdout);
+            continue;
+        }
         if (status != SINEW_OK)
             return fail("receive", status);
         if (held[count].kind == torque) {

@@ -128,6 +128,28 @@ static void used_twice(sinew_endpoint *endpoint)
     EXPECT(sinew_unregister(&other), SINEW_OK);
 }
 
+/* What lies in the ring goes first, or is given back first: a second one cannot overtake it. */
+static void two_in_the_making(sinew_endpoint *endpoint)
+{
+    sinew_tid to = sinew_endpoint_tid(endpoint);
+    sinew_message first = new_message(endpoint, to, 5), second = new_message(endpoint, to, 6);
+    sinew_received received;
+    memcpy(first.bytes, "first", 5);
+    EXPECT_WORDS(sinew_send_message(endpoint, &second), SINEW_ERROR_LENT, "send that message or drop it first");
+    EXPECT(second.bytes == NULL, 1);
+    EXPECT(sinew_send_message(endpoint, &first), SINEW_OK);
+    first = new_message(endpoint, to, 50000);
+    EXPECT_WORDS(sinew_send_bytes(endpoint, to, kind, SINEW_CONTROL, (const uint8_t *)"lent", 4), SINEW_ERROR_LENT, "memory for a message");
+    EXPECT(sinew_discard_message(endpoint, &first), SINEW_OK);
+    EXPECT(sinew_send_bytes(endpoint, to, kind, SINEW_CONTROL, (const uint8_t *)"second", 6), SINEW_OK);
+    EXPECT(sinew_receive_message(endpoint, 10 * SECOND, &received), SINEW_OK);
+    EXPECT(received.length == 5 && memcmp(received.bytes, "first", 5) == 0, 1);
+    EXPECT(sinew_settle_message(endpoint, &received, SINEW_DELIVERED), SINEW_OK);
+    EXPECT(sinew_receive_message(endpoint, 10 * SECOND, &received), SINEW_OK);
+    EXPECT(received.length == 6 && memcmp(received.bytes, "second", 6) == 0, 1);
+    EXPECT(sinew_settle_message(endpoint, &received, SINEW_DELIVERED), SINEW_OK);
+}
+
 /* So many may be in the making, and what is not sent goes with the endpoint. */
 static void too_many(void)
 {
@@ -211,6 +233,7 @@ int main(int argc, char **argv)
     null_arguments(endpoint);
     wrong_values(endpoint);
     used_twice(endpoint);
+    two_in_the_making(endpoint);
     too_many();
     two_threads(endpoint);
     forked(endpoint);
