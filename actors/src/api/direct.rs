@@ -38,7 +38,7 @@ use crate::{
     ring::{self as rings, Exchange, ExchangeError, RingError},
 };
 
-use standing::{Alone, Pair};
+use standing::{Alone, Pair, Put};
 pub(super) use standing::{Came, Everything, Standing};
 
 /// Time until it is looked again whether there is room for what is owed to a peer.
@@ -78,12 +78,20 @@ pub(super) struct Direct {
     look_at: Time,
     /// When one who only sends looks for answers of the node.
     hear_at: Time,
+    /// When it is tried again to write what waits for room.
+    flush_at: Time,
+    /// A caller writes a frame there, and wants to know first when that is done.
+    writing: Option<LinkNumber>,
 }
 
 /// What became of a message that was to go directly.
 pub(super) enum Sent {
     /// It is in the ring, or waits for room as the newest of its Stream.
     Taken,
+    /// Part of it is in the ring, and the rest follows when there is room.
+    Begun,
+    /// There is no room.
+    Full(Draft),
     /// The peer has gone.
     Gone(Draft),
 }
@@ -133,6 +141,8 @@ impl Direct {
             open: Vec::new(),
             look_at: Time::ZERO,
             hear_at: Time::ZERO,
+            flush_at: Time::ZERO,
+            writing: None,
         }
     }
 
@@ -161,10 +171,10 @@ impl Direct {
         self.standing(number)?.writer.lend(length)
     }
 
-    /// Sends on a link.
+    /// Sends on a link, as far as there is room.
     ///
     /// # Errors
-    /// [`ApiError::Stalled`]: the peer takes nothing; or it is too long for its rings.
+    /// [`ApiError::Lent`], or it is too long for its rings.
     pub(super) fn send(&mut self, number: LinkNumber, draft: Draft, now: Time) -> Result<Sent, ApiError> {
         let Some(link) = self.standing(number) else { return Ok(Sent::Gone(draft)) };
         match link.send_draft(draft) {
@@ -176,7 +186,21 @@ impl Direct {
                 Ok(Sent::Gone(draft))
             }
             Err((error, _)) => Err(error),
-            Ok(()) => Ok(Sent::Taken),
+            Ok(Put::Taken) => Ok(Sent::Taken),
+            Ok(Put::Begun) => Ok(Sent::Begun),
+            Ok(Put::Full(message)) => Ok(Sent::Full(message.into())),
+        }
+    }
+
+    /// Whether nothing is left half written on a link, or it has ended.
+    pub(super) fn is_whole(&mut self, number: LinkNumber) -> bool {
+        self.standing(number).is_none_or(Standing::is_whole)
+    }
+
+    /// Waits until a link has room for the beginning of a frame of so many bytes, or ends, or `within` this time.
+    pub(super) fn await_room(&mut self, number: LinkNumber, length: usize, within: Duration) {
+        if let Some(link) = self.standing(number) {
+            link.await_room(length, within);
         }
     }
 
@@ -335,19 +359,32 @@ impl Direct {
 
     /// Looks who has gone and what is to be said again, now and then.
     pub(super) fn look(&mut self, now: Time, node: &mut ToNode<'_>) {
+        if now >= self.flush_at {
+            self.flush_at = now + NAP;
+            self.flush();
+        }
         if now < self.look_at {
             return;
         }
         self.look_at = now + NAP;
         self.see_ends(now);
-        for link in self.open.iter_mut().chain(&mut self.held) {
-            link.flush();
-        }
         while let Some((peer, number)) = self.routes.switch_due(now) {
             match node.ask(self.switch_to(peer, number)) {
                 Some(correlation) => self.routes.switched(peer, correlation),
                 None => self.routes.not_switched(peer, now),
             }
+        }
+    }
+
+    /// A caller waits for room there: what answers its frame must not come before it knows that the frame is written.
+    pub(super) const fn is_writing_on(&mut self, link: Option<LinkNumber>) {
+        self.writing = link;
+    }
+
+    fn flush(&mut self) {
+        let writing = self.writing;
+        for link in self.open.iter_mut().chain(&mut self.held).filter(|link| Some(link.number) != writing) {
+            link.flush();
         }
     }
 
@@ -374,8 +411,12 @@ impl Direct {
     }
 
     /// When to look at the latest, if nothing comes before: what is owed is not said by itself.
-    pub(super) fn wake_by(&self, deadline: Time) -> Time {
-        if self.open.iter().any(Standing::owes) { deadline.min(Time::now() + OWED_AGAIN) } else { deadline }
+    pub(super) fn wake_by(&mut self, deadline: Time) -> Time {
+        if !self.open.iter().chain(&self.held).any(Standing::owes) {
+            return deadline;
+        }
+        self.flush_at = Time::now() + OWED_AGAIN;
+        deadline.min(self.flush_at)
     }
 
     /// What the end of a wait for the node and the open links says about the links.
@@ -417,10 +458,13 @@ impl Direct {
     fn see_ends(&mut self, now: Time) {
         let standing = self.open.iter().chain(&self.held).map(|link| (link.peer, link.number, &link.socket));
         let offered = self.offered.iter().map(|link| (link.peer, link.number, &link.socket));
-        let gone: Vec<_> = standing
-            .chain(offered)
-            .filter(|(_, _, socket)| socket::has_hung_up(socket))
-            .map(|(peer, number, _)| (peer, number))
+        let links: Vec<_> = standing.chain(offered).collect();
+        if links.is_empty() {
+            return;
+        }
+        let gone: Vec<_> = socket::which_hung_up(links.iter().map(|(_, _, socket)| &***socket))
+            .into_iter()
+            .map(|index| (links[index].0, links[index].1))
             .collect();
         for (peer, number) in gone {
             let left = self.left(number);

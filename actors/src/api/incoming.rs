@@ -136,9 +136,9 @@ impl Endpoint {
 
     /// Waits until something comes, from the node or from a link, or until there is something to do.
     pub(super) fn wait(&mut self, deadline: Time) {
+        let deadline = self.direct.wake_by(deadline);
         match &mut self.reader {
             Reader::Ring(reader) if !self.direct.open.is_empty() => {
-                let deadline = self.direct.wake_by(deadline);
                 let links = &mut self.direct.open[..];
                 let ended = reader.wait_for_all(deadline, |node| Everything { node, links });
                 reader.note(&ended);

@@ -6,7 +6,7 @@ use sinew_runtime::{
     outcome::{Outcome, Rejection},
     tid::{NodeAddress, Tid},
     time::Time,
-    wire::{Class, Flags, Header, Message},
+    wire::{Class, Flags, HEADER_LEN, Header, Message},
 };
 
 use super::{
@@ -15,11 +15,14 @@ use super::{
     inbox::{Answer, Awaited},
     incoming::{Wanted, WhenFull},
     lent::{Draft, LentMessage},
+    link::ring::NAP,
     routes::LinkNumber,
 };
 
 /// Looks for the last words of a node that has gone.
 const LAST_LOOKS: usize = 64;
+/// First pause between two looks at what others send while a direct link has no room; doubled up to a nap. Room ends it.
+const ROOM_PAUSE: Duration = Duration::from_millis(1);
 
 impl Endpoint {
     /// Sends `message` and waits for its outcome.
@@ -132,9 +135,9 @@ impl Endpoint {
         let destination = self.absolute(draft.header.destination);
         if let Some(link) = self.way(destination, now) {
             draft.header.destination = destination;
-            match self.direct.send(link, draft, now)? {
-                Sent::Taken => return Ok(Some(link)),
-                Sent::Gone(back) => draft = back,
+            match self.send_on(link, draft)? {
+                None => return Ok(Some(link)),
+                Some(back) => draft = back,
             }
         }
         self.be_there()?;
@@ -154,6 +157,45 @@ impl Endpoint {
         }
         let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
         self.direct.way(destination, now, &mut node)
+    }
+
+    /// Sends on a direct link, and hands the message back if the peer has gone. While there is no room this endpoint takes in
+    /// what others send to it: two that wait for room in each other's rings would wait for ever.
+    ///
+    /// # Errors
+    /// [`ApiError::Stalled`]: nothing of it was written. Of what was written in part the rest goes out with later calls.
+    fn send_on(&mut self, link: LinkNumber, draft: Draft) -> Result<Option<Draft>, ApiError> {
+        let (length, patience) = (HEADER_LEN + draft.payload.len(), self.home.options.patience);
+        // `None`: it is begun.
+        let mut left = Some(draft);
+        let (mut until, mut pause) = (None, ROOM_PAUSE);
+        loop {
+            left = match left {
+                None if self.direct.is_whole(link) => return Ok(None),
+                None => None,
+                Some(draft) => match self.direct.send(link, draft, Time::now())? {
+                    Sent::Taken => return Ok(None),
+                    Sent::Gone(back) => return Ok(Some(back)),
+                    Sent::Full(back) => Some(back),
+                    Sent::Begun => None,
+                },
+            };
+            let now = Time::now();
+            let until = *until.get_or_insert(now + patience);
+            if now >= until {
+                return left.map_or(Ok(None), |_| Err(ApiError::Stalled(patience)));
+            }
+            self.take_in_while_writing(link);
+            self.direct.await_room(link, length, pause.min(until.since(now)));
+            pause = (pause * 2).min(NAP);
+        }
+    }
+
+    fn take_in_while_writing(&mut self, link: LinkNumber) {
+        self.direct.is_writing_on(Some(link));
+        // What it cannot sort in, or read, shows when it receives.
+        let _ = self.take_in(None, WhenFull::Leave);
+        self.direct.is_writing_on(None);
     }
 
     pub(super) const fn absolute(&self, destination: Tid) -> Tid {

@@ -169,14 +169,9 @@ fn look(ends: &mut impl Ends) -> Result<Option<usize>, AnyError> {
 }
 
 fn hung_up(ends: &impl Ends) -> Result<Option<usize>, AnyError> {
-    for index in 0..ends.count() {
-        if let Some(hang_up) = ends.hang_up(index)
-            && platform::has_ended(hang_up).map_err(AnyError::System)?
-        {
-            return Ok(Some(index));
-        }
-    }
-    Ok(None)
+    let shown = || (0..ends.count()).filter_map(|index| ends.hang_up(index).map(|hang_up| (index, hang_up)));
+    let gone = platform::which_ended(shown().map(|(_, hang_up)| hang_up)).map_err(AnyError::System)?;
+    Ok(gone.and_then(|gone| shown().nth(gone)).map(|(index, _)| index))
 }
 
 #[cfg(all(test, target_os = "linux", not(any(loom, miri))))]

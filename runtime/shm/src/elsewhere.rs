@@ -44,7 +44,7 @@ pub(crate) fn buttons(_: BellKind, _: Vec<OwnedFd>) -> Result<Buttons, RefusedOf
     Err(RefusedOffer::Unsupported)
 }
 
-pub(crate) fn has_ended(_: HangUp<'_>) -> io::Result<bool> {
+pub(crate) fn which_ended<'a>(_: impl Iterator<Item = HangUp<'a>>) -> io::Result<Option<usize>> {
     Err(io::ErrorKind::Unsupported.into())
 }
 

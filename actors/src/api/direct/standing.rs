@@ -3,6 +3,7 @@
 use std::{
     os::{fd::AsFd, unix::net::UnixStream},
     sync::Arc,
+    time::Duration,
 };
 
 use sinew_runtime::{
@@ -17,7 +18,7 @@ use crate::{
     api::{
         ApiError,
         lent::{Content, Draft},
-        link::ring::{self, ENOUGH, End},
+        link::ring::{self, Begun, ENOUGH, End, Rest},
         routes::LinkNumber,
     },
     ring::{RingError, RingFrames, Taken},
@@ -39,6 +40,8 @@ pub(in crate::api) struct Standing {
     frames: RingFrames,
     /// The newest value of each kind of Stream that found no room: an older one must not come later.
     parked: Vec<Message>,
+    /// What is left of a long frame. Nothing else is written before it.
+    rest: Option<Rest>,
     has_forged: bool,
 }
 
@@ -49,6 +52,16 @@ pub(super) struct Pair {
     pub(super) number: LinkNumber,
     /// Hangs up with the peer.
     pub(super) socket: Arc<UnixStream>,
+}
+
+/// What became of a message that was to be written.
+pub(in crate::api) enum Put {
+    /// It is in the ring, or waits for room as the newest of its Stream.
+    Taken,
+    /// Part of it is in the ring: the rest is written when there is room.
+    Begun,
+    /// Nothing of it was written.
+    Full(Message),
 }
 
 /// What the ring of a link gave.
@@ -73,12 +86,13 @@ impl Standing {
             consumer,
             frames,
             parked: Vec::new(),
+            rest: None,
             has_forged: false,
         }
     }
 
     /// Sends a message: in place if it lies in this link's ring, else as [`send`](Self::send) does.
-    pub(super) fn send_draft(&mut self, draft: Draft) -> Result<(), (ApiError, Draft)> {
+    pub(super) fn send_draft(&mut self, draft: Draft) -> Result<Put, (ApiError, Draft)> {
         let Draft { header, payload } = draft;
         match payload {
             Content::InRing(loan) if loan.is_of(&self.writer) => {
@@ -87,7 +101,7 @@ impl Standing {
                     self.parked.retain(|older| older.header.kind != header.kind);
                 }
                 loan.publish(&header);
-                Ok(())
+                Ok(Put::Taken)
             }
             payload @ (Content::Bytes(_) | Content::InRing(_)) => {
                 let message = Draft { header, payload }.into_message();
@@ -96,44 +110,81 @@ impl Standing {
         }
     }
 
-    /// Writes a message; waits for room as long as the endpoint's patience lasts. Of a Stream the newest value waits here
-    /// instead, and is written when there is room: a late setpoint is a hazard.
-    pub(super) fn send(&mut self, message: Message) -> Result<(), (ApiError, Message)> {
-        if message.header.class != Class::Stream {
-            self.flush();
-            return self.writer.write(&message).map_err(|error| (error, message));
-        }
-        if let Some(parked) = self.parked.iter_mut().find(|other| other.header.kind == message.header.kind) {
-            *parked = message;
-            self.flush();
-            return Ok(());
-        }
-        match self.writer.try_write(&message) {
-            Ok(true) => Ok(()),
-            Ok(false) if self.parked.len() < PARKED_MAX => {
-                self.parked.push(message);
-                Ok(())
+    /// Writes a message as far as there is room. Of a Stream the newest value waits here for more, and is written when there
+    /// is: a late setpoint is a hazard.
+    ///
+    /// # Errors
+    /// The link cannot be used any more, or its ring is lent; the message was not written.
+    pub(super) fn send(&mut self, message: Message) -> Result<Put, (ApiError, Message)> {
+        if message.header.class == Class::Stream {
+            let same_kind = |other: &&mut Message| other.header.kind == message.header.kind;
+            if let Some(parked) = self.parked.iter_mut().find(same_kind) {
+                *parked = message;
+                self.flush();
+                return Ok(Put::Taken);
             }
-            Ok(false) => self.writer.write(&message).map_err(|error| (error, message)),
-            Err(error) => Err((error, message)),
+        } else if !self.parked.is_empty() {
+            self.flush();
         }
+        match self.put(message)? {
+            Put::Full(message) if message.header.class == Class::Stream && self.parked.len() < PARKED_MAX => {
+                self.parked.push(message);
+                Ok(Put::Taken)
+            }
+            whole_or_full @ (Put::Taken | Put::Begun | Put::Full(_)) => Ok(whole_or_full),
+        }
+    }
+
+    fn put(&mut self, message: Message) -> Result<Put, (ApiError, Message)> {
+        if !self.is_whole() {
+            return Ok(Put::Full(message));
+        }
+        Ok(match self.writer.begin(message)? {
+            Begun::Whole => Put::Taken,
+            Begun::Part(rest) => {
+                self.rest = Some(rest);
+                Put::Begun
+            }
+            Begun::Full(message) => Put::Full(message),
+        })
     }
 
     /// Writes what waits for room, as far as there is room.
     pub(in crate::api) fn flush(&mut self) {
-        self.writer.pay();
-        while let Some(first) = self.parked.first() {
-            // An error shows itself again when the ring is read.
-            if !matches!(self.writer.try_write(first), Ok(true)) {
-                break;
+        while self.is_whole() && !self.parked.is_empty() {
+            let first = self.parked.remove(0);
+            match self.put(first) {
+                Ok(Put::Taken | Put::Begun) => {}
+                Ok(Put::Full(first)) | Err((_, first)) => {
+                    // An error shows itself again when the ring is read.
+                    self.parked.insert(0, first);
+                    break;
+                }
             }
-            self.parked.remove(0);
+        }
+        self.writer.pay();
+    }
+
+    /// Writes on with a long frame; whether none is left half written.
+    pub(in crate::api) fn is_whole(&mut self) -> bool {
+        // An error shows itself again when the ring is read: the socket is closed.
+        if self.rest.as_mut().is_some_and(|rest| rest.go_on().unwrap_or(false)) {
+            self.rest = None;
+        }
+        self.rest.is_none()
+    }
+
+    /// Waits until there is room, the peer's end, or `within` this time.
+    pub(in crate::api) fn await_room(&mut self, length: usize, within: Duration) {
+        match &mut self.rest {
+            Some(rest) => rest.await_room(within),
+            None => self.writer.await_room(length, within),
         }
     }
 
     /// Whether something waits for room in the ring, so that it should be looked at soon.
     pub(in crate::api) fn owes(&self) -> bool {
-        !self.parked.is_empty() || self.writer.owes()
+        !self.parked.is_empty() || self.rest.is_some() || self.writer.owes()
     }
 
     /// The next message of those that were taken from the ring.
@@ -180,7 +231,10 @@ impl Drop for Standing {
     fn drop(&mut self) {
         // A message in some thread's hand may hold the writer, and the socket with it, a little longer.
         hang_up(&self.socket);
-        self.writer.wake_peer();
+        match &self.rest {
+            Some(rest) => rest.wake_peer(),
+            None => self.writer.wake_peer(),
+        }
     }
 }
 

@@ -409,6 +409,59 @@ fn a_long_message_goes_in_pieces_through_a_short_ring() {
 }
 
 #[test]
+fn two_that_wait_for_room_in_each_others_rings_take_in_what_is_there_meanwhile() {
+    // given: rings that hold a fraction of what each sends before it receives anything
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let wanted = || Registration::new().direct(true).patience(WATCHDOG / 2);
+    let (mut one, mut other) = (register(&node, wanted()), register(&node, wanted()));
+    link(&mut one, &mut other);
+    let (one_tid, other_tid, number) = (one.tid(), other.tid(), one.direct.open[0].number);
+    // when
+    let exchange = |endpoint: &mut Endpoint, to| {
+        for _ in 0..20 {
+            let long = endpoint.create_message(to, Kind::named("test.long"), 20_000).unwrap();
+            endpoint.send_message(long).unwrap();
+        }
+        for _ in 0..20 {
+            assert_eq!(endpoint.receive(WATCHDOG).unwrap().expect("a message").bytes().len(), 20_000);
+        }
+    };
+    thread::scope(|scope| {
+        scope.spawn(|| exchange(&mut one, other_tid));
+        exchange(&mut other, one_tid);
+    });
+    // then
+    assert_eq!(one.direct.open[0].number, number, "nobody lost patience within a frame");
+}
+
+#[test]
+fn of_a_long_message_that_a_peer_does_not_take_in_time_the_rest_goes_out_with_later_calls() {
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let mut one = register(&node, Registration::new().direct(true).patience(Duration::from_millis(10)));
+    let mut other = endpoint(&node);
+    link(&mut one, &mut other);
+    // when: nobody reads
+    let mut long = one.create_message(other.tid(), Kind::named("test.long"), 20_000).unwrap();
+    long.fill(7);
+    one.send_message(long).unwrap();
+    let stalled = one.send(other.tid(), &Counted(1)).unwrap_err();
+    assert!(matches!(stalled, ApiError::Stalled(_)), "{stalled}");
+    // then
+    let deadline = Time::now() + WATCHDOG;
+    let received = loop {
+        assert!(Time::now() < deadline, "waited for the long message");
+        assert!(one.receive(Duration::ZERO).unwrap().is_none());
+        if let Some(received) = other.receive(Duration::from_millis(1)).unwrap() {
+            break received;
+        }
+    };
+    assert!(received.bytes().len() == 20_000 && received.bytes().iter().all(|byte| *byte == 7));
+    assert!(has_link(&one, &other) && has_link(&other, &one), "the link has not ended");
+    one.send(other.tid(), &Counted(2)).unwrap();
+    assert_eq!(other.receive(WATCHDOG).unwrap().expect("a message").decode::<Counted>().unwrap(), Counted(2));
+}
+
+#[test]
 fn links_are_bounded_and_what_is_above_goes_through_the_node() {
     use crate::api::routes::LINKS_MAX;
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);

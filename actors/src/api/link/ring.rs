@@ -1,5 +1,7 @@
 //! A ring each way in shared memory, and a socket that tells the other end's end.
 
+mod writing;
+
 use std::{
     collections::VecDeque,
     io::IoSlice,
@@ -30,6 +32,8 @@ use crate::{
     lncl::payload::{self, Refusal},
     ring::{self, Exchange, ExchangeError, RingFrames, Taken},
 };
+
+pub(in crate::api) use writing::{Begun, Rest};
 
 /// Bytes that are taken from a ring at once.
 pub(in crate::api) const ENOUGH: usize = 64 * 1024;

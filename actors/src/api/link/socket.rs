@@ -154,6 +154,19 @@ pub(in crate::api) fn has_hung_up(socket: &UnixStream) -> bool {
     poll(&mut [PollFd::new(socket, PollFlags::RDHUP)], Some(&nothing)).is_ok_and(|count| count > 0)
 }
 
+/// Those of `sockets` whose other end is closed: one system call for all. Does not wait.
+pub(in crate::api) fn which_hung_up<'a>(sockets: impl Iterator<Item = &'a UnixStream>) -> Vec<usize> {
+    let nothing = Timespec { tv_sec: 0, tv_nsec: 0 };
+    let mut ends: Vec<_> = sockets.map(|socket| PollFd::new(socket, PollFlags::RDHUP)).collect();
+    match poll(&mut ends, Some(&nothing)) {
+        Ok(1..) => {
+            (0..).zip(&ends).filter(|(_, end)| !end.revents().is_empty()).map(|(index, _)| index).collect()
+        }
+        // They are looked at again.
+        Ok(0) | Err(_) => Vec::new(),
+    }
+}
+
 /// Waits for the socket; returns whether it is ready, `false` at the deadline. One wake of the calling thread.
 pub(super) fn wait(socket: &UnixStream, what: PollFlags, deadline: Time) -> Result<bool, Errno> {
     loop {

@@ -267,9 +267,18 @@ fn end_of(hang_up: HangUp<'_>) -> PollFd<'_> {
 
 /// Whether the peer is gone. Does not wait.
 pub(crate) fn has_ended(hang_up: HangUp<'_>) -> io::Result<bool> {
-    match poll(&mut [end_of(hang_up)], Some(&timespec(Duration::ZERO))) {
-        Ok(count) => Ok(count > 0),
-        Err(Errno::INTR) => Ok(false),
+    first_ended(&mut [end_of(hang_up)]).map(|ended| ended.is_some())
+}
+
+/// The first of those peers that are gone: one system call for all of them. Does not wait.
+pub(crate) fn which_ended<'a>(hang_ups: impl Iterator<Item = HangUp<'a>>) -> io::Result<Option<usize>> {
+    first_ended(&mut hang_ups.map(end_of).collect::<Vec<_>>())
+}
+
+fn first_ended(ends: &mut [PollFd<'_>]) -> io::Result<Option<usize>> {
+    match poll(ends, Some(&timespec(Duration::ZERO))) {
+        Ok(0) | Err(Errno::INTR) => Ok(None),
+        Ok(_) => Ok(ends.iter().position(|end| !end.revents().is_empty())),
         Err(errno) => Err(errno.into()),
     }
 }

@@ -8,7 +8,7 @@ mod passing;
 #[cfg(test)]
 mod tests;
 
-pub(crate) use bells::{bells, buttons, has_ended};
+pub(crate) use bells::{bells, buttons, which_ended};
 pub(crate) use ears::Ears;
 pub(crate) use mapping::{OwnHeaderMemory, OwnMemory, OwnRingMemory, PeerMemory};
 pub(crate) use memfd::{adopt, create};

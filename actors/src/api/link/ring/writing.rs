@@ -1,0 +1,131 @@
+//! A frame that is written without waiting, as far as there is room: the rest of a long one goes out later.
+
+use std::{io::IoSlice, mem, sync::Arc, sync::PoisonError, time::Duration};
+
+use rustix::fd::AsFd;
+use sinew_runtime::wire::{HEADER_LEN, Message};
+use sinew_shm::{HangUp, LoanError, Producer, Wait};
+
+use super::Writer;
+use crate::{api::ApiError, ring};
+
+/// The rest of a frame, part of which is in the ring. It has the ring for itself until it is whole: what others say
+/// meanwhile is owed.
+#[derive(Debug)]
+pub(in crate::api) struct Rest {
+    writer: Arc<Writer>,
+    /// `None` once it is given back.
+    producer: Option<Box<Producer>>,
+    head: [u8; HEADER_LEN],
+    message: Message,
+    written: usize,
+}
+
+/// How far a frame came.
+#[derive(Debug)]
+pub(in crate::api) enum Begun {
+    /// It is in the ring.
+    Whole,
+    /// Part of it is in the ring; the peer takes the rest for the same frame.
+    Part(Rest),
+    /// Nothing is in the ring: it is full.
+    Full(Message),
+}
+
+impl Writer {
+    /// Writes a frame as far as there is room now.
+    ///
+    /// # Errors
+    /// [`ApiError::Lent`], or [`ApiError::Closed`] if the ring cannot be used any more; nothing was written.
+    pub(in crate::api) fn begin(self: &Arc<Self>, message: Message) -> Result<Begun, (ApiError, Message)> {
+        self.pay();
+        let taken = self.producer.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let Some(producer) = taken else { return Err((ApiError::Lent, message)) };
+        let head = message.header.encode_in_memory(message.payload.len());
+        let mut rest = Rest { writer: self.clone(), producer: Some(producer), head, message, written: 0 };
+        match rest.go_on() {
+            Ok(true) => Ok(Begun::Whole),
+            Ok(false) if rest.written > 0 => Ok(Begun::Part(rest)),
+            Ok(false) => Ok(Begun::Full(rest.into_message())),
+            Err(error) => Err((error, rest.into_message())),
+        }
+    }
+
+    /// Waits until there is room for the beginning of a frame of so many bytes, the peer's end, or `within` this time.
+    pub(in crate::api) fn await_room(&self, length: usize, within: Duration) {
+        let mut producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(producer) = producer.as_deref_mut() {
+            await_room(producer, length, self, within);
+        }
+    }
+}
+
+fn await_room(producer: &mut Producer, length: usize, writer: &Writer, within: Duration) {
+    let wait = Wait::within(within).or_hang_up(HangUp::Socket(writer.socket.as_fd()));
+    let length = ring::piece(producer, length);
+    // Whatever ended the wait shows when it is written.
+    drop(producer.loan_before(length, &wait));
+}
+
+impl Rest {
+    /// Writes on, as far as there is room now; whether all is written. The peer sees an end of the link otherwise.
+    ///
+    /// # Errors
+    /// The ring cannot be used any more.
+    pub(in crate::api) fn go_on(&mut self) -> Result<bool, ApiError> {
+        let Some(producer) = self.producer.as_deref_mut() else { return Ok(true) };
+        let whole = HEADER_LEN + self.message.payload.len();
+        while self.written < whole {
+            let parts = [
+                IoSlice::new(&self.head[self.written.min(HEADER_LEN)..]),
+                IoSlice::new(&self.message.payload[self.written.saturating_sub(HEADER_LEN)..]),
+            ];
+            match ring::write(producer, &parts) {
+                Ok(count) => self.written += count,
+                Err(LoanError::Full { .. }) => return Ok(false),
+                Err(error @ (LoanError::TooLong { .. } | LoanError::Corrupt(_))) => {
+                    self.writer.close();
+                    return Err(ApiError::Closed(error.to_string()));
+                }
+            }
+        }
+        self.give_back();
+        Ok(true)
+    }
+
+    /// Waits until there is room for more, the peer's end, or `within` this time.
+    pub(in crate::api) fn await_room(&mut self, within: Duration) {
+        let left = HEADER_LEN + self.message.payload.len() - self.written;
+        if let Some(producer) = self.producer.as_deref_mut() {
+            await_room(producer, left, &self.writer, within);
+        }
+    }
+
+    /// Wakes the peer: the link's socket has been closed.
+    pub(in crate::api) fn wake_peer(&self) {
+        if let Some(producer) = &self.producer {
+            producer.ring();
+        }
+    }
+
+    fn into_message(mut self) -> Message {
+        let nothing = Message::new(self.message.header, bytes::Bytes::new());
+        mem::replace(&mut self.message, nothing)
+    }
+
+    fn give_back(&mut self) {
+        if let Some(producer) = self.producer.take() {
+            *self.writer.producer.lock().unwrap_or_else(PoisonError::into_inner) = Some(producer);
+            self.writer.pay();
+        }
+    }
+}
+
+impl Drop for Rest {
+    fn drop(&mut self) {
+        // A frame that was cut ends with its link: nobody may write behind it.
+        if self.written == 0 {
+            self.give_back();
+        }
+    }
+}
