@@ -53,8 +53,8 @@ impl DownClass {
 
 /// What a monitor says, once: the life that was watched has ended. The watcher handles it with `handles::<Down>()`; it
 /// goes ahead of every message that waits. A restart behind the same TID is an end, too; who wants to watch the next
-/// life monitors again, if there will be one: for an address that nobody has, [`DownClass::NoSuchAddress`] comes at once, and a
-/// watcher that answers it by monitoring again comes to nothing else.
+/// life monitors again. That there is nobody ([`DownClass::NoSuchAddress`], [`DownClass::NodeLost`]) is told at once, 256 times;
+/// who goes on to ask is told once every 10 ms.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Down {
     /// Which monitor.

@@ -3,18 +3,19 @@
 //! After each [`Core::handle`] and [`Core::monitor`] the shell takes [`Core::poll`] until nothing is left, and comes back
 //! with [`Input::TimePassed`] at [`Core::next_wake`].
 
+mod pace;
 mod watched;
 mod watching;
 
 use std::{collections::VecDeque, time::Duration};
 
 use sinew_runtime::{
-    monitor::{Down, MonitorError, MonitorId},
+    monitor::{Down, DownClass, MonitorError, MonitorId},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
 };
 
-use self::{watched::Watched, watching::Watching};
+use self::{pace::Pace, watched::Watched, watching::Watching};
 use super::words::{Cause, LifeState, Lives, WATCHED_MAX, Watch};
 
 /// Time until a `Down` that was not taken is offered again.
@@ -27,6 +28,8 @@ pub(super) const SPACING: Duration = Duration::from_millis(5);
 pub(super) const ORPHAN: Duration = Duration::from_secs(10);
 /// Monitors of one application at most.
 pub(super) const PER_WATCHER_MAX: usize = 256;
+/// Time that each answer "nobody is there" costs its watcher, once it had [`PER_WATCHER_MAX`] of them.
+pub(super) const NOBODY_EVERY: Duration = Duration::from_millis(10);
 /// Monitors of a node at most.
 pub(super) const MONITORS_MAX: usize = 4_096;
 
@@ -66,6 +69,14 @@ pub(crate) enum Output {
     Lives { to: NodeAddress, lives: Lives },
 }
 
+/// A `Down` whose time has not come, or that was not taken. It counts as a monitor.
+#[derive(Debug)]
+struct Waiting {
+    until: Time,
+    watcher: AppAddress,
+    down: Down,
+}
+
 /// The monitors of a node, and those of other nodes on its applications.
 #[derive(Debug)]
 pub(crate) struct Core {
@@ -73,8 +84,9 @@ pub(crate) struct Core {
     incarnation: Incarnation,
     watched: Watched,
     watching: Watching,
-    not_taken: Vec<(AppAddress, Down)>,
-    retry: Option<Time>,
+    pace: Pace,
+    waiting: Vec<Waiting>,
+    wake: Option<Time>,
     outputs: VecDeque<Output>,
 }
 
@@ -86,8 +98,9 @@ impl Core {
             incarnation,
             watched: Watched::new(nodes_max),
             watching: Watching::new(nodes_max),
-            not_taken: Vec::new(),
-            retry: None,
+            pace: Pace::default(),
+            waiting: Vec::new(),
+            wake: None,
             outputs: VecDeque::new(),
         }
     }
@@ -111,7 +124,7 @@ impl Core {
             match self.watched.life_of(target.app) {
                 // spec: MON-1
                 Some(life) => self.watching.establish(id, life),
-                None => self.end(id, &nobody()),
+                None => self.answer_nobody(id, &nobody(), now),
             }
             return Ok(id);
         }
@@ -121,7 +134,7 @@ impl Core {
         let id = self.watching.add(watcher, target, now);
         if !self.watching.make_due(target.node, now) {
             // spec: MON-2
-            self.end(id, &lost_node("its node is not known"));
+            self.answer_nobody(id, &lost_node("its node is not known"), now);
         }
         self.publish(now);
         Ok(id)
@@ -129,14 +142,14 @@ impl Core {
 
     /// Ends a monitor of `watcher`. `false` if there is none, or if its `Down` was told already.
     pub(crate) fn demonitor(&mut self, now: Time, watcher: AppAddress, id: MonitorId) -> bool {
-        let waiting = self.not_taken.len();
-        self.not_taken.retain(|(who, down)| *who != watcher || down.monitor != id);
+        let before = self.waiting.len();
+        self.waiting.retain(|waiting| waiting.watcher != watcher || waiting.down.monitor != id);
         let target = self.watching.remove_of(watcher, id);
         if let Some(target) = target {
             self.watching.make_due(target.node, now);
             self.publish(now);
         }
-        target.is_some() || self.not_taken.len() < waiting
+        target.is_some() || self.waiting.len() < before
     }
 
     /// Takes in what has happened.
@@ -161,10 +174,10 @@ impl Core {
             Input::Watch { from, watch } => self.watch_received(now, from, watch),
             Input::Lives { from, lives } => self.lives_received(now, from, &lives),
             // Nothing is offered again here: others are being told, and whoever tells them would not come to an end.
-            Input::NotTaken { watcher, down } => return self.keep(now, watcher, down),
+            Input::NotTaken { watcher, down } => return self.keep(now + RETRY, watcher, down),
             Input::TimePassed => {}
         }
-        self.offer_again(now);
+        self.tell_the_waiting(now);
         for node in self.watching.orphans(now) {
             self.end_all_on(node, None, "its link broke and was not made again");
         }
@@ -183,16 +196,16 @@ impl Core {
 
     /// When to come back.
     pub(crate) fn next_wake(&self) -> Option<Time> {
-        [self.retry, self.watching.next_due()].into_iter().flatten().min()
+        [self.wake, self.watching.next_due()].into_iter().flatten().min()
     }
 
     fn check_room(&self, watcher: AppAddress) -> Result<(), MonitorError> {
         // spec: MON-6
-        let kept = self.not_taken.iter().filter(|(who, _)| *who == watcher).count();
-        if self.watching.count_of(watcher) + kept >= PER_WATCHER_MAX {
+        let waiting = self.waiting.iter().filter(|waiting| waiting.watcher == watcher).count();
+        if self.watching.count_of(watcher) + waiting >= PER_WATCHER_MAX {
             return Err(MonitorError::TooMany(PER_WATCHER_MAX));
         }
-        if self.watching.len() + self.not_taken.len() >= MONITORS_MAX {
+        if self.watching.len() + self.waiting.len() >= MONITORS_MAX {
             return Err(MonitorError::NodeFull(MONITORS_MAX));
         }
         Ok(())
@@ -201,7 +214,8 @@ impl Core {
     fn life_ended(&mut self, now: Time, app: AppAddress, cause: &Cause, is_gone: bool) {
         let Some(life) = self.watched.ended(now, app, cause, is_gone) else { return };
         // spec: MON-5
-        self.not_taken.retain(|(watcher, _)| *watcher != app);
+        self.waiting.retain(|waiting| waiting.watcher != app);
+        self.pace.forget(app);
         for target in self.watching.remove_watcher(app) {
             self.watching.make_due(target.node, now);
         }
@@ -233,9 +247,25 @@ impl Core {
     }
 
     fn end(&mut self, id: MonitorId, cause: &Cause) {
-        let Some((watcher, tid)) = self.watching.remove(id) else { return };
-        let down = Down { monitor: id, tid, class: cause.class, why: cause.why().to_owned() };
-        self.outputs.push_back(Output::Tell { watcher, down });
+        if let Some((watcher, down)) = self.take_down(id, cause) {
+            self.outputs.push_back(Output::Tell { watcher, down });
+        }
+    }
+
+    /// Ends a monitor that no life has to end for. Who sets the next one in each `Down` would be told without end, ahead of
+    /// all messages: it is told at its pace.
+    fn answer_nobody(&mut self, id: MonitorId, cause: &Cause, now: Time) {
+        // spec: MON-8
+        let Some((watcher, down)) = self.take_down(id, cause) else { return };
+        match self.pace.next(watcher, now) {
+            Some(until) => self.keep(until, watcher, down),
+            None => self.outputs.push_back(Output::Tell { watcher, down }),
+        }
+    }
+
+    fn take_down(&mut self, id: MonitorId, cause: &Cause) -> Option<(AppAddress, Down)> {
+        let (watcher, tid) = self.watching.remove(id)?;
+        Some((watcher, Down { monitor: id, tid, class: cause.class, why: cause.why().to_owned() }))
     }
 
     fn watch_received(&mut self, now: Time, from: NodeAddress, watch: Watch) {
@@ -266,24 +296,34 @@ impl Core {
             }
             for id in monitors {
                 if let Some(cause) = self.watching.judge(id, lives.version, state, now) {
-                    self.end(id, &cause);
+                    match cause.class {
+                        DownClass::NoSuchAddress => self.answer_nobody(id, &cause, now),
+                        DownClass::Normal
+                        | DownClass::Shutdown
+                        | DownClass::Panic
+                        | DownClass::Hung
+                        | DownClass::Killed
+                        | DownClass::ProcessEnded
+                        | DownClass::NodeLost => self.end(id, &cause),
+                    }
                     self.watching.make_due(from, now);
                 }
             }
         }
     }
 
-    fn keep(&mut self, now: Time, watcher: AppAddress, down: Down) {
-        self.not_taken.push((watcher, down));
-        self.retry.get_or_insert(now + RETRY);
+    fn keep(&mut self, until: Time, watcher: AppAddress, down: Down) {
+        self.waiting.push(Waiting { until, watcher, down });
+        self.wake = Some(self.wake.map_or(until, |wake| wake.min(until)));
     }
 
-    fn offer_again(&mut self, now: Time) {
-        if self.retry.is_some_and(|retry| retry <= now) {
-            self.retry = None;
-            let again = std::mem::take(&mut self.not_taken);
-            self.outputs.extend(again.into_iter().map(|(watcher, down)| Output::Tell { watcher, down }));
+    fn tell_the_waiting(&mut self, now: Time) {
+        if self.wake.is_none_or(|wake| wake > now) {
+            return;
         }
+        let due = self.waiting.extract_if(.., |waiting| waiting.until <= now);
+        self.outputs.extend(due.map(|Waiting { watcher, down, .. }| Output::Tell { watcher, down }));
+        self.wake = self.waiting.iter().map(|waiting| waiting.until).min();
     }
 
     fn publish(&mut self, now: Time) {
@@ -295,9 +335,9 @@ impl Core {
 }
 
 fn nobody() -> Cause {
-    Cause::new(sinew_runtime::monitor::DownClass::NoSuchAddress, "no application has this TID")
+    Cause::new(DownClass::NoSuchAddress, "no application has this TID")
 }
 
 fn lost_node(why: &str) -> Cause {
-    Cause::new(sinew_runtime::monitor::DownClass::NodeLost, why)
+    Cause::new(DownClass::NodeLost, why)
 }

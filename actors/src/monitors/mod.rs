@@ -14,6 +14,7 @@
 //! | MON-5 | A watcher's monitors end with its life. |
 //! | MON-6 | 256 monitors of one application, 4,096 of a node, 1,024 applications watched on one other node: the next one is refused. A `Down` that a mailbox does not take is offered again every 10 ms, and counts as a monitor until then. |
 //! | MON-7 | The ends of the 1,024 applications that went last are remembered. |
+//! | MON-8 | That nobody is there, or no such node is known, is told to one watcher 256 times at once and then once every 10 ms; what waits for its time counts as a monitor. |
 
 mod core;
 mod shell;

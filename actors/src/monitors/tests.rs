@@ -14,8 +14,8 @@ use sinew_runtime::{
 
 use super::{
     Cause, Core, Input,
-    core::{MONITORS_MAX, Output, PER_WATCHER_MAX, REPEAT, RETRY},
-    words::Watch,
+    core::{MONITORS_MAX, NOBODY_EVERY, Output, PER_WATCHER_MAX, REPEAT, RETRY},
+    words::{LifeState, Lives, Watch},
 };
 
 const HERE: NodeAddress = NodeAddress::new(0x7f00_0001);
@@ -193,6 +193,77 @@ fn monitors_are_bounded_and_what_a_mailbox_did_not_take_counts_until_it_does() {
         bench.monitors(2 + number as u32 / 200, target).0.unwrap();
     }
     assert_eq!(bench.monitors(99, target).0, Err(MonitorError::NodeFull(MONITORS_MAX)));
+}
+
+/// A watcher that sets the next monitor in each `Down`, for a second. Returns how often it was told.
+fn told_in_a_second(bench: &mut Bench, mut target: impl FnMut(u32) -> Tid) -> usize {
+    let until = bench.now + Duration::from_secs(1);
+    let (mut told, mut waiting) = (0, downs(&bench.monitors(1, target(0)).1).len());
+    while bench.now < until {
+        while waiting > 0 {
+            (told, waiting) = (told + 1, waiting - 1);
+            assert!(told < 100_000, "there is no end to it");
+            waiting += downs(&bench.monitors(1, target(told as u32)).1).len();
+        }
+        bench.now = bench.core.next_wake().expect("what waits has its time").max(bench.now);
+        waiting += downs(&bench.hears(Input::TimePassed)).len();
+    }
+    told + waiting
+}
+
+// spec: MON-8
+#[test]
+fn who_monitors_again_in_each_answer_that_nobody_is_there_is_answered_at_a_pace() {
+    let second = (Duration::from_secs(1).as_nanos() / NOBODY_EVERY.as_nanos()) as usize;
+    for node in [HERE, THERE] {
+        for name in [|_| app(0), |number| app(number % 4_000)] as [fn(u32) -> AppAddress; 2] {
+            let mut bench = Bench::new();
+            let told = told_in_a_second(&mut bench, |number| Tid::new(node, name(number)));
+            assert_eq!(told, PER_WATCHER_MAX + second, "on {node}");
+        }
+    }
+}
+
+// spec: MON-8
+#[test]
+fn the_answers_of_another_node_that_nobody_is_there_have_the_same_pace() {
+    let mut bench = Bench::new();
+    bench.hears(Input::LinkUp { node: THERE, incarnation: LIFE });
+    let (mut told, mut version) = (0, 0);
+    let target = Tid::new(THERE, app(0));
+    for _ in 0..4 {
+        for _ in 0..PER_WATCHER_MAX {
+            // Refused as soon as what waits is as much as it may have.
+            let _ = bench.monitors(1, target);
+        }
+        version += 1;
+        let lives = vec![LifeState { app: app(0), life: 0, age_us: 0, ended: None }];
+        let lives = Lives { incarnation: LIFE, version, lives };
+        told += downs(&bench.hears(Input::Lives { from: THERE, lives })).len();
+    }
+    assert_eq!(told, PER_WATCHER_MAX);
+}
+
+// spec: MON-8
+#[test]
+fn an_answer_that_waits_counts_as_a_monitor_and_can_be_taken_back_and_ends_with_its_watcher() {
+    let mut bench = Bench::new();
+    bench.hears(Input::Began { app: app(1) });
+    let target = Tid::new(HERE, app(0));
+    for _ in 0..PER_WATCHER_MAX {
+        assert_eq!(classes(&bench.monitors(1, target).1), [DownClass::NoSuchAddress]);
+    }
+    let waits: Vec<_> = (0..PER_WATCHER_MAX).map(|_| bench.monitors(1, target).0.unwrap()).collect();
+    assert_eq!(bench.monitors(1, target).0, Err(MonitorError::TooMany(PER_WATCHER_MAX)));
+    assert!(bench.core.demonitor(bench.now, app(1), waits[0]));
+    bench.now = bench.now + NOBODY_EVERY * 2;
+    let told: Vec<_> = downs(&bench.hears(Input::TimePassed)).iter().map(|(_, down)| down.monitor).collect();
+    assert_eq!(told, [waits[1]], "the second one's time has come, and the first one was taken back");
+    // Another watcher has its own pace.
+    assert_eq!(classes(&bench.monitors(2, target).1), [DownClass::NoSuchAddress]);
+    bench.hears(ended(1, true));
+    bench.now = bench.now + Duration::from_secs(10);
+    assert_eq!(bench.hears(Input::TimePassed), []);
 }
 
 /// What happens in a history.

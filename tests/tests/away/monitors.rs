@@ -240,3 +240,83 @@ fn a_life_that_hangs_is_told_as_hung_and_its_will_is_sent_for_it() {
     log.wait_for(Seen::Started(2));
     eye.told_once(&[monitor]);
 }
+
+/// Answers each `Down` with the next monitor, as one does who waits for somebody to come back.
+struct Insistent {
+    /// Who it names next; the number counts up.
+    next: fn(u32) -> Tid,
+    told: Log<Down>,
+    seen: Log<Trace>,
+}
+
+/// What else an insistent watcher came to.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Trace {
+    Tick,
+    Stops,
+}
+
+impl Insistent {
+    fn watch(&self, context: &AppContext<Self>) {
+        context.monitor((self.next)(self.told.all().len() as u32)).expect("one at a time");
+    }
+}
+
+impl Actor for Insistent {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        self.watch(context);
+        context.every(Duration::from_millis(20), |this, _, _| this.seen.write(Trace::Tick));
+    }
+
+    fn stopping(&mut self, _: &mut Self::Context) -> Running {
+        self.seen.write(Trace::Stops);
+        Running::Stop
+    }
+}
+
+impl Handler<Delivery<Down>> for Insistent {
+    type Result = ();
+
+    fn handle(&mut self, down: Delivery<Down>, context: &mut Self::Context) {
+        self.told.write(down.payload);
+        self.watch(context);
+    }
+}
+
+impl Handler<Delivery<Job>> for Insistent {
+    type Result = ();
+
+    fn handle(&mut self, _: Delivery<Job>, _: &mut Self::Context) {}
+}
+
+#[test]
+fn a_watcher_that_monitors_again_whom_nobody_has_comes_to_its_timers_its_messages_and_its_stop() {
+    let nobody = |_| Tid::new(NodeAddress::HERE, AppAddress::fixed(99).expect("a fixed one"));
+    let no_node =
+        |_| Tid::new(NodeAddress::from([127, 0, 0, 99]), AppAddress::fixed(99).expect("a fixed one"));
+    let another =
+        |number| Tid::new(NodeAddress::HERE, AppAddress::fixed(100 + number % 800).expect("a fixed one"));
+    for next in [nobody, no_node, another] as [fn(u32) -> Tid; 3] {
+        let (told, seen) = (Log::default(), Log::default());
+        let watcher = {
+            let (told, seen) = (told.clone(), seen.clone());
+            AppSpec::new("watcher", move || Insistent { next, told: told.clone(), seen: seen.clone() })
+        };
+        let ((desk, key), began) = (desk("desk"), std::time::Instant::now());
+        let watcher = watcher.handles::<Down>().handles::<Job>().own_thread();
+        let node = Ground::new().node("node").app(watcher).app(desk).start().expect("a node");
+        all_run(&[&node]);
+        let sender = key.sender();
+        told.wait("the burst, and the pace after it", |all| (all.len() > 300).then_some(()));
+        for number in 0..10 {
+            assert_eq!(outcome_of_job(&sender, "watcher", number), Outcome::Delivered);
+        }
+        seen.wait("its timer", |all| (all.len() >= 10).then_some(()));
+        let (told, pace) = (told.all().len(), began.elapsed().as_millis() / 10);
+        assert!(told as u128 <= 257 + pace, "told {told} times in {pace} times 10 ms");
+        node.stop();
+        assert_eq!(seen.all().last(), Some(&Trace::Stops));
+    }
+}
