@@ -26,6 +26,9 @@
 // The macro `payload!` names this crate as its users do.
 extern crate self as sinew;
 
+// What the layers log stops nobody.
+use sinew_runtime::log;
+
 pub mod api;
 pub mod config;
 

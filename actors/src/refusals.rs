@@ -38,7 +38,7 @@ impl Refusals {
         let suppressed = std::mem::take(&mut entry.suppressed);
         // Whoever reads the log may be slow: nobody waits for it with the lock in hand.
         drop(causes);
-        tracing::warn!(cause, suppressed, "refused: {detail}");
+        crate::log::warn!(cause, suppressed, "refused: {detail}");
     }
 
     /// How much was refused.

@@ -16,8 +16,10 @@
 //! | [`schedule`] | what an actor does when |
 //! | [`app`] | what an application is |
 //! | [`supervision`] | who is started, when, and again after a fault |
+//! | [`log`] | what the runtime says of itself, without waiting for who reads it |
 
 pub mod app;
+pub mod log;
 pub mod mailbox;
 pub mod monitor;
 pub mod outcome;

@@ -122,7 +122,7 @@ impl<E> Post<E> {
             waker.wake();
         }
         if dropped.is_some() {
-            tracing::error!("an event on which two readers failed is dropped");
+            crate::log::error!("an event on which two readers failed is dropped");
         }
         PostStream { shared: self.shared.clone(), epoch, keep, reader: Vitals::present() }
     }

@@ -237,7 +237,7 @@ impl Gncl {
     }
 
     fn tell(&self, fact: LinkFact) {
-        tracing::info!(?fact, "link");
+        crate::log::info!(?fact, "link");
         self.post(&self.stores.posts.ndl, ndl::Event::Link(fact));
         self.post(&self.stores.posts.sync, sync::Event::Link(fact));
     }
@@ -420,7 +420,7 @@ impl StreamHandler<News> for Gncl {
                 self.input(Input::Connected(connection), ctx);
             }
             What::DialFailed(error) => {
-                tracing::debug!(%error, "dial failed");
+                crate::log::debug!(%error, "dial failed");
                 let refused = error.kind() == io::ErrorKind::ConnectionRefused;
                 self.input(Input::DialFailed { connection, refused }, ctx);
                 self.close(connection, ctx);

@@ -150,7 +150,7 @@ impl Client {
         let name = lock(&server.stores.registry).name_of(app);
         let outlet = Arc::new(StreamOutlet::new(limits(&server.stores)));
         server.add_outlet(peer.id, outlet.clone());
-        tracing::info!(%tid, name, pid = peer.pid, "an application of another process has registered");
+        crate::log::info!(%tid, name, pid = peer.pid, "an application of another process has registered");
         let (link, events, has_been_told) = (None, events.into(), false);
         let cause = Cause::new(DownClass::Killed, registrar::LNCL_ENDED);
         let ring = if ring { Ring::Asked } else { Ring::None };

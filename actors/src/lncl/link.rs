@@ -47,7 +47,7 @@ pub(super) fn prepare(ring_bytes: usize) -> Option<(Capacity, Exchange)> {
     match Exchange::prepare(capacity, BellKind::Socket) {
         Ok(exchange) => Some((capacity, exchange)),
         Err(why) => {
-            tracing::warn!(%why, "a client that asked for rings gets a plain socket");
+            crate::log::warn!(%why, "a client that asked for rings gets a plain socket");
             None
         }
     }

@@ -59,7 +59,7 @@ impl Drop for SocketFile {
         if self.is_there()
             && let Err(cause) = fs::remove_file(&self.path)
         {
-            tracing::warn!(path = ?self.path, %cause, "the socket file is left behind; the next start replaces it");
+            crate::log::warn!(path = ?self.path, %cause, "the socket file is left behind; the next start replaces it");
         }
     }
 }
@@ -106,7 +106,7 @@ fn remove_if_dead(path: &Path) -> Result<(), ListenError> {
     }
     match probe(path) {
         Err(cause) if cause.kind() == io::ErrorKind::ConnectionRefused => {
-            tracing::info!(?path, "replacing the socket file that a killed node left");
+            crate::log::info!(?path, "replacing the socket file that a killed node left");
             fs::remove_file(path).map_err(system("remove", path))
         }
         // `WouldBlock`: somebody listens, and its queue of connections is full.

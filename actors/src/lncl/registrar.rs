@@ -148,7 +148,7 @@ fn tell(stores: &Stores, fact: AppFact) {
     };
     let wants_nodes = stores.router.subscribes(app, NodeEvent::KIND);
     if wants_nodes && stores.posts.ndl.post(ndl::Event::App(fact.clone())).is_err() {
-        tracing::error!(?fact, "NDL's post is full and this was not told: does it hang?");
+        crate::log::error!(?fact, "NDL's post is full and this was not told: does it hang?");
     }
     tell_sync(stores, fact);
 }
@@ -157,6 +157,6 @@ fn tell_sync(stores: &Stores, fact: AppFact) {
     stores.directory_has_changed();
     if let Err(event) = stores.posts.sync.post(sync::Event::App(fact)) {
         // Thousands of events wait for it then, so it has stood still for long.
-        tracing::error!(?event, "the sync manager's post is full and this was not told: does it hang?");
+        crate::log::error!(?event, "the sync manager's post is full and this was not told: does it hang?");
     }
 }

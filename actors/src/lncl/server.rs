@@ -111,7 +111,9 @@ fn report(ended: Result<(), JoinError>) {
     if let Err(panicked) = ended
         && panicked.is_panic()
     {
-        tracing::error!("the task of a client's connection panicked; the connection is closed: {panicked}");
+        crate::log::error!(
+            "the task of a client's connection panicked; the connection is closed: {panicked}"
+        );
     }
 }
 

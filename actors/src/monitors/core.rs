@@ -222,7 +222,7 @@ impl Core {
         for id in self.watching.of(Tid::new(self.node, app)) {
             self.end(id, cause);
         }
-        tracing::trace!(%app, life, "a life ended");
+        crate::log::trace!(%app, life, "a life ended");
         let state = self.watched.state(now, app);
         for to in self.watched.watchers_of(app) {
             self.say_lives(to, vec![state.clone()]);

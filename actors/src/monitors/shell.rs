@@ -130,7 +130,7 @@ pub(crate) fn receive(stores: &Stores, from: NodeAddress, message: &Message) -> 
 
 fn poke(stores: &Stores) {
     if stores.posts.sync.post(sync::Event::Monitors).is_err() {
-        tracing::error!("the sync manager's post is full; monitors are looked at late: does it hang?");
+        crate::log::error!("the sync manager's post is full; monitors are looked at late: does it hang?");
     }
 }
 

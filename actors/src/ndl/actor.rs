@@ -117,7 +117,7 @@ impl StreamHandler<Event> for NdlActor {
 
 /// The start fails: the supervisor reports these words, and tries again within its limit.
 fn give_up(words: &str) -> ! {
-    tracing::error!("{words}");
+    crate::log::error!("{words}");
     panic!("{words}");
 }
 
@@ -151,7 +151,7 @@ impl Shell {
         let udp = socket.local_addr().map_err(unbound)?;
         let reader = socket.try_clone().map_err(unbound)?;
         let epoch = lock(&stores).start(Time::now(), udp, gncl);
-        tracing::info!(%udp, %gncl, "NDL asks and answers");
+        crate::log::info!(%udp, %gncl, "NDL asks and answers");
         let (rewind, refusals) = (Notify::new(), stores.refusals.clone());
         Ok((Self { stores, epoch, socket, rewind, refusals }, reader))
     }
@@ -162,7 +162,7 @@ impl Shell {
         let joined = socket::join_group(group, ndl.interface).and_then(tokio::net::UdpSocket::from_std);
         joined
             .inspect_err(|error| {
-                tracing::warn!(
+                crate::log::warn!(
                     "NDL does not hear multicast {group} on {}: {error}; nodes are found through mDNS and seeds only. \
                      Set `ndl.interface` to an interface that is up and `ndl.multicast` to a group, or list `ndl.seeds`",
                     ndl.interface,
@@ -225,7 +225,7 @@ impl Shell {
             Output::Fact(fact) => self.tell_layers(fact),
             Output::Event { to, event } => self.tell_applications(&to, &event),
             Output::ClockMeasured { node, offset } => self.stores.clocks.set(node, offset),
-            Output::Collision { node, holder, newcomer } => tracing::error!(
+            Output::Collision { node, holder, newcomer } => crate::log::error!(
                 "node address {node} is used twice: by {holder}, and by {newcomer}, which is not let in; give one of \
                  them another `address`"
             ),
@@ -234,7 +234,7 @@ impl Shell {
                  a free one",
                 self.stores.node
             )),
-            Output::Stalled { late } => tracing::warn!(
+            Output::Stalled { late } => crate::log::warn!(
                 late_ms = late.as_millis(),
                 "NDL was starved: its own timer came late, so nobody is counted as silent in this cycle"
             ),
@@ -261,13 +261,13 @@ impl Shell {
         if let MembershipFact::NodeLost { node, .. } = fact {
             self.stores.clocks.forget(node);
         }
-        tracing::info!(?fact, "membership");
+        crate::log::info!(?fact, "membership");
         let posts = &self.stores.posts;
         if let Err(event) = posts.gncl.post(gncl::Event::Membership(fact.clone())) {
-            tracing::error!(?event, "GNCL's post is full: it does not learn this");
+            crate::log::error!(?event, "GNCL's post is full: it does not learn this");
         }
         if let Err(event) = posts.sync.post(sync::Event::Membership(fact)) {
-            tracing::error!(?event, "the sync manager's post is full: it does not learn this");
+            crate::log::error!(?event, "the sync manager's post is full: it does not learn this");
         }
     }
 
@@ -346,9 +346,9 @@ async fn browse(shell: Rc<Shell>, mdns: Rc<Mdns>) {
                     }
                 }
                 // mdns-sd drops a listener that is a thousand events behind.
-                tracing::warn!("NDL missed events of mDNS; listening again");
+                crate::log::warn!("NDL missed events of mDNS; listening again");
             }
-            Err(error) => tracing::warn!("NDL cannot look for nodes through mDNS: {error}; trying again"),
+            Err(error) => crate::log::warn!("NDL cannot look for nodes through mDNS: {error}; trying again"),
         }
         tokio::time::sleep(MDNS_REST).await;
     }
@@ -375,7 +375,7 @@ async fn watch_mdns(mdns: Rc<Mdns>) {
 }
 
 fn warn_of_mdns(port: u16, error: &MdnsError) {
-    tracing::warn!(
+    crate::log::warn!(
         "NDL does not use mDNS on port {port}: {error}; nodes are found through multicast and seeds only. Set \
          `ndl.mdns_port` to a port that this process may share, or switch it off"
     );

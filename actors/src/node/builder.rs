@@ -13,13 +13,13 @@ use sinew_runtime::{
 };
 
 use super::{
-    Node, NodeHandle,
+    LAST_WORDS, Node, NodeHandle,
     root::{self, RootEvent},
     supervisor_spec::SupervisorSpec,
 };
 use crate::{
     config::{ConfigFaults, NodeConfig},
-    process,
+    log, process,
     stores::Stores,
     sync::Waiting,
 };
@@ -171,8 +171,9 @@ impl NodeBuilder {
         match self.heed_signals().start() {
             Ok(node) => node.run(),
             Err(error) => {
-                tracing::error!(%error, "the node did not start");
-                eprintln!("{error}");
+                log::error!(%error, "the node did not start");
+                log::print(error.to_string());
+                log::flush(LAST_WORDS);
                 ExitCode::FAILURE
             }
         }
@@ -211,6 +212,8 @@ impl NodeBuilder {
     /// # Errors
     /// The configuration has faults, an application cannot be registered, or a layer did not become ready.
     pub fn start(mut self) -> Result<Node, StartError> {
+        // Here, on a thread like any other.
+        log::begin();
         self.config.validate()?;
         check_panics(UNWINDS, self.accept_abort_on_panic)?;
         #[cfg(feature = "fault-points")]
@@ -226,9 +229,7 @@ impl NodeBuilder {
         super::faults::keep(&stores, &planned)?;
         #[cfg(not(feature = "fault-points"))]
         if std::env::var_os("SINEW_FAULTS").is_some() {
-            tracing::warn!(
-                "SINEW_FAULTS is ignored: this program was built without the feature `fault-points`"
-            );
+            log::warn!("SINEW_FAULTS is ignored: this program was built without the feature `fault-points`");
         }
         let handle = NodeHandle { root: stores.posts.root.clone(), stores: stores.clone(), is_bystander };
         let (say_started, started) = sync_channel(1);
@@ -265,9 +266,7 @@ fn check_panics(unwinds: bool, accepted: bool) -> Result<(), StartError> {
         return Ok(());
     }
     if accepted {
-        tracing::warn!(
-            "this program ends with its first panic: no supervisor of this node restarts what panics"
-        );
+        log::warn!("this program ends with its first panic: no supervisor of this node restarts what panics");
         return Ok(());
     }
     Err(StartError::AbortsOnPanic)

@@ -32,7 +32,7 @@ impl NodeHandle {
     /// This node has no actor of this name, or too many faults wait for it already.
     pub fn inject(&self, name: &str, fault: Fault) -> Result<(), FaultError> {
         let name = full_name(name);
-        tracing::warn!(actor = name, %fault, "a fault is injected");
+        crate::log::warn!(actor = name, %fault, "a fault is injected");
         self.stores.faults.inject(name, fault)
     }
 
@@ -109,14 +109,14 @@ pub(crate) fn arm_alone(app: &DynApp, launch: Launch) -> Launch {
 fn arm_at(points: &FaultPoints, app: &DynApp, launch: Launch) -> Launch {
     for fault in app.faults() {
         if let Err(error) = plan(points, app.name(), fault) {
-            tracing::error!(%error, "a fault is not planned");
+            crate::log::error!(%error, "a fault is not planned");
         }
     }
     points.arm(app.name(), launch)
 }
 
 fn plan(points: &FaultPoints, name: &str, fault: &Fault) -> Result<(), FaultError> {
-    tracing::warn!(actor = name, %fault, "a fault is planned");
+    crate::log::warn!(actor = name, %fault, "a fault is planned");
     points.plan(name, fault.clone())
 }
 

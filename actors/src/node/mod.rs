@@ -48,11 +48,15 @@ use sinew_runtime::{
 
 use crate::{
     gncl::Peer,
+    log,
     ndl::KnownNode,
     outlet::OutletCounts,
     stores::{Stores, lock},
     sync::{DirectoryEntry, Waiting},
 };
+
+/// Time at its end for what the node has logged to be written.
+const LAST_WORDS: Duration = Duration::from_millis(500);
 
 /// How a node ended.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -142,8 +146,9 @@ impl Node {
             NodeEnd::Stopped => ExitCode::SUCCESS,
             NodeEnd::GaveUp(why) => {
                 let name = &self.handle.stores.config.name;
-                tracing::error!(node = name, why, "the node gave up");
-                eprintln!("node {name} gave up: {why}");
+                log::error!(node = name, why, "the node gave up");
+                log::print(format!("node {name} gave up: {why}"));
+                log::flush(LAST_WORDS);
                 ExitCode::FAILURE
             }
         }
@@ -159,6 +164,7 @@ impl Node {
             // It has said its last word; what is left of it is the end of its function.
             let _ = thread.join();
         }
+        log::flush(LAST_WORDS);
         end
     }
 }
@@ -269,10 +275,7 @@ impl NodeHandle {
 
     fn tell(&self, event: RootEvent) {
         if self.root.post(event).is_err() {
-            tracing::error!(
-                node = self.stores.config.name,
-                "the root's post is full; the order was not given"
-            );
+            log::error!(node = self.stores.config.name, "the root's post is full; the order was not given");
         }
     }
 }

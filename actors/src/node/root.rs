@@ -141,7 +141,7 @@ pub(super) fn run(
     };
     system.block_on(async { wind_up::oversee(root, heirs, kept, last_word) });
     if let Err(error) = system.run() {
-        tracing::error!(%error, "the root's event loop failed");
+        crate::log::error!(%error, "the root's event loop failed");
     }
     threads.borrow_mut().stop();
 }
@@ -170,7 +170,7 @@ impl Actor for Root {
 
 fn tell(post: &Post<RootEvent>, event: RootEvent) {
     if let Err(lost) = post.post(event) {
-        tracing::error!(?lost, "the root's post is full");
+        crate::log::error!(?lost, "the root's post is full");
     }
 }
 
@@ -209,7 +209,7 @@ impl Root {
             // Not an application of this process: LNCL knows its client.
             (None, _) => {
                 if self.stores.posts.lncl.post(lncl::Event::Released { app }).is_err() {
-                    tracing::error!(%app, "LNCL's post is full; a client's registration ends at its deadline");
+                    crate::log::error!(%app, "LNCL's post is full; a client's registration ends at its deadline");
                 }
             }
             // The node stops: nothing is started any more.
@@ -403,7 +403,7 @@ impl Root {
             Phase::StartingLayers | Phase::Running => {}
             Phase::StoppingApps | Phase::StoppingLayers => return,
         }
-        tracing::info!(node = self.stores.config.name, "stops");
+        crate::log::info!(node = self.stores.config.name, "stops");
         self.phase = Phase::StoppingApps;
         match &self.app_supervisor {
             Some(supervisor) => order(supervisor, Input::StopOrdered),
@@ -437,7 +437,7 @@ impl Root {
         let (Ok(mut interrupt), Ok(mut terminate)) =
             (signal(SignalKind::interrupt()), signal(SignalKind::terminate()))
         else {
-            tracing::error!("signals cannot be heeded; stop this node by its handle");
+            crate::log::error!("signals cannot be heeded; stop this node by its handle");
             return;
         };
         let heed = async move {
@@ -445,7 +445,7 @@ impl Root {
                 _ = interrupt.recv() => "SIGINT",
                 _ = terminate.recv() => "SIGTERM",
             };
-            tracing::info!(which, "a signal asks for a stop");
+            crate::log::info!(which, "a signal asks for a stop");
             tell(&post, RootEvent::StopOrdered);
         };
         context.spawn(heed.into_actor(self));
@@ -454,6 +454,6 @@ impl Root {
 
 fn order(supervisor: &Roster, input: Input) {
     if let Err(lost) = supervisor.tell(input) {
-        tracing::error!(?lost, "a supervisor's post is full");
+        crate::log::error!(?lost, "a supervisor's post is full");
     }
 }

@@ -50,9 +50,9 @@ impl Heirs {
             let reason = ended.await;
             if reason.is_failure() {
                 let why = format!("their supervisor {reason}");
-                tracing::error!(?branch, why, "all that it supervised have ended");
+                crate::log::error!(?branch, why, "all that it supervised have ended");
                 if root.post(event(SupervisorFact::Ended(Reason::GaveUp(why)))).is_err() {
-                    tracing::error!("the root's post is full");
+                    crate::log::error!("the root's post is full");
                 }
             }
         });
@@ -81,7 +81,7 @@ pub(super) fn oversee(root: Root, heirs: Heirs, stores: Arc<Stores>, ended: Sync
         if !reason.is_failure() {
             return;
         }
-        tracing::error!(%reason, "the root failed: the node ends in order");
+        crate::log::error!(%reason, "the root failed: the node ends in order");
         let mut events = stores.posts.root.attach();
         heirs.stop(Branch::Apps);
         wait(&mut events, Branch::Apps, &heirs).await;
@@ -111,6 +111,6 @@ async fn wait(events: &mut PostStream<RootEvent>, wanted: Branch, heirs: &Heirs)
         }
     };
     if tokio::time::timeout(within.saturating_add(WIND_UP_WITHIN), end).await.is_err() {
-        tracing::error!(?wanted, "they did not end in their time; the process has to end them");
+        crate::log::error!(?wanted, "they did not end in their time; the process has to end them");
     }
 }

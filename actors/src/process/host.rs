@@ -28,12 +28,14 @@ use super::{
     wire::Wire,
     words::{self, Ending, WORDS_BYTES_MAX, Welcome},
 };
-use crate::{config::NodeConfig, lncl::payload};
+use crate::{config::NodeConfig, lncl::payload, log};
 
 /// Time that the node has for its first words.
 const WELCOME: Duration = Duration::from_secs(10);
 /// Time that the node has to take the last words.
 const LAST_WORDS: Duration = Duration::from_millis(100);
+/// Time at the end for what this process has logged to be written.
+const LOG_WRITTEN: Duration = Duration::from_millis(500);
 /// Longest time between two looks at what has expired.
 const EXPIRING: Duration = Duration::from_millis(250);
 
@@ -51,16 +53,21 @@ pub(super) fn host(config: &NodeConfig, apps: Vec<DynApp>, hosting: Hosting) -> 
     let thread = std::thread::Builder::new().name(name.clone());
     // A thread of its own, because the caller's may have a runtime already.
     let hosted = thread.spawn(move || run(&config, &app, socket));
-    match hosted.map(std::thread::JoinHandle::join) {
-        Ok(Ok(Ok(()))) => std::process::exit(0),
+    let code = match hosted.map(std::thread::JoinHandle::join) {
+        Ok(Ok(Ok(()))) => 0,
         Ok(Ok(Err(error))) => {
-            eprintln!("the process that hosts '{name}' has no connection to its node: {error}")
+            log::print(format!("the process that hosts '{name}' has no connection to its node: {error}"));
+            1
         }
         // The panic has been told by the panic hook.
-        Ok(Err(_)) => {}
-        Err(error) => eprintln!("no thread for '{name}': {error}; raise `ulimit -u`"),
-    }
-    std::process::exit(1)
+        Ok(Err(_)) => 1,
+        Err(error) => {
+            log::print(format!("no thread for '{name}': {error}; raise `ulimit -u`"));
+            1
+        }
+    };
+    log::flush(LOG_WRITTEN);
+    std::process::exit(code)
 }
 
 fn run(config: &NodeConfig, app: &DynApp, mut socket: StdStream) -> io::Result<()> {
@@ -182,7 +189,7 @@ async fn stop_asked(wire: &Wire) {
     let Ok(mut terminate) = signal(SignalKind::terminate()) else { return wire.stop_asked().await };
     tokio::select! {
         () = wire.stop_asked() => {}
-        _ = terminate.recv() => tracing::info!("SIGTERM asks for a stop"),
+        _ = terminate.recv() => log::info!("SIGTERM asks for a stop"),
     }
 }
 
@@ -192,7 +199,7 @@ async fn say_last(wire: &Wire, tid: Tid, reason: &Reason) {
     let until = Time::now() + LAST_WORDS;
     while !wire.has_sent_all() {
         if Time::now() >= until {
-            tracing::warn!(%tid, waited = ?LAST_WORDS, "the node does not read this application's last words; it ends without them");
+            log::warn!(%tid, waited = ?LAST_WORDS, "the node does not read this application's last words; it ends without them");
             return;
         }
         tokio::time::sleep(Duration::from_millis(1)).await;

@@ -85,7 +85,7 @@ async fn run(hosted: Arc<Hosted>, ready: ReadyGate, stop: Rc<Notify>) -> Reason 
     if let Some(former) = hosted.link.take_former()
         && !is_dead(former, ENDING).await
     {
-        tracing::warn!(
+        crate::log::warn!(
             app = hosted.name,
             "its former process was killed and has not ended; another one is started beside it"
         );
@@ -99,7 +99,7 @@ async fn run(hosted: Arc<Hosted>, ready: ReadyGate, stop: Rc<Notify>) -> Reason 
         Ok(process) => process,
         Err(why) => return Reason::ProcessEnded(format!("it could not be watched: {why}")),
     };
-    tracing::debug!(app = hosted.name, pid = pid.as_raw_nonzero(), "a process was started");
+    crate::log::debug!(app = hosted.name, pid = pid.as_raw_nonzero(), "a process was started");
     match Child::new(hosted, Rc::new(process), ready, socket) {
         Ok(mut child) => child.accompany(&stop).await,
         Err(why) => Reason::ProcessEnded(format!("it could not be listened to: {why}")),

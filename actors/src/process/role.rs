@@ -78,7 +78,7 @@ fn die_with(parent: Pid, socket: &UnixStream) {
     // Tells of the thread that started this process, which lives as long as the node's process
     // (`spawn.rs`). It is forgotten when the calling thread ends; the thread below is not.
     if let Err(error) = set_parent_process_death_signal(Some(Signal::KILL)) {
-        tracing::warn!(%error, "the kernel does not bind this process to its node; its connection does");
+        crate::log::warn!(%error, "the kernel does not bind this process to its node; its connection does");
     }
     if getppid() != Some(parent) {
         // The node died before that.

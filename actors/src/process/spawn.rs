@@ -66,7 +66,7 @@ pub(super) async fn start(variable: String) -> Result<Started, String> {
 /// it knows of the process, longer than a thread of the node's may stand still.
 pub(super) fn reap(pidfd: Arc<OwnedFd>) {
     if let Err(why) = order(Order::Reap(pidfd)) {
-        tracing::error!(why, "a process that has ended is not reaped");
+        crate::log::error!(why, "a process that has ended is not reaped");
     }
 }
 

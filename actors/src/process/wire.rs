@@ -239,7 +239,7 @@ impl Wire {
                     Ok(Some(message)) => self.take(message),
                     Ok(None) => break,
                     Err(error) => {
-                        tracing::error!(%error, "the node does not speak the language of this process");
+                        crate::log::error!(%error, "the node does not speak the language of this process");
                         die();
                     }
                 }
@@ -321,7 +321,7 @@ impl Directory for Wire {
         loop {
             let left = until.since(Time::now());
             if left.is_zero() {
-                tracing::warn!(name, "the node did not say within {LOOKING:?} who has this name");
+                crate::log::warn!(name, "the node did not say within {LOOKING:?} who has this name");
                 return None;
             }
             let wait = Timespec { tv_sec: 0, tv_nsec: i64::from(left.subsec_nanos()) };

@@ -181,7 +181,7 @@ impl SyncManager {
     fn carry_out(&self, output: Output) {
         match output {
             Output::Release { app } => {
-                tracing::debug!(%app, "all that it requires is ready");
+                crate::log::debug!(%app, "all that it requires is ready");
                 if self.stores.posts.root.post(RootEvent::Release { app }).is_err() {
                     self.refuse("root", &"the node's root is too busy to start an application; tried again");
                     self.core().handle(Time::now(), Input::ReleaseNotTaken { app });
@@ -191,11 +191,11 @@ impl SyncManager {
             Output::Publish { to, list } => self.publish(to, list),
             Output::RouteGroups { node, groups } => self.stores.router.set_remote_groups(node, &groups),
             Output::Cycle { names } => self.refuse_cycle(names),
-            Output::Overdue(waiting) => tracing::warn!(
+            Output::Overdue(waiting) => crate::log::warn!(
                 application = waiting.application,
                 "{waiting}; it goes on waiting. Are these applications started, and spelled right?"
             ),
-            Output::SameName { name, tids } => tracing::warn!(
+            Output::SameName { name, tids } => crate::log::warn!(
                 name,
                 ?tids,
                 "several nodes have an application of this name; whoever asks for the name gets the first of these"
@@ -209,14 +209,14 @@ impl SyncManager {
         match &event {
             RequirementEvent::Lost { name } if why.is_some_and(Reason::is_orderly) => {
                 let why = why.map(Reason::words);
-                tracing::info!(%app, name, why, "what an application requires was stopped in order");
+                crate::log::info!(%app, name, why, "what an application requires was stopped in order");
             }
             RequirementEvent::Lost { name } => {
                 let why = why.map_or("it is ready again by now", Reason::words);
-                tracing::warn!(%app, name, why, "an application lost what it requires");
+                crate::log::warn!(%app, name, why, "an application lost what it requires");
             }
             RequirementEvent::Met { name } => {
-                tracing::info!(%app, name, "an application's requirement is met again")
+                crate::log::info!(%app, name, "an application's requirement is met again")
             }
         }
         if !self.stores.router.subscribes(app, RequirementEvent::KIND) {
@@ -252,7 +252,7 @@ impl SyncManager {
 
     fn refuse_cycle(&self, names: Vec<String>) {
         let spelled = names.join(" -> ");
-        tracing::error!(
+        crate::log::error!(
             "these applications require each other in a circle, so that none of them can ever start: {spelled}; \
              remove one of these requirements"
         );

@@ -61,7 +61,7 @@ pub(crate) fn feed(stores: &Stores, input: Input) {
         }
     }
     if is_earlier && stores.posts.sync.post(sync::Event::Monitors).is_err() {
-        tracing::error!("the sync manager's post is full; wills are told late: does it hang?");
+        crate::log::error!("the sync manager's post is full; wills are told late: does it hang?");
     }
 }
 
@@ -110,8 +110,8 @@ fn execute(stores: &Stores, node: NodeAddress, will: &HeldWill) {
     let mut header = Header::new(will.kind, Tid::new(node, will.app), destination);
     header.class = class;
     header.sent = Time::now();
-    tracing::warn!(source = %header.source, %destination, "the last will of an application of a lost node");
+    crate::log::warn!(source = %header.source, %destination, "the last will of an application of a lost node");
     if let Err(why) = stores.router.deliver(Message::new(header, will.payload())) {
-        tracing::error!(source = %header.source, %destination, %why, "a last will was not taken");
+        crate::log::error!(source = %header.source, %destination, %why, "a last will was not taken");
     }
 }

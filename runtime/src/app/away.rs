@@ -179,7 +179,7 @@ impl Absence {
         }
         for will in self.wills.iter().filter(|will| will.applies_to(reason)) {
             if let Err(error) = self.execute(will) {
-                tracing::error!(tid = %self.tid(), heir = ?will.heir, %error, "a last will was not taken");
+                crate::log::error!(tid = %self.tid(), heir = ?will.heir, %error, "a last will was not taken");
             }
         }
     }

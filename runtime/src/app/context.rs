@@ -171,7 +171,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     pub(super) fn warn_of_payload(&mut self, source: Tid, error: &DecodeError, now: Time) {
         if self.warned.is_none_or(|last| now.since(last) >= Duration::from_secs(1)) {
             self.warned = Some(now);
-            tracing::warn!(tid = %self.tid(), %source, %error, "payloads are refused");
+            crate::log::warn!(tid = %self.tid(), %source, %error, "payloads are refused");
         }
     }
 

@@ -12,7 +12,7 @@ use tokio::sync::oneshot;
 use super::{
     Launch, ReadyGate, Reason,
     guard::{Guard, life},
-    panics::install_hook,
+    panics::{install_hook, is_the_runtimes},
     place::Place,
     tenant::{Fate, Report, Tenant},
     threads::Seat,
@@ -89,7 +89,8 @@ pub fn overseen<A>(name: &str, actor: A) -> impl Future<Output = Reason> + use<A
 where
     A: Actor<Context = Context<A>>,
 {
-    // Nobody watches it, so nobody says that it hangs.
+    // Nobody watches it, so nobody says that it hangs: what it does waits for nothing, not even for its own log.
+    is_the_runtimes();
     let (report, ended) = report(Box::new(|_| {}));
     let tenant = Tenant::new(Vitals::new(name), None, None, report);
     actix_rt::spawn(Guard::around(Some(life(Context::new().into_future(actor))), tenant));

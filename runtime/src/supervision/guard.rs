@@ -120,7 +120,7 @@ impl Guard {
             vitals.set_gone();
             if let Some(since) = self.tenant.holds_its_thread() {
                 let (actor, away) = (vitals.name(), Time::now().since(since));
-                tracing::warn!(actor, ?away, "came back too late: it is dropped, and its thread ends");
+                crate::log::warn!(actor, ?away, "came back too late: it is dropped, and its thread ends");
             }
             self.tenant.report(Fate::Ended(reason));
         }
@@ -134,7 +134,7 @@ fn bury(mut life: Box<dyn Life>) {
         drop(life);
     }));
     if let Err(panic) = buried {
-        tracing::error!(said = words(panic), "an actor panicked while it was dropped");
+        crate::log::error!(said = words(panic), "an actor panicked while it was dropped");
     }
 }
 

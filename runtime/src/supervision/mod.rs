@@ -15,7 +15,7 @@
 //! | `tenant` | one life of an actor, as its supervisor, its thread and the watchdog hold it |
 //! | `vitals` | its signs of life, and its fence |
 //! | `watchdog` | who does not come back |
-//! | `panics` | where a panic was |
+//! | `panics` | where a panic was, and who is told of it |
 //! | `linux`, `elsewhere` | what the system does for a thread |
 //! | `fault` | faults on purpose, with the feature `fault-points` only |
 
@@ -44,6 +44,7 @@ mod watchdog;
 use self::elsewhere as system;
 #[cfg(target_os = "linux")]
 use self::linux as system;
+pub(crate) use self::panics::writes_the_log;
 pub use self::{
     alone::{Alone, AloneHandle, alone, overseen},
     core::{

@@ -174,7 +174,7 @@ impl Orphans {
     fn lose(&mut self, id: ChildId, reason: Reason) {
         let Some(Left { tenant, .. }) = self.left.remove(&id) else { return };
         tenant.kill();
-        tracing::warn!(child = tenant.vitals().name(), %reason, "ended without its supervisor");
+        crate::log::warn!(child = tenant.vitals().name(), %reason, "ended without its supervisor");
         self.tell(SupervisorFact::Gone(id, reason));
         if tenant.holds_its_thread().is_some() {
             self.give_up(&tenant);
@@ -193,7 +193,7 @@ impl Orphans {
     /// Whoever listens may be why the supervisor failed.
     fn tell(&mut self, fact: SupervisorFact) {
         if let Err(panic) = catch_unwind(AssertUnwindSafe(|| (self.listener)(fact))) {
-            tracing::error!(
+            crate::log::error!(
                 said = words(panic),
                 "whoever listens to a supervisor panicked, and is told the rest"
             );

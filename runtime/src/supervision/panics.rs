@@ -1,51 +1,79 @@
-//! Where a panic was: a hook that remembers it for the guard, which alone knows whose it was.
+//! Where a panic was, and who is told of it: a hook that remembers the place for the guard, and lets the log's thread do all
+//! that may take time. Of a panic in an actor its supervisor hears first; what a log that takes nothing holds up is the log.
 
 use std::{
     any::Any,
-    cell::RefCell,
+    backtrace::{Backtrace, BacktraceStatus},
+    cell::{Cell, RefCell},
     panic::{AssertUnwindSafe, PanicHookInfo, catch_unwind},
-    sync::{
-        Once,
-        atomic::{AtomicU64, Ordering},
-    },
+    sync::{Arc, Once, RwLock},
+    time::Duration,
+};
+
+use tracing::{
+    Dispatch,
+    dispatcher::{get_default, with_default},
+    level_filters::LevelFilter,
+    subscriber::NoSubscriber,
 };
 
 use super::{
     system,
     vitals::{Doing, Vitals},
 };
+use crate::log;
 
 /// Whether this program unwinds from a panic. One that is built with `panic = "abort"` ends with its first panic, whatever
 /// supervisors it has. Cargo builds every crate of a program with the same strategy, so this crate's is the program's.
 pub const UNWINDS: bool = cfg!(panic = "unwind");
 
+/// Time for the log before the process aborts.
+const LAST_WORDS: Duration = Duration::from_secs(1);
+
+type Hook = Box<dyn Fn(&PanicHookInfo<'_>) + Send + Sync>;
+
+/// Whose a thread is.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Station {
+    /// Nobody's that is known here.
+    Foreign,
+    /// The runtime's: whoever holds it up holds up actors, or those who watch them.
+    Runtime,
+    /// The log's.
+    Log,
+}
+
 thread_local! {
     /// Where the last panic on this thread was.
     static LAST: RefCell<Option<String>> = const { RefCell::new(None) };
+    static STATION: Cell<Station> = const { Cell::new(Station::Foreign) };
 }
 
-/// Panics that were told to whoever listens, with their backtraces. One at a time: all others wait.
-static TOLD: AtomicU64 = AtomicU64::new(0);
+/// Read by who may hold the standard library's lock on backtraces for long: it prints a panic while it has that lock. Who
+/// must not wait takes a backtrace only where nobody reads this.
+static PRINTS: RwLock<()> = RwLock::new(());
 
-/// How many panics were told so far: while it grows, whoever panics waits for his turn.
-pub(super) fn told() -> u64 {
-    TOLD.load(Ordering::Relaxed)
+/// The calling thread is the runtime's: a panic on it is told elsewhere.
+pub(super) fn is_the_runtimes() {
+    STATION.set(Station::Runtime);
 }
 
-/// Makes panics remember where they were. The hook that was there before is called as before.
+/// The calling thread is the log's.
+pub(crate) fn writes_the_log() {
+    STATION.set(Station::Log);
+}
+
+/// Makes panics remember where they were. The hook that was there before is called: on the thread that panics where nobody
+/// waits for that, and else on the log's.
 pub(super) fn install_hook() {
     static INSTALLED: Once = Once::new();
     INSTALLED.call_once(|| {
-        let former = std::panic::take_hook();
-        std::panic::set_hook(Box::new(move |info| {
-            remember(info);
-            former(info);
-            TOLD.fetch_add(1, Ordering::Relaxed);
-        }));
+        let former: Arc<Hook> = Arc::new(std::panic::take_hook());
+        std::panic::set_hook(Box::new(move |info| hook(info, &former)));
     });
 }
 
-fn remember(info: &PanicHookInfo<'_>) {
+fn hook(info: &PanicHookInfo<'_>, former: &Arc<Hook>) {
     let place = info.location().map(|at| format!("{}:{}", at.file(), at.line()));
     // A thread that is about to end has no such memory any more; then nobody asks either.
     let _ = LAST.try_with(|last| {
@@ -53,14 +81,84 @@ fn remember(info: &PanicHookInfo<'_>) {
             *last = place;
         }
     });
-    let thread = system::thread_id();
-    match Vitals::present() {
-        Some(vitals) => {
-            vitals.begins(Doing::Panic, None);
-            tracing::error!(actor = vitals.name(), thread, "{}", sentence(info));
+    let vitals = Vitals::present();
+    if let Some(vitals) = &vitals {
+        vitals.begins(Doing::Panic, None);
+    }
+    let station = STATION.try_with(Cell::get).unwrap_or(Station::Foreign);
+    match (station, &vitals) {
+        (Station::Log, _) => former(info),
+        (Station::Runtime, _) | (Station::Foreign, Some(_)) if UNWINDS => {
+            let panicked = Panicked::new(info, vitals.as_deref());
+            log::enter(Box::new(move || panicked.tell()));
+            if is_the_last(info) {
+                log::flush(LAST_WORDS);
+            }
         }
-        // Not within an actor's turn: a task or a thread that somebody spawned and nobody supervises.
-        None => tracing::error!(thread, "outside of any supervised actor's turn: {}", sentence(info)),
+        (Station::Runtime | Station::Foreign, _) => {
+            let thread = system::thread_id();
+            log::error!(thread, "outside of any supervised actor's turn: {}", sentence(info));
+            let _prints = PRINTS.read();
+            former(info);
+        }
+    }
+}
+
+/// Whether the process aborts when the hook returns. It is not said otherwise in a stable way.
+fn is_the_last(info: &PanicHookInfo<'_>) -> bool {
+    info.payload_as_str().is_some_and(|said| said.starts_with("panic in a "))
+}
+
+/// A panic that is to be told on the log's thread.
+struct Panicked {
+    actor: Option<String>,
+    thread: i32,
+    said: String,
+    backtrace: Option<Backtrace>,
+    reader: Dispatch,
+}
+
+impl Panicked {
+    /// Waits for nobody: where a backtrace is printed now, this panic has none.
+    fn new(info: &PanicHookInfo<'_>, vitals: Option<&Vitals>) -> Self {
+        let backtrace = PRINTS.try_write().ok().map(|_held| Backtrace::capture());
+        Self {
+            actor: vitals.map(|vitals| vitals.name().to_owned()),
+            thread: system::thread_id(),
+            said: sentence(info),
+            backtrace: backtrace.filter(|backtrace| backtrace.status() == BacktraceStatus::Captured),
+            reader: get_default(Dispatch::clone),
+        }
+    }
+
+    /// Tells the reader of the log, then the hook that was there before.
+    fn tell(&self) {
+        let _prints = PRINTS.read();
+        let backtrace = self.backtrace.as_ref().map(|backtrace| format!("\n{backtrace}")).unwrap_or_default();
+        if self.reader.is::<NoSubscriber>() {
+            self.log(&backtrace);
+        } else {
+            with_default(&self.reader, || self.log(&backtrace));
+        }
+        let is_read = LevelFilter::current() >= LevelFilter::ERROR;
+        let backtrace = if is_read { "" } else { &*backtrace };
+        let who = match &self.actor {
+            Some(actor) => format!("the actor '{actor}'"),
+            None => "a task that is no actor's".to_owned(),
+        };
+        let Self { thread, said, .. } = self;
+        // A hook takes what only a panic can make.
+        let _ = catch_unwind(|| {
+            std::panic::panic_any(format!("{who} on thread {thread} {said}{backtrace}"));
+        });
+    }
+
+    fn log(&self, backtrace: &str) {
+        let Self { actor, thread, said, .. } = self;
+        match actor {
+            Some(actor) => tracing::error!(actor, thread, "{said}{backtrace}"),
+            None => tracing::error!(thread, "outside of any supervised actor's turn: {said}{backtrace}"),
+        }
     }
 }
 

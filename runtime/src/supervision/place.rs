@@ -137,7 +137,7 @@ impl Place {
         if let Some(cpu) = self.cpu
             && let Err(error) = system::keep_on(cpu)
         {
-            tracing::warn!(thread = self.thread, cpu, %error, "the thread stays on any CPU; does this one exist?");
+            crate::log::warn!(thread = self.thread, cpu, %error, "the thread stays on any CPU; does this one exist?");
         }
         if let Some(priority) = self.realtime_priority {
             self.make_realtime(priority);
@@ -146,7 +146,7 @@ impl Place {
 
     fn make_realtime(&self, priority: u8) {
         if let Err(error) = make_realtime(priority) {
-            tracing::warn!(
+            crate::log::warn!(
                 thread = self.thread,
                 priority,
                 ?error,

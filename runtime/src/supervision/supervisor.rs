@@ -163,7 +163,7 @@ impl Supervisor {
             let left = legacy.take();
             if let Some(mut left) = left {
                 let why = Reason::GaveUp(format!("its supervisor {reason}"));
-                tracing::error!(%reason, "a supervisor failed itself; its children are told to stop");
+                crate::log::error!(%reason, "a supervisor failed itself; its children are told to stop");
                 left.end_all(&why).await;
             }
             reason
@@ -315,16 +315,16 @@ impl Supervisor {
     fn note(&self, id: ChildId, what: &'static str) {
         let (supervisor, tid) = (self.roster.supervisor_of(id), self.tid_of(id));
         let (generation, restarts) = self.life_of(id);
-        tracing::debug!(supervisor, child = self.roster.name(id), tid, generation, restarts, "{what}");
+        crate::log::debug!(supervisor, child = self.roster.name(id), tid, generation, restarts, "{what}");
     }
 
     fn note_end(&self, id: ChildId, reason: &Reason) {
         let (supervisor, tid) = (self.roster.supervisor_of(id), self.tid_of(id));
         let (child, (generation, restarts)) = (self.roster.name(id), self.life_of(id));
         if reason.is_failure() {
-            tracing::error!(supervisor, child, tid, generation, restarts, %reason, "a child failed");
+            crate::log::error!(supervisor, child, tid, generation, restarts, %reason, "a child failed");
         } else {
-            tracing::info!(supervisor, child, tid, generation, restarts, %reason, "a child ended");
+            crate::log::info!(supervisor, child, tid, generation, restarts, %reason, "a child ended");
         }
     }
 
@@ -373,7 +373,11 @@ impl Supervisor {
     fn abandon(&mut self, id: ChildId, context: &mut Context<Self>) {
         let Some(Child { spec, tenant, .. }) = self.children.get_mut(&id) else { return };
         let Some(tenant) = tenant.take() else { return };
-        tracing::error!(supervisor = self.roster.supervisor_of(id), child = spec.name, "its life is taken");
+        crate::log::error!(
+            supervisor = self.roster.supervisor_of(id),
+            child = spec.name,
+            "its life is taken"
+        );
         tenant.kill();
         if tenant.holds_its_thread().is_some() {
             self.threads.borrow_mut().give_up(&tenant);
@@ -425,7 +429,7 @@ impl Drop for Unborn {
 
 fn say(post: &Post<Input>, input: Input) {
     if let Err(lost) = post.post(input) {
-        tracing::error!(
+        crate::log::error!(
             ?lost,
             "a supervisor was not told: its post is full, or who told it was replaced; its deadlines will notice"
         );

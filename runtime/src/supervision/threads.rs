@@ -15,6 +15,7 @@ use thread_priority::{ThreadId, ThreadPriority, set_thread_priority_and_policy, 
 
 use super::{
     Place, Reason,
+    panics::is_the_runtimes,
     place::Owner,
     system,
     tenant::{Fate, Tenant, WeakTenant},
@@ -99,6 +100,7 @@ impl Seat {
     fn occupy(self: Arc<Self>) {
         self.tid.store(system::thread_id(), Ordering::Relaxed);
         *lock(&self.native) = Some(thread_native_id());
+        is_the_runtimes();
         OCCUPIED.set(Some(Occupied(self)));
     }
 }
@@ -199,7 +201,7 @@ impl Threads {
             .filter(|other| !Arc::ptr_eq(other.vitals(), hung.vitals()))
             .collect();
         let (thread, child) = (&seat.place.thread, hung.vitals().name());
-        tracing::error!(
+        crate::log::error!(
             child,
             thread,
             abandoned,

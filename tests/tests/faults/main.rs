@@ -6,6 +6,7 @@ mod groups;
 mod hangs;
 mod layers;
 mod load;
+mod logs;
 mod mailboxes;
 mod panics;
 mod points;

@@ -129,7 +129,7 @@ impl Client {
     }
 
     fn log(&self, what: &str) {
-        tracing::info!(tid = %self.tid, name = self.name, pid = self.peer.pid, "an application of another process {what}");
+        crate::log::info!(tid = %self.tid, name = self.name, pid = self.peer.pid, "an application of another process {what}");
     }
 }
 

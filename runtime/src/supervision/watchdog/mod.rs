@@ -27,7 +27,7 @@ use suspect::{Hang, Look, Stall, StallSuspect, TurnSuspect};
 
 use super::{
     Reason,
-    panics::{told, words},
+    panics::{is_the_runtimes, words},
     place::make_realtime,
     tenant::{Fate, Tenant},
 };
@@ -71,7 +71,11 @@ impl Watchdog {
         if self.shared.count.fetch_add(1, Ordering::Relaxed) >= WATCHED_MAX {
             self.shared.count.fetch_sub(1, Ordering::Relaxed);
             let name = tenant.vitals().name();
-            tracing::error!(name, WATCHED_MAX, "the watchdog's table is full; nobody sees if this one hangs");
+            crate::log::error!(
+                name,
+                WATCHED_MAX,
+                "the watchdog's table is full; nobody sees if this one hangs"
+            );
             return;
         }
         lock(&self.shared.arrivals).push(Watched::new(tenant.clone(), budget));
@@ -94,7 +98,7 @@ impl Watchdog {
         let shared = Arc::downgrade(&self.shared);
         match std::thread::Builder::new().name("watchdog".to_owned()).spawn(move || run(&shared)) {
             Ok(new) => *thread = Some(new),
-            Err(error) => tracing::error!(%error, "no thread for the watchdog; nobody sees who hangs"),
+            Err(error) => crate::log::error!(%error, "no thread for the watchdog; nobody sees who hangs"),
         }
     }
 }
@@ -110,10 +114,11 @@ impl Drop for Watchdog {
 }
 
 fn run(shared: &Weak<Shared>) {
+    is_the_runtimes();
     if let Err(error) = make_realtime(PRIORITY) {
         static SAID: Once = Once::new();
         SAID.call_once(|| {
-            tracing::warn!(
+            crate::log::warn!(
                 ?error,
                 "the watchdog has no real-time priority: on a busy CPU it notices a hang late; allow it with `ulimit -r 99`"
             );
@@ -123,7 +128,7 @@ fn run(shared: &Weak<Shared>) {
         // A fault in here must not leave the node without a watchdog.
         let looked = catch_unwind(AssertUnwindSafe(|| shared.look()));
         let next = looked.unwrap_or_else(|panic| {
-            tracing::error!(said = words(panic), "the watchdog panicked, and goes on");
+            crate::log::error!(said = words(panic), "the watchdog panicked, and goes on");
             Some(Time::now() + PERIOD_MAX)
         });
         shared.lateness.is_due(next);
@@ -165,7 +170,11 @@ fn look_at(watched: &mut Watched, now: Time, late: Duration, period: Duration) -
         Ok(goes_on) => goes_on,
         Err(panic) => {
             let name = watched.tenant.vitals().name();
-            tracing::error!(name, said = words(panic), "the watchdog panicked over this one and leaves it");
+            crate::log::error!(
+                name,
+                said = words(panic),
+                "the watchdog panicked over this one and leaves it"
+            );
             false
         }
     }
@@ -192,7 +201,7 @@ impl Watched {
 
     fn look(&mut self, now: Time, late: Duration, period: Duration) -> bool {
         let vitals = self.tenant.vitals();
-        let look = Look { now, late, panics: told(), sight: vitals.sight() };
+        let look = Look { now, late, sight: vitals.sight() };
         let seat = self.tenant.seat().cloned();
         let cpu = || sample(seat.as_ref()?.tid()?);
         if let Some(hang) = self.turn.look(look, period, cpu) {

@@ -14,11 +14,8 @@ use crate::{
 /// Looks before the end of a budget at which the CPU's account is read, so that the last of them has one to compare with.
 const LAST_LOOKS: u32 = 4;
 
-/// Time for a panic at least: its hook may look up and print a backtrace, which takes a second in a debug build. Counted anew
-/// whenever another panic was told meanwhile, for they are told one by one.
-const PANIC_WITHIN: Duration = Duration::from_secs(10);
-/// Time for a panic at most, however many there are.
-const PANIC_WITHIN_MAX: Duration = Duration::from_secs(60);
+/// Time for a panic at least: a hook of the program's own may look up a backtrace.
+const PANIC_WITHIN: Duration = Duration::from_secs(1);
 
 /// One look at an actor.
 #[derive(Clone, Copy, Debug)]
@@ -26,8 +23,6 @@ pub(super) struct Look {
     pub(super) now: Time,
     /// How much later than intended this look is.
     pub(super) late: Duration,
-    /// Panics of this process that were told so far.
-    pub(super) panics: u64,
     pub(super) sight: Sight,
 }
 
@@ -48,15 +43,11 @@ pub(super) struct TurnSuspect {
     first_seen: Time,
     looks: u32,
     account: Account,
-    panics: u64,
-    /// When a panic was told last that was seen in this turn; its beginning, if none was.
-    panic_told: Time,
 }
 
 impl TurnSuspect {
     pub(super) fn new(budget: Duration) -> Self {
-        let (first_seen, panic_told, account) = (Time::ZERO, Time::ZERO, Account::default());
-        Self { budget, turn: 0, first_seen, looks: 0, account, panics: 0, panic_told }
+        Self { budget, turn: 0, first_seen: Time::ZERO, looks: 0, account: Account::default() }
     }
 
     /// Takes a look. `sample` reads the CPU's account; it is called only when that matters.
@@ -66,14 +57,11 @@ impl TurnSuspect {
         period: Duration,
         sample: impl FnOnce() -> Option<Sample>,
     ) -> Option<Hang> {
-        let Look { now, late, panics, sight } = look;
+        let Look { now, late, sight } = look;
         if sight.turn != self.turn || !sight.is_busy() {
             let (account, turn) = (Account::opened(late), sight.turn);
-            *self = Self { turn, first_seen: now, looks: 0, account, panics, panic_told: now, ..*self };
+            *self = Self { turn, first_seen: now, looks: 0, account, ..*self };
             return None;
-        }
-        if std::mem::replace(&mut self.panics, panics) != panics {
-            self.panic_told = now;
         }
         self.looks = self.looks.saturating_add(1);
         self.account.late += late;
@@ -90,11 +78,7 @@ impl TurnSuspect {
 
     /// One that panicked is on its way out, and has time for it.
     fn budget_of(&self, sight: Sight) -> Duration {
-        if sight.doing != Doing::Panic {
-            return self.budget;
-        }
-        let waited = self.panic_told.since(sight.begun.unwrap_or(self.first_seen));
-        self.budget.max((waited + PANIC_WITHIN).min(PANIC_WITHIN_MAX))
+        if sight.doing == Doing::Panic { self.budget.max(PANIC_WITHIN) } else { self.budget }
     }
 
     /// When the turn that was seen last is too long.
