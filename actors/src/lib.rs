@@ -42,6 +42,7 @@ mod payload;
 mod process;
 mod refusals;
 mod ring;
+mod session;
 mod stores;
 mod sync;
 mod wills;

@@ -12,7 +12,10 @@
 //! All of it stands under one mutex. Receipts are never settled and nobody is woken with it in hand, because whoever
 //! is told may submit to this very outlet.
 
+mod expiry;
 mod half;
+mod partial;
+mod resume;
 #[cfg(test)]
 mod tests;
 
@@ -31,7 +34,10 @@ use sinew_runtime::{
 };
 use tokio::net::{TcpStream, UnixStream};
 
+use crate::session::Ack;
+
 use half::{After, Half};
+pub(crate) use resume::Session;
 
 /// A non-blocking socket, or what is like one, that can be written to from any thread.
 pub(crate) trait Socket: Send + 'static {
@@ -115,6 +121,13 @@ pub struct OutletCounts {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct LinkNumber(u64);
 
+impl LinkNumber {
+    /// The n-th, from 1.
+    pub(crate) const fn number(self) -> u64 {
+        self.0
+    }
+}
+
 /// The writing half of a connection, and the messages that wait for it. It outlives the connection: while there is
 /// none, messages wait.
 pub(crate) struct StreamOutlet<S> {
@@ -124,7 +137,23 @@ pub(crate) struct StreamOutlet<S> {
 impl<S: Socket> StreamOutlet<S> {
     /// An outlet without a connection.
     pub(crate) fn new(limits: OutletLimits) -> Self {
-        Self { half: Mutex::new(Half::new(limits)) }
+        Self { half: Mutex::new(Half::new(limits, None)) }
+    }
+
+    /// An outlet whose messages arrive once and in order, however many connections it takes.
+    pub(crate) fn with_session(limits: OutletLimits, session: Session) -> Self {
+        Self { half: Mutex::new(Half::new(limits, Some(session))) }
+    }
+
+    /// The epoch in which it counts what it sends; 0 without a session.
+    pub(crate) fn epoch(&self) -> u64 {
+        self.lock().epoch()
+    }
+
+    /// The peer has said on `link` what it takes next; with a session, nothing goes out on a connection before this.
+    /// Returns whether the peer must be told at once in which [`epoch`](Self::epoch) that is.
+    pub(crate) fn heard(&self, link: LinkNumber, ack: &Ack, now: Time) -> bool {
+        self.with(|half, after| half.heard(link, ack, now, after))
     }
 
     /// Writes to `socket` from now on: `preface` first, then all that waits. Needs a drainer: [`drain`](Self::drain).

@@ -186,11 +186,12 @@ impl Gncl {
         let Attach { connection, node, incarnation, payload_max, welcome } = attach;
         let Some(wire) = self.wires.get_mut(&connection) else { return };
         let Some(socket) = wire.socket.clone() else { return };
-        let peer = self.stores.gncl.meet(node, incarnation, &self.stores.config);
-        wire.set_mode(Mode::Linked(Inbound { stores: self.stores.clone(), peer: peer.clone() }));
+        let peer = self.stores.gncl.meet(Time::now(), node, incarnation, &self.stores);
         let welcome = welcome.map(|words| frame(self.stores.node, node, Kind::GNCL_WELCOME, write(&words)));
         let payload_max = usize::try_from(payload_max).unwrap_or(usize::MAX);
         let link = peer.outlet.connect(socket, payload_max, welcome);
+        peer.attach(link);
+        wire.set_mode(Mode::Linked(Inbound { stores: self.stores.clone(), peer: peer.clone(), link }));
         self.stores.router.set_peer(node, peer.clone());
         let drainer = fut::wrap_future::<_, Self>(async move { peer.outlet.drain(link).await });
         let drainer = ctx.spawn(drainer.map(move |_, actor, ctx| actor.ended(connection, ctx)));
@@ -225,7 +226,7 @@ impl Gncl {
 
     fn send(&self, node: NodeAddress, kind: Kind) {
         if let Some(peer) = self.stores.gncl.peer(node) {
-            peer.send(frame(self.stores.node, node, kind, bytes::Bytes::new()));
+            peer.say(frame(self.stores.node, node, kind, bytes::Bytes::new()));
         }
     }
 
@@ -364,6 +365,7 @@ impl Actor for Gncl {
             let now = Time::now();
             for peer in actor.stores.gncl.peers() {
                 peer.outlet.expire(now);
+                peer.acknowledge_if_owed();
             }
         });
         if let Some(ready) = self.ready.take() {

@@ -4,23 +4,43 @@ use std::sync::Arc;
 
 use sinew_runtime::{
     outcome::{Outcome, Receipt, Rejection, Ticket},
-    tid::NodeAddress,
+    tid::{AppAddress, NodeAddress},
     time::Time,
-    wire::{Class, Flags, Message},
+    wire::{Class, Flags, Kind, Message},
 };
 
-use super::peer::Peer;
-use crate::stores::Stores;
+use super::{
+    core::{Decline, read},
+    peer::Peer,
+};
+use crate::{outlet::LinkNumber, stores::Stores};
 
 /// The way in for the frames of one peer.
 pub(super) struct Inbound {
     pub(super) stores: Arc<Stores>,
     pub(super) peer: Arc<Peer>,
+    /// The connection on which they come.
+    pub(super) link: LinkNumber,
 }
 
 impl Inbound {
-    /// Takes a frame that came at `now`: delivers it, settles it, or refuses and counts it.
-    pub(super) fn receive(&self, now: Time, mut message: Message) {
+    /// Takes a frame that came at `now`, if it is the next one: delivers it, settles it, or refuses and counts it.
+    ///
+    /// # Errors
+    /// It is not the next one, or an acknowledgement that is none: the peer is at fault.
+    pub(super) fn receive(&self, now: Time, message: Message) -> Result<(), Decline> {
+        if is_for_the_link(&message, Kind::GNCL_ACK) {
+            self.peer.heard(self.link, &read(&message.payload)?, now);
+            return Ok(());
+        }
+        // Counted first: what panics from here on must not come again.
+        if self.peer.arrive(self.link, &message)? && !is_for_the_link(&message, Kind::GNCL_VOID) {
+            self.take(now, message);
+        }
+        Ok(())
+    }
+
+    fn take(&self, now: Time, mut message: Message) {
         let header = message.header;
         if header.source.node != self.peer.node {
             // No outcome is sent: the source that it names has not sent it.
@@ -58,12 +78,7 @@ impl Inbound {
     /// spec: GNCL-12
     fn attach_receipt(&self, message: &mut Message) {
         if message.header.flags.has(Flags::CONFIRM) {
-            let ticket = Ticket {
-                source: message.header.source,
-                destination: message.header.destination,
-                correlation: message.header.correlation,
-            };
-            message.receipt = Some(Receipt::new(self.peer.clone(), ticket));
+            message.receipt = Some(Receipt::new(self.peer.clone(), message.ticket()));
         }
     }
 
@@ -90,4 +105,9 @@ impl Inbound {
         let detail = format!("node {peer} sent a frame from {} to {}", header.source, header.destination);
         self.stores.gncl.refusals.count(now, cause, &detail);
     }
+}
+
+/// Whether this is about the connection itself, and of that kind.
+fn is_for_the_link(message: &Message, kind: Kind) -> bool {
+    message.header.destination.app == AppAddress::GNCL && message.header.kind == kind
 }

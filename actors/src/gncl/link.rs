@@ -193,7 +193,9 @@ impl Reader {
             match (FrameCodec::new(payload_max).decode(&mut self.buffer), &*mode) {
                 (Ok(Some(message)), Mode::Linked(inbound)) if !is_for_the_shell(&message) => {
                     self.heard = true;
-                    inbound.receive(Time::now(), message);
+                    if let Err(decline) = inbound.receive(Time::now(), message) {
+                        return Look::Tell(What::Violated(decline));
+                    }
                 }
                 (Ok(Some(message)), _) => return Look::Tell(What::Frame(message)),
                 (Ok(None), _) => return Look::Empty,

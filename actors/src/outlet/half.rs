@@ -2,9 +2,8 @@
 
 use std::{
     collections::VecDeque,
-    io::{self, IoSlice},
+    io,
     task::{Context, Poll, Waker},
-    time::Duration,
 };
 
 use sinew_runtime::{
@@ -12,21 +11,23 @@ use sinew_runtime::{
     outcome::{Outcome, Receipt, Rejection, Ticket},
     router::Refused,
     time::Time,
-    wire::{Checksum, Class, Flags, HEADER_LEN, Message},
+    wire::{Checksum, Class, Flags, Message},
 };
 
-use super::{LinkNumber, OutletCounts, OutletLimits, Socket};
+use super::{
+    LinkNumber, OutletCounts, OutletLimits, Socket,
+    partial::{Partial, Sort, Written},
+    resume::Session,
+};
 
-/// Time after a sent message's time to live in which its outcome may still come.
-const OUTCOME_GRACE: Duration = Duration::from_secs(1);
 /// Frames that the drainer writes before other tasks of its thread have their turn.
 const WRITES_PER_WAKE: usize = 64;
 
 /// What is done when the lock is free again.
 #[derive(Default)]
 pub(super) struct After {
-    settle: Vec<(Receipt, Outcome)>,
-    wake: Option<Waker>,
+    pub(super) settle: Vec<(Receipt, Outcome)>,
+    pub(super) wake: Option<Waker>,
 }
 
 impl After {
@@ -40,7 +41,7 @@ impl After {
     }
 }
 
-enum Link<S> {
+pub(super) enum Link<S> {
     Down,
     Up(S),
     /// A sender's write failed; the drainer takes the error to the layer.
@@ -48,76 +49,48 @@ enum Link<S> {
     Closed(Rejection),
 }
 
-/// A frame of which the socket has taken the first bytes.
-struct Partial {
-    message: Message,
-    head: [u8; HEADER_LEN],
-    written: usize,
-    /// The first or the last frame of a connection: it belongs to that one, and to no sender.
-    is_frill: bool,
-}
-
-impl Partial {
-    fn new(message: Message, checksum: Checksum) -> Self {
-        let head = checksum.encode(&message.header, &message.payload);
-        Self { message, head, written: 0, is_frill: false }
-    }
-
-    /// Writes what the socket takes; returns whether that was all.
-    fn write_to(&mut self, socket: &mut impl Socket) -> io::Result<bool> {
-        let head = &self.head[self.written.min(HEADER_LEN)..];
-        let payload = &self.message.payload[self.written.saturating_sub(HEADER_LEN)..];
-        self.written += socket.try_write_vectored(&[IoSlice::new(head), IoSlice::new(payload)])?;
-        Ok(self.written == self.message.size())
-    }
-}
-
 /// A message whose outcome the peer owes.
-struct Sent {
-    receipt: Receipt,
-    expiry: Time,
+pub(super) struct Sent {
+    pub(super) receipt: Receipt,
+    pub(super) expiry: Time,
     /// The connection's account when it was written.
     written: u64,
-}
-
-/// How a write ended.
-enum Written {
-    Whole,
-    InPart,
-    Broken,
 }
 
 pub(super) struct Half<S> {
     limits: OutletLimits,
     payload_max: usize,
     link: Link<S>,
-    number: u64,
+    pub(super) number: u64,
+    /// What makes a message arrive once through any number of connections; `None` where there is only ever one.
+    pub(super) session: Option<Session>,
     partial: Option<Partial>,
     /// The frame that was being written when the last connection ended. No peer can have handled it: it goes first.
-    interrupted: Option<Message>,
-    queue: ClassQueue,
+    pub(super) interrupted: Option<Message>,
+    pub(super) queue: ClassQueue,
     /// Frames that go ahead of the queue, in their order.
     urgent: VecDeque<Message>,
     /// What is sent when nothing waits any more; nothing is taken after it.
     last: Option<Message>,
     finishing: bool,
     /// Receipts of messages that wait.
-    waiting_receipts: usize,
+    pub(super) waiting_receipts: usize,
     /// No waiting message expires before this.
-    next_expiry: Time,
+    pub(super) next_expiry: Time,
     /// Receipts of messages that were sent, oldest first: outcomes come back in about this order.
-    sent_receipts: VecDeque<Sent>,
-    drainer: Option<Waker>,
-    counts: OutletCounts,
+    pub(super) sent_receipts: VecDeque<Sent>,
+    pub(super) drainer: Option<Waker>,
+    pub(super) counts: OutletCounts,
 }
 
 impl<S: Socket> Half<S> {
-    pub(super) fn new(limits: OutletLimits) -> Self {
+    pub(super) fn new(limits: OutletLimits, session: Option<Session>) -> Self {
         Self {
             limits,
             payload_max: limits.payload_max,
             link: Link::Down,
             number: 0,
+            session,
             partial: None,
             interrupted: None,
             queue: ClassQueue::new(limits.queue_capacity),
@@ -161,17 +134,34 @@ impl<S: Socket> Half<S> {
         self.last = None;
         self.urgent.clear();
         after.wake = self.drainer.take();
-        after.settle.extend(self.sent_receipts.drain(..).map(|sent| (sent.receipt, Outcome::Unknown)));
-        let Some(partial) = self.partial.take() else { return true };
-        self.next_expiry = self.next_expiry.min(partial.message.header.expiry());
-        if partial.is_frill {
-            // The next connection has its own.
-        } else if partial.message.header.class == Class::Stream {
-            self.put_back(partial.message);
+        let partial = self.partial.take();
+        let was_whole = partial.as_ref().is_none_or(|partial| partial.written == 0);
+        if self.session.is_some() {
+            self.pause(partial);
         } else {
-            self.interrupted = Some(partial.message);
+            self.unknown(after);
+            self.interrupt(partial);
         }
-        partial.written == 0
+        was_whole
+    }
+
+    /// What was sent and not confirmed may have been handled or not.
+    pub(super) fn unknown(&mut self, after: &mut After) {
+        after.settle.extend(self.sent_receipts.drain(..).map(|sent| (sent.receipt, Outcome::Unknown)));
+    }
+
+    /// The frame that was being written goes out on the next connection.
+    fn interrupt(&mut self, partial: Option<Partial>) {
+        // The connection's own frames are not the next one's.
+        let Some(Partial { message, .. }) = partial.filter(|partial| partial.sort == Sort::Message) else {
+            return;
+        };
+        self.next_expiry = self.next_expiry.min(message.header.expiry());
+        if message.header.class == Class::Stream {
+            self.put_back(message);
+        } else {
+            self.interrupted = Some(message);
+        }
     }
 
     /// Puts a Stream message back before all others, so that a newer value takes its place.
@@ -188,6 +178,8 @@ impl<S: Socket> Half<S> {
 
     pub(super) fn close(&mut self, why: Rejection, after: &mut After) {
         self.cut(after);
+        self.unknown(after);
+        self.forget_kept();
         self.link = Link::Closed(why);
         let waiting: Vec<_> = self.interrupted.take().into_iter().chain(self.queue.drain_all()).collect();
         for message in waiting {
@@ -226,7 +218,7 @@ impl<S: Socket> Half<S> {
             self.expired(message, after);
             return Ok(());
         }
-        if self.waiting() > 0 || !matches!(self.link, Link::Up(_)) {
+        if self.waiting() > 0 || !self.takes_new() {
             return self.enqueue(message, after);
         }
         let mut frame = self.frame(message);
@@ -266,13 +258,14 @@ impl<S: Socket> Half<S> {
 
     /// Urgent frames that the socket has not taken to their last byte.
     pub(super) fn urgent_left(&self) -> usize {
-        self.urgent.len() + usize::from(self.partial.as_ref().is_some_and(|partial| partial.is_frill))
+        self.urgent.len()
+            + usize::from(self.partial.as_ref().is_some_and(|partial| partial.sort == Sort::Frill))
     }
 
     pub(super) fn finish(&mut self, last: Message, after: &mut After) {
         self.finishing = true;
         self.last = Some(last);
-        if self.waiting() == 1 && matches!(self.link, Link::Up(_)) {
+        if self.waiting() == 1 && self.has_frame() && matches!(self.link, Link::Up(_)) {
             self.write_next(after);
         }
         after.wake = self.drainer.take();
@@ -281,6 +274,7 @@ impl<S: Socket> Half<S> {
     /// A frame that was to be written at once and could not be: it waits like any other.
     fn requeue(&mut self, frame: Partial, after: &mut After) -> Result<(), Refused> {
         self.waiting_receipts -= usize::from(frame.message.receipt.is_some());
+        self.take_back();
         self.enqueue(frame.message, after)
     }
 
@@ -318,18 +312,27 @@ impl<S: Socket> Half<S> {
         Ok(())
     }
 
+    /// Whether a message that was never sent may be written now.
+    fn takes_new(&self) -> bool {
+        matches!(self.link, Link::Up(_)) && self.session_has_room()
+    }
+
     /// A message as it goes to the connection that there is now.
-    fn frame(&self, message: Message) -> Partial {
-        let checksum = match &self.link {
+    fn frame(&mut self, mut message: Message) -> Partial {
+        self.number(&mut message);
+        Partial::new(message, self.checksum(), Sort::Message)
+    }
+
+    pub(super) fn checksum(&self) -> Checksum {
+        match &self.link {
             Link::Up(socket) => socket.checksum(),
             // It is not written; whoever writes it later makes it a frame again.
             Link::Down | Link::Failed(_) | Link::Closed(_) => Checksum::Crc,
-        };
-        Partial::new(message, checksum)
+        }
     }
 
     fn frill(&self, message: Message) -> Partial {
-        Partial { is_frill: true, ..self.frame(message) }
+        Partial::new(message, self.checksum(), Sort::Frill)
     }
 
     fn write(&mut self, frame: &mut Partial) -> Written {
@@ -347,19 +350,14 @@ impl<S: Socket> Half<S> {
         }
     }
 
-    fn sent(&mut self, frame: Partial) {
-        self.counts.sent += u64::from(!frame.is_frill);
+    pub(super) fn sent(&mut self, frame: Partial) {
+        self.counts.sent += u64::from(frame.sort == Sort::Message);
         let expiry = frame.message.header.expiry();
         if let Some(receipt) = frame.message.receipt {
             self.waiting_receipts -= 1;
             let written = if let Link::Up(socket) = &mut self.link { socket.account().written } else { 0 };
             self.sent_receipts.push_back(Sent { receipt, expiry, written });
         }
-    }
-
-    fn expired(&mut self, message: Message, after: &mut After) {
-        self.counts.expired += 1;
-        after.settle.extend(message.receipt.map(|receipt| (receipt, Outcome::Expired)));
     }
 
     pub(super) fn poll_drain(
@@ -375,7 +373,7 @@ impl<S: Socket> Half<S> {
             if !self.drainer.as_ref().is_some_and(|waker| waker.will_wake(cx.waker())) {
                 self.drainer = Some(cx.waker().clone());
             }
-            if self.waiting() == 0 {
+            if !self.has_frame() {
                 return Poll::Pending;
             }
             let Link::Up(socket) = &mut self.link else { continue };
@@ -423,55 +421,22 @@ impl<S: Socket> Half<S> {
         if let Some(urgent) = self.urgent.pop_front() {
             return Some(self.frill(urgent));
         }
-        let Some(message) = self.interrupted.take().or_else(|| self.queue.pop()) else {
+        if let Some(again) = self.frame_again() {
+            return Some(again);
+        }
+        if self.queue.is_empty() && self.interrupted.is_none() {
             return self.last.take().map(|last| self.frill(last));
-        };
+        }
+        if !self.session_has_room() {
+            return None;
+        }
+        let message = self.interrupted.take().or_else(|| self.queue.pop())?;
         if message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
             self.waiting_receipts -= usize::from(message.receipt.is_some());
             self.expired(message, after);
             return None;
         }
         Some(self.frame(message))
-    }
-
-    /// Outcomes that are long overdue do not come any more; their places are needed. By then the senders have stopped
-    /// waiting.
-    fn give_up_overdue(&mut self, now: Time, after: &mut After) {
-        while let Some(at) = self
-            .sent_receipts
-            .iter()
-            .position(|sent| sent.expiry != Time::MAX && now > sent.expiry + OUTCOME_GRACE)
-        {
-            after.settle.extend(self.sent_receipts.remove(at).map(|sent| (sent.receipt, Outcome::Unknown)));
-        }
-    }
-
-    pub(super) fn expire(&mut self, now: Time, after: &mut After) {
-        self.give_up_overdue(now, after);
-        if now <= self.next_expiry {
-            return;
-        }
-        self.next_expiry = Time::MAX;
-        if let Some(message) = self.interrupted.take() {
-            self.interrupted = self.keep_or_expire(message, now, after);
-        }
-        let waiting: Vec<_> = self.queue.drain_all().collect();
-        for message in waiting {
-            if let Some(message) = self.keep_or_expire(message, now, after) {
-                let kept = self.queue.push(message);
-                debug_assert!(matches!(kept, Ok(None)), "what was in the queue has room in it");
-            }
-        }
-    }
-
-    fn keep_or_expire(&mut self, message: Message, now: Time, after: &mut After) -> Option<Message> {
-        if message.header.is_expired(now) {
-            self.waiting_receipts -= usize::from(message.receipt.is_some());
-            self.expired(message, after);
-            return None;
-        }
-        self.next_expiry = self.next_expiry.min(message.header.expiry());
-        Some(message)
     }
 
     pub(super) fn confirm(&mut self, ticket: Ticket, outcome: Outcome, after: &mut After) -> bool {
@@ -482,9 +447,22 @@ impl<S: Socket> Half<S> {
         true
     }
 
+    /// Whether there is something that may be written now.
+    fn has_frame(&self) -> bool {
+        let waits = self.interrupted.is_some() || !self.queue.is_empty();
+        self.partial.is_some()
+            || !self.urgent.is_empty()
+            || self.behind() > 0
+            || waits && self.session_has_room()
+            || !waits && self.last.is_some() && self.session_is_through()
+    }
+
     pub(super) fn waiting(&self) -> usize {
         let single = [self.partial.is_some(), self.interrupted.is_some(), self.last.is_some()];
-        self.queue.len() + self.urgent.len() + single.into_iter().filter(|waits| *waits).count()
+        self.queue.len()
+            + self.urgent.len()
+            + self.behind()
+            + single.into_iter().filter(|waits| *waits).count()
     }
 
     pub(super) fn unconfirmed(&self) -> usize {

@@ -17,7 +17,7 @@ use std::{
 };
 
 pub use lender::Lender;
-pub use queue::ClassQueue;
+pub use queue::{ClassQueue, is_same_stream};
 pub use reader::MailboxReader;
 pub use source::Source;
 pub use tally::Tally;

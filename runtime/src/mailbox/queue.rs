@@ -68,6 +68,13 @@ impl ClassQueue {
             || header.class == Class::Stream && lane.iter().any(|other| is_same_stream(&other.header, header))
     }
 
+    /// Whether a newer value of this Stream message waits.
+    #[must_use]
+    pub fn supersedes(&self, older: &Header) -> bool {
+        let lane = &self.lanes[Class::Stream as usize];
+        older.class == Class::Stream && lane.iter().any(|newer| is_same_stream(&newer.header, older))
+    }
+
     /// Puts a message back that was popped, before all others of its class, whatever the bound. Hands it back if it is
     /// of a Stream whose newer value waits here.
     pub fn put_back(&mut self, message: Message) -> Option<Message> {
@@ -135,7 +142,8 @@ impl ClassQueue {
 }
 
 /// Whether the newer of the two takes the place of the older, both being of class Stream.
-fn is_same_stream(one: &Header, other: &Header) -> bool {
+#[must_use]
+pub fn is_same_stream(one: &Header, other: &Header) -> bool {
     one.source == other.source && one.kind == other.kind && one.destination == other.destination
 }
 

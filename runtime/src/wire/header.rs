@@ -9,7 +9,7 @@
 //!      8    4 kind of the payload
 //!     12    1 class: 0 Control, 1 Stream, 2 Bulk
 //!     13    1 flags
-//!     14    2 reserved, zero
+//!     14    2 between two nodes: the lower 16 bits of its number in their session; else zero
 //!     16    8 source TID
 //!     24    8 destination TID
 //!     32    8 sequence: the source's n-th message
@@ -111,6 +111,8 @@ pub struct Header {
     pub source: Tid,
     /// Whom it is for.
     pub destination: Tid,
+    /// Between two nodes: the lower 16 bits of its number in their session. Zero elsewhere, and not looked at.
+    pub number: u16,
     /// The source's n-th message, from 1.
     pub sequence: u64,
     /// Ties a reply or an outcome to its message; 0 where there is none.
@@ -131,6 +133,7 @@ impl Header {
             flags: Flags::NONE,
             source,
             destination,
+            number: 0,
             sequence: 0,
             correlation: 0,
             sent: Time::ZERO,
@@ -181,6 +184,7 @@ impl Header {
         bytes[8..12].copy_from_slice(&self.kind.bits().to_le_bytes());
         bytes[12] = self.class.code();
         bytes[13] = self.flags.0;
+        bytes[14..16].copy_from_slice(&self.number.to_le_bytes());
         bytes[16..24].copy_from_slice(&self.source.bits().to_le_bytes());
         bytes[24..32].copy_from_slice(&self.destination.bits().to_le_bytes());
         bytes[32..40].copy_from_slice(&self.sequence.to_le_bytes());
@@ -228,7 +232,7 @@ impl Header {
     /// What is wrong with the bytes; the peer is at fault.
     pub fn decode_in_memory(bytes: &[u8; HEADER_LEN]) -> Result<Self, HeaderError> {
         Self::payload_len(&field(bytes, 0))?;
-        if bytes[14..16] != [0, 0] || bytes[13] & !Flags::KNOWN != 0 {
+        if bytes[13] & !Flags::KNOWN != 0 {
             return Err(HeaderError::Reserved);
         }
         Ok(Self {
@@ -237,6 +241,7 @@ impl Header {
             flags: Flags(bytes[13]),
             source: Tid::from_bits(u64::from_le_bytes(field(bytes, 16))),
             destination: Tid::from_bits(u64::from_le_bytes(field(bytes, 24))),
+            number: u16::from_le_bytes(field(bytes, 14)),
             sequence: u64::from_le_bytes(field(bytes, 32)),
             correlation: u64::from_le_bytes(field(bytes, 40)),
             sent: Time::from_nanos(u64::from_le_bytes(field(bytes, 48))),
@@ -299,19 +304,20 @@ mod tests {
     use super::*;
 
     fn any_header() -> impl Strategy<Value = Header> {
-        (any::<[u64; 5]>(), any::<[u32; 2]>(), 0u8..3, 0u8..16).prop_map(|(long, short, class, flags)| {
-            Header {
+        (any::<[u64; 5]>(), any::<[u32; 2]>(), any::<u16>(), 0u8..3, 0u8..16).prop_map(
+            |(long, short, number, class, flags)| Header {
                 kind: Kind::from_bits(short[0]),
                 class: Class::from_code(class).unwrap(),
                 flags: Flags(flags),
                 source: Tid::from_bits(long[0]),
                 destination: Tid::from_bits(long[1]),
+                number,
                 sequence: long[2],
                 correlation: long[3],
                 sent: Time::from_nanos(long[4]),
                 time_to_live_us: short[1],
-            }
-        })
+            },
+        )
     }
 
     proptest! {

@@ -39,6 +39,10 @@ impl Kind {
     pub const GNCL_PONG: Self = Self(0x14);
     /// Orderly end of a connection.
     pub const GNCL_GOODBYE: Self = Self(0x15);
+    /// Says what its sender takes next.
+    pub const GNCL_ACK: Self = Self(0x16);
+    /// Stands for a message that lost its use before it arrived.
+    pub const GNCL_VOID: Self = Self(0x17);
     /// A node asks who is there, or whether a known node lives.
     pub const NDL_QUERY: Self = Self(0x20);
     /// The matched answer.

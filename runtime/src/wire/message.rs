@@ -99,6 +99,13 @@ impl Message {
         self.settle(Outcome::Rejected(why));
     }
 
+    /// What names this message in an outcome.
+    #[must_use]
+    pub const fn ticket(&self) -> Ticket {
+        let Header { source, destination, correlation, .. } = self.header;
+        Ticket { source, destination, correlation }
+    }
+
     /// Bytes that this message takes in a queue: its header and its payload.
     #[must_use]
     pub fn size(&self) -> usize {

@@ -28,6 +28,7 @@ use crate::{
         peer::frame,
     },
     ndl::{self, LossReason, MembershipFact},
+    session::Ack,
     stores::Stores,
 };
 
@@ -221,6 +222,8 @@ pub(super) async fn pair() -> (Node, Node) {
 pub(super) struct ByHand {
     pub(super) socket: TcpStream,
     buffer: bytes::BytesMut,
+    /// The number of what it sends next in its session.
+    number: u16,
 }
 
 impl ByHand {
@@ -231,7 +234,7 @@ impl ByHand {
     }
 
     pub(super) fn on(socket: TcpStream) -> Self {
-        Self { socket, buffer: bytes::BytesMut::new() }
+        Self { socket, buffer: bytes::BytesMut::new(), number: 1 }
     }
 
     /// A link to `node`, as its peer number 9.
@@ -242,13 +245,34 @@ impl ByHand {
         assert_eq!(welcome.header.kind, Kind::GNCL_WELCOME);
         let welcome: Introduction = read(&welcome.payload).expect("a WELCOME has a payload");
         assert_eq!((welcome.node, welcome.peer), (node.address(), NINE));
+        peer.begin(node).await;
         node.up().await;
         peer
     }
 
+    /// Says what it takes next: everything from the first message on, as if it had not been there before.
+    async fn begin(&mut self, node: &Node) {
+        let theirs = self.try_hear_any().await.expect("the node says what it takes next");
+        assert_eq!(theirs.header.kind, Kind::GNCL_ACK);
+        let memory = Time::now().as_nanos();
+        let ours = Ack { memory, epoch: memory, of: 0, next: 1 };
+        self.say(&frame(NINE, node.address(), Kind::GNCL_ACK, write(&ours))).await;
+    }
+
+    /// Leaves its session's order.
+    pub(super) fn skip(&mut self, numbers: i32) {
+        self.number = self.number.wrapping_add_signed(numbers as i16);
+    }
+
+    /// Writes a frame, with the next number if it is a message.
     pub(super) async fn say(&mut self, message: &Message) {
         let mut bytes = bytes::BytesMut::new();
-        FrameCodec::new(usize::MAX).encode(message, &mut bytes).unwrap();
+        let mut message = Message::new(message.header, message.payload.clone());
+        if message.header.destination.app != AppAddress::GNCL {
+            message.header.number = self.number;
+            self.number = self.number.wrapping_add(1);
+        }
+        FrameCodec::new(usize::MAX).encode(&message, &mut bytes).unwrap();
         self.say_bytes(&bytes).await;
     }
 
@@ -262,8 +286,17 @@ impl ByHand {
         self.try_hear().await.expect("the node closed the connection")
     }
 
-    /// The next frame, or `None` when the node has closed the connection.
+    /// The next frame that is no ACK, or `None` when the node has closed the connection.
     pub(super) async fn try_hear(&mut self) -> Option<Message> {
+        loop {
+            let message = self.try_hear_any().await?;
+            if message.header.kind != Kind::GNCL_ACK {
+                return Some(message);
+            }
+        }
+    }
+
+    async fn try_hear_any(&mut self) -> Option<Message> {
         loop {
             if let Some(message) =
                 FrameCodec::new(1 << 20).decode(&mut self.buffer).expect("the node writes frames")

@@ -1,0 +1,60 @@
+//! What loses its use while it waits, and outcomes that do not come any more.
+
+use std::time::Duration;
+
+use sinew_runtime::{outcome::Outcome, time::Time, wire::Message};
+
+use super::{
+    Socket,
+    half::{After, Half},
+};
+
+/// Time after a sent message's time to live in which its outcome may still come.
+const OUTCOME_GRACE: Duration = Duration::from_secs(1);
+
+impl<S: Socket> Half<S> {
+    pub(super) fn expired(&mut self, message: Message, after: &mut After) {
+        self.counts.expired += 1;
+        after.settle.extend(message.receipt.map(|receipt| (receipt, Outcome::Expired)));
+    }
+
+    /// Outcomes that are long overdue do not come any more; their places are needed. By then the senders have stopped
+    /// waiting.
+    fn give_up_overdue(&mut self, now: Time, after: &mut After) {
+        while let Some(at) = self
+            .sent_receipts
+            .iter()
+            .position(|sent| sent.expiry != Time::MAX && now > sent.expiry + OUTCOME_GRACE)
+        {
+            after.settle.extend(self.sent_receipts.remove(at).map(|sent| (sent.receipt, Outcome::Unknown)));
+        }
+    }
+
+    pub(super) fn expire(&mut self, now: Time, after: &mut After) {
+        self.give_up_overdue(now, after);
+        if now <= self.next_expiry {
+            return;
+        }
+        self.next_expiry = Time::MAX;
+        if let Some(message) = self.interrupted.take() {
+            self.interrupted = self.keep_or_expire(message, now, after);
+        }
+        let waiting: Vec<_> = self.queue.drain_all().collect();
+        for message in waiting {
+            if let Some(message) = self.keep_or_expire(message, now, after) {
+                let kept = self.queue.push(message);
+                debug_assert!(matches!(kept, Ok(None)), "what was in the queue has room in it");
+            }
+        }
+    }
+
+    fn keep_or_expire(&mut self, message: Message, now: Time, after: &mut After) -> Option<Message> {
+        if message.header.is_expired(now) {
+            self.waiting_receipts -= usize::from(message.receipt.is_some());
+            self.expired(message, after);
+            return None;
+        }
+        self.next_expiry = self.next_expiry.min(message.header.expiry());
+        Some(message)
+    }
+}

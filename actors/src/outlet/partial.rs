@@ -1,0 +1,51 @@
+//! A frame on its way into a socket.
+
+use std::io::{self, IoSlice};
+
+use sinew_runtime::wire::{Checksum, HEADER_LEN, Message};
+
+use super::Socket;
+
+/// A frame of which the socket has taken the first bytes, or none yet.
+pub(super) struct Partial {
+    pub(super) message: Message,
+    head: [u8; HEADER_LEN],
+    pub(super) written: usize,
+    pub(super) sort: Sort,
+}
+
+/// Whose a frame is.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum Sort {
+    /// A sender's message, for the first time.
+    Message,
+    /// A message that the session keeps, or a void in its place: it was counted when it was written first.
+    Again,
+    /// The connection's own: the first, the last, one that went ahead. It belongs to that one, and to no sender.
+    Frill,
+}
+
+/// How a write ended.
+pub(super) enum Written {
+    Whole,
+    InPart,
+    Broken,
+}
+
+impl Partial {
+    pub(super) fn new(message: Message, checksum: Checksum, sort: Sort) -> Self {
+        let head = checksum.encode(&message.header, &message.payload);
+        Self { message, head, written: 0, sort }
+    }
+
+    /// Writes what the socket takes; returns whether that was all.
+    ///
+    /// # Errors
+    /// The socket's.
+    pub(super) fn write_to(&mut self, socket: &mut impl Socket) -> io::Result<bool> {
+        let head = &self.head[self.written.min(HEADER_LEN)..];
+        let payload = &self.message.payload[self.written.saturating_sub(HEADER_LEN)..];
+        self.written += socket.try_write_vectored(&[IoSlice::new(head), IoSlice::new(payload)])?;
+        Ok(self.written == self.message.size())
+    }
+}

@@ -1,0 +1,133 @@
+//! The session of an outlet: numbers on the way out, and what is sent again on the next connection.
+
+use sinew_runtime::{
+    mailbox::is_same_stream,
+    outcome::Outcome,
+    time::Time,
+    wire::{Class, Flags, Header, Message},
+};
+
+use super::{
+    LinkNumber, Socket,
+    half::{After, Half},
+    partial::{Partial, Sort},
+};
+use crate::session::{Ack, Heard, Sending, Window};
+
+/// What is kept for the peer.
+pub(crate) struct Session {
+    sending: Sending<Message>,
+    /// The header of what stands for a message that has lost its use.
+    void: Header,
+}
+
+impl Session {
+    /// Nothing was sent yet; see [`Sending::new`].
+    pub(crate) const fn new(epoch: u64, window: Window, void: Header) -> Self {
+        Self { sending: Sending::new(epoch, window), void }
+    }
+}
+
+impl<S: Socket> Half<S> {
+    pub(super) fn session_has_room(&self) -> bool {
+        self.session.as_ref().is_none_or(|session| session.sending.has_room())
+    }
+
+    pub(super) fn session_is_through(&self) -> bool {
+        self.session.as_ref().is_none_or(|session| session.sending.is_through())
+    }
+
+    /// Messages that are to be sent again.
+    pub(super) fn behind(&self) -> usize {
+        self.session.as_ref().map_or(0, |session| session.sending.behind())
+    }
+
+    pub(super) fn epoch(&self) -> u64 {
+        self.session.as_ref().map_or(0, |session| session.sending.epoch())
+    }
+
+    /// Gives a message its number, and keeps a copy that shares its payload.
+    pub(super) fn number(&mut self, message: &mut Message) {
+        if let Some(session) = &mut self.session {
+            let kept = Message::new(message.header, message.payload.clone());
+            message.header.number = session.sending.keep(kept, message.size()) as u16;
+        }
+    }
+
+    pub(super) fn take_back(&mut self) {
+        if let Some(session) = &mut self.session {
+            session.sending.take_back();
+        }
+    }
+
+    pub(super) fn forget_kept(&mut self) {
+        if let Some(session) = &mut self.session {
+            self.counts.lost += session.sending.drain().len() as u64;
+        }
+    }
+
+    /// The connection has ended. The frame that was being written is kept, like all before it.
+    pub(super) fn pause(&mut self, partial: Option<Partial>) {
+        if let Some(session) = &mut self.session {
+            session.sending.link_ended();
+        }
+        if let Some(partial) = partial {
+            self.sent(partial);
+        }
+    }
+
+    /// The next frame that is to be written again.
+    pub(super) fn frame_again(&mut self) -> Option<Partial> {
+        let checksum = self.checksum();
+        let session = self.session.as_mut()?;
+        let (number, kept) = session.sending.again()?;
+        let mut message = match kept {
+            Some(kept) => Message::new(kept.header, kept.payload.clone()),
+            None => Message::new(session.void, bytes::Bytes::new()),
+        };
+        message.header.number = number as u16;
+        Some(Partial::new(message, checksum, Sort::Again))
+    }
+
+    /// The peer has said on `link` what it takes next. Returns whether it must be told at once in which epoch that is.
+    pub(super) fn heard(&mut self, link: LinkNumber, ack: &Ack, now: Time, after: &mut After) -> bool {
+        if link.0 != self.number {
+            return false;
+        }
+        let Some(session) = &mut self.session else { return false };
+        let heard = session.sending.heard(ack);
+        after.wake = self.drainer.take();
+        match heard {
+            Heard::Known => false,
+            Heard::Resumed => {
+                self.void(now, after);
+                false
+            }
+            Heard::Reset(kept) => {
+                self.counts.lost += kept.len() as u64;
+                self.unknown(after);
+                true
+            }
+        }
+    }
+
+    /// What has expired, or has a newer value behind it, is not sent again. It has not arrived, so the outcome is true.
+    fn void(&mut self, now: Time, after: &mut After) {
+        let Some(session) = &mut self.session else { return };
+        let (queue, mut newer) = (&self.queue, Vec::<Header>::new());
+        let void = session.sending.void(|Message { header, .. }| {
+            let is_old = queue.supersedes(header) || newer.iter().any(|newer| is_same_stream(newer, header));
+            if header.class == Class::Stream {
+                newer.push(*header);
+                is_old || header.is_expired(now)
+            } else {
+                header.is_expired(now)
+            }
+        });
+        for message in void {
+            if message.header.flags.has(Flags::CONFIRM) {
+                self.confirm(message.ticket(), Outcome::Expired, after);
+            }
+        }
+    }
+}

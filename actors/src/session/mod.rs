@@ -1,0 +1,47 @@
+//! The session between two nodes: what makes messages arrive once and in order through any number of connections.
+//!
+//! Each direction counts for itself. The sender numbers a message when it writes it first, and keeps it until the receiver
+//! has acknowledged it; the receiver takes the next number and nothing else. Whoever has a new connection says first what
+//! it takes next ([`Ack`]), and the other goes on from there. Both halves outlive connections and restarts of GNCL.
+//!
+//! ```text
+//!  Sending     Paused ── Ack ──► Flowing ── link ended ──► Paused        Ack of another epoch: Reset, all kept are reported
+//!  Receiving   Fenced ── attached, epoch known ──► Taking ── next link ──► Fenced
+//! ```
+//!
+//! | rule | what it says |
+//! | --- | --- |
+//! | SESSION-1 | A message has the next number when it is written first, and keeps it on every later connection. |
+//! | SESSION-2 | The sender keeps it until it is acknowledged; what it keeps is bounded in messages and bytes. |
+//! | SESSION-3 | On a new connection nothing is sent before the receiver's Ack; then all from the number in it. |
+//! | SESSION-4 | The receiver takes the next number only, on the latest connection only, and counts it before it hands it on. |
+//! | SESSION-5 | An epoch is one counting. An Ack of a peer that has forgotten what it took ends the epoch: what is kept is reported, not sent again. |
+//! | SESSION-6 | What has lost its use while it was kept (expired, superseded) is sent as a void of the same number. |
+//!
+//! No socket, no clock: the same calls give the same answers. `docs/protocol/gncl.md` has the bytes.
+
+mod receiving;
+mod sending;
+#[cfg(test)]
+mod tests;
+
+pub(crate) use receiving::{Arrival, Receiving};
+pub(crate) use sending::{Heard, Sending, Window};
+
+use serde::{Deserialize, Serialize};
+
+/// The number of an epoch's first message.
+const FIRST: u64 = 1;
+
+/// What one side says of both directions: payload of the frame ACK.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Ack {
+    /// Which memory of the receiver of this its sender has: another one has forgotten all that was taken.
+    pub(crate) memory: u64,
+    /// Epoch in which the sender of this counts what it sends. A later one is larger.
+    pub(crate) epoch: u64,
+    /// Epoch of the receiver of this that `next` is about; 0 if its sender knows none.
+    pub(crate) of: u64,
+    /// The number that the sender of this takes next: it has all before it.
+    pub(crate) next: u64,
+}

@@ -1,0 +1,88 @@
+//! The receiving half: takes each number once, in order, from the latest connection.
+
+use super::{Ack, FIRST};
+
+/// Messages after which the sender is told, so that it need not keep them.
+const ACK_EVERY: u32 = 32;
+/// Bytes of frames after which it is told.
+const ACK_EVERY_BYTES: usize = 64 << 10;
+
+/// What is to be done with a numbered frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Arrival {
+    /// It is the next one, and counted: hand it on. If `ack_is_due`, tell the sender now.
+    Take { ack_is_due: bool },
+    /// It came on a connection that another one has followed: drop it, it comes again there.
+    Fenced,
+    /// It is not the next one: the peer is at fault, and the connection must end.
+    OutOfStep { expected: u64 },
+}
+
+/// What one node has taken of another's messages.
+#[derive(Debug, Default)]
+pub(crate) struct Receiving {
+    /// No other memory of the same peer, before or after, has this number.
+    memory: u64,
+    /// The latest connection.
+    link: u64,
+    /// Whether the peer has said on it in which epoch it counts.
+    knows_epoch: bool,
+    /// Epoch of the peer; 0 before the first.
+    epoch: u64,
+    next: u64,
+    /// Taken, and not acknowledged.
+    unsaid: u32,
+    unsaid_bytes: usize,
+}
+
+impl Receiving {
+    /// Nothing has come yet. `memory` is a number that no other one had for the same two lives of nodes.
+    pub(crate) fn new(memory: u64) -> Self {
+        Self { memory, next: FIRST, ..Self::default() }
+    }
+
+    /// Messages come on the connection `link` from now on, and on no other.
+    pub(crate) const fn attach(&mut self, link: u64) {
+        self.link = link;
+        self.knows_epoch = false;
+    }
+
+    /// The peer counts in `epoch`. Returns whether this came on the latest connection, and so counts.
+    pub(crate) const fn heard(&mut self, link: u64, epoch: u64) -> bool {
+        if link != self.link || epoch < self.epoch {
+            return false;
+        }
+        if epoch > self.epoch {
+            self.epoch = epoch;
+            self.next = FIRST;
+        }
+        self.knows_epoch = true;
+        true
+    }
+
+    /// A frame of `bytes` came on `link` with the lower 16 bits of its number. spec: SESSION-4
+    pub(crate) fn arrive(&mut self, link: u64, number: u16, bytes: usize) -> Arrival {
+        if link != self.link {
+            return Arrival::Fenced;
+        }
+        if !self.knows_epoch || number != self.next as u16 {
+            return Arrival::OutOfStep { expected: self.next };
+        }
+        self.next += 1;
+        self.unsaid += 1;
+        self.unsaid_bytes += bytes;
+        Arrival::Take { ack_is_due: self.unsaid >= ACK_EVERY || self.unsaid_bytes >= ACK_EVERY_BYTES }
+    }
+
+    /// Whether something was taken that the sender has not been told.
+    pub(crate) const fn owes_ack(&self) -> bool {
+        self.unsaid > 0
+    }
+
+    /// What the sender is told now; `epoch` is that of what goes the other way.
+    pub(crate) const fn ack(&mut self, epoch: u64) -> Ack {
+        self.unsaid = 0;
+        self.unsaid_bytes = 0;
+        Ack { memory: self.memory, epoch, of: self.epoch, next: self.next }
+    }
+}

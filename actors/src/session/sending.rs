@@ -1,0 +1,176 @@
+//! The sending half: numbers, keeps, and sends again.
+
+use std::collections::VecDeque;
+
+use super::{Ack, FIRST};
+
+/// How much is kept without an acknowledgement. At least one message always is.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Window {
+    /// Messages at most. A further one waits.
+    pub(crate) messages: usize,
+    /// Bytes of frames from which on a further message waits: one message more than this is the bound.
+    pub(crate) bytes: usize,
+}
+
+#[derive(Debug)]
+struct Kept<M> {
+    /// `None`: it has lost its use.
+    message: Option<M>,
+    bytes: usize,
+}
+
+/// What an [`Ack`] has changed.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Heard<M> {
+    /// Some of what was kept has arrived, or nothing is new.
+    Known,
+    /// The connection can be used: what was kept and has not arrived is sent again now.
+    Resumed,
+    /// The peer does not know what it took in this epoch. A new one has begun, which the peer must be told before all else; whether these
+    /// messages, oldest first, have arrived nobody can say.
+    Reset(Vec<M>),
+}
+
+/// What one node sends to another.
+#[derive(Debug)]
+pub(crate) struct Sending<M> {
+    window: Window,
+    epoch: u64,
+    /// Number of the oldest message that is kept.
+    base: u64,
+    kept: VecDeque<Kept<M>>,
+    bytes: usize,
+    /// Number of what is written next on the present connection; `None` until the peer has said where to go on.
+    cursor: Option<u64>,
+    /// The memory of the peer that this epoch's messages were for.
+    peer: Option<u64>,
+}
+
+impl<M> Sending<M> {
+    /// Nothing was sent yet. `epoch` is larger than any before it between the same two lives of nodes, and not 0.
+    pub(crate) const fn new(epoch: u64, window: Window) -> Self {
+        Self { window, epoch, base: FIRST, kept: VecDeque::new(), bytes: 0, cursor: None, peer: None }
+    }
+
+    /// The epoch that the peer is told.
+    pub(crate) const fn epoch(&self) -> u64 {
+        self.epoch
+    }
+
+    /// The number of the next message that has none yet.
+    fn end(&self) -> u64 {
+        self.base + self.kept.len() as u64
+    }
+
+    /// Whether a message that was never sent may be sent now.
+    pub(crate) fn has_room(&self) -> bool {
+        let has_room = self.kept.len() < self.window.messages && self.bytes < self.window.bytes;
+        self.cursor == Some(self.end()) && (has_room || self.kept.is_empty())
+    }
+
+    /// Whether everything that has a number was written on this connection, or has arrived.
+    pub(crate) fn is_through(&self) -> bool {
+        self.kept.is_empty() || self.cursor == Some(self.end())
+    }
+
+    /// Messages that are to be written again.
+    pub(crate) fn behind(&self) -> usize {
+        self.cursor.map_or(0, |cursor| (self.end() - cursor) as usize)
+    }
+
+    /// Keeps a message whose frame of `bytes` is written now, and gives it its number. Only where there is
+    /// [room](Self::has_room).
+    pub(crate) fn keep(&mut self, message: M, bytes: usize) -> u64 {
+        // spec: SESSION-1
+        debug_assert!(self.has_room(), "numbers go out in their order");
+        let number = self.end();
+        self.kept.push_back(Kept { message: Some(message), bytes });
+        self.bytes += bytes;
+        self.cursor = Some(number + 1);
+        number
+    }
+
+    /// Takes the number back from the message that was kept last: nothing of it was written.
+    pub(crate) fn take_back(&mut self) {
+        if let Some(kept) = self.kept.pop_back() {
+            self.bytes -= kept.bytes;
+            self.cursor = self.cursor.map(|cursor| cursor.min(self.end()));
+        }
+    }
+
+    /// What is to be written again next, with its number; the message is `None` for a void.
+    pub(crate) fn again(&mut self) -> Option<(u64, Option<&M>)> {
+        let number = self.cursor.filter(|cursor| *cursor < self.end())?;
+        self.cursor = Some(number + 1);
+        let kept = &self.kept[(number - self.base) as usize];
+        Some((number, kept.message.as_ref()))
+    }
+
+    /// Makes voids of the kept messages that `has_no_use`, newest first, and gives them back. spec: SESSION-6
+    pub(crate) fn void(&mut self, mut has_no_use: impl FnMut(&M) -> bool) -> Vec<M> {
+        let mut void = Vec::new();
+        for kept in self.kept.iter_mut().rev() {
+            if kept.message.as_ref().is_some_and(&mut has_no_use) {
+                void.extend(kept.message.take());
+                self.bytes -= std::mem::take(&mut kept.bytes);
+            }
+        }
+        void
+    }
+
+    /// The connection has ended.
+    pub(crate) const fn link_ended(&mut self) {
+        self.cursor = None;
+    }
+
+    /// The peer has said what it takes next.
+    pub(crate) fn heard(&mut self, ack: &Ack) -> Heard<M> {
+        let remembers = self.peer.is_none_or(|peer| peer == ack.memory) || self.end() == FIRST;
+        self.peer = Some(ack.memory);
+        // A peer that has not heard of this epoch yet has taken nothing of it.
+        let next = if ack.of == self.epoch { ack.next } else { FIRST };
+        if remembers && (self.base..=self.end()).contains(&next) {
+            return self.arrived(next);
+        }
+        if remembers && next < self.base && self.cursor.is_some() {
+            // Two threads said it, and the older word came last.
+            return Heard::Known;
+        }
+        self.reset()
+    }
+
+    /// The peer has everything before `next`. spec: SESSION-2, SESSION-3
+    fn arrived(&mut self, next: u64) -> Heard<M> {
+        while self.base < next {
+            let kept = self.kept.pop_front().expect("a number between base and end is kept");
+            self.bytes -= kept.bytes;
+            self.base += 1;
+        }
+        match self.cursor {
+            Some(cursor) => {
+                self.cursor = Some(cursor.max(next));
+                Heard::Known
+            }
+            None => {
+                self.cursor = Some(next);
+                Heard::Resumed
+            }
+        }
+    }
+
+    /// spec: SESSION-5
+    fn reset(&mut self) -> Heard<M> {
+        let lost = self.drain();
+        self.epoch += 1;
+        self.base = FIRST;
+        self.cursor = Some(FIRST);
+        Heard::Reset(lost)
+    }
+
+    /// Gives up all that is kept, oldest first.
+    pub(crate) fn drain(&mut self) -> Vec<M> {
+        self.bytes = 0;
+        self.kept.drain(..).filter_map(|kept| kept.message).collect()
+    }
+}

@@ -1,0 +1,323 @@
+//! Two nodes, connections that are cut at any byte's distance, and what came of the messages.
+
+use std::collections::VecDeque;
+
+use proptest::prelude::*;
+
+use super::*;
+
+const WINDOW: Window = Window { messages: 4, bytes: 1_000 };
+
+/// What is on a connection, in one direction.
+#[derive(Clone, Copy, Debug)]
+enum Frame {
+    Ack(Ack),
+    Message { number: u16, value: Option<u32> },
+}
+
+/// One of the two nodes.
+struct Side {
+    sending: Sending<u32>,
+    receiving: Receiving,
+    link: u64,
+    /// Waits for its first number.
+    queue: VecDeque<u32>,
+    /// Handed to the applications.
+    taken: Vec<u32>,
+    /// Reported to the sender: may have arrived or not.
+    lost: Vec<u32>,
+    void: Vec<u32>,
+    epochs: u64,
+}
+
+impl Side {
+    fn new() -> Self {
+        Self {
+            sending: Sending::new(1_000, WINDOW),
+            receiving: Receiving::new(1_000),
+            link: 0,
+            queue: VecDeque::new(),
+            taken: Vec::new(),
+            lost: Vec::new(),
+            void: Vec::new(),
+            epochs: 1_000,
+        }
+    }
+
+    fn say_ack(&mut self, out: &mut VecDeque<Frame>) {
+        out.push_back(Frame::Ack(self.receiving.ack(self.sending.epoch())));
+    }
+
+    fn attach(&mut self, link: u64, out: &mut VecDeque<Frame>) {
+        self.link = link;
+        self.sending.link_ended();
+        self.receiving.attach(link);
+        self.say_ack(out);
+    }
+
+    /// All that this side knows of the other is gone, as when a node counts as lost.
+    fn forget(&mut self) {
+        self.epochs += 1_000;
+        self.lost.extend(self.sending.drain());
+        self.lost.extend(self.queue.drain(..));
+        self.sending = Sending::new(self.epochs, WINDOW);
+        self.receiving = Receiving::new(self.epochs);
+    }
+
+    fn write(&mut self, out: &mut VecDeque<Frame>) {
+        if let Some((number, value)) = self.sending.again() {
+            return out.push_back(Frame::Message { number: number as u16, value: value.copied() });
+        }
+        if self.sending.has_room()
+            && let Some(value) = self.queue.pop_front()
+        {
+            let number = self.sending.keep(value, 100) as u16;
+            out.push_back(Frame::Message { number, value: Some(value) });
+        }
+    }
+
+    fn read(&mut self, link: u64, frame: Frame, out: &mut VecDeque<Frame>) {
+        match frame {
+            Frame::Ack(ack) => {
+                if !self.receiving.heard(link, ack.epoch) {
+                    return;
+                }
+                match self.sending.heard(&ack) {
+                    Heard::Known => {}
+                    Heard::Resumed => {
+                        // Every third value has lost its use while it was kept.
+                        let void = self.sending.void(|value| value % 3 == 0);
+                        self.void.extend(void);
+                    }
+                    Heard::Reset(lost) => {
+                        self.lost.extend(lost);
+                        self.say_ack(out);
+                    }
+                }
+            }
+            Frame::Message { number, value } => match self.receiving.arrive(link, number, 100) {
+                Arrival::Take { ack_is_due } => {
+                    self.taken.extend(value);
+                    if ack_is_due {
+                        self.say_ack(out);
+                    }
+                }
+                Arrival::Fenced => {}
+                Arrival::OutOfStep { expected } => panic!("{number} came, {expected} was to come"),
+            },
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Step {
+    Send(bool),
+    Write(bool),
+    Read(bool),
+    /// Told without being due, as the layer's clock does it.
+    Acknowledge(bool),
+    Cut,
+    Forget(bool),
+}
+
+fn any_step() -> impl Strategy<Value = Step> {
+    prop_oneof![
+        8 => any::<bool>().prop_map(Step::Send),
+        10 => any::<bool>().prop_map(Step::Write),
+        10 => any::<bool>().prop_map(Step::Read),
+        2 => any::<bool>().prop_map(Step::Acknowledge),
+        2 => Just(Step::Cut),
+        1 => any::<bool>().prop_map(Step::Forget),
+    ]
+}
+
+/// Both nodes, and what is on the wires between them.
+struct World {
+    sides: [Side; 2],
+    wires: [VecDeque<Frame>; 2],
+    link: u64,
+    sent: u32,
+    sent_by: [Vec<u32>; 2],
+}
+
+impl World {
+    fn new() -> Self {
+        let mut world = Self {
+            sides: [Side::new(), Side::new()],
+            wires: [VecDeque::new(), VecDeque::new()],
+            link: 0,
+            sent: 0,
+            sent_by: [Vec::new(), Vec::new()],
+        };
+        world.cut();
+        world
+    }
+
+    /// The connection ends, with what is on it, and the next one begins.
+    fn cut(&mut self) {
+        self.link += 1;
+        self.wires.iter_mut().for_each(VecDeque::clear);
+        for (side, wire) in self.sides.iter_mut().zip(&mut self.wires) {
+            side.attach(self.link, wire);
+        }
+    }
+
+    fn step(&mut self, step: Step) {
+        match step {
+            Step::Send(who) => {
+                self.sent += 1;
+                self.sides[usize::from(who)].queue.push_back(self.sent);
+                self.sent_by[usize::from(who)].push(self.sent);
+            }
+            Step::Write(who) => {
+                let who = usize::from(who);
+                self.sides[who].write(&mut self.wires[who]);
+            }
+            Step::Read(who) => {
+                let who = usize::from(who);
+                if let Some(frame) = self.wires[1 - who].pop_front() {
+                    self.sides[who].read(self.link, frame, &mut self.wires[who]);
+                }
+            }
+            Step::Acknowledge(who) => {
+                let who = usize::from(who);
+                self.sides[who].say_ack(&mut self.wires[who]);
+            }
+            Step::Cut => self.cut(),
+            Step::Forget(who) => {
+                self.sides[usize::from(who)].forget();
+                self.cut();
+            }
+        }
+    }
+
+    /// No more faults: everything is written and read.
+    fn settle(&mut self) {
+        for _ in 0..2_000 {
+            for who in [false, true] {
+                self.step(Step::Acknowledge(who));
+                self.step(Step::Write(who));
+                self.step(Step::Read(who));
+                self.step(Step::Read(who));
+            }
+        }
+        // Acknowledgements of every round are still on the wires, which is all that is.
+        let is_empty = |side: &Side| side.queue.is_empty() && side.sending.is_through();
+        assert!(self.sides.iter().all(is_empty), "everything goes out once nothing fails");
+    }
+
+    fn check(&self) {
+        for who in 0..2 {
+            let (sender, taken) = (&self.sides[who], &self.sides[1 - who].taken);
+            assert!(taken.is_sorted_by(|a, b| a < b), "in order and once: {taken:?}");
+            for value in &self.sent_by[who] {
+                let is_told = sender.lost.contains(value) || sender.void.contains(value);
+                assert!(taken.contains(value) || is_told, "{value} is lost in silence");
+            }
+            let is_void_and_taken = sender.void.iter().find(|value| taken.contains(value));
+            assert_eq!(is_void_and_taken, None, "what was said to be of no use has arrived");
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(2_000))]
+
+    #[test]
+    fn whatever_is_cut_and_forgotten_all_arrives_once_in_order_or_is_reported(
+        steps in proptest::collection::vec(any_step(), 1..200),
+    ) {
+        let mut world = World::new();
+        for step in steps {
+            world.step(step);
+        }
+        world.settle();
+        world.check();
+    }
+
+    #[test]
+    fn without_a_node_that_forgets_nothing_is_reported(
+        steps in proptest::collection::vec(any_step().prop_filter("no forgetting", |s| !matches!(s, Step::Forget(_))), 1..200),
+    ) {
+        let mut world = World::new();
+        for step in steps {
+            world.step(step);
+        }
+        world.settle();
+        world.check();
+        prop_assert!(world.sides.iter().all(|side| side.lost.is_empty()));
+    }
+}
+
+#[test]
+fn what_is_kept_is_bounded_and_an_ack_makes_room() {
+    let mut sending = Sending::new(7, WINDOW);
+    assert!(!sending.has_room(), "the peer has not said where to go on");
+    assert_eq!(sending.heard(&Ack { memory: 1, epoch: 1, of: 0, next: FIRST }), Heard::Resumed);
+    for value in 0..4u32 {
+        assert!(sending.has_room());
+        assert_eq!(sending.keep(value, 10), FIRST + u64::from(value));
+    }
+    assert!(!sending.has_room(), "four messages are the bound");
+    assert_eq!(sending.heard(&Ack { memory: 1, epoch: 1, of: 7, next: 3 }), Heard::Known);
+    assert!(sending.has_room());
+    sending.keep(4, 1_000);
+    assert!(!sending.has_room(), "a thousand bytes are the bound");
+}
+
+#[test]
+fn a_message_longer_than_the_window_goes_when_nothing_else_is_kept() {
+    let mut sending = Sending::new(7, WINDOW);
+    sending.heard(&Ack { memory: 1, epoch: 1, of: 0, next: FIRST });
+    sending.keep(1, 5_000);
+    sending.heard(&Ack { memory: 1, epoch: 1, of: 7, next: 2 });
+    assert!(sending.has_room());
+}
+
+#[test]
+fn what_was_not_written_gives_its_number_back() {
+    let mut sending = Sending::new(7, WINDOW);
+    sending.heard(&Ack { memory: 1, epoch: 1, of: 0, next: FIRST });
+    sending.keep(1, 10);
+    sending.take_back();
+    assert_eq!(sending.keep(2, 10), FIRST);
+    sending.link_ended();
+    assert_eq!(sending.heard(&Ack { memory: 1, epoch: 1, of: 7, next: FIRST }), Heard::Resumed);
+    assert_eq!(sending.again(), Some((FIRST, Some(&2))));
+    assert_eq!(sending.again(), None);
+}
+
+#[test]
+fn an_ack_beyond_what_was_sent_is_never_guessed_about() {
+    let mut sending = Sending::new(7, WINDOW);
+    sending.heard(&Ack { memory: 1, epoch: 1, of: 0, next: FIRST });
+    sending.keep(1, 10);
+    assert_eq!(sending.heard(&Ack { memory: 1, epoch: 1, of: 7, next: 9 }), Heard::Reset(vec![1]));
+    assert_eq!(sending.epoch(), 8);
+}
+
+#[test]
+fn a_former_connection_brings_nothing_in() {
+    let mut receiving = Receiving::new(1);
+    receiving.attach(1);
+    assert!(receiving.heard(1, 5));
+    assert!(matches!(receiving.arrive(1, 1, 10), Arrival::Take { .. }));
+    receiving.attach(2);
+    assert_eq!(receiving.arrive(1, 2, 10), Arrival::Fenced);
+    assert!(!receiving.heard(1, 6));
+    assert_eq!(receiving.arrive(2, 2, 10), Arrival::OutOfStep { expected: 2 }, "the epoch was not said");
+    assert!(receiving.heard(2, 5));
+    assert!(matches!(receiving.arrive(2, 2, 10), Arrival::Take { .. }));
+    assert_eq!(receiving.ack(9), Ack { memory: 1, epoch: 9, of: 5, next: 3 });
+}
+
+#[test]
+fn numbers_go_on_beyond_sixteen_bits() {
+    let mut receiving = Receiving::new(1);
+    receiving.attach(1);
+    receiving.heard(1, 5);
+    for number in 1..=70_000u32 {
+        assert!(matches!(receiving.arrive(1, number as u16, 1), Arrival::Take { .. }));
+    }
+    assert_eq!(receiving.ack(1).next, 70_001);
+}
