@@ -1,8 +1,8 @@
 //! GNCL, the Global Node Communication Layer: moves messages between nodes over TCP, in order.
 //!
-//! Its promise: a message to an application of another node goes out on the one connection to that node, in the order
-//! in which its class was submitted; a short break loses nothing that was not sent yet; and a confirmed message has
-//! exactly one outcome, whatever breaks. `docs/protocol/gncl.md` has every byte. The rules, cited in the code:
+//! Its promise: a message to an application of another node arrives once, in the order in which its class was submitted,
+//! through any number of connections and restarts of this layer; and a confirmed message has exactly one outcome,
+//! whatever breaks. `docs/protocol/gncl.md` has every byte. The rules, cited in the code:
 //!
 //! | rule | what it says |
 //! | --- | --- |
@@ -18,7 +18,7 @@
 //! | GNCL-10 | GOODBYE is the last frame of a node that leaves; it is not dialled again until it is found again. |
 //! | GNCL-11 | A frame's source must be on the peer's node and its destination on this one; times are turned into our clock. |
 //! | GNCL-12 | CONFIRM is answered by OUTCOME on the peer's present connection. |
-//! | GNCL-13 | When a connection ends, what was sent and not confirmed is `Unknown`; what was not sent waits until NodeLost. |
+//! | GNCL-13 | When a connection ends, nothing is lost (`session/`); when the node is, what was sent is `Unknown`, what waited `PeerLost`. |
 //!
 //! | file | what it is |
 //! | --- | --- |

@@ -28,6 +28,8 @@ use crate::{
 
 /// Bytes of frames for one peer that are kept unacknowledged, from which on further messages wait.
 const WINDOW_BYTES: usize = 4 << 20;
+/// Messages that are kept at most: half of what their numbers' 16 bits on the wire can tell apart.
+const WINDOW_MESSAGES_MAX: usize = 1 << 15;
 /// Frames of this layer itself that wait for a socket at most: more than a peer's ACKs, PINGs and PONGs ever are.
 const WORDS_MAX: usize = 32;
 
@@ -63,7 +65,8 @@ impl Peer {
             unconfirmed_max: config.gncl.queue_capacity,
             payload_max: config.payload_max,
         };
-        let window = Window { messages: config.gncl.queue_capacity, bytes: WINDOW_BYTES };
+        let messages = config.gncl.queue_capacity.min(WINDOW_MESSAGES_MAX);
+        let window = Window { messages, bytes: WINDOW_BYTES };
         let (memory, void) = (now.as_nanos(), frame(here, node, Kind::GNCL_VOID, Bytes::new()).header);
         let outlet = StreamOutlet::with_session(limits, Session::new(memory, window, void));
         let receiving = Mutex::new(Receiving::new(memory));

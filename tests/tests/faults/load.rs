@@ -21,7 +21,6 @@ fn forty_layer_panics_under_load_lose_nothing_within_a_node_and_tell_no_lie_betw
 }
 
 #[test]
-#[ignore = "needs a session between nodes that resumes (docs/decisions/0005): what is under way when GNCL dies is lost today"]
 fn forty_layer_panics_under_load_lose_nothing_between_nodes_either() {
     let plan =
         Plan { panics: 40, in_process: 5_000, between_nodes: 5_000, spacing: Duration::from_millis(15) };
