@@ -11,7 +11,7 @@
 //! | a node and its life | [`Node`], [`NodeBuilder`], [`config`] |
 //! | an application in the node's process | [`AppSpec`], [`AppContext`], [`Delivery`], [`payload!`] |
 //! | the same in a process of its own, started and restarted by the node | [`AppSpec::own_process`], [`Place::process`] |
-//! | an application in a process that the node did not start | [`NodeApi`], [`Endpoint`] |
+//! | an application in a process that the node did not start | [`NodeApi`], [`Endpoint`] for a thread, [`AsyncEndpoint`] for a task |
 //! | sending | [`Sender`]: `send`, `send_confirmed`, `ask`; [`Outcome`] |
 //! | events | [`NodeEvent`] (who is there), [`RequirementEvent`] (what is ready), [`Down`] (who ended, and why) |
 //!
@@ -50,7 +50,7 @@ mod wills;
 #[cfg(feature = "fault-points")]
 pub use sinew_runtime::supervision::fault;
 
-pub use api::{ApiError, Endpoint, LentMessage, NodeApi, Received, Registration, Transport};
+pub use api::{ApiError, AsyncEndpoint, Endpoint, LentMessage, NodeApi, Received, Registration, Transport};
 pub use config::{ConfigFaults, NodeConfig};
 pub use lncl::RegisterError;
 pub use ndl::{KnownNode, LossReason, NodeEvent, Source};

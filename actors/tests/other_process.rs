@@ -9,7 +9,7 @@ use std::{
     time::Duration,
 };
 
-use sinew::{ApiError, NodeApi, Registration, Transport, prelude::*};
+use sinew::{ApiError, AppAddress, NodeApi, Registration, Transport, prelude::*};
 
 const WATCHDOG: Duration = Duration::from_secs(20);
 const SOCKET: &str = "SINEW_TEST_SOCKET";
@@ -189,6 +189,70 @@ fn an_endpoint_at_rings_comes_back_to_a_node_that_was_killed_and_started_again()
 #[test]
 fn an_endpoint_at_a_socket_comes_back_to_a_node_that_was_killed_and_started_again() {
     comes_back_to_a_killed_node(Transport::Socket);
+}
+
+#[test]
+fn an_endpoint_of_a_task_comes_back_to_a_node_that_was_killed_and_started_again() {
+    for transport in [Transport::Ring, Transport::Socket] {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        runtime.block_on(a_task_comes_back(transport));
+    }
+}
+
+async fn a_task_comes_back(transport: Transport) {
+    // Given
+    let name = format!("sinew-task-returns-{transport:?}-{}", std::process::id());
+    let directory = Directory(std::env::temp_dir().join(name));
+    let socket = directory.0.join("knee.sock");
+    let mut node = start_process("lone_node", &socket);
+    let api = until("the node", || NodeApi::connect(&socket).ok());
+    let registration = Registration::new().name("drive").transport(transport);
+    let mut endpoint = api.register_transport_address_async(registration.clone()).await.unwrap();
+    endpoint.join("drives").await.unwrap();
+    let tid = endpoint.tid();
+    // When
+    node.kill().unwrap();
+    node.wait().unwrap();
+    // Then: who waits is told at once, and each send
+    let told =
+        tokio::time::timeout(WATCHDOG, endpoint.receive()).await.expect("word of the end").unwrap_err();
+    assert!(matches!(told, ApiError::Away(_)), "{told}");
+    let told = endpoint.send(tid, &Angle { degrees: 1.0 }).await.unwrap_err();
+    assert!(matches!(told, ApiError::Away(_)), "{told}");
+    // When: the node comes back while it waits
+    let mut node = start_process("lone_node", &socket);
+    // Its address is of another range: who comes first has the former dynamic one.
+    let fixed = Registration::new().fixed(AppAddress::fixed(9).unwrap());
+    let other = tokio::task::spawn_blocking(move || {
+        let mut other = until("the door", || api.register_transport_address(fixed.clone()).ok());
+        until("the name", || other.resolve("drive", WATCHDOG).unwrap());
+        // A group's members say so after they have registered: until one hears it.
+        move || other.send(Tid::group("drives"), &Angle { degrees: 2.0 }).unwrap()
+    });
+    let mut send = tokio::time::timeout(WATCHDOG, async {
+        tokio::select! {
+            other = other => other.unwrap(),
+            received = endpoint.receive() => panic!("{received:?} before anything was sent"),
+        }
+    })
+    .await
+    .expect("it comes back while it waits");
+    // Then: it is who it was, and where it was
+    let received = tokio::time::timeout(WATCHDOG, async {
+        loop {
+            send();
+            let soon = tokio::time::timeout(Duration::from_millis(20), endpoint.receive()).await;
+            if let Ok(received) = soon {
+                break received.unwrap();
+            }
+        }
+    })
+    .await
+    .expect("a message to the group");
+    assert_eq!(received.decode::<Angle>().unwrap().degrees, 2.0);
+    assert_eq!((endpoint.tid(), endpoint.registrations()), (tid, 2));
+    node.kill().unwrap();
+    node.wait().unwrap();
 }
 
 #[test]

@@ -12,10 +12,12 @@ use sinew_runtime::{
 use super::{
     ApiError, Received, Registration, Transport,
     direct::{Direct, Terms},
+    form::{Form, at_once},
     inbox::{Answer, Awaited, Inbox},
     incoming::WhenFull,
     lent::LentMessage,
-    link::{Ended, Greeting, Link, Reader, Writer},
+    link::{Ended, Link, Reader, Writer},
+    outgoing::Request,
     returning::Home,
 };
 use crate::lncl::payload::{self, Group, Registered, Resolve};
@@ -41,6 +43,7 @@ pub struct Endpoint {
     /// Why the connection has ended, once it has.
     pub(super) ended: Option<Ended>,
     pub(super) home: Home,
+    pub(super) form: Form,
 }
 
 impl std::fmt::Debug for Endpoint {
@@ -50,20 +53,21 @@ impl std::fmt::Debug for Endpoint {
 }
 impl Endpoint {
     pub(super) fn register(path: &Path, registration: Registration) -> Result<Self, ApiError> {
-        let Registration { mut register, deadline, inbox_capacity, link: options, returning } = registration;
-        let Some(link) = Greeting::begin(path, &register, options)?.wait(Time::now() + deadline)? else {
-            return Err(match register.requires {
-                requires if requires.is_empty() => ApiError::NoAnswer(deadline),
-                requires => ApiError::Waiting { requires, waited: deadline },
-            });
-        };
+        let link = registration.greet(path, registration.deadline, || true)?;
+        Ok(Self::new(path, registration, link, Form::Thread))
+    }
+
+    /// One that is registered.
+    pub(super) fn new(path: &Path, registration: Registration, link: Link, form: Form) -> Self {
+        let Registration { mut register, deadline: _, inbox_capacity, link: options, returning } =
+            registration;
         let Link { registered, writer, reader, node: node_process } = link;
         let terms = Terms::of(&registered, options);
         let Registered { node, app, node_name, payload_max, ring: _ } = registered;
         let control = reader.control().filter(|_| register.direct);
         let inbox = Inbox::new(inbox_capacity, writer.clone());
         register.former = Some(app);
-        Ok(Self {
+        Self {
             tid: Tid::new(node, app),
             node_name,
             payload_max: payload_max as usize,
@@ -75,7 +79,8 @@ impl Endpoint {
             correlation: 0,
             ended: None,
             home: Home::new(path.to_owned(), register, options, returning, node_process),
-        })
+            form,
+        }
     }
 
     /// The address that was registered.
@@ -123,7 +128,7 @@ impl Endpoint {
     /// # Errors
     /// It was not sent, and its memory is given back. [`ApiError::Lent`]: another one lies in the ring.
     pub fn send_message(&mut self, message: LentMessage) -> Result<(), ApiError> {
-        self.dispatch(message).map(drop)
+        at_once(self.dispatch(message.into())).map(drop)
     }
 
     /// Sends a value, in the class of its type. Returns when the socket to the node has taken it.
@@ -131,7 +136,7 @@ impl Endpoint {
     /// # Errors
     /// It was not sent.
     pub fn send<P: Payload>(&mut self, destination: Tid, value: &P) -> Result<(), ApiError> {
-        self.dispatch(Message::typed(self.tid, destination, value)).map(drop)
+        at_once(self.dispatch(Message::typed(self.tid, destination, value).into())).map(drop)
     }
 
     /// Sends a value and waits for what becomes of it: [`Outcome::Unknown`] when nobody has said so `within` this
@@ -146,7 +151,7 @@ impl Endpoint {
         value: &P,
         within: Duration,
     ) -> Result<Outcome, ApiError> {
-        self.confirm(Message::typed(self.tid, destination, value), within)
+        at_once(self.confirm(Message::typed(self.tid, destination, value).into(), within))
     }
 
     /// Sends a request and waits for the reply.
@@ -159,7 +164,8 @@ impl Endpoint {
         request: &P,
         within: Duration,
     ) -> Result<R, ApiError> {
-        Ok(self.await_reply(Message::typed(self.tid, destination, request), within)?.decode()?)
+        Ok(at_once(self.await_reply(Message::typed(self.tid, destination, request).into(), within))?
+            .decode()?)
     }
 
     /// Answers a request.
@@ -167,7 +173,8 @@ impl Endpoint {
     /// # Errors
     /// The message asks for no reply, or the reply was not sent.
     pub fn reply<R: Payload>(&mut self, request: &Received, value: &R) -> Result<(), ApiError> {
-        self.answer(request, Message::typed(self.tid, request.source(), value))
+        let message = Message::typed(self.tid, request.source(), value);
+        at_once(self.answer(Request::of(request)?, message.into()))
     }
 
     /// Waits for a message, at most `within` this time; `None` if none came (the paper's ReceiveMessage). Control
@@ -179,7 +186,10 @@ impl Endpoint {
     /// # Errors
     /// The connection has ended, and everything that came before was received.
     pub fn receive(&mut self, within: Duration) -> Result<Option<Received>, ApiError> {
-        let deadline = Time::now() + within;
+        at_once(self.receive_until(Time::now() + within))
+    }
+
+    pub(super) async fn receive_until(&mut self, deadline: Time) -> Result<Option<Received>, ApiError> {
         loop {
             // The socket first: what came just now may be more urgent or newer than what waits.
             self.take_in(None, WhenFull::Leave)?;
@@ -191,14 +201,14 @@ impl Endpoint {
                 if Time::now() >= deadline {
                     return Ok(None);
                 }
-                self.await_return(deadline);
+                self.await_return(deadline).await;
                 continue;
             }
             // The clock is asked by us: a flood keeps the link readable for ever.
             if Time::now() >= deadline {
                 return Ok(None);
             }
-            self.wait(deadline);
+            self.wait(deadline).await;
         }
     }
 
@@ -214,7 +224,7 @@ impl Endpoint {
     /// # Errors
     /// It is a member of 256 groups already, or the node did not answer.
     pub fn join(&mut self, name: &str) -> Result<(), ApiError> {
-        self.set_member(AppAddress::group(name), true)
+        at_once(self.set_member(AppAddress::group(name), true))
     }
 
     /// Leaves the group called `name`.
@@ -222,7 +232,7 @@ impl Endpoint {
     /// # Errors
     /// The node did not answer.
     pub fn leave(&mut self, name: &str) -> Result<(), ApiError> {
-        self.set_member(AppAddress::group(name), false)
+        at_once(self.set_member(AppAddress::group(name), false))
     }
 
     /// The TID that has `name` now, on any node; `None` if nobody has it.
@@ -230,9 +240,13 @@ impl Endpoint {
     /// # Errors
     /// The node did not answer `within` this time.
     pub fn resolve(&mut self, name: &str, within: Duration) -> Result<Option<Tid>, ApiError> {
-        let asked = Resolve { name: name.to_owned() };
+        at_once(self.look_up(name.to_owned(), within))
+    }
+
+    pub(super) async fn look_up(&mut self, name: String, within: Duration) -> Result<Option<Tid>, ApiError> {
+        let asked = Resolve { name };
         let message = payload::frame(Kind::LNCL_RESOLVE, self.tid, LNCL, &asked);
-        match self.request(message, Awaited::Resolved, Flags::NONE, within)? {
+        match self.request(message.into(), Awaited::Resolved, Flags::NONE, within).await? {
             Some(Answer::Resolved(tid)) => Ok(tid),
             Some(Answer::Outcome(_) | Answer::Reply(_)) | None => Err(ApiError::NoAnswer(within)),
         }
@@ -243,13 +257,17 @@ impl Endpoint {
     /// # Errors
     /// The node did not answer. The address is given back in any case.
     pub fn unregister(mut self) -> Result<(), ApiError> {
+        at_once(self.take_leave())
+    }
+
+    pub(super) async fn take_leave(&mut self) -> Result<(), ApiError> {
         self.inbox.close();
         if self.ended.is_some() {
             // The connection has taken the address with it.
             return Ok(());
         }
         let goodbye = Message::new(Header::new(Kind::LNCL_UNREGISTER, self.tid, LNCL), bytes::Bytes::new());
-        self.writer.write(&goodbye)?;
+        self.write(goodbye.into()).await?;
         let deadline = Time::now() + PROMPT;
         while self.ended.is_none() {
             self.take_in(None, WhenFull::Refuse)?;
@@ -260,14 +278,14 @@ impl Endpoint {
             if Time::now() >= deadline {
                 return Err(ApiError::NoAnswer(PROMPT));
             }
-            self.wait(deadline);
+            self.wait(deadline).await;
         }
         Ok(())
     }
 
-    fn set_member(&mut self, group: AppAddress, member: bool) -> Result<(), ApiError> {
+    pub(super) async fn set_member(&mut self, group: AppAddress, member: bool) -> Result<(), ApiError> {
         let message = payload::frame(Kind::LNCL_GROUP, self.tid, LNCL, &Group { group, member });
-        match self.request(message, Awaited::Outcome, Flags::CONFIRM, PROMPT)? {
+        match self.request(message.into(), Awaited::Outcome, Flags::CONFIRM, PROMPT).await? {
             Some(Answer::Outcome(Outcome::Delivered)) => {
                 if member {
                     self.home.groups.insert(group);

@@ -9,6 +9,7 @@ use sinew_runtime::{
 use super::{
     ApiError, Endpoint,
     direct::{Came, Everything, ToNode},
+    form::Form,
     inbox::{Answer, Awaited, Sorted},
     link::{Read, Reader},
 };
@@ -51,7 +52,7 @@ impl Endpoint {
         wanted: Option<Wanted>,
         when_full: WhenFull,
     ) -> Result<Option<Answer>, ApiError> {
-        self.writer.pay();
+        self.pay();
         for read in 0.. {
             if let Some(answer) = self.sort_in(wanted, when_full)? {
                 return Ok(Some(answer));
@@ -134,8 +135,23 @@ impl Endpoint {
         None
     }
 
+    /// Writes what waits for room, as far as there is room.
+    fn pay(&mut self) {
+        if let Form::Reactor(reactor) = &mut self.form {
+            reactor.go_on();
+        }
+        self.writer.pay();
+    }
+
     /// Waits until something comes, from the node or from a link, or until there is something to do.
-    pub(super) fn wait(&mut self, deadline: Time) {
+    pub(super) async fn wait(&mut self, deadline: Time) {
+        match &mut self.form {
+            Form::Thread => self.block(deadline),
+            Form::Reactor(reactor) => reactor.wait(&mut self.reader, &self.writer, deadline).await,
+        }
+    }
+
+    fn block(&mut self, deadline: Time) {
         let deadline = self.direct.wake_by(deadline);
         match &mut self.reader {
             Reader::Ring(reader) if !self.direct.open.is_empty() => {

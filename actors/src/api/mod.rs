@@ -2,7 +2,8 @@
 //!
 //! A program connects to the node on its host through the node's unix socket, registers one or more transport
 //! addresses, and sends and receives on them from plain threads; it needs no async runtime. Each [`Endpoint`] is one
-//! address with one connection, and belongs to one thread at a time.
+//! address with one connection, and belongs to one thread at a time. A task of tokio has the same as [`AsyncEndpoint`], a
+//! program in C or C++ through `bindings/c`: three forms, one semantics.
 //!
 //! | the paper's name | here |
 //! | --- | --- |
@@ -36,15 +37,18 @@
 //!
 //! The protocol underneath is `docs/protocol/lncl.md`; it can be spoken from any language.
 
+mod async_endpoint;
 mod direct;
 mod endpoint;
 mod error;
+mod form;
 mod inbox;
 mod incoming;
 mod lent;
 mod link;
 mod outgoing;
 mod raw;
+mod reactor;
 mod received;
 mod returning;
 mod routes;
@@ -58,17 +62,22 @@ use std::{
 
 use sinew_runtime::{
     tid::AppAddress,
+    time::Time,
     wire::{Kind, Payload},
 };
-use sinew_shm::Spin;
+use sinew_shm::{BellKind, Spin};
 
+pub use async_endpoint::AsyncEndpoint;
 pub use endpoint::Endpoint;
 pub use error::ApiError;
 pub use lent::LentMessage;
 pub use link::Transport;
 pub use received::Received;
 
-use self::{link::LinkOptions, returning::Returning};
+use self::{
+    link::{Greeting, Link, LinkOptions},
+    returning::Returning,
+};
 use crate::lncl::payload::Register;
 
 /// The way to the node of this host, at the path of its socket.
@@ -98,6 +107,17 @@ impl NodeApi {
     pub fn register_transport_address(&self, registration: Registration) -> Result<Endpoint, ApiError> {
         Endpoint::register(&self.path, registration)
     }
+
+    /// The same for a task of tokio, which is not blocked meanwhile. Dropped, it gives up within a tenth of a second.
+    ///
+    /// # Errors
+    /// As [`register_transport_address`](Self::register_transport_address).
+    pub async fn register_transport_address_async(
+        &self,
+        registration: Registration,
+    ) -> Result<AsyncEndpoint, ApiError> {
+        AsyncEndpoint::register(&self.path, registration).await
+    }
 }
 
 /// What an application asks for when it registers.
@@ -120,6 +140,7 @@ impl Default for Registration {
                 transport: Transport::Ring,
                 spin: Spin::Off,
                 patience: Duration::from_secs(1),
+                bell: BellKind::Futex,
             },
             returning: Returning::Always,
         }
@@ -227,6 +248,25 @@ impl Registration {
     pub const fn spin(mut self, spin: Spin) -> Self {
         self.link.spin = spin;
         self
+    }
+
+    /// Registers, and blocks meanwhile. Each `look` it is looked whether that is still wanted.
+    fn greet(&self, path: &Path, look: Duration, is_wanted: impl Fn() -> bool) -> Result<Link, ApiError> {
+        let deadline = Time::now() + self.deadline;
+        let mut greeting = Greeting::begin(path, &self.register, self.link)?;
+        while is_wanted() {
+            if let Some(link) = greeting.wait(deadline.min(Time::now() + look))? {
+                return Ok(link);
+            }
+            if Time::now() >= deadline {
+                break;
+            }
+        }
+        Err(if self.register.requires.is_empty() {
+            ApiError::NoAnswer(self.deadline)
+        } else {
+            ApiError::Waiting { requires: self.register.requires.clone(), waited: self.deadline }
+        })
     }
 
     fn subscribe_kind(mut self, kind: Kind) -> Self {

@@ -12,6 +12,7 @@ use sinew_runtime::{
 use super::{
     ApiError, Endpoint, Received,
     direct::{Sent, ToNode},
+    form::Form,
     inbox::{Answer, Awaited},
     incoming::{Wanted, WhenFull},
     lent::{Draft, LentMessage},
@@ -26,33 +27,31 @@ const ROOM_PAUSE: Duration = Duration::from_millis(1);
 
 impl Endpoint {
     /// Sends `message` and waits for its outcome.
-    pub(super) fn confirm(
+    pub(super) async fn confirm(
         &mut self,
-        message: impl Into<Draft>,
+        mut message: Draft,
         within: Duration,
     ) -> Result<Outcome, ApiError> {
-        let mut message = message.into();
         if message.header.class == Class::Stream {
             // Of a Stream the newest wins, so an older one has no outcome of its own.
             return Ok(Outcome::Rejected(Rejection::Unsupported));
         }
         message.header.time_to_live_us = in_micros(within);
-        match self.request(message, Awaited::Outcome, Flags::CONFIRM, within)? {
+        match self.request(message, Awaited::Outcome, Flags::CONFIRM, within).await? {
             Some(Answer::Outcome(outcome)) => Ok(outcome),
             Some(Answer::Reply(_) | Answer::Resolved(_)) | None => Ok(Outcome::Unknown),
         }
     }
 
     /// Sends `message` as a request and waits for the reply.
-    pub(super) fn await_reply(
+    pub(super) async fn await_reply(
         &mut self,
-        message: impl Into<Draft>,
+        mut message: Draft,
         within: Duration,
     ) -> Result<Message, ApiError> {
-        let mut message = message.into();
         message.header.class = Class::Control;
         message.header.time_to_live_us = in_micros(within);
-        match self.request(message, Awaited::Reply, Flags::CONFIRM.with(Flags::ASK), within)? {
+        match self.request(message, Awaited::Reply, Flags::CONFIRM.with(Flags::ASK), within).await? {
             Some(Answer::Reply(reply)) => Ok(reply),
             Some(Answer::Outcome(outcome)) => Err(ApiError::Ended(outcome)),
             Some(Answer::Resolved(_)) | None => Err(ApiError::NoReply(within)),
@@ -60,34 +59,29 @@ impl Endpoint {
     }
 
     /// Sends `message` as the reply to `request`.
-    pub(super) fn answer(&mut self, request: &Received, message: impl Into<Draft>) -> Result<(), ApiError> {
-        if !request.wants_reply() {
-            return Err(ApiError::NotAsked);
-        }
-        let mut message = message.into();
-        message.header.destination = request.source();
+    pub(super) async fn answer(&mut self, request: Request, mut message: Draft) -> Result<(), ApiError> {
+        message.header.destination = request.source;
         message.header.class = Class::Control;
         message.header.flags = Flags::REPLY;
-        message.header.correlation = request.correlation();
-        self.dispatch(message).map(drop)
+        message.header.correlation = request.correlation;
+        self.dispatch(message).await.map(drop)
     }
 
     /// Sends `message` and waits for its answer; `None` at the deadline.
-    pub(super) fn request(
+    pub(super) async fn request(
         &mut self,
-        message: impl Into<Draft>,
+        mut message: Draft,
         awaited: Awaited,
         flags: Flags,
         within: Duration,
     ) -> Result<Option<Answer>, ApiError> {
-        let mut message = message.into();
         self.correlation += 1;
         message.header.correlation = self.correlation;
         message.header.flags = message.header.flags.with(flags);
         let of = self.absolute(message.header.destination);
         let wanted = Wanted { number: self.correlation, what: awaited, of };
         let deadline = Time::now() + within;
-        let way = self.dispatch(message)?;
+        let way = self.dispatch(message).await?;
         loop {
             if let Some(answer) = self.take_in(Some(wanted), WhenFull::Refuse)? {
                 return Ok(Some(answer));
@@ -104,7 +98,7 @@ impl Endpoint {
             if Time::now() >= deadline {
                 return Ok(None);
             }
-            self.wait(deadline);
+            self.wait(deadline).await;
         }
     }
 
@@ -122,8 +116,7 @@ impl Endpoint {
     }
 
     /// Sends `message` the way that is right now; the link, if it did not go through the node.
-    pub(super) fn dispatch(&mut self, message: impl Into<Draft>) -> Result<Option<LinkNumber>, ApiError> {
-        let mut draft = message.into();
+    pub(super) async fn dispatch(&mut self, mut draft: Draft) -> Result<Option<LinkNumber>, ApiError> {
         self.try_return();
         self.check_length(draft.payload.len())?;
         // A new connection may have another address.
@@ -144,7 +137,15 @@ impl Endpoint {
         if self.reader.has_ended(now) {
             return Err(self.explain(ApiError::Closed("the node has gone".to_owned())));
         }
-        self.writer.send(draft).map(|()| None).map_err(|error| self.explain(error))
+        self.write(draft).await.map(|()| None).map_err(|error| self.explain(error))
+    }
+
+    /// Writes to the node; waits for room as long as the endpoint's patience lasts.
+    pub(super) async fn write(&mut self, draft: Draft) -> Result<(), ApiError> {
+        match &mut self.form {
+            Form::Thread => self.writer.send(draft),
+            Form::Reactor(reactor) => reactor.send(&self.writer, draft, self.home.options.patience).await,
+        }
     }
 
     /// The link on which a message to `destination` goes now; `None` for the way through the node.
@@ -225,6 +226,23 @@ impl Endpoint {
             return Err(ApiError::TooLong { length, limit: self.payload_max });
         }
         Ok(())
+    }
+}
+
+/// Who has asked, and for what.
+#[derive(Clone, Copy)]
+pub(super) struct Request {
+    pub(super) source: Tid,
+    correlation: u64,
+}
+
+impl Request {
+    /// What `received` asks for.
+    pub(super) fn of(received: &Received) -> Result<Self, ApiError> {
+        if !received.wants_reply() {
+            return Err(ApiError::NotAsked);
+        }
+        Ok(Self { source: received.source(), correlation: received.correlation() })
     }
 }
 

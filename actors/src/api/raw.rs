@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use sinew_runtime::outcome::Outcome;
 
-use super::{ApiError, Endpoint, LentMessage, Received};
+use super::{ApiError, Endpoint, LentMessage, Received, form::at_once, outgoing::Request};
 
 impl Endpoint {
     /// As [`send_confirmed`](Self::send_confirmed), for memory that [`create_message`](Self::create_message) lent.
@@ -16,7 +16,7 @@ impl Endpoint {
         message: LentMessage,
         within: Duration,
     ) -> Result<Outcome, ApiError> {
-        self.confirm(message, within)
+        at_once(self.confirm(message.into(), within))
     }
 
     /// As [`ask`](Self::ask), for memory that [`create_message`](Self::create_message) lent; it travels as Control.
@@ -24,7 +24,7 @@ impl Endpoint {
     /// # Errors
     /// It was not sent or not handled, or no reply came `within` this time.
     pub fn ask_message(&mut self, message: LentMessage, within: Duration) -> Result<Received, ApiError> {
-        self.await_reply(message, within).map(Received::new)
+        at_once(self.await_reply(message.into(), within)).map(Received::new)
     }
 
     /// As [`reply`](Self::reply), for memory that [`create_message`](Self::create_message) lent. It goes to who asked,
@@ -33,6 +33,6 @@ impl Endpoint {
     /// # Errors
     /// The message asks for no reply, or the reply was not sent.
     pub fn reply_message(&mut self, request: &Received, message: LentMessage) -> Result<(), ApiError> {
-        self.answer(request, message)
+        at_once(self.answer(Request::of(request)?, message.into()))
     }
 }

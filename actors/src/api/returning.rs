@@ -16,12 +16,16 @@ use super::{
     ApiError, Endpoint,
     direct::{Direct, Terms},
     endpoint::LNCL,
+    form::Form,
     link::{Ended, Greeting, Link, LinkOptions},
 };
 use crate::lncl::payload::{self, Group, Register};
 
 /// First and longest pause between two tries.
 const PAUSE: (Duration, Duration) = (Duration::from_millis(10), Duration::from_secs(1));
+
+/// How often who registers on another thread looks whether that is still wanted.
+pub(super) const LOOK: Duration = Duration::from_millis(100);
 
 /// Whether an endpoint registers again when its connection has ended through no fault of its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -109,6 +113,28 @@ impl Home {
     }
 }
 
+impl Home {
+    /// The same way, begun anew.
+    pub(super) fn another(&self) -> Self {
+        Self::new(self.path.clone(), self.register.clone(), self.options, self.returning, self.node)
+    }
+}
+
+/// Tries until it is registered, or is not wanted any more, which is looked at between two tries. Blocks.
+pub(super) fn come_home(mut home: Home, is_wanted: impl Fn() -> bool) -> Option<Link> {
+    while is_wanted() {
+        let until = Time::now() + LOOK;
+        if let Some(link) = home.knock(until) {
+            return Some(link);
+        }
+        let way = home.way();
+        if way.greeting.is_none() {
+            thread::sleep(way.next.min(until).since(Time::now()));
+        }
+    }
+    None
+}
+
 impl Endpoint {
     /// The error of a call that finds the connection ended.
     pub(super) fn gone(&self, ended: &Ended) -> ApiError {
@@ -140,7 +166,10 @@ impl Endpoint {
     pub(super) fn try_return(&mut self) {
         if let Some(ended) = &self.ended
             && self.returns(ended)
-            && let Some(link) = self.home.knock(Time::now())
+            && let Some(link) = match &mut self.form {
+                Form::Thread => self.home.knock(Time::now()),
+                Form::Reactor(reactor) => reactor.look_home(&self.home),
+            }
         {
             self.arrive(link);
         }
@@ -155,7 +184,13 @@ impl Endpoint {
     }
 
     /// Comes back, or waits until the next try, until something comes on a direct link, or until `deadline`.
-    pub(super) fn await_return(&mut self, deadline: Time) {
+    pub(super) async fn await_return(&mut self, deadline: Time) {
+        if let Form::Reactor(reactor) = &mut self.form {
+            if let Some(link) = reactor.await_home(&self.home, deadline).await {
+                self.arrive(link);
+            }
+            return;
+        }
         let has_links = !self.direct.open.is_empty();
         let now = Time::now();
         if let Some(link) = self.home.knock(if has_links { now } else { deadline }) {
@@ -192,6 +227,12 @@ impl Endpoint {
         (self.writer, self.reader) = (writer, reader);
         (self.ended, self.home.way) = (None, None);
         self.home.registrations += 1;
+        if let Form::Reactor(reactor) = &mut self.form
+            && let Err(why) = reactor.change(&self.reader, &self.writer)
+        {
+            self.writer.close();
+            return self.end(Ended { why: why.to_string(), again: true });
+        }
         for group in &self.home.groups {
             let membership = Group { group: *group, member: true };
             let message: Message = payload::frame(Kind::LNCL_GROUP, self.tid, LNCL, &membership);

@@ -1,4 +1,6 @@
-//! NodeAPI against a real LNCL: what a program in a process of its own sees.
+//! NodeAPI against a real LNCL: what a program in a process of its own sees, in every form.
+
+mod forms;
 
 use std::{thread, time::Duration};
 
@@ -10,11 +12,13 @@ use sinew_runtime::{
     wire::{Class, Flags, Kind, Message, Payload},
 };
 
-use super::{ApiError, Endpoint, NodeApi, Registration, Transport};
+use super::{ApiError, NodeApi, Registration, Transport};
 use crate::lncl::{
     AppFact,
     testing::{TestDirectory, TestNode, WATCHDOG},
 };
+
+use forms::{Api, Client, Under};
 
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Torque {
@@ -44,14 +48,21 @@ impl Payload for Setpoint {
 
 pub(super) const TORQUE: Torque = Torque { newton_metres: 2.5 };
 
-/// Every claim of NodeAPI holds whatever carries the messages.
+/// Every claim of NodeAPI holds whatever carries the messages, and whoever waits.
 macro_rules! on_every_transport {
     ($($claim:ident)*) => {
-        mod ring {
-            $(#[test] fn $claim() { super::$claim(super::Transport::Ring) })*
-        }
-        mod socket {
-            $(#[test] fn $claim() { super::$claim(super::Transport::Socket) })*
+        on_every_transport!(ring Ring Thread, $($claim)*);
+        on_every_transport!(socket Socket Thread, $($claim)*);
+        on_every_transport!(async_ring Ring Task, $($claim)*);
+        on_every_transport!(async_socket Socket Task, $($claim)*);
+    };
+    ($module:ident $transport:ident $form:ident, $($claim:ident)*) => {
+        mod $module {
+            use super::{Transport, forms::{Form, Under}};
+
+            const UNDER: Under = Under { transport: Transport::$transport, form: Form::$form };
+
+            $(#[test] fn $claim() { super::$claim(UNDER) })*
         }
     };
 }
@@ -78,38 +89,36 @@ on_every_transport! {
     every_thread_may_have_an_address_of_its_own
 }
 
-fn on(transport: Transport) -> Registration {
-    Registration::new().transport(transport)
+fn on(under: Under) -> Registration {
+    Registration::new().transport(under.transport)
 }
 
-fn register(node: &TestNode, registration: Registration) -> Endpoint {
-    let api = NodeApi::connect(node.path()).unwrap();
-    api.register_transport_address(registration).unwrap()
+fn register(under: Under, node: &TestNode, registration: Registration) -> Client {
+    Api::connect(under, node).register(registration).unwrap()
 }
 
-fn refusal(node: &TestNode, registration: Registration) -> String {
-    let api = NodeApi::connect(node.path()).unwrap();
-    match api.register_transport_address(registration) {
+fn refusal(under: Under, node: &TestNode, registration: Registration) -> String {
+    match Api::connect(under, node).register(registration) {
         Err(ApiError::Refused(sentence)) => sentence,
         other => panic!("{other:?} instead of a refusal"),
     }
 }
 
-fn addresses_are_fixed_or_dynamic_and_names_have_one_holder(transport: Transport) {
+fn addresses_are_fixed_or_dynamic_and_names_have_one_holder(under: Under) {
     let node = TestNode::start();
     let fixed = AppAddress::fixed(7).unwrap();
-    let first = register(&node, on(transport).name("knee").fixed(fixed));
-    assert_eq!(first.transport(), transport);
+    let first = register(under, &node, on(under).name("knee").fixed(fixed));
+    assert_eq!(first.transport(), under.transport);
     assert_eq!(first.tid(), Tid::new(node.address(), fixed));
     assert_eq!((first.node_name(), first.payload_max()), ("test", 1 << 20));
-    let second = register(&node, on(transport));
+    let second = register(under, &node, on(under));
     assert!(second.tid().app.is_dynamic());
     let pid = std::process::id();
-    let why = refusal(&node, on(transport).name("knee"));
+    let why = refusal(under, &node, on(under).name("knee"));
     assert!(why.contains(&format!("'knee' is taken by application {fixed} of process {pid}")), "{why}");
-    let why = refusal(&node, on(transport).fixed(fixed));
+    let why = refusal(under, &node, on(under).fixed(fixed));
     assert!(why.contains("is taken by 'knee'"), "{why}");
-    let why = refusal(&node, on(transport).fixed(AppAddress::NDL));
+    let why = refusal(under, &node, on(under).fixed(AppAddress::NDL));
     assert!(why.contains("fixed addresses are"), "{why}");
 }
 
@@ -120,10 +129,10 @@ fn without_a_node_the_error_says_where_it_was_looked_for() {
     assert!(error.to_string().contains("nobody.sock"), "{error}");
 }
 
-fn messages_go_to_and_fro_between_processes(transport: Transport) {
+fn messages_go_to_and_fro_between_processes(under: Under) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, on(transport));
+    let mut endpoint = register(under, &node, on(under));
     endpoint.send(app.tid, &TORQUE).unwrap();
     let message = app.next();
     assert_eq!((message.header.source, message.header.sequence), (endpoint.tid(), 1));
@@ -136,10 +145,10 @@ fn messages_go_to_and_fro_between_processes(transport: Transport) {
     assert!(endpoint.receive(Duration::ZERO).unwrap().is_none());
 }
 
-fn raw_memory_is_lent_filled_and_sent(transport: Transport) {
+fn raw_memory_is_lent_filled_and_sent(under: Under) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, on(transport));
+    let mut endpoint = register(under, &node, on(under));
     let kind = Kind::named("test.raw");
     let mut buffer = endpoint.create_message(app.tid, kind, 100_000).unwrap();
     buffer[99_999] = 7;
@@ -150,10 +159,10 @@ fn raw_memory_is_lent_filled_and_sent(transport: Transport) {
     assert!(matches!(too_long, Err(ApiError::TooLong { .. })));
 }
 
-fn raw_memory_is_confirmed_asked_with_and_replied_with(transport: Transport) {
+fn raw_memory_is_confirmed_asked_with_and_replied_with(under: Under) {
     let node = TestNode::start();
-    let mut asking = register(&node, on(transport).handles_named("test.raw"));
-    let mut replying = register(&node, on(transport));
+    let mut asking = register(under, &node, on(under).handles_named("test.raw"));
+    let mut replying = register(under, &node, on(under));
     let (to, kind) = (replying.tid(), Kind::named("test.raw"));
     let thread = thread::spawn(move || {
         replying
@@ -176,10 +185,10 @@ fn raw_memory_is_confirmed_asked_with_and_replied_with(transport: Transport) {
     thread.join().unwrap();
 }
 
-fn a_confirmed_message_ends_in_what_its_receiver_says(transport: Transport) {
+fn a_confirmed_message_ends_in_what_its_receiver_says(under: Under) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, on(transport));
+    let mut endpoint = register(under, &node, on(under));
     for said in [Outcome::Delivered, Outcome::Rejected(Rejection::ByHandler), Outcome::Failed] {
         let told = thread::scope(|scope| {
             scope.spawn(|| app.next().settle(said));
@@ -194,10 +203,10 @@ fn a_confirmed_message_ends_in_what_its_receiver_says(transport: Transport) {
     assert_eq!(told, Outcome::Rejected(Rejection::Unsupported), "of a Stream the newest wins");
 }
 
-fn an_outcome_that_nobody_says_is_unknown_at_the_deadline(transport: Transport) {
+fn an_outcome_that_nobody_says_is_unknown_at_the_deadline(under: Under) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, on(transport));
+    let mut endpoint = register(under, &node, on(under));
     let told = endpoint.send_confirmed(app.tid, &TORQUE, Duration::from_millis(1)).unwrap();
     assert_eq!(told, Outcome::Unknown);
     // The late outcome of the first is not taken for the second's.
@@ -209,10 +218,10 @@ fn an_outcome_that_nobody_says_is_unknown_at_the_deadline(transport: Transport) 
     assert_eq!(told, Outcome::Failed);
 }
 
-fn messages_that_come_while_an_outcome_is_awaited_are_received_afterwards(transport: Transport) {
+fn messages_that_come_while_an_outcome_is_awaited_are_received_afterwards(under: Under) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, on(transport));
+    let mut endpoint = register(under, &node, on(under));
     let tid = endpoint.tid();
     thread::scope(|scope| {
         scope.spawn(|| {
@@ -225,10 +234,10 @@ fn messages_that_come_while_an_outcome_is_awaited_are_received_afterwards(transp
     assert!(endpoint.receive(Duration::ZERO).unwrap().is_some());
 }
 
-fn two_endpoints_of_one_process_ask_and_reply(transport: Transport) {
+fn two_endpoints_of_one_process_ask_and_reply(under: Under) {
     let node = TestNode::start();
-    let mut asking = register(&node, on(transport));
-    let mut replying = register(&node, on(transport));
+    let mut asking = register(under, &node, on(under));
+    let mut replying = register(under, &node, on(under));
     let to = replying.tid();
     let thread = thread::spawn(move || {
         let request = replying.receive(WATCHDOG).unwrap().expect("a request");
@@ -241,27 +250,27 @@ fn two_endpoints_of_one_process_ask_and_reply(transport: Transport) {
     thread.join().unwrap();
 }
 
-fn a_request_that_cannot_be_handled_ends_at_once(transport: Transport) {
+fn a_request_that_cannot_be_handled_ends_at_once(under: Under) {
     let node = TestNode::start();
-    let mut endpoint = register(&node, on(transport));
+    let mut endpoint = register(under, &node, on(under));
     let nobody = Tid::new(node.address(), AppAddress::new(0x7777));
     let error = endpoint.ask::<_, Doubled>(nobody, &TORQUE, WATCHDOG).unwrap_err();
     assert!(matches!(error, ApiError::Ended(Outcome::Rejected(Rejection::NoSuchApplication))), "{error}");
 }
 
-fn what_asks_for_no_reply_gets_none(transport: Transport) {
+fn what_asks_for_no_reply_gets_none(under: Under) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, on(transport));
+    let mut endpoint = register(under, &node, on(under));
     node.stores.router.send(Message::typed(app.tid, endpoint.tid(), &TORQUE)).unwrap();
     let received = endpoint.receive(WATCHDOG).unwrap().expect("a message");
     assert!(matches!(endpoint.reply(&received, &TORQUE), Err(ApiError::NotAsked)));
 }
 
-fn a_received_message_counts_as_handled_when_it_is_dropped(transport: Transport) {
+fn a_received_message_counts_as_handled_when_it_is_dropped(under: Under) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, on(transport));
+    let mut endpoint = register(under, &node, on(under));
     let tid = endpoint.tid();
     let outcome = node.send_confirmed(app.tid, tid, &TORQUE);
     drop(endpoint.receive(WATCHDOG).unwrap().expect("a message"));
@@ -271,10 +280,10 @@ fn a_received_message_counts_as_handled_when_it_is_dropped(transport: Transport)
     assert_eq!(outcome.recv_timeout(WATCHDOG), Ok(Outcome::Rejected(Rejection::Malformed)));
 }
 
-fn a_message_that_is_in_hand_at_a_panic_has_failed(transport: Transport) {
+fn a_message_that_is_in_hand_at_a_panic_has_failed(under: Under) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, on(transport));
+    let mut endpoint = register(under, &node, on(under));
     let outcome = node.send_confirmed(app.tid, endpoint.tid(), &TORQUE);
     let thread = thread::spawn(move || {
         let _in_hand = endpoint.receive(WATCHDOG).unwrap().expect("a message");
@@ -284,10 +293,10 @@ fn a_message_that_is_in_hand_at_a_panic_has_failed(transport: Transport) {
     assert_eq!(outcome.recv_timeout(WATCHDOG), Ok(Outcome::Failed));
 }
 
-fn what_waited_in_a_dropped_endpoint_was_not_handled(transport: Transport) {
+fn what_waited_in_a_dropped_endpoint_was_not_handled(under: Under) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, on(transport));
+    let mut endpoint = register(under, &node, on(under));
     let first = node.send_confirmed(app.tid, endpoint.tid(), &TORQUE);
     let second = node.send_confirmed(app.tid, endpoint.tid(), &TORQUE);
     // Both have come with one look at the socket.
@@ -297,10 +306,10 @@ fn what_waited_in_a_dropped_endpoint_was_not_handled(transport: Transport) {
     assert_eq!(second.recv_timeout(WATCHDOG), Ok(Outcome::Rejected(Rejection::Closed)));
 }
 
-fn of_a_stream_only_the_newest_value_is_received(transport: Transport) {
+fn of_a_stream_only_the_newest_value_is_received(under: Under) {
     let node = TestNode::start();
     let app = node.local(1);
-    let mut endpoint = register(&node, on(transport));
+    let mut endpoint = register(under, &node, on(under));
     for value in 0..10 {
         node.stores.router.send(Message::typed(app.tid, endpoint.tid(), &Setpoint(value))).unwrap();
     }
@@ -309,10 +318,10 @@ fn of_a_stream_only_the_newest_value_is_received(transport: Transport) {
     assert!(endpoint.receive(Duration::ZERO).unwrap().is_none());
 }
 
-fn a_member_gets_what_is_sent_to_its_group_until_it_leaves(transport: Transport) {
+fn a_member_gets_what_is_sent_to_its_group_until_it_leaves(under: Under) {
     let node = TestNode::start();
-    let mut member = register(&node, on(transport));
-    let mut sender = register(&node, on(transport));
+    let mut member = register(under, &node, on(under));
+    let mut sender = register(under, &node, on(under));
     let group = Tid::group("drives");
     member.join("drives").unwrap();
     sender.send(group, &TORQUE).unwrap();
@@ -324,35 +333,34 @@ fn a_member_gets_what_is_sent_to_its_group_until_it_leaves(transport: Transport)
     assert_eq!(member.receive(WATCHDOG).unwrap().expect("a message").destination(), member.tid());
 }
 
-fn names_resolve_and_are_free_when_unregister_returns(transport: Transport) {
+fn names_resolve_and_are_free_when_unregister_returns(under: Under) {
     let node = TestNode::start();
-    let mut endpoint = register(&node, on(transport));
+    let mut endpoint = register(under, &node, on(under));
     assert_eq!(endpoint.resolve("hip", WATCHDOG).unwrap(), None);
-    let hip = register(&node, on(transport).name("hip"));
+    let hip = register(under, &node, on(under).name("hip"));
     assert_eq!(endpoint.resolve("hip", WATCHDOG).unwrap(), Some(hip.tid()));
     hip.unregister().unwrap();
     assert_eq!(endpoint.resolve("hip", WATCHDOG).unwrap(), None);
-    register(&node, on(transport).name("hip"));
+    register(under, &node, on(under).name("hip"));
 }
 
-fn a_registration_waits_at_the_barrier_and_names_what_it_waits_for(transport: Transport) {
+fn a_registration_waits_at_the_barrier_and_names_what_it_waits_for(under: Under) {
     let mut node = TestNode::start();
-    let api = NodeApi::connect(node.path()).unwrap();
-    let wanted = on(transport).requires(["knee.sensor", "central.gait"]);
-    let error =
-        api.register_transport_address(wanted.clone().deadline(Duration::from_millis(1))).unwrap_err();
+    let api = Api::connect(under, &node);
+    let wanted = on(under).requires(["knee.sensor", "central.gait"]);
+    let error = api.register(wanted.clone().deadline(Duration::from_millis(1))).unwrap_err();
     assert!(error.to_string().contains("knee.sensor, central.gait"), "{error}");
     let AppFact::Registered { app: given_up, .. } = node.fact() else { panic!("no registration") };
     assert_eq!(node.fact(), AppFact::Unregistered { app: given_up });
-    let waiting = thread::spawn(move || api.register_transport_address(wanted.deadline(WATCHDOG)));
+    let waiting = thread::spawn(move || api.register(wanted.deadline(WATCHDOG)));
     let AppFact::Registered { app, .. } = node.fact() else { panic!("no registration") };
     node.release(app);
     assert_eq!(waiting.join().unwrap().unwrap().tid().app, app);
 }
 
-fn the_end_of_the_node_is_an_error_with_its_reason(transport: Transport) {
+fn the_end_of_the_node_is_an_error_with_its_reason(under: Under) {
     let mut node = TestNode::start();
-    let mut endpoint = register(&node, on(transport));
+    let mut endpoint = register(under, &node, on(under));
     node.stop();
     let error = endpoint.receive(WATCHDOG).unwrap_err();
     assert!(error.to_string().contains("LNCL has ended"), "{error}");
@@ -360,14 +368,14 @@ fn the_end_of_the_node_is_an_error_with_its_reason(transport: Transport) {
     assert!(error.to_string().contains("LNCL has ended"), "{error}");
 }
 
-fn every_thread_may_have_an_address_of_its_own(transport: Transport) {
+fn every_thread_may_have_an_address_of_its_own(under: Under) {
     let node = TestNode::start();
-    let api = NodeApi::connect(node.path()).unwrap();
+    let api = Api::connect(under, &node);
     let app = node.local(1);
     thread::scope(|scope| {
         for _ in 0..8 {
             scope.spawn(|| {
-                let mut endpoint = api.register_transport_address(on(transport)).unwrap();
+                let mut endpoint = api.register(on(under)).unwrap();
                 let kind = Kind::named("test.raw");
                 for number in 0..100_u64 {
                     let mut buffer = endpoint.create_message(app.tid, kind, 8).unwrap();

@@ -46,7 +46,7 @@ impl Greeting {
         let lncl = payload::lncl_of(NodeAddress::HERE);
         let asked = asked(register, options.transport);
         let frame = payload::frame(Kind::LNCL_REGISTER, Tid::NONE, lncl, &asked);
-        socket::Writer::new(socket.clone(), options.patience).write(&frame)?;
+        socket::Writer::new(socket.clone(), options).write(&frame)?;
         Ok(Self { socket, options, frame: BytesMut::zeroed(HEADER_LEN), filled: 0 })
     }
 
@@ -75,11 +75,12 @@ impl Greeting {
         let payload_max = registered.payload_max as usize;
         let (writer, reader) = match registered.ring {
             None => {
-                let writer = socket::Writer::new(socket.clone(), options.patience);
+                let writer = socket::Writer::new(socket.clone(), options);
                 (Writer::Socket(writer), Reader::Socket(socket::Reader::new(socket, payload_max)))
             }
             Some(ring_bytes) => {
-                let (producer, consumer) = ring::exchange(&socket, ring_bytes, Time::now() + EXCHANGE)?;
+                let (producer, consumer) =
+                    ring::exchange(&socket, ring_bytes, options.bell, Time::now() + EXCHANGE)?;
                 let reader = ring::Reader::new(socket.clone(), consumer, payload_max, options.spin);
                 let writer = Arc::new(ring::Writer::new(socket, producer, options));
                 (Writer::Ring(writer), Reader::Ring(Box::new(reader)))

@@ -19,7 +19,7 @@ use sinew_runtime::{
     time::Time,
     wire::Message,
 };
-use sinew_shm::Spin;
+use sinew_shm::{Armed, BellKind, Spin};
 use socket2::{Domain, SockAddr, Socket, Type};
 
 use super::{
@@ -30,6 +30,7 @@ use crate::lncl::payload::{Refusal, Register, Registered};
 
 pub(super) use greeting::Greeting;
 use loan::InRing;
+use ring::{Begun, Rest};
 
 /// How long to wait for a place in the queue of a node that does not accept.
 const CONNECT: Duration = Duration::from_secs(2);
@@ -52,6 +53,8 @@ pub(super) struct LinkOptions {
     pub(super) spin: Spin,
     /// How long a send waits for room.
     pub(super) patience: Duration,
+    /// How this side is woken: by a futex where threads wait, by a socket where tasks do.
+    pub(super) bell: BellKind,
 }
 
 /// A registered link.
@@ -74,6 +77,15 @@ pub(super) fn connect(path: &Path) -> Result<UnixStream, ApiError> {
         Ok(UnixStream::from(OwnedFd::from(socket)))
     };
     try_to().map_err(|cause| ApiError::NoNode { path: path.to_owned(), cause })
+}
+
+/// How far a frame came.
+pub(super) enum Progress {
+    Whole,
+    /// The rest is here, or with the writer itself.
+    Part(Option<Rest>),
+    /// Nothing of it was written.
+    Full(Message),
 }
 
 /// The writing half: whoever settles a message writes, from whatever thread.
@@ -120,6 +132,67 @@ impl Writer {
         }
     }
 
+    /// Whether the payload of this draft lies in this link's ring.
+    pub(super) fn is_home_of(&self, draft: &Draft) -> bool {
+        match (self, &draft.payload) {
+            (Self::Ring(writer), Content::InRing(loan)) => loan.is_of(writer),
+            (Self::Ring(_) | Self::Socket(_), Content::Bytes(_) | Content::InRing(_)) => false,
+        }
+    }
+
+    /// Writes one frame as far as there is room now.
+    pub(super) fn begin(&self, message: Message) -> Result<Progress, ApiError> {
+        match self {
+            Self::Socket(writer) => writer.begin(message),
+            Self::Ring(writer) => match writer.begin(message) {
+                Ok(Begun::Whole) => Ok(Progress::Whole),
+                Ok(Begun::Part(rest)) => Ok(Progress::Part(Some(rest))),
+                Ok(Begun::Full(message)) => Ok(Progress::Full(message)),
+                Err((error, _)) => Err(error),
+            },
+        }
+    }
+
+    /// Whether the last frame was written in part, and the writer itself has the rest.
+    pub(super) fn is_within_frame(&self) -> bool {
+        match self {
+            Self::Socket(writer) => writer.owes(),
+            Self::Ring(_) => false,
+        }
+    }
+
+    /// Whether outcomes wait for room.
+    pub(super) fn owes(&self) -> bool {
+        match self {
+            Self::Socket(writer) => writer.owes(),
+            Self::Ring(writer) => writer.owes(),
+        }
+    }
+
+    /// Ends when some thread has left an outcome that waits for room.
+    pub(super) async fn owing(&self) {
+        match self {
+            Self::Socket(writer) => writer.owing.notified().await,
+            Self::Ring(writer) => writer.owing.notified().await,
+        }
+    }
+
+    /// Announces that a task waits for room for `length` bytes.
+    pub(super) fn arm(&self, length: usize) -> Armed {
+        match self {
+            Self::Socket(_) => Armed::Ready,
+            Self::Ring(writer) => writer.arm(length),
+        }
+    }
+
+    /// Says that it is awake.
+    pub(super) fn disarm(&self) {
+        match self {
+            Self::Socket(_) => {}
+            Self::Ring(writer) => writer.disarm(),
+        }
+    }
+
     /// Writes one frame if there is room for it now, and the link is one of rings.
     pub(super) fn try_write(&self, message: &Message) -> bool {
         match self {
@@ -132,8 +205,7 @@ impl Writer {
     /// Writes the outcomes that found no room when they were said, as far as there is room now. Never waits.
     pub(super) fn pay(&self) {
         match self {
-            // A socket's writer waits for room.
-            Self::Socket(_) => {}
+            Self::Socket(writer) => writer.pay(),
             Self::Ring(writer) => writer.pay(),
         }
     }

@@ -5,7 +5,10 @@ mod writing;
 use std::{
     collections::VecDeque,
     io::IoSlice,
-    os::{fd::AsFd, unix::net::UnixStream},
+    os::{
+        fd::{AsFd, BorrowedFd},
+        unix::net::UnixStream,
+    },
     sync::{Arc, Mutex, OnceLock, PoisonError, TryLockError},
     time::{Duration, Instant},
 };
@@ -21,9 +24,10 @@ use sinew_runtime::{
     wire::{FrameCodec, HEADER_LEN, Kind, Message},
 };
 use sinew_shm::{
-    Any, AnyError, BellKind, Capacity, Consumer, Ends, HangUp, LoanError, Producer, Region, RoomError, Spin,
-    Wait, Waiter,
+    Any, AnyError, Armed, BellKind, Capacity, Consumer, Ends, HangUp, LoanError, Producer, Region, RoomError,
+    Spin, Wait, Waiter,
 };
+use tokio::sync::Notify;
 use tokio_util::codec::Decoder;
 
 use super::{Ended, LinkOptions, Read, socket};
@@ -60,10 +64,11 @@ pub(super) fn is_available() -> bool {
 pub(in crate::api) fn exchange(
     socket: &UnixStream,
     ring_bytes: u32,
+    bell: BellKind,
     deadline: Time,
 ) -> Result<(Producer, Consumer), ApiError> {
     let closed = |error: ExchangeError| ApiError::Closed(error.to_string());
-    let exchange = Exchange::prepare(ring::capacity(ring_bytes as usize), BellKind::Futex).map_err(closed)?;
+    let exchange = Exchange::prepare(ring::capacity(ring_bytes as usize), bell).map_err(closed)?;
     exchange.offer(socket).map_err(closed)?;
     loop {
         if let Some(theirs) = Exchange::receive(socket).map_err(closed)? {
@@ -85,6 +90,8 @@ pub(in crate::api) struct Writer {
     producer: Mutex<Option<Box<Producer>>>,
     /// Outcomes that found no room, or the ring lent, when they were said.
     owed: Mutex<VecDeque<Message>>,
+    /// Told when some thread has left something owed: a task that waits looks again.
+    pub(super) owing: Notify,
     patience: Duration,
 }
 
@@ -92,7 +99,7 @@ impl Writer {
     pub(in crate::api) fn new(socket: Arc<UnixStream>, mut producer: Producer, options: LinkOptions) -> Self {
         producer.set_spin(options.spin);
         let (producer, owed) = (Mutex::new(Some(Box::new(producer))), Mutex::default());
-        Self { socket, producer, owed, patience: options.patience }
+        Self { socket, producer, owed, owing: Notify::new(), patience: options.patience }
     }
 
     /// Writes one frame; waits for room as long as the link's patience lasts.
@@ -143,6 +150,25 @@ impl Writer {
     pub(super) fn put_back(&self, producer: Box<Producer>) {
         *self.producer.lock().unwrap_or_else(PoisonError::into_inner) = Some(producer);
         self.pay();
+    }
+
+    /// Announces that a task waits for room for a frame of `length` bytes.
+    pub(super) fn arm(&self, length: usize) -> Armed {
+        let mut producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
+        producer.as_deref_mut().map_or(Armed::Ready, |producer| writing::arm(producer, length))
+    }
+
+    /// Says that it is awake.
+    pub(super) fn disarm(&self) {
+        if let Some(producer) = self.producer.lock().unwrap_or_else(PoisonError::into_inner).as_deref_mut() {
+            producer.disarm();
+        }
+    }
+
+    /// Does something with the descriptor of the bell for room.
+    pub(in crate::api) fn with_bell<T>(&self, look: impl FnOnce(Option<BorrowedFd<'_>>) -> T) -> T {
+        let producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
+        look(producer.as_deref().and_then(Producer::fd))
     }
 
     /// Writes what is no frame.
@@ -248,6 +274,9 @@ impl ReceiptSink for Writer {
         }
         drop(owed);
         self.pay();
+        if self.owes() {
+            self.owing.notify_one();
+        }
     }
 }
 
@@ -365,6 +394,30 @@ impl Reader {
                 self.ended = Some(Ended::for_good(error.to_string()))
             }
         }
+    }
+
+    /// Announces that a task waits for a message. [`Armed::Ready`]: there is something to do.
+    pub(in crate::api) fn arm(&mut self) -> Armed {
+        if self.ended.is_some() {
+            return Armed::Ready;
+        }
+        // Corrupt memory shows itself when it is read.
+        self.end.consumer.arm().unwrap_or(Armed::Ready)
+    }
+
+    /// Says that it is awake.
+    pub(in crate::api) fn disarm(&mut self) {
+        self.end.consumer.disarm();
+    }
+
+    /// The next look at the ring looks at the socket, too.
+    pub(in crate::api) fn look_at_once(&mut self) {
+        self.look_at = Time::ZERO;
+    }
+
+    /// The descriptor of the bell for messages.
+    pub(in crate::api) fn bell(&self) -> Option<BorrowedFd<'_>> {
+        self.end.consumer.fd()
     }
 
     /// The socket beside the ring.

@@ -2,12 +2,15 @@
 
 use std::{
     io::IoSlice,
-    os::unix::net::UnixStream,
+    os::{
+        fd::{AsFd, BorrowedFd},
+        unix::net::UnixStream,
+    },
     sync::{Arc, Mutex, PoisonError},
     time::Duration,
 };
 
-use bytes::BytesMut;
+use bytes::{Buf, BytesMut};
 use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
     io::Errno,
@@ -16,26 +19,43 @@ use rustix::{
 use sinew_runtime::{
     outcome::{Outcome, ReceiptSink, Ticket},
     time::Time,
-    wire::{FrameCodec, Message},
+    wire::{FrameCodec, HEADER_LEN, Message, encode_frame},
 };
+use sinew_shm::BellKind;
+use tokio::sync::Notify;
 use tokio_util::codec::Decoder;
 
-use super::{Ended, Read};
+use super::{Ended, LinkOptions, Progress, Read};
 use crate::api::ApiError;
 
 /// Bytes that are read at once.
 const READ_CHUNK: usize = 64 * 1024;
+/// What may be left before an outcome that is to be said is left out: as many as at a ring.
+const BACKLOG_BYTES_MAX: usize = 4_096 * (HEADER_LEN + 1);
 
 /// The writing half: whoever settles a message writes, from whatever thread.
 #[derive(Debug)]
 pub(in crate::api) struct Writer {
     socket: Arc<UnixStream>,
-    /// Frames go out whole, one after the other.
-    turn: Mutex<()>,
+    /// Frames go out whole, one after the other. What could not be written at once is here, where tasks write, who do not
+    /// wait; else it is empty.
+    turn: Mutex<BytesMut>,
+    /// Told when some thread has left an outcome there: a task that waits looks again.
+    pub(super) owing: Notify,
     patience: Duration,
+    waits: Waits,
 }
 
-/// How far a frame came.
+/// What who writes does where there is no room.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Waits {
+    /// It is a thread that may block.
+    Here,
+    /// It is a task.
+    Elsewhere,
+}
+
+/// How far a frame came, of one who waits.
 enum Stuck {
     /// Nothing of it was written.
     Before,
@@ -44,8 +64,64 @@ enum Stuck {
 }
 
 impl Writer {
-    pub(in crate::api) const fn new(socket: Arc<UnixStream>, patience: Duration) -> Self {
-        Self { socket, turn: Mutex::new(()), patience }
+    pub(in crate::api) fn new(socket: Arc<UnixStream>, options: LinkOptions) -> Self {
+        let waits = if options.bell == BellKind::Futex { Waits::Here } else { Waits::Elsewhere };
+        Self { socket, turn: Mutex::default(), owing: Notify::new(), patience: options.patience, waits }
+    }
+
+    /// Writes one frame as far as there is room now; what is left of it is kept here.
+    pub(super) fn begin(&self, message: Message) -> Result<Progress, ApiError> {
+        let mut backlog = self.turn.lock().unwrap_or_else(PoisonError::into_inner);
+        if !self.work_off(&mut backlog)? {
+            return Ok(Progress::Full(message));
+        }
+        encode_frame(&message.header, &message.payload, &mut backlog);
+        let whole = backlog.len();
+        if self.work_off(&mut backlog)? {
+            return Ok(Progress::Whole);
+        }
+        if backlog.len() < whole {
+            return Ok(Progress::Part(None));
+        }
+        backlog.clear();
+        Ok(Progress::Full(message))
+    }
+
+    /// Writes on what was left, as far as there is room now.
+    pub(super) fn pay(&self) {
+        // An error shows itself again when the socket is read.
+        let _ = self.work_off(&mut self.turn.lock().unwrap_or_else(PoisonError::into_inner));
+    }
+
+    /// Whether something is left.
+    pub(super) fn owes(&self) -> bool {
+        !self.turn.lock().unwrap_or_else(PoisonError::into_inner).is_empty()
+    }
+
+    /// Whether all is written.
+    fn work_off(&self, backlog: &mut BytesMut) -> Result<bool, ApiError> {
+        while !backlog.is_empty() {
+            match self.write_now(&[IoSlice::new(backlog)]) {
+                Ok(count) => backlog.advance(count),
+                Err(Errno::AGAIN) => return Ok(false),
+                Err(error) => {
+                    backlog.clear();
+                    return Err(ApiError::Closed(error.to_string()));
+                }
+            }
+        }
+        Ok(true)
+    }
+
+    /// Says an outcome without waiting; one more than there may be is not said, and counts as Unknown at its deadline.
+    fn owe(&self, outcome: &Message) {
+        let mut backlog = self.turn.lock().unwrap_or_else(PoisonError::into_inner);
+        if backlog.len() < BACKLOG_BYTES_MAX {
+            encode_frame(&outcome.header, &outcome.payload, &mut backlog);
+        }
+        if !self.work_off(&mut backlog).unwrap_or(true) {
+            self.owing.notify_one();
+        }
     }
 
     /// Writes one frame.
@@ -70,11 +146,19 @@ impl Writer {
         Ok(())
     }
 
-    fn write_some(&self, parts: &[IoSlice<'_>], deadline: Time) -> Result<usize, Errno> {
+    fn write_now(&self, parts: &[IoSlice<'_>]) -> Result<usize, Errno> {
         let flags = SendFlags::DONTWAIT | SendFlags::NOSIGNAL;
         loop {
             match sendmsg(&self.socket, parts, &mut SendAncillaryBuffer::default(), flags) {
                 Err(Errno::INTR) => {}
+                result => return result,
+            }
+        }
+    }
+
+    fn write_some(&self, parts: &[IoSlice<'_>], deadline: Time) -> Result<usize, Errno> {
+        loop {
+            match self.write_now(parts) {
                 Err(Errno::AGAIN) if wait(&self.socket, PollFlags::OUT, deadline)? => {}
                 result => return result,
             }
@@ -101,8 +185,12 @@ impl Writer {
 
 impl ReceiptSink for Writer {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
-        // If it cannot be said the connection has ended, and the node tells the sender so.
-        let _ = self.write(&Message::outcome(ticket, outcome));
+        let outcome = Message::outcome(ticket, outcome);
+        match self.waits {
+            // If it cannot be said the connection has ended, and the node tells the sender so.
+            Waits::Here => drop(self.write(&outcome)),
+            Waits::Elsewhere => self.owe(&outcome),
+        }
     }
 }
 
@@ -139,6 +227,11 @@ impl Reader {
                 Err(_) => return Read::Ended(Ended::silently()),
             }
         }
+    }
+
+    /// The socket.
+    pub(in crate::api) fn fd(&self) -> BorrowedFd<'_> {
+        self.socket.as_fd()
     }
 
     /// Waits until there is something to read, or until the deadline.

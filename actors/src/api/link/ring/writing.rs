@@ -4,7 +4,7 @@ use std::{io::IoSlice, mem, sync::Arc, sync::PoisonError, time::Duration};
 
 use rustix::fd::AsFd;
 use sinew_runtime::wire::{HEADER_LEN, Message};
-use sinew_shm::{HangUp, LoanError, Producer, Wait};
+use sinew_shm::{Armed, HangUp, LoanError, Producer, Wait};
 
 use super::Writer;
 use crate::{api::ApiError, ring};
@@ -67,6 +67,13 @@ fn await_room(producer: &mut Producer, length: usize, writer: &Writer, within: D
     drop(producer.loan_before(length, &wait));
 }
 
+/// Announces sleep until there is room for the next record of a frame of which `length` bytes are left.
+pub(super) fn arm(producer: &mut Producer, length: usize) -> Armed {
+    let length = ring::piece(producer, length);
+    // Whatever is wrong shows when it is written.
+    producer.arm(length).unwrap_or(Armed::Ready)
+}
+
 impl Rest {
     /// Writes on, as far as there is room now; whether all is written. The peer sees an end of the link otherwise.
     ///
@@ -91,6 +98,19 @@ impl Rest {
         }
         self.give_back();
         Ok(true)
+    }
+
+    /// Announces that a task waits for room for more.
+    pub(in crate::api) fn arm(&mut self) -> Armed {
+        let left = HEADER_LEN + self.message.payload.len() - self.written;
+        self.producer.as_deref_mut().map_or(Armed::Ready, |producer| arm(producer, left))
+    }
+
+    /// Says that it is awake.
+    pub(in crate::api) fn disarm(&mut self) {
+        if let Some(producer) = self.producer.as_deref_mut() {
+            producer.disarm();
+        }
     }
 
     /// Waits until there is room for more, the peer's end, or `within` this time.

@@ -1,0 +1,291 @@
+//! The waits of a task: what a blocking thread does with futexes and `poll`, done by the runtime's reactor.
+//!
+//! The bells of the ring, or the socket, are watched through descriptors of their own, so that an end of the link takes
+//! nothing away under the reactor. One wake of the task's thread for each wait that was in earnest, as a thread has.
+
+use std::{
+    io,
+    os::{
+        fd::{AsFd, BorrowedFd},
+        unix::net,
+    },
+    sync::Arc,
+    time::Duration,
+};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use sinew_runtime::{time::Time, wire::HEADER_LEN};
+use sinew_shm::Armed;
+use tokio::{io::Interest, net::UnixStream, sync::oneshot, task::spawn_blocking};
+
+use super::{
+    ApiError,
+    lent::{Content, Draft},
+    link::{
+        Link, Progress, Reader, Writer,
+        ring::{self, NAP, Rest},
+    },
+    returning::{Home, come_home},
+};
+
+/// What is watched for a task.
+pub(super) struct Reactor {
+    ears: Ears,
+    /// What is left of a frame of which a part is in the ring.
+    rest: Option<Rest>,
+    /// The way back, while it is looked for.
+    home: Option<oneshot::Receiver<Link>>,
+    /// Who looks for it stops when this is gone.
+    wanted: Arc<()>,
+}
+
+enum Ears {
+    Socket(UnixStream),
+    Ring {
+        message: UnixStream,
+        room: UnixStream,
+        /// Hangs up with the node.
+        socket: UnixStream,
+    },
+}
+
+impl Reactor {
+    /// Watches a link, for the runtime of the calling task.
+    pub(super) fn new(reader: &Reader, writer: &Writer) -> io::Result<Self> {
+        Ok(Self { ears: Ears::of(reader, writer)?, rest: None, home: None, wanted: Arc::new(()) })
+    }
+
+    /// Waits until there may be something to read, or to do, until `deadline` at most.
+    pub(super) async fn wait(&mut self, reader: &mut Reader, writer: &Writer, deadline: Time) {
+        let owes = self.rest.is_some() || writer.owes();
+        let deadline = if owes { deadline.min(Time::now() + NAP) } else { deadline };
+        match (&self.ears, reader) {
+            (Ears::Socket(socket), _) => tokio::select! {
+                () = ready(socket, Interest::READABLE, PollFlags::IN) => {}
+                () = writer.owing() => {}
+                () = until(deadline) => {}
+            },
+            (Ears::Ring { message, socket, .. }, Reader::Ring(reader)) => {
+                let Some(armed) = Listening::begin(reader) else { return };
+                tokio::select! {
+                    () = rung(message) => {}
+                    () = ready(socket, Interest::READABLE, PollFlags::RDHUP) => armed.0.look_at_once(),
+                    () = writer.owing() => {}
+                    () = until(deadline) => {}
+                }
+            }
+            (Ears::Ring { .. }, Reader::Socket(_)) => unreachable!("both are of one link"),
+        }
+    }
+
+    /// Writes a message; waits for room for `patience` at most. A message of which nothing was written when this is dropped
+    /// is not sent; one that was begun goes out with later calls.
+    pub(super) async fn send(
+        &mut self,
+        writer: &Writer,
+        draft: Draft,
+        patience: Duration,
+    ) -> Result<(), ApiError> {
+        let until = Time::now() + patience;
+        if !self.finish(writer, until).await {
+            return Err(ApiError::Stalled(patience));
+        }
+        if matches!(draft.payload, Content::InRing(_)) && writer.is_home_of(&draft) {
+            return writer.send(draft);
+        }
+        let mut message = draft.into_message();
+        loop {
+            message = match writer.begin(message) {
+                Ok(Progress::Whole) => return Ok(()),
+                Ok(Progress::Part(rest)) => {
+                    self.rest = rest;
+                    return self.finish_or_close(writer, until, patience).await;
+                }
+                Ok(Progress::Full(message)) => message,
+                Err(error) => return Err(error),
+            };
+            let length = HEADER_LEN + message.payload.len();
+            if !self.room(writer, length, until).await {
+                return Err(ApiError::Stalled(patience));
+            }
+        }
+    }
+
+    /// Writes on what was begun, as far as there is room now.
+    pub(super) fn go_on(&mut self) {
+        // An error shows itself again when the ring is read.
+        if self.rest.as_mut().is_some_and(|rest| rest.go_on().unwrap_or(true)) {
+            self.rest = None;
+        }
+    }
+
+    /// Writes on what was begun to its end; `false` at the deadline.
+    async fn finish(&mut self, writer: &Writer, until: Time) -> bool {
+        loop {
+            self.go_on();
+            writer.pay();
+            if self.rest.is_none() && !writer.is_within_frame() {
+                return true;
+            }
+            if !self.room(writer, 0, until).await {
+                return false;
+            }
+        }
+    }
+
+    /// The same; nothing after a frame that was cut would be understood.
+    async fn finish_or_close(
+        &mut self,
+        writer: &Writer,
+        until: Time,
+        patience: Duration,
+    ) -> Result<(), ApiError> {
+        if self.finish(writer, until).await {
+            return Ok(());
+        }
+        writer.close();
+        Err(ApiError::Closed(format!("the node stopped reading for {patience:?} within a frame")))
+    }
+
+    /// Waits until there may be room for a frame of `length` bytes, or for the rest of one; `false` at the deadline.
+    async fn room(&mut self, writer: &Writer, length: usize, deadline: Time) -> bool {
+        if Time::now() >= deadline {
+            return false;
+        }
+        match &self.ears {
+            Ears::Socket(socket) => tokio::select! {
+                () = ready(socket, Interest::WRITABLE, PollFlags::OUT) => {}
+                () = until(deadline) => {}
+            },
+            Ears::Ring { room, socket, .. } => {
+                let armed = match &mut self.rest {
+                    Some(rest) => rest.arm(),
+                    None => writer.arm(length),
+                };
+                if armed == Armed::Ready {
+                    return true;
+                }
+                // Not disarmed if this is dropped: the node may ring once for nothing.
+                tokio::select! {
+                    () = rung(room) => {}
+                    () = ready(socket, Interest::READABLE, PollFlags::RDHUP) => {}
+                    () = until(deadline) => {}
+                }
+                match &mut self.rest {
+                    Some(rest) => rest.disarm(),
+                    None => writer.disarm(),
+                }
+            }
+        }
+        true
+    }
+
+    /// Looks for the way back, on a thread of the runtime's pool that may block; what it has found, once it has.
+    pub(super) fn look_home(&mut self, home: &Home) -> Option<Link> {
+        let found = self.home.get_or_insert_with(|| {
+            let (found, hear) = oneshot::channel();
+            let (home, wanted) = (home.another(), Arc::downgrade(&self.wanted));
+            spawn_blocking(move || {
+                if let Some(link) = come_home(home, || wanted.strong_count() > 0) {
+                    // Not wanted any more: dropped, it is given back.
+                    let _ = found.send(link);
+                }
+            });
+            hear
+        });
+        let link = found.try_recv();
+        if !matches!(link, Err(oneshot::error::TryRecvError::Empty)) {
+            self.home = None;
+        }
+        link.ok()
+    }
+
+    /// Waits until the way back is found, until `deadline` at most.
+    pub(super) async fn await_home(&mut self, home: &Home, deadline: Time) -> Option<Link> {
+        if let Some(link) = self.look_home(home) {
+            return Some(link);
+        }
+        let found = self.home.as_mut()?;
+        let link = tokio::select! {
+            link = found => link.ok(),
+            () = until(deadline) => return None,
+        };
+        self.home = None;
+        link
+    }
+
+    /// Watches another link.
+    pub(super) fn change(&mut self, reader: &Reader, writer: &Writer) -> io::Result<()> {
+        self.rest = None;
+        self.ears = Ears::of(reader, writer)?;
+        Ok(())
+    }
+}
+
+impl Ears {
+    fn of(reader: &Reader, writer: &Writer) -> io::Result<Self> {
+        match (reader, writer) {
+            (Reader::Ring(reader), Writer::Ring(writer)) => {
+                let no_bell = || io::Error::from(io::ErrorKind::Unsupported);
+                let message = watch(reader.bell().ok_or_else(no_bell)?)?;
+                let room = writer.with_bell(|bell| watch(bell.ok_or_else(no_bell)?))?;
+                Ok(Self::Ring { message, room, socket: watch(reader.socket().as_fd())? })
+            }
+            (Reader::Socket(reader), _) => Ok(Self::Socket(watch(reader.fd())?)),
+            (Reader::Ring(_), Writer::Socket(_)) => unreachable!("both are of one link"),
+        }
+    }
+}
+
+/// A reader that has announced that it sleeps; awake again when dropped.
+struct Listening<'a>(&'a mut ring::Reader);
+
+impl<'a> Listening<'a> {
+    /// `None` if there is something to do already.
+    fn begin(reader: &'a mut ring::Reader) -> Option<Self> {
+        (reader.arm() == Armed::Sleep).then(|| Self(reader))
+    }
+}
+
+impl Drop for Listening<'_> {
+    fn drop(&mut self) {
+        self.0.disarm();
+    }
+}
+
+/// Has the reactor watch what is behind a descriptor that does not block.
+fn watch(fd: BorrowedFd<'_>) -> io::Result<UnixStream> {
+    UnixStream::from_std(net::UnixStream::from(fd.try_clone_to_owned()?))
+}
+
+/// Ends when a bell rings. What it was rung for is looked at after this, so that no ring is lost.
+async fn rung(bell: &UnixStream) {
+    // An error is an end, which shows elsewhere.
+    if bell.readable().await.is_ok() {
+        let _ = bell.try_io(Interest::READABLE, || Err::<(), _>(io::ErrorKind::WouldBlock.into()));
+    }
+}
+
+/// Ends when the system says so of the socket now, whatever was read from it or written to it meanwhile.
+async fn ready(socket: &UnixStream, interest: Interest, what: PollFlags) {
+    let now = || {
+        let nothing = Timespec { tv_sec: 0, tv_nsec: 0 };
+        match poll(&mut [PollFd::new(socket, what)], Some(&nothing)) {
+            Ok(0) => Err(io::Error::from(io::ErrorKind::WouldBlock)),
+            Ok(_) | Err(_) => Ok(()),
+        }
+    };
+    while socket.ready(interest).await.is_ok() {
+        if socket.try_io(interest, now).is_ok() {
+            return;
+        }
+    }
+}
+
+/// Ends at `deadline`.
+async fn until(deadline: Time) {
+    if deadline == Time::MAX {
+        return std::future::pending().await;
+    }
+    tokio::time::sleep(deadline.since(Time::now())).await;
+}
