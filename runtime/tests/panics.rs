@@ -205,8 +205,8 @@ fn a_panic_in_stopping_or_stopped_is_a_failure() {
 }
 
 #[test]
-fn a_panic_in_drop_after_an_end_of_its_own_does_not_change_how_it_ended() {
-    assert_eq!(end_of(Where::Drop), Reason::Normal);
+fn a_panic_in_drop_after_an_end_of_its_own_is_a_failure() {
+    assert_panicked(Where::Drop, "in drop");
 }
 
 #[test]

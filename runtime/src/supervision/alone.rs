@@ -93,7 +93,7 @@ where
     is_the_runtimes();
     let (report, ended) = report(Box::new(|_| {}));
     let tenant = Tenant::new(Vitals::new(name), None, None, report);
-    actix_rt::spawn(Guard::around(Some(life(Context::new().into_future(actor))), tenant));
+    actix_rt::spawn(Guard::around_overseer(life(Context::new().into_future(actor)), tenant));
     ended
 }
 

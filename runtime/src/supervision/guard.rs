@@ -71,13 +71,23 @@ pub(super) struct Guard {
     vitals: Option<Arc<Vitals>>,
     was_polled: bool,
     has_reported: bool,
+    /// How it ended does not depend on its drop.
+    ends_before_its_drop: bool,
 }
 
 impl Guard {
     /// Guards an actor that is made.
     pub(super) fn around(life: Option<Box<dyn Life>>, tenant: Tenant) -> Self {
         let vitals = Some(tenant.vitals().clone());
-        Self { life, tenant, vitals, was_polled: false, has_reported: false }
+        let (was_polled, has_reported, ends_before_its_drop) = (false, false, false);
+        Self { life, tenant, vitals, was_polled, has_reported, ends_before_its_drop }
+    }
+
+    /// Guards one that has done all that it is for when it has ended: what it drops then is not its own.
+    pub(super) fn around_overseer(life: Box<dyn Life>, tenant: Tenant) -> Self {
+        let mut guard = Self::around(Some(life), tenant);
+        guard.ends_before_its_drop = true;
+        guard
     }
 
     /// Makes an actor, on its thread. `None` if its code panicked, which is reported.
@@ -107,9 +117,13 @@ impl Guard {
         }
     }
 
-    fn end(&mut self, reason: Reason) {
+    fn end(&mut self, mut reason: Reason) {
         if let Some(life) = self.life.take() {
-            Vitals::turn(&mut self.vitals, Doing::Drop, || bury(life));
+            let said = Vitals::turn(&mut self.vitals, Doing::Drop, || bury(life));
+            // Not where it has failed already: the first failure is the reason.
+            if let Some(said) = said.filter(|_| !reason.is_failure() && !self.ends_before_its_drop) {
+                reason = Reason::Panic(said);
+            }
         }
         if !std::mem::replace(&mut self.has_reported, true) {
             let vitals = self.tenant.vitals();
@@ -127,15 +141,15 @@ impl Guard {
     }
 }
 
-/// Drops an actor whose code may panic once more while it is dropped.
-fn bury(mut life: Box<dyn Life>) {
+/// Drops an actor whose code may panic while it is dropped, even if that is not the first time; what it said then.
+fn bury(mut life: Box<dyn Life>) -> Option<String> {
     let buried = catch_unwind(AssertUnwindSafe(|| {
         life.terminate();
         drop(life);
     }));
-    if let Err(panic) = buried {
-        crate::log::error!(said = words(panic), "an actor panicked while it was dropped");
-    }
+    let panic = buried.err()?;
+    // A life that was taken leaves its drop as it leaves any turn.
+    (!panic.is::<Over>()).then(|| words(panic))
 }
 
 impl Future for Guard {

@@ -6,7 +6,7 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew::{NodeEnd, Sender, StartError, fault::Fault, prelude::*};
+use sinew::{NodeEnd, Reason, Sender, StartError, fault::Fault, prelude::*};
 use sinew_tests::{
     Ground, Log, OwnDirectory, Program, all_run, node_under_test, own_group,
     puppet::{Job, Order, Puppet, Seen, Stage, desk, lives, numbers, outcome_of_job},
@@ -259,4 +259,44 @@ fn the_wills_of_a_killed_node_are_executed_by_the_others_and_those_of_one_that_s
     hip.wait_for(&["Met", "knee"]);
     let is_will = |line: &&String| line.contains("count 1000000");
     assert_eq!(hip.said().iter().filter(is_will).count(), 2, "{:?}", hip.said());
+}
+
+/// Stops at the first message, and panics in each drop.
+fn messy() -> (AppSpec<Puppet>, Log<Seen>) {
+    let stage = Stage::new().got(|_, context| context.stop()).dropped(|_| panic!("its drop"));
+    stage.app("mortal")
+}
+
+#[test]
+fn who_stops_by_itself_and_panics_in_drop_has_failed_and_its_will_is_sent() {
+    let ((mortal, log), (heir, seen), (desk, key)) = (messy(), heir(), desk("desk"));
+    let mortal = mortal.restart(Restart::Transient).last_will("heir", &WILL);
+    let node = Ground::new().node("node").app(heir).app(mortal).app(desk).start().expect("a node");
+    all_run(&[&node]);
+    assert_eq!(outcome_of_job(&key.sender(), "mortal", 1), Outcome::Delivered);
+    seen.wait_for(Seen::Got(1, WILL.number));
+    log.wait_for(Seen::Started(2));
+    let ended = reason_of_last_end(&node, "mortal");
+    assert!(matches!(&ended, Some(Reason::Panic(said)) if said.contains("its drop")), "{ended:?}");
+}
+
+#[test]
+fn who_is_told_to_stop_and_panics_in_drop_is_told_of_as_panicked_and_neither_started_again_nor_counted() {
+    let ((mortal, log), (heir, seen)) = (messy(), heir());
+    let mortal = mortal.last_will("heir", &WILL);
+    let node = Ground::new().node("node").configure(|config| config.supervision.app_restarts_max = 0);
+    let node = node.app(heir).app(mortal).start().expect("a node");
+    all_run(&[&node]);
+    node.handle().stop_app("mortal").expect("it is there");
+    seen.wait_for(Seen::Got(1, WILL.number));
+    let ended = reason_of_last_end(&node, "mortal");
+    assert!(matches!(&ended, Some(Reason::Panic(said)) if said.contains("its drop")), "{ended:?}");
+    // No restart is allowed: one that is counted ends the node.
+    assert_eq!(node.stop(), NodeEnd::Stopped);
+    assert_eq!(lives(&log), 1);
+}
+
+fn reason_of_last_end(node: &Node, name: &str) -> Option<Reason> {
+    let tree = node.handle().tree().expect("the root answers");
+    tree.find(name).expect("it is declared").last_reason.clone()
 }
