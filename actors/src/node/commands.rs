@@ -135,7 +135,11 @@ impl Root {
         let Ordered { what, answer } = ordered;
         let given = match what {
             What::Add(app, under) => {
-                self.add(&app, under.as_deref()).map(|id| (id, Command::Add, app.name().to_owned()))
+                let name = app.name().to_owned();
+                let added = self.add(&app, under.as_deref());
+                // Not here: what it captured is the user's, and if it was not added, nobody else holds it.
+                self.burials.bury(name.clone(), app);
+                added.map(|id| (id, Command::Add, name))
             }
             What::Tell(command, name) => self.command(command, &name).map(|id| (id, command, name)),
         };
@@ -170,7 +174,8 @@ impl Root {
         self.apps.check_place(app)?;
         let spec = self.register(app)?;
         let id = spec.id;
-        if roster.bring(under, spec).is_err() {
+        if let Err(spec) = roster.bring(under, spec) {
+            self.burials.bury(spec.name.clone(), spec);
             self.apps.remove(&self.stores, id);
             self.absences.forget(id);
             return Err(CommandError::NotRunning);

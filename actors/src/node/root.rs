@@ -4,6 +4,7 @@ use std::{
     cell::RefCell,
     rc::Rc,
     sync::{Arc, atomic::Ordering, mpsc::SyncSender},
+    time::Duration,
 };
 
 use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, fut::WrapFuture};
@@ -15,8 +16,8 @@ use sinew_runtime::{
     router::Outlet,
     sender::Sender,
     supervision::{
-        ChildId, ChildIds, ChildSpec, Input, Place, PlannedChild, Policy, Reason, Roster, Supervisor,
-        SupervisorFact, SupervisorPlan, Threads,
+        Burials, ChildId, ChildIds, ChildSpec, Input, Place, PlannedChild, Policy, Reason, Roster,
+        Supervisor, SupervisorFact, SupervisorPlan, Threads,
     },
     tid::AppAddress,
     time::Time,
@@ -85,9 +86,13 @@ struct Cycle {
     ours: Vec<ChildId>,
 }
 
+/// Time that what applications captured has to be dropped when their node has ended, before nobody waits for it any more.
+const BURIED_WITHIN: Duration = Duration::from_secs(1);
+
 pub(super) struct Root {
     pub(super) stores: Arc<Stores>,
     threads: Rc<RefCell<Threads>>,
+    pub(super) burials: Burials,
     heirs: Heirs,
     pub(super) phase: Phase,
     pub(super) began: Time,
@@ -118,8 +123,10 @@ pub(super) fn run(
     let heirs = Heirs::default();
     let (kept, last_word) = (stores.clone(), ended.clone());
     let threads = Rc::new(RefCell::new(Threads::default()));
+    let burials = threads.borrow().burials();
     let root = Root {
         threads: threads.clone(),
+        burials: burials.clone(),
         heirs: heirs.clone(),
         phase: Phase::StartingLayers,
         began: Time::now(),
@@ -144,6 +151,16 @@ pub(super) fn run(
         crate::log::error!(%error, "the root's event loop failed");
     }
     threads.borrow_mut().stop();
+    burials.wait(BURIED_WITHIN);
+}
+
+impl Drop for Root {
+    fn drop(&mut self) {
+        // Its layers did not come up: what the applications captured is dropped elsewhere all the same.
+        if let Some(declared) = self.declared.take() {
+            self.burials.bury("a node that did not start", declared);
+        }
+    }
 }
 
 impl Actor for Root {
@@ -278,17 +295,32 @@ impl Root {
         let SupervisorSpec { name, flags, policy, members } = spec;
         let id = self.child_ids.next();
         self.apps.add_supervisor(id, &name);
-        let mut children = Vec::new();
-        for member in members {
-            children.push(match member {
-                Member::App(app) => PlannedChild::Worker(self.register(&app)?),
-                Member::Supervisor(below) => {
-                    let (plan, policy) = self.plan(below)?;
-                    PlannedChild::Supervisor(plan, policy)
+        let (mut children, mut members) = (Vec::new(), members.into_iter());
+        while let Some(member) = members.next() {
+            match self.plan_member(member) {
+                Ok(child) => children.push(child),
+                Err(error) => {
+                    self.burials.bury(name, (children, members));
+                    return Err(error);
                 }
-            });
+            }
         }
         Ok((SupervisorPlan { id, name, flags, children }, policy))
+    }
+
+    fn plan_member(&mut self, member: Member) -> Result<PlannedChild, StartError> {
+        match member {
+            Member::App(app) => {
+                let spec = self.register(&app);
+                // Not here: what it captured is the user's.
+                self.burials.bury(app.name().to_owned(), app);
+                spec.map(PlannedChild::Worker)
+            }
+            Member::Supervisor(below) => {
+                let (plan, policy) = self.plan(below)?;
+                Ok(PlannedChild::Supervisor(plan, policy))
+            }
+        }
     }
 
     fn supervise(&mut self, plan: SupervisorPlan) {

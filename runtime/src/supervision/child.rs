@@ -1,6 +1,6 @@
 //! One child of a supervisor, as its shell holds it.
 
-use super::{ChildSpec, ChildState, tenant::Tenant, watchdog::Reprieve};
+use super::{Burials, ChildSpec, ChildState, tenant::Tenant, watchdog::Reprieve};
 use crate::time::Time;
 
 /// A child's declaration, and what holds its present life.
@@ -16,6 +16,12 @@ pub(super) struct Child {
 impl Child {
     pub(super) const fn new(spec: ChildSpec) -> Self {
         Self { spec, tenant: None, reprieve: None, is_owed: false }
+    }
+
+    /// Nobody makes it again: what makes it is the user's, and is not dropped here. Returns what is left of its life.
+    pub(super) fn bury(self, burials: &Burials) -> Option<Tenant> {
+        burials.bury(self.spec.name, self.spec.launch);
+        self.tenant
     }
 
     /// Until when it has more time, if this is over.

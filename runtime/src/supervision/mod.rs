@@ -7,6 +7,7 @@
 //! | `child` | one child as its supervisor's shell holds it |
 //! | `guard` | the future around each actor: catches its panics, takes its stop order, reports its end |
 //! | `alone` | one actor under a guard and under no supervisor |
+//! | `burial` | where the user's values are dropped that nobody needs any more |
 //! | `orphans` | what becomes of the children of a supervisor that fails itself |
 //! | `roster` | who is supervised, for the supervisor's owner |
 //! | `ready` | when an actor may say that it is ready |
@@ -20,6 +21,7 @@
 //! | `fault` | faults on purpose, with the feature `fault-points` only |
 
 mod alone;
+mod burial;
 mod child;
 pub mod core;
 #[cfg(not(target_os = "linux"))]
@@ -47,6 +49,7 @@ use self::linux as system;
 pub(crate) use self::panics::writes_the_log;
 pub use self::{
     alone::{Alone, AloneHandle, alone, overseen},
+    burial::Burials,
     core::{
         AutoShutdown, BranchView, ChildId, ChildIds, ChildState, ChildView, Command, Flags, Generation,
         Input, Intensity, Policy, Reason, Refusal, Restart, Strategy,

@@ -5,7 +5,7 @@ use std::{cell::RefCell, collections::BTreeMap, rc::Rc, time::Duration};
 use crate::{
     post::Post,
     supervision::{
-        ChildSpec, Place,
+        Burials, ChildSpec, Place,
         core::{BranchView, ChildId, Input, Plan, Planned, Policy, Reason, Tree},
         supervisor::{PlannedChild, SupervisorPlan},
     },
@@ -146,6 +146,13 @@ impl Roster {
         let (under, spec) = self.arrivals.borrow_mut().remove(&id)?;
         self.listed.borrow_mut().insert(id, listed(&spec));
         Some((under, spec))
+    }
+
+    /// Those that were brought to a supervisor that has ended before it took them in.
+    pub(super) fn bury_arrivals(&self, burials: &Burials) {
+        for (_, (_, spec)) in std::mem::take(&mut *self.arrivals.borrow_mut()) {
+            burials.bury(spec.name, spec.launch);
+        }
     }
 
     pub(super) fn remove(&self, id: ChildId) {

@@ -9,6 +9,7 @@ use crate::{
     supervision::{
         Life, Place, ReadyGate, Reason, Roster, Threads,
         alone::overseen,
+        burial::Burials,
         child::Child,
         core::{ChildId, Command, Flags, Generation, Input, Order, Policy, Refusal},
         guard::Guard,
@@ -97,6 +98,7 @@ pub struct Supervisor {
     roster: Roster,
     children: BTreeMap<ChildId, Child>,
     threads: Rc<RefCell<Threads>>,
+    burials: Burials,
     post: Post<Input>,
     listener: Listener,
     alarm: Option<SpawnHandle>,
@@ -137,12 +139,13 @@ impl Supervisor {
         threads: Rc<RefCell<Threads>>,
         listener: impl FnMut(SupervisorFact) + 'static,
     ) -> Self {
-        let post = Post::new(POST_CAPACITY);
+        let (post, burials) = (Post::new(POST_CAPACITY), threads.borrow().burials());
         let (roster, workers) = Roster::new(plan, seed(), post.clone());
         Self {
             roster,
             children: workers.into_iter().map(|spec| (spec.id, Child::new(spec))).collect(),
             threads,
+            burials,
             post,
             listener: Box::new(listener),
             alarm: None,
@@ -307,6 +310,7 @@ impl Supervisor {
     fn forget(&mut self, id: ChildId) {
         if let Some(child) = self.children.remove(&id) {
             self.threads.borrow_mut().leave(&child.spec.place);
+            child.bury(&self.burials);
         }
         self.roster.remove(id);
     }
@@ -438,19 +442,23 @@ fn say(post: &Post<Input>, input: Input) {
 
 impl Drop for Supervisor {
     fn drop(&mut self) {
+        self.roster.bury_arrivals(&self.burials);
+        let mut orphans = Vec::new();
+        for (id, child) in std::mem::take(&mut self.children) {
+            let stop_within = child.spec.policy.stop_within;
+            let owed = child.is_owed;
+            let tenant = child.bury(&self.burials).filter(|_| owed);
+            orphans.extend(tenant.map(|tenant| (id, Orphan { tenant, stop_within })));
+        }
         match self.progress {
             // None lives.
             Progress::Planned | Progress::HasEnded => return,
             // It panicked, or somebody dropped it: nobody decides for its children any more.
             Progress::Runs => {}
         }
-        let orphan = |(id, child): (ChildId, Child)| {
-            let tenant = child.tenant.filter(|_| child.is_owed)?;
-            Some((id, Orphan { tenant, stop_within: child.spec.policy.stop_within }))
-        };
-        let children = std::mem::take(&mut self.children).into_iter().filter_map(orphan);
         let listener = std::mem::replace(&mut self.listener, Box::new(|_| {}));
-        let orphans = Orphans::take_over(children, self.threads.clone(), self.post.clone(), listener);
+        let (threads, post) = (self.threads.clone(), self.post.clone());
+        let orphans = Orphans::take_over(orphans.into_iter(), threads, post, listener);
         match &self.heir {
             Some(heir) => _ = heir.replace(Some(orphans)),
             None => orphans.end_apart(),

@@ -14,7 +14,7 @@ use actix_rt::{Arbiter, ArbiterHandle};
 use thread_priority::{ThreadId, ThreadPriority, set_thread_priority_and_policy, thread_native_id};
 
 use super::{
-    Place, Reason,
+    Burials, Place, Reason,
     panics::is_the_runtimes,
     place::Owner,
     system,
@@ -129,9 +129,16 @@ pub struct Threads {
     arbiters: BTreeMap<(Owner, String), (Arbiter, Arc<Seat>)>,
     watchdog: Watchdog,
     abandoned: Arc<AtomicUsize>,
+    burials: Burials,
 }
 
 impl Threads {
+    /// Where to drop what is foreign.
+    #[must_use]
+    pub fn burials(&self) -> Burials {
+        self.burials.clone()
+    }
+
     /// The thread of `place`, a new one if it has none that lives.
     ///
     /// # Errors

@@ -1,5 +1,6 @@
 //! Faults on real nodes: what happens, and what does not. One binary, one module a theme.
 
+mod captured;
 mod doors;
 mod ends;
 mod groups;
