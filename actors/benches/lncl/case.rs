@@ -11,7 +11,7 @@ use sinew_figures::{Alone, Beside, End, Figures, Pinning};
 use crate::{
     crowds,
     ends::{self, Memory},
-    processes, raw,
+    processes, raw, tasks,
 };
 
 /// The mean of the paper's Table 1, in nanoseconds.
@@ -28,10 +28,12 @@ pub(crate) enum Way {
     Direct,
     /// The same, the applications looking before they sleep.
     DirectSpin,
+    /// As `Ring`, the applications being tasks of tokio.
+    TaskRing,
 }
 
 impl Way {
-    const ALL: [Self; 4] = [Self::Socket, Self::Ring, Self::Direct, Self::DirectSpin];
+    const ALL: [Self; 5] = [Self::Socket, Self::Ring, Self::Direct, Self::DirectSpin, Self::TaskRing];
 
     const fn name(self) -> &'static str {
         match self {
@@ -39,12 +41,13 @@ impl Way {
             Self::Ring => "ring",
             Self::Direct => "direct",
             Self::DirectSpin => "direct_spin",
+            Self::TaskRing => "task_ring",
         }
     }
 
     const fn references(self) -> &'static [Reference] {
         match self {
-            Self::Socket | Self::Ring | Self::Direct => {
+            Self::Socket | Self::Ring | Self::Direct | Self::TaskRing => {
                 &[Reference::BareFutex, Reference::UnixStream, Reference::Iceoryx2Event]
             }
             Self::DirectSpin => &[Reference::BarePoll, Reference::Iceoryx2Poll],
@@ -54,8 +57,16 @@ impl Way {
     /// Who looks without sleeping needs the other one to have another CPU.
     const fn spins(self) -> bool {
         match self {
-            Self::Socket | Self::Ring | Self::Direct => false,
+            Self::Socket | Self::Ring | Self::Direct | Self::TaskRing => false,
             Self::DirectSpin => true,
+        }
+    }
+
+    /// Whether the applications are tasks: then there are round trips only.
+    const fn is_of_tasks(self) -> bool {
+        match self {
+            Self::Socket | Self::Ring | Self::Direct | Self::DirectSpin => false,
+            Self::TaskRing => true,
         }
     }
 }
@@ -201,6 +212,7 @@ pub(crate) fn all(is_short: bool) -> impl Iterator<Item = Case> {
         .flat_map(move |(way, pinning)| {
             things.clone().into_iter().map(move |what| Case { way, what, pinning })
         })
+        .filter(|case| !case.way.is_of_tasks() || matches!(case.what, What::RoundTrips { .. }))
         // A socket lends nothing.
         .filter(|case| !(matches!(case.what, What::Loan { .. }) && case.way == Way::Socket))
         // In C++ there is the default way alone.
@@ -249,7 +261,11 @@ impl Case {
         let raws: Vec<_> = references
             .map(|reference| (reference.name(), raw::round_trips(*reference, bytes, rounds, self.pinning)))
             .collect();
-        let seen = ends::round_trips(self.way, bytes, rounds, self.pinning);
+        let seen = if self.way.is_of_tasks() {
+            tasks::round_trips(self.way, bytes, rounds, self.pinning)
+        } else {
+            ends::round_trips(self.way, bytes, rounds, self.pinning)
+        };
         for (reference, raw) in &raws {
             Beside {
                 bench: "lncl",
@@ -337,7 +353,10 @@ pub(crate) fn play(role: &str) -> ExitCode {
         }
         ["echo", way, pinning, socket] => {
             raw::pin(pinning, End::Echoing);
-            ends::echo(way_named(way), Memory::Lent, socket);
+            match way_named(way) {
+                way if way.is_of_tasks() => tasks::echo(socket),
+                way => ends::echo(way, Memory::Lent, socket),
+            }
         }
         ["echo_copied", way, pinning, socket] => {
             raw::pin(pinning, End::Echoing);

@@ -21,7 +21,7 @@ const RING_BYTES: usize = 256 * 1024;
 /// Bytes of a ring that takes the longest message in one piece.
 const LONG_RING_BYTES: usize = 4 * 1024 * 1024;
 /// What is sent back as it came.
-const BLOCK: Kind = Kind::named("lncl.block");
+pub(crate) const BLOCK: Kind = Kind::named("lncl.block");
 /// What is sent back with its age in its first bytes.
 const AGED: Kind = Kind::named("lncl.aged");
 /// Packets of the paper's Table 1.
@@ -74,6 +74,7 @@ pub(crate) fn register(way: Way, socket: &str, name: &str) -> Endpoint {
     let registration = match way {
         Way::Socket => Registration::new().transport(Transport::Socket),
         Way::Ring => Registration::new(),
+        Way::TaskRing => unreachable!("its ends are in tasks.rs"),
         Way::Direct => Registration::new().direct(true),
         Way::DirectSpin => Registration::new().direct(true).spin(Spin::For(LOOKS)),
     };

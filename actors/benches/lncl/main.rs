@@ -1,7 +1,8 @@
 //! What a message between two processes of one node costs, beside raw references of the same run.
 //!
 //! `cargo bench -p sinew --bench lncl [-- [--short] WORD...]` runs the cases whose name holds every WORD, each in fresh
-//! processes: a node, and the two applications in processes of their own, which speak through LNCL (`socket`, `ring`) or directly by the blocking NodeAPI.
+//! processes: a node, and the two applications in processes of their own, which speak through LNCL (`socket`, `ring`; `task_ring`: as
+//! tasks of tokio) or directly, by the blocking NodeAPI.
 //! JSON lines are on the standard output, the same as rows of a table on the standard error; `--short` does a tenth of the
 //! rounds of the cases at 1000 bytes. Times are microseconds. Nothing here asserts a time.
 //!
@@ -27,6 +28,8 @@ mod ends;
 mod processes;
 #[cfg(target_os = "linux")]
 mod raw;
+#[cfg(target_os = "linux")]
+mod tasks;
 
 #[cfg(target_os = "linux")]
 fn main() -> std::process::ExitCode {

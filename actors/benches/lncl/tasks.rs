@@ -1,0 +1,59 @@
+//! Sinew's ends as tasks of tokio, each on a runtime of one thread: the same round trips by `AsyncEndpoint`.
+
+use sinew::{AsyncEndpoint, LentMessage, NodeApi, Registration, Tid};
+use sinew_figures::{Figures, Pinning};
+use sinew_runtime::wire::Kind;
+use tokio::runtime::{Builder, Runtime};
+
+use crate::{
+    case::{Rounds, Way, role},
+    ends::{BLOCK, DEADLINE, Home},
+    processes::{Process, say_there},
+};
+
+fn runtime() -> Runtime {
+    Builder::new_current_thread().enable_all().build().expect("a runtime")
+}
+
+async fn register(socket: &str, name: &str) -> AsyncEndpoint {
+    let api = NodeApi::connect(socket).expect("the node's door");
+    let registration = Registration::new().name(name);
+    api.register_transport_address_async(registration).await.expect("an address")
+}
+
+fn filled(endpoint: &mut AsyncEndpoint, to: Tid, kind: Kind, bytes: &[u8]) -> LentMessage {
+    let mut message = endpoint.create_message(to, kind, bytes.len()).expect("not too long");
+    message.copy_from_slice(bytes);
+    message
+}
+
+/// The application that echoes: until the measuring end ends this process.
+pub(crate) fn echo(socket: &str) {
+    runtime().block_on(async {
+        let mut endpoint = register(socket, "echo").await;
+        say_there();
+        loop {
+            let received = endpoint.receive().await.expect("the node lives");
+            let back = filled(&mut endpoint, received.source(), received.kind(), received.bytes());
+            endpoint.send_message(back).await.expect("the node takes it");
+        }
+    });
+}
+
+/// Round trips between two such applications.
+pub(crate) fn round_trips(way: Way, bytes: usize, rounds: Rounds, pinning: Pinning) -> Figures {
+    let home = Home::start(pinning);
+    let _echo = Process::start(&role("echo", way, pinning, home.socket()));
+    let runtime = runtime();
+    let mut endpoint = runtime.block_on(register(home.socket(), "ping"));
+    let to = runtime.block_on(endpoint.resolve("echo", DEADLINE)).expect("the node lives");
+    let (to, mut buffer) = (to.expect("it is registered"), vec![7; bytes]);
+    rounds.time(|| {
+        runtime.block_on(async {
+            let block = filled(&mut endpoint, to, BLOCK, &buffer);
+            endpoint.send_message(block).await.expect("the node takes it");
+            let back = endpoint.receive().await.expect("the echo answers");
+            buffer.copy_from_slice(back.bytes());
+        });
+    })
+}
