@@ -20,6 +20,8 @@
 //!
 //! No socket, no clock: the same calls give the same answers. `docs/protocol/gncl.md` has the bytes.
 
+#[cfg(test)]
+mod model;
 mod receiving;
 mod sending;
 #[cfg(test)]
@@ -34,7 +36,7 @@ use serde::{Deserialize, Serialize};
 const FIRST: u64 = 1;
 
 /// What one side says of both directions: payload of the frame ACK.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub(crate) struct Ack {
     /// Which memory of the receiver of this its sender has: another one has forgotten all that was taken.
     pub(crate) memory: u64,

@@ -19,7 +19,7 @@ pub(crate) enum Arrival {
 }
 
 /// What one node has taken of another's messages.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]
 pub(crate) struct Receiving {
     /// No other memory of the same peer, before or after, has this number.
     memory: u64,

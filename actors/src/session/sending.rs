@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use super::{Ack, FIRST};
 
 /// How much is kept without an acknowledgement. At least one message always is.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(crate) struct Window {
     /// Messages at most. A further one waits.
     pub(crate) messages: usize,
@@ -13,7 +13,7 @@ pub(crate) struct Window {
     pub(crate) bytes: usize,
 }
 
-#[derive(Debug)]
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
 struct Kept<M> {
     /// `None`: it has lost its use.
     message: Option<M>,
@@ -33,7 +33,7 @@ pub(crate) enum Heard<M> {
 }
 
 /// What one node sends to another.
-#[derive(Debug)]
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub(crate) struct Sending<M> {
     window: Window,
     epoch: u64,
