@@ -124,6 +124,28 @@ fn requests_to_another_node_are_answered_and_every_confirmed_send_has_its_outcom
 }
 
 #[test]
+fn all_that_was_sent_arrives_before_the_node_that_sent_it_is_gone() {
+    const WORDS: usize = 900;
+    let (spec, heard) = oracle("oracle");
+    let (here, _there) = tell(
+        |node| node.app(spec),
+        &["oracle"],
+        async |sender: sinew::Sender| {
+            // More than sockets and the session's window hold: most of it waits when the node is told to stop.
+            for number in 0..WORDS {
+                let text = format!("{number:>16384}");
+                sender.send("oracle", &Word { text }).expect("there is room for it");
+            }
+        },
+    );
+    here.stop();
+    for number in 0..WORDS {
+        let word = heard.recv_timeout(DEADLINE).expect("it was sent before the node stopped");
+        assert_eq!(word.trim_start(), number.to_string());
+    }
+}
+
+#[test]
 fn a_group_and_a_broadcast_reach_each_member_on_every_node_once() {
     let ((first, at_first), (second, at_second)) = (oracle("first"), oracle("second"));
     let (here, there) = tell(

@@ -10,7 +10,9 @@ use std::{
     time::Duration,
 };
 
-use actix::{Actor, ActorFutureExt, AsyncContext, Context, Running, SpawnHandle, StreamHandler, fut};
+use actix::{
+    Actor, ActorContext, ActorFutureExt, AsyncContext, Context, Running, SpawnHandle, StreamHandler, fut,
+};
 use sinew_runtime::{
     post::Post,
     supervision::ReadyGate,
@@ -43,6 +45,12 @@ use crate::{
 /// How often expired messages are looked for in the queues of peers without a connection.
 const EXPIRY_PERIOD: Duration = Duration::from_millis(50);
 
+/// Time that peers have, when the node is stopped, to take what waits for them and hang up. Whoever has more to send
+/// than goes over its network in this time loses it.
+const LINGER: Duration = Duration::from_secs(1);
+/// How often it is looked whether they have.
+const LINGER_LOOK: Duration = Duration::from_millis(1);
+
 /// GNCL's actor.
 pub(crate) struct Gncl {
     stores: Arc<Stores>,
@@ -50,6 +58,8 @@ pub(crate) struct Gncl {
     core: Core,
     wires: BTreeMap<ConnectionId, Wire>,
     alarm: Option<(Time, SpawnHandle)>,
+    /// When it goes, whoever has not hung up; set once the node is being stopped.
+    goes_at: Option<Time>,
 }
 
 /// One connection and what runs for it.
@@ -68,7 +78,7 @@ impl Gncl {
     pub(crate) fn new(stores: Arc<Stores>, ready: ReadyGate) -> Self {
         let seed = Time::now().as_nanos() ^ u64::from(stores.node.bits());
         let core = Core::new(settings(&stores), seed);
-        Self { stores, ready: Some(ready), core, wires: BTreeMap::new(), alarm: None }
+        Self { stores, ready: Some(ready), core, wires: BTreeMap::new(), alarm: None, goes_at: None }
     }
 
     /// The listener: the one that is open already, if this layer was restarted.
@@ -282,6 +292,11 @@ impl Gncl {
         }
     }
 
+    /// Whether everybody has hung up, which a peer does at our GOODBYE, behind all that waited; or the time is over.
+    fn may_go(&self, now: Time) -> bool {
+        self.goes_at.is_none_or(|at| at <= now) || self.wires.values().all(|wire| wire.link.is_none())
+    }
+
     /// Cuts what a former instance of this layer, or this one, has connected.
     fn cut_all(&self) {
         for peer in self.stores.gncl.peers() {
@@ -375,11 +390,21 @@ impl Actor for Gncl {
 
     fn stopping(&mut self, ctx: &mut Self::Context) -> Running {
         // SYNC: Relaxed; the order to stop came through the supervisor's lock, after the flag was set.
-        if self.stores.stopping.load(Ordering::Relaxed) {
+        if !self.stores.stopping.load(Ordering::Relaxed) {
+            return Running::Stop;
+        }
+        let now = Time::now();
+        if self.goes_at.is_none() {
+            self.goes_at = Some(now + LINGER);
             self.input(Input::LeaveRequested, ctx);
             self.stores.gncl.close();
+            ctx.run_interval(LINGER_LOOK, |actor, ctx| {
+                if actor.may_go(Time::now()) {
+                    ctx.stop();
+                }
+            });
         }
-        Running::Stop
+        if self.may_go(now) { Running::Stop } else { Running::Continue }
     }
 }
 

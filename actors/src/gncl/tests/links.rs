@@ -203,6 +203,9 @@ fn a_node_that_leaves_says_goodbye_last_and_its_peer_knows_that_it_left() {
     run(async {
         let (mut a, mut b) = pair().await;
         let mut inbox = b.app(1);
+        a.send(b.tid(1), b"the first word");
+        next("the first word", &mut inbox).await;
+        // What is sent now is on the wire at once: this layer's thread ends without the time that a supervisor gives.
         a.send(b.tid(1), b"the last word");
         a.stores.stopping.store(true, Ordering::Relaxed);
         a.stop_layer();
