@@ -32,6 +32,8 @@ pub struct Post<E> {
 struct Shared<E> {
     queue: VecDeque<E>,
     capacity: usize,
+    /// Nobody will read it any more.
+    is_closed: bool,
     epoch: u64,
     waker: Option<Waker>,
     refused: u64,
@@ -56,6 +58,7 @@ impl<E> Post<E> {
         let shared = Shared {
             queue: VecDeque::new(),
             capacity,
+            is_closed: false,
             epoch: 0,
             waker: None,
             refused: 0,
@@ -69,7 +72,7 @@ impl<E> Post<E> {
     /// Posts an event.
     ///
     /// # Errors
-    /// The event itself, if the post is full (it is counted), or if the actor that posts it was replaced.
+    /// The event itself, if the post is full (it is counted), if it is closed, or if the actor that posts it was replaced.
     pub fn post(&self, event: E) -> Result<(), E> {
         if Vitals::is_present_over() {
             // A layer that was replaced has nothing more to say.
@@ -77,6 +80,9 @@ impl<E> Post<E> {
         }
         let waker = {
             let mut shared = lock(&self.shared);
+            if shared.is_closed {
+                return Err(event);
+            }
             if shared.queue.len() >= shared.capacity {
                 shared.refused += 1;
                 return Err(event);
@@ -89,6 +95,20 @@ impl<E> Post<E> {
             waker.wake();
         }
         Ok(())
+    }
+
+    /// Takes no events any more, because nobody will read them. Returns those that nobody has read.
+    #[must_use]
+    pub fn close(&self) -> VecDeque<E> {
+        let mut shared = lock(&self.shared);
+        shared.is_closed = true;
+        std::mem::take(&mut shared.queue)
+    }
+
+    /// Whether it was [closed](Self::close).
+    #[must_use]
+    pub fn is_closed(&self) -> bool {
+        lock(&self.shared).is_closed
     }
 
     /// How many events were refused because the post was full.

@@ -2,7 +2,7 @@
 
 use std::sync::Mutex;
 
-use sinew::{CommandError, LifeState, NodeEnd, Refusal, Rejection, Supervised, prelude::*};
+use sinew::{CommandError, LifeState, NodeEnd, Refusal, Rejection, StartError, Supervised, prelude::*};
 use sinew_tests::{
     DEADLINE, Ground, Log, all_run,
     puppet::{Job, Puppet, Seen, Stage, desk, lives, outcome_of_job},
@@ -199,6 +199,24 @@ fn only_a_stopped_application_can_be_restarted_or_removed_and_a_removed_one_free
 }
 
 #[test]
+fn who_may_not_do_what_he_asks_is_told_what_to_do_instead() {
+    let order = Log::default();
+    let node = Ground::new().node("node").app(member("app", &order).0).start().expect("a node");
+    all_run(&[&node]);
+    let handle = node.handle();
+    let words = |result: Result<(), CommandError>| result.expect_err("it is refused").to_string();
+    let runs = words(handle.remove_app("app"));
+    assert!(runs.contains("'app'") && runs.contains("stop it first, with `stop_app`"), "{runs}");
+    for layer in ["LNCL", "sync manager", "GNCL", "NDL"] {
+        let orders = [handle.stop_app(layer), handle.restart_app(layer), handle.remove_app(layer)];
+        for refused in orders.into_iter().chain([handle.add_app(member("second", &order).0, Some(layer))]) {
+            let refused = words(refused);
+            assert!(refused.contains("is a layer") && refused.contains("`NodeHandle::stop`"), "{refused}");
+        }
+    }
+}
+
+#[test]
 fn a_stopped_supervisor_has_stopped_its_children_and_brings_them_back() {
     let order = Log::default();
     let [(a, _), (b, _)] = ["a", "b"].map(|name| member(name, &order));
@@ -264,6 +282,21 @@ fn a_node_that_has_ended_answers_no_command() {
     node.stop();
     assert!(matches!(handle.stop_app("app"), Err(CommandError::NotRunning)));
     assert!(matches!(handle.add_app(member("b", &order).0, None), Err(CommandError::NotRunning)));
+    assert!(matches!(handle.wait_until_running(DEADLINE), Err(StartError::Ended)));
+}
+
+#[test]
+fn who_waits_until_all_run_is_told_that_the_node_ended_and_not_that_nobody_is_waited_for() {
+    let order = Log::default();
+    let waits = member("app", &order).0.requires(["nobody"]);
+    let node = Ground::new().node("node").app(waits).start().expect("a node");
+    let (handle, (say, heard)) = (node.handle(), std::sync::mpsc::sync_channel(1));
+    std::thread::spawn(move || say.send(handle.wait_until_running(DEADLINE * 2)).expect("it is heard"));
+    let handle = node.handle();
+    until("the application is waited for", || (!handle.waiting().is_empty()).then_some(()));
+    node.stop();
+    let told = heard.recv_timeout(DEADLINE).expect("it does not wait longer than the node lives");
+    assert!(matches!(told, Err(StartError::Ended)), "{told:?}");
 }
 
 #[test]

@@ -88,6 +88,12 @@ pub enum StartError {
         /// The time that was given.
         within: Duration,
     },
+    /// The node ends, or has ended.
+    #[error("the node ends, or has ended; `Node::wait_for_end` says how")]
+    Ended,
+    /// The node's root has more orders than it can keep. Nothing was asked.
+    #[error("the node's root has more orders waiting than it can keep; ask again, and not so often")]
+    Busy,
     /// A fault that was to strike on purpose cannot.
     #[cfg(feature = "fault-points")]
     #[error(transparent)]

@@ -2,7 +2,10 @@
 
 use std::{
     collections::{BTreeMap, VecDeque},
-    sync::{atomic::Ordering, mpsc::SyncSender},
+    sync::{
+        atomic::Ordering,
+        mpsc::{RecvTimeoutError, SyncSender},
+    },
     time::Duration,
 };
 
@@ -12,7 +15,8 @@ use sinew_runtime::{
 };
 
 use super::{
-    NodeHandle, StartError,
+    NodeHandle, StartError, Told,
+    layers::LAYERS,
     root::{Phase, Root, RootEvent},
 };
 
@@ -28,6 +32,15 @@ pub enum CommandError {
     /// New children go under supervisors only. Nothing has changed.
     #[error("'{0}' is an application; children are added under a supervisor")]
     NotASupervisor(String),
+    /// A layer is not at the user's command. Nothing has changed.
+    #[error(
+        "'{0}' is a layer of the node: it lives as long as the node does, which restarts it when it fails; to end both, \
+         `NodeHandle::stop`"
+    )]
+    Layer(String),
+    /// The node's root has more orders than it can keep. Nothing has changed.
+    #[error("the node's root has more orders waiting than it can keep; try again, and not so often")]
+    Busy,
     /// The supervisor refuses. Nothing has changed.
     #[error("'{name}': {why}")]
     Refused {
@@ -125,8 +138,16 @@ impl NodeHandle {
             return Err(CommandError::NotRunning);
         }
         let (answer, answered) = std::sync::mpsc::sync_channel(1);
-        self.tell(RootEvent::Ordered(Ordered { what, answer }));
-        answered.recv_timeout(WITHIN).unwrap_or(Err(CommandError::NoAnswer(name)))
+        match self.tell(RootEvent::Ordered(Ordered { what, answer })) {
+            Told::Taken => {}
+            Told::TooMany => return Err(CommandError::Busy),
+            Told::HasEnded => return Err(CommandError::NotRunning),
+        }
+        match answered.recv_timeout(WITHIN) {
+            Ok(answer) => answer,
+            Err(RecvTimeoutError::Timeout) => Err(CommandError::NoAnswer(name)),
+            Err(RecvTimeoutError::Disconnected) => Err(CommandError::NotRunning),
+        }
     }
 }
 
@@ -161,7 +182,7 @@ impl Root {
         }
         let under = match under {
             None => roster.top(),
-            Some(name) => self.apps.named(name).ok_or_else(|| CommandError::Unknown(name.to_owned()))?,
+            Some(name) => self.named(name)?,
         };
         if self.apps.contains(under) {
             return Err(CommandError::NotASupervisor(
@@ -178,23 +199,31 @@ impl Root {
             self.burials.bury(spec.name.clone(), spec);
             self.apps.remove(&self.stores, id);
             self.absences.forget(id);
-            return Err(CommandError::NotRunning);
+            return Err(CommandError::Busy);
         }
         Ok(id)
+    }
+
+    fn named(&self, name: &str) -> Result<ChildId, CommandError> {
+        let unknown = || match LAYERS.contains(&name) {
+            true => CommandError::Layer(name.to_owned()),
+            false => CommandError::Unknown(name.to_owned()),
+        };
+        self.apps.named(name).ok_or_else(unknown)
     }
 
     fn command(&self, command: Command, name: &str) -> Result<ChildId, CommandError> {
         let (Phase::Running, Some(roster)) = (self.phase, &self.app_supervisor) else {
             return Err(CommandError::NotRunning);
         };
-        let id = self.apps.named(name).ok_or_else(|| CommandError::Unknown(name.to_owned()))?;
+        let id = self.named(name)?;
         let input = match command {
             Command::Terminate => Input::TerminateChild(id),
             Command::Restart => Input::RestartChild(id),
             Command::Delete => Input::DeleteChild(id),
             Command::Add => return Err(CommandError::Unknown(name.to_owned())),
         };
-        roster.tell(input).map_err(|_| CommandError::NotRunning)?;
+        roster.tell(input).map_err(|_| CommandError::Busy)?;
         Ok(id)
     }
 

@@ -38,12 +38,13 @@ impl NodeHandle {
 
     /// Makes the root of the node panic: the one fault that ends it.
     pub fn fail_root(&self) {
-        self.tell(super::RootEvent::Fail);
+        // One that has ended cannot fail any more.
+        let _ = self.tell(super::RootEvent::Fail);
     }
 
     /// Makes the supervisor of all applications panic.
     pub fn fail_supervisor(&self) {
-        self.tell(super::RootEvent::FailSupervisor);
+        let _ = self.tell(super::RootEvent::FailSupervisor);
     }
 
     /// How often the actor called `name` was started and became ready, if this node has one of this name.

@@ -35,7 +35,10 @@ pub use tree::{LifeState, MailboxState, Supervised, Supervises, SupervisionTree}
 use std::{
     net::SocketAddr,
     process::ExitCode,
-    sync::{Arc, mpsc::Receiver},
+    sync::{
+        Arc,
+        mpsc::{Receiver, RecvTimeoutError},
+    },
     time::Duration,
 };
 
@@ -87,6 +90,17 @@ pub struct Traffic {
     pub waiting: usize,
     /// Confirmed ones whose outcome is not known yet.
     pub unconfirmed: usize,
+}
+
+/// What became of an order to the root.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Told {
+    /// It will be read, unless the node ends before.
+    Taken,
+    /// So many wait already; the order was not given, which is logged.
+    TooMany,
+    /// The node has ended.
+    HasEnded,
 }
 
 /// Asks about a running node and stops it, from any thread.
@@ -141,7 +155,7 @@ impl Node {
         if self.handle.is_bystander {
             wait_for_ever();
         }
-        self.handle.tell(RootEvent::HeedSignals);
+        let _ = self.handle.tell(RootEvent::HeedSignals);
         match self.wait() {
             NodeEnd::Stopped => ExitCode::SUCCESS,
             NodeEnd::GaveUp(why) => {
@@ -255,27 +269,62 @@ impl NodeHandle {
 
     /// Tells the node to stop; returns at once.
     pub fn stop(&self) {
-        self.tell(RootEvent::StopOrdered);
+        // One that has ended is stopped.
+        let _ = self.tell(RootEvent::StopOrdered);
     }
 
     /// Waits until every application of this node runs.
     ///
     /// # Errors
-    /// Who still waits after `within`, and for whom.
+    /// Who still waits after `within`, and for whom; or that the node ends, or takes no order.
     pub fn wait_until_running(&self, within: Duration) -> Result<(), StartError> {
         if self.is_bystander {
             return Ok(());
         }
         let (say, heard) = std::sync::mpsc::sync_channel(1);
-        self.tell(RootEvent::TellWhenRunning(say));
-        heard
-            .recv_timeout(within)
-            .unwrap_or_else(|_| Err(StartError::Waiting { waiting: self.waiting(), within }))
+        match self.tell(RootEvent::TellWhenRunning(say)) {
+            Told::Taken => {}
+            Told::TooMany => return Err(StartError::Busy),
+            Told::HasEnded => return Err(StartError::Ended),
+        }
+        match heard.recv_timeout(within) {
+            Ok(answer) => answer,
+            Err(RecvTimeoutError::Disconnected) => Err(StartError::Ended),
+            Err(RecvTimeoutError::Timeout) => Err(StartError::Waiting { waiting: self.waiting(), within }),
+        }
     }
 
-    fn tell(&self, event: RootEvent) {
-        if self.root.post(event).is_err() {
-            log::error!(node = self.stores.config.name, "the root's post is full; the order was not given");
+    fn tell(&self, event: RootEvent) -> Told {
+        match self.root.post(event) {
+            Ok(()) => Told::Taken,
+            Err(_) if self.root.is_closed() => Told::HasEnded,
+            Err(_) => {
+                log::error!(
+                    node = self.stores.config.name,
+                    "the root's post is full; the order was not given"
+                );
+                Told::TooMany
+            }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::NodeConfig;
+
+    #[test]
+    fn who_asks_a_root_that_takes_no_more_orders_is_told_so_and_not_that_nobody_waits() {
+        // Given: a root that never comes to its orders
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let handle = NodeHandle { root: stores.posts.root.clone(), stores, is_bystander: false };
+        let short = Duration::from_millis(1);
+        assert!(matches!(handle.wait_until_running(short), Err(StartError::Waiting { .. })));
+        while handle.tell(RootEvent::HeedSignals) == Told::Taken {}
+        // When, then
+        assert!(matches!(handle.wait_until_running(short), Err(StartError::Busy)));
+        drop(handle.root.close());
+        assert!(matches!(handle.wait_until_running(short), Err(StartError::Ended)));
     }
 }

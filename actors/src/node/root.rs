@@ -122,6 +122,7 @@ pub(super) fn run(
     let system = actix::System::new();
     let heirs = Heirs::default();
     let (kept, last_word) = (stores.clone(), ended.clone());
+    let post = stores.posts.root.clone();
     let threads = Rc::new(RefCell::new(Threads::default()));
     let burials = threads.borrow().burials();
     let root = Root {
@@ -151,6 +152,8 @@ pub(super) fn run(
         crate::log::error!(%error, "the root's event loop failed");
     }
     threads.borrow_mut().stop();
+    // Whoever waits for an answer has it now: there will be none.
+    burials.bury("orders that came too late", post.close());
     burials.wait(BURIED_WITHIN);
 }
 
@@ -415,6 +418,11 @@ impl Root {
     }
 
     fn tell_if_running(&mut self) {
+        match self.phase {
+            Phase::StartingLayers | Phase::Running => {}
+            // Applications that have ended for good are no applications that run. Dropped, this says that the node ends.
+            Phase::StoppingApps | Phase::StoppingLayers => return self.tell_when_running.clear(),
+        }
         let is_running = self.app_supervisor.is_some() && self.apps.all_run();
         // Once one of them is removed, the circle is open.
         self.cycle.take_if(|cycle| !cycle.ours.iter().all(|id| self.apps.contains(*id)));
@@ -437,6 +445,7 @@ impl Root {
         }
         crate::log::info!(node = self.stores.config.name, "stops");
         self.phase = Phase::StoppingApps;
+        self.tell_if_running();
         match &self.app_supervisor {
             Some(supervisor) => order(supervisor, Input::StopOrdered),
             None => self.stop_layers(),

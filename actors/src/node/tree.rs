@@ -9,7 +9,7 @@ use sinew_runtime::{
 };
 
 use super::{
-    CommandError, NodeHandle,
+    CommandError, NodeHandle, Told,
     root::{Root, RootEvent},
 };
 use crate::stores::lock;
@@ -105,13 +105,15 @@ impl NodeHandle {
     /// hangs or floods is shown like all others, and no message takes longer for it.
     ///
     /// # Errors
-    /// The node does not run.
+    /// The node does not run, or its root has too many orders.
     pub fn tree(&self) -> Result<SupervisionTree, CommandError> {
         if self.is_bystander || self.stores.stopping.load(Ordering::Relaxed) {
             return Err(CommandError::NotRunning);
         }
         let (answer, answered) = std::sync::mpsc::sync_channel(1);
-        self.tell(RootEvent::TellTree(answer));
+        if self.tell(RootEvent::TellTree(answer)) == Told::TooMany {
+            return Err(CommandError::Busy);
+        }
         answered.recv_timeout(WITHIN).map_err(|_| CommandError::NotRunning)
     }
 }

@@ -190,6 +190,32 @@ fn neighbours_of_a_hung_application_move_to_another_thread_with_their_messages()
 }
 
 #[test]
+fn a_temporary_neighbour_of_a_hung_application_is_gone_and_a_transient_one_comes_back() {
+    let gate = Opener(Gate::default());
+    let blocks = gate.0.clone();
+    let stage = Stage::new().got(move |_, _| blocks.wait());
+    let ((wild, at_wild), (desk, key)) = (stage.app("wild"), desk("desk"));
+    let ((once, at_once), (calm, at_calm)) = (Stage::new().app("once"), Stage::new().app("calm"));
+    let place = || Place::thread("shared");
+    let node = Ground::new()
+        .node("node")
+        .app(wild.place(place()).progress_within(BUDGET))
+        .app(once.place(place()).restart(Restart::Temporary))
+        .app(calm.place(place()).restart(Restart::Transient))
+        .app(desk)
+        .start()
+        .expect("a node");
+    all_run(&[&node]);
+    // When
+    send_jobs(&key.sender(), "wild", [1]);
+    // Then
+    at_calm.wait_for(Seen::Started(2));
+    until("its name is free", || node.handle().resolve("once").is_none().then_some(()));
+    at_wild.wait_for(Seen::Started(2));
+    assert_eq!(lives(&at_once), 1, "whoever ended it: it is not started again");
+}
+
+#[test]
 fn a_slow_application_within_its_budget_is_not_accused() {
     let (_node, sender, log) = perform(Stage::new(), |app| app.fault(Fault::slow(BUDGET / 10).at_every(1)));
     send_jobs(&sender, "puppet", 1..=30);

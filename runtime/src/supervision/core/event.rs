@@ -77,10 +77,10 @@ pub enum Refusal {
     #[error("this child is there already")]
     Present,
     /// The child lives, or is about to be started.
-    #[error("the child runs; terminate it first")]
+    #[error("it runs; stop it first, with `stop_app`")]
     Running,
     /// The child failed and is about to be started again.
-    #[error("the child is being restarted; terminate it first")]
+    #[error("it is being restarted; stop it first, with `stop_app`")]
     Restarting,
     /// The supervisor stops all its children.
     #[error("its supervisor ends")]
