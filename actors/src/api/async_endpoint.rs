@@ -28,7 +28,8 @@ use super::{
 ///
 /// It belongs to the runtime in which it was registered, with I/O and time enabled. A wait costs one wake of the task's
 /// thread, of which none is this endpoint's own: only registering, and coming back to a node, take a thread of the runtime's
-/// pool for blocking work meanwhile. Its messages go through the node: direct links are for threads.
+/// pool for blocking work meanwhile. With a direct link it looks every 20 ms, as a thread does that waits, and a direct link
+/// that is full is looked at again after 1 ms, doubling to 20.
 #[derive(Debug)]
 pub struct AsyncEndpoint {
     endpoint: Endpoint,
@@ -37,7 +38,6 @@ pub struct AsyncEndpoint {
 impl AsyncEndpoint {
     pub(super) async fn register(path: &Path, mut registration: Registration) -> Result<Self, ApiError> {
         registration.link.bell = BellKind::Socket;
-        registration.register.direct = false;
         let wanted = Arc::new(());
         let (is_wanted, path) = (Arc::downgrade(&wanted), path.to_owned());
         let registered = spawn_blocking(move || {

@@ -20,7 +20,7 @@ use sinew_runtime::{
     time::Time,
     wire::{Flags, Kind, Message},
 };
-use sinew_shm::{Any, AnyError, BellKind, Offer, Spin, Waiter};
+use sinew_shm::{Any, AnyError, Offer, Spin, Waiter};
 
 use super::{
     ApiError,
@@ -249,7 +249,7 @@ impl Direct {
     }
 
     fn prepare(&self, socket: &UnixStream) -> Result<Exchange, ExchangeError> {
-        let exchange = Exchange::prepare(rings::capacity(self.terms.ring_bytes), BellKind::Futex)?;
+        let exchange = Exchange::prepare(rings::capacity(self.terms.ring_bytes), self.terms.options.bell)?;
         exchange.offer(socket)?;
         Ok(exchange)
     }
@@ -400,6 +400,18 @@ impl Direct {
         }
         self.hear_at = now + NAP;
         self.routes.is_asking()
+    }
+
+    /// Whether something may be due that nobody rings for: a SWITCH, the end of a link that is not read yet.
+    pub(super) fn is_to_be_looked_at(&self) -> bool {
+        !self.is_empty() || self.routes.is_asking()
+    }
+
+    /// A task has heard something of the open links.
+    pub(super) const fn heard(&mut self, has_one_hung_up: bool) {
+        if has_one_hung_up {
+            self.look_at = Time::ZERO;
+        }
     }
 
     /// Ends the open link at `index`, whose ring holds what it cannot.

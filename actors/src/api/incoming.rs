@@ -147,7 +147,9 @@ impl Endpoint {
     pub(super) async fn wait(&mut self, deadline: Time) {
         match &mut self.form {
             Form::Thread => self.block(deadline),
-            Form::Reactor(reactor) => reactor.wait(&mut self.reader, &self.writer, deadline).await,
+            Form::Reactor(reactor) => {
+                reactor.wait(&mut self.reader, &self.writer, &mut self.direct, deadline).await;
+            }
         }
     }
 

@@ -128,7 +128,7 @@ impl Endpoint {
         let destination = self.absolute(draft.header.destination);
         if let Some(link) = self.way(destination, now) {
             draft.header.destination = destination;
-            match self.send_on(link, draft)? {
+            match self.send_on(link, draft).await? {
                 None => return Ok(Some(link)),
                 Some(back) => draft = back,
             }
@@ -165,7 +165,7 @@ impl Endpoint {
     ///
     /// # Errors
     /// [`ApiError::Stalled`]: nothing of it was written. Of what was written in part the rest goes out with later calls.
-    fn send_on(&mut self, link: LinkNumber, draft: Draft) -> Result<Option<Draft>, ApiError> {
+    async fn send_on(&mut self, link: LinkNumber, draft: Draft) -> Result<Option<Draft>, ApiError> {
         let (length, patience) = (HEADER_LEN + draft.payload.len(), self.home.options.patience);
         // `None`: it is begun.
         let mut left = Some(draft);
@@ -187,7 +187,11 @@ impl Endpoint {
                 return left.map_or(Ok(None), |_| Err(ApiError::Stalled(patience)));
             }
             self.take_in_while_writing(link);
-            self.direct.await_room(link, length, pause.min(until.since(now)));
+            match self.form {
+                Form::Thread => self.direct.await_room(link, length, pause.min(until.since(now))),
+                // Nobody rings for room here: it is looked for again after the pause, or when something comes.
+                Form::Reactor(_) => self.wait(until.min(now + pause)).await,
+            }
             pause = (pause * 2).min(NAP);
         }
     }

@@ -3,7 +3,10 @@
 //! The bells of the ring, or the socket, are watched through descriptors of their own, so that an end of the link takes
 //! nothing away under the reactor. One wake of the task's thread for each wait that was in earnest, as a thread has.
 
+mod links;
+
 use std::{
+    future::poll_fn,
     io,
     os::{
         fd::{AsFd, BorrowedFd},
@@ -18,8 +21,11 @@ use sinew_runtime::{time::Time, wire::HEADER_LEN};
 use sinew_shm::Armed;
 use tokio::{io::Interest, net::UnixStream, sync::oneshot, task::spawn_blocking};
 
+use links::{Heard, Links, forget};
+
 use super::{
     ApiError,
+    direct::{Direct, Standing},
     lent::{Content, Draft},
     link::{
         Link, Progress, Reader, Writer,
@@ -31,6 +37,7 @@ use super::{
 /// What is watched for a task.
 pub(super) struct Reactor {
     ears: Ears,
+    links: Links,
     /// What is left of a frame of which a part is in the ring.
     rest: Option<Rest>,
     /// The way back, while it is looked for.
@@ -52,13 +59,21 @@ enum Ears {
 impl Reactor {
     /// Watches a link, for the runtime of the calling task.
     pub(super) fn new(reader: &Reader, writer: &Writer) -> io::Result<Self> {
-        Ok(Self { ears: Ears::of(reader, writer)?, rest: None, home: None, wanted: Arc::new(()) })
+        let (ears, links) = (Ears::of(reader, writer)?, Links::default());
+        Ok(Self { ears, links, rest: None, home: None, wanted: Arc::new(()) })
     }
 
     /// Waits until there may be something to read, or to do, until `deadline` at most.
-    pub(super) async fn wait(&mut self, reader: &mut Reader, writer: &Writer, deadline: Time) {
+    pub(super) async fn wait(
+        &mut self,
+        reader: &mut Reader,
+        writer: &Writer,
+        direct: &mut Direct,
+        deadline: Time,
+    ) {
         let owes = self.rest.is_some() || writer.owes();
-        let deadline = if owes { deadline.min(Time::now() + NAP) } else { deadline };
+        let naps = owes || direct.is_to_be_looked_at();
+        let deadline = direct.wake_by(if naps { deadline.min(Time::now() + NAP) } else { deadline });
         match (&self.ears, reader) {
             (Ears::Socket(socket), _) => tokio::select! {
                 () = ready(socket, Interest::READABLE, PollFlags::IN) => {}
@@ -66,16 +81,38 @@ impl Reactor {
                 () = until(deadline) => {}
             },
             (Ears::Ring { message, socket, .. }, Reader::Ring(reader)) => {
-                let Some(armed) = Listening::begin(reader) else { return };
-                tokio::select! {
-                    () = rung(message) => {}
-                    () = ready(socket, Interest::READABLE, PollFlags::RDHUP) => armed.0.look_at_once(),
-                    () = writer.owing() => {}
-                    () = until(deadline) => {}
-                }
+                self.links.follow(&direct.open);
+                let Some(mut listening) = Listening::begin(Some(reader), &mut direct.open) else { return };
+                let links = &mut self.links;
+                let heard = tokio::select! {
+                    () = rung(message) => Heard::Bell,
+                    () = ready(socket, Interest::READABLE, PollFlags::RDHUP) => {
+                        listening.look_at_once();
+                        Heard::Bell
+                    }
+                    heard = poll_fn(|cx| links.poll(cx)) => heard,
+                    () = writer.owing() => Heard::Bell,
+                    () = until(deadline) => Heard::Bell,
+                };
+                drop(listening);
+                direct.heard(heard == Heard::HungUp);
             }
             (Ears::Ring { .. }, Reader::Socket(_)) => unreachable!("both are of one link"),
         }
+    }
+
+    /// The same while there is no node: for direct links alone.
+    async fn wait_for_links(&mut self, direct: &mut Direct, deadline: Time) {
+        let deadline = direct.wake_by(deadline.min(Time::now() + NAP));
+        self.links.follow(&direct.open);
+        let Some(listening) = Listening::begin(None, &mut direct.open) else { return };
+        let links = &mut self.links;
+        let heard = tokio::select! {
+            heard = poll_fn(|cx| links.poll(cx)) => heard,
+            () = until(deadline) => Heard::Bell,
+        };
+        drop(listening);
+        direct.heard(heard == Heard::HungUp);
     }
 
     /// Writes a message; waits for room for `patience` at most. A message of which nothing was written when this is dropped
@@ -200,10 +237,19 @@ impl Reactor {
         link.ok()
     }
 
-    /// Waits until the way back is found, until `deadline` at most.
-    pub(super) async fn await_home(&mut self, home: &Home, deadline: Time) -> Option<Link> {
+    /// Waits until the way back is found, until something comes on a direct link, until `deadline` at most.
+    pub(super) async fn await_home(
+        &mut self,
+        home: &Home,
+        direct: &mut Direct,
+        deadline: Time,
+    ) -> Option<Link> {
         if let Some(link) = self.look_home(home) {
             return Some(link);
+        }
+        if !direct.open.is_empty() {
+            self.wait_for_links(direct, deadline).await;
+            return self.look_home(home);
         }
         let found = self.home.as_mut()?;
         let link = tokio::select! {
@@ -237,32 +283,51 @@ impl Ears {
     }
 }
 
-/// A reader that has announced that it sleeps; awake again when dropped.
-struct Listening<'a>(&'a mut ring::Reader);
+/// Readers that have announced that they sleep; awake again when dropped.
+struct Listening<'a> {
+    node: Option<&'a mut ring::Reader>,
+    links: &'a mut [Standing],
+}
 
 impl<'a> Listening<'a> {
     /// `None` if there is something to do already.
-    fn begin(reader: &'a mut ring::Reader) -> Option<Self> {
-        (reader.arm() == Armed::Sleep).then(|| Self(reader))
+    fn begin(node: Option<&'a mut ring::Reader>, links: &'a mut [Standing]) -> Option<Self> {
+        let mut listening = Self { node, links };
+        let is_silent = listening.node.as_mut().is_none_or(|node| node.arm() == Armed::Sleep)
+            && listening.links.iter_mut().all(|link| link.arm() == Armed::Sleep);
+        is_silent.then_some(listening)
+    }
+
+    /// The node's socket is to be looked at.
+    fn look_at_once(&mut self) {
+        if let Some(node) = &mut self.node {
+            node.look_at_once();
+        }
     }
 }
 
 impl Drop for Listening<'_> {
     fn drop(&mut self) {
-        self.0.disarm();
+        if let Some(node) = &mut self.node {
+            node.disarm();
+        }
+        self.links.iter_mut().for_each(Standing::disarm);
     }
 }
 
-/// Has the reactor watch what is behind a descriptor that does not block.
+/// Has the reactor watch what is behind a descriptor.
 fn watch(fd: BorrowedFd<'_>) -> io::Result<UnixStream> {
-    UnixStream::from_std(net::UnixStream::from(fd.try_clone_to_owned()?))
+    let socket = net::UnixStream::from(fd.try_clone_to_owned()?);
+    // The reactor asks for it; here nothing waits at a descriptor in any case.
+    socket.set_nonblocking(true)?;
+    UnixStream::from_std(socket)
 }
 
 /// Ends when a bell rings. What it was rung for is looked at after this, so that no ring is lost.
 async fn rung(bell: &UnixStream) {
     // An error is an end, which shows elsewhere.
     if bell.readable().await.is_ok() {
-        let _ = bell.try_io(Interest::READABLE, || Err::<(), _>(io::ErrorKind::WouldBlock.into()));
+        forget(bell);
     }
 }
 

@@ -186,7 +186,7 @@ impl Endpoint {
     /// Comes back, or waits until the next try, until something comes on a direct link, or until `deadline`.
     pub(super) async fn await_return(&mut self, deadline: Time) {
         if let Form::Reactor(reactor) = &mut self.form {
-            if let Some(link) = reactor.await_home(&self.home, deadline).await {
+            if let Some(link) = reactor.await_home(&self.home, &mut self.direct, deadline).await {
                 self.arrive(link);
             }
             return;

@@ -1,7 +1,10 @@
 //! One direct link that stands: a ring each way, and the socket whose hang-up is the peer's end.
 
 use std::{
-    os::{fd::AsFd, unix::net::UnixStream},
+    os::{
+        fd::{AsFd, BorrowedFd},
+        unix::net::UnixStream,
+    },
     sync::Arc,
     time::Duration,
 };
@@ -11,7 +14,7 @@ use sinew_runtime::{
     tid::Tid,
     wire::{Class, Flags, Kind, Message},
 };
-use sinew_shm::{Consumer, Ends, HangUp};
+use sinew_shm::{Armed, Consumer, Ends, HangUp};
 
 use super::hang_up;
 use crate::{
@@ -89,6 +92,27 @@ impl Standing {
             rest: None,
             has_forged: false,
         }
+    }
+
+    /// The descriptor of the bell for messages, if the ring has one.
+    pub(in crate::api) fn bell(&self) -> Option<BorrowedFd<'_>> {
+        self.consumer.fd()
+    }
+
+    /// Hangs up with the peer.
+    pub(in crate::api) fn socket(&self) -> &UnixStream {
+        &self.socket
+    }
+
+    /// Announces that a task waits for a message. [`Armed::Ready`]: there is one.
+    pub(in crate::api) fn arm(&mut self) -> Armed {
+        // Corrupt memory is found when it is read.
+        self.consumer.arm().unwrap_or(Armed::Ready)
+    }
+
+    /// Says that it is awake.
+    pub(in crate::api) fn disarm(&mut self) {
+        self.consumer.disarm();
     }
 
     /// Sends a message: in place if it lies in this link's ring, else as [`send`](Self::send) does.

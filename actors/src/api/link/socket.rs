@@ -243,8 +243,13 @@ impl Reader {
 
 /// Whether the other end is closed. Does not wait.
 pub(in crate::api) fn has_hung_up(socket: &UnixStream) -> bool {
+    hangs_up(socket)
+}
+
+/// The same for whatever is a socket.
+pub(in crate::api) fn hangs_up(socket: impl AsFd) -> bool {
     let nothing = Timespec { tv_sec: 0, tv_nsec: 0 };
-    poll(&mut [PollFd::new(socket, PollFlags::RDHUP)], Some(&nothing)).is_ok_and(|count| count > 0)
+    poll(&mut [PollFd::new(&socket, PollFlags::RDHUP)], Some(&nothing)).is_ok_and(|count| count > 0)
 }
 
 /// Those of `sockets` whose other end is closed: one system call for all. Does not wait.

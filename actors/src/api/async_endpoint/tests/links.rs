@@ -1,0 +1,172 @@
+//! Direct links of tasks: with each other, and with threads.
+
+use std::{cell::Cell, thread, time::Duration};
+
+use sinew_runtime::{
+    outcome::{Outcome, Rejection},
+    tid::Tid,
+    time::Time,
+    wire::Class,
+};
+use tokio::time::timeout;
+
+use super::{RAW, number_of, runtime};
+use crate::{
+    api::{AsyncEndpoint, Endpoint, NodeApi, Registration},
+    lncl::testing::{TestNode, WATCHDOG},
+};
+
+fn wish() -> Registration {
+    Registration::new().direct(true).patience(WATCHDOG)
+}
+
+async fn task(node: &TestNode) -> AsyncEndpoint {
+    let api = NodeApi::connect(node.path()).unwrap();
+    api.register_transport_address_async(wish()).await.unwrap()
+}
+
+fn has_link(from: &Endpoint, to: Tid) -> bool {
+    from.direct.open.iter().any(|link| link.peer == to)
+}
+
+async fn send(from: &mut AsyncEndpoint, to: Tid, number: u64, length: usize) {
+    let mut message = from.create_message(to, RAW, length).unwrap();
+    message.set_class(Class::Bulk);
+    message[..8].copy_from_slice(&number.to_le_bytes());
+    from.send_message(message).await.unwrap();
+}
+
+/// Two tasks, each with an open link with the other.
+async fn linked(node: &TestNode) -> (AsyncEndpoint, AsyncEndpoint) {
+    let (mut one, mut other) = (task(node).await, task(node).await);
+    let (to, back) = (other.tid(), one.tid());
+    send(&mut one, to, 0, 8).await;
+    let deadline = Time::now() + WATCHDOG;
+    while !(has_link(&one.endpoint, to) && has_link(&other.endpoint, back)) {
+        assert!(Time::now() < deadline, "waited for a link");
+        for endpoint in [&mut one, &mut other] {
+            let _ = timeout(Duration::from_millis(1), endpoint.receive()).await;
+        }
+    }
+    (one, other)
+}
+
+#[test]
+fn two_tasks_speak_directly_while_the_node_does_nothing() {
+    let node = TestNode::start();
+    runtime().block_on(async {
+        let (mut one, mut other) = linked(&node).await;
+        // The node does not know the way to either of them any more.
+        for tid in [one.tid(), other.tid()] {
+            node.stores.router.remove_local(tid.app);
+        }
+        let to = other.tid();
+        let echo = async {
+            for _ in 0..100 {
+                let request = timeout(WATCHDOG, other.receive()).await.expect("a request").unwrap();
+                let reply = other.create_message(request.source(), RAW, 8).unwrap();
+                other.reply_message(&request, reply).await.unwrap();
+            }
+        };
+        let ask = async {
+            for _ in 0..100 {
+                let request = one.create_message(to, RAW, 8).unwrap();
+                assert!(request.is_in_place());
+                drop(one.ask_message(request, WATCHDOG).await.unwrap());
+            }
+        };
+        tokio::join!(echo, ask);
+    });
+}
+
+#[test]
+fn a_task_and_a_thread_have_a_link_with_each_other() {
+    let node = TestNode::start();
+    let mut blocking = NodeApi::connect(node.path()).unwrap().register_transport_address(wish()).unwrap();
+    let thread_tid = blocking.tid();
+    let thread = thread::spawn(move || {
+        let mut is_direct = false;
+        while let Some(request) = blocking.receive(WATCHDOG).unwrap() {
+            is_direct |= has_link(&blocking, request.source());
+            if !request.wants_reply() {
+                return is_direct;
+            }
+            let reply = blocking.create_message(request.source(), RAW, 8).unwrap();
+            blocking.reply_message(&request, reply).unwrap();
+        }
+        panic!("the last word did not come");
+    });
+    let is_direct = runtime().block_on(async {
+        let mut endpoint = task(&node).await;
+        let mut is_direct = false;
+        for _ in 0..200 {
+            let request = endpoint.create_message(thread_tid, RAW, 8).unwrap();
+            drop(endpoint.ask_message(request, WATCHDOG).await.unwrap());
+            is_direct |= has_link(&endpoint.endpoint, thread_tid);
+        }
+        send(&mut endpoint, thread_tid, 0, 8).await;
+        is_direct
+    });
+    assert!(is_direct && thread.join().unwrap());
+}
+
+#[test]
+fn two_tasks_that_fill_each_others_rings_go_on_and_lose_nothing() {
+    const COUNT: u64 = 200;
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 16_384);
+    runtime().block_on(async {
+        let (mut one, mut other) = linked(&node).await;
+        let (to, back) = (other.tid(), one.tid());
+        drain(&mut one).await;
+        drain(&mut other).await;
+        // Each sends before it receives, so that both rings are full at times; some are longer than a ring.
+        let turn = async |endpoint: &mut AsyncEndpoint, to: Tid, next: &Cell<u64>| {
+            for number in 0..COUNT {
+                send(endpoint, to, number, if number % 16 == 0 { 40_000 } else { 1_000 }).await;
+                while number >= next.get() + 40 {
+                    expect_next(endpoint, next).await;
+                }
+            }
+            while next.get() < COUNT {
+                expect_next(endpoint, next).await;
+            }
+        };
+        let (first, second) = (Cell::new(0), Cell::new(0));
+        let both = async { tokio::join!(turn(&mut one, to, &first), turn(&mut other, back, &second)) };
+        timeout(WATCHDOG * 2, both).await.expect("both end");
+        assert!(has_link(&one.endpoint, to), "the link stands");
+    });
+}
+
+async fn drain(endpoint: &mut AsyncEndpoint) {
+    while timeout(Duration::from_millis(30), endpoint.receive()).await.is_ok() {}
+}
+
+async fn expect_next(endpoint: &mut AsyncEndpoint, next: &Cell<u64>) {
+    let received = endpoint.receive().await.unwrap();
+    assert_eq!(number_of(received.bytes()), next.get());
+    next.set(next.get() + 1);
+}
+
+#[test]
+fn the_end_of_a_peer_on_a_link_ends_what_was_asked_of_it_and_the_rest_goes_through_the_node() {
+    let node = TestNode::start();
+    runtime().block_on(async {
+        let (mut one, mut other) = linked(&node).await;
+        drain(&mut other).await;
+        let to = other.tid();
+        let asking = async {
+            let message = one.create_message(to, RAW, 8).unwrap();
+            let first = one.send_message_confirmed(message, WATCHDOG).await.unwrap();
+            let message = one.create_message(to, RAW, 8).unwrap();
+            (first, one.send_message_confirmed(message, WATCHDOG).await.unwrap())
+        };
+        let dying = async {
+            // In its hand for ever, and its endpoint gone.
+            std::mem::forget(other.receive().await.unwrap());
+            drop(other);
+        };
+        let (outcomes, ()) = tokio::join!(asking, dying);
+        assert_eq!(outcomes, (Outcome::Failed, Outcome::Rejected(Rejection::NoSuchApplication)));
+    });
+}
