@@ -8,3 +8,7 @@ mod fence;
 mod placement;
 #[path = "processes/scenario.rs"]
 mod scenario;
+#[path = "processes/stalls.rs"]
+mod stalls;
+#[path = "processes/trees.rs"]
+mod trees;

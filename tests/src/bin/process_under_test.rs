@@ -2,12 +2,13 @@
 //!
 //! `process_under_test CONFIG.toml [--place thread|process|io] [--requires NAME] [--on-lost pause|restart]
 //! [--dies-at-start CODE] [--neighbour-hangs MILLIS] [--talks] [--stays]
-//! [--swells-at-start MIB]`
+//! [--swells-at-start MIB] [--starts-in MILLIS] [--ramps-for MILLIS] [--tree rest-for-one|escalation]`
 //!
 //! The application `drive` does as it is told (`Order`), and says what it sees, one line each. With a neighbour there is another
 //! one on the `io` thread, which blocks that thread a moment after its start for so long; if for 0 ms, each life of it for ever.
 //! A drive that talks tells its number to an application `witness` all the time, which says whom it heard. A program that
-//! stays goes on after the end of its node, until its standard input ends.
+//! stays goes on after the end of its node, until its standard input ends. In a tree it is under the supervisor `leg`, behind
+//! an application `leader` of the same kind in a thread; for an escalation, `leg` restarts one by one, and once.
 
 use std::{
     process::ExitCode,
@@ -15,7 +16,7 @@ use std::{
 };
 
 use rustix::process::{Signal, getpid, kill_process};
-use sinew::prelude::*;
+use sinew::{ReadyGate, prelude::*};
 use sinew_tests::orders::{Count, Level, Me, Order, Who};
 
 #[derive(Default)]
@@ -24,6 +25,10 @@ struct Drive {
     talks: bool,
     /// How much memory it takes at its start, in MiB; it is never ready then.
     swells: Option<usize>,
+    /// How long it takes until it is ready; it has a second.
+    starts_in: Option<Duration>,
+    /// How long it takes to stop; it has half a second.
+    ramps_for: Duration,
 }
 
 fn say(what: &str) {
@@ -65,6 +70,10 @@ impl Actor for Drive {
             std::mem::forget((vec![1_u8; mib << 20], context.hold_ready()));
             say("has swollen");
         }
+        if let Some(time) = self.starts_in {
+            let mut ready = context.hold_ready();
+            context.after(time, move |_, _, _| ready.take().into_iter().for_each(ReadyGate::reached));
+        }
     }
 
     fn stopping(&mut self, context: &mut Self::Context) -> Running {
@@ -74,7 +83,7 @@ impl Actor for Drive {
         }
         say("ramping down");
         self.counts.push(u64::MAX);
-        context.after(Duration::from_millis(20), |_, _, context| context.stop());
+        context.after(self.ramps_for, |_, _, context| context.stop());
         Running::Continue
     }
 }
@@ -208,6 +217,16 @@ fn ask(context: &mut AppContext<Drive>, whom: &str) {
     }
 }
 
+/// The drive behind its leader.
+fn leg(tree: &str, drive: AppSpec<Drive>) -> SupervisorSpec {
+    let leader = AppSpec::new("leader", Drive::default).handles::<Who>().handles::<Order>().own_thread();
+    let leg = SupervisorSpec::new("leg").app(leader).app(drive);
+    match tree {
+        "rest-for-one" => leg.strategy(Strategy::RestForOne),
+        _ => leg.intensity(1, Duration::from_secs(600)),
+    }
+}
+
 /// Blocks its thread in a timer.
 struct Neighbour(Duration);
 
@@ -278,11 +297,14 @@ fn main() -> ExitCode {
     let is_set = |flag: &str| arguments.iter().any(|argument| argument == flag);
     let (talks, stays) = (is_set("--talks"), is_set("--stays"));
     let swells: Option<usize> = after("--swells-at-start").map(|mib| mib.parse().expect("a number of MiB"));
+    let time = |flag: &str| after(flag).map(|text| Duration::from_millis(text.parse().expect("a time")));
+    let (starts_in, ramps_for) =
+        (time("--starts-in"), time("--ramps-for").unwrap_or(Duration::from_millis(20)));
     let drive = move || {
         if let Some(code) = dies_with {
             std::process::exit(code);
         }
-        Drive { talks, swells, ..Drive::default() }
+        Drive { talks, swells, starts_in, ramps_for, ..Drive::default() }
     };
     let mut drive = AppSpec::new("drive", drive)
         .handles::<Count>()
@@ -292,7 +314,7 @@ fn main() -> ExitCode {
         .handles::<NodeEvent>()
         .handles::<RequirementEvent>()
         .requires(after("--requires"));
-    if swells.is_some() {
+    if swells.is_some() || starts_in.is_some() {
         drive = drive.start_within(Duration::from_secs(1));
     }
     drive = match after("--on-lost").as_deref() {
@@ -305,7 +327,11 @@ fn main() -> ExitCode {
         Some("thread") => drive.own_thread(),
         Some(_) => drive.on_io_thread(),
     };
-    let mut builder = Node::builder(config.name.clone()).config(config).app(drive).heed_signals();
+    let builder = Node::builder(config.name.clone()).config(config).heed_signals();
+    let mut builder = match after("--tree").as_deref() {
+        None => builder.app(drive),
+        Some(tree) => builder.supervisor(leg(tree, drive)),
+    };
     if talks {
         builder = builder.app(AppSpec::new("witness", || Witness).handles::<Count>().own_thread());
     }

@@ -1,0 +1,80 @@
+//! A host that stands still for a while: nobody's fault, and no reason to kill a process that is healthy.
+
+use std::time::Duration;
+
+use rustix::process::Signal;
+use sinew::{NodeApi, Registration};
+use sinew_tests::{
+    DEADLINE, OwnDirectory, Program,
+    orders::{Me, Who},
+    process_under_test,
+};
+
+use crate::scenario::{Scenario, Watched, configuration, signal};
+
+/// Longer than an application has for a turn, to start, or to stop.
+const STALL: Duration = Duration::from_millis(2_500);
+
+/// Nothing of the node and of its process runs for a while, or nothing of the node.
+fn stall(node: &Program, process: Option<u32>) {
+    process.into_iter().for_each(|id| signal(id, Signal::STOP));
+    node.signal(Signal::STOP);
+    std::thread::sleep(STALL);
+    node.signal(Signal::CONT);
+    process.into_iter().for_each(|id| signal(id, Signal::CONT));
+}
+
+/// Which process says that it has started.
+fn started(node: &mut Program) -> u32 {
+    let line = node.wait_for(&["started"]);
+    line.split(' ').next().and_then(|id| id.parse().ok()).expect("it begins with its id")
+}
+
+#[test]
+fn a_host_that_stands_still_kills_no_process_of_a_node() {
+    let mut scenario = Scenario::start(&[]);
+    let pid = scenario.who().pid;
+    for _ in 0..3 {
+        stall(&scenario.node, Some(pid));
+        assert_eq!(scenario.who().pid, pid);
+    }
+}
+
+#[test]
+fn a_process_that_starts_while_its_node_or_all_of_the_host_stands_still_is_not_killed() {
+    for with_process in [false, true] {
+        let directory = OwnDirectory::new();
+        let mut node = process_under_test(&configuration(&directory, ""), &["--starts-in", "500"]);
+        let pid = started(&mut node);
+        stall(&node, with_process.then_some(pid));
+        node.wait_for(&["is up"]);
+        let api = NodeApi::connect(directory.join("robot.sock")).expect("the node is up");
+        let wanted = Registration::new().requires(["drive"]).deadline(DEADLINE);
+        let mut endpoint = api.register_transport_address(wanted).expect("the drive becomes ready");
+        let drive = endpoint.resolve("drive", DEADLINE).expect("the node answers").expect("it is ready");
+        let me: Me = endpoint.ask(drive, &Who {}, DEADLINE).expect("it answers");
+        assert_eq!(me.pid, pid, "with the process: {with_process}");
+    }
+}
+
+#[test]
+fn a_process_that_stops_while_its_node_or_all_of_the_host_stands_still_has_its_time() {
+    for with_process in [false, true] {
+        let mut scenario = Scenario::start(&["--ramps-for", "300"]);
+        let pid = scenario.who().pid;
+        let process = Watched::new(pid);
+        scenario.node.signal(Signal::TERM);
+        scenario.node.wait_for(&["ramping down"]);
+        if with_process {
+            stall(&scenario.node, Some(pid));
+        } else {
+            // Its ramp is over meanwhile, and it says so to a node that cannot hear it.
+            stall(&scenario.node, None);
+        }
+        scenario.node.wait_for(&[&format!("{pid} stopping")]);
+        process.wait_for_end();
+        assert_eq!(scenario.node.wait_for_end(), Some(0));
+        let killed = scenario.node.said().iter().find(|line| line.contains("its life is taken"));
+        assert_eq!(killed, None);
+    }
+}
