@@ -14,6 +14,8 @@ use std::{
     time::{Duration, Instant},
 };
 
+use rustix::process::setpriority_process;
+
 use super::{
     Performer, Stage, StageLimits,
     held::{Held, files_of_the_host},
@@ -41,6 +43,9 @@ pub struct Plan {
     pub reference: Duration,
     /// Decides who is killed when.
     pub seed: u64,
+    /// Those that are killed yield the CPUs to all others: what is measured is what their end costs the node and its other
+    /// clients, not what starting a process costs a machine of two CPUs.
+    pub yields: bool,
 }
 
 /// What was seen.
@@ -151,6 +156,10 @@ impl Cast {
             held_loans: 0,
             ended_by_themselves: 0,
         };
+        if cast.plan.yields {
+            // Inherited by every process that this thread starts from now on.
+            setpriority_process(None, 19).expect("anybody may be nicer");
+        }
         (0..VICTIMS).for_each(|victim| cast.start(victim));
         cast
     }
