@@ -32,6 +32,8 @@ use sinew_runtime::log;
 pub mod api;
 pub mod config;
 
+#[cfg(test)]
+mod documentation;
 mod gncl;
 mod lncl;
 mod monitors;

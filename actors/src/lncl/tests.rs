@@ -18,7 +18,10 @@ use super::{
     registrar,
     testing::{RawClient, TestNode, WATCHDOG},
 };
-use crate::ndl::{self, NodeEvent};
+use crate::{
+    documentation::{block, python},
+    ndl::{self, NodeEvent},
+};
 
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Angle {
@@ -346,17 +349,10 @@ impl sinew_runtime::outcome::ReceiptSink for Told {
 
 const DOCUMENTATION: &str = include_str!("../../../docs/protocol/lncl.md");
 
-/// The block of the documentation that starts with `fence` after `heading`.
-fn block(heading: &str, fence: &str) -> &'static str {
-    let section = DOCUMENTATION.split_once(heading).expect("the section is there").1;
-    let block = section.split_once(fence).expect("the block begins").1;
-    block.split_once("```").expect("the block ends").0
-}
-
 #[test]
 fn the_bytes_in_the_documentation_are_a_registration() {
     let node = TestNode::start();
-    let text = block("## The bytes of a registration", "```text");
+    let text = block(DOCUMENTATION, "## The bytes of a registration", "```text");
     let bytes: Vec<_> = text.split_whitespace().map(|byte| u8::from_str_radix(byte, 16).unwrap()).collect();
     let mut client = RawClient::connect(&node);
     client.send_bytes(&bytes);
@@ -365,13 +361,10 @@ fn the_bytes_in_the_documentation_are_a_registration() {
 }
 
 #[test]
-#[ignore = "needs python3, which a machine that builds Sinew need not have"]
 fn the_client_in_the_documentation_answers_and_confirms() {
+    let Some(mut python) = python(DOCUMENTATION, "## A whole client") else { return };
     let mut node = TestNode::start();
-    let mut python = std::process::Command::new("python3")
-        .args(["-c", block("## A whole client", "```python"), node.path().to_str().unwrap()])
-        .spawn()
-        .expect("python3 is there");
+    let mut python = python.arg(node.path()).spawn().expect("it was there a moment ago");
     let AppFact::Registered { app, name, .. } = node.fact() else { panic!("no registration") };
     assert_eq!(name.as_deref(), Some("echo"));
     assert_eq!(node.fact(), AppFact::Ready { app });

@@ -9,7 +9,7 @@ use sinew_runtime::{
     wire::{Class, Flags, Kind, Message},
 };
 
-use super::bench::{ByHand, NINE, Node, next, pair, run};
+use super::bench::{ByHand, KIND, NINE, Node, next, pair, run, within};
 use crate::stores::ClockOffset;
 
 /// A message as the peer that is written by hand sends it.
@@ -159,5 +159,33 @@ fn a_large_message_arrives_whole_among_small_ones() {
         }
         let too_long = a.message(b.tid(1), &vec![0; (1 << 20) + 1]);
         assert_eq!(a.stores.router.send(too_long), Err(Rejection::TooLong));
+    });
+}
+
+/// Written from the documentation alone, in another language.
+#[test]
+fn the_node_in_the_documentation_breaks_its_connection_twice_and_all_arrives_once_and_in_order() {
+    const PAGE: &str = include_str!("../../../../docs/protocol/gncl.md");
+    let Some(mut python) = crate::documentation::python(PAGE, "## A whole node") else { return };
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut inbox = node.app(1);
+        let address = node.listens_at();
+        let words = [address.port().to_string(), node.tid(1).bits().to_string(), KIND.bits().to_string()];
+        python.arg(address.ip().to_string()).args(words).stdout(std::process::Stdio::piped());
+        let python = python.spawn().expect("it was there a moment ago");
+        node.up().await;
+        for number in 1..=10u64 {
+            let message = next("a message from Python", &mut inbox).await;
+            assert_eq!(message.payload[..], number.to_le_bytes());
+            message.receipt.expect("it is to be confirmed").settle(Outcome::Delivered);
+        }
+        let output = tokio::task::spawn_blocking(|| python.wait_with_output());
+        let output =
+            within("the end of the program", output).await.expect("it is waited for").expect("it ends");
+        assert!(output.status.success(), "{output:?}");
+        let said = String::from_utf8(output.stdout).expect("it writes text");
+        let expected: String = (1..=10).map(|number| format!("outcome {number} 0\n")).collect();
+        assert_eq!(said, expected);
     });
 }

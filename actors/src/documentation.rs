@@ -1,0 +1,22 @@
+//! What the documentation shows, for the tests that try it.
+
+use std::process::{Command, Stdio};
+
+/// The block of a page that starts with `fence` after `heading`.
+pub(crate) fn block(page: &'static str, heading: &str, fence: &str) -> &'static str {
+    let section = page.split_once(heading).expect("the section is there").1;
+    let block = section.split_once(fence).expect("the block begins").1;
+    block.split_once("```").expect("the block ends").0
+}
+
+/// A Python program of a page, or `None`, which is said, on a machine without Python 3.
+pub(crate) fn python(page: &'static str, heading: &str) -> Option<Command> {
+    let is_there = Command::new("python3").arg("--version").stdout(Stdio::null()).status();
+    if !is_there.is_ok_and(|status| status.success()) {
+        println!("skipped: there is no python3 on this machine");
+        return None;
+    }
+    let mut command = Command::new("python3");
+    command.args(["-c", block(page, heading, "```python")]);
+    Some(command)
+}
