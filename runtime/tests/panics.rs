@@ -41,6 +41,8 @@ enum Where {
     Stopping,
     Stopped,
     Drop,
+    /// In a task that no actor owns.
+    Task,
     /// No panic: it ends the thread that it lives on.
     EndThread,
 }
@@ -123,6 +125,13 @@ impl Handler<Delivery<Number>> for Fragile {
                 context.add_stream(futures_util::stream::iter([1]));
             }
             Where::Stopping | Where::Stopped | Where::Drop => context.stop(),
+            Where::Task => {
+                let written = self.written.clone();
+                actix::spawn(async move {
+                    written.send("a task".to_owned()).unwrap();
+                    panic!("in nobody's task");
+                });
+            }
             Where::EndThread => {
                 actix_rt::Arbiter::current().stop();
             }
@@ -253,4 +262,18 @@ fn all_on_a_thread_that_ends_are_started_again_on_another_and_nobody_failed() {
     stage.send(1, 1);
     assert_eq!(read.recv_timeout(DEADLINE).expect("the neighbour works again"), "2: 1");
     stage.stop();
+}
+
+#[test]
+fn a_panic_in_a_task_that_no_actor_owns_ends_that_task_and_no_actor() {
+    let (spec, read) = fragile("fragile", Where::Task);
+    let stage = Stage::start(vec![spec.own_thread().into()]);
+    stage.wait_ready(0);
+    for number in [13, 2, 13, 3] {
+        stage.send(0, number);
+    }
+    let mut said = [(); 4].map(|()| read.recv_timeout(DEADLINE).expect("each is written"));
+    said.sort();
+    assert_eq!(said, ["1: 2", "1: 3", "a task", "a task"], "it is the same life");
+    assert_eq!(stage.stop(), Reason::Shutdown);
 }

@@ -75,5 +75,7 @@ payload!("process.order" =>
         ForgeNumbers(String),
         /// Start a command that ends at once, and write down how it ended.
         StartACommand,
+        /// Stop the system of actix that it finds.
+        StopTheSystem,
     }
 );

@@ -17,7 +17,7 @@ use sinew_runtime::{
     sender::Sender,
     supervision::{
         Burials, ChildId, ChildIds, ChildSpec, Input, Place, PlannedChild, Policy, Reason, Roster,
-        Supervisor, SupervisorFact, SupervisorPlan, Threads,
+        Supervisor, SupervisorFact, SupervisorPlan, Threads, part_from_threads,
     },
     tid::AppAddress,
     time::Time,
@@ -147,10 +147,9 @@ pub(super) fn run(
         heeds_signals: false,
         stores,
     };
-    system.block_on(async { wind_up::oversee(root, heirs, kept, last_word) });
-    if let Err(error) = system.run() {
-        crate::log::error!(%error, "the root's event loop failed");
-    }
+    part_from_threads();
+    // To the root's own end: whoever stops the system that he finds does not end the node.
+    system.block_on(wind_up::oversee(root, heirs, kept, last_word));
     threads.borrow_mut().stop();
     // Whoever waits for an answer has it now: there will be none.
     burials.bury("orders that came too late", post.close());
@@ -467,7 +466,6 @@ impl Root {
         // The owner may be gone: then nobody wants to know.
         let _ = self.ended.try_send(self.end.clone());
         context.stop();
-        actix::System::current().stop();
     }
 
     fn heed_signals(&mut self, context: &mut Context<Self>) {

@@ -74,25 +74,21 @@ impl Heirs {
 }
 
 /// Runs the root, to its end and beyond if it fails.
-pub(super) fn oversee(root: Root, heirs: Heirs, stores: Arc<Stores>, ended: SyncSender<NodeEnd>) {
-    let root = overseen("root", root);
-    actix_rt::spawn(async move {
-        let reason = root.await;
-        if !reason.is_failure() {
-            return;
-        }
-        crate::log::error!(%reason, "the root failed: the node ends in order");
-        let mut events = stores.posts.root.attach();
-        heirs.stop(Branch::Apps);
-        wait(&mut events, Branch::Apps, &heirs).await;
-        stores.stopping.store(true, Ordering::Relaxed);
-        heirs.stop(Branch::Layers);
-        wait(&mut events, Branch::Layers, &heirs).await;
-        stores.close();
-        // The owner may be gone: then nobody wants to know.
-        let _ = ended.try_send(NodeEnd::GaveUp(format!("the root {reason}")));
-        actix::System::current().stop();
-    });
+pub(super) async fn oversee(root: Root, heirs: Heirs, stores: Arc<Stores>, ended: SyncSender<NodeEnd>) {
+    let reason = overseen("root", root).await;
+    if !reason.is_failure() {
+        return;
+    }
+    crate::log::error!(%reason, "the root failed: the node ends in order");
+    let mut events = stores.posts.root.attach();
+    heirs.stop(Branch::Apps);
+    wait(&mut events, Branch::Apps, &heirs).await;
+    stores.stopping.store(true, Ordering::Relaxed);
+    heirs.stop(Branch::Layers);
+    wait(&mut events, Branch::Layers, &heirs).await;
+    stores.close();
+    // The owner may be gone: then nobody wants to know.
+    let _ = ended.try_send(NodeEnd::GaveUp(format!("the root {reason}")));
 }
 
 /// Waits until this branch has ended, if there is one, and not for ever: its supervisor keeps the time of each child.

@@ -11,7 +11,7 @@ use std::{
 use sinew_runtime::{
     app::{AppWiring, DynApp},
     mailbox::Mailbox,
-    supervision::{Alone, Place, ReadyGate, Reason, alone},
+    supervision::{Alone, Place, ReadyGate, Reason, alone, tell_of_a_stop},
     tid::Tid,
     time::Time,
     wire::{FrameCodec, HEADER_LEN, Header, Kind},
@@ -75,7 +75,11 @@ fn run(config: &NodeConfig, app: &DynApp, mut socket: StdStream) -> io::Result<(
     socket.set_nonblocking(true)?;
     place(app).prepare();
     let system = actix::System::new();
-    system.block_on(live(config, app, socket, welcome))
+    let stop = system.stop_future();
+    system.block_on(async {
+        actix_rt::spawn(tell_of_a_stop(stop));
+        live(config, app, socket, welcome).await
+    })
 }
 
 /// Reads the first frame and not a byte more.

@@ -13,6 +13,7 @@
 //! | `ready` | when an actor may say that it is ready |
 //! | `place` | where an actor is to run |
 //! | `threads` | where actors live |
+//! | `own_system` | what an actor stops that stops actix's system: nothing of the node's |
 //! | `tenant` | one life of an actor, as its supervisor, its thread and the watchdog hold it |
 //! | `vitals` | its signs of life, and its fence |
 //! | `watchdog` | who does not come back |
@@ -32,6 +33,7 @@ mod guard;
 #[cfg(target_os = "linux")]
 mod linux;
 mod orphans;
+mod own_system;
 mod panics;
 mod place;
 mod ready;
@@ -55,6 +57,7 @@ pub use self::{
         Input, Intensity, Policy, Reason, Refusal, Restart, Strategy,
     },
     guard::{Life, life},
+    own_system::{part_from_threads, tell_of_a_stop},
     panics::UNWINDS,
     place::{Owner, Place},
     ready::{ReadyGate, ReadyPart},

@@ -15,6 +15,7 @@ use thread_priority::{ThreadId, ThreadPriority, set_thread_priority_and_policy, 
 
 use super::{
     Burials, Place, Reason,
+    own_system::{OwnSystem, settle_in},
     panics::is_the_runtimes,
     place::Owner,
     system,
@@ -162,8 +163,9 @@ impl Threads {
         let arbiter = Arbiter::try_with_tokio_rt(move || {
             prepared.prepare();
             occupied.occupy();
-            tokio::runtime::Builder::new_current_thread().enable_all().build()
+            tokio::runtime::Builder::new_current_thread().enable_all().build().map(OwnSystem)
         })?;
+        arbiter.spawn_fn(settle_in);
         let handle = arbiter.handle();
         self.arbiters.insert(place.key(), (arbiter, seat.clone()));
         Ok((handle, seat))

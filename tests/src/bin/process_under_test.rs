@@ -167,6 +167,7 @@ impl Handler<Delivery<Order>> for Drive {
                 assert!(context.sender().count_on_from(far, far));
                 send(context, to, 0);
             }
+            Order::StopTheSystem => actix::System::current().stop(),
             Order::StartACommand => {
                 let status = std::process::Command::new("true").status();
                 say(&format!("command {status:?}"));

@@ -35,6 +35,7 @@ in_every_place! {
     it_is_started_anew_when_what_it_requires_is_back
     large_messages_go_both_ways
     a_node_that_is_told_to_stop_lets_it_ramp_down
+    whoever_stops_the_system_of_actix_ends_nothing_and_the_log_says_what_would
 }
 
 fn start(place: &str) -> Scenario {
@@ -260,4 +261,17 @@ fn a_node_that_is_told_to_stop_lets_it_ramp_down(place: &str) {
     scenario.node.wait_for(&["ramping down"]);
     scenario.node.wait_for(&["stopping"]);
     assert_eq!(scenario.node.wait_for_end(), Some(0));
+}
+
+fn whoever_stops_the_system_of_actix_ends_nothing_and_the_log_says_what_would(place: &str) {
+    let mut scenario = start(place);
+    assert_eq!(scenario.count_confirmed(1), Outcome::Delivered);
+    for count in 2..=3 {
+        assert_eq!(scenario.order_confirmed(Order::StopTheSystem), Outcome::Delivered);
+        assert_eq!(scenario.count_confirmed(count), Outcome::Delivered);
+    }
+    scenario.node.wait_for(&["actix::System::current().stop()", "NodeHandle::stop"]);
+    assert_eq!(scenario.who().counts, [1, 2, 3], "it is the same life");
+    scenario.node.signal(Signal::TERM);
+    assert_eq!(scenario.node.wait_for_end(), Some(0), "and the node still ends in order");
 }
