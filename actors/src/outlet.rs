@@ -36,7 +36,7 @@ use tokio::net::{TcpStream, UnixStream};
 
 use crate::session::Ack;
 
-use half::{After, Half};
+use half::{After, Bound, Half};
 pub(crate) use resume::Session;
 
 /// A non-blocking socket, or what is like one, that can be written to from any thread.
@@ -197,6 +197,15 @@ impl<S: Socket> StreamOutlet<S> {
         self.with(|half, after| half.finish(last, after));
     }
 
+    /// As `submit`, whatever the bounds: for frames whose place behind all that was taken before counts, and of which the
+    /// caller sees to it that they are few.
+    ///
+    /// # Errors
+    /// The frame: there will be no further connection.
+    pub(crate) fn submit_beyond(&self, message: Message) -> Result<(), Refused> {
+        self.with(|half, after| half.submit(message, Bound::Waived, after))
+    }
+
     /// Takes a frame that goes ahead of all that waits, behind those taken so before it. At most `waiting_max` wait.
     ///
     /// # Errors
@@ -251,6 +260,6 @@ impl<S: Socket> StreamOutlet<S> {
 
 impl<S: Socket> Outlet for StreamOutlet<S> {
     fn submit(&self, message: Message) -> Result<(), Refused> {
-        self.with(|half, after| half.submit(message, after))
+        self.with(|half, after| half.submit(message, Bound::Kept, after))
     }
 }

@@ -10,7 +10,7 @@ use std::{
 };
 
 use bytes::BytesMut;
-use sinew_runtime::wire::{FrameCodec, FrameError, Message};
+use sinew_runtime::wire::{FrameCodec, FrameError, HEADER_LEN, Header, Message};
 use sinew_shm::{
     BellKind, Capacity, Consumer, Corrupt, CreateError, LoanError, Offer, PassError, Producer, RefusedOffer,
     Region, Terms,
@@ -142,6 +142,12 @@ impl RingFrames {
     /// The next frame of what was taken.
     pub(crate) fn next(&mut self) -> Result<Option<Message>, FrameError> {
         self.codec.decode(&mut self.buffer)
+    }
+
+    /// Whether [`next`](Self::next) has something to say: a frame, or that there is none to be had.
+    pub(crate) fn has_frame(&self) -> bool {
+        let Some(head) = self.buffer.first_chunk() else { return false };
+        Header::payload_len(head).map_or(true, |length| self.buffer.len() >= HEADER_LEN + length as usize)
     }
 
     /// Takes records, without waiting, until there are about `enough` bytes. Each byte is read once.

@@ -8,6 +8,7 @@ mod standing;
 mod tests;
 
 use std::{
+    collections::{BTreeMap, VecDeque},
     os::unix::net::UnixStream,
     sync::Arc,
     time::{Duration, Instant},
@@ -31,7 +32,7 @@ use super::{
         ring::{self, NAP},
         socket,
     },
-    routes::{Answered, Directness, Farewell, Left, LinkNumber, Marked, Routes, Way},
+    routes::{Answered, Directness, Farewell, Left, LinkNumber, Marked, Passed, Routes, Way},
 };
 use crate::{
     lncl::payload::{self, Introduce, Introduction, Registered, Switch},
@@ -41,6 +42,8 @@ use crate::{
 use standing::{Alone, Pair, Put};
 pub(super) use standing::{Came, Everything, Standing};
 
+/// Messages at most that wait for the rest of a ring of which the sender has said no more. One more is refused as `QueueFull`.
+const EARLY_MAX: usize = 4_096;
 /// Time until it is looked again whether there is room for what is owed to a peer.
 const OWED_AGAIN: Duration = Duration::from_millis(1);
 
@@ -63,6 +66,23 @@ struct Offered {
     exchange: Exchange,
 }
 
+/// What one who has ended its link, or its next life, has sent through the node.
+struct Early {
+    /// The link that is read first.
+    after: LinkNumber,
+    messages: VecDeque<Message>,
+}
+
+/// What is to be done with a message that came through the node.
+pub(super) enum InTurn {
+    /// To be sorted in.
+    Now(Message),
+    /// It is kept until its turn has come.
+    Later,
+    /// Too many are kept: to be refused.
+    Never(Message),
+}
+
 /// The direct links of an endpoint.
 pub(super) struct Direct {
     terms: Terms,
@@ -74,6 +94,8 @@ pub(super) struct Direct {
     held: Vec<Standing>,
     /// Written to and read.
     pub(super) open: Vec<Standing>,
+    /// What came through the node and was sent after what that link's ring still holds.
+    early: BTreeMap<Tid, Early>,
     /// When it is looked again who has gone, and what is to be said again.
     look_at: Time,
     /// When one who only sends looks for answers of the node.
@@ -139,6 +161,7 @@ impl Direct {
             offered: Vec::new(),
             held: Vec::new(),
             open: Vec::new(),
+            early: BTreeMap::new(),
             look_at: Time::ZERO,
             hear_at: Time::ZERO,
             flush_at: Time::ZERO,
@@ -158,7 +181,7 @@ impl Direct {
                 let lncl = payload::lncl_of(destination.node);
                 let frame = payload::frame(Kind::LNCL_INTRODUCE, self.terms.own, lncl, &introduce);
                 match node.ask(frame) {
-                    Some(correlation) => self.routes.asked(destination, correlation),
+                    Some(correlation) => self.routes.asked(destination, correlation, now),
                     None => self.routes.not_asked(destination, now),
                 }
                 None
@@ -357,6 +380,51 @@ impl Direct {
         None
     }
 
+    /// Keeps back what was sent after what is left in its sender's ring.
+    pub(super) fn keep_early(&mut self, message: Message) -> InTurn {
+        let header = &message.header;
+        // A group is another destination: its order is its own.
+        if self.is_empty() || !header.kind.is_user() || header.destination != self.terms.own {
+            return InTurn::Now(message);
+        }
+        let (source, class) = (header.source, header.class);
+        let after = match self.early.get(&source) {
+            Some(early) => early.after,
+            None => match self.routes.passed(source, class, Time::now()) {
+                Passed::Take => return InTurn::Now(message),
+                Passed::AfterLink(after) => after,
+            },
+        };
+        if self.early.values().map(|early| early.messages.len()).sum::<usize>() >= EARLY_MAX {
+            return InTurn::Never(message);
+        }
+        let early = self.early.entry(source).or_insert_with(|| Early { after, messages: VecDeque::new() });
+        early.messages.push_back(message);
+        InTurn::Later
+    }
+
+    /// The next of those that were kept back whose turn has come.
+    pub(super) fn next_early(&mut self, now: Time) -> Option<Message> {
+        if self.early.is_empty() {
+            return None;
+        }
+        self.pop_early().or_else(|| {
+            self.see_ends(now);
+            self.pop_early()
+        })
+    }
+
+    fn pop_early(&mut self) -> Option<Message> {
+        let routes = &self.routes;
+        let is_due = |(source, early): &(&Tid, &mut Early)| routes.link(**source) != Some(early.after);
+        let (source, early) = self.early.iter_mut().find(is_due)?;
+        let (source, message) = (*source, early.messages.pop_front());
+        if early.messages.is_empty() {
+            self.early.remove(&source);
+        }
+        message
+    }
+
     /// Looks who has gone and what is to be said again, now and then.
     pub(super) fn look(&mut self, now: Time, node: &mut ToNode<'_>) {
         if now >= self.flush_at {
@@ -370,7 +438,7 @@ impl Direct {
         self.see_ends(now);
         while let Some((peer, number)) = self.routes.switch_due(now) {
             match node.ask(self.switch_to(peer, number)) {
-                Some(correlation) => self.routes.switched(peer, correlation),
+                Some(correlation) => self.routes.switched(peer, correlation, now),
                 None => self.routes.not_switched(peer, now),
             }
         }
@@ -389,8 +457,8 @@ impl Direct {
     }
 
     /// Whether there are no links, made or in the making.
-    pub(super) const fn is_empty(&self) -> bool {
-        self.open.is_empty() && self.held.is_empty() && self.offered.is_empty()
+    pub(super) fn is_empty(&self) -> bool {
+        self.open.is_empty() && self.held.is_empty() && self.offered.is_empty() && self.early.is_empty()
     }
 
     /// Whether the answer to an introduction that was asked for may have come; true once a nap.
@@ -466,7 +534,7 @@ impl Direct {
         });
     }
 
-    /// Ends the links whose peers have gone and have nothing left to say.
+    /// Ends the links whose peers have gone, or say no more there, and have left nothing.
     fn see_ends(&mut self, now: Time) {
         let standing = self.open.iter().chain(&self.held).map(|link| (link.peer, link.number, &link.socket));
         let offered = self.offered.iter().map(|link| (link.peer, link.number, &link.socket));
@@ -477,6 +545,8 @@ impl Direct {
         let gone: Vec<_> = socket::which_hung_up(links.iter().map(|(_, _, socket)| &***socket))
             .into_iter()
             .map(|index| (links[index].0, links[index].1))
+            .chain(self.early.iter().map(|(peer, early)| (*peer, early.after)))
+            .filter(|(peer, number)| self.routes.link(*peer) == Some(*number))
             .collect();
         for (peer, number) in gone {
             let left = self.left(number);

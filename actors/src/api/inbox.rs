@@ -102,6 +102,11 @@ impl Inbox {
         }
     }
 
+    /// Refuses a message of the node for which there is no room elsewhere.
+    pub(super) fn refuse(&self, message: Message) {
+        with_receipt(&self.sink, message).reject(Rejection::QueueFull);
+    }
+
     /// The next message, most urgent class first. What is too old is not handed out.
     pub(super) fn pop(&mut self, now: Time) -> Option<Message> {
         loop {

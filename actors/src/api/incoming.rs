@@ -8,7 +8,7 @@ use sinew_runtime::{
 
 use super::{
     ApiError, Endpoint,
-    direct::{Came, Everything, ToNode},
+    direct::{Came, Everything, InTurn, ToNode},
     form::Form,
     inbox::{Answer, Awaited, Sorted},
     link::{Read, Reader},
@@ -42,9 +42,24 @@ impl Endpoint {
         }
         let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
         self.direct.look(Time::now(), &mut node);
+        if let Some(answer) = self.take_in_early(wanted, when_full) {
+            return Ok(Some(answer));
+        }
         // From the last one on: one that ends makes no other one's turn go by.
-        let links = (0..self.direct.open.len()).rev();
-        Ok(links.into_iter().find_map(|index| self.take_in_from_link(index, wanted, when_full)))
+        let mut links = (0..self.direct.open.len()).rev();
+        let answer = links.find_map(|index| self.take_in_from_link(index, wanted, when_full));
+        Ok(answer.or_else(|| self.take_in_early(wanted, when_full)))
+    }
+
+    /// Sorts in what had come through the node and was sent after what a link's ring held.
+    fn take_in_early(&mut self, wanted: Option<Wanted>, when_full: WhenFull) -> Option<Answer> {
+        while when_full == WhenFull::Refuse || self.inbox.has_room() {
+            let message = self.direct.next_early(Time::now())?;
+            if let Sorted::Answer(answer) = self.inbox.sort(message, wanted.map(Wanted::at_node)) {
+                return Some(answer);
+            }
+        }
+        None
     }
 
     pub(super) fn take_in_from_node(
@@ -78,6 +93,14 @@ impl Endpoint {
         while when_full == WhenFull::Refuse || self.inbox.has_room() {
             let Some(message) = self.reader.next()? else { break };
             let Some(message) = self.heed(message, wanted) else { continue };
+            let message = match self.direct.keep_early(message) {
+                InTurn::Now(message) => message,
+                InTurn::Later => continue,
+                InTurn::Never(message) => {
+                    self.inbox.refuse(message);
+                    continue;
+                }
+            };
             match self.inbox.sort(message, wanted.map(Wanted::at_node)) {
                 Sorted::Answer(answer) => return Ok(Some(answer)),
                 Sorted::Refusal(refusal) => self.end(refusal.into()),

@@ -18,6 +18,8 @@
 //! before it, and a ring is read when all three have come. Nobody waits for that: who sends writes into the ring at once.
 
 #[cfg(test)]
+mod simulation;
+#[cfg(test)]
 mod tests;
 
 use std::{collections::BTreeMap, time::Duration};
@@ -37,8 +39,12 @@ const REFUSALS_MAX: usize = 256;
 const ASK_AGAIN: Duration = Duration::from_millis(100);
 /// Time until one is asked for again that this destination will hardly ever allow.
 const HARDLY_EVER: Duration = Duration::from_secs(10);
-/// Time until a SWITCH is said again that did not arrive.
+/// Time until an introduction is given up that nobody has answered: the peer answers within its own calls.
+const ANSWER_WITHIN: Duration = Duration::from_secs(10);
+/// Time until a SWITCH is said again for which there was no room.
 const SWITCH_AGAIN: Duration = Duration::from_millis(10);
+/// Time until a SWITCH is said again that was refused or that nobody has answered.
+const SWITCH_UNHEARD: Duration = Duration::from_secs(1);
 /// So long the ring of a peer that has gone waits for its marks. LNCL says them even after the peer's end, so they do not
 /// come only if the peer died before its SWITCH, or LNCL with it.
 const MARKS_AFTER_END: Duration = Duration::from_secs(10);
@@ -97,6 +103,16 @@ pub(super) enum Left {
     Something,
 }
 
+/// What is to be done with a message to this application that came through the node.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Passed {
+    /// It was sent before the source's SWITCH, or there is no link.
+    Take,
+    /// It was sent after the SWITCH: by another life of the source, or the source has ended this link. What it wrote into
+    /// its ring was sent before, and what it says to this side comes no more through that: nothing is sent there any more.
+    AfterLink(LinkNumber),
+}
+
 /// What is to be done about a peer that has hung up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Farewell {
@@ -116,6 +132,10 @@ struct Marks {
 }
 
 impl Marks {
+    const fn has(&self, class: Class) -> bool {
+        self.classes[class as usize]
+    }
+
     /// Returns whether all have come.
     fn note(&mut self, class: Class, confirm: Option<u64>) -> bool {
         self.classes[class as usize] = true;
@@ -127,9 +147,30 @@ impl Marks {
 /// Whether the peer has taken our SWITCH.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Switch {
-    Said { correlation: u64 },
-    ToSay { at: Time },
+    /// Never said yet: messages go through the node. If this process ended now, nobody would read its ring.
+    Unsaid {
+        at: Time,
+    },
+    /// To be said `again` then if nobody answers.
+    Said {
+        correlation: u64,
+        again: Time,
+    },
+    /// To be said again.
+    ToSay {
+        at: Time,
+    },
     Taken,
+}
+
+impl Switch {
+    /// When it is to be said, if nobody answers before.
+    const fn due(&self) -> Option<Time> {
+        match self {
+            Self::Unsaid { at } | Self::ToSay { at } | Self::Said { again: at, .. } => Some(*at),
+            Self::Taken => None,
+        }
+    }
 }
 
 /// Whether the peer's ring is read.
@@ -144,7 +185,7 @@ enum Peer {
     /// Through the node; asked for again from `until` on.
     Refused { until: Time },
     /// Through the node; LNCL has been asked.
-    Asked { correlation: u64 },
+    Asked { correlation: u64, until: Time },
     /// Through the node; the peer has asked, and our offer is in the link's socket.
     Offered { number: LinkNumber, marks: Marks, gone: Option<Time> },
     /// Into our ring, until the peer has gone.
@@ -161,9 +202,8 @@ impl Peer {
 
     const fn correlation(&self) -> Option<u64> {
         match self {
-            Self::Asked { correlation } | Self::Direct { switch: Switch::Said { correlation }, .. } => {
-                Some(*correlation)
-            }
+            Self::Asked { correlation, .. }
+            | Self::Direct { switch: Switch::Said { correlation, .. }, .. } => Some(*correlation),
             Self::Refused { .. } | Self::Offered { .. } | Self::Direct { .. } => None,
         }
     }
@@ -196,17 +236,20 @@ impl Routes {
     /// The way to `destination`, which is absolute.
     pub(super) fn way(&self, destination: Tid, now: Time) -> Way {
         match self.peers.get(&destination) {
+            Some(Peer::Direct { switch: Switch::Unsaid { .. }, .. } | Peer::Offered { .. }) => Way::Through,
             Some(Peer::Direct { number, gone: None, .. }) => Way::Direct(*number),
-            Some(Peer::Direct { .. } | Peer::Asked { .. } | Peer::Offered { .. }) => Way::Through,
-            Some(Peer::Refused { until }) if now < *until => Way::Through,
+            Some(Peer::Direct { .. }) => Way::Through,
+            Some(Peer::Refused { until } | Peer::Asked { until, .. }) if now < *until => Way::Through,
+            // Nobody has answered.
+            Some(Peer::Asked { .. }) => Way::ThroughAndAsk,
             Some(Peer::Refused { .. }) | None if self.may_ask(destination) => Way::ThroughAndAsk,
             Some(Peer::Refused { .. }) | None => Way::Through,
         }
     }
 
     /// LNCL has been asked for an introduction to `peer`.
-    pub(super) fn asked(&mut self, peer: Tid, correlation: u64) {
-        self.set(peer, Peer::Asked { correlation });
+    pub(super) fn asked(&mut self, peer: Tid, correlation: u64, now: Time) {
+        self.set(peer, Peer::Asked { correlation, until: now + ANSWER_WITHIN });
     }
 
     /// LNCL could not be asked.
@@ -216,7 +259,7 @@ impl Routes {
 
     /// LNCL says that `peer` has agreed to a link. Whether it is still wanted: else its descriptor is closed.
     pub(super) fn introduced(&self, peer: Tid, correlation: u64) -> bool {
-        self.peers.get(&peer) == Some(&Peer::Asked { correlation })
+        matches!(self.peers.get(&peer), Some(Peer::Asked { correlation: asked, .. }) if *asked == correlation)
     }
 
     /// LNCL says that `peer` asks for a link.
@@ -251,8 +294,9 @@ impl Routes {
                 (Theirs::Held(Marks::default()), None)
             }
         };
-        let later = Switch::ToSay { at: now + SWITCH_AGAIN };
-        let switch = said.map_or(later, |correlation| Switch::Said { correlation });
+        let later = Switch::Unsaid { at: now + SWITCH_AGAIN };
+        let switch =
+            said.map_or(later, |correlation| Switch::Said { correlation, again: now + SWITCH_UNHEARD });
         self.set(peer, Peer::Direct { number, switch, theirs, gone });
     }
 
@@ -304,7 +348,7 @@ impl Routes {
             | Outcome::Expired
             | Outcome::Failed
             | Outcome::PeerLost
-            | Outcome::Unknown => self.set_switch(tid, Switch::ToSay { at: now + SWITCH_AGAIN }),
+            | Outcome::Unknown => self.set_switch(tid, Switch::ToSay { at: now + SWITCH_UNHEARD }),
         }
         Answered::Noted
     }
@@ -313,7 +357,7 @@ impl Routes {
     /// [`not_switched`](Self::not_switched).
     pub(super) fn switch_due(&self, now: Time) -> Option<(Tid, LinkNumber)> {
         self.peers.iter().find_map(|(tid, peer)| match peer {
-            Peer::Direct { number, switch: Switch::ToSay { at }, gone: None, .. } if *at <= now => {
+            Peer::Direct { number, switch, gone: None, .. } if switch.due().is_some_and(|at| at <= now) => {
                 Some((*tid, *number))
             }
             Peer::Refused { .. } | Peer::Asked { .. } | Peer::Offered { .. } | Peer::Direct { .. } => None,
@@ -321,13 +365,38 @@ impl Routes {
     }
 
     /// The SWITCH was said again.
-    pub(super) fn switched(&mut self, peer: Tid, correlation: u64) {
-        self.set_switch(peer, Switch::Said { correlation });
+    pub(super) fn switched(&mut self, peer: Tid, correlation: u64, now: Time) {
+        self.set_switch(peer, Switch::Said { correlation, again: now + SWITCH_UNHEARD });
     }
 
     /// The SWITCH could not be said; later.
     pub(super) fn not_switched(&mut self, peer: Tid, now: Time) {
-        self.set_switch(peer, Switch::ToSay { at: now + SWITCH_AGAIN });
+        if let Some(Peer::Direct { switch, .. }) = self.peers.get_mut(&peer) {
+            let at = now + SWITCH_AGAIN;
+            *switch = match switch {
+                Switch::Unsaid { .. } => Switch::Unsaid { at },
+                Switch::Said { .. } | Switch::ToSay { .. } | Switch::Taken => Switch::ToSay { at },
+            };
+        }
+    }
+
+    /// A message to this application alone has come from `source` through the node.
+    pub(super) fn passed(&mut self, source: Tid, class: Class, now: Time) -> Passed {
+        match self.peers.get_mut(&source) {
+            Some(Peer::Direct { number, theirs: Theirs::Open, gone, .. }) => {
+                gone.get_or_insert(now);
+                Passed::AfterLink(*number)
+            }
+            Some(
+                Peer::Direct { number, theirs: Theirs::Held(marks), gone, .. }
+                | Peer::Offered { number, marks, gone },
+            ) if marks.has(class) => {
+                gone.get_or_insert(now);
+                Passed::AfterLink(*number)
+            }
+            Some(Peer::Refused { .. } | Peer::Asked { .. } | Peer::Offered { .. } | Peer::Direct { .. })
+            | None => Passed::Take,
+        }
     }
 
     /// The peer has closed the link, or its process has ended, with so much `left` unread. Asked again and again while its
@@ -361,7 +430,7 @@ impl Routes {
                     *peer = Peer::Refused { until: now };
                     self.links -= 1;
                 }
-                Peer::Direct { switch, .. } if matches!(switch, Switch::Said { .. }) => {
+                Peer::Direct { switch: switch @ Switch::Said { .. }, .. } => {
                     *switch = Switch::ToSay { at: now };
                 }
                 Peer::Direct { .. } | Peer::Offered { .. } | Peer::Refused { .. } => {}

@@ -24,17 +24,34 @@ use rustix::{
 };
 use sinew_runtime::{
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
-    router::Outlet,
+    router::{Outlet, Refused},
     tid::{AppAddress, Tid},
     wire::{Class, Flags, Kind, Message},
 };
 
 use super::payload::{self, Introduction, Switch};
+use crate::outlet::{Socket, StreamOutlet};
 
 /// Introductions that one client may have asked for and that are not answered yet; one more is refused as `QueueFull`.
 pub(crate) const ASKED_MAX: usize = 64;
 /// Introductions to one client that it has not answered: each is a descriptor on its way to it. One more is refused likewise.
 pub(crate) const UNANSWERED_MAX: usize = 16;
+/// SWITCHes to one client that it has not confirmed: their marks wait beside the bounds of its queue. One more is refused as
+/// `QueueFull`, and its sender says it again.
+const SWITCHES_MAX: usize = 1_024;
+
+/// What takes the frames of a client.
+pub(super) trait Listener: Outlet {
+    /// Takes a mark, which keeps its place behind all that was submitted before, whatever the bounds: one that came later
+    /// could come behind what the next life of its sender sends.
+    fn submit_mark(&self, mark: Message) -> Result<(), Refused>;
+}
+
+impl<S: Socket> Listener for StreamOutlet<S> {
+    fn submit_mark(&self, mark: Message) -> Result<(), Refused> {
+        self.submit_beyond(mark)
+    }
+}
 
 /// A client that others may be introduced to.
 pub(super) struct Party {
@@ -42,21 +59,23 @@ pub(super) struct Party {
     /// As the kernel says.
     pub(super) pid: u32,
     /// What takes its frames.
-    pub(super) outlet: Arc<dyn Outlet>,
+    pub(super) outlet: Arc<dyn Listener>,
     /// Its socket, which takes descriptors: its frames go through rings.
     pub(super) socket: Arc<dyn AsFd + Send + Sync>,
     asked: AtomicUsize,
     unanswered: AtomicUsize,
+    switches: AtomicUsize,
 }
 
 impl Party {
     pub(super) fn new(
         tid: Tid,
         pid: u32,
-        outlet: Arc<dyn Outlet>,
+        outlet: Arc<dyn Listener>,
         socket: Arc<dyn AsFd + Send + Sync>,
     ) -> Self {
-        Self { tid, pid, outlet, socket, asked: AtomicUsize::new(0), unanswered: AtomicUsize::new(0) }
+        let none = || AtomicUsize::new(0);
+        Self { tid, pid, outlet, socket, asked: none(), unanswered: none(), switches: none() }
     }
 }
 
@@ -106,31 +125,43 @@ impl Introductions {
         Ok(())
     }
 
-    /// The marks that tell `to` that `source` goes on on their link: one behind all that waits in each class, for only within
-    /// a class is the order kept. The last one is confirmed by `receipt`.
+    /// Tells `to` by marks that `source` goes on on their link: one behind all that waits in each class, for only within a
+    /// class is the order kept. The last one is confirmed by `receipt`.
     ///
     /// # Errors
     /// Why not, to be told to the source.
-    pub(super) fn marks(
+    pub(super) fn pass_marks(
         &self,
         source: Tid,
         to: Tid,
         number: u64,
         receipt: Receipt,
-    ) -> Result<Marks, (Receipt, Rejection)> {
+    ) -> Result<(), (Receipt, Rejection)> {
         let Ok(peer) = self.party(to) else { return Err((receipt, Rejection::NoSuchApplication)) };
-        let payload =
+        if peer.switches.fetch_add(1, Ordering::Relaxed) >= SWITCHES_MAX {
+            peer.switches.fetch_sub(1, Ordering::Relaxed);
+            return Err((receipt, Rejection::QueueFull));
+        }
+        let frame =
             payload::frame(Kind::LNCL_SWITCH, source, peer.tid, &Switch { peer: source.bits(), number });
-        let mark = |class| {
-            let mut mark = Message::new(payload.header, payload.payload.clone());
+        let correlation = receipt.ticket().correlation;
+        let ticket = receipt.ticket();
+        let confirmed = Confirmed { peer: peer.clone(), receipt: Mutex::new(Some(receipt)) };
+        for class in [Class::Control, Class::Stream] {
+            let mut mark = Message::new(frame.header, frame.payload.clone());
             mark.header.class = class;
-            mark
-        };
-        let mut last = mark(Class::Bulk);
+            // Not taken: it has gone, which the last one tells.
+            let _ = peer.outlet.submit_mark(mark);
+        }
+        let mut last = frame;
+        last.header.class = Class::Bulk;
         last.header.flags = Flags::CONFIRM;
-        last.header.correlation = receipt.ticket().correlation;
-        last.receipt = Some(receipt);
-        Ok(Marks { outlet: peer.outlet.clone(), left: vec![mark(Class::Control), mark(Class::Stream), last] })
+        last.header.correlation = correlation;
+        last.receipt = Some(Receipt::new(Arc::new(confirmed), ticket));
+        if let Err(refused) = peer.outlet.submit_mark(last) {
+            refused.message.reject(refused.why);
+        }
+        Ok(())
     }
 
     fn party(&self, tid: Tid) -> Result<Arc<Party>, Rejection> {
@@ -140,24 +171,19 @@ impl Introductions {
     }
 }
 
-/// Marks that are on their way. One that finds no room is not given up: the client that sent them may be dead, and what it
-/// wrote into its ring before that is read behind them.
-pub(super) struct Marks {
-    outlet: Arc<dyn Outlet>,
-    left: Vec<Message>,
+/// Counts a SWITCH until the one who was to hear it has answered, or has gone.
+struct Confirmed {
+    peer: Arc<Party>,
+    receipt: Mutex<Option<Receipt>>,
 }
 
-impl Marks {
-    /// Passes them on, as far as there is room; returns whether some are left.
-    pub(super) fn pass_on(&mut self) -> bool {
-        for mark in std::mem::take(&mut self.left) {
-            match self.outlet.submit(mark) {
-                Ok(()) => {}
-                Err(refused) if refused.why == Rejection::QueueFull => self.left.push(refused.message),
-                Err(refused) => refused.message.reject(refused.why),
-            }
+impl ReceiptSink for Confirmed {
+    fn settle(&self, _: Ticket, outcome: Outcome) {
+        let receipt = self.receipt.lock().unwrap_or_else(PoisonError::into_inner).take();
+        if let Some(receipt) = receipt {
+            self.peer.switches.fetch_sub(1, Ordering::Relaxed);
+            receipt.settle(outcome);
         }
-        !self.left.is_empty()
     }
 }
 
@@ -254,15 +280,25 @@ mod tests {
     };
 
     use rustix::net::{RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, recv, recvmsg};
-    use sinew_runtime::{router::Refused, tid::NodeAddress};
+    use sinew_runtime::tid::NodeAddress;
 
     use super::*;
 
-    struct Queue(SyncSender<Message>);
+    struct Queue {
+        frames: SyncSender<Message>,
+        /// More than are passed.
+        marks: SyncSender<Message>,
+    }
+
+    impl Listener for Queue {
+        fn submit_mark(&self, mark: Message) -> Result<(), Refused> {
+            self.marks.send(mark).map_err(|error| Refused::new(error.0, Rejection::Closed))
+        }
+    }
 
     impl Outlet for Queue {
         fn submit(&self, message: Message) -> Result<(), Refused> {
-            self.0.try_send(message).map_err(|error| match error {
+            self.frames.try_send(message).map_err(|error| match error {
                 TrySendError::Full(message) => Refused::new(message, Rejection::QueueFull),
                 TrySendError::Disconnected(message) => Refused::new(message, Rejection::Closed),
             })
@@ -272,6 +308,7 @@ mod tests {
     struct Client {
         tid: Tid,
         frames: Receiver<Message>,
+        marks: Receiver<Message>,
         socket: UnixStream,
     }
 
@@ -280,11 +317,12 @@ mod tests {
     }
 
     fn join(introductions: &Introductions, app: u32, room: usize) -> Client {
-        let (sender, frames) = sync_channel(room);
+        let ((sender, frames), (marking, marks)) = (sync_channel(room), sync_channel(4 * SWITCHES_MAX));
         let (theirs, socket) = UnixStream::pair().unwrap();
-        let party = Party::new(tid(app), app, Arc::new(Queue(sender)), Arc::new(theirs));
+        let party =
+            Party::new(tid(app), app, Arc::new(Queue { frames: sender, marks: marking }), Arc::new(theirs));
         introductions.add(party);
-        Client { tid: tid(app), frames, socket }
+        Client { tid: tid(app), frames, marks, socket }
     }
 
     impl Client {
@@ -395,23 +433,28 @@ mod tests {
     }
 
     #[test]
-    fn a_mark_goes_behind_each_class_and_one_without_room_is_not_given_up() {
+    fn a_mark_goes_behind_each_class_whatever_the_bounds_and_so_many_are_unconfirmed_at_most() {
         struct Told(SyncSender<Outcome>);
         impl ReceiptSink for Told {
             fn settle(&self, _: Ticket, outcome: Outcome) {
-                self.0.send(outcome).unwrap();
+                // At the end of this test nobody listens.
+                let _ = self.0.try_send(outcome);
             }
         }
         let introductions = Introductions::default();
-        let peer = join(&introductions, 2, 2);
+        let peer = join(&introductions, 2, 1);
         let (sender, outcome) = sync_channel(1);
         let ticket = Ticket { source: tid(1), destination: peer.tid, correlation: 5 };
         let receipt = || Receipt::new(Arc::new(Told(sender.clone())), ticket);
-        let Ok(mut marks) = introductions.marks(tid(1), peer.tid, 7, receipt()) else { panic!("no marks") };
-        assert!(marks.pass_on(), "there is room for two");
-        let (first, second) = (peer.next(), peer.next());
-        assert!(!marks.pass_on());
-        let mut third = peer.next();
+        let pass = |to| {
+            introductions.pass_marks(tid(1), to, 7, receipt()).map_err(|(receipt, why)| {
+                receipt.settle(Outcome::Rejected(why));
+                why
+            })
+        };
+        assert_eq!(pass(peer.tid), Ok(()), "there is room for one, and three are taken");
+        let (first, second, mut third) =
+            (peer.marks.try_recv().unwrap(), peer.marks.try_recv().unwrap(), peer.marks.try_recv().unwrap());
         assert_eq!(
             [&first, &second, &third].map(|mark| (mark.header.class, mark.header.flags.has(Flags::CONFIRM))),
             [(Class::Control, false), (Class::Stream, false), (Class::Bulk, true)]
@@ -419,8 +462,12 @@ mod tests {
         assert_eq!(third.header.correlation, 5);
         third.settle(Outcome::Delivered);
         assert_eq!(outcome.recv(), Ok(Outcome::Delivered));
-        let Err((receipt, why)) = introductions.marks(tid(1), tid(9), 7, receipt()) else { panic!("marks") };
-        assert_eq!(why, Rejection::NoSuchApplication);
-        receipt.settle(Outcome::Delivered);
+        assert_eq!(pass(tid(9)), Err(Rejection::NoSuchApplication));
+        assert_eq!(outcome.recv(), Ok(Outcome::Rejected(Rejection::NoSuchApplication)));
+        for _ in 0..SWITCHES_MAX {
+            assert_eq!(pass(peer.tid), Ok(()));
+        }
+        assert_eq!(pass(peer.tid), Err(Rejection::QueueFull));
+        assert_eq!(outcome.recv(), Ok(Outcome::Rejected(Rejection::QueueFull)));
     }
 }

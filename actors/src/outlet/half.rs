@@ -57,6 +57,14 @@ pub(super) struct Sent {
     written: u64,
 }
 
+/// Whether a message is refused where too many wait.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Bound {
+    Kept,
+    /// Whoever submits it bounds how many there are.
+    Waived,
+}
+
 pub(super) struct Half<S> {
     limits: OutletLimits,
     payload_max: usize,
@@ -205,8 +213,13 @@ impl<S: Socket> Half<S> {
         self.close(why, after);
     }
 
-    pub(super) fn submit(&mut self, mut message: Message, after: &mut After) -> Result<(), Refused> {
-        if let Err(why) = self.admit(&message) {
+    pub(super) fn submit(
+        &mut self,
+        mut message: Message,
+        bound: Bound,
+        after: &mut After,
+    ) -> Result<(), Refused> {
+        if let Err(why) = self.admit(&message, bound) {
             self.counts.refused += 1;
             return Err(Refused::new(message, why));
         }
@@ -219,7 +232,7 @@ impl<S: Socket> Half<S> {
             return Ok(());
         }
         if self.waiting() > 0 || !self.takes_new() {
-            return self.enqueue(message, after);
+            return self.enqueue(message, bound, after);
         }
         let mut frame = self.frame(message);
         self.waiting_receipts += usize::from(frame.message.receipt.is_some());
@@ -229,7 +242,7 @@ impl<S: Socket> Half<S> {
                 self.partial = Some(frame);
                 after.wake = self.drainer.take();
             }
-            Written::InPart | Written::Broken => return self.requeue(frame, after),
+            Written::InPart | Written::Broken => return self.requeue(frame, bound, after),
         }
         Ok(())
     }
@@ -272,13 +285,13 @@ impl<S: Socket> Half<S> {
     }
 
     /// A frame that was to be written at once and could not be: it waits like any other.
-    fn requeue(&mut self, frame: Partial, after: &mut After) -> Result<(), Refused> {
+    fn requeue(&mut self, frame: Partial, bound: Bound, after: &mut After) -> Result<(), Refused> {
         self.waiting_receipts -= usize::from(frame.message.receipt.is_some());
         self.take_back();
-        self.enqueue(frame.message, after)
+        self.enqueue(frame.message, bound, after)
     }
 
-    fn admit(&self, message: &Message) -> Result<(), Rejection> {
+    fn admit(&self, message: &Message, bound: Bound) -> Result<(), Rejection> {
         let confirmed = message.receipt.is_some();
         if let Link::Closed(why) = self.link {
             Err(why)
@@ -289,22 +302,25 @@ impl<S: Socket> Half<S> {
         } else if confirmed && message.header.class == Class::Stream {
             // It may be superseded, and then there is no outcome that tells the truth.
             Err(Rejection::Unsupported)
-        } else if confirmed && self.unconfirmed() >= self.limits.unconfirmed_max {
+        } else if confirmed && bound == Bound::Kept && self.unconfirmed() >= self.limits.unconfirmed_max {
             Err(Rejection::QueueFull)
         } else {
             Ok(())
         }
     }
 
-    fn enqueue(&mut self, message: Message, after: &mut After) -> Result<(), Refused> {
+    fn enqueue(&mut self, message: Message, bound: Bound, after: &mut After) -> Result<(), Refused> {
         let confirmed = message.receipt.is_some();
         let expiry = message.header.expiry();
-        match self.queue.push(message) {
-            Ok(superseded) => self.counts.superseded += u64::from(superseded.is_some()),
-            Err(refused) => {
-                self.counts.refused += 1;
-                return Err(refused);
-            }
+        match bound {
+            Bound::Waived => self.queue.push_beyond(message),
+            Bound::Kept => match self.queue.push(message) {
+                Ok(superseded) => self.counts.superseded += u64::from(superseded.is_some()),
+                Err(refused) => {
+                    self.counts.refused += 1;
+                    return Err(refused);
+                }
+            },
         }
         self.waiting_receipts += usize::from(confirmed);
         self.next_expiry = self.next_expiry.min(expiry);

@@ -47,7 +47,7 @@ impl ClassQueue {
     pub fn push(&mut self, message: Message) -> Result<Option<Message>, Refused> {
         let lane = &mut self.lanes[message.header.class as usize];
         if message.header.class == Class::Stream
-            && let Some(older) = lane.iter_mut().find(|other| is_same_stream(&other.header, &message.header))
+            && let Some(older) = older_value(lane, &message.header)
         {
             self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
             return Ok(Some(std::mem::replace(older, message)));
@@ -58,6 +58,13 @@ impl ClassQueue {
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
         lane.push_back(message);
         Ok(None)
+    }
+
+    /// Takes a message behind all others of its class, whatever the bound, and replaces none. For the few whose place in the
+    /// order counts; who uses it bounds how many there are.
+    pub fn push_beyond(&mut self, message: Message) {
+        self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
+        self.lanes[message.header.class as usize].push_back(message);
     }
 
     /// Whether [`push`](Self::push) would take a message with this header.
@@ -139,6 +146,17 @@ impl ClassQueue {
     pub fn drain_all(&mut self) -> impl Iterator<Item = Message> + '_ {
         self.lanes.iter_mut().flat_map(|lane| lane.drain(..))
     }
+}
+
+/// The value whose place one with this header takes: none that waits before a [mark](ClassQueue::push_beyond) of the same
+/// source, for the mark says that what was sent before it comes before it.
+fn older_value<'a>(lane: &'a mut VecDeque<Message>, header: &Header) -> Option<&'a mut Message> {
+    let is_mark = |other: &Header| {
+        !other.kind.is_user() && other.source == header.source && other.destination == header.destination
+    };
+    let mut newest_first = lane.iter_mut().rev();
+    let found = newest_first.find(|other| is_same_stream(&other.header, header) || is_mark(&other.header))?;
+    is_same_stream(&found.header, header).then_some(found)
 }
 
 /// Whether the newer of the two takes the place of the older, both being of class Stream.

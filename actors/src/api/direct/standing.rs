@@ -229,10 +229,10 @@ impl Standing {
         Ok(self.frames.take(&mut self.consumer, ENOUGH)?)
     }
 
-    /// Whether the peer has left something in its ring.
+    /// Whether the peer has left something in its ring, or of what was taken out something is not sorted in.
     pub(super) fn has_something(&mut self) -> bool {
         // Corrupt memory is found when it is read.
-        self.consumer.is_ready().unwrap_or(true)
+        self.frames.has_frame() || self.consumer.is_ready().unwrap_or(true)
     }
 
     /// spec: LNCL-3: a forged source costs the message, not the link.

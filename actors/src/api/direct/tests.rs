@@ -12,6 +12,7 @@ use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg}
 use serde::{Deserialize, Serialize};
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
+    tid::AppAddress,
     time::Time,
     wire::{Class, Flags, Header, Kind, Message, Payload},
 };
@@ -317,6 +318,61 @@ fn what_a_peer_said_before_it_went_is_received_and_then_it_has_gone() {
     }
     let told = other.send_confirmed(gone, &Counted(4), WATCHDOG).unwrap();
     assert!(matches!(told, Outcome::Rejected(_)), "through the node again: {told:?}");
+}
+
+#[test]
+fn what_one_life_of_an_address_wrote_into_its_ring_comes_before_what_the_next_one_sends_through_the_node() {
+    // given
+    let node = TestNode::start();
+    let wanted = || Registration::new().direct(true).fixed(AppAddress::fixed(7).unwrap());
+    let (mut one, mut other) = (register(&node, wanted()), endpoint(&node));
+    link(&mut one, &mut other);
+    for number in 1..=3 {
+        one.send(other.tid(), &Counted(number)).unwrap();
+    }
+    // when: the other has not looked since
+    one.unregister().unwrap();
+    let mut next = register(&node, wanted());
+    for number in 4..=5 {
+        next.send(other.tid(), &Counted(number)).unwrap();
+    }
+    // The node answers behind what was sent before: it is there.
+    next.resolve("nobody", WATCHDOG).unwrap();
+    // then
+    for number in 1..=5 {
+        let received = other.receive(WATCHDOG).unwrap().expect("a message");
+        assert_eq!(received.decode::<Counted>().unwrap(), Counted(number));
+    }
+    let deadline = Time::now() + WATCHDOG;
+    while !has_link(&other, &next) {
+        assert!(Time::now() < deadline, "waited for a link with the next life");
+        next.send(other.tid(), &Counted(6)).unwrap();
+        drop(other.receive(Duration::from_millis(1)).unwrap());
+    }
+}
+
+#[test]
+fn what_was_taken_out_of_a_ring_and_found_no_room_is_received_after_its_senders_end() {
+    // given
+    let node = TestNode::start();
+    let (mut one, mut other) =
+        (endpoint(&node), register(&node, Registration::new().direct(true).inbox_capacity(1)));
+    link(&mut one, &mut other);
+    for number in 1..=5 {
+        one.send(other.tid(), &Counted(number)).unwrap();
+    }
+    let mut received = vec![other.receive(WATCHDOG).unwrap().expect("a message")];
+    // when
+    drop(one);
+    // then
+    let deadline = Time::now() + WATCHDOG;
+    while !other.direct.open.is_empty() {
+        assert!(Time::now() < deadline, "waited for the end of the link to be seen");
+        other.direct.look_at = Time::ZERO;
+        received.extend(other.receive(Duration::ZERO).unwrap());
+    }
+    let numbers: Vec<_> = received.iter().map(|received| received.decode::<Counted>().unwrap().0).collect();
+    assert_eq!(numbers, [1, 2, 3, 4, 5]);
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! What a client's connection does with the orders of its session.
 
-use std::{ops::ControlFlow, sync::Arc, time::Duration};
+use std::{ops::ControlFlow, sync::Arc};
 
 use sinew_runtime::{
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
@@ -12,7 +12,6 @@ use sinew_runtime::{
 
 use super::{
     super::{
-        introductions::Marks,
         payload::{self, Resolved},
         registrar,
         session::Order,
@@ -21,9 +20,6 @@ use super::{
     end::End,
 };
 use crate::stores::lock;
-
-/// Time until a mark is passed on again that found no room.
-const MARK_AGAIN: Duration = Duration::from_millis(2);
 
 impl Client {
     /// Carries an order out; the end of the connection, if that is what it asks for.
@@ -101,9 +97,8 @@ impl Client {
         let to = self.server.stores.router.absolute(to);
         let ticket = Ticket { source: self.tid, destination: to, correlation };
         let receipt = Receipt::new(Arc::new(OutcomeSink(self.outlet.clone())), ticket);
-        match self.server.introductions.marks(self.tid, to, number, receipt) {
-            Ok(marks) => pass_on(marks),
-            Err((receipt, why)) => receipt.settle(Outcome::Rejected(why)),
+        if let Err((receipt, why)) = self.server.introductions.pass_marks(self.tid, to, number, receipt) {
+            receipt.settle(Outcome::Rejected(why));
         }
     }
 
@@ -120,18 +115,6 @@ impl Client {
     fn tell(&self, about: Tid, correlation: u64, outcome: Outcome) {
         let ticket = Ticket { source: self.tid, destination: about, correlation };
         self.say(Message::outcome(ticket, outcome));
-    }
-}
-
-/// Passes marks on, now or, where there is no room, as soon as there is.
-fn pass_on(mut marks: Marks) {
-    if marks.pass_on() {
-        tokio::task::spawn_local(async move {
-            // Ends when there is room, or the client's outlet has ended.
-            while marks.pass_on() {
-                tokio::time::sleep(MARK_AGAIN).await;
-            }
-        });
     }
 }
 
