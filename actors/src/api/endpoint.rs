@@ -76,7 +76,8 @@ impl Endpoint {
             direct: Direct::new(terms, control),
             inbox,
             sequence: 0,
-            correlation: 0,
+            // The outcome of a former life's message must not be taken for one of this: no number comes again.
+            correlation: Time::now().as_nanos(),
             ended: None,
             home: Home::new(path.to_owned(), register, options, returning, node_process),
             form,

@@ -79,7 +79,7 @@ pub(super) enum Marked {
         /// The correlation to confirm.
         confirm: Option<u64>,
     },
-    /// It was said again; the ring is being read.
+    /// It was said again.
     Known,
     /// There is no such link.
     Unknown,
@@ -139,7 +139,7 @@ impl Marks {
     /// Returns whether all have come.
     fn note(&mut self, class: Class, confirm: Option<u64>) -> bool {
         self.classes[class as usize] = true;
-        self.confirm = confirm.or(self.confirm);
+        self.confirm = self.confirm.or(confirm);
         self.classes == [true; 3]
     }
 }
@@ -309,6 +309,11 @@ impl Routes {
         confirm: Option<u64>,
     ) -> Marked {
         match self.peers.get_mut(&peer) {
+            // It was said again, and the first one is answered when all have come.
+            Some(
+                Peer::Offered { number: ours, marks, .. }
+                | Peer::Direct { number: ours, theirs: Theirs::Held(marks), .. },
+            ) if *ours == number && marks.confirm.is_some() && confirm.is_some() => Marked::Known,
             Some(Peer::Offered { number: ours, marks, .. }) if *ours == number => {
                 if !marks.note(class, confirm) {
                     return Marked::Wait;

@@ -538,3 +538,32 @@ fn links_are_bounded_and_what_is_above_goes_through_the_node() {
     }
     assert_eq!(hub.direct.open.len(), LINKS_MAX);
 }
+
+/// A message of a former life may be handled after one of this life. Both have the same source, destination and way.
+#[test]
+fn the_outcome_of_a_former_lifes_message_is_not_taken_for_one_of_this_life() {
+    // given: a message of the former life waits to be received
+    let node = TestNode::start();
+    let wanted = || Registration::new().fixed(AppAddress::fixed(7).unwrap());
+    let (former, mut other) = (register(&node, wanted()), register(&node, Registration::new()));
+    let mut left = Message::typed(former.tid(), other.tid(), &Counted(1));
+    (left.header.class, left.header.flags) = (Class::Bulk, Flags::CONFIRM);
+    left.header.correlation = former.correlation + 1;
+    former.writer.write(&left).unwrap();
+    former.unregister().unwrap();
+    // when
+    let (mut next, to) = (register(&node, wanted()), other.tid());
+    let asking = thread::spawn(move || next.send_confirmed(to, &Hurried(2), WATCHDOG).unwrap());
+    let deadline = Time::now() + WATCHDOG;
+    let mut held = Vec::new();
+    while held.len() < 2 {
+        assert!(Time::now() < deadline, "waited for both messages");
+        held.extend(other.receive(Duration::from_millis(1)).unwrap());
+    }
+    let (urgent, left): (Vec<_>, Vec<_>) =
+        held.into_iter().partition(|received| received.class() == Class::Control);
+    urgent.into_iter().for_each(|received| received.settle(Outcome::Failed));
+    left.into_iter().for_each(|received| received.settle(Outcome::Delivered));
+    // then
+    assert_eq!(asking.join().unwrap(), Outcome::Failed);
+}
