@@ -35,6 +35,9 @@ pub(crate) enum ExchangeError {
     /// The peer's fault: it says that it has offered something.
     #[error("the peer has offered no shared memory")]
     Missing,
+    /// Other rings have all that there may be.
+    #[error("the rings of this process's direct links have their most in bytes")]
+    Budget,
 }
 
 /// The exchange of offers over a socket, on which nothing else comes meanwhile. Both ends do the same, in any order.
@@ -48,8 +51,17 @@ pub(crate) struct Exchange {
 impl Exchange {
     /// Makes this side's memory. The peer's ring may be as large as this side's.
     pub(crate) fn prepare(capacity: Capacity, bell: BellKind) -> Result<Self, ExchangeError> {
+        Self::prepare_for(capacity, bell, capacity)
+    }
+
+    /// As [`prepare`](Self::prepare), for a peer's ring of at most `theirs`.
+    pub(crate) fn prepare_for(
+        capacity: Capacity,
+        bell: BellKind,
+        theirs: Capacity,
+    ) -> Result<Self, ExchangeError> {
         let (region, offer) = Region::create(capacity, bell)?;
-        Ok(Self { region, offer, terms: Terms { capacity_max: capacity, ..Terms::default() } })
+        Ok(Self { region, offer, terms: Terms { capacity_max: theirs, ..Terms::default() } })
     }
 
     /// Offers it to the peer.

@@ -2,6 +2,7 @@
 
 use std::{
     collections::BTreeMap,
+    hash::{BuildHasher, RandomState},
     net::{SocketAddr, UdpSocket},
     sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, atomic::AtomicBool},
     time::Duration,
@@ -86,7 +87,7 @@ impl Stores {
             ndl_socket: Mutex::default(),
             ndl: Mutex::new(ndl::new_core(&config, node, incarnation)),
             door: lncl::Door::default(),
-            registry: Mutex::default(),
+            registry: Mutex::new(lncl::Registry::counting_links_from(RandomState::new().hash_one(()))),
             directory_changes: watch::Sender::default(),
             sync: Mutex::new(sync::Core::new(&config, node, incarnation)),
             monitors: Mutex::new(monitors::Core::new(node, incarnation, config.ndl.nodes_max)),

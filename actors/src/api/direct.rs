@@ -2,6 +2,7 @@
 //!
 //! When which way is taken is decided in `routes.rs`; here are the sockets and the memory.
 
+mod budget;
 mod descriptors;
 mod standing;
 #[cfg(test)]
@@ -39,11 +40,16 @@ use crate::{
     ring::{self as rings, Exchange, ExchangeError, RingError},
 };
 
+use budget::{Budget, PROCESS, Share};
 use standing::{Alone, Pair, Put};
 pub(super) use standing::{Came, Everything, Standing};
 
 /// Messages at most that wait for the rest of a ring of which the sender has said no more. One more is refused as `QueueFull`.
 const EARLY_MAX: usize = 4_096;
+/// Bytes of a direct link's ring, if nothing else is asked for.
+pub(super) const RING_BYTES: usize = 64 * 1024;
+/// Bytes of a peer's ring at most.
+const RING_BYTES_MAX: usize = 1 << 20;
 /// Time until it is looked again whether there is room for what is owed to a peer.
 const OWED_AGAIN: Duration = Duration::from_millis(1);
 
@@ -56,6 +62,8 @@ pub(super) struct Terms {
     /// Longest payload in bytes.
     pub(super) payload_max: usize,
     pub(super) options: LinkOptions,
+    /// What all rings together may take.
+    budget: &'static Budget,
 }
 
 /// A link of which the peer knows our half.
@@ -64,6 +72,7 @@ struct Offered {
     number: LinkNumber,
     socket: Arc<UnixStream>,
     exchange: Exchange,
+    share: Share,
 }
 
 /// What one who has ended its link, or its next life, has sent through the node.
@@ -128,9 +137,10 @@ impl Terms {
     pub(super) fn of(registered: &Registered, options: LinkOptions) -> Self {
         Self {
             own: Tid::new(registered.node, registered.app),
-            ring_bytes: registered.ring.unwrap_or_default() as usize,
+            ring_bytes: options.direct_ring_bytes.min(registered.ring.unwrap_or_default() as usize),
             payload_max: registered.payload_max as usize,
             options,
+            budget: &PROCESS,
         }
     }
 }
@@ -176,6 +186,10 @@ impl Direct {
         match self.routes.way(destination, now) {
             Way::Direct(number) => Some(number),
             Way::Through => None,
+            Way::ThroughAndAsk if !self.terms.budget.has_room(self.terms.ring_bytes) => {
+                self.routes.no_memory(destination, now);
+                None
+            }
             Way::ThroughAndAsk => {
                 let introduce = Introduce { to: destination.bits() };
                 let lncl = payload::lncl_of(destination.node);
@@ -262,19 +276,24 @@ impl Direct {
 
     fn offer(&mut self, peer: Tid, number: LinkNumber) -> Result<(), Rejection> {
         let socket = self.take_end(number).ok_or(Rejection::QueueFull)?;
-        let exchange = self.prepare(&socket).map_err(|why| {
+        if !self.terms.budget.has_room(self.terms.ring_bytes) {
+            return Err(Rejection::Unsupported);
+        }
+        let (exchange, share) = self.prepare(&socket).map_err(|why| {
             tracing::warn!(%peer, %why, "a direct link was not made");
             Rejection::QueueFull
         })?;
         self.routes.offered(peer, number);
-        self.offered.push(Offered { peer, number, socket, exchange });
+        self.offered.push(Offered { peer, number, socket, exchange, share });
         Ok(())
     }
 
-    fn prepare(&self, socket: &UnixStream) -> Result<Exchange, ExchangeError> {
-        let exchange = Exchange::prepare(rings::capacity(self.terms.ring_bytes), self.terms.options.bell)?;
+    fn prepare(&self, socket: &UnixStream) -> Result<(Exchange, Share), ExchangeError> {
+        let share = self.terms.budget.take(self.terms.ring_bytes).ok_or(ExchangeError::Budget)?;
+        let [own, theirs] = [self.terms.ring_bytes, RING_BYTES_MAX].map(rings::capacity);
+        let exchange = Exchange::prepare_for(own, self.terms.options.bell, theirs)?;
         exchange.offer(socket)?;
-        Ok(exchange)
+        Ok((exchange, share))
     }
 
     fn take_end(&self, number: LinkNumber) -> Option<Arc<UnixStream>> {
@@ -292,8 +311,8 @@ impl Direct {
         }
         let connected = socket.ok_or(ExchangeError::Missing).and_then(|socket| {
             let theirs = Exchange::receive(&socket)?.ok_or(ExchangeError::Missing)?;
-            let exchange = self.prepare(&socket)?;
-            self.connect(Offered { peer, number, socket, exchange }, theirs)
+            let (exchange, share) = self.prepare(&socket)?;
+            self.connect(Offered { peer, number, socket, exchange, share }, theirs)
         });
         match connected {
             Ok(link) => {
@@ -309,11 +328,11 @@ impl Direct {
     }
 
     fn connect(&self, offered: Offered, theirs: Offer) -> Result<Standing, ExchangeError> {
-        let Offered { peer, number, socket, exchange } = offered;
+        let Offered { peer, number, socket, exchange, share } = offered;
         let (producer, consumer) = exchange.finish(theirs)?;
         let writer = ring::Writer::new(socket.clone(), producer, self.terms.options);
         let pair = Pair { own: self.terms.own, peer, number, socket };
-        Ok(Standing::new(pair, writer, consumer, self.terms.payload_max))
+        Ok(Standing::new(pair, writer, consumer, share, self.terms.payload_max))
     }
 
     fn switch_to(&self, peer: Tid, number: LinkNumber) -> Message {
@@ -516,9 +535,9 @@ impl Direct {
         self.routes.node_has_ended(now);
     }
 
-    /// The same life of the node is back, with another connection; the links stand.
-    pub(super) fn node_is_back(&mut self, control: Option<Arc<UnixStream>>) {
-        self.control = control;
+    /// There is another connection to the node, or to its next life; the links stand.
+    pub(super) fn node_is_back(&mut self, terms: Terms, control: Option<Arc<UnixStream>>) {
+        (self.terms, self.control) = (terms, control);
     }
 
     /// Waits until something comes on an open link, for `left` at most. May end early without a reason.

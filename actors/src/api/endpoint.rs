@@ -61,7 +61,7 @@ impl Endpoint {
     pub(super) fn new(path: &Path, registration: Registration, link: Link, form: Form) -> Self {
         let Registration { mut register, deadline: _, inbox_capacity, link: options, returning } =
             registration;
-        let Link { registered, writer, reader, node: node_process } = link;
+        let Link { registered, writer, reader } = link;
         let terms = Terms::of(&registered, options);
         let Registered { node, app, node_name, payload_max, ring: _ } = registered;
         let control = reader.control().filter(|_| register.direct);
@@ -79,7 +79,7 @@ impl Endpoint {
             // The outcome of a former life's message must not be taken for one of this: no number comes again.
             correlation: Time::now().as_nanos(),
             ended: None,
-            home: Home::new(path.to_owned(), register, options, returning, node_process),
+            home: Home::new(path.to_owned(), register, options, returning),
             form,
         }
     }

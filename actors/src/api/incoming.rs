@@ -51,6 +51,13 @@ impl Endpoint {
         Ok(answer.or_else(|| self.take_in_early(wanted, when_full)))
     }
 
+    /// Sorts in what has come on links that are about to end; what finds no room is refused.
+    pub(super) fn take_in_from_links(&mut self) {
+        for index in (0..self.direct.open.len()).rev() {
+            self.take_in_from_link(index, None, WhenFull::Refuse);
+        }
+    }
+
     /// Sorts in what had come through the node and was sent after what a link's ring held.
     fn take_in_early(&mut self, wanted: Option<Wanted>, when_full: WhenFull) -> Option<Answer> {
         while when_full == WhenFull::Refuse || self.inbox.has_room() {

@@ -141,6 +141,7 @@ impl Default for Registration {
                 spin: Spin::Off,
                 patience: Duration::from_secs(1),
                 bell: BellKind::Futex,
+                direct_ring_bytes: direct::RING_BYTES,
             },
             returning: Returning::Always,
         }
@@ -219,11 +220,21 @@ impl Registration {
 
     /// Whether messages to and from other processes of the node may go directly, through rings of their own, where LNCL
     /// introduces the two and both want it; else all of them go through the node. A link is made at the first message to
-    /// another process. It costs a ring of each side, allocated at once, and some time in the call in which it is made.
+    /// another process. It costs a ring of each side ([`direct_ring_bytes`](Self::direct_ring_bytes)), allocated at once, and some
+    /// time in the call in which it is made.
     /// Default false; only with [`Transport::Ring`].
     #[must_use]
     pub const fn direct(mut self, direct: bool) -> Self {
         self.register.direct = direct;
+        self
+    }
+
+    /// Bytes of this side's ring of each direct link, from 4 KiB to 1 MiB, rounded up to a power of two and never more than the
+    /// node's `lncl.ring_bytes`. A message longer than half of it goes in pieces. All rings for direct links that a process
+    /// makes take 64 MiB at most: beyond that messages go through the node, which a line of the log says once. Default 64 KiB.
+    #[must_use]
+    pub const fn direct_ring_bytes(mut self, bytes: usize) -> Self {
+        self.link.direct_ring_bytes = if bytes > 1 << 20 { 1 << 20 } else { bytes };
         self
     }
 

@@ -5,7 +5,6 @@
 
 use std::{collections::BTreeSet, path::PathBuf, thread, time::Duration};
 
-use rustix::process::Pid;
 use sinew_runtime::{
     tid::{AppAddress, Tid},
     time::Time,
@@ -44,8 +43,6 @@ pub(super) struct Home {
     pub(super) groups: BTreeSet<AppAddress>,
     /// How often it has registered.
     pub(super) registrations: u64,
-    /// The node's process, as the kernel says.
-    node: Option<Pid>,
     way: Option<Way>,
 }
 
@@ -66,18 +63,8 @@ impl Home {
         register: Register,
         options: LinkOptions,
         returning: Returning,
-        node: Option<Pid>,
     ) -> Self {
-        Self {
-            path,
-            register,
-            options,
-            returning,
-            groups: BTreeSet::new(),
-            registrations: 1,
-            node,
-            way: None,
-        }
+        Self { path, register, options, returning, groups: BTreeSet::new(), registrations: 1, way: None }
     }
 
     /// The way back, which begins with the first question for it.
@@ -116,7 +103,7 @@ impl Home {
 impl Home {
     /// The same way, begun anew.
     pub(super) fn another(&self) -> Self {
-        Self::new(self.path.clone(), self.register.clone(), self.options, self.returning, self.node)
+        Self::new(self.path.clone(), self.register.clone(), self.options, self.returning)
     }
 }
 
@@ -208,16 +195,16 @@ impl Endpoint {
 
     /// Goes on with a new connection, as a member of the same groups.
     fn arrive(&mut self, link: Link) {
-        let Link { registered, writer, reader, node } = link;
-        let is_same_node = node.is_some() && node == self.home.node;
-        self.home.node = node;
+        let Link { registered, writer, reader } = link;
         let control = reader.control().filter(|_| self.home.register.direct);
         let own = Tid::new(registered.node, registered.app);
-        if is_same_node && own == self.tid {
-            self.direct.node_is_back(control);
+        let terms = Terms::of(&registered, self.home.options);
+        if own == self.tid {
+            self.direct.node_is_back(terms, control);
         } else {
-            // Another life of the node counts its links anew, and another address has none.
-            self.direct = Direct::new(Terms::of(&registered, self.home.options), control);
+            // Another address has no links. What has come on them is received.
+            self.take_in_from_links();
+            self.direct = Direct::new(terms, control);
         }
         self.tid = own;
         self.home.register.former = Some(registered.app);

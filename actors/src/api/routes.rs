@@ -257,6 +257,11 @@ impl Routes {
         self.refuse(peer, now + ASK_AGAIN);
     }
 
+    /// This process has no memory for one more link.
+    pub(super) fn no_memory(&mut self, peer: Tid, now: Time) {
+        self.refuse(peer, now + HARDLY_EVER);
+    }
+
     /// LNCL says that `peer` has agreed to a link. Whether it is still wanted: else its descriptor is closed.
     pub(super) fn introduced(&self, peer: Tid, correlation: u64) -> bool {
         matches!(self.peers.get(&peer), Some(Peer::Asked { correlation: asked, .. }) if *asked == correlation)

@@ -203,9 +203,14 @@ impl Registry {
         ClientId(self.next_client)
     }
 
-    /// A number for a new link between two applications; never used again in a node's life.
+    /// One that counts links from `number` on. Links outlive their node, so each of its lives begins elsewhere.
+    pub(crate) fn counting_links_from(number: u64) -> Self {
+        Self { next_link: number, ..Self::default() }
+    }
+
+    /// A number for a new link between two applications; never used again, in other lives of the node neither.
     pub(crate) fn new_link(&mut self) -> u64 {
-        self.next_link += 1;
+        self.next_link = self.next_link.wrapping_add(1);
         self.next_link
     }
 

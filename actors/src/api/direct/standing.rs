@@ -16,7 +16,7 @@ use sinew_runtime::{
 };
 use sinew_shm::{Armed, Consumer, Ends, HangUp};
 
-use super::hang_up;
+use super::{budget::Share, hang_up};
 use crate::{
     api::{
         ApiError,
@@ -40,6 +40,8 @@ pub(in crate::api) struct Standing {
     /// What comes on this link is settled on it.
     pub(in crate::api) sink: Arc<dyn ReceiptSink>,
     consumer: Consumer,
+    /// What its ring takes of what all may.
+    _share: Share,
     frames: RingFrames,
     /// The newest value of each kind of Stream that found no room: an older one must not come later.
     parked: Vec<Message>,
@@ -76,7 +78,13 @@ pub(in crate::api) enum Came {
 }
 
 impl Standing {
-    pub(super) fn new(pair: Pair, writer: ring::Writer, consumer: Consumer, payload_max: usize) -> Self {
+    pub(super) fn new(
+        pair: Pair,
+        writer: ring::Writer,
+        consumer: Consumer,
+        share: Share,
+        payload_max: usize,
+    ) -> Self {
         let Pair { own, peer, number, socket } = pair;
         let (writer, frames) = (Arc::new(writer), RingFrames::new(payload_max));
         Self {
@@ -87,6 +95,7 @@ impl Standing {
             sink: writer.clone(),
             writer,
             consumer,
+            _share: share,
             frames,
             parked: Vec::new(),
             rest: None,

@@ -17,7 +17,7 @@ use sinew_runtime::{
     wire::{Class, Flags, Header, Kind, Message, Payload},
 };
 
-use super::Came;
+use super::{Came, budget::Budget};
 use crate::{
     api::{ApiError, Endpoint, NodeApi, Registration},
     lncl::{
@@ -566,4 +566,79 @@ fn the_outcome_of_a_former_lifes_message_is_not_taken_for_one_of_this_life() {
     left.into_iter().for_each(|received| received.settle(Outcome::Delivered));
     // then
     assert_eq!(asking.join().unwrap(), Outcome::Failed);
+}
+
+#[test]
+fn links_outlive_the_node_and_none_of_its_next_life_has_the_number_of_one_of_the_former() {
+    // given: a link with messages that were not received
+    let mut node = TestNode::start();
+    let path = node.path();
+    let fixed = |index| Registration::new().direct(true).fixed(AppAddress::fixed(index).unwrap());
+    let (mut one, mut other) = (register(&node, fixed(1)), register(&node, fixed(2)));
+    link(&mut one, &mut other);
+    let former = one.direct.open[0].number;
+    for number in 1..=3 {
+        one.send(other.tid(), &Counted(number)).unwrap();
+    }
+    // when
+    node.stop();
+    let next = TestNode::start_with(|config| config.lncl.socket = Some(path));
+    let mut numbers = Vec::new();
+    let deadline = Time::now() + WATCHDOG;
+    while one.registrations() < 2 || other.registrations() < 2 {
+        assert!(Time::now() < deadline, "waited for both to be back");
+        for endpoint in [&mut one, &mut other] {
+            match endpoint.receive(Duration::from_millis(1)) {
+                Ok(received) => {
+                    numbers.extend(received.map(|received| received.decode::<Counted>().unwrap().0))
+                }
+                Err(error) => assert!(matches!(error, ApiError::Away(_)), "{error}"),
+            }
+        }
+    }
+    // then
+    let path = next.stores.config.lncl.socket.clone().expect("it was set");
+    let mut third = NodeApi::connect(path).unwrap().register_transport_address(fixed(3)).unwrap();
+    link(&mut third, &mut one);
+    one.send(other.tid(), &Counted(4)).unwrap();
+    one.send(third.tid(), &Counted(5)).unwrap();
+    while numbers.len() < 4 {
+        let received = other.receive(WATCHDOG).unwrap().expect("a message");
+        numbers.push(received.decode::<Counted>().unwrap().0);
+    }
+    assert_eq!(numbers, [1, 2, 3, 4]);
+    assert_eq!(third.receive(WATCHDOG).unwrap().expect("a message").decode::<Counted>().unwrap(), Counted(5));
+    assert!(one.direct.open.iter().any(|link| link.number == former), "the first link stands");
+    assert_eq!(one.direct.open.iter().filter(|link| link.number == former).count(), 1);
+}
+
+#[test]
+fn when_the_rings_of_a_process_have_their_most_in_bytes_messages_go_through_the_node() {
+    let node = TestNode::start();
+    let (mut one, mut other, mut third) = (endpoint(&node), endpoint(&node), endpoint(&node));
+    // given: room for one ring of either
+    let budgets = [&mut one, &mut other].map(|endpoint| {
+        let budget = Box::leak(Box::new(Budget::new(endpoint.direct.terms.ring_bytes * 3 / 2)));
+        endpoint.direct.terms.budget = budget;
+        &*budget
+    });
+    link(&mut one, &mut other);
+    assert!(budgets[0].held() > 0 && budgets[1].held() > 0);
+    // when
+    for _ in 0..20 {
+        one.send(third.tid(), &Counted(1)).unwrap();
+        drop(third.receive(WATCHDOG).unwrap().expect("a message"));
+        third.send(other.tid(), &Counted(1)).unwrap();
+        drop(other.receive(WATCHDOG).unwrap().expect("a message"));
+    }
+    // then
+    assert_eq!((one.direct.open.len(), other.direct.open.len()), (1, 1));
+    assert!(third.direct.is_empty());
+    drop(one);
+    let deadline = Time::now() + WATCHDOG;
+    while !other.direct.is_empty() {
+        assert!(Time::now() < deadline, "waited for the end of the link");
+        assert!(other.receive(Duration::from_millis(1)).unwrap().is_none());
+    }
+    assert_eq!(budgets.map(Budget::held), [0, 0], "what a link took is given back");
 }

@@ -71,7 +71,6 @@ impl Greeting {
     /// Agrees with the node on what carries the messages.
     fn finish(&self, registered: Registered) -> Result<Link, ApiError> {
         let (socket, options) = (self.socket.clone(), self.options);
-        let node = rustix::net::sockopt::socket_peercred(&socket).ok().map(|credentials| credentials.pid);
         let payload_max = registered.payload_max as usize;
         let (writer, reader) = match registered.ring {
             None => {
@@ -86,7 +85,7 @@ impl Greeting {
                 (Writer::Ring(writer), Reader::Ring(Box::new(reader)))
             }
         };
-        Ok(Link { registered, writer: Arc::new(writer), reader, node })
+        Ok(Link { registered, writer: Arc::new(writer), reader })
     }
 
     /// Whether all that is wanted has come by the deadline.

@@ -13,7 +13,6 @@ use std::{
     time::Duration,
 };
 
-use rustix::process::Pid;
 use sinew_runtime::{
     outcome::{Outcome, ReceiptSink, Ticket},
     time::Time,
@@ -55,6 +54,8 @@ pub(super) struct LinkOptions {
     pub(super) patience: Duration,
     /// How this side is woken: by a futex where threads wait, by a socket where tasks do.
     pub(super) bell: BellKind,
+    /// Bytes of this side's ring of a direct link.
+    pub(super) direct_ring_bytes: usize,
 }
 
 /// A registered link.
@@ -62,8 +63,6 @@ pub(super) struct Link {
     pub(super) registered: Registered,
     pub(super) writer: Arc<Writer>,
     pub(super) reader: Reader,
-    /// The node's process, as the kernel says.
-    pub(super) node: Option<Pid>,
 }
 
 /// Connects to the node that listens at `path`.
