@@ -229,6 +229,18 @@ impl Direct {
         }
     }
 
+    /// A sender has lost its patience there. Until the peer takes something no other one waits.
+    pub(super) fn has_stalled(&mut self, number: LinkNumber) {
+        if let Some(link) = self.standing(number) {
+            link.is_stalled = true;
+        }
+    }
+
+    /// Whether a sender has lost its patience there, and the peer has taken nothing since.
+    pub(super) fn is_stalled(&mut self, number: LinkNumber) -> bool {
+        self.standing(number).is_some_and(|link| link.is_stalled)
+    }
+
     /// Whether nothing is left half written on a link, or it has ended.
     pub(super) fn is_whole(&mut self, number: LinkNumber) -> bool {
         self.standing(number).is_none_or(Standing::is_whole)

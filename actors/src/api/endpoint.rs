@@ -132,7 +132,7 @@ impl Endpoint {
         at_once(self.dispatch(message.into())).map(drop)
     }
 
-    /// Sends a value, in the class of its type. Returns when the socket to the node has taken it.
+    /// Sends a value, in the class of its type. Returns when the way to the node, or the ring of a direct link, has taken it.
     ///
     /// # Errors
     /// It was not sent.

@@ -211,7 +211,7 @@ impl Registration {
         self
     }
 
-    /// How long a send waits at most while the node takes nothing. Default 1 s.
+    /// How long a send waits at most while the node or, on a direct link, the peer takes nothing. Default 1 s.
     #[must_use]
     pub const fn patience(mut self, patience: Duration) -> Self {
         self.link.patience = patience;

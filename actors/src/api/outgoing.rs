@@ -167,6 +167,8 @@ impl Endpoint {
     /// [`ApiError::Stalled`]: nothing of it was written. Of what was written in part the rest goes out with later calls.
     async fn send_on(&mut self, link: LinkNumber, draft: Draft) -> Result<Option<Draft>, ApiError> {
         let (length, patience) = (HEADER_LEN + draft.payload.len(), self.home.options.patience);
+        // Who takes nothing costs that once, and not with each message.
+        let waits = if self.direct.is_stalled(link) { Duration::ZERO } else { patience };
         // `None`: it is begun.
         let mut left = Some(draft);
         let (mut until, mut pause) = (None, ROOM_PAUSE);
@@ -182,8 +184,9 @@ impl Endpoint {
                 },
             };
             let now = Time::now();
-            let until = *until.get_or_insert(now + patience);
+            let until = *until.get_or_insert(now + waits);
             if now >= until {
+                self.direct.has_stalled(link);
                 return left.map_or(Ok(None), |_| Err(ApiError::Stalled(patience)));
             }
             self.take_in_while_writing(link);

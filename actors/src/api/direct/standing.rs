@@ -48,6 +48,8 @@ pub(in crate::api) struct Standing {
     /// What is left of a long frame. Nothing else is written before it.
     rest: Option<Rest>,
     has_forged: bool,
+    /// A sender has waited for room in vain.
+    pub(super) is_stalled: bool,
 }
 
 /// Whom a link is between.
@@ -100,6 +102,7 @@ impl Standing {
             parked: Vec::new(),
             rest: None,
             has_forged: false,
+            is_stalled: false,
         }
     }
 
@@ -172,7 +175,9 @@ impl Standing {
         if !self.is_whole() {
             return Ok(Put::Full(message));
         }
-        Ok(match self.writer.begin(message)? {
+        let begun = self.writer.begin(message)?;
+        self.is_stalled &= matches!(begun, Begun::Full(_));
+        Ok(match begun {
             Begun::Whole => Put::Taken,
             Begun::Part(rest) => {
                 self.rest = Some(rest);

@@ -642,3 +642,35 @@ fn when_the_rings_of_a_process_have_their_most_in_bytes_messages_go_through_the_
     }
     assert_eq!(budgets.map(Budget::held), [0, 0], "what a link took is given back");
 }
+
+#[test]
+fn a_peer_that_takes_nothing_costs_a_sender_its_patience_once_and_not_with_each_message() {
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let patience = WATCHDOG / 20;
+    let mut one = register(&node, Registration::new().direct(true).patience(patience));
+    let (mut other, mut third) = (endpoint(&node), endpoint(&node));
+    link(&mut one, &mut other);
+    while one.send(other.tid(), &Counted(1)).is_ok() {}
+    // when
+    let deadline = Time::now() + WATCHDOG;
+    for number in 0..100 {
+        assert!(
+            Time::now() < deadline,
+            "{number} messages were refused, and each after the sender's patience"
+        );
+        let refused = one.send(other.tid(), &Counted(2)).unwrap_err();
+        assert!(matches!(refused, ApiError::Stalled(_)), "{refused}");
+        // then: others are served
+        one.send(third.tid(), &Counted(number)).unwrap();
+        assert_eq!(
+            third.receive(WATCHDOG).unwrap().expect("a message").decode::<Counted>().unwrap(),
+            Counted(number)
+        );
+    }
+    // It takes again, and is waited for again.
+    while let Some(received) = other.receive(Duration::ZERO).unwrap() {
+        drop(received);
+    }
+    one.send(other.tid(), &Counted(3)).unwrap();
+    assert_eq!(other.receive(WATCHDOG).unwrap().expect("a message").decode::<Counted>().unwrap(), Counted(3));
+}
