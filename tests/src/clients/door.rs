@@ -1,6 +1,6 @@
 //! The role of the node: opens its door, says when, and answers what its director asks.
 
-use sinew::prelude::*;
+use sinew::{fault::Fault, prelude::*};
 
 use super::{entry::Poster, poster, resident, say, told};
 use crate::{DEADLINE, puppet::Order};
@@ -46,6 +46,7 @@ pub(super) fn play(arguments: &[String]) {
     for question in told() {
         match &*question {
             "quiet" => poster::be_quiet(),
+            "panic" => node.handle().inject("LNCL", Fault::panic()).expect("every node has it"),
             "refused" => say(&format!("refused {}", node.handle().refused())),
             _ => panic!("{question:?} is nothing that the node answers"),
         }

@@ -105,6 +105,11 @@ impl Performer {
         status
     }
 
+    /// Kills it, and returns when it is gone and all that it said was heard.
+    pub(super) fn kill_now(&mut self) {
+        self.end_now();
+    }
+
     fn end_now(&mut self) {
         // It may have ended by itself.
         let _ = self.child.kill();

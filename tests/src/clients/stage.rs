@@ -23,6 +23,7 @@ pub struct StageLimits {
 #[derive(Debug)]
 pub struct Stage {
     program: PathBuf,
+    residents: Vec<String>,
     /// Ends before its directory does.
     node: Performer,
     answers: Receiver<String>,
@@ -44,7 +45,7 @@ impl Stage {
         program: &Path,
         limits: StageLimits,
         residents: &[String],
-        mut hear: impl FnMut(&str) + Send + 'static,
+        hear: impl FnMut(&str) + Send + 'static,
     ) -> Self {
         let directory = OwnDirectory::new();
         for name in ["run", "tmp"] {
@@ -57,19 +58,26 @@ impl Stage {
              [lncl]\nsocket = {socket:?}\nclients_max = {clients_max}\n[ndl]\nmulticast = false\nmdns_port = false\n"
         );
         std::fs::write(&config, text).expect("the test's own directory");
-        let (say, answers) = sync_channel(64);
-        let arguments: Vec<_> =
-            [config.display().to_string()].into_iter().chain(residents.iter().cloned()).collect();
-        let node = Performer::start(program, "door", &arguments, &directory.join("tmp"), move |line| {
-            if line.starts_with(|first: char| first.is_ascii_digit()) {
-                return hear(line);
-            }
-            // Nobody waits for its answers any more when the stage is gone.
-            let _ = say.send(line.to_owned());
-        });
-        let stage = Self { program: program.to_owned(), node, answers, directory };
+        let (node, answers) = open(program, &directory, residents, hear);
+        let (program, residents) = (program.to_owned(), residents.to_owned());
+        let stage = Self { program, residents, node, answers, directory };
         stage.wait_for("open");
         stage
+    }
+
+    /// Kills the node, and starts another one behind the same door.
+    ///
+    /// # Panics
+    /// If it does not start.
+    pub fn replace_node(&mut self) {
+        self.node.kill_now();
+        (self.node, self.answers) = open(&self.program, &self.directory, &self.residents, |_| {});
+        self.wait_for("open");
+    }
+
+    /// Lets the node's LNCL panic. It is back soon.
+    pub fn panic_lncl(&mut self) {
+        self.node.tell("panic");
     }
 
     fn wait_for(&self, word: &str) -> String {
@@ -141,4 +149,24 @@ impl Stage {
         let left = std::fs::read_dir(directory.join("run")).expect("the stage's own directory").count();
         assert_eq!(left, 0, "files are left beside the socket");
     }
+}
+
+/// Starts a node with the stage's configuration: its process, and what it says to its director.
+fn open(
+    program: &Path,
+    directory: &OwnDirectory,
+    residents: &[String],
+    mut hear: impl FnMut(&str) + Send + 'static,
+) -> (Performer, Receiver<String>) {
+    let (say, answers) = sync_channel(64);
+    let config = directory.join("node.toml").display().to_string();
+    let arguments: Vec<_> = [config].into_iter().chain(residents.iter().cloned()).collect();
+    let node = Performer::start(program, "door", &arguments, &directory.join("tmp"), move |line| {
+        if line.starts_with(|first: char| first.is_ascii_digit()) {
+            return hear(line);
+        }
+        // Nobody waits for its answers any more when the stage is gone.
+        let _ = say.send(line.to_owned());
+    });
+    (node, answers)
 }

@@ -11,7 +11,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew::{Endpoint, NodeApi, Payload as _};
+use sinew::{ApiError, Endpoint, NodeApi, Payload as _};
 
 use super::{
     registration::{register, wishes},
@@ -122,8 +122,11 @@ pub(super) fn play_taker(arguments: &[String]) {
 
 fn take(mut endpoint: Endpoint, over: &AtomicBool) {
     while !over.load(Ordering::Relaxed) {
-        let Some(received) = endpoint.receive(Duration::from_millis(100)).expect("the node lives") else {
-            continue;
+        let received = match endpoint.receive(Duration::from_millis(100)) {
+            Ok(Some(received)) => received,
+            // It comes back by itself when its node was replaced.
+            Ok(None) | Err(ApiError::Away(_)) => continue,
+            Err(error) => panic!("{error}"),
         };
         if received.kind() == Order::KIND && received.wants_reply() {
             let question: Order = received.decode().expect("whoever asks here asks so");

@@ -1,6 +1,7 @@
 //! Two processes that LNCL has introduced to each other do not need the node any more.
 
 use std::{
+    sync::atomic::{AtomicBool, Ordering},
     thread,
     time::{Duration, Instant},
 };
@@ -12,6 +13,7 @@ use sinew_tests::{
     clients::{Performer, Stage, StageLimits},
     program,
     puppet::Order,
+    until,
 };
 
 /// Who has not answered by then is not asked directly yet.
@@ -115,4 +117,71 @@ fn the_death_of_a_peer_is_an_outcome_also_while_the_node_is_stopped() {
     scene.to = scene.asking.resolve("echo", DEADLINE).expect("the node answers").expect("it is registered");
     assert_eq!(scene.ask(8, DEADLINE).expect("an answer").number, 8);
     scene.end();
+}
+
+/// Asks the echo directly until it is told to end; how many questions were answered. Each is, by its own number, once.
+fn ask_all_along(asking: &mut Endpoint, to: Tid, is_over: &AtomicBool) -> u64 {
+    let mut number = 0;
+    while !is_over.load(Ordering::Relaxed) {
+        number += 1;
+        let answer = asking.ask::<Order, Order>(to, &Order { number }, DEADLINE);
+        assert_eq!(answer.expect("the link stands").number, number);
+        let told = asking.send_confirmed(to, &Order { number }, DEADLINE);
+        assert!(matches!(told, Ok(Outcome::Delivered)), "{number}: {told:?}");
+    }
+    number
+}
+
+/// Both come back, and through the node as well.
+fn is_whole_again(scene: &mut Scene, registrations: u64) {
+    until("the asking endpoint is back", || {
+        match scene.asking.receive(Duration::from_millis(20)) {
+            Ok(None) | Err(ApiError::Away(_)) => {}
+            other => panic!("{other:?}"),
+        }
+        (scene.asking.registrations() >= registrations).then_some(())
+    });
+    let api = NodeApi::connect(scene.stage.socket()).expect("the door is open");
+    let mut third = api.register_transport_address(Registration::new()).expect("an address");
+    let echo = until("the echo is back", || third.resolve("echo", DEADLINE).expect("the node answers"));
+    assert_eq!(echo, scene.to, "it has its address again");
+    let answer = third.ask::<Order, Order>(echo, &Order { number: 3 }, DEADLINE).expect("an answer");
+    assert_eq!(answer.number, 3);
+}
+
+/// Lets the node fail so `times` while questions are asked on a link.
+fn asks_while(times: u64, mut fails: impl FnMut(&mut Stage)) {
+    let mut scene = Scene::new();
+    scene.stop_the_node_when_it_is_not_needed();
+    scene.signal_node(Signal::CONT);
+    let is_over = AtomicBool::new(false);
+    let Scene { mut stage, echo, asking, to, ups } = scene;
+    let (asking, answered) = thread::scope(|scope| {
+        let asks = scope.spawn(|| {
+            let mut asking = asking;
+            let answered = ask_all_along(&mut asking, to, &is_over);
+            (asking, answered)
+        });
+        for _ in 0..times {
+            thread::sleep(SOON);
+            fails(&mut stage);
+        }
+        thread::sleep(SOON);
+        is_over.store(true, Ordering::Relaxed);
+        asks.join().expect("it does not panic")
+    });
+    assert!(answered > times, "{answered} questions in all");
+    let mut scene = Scene { stage, echo, asking, to, ups };
+    is_whole_again(&mut scene, 2);
+    scene.end();
+}
+
+#[test]
+fn every_question_on_a_link_has_its_one_answer_while_the_node_is_killed_and_replaced() {
+    asks_while(3, Stage::replace_node);
+}
+
+#[test]
+fn every_question_on_a_link_has_its_one_answer_while_lncl_panics() {
+    asks_while(5, Stage::panic_lncl);
 }
