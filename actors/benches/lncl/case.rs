@@ -30,10 +30,13 @@ pub(crate) enum Way {
     DirectSpin,
     /// As `Ring`, the applications being tasks of tokio.
     TaskRing,
+    /// As `Direct`, the same.
+    TaskDirect,
 }
 
 impl Way {
-    const ALL: [Self; 5] = [Self::Socket, Self::Ring, Self::Direct, Self::DirectSpin, Self::TaskRing];
+    const ALL: [Self; 6] =
+        [Self::Socket, Self::Ring, Self::Direct, Self::DirectSpin, Self::TaskRing, Self::TaskDirect];
 
     const fn name(self) -> &'static str {
         match self {
@@ -42,12 +45,13 @@ impl Way {
             Self::Direct => "direct",
             Self::DirectSpin => "direct_spin",
             Self::TaskRing => "task_ring",
+            Self::TaskDirect => "task_direct",
         }
     }
 
     const fn references(self) -> &'static [Reference] {
         match self {
-            Self::Socket | Self::Ring | Self::Direct | Self::TaskRing => {
+            Self::Socket | Self::Ring | Self::Direct | Self::TaskRing | Self::TaskDirect => {
                 &[Reference::BareFutex, Reference::UnixStream, Reference::Iceoryx2Event]
             }
             Self::DirectSpin => &[Reference::BarePoll, Reference::Iceoryx2Poll],
@@ -57,7 +61,7 @@ impl Way {
     /// Who looks without sleeping needs the other one to have another CPU.
     const fn spins(self) -> bool {
         match self {
-            Self::Socket | Self::Ring | Self::Direct | Self::TaskRing => false,
+            Self::Socket | Self::Ring | Self::Direct | Self::TaskRing | Self::TaskDirect => false,
             Self::DirectSpin => true,
         }
     }
@@ -66,7 +70,7 @@ impl Way {
     const fn is_of_tasks(self) -> bool {
         match self {
             Self::Socket | Self::Ring | Self::Direct | Self::DirectSpin => false,
-            Self::TaskRing => true,
+            Self::TaskRing | Self::TaskDirect => true,
         }
     }
 }
@@ -354,7 +358,7 @@ pub(crate) fn play(role: &str) -> ExitCode {
         ["echo", way, pinning, socket] => {
             raw::pin(pinning, End::Echoing);
             match way_named(way) {
-                way if way.is_of_tasks() => tasks::echo(socket),
+                way if way.is_of_tasks() => tasks::echo(way, socket),
                 way => ends::echo(way, Memory::Lent, socket),
             }
         }

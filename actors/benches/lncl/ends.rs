@@ -74,7 +74,7 @@ pub(crate) fn register(way: Way, socket: &str, name: &str) -> Endpoint {
     let registration = match way {
         Way::Socket => Registration::new().transport(Transport::Socket),
         Way::Ring => Registration::new(),
-        Way::TaskRing => unreachable!("its ends are in tasks.rs"),
+        Way::TaskRing | Way::TaskDirect => unreachable!("its ends are in tasks.rs"),
         Way::Direct => Registration::new().direct(true),
         Way::DirectSpin => Registration::new().direct(true).spin(Spin::For(LOOKS)),
     };

@@ -2,7 +2,7 @@
 //!
 //! `cargo bench -p sinew --bench lncl [-- [--short] WORD...]` runs the cases whose name holds every WORD, each in fresh
 //! processes: a node, and the two applications in processes of their own, which speak through LNCL (`socket`, `ring`; `task_ring`: as
-//! tasks of tokio) or directly, by the blocking NodeAPI.
+//! tasks of tokio) or directly (`direct`, `task_direct`), by the blocking NodeAPI unless they are tasks.
 //! JSON lines are on the standard output, the same as rows of a table on the standard error; `--short` does a tenth of the
 //! rounds of the cases at 1000 bytes. Times are microseconds. Nothing here asserts a time.
 //!

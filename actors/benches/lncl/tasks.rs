@@ -15,9 +15,9 @@ fn runtime() -> Runtime {
     Builder::new_current_thread().enable_all().build().expect("a runtime")
 }
 
-async fn register(socket: &str, name: &str) -> AsyncEndpoint {
+async fn register(way: Way, socket: &str, name: &str) -> AsyncEndpoint {
     let api = NodeApi::connect(socket).expect("the node's door");
-    let registration = Registration::new().name(name);
+    let registration = Registration::new().name(name).direct(way == Way::TaskDirect);
     api.register_transport_address_async(registration).await.expect("an address")
 }
 
@@ -28,9 +28,9 @@ fn filled(endpoint: &mut AsyncEndpoint, to: Tid, kind: Kind, bytes: &[u8]) -> Le
 }
 
 /// The application that echoes: until the measuring end ends this process.
-pub(crate) fn echo(socket: &str) {
+pub(crate) fn echo(way: Way, socket: &str) {
     runtime().block_on(async {
-        let mut endpoint = register(socket, "echo").await;
+        let mut endpoint = register(way, socket, "echo").await;
         say_there();
         loop {
             let received = endpoint.receive().await.expect("the node lives");
@@ -45,7 +45,7 @@ pub(crate) fn round_trips(way: Way, bytes: usize, rounds: Rounds, pinning: Pinni
     let home = Home::start(pinning);
     let _echo = Process::start(&role("echo", way, pinning, home.socket()));
     let runtime = runtime();
-    let mut endpoint = runtime.block_on(register(home.socket(), "ping"));
+    let mut endpoint = runtime.block_on(register(way, home.socket(), "ping"));
     let to = runtime.block_on(endpoint.resolve("echo", DEADLINE)).expect("the node lives");
     let (to, mut buffer) = (to.expect("it is registered"), vec![7; bytes]);
     rounds.time(|| {
