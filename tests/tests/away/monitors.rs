@@ -245,6 +245,7 @@ fn a_life_that_hangs_is_told_as_hung_and_its_will_is_sent_for_it() {
 struct Insistent {
     /// Who it names next; the number counts up.
     next: fn(u32) -> Tid,
+    count: u32,
     told: Log<Down>,
     seen: Log<Trace>,
 }
@@ -257,8 +258,9 @@ enum Trace {
 }
 
 impl Insistent {
-    fn watch(&self, context: &AppContext<Self>) {
-        context.monitor((self.next)(self.told.all().len() as u32)).expect("one at a time");
+    fn watch(&mut self, context: &AppContext<Self>) {
+        self.count += 1;
+        context.monitor((self.next)(self.count)).expect("one at a time");
     }
 }
 
@@ -302,7 +304,12 @@ fn a_watcher_that_monitors_again_whom_nobody_has_comes_to_its_timers_its_message
         let (told, seen) = (Log::default(), Log::default());
         let watcher = {
             let (told, seen) = (told.clone(), seen.clone());
-            AppSpec::new("watcher", move || Insistent { next, told: told.clone(), seen: seen.clone() })
+            AppSpec::new("watcher", move || Insistent {
+                next,
+                count: 0,
+                told: told.clone(),
+                seen: seen.clone(),
+            })
         };
         let ((desk, key), began) = (desk("desk"), std::time::Instant::now());
         let watcher = watcher.handles::<Down>().handles::<Job>().own_thread();
