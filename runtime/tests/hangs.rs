@@ -13,7 +13,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use actix::{Actor, AsyncContext, Handler, fut::WrapFuture};
+use actix::{Actor, ActorContext, ActorFutureExt, AsyncContext, Handler, Running, fut::WrapFuture};
 use sinew_runtime::{
     app::{AppContext, AppSpec, Delivery},
     outcome::Outcome,
@@ -287,6 +287,45 @@ fn one_that_hangs_in_started_or_in_its_making_is_seen_before_its_start_is_over_t
     }
     drop((open, second));
     stage.stop();
+}
+
+/// Stops as it is told to, and does not come back from its `stopping`.
+struct Clinging(Arc<std::sync::Mutex<Receiver<()>>>);
+
+impl Actor for Clinging {
+    type Context = AppContext<Self>;
+
+    fn stopping(&mut self, _: &mut Self::Context) -> Running {
+        self.0.lock().unwrap().recv_timeout(DEADLINE).ok();
+        Running::Stop
+    }
+}
+
+impl Handler<Delivery<Number>> for Clinging {
+    type Result = ();
+
+    fn handle(&mut self, number: Delivery<Number>, context: &mut Self::Context) {
+        match number.0 {
+            1 => context.stop(),
+            2 => _ = context.after(Duration::ZERO, |_, _, context| context.stop()),
+            _ => _ = context.spawn(async {}.into_actor(self).map(|(), _, context| context.stop())),
+        }
+    }
+}
+
+#[test]
+fn one_that_hangs_in_stopping_is_said_to_hang_there_whatever_made_it_stop() {
+    for how in 1..=3 {
+        let (open, gate) = gate();
+        let spec = AppSpec::new("clinging", move || Clinging(gate.clone())).handles::<Number>();
+        let stage = Stage::start(vec![spec.progress_within(BUDGET).own_thread().into()]);
+        stage.wait_ready(0);
+        stage.send(0, how);
+        let what = hung(stage.wait_failed(0));
+        assert!(what.contains("in its `stopping`"), "{how}: {what}");
+        drop(open);
+        stage.stop();
+    }
 }
 
 /// Slow, and never too slow: each message takes a third of the budget.

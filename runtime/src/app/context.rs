@@ -13,7 +13,7 @@ use crate::{
     outcome::{Outcome, Rejection},
     schedule::{Schedule, Tick, TimerId},
     sender::{Confirmation, Destination, Reply, SendError, Sender},
-    supervision::ReadyGate,
+    supervision::{ReadyGate, vitals::Vitals},
     tid::Tid,
     time::Time,
     wire::{DecodeError, Kind, Payload},
@@ -244,6 +244,9 @@ impl<A: Actor<Context = Self>> AppContext<A> {
 
 impl<A: Actor<Context = Self>> ActorContext for AppContext<A> {
     fn stop(&mut self) {
+        if let Some(vitals) = Vitals::present() {
+            vitals.stops();
+        }
         self.parts.stop();
     }
 

@@ -10,7 +10,7 @@ use std::{
     time::Duration,
 };
 
-use actix::{Actor, ActorContext, ActorFuture, Handler};
+use actix::{Actor, ActorContext, ActorFuture, ActorState, Handler};
 
 use crate::{
     app::{
@@ -254,7 +254,8 @@ impl<A: Actor<Context = AppContext<A>>> ActorFuture<A> for Drive<A> {
         let polled = this.steps(actor, context, task);
         // What runs next in this turn is nothing that was taken here.
         this.reader.count();
-        this.vitals.begins(Doing::Task, None);
+        let next = if context.state() == ActorState::Stopping { Doing::Stop } else { Doing::Task };
+        this.vitals.begins(next, None);
         polled
     }
 }

@@ -6,7 +6,7 @@ use crate::{
     post::Post,
     supervision::{
         Burials, ChildSpec, Place,
-        core::{BranchView, ChildId, Input, Plan, Planned, Policy, Reason, Tree},
+        core::{BranchView, ChildId, Generation, Input, Plan, Planned, Policy, Reason, Tree},
         supervisor::{PlannedChild, SupervisorPlan},
     },
     tid::Tid,
@@ -26,11 +26,21 @@ pub struct Listed {
     pub stop_within: Duration,
 }
 
+/// Whose child one is, and in which life.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Standing {
+    pub(super) supervisor: String,
+    pub(super) generation: Generation,
+    pub(super) restarts: u64,
+}
+
 /// The children of a supervisor and of those below it. Clones are the same roster.
 #[derive(Clone)]
 pub struct Roster {
     pub(super) tree: Rc<RefCell<Tree>>,
     listed: Rc<RefCell<BTreeMap<ChildId, Listed>>>,
+    /// What was told of each child last.
+    standings: Rc<RefCell<BTreeMap<ChildId, Standing>>>,
     arrivals: Rc<RefCell<BTreeMap<ChildId, (ChildId, ChildSpec)>>>,
     post: Post<Input>,
     /// A test wants the supervisor to panic.
@@ -52,6 +62,7 @@ impl Roster {
         let roster = Self {
             tree: Rc::new(RefCell::new(Tree::new(plan, seed))),
             listed: Rc::new(RefCell::new(listed)),
+            standings: Rc::default(),
             arrivals: Rc::default(),
             post,
             #[cfg(feature = "fault-points")]
@@ -125,10 +136,22 @@ impl Roster {
         self.listed.borrow().get(&id).map_or_else(|| id.to_string(), |listed| listed.name.clone())
     }
 
-    /// The name of the supervisor of a child.
-    pub(super) fn supervisor_of(&self, id: ChildId) -> String {
-        let owner = self.tree.borrow().owner(id);
-        owner.map_or_else(|| "nobody".to_owned(), |owner| self.name(owner))
+    /// Whose child it is and in which life. Of one that its own end has removed, what was known last.
+    pub(super) fn standing(&self, id: ChildId) -> Standing {
+        let known = {
+            let tree = self.tree.borrow();
+            tree.owner(id).zip(tree.child(id))
+        };
+        let mut standings = self.standings.borrow_mut();
+        if let Some((owner, child)) = known {
+            let standing = Standing {
+                supervisor: self.name(owner),
+                generation: child.generation,
+                restarts: child.restarts,
+            };
+            standings.insert(id, standing);
+        }
+        standings.get(&id).cloned().unwrap_or_default()
     }
 
     /// Replaces ids by names in what a supervisor says of why it gave up.
@@ -157,6 +180,7 @@ impl Roster {
 
     pub(super) fn remove(&self, id: ChildId) {
         self.listed.borrow_mut().remove(&id);
+        self.standings.borrow_mut().remove(&id);
     }
 }
 

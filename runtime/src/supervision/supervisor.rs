@@ -15,6 +15,7 @@ use crate::{
         guard::Guard,
         orphans::{LETTING_GO, Legacy, Listener, Orphan, Orphans},
         panics::install_hook,
+        roster::Standing,
         tenant::{Fate, Tenant},
         vitals::Vitals,
         watchdog::Reprieve,
@@ -317,28 +318,29 @@ impl Supervisor {
 
     /// One event for each change, for whoever reads them.
     fn note(&self, id: ChildId, what: &'static str) {
-        let (supervisor, tid) = (self.roster.supervisor_of(id), self.tid_of(id));
-        let (generation, restarts) = self.life_of(id);
-        crate::log::debug!(supervisor, child = self.roster.name(id), tid, generation, restarts, "{what}");
+        let Standing { supervisor, generation, restarts } = self.roster.standing(id);
+        let (child, tid, waiting) = (self.roster.name(id), self.tid_of(id), self.waiting(id));
+        crate::log::debug!(supervisor, child, tid, generation, restarts, waiting, "{what}");
     }
 
     fn note_end(&self, id: ChildId, reason: &Reason) {
-        let (supervisor, tid) = (self.roster.supervisor_of(id), self.tid_of(id));
-        let (child, (generation, restarts)) = (self.roster.name(id), self.life_of(id));
+        let Standing { supervisor, generation, restarts } = self.roster.standing(id);
+        let (child, tid, waiting) = (self.roster.name(id), self.tid_of(id), self.waiting(id));
         if reason.is_failure() {
-            crate::log::error!(supervisor, child, tid, generation, restarts, %reason, "a child failed");
+            crate::log::error!(supervisor, child, tid, generation, restarts, waiting, %reason, "a child failed");
         } else {
-            crate::log::info!(supervisor, child, tid, generation, restarts, %reason, "a child ended");
+            crate::log::info!(supervisor, child, tid, generation, restarts, waiting, %reason, "a child ended");
         }
+    }
+
+    /// Messages that wait for it; `None` where that is not known here, or somebody is in its mailbox.
+    fn waiting(&self, id: ChildId) -> Option<usize> {
+        let tenant = self.children.get(&id)?.tenant.as_ref()?;
+        tenant.vitals().backlog().map(|(waiting, _)| waiting)
     }
 
     fn tid_of(&self, id: ChildId) -> Option<String> {
         self.children.get(&id).and_then(|child| child.spec.tid).map(|tid| tid.to_string())
-    }
-
-    fn life_of(&self, id: ChildId) -> (Generation, u64) {
-        let child = self.roster.tree.borrow().child(id);
-        child.map_or((0, 0), |child| (child.generation, child.restarts))
     }
 
     fn spawn(&mut self, id: ChildId, generation: Generation) {
@@ -378,7 +380,7 @@ impl Supervisor {
         let Some(Child { spec, tenant, .. }) = self.children.get_mut(&id) else { return };
         let Some(tenant) = tenant.take() else { return };
         crate::log::error!(
-            supervisor = self.roster.supervisor_of(id),
+            supervisor = self.roster.standing(id).supervisor,
             child = spec.name,
             "its life is taken"
         );

@@ -187,6 +187,13 @@ impl Vitals {
         self.begun.store(now.map_or(0, Time::as_nanos), Ordering::Release);
     }
 
+    /// It stops by itself. Of a future of its own nobody hears when it has ended: what comes then in this turn is its `stopping`.
+    pub(crate) fn stops(&self) {
+        if self.sight().doing == Doing::Task {
+            self.begins(Doing::Stop, None);
+        }
+    }
+
     /// The turn is over.
     fn rests(&self) {
         let next = (self.turn.load(Ordering::Relaxed) + 2) & !1;
