@@ -4,6 +4,8 @@
 
 mod budget;
 mod descriptors;
+mod early;
+mod meeting;
 mod standing;
 #[cfg(test)]
 mod tests;
@@ -41,11 +43,11 @@ use crate::{
 };
 
 use budget::{Budget, PROCESS, Share};
+use early::Early;
+pub(super) use early::InTurn;
 use standing::{Alone, Pair, Put};
 pub(super) use standing::{Came, Everything, Standing};
 
-/// Messages at most that wait for the rest of a ring of which the sender has said no more. One more is refused as `QueueFull`.
-const EARLY_MAX: usize = 4_096;
 /// Bytes of a direct link's ring, if nothing else is asked for.
 pub(super) const RING_BYTES: usize = 64 * 1024;
 /// Bytes of a peer's ring at most.
@@ -73,23 +75,6 @@ struct Offered {
     socket: Arc<UnixStream>,
     exchange: Exchange,
     share: Share,
-}
-
-/// What one who has ended its link, or its next life, has sent through the node.
-struct Early {
-    /// The link that is read first.
-    after: LinkNumber,
-    messages: VecDeque<Message>,
-}
-
-/// What is to be done with a message that came through the node.
-pub(super) enum InTurn {
-    /// To be sorted in.
-    Now(Message),
-    /// It is kept until its turn has come.
-    Later,
-    /// Too many are kept: to be refused.
-    Never(Message),
 }
 
 /// The direct links of an endpoint.
@@ -260,200 +245,6 @@ impl Direct {
     /// Whether this link has not ended.
     pub(super) fn has(&self, number: LinkNumber) -> bool {
         self.open.iter().chain(&self.held).any(|link| link.number == number)
-    }
-
-    /// Does what a frame of the node asks for. Hands it back if it is not about links.
-    pub(super) fn heed(&mut self, message: Message, now: Time, node: &mut ToNode<'_>) -> Option<Message> {
-        match message.header.kind {
-            Kind::LNCL_INTRODUCTION => self.meet(&message, now, node),
-            Kind::LNCL_INTRODUCED => self.go_on(&message, now, node),
-            Kind::LNCL_SWITCH => self.mark(&message, now, node),
-            Kind::OUTCOME => return self.hear(message, now),
-            // Not an enum of ours: an open set of numbers.
-            _ => return Some(message),
-        }
-        None
-    }
-
-    /// Another one asks for a link.
-    fn meet(&mut self, message: &Message, now: Time, node: &ToNode<'_>) {
-        let Ok(Introduction { peer, number, pid: _ }) = payload::read(&message.payload) else { return };
-        let (peer, number) = (Tid::from_bits(peer), LinkNumber(number));
-        // A new life may ask before it was seen that the former one has ended.
-        self.see_ends(now);
-        let met = self.routes.introduction(peer).and_then(|()| self.offer(peer, number));
-        let outcome = met.map_or_else(Outcome::Rejected, |()| Outcome::Delivered);
-        node.answer(self.terms.own, message.header.source, message.header.correlation, outcome);
-    }
-
-    fn offer(&mut self, peer: Tid, number: LinkNumber) -> Result<(), Rejection> {
-        let socket = self.take_end(number).ok_or(Rejection::QueueFull)?;
-        if !self.terms.budget.has_room(self.terms.ring_bytes) {
-            return Err(Rejection::Unsupported);
-        }
-        let (exchange, share) = self.prepare(&socket).map_err(|why| {
-            tracing::warn!(%peer, %why, "a direct link was not made");
-            Rejection::QueueFull
-        })?;
-        self.routes.offered(peer, number);
-        self.offered.push(Offered { peer, number, socket, exchange, share });
-        Ok(())
-    }
-
-    fn prepare(&self, socket: &UnixStream) -> Result<(Exchange, Share), ExchangeError> {
-        let share = self.terms.budget.take(self.terms.ring_bytes).ok_or(ExchangeError::Budget)?;
-        let [own, theirs] = [self.terms.ring_bytes, RING_BYTES_MAX].map(rings::capacity);
-        let exchange = Exchange::prepare_for(own, self.terms.options.bell, theirs)?;
-        exchange.offer(socket)?;
-        Ok((exchange, share))
-    }
-
-    fn take_end(&self, number: LinkNumber) -> Option<Arc<UnixStream>> {
-        descriptors::take(self.control.as_ref()?, number).map(Arc::new)
-    }
-
-    /// The other one has agreed to a link: it stands, and is switched to.
-    fn go_on(&mut self, message: &Message, now: Time, node: &mut ToNode<'_>) {
-        let Ok(Introduction { peer, number, pid: _ }) = payload::read(&message.payload) else { return };
-        let (peer, number) = (Tid::from_bits(peer), LinkNumber(number));
-        // Taken in any case: what nobody holds hangs up.
-        let socket = self.take_end(number);
-        if !self.routes.introduced(peer, message.header.correlation) {
-            return;
-        }
-        let connected = socket.ok_or(ExchangeError::Missing).and_then(|socket| {
-            let theirs = Exchange::receive(&socket)?.ok_or(ExchangeError::Missing)?;
-            let (exchange, share) = self.prepare(&socket)?;
-            self.connect(Offered { peer, number, socket, exchange, share }, theirs)
-        });
-        match connected {
-            Ok(link) => {
-                self.held.push(link);
-                let said = node.ask(self.switch_to(peer, number));
-                self.routes.connected(peer, number, said, now);
-            }
-            Err(why) => {
-                tracing::warn!(%peer, %why, "a direct link was not made");
-                self.routes.ended(peer, now);
-            }
-        }
-    }
-
-    fn connect(&self, offered: Offered, theirs: Offer) -> Result<Standing, ExchangeError> {
-        let Offered { peer, number, socket, exchange, share } = offered;
-        let (producer, consumer) = exchange.finish(theirs)?;
-        let writer = ring::Writer::new(socket.clone(), producer, self.terms.options);
-        let pair = Pair { own: self.terms.own, peer, number, socket };
-        Ok(Standing::new(pair, writer, consumer, share, self.terms.payload_max))
-    }
-
-    fn switch_to(&self, peer: Tid, number: LinkNumber) -> Message {
-        let switch = Switch { peer: peer.bits(), number: number.0 };
-        payload::frame(Kind::LNCL_SWITCH, self.terms.own, payload::lncl_of(peer.node), &switch)
-    }
-
-    /// A mark of a peer's SWITCH has come.
-    fn mark(&mut self, message: &Message, now: Time, node: &mut ToNode<'_>) {
-        let Ok(Switch { peer, number }) = payload::read(&message.payload) else { return };
-        let (peer, number) = (Tid::from_bits(peer), LinkNumber(number));
-        let header = &message.header;
-        let confirm = header.flags.has(Flags::CONFIRM).then_some(header.correlation);
-        let told = match self.routes.marked(peer, number, header.class, confirm) {
-            Marked::Wait => None,
-            Marked::Known => confirm.map(|correlation| (correlation, Outcome::Delivered)),
-            Marked::Unknown => {
-                confirm.map(|correlation| (correlation, Outcome::Rejected(Rejection::Unsupported)))
-            }
-            Marked::Open { confirm } => {
-                let index = self.held.iter().position(|link| link.number == number);
-                self.open.extend(index.map(|index| self.held.swap_remove(index)));
-                confirm.map(|correlation| (correlation, Outcome::Delivered))
-            }
-            Marked::Connect { confirm } => {
-                let connected = self.connect_offered(peer, number, now, node);
-                let why = Outcome::Rejected(Rejection::Malformed);
-                let outcome = if connected { Outcome::Delivered } else { why };
-                confirm.map(|correlation| (correlation, outcome))
-            }
-        };
-        if let Some((correlation, outcome)) = told {
-            node.answer(self.terms.own, header.source, correlation, outcome);
-        }
-    }
-
-    /// The peer has switched to the link that it had asked for: its offer is there.
-    fn connect_offered(&mut self, peer: Tid, number: LinkNumber, now: Time, node: &mut ToNode<'_>) -> bool {
-        let Some(index) = self.offered.iter().position(|link| link.number == number) else { return false };
-        let offered = self.offered.swap_remove(index);
-        let theirs = Exchange::receive(&offered.socket).and_then(|offer| offer.ok_or(ExchangeError::Missing));
-        match theirs.and_then(|theirs| self.connect(offered, theirs)) {
-            Ok(link) => {
-                self.open.push(link);
-                let said = node.ask(self.switch_to(peer, number));
-                self.routes.connected(peer, number, said, now);
-                true
-            }
-            Err(why) => {
-                tracing::warn!(%peer, %why, "a direct link was not made");
-                self.routes.ended(peer, now);
-                false
-            }
-        }
-    }
-
-    fn hear(&mut self, message: Message, now: Time) -> Option<Message> {
-        let outcome = message.payload.first().and_then(|code| Outcome::from_code(*code));
-        match self.routes.answered(message.header.correlation, outcome.unwrap_or(Outcome::Unknown), now) {
-            Answered::NotOurs => return Some(message),
-            Answered::Noted => {}
-            Answered::End(peer, number) => self.end(peer, number, now),
-        }
-        None
-    }
-
-    /// Keeps back what was sent after what is left in its sender's ring.
-    pub(super) fn keep_early(&mut self, message: Message) -> InTurn {
-        let header = &message.header;
-        // A group is another destination: its order is its own.
-        if self.is_empty() || !header.kind.is_user() || header.destination != self.terms.own {
-            return InTurn::Now(message);
-        }
-        let (source, class) = (header.source, header.class);
-        let after = match self.early.get(&source) {
-            Some(early) => early.after,
-            None => match self.routes.passed(source, class, Time::now()) {
-                Passed::Take => return InTurn::Now(message),
-                Passed::AfterLink(after) => after,
-            },
-        };
-        if self.early.values().map(|early| early.messages.len()).sum::<usize>() >= EARLY_MAX {
-            return InTurn::Never(message);
-        }
-        let early = self.early.entry(source).or_insert_with(|| Early { after, messages: VecDeque::new() });
-        early.messages.push_back(message);
-        InTurn::Later
-    }
-
-    /// The next of those that were kept back whose turn has come.
-    pub(super) fn next_early(&mut self, now: Time) -> Option<Message> {
-        if self.early.is_empty() {
-            return None;
-        }
-        self.pop_early().or_else(|| {
-            self.see_ends(now);
-            self.pop_early()
-        })
-    }
-
-    fn pop_early(&mut self) -> Option<Message> {
-        let routes = &self.routes;
-        let is_due = |(source, early): &(&Tid, &mut Early)| routes.link(**source) != Some(early.after);
-        let (source, early) = self.early.iter_mut().find(is_due)?;
-        let (source, message) = (*source, early.messages.pop_front());
-        if early.messages.is_empty() {
-            self.early.remove(&source);
-        }
-        message
     }
 
     /// Looks who has gone and what is to be said again, now and then.

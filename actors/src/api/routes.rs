@@ -17,6 +17,7 @@
 //! over has its turn before others. So a SWITCH becomes one mark in each class, behind all that was sent through the node
 //! before it, and a ring is read when all three have come. Nobody waits for that: who sends writes into the ring at once.
 
+mod said;
 #[cfg(test)]
 mod simulation;
 #[cfg(test)]
@@ -30,6 +31,8 @@ use sinew_runtime::{
     time::Time,
     wire::Class,
 };
+
+pub(super) use said::{Answered, Farewell, Left, Marked, Passed};
 
 /// Direct links of one endpoint at most, those that are being made included. What is above goes through the node.
 pub(super) const LINKS_MAX: usize = 64;
@@ -63,66 +66,6 @@ pub(super) enum Way {
 /// The number that LNCL gave a link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct LinkNumber(pub(super) u64);
-
-/// What a mark of the peer's SWITCH means.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Marked {
-    /// Others are missing.
-    Wait,
-    /// All have come. The peer's offer is in the link's socket: connect, then [`Routes::connected`].
-    Connect {
-        /// The correlation to confirm, once connected.
-        confirm: Option<u64>,
-    },
-    /// All have come: the peer's ring is read from now on.
-    Open {
-        /// The correlation to confirm.
-        confirm: Option<u64>,
-    },
-    /// It was said again.
-    Known,
-    /// There is no such link.
-    Unknown,
-}
-
-/// What an OUTCOME meant for a route.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Answered {
-    /// It was about a route, and there is nothing to do.
-    Noted,
-    /// The peer does not have this link any more: end it.
-    End(Tid, LinkNumber),
-    /// It is not about a route.
-    NotOurs,
-}
-
-/// Whether a peer that has gone has left anything: messages in its ring or, before that is mapped, its offer in the socket.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Left {
-    Nothing,
-    Something,
-}
-
-/// What is to be done with a message to this application that came through the node.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Passed {
-    /// It was sent before the source's SWITCH, or there is no link.
-    Take,
-    /// It was sent after the SWITCH: by another life of the source, or the source has ended this link. What it wrote into
-    /// its ring was sent before, and what it says to this side comes no more through that: nothing is sent there any more.
-    AfterLink(LinkNumber),
-}
-
-/// What is to be done about a peer that has hung up.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Farewell {
-    /// Its ring is open: read its last words, then [`Routes::ended`].
-    Read,
-    /// What it sent through the node comes first: keep the ring until its marks have come.
-    Keep,
-    /// There is no such link, or nothing can be in it: [`Routes::ended`].
-    Drop,
-}
 
 /// Classes whose mark has come.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -1,0 +1,70 @@
+//! What came through the node and was sent after what a link's ring still holds: it waits for its turn.
+
+use super::*;
+
+/// Messages at most that wait for the rest of a ring of which the sender has said no more. One more is refused as `QueueFull`.
+const EARLY_MAX: usize = 4_096;
+
+/// What one who has ended its link, or its next life, has sent through the node.
+pub(super) struct Early {
+    /// The link that is read first.
+    pub(super) after: LinkNumber,
+    messages: VecDeque<Message>,
+}
+
+/// What is to be done with a message that came through the node.
+pub(in crate::api) enum InTurn {
+    /// To be sorted in.
+    Now(Message),
+    /// It is kept until its turn has come.
+    Later,
+    /// Too many are kept: to be refused.
+    Never(Message),
+}
+
+impl Direct {
+    /// Keeps back what was sent after what is left in its sender's ring.
+    pub(in crate::api) fn keep_early(&mut self, message: Message) -> InTurn {
+        let header = &message.header;
+        // A group is another destination: its order is its own.
+        if self.is_empty() || !header.kind.is_user() || header.destination != self.terms.own {
+            return InTurn::Now(message);
+        }
+        let (source, class) = (header.source, header.class);
+        let after = match self.early.get(&source) {
+            Some(early) => early.after,
+            None => match self.routes.passed(source, class, Time::now()) {
+                Passed::Take => return InTurn::Now(message),
+                Passed::AfterLink(after) => after,
+            },
+        };
+        if self.early.values().map(|early| early.messages.len()).sum::<usize>() >= EARLY_MAX {
+            return InTurn::Never(message);
+        }
+        let early = self.early.entry(source).or_insert_with(|| Early { after, messages: VecDeque::new() });
+        early.messages.push_back(message);
+        InTurn::Later
+    }
+
+    /// The next of those that were kept back whose turn has come.
+    pub(in crate::api) fn next_early(&mut self, now: Time) -> Option<Message> {
+        if self.early.is_empty() {
+            return None;
+        }
+        self.pop_early().or_else(|| {
+            self.see_ends(now);
+            self.pop_early()
+        })
+    }
+
+    fn pop_early(&mut self) -> Option<Message> {
+        let routes = &self.routes;
+        let is_due = |(source, early): &(&Tid, &mut Early)| routes.link(**source) != Some(early.after);
+        let (source, early) = self.early.iter_mut().find(is_due)?;
+        let (source, message) = (*source, early.messages.pop_front());
+        if early.messages.is_empty() {
+            self.early.remove(&source);
+        }
+        message
+    }
+}

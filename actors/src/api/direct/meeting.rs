@@ -1,0 +1,159 @@
+//! How a link is made: LNCL's introductions, the offers of both sides, and the marks by which they switch to it.
+
+use super::*;
+
+impl Direct {
+    /// Does what a frame of the node asks for. Hands it back if it is not about links.
+    pub(in crate::api) fn heed(
+        &mut self,
+        message: Message,
+        now: Time,
+        node: &mut ToNode<'_>,
+    ) -> Option<Message> {
+        match message.header.kind {
+            Kind::LNCL_INTRODUCTION => self.meet(&message, now, node),
+            Kind::LNCL_INTRODUCED => self.go_on(&message, now, node),
+            Kind::LNCL_SWITCH => self.mark(&message, now, node),
+            Kind::OUTCOME => return self.hear(message, now),
+            // Not an enum of ours: an open set of numbers.
+            _ => return Some(message),
+        }
+        None
+    }
+
+    /// Another one asks for a link.
+    fn meet(&mut self, message: &Message, now: Time, node: &ToNode<'_>) {
+        let Ok(Introduction { peer, number, pid: _ }) = payload::read(&message.payload) else { return };
+        let (peer, number) = (Tid::from_bits(peer), LinkNumber(number));
+        // A new life may ask before it was seen that the former one has ended.
+        self.see_ends(now);
+        let met = self.routes.introduction(peer).and_then(|()| self.offer(peer, number));
+        let outcome = met.map_or_else(Outcome::Rejected, |()| Outcome::Delivered);
+        node.answer(self.terms.own, message.header.source, message.header.correlation, outcome);
+    }
+
+    fn offer(&mut self, peer: Tid, number: LinkNumber) -> Result<(), Rejection> {
+        let socket = self.take_end(number).ok_or(Rejection::QueueFull)?;
+        if !self.terms.budget.has_room(self.terms.ring_bytes) {
+            return Err(Rejection::Unsupported);
+        }
+        let (exchange, share) = self.prepare(&socket).map_err(|why| {
+            tracing::warn!(%peer, %why, "a direct link was not made");
+            Rejection::QueueFull
+        })?;
+        self.routes.offered(peer, number);
+        self.offered.push(Offered { peer, number, socket, exchange, share });
+        Ok(())
+    }
+
+    fn prepare(&self, socket: &UnixStream) -> Result<(Exchange, Share), ExchangeError> {
+        let share = self.terms.budget.take(self.terms.ring_bytes).ok_or(ExchangeError::Budget)?;
+        let [own, theirs] = [self.terms.ring_bytes, RING_BYTES_MAX].map(rings::capacity);
+        let exchange = Exchange::prepare_for(own, self.terms.options.bell, theirs)?;
+        exchange.offer(socket)?;
+        Ok((exchange, share))
+    }
+
+    fn take_end(&self, number: LinkNumber) -> Option<Arc<UnixStream>> {
+        descriptors::take(self.control.as_ref()?, number).map(Arc::new)
+    }
+
+    /// The other one has agreed to a link: it stands, and is switched to.
+    fn go_on(&mut self, message: &Message, now: Time, node: &mut ToNode<'_>) {
+        let Ok(Introduction { peer, number, pid: _ }) = payload::read(&message.payload) else { return };
+        let (peer, number) = (Tid::from_bits(peer), LinkNumber(number));
+        // Taken in any case: what nobody holds hangs up.
+        let socket = self.take_end(number);
+        if !self.routes.introduced(peer, message.header.correlation) {
+            return;
+        }
+        let connected = socket.ok_or(ExchangeError::Missing).and_then(|socket| {
+            let theirs = Exchange::receive(&socket)?.ok_or(ExchangeError::Missing)?;
+            let (exchange, share) = self.prepare(&socket)?;
+            self.connect(Offered { peer, number, socket, exchange, share }, theirs)
+        });
+        match connected {
+            Ok(link) => {
+                self.held.push(link);
+                let said = node.ask(self.switch_to(peer, number));
+                self.routes.connected(peer, number, said, now);
+            }
+            Err(why) => {
+                tracing::warn!(%peer, %why, "a direct link was not made");
+                self.routes.ended(peer, now);
+            }
+        }
+    }
+
+    fn connect(&self, offered: Offered, theirs: Offer) -> Result<Standing, ExchangeError> {
+        let Offered { peer, number, socket, exchange, share } = offered;
+        let (producer, consumer) = exchange.finish(theirs)?;
+        let writer = ring::Writer::new(socket.clone(), producer, self.terms.options);
+        let pair = Pair { own: self.terms.own, peer, number, socket };
+        Ok(Standing::new(pair, writer, consumer, share, self.terms.payload_max))
+    }
+
+    pub(super) fn switch_to(&self, peer: Tid, number: LinkNumber) -> Message {
+        let switch = Switch { peer: peer.bits(), number: number.0 };
+        payload::frame(Kind::LNCL_SWITCH, self.terms.own, payload::lncl_of(peer.node), &switch)
+    }
+
+    /// A mark of a peer's SWITCH has come.
+    fn mark(&mut self, message: &Message, now: Time, node: &mut ToNode<'_>) {
+        let Ok(Switch { peer, number }) = payload::read(&message.payload) else { return };
+        let (peer, number) = (Tid::from_bits(peer), LinkNumber(number));
+        let header = &message.header;
+        let confirm = header.flags.has(Flags::CONFIRM).then_some(header.correlation);
+        let told = match self.routes.marked(peer, number, header.class, confirm) {
+            Marked::Wait => None,
+            Marked::Known => confirm.map(|correlation| (correlation, Outcome::Delivered)),
+            Marked::Unknown => {
+                confirm.map(|correlation| (correlation, Outcome::Rejected(Rejection::Unsupported)))
+            }
+            Marked::Open { confirm } => {
+                let index = self.held.iter().position(|link| link.number == number);
+                self.open.extend(index.map(|index| self.held.swap_remove(index)));
+                confirm.map(|correlation| (correlation, Outcome::Delivered))
+            }
+            Marked::Connect { confirm } => {
+                let connected = self.connect_offered(peer, number, now, node);
+                let why = Outcome::Rejected(Rejection::Malformed);
+                let outcome = if connected { Outcome::Delivered } else { why };
+                confirm.map(|correlation| (correlation, outcome))
+            }
+        };
+        if let Some((correlation, outcome)) = told {
+            node.answer(self.terms.own, header.source, correlation, outcome);
+        }
+    }
+
+    /// The peer has switched to the link that it had asked for: its offer is there.
+    fn connect_offered(&mut self, peer: Tid, number: LinkNumber, now: Time, node: &mut ToNode<'_>) -> bool {
+        let Some(index) = self.offered.iter().position(|link| link.number == number) else { return false };
+        let offered = self.offered.swap_remove(index);
+        let theirs = Exchange::receive(&offered.socket).and_then(|offer| offer.ok_or(ExchangeError::Missing));
+        match theirs.and_then(|theirs| self.connect(offered, theirs)) {
+            Ok(link) => {
+                self.open.push(link);
+                let said = node.ask(self.switch_to(peer, number));
+                self.routes.connected(peer, number, said, now);
+                true
+            }
+            Err(why) => {
+                tracing::warn!(%peer, %why, "a direct link was not made");
+                self.routes.ended(peer, now);
+                false
+            }
+        }
+    }
+
+    fn hear(&mut self, message: Message, now: Time) -> Option<Message> {
+        let outcome = message.payload.first().and_then(|code| Outcome::from_code(*code));
+        match self.routes.answered(message.header.correlation, outcome.unwrap_or(Outcome::Unknown), now) {
+            Answered::NotOurs => return Some(message),
+            Answered::Noted => {}
+            Answered::End(peer, number) => self.end(peer, number, now),
+        }
+        None
+    }
+}
