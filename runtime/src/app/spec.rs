@@ -249,10 +249,15 @@ impl<A: Actor<Context = AppContext<A>>> From<AppSpec<A>> for DynApp {
             let (factory, handlers, safe_state) = (factory.clone(), handlers.clone(), safe_state.clone());
             let kinds = kinds.clone();
             let launch: Launch = Arc::new(move |ready| {
-                let actor = factory();
                 // A launch outside of a guard has nobody who would take its life.
                 let vitals = Vitals::present().unwrap_or_else(|| Vitals::new("unguarded"));
+                // Before the factory: if that comes back after another life has taken this one's place, the reader is the
+                // other's, and stays so.
                 let reader = wiring.mailbox.attach();
+                let actor = factory();
+                if vitals.is_over() {
+                    vitals.leave();
+                }
                 vitals.reads(wiring.mailbox.clone(), reader.epoch(), kinds.clone());
                 let sender = wiring.sender.in_life(vitals.clone());
                 let parting = Parting::default();

@@ -129,8 +129,11 @@ fn a_hang_in_the_factory_is_a_failed_start_and_is_tried_again_on_another_thread(
     assert_eq!(outcome_of_job(&sender, "puppet", 1), Outcome::Delivered);
     all_run(&[&node]);
     gate.0.open();
+    log.wait_for(Seen::Dropped(1));
     assert_eq!(outcome_of_job(&sender, "puppet", 2), Outcome::Delivered);
     assert!(!log.all().contains(&Seen::Started(1)), "who is made late is not started");
+    assert!(!log.all().contains(&Seen::Stopping(2)), "and does not end who has taken its place");
+    assert_eq!(node.handle().lives("puppet").map(|lives| lives.readies), Some(1), "which goes on living");
 }
 
 #[test]
