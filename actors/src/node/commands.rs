@@ -96,7 +96,8 @@ struct Waits {
 impl NodeHandle {
     /// Adds an application while the node runs, as the last child of the supervisor called `under`; of the one that the
     /// builder's applications have, if `None`. Returns when it is taken in; it starts when what it requires is ready, and
-    /// [`wait_until_running`](Self::wait_until_running) waits for it too.
+    /// [`wait_until_running`](Self::wait_until_running) waits for it too. Supervisors, and applications in processes of their
+    /// own, are declared when the node is built; under a supervisor that was, applications come and go.
     ///
     /// # Errors
     /// Why it was not added. All variants but [`CommandError::NoAnswer`] say that nothing has changed.

@@ -12,6 +12,7 @@
 
 mod absences;
 mod apps;
+mod asker;
 mod builder;
 mod commands;
 mod directory;
@@ -24,6 +25,7 @@ mod supervisor_spec;
 mod tree;
 mod wind_up;
 
+use asker::Asker;
 pub use builder::{NodeBuilder, StartError};
 pub use commands::CommandError;
 #[cfg(feature = "fault-points")]
@@ -281,13 +283,13 @@ impl NodeHandle {
         if self.is_bystander {
             return Ok(());
         }
-        let (say, heard) = std::sync::mpsc::sync_channel(1);
-        match self.tell(RootEvent::TellWhenRunning(say)) {
+        let (asker, question) = Asker::new();
+        match self.tell(RootEvent::TellWhenRunning(asker)) {
             Told::Taken => {}
             Told::TooMany => return Err(StartError::Busy),
             Told::HasEnded => return Err(StartError::Ended),
         }
-        match heard.recv_timeout(within) {
+        match question.heard.recv_timeout(within) {
             Ok(answer) => answer,
             Err(RecvTimeoutError::Disconnected) => Err(StartError::Ended),
             Err(RecvTimeoutError::Timeout) => Err(StartError::Waiting { waiting: self.waiting(), within }),

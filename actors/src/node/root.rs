@@ -28,6 +28,7 @@ use super::{
     NodeEnd, StartError,
     absences::Absences,
     apps::Apps,
+    asker::Asker,
     commands::{Answers, Ordered},
     directory::NodeDirectory,
     layers,
@@ -67,7 +68,7 @@ pub(crate) enum RootEvent {
     #[cfg(feature = "fault-points")]
     FailSupervisor,
     /// By the owner: say when every application runs.
-    TellWhenRunning(SyncSender<Result<(), StartError>>),
+    TellWhenRunning(Asker),
 }
 
 /// How far the node is.
@@ -108,7 +109,7 @@ pub(super) struct Root {
     cycle: Option<Cycle>,
     started: Option<SyncSender<Result<(), StartError>>>,
     ended: SyncSender<NodeEnd>,
-    tell_when_running: Vec<SyncSender<Result<(), StartError>>>,
+    tell_when_running: Vec<Asker>,
     heeds_signals: bool,
 }
 
@@ -213,8 +214,8 @@ impl StreamHandler<RootEvent> for Root {
             RootEvent::Fail => panic!("a fault was planned for the root"),
             #[cfg(feature = "fault-points")]
             RootEvent::FailSupervisor => self.app_supervisor.iter().for_each(Roster::fail),
-            RootEvent::TellWhenRunning(say) => {
-                self.tell_when_running.push(say);
+            RootEvent::TellWhenRunning(asker) => {
+                asker.join(&mut self.tell_when_running);
                 self.tell_if_running();
             }
         }
@@ -426,13 +427,11 @@ impl Root {
         // Once one of them is removed, the circle is open.
         self.cycle.take_if(|cycle| !cycle.ours.iter().all(|id| self.apps.contains(*id)));
         if is_running || self.cycle.is_some() {
-            for say in self.tell_when_running.drain(..) {
-                let answer = match &self.cycle {
+            for asker in self.tell_when_running.drain(..) {
+                asker.answer(match &self.cycle {
                     Some(cycle) if !is_running => Err(StartError::Cycle(cycle.names.clone())),
                     Some(_) | None => Ok(()),
-                };
-                // Who asked may have stopped waiting.
-                let _ = say.try_send(answer);
+                });
             }
         }
     }
