@@ -109,6 +109,9 @@ fn read_welcome(socket: &mut StdStream) -> io::Result<Welcome> {
 
 async fn live(config: &NodeConfig, app: &DynApp, socket: StdStream, welcome: Welcome) -> io::Result<()> {
     let socket = Arc::new(UnixStream::from_std(socket)?);
+    // Other threads can write to it from now on: the reactor has seen it once. It has no turn while the application's
+    // factory or its `started` keeps this thread, and a hang there must be told all the same.
+    socket.writable().await?;
     let (sequence, beat_us, tid) = (welcome.sequence, welcome.beat_us, Tid::from_bits(welcome.tid));
     let wire = Wire::new(config, socket, welcome);
     wire.say_kind(Kind::HOST_BEAT);

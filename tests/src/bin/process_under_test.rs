@@ -2,7 +2,8 @@
 //!
 //! `process_under_test CONFIG.toml [--place thread|process|io] [--requires NAME] [--on-lost pause|restart]
 //! [--dies-at-start CODE] [--neighbour-hangs MILLIS] [--talks] [--stays]
-//! [--swells-at-start MIB] [--starts-in MILLIS] [--ramps-for MILLIS] [--tree rest-for-one|escalation]`
+//! [--swells-at-start MIB] [--starts-in MILLIS] [--starts-within MILLIS] [--ramps-for MILLIS]
+//! [--tree rest-for-one|escalation] [--hangs-in started|factory TOKEN]`
 //!
 //! The application `drive` does as it is told (`Order`), and says what it sees, one line each. With a neighbour there is another
 //! one on the `io` thread, which blocks that thread a moment after its start for so long; if for 0 ms, each life of it for ever.
@@ -25,10 +26,30 @@ struct Drive {
     talks: bool,
     /// How much memory it takes at its start, in MiB; it is never ready then.
     swells: Option<usize>,
-    /// How long it takes until it is ready; it has a second.
+    /// How long it takes until it is ready; it has a second, unless said otherwise.
     starts_in: Option<Duration>,
+    /// Its first life does not come back from `started`.
+    hangs: Option<Token>,
     /// How long it takes to stop; it has half a second.
     ramps_for: Duration,
+}
+
+/// Where one life hangs, and the file that says that none has yet.
+#[derive(Clone)]
+struct Token {
+    place: String,
+    file: String,
+}
+
+impl Token {
+    fn hang_in(&self, place: &str) {
+        if self.place == place && std::fs::remove_file(&self.file).is_ok() {
+            say(&format!("hangs in its {place}"));
+            loop {
+                std::thread::park();
+            }
+        }
+    }
 }
 
 fn say(what: &str) {
@@ -57,6 +78,7 @@ impl Actor for Drive {
 
     fn started(&mut self, context: &mut Self::Context) {
         say(&format!("started {}", context.tid()));
+        self.hangs.iter().for_each(|token| token.hang_in("started"));
         context.expect::<Level>(None, Duration::from_millis(50), |_, _, _| say("silence"));
         if self.talks {
             context.every(Duration::from_millis(2), |_, _, context| {
@@ -301,11 +323,14 @@ fn main() -> ExitCode {
     let time = |flag: &str| after(flag).map(|text| Duration::from_millis(text.parse().expect("a time")));
     let (starts_in, ramps_for) =
         (time("--starts-in"), time("--ramps-for").unwrap_or(Duration::from_millis(20)));
+    let mut places = arguments.windows(3).filter(|flag| flag[0] == "--hangs-in");
+    let hangs = places.next().map(|flag| Token { place: flag[1].clone(), file: flag[2].clone() });
     let drive = move || {
+        hangs.iter().for_each(|token| token.hang_in("factory"));
         if let Some(code) = dies_with {
             std::process::exit(code);
         }
-        Drive { talks, swells, starts_in, ramps_for, ..Drive::default() }
+        Drive { talks, swells, starts_in, ramps_for, hangs: hangs.clone(), ..Drive::default() }
     };
     let mut drive = AppSpec::new("drive", drive)
         .handles::<Count>()
@@ -316,7 +341,7 @@ fn main() -> ExitCode {
         .handles::<RequirementEvent>()
         .requires(after("--requires"));
     if swells.is_some() || starts_in.is_some() {
-        drive = drive.start_within(Duration::from_secs(1));
+        drive = drive.start_within(time("--starts-within").unwrap_or(Duration::from_secs(1)));
     }
     drive = match after("--on-lost").as_deref() {
         None => drive,

@@ -78,3 +78,30 @@ fn a_process_that_stops_while_its_node_or_all_of_the_host_stands_still_has_its_t
         assert_eq!(killed, None);
     }
 }
+
+#[test]
+fn a_process_that_hangs_in_started_or_in_its_factory_is_noticed_as_a_thread_is() {
+    for place in ["started", "factory"] {
+        for lives_in in ["thread", "process"] {
+            let directory = OwnDirectory::new();
+            let token = directory.join("token");
+            std::fs::write(&token, "").expect("the test's own directory");
+            let token = token.to_str().expect("it is text");
+            let arguments = ["--place", lives_in, "--hangs-in", place, token];
+            let mut node = process_under_test(&configuration(&directory, ""), &arguments);
+            node.wait_for(&[&format!("hangs in its {place}")]);
+            let line = node.wait_for(&["a child failed"]);
+            assert!(line.contains("hung: in its `started`"), "{place}, in a {lives_in}: {line}");
+            let api = NodeApi::connect(directory.join("robot.sock")).expect("the node is up");
+            let wanted = Registration::new().requires(["drive"]).deadline(DEADLINE);
+            api.register_transport_address(wanted).expect("the next life of it becomes ready");
+        }
+    }
+}
+
+#[test]
+fn a_process_that_starts_for_longer_than_a_turn_may_last_is_not_killed_as_long_as_it_comes_back() {
+    // Its turns have a second each.
+    let mut scenario = Scenario::start(&["--starts-in", "2500", "--starts-within", "60000"]);
+    assert_eq!(scenario.who().pid, started(&mut scenario.node));
+}
