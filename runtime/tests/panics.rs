@@ -33,6 +33,8 @@ enum Where {
     HandlerThenDrop,
     /// In the handler, with something that panics when it is dropped.
     HandlerWithBomb,
+    /// In the handler, with something whose drop does not come back.
+    HandlerWithTar,
     Timer,
     Silence,
     ActixTimer,
@@ -59,6 +61,18 @@ struct Bomb;
 impl Drop for Bomb {
     fn drop(&mut self) {
         panic!("a bomb");
+    }
+}
+
+/// Says under which schedule it is dropped, and does not come back from that.
+struct Tar(SyncSender<String>);
+
+impl Drop for Tar {
+    fn drop(&mut self) {
+        self.0.send(format!("{:?}", thread_priority::thread_schedule_policy().unwrap())).unwrap();
+        loop {
+            std::thread::park();
+        }
     }
 }
 
@@ -109,6 +123,7 @@ impl Handler<Delivery<Number>> for Fragile {
             Where::Nowhere | Where::Making | Where::Started => {}
             Where::Handler | Where::HandlerThenDrop => panic!("in the handler"),
             Where::HandlerWithBomb => std::panic::panic_any(Bomb),
+            Where::HandlerWithTar => std::panic::panic_any(Tar(self.written.clone())),
             Where::Timer => {
                 context.after(now, |_, _, _| panic!("in a timer"));
             }
@@ -227,6 +242,27 @@ fn a_second_panic_in_drop_is_caught_and_the_first_one_is_the_reason() {
 fn a_panic_that_carries_something_that_panics_when_it_is_dropped_is_caught() {
     let Reason::Panic(words) = end_of(Where::HandlerWithBomb) else { panic!("no panic") };
     assert!(words.starts_with("something that is not text"), "{words}");
+}
+
+#[test]
+fn a_panic_that_carries_something_whose_drop_never_ends_is_told_and_that_is_dropped_elsewhere() {
+    // Given one under a real-time priority, where the system grants it.
+    let (spec, read) = fragile("fragile", Where::HandlerWithTar);
+    let stage = Stage::start(vec![spec.place(Place::thread("fifo").realtime(20)).into()]);
+    stage.wait_ready(0);
+    // When it panics with that, and nobody sends it anything more.
+    stage.send(0, 13);
+    // Then its death is told, as what it was.
+    let Reason::Panic(words) = stage.wait_failed(0) else { panic!("no panic") };
+    assert!(words.starts_with("something that is not text at runtime/tests/panics.rs:"), "{words}");
+    // And what it carried holds up neither its successor nor the CPU.
+    let schedule = read.recv_timeout(DEADLINE).expect("it is dropped");
+    assert_eq!(schedule, "Normal(Other)");
+    stage.wait_ready(0);
+    stage.send(0, 1);
+    assert_eq!(read.recv_timeout(DEADLINE).expect("the successor works"), "2: 1");
+    assert_eq!(stage.most_abandoned(), 0);
+    assert_eq!(stage.stop(), Reason::Shutdown);
 }
 
 #[test]

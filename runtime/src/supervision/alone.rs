@@ -10,7 +10,7 @@ use actix::{Actor, Context};
 use tokio::sync::oneshot;
 
 use super::{
-    Launch, ReadyGate, Reason,
+    Burials, Launch, ReadyGate, Reason,
     guard::{Guard, life},
     panics::{install_hook, is_the_runtimes},
     place::Place,
@@ -77,7 +77,7 @@ pub fn alone(
         vitals.set_ready();
         ready.reached();
     });
-    if let Some(guard) = Guard::make(launch, ready, tenant.clone()) {
+    if let Some(guard) = Guard::make(launch, ready, tenant.clone(), Burials::default()) {
         actix_rt::spawn(guard);
     }
     (AloneHandle { tenant, _watchdog: watchdog }, ended)

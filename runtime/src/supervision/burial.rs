@@ -1,7 +1,7 @@
 //! Where values of the user's are dropped that nobody needs any more: on threads of their own, never on the root's.
 //!
-//! A factory and what it captured are foreign code, and so is their drop: it may last, never end, or panic. Whoever
-//! supervises others must not wait for it.
+//! A factory and what it captured are foreign code, what a panic carried too, and so is their drop: it may last, never end,
+//! or panic. Whoever supervises others must not wait for it.
 
 use std::{
     any::Any,
@@ -11,7 +11,10 @@ use std::{
     time::Duration,
 };
 
-use super::panics::{is_the_runtimes, words};
+use super::{
+    panics::{is_the_runtimes, words},
+    place::make_ordinary,
+};
 use crate::{log, post::lock, time::Time};
 
 /// Drops at one time at most: so many that never end hold up nobody.
@@ -92,6 +95,8 @@ impl Burials {
         let burials = self.clone();
         let begun = std::thread::Builder::new().name(name.to_owned()).spawn(move || {
             is_the_runtimes();
+            // Whose panic it was may have a real-time priority.
+            make_ordinary();
             work(&burials);
         });
         if let Err(error) = &begun {
@@ -106,7 +111,7 @@ impl Burials {
         while let Some((number, remains)) = self.next() {
             let Remains { whose, what } = remains;
             if let Err(panic) = catch_unwind(AssertUnwindSafe(|| drop(what))) {
-                log::error!(whose, said = words(panic), "what it captured panicked while it was dropped");
+                log::error!(whose, said = words(panic), "what it left behind panicked while it was dropped");
             }
             lock(&self.0.state).under_way.remove(&number);
             self.0.changed.notify_all();
@@ -141,7 +146,7 @@ impl Burials {
                 continue;
             }
             for (whose, lasts) in late {
-                log::error!(whose, ?lasts, waiting, "what it captured has not come back from its drop");
+                log::error!(whose, ?lasts, waiting, "what it left behind has not come back from its drop");
             }
         }
         state.is_watched = false;

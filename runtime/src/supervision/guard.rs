@@ -1,6 +1,7 @@
 //! The guard around a supervised actor: catches its panics, takes its stop order, and says how it ended.
 
 use std::{
+    any::Any,
     panic::{AssertUnwindSafe, catch_unwind},
     pin::Pin,
     sync::Arc,
@@ -13,8 +14,8 @@ use actix::{
 };
 
 use super::{
-    Launch, ReadyGate, Reason,
-    panics::words,
+    Burials, Launch, ReadyGate, Reason,
+    panics::Caught,
     tenant::{Fate, Tenant},
     vitals::{Doing, Over, Vitals},
 };
@@ -73,26 +74,28 @@ pub(super) struct Guard {
     has_reported: bool,
     /// How it ended does not depend on its drop.
     ends_before_its_drop: bool,
+    /// Where what its panics carry is dropped.
+    burials: Burials,
 }
 
 impl Guard {
     /// Guards an actor that is made.
-    pub(super) fn around(life: Option<Box<dyn Life>>, tenant: Tenant) -> Self {
+    pub(super) fn around(life: Option<Box<dyn Life>>, tenant: Tenant, burials: Burials) -> Self {
         let vitals = Some(tenant.vitals().clone());
         let (was_polled, has_reported, ends_before_its_drop) = (false, false, false);
-        Self { life, tenant, vitals, was_polled, has_reported, ends_before_its_drop }
+        Self { life, tenant, vitals, was_polled, has_reported, ends_before_its_drop, burials }
     }
 
     /// Guards one that has done all that it is for when it has ended: what it drops then is not its own.
     pub(super) fn around_overseer(life: Box<dyn Life>, tenant: Tenant) -> Self {
-        let mut guard = Self::around(Some(life), tenant);
+        let mut guard = Self::around(Some(life), tenant, Burials::default());
         guard.ends_before_its_drop = true;
         guard
     }
 
     /// Makes an actor, on its thread. `None` if its code panicked, which is reported.
-    pub(super) fn make(launch: &Launch, ready: ReadyGate, tenant: Tenant) -> Option<Self> {
-        let mut guard = Self::around(None, tenant);
+    pub(super) fn make(launch: &Launch, ready: ReadyGate, tenant: Tenant, burials: Burials) -> Option<Self> {
+        let mut guard = Self::around(None, tenant, burials);
         let made = Vitals::turn(&mut guard.vitals, Doing::Start, || {
             catch_unwind(AssertUnwindSafe(|| launch(ready)))
         });
@@ -102,7 +105,7 @@ impl Guard {
                 Some(guard)
             }
             Err(panic) => {
-                guard.end(Reason::Panic(words(panic)));
+                guard.end_in(panic);
                 None
             }
         }
@@ -117,12 +120,29 @@ impl Guard {
         }
     }
 
+    /// It panicked. That is told before anything becomes of what the panic carries.
+    fn end_in(&mut self, panic: Box<dyn Any + Send>) {
+        let Caught { words, carried } = Caught::new(panic);
+        self.end(Reason::Panic(words));
+        self.bury_carried(carried);
+    }
+
+    fn bury_carried(&self, carried: Option<Box<dyn Any + Send>>) {
+        if let Some(carried) = carried {
+            self.burials.bury(self.tenant.vitals().name(), carried);
+        }
+    }
+
     fn end(&mut self, mut reason: Reason) {
+        let mut carried = None;
         if let Some(life) = self.life.take() {
-            let said = Vitals::turn(&mut self.vitals, Doing::Drop, || bury(life));
-            // Not where it has failed already: the first failure is the reason.
-            if let Some(said) = said.filter(|_| !reason.is_failure() && !self.ends_before_its_drop) {
-                reason = Reason::Panic(said);
+            let caught = Vitals::turn(&mut self.vitals, Doing::Drop, || bury(life));
+            if let Some(caught) = caught {
+                carried = caught.carried;
+                // Not where it has failed already: the first failure is the reason.
+                if !reason.is_failure() && !self.ends_before_its_drop {
+                    reason = Reason::Panic(caught.words);
+                }
             }
         }
         if !std::mem::replace(&mut self.has_reported, true) {
@@ -138,18 +158,19 @@ impl Guard {
             }
             self.tenant.report(Fate::Ended(reason));
         }
+        self.bury_carried(carried);
     }
 }
 
-/// Drops an actor whose code may panic while it is dropped, even if that is not the first time; what it said then.
-fn bury(mut life: Box<dyn Life>) -> Option<String> {
+/// Drops an actor whose code may panic while it is dropped, even if that is not the first time; its panic then.
+fn bury(mut life: Box<dyn Life>) -> Option<Caught> {
     let buried = catch_unwind(AssertUnwindSafe(|| {
         life.terminate();
         drop(life);
     }));
     let panic = buried.err()?;
     // A life that was taken leaves its drop as it leaves any turn.
-    (!panic.is::<Over>()).then(|| words(panic))
+    (!panic.is::<Over>()).then(|| Caught::new(panic))
 }
 
 impl Future for Guard {
@@ -178,7 +199,10 @@ impl Future for Guard {
             Ok(Poll::Pending) => Reason::Killed,
             Err(panic) if panic.is::<Over>() => Reason::Killed,
             Ok(Poll::Ready(reason)) => reason,
-            Err(panic) => Reason::Panic(words(panic)),
+            Err(panic) => {
+                this.end_in(panic);
+                return Poll::Ready(());
+            }
         };
         this.end(reason);
         Poll::Ready(())

@@ -172,17 +172,36 @@ fn sentence(info: &PanicHookInfo<'_>) -> String {
 
 const SPEECHLESS: &str = "something that is not text";
 
-/// What a panic on this thread said, and where: `said at file:line`. Takes what the panic carries, whose own drop may
-/// panic too.
-pub(super) fn words(panic: Box<dyn Any + Send>) -> String {
-    let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
-    let said =
-        text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| SPEECHLESS.to_owned());
-    discard(panic);
-    match LAST.try_with(|last| last.borrow_mut().take()).ok().flatten() {
-        Some(place) => format!("{said} at {place}"),
-        None => said,
+/// A panic that was caught.
+pub(super) struct Caught {
+    /// What it said on this thread, and where: `said at file:line`.
+    pub(super) words: String,
+    /// What it carried, if that is more than text: the user's, and so is its drop, which may last, never end, or panic.
+    pub(super) carried: Option<Box<dyn Any + Send>>,
+}
+
+impl Caught {
+    /// Of what `catch_unwind` returned, on the thread that panicked.
+    pub(super) fn new(panic: Box<dyn Any + Send>) -> Self {
+        let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
+        let text = text.or_else(|| panic.downcast_ref::<String>().cloned());
+        let carried = text.is_none().then_some(panic);
+        let said = text.unwrap_or_else(|| SPEECHLESS.to_owned());
+        let words = match LAST.try_with(|last| last.borrow_mut().take()).ok().flatten() {
+            Some(place) => format!("{said} at {place}"),
+            None => said,
+        };
+        Self { words, carried }
     }
+}
+
+/// What a panic on this thread said, and where, for whom nobody waits: drops what it carries here, whose drop may panic too.
+pub(super) fn words(panic: Box<dyn Any + Send>) -> String {
+    let Caught { words, carried } = Caught::new(panic);
+    if let Some(carried) = carried {
+        discard(carried);
+    }
+    words
 }
 
 /// Drops what a panic carries. If that panics in its turn, the same again, a few times; the last is kept for ever.

@@ -3,8 +3,8 @@
 use std::ffi::CString;
 
 use thread_priority::{
-    RealtimeThreadSchedulePolicy, ThreadPriority, ThreadSchedulePolicy, set_thread_priority_and_policy,
-    thread_native_id,
+    NormalThreadSchedulePolicy, RealtimeThreadSchedulePolicy, ThreadPriority, ThreadSchedulePolicy,
+    set_thread_priority_and_policy, thread_native_id,
 };
 
 use super::system;
@@ -163,6 +163,17 @@ pub(super) fn make_realtime(priority: u8) -> Result<(), thread_priority::Error> 
         .map_err(|_| thread_priority::Error::Priority("a real-time priority is 1 to 99"))?;
     let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
     set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(level), policy)
+}
+
+/// The middle of `thread_priority`'s scale of 0 to 99, which is a niceness of 0.
+const MIDDLE: u8 = 48;
+
+/// Puts the calling thread under the ordinary schedule: a thread begins with that of who made it.
+pub(super) fn make_ordinary() {
+    let policy = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Other);
+    let level = ThreadPriority::Crossplatform(MIDDLE.try_into().expect("it is on the scale"));
+    // The schedule itself is refused to nobody; the niceness stays where that is.
+    let _ = set_thread_priority_and_policy(thread_native_id(), level, policy);
 }
 
 #[cfg(test)]

@@ -370,9 +370,9 @@ impl Supervisor {
                 say(&post, Input::BecameReady(id, generation));
             })
         };
-        let (launch, unborn) = (spec.launch.clone(), Unborn(Some(tenant)));
+        let (launch, unborn, burials) = (spec.launch.clone(), Unborn(Some(tenant)), self.burials.clone());
         // A thread that has ended drops this, which is reported: the next start makes a new thread.
-        thread.spawn_fn(move || start(&launch, ready, unborn));
+        thread.spawn_fn(move || start(&launch, ready, unborn, burials));
     }
 
     /// Takes a child's life. Its thread may have other tenants: it is given up only if it does not let the child go.
@@ -413,9 +413,9 @@ fn seed() -> u64 {
 }
 
 /// Runs on the child's thread.
-fn start(launch: &Launch, ready: ReadyGate, mut unborn: Unborn) {
+fn start(launch: &Launch, ready: ReadyGate, mut unborn: Unborn, burials: Burials) {
     if let Some(tenant) = unborn.0.take()
-        && let Some(guard) = Guard::make(launch, ready, tenant)
+        && let Some(guard) = Guard::make(launch, ready, tenant, burials)
     {
         actix_rt::spawn(guard);
     }
