@@ -141,7 +141,10 @@ fn a_process_that_dies_at_each_start_makes_the_node_give_up_and_say_of_what() {
 fn the_next_process_begins_when_the_one_that_was_killed_has_ended_however_long_that_takes() {
     let directory = OwnDirectory::new();
     // Never ready, each is killed when its time is over, and has half a gibibyte to give back.
-    let mut node = process_under_test(&configuration(&directory, ""), &["--swells-at-start", "512"]);
+    // On a busy host some are killed before they say anything: it goes on until three have.
+    let intensity = "[supervision]\napp_restarts_max = 1000\napp_window_ms = 1\n";
+    let configuration = configuration(&directory, intensity);
+    let mut node = process_under_test(&configuration, &["--swells-at-start", "512"]);
     for _ in 0..3 {
         let line = node.wait_for(&["process has"]);
         assert!(line.ends_with("has no brother"), "its devices and ports may be in use: {line}");
