@@ -97,7 +97,7 @@ fn the_death_of_a_peer_is_an_outcome_also_while_the_node_is_stopped() {
     // Given: a question in the hand of a process that does nothing.
     let mut scene = Scene::new();
     scene.stop_the_node_when_it_is_not_needed();
-    scene.echo.signal(Signal::STOP);
+    scene.echo.freeze();
     let Scene { stage, echo, mut asking, to, ups } = scene;
     let waiting = thread::spawn(move || {
         let answer = asking.ask::<Order, Order>(to, &Order { number: 7 }, DEADLINE * 3);
