@@ -13,7 +13,7 @@ use sinew_tests::{
     clients::{Performer, Stage, StageLimits},
     program,
     puppet::Order,
-    until,
+    until, wait_until_frozen,
 };
 
 /// Who has not answered by then is not asked directly yet.
@@ -43,6 +43,10 @@ impl Scene {
     fn signal_node(&self, signal: Signal) {
         let id = i32::try_from(self.stage.node_id()).ok().and_then(Pid::from_raw).expect("a process id");
         kill_process(id, signal).expect("the node runs");
+        if signal == Signal::STOP {
+            // Until then it passes messages on.
+            wait_until_frozen(self.stage.node_id());
+        }
     }
 
     fn ask(&mut self, number: u64, within: Duration) -> Result<Order, ApiError> {
@@ -141,9 +145,11 @@ fn is_whole_again(scene: &mut Scene, registrations: u64) {
         }
         (scene.asking.registrations() >= registrations).then_some(())
     });
+    // Before anybody else asks for an address.
+    let echo =
+        until("the echo is back", || scene.asking.resolve("echo", DEADLINE).expect("the node answers"));
     let api = NodeApi::connect(scene.stage.socket()).expect("the door is open");
     let mut third = api.register_transport_address(Registration::new()).expect("an address");
-    let echo = until("the echo is back", || third.resolve("echo", DEADLINE).expect("the node answers"));
     assert_eq!(echo, scene.to, "it has its address again");
     let answer = third.ask::<Order, Order>(echo, &Order { number: 3 }, DEADLINE).expect("an answer");
     assert_eq!(answer.number, 3);
