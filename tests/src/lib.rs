@@ -15,7 +15,9 @@ pub mod puppet;
 pub use ground::{Ground, all_run, ready_for, sees};
 pub use hosts::{Host, Hosts};
 pub use log::{Log, until};
-pub use program::{Program, node_under_test, process_under_test, program, wait_until_frozen};
+pub use program::{
+    Program, node_under_test, process_under_test, program, wait_until_asleep, wait_until_frozen,
+};
 
 use std::{
     net::SocketAddrV4,

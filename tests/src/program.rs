@@ -185,8 +185,19 @@ pub fn wait_until_frozen(process: u32) {
 
 fn is_frozen(process: u32) -> bool {
     let tasks = std::fs::read_dir(format!("/proc/{process}/task")).expect("it is there");
-    tasks.flatten().all(|task| {
-        let status = std::fs::read_to_string(task.path().join("stat")).unwrap_or_default();
-        status.rsplit_once(')').is_some_and(|(_, rest)| rest.trim_start().starts_with('T'))
-    })
+    tasks.flatten().all(|task| is_in_state(&task.path(), 'T'))
+}
+
+/// Waits until a thread of this process, by its kernel's id, sleeps: it has done what it does before it waits.
+///
+/// # Panics
+/// If it does not within [`crate::DEADLINE`].
+pub fn wait_until_asleep(thread: i32) {
+    let task = Path::new("/proc/self/task").join(thread.to_string());
+    crate::until("the thread sleeps", || is_in_state(&task, 'S').then_some(()));
+}
+
+fn is_in_state(task: &Path, state: char) -> bool {
+    let status = std::fs::read_to_string(task.join("stat")).unwrap_or_default();
+    status.rsplit_once(')').is_some_and(|(_, rest)| rest.trim_start().starts_with(state))
 }

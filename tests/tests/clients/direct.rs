@@ -1,19 +1,25 @@
 //! Two processes that LNCL has introduced to each other do not need the node any more.
 
 use std::{
-    sync::atomic::{AtomicBool, Ordering},
+    sync::{
+        atomic::{AtomicBool, Ordering},
+        mpsc::sync_channel,
+    },
     thread,
     time::{Duration, Instant},
 };
 
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::{
+    process::{Pid, Signal, kill_process},
+    thread::gettid,
+};
 use sinew::{ApiError, Endpoint, NodeApi, Registration, prelude::*};
 use sinew_tests::{
     DEADLINE, Log,
     clients::{Performer, Stage, StageLimits},
     program,
     puppet::Order,
-    until, wait_until_frozen,
+    until, wait_until_asleep, wait_until_frozen,
 };
 
 /// Who has not answered by then is not asked directly yet.
@@ -103,10 +109,14 @@ fn the_death_of_a_peer_is_an_outcome_also_while_the_node_is_stopped() {
     scene.stop_the_node_when_it_is_not_needed();
     scene.echo.freeze();
     let Scene { stage, echo, mut asking, to, ups } = scene;
+    let (say, said) = sync_channel(1);
     let waiting = thread::spawn(move || {
+        say.send(gettid().as_raw_nonzero().get()).expect("the test waits for it");
         let answer = asking.ask::<Order, Order>(to, &Order { number: 7 }, DEADLINE * 3);
         (asking, answer)
     });
+    // It sleeps when the question is in the ring, and not before.
+    wait_until_asleep(said.recv_timeout(DEADLINE).expect("the thread begins"));
 
     // When: it is killed.
     assert!(echo.kill(), "it had lived until then");
