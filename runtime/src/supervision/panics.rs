@@ -32,6 +32,25 @@ const LAST_WORDS: Duration = Duration::from_secs(1);
 
 type Hook = Box<dyn Fn(&PanicHookInfo<'_>) + Send + Sync>;
 
+/// The panic hook that was there before.
+struct Former {
+    hook: Hook,
+    /// It is the standard library's, which names the thread that it is called on and looks up that one's backtrace: of a panic
+    /// that is told elsewhere neither is true.
+    is_standard: bool,
+}
+
+impl Former {
+    /// Takes it away.
+    fn take() -> Self {
+        let hook = std::panic::take_hook();
+        // Where none is set any more, this is the standard library's.
+        let standard = std::panic::take_hook();
+        let is_standard = std::ptr::eq(&raw const *hook, &raw const *standard);
+        Self { hook, is_standard }
+    }
+}
+
 /// Whose a thread is.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Station {
@@ -68,12 +87,12 @@ pub(crate) fn writes_the_log() {
 pub(super) fn install_hook() {
     static INSTALLED: Once = Once::new();
     INSTALLED.call_once(|| {
-        let former: Arc<Hook> = Arc::new(std::panic::take_hook());
+        let former = Arc::new(Former::take());
         std::panic::set_hook(Box::new(move |info| hook(info, &former)));
     });
 }
 
-fn hook(info: &PanicHookInfo<'_>, former: &Arc<Hook>) {
+fn hook(info: &PanicHookInfo<'_>, former: &Arc<Former>) {
     let place = info.location().map(|at| format!("{}:{}", at.file(), at.line()));
     // A thread that is about to end has no such memory any more; then nobody asks either.
     let _ = LAST.try_with(|last| {
@@ -87,10 +106,11 @@ fn hook(info: &PanicHookInfo<'_>, former: &Arc<Hook>) {
     }
     let station = STATION.try_with(Cell::get).unwrap_or(Station::Foreign);
     match (station, &vitals) {
-        (Station::Log, _) => former(info),
+        (Station::Log, _) => (former.hook)(info),
         (Station::Runtime, _) | (Station::Foreign, Some(_)) if UNWINDS => {
             let panicked = Panicked::new(info, vitals.as_deref());
-            log::enter(Box::new(move || panicked.tell()));
+            let former = former.clone();
+            log::enter(Box::new(move || panicked.tell(&former)));
             if is_the_last(info) {
                 log::flush(LAST_WORDS);
             }
@@ -99,7 +119,7 @@ fn hook(info: &PanicHookInfo<'_>, former: &Arc<Hook>) {
             let thread = system::thread_id();
             log::error!(thread, "outside of any supervised actor's turn: {}", sentence(info));
             let _prints = PRINTS.read();
-            former(info);
+            (former.hook)(info);
         }
     }
 }
@@ -132,9 +152,10 @@ impl Panicked {
     }
 
     /// Tells the reader of the log, then the hook that was there before.
-    fn tell(&self) {
+    fn tell(&self, former: &Former) {
         let _prints = PRINTS.read();
-        let backtrace = self.backtrace.as_ref().map(|backtrace| format!("\n{backtrace}")).unwrap_or_default();
+        let in_words = |backtrace| format!("\nstack backtrace:\n{backtrace}");
+        let backtrace = self.backtrace.as_ref().map(in_words).unwrap_or_default();
         if self.reader.is::<NoSubscriber>() {
             self.log(&backtrace);
         } else {
@@ -147,9 +168,12 @@ impl Panicked {
             None => "a task that is no actor's".to_owned(),
         };
         let Self { thread, said, .. } = self;
-        // A hook takes what only a panic can make.
-        let _ = catch_unwind(|| {
-            std::panic::panic_any(format!("{who} on thread {thread} {said}{backtrace}"));
+        let words = format!("{who} on thread {thread} {said}{backtrace}");
+        let is_standard = former.is_standard;
+        let _ = catch_unwind(|| match is_standard {
+            true => eprintln!("\n{words}"),
+            // A hook takes what only a panic can make.
+            false => std::panic::panic_any(words),
         });
     }
 
