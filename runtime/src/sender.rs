@@ -1,5 +1,7 @@
 //! How an application sends: fire and forget, confirmed, or asking.
 
+mod clock;
+
 use std::{
     marker::PhantomData,
     pin::Pin,
@@ -369,7 +371,8 @@ pub struct ReplyTo {
     pub(crate) correlation: u64,
 }
 
-/// A wait with its deadline. The timer is made at the first poll, on the thread that polls.
+/// A wait with its deadline. The timer is made at the first poll: by the runtime of the thread that polls, and where there is
+/// none by one that is kept for that.
 #[derive(Debug)]
 struct Deadline {
     wait: Wait,
@@ -387,14 +390,19 @@ impl Deadline {
         if let Poll::Ready(settlement) = self.wait.poll_settled(cx) {
             return Poll::Ready(Some(settlement));
         }
-        let within = self.within;
-        let timer = self.timer.get_or_insert_with(|| Box::pin(tokio::time::sleep(within)));
-        ready!(timer.as_mut().poll(cx));
+        if self.timer.is_none() {
+            self.timer = clock::sleep(self.within);
+        }
+        // Where there is no timer nobody can say when the deadline is: it is now.
+        if let Some(timer) = &mut self.timer {
+            ready!(timer.as_mut().poll(cx));
+        }
         Poll::Ready(None)
     }
 }
 
-/// The future outcome of a confirmed message.
+/// The future outcome of a confirmed message. Any thread may poll it, with any executor; in a runtime of tokio's, one whose
+/// time is enabled.
 #[derive(Debug)]
 #[must_use = "an outcome that nobody reads is no better than an unconfirmed send"]
 pub struct Confirmation(Deadline);
@@ -410,7 +418,8 @@ impl Future for Confirmation {
     }
 }
 
-/// The future reply to a request.
+/// The future reply to a request. Any thread may poll it, with any executor; in a runtime of tokio's, one whose time is
+/// enabled.
 #[derive(Debug)]
 #[must_use = "a reply that nobody reads need not be asked for"]
 pub struct Reply<R> {

@@ -1,0 +1,84 @@
+//! Futures of an application's sender on a thread of the program's own, where there is no tokio.
+
+#![expect(clippy::unwrap_used, reason = "a test says what failed by failing")]
+
+#[expect(dead_code, reason = "other tests and the benches need more of it")]
+mod stage;
+
+use std::{
+    pin::pin,
+    sync::Arc,
+    task::{Context, Poll, Wake, Waker},
+    thread::Thread,
+    time::{Duration, Instant},
+};
+
+use actix::{Actor, AsyncContext, Handler, fut::WrapFuture};
+use sinew_runtime::{
+    app::{AppContext, AppSpec, Delivery},
+    outcome::Outcome,
+    sender::AskError,
+};
+use stage::{DEADLINE, Number, Stage};
+
+/// Takes numbers until it gets the 13, and then none.
+struct Taker;
+
+impl Actor for Taker {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<Number>> for Taker {
+    type Result = ();
+
+    fn handle(&mut self, number: Delivery<Number>, context: &mut Self::Context) {
+        if number.0 == 13 {
+            context.wait(std::future::pending().into_actor(self));
+        }
+    }
+}
+
+struct Unpark(Thread);
+
+impl Wake for Unpark {
+    fn wake(self: Arc<Self>) {
+        self.0.unpark();
+    }
+}
+
+/// An executor as small as can be.
+fn block_on<F: Future>(future: F) -> F::Output {
+    let waker = Waker::from(Arc::new(Unpark(std::thread::current())));
+    let (mut future, until) = (pin!(future), Instant::now() + DEADLINE);
+    loop {
+        if let Poll::Ready(output) = future.as_mut().poll(&mut Context::from_waker(&waker)) {
+            return output;
+        }
+        assert!(Instant::now() < until, "nobody wakes whoever waits");
+        std::thread::park_timeout(DEADLINE);
+    }
+}
+
+#[test]
+fn outcomes_and_replies_that_are_polled_without_tokio_come_and_have_their_deadlines() {
+    // Given an application that nobody remakes, and this thread.
+    let spec = AppSpec::new("taker", || Taker).handles::<Number>().progress_within(DEADLINE * 10);
+    let stage = Stage::start(vec![spec.own_thread().into()]);
+    stage.wait_ready(0);
+    let sender = &stage.senders[0];
+    let confirmed = |number, within| sender.send_confirmed(sender.tid(), &Number(number), within).unwrap();
+    // When a message is handled, then that is heard of.
+    assert_eq!(block_on(confirmed(1, DEADLINE)), Outcome::Delivered);
+    assert_eq!(block_on(confirmed(13, DEADLINE)), Outcome::Delivered);
+    // When the next ones are not, then the wait ends at its deadline, and not before.
+    let within = Duration::from_millis(50);
+    for _ in 0..2 {
+        let sent = Instant::now();
+        assert_eq!(block_on(confirmed(2, within)), Outcome::Unknown);
+        assert!(sent.elapsed() >= within);
+    }
+    let reply = sender.ask::<_, Number>(sender.tid(), &Number(3), within).unwrap();
+    let answer = block_on(reply);
+    assert!(matches!(answer, Err(AskError::Deadline(after)) if after == within), "{answer:?}");
+    stage.order_stop();
+}
