@@ -289,15 +289,30 @@ fn one_that_hangs_in_started_or_in_its_making_is_seen_before_its_start_is_over_t
     stage.stop();
 }
 
-/// Stops as it is told to, and does not come back from its `stopping`.
-struct Clinging(Arc<std::sync::Mutex<Receiver<()>>>);
+/// Stops as it is told to, and does not come back from its `stopping`, or from its `stopped`.
+struct Clinging {
+    gate: Arc<std::sync::Mutex<Receiver<()>>>,
+    clings_to_the_last: bool,
+}
+
+impl Clinging {
+    fn cling(&self) {
+        self.gate.lock().unwrap().recv_timeout(DEADLINE).ok();
+    }
+}
 
 impl Actor for Clinging {
     type Context = AppContext<Self>;
 
     fn stopping(&mut self, _: &mut Self::Context) -> Running {
-        self.0.lock().unwrap().recv_timeout(DEADLINE).ok();
+        if !self.clings_to_the_last {
+            self.cling();
+        }
         Running::Stop
+    }
+
+    fn stopped(&mut self, _: &mut Self::Context) {
+        self.cling();
     }
 }
 
@@ -308,21 +323,26 @@ impl Handler<Delivery<Number>> for Clinging {
         match number.0 {
             1 => context.stop(),
             2 => _ = context.after(Duration::ZERO, |_, _, context| context.stop()),
-            _ => _ = context.spawn(async {}.into_actor(self).map(|(), _, context| context.stop())),
+            3 => _ = context.spawn(async {}.into_actor(self).map(|(), _, context| context.stop())),
+            4 => context.terminate(),
+            _ => _ = context.spawn(async {}.into_actor(self).map(|(), _, context| context.terminate())),
         }
     }
 }
 
 #[test]
 fn one_that_hangs_in_stopping_is_said_to_hang_there_whatever_made_it_stop() {
-    for how in 1..=3 {
+    for (how, clings_to_the_last) in
+        [(1, false), (2, false), (3, false), (1, true), (2, true), (3, true), (4, true), (5, true)]
+    {
         let (open, gate) = gate();
-        let spec = AppSpec::new("clinging", move || Clinging(gate.clone())).handles::<Number>();
+        let make = move || Clinging { gate: gate.clone(), clings_to_the_last };
+        let spec = AppSpec::new("clinging", make).handles::<Number>();
         let stage = Stage::start(vec![spec.progress_within(BUDGET).own_thread().into()]);
         stage.wait_ready(0);
         stage.send(0, how);
         let what = hung(stage.wait_failed(0));
-        assert!(what.contains("in its `stopping`"), "{how}: {what}");
+        assert!(what.contains("in its `stopping` or `stopped`"), "{how}: {what}");
         drop(open);
         stage.stop();
     }

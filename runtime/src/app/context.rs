@@ -242,15 +242,20 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     }
 }
 
+fn note_stop() {
+    if let Some(vitals) = Vitals::present() {
+        vitals.stops();
+    }
+}
+
 impl<A: Actor<Context = Self>> ActorContext for AppContext<A> {
     fn stop(&mut self) {
-        if let Some(vitals) = Vitals::present() {
-            vitals.stops();
-        }
+        note_stop();
         self.parts.stop();
     }
 
     fn terminate(&mut self) {
+        note_stop();
         self.parts.terminate();
     }
 

@@ -254,7 +254,10 @@ impl<A: Actor<Context = AppContext<A>>> ActorFuture<A> for Drive<A> {
         let polled = this.steps(actor, context, task);
         // What runs next in this turn is nothing that was taken here.
         this.reader.count();
-        let next = if context.state() == ActorState::Stopping { Doing::Stop } else { Doing::Task };
+        let next = match context.state() {
+            ActorState::Started | ActorState::Running => Doing::Task,
+            ActorState::Stopping | ActorState::Stopped => Doing::Stop,
+        };
         this.vitals.begins(next, None);
         polled
     }
