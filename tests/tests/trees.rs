@@ -214,6 +214,17 @@ fn who_may_not_do_what_he_asks_is_told_what_to_do_instead() {
             assert!(refused.contains("is a layer") && refused.contains("`NodeHandle::stop`"), "{refused}");
         }
     }
+    // Those that the node has by itself, as its tree names them.
+    let own: Vec<_> = handle.tree().expect("it runs").supervisors.into_iter().map(|own| own.name).collect();
+    assert_eq!(own, ["layers", "applications"]);
+    for own in &own {
+        for refused in [handle.stop_app(own), handle.restart_app(own), handle.remove_app(own)] {
+            let refused = words(refused);
+            assert!(refused.contains("is a supervisor of the node's own"), "{refused}");
+        }
+    }
+    let under = words(handle.add_app(member("second", &order).0, Some("layers")));
+    assert!(under.contains("is a supervisor of the node's own"), "{under}");
 }
 
 #[test]

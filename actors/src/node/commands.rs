@@ -16,7 +16,7 @@ use sinew_runtime::{
 
 use super::{
     NodeHandle, StartError, Told,
-    layers::LAYERS,
+    layers::{self, LAYERS},
     root::{Phase, Root, RootEvent},
 };
 
@@ -38,6 +38,12 @@ pub enum CommandError {
          `NodeHandle::stop`"
     )]
     Layer(String),
+    /// A supervisor that the node has by itself is not at the user's command. Nothing has changed.
+    #[error(
+        "'{0}' is a supervisor of the node's own, and lives as long as the node does; name one of its applications, or \
+         end all with `NodeHandle::stop`"
+    )]
+    OwnSupervisor(String),
     /// The node's root has more orders than it can keep. Nothing has changed.
     #[error("the node's root has more orders waiting than it can keep; try again, and not so often")]
     Busy,
@@ -206,9 +212,10 @@ impl Root {
     }
 
     fn named(&self, name: &str) -> Result<ChildId, CommandError> {
-        let unknown = || match LAYERS.contains(&name) {
-            true => CommandError::Layer(name.to_owned()),
-            false => CommandError::Unknown(name.to_owned()),
+        let unknown = || match name {
+            layers::SUPERVISOR => CommandError::OwnSupervisor(name.to_owned()),
+            layer if LAYERS.contains(&layer) => CommandError::Layer(name.to_owned()),
+            _ => CommandError::Unknown(name.to_owned()),
         };
         self.apps.named(name).ok_or_else(unknown)
     }
@@ -218,6 +225,9 @@ impl Root {
             return Err(CommandError::NotRunning);
         };
         let id = self.named(name)?;
+        if id == roster.top() {
+            return Err(CommandError::OwnSupervisor(name.to_owned()));
+        }
         let input = match command {
             Command::Terminate => Input::TerminateChild(id),
             Command::Restart => Input::RestartChild(id),

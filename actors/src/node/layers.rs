@@ -10,6 +10,9 @@ use crate::{gncl, lncl, ndl, stores::Stores, sync};
 /// The layers' names, in the paper's order of start (section 6).
 pub(super) const LAYERS: [&str; 4] = ["LNCL", "sync manager", "GNCL", "NDL"];
 
+/// The name of their supervisor.
+pub(super) const SUPERVISOR: &str = "layers";
+
 /// The layers in that order.
 pub(super) fn specs(stores: &Arc<Stores>, ids: &ChildIds, deadline: Duration) -> Vec<ChildSpec> {
     let child = |name: &str, place: Place, launch: Launch| ChildSpec {

@@ -178,7 +178,7 @@ impl Actor for Root {
         let listener = move |fact| tell(&post, RootEvent::Layers(fact));
         let plan = SupervisorPlan {
             id: self.child_ids.next(),
-            name: "layers".to_owned(),
+            name: layers::SUPERVISOR.to_owned(),
             flags: self.stores.config.supervision.layers(),
             children: layers.into_iter().map(PlannedChild::Worker).collect(),
         };
