@@ -75,6 +75,8 @@ payload!("process.order" =>
         ForgeNumbers(String),
         /// Start a command that ends at once, and write down how it ended.
         StartACommand,
+        /// Start a command that sleeps for two minutes, and write down its process; in a group of its own, or not.
+        StartASleeper(bool),
         /// Stop the system of actix that it finds.
         StopTheSystem,
     }

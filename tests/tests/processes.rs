@@ -4,6 +4,8 @@
 mod death;
 #[path = "processes/fence.rs"]
 mod fence;
+#[path = "processes/groups.rs"]
+mod groups;
 #[path = "processes/placement.rs"]
 mod placement;
 #[path = "processes/scenario.rs"]

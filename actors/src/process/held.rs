@@ -4,53 +4,52 @@ use std::{io, os::fd::OwnedFd, sync::Arc, time::Duration};
 
 use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
-    process::{Signal, WaitIdStatus, pidfd_send_signal},
+    process::{Signal, WaitIdStatus},
 };
 use sinew_runtime::supervision;
 use tokio::{io::unix::AsyncFd, time::timeout};
 
-use super::spawn;
+use super::{group::Group, spawn};
 
-/// The process itself. Dropping it kills it.
+/// The process itself. Dropping it kills it, and what it has started.
 pub(super) struct Process {
+    group: Arc<Group>,
     pidfd: AsyncFd<Arc<OwnedFd>>,
 }
 
 impl Process {
-    pub(super) fn new(pidfd: Arc<OwnedFd>) -> io::Result<Self> {
-        let doomed = pidfd.clone();
-        let fenced = pidfd.clone();
+    pub(super) fn new(group: Arc<Group>) -> io::Result<Self> {
+        let doomed = group.clone();
+        let fenced = group.clone();
         // Its supervisor does not wait for the thread that listens to it: that may hang on somebody else's account.
         supervision::at_fence(move || {
-            // An error says that it has ended.
-            let _ = pidfd_send_signal(&fenced, Signal::KILL);
+            fenced.kill();
             spawn::reap(fenced);
         });
         #[expect(
             deprecated,
             reason = "sound for an OwnedFd, whose descriptor never changes; its successor is an unsafe fn, and unsafe code lives in sinew-shm alone"
         )]
-        AsyncFd::new(pidfd).map(|pidfd| Self { pidfd }).inspect_err(|_| {
-            let _ = pidfd_send_signal(&doomed, Signal::KILL);
+        AsyncFd::new(group.pidfd().clone()).map(|pidfd| Self { group, pidfd }).inspect_err(|_| {
+            doomed.kill();
             spawn::reap(doomed);
         })
     }
 
     pub(super) fn kill(&self) {
-        // An error says that it has ended.
-        let _ = pidfd_send_signal(self.pidfd.get_ref(), Signal::KILL);
+        self.group.kill();
     }
 
     /// What holds it, for who waits for its end after it was killed.
     pub(super) fn pidfd(&self) -> Arc<OwnedFd> {
-        self.pidfd.get_ref().clone()
+        self.group.pidfd().clone()
     }
 
     /// Waits for its end, for this time at most, on a thread that has nobody else to care for: it ends.
     pub(super) fn ends_at_once(&self, within: Duration) -> bool {
         let within = Timespec { tv_sec: 0, tv_nsec: i64::from(within.subsec_nanos()) };
-        let ended = poll(&mut [PollFd::new(self.pidfd.get_ref(), PollFlags::IN)], Some(&within));
-        ended == Ok(1) && !matches!(spawn::ending_of(self.pidfd.get_ref()), Ok(None))
+        let ended = poll(&mut [PollFd::new(self.group.pidfd(), PollFlags::IN)], Some(&within));
+        ended == Ok(1) && !matches!(self.group.ending(), Ok(None))
     }
 
     /// How it has ended, if it does so in time.
@@ -63,7 +62,7 @@ impl Process {
         loop {
             // An error of the reactor's means that nothing will be told by it: what can be known is asked for.
             let guard = self.pidfd.readable().await;
-            match spawn::ending_of(self.pidfd.get_ref()) {
+            match self.group.ending() {
                 Ok(Some(status)) => return in_words(&status),
                 Err(cause) => return format!("how is not known: {cause}; does the program ignore SIGCHLD?"),
                 Ok(None) => {}
@@ -79,7 +78,7 @@ impl Process {
 impl Drop for Process {
     fn drop(&mut self) {
         self.kill();
-        spawn::reap(self.pidfd.get_ref().clone());
+        spawn::reap(self.group.clone());
     }
 }
 

@@ -94,8 +94,9 @@ async fn run(hosted: Arc<Hosted>, ready: ReadyGate, stop: Rc<Notify>) -> Reason 
         Ok(started) => started,
         Err(why) => return Reason::ProcessEnded(format!("it could not be started: {why}")),
     };
-    let Started { pid, pidfd, socket } = started;
-    let process = match Process::new(pidfd) {
+    let Started { group, socket } = started;
+    let pid = group.leader();
+    let process = match Process::new(group) {
         Ok(process) => process,
         Err(why) => return Reason::ProcessEnded(format!("it could not be watched: {why}")),
     };

@@ -18,6 +18,7 @@
 //! | `link` | node | carries messages to the child from any thread |
 //! | `names` | node | which names the child wants to know |
 //! | `life` | node | the child under supervision: started, listened to, stopped, killed |
+//! | `group` | node | a process and what it has started: killed together, reaped |
 //! | `held` | node | one process by its descriptor: killed, waited for, and how it ended |
 //! | `spawn` | node | starts processes and reaps them |
 //! | `role` | child | whether this process is a node or such a child |
@@ -25,6 +26,7 @@
 //! | `inbox` | child | where the application's messages come from |
 //! | `wire` | child | reads what the node says |
 
+mod group;
 mod held;
 mod host;
 mod inbox;

@@ -7,7 +7,7 @@
 use std::{
     ffi::OsString,
     os::{
-        fd::{AsFd, OwnedFd},
+        fd::OwnedFd,
         unix::{net::UnixStream, process::CommandExt},
     },
     process::{Command, Stdio},
@@ -18,12 +18,10 @@ use std::{
     time::Duration,
 };
 
-use rustix::process::{
-    Pid, PidfdFlags, Signal, WaitId, WaitIdOptions, WaitIdStatus, pidfd_open, pidfd_send_signal, waitid,
-};
+use rustix::process::{Pid, PidfdFlags, Signal, kill_process_group, pidfd_open};
 use tokio::sync::oneshot;
 
-use super::words::VARIABLE;
+use super::{group::Group, words::VARIABLE};
 
 /// Orders that wait for the thread at most. When full: a start fails and is tried again, and a process that has ended
 /// stays in the kernel's table.
@@ -34,9 +32,8 @@ const REAPING_MAX: Duration = Duration::from_millis(256);
 
 /// A process that has just been started.
 pub(super) struct Started {
-    pub(super) pid: Pid,
     /// It owns the process: whoever drops it hands it to [`reap`].
-    pub(super) pidfd: Arc<OwnedFd>,
+    pub(super) group: Arc<Group>,
     pub(super) socket: UnixStream,
 }
 
@@ -46,7 +43,7 @@ enum Order {
         variable: String,
         answer: oneshot::Sender<Result<Started, String>>,
     },
-    Reap(Arc<OwnedFd>),
+    Reap(Arc<Group>),
 }
 
 /// Begins the thread, so that processes inherit priority and CPUs of the calling one and not of one of the node's.
@@ -64,16 +61,10 @@ pub(super) async fn start(variable: String) -> Result<Started, String> {
 
 /// Reaps a process that has ended, or was killed. Not on the calling thread: the kernel may take its time to clear away what
 /// it knows of the process, longer than a thread of the node's may stand still.
-pub(super) fn reap(pidfd: Arc<OwnedFd>) {
-    if let Err(why) = order(Order::Reap(pidfd)) {
+pub(super) fn reap(group: Arc<Group>) {
+    if let Err(why) = order(Order::Reap(group)) {
         crate::log::error!(why, "a process that has ended is not reaped");
     }
-}
-
-/// How a process has ended; `None` if it has not, or if that cannot be known. It is left to be reaped.
-pub(super) fn ending_of(pidfd: &OwnedFd) -> rustix::io::Result<Option<WaitIdStatus>> {
-    let look = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
-    waitid(WaitId::PidFd(pidfd.as_fd()), look)
 }
 
 fn order(order: Order) -> Result<(), String> {
@@ -95,7 +86,7 @@ fn thread() -> &'static std::io::Result<SyncSender<Order>> {
 }
 
 fn run(inbox: &Receiver<Order>) {
-    let mut doomed: Vec<Arc<OwnedFd>> = Vec::new();
+    let mut doomed: Vec<Arc<Group>> = Vec::new();
     let mut pause = REAPING_MIN;
     loop {
         let order = if doomed.is_empty() {
@@ -106,24 +97,20 @@ fn run(inbox: &Receiver<Order>) {
         pause = if order.is_ok() { REAPING_MIN } else { (pause * 2).min(REAPING_MAX) };
         match order {
             Ok(Order::Start { variable, answer }) => {
+                // Nothing that one of them has started keeps what the next one needs.
+                doomed.retain(|group| !group.has_been_reaped());
                 if let Err(Ok(unwanted)) = answer.send(start_now(&variable)) {
                     // Who ordered it is gone: it was told to stop, or failed.
-                    let _ = pidfd_send_signal(&unwanted.pidfd, Signal::KILL);
-                    doomed.push(unwanted.pidfd);
+                    unwanted.group.kill();
+                    doomed.push(unwanted.group);
                 }
             }
-            Ok(Order::Reap(pidfd)) => doomed.push(pidfd),
+            Ok(Order::Reap(group)) => doomed.push(group),
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => return,
         }
-        doomed.retain(|pidfd| !has_been_reaped(pidfd));
+        doomed.retain(|group| !group.has_been_reaped());
     }
-}
-
-fn has_been_reaped(pidfd: &OwnedFd) -> bool {
-    let reaped = waitid(WaitId::PidFd(pidfd.as_fd()), WaitIdOptions::EXITED | WaitIdOptions::NOHANG);
-    // An error says that it is nobody's child any more.
-    !matches!(reaped, Ok(None))
 }
 
 fn start_now(variable: &str) -> Result<Started, String> {
@@ -137,41 +124,19 @@ fn start_now(variable: &str) -> Result<Started, String> {
         .args(arguments)
         .env(VARIABLE, variable)
         .stdin(Stdio::from(OwnedFd::from(theirs)))
-        // Ctrl-C is for the node, which then stops its applications in order.
+        // Ctrl-C is for the node, which then stops its applications in order. And what the process starts ends with it.
         .process_group(0)
         .spawn()
         .map_err(fault("this program cannot be started again"))?;
     let pid = Pid::from_child(&child);
     // It is our child and has not been waited for, so nobody else has its id.
     match pidfd_open(pid, PidfdFlags::empty()) {
-        Ok(pidfd) => Ok(Started { pid, pidfd: Arc::new(pidfd), socket }),
+        Ok(pidfd) => Ok(Started { group: Arc::new(Group::new(pid, pidfd)), socket }),
         Err(cause) => {
             let mut child = child;
-            let _ = child.kill();
+            let _ = kill_process_group(pid, Signal::KILL);
             let _ = child.wait();
             Err(format!("no descriptor for the process: {cause}; raise `ulimit -n`"))
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use rustix::event::{PollFd, PollFlags, poll};
-
-    use super::*;
-
-    #[test]
-    #[expect(clippy::zombie_processes, reason = "reaping it is what is tried")]
-    fn who_looks_how_a_process_has_ended_leaves_it_to_be_reaped() {
-        let child = Command::new("true").spawn().expect("a program that every system has");
-        let pid = Pid::from_child(&child);
-        let pidfd = pidfd_open(pid, PidfdFlags::empty()).expect("it is a child of ours");
-        poll(&mut [PollFd::new(&pidfd, PollFlags::IN)], None).expect("it ends");
-        for _ in 0..2 {
-            let status = ending_of(&pidfd).expect("it is not reaped yet").expect("it has ended");
-            assert_eq!(status.exit_status(), Some(0));
-        }
-        assert!(has_been_reaped(&pidfd));
-        assert!(ending_of(&pidfd).is_err(), "there is nothing left of it");
     }
 }

@@ -12,7 +12,8 @@
 //! an application `leader` of the same kind in a thread; for an escalation, `leg` restarts one by one, and once.
 
 use std::{
-    process::ExitCode,
+    os::unix::process::CommandExt,
+    process::{Command, ExitCode, Stdio},
     sync::atomic::{AtomicU64, Ordering},
 };
 
@@ -191,11 +192,24 @@ impl Handler<Delivery<Order>> for Drive {
             }
             Order::StopTheSystem => actix::System::current().stop(),
             Order::StartACommand => {
-                let status = std::process::Command::new("true").status();
+                let status = Command::new("true").status();
                 say(&format!("command {status:?}"));
             }
+            Order::StartASleeper(in_own_group) => start_a_sleeper(in_own_group),
         }
     }
+}
+
+/// It does not hold the output: the scenario waits for the end of that.
+#[expect(clippy::zombie_processes, reason = "what becomes of it is what is tried")]
+fn start_a_sleeper(in_own_group: bool) {
+    let mut command = Command::new("sleep");
+    command.arg("120").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+    if in_own_group {
+        command.process_group(0);
+    }
+    let sleeper = command.spawn().expect("a program that every system has");
+    say(&format!("sleeper {}", sleeper.id()));
 }
 
 /// Does not return: another thread may take the signal, a moment later. The first SIGSEGV may meet the handler that Rust has

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
-    process::{Pid, PidfdFlags, Signal, kill_process, pidfd_open},
+    process::{Pid, PidfdFlags, Signal, kill_process, pidfd_open, pidfd_send_signal},
 };
 use sinew::{Endpoint, NodeApi, Outcome, Registration, Tid};
 use sinew_tests::{
@@ -106,6 +106,17 @@ pub(crate) struct Watched(std::os::fd::OwnedFd);
 impl Watched {
     pub(crate) fn new(id: u32) -> Self {
         Self(pidfd_open(process(id), PidfdFlags::empty()).expect("it is alive"))
+    }
+
+    /// Whether it lives.
+    pub(crate) fn is_alive(&self) -> bool {
+        let now = Timespec { tv_sec: 0, tv_nsec: 0 };
+        poll(&mut [PollFd::new(&self.0, PollFlags::IN)], Some(&now)) == Ok(0)
+    }
+
+    /// Kills it.
+    pub(crate) fn kill(&self) {
+        pidfd_send_signal(&self.0, Signal::KILL).expect("it is alive");
     }
 
     /// Waits until it has ended.

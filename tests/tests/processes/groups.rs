@@ -1,0 +1,49 @@
+//! What a process of a node's has started: it ends with it.
+
+use rustix::process::Signal;
+use sinew::Outcome;
+use sinew_tests::orders::Order;
+
+use crate::scenario::{Scenario, Watched, signal};
+
+/// Something that the application has started.
+fn sleeper(scenario: &mut Scenario, in_own_group: bool) -> Watched {
+    scenario.order(Order::StartASleeper(in_own_group));
+    let line = scenario.node.wait_for(&["sleeper"]);
+    let id = line.rsplit(' ').next().and_then(|id| id.parse().ok()).expect("it ends with its id");
+    let sleeper = Watched::new(id);
+    assert!(sleeper.is_alive());
+    sleeper
+}
+
+#[test]
+fn what_a_process_has_started_ends_with_it_however_that_ends() {
+    let mut scenario = Scenario::start(&[]);
+    for order in [Order::Kill, Order::Exit(0), Order::Panic, Order::Hang] {
+        let sleeper = sleeper(&mut scenario, false);
+        assert_eq!(scenario.order_confirmed(order), Outcome::Failed);
+        sleeper.wait_for_end();
+    }
+    assert_eq!(scenario.count_confirmed(1), Outcome::Delivered);
+}
+
+#[test]
+fn what_a_process_has_started_ends_with_it_when_its_node_stops_in_order() {
+    let mut scenario = Scenario::start(&[]);
+    let sleeper = sleeper(&mut scenario, false);
+    scenario.node.signal(Signal::TERM);
+    assert_eq!(scenario.node.wait_for_end(), Some(0));
+    sleeper.wait_for_end();
+}
+
+#[test]
+fn what_a_process_has_started_in_another_group_is_let_alone() {
+    let mut scenario = Scenario::start(&[]);
+    let pid = scenario.who().pid;
+    let (ours, other) = (sleeper(&mut scenario, false), sleeper(&mut scenario, true));
+    signal(pid, Signal::KILL);
+    ours.wait_for_end();
+    assert_ne!(scenario.who().pid, pid);
+    assert!(other.is_alive());
+    other.kill();
+}
