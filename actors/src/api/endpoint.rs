@@ -112,7 +112,7 @@ impl Endpoint {
     /// itself where that is possible, see [`LentMessage`]. Never waits.
     ///
     /// # Errors
-    /// It would be longer than the node takes.
+    /// It would be longer than the node takes, or `kind` is one of the layers' own.
     pub fn create_message(
         &mut self,
         destination: Tid,
@@ -120,6 +120,9 @@ impl Endpoint {
         length: usize,
     ) -> Result<LentMessage, ApiError> {
         self.check_length(length)?;
+        if !kind.is_user() {
+            return Err(ApiError::NotYours(kind));
+        }
         Ok(self.lend(Header::new(kind, self.tid, destination), length))
     }
 

@@ -4,7 +4,7 @@ use std::{io, path::PathBuf, time::Duration};
 
 use sinew_runtime::{
     outcome::Outcome,
-    wire::{DecodeError, FrameError},
+    wire::{DecodeError, FrameError, Kind},
 };
 
 /// Why an operation of NodeAPI failed.
@@ -54,6 +54,11 @@ pub enum ApiError {
         /// The node's limit.
         limit: usize,
     },
+    /// The kind is one of the layers' own. The caller is at fault; nothing was sent.
+    #[error(
+        "the kind {0} belongs to Sinew's layers, which would end the connection; take one from `Kind::named`"
+    )]
+    NotYours(Kind),
     /// A request was not handled, or a group not joined.
     #[error("it ended as {0:?}")]
     Ended(Outcome),

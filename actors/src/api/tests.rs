@@ -71,6 +71,7 @@ on_every_transport! {
     addresses_are_fixed_or_dynamic_and_names_have_one_holder
     messages_go_to_and_fro_between_processes
     raw_memory_is_lent_filled_and_sent
+    what_is_handled_while_memory_is_lent_is_told_when_it_is_given_back
     raw_memory_is_confirmed_asked_with_and_replied_with
     a_confirmed_message_ends_in_what_its_receiver_says
     an_outcome_that_nobody_says_is_unknown_at_the_deadline
@@ -157,6 +158,26 @@ fn raw_memory_is_lent_filled_and_sent(under: Under) {
     assert_eq!((message.header.kind, message.payload.len(), message.payload[99_999]), (kind, 100_000, 7));
     let too_long = endpoint.create_message(app.tid, kind, endpoint.payload_max() + 1);
     assert!(matches!(too_long, Err(ApiError::TooLong { .. })));
+    let not_ours = endpoint.create_message(app.tid, Kind::NDL_QUERY, 1);
+    assert!(matches!(not_ours, Err(ApiError::NotYours(Kind::NDL_QUERY))));
+}
+
+fn what_is_handled_while_memory_is_lent_is_told_when_it_is_given_back(under: Under) {
+    const MESSAGES: u32 = 6_000;
+    let node = TestNode::start_with(|config| config.mailbox_capacity = 8_192);
+    let app = node.local(1);
+    let mut endpoint = register(under, &node, on(under));
+    let lent = endpoint.create_message(app.tid, Kind::named("test.raw"), 8).unwrap();
+    let outcomes: Vec<_> =
+        (0..MESSAGES).map(|_| node.send_confirmed(app.tid, endpoint.tid(), &TORQUE)).collect();
+    for _ in 0..MESSAGES {
+        drop(endpoint.receive(WATCHDOG).unwrap().expect("it was sent"));
+    }
+    drop(lent);
+    assert!(endpoint.receive(Duration::from_millis(50)).unwrap().is_none());
+    for outcome in outcomes {
+        assert_eq!(outcome.recv_timeout(WATCHDOG), Ok(Outcome::Delivered));
+    }
 }
 
 fn raw_memory_is_confirmed_asked_with_and_replied_with(under: Under) {

@@ -190,6 +190,7 @@ impl From<ApiError> for Fault {
             ApiError::Malformed(_) => Status::SinewErrorMalformed,
             ApiError::NotAsked => Status::SinewErrorNotAsked,
             ApiError::Lent => Status::SinewErrorLent,
+            ApiError::NotYours(_) => Status::SinewErrorInvalidArgument,
         };
         Self::new(status, sentence)
     }

@@ -210,6 +210,7 @@ impl Letters {
             | ApiError::Ended(_)
             | ApiError::NoReply(_)
             | ApiError::Lent
+            | ApiError::NotYours(_)
             | ApiError::NotAsked
             | ApiError::Malformed(_)
             | ApiError::Frame(_) => Entry::Broken(format!("number {number} to {way:?}: {error}")),

@@ -25,13 +25,13 @@ use sinew_shm::BellKind;
 use tokio::sync::Notify;
 use tokio_util::codec::Decoder;
 
-use super::{Ended, LinkOptions, Progress, Read};
+use super::{Ended, LinkOptions, Progress, Read, ring::OWED_MAX};
 use crate::api::ApiError;
 
 /// Bytes that are read at once.
 const READ_CHUNK: usize = 64 * 1024;
 /// What may be left before an outcome that is to be said is left out: as many as at a ring.
-const BACKLOG_BYTES_MAX: usize = 4_096 * (HEADER_LEN + 1);
+const BACKLOG_BYTES_MAX: usize = OWED_MAX * (HEADER_LEN + 1);
 
 /// The writing half: whoever settles a message writes, from whatever thread.
 #[derive(Debug)]
