@@ -1,7 +1,8 @@
 //! Coming back: an endpoint whose connection ended registers again, within the calls of its user.
 //!
 //! There is no thread for it. [`receive`](Endpoint::receive) waits for the node's return as it waits for a message; a send
-//! tries once, without waiting. Between two tries there is a pause, from 10 ms doubling to 1 s.
+//! tries once, and waits for a node that is there and has just been asked, for 20 ms at most: who calls seldom would else
+//! come too late for each step of it. Between two tries there is a pause, from 10 ms doubling to 1 s.
 
 use std::{collections::BTreeSet, path::PathBuf, thread, time::Duration};
 
@@ -22,6 +23,9 @@ use crate::lncl::payload::{self, Group, Register};
 
 /// First and longest pause between two tries.
 const PAUSE: (Duration, Duration) = (Duration::from_millis(10), Duration::from_secs(1));
+
+/// Time that a node has to answer in the call that asked it. Later calls look without waiting.
+const ANSWERED_WITHIN: Duration = Duration::from_millis(20);
 
 /// How often who registers on another thread looks whether that is still wanted.
 pub(super) const LOOK: Duration = Duration::from_millis(100);
@@ -80,9 +84,12 @@ impl Home {
         if way.greeting.is_none() && Time::now() < way.next {
             return None;
         }
-        let answer = match way.greeting.take() {
-            Some(greeting) => Ok(greeting),
-            None => Greeting::begin(&path, &register, options),
+        let (answer, until) = match way.greeting.take() {
+            Some(greeting) => (Ok(greeting), until),
+            None => {
+                let asked = Greeting::begin(&path, &register, options);
+                (asked, until.max(Time::now() + ANSWERED_WITHIN))
+            }
         };
         let answer = answer.and_then(|mut greeting| match greeting.wait(until)? {
             None => {
@@ -149,7 +156,7 @@ impl Endpoint {
         self.ended.as_ref().map_or(Ok(()), |ended| Err(self.gone(ended)))
     }
 
-    /// Comes back if that takes no waiting.
+    /// Comes back if that takes no waiting to speak of.
     pub(super) fn try_return(&mut self) {
         if let Some(ended) = &self.ended
             && self.returns(ended)

@@ -64,3 +64,25 @@ fn endpoints_at_rings_come_back_when_lncl_panics() {
 fn endpoints_at_sockets_come_back_when_lncl_panics() {
     comes_back(Transport::Socket);
 }
+
+/// A node gives up after 2 s whoever has begun to register and does not go on.
+#[test]
+fn an_endpoint_that_is_used_every_two_seconds_and_a_bit_comes_back_all_the_same() {
+    let directory = OwnDirectory::new();
+    let socket = directory.join("node.sock");
+    let door = socket.clone();
+    let node = Ground::new().node("node").configure(|config| config.lncl.socket = Some(door));
+    let node = node.start().expect("a node");
+    all_run(&[&node]);
+    let api = NodeApi::connect(&socket).expect("somebody listens");
+    let mut seldom = api.register_transport_address(Registration::new().name("seldom")).expect("an address");
+    let to = seldom.tid();
+    node.handle().inject("LNCL", Fault::panic()).expect("every node has it");
+    ready_for(&node.handle(), "LNCL", 2);
+    let calls = (1..=5).find(|_| {
+        thread::sleep(Duration::from_millis(2_100));
+        seldom.send(to, &Job { number: 1 }).is_ok()
+    });
+    assert!(calls.is_some_and(|calls| calls <= 3), "back at call {calls:?}");
+    assert_eq!(seldom.registrations(), 2);
+}
