@@ -289,7 +289,9 @@ impl Case {
         let rounds = Rounds::of(bytes, Pace::BackToBack, is_short);
         let (copied, _) = ends::loans(self.way, Memory::Copied, bytes, rounds, self.pinning);
         let (seen, is_in_place) = ends::loans(self.way, Memory::Lent, bytes, rounds, self.pinning);
-        assert!(is_in_place, "the ring is long enough, and empty");
+        if !is_in_place {
+            return eprintln!("{} {bytes}: it fits no ring of this way, and was copied", self.way.name());
+        }
         Beside {
             bench: "lncl",
             case: &format!("{}_loan", self.way.name()),

@@ -75,11 +75,16 @@ pub(crate) fn register(way: Way, socket: &str, name: &str) -> Endpoint {
         Way::Socket => Registration::new().transport(Transport::Socket),
         Way::Ring => Registration::new(),
         Way::TaskRing | Way::TaskDirect => unreachable!("its ends are in tasks.rs"),
-        Way::Direct => Registration::new().direct(true),
-        Way::DirectSpin => Registration::new().direct(true).spin(Spin::For(LOOKS)),
+        Way::Direct => direct(),
+        Way::DirectSpin => direct().spin(Spin::For(LOOKS)),
     };
     let api = NodeApi::connect(socket).expect("the node's door");
     api.register_transport_address(registration.name(name)).expect("an address")
+}
+
+/// Rings of the longest sort, for the long payloads.
+fn direct() -> Registration {
+    Registration::new().direct(true).direct_ring_bytes(1 << 20)
 }
 
 /// Where a payload is written.
