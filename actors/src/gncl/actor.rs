@@ -36,7 +36,7 @@ use super::{
 use crate::{
     config::NodeConfig,
     ndl,
-    ndl::{KnownNode, MembershipFact},
+    ndl::{KnownNode, LossReason, MembershipFact},
     outlet::LinkNumber,
     stores::{Stores, lock},
     sync,
@@ -47,7 +47,7 @@ const EXPIRY_PERIOD: Duration = Duration::from_millis(50);
 
 /// Time that peers have, when the node is stopped, to take what waits for them and hang up. Whoever has more to send
 /// than goes over its network in this time loses it.
-const LINGER: Duration = Duration::from_secs(1);
+pub(crate) const LINGER: Duration = Duration::from_secs(3);
 /// How often it is looked whether they have.
 const LINGER_LOOK: Duration = Duration::from_millis(1);
 
@@ -420,6 +420,9 @@ impl StreamHandler<Event> for Gncl {
         let input = match event {
             Event::Membership(MembershipFact::NodeFound { node, incarnation, gncl }) => {
                 Input::NodeFound { node, incarnation, address: gncl }
+            }
+            Event::Membership(MembershipFact::NodeLost { node, incarnation, why: LossReason::Left }) => {
+                Input::NodeLeaves { node, incarnation }
             }
             Event::Membership(MembershipFact::NodeLost { node, incarnation, .. }) => {
                 Input::NodeLost { node, incarnation }

@@ -39,7 +39,7 @@ mod peer;
 #[cfg(test)]
 mod tests;
 
-pub(crate) use actor::Gncl;
+pub(crate) use actor::{Gncl, LINGER};
 pub(crate) use facts::LinkFact;
 pub(crate) use peer::{Peer, Store};
 

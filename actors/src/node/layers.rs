@@ -26,10 +26,13 @@ pub(super) fn specs(stores: &Arc<Stores>, ids: &ChildIds, deadline: Duration) ->
         #[cfg(not(feature = "fault-points"))]
         launch,
     };
+    let mut gncl = child(LAYERS[2], Place::io(), layer(stores, gncl::Gncl::new));
+    // Peers take what waits for them while it stops.
+    gncl.policy.stop_within += gncl::LINGER;
     vec![
         child(LAYERS[0], Place::io(), layer(stores, lncl::Lncl::new)),
         child(LAYERS[1], Place::layer("sync"), layer(stores, sync::SyncManager::new)),
-        child(LAYERS[2], Place::io(), layer(stores, gncl::Gncl::new)),
+        gncl,
         child(LAYERS[3], Place::layer("ndl"), layer(stores, ndl::NdlActor::new)),
     ]
 }

@@ -57,6 +57,14 @@ impl Core {
         self.forget(now, node);
     }
 
+    /// A link outlives the word of its node that it leaves: GOODBYE, or its break, ends it. spec: GNCL-10
+    pub(super) fn leaves(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
+        match self.peers.get_mut(&node) {
+            Some(peer) if peer.link.is_some() && peer.incarnation == incarnation => peer.wanted = None,
+            Some(_) | None => self.lost(now, node, incarnation),
+        }
+    }
+
     /// A former instance of this layer had this peer: it has some time to come back.
     pub(super) fn restored(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
         self.meet(now, node, incarnation);

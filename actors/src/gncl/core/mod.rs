@@ -68,6 +68,8 @@ pub(super) enum Input {
     NodeFound { node: NodeAddress, incarnation: Incarnation, address: SocketAddr },
     /// NDL lost a node.
     NodeLost { node: NodeAddress, incarnation: Incarnation },
+    /// NDL heard a node say that it leaves. What it had sent before may still be on its way, and its GOODBYE behind that.
+    NodeLeaves { node: NodeAddress, incarnation: Incarnation },
     /// The listener accepted a connection; `connection` is from [`Core::open`].
     Accepted(ConnectionId),
     /// A dial reached the peer's host.
@@ -198,6 +200,7 @@ impl Core {
             Input::Restored { node, incarnation } => self.restored(now, node, incarnation),
             Input::NodeFound { node, incarnation, address } => self.found(now, node, incarnation, address),
             Input::NodeLost { node, incarnation } => self.lost(now, node, incarnation),
+            Input::NodeLeaves { node, incarnation } => self.leaves(now, node, incarnation),
             Input::Accepted(connection) => self.accepted(now, connection),
             Input::Connected(connection) => self.connected(now, connection),
             Input::DialFailed { connection, refused } => self.dial_failed(now, connection, refused),
