@@ -202,12 +202,18 @@ impl Link {
         }
     }
 
-    /// The child knows all that had changed when the message that waits came: it may go.
+    /// The message that waits may go, if the child knows all that had changed when it came. It may have come, behind a further
+    /// change, while the child was told of the one before: then it waits for the next time.
     pub(super) fn hand_over_held(&self) {
         if let Some(present) = &mut *lock(&self.present)
             && let Some(message) = present.held.take()
         {
-            self.hand_over(present, message);
+            if present.directory.has_changed().unwrap_or(false) {
+                present.held = Some(message);
+                self.nudge.notify_one();
+            } else {
+                self.hand_over(present, message);
+            }
         }
         self.pump();
     }
@@ -368,6 +374,39 @@ mod tests {
         link.begin_life();
         assert!(says((1 << 40) + 1), "the next one counts on from there");
         assert_eq!(link.sequence(), (1 << 40) + 1);
+    }
+
+    #[test]
+    fn a_message_does_not_overtake_the_change_of_the_directory_behind_which_it_came() {
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let link = Link::new(&stores, Mailbox::new(8));
+        let tid = Tid::new(NodeAddress::HERE, AppAddress::fixed(1).expect("a fixed one"));
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().expect("a reactor");
+        let _entered = runtime.enter();
+        let (socket, mut process) = UnixStream::pair().expect("a pair of sockets");
+        let welcome = words::bare(Kind::HOST_WELCOME, Tid::NONE, tid);
+        let number = link.connect(Arc::new(socket), welcome, stores.directory_changes.subscribe());
+        let mut frame = [0; HEADER_LEN];
+        runtime.block_on(async {
+            tokio::select! {
+                error = link.drain(number) => panic!("the process reads: {error}"),
+                read = process.read_exact(&mut frame) => read.expect("the welcome"),
+            }
+        });
+        let waits = || lock(&link.present).as_ref().expect("it is connected").held.is_some();
+        // Given: the child is being told of one change when another one and a message come
+        stores.directory_has_changed();
+        link.directory_is_told();
+        stores.directory_has_changed();
+        link.submit(Message::new(Header::new(Kind::named("event"), tid, tid), Bytes::new()))
+            .expect("there is room");
+        // When: the child has been told of the first
+        link.hand_over_held();
+        // Then
+        assert!(waits(), "it does not know of the second");
+        link.directory_is_told();
+        link.hand_over_held();
+        assert!(!waits());
     }
 
     #[test]
