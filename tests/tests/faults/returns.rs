@@ -5,6 +5,18 @@ use std::thread;
 use sinew::{ApiError, Endpoint, NodeApi, Registration, Transport, fault::Fault, prelude::*};
 use sinew_tests::{DEADLINE, Ground, OwnDirectory, all_run, puppet::Job, ready_for, until};
 
+/// A node, the way to it, and the directory where its socket lies.
+fn node_and_its_door() -> (Node, NodeApi, OwnDirectory) {
+    let directory = OwnDirectory::new();
+    let socket = directory.join("node.sock");
+    let door = socket.clone();
+    let node = Ground::new().node("node").configure(|config| config.lncl.socket = Some(door));
+    let node = node.start().expect("a node");
+    all_run(&[&node]);
+    let api = NodeApi::connect(&socket).expect("somebody listens");
+    (node, api, directory)
+}
+
 /// Receives, and answers nobody, until the endpoint has registered `times`.
 fn come_back(endpoint: &mut Endpoint, times: u64) {
     until("the endpoint is back", || {
@@ -19,13 +31,7 @@ fn come_back(endpoint: &mut Endpoint, times: u64) {
 
 fn comes_back(transport: Transport) {
     // Given: two endpoints, one of them in a group, and a message in flight between them
-    let directory = OwnDirectory::new();
-    let socket = directory.join("node.sock");
-    let door = socket.clone();
-    let node = Ground::new().node("node").configure(|config| config.lncl.socket = Some(door));
-    let node = node.start().expect("a node");
-    all_run(&[&node]);
-    let api = NodeApi::connect(&socket).expect("somebody listens");
+    let (node, api, _directory) = node_and_its_door();
     let register = |name: &str| {
         let registration = Registration::new().name(name).transport(transport);
         api.register_transport_address(registration).expect("the name is free")
@@ -68,13 +74,7 @@ fn endpoints_at_sockets_come_back_when_lncl_panics() {
 /// A node gives up after 2 s whoever has begun to register and does not go on.
 #[test]
 fn an_endpoint_that_is_used_every_two_seconds_and_a_bit_comes_back_all_the_same() {
-    let directory = OwnDirectory::new();
-    let socket = directory.join("node.sock");
-    let door = socket.clone();
-    let node = Ground::new().node("node").configure(|config| config.lncl.socket = Some(door));
-    let node = node.start().expect("a node");
-    all_run(&[&node]);
-    let api = NodeApi::connect(&socket).expect("somebody listens");
+    let (node, api, _directory) = node_and_its_door();
     let mut seldom = api.register_transport_address(Registration::new().name("seldom")).expect("an address");
     let to = seldom.tid();
     node.handle().inject("LNCL", Fault::panic()).expect("every node has it");
