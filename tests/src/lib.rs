@@ -10,6 +10,7 @@ mod log;
 mod program;
 
 pub mod orders;
+pub mod proxy;
 pub mod puppet;
 
 pub use ground::{Ground, all_run, ready_for, sees};

@@ -138,6 +138,12 @@ impl NodeConfig {
 
     fn check_gncl(&self, faults: &mut Vec<ConfigFault>) {
         let gncl = &self.gncl;
+        if let Some(outer) = gncl.announce.filter(|outer| !is_host_address(*outer.ip()) || outer.port() == 0)
+        {
+            let legal = "the address of one host and a port, as in 192.168.1.7:6912, or false";
+            let remedy = "write where the others' connections are forwarded from, or leave it out";
+            faults.push(fault("gncl.announce", quoted(&outer.to_string()), legal, remedy));
+        }
         QUEUE_CAPACITY.count(faults, gncl.queue_capacity);
         STRANGERS_MAX.count(faults, gncl.strangers_max);
         HANDSHAKE.time(faults, gncl.handshake);

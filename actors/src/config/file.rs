@@ -29,7 +29,7 @@ const FILE_BYTES_MAX: u64 = 1 << 20;
 const SECTIONS: [&str; 6] = ["node", "lncl", "gncl", "ndl", "sync", "supervision"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 29] = [
+pub(super) const KEYS: [&str; 30] = [
     "node.name",
     "node.project",
     "node.address",
@@ -40,6 +40,7 @@ pub(super) const KEYS: [&str; 29] = [
     "lncl.apps_max",
     "lncl.ring_bytes",
     "gncl.port",
+    "gncl.announce",
     "gncl.queue_capacity",
     "gncl.strangers_max",
     "gncl.handshake_ms",
@@ -320,6 +321,8 @@ impl Reader<'_> {
     fn read_gncl(&mut self, config: &mut NodeConfig) {
         let gncl = &mut config.gncl;
         self.number(&check::GNCL_PORT, &mut gncl.port);
+        let example = "\"192.168.1.7:6912\" or false";
+        self.text_or_off::<SocketAddrV4>("gncl.announce", example, &mut gncl.announce);
         self.number(&check::QUEUE_CAPACITY, &mut gncl.queue_capacity);
         self.number(&check::STRANGERS_MAX, &mut gncl.strangers_max);
         self.time(&check::HANDSHAKE, &mut gncl.handshake);

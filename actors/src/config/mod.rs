@@ -71,6 +71,9 @@ pub struct LnclConfig {
 pub struct GnclConfig {
     /// TCP port to listen on, at [`NdlConfig::interface`]. Default 0: any free one; NDL tells the others which.
     pub port: u16,
+    /// Where the others reach the listener, if not where it listens: the outer side of a forwarded port. Default: none, where it
+    /// listens.
+    pub announce: Option<SocketAddrV4>,
     /// Messages that wait for one peer at most, each class by itself. 1 to 65,536; default 1,024.
     pub queue_capacity: usize,
     /// Connections whose peer has not said who it is, at most. 1 to 1,024; default 64.
@@ -166,6 +169,7 @@ impl NodeConfig {
             lncl: LnclConfig { socket: None, clients_max: 256, apps_max: 1_024, ring_bytes: 256 * 1_024 },
             gncl: GnclConfig {
                 port: 0,
+                announce: None,
                 queue_capacity: 1_024,
                 strangers_max: 64,
                 handshake: Duration::from_secs(2),

@@ -140,6 +140,7 @@ impl Shell {
         };
         let interface = stores.config.ndl.interface;
         let gncl = if gncl.ip().is_unspecified() { SocketAddrV4::new(interface, gncl.port()) } else { gncl };
+        let gncl = stores.config.gncl.announce.unwrap_or(gncl);
         let unbound = |error: io::Error| {
             let port = stores.config.ndl.port;
             format!(
