@@ -32,7 +32,7 @@ use super::{
 /// that is full is looked at again after 1 ms, doubling to 20.
 #[derive(Debug)]
 pub struct AsyncEndpoint {
-    endpoint: Endpoint,
+    pub(super) endpoint: Endpoint,
 }
 
 impl AsyncEndpoint {
@@ -102,7 +102,7 @@ impl AsyncEndpoint {
     /// # Errors
     /// It was not sent.
     pub async fn send_message(&mut self, message: LentMessage) -> Result<(), ApiError> {
-        self.endpoint.dispatch(message.into()).await.map(drop)
+        self.endpoint.dispatch(message.into(), self.endpoint.patience()).await.map(drop)
     }
 
     /// The same, and waits for what becomes of it, as [`send_confirmed`](Self::send_confirmed).
@@ -135,7 +135,7 @@ impl AsyncEndpoint {
     /// The message asks for no reply, or the reply was not sent.
     pub async fn reply_message(&mut self, request: &Received, message: LentMessage) -> Result<(), ApiError> {
         let request = Request::of(request)?;
-        self.endpoint.answer(request, message.into()).await
+        self.endpoint.answer(request, message.into(), self.endpoint.patience()).await
     }
 
     /// Sends a value, as [`Endpoint::send`].
@@ -144,7 +144,7 @@ impl AsyncEndpoint {
     /// It was not sent.
     pub async fn send<P: Payload>(&mut self, destination: Tid, value: &P) -> Result<(), ApiError> {
         let message = Message::typed(self.tid(), destination, value);
-        self.endpoint.dispatch(message.into()).await.map(drop)
+        self.endpoint.dispatch(message.into(), self.endpoint.patience()).await.map(drop)
     }
 
     /// Sends a value and waits for what becomes of it, as [`Endpoint::send_confirmed`].
@@ -182,7 +182,7 @@ impl AsyncEndpoint {
     pub async fn reply<R: Payload>(&mut self, request: &Received, value: &R) -> Result<(), ApiError> {
         let request = Request::of(request)?;
         let message = Message::typed(self.tid(), request.source, value);
-        self.endpoint.answer(request, message.into()).await
+        self.endpoint.answer(request, message.into(), self.endpoint.patience()).await
     }
 
     /// Waits for a message, in the order of [`Endpoint::receive`]. May be dropped at any time without losing one. When the

@@ -226,6 +226,11 @@ impl Direct {
         self.standing(number).is_some_and(|link| link.is_stalled)
     }
 
+    /// A count of what the peer of a link takes.
+    pub(super) fn taken(&mut self, number: LinkNumber) -> u32 {
+        self.standing(number).map_or(0, Standing::taken)
+    }
+
     /// Whether nothing is left half written on a link, or it has ended.
     pub(super) fn is_whole(&mut self, number: LinkNumber) -> bool {
         self.standing(number).is_none_or(Standing::is_whole)

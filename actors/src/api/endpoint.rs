@@ -16,7 +16,7 @@ use super::{
     inbox::{Answer, Awaited, Inbox},
     incoming::WhenFull,
     lent::LentMessage,
-    link::{Ended, Link, Reader, Writer},
+    link::{Ended, Link, Reader, Writer, ring::Rest},
     outgoing::Request,
     returning::Home,
 };
@@ -44,6 +44,10 @@ pub struct Endpoint {
     pub(super) ended: Option<Ended>,
     pub(super) home: Home,
     pub(super) form: Form,
+    /// What is left of a frame of which a part is in the ring to the node.
+    pub(super) rest: Option<Rest>,
+    /// What the node had taken when a sender's patience with it was over.
+    pub(super) stalled: Option<u32>,
 }
 
 impl std::fmt::Debug for Endpoint {
@@ -81,6 +85,8 @@ impl Endpoint {
             ended: None,
             home: Home::new(path.to_owned(), register, options, returning),
             form,
+            rest: None,
+            stalled: None,
         }
     }
 
@@ -132,7 +138,7 @@ impl Endpoint {
     /// # Errors
     /// It was not sent, and its memory is given back. [`ApiError::Lent`]: another one lies in the ring.
     pub fn send_message(&mut self, message: LentMessage) -> Result<(), ApiError> {
-        at_once(self.dispatch(message.into())).map(drop)
+        at_once(self.dispatch(message.into(), self.patience())).map(drop)
     }
 
     /// Sends a value, in the class of its type. Returns when the way to the node, or the ring of a direct link, has taken it.
@@ -140,7 +146,7 @@ impl Endpoint {
     /// # Errors
     /// It was not sent.
     pub fn send<P: Payload>(&mut self, destination: Tid, value: &P) -> Result<(), ApiError> {
-        at_once(self.dispatch(Message::typed(self.tid, destination, value).into())).map(drop)
+        at_once(self.dispatch(Message::typed(self.tid, destination, value).into(), self.patience())).map(drop)
     }
 
     /// Sends a value and waits for what becomes of it: [`Outcome::Unknown`] when nobody has said so `within` this
@@ -178,7 +184,7 @@ impl Endpoint {
     /// The message asks for no reply, or the reply was not sent.
     pub fn reply<R: Payload>(&mut self, request: &Received, value: &R) -> Result<(), ApiError> {
         let message = Message::typed(self.tid, request.source(), value);
-        at_once(self.answer(Request::of(request)?, message.into()))
+        at_once(self.answer(Request::of(request)?, message.into(), self.patience()))
     }
 
     /// Waits for a message, at most `within` this time; `None` if none came (the paper's ReceiveMessage). Control
@@ -271,7 +277,7 @@ impl Endpoint {
             return Ok(());
         }
         let goodbye = Message::new(Header::new(Kind::LNCL_UNREGISTER, self.tid, LNCL), bytes::Bytes::new());
-        self.write(goodbye.into()).await?;
+        self.write(goodbye.into(), self.patience()).await?;
         let deadline = Time::now() + PROMPT;
         while self.ended.is_none() {
             self.take_in(None, WhenFull::Refuse)?;

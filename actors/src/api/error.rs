@@ -39,9 +39,11 @@ pub enum ApiError {
     /// send tries, and [`receive`](super::Endpoint::receive) waits for it. A message of this call was not sent.
     #[error("the connection to the node has ended: {0}; the endpoint registers again by itself")]
     Away(String),
-    /// There was no room for so long, or there was none before and there is none yet: the node takes no bytes or, on a direct
-    /// link, the peer. This message was not sent; it may be tried again.
-    #[error("the node, or the peer on a direct link, has taken no bytes for {0:?}; the message was not sent")]
+    /// There was no room for so long: the patience of the endpoint, or the time that the call was given. Or another send's
+    /// patience was over before, and nothing was taken since. Nothing of this message was written; it may be sent again.
+    #[error(
+        "no room for the message for {0:?}: the node, or the receiver on a direct link, is stopped or too slow; it was not sent"
+    )]
     Stalled(Duration),
     /// A message that was lent was neither sent nor dropped. The caller is at fault; nothing was sent.
     #[error("memory for a message is lent; send that message or drop it first")]

@@ -1,5 +1,7 @@
 //! Messages on their way in: from the node and from direct links, without waiting; and the wait.
 
+use std::time::Duration;
+
 use sinew_runtime::{
     tid::Tid,
     time::Time,
@@ -18,6 +20,9 @@ use crate::ring::Taken;
 /// Chunks of 64 KiB that are read before the caller has its turn. In tests each read is the last of its look: a message
 /// that ends with it must not be left lying until more comes.
 const READS_PER_LOOK: usize = if cfg!(test) { 1 } else { 16 };
+
+/// Time until it is looked again whether there is room for the rest of a long frame.
+const REST_AGAIN: Duration = Duration::from_millis(1);
 
 /// What to do with messages that find the inbox full.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -74,7 +79,7 @@ impl Endpoint {
         wanted: Option<Wanted>,
         when_full: WhenFull,
     ) -> Result<Option<Answer>, ApiError> {
-        self.pay();
+        self.go_on();
         for read in 0.. {
             if let Some(answer) = self.sort_in(wanted, when_full)? {
                 return Ok(Some(answer));
@@ -165,16 +170,10 @@ impl Endpoint {
         None
     }
 
-    /// Writes what waits for room, as far as there is room.
-    fn pay(&mut self) {
-        if let Form::Reactor(reactor) = &mut self.form {
-            reactor.go_on();
-        }
-        self.writer.pay();
-    }
-
     /// Waits until something comes, from the node or from a link, or until there is something to do.
     pub(super) async fn wait(&mut self, deadline: Time) {
+        // The rest of a frame goes out meanwhile.
+        let deadline = if self.is_within_frame() { deadline.min(Time::now() + REST_AGAIN) } else { deadline };
         match &mut self.form {
             Form::Thread => self.block(deadline),
             Form::Reactor(reactor) => {

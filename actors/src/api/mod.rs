@@ -47,6 +47,7 @@ mod incoming;
 mod lent;
 mod link;
 mod outgoing;
+mod patience;
 mod raw;
 mod reactor;
 mod received;
@@ -54,6 +55,8 @@ mod returning;
 mod routes;
 #[cfg(test)]
 mod tests;
+mod to_node;
+mod within;
 
 use std::{
     path::{Path, PathBuf},
@@ -211,7 +214,8 @@ impl Registration {
         self
     }
 
-    /// How long a send waits at most while the node or, on a direct link, the peer takes nothing. Default 1 s.
+    /// How long a send waits while the node or, on a direct link, the peer takes nothing; whatever it takes begins that time
+    /// anew. Default 1 s. For one send alone, and in all: [`Endpoint::send_within`].
     #[must_use]
     pub const fn patience(mut self, patience: Duration) -> Self {
         self.link.patience = patience;

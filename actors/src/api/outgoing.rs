@@ -17,6 +17,7 @@ use super::{
     incoming::{Wanted, WhenFull},
     lent::{Draft, LentMessage},
     link::ring::NAP,
+    patience::{Limit, Waiting},
     routes::LinkNumber,
 };
 
@@ -59,12 +60,17 @@ impl Endpoint {
     }
 
     /// Sends `message` as the reply to `request`.
-    pub(super) async fn answer(&mut self, request: Request, mut message: Draft) -> Result<(), ApiError> {
+    pub(super) async fn answer(
+        &mut self,
+        request: Request,
+        mut message: Draft,
+        limit: Limit,
+    ) -> Result<(), ApiError> {
         message.header.destination = request.source;
         message.header.class = Class::Control;
         message.header.flags = Flags::REPLY;
         message.header.correlation = request.correlation;
-        self.dispatch(message).await.map(drop)
+        self.dispatch(message, limit).await.map(drop)
     }
 
     /// Sends `message` and waits for its answer; `None` at the deadline.
@@ -81,7 +87,8 @@ impl Endpoint {
         let of = self.absolute(message.header.destination);
         let wanted = Wanted { number: self.correlation, what: awaited, of };
         let deadline = Time::now() + within;
-        let way = self.dispatch(message).await?;
+        // Who waits so long for the answer waits no longer for room.
+        let way = self.dispatch(message, self.patience().and_in_all(within)).await?;
         loop {
             if let Some(answer) = self.take_in(Some(wanted), WhenFull::Refuse)? {
                 return Ok(Some(answer));
@@ -115,9 +122,17 @@ impl Endpoint {
         }
     }
 
-    /// Sends `message` the way that is right now; the link, if it did not go through the node.
-    pub(super) async fn dispatch(&mut self, mut draft: Draft) -> Result<Option<LinkNumber>, ApiError> {
-        self.try_return();
+    /// Sends `message` the way that is right now, and waits for room as long as `limit` allows; the link, if it did not go
+    /// through the node.
+    pub(super) async fn dispatch(
+        &mut self,
+        mut draft: Draft,
+        limit: Limit,
+    ) -> Result<Option<LinkNumber>, ApiError> {
+        if !limit.is_in_all() {
+            // To register takes as long as it takes.
+            self.try_return();
+        }
         self.check_length(draft.payload.len())?;
         // A new connection may have another address.
         draft.header.source = self.tid;
@@ -128,7 +143,7 @@ impl Endpoint {
         let destination = self.absolute(draft.header.destination);
         if let Some(link) = self.way(destination, now) {
             draft.header.destination = destination;
-            match self.send_on(link, draft).await? {
+            match self.send_on(link, draft, limit).await? {
                 None => return Ok(Some(link)),
                 Some(back) => draft = back,
             }
@@ -137,15 +152,7 @@ impl Endpoint {
         if self.reader.has_ended(now) {
             return Err(self.explain(ApiError::Closed("the node has gone".to_owned())));
         }
-        self.write(draft).await.map(|()| None).map_err(|error| self.explain(error))
-    }
-
-    /// Writes to the node; waits for room as long as the endpoint's patience lasts.
-    pub(super) async fn write(&mut self, draft: Draft) -> Result<(), ApiError> {
-        match &mut self.form {
-            Form::Thread => self.writer.send(draft),
-            Form::Reactor(reactor) => reactor.send(&self.writer, draft, self.home.options.patience).await,
-        }
+        self.write(draft, limit).await.map(|()| None).map_err(|error| self.explain(error))
     }
 
     /// The link on which a message to `destination` goes now; `None` for the way through the node.
@@ -165,13 +172,18 @@ impl Endpoint {
     ///
     /// # Errors
     /// [`ApiError::Stalled`]: nothing of it was written. Of what was written in part the rest goes out with later calls.
-    async fn send_on(&mut self, link: LinkNumber, draft: Draft) -> Result<Option<Draft>, ApiError> {
-        let (length, patience) = (HEADER_LEN + draft.payload.len(), self.home.options.patience);
-        // Who takes nothing costs that once, and not with each message.
-        let waits = if self.direct.is_stalled(link) { Duration::ZERO } else { patience };
+    async fn send_on(
+        &mut self,
+        link: LinkNumber,
+        draft: Draft,
+        limit: Limit,
+    ) -> Result<Option<Draft>, ApiError> {
+        let length = HEADER_LEN + draft.payload.len();
+        // Who takes nothing costs a patience once, and not with each message.
+        let has_stalled = self.direct.is_stalled(link);
+        let mut waiting = if has_stalled { Waiting::after_a_stall(limit) } else { Waiting::new(limit) };
         // `None`: it is begun.
-        let mut left = Some(draft);
-        let (mut until, mut pause) = (None, ROOM_PAUSE);
+        let (mut left, mut pause) = (Some(draft), ROOM_PAUSE);
         loop {
             left = match left {
                 None if self.direct.is_whole(link) => return Ok(None),
@@ -184,11 +196,12 @@ impl Endpoint {
                 },
             };
             let now = Time::now();
-            let until = *until.get_or_insert(now + waits);
-            if now >= until {
-                self.direct.has_stalled(link);
-                return left.map_or(Ok(None), |_| Err(ApiError::Stalled(patience)));
-            }
+            let Some(until) = waiting.until(self.direct.taken(link), now) else {
+                if waiting.is_out_of_patience(now) {
+                    self.direct.has_stalled(link);
+                }
+                return left.map_or(Ok(None), |_| Err(waiting.in_vain()));
+            };
             self.take_in_while_writing(link);
             match self.form {
                 Form::Thread => self.direct.await_room(link, length, pause.min(until.since(now))),

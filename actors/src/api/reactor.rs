@@ -13,22 +13,19 @@ use std::{
         unix::net,
     },
     sync::Arc,
-    time::Duration,
 };
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use sinew_runtime::{time::Time, wire::HEADER_LEN};
+use sinew_runtime::time::Time;
 use sinew_shm::Armed;
 use tokio::{io::Interest, net::UnixStream, sync::oneshot, task::spawn_blocking};
 
 use links::{Heard, Links, forget};
 
 use super::{
-    ApiError,
     direct::{Direct, Standing},
-    lent::{Content, Draft},
     link::{
-        Link, Progress, Reader, Writer,
+        Link, Reader, Writer,
         ring::{self, NAP, Rest},
     },
     returning::{Home, come_home},
@@ -38,8 +35,6 @@ use super::{
 pub(super) struct Reactor {
     ears: Ears,
     links: Links,
-    /// What is left of a frame of which a part is in the ring.
-    rest: Option<Rest>,
     /// The way back, while it is looked for.
     home: Option<oneshot::Receiver<Link>>,
     /// Who looks for it stops when this is gone.
@@ -60,7 +55,7 @@ impl Reactor {
     /// Watches a link, for the runtime of the calling task.
     pub(super) fn new(reader: &Reader, writer: &Writer) -> io::Result<Self> {
         let (ears, links) = (Ears::of(reader, writer)?, Links::default());
-        Ok(Self { ears, links, rest: None, home: None, wanted: Arc::new(()) })
+        Ok(Self { ears, links, home: None, wanted: Arc::new(()) })
     }
 
     /// Waits until there may be something to read, or to do, until `deadline` at most.
@@ -71,8 +66,7 @@ impl Reactor {
         direct: &mut Direct,
         deadline: Time,
     ) {
-        let owes = self.rest.is_some() || writer.owes();
-        let naps = owes || direct.is_to_be_looked_at();
+        let naps = writer.owes() || direct.is_to_be_looked_at();
         let deadline = direct.wake_by(if naps { deadline.min(Time::now() + NAP) } else { deadline });
         match (&self.ears, reader) {
             (Ears::Socket(socket), _) => tokio::select! {
@@ -115,92 +109,20 @@ impl Reactor {
         direct.heard(heard == Heard::HungUp);
     }
 
-    /// Writes a message; waits for room for `patience` at most. A message of which nothing was written when this is dropped
-    /// is not sent; one that was begun goes out with later calls.
-    pub(super) async fn send(
-        &mut self,
-        writer: &Writer,
-        draft: Draft,
-        patience: Duration,
-    ) -> Result<(), ApiError> {
-        let until = Time::now() + patience;
-        if !self.finish(writer, until).await {
-            return Err(ApiError::Stalled(patience));
-        }
-        if matches!(draft.payload, Content::InRing(_)) && writer.is_home_of(&draft) {
-            return writer.send(draft);
-        }
-        let mut message = draft.into_message();
-        loop {
-            message = match writer.begin(message) {
-                Ok(Progress::Whole) => return Ok(()),
-                Ok(Progress::Part(rest)) => {
-                    self.rest = rest;
-                    return self.finish_or_close(writer, until, patience).await;
-                }
-                Ok(Progress::Full(message)) => message,
-                Err(error) => return Err(error),
-            };
-            let length = HEADER_LEN + message.payload.len();
-            if !self.room(writer, length, until).await {
-                return Err(ApiError::Stalled(patience));
-            }
-        }
-    }
-
-    /// Writes on what was begun, as far as there is room now.
-    pub(super) fn go_on(&mut self) {
-        // An error shows itself again when the ring is read.
-        if self.rest.as_mut().is_some_and(|rest| rest.go_on().unwrap_or(true)) {
-            self.rest = None;
-        }
-    }
-
-    /// Writes on what was begun to its end; `false` at the deadline.
-    async fn finish(&mut self, writer: &Writer, until: Time) -> bool {
-        loop {
-            self.go_on();
-            writer.pay();
-            if self.rest.is_none() && !writer.is_within_frame() {
-                return true;
-            }
-            if !self.room(writer, 0, until).await {
-                return false;
-            }
-        }
-    }
-
-    /// The same; nothing after a frame that was cut would be understood.
-    async fn finish_or_close(
-        &mut self,
-        writer: &Writer,
-        until: Time,
-        patience: Duration,
-    ) -> Result<(), ApiError> {
-        if self.finish(writer, until).await {
-            return Ok(());
-        }
-        writer.close();
-        Err(ApiError::Closed(format!("the node stopped reading for {patience:?} within a frame")))
-    }
-
-    /// Waits until there may be room for a frame of `length` bytes, or for the rest of one; `false` at the deadline.
-    async fn room(&mut self, writer: &Writer, length: usize, deadline: Time) -> bool {
-        if Time::now() >= deadline {
-            return false;
-        }
+    /// Waits until there may be room for a frame of `length` bytes, or for the rest of one, until `deadline` at most.
+    pub(super) async fn room(&self, writer: &Writer, rest: &mut Option<Rest>, length: usize, deadline: Time) {
         match &self.ears {
             Ears::Socket(socket) => tokio::select! {
                 () = ready(socket, Interest::WRITABLE, PollFlags::OUT) => {}
                 () = until(deadline) => {}
             },
             Ears::Ring { room, socket, .. } => {
-                let armed = match &mut self.rest {
+                let armed = match rest {
                     Some(rest) => rest.arm(),
                     None => writer.arm(length),
                 };
                 if armed == Armed::Ready {
-                    return true;
+                    return;
                 }
                 // Not disarmed if this is dropped: the node may ring once for nothing.
                 tokio::select! {
@@ -208,13 +130,12 @@ impl Reactor {
                     () = ready(socket, Interest::READABLE, PollFlags::RDHUP) => {}
                     () = until(deadline) => {}
                 }
-                match &mut self.rest {
+                match rest {
                     Some(rest) => rest.disarm(),
                     None => writer.disarm(),
                 }
             }
         }
-        true
     }
 
     /// Looks for the way back, on a thread of the runtime's pool that may block; what it has found, once it has.
@@ -262,7 +183,6 @@ impl Reactor {
 
     /// Watches another link.
     pub(super) fn change(&mut self, reader: &Reader, writer: &Writer) -> io::Result<()> {
-        self.rest = None;
         self.ears = Ears::of(reader, writer)?;
         Ok(())
     }

@@ -220,6 +220,7 @@ impl Endpoint {
         self.inbox.set_sink(writer.clone());
         (self.writer, self.reader) = (writer, reader);
         (self.ended, self.home.way) = (None, None);
+        (self.rest, self.stalled) = (None, None);
         self.home.registrations += 1;
         if let Form::Reactor(reactor) = &mut self.form
             && let Err(why) = reactor.change(&self.reader, &self.writer)

@@ -1,6 +1,7 @@
 //! NodeAPI against a real LNCL: what a program in a process of its own sees, in every form.
 
 mod forms;
+mod played_node;
 
 use std::{thread, time::Duration};
 
@@ -66,6 +67,8 @@ macro_rules! on_every_transport {
         }
     };
 }
+
+mod room;
 
 on_every_transport! {
     addresses_are_fixed_or_dynamic_and_names_have_one_holder

@@ -212,6 +212,14 @@ impl Standing {
         self.rest.is_none()
     }
 
+    /// A count of what the peer takes.
+    pub(super) fn taken(&mut self) -> u32 {
+        match &mut self.rest {
+            Some(rest) => rest.taken(),
+            None => self.writer.taken(),
+        }
+    }
+
     /// Waits until there is room, the peer's end, or `within` this time.
     pub(in crate::api) fn await_room(&mut self, length: usize, within: Duration) {
         match &mut self.rest {

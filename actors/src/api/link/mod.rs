@@ -102,7 +102,7 @@ impl Writer {
         }
     }
 
-    /// Writes one frame.
+    /// Writes one of the layers' own frames, none of which is long; waits for room as long as the link's patience lasts.
     pub(super) fn write(&self, message: &Message) -> Result<(), ApiError> {
         match self {
             Self::Socket(writer) => writer.write(message),
@@ -118,24 +118,16 @@ impl Writer {
         }
     }
 
-    /// Writes the frame of a draft: in place if its payload is in this very ring.
-    pub(super) fn send(&self, draft: Draft) -> Result<(), ApiError> {
+    /// Sends a draft in place if its payload is in this very ring; else hands it back as a message.
+    pub(super) fn send_in_place(&self, draft: Draft) -> Option<Message> {
         match (self, draft.payload) {
             (Self::Ring(writer), Content::InRing(loan)) if loan.is_of(writer) => {
                 loan.publish(&draft.header);
-                Ok(())
+                None
             }
             (Self::Ring(_) | Self::Socket(_), payload) => {
-                self.write(&Message::new(draft.header, payload.into_bytes()))
+                Some(Message::new(draft.header, payload.into_bytes()))
             }
-        }
-    }
-
-    /// Whether the payload of this draft lies in this link's ring.
-    pub(super) fn is_home_of(&self, draft: &Draft) -> bool {
-        match (self, &draft.payload) {
-            (Self::Ring(writer), Content::InRing(loan)) => loan.is_of(writer),
-            (Self::Ring(_) | Self::Socket(_), Content::Bytes(_) | Content::InRing(_)) => false,
         }
     }
 
@@ -173,6 +165,22 @@ impl Writer {
         match self {
             Self::Socket(writer) => writer.owing.notified().await,
             Self::Ring(writer) => writer.owing.notified().await,
+        }
+    }
+
+    /// A count of what the node takes.
+    pub(super) fn taken(&self) -> u32 {
+        match self {
+            Self::Socket(writer) => writer.taken(),
+            Self::Ring(writer) => writer.taken(),
+        }
+    }
+
+    /// Waits until there may be room for a frame of `length` bytes, for the node's end, or until `deadline`.
+    pub(super) fn await_room(&self, length: usize, deadline: Time) {
+        match self {
+            Self::Socket(writer) => writer.await_room(deadline),
+            Self::Ring(writer) => writer.await_room(length, deadline.since(Time::now())),
         }
     }
 
@@ -301,6 +309,17 @@ impl Reader {
             // Writing to it says so.
             Self::Socket(_) => false,
             Self::Ring(reader) => reader.has_ended(now),
+        }
+    }
+
+    /// The same, looked at now.
+    pub(super) fn has_ended_now(&mut self) -> bool {
+        match self {
+            Self::Socket(_) => false,
+            Self::Ring(reader) => {
+                reader.look_at_once();
+                reader.has_ended(Time::now())
+            }
         }
     }
 

@@ -21,7 +21,7 @@ use rustix::{
 use sinew_runtime::{
     outcome::{Outcome, ReceiptSink, Ticket},
     time::Time,
-    wire::{FrameCodec, HEADER_LEN, Kind, Message},
+    wire::{FrameCodec, Kind, Message},
 };
 use sinew_shm::{
     Any, AnyError, Armed, BellKind, Capacity, Consumer, Ends, HangUp, LoanError, Producer, Region, RoomError,
@@ -104,12 +104,13 @@ impl Writer {
         Self { socket, producer, owed, owing: Notify::new(), patience: options.patience }
     }
 
-    /// Writes one frame; waits for room as long as the link's patience lasts.
+    /// Writes one frame that fits into half the ring; waits for room as long as the link's patience lasts.
     pub(in crate::api) fn write(&self, message: &Message) -> Result<(), ApiError> {
         let head = message.header.encode_in_memory(message.payload.len());
+        let parts = [IoSlice::new(&head), IoSlice::new(&message.payload)];
         let mut producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
         let written = match producer.as_deref_mut() {
-            Some(producer) => self.write_to(producer, &head, &message.payload),
+            Some(producer) => self.write_to(producer, &parts, message.size()),
             None => Err(ApiError::Lent),
         };
         drop(producer);
@@ -117,7 +118,7 @@ impl Writer {
         written
     }
 
-    /// Writes one frame if there is room for all of it now; returns whether there was.
+    /// Writes one frame if there is room for all of it now, in one piece; returns whether there was.
     pub(in crate::api) fn try_write(&self, message: &Message) -> Result<bool, ApiError> {
         self.pay();
         let head = message.header.encode_in_memory(message.payload.len());
@@ -125,8 +126,7 @@ impl Writer {
         let Some(producer) = producer.as_deref_mut() else { return Ok(false) };
         let parts = [IoSlice::new(&head), IoSlice::new(&message.payload)];
         if ring::piece(producer, message.size()) < message.size() {
-            // One that goes in pieces can wait for room half way.
-            return self.write_to(producer, &head, &message.payload).map(|()| true);
+            return Ok(false);
         }
         match ring::write(producer, &parts) {
             Ok(_) => Ok(true),
@@ -189,40 +189,24 @@ impl Writer {
         }
     }
 
-    fn write_to(&self, producer: &mut Producer, head: &[u8], payload: &[u8]) -> Result<(), ApiError> {
-        let whole = HEADER_LEN + payload.len();
-        let mut written = 0;
-        while written < whole {
-            let parts = [
-                IoSlice::new(&head[written.min(HEADER_LEN)..]),
-                IoSlice::new(&payload[written.saturating_sub(HEADER_LEN)..]),
-            ];
-            written += self.write_some(producer, &parts).map_err(|error| self.give_up(&error, written))?;
-        }
-        Ok(())
-    }
-
-    /// Writes one record and waits for room if there is none.
-    fn write_some(&self, producer: &mut Producer, parts: &[IoSlice<'_>]) -> Result<usize, RoomError> {
-        let length = ring::piece(producer, parts.iter().map(|part| part.len()).sum());
+    fn write_to(
+        &self,
+        producer: &mut Producer,
+        parts: &[IoSlice<'_>],
+        length: usize,
+    ) -> Result<(), ApiError> {
         let wait = Wait::within(self.patience).or_hang_up(HangUp::Socket(self.socket.as_fd()));
-        let mut loan = producer.loan_before(length, &wait)?;
-        ring::gather(parts, &mut loan);
-        loan.publish();
-        Ok(length)
-    }
-
-    fn give_up(&self, error: &RoomError, written: usize) -> ApiError {
-        match error {
-            RoomError::TimedOut if written == 0 => ApiError::Stalled(self.patience),
-            RoomError::TimedOut => {
-                self.close();
-                ApiError::Closed(format!("the node stopped reading for {:?} within a frame", self.patience))
+        match producer.loan_before(length, &wait) {
+            Ok(mut loan) => {
+                ring::gather(parts, &mut loan);
+                loan.publish();
+                Ok(())
             }
-            RoomError::HungUp => ApiError::Closed(Ended::silently().why),
-            RoomError::TooLong { .. } | RoomError::Corrupt(_) | RoomError::System(_) => {
+            Err(RoomError::TimedOut) => Err(ApiError::Stalled(self.patience)),
+            Err(RoomError::HungUp) => Err(ApiError::Closed(Ended::silently().why)),
+            Err(error @ (RoomError::TooLong { .. } | RoomError::Corrupt(_) | RoomError::System(_))) => {
                 self.close();
-                ApiError::Closed(error.to_string())
+                Err(ApiError::Closed(error.to_string()))
             }
         }
     }

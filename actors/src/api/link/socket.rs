@@ -6,7 +6,7 @@ use std::{
         fd::{AsFd, BorrowedFd},
         unix::net::UnixStream,
     },
-    sync::{Arc, Mutex, PoisonError},
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::Duration,
 };
 
@@ -26,7 +26,10 @@ use tokio::sync::Notify;
 use tokio_util::codec::Decoder;
 
 use super::{Ended, LinkOptions, Progress, Read, ring::OWED_MAX};
-use crate::api::ApiError;
+use crate::api::{
+    ApiError,
+    patience::{Limit, Waiting},
+};
 
 /// Bytes that are read at once.
 const READ_CHUNK: usize = 64 * 1024;
@@ -37,13 +40,21 @@ const BACKLOG_BYTES_MAX: usize = OWED_MAX * (HEADER_LEN + 1);
 #[derive(Debug)]
 pub(in crate::api) struct Writer {
     socket: Arc<UnixStream>,
-    /// Frames go out whole, one after the other. What could not be written at once is here, where tasks write, who do not
-    /// wait; else it is empty.
-    turn: Mutex<BytesMut>,
+    /// Frames go out whole, one after the other.
+    turn: Mutex<Turn>,
     /// Told when some thread has left an outcome there: a task that waits looks again.
     pub(super) owing: Notify,
     patience: Duration,
     waits: Waits,
+}
+
+/// What is on its way out. Kept for a moment only: nobody waits for room with it in hand.
+#[derive(Debug, Default)]
+struct Turn {
+    /// What was begun and found no room.
+    backlog: BytesMut,
+    /// Bytes that the socket took; wraps.
+    taken: u32,
 }
 
 /// What who writes does where there is no room.
@@ -55,12 +66,13 @@ enum Waits {
     Elsewhere,
 }
 
-/// How far a frame came, of one who waits.
-enum Stuck {
-    /// Nothing of it was written.
-    Before,
-    /// Part of it was written: nothing after it would be understood.
-    Within,
+/// How far a frame came.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Pushed {
+    Whole,
+    /// The rest is in the backlog.
+    Part,
+    Nothing,
 }
 
 impl Writer {
@@ -69,43 +81,71 @@ impl Writer {
         Self { socket, turn: Mutex::default(), owing: Notify::new(), patience: options.patience, waits }
     }
 
+    fn turn(&self) -> MutexGuard<'_, Turn> {
+        self.turn.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// Writes one frame as far as there is room now; what is left of it is kept here.
     pub(super) fn begin(&self, message: Message) -> Result<Progress, ApiError> {
-        let mut backlog = self.turn.lock().unwrap_or_else(PoisonError::into_inner);
-        if !self.work_off(&mut backlog)? {
-            return Ok(Progress::Full(message));
-        }
-        encode_frame(&message.header, &message.payload, &mut backlog);
-        let whole = backlog.len();
-        if self.work_off(&mut backlog)? {
-            return Ok(Progress::Whole);
-        }
-        if backlog.len() < whole {
-            return Ok(Progress::Part(None));
-        }
-        backlog.clear();
-        Ok(Progress::Full(message))
+        Ok(match self.push(&mut self.turn(), &message)? {
+            Pushed::Whole => Progress::Whole,
+            Pushed::Part => Progress::Part(None),
+            Pushed::Nothing => Progress::Full(message),
+        })
     }
 
     /// Writes on what was left, as far as there is room now.
     pub(super) fn pay(&self) {
         // An error shows itself again when the socket is read.
-        let _ = self.work_off(&mut self.turn.lock().unwrap_or_else(PoisonError::into_inner));
+        let _ = self.work_off(&mut self.turn());
     }
 
     /// Whether something is left.
     pub(super) fn owes(&self) -> bool {
-        !self.turn.lock().unwrap_or_else(PoisonError::into_inner).is_empty()
+        !self.turn().backlog.is_empty()
+    }
+
+    /// A count of what the node takes: it makes room for what the socket takes.
+    pub(super) fn taken(&self) -> u32 {
+        self.turn().taken
+    }
+
+    /// Waits until there may be room, or until the deadline.
+    pub(super) fn await_room(&self, deadline: Time) {
+        // An error shows itself again when it is written.
+        let _ = wait(&self.socket, PollFlags::OUT, deadline);
+    }
+
+    fn push(&self, turn: &mut Turn, message: &Message) -> Result<Pushed, ApiError> {
+        if !self.work_off(turn)? {
+            return Ok(Pushed::Nothing);
+        }
+        let head = message.header.encode(&message.payload);
+        let written = match self.write_now(&[IoSlice::new(&head), IoSlice::new(&message.payload)]) {
+            Ok(count) => count,
+            Err(Errno::AGAIN) => return Ok(Pushed::Nothing),
+            Err(error) => return Err(ApiError::Closed(error.to_string())),
+        };
+        turn.taken = turn.taken.wrapping_add(written as u32);
+        if written == message.size() {
+            return Ok(Pushed::Whole);
+        }
+        turn.backlog.extend_from_slice(&head[written.min(head.len())..]);
+        turn.backlog.extend_from_slice(&message.payload[written.saturating_sub(head.len())..]);
+        Ok(if self.work_off(turn)? { Pushed::Whole } else { Pushed::Part })
     }
 
     /// Whether all is written.
-    fn work_off(&self, backlog: &mut BytesMut) -> Result<bool, ApiError> {
-        while !backlog.is_empty() {
-            match self.write_now(&[IoSlice::new(backlog)]) {
-                Ok(count) => backlog.advance(count),
+    fn work_off(&self, turn: &mut Turn) -> Result<bool, ApiError> {
+        while !turn.backlog.is_empty() {
+            match self.write_now(&[IoSlice::new(&turn.backlog)]) {
+                Ok(count) => {
+                    turn.backlog.advance(count);
+                    turn.taken = turn.taken.wrapping_add(count as u32);
+                }
                 Err(Errno::AGAIN) => return Ok(false),
                 Err(error) => {
-                    backlog.clear();
+                    turn.backlog.clear();
                     return Err(ApiError::Closed(error.to_string()));
                 }
             }
@@ -115,35 +155,37 @@ impl Writer {
 
     /// Says an outcome without waiting; one more than there may be is not said, and counts as Unknown at its deadline.
     fn owe(&self, outcome: &Message) {
-        let mut backlog = self.turn.lock().unwrap_or_else(PoisonError::into_inner);
-        if backlog.len() < BACKLOG_BYTES_MAX {
-            encode_frame(&outcome.header, &outcome.payload, &mut backlog);
+        let mut turn = self.turn();
+        if turn.backlog.len() < BACKLOG_BYTES_MAX {
+            encode_frame(&outcome.header, &outcome.payload, &mut turn.backlog);
         }
-        if !self.work_off(&mut backlog).unwrap_or(true) {
+        if !self.work_off(&mut turn).unwrap_or(true) {
             self.owing.notify_one();
         }
     }
 
-    /// Writes one frame.
+    /// Writes one frame, and waits for room for as long as the patience lasts.
     pub(in crate::api) fn write(&self, message: &Message) -> Result<(), ApiError> {
-        let head = message.header.encode(&message.payload);
-        // A turn that ended in a panic wrote a frame in part, and closed the socket.
-        let _turn = self.turn.lock().unwrap_or_else(PoisonError::into_inner);
-        let whole = message.size();
-        let deadline = Time::now() + self.patience;
-        let mut written = 0;
-        while written < whole {
-            let head = &head[written.min(head.len())..];
-            let payload = &message.payload[written.saturating_sub(whole - message.payload.len())..];
-            let parts = [IoSlice::new(head), IoSlice::new(payload)];
-            match self.write_some(&parts, deadline) {
-                Ok(count) => written += count,
-                Err(error) => {
-                    return Err(self.give_up(error, if written == 0 { Stuck::Before } else { Stuck::Within }));
-                }
+        let mut waiting = Waiting::new(Limit::patience(self.patience));
+        let mut pushed = Pushed::Nothing;
+        loop {
+            let taken = {
+                let mut turn = self.turn();
+                pushed = match pushed {
+                    Pushed::Nothing => self.push(&mut turn, message)?,
+                    Pushed::Part | Pushed::Whole if self.work_off(&mut turn)? => Pushed::Whole,
+                    Pushed::Part | Pushed::Whole => Pushed::Part,
+                };
+                turn.taken
+            };
+            if pushed == Pushed::Whole {
+                return Ok(());
             }
+            let Some(until) = waiting.until(taken, Time::now()) else { break };
+            self.await_room(until);
         }
-        Ok(())
+        // What was begun goes out with later calls.
+        if pushed == Pushed::Part { Ok(()) } else { Err(waiting.in_vain()) }
     }
 
     fn write_now(&self, parts: &[IoSlice<'_>]) -> Result<usize, Errno> {
@@ -153,26 +195,6 @@ impl Writer {
                 Err(Errno::INTR) => {}
                 result => return result,
             }
-        }
-    }
-
-    fn write_some(&self, parts: &[IoSlice<'_>], deadline: Time) -> Result<usize, Errno> {
-        loop {
-            match self.write_now(parts) {
-                Err(Errno::AGAIN) if wait(&self.socket, PollFlags::OUT, deadline)? => {}
-                result => return result,
-            }
-        }
-    }
-
-    fn give_up(&self, error: Errno, stuck: Stuck) -> ApiError {
-        match (error, stuck) {
-            (Errno::AGAIN, Stuck::Before) => ApiError::Stalled(self.patience),
-            (Errno::AGAIN, Stuck::Within) => {
-                self.close();
-                ApiError::Closed(format!("the node stopped reading for {:?} within a frame", self.patience))
-            }
-            (error, Stuck::Before | Stuck::Within) => ApiError::Closed(error.to_string()),
         }
     }
 
@@ -187,8 +209,12 @@ impl ReceiptSink for Writer {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
         let outcome = Message::outcome(ticket, outcome);
         match self.waits {
-            // If it cannot be said the connection has ended, and the node tells the sender so.
-            Waits::Here => drop(self.write(&outcome)),
+            Waits::Here => {
+                // If the connection has ended the node tells the sender so; else it is said when there is room.
+                if self.write(&outcome).is_err() {
+                    self.owe(&outcome);
+                }
+            }
             Waits::Elsewhere => self.owe(&outcome),
         }
     }

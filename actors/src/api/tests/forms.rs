@@ -1,6 +1,6 @@
 //! An endpoint in each of its forms behind one face, so that one suite holds both to the same claims.
 
-use std::{future::Future, time::Duration};
+use std::{future::Future, path::Path, time::Duration};
 
 use sinew_runtime::{
     outcome::Outcome,
@@ -37,7 +37,12 @@ pub(super) struct Api {
 
 impl Api {
     pub(super) fn connect(under: Under, node: &TestNode) -> Self {
-        Self { form: under.form, node: NodeApi::connect(node.path()).unwrap() }
+        Self::at(under, &node.path())
+    }
+
+    /// Not looked for: one that serves a single connection may listen there.
+    pub(super) fn at(under: Under, path: &Path) -> Self {
+        Self { form: under.form, node: NodeApi { path: path.to_owned() } }
     }
 
     pub(super) fn register(&self, registration: Registration) -> Result<Client, ApiError> {
@@ -109,6 +114,14 @@ impl Client {
         either!(self, endpoint => endpoint.send_message(message))
     }
 
+    pub(super) fn send_message_within(
+        &mut self,
+        message: LentMessage,
+        within: Duration,
+    ) -> Result<(), ApiError> {
+        either!(self, endpoint => endpoint.send_message_within(message, within))
+    }
+
     pub(super) fn send_message_confirmed(
         &mut self,
         message: LentMessage,
@@ -133,6 +146,15 @@ impl Client {
         either!(self, endpoint => endpoint.send(destination, value))
     }
 
+    pub(super) fn send_within<P: Payload>(
+        &mut self,
+        destination: Tid,
+        value: &P,
+        within: Duration,
+    ) -> Result<(), ApiError> {
+        either!(self, endpoint => endpoint.send_within(destination, value, within))
+    }
+
     pub(super) fn send_confirmed<P: Payload>(
         &mut self,
         destination: Tid,
@@ -153,6 +175,15 @@ impl Client {
 
     pub(super) fn reply<R: Payload>(&mut self, request: &Received, value: &R) -> Result<(), ApiError> {
         either!(self, endpoint => endpoint.reply(request, value))
+    }
+
+    pub(super) fn reply_within<R: Payload>(
+        &mut self,
+        request: &Received,
+        value: &R,
+        within: Duration,
+    ) -> Result<(), ApiError> {
+        either!(self, endpoint => endpoint.reply_within(request, value, within))
     }
 
     pub(super) fn receive(&mut self, within: Duration) -> Result<Option<Received>, ApiError> {

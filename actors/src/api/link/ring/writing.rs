@@ -39,16 +39,35 @@ impl Writer {
     /// [`ApiError::Lent`], or [`ApiError::Closed`] if the ring cannot be used any more; nothing was written.
     pub(in crate::api) fn begin(self: &Arc<Self>, message: Message) -> Result<Begun, (ApiError, Message)> {
         self.pay();
-        let taken = self.producer.lock().unwrap_or_else(PoisonError::into_inner).take();
-        let Some(producer) = taken else { return Err((ApiError::Lent, message)) };
         let head = message.header.encode_in_memory(message.payload.len());
-        let mut rest = Rest { writer: self.clone(), producer: Some(producer), head, message, written: 0 };
+        let mut place = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(producer) = place.as_deref_mut() else { return Err((ApiError::Lent, message)) };
+        let written = match ring::write(producer, &[IoSlice::new(&head), IoSlice::new(&message.payload)]) {
+            Ok(count) => count,
+            Err(LoanError::Full { .. }) => return Ok(Begun::Full(message)),
+            Err(error @ (LoanError::TooLong { .. } | LoanError::Corrupt(_))) => {
+                self.close();
+                return Err((ApiError::Closed(error.to_string()), message));
+            }
+        };
+        let producer = if written < message.size() { place.take() } else { None };
+        drop(place);
+        if producer.is_none() {
+            self.pay();
+            return Ok(Begun::Whole);
+        }
+        let mut rest = Rest { writer: self.clone(), producer, head, message, written };
         match rest.go_on() {
             Ok(true) => Ok(Begun::Whole),
-            Ok(false) if rest.written > 0 => Ok(Begun::Part(rest)),
-            Ok(false) => Ok(Begun::Full(rest.into_message())),
+            Ok(false) => Ok(Begun::Part(rest)),
             Err(error) => Err((error, rest.into_message())),
         }
+    }
+
+    /// A count of what the peer takes; 0 while the ring is lent.
+    pub(in crate::api) fn taken(&self) -> u32 {
+        let mut producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
+        producer.as_deref_mut().map_or(0, taken)
     }
 
     /// Waits until there is room for the beginning of a frame of so many bytes, the peer's end, or `within` this time.
@@ -65,6 +84,11 @@ fn await_room(producer: &mut Producer, length: usize, writer: &Writer, within: D
     let length = ring::piece(producer, length);
     // Whatever ended the wait shows when it is written.
     drop(producer.loan_before(length, &wait));
+}
+
+/// Corrupt memory, which shows when it is written, takes nothing.
+fn taken(producer: &mut Producer) -> u32 {
+    producer.published().wrapping_sub(producer.untaken().unwrap_or_default())
 }
 
 /// Announces sleep until there is room for the next record of a frame of which `length` bytes are left.
@@ -98,6 +122,11 @@ impl Rest {
         }
         self.give_back();
         Ok(true)
+    }
+
+    /// A count of what the peer takes.
+    pub(in crate::api) fn taken(&mut self) -> u32 {
+        self.producer.as_deref_mut().map_or(0, taken)
     }
 
     /// Announces that a task waits for room for more.

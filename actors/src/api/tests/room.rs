@@ -1,0 +1,217 @@
+//! What a send does where there is no room: how long it waits, and what it leaves behind.
+
+use std::{thread, time::Duration};
+
+use super::{
+    ApiError, Kind, Registration, TestNode, Transport, WATCHDOG,
+    forms::{self, Client, Under},
+    played_node::PlayedNode,
+};
+
+const RAW: Kind = Kind::named("test.raw");
+/// More than a socket's buffer and both rings take.
+const LONG: usize = 1 << 20;
+const SHORT: usize = 1_000;
+const NO_TIME: Duration = Duration::ZERO;
+
+on_every_transport! {
+    patience_is_for_a_node_that_takes_nothing_and_not_for_a_long_message
+    what_was_begun_goes_out_with_later_calls_and_costs_no_connection
+    who_has_no_time_is_told_at_once_and_nothing_that_was_refused_comes
+    a_long_message_of_who_has_no_time_comes_whole_and_in_order
+    who_has_time_waits_for_room_and_no_longer_than_it_has
+    who_waits_so_long_for_an_answer_waits_no_longer_for_room
+    patience_that_was_lost_once_is_not_lost_again_until_the_node_takes_something
+    values_and_replies_may_have_a_time_too
+}
+
+fn register(under: Under, node: &PlayedNode, patience: Duration) -> Client {
+    let registration = Registration::new().transport(under.transport).patience(patience);
+    forms::Api::at(under, &node.path()).register(registration).unwrap()
+}
+
+fn message(from: &mut Client, number: u64, length: usize) -> crate::LentMessage {
+    let mut message = from.create_message(PlayedNode::somebody(), RAW, length).unwrap();
+    message[..8].copy_from_slice(&number.to_le_bytes());
+    message
+}
+
+fn number_of(node: &PlayedNode, length: usize) -> u64 {
+    let message = node.next();
+    assert_eq!(message.payload.len(), length);
+    u64::from_le_bytes(*message.payload.first_chunk().unwrap())
+}
+
+/// Sends without waiting until there is no room; how many were taken.
+fn fill(from: &mut Client, length: usize) -> u64 {
+    for number in 0.. {
+        let message = message(from, number, length);
+        match from.send_message_within(message, NO_TIME) {
+            Ok(()) => {}
+            Err(ApiError::Stalled(waited)) => {
+                assert_eq!(waited, NO_TIME);
+                return number;
+            }
+            Err(other) => panic!("{other}"),
+        }
+    }
+    unreachable!("a queue without an end")
+}
+
+fn patience_is_for_a_node_that_takes_nothing_and_not_for_a_long_message(under: Under) {
+    const PATIENCE: Duration = Duration::from_secs(2);
+    let node = PlayedNode::start();
+    let mut client = register(under, &node, PATIENCE);
+    // given: a node that takes a little of a message again and again, for longer than the patience lasts
+    let long = message(&mut client, 1, LONG);
+    let sending = thread::spawn(move || {
+        client.send_message(long).unwrap();
+        client
+    });
+    let began = std::time::Instant::now();
+    while began.elapsed() < PATIENCE * 5 / 4 {
+        thread::sleep(PATIENCE / 10);
+        node.take(LONG / 40);
+    }
+    // when: it takes the rest
+    node.take_all();
+    // then: it is sent, and so is the next one
+    let mut client = sending.join().unwrap();
+    assert_eq!(number_of(&node, LONG), 1);
+    let next = message(&mut client, 2, SHORT);
+    client.send_message(next).unwrap();
+    assert_eq!(number_of(&node, SHORT), 2);
+}
+
+fn what_was_begun_goes_out_with_later_calls_and_costs_no_connection(under: Under) {
+    let node = PlayedNode::start();
+    let mut client = register(under, &node, Duration::from_millis(50));
+    // given: a node that takes nothing
+    let long = message(&mut client, 1, LONG);
+    client.send_message(long).unwrap();
+    let refused = message(&mut client, 2, SHORT);
+    let error = client.send_message(refused).unwrap_err();
+    assert!(matches!(error, ApiError::Stalled(_)), "{error}");
+    assert!(node.next_now().is_none());
+    // when: it takes again, and the client does nothing but receive
+    node.take_all();
+    let came = loop {
+        assert!(client.receive(Duration::from_millis(1)).unwrap().is_none());
+        if let Some(came) = node.next_now() {
+            break came;
+        }
+    };
+    // then
+    assert_eq!((came.payload.len(), came.payload[0]), (LONG, 1));
+    let third = message(&mut client, 3, SHORT);
+    client.send_message(third).unwrap();
+    assert_eq!(number_of(&node, SHORT), 3, "the refused one does not come");
+}
+
+fn who_has_no_time_is_told_at_once_and_nothing_that_was_refused_comes(under: Under) {
+    let node = PlayedNode::start();
+    let mut client = register(under, &node, WATCHDOG);
+    let taken = fill(&mut client, SHORT);
+    assert!(taken > 0);
+    for _ in 0..100 {
+        let refused = message(&mut client, 1_000_000, SHORT);
+        assert!(matches!(client.send_message_within(refused, NO_TIME), Err(ApiError::Stalled(_))));
+    }
+    node.take_all();
+    // Its patience is whole: those who have no time have lost none of it.
+    let last = message(&mut client, taken, SHORT);
+    client.send_message(last).unwrap();
+    for number in 0..=taken {
+        assert_eq!(number_of(&node, SHORT), number);
+    }
+}
+
+fn a_long_message_of_who_has_no_time_comes_whole_and_in_order(under: Under) {
+    let node = PlayedNode::start();
+    let mut client = register(under, &node, WATCHDOG);
+    for round in 0..3 {
+        let first = message(&mut client, 3 * round, LONG);
+        client.send_message_within(first, NO_TIME).unwrap();
+        // Behind what is half written nothing is.
+        let refused = message(&mut client, 1_000_000, SHORT);
+        assert!(matches!(client.send_message_within(refused, NO_TIME), Err(ApiError::Stalled(_))));
+        node.take_all();
+        for (number, length) in [(1, SHORT), (2, LONG)] {
+            let next = message(&mut client, 3 * round + number, length);
+            client.send_message(next).unwrap();
+        }
+        assert_eq!(number_of(&node, LONG), 3 * round);
+        assert_eq!(number_of(&node, SHORT), 3 * round + 1);
+        assert_eq!(number_of(&node, LONG), 3 * round + 2);
+        node.take_nothing();
+    }
+}
+
+fn who_has_time_waits_for_room_and_no_longer_than_it_has(under: Under) {
+    let node = PlayedNode::start();
+    let mut client = register(under, &node, Duration::from_millis(1));
+    let taken = fill(&mut client, SHORT);
+    let time = Duration::from_millis(30);
+    let late = message(&mut client, taken, SHORT);
+    let (began, error) = (std::time::Instant::now(), client.send_message_within(late, time).unwrap_err());
+    assert!(matches!(error, ApiError::Stalled(waited) if waited == time), "{error}");
+    assert!(began.elapsed() >= time);
+    // A time of its own is longer than the patience.
+    let waits = message(&mut client, taken, SHORT);
+    node.take_all_in(Duration::from_millis(20));
+    client.send_message_within(waits, WATCHDOG).unwrap();
+    for number in 0..=taken {
+        assert_eq!(number_of(&node, SHORT), number);
+    }
+}
+
+fn who_waits_so_long_for_an_answer_waits_no_longer_for_room(under: Under) {
+    let node = PlayedNode::start();
+    let mut client = register(under, &node, Duration::MAX);
+    fill(&mut client, SHORT);
+    fill(&mut client, 8);
+    let time = Duration::from_millis(5);
+    let lent = message(&mut client, 0, SHORT);
+    assert!(matches!(client.send_message_confirmed(lent, time), Err(ApiError::Stalled(_))));
+    let lent = message(&mut client, 0, SHORT);
+    assert!(matches!(client.ask_message(lent, time), Err(ApiError::Stalled(_))));
+    assert!(matches!(client.resolve("anybody", time), Err(ApiError::Stalled(_))));
+}
+
+fn patience_that_was_lost_once_is_not_lost_again_until_the_node_takes_something(under: Under) {
+    let patience = Duration::from_millis(500);
+    let node = PlayedNode::start();
+    let mut client = register(under, &node, patience);
+    let taken = fill(&mut client, SHORT);
+    let began = std::time::Instant::now();
+    let refused = message(&mut client, 0, SHORT);
+    assert!(matches!(client.send_message(refused), Err(ApiError::Stalled(_))));
+    assert!(began.elapsed() >= patience);
+    // Each with a patience of its own, these would take eight minutes.
+    for _ in 0..1_000 {
+        let refused = message(&mut client, 0, SHORT);
+        let error = client.send_message(refused).unwrap_err();
+        assert!(matches!(error, ApiError::Stalled(waited) if waited == patience), "{error}");
+    }
+    node.take_all();
+    while client.send(PlayedNode::somebody(), &super::TORQUE).is_err() {}
+    for number in 0..taken {
+        assert_eq!(number_of(&node, SHORT), number);
+    }
+}
+
+fn values_and_replies_may_have_a_time_too(under: Under) {
+    let node = TestNode::start();
+    let register = || super::register(under, &node, Registration::new().transport(under.transport));
+    let (mut asking, mut replying) = (register(), register());
+    let to = replying.tid();
+    asking.send_within(to, &super::TORQUE, NO_TIME).unwrap();
+    assert_eq!(
+        replying.receive(WATCHDOG).unwrap().expect("a value").decode::<super::Torque>().unwrap(),
+        super::TORQUE
+    );
+    let asked = thread::spawn(move || asking.ask::<_, super::Torque>(to, &super::TORQUE, WATCHDOG).unwrap());
+    let request = replying.receive(WATCHDOG).unwrap().expect("a request");
+    replying.reply_within(&request, &super::TORQUE, NO_TIME).unwrap();
+    assert_eq!(asked.join().unwrap(), super::TORQUE);
+}

@@ -1,0 +1,100 @@
+//! Frames to the node, one after the other: what is begun goes on until it is whole, over as many calls as that takes.
+//!
+//! One piece of code for threads and tasks. Either nothing of a message was written, and its caller is told so, or it is
+//! sent, and what does not go out now goes out with later calls: a node that takes little never costs the connection.
+
+use sinew_runtime::time::Time;
+
+use super::{
+    ApiError, Endpoint,
+    form::Form,
+    lent::Draft,
+    link::Progress,
+    patience::{Limit, Waiting},
+};
+
+impl Endpoint {
+    /// How long a send waits if its caller says nothing.
+    pub(super) const fn patience(&self) -> Limit {
+        Limit::patience(self.home.options.patience)
+    }
+
+    /// Writes a message to the node; waits for room as long as `limit` allows.
+    ///
+    /// # Errors
+    /// Nothing of it was written. [`ApiError::Closed`]: or the connection ended before it was whole.
+    pub(super) async fn write(&mut self, draft: Draft, limit: Limit) -> Result<(), ApiError> {
+        // Who takes nothing costs a patience once, and not with each message.
+        let has_stalled = self.stalled.is_some_and(|taken| taken == self.taken());
+        let mut waiting = if has_stalled { Waiting::after_a_stall(limit) } else { Waiting::new(limit) };
+        let written = self.write_within(draft, &mut waiting).await;
+        self.stalled = waiting.is_out_of_patience(Time::now()).then(|| self.taken());
+        written
+    }
+
+    async fn write_within(&mut self, draft: Draft, waiting: &mut Waiting) -> Result<(), ApiError> {
+        while !self.go_on() {
+            self.await_room(0, waiting).await?;
+        }
+        let Some(mut message) = self.writer.send_in_place(draft) else { return Ok(()) };
+        let length = message.size();
+        self.rest = loop {
+            message = match self.writer.begin(message)? {
+                Progress::Whole => return Ok(()),
+                Progress::Part(rest) => break rest,
+                Progress::Full(message) => message,
+            };
+            self.await_room(length, waiting).await?;
+        };
+        while !self.go_on() {
+            match self.await_room(0, waiting).await {
+                Ok(()) => {}
+                // It has begun: the rest goes out with later calls.
+                Err(ApiError::Stalled(_)) => break,
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes on what was begun, as far as there is room now; whether nothing is left of it.
+    pub(super) fn go_on(&mut self) -> bool {
+        // An error shows itself again when the ring is read.
+        if self.rest.as_mut().is_some_and(|rest| rest.go_on().unwrap_or(true)) {
+            self.rest = None;
+        }
+        self.writer.pay();
+        !self.is_within_frame()
+    }
+
+    /// Whether the last frame was written in part.
+    pub(super) fn is_within_frame(&self) -> bool {
+        self.rest.is_some() || self.writer.is_within_frame()
+    }
+
+    /// Waits until there may be room for a frame of `length` bytes, or for the rest of one.
+    async fn await_room(&mut self, length: usize, waiting: &mut Waiting) -> Result<(), ApiError> {
+        let Some(until) = waiting.until(self.taken(), Time::now()) else {
+            return Err(waiting.in_vain());
+        };
+        match (&mut self.form, &mut self.rest) {
+            (Form::Thread, Some(rest)) => rest.await_room(until.since(Time::now())),
+            (Form::Thread, None) => self.writer.await_room(length, until),
+            (Form::Reactor(reactor), rest) => reactor.room(&self.writer, rest, length, until).await,
+        }
+        // There is no room to come any more.
+        if self.reader.has_ended_now() {
+            Err(ApiError::Closed("the node has gone".to_owned()))
+        } else {
+            Ok(())
+        }
+    }
+
+    /// A count of what the node takes.
+    fn taken(&mut self) -> u32 {
+        match &mut self.rest {
+            Some(rest) => rest.taken(),
+            None => self.writer.taken(),
+        }
+    }
+}
