@@ -52,9 +52,9 @@ impl Way {
     const fn references(self) -> &'static [Reference] {
         match self {
             Self::Socket | Self::Ring | Self::Direct | Self::TaskRing | Self::TaskDirect => {
-                &[Reference::BareFutex, Reference::UnixStream, Reference::Iceoryx2Event]
+                &[Reference::BareFutex, Reference::UnixStream]
             }
-            Self::DirectSpin => &[Reference::BarePoll, Reference::Iceoryx2Poll],
+            Self::DirectSpin => &[Reference::BarePoll],
         }
     }
 
@@ -81,29 +81,16 @@ pub(crate) enum Reference {
     BareFutex,
     BarePoll,
     UnixStream,
-    Iceoryx2Event,
-    Iceoryx2Poll,
 }
 
 impl Reference {
-    const ALL: [Self; 5] =
-        [Self::BareFutex, Self::BarePoll, Self::UnixStream, Self::Iceoryx2Event, Self::Iceoryx2Poll];
+    const ALL: [Self; 3] = [Self::BareFutex, Self::BarePoll, Self::UnixStream];
 
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::BareFutex => "bare_futex",
             Self::BarePoll => "bare_poll",
             Self::UnixStream => "raw_unix_stream",
-            Self::Iceoryx2Event => "iceoryx2_event",
-            Self::Iceoryx2Poll => "iceoryx2_poll",
-        }
-    }
-
-    /// Whether it can be had: a peer's program only if it was named.
-    fn is_there(self) -> bool {
-        match self {
-            Self::BareFutex | Self::BarePoll | Self::UnixStream => true,
-            Self::Iceoryx2Event | Self::Iceoryx2Poll => std::env::var_os(raw::PEER).is_some(),
         }
     }
 }
@@ -154,7 +141,8 @@ pub(crate) struct Rounds {
 impl Rounds {
     const fn of(bytes: usize, pace: Pace, is_short: bool) -> Self {
         let (warm_up, counted) = match pace {
-            Pace::EveryMillisecond => (50, 1_500),
+            Pace::EveryMillisecond if bytes == 1_000 => (50, 1_500),
+            Pace::EveryMillisecond => (50, 300),
             Pace::BackToBack if bytes > 100_000 => (50, 500),
             Pace::BackToBack if bytes > 10_000 => (200, 4_000),
             Pace::BackToBack => (1_000, 20_000),
@@ -200,14 +188,15 @@ pub(crate) struct Case {
 /// Every case, or those of a short run.
 pub(crate) fn all(is_short: bool) -> impl Iterator<Item = Case> {
     let back_to_back = |bytes| What::RoundTrips { bytes, pace: Pace::BackToBack };
-    let paced = What::RoundTrips { bytes: 1000, pace: Pace::EveryMillisecond };
-    let mut things = vec![back_to_back(1000), paced, What::TableOne, What::FanIn, What::Flood];
+    let paced = |bytes| What::RoundTrips { bytes, pace: Pace::EveryMillisecond };
+    let mut things = vec![back_to_back(1000), paced(1000), What::TableOne, What::FanIn, What::Flood];
     if std::env::var_os(ends::CPP_ECHO).is_some() {
         things.push(What::TableOneCpp);
     }
     things.extend([65_536, 1 << 20].map(|bytes| What::Loan { bytes }));
     if !is_short {
-        things.extend([8, 65_536, 1 << 20].map(back_to_back));
+        let others = [8, 64, 65_536, 1 << 20];
+        things.extend(others.map(back_to_back).into_iter().chain(others.map(paced)));
     }
     Pinning::ALL
         .into_iter()
@@ -261,8 +250,7 @@ impl Case {
 
     fn round_trips(self, bytes: usize, pace: Pace, is_short: bool) {
         let rounds = Rounds::of(bytes, pace, is_short);
-        let references = self.way.references().iter().filter(|reference| reference.is_there());
-        let raws: Vec<_> = references
+        let raws: Vec<_> = (self.way.references().iter())
             .map(|reference| (reference.name(), raw::round_trips(*reference, bytes, rounds, self.pinning)))
             .collect();
         let seen = if self.way.is_of_tasks() {

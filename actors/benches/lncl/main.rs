@@ -6,7 +6,7 @@
 //! JSON lines are on the standard output, the same as rows of a table on the standard error; `--short` does a tenth of the
 //! rounds of the cases at 1000 bytes. Times are microseconds. Nothing here asserts a time.
 //!
-//! - Round trips at 8 B to 1 MiB, back to back; at 1000 B also one every millisecond.
+//! - Round trips at 8 B, 64 B, 1000 B, 64 KiB and 1 MiB, back to back and one every millisecond.
 //! - `loan`: the same at 64 KiB and 1 MiB through rings that take them in one piece, written in the ring, beside copied into it.
 //! - `table_1`: the paper's test, 1024 packets of 1000 bytes, one way, the first ones included.
 //!   With the receiver in C++ too if `SINEW_CPP_ECHO` is the path of what `echo.cpp` was compiled to, as in `bindings/c/README.md`.
@@ -15,8 +15,7 @@
 //!
 //! Each three times: wherever the scheduler likes, all on one CPU, and one CPU for each application (the node has none of its
 //! own then). References: a hand-written ring in shared memory without any check, woken by a futex or polled
-//! (`sinew_shm::bare`); a unix stream socket between the two; and iceoryx2, if `SINEW_PEER_ICEORYX2` is the path of the program
-//! that `cargo build --release --manifest-path tests/peers/iceoryx2/Cargo.toml` makes.
+//! (`sinew_shm::bare`), and a unix stream socket between the two. Other people's middleware: `benches/peers`.
 
 #[cfg(target_os = "linux")]
 mod case;

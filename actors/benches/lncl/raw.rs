@@ -3,8 +3,7 @@
 use std::{
     io::{Read, Write},
     os::unix::net::UnixStream,
-    process::{Command, Stdio},
-    time::{Duration, Instant},
+    time::Instant,
 };
 
 use rustix::{
@@ -22,9 +21,6 @@ use crate::{
     processes::{Process, say_there},
 };
 
-/// The environment variable that names the program of `tests/peers/iceoryx2`.
-pub(crate) const PEER: &str = "SINEW_PEER_ICEORYX2";
-
 /// Round trips of a reference.
 pub(crate) fn round_trips(reference: Reference, bytes: usize, rounds: Rounds, pinning: Pinning) -> Figures {
     let role = format!("raw_echo {} {bytes} {}", reference.name(), pinning.name());
@@ -39,8 +35,6 @@ pub(crate) fn round_trips(reference: Reference, bytes: usize, rounds: Rounds, pi
                 end.receive(&mut buffer);
             })
         }
-        Reference::Iceoryx2Event => peer("event", bytes, rounds, pinning),
-        Reference::Iceoryx2Poll => peer("poll", bytes, rounds, pinning),
         Reference::UnixStream => {
             let (mut socket, theirs) = UnixStream::pair().expect("a pair of sockets");
             let _echo = Process::start_on(&role, theirs.into());
@@ -64,7 +58,6 @@ pub(crate) fn echo(reference: Reference, bytes: usize) {
                 end.send(&buffer);
             }
         }
-        Reference::Iceoryx2Event | Reference::Iceoryx2Poll => unreachable!("it has a program of its own"),
         Reference::UnixStream => {
             let mut socket = input();
             say_there();
@@ -75,27 +68,9 @@ pub(crate) fn echo(reference: Reference, bytes: usize) {
 
 const fn waiting(reference: Reference) -> Waiting {
     match reference {
-        Reference::BarePoll | Reference::Iceoryx2Poll => Waiting::Poll,
-        Reference::BareFutex | Reference::UnixStream | Reference::Iceoryx2Event => Waiting::Futex,
+        Reference::BarePoll => Waiting::Poll,
+        Reference::BareFutex | Reference::UnixStream => Waiting::Futex,
     }
-}
-
-/// What `tests/peers/iceoryx2` prints: the time of each round trip in nanoseconds.
-fn peer(waits: &str, bytes: usize, rounds: Rounds, pinning: Pinning) -> Figures {
-    let cpu = |end| pinning.cpu(end).map_or_else(|| "-".to_owned(), |cpu| cpu.to_string());
-    let numbers = [bytes as u64, rounds.warm_up.into(), rounds.counted.into(), rounds.pause_us()];
-    let output = Command::new(std::env::var_os(PEER).expect("it was there when the cases were chosen"))
-        .arg(waits)
-        .args(numbers.map(|number| number.to_string()))
-        .args([cpu(End::Measuring), cpu(End::Echoing)])
-        .stderr(Stdio::null())
-        .output()
-        .expect("the peer's program can be started");
-    assert!(output.status.success(), "the peer failed: {:?}", output.status);
-    let mut figures = Figures::new();
-    let lines = str::from_utf8(&output.stdout).expect("numbers").lines();
-    lines.for_each(|line| figures.record(Duration::from_nanos(line.parse().expect("a number"))));
-    figures
 }
 
 /// The socket that this process was given as its input.
