@@ -94,6 +94,8 @@ impl Socket for Arc<UnixStream> {
 pub(crate) struct OutletLimits {
     /// Messages that wait at most, each class by itself. When full: refused with [`Rejection::QueueFull`].
     pub(crate) queue_capacity: usize,
+    /// Bytes of their payloads at most, each class by itself; one message waits however long it is. When full: likewise.
+    pub(crate) queue_bytes: usize,
     /// Confirmed messages at most whose outcome is not known yet, waiting or sent. When full: refused likewise.
     pub(crate) unconfirmed_max: usize,
     /// Longest payload in bytes. Longer ones are refused with [`Rejection::TooLong`].

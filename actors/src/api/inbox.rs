@@ -7,7 +7,7 @@ use sinew_runtime::{
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     tid::Tid,
     time::Time,
-    wire::{Flags, Kind, Message},
+    wire::{Class, Flags, Kind, Message},
 };
 
 use crate::lncl::payload::{self, Refusal, Resolved};
@@ -44,6 +44,9 @@ pub(super) enum Sorted {
     Nothing,
 }
 
+/// Bytes of their payloads from which on nothing more is taken, but for the newest value of a Stream.
+const BYTES_ENOUGH: usize = 4 << 20;
+
 /// Messages that wait to be received, and the rule by which frames become messages or answers.
 pub(super) struct Inbox {
     queue: ClassQueue,
@@ -64,7 +67,7 @@ impl Inbox {
 
     /// Whether every class has room for one more.
     pub(super) fn has_room(&self) -> bool {
-        self.queue.len() < self.capacity
+        self.queue.len() < self.capacity && self.queue.bytes() < BYTES_ENOUGH
     }
 
     /// Sorts a frame of the node in. One that finds its class full is refused, and its sender told so if it asked.
@@ -126,6 +129,9 @@ impl Inbox {
     }
 
     fn push(&mut self, message: Message) {
+        if self.queue.bytes() >= BYTES_ENOUGH && message.header.class != Class::Stream {
+            return message.reject(Rejection::QueueFull);
+        }
         match self.queue.push(message) {
             // Of a Stream the newest value wins; Stream messages have no receipts.
             Ok(_) => {}

@@ -31,12 +31,14 @@ const fn range(key: &'static str, low: u64, high: u64, unit: &'static str) -> Ra
 }
 
 pub(super) const MAILBOX_CAPACITY: Range = range("node.mailbox_capacity", 1, 65_536, "messages");
+pub(super) const MAILBOX_BYTES: Range = range("node.mailbox_bytes", 4 << 10, 1 << 30, "bytes");
 pub(super) const PAYLOAD_MAX: Range = range("node.payload_max", 64, 64 << 20, "bytes");
 pub(super) const CLIENTS_MAX: Range = range("lncl.clients_max", 1, 4_096, "connections");
 pub(super) const APPS_MAX: Range = range("lncl.apps_max", 1, 65_536, "applications");
 pub(super) const RING_BYTES: Range = range("lncl.ring_bytes", 4 << 10, 16 << 20, "bytes");
 pub(super) const GNCL_PORT: Range = range("gncl.port", 0, 65_535, "(0: any free port)");
 pub(super) const QUEUE_CAPACITY: Range = range("gncl.queue_capacity", 1, 65_536, "messages");
+pub(super) const QUEUE_BYTES: Range = range("gncl.queue_bytes", 4 << 10, 1 << 30, "bytes");
 pub(super) const STRANGERS_MAX: Range = range("gncl.strangers_max", 1, 1_024, "connections");
 pub(super) const HANDSHAKE: Range = range("gncl.handshake_ms", 10, 60_000, "ms");
 pub(super) const REDIAL_MIN: Range = range("gncl.redial_min_ms", 1, 10_000, "ms");
@@ -122,6 +124,7 @@ impl NodeConfig {
             faults.push(fault("node.address", quoted(&address.to_string()), legal, remedy));
         }
         MAILBOX_CAPACITY.count(faults, self.mailbox_capacity);
+        MAILBOX_BYTES.count(faults, self.mailbox_bytes);
         PAYLOAD_MAX.count(faults, self.payload_max);
     }
 
@@ -145,6 +148,7 @@ impl NodeConfig {
             faults.push(fault("gncl.announce", quoted(&outer.to_string()), legal, remedy));
         }
         QUEUE_CAPACITY.count(faults, gncl.queue_capacity);
+        QUEUE_BYTES.count(faults, gncl.queue_bytes);
         STRANGERS_MAX.count(faults, gncl.strangers_max);
         HANDSHAKE.time(faults, gncl.handshake);
         REDIAL_MIN.time(faults, gncl.redial_min);

@@ -29,11 +29,12 @@ const FILE_BYTES_MAX: u64 = 1 << 20;
 const SECTIONS: [&str; 6] = ["node", "lncl", "gncl", "ndl", "sync", "supervision"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 30] = [
+pub(super) const KEYS: [&str; 32] = [
     "node.name",
     "node.project",
     "node.address",
     "node.mailbox_capacity",
+    "node.mailbox_bytes",
     "node.payload_max",
     "lncl.socket",
     "lncl.clients_max",
@@ -42,6 +43,7 @@ pub(super) const KEYS: [&str; 30] = [
     "gncl.port",
     "gncl.announce",
     "gncl.queue_capacity",
+    "gncl.queue_bytes",
     "gncl.strangers_max",
     "gncl.handshake_ms",
     "gncl.redial_min_ms",
@@ -308,6 +310,7 @@ impl Reader<'_> {
         self.text("node.address", "\"10.0.0.7\"", &mut address);
         config.address = address.0;
         self.number(&check::MAILBOX_CAPACITY, &mut config.mailbox_capacity);
+        self.number(&check::MAILBOX_BYTES, &mut config.mailbox_bytes);
         self.number(&check::PAYLOAD_MAX, &mut config.payload_max);
     }
 
@@ -324,6 +327,7 @@ impl Reader<'_> {
         let example = "\"192.168.1.7:6912\" or false";
         self.text_or_off::<SocketAddrV4>("gncl.announce", example, &mut gncl.announce);
         self.number(&check::QUEUE_CAPACITY, &mut gncl.queue_capacity);
+        self.number(&check::QUEUE_BYTES, &mut gncl.queue_bytes);
         self.number(&check::STRANGERS_MAX, &mut gncl.strangers_max);
         self.time(&check::HANDSHAKE, &mut gncl.handshake);
         self.time(&check::REDIAL_MIN, &mut gncl.redial_min);

@@ -33,9 +33,11 @@ pub struct NodeConfig {
     /// Address of the node, unique in the project: not 0.0.0.0 (here) and not 255.255.255.255 (every node). Default: the
     /// address of [`NdlConfig::interface`]; set it by hand where several nodes share a host.
     pub address: Option<NodeAddress>,
-    /// Messages that an application's mailbox holds at most, each class by itself. 1 to 65,536; default 256. Memory:
-    /// the longest payload times this times three, for each application, at the very worst.
+    /// Messages that an application's mailbox holds at most, each class by itself. 1 to 65,536; default 256.
     pub mailbox_capacity: usize,
+    /// Bytes of the payloads in it at most, each class by itself; one message is held where nothing else waits, however
+    /// long it is. 4 KiB to 1 GiB; default 4 MiB. Memory: three times this for each application, at the very worst.
+    pub mailbox_bytes: usize,
     /// Longest payload in bytes. 64 to 64 MiB; default 1 MiB. A peer can make the node hold this much a connection. All
     /// nodes of a project should have the same.
     pub payload_max: usize,
@@ -76,6 +78,9 @@ pub struct GnclConfig {
     pub announce: Option<SocketAddrV4>,
     /// Messages that wait for one peer at most, each class by itself. 1 to 65,536; default 1,024.
     pub queue_capacity: usize,
+    /// Bytes of their payloads at most, each class by itself; one message waits however long it is. 4 KiB to 1 GiB;
+    /// default 16 MiB.
+    pub queue_bytes: usize,
     /// Connections whose peer has not said who it is, at most. 1 to 1,024; default 64.
     pub strangers_max: usize,
     /// Time for a handshake. 10 ms to 60 s; default 2 s.
@@ -165,12 +170,14 @@ impl NodeConfig {
             project: "sinew".to_owned(),
             address: None,
             mailbox_capacity: 256,
+            mailbox_bytes: 4 << 20,
             payload_max: 1 << 20,
             lncl: LnclConfig { socket: None, clients_max: 256, apps_max: 1_024, ring_bytes: 256 * 1_024 },
             gncl: GnclConfig {
                 port: 0,
                 announce: None,
                 queue_capacity: 1_024,
+                queue_bytes: 16 << 20,
                 strangers_max: 64,
                 handshake: Duration::from_secs(2),
                 redial_min: Duration::from_millis(10),

@@ -65,11 +65,14 @@ fn the_documented_faults_look_like_that() {
 fn every_number_is_legal_at_both_ends_and_not_beyond() {
     let ranges = [
         (check::MAILBOX_CAPACITY, ""),
+        (check::MAILBOX_BYTES, ""),
         (check::PAYLOAD_MAX, ""),
         (check::CLIENTS_MAX, ""),
         (check::APPS_MAX, ""),
+        (check::RING_BYTES, ""),
         (check::GNCL_PORT, ""),
         (check::QUEUE_CAPACITY, ""),
+        (check::QUEUE_BYTES, ""),
         (check::STRANGERS_MAX, ""),
         (check::HANDSHAKE, ""),
         (check::REDIAL_MIN, "redial_max_ms = 60_000"),

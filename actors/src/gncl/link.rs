@@ -210,8 +210,10 @@ impl Reader {
             Mode::Linked(_) => READ_LEN,
             Mode::Handshake | Mode::Discard => HANDSHAKE_PAYLOAD_MAX,
         };
-        // A quarter of room left is room enough: copying the rest of a frame for each read would cost more.
-        if self.buffer.capacity() - self.buffer.len() < room / 4 {
+        let left = self.buffer.capacity() - self.buffer.len();
+        // A quarter of room left is room enough: copying the rest of a frame for each read would cost more. A larger buffer
+        // is one that the codec has made for the frame that is coming, and is filled to its end.
+        if left == 0 || left < room / 4 && self.buffer.capacity() <= room {
             self.buffer.reserve(room);
         }
         loop {

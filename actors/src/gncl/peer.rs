@@ -62,6 +62,7 @@ impl Peer {
         let Setting { config, refusals } = setting;
         let limits = OutletLimits {
             queue_capacity: config.gncl.queue_capacity,
+            queue_bytes: config.gncl.queue_bytes,
             unconfirmed_max: config.gncl.queue_capacity,
             payload_max: config.payload_max,
         };

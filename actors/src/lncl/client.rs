@@ -310,6 +310,7 @@ fn limits(stores: &Stores) -> OutletLimits {
     let config = &stores.config;
     OutletLimits {
         queue_capacity: config.mailbox_capacity,
+        queue_bytes: config.mailbox_bytes,
         unconfirmed_max: config.mailbox_capacity,
         payload_max: config.payload_max,
     }

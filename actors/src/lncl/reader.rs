@@ -56,7 +56,10 @@ impl Reader {
                 return Ok(Some(message));
             }
             stream.readable().await?;
-            self.buffer.reserve(READ_CHUNK);
+            // What the codec has made room for is filled first: then it is that frame's alone.
+            if self.buffer.len() == self.buffer.capacity() {
+                self.buffer.reserve(READ_CHUNK);
+            }
             match stream.try_read_buf(&mut self.buffer) {
                 Ok(0) => return Ok(None),
                 Ok(_) => {}

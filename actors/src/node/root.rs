@@ -10,7 +10,7 @@ use std::{
 use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, fut::WrapFuture};
 use sinew_runtime::{
     app::{AppWiring, DynApp},
-    mailbox::Mailbox,
+    mailbox::{Bounds, Mailbox},
     pending::{AppOutlet, Pending},
     post::Post,
     router::Outlet,
@@ -347,7 +347,7 @@ impl Root {
         if let Some(why) = app.fault() {
             return Err(StartError::Application { name: app.name().to_owned(), why });
         }
-        let mailbox = Mailbox::new(config.mailbox_capacity);
+        let mailbox = Mailbox::new(Bounds { messages: config.mailbox_capacity, bytes: config.mailbox_bytes });
         let pending = Pending::new(WAITS_MAX);
         let hosted = app.place().own_process.then(|| process::Link::new(&self.stores, mailbox.clone()));
         let outlet: Arc<dyn Outlet> = match &hosted {

@@ -7,7 +7,7 @@ use std::{
 };
 
 use sinew_runtime::{
-    mailbox::ClassQueue,
+    mailbox::{Bounds, ClassQueue},
     outcome::{Outcome, Receipt, Rejection, Ticket},
     router::Refused,
     time::Time,
@@ -101,7 +101,7 @@ impl<S: Socket> Half<S> {
             session,
             partial: None,
             interrupted: None,
-            queue: ClassQueue::new(limits.queue_capacity),
+            queue: ClassQueue::new(Bounds { messages: limits.queue_capacity, bytes: limits.queue_bytes }),
             urgent: VecDeque::new(),
             last: None,
             finishing: false,

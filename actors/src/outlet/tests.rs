@@ -72,7 +72,8 @@ struct Bench {
     ledger: Arc<Ledger>,
 }
 
-const LIMITS: OutletLimits = OutletLimits { queue_capacity: 4, unconfirmed_max: 4, payload_max: 1_000 };
+const LIMITS: OutletLimits =
+    OutletLimits { queue_capacity: 4, queue_bytes: 4_000, unconfirmed_max: 4, payload_max: 1_000 };
 const PLENTY: usize = 1 << 30;
 
 impl Bench {
@@ -384,7 +385,12 @@ fn threads_that_send_at_once_through_a_narrow_socket_keep_their_order_and_lose_n
     runtime.block_on(async {
         let (ours, theirs) = UnixStream::pair().unwrap();
         socket2::SockRef::from(&ours).set_send_buffer_size(4_096).unwrap();
-        let limits = OutletLimits { queue_capacity: 2_000, unconfirmed_max: 1, payload_max: 10_000 };
+        let limits = OutletLimits {
+            queue_capacity: 2_000,
+            queue_bytes: 20_000_000,
+            unconfirmed_max: 1,
+            payload_max: 10_000,
+        };
         let outlet = Arc::new(StreamOutlet::new(limits));
         let link = outlet.connect(Arc::new(ours), usize::MAX, None);
         let senders: Vec<_> = (0..THREADS)

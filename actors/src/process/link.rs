@@ -27,8 +27,8 @@ use tokio::{
 
 use super::{
     life::{Hosted, process_life},
-    window::{Left, NoSuchMessage, Window},
-    words::{EVENTS_MAX, Fate, Turn, WINDOW},
+    window::{Left, NoSuchMessage, Room, Window},
+    words::{Fate, Turn},
 };
 use crate::{
     outlet::{LinkNumber, OutletLimits, StreamOutlet},
@@ -57,8 +57,6 @@ pub(crate) struct Link {
     sender: OnceLock<Sender>,
 }
 
-const WINDOW_AND_EVENTS: usize = WINDOW + EVENTS_MAX;
-
 /// Whether the node knows all that a process has said.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum LastWords {
@@ -85,6 +83,7 @@ impl Link {
         let config = &stores.config;
         let limits = OutletLimits {
             queue_capacity: config.mailbox_capacity,
+            queue_bytes: config.mailbox_bytes,
             unconfirmed_max: config.mailbox_capacity,
             payload_max: config.payload_max,
         };
@@ -262,10 +261,10 @@ impl Link {
         let mut present = lock(&self.present);
         let Some(present) = &mut *present else { return };
         while present.held.is_none() && self.outlet.urgent_left() == 0 {
-            let next = match present.window.len() {
-                0..WINDOW => present.lender.take(),
-                WINDOW..WINDOW_AND_EVENTS => present.lender.take_event(),
-                _ => None,
+            let next = match present.window.room() {
+                Room::Any => present.lender.take(),
+                Room::Events => present.lender.take_event(),
+                Room::Nothing => None,
             };
             let Some(message) = next else { return };
             // It has not changed either where nobody can tell any more.

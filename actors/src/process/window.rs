@@ -8,7 +8,11 @@ use std::collections::VecDeque;
 
 use sinew_runtime::wire::Message;
 
-use super::words::{Fate, Turn};
+use super::words::{EVENTS_MAX, Fate, Turn, WINDOW};
+
+/// Bytes of the payloads that a child has, from which on it gets no further message.
+const BYTES_ENOUGH: usize = 1 << 20;
+const WINDOW_AND_EVENTS: usize = WINDOW + EVENTS_MAX;
 
 /// A message that the child has.
 struct Lent {
@@ -20,8 +24,19 @@ struct Lent {
 #[derive(Default)]
 pub(super) struct Window {
     lent: VecDeque<Lent>,
+    /// Bytes of their payloads.
+    bytes: usize,
     last: u64,
     in_hand: Option<u64>,
+}
+
+/// What a child may be handed over.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Room {
+    Any,
+    /// The layers' events.
+    Events,
+    Nothing,
 }
 
 /// What the child said does not agree with what it was given.
@@ -39,14 +54,19 @@ pub(super) struct Left {
 }
 
 impl Window {
-    /// How many messages the child has.
-    pub(super) fn len(&self) -> usize {
-        self.lent.len()
+    /// What there is room for.
+    pub(super) fn room(&self) -> Room {
+        match self.lent.len() {
+            0..WINDOW if self.bytes < BYTES_ENOUGH => Room::Any,
+            0..WINDOW_AND_EVENTS => Room::Events,
+            _ => Room::Nothing,
+        }
     }
 
     /// Remembers a message that goes to the child now; messages are numbered from 1 in this order.
     pub(super) fn lend(&mut self, message: Message) {
         self.last += 1;
+        self.bytes += message.payload.len();
         self.lent.push_back(Lent { number: self.last, message });
     }
 
@@ -58,7 +78,11 @@ impl Window {
                 if self.in_hand == Some(number) {
                     self.in_hand = None;
                 }
-                self.lent.remove(at).map(|lent| (lent.message, fate))
+                let Some(Lent { message, .. }) = self.lent.remove(at) else {
+                    return Err(NoSuchMessage(number));
+                };
+                self.bytes -= message.payload.len();
+                Some((message, fate))
             }
             None => None,
         };

@@ -116,6 +116,7 @@ impl Wire {
     pub(super) fn new(config: &NodeConfig, socket: Arc<UnixStream>, welcome: Welcome) -> Arc<Self> {
         let limits = OutletLimits {
             queue_capacity: config.mailbox_capacity,
+            queue_bytes: config.mailbox_bytes,
             unconfirmed_max: WAITS_MAX,
             payload_max: config.payload_max,
         };

@@ -17,7 +17,7 @@ use std::{
 };
 
 pub use lender::Lender;
-pub use queue::{ClassQueue, is_same_stream};
+pub use queue::{Bounds, ClassQueue, is_same_stream};
 pub use reader::MailboxReader;
 pub use source::Source;
 pub use tally::Tally;
@@ -43,7 +43,7 @@ struct Shared {
     queue: ClassQueue,
     /// What this node's layers say: ahead of everything else.
     events: VecDeque<Message>,
-    capacity: usize,
+    events_max: usize,
     /// The reader takes nothing but events, and is not woken for anything else.
     paused: bool,
     waker: Option<Waker>,
@@ -90,7 +90,7 @@ impl Shared {
 
     fn submit_event(&mut self, event: Message) -> Result<Option<Waker>, Refused> {
         let tally = &mut self.tallies[event.header.class as usize];
-        if self.events.len() >= self.capacity {
+        if self.events.len() >= self.events_max {
             tally.refused += 1;
             return Err(Refused::new(event, Rejection::QueueFull));
         }
@@ -132,23 +132,23 @@ impl Shared {
 }
 
 impl Mailbox {
-    /// An empty mailbox that holds at most `capacity` messages of each class.
+    /// An empty mailbox that holds at most so much of each class.
     #[must_use]
-    pub fn new(capacity: usize) -> Arc<Self> {
-        Arc::new(Self::with_source(capacity, None))
+    pub fn new(bounds: impl Into<Bounds>) -> Arc<Self> {
+        Arc::new(Self::with_source(bounds.into(), None))
     }
 
     /// The mailbox of a process that hosts one application: its reader takes from `source`.
     #[must_use]
     pub fn fed_by(source: Arc<dyn Source>) -> Arc<Self> {
-        Arc::new(Self::with_source(0, Some(source)))
+        Arc::new(Self::with_source(Bounds { messages: 0, bytes: 0 }, Some(source)))
     }
 
-    fn with_source(capacity: usize, source: Option<Arc<dyn Source>>) -> Self {
+    fn with_source(bounds: Bounds, source: Option<Arc<dyn Source>>) -> Self {
         let shared = Shared {
-            queue: ClassQueue::new(capacity),
+            queue: ClassQueue::new(bounds),
             events: VecDeque::new(),
-            capacity,
+            events_max: bounds.messages,
             paused: false,
             waker: None,
             epoch: 0,
@@ -291,7 +291,7 @@ impl Outlet for Mailbox {
                 shared.tallies[class].refused += 1;
                 return Err(Refused::new(message, Rejection::Unsupported));
             }
-            if !shared.queue.has_room_for(&message.header) {
+            if !shared.queue.has_room_for(&message) {
                 // An application that waits for its start takes nothing out: what has expired makes room.
                 expired = shared.expire(Time::now());
             }

@@ -13,29 +13,55 @@ use crate::{
 /// must not stop the rest for ever.
 const PASSED_OVER_MAX: u32 = 32;
 
+/// What a queue holds at most, each class by itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Bounds {
+    /// Messages.
+    pub messages: usize,
+    /// Bytes of their payloads, all together. One message is held where nothing else is, however long it is.
+    pub bytes: usize,
+}
+
+impl Bounds {
+    /// Whether `length` bytes more have room beside `held`.
+    const fn has_bytes_for(self, length: usize, held: usize) -> bool {
+        held == 0 || length <= self.bytes.saturating_sub(held)
+    }
+}
+
+impl From<usize> for Bounds {
+    /// So many messages, however long: where who puts them in bounds their bytes.
+    fn from(messages: usize) -> Self {
+        Self { messages, bytes: usize::MAX }
+    }
+}
+
 /// Messages in the order in which they are to be handled: Control, then Stream, then Bulk.
 ///
 /// - Control and Bulk keep the order in which they came.
 /// - Stream keeps one message for each source and kind: a newer one takes the place of the older, and its turn.
 /// - A lane that was passed over 32 times has one turn.
-/// - A full lane refuses; it never drops.
+/// - A full lane refuses; it never drops. It is full when it holds as many messages, or as many bytes, as it may.
 #[derive(Debug)]
 pub struct ClassQueue {
     lanes: [VecDeque<Message>; 3],
+    /// Bytes of the payloads in each lane.
+    bytes: [usize; 3],
     passed_over: [u32; 3],
-    capacity: usize,
+    bounds: Bounds,
     /// Nothing that waits expires before this.
     earliest_expiry: Time,
 }
 
 impl ClassQueue {
-    /// An empty queue that holds at most `capacity` messages of each class.
+    /// An empty queue that holds at most so much of each class.
     #[must_use]
-    pub fn new(capacity: usize) -> Self {
+    pub fn new(bounds: impl Into<Bounds>) -> Self {
         Self {
             lanes: [const { VecDeque::new() }; 3],
+            bytes: [0; 3],
             passed_over: [0; 3],
-            capacity,
+            bounds: bounds.into(),
             earliest_expiry: Time::MAX,
         }
     }
@@ -43,18 +69,26 @@ impl ClassQueue {
     /// Takes a message. Returns the older Stream message that it replaced, if any.
     ///
     /// # Errors
-    /// The message itself, if the lane of its class is full.
+    /// The message itself, if the lane of its class is full. An older value that waits stays there then.
     pub fn push(&mut self, message: Message) -> Result<Option<Message>, Refused> {
-        let lane = &mut self.lanes[message.header.class as usize];
-        if message.header.class == Class::Stream
+        let (class, length) = (message.header.class, message.payload.len());
+        let lane = &mut self.lanes[class as usize];
+        let held = &mut self.bytes[class as usize];
+        if class == Class::Stream
             && let Some(older) = older_value(lane, &message.header)
         {
+            let others = *held - older.payload.len();
+            if !self.bounds.has_bytes_for(length, others) {
+                return Err(Refused::new(message, Rejection::QueueFull));
+            }
+            *held = others + length;
             self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
             return Ok(Some(std::mem::replace(older, message)));
         }
-        if lane.len() >= self.capacity {
+        if lane.len() >= self.bounds.messages || !self.bounds.has_bytes_for(length, *held) {
             return Err(Refused::new(message, Rejection::QueueFull));
         }
+        *held += length;
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
         lane.push_back(message);
         Ok(None)
@@ -64,15 +98,17 @@ impl ClassQueue {
     /// order counts; who uses it bounds how many there are.
     pub fn push_beyond(&mut self, message: Message) {
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
-        self.lanes[message.header.class as usize].push_back(message);
+        let class = message.header.class as usize;
+        self.bytes[class] += message.payload.len();
+        self.lanes[class].push_back(message);
     }
 
-    /// Whether [`push`](Self::push) would take a message with this header.
+    /// Whether there is room for this message beside all that waits.
     #[must_use]
-    pub fn has_room_for(&self, header: &Header) -> bool {
-        let lane = &self.lanes[header.class as usize];
-        lane.len() < self.capacity
-            || header.class == Class::Stream && lane.iter().any(|other| is_same_stream(&other.header, header))
+    pub fn has_room_for(&self, message: &Message) -> bool {
+        let class = message.header.class as usize;
+        self.lanes[class].len() < self.bounds.messages
+            && self.bounds.has_bytes_for(message.payload.len(), self.bytes[class])
     }
 
     /// Whether a newer value of this Stream message waits.
@@ -91,6 +127,7 @@ impl ClassQueue {
             return Some(message);
         }
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
+        self.bytes[message.header.class as usize] += message.payload.len();
         lane.push_front(message);
         None
     }
@@ -107,7 +144,9 @@ impl ClassQueue {
                 self.passed_over[lane] += 1;
             }
         }
-        self.lanes[chosen].pop_front()
+        let next = self.lanes[chosen].pop_front()?;
+        self.bytes[chosen] -= next.payload.len();
+        Some(next)
     }
 
     /// Takes out what has expired by `now`. Costs nothing as long as nothing can have.
@@ -117,9 +156,10 @@ impl ClassQueue {
             return expired;
         }
         self.earliest_expiry = Time::MAX;
-        for lane in &mut self.lanes {
+        for (lane, bytes) in self.lanes.iter_mut().zip(&mut self.bytes) {
             for message in std::mem::take(lane) {
                 if message.header.is_expired(now) {
+                    *bytes -= message.payload.len();
                     expired.push(message);
                 } else {
                     self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
@@ -136,6 +176,12 @@ impl ClassQueue {
         self.lanes.iter().map(VecDeque::len).sum()
     }
 
+    /// Bytes of the payloads that wait.
+    #[must_use]
+    pub fn bytes(&self) -> usize {
+        self.bytes.iter().sum()
+    }
+
     /// Whether none waits.
     #[must_use]
     pub fn is_empty(&self) -> bool {
@@ -143,8 +189,9 @@ impl ClassQueue {
     }
 
     /// Empties the queue, most urgent class first.
-    pub fn drain_all(&mut self) -> impl Iterator<Item = Message> + '_ {
-        self.lanes.iter_mut().flat_map(|lane| lane.drain(..))
+    pub fn drain_all(&mut self) -> impl Iterator<Item = Message> + use<> {
+        self.bytes = [0; 3];
+        std::mem::take(&mut self.lanes).into_iter().flatten()
     }
 }
 
@@ -220,7 +267,83 @@ mod tests {
         assert_eq!(pops, u64::from(PASSED_OVER_MAX));
     }
 
+    fn long(class: Class, source: u32, length: usize) -> Message {
+        let Message { header, .. } = message(class, source, 0);
+        Message::new(header, vec![0; length].into())
+    }
+
+    #[test]
+    fn a_class_holds_so_many_bytes_and_the_others_have_theirs() {
+        let mut queue = ClassQueue::new(Bounds { messages: 8, bytes: 100 });
+        queue.push(long(Class::Bulk, 1, 60)).unwrap();
+        queue.push(long(Class::Bulk, 1, 40)).unwrap();
+        let refused = queue.push(long(Class::Bulk, 1, 1)).unwrap_err();
+        assert_eq!((refused.why, refused.message.payload.len()), (Rejection::QueueFull, 1));
+        queue.push(long(Class::Bulk, 1, 0)).unwrap();
+        queue.push(long(Class::Control, 1, 100)).unwrap();
+        assert_eq!(queue.bytes(), 200);
+        queue.pop();
+        queue.pop();
+        queue.push(long(Class::Bulk, 1, 60)).unwrap();
+        assert_eq!(queue.bytes(), 100);
+    }
+
+    #[test]
+    fn one_message_has_room_where_nothing_else_is_however_long_it_is() {
+        let mut queue = ClassQueue::new(Bounds { messages: 8, bytes: 10 });
+        queue.push(long(Class::Control, 1, 1_000)).unwrap();
+        assert!(queue.push(long(Class::Control, 1, 1)).is_err());
+        queue.push(long(Class::Stream, 1, 1_000)).unwrap();
+        queue.push(long(Class::Stream, 1, 2_000)).unwrap();
+        assert_eq!((queue.len(), queue.bytes()), (2, 3_000));
+    }
+
+    #[test]
+    fn a_newer_value_counts_instead_of_the_older_and_a_longer_one_without_room_leaves_it_there() {
+        let mut queue = ClassQueue::new(Bounds { messages: 8, bytes: 100 });
+        queue.push(long(Class::Stream, 1, 50)).unwrap();
+        queue.push(long(Class::Stream, 2, 50)).unwrap();
+        queue.push(long(Class::Stream, 1, 50)).unwrap();
+        assert!(queue.push(long(Class::Stream, 1, 51)).is_err());
+        assert_eq!((queue.len(), queue.bytes()), (2, 100));
+        queue.push(long(Class::Stream, 1, 10)).unwrap();
+        queue.push(long(Class::Stream, 3, 40)).unwrap();
+        assert_eq!((queue.len(), queue.bytes()), (3, 100));
+    }
+
     proptest! {
+        #[test]
+        fn the_bytes_that_are_counted_are_those_that_wait_and_within_the_bound(
+            inputs in proptest::collection::vec((0usize..3, 0u32..3, 0usize..40, 0u8..8), 0..200),
+        ) {
+            const BOUNDS: Bounds = Bounds { messages: 6, bytes: 64 };
+            let mut queue = ClassQueue::new(BOUNDS);
+            for (now, (class, source, length, step)) in (1u64..).zip(inputs) {
+                let mut message = long(Class::ALL[class], source, length);
+                (message.header.sent, message.header.time_to_live_us) = (Time::from_nanos(now * 1_000), 20);
+                match step {
+                    0..5 => {
+                        let older = queue.bytes[class];
+                        if queue.push(message).is_ok() {
+                            prop_assert!(older == 0 || queue.bytes[class] <= BOUNDS.bytes);
+                        } else {
+                            prop_assert_eq!(queue.bytes[class], older);
+                        }
+                    }
+                    5 => drop(queue.pop()),
+                    6 => drop(queue.take_expired(Time::from_nanos(now * 1_000))),
+                    _ => if let Some(popped) = queue.pop() { queue.put_back(popped); },
+                }
+                for (lane, counted) in queue.lanes.iter().zip(queue.bytes) {
+                    prop_assert_eq!(lane.iter().map(|message| message.payload.len()).sum::<usize>(), counted);
+                    prop_assert!(lane.len() <= BOUNDS.messages);
+                }
+            }
+            let counted = queue.bytes();
+            prop_assert_eq!(queue.drain_all().map(|message| message.payload.len()).sum::<usize>(), counted);
+            prop_assert_eq!((queue.bytes(), queue.len()), (0, 0));
+        }
+
         #[test]
         fn nothing_is_lost_or_reordered_within_a_class(
             inputs in proptest::collection::vec((0usize..3, 0u32..4, any::<bool>()), 0..200),

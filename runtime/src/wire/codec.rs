@@ -26,13 +26,21 @@ pub enum FrameError {
     Io(#[from] std::io::Error),
 }
 
+/// A frame of at least so many bytes that is alone in its buffer takes the buffer along; of others the payload is copied.
+const TAKES_ITS_BUFFER: usize = 8 * 1024;
+/// A longer buffer that nothing is left in is given back.
+const BUFFER_KEPT: usize = 256 * 1024;
+
 /// Cuts a byte stream into messages and writes messages to one.
 ///
-/// The length in a header is checked before memory is reserved for it.
+/// The length in a header is checked before memory is reserved for it. A payload holds its own bytes in memory and little
+/// more: no message that waits long keeps the buffer that it came in.
 #[derive(Clone, Copy, Debug)]
 pub struct FrameCodec {
     payload_max: usize,
     checksum: Checksum,
+    /// The most that the present buffer was seen to hold room for: what is cut off from its front does not show any more.
+    largest: usize,
 }
 
 /// What a frame's last four header bytes are.
@@ -66,13 +74,13 @@ impl FrameCodec {
     /// A codec that takes payloads of at most `payload_max` bytes.
     #[must_use]
     pub const fn new(payload_max: usize) -> Self {
-        Self { payload_max, checksum: Checksum::Crc }
+        Self { payload_max, checksum: Checksum::Crc, largest: 0 }
     }
 
     /// A codec for frames that stay in memory: without checksums.
     #[must_use]
     pub const fn in_memory(payload_max: usize) -> Self {
-        Self { payload_max, checksum: Checksum::None }
+        Self { payload_max, checksum: Checksum::None, largest: 0 }
     }
 }
 
@@ -88,20 +96,43 @@ impl Decoder for FrameCodec {
         }
         let whole = HEADER_LEN + said;
         if source.len() < whole {
-            source.reserve(whole - source.len());
+            self.make_room(source, whole);
             return Ok(None);
         }
-        Ok(Some(split(source.split_to(whole).freeze(), self.checksum)?))
+        let frame = &source[..whole];
+        let head = frame.first_chunk::<HEADER_LEN>().ok_or(HeaderError::NotAFrame)?;
+        let header = self.checksum.decode(head, &frame[HEADER_LEN..])?;
+        Ok(Some(Message::new(header, self.take_payload(source, whole))))
     }
 }
 
-/// Reads the frame that fills `frame` to its last byte.
-fn split(mut frame: Bytes, checksum: Checksum) -> Result<Message, HeaderError> {
-    let Some(bytes) = frame.first_chunk::<HEADER_LEN>().copied() else {
-        return Err(HeaderError::NotAFrame);
-    };
-    frame.advance(HEADER_LEN);
-    Ok(Message::new(checksum.decode(&bytes, &frame)?, frame))
+impl FrameCodec {
+    /// Sees to it that the rest of a frame of `whole` bytes has room: in a buffer of just that length, if it needs a new one.
+    fn make_room(&mut self, source: &mut BytesMut, whole: usize) {
+        if source.capacity() < whole {
+            let mut own = BytesMut::with_capacity(whole);
+            own.put_slice(source);
+            *source = own;
+            self.largest = 0;
+        }
+    }
+
+    /// The payload of the first frame of `source`, which has `whole` bytes.
+    fn take_payload(&mut self, source: &mut BytesMut, whole: usize) -> Bytes {
+        self.largest = self.largest.max(source.capacity());
+        if source.len() == whole && whole >= TAKES_ITS_BUFFER && whole >= self.largest / 4 {
+            self.largest = 0;
+            let mut frame = std::mem::take(source).freeze();
+            frame.advance(HEADER_LEN);
+            return frame;
+        }
+        let payload = Bytes::copy_from_slice(&source[HEADER_LEN..whole]);
+        source.advance(whole);
+        if source.is_empty() && self.largest > BUFFER_KEPT {
+            (*source, self.largest) = (BytesMut::new(), 0);
+        }
+        payload
+    }
 }
 
 impl Encoder<&Message> for FrameCodec {
@@ -190,6 +221,29 @@ mod tests {
             let kept = (whole.len() as f64 * keep) as usize;
             prop_assert!(decode_datagram(&whole[..kept]).is_err());
         }
+    }
+
+    #[test]
+    fn a_short_message_does_not_keep_the_buffer_that_it_came_in_and_a_long_one_takes_it_along() {
+        let (mut codec, mut buffer) = (FrameCodec::new(1 << 20), BytesMut::with_capacity(1 << 20));
+        buffer.extend_from_slice(&frame(&[1; 10]));
+        buffer.extend_from_slice(&frame(&[2; 100_000]));
+        let start = buffer.as_ptr() as usize;
+        let mut next = || codec.decode(&mut buffer).unwrap().expect("a whole frame").payload;
+        let (short, long) = (next(), next());
+        for payload in [short, long] {
+            let at = payload.as_ptr() as usize;
+            assert!(!(start..start + (1 << 20)).contains(&at), "{} bytes keep a MiB", payload.len());
+        }
+        let whole = frame(&[3; 100_000]);
+        for piece in whole.chunks(30_000) {
+            assert!(codec.decode(&mut buffer).unwrap().is_none());
+            buffer.extend_from_slice(piece);
+        }
+        let start = buffer.as_ptr() as usize;
+        let long = codec.decode(&mut buffer).unwrap().expect("a whole frame").payload;
+        assert_eq!(long.as_ptr() as usize, start + HEADER_LEN, "it is not copied");
+        assert_eq!(buffer.capacity(), 0);
     }
 
     #[test]

@@ -40,7 +40,11 @@ fn record(mut endpoint: Endpoint, over: &AtomicBool) {
             Job::KIND => ("bulk", received.decode::<Job>().expect(unreadable).number),
             Value::KIND => ("stream", received.decode::<Value>().expect(unreadable).number),
             Order::KIND => ("control", received.decode::<Order>().expect(unreadable).number),
-            kind => panic!("{kind}: {unreadable}"),
+            // Bytes laid out by the test: a number, and many more.
+            _ => {
+                let number = received.bytes().first_chunk().copied().map(u64::from_le_bytes);
+                ("load", number.expect(unreadable))
+            }
         };
         say(&format!("{class} {number}"));
     }

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use rustix::process::Signal;
-use sinew::{ApiError, Endpoint, NodeApi, Payload, Registration, prelude::*};
+use sinew::{ApiError, Class, Endpoint, Kind, NodeApi, Payload, Registration, prelude::*};
 use sinew_tests::{
     DEADLINE, Log,
     clients::{Held, Performer, Stage, StageLimits, Window},
@@ -167,4 +167,63 @@ fn a_stopped_client_fills_what_is_its_own_and_gets_what_its_classes_promise_when
     let last_control = place("control", control.len() as u64);
     assert!(last_control < place("bulk", bulk.len() as u64), "Control goes ahead of Bulk where both wait");
     scene.end();
+}
+
+/// The longest payload with the default configuration.
+const LONG: usize = 1 << 20;
+/// `node.mailbox_bytes` with the default configuration, in messages of that length: what waits for one, each class by itself.
+const LONG_WAIT: u64 = 4;
+/// What the node may hold for one that takes nothing: that in each class; its rings, a message in the sender's hand, and what
+/// the allocator keeps of those that were refused.
+const LONG_BOUND_KIB: u64 = 3 * LONG_WAIT * 1_024 + 8 * 1_024;
+const LONG_ROUNDS: u64 = 256;
+
+#[test]
+fn a_stopped_client_costs_its_node_bytes_within_their_bound_and_they_go_back_when_it_takes_them() {
+    // Given: a node with the default bounds, one client that is stopped, and one that sends.
+    let limits = StageLimits { mailbox_capacity: 256, payload_max: LONG, clients_max: 16 };
+    let stage = Stage::new(&program("client_kills"), limits);
+    let got: Log<String> = Log::default();
+    let says = got.clone();
+    let stopped = stage.start("recorder", &["stopped".to_owned()], move |line| says.write(line.to_owned()));
+    got.wait_for("up".to_owned());
+    let api = NodeApi::connect(stage.socket()).expect("the door is open");
+    let mut sender = api.register_transport_address(Registration::new()).expect("an address");
+    let to = sender.resolve("stopped", DEADLINE).expect("the node answers").expect("it is registered");
+    let before = Held::of(stage.node_id());
+    stopped.freeze();
+
+    // When: as many of the longest messages are sent to it as it may have waiting in number.
+    let mut most = 0;
+    for number in 1..=LONG_ROUNDS {
+        for class in [Class::Control, Class::Stream, Class::Bulk] {
+            // Values of their own, so that none takes the place of another.
+            let kind = Kind::named(&format!("scenario.load.{number}"));
+            let mut message = sender.create_message(to, kind, LONG).expect("the longest there may be");
+            message.set_class(class);
+            message[..8].copy_from_slice(&number.to_le_bytes());
+            sender.send_message(message).expect("the node takes it, and passes it on or refuses it");
+        }
+        most = most.max(Held::of(stage.node_id()).own_kib.saturating_sub(before.own_kib));
+    }
+
+    // Then: the node holds so many bytes and no more, and who asks is told.
+    assert!(most <= LONG_BOUND_KIB, "the node has grown by {most} KiB of {LONG_BOUND_KIB}");
+    assert!(most >= LONG_WAIT * 1_024, "it did hold what it may: {most} KiB");
+    let refused = sender.create_message(to, Kind::named("scenario.load"), LONG).expect("as above");
+    let outcome = sender.send_message_confirmed(refused, DEADLINE).expect("it is sent");
+    assert_eq!(outcome, Outcome::Rejected(sinew::Rejection::QueueFull));
+
+    // And when it goes on, it gets what waited, and the memory is free again.
+    stopped.signal(Signal::CONT);
+    let loads = |got: &Log<String>| got.all().iter().filter(|line| line.starts_with("load")).count();
+    until("what waited for it has come", || (loads(&got) as u64 >= 3 * LONG_WAIT).then_some(()));
+    let mut left = 0;
+    until("the memory is given back", || {
+        left = Held::of(stage.node_id()).own_kib.saturating_sub(before.own_kib);
+        (left <= 2 * LONG_WAIT * 1_024).then_some(())
+    });
+    println!("grown by {most} KiB at most, by {left} KiB after it");
+    assert!(stopped.end().success());
+    stage.end();
 }
