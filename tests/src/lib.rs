@@ -4,9 +4,11 @@
 pub mod clients;
 pub mod dice;
 mod ground;
+pub mod history;
 mod hosts;
 pub mod load;
 mod log;
+mod numbers;
 mod program;
 
 pub mod orders;

@@ -8,6 +8,7 @@ use std::{
 use sinew::{Class, Outcome, Rejection, Time};
 
 use super::entry::{Entry, Poster, Way};
+use crate::numbers::Numbers;
 
 /// Faults that an account tells in words; the others are counted.
 const FAULTS_TOLD: usize = 20;
@@ -51,28 +52,6 @@ impl Fate {
         Self::EndedWithSource,
         Self::InFlight,
     ];
-}
-
-/// A set of numbers from 1, one bit each.
-#[derive(Debug, Default)]
-struct Numbers(Vec<u64>);
-
-impl Numbers {
-    /// Whether it was not there.
-    fn insert(&mut self, number: u64) -> bool {
-        let (word, bit) = (usize::try_from(number / 64).expect("memory ends before"), 1 << (number % 64));
-        if self.0.len() <= word {
-            self.0.resize(word + 1, 0);
-        }
-        let is_new = self.0[word] & bit == 0;
-        self.0[word] |= bit;
-        is_new
-    }
-
-    fn has(&self, number: u64) -> bool {
-        let word = usize::try_from(number / 64).ok().and_then(|word| self.0.get(word));
-        word.is_some_and(|word| word & (1 << (number % 64)) != 0)
-    }
 }
 
 /// The first and the last number that one life of a destination got.

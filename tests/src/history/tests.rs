@@ -1,0 +1,239 @@
+//! What the checker promises: a true history holds, and no planted violation passes.
+
+use proptest::prelude::*;
+use sinew::{Class, Outcome, Rejection};
+
+use super::{
+    verdict::Fault::{self, *},
+    *,
+};
+
+const ONE: Party = Party { station: 1, life: 1 };
+const TWO: Party = Party { station: 2, life: 1 };
+
+fn sent(class: Class, first: u64, count: u64) -> (Party, Note) {
+    (ONE, Note::Sent { to: 2, class, first, count, asked: false })
+}
+
+fn asked(first: u64, count: u64) -> (Party, Note) {
+    (ONE, Note::Sent { to: 2, class: Class::Control, first, count, asked: true })
+}
+
+fn got(class: Class, first: u64, count: u64) -> (Party, Note) {
+    (TWO, Note::Got { from: ONE, class, first, count })
+}
+
+fn ended(number: u64, outcome: Outcome) -> (Party, Note) {
+    (ONE, Note::Ended { to: 2, class: Class::Control, number, outcome })
+}
+
+fn lost(upto: [u64; 3]) -> (Party, Note) {
+    (ONE, Note::PeerLost { to: 2, upto })
+}
+
+fn history(notes: &[(Party, Note)]) -> History {
+    let mut history = History::default();
+    notes.iter().for_each(|(who, note)| history.note(*who, *note));
+    history
+}
+
+/// What is wrong with a history, and how often.
+fn faults(notes: &[(Party, Note)]) -> Vec<(Fault, u64)> {
+    let verdict = history(notes).verdict();
+    assert_eq!(verdict.holds(), verdict.faults.is_empty(), "{verdict}");
+    verdict.faults.into_iter().collect()
+}
+
+/// Two classes, some confirmed, nothing wrong.
+fn clean() -> Vec<(Party, Note)> {
+    let outcomes = (1..=3).map(|number| ended(number, Outcome::Delivered));
+    let notes = [sent(Class::Bulk, 1, 10), asked(1, 3), got(Class::Control, 1, 3), got(Class::Bulk, 1, 10)];
+    notes.into_iter().chain(outcomes).collect()
+}
+
+#[test]
+fn a_true_history_holds_and_is_perfect() {
+    let verdict = history(&clean()).verdict();
+    assert!(verdict.holds() && verdict.is_perfect(), "{verdict}");
+    assert_eq!((verdict.sent, verdict.got, verdict.asked), (13, 13, 3));
+}
+
+#[test]
+fn the_order_between_parties_does_not_matter() {
+    let mut notes = clean();
+    notes.sort_by_key(|(who, _)| std::cmp::Reverse(*who));
+    assert!(history(&notes).verdict().is_perfect());
+}
+
+#[test]
+fn a_lost_message_is_caught_in_the_middle_and_at_the_end() {
+    let middle = [sent(Class::Bulk, 1, 10), got(Class::Bulk, 1, 3), got(Class::Bulk, 6, 5)];
+    assert_eq!(faults(&middle), [(Lost, 2)]);
+    assert_eq!(faults(&[sent(Class::Bulk, 1, 10), got(Class::Bulk, 1, 9)]), [(Lost, 1)]);
+    assert_eq!(faults(&[sent(Class::Bulk, 1, 10)]), [(Lost, 10)]);
+}
+
+#[test]
+fn a_duplicated_message_is_caught() {
+    assert_eq!(
+        faults(&[sent(Class::Bulk, 1, 4), got(Class::Bulk, 1, 4), got(Class::Bulk, 4, 1)]),
+        [(Duplicated, 1)]
+    );
+    let mut in_another_life = clean();
+    let note = Note::Got { from: ONE, class: Class::Bulk, first: 2, count: 1 };
+    in_another_life.push((Party { life: 2, ..TWO }, note));
+    assert_eq!(faults(&in_another_life), [(Duplicated, 1)]);
+}
+
+#[test]
+fn a_reordered_message_is_caught() {
+    let notes =
+        [sent(Class::Bulk, 1, 3), got(Class::Bulk, 1, 1), got(Class::Bulk, 3, 1), got(Class::Bulk, 2, 1)];
+    assert_eq!(faults(&notes), [(Reordered, 1)]);
+}
+
+#[test]
+fn a_message_of_a_former_life_behind_one_of_a_later_is_caught() {
+    let later = Party { life: 2, ..ONE };
+    let notes = [
+        sent(Class::Bulk, 1, 1),
+        (later, Note::Sent { to: 2, class: Class::Bulk, first: 1, count: 1, asked: false }),
+        (TWO, Note::Got { from: later, class: Class::Bulk, first: 1, count: 1 }),
+        got(Class::Bulk, 1, 1),
+    ];
+    assert_eq!(faults(&notes), [(Reordered, 1)]);
+}
+
+#[test]
+fn an_invented_and_a_damaged_message_are_caught() {
+    assert_eq!(faults(&[sent(Class::Bulk, 1, 1), got(Class::Bulk, 1, 2)]), [(Invented, 1)]);
+    assert_eq!(faults(&[got(Class::Stream, 7, 1)]), [(Invented, 1)]);
+    let mut notes = clean();
+    notes.push((TWO, Note::Damaged { from: ONE, class: Class::Bulk, number: 4 }));
+    assert_eq!(faults(&notes), [(Damaged, 1)]);
+}
+
+#[test]
+fn a_missing_outcome_is_caught() {
+    assert_eq!(faults(&[asked(1, 1), got(Class::Control, 1, 1)]), [(OutcomeMissing, 1)]);
+}
+
+#[test]
+fn a_second_outcome_is_caught_also_where_it_is_the_same() {
+    for outcome in [Outcome::Delivered, Outcome::Unknown] {
+        let mut notes = clean();
+        notes.push(ended(2, outcome));
+        assert_eq!(faults(&notes), [(OutcomeTwice, 1)]);
+    }
+}
+
+#[test]
+fn delivered_and_not_got_is_caught_also_where_a_loss_excuses_that_it_did_not_come() {
+    let notes = [asked(1, 1), ended(1, Outcome::Delivered)];
+    assert_eq!(faults(&notes), [(Lost, 1), (DeliveredAndNotGot, 1)]);
+    assert_eq!(faults(&[notes[0], notes[1], lost([1, 0, 0])]), [(DeliveredAndNotGot, 1)]);
+}
+
+#[test]
+fn got_and_denied_is_caught() {
+    for denial in [Outcome::Expired, Outcome::PeerLost, Outcome::Rejected(Rejection::QueueFull)] {
+        let notes = [asked(1, 1), got(Class::Control, 1, 1), ended(1, denial)];
+        assert_eq!(faults(&notes), [(GotAndDenied, 1)], "{denial:?}");
+        let told = history(&[asked(1, 1), ended(1, denial)]).verdict();
+        assert!(told.holds() && !told.is_perfect() && told.told == 1, "{told}");
+    }
+}
+
+#[test]
+fn unknown_is_true_only_where_a_node_was_lost() {
+    for outcome in [Outcome::Unknown, Outcome::Failed] {
+        let notes = [asked(1, 1), got(Class::Control, 1, 1), ended(1, outcome)];
+        assert_eq!(faults(&notes), [(UnknownWithoutLoss, 1)], "{outcome:?}");
+        assert_eq!(faults(&[notes[0], notes[1], notes[2], lost([1, 0, 0])]), []);
+        let mut killed = history(&notes);
+        killed.killed(TWO);
+        assert!(killed.verdict().holds());
+    }
+}
+
+#[test]
+fn a_loss_that_was_told_excuses_one_row_before_it_and_no_more() {
+    let bulk = |upto| lost([0, 0, upto]);
+    let tail = [sent(Class::Bulk, 1, 10), got(Class::Bulk, 1, 4)];
+    assert_eq!(faults(&[tail[0], tail[1], bulk(10)]), []);
+    let behind_it = [tail[0], tail[1], bulk(4)];
+    assert_eq!(faults(&behind_it), [(Lost, 6)]);
+    let two_rows = [tail[0], tail[1], got(Class::Bulk, 6, 2), bulk(10)];
+    assert_eq!(faults(&two_rows), [(Lost, 3)]);
+    let verdict = history(&[two_rows[0], two_rows[1], two_rows[2], two_rows[3], bulk(10)]).verdict();
+    assert!(verdict.holds() && verdict.lost_with_node == 4, "{verdict}");
+}
+
+#[test]
+fn of_a_stream_all_but_the_newest_may_be_superseded() {
+    let notes = [sent(Class::Stream, 1, 10), got(Class::Stream, 3, 1), got(Class::Stream, 10, 1)];
+    let verdict = history(&notes).verdict();
+    assert!(verdict.is_perfect() && verdict.superseded == 8, "{verdict}");
+    assert_eq!(faults(&notes[..2]), [(Lost, 7)]);
+}
+
+#[test]
+fn of_a_killed_source_the_last_ones_are_not_owed_but_those_before_are() {
+    let mut killed = history(&[sent(Class::Bulk, 1, 10), got(Class::Bulk, 1, 6), asked(1, 1)]);
+    killed.killed(ONE);
+    let verdict = killed.verdict();
+    assert!(verdict.holds() && verdict.lost_with_node == 5 && verdict.ended_with_source == 1, "{verdict}");
+    // It was killed before it wrote down that it had sent this.
+    killed.note(TWO, Note::Got { from: ONE, class: Class::Bulk, first: 7, count: 5 });
+    assert!(killed.verdict().holds(), "{}", killed.verdict());
+    killed.note(TWO, Note::Got { from: ONE, class: Class::Bulk, first: 13, count: 1 });
+    assert_eq!(killed.verdict().count(Lost), 1);
+}
+
+#[test]
+fn notes_that_cannot_be_are_caught() {
+    assert_eq!(faults(&[sent(Class::Bulk, 2, 1)]), [(WrongNote, 1)]);
+    assert_eq!(faults(&[ended(1, Outcome::Delivered)]), [(WrongNote, 1)]);
+}
+
+#[test]
+fn every_note_is_read_as_it_was_written() {
+    let mut notes = clean();
+    notes.extend([lost([1, 2, 3]), ended(9, Outcome::Rejected(Rejection::Away))]);
+    notes.push((TWO, Note::Damaged { from: ONE, class: Class::Stream, number: 4 }));
+    for (_, note) in notes {
+        assert_eq!(note.to_string().parse(), Ok(note));
+    }
+    for nonsense in ["", "got 1 2", "sent 1 9 1 1", "ended 1 0 1 99", "sent x"] {
+        assert!(nonsense.parse::<Note>().is_err(), "{nonsense}");
+    }
+}
+
+proptest! {
+    /// Of a row in which each message has come, one is left out, comes twice, or comes late.
+    #[test]
+    fn whichever_message_is_meddled_with_it_is_caught(
+        count in 2_u64..200, which in any::<prop::sample::Index>(), how in 0_usize..3,
+    ) {
+        let one = which.index(count as usize - 1) as u64 + 1;
+        let mut numbers: Vec<u64> = (1..=count).collect();
+        let index = one as usize - 1;
+        let fault = match how {
+            0 => {
+                numbers.remove(index);
+                Lost
+            }
+            1 => {
+                numbers.push(one);
+                Duplicated
+            }
+            _ => {
+                numbers.swap(index, index + 1);
+                Reordered
+            }
+        };
+        let mut notes = vec![sent(Class::Bulk, 1, count)];
+        notes.extend(numbers.into_iter().map(|number| got(Class::Bulk, number, 1)));
+        prop_assert_eq!(faults(&notes), [(fault, 1)]);
+    }
+}
