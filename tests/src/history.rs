@@ -86,7 +86,13 @@ impl History {
         self.killed.push(who);
     }
 
-    /// What `who` has got of a source so far: the last number.
+    /// The last number that a source has written down as sent so far.
+    #[must_use]
+    pub fn last_sent(&self, from: Party, to: Station, class: Class) -> u64 {
+        self.flows.get(&Path { from, to, class }).map_or(0, |flow| flow.sent)
+    }
+
+    /// The last number that has come of a source so far.
     #[must_use]
     pub fn last_got(&self, from: Party, to: Station, class: Class) -> u64 {
         self.flows.get(&Path { from, to, class }).map_or(0, Flow::last_got)

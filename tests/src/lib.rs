@@ -6,6 +6,7 @@ pub mod dice;
 mod ground;
 pub mod history;
 mod hosts;
+pub mod link_faults;
 pub mod load;
 mod log;
 mod numbers;

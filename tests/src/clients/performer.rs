@@ -25,7 +25,7 @@ impl Performer {
     ///
     /// # Panics
     /// If it cannot be started.
-    pub(super) fn start(
+    pub(crate) fn start(
         program: &Path,
         role: &str,
         arguments: &[String],
@@ -106,7 +106,7 @@ impl Performer {
     }
 
     /// Kills it, and returns when it is gone and all that it said was heard.
-    pub(super) fn kill_now(&mut self) {
+    pub(crate) fn kill_now(&mut self) {
         self.end_now();
     }
 

@@ -1,0 +1,185 @@
+//! The role of a node: one application that sends at a rate and takes what comes.
+
+use std::{
+    io::BufRead,
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicU64, Ordering},
+    },
+};
+
+use sinew::{Class, NodeHandle, Time, fault::Fault, prelude::*};
+
+use super::{
+    clerk::Clerk,
+    pacer::{Bulk, Control, Numbers, Pacer, Stream, filling, name, pattern},
+};
+use crate::{
+    DEADLINE,
+    history::{Note, Party, Station},
+    puppet::desk,
+    until,
+};
+
+/// The application.
+struct Office {
+    peer: Station,
+    clerk: Clerk,
+    numbers: Arc<Numbers>,
+    lull: Arc<Lull>,
+    pattern: Arc<Vec<u8>>,
+    length: usize,
+    /// Whether the peer's node is there, as far as this one was told.
+    is_peer_there: bool,
+}
+
+/// The longest time between two messages that came.
+#[derive(Debug, Default)]
+struct Lull {
+    last: Mutex<Option<Time>>,
+    longest_ns: AtomicU64,
+}
+
+impl Lull {
+    fn end(&self, now: Time) {
+        let last = self.last.lock().unwrap_or_else(PoisonError::into_inner).replace(now);
+        if let Some(last) = last {
+            let lull = u64::try_from(now.since(last).as_nanos()).unwrap_or(u64::MAX);
+            self.longest_ns.fetch_max(lull, Ordering::Relaxed);
+        }
+    }
+}
+
+impl Actor for Office {
+    type Context = AppContext<Self>;
+}
+
+impl Office {
+    fn got(&self, (class, life, number): (Class, u32, u64), filled: &[u8], is_awaited: bool) {
+        self.lull.end(Time::now());
+        let from = Party { station: self.peer, life };
+        if filled != filling(&self.pattern, number, self.length) {
+            self.clerk.note(Note::Damaged { from, class, number });
+        }
+        self.clerk.got(from, class, number, is_awaited);
+    }
+
+    fn peer_lost(&self) {
+        self.clerk.note(Note::PeerLost { to: self.peer, upto: self.numbers.tried() });
+    }
+}
+
+impl Handler<Delivery<Bulk>> for Office {
+    type Result = ();
+
+    fn handle(&mut self, bulk: Delivery<Bulk>, _: &mut Self::Context) {
+        self.got((Class::Bulk, bulk.life, bulk.number), &bulk.filling, false);
+    }
+}
+
+impl Handler<Delivery<Stream>> for Office {
+    type Result = ();
+
+    fn handle(&mut self, stream: Delivery<Stream>, _: &mut Self::Context) {
+        self.got((Class::Stream, stream.life, stream.number), &stream.filling, false);
+    }
+}
+
+impl Handler<Delivery<Control>> for Office {
+    type Result = ();
+
+    fn handle(&mut self, control: Delivery<Control>, _: &mut Self::Context) {
+        self.got((Class::Control, control.life, control.number), &control.filling, control.asked);
+    }
+}
+
+impl Handler<Delivery<NodeEvent>> for Office {
+    type Result = ();
+
+    fn handle(&mut self, event: Delivery<NodeEvent>, _: &mut Self::Context) {
+        match event.payload {
+            NodeEvent::NodeFound { .. } => self.is_peer_there = true,
+            NodeEvent::NodeLost { .. } => {
+                self.is_peer_there = false;
+                self.peer_lost();
+            }
+            NodeEvent::NodeRestarted { .. } => {
+                if std::mem::replace(&mut self.is_peer_there, true) {
+                    self.peer_lost();
+                }
+            }
+        }
+    }
+}
+
+/// `CONFIGURATION STATION LIFE PEER FILLING`
+pub(super) fn play(arguments: &[String]) {
+    if std::env::var_os("RUST_LOG").is_some() {
+        let filter = tracing_subscriber::EnvFilter::from_default_env();
+        tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    }
+    // A thousand panics would fill the terminal; their words are in each supervisor's log.
+    std::panic::set_hook(Box::new(|_| {}));
+    let number = |at: usize| arguments[at].parse::<u64>().expect("a number");
+    let (station, life, peer) = (number(1) as Station, number(2) as u32, number(3) as Station);
+    let (clerk, numbers, lull) = (Clerk::default(), Arc::new(Numbers::default()), Arc::new(Lull::default()));
+    let length = number(4) as usize;
+    let office = {
+        let (clerk, numbers, lull) = (clerk.clone(), numbers.clone(), lull.clone());
+        let pattern = Arc::new(pattern());
+        AppSpec::new(name(station).as_str(), move || Office {
+            peer,
+            clerk: clerk.clone(),
+            numbers: numbers.clone(),
+            lull: lull.clone(),
+            pattern: pattern.clone(),
+            length,
+            is_peer_there: false,
+        })
+    };
+    let office = office.handles::<Bulk>().handles::<Control>().handles::<Stream>().handles::<NodeEvent>();
+    let (desk, key) = desk("desk");
+    let config = NodeConfig::from_file(&arguments[0]).expect("the director's configuration");
+    let node = Node::builder(config.name.clone()).config(config).app(office.own_thread()).app(desk);
+    let node = node.start().expect("a node");
+    node.handle().wait_until_running(DEADLINE).expect("it requires nothing");
+    serve(&node, Pacer { sender: key.sender(), clerk, numbers, to: peer, life, length }, &lull);
+    node.stop();
+}
+
+/// Says where the node is, and does what it is told until it is told no more.
+fn serve(node: &Node, pacer: Pacer, lull: &Lull) {
+    let handle = node.handle();
+    let address = |address: Option<std::net::SocketAddr>| address.expect("its layers are ready");
+    println!("up {} {}", address(handle.gncl_address()), address(handle.ndl_address()));
+    let (numbers, clerk) = (pacer.numbers.clone(), pacer.clerk.clone());
+    let pacing = std::thread::spawn(move || pacer.run());
+    for line in std::io::stdin().lock().lines().map_while(Result::ok) {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        match words[..] {
+            ["rate", rate] => numbers.rate.store(rate.parse().expect("a number"), Ordering::Relaxed),
+            ["panic"] => println!("ready {}", panic_gncl(&handle).as_nanos()),
+            ["forget-gap"] => lull.longest_ns.store(0, Ordering::Relaxed),
+            ["gap"] => println!("gap {}", lull.longest_ns.load(Ordering::Relaxed)),
+            ["say"] => clerk.say(),
+            ["quiet"] => {
+                numbers.quiet.store(true, Ordering::Relaxed);
+                until("the pacer ends", || pacing.is_finished().then_some(()));
+                clerk.say();
+                println!("quiet");
+            }
+            _ => panic!("{line:?} is nothing that a node is told"),
+        }
+    }
+    clerk.say();
+}
+
+/// GNCL panics; returns the time until it was ready again.
+fn panic_gncl(node: &NodeHandle) -> Duration {
+    let lives = || node.lives("GNCL").expect("every node has it");
+    let before = lives().readies;
+    node.inject("GNCL", Fault::panic()).expect("every node has it");
+    until("GNCL is ready again", || (lives().readies > before).then_some(()));
+    let lives = lives();
+    lives.ready.expect("it is ready").since(lives.struck.expect("it was struck"))
+}

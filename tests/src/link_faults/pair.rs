@@ -1,0 +1,275 @@
+//! Both nodes with the faulty network between them, as their director sees them.
+
+use std::{
+    net::{Ipv4Addr, SocketAddr},
+    num::NonZeroU32,
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError,
+        mpsc::{Receiver, SyncSender, sync_channel},
+    },
+    time::{Duration, Instant},
+};
+
+use rustix::process::Signal;
+use sinew::Class;
+
+use super::{Plan, trouble::Trouble};
+use crate::{
+    DEADLINE, OwnDirectory,
+    clients::Performer,
+    history::{Fault, History, Party, Station, Verdict},
+    proxy::{Counts, Cut, Door, Proxy, Side},
+    unique, until,
+};
+
+/// The one that sends most.
+const FIRST: Station = 1;
+/// The other.
+const SECOND: Station = 2;
+
+/// The doors: to the second node's GNCL, to the first's, to the second's NDL.
+const TO_SECOND: usize = 0;
+const TO_FIRST: usize = 1;
+const TO_SECOND_UDP: usize = 2;
+
+type Shared = Arc<Mutex<History>>;
+
+fn lock(history: &Shared) -> MutexGuard<'_, History> {
+    history.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// One of the nodes, in the life that it is in.
+struct Member {
+    station: Station,
+    life: u32,
+    interface: Ipv4Addr,
+    performer: Performer,
+    answers: Receiver<String>,
+}
+
+pub(super) struct Pair {
+    plan: Plan,
+    proxy: Proxy,
+    history: Shared,
+    members: [Member; 2],
+    directory: OwnDirectory,
+}
+
+impl Pair {
+    /// Starts the nodes, and lets messages flow.
+    pub(super) fn start(plan: &Plan) -> Self {
+        let listen = SocketAddr::from(([127, 0, 0, 1], 0));
+        let door = |side, datagrams| Door { side, listen, datagrams };
+        let doors = [door(Side::Right, false), door(Side::Left, false), door(Side::Right, true)];
+        let proxy = Proxy::start(&doors, plan.seed).expect("ports on loopback");
+        for side in [Side::Left, Side::Right] {
+            proxy.change(side, |faults| {
+                faults.one_flip_in = plan.one_flip_in.and_then(NonZeroU32::new);
+            });
+        }
+        let (history, directory) = (Shared::default(), OwnDirectory::new());
+        let members = [FIRST, SECOND].map(|station| {
+            let interface = own_interface();
+            start((station, 1), interface, (plan, &proxy), (&history, &directory))
+        });
+        let mut pair = Self { plan: plan.clone(), proxy, history, members, directory };
+        [FIRST, SECOND].into_iter().for_each(|station| pair.begin(station));
+        pair.wait_for_flow();
+        pair
+    }
+
+    fn member(&mut self, station: Station) -> &mut Member {
+        &mut self.members[usize::from(station - FIRST)]
+    }
+
+    fn party(&self, station: Station) -> Party {
+        Party { station, life: self.members[usize::from(station - FIRST)].life }
+    }
+
+    /// Messages flow from `station` as soon as it sees the other.
+    fn begin(&mut self, station: Station) {
+        let rate = if station == FIRST { self.plan.rate } else { self.plan.back_rate };
+        self.member(station).performer.tell(&format!("rate {rate}"));
+    }
+
+    /// The last number that has come from the first node.
+    fn last_got(&self, from: Station, to: Station) -> u64 {
+        lock(&self.history).last_got(self.party(from), to, Class::Bulk)
+    }
+
+    /// Waits until messages that are sent after this come, both ways.
+    ///
+    /// What is sent is written down a little later: what was under way then is less than what this waits for.
+    pub(super) fn wait_for_flow(&self) {
+        let ways = [(FIRST, SECOND, self.plan.rate), (SECOND, FIRST, self.plan.back_rate)];
+        for (from, to, rate) in ways.into_iter().filter(|(.., rate)| *rate > 0) {
+            let party = self.party(from);
+            let upto = lock(&self.history).last_sent(party, to, Class::Bulk) + rate / 200 + 1;
+            until(&format!("messages from {party:?} flow"), || {
+                (self.last_got(from, to) >= upto).then_some(())
+            });
+        }
+    }
+
+    pub(super) fn forget_gap(&mut self) {
+        self.member(SECOND).performer.tell("forget-gap");
+    }
+
+    /// The longest time without a message at the second node since it was told to forget the last.
+    pub(super) fn gap(&mut self) -> Duration {
+        let nanos = self.member(SECOND).ask("gap");
+        Duration::from_nanos(nanos.parse().expect("a number"))
+    }
+
+    /// Something happens. Returns when it is over.
+    pub(super) fn suffer(&mut self, trouble: Trouble, hold: Duration) {
+        match trouble {
+            Trouble::Cut => self.cut(Cut::Reset),
+            Trouble::Finish => self.cut(Cut::Finish),
+            Trouble::PanicSender => drop(self.member(FIRST).ask_as("panic", "ready")),
+            Trouble::PanicReceiver => drop(self.member(SECOND).ask_as("panic", "ready")),
+            Trouble::Stall => self.hold(&[Side::Left, Side::Right], hold, |faults| faults.stalled = true),
+            Trouble::PartThere => self.hold(&[Side::Right], hold, |faults| faults.parted = true),
+            Trouble::PartBack => self.hold(&[Side::Left], hold, |faults| faults.parted = true),
+            Trouble::Freeze => {
+                self.member(SECOND).performer.freeze();
+                std::thread::sleep(hold);
+                self.member(SECOND).performer.signal(Signal::CONT);
+            }
+            Trouble::KillReceiver => self.replace(SECOND),
+            Trouble::KillSender => self.replace(FIRST),
+        }
+    }
+
+    fn cut(&self, how: Cut) {
+        // One that is being made at this moment is not there yet.
+        until("there is a connection", || (self.proxy.counts().open > 0).then_some(()));
+        let before = self.proxy.counts();
+        self.proxy.cut(how);
+        until("it is cut", || {
+            let now = self.proxy.counts();
+            (now.cut > before.cut || now.made > before.made).then_some(())
+        });
+    }
+
+    fn hold(&self, sides: &[Side], hold: Duration, change: impl Fn(&mut crate::proxy::Faults)) {
+        sides.iter().for_each(|side| self.proxy.change(*side, &change));
+        std::thread::sleep(hold);
+        for side in sides {
+            self.proxy.change(*side, |faults| (faults.stalled, faults.parted) = (false, false));
+        }
+    }
+
+    /// Kills a node, and starts its next life. As on a host of its own, nobody listens in between.
+    fn replace(&mut self, station: Station) {
+        let party = self.party(station);
+        self.proxy.refuse(true);
+        self.member(station).performer.kill_now();
+        lock(&self.history).killed(party);
+        let interface = self.member(station).interface;
+        let next = start(
+            (station, party.life + 1),
+            interface,
+            (&self.plan, &self.proxy),
+            (&self.history, &self.directory),
+        );
+        *self.member(station) = next;
+        self.proxy.refuse(false);
+        self.begin(station);
+    }
+
+    /// No more is sent; waits until what was sent has arrived, and says what became of everything.
+    pub(super) fn finish(mut self) -> (Verdict, Counts) {
+        for side in [Side::Left, Side::Right] {
+            self.proxy.change(side, |faults| faults.one_flip_in = None);
+        }
+        self.members.iter_mut().for_each(|member| member.performer.tell("quiet"));
+        self.members.iter_mut().for_each(|member| drop(member.wait_for("quiet")));
+        let end = Instant::now() + DEADLINE;
+        let mut verdict = lock(&self.history).verdict();
+        // What is on its way counts as lost as long as it is.
+        while verdict.count(Fault::Lost) > 0 && Instant::now() < end {
+            self.members.iter_mut().for_each(|member| member.performer.tell("say"));
+            std::thread::sleep(Duration::from_millis(100));
+            verdict = lock(&self.history).verdict();
+        }
+        let network = self.proxy.counts();
+        for member in self.members {
+            let status = member.performer.end();
+            assert!(status.success(), "node {} ended with {status}", member.station);
+        }
+        (verdict, network)
+    }
+}
+
+/// A loopback address that no other test of this host has.
+fn own_interface() -> Ipv4Addr {
+    let [_, b, c, d] = unique().to_be_bytes();
+    Ipv4Addr::new(127, 64 | b & 63, c, d.clamp(1, 254))
+}
+
+fn start(
+    (station, life): (Station, u32),
+    interface: Ipv4Addr,
+    (plan, proxy): (&Plan, &Proxy),
+    (history, directory): (&Shared, &OwnDirectory),
+) -> Member {
+    let (announce, seeds) = if station == FIRST {
+        (proxy.address(TO_FIRST), format!("[\"{}\"]", proxy.address(TO_SECOND_UDP)))
+    } else {
+        (proxy.address(TO_SECOND), "[]".to_owned())
+    };
+    let text = format!(
+        "[node]\nname = \"node-{station}\"\nproject = \"link faults\"\nmailbox_capacity = 65536\n\
+         [gncl]\nannounce = \"{announce}\"\nqueue_capacity = 65536\n\
+         [ndl]\ninterface = \"{interface}\"\nmulticast = false\nmdns_port = false\nseeds = {seeds}\n\
+         [supervision]\nlayer_restarts_max = 1000000\nlayer_window_ms = 10\n"
+    );
+    let path = directory.join(&format!("node-{station}.toml"));
+    std::fs::write(&path, text).expect("the scenario's own directory");
+    let arguments =
+        [u64::from(station), life.into(), u64::from(FIRST + SECOND - station), plan.filling as u64];
+    let arguments: Vec<String> =
+        [path.display().to_string()].into_iter().chain(arguments.map(|number| number.to_string())).collect();
+    let (say, answers) = sync_channel(64);
+    let (party, notes) = (Party { station, life }, history.clone());
+    let hear = move |line: &str| hear(party, &notes, &say, line);
+    let performer = Performer::start(&plan.program, "node", &arguments, &std::env::temp_dir(), hear);
+    let member = Member { station, life, interface, performer, answers };
+    let places = member.wait_for("up");
+    let places: Vec<SocketAddr> =
+        places.split_whitespace().map(|place| place.parse().expect("an address")).collect();
+    if station == FIRST {
+        proxy.lead(TO_FIRST, places[0]);
+    } else {
+        proxy.lead(TO_SECOND, places[0]);
+        proxy.lead(TO_SECOND_UDP, places[1]);
+    }
+    member
+}
+
+fn hear(party: Party, history: &Shared, say: &SyncSender<String>, line: &str) {
+    match line.parse() {
+        Ok(note) => lock(history).note(party, note),
+        // Nobody waits for its answers any more when the director is done.
+        Err(_) => drop(say.send(line.to_owned())),
+    }
+}
+
+impl Member {
+    fn wait_for(&self, word: &str) -> String {
+        let answer = self.answers.recv_timeout(DEADLINE);
+        let answer = answer.unwrap_or_else(|_| panic!("node {} does not say {word:?}", self.station));
+        let rest = answer.strip_prefix(word);
+        rest.unwrap_or_else(|| panic!("{answer:?} instead of {word:?}")).trim().to_owned()
+    }
+
+    fn ask(&mut self, question: &str) -> String {
+        self.ask_as(question, question)
+    }
+
+    fn ask_as(&mut self, question: &str, answer: &str) -> String {
+        self.performer.tell(question);
+        self.wait_for(answer)
+    }
+}

@@ -1,0 +1,48 @@
+//! Faults of the link between two nodes under load, in short: the long form is the program `link_faults`.
+
+use std::time::Duration;
+
+use sinew_tests::{
+    link_faults::{Plan, Report, Trouble, run},
+    program,
+};
+
+/// What happens at 3,000 messages a second.
+fn report(troubles: &[Trouble], faults: u64) -> Report {
+    let plan = Plan {
+        program: program("link_faults"),
+        rate: 3_000,
+        back_rate: 300,
+        filling: 128,
+        troubles: troubles.to_vec(),
+        faults,
+        spacing: Duration::from_millis(40),
+        hold: Duration::from_millis(500),
+        one_flip_in: None,
+        seed: u64::from(std::process::id()),
+    };
+    let report = run(&plan);
+    println!("{report}");
+    report
+}
+
+#[test]
+fn cuts_and_panics_of_gncl_on_both_sides_lose_double_and_reorder_nothing() {
+    let troubles = [Trouble::Cut, Trouble::PanicSender, Trouble::Finish, Trouble::PanicReceiver];
+    let report = report(&troubles, 40);
+    assert!(report.holds() && report.verdict.is_perfect(), "{report}");
+    assert!(report.verdict.asked > 0 && report.network.cut > 0, "{report}");
+}
+
+#[test]
+fn a_link_that_is_stalled_or_parted_for_less_than_a_loss_takes_loses_nothing() {
+    let report = report(&[Trouble::Stall, Trouble::PartThere, Trouble::PartBack], 3);
+    assert!(report.verdict.is_perfect(), "{report}");
+}
+
+#[test]
+fn of_a_killed_node_every_confirmed_message_has_its_outcome() {
+    let report = report(&[Trouble::KillReceiver, Trouble::KillSender], 4);
+    assert!(report.holds(), "{report}");
+    assert!(report.verdict.got > 0 && report.verdict.asked > 0, "{report}");
+}
