@@ -1,0 +1,203 @@
+//! Rings without room, long messages, and the bounds on links and their memory.
+
+use super::*;
+use crate::api::{direct::budget::Budget, routes::LINKS_MAX};
+
+#[test]
+fn of_a_stream_the_newest_value_waits_for_room_in_the_ring() {
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let (mut one, mut other) = (endpoint(&node), endpoint(&node));
+    link(&mut one, &mut other);
+    // Nobody reads meanwhile, and nobody waits.
+    for number in 1..=1_000 {
+        one.send(other.tid(), &Setpoint(number)).unwrap();
+    }
+    let mut last = 0;
+    let deadline = Time::now() + WATCHDOG;
+    while last < 1_000 {
+        assert!(Time::now() < deadline, "waited for the newest value; the last was {last}");
+        drop(one.receive(Duration::ZERO).unwrap());
+        let Some(received) = other.receive(Duration::from_millis(1)).unwrap() else { continue };
+        let Setpoint(number) = received.decode().unwrap();
+        assert!(number > last, "{number} came after {last}");
+        last = number;
+    }
+}
+
+#[test]
+fn a_peer_that_takes_nothing_costs_a_sender_its_patience_and_not_the_link() {
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let mut one = register(&node, Registration::new().direct(true).patience(Duration::from_millis(10)));
+    let mut other = endpoint(&node);
+    link(&mut one, &mut other);
+    let mut taken = 0;
+    let stalled = loop {
+        match one.send(other.tid(), &Counted(taken)) {
+            Ok(()) => taken += 1,
+            Err(error) => break error,
+        }
+        assert!(taken < 4_096, "a ring of 4,096 bytes takes no end of messages");
+    };
+    assert!(matches!(stalled, ApiError::Stalled(_)), "{stalled}");
+    for number in 0..taken {
+        let received = other.receive(WATCHDOG).unwrap().expect("what was taken comes");
+        assert_eq!(received.decode::<Counted>().unwrap(), Counted(number));
+    }
+    one.send(other.tid(), &Counted(taken)).unwrap();
+    assert!(other.receive(WATCHDOG).unwrap().is_some());
+}
+
+#[test]
+fn a_long_message_goes_in_pieces_through_a_short_ring() {
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let (mut one, mut other) = (endpoint(&node), endpoint(&node));
+    link(&mut one, &mut other);
+    let to = other.tid();
+    let kind = Kind::named("test.long");
+    let sending = thread::spawn(move || {
+        let mut buffer = one.create_message(to, kind, 100_000).unwrap();
+        buffer.fill(7);
+        one.send_message(buffer).unwrap();
+        one
+    });
+    let received = other.receive(WATCHDOG).unwrap().expect("a message");
+    assert!(received.bytes().len() == 100_000 && received.bytes().iter().all(|byte| *byte == 7));
+    sending.join().unwrap();
+}
+
+#[test]
+fn two_that_wait_for_room_in_each_others_rings_take_in_what_is_there_meanwhile() {
+    // given: rings that hold a fraction of what each sends before it receives anything
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let wanted = || Registration::new().direct(true).patience(WATCHDOG / 2);
+    let (mut one, mut other) = (register(&node, wanted()), register(&node, wanted()));
+    link(&mut one, &mut other);
+    let (one_tid, other_tid, number) = (one.tid(), other.tid(), one.direct.open[0].number);
+    // when
+    let exchange = |endpoint: &mut Endpoint, to| {
+        for _ in 0..20 {
+            let long = endpoint.create_message(to, Kind::named("test.long"), 20_000).unwrap();
+            endpoint.send_message(long).unwrap();
+        }
+        for _ in 0..20 {
+            assert_eq!(endpoint.receive(WATCHDOG).unwrap().expect("a message").bytes().len(), 20_000);
+        }
+    };
+    thread::scope(|scope| {
+        scope.spawn(|| exchange(&mut one, other_tid));
+        exchange(&mut other, one_tid);
+    });
+    // then
+    assert_eq!(one.direct.open[0].number, number, "nobody lost patience within a frame");
+}
+
+#[test]
+fn of_a_long_message_that_a_peer_does_not_take_in_time_the_rest_goes_out_with_later_calls() {
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let mut one = register(&node, Registration::new().direct(true).patience(Duration::from_millis(10)));
+    let mut other = endpoint(&node);
+    link(&mut one, &mut other);
+    // when: nobody reads
+    let mut long = one.create_message(other.tid(), Kind::named("test.long"), 20_000).unwrap();
+    long.fill(7);
+    one.send_message(long).unwrap();
+    let stalled = one.send(other.tid(), &Counted(1)).unwrap_err();
+    assert!(matches!(stalled, ApiError::Stalled(_)), "{stalled}");
+    // then
+    let deadline = Time::now() + WATCHDOG;
+    let received = loop {
+        assert!(Time::now() < deadline, "waited for the long message");
+        assert!(one.receive(Duration::ZERO).unwrap().is_none());
+        if let Some(received) = other.receive(Duration::from_millis(1)).unwrap() {
+            break received;
+        }
+    };
+    assert!(received.bytes().len() == 20_000 && received.bytes().iter().all(|byte| *byte == 7));
+    assert!(has_link(&one, &other) && has_link(&other, &one), "the link has not ended");
+    one.send(other.tid(), &Counted(2)).unwrap();
+    assert_eq!(other.receive(WATCHDOG).unwrap().expect("a message").decode::<Counted>().unwrap(), Counted(2));
+}
+
+#[test]
+fn links_are_bounded_and_what_is_above_goes_through_the_node() {
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let mut hub = endpoint(&node);
+    let mut others: Vec<_> = (0..=LINKS_MAX).map(|_| endpoint(&node)).collect();
+    let deadline = Time::now() + WATCHDOG * 3;
+    while hub.direct.open.len() < LINKS_MAX {
+        assert!(Time::now() < deadline, "waited for {LINKS_MAX} links; there are {}", hub.direct.open.len());
+        for other in &mut others {
+            hub.send(other.tid(), &Counted(1)).unwrap();
+            drop(other.receive(Duration::ZERO).unwrap());
+            drop(hub.receive(Duration::ZERO).unwrap());
+        }
+    }
+    for other in &mut others {
+        hub.send(other.tid(), &Hurried(9)).unwrap();
+        while other.receive(WATCHDOG).unwrap().expect("a message").kind() != Hurried::KIND {}
+    }
+    assert_eq!(hub.direct.open.len(), LINKS_MAX);
+}
+
+#[test]
+fn when_the_rings_of_a_process_have_their_most_in_bytes_messages_go_through_the_node() {
+    let node = TestNode::start();
+    let (mut one, mut other, mut third) = (endpoint(&node), endpoint(&node), endpoint(&node));
+    // given: room for one ring of either
+    let budgets = [&mut one, &mut other].map(|endpoint| {
+        let budget = Box::leak(Box::new(Budget::new(endpoint.direct.terms.ring_bytes * 3 / 2)));
+        endpoint.direct.terms.budget = budget;
+        &*budget
+    });
+    link(&mut one, &mut other);
+    assert!(budgets[0].held() > 0 && budgets[1].held() > 0);
+    // when
+    for _ in 0..20 {
+        one.send(third.tid(), &Counted(1)).unwrap();
+        drop(third.receive(WATCHDOG).unwrap().expect("a message"));
+        third.send(other.tid(), &Counted(1)).unwrap();
+        drop(other.receive(WATCHDOG).unwrap().expect("a message"));
+    }
+    // then
+    assert_eq!((one.direct.open.len(), other.direct.open.len()), (1, 1));
+    assert!(third.direct.is_empty());
+    drop(one);
+    let deadline = Time::now() + WATCHDOG;
+    while !other.direct.is_empty() {
+        assert!(Time::now() < deadline, "waited for the end of the link");
+        assert!(other.receive(Duration::from_millis(1)).unwrap().is_none());
+    }
+    assert_eq!(budgets.map(Budget::held), [0, 0], "what a link took is given back");
+}
+
+#[test]
+fn a_peer_that_takes_nothing_costs_a_sender_its_patience_once_and_not_with_each_message() {
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let patience = WATCHDOG / 20;
+    let mut one = register(&node, Registration::new().direct(true).patience(patience));
+    let (mut other, mut third) = (endpoint(&node), endpoint(&node));
+    link(&mut one, &mut other);
+    while one.send(other.tid(), &Counted(1)).is_ok() {}
+    // when
+    let deadline = Time::now() + WATCHDOG;
+    for number in 0..100 {
+        assert!(
+            Time::now() < deadline,
+            "{number} messages were refused, and each after the sender's patience"
+        );
+        let refused = one.send(other.tid(), &Counted(2)).unwrap_err();
+        assert!(matches!(refused, ApiError::Stalled(_)), "{refused}");
+        // then: others are served
+        one.send(third.tid(), &Counted(number)).unwrap();
+        assert_eq!(
+            third.receive(WATCHDOG).unwrap().expect("a message").decode::<Counted>().unwrap(),
+            Counted(number)
+        );
+    }
+    // It takes again, and is waited for again.
+    while let Some(received) = other.receive(Duration::ZERO).unwrap() {
+        drop(received);
+    }
+    one.send(other.tid(), &Counted(3)).unwrap();
+    assert_eq!(other.receive(WATCHDOG).unwrap().expect("a message").decode::<Counted>().unwrap(), Counted(3));
+}
