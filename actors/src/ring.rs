@@ -2,7 +2,7 @@
 //!
 //! What goes through a ring is the byte stream that would go through the socket: the records' bytes one after the other
 //! are frames, without checksums. A frame that fits into half the ring is one record, so that it can be written in place
-//! and is read in one go; a longer one comes in pieces.
+//! and is read in one go; a longer one comes in pieces. A record without bytes takes back the frame that began before it.
 
 use std::{
     io::{self, IoSlice},
@@ -111,6 +111,15 @@ pub(crate) fn write(producer: &mut Producer, parts: &[IoSlice<'_>]) -> Result<us
     Ok(length)
 }
 
+/// Takes back the frame of which only a part is written: the reader forgets that part.
+///
+/// # Errors
+/// [`LoanError::Full`] when there is no room for it now.
+pub(crate) fn withdraw(producer: &mut Producer) -> Result<(), LoanError> {
+    producer.loan(0)?.publish();
+    Ok(())
+}
+
 /// Fills `target` from the beginning of `parts`, which are at least as long.
 pub(crate) fn gather(parts: &[IoSlice<'_>], mut target: &mut [u8]) {
     for part in parts {
@@ -143,17 +152,22 @@ pub(crate) enum Taken {
 pub(crate) struct RingFrames {
     codec: FrameCodec,
     buffer: BytesMut,
+    /// Bytes of `buffer` that are known to be whole frames: where a record without bytes came, it was looked for their end.
+    whole: usize,
 }
 
 impl RingFrames {
     /// Takes payloads of at most `payload_max` bytes.
     pub(crate) fn new(payload_max: usize) -> Self {
-        Self { codec: FrameCodec::in_memory(payload_max), buffer: BytesMut::new() }
+        Self { codec: FrameCodec::in_memory(payload_max), buffer: BytesMut::new(), whole: 0 }
     }
 
     /// The next frame of what was taken.
     pub(crate) fn next(&mut self) -> Result<Option<Message>, FrameError> {
-        self.codec.decode(&mut self.buffer)
+        let before = self.buffer.len();
+        let next = self.codec.decode(&mut self.buffer);
+        self.whole = self.whole.saturating_sub(before - self.buffer.len());
+        next
     }
 
     /// Whether [`next`](Self::next) has something to say: a frame, or that there is none to be had.
@@ -167,6 +181,9 @@ impl RingFrames {
         let mut taken = Taken::Nothing;
         for _ in 0..RECORDS_A_LOOK {
             let Some(lent) = consumer.receive()? else { break };
+            if lent.is_empty() {
+                self.forget_part();
+            }
             let before = self.buffer.len();
             self.buffer.resize(before + lent.len(), 0);
             lent.copy_to(&mut self.buffer[before..]);
@@ -176,5 +193,61 @@ impl RingFrames {
             }
         }
         Ok(taken)
+    }
+
+    /// Forgets the frame that has begun and is not whole.
+    fn forget_part(&mut self) {
+        while let Some(head) = self.buffer.get(self.whole..).and_then(<[u8]>::first_chunk) {
+            // What is no frame is said by `next`.
+            let Ok(length) = Header::payload_len(head) else { return };
+            let end = self.whole + HEADER_LEN + length as usize;
+            if end > self.buffer.len() {
+                break;
+            }
+            self.whole = end;
+        }
+        self.buffer.truncate(self.whole);
+    }
+}
+
+#[cfg(all(test, target_os = "linux"))]
+mod tests {
+    use sinew_runtime::{tid::Tid, wire::Kind};
+
+    use super::*;
+
+    fn ring() -> (Producer, Consumer) {
+        let make = || Region::create(Capacity::MIN, BellKind::Futex).expect("a region");
+        let ((left, left_offer), (right, right_offer)) = (make(), make());
+        let (producer, _) = left.connect(right_offer, &Terms::default()).expect("an honest offer");
+        let (_, consumer) = right.connect(left_offer, &Terms::default()).expect("an honest offer");
+        (producer, consumer)
+    }
+
+    fn frame(length: usize) -> Vec<u8> {
+        let header = Header::new(Kind::named("test"), Tid::NONE, Tid::BROADCAST);
+        [&header.encode_in_memory(length)[..], &vec![7; length]].concat()
+    }
+
+    #[test]
+    fn a_record_without_bytes_takes_back_the_frame_that_has_begun_and_no_other() {
+        let (whole, begun) = (frame(100), frame(1_000));
+        for part in [1, 7, 8, HEADER_LEN, HEADER_LEN + 999] {
+            // given
+            let ((mut producer, mut consumer), mut frames) = (ring(), RingFrames::new(4_096));
+            for bytes in [&whole, &whole, &begun[..part].to_vec()] {
+                producer.send(bytes).expect("there is room");
+            }
+            // when
+            withdraw(&mut producer).expect("there is room");
+            withdraw(&mut producer).expect("there is room");
+            producer.send(&whole).expect("there is room");
+            // then
+            assert_eq!(frames.take(&mut consumer, usize::MAX).expect("an honest peer"), Taken::Some);
+            for _ in 0..3 {
+                assert_eq!(frames.next().expect("a frame").expect("a frame").payload.len(), 100);
+            }
+            assert!(frames.next().expect("nothing wrong").is_none(), "{part} bytes had been written");
+        }
     }
 }

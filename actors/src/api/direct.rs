@@ -98,18 +98,29 @@ pub(super) struct Direct {
     flush_at: Time,
     /// A caller writes a frame there, and wants to know first when that is done.
     writing: Option<LinkNumber>,
+    /// What was half written there when the link ended.
+    cut: Option<Message>,
 }
 
 /// What became of a message that was to go directly.
 pub(super) enum Sent {
     /// It is in the ring, or waits for room as the newest of its Stream.
     Taken,
-    /// Part of it is in the ring, and the rest follows when there is room.
+    /// Part of it is in the ring: [`Direct::write_on`].
     Begun,
     /// There is no room.
     Full(Draft),
     /// The peer has gone.
     Gone(Draft),
+}
+
+/// How far a message is that was begun.
+pub(super) enum Writing {
+    Whole,
+    /// There is no room for more.
+    Part,
+    /// The link has ended before it was whole: nobody has received it.
+    Cut(Draft),
 }
 
 /// The node's link, and the numbers by which this endpoint knows what it has asked.
@@ -161,6 +172,7 @@ impl Direct {
             hear_at: Time::ZERO,
             flush_at: Time::ZERO,
             writing: None,
+            cut: None,
         }
     }
 
@@ -209,7 +221,10 @@ impl Direct {
             }
             Err((error, _)) => Err(error),
             Ok(Put::Taken) => Ok(Sent::Taken),
-            Ok(Put::Begun) => Ok(Sent::Begun),
+            Ok(Put::Begun) => {
+                self.cut = None;
+                Ok(Sent::Begun)
+            }
             Ok(Put::Full(message)) => Ok(Sent::Full(message.into())),
         }
     }
@@ -231,9 +246,20 @@ impl Direct {
         self.standing(number).map_or(0, Standing::taken)
     }
 
-    /// Whether nothing is left half written on a link, or it has ended.
-    pub(super) fn is_whole(&mut self, number: LinkNumber) -> bool {
-        self.standing(number).is_none_or(Standing::is_whole)
+    /// Writes on with what was begun on a link.
+    pub(super) fn write_on(&mut self, number: LinkNumber) -> Writing {
+        match self.standing(number).map(Standing::is_whole) {
+            Some(true) => Writing::Whole,
+            Some(false) => Writing::Part,
+            None => self.cut.take().map_or(Writing::Whole, |message| Writing::Cut(message.into())),
+        }
+    }
+
+    /// Takes back what was begun on a link: the peer receives nothing of it.
+    pub(super) fn withdraw(&mut self, number: LinkNumber) {
+        if let Some(link) = self.standing(number) {
+            link.withdraw();
+        }
     }
 
     /// Waits until a link has room for the beginning of a frame of so many bytes, or ends, or `within` this time.
@@ -276,7 +302,7 @@ impl Direct {
         self.writing = link;
     }
 
-    fn flush(&mut self) {
+    pub(super) fn flush(&mut self) {
         let writing = self.writing;
         for link in self.open.iter_mut().chain(&mut self.held).filter(|link| Some(link.number) != writing) {
             link.flush();
@@ -324,6 +350,30 @@ impl Direct {
         }
         self.flush_at = Time::now() + OWED_AGAIN;
         deadline.min(self.flush_at)
+    }
+
+    /// Whether what waits for room on some link may still find it.
+    pub(super) fn owes(&self) -> bool {
+        self.owing().next().is_some()
+    }
+
+    /// Waits for room on a link that owes something, for `within` at most.
+    pub(super) fn await_owed(&mut self, within: Duration) {
+        let first = self.owing().next().map(|link| link.number);
+        if let Some(link) = first.and_then(|number| self.standing(number)) {
+            link.await_owed(within);
+        }
+    }
+
+    /// Those that owe something to a peer that is there and takes something.
+    fn owing(&self) -> impl Iterator<Item = &Standing> {
+        let links = self.open.iter().chain(&self.held);
+        links.filter(|link| link.owes() && !link.is_stalled && !socket::has_hung_up(&link.socket))
+    }
+
+    /// Says what waits for room and will find none any more.
+    pub(super) fn tell_unsent(&self) {
+        self.open.iter().chain(&self.held).for_each(Standing::tell_unsent);
     }
 
     /// What the end of a wait for the node and the open links says about the links.
@@ -398,6 +448,9 @@ impl Direct {
 
     /// Ends a link: the peer sees its socket hang up.
     pub(super) fn end(&mut self, peer: Tid, number: LinkNumber, now: Time) {
+        if self.writing == Some(number) {
+            self.cut = self.standing(number).and_then(|link| link.cut());
+        }
         self.open.retain(|link| link.number != number);
         self.held.retain(|link| link.number != number);
         self.offered.retain(|link| link.number != number);

@@ -24,6 +24,8 @@ use crate::lncl::payload::{self, Group, Registered, Resolve};
 
 /// Time that the node has to answer what it answers at once.
 const PROMPT: Duration = Duration::from_secs(2);
+/// Time that what waits for room on direct links has to find it when an endpoint is dropped by a thread.
+const PARTING: Duration = Duration::from_millis(20);
 pub(super) const LNCL: Tid = payload::lncl_of(NodeAddress::HERE);
 
 /// A registered transport address: sends and receives, from one thread at a time.
@@ -272,6 +274,7 @@ impl Endpoint {
 
     pub(super) async fn take_leave(&mut self) -> Result<(), ApiError> {
         self.inbox.close();
+        self.part(self.home.options.patience).await;
         if self.ended.is_some() {
             // The connection has taken the address with it.
             return Ok(());
@@ -315,6 +318,11 @@ impl Drop for Endpoint {
         // What has come and was not looked at is refused, too. An error ends the connection, as this does.
         let _ = self.take_in(None, WhenFull::Refuse);
         self.inbox.close();
+        if matches!(self.form, Form::Thread) {
+            at_once(self.part(PARTING));
+        }
+        self.direct.flush();
+        self.direct.tell_unsent();
         // A message that is still in some thread's hand ends as `Failed`.
         self.writer.close();
     }

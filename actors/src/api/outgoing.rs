@@ -11,7 +11,7 @@ use sinew_runtime::{
 
 use super::{
     ApiError, Endpoint, Received,
-    direct::{Sent, ToNode},
+    direct::{Sent, ToNode, Writing},
     form::Form,
     inbox::{Answer, Awaited},
     incoming::{Wanted, WhenFull},
@@ -171,7 +171,7 @@ impl Endpoint {
     /// what others send to it: two that wait for room in each other's rings would wait for ever.
     ///
     /// # Errors
-    /// [`ApiError::Stalled`]: nothing of it was written. Of what was written in part the rest goes out with later calls.
+    /// [`ApiError::Stalled`]: nothing of it is received. What was written of a long one is taken back.
     async fn send_on(
         &mut self,
         link: LinkNumber,
@@ -186,13 +186,22 @@ impl Endpoint {
         let (mut left, mut pause) = (Some(draft), ROOM_PAUSE);
         loop {
             left = match left {
-                None if self.direct.is_whole(link) => return Ok(None),
-                None => None,
+                None => match self.direct.write_on(link) {
+                    Writing::Whole => return Ok(None),
+                    Writing::Part => None,
+                    Writing::Cut(back) => return Ok(Some(back)),
+                },
                 Some(draft) => match self.direct.send(link, draft, Time::now())? {
                     Sent::Taken => return Ok(None),
                     Sent::Gone(back) => return Ok(Some(back)),
                     Sent::Full(back) => Some(back),
-                    Sent::Begun => None,
+                    Sent::Begun => {
+                        if has_stalled && !limit.is_in_all() {
+                            // It takes something again.
+                            waiting = Waiting::new(limit);
+                        }
+                        None
+                    }
                 },
             };
             let now = Time::now();
@@ -200,7 +209,10 @@ impl Endpoint {
                 if waiting.is_out_of_patience(now) {
                     self.direct.has_stalled(link);
                 }
-                return left.map_or(Ok(None), |_| Err(waiting.in_vain()));
+                if left.is_none() {
+                    self.direct.withdraw(link);
+                }
+                return Err(waiting.in_vain());
             };
             self.take_in_while_writing(link);
             match self.form {
@@ -209,6 +221,23 @@ impl Endpoint {
                 Form::Reactor(_) => self.wait(until.min(now + pause)).await,
             }
             pause = (pause * 2).min(NAP);
+        }
+    }
+
+    /// Before this endpoint goes: gives peers that take something the time to take what waits for room, `within` this time.
+    /// What comes meanwhile is refused.
+    pub(super) async fn part(&mut self, within: Duration) {
+        let deadline = Time::now() + within;
+        self.direct.flush();
+        while self.direct.owes() && Time::now() < deadline {
+            match self.form {
+                Form::Thread => self.direct.await_owed(ROOM_PAUSE),
+                Form::Reactor(_) => self.wait(deadline.min(Time::now() + ROOM_PAUSE)).await,
+            }
+            // A peer that waits for room itself takes nothing until it has that.
+            let _ = self.take_in(None, WhenFull::Refuse);
+            self.inbox.close();
+            self.direct.flush();
         }
     }
 

@@ -12,7 +12,7 @@ use std::{
 use sinew_runtime::{
     outcome::{Outcome, ReceiptSink, Rejection, Ticket},
     tid::Tid,
-    wire::{Class, Flags, Kind, Message},
+    wire::{Class, Flags, HEADER_LEN, Kind, Message},
 };
 use sinew_shm::{Armed, Consumer, Ends, HangUp};
 
@@ -65,7 +65,7 @@ pub(super) struct Pair {
 pub(in crate::api) enum Put {
     /// It is in the ring, or waits for room as the newest of its Stream.
     Taken,
-    /// Part of it is in the ring: the rest is written when there is room.
+    /// Part of it is in the ring: the rest is written when there is room, unless it is withdrawn.
     Begun,
     /// Nothing of it was written.
     Full(Message),
@@ -203,6 +203,18 @@ impl Standing {
         self.writer.pay();
     }
 
+    /// Takes back what is left half written: the peer receives nothing of it.
+    pub(super) fn withdraw(&mut self) {
+        if let Some(rest) = &mut self.rest {
+            rest.withdraw();
+        }
+    }
+
+    /// The message that is half written, which the link's end cuts.
+    pub(super) fn cut(&self) -> Option<Message> {
+        self.rest.as_ref().and_then(Rest::cut)
+    }
+
     /// Writes on with a long frame; whether none is left half written.
     pub(in crate::api) fn is_whole(&mut self) -> bool {
         // An error shows itself again when the ring is read: the socket is closed.
@@ -225,6 +237,21 @@ impl Standing {
         match &mut self.rest {
             Some(rest) => rest.await_room(within),
             None => self.writer.await_room(length, within),
+        }
+    }
+
+    /// Waits until there is room for what waits for it, the peer's end, or `within` this time.
+    pub(super) fn await_owed(&mut self, within: Duration) {
+        let first = self.parked.first().map_or(1, |parked| parked.payload.len());
+        self.await_room(HEADER_LEN + first, within);
+    }
+
+    /// Says what waits for room and will find none any more.
+    pub(super) fn tell_unsent(&self) {
+        let (peer, values) = (self.peer, self.parked.len() + usize::from(self.cut().is_some()));
+        if values > 0 || self.writer.owes() {
+            let owes_outcomes = self.writer.owes();
+            tracing::warn!(%peer, values, owes_outcomes, "a direct link ends whose peer takes nothing; the newest values of so many kinds of Stream do not reach it");
         }
     }
 

@@ -1,5 +1,7 @@
 //! Rings without room, long messages, and the bounds on links and their memory.
 
+use sinew_runtime::tid::Tid;
+
 use super::*;
 use crate::api::{direct::budget::Budget, routes::LINKS_MAX};
 
@@ -91,31 +93,118 @@ fn two_that_wait_for_room_in_each_others_rings_take_in_what_is_there_meanwhile()
     assert_eq!(one.direct.open[0].number, number, "nobody lost patience within a frame");
 }
 
+fn send_long(from: &mut Endpoint, to: Tid, length: usize) -> Result<(), ApiError> {
+    let mut long = from.create_message(to, Kind::named("test.long"), length).unwrap();
+    long.fill(7);
+    from.send_message(long)
+}
+
 #[test]
-fn of_a_long_message_that_a_peer_does_not_take_in_time_the_rest_goes_out_with_later_calls() {
+fn a_long_message_that_a_peer_does_not_take_in_time_is_not_sent_and_nothing_of_it_comes() {
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let mut one = register(&node, Registration::new().direct(true).patience(Duration::from_millis(1)));
+    let mut other = endpoint(&node);
+    link(&mut one, &mut other);
+    let to = other.tid();
+    // So that now and then no room is left in which to take it back.
+    for length in (0..1_100).step_by(8) {
+        // when: nobody reads
+        let mut sent = Vec::new();
+        send_long(&mut one, to, length).unwrap();
+        sent.push(length);
+        let refused = send_long(&mut one, to, 20_000).unwrap_err();
+        assert!(matches!(refused, ApiError::Stalled(_)), "{refused}");
+        while send_long(&mut one, to, 1).is_ok() {
+            sent.push(1);
+        }
+        // then
+        for length in sent {
+            let received = other.receive(WATCHDOG).unwrap().expect("what was sent comes");
+            assert_eq!(received.bytes().len(), length);
+        }
+        assert!(other.receive(Duration::ZERO).unwrap().is_none());
+    }
+    assert!(has_link(&one, &other) && has_link(&other, &one), "the link has not ended");
+}
+
+#[test]
+fn who_goes_after_a_long_message_was_not_taken_in_time_has_lost_nothing_of_which_it_was_told_ok() {
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
     let mut one = register(&node, Registration::new().direct(true).patience(Duration::from_millis(10)));
     let mut other = endpoint(&node);
     link(&mut one, &mut other);
-    // when: nobody reads
-    let mut long = one.create_message(other.tid(), Kind::named("test.long"), 20_000).unwrap();
-    long.fill(7);
-    one.send_message(long).unwrap();
-    let stalled = one.send(other.tid(), &Counted(1)).unwrap_err();
-    assert!(matches!(stalled, ApiError::Stalled(_)), "{stalled}");
+    let mut sent = 0;
+    while sent < 4 {
+        one.send(other.tid(), &Counted(sent)).unwrap();
+        sent += 1;
+    }
+    send_long(&mut one, other.tid(), 20_000).unwrap_err();
+    // when
+    drop(one);
+    // then
+    let mut received = 0;
+    let deadline = Time::now() + WATCHDOG;
+    while !other.direct.open.is_empty() {
+        assert!(Time::now() < deadline, "waited for the end of the link to be seen");
+        let Some(next) = other.receive(Duration::from_millis(1)).unwrap() else { continue };
+        assert_eq!(next.decode::<Counted>().unwrap(), Counted(received));
+        received += 1;
+    }
+    assert_eq!(received, sent);
+}
+
+#[test]
+fn a_long_message_that_the_links_end_cuts_goes_through_the_node_once() {
+    // given
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let mut one = register(&node, Registration::new().direct(true).patience(WATCHDOG / 2));
+    let mut other = endpoint(&node);
+    link(&mut one, &mut other);
+    let (to, peer) = (other.tid(), one.tid());
+    let sending = thread::spawn(move || {
+        send_long(&mut one, to, 20_000).unwrap();
+        one
+    });
+    let link = &mut other.direct.open[0];
+    let deadline = Time::now() + WATCHDOG;
+    while !link.has_something() {
+        assert!(Time::now() < deadline, "waited for the first piece");
+        thread::sleep(Duration::from_millis(1));
+    }
+    // when
+    let number = link.number;
+    other.direct.end(peer, number, Time::now());
+    // then
+    let received = other.receive(WATCHDOG).unwrap().expect("a message");
+    assert!(received.bytes().len() == 20_000 && received.bytes().iter().all(|byte| *byte == 7));
+    drop(received);
+    let mut one = sending.join().unwrap();
+    one.send(to, &Counted(1)).unwrap();
+    assert_eq!(other.receive(WATCHDOG).unwrap().expect("a message").decode::<Counted>().unwrap(), Counted(1));
+}
+
+#[test]
+fn the_newest_value_of_a_stream_reaches_a_peer_that_takes_something_although_its_sender_goes() {
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let mut one = register(&node, Registration::new().direct(true).patience(WATCHDOG));
+    let mut other = endpoint(&node);
+    link(&mut one, &mut other);
+    for number in 1..=1_000 {
+        one.send(other.tid(), &Setpoint(number)).unwrap();
+    }
+    // when
+    let going = thread::spawn(move || one.unregister().unwrap());
     // then
     let deadline = Time::now() + WATCHDOG;
-    let received = loop {
-        assert!(Time::now() < deadline, "waited for the long message");
-        assert!(one.receive(Duration::ZERO).unwrap().is_none());
-        if let Some(received) = other.receive(Duration::from_millis(1)).unwrap() {
-            break received;
-        }
-    };
-    assert!(received.bytes().len() == 20_000 && received.bytes().iter().all(|byte| *byte == 7));
-    assert!(has_link(&one, &other) && has_link(&other, &one), "the link has not ended");
-    one.send(other.tid(), &Counted(2)).unwrap();
-    assert_eq!(other.receive(WATCHDOG).unwrap().expect("a message").decode::<Counted>().unwrap(), Counted(2));
+    let mut last = 0;
+    while last < 1_000 {
+        assert!(Time::now() < deadline, "waited for the newest value; the last was {last}");
+        let Some(received) = other.receive(Duration::from_millis(1)).unwrap() else { continue };
+        let Setpoint(number) = received.decode().unwrap();
+        assert!(number > last, "{number} came after {last}");
+        last = number;
+    }
+    going.join().unwrap();
 }
 
 #[test]

@@ -19,6 +19,8 @@ pub(in crate::api) struct Rest {
     head: [u8; HEADER_LEN],
     message: Message,
     written: usize,
+    /// Its sender has given up: nothing of it is to be received.
+    is_withdrawn: bool,
 }
 
 /// How far a frame came.
@@ -56,7 +58,7 @@ impl Writer {
             self.pay();
             return Ok(Begun::Whole);
         }
-        let mut rest = Rest { writer: self.clone(), producer, head, message, written };
+        let mut rest = Rest { writer: self.clone(), producer, head, message, written, is_withdrawn: false };
         match rest.go_on() {
             Ok(true) => Ok(Begun::Whole),
             Ok(false) => Ok(Begun::Part(rest)),
@@ -104,15 +106,9 @@ impl Rest {
     /// # Errors
     /// The ring cannot be used any more.
     pub(in crate::api) fn go_on(&mut self) -> Result<bool, ApiError> {
-        let Some(producer) = self.producer.as_deref_mut() else { return Ok(true) };
-        let whole = HEADER_LEN + self.message.payload.len();
-        while self.written < whole {
-            let parts = [
-                IoSlice::new(&self.head[self.written.min(HEADER_LEN)..]),
-                IoSlice::new(&self.message.payload[self.written.saturating_sub(HEADER_LEN)..]),
-            ];
-            match ring::write(producer, &parts) {
-                Ok(count) => self.written += count,
+        while self.producer.is_some() && (self.is_withdrawn || self.left() > 0) {
+            match self.write_some() {
+                Ok(()) => {}
                 Err(LoanError::Full { .. }) => return Ok(false),
                 Err(error @ (LoanError::TooLong { .. } | LoanError::Corrupt(_))) => {
                     self.writer.close();
@@ -129,9 +125,41 @@ impl Rest {
         self.producer.as_deref_mut().map_or(0, taken)
     }
 
+    /// Writes one record.
+    fn write_some(&mut self) -> Result<(), LoanError> {
+        let Some(producer) = self.producer.as_deref_mut() else { return Ok(()) };
+        if self.is_withdrawn {
+            ring::withdraw(producer)?;
+            self.give_back();
+            return Ok(());
+        }
+        let parts = [
+            IoSlice::new(&self.head[self.written.min(HEADER_LEN)..]),
+            IoSlice::new(&self.message.payload[self.written.saturating_sub(HEADER_LEN)..]),
+        ];
+        self.written += ring::write(producer, &parts)?;
+        Ok(())
+    }
+
+    /// Bytes that are not written yet.
+    fn left(&self) -> usize {
+        if self.is_withdrawn { 0 } else { HEADER_LEN + self.message.payload.len() - self.written }
+    }
+
+    /// Takes back what is written: a record without bytes is written instead of the rest.
+    pub(in crate::api) fn withdraw(&mut self) {
+        self.is_withdrawn = true;
+        self.message.payload = bytes::Bytes::new();
+    }
+
+    /// The message that will not become whole any more, since its link ends; `None` if it was taken back.
+    pub(in crate::api) fn cut(&self) -> Option<Message> {
+        (!self.is_withdrawn).then(|| Message::new(self.message.header, self.message.payload.clone()))
+    }
+
     /// Announces that a task waits for room for more.
     pub(in crate::api) fn arm(&mut self) -> Armed {
-        let left = HEADER_LEN + self.message.payload.len() - self.written;
+        let left = self.left();
         self.producer.as_deref_mut().map_or(Armed::Ready, |producer| arm(producer, left))
     }
 
@@ -144,7 +172,7 @@ impl Rest {
 
     /// Waits until there is room for more, the peer's end, or `within` this time.
     pub(in crate::api) fn await_room(&mut self, within: Duration) {
-        let left = HEADER_LEN + self.message.payload.len() - self.written;
+        let left = self.left();
         if let Some(producer) = self.producer.as_deref_mut() {
             await_room(producer, left, &self.writer, within);
         }
