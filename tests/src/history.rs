@@ -63,6 +63,11 @@ impl History {
                 for (class, upto) in [Class::Control, Class::Stream, Class::Bulk].into_iter().zip(upto) {
                     self.flows.entry(Path { from: who, to, class }).or_default().peer_lost(upto);
                 }
+                let of_the_lost = self
+                    .flows
+                    .iter_mut()
+                    .filter(|(path, _)| path.from.station == to && path.to == who.station);
+                of_the_lost.for_each(|(_, flow)| flow.forgotten += 1);
             }
         }
     }

@@ -20,6 +20,9 @@ pub(super) struct Flow {
     pub(super) unique: u64,
     /// Where the source was each time it was told that the destination's node is lost.
     pub(super) losses: Vec<u64>,
+    /// How often the destination was told that the source's node is lost: it forgets then what was under way. A source that
+    /// was frozen meanwhile is not told.
+    pub(super) forgotten: usize,
 }
 
 impl Flow {

@@ -170,6 +170,17 @@ fn a_loss_that_was_told_excuses_one_row_before_it_and_no_more() {
 }
 
 #[test]
+fn a_source_that_its_destination_lost_may_lose_one_row_and_no_more() {
+    let lost = (TWO, Note::PeerLost { to: 1, upto: [0; 3] });
+    let notes =
+        [sent(Class::Bulk, 1, 10), got(Class::Bulk, 1, 4), got(Class::Bulk, 6, 3), got(Class::Bulk, 10, 1)];
+    assert_eq!(faults(&[notes[0], notes[1], notes[2], notes[3], lost]), [(Lost, 1)]);
+    assert_eq!(faults(&[notes[0], notes[1], notes[2], notes[3], lost, lost]), []);
+    let unknown = [asked(1, 1), got(Class::Control, 1, 1), ended(1, Outcome::Unknown)];
+    assert_eq!(faults(&[unknown[0], unknown[1], lost, unknown[2]]), []);
+}
+
+#[test]
 fn of_a_stream_all_but_the_newest_may_be_superseded() {
     let notes = [sent(Class::Stream, 1, 10), got(Class::Stream, 3, 1), got(Class::Stream, 10, 1)];
     let verdict = history(&notes).verdict();

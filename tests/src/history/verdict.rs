@@ -172,7 +172,7 @@ impl Judge {
             self.0.asked += 1;
             match outcome {
                 Some(outcome) => {
-                    let could_be_lost = deaths > 0 || !flow.losses.is_empty();
+                    let could_be_lost = deaths > 0 || flow.forgotten > 0 || !flow.losses.is_empty();
                     self.judge_outcome(path, (*number, *outcome), flow.has_come(*number), could_be_lost);
                 }
                 None if source_was_killed => self.0.ended_with_source += 1,
@@ -182,9 +182,10 @@ impl Judge {
     }
 
     /// What did not come. Each loss of the destination's node excuses one row of messages that its source had sent before it
-    /// was told, and the source's own end excuses the last.
+    /// was told; so does each loss of the source's node that the destination was told of; and the source's own end excuses the
+    /// last.
     fn judge_holes(&mut self, path: Path, flow: &Flow, end: u64, source_was_killed: bool) {
-        let mut losses = flow.losses.clone();
+        let (mut losses, mut forgotten) = (flow.losses.clone(), flow.forgotten);
         losses.sort_unstable();
         for (first, last) in flow.holes(end) {
             let count = (first..=last).filter(|n| !flow.has_come(*n) && !flow.is_told(*n)).count() as u64;
@@ -197,6 +198,9 @@ impl Judge {
                 losses.remove(at);
                 self.0.lost_with_node += count;
             } else if source_was_killed && last == end {
+                self.0.lost_with_node += count;
+            } else if forgotten > 0 {
+                forgotten -= 1;
                 self.0.lost_with_node += count;
             } else {
                 let more = format!("to {last}; {count} in a row of {end}; losses told at {:?}", flow.losses);
