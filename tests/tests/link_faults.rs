@@ -9,7 +9,11 @@ use sinew_tests::{
 
 /// What happens at 3,000 messages a second.
 fn report(troubles: &[Trouble], faults: u64) -> Report {
-    let plan = Plan {
+    plan(troubles, faults, |_| {})
+}
+
+fn plan(troubles: &[Trouble], faults: u64, change: impl FnOnce(&mut Plan)) -> Report {
+    let mut plan = Plan {
         program: program("link_faults"),
         rate: 3_000,
         back_rate: 300,
@@ -21,6 +25,7 @@ fn report(troubles: &[Trouble], faults: u64) -> Report {
         one_flip_in: None,
         seed: u64::from(std::process::id()),
     };
+    change(&mut plan);
     let report = run(&plan);
     println!("{report}");
     report
@@ -32,6 +37,16 @@ fn cuts_and_panics_of_gncl_on_both_sides_lose_double_and_reorder_nothing() {
     let report = report(&troubles, 40);
     assert!(report.holds() && report.verdict.is_perfect(), "{report}");
     assert!(report.verdict.asked > 0 && report.network.cut > 0, "{report}");
+}
+
+#[test]
+fn flipped_bits_cost_connections_and_no_message() {
+    let report = plan(&[Trouble::Cut], 5, |plan| {
+        plan.one_flip_in = Some(40_000);
+        plan.spacing = Duration::from_millis(400);
+    });
+    assert!(report.holds() && report.verdict.is_perfect(), "{report}");
+    assert!(report.network.flips > 0, "{report}");
 }
 
 #[test]

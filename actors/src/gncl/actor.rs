@@ -457,6 +457,7 @@ impl StreamHandler<News> for Gncl {
             }
             What::Frame(message) => self.frame_came(connection, &message, ctx),
             What::Heard => self.input(Input::Heard(connection), ctx),
+            What::Carried => self.input(Input::Carried(connection), ctx),
             What::Violated(decline) => self.input(Input::Violated(connection, decline), ctx),
             What::Ended => self.ended(connection, ctx),
         }

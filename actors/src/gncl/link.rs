@@ -45,6 +45,8 @@ pub(super) enum What {
     Frame(Message),
     /// Frames came, and were delivered.
     Heard,
+    /// Messages pass on this link, one way or the other. Told once.
+    Carried,
     /// Bytes came that cannot be used.
     Violated(Decline),
     /// The peer closed the connection, or it failed.
@@ -153,6 +155,10 @@ struct Reader {
     reading: Reading,
     /// Frames were delivered of which the shell does not know yet.
     heard: bool,
+    /// The peer has said what it takes next.
+    greeted: bool,
+    /// The shell knows that messages pass.
+    carried: bool,
 }
 
 /// How a look at the buffer ended.
@@ -164,7 +170,7 @@ enum Look {
 
 impl Reader {
     fn new(socket: Arc<TcpStream>, reading: Reading) -> Self {
-        Self { socket, buffer: BytesMut::new(), reading, heard: false }
+        Self { socket, buffer: BytesMut::new(), reading, heard: false, greeted: false, carried: false }
     }
 
     /// What the shell must know next; `None` when the connection has ended.
@@ -195,6 +201,11 @@ impl Reader {
                     self.heard = true;
                     if let Err(decline) = inbound.receive(Time::now(), message) {
                         return Look::Tell(What::Violated(decline));
+                    }
+                    // The first frame is an ACK in any case. A later one says that our messages arrive.
+                    if !self.carried && std::mem::replace(&mut self.greeted, true) {
+                        self.carried = true;
+                        return Look::Tell(What::Carried);
                     }
                 }
                 (Ok(Some(message)), _) => return Look::Tell(What::Frame(message)),

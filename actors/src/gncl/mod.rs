@@ -13,7 +13,7 @@
 //! | GNCL-5 | A HELLO from a linked peer replaces the link: the peer knows better that the old one is dead. |
 //! | GNCL-6 | Dials are numbered; a WELCOME voids its sender's dials so far, and a void HELLO is refused. |
 //! | GNCL-7 | A newer incarnation ends all that belongs to the older; an older one is refused. |
-//! | GNCL-8 | After a break both dial again: waits double from `redial_min` to `redial_max`, 20 % jitter, until NodeLost. |
+//! | GNCL-8 | After a break both dial again: waits double from `redial_min` to `redial_max`, 20 % jitter, until NodeLost; from the least again once messages pass. |
 //! | GNCL-9 | A link on which nothing comes is pinged every second; after 3 unanswered pings it is broken. |
 //! | GNCL-10 | GOODBYE is the last frame of a node that leaves; it is not dialled again until it is found again. |
 //! | GNCL-11 | A frame's source must be on the peer's node and its destination on this one; times are turned into our clock. |

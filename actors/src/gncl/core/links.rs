@@ -116,6 +116,14 @@ impl Core {
         }
     }
 
+    /// A peer with which messages pass is dialled again soon, however short its links are. spec: GNCL-8
+    pub(super) fn carried(&mut self, connection: ConnectionId) {
+        let Some(node) = self.linked_node(connection) else { return };
+        if let Some(peer) = self.peers.get_mut(&node) {
+            peer.back_off = self.settings.redial_min;
+        }
+    }
+
     pub(super) fn goodbye(&mut self, now: Time, connection: ConnectionId) {
         // spec: GNCL-10
         let Some(node) = self.linked_node(connection) else { return };

@@ -86,6 +86,8 @@ pub(super) enum Input {
     Violated(ConnectionId, Decline),
     /// Any frame came on a link.
     Heard(ConnectionId),
+    /// Messages pass on a link.
+    Carried(ConnectionId),
     /// The peer asked for a sign of life.
     PingReceived(ConnectionId),
     /// The peer said goodbye.
@@ -209,6 +211,7 @@ impl Core {
             Input::RefusalReceived(connection, refusal) => self.refused(now, connection, &refusal),
             Input::Violated(connection, decline) => self.decline(now, connection, &decline),
             Input::Heard(connection) => self.heard(now, connection),
+            Input::Carried(connection) => self.carried(connection),
             Input::PingReceived(connection) => {
                 let pong = self.linked_node(connection).map(Output::SendPong);
                 self.outputs.extend(pong);

@@ -169,6 +169,28 @@ fn waits_between_dials_double_from_the_least_to_the_most_with_a_fifth_of_jitter(
 }
 
 #[test]
+fn links_that_carry_messages_are_dialled_again_soon_and_those_that_do_not_later_each_time() {
+    for carries in [true, false] {
+        let mut core = core();
+        core.handle(millis(0), found(1));
+        let mut now = millis(0);
+        let waits: Vec<_> = (0..6)
+            .map(|dial| {
+                now = now + Duration::from_millis(30);
+                let (link, _) = greet(&mut core, now, hello_from(HIGH, 1, dial + 1));
+                if carries {
+                    core.handle(now, Input::Carried(link));
+                }
+                core.handle(now, Input::Ended(link));
+                core.next_wake().expect("a dial is planned").since(now)
+            })
+            .collect();
+        let longest = waits.into_iter().max().expect("there are six");
+        assert_eq!(longest <= Duration::from_millis(12), carries, "{longest:?}");
+    }
+}
+
+#[test]
 fn a_refused_dial_to_a_known_node_is_told_and_a_lost_node_is_dialled_no_more() {
     let mut core = core();
     core.handle(millis(0), found(1));
