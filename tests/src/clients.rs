@@ -12,6 +12,7 @@
 //! | `entry`, `ledger` | what posters tell, and what became of every message |
 //! | `steady` | the roles of those who are not to feel it: one asks and measures, one answers, one takes what comes |
 //! | `recorder` | the role of one that is stopped: says what it got |
+//! | `crowd` | the role of one that takes all places at the door that it can have |
 //! | `victim` | the role of a process that is killed with loans in its hands |
 //! | `held` | what a process has of the host |
 //! | `conservation` | the claim: what was sent has one fate that is true, whoever is killed |
@@ -19,6 +20,7 @@
 //! | `hostile` | the claim: whatever a client does, the node lives within its bounds and serves the others |
 
 pub mod conservation;
+mod crowd;
 mod door;
 pub mod entry;
 mod held;
@@ -57,6 +59,7 @@ pub fn play() -> Option<ExitCode> {
     }
     match &*role {
         "door" => door::play(&arguments),
+        "crowd" => crowd::play(&arguments),
         "poster" => poster::play(&arguments),
         "attacker" => hostile::play_attacker(&arguments),
         "sleeper" => hostile::play_sleeper(&arguments),

@@ -3,7 +3,8 @@
 use std::{net::SocketAddrV4, path::PathBuf};
 
 use rustix::process::Signal;
-use sinew_tests::{OwnDirectory, Program, node_under_test, own_group};
+use sinew::{NodeApi, Registration, StartError};
+use sinew_tests::{Ground, OwnDirectory, Program, node_under_test, own_group, process_under_test};
 
 /// A node of a scenario: its own address on loopback, the scenario's own multicast group.
 struct Scenario {
@@ -113,4 +114,42 @@ fn a_second_node_with_the_same_address_is_not_let_in() {
     ankle.wait_for(&["started"]);
     knee.wait_for(&["count", "from 127.0.0.3"]);
     assert!(hip.said().iter().all(|line| !line.contains("impostor")));
+}
+
+#[test]
+fn a_door_that_another_node_has_is_a_fault_of_the_start_and_free_when_that_one_has_gone() {
+    // Given: a node behind a door.
+    let (ground, directory) = (Ground::new(), OwnDirectory::new());
+    let path = directory.join("node.sock");
+    let node = |name: &str| ground.node(name).configure(|config| config.lncl.socket = Some(path.clone()));
+    let knee = node("knee").start().expect("the path is free");
+
+    // When: another one is to have the same path.
+    let refused = node("hip").start().expect_err("it is taken");
+
+    // Then: it is told what to do, and the first one goes on.
+    assert!(matches!(refused, StartError::Door(_)), "{refused:?}");
+    let said = refused.to_string();
+    for words in ["another node listens", &path.display().to_string(), "set another `lncl.socket`"] {
+        assert!(said.contains(words), "{words:?} is not in: {said}");
+    }
+    let api = NodeApi::connect(&path).expect("a path");
+    drop(api.register_transport_address(Registration::new()).expect("the first node serves"));
+    knee.stop();
+    node("hip").start().expect("the path is free again");
+}
+
+#[test]
+fn a_door_where_nothing_can_be_made_ends_the_start_in_one_sentence() {
+    let scenario = Scenario::new();
+    let config = scenario.configuration("knee", 1);
+    let text = std::fs::read_to_string(&config).expect("it was written just now");
+    // Not even root makes directories there.
+    let text = format!("{text}[lncl]\nsocket = \"/proc/nobody/knee.sock\"\n");
+    std::fs::write(&config, text).expect("the test's own directory");
+    let mut knee = process_under_test(&config, &[]);
+    assert_eq!(knee.wait_for_end(), Some(1));
+    let said = knee.said().join("\n");
+    assert!(said.contains("cannot create the directory \"/proc/nobody\""), "{said}");
+    assert!(said.contains("set another `lncl.socket`") && !said.contains("panicked"), "{said}");
 }

@@ -16,7 +16,7 @@ use sinew_runtime::{
 use super::{ApiError, NodeApi, Registration, Transport};
 use crate::lncl::{
     AppFact,
-    testing::{TestDirectory, TestNode, WATCHDOG},
+    testing::{RawClient, TestDirectory, TestNode, WATCHDOG},
 };
 
 use forms::{Api, Client, Under};
@@ -418,4 +418,20 @@ fn every_thread_may_have_an_address_of_its_own(under: Under) {
         }
         assert_eq!(next.len(), 8);
     });
+}
+
+/// Who is refused at the door has its words closed in behind it, and not only a broken pipe.
+#[test]
+fn who_is_refused_before_it_has_said_a_word_is_told_why() {
+    let node = TestNode::start_with(|config| config.lncl.strangers_per_process_max = 1);
+    for _ in 0..20 {
+        // Whoever is silent has its place for two seconds, or for less where this thread stands still.
+        let _silent = RawClient::connect(&node);
+        match NodeApi::connect(node.path()).unwrap().register_transport_address(Registration::new()) {
+            Err(ApiError::Refused(why)) => assert!(why.contains("strangers_per_process_max"), "{why}"),
+            Ok(_) => {}
+            Err(other) => panic!("{other:?} instead of a refusal"),
+        }
+    }
+    assert!(node.refused("too many strangers") > 0);
 }

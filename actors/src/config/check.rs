@@ -34,6 +34,11 @@ pub(super) const MAILBOX_CAPACITY: Range = range("node.mailbox_capacity", 1, 65_
 pub(super) const MAILBOX_BYTES: Range = range("node.mailbox_bytes", 4 << 10, 1 << 30, "bytes");
 pub(super) const PAYLOAD_MAX: Range = range("node.payload_max", 64, 64 << 20, "bytes");
 pub(super) const CLIENTS_MAX: Range = range("lncl.clients_max", 1, 4_096, "connections");
+pub(super) const CLIENTS_PER_PROCESS_MAX: Range =
+    range("lncl.clients_per_process_max", 1, 4_096, "connections");
+pub(super) const LNCL_STRANGERS_MAX: Range = range("lncl.strangers_max", 1, 1_024, "connections");
+pub(super) const STRANGERS_PER_PROCESS_MAX: Range =
+    range("lncl.strangers_per_process_max", 1, 1_024, "connections");
 pub(super) const APPS_MAX: Range = range("lncl.apps_max", 1, 65_536, "applications");
 pub(super) const RING_BYTES: Range = range("lncl.ring_bytes", 4 << 10, 16 << 20, "bytes");
 pub(super) const GNCL_PORT: Range = range("gncl.port", 0, 65_535, "(0: any free port)");
@@ -135,6 +140,9 @@ impl NodeConfig {
             faults.push(fault("lncl.socket", quoted(&socket.to_string_lossy()), legal, remedy));
         }
         CLIENTS_MAX.count(faults, self.lncl.clients_max);
+        CLIENTS_PER_PROCESS_MAX.count(faults, self.lncl.clients_per_process_max);
+        LNCL_STRANGERS_MAX.count(faults, self.lncl.strangers_max);
+        STRANGERS_PER_PROCESS_MAX.count(faults, self.lncl.strangers_per_process_max);
         APPS_MAX.count(faults, self.lncl.apps_max);
         RING_BYTES.count(faults, self.lncl.ring_bytes);
     }

@@ -29,7 +29,7 @@ const FILE_BYTES_MAX: u64 = 1 << 20;
 const SECTIONS: [&str; 6] = ["node", "lncl", "gncl", "ndl", "sync", "supervision"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 32] = [
+pub(super) const KEYS: [&str; 35] = [
     "node.name",
     "node.project",
     "node.address",
@@ -38,6 +38,9 @@ pub(super) const KEYS: [&str; 32] = [
     "node.payload_max",
     "lncl.socket",
     "lncl.clients_max",
+    "lncl.clients_per_process_max",
+    "lncl.strangers_max",
+    "lncl.strangers_per_process_max",
     "lncl.apps_max",
     "lncl.ring_bytes",
     "gncl.port",
@@ -316,9 +319,13 @@ impl Reader<'_> {
 
     fn read_lncl(&mut self, config: &mut NodeConfig) {
         self.text_or_off("lncl.socket", "\"/run/sinew/knee.sock\" or false", &mut config.lncl.socket);
-        self.number(&check::CLIENTS_MAX, &mut config.lncl.clients_max);
-        self.number(&check::APPS_MAX, &mut config.lncl.apps_max);
-        self.number(&check::RING_BYTES, &mut config.lncl.ring_bytes);
+        let lncl = &mut config.lncl;
+        self.number(&check::CLIENTS_MAX, &mut lncl.clients_max);
+        self.number(&check::CLIENTS_PER_PROCESS_MAX, &mut lncl.clients_per_process_max);
+        self.number(&check::LNCL_STRANGERS_MAX, &mut lncl.strangers_max);
+        self.number(&check::STRANGERS_PER_PROCESS_MAX, &mut lncl.strangers_per_process_max);
+        self.number(&check::APPS_MAX, &mut lncl.apps_max);
+        self.number(&check::RING_BYTES, &mut lncl.ring_bytes);
     }
 
     fn read_gncl(&mut self, config: &mut NodeConfig) {

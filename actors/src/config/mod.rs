@@ -60,6 +60,12 @@ pub struct LnclConfig {
     pub socket: Option<PathBuf>,
     /// Connections of other processes at most, one for each registered address. 1 to 4,096; default 256.
     pub clients_max: usize,
+    /// Those of one process at most. 1 to 4,096; default 64: one process leaves room for others.
+    pub clients_per_process_max: usize,
+    /// Connections that have not said yet who they are, at most, beside those. 1 to 1,024; default 128. Each may take 2 s.
+    pub strangers_max: usize,
+    /// Those of one process at most. 1 to 1,024; default 32.
+    pub strangers_per_process_max: usize,
     /// Applications of the node at most, in all its processes. 1 to 65,536; default 1,024.
     pub apps_max: usize,
     /// Bytes of the ring in shared memory for each direction of a connection of another process; the next power of two
@@ -172,7 +178,15 @@ impl NodeConfig {
             mailbox_capacity: 256,
             mailbox_bytes: 4 << 20,
             payload_max: 1 << 20,
-            lncl: LnclConfig { socket: None, clients_max: 256, apps_max: 1_024, ring_bytes: 256 * 1_024 },
+            lncl: LnclConfig {
+                socket: None,
+                clients_max: 256,
+                clients_per_process_max: 64,
+                strangers_max: 128,
+                strangers_per_process_max: 32,
+                apps_max: 1_024,
+                ring_bytes: 256 * 1_024,
+            },
             gncl: GnclConfig {
                 port: 0,
                 announce: None,

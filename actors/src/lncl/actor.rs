@@ -36,7 +36,7 @@ impl Lncl {
     /// Opens the door, if there is to be one.
     ///
     /// # Panics
-    /// If the path cannot be had. That is how a layer's start fails: its supervisor reports these words.
+    /// If the path was lost, and cannot be had again. That is how a layer's start fails: its supervisor reports these words.
     fn open_door(&mut self, ctx: &mut Context<Self>) {
         let Some(path) = self.server.stores.config.lncl.socket.clone() else { return };
         let in_words = |cause| ListenError::System { doing: "watch", path: path.clone(), cause };

@@ -26,6 +26,7 @@ use super::{
     registrar,
     server::{Server, refuse},
     session::{Order, Session},
+    strangers::Place,
 };
 use crate::{
     monitors::Cause,
@@ -41,13 +42,22 @@ const HANDSHAKE: Duration = Duration::from_secs(2);
 pub(super) type ClientOutlet = StreamOutlet<ClientSocket>;
 
 /// Serves one connection to its end.
-pub(super) async fn serve(server: Rc<Server>, stream: Arc<UnixStream>, credentials: UCred, id: ClientId) {
+pub(super) async fn serve(
+    server: Rc<Server>,
+    stream: Arc<UnixStream>,
+    credentials: UCred,
+    id: ClientId,
+    place: Place,
+) {
     let mut reader = Reader::new(REGISTER_BYTES_MAX);
     let mut session = Session::new();
     // spec: LNCL-1
     let register = match tokio::time::timeout(HANDSHAKE, introduce(&mut reader, &stream, &mut session)).await
     {
-        Ok(Ok(Some(register))) => register,
+        Ok(Ok(Some(register))) => {
+            drop(place);
+            register
+        }
         // Whoever only looks whether somebody listens hangs up without a word.
         Ok(Ok(None)) => return,
         Ok(Err(why)) => return refuse(&server, &stream, "bad first frame", &why),

@@ -1,5 +1,8 @@
 //! Who is registered on this node. Pure: no socket, no clock.
 
+#[cfg(test)]
+mod tests;
+
 use std::{collections::BTreeMap, fmt};
 
 use sinew_runtime::{tid::AppAddress, wire::Kind};
@@ -8,8 +11,17 @@ use sinew_runtime::{tid::AppAddress, wire::Kind};
 pub(crate) const NAME_MAX: usize = 63;
 /// Names that one application may require, and payload types that it may name, at most.
 pub(crate) const NAMES_MAX: usize = 64;
-/// Addresses of one client process at most.
-pub(crate) const PER_PROCESS_MAX: usize = 256;
+
+/// How many there may be.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Limits {
+    /// Applications of the node, in all its processes.
+    pub(crate) apps: usize,
+    /// Those of them in processes that come in through the door.
+    pub(crate) clients: usize,
+    /// Those of one such process.
+    pub(crate) per_process: usize,
+}
 
 /// One connection of another process; never used again in a node's life.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -98,8 +110,19 @@ pub enum RegisterError {
         /// The limit in force.
         limit: usize,
     },
+    /// As many applications of other processes are registered as the node's configuration allows.
+    #[error(
+        "the node serves {limit} connections of other processes, which is its limit; raise `lncl.clients_max`"
+    )]
+    ClientsFull {
+        /// The limit in force.
+        limit: usize,
+    },
     /// The process has as many addresses as one process may have.
-    #[error("process {pid} has {limit} addresses, which is the limit for one process; unregister some")]
+    #[error(
+        "process {pid} has {limit} addresses, which is the limit for one process; unregister some, or raise \
+         `lncl.clients_per_process_max`"
+    )]
     ProcessFull {
         /// The process.
         pid: i32,
@@ -148,17 +171,13 @@ pub(crate) struct Registry {
 }
 
 impl Registry {
-    /// Registers an application on a node that takes at most `apps_max`.
+    /// Registers an application on a node that takes at most so many.
     ///
     /// # Errors
     /// Why not; nothing changed.
-    pub(crate) fn register(
-        &mut self,
-        request: Request,
-        apps_max: usize,
-    ) -> Result<AppAddress, RegisterError> {
+    pub(crate) fn register(&mut self, request: Request, limits: Limits) -> Result<AppAddress, RegisterError> {
         check_lists(&request)?;
-        self.check_room(request.owner, apps_max)?;
+        self.check_room(request.owner, limits)?;
         self.check_name(request.name.as_deref())?;
         let kinds = self.check_kinds(&request.kinds)?;
         let app = match request.address {
@@ -166,7 +185,7 @@ impl Registry {
             Address::Former(app) if app.is_dynamic() && !self.apps.contains_key(&app) => app,
             Address::Dynamic | Address::Former(_) => self.free_dynamic(),
         };
-        self.claim_kinds(kinds, apps_max);
+        self.claim_kinds(kinds, limits.apps);
         if let Some(name) = &request.name {
             self.names.insert(name.clone(), app);
         }
@@ -240,14 +259,23 @@ impl Registry {
         self.apps.iter().filter(|(_, entry)| is_owner(entry.owner)).map(|(app, _)| *app).collect()
     }
 
-    fn check_room(&self, owner: Owner, apps_max: usize) -> Result<(), RegisterError> {
-        if self.apps.len() >= apps_max {
-            return Err(RegisterError::NodeFull { limit: apps_max });
+    fn check_room(&self, owner: Owner, limits: Limits) -> Result<(), RegisterError> {
+        if self.apps.len() >= limits.apps {
+            return Err(RegisterError::NodeFull { limit: limits.apps });
         }
         let Owner::Client { pid, .. } = owner else { return Ok(()) };
-        let held = self.owned_by(|other| matches!(other, Owner::Client { pid: theirs, .. } if theirs == pid));
-        if held.len() >= PER_PROCESS_MAX {
-            return Err(RegisterError::ProcessFull { pid, limit: PER_PROCESS_MAX });
+        let (mut all, mut own) = (0, 0);
+        for entry in self.apps.values() {
+            if let Owner::Client { pid: theirs, .. } = entry.owner {
+                all += 1;
+                own += usize::from(theirs == pid);
+            }
+        }
+        if own >= limits.per_process {
+            return Err(RegisterError::ProcessFull { pid, limit: limits.per_process });
+        }
+        if all >= limits.clients {
+            return Err(RegisterError::ClientsFull { limit: limits.clients });
         }
         Ok(())
     }
@@ -337,164 +365,4 @@ fn check_lists(request: &Request) -> Result<(), RegisterError> {
         list.iter().try_for_each(|name| check_spelling(name))?;
     }
     Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use proptest::prelude::*;
-
-    use super::*;
-
-    fn request(address: Address, name: Option<&str>) -> Request {
-        let name = name.map(str::to_owned);
-        Request { address, name, requires: Vec::new(), kinds: Vec::new(), owner: Owner::Node }
-    }
-
-    fn client(id: u64, pid: i32) -> Owner {
-        Owner::Client { id: ClientId(id), pid }
-    }
-
-    fn fixed(index: u32) -> Address {
-        Address::Fixed(AppAddress::fixed(index).unwrap())
-    }
-
-    #[test]
-    fn a_taken_name_is_refused_and_its_holder_named() {
-        let mut registry = Registry::default();
-        registry.register(request(fixed(1), Some("knee.sensor")), 9).unwrap();
-        let refusal = registry.register(request(Address::Dynamic, Some("knee.sensor")), 9).unwrap_err();
-        assert_eq!(
-            refusal.to_string(),
-            "the name 'knee.sensor' is taken by application 1001 of the node's own process; choose another name or \
-             end that one first"
-        );
-    }
-
-    #[test]
-    fn a_fixed_address_must_be_in_its_range_and_free() {
-        let mut registry = Registry::default();
-        for wrong in [AppAddress::NDL, AppAddress::NONE, AppAddress::dynamic(0).unwrap(), AppAddress::ALL] {
-            let refusal = registry.register(request(Address::Fixed(wrong), None), 9);
-            assert_eq!(refusal, Err(RegisterError::NotFixed(wrong)));
-        }
-        registry.register(request(fixed(1), None), 9).unwrap();
-        let refusal = registry.register(request(fixed(1), None), 9);
-        assert!(matches!(refusal, Err(RegisterError::AddressTaken { .. })));
-    }
-
-    #[test]
-    fn names_that_nobody_could_read_are_refused() {
-        for name in ["", "line\nbreak", &"x".repeat(64)] {
-            let refusal = Registry::default().register(request(Address::Dynamic, Some(name)), 9);
-            assert!(matches!(refusal, Err(RegisterError::BadName(_))), "{name:?}");
-        }
-    }
-
-    #[test]
-    fn an_address_that_was_given_back_is_not_given_out_at_once() {
-        let mut registry = Registry::default();
-        let first = registry.register(request(Address::Dynamic, None), 9).unwrap();
-        registry.unregister(first);
-        assert_ne!(registry.register(request(Address::Dynamic, None), 9), Ok(first));
-    }
-
-    #[test]
-    fn who_comes_back_gets_its_former_dynamic_address_if_that_is_free() {
-        let mut registry = Registry::default();
-        let former = registry.register(request(Address::Dynamic, None), 9).unwrap();
-        registry.unregister(former);
-        assert_eq!(registry.register(request(Address::Former(former), None), 9), Ok(former));
-        let other = registry.register(request(Address::Former(former), None), 9).unwrap();
-        assert!(other.is_dynamic() && other != former);
-        let never_dynamic = registry.register(request(Address::Former(AppAddress::NDL), None), 9).unwrap();
-        assert!(never_dynamic.is_dynamic());
-    }
-
-    #[test]
-    fn dynamic_addresses_go_round_their_range() {
-        let mut registry = Registry { next_dynamic: 0x6fff_ffff, ..Registry::default() };
-        let last = registry.register(request(Address::Dynamic, None), 9).unwrap();
-        let first = registry.register(request(Address::Dynamic, None), 9).unwrap();
-        assert_eq!((last.bits(), first.bits()), (0xefff_ffff, 0x8000_0000));
-    }
-
-    #[test]
-    fn a_node_and_a_process_have_their_limits() {
-        let mut registry = Registry::default();
-        for _ in 0..PER_PROCESS_MAX {
-            let owner = Owner::Client { id: registry.new_client(), pid: 7 };
-            registry.register(Request { owner, ..request(Address::Dynamic, None) }, 1_000).unwrap();
-        }
-        let one_more = Request { owner: client(999, 7), ..request(Address::Dynamic, None) };
-        let refusal = registry.register(one_more.clone(), 1_000);
-        assert_eq!(refusal, Err(RegisterError::ProcessFull { pid: 7, limit: PER_PROCESS_MAX }));
-        let refusal = registry.register(Request { owner: client(999, 8), ..one_more }, PER_PROCESS_MAX);
-        assert_eq!(refusal, Err(RegisterError::NodeFull { limit: PER_PROCESS_MAX }));
-    }
-
-    /// "costarring" and "liquid" share their 32-bit FNV-1a, the best known pair of words that does.
-    #[test]
-    fn two_payload_names_with_one_id_are_refused() {
-        assert_eq!(Kind::named("costarring"), Kind::named("liquid"));
-        let with = |kind: &str| Request { kinds: vec![kind.to_owned()], ..request(Address::Dynamic, None) };
-        let mut registry = Registry::default();
-        registry.register(with("liquid"), 9).unwrap();
-        registry.register(with("liquid"), 9).unwrap();
-        let refusal = registry.register(with("costarring"), 9);
-        assert!(matches!(refusal, Err(RegisterError::KindCollision { .. })));
-    }
-
-    #[derive(Clone, Debug)]
-    enum Step {
-        Register { fixed: Option<u32>, name: Option<u8>, owner: u64 },
-        Unregister(u32),
-        ClientGone(u64),
-    }
-
-    fn any_step() -> impl Strategy<Value = Step> {
-        prop_oneof![
-            (proptest::option::of(0u32..6), proptest::option::of(0u8..6), 0u64..4)
-                .prop_map(|(fixed, name, owner)| Step::Register { fixed, name, owner }),
-            (0u32..6).prop_map(Step::Unregister),
-            (1u64..4).prop_map(Step::ClientGone),
-        ]
-    }
-
-    fn owner_of(number: u64) -> Owner {
-        if number == 0 { Owner::Node } else { client(number, number as i32) }
-    }
-
-    proptest! {
-        #[test]
-        fn names_and_addresses_have_one_holder_through_any_history(
-            steps in proptest::collection::vec(any_step(), 0..60),
-        ) {
-            let mut registry = Registry::default();
-            for step in steps {
-                match step {
-                    Step::Register { fixed: index, name, owner } => {
-                        let before = registry.len();
-                        let address = index.map_or(Address::Dynamic, fixed);
-                        let name = name.map(|n| n.to_string());
-                        let asked = Request { owner: owner_of(owner), ..request(address, name.as_deref()) };
-                        let grown = usize::from(registry.register(asked, 10).is_ok());
-                        prop_assert_eq!(registry.len(), before + grown);
-                    }
-                    Step::Unregister(index) => {
-                        registry.unregister(AppAddress::fixed(index).unwrap());
-                    }
-                    Step::ClientGone(number) => {
-                        registry.remove_owner(owner_of(number));
-                        prop_assert!(registry.owned_by(|owner| owner == owner_of(number)).is_empty());
-                    }
-                }
-                prop_assert!(registry.len() <= 10);
-                let named: Vec<_> = registry.apps.values().filter_map(|entry| entry.name.clone()).collect();
-                prop_assert_eq!(named.len(), registry.names.len());
-                for (name, app) in &registry.names {
-                    prop_assert_eq!(registry.apps[app].name.as_ref(), Some(name));
-                }
-            }
-        }
-    }
 }

@@ -36,11 +36,11 @@ struct Connection {
 }
 
 impl Door {
-    /// The socket that listens at `path`: the one that is open already, if LNCL was restarted and the path is still ours.
+    /// The socket that listens at `path`: the one that is open already, as it is when LNCL starts, if the path is still ours.
     ///
     /// # Errors
     /// Why not, with what to do about it.
-    pub(super) fn open(&self, path: &Path) -> Result<UnixListener, ListenError> {
+    pub(crate) fn open(&self, path: &Path) -> Result<UnixListener, ListenError> {
         let mut open = lock(&self.open);
         if open.as_ref().is_none_or(|(_, file)| !file.is_there()) {
             // A former life may have what somebody took the file of.

@@ -17,6 +17,7 @@
 //! | LNCL-7 | Each confirmed message to a client ends in what the client says of it; as `Failed` if the connection ends while the client has it; as `Rejected(Closed)` if it was not sent yet, or lay in its ring untaken. |
 //! | LNCL-8 | Two names of payload types with one id are refused where both are told at registration. |
 //! | LNCL-9 | A client that can, and says so, gets a ring in shared memory for each direction; the socket then carries descriptors and last words only, and tells either side's end. |
+//! | LNCL-13 | Connections that have not said who they are have bounds of their own, for all and for one process. |
 
 mod actor;
 mod client;
@@ -31,6 +32,7 @@ mod reader;
 mod registrar;
 mod server;
 pub(crate) mod session;
+mod strangers;
 #[cfg(test)]
 pub(crate) mod testing;
 #[cfg(test)]

@@ -13,7 +13,7 @@ use sinew_runtime::{
 
 use super::{
     AppFact,
-    core::{Address, Owner, RegisterError, Request},
+    core::{Address, Limits, Owner, RegisterError, Request},
 };
 use crate::{
     monitors::{self, Cause},
@@ -51,11 +51,16 @@ pub(crate) fn register_local(stores: &Stores, app: LocalApp) -> Result<Tid, Regi
     let request = Request { address, name: name.clone(), requires, kinds, owner: Owner::Node };
     let mut registry = lock(&stores.registry);
     let fact_requires = request.requires.clone();
-    let app = registry.register(request, stores.config.lncl.apps_max)?;
+    let app = registry.register(request, limits(stores))?;
     stores.router.set_local(app, LocalRoute { outlet, events });
     monitors::note(stores, monitors::Input::Began { app });
     tell_sync(stores, AppFact::Registered { app, name, requires: fact_requires });
     Ok(Tid::new(stores.node, app))
+}
+
+fn limits(stores: &Stores) -> Limits {
+    let lncl = &stores.config.lncl;
+    Limits { apps: lncl.apps_max, clients: lncl.clients_max, per_process: lncl.clients_per_process_max }
 }
 
 /// The application has started and takes messages.
@@ -99,7 +104,7 @@ pub(crate) fn set_member(stores: &Stores, app: AppAddress, group: AppAddress, me
 pub(super) fn register_client(stores: &Stores, request: Request) -> Result<AppAddress, RegisterError> {
     let (name, requires) = (request.name.clone(), request.requires.clone());
     let mut registry = lock(&stores.registry);
-    let app = registry.register(request, stores.config.lncl.apps_max)?;
+    let app = registry.register(request, limits(stores))?;
     monitors::note(stores, monitors::Input::Began { app });
     tell_sync(stores, AppFact::Registered { app, name, requires });
     Ok(app)

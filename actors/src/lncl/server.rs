@@ -18,6 +18,7 @@ use super::{
     core::ClientId,
     introductions::Introductions,
     payload::{self, Refusal},
+    strangers::{Bounds, NoPlace, Place, Strangers},
 };
 use crate::{
     refusals::Refusals,
@@ -31,6 +32,8 @@ const ACCEPT_BACKOFF: (Duration, Duration) = (Duration::from_millis(10), Duratio
 pub(super) struct Server {
     pub(super) stores: Arc<Stores>,
     pub(super) refusals: Arc<Refusals>,
+    /// Who has not said yet who it is.
+    strangers: Strangers,
     /// Who may be introduced to whom.
     pub(super) introductions: Introductions,
     /// Who waits at the barrier.
@@ -43,7 +46,8 @@ impl Server {
     pub(super) fn new(stores: Arc<Stores>) -> Rc<Self> {
         let (releases, outlets) = (RefCell::default(), RefCell::default());
         let refusals = stores.refusals.clone();
-        Rc::new(Self { stores, refusals, introductions: Introductions::default(), releases, outlets })
+        let (strangers, introductions) = (Strangers::default(), Introductions::default());
+        Rc::new(Self { stores, refusals, strangers, introductions, releases, outlets })
     }
 
     /// Resolves when the barrier opens for `app`.
@@ -95,6 +99,8 @@ pub(super) async fn accept(server: Rc<Server>, listener: UnixListener) {
                 Ok((stream, _)) => {
                     backoff = ACCEPT_BACKOFF.0;
                     admit(&server, stream, &mut clients);
+                    // Who has said already who it is leaves the strangers before the next one comes.
+                    tokio::task::yield_now().await;
                 }
                 Err(cause) => {
                     server.refusals.count(Time::now(), "accept failed", &cause);
@@ -117,26 +123,32 @@ fn report(ended: Result<(), JoinError>) {
     }
 }
 
+/// Serves a connection from now on, or refuses it. Those that are served are bounded: as strangers here, as clients by the
+/// registry.
 fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) {
-    let limit = server.stores.config.lncl.clients_max;
-    if clients.len() >= limit {
-        let why =
-            format!("the node serves {limit} connections, which is its limit; raise `lncl.clients_max`");
-        return refuse(server, &stream, "too many clients", &why);
-    }
-    match check_credentials(&stream) {
-        Ok(credentials) => {
-            let server = server.clone();
-            let id = lock(&server.stores.registry).new_client();
-            let stream = Arc::new(stream);
-            server.stores.door.admit(id, &stream);
-            clients.spawn_local(async move {
-                client::serve(server.clone(), stream, credentials, id).await;
-                server.stores.door.dismiss(id);
-            });
-        }
-        Err(why) => refuse(server, &stream, "credentials", &why),
-    }
+    let credentials = match check_credentials(&stream) {
+        Ok(credentials) => credentials,
+        Err(why) => return refuse(server, &stream, "credentials", &why),
+    };
+    let place = match place_for(server, credentials) {
+        Ok(place) => place,
+        Err(why) => return refuse(server, &stream, "too many strangers", &why),
+    };
+    let server = server.clone();
+    let id = lock(&server.stores.registry).new_client();
+    let stream = Arc::new(stream);
+    server.stores.door.admit(id, &stream);
+    clients.spawn_local(async move {
+        client::serve(server.clone(), stream, credentials, id, place).await;
+        server.stores.door.dismiss(id);
+    });
+}
+
+/// spec: LNCL-13
+fn place_for(server: &Server, credentials: UCred) -> Result<Place, NoPlace> {
+    let lncl = &server.stores.config.lncl;
+    let bounds = Bounds { all: lncl.strangers_max, per_process: lncl.strangers_per_process_max };
+    server.strangers.admit(credentials.pid().unwrap_or_default(), bounds)
 }
 
 fn check_credentials(stream: &UnixStream) -> Result<UCred, String> {

@@ -120,7 +120,38 @@ fn a_silent_stranger_is_sent_away() {
 fn one_connection_too_many_is_refused_in_words() {
     let node = TestNode::start_with(|config| config.lncl.clients_max = 1);
     let (_first, _) = RawClient::register(&node, &Register::default());
-    assert!(RawClient::connect(&node).expect_refusal().contains("lncl.clients_max"));
+    let mut second = RawClient::connect(&node);
+    second.ask_for_address(&Register::default());
+    let refusal = second.expect_refusal();
+    assert!(refusal.contains("`lncl.clients_max`"), "{refusal}");
+}
+
+#[test]
+fn a_process_has_its_share_of_the_connections_and_is_told_so() {
+    let node = TestNode::start_with(|config| config.lncl.clients_per_process_max = 1);
+    let (first, _) = RawClient::register(&node, &Register::default());
+    let mut second = RawClient::connect(&node);
+    second.ask_for_address(&Register::default());
+    let refusal = second.expect_refusal();
+    assert!(refusal.contains("`lncl.clients_per_process_max`"), "{refusal}");
+    drop(first);
+    let mut third = RawClient::connect(&node);
+    third.ask_for_address(&Register::default());
+    while third.next().is_some_and(|message| message.header.kind == Kind::LNCL_REFUSAL) {
+        // The node has not seen the end of the first one yet.
+        third = RawClient::connect(&node);
+        third.ask_for_address(&Register::default());
+    }
+}
+
+#[test]
+fn so_many_of_a_process_may_be_silent_and_those_that_have_spoken_do_not_count() {
+    let node = TestNode::start_with(|config| config.lncl.strangers_per_process_max = 1);
+    let clients: Vec<_> = (0..4).map(|_| RawClient::register(&node, &Register::default())).collect();
+    let _silent = RawClient::connect(&node);
+    let refusal = RawClient::connect(&node).expect_refusal();
+    assert!(refusal.contains("`lncl.strangers_per_process_max`"), "{refusal}");
+    assert_eq!(clients.len(), 4);
 }
 
 #[test]

@@ -58,6 +58,9 @@ pub enum StartError {
         /// Why.
         why: String,
     },
+    /// `lncl.socket` cannot be had: another node has it, or the place cannot be written to. No layer was started.
+    #[error("the door for applications of other processes cannot be opened: {0}")]
+    Door(String),
     /// A layer did not become ready.
     #[error("the layers did not start: {0}")]
     Layers(String),
@@ -216,7 +219,8 @@ impl NodeBuilder {
     /// keep it short there, and do not read the standard input.
     ///
     /// # Errors
-    /// The configuration has faults, an application cannot be registered, or a layer did not become ready.
+    /// The configuration has faults, `lncl.socket` cannot be had, an application cannot be registered, or a layer did not
+    /// become ready.
     pub fn start(mut self) -> Result<Node, StartError> {
         // Here, on a thread like any other.
         log::begin();
@@ -243,6 +247,8 @@ impl NodeBuilder {
         if is_bystander {
             return Ok(Node { handle, ended, thread: None });
         }
+        // Before any layer: one that cannot have it would fail again and again, with the same words.
+        open_door(&stores)?;
         let (tree, heed_signals) = (self.tree, self.heed_signals);
         if heed_signals && handle.root.post(RootEvent::HeedSignals).is_err() {
             return Err(StartError::Layers("the root's post is full before it was read".to_owned()));
@@ -258,6 +264,12 @@ impl NodeBuilder {
             Err(_) => Err(StartError::Layers(format!("no word from the root in {patience:?}"))),
         }
     }
+}
+
+/// Opens the door for other processes, if there is to be one. LNCL serves it later.
+fn open_door(stores: &Stores) -> Result<(), StartError> {
+    let Some(path) = &stores.config.lncl.socket else { return Ok(()) };
+    stores.door.open(path).map(drop).map_err(|why| StartError::Door(why.to_string()))
 }
 
 /// A number that grows from one start of a host's node to the next, as long as the host's clock does not go back.

@@ -462,7 +462,7 @@ uint32_t sinew_abi(void);
  * everything that is required is ready (the paper's RegisterTransportAddress). `options` may be NULL: a dynamic address,
  * no name. Any thread; blocks until the deadline of the options at most.
  *
- * The endpoint is one thread's at a time. A process may have 256.
+ * The endpoint is one thread's at a time. A process may have 256, if its node lets it: `lncl.clients_per_process_max`, 64.
  */
 sinew_status sinew_register_transport_address(struct sinew_text socket,
                                               const struct sinew_options *options,

@@ -28,7 +28,7 @@ pub extern "C" fn sinew_abi() -> u32 {
 /// everything that is required is ready (the paper's RegisterTransportAddress). `options` may be NULL: a dynamic address,
 /// no name. Any thread; blocks until the deadline of the options at most.
 ///
-/// The endpoint is one thread's at a time. A process may have 256.
+/// The endpoint is one thread's at a time. A process may have 256, if its node lets it: `lncl.clients_per_process_max`, 64.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_register_transport_address(
     socket: Text,

@@ -117,6 +117,15 @@ impl FrameCodec {
         }
     }
 
+    /// Begins at the front of an empty buffer again, or gives a long one back.
+    fn reuse(&mut self, source: &mut BytesMut) {
+        // Nothing else holds it, so that all of its length can be had again.
+        if self.largest > BUFFER_KEPT || !source.try_reclaim(self.largest) {
+            *source = BytesMut::new();
+        }
+        self.largest = 0;
+    }
+
     /// The payload of the first frame of `source`, which has `whole` bytes.
     fn take_payload(&mut self, source: &mut BytesMut, whole: usize) -> Bytes {
         self.largest = self.largest.max(source.capacity());
@@ -128,8 +137,8 @@ impl FrameCodec {
         }
         let payload = Bytes::copy_from_slice(&source[HEADER_LEN..whole]);
         source.advance(whole);
-        if source.is_empty() && self.largest > BUFFER_KEPT {
-            (*source, self.largest) = (BytesMut::new(), 0);
+        if source.is_empty() {
+            self.reuse(source);
         }
         payload
     }

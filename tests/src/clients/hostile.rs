@@ -23,7 +23,7 @@ use std::{
 };
 
 use rustix::process::{Signal, getpid, kill_process};
-use sinew::Kind;
+use sinew::{Kind, NodeApi, Registration};
 
 use self::{
     stranger::{Frame, Stranger},
@@ -42,6 +42,8 @@ use crate::{DEADLINE, dice::Dice, until};
 const ATTACKERS: u64 = 2;
 /// How long an attacker lives; some are killed before.
 const LIFE: Duration = Duration::from_secs(2);
+/// Sentences that are kept of those that newcomers are told.
+const TOLD_MAX: usize = 8;
 /// How often the node's memory is looked at.
 const LOOK: Duration = Duration::from_millis(50);
 const LIMITS: StageLimits = StageLimits { mailbox_capacity: 32, payload_max: 16 * 1024, clients_max: 64 };
@@ -68,6 +70,15 @@ pub struct Report {
     pub grown_kib: u64,
     held: (Held, Held),
     windows: [Window; 2],
+    newcomers: Newcomers,
+}
+
+/// Honest ones that asked for an address during the attack.
+#[derive(Clone, Debug, Default)]
+struct Newcomers {
+    served: u64,
+    /// What those were told that got none.
+    turned_away: Vec<String>,
 }
 
 impl Report {
@@ -89,22 +100,26 @@ impl Report {
             && self.grown_kib <= Self::bound_kib()
             && self.held.1.is_back_at(&self.held.0)
             && self.windows.iter().all(|window| window.failed == 0)
+            && self.newcomers.served > 0
+            && self.newcomers.turned_away.is_empty()
     }
 }
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { seconds, tally, refused, grown_kib, held, windows } = self;
+        let Self { seconds, tally, refused, grown_kib, held, windows, newcomers } = self;
         let Tally { tricks, connections, bytes, refused: told, rings, lies } = tally;
         writeln!(f, "{seconds:.1} s, {tricks} tricks on {connections} connections, {bytes} bytes taken")?;
         writeln!(f, "{rings} links with rings, {lies} lies written into their memory")?;
         writeln!(f, "refusals: {told} told to the hostile ones, {refused} counted by the node")?;
+        let Newcomers { served, turned_away } = newcomers;
+        writeln!(f, "newcomers: {served} served, {} turned away {turned_away:?}", turned_away.len())?;
         writeln!(f, "node before {}\n     after  {}", held.0, held.1)?;
         writeln!(f, "node grown by {grown_kib} KiB at most; its bound is {} KiB", Self::bound_kib())?;
         writeln!(f, "others, alone        {}\nothers, under attack {}", windows[0], windows[1])?;
         write!(
             f,
-            "expected: the node lives, within its bound, all given back, no round trip failed, every refusal counted; seen: {}",
+            "expected: the node lives, within its bound, all given back, no round trip failed, no newcomer turned away, every refusal counted; seen: {}",
             if self.holds() { "so" } else { "NOT SO" }
         )
     }
@@ -232,6 +247,23 @@ fn watch(process: u32, over: &AtomicBool) -> u64 {
     most
 }
 
+/// Asks for an address again and again, until it is told not to, as a program does that is started.
+fn come(socket: &Path, over: &AtomicBool) -> Newcomers {
+    let mut newcomers = Newcomers::default();
+    while !over.load(Ordering::Relaxed) {
+        let api = NodeApi::connect(socket).expect("the door is open");
+        match api.register_transport_address(Registration::new()) {
+            Ok(_) => newcomers.served += 1,
+            Err(error) if newcomers.turned_away.len() < TOLD_MAX => {
+                newcomers.turned_away.push(error.to_string())
+            }
+            Err(_) => {}
+        }
+        thread::sleep(LOOK);
+    }
+    newcomers
+}
+
 /// Lets hostile clients do what they like, and says what the node made of it.
 ///
 /// # Panics
@@ -244,12 +276,14 @@ pub fn run(plan: Plan) -> Report {
     thread::sleep(cast.plan.lasts / 8);
     let alone = cast.window();
     let (before, over, began) = (Held::of(node), AtomicBool::new(false), Instant::now());
-    let most = thread::scope(|scope| {
+    let socket = cast.stage.socket();
+    let (most, newcomers) = thread::scope(|scope| {
         let watching = scope.spawn(|| watch(node, &over));
+        let coming = scope.spawn(|| come(&socket, &over));
         let ends = EndsIt(&over);
         cast.attack();
         drop(ends);
-        watching.join().expect("it only looks")
+        (watching.join().expect("it only looks"), coming.join().expect("the door is open all the time"))
     });
     let attacked = cast.window();
     let end = Instant::now() + DEADLINE;
@@ -265,5 +299,5 @@ pub fn run(plan: Plan) -> Report {
     }
     cast.stage.end();
     let grown_kib = most.max(held.1.own_kib).saturating_sub(before.own_kib);
-    Report { seconds, tally, refused, grown_kib, held, windows: [alone, attacked] }
+    Report { seconds, tally, refused, grown_kib, held, windows: [alone, attacked], newcomers }
 }

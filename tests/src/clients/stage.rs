@@ -15,7 +15,7 @@ pub struct StageLimits {
     pub mailbox_capacity: usize,
     /// `node.payload_max`.
     pub payload_max: usize,
-    /// `lncl.clients_max`.
+    /// `lncl.clients_max`; one process may have a quarter of it.
     pub clients_max: usize,
 }
 
@@ -53,9 +53,11 @@ impl Stage {
         }
         let (socket, config) = (directory.join("run").join("node.sock"), directory.join("node.toml"));
         let StageLimits { mailbox_capacity, payload_max, clients_max } = limits;
+        // One process leaves room for others.
+        let share = clients_max / 4;
         let text = format!(
             "[node]\nname = \"stage\"\nmailbox_capacity = {mailbox_capacity}\npayload_max = {payload_max}\n\
-             [lncl]\nsocket = {socket:?}\nclients_max = {clients_max}\n[ndl]\nmulticast = false\nmdns_port = false\n"
+             [lncl]\nsocket = {socket:?}\nclients_max = {clients_max}\nclients_per_process_max = {share}\n[ndl]\nmulticast = false\nmdns_port = false\n"
         );
         std::fs::write(&config, text).expect("the test's own directory");
         let (node, answers) = open(program, &directory, residents, hear);

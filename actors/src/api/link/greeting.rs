@@ -46,8 +46,21 @@ impl Greeting {
         let lncl = payload::lncl_of(NodeAddress::HERE);
         let asked = asked(register, options.transport);
         let frame = payload::frame(Kind::LNCL_REGISTER, Tid::NONE, lncl, &asked);
-        socket::Writer::new(socket.clone(), options).write(&frame)?;
-        Ok(Self { socket, options, frame: BytesMut::zeroed(HEADER_LEN), filled: 0 })
+        let written = socket::Writer::new(socket.clone(), options).write(&frame);
+        let mut greeting = Self { socket, options, frame: BytesMut::zeroed(HEADER_LEN), filled: 0 };
+        match written {
+            Ok(()) => Ok(greeting),
+            Err(error) => Err(greeting.explain(error)),
+        }
+    }
+
+    /// Who is refused before it has said a word finds a closed socket, and the reason in it.
+    fn explain(&mut self, error: ApiError) -> ApiError {
+        match self.wait(Time::now()) {
+            Err(refused @ ApiError::Refused(_)) => refused,
+            // It said nothing, or nothing that says more.
+            Ok(_) | Err(_) => error,
+        }
     }
 
     /// Waits for the answer; `None` if the node has not given it by the deadline. May be called again then.

@@ -229,10 +229,17 @@ impl Attacker {
         Ok(())
     }
 
-    /// More connections than the node has places.
+    /// More addresses than one process may have, and more connections than the node has places.
     fn crowd(&mut self) -> io::Result<()> {
         let mut crowd = Vec::new();
         let end = Instant::now() + TRICK;
+        let mut addresses = Vec::new();
+        while addresses.len() < 200
+            && Instant::now() < end
+            && let Ok(one) = self.register()
+        {
+            addresses.push(one);
+        }
         for _ in (0..200).take_while(|_| Instant::now() < end) {
             crowd.push(self.connect()?);
         }

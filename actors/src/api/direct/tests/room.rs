@@ -209,7 +209,11 @@ fn the_newest_value_of_a_stream_reaches_a_peer_that_takes_something_although_its
 
 #[test]
 fn links_are_bounded_and_what_is_above_goes_through_the_node() {
-    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let node = TestNode::start_with(|config| {
+        config.lncl.ring_bytes = 4_096;
+        // All of them are in this process.
+        config.lncl.clients_per_process_max = 256;
+    });
     let mut hub = endpoint(&node);
     let mut others: Vec<_> = (0..=LINKS_MAX).map(|_| endpoint(&node)).collect();
     let deadline = Time::now() + WATCHDOG * 3;

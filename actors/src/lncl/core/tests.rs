@@ -1,0 +1,168 @@
+//! What the registry promises.
+
+use proptest::prelude::*;
+
+use super::*;
+
+const LIMITS: Limits = Limits { apps: 9, clients: 8, per_process: 4 };
+
+fn request(address: Address, name: Option<&str>) -> Request {
+    let name = name.map(str::to_owned);
+    Request { address, name, requires: Vec::new(), kinds: Vec::new(), owner: Owner::Node }
+}
+
+fn client(id: u64, pid: i32) -> Owner {
+    Owner::Client { id: ClientId(id), pid }
+}
+
+fn fixed(index: u32) -> Address {
+    Address::Fixed(AppAddress::fixed(index).unwrap())
+}
+
+#[test]
+fn a_taken_name_is_refused_and_its_holder_named() {
+    let mut registry = Registry::default();
+    registry.register(request(fixed(1), Some("knee.sensor")), LIMITS).unwrap();
+    let refusal = registry.register(request(Address::Dynamic, Some("knee.sensor")), LIMITS).unwrap_err();
+    assert_eq!(
+        refusal.to_string(),
+        "the name 'knee.sensor' is taken by application 1001 of the node's own process; choose another name or \
+         end that one first"
+    );
+}
+
+#[test]
+fn a_fixed_address_must_be_in_its_range_and_free() {
+    let mut registry = Registry::default();
+    for wrong in [AppAddress::NDL, AppAddress::NONE, AppAddress::dynamic(0).unwrap(), AppAddress::ALL] {
+        let refusal = registry.register(request(Address::Fixed(wrong), None), LIMITS);
+        assert_eq!(refusal, Err(RegisterError::NotFixed(wrong)));
+    }
+    registry.register(request(fixed(1), None), LIMITS).unwrap();
+    let refusal = registry.register(request(fixed(1), None), LIMITS);
+    assert!(matches!(refusal, Err(RegisterError::AddressTaken { .. })));
+}
+
+#[test]
+fn names_that_nobody_could_read_are_refused() {
+    for name in ["", "line\nbreak", &"x".repeat(64)] {
+        let refusal = Registry::default().register(request(Address::Dynamic, Some(name)), LIMITS);
+        assert!(matches!(refusal, Err(RegisterError::BadName(_))), "{name:?}");
+    }
+}
+
+#[test]
+fn an_address_that_was_given_back_is_not_given_out_at_once() {
+    let mut registry = Registry::default();
+    let first = registry.register(request(Address::Dynamic, None), LIMITS).unwrap();
+    registry.unregister(first);
+    assert_ne!(registry.register(request(Address::Dynamic, None), LIMITS), Ok(first));
+}
+
+#[test]
+fn who_comes_back_gets_its_former_dynamic_address_if_that_is_free() {
+    let mut registry = Registry::default();
+    let former = registry.register(request(Address::Dynamic, None), LIMITS).unwrap();
+    registry.unregister(former);
+    assert_eq!(registry.register(request(Address::Former(former), None), LIMITS), Ok(former));
+    let other = registry.register(request(Address::Former(former), None), LIMITS).unwrap();
+    assert!(other.is_dynamic() && other != former);
+    let never_dynamic = registry.register(request(Address::Former(AppAddress::NDL), None), LIMITS).unwrap();
+    assert!(never_dynamic.is_dynamic());
+}
+
+#[test]
+fn dynamic_addresses_go_round_their_range() {
+    let mut registry = Registry { next_dynamic: 0x6fff_ffff, ..Registry::default() };
+    let last = registry.register(request(Address::Dynamic, None), LIMITS).unwrap();
+    let first = registry.register(request(Address::Dynamic, None), LIMITS).unwrap();
+    assert_eq!((last.bits(), first.bits()), (0xefff_ffff, 0x8000_0000));
+}
+
+#[test]
+fn a_node_and_a_process_have_their_limits() {
+    let mut registry = Registry::default();
+    let mut register = |pid: i32, limits| {
+        let owner = Owner::Client { id: registry.new_client(), pid };
+        registry.register(Request { owner, ..request(Address::Dynamic, None) }, limits)
+    };
+    for _ in 0..LIMITS.per_process {
+        register(7, LIMITS).unwrap();
+    }
+    assert_eq!(register(7, LIMITS), Err(RegisterError::ProcessFull { pid: 7, limit: LIMITS.per_process }));
+    register(8, LIMITS).expect("another process has its own places");
+    let clients = LIMITS.per_process + 1;
+    assert_eq!(register(8, Limits { clients, ..LIMITS }), Err(RegisterError::ClientsFull { limit: clients }));
+    assert_eq!(
+        register(8, Limits { apps: clients, ..LIMITS }),
+        Err(RegisterError::NodeFull { limit: clients })
+    );
+    let own = registry.register(request(Address::Dynamic, None), Limits { clients, ..LIMITS });
+    assert!(own.is_ok(), "the node's own applications need no place of a client's");
+}
+
+/// "costarring" and "liquid" share their 32-bit FNV-1a, the best known pair of words that does.
+#[test]
+fn two_payload_names_with_one_id_are_refused() {
+    assert_eq!(Kind::named("costarring"), Kind::named("liquid"));
+    let with = |kind: &str| Request { kinds: vec![kind.to_owned()], ..request(Address::Dynamic, None) };
+    let mut registry = Registry::default();
+    registry.register(with("liquid"), LIMITS).unwrap();
+    registry.register(with("liquid"), LIMITS).unwrap();
+    let refusal = registry.register(with("costarring"), LIMITS);
+    assert!(matches!(refusal, Err(RegisterError::KindCollision { .. })));
+}
+
+#[derive(Clone, Debug)]
+enum Step {
+    Register { fixed: Option<u32>, name: Option<u8>, owner: u64 },
+    Unregister(u32),
+    ClientGone(u64),
+}
+
+fn any_step() -> impl Strategy<Value = Step> {
+    prop_oneof![
+        (proptest::option::of(0u32..6), proptest::option::of(0u8..6), 0u64..4)
+            .prop_map(|(fixed, name, owner)| Step::Register { fixed, name, owner }),
+        (0u32..6).prop_map(Step::Unregister),
+        (1u64..4).prop_map(Step::ClientGone),
+    ]
+}
+
+fn owner_of(number: u64) -> Owner {
+    if number == 0 { Owner::Node } else { client(number, number as i32) }
+}
+
+proptest! {
+    #[test]
+    fn names_and_addresses_have_one_holder_through_any_history(
+        steps in proptest::collection::vec(any_step(), 0..60),
+    ) {
+        let mut registry = Registry::default();
+        for step in steps {
+            match step {
+                Step::Register { fixed: index, name, owner } => {
+                    let before = registry.len();
+                    let address = index.map_or(Address::Dynamic, fixed);
+                    let name = name.map(|n| n.to_string());
+                    let asked = Request { owner: owner_of(owner), ..request(address, name.as_deref()) };
+                    let grown = usize::from(registry.register(asked, Limits { apps: 10, ..LIMITS }).is_ok());
+                    prop_assert_eq!(registry.len(), before + grown);
+                }
+                Step::Unregister(index) => {
+                    registry.unregister(AppAddress::fixed(index).unwrap());
+                }
+                Step::ClientGone(number) => {
+                    registry.remove_owner(owner_of(number));
+                    prop_assert!(registry.owned_by(|owner| owner == owner_of(number)).is_empty());
+                }
+            }
+            prop_assert!(registry.len() <= 10);
+            let named: Vec<_> = registry.apps.values().filter_map(|entry| entry.name.clone()).collect();
+            prop_assert_eq!(named.len(), registry.names.len());
+            for (name, app) in &registry.names {
+                prop_assert_eq!(registry.apps[app].name.as_ref(), Some(name));
+            }
+        }
+    }
+}
