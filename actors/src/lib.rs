@@ -52,7 +52,9 @@ mod wills;
 #[cfg(feature = "fault-points")]
 pub use sinew_runtime::supervision::fault;
 
-pub use api::{ApiError, AsyncEndpoint, Endpoint, LentMessage, NodeApi, Received, Registration, Transport};
+pub use api::{
+    ApiError, AsyncEndpoint, Endpoint, LentMessage, NodeApi, Received, Registration, Transport, Untaken,
+};
 pub use config::{ConfigFaults, NodeConfig};
 pub use lncl::RegisterError;
 pub use ndl::{KnownNode, LossReason, NodeEvent, Source};

@@ -15,8 +15,8 @@ use sinew_shm::BellKind;
 use tokio::task::spawn_blocking;
 
 use super::{
-    ApiError, Endpoint, LentMessage, Received, Registration, Transport, form::Form, outgoing::Request,
-    reactor::Reactor, returning::LOOK,
+    ApiError, Endpoint, LentMessage, Received, Registration, Transport, Untaken, form::Form,
+    outgoing::Request, reactor::Reactor, returning::LOOK,
 };
 
 /// A registered transport address for a task: an [`Endpoint`] whose calls await instead of blocking. The same semantics, word
@@ -197,6 +197,11 @@ impl AsyncEndpoint {
                 return Ok(received);
             }
         }
+    }
+
+    /// What the node has said about messages that nobody has taken, as [`Endpoint::untaken`]. Never waits.
+    pub fn untaken(&mut self) -> Option<Untaken> {
+        self.endpoint.untaken()
     }
 
     /// Joins the group called `name`, as [`Endpoint::join`].

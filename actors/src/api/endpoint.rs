@@ -19,6 +19,7 @@ use super::{
     link::{Ended, Link, Reader, Writer, ring::Rest},
     outgoing::Request,
     returning::Home,
+    untaken::Refusals,
 };
 use crate::lncl::payload::{self, Group, Registered, Resolve};
 
@@ -40,6 +41,8 @@ pub struct Endpoint {
     /// Links to other processes that the node is not on the way of.
     pub(super) direct: Direct,
     pub(super) inbox: Inbox,
+    /// What the node has said of messages that nobody has taken.
+    pub(super) refusals: Refusals,
     pub(super) sequence: u64,
     pub(super) correlation: u64,
     /// Why the connection has ended, once it has.
@@ -81,6 +84,7 @@ impl Endpoint {
             reader,
             direct: Direct::new(terms, control),
             inbox,
+            refusals: Refusals::default(),
             sequence: 0,
             // The outcome of a former life's message must not be taken for one of this: no number comes again.
             correlation: Time::now().as_nanos(),
@@ -135,7 +139,8 @@ impl Endpoint {
     }
 
     /// Sends memory that [`create_message`](Self::create_message) lent (the paper's SendMessage), without a copy if it lies
-    /// in the ring. Returns when the ring, or the socket to the node, has it; what becomes of it then is not told.
+    /// in the ring. Returns when the ring, or the socket to the node, has it; [`untaken`](Self::untaken) says if nobody takes
+    /// it then.
     ///
     /// # Errors
     /// It was not sent, and its memory is given back. [`ApiError::Lent`]: another one lies in the ring.

@@ -40,6 +40,8 @@ pub(super) enum Sorted {
     Answer(Answer),
     /// The node ends the connection, for this reason.
     Refusal(Refusal),
+    /// Messages of this endpoint's that nobody has taken.
+    Untaken(payload::Untaken),
     /// Nobody waits for it any more, or this version does not know it.
     Nothing,
 }
@@ -100,6 +102,7 @@ impl Inbox {
                 payload::read(&message.payload)
                     .unwrap_or_else(|error| Refusal { sentence: error.to_string(), again: false }),
             ),
+            Kind::LNCL_UNTAKEN => payload::read(&message.payload).map_or(Sorted::Nothing, Sorted::Untaken),
             // A node of a later version may say more than we know.
             _ => Sorted::Nothing,
         }

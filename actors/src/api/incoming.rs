@@ -116,6 +116,7 @@ impl Endpoint {
             match self.inbox.sort(message, wanted.map(Wanted::at_node)) {
                 Sorted::Answer(answer) => return Ok(Some(answer)),
                 Sorted::Refusal(refusal) => self.end(refusal.into()),
+                Sorted::Untaken(untaken) => self.refusals.hear(&untaken),
                 Sorted::Message | Sorted::Nothing => {}
             }
         }

@@ -56,6 +56,7 @@ mod routes;
 #[cfg(test)]
 mod tests;
 mod to_node;
+mod untaken;
 mod within;
 
 use std::{
@@ -76,6 +77,7 @@ pub use error::ApiError;
 pub use lent::LentMessage;
 pub use link::Transport;
 pub use received::Received;
+pub use untaken::Untaken;
 
 use self::{
     link::{Greeting, Link, LinkOptions},

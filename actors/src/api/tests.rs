@@ -91,6 +91,7 @@ on_every_transport! {
     a_registration_waits_at_the_barrier_and_names_what_it_waits_for
     the_end_of_the_node_is_an_error_with_its_reason
     every_thread_may_have_an_address_of_its_own
+    what_nobody_takes_is_said_with_its_number_and_once
 }
 
 fn on(under: Under) -> Registration {
@@ -418,6 +419,36 @@ fn every_thread_may_have_an_address_of_its_own(under: Under) {
         }
         assert_eq!(next.len(), 8);
     });
+}
+
+fn what_nobody_takes_is_said_with_its_number_and_once(under: Under) {
+    // What the application that the test plays takes.
+    const ROOM: u64 = 1_024;
+    const MORE: u64 = 20;
+    let node = TestNode::start();
+    let app = node.local(1);
+    let nobody = Tid::new(node.address(), AppAddress::fixed(9).unwrap());
+    let mut endpoint = register(under, &node, on(under));
+    assert_eq!(endpoint.untaken(), None);
+    for _ in 0..ROOM + MORE {
+        endpoint.send(app.tid, &Torque { newton_metres: 1.0 }).unwrap();
+    }
+    endpoint.send(nobody, &Torque { newton_metres: 1.0 }).unwrap();
+    let (mut full, mut gone) = (0, 0);
+    let deadline = Time::now() + WATCHDOG;
+    while full < MORE || gone < 1 {
+        assert!(Time::now() < deadline, "waited for {MORE} and 1, was told of {full} and {gone}");
+        let Some(untaken) = endpoint.untaken() else {
+            assert!(endpoint.receive(Duration::from_millis(10)).unwrap().is_none(), "nobody sends to it");
+            continue;
+        };
+        match (untaken.destination, untaken.why) {
+            (to, Rejection::QueueFull) if to == app.tid => full += untaken.count,
+            (to, Rejection::NoSuchApplication) if to == nobody => gone += untaken.count,
+            other => panic!("{other:?}"),
+        }
+    }
+    assert_eq!((full, gone, endpoint.untaken()), (MORE, 1, None));
 }
 
 /// Who is refused at the door has its words closed in behind it, and not only a broken pipe.

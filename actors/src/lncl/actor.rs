@@ -18,8 +18,8 @@ use super::{
 };
 use crate::stores::Stores;
 
-/// Time between two looks at messages that wait for clients that do not read.
-const EXPIRY_PERIOD: Duration = Duration::from_millis(100);
+/// Time between two looks at messages that wait for clients that do not read, and at what clients are still to be told.
+const TICK: Duration = Duration::from_millis(100);
 
 /// The LNCL of a node: a new one after each fault, on the same registry. Connections end with it.
 pub(crate) struct Lncl {
@@ -55,7 +55,7 @@ impl Actor for Lncl {
         registrar::forget_former_clients(&self.server.stores);
         self.server.stores.door.hang_up();
         ctx.add_stream(self.server.stores.posts.lncl.attach());
-        ctx.run_interval(EXPIRY_PERIOD, |lncl, _| lncl.server.expire(Time::now()));
+        ctx.run_interval(TICK, |lncl, _| lncl.server.tick(Time::now()));
         self.open_door(ctx);
         if let Some(ready) = self.ready.take() {
             ready.reached();

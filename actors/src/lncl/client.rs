@@ -1,6 +1,7 @@
 //! One connection of another process, from its first frame to its end.
 
 mod end;
+mod notices;
 mod orders;
 
 use std::{ops::ControlFlow, rc::Rc, sync::Arc, time::Duration};
@@ -15,6 +16,8 @@ use sinew_runtime::{
 };
 use sinew_shm::PassError;
 use tokio::net::{UnixStream, unix::UCred};
+
+pub(super) use self::notices::Notices;
 
 use self::end::{End, LAST_WORDS};
 use super::{
@@ -133,6 +136,7 @@ struct Client {
     server: Rc<Server>,
     peer: Peer,
     outlet: Arc<ClientOutlet>,
+    notices: Rc<Notices>,
     /// Set while messages flow.
     link: Option<LinkNumber>,
     tid: Tid,
@@ -159,7 +163,8 @@ impl Client {
         let tid = Tid::new(server.stores.node, app);
         let name = lock(&server.stores.registry).name_of(app);
         let outlet = Arc::new(StreamOutlet::new(limits(&server.stores)));
-        server.add_outlet(peer.id, outlet.clone());
+        let notices = Rc::new(Notices::new(tid, outlet.clone()));
+        server.add_client(peer.id, outlet.clone(), notices.clone());
         crate::log::info!(%tid, name, pid = peer.pid, "an application of another process has registered");
         let (link, events, has_been_told) = (None, events.into(), false);
         let cause = Cause::new(DownClass::Killed, registrar::LNCL_ENDED);
@@ -169,6 +174,7 @@ impl Client {
             server,
             peer,
             outlet,
+            notices,
             link,
             tid,
             name,

@@ -18,6 +18,7 @@
 //! | LNCL-8 | Two names of payload types with one id are refused where both are told at registration. |
 //! | LNCL-9 | A client that can, and says so, gets a ring in shared memory for each direction; the socket then carries descriptors and last words only, and tells either side's end. |
 //! | LNCL-13 | Connections that have not said who they are have bounds of their own, for all and for one process. |
+//! | LNCL-14 | What nobody has taken of a client's unconfirmed messages the client is told, with its number and once: the first at once, later ones together. |
 
 mod actor;
 mod client;
@@ -37,6 +38,7 @@ mod strangers;
 pub(crate) mod testing;
 #[cfg(test)]
 mod tests;
+mod untaken;
 
 pub(crate) use actor::Lncl;
 pub use core::RegisterError;

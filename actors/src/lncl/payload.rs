@@ -118,6 +118,26 @@ pub(crate) struct Switch {
     pub(crate) number: u64,
 }
 
+/// Unconfirmed messages of the client that nobody has taken, since it was told so last.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Untaken {
+    /// One for each destination and reason; a few at most.
+    pub(crate) entries: Vec<UntakenEntry>,
+}
+
+/// Those to one destination, for one reason.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct UntakenEntry {
+    /// 64 bits of the destination's TID; 0: several that are not told apart any more.
+    pub(crate) to: u64,
+    /// Code of the outcome that each of them would have had.
+    pub(crate) why: u8,
+    /// How many.
+    pub(crate) count: u64,
+    /// When the first of them was refused: nanoseconds of the system's monotonic clock.
+    pub(crate) since: u64,
+}
+
 /// The TID of the LNCL of `node`.
 pub(crate) const fn lncl_of(node: NodeAddress) -> Tid {
     Tid::new(node, AppAddress::LNCL)

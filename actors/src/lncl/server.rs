@@ -14,7 +14,7 @@ use tokio::{
 };
 
 use super::{
-    client::{self, ClientOutlet},
+    client::{self, ClientOutlet, Notices},
     core::ClientId,
     introductions::Introductions,
     payload::{self, Refusal},
@@ -38,16 +38,22 @@ pub(super) struct Server {
     pub(super) introductions: Introductions,
     /// Who waits at the barrier.
     releases: RefCell<BTreeMap<AppAddress, oneshot::Sender<()>>>,
-    /// The writing halves of the connections, for what expires in them.
-    outlets: RefCell<BTreeMap<ClientId, Arc<ClientOutlet>>>,
+    /// The connections, for what is to be done now and then.
+    clients: RefCell<BTreeMap<ClientId, Served>>,
+}
+
+/// One connection that is served.
+struct Served {
+    outlet: Arc<ClientOutlet>,
+    notices: Rc<Notices>,
 }
 
 impl Server {
     pub(super) fn new(stores: Arc<Stores>) -> Rc<Self> {
-        let (releases, outlets) = (RefCell::default(), RefCell::default());
+        let (releases, clients) = (RefCell::default(), RefCell::default());
         let refusals = stores.refusals.clone();
         let (strangers, introductions) = (Strangers::default(), Introductions::default());
-        Rc::new(Self { stores, refusals, strangers, introductions, releases, outlets })
+        Rc::new(Self { stores, refusals, strangers, introductions, releases, clients })
     }
 
     /// Resolves when the barrier opens for `app`.
@@ -71,19 +77,20 @@ impl Server {
         }
     }
 
-    pub(super) fn add_outlet(&self, id: ClientId, outlet: Arc<ClientOutlet>) {
+    pub(super) fn add_client(&self, id: ClientId, outlet: Arc<ClientOutlet>, notices: Rc<Notices>) {
         self.stores.door.add_outlet(id, &outlet);
-        self.outlets.borrow_mut().insert(id, outlet);
+        self.clients.borrow_mut().insert(id, Served { outlet, notices });
     }
 
-    pub(super) fn remove_outlet(&self, id: ClientId) {
-        self.outlets.borrow_mut().remove(&id);
+    pub(super) fn remove_client(&self, id: ClientId) {
+        self.clients.borrow_mut().remove(&id);
     }
 
-    /// Settles messages that expired while their client did not read.
-    pub(super) fn expire(&self, now: Time) {
-        for outlet in self.outlets.borrow().values() {
+    /// Settles messages that expired while their client did not read, and tells clients what nobody has taken of theirs.
+    pub(super) fn tick(&self, now: Time) {
+        for Served { outlet, notices } in self.clients.borrow().values() {
             outlet.expire(now);
+            notices.tell(now);
         }
     }
 }

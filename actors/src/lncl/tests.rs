@@ -9,12 +9,13 @@ use serde::{Deserialize, Serialize};
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
     tid::{AppAddress, Tid},
+    time::Time,
     wire::{Class, Flags, HEADER_LEN, Header, Kind, Message, Payload},
 };
 
 use super::{
     AppFact,
-    payload::{self, Group, Register, Resolve, Resolved},
+    payload::{self, Group, Register, Resolve, Resolved, Untaken},
     registrar,
     testing::{RawClient, TestNode, WATCHDOG},
 };
@@ -152,6 +153,37 @@ fn so_many_of_a_process_may_be_silent_and_those_that_have_spoken_do_not_count() 
     let refusal = RawClient::connect(&node).expect_refusal();
     assert!(refusal.contains("`lncl.strangers_per_process_max`"), "{refusal}");
     assert_eq!(clients.len(), 4);
+}
+
+#[test]
+fn who_sends_more_than_its_destination_takes_is_told_how_much_of_it_and_not_of_each_message() {
+    // What the application that the test plays takes.
+    const ROOM: u64 = 1_024;
+    const MORE: u64 = 500;
+    let node = TestNode::start();
+    let app = node.local(1);
+    let (mut client, tid) = RawClient::register(&node, &Register::default());
+    let began = Time::now();
+    for sequence in 1..=ROOM + MORE {
+        let mut message = Message::typed(tid, app.tid, &Angle { degrees: 1.0 });
+        message.header.sequence = sequence;
+        client.send(&message);
+    }
+    let (mut told, mut frames) = (0, 0);
+    while told < MORE {
+        let said = client.next().expect("what nobody has taken");
+        assert_eq!((said.header.kind, said.header.class), (Kind::LNCL_UNTAKEN, Class::Control));
+        let Untaken { entries } = payload::read(&said.payload).unwrap();
+        let [entry] = &entries[..] else { panic!("{entries:?} of one destination") };
+        assert_eq!(entry.to, app.tid.bits());
+        assert_eq!(Outcome::from_code(entry.why), Some(Outcome::Rejected(Rejection::QueueFull)));
+        assert!(began <= Time::from_nanos(entry.since) && Time::from_nanos(entry.since) <= Time::now());
+        told += entry.count;
+        frames += 1;
+    }
+    assert_eq!(told, MORE);
+    let tenths = Time::now().since(began).as_millis() / 100;
+    assert!(frames <= 2 + tenths, "{frames} frames in {tenths} tenths of a second");
 }
 
 #[test]
@@ -355,7 +387,7 @@ fn what_expires_while_a_client_does_not_read_is_said_to_its_sender() {
     // When: a message with a time to live waits in another class.
     let (outcome, receiver) = std::sync::mpsc::sync_channel(1);
     let mut message = confirmed(app.tid, tid, 1);
-    message.header.sent = sinew_runtime::time::Time::now();
+    message.header.sent = Time::now();
     message.header.time_to_live_us = u32::try_from(Duration::from_millis(5).as_micros()).unwrap();
     let ticket = sinew_runtime::outcome::Ticket { source: app.tid, destination: tid, correlation: 1 };
     message.receipt = Some(sinew_runtime::outcome::Receipt::new(Arc::new(Told(outcome)), ticket));

@@ -448,6 +448,32 @@ typedef struct sinew_received {
     uint8_t reserved[2];
 } sinew_received;
 
+/**
+ * Messages to one destination that were sent without asking for their outcome, and that nobody has taken.
+ */
+typedef struct sinew_untaken {
+    /**
+     * Whom they were for; 0: several that are not told apart any more.
+     */
+    sinew_tid destination;
+    /**
+     * How many, since the last time that this endpoint said so. Never 0.
+     */
+    uint64_t count;
+    /**
+     * When the first of these was refused, on the clock of `sinew_now_ns`.
+     */
+    uint64_t since_ns;
+    /**
+     * Why: one of `sinew_outcome`, mostly `SINEW_REJECTED_QUEUE_FULL`, that is more came than the destination takes.
+     */
+    int32_t outcome;
+    /**
+     * Zero.
+     */
+    uint32_t reserved;
+} sinew_untaken;
+
 #ifdef __cplusplus
 extern "C" {
 #endif // __cplusplus
@@ -612,6 +638,14 @@ sinew_status sinew_reply(struct sinew_endpoint *endpoint,
 sinew_status sinew_receive_message(struct sinew_endpoint *endpoint,
                                    uint64_t within_ns,
                                    struct sinew_received *received);
+
+/**
+ * The next thing that the node has said about messages that were sent without asking for their outcome, and that nobody has
+ * taken: once for each destination and reason, with how many; `SINEW_NOTHING` if there is nothing new. Does not block. The
+ * first refusal is told at once, those after it every 100 ms together. `*untaken` is set if this returns `SINEW_OK`.
+ */
+sinew_status sinew_next_untaken(struct sinew_endpoint *endpoint,
+                                struct sinew_untaken *untaken);
 
 /**
  * Says what became of a message in hand, which its sender is told if it asked, and gives its memory back. `outcome` is

@@ -290,6 +290,16 @@ public:
         return came;
     }
 
+    /// What the node has said about messages that were sent without asking for their outcome, and that nobody has taken:
+    /// the next of them; nothing if there is nothing new.
+    [[nodiscard]] std::optional<sinew_untaken> untaken()
+    {
+        sinew_untaken next;
+        if (detail::check(sinew_next_untaken(raw_, &next)) == SINEW_NOTHING)
+            return std::nullopt;
+        return next;
+    }
+
     /// Who has a name now, on any node; nothing if nobody has.
     [[nodiscard]] std::optional<tid> resolve(std::string_view name, duration within)
     {

@@ -2,6 +2,8 @@
 
 use sinew::{Class, Tid};
 
+use crate::words::code_of as outcome_code;
+
 /// A transport ID (TID): the node's address in the upper half, the application's in the lower. 0 is nobody.
 pub type TidBits = u64;
 
@@ -71,6 +73,22 @@ pub struct Received {
     pub reserved: [u8; 2],
 }
 
+/// Messages to one destination that were sent without asking for their outcome, and that nobody has taken.
+#[derive(Clone, Copy, Debug)]
+#[repr(C)]
+pub struct Untaken {
+    /// Whom they were for; 0: several that are not told apart any more.
+    pub destination: TidBits,
+    /// How many, since the last time that this endpoint said so. Never 0.
+    pub count: u64,
+    /// When the first of these was refused, on the clock of `sinew_now_ns`.
+    pub since_ns: u64,
+    /// Why: one of `sinew_outcome`, mostly `SINEW_REJECTED_QUEUE_FULL`, that is more came than the destination takes.
+    pub outcome: i32,
+    /// Zero.
+    pub reserved: u32,
+}
+
 impl Message {
     /// What is left in the caller's memory when the library has taken the message.
     pub(crate) const GONE: Self = Self { bytes: std::ptr::null_mut(), length: 0, token: 0 };
@@ -105,6 +123,18 @@ impl Received {
             message_class: code_of(received.class()),
             wants_reply: received.wants_reply(),
             reserved: [0; 2],
+        }
+    }
+}
+
+impl Untaken {
+    pub(crate) fn of(untaken: &sinew::Untaken) -> Self {
+        Self {
+            destination: untaken.destination.bits(),
+            count: untaken.count,
+            since_ns: untaken.since.as_nanos(),
+            outcome: outcome_code(sinew::Outcome::Rejected(untaken.why)) as i32,
+            reserved: 0,
         }
     }
 }

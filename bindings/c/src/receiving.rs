@@ -4,7 +4,7 @@ use std::{mem::MaybeUninit, time::Duration};
 
 use crate::{
     border::{call, present, write},
-    message::{Endpoint, Received},
+    message::{Endpoint, Received, Untaken},
     registration::with,
     status::{Fault, Status},
     words::outcome_of,
@@ -25,6 +25,23 @@ pub extern "C" fn sinew_receive_message(
         let received = present(received, "received")?;
         match with(endpoint, |session| session.receive(Duration::from_nanos(within_ns)))? {
             Some(message) => Ok(write(received, message)),
+            None => Ok(Status::SinewNothing),
+        }
+    })
+}
+
+/// The next thing that the node has said about messages that were sent without asking for their outcome, and that nobody has
+/// taken: once for each destination and reason, with how many; `SINEW_NOTHING` if there is nothing new. Does not block. The
+/// first refusal is told at once, those after it every 100 ms together. `*untaken` is set if this returns `SINEW_OK`.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_next_untaken(
+    endpoint: *mut Endpoint,
+    untaken: Option<&mut MaybeUninit<Untaken>>,
+) -> Status {
+    call(|| {
+        let untaken = present(untaken, "untaken")?;
+        match with(endpoint, |session| Ok(session.endpoint().untaken()))? {
+            Some(next) => Ok(write(untaken, Untaken::of(&next))),
             None => Ok(Status::SinewNothing),
         }
     })

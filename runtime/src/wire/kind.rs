@@ -79,6 +79,8 @@ impl Kind {
     pub const LNCL_INTRODUCED: Self = Self(0x4a);
     /// From here on a process sends to another one on their link only.
     pub const LNCL_SWITCH: Self = Self(0x4b);
+    /// A process is told which of its unconfirmed messages nobody has taken.
+    pub const LNCL_UNTAKEN: Self = Self(0x4c);
 
     /// A node tells the process that it started for an application who it is: the first frame.
     pub const HOST_WELCOME: Self = Self(0x50);

@@ -10,7 +10,9 @@ use sinew_runtime::{
 use tokio::runtime::{Builder, Runtime};
 
 use crate::{
-    api::{ApiError, AsyncEndpoint, Endpoint, LentMessage, NodeApi, Received, Registration, Transport},
+    api::{
+        ApiError, AsyncEndpoint, Endpoint, LentMessage, NodeApi, Received, Registration, Transport, Untaken,
+    },
     lncl::testing::TestNode,
 };
 
@@ -191,6 +193,10 @@ impl Client {
             Self::Thread(endpoint) => endpoint.receive(within),
             Self::Task(endpoint, runtime) => runtime.block_on(within_time(within, endpoint.receive())),
         }
+    }
+
+    pub(super) fn untaken(&mut self) -> Option<Untaken> {
+        look!(self, endpoint => endpoint.untaken())
     }
 
     pub(super) fn join(&mut self, name: &str) -> Result<(), ApiError> {

@@ -137,7 +137,7 @@ impl Drop for Client {
     fn drop(&mut self) {
         self.server.introductions.remove(self.tid.app);
         registrar::owner_gone(&self.server.stores, self.peer.owner(), &self.cause);
-        self.server.remove_outlet(self.peer.id);
+        self.server.remove_client(self.peer.id);
         if !self.has_been_told {
             self.say_last("the node's LNCL has ended; connect again when it is back".to_owned(), true);
         }

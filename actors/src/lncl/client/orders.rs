@@ -63,8 +63,9 @@ impl Client {
             && destination.is_single()
         {
             // The source of a confirmed message knows; a group without members is no fault.
-            let detail = format!("from {} to {destination}: {why}", self.tid);
-            self.server.refusals.count(Time::now(), "unconfirmed message not taken", &detail);
+            let (detail, now) = (format!("from {} to {destination}: {why}", self.tid), Time::now());
+            self.server.refusals.count(now, "unconfirmed message not taken", &detail);
+            self.notices.count(destination, why, now);
         }
     }
 
@@ -106,9 +107,12 @@ impl Client {
         let Header { source, destination, correlation, flags, .. } = message.header;
         let detail = format!("{} said that {source} sends to {destination}: {why}", self.tid);
         let cause = if why == Rejection::ForgedSource { "forged source" } else { "unsupported flags" };
-        self.server.refusals.count(Time::now(), cause, &detail);
+        let now = Time::now();
+        self.server.refusals.count(now, cause, &detail);
         if flags.has(Flags::CONFIRM) {
             self.tell(destination, correlation, Outcome::Rejected(why));
+        } else {
+            self.notices.count(self.server.stores.router.absolute(destination), why, now);
         }
     }
 

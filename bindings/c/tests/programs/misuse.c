@@ -58,6 +58,7 @@ static void null_arguments(sinew_endpoint *endpoint)
     EXPECT_WORDS(sinew_send_bytes(endpoint, 1, kind, 0, NULL, 5), SINEW_ERROR_INVALID_ARGUMENT, "`bytes` is NULL");
     EXPECT_WORDS(sinew_receive_message(endpoint, 0, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`received` is NULL");
     EXPECT_WORDS(sinew_receive_message(NULL, 0, &received), SINEW_ERROR_INVALID_ARGUMENT, "`endpoint` is NULL");
+    EXPECT_WORDS(sinew_next_untaken(endpoint, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`untaken` is NULL");
     EXPECT_WORDS(sinew_settle_message(endpoint, NULL, 0), SINEW_ERROR_INVALID_ARGUMENT, "`received` is NULL");
     EXPECT_WORDS(sinew_resolve(endpoint, no_text, 1, &tid), SINEW_ERROR_INVALID_ARGUMENT, "`name` is NULL");
     EXPECT_WORDS(sinew_resolve(endpoint, node, 1, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`tid` is NULL");

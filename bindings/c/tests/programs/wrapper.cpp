@@ -39,6 +39,24 @@ static void errors_are_exceptions(sinew::endpoint &endpoint)
     EXPECT(endpoint.confirm(0x7777, what, pair{1, 2}, 10s) == SINEW_REJECTED_NO_SUCH_APPLICATION);
 }
 
+// What was sent without asking and reached nobody is said with its number.
+static void untaken_messages_are_counted(sinew::endpoint &endpoint)
+{
+    EXPECT(!endpoint.untaken());
+    for (int number = 0; number < 3; number++)
+        endpoint.send(0x7777, what, pair{1, 2});
+    std::uint64_t count = 0;
+    for (int look = 0; look < 1000 && count < 3; look++) {
+        while (const auto untaken = endpoint.untaken()) {
+            EXPECT((untaken->destination & 0xffffffff) == 0x7777 && untaken->since_ns <= sinew_now_ns());
+            EXPECT(untaken->outcome == SINEW_REJECTED_NO_SUCH_APPLICATION);
+            count += untaken->count;
+        }
+        EXPECT(!endpoint.receive(10ms));
+    }
+    EXPECT(count == 3);
+}
+
 // How the receiver ends with the message in hand decides what its sender is told.
 static void scopes_settle(sinew::endpoint &sender, sinew::endpoint receiver)
 {
@@ -100,6 +118,7 @@ int main(int argc, char **argv)
     const char *socket = argc > 1 ? argv[1] : "";
     sinew::endpoint endpoint(socket);
     errors_are_exceptions(endpoint);
+    untaken_messages_are_counted(endpoint);
     scopes_settle(endpoint, sinew::endpoint(socket));
     unsent_messages_are_given_back(endpoint);
     groups_and_names(socket);
