@@ -12,6 +12,7 @@
 //! All of it stands under one mutex. Receipts are never settled and nobody is woken with it in hand, because whoever
 //! is told may submit to this very outlet.
 
+mod draining;
 mod expiry;
 mod half;
 mod partial;
@@ -36,7 +37,8 @@ use tokio::net::{TcpStream, UnixStream};
 
 use crate::session::Ack;
 
-use half::{After, Bound, Half};
+use draining::Drained;
+use half::{After, Bound, Half, Step};
 pub(crate) use resume::Session;
 
 /// A non-blocking socket, or what is like one, that can be written to from any thread.
@@ -44,6 +46,11 @@ pub(crate) trait Socket: Send + 'static {
     /// What its frames have for a checksum.
     fn checksum(&self) -> Checksum {
         Checksum::Crc
+    }
+
+    /// Bytes of a payload that are written at once, with the outlet locked: whoever else needs it waits that long.
+    fn piece_max(&self) -> usize {
+        usize::MAX
     }
 
     /// Writes what the socket takes at once, from the first byte of `parts` on.
@@ -70,6 +77,11 @@ pub(crate) struct Account {
 }
 
 impl Socket for Arc<TcpStream> {
+    fn piece_max(&self) -> usize {
+        // About 20 us of copying.
+        64 << 10
+    }
+
     fn try_write_vectored(&mut self, parts: &[IoSlice<'_>]) -> io::Result<usize> {
         TcpStream::try_write_vectored(self, parts)
     }
@@ -117,6 +129,20 @@ pub struct OutletCounts {
     pub lost: u64,
     /// Handed back to their sender.
     pub refused: u64,
+}
+
+impl std::ops::Add for OutletCounts {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Self {
+            sent: self.sent + other.sent,
+            superseded: self.superseded + other.superseded,
+            expired: self.expired + other.expired,
+            lost: self.lost + other.lost,
+            refused: self.refused + other.refused,
+        }
+    }
 }
 
 /// Which of an outlet's connections, one after the other, something is about.
@@ -191,7 +217,13 @@ impl<S: Socket> StreamOutlet<S> {
     /// Writes what waits whenever the socket takes it. Resolves when this connection cannot be written to any more,
     /// with the reason. To be run by one task, on the thread whose reactor the socket belongs to.
     pub(crate) async fn drain(&self, link: LinkNumber) -> io::Error {
-        poll_fn(|cx| self.with(|half, after| half.poll_drain(link, cx, after))).await
+        loop {
+            match poll_fn(|cx| self.with(|half, after| half.poll_drain(link, cx, after))).await {
+                Drained::Over(error) => return error,
+                // Others of this thread have their turn, and what has come meanwhile is looked at.
+                Drained::Enough => tokio::task::yield_now().await,
+            }
+        }
     }
 
     /// Sends `last` when nothing waits any more, and takes nothing from now on: [`Rejection::Closed`].
@@ -205,7 +237,11 @@ impl<S: Socket> StreamOutlet<S> {
     /// # Errors
     /// The frame: there will be no further connection.
     pub(crate) fn submit_beyond(&self, message: Message) -> Result<(), Refused> {
-        self.with(|half, after| half.submit(message, Bound::Waived, after))
+        let step = self.with(|half, after| half.submit(message, Bound::Waived, after))?;
+        if step == Step::More {
+            self.with(Half::hand_to_drainer);
+        }
+        Ok(())
     }
 
     /// Takes a frame that goes ahead of all that waits, behind those taken so before it. At most `waiting_max` wait.
@@ -262,6 +298,10 @@ impl<S: Socket> StreamOutlet<S> {
 
 impl<S: Socket> Outlet for StreamOutlet<S> {
     fn submit(&self, message: Message) -> Result<(), Refused> {
-        self.with(|half, after| half.submit(message, Bound::Kept, after))
+        let mut step = self.with(|half, after| half.submit(message, Bound::Kept, after))?;
+        while step == Step::More {
+            step = self.with(|half, after| half.write_on(after));
+        }
+        Ok(())
     }
 }

@@ -26,7 +26,8 @@ use tokio::net::TcpStream;
 use super::{
     Event, LinkFact,
     core::{
-        Attach, ConnectionId, Core, Decline, Input, Introduction, Output, Refusal, Settings, read, write,
+        Attach, CLASSES, ConnectionId, Core, Decline, Input, Introduction, Lane, Output, Refusal, Settings,
+        read, write,
     },
     inbound::Inbound,
     link::{self, Mode, News, Reading, SharedMode, What},
@@ -125,12 +126,12 @@ impl Gncl {
         match output {
             Output::Dial { connection, address } => self.dial(connection, address, ctx),
             Output::SendHello(connection, hello) => self.send_hello(connection, &hello, ctx),
-            Output::Attach(attach) => self.attach(attach, ctx),
-            Output::Detach { connection, node } => self.detach(connection, node, ctx),
+            Output::Attach(attach) => self.attach(&attach, ctx),
+            Output::Detach { connection, node, lane } => self.detach(connection, (node, lane), ctx),
             Output::Refuse(connection, refusal) => self.refuse(connection, &refusal, ctx),
             Output::Close(connection) => self.close(connection, ctx),
-            Output::SendPing(node) => self.send(node, Kind::GNCL_PING),
-            Output::SendPong(node) => self.send(node, Kind::GNCL_PONG),
+            Output::SendPing(node, lane) => self.send(node, lane, Kind::GNCL_PING),
+            Output::SendPong(node, lane) => self.send(node, lane, Kind::GNCL_PONG),
             Output::SendGoodbye(node) => self.say_goodbye(node),
             Output::Forget(node) => {
                 self.stores.router.remove_peer(node);
@@ -192,28 +193,41 @@ impl Gncl {
         wire.tasks.push(ctx.spawn(fut::wrap_future(task)));
     }
 
-    fn attach(&mut self, attach: Attach, ctx: &mut Context<Self>) {
-        let Attach { connection, node, incarnation, payload_max, welcome } = attach;
+    fn attach(&mut self, attach: &Attach, ctx: &mut Context<Self>) {
+        let Attach { connection, node, lane, .. } = *attach;
         let Some(wire) = self.wires.get_mut(&connection) else { return };
         let Some(socket) = wire.socket.clone() else { return };
-        let peer = self.stores.gncl.meet(Time::now(), node, incarnation, &self.stores);
-        let welcome = welcome.map(|words| frame(self.stores.node, node, Kind::GNCL_WELCOME, write(&words)));
-        let payload_max = usize::try_from(payload_max).unwrap_or(usize::MAX);
-        let link = peer.outlet.connect(socket, payload_max, welcome);
-        peer.attach(link);
-        wire.set_mode(Mode::Linked(Inbound { stores: self.stores.clone(), peer: peer.clone(), link }));
+        let peer = self.stores.gncl.meet(Time::now(), attach, &self.stores);
+        let Some(way) = peer.way(lane) else { return };
+        let words = attach.welcome.as_ref();
+        let welcome = words.map(|words| frame(self.stores.node, node, Kind::GNCL_WELCOME, write(words)));
+        let payload_max = usize::try_from(attach.payload_max).unwrap_or(usize::MAX);
+        let link = way.outlet.connect(socket, payload_max, welcome);
+        way.attach(link);
+        wire.set_mode(Mode::Linked(Inbound { stores: self.stores.clone(), peer: peer.clone(), lane, link }));
         self.stores.router.set_peer(node, peer.clone());
-        let drainer = fut::wrap_future::<_, Self>(async move { peer.outlet.drain(link).await });
+        let drainer = async move {
+            match peer.way(lane) {
+                Some(way) => way.outlet.drain(link).await,
+                None => io::ErrorKind::NotConnected.into(),
+            }
+        };
+        let drainer = fut::wrap_future::<_, Self>(drainer);
         let drainer = ctx.spawn(drainer.map(move |_, actor, ctx| actor.ended(connection, ctx)));
         wire.link = Some((link, drainer));
     }
 
-    fn detach(&mut self, connection: ConnectionId, node: NodeAddress, ctx: &mut Context<Self>) {
+    fn detach(
+        &mut self,
+        connection: ConnectionId,
+        (node, lane): (NodeAddress, Lane),
+        ctx: &mut Context<Self>,
+    ) {
         let Some(wire) = self.wires.get_mut(&connection) else { return };
         let Some((link, drainer)) = wire.link.take() else { return };
         ctx.cancel_future(drainer);
-        if let Some(peer) = self.stores.gncl.peer(node) {
-            wire.may_speak = peer.outlet.disconnect(link);
+        if let Some(way) = self.stores.gncl.peer(node).as_ref().and_then(|peer| peer.way(lane)) {
+            wire.may_speak = way.outlet.disconnect(link);
         }
     }
 
@@ -234,16 +248,16 @@ impl Gncl {
         self.close(connection, ctx);
     }
 
-    fn send(&self, node: NodeAddress, kind: Kind) {
-        if let Some(peer) = self.stores.gncl.peer(node) {
-            peer.say(frame(self.stores.node, node, kind, bytes::Bytes::new()));
+    fn send(&self, node: NodeAddress, lane: Lane, kind: Kind) {
+        if let Some(way) = self.stores.gncl.peer(node).as_ref().and_then(|peer| peer.way(lane)) {
+            way.say(frame(self.stores.node, node, kind, bytes::Bytes::new()));
         }
     }
 
     /// spec: GNCL-10
     fn say_goodbye(&self, node: NodeAddress) {
-        if let Some(peer) = self.stores.gncl.peer(node) {
-            peer.outlet.finish(frame(self.stores.node, node, Kind::GNCL_GOODBYE, bytes::Bytes::new()));
+        for way in self.stores.gncl.peer(node).iter().flat_map(|peer| peer.ways()) {
+            way.outlet.finish(frame(self.stores.node, node, Kind::GNCL_GOODBYE, bytes::Bytes::new()));
         }
     }
 
@@ -300,7 +314,7 @@ impl Gncl {
     /// Cuts what a former instance of this layer, or this one, has connected.
     fn cut_all(&self) {
         for peer in self.stores.gncl.peers() {
-            peer.outlet.cut();
+            peer.cut();
         }
     }
 }
@@ -339,7 +353,9 @@ fn settings(stores: &Stores) -> Settings {
             peer: NodeAddress::HERE,
             dial: 0,
             payload_max: payload_max as u64,
-            features: Vec::new(),
+            features: vec![CLASSES.to_owned()],
+            lane: Lane::Control,
+            link: 0,
         },
         handshake: gncl.handshake,
         redial_min: gncl.redial_min,
@@ -378,9 +394,9 @@ impl Actor for Gncl {
         ctx.add_stream(self.stores.posts.gncl.attach_keeping(Clone::clone));
         ctx.run_interval(EXPIRY_PERIOD, |actor, _| {
             let now = Time::now();
-            for peer in actor.stores.gncl.peers() {
-                peer.outlet.expire(now);
-                peer.acknowledge_if_owed();
+            for way in actor.stores.gncl.peers().iter().flat_map(|peer| peer.ways()) {
+                way.outlet.expire(now);
+                way.acknowledge_if_owed();
             }
         });
         if let Some(ready) = self.ready.take() {

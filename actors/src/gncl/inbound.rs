@@ -10,7 +10,7 @@ use sinew_runtime::{
 };
 
 use super::{
-    core::{Decline, read},
+    core::{Decline, Lane, read},
     peer::Peer,
 };
 use crate::{outlet::LinkNumber, stores::Stores};
@@ -19,6 +19,8 @@ use crate::{outlet::LinkNumber, stores::Stores};
 pub(super) struct Inbound {
     pub(super) stores: Arc<Stores>,
     pub(super) peer: Arc<Peer>,
+    /// Whose connections this is one of.
+    pub(super) lane: Lane,
     /// The connection on which they come.
     pub(super) link: LinkNumber,
 }
@@ -29,12 +31,13 @@ impl Inbound {
     /// # Errors
     /// It is not the next one, or an acknowledgement that is none: the peer is at fault.
     pub(super) fn receive(&self, now: Time, message: Message) -> Result<(), Decline> {
+        let Some(way) = self.peer.way(self.lane) else { return Ok(()) };
         if is_for_the_link(&message, Kind::GNCL_ACK) {
-            self.peer.heard(self.link, &read(&message.payload)?, now);
+            way.heard(self.link, &read(&message.payload)?, now);
             return Ok(());
         }
         // Counted first: what panics from here on must not come again.
-        if self.peer.arrive(self.link, &message)? && !is_for_the_link(&message, Kind::GNCL_VOID) {
+        if way.arrive(self.link, &message)? && !is_for_the_link(&message, Kind::GNCL_VOID) {
             self.take(now, message);
         }
         Ok(())
@@ -95,7 +98,7 @@ impl Inbound {
         };
         match outcome {
             // One that nobody waits for any more was settled as Unknown when an earlier connection ended.
-            Some(outcome) => drop(self.peer.outlet.confirm(ticket, outcome)),
+            Some(outcome) => self.peer.confirm(ticket, outcome),
             None => self.count(now, "no such outcome", message),
         }
     }

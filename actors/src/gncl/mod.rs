@@ -18,12 +18,14 @@
 //! | GNCL-10 | GOODBYE is the last frame of a node that leaves; it is not dialled again until it is found again. |
 //! | GNCL-11 | A frame's source must be on the peer's node and its destination on this one; times are turned into our clock. |
 //! | GNCL-12 | CONFIRM is answered by OUTCOME on the peer's present connection. |
+//! | GNCL-14 | Where both know `classes`, whoever dialled a link dials a connection each for Stream and for Bulk as well. |
 //! | GNCL-13 | When a connection ends, nothing is lost (`session/`); when the node is, what was sent is `Unknown`, what waited `PeerLost`. |
 //!
 //! | file | what it is |
 //! | --- | --- |
 //! | `core/` | who dials, who is refused, which link stays: no socket, no clock |
-//! | `peer.rs` | what a peer is to senders: its outlet, which outlives connections and this layer's restarts |
+//! | `peer.rs` | what a peer is to senders: its sessions, which outlive connections and this layer's restarts |
+//! | `way.rs` | one of these sessions, with its outlet |
 //! | `link.rs` | the reading half of a connection |
 //! | `inbound.rs` | what is checked before a frame becomes a message of this node |
 //! | `listener.rs` | the accepting socket |
@@ -38,6 +40,7 @@ mod listener;
 mod peer;
 #[cfg(test)]
 mod tests;
+mod way;
 
 pub(crate) use actor::{Gncl, LINGER};
 pub(crate) use facts::LinkFact;

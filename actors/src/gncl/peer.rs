@@ -1,4 +1,4 @@
-//! What another node is to the senders of this one: an outlet that outlives connections and restarts of this layer.
+//! What another node is to the senders of this one: its sessions, which outlive connections and restarts of this layer.
 
 use std::{
     collections::BTreeMap,
@@ -12,150 +12,83 @@ use sinew_runtime::{
     router::{Outlet, Refused},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
-    wire::{Header, Kind, Message},
+    wire::{Class, Header, Kind, Message},
 };
 use socket2::SockRef;
-use tokio::net::TcpStream;
 
-use super::core::{Decline, write};
+use super::{
+    core::{Attach, Lane},
+    way::{Ends, Way},
+};
 use crate::{
-    config::NodeConfig,
-    outlet::{LinkNumber, OutletLimits, Session, StreamOutlet},
+    outlet::OutletCounts,
     refusals::Refusals,
-    session::{Ack, Arrival, Receiving, Window},
     stores::{Stores, lock},
 };
-
-/// Bytes of frames for one peer that are kept unacknowledged, from which on further messages wait.
-const WINDOW_BYTES: usize = 4 << 20;
-/// Messages that are kept at most: half of what their numbers' 16 bits on the wire can tell apart.
-const WINDOW_MESSAGES_MAX: usize = 1 << 15;
-/// Frames of this layer itself that wait for a socket at most: more than a peer's ACKs, PINGs and PONGs ever are.
-const WORDS_MAX: usize = 32;
-
-/// What all peers of a node share.
-struct Setting<'a> {
-    config: &'a NodeConfig,
-    refusals: &'a Arc<Refusals>,
-}
 
 /// One life of another node, from its first link until it is forgotten.
 pub(crate) struct Peer {
     pub(crate) node: NodeAddress,
     pub(crate) incarnation: Incarnation,
-    pub(crate) outlet: StreamOutlet<Arc<TcpStream>>,
-    /// What was taken of its messages. Locked for a moment, never with another lock in hand.
-    receiving: Mutex<Receiving>,
-    here: NodeAddress,
-    refusals: Arc<Refusals>,
+    /// A session for each class, or one for all.
+    ways: Vec<Way>,
 }
 
 impl Peer {
     /// `now` numbers what is remembered of the peer: a later peer of the same life has a larger number.
-    fn new(
-        now: Time,
-        here: NodeAddress,
-        node: NodeAddress,
-        incarnation: Incarnation,
-        setting: Setting<'_>,
-    ) -> Self {
-        let Setting { config, refusals } = setting;
-        let limits = OutletLimits {
-            queue_capacity: config.gncl.queue_capacity,
-            queue_bytes: config.gncl.queue_bytes,
-            unconfirmed_max: config.gncl.queue_capacity,
-            payload_max: config.payload_max,
-        };
-        let messages = config.gncl.queue_capacity.min(WINDOW_MESSAGES_MAX);
-        let window = Window { messages, bytes: WINDOW_BYTES };
-        let (memory, void) = (now.as_nanos(), frame(here, node, Kind::GNCL_VOID, Bytes::new()).header);
-        let outlet = StreamOutlet::with_session(limits, Session::new(memory, window, void));
-        let receiving = Mutex::new(Receiving::new(memory));
-        Self { node, incarnation, outlet, receiving, here, refusals: refusals.clone() }
+    fn new(now: Time, attach: &Attach, stores: &Stores) -> Self {
+        let ends = Ends { here: stores.node, node: attach.node };
+        let ways = if attach.by_class { Lane::ALL.len() } else { 1 };
+        let refusals = &stores.gncl.refusals;
+        let ways = (0..ways).map(|_| Way::new(now, ends, &stores.config, refusals)).collect();
+        Self { node: attach.node, incarnation: attach.incarnation, ways }
     }
 
-    /// Its messages come on `link` from now on, and are taken from no other.
-    pub(super) fn attach(&self, link: LinkNumber) {
-        self.receiving().attach(link.number());
-        self.acknowledge();
+    /// Its sessions.
+    pub(crate) fn ways(&self) -> &[Way] {
+        &self.ways
     }
 
-    /// A message came on `link`. Returns whether it is to be taken.
-    ///
-    /// # Errors
-    /// It is not the next one.
-    pub(super) fn arrive(&self, link: LinkNumber, message: &Message) -> Result<bool, Decline> {
-        let number = message.header.number;
-        let arrival = self.receiving().arrive(link.number(), number, message.size());
-        match arrival {
-            Arrival::Take { ack_is_due } => {
-                if ack_is_due {
-                    self.acknowledge();
-                }
-                Ok(true)
-            }
-            Arrival::Fenced => Ok(false),
-            Arrival::OutOfStep { expected } => Err(Decline::Violation(format!(
-                "message {number} came where {} is the next one",
-                expected as u16
-            ))),
-        }
+    /// The session whose messages travel on connections of this lane.
+    pub(super) fn way(&self, lane: Lane) -> Option<&Way> {
+        self.ways.get(lane as usize)
     }
 
-    /// The peer says what it has taken.
-    pub(super) fn heard(&self, link: LinkNumber, ack: &Ack, now: Time) {
-        let counts = self.receiving().heard(link.number(), ack.epoch);
-        if counts && self.outlet.heard(link, ack, now) {
-            self.refusals.count(
-                now,
-                "session begun anew",
-                &format!("node {} does not know what it took; what it was sent ends as Unknown", self.node),
-            );
-            self.acknowledge();
-        }
+    /// The session of this class.
+    fn way_of(&self, class: Class) -> &Way {
+        self.ways.get(class as usize).unwrap_or(&self.ways[0])
     }
 
-    /// Tells the peer what was taken, if it does not know.
-    pub(super) fn acknowledge_if_owed(&self) {
-        let owes = self.receiving().owes_ack();
-        if owes {
-            self.acknowledge();
-        }
+    /// Cuts every connection.
+    pub(super) fn cut(&self) {
+        self.ways.iter().for_each(|way| way.outlet.cut());
     }
 
-    fn acknowledge(&self) {
-        let epoch = self.outlet.epoch();
-        let ack = self.receiving().ack(epoch);
-        self.say(frame(self.here, self.node, Kind::GNCL_ACK, write(&ack)));
+    /// The peer says what became of the message that `ticket` names; if nobody waits for it any more, nothing happens.
+    pub(super) fn confirm(&self, ticket: Ticket, outcome: Outcome) {
+        // Stream is never confirmed, and the ticket does not say the class.
+        let _ = self.ways.iter().any(|way| way.outlet.confirm(ticket, outcome));
     }
 
-    fn receiving(&self) -> MutexGuard<'_, Receiving> {
-        self.receiving.lock().unwrap_or_else(PoisonError::into_inner)
+    /// What became of the messages to it so far.
+    pub(crate) fn counts(&self) -> OutletCounts {
+        self.ways.iter().fold(OutletCounts::default(), |sum, way| sum + way.outlet.counts())
     }
 
-    /// Says something on the present connection, ahead of all that waits. Without one nobody needs it.
-    pub(super) fn say(&self, message: Message) {
-        if let Err(refused) = self.outlet.submit_urgent(message, WORDS_MAX)
-            && refused.why == Rejection::QueueFull
-        {
-            let detail = format!("a frame of kind {} for node {}", refused.message.header.kind, self.node);
-            self.refusals.count(Time::now(), "own frame not sent", &detail);
-        }
+    /// Messages that wait to be sent to it.
+    pub(crate) fn waiting(&self) -> usize {
+        self.ways.iter().map(|way| way.outlet.waiting()).sum()
     }
 
-    /// Sends a frame of this layer itself.
-    pub(super) fn send(&self, message: Message) {
-        if let Err(refused) = self.outlet.submit(message) {
-            let kind = refused.message.header.kind;
-            let detail = format!("a frame of kind {kind} for node {}: {}", self.node, refused.why);
-            self.refusals.count(Time::now(), "own frame not sent", &detail);
-        }
+    /// Confirmed messages to it whose outcome is not known yet.
+    pub(crate) fn unconfirmed(&self) -> usize {
+        self.ways.iter().map(|way| way.outlet.unconfirmed()).sum()
     }
 }
 
 impl Outlet for Peer {
     fn submit(&self, message: Message) -> Result<(), Refused> {
-        self.outlet.submit(message)
+        self.way_of(message.header.class).outlet.submit(message)
     }
 }
 
@@ -164,7 +97,7 @@ impl ReceiptSink for Peer {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
         let mut said = Message::outcome(ticket, outcome);
         said.header.sent = Time::now();
-        self.send(said);
+        self.way_of(said.header.class).send(said);
     }
 }
 
@@ -197,21 +130,19 @@ impl Store {
         self.lock().get(&node).cloned()
     }
 
-    /// The peer at `node` in this life of it, made if need be. An older life is closed.
-    pub(super) fn meet(
-        &self,
-        now: Time,
-        node: NodeAddress,
-        incarnation: Incarnation,
-        stores: &Stores,
-    ) -> Arc<Peer> {
+    /// The peer that a connection leads to, made if need be. An older life of it is closed.
+    pub(super) fn meet(&self, now: Time, attach: &Attach, stores: &Stores) -> Arc<Peer> {
+        let node = attach.node;
         match self.peer(node) {
-            Some(peer) if peer.incarnation == incarnation => return peer,
+            Some(peer)
+                if peer.incarnation == attach.incarnation && (peer.ways.len() > 1) == attach.by_class =>
+            {
+                return peer;
+            }
             Some(_) => self.forget(node),
             None => {}
         }
-        let setting = Setting { config: &stores.config, refusals: &self.refusals };
-        let peer = Arc::new(Peer::new(now, stores.node, node, incarnation, setting));
+        let peer = Arc::new(Peer::new(now, attach, stores));
         self.lock().insert(node, peer.clone());
         peer
     }
@@ -221,7 +152,7 @@ impl Store {
         let peer = self.lock().remove(&node);
         // Closed without the lock: whoever is told of an outcome may ask for a peer.
         if let Some(peer) = peer {
-            peer.outlet.close(Rejection::NoSuchNode);
+            peer.ways.iter().for_each(|way| way.outlet.close(Rejection::NoSuchNode));
         }
     }
 

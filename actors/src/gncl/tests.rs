@@ -1,6 +1,7 @@
 //! Real GNCL actors over loopback, and peers that are written by hand, as another language's would be.
 
 mod bench;
+mod classes;
 mod handshakes;
 mod links;
 mod messages;

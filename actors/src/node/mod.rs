@@ -243,9 +243,9 @@ impl NodeHandle {
     pub fn traffic(&self) -> Vec<Traffic> {
         let traffic = |peer: Arc<Peer>| Traffic {
             node: peer.node,
-            counts: peer.outlet.counts(),
-            waiting: peer.outlet.waiting(),
-            unconfirmed: peer.outlet.unconfirmed(),
+            counts: peer.counts(),
+            waiting: peer.waiting(),
+            unconfirmed: peer.unconfirmed(),
         };
         self.stores.gncl.peers().into_iter().map(traffic).collect()
     }

@@ -1,10 +1,6 @@
 //! What stands under an outlet's mutex: the socket, the frame being written, and all that waits.
 
-use std::{
-    collections::VecDeque,
-    io,
-    task::{Context, Poll, Waker},
-};
+use std::{collections::VecDeque, io, task::Waker};
 
 use sinew_runtime::{
     mailbox::{Bounds, ClassQueue},
@@ -19,9 +15,6 @@ use super::{
     partial::{Partial, Sort, Written},
     resume::Session,
 };
-
-/// Frames that the drainer writes before other tasks of its thread have their turn.
-const WRITES_PER_WAKE: usize = 64;
 
 /// What is done when the lock is free again.
 #[derive(Default)]
@@ -65,21 +58,29 @@ pub(super) enum Bound {
     Waived,
 }
 
+/// Whether a sender's thread has more to write.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Step {
+    Done,
+    /// A long frame of its own is on its way; the lock was given back in between.
+    More,
+}
+
 pub(super) struct Half<S> {
     limits: OutletLimits,
     payload_max: usize,
-    link: Link<S>,
+    pub(super) link: Link<S>,
     pub(super) number: u64,
     /// What makes a message arrive once through any number of connections; `None` where there is only ever one.
     pub(super) session: Option<Session>,
-    partial: Option<Partial>,
+    pub(super) partial: Option<Partial>,
     /// The frame that was being written when the last connection ended. No peer can have handled it: it goes first.
     pub(super) interrupted: Option<Message>,
     pub(super) queue: ClassQueue,
     /// Frames that go ahead of the queue, in their order.
-    urgent: VecDeque<Message>,
-    /// What is sent when nothing waits any more; nothing is taken after it.
-    last: Option<Message>,
+    pub(super) urgent: VecDeque<Message>,
+    /// What is sent when nothing waits any more, on whichever connection there is then; nothing is taken after it.
+    pub(super) last: Option<Message>,
     finishing: bool,
     /// Receipts of messages that wait.
     pub(super) waiting_receipts: usize,
@@ -139,7 +140,6 @@ impl<S: Socket> Half<S> {
             return true;
         }
         self.link = Link::Down;
-        self.last = None;
         self.urgent.clear();
         after.wake = self.drainer.take();
         let partial = self.partial.take();
@@ -218,7 +218,7 @@ impl<S: Socket> Half<S> {
         mut message: Message,
         bound: Bound,
         after: &mut After,
-    ) -> Result<(), Refused> {
+    ) -> Result<Step, Refused> {
         if let Err(why) = self.admit(&message, bound) {
             self.counts.refused += 1;
             return Err(Refused::new(message, why));
@@ -229,22 +229,28 @@ impl<S: Socket> Half<S> {
         };
         if message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
             self.expired(message, after);
-            return Ok(());
+            return Ok(Step::Done);
         }
         if self.waiting() > 0 || !self.takes_new() {
-            return self.enqueue(message, bound, after);
+            return self.enqueue(message, bound, after).map(|()| Step::Done);
         }
         let mut frame = self.frame(message);
         self.waiting_receipts += usize::from(frame.message.receipt.is_some());
         match self.write(&mut frame) {
             Written::Whole => self.sent(frame),
+            Written::Piece => {
+                self.partial = Some(frame);
+                return Ok(Step::More);
+            }
             Written::InPart if frame.written > 0 => {
                 self.partial = Some(frame);
                 after.wake = self.drainer.take();
             }
-            Written::InPart | Written::Broken => return self.requeue(frame, bound, after),
+            Written::InPart | Written::Broken => {
+                return self.requeue(frame, bound, after).map(|()| Step::Done);
+            }
         }
-        Ok(())
+        Ok(Step::Done)
     }
 
     pub(super) fn submit_urgent(
@@ -334,7 +340,7 @@ impl<S: Socket> Half<S> {
     }
 
     /// A message as it goes to the connection that there is now.
-    fn frame(&mut self, mut message: Message) -> Partial {
+    pub(super) fn frame(&mut self, mut message: Message) -> Partial {
         self.number(&mut message);
         Partial::new(message, self.checksum(), Sort::Message)
     }
@@ -347,15 +353,14 @@ impl<S: Socket> Half<S> {
         }
     }
 
-    fn frill(&self, message: Message) -> Partial {
+    pub(super) fn frill(&self, message: Message) -> Partial {
         Partial::new(message, self.checksum(), Sort::Frill)
     }
 
-    fn write(&mut self, frame: &mut Partial) -> Written {
+    pub(super) fn write(&mut self, frame: &mut Partial) -> Written {
         let Link::Up(socket) = &mut self.link else { return Written::Broken };
         match frame.write_to(socket) {
-            Ok(true) => Written::Whole,
-            Ok(false) => Written::InPart,
+            Ok(written) => written,
             Err(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted) => {
                 Written::InPart
             }
@@ -376,101 +381,12 @@ impl<S: Socket> Half<S> {
         }
     }
 
-    pub(super) fn poll_drain(
-        &mut self,
-        link: LinkNumber,
-        cx: &mut Context<'_>,
-        after: &mut After,
-    ) -> Poll<io::Error> {
-        for _ in 0..WRITES_PER_WAKE {
-            if let Some(end) = self.end_of(link) {
-                return Poll::Ready(end);
-            }
-            if !self.drainer.as_ref().is_some_and(|waker| waker.will_wake(cx.waker())) {
-                self.drainer = Some(cx.waker().clone());
-            }
-            if !self.has_frame() {
-                return Poll::Pending;
-            }
-            let Link::Up(socket) = &mut self.link else { continue };
-            match socket.poll_writable(cx) {
-                Poll::Pending => return Poll::Pending,
-                Poll::Ready(Err(error)) => self.link = Link::Failed(error),
-                Poll::Ready(Ok(())) => self.write_next(after),
-            }
-        }
-        cx.waker().wake_by_ref();
-        Poll::Pending
-    }
-
-    /// Why the connection `link` cannot be written to, if it cannot.
-    fn end_of(&mut self, link: LinkNumber) -> Option<io::Error> {
-        if link.0 != self.number {
-            return Some(io::ErrorKind::ConnectionAborted.into());
-        }
-        match std::mem::replace(&mut self.link, Link::Down) {
-            Link::Failed(error) => Some(error),
-            Link::Down => Some(io::ErrorKind::NotConnected.into()),
-            link @ Link::Closed(_) => {
-                self.link = link;
-                Some(io::ErrorKind::NotConnected.into())
-            }
-            link @ Link::Up(_) => {
-                self.link = link;
-                None
-            }
-        }
-    }
-
-    fn write_next(&mut self, after: &mut After) {
-        let Some(mut frame) = self.next_frame(after) else { return };
-        match self.write(&mut frame) {
-            Written::Whole => self.sent(frame),
-            Written::InPart | Written::Broken => self.partial = Some(frame),
-        }
-    }
-
-    fn next_frame(&mut self, after: &mut After) -> Option<Partial> {
-        if let Some(partial) = self.partial.take() {
-            return Some(partial);
-        }
-        if let Some(urgent) = self.urgent.pop_front() {
-            return Some(self.frill(urgent));
-        }
-        if let Some(again) = self.frame_again() {
-            return Some(again);
-        }
-        if self.queue.is_empty() && self.interrupted.is_none() {
-            return self.last.take().map(|last| self.frill(last));
-        }
-        if !self.session_has_room() {
-            return None;
-        }
-        let message = self.interrupted.take().or_else(|| self.queue.pop())?;
-        if message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
-            self.waiting_receipts -= usize::from(message.receipt.is_some());
-            self.expired(message, after);
-            return None;
-        }
-        Some(self.frame(message))
-    }
-
     pub(super) fn confirm(&mut self, ticket: Ticket, outcome: Outcome, after: &mut After) -> bool {
         let Some(at) = self.sent_receipts.iter().position(|sent| sent.receipt.ticket() == ticket) else {
             return false;
         };
         after.settle.extend(self.sent_receipts.remove(at).map(|sent| (sent.receipt, outcome)));
         true
-    }
-
-    /// Whether there is something that may be written now.
-    fn has_frame(&self) -> bool {
-        let waits = self.interrupted.is_some() || !self.queue.is_empty();
-        self.partial.is_some()
-            || !self.urgent.is_empty()
-            || self.behind() > 0
-            || waits && self.session_has_room()
-            || !waits && self.last.is_some() && self.session_is_through()
     }
 
     pub(super) fn waiting(&self) -> usize {

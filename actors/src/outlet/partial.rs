@@ -28,6 +28,9 @@ pub(super) enum Sort {
 /// How a write ended.
 pub(super) enum Written {
     Whole,
+    /// As much of it as is written at once; the socket may take more.
+    Piece,
+    /// The socket takes no more now.
     InPart,
     Broken,
 }
@@ -38,14 +41,23 @@ impl Partial {
         Self { message, head, written: 0, sort }
     }
 
-    /// Writes what the socket takes; returns whether that was all.
+    /// Writes what the socket takes of the next piece.
     ///
     /// # Errors
     /// The socket's.
-    pub(super) fn write_to(&mut self, socket: &mut impl Socket) -> io::Result<bool> {
+    pub(super) fn write_to(&mut self, socket: &mut impl Socket) -> io::Result<Written> {
         let head = &self.head[self.written.min(HEADER_LEN)..];
         let payload = &self.message.payload[self.written.saturating_sub(HEADER_LEN)..];
-        self.written += socket.try_write_vectored(&[IoSlice::new(head), IoSlice::new(payload)])?;
-        Ok(self.written == self.message.size())
+        let payload = &payload[..payload.len().min(socket.piece_max())];
+        let offered = head.len() + payload.len();
+        let taken = socket.try_write_vectored(&[IoSlice::new(head), IoSlice::new(payload)])?;
+        self.written += taken;
+        Ok(if self.written == self.message.size() {
+            Written::Whole
+        } else if taken == offered {
+            Written::Piece
+        } else {
+            Written::InPart
+        })
     }
 }

@@ -38,6 +38,12 @@ impl Figures {
         self.0.len()
     }
 
+    /// The time that 99 of 100 do not exceed.
+    #[must_use]
+    pub fn p99(&self) -> Duration {
+        Duration::from_nanos(self.0.value_at_quantile(0.99))
+    }
+
     /// The time that this share of all do not exceed, in microseconds.
     fn us(&self, quantile: f64) -> f64 {
         self.0.value_at_quantile(quantile) as f64 / 1_000.0

@@ -4,7 +4,7 @@ use std::{net::SocketAddr, time::Duration};
 
 use sinew_runtime::{tid::Incarnation, time::Time};
 
-use super::{ConnectionId, Settings};
+use super::{ConnectionId, Settings, sides::Side};
 
 /// What is known of one peer.
 #[derive(Debug)]
@@ -31,11 +31,25 @@ pub(super) struct Acquaintance {
     pub(super) orphan_at: Option<Time>,
 }
 
-/// A connection on which messages flow.
+/// A connection on which messages flow, and those for Stream and Bulk that go with it.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Link {
     pub(super) connection: ConnectionId,
     pub(super) since: Time,
+    pub(super) pulse: Pulse,
+    /// Number of the dial that made it.
+    pub(super) dial: u64,
+    /// Where the peer listens, if the dial was ours.
+    pub(super) dialled: Option<SocketAddr>,
+    /// What there is for Stream and for Bulk, if both nodes know classes.
+    pub(super) sides: Option<[Side; 2]>,
+    /// The peer has said goodbye on it.
+    pub(super) has_left: bool,
+}
+
+/// When a connection was last known to live.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Pulse {
     pub(super) heard: Time,
     /// Pings since something was heard.
     pub(super) pings: u32,
@@ -81,8 +95,8 @@ impl Acquaintance {
     }
 
     /// A link is there: nothing is planned.
-    pub(super) fn linked(&mut self, connection: ConnectionId, now: Time) {
-        self.link = Some(Link { connection, since: now, heard: now, pings: 0 });
+    pub(super) fn linked(&mut self, link: Link) {
+        self.link = Some(link);
         self.redial_at = None;
         self.orphan_at = None;
     }
@@ -98,14 +112,42 @@ impl Acquaintance {
 
     /// When something is to be done about it without further news.
     pub(super) fn next_wake(&self, settings: &Settings) -> Option<Time> {
-        let ping = self.link.map(|link| link.ping_at(settings));
-        [ping, self.redial_at, self.orphan_at].into_iter().flatten().min()
+        let link = self.link.as_ref().and_then(|link| link.next_wake(settings));
+        [link, self.redial_at, self.orphan_at].into_iter().flatten().min()
     }
 }
 
 impl Link {
-    /// When the next ping is due, or the link counts as broken.
+    fn next_wake(&self, settings: &Settings) -> Option<Time> {
+        let sides = self.sides.iter().flatten().filter_map(|side| side.next_wake(settings));
+        sides.chain([self.pulse.ping_at(settings)]).min()
+    }
+
+    /// The pulses of all connections that stand.
+    pub(super) fn pulses(&mut self) -> impl Iterator<Item = &mut Pulse> {
+        let sides = self.sides.iter_mut().flatten().filter_map(Side::pulse);
+        std::iter::once(&mut self.pulse).chain(sides)
+    }
+}
+
+impl Pulse {
+    /// Something was heard at `now`.
+    pub(super) const fn beat(now: Time) -> Self {
+        Self { heard: now, pings: 0 }
+    }
+
+    /// When the next ping is due, or the connection counts as broken.
     pub(super) fn ping_at(&self, settings: &Settings) -> Time {
         self.heard + settings.ping_period * (self.pings + 1)
+    }
+
+    /// Whether one more ping is sent at `now`; `None` if none is due, `Some(false)` if enough were.
+    pub(super) fn ping(&mut self, now: Time, settings: &Settings) -> Option<bool> {
+        if self.ping_at(settings) > now {
+            return None;
+        }
+        let again = self.pings < settings.pings_missed_max;
+        self.pings += u32::from(again);
+        Some(again)
     }
 }

@@ -3,8 +3,10 @@
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
 use super::{
-    Attach, Connection, ConnectionId, Core, Decline, Introduction, LinkFact, Output, Refusal, Stage,
-    acquaintance::Acquaintance, handshake::check,
+    Attach, Connection, ConnectionId, Core, Decline, Introduction, Lane, LinkFact, Output, Refusal, Stage,
+    acquaintance::{Acquaintance, Link, Pulse},
+    handshake::check,
+    sides::Side,
 };
 
 impl Core {
@@ -30,23 +32,30 @@ impl Core {
         debug_assert!(peer.link.is_none() && peer.dial.is_none(), "one connection to a peer is enough");
         peer.redial_at = None;
         peer.dial = Some(connection);
-        self.stage_for_handshake(now, connection, Stage::Dialling(node));
+        self.stage_for_handshake(now, connection, Stage::Dialling(node, Lane::Control));
         self.outputs.push_back(Output::Dial { connection, address });
     }
 
     pub(super) fn connected(&mut self, now: Time, connection: ConnectionId) {
-        let Some(Stage::Dialling(node)) = self.stage(connection) else { return };
+        let Some(Stage::Dialling(node, lane)) = self.stage(connection) else { return };
         let Some(peer) = self.peers.get_mut(&node) else { return };
         // The clock makes the number grow through restarts of this layer as well. spec: GNCL-6
         peer.dial_number = now.as_nanos().max(peer.dial_number + 1);
-        let hello = Introduction { peer: node, dial: peer.dial_number, ..self.settings.ours.clone() };
-        self.stage_for_handshake(now, connection, Stage::HelloSent(node));
+        // Of the first connection there is no link yet.
+        let link = peer.link.map_or(0, |link| link.dial);
+        let hello =
+            Introduction { peer: node, dial: peer.dial_number, lane, link, ..self.settings.ours.clone() };
+        self.stage_for_handshake(now, connection, Stage::HelloSent(node, lane));
         self.outputs.push_back(Output::SendHello(connection, hello));
     }
 
     pub(super) fn dial_failed(&mut self, now: Time, connection: ConnectionId, refused: bool) {
-        let Some(Stage::Dialling(node)) = self.stage(connection) else { return };
+        let Some(Stage::Dialling(node, lane)) = self.stage(connection) else { return };
         self.connections.remove(&connection);
+        if lane != Lane::Control {
+            // The first connection tells whether the node is there.
+            return self.side_over(now, node, lane);
+        }
         if let (true, Some(peer)) = (refused, self.peers.get(&node)) {
             let incarnation = peer.incarnation;
             self.fact(LinkFact::DialRefused { node, incarnation });
@@ -58,10 +67,13 @@ impl Core {
         match self.stage(connection) {
             Some(Stage::Stranger) => {}
             Some(Stage::Leaving) | None => return,
-            Some(Stage::Dialling(_) | Stage::HelloSent(_) | Stage::Linked(_)) => {
+            Some(Stage::Dialling(..) | Stage::HelloSent(..) | Stage::Linked(..)) => {
                 let what = "a HELLO came where none belongs".to_owned();
                 return self.decline(now, connection, &Decline::Violation(what));
             }
+        }
+        if hello.lane != Lane::Control {
+            return self.side_hello(now, connection, hello);
         }
         if let Err(decline) = self.judge(hello) {
             return self.decline(now, connection, &decline);
@@ -95,7 +107,7 @@ impl Core {
         // spec: GNCL-6
         let is_void = hello.incarnation == peer.incarnation && hello.dial <= peer.void_dial;
         // A dial that has not said hello yet loses against one that has. spec: GNCL-4
-        let said_hello = peer.dial.is_some_and(|dial| matches!(self.stage(dial), Some(Stage::HelloSent(_))));
+        let said_hello = peer.dial.is_some_and(|dial| matches!(self.stage(dial), Some(Stage::HelloSent(..))));
         if is_void || (said_hello && self.settings.ours.node < hello.node) {
             return Err(Decline::Duplicate);
         }
@@ -114,9 +126,12 @@ impl Core {
 
     pub(super) fn welcome(&mut self, now: Time, connection: ConnectionId, welcome: &Introduction) {
         let node = match self.stage(connection) {
-            Some(Stage::HelloSent(node)) => node,
+            Some(Stage::HelloSent(node, Lane::Control)) => node,
+            Some(Stage::HelloSent(node, lane)) => {
+                return self.side_welcome(now, connection, (node, lane), welcome);
+            }
             Some(Stage::Leaving) | None => return,
-            Some(Stage::Dialling(_) | Stage::Stranger | Stage::Linked(_)) => {
+            Some(Stage::Dialling(..) | Stage::Stranger | Stage::Linked(..)) => {
                 let what = "a WELCOME came where none belongs".to_owned();
                 return self.decline(now, connection, &Decline::Violation(what));
             }
@@ -155,24 +170,39 @@ impl Core {
         welcome: Option<Introduction>,
     ) {
         let (node, incarnation) = (theirs.node, theirs.incarnation);
+        let by_class = theirs.knows_classes() && self.settings.ours.knows_classes();
+        let redial_min = self.settings.redial_min;
         let Some(peer) = self.peers.get_mut(&node) else { return };
-        peer.linked(connection, now);
-        self.connections.insert(connection, Connection { stage: Stage::Linked(node), deadline: Time::MAX });
-        let payload_max = theirs.payload_max;
+        let (dial, dialled) =
+            if welcome.is_some() { (theirs.dial, None) } else { (peer.dial_number, peer.wanted) };
+        peer.linked(Link {
+            connection,
+            since: now,
+            pulse: Pulse::beat(now),
+            dial,
+            dialled,
+            sides: by_class.then(|| [Side::new(redial_min); 2]),
+            has_left: false,
+        });
+        let stage = Stage::Linked(node, Lane::Control);
+        self.connections.insert(connection, Connection { stage, deadline: Time::MAX });
         self.outputs.push_back(Output::Attach(Attach {
             connection,
             node,
             incarnation,
-            payload_max,
+            lane: Lane::Control,
+            by_class,
+            payload_max: theirs.payload_max,
             welcome,
         }));
         self.fact(LinkFact::LinkUp { node, incarnation });
+        self.dial_sides(now, node);
     }
 
     pub(super) fn refused(&mut self, now: Time, connection: ConnectionId, refusal: &Refusal) {
         let Some(stage) = self.stage(connection) else { return };
         match stage {
-            Stage::HelloSent(node) | Stage::Linked(node) => {
+            Stage::HelloSent(node, _) | Stage::Linked(node, _) => {
                 // Two nodes that dial each other at once refuse one of the two: that is how it should be.
                 let cause = if refusal.cause == "duplicate" {
                     "duplicate at the peer"
@@ -181,7 +211,7 @@ impl Core {
                 };
                 self.count(cause, format!("node {node} says: {}", printable(&refusal.sentence)));
             }
-            Stage::Dialling(_) | Stage::Stranger | Stage::Leaving => {}
+            Stage::Dialling(..) | Stage::Stranger | Stage::Leaving => {}
         }
         self.ended(now, connection);
         self.outputs.push_back(Output::Close(connection));
@@ -207,13 +237,13 @@ impl Core {
 
     pub(super) fn timed_out(&mut self, now: Time, connection: ConnectionId, stage: Stage) {
         match stage {
-            Stage::Stranger | Stage::HelloSent(_) => self.decline(now, connection, &Decline::TooLate),
-            Stage::Dialling(node) => {
+            Stage::Stranger | Stage::HelloSent(..) => self.decline(now, connection, &Decline::TooLate),
+            Stage::Dialling(node, _) => {
                 self.count("dial timed out", format!("node {node} cannot be reached"));
                 self.outputs.push_back(Output::Close(connection));
                 self.ended(now, connection);
             }
-            Stage::Leaving | Stage::Linked(_) => {
+            Stage::Leaving | Stage::Linked(..) => {
                 self.outputs.push_back(Output::Close(connection));
                 self.ended(now, connection);
             }
@@ -223,11 +253,20 @@ impl Core {
     /// The connection is not in `stage` any more: the peer's side of that.
     fn leave_stage(&mut self, now: Time, connection: ConnectionId, stage: Stage) {
         match stage {
-            Stage::Dialling(node) | Stage::HelloSent(node) => {
+            Stage::Dialling(node, Lane::Control) | Stage::HelloSent(node, Lane::Control) => {
                 self.connections.remove(&connection);
                 self.dial_over(now, node);
             }
-            Stage::Linked(node) => self.link_over(now, node),
+            Stage::Linked(node, Lane::Control) => self.link_over(now, node),
+            Stage::Dialling(node, lane) | Stage::HelloSent(node, lane) => {
+                self.connections.remove(&connection);
+                self.side_over(now, node, lane);
+            }
+            Stage::Linked(node, lane) => {
+                self.connections.remove(&connection);
+                self.outputs.push_back(Output::Detach { connection, node, lane });
+                self.side_over(now, node, lane);
+            }
             Stage::Stranger | Stage::Leaving => {
                 self.connections.remove(&connection);
             }
@@ -252,7 +291,7 @@ impl Core {
     }
 
     /// Enters a stage that does not last. spec: GNCL-2
-    fn stage_for_handshake(&mut self, now: Time, connection: ConnectionId, stage: Stage) {
+    pub(super) fn stage_for_handshake(&mut self, now: Time, connection: ConnectionId, stage: Stage) {
         let deadline = now + self.settings.handshake;
         self.connections.insert(connection, Connection { stage, deadline });
     }

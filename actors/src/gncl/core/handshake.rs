@@ -12,6 +12,31 @@ pub(crate) const HANDSHAKE_PAYLOAD_MAX: usize = 4_096;
 /// Longest name of a node or a project, in bytes.
 const NAME_MAX: usize = 63;
 
+/// The ability to have a connection for each class.
+pub(crate) const CLASSES: &str = "classes";
+
+/// Whose messages a connection carries: those of one class, where both nodes know [`CLASSES`]. Where one does not, the first
+/// carries all.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Lane {
+    /// The first connection: the link stands and falls with it.
+    #[default]
+    Control,
+    Stream,
+    Bulk,
+}
+
+impl Lane {
+    pub(crate) const ALL: [Self; 3] = [Self::Control, Self::Stream, Self::Bulk];
+    /// Those that are made when the first connection stands.
+    pub(crate) const SIDES: [Self; 2] = [Self::Stream, Self::Bulk];
+
+    fn is_control(&self) -> bool {
+        *self == Self::Control
+    }
+}
+
 /// Payload of HELLO and of WELCOME: who the sender is. Fields that are not known are ignored.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Introduction {
@@ -30,9 +55,27 @@ pub(crate) struct Introduction {
     pub(crate) dial: u64,
     /// Longest payload that the sender takes, in bytes.
     pub(crate) payload_max: u64,
-    /// Optional abilities of the sender; what both have may be used. None is defined in version 1.
+    /// Optional abilities of the sender; what both have may be used: [`CLASSES`].
     #[serde(default)]
     pub(crate) features: Vec<String>,
+    /// What travels on this connection.
+    #[serde(default, skip_serializing_if = "Lane::is_control")]
+    pub(crate) lane: Lane,
+    /// Of a further connection: number of the dial that made the first one.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub(crate) link: u64,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde calls it with a reference")]
+const fn is_zero(number: &u64) -> bool {
+    *number == 0
+}
+
+impl Introduction {
+    /// Whether the sender can have a connection for each class.
+    pub(crate) fn knows_classes(&self) -> bool {
+        self.features.iter().any(|feature| feature == CLASSES)
+    }
 }
 
 /// Payload of REFUSAL.
@@ -188,6 +231,8 @@ mod tests {
             dial: 1,
             payload_max: 1 << 20,
             features: Vec::new(),
+            lane: Lane::Control,
+            link: 0,
         }
     }
 
@@ -222,6 +267,8 @@ mod tests {
             dial: 1_000_000,
             payload_max: 1 << 20,
             features: Vec::new(),
+            lane: Lane::Control,
+            link: 0,
         };
         let page = include_str!("../../../../docs/protocol/gncl.md");
         let shown = page.split("```text").nth(1).and_then(|rest| rest.split("```").next()).unwrap();

@@ -7,7 +7,10 @@ use sinew_runtime::{
     time::Time,
 };
 
-use super::{ConnectionId, Core, LinkFact, Output, Stage, acquaintance::Acquaintance};
+use super::{
+    ConnectionId, Core, Lane, LinkFact, Output, Stage,
+    acquaintance::{Acquaintance, Pulse},
+};
 
 impl Core {
     pub(super) fn found(
@@ -109,29 +112,45 @@ impl Core {
     }
 
     pub(super) fn heard(&mut self, now: Time, connection: ConnectionId) {
-        let Some(node) = self.linked_node(connection) else { return };
-        if let Some(link) = self.peers.get_mut(&node).and_then(|peer| peer.link.as_mut()) {
-            link.heard = now;
-            link.pings = 0;
+        let Some((node, lane)) = self.linked(connection) else { return };
+        let Some(link) = self.peers.get_mut(&node).and_then(|peer| peer.link.as_mut()) else { return };
+        if let Some(pulse) = link.pulse_of(lane) {
+            *pulse = Pulse::beat(now);
         }
     }
 
     /// A peer with which messages pass is dialled again soon, however short its links are. spec: GNCL-8
     pub(super) fn carried(&mut self, connection: ConnectionId) {
-        let Some(node) = self.linked_node(connection) else { return };
-        if let Some(peer) = self.peers.get_mut(&node) {
-            peer.back_off = self.settings.redial_min;
+        let Some((node, lane)) = self.linked(connection) else { return };
+        let Some(peer) = self.peers.get_mut(&node) else { return };
+        peer.back_off = self.settings.redial_min;
+        if let Some(link) = &mut peer.link {
+            link.side_carried(lane, self.settings.redial_min);
         }
     }
 
+    /// spec: GNCL-10
     pub(super) fn goodbye(&mut self, now: Time, connection: ConnectionId) {
-        // spec: GNCL-10
-        let Some(node) = self.linked_node(connection) else { return };
+        let Some((node, lane)) = self.linked(connection) else { return };
         let Some(peer) = self.peers.get_mut(&node) else { return };
-        let incarnation = peer.incarnation;
         peer.wanted = None;
-        self.fact(LinkFact::PeerLeft { node, incarnation });
-        self.forget(now, node);
+        if lane != Lane::Control {
+            return self.side_goodbye(now, connection, (node, lane));
+        }
+        if let Some(link) = &mut peer.link {
+            link.has_left = true;
+        }
+        self.farewell(now, node);
+    }
+
+    /// A node that has said goodbye is gone when all its connections are through.
+    pub(super) fn farewell(&mut self, now: Time, node: NodeAddress) {
+        let Some(peer) = self.peers.get(&node) else { return };
+        if peer.link.is_some_and(|link| link.has_left && !link.expects_more()) {
+            let incarnation = peer.incarnation;
+            self.fact(LinkFact::PeerLeft { node, incarnation });
+            self.forget(now, node);
+        }
     }
 
     /// Ends all that there is with `node`; its incarnation stays known, so that no older one comes back.
@@ -148,6 +167,10 @@ impl Core {
 
     /// The link to `node` is over because its connection is; plans the next one.
     pub(super) fn link_over(&mut self, now: Time, node: NodeAddress) {
+        if self.peers.get(&node).and_then(|peer| peer.link).is_some_and(|link| link.has_left) {
+            self.drop_sides(node);
+            return self.farewell(now, node);
+        }
         let Some(connection) = self.detach(now, node) else { return };
         self.connections.remove(&connection);
         let chance = self.chance();
@@ -166,10 +189,11 @@ impl Core {
 
     /// The peer's messages wait from now on. spec: GNCL-13
     fn detach(&mut self, now: Time, node: NodeAddress) -> Option<ConnectionId> {
+        self.drop_sides(node);
         let peer = self.peers.get_mut(&node)?;
         let incarnation = peer.incarnation;
         let connection = peer.unlink(now, &self.settings)?.connection;
-        self.outputs.push_back(Output::Detach { connection, node });
+        self.outputs.push_back(Output::Detach { connection, node, lane: Lane::Control });
         self.fact(LinkFact::LinkBroken { node, incarnation });
         Some(connection)
     }
@@ -182,22 +206,25 @@ impl Core {
         } else if peer.redial_at.is_some_and(|at| at <= now) {
             self.dial(now, node);
         } else {
-            self.ping_due(now, node);
+            self.ping_due(now, node, Lane::Control);
+            for lane in Lane::SIDES {
+                self.redial_side(now, node, lane);
+                self.ping_due(now, node, lane);
+            }
         }
     }
 
     /// spec: GNCL-9
-    fn ping_due(&mut self, now: Time, node: NodeAddress) {
-        let Some(peer) = self.peers.get_mut(&node) else { return };
-        let Some(link) = peer.link.as_mut().filter(|link| link.ping_at(&self.settings) <= now) else {
+    fn ping_due(&mut self, now: Time, node: NodeAddress, lane: Lane) {
+        let Some(link) = self.peers.get_mut(&node).and_then(|peer| peer.link.as_mut()) else { return };
+        let Some(again) = link.pulse_of(lane).and_then(|pulse| pulse.ping(now, &self.settings)) else {
             return;
         };
-        if link.pings < self.settings.pings_missed_max {
-            link.pings += 1;
-            self.outputs.push_back(Output::SendPing(node));
+        if again {
+            self.outputs.push_back(Output::SendPing(node, lane));
             return;
         }
-        let connection = link.connection;
+        let Some(connection) = link.connection_of(lane) else { return };
         self.count(
             "silent link",
             format!("node {node} answers no ping; its GNCL hangs or the way to it is cut"),

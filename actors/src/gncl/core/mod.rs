@@ -5,6 +5,7 @@
 //! ```text
 //!  dialler    Dialling ── connected ──► HelloSent ── WELCOME ──► Linked
 //!  acceptor   Stranger ── HELLO ──► (WELCOME) ──────────────────► Linked
+//!  sides      Linked, both know classes: the dialler dials again for Stream and for Bulk; they end with the link (`sides.rs`)
 //!  either     any of them ── refused ──► Leaving (until the peer has read the words, or the time is over)
 //! ```
 
@@ -12,6 +13,7 @@ mod acquaintance;
 mod connections;
 mod handshake;
 mod links;
+mod sides;
 #[cfg(test)]
 mod tests;
 
@@ -28,7 +30,9 @@ use sinew_runtime::{
 
 use super::LinkFact;
 use acquaintance::Acquaintance;
-pub(super) use handshake::{Decline, HANDSHAKE_PAYLOAD_MAX, Introduction, Refusal, read, write};
+pub(super) use handshake::{
+    CLASSES, Decline, HANDSHAKE_PAYLOAD_MAX, Introduction, Lane, Refusal, read, write,
+};
 
 /// What the core is set to.
 #[derive(Clone, Debug)]
@@ -111,16 +115,16 @@ pub(super) enum Output {
     /// one to send.
     Attach(Attach),
     /// The peer's messages do not flow on this connection any more. A `Close` or a `Refuse` follows.
-    Detach { connection: ConnectionId, node: NodeAddress },
+    Detach { connection: ConnectionId, node: NodeAddress, lane: Lane },
     /// Send a REFUSAL, close our direction, and throw away what still comes until the peer closes its own.
     Refuse(ConnectionId, Refusal),
     /// Close the connection and forget it. No input about it is expected any more.
     Close(ConnectionId),
-    /// Send a PING on the link to this node.
-    SendPing(NodeAddress),
+    /// Send a PING on this connection to the node.
+    SendPing(NodeAddress, Lane),
     /// Send a PONG.
-    SendPong(NodeAddress),
-    /// Send a GOODBYE, after all that waits.
+    SendPong(NodeAddress, Lane),
+    /// Send a GOODBYE on each connection, after all that waits for it.
     SendGoodbye(NodeAddress),
     /// The node, or this life of it, is gone with all that waits for it.
     Forget(NodeAddress),
@@ -136,6 +140,9 @@ pub(super) struct Attach {
     pub(super) connection: ConnectionId,
     pub(super) node: NodeAddress,
     pub(super) incarnation: Incarnation,
+    pub(super) lane: Lane,
+    /// Whether each class has a connection of its own.
+    pub(super) by_class: bool,
     /// Longest payload that the peer takes, in bytes.
     pub(super) payload_max: u64,
     /// To be sent before all else.
@@ -146,13 +153,13 @@ pub(super) struct Attach {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Stage {
     /// Our dial has not reached the peer's host yet.
-    Dialling(NodeAddress),
+    Dialling(NodeAddress, Lane),
     /// Our hello is on its way.
-    HelloSent(NodeAddress),
+    HelloSent(NodeAddress, Lane),
     /// Accepted; has not said who it is.
     Stranger,
     /// Messages flow.
-    Linked(NodeAddress),
+    Linked(NodeAddress, Lane),
     /// Refused; has not closed its side.
     Leaving,
 }
@@ -213,7 +220,7 @@ impl Core {
             Input::Heard(connection) => self.heard(now, connection),
             Input::Carried(connection) => self.carried(connection),
             Input::PingReceived(connection) => {
-                let pong = self.linked_node(connection).map(Output::SendPong);
+                let pong = self.linked(connection).map(|(node, lane)| Output::SendPong(node, lane));
                 self.outputs.extend(pong);
             }
             Input::GoodbyeReceived(connection) => self.goodbye(now, connection),
@@ -257,7 +264,7 @@ impl Core {
             return;
         }
         for link in self.peers.values_mut().filter_map(|peer| peer.link.as_mut()) {
-            link.heard = link.heard + late;
+            link.pulses().for_each(|pulse| pulse.heard = pulse.heard + late);
         }
     }
 
@@ -273,10 +280,10 @@ impl Core {
         self.connections.get(&connection).map(|connection| connection.stage)
     }
 
-    fn linked_node(&self, connection: ConnectionId) -> Option<NodeAddress> {
+    fn linked(&self, connection: ConnectionId) -> Option<(NodeAddress, Lane)> {
         match self.stage(connection)? {
-            Stage::Linked(node) => Some(node),
-            Stage::Dialling(_) | Stage::HelloSent(_) | Stage::Stranger | Stage::Leaving => None,
+            Stage::Linked(node, lane) => Some((node, lane)),
+            Stage::Dialling(..) | Stage::HelloSent(..) | Stage::Stranger | Stage::Leaving => None,
         }
     }
 

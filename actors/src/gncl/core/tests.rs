@@ -4,6 +4,7 @@ use proptest::prelude::*;
 
 use super::*;
 
+mod sides;
 mod virtual_wire;
 
 use virtual_wire::{Mishap, World, millis};
@@ -70,7 +71,9 @@ fn settings(node: NodeAddress, incarnation: u64) -> Settings {
             peer: NodeAddress::HERE,
             dial: 0,
             payload_max: 1 << 20,
-            features: Vec::new(),
+            features: vec![CLASSES.to_owned()],
+            lane: Lane::Control,
+            link: 0,
         },
         handshake: Duration::from_secs(2),
         redial_min: Duration::from_millis(10),
@@ -131,7 +134,7 @@ fn an_older_life_of_a_peer_is_refused_and_a_newer_one_ends_what_belongs_to_the_o
     let (_, newer) = greet(&mut core, millis(2), hello_from(HIGH, 6, 1));
     let at =
         |wanted: &Output| newer.iter().position(|output| output == wanted).expect("is among the outputs");
-    let detached = at(&Output::Detach { connection: old, node: HIGH });
+    let detached = at(&Output::Detach { connection: old, node: HIGH, lane: Lane::Control });
     let forgotten = at(&Output::Forget(HIGH));
     let up = at(&Output::Fact(LinkFact::LinkUp { node: HIGH, incarnation: Incarnation(6) }));
     assert!(detached < forgotten && forgotten < up);
@@ -221,7 +224,7 @@ fn a_silent_link_is_pinged_three_times_and_then_broken() {
     greet(&mut core, millis(0), hello_from(HIGH, 1, 1));
     let seen = silence(&mut core, millis(4_000));
     let pings: Vec<_> =
-        seen.iter().filter(|(_, o)| *o == Output::SendPing(HIGH)).map(|(at, _)| *at).collect();
+        seen.iter().filter(|(_, o)| *o == Output::SendPing(HIGH, Lane::Control)).map(|(at, _)| *at).collect();
     assert_eq!(pings, [millis(1_000), millis(2_000), millis(3_000)]);
     let broken = Output::Fact(LinkFact::LinkBroken { node: HIGH, incarnation: Incarnation(1) });
     assert!(seen.contains(&(millis(4_000), broken)));
@@ -232,7 +235,7 @@ fn a_node_that_was_held_up_itself_does_not_call_its_peer_silent() {
     let mut core = core();
     greet(&mut core, millis(0), hello_from(HIGH, 1, 1));
     core.handle(millis(60_000), Input::TimePassed);
-    assert_eq!(outputs(&mut core), [Output::SendPing(HIGH)]);
+    assert_eq!(outputs(&mut core), [Output::SendPing(HIGH, Lane::Control)]);
 }
 
 #[test]
@@ -267,7 +270,8 @@ fn a_full_table_refuses_newcomers_unless_somebody_in_it_is_gone() {
 fn who_says_goodbye_has_left_and_is_not_dialled() {
     let mut core = core();
     core.handle(millis(0), found(1));
-    let (link, _) = greet(&mut core, millis(0), hello_from(HIGH, 1, 1));
+    let one_for_all = Introduction { features: Vec::new(), ..hello_from(HIGH, 1, 1) };
+    let (link, _) = greet(&mut core, millis(0), one_for_all);
     core.handle(millis(1), Input::GoodbyeReceived(link));
     let left = Output::Fact(LinkFact::PeerLeft { node: HIGH, incarnation: Incarnation(1) });
     assert!(outputs(&mut core).contains(&left));

@@ -24,7 +24,7 @@ use crate::{
     config::NodeConfig,
     gncl::{
         Event, Gncl, LinkFact,
-        core::{Introduction, Refusal, read, write},
+        core::{Introduction, Lane, Refusal, read, write},
         peer::frame,
     },
     ndl::{self, LossReason, MembershipFact},
@@ -239,14 +239,21 @@ impl ByHand {
 
     /// A link to `node`, as its peer number 9.
     pub(super) async fn linked_to(node: &mut Node) -> Self {
+        let peer = Self::greeting(node, &introduction(node.address())).await;
+        node.up().await;
+        peer
+    }
+
+    /// A connection to `node` on which `hello` was said, and welcomed.
+    pub(super) async fn greeting(node: &Node, hello: &Introduction) -> Self {
         let mut peer = Self::dial(node).await;
-        peer.say(&frame(NINE, node.address(), Kind::GNCL_HELLO, write(&introduction(node.address())))).await;
+        peer.say(&frame(NINE, node.address(), Kind::GNCL_HELLO, write(hello))).await;
         let welcome = peer.hear().await;
         assert_eq!(welcome.header.kind, Kind::GNCL_WELCOME);
         let welcome: Introduction = read(&welcome.payload).expect("a WELCOME has a payload");
         assert_eq!((welcome.node, welcome.peer), (node.address(), NINE));
+        assert_eq!((welcome.lane, welcome.link), (hello.lane, hello.link));
         peer.begin(node).await;
-        node.up().await;
         peer
     }
 
@@ -342,13 +349,22 @@ pub(super) fn introduction(to: NodeAddress) -> Introduction {
         dial: 1,
         payload_max: 1 << 20,
         features: Vec::new(),
+        lane: Lane::Control,
+        link: 0,
     }
+}
+
+/// What is cut: of the connections that were made, in their order from 0, this one, or all.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Cut {
+    All,
+    One(usize),
 }
 
 /// A cable between a dialler and `target` that can be cut.
 pub(super) struct Cable {
     pub(super) address: SocketAddr,
-    cut: tokio::sync::watch::Sender<u64>,
+    cut: tokio::sync::watch::Sender<(u64, Cut)>,
     accepting: JoinHandle<()>,
 }
 
@@ -356,16 +372,19 @@ impl Cable {
     pub(super) async fn to(target: SocketAddr) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("loopback has a free port");
         let address = listener.local_addr().expect("it is bound");
-        let (cut, cuts) = tokio::sync::watch::channel(0);
+        let (cut, cuts) = tokio::sync::watch::channel((0, Cut::All));
         let accepting = actix_rt::spawn(async move {
-            while let Ok((mut near, _)) = listener.accept().await {
+            let mut made = 0..;
+            while let (Ok((mut near, _)), Some(number)) = (listener.accept().await, made.next()) {
                 let mut cuts = cuts.clone();
-                cuts.mark_unchanged();
+                let before = cuts.borrow_and_update().0;
                 let Ok(mut far) = TcpStream::connect(target).await else { continue };
                 actix_rt::spawn(async move {
                     tokio::select! {
                         _ = tokio::io::copy_bidirectional(&mut near, &mut far) => {}
-                        _ = cuts.changed() => {}
+                        _ = cuts.wait_for(|(at, cut)| {
+                            *at > before && matches!(*cut, Cut::All) || *cut == Cut::One(number)
+                        }) => {}
                     }
                 });
             }
@@ -375,7 +394,12 @@ impl Cable {
 
     /// Ends all present connections.
     pub(super) fn cut(&self) {
-        self.cut.send_modify(|cuts| *cuts += 1);
+        self.cut.send_modify(|(at, cut)| (*at, *cut) = (*at + 1, Cut::All));
+    }
+
+    /// Ends the connection with this number, of those that were made, from 0.
+    pub(super) fn cut_one(&self, number: usize) {
+        self.cut.send_modify(|(at, cut)| (*at, *cut) = (*at + 1, Cut::One(number)));
     }
 }
 

@@ -276,8 +276,8 @@ impl World {
                 self.send(node, connection, Parcel::End);
                 self.drop_end(node, connection);
             }
-            Output::SendPing(_) => self.send_on_link(node, Parcel::Ping),
-            Output::SendPong(_) => self.send_on_link(node, Parcel::Pong),
+            Output::SendPing(_, lane) => self.send_on_link(node, lane, Parcel::Ping),
+            Output::SendPong(_, lane) => self.send_on_link(node, lane, Parcel::Pong),
             Output::Fact(fact) => self.nodes[node].facts.push(fact),
             Output::Detach { .. } | Output::SendGoodbye(_) | Output::Forget(_) | Output::Count { .. } => {}
         }
@@ -296,11 +296,15 @@ impl World {
         self.post(last[node], Event::Arrives { node, pipe, what: Parcel::Connected });
     }
 
-    fn send_on_link(&mut self, node: usize, what: Parcel) {
-        let link = self.nodes[node].core.peers.get(&ADDRESSES[1 - node]).and_then(|peer| peer.link);
-        if let Some(link) = link {
-            self.send(node, link.connection, what);
+    fn send_on_link(&mut self, node: usize, lane: Lane, what: Parcel) {
+        if let Some(connection) = self.connection(node, lane) {
+            self.send(node, connection, what);
         }
+    }
+
+    fn connection(&self, node: usize, lane: Lane) -> Option<ConnectionId> {
+        let mut link = self.nodes[node].core.peers.get(&ADDRESSES[1 - node])?.link?;
+        link.connection_of(lane)
     }
 
     fn send(&mut self, node: usize, connection: ConnectionId, what: Parcel) {
@@ -342,16 +346,19 @@ impl World {
         self.nodes.iter().all(|node| node.core.peers.values().any(|peer| peer.link.is_some()))
     }
 
-    /// Whether both have one link, the same, and nothing else.
+    /// Whether both have one link with its two sides, the same, and nothing else.
     pub(super) fn agreed_link(&self) -> Result<(), String> {
-        let pipes = [0, 1].map(|n| {
-            let node = &self.nodes[n];
-            let link = node.core.peers.get(&ADDRESSES[1 - n])?.link?;
-            (node.core.connections.len() == 1).then(|| node.ends.get(&link.connection).copied())?
-        });
-        match pipes {
-            [Some(a), Some(b)] if a == b => Ok(()),
-            other => Err(format!("linked on pipes {other:?}")),
+        for lane in Lane::ALL {
+            let pipes = [0, 1].map(|n| {
+                let node = &self.nodes[n];
+                let connection = self.connection(n, lane)?;
+                (node.core.connections.len() == 3).then(|| node.ends.get(&connection).copied())?
+            });
+            match pipes {
+                [Some(a), Some(b)] if a == b => {}
+                other => return Err(format!("{lane:?} on pipes {other:?}")),
+            }
         }
+        Ok(())
     }
 }

@@ -1,0 +1,231 @@
+//! The two nodes: who asks and floods, who answers and takes.
+
+use std::{
+    io::Read,
+    net::Ipv4Addr,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, AtomicU64, Ordering},
+        mpsc::{SyncSender, sync_channel},
+    },
+    time::{Duration, Instant},
+};
+
+use serde::{Deserialize, Serialize};
+use sinew::{Sender, prelude::*};
+use sinew_figures::Figures;
+
+/// No wait of this bench is longer.
+const DEADLINE: Duration = Duration::from_secs(60);
+/// From one round trip to the next.
+const PERIOD: Duration = Duration::from_millis(1);
+/// Round trips before any is counted.
+const WARM_UP: u64 = 200;
+/// Round trips that are counted, each time.
+const ROUNDS: u64 = 4_000;
+/// Messages that wait for the other node at most: enough to saturate, and 64 MB of the longest.
+const QUEUE: usize = 64;
+
+#[derive(Serialize, Deserialize)]
+struct Ask {
+    /// When it was sent, in nanoseconds since the asker began: one that is late is counted as it is, though others follow it.
+    sent_ns: u64,
+    #[serde(with = "serde_bytes")]
+    block: Vec<u8>,
+}
+
+impl Payload for Ask {
+    const NAME: &'static str = "gncl.ask";
+}
+
+#[derive(Serialize, Deserialize)]
+struct Answer {
+    /// Of the question.
+    sent_ns: u64,
+    #[serde(with = "serde_bytes")]
+    block: Vec<u8>,
+}
+
+impl Payload for Answer {
+    const NAME: &'static str = "gncl.answer";
+}
+
+#[derive(Serialize, Deserialize)]
+struct Load {
+    #[serde(with = "serde_bytes")]
+    block: Vec<u8>,
+}
+
+impl Payload for Load {
+    const NAME: &'static str = "gncl.load";
+    const CLASS: Class = Class::Bulk;
+}
+
+/// What was measured.
+pub(crate) struct Seen {
+    pub(crate) alone: Figures,
+    pub(crate) beside: Figures,
+    /// Bytes of Bulk that were taken by the socket's outlet, a second.
+    pub(crate) bulk_bytes_per_s: u64,
+}
+
+struct Echo;
+
+impl Actor for Echo {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<Ask>> for Echo {
+    type Result = ();
+
+    fn handle(&mut self, ask: Delivery<Ask>, context: &mut Self::Context) {
+        let Ask { sent_ns, block } = ask.payload;
+        // What is refused is missing among the answers.
+        let _ = context.send(ask.source, &Answer { sent_ns, block });
+    }
+}
+
+struct Sink;
+
+impl Actor for Sink {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<Load>> for Sink {
+    type Result = ();
+
+    fn handle(&mut self, load: Delivery<Load>, _: &mut Self::Context) {
+        std::hint::black_box(load.payload.block);
+    }
+}
+
+struct Asker {
+    to: Option<Tid>,
+    round: u64,
+    clock: Instant,
+    figures: Figures,
+    flood: Arc<Flood>,
+    done: SyncSender<Seen>,
+    alone: Option<Figures>,
+    began: Instant,
+}
+
+impl Actor for Asker {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        self.to = context.resolve("echo");
+        let (sender, flood) = (context.sender(), self.flood.clone());
+        std::thread::spawn(move || flood.run(&sender));
+        context.every(PERIOD, |asker: &mut Self, _, context: &mut AppContext<Self>| asker.ask(context));
+    }
+}
+
+impl Asker {
+    fn ask(&mut self, context: &AppContext<Self>) {
+        let to = self.to.expect("it was found at the start");
+        let sent_ns = self.now_ns();
+        // What is refused is asked again a period later.
+        let _ = context.send(to, &Ask { sent_ns, block: vec![7; 64] });
+    }
+
+    fn now_ns(&self) -> u64 {
+        u64::try_from(self.clock.elapsed().as_nanos()).expect("a bench does not last for centuries")
+    }
+
+    /// The rounds without a flood, or those beside it, are over.
+    fn next(&mut self) {
+        self.round = 0;
+        let figures = std::mem::take(&mut self.figures);
+        match self.alone.take() {
+            None => {
+                self.alone = Some(figures);
+                self.flood.runs.store(true, Ordering::Relaxed);
+                self.began = Instant::now();
+            }
+            Some(alone) => {
+                self.flood.runs.store(false, Ordering::Relaxed);
+                let bytes = self.flood.bytes.load(Ordering::Relaxed);
+                let millis = u64::try_from(self.began.elapsed().as_millis()).unwrap_or(u64::MAX);
+                let bulk_bytes_per_s = bytes * 1_000 / millis.max(1);
+                // The one who waits for it takes one; later rounds are of no use.
+                let _ = self.done.try_send(Seen { alone, beside: figures, bulk_bytes_per_s });
+            }
+        }
+    }
+}
+
+impl Handler<Delivery<Answer>> for Asker {
+    type Result = ();
+
+    fn handle(&mut self, answer: Delivery<Answer>, _: &mut Self::Context) {
+        self.round += 1;
+        if self.round > WARM_UP {
+            self.figures.record(Duration::from_nanos(self.now_ns() - answer.payload.sent_ns));
+        }
+        if self.round == WARM_UP + ROUNDS {
+            self.next();
+        }
+    }
+}
+
+/// A thread that sends Bulk as fast as it is taken.
+struct Flood {
+    runs: AtomicBool,
+    bytes: AtomicU64,
+    message_bytes: usize,
+}
+
+impl Flood {
+    fn run(&self, sender: &Sender) {
+        let load = Load { block: vec![7; self.message_bytes] };
+        loop {
+            if self.runs.load(Ordering::Relaxed) && sender.send("sink", &load).is_ok() {
+                self.bytes.fetch_add(self.message_bytes as u64, Ordering::Relaxed);
+            } else {
+                std::thread::sleep(Duration::from_micros(100));
+            }
+        }
+    }
+}
+
+fn node(name: &str, host: u8, group: &str) -> NodeBuilder {
+    let group = group.parse().expect("a group that this program wrote itself");
+    Node::builder(name).address(Ipv4Addr::new(127, 0, 0, host)).configure(|config| {
+        config.ndl.multicast = Some(group);
+        config.ndl.mdns_port = None;
+        config.gncl.queue_capacity = QUEUE;
+    })
+}
+
+/// The node that answers, until its input ends.
+pub(crate) fn echo(group: &str) {
+    let echo = AppSpec::new("echo", || Echo).handles::<Ask>().own_thread();
+    let sink = AppSpec::new("sink", || Sink).handles::<Load>().own_thread();
+    let _node = node("there", 2, group).app(echo).app(sink).start().expect("a node");
+    println!("there");
+    // Until the measuring end closes the pipe or ends this process.
+    let _ = std::io::stdin().read(&mut [0]);
+}
+
+/// The node that asks, and then asks and floods.
+pub(crate) fn measure(group: &str, bulk_bytes: usize) -> Seen {
+    let (done, seen) = sync_channel(1);
+    let flood = Flood { runs: AtomicBool::new(false), bytes: AtomicU64::new(0), message_bytes: bulk_bytes };
+    let flood = Arc::new(flood);
+    let asker = move || Asker {
+        to: None,
+        round: 0,
+        clock: Instant::now(),
+        figures: Figures::new(),
+        flood: flood.clone(),
+        done: done.clone(),
+        alone: None,
+        began: Instant::now(),
+    };
+    let asker = AppSpec::new("asker", asker).handles::<Answer>().requires(["echo", "sink"]).own_thread();
+    let node = node("here", 1, group).app(asker).start().expect("a node");
+    let seen = seen.recv_timeout(DEADLINE).expect("the rounds end");
+    node.stop();
+    seen
+}

@@ -1,0 +1,123 @@
+//! The connections for Stream and for Bulk: they go with their link, and their faults are their own.
+
+use super::*;
+
+fn side_of(link: u64, lane: Lane, dial: u64) -> Introduction {
+    Introduction { lane, link, ..hello_from(HIGH, 1, dial) }
+}
+
+/// A core whose dial to the peer has become a link, and the dials for its sides.
+fn dialler() -> (Core, ConnectionId, Vec<ConnectionId>) {
+    let mut core = core();
+    core.handle(millis(0), found(1));
+    let Some(Output::Dial { connection: link, .. }) = core.poll() else { panic!("it is dialled") };
+    core.handle(millis(1), Input::Connected(link));
+    outputs(&mut core);
+    core.handle(millis(2), Input::WelcomeReceived(link, hello_from(HIGH, 1, 0)));
+    let dials = dials(&mut core);
+    assert_eq!(dials.len(), 2, "one for Stream and one for Bulk");
+    (core, link, dials)
+}
+
+fn dials(core: &mut Core) -> Vec<ConnectionId> {
+    let dials = outputs(core).into_iter().filter_map(|output| {
+        let Output::Dial { connection, .. } = output else { return None };
+        Some(connection)
+    });
+    dials.collect()
+}
+
+/// The hello that the core says on its dial.
+fn hello_on(core: &mut Core, now: Time, connection: ConnectionId) -> Introduction {
+    core.handle(now, Input::Connected(connection));
+    match core.poll() {
+        Some(Output::SendHello(_, hello)) => hello,
+        other => panic!("{other:?} is no hello"),
+    }
+}
+
+#[test]
+fn a_side_that_breaks_is_dialled_again_and_its_link_stays() {
+    let (mut core, _, sides) = dialler();
+    let hello = hello_on(&mut core, millis(3), sides[1]);
+    assert_eq!((hello.lane, hello.link), (Lane::Bulk, millis(1).as_nanos()));
+    let welcome = Introduction { lane: Lane::Bulk, link: hello.link, ..hello_from(HIGH, 1, 0) };
+    core.handle(millis(4), Input::WelcomeReceived(sides[1], welcome));
+    let attached = |output: &Output| matches!(output, Output::Attach(attach) if attach.lane == Lane::Bulk);
+    assert!(outputs(&mut core).iter().any(attached));
+
+    core.handle(millis(5), Input::Ended(sides[1]));
+    let detached = Output::Detach { connection: sides[1], node: HIGH, lane: Lane::Bulk };
+    assert_eq!(outputs(&mut core), [detached], "nothing else is told");
+    core.handle(millis(17), Input::TimePassed);
+    assert_eq!(dials(&mut core).len(), 1);
+}
+
+#[test]
+fn a_side_of_a_link_that_is_not_there_is_refused() {
+    let mut core = core();
+    let refused =
+        |core: &mut Core, hello: Introduction| refusal(&greet(core, millis(1), hello).1).map(str::to_owned);
+    let duplicate = Some("duplicate".to_owned());
+    assert_eq!(refused(&mut core, side_of(10, Lane::Bulk, 11)), duplicate, "nobody is linked");
+    greet(&mut core, millis(0), hello_from(HIGH, 1, 10));
+    assert_eq!(refused(&mut core, side_of(9, Lane::Bulk, 11)), duplicate, "it belongs to a former link");
+    assert_eq!(refused(&mut core, side_of(10, Lane::Bulk, 12)), None);
+    assert_eq!(refused(&mut core, side_of(10, Lane::Bulk, 11)), duplicate, "it was dialled before that one");
+    assert_eq!(refused(&mut core, side_of(10, Lane::Stream, 11)), None);
+}
+
+#[test]
+fn a_link_that_ends_takes_its_sides_and_their_dials_with_it() {
+    let (mut core, link, sides) = dialler();
+    core.handle(millis(3), Input::Ended(link));
+    let out = outputs(&mut core);
+    for side in sides {
+        assert!(out.contains(&Output::Close(side)), "{out:?}");
+    }
+}
+
+#[test]
+fn a_node_that_says_goodbye_has_left_when_each_of_its_connections_is_through() {
+    let mut core = core();
+    let (link, _) = greet(&mut core, millis(0), hello_from(HIGH, 1, 10));
+    let (stream, _) = greet(&mut core, millis(1), side_of(10, Lane::Stream, 11));
+    let (bulk, _) = greet(&mut core, millis(1), side_of(10, Lane::Bulk, 12));
+    let left = Output::Fact(LinkFact::PeerLeft { node: HIGH, incarnation: Incarnation(1) });
+    for connection in [bulk, link] {
+        core.handle(millis(2), Input::GoodbyeReceived(connection));
+        let out = outputs(&mut core);
+        assert!(!out.contains(&left), "there may be more on the third: {out:?}");
+    }
+    core.handle(millis(3), Input::GoodbyeReceived(stream));
+    assert!(outputs(&mut core).contains(&left));
+    assert_eq!(core.next_wake(), None);
+}
+
+#[test]
+fn a_node_that_said_goodbye_and_hangs_up_has_left_whatever_its_other_connections_do() {
+    let mut core = core();
+    let (link, _) = greet(&mut core, millis(0), hello_from(HIGH, 1, 10));
+    greet(&mut core, millis(1), side_of(10, Lane::Bulk, 12));
+    core.handle(millis(2), Input::GoodbyeReceived(link));
+    core.handle(millis(3), Input::Ended(link));
+    let left = Output::Fact(LinkFact::PeerLeft { node: HIGH, incarnation: Incarnation(1) });
+    assert!(outputs(&mut core).contains(&left));
+    assert_eq!(core.next_wake(), None);
+}
+
+#[test]
+fn a_silent_side_is_broken_alone() {
+    let mut core = core();
+    let (link, _) = greet(&mut core, millis(0), hello_from(HIGH, 1, 10));
+    let (bulk, _) = greet(&mut core, millis(0), side_of(10, Lane::Bulk, 12));
+    for second in 1..=3 {
+        core.handle(millis(second * 1_000), Input::TimePassed);
+        assert!(outputs(&mut core).contains(&Output::SendPing(HIGH, Lane::Bulk)));
+        core.handle(millis(second * 1_000), Input::Heard(link));
+    }
+    core.handle(millis(4_000), Input::TimePassed);
+    let out = outputs(&mut core);
+    assert!(out.contains(&Output::Close(bulk)), "{out:?}");
+    assert!(!out.contains(&Output::Close(link)), "{out:?}");
+}

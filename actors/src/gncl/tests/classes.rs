@@ -1,0 +1,105 @@
+//! Connections for each class: what one of them does is nothing to the others.
+
+use sinew_runtime::{
+    outcome::Outcome,
+    wire::{Class, Message},
+};
+
+use super::bench::{ByHand, Cable, NINE, Node, introduction, next, pair, run};
+use crate::gncl::{
+    LinkFact,
+    core::{CLASSES, Introduction, Lane},
+};
+
+fn of_class(class: Class, mut message: Message) -> Message {
+    message.header.class = class;
+    message
+}
+
+/// The connection of `lane` to `node`, from a peer that has one for each class.
+async fn lane_by_hand(node: &Node, lane: Lane, dial: u64) -> ByHand {
+    let link = if lane == Lane::Control { 0 } else { 1 };
+    let features = vec![CLASSES.to_owned()];
+    ByHand::greeting(node, &Introduction { lane, link, dial, features, ..introduction(node.address()) }).await
+}
+
+#[test]
+fn each_class_travels_on_its_own_connection() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let first = lane_by_hand(&node, Lane::Control, 1).await;
+        node.up().await;
+        let stream = lane_by_hand(&node, Lane::Stream, 2).await;
+        let bulk = lane_by_hand(&node, Lane::Bulk, 3).await;
+        let mut message = node.message(node.tid(1), b"to nine");
+        message.header.destination.node = NINE;
+        let mut lanes = [first, stream, bulk];
+        for (class, lane) in Class::ALL.into_iter().zip(&mut lanes) {
+            let copy = Message::new(message.header, message.payload.clone());
+            node.stores.router.send(of_class(class, copy)).expect("the peer is linked");
+            let there = lane.hear().await.header;
+            assert_eq!((there.class, there.number), (class, 1), "each has its own numbers");
+        }
+    });
+}
+
+#[test]
+fn control_arrives_while_bulk_is_not_read() {
+    run(async {
+        let mut node = Node::start_with(1, |config| config.gncl.queue_capacity = 64).await;
+        let mut first = lane_by_hand(&node, Lane::Control, 1).await;
+        node.up().await;
+        let _never_read = lane_by_hand(&node, Lane::Bulk, 2).await;
+        let mut to = node.tid(1);
+        to.node = NINE;
+        let long = vec![0; 1 << 20];
+        // Until the socket and the queue before it are full.
+        while node.stores.router.send(of_class(Class::Bulk, node.message(to, &long))).is_ok() {}
+        node.send(to, b"in time");
+        assert_eq!(first.hear().await.payload[..], *b"in time");
+    });
+}
+
+#[test]
+fn a_bulk_connection_that_breaks_leaves_the_link_alone_and_loses_nothing() {
+    run(async {
+        let (mut a, b) = (Node::start(1).await, Node::start(2).await);
+        let mut inbox = b.app(1);
+        let cable = Cable::to(b.listens_at()).await;
+        a.find(b.address(), cable.address);
+        a.up().await;
+        let mut number = 0u64;
+        // Connections 1 and 2 are the first sides; each that is cut is followed by another.
+        for cut in 1..8 {
+            for _ in 0..100 {
+                number += 1;
+                let message = a.message(b.tid(1), &number.to_le_bytes());
+                a.stores.router.send(of_class(Class::Bulk, message)).expect("there is room for it");
+            }
+            cable.cut_one(cut);
+            for expected in number - 99..=number {
+                let message = next("a message of Bulk", &mut inbox).await;
+                assert_eq!(message.payload[..], expected.to_le_bytes());
+            }
+        }
+        a.send(b.tid(1), b"Control");
+        next("a message of Control", &mut inbox).await;
+        a.lose(b.address());
+        let fact = a.fact().await;
+        assert!(matches!(fact, LinkFact::LinkBroken { .. }), "{fact:?} is the first since the link stood");
+    });
+}
+
+#[test]
+fn the_outcome_of_a_message_of_any_class_finds_it() {
+    run(async {
+        let (mut a, b) = pair().await;
+        let mut inbox = b.app(1);
+        for (correlation, class) in [(1, Class::Control), (2, Class::Bulk)] {
+            a.stores.router.send(of_class(class, a.confirmed(b.tid(1), correlation))).unwrap();
+            let message = next("the message", &mut inbox).await;
+            message.receipt.expect("it is to be confirmed").settle(Outcome::Delivered);
+            assert_eq!(next("its outcome", &mut a.settled).await, (correlation, Outcome::Delivered));
+        }
+    });
+}

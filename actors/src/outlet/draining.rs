@@ -1,0 +1,148 @@
+//! Writing on: the next frame, the next piece of a long one, and when others have their turn.
+
+use std::{
+    io,
+    task::{Context, Poll},
+};
+
+use sinew_runtime::time::Time;
+
+use super::{
+    LinkNumber, Socket,
+    half::{After, Half, Link, Step},
+    partial::{Partial, Written},
+};
+
+/// Frames, or pieces of them, that the drainer writes before other tasks of its thread have their turn.
+const WRITES_PER_WAKE: usize = 64;
+/// Bytes that it writes before.
+const BYTES_PER_WAKE: usize = 64 << 10;
+
+/// Why the drainer does not write on.
+pub(super) enum Drained {
+    /// The connection cannot be written to any more.
+    Over(io::Error),
+    /// It has had its turn.
+    Enough,
+}
+
+impl<S: Socket> Half<S> {
+    pub(super) fn poll_drain(
+        &mut self,
+        link: LinkNumber,
+        cx: &mut Context<'_>,
+        after: &mut After,
+    ) -> Poll<Drained> {
+        let mut bytes = 0;
+        for _ in 0..WRITES_PER_WAKE {
+            if let Some(end) = self.end_of(link) {
+                return Poll::Ready(Drained::Over(end));
+            }
+            if !self.drainer.as_ref().is_some_and(|waker| waker.will_wake(cx.waker())) {
+                self.drainer = Some(cx.waker().clone());
+            }
+            if !self.has_frame() {
+                return Poll::Pending;
+            }
+            let Link::Up(socket) = &mut self.link else { continue };
+            match socket.poll_writable(cx) {
+                Poll::Pending => return Poll::Pending,
+                Poll::Ready(Err(error)) => self.link = Link::Failed(error),
+                Poll::Ready(Ok(())) => bytes += self.write_next(after),
+            }
+            if bytes >= BYTES_PER_WAKE {
+                break;
+            }
+        }
+        Poll::Ready(Drained::Enough)
+    }
+
+    /// Why the connection `link` cannot be written to, if it cannot.
+    fn end_of(&mut self, link: LinkNumber) -> Option<io::Error> {
+        if link.0 != self.number {
+            return Some(io::ErrorKind::ConnectionAborted.into());
+        }
+        match std::mem::replace(&mut self.link, Link::Down) {
+            Link::Failed(error) => Some(error),
+            Link::Down => Some(io::ErrorKind::NotConnected.into()),
+            link @ Link::Closed(_) => {
+                self.link = link;
+                Some(io::ErrorKind::NotConnected.into())
+            }
+            link @ Link::Up(_) => {
+                self.link = link;
+                None
+            }
+        }
+    }
+
+    /// Writes the next frame, or the next piece of it; returns how many bytes the socket has taken.
+    pub(super) fn write_next(&mut self, after: &mut After) -> usize {
+        let Some(mut frame) = self.next_frame(after) else { return 0 };
+        let before = frame.written;
+        let result = self.write(&mut frame);
+        let taken = frame.written - before;
+        match result {
+            Written::Whole => self.sent(frame),
+            Written::Piece | Written::InPart | Written::Broken => self.partial = Some(frame),
+        }
+        taken
+    }
+
+    fn next_frame(&mut self, after: &mut After) -> Option<Partial> {
+        if let Some(partial) = self.partial.take() {
+            return Some(partial);
+        }
+        if let Some(urgent) = self.urgent.pop_front() {
+            return Some(self.frill(urgent));
+        }
+        if let Some(again) = self.frame_again() {
+            return Some(again);
+        }
+        if self.queue.is_empty() && self.interrupted.is_none() {
+            return self.last.take().map(|last| self.frill(last));
+        }
+        if !self.session_has_room() {
+            return None;
+        }
+        let message = self.interrupted.take().or_else(|| self.queue.pop())?;
+        if message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
+            self.waiting_receipts -= usize::from(message.receipt.is_some());
+            self.expired(message, after);
+            return None;
+        }
+        Some(self.frame(message))
+    }
+
+    /// Writes the next piece of the frame that has been begun.
+    pub(super) fn write_on(&mut self, after: &mut After) -> Step {
+        let Some(mut frame) = self.partial.take() else { return Step::Done };
+        match self.write(&mut frame) {
+            Written::Whole => self.sent(frame),
+            Written::Piece => {
+                self.partial = Some(frame);
+                return Step::More;
+            }
+            Written::InPart | Written::Broken => self.partial = Some(frame),
+        }
+        self.hand_to_drainer(after);
+        Step::Done
+    }
+
+    /// The drainer writes on, if there is anything to write.
+    pub(super) fn hand_to_drainer(&mut self, after: &mut After) {
+        if self.waiting() > 0 {
+            after.wake = self.drainer.take();
+        }
+    }
+
+    /// Whether there is something that may be written now.
+    pub(super) fn has_frame(&self) -> bool {
+        let waits = self.interrupted.is_some() || !self.queue.is_empty();
+        self.partial.is_some()
+            || !self.urgent.is_empty()
+            || self.behind() > 0
+            || waits && self.session_has_room()
+            || !waits && self.last.is_some() && self.session_is_through()
+    }
+}
