@@ -76,11 +76,13 @@ pub fn run(plan: &Plan) -> Report {
     let began = Instant::now();
     for fault in 0..plan.faults {
         let trouble = plan.troubles[fault as usize % plan.troubles.len()];
+        let _ = pair.gap();
         let struck = Instant::now();
-        pair.forget_gap();
         pair.suffer(trouble, plan.hold);
         pair.wait_for_flow();
-        gaps.note(trouble, pair.gap());
+        let flows = struck.elapsed();
+        // A new receiver does not know when its former life got the last one.
+        gaps.note(trouble, if trouble == Trouble::KillReceiver { flows } else { pair.gap() });
         let pause = plan.spacing + dice.time_below(plan.spacing / 2);
         std::thread::sleep(pause.saturating_sub(struck.elapsed()));
     }

@@ -159,8 +159,7 @@ fn serve(node: &Node, pacer: Pacer, lull: &Lull) {
         match words[..] {
             ["rate", rate] => numbers.rate.store(rate.parse().expect("a number"), Ordering::Relaxed),
             ["panic"] => println!("ready {}", panic_gncl(&handle).as_nanos()),
-            ["forget-gap"] => lull.longest_ns.store(0, Ordering::Relaxed),
-            ["gap"] => println!("gap {}", lull.longest_ns.load(Ordering::Relaxed)),
+            ["gap"] => println!("gap {}", lull.longest_ns.swap(0, Ordering::Relaxed)),
             ["say"] => clerk.say(),
             ["quiet"] => {
                 numbers.quiet.store(true, Ordering::Relaxed);

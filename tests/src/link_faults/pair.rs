@@ -111,11 +111,7 @@ impl Pair {
         }
     }
 
-    pub(super) fn forget_gap(&mut self) {
-        self.member(SECOND).performer.tell("forget-gap");
-    }
-
-    /// The longest time without a message at the second node since it was told to forget the last.
+    /// The longest time without a message at the second node since this was asked last, or since it was started.
     pub(super) fn gap(&mut self) -> Duration {
         let nanos = self.member(SECOND).ask("gap");
         Duration::from_nanos(nanos.parse().expect("a number"))

@@ -195,6 +195,7 @@ fn device_maker(joint: Joint, topology: &Topology) -> DeviceMaker {
 }
 
 /// Larger than that of any life before, as long as the host's clock does not go back.
+#[expect(clippy::disallowed_methods, reason = "read once, at the start: a later life needs a larger number")]
 fn incarnation() -> Incarnation {
     let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     Incarnation(u64::try_from(since_1970.as_micros()).unwrap_or(u64::MAX))
