@@ -97,23 +97,30 @@ pub(crate) enum Memory {
 }
 
 impl Memory {
-    fn create(self, endpoint: &mut Endpoint, to: Tid, kind: Kind, length: usize) -> LentMessage {
-        // While one is lent there is no other one in the ring.
-        let taken =
-            (self == Self::Copied).then(|| endpoint.create_message(to, kind, 0).expect("it is short"));
-        let message = endpoint.create_message(to, kind, length).expect("not too long");
-        drop(taken);
-        message
+    fn maker(self, socket: &str) -> Maker {
+        Maker(
+            (self == Self::Copied)
+                .then(|| register(Way::Socket, socket, &format!("maker-{}", std::process::id()))),
+        )
+    }
+}
+
+/// Who creates the messages: the endpoint that sends them, or one that has no ring in which they could lie.
+struct Maker(Option<Endpoint>);
+
+impl Maker {
+    fn create(&mut self, endpoint: &mut Endpoint, to: Tid, kind: Kind, length: usize) -> LentMessage {
+        self.0.as_mut().unwrap_or(endpoint).create_message(to, kind, length).expect("not too long")
     }
 }
 
 /// The application that echoes: until the measuring end ends this process.
 pub(crate) fn echo(way: Way, memory: Memory, socket: &str) {
-    let mut endpoint = register(way, socket, "echo");
+    let (mut endpoint, mut maker) = (register(way, socket, "echo"), memory.maker(socket));
     say_there();
     while let Some(received) = endpoint.receive(DEADLINE).expect("the node lives") {
         let (to, bytes) = (received.source(), received.bytes());
-        let mut back = memory.create(&mut endpoint, to, received.kind(), bytes.len());
+        let mut back = maker.create(&mut endpoint, to, received.kind(), bytes.len());
         back.copy_from_slice(bytes);
         if received.kind() == AGED {
             let age = received.age(Time::now());
@@ -136,7 +143,7 @@ pub(crate) fn become_cpp_echo(socket: &str) {
 struct Pair {
     endpoint: Endpoint,
     to: Tid,
-    memory: Memory,
+    maker: Maker,
     _echo: Process,
     _home: Home,
 }
@@ -150,12 +157,12 @@ impl Pair {
         let echo = Process::start(&role(echo, way, pinning, home.socket()));
         let mut endpoint = register(way, home.socket(), "ping");
         let to = endpoint.resolve("echo", DEADLINE).expect("the node lives").expect("it is registered");
-        Self { endpoint, to, memory: Memory::Lent, _echo: echo, _home: home }
+        Self { endpoint, to, maker: Maker(None), _echo: echo, _home: home }
     }
 
     /// Sends `buffer`, and fills it with what comes back.
     fn round_trip(&mut self, kind: Kind, buffer: &mut [u8]) {
-        let mut block = self.memory.create(&mut self.endpoint, self.to, kind, buffer.len());
+        let mut block = self.maker.create(&mut self.endpoint, self.to, kind, buffer.len());
         block.copy_from_slice(buffer);
         self.endpoint.send_message(block).expect("the node takes it");
         let back = self.endpoint.receive(DEADLINE).expect("the node lives").expect("the echo answers");
@@ -182,10 +189,11 @@ pub(crate) fn loans(
         Memory::Lent => "echo",
         Memory::Copied => "echo_copied",
     };
-    let mut pair = Pair { memory, ..Pair::at(home, way, pinning, echo) };
+    let maker = memory.maker(home.socket());
+    let mut pair = Pair { maker, ..Pair::at(home, way, pinning, echo) };
     let mut buffer = vec![7; bytes];
     let figures = rounds.time(|| pair.round_trip(BLOCK, &mut buffer));
-    let last = memory.create(&mut pair.endpoint, pair.to, BLOCK, bytes);
+    let last = pair.maker.create(&mut pair.endpoint, pair.to, BLOCK, bytes);
     (figures, last.is_in_place())
 }
 

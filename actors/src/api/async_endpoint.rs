@@ -83,11 +83,10 @@ impl AsyncEndpoint {
         self.endpoint.registrations()
     }
 
-    /// Writable memory for a raw payload, as [`Endpoint::create_message`]. Never waits. A message that is kept across an
-    /// await keeps the ring.
+    /// Writable memory for a raw payload, as [`Endpoint::create_message`]. Never waits.
     ///
     /// # Errors
-    /// It would be longer than the node takes.
+    /// It would be longer than the node takes, `kind` is one of the layers' own, or another message is lent.
     pub fn create_message(
         &mut self,
         destination: Tid,

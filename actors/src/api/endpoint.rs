@@ -15,7 +15,7 @@ use super::{
     form::{Form, at_once},
     inbox::{Answer, Awaited, Inbox},
     incoming::WhenFull,
-    lent::LentMessage,
+    lent::{Lender, LentMessage},
     link::{Ended, Link, Reader, Writer, ring::Rest},
     outgoing::Request,
     returning::Home,
@@ -49,6 +49,7 @@ pub struct Endpoint {
     pub(super) ended: Option<Ended>,
     pub(super) home: Home,
     pub(super) form: Form,
+    pub(super) lender: Lender,
     /// What is left of a frame of which a part is in the ring to the node.
     pub(super) rest: Option<Rest>,
     /// What the node had taken when a sender's patience with it was over.
@@ -91,6 +92,7 @@ impl Endpoint {
             ended: None,
             home: Home::new(path.to_owned(), register, options, returning),
             form,
+            lender: Lender::default(),
             rest: None,
             stalled: None,
         }
@@ -121,10 +123,12 @@ impl Endpoint {
     }
 
     /// Writable memory of `length` bytes, all zeros, for a raw payload of `kind` (the paper's CreateMessage): in the ring
-    /// itself where that is possible, see [`LentMessage`]. Never waits.
+    /// itself where that is possible. Never waits. One message is lent at a time, and nothing else goes out until it is sent or
+    /// dropped: see [`LentMessage`].
     ///
     /// # Errors
-    /// It would be longer than the node takes, or `kind` is one of the layers' own.
+    /// It would be longer than the node takes, `kind` is one of the layers' own, or another message is lent
+    /// ([`ApiError::Lent`]).
     pub fn create_message(
         &mut self,
         destination: Tid,
@@ -135,7 +139,7 @@ impl Endpoint {
         if !kind.is_user() {
             return Err(ApiError::NotYours(kind));
         }
-        Ok(self.lend(Header::new(kind, self.tid, destination), length))
+        self.lend(Header::new(kind, self.tid, destination), length)
     }
 
     /// Sends memory that [`create_message`](Self::create_message) lent (the paper's SendMessage), without a copy if it lies
@@ -143,7 +147,8 @@ impl Endpoint {
     /// it then.
     ///
     /// # Errors
-    /// It was not sent, and its memory is given back. [`ApiError::Lent`]: another one lies in the ring.
+    /// It was not sent, and its memory is given back. It may have been another endpoint's: [`ApiError::Lent`] if this one has
+    /// lent one too.
     pub fn send_message(&mut self, message: LentMessage) -> Result<(), ApiError> {
         at_once(self.dispatch(message.into(), self.patience())).map(drop)
     }
@@ -272,7 +277,7 @@ impl Endpoint {
     /// Gives the address back and waits until the node has taken it: the name is free when this returns.
     ///
     /// # Errors
-    /// The node did not answer. The address is given back in any case.
+    /// The node did not answer, or a message is lent ([`ApiError::Lent`]). The address is given back in any case.
     pub fn unregister(mut self) -> Result<(), ApiError> {
         at_once(self.take_leave())
     }
@@ -284,6 +289,7 @@ impl Endpoint {
             // The connection has taken the address with it.
             return Ok(());
         }
+        self.lender.be_free()?;
         let goodbye = Message::new(Header::new(Kind::LNCL_UNREGISTER, self.tid, LNCL), bytes::Bytes::new());
         self.write(goodbye.into(), self.patience()).await?;
         let deadline = Time::now() + PROMPT;

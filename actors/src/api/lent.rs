@@ -3,26 +3,57 @@
 #[cfg(test)]
 mod tests;
 
-use std::ops::{Deref, DerefMut};
+use std::{
+    ops::{Deref, DerefMut},
+    sync::Arc,
+};
 
 use bytes::Bytes;
 use sinew_runtime::wire::{Class, Header, Message, MessageBuffer};
 
-use super::link::loan::InRing;
+use super::{ApiError, link::loan::InRing};
 
 /// Writable memory for one payload: what [`create_message`](super::Endpoint::create_message) lends. Sent, it is gone;
 /// dropped, it was never there, and so it is when the process is killed.
 ///
-/// Where there is room for it in the ring to its receiver, or to the node, it lies there, and sending it copies nothing.
-/// That ring is lent until then: whatever else is to be sent on it is refused with
-/// [`ApiError::Lent`](super::ApiError::Lent), and the outcomes of messages that were received wait. So keep it no longer than
-/// it takes to write it. Else (no rings, more than half a ring, no room now, or another one lent already) it is ordinary
-/// memory, copied when it is sent. [`is_in_place`](Self::is_in_place) says which.
+/// **An endpoint lends one message at a time, and until that is sent or dropped nothing else goes out of it**: to create
+/// another, to send, ask, reply, resolve, join and leave are refused with [`ApiError::Lent`], whatever carries the messages, and
+/// so is to unregister, which gives the address back all the same. To receive goes on. What is said of received messages
+/// may wait. So keep it no longer than it takes to write it.
+///
+/// Where there is room for it in the ring to its receiver, or to the node, it lies there, and sending it copies nothing. Else
+/// (no rings, more than half a ring, no room now) it is ordinary memory, copied when it is sent.
+/// [`is_in_place`](Self::is_in_place) says which. After a restart of the node it is copied to the node's next life.
 #[derive(Debug)]
 #[must_use = "memory that is dropped is not sent"]
 pub struct LentMessage {
     header: Header,
     memory: Memory,
+    /// Over when the memory has been given back.
+    _loan: Loan,
+}
+
+/// What an endpoint lends from: one message at a time.
+#[derive(Debug, Default)]
+pub(super) struct Lender(Arc<()>);
+
+/// A loan that is not over.
+#[derive(Debug)]
+pub(super) struct Loan {
+    _of: Arc<()>,
+}
+
+impl Lender {
+    /// Begins a loan.
+    pub(super) fn lend(&self) -> Result<Loan, ApiError> {
+        self.be_free()?;
+        Ok(Loan { _of: self.0.clone() })
+    }
+
+    /// Whether nothing is lent.
+    pub(super) fn be_free(&self) -> Result<(), ApiError> {
+        if Arc::strong_count(&self.0) > 1 { Err(ApiError::Lent) } else { Ok(()) }
+    }
 }
 
 #[derive(Debug)]
@@ -32,12 +63,10 @@ enum Memory {
 }
 
 impl LentMessage {
-    pub(super) fn new(header: Header, length: usize) -> Self {
-        Self { memory: Memory::Own(MessageBuffer::new(header, length)), header }
-    }
-
-    pub(super) const fn in_ring(header: Header, room: InRing) -> Self {
-        Self { header, memory: Memory::InRing(room) }
+    /// In a ring if there is room, else in memory of its own.
+    pub(super) fn new(loan: Loan, header: Header, room: Option<InRing>, length: usize) -> Self {
+        let own = || Memory::Own(MessageBuffer::new(header, length));
+        Self { header, memory: room.map_or_else(own, Memory::InRing), _loan: loan }
     }
 
     /// The class in which it will travel. Control at first.
@@ -45,7 +74,7 @@ impl LentMessage {
         self.header.class = class;
     }
 
-    /// Whether it lies in a ring: sending it copies nothing, and nothing else goes that way before.
+    /// Whether it lies in a ring: sending it copies nothing.
     #[must_use]
     pub const fn is_in_place(&self) -> bool {
         match self.memory {
@@ -121,10 +150,12 @@ impl From<Message> for Draft {
 
 impl From<LentMessage> for Draft {
     fn from(lent: LentMessage) -> Self {
-        let payload = match lent.memory {
+        // What its own sending does not wait for.
+        let LentMessage { header, memory, _loan: _ } = lent;
+        let payload = match memory {
             Memory::Own(buffer) => Content::Bytes(buffer.freeze().payload),
             Memory::InRing(room) => Content::InRing(room),
         };
-        Self { header: lent.header, payload }
+        Self { header, payload }
     }
 }

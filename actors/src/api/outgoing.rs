@@ -110,16 +110,14 @@ impl Endpoint {
     }
 
     /// Lends memory for a payload of `length` bytes: in the ring that a message to `destination` goes into now, if it can.
-    pub(super) fn lend(&mut self, header: Header, length: usize) -> LentMessage {
+    pub(super) fn lend(&mut self, header: Header, length: usize) -> Result<LentMessage, ApiError> {
+        let loan = self.lender.lend()?;
         let way = self.way(self.absolute(header.destination), Time::now());
         let room = match way {
             Some(link) => self.direct.lend(link, length),
             None => self.writer.lend(length),
         };
-        match room {
-            Some(room) => LentMessage::in_ring(header, room),
-            None => LentMessage::new(header, length),
-        }
+        Ok(LentMessage::new(loan, header, room, length))
     }
 
     /// Sends `message` the way that is right now, and waits for room as long as `limit` allows; the link, if it did not go
@@ -129,6 +127,7 @@ impl Endpoint {
         mut draft: Draft,
         limit: Limit,
     ) -> Result<Option<LinkNumber>, ApiError> {
+        self.lender.be_free()?;
         if !limit.is_in_all() {
             // To register takes as long as it takes.
             self.try_return();

@@ -52,22 +52,26 @@ pub(super) const TORQUE: Torque = Torque { newton_metres: 2.5 };
 /// Every claim of NodeAPI holds whatever carries the messages, and whoever waits.
 macro_rules! on_every_transport {
     ($($claim:ident)*) => {
-        on_every_transport!(ring Ring Thread, $($claim)*);
-        on_every_transport!(socket Socket Thread, $($claim)*);
-        on_every_transport!(async_ring Ring Task, $($claim)*);
-        on_every_transport!(async_socket Socket Task, $($claim)*);
+        on_every_transport!(ring Ring Thread false, $($claim)*);
+        on_every_transport!(direct Ring Thread true, $($claim)*);
+        on_every_transport!(socket Socket Thread false, $($claim)*);
+        on_every_transport!(async_ring Ring Task false, $($claim)*);
+        on_every_transport!(async_direct Ring Task true, $($claim)*);
+        on_every_transport!(async_socket Socket Task false, $($claim)*);
     };
-    ($module:ident $transport:ident $form:ident, $($claim:ident)*) => {
+    ($module:ident $transport:ident $form:ident $direct:literal, $($claim:ident)*) => {
         mod $module {
             use super::{Transport, forms::{Form, Under}};
 
-            const UNDER: Under = Under { transport: Transport::$transport, form: Form::$form };
+            const UNDER: Under =
+                Under { transport: Transport::$transport, form: Form::$form, direct: $direct };
 
             $(#[test] fn $claim() { super::$claim(UNDER) })*
         }
     };
 }
 
+mod loans;
 mod room;
 
 on_every_transport! {
@@ -95,7 +99,7 @@ on_every_transport! {
 }
 
 fn on(under: Under) -> Registration {
-    Registration::new().transport(under.transport)
+    Registration::new().transport(under.transport).direct(under.direct)
 }
 
 fn register(under: Under, node: &TestNode, registration: Registration) -> Client {

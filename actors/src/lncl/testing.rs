@@ -69,6 +69,22 @@ pub(crate) struct TestNode {
     directory: TestDirectory,
 }
 
+/// Starts the LNCL of a node, and waits until it is ready.
+fn live(stores: &Arc<Stores>) -> (oneshot::Sender<()>, JoinHandle<()>) {
+    let (say_ready, ready) = sync_channel(1);
+    let (stop, stopped) = oneshot::channel();
+    let its_stores = stores.clone();
+    let thread = std::thread::spawn(move || {
+        actix_rt::System::new().block_on(async move {
+            let gate = ReadyGate::new(move || say_ready.send(()).unwrap());
+            let _lncl = Lncl::new(its_stores, gate).start();
+            let _ = stopped.await;
+        });
+    });
+    ready.recv_timeout(WATCHDOG).expect("LNCL becomes ready");
+    (stop, thread)
+}
+
 impl TestNode {
     pub(crate) fn start() -> Self {
         Self::start_with(|_| ())
@@ -81,18 +97,18 @@ impl TestNode {
         change(&mut config);
         let stores = Stores::for_test(config, Incarnation(1));
         let facts = stores.posts.sync.attach();
-        let (say_ready, ready) = sync_channel(1);
-        let (stop, stopped) = oneshot::channel();
-        let its_stores = stores.clone();
-        let thread = std::thread::spawn(move || {
-            actix_rt::System::new().block_on(async move {
-                let gate = ReadyGate::new(move || say_ready.send(()).unwrap());
-                let _lncl = Lncl::new(its_stores, gate).start();
-                let _ = stopped.await;
-            });
-        });
-        ready.recv_timeout(WATCHDOG).expect("LNCL becomes ready");
+        let (stop, thread) = live(&stores);
         Self { stores, facts, stop: Some(stop), thread: Some(thread), directory }
+    }
+
+    /// Ends it, and starts another life of it behind the same socket.
+    pub(crate) fn restart(&mut self) {
+        let (config, life) = (self.stores.config.clone(), self.stores.incarnation.0);
+        self.stop();
+        self.stores = Stores::for_test(config, Incarnation(life + 1));
+        self.facts = self.stores.posts.sync.attach();
+        let (stop, thread) = live(&self.stores);
+        (self.stop, self.thread) = (Some(stop), Some(thread));
     }
 
     pub(crate) fn path(&self) -> PathBuf {

@@ -8,8 +8,15 @@
  * messages on it. bindings/c/README.md has a first program; docs/SEMANTICS.md says what is promised of messages.
  *
  * Threads.  An endpoint is one thread's at a time: a call on it while another thread is in one returns
- *   SINEW_ERROR_BUSY and does nothing. Different endpoints are independent: take one for each thread. Functions
- *   without an endpoint may be called by any thread at any time. The sentence of sinew_last_error is the thread's own.
+ *   SINEW_ERROR_BUSY and does nothing. Different endpoints are independent: take one for each thread. Each function says
+ *   who may call it. "The endpoint's thread": whichever thread has it now; to hand it on, order the last call of the one
+ *   before the first of the other (a mutex, a queue, pthread_join). "Any thread": any number, at any time. The sentence of
+ *   sinew_last_error is the thread's own.
+ * Messages.  A message that is handed to a function that sends is gone when it returns, whatever that returns, and
+ *   `*message` is all zeros. Four errors are said before a message is looked at, which is left as it was then:
+ *   SINEW_ERROR_BUSY (it is still yours), and SINEW_ERROR_NO_SUCH_ENDPOINT, _FORKED and _PANIC (nobody can send it; it
+ *   goes with its endpoint). SINEW_ERROR_NO_SUCH_MESSAGE: it was gone before. A received message is in hand until
+ *   sinew_settle_message returns SINEW_OK, or its endpoint is unregistered.
  * Pointers.  NULL is refused where it is not said to be legal. Any other pointer must point to what its type says, for
  *   the length of the call. Endpoints and messages are looked up, not followed: one that was unregistered, sent,
  *   discarded or settled is refused. The `bytes` of a message are good until then, and not after. Between two calls any
@@ -86,7 +93,7 @@ enum sinew_status
      */
     SINEW_NOTHING = 1,
     /**
-     * An argument is NULL, no UTF-8, too long, or none of its legal values. Nothing was done.
+     * An argument is NULL, no UTF-8, too long, or none of its legal values. Nothing was sent or registered.
      */
     SINEW_ERROR_INVALID_ARGUMENT = -1,
     /**
@@ -110,7 +117,8 @@ enum sinew_status
      */
     SINEW_ERROR_CLOSED = -6,
     /**
-     * The node takes no bytes. The message was not sent; it may be made and sent again.
+     * There was no room in time: the node or, on a direct link, the receiver is stopped or too slow. Nothing of the message
+     * was written; it may be made and sent again.
      */
     SINEW_ERROR_STALLED = -7,
     /**
@@ -134,7 +142,7 @@ enum sinew_status
      */
     SINEW_ERROR_MALFORMED = -12,
     /**
-     * This is no endpoint: it was unregistered, or never registered. Nothing was done.
+     * This is no endpoint: it is NULL, or was unregistered, or never registered. Nothing was done.
      */
     SINEW_ERROR_NO_SUCH_ENDPOINT = -13,
     /**
@@ -146,7 +154,7 @@ enum sinew_status
      */
     SINEW_ERROR_NO_SUCH_MESSAGE = -15,
     /**
-     * Too many endpoints in this process, or too many messages in hand. Nothing was done.
+     * Too many endpoints in this process, or too many messages in hand. Nothing was sent or registered.
      */
     SINEW_ERROR_TOO_MANY = -16,
     /**
@@ -158,12 +166,13 @@ enum sinew_status
      */
     SINEW_ERROR_PANIC = -18,
     /**
-     * Memory for a message is lent in place; send or discard that message first. Nothing was sent.
+     * A message is lent and was neither sent nor discarded: nothing else goes out of the endpoint before. Nothing was sent.
      */
     SINEW_ERROR_LENT = -19,
     /**
      * The connection to the node has ended, through no fault of this endpoint, which registers again by itself while it is
-     * used: go on. Each send tries, and `sinew_receive_message`, which says this once, waits for it. The message was not sent.
+     * used: go on. Each send without a time tries, and `sinew_receive_message`, which says this once, waits for it. The message
+     * was not sent.
      */
     SINEW_ERROR_AWAY = -20,
 };
@@ -347,7 +356,8 @@ typedef struct sinew_options {
      */
     uint64_t deadline_ns;
     /**
-     * How long a send waits at most while the node takes no bytes. Default: 1 s.
+     * How long a send waits while the node or, on a direct link, the receiver takes nothing; whatever it takes begins that time
+     * anew. Default: 1 s. For one send alone, and in all: `sinew_send_message_within`.
      */
     uint64_t patience_ns;
     /**
@@ -479,14 +489,14 @@ extern "C" {
 #endif // __cplusplus
 
 /**
- * The `SINEW_ABI` that the library was built with. A program that loads the library at run time compares.
+ * The `SINEW_ABI` that the library was built with. A program that loads the library at run time compares. Any thread.
  */
 uint32_t sinew_abi(void);
 
 /**
  * Connects to the node whose configuration's `lncl.socket` is `socket`, asks for a transport address, and waits until
  * everything that is required is ready (the paper's RegisterTransportAddress). `options` may be NULL: a dynamic address,
- * no name. Any thread; blocks until the deadline of the options at most.
+ * no name. Any thread, any number at the same time. Blocks until the deadline of the options at most.
  *
  * The endpoint is one thread's at a time. A process may have 256, if its node lets it: `lncl.clients_per_process_max`, 64.
  */
@@ -497,28 +507,31 @@ sinew_status sinew_register_transport_address(struct sinew_text socket,
 /**
  * Gives the address back, and waits until the node has taken it, 2 s at most: then the name is free. Whatever it returns,
  * but for `SINEW_ERROR_BUSY` and `SINEW_ERROR_FORKED`, the endpoint is gone and `*endpoint` is NULL. Messages that were
- * received and not settled end as Failed; messages that were made and not sent are discarded; the memory of both is gone.
+ * received and not settled end as Failed; one that was made and not sent is discarded; the memory of both is gone. The
+ * endpoint's thread, or any when no other one is in a call on it.
  */
 sinew_status sinew_unregister(struct sinew_endpoint **endpoint);
 
 /**
- * The address that was registered; 0 if this is no endpoint or another thread is in a call on it.
+ * The address that was registered; 0 if this is no endpoint or another thread is in a call on it. The endpoint's thread.
  */
 sinew_tid sinew_endpoint_tid(const struct sinew_endpoint *endpoint);
 
 /**
- * Longest payload that the node takes, in bytes; 0 if this is no endpoint or another thread is in a call on it.
+ * Longest payload that the node takes, in bytes; 0 if this is no endpoint or another thread is in a call on it. The
+ * endpoint's thread.
  */
 size_t sinew_payload_max(const struct sinew_endpoint *endpoint);
 
 /**
  * The name of the node, ended by a zero, until the endpoint is unregistered; NULL if this is no endpoint or another thread
- * is in a call on it.
+ * is in a call on it. The endpoint's thread; what it points to, any.
  */
 const char *sinew_node_name(const struct sinew_endpoint *endpoint);
 
 /**
  * Asks who has `name` now, on any node; waits `within_ns` at most. `SINEW_NOTHING` and a `*tid` of 0 if nobody has it.
+ * The endpoint's thread.
  */
 sinew_status sinew_resolve(struct sinew_endpoint *endpoint,
                            struct sinew_text name,
@@ -526,49 +539,53 @@ sinew_status sinew_resolve(struct sinew_endpoint *endpoint,
                            sinew_tid *tid);
 
 /**
- * Joins a group: what is sent to `sinew_group` of this name reaches this endpoint from now on. Waits 2 s at most.
+ * Joins a group: what is sent to `sinew_group` of this name reaches this endpoint from now on. Waits 2 s at most. The
+ * endpoint's thread.
  */
 sinew_status sinew_join_group(struct sinew_endpoint *endpoint,
                               struct sinew_text name);
 
 /**
- * Leaves a group. Waits 2 s at most.
+ * Leaves a group. Waits 2 s at most. The endpoint's thread.
  */
 sinew_status sinew_leave_group(struct sinew_endpoint *endpoint, struct sinew_text name);
 
 /**
- * The members of the group called `name`, on every node; 0 if it is no text.
+ * The members of the group called `name`, on every node; 0 if it is no text. Any thread.
  */
 sinew_tid sinew_group(struct sinew_text name);
 
 /**
  * The kind of the payload type called `name`, the same in every program and language; 0 if it is no text.
+ * Any thread.
  */
 sinew_kind sinew_kind_named(struct sinew_text name);
 
 /**
- * The TID that is written in `text`, as in `10.0.0.7/1001`.
+ * The TID that is written in `text`, as in `10.0.0.7/1001`. Any thread.
  */
 sinew_status sinew_tid_parse(struct sinew_text text, sinew_tid *tid);
 
 /**
- * Writes a TID as text, ended by a zero, into `capacity` bytes; `SINEW_TID_TEXT` are always enough.
+ * Writes a TID as text, ended by a zero, into `capacity` bytes; `SINEW_TID_TEXT` are always enough. Any
+ * thread.
  */
 sinew_status sinew_tid_text(sinew_tid tid, char *text, size_t capacity);
 
 /**
- * The present moment in nanoseconds of the host's monotonic clock: the clock of `sent_ns`.
+ * The present moment in nanoseconds of the host's monotonic clock: the clock of `sent_ns`. Any thread.
  */
 uint64_t sinew_now_ns(void);
 
 /**
  * Lends `length` writable bytes, all zeros, for a payload of `kind` to `destination` (the paper's CreateMessage).
- * `message_class` is one of `sinew_message_class`. Up to 64 messages may be in the making. Does not block.
+ * `message_class` is one of `sinew_message_class`. Does not block. The endpoint's thread; the bytes, any.
  *
- * The bytes lie in the shared memory from which they are read, if there is room and no other message of this endpoint in
- * the making lies there already: then sending copies nothing. Until it is sent or discarded, sending anything else the same
- * way returns `SINEW_ERROR_LENT`, and what `sinew_settle_message` says waits: so write it at once. Else they are ordinary
- * memory. If the process is killed meanwhile, nobody notices more than its end.
+ * An endpoint lends one message at a time, and until that is sent or discarded nothing else goes out of it: to create
+ * another, to send, ask, reply, resolve, join and leave return `SINEW_ERROR_LENT`, whatever carries the messages; what
+ * `sinew_settle_message` says may wait. So write it at once. The bytes lie in the shared memory from which they are read, if there
+ * is room: then sending copies nothing. Else they are ordinary memory. If the process is killed meanwhile, nobody notices more
+ * than its end.
  */
 sinew_status sinew_create_message(struct sinew_endpoint *endpoint,
                                   sinew_tid destination,
@@ -578,19 +595,33 @@ sinew_status sinew_create_message(struct sinew_endpoint *endpoint,
                                   struct sinew_message *message);
 
 /**
- * Gives a message back that is not to be sent. `*message` is all zeros then. Does not block.
+ * Gives a message back that is not to be sent. `*message` is all zeros then. Does not block. The endpoint's thread.
  */
-sinew_status sinew_discard_message(struct sinew_endpoint *endpoint, struct sinew_message *message);
+sinew_status sinew_discard_message(struct sinew_endpoint *endpoint,
+                                   struct sinew_message *message);
 
 /**
- * Sends a message (the paper's SendMessage). What becomes of it is not told. If it is this endpoint's it is gone when this
- * returns, sent or not: `*message` is all zeros then. Blocks for the `patience_ns` of the options at most.
+ * Sends a message (the paper's SendMessage). What becomes of it then is not told. The message is gone when this returns, sent
+ * or not: see Messages at the top. Blocks while there is no room and nothing is taken, for the `patience_ns` of the options.
+ * The endpoint's thread.
  */
 sinew_status sinew_send_message(struct sinew_endpoint *endpoint,
                                 struct sinew_message *message);
 
 /**
- * Lends, copies and sends in one call. `bytes` may be NULL if `length` is 0. Blocks as `sinew_send_message`.
+ * The same, and blocks for `within_ns` at most while there is no room; with 0 it does not block at all. For a control loop:
+ * `SINEW_ERROR_STALLED` says that there was no room in time and that nothing of the message was written. One that is longer than
+ * half the ring goes out in pieces; it is sent when its first piece is, and the rest follows with later calls. A node that has
+ * gone is not looked for here (`SINEW_ERROR_AWAY`): `sinew_receive_message`, or a send without a time, does. The endpoint's
+ * thread.
+ */
+sinew_status sinew_send_message_within(struct sinew_endpoint *endpoint,
+                                       struct sinew_message *message,
+                                       uint64_t within_ns);
+
+/**
+ * Lends, copies and sends in one call. `bytes` may be NULL if `length` is 0. Blocks as `sinew_send_message`. The endpoint's
+ * thread.
  */
 sinew_status sinew_send_bytes(struct sinew_endpoint *endpoint,
                               sinew_tid destination,
@@ -600,9 +631,21 @@ sinew_status sinew_send_bytes(struct sinew_endpoint *endpoint,
                               size_t length);
 
 /**
+ * The same, and blocks as `sinew_send_message_within`. The endpoint's thread.
+ */
+sinew_status sinew_send_bytes_within(struct sinew_endpoint *endpoint,
+                                     sinew_tid destination,
+                                     sinew_kind kind,
+                                     int32_t message_class,
+                                     const uint8_t *bytes,
+                                     size_t length,
+                                     uint64_t within_ns);
+
+/**
  * Sends a message and waits for what becomes of it; `SINEW_UNKNOWN` when nobody has said so after `within_ns`. The message
  * expires where it waits when it is older. `*outcome` is set if this returns `SINEW_OK`. The message is gone as with
- * `sinew_send_message`. What comes meanwhile waits to be received.
+ * `sinew_send_message`. What comes meanwhile waits to be received. Blocks for `within_ns` at most, room included. The endpoint's
+ * thread.
  */
 sinew_status sinew_send_message_confirmed(struct sinew_endpoint *endpoint,
                                           struct sinew_message *message,
@@ -610,9 +653,10 @@ sinew_status sinew_send_message_confirmed(struct sinew_endpoint *endpoint,
                                           sinew_outcome *outcome);
 
 /**
- * Sends a message as a request, in class Control, and waits for the reply, `within_ns` at most. `*reply` is set if this
- * returns `SINEW_OK`; settle it when it has been read. If it returns `SINEW_ERROR_NOT_HANDLED` and `outcome` is not NULL,
- * `*outcome` says what became of the request. The message is gone as with `sinew_send_message`.
+ * Sends a message as a request, in class Control, and waits for the reply, `within_ns` at most, room included. `*reply` is
+ * set if this returns `SINEW_OK`; settle it when it has been read. If it returns `SINEW_ERROR_NOT_HANDLED` and `outcome` is not
+ * NULL, `*outcome` says what became of the request. With 1024 received messages in hand there is no place for a reply:
+ * `SINEW_ERROR_TOO_MANY`, and nothing was sent. The message is gone as with `sinew_send_message`. The endpoint's thread.
  */
 sinew_status sinew_ask(struct sinew_endpoint *endpoint,
                        struct sinew_message *message,
@@ -622,16 +666,25 @@ sinew_status sinew_ask(struct sinew_endpoint *endpoint,
 
 /**
  * Sends a message as the reply to a request in hand; it goes to who asked, whatever destination it was created for. The
- * request is still to be settled. The message is gone as with `sinew_send_message`.
+ * request is still to be settled. The message is gone as with `sinew_send_message`, as which it blocks. The endpoint's thread.
  */
 sinew_status sinew_reply(struct sinew_endpoint *endpoint,
                          const struct sinew_received *request,
                          struct sinew_message *message);
 
 /**
+ * The same, and blocks as `sinew_send_message_within`. The endpoint's thread.
+ */
+sinew_status sinew_reply_within(struct sinew_endpoint *endpoint,
+                                const struct sinew_received *request,
+                                struct sinew_message *message,
+                                uint64_t within_ns);
+
+/**
  * Waits for a message, `within_ns` at most; `SINEW_NOTHING` if none came (the paper's ReceiveMessage). Control comes first,
  * then Stream, of which only the newest value of each source and kind, then Bulk. `*received` is set if this returns
- * `SINEW_OK`; settle it when it has been handled. Up to 1024 may be in hand.
+ * `SINEW_OK`; settle it when it has been handled. Up to 1024 may be in hand; one more is `SINEW_ERROR_TOO_MANY`, and stays
+ * where it waits. With 0 it only looks. The endpoint's thread.
  *
  * Signals do not end the wait: a loop that is to end at one takes a short `within_ns` and looks each time.
  */
@@ -649,7 +702,8 @@ sinew_status sinew_next_untaken(struct sinew_endpoint *endpoint,
 
 /**
  * Says what became of a message in hand, which its sender is told if it asked, and gives its memory back. `outcome` is
- * `SINEW_DELIVERED` if it was handled, `SINEW_FAILED`, or one of the rejections. `*received` is all zeros then.
+ * `SINEW_DELIVERED` if it was handled, `SINEW_FAILED`, or one of the rejections. `*received` is all zeros then; after
+ * an error it is still in hand. The endpoint's thread. Does not block.
  */
 sinew_status sinew_settle_message(struct sinew_endpoint *endpoint,
                                   struct sinew_received *received,
@@ -662,7 +716,7 @@ const char *sinew_status_text(int32_t status);
 
 /**
  * A sentence about the last error of the calling thread: what was wrong this time, and what to do. Never NULL; empty if
- * there was no error. It stays until the thread's next error.
+ * there was no error. It stays until the thread's next error. Any thread, each of which has its own.
  */
 const char *sinew_last_error(void);
 

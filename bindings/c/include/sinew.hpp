@@ -2,8 +2,8 @@
 //
 // Errors are exceptions of type sinew::error. A program that goes on with an endpoint that has ended, or with a message that
 // was not sent, moves a limb by chance; an exception cannot be overlooked, a status can. What belongs to the ordinary course
-// of a control loop is no error and throws nothing: no message in time (std::optional), a name that nobody has
-// (std::optional), a message that was not handled (its outcome). Programs without exceptions take sinew.h.
+// of a control loop is no error and throws nothing: no message in time (std::optional), no room in time (send_within: false),
+// a name that nobody has (std::optional), a message that was not handled (its outcome). Programs without exceptions take sinew.h.
 //
 // Everything here belongs to one thread at a time, with the endpoint that it came from.
 #ifndef SINEW_HPP
@@ -230,7 +230,7 @@ public:
         return name != nullptr ? name : "";
     }
 
-    /// Lends writable bytes, all zeros, for a message.
+    /// Lends writable bytes, all zeros, for a message. One at a time: nothing else goes out until it is sent or at its end.
     message create(tid destination, kind what, std::size_t length, sinew_message_class how = SINEW_CONTROL)
     {
         message created(raw_);
@@ -244,6 +244,19 @@ public:
     template <class T> void send(tid destination, kind what, const T &value, sinew_message_class how = SINEW_CONTROL)
     {
         send(filled(destination, what, value, how));
+    }
+
+    /// Sends a message if there is room in time, zero: now; says whether there was. What is not sent is gone.
+    [[nodiscard]] bool send_within(message &&made, duration within)
+    {
+        return is_sent(sinew_send_message_within(raw_, &made.raw_, detail::nanoseconds(within)));
+    }
+    /// Sends a plain struct if there is room in time.
+    template <class T>
+    [[nodiscard]] bool send_within(tid destination, kind what, const T &value, duration within,
+                                   sinew_message_class how = SINEW_CONTROL)
+    {
+        return send_within(filled(destination, what, value, how), within);
     }
 
     /// Sends a message and waits for what becomes of it; SINEW_UNKNOWN when nobody has said so in time.
@@ -278,6 +291,12 @@ public:
     template <class T> void reply(const received &request, kind what, const T &value)
     {
         reply(request, filled(request.source(), what, value, SINEW_CONTROL));
+    }
+
+    /// Replies to a request if there is room in time; says whether there was.
+    [[nodiscard]] bool reply_within(const received &request, message &&made, duration within)
+    {
+        return is_sent(sinew_reply_within(raw_, &request.raw_, &made.raw_, detail::nanoseconds(within)));
     }
 
     /// Waits for a message; nothing if none came in time.
@@ -317,6 +336,11 @@ public:
     void unregister() { detail::check(sinew_unregister(&raw_)); }
 
 private:
+    static bool is_sent(sinew_status status)
+    {
+        return status != SINEW_ERROR_STALLED && detail::check(status) == SINEW_OK;
+    }
+
     static std::vector<sinew_text> texts(const std::vector<std::string> &strings)
     {
         std::vector<sinew_text> texts;

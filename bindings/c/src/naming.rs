@@ -13,6 +13,7 @@ use crate::{
 };
 
 /// Asks who has `name` now, on any node; waits `within_ns` at most. `SINEW_NOTHING` and a `*tid` of 0 if nobody has it.
+/// The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_resolve(
     endpoint: *mut Endpoint,
@@ -31,7 +32,8 @@ pub extern "C" fn sinew_resolve(
     })
 }
 
-/// Joins a group: what is sent to `sinew_group` of this name reaches this endpoint from now on. Waits 2 s at most.
+/// Joins a group: what is sent to `sinew_group` of this name reaches this endpoint from now on. Waits 2 s at most. The
+/// endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_join_group(endpoint: *mut Endpoint, name: Text) -> Status {
     call(|| {
@@ -40,7 +42,7 @@ pub extern "C" fn sinew_join_group(endpoint: *mut Endpoint, name: Text) -> Statu
     })
 }
 
-/// Leaves a group. Waits 2 s at most.
+/// Leaves a group. Waits 2 s at most. The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_leave_group(endpoint: *mut Endpoint, name: Text) -> Status {
     call(|| {
@@ -49,19 +51,20 @@ pub extern "C" fn sinew_leave_group(endpoint: *mut Endpoint, name: Text) -> Stat
     })
 }
 
-/// The members of the group called `name`, on every node; 0 if it is no text.
+/// The members of the group called `name`, on every node; 0 if it is no text. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_group(name: Text) -> TidBits {
     value(0, || Ok(Tid::group(name.read("name")?).bits()))
 }
 
 /// The kind of the payload type called `name`, the same in every program and language; 0 if it is no text.
+/// Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_kind_named(name: Text) -> KindBits {
     value(0, || Ok(Kind::named(name.read("name")?).bits()))
 }
 
-/// The TID that is written in `text`, as in `10.0.0.7/1001`.
+/// The TID that is written in `text`, as in `10.0.0.7/1001`. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_tid_parse(text: Text, tid: Option<&mut MaybeUninit<TidBits>>) -> Status {
     call(|| {
@@ -71,7 +74,8 @@ pub extern "C" fn sinew_tid_parse(text: Text, tid: Option<&mut MaybeUninit<TidBi
     })
 }
 
-/// Writes a TID as text, ended by a zero, into `capacity` bytes; `SINEW_TID_TEXT` are always enough.
+/// Writes a TID as text, ended by a zero, into `capacity` bytes; `SINEW_TID_TEXT` are always enough. Any
+/// thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_tid_text(tid: TidBits, text: *mut c_char, capacity: usize) -> Status {
     call(|| {
@@ -97,7 +101,7 @@ pub extern "C" fn sinew_tid_text(tid: TidBits, text: *mut c_char, capacity: usiz
 #[allow(dead_code, reason = "it is for C")]
 pub const SINEW_TID_TEXT: usize = 32;
 
-/// The present moment in nanoseconds of the host's monotonic clock: the clock of `sent_ns`.
+/// The present moment in nanoseconds of the host's monotonic clock: the clock of `sent_ns`. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_now_ns() -> u64 {
     Time::now().as_nanos()

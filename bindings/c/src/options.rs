@@ -44,7 +44,8 @@ pub struct Options {
     pub events: u32,
     /// How long the registration may take, waiting for what is required included. Default: 60 s.
     pub deadline_ns: u64,
-    /// How long a send waits at most while the node takes no bytes. Default: 1 s.
+    /// How long a send waits while the node or, on a direct link, the receiver takes nothing; whatever it takes begins that time
+    /// anew. Default: 1 s. For one send alone, and in all: `sinew_send_message_within`.
     pub patience_ns: u64,
     /// How many received messages wait in this process at most, each class by itself. Default: 256.
     pub inbox_capacity: usize,
@@ -123,7 +124,10 @@ impl Options {
     }
 
     fn with_links(&self, mut registration: Registration) -> Result<Registration, Fault> {
-        if self.links & !(SINEW_SOCKET_ONLY | SINEW_DIRECT | SINEW_SPIN_ADAPTIVE) != 0 || self.reserved != 0 {
+        if self.reserved != 0 {
+            return Err(Fault::argument(format!("`options.reserved` is {}: set it to 0", self.reserved)));
+        }
+        if self.links & !(SINEW_SOCKET_ONLY | SINEW_DIRECT | SINEW_SPIN_ADAPTIVE) != 0 {
             return Err(Fault::argument(format!("`options.links` is {:#x}: no such links", self.links)));
         }
         if self.links & SINEW_SOCKET_ONLY != 0 {
@@ -232,6 +236,10 @@ mod tests {
         let mut options = zeroed(size_of::<Options>());
         options.links = 8;
         assert!(options.registration().is_err());
+        let mut options = zeroed(size_of::<Options>());
+        options.reserved = 1;
+        let fault = format!("{:?}", options.registration().unwrap_err());
+        assert!(fault.contains("`options.reserved` is 1"), "{fault}");
         let mut options = zeroed(size_of::<Options>());
         options.inbox_capacity = INBOX_MAX + 1;
         assert!(options.registration().is_err());

@@ -12,7 +12,8 @@ use crate::{
 
 /// Waits for a message, `within_ns` at most; `SINEW_NOTHING` if none came (the paper's ReceiveMessage). Control comes first,
 /// then Stream, of which only the newest value of each source and kind, then Bulk. `*received` is set if this returns
-/// `SINEW_OK`; settle it when it has been handled. Up to 1024 may be in hand.
+/// `SINEW_OK`; settle it when it has been handled. Up to 1024 may be in hand; one more is `SINEW_ERROR_TOO_MANY`, and stays
+/// where it waits. With 0 it only looks. The endpoint's thread.
 ///
 /// Signals do not end the wait: a loop that is to end at one takes a short `within_ns` and looks each time.
 #[unsafe(no_mangle)]
@@ -48,7 +49,8 @@ pub extern "C" fn sinew_next_untaken(
 }
 
 /// Says what became of a message in hand, which its sender is told if it asked, and gives its memory back. `outcome` is
-/// `SINEW_DELIVERED` if it was handled, `SINEW_FAILED`, or one of the rejections. `*received` is all zeros then.
+/// `SINEW_DELIVERED` if it was handled, `SINEW_FAILED`, or one of the rejections. `*received` is all zeros then; after
+/// an error it is still in hand. The endpoint's thread. Does not block.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_settle_message(
     endpoint: *mut Endpoint,

@@ -18,7 +18,7 @@ use crate::{
 /// The version of this header's structs and functions. It grows when a program must be compiled anew.
 pub const SINEW_ABI: u32 = 1;
 
-/// The `SINEW_ABI` that the library was built with. A program that loads the library at run time compares.
+/// The `SINEW_ABI` that the library was built with. A program that loads the library at run time compares. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_abi() -> u32 {
     SINEW_ABI
@@ -26,7 +26,7 @@ pub extern "C" fn sinew_abi() -> u32 {
 
 /// Connects to the node whose configuration's `lncl.socket` is `socket`, asks for a transport address, and waits until
 /// everything that is required is ready (the paper's RegisterTransportAddress). `options` may be NULL: a dynamic address,
-/// no name. Any thread; blocks until the deadline of the options at most.
+/// no name. Any thread, any number at the same time. Blocks until the deadline of the options at most.
 ///
 /// The endpoint is one thread's at a time. A process may have 256, if its node lets it: `lncl.clients_per_process_max`, 64.
 #[unsafe(no_mangle)]
@@ -53,31 +53,33 @@ pub extern "C" fn sinew_register_transport_address(
 
 /// Gives the address back, and waits until the node has taken it, 2 s at most: then the name is free. Whatever it returns,
 /// but for `SINEW_ERROR_BUSY` and `SINEW_ERROR_FORKED`, the endpoint is gone and `*endpoint` is NULL. Messages that were
-/// received and not settled end as Failed; messages that were made and not sent are discarded; the memory of both is gone.
+/// received and not settled end as Failed; one that was made and not sent is discarded; the memory of both is gone. The
+/// endpoint's thread, or any when no other one is in a call on it.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_unregister(endpoint: Option<&mut *mut Endpoint>) -> Status {
     call(|| {
-        let endpoint = present(endpoint, "endpoint")?;
+        let endpoint = endpoint.ok_or_else(|| Fault::plain(Status::SinewErrorNoSuchEndpoint))?;
         let session = ENDPOINTS.take(endpoint.addr())?;
         *endpoint = std::ptr::null_mut();
         session.unregister().map(|()| Status::SinewOk)
     })
 }
 
-/// The address that was registered; 0 if this is no endpoint or another thread is in a call on it.
+/// The address that was registered; 0 if this is no endpoint or another thread is in a call on it. The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_endpoint_tid(endpoint: *const Endpoint) -> TidBits {
     value(0, || with(endpoint, |session| Ok(session.endpoint().tid().bits())))
 }
 
-/// Longest payload that the node takes, in bytes; 0 if this is no endpoint or another thread is in a call on it.
+/// Longest payload that the node takes, in bytes; 0 if this is no endpoint or another thread is in a call on it. The
+/// endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_payload_max(endpoint: *const Endpoint) -> usize {
     value(0, || with(endpoint, |session| Ok(session.endpoint().payload_max())))
 }
 
 /// The name of the node, ended by a zero, until the endpoint is unregistered; NULL if this is no endpoint or another thread
-/// is in a call on it.
+/// is in a call on it. The endpoint's thread; what it points to, any.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_node_name(endpoint: *const Endpoint) -> *const std::ffi::c_char {
     value(std::ptr::null(), || with(endpoint, |session| Ok(session.node_name().as_ptr())))
@@ -88,8 +90,5 @@ pub(crate) fn with<R>(
     endpoint: *const Endpoint,
     body: impl FnOnce(&mut Session) -> Result<R, Fault>,
 ) -> Result<R, Fault> {
-    if endpoint.is_null() {
-        return Err(Fault::argument("`endpoint` is NULL"));
-    }
     ENDPOINTS.with(endpoint.addr(), body)
 }

@@ -8,18 +8,20 @@ use crate::{
     border::{call, present, write},
     message::{Endpoint, KindBits, Message, Received, TidBits},
     registration::with,
+    session::Session,
     status::{Fault, Status},
     text,
     words::{Outcome, code_of},
 };
 
 /// Lends `length` writable bytes, all zeros, for a payload of `kind` to `destination` (the paper's CreateMessage).
-/// `message_class` is one of `sinew_message_class`. Up to 64 messages may be in the making. Does not block.
+/// `message_class` is one of `sinew_message_class`. Does not block. The endpoint's thread; the bytes, any.
 ///
-/// The bytes lie in the shared memory from which they are read, if there is room and no other message of this endpoint in
-/// the making lies there already: then sending copies nothing. Until it is sent or discarded, sending anything else the same
-/// way returns `SINEW_ERROR_LENT`, and what `sinew_settle_message` says waits: so write it at once. Else they are ordinary
-/// memory. If the process is killed meanwhile, nobody notices more than its end.
+/// An endpoint lends one message at a time, and until that is sent or discarded nothing else goes out of it: to create
+/// another, to send, ask, reply, resolve, join and leave return `SINEW_ERROR_LENT`, whatever carries the messages; what
+/// `sinew_settle_message` says may wait. So write it at once. The bytes lie in the shared memory from which they are read, if there
+/// is room: then sending copies nothing. Else they are ordinary memory. If the process is killed meanwhile, nobody notices more
+/// than its end.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_create_message(
     endpoint: *mut Endpoint,
@@ -38,7 +40,7 @@ pub extern "C" fn sinew_create_message(
     })
 }
 
-/// Gives a message back that is not to be sent. `*message` is all zeros then. Does not block.
+/// Gives a message back that is not to be sent. `*message` is all zeros then. Does not block. The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_discard_message(endpoint: *mut Endpoint, message: Option<&mut Message>) -> Status {
     call(|| {
@@ -47,17 +49,37 @@ pub extern "C" fn sinew_discard_message(endpoint: *mut Endpoint, message: Option
     })
 }
 
-/// Sends a message (the paper's SendMessage). What becomes of it is not told. If it is this endpoint's it is gone when this
-/// returns, sent or not: `*message` is all zeros then. Blocks for the `patience_ns` of the options at most.
+/// Sends a message (the paper's SendMessage). What becomes of it then is not told. The message is gone when this returns, sent
+/// or not: see Messages at the top. Blocks while there is no room and nothing is taken, for the `patience_ns` of the options.
+/// The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_send_message(endpoint: *mut Endpoint, message: Option<&mut Message>) -> Status {
     call(|| {
         let message = present(message, "message")?;
-        with(endpoint, |session| session.send(message)).map(|()| Status::SinewOk)
+        with(endpoint, |session| session.send(message, None)).map(|()| Status::SinewOk)
     })
 }
 
-/// Lends, copies and sends in one call. `bytes` may be NULL if `length` is 0. Blocks as `sinew_send_message`.
+/// The same, and blocks for `within_ns` at most while there is no room; with 0 it does not block at all. For a control loop:
+/// `SINEW_ERROR_STALLED` says that there was no room in time and that nothing of the message was written. One that is longer than
+/// half the ring goes out in pieces; it is sent when its first piece is, and the rest follows with later calls. A node that has
+/// gone is not looked for here (`SINEW_ERROR_AWAY`): `sinew_receive_message`, or a send without a time, does. The endpoint's
+/// thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_send_message_within(
+    endpoint: *mut Endpoint,
+    message: Option<&mut Message>,
+    within_ns: u64,
+) -> Status {
+    call(|| {
+        let message = present(message, "message")?;
+        let within = Duration::from_nanos(within_ns);
+        with(endpoint, |session| session.send(message, Some(within))).map(|()| Status::SinewOk)
+    })
+}
+
+/// Lends, copies and sends in one call. `bytes` may be NULL if `length` is 0. Blocks as `sinew_send_message`. The endpoint's
+/// thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_send_bytes(
     endpoint: *mut Endpoint,
@@ -69,16 +91,28 @@ pub extern "C" fn sinew_send_bytes(
 ) -> Status {
     call(|| {
         with(endpoint, |session| {
-            // First, since it says whether so many bytes can be sent at all.
-            let mut message =
-                session.create(Tid::from_bits(destination), kind_of(kind)?, message_class, length)?;
-            // SAFETY: the header asks of the caller that so many bytes are there while the call lasts; they fit a message.
-            let Some(payload) = (unsafe { text::memory(bytes, length) }) else {
-                session.discard(&mut message)?;
-                return Err(Fault::argument("`bytes` is NULL, but has a length"));
-            };
-            session.fill(&message, payload);
-            session.send(&mut message)
+            let mut message = filled(session, destination, kind, message_class, (bytes, length))?;
+            session.send(&mut message, None)
+        })
+        .map(|()| Status::SinewOk)
+    })
+}
+
+/// The same, and blocks as `sinew_send_message_within`. The endpoint's thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_send_bytes_within(
+    endpoint: *mut Endpoint,
+    destination: TidBits,
+    kind: KindBits,
+    message_class: i32,
+    bytes: *const u8,
+    length: usize,
+    within_ns: u64,
+) -> Status {
+    call(|| {
+        with(endpoint, |session| {
+            let mut message = filled(session, destination, kind, message_class, (bytes, length))?;
+            session.send(&mut message, Some(Duration::from_nanos(within_ns)))
         })
         .map(|()| Status::SinewOk)
     })
@@ -86,7 +120,8 @@ pub extern "C" fn sinew_send_bytes(
 
 /// Sends a message and waits for what becomes of it; `SINEW_UNKNOWN` when nobody has said so after `within_ns`. The message
 /// expires where it waits when it is older. `*outcome` is set if this returns `SINEW_OK`. The message is gone as with
-/// `sinew_send_message`. What comes meanwhile waits to be received.
+/// `sinew_send_message`. What comes meanwhile waits to be received. Blocks for `within_ns` at most, room included. The endpoint's
+/// thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_send_message_confirmed(
     endpoint: *mut Endpoint,
@@ -96,16 +131,20 @@ pub extern "C" fn sinew_send_message_confirmed(
 ) -> Status {
     call(|| {
         let message = present(message, "message")?;
-        let outcome = present(outcome, "outcome")?;
         let within = Duration::from_nanos(within_ns);
-        let ended = with(endpoint, |session| session.send_confirmed(message, within))?;
-        Ok(write(outcome, code_of(ended)))
+        with(endpoint, |session| {
+            // First: after any error behind this it is gone.
+            let taken = session.take(message)?;
+            let outcome = present(outcome, "outcome")?;
+            Ok(write(outcome, code_of(session.send_confirmed(taken, within)?)))
+        })
     })
 }
 
-/// Sends a message as a request, in class Control, and waits for the reply, `within_ns` at most. `*reply` is set if this
-/// returns `SINEW_OK`; settle it when it has been read. If it returns `SINEW_ERROR_NOT_HANDLED` and `outcome` is not NULL,
-/// `*outcome` says what became of the request. The message is gone as with `sinew_send_message`.
+/// Sends a message as a request, in class Control, and waits for the reply, `within_ns` at most, room included. `*reply` is
+/// set if this returns `SINEW_OK`; settle it when it has been read. If it returns `SINEW_ERROR_NOT_HANDLED` and `outcome` is not
+/// NULL, `*outcome` says what became of the request. With 1024 received messages in hand there is no place for a reply:
+/// `SINEW_ERROR_TOO_MANY`, and nothing was sent. The message is gone as with `sinew_send_message`. The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_ask(
     endpoint: *mut Endpoint,
@@ -116,33 +155,76 @@ pub extern "C" fn sinew_ask(
 ) -> Status {
     call(|| {
         let message = present(message, "message")?;
-        let reply = present(reply, "reply")?;
         let within = Duration::from_nanos(within_ns);
-        match with(endpoint, |session| session.ask(message, within))? {
-            Ok(received) => Ok(write(reply, received)),
-            Err((ended, fault)) => {
-                if let Some(outcome) = outcome {
-                    outcome.write(code_of(ended));
+        with(endpoint, |session| {
+            let taken = session.take(message)?;
+            let reply = present(reply, "reply")?;
+            match session.ask(taken, within)? {
+                Ok(received) => Ok(write(reply, received)),
+                Err((ended, fault)) => {
+                    if let Some(outcome) = outcome {
+                        outcome.write(code_of(ended));
+                    }
+                    Err(fault)
                 }
-                Err(fault)
             }
-        }
+        })
     })
 }
 
 /// Sends a message as the reply to a request in hand; it goes to who asked, whatever destination it was created for. The
-/// request is still to be settled. The message is gone as with `sinew_send_message`.
+/// request is still to be settled. The message is gone as with `sinew_send_message`, as which it blocks. The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_reply(
     endpoint: *mut Endpoint,
     request: Option<&Received>,
     message: Option<&mut Message>,
 ) -> Status {
-    call(|| {
-        let request = present(request, "request")?;
-        let message = present(message, "message")?;
-        with(endpoint, |session| session.reply(request, message)).map(|()| Status::SinewOk)
+    call(|| reply(endpoint, request, message, None))
+}
+
+/// The same, and blocks as `sinew_send_message_within`. The endpoint's thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_reply_within(
+    endpoint: *mut Endpoint,
+    request: Option<&Received>,
+    message: Option<&mut Message>,
+    within_ns: u64,
+) -> Status {
+    call(|| reply(endpoint, request, message, Some(Duration::from_nanos(within_ns))))
+}
+
+fn reply(
+    endpoint: *mut Endpoint,
+    request: Option<&Received>,
+    message: Option<&mut Message>,
+    within: Option<Duration>,
+) -> Result<Status, Fault> {
+    let message = present(message, "message")?;
+    with(endpoint, |session| {
+        let taken = session.take(message)?;
+        session.reply(present(request, "request")?, taken, within)
     })
+    .map(|()| Status::SinewOk)
+}
+
+/// A message with these bytes of the caller's.
+fn filled(
+    session: &mut Session,
+    destination: TidBits,
+    kind: KindBits,
+    message_class: i32,
+    (bytes, length): (*const u8, usize),
+) -> Result<Message, Fault> {
+    // First, since it says whether so many bytes can be sent at all.
+    let mut message = session.create(Tid::from_bits(destination), kind_of(kind)?, message_class, length)?;
+    // SAFETY: the header asks of the caller that so many bytes are there while the call lasts; they fit a message.
+    let Some(payload) = (unsafe { text::memory(bytes, length) }) else {
+        session.discard(&mut message)?;
+        return Err(Fault::argument("`bytes` is NULL, but has a length"));
+    };
+    session.fill(&message, payload);
+    Ok(message)
 }
 
 /// The kinds of Sinew's own layers are not for applications.

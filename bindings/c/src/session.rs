@@ -10,8 +10,8 @@ use crate::{
     status::{Fault, Status},
 };
 
-/// Messages that are being made at most.
-const MADE_MAX: usize = 64;
+/// Messages that are being made at most: an endpoint lends one at a time.
+const MADE_MAX: usize = 1;
 /// Messages that were received and not settled at most.
 const RECEIVED_MAX: usize = 1024;
 
@@ -49,15 +49,13 @@ impl Session {
         let class = class_of(class).ok_or_else(|| {
             Fault::argument(format!("`message_class` is {class}: take one of sinew_message_class"))
         })?;
-        if self.made.is_full() {
-            return Err(too_many(format!("{MADE_MAX} messages are being made; send or discard one")));
-        }
         let mut buffer = self.endpoint.create_message(destination, kind, length)?;
         buffer.set_class(class);
         let bytes = buffer.as_mut_ptr();
         match self.made.take(buffer) {
             Ok(token) => Ok(Message { bytes, length, token }),
-            Err(_) => Err(Fault::plain(Status::SinewErrorTooMany)),
+            // Dropped; there is none in the hand that is not lent.
+            Err(_) => Err(Fault::plain(Status::SinewErrorLent)),
         }
     }
 
@@ -72,28 +70,26 @@ impl Session {
         self.take(message).map(drop)
     }
 
-    pub(crate) fn send(&mut self, message: &mut Message) -> Result<(), Fault> {
+    /// `within` `None`: for the endpoint's patience.
+    pub(crate) fn send(&mut self, message: &mut Message, within: Option<Duration>) -> Result<(), Fault> {
         let buffer = self.take(message)?;
-        Ok(self.endpoint.send_message(buffer)?)
+        Ok(match within {
+            None => self.endpoint.send_message(buffer),
+            Some(within) => self.endpoint.send_message_within(buffer, within),
+        }?)
     }
 
-    pub(crate) fn send_confirmed(
-        &mut self,
-        message: &mut Message,
-        within: Duration,
-    ) -> Result<Outcome, Fault> {
-        let buffer = self.take(message)?;
+    pub(crate) fn send_confirmed(&mut self, buffer: LentMessage, within: Duration) -> Result<Outcome, Fault> {
         Ok(self.endpoint.send_message_confirmed(buffer, within)?)
     }
 
     /// Asks; what became of the request, too, if it was not handled.
     pub(crate) fn ask(
         &mut self,
-        message: &mut Message,
+        buffer: LentMessage,
         within: Duration,
     ) -> Result<Result<Received, (Outcome, Fault)>, Fault> {
         self.check_hand()?;
-        let buffer = self.take(message)?;
         match self.endpoint.ask_message(buffer, within) {
             Ok(reply) => self.hand_out(reply).map(Ok),
             Err(ApiError::Ended(outcome)) => Ok(Err((outcome, ApiError::Ended(outcome).into()))),
@@ -101,14 +97,19 @@ impl Session {
         }
     }
 
-    /// Replies; on success the message is gone, before that nothing is.
-    pub(crate) fn reply(&mut self, request: &Received, message: &mut Message) -> Result<(), Fault> {
+    pub(crate) fn reply(
+        &mut self,
+        request: &Received,
+        buffer: LentMessage,
+        within: Option<Duration>,
+    ) -> Result<(), Fault> {
         let Some(request) = self.received.get_mut(request.token) else {
             return Err(no_such("the request"));
         };
-        let Some(buffer) = self.made.give(message.token) else { return Err(no_such("the reply")) };
-        *message = Message::GONE;
-        Ok(self.endpoint.reply_message(request, buffer)?)
+        Ok(match within {
+            None => self.endpoint.reply_message(request, buffer),
+            Some(within) => self.endpoint.reply_message_within(request, buffer, within),
+        }?)
     }
 
     pub(crate) fn receive(&mut self, within: Duration) -> Result<Option<Received>, Fault> {
@@ -136,7 +137,8 @@ impl Session {
         Ok(self.endpoint.unregister()?)
     }
 
-    fn take(&mut self, message: &mut Message) -> Result<LentMessage, Fault> {
+    /// Takes a message out of the program's hand: whatever comes now, it is gone.
+    pub(crate) fn take(&mut self, message: &mut Message) -> Result<LentMessage, Fault> {
         let Some(buffer) = self.made.give(message.token) else { return Err(no_such("the message")) };
         *message = Message::GONE;
         Ok(buffer)

@@ -17,7 +17,7 @@ pub enum Status {
     SinewOk = 0,
     /// No error, but nothing to hand out: no message came in time, or nobody has the name.
     SinewNothing = 1,
-    /// An argument is NULL, no UTF-8, too long, or none of its legal values. Nothing was done.
+    /// An argument is NULL, no UTF-8, too long, or none of its legal values. Nothing was sent or registered.
     SinewErrorInvalidArgument = -1,
     /// No node listens at the path, or this user may not connect. Nothing was done.
     SinewErrorNoNode = -2,
@@ -29,7 +29,8 @@ pub enum Status {
     SinewErrorNoAnswer = -5,
     /// The connection to the node has ended, and the registration with it: unregister, then register again.
     SinewErrorClosed = -6,
-    /// The node takes no bytes. The message was not sent; it may be made and sent again.
+    /// There was no room in time: the node or, on a direct link, the receiver is stopped or too slow. Nothing of the message
+    /// was written; it may be made and sent again.
     SinewErrorStalled = -7,
     /// The payload is longer than `sinew_payload_max`. Nothing was sent.
     SinewErrorTooLong = -8,
@@ -41,22 +42,23 @@ pub enum Status {
     SinewErrorNotAsked = -11,
     /// What came is not what its kind says.
     SinewErrorMalformed = -12,
-    /// This is no endpoint: it was unregistered, or never registered. Nothing was done.
+    /// This is no endpoint: it is NULL, or was unregistered, or never registered. Nothing was done.
     SinewErrorNoSuchEndpoint = -13,
     /// Another thread is in a call on this endpoint. Nothing was done.
     SinewErrorBusy = -14,
     /// This is no message of this endpoint: it was sent, discarded or settled already. Nothing was done.
     SinewErrorNoSuchMessage = -15,
-    /// Too many endpoints in this process, or too many messages in hand. Nothing was done.
+    /// Too many endpoints in this process, or too many messages in hand. Nothing was sent or registered.
     SinewErrorTooMany = -16,
     /// The endpoint belongs to the process that this one was forked from. Nothing was done.
     SinewErrorForked = -17,
     /// A fault of this library. The endpoint can only be unregistered; all others go on.
     SinewErrorPanic = -18,
-    /// Memory for a message is lent in place; send or discard that message first. Nothing was sent.
+    /// A message is lent and was neither sent nor discarded: nothing else goes out of the endpoint before. Nothing was sent.
     SinewErrorLent = -19,
     /// The connection to the node has ended, through no fault of this endpoint, which registers again by itself while it is
-    /// used: go on. Each send tries, and `sinew_receive_message`, which says this once, waits for it. The message was not sent.
+    /// used: go on. Each send without a time tries, and `sinew_receive_message`, which says this once, waits for it. The message
+    /// was not sent.
     SinewErrorAway = -20,
 }
 
@@ -106,7 +108,9 @@ impl Status {
             Self::SinewErrorWaiting => c"what is required was not ready at the deadline",
             Self::SinewErrorNoAnswer => c"the node did not answer in time; does it hang?",
             Self::SinewErrorClosed => c"the connection to the node has ended; register again",
-            Self::SinewErrorStalled => c"the node takes no bytes; the message was not sent",
+            Self::SinewErrorStalled => {
+                c"no room in time: the node, or the receiver on a direct link, is stopped or too slow; it was not sent"
+            },
             Self::SinewErrorTooLong => c"the payload is above the node's limit; raise `payload_max`",
             Self::SinewErrorNotHandled => c"it was not handled",
             Self::SinewErrorNoReply => c"no reply came in time",
@@ -115,7 +119,7 @@ impl Status {
                 c"what came is not what its kind says; do both sides use the same type?"
             }
             Self::SinewErrorNoSuchEndpoint => {
-                c"this is no endpoint; was it unregistered, or never registered?"
+                c"this is no endpoint; is it NULL, was it unregistered, or never registered?"
             }
             Self::SinewErrorBusy => {
                 c"another thread is in a call on this endpoint; register one endpoint for each thread"
@@ -128,7 +132,7 @@ impl Status {
                 c"this endpoint belongs to the process that this one was forked from; register an own one"
             }
             Self::SinewErrorLent => {
-                c"memory for a message is lent in place; send or discard that message first"
+                c"a message of this endpoint is lent; send or discard it first"
             }
             Self::SinewErrorAway => {
                 c"the connection to the node has ended; the endpoint registers again by itself while it is used"

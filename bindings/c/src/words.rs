@@ -52,7 +52,7 @@ pub extern "C" fn sinew_status_text(status: i32) -> *const c_char {
 }
 
 /// A sentence about the last error of the calling thread: what was wrong this time, and what to do. Never NULL; empty if
-/// there was no error. It stays until the thread's next error.
+/// there was no error. It stays until the thread's next error. Any thread, each of which has its own.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_last_error() -> *const c_char {
     last_sentence()

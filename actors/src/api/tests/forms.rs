@@ -21,6 +21,8 @@ use crate::{
 pub(super) struct Under {
     pub(super) transport: Transport,
     pub(super) form: Form,
+    /// Whether what goes to other endpoints may go there directly.
+    pub(super) direct: bool,
 }
 
 /// Who waits.
@@ -89,6 +91,10 @@ macro_rules! look {
 impl Client {
     pub(super) fn tid(&self) -> Tid {
         look!(self, endpoint => endpoint.tid())
+    }
+
+    pub(super) fn registrations(&self) -> u64 {
+        look!(self, endpoint => endpoint.registrations())
     }
 
     pub(super) fn transport(&self) -> Transport {

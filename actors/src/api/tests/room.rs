@@ -3,7 +3,7 @@
 use std::{thread, time::Duration};
 
 use super::{
-    ApiError, Kind, Registration, TestNode, Transport, WATCHDOG,
+    ApiError, Kind, TestNode, Transport, WATCHDOG,
     forms::{self, Client, Under},
     played_node::PlayedNode,
 };
@@ -26,7 +26,7 @@ on_every_transport! {
 }
 
 fn register(under: Under, node: &PlayedNode, patience: Duration) -> Client {
-    let registration = Registration::new().transport(under.transport).patience(patience);
+    let registration = super::on(under).patience(patience);
     forms::Api::at(under, &node.path()).register(registration).unwrap()
 }
 
@@ -202,7 +202,7 @@ fn patience_that_was_lost_once_is_not_lost_again_until_the_node_takes_something(
 
 fn values_and_replies_may_have_a_time_too(under: Under) {
     let node = TestNode::start();
-    let register = || super::register(under, &node, Registration::new().transport(under.transport));
+    let register = || super::register(under, &node, super::on(under));
     let (mut asking, mut replying) = (register(), register());
     let to = replying.tid();
     asking.send_within(to, &super::TORQUE, NO_TIME).unwrap();

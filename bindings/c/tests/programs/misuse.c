@@ -45,29 +45,108 @@ static void null_arguments(sinew_endpoint *endpoint)
     sinew_message message = new_message(endpoint, 1, 1);
     sinew_received received;
     sinew_tid tid;
+    sinew_endpoint *no_endpoint = NULL;
     sinew_text no_text = { NULL, 3 };
     EXPECT_WORDS(sinew_register_transport_address(node, NULL, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`endpoint` is NULL");
     EXPECT_WORDS(sinew_register_transport_address(no_text, NULL, &endpoint), SINEW_ERROR_INVALID_ARGUMENT, "`socket`");
-    EXPECT_WORDS(sinew_unregister(NULL), SINEW_ERROR_INVALID_ARGUMENT, "`endpoint` is NULL");
+    EXPECT_WORDS(sinew_unregister(NULL), SINEW_ERROR_NO_SUCH_ENDPOINT, "is it NULL");
+    EXPECT_WORDS(sinew_unregister(&no_endpoint), SINEW_ERROR_NO_SUCH_ENDPOINT, "is it NULL");
     EXPECT_WORDS(sinew_create_message(endpoint, 1, kind, 0, 1, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`message` is NULL");
-    EXPECT_WORDS(sinew_create_message(NULL, 1, kind, 0, 1, &message), SINEW_ERROR_INVALID_ARGUMENT, "`endpoint` is NULL");
+    EXPECT_WORDS(sinew_create_message(NULL, 1, kind, 0, 1, &message), SINEW_ERROR_NO_SUCH_ENDPOINT, "is it NULL");
     EXPECT_WORDS(sinew_send_message(endpoint, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`message` is NULL");
-    EXPECT_WORDS(sinew_send_message_confirmed(endpoint, &message, 1, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`outcome`");
-    EXPECT_WORDS(sinew_ask(endpoint, &message, 1, NULL, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`reply` is NULL");
-    EXPECT_WORDS(sinew_reply(endpoint, NULL, &message), SINEW_ERROR_INVALID_ARGUMENT, "`request` is NULL");
+    EXPECT_WORDS(sinew_send_message_within(endpoint, NULL, 0), SINEW_ERROR_INVALID_ARGUMENT, "`message` is NULL");
+    EXPECT(sinew_discard_message(endpoint, &message), SINEW_OK);
+    EXPECT_WORDS(sinew_send_bytes_within(endpoint, 1, kind, 0, NULL, 5, 0), SINEW_ERROR_INVALID_ARGUMENT, "`bytes` is NULL");
     EXPECT_WORDS(sinew_send_bytes(endpoint, 1, kind, 0, NULL, 5), SINEW_ERROR_INVALID_ARGUMENT, "`bytes` is NULL");
     EXPECT_WORDS(sinew_receive_message(endpoint, 0, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`received` is NULL");
-    EXPECT_WORDS(sinew_receive_message(NULL, 0, &received), SINEW_ERROR_INVALID_ARGUMENT, "`endpoint` is NULL");
+    EXPECT_WORDS(sinew_receive_message(NULL, 0, &received), SINEW_ERROR_NO_SUCH_ENDPOINT, "is it NULL");
     EXPECT_WORDS(sinew_next_untaken(endpoint, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`untaken` is NULL");
     EXPECT_WORDS(sinew_settle_message(endpoint, NULL, 0), SINEW_ERROR_INVALID_ARGUMENT, "`received` is NULL");
     EXPECT_WORDS(sinew_resolve(endpoint, no_text, 1, &tid), SINEW_ERROR_INVALID_ARGUMENT, "`name` is NULL");
     EXPECT_WORDS(sinew_resolve(endpoint, node, 1, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`tid` is NULL");
-    EXPECT_WORDS(sinew_join_group(NULL, node), SINEW_ERROR_INVALID_ARGUMENT, "`endpoint` is NULL");
+    EXPECT_WORDS(sinew_join_group(NULL, node), SINEW_ERROR_NO_SUCH_ENDPOINT, "is it NULL");
     EXPECT_WORDS(sinew_tid_text(1, NULL, 9), SINEW_ERROR_INVALID_ARGUMENT, "`text` is NULL");
     EXPECT(sinew_endpoint_tid(NULL) == 0, 1);
     EXPECT(sinew_payload_max(NULL) == 0, 1);
     EXPECT(sinew_node_name(NULL) == NULL, 1);
+}
+
+/* Each of the functions that send, with whatever is wrong this time. */
+static sinew_status send_anyhow(int how, sinew_endpoint *endpoint, const sinew_received *request, sinew_message *message)
+{
+    sinew_received reply;
+    sinew_outcome outcome;
+    switch (how) {
+    case 0: return sinew_send_message(endpoint, message);
+    case 1: return sinew_send_message_within(endpoint, message, 0);
+    case 2: return sinew_send_message_confirmed(endpoint, message, SECOND, &outcome);
+    case 3: return sinew_ask(endpoint, message, SECOND, &reply, &outcome);
+    case 4: return sinew_reply(endpoint, request, message);
+    default: return sinew_reply_within(endpoint, request, message, 0);
+    }
+}
+
+/* A message that was handed in is gone, whatever is said: nothing is kept, and the next one can be made. */
+static void gone(sinew_endpoint *endpoint, const sinew_message *message)
+{
+    sinew_message next;
+    EXPECT(message->bytes == NULL && message->length == 0 && message->token == 0, 1);
+    next = new_message(endpoint, 1, 1);
+    EXPECT(sinew_discard_message(endpoint, &next), SINEW_OK);
+}
+
+static void whose_it_is_after_an_error(sinew_endpoint *endpoint)
+{
+    static sinew_received in_hand[1024];
+    sinew_tid own = sinew_endpoint_tid(endpoint);
+    sinew_received reply, none;
+    sinew_outcome outcome;
+    sinew_message message, other;
+    memset(&none, 0, sizeof none);
+    message = new_message(endpoint, own, 100);
+    EXPECT_WORDS(sinew_send_message_confirmed(endpoint, &message, 1, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`outcome`");
+    gone(endpoint, &message);
+    message = new_message(endpoint, own, 100);
+    EXPECT_WORDS(sinew_ask(endpoint, &message, 1, NULL, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`reply` is NULL");
+    gone(endpoint, &message);
+    for (int how = 4; how < 6; how++) {
+        message = new_message(endpoint, own, 100);
+        EXPECT_WORDS(send_anyhow(how, endpoint, NULL, &message), SINEW_ERROR_INVALID_ARGUMENT, "`request` is NULL");
+        gone(endpoint, &message);
+        message = new_message(endpoint, own, 100);
+        EXPECT_WORDS(send_anyhow(how, endpoint, &none, &message), SINEW_ERROR_NO_SUCH_MESSAGE, "the request");
+        gone(endpoint, &message);
+    }
+    /* It is gone already. */
+    for (int how = 0; how < 6; how++) {
+        memset(&other, 0, sizeof other);
+        EXPECT_WORDS(send_anyhow(how, endpoint, &none, &other), SINEW_ERROR_NO_SUCH_MESSAGE, "the message");
+    }
+    /* It is not looked at. */
+    message = other = new_message(endpoint, own, 100);
+    for (int how = 0; how < 6; how++) {
+        EXPECT(send_anyhow(how, NULL, &none, &message), SINEW_ERROR_NO_SUCH_ENDPOINT);
+        EXPECT(memcmp(&message, &other, sizeof message), 0);
+    }
     EXPECT(sinew_discard_message(endpoint, &message), SINEW_OK);
+    /* Nobody answers. */
+    message = new_message(endpoint, own, 100);
+    EXPECT(sinew_send_message_confirmed(endpoint, &message, 1, &outcome), SINEW_OK);
+    EXPECT(outcome == SINEW_UNKNOWN || outcome == SINEW_EXPIRED, 1);
+    gone(endpoint, &message);
+    while (sinew_receive_message(endpoint, SECOND / 100, &reply) == SINEW_OK)
+        EXPECT(sinew_settle_message(endpoint, &reply, SINEW_DELIVERED), SINEW_OK);
+    /* The hand is full. */
+    for (int held = 0; held < 1024; held++) {
+        EXPECT(sinew_send_bytes(endpoint, own, kind, SINEW_CONTROL, NULL, 0), SINEW_OK);
+        EXPECT(sinew_receive_message(endpoint, 10 * SECOND, &in_hand[held]), SINEW_OK);
+    }
+    EXPECT_WORDS(sinew_receive_message(endpoint, 0, &reply), SINEW_ERROR_TOO_MANY, "settle");
+    message = new_message(endpoint, own, 100);
+    EXPECT_WORDS(sinew_ask(endpoint, &message, SECOND, &reply, &outcome), SINEW_ERROR_TOO_MANY, "settle");
+    gone(endpoint, &message);
+    for (int held = 0; held < 1024; held++)
+        EXPECT(sinew_settle_message(endpoint, &in_hand[held], SINEW_DELIVERED), SINEW_OK);
 }
 
 static void wrong_values(sinew_endpoint *endpoint)
@@ -95,6 +174,10 @@ static void wrong_values(sinew_endpoint *endpoint)
     EXPECT_WORDS(sinew_create_message(endpoint, 1, 7, 0, 1, &message), SINEW_ERROR_INVALID_ARGUMENT, "sinew_kind_named");
     EXPECT_WORDS(sinew_create_message(endpoint, 1, kind, 0, sinew_payload_max(endpoint) + 1, &message),
                  SINEW_ERROR_TOO_LONG, "65536");
+    memset(&options, 0, sizeof options);
+    options.size = sizeof options;
+    options.reserved = 1;
+    EXPECT_WORDS(sinew_register_transport_address(node, &options, &other), SINEW_ERROR_INVALID_ARGUMENT, "`options.reserved` is 1");
     EXPECT_WORDS(sinew_tid_parse(SINEW_TEXT("knee"), &tid), SINEW_ERROR_INVALID_ARGUMENT, "node/application");
     EXPECT_WORDS(sinew_tid_text(1, text, 3), SINEW_ERROR_INVALID_ARGUMENT, "`capacity`");
     EXPECT(sinew_tid_parse(SINEW_TEXT("10.0.0.7/1001"), &tid), SINEW_OK);
@@ -129,37 +212,48 @@ static void used_twice(sinew_endpoint *endpoint)
     EXPECT(sinew_unregister(&other), SINEW_OK);
 }
 
-/* What lies in the ring goes first, or is given back first: a second one cannot overtake it. */
-static void two_in_the_making(sinew_endpoint *endpoint)
+/* One message is lent at a time, on every way, and nothing else goes out before it. */
+static void one_at_a_time(const char *way, uint32_t links)
 {
-    sinew_tid to = sinew_endpoint_tid(endpoint);
-    sinew_message first = new_message(endpoint, to, 5), second = new_message(endpoint, to, 6);
+    sinew_options options = { .size = sizeof options, .links = links };
+    sinew_endpoint *endpoint = NULL;
     sinew_received received;
-    memcpy(first.bytes, "first", 5);
-    EXPECT_WORDS(sinew_send_message(endpoint, &second), SINEW_ERROR_LENT, "send that message or drop it first");
-    EXPECT(second.bytes == NULL, 1);
-    EXPECT(sinew_send_message(endpoint, &first), SINEW_OK);
-    first = new_message(endpoint, to, 50000);
-    EXPECT_WORDS(sinew_send_bytes(endpoint, to, kind, SINEW_CONTROL, (const uint8_t *)"lent", 4), SINEW_ERROR_LENT, "memory for a message");
-    EXPECT(sinew_discard_message(endpoint, &first), SINEW_OK);
-    EXPECT(sinew_send_bytes(endpoint, to, kind, SINEW_CONTROL, (const uint8_t *)"second", 6), SINEW_OK);
-    EXPECT(sinew_receive_message(endpoint, 10 * SECOND, &received), SINEW_OK);
-    EXPECT(received.length == 5 && memcmp(received.bytes, "first", 5) == 0, 1);
-    EXPECT(sinew_settle_message(endpoint, &received, SINEW_DELIVERED), SINEW_OK);
-    EXPECT(sinew_receive_message(endpoint, 10 * SECOND, &received), SINEW_OK);
-    EXPECT(received.length == 6 && memcmp(received.bytes, "second", 6) == 0, 1);
-    EXPECT(sinew_settle_message(endpoint, &received, SINEW_DELIVERED), SINEW_OK);
+    sinew_message first, second;
+    sinew_tid to, tid;
+    EXPECT_WORDS(sinew_register_transport_address(node, &options, &endpoint), SINEW_OK, "");
+    to = sinew_endpoint_tid(endpoint);
+    for (size_t length = 5; length <= 50000; length += 49995) {
+        first = new_message(endpoint, to, length);
+        memcpy(first.bytes, "first", 5);
+        EXPECT_WORDS(sinew_create_message(endpoint, to, kind, 0, 1, &second), SINEW_ERROR_LENT, "send that message or drop it first");
+        EXPECT_WORDS(sinew_send_bytes(endpoint, to, kind, SINEW_CONTROL, NULL, 0), SINEW_ERROR_LENT, "lent");
+        EXPECT_WORDS(sinew_send_bytes_within(endpoint, to, kind, SINEW_CONTROL, NULL, 0, 0), SINEW_ERROR_LENT, "lent");
+        EXPECT(sinew_resolve(endpoint, SINEW_TEXT("nobody"), SECOND, &tid), SINEW_ERROR_LENT);
+        EXPECT(sinew_join_group(endpoint, SINEW_TEXT("drives")), SINEW_ERROR_LENT);
+        EXPECT(sinew_leave_group(endpoint, SINEW_TEXT("drives")), SINEW_ERROR_LENT);
+        EXPECT(sinew_receive_message(endpoint, 0, &received), SINEW_NOTHING);
+        EXPECT(sinew_send_message(endpoint, &first), SINEW_OK);
+        EXPECT(sinew_receive_message(endpoint, 10 * SECOND, &received), SINEW_OK);
+        EXPECT(received.length == length && memcmp(received.bytes, "first", 5) == 0, 1);
+        EXPECT(sinew_settle_message(endpoint, &received, SINEW_DELIVERED), SINEW_OK);
+        first = new_message(endpoint, to, length);
+        EXPECT(sinew_discard_message(endpoint, &first), SINEW_OK);
+        EXPECT(sinew_send_bytes_within(endpoint, to, kind, SINEW_CONTROL, (const uint8_t *)"second", 6, SECOND), SINEW_OK);
+        EXPECT(sinew_receive_message(endpoint, 10 * SECOND, &received), SINEW_OK);
+        EXPECT(received.length == 6 && memcmp(received.bytes, "second", 6) == 0, 1);
+        EXPECT(sinew_settle_message(endpoint, &received, SINEW_DELIVERED), SINEW_OK);
+    }
+    /* What is not sent goes with the endpoint. */
+    (void)new_message(endpoint, to, 100);
+    EXPECT(sinew_unregister(&endpoint), SINEW_OK);
+    printf("one at a time by %s\n", way);
 }
 
-/* So many may be in the making, and what is not sent goes with the endpoint. */
-static void too_many(void)
+static void unregistered(void)
 {
     sinew_endpoint *endpoint = new_endpoint(), *copy = endpoint;
     sinew_message message;
     sinew_endpoint *garbage = (sinew_endpoint *)(void *)&message;
-    for (int made = 0; made < 64; made++)
-        (void)new_message(endpoint, 1, 100);
-    EXPECT_WORDS(sinew_create_message(endpoint, 1, kind, 0, 1, &message), SINEW_ERROR_TOO_MANY, "64 messages");
     EXPECT(sinew_unregister(&endpoint), SINEW_OK);
     EXPECT(endpoint == NULL, 1);
     EXPECT_WORDS(sinew_unregister(&copy), SINEW_ERROR_NO_SUCH_ENDPOINT, "unregistered");
@@ -234,8 +328,11 @@ int main(int argc, char **argv)
     null_arguments(endpoint);
     wrong_values(endpoint);
     used_twice(endpoint);
-    two_in_the_making(endpoint);
-    too_many();
+    whose_it_is_after_an_error(endpoint);
+    one_at_a_time("rings", 0);
+    one_at_a_time("direct links", SINEW_DIRECT);
+    one_at_a_time("the socket", SINEW_SOCKET_ONLY);
+    unregistered();
     two_threads(endpoint);
     forked(endpoint);
     EXPECT(sinew_unregister(&endpoint), SINEW_OK);

@@ -85,14 +85,28 @@ static void scopes_settle(sinew::endpoint &sender, sinew::endpoint receiver)
     receiving.join();
 }
 
-// More than may be in the making at once: those that are not sent are given back.
+// One is lent at a time: it is given back at the end of its scope.
 static void unsent_messages_are_given_back(sinew::endpoint &endpoint)
 {
     for (int made = 0; made < 1000; made++) {
-        auto message = endpoint.create(endpoint.address(), what, 8, SINEW_BULK);
-        message = endpoint.create(endpoint.address(), what, 9, SINEW_BULK);
+        auto message = endpoint.create(endpoint.address(), what, 9, SINEW_BULK);
         EXPECT(message.end() - message.begin() == 9);
+        try {
+            auto another = endpoint.create(endpoint.address(), what, 8);
+            EXPECT(false);
+        } catch (const sinew::error &error) {
+            EXPECT(error.status() == SINEW_ERROR_LENT);
+        }
     }
+}
+
+// No room in time is of a control loop's ordinary course: it throws nothing.
+static void sends_may_have_a_time(sinew::endpoint &endpoint)
+{
+    EXPECT(endpoint.send_within(endpoint.address(), what, pair{5, 6}, 0ns));
+    EXPECT(endpoint.receive(20s)->as<pair>()->a == 5);
+    EXPECT(endpoint.send_within(endpoint.create(endpoint.address(), what, 3), 1ms));
+    EXPECT(endpoint.receive(20s)->size() == 3);
 }
 
 static void groups_and_names(const char *socket)
@@ -121,6 +135,7 @@ int main(int argc, char **argv)
     untaken_messages_are_counted(endpoint);
     scopes_settle(endpoint, sinew::endpoint(socket));
     unsent_messages_are_given_back(endpoint);
+    sends_may_have_a_time(endpoint);
     groups_and_names(socket);
     std::puts("all well");
 }

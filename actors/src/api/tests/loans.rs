@@ -1,0 +1,169 @@
+//! Messages that are lent: one at a time, and what that means for all else, the same on every way.
+
+use std::{thread, time::Duration};
+
+use super::{
+    ApiError, Kind, Outcome, Registration, TORQUE, TestNode, Tid, Torque, Transport, WATCHDOG,
+    forms::{self, Client, Under},
+    on, register,
+};
+
+const RAW: Kind = Kind::named("test.raw");
+/// In the ring, if there is one; and in ordinary memory in any case.
+const LENGTHS: [usize; 2] = [100, 200_000];
+
+on_every_transport! {
+    while_a_message_is_lent_nothing_else_goes_out_and_the_refusal_says_what_to_do
+    a_message_that_is_dropped_was_never_there
+    another_endpoint_may_send_what_this_one_has_lent_if_it_has_lent_nothing_itself
+    who_unregisters_while_a_message_is_lent_is_told_and_gives_the_address_back
+    what_was_lent_before_the_node_was_restarted_goes_to_its_next_life
+    what_was_lent_before_a_link_was_made_goes_out_on_it
+}
+
+fn lent<T>(refused: Result<T, ApiError>) {
+    match refused {
+        Err(error @ ApiError::Lent) => {
+            assert!(error.to_string().contains("send that message or drop it first"), "{error}");
+        }
+        Err(other) => panic!("{other}"),
+        Ok(_) => panic!("it was not refused"),
+    }
+}
+
+fn while_a_message_is_lent_nothing_else_goes_out_and_the_refusal_says_what_to_do(under: Under) {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let (mut client, other) = (register(under, &node, on(under)), register(under, &node, on(under)));
+    for length in LENGTHS {
+        // On the same way, and on another one.
+        for to in [app.tid, other.tid()] {
+            let outcome = node.send_confirmed(app.tid, client.tid(), &TORQUE);
+            let received = client.receive(WATCHDOG).unwrap().expect("a message");
+            let mut message = client.create_message(app.tid, RAW, length).unwrap();
+            message.fill(7);
+            lent(client.create_message(to, RAW, 1));
+            lent(client.send(to, &TORQUE));
+            lent(client.send_within(to, &TORQUE, Duration::ZERO));
+            lent(client.send_confirmed(to, &TORQUE, WATCHDOG));
+            lent(client.ask::<_, Torque>(to, &TORQUE, WATCHDOG));
+            lent(client.resolve("anybody", WATCHDOG));
+            lent(client.join("drives"));
+            lent(client.leave("drives"));
+            assert!(client.receive(Duration::ZERO).unwrap().is_none(), "it is looked, and nothing is there");
+            client.send_message(message).unwrap();
+            assert_eq!(app.next().payload[..], vec![7; length]);
+            drop(received);
+            assert_eq!(outcome.recv_timeout(WATCHDOG), Ok(Outcome::Delivered));
+            assert_eq!(client.resolve("anybody", WATCHDOG).unwrap(), None);
+        }
+    }
+}
+
+fn a_message_that_is_dropped_was_never_there(under: Under) {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let mut client = register(under, &node, on(under));
+    for length in LENGTHS {
+        let mut message = client.create_message(app.tid, RAW, length).unwrap();
+        message.fill(7);
+        drop(message);
+        client.send(app.tid, &TORQUE).unwrap();
+        assert_eq!(app.next().decode::<Torque>().unwrap(), TORQUE);
+    }
+}
+
+fn another_endpoint_may_send_what_this_one_has_lent_if_it_has_lent_nothing_itself(under: Under) {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let (mut one, mut other) = (register(under, &node, on(under)), register(under, &node, on(under)));
+    for length in LENGTHS {
+        let message = one.create_message(app.tid, RAW, length).unwrap();
+        let its_own = other.create_message(app.tid, RAW, length).unwrap();
+        lent(other.send_message(message));
+        // That one is gone, and its memory given back.
+        one.send(app.tid, &TORQUE).unwrap();
+        assert_eq!(app.next().header.source, one.tid());
+        one.send_message(its_own).unwrap();
+        let came = app.next();
+        assert_eq!((came.header.source, came.payload.len()), (one.tid(), length));
+        other.send(app.tid, &TORQUE).unwrap();
+        assert_eq!(app.next().header.source, other.tid());
+    }
+}
+
+fn who_unregisters_while_a_message_is_lent_is_told_and_gives_the_address_back(under: Under) {
+    let node = TestNode::start();
+    for length in LENGTHS {
+        let mut client = register(under, &node, on(under).name("knee"));
+        let mut message = client.create_message(Tid::NONE, RAW, length).unwrap();
+        lent(client.unregister());
+        message.fill(7);
+        let next = register_when_free(under, &node, on(under).name("knee"));
+        drop((message, next));
+    }
+}
+
+/// A name is free when the node has seen the connection's end.
+fn register_when_free(under: Under, node: &TestNode, registration: Registration) -> Client {
+    let api = forms::Api::connect(under, node);
+    let deadline = super::Time::now() + WATCHDOG;
+    loop {
+        match api.register(registration.clone()) {
+            Ok(client) => return client,
+            Err(ApiError::Refused(why)) => {
+                assert!(super::Time::now() < deadline, "waited for the name: {why}")
+            }
+            Err(other) => panic!("{other}"),
+        }
+    }
+}
+
+fn what_was_lent_before_the_node_was_restarted_goes_to_its_next_life(under: Under) {
+    let mut node = TestNode::start();
+    for length in LENGTHS {
+        // given: a message that was lent by an endpoint whose node has another life since
+        let mut client = register(under, &node, on(under));
+        let to = node.local(1).tid;
+        let mut message = client.create_message(to, RAW, length).unwrap();
+        message.fill(7);
+        node.restart();
+        let app = node.local(1);
+        let deadline = super::Time::now() + WATCHDOG;
+        while client.registrations() == 1 {
+            assert!(super::Time::now() < deadline, "waited for the endpoint to come back");
+            if let Err(error) = client.receive(Duration::from_millis(10)) {
+                assert!(matches!(error, ApiError::Away(_)), "{error}");
+            }
+        }
+        // when: other things are to go out, they are still refused
+        lent(client.send(to, &TORQUE));
+        lent(client.join("drives"));
+        // then: it goes to the node's next life
+        client.send_message(message).unwrap();
+        let came = app.next();
+        assert_eq!((came.header.source, &came.payload[..]), (client.tid(), &vec![7; length][..]));
+        client.join("drives").unwrap();
+    }
+}
+
+fn what_was_lent_before_a_link_was_made_goes_out_on_it(under: Under) {
+    let node = TestNode::start();
+    let (mut one, mut other) = (register(under, &node, on(under)), register(under, &node, on(under)));
+    let (to, from) = (other.tid(), one.tid());
+    for length in LENGTHS {
+        let mut message = one.create_message(to, RAW, length).unwrap();
+        message.fill(7);
+        // Whatever asks for a link meanwhile.
+        other.send(from, &TORQUE).unwrap();
+        drop(one.receive(WATCHDOG).unwrap().expect("a message"));
+        let other_receives = thread::spawn(move || {
+            let received = other.receive(WATCHDOG).unwrap().expect("the message");
+            assert_eq!((received.source(), received.bytes()), (from, &vec![7; length][..]));
+            drop(received);
+            other
+        });
+        one.send_message(message).unwrap();
+        other = other_receives.join().unwrap();
+    }
+}
