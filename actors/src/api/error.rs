@@ -40,7 +40,7 @@ pub enum ApiError {
     #[error("the connection to the node has ended: {0}; the endpoint registers again by itself")]
     Away(String),
     /// There was no room for so long: the patience of the endpoint, or the time that the call was given. Or another send's
-    /// patience was over before, and nothing was taken since. Nothing of this message was written; it may be sent again.
+    /// patience was over before, and nothing was taken since. Nothing of this message is received; it may be sent again.
     #[error(
         "no room for the message for {0:?}: the node, or the receiver on a direct link, is stopped or too slow; it was not sent"
     )]

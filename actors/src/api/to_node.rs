@@ -1,7 +1,8 @@
-//! Frames to the node, one after the other: what is begun goes on until it is whole, over as many calls as that takes.
+//! Frames to the node, one after the other; one piece of code for threads and tasks.
 //!
-//! One piece of code for threads and tasks. Either nothing of a message was written, and its caller is told so, or it is
-//! sent, and what does not go out now goes out with later calls: a node that takes little never costs the connection.
+//! A message is sent when it is whole in the ring; one that is not when its time is over is taken back. From a socket nothing can be
+//! taken back: there it is sent when it has begun, and the rest goes out with later calls. A node that takes little never costs the
+//! connection.
 
 use sinew_runtime::time::Time;
 
@@ -9,7 +10,7 @@ use super::{
     ApiError, Endpoint,
     form::Form,
     lent::Draft,
-    link::Progress,
+    link::{Progress, ring::Rest},
     patience::{Limit, Waiting},
 };
 
@@ -22,7 +23,7 @@ impl Endpoint {
     /// Writes a message to the node; waits for room as long as `limit` allows.
     ///
     /// # Errors
-    /// Nothing of it was written. [`ApiError::Closed`]: or the connection ended before it was whole.
+    /// Nothing of it is received. [`ApiError::Closed`]: or the connection ended before it was whole.
     pub(super) async fn write(&mut self, draft: Draft, limit: Limit) -> Result<(), ApiError> {
         // Who takes nothing costs a patience once, and not with each message.
         let has_stalled = self.stalled.is_some_and(|taken| taken == self.taken());
@@ -49,12 +50,16 @@ impl Endpoint {
         while !self.go_on() {
             match self.await_room(0, waiting).await {
                 Ok(()) => {}
-                // It has begun: the rest goes out with later calls.
-                Err(ApiError::Stalled(_)) => break,
+                Err(error @ ApiError::Stalled(_)) => return self.withdraw().map_or(Ok(()), |()| Err(error)),
                 Err(error) => return Err(error),
             }
         }
         Ok(())
+    }
+
+    /// Takes back what was begun; `None` if it lies with a socket, where the rest goes out with later calls.
+    fn withdraw(&mut self) -> Option<()> {
+        self.rest.as_mut().map(Rest::withdraw)
     }
 
     /// Writes on what was begun, as far as there is room now; whether nothing is left of it.

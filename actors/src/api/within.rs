@@ -1,9 +1,10 @@
 //! Sends that wait for room no longer than their caller says: for a control loop, which has better to do.
 //!
 //! Each is its namesake without `_within`, but for the wait. [`Duration::ZERO`]: it does not wait at all, and makes no system
-//! call that could. Where there is no room in time that is [`ApiError::Stalled`], and nothing of the message was written. One that is
-//! longer than half the ring, or than the socket's buffer, goes out in pieces: it is sent when its first piece is, and the rest
-//! follows with later calls, ahead of all that is sent then.
+//! call that could. Where there is no room in time that is [`ApiError::Stalled`], and nothing of the message is received. One that is
+//! longer than half the ring goes out in pieces; if the last one finds no room in time the others are taken back. So who has no
+//! time sends nothing that is longer than the ring. Only from a plain socket nothing can be taken back: there a message is sent
+//! when its first byte is, and the rest follows with later calls, ahead of all that is sent then.
 //!
 //! These do not look for a node that has gone, since to register takes time: they say [`ApiError::Away`], and
 //! [`Endpoint::receive`], or a send without a time, brings the endpoint back.

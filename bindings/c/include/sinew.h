@@ -118,7 +118,7 @@ enum sinew_status
     SINEW_ERROR_CLOSED = -6,
     /**
      * There was no room in time: the node or, on a direct link, the receiver is stopped or too slow. Nothing of the message
-     * was written; it may be made and sent again.
+     * is received; it may be made and sent again.
      */
     SINEW_ERROR_STALLED = -7,
     /**
@@ -610,10 +610,10 @@ sinew_status sinew_send_message(struct sinew_endpoint *endpoint,
 
 /**
  * The same, and blocks for `within_ns` at most while there is no room; with 0 it does not block at all. For a control loop:
- * `SINEW_ERROR_STALLED` says that there was no room in time and that nothing of the message was written. One that is longer than
- * half the ring goes out in pieces; it is sent when its first piece is, and the rest follows with later calls. A node that has
- * gone is not looked for here (`SINEW_ERROR_AWAY`): `sinew_receive_message`, or a send without a time, does. The endpoint's
- * thread.
+ * `SINEW_ERROR_STALLED` says that there was no room in time and that nothing of the message is received. One that is longer than
+ * the ring needs a time in which its receiver takes some of it (with `SINEW_SOCKET_ONLY` it is sent with its first byte, and the
+ * rest follows with later calls). A node that has gone is not looked for here (`SINEW_ERROR_AWAY`): `sinew_receive_message`,
+ * or a send without a time, does. The endpoint's thread.
  */
 sinew_status sinew_send_message_within(struct sinew_endpoint *endpoint,
                                        struct sinew_message *message,

@@ -61,10 +61,10 @@ pub extern "C" fn sinew_send_message(endpoint: *mut Endpoint, message: Option<&m
 }
 
 /// The same, and blocks for `within_ns` at most while there is no room; with 0 it does not block at all. For a control loop:
-/// `SINEW_ERROR_STALLED` says that there was no room in time and that nothing of the message was written. One that is longer than
-/// half the ring goes out in pieces; it is sent when its first piece is, and the rest follows with later calls. A node that has
-/// gone is not looked for here (`SINEW_ERROR_AWAY`): `sinew_receive_message`, or a send without a time, does. The endpoint's
-/// thread.
+/// `SINEW_ERROR_STALLED` says that there was no room in time and that nothing of the message is received. One that is longer than
+/// the ring needs a time in which its receiver takes some of it (with `SINEW_SOCKET_ONLY` it is sent with its first byte, and the
+/// rest follows with later calls). A node that has gone is not looked for here (`SINEW_ERROR_AWAY`): `sinew_receive_message`,
+/// or a send without a time, does. The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_send_message_within(
     endpoint: *mut Endpoint,

@@ -30,7 +30,7 @@ pub enum Status {
     /// The connection to the node has ended, and the registration with it: unregister, then register again.
     SinewErrorClosed = -6,
     /// There was no room in time: the node or, on a direct link, the receiver is stopped or too slow. Nothing of the message
-    /// was written; it may be made and sent again.
+    /// is received; it may be made and sent again.
     SinewErrorStalled = -7,
     /// The payload is longer than `sinew_payload_max`. Nothing was sent.
     SinewErrorTooLong = -8,
