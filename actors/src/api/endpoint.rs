@@ -3,7 +3,7 @@
 use std::{path::Path, sync::Arc, time::Duration};
 
 use sinew_runtime::{
-    outcome::Outcome,
+    outcome::{Outcome, Rejection},
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     wire::{Flags, Header, Kind, Message, Payload},
@@ -318,6 +318,7 @@ impl Endpoint {
                 }
                 Ok(())
             }
+            Some(Answer::Outcome(Outcome::Rejected(Rejection::QueueFull))) => Err(ApiError::TooManyGroups),
             Some(Answer::Outcome(outcome)) => Err(ApiError::Ended(outcome)),
             Some(Answer::Reply(_) | Answer::Resolved(_)) | None => Err(ApiError::NoAnswer(PROMPT)),
         }

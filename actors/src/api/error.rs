@@ -22,7 +22,10 @@ pub enum ApiError {
     #[error("the node refused: {0}")]
     Refused(String),
     /// The registration's deadline passed at the start-up barrier. Nothing is registered.
-    #[error("after {waited:?} still waiting for these to be ready: {}", requires.join(", "))]
+    #[error(
+        "after {waited:?} still waiting for these to be ready: {}; start what is missing, or give the registration a longer deadline",
+        requires.join(", ")
+    )]
     Waiting {
         /// The names that were required; at least one of them is not ready.
         requires: Vec<String>,
@@ -30,26 +33,34 @@ pub enum ApiError {
         waited: Duration,
     },
     /// The node did not answer in time. Whether it did what was asked is not known.
-    #[error("the node did not answer within {0:?}; does it hang?")]
+    #[error("the node did not answer within {0:?}; is it stopped, or its host overloaded? Its log says more")]
     NoAnswer(Duration),
     /// The connection has ended, and the registration with it; register again.
-    #[error("the connection to the node has ended: {0}")]
+    #[error(
+        "the connection to the node has ended: {0}; this endpoint does not come back, register a new one"
+    )]
     Closed(String),
     /// The connection has ended through no fault of this endpoint, which registers again by itself while it is used: each
     /// send tries, and [`receive`](super::Endpoint::receive) waits for it. A message of this call was not sent.
-    #[error("the connection to the node has ended: {0}; the endpoint registers again by itself")]
+    #[error(
+        "the connection to the node has ended: {0}; the endpoint registers again by itself, go on receiving"
+    )]
     Away(String),
     /// There was no room for so long: the patience of the endpoint, or the time that the call was given. Or another send's
     /// patience was over before, and nothing was taken since. Nothing of this message is received; it may be sent again.
     #[error(
-        "no room for the message for {0:?}: the node, or the receiver on a direct link, is stopped or too slow; it was not sent"
+        "no room for the message for {0:?}, it was not sent: the node, or the receiver on a direct link, is stopped or slower than \
+         messages come; send less often, or as a Stream, of which only the newest value waits"
     )]
     Stalled(Duration),
-    /// A message that was lent was neither sent nor dropped. The caller is at fault; nothing was sent.
-    #[error("memory for a message is lent; send that message or drop it first")]
+    /// A message that was lent was neither sent nor dropped, before which nothing else goes out of its endpoint: see
+    /// [`LentMessage`](super::LentMessage). The caller is at fault; nothing was sent.
+    #[error("this endpoint has lent memory for a message; send that message or drop it first")]
     Lent,
     /// The payload is above the node's limit. The caller is at fault; nothing was sent.
-    #[error("a payload of {length} bytes is above the node's limit of {limit}; raise `payload_max`")]
+    #[error(
+        "a payload of {length} bytes is above the node's limit of {limit}; raise `node.payload_max` on all nodes, or send it in parts"
+    )]
     TooLong {
         /// Length of the payload.
         length: usize,
@@ -61,19 +72,86 @@ pub enum ApiError {
         "the kind {0} belongs to Sinew's layers, which would end the connection; take one from `Kind::named`"
     )]
     NotYours(Kind),
-    /// A request was not handled, or a group not joined.
-    #[error("it ended as {0:?}")]
+    /// A request was not handled. The outcome says why.
+    #[error("{}", not_handled(*.0))]
     Ended(Outcome),
+    /// The endpoint is a member of as many groups as it may. The caller is at fault; nothing was joined.
+    #[error("this endpoint is a member of 256 groups, which is the most; leave one first")]
+    TooManyGroups,
     /// No reply came in time. The request may have been handled.
-    #[error("no reply came within {0:?}")]
+    #[error(
+        "no reply came within {0:?}, the request may have been handled; is its receiver slow, or does it not reply to this kind?"
+    )]
     NoReply(Duration),
     /// The message asks for no reply. The caller is at fault; nothing was sent.
-    #[error("the message asks for no reply")]
+    #[error(
+        "the message asks for no reply; only what was sent with `ask` does: look at `Received::wants_reply` first"
+    )]
     NotAsked,
-    /// The payload of a reply or of an answer is not what it should be. The peer is at fault.
-    #[error(transparent)]
+    /// The payload of a message or of a reply is not what its kind says. The peer is at fault.
+    #[error("the payload is not what its kind says: {0}; do both programs use the same type?")]
     Malformed(#[from] DecodeError),
     /// The node sent something that is no frame. The connection is closed.
-    #[error("the node sent what cannot be read: {0}")]
+    #[error(
+        "the node sent what cannot be read: {0}; are the node and this program of the same version of Sinew?"
+    )]
     Frame(#[from] FrameError),
+}
+
+/// What became of a request, and what to do.
+fn not_handled(outcome: Outcome) -> String {
+    let why = match outcome {
+        Outcome::Rejected(why) => return format!("not handled, {outcome:?}: {why}"),
+        Outcome::Expired => {
+            "its time was over before its receiver came to it; give it more, or the receiver less to do"
+        }
+        Outcome::Failed => "its receiver failed or ended with it in hand; what it did of it is not known",
+        Outcome::PeerLost => "the receiver's node was lost before it was sent; ask again when it is back",
+        Outcome::Unknown => "the connection was lost on the way, nobody can say whether it was handled",
+        Outcome::Delivered => "it was handled, and no reply follows",
+    };
+    format!("no reply, {outcome:?}: {why}")
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew_runtime::outcome::Rejection;
+
+    use super::*;
+
+    /// One of each, so that a new one is not forgotten here.
+    fn all() -> Vec<ApiError> {
+        let second = Duration::from_secs(1);
+        let mut all = vec![
+            ApiError::NoNode { path: "/run/knee.sock".into(), cause: io::ErrorKind::NotFound.into() },
+            ApiError::Waiting { requires: vec!["hip".to_owned()], waited: second },
+            ApiError::NoAnswer(second),
+            ApiError::Closed("why".to_owned()),
+            ApiError::Away("why".to_owned()),
+            ApiError::Stalled(second),
+            ApiError::Lent,
+            ApiError::TooLong { length: 2, limit: 1 },
+            ApiError::NotYours(Kind::OUTCOME),
+            ApiError::NoReply(second),
+            ApiError::NotAsked,
+            ApiError::TooManyGroups,
+        ];
+        let outcomes =
+            (0..=u8::MAX).filter_map(Outcome::from_code).filter(|outcome| *outcome != Outcome::Delivered);
+        all.extend(outcomes.map(ApiError::Ended));
+        all
+    }
+
+    #[test]
+    fn every_error_says_what_happened_and_what_to_do_or_what_is_not_known() {
+        for error in all() {
+            let text = error.to_string();
+            let (cause, remedy) = text.split_once([';', ':']).unwrap_or_else(|| panic!("no remedy: {text}"));
+            assert!(cause.len() > 10 && remedy.len() > 10, "{text}");
+            // The brackets of `Debug` and the names of our types are no words of a control engineer's.
+            assert!(!text.contains("ApiError") && !text.contains('{'), "{text}");
+        }
+        let no_room = ApiError::Ended(Outcome::Rejected(Rejection::QueueFull)).to_string();
+        assert!(no_room.contains("more slowly than they come"), "{no_room}");
+    }
 }

@@ -1,38 +1,155 @@
 //! NodeAPI: for applications in processes of their own.
 //!
-//! A program connects to the node on its host through the node's unix socket, registers one or more transport
-//! addresses, and sends and receives on them from plain threads; it needs no async runtime. Each [`Endpoint`] is one
-//! address with one connection, and belongs to one thread at a time. A task of tokio has the same as [`AsyncEndpoint`], a
-//! program in C or C++ through `bindings/c`: three forms, one semantics.
+//! A program connects to the node on its host through the node's unix socket, registers one or more transport addresses
+//! (*endpoints*), sends and receives on them. There are three forms of one semantics, which `docs/SEMANTICS.md` says on one page:
 //!
-//! | the paper's name | here |
-//! | --- | --- |
-//! | RegisterTransportAddress | [`NodeApi::register_transport_address`] |
-//! | CreateMessage | [`Endpoint::create_message`] |
-//! | SendMessage | [`Endpoint::send_message`], [`send_message_confirmed`](Endpoint::send_message_confirmed), [`ask_message`](Endpoint::ask_message); typed: [`Endpoint::send`], [`send_confirmed`](Endpoint::send_confirmed), [`ask`](Endpoint::ask) |
-//! | ReceiveMessage | [`Endpoint::receive`] |
+//! | your program is | its form | it begins with |
+//! | --- | --- | --- |
+//! | a plain thread, as of a control loop; no async runtime | [`Endpoint`] | [`NodeApi::register_transport_address`] |
+//! | a task of tokio | [`AsyncEndpoint`] | [`NodeApi::register_transport_address_async`] |
+//! | in C or C++ | `sinew.h`, `sinew.hpp` | `bindings/c/README.md` |
 //!
-//! ```no_run
+//! # What you can do
+//!
+//! The names are the same in both forms of Rust. What is sent is a type of yours ([`payload!`](crate::payload)) or, with `_message`
+//! in the name, raw bytes.
+//!
+//! | to | Rust | C |
+//! | --- | --- | --- |
+//! | get an address, with a name, and give it back (RegisterTransportAddress) | [`Registration`], [`unregister`](Endpoint::unregister) or drop | `sinew_register_transport_address`, `sinew_unregister` |
+//! | find somebody by name, on any node | [`resolve`](Endpoint::resolve), [`Registration::requires`] | `sinew_resolve` |
+//! | send, and not ask what becomes of it | [`send`](Endpoint::send) | `sinew_send_bytes` |
+//! | be told what became of it (confirm) | [`send_confirmed`](Endpoint::send_confirmed): one [`Outcome`](crate::Outcome) | `sinew_send_message_confirmed` |
+//! | ask, and wait for the reply | [`ask`](Endpoint::ask), [`reply`](Endpoint::reply) | `sinew_ask`, `sinew_reply` |
+//! | wait for room 200 us at most, or not at all | [`send_within`](Endpoint::send_within), [`reply_within`](Endpoint::reply_within) | `sinew_send_message_within` |
+//! | write a payload where it is read, without a copy (loan: CreateMessage, SendMessage) | [`create_message`](Endpoint::create_message), [`LentMessage`], [`send_message`](Endpoint::send_message) | `sinew_create_message`, `sinew_send_message` |
+//! | receive, with a deadline (ReceiveMessage) | [`receive`](Endpoint::receive), [`Received`] | `sinew_receive_message`, `sinew_settle_message` |
+//! | speak to many at once (groups) | [`join`](Endpoint::join), [`leave`](Endpoint::leave), [`Tid::group`](crate::Tid::group) | `sinew_join_group`, `sinew_group` |
+//! | take only the newest value of a sensor | [`Class::Stream`](crate::Class), at the type | `SINEW_STREAM` |
+//! | hear of nodes that come and go | [`Registration::subscribe`] | `events` of `sinew_options` |
+//! | go on when the node was restarted | nothing to do; [`ApiError::Away`] says so once | `SINEW_ERROR_AWAY` |
+//! | the shortest way to another process | [`Registration::direct`], [`Registration::spin`] | `SINEW_DIRECT`, `spin_ns` |
+//! | know what went wrong | [`ApiError`]: cause, place, remedy | `sinew_last_error` |
+//!
+//! # A thread
+//!
+//! ```
 //! use std::time::Duration;
 //!
-//! use serde::{Deserialize, Serialize};
-//! use sinew::{NodeApi, Payload, Registration};
+//! use sinew::{ApiError, NodeApi, Registration};
 //!
-//! #[derive(Serialize, Deserialize)]
-//! struct JointAngle { degrees: f32 }
+//! sinew::payload!("demo.joint_angle", Stream => struct JointAngle { degrees: f32 });
+//! sinew::payload!("demo.limit" => struct Limit { degrees: f32 });
 //!
-//! impl Payload for JointAngle {
-//!     const NAME: &'static str = "demo.joint_angle";
+//! # let path = std::env::temp_dir().join(format!("sinew-doc-thread-{}.sock", std::process::id()));
+//! # let mut builder = sinew::Node::builder("knee");
+//! # builder = builder.configure(|config| {
+//! #     (config.lncl.socket, config.ndl.multicast, config.ndl.mdns_port) = (Some(path.clone()), None, None);
+//! # });
+//! # let _node = builder.start().expect("a node for this example");
+//! # let path = path.to_str().expect("a short path");
+//! let node = NodeApi::connect(path)?; // the `lncl.socket` of the node, as "/run/sinew/knee.sock"
+//! let mut drive = node.register_transport_address(Registration::new().name("knee.drive"))?;
+//! let mut sensor = node.register_transport_address(Registration::new().requires(["knee.drive"]))?;
+//! let second = Duration::from_secs(1);
+//!
+//! // The sensor finds the drive, and sends it an angle; if there is no room now, it is skipped.
+//! let to = sensor.resolve("knee.drive", second)?.expect("it is registered");
+//! match sensor.send_within(to, &JointAngle { degrees: 12.5 }, Duration::ZERO) {
+//!     Ok(()) | Err(ApiError::Stalled(_)) => {}
+//!     Err(other) => return Err(other),
 //! }
 //!
-//! let node = NodeApi::connect("/run/sinew/knee.sock")?;
-//! let mut sensor = node.register_transport_address(Registration::new().name("knee.sensor"))?;
-//! let drive = sensor.resolve("knee.drive", Duration::from_secs(1))?.expect("the drive is registered");
-//! sensor.send(drive, &JointAngle { degrees: 12.5 })?;
-//! while let Some(received) = sensor.receive(Duration::from_millis(10))? {
-//!     println!("{} says something of kind {}", received.source(), received.kind());
+//! // The drive receives it. The message counts as handled when `received` goes out of scope.
+//! let received = drive.receive(second)?.expect("an angle");
+//! assert_eq!(received.decode::<JointAngle>()?.degrees, 12.5);
+//!
+//! // The drive tells its limit to who has spoken, in bytes that lie where they are read.
+//! let mut limit = drive.create_message(received.source(), sinew::Kind::named("demo.raw"), 4)?;
+//! limit.copy_from_slice(&90_f32.to_le_bytes());
+//! drive.send_message(limit)?;
+//! assert_eq!(sensor.receive(second)?.expect("the limit").bytes(), 90_f32.to_le_bytes());
+//! # Ok::<(), ApiError>(())
+//! ```
+//!
+//! # A task
+//!
+//! ```
+//! use std::time::Duration;
+//!
+//! use sinew::{ApiError, NodeApi, Outcome, Registration};
+//!
+//! sinew::payload!("demo.torque" => #[derive(Debug, PartialEq)] struct Torque { newton_metres: f32 });
+//!
+//! # let path = std::env::temp_dir().join(format!("sinew-doc-task-{}.sock", std::process::id()));
+//! # let mut builder = sinew::Node::builder("hip");
+//! # builder = builder.configure(|config| {
+//! #     (config.lncl.socket, config.ndl.multicast, config.ndl.mdns_port) = (Some(path.clone()), None, None);
+//! # });
+//! # let _node = builder.start().expect("a node for this example");
+//! # let path = path.to_str().expect("a short path");
+//! # let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+//! # runtime.block_on(async {
+//! let node = NodeApi::connect(path)?;
+//! let mut drive = node.register_transport_address_async(Registration::new().name("hip.drive")).await?;
+//! let mut control = node.register_transport_address_async(Registration::new()).await?;
+//! let (second, to) = (Duration::from_secs(1), drive.tid());
+//!
+//! let driving = async {
+//!     // The first is confirmed at the end of its scope, the second is a request.
+//!     drop(drive.receive().await?);
+//!     let request = drive.receive().await?;
+//!     let Torque { newton_metres } = request.decode()?;
+//!     drive.reply(&request, &Torque { newton_metres: newton_metres / 2.0 }).await
+//! };
+//! let controlling = async {
+//!     let outcome = control.send_confirmed(to, &Torque { newton_metres: 3.0 }, second).await?;
+//!     assert_eq!(outcome, Outcome::Delivered);
+//!     control.ask::<_, Torque>(to, &Torque { newton_metres: 3.0 }, second).await
+//! };
+//! let (driven, given) = tokio::join!(driving, controlling);
+//! driven?;
+//! assert_eq!(given?, Torque { newton_metres: 1.5 });
+//! # Ok::<(), ApiError>(())
+//! # })?;
+//! # Ok::<(), ApiError>(())
+//! ```
+//!
+//! # C
+//!
+//! This is `bindings/c/examples/hello.c`, which the tests compile and run; C++ has a wrapper with scopes and exceptions.
+//!
+//! ```c
+//! /* Says its name to whoever is called "greeter", and prints the reply:  hello SOCKET */
+//! #include <sinew.h>
+//! #include <stdio.h>
+//! #include <stdlib.h>
+//!
+//! static void check(sinew_status status)
+//! {
+//!     if (status < 0) {
+//!         fprintf(stderr, "hello: %s\n", sinew_last_error());
+//!         exit(EXIT_FAILURE);
+//!     }
 //! }
-//! # Ok::<(), sinew::ApiError>(())
+//!
+//! int main(int argc, char **argv)
+//! {
+//!     const uint64_t second = UINT64_C(1000000000);
+//!     sinew_endpoint *endpoint;
+//!     sinew_message message;
+//!     sinew_received reply;
+//!     sinew_tid greeter;
+//!     check(sinew_register_transport_address(sinew_text_of(argc > 1 ? argv[1] : ""), NULL, &endpoint));
+//!     check(sinew_resolve(endpoint, SINEW_TEXT("greeter"), second, &greeter));
+//!     check(sinew_create_message(endpoint, greeter, sinew_kind_named(SINEW_TEXT("demo.name")), SINEW_CONTROL, 5, &message));
+//!     memcpy(message.bytes, "Ankle", 5); /* in the memory from which it is read */
+//!     check(sinew_ask(endpoint, &message, second, &reply, NULL)); /* whatever this returns, the message is gone */
+//!     printf("%.*s\n", (int)reply.length, (const char *)reply.bytes);
+//!     check(sinew_settle_message(endpoint, &reply, SINEW_DELIVERED));
+//!     check(sinew_unregister(&endpoint));
+//!     return EXIT_SUCCESS;
+//! }
 //! ```
 //!
 //! The protocol underneath is `docs/protocol/lncl.md`; it can be spoken from any language.

@@ -72,6 +72,7 @@ macro_rules! on_every_transport {
 }
 
 mod loans;
+mod returns;
 mod room;
 
 on_every_transport! {

@@ -189,7 +189,7 @@ impl From<ApiError> for Fault {
             ApiError::Closed(_) | ApiError::Frame(_) => Status::SinewErrorClosed,
             ApiError::Stalled(_) => Status::SinewErrorStalled,
             ApiError::TooLong { .. } => Status::SinewErrorTooLong,
-            ApiError::Ended(_) => Status::SinewErrorNotHandled,
+            ApiError::Ended(_) | ApiError::TooManyGroups => Status::SinewErrorNotHandled,
             ApiError::NoReply(_) => Status::SinewErrorNoReply,
             ApiError::Malformed(_) => Status::SinewErrorMalformed,
             ApiError::NotAsked => Status::SinewErrorNotAsked,

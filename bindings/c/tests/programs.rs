@@ -52,6 +52,23 @@ fn the_sensor_in_c_and_the_drive_in_cpp_find_each_other_and_walk() {
 }
 
 #[test]
+fn the_first_program_in_c_asks_and_prints_the_reply() {
+    if !is_there("gcc") {
+        return;
+    }
+    let ground = Ground::new();
+    let mut greeter = endpoint(&ground, Registration::new().name("greeter"));
+    let mut hello = ground.start(&C.shared("examples/hello.c", &ground), &[]);
+    let request = greeter.receive(WATCHDOG).unwrap().expect("a name");
+    assert_eq!((request.kind(), request.bytes()), (Kind::named("demo.name"), &b"Ankle"[..]));
+    let mut reply = greeter.create_message(request.source(), request.kind(), 6).unwrap();
+    reply.copy_from_slice(b"Hello!");
+    greeter.reply_message(&request, reply).unwrap();
+    hello.wait_for(&["Hello!"]);
+    assert_eq!(hello.wait_for_end(), Some(0));
+}
+
+#[test]
 fn the_library_can_be_linked_statically_and_the_wrapper_compiled_as_cpp20() {
     if !is_there("gcc") || !is_there("g++") {
         return;
@@ -67,21 +84,22 @@ fn the_library_can_be_linked_statically_and_the_wrapper_compiled_as_cpp20() {
 fn drive_in_rust(drive: &mut Endpoint) -> (f32, u32) {
     let mut last = (0.0, 0);
     loop {
-        let message = drive.receive(WATCHDOG).unwrap().expect("an angle, or the question at the end");
+        let message =
+            drive.receive(WATCHDOG).expect("the node lives").expect("an angle, or the question at the end");
         if message.wants_reply() {
             assert_eq!(message.kind(), Kind::named("demo.drive_report"));
-            let mut report = drive.create_message(message.source(), message.kind(), 8).unwrap();
+            let mut report = drive.create_message(message.source(), message.kind(), 8).expect("it is short");
             report[..4].copy_from_slice(&f32::to_ne_bytes(last.0));
             report[4..].copy_from_slice(&u32::to_ne_bytes(last.1));
-            drive.reply_message(&message, report).unwrap();
+            drive.reply_message(&message, report).expect("the node takes it");
             return last;
         }
         assert_eq!(message.kind(), Kind::named("demo.joint_angle"));
-        let (degrees, number) = message.bytes().split_at(4);
-        let number = u32::from_ne_bytes(number.try_into().unwrap());
+        let half = |at: usize| *message.bytes()[at..].first_chunk().expect("an angle has eight bytes");
+        let number = u32::from_ne_bytes(half(4));
         // The last one is Control, which overtakes what waits of the Stream.
         if number > last.1 {
-            last = (f32::from_ne_bytes(degrees.try_into().unwrap()), number);
+            last = (f32::from_ne_bytes(half(0)), number);
         }
     }
 }

@@ -13,7 +13,7 @@ pub enum FrameError {
     Header(#[from] HeaderError),
     /// The frame is longer than this node takes.
     #[error(
-        "a payload of {said} bytes is above this node's limit of {limit}; raise `max_payload_bytes` on both sides"
+        "a payload of {said} bytes is above this node's limit of {limit}; raise `node.payload_max` on both sides"
     )]
     TooLong {
         /// Length in the header.

@@ -208,6 +208,7 @@ impl Letters {
             | ApiError::NoAnswer(_)
             | ApiError::TooLong { .. }
             | ApiError::Ended(_)
+            | ApiError::TooManyGroups
             | ApiError::NoReply(_)
             | ApiError::Lent
             | ApiError::NotYours(_)

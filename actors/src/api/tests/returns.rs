@@ -1,0 +1,154 @@
+//! Endpoints whose node is restarted: what they say meanwhile, and what they come back to, in every form.
+
+use std::{thread, time::Duration};
+
+use super::{
+    ApiError, AppAddress, Kind, Outcome, TORQUE, TestNode, Tid, Time, Torque, Transport, WATCHDOG,
+    forms::{self, Client, Under},
+    on, register,
+};
+
+on_every_transport! {
+    an_endpoint_comes_back_to_its_name_its_address_and_its_groups
+    meanwhile_it_says_once_that_it_is_away_and_each_send_says_it_was_not_sent
+    a_confirmed_message_that_its_node_took_along_is_unknown
+    who_is_there_for_one_connection_does_not_come_back
+    a_send_with_a_time_of_its_own_does_not_look_for_the_node
+    what_is_left_of_a_long_message_ends_with_the_connection_and_the_next_one_is_whole
+}
+
+/// Receives until it has come back. Says how often it was told that it is away.
+fn await_return(client: &mut Client) -> u32 {
+    let (deadline, before) = (Time::now() + WATCHDOG, client.registrations());
+    let mut told = 0;
+    while client.registrations() == before {
+        assert!(Time::now() < deadline, "waited for the endpoint to come back");
+        match client.receive(Duration::from_millis(10)) {
+            Ok(None) => {}
+            Ok(Some(received)) => panic!("{received:?}"),
+            Err(ApiError::Away(_)) => told += 1,
+            Err(error) => panic!("{error}"),
+        }
+    }
+    told
+}
+
+/// Receives until the end of the connection is seen.
+fn await_end(client: &mut Client) -> ApiError {
+    let deadline = Time::now() + WATCHDOG;
+    loop {
+        assert!(Time::now() < deadline, "waited for the end of the connection");
+        match client.receive(Duration::from_millis(10)) {
+            Ok(None) => {}
+            Ok(Some(received)) => panic!("{received:?}"),
+            Err(error) => return error,
+        }
+    }
+}
+
+fn an_endpoint_comes_back_to_its_name_its_address_and_its_groups(under: Under) {
+    let mut node = TestNode::start();
+    let fixed = AppAddress::fixed(77).unwrap();
+    let mut client = register(under, &node, on(under).name("knee").fixed(fixed));
+    let tid = client.tid();
+    client.join("drives").unwrap();
+    for life in 2..4 {
+        node.restart();
+        assert_eq!(await_return(&mut client), 1, "said once");
+        assert_eq!((client.tid(), client.registrations()), (tid, life));
+        let mut other = register(under, &node, on(under));
+        assert_eq!(other.resolve("knee", WATCHDOG).unwrap(), Some(tid));
+        other.send(Tid::group("drives"), &TORQUE).unwrap();
+        let received = client.receive(WATCHDOG).unwrap().expect("what was sent to the group");
+        assert_eq!(received.destination(), Tid::group("drives"));
+    }
+}
+
+fn meanwhile_it_says_once_that_it_is_away_and_each_send_says_it_was_not_sent(under: Under) {
+    let mut node = TestNode::start();
+    let mut client = register(under, &node, on(under));
+    node.stop();
+    let told = await_end(&mut client);
+    assert!(matches!(told, ApiError::Away(_)), "{told}");
+    assert!(told.to_string().contains("registers again by itself"), "{told}");
+    assert!(client.receive(Duration::from_millis(1)).unwrap().is_none(), "it was said once");
+    let to = Tid::new(client.tid().node, AppAddress::fixed(1).unwrap());
+    for refused in [
+        client.send(to, &TORQUE),
+        client.send_within(to, &TORQUE, Duration::ZERO),
+        client.send_confirmed(to, &TORQUE, WATCHDOG).map(drop),
+        client.ask::<_, Torque>(to, &TORQUE, WATCHDOG).map(drop),
+        client.resolve("anybody", WATCHDOG).map(drop),
+        client.join("drives"),
+    ] {
+        assert!(matches!(refused, Err(ApiError::Away(_))), "{refused:?}");
+    }
+    node.restart();
+    assert_eq!(await_return(&mut client), 0, "it was said before");
+    let app = node.local(1);
+    client.send(to, &TORQUE).unwrap();
+    assert_eq!(app.next().decode::<Torque>().unwrap(), TORQUE);
+}
+
+fn a_confirmed_message_that_its_node_took_along_is_unknown(under: Under) {
+    let mut node = TestNode::start();
+    let app = node.local(1);
+    let mut client = register(under, &node, on(under));
+    let to = app.tid;
+    let sending = thread::spawn(move || client.send_confirmed(to, &TORQUE, WATCHDOG * 3));
+    // Its receiver has it in hand, and says nothing before the node's end.
+    let in_hand = app.next();
+    node.stop();
+    assert_eq!(sending.join().unwrap().unwrap(), Outcome::Unknown);
+    drop(in_hand);
+}
+
+fn who_is_there_for_one_connection_does_not_come_back(under: Under) {
+    let mut node = TestNode::start();
+    let mut client = register(under, &node, on(under).for_one_connection());
+    node.restart();
+    for _ in 0..3 {
+        let told = await_end(&mut client);
+        assert!(matches!(told, ApiError::Closed(_)), "{told}");
+        assert!(told.to_string().contains("register a new one"), "{told}");
+    }
+    let refused = client.send(Tid::NONE, &TORQUE);
+    assert!(matches!(refused, Err(ApiError::Closed(_))), "{refused:?}");
+    assert_eq!(client.registrations(), 1);
+}
+
+fn a_send_with_a_time_of_its_own_does_not_look_for_the_node(under: Under) {
+    let mut node = TestNode::start();
+    let mut client = register(under, &node, on(under));
+    node.restart();
+    assert!(matches!(await_end(&mut client), ApiError::Away(_)));
+    let before = client.registrations();
+    for _ in 0..100 {
+        let refused = client.send_within(Tid::NONE, &TORQUE, Duration::from_millis(1));
+        assert!(matches!(refused, Err(ApiError::Away(_))), "{refused:?}");
+    }
+    assert_eq!(client.registrations(), before);
+    await_return(&mut client);
+}
+
+fn what_is_left_of_a_long_message_ends_with_the_connection_and_the_next_one_is_whole(under: Under) {
+    const LONG: usize = 1 << 20;
+    let mut node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let raw = Kind::named("test.raw");
+    let to = node.local(1).tid;
+    let mut client = register(under, &node, on(under).patience(Duration::from_millis(1)));
+    for _ in 0..3 {
+        let mut half = client.create_message(to, raw, LONG).unwrap();
+        half.fill(1);
+        // From a socket it is sent with its first byte; from a ring it is taken back, for which there may be no room yet.
+        let begun = client.send_message_within(half, Duration::ZERO);
+        assert!(matches!(begun, Ok(()) | Err(ApiError::Stalled(_))), "{begun:?}");
+        node.restart();
+        await_return(&mut client);
+        let app = node.local(1);
+        let mut whole = client.create_message(to, raw, LONG).unwrap();
+        whole.fill(2);
+        client.send_message_within(whole, WATCHDOG).unwrap();
+        assert_eq!(app.next().payload[..], vec![2; LONG]);
+    }
+}
