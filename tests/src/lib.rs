@@ -15,6 +15,7 @@ mod program;
 pub mod orders;
 pub mod proxy;
 pub mod puppet;
+pub mod slow_consumer;
 
 pub use ground::{Ground, all_run, ready_for, sees};
 pub use hosts::{Host, Hosts};

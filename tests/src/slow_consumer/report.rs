@@ -1,0 +1,142 @@
+//! What was seen of a slow consumer.
+
+use std::{fmt, time::Duration};
+
+use serde_json::{Value, json};
+
+use super::Plan;
+
+/// How much longer the questions of others may take, 99 of 100: more than this is felt.
+const RATIO_MAX: f64 = 1.5;
+
+/// One look at the two nodes.
+#[derive(Clone, Copy, Debug)]
+pub struct Window {
+    /// Questions that were answered.
+    pub count: u64,
+    /// Questions without an answer.
+    pub failed: u64,
+    /// Half of the answers took no longer.
+    pub p50: Duration,
+    /// 99 of 100.
+    pub p99: Duration,
+    /// The longest.
+    pub max: Duration,
+    /// Memory of sender and receiver at the beginning, in bytes.
+    pub before: [u64; 2],
+    /// The most that was seen.
+    pub most: [u64; 2],
+}
+
+/// What was seen.
+#[derive(Clone, Debug)]
+pub struct Report {
+    pub(super) plan: Plan,
+    /// Without Bulk.
+    pub quiet: Window,
+    /// With a consumer that keeps up.
+    pub fast: Window,
+    /// With one that does not.
+    pub slow: Window,
+    /// Messages that the slow consumer took.
+    pub taken: u64,
+    /// Messages that were offered, over all.
+    pub offered: u64,
+    /// Of these, refused at once, as there was no room.
+    pub refused: u64,
+    /// What sender and receiver may hold more than before, in bytes.
+    pub bounds: [u64; 2],
+}
+
+impl Report {
+    /// What sender and receiver held more than before the consumer was slow, in bytes.
+    #[must_use]
+    pub fn growth(&self) -> [u64; 2] {
+        [0, 1].map(|node: usize| self.slow.most[node].saturating_sub(self.quiet.before[node]))
+    }
+
+    /// Whether both nodes stayed within their bounds, and no question was left without an answer.
+    #[must_use]
+    pub fn is_bounded(&self) -> bool {
+        let [here, there] = self.growth();
+        here <= self.bounds[0] && there <= self.bounds[1] && self.slow.failed == 0
+    }
+
+    /// How much longer the others' questions took than beside a consumer that keeps up.
+    #[must_use]
+    pub fn ratio(&self) -> f64 {
+        self.slow.p99.as_secs_f64() / self.fast.p99.as_secs_f64().max(f64::MIN_POSITIVE)
+    }
+
+    /// Whether the others did not feel it.
+    #[must_use]
+    pub fn is_unfelt(&self) -> bool {
+        self.ratio() <= RATIO_MAX
+    }
+
+    /// One line for other programs.
+    #[must_use]
+    pub fn json(&self) -> Value {
+        let window = |window: &Window| {
+            let us = |time: Duration| time.as_secs_f64() * 1e6;
+            json!({
+                "answers": window.count, "failed": window.failed, "p50_us": us(window.p50), "p99_us": us(window.p99),
+                "max_us": us(window.max), "held_before": window.before, "held_most": window.most,
+            })
+        };
+        json!({
+            "bench": "slow_consumer", "seconds": self.plan.lasts.as_secs_f64(), "rate": self.plan.rate,
+            "length": self.plan.length, "quiet": window(&self.quiet), "fast": window(&self.fast),
+            "slow": window(&self.slow), "taken": self.taken, "offered": self.offered, "refused": self.refused,
+            "growth": self.growth(), "bounds": self.bounds, "p99_ratio": self.ratio(),
+        })
+    }
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let us = |time: Duration| time.as_secs_f64() * 1e6;
+        let kib = |bytes: u64| bytes >> 10;
+        writeln!(
+            f,
+            "{:<22} {:>8} {:>6} {:>9} {:>9} {:>10} {:>12} {:>12}",
+            "round trips of others",
+            "answers",
+            "failed",
+            "p50 us",
+            "p99 us",
+            "max us",
+            "sender KiB",
+            "receiver KiB"
+        )?;
+        for (name, window) in
+            [("no bulk", &self.quiet), ("consumer keeps up", &self.fast), ("consumer is slow", &self.slow)]
+        {
+            let Window { count, failed, p50, p99, max, most, .. } = window;
+            writeln!(
+                f,
+                "{name:<22} {count:>8} {failed:>6} {:>9.1} {:>9.1} {:>10.1} {:>12} {:>12}",
+                us(*p50),
+                us(*p99),
+                us(*max),
+                kib(most[0]),
+                kib(most[1])
+            )?;
+        }
+        let ([here, there], [here_max, there_max]) = (self.growth(), self.bounds);
+        writeln!(
+            f,
+            "sender +{} KiB of {}, receiver +{} KiB of {}; p99 {:.2} times that beside a consumer that keeps up",
+            kib(here),
+            kib(here_max),
+            kib(there),
+            kib(there_max),
+            self.ratio()
+        )?;
+        write!(
+            f,
+            "offered {}, refused at once {}; the slow one took {}",
+            self.offered, self.refused, self.taken
+        )
+    }
+}
