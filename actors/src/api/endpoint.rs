@@ -290,6 +290,8 @@ impl Endpoint {
             return Ok(());
         }
         self.lender.be_free()?;
+        // It may go on just now.
+        self.stalled = None;
         let goodbye = Message::new(Header::new(Kind::LNCL_UNREGISTER, self.tid, LNCL), bytes::Bytes::new());
         self.write(goodbye.into(), self.patience()).await?;
         let deadline = Time::now() + PROMPT;

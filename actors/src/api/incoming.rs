@@ -13,7 +13,7 @@ use super::{
     direct::{Came, Everything, InTurn, ToNode},
     form::Form,
     inbox::{Answer, Awaited, Sorted},
-    link::{Read, Reader},
+    link::{Read, Reader, ring::NAP},
 };
 use crate::ring::Taken;
 
@@ -173,8 +173,12 @@ impl Endpoint {
 
     /// Waits until something comes, from the node or from a link, or until there is something to do.
     pub(super) async fn wait(&mut self, deadline: Time) {
-        // The rest of a frame goes out meanwhile.
-        let deadline = if self.is_within_frame() { deadline.min(Time::now() + REST_AGAIN) } else { deadline };
+        // The rest of a frame goes out meanwhile; that it was taken back is not urgent.
+        let deadline = match &self.rest {
+            Some(rest) if rest.is_withdrawn() => deadline.min(Time::now() + NAP),
+            None if !self.is_within_frame() => deadline,
+            Some(_) | None => deadline.min(Time::now() + REST_AGAIN),
+        };
         match &mut self.form {
             Form::Thread => self.block(deadline),
             Form::Reactor(reactor) => {

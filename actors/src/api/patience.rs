@@ -9,8 +9,8 @@ use super::ApiError;
 /// What a send may wait for room.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Limit {
-    /// Time in which the peer takes nothing.
-    patience: Duration,
+    /// Time in which the peer takes nothing; `None` if it does not matter what it takes.
+    patience: Option<Duration>,
     /// Time in all.
     in_all: Duration,
 }
@@ -18,12 +18,12 @@ pub(super) struct Limit {
 impl Limit {
     /// As long as the peer goes on taking, and then so much longer.
     pub(super) const fn patience(patience: Duration) -> Self {
-        Self { patience, in_all: Duration::MAX }
+        Self { patience: Some(patience), in_all: Duration::MAX }
     }
 
     /// So long at most, whatever the peer takes. Zero: not at all.
     pub(super) const fn in_all(within: Duration) -> Self {
-        Self { patience: Duration::MAX, in_all: within }
+        Self { patience: None, in_all: within }
     }
 
     /// The same, and so long at most.
@@ -32,8 +32,12 @@ impl Limit {
     }
 
     /// Whether the caller has said how long it takes in all.
-    pub(super) fn is_in_all(&self) -> bool {
-        self.patience == Duration::MAX
+    pub(super) const fn is_in_all(&self) -> bool {
+        self.patience.is_none()
+    }
+
+    fn patience_from(&self, now: Time) -> Time {
+        self.patience.map_or(Time::MAX, |patience| now + patience)
     }
 }
 
@@ -50,13 +54,13 @@ pub(super) struct Waiting {
 
 impl Waiting {
     pub(super) fn new(limit: Limit) -> Self {
-        Self { limit, told: limit.in_all.min(limit.patience), end: None, turn: None }
+        Self { limit, told: limit.patience.unwrap_or(limit.in_all).min(limit.in_all), end: None, turn: None }
     }
 
     /// The same where the peer, as far as is known, has taken nothing since another one's patience was over: that was the
     /// time for all. Who has said a time in all has it.
     pub(super) fn after_a_stall(limit: Limit) -> Self {
-        let patience = if limit.is_in_all() { limit.patience } else { Duration::ZERO };
+        let patience = limit.patience.map(|_| Duration::ZERO);
         Self { limit: Limit { patience, in_all: limit.in_all }, ..Self::new(limit) }
     }
 
@@ -66,7 +70,7 @@ impl Waiting {
         let end = *self.end.get_or_insert_with(|| now + self.limit.in_all);
         let turn = match self.turn {
             Some((before, until)) if before == taken => until,
-            Some(_) | None => now + self.limit.patience,
+            Some(_) | None => self.limit.patience_from(now),
         };
         self.turn = Some((taken, turn));
         let until = end.min(turn);
@@ -150,5 +154,8 @@ mod tests {
         let mut waiting = Waiting::new(Limit::in_all(Duration::MAX));
         assert_eq!(waiting.until(0, at(5)), Some(Time::MAX));
         assert_eq!(waiting.until(0, at(1 << 40)), Some(Time::MAX));
+        let endless = Limit::patience(Duration::MAX);
+        assert!(!endless.is_in_all(), "it may take the time to come back to a node");
+        assert_eq!(Waiting::new(endless).until(0, at(5)), Some(Time::MAX));
     }
 }

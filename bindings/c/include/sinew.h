@@ -695,7 +695,8 @@ sinew_status sinew_receive_message(struct sinew_endpoint *endpoint,
 /**
  * The next thing that the node has said about messages that were sent without asking for their outcome, and that nobody has
  * taken: once for each destination and reason, with how many; `SINEW_NOTHING` if there is nothing new. Does not block. The
- * first refusal is told at once, those after it every 100 ms together. `*untaken` is set if this returns `SINEW_OK`.
+ * first refusal is told at once, those after it every 100 ms together. `*untaken` is set if this returns `SINEW_OK`. The
+ * endpoint's thread. Does not block.
  */
 sinew_status sinew_next_untaken(struct sinew_endpoint *endpoint,
                                 struct sinew_untaken *untaken);
@@ -732,7 +733,7 @@ const char *sinew_outcome_text(int32_t outcome);
 /** A text of a string literal. C only: in C++ take sinew.hpp, or sinew_text_of. */
 #define SINEW_TEXT(literal) ((sinew_text){ "" literal, sizeof(literal) - 1 })
 
-/** A text of a C string; of none if it is NULL. */
+/** A text of a C string; of none if it is NULL. Any thread. */
 static inline sinew_text sinew_text_of(const char *string)
 {
     sinew_text text;

@@ -33,7 +33,8 @@ pub extern "C" fn sinew_receive_message(
 
 /// The next thing that the node has said about messages that were sent without asking for their outcome, and that nobody has
 /// taken: once for each destination and reason, with how many; `SINEW_NOTHING` if there is nothing new. Does not block. The
-/// first refusal is told at once, those after it every 100 ms together. `*untaken` is set if this returns `SINEW_OK`.
+/// first refusal is told at once, those after it every 100 ms together. `*untaken` is set if this returns `SINEW_OK`. The
+/// endpoint's thread. Does not block.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_next_untaken(
     endpoint: *mut Endpoint,

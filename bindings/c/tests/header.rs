@@ -45,3 +45,25 @@ fn the_first_page_of_the_api_shows_the_example_as_it_is() {
         "actors/src/api/mod.rs shows another examples/hello.c"
     );
 }
+
+#[test]
+fn every_function_says_which_thread_may_call_it() {
+    let header =
+        std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("include/sinew.h")).unwrap();
+    let mut functions = 0;
+    let mut words = String::new();
+    for line in header.lines() {
+        if line.starts_with("/**") {
+            words.clear();
+        }
+        words.push_str(line.trim_start_matches(" *"));
+        // The end of a declaration or of a head; types have none of these.
+        if line.contains(" sinew_") && line.contains('(') && !line.starts_with([' ', '/', '#']) {
+            functions += 1;
+            let says = ["Any thread", "The endpoint's thread"];
+            let flat = words.split_whitespace().collect::<Vec<_>>().join(" ");
+            assert!(says.iter().any(|thread| flat.contains(thread)), "which thread? {line}");
+        }
+    }
+    assert!(functions > 25, "{functions} functions were found");
+}

@@ -2,6 +2,7 @@
 
 use std::{
     io::{Read, Write},
+    net::Shutdown,
     os::unix::net::{UnixListener, UnixStream},
     path::{Path, PathBuf},
     sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel},
@@ -211,6 +212,10 @@ impl Played {
             match next {
                 // An error is that nobody wants to know.
                 Some(message) if message.header.kind.is_user() => drop(self.say.send(message)),
+                // As a node does: the address is free.
+                Some(message) if message.header.kind == Kind::LNCL_UNREGISTER => {
+                    self.socket.shutdown(Shutdown::Both).unwrap();
+                }
                 Some(_) => {}
                 None => return,
             }

@@ -14,6 +14,7 @@ on_every_transport! {
     a_confirmed_message_that_its_node_took_along_is_unknown
     who_is_there_for_one_connection_does_not_come_back
     a_send_with_a_time_of_its_own_does_not_look_for_the_node
+    a_send_of_whatever_patience_does_and_comes_back
     what_is_left_of_a_long_message_ends_with_the_connection_and_the_next_one_is_whole
 }
 
@@ -129,6 +130,23 @@ fn a_send_with_a_time_of_its_own_does_not_look_for_the_node(under: Under) {
     }
     assert_eq!(client.registrations(), before);
     await_return(&mut client);
+}
+
+fn a_send_of_whatever_patience_does_and_comes_back(under: Under) {
+    for patience in [Duration::ZERO, Duration::MAX] {
+        let mut node = TestNode::start();
+        let mut client = register(under, &node, on(under).patience(patience));
+        let to = Tid::new(client.tid().node, AppAddress::fixed(1).unwrap());
+        node.restart();
+        let app = node.local(1);
+        let deadline = Time::now() + WATCHDOG;
+        while client.registrations() == 1 || client.send(to, &TORQUE).is_err() {
+            assert!(Time::now() < deadline, "waited for the endpoint to come back");
+            // Refused until it has.
+            let _ = client.send(Tid::NONE, &TORQUE);
+        }
+        assert_eq!(app.next().decode::<Torque>().unwrap(), TORQUE);
+    }
 }
 
 fn what_is_left_of_a_long_message_ends_with_the_connection_and_the_next_one_is_whole(under: Under) {

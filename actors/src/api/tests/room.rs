@@ -23,6 +23,7 @@ on_every_transport! {
     who_waits_so_long_for_an_answer_waits_no_longer_for_room
     patience_that_was_lost_once_is_not_lost_again_until_the_node_takes_something
     values_and_replies_may_have_a_time_too
+    who_unregisters_waits_until_what_was_sent_is_out
 }
 
 fn register(under: Under, node: &PlayedNode, patience: Duration) -> Client {
@@ -224,4 +225,21 @@ fn values_and_replies_may_have_a_time_too(under: Under) {
     let request = replying.receive(WATCHDOG).unwrap().expect("a request");
     replying.reply_within(&request, &super::TORQUE, NO_TIME).unwrap();
     assert_eq!(asked.join().unwrap(), super::TORQUE);
+}
+
+fn who_unregisters_waits_until_what_was_sent_is_out(under: Under) {
+    let node = PlayedNode::start();
+    let mut client = register(under, &node, WATCHDOG);
+    let first = message(&mut client, 0, SHORT);
+    client.send_message(first).unwrap();
+    let long = message(&mut client, 1, LONG);
+    let is_sent = client.send_message_within(long, NO_TIME).is_ok();
+    assert_eq!(is_sent, under.transport == Transport::Socket, "from a ring it is taken back");
+    node.take_all_in(Duration::from_millis(20));
+    client.unregister().unwrap();
+    assert_eq!(number_of(&node, SHORT), 0);
+    if is_sent {
+        assert_eq!(number_of(&node, LONG), 1);
+    }
+    assert!(node.next_now().is_none());
 }

@@ -152,6 +152,11 @@ impl Rest {
         self.message.payload = bytes::Bytes::new();
     }
 
+    /// Whether it was taken back, and only that is still to be said.
+    pub(in crate::api) const fn is_withdrawn(&self) -> bool {
+        self.is_withdrawn
+    }
+
     /// The message that will not become whole any more, since its link ends; `None` if it was taken back.
     pub(in crate::api) fn cut(&self) -> Option<Message> {
         (!self.is_withdrawn).then(|| Message::new(self.message.header, self.message.payload.clone()))
