@@ -28,6 +28,7 @@ use std::{
 };
 
 use sinew_runtime::{
+    mailbox::Budget,
     outcome::{Outcome, Rejection, Ticket},
     router::{Outlet, Refused},
     time::Time,
@@ -166,6 +167,13 @@ impl<S: Socket> StreamOutlet<S> {
     /// An outlet without a connection.
     pub(crate) fn new(limits: OutletLimits) -> Self {
         Self { half: Mutex::new(Half::new(limits, None)) }
+    }
+
+    /// An outlet without a connection, whose waiting messages count in a budget that it shares with others.
+    pub(crate) fn sharing(limits: OutletLimits, budget: Arc<Budget>) -> Self {
+        let mut half = Half::new(limits, None);
+        half.share(budget);
+        Self { half: Mutex::new(half) }
     }
 
     /// An outlet whose messages arrive once and in order, however many connections it takes.

@@ -39,6 +39,7 @@ pub(super) const CLIENTS_PER_PROCESS_MAX: Range =
 pub(super) const LNCL_STRANGERS_MAX: Range = range("lncl.strangers_max", 1, 1_024, "connections");
 pub(super) const STRANGERS_PER_PROCESS_MAX: Range =
     range("lncl.strangers_per_process_max", 1, 1_024, "connections");
+pub(super) const CLIENTS_BYTES: Range = range("lncl.clients_bytes", 64 << 10, 64 << 30, "bytes");
 pub(super) const APPS_MAX: Range = range("lncl.apps_max", 1, 65_536, "applications");
 pub(super) const RING_BYTES: Range = range("lncl.ring_bytes", 4 << 10, 16 << 20, "bytes");
 pub(super) const GNCL_PORT: Range = range("gncl.port", 0, 65_535, "(0: any free port)");
@@ -143,6 +144,7 @@ impl NodeConfig {
         CLIENTS_PER_PROCESS_MAX.count(faults, self.lncl.clients_per_process_max);
         LNCL_STRANGERS_MAX.count(faults, self.lncl.strangers_max);
         STRANGERS_PER_PROCESS_MAX.count(faults, self.lncl.strangers_per_process_max);
+        CLIENTS_BYTES.count(faults, self.lncl.clients_bytes);
         APPS_MAX.count(faults, self.lncl.apps_max);
         RING_BYTES.count(faults, self.lncl.ring_bytes);
     }

@@ -66,6 +66,9 @@ pub struct LnclConfig {
     pub strangers_max: usize,
     /// Those of one process at most. 1 to 1,024; default 32.
     pub strangers_per_process_max: usize,
+    /// Bytes of payloads that wait for all clients together at most; a quarter of it for those of one process. 64 KiB to
+    /// 64 GiB; default 256 MiB. Beside [`NodeConfig::mailbox_bytes`], which each of them has.
+    pub clients_bytes: usize,
     /// Applications of the node at most, in all its processes. 1 to 65,536; default 1,024.
     pub apps_max: usize,
     /// Bytes of the ring in shared memory for each direction of a connection of another process; the next power of two
@@ -184,6 +187,7 @@ impl NodeConfig {
                 clients_per_process_max: 64,
                 strangers_max: 128,
                 strangers_per_process_max: 32,
+                clients_bytes: 256 << 20,
                 apps_max: 1_024,
                 ring_bytes: 256 * 1_024,
             },

@@ -71,6 +71,7 @@ fn every_number_is_legal_at_both_ends_and_not_beyond() {
         (check::CLIENTS_PER_PROCESS_MAX, ""),
         (check::LNCL_STRANGERS_MAX, ""),
         (check::STRANGERS_PER_PROCESS_MAX, ""),
+        (check::CLIENTS_BYTES, ""),
         (check::APPS_MAX, ""),
         (check::RING_BYTES, ""),
         (check::GNCL_PORT, ""),

@@ -162,7 +162,7 @@ impl Client {
         let app = registrar::register_client(&server.stores, request)?;
         let tid = Tid::new(server.stores.node, app);
         let name = lock(&server.stores.registry).name_of(app);
-        let outlet = Arc::new(StreamOutlet::new(limits(&server.stores)));
+        let outlet = Arc::new(StreamOutlet::sharing(limits(&server.stores), server.budget_of(peer.pid)));
         let notices = Rc::new(Notices::new(tid, outlet.clone()));
         server.add_client(peer.id, outlet.clone(), notices.clone());
         crate::log::info!(%tid, name, pid = peer.pid, "an application of another process has registered");

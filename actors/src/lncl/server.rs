@@ -1,8 +1,16 @@
 //! The door for other processes: accepts connections, and refuses them in words.
 
-use std::{cell::RefCell, collections::BTreeMap, io, rc::Rc, sync::Arc, time::Duration};
+use std::{
+    cell::RefCell,
+    collections::BTreeMap,
+    io,
+    rc::Rc,
+    sync::{Arc, Weak},
+    time::Duration,
+};
 
 use sinew_runtime::{
+    mailbox::Budget,
     tid::{AppAddress, Tid},
     time::Time,
     wire::{Kind, encode_frame},
@@ -28,12 +36,19 @@ use crate::{
 /// First and longest wait after `accept` failed: usually the process has no descriptor left, and needs time to get one.
 const ACCEPT_BACKOFF: (Duration, Duration) = (Duration::from_millis(10), Duration::from_millis(100));
 
+/// The bytes that may wait for clients are enough for so many processes at their worst.
+const PROCESSES_MIN: usize = 4;
+
 /// What the connections of one life of LNCL's actor share. All of them live on its thread.
 pub(super) struct Server {
     pub(super) stores: Arc<Stores>,
     pub(super) refusals: Arc<Refusals>,
     /// Who has not said yet who it is.
     strangers: Strangers,
+    /// The bytes that wait for all clients.
+    budget: Arc<Budget>,
+    /// The part of each process that has clients.
+    shares: RefCell<BTreeMap<i32, Weak<Budget>>>,
     /// Who may be introduced to whom.
     pub(super) introductions: Introductions,
     /// Who waits at the barrier.
@@ -53,7 +68,21 @@ impl Server {
         let (releases, clients) = (RefCell::default(), RefCell::default());
         let refusals = stores.refusals.clone();
         let (strangers, introductions) = (Strangers::default(), Introductions::default());
-        Rc::new(Self { stores, refusals, strangers, introductions, releases, clients })
+        let (budget, shares) = (Budget::new(stores.config.lncl.clients_bytes), RefCell::default());
+        Rc::new(Self { stores, refusals, budget, shares, strangers, introductions, releases, clients })
+    }
+
+    /// The bytes that may wait for the clients of the process `pid`, together.
+    pub(super) fn budget_of(&self, pid: i32) -> Arc<Budget> {
+        let mut shares = self.shares.borrow_mut();
+        if let Some(share) = shares.get(&pid).and_then(Weak::upgrade) {
+            return share;
+        }
+        // Those of processes that have none any more.
+        shares.retain(|_, share| share.strong_count() > 0);
+        let share = Budget::part_of(&self.budget, self.stores.config.lncl.clients_bytes / PROCESSES_MIN);
+        shares.insert(pid, Arc::downgrade(&share));
+        share
     }
 
     /// Resolves when the barrier opens for `app`.

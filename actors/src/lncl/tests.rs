@@ -187,6 +187,40 @@ fn who_sends_more_than_its_destination_takes_is_told_how_much_of_it_and_not_of_e
 }
 
 #[test]
+fn what_waits_for_the_clients_of_one_process_has_a_bound_together_and_goes_with_them() {
+    // Given: two clients of this process that read nothing, with plenty of room for each and little for both.
+    let node = TestNode::start_with(|config| {
+        (config.mailbox_capacity, config.mailbox_bytes) = (65_536, 1 << 30);
+        config.lncl.clients_bytes = 8 << 20;
+    });
+    let app = node.local(1);
+    let (first, first_tid) = RawClient::register(&node, &Register::default());
+    let (_second, second_tid) = RawClient::register(&node, &Register::default());
+    let send = |to| {
+        let mut header = Header::new(Kind::named("x"), app.tid, to);
+        header.class = Class::Bulk;
+        node.stores.router.send(Message::new(header, vec![0; 64 << 10].into()))
+    };
+    let fill = |to| (0..10_000).take_while(|_| send(to).is_ok()).count();
+
+    // When: one of them has all that there is for its process.
+    let taken = fill(first_tid);
+
+    // Then: no more than that waits, and the other gets what its socket takes and no byte more.
+    assert!((32..64).contains(&taken), "2 MiB, and what a socket takes: {taken} of 64 KiB");
+    assert!(fill(second_tid) < 16, "a socket's worth");
+    assert_eq!(send(second_tid), Err(Rejection::QueueFull));
+
+    // And when the first one has gone, there is room again.
+    drop(first);
+    let deadline = Time::now() + WATCHDOG;
+    while send(second_tid).is_err() {
+        assert!(Time::now() < deadline, "waited for room");
+        std::thread::yield_now();
+    }
+}
+
+#[test]
 fn a_forged_source_is_refused_and_counted_and_its_connection_lives() {
     let node = TestNode::start();
     let app = node.local(1);

@@ -1,9 +1,9 @@
 //! What stands under an outlet's mutex: the socket, the frame being written, and all that waits.
 
-use std::{collections::VecDeque, io, task::Waker};
+use std::{collections::VecDeque, io, sync::Arc, task::Waker};
 
 use sinew_runtime::{
-    mailbox::{Bounds, ClassQueue},
+    mailbox::{Bounds, Budget, ClassQueue},
     outcome::{Outcome, Receipt, Rejection, Ticket},
     router::Refused,
     time::Time,
@@ -102,7 +102,7 @@ impl<S: Socket> Half<S> {
             session,
             partial: None,
             interrupted: None,
-            queue: ClassQueue::new(Bounds { messages: limits.queue_capacity, bytes: limits.queue_bytes }),
+            queue: ClassQueue::new(bounds(limits)),
             urgent: VecDeque::new(),
             last: None,
             finishing: false,
@@ -112,6 +112,11 @@ impl<S: Socket> Half<S> {
             drainer: None,
             counts: OutletCounts::default(),
         }
+    }
+
+    /// What waits counts in `budget`, too. Before anything waits.
+    pub(super) fn share(&mut self, budget: Arc<Budget>) {
+        self.queue = ClassQueue::sharing(bounds(self.limits), budget);
     }
 
     pub(super) fn connect(
@@ -404,4 +409,8 @@ impl<S: Socket> Half<S> {
     pub(super) const fn counts(&self) -> OutletCounts {
         self.counts
     }
+}
+
+const fn bounds(limits: OutletLimits) -> Bounds {
+    Bounds { messages: limits.queue_capacity, bytes: limits.queue_bytes }
 }

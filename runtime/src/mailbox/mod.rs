@@ -4,6 +4,7 @@
 //! them out. When the actor panics the message in its hand ends as `Failed`, the rest stays and goes to the next
 //! incarnation. Queue and waker stand under one mutex, see [`post`](crate::post).
 
+mod budget;
 mod lender;
 mod queue;
 mod reader;
@@ -16,6 +17,7 @@ use std::{
     task::Waker,
 };
 
+pub use budget::Budget;
 pub use lender::Lender;
 pub use queue::{Bounds, ClassQueue, is_same_stream};
 pub use reader::MailboxReader;

@@ -1,7 +1,8 @@
 //! The pure queue behind mailboxes and connections: one lane a class, each with its own bound.
 
-use std::collections::VecDeque;
+use std::{collections::VecDeque, sync::Arc};
 
+use super::Budget;
 use crate::{
     outcome::Rejection,
     router::Refused,
@@ -49,6 +50,8 @@ pub struct ClassQueue {
     bytes: [usize; 3],
     passed_over: [u32; 3],
     bounds: Bounds,
+    /// What it shares with others.
+    budget: Option<Arc<Budget>>,
     /// Nothing that waits expires before this.
     earliest_expiry: Time,
 }
@@ -62,8 +65,17 @@ impl ClassQueue {
             bytes: [0; 3],
             passed_over: [0; 3],
             bounds: bounds.into(),
+            budget: None,
             earliest_expiry: Time::MAX,
         }
+    }
+
+    /// The same, within a budget that it shares with other queues.
+    #[must_use]
+    pub fn sharing(bounds: impl Into<Bounds>, budget: Arc<Budget>) -> Self {
+        let mut queue = Self::new(bounds);
+        queue.budget = Some(budget);
+        queue
     }
 
     /// Takes a message. Returns the older Stream message that it replaced, if any.
@@ -78,14 +90,19 @@ impl ClassQueue {
             && let Some(older) = older_value(lane, &message.header)
         {
             let others = *held - older.payload.len();
-            if !self.bounds.has_bytes_for(length, others) {
+            if !self.bounds.has_bytes_for(length, others)
+                || !takes_instead(self.budget.as_deref(), length, older.payload.len())
+            {
                 return Err(Refused::new(message, Rejection::QueueFull));
             }
             *held = others + length;
             self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
             return Ok(Some(std::mem::replace(older, message)));
         }
-        if lane.len() >= self.bounds.messages || !self.bounds.has_bytes_for(length, *held) {
+        if lane.len() >= self.bounds.messages
+            || !self.bounds.has_bytes_for(length, *held)
+            || !takes_instead(self.budget.as_deref(), length, 0)
+        {
             return Err(Refused::new(message, Rejection::QueueFull));
         }
         *held += length;
@@ -98,9 +115,17 @@ impl ClassQueue {
     /// order counts; who uses it bounds how many there are.
     pub fn push_beyond(&mut self, message: Message) {
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
-        let class = message.header.class as usize;
-        self.bytes[class] += message.payload.len();
-        self.lanes[class].push_back(message);
+        self.hold(&message);
+        self.lanes[message.header.class as usize].push_back(message);
+    }
+
+    /// Counts a message in, whatever the bounds.
+    fn hold(&mut self, message: &Message) {
+        let length = message.payload.len();
+        self.bytes[message.header.class as usize] += length;
+        if let Some(budget) = &self.budget {
+            budget.add(length);
+        }
     }
 
     /// Whether there is room for this message beside all that waits.
@@ -121,14 +146,14 @@ impl ClassQueue {
     /// Puts a message back that was popped, before all others of its class, whatever the bound. Hands it back if it is
     /// of a Stream whose newer value waits here.
     pub fn put_back(&mut self, message: Message) -> Option<Message> {
-        let lane = &mut self.lanes[message.header.class as usize];
+        let lane = &self.lanes[message.header.class as usize];
         let header = &message.header;
         if header.class == Class::Stream && lane.iter().any(|newer| is_same_stream(&newer.header, header)) {
             return Some(message);
         }
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
-        self.bytes[message.header.class as usize] += message.payload.len();
-        lane.push_front(message);
+        self.hold(&message);
+        self.lanes[message.header.class as usize].push_front(message);
         None
     }
 
@@ -146,7 +171,15 @@ impl ClassQueue {
         }
         let next = self.lanes[chosen].pop_front()?;
         self.bytes[chosen] -= next.payload.len();
+        self.give(next.payload.len());
         Some(next)
+    }
+
+    /// So many bytes are held no more.
+    fn give(&self, bytes: usize) {
+        if let Some(budget) = &self.budget {
+            budget.give(bytes);
+        }
     }
 
     /// Takes out what has expired by `now`. Costs nothing as long as nothing can have.
@@ -167,6 +200,7 @@ impl ClassQueue {
                 }
             }
         }
+        self.give(expired.iter().map(|message| message.payload.len()).sum());
         expired
     }
 
@@ -190,9 +224,26 @@ impl ClassQueue {
 
     /// Empties the queue, most urgent class first.
     pub fn drain_all(&mut self) -> impl Iterator<Item = Message> + use<> {
+        self.give(self.bytes());
         self.bytes = [0; 3];
         std::mem::take(&mut self.lanes).into_iter().flatten()
     }
+}
+
+impl Drop for ClassQueue {
+    fn drop(&mut self) {
+        self.give(self.bytes());
+    }
+}
+
+/// Whether a budget has room for `length` bytes in the place of `former` ones; if so, they are counted.
+fn takes_instead(budget: Option<&Budget>, length: usize, former: usize) -> bool {
+    let Some(budget) = budget else { return true };
+    if let Some(fewer) = former.checked_sub(length) {
+        budget.give(fewer);
+        return true;
+    }
+    budget.take(length - former)
 }
 
 /// The value whose place one with this header takes: none that waits before a [mark](ClassQueue::push_beyond) of the same
@@ -317,7 +368,8 @@ mod tests {
             inputs in proptest::collection::vec((0usize..3, 0u32..3, 0usize..40, 0u8..8), 0..200),
         ) {
             const BOUNDS: Bounds = Bounds { messages: 6, bytes: 64 };
-            let mut queue = ClassQueue::new(BOUNDS);
+            let budget = Budget::new(150);
+            let mut queue = ClassQueue::sharing(BOUNDS, budget.clone());
             for (now, (class, source, length, step)) in (1u64..).zip(inputs) {
                 let mut message = long(Class::ALL[class], source, length);
                 (message.header.sent, message.header.time_to_live_us) = (Time::from_nanos(now * 1_000), 20);
@@ -338,10 +390,15 @@ mod tests {
                     prop_assert_eq!(lane.iter().map(|message| message.payload.len()).sum::<usize>(), counted);
                     prop_assert!(lane.len() <= BOUNDS.messages);
                 }
+                prop_assert!(budget.held() == queue.bytes() && budget.held() <= 150);
             }
             let counted = queue.bytes();
             prop_assert_eq!(queue.drain_all().map(|message| message.payload.len()).sum::<usize>(), counted);
-            prop_assert_eq!((queue.bytes(), queue.len()), (0, 0));
+            prop_assert_eq!((queue.bytes(), queue.len(), budget.held()), (0, 0, 0));
+            queue.push(long(Class::Bulk, 1, 40)).unwrap();
+            prop_assert_eq!(budget.held(), 40);
+            drop(queue);
+            prop_assert_eq!(budget.held(), 0);
         }
 
         #[test]
