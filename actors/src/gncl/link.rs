@@ -155,6 +155,7 @@ pub(super) async fn write_frame(socket: &TcpStream, message: &Message) -> io::Re
 struct Reader {
     socket: Arc<TcpStream>,
     buffer: BytesMut,
+    codec: FrameCodec,
     reading: Reading,
     /// Frames were delivered of which the shell does not know yet.
     heard: bool,
@@ -178,6 +179,7 @@ impl Reader {
         Self {
             socket,
             buffer: BytesMut::new(),
+            codec: FrameCodec::new(HANDSHAKE_PAYLOAD_MAX),
             reading,
             heard: false,
             greeted: false,
@@ -208,8 +210,9 @@ impl Reader {
                 return Look::Empty;
             }
         };
+        self.codec.set_payload_max(payload_max);
         for _ in 0..FRAMES_PER_WAKE {
-            match (FrameCodec::new(payload_max).decode(&mut self.buffer), &*mode) {
+            match (self.codec.decode(&mut self.buffer), &*mode) {
                 (Ok(Some(message)), Mode::Linked(inbound)) if !is_for_the_shell(&message) => {
                     self.heard = true;
                     if let Err(decline) = inbound.receive(Time::now(), message) {
@@ -243,7 +246,7 @@ impl Reader {
         let left = self.buffer.capacity() - self.buffer.len();
         // A quarter of room left is room enough: copying the rest of a frame for each read would cost more. A larger buffer
         // is one that the codec has made for the frame that is coming, and is filled to its end.
-        if left == 0 || left < room / 4 && self.buffer.capacity() <= room {
+        if left == 0 || left < room / 4 && self.buffer.capacity() <= FrameCodec::BUFFER_KEPT {
             self.buffer.reserve(room);
         }
         if self.turn >= BYTES_PER_TURN {

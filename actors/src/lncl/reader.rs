@@ -28,7 +28,7 @@ impl Reader {
 
     /// Takes payloads of at most `payload_max` bytes from now on.
     pub(crate) fn set_payload_max(&mut self, payload_max: usize) {
-        self.codec = FrameCodec::new(payload_max);
+        self.codec.set_payload_max(payload_max);
     }
 
     /// The next frame that is there already; `None` if there is none and none will come, the process at the other end
@@ -56,8 +56,10 @@ impl Reader {
                 return Ok(Some(message));
             }
             stream.readable().await?;
-            // What the codec has made room for is filled first: then it is that frame's alone.
-            if self.buffer.len() == self.buffer.capacity() {
+            // A long buffer is one that the codec has made for the frame that is coming, and is filled to its end.
+            if self.buffer.capacity() <= FrameCodec::BUFFER_KEPT
+                || self.buffer.len() == self.buffer.capacity()
+            {
                 self.buffer.reserve(READ_CHUNK);
             }
             match stream.try_read_buf(&mut self.buffer) {

@@ -26,10 +26,8 @@ pub enum FrameError {
     Io(#[from] std::io::Error),
 }
 
-/// A frame of at least so many bytes that is alone in its buffer takes the buffer along; of others the payload is copied.
-const TAKES_ITS_BUFFER: usize = 8 * 1024;
-/// A longer buffer that nothing is left in is given back.
-const BUFFER_KEPT: usize = 256 * 1024;
+/// The payloads of frames that are shorter are copied out of the buffer that they came in.
+const COPIED_BELOW: usize = 8 * 1024;
 
 /// Cuts a byte stream into messages and writes messages to one.
 ///
@@ -39,7 +37,9 @@ const BUFFER_KEPT: usize = 256 * 1024;
 pub struct FrameCodec {
     payload_max: usize,
     checksum: Checksum,
-    /// The most that the present buffer was seen to hold room for: what is cut off from its front does not show any more.
+    /// Where the present buffer ends, by which it is known again.
+    end: usize,
+    /// The most that it was seen to have room for: what is cut off from its front does not show any more.
     largest: usize,
 }
 
@@ -74,13 +74,18 @@ impl FrameCodec {
     /// A codec that takes payloads of at most `payload_max` bytes.
     #[must_use]
     pub const fn new(payload_max: usize) -> Self {
-        Self { payload_max, checksum: Checksum::Crc, largest: 0 }
+        Self { payload_max, checksum: Checksum::Crc, end: 0, largest: 0 }
+    }
+
+    /// Takes payloads of at most `payload_max` bytes from now on.
+    pub const fn set_payload_max(&mut self, payload_max: usize) {
+        self.payload_max = payload_max;
     }
 
     /// A codec for frames that stay in memory: without checksums.
     #[must_use]
     pub const fn in_memory(payload_max: usize) -> Self {
-        Self { payload_max, checksum: Checksum::None, largest: 0 }
+        Self { payload_max, checksum: Checksum::None, end: 0, largest: 0 }
     }
 }
 
@@ -95,6 +100,7 @@ impl Decoder for FrameCodec {
             return Err(FrameError::TooLong { said, limit: self.payload_max });
         }
         let whole = HEADER_LEN + said;
+        self.watch(source);
         if source.len() < whole {
             self.make_room(source, whole);
             return Ok(None);
@@ -107,40 +113,55 @@ impl Decoder for FrameCodec {
 }
 
 impl FrameCodec {
-    /// Sees to it that the rest of a frame of `whole` bytes has room: in a buffer of just that length, if it needs a new one.
-    fn make_room(&mut self, source: &mut BytesMut, whole: usize) {
-        if source.capacity() < whole {
+    /// A longer frame has a buffer of its own, which goes with it, and a longer buffer that nothing is left in is given back.
+    pub const BUFFER_KEPT: usize = 256 * 1024;
+
+    /// Sees how large the allocation is that payloads would keep.
+    fn watch(&mut self, source: &BytesMut) {
+        let end = source.as_ptr().addr() + source.capacity();
+        self.largest = if end == self.end { self.largest.max(source.capacity()) } else { source.capacity() };
+        self.end = end;
+    }
+
+    /// Sees to it that the rest of a frame of `whole` bytes has room.
+    fn make_room(&self, source: &mut BytesMut, whole: usize) {
+        if whole <= Self::BUFFER_KEPT {
+            // Where the one before it is not needed any more its memory is used again.
+            source.reserve(whole - source.len());
+        } else if source.capacity() < whole {
             let mut own = BytesMut::with_capacity(whole);
             own.put_slice(source);
             *source = own;
-            self.largest = 0;
         }
-    }
-
-    /// Begins at the front of an empty buffer again, or gives a long one back.
-    fn reuse(&mut self, source: &mut BytesMut) {
-        // Nothing else holds it, so that all of its length can be had again.
-        if self.largest > BUFFER_KEPT || !source.try_reclaim(self.largest) {
-            *source = BytesMut::new();
-        }
-        self.largest = 0;
     }
 
     /// The payload of the first frame of `source`, which has `whole` bytes.
-    fn take_payload(&mut self, source: &mut BytesMut, whole: usize) -> Bytes {
-        self.largest = self.largest.max(source.capacity());
-        if source.len() == whole && whole >= TAKES_ITS_BUFFER && whole >= self.largest / 4 {
-            self.largest = 0;
-            let mut frame = std::mem::take(source).freeze();
+    fn take_payload(&self, source: &mut BytesMut, whole: usize) -> Bytes {
+        // It may wait for long, and must not keep much more than itself.
+        let fills_its_buffer = whole >= COPIED_BELOW && whole >= self.largest / 4;
+        if fills_its_buffer && (whole <= Self::BUFFER_KEPT || whole == source.len()) {
+            let mut frame = source.split_to(whole).freeze();
             frame.advance(HEADER_LEN);
+            self.tidy(source);
             return frame;
         }
         let payload = Bytes::copy_from_slice(&source[HEADER_LEN..whole]);
         source.advance(whole);
-        if source.is_empty() {
-            self.reuse(source);
-        }
+        self.tidy(source);
         payload
+    }
+
+    /// Gives a long buffer back that has become empty; a shorter one begins at its front again, if no payload keeps it.
+    fn tidy(&self, source: &mut BytesMut) {
+        if !source.is_empty() {
+            return;
+        }
+        if self.largest > 2 * Self::BUFFER_KEPT {
+            *source = BytesMut::new();
+        } else {
+            // Where a payload keeps it this is tried again when there is to be room.
+            let _ = source.try_reclaim(self.largest);
+        }
     }
 }
 
@@ -244,15 +265,63 @@ mod tests {
             let at = payload.as_ptr() as usize;
             assert!(!(start..start + (1 << 20)).contains(&at), "{} bytes keep a MiB", payload.len());
         }
-        let whole = frame(&[3; 100_000]);
-        for piece in whole.chunks(30_000) {
-            assert!(codec.decode(&mut buffer).unwrap().is_none());
-            buffer.extend_from_slice(piece);
+        assert_eq!(buffer.capacity(), 0, "it is given back");
+        for length in [20_000, 100_000, 500_000] {
+            for piece in frame(&vec![3; length]).chunks(30_000) {
+                assert!(codec.decode(&mut buffer).unwrap().is_none());
+                buffer.extend_from_slice(piece);
+            }
+            let start = buffer.as_ptr() as usize;
+            let long = codec.decode(&mut buffer).unwrap().expect("a whole frame").payload;
+            assert_eq!(long.as_ptr() as usize, start + HEADER_LEN, "{length} bytes are not copied");
         }
-        let start = buffer.as_ptr() as usize;
-        let long = codec.decode(&mut buffer).unwrap().expect("a whole frame").payload;
-        assert_eq!(long.as_ptr() as usize, start + HEADER_LEN, "it is not copied");
-        assert_eq!(buffer.capacity(), 0);
+    }
+
+    #[test]
+    fn a_buffer_whose_payload_is_gone_is_used_again_and_one_that_is_kept_is_not() {
+        let (mut codec, mut buffer) = (FrameCodec::new(1 << 20), BytesMut::new());
+        let mut next = |value: u8| {
+            buffer.extend_from_slice(&frame(&[value; 60_000]));
+            codec.decode(&mut buffer).unwrap().expect("a whole frame").payload
+        };
+        let first = next(1);
+        let at = first.as_ptr();
+        drop(first);
+        let second = next(2);
+        assert_eq!(second.as_ptr(), at);
+        let third = next(3);
+        assert_ne!(third.as_ptr(), at);
+        assert!(second.iter().all(|byte| *byte == 2) && third.iter().all(|byte| *byte == 3));
+    }
+
+    proptest! {
+        // Each of them moves megabytes.
+        #![proptest_config(ProptestConfig::with_cases(32))]
+
+        #[test]
+        fn what_a_payload_keeps_is_a_few_times_its_length_whatever_came_before(
+            lengths in proptest::collection::vec(prop_oneof![0usize..200, 8_000usize..9_000, 20_000usize..700_000], 1..20),
+            piece in 1_000usize..300_000,
+        ) {
+            let stream: Vec<u8> = lengths.iter().flat_map(|length| frame(&vec![7; *length]).to_vec()).collect();
+            let (mut codec, mut buffer, mut waiting) = (FrameCodec::new(1 << 20), BytesMut::new(), Vec::new());
+            let mut buffers = Vec::new();
+            for piece in stream.chunks(piece) {
+                buffer.extend_from_slice(piece);
+                let held = buffer.as_ptr() as usize..buffer.as_ptr() as usize + buffer.capacity();
+                while let Some(message) = codec.decode(&mut buffer).unwrap() {
+                    let at = message.payload.as_ptr() as usize;
+                    if held.contains(&at) {
+                        buffers.push((message.payload.len(), held.len()));
+                    }
+                    waiting.push(message.payload);
+                }
+            }
+            for (length, kept) in buffers {
+                prop_assert!(length >= COPIED_BELOW - HEADER_LEN && kept <= 5 * length, "{length} bytes keep {kept}");
+            }
+            prop_assert_eq!(waiting.iter().map(Bytes::len).collect::<Vec<_>>(), lengths);
+        }
     }
 
     #[test]
