@@ -15,6 +15,8 @@
 mod draining;
 mod expiry;
 mod half;
+mod held;
+mod outstanding;
 mod partial;
 mod resume;
 #[cfg(test)]
@@ -40,6 +42,7 @@ use crate::session::Ack;
 
 use draining::Drained;
 use half::{After, Bound, Half, Step};
+pub(crate) use held::line_of;
 pub(crate) use resume::Session;
 
 /// A non-blocking socket, or what is like one, that can be written to from any thread.
@@ -282,7 +285,14 @@ impl<S: Socket> StreamOutlet<S> {
 
     /// Messages that wait to be sent.
     pub(crate) fn waiting(&self) -> usize {
-        self.lock().waiting()
+        let half = self.lock();
+        half.waiting() + half.in_lines()
+    }
+
+    /// Messages that wait because their destinations take nothing.
+    #[cfg(test)]
+    pub(crate) fn in_lines(&self) -> usize {
+        self.lock().in_lines()
     }
 
     /// Confirmed messages whose outcome is not known yet.
@@ -311,5 +321,13 @@ impl<S: Socket> Outlet for StreamOutlet<S> {
             step = self.with(|half, after| half.write_on(after));
         }
         Ok(())
+    }
+
+    fn offer(&self, message: Message) -> Result<(), Refused> {
+        let result = self.submit(message);
+        if result.as_ref().is_err_and(|refused| refused.why == Rejection::QueueFull) {
+            self.lock().is_offered_again();
+        }
+        result
     }
 }

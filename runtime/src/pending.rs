@@ -188,6 +188,10 @@ impl<O: Outlet> Outlet for AppOutlet<O> {
             Err(message) => self.inbox.submit(message),
         }
     }
+
+    fn offer(&self, message: Message) -> Result<(), Refused> {
+        if is_answer(&message.header) { self.submit(message) } else { self.inbox.offer(message) }
+    }
 }
 
 #[cfg(test)]

@@ -24,6 +24,14 @@ pub trait Outlet: Send + Sync {
     /// # Errors
     /// The message, untouched, and why it was not taken.
     fn submit(&self, message: Message) -> Result<(), Refused>;
+
+    /// As [`submit`](Self::submit), by one who keeps what finds a full queue and offers it again: that is not counted as refused.
+    ///
+    /// # Errors
+    /// As `submit`.
+    fn offer(&self, message: Message) -> Result<(), Refused> {
+        self.submit(message)
+    }
 }
 
 /// A message that an [`Outlet`] did not take.
@@ -142,6 +150,25 @@ impl Router {
             Ok(())
         };
         self.account(result)
+    }
+
+    /// Offers a message that came from another node to the one application of this node that it is for. One who is refused because of a
+    /// full queue may offer it again; any other refusal is to be [told](Self::refuse).
+    ///
+    /// # Errors
+    /// The message, and why it was not taken.
+    pub fn offer(&self, message: Message) -> Result<(), Refused> {
+        let table = self.table.load();
+        match table.local.get(&message.header.destination.app) {
+            Some(route) => route.outlet.offer(message),
+            None => Err(Refused::new(message, Rejection::NoSuchApplication)),
+        }
+    }
+
+    /// Counts a message that nobody takes, and settles it so.
+    pub fn refuse(&self, refused: Refused) {
+        // The reason is told to whom the receipt belongs.
+        let _ = self.account(Err(refused));
     }
 
     /// Whether the application of this node at `app` subscribed to events of this kind.

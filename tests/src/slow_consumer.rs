@@ -142,8 +142,10 @@ pub fn run(plan: &Plan) -> Report {
 fn bounds() -> [u64; 2] {
     let config = sinew::config::NodeConfig::new("any");
     let (kept_unacknowledged, frame) = (4 << 20, config.payload_max as u64);
-    let sender = config.gncl.queue_bytes as u64 + kept_unacknowledged + frame;
-    let receiver = config.mailbox_bytes as u64 + frame;
+    // What waits in line for a consumer that is held: a window and two frames there, 4 MiB and one frame here.
+    let (line_here, line_there) = ((4 << 20) + frame, kept_unacknowledged + 2 * frame);
+    let sender = config.gncl.queue_bytes as u64 + kept_unacknowledged + frame + line_here;
+    let receiver = config.mailbox_bytes as u64 + frame + line_there;
     [sender + SLACK_BYTES, receiver + SLACK_BYTES]
 }
 

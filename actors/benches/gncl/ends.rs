@@ -85,7 +85,9 @@ impl Handler<Delivery<Ask>> for Echo {
     }
 }
 
-struct Sink;
+struct Sink {
+    pause: Duration,
+}
 
 impl Actor for Sink {
     type Context = AppContext<Self>;
@@ -96,6 +98,9 @@ impl Handler<Delivery<Load>> for Sink {
 
     fn handle(&mut self, load: Delivery<Load>, _: &mut Self::Context) {
         std::hint::black_box(load.payload.block);
+        if !self.pause.is_zero() {
+            std::thread::sleep(self.pause);
+        }
     }
 }
 
@@ -199,9 +204,9 @@ fn node(name: &str, host: u8, group: &str) -> NodeBuilder {
 }
 
 /// The node that answers, until its input ends.
-pub(crate) fn echo(group: &str) {
+pub(crate) fn echo(group: &str, pause: Duration) {
     let echo = AppSpec::new("echo", || Echo).handles::<Ask>().own_thread();
-    let sink = AppSpec::new("sink", || Sink).handles::<Load>().own_thread();
+    let sink = AppSpec::new("sink", move || Sink { pause }).handles::<Load>().own_thread();
     let _node = node("there", 2, group).app(echo).app(sink).start().expect("a node");
     println!("there");
     // Until the measuring end closes the pipe or ends this process.

@@ -7,12 +7,14 @@
 //! - `control_beside_bulk_N`: round trips of 64 bytes in class Control, one every millisecond: first alone, then beside a
 //!   flood of Bulk messages of N bytes to another application of the other node, as fast as they are taken. What counts is the
 //!   p99 beside the flood by the p99 alone (`p99_ratio_percent`).
+//! - `control_beside_slow_consumer`: the same, and the application that is flooded takes a millisecond for each of its messages.
 
 mod ends;
 
 use std::{
     io::{BufRead, BufReader},
     process::{Child, Command, ExitCode, Stdio},
+    time::Duration,
 };
 
 use sinew_figures::Alone;
@@ -20,16 +22,18 @@ use sinew_figures::Alone;
 /// The role of a process that this program starts of itself.
 const ROLE: &str = "SINEW_GNCL_ROLE";
 
-/// A case: the length of the Bulk messages, in bytes.
+/// A case: the length of the Bulk messages in bytes, and how long whoever takes them takes for each.
 struct Case {
     name: &'static str,
     bulk_bytes: usize,
+    pause_us: u64,
 }
 
 const CASES: &[Case] = &[
-    Case { name: "control_beside_bulk_1000", bulk_bytes: 1_000 },
-    Case { name: "control_beside_bulk_65536", bulk_bytes: 65_536 },
-    Case { name: "control_beside_bulk_1000000", bulk_bytes: 1_000_000 },
+    Case { name: "control_beside_bulk_1000", bulk_bytes: 1_000, pause_us: 0 },
+    Case { name: "control_beside_bulk_65536", bulk_bytes: 65_536, pause_us: 0 },
+    Case { name: "control_beside_bulk_1000000", bulk_bytes: 1_000_000, pause_us: 0 },
+    Case { name: "control_beside_slow_consumer", bulk_bytes: 1_000, pause_us: 1_000 },
 ];
 
 fn main() -> ExitCode {
@@ -66,7 +70,10 @@ fn play(role: &str) -> ExitCode {
             let case = CASES.iter().find(|case| case.name == name);
             measure(case.expect("a name that this program wrote itself"));
         }
-        ["echo", group] => ends::echo(group),
+        ["echo", group, pause_us] => {
+            let pause_us = pause_us.parse().expect("a number that this program wrote itself");
+            ends::echo(group, Duration::from_micros(pause_us));
+        }
         _ => {
             eprintln!("no such role: {role}");
             return ExitCode::FAILURE;
@@ -78,7 +85,7 @@ fn play(role: &str) -> ExitCode {
 fn measure(case: &Case) {
     let process = std::process::id();
     let group = format!("239.255.84.{}:{}", process % 200 + 1, 20_000 + process % 20_000);
-    let _other = Other::start(&group);
+    let _other = Other::start(&group, case.pause_us);
     let seen = ends::measure(&group, case.bulk_bytes);
     let report = |figure, seen, counts: &[(&str, u64)]| {
         Alone { bench: "gncl", case: case.name, figure, seen, counts }.report();
@@ -98,8 +105,8 @@ fn measure(case: &Case) {
 struct Other(Child);
 
 impl Other {
-    fn start(group: &str) -> Self {
-        let mut command = this_program(&format!("echo {group}"));
+    fn start(group: &str, pause_us: u64) -> Self {
+        let mut command = this_program(&format!("echo {group} {pause_us}"));
         let mut child = command
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())

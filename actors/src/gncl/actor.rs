@@ -32,7 +32,7 @@ use super::{
     inbound::Inbound,
     link::{self, Mode, News, Reading, SharedMode, What},
     listener,
-    peer::frame,
+    peer::{Store, frame},
 };
 use crate::{
     config::NodeConfig,
@@ -392,6 +392,7 @@ impl Actor for Gncl {
         }
         ctx.add_stream(listener::accepted(listener));
         ctx.add_stream(self.stores.posts.gncl.attach_keeping(Clone::clone));
+        ctx.spawn(fut::wrap_future(Store::serve_those_held_up(self.stores.clone())));
         ctx.run_interval(EXPIRY_PERIOD, |actor, _| {
             let now = Time::now();
             for way in actor.stores.gncl.peers().iter().flat_map(|peer| peer.ways()) {

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use sinew_runtime::{
     outcome::{Outcome, Receipt, Rejection, Ticket},
+    router::Refused,
     tid::{AppAddress, NodeAddress},
     time::Time,
     wire::{Class, Flags, Kind, Message},
@@ -12,8 +13,12 @@ use sinew_runtime::{
 use super::{
     core::{Decline, Lane, read},
     peer::Peer,
+    way::{Taken, Way},
 };
-use crate::{outlet::LinkNumber, stores::Stores};
+use crate::{
+    outlet::{LinkNumber, line_of},
+    stores::Stores,
+};
 
 /// The way in for the frames of one peer.
 pub(super) struct Inbound {
@@ -37,13 +42,14 @@ impl Inbound {
             return Ok(());
         }
         // Counted first: what panics from here on must not come again.
-        if way.arrive(self.link, &message)? && !is_for_the_link(&message, Kind::GNCL_VOID) {
-            self.take(now, message);
+        let taken = way.arrive(self.link, &message)?;
+        if taken != Taken::No && !is_for_the_link(&message, Kind::GNCL_VOID) {
+            self.take(now, message, way, taken);
         }
         Ok(())
     }
 
-    fn take(&self, now: Time, mut message: Message) {
+    fn take(&self, now: Time, mut message: Message, way: &Way, taken: Taken) {
         let header = message.header;
         if header.source.node != self.peer.node {
             // No outcome is sent: the source that it names has not sent it.
@@ -66,8 +72,27 @@ impl Inbound {
         if message.header.is_expired(now) {
             return message.settle(Outcome::Expired);
         }
-        // The router counts what nobody takes, and settles it.
-        let _ = self.stores.router.deliver(message);
+        match (taken, line_of(&message.header)) {
+            (Taken::InLine(line), _) => self.put_in_line(way, line, message),
+            (_, Some(line)) => self.offer(way, line, message),
+            // The router counts what nobody takes, and settles it.
+            (_, None) => drop(self.stores.router.deliver(message)),
+        }
+    }
+
+    fn offer(&self, way: &Way, line: u64, message: Message) {
+        match self.stores.router.offer(message) {
+            Ok(()) => {}
+            Err(Refused { message, why: Rejection::QueueFull }) => self.put_in_line(way, line, message),
+            Err(refused) => self.stores.router.refuse(refused),
+        }
+    }
+
+    fn put_in_line(&self, way: &Way, line: u64, message: Message) {
+        match way.put_in_line(line, message) {
+            Ok(()) => self.stores.gncl.held_up.notify_one(),
+            Err(message) => self.stores.router.refuse(Refused::new(message, Rejection::QueueFull)),
+        }
     }
 
     /// The peer's time in our clock; never later than `now`.

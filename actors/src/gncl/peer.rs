@@ -4,6 +4,7 @@ use std::{
     collections::BTreeMap,
     net::Shutdown,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::Duration,
 };
 
 use bytes::Bytes;
@@ -15,6 +16,7 @@ use sinew_runtime::{
     wire::{Class, Header, Kind, Message},
 };
 use socket2::SockRef;
+use tokio::sync::Notify;
 
 use super::{
     core::{Attach, Lane},
@@ -25,6 +27,11 @@ use crate::{
     refusals::Refusals,
     stores::{Stores, lock},
 };
+
+/// How often what waits for an application that is full is offered to it. A mailbox that is full has work for longer.
+const OFFER_PERIOD: Duration = Duration::from_millis(1);
+/// Peers at most that are gone and have left messages for applications that take nothing.
+const GONE_MAX: usize = 16;
 
 /// One life of another node, from its first link until it is forgotten.
 pub(crate) struct Peer {
@@ -97,7 +104,7 @@ impl ReceiptSink for Peer {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
         let mut said = Message::outcome(ticket, outcome);
         said.header.sent = Time::now();
-        self.way_of(said.header.class).send(said);
+        self.way_of(said.header.class).send_outcome(said);
     }
 }
 
@@ -112,6 +119,10 @@ pub(super) fn frame(here: NodeAddress, node: NodeAddress, kind: Kind, payload: B
 #[derive(Default)]
 pub(crate) struct Store {
     peers: Mutex<BTreeMap<NodeAddress, Arc<Peer>>>,
+    /// Peers that are gone, as long as messages of theirs wait for applications here.
+    gone: Mutex<Vec<Arc<Peer>>>,
+    /// Told when a message has to wait for an application here.
+    pub(super) held_up: Notify,
     /// The socket that listens. It stays open while this layer is restarted: a peer that is refused would say that this
     /// node is lost.
     pub(super) listener: Mutex<Option<std::net::TcpListener>>,
@@ -151,8 +162,35 @@ impl Store {
     pub(super) fn forget(&self, node: NodeAddress) {
         let peer = self.lock().remove(&node);
         // Closed without the lock: whoever is told of an outcome may ask for a peer.
-        if let Some(peer) = peer {
-            peer.ways.iter().for_each(|way| way.outlet.close(Rejection::NoSuchNode));
+        let Some(peer) = peer else { return };
+        peer.ways.iter().for_each(|way| way.outlet.close(Rejection::NoSuchNode));
+        if peer.ways.iter().any(Way::is_held_up) {
+            let mut gone = lock(&self.gone);
+            // What the first one left has waited longest; it is dropped, and its receipts have nobody to tell.
+            let surplus = (gone.len() + 1).saturating_sub(GONE_MAX);
+            let dropped: Vec<_> = gone.drain(..surplus).collect();
+            gone.push(peer);
+            drop(gone);
+            drop(dropped);
+        }
+    }
+
+    /// Offers what waits for applications here to them again, and goes on as long as some does.
+    pub(super) async fn serve_those_held_up(stores: Arc<Stores>) {
+        let store = &stores.gncl;
+        let all = || store.peers().into_iter().chain(lock(&store.gone).clone()).collect::<Vec<_>>();
+        all().iter().flat_map(|peer| &peer.ways).for_each(Way::forget_offers);
+        loop {
+            let ways = all();
+            let now = Time::now();
+            let offer = |way: &&Way| way.offer_again(now, &stores.router);
+            let waits = ways.iter().flat_map(|peer| &peer.ways).filter(offer).count() > 0;
+            lock(&store.gone).retain(|peer| peer.ways.iter().any(Way::is_held_up));
+            if waits {
+                tokio::time::sleep(OFFER_PERIOD).await;
+            } else {
+                store.held_up.notified().await;
+            }
         }
     }
 

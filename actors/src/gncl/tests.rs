@@ -2,6 +2,7 @@
 
 mod bench;
 mod classes;
+mod credit;
 mod handshakes;
 mod links;
 mod messages;

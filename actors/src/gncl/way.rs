@@ -4,8 +4,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use bytes::Bytes;
 use sinew_runtime::{
-    outcome::Rejection,
-    router::Outlet as _,
+    outcome::{Outcome, Rejection},
+    router::{Outlet as _, Refused, Router},
     tid::NodeAddress,
     time::Time,
     wire::{Kind, Message},
@@ -18,9 +18,9 @@ use super::{
 };
 use crate::{
     config::NodeConfig,
-    outlet::{LinkNumber, OutletLimits, Session, StreamOutlet},
+    outlet::{LinkNumber, OutletLimits, Session, StreamOutlet, line_of},
     refusals::Refusals,
-    session::{Ack, Arrival, Receiving, Window},
+    session::{Ack, Arrival, Receiving, Shelf, ShelfLimits, Window},
 };
 
 /// Bytes of frames for one peer that are kept unacknowledged, from which on further messages wait.
@@ -29,6 +29,33 @@ const WINDOW_BYTES: usize = 4 << 20;
 const WINDOW_MESSAGES_MAX: usize = 1 << 15;
 /// Frames of this layer itself that wait for a socket at most: more than a peer's ACKs, PINGs and PONGs ever are.
 const WORDS_MAX: usize = 32;
+
+/// Applications at most for which messages of one session wait because they take nothing. Of a further one that is full each message is
+/// refused at once.
+const LINES_MAX: usize = 64;
+/// Windows that may wait for applications, all together.
+const SHELF_WINDOWS: usize = 4;
+/// Messages of one line that are offered before others have their turn.
+const OFFERS_PER_TURN: usize = 256;
+/// Times `gncl.queue_capacity`: so many outcomes may wait to be sent. They answer confirmed messages of the peer, of which it can
+/// have that many.
+const OUTCOMES_MAX: usize = 8;
+
+/// What is to be done with a message that has come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Taken {
+    /// Nothing: it comes again elsewhere.
+    No,
+    Yes,
+    /// Its destination takes nothing now: it belongs behind what waits there. spec: CREDIT-1
+    InLine(u64),
+}
+
+/// What was taken of a peer's messages, and those that wait for applications here.
+struct Inbox {
+    receiving: Receiving,
+    shelf: Shelf<u64, Message>,
+}
 
 /// The two nodes of a session.
 #[derive(Clone, Copy, Debug)]
@@ -40,8 +67,9 @@ pub(super) struct Ends {
 /// A session with a peer.
 pub(crate) struct Way {
     pub(crate) outlet: StreamOutlet<Arc<TcpStream>>,
-    /// What was taken of its messages. Locked for a moment, never with another lock in hand.
-    receiving: Mutex<Receiving>,
+    /// Locked for a moment, never with another lock in hand.
+    inbox: Mutex<Inbox>,
+    outcomes_max: usize,
     ends: Ends,
     refusals: Arc<Refusals>,
 }
@@ -60,31 +88,45 @@ impl Way {
         let memory = now.as_nanos();
         let void = frame(ends.here, ends.node, Kind::GNCL_VOID, Bytes::new()).header;
         let outlet = StreamOutlet::with_session(limits, Session::new(memory, window, void));
-        let receiving = Mutex::new(Receiving::new(memory));
-        Self { outlet, receiving, ends, refusals: refusals.clone() }
+        // A message may be acknowledged before it is known that its destination is full: one more than a window.
+        let (line_messages, line_bytes) = (messages + 1, WINDOW_BYTES + config.payload_max);
+        let shelf = Shelf::new(ShelfLimits {
+            lines: LINES_MAX,
+            line_messages,
+            line_bytes,
+            messages: SHELF_WINDOWS * line_messages,
+            bytes: SHELF_WINDOWS * line_bytes,
+        });
+        let inbox = Mutex::new(Inbox { receiving: Receiving::new(memory), shelf });
+        let outcomes_max = OUTCOMES_MAX * config.gncl.queue_capacity;
+        Self { outlet, inbox, outcomes_max, ends, refusals: refusals.clone() }
     }
 
     /// Its messages come on `link` from now on, and are taken from no other.
     pub(super) fn attach(&self, link: LinkNumber) {
-        self.receiving().attach(link.number());
+        self.inbox().receiving.attach(link.number());
         self.acknowledge();
     }
 
-    /// A message came on `link`. Returns whether it is to be taken.
+    /// A message came on `link`. Says whether it is to be taken, and where it belongs.
     ///
     /// # Errors
     /// It is not the next one.
-    pub(super) fn arrive(&self, link: LinkNumber, message: &Message) -> Result<bool, Decline> {
+    pub(super) fn arrive(&self, link: LinkNumber, message: &Message) -> Result<Taken, Decline> {
         let number = message.header.number;
-        let arrival = self.receiving().arrive(link.number(), number, message.size());
+        let (arrival, line) = {
+            let mut inbox = self.inbox();
+            let arrival = inbox.receiving.arrive(link.number(), number, message.size());
+            (arrival, inbox.line(message))
+        };
         match arrival {
             Arrival::Take { ack_is_due } => {
                 if ack_is_due {
                     self.acknowledge();
                 }
-                Ok(true)
+                Ok(line.map_or(Taken::Yes, Taken::InLine))
             }
-            Arrival::Fenced => Ok(false),
+            Arrival::Fenced => Ok(Taken::No),
             Arrival::OutOfStep { expected } => Err(Decline::Violation(format!(
                 "message {number} came where {} is the next one",
                 expected as u16
@@ -94,7 +136,7 @@ impl Way {
 
     /// The peer says what it has taken.
     pub(super) fn heard(&self, link: LinkNumber, ack: &Ack, now: Time) {
-        let counts = self.receiving().heard(link.number(), ack.epoch);
+        let counts = self.inbox().receiving.heard(link.number(), ack.epoch);
         if counts && self.outlet.heard(link, ack, now) {
             self.refusals.count(
                 now,
@@ -110,7 +152,7 @@ impl Way {
 
     /// Tells the peer what was taken, if it does not know.
     pub(super) fn acknowledge_if_owed(&self) {
-        let owes = self.receiving().owes_ack();
+        let owes = self.inbox().receiving.owes_ack();
         if owes {
             self.acknowledge();
         }
@@ -118,12 +160,78 @@ impl Way {
 
     fn acknowledge(&self) {
         let epoch = self.outlet.epoch();
-        let ack = self.receiving().ack(epoch);
+        let ack = {
+            let Inbox { receiving, shelf } = &mut *self.inbox();
+            Ack { change: shelf.change(), held: shelf.held(), ..receiving.ack(epoch) }
+        };
         self.say(frame(self.ends.here, self.ends.node, Kind::GNCL_ACK, write(&ack)));
     }
 
-    fn receiving(&self) -> MutexGuard<'_, Receiving> {
-        self.receiving.lock().unwrap_or_else(PoisonError::into_inner)
+    /// Puts a message behind what waits for its destination; if that is held from now on, the peer is told so at once.
+    ///
+    /// # Errors
+    /// The message: there is no room.
+    pub(super) fn put_in_line(&self, key: u64, message: Message) -> Result<(), Message> {
+        let bytes = message.size();
+        let is_news = {
+            let shelf = &mut self.inbox().shelf;
+            let before = shelf.change();
+            shelf.put(key, message, bytes)?;
+            shelf.change() != before
+        };
+        if is_news {
+            // spec: CREDIT-2
+            self.acknowledge();
+        }
+        Ok(())
+    }
+
+    /// Offers what waits for applications here to them again. Returns whether some still waits.
+    pub(super) fn offer_again(&self, now: Time, router: &Router) -> bool {
+        let held = self.inbox().shelf.held();
+        let released = held.iter().filter(|key| self.offer_line(now, **key, router)).count();
+        if released > 0 {
+            self.acknowledge();
+        }
+        released < held.len()
+    }
+
+    /// Offers what waits in one line until its destination takes no more. Returns whether it is held no more.
+    fn offer_line(&self, now: Time, key: u64, router: &Router) -> bool {
+        for _ in 0..OFFERS_PER_TURN {
+            let Some((mut message, bytes)) = self.inbox().shelf.offer(key) else { return false };
+            // Nobody is told anything with the lock in hand.
+            if message.header.is_expired(now) {
+                message.settle(Outcome::Expired);
+            } else {
+                match router.offer(message) {
+                    Ok(()) => {}
+                    Err(Refused { message, why: Rejection::QueueFull }) => {
+                        self.inbox().shelf.put_back(key, message, bytes);
+                        return false;
+                    }
+                    Err(refused) => router.refuse(refused),
+                }
+            }
+            if self.inbox().shelf.taken(key) {
+                return true;
+            }
+        }
+        false
+    }
+
+    /// Whether messages wait for applications here.
+    pub(super) fn is_held_up(&self) -> bool {
+        !self.inbox().shelf.is_empty()
+    }
+
+    /// Whoever offered what waits has ended.
+    pub(super) fn forget_offers(&self) {
+        self.inbox().shelf.forget_offers();
+    }
+
+    fn inbox(&self) -> MutexGuard<'_, Inbox> {
+        self.inbox.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Says something on the present connection, ahead of all that waits. Without one nobody needs it.
@@ -137,12 +245,27 @@ impl Way {
         }
     }
 
-    /// Sends a frame of this layer itself.
-    pub(super) fn send(&self, message: Message) {
-        if let Err(refused) = self.outlet.submit(message) {
+    /// Sends an outcome: more of them than other messages may wait, for one that is lost leaves its sender waiting.
+    pub(super) fn send_outcome(&self, message: Message) {
+        let result = if self.outlet.waiting() < self.outcomes_max {
+            self.outlet.submit_beyond(message)
+        } else {
+            self.outlet.submit(message)
+        };
+        if let Err(refused) = result {
             let kind = refused.message.header.kind;
             let detail = format!("a frame of kind {kind} for node {}: {}", self.ends.node, refused.why);
             self.refusals.count(Time::now(), "own frame not sent", &detail);
         }
+    }
+}
+
+impl Inbox {
+    /// The line of a message whose destination is held.
+    fn line(&self, message: &Message) -> Option<u64> {
+        if self.shelf.is_empty() {
+            return None;
+        }
+        line_of(&message.header).filter(|key| self.shelf.holds(*key))
     }
 }

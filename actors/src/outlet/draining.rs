@@ -100,6 +100,9 @@ impl<S: Socket> Half<S> {
             return Some(again);
         }
         if self.queue.is_empty() && self.interrupted.is_none() {
+            if self.in_lines() > 0 {
+                return None;
+            }
             return self.last.take().map(|last| self.frill(last));
         }
         if !self.session_has_room() {
@@ -143,6 +146,6 @@ impl<S: Socket> Half<S> {
             || !self.urgent.is_empty()
             || self.behind() > 0
             || waits && self.session_has_room()
-            || !waits && self.last.is_some() && self.session_is_through()
+            || !waits && self.in_lines() == 0 && self.last.is_some() && self.session_is_through()
     }
 }

@@ -21,13 +21,8 @@ impl<S: Socket> Half<S> {
     /// Outcomes that are long overdue do not come any more; their places are needed. By then the senders have stopped
     /// waiting.
     fn give_up_overdue(&mut self, now: Time, after: &mut After) {
-        while let Some(at) = self
-            .sent_receipts
-            .iter()
-            .position(|sent| sent.expiry != Time::MAX && now > sent.expiry + OUTCOME_GRACE)
-        {
-            after.settle.extend(self.sent_receipts.remove(at).map(|sent| (sent.receipt, Outcome::Unknown)));
-        }
+        let overdue = self.sent_receipts.take_overdue(now, OUTCOME_GRACE);
+        after.settle.extend(overdue.into_iter().map(|receipt| (receipt, Outcome::Unknown)));
     }
 
     pub(super) fn expire(&mut self, now: Time, after: &mut After) {
@@ -36,6 +31,7 @@ impl<S: Socket> Half<S> {
             return;
         }
         self.next_expiry = Time::MAX;
+        self.expire_lines(now, after);
         if let Some(message) = self.interrupted.take() {
             self.interrupted = self.keep_or_expire(message, now, after);
         }

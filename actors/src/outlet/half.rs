@@ -6,15 +6,20 @@ use sinew_runtime::{
     mailbox::{Bounds, Budget, ClassQueue},
     outcome::{Outcome, Receipt, Rejection, Ticket},
     router::Refused,
+    tid::Tid,
     time::Time,
     wire::{Checksum, Class, Flags, Message},
 };
 
 use super::{
     LinkNumber, OutletCounts, OutletLimits, Socket,
+    outstanding::{Outstanding, Sent},
     partial::{Partial, Sort, Written},
     resume::Session,
 };
+
+/// Of a session: times the bound for one destination, so many messages may be unconfirmed for all.
+const UNCONFIRMED_DESTINATIONS: usize = 8;
 
 /// What is done when the lock is free again.
 #[derive(Default)]
@@ -40,14 +45,6 @@ pub(super) enum Link<S> {
     /// A sender's write failed; the drainer takes the error to the layer.
     Failed(io::Error),
     Closed(Rejection),
-}
-
-/// A message whose outcome the peer owes.
-pub(super) struct Sent {
-    pub(super) receipt: Receipt,
-    pub(super) expiry: Time,
-    /// The connection's account when it was written.
-    written: u64,
 }
 
 /// Whether a message is refused where too many wait.
@@ -86,8 +83,8 @@ pub(super) struct Half<S> {
     pub(super) waiting_receipts: usize,
     /// No waiting message expires before this.
     pub(super) next_expiry: Time,
-    /// Receipts of messages that were sent, oldest first: outcomes come back in about this order.
-    pub(super) sent_receipts: VecDeque<Sent>,
+    /// Receipts of messages that were sent.
+    pub(super) sent_receipts: Outstanding,
     pub(super) drainer: Option<Waker>,
     pub(super) counts: OutletCounts,
 }
@@ -108,7 +105,7 @@ impl<S: Socket> Half<S> {
             finishing: false,
             waiting_receipts: 0,
             next_expiry: Time::MAX,
-            sent_receipts: VecDeque::new(),
+            sent_receipts: Outstanding::default(),
             drainer: None,
             counts: OutletCounts::default(),
         }
@@ -160,7 +157,7 @@ impl<S: Socket> Half<S> {
 
     /// What was sent and not confirmed may have been handled or not.
     pub(super) fn unknown(&mut self, after: &mut After) {
-        after.settle.extend(self.sent_receipts.drain(..).map(|sent| (sent.receipt, Outcome::Unknown)));
+        after.settle.extend(self.sent_receipts.take_all().map(|sent| (sent.receipt, Outcome::Unknown)));
     }
 
     /// The frame that was being written goes out on the next connection.
@@ -189,12 +186,19 @@ impl<S: Socket> Half<S> {
         }
     }
 
+    /// Takes out all that waits to be sent for the first time.
+    fn take_waiting(&mut self) -> Vec<Message> {
+        let mut waiting: Vec<_> = self.interrupted.take().into_iter().chain(self.queue.drain_all()).collect();
+        waiting.extend(self.empty_lines());
+        waiting
+    }
+
     pub(super) fn close(&mut self, why: Rejection, after: &mut After) {
         self.cut(after);
         self.unknown(after);
         self.forget_kept();
         self.link = Link::Closed(why);
-        let waiting: Vec<_> = self.interrupted.take().into_iter().chain(self.queue.drain_all()).collect();
+        let waiting = self.take_waiting();
         for message in waiting {
             self.counts.lost += 1;
             after.settle.extend(message.receipt.map(|receipt| (receipt, Outcome::PeerLost)));
@@ -205,12 +209,12 @@ impl<S: Socket> Half<S> {
 
     pub(super) fn end(&mut self, in_hand: Outcome, why: Rejection, after: &mut After) {
         let taken = if let Link::Up(socket) = &mut self.link { socket.account().taken } else { u64::MAX };
-        after.settle.extend(self.sent_receipts.drain(..).map(|Sent { receipt, written, .. }| {
+        after.settle.extend(self.sent_receipts.take_all().map(|Sent { receipt, written, .. }| {
             // What lay in its memory untaken was not handled.
             (receipt, if written > taken { Outcome::Rejected(why) } else { in_hand })
         }));
         self.cut(after);
-        let waiting: Vec<_> = self.interrupted.take().into_iter().chain(self.queue.drain_all()).collect();
+        let waiting = self.take_waiting();
         for message in waiting {
             self.counts.lost += 1;
             after.settle.extend(message.receipt.map(|receipt| (receipt, Outcome::Rejected(why))));
@@ -235,6 +239,9 @@ impl<S: Socket> Half<S> {
         if message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
             self.expired(message, after);
             return Ok(Step::Done);
+        }
+        if let Some(key) = self.held_line(&message.header) {
+            return self.put_in_line(key, message).map(|()| Step::Done);
         }
         if self.waiting() > 0 || !self.takes_new() {
             return self.enqueue(message, bound, after).map(|()| Step::Done);
@@ -295,6 +302,17 @@ impl<S: Socket> Half<S> {
         after.wake = self.drainer.take();
     }
 
+    /// Where there is a session, a destination may have as many as the bound says, and all together a few times that: one that
+    /// says nothing for long stops nobody else.
+    fn has_too_many_unconfirmed(&self, destination: Tid) -> bool {
+        let unconfirmed_max = self.limits.unconfirmed_max;
+        if self.session.is_none() {
+            return self.unconfirmed() >= unconfirmed_max;
+        }
+        self.sent_receipts.of(destination) >= unconfirmed_max
+            || self.unconfirmed() >= UNCONFIRMED_DESTINATIONS * unconfirmed_max
+    }
+
     /// A frame that was to be written at once and could not be: it waits like any other.
     fn requeue(&mut self, frame: Partial, bound: Bound, after: &mut After) -> Result<(), Refused> {
         self.waiting_receipts -= usize::from(frame.message.receipt.is_some());
@@ -313,7 +331,10 @@ impl<S: Socket> Half<S> {
         } else if confirmed && message.header.class == Class::Stream {
             // It may be superseded, and then there is no outcome that tells the truth.
             Err(Rejection::Unsupported)
-        } else if confirmed && bound == Bound::Kept && self.unconfirmed() >= self.limits.unconfirmed_max {
+        } else if confirmed
+            && bound == Bound::Kept
+            && self.has_too_many_unconfirmed(message.header.destination)
+        {
             Err(Rejection::QueueFull)
         } else {
             Ok(())
@@ -337,6 +358,11 @@ impl<S: Socket> Half<S> {
         self.next_expiry = self.next_expiry.min(expiry);
         after.wake = self.drainer.take();
         Ok(())
+    }
+
+    /// What found no room is not refused: its sender keeps it.
+    pub(super) const fn is_offered_again(&mut self) {
+        self.counts.refused -= 1;
     }
 
     /// Whether a message that was never sent may be written now.
@@ -382,15 +408,13 @@ impl<S: Socket> Half<S> {
         if let Some(receipt) = frame.message.receipt {
             self.waiting_receipts -= 1;
             let written = if let Link::Up(socket) = &mut self.link { socket.account().written } else { 0 };
-            self.sent_receipts.push_back(Sent { receipt, expiry, written });
+            self.sent_receipts.push(Sent { receipt, expiry, written });
         }
     }
 
     pub(super) fn confirm(&mut self, ticket: Ticket, outcome: Outcome, after: &mut After) -> bool {
-        let Some(at) = self.sent_receipts.iter().position(|sent| sent.receipt.ticket() == ticket) else {
-            return false;
-        };
-        after.settle.extend(self.sent_receipts.remove(at).map(|sent| (sent.receipt, outcome)));
+        let Some(receipt) = self.sent_receipts.take(ticket) else { return false };
+        after.settle.push((receipt, outcome));
         true
     }
 

@@ -10,21 +10,29 @@ use sinew_runtime::{
 use super::{
     LinkNumber, Socket,
     half::{After, Half},
+    held::LIMITS_OF_LINES,
     partial::{Partial, Sort},
 };
-use crate::session::{Ack, Heard, Sending, Window};
+use crate::session::{Ack, Heard, Held, Sending, ShelfLimits, Window};
 
 /// What is kept for the peer.
 pub(crate) struct Session {
     sending: Sending<Message>,
+    /// What waits for destinations that take nothing now.
+    pub(super) held: Held<u64, Message>,
     /// The header of what stands for a message that has lost its use.
     void: Header,
 }
 
 impl Session {
     /// Nothing was sent yet; see [`Sending::new`].
-    pub(crate) const fn new(epoch: u64, window: Window, void: Header) -> Self {
-        Self { sending: Sending::new(epoch, window), void }
+    pub(crate) fn new(epoch: u64, window: Window, void: Header) -> Self {
+        let lines = ShelfLimits {
+            line_messages: window.messages.div_ceil(4),
+            messages: window.messages,
+            ..LIMITS_OF_LINES
+        };
+        Self { sending: Sending::new(epoch, window), held: Held::new(lines), void }
     }
 }
 
@@ -70,6 +78,7 @@ impl<S: Socket> Half<S> {
     pub(super) fn pause(&mut self, partial: Option<Partial>) {
         if let Some(session) = &mut self.session {
             session.sending.link_ended();
+            session.held.link_ended();
         }
         if let Some(partial) = partial {
             self.sent(partial);
@@ -96,6 +105,8 @@ impl<S: Socket> Half<S> {
         }
         let Some(session) = &mut self.session else { return false };
         let heard = session.sending.heard(ack);
+        let turn = session.held.heard(ack.change, ack.held.iter().copied());
+        self.turn(turn);
         after.wake = self.drainer.take();
         match heard {
             Heard::Known => false,

@@ -287,6 +287,21 @@ impl Link {
 
 impl Outlet for Link {
     fn submit(&self, message: Message) -> Result<(), Refused> {
+        self.take(message, |mailbox, message| mailbox.submit(message))
+    }
+
+    fn offer(&self, message: Message) -> Result<(), Refused> {
+        self.take(message, |mailbox, message| mailbox.offer(message))
+    }
+}
+
+impl Link {
+    /// Says to the child at once what it waits for, and has its mailbox take all else.
+    fn take(
+        &self,
+        message: Message,
+        put: impl FnOnce(&Mailbox, Message) -> Result<(), Refused>,
+    ) -> Result<(), Refused> {
         let Header { flags, kind, .. } = message.header;
         if flags.has(Flags::REPLY) || (flags.has(Flags::OUTCOME) && kind == Kind::OUTCOME) {
             return match self.say(message) {
@@ -299,7 +314,7 @@ impl Outlet for Link {
             // The child takes these for the node's own words.
             return Err(Refused::new(message, Rejection::UnknownKind));
         }
-        self.mailbox.submit(message)?;
+        put(&self.mailbox, message)?;
         self.pump();
         Ok(())
     }

@@ -18,17 +18,25 @@
 //! | SESSION-5 | An epoch is one counting. An Ack of a peer that has forgotten what it took ends the epoch: what is kept is reported, not sent again. |
 //! | SESSION-6 | What has lost its use while it was kept (expired, superseded) is sent as a void of the same number. |
 //!
+//! Who cannot be sent to at present is in `shelf.rs`, with its rules (CREDIT-1 to CREDIT-4).
+//!
 //! No socket, no clock: the same calls give the same answers. `docs/protocol/gncl.md` has the bytes.
 
+#[cfg(test)]
+mod credit_model;
 #[cfg(test)]
 mod model;
 mod receiving;
 mod sending;
+mod shelf;
+#[cfg(test)]
+mod table;
 #[cfg(test)]
 mod tests;
 
 pub(crate) use receiving::{Arrival, Receiving};
 pub(crate) use sending::{Heard, Sending, Window};
+pub(crate) use shelf::{Held, Shelf, ShelfLimits, Turn};
 
 use serde::{Deserialize, Serialize};
 
@@ -36,7 +44,7 @@ use serde::{Deserialize, Serialize};
 const FIRST: u64 = 1;
 
 /// What one side says of both directions: payload of the frame ACK.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub(crate) struct Ack {
     /// Which memory of the receiver of this its sender has: another one has forgotten all that was taken.
     pub(crate) memory: u64,
@@ -46,4 +54,15 @@ pub(crate) struct Ack {
     pub(crate) of: u64,
     /// The number that the sender of this takes next: it has all before it.
     pub(crate) next: u64,
+    /// Number of the last change of `held`.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub(crate) change: u64,
+    /// Destinations that take nothing now; see [`Shelf`].
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(crate) held: Vec<u64>,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde calls it with a reference")]
+const fn is_zero(number: &u64) -> bool {
+    *number == 0
 }

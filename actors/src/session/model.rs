@@ -9,7 +9,7 @@ use super::{Ack, Arrival, Heard, Receiving, Sending, Window};
 
 const WINDOW: Window = Window { messages: 2, bytes: 1_000 };
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
 enum Frame {
     Ack(Ack),
     Message { number: u16, value: u8 },

@@ -83,6 +83,7 @@ impl Receiving {
     pub(crate) const fn ack(&mut self, epoch: u64) -> Ack {
         self.unsaid = 0;
         self.unsaid_bytes = 0;
-        Ack { memory: self.memory, epoch, of: self.epoch, next: self.next }
+        let held = Vec::new();
+        Ack { memory: self.memory, epoch, of: self.epoch, next: self.next, change: 0, held }
     }
 }

@@ -171,6 +171,8 @@ impl<M> Sending<M> {
     /// Gives up all that is kept, oldest first.
     pub(crate) fn drain(&mut self) -> Vec<M> {
         self.bytes = 0;
+        // There is nothing that the connection could go on with.
+        self.cursor = None;
         self.kept.drain(..).filter_map(|kept| kept.message).collect()
     }
 }

@@ -316,6 +316,16 @@ impl Outlet for Mailbox {
         }
         taken.map(|waker| waker.into_iter().for_each(Waker::wake))
     }
+
+    fn offer(&self, message: Message) -> Result<(), Refused> {
+        let class = message.header.class as usize;
+        let result = self.submit(message);
+        if result.as_ref().is_err_and(|refused| refused.why == Rejection::QueueFull) {
+            // It is offered again.
+            lock(&self.shared).tallies[class].refused -= 1;
+        }
+        result
+    }
 }
 
 /// Whether one of the node's own layers says something to an application of it: who is there, what it requires, who died.

@@ -164,7 +164,12 @@ impl Node {
 
     /// Registers an application; what comes for it comes out of the stream.
     pub(super) fn app(&self, app: u32) -> PostStream<Message> {
-        let post = Post::new(10_000);
+        self.app_of(app, 10_000)
+    }
+
+    /// The same, with a mailbox for `capacity` messages.
+    pub(super) fn app_of(&self, app: u32, capacity: usize) -> PostStream<Message> {
+        let post = Post::new(capacity);
         let inbox = post.attach();
         let route = LocalRoute { outlet: Arc::new(Inbox(post)), events: Arc::new([]) };
         self.stores.router.set_local(AppAddress::new(0x1000 + app), route);
@@ -262,7 +267,7 @@ impl ByHand {
         let theirs = self.try_hear_any().await.expect("the node says what it takes next");
         assert_eq!(theirs.header.kind, Kind::GNCL_ACK);
         let memory = Time::now().as_nanos();
-        let ours = Ack { memory, epoch: memory, of: 0, next: 1 };
+        let ours = Ack { memory, epoch: memory, of: 0, next: 1, change: 0, held: Vec::new() };
         self.say(&frame(NINE, node.address(), Kind::GNCL_ACK, write(&ours))).await;
     }
 

@@ -169,7 +169,8 @@ fn the_node_in_the_documentation_breaks_its_connection_twice_and_all_arrives_onc
     let Some(mut python) = crate::documentation::python(PAGE, "## A whole node") else { return };
     run(async {
         let mut node = Node::start(1).await;
-        let mut inbox = node.app(1);
+        // It holds Python back.
+        let mut inbox = node.app_of(1, 2);
         let address = node.listens_at();
         let words = [address.port().to_string(), node.tid(1).bits().to_string(), KIND.bits().to_string()];
         python.arg(address.ip().to_string()).args(words).stdout(std::process::Stdio::piped());

@@ -1,0 +1,219 @@
+//! Applications that take nothing: their senders are held, nobody else is, and nothing is lost, double or out of order.
+
+use futures_util::FutureExt;
+use sinew_runtime::{
+    outcome::{Outcome, Rejection},
+    post::PostStream,
+    tid::Tid,
+    time::Time,
+    wire::{Class, Message},
+};
+
+use super::bench::{Node, next, run, within};
+use crate::gncl::core::Lane;
+
+/// Messages that wait for a peer at most, in these tests: a window, too.
+const QUEUE: usize = 64;
+/// Messages that the slow application's mailbox holds.
+const MAILBOX: usize = 8;
+
+/// Two nodes with small queues that have found each other, and an application of the second that is slow.
+async fn pair() -> (Node, Node, PostStream<Message>) {
+    let small = |number| Node::start_with(number, |config| config.gncl.queue_capacity = QUEUE);
+    let (mut a, mut b) = (small(1).await, small(2).await);
+    a.find(b.address(), b.listens_at());
+    b.find(a.address(), a.listens_at());
+    a.up().await;
+    b.up().await;
+    let slow = b.app_of(1, MAILBOX);
+    (a, b, slow)
+}
+
+fn bulk(node: &Node, to: Tid, number: u64) -> Message {
+    let mut message = node.message(to, &number.to_le_bytes());
+    message.header.class = Class::Bulk;
+    message
+}
+
+/// Messages that wait at `node` because their destination is held.
+fn held_at(node: &Node, peer: &Node) -> usize {
+    let peer = node.stores.gncl.peer(peer.address()).expect("it is linked");
+    peer.way(Lane::Bulk).expect("it has a way for each class").outlet.in_lines()
+}
+
+/// Sends to the slow application until its line at the sender is full; returns how many were taken.
+async fn fill(a: &Node, b: &Node) -> u64 {
+    let mut taken = 0;
+    within("the sender's line to be full", async {
+        loop {
+            match a.stores.router.send(bulk(a, b.tid(1), taken)) {
+                Ok(()) => taken += 1,
+                Err(why) => assert_eq!(why, Rejection::QueueFull),
+            }
+            if held_at(a, b) >= QUEUE / 4 {
+                break;
+            }
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+    taken
+}
+
+/// Sends to the slow application, each message when the one before is out, until one waits in its line at the sender.
+async fn hold(a: &Node, b: &Node) {
+    let peer = a.stores.gncl.peer(b.address()).expect("it is linked");
+    let outlet = &peer.way(Lane::Bulk).expect("it has a way for each class").outlet;
+    within("the slow one to be held", async {
+        let mut number = 0;
+        while outlet.in_lines() == 0 {
+            if outlet.waiting() == 0 {
+                a.stores.router.send(bulk(a, b.tid(1), number)).expect("nothing waits before it");
+                number += 1;
+            }
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+}
+
+async fn take_all(slow: &mut PostStream<Message>, count: u64) {
+    for number in 0..count {
+        let message = next("a message for the slow one", slow).await;
+        assert_eq!(message.payload[..], number.to_le_bytes());
+    }
+    assert!(slow.next_now().is_none(), "nothing comes twice");
+}
+
+trait NextNow {
+    fn next_now(&mut self) -> Option<Message>;
+}
+
+impl NextNow for PostStream<Message> {
+    fn next_now(&mut self) -> Option<Message> {
+        futures_util::StreamExt::next(self).now_or_never().flatten()
+    }
+}
+
+#[test]
+fn an_application_that_takes_nothing_holds_its_senders_and_nobody_else() {
+    run(async {
+        let (a, b, mut slow) = pair().await;
+        let mut quick = b.app(2);
+        let taken = fill(&a, &b).await;
+        // Mailbox, line there (a window and one), line here, and what was in the queue when it became held.
+        let bound = MAILBOX + QUEUE + 1 + QUEUE / 4 + QUEUE;
+        assert!(taken as usize <= bound, "{taken} were taken, and {bound} have room");
+        for number in 0..200 {
+            a.stores.router.send(bulk(&a, b.tid(2), number)).expect("another destination is not held");
+            let message = next("a message for the quick one", &mut quick).await;
+            assert_eq!(message.payload[..], number.to_le_bytes());
+        }
+        take_all(&mut slow, taken).await;
+        within("the sender to be held no more", async {
+            while a.stores.router.send(bulk(&a, b.tid(1), taken)).is_err() {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        assert_eq!(
+            next("a message for one that takes again", &mut slow).await.payload[..],
+            taken.to_le_bytes()
+        );
+    });
+}
+
+#[test]
+fn what_waits_for_a_slow_application_outlives_its_nodes_gncl_and_its_senders() {
+    run(async {
+        let (mut a, mut b, mut slow) = pair().await;
+        let taken = fill(&a, &b).await;
+        b.stop_layer();
+        b.start_layer().await;
+        b.find(a.address(), a.listens_at());
+        a.stop_layer();
+        a.start_layer().await;
+        a.find(b.address(), b.listens_at());
+        take_all(&mut slow, taken).await;
+    });
+}
+
+#[test]
+fn what_waits_at_its_sender_expires_there() {
+    run(async {
+        let (mut a, b, _slow) = pair().await;
+        hold(&a, &b).await;
+        let before = held_at(&a, &b);
+        let mut message = a.confirmed(b.tid(1), 77);
+        message.header.class = Class::Bulk;
+        message.header.time_to_live_us = 500_000;
+        message.header.sent = Time::now();
+        a.stores.router.send(message).expect("there is room for it");
+        assert_eq!(held_at(&a, &b), before + 1, "it waits here");
+        assert_eq!(next("its outcome", &mut a.settled).await, (77, Outcome::Expired));
+    });
+}
+
+#[test]
+fn confirmed_messages_that_a_slow_application_leaves_open_take_no_place_of_others() {
+    run(async {
+        let (mut a, b, _slow) = pair().await;
+        let mut quick = b.app(2);
+        let mut refused = None;
+        for correlation in 0..1_000 {
+            let mut message = a.confirmed(b.tid(1), correlation);
+            message.header.class = Class::Bulk;
+            refused = a.stores.router.send(message).err();
+            if refused.is_some() && held_at(&a, &b) > 0 {
+                break;
+            }
+            tokio::task::yield_now().await;
+        }
+        assert_eq!(refused, Some(Rejection::QueueFull), "its own bound is reached");
+        let peer = a.stores.gncl.peer(b.address()).expect("it is linked");
+        let outlet = &peer.way(Lane::Bulk).expect("it has a way for each class").outlet;
+        within("the queue that all share to be empty", async {
+            while outlet.waiting() > outlet.in_lines() {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        let mut message = a.confirmed(b.tid(2), 5_000);
+        message.header.class = Class::Bulk;
+        a.stores.router.send(message).expect("the other destination has its own bound");
+        next("the message", &mut quick).await.receipt.expect("it is confirmed").settle(Outcome::Delivered);
+        loop {
+            let (correlation, outcome) = next("the outcome", &mut a.settled).await;
+            if correlation == 5_000 {
+                break assert_eq!(outcome, Outcome::Delivered);
+            }
+            assert_eq!(outcome, Outcome::Rejected(Rejection::QueueFull), "what found no room said so");
+        }
+    });
+}
+
+#[test]
+fn what_waits_for_an_application_that_goes_is_refused_and_its_sender_is_held_no_more() {
+    run(async {
+        let (mut a, b, _slow) = pair().await;
+        fill(&a, &b).await;
+        b.stores.router.remove_local(b.tid(1).app);
+        within("the lines to be empty", async {
+            while held_at(&a, &b) > 0 {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        let mut message = a.confirmed(b.tid(1), 1);
+        message.header.class = Class::Bulk;
+        within("room", async {
+            while a.stores.router.send(Message::new(message.header, message.payload.clone())).is_err() {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        a.stores.router.send(message).expect("there is room for it");
+        let gone = Outcome::Rejected(Rejection::NoSuchApplication);
+        assert_eq!(next("its outcome", &mut a.settled).await, (1, gone));
+    });
+}

@@ -1,0 +1,108 @@
+//! What waits for destinations that take nothing now, so that what is for others passes it. spec: CREDIT-3
+
+use sinew_runtime::{
+    outcome::Rejection,
+    router::Refused,
+    time::Time,
+    wire::{Class, Flags, Header, Message},
+};
+
+use super::{
+    Socket,
+    half::{After, Half},
+};
+use crate::session::{ShelfLimits, Turn};
+
+/// What waits in lines at the sender. In messages the bound of a session's queue holds, and a quarter of it for each line.
+pub(super) const LIMITS_OF_LINES: ShelfLimits =
+    ShelfLimits { lines: 64, line_messages: 0, line_bytes: 1 << 20, messages: 0, bytes: 4 << 20 };
+
+/// The name of a destination that may be held, by class: an application's mailbox, and not where the newest value is all that
+/// waits.
+pub(crate) fn line_of(header: &Header) -> Option<u64> {
+    let is_for_a_mailbox = header.destination.is_single()
+        && !header.destination.app.is_layer()
+        // One that waits for an answer may take nothing else before it.
+        && !header.flags.has(Flags::OUTCOME)
+        && !header.flags.has(Flags::REPLY);
+    match header.class {
+        Class::Control | Class::Bulk if is_for_a_mailbox => {
+            Some((header.class as u64) << 32 | u64::from(header.destination.app.bits()))
+        }
+        Class::Control | Class::Bulk | Class::Stream => None,
+    }
+}
+
+impl<S: Socket> Half<S> {
+    /// The line that this message belongs into, if its destination is held.
+    pub(super) fn held_line(&self, header: &Header) -> Option<u64> {
+        let session = self.session.as_ref().filter(|session| session.held.holds_any())?;
+        line_of(header).filter(|key| session.held.holds(*key))
+    }
+
+    /// Messages in lines.
+    pub(super) fn in_lines(&self) -> usize {
+        self.session.as_ref().map_or(0, |session| session.held.messages())
+    }
+
+    pub(super) fn put_in_line(&mut self, key: u64, message: Message) -> Result<(), Refused> {
+        let Some(session) = &mut self.session else {
+            return Err(Refused::new(message, Rejection::QueueFull));
+        };
+        let (expiry, confirmed, bytes) = (message.header.expiry(), message.receipt.is_some(), message.size());
+        match session.held.put(key, message, bytes) {
+            Ok(()) => {
+                self.waiting_receipts += usize::from(confirmed);
+                self.next_expiry = self.next_expiry.min(expiry);
+                Ok(())
+            }
+            Err(message) => {
+                self.counts.refused += 1;
+                Err(Refused::new(message, Rejection::QueueFull))
+            }
+        }
+    }
+
+    /// The peer has said who is held: what waits changes between queue and lines, and keeps its order.
+    pub(super) fn turn(&mut self, turn: Turn<Message>) {
+        for message in turn.released.into_iter().rev() {
+            // Never of class Stream, so it is not handed back.
+            let _ = self.queue.put_back(message);
+        }
+        let Some(session) = self.session.as_mut().filter(|_| turn.holds_more) else { return };
+        let waiting: Vec<_> = self.queue.drain_all().collect();
+        for message in waiting {
+            match line_of(&message.header).filter(|key| session.held.holds(*key)) {
+                Some(key) => {
+                    let bytes = message.size();
+                    session.held.put_beyond(key, message, bytes);
+                }
+                // What was in the queue has room in it.
+                None => self.queue.push_beyond(message),
+            }
+        }
+    }
+
+    /// Takes out of the lines what has expired; `next_expiry` takes what is left into account.
+    pub(super) fn expire_lines(&mut self, now: Time, after: &mut After) {
+        let Some(session) = &mut self.session else { return };
+        let mut next = self.next_expiry;
+        let expired = session.held.take_useless(|message| {
+            if message.header.is_expired(now) {
+                return true;
+            }
+            next = next.min(message.header.expiry());
+            false
+        });
+        self.next_expiry = next;
+        for message in expired {
+            self.waiting_receipts -= usize::from(message.receipt.is_some());
+            self.expired(message, after);
+        }
+    }
+
+    /// Takes all out of the lines.
+    pub(super) fn empty_lines(&mut self) -> Vec<Message> {
+        self.session.as_mut().map_or_else(Vec::new, |session| session.held.take_useless(|_| true))
+    }
+}

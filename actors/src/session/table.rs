@@ -1,0 +1,232 @@
+//! Every state of the session's halves, times every input: the new state and the answer, as the file `table.txt`.
+//!
+//! A change of behaviour shows as a difference; `SINEW_WRITE_TABLE=1 cargo test -p sinew session::table` writes the file anew, for a person
+//! to read.
+
+use super::*;
+
+const FILE: &str = "src/session/table.txt";
+const WRITE_VARIABLE: &str = "SINEW_WRITE_TABLE";
+const WINDOW: Window = Window { messages: 2, bytes: 1_000 };
+const LIMITS: ShelfLimits =
+    ShelfLimits { lines: 2, line_messages: 2, line_bytes: 1_000, messages: 3, bytes: 1_000 };
+/// The epoch of the sending half, and the peer's memory that it knows.
+const EPOCH: u64 = 7;
+const MEMORY: u64 = 3;
+
+#[test]
+fn every_state_of_the_session_answers_every_input_as_the_table_says() {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(FILE);
+    let table = [sending(), receiving(), shelf(), held()].concat();
+    if std::env::var_os(WRITE_VARIABLE).is_some() {
+        std::fs::write(&path, &table).expect("the source tree can be written");
+    }
+    let golden = std::fs::read_to_string(&path).expect("the table is in the source tree");
+    let differences: String = golden
+        .lines()
+        .zip(table.lines())
+        .filter(|(then, now)| then != now)
+        .map(|(then, now)| format!("\n- {then}\n+ {now}"))
+        .collect();
+    assert!(differences.is_empty(), "the table has changed:{differences}");
+    assert_eq!(golden.lines().count(), table.lines().count(), "the table has another length");
+}
+
+/// An input: its name, and what it does and says.
+type Input<'a, H> = (&'a str, fn(&mut H) -> String);
+
+/// The rows of one half: each of its states with each input.
+fn rows<H: Clone>(
+    head: &str,
+    states: &[(&str, H)],
+    inputs: &[Input<'_, H>],
+    word: fn(&H) -> String,
+) -> String {
+    let mut rows = format!("# {head}\n");
+    for (state, half) in states {
+        for (input, act) in inputs {
+            let mut half = half.clone();
+            let answer = act(&mut half);
+            rows.push_str(format!("{state} + {input} -> {}: {answer}", word(&half)).trim_end());
+            rows.push('\n');
+        }
+    }
+    rows
+}
+
+fn ack(memory: u64, of: u64, next: u64) -> Ack {
+    Ack { memory, epoch: 1, of, next, change: 0, held: Vec::new() }
+}
+
+fn sending() -> String {
+    let fresh = Sending::new(EPOCH, WINDOW);
+    let mut flowing = fresh.clone();
+    flowing.heard(&ack(MEMORY, EPOCH, 1));
+    let mut keeping = flowing.clone();
+    keeping.keep('a', 10);
+    let mut full = keeping.clone();
+    full.keep('b', 10);
+    let mut paused = full.clone();
+    paused.link_ended();
+    let mut resuming = paused.clone();
+    resuming.heard(&ack(MEMORY, EPOCH, 1));
+    // Its first message has arrived: what is below its base can be told from what is not.
+    let mut later = full.clone();
+    later.heard(&ack(MEMORY, EPOCH, 2));
+    let states = [
+        ("fresh", fresh),
+        ("flowing", flowing),
+        ("flowing, 1 kept", keeping),
+        ("flowing, 2 kept: full", full),
+        ("flowing, 1 arrived, 1 kept", later),
+        ("paused, 2 kept", paused),
+        ("resuming, 2 kept", resuming),
+    ];
+    rows(
+        "Sending: state + input -> epoch, kept, to be written again, room: answer",
+        &states,
+        &[
+            ("Ack, takes 1 next", |half| format!("{:?}", half.heard(&ack(MEMORY, EPOCH, 1)))),
+            ("Ack, takes 2 next", |half| format!("{:?}", half.heard(&ack(MEMORY, EPOCH, 2)))),
+            ("Ack, takes 3 next", |half| format!("{:?}", half.heard(&ack(MEMORY, EPOCH, 3)))),
+            ("Ack, takes 9 next", |half| format!("{:?}", half.heard(&ack(MEMORY, EPOCH, 9)))),
+            ("Ack, knows no epoch", |half| format!("{:?}", half.heard(&ack(MEMORY, 0, 1)))),
+            ("Ack, knows another epoch", |half| format!("{:?}", half.heard(&ack(MEMORY, EPOCH - 1, 5)))),
+            ("Ack of another memory", |half| format!("{:?}", half.heard(&ack(MEMORY + 1, EPOCH, 1)))),
+            ("again", |half| format!("{:?}", half.again())),
+            ("take_back", |half| {
+                half.take_back();
+                String::new()
+            }),
+            ("void of the oldest", |half| format!("{:?}", half.void(|message| *message == 'a'))),
+            ("link_ended", |half| {
+                half.link_ended();
+                String::new()
+            }),
+            ("drain", |half| format!("{:?}", half.drain())),
+        ],
+        |half| {
+            let (epoch, room) = (half.epoch(), half.has_room());
+            let kept = half.clone().drain().into_iter().collect::<String>();
+            format!("epoch {epoch}, kept '{kept}', again {}, room {room}", half.behind())
+        },
+    )
+}
+
+fn receiving() -> String {
+    let fresh = Receiving::new(MEMORY);
+    let mut attached = fresh.clone();
+    attached.attach(5);
+    let mut taking = attached.clone();
+    taking.heard(5, 20);
+    let mut taken = taking.clone();
+    taken.arrive(5, 1, 10);
+    let mut replaced = taken.clone();
+    replaced.attach(6);
+    let states = [
+        ("fresh", fresh),
+        ("on link 5, epoch unsaid", attached),
+        ("on link 5, epoch 20", taking),
+        ("on link 5, epoch 20, 1 taken", taken),
+        ("on link 6 after 5, epoch unsaid, 1 taken", replaced),
+    ];
+    rows(
+        "Receiving: state + input -> its Ack, owes one: answer",
+        &states,
+        &[
+            ("attach 7", |half| {
+                half.attach(7);
+                String::new()
+            }),
+            ("epoch 20 on link 5", |half| half.heard(5, 20).to_string()),
+            ("epoch 20 on link 6", |half| half.heard(6, 20).to_string()),
+            ("epoch 21 on link 6", |half| half.heard(6, 21).to_string()),
+            ("epoch 19 on link 6", |half| half.heard(6, 19).to_string()),
+            ("message 1 on link 5", |half| format!("{:?}", half.arrive(5, 1, 10))),
+            ("message 2 on link 5", |half| format!("{:?}", half.arrive(5, 2, 10))),
+            ("message 1 on link 6", |half| format!("{:?}", half.arrive(6, 1, 10))),
+            ("message 2 on link 6", |half| format!("{:?}", half.arrive(6, 2, 10))),
+            ("message 2 of 64 KiB on link 5", |half| format!("{:?}", half.arrive(5, 2, 64 << 10))),
+        ],
+        |half| {
+            let Ack { memory, of, next, .. } = half.clone().ack(1);
+            format!("memory {memory}, of {of}, next {next}, owes {}", half.owes_ack())
+        },
+    )
+}
+
+fn shelf() -> String {
+    let empty = Shelf::<u64, char>::new(LIMITS);
+    let mut one = empty.clone();
+    one.put(1, 'a', 10).expect("there is room");
+    let mut offered = one.clone();
+    offered.offer(1);
+    let mut full = one.clone();
+    full.put(1, 'b', 10).expect("there is room");
+    let mut two = full.clone();
+    two.put(2, 'c', 10).expect("there is room");
+    let states = [
+        ("empty", empty),
+        ("1 in line 1", one),
+        ("1 of line 1 offered", offered),
+        ("2 in line 1: full", full),
+        ("2 in line 1, 1 in line 2: all full", two),
+    ];
+    rows(
+        "Shelf: state + input -> held, change, messages, bytes: answer",
+        &states,
+        &[
+            ("put 'x' in line 1", |half| format!("{:?}", half.put(1, 'x', 10))),
+            ("put 'x' in line 2", |half| format!("{:?}", half.put(2, 'x', 10))),
+            ("put 'x' in line 3", |half| format!("{:?}", half.put(3, 'x', 10))),
+            ("offer line 1", |half| format!("{:?}", half.offer(1))),
+            ("taken of line 1", |half| format!("{:?}", half.taken(1))),
+            ("put back 'y' in line 1", |half| {
+                half.put_back(1, 'y', 10);
+                String::new()
+            }),
+            ("forget_offers", |half| {
+                half.forget_offers();
+                String::new()
+            }),
+        ],
+        |half| {
+            let (held, change) = (half.held(), half.change());
+            format!("{held:?}, change {change}, {} messages, {} bytes", half.messages(), half.bytes())
+        },
+    )
+}
+
+fn held() -> String {
+    let fresh = Held::<u64, char>::new(LIMITS);
+    let mut holding = fresh.clone();
+    holding.heard(4, [1]);
+    let mut waiting = holding.clone();
+    waiting.put(1, 'a', 10).expect("there is room");
+    let mut ended = waiting.clone();
+    ended.link_ended();
+    let states = [
+        ("nobody held", fresh),
+        ("1 held by change 4", holding),
+        ("1 held by change 4, 'a' waits", waiting),
+        ("1 held, 'a' waits, link ended", ended),
+    ];
+    rows(
+        "Held: state + input -> holds 1, holds 2, messages: answer",
+        &states,
+        &[
+            ("change 3: nobody", |half| format!("{:?}", half.heard(3, []))),
+            ("change 4: nobody", |half| format!("{:?}", half.heard(4, []))),
+            ("change 5: nobody", |half| format!("{:?}", half.heard(5, []))),
+            ("change 5: 1 and 2", |half| format!("{:?}", half.heard(5, [1, 2]))),
+            ("change 5: 2", |half| format!("{:?}", half.heard(5, [2]))),
+            ("put 'x' for 1", |half| format!("{:?}", half.put(1, 'x', 10))),
+            ("useless", |half| format!("{:?}", half.take_useless(|_| true))),
+            ("link_ended", |half| {
+                half.link_ended();
+                String::new()
+            }),
+        ],
+        |half| format!("{}, {}, {}", half.holds(1), half.holds(2), half.messages()),
+    )
+}
