@@ -12,7 +12,7 @@ use std::{
 use bytes::BytesMut;
 use sinew_runtime::wire::{FrameCodec, FrameError, HEADER_LEN, Header, Message};
 use sinew_shm::{
-    BellKind, Capacity, Consumer, Corrupt, CreateError, LoanError, Offer, PassError, Producer, RefusedOffer,
+    Bell, Capacity, Consumer, Corrupt, CreateError, LoanError, Offer, PassError, Producer, RefusedOffer,
     Region, Terms,
 };
 use tokio_util::codec::Decoder;
@@ -50,14 +50,14 @@ pub(crate) struct Exchange {
 
 impl Exchange {
     /// Makes this side's memory. The peer's ring may be as large as this side's.
-    pub(crate) fn prepare(capacity: Capacity, bell: BellKind) -> Result<Self, ExchangeError> {
+    pub(crate) fn prepare(capacity: Capacity, bell: impl Into<Bell>) -> Result<Self, ExchangeError> {
         Self::prepare_for(capacity, bell, capacity)
     }
 
     /// As [`prepare`](Self::prepare), for a peer's ring of at most `theirs`.
     pub(crate) fn prepare_for(
         capacity: Capacity,
-        bell: BellKind,
+        bell: impl Into<Bell>,
         theirs: Capacity,
     ) -> Result<Self, ExchangeError> {
         let (region, offer) = Region::create(capacity, bell)?;
@@ -213,6 +213,7 @@ impl RingFrames {
 #[cfg(all(test, target_os = "linux"))]
 mod tests {
     use sinew_runtime::{tid::Tid, wire::Kind};
+    use sinew_shm::BellKind;
 
     use super::*;
 

@@ -37,7 +37,7 @@ pub struct AsyncEndpoint {
 
 impl AsyncEndpoint {
     pub(super) async fn register(path: &Path, mut registration: Registration) -> Result<Self, ApiError> {
-        registration.link.bell = BellKind::Socket;
+        registration.link.bell = BellKind::Socket.into();
         let wanted = Arc::new(());
         let (is_wanted, path) = (Arc::downgrade(&wanted), path.to_owned());
         let registered = spawn_blocking(move || {
@@ -192,7 +192,7 @@ impl AsyncEndpoint {
     pub async fn receive(&mut self) -> Result<Received, ApiError> {
         loop {
             // There is always a later time.
-            if let Some(received) = self.endpoint.receive_until(Time::MAX).await? {
+            if let Some(received) = self.endpoint.receive_until(Time::MAX, Time::now()).await? {
                 return Ok(received);
             }
         }

@@ -14,7 +14,7 @@ use std::{
     collections::{BTreeMap, VecDeque},
     os::unix::net::UnixStream,
     sync::Arc,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use rustix::net::Shutdown;
@@ -130,12 +130,12 @@ pub(super) struct ToNode<'a> {
 }
 
 impl Terms {
-    pub(super) fn of(registered: &Registered, options: LinkOptions) -> Self {
+    pub(super) fn of(registered: &Registered, options: &LinkOptions) -> Self {
         Self {
             own: Tid::new(registered.node, registered.app),
             ring_bytes: options.direct_ring_bytes.min(registered.ring.unwrap_or_default() as usize),
             payload_max: registered.payload_max as usize,
-            options,
+            options: options.clone(),
             budget: &PROCESS,
         }
     }
@@ -197,6 +197,15 @@ impl Direct {
                 }
                 None
             }
+        }
+    }
+
+    /// The link on which a message to `destination` would go now. Nobody is asked for one.
+    pub(super) fn link_to(&self, destination: Tid) -> Option<LinkNumber> {
+        // Whether a link stands is no question of time.
+        match self.routes.way(destination, Time::ZERO) {
+            Way::Direct(number) => self.control.as_ref().map(|_| number),
+            Way::Through | Way::ThroughAndAsk => None,
         }
     }
 
@@ -344,11 +353,11 @@ impl Direct {
     }
 
     /// When to look at the latest, if nothing comes before: what is owed is not said by itself.
-    pub(super) fn wake_by(&mut self, deadline: Time) -> Time {
+    pub(super) fn wake_by(&mut self, deadline: Time, now: Time) -> Time {
         if !self.open.iter().chain(&self.held).any(Standing::owes) {
             return deadline;
         }
-        self.flush_at = Time::now() + OWED_AGAIN;
+        self.flush_at = now + OWED_AGAIN;
         deadline.min(self.flush_at)
     }
 
@@ -400,9 +409,9 @@ impl Direct {
 
     /// Waits until something comes on an open link, for `left` at most. May end early without a reason.
     pub(super) fn wait(&mut self, left: Duration) {
-        let deadline = self.wake_by(Time::now() + left);
-        let until = Instant::now() + deadline.since(Time::now());
-        let ended = Waiter::new(Spin::Off).wait(&mut Alone(&mut self.open), until);
+        let now = Time::now();
+        let left = self.wake_by(now + left, now).since(now);
+        let ended = Waiter::new(Spin::Off).wait_within(&mut Alone(&mut self.open), left);
         let at = |index: usize| index + 1;
         self.note(&match ended {
             Ok(Any::HungUp(index)) => Ok(Any::HungUp(at(index))),

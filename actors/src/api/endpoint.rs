@@ -8,6 +8,7 @@ use sinew_runtime::{
     time::Time,
     wire::{Flags, Header, Kind, Message, Payload},
 };
+use sinew_shm::{Bell, CommonBell};
 
 use super::{
     ApiError, Received, Registration, Transport,
@@ -62,7 +63,11 @@ impl std::fmt::Debug for Endpoint {
     }
 }
 impl Endpoint {
-    pub(super) fn register(path: &Path, registration: Registration) -> Result<Self, ApiError> {
+    pub(super) fn register(path: &Path, mut registration: Registration) -> Result<Self, ApiError> {
+        if registration.register.direct {
+            // Without it there is a bell for each link, which are slept at together.
+            registration.link.bell = CommonBell::create().map_or(registration.link.bell, Bell::Common);
+        }
         let link = registration.greet(path, registration.deadline, || true)?;
         Ok(Self::new(path, registration, link, Form::Thread))
     }
@@ -72,7 +77,7 @@ impl Endpoint {
         let Registration { mut register, deadline: _, inbox_capacity, link: options, returning } =
             registration;
         let Link { registered, writer, reader } = link;
-        let terms = Terms::of(&registered, options);
+        let terms = Terms::of(&registered, &options);
         let Registered { node, app, node_name, payload_max, ring: _ } = registered;
         let control = reader.control().filter(|_| register.direct);
         let inbox = Inbox::new(inbox_capacity, writer.clone());
@@ -208,29 +213,35 @@ impl Endpoint {
     /// # Errors
     /// The connection has ended, and everything that came before was received.
     pub fn receive(&mut self, within: Duration) -> Result<Option<Received>, ApiError> {
-        at_once(self.receive_until(Time::now() + within))
+        let now = Time::now();
+        at_once(self.receive_until(now + within, now))
     }
 
-    pub(super) async fn receive_until(&mut self, deadline: Time) -> Result<Option<Received>, ApiError> {
+    /// The clock is read once for each look: it costs as much as a look.
+    pub(super) async fn receive_until(
+        &mut self,
+        deadline: Time,
+        mut now: Time,
+    ) -> Result<Option<Received>, ApiError> {
         loop {
             // The socket first: what came just now may be more urgent or newer than what waits.
-            self.take_in(None, WhenFull::Leave)?;
-            if let Some(message) = self.inbox.pop(Time::now()) {
+            self.take_in(None, WhenFull::Leave, now)?;
+            if let Some(message) = self.inbox.pop(now) {
                 return Ok(Some(Received::new(message)));
             }
-            if let Some(ended) = self.ended.clone() {
-                self.tell(&ended)?;
-                if Time::now() >= deadline {
-                    return Ok(None);
-                }
-                self.await_return(deadline).await;
-                continue;
+            let ended = self.ended.clone();
+            if let Some(ended) = &ended {
+                self.tell(ended)?;
             }
             // The clock is asked by us: a flood keeps the link readable for ever.
-            if Time::now() >= deadline {
+            if now >= deadline {
                 return Ok(None);
             }
-            self.wait(deadline).await;
+            match ended {
+                Some(_) => self.await_return(deadline).await,
+                None => self.wait(deadline, now).await,
+            }
+            now = Time::now();
         }
     }
 
@@ -296,7 +307,7 @@ impl Endpoint {
         self.write(goodbye.into(), self.patience()).await?;
         let deadline = Time::now() + PROMPT;
         while self.ended.is_none() {
-            self.take_in(None, WhenFull::Refuse)?;
+            self.take_in(None, WhenFull::Refuse, Time::now())?;
             self.inbox.close();
             if self.ended.is_some() {
                 break;
@@ -304,7 +315,7 @@ impl Endpoint {
             if Time::now() >= deadline {
                 return Err(ApiError::NoAnswer(PROMPT));
             }
-            self.wait(deadline).await;
+            self.wait(deadline, Time::now()).await;
         }
         Ok(())
     }
@@ -330,7 +341,7 @@ impl Endpoint {
 impl Drop for Endpoint {
     fn drop(&mut self) {
         // What has come and was not looked at is refused, too. An error ends the connection, as this does.
-        let _ = self.take_in(None, WhenFull::Refuse);
+        let _ = self.take_in(None, WhenFull::Refuse, Time::now());
         self.inbox.close();
         if matches!(self.form, Form::Thread) {
             at_once(self.part(PARTING));

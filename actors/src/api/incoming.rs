@@ -39,21 +39,22 @@ impl Endpoint {
         &mut self,
         wanted: Option<Wanted>,
         when_full: WhenFull,
+        now: Time,
     ) -> Result<Option<Answer>, ApiError> {
         // The node first: there a peer may say that from now on its link is read.
-        let answer = self.take_in_from_node(wanted, when_full)?;
+        let answer = self.take_in_from_node(wanted, when_full, now)?;
         if answer.is_some() || self.direct.is_empty() {
             return Ok(answer);
         }
         let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
-        self.direct.look(Time::now(), &mut node);
-        if let Some(answer) = self.take_in_early(wanted, when_full) {
+        self.direct.look(now, &mut node);
+        if let Some(answer) = self.take_in_early(wanted, when_full, now) {
             return Ok(Some(answer));
         }
         // From the last one on: one that ends makes no other one's turn go by.
         let mut links = (0..self.direct.open.len()).rev();
         let answer = links.find_map(|index| self.take_in_from_link(index, wanted, when_full));
-        Ok(answer.or_else(|| self.take_in_early(wanted, when_full)))
+        Ok(answer.or_else(|| self.take_in_early(wanted, when_full, now)))
     }
 
     /// Sorts in what has come on links that are about to end; what finds no room is refused.
@@ -64,9 +65,9 @@ impl Endpoint {
     }
 
     /// Sorts in what had come through the node and was sent after what a link's ring held.
-    fn take_in_early(&mut self, wanted: Option<Wanted>, when_full: WhenFull) -> Option<Answer> {
+    fn take_in_early(&mut self, wanted: Option<Wanted>, when_full: WhenFull, now: Time) -> Option<Answer> {
         while when_full == WhenFull::Refuse || self.inbox.has_room() {
-            let message = self.direct.next_early(Time::now())?;
+            let message = self.direct.next_early(now)?;
             if let Sorted::Answer(answer) = self.inbox.sort(message, wanted.map(Wanted::at_node)) {
                 return Some(answer);
             }
@@ -78,6 +79,7 @@ impl Endpoint {
         &mut self,
         wanted: Option<Wanted>,
         when_full: WhenFull,
+        now: Time,
     ) -> Result<Option<Answer>, ApiError> {
         self.go_on();
         for read in 0.. {
@@ -88,7 +90,7 @@ impl Endpoint {
             if is_full || read == READS_PER_LOOK {
                 return Ok(None);
             }
-            match self.reader.read() {
+            match self.reader.read(now) {
                 Read::Some => {}
                 Read::Nothing => return Ok(None),
                 Read::Ended(ended) => {
@@ -172,31 +174,33 @@ impl Endpoint {
     }
 
     /// Waits until something comes, from the node or from a link, or until there is something to do.
-    pub(super) async fn wait(&mut self, deadline: Time) {
+    pub(super) async fn wait(&mut self, deadline: Time, now: Time) {
         // The rest of a frame goes out meanwhile; that it was taken back is not urgent.
         let deadline = match &self.rest {
-            Some(rest) if rest.is_withdrawn() => deadline.min(Time::now() + NAP),
+            Some(rest) if rest.is_withdrawn() => deadline.min(now + NAP),
             None if !self.is_within_frame() => deadline,
-            Some(_) | None => deadline.min(Time::now() + REST_AGAIN),
+            Some(_) | None => deadline.min(now + REST_AGAIN),
         };
+        let deadline = self.direct.wake_by(deadline, now);
         match &mut self.form {
-            Form::Thread => self.block(deadline),
+            Form::Thread => self.block(deadline.since(now)),
             Form::Reactor(reactor) => {
+                let naps = self.writer.owes() || self.direct.is_to_be_looked_at();
+                let deadline = if naps { deadline.min(now + NAP) } else { deadline };
                 reactor.wait(&mut self.reader, &self.writer, &mut self.direct, deadline).await;
             }
         }
     }
 
-    fn block(&mut self, deadline: Time) {
-        let deadline = self.direct.wake_by(deadline);
+    fn block(&mut self, left: Duration) {
         match &mut self.reader {
             Reader::Ring(reader) if !self.direct.open.is_empty() => {
                 let links = &mut self.direct.open[..];
-                let ended = reader.wait_for_all(deadline, |node| Everything { node, links });
+                let ended = reader.wait_for_all(left, |node| Everything { node, links });
                 reader.note(&ended);
                 self.direct.note(&ended);
             }
-            Reader::Ring(_) | Reader::Socket(_) => self.reader.wait(deadline),
+            Reader::Ring(_) | Reader::Socket(_) => self.reader.wait(left),
         }
     }
 }

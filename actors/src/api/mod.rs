@@ -262,7 +262,7 @@ impl Default for Registration {
                 transport: Transport::Ring,
                 spin: Spin::Off,
                 patience: Duration::from_secs(1),
-                bell: BellKind::Futex,
+                bell: BellKind::Futex.into(),
                 direct_ring_bytes: direct::RING_BYTES,
             },
             returning: Returning::Always,
@@ -387,7 +387,7 @@ impl Registration {
     /// Registers, and blocks meanwhile. Each `look` it is looked whether that is still wanted.
     fn greet(&self, path: &Path, look: Duration, is_wanted: impl Fn() -> bool) -> Result<Link, ApiError> {
         let deadline = Time::now() + self.deadline;
-        let mut greeting = Greeting::begin(path, &self.register, self.link)?;
+        let mut greeting = Greeting::begin(path, &self.register, self.link.clone())?;
         while is_wanted() {
             if let Some(link) = greeting.wait(deadline.min(Time::now() + look))? {
                 return Ok(link);

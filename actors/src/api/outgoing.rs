@@ -86,11 +86,12 @@ impl Endpoint {
         message.header.flags = message.header.flags.with(flags);
         let of = self.absolute(message.header.destination);
         let wanted = Wanted { number: self.correlation, what: awaited, of };
-        let deadline = Time::now() + within;
+        let mut now = Time::now();
+        let deadline = now + within;
         // Who waits so long for the answer waits no longer for room.
         let way = self.dispatch(message, self.patience().and_in_all(within)).await?;
         loop {
-            if let Some(answer) = self.take_in(Some(wanted), WhenFull::Refuse)? {
+            if let Some(answer) = self.take_in(Some(wanted), WhenFull::Refuse, now)? {
                 return Ok(Some(answer));
             }
             // spec: LNCL-7. The link has ended with the message in the peer's hand.
@@ -102,18 +103,21 @@ impl Endpoint {
                 return Ok(Some(Answer::Outcome(Outcome::Unknown)));
             }
             // The clock is asked by us: a flood keeps the link readable for ever.
-            if Time::now() >= deadline {
+            if now >= deadline {
                 return Ok(None);
             }
-            self.wait(deadline).await;
+            self.wait(deadline, now).await;
+            now = Time::now();
         }
     }
 
     /// Lends memory for a payload of `length` bytes: in the ring that a message to `destination` goes into now, if it can.
     pub(super) fn lend(&mut self, header: Header, length: usize) -> Result<LentMessage, ApiError> {
         let loan = self.lender.lend()?;
-        let way = self.way(self.absolute(header.destination), Time::now());
-        let room = match way {
+        let destination = self.absolute(header.destination);
+        // Who has no link asks for one now: while the ring to the node is lent it cannot.
+        let link = self.direct.link_to(destination).or_else(|| self.way(destination, Time::now()));
+        let room = match link {
             Some(link) => self.direct.lend(link, length),
             None => self.writer.lend(length),
         };
@@ -142,7 +146,7 @@ impl Endpoint {
         let destination = self.absolute(draft.header.destination);
         if let Some(link) = self.way(destination, now) {
             draft.header.destination = destination;
-            match self.send_on(link, draft, limit).await? {
+            match self.send_on(link, draft, limit, now).await? {
                 None => return Ok(Some(link)),
                 Some(back) => draft = back,
             }
@@ -160,7 +164,7 @@ impl Endpoint {
         self.direct.look(now, &mut node);
         if self.direct.is_asking(now) {
             // Who only sends looks here for the answer. What it cannot sort in, or read, shows when it receives.
-            let _ = self.take_in_from_node(None, WhenFull::Leave);
+            let _ = self.take_in_from_node(None, WhenFull::Leave, now);
         }
         let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
         self.direct.way(destination, now, &mut node)
@@ -176,6 +180,7 @@ impl Endpoint {
         link: LinkNumber,
         draft: Draft,
         limit: Limit,
+        mut now: Time,
     ) -> Result<Option<Draft>, ApiError> {
         let length = HEADER_LEN + draft.payload.len();
         // Who takes nothing costs a patience once, and not with each message.
@@ -190,7 +195,7 @@ impl Endpoint {
                     Writing::Part => None,
                     Writing::Cut(back) => return Ok(Some(back)),
                 },
-                Some(draft) => match self.direct.send(link, draft, Time::now())? {
+                Some(draft) => match self.direct.send(link, draft, now)? {
                     Sent::Taken => return Ok(None),
                     Sent::Gone(back) => return Ok(Some(back)),
                     Sent::Full(back) => Some(back),
@@ -203,7 +208,7 @@ impl Endpoint {
                     }
                 },
             };
-            let now = Time::now();
+            now = Time::now();
             let Some(until) = waiting.until(self.direct.taken(link), now) else {
                 if waiting.is_out_of_patience(now) {
                     self.direct.has_stalled(link);
@@ -213,11 +218,11 @@ impl Endpoint {
                 }
                 return Err(waiting.in_vain());
             };
-            self.take_in_while_writing(link);
+            self.take_in_while_writing(link, now);
             match self.form {
                 Form::Thread => self.direct.await_room(link, length, pause.min(until.since(now))),
                 // Nobody rings for room here: it is looked for again after the pause, or when something comes.
-                Form::Reactor(_) => self.wait(until.min(now + pause)).await,
+                Form::Reactor(_) => self.wait(until.min(now + pause), now).await,
             }
             pause = (pause * 2).min(NAP);
         }
@@ -231,19 +236,19 @@ impl Endpoint {
         while self.direct.owes() && Time::now() < deadline {
             match self.form {
                 Form::Thread => self.direct.await_owed(ROOM_PAUSE),
-                Form::Reactor(_) => self.wait(deadline.min(Time::now() + ROOM_PAUSE)).await,
+                Form::Reactor(_) => self.wait(deadline.min(Time::now() + ROOM_PAUSE), Time::now()).await,
             }
             // A peer that waits for room itself takes nothing until it has that.
-            let _ = self.take_in(None, WhenFull::Refuse);
+            let _ = self.take_in(None, WhenFull::Refuse, Time::now());
             self.inbox.close();
             self.direct.flush();
         }
     }
 
-    fn take_in_while_writing(&mut self, link: LinkNumber) {
+    fn take_in_while_writing(&mut self, link: LinkNumber, now: Time) {
         self.direct.is_writing_on(Some(link));
         // What it cannot sort in, or read, shows when it receives.
-        let _ = self.take_in(None, WhenFull::Leave);
+        let _ = self.take_in(None, WhenFull::Leave, now);
         self.direct.is_writing_on(None);
     }
 
@@ -262,7 +267,7 @@ impl Endpoint {
         }
         for _ in 0..LAST_LOOKS {
             // The error to tell is the first one.
-            if self.ended.is_some() || self.take_in(None, WhenFull::Refuse).is_err() {
+            if self.ended.is_some() || self.take_in(None, WhenFull::Refuse, Time::now()).is_err() {
                 break;
             }
         }

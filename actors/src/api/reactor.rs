@@ -66,8 +66,6 @@ impl Reactor {
         direct: &mut Direct,
         deadline: Time,
     ) {
-        let naps = writer.owes() || direct.is_to_be_looked_at();
-        let deadline = direct.wake_by(if naps { deadline.min(Time::now() + NAP) } else { deadline });
         match (&self.ears, reader) {
             (Ears::Socket(socket), _) => tokio::select! {
                 () = ready(socket, Interest::READABLE, PollFlags::IN) => {}
@@ -97,7 +95,8 @@ impl Reactor {
 
     /// The same while there is no node: for direct links alone.
     async fn wait_for_links(&mut self, direct: &mut Direct, deadline: Time) {
-        let deadline = direct.wake_by(deadline.min(Time::now() + NAP));
+        let now = Time::now();
+        let deadline = direct.wake_by(deadline.min(now + NAP), now);
         self.links.follow(&direct.open);
         let Some(listening) = Listening::begin(None, &mut direct.open) else { return };
         let links = &mut self.links;

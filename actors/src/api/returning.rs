@@ -79,7 +79,7 @@ impl Home {
 
     /// Tries to register; `None` if it has not come to that by the deadline, or the next try is not due.
     fn knock(&mut self, until: Time) -> Option<Link> {
-        let (path, register, options) = (self.path.clone(), self.register.clone(), self.options);
+        let (path, register, options) = (self.path.clone(), self.register.clone(), self.options.clone());
         let way = self.way();
         if way.greeting.is_none() && Time::now() < way.next {
             return None;
@@ -110,7 +110,7 @@ impl Home {
 impl Home {
     /// The same way, begun anew.
     pub(super) fn another(&self) -> Self {
-        Self::new(self.path.clone(), self.register.clone(), self.options, self.returning)
+        Self::new(self.path.clone(), self.register.clone(), self.options.clone(), self.returning)
     }
 }
 
@@ -205,7 +205,7 @@ impl Endpoint {
         let Link { registered, writer, reader } = link;
         let control = reader.control().filter(|_| self.home.register.direct);
         let own = Tid::new(registered.node, registered.app);
-        let terms = Terms::of(&registered, self.home.options);
+        let terms = Terms::of(&registered, &self.home.options);
         if own == self.tid {
             self.direct.node_is_back(terms, control);
         } else {

@@ -73,7 +73,7 @@ impl Endpoint {
     /// Whoever needs to know it of one message sends that one [confirmed](Self::send_confirmed).
     pub fn untaken(&mut self) -> Option<Untaken> {
         // An error shows itself again when messages are received.
-        let _ = self.take_in(None, WhenFull::Leave);
+        let _ = self.take_in(None, WhenFull::Leave, Time::now());
         self.refusals.take()
     }
 }

@@ -1,17 +1,21 @@
 //! Waiting for messages of several consumers at once: one thread, one system call, whoever rings first.
 
 use std::{
-    io,
+    io, ptr,
+    sync::atomic::{AtomicU32, Ordering},
     time::{Duration, Instant},
 };
 
 use crate::{
     bell::{Heard, Woken},
     consumer::Consumer,
+    core::sleep::{Ear, fence_before_looking_again},
     error::AnyError,
+    memory::fence,
     platform,
     spin::{Spin, Spinner},
-    wait::{Armed, HangUp, spin},
+    trust::Trust,
+    wait::{HangUp, spin},
 };
 
 /// The most consumers that one call waits for: what the system takes.
@@ -51,57 +55,95 @@ pub enum Any {
 #[derive(Debug)]
 pub struct Waiter {
     spinner: Spinner,
+    trust: Trust,
 }
 
 impl Waiter {
     /// One that spins as `spin` says before it sleeps.
     #[must_use]
     pub const fn new(spin: Spin) -> Self {
-        Self { spinner: Spinner::new(spin) }
+        Self { spinner: Spinner::new(spin), trust: Trust::new() }
     }
 
     /// Waits until one of `ends` has a message, which is left there, or its peer is gone; until `deadline` at most. A
     /// deadline that is past means: look, and do not wait.
     ///
+    /// Where all have one [`CommonBell`](crate::CommonBell) that costs one sleep at one word, else one at as many words.
+    ///
     /// # Errors
     /// [`AnyError::Corrupt`] when a peer wrote what no peer of ours writes, [`AnyError::System`] when the system refused
     /// to wait, or one has no futex, or there are more than [`ENDS_MAX`].
     pub fn wait(&mut self, ends: &mut impl Ends, deadline: Instant) -> Result<Any, AnyError> {
+        let mut left = deadline.saturating_duration_since(Instant::now());
+        loop {
+            let ended = self.wait_within(ends, left)?;
+            left = deadline.saturating_duration_since(Instant::now());
+            if ended != Any::TimedOut {
+                return Ok(ended);
+            }
+            if left.is_zero() {
+                return look_for_the_gone(ends);
+            }
+        }
+    }
+
+    /// As [`wait`](Self::wait), for `left` at most. It may say [`Any::TimedOut`] before, for no reason; so that it need not read
+    /// the clock where something has come. For less than 20 ms it does not look whether a peer is gone, unless it is rung for nothing:
+    /// where there are many peers that costs more than the wait.
+    ///
+    /// # Errors
+    /// As [`wait`](Self::wait).
+    pub fn wait_within(&mut self, ends: &mut impl Ends, left: Duration) -> Result<Any, AnyError> {
+        let budget = self.spinner.begin();
+        if budget.is_zero() && !self.spinner.learns() {
+            // It is looked before the sleep.
+            return self.sleep(ends, left);
+        }
         if let Some(index) = look(ends)? {
             return Ok(Any::Message(index));
         }
         let started = self.spinner.learns().then(Instant::now);
-        let ended = self.spin_or_sleep(ends, deadline)?;
+        let ended = self.spin_or_sleep(ends, budget.min(left), left)?;
         if let Some(started) = started {
             self.spinner.learn(started.elapsed());
         }
         Ok(ended)
     }
 
-    fn spin_or_sleep(&mut self, ends: &mut impl Ends, deadline: Instant) -> Result<Any, AnyError> {
-        if spin(self.spinner.begin(), || (0..ends.count()).any(|index| ends.consumer(index).has_moved()))
+    fn spin_or_sleep(
+        &mut self,
+        ends: &mut impl Ends,
+        budget: Duration,
+        left: Duration,
+    ) -> Result<Any, AnyError> {
+        if spin(budget, || (0..ends.count()).any(|index| ends.consumer(index).has_moved()))
             && let Some(index) = look(ends)?
         {
             return Ok(Any::Message(index));
         }
-        loop {
-            let woken = match sleep(ends, deadline)? {
-                Slept::Ready(index) => return Ok(Any::Message(index)),
-                Slept::Ended(woken) => woken,
-            };
-            // What was published before the end of the wait, or of the peer, is still a message.
-            if let Some(index) = look(ends)? {
-                return Ok(Any::Message(index));
+        self.sleep(ends, left.saturating_sub(budget))
+    }
+
+    /// Sleeps once.
+    fn sleep(&mut self, ends: &mut impl Ends, left: Duration) -> Result<Any, AnyError> {
+        let ear = self.trust.ear(Instant::now);
+        let woken = match sleep(ends, ear, left.min(HANG_UP_LOOK))? {
+            Slept::Ready(index) => return Ok(Any::Message(index)),
+            Slept::Ended(woken) => woken,
+            Slept::Robbed => {
+                self.trust.doubt(Instant::now());
+                Woken::TimedOut
             }
-            // Rung for nothing: the peer may ring because it goes.
-            if let Some(index) = hung_up(ends)? {
-                // It may have said something between the two looks.
-                return Ok(look(ends)?.map_or(Any::HungUp(index), Any::Message));
-            }
-            if woken == Woken::TimedOut && Instant::now() >= deadline {
-                return Ok(Any::TimedOut);
-            }
+        };
+        // What was published before the end of the wait, or of the peer, is still a message.
+        if let Some(index) = look(ends)? {
+            return Ok(Any::Message(index));
         }
+        if woken == Woken::TimedOut && left < HANG_UP_LOOK {
+            return Ok(Any::TimedOut);
+        }
+        // Rung for nothing, the peer may ring because it goes; or a nap is over.
+        look_for_the_gone(ends)
     }
 }
 
@@ -110,52 +152,104 @@ enum Slept {
     /// It did not begin: the one at this index has a message.
     Ready(usize),
     Ended(Woken),
+    /// At its end, although a peer had rung: another one has undone that.
+    Robbed,
 }
 
-fn sleep(ends: &mut impl Ends, deadline: Instant) -> Result<Slept, AnyError> {
-    if ends.count() > ENDS_MAX {
+/// Whether a peer has rung for the sleep that is over, and its bell is as it was before: who rings changes it first, and says that it
+/// has rung afterwards.
+fn has_been_robbed(ends: &impl Ends, heard: &Listened) -> bool {
+    let was_rung = (0..ends.count()).any(|index| ends.consumer(index).was_rung());
+    // SYNC: what a peer did before it said so is seen: `ProducerCore::say_rung`.
+    fence(Ordering::Acquire);
+    was_rung && heard.is_unchanged(ends)
+}
+
+fn sleep(ends: &mut impl Ends, ear: Ear, left: Duration) -> Result<Slept, AnyError> {
+    let count = ends.count();
+    if count > ENDS_MAX {
         return Err(AnyError::System(io::ErrorKind::InvalidInput.into()));
     }
-    let mut heard = [Heard(0); ENDS_MAX];
-    for (index, heard) in heard.iter_mut().enumerate().take(ends.count()) {
-        *heard = ends.consumer(index).message_bell().listen();
+    if left.is_zero() {
+        return Ok(look(ends)?.map_or(Slept::Ended(Woken::TimedOut), Slept::Ready));
     }
-    // Announced after the bells were listened to: whoever rings from now on is heard.
-    if let Some(index) = announce(ends)? {
-        return Ok(Slept::Ready(index));
-    }
-    let mut ears = platform::Ears::new();
-    let are_futexes =
-        (0..ends.count()).all(|index| ears.add(ends.consumer(index).message_bell(), heard[index]));
-    let left = deadline.saturating_duration_since(Instant::now());
-    let slept = if are_futexes {
-        ears.sleep(left.min(HANG_UP_LOOK))
-    } else {
-        Err(io::ErrorKind::InvalidInput.into())
-    };
-    withdraw(ends, ends.count());
-    Ok(Slept::Ended(slept.map_err(AnyError::System)?))
-}
-
-/// Announces sleep to all peers. One that has a message calls it off.
-fn announce(ends: &mut impl Ends) -> Result<Option<usize>, AnyError> {
-    for index in 0..ends.count() {
-        let armed = ends.consumer_mut(index).arm();
-        if !matches!(armed, Ok(Armed::Sleep)) {
-            withdraw(ends, index);
-        }
-        match armed.map_err(|cause| AnyError::Corrupt { index, cause })? {
-            Armed::Sleep => {}
-            Armed::Ready => return Ok(Some(index)),
-        }
-    }
-    Ok(None)
-}
-
-/// Says to the first `count` peers that this side is awake.
-fn withdraw(ends: &mut impl Ends, count: usize) {
+    let heard = listen(ends, ear).ok_or_else(|| AnyError::System(io::ErrorKind::InvalidInput.into()))?;
+    // Announced after the words were listened to: whoever rings from now on is heard.
     for index in 0..count {
-        ends.consumer_mut(index).disarm();
+        ends.consumer_mut(index).announce(ear);
+    }
+    fence_before_looking_again();
+    let slept = look(ends).and_then(|found| match found {
+        Some(index) => Ok(Slept::Ready(index)),
+        None => match heard.sleep(ends, ear, left).map_err(AnyError::System)? {
+            Woken::TimedOut if ear == Ear::Bell && has_been_robbed(ends, &heard) => Ok(Slept::Robbed),
+            woken @ (Woken::Rung | Woken::TimedOut | Woken::HungUp) => Ok(Slept::Ended(woken)),
+        },
+    });
+    for index in 0..count {
+        ends.consumer_mut(index).withdraw();
+    }
+    slept
+}
+
+/// What was heard of the words that are slept at.
+#[expect(clippy::large_enum_variant, reason = "it lies on the stack for one sleep, and is not moved")]
+enum Listened {
+    /// All have the same.
+    One(Heard),
+    Each([Heard; ENDS_MAX]),
+}
+
+/// `None` when one has no such word, or there are none.
+fn listen(ends: &impl Ends, ear: Ear) -> Option<Listened> {
+    let word = |index| (index < ends.count()).then(|| word_of(ends.consumer(index), ear)).flatten();
+    let first = word(0)?;
+    let listened = if (1..ends.count()).all(|index| word(index).is_some_and(|other| ptr::eq(other, first))) {
+        Listened::One(Heard(first.load(Ordering::Relaxed)))
+    } else {
+        let mut heard = [Heard(0); ENDS_MAX];
+        for (index, heard) in heard.iter_mut().enumerate().take(ends.count()) {
+            *heard = Heard(word(index)?.load(Ordering::Relaxed));
+        }
+        Listened::Each(heard)
+    };
+    // SYNC: who heard a ring also sees what it was rung for: `FutexBell::ring`, `ProducerCore::say_rung`.
+    fence(Ordering::Acquire);
+    Some(listened)
+}
+
+fn word_of(consumer: &Consumer, ear: Ear) -> Option<&AtomicU32> {
+    match ear {
+        Ear::Bell => consumer.message_bell().word(),
+        Ear::Own => Some(consumer.own_word()),
+    }
+}
+
+impl Listened {
+    /// Whether the one bell that all have has not been rung since.
+    fn is_unchanged(&self, ends: &impl Ends) -> bool {
+        match self {
+            Self::One(heard) => word_of(ends.consumer(0), Ear::Bell)
+                .is_some_and(|word| word.load(Ordering::Relaxed) == heard.0),
+            // Each bell has one peer who can write it: that robs nobody else.
+            Self::Each(_) => false,
+        }
+    }
+
+    fn sleep(&self, ends: &impl Ends, ear: Ear, left: Duration) -> io::Result<Woken> {
+        let no_word = || io::Error::from(io::ErrorKind::InvalidInput);
+        match self {
+            Self::One(heard) => {
+                platform::sleep_at(word_of(ends.consumer(0), ear).ok_or_else(no_word)?, *heard, left)
+            }
+            Self::Each(heard) => {
+                let mut ears = platform::Ears::new();
+                for (index, heard) in heard.iter().enumerate().take(ends.count()) {
+                    ears.add(word_of(ends.consumer(index), ear).ok_or_else(no_word)?, *heard);
+                }
+                ears.sleep(left)
+            }
+        }
     }
 }
 
@@ -168,6 +262,12 @@ fn look(ends: &mut impl Ends) -> Result<Option<usize>, AnyError> {
     Ok(None)
 }
 
+fn look_for_the_gone(ends: &mut impl Ends) -> Result<Any, AnyError> {
+    let Some(index) = hung_up(ends)? else { return Ok(Any::TimedOut) };
+    // It may have said something before.
+    Ok(look(ends)?.map_or(Any::HungUp(index), Any::Message))
+}
+
 fn hung_up(ends: &impl Ends) -> Result<Option<usize>, AnyError> {
     let shown = || (0..ends.count()).filter_map(|index| ends.hang_up(index).map(|hang_up| (index, hang_up)));
     let gone = platform::which_ended(shown().map(|(_, hang_up)| hang_up)).map_err(AnyError::System)?;
@@ -176,8 +276,10 @@ fn hung_up(ends: &impl Ends) -> Result<Option<usize>, AnyError> {
 
 #[cfg(all(test, target_os = "linux", not(any(loom, miri))))]
 mod tests {
+    use std::thread;
+
     use super::*;
-    use crate::{BellKind, Capacity, Corrupt, Region, Terms, layout::Word};
+    use crate::{Bell, BellKind, Capacity, CommonBell, Corrupt, Producer, Region, Terms, layout::Word};
 
     struct One(Consumer);
 
@@ -213,5 +315,42 @@ mod tests {
             ended,
             Err(AnyError::Corrupt { index: 0, cause: Corrupt::Tail { tail: 3, seen: 0 } })
         ));
+    }
+
+    /// Its bells ring in a page that nobody listens to: each of its rings is robbed.
+    fn robbed_peer(bell: &CommonBell) -> (One, Producer, (Producer, Consumer)) {
+        let (side, mut offer) = Region::create(Capacity::MIN, Bell::Common(bell.clone())).expect("a region");
+        let (other, theirs) = Region::create(Capacity::MIN, BellKind::Futex).expect("a region");
+        let (_unheard, unheard) = Region::create(Capacity::MIN, BellKind::Futex).expect("a region");
+        offer.descriptors.truncate(1);
+        offer.descriptors.extend(unheard.descriptors.into_iter().skip(1));
+        let (back, consumer) = side.connect(theirs, &Terms::default()).expect("an honest offer");
+        let (producer, forth) = other.connect(offer, &Terms::default()).expect("an honest offer");
+        (One(consumer), producer, (back, forth))
+    }
+
+    #[test]
+    fn who_was_not_woken_by_a_ring_sleeps_where_nobody_can_take_a_ring_away() {
+        // given
+        let bell = CommonBell::create().expect("a page");
+        let (mut end, mut producer, _rest) = robbed_peer(&bell);
+        let (mut waiter, until) = (Waiter::new(Spin::Off), Instant::now() + Duration::from_secs(20));
+        let sleeps = |producer: &Producer| producer.peer_sleeps();
+        for (number, ear) in [(1, Ear::Bell), (2, Ear::Own), (3, Ear::Own)] {
+            assert_eq!(waiter.trust.ear(Instant::now), ear, "before message {number}");
+            // when
+            thread::scope(|scope| {
+                scope.spawn(|| {
+                    while !sleeps(&producer) {
+                        assert!(Instant::now() < until, "waited for the sleep before message {number}");
+                        thread::yield_now();
+                    }
+                    producer.send(&[number]).expect("room");
+                });
+                // then
+                assert!(matches!(waiter.wait(&mut end, until), Ok(Any::Message(0))), "message {number}");
+            });
+            end.0.receive().expect("an honest peer").expect("a message");
+        }
     }
 }

@@ -6,7 +6,7 @@ use std::{
     sync::atomic::AtomicU32,
 };
 
-use crate::wait::Waiting;
+use crate::{platform, wait::Waiting};
 
 /// How a side wants to be woken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -56,6 +56,50 @@ impl fmt::Display for BellKind {
             Self::EventFd => "eventfd",
             Self::Socket => "socket",
         })
+    }
+}
+
+/// The bell of a region: one of its own, or one that several have.
+#[derive(Clone, Debug)]
+pub enum Bell {
+    /// One of this kind, for this region alone.
+    OfItsOwn(BellKind),
+    /// One for all regions that are made with it: who waits for all of them sleeps at one place.
+    Common(CommonBell),
+}
+
+/// A futex that several regions have. Who waits for all of them ([`Waiter`](crate::Waiter)) sleeps at one word, however many they are.
+///
+/// Each peer gets the page in which it is, and can write it: it can wake this side for nothing, and undo the ring of another
+/// peer in the moment in which this side falls asleep. That message waits for the end of the nap then, 20 ms. Where this side finds it out it
+/// sleeps for a while, each time longer, at words of which each has one writer.
+#[derive(Clone, Debug)]
+pub struct CommonBell(pub(crate) platform::SharedPage);
+
+impl CommonBell {
+    /// Makes one.
+    ///
+    /// # Errors
+    /// What the system said.
+    pub fn create() -> io::Result<Self> {
+        platform::SharedPage::create().map(Self)
+    }
+}
+
+impl Bell {
+    /// The kind of it.
+    #[must_use]
+    pub const fn kind(&self) -> BellKind {
+        match self {
+            Self::OfItsOwn(kind) => *kind,
+            Self::Common(_) => BellKind::Futex,
+        }
+    }
+}
+
+impl From<BellKind> for Bell {
+    fn from(kind: BellKind) -> Self {
+        Self::OfItsOwn(kind)
     }
 }
 

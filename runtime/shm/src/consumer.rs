@@ -1,10 +1,10 @@
 //! Receiving: a message is lent in place, read by copying, and its memory goes back when the lending ends.
 
-use std::{fmt, io, os::fd::BorrowedFd, time::Instant};
+use std::{fmt, io, os::fd::BorrowedFd, sync::atomic::AtomicU32, time::Instant};
 
 use crate::{
     bell::{Doorbell, Heard, Woken},
-    core::{ConsumerCore, Record},
+    core::{ConsumerCore, Record, sleep::Ear},
     error::{Corrupt, ReceiveError},
     platform::{OwnHeaderMemory, PeerMemory},
     spin::{Spin, Spinner},
@@ -71,6 +71,26 @@ impl Consumer {
 
     pub(crate) fn message_bell(&self) -> &dyn Doorbell {
         &*self.message
+    }
+
+    /// The word that a ring of this peer changes, and nobody else can.
+    pub(crate) fn own_word(&self) -> &AtomicU32 {
+        self.core.peer.rung()
+    }
+
+    /// Whether the peer says that it has rung for the sleep that was announced last.
+    pub(crate) fn was_rung(&self) -> bool {
+        self.core.was_rung()
+    }
+
+    /// Says that this side is awake, of a bell that keeps no rings.
+    pub(crate) fn withdraw(&mut self) {
+        self.core.disarm();
+    }
+
+    /// Announces sleep, one of several; see [`ConsumerCore::announce`].
+    pub(crate) fn announce(&mut self, ear: Ear) {
+        self.core.announce(ear);
     }
 
     /// Announces that a reactor is about to wait for [`Consumer::fd`]. Followed by [`Consumer::disarm`] in any case but

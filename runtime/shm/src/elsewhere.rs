@@ -4,12 +4,12 @@ use std::{
     convert::Infallible,
     io,
     os::fd::{BorrowedFd, OwnedFd},
-    sync::atomic::Ordering,
+    sync::atomic::{AtomicU32, Ordering},
     time::Duration,
 };
 
 use crate::{
-    bell::{BellKind, Bells, Doorbell, Heard, Woken},
+    bell::{Bell, BellKind, Bells, Doorbell, Heard, Woken},
     error::{CreateError, PassError, RefusedOffer},
     layout::{Capacity, Word},
     memory::{OwnHeader, OwnRing, Peer},
@@ -33,7 +33,17 @@ pub(crate) fn adopt(_: OwnedFd, _: Capacity) -> Result<PeerMemory, RefusedOffer>
     Err(RefusedOffer::Unsupported)
 }
 
-pub(crate) fn bells(_: BellKind) -> Result<Bells, CreateError> {
+/// There is none.
+#[derive(Clone, Debug)]
+pub(crate) struct SharedPage(Infallible);
+
+impl SharedPage {
+    pub(crate) fn create() -> io::Result<Self> {
+        Err(io::ErrorKind::Unsupported.into())
+    }
+}
+
+pub(crate) fn bells(_: &Bell) -> Result<Bells, CreateError> {
     Err(CreateError::Unsupported)
 }
 
@@ -48,6 +58,10 @@ pub(crate) fn which_ended<'a>(_: impl Iterator<Item = HangUp<'a>>) -> io::Result
     Err(io::ErrorKind::Unsupported.into())
 }
 
+pub(crate) fn sleep_at(_: &AtomicU32, _: Heard, _: Duration) -> io::Result<Woken> {
+    Err(io::ErrorKind::Unsupported.into())
+}
+
 /// There are none.
 pub(crate) struct Ears;
 
@@ -56,7 +70,7 @@ impl Ears {
         Self
     }
 
-    pub(crate) fn add(&mut self, _: &dyn Doorbell, _: Heard) -> bool {
+    pub(crate) fn add(&mut self, _: &AtomicU32, _: Heard) -> bool {
         false
     }
 
@@ -95,6 +109,10 @@ impl OwnHeader for OwnHeaderMemory {
 pub(crate) struct OwnRingMemory(Infallible);
 
 impl OwnRingMemory {
+    pub(crate) fn wake_rung(&self) {
+        match self.0 {}
+    }
+
     pub(crate) fn bytes(&self, _: u32, _: u32) -> &[u8] {
         match self.0 {}
     }
@@ -121,6 +139,10 @@ impl OwnRing for OwnRingMemory {
 pub(crate) struct PeerMemory(Infallible);
 
 impl PeerMemory {
+    pub(crate) fn rung(&self) -> &AtomicU32 {
+        match self.0 {}
+    }
+
     pub(crate) fn copy_out(&self, _: usize, _: &mut [u8]) {
         match self.0 {}
     }

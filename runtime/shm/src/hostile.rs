@@ -288,15 +288,16 @@ impl Attacker {
 
     fn write_something_likely(&mut self) {
         let small = self.dice.below(600);
-        match self.dice.below(12) {
+        match self.dice.below(13) {
             0..4 => self.publish(small),
             4..6 => self.take(),
             6 => self.region.scribble(Word::ConsumerSleep.index() as u32, small),
             7 => self.region.scribble(Word::ProducerSleep.index() as u32, small),
-            8 => self.buttons[small as usize % 2].ring(),
+            8 => self.region.scribble(Word::Rung.index() as u32, small),
+            9 => self.buttons[small as usize % 2].ring(),
             _ if self.wild == 0 => {}
-            9 => self.change_a_mark(Mark::Message(small * 9)),
-            10 => self.change_a_mark(Mark::Skip),
+            10 => self.change_a_mark(Mark::Message(small * 9)),
+            11 => self.change_a_mark(Mark::Skip),
             // Bytes of some message, perhaps while it is copied.
             _ => {
                 let place = HEADER_BYTES as u32 / 4 + self.dice.below(self.region.capacity.bytes() / 4);

@@ -6,6 +6,7 @@
 //! byte 256   head                                       bytes ever taken from the peer's ring
 //! byte 384   sleep of this side's consumer              odd while it sleeps
 //! byte 512   sleep of this side's producer              odd while it sleeps
+//! byte 640   rung                                       the peer's sleep for which this side has rung last
 //! byte 4096  the ring: records of 8-byte multiples
 //! ```
 //!
@@ -19,7 +20,7 @@ use thiserror::Error;
 /// "SINEWSHM", read as little-endian.
 pub(crate) const MAGIC: u64 = u64::from_le_bytes(*b"SINEWSHM");
 /// Changes whenever a byte changes its meaning.
-pub(crate) const VERSION: u32 = 1;
+pub(crate) const VERSION: u32 = 2;
 /// Where the ring begins: after a page for the header.
 pub(crate) const HEADER_BYTES: usize = 4096;
 /// A record begins with this, and is padded to a multiple of it.
@@ -36,6 +37,8 @@ pub(crate) enum Word {
     ConsumerSleep,
     /// Sleep of the region's producer, which waits for room.
     ProducerSleep,
+    /// The sleep of the peer's consumer for which the region's producer has rung last. The consumer may sleep at it.
+    Rung,
 }
 
 impl Word {
@@ -46,6 +49,7 @@ impl Word {
             Self::Head => 256 / 4,
             Self::ConsumerSleep => 384 / 4,
             Self::ProducerSleep => 512 / 4,
+            Self::Rung => 640 / 4,
         }
     }
 }
@@ -181,7 +185,7 @@ mod tests {
 
     #[test]
     fn no_two_header_words_share_a_pair_of_cache_lines_and_all_lie_before_the_ring() {
-        let words = [Word::Tail, Word::Head, Word::ConsumerSleep, Word::ProducerSleep];
+        let words = [Word::Tail, Word::Head, Word::ConsumerSleep, Word::ProducerSleep, Word::Rung];
         let pairs: std::collections::BTreeSet<usize> =
             words.iter().map(|word| word.index() * 4 / 128).collect();
         assert_eq!(pairs.len(), words.len());

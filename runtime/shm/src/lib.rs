@@ -51,6 +51,7 @@ mod offer;
 mod producer;
 mod region;
 mod spin;
+mod trust;
 mod wait;
 
 #[cfg(target_os = "linux")]
@@ -61,7 +62,7 @@ mod platform;
 mod platform;
 
 pub use any::{Any, ENDS_MAX, Ends, Waiter};
-pub use bell::BellKind;
+pub use bell::{Bell, BellKind, CommonBell};
 pub use consumer::{Consumer, Lent, LentReader};
 pub use error::{
     AnyError, Corrupt, CreateError, LoanError, PassError, ReceiveError, RefusedOffer, RoomError,

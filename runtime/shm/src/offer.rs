@@ -127,6 +127,6 @@ mod tests {
         let mut bytes = offer.to_bytes();
         bytes[8] = 9;
         let refused = Offer::from_parts(&bytes, Vec::new()).expect_err("version 9 is not known");
-        assert_eq!(refused.to_string(), "the peer's layout has version 9, this one 1");
+        assert_eq!(refused.to_string(), "the peer's layout has version 9, this one 2");
     }
 }

@@ -9,7 +9,7 @@ use std::{
 
 use crate::{
     bell::{Doorbell, Heard, Woken},
-    core::{ProducerCore, producer::Reserved},
+    core::{ProducerCore, producer::Reserved, sleep::Ear},
     error::{Corrupt, LoanError, RoomError},
     platform::{OwnRingMemory, PeerMemory},
     spin::{Spin, Spinner},
@@ -140,6 +140,29 @@ impl Producer {
     /// Wakes the peer without a message, so that it looks whether this side is still there. For who is about to go.
     pub fn ring(&self) {
         self.message_button.ring();
+        self.core.say_rung_anyhow();
+        self.core.own.wake_rung();
+    }
+
+    /// Whether the consumer has announced that it sleeps.
+    #[cfg(test)]
+    pub(crate) fn peer_sleeps(&self) -> bool {
+        self.core.peer_sleeps()
+    }
+
+    /// Wakes the consumer, which sleeps.
+    fn wake(&self) {
+        match self.core.ear() {
+            // Said afterwards: a sleeper that finds it said, and was not woken, has been robbed of the ring.
+            Ear::Bell => {
+                self.message_button.ring();
+                self.core.say_rung();
+            }
+            Ear::Own => {
+                self.core.say_rung();
+                self.core.own.wake_rung();
+            }
+        }
     }
 
     fn await_room(&mut self, length: usize, wait: &Wait<'_>) -> Result<Reserved, RoomError> {
@@ -222,7 +245,7 @@ impl Loan<'_> {
     pub fn publish(self) {
         let producer = &mut *self.producer;
         if producer.core.publish() {
-            producer.message_button.ring();
+            producer.wake();
         }
     }
 

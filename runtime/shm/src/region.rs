@@ -1,7 +1,7 @@
 //! A side's own memory, and how two sides come together.
 
 use crate::{
-    bell::{BellKind, Bells, Doorbell},
+    bell::{Bell, BellKind, Bells, Doorbell},
     consumer::Consumer,
     core::{ConsumerCore, ProducerCore},
     error::{CreateError, RefusedOffer},
@@ -44,10 +44,12 @@ impl Region {
     ///
     /// # Errors
     /// [`CreateError::Unsupported`] where there is no sealed memory; else what the system said.
-    pub fn create(capacity: Capacity, bell: BellKind) -> Result<(Self, Offer), CreateError> {
+    pub fn create(capacity: Capacity, bell: impl Into<Bell>) -> Result<(Self, Offer), CreateError> {
         let (own, memory) = platform::create(capacity)?;
-        let Bells { message, room, buttons } = platform::bells(bell)?;
+        let bell = bell.into();
+        let Bells { message, room, buttons } = platform::bells(&bell)?;
         let descriptors = [memory].into_iter().chain(buttons).collect();
+        let bell = bell.kind();
         Ok((Self { capacity, own, message, room }, Offer { capacity, bell, descriptors }))
     }
 

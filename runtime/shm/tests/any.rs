@@ -8,8 +8,8 @@ use std::{
 };
 
 use sinew_shm::{
-    Any, AnyError, BellKind, Capacity, Consumer, ENDS_MAX, Ends, HangUp, Producer, Region, Spin, Terms,
-    Waiter,
+    Any, AnyError, Bell, BellKind, Capacity, CommonBell, Consumer, ENDS_MAX, Ends, HangUp, Producer, Region,
+    Spin, Terms, Waiter,
 };
 
 /// Longer than any test takes.
@@ -47,8 +47,8 @@ struct Peer {
     _rest: (Consumer, Producer),
 }
 
-fn pair(bell: BellKind) -> (Side, Peer) {
-    let (left, left_offer) = Region::create(Capacity::MIN, bell).expect("a region");
+fn pair(bell: impl Into<Bell>) -> (Side, Peer) {
+    let (left, left_offer) = Region::create(Capacity::MIN, BellKind::Futex).expect("a region");
     let (right, right_offer) = Region::create(Capacity::MIN, bell).expect("a region");
     let (producer, left_consumer) = left.connect(right_offer, &Terms::default()).expect("an honest offer");
     let (right_producer, consumer) = right.connect(left_offer, &Terms::default()).expect("an honest offer");
@@ -61,17 +61,30 @@ fn sides(count: usize) -> (Sides, Vec<Peer>) {
     (Sides(sides), peers)
 }
 
+/// The same, who all ring one bell.
+fn sides_with_one_bell(count: usize) -> (Sides, Vec<Peer>) {
+    let bell = CommonBell::create().expect("a page");
+    let (sides, peers) = (0..count).map(|_| pair(Bell::Common(bell.clone()))).unzip();
+    (Sides(sides), peers)
+}
+
 fn in_time() -> Instant {
     Instant::now() + WATCHDOG
 }
 
 #[test]
 fn every_message_of_every_peer_wakes_the_one_who_sleeps() {
-    for (count, spin) in
-        [(1, Spin::Off), (3, Spin::Off), (3, Spin::Adaptive { max: Duration::from_micros(50) })]
-    {
+    let looks = Spin::Adaptive { max: Duration::from_micros(50) };
+    for (make, count, spin) in [
+        (sides as fn(usize) -> (Sides, Vec<Peer>), 1, Spin::Off),
+        (sides, 3, Spin::Off),
+        (sides, 3, looks),
+        (sides_with_one_bell, 1, Spin::Off),
+        (sides_with_one_bell, 70, Spin::Off),
+        (sides_with_one_bell, 3, looks),
+    ] {
         // given
-        let (mut ends, mut peers) = sides(count);
+        let (mut ends, mut peers) = make(count);
         let (tell, told) = std::sync::mpsc::sync_channel::<usize>(1);
         let sending = thread::spawn(move || {
             while let Ok(index) = told.recv() {

@@ -49,7 +49,7 @@ impl Direct {
     fn prepare(&self, socket: &UnixStream) -> Result<(Exchange, Share), ExchangeError> {
         let share = self.terms.budget.take(self.terms.ring_bytes).ok_or(ExchangeError::Budget)?;
         let [own, theirs] = [self.terms.ring_bytes, RING_BYTES_MAX].map(rings::capacity);
-        let exchange = Exchange::prepare_for(own, self.terms.options.bell, theirs)?;
+        let exchange = Exchange::prepare_for(own, self.terms.options.bell.clone(), theirs)?;
         exchange.offer(socket)?;
         Ok((exchange, share))
     }
@@ -88,7 +88,7 @@ impl Direct {
     fn connect(&self, offered: Offered, theirs: Offer) -> Result<Standing, ExchangeError> {
         let Offered { peer, number, socket, exchange, share } = offered;
         let (producer, consumer) = exchange.finish(theirs)?;
-        let writer = ring::Writer::new(socket.clone(), producer, self.terms.options);
+        let writer = ring::Writer::new(socket.clone(), producer, &self.terms.options);
         let pair = Pair { own: self.terms.own, peer, number, socket };
         Ok(Standing::new(pair, writer, consumer, share, self.terms.payload_max))
     }

@@ -46,7 +46,7 @@ impl Greeting {
         let lncl = payload::lncl_of(NodeAddress::HERE);
         let asked = asked(register, options.transport);
         let frame = payload::frame(Kind::LNCL_REGISTER, Tid::NONE, lncl, &asked);
-        let written = socket::Writer::new(socket.clone(), options).write(&frame);
+        let written = socket::Writer::new(socket.clone(), &options).write(&frame);
         let mut greeting = Self { socket, options, frame: BytesMut::zeroed(HEADER_LEN), filled: 0 };
         match written {
             Ok(()) => Ok(greeting),
@@ -83,7 +83,7 @@ impl Greeting {
 
     /// Agrees with the node on what carries the messages.
     fn finish(&self, registered: Registered) -> Result<Link, ApiError> {
-        let (socket, options) = (self.socket.clone(), self.options);
+        let (socket, options) = (self.socket.clone(), &self.options);
         let payload_max = registered.payload_max as usize;
         let (writer, reader) = match registered.ring {
             None => {
@@ -92,7 +92,7 @@ impl Greeting {
             }
             Some(ring_bytes) => {
                 let (producer, consumer) =
-                    ring::exchange(&socket, ring_bytes, options.bell, Time::now() + EXCHANGE)?;
+                    ring::exchange(&socket, ring_bytes, options.bell.clone(), Time::now() + EXCHANGE)?;
                 let reader = ring::Reader::new(socket.clone(), consumer, payload_max, options.spin);
                 let writer = Arc::new(ring::Writer::new(socket, producer, options));
                 (Writer::Ring(writer), Reader::Ring(Box::new(reader)))

@@ -18,7 +18,7 @@ use sinew_runtime::{
     time::Time,
     wire::Message,
 };
-use sinew_shm::{Armed, BellKind, Spin};
+use sinew_shm::{Armed, Bell, Spin};
 use socket2::{Domain, SockAddr, Socket, Type};
 
 use super::{
@@ -46,14 +46,14 @@ pub enum Transport {
 }
 
 /// How a link is to be.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct LinkOptions {
     pub(super) transport: Transport,
     pub(super) spin: Spin,
     /// How long a send waits for room.
     pub(super) patience: Duration,
-    /// How this side is woken: by a futex where threads wait, by a socket where tasks do.
-    pub(super) bell: BellKind,
+    /// How this side is woken: by a futex where threads wait, one for all links of the endpoint; by a socket each where tasks do.
+    pub(super) bell: Bell,
     /// Bytes of this side's ring of a direct link.
     pub(super) direct_ring_bytes: usize,
 }
@@ -288,10 +288,10 @@ impl Reader {
     }
 
     /// Reads what is there, without waiting.
-    pub(super) fn read(&mut self) -> Read {
+    pub(super) fn read(&mut self, now: Time) -> Read {
         match self {
             Self::Socket(reader) => reader.read(),
-            Self::Ring(reader) => reader.read(),
+            Self::Ring(reader) => reader.read(now),
         }
     }
 
@@ -323,12 +323,12 @@ impl Reader {
         }
     }
 
-    /// Waits until there is something to read, or to do, until `deadline` at most. May end early without a reason. One
+    /// Waits until there is something to read, or to do, for `left` at most. May end early without a reason. One
     /// wake of the calling thread.
-    pub(super) fn wait(&mut self, deadline: Time) {
+    pub(super) fn wait(&mut self, left: Duration) {
         match self {
-            Self::Socket(reader) => reader.wait(deadline),
-            Self::Ring(reader) => reader.wait(deadline),
+            Self::Socket(reader) => reader.wait(Time::now() + left),
+            Self::Ring(reader) => reader.wait(left),
         }
     }
 }

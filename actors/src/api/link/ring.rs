@@ -9,8 +9,11 @@ use std::{
         fd::{AsFd, BorrowedFd},
         unix::net::UnixStream,
     },
-    sync::{Arc, Mutex, OnceLock, PoisonError, TryLockError},
-    time::{Duration, Instant},
+    sync::{
+        Arc, Mutex, OnceLock, PoisonError, TryLockError,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::Duration,
 };
 
 use bytes::BytesMut;
@@ -24,8 +27,8 @@ use sinew_runtime::{
     wire::{FrameCodec, Kind, Message},
 };
 use sinew_shm::{
-    Any, AnyError, Armed, BellKind, Capacity, Consumer, Ends, HangUp, LoanError, Producer, Region, RoomError,
-    Spin, Wait, Waiter,
+    Any, AnyError, Armed, Bell, BellKind, Capacity, Consumer, Ends, HangUp, LoanError, Producer, Region,
+    RoomError, Spin, Wait, Waiter,
 };
 use tokio::sync::Notify;
 use tokio_util::codec::Decoder;
@@ -66,7 +69,7 @@ pub(super) fn is_available() -> bool {
 pub(in crate::api) fn exchange(
     socket: &UnixStream,
     ring_bytes: u32,
-    bell: BellKind,
+    bell: impl Into<Bell>,
     deadline: Time,
 ) -> Result<(Producer, Consumer), ApiError> {
     let closed = |error: ExchangeError| ApiError::Closed(error.to_string());
@@ -92,16 +95,23 @@ pub(in crate::api) struct Writer {
     producer: Mutex<Option<Box<Producer>>>,
     /// Outcomes that found no room, or the ring lent, when they were said.
     owed: Mutex<VecDeque<Message>>,
+    /// Whether there are any; changed with `owed` locked. Looked at with each message.
+    is_owing: AtomicBool,
     /// Told when some thread has left something owed: a task that waits looks again.
     pub(super) owing: Notify,
     patience: Duration,
 }
 
 impl Writer {
-    pub(in crate::api) fn new(socket: Arc<UnixStream>, mut producer: Producer, options: LinkOptions) -> Self {
+    pub(in crate::api) fn new(
+        socket: Arc<UnixStream>,
+        mut producer: Producer,
+        options: &LinkOptions,
+    ) -> Self {
         producer.set_spin(options.spin);
         let (producer, owed) = (Mutex::new(Some(Box::new(producer))), Mutex::default());
-        Self { socket, producer, owed, owing: Notify::new(), patience: options.patience }
+        let is_owing = AtomicBool::new(false);
+        Self { socket, producer, owed, is_owing, owing: Notify::new(), patience: options.patience }
     }
 
     /// Writes one frame that fits into half the ring; waits for room as long as the link's patience lasts.
@@ -238,11 +248,12 @@ impl Writer {
                 Err(LoanError::TooLong { .. } | LoanError::Corrupt(_)) => owed.clear(),
             }
         }
+        self.is_owing.store(false, Ordering::Release);
         true
     }
 
     pub(in crate::api) fn owes(&self) -> bool {
-        !self.owed.lock().unwrap_or_else(PoisonError::into_inner).is_empty()
+        self.is_owing.load(Ordering::Acquire)
     }
 
     /// Closes the connection, which gives the address back.
@@ -257,6 +268,7 @@ impl ReceiptSink for Writer {
         let mut owed = self.owed.lock().unwrap_or_else(PoisonError::into_inner);
         if owed.len() < OWED_MAX {
             owed.push_back(Message::outcome(ticket, outcome));
+            self.is_owing.store(true, Ordering::Release);
         }
         drop(owed);
         self.pay();
@@ -324,7 +336,7 @@ impl Reader {
     }
 
     /// Takes what is there, without waiting.
-    pub(super) fn read(&mut self) -> Read {
+    pub(super) fn read(&mut self, now: Time) -> Read {
         match self.frames.take(&mut self.end.consumer, ENOUGH) {
             Err(corrupt) => {
                 Read::Ended(Ended::for_good(format!("shared memory holds what it cannot: {corrupt}")))
@@ -333,7 +345,7 @@ impl Reader {
             Ok(Taken::Nothing) => match self.ended.clone() {
                 Some(why) => Read::Ended(why),
                 // What was published before the end is taken by the next look.
-                None if self.has_ended(Time::now()) => Read::Some,
+                None if self.has_ended(now) => Read::Some,
                 None => Read::Nothing,
             },
         }
@@ -350,24 +362,21 @@ impl Reader {
     }
 
     /// Waits for a message, the node's end, or a nap's length.
-    pub(super) fn wait(&mut self, deadline: Time) {
+    pub(super) fn wait(&mut self, left: Duration) {
         if self.ended.is_some() {
             return;
         }
-        let left = deadline.since(Time::now()).min(NAP);
-        let ended = self.waiter.wait(&mut self.end, Instant::now() + left);
+        let ended = self.waiter.wait_within(&mut self.end, left.min(NAP));
         self.note(&ended);
     }
 
     /// As [`wait`](Self::wait), for the ends that `all` makes of the node's, which is the first, and others.
     pub(in crate::api) fn wait_for_all<'a, E: Ends>(
         &'a mut self,
-        deadline: Time,
+        left: Duration,
         all: impl FnOnce(&'a mut End) -> E,
     ) -> Result<Any, AnyError> {
-        let left = deadline.since(Time::now()).min(NAP);
-        let mut ends = all(&mut self.end);
-        self.waiter.wait(&mut ends, Instant::now() + left)
+        self.waiter.wait_within(&mut all(&mut self.end), left.min(NAP))
     }
 
     /// What the end of a wait says about the node.

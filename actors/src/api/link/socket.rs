@@ -76,8 +76,8 @@ enum Pushed {
 }
 
 impl Writer {
-    pub(in crate::api) fn new(socket: Arc<UnixStream>, options: LinkOptions) -> Self {
-        let waits = if options.bell == BellKind::Futex { Waits::Here } else { Waits::Elsewhere };
+    pub(in crate::api) fn new(socket: Arc<UnixStream>, options: &LinkOptions) -> Self {
+        let waits = if options.bell.kind() == BellKind::Futex { Waits::Here } else { Waits::Elsewhere };
         Self { socket, turn: Mutex::default(), owing: Notify::new(), patience: options.patience, waits }
     }
 

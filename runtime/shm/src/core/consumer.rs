@@ -2,7 +2,7 @@
 
 use std::sync::atomic::Ordering;
 
-use super::sleep::{Sleep, Waking};
+use super::sleep::{Ear, Sleep, Waking};
 use crate::{
     error::Corrupt,
     layout::{Capacity, MARK_BYTES, Mark, Word, record_bytes},
@@ -88,6 +88,16 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
                 Err(corrupt)
             }
         }
+    }
+
+    /// Announces sleep to this peer, one of several. After all of them a fence follows, and another look.
+    pub(crate) fn announce(&mut self, ear: Ear) {
+        self.sleep.announce_at(ear, &self.own);
+    }
+
+    /// Whether the peer says that it has rung for the sleep that was announced last.
+    pub(crate) fn was_rung(&self) -> bool {
+        self.peer.load(Word::Rung) == self.sleep.announced()
     }
 
     /// Says that this side is awake again.

@@ -9,8 +9,15 @@ use loom::{
     thread,
 };
 
-use super::model::{Receiver, Sender, fill, read, ring};
-use crate::{layout::Capacity, wait::Armed};
+use super::{
+    model::{Receiver, Sender, fill, read, ring},
+    sleep::{Ear, fence_before_looking_again},
+};
+use crate::{
+    layout::{Capacity, Word},
+    memory::{Peer, fence},
+    wait::Armed,
+};
 
 /// What a futex does, and a descriptor: rung after it was listened to, a sleep ends. The lock is the system's.
 struct Bell {
@@ -184,74 +191,118 @@ fn a_loan_that_is_given_back_is_never_seen() {
     });
 }
 
-/// What a sleeper on several futexes sleeps on: it is woken by any of them that rings after it was listened to.
-struct Bells {
-    words: [AtomicU32; 2],
+/// What a sleeper for several rings sleeps at: one bell that all ring, or the words of the wakers' own. The lock is the system's.
+struct Place {
+    bell: AtomicU32,
     sleepers: Mutex<()>,
     woken: Condvar,
 }
 
-impl Bells {
-    fn ring(&self, index: usize) {
-        self.words[index].fetch_add(1, Ordering::Release);
+impl Place {
+    fn new() -> Arc<Self> {
+        Arc::new(Self { bell: AtomicU32::new(0), sleepers: Mutex::new(()), woken: Condvar::new() })
+    }
+
+    fn wake(&self) {
         let sleepers = self.sleepers.lock().unwrap();
         self.woken.notify_one();
         drop(sleepers);
     }
 
-    fn listen(&self) -> [u32; 2] {
-        [self.words[0].load(Ordering::Acquire), self.words[1].load(Ordering::Acquire)]
-    }
-
-    fn sleep(&self, heard: [u32; 2]) {
-        let sleepers = self.sleepers.lock().unwrap();
-        if (0..2).all(|index| self.words[index].load(Ordering::Relaxed) == heard[index]) {
-            drop(self.woken.wait(sleepers).unwrap());
+    /// As `Producer::publish` does.
+    fn send(&self, sender: &mut Sender, number: u64) {
+        if !send(sender, 8, number) {
+            return;
         }
-    }
-}
-
-/// The order of steps of `any.rs`: listen to all, announce to all, sleep, withdraw from all.
-fn take_sleeping_any(receivers: &mut [Receiver; 2], bells: &Bells) -> Vec<u64> {
-    loop {
-        for receiver in receivers.iter_mut() {
-            if let Some((words, _)) = take(receiver) {
-                return words;
+        match sender.ear() {
+            Ear::Bell => {
+                self.bell.fetch_add(1, Ordering::Release);
+                self.wake();
+                sender.say_rung();
+            }
+            Ear::Own => {
+                sender.say_rung();
+                self.wake();
             }
         }
-        let heard = bells.listen();
-        let ready = receivers.iter_mut().position(|receiver| receiver.arm().unwrap() == Armed::Ready);
-        if ready.is_none() {
-            bells.sleep(heard);
-        }
-        for receiver in receivers.iter_mut().take(ready.unwrap_or(2)) {
-            receiver.disarm();
+    }
+
+    fn words<const N: usize>(&self, receivers: &[Receiver; N], ear: Ear) -> [u32; N] {
+        std::array::from_fn(|index| match ear {
+            Ear::Bell => self.bell.load(Ordering::Relaxed),
+            Ear::Own => receivers[index].peer.load(Word::Rung),
+        })
+    }
+
+    /// The order of steps of `any.rs`: listen, announce to all, fence once, look, sleep, withdraw from all.
+    fn take<const N: usize>(
+        &self,
+        receivers: &mut [Receiver; N],
+        ears: &mut impl Iterator<Item = Ear>,
+    ) -> Vec<u64> {
+        loop {
+            for receiver in receivers.iter_mut() {
+                if let Some((words, _)) = take(receiver) {
+                    return words;
+                }
+            }
+            let ear = ears.next().unwrap();
+            let heard = self.words(receivers, ear);
+            fence(Ordering::Acquire);
+            receivers.iter_mut().for_each(|receiver| receiver.announce(ear));
+            fence_before_looking_again();
+            if receivers.iter_mut().all(|receiver| receiver.next().unwrap().is_none()) {
+                let sleepers = self.sleepers.lock().unwrap();
+                if self.words(receivers, ear) == heard {
+                    drop(self.woken.wait(sleepers).unwrap());
+                }
+            }
+            receivers.iter_mut().for_each(Receiver::disarm);
         }
     }
 }
 
-#[test]
-fn who_sleeps_at_two_rings_is_woken_for_every_message_of_either() {
-    loom::model(|| {
+fn who_sleeps_at_two_rings_takes_both_messages(ears: [Ear; 2]) {
+    loom::model(move || {
         let (mut first, first_end) = ring(Capacity::tiny(64));
         let (mut second, second_end) = ring(Capacity::tiny(64));
-        let words = [AtomicU32::new(0), AtomicU32::new(0)];
-        let bells = Arc::new(Bells { words, sleepers: Mutex::new(()), woken: Condvar::new() });
-        let buttons = Arc::clone(&bells);
+        let place = Place::new();
+        let button = Arc::clone(&place);
         let sending = thread::spawn(move || {
-            if send(&mut second, 8, 2) {
-                buttons.ring(1);
-            }
-            if send(&mut first, 8, 1) {
-                buttons.ring(0);
-            }
+            button.send(&mut second, 2);
+            button.send(&mut first, 1);
         });
-        let mut receivers = [first_end, second_end];
+        let (mut receivers, mut ears) = ([first_end, second_end], ears.into_iter().cycle());
         // A lost wake is a deadlock, which loom reports.
-        let mut taken =
-            vec![take_sleeping_any(&mut receivers, &bells), take_sleeping_any(&mut receivers, &bells)];
+        let mut taken = vec![place.take(&mut receivers, &mut ears), place.take(&mut receivers, &mut ears)];
         taken.sort();
         assert_eq!(taken, [[1], [2]]);
         sending.join().unwrap();
     });
+}
+
+#[test]
+fn who_sleeps_at_one_bell_is_woken_for_every_message_of_either_ring() {
+    who_sleeps_at_two_rings_takes_both_messages([Ear::Bell; 2]);
+}
+
+#[test]
+fn who_sleeps_at_the_wakers_own_words_is_woken_for_every_message_of_either_ring() {
+    who_sleeps_at_two_rings_takes_both_messages([Ear::Own; 2]);
+}
+
+#[test]
+fn who_goes_from_the_bell_to_the_wakers_own_word_and_back_is_woken_for_every_message() {
+    for ears in [[Ear::Bell, Ear::Own], [Ear::Own, Ear::Bell]] {
+        loom::model(move || {
+            let (mut sender, end) = ring(Capacity::tiny(64));
+            let place = Place::new();
+            let button = Arc::clone(&place);
+            let sending = thread::spawn(move || (1..=2).for_each(|number| button.send(&mut sender, number)));
+            let (mut receivers, mut ears) = ([end], ears.into_iter().cycle());
+            assert_eq!(place.take(&mut receivers, &mut ears), [1]);
+            assert_eq!(place.take(&mut receivers, &mut ears), [2]);
+            sending.join().unwrap();
+        });
+    }
 }

@@ -16,7 +16,7 @@ use crate::{
 /// One side's region.
 #[derive(Debug)]
 pub(super) struct Side {
-    words: [AtomicU32; 4],
+    words: [AtomicU32; 5],
     ring: Vec<AtomicU64>,
 }
 
@@ -37,6 +37,7 @@ impl Side {
             Word::Head => &self.words[1],
             Word::ConsumerSleep => &self.words[2],
             Word::ProducerSleep => &self.words[3],
+            Word::Rung => &self.words[4],
         }
     }
 

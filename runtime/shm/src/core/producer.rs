@@ -2,7 +2,7 @@
 
 use std::sync::atomic::Ordering;
 
-use super::sleep::{Sleep, Waking};
+use super::sleep::{Ear, Sleep, Waking};
 use crate::{
     error::{Corrupt, LoanError},
     layout::{Capacity, MARK_BYTES, Mark, Word, record_bytes},
@@ -114,6 +114,28 @@ impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
     /// Gives the reserved room back: it was never seen by anyone.
     pub(crate) fn give_back(&mut self) {
         self.reserved = None;
+    }
+
+    /// Where the consumer sleeps that has to be woken.
+    pub(crate) const fn ear(&self) -> Ear {
+        self.waking.ear()
+    }
+
+    /// Whether the consumer has announced that it sleeps.
+    #[cfg(test)]
+    pub(crate) fn peer_sleeps(&self) -> bool {
+        self.peer.load(Word::ConsumerSleep) % 2 == 1
+    }
+
+    /// Says for which sleep of the consumer this side has rung.
+    pub(crate) fn say_rung(&self) {
+        // SYNC: who sleeps at this word and sees it also sees what it was rung for.
+        self.own.store(Word::Rung, self.waking.rung_for(), Ordering::Release);
+    }
+
+    /// The same for a sleep that need not have been announced: for who is about to go.
+    pub(crate) fn say_rung_anyhow(&self) {
+        self.own.store(Word::Rung, self.peer.load(Word::ConsumerSleep), Ordering::Release);
     }
 
     /// Announces sleep until there is room for `length` bytes.

@@ -12,6 +12,9 @@
 //!
 //! Whatever the timing, S3 sees W1 or W3 sees S1: the two fences have an order. The waker cannot clear the sleeper's word
 //! (the memory is not its own), so it remembers for which number it has rung, and rings once for each.
+//!
+//! Who sleeps for many rings announces to all of them and fences once. Its number says by what it is woken: by the bell of all its peers,
+//! or by each peer's own word (`any.rs`): 4k+1 and 4k+3 while it sleeps, 4k awake.
 
 use std::sync::atomic::Ordering;
 
@@ -19,6 +22,25 @@ use crate::{
     layout::Word,
     memory::{OwnHeader, Peer, fence},
 };
+
+/// By what a sleeper is woken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Ear {
+    /// The bell that it gave its peers, perhaps the same to all of them: any of them can write it.
+    Bell,
+    /// The word in the waker's own region, which nobody else can write.
+    Own,
+}
+
+const ASLEEP: u32 = 1;
+const AT_OWN: u32 = 2;
+const STEP: u32 = 4;
+
+/// Between announcing one's sleep and looking again.
+pub(crate) fn fence_before_looking_again() {
+    // SYNC: S2, with W2 in `Waking::is_owed`.
+    fence(Ordering::SeqCst);
+}
 
 /// This side's sleep.
 #[derive(Debug)]
@@ -34,18 +56,31 @@ impl Sleep {
 
     /// Says that this side is about to sleep. What it waits for has to be looked at again after this.
     pub(crate) fn announce(&mut self, own: &impl OwnHeader) {
-        self.number = self.number.wrapping_add(1) | 1;
+        self.announce_at(Ear::Bell, own);
+        fence_before_looking_again();
+    }
+
+    /// The same, without the fence.
+    pub(crate) fn announce_at(&mut self, ear: Ear, own: &impl OwnHeader) {
+        let at = match ear {
+            Ear::Bell => 0,
+            Ear::Own => AT_OWN,
+        };
+        self.number = (self.number & !(STEP - 1)).wrapping_add(STEP) | ASLEEP | at;
         own.store(self.word, self.number, Ordering::Relaxed);
-        // SYNC: S2, with W2 in `Waking::is_owed`.
-        fence(Ordering::SeqCst);
     }
 
     /// Says that this side is awake. When the waker sees this late, it rings in vain, which harms nobody.
     pub(crate) fn end(&mut self, own: &impl OwnHeader) {
-        if self.number % 2 == 1 {
-            self.number = self.number.wrapping_add(1);
-            own.store(self.word, self.number, Ordering::Relaxed);
+        if self.number & ASLEEP != 0 {
+            own.store(self.word, self.number & !(STEP - 1), Ordering::Relaxed);
+            self.number &= !ASLEEP;
         }
+    }
+
+    /// The number that was announced last.
+    pub(crate) const fn announced(&self) -> u32 {
+        self.number | ASLEEP
     }
 }
 
@@ -66,10 +101,20 @@ impl Waking {
         // SYNC: W2, with S2 in `Sleep::announce`.
         fence(Ordering::SeqCst);
         let number = peer.load(self.word);
-        let owed = number % 2 == 1 && number != self.rung_for;
+        let owed = number & ASLEEP != 0 && number != self.rung_for;
         if owed {
             self.rung_for = number;
         }
         owed
+    }
+
+    /// The number for which it was owed last.
+    pub(crate) const fn rung_for(&self) -> u32 {
+        self.rung_for
+    }
+
+    /// Where the other side sleeps for which it was owed last.
+    pub(crate) const fn ear(&self) -> Ear {
+        if self.rung_for & AT_OWN == 0 { Ear::Bell } else { Ear::Own }
     }
 }

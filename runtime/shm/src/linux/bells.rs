@@ -23,7 +23,7 @@ use super::{
     memfd::{adopt_page, create_page},
 };
 use crate::{
-    bell::{BellKind, Bells, Doorbell, Heard, Woken},
+    bell::{Bell, BellKind, Bells, CommonBell, Doorbell, Heard, Woken},
     error::{CreateError, RefusedOffer},
     wait::{HangUp, Waiting},
 };
@@ -32,23 +32,36 @@ use crate::{
 type Both = (Box<dyn Doorbell>, Box<dyn Doorbell>);
 
 /// A region's bells.
-pub(crate) fn bells(kind: BellKind) -> Result<Bells, CreateError> {
-    let made = match kind {
-        BellKind::Futex => futexes(),
-        BellKind::EventFd => pair_of(event),
-        BellKind::Socket => pair_of(socket),
+pub(crate) fn bells(bell: &Bell) -> Result<Bells, CreateError> {
+    let made = match bell {
+        Bell::OfItsOwn(BellKind::Futex) => SharedPage::create().and_then(|page| page.bells()),
+        Bell::OfItsOwn(BellKind::EventFd) => pair_of(event),
+        Bell::OfItsOwn(BellKind::Socket) => pair_of(socket),
+        Bell::Common(CommonBell(page)) => page.bells(),
     };
     made.map_err(|cause| CreateError::System { step: "making bells", cause })
 }
 
-fn futexes() -> io::Result<Bells> {
-    let (page, memory) = create_page()?;
-    let (message, room) = on_page(page);
-    Ok(Bells { message, room, buttons: vec![memory] })
+/// A page of futexes, for one region or several.
+#[derive(Clone, Debug)]
+pub(crate) struct SharedPage {
+    page: Arc<Mapping>,
+    memory: Arc<OwnedFd>,
 }
 
-fn on_page(page: Mapping) -> Both {
-    let page = Arc::new(page);
+impl SharedPage {
+    pub(crate) fn create() -> io::Result<Self> {
+        let (page, memory) = create_page()?;
+        Ok(Self { page: Arc::new(page), memory: Arc::new(memory) })
+    }
+
+    fn bells(&self) -> io::Result<Bells> {
+        let (message, room) = on_page(Arc::clone(&self.page));
+        Ok(Bells { message, room, buttons: vec![self.memory.try_clone()?] })
+    }
+}
+
+fn on_page(page: Arc<Mapping>) -> Both {
     let bell = |index| Box::new(FutexBell { page: Arc::clone(&page), index });
     (bell(MESSAGE_WORD), bell(ROOM_WORD))
 }
@@ -78,7 +91,7 @@ pub(crate) fn buttons(kind: BellKind, fds: Vec<OwnedFd>) -> Result<Both, Refused
         (BellKind::Futex, Some(fd), None) => {
             let page = adopt_page(&fd)
                 .map_err(|cause| RefusedOffer::System { step: "mapping the offered page of bells", cause })?;
-            page.map(on_page).ok_or(RefusedOffer::NotABell(kind))
+            page.map(Arc::new).map(on_page).ok_or(RefusedOffer::NotABell(kind))
         }
         (BellKind::EventFd, Some(message), Some(room)) if is_eventfd(&message)? && is_eventfd(&room)? => {
             Ok((Box::new(EventBell(message)), Box::new(EventBell(room))))
@@ -110,10 +123,17 @@ const HANG_UP_LOOK: Duration = Duration::from_millis(20);
 const MESSAGE_WORD: usize = 0;
 const ROOM_WORD: usize = 32;
 
+/// Wakes one who sleeps at a word.
+pub(super) fn wake(word: &AtomicU32) {
+    // Not private: the sleeper is in another process. It can fail only for a bad address, which this is not.
+    let _ = futex::wake(word, futex::Flags::empty(), 1);
+}
+
 /// A word that each ring changes, in a page that both sides write.
 ///
 /// Not the tail or head itself: the sleeper's mapping of those is read-only, and a futex on a read-only mapping costs half a
-/// microsecond more each time. What a hostile peer writes here ends sleeps early, or lets its own rings go unheard.
+/// microsecond more each time. What a hostile peer writes here ends sleeps early, or lets rings go unheard: its own and, where several regions have
+/// the page, those of others until `Waiter` has found that out.
 struct FutexBell {
     page: Arc<Mapping>,
     index: usize,
@@ -133,8 +153,7 @@ impl Doorbell for FutexBell {
     fn ring(&self) {
         // SYNC: who hears this ring in `listen` also sees what it was rung for.
         self.counter().fetch_add(1, Ordering::Release);
-        // Not private: the sleeper is in another process. It can fail only for a bad address, which this is not.
-        let _ = futex::wake(self.counter(), futex::Flags::empty(), 1);
+        wake(self.counter());
     }
 
     fn listen(&self) -> Heard {

@@ -15,13 +15,13 @@ use rustix::{
 use super::bells::timespec;
 use crate::{
     any::ENDS_MAX,
-    bell::{Doorbell, Heard, Woken},
+    bell::{Heard, Woken},
 };
 
 /// How long to sleep on one futex of several where the system cannot wait for all (before Linux 5.16).
 const TURN: Duration = Duration::from_millis(1);
 
-/// Bells that were listened to and are slept on.
+/// Words that were listened to and are slept on.
 pub(crate) struct Ears<'a> {
     first: Option<(&'a AtomicU32, u32)>,
     waits: [futex::Wait; ENDS_MAX],
@@ -33,9 +33,9 @@ impl<'a> Ears<'a> {
         Self { first: None, waits: [futex::Wait::new(); ENDS_MAX], count: 0 }
     }
 
-    /// Adds one of which this was heard. False when it has no futex, or there are too many.
-    pub(crate) fn add(&mut self, bell: &'a dyn Doorbell, heard: Heard) -> bool {
-        let (Some(word), Some(wait)) = (bell.word(), self.waits.get_mut(self.count)) else {
+    /// Adds one of which this was heard. False when there are too many.
+    pub(crate) fn add(&mut self, word: &'a AtomicU32, heard: Heard) -> bool {
+        let Some(wait) = self.waits.get_mut(self.count) else {
             return false;
         };
         wait.val = u64::from(heard.0);
@@ -51,25 +51,32 @@ impl<'a> Ears<'a> {
     pub(crate) fn sleep(&self, left: Duration) -> io::Result<Woken> {
         let slept = match self.first {
             None => return Ok(Woken::TimedOut),
-            // One is quicker alone.
-            Some((word, heard)) if self.count == 1 => sleep_on(word, heard, left),
             Some((word, heard)) => match self.sleep_on_all(left) {
                 Err(Errno::NOSYS) => sleep_on(word, heard, left.min(TURN)),
                 other => other,
             },
         };
-        match slept {
-            // Rung before the sleep; a signal came. The caller looks again.
-            Ok(()) | Err(Errno::AGAIN | Errno::INTR) => Ok(Woken::Rung),
-            Err(Errno::TIMEDOUT) => Ok(Woken::TimedOut),
-            Err(errno) => Err(errno.into()),
-        }
+        woken(slept)
     }
 
     fn sleep_on_all(&self, left: Duration) -> Result<(), Errno> {
         let until = after(clock_gettime(ClockId::Monotonic), left);
         futex::waitv(&self.waits[..self.count], WaitvFlags::empty(), Some(&until), ClockId::Monotonic)?;
         Ok(())
+    }
+}
+
+/// Sleeps on one word until it is rung after this was heard, or `left` has passed. May end early without a reason.
+pub(crate) fn sleep_at(word: &AtomicU32, heard: Heard, left: Duration) -> io::Result<Woken> {
+    woken(sleep_on(word, heard.0, left))
+}
+
+fn woken(slept: Result<(), Errno>) -> io::Result<Woken> {
+    match slept {
+        // Rung before the sleep; a signal came. The caller looks again.
+        Ok(()) | Err(Errno::AGAIN | Errno::INTR) => Ok(Woken::Rung),
+        Err(Errno::TIMEDOUT) => Ok(Woken::TimedOut),
+        Err(errno) => Err(errno.into()),
     }
 }
 

@@ -11,7 +11,8 @@
 //! - M4. Of an own region, the header is touched only as atomics, and the ring only through the one `OwnRingMemory` that
 //!   `OwnMemory::split` makes of it: it is neither `Clone` nor `Copy`.
 //! - M5. Of a peer's region, which changes at any time, everything is touched only by relaxed atomic loads of 4 or 8 aligned
-//!   bytes, each place always in the same size: header 4, ring 8. These are defined on read-only mappings too.
+//!   bytes, each place always in the same size: header 4, ring 8. These are defined on read-only mappings too. The word `Rung` is also
+//!   slept at, which makes the kernel load it.
 //! - M6. A page of bells is written by both sides, and touched only as atomics of 4 bytes. It cannot shrink (seal SHRINK); a
 //!   hole in it reads as zeros.
 
@@ -25,6 +26,7 @@ use std::{
 
 use memmap2::MmapRaw;
 
+use super::bells::wake;
 use crate::{
     layout::{Capacity, HEADER_BYTES, MAGIC, VERSION, Word},
     memory::{OwnHeader, OwnRing, Peer},
@@ -134,6 +136,11 @@ impl OwnHeader for OwnHeaderMemory {
 pub(crate) struct OwnRingMemory(OwnHeaderMemory);
 
 impl OwnRingMemory {
+    /// Wakes who sleeps at the word that says for what this side has rung.
+    pub(crate) fn wake_rung(&self) {
+        wake(self.0.word(Word::Rung));
+    }
+
     /// Bytes of the ring.
     pub(crate) fn bytes(&self, position: u32, length: u32) -> &[u8] {
         let mapping = &self.0.0;
@@ -181,6 +188,11 @@ pub(crate) struct PeerMemory(Arc<Mapping>);
 impl PeerMemory {
     pub(super) fn new(mapping: Mapping) -> Self {
         Self(Arc::new(mapping))
+    }
+
+    /// The word that says for what the peer has rung: to be loaded, relaxed, and slept at.
+    pub(crate) fn rung(&self) -> &AtomicU32 {
+        &self.0.header()[Word::Rung.index()]
     }
 
     /// Copies bytes of the ring, each read once, in words of 8: no instruction in it can be torn apart by the compiler, and

@@ -8,8 +8,8 @@ mod passing;
 #[cfg(test)]
 mod tests;
 
-pub(crate) use bells::{bells, buttons, which_ended};
-pub(crate) use ears::Ears;
+pub(crate) use bells::{SharedPage, bells, buttons, which_ended};
+pub(crate) use ears::{Ears, sleep_at};
 pub(crate) use mapping::{OwnHeaderMemory, OwnMemory, OwnRingMemory, PeerMemory};
 pub(crate) use memfd::{adopt, create};
 pub(crate) use passing::{receive, send};

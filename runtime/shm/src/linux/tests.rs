@@ -40,7 +40,7 @@ fn words_and_marks_are_where_both_sides_look_for_them() {
     let (header, mut ring) = OwnMemory::new(anonymous(Capacity::MIN)).split();
     // when
     for (value, word) in
-        [Word::Tail, Word::Head, Word::ConsumerSleep, Word::ProducerSleep].into_iter().enumerate()
+        [Word::Tail, Word::Head, Word::ConsumerSleep, Word::ProducerSleep, Word::Rung].into_iter().enumerate()
     {
         header.store(word, value as u32 + 1, std::sync::atomic::Ordering::Relaxed);
     }
