@@ -9,9 +9,12 @@
 //!     └─ else ► queue (Control, Stream, Bulk) ► drainer ──►─┘
 //! ```
 //!
+//! Messages that come faster than a write each would carry them wait, too: the drainer writes many at once (`batch.rs`).
+//!
 //! All of it stands under one mutex. Receipts are never settled and nobody is woken with it in hand, because whoever
 //! is told may submit to this very outlet.
 
+mod batch;
 mod draining;
 mod expiry;
 mod half;
@@ -40,6 +43,7 @@ use tokio::net::{TcpStream, UnixStream};
 
 use crate::session::Ack;
 
+pub(crate) use batch::Gathering;
 use draining::Drained;
 use half::{After, Bound, Half, Step};
 pub(crate) use held::line_of;
@@ -66,6 +70,30 @@ pub(crate) trait Socket: Send + 'static {
     /// Bytes that were ever written and bytes that the peer has taken, in one count, where that can be known.
     fn account(&mut self) -> Account {
         Account { written: 0, taken: u64::MAX }
+    }
+
+    /// Whether it gathers frames, to write many at once.
+    fn gathers(&self) -> bool {
+        false
+    }
+
+    /// Keeps a copy of a whole frame, to be written behind what was gathered before. Returns whether there was room.
+    fn gather(&mut self, parts: &[IoSlice<'_>]) -> bool {
+        let _ = parts;
+        false
+    }
+
+    /// Gathered bytes that are not written. While there are any, nothing else is written.
+    fn gathered(&self) -> usize {
+        0
+    }
+
+    /// Writes of what was gathered what the socket takes at once.
+    ///
+    /// # Errors
+    /// As [`try_write_vectored`](Self::try_write_vectored).
+    fn write_gathered(&mut self) -> io::Result<usize> {
+        Ok(0)
     }
 
     /// Ready when the socket may take something. For one task only: the drainer.

@@ -38,7 +38,7 @@ use crate::{
     config::NodeConfig,
     ndl,
     ndl::{KnownNode, LossReason, MembershipFact},
-    outlet::LinkNumber,
+    outlet::{Gathering, LinkNumber},
     stores::{Stores, lock},
     sync,
 };
@@ -202,7 +202,7 @@ impl Gncl {
         let words = attach.welcome.as_ref();
         let welcome = words.map(|words| frame(self.stores.node, node, Kind::GNCL_WELCOME, write(words)));
         let payload_max = usize::try_from(attach.payload_max).unwrap_or(usize::MAX);
-        let link = way.outlet.connect(socket, payload_max, welcome);
+        let link = way.outlet.connect(Gathering::new(socket), payload_max, welcome);
         way.attach(link);
         wire.set_mode(Mode::Linked(Inbound { stores: self.stores.clone(), peer: peer.clone(), lane, link }));
         self.stores.router.set_peer(node, peer.clone());

@@ -18,7 +18,7 @@ use super::{
 };
 use crate::{
     config::NodeConfig,
-    outlet::{LinkNumber, OutletLimits, Session, StreamOutlet, line_of},
+    outlet::{Gathering, LinkNumber, OutletLimits, Session, StreamOutlet, line_of},
     refusals::Refusals,
     session::{Ack, Arrival, Receiving, Shelf, ShelfLimits, Window},
 };
@@ -66,7 +66,7 @@ pub(super) struct Ends {
 
 /// A session with a peer.
 pub(crate) struct Way {
-    pub(crate) outlet: StreamOutlet<Arc<TcpStream>>,
+    pub(crate) outlet: StreamOutlet<Gathering<Arc<TcpStream>>>,
     /// Locked for a moment, never with another lock in hand.
     inbox: Mutex<Inbox>,
     outcomes_max: usize,

@@ -18,6 +18,9 @@ const WRITES_PER_WAKE: usize = 64;
 /// Bytes that it writes before.
 const BYTES_PER_WAKE: usize = 64 << 10;
 
+/// Messages that wait before a sender writes them itself: the drainer does not keep up.
+const HELP_AT: usize = 32;
+
 /// Why the drainer does not write on.
 pub(super) enum Drained {
     /// The connection cannot be written to any more.
@@ -48,13 +51,31 @@ impl<S: Socket> Half<S> {
             match socket.poll_writable(cx) {
                 Poll::Pending => return Poll::Pending,
                 Poll::Ready(Err(error)) => self.link = Link::Failed(error),
-                Poll::Ready(Ok(())) => bytes += self.write_next(after),
+                Poll::Ready(Ok(())) => bytes += self.gather_next(after),
             }
             if bytes >= BYTES_PER_WAKE {
                 break;
             }
         }
+        self.write_gathered();
         Poll::Ready(Drained::Enough)
+    }
+
+    /// Lets a sender write what waits, if that is much and the socket may take it: it pays for its flood itself.
+    pub(super) fn help(&mut self, after: &mut After) {
+        let Link::Up(socket) = &self.link else { return };
+        let is_stuck = self.partial.is_some() || socket.gathered() > 0;
+        if !socket.gathers() || is_stuck || self.queue.len() < HELP_AT {
+            return;
+        }
+        let mut bytes = 0;
+        for _ in 0..WRITES_PER_WAKE {
+            if bytes >= BYTES_PER_WAKE || !self.has_frame() {
+                break;
+            }
+            bytes += self.gather_next(after);
+        }
+        self.write_gathered();
     }
 
     /// Why the connection `link` cannot be written to, if it cannot.
@@ -76,9 +97,46 @@ impl<S: Socket> Half<S> {
         }
     }
 
+    /// Gathers the next frame, or writes what is gathered if there is none or no room for it, and then the next piece of it;
+    /// returns how many bytes the socket has taken.
+    fn gather_next(&mut self, after: &mut After) -> usize {
+        let Some(frame) = self.next_frame(after) else { return self.write_gathered() };
+        if let Link::Up(socket) = &mut self.link
+            && frame.gather_in(socket)
+        {
+            self.sent(frame);
+            return 0;
+        }
+        let taken = self.write_gathered();
+        if self.gathered() > 0 {
+            self.partial = Some(frame);
+            return taken;
+        }
+        taken + self.write_frame(frame)
+    }
+
+    fn write_gathered(&mut self) -> usize {
+        let Link::Up(socket) = &mut self.link else { return 0 };
+        if socket.gathered() == 0 {
+            return 0;
+        }
+        socket.write_gathered().unwrap_or_else(|error| {
+            self.note(error);
+            0
+        })
+    }
+
+    /// Bytes that were gathered and not written.
+    pub(super) fn gathered(&self) -> usize {
+        if let Link::Up(socket) = &self.link { socket.gathered() } else { 0 }
+    }
+
     /// Writes the next frame, or the next piece of it; returns how many bytes the socket has taken.
     pub(super) fn write_next(&mut self, after: &mut After) -> usize {
-        let Some(mut frame) = self.next_frame(after) else { return 0 };
+        self.next_frame(after).map_or(0, |frame| self.write_frame(frame))
+    }
+
+    fn write_frame(&mut self, mut frame: Partial) -> usize {
         let before = frame.written;
         let result = self.write(&mut frame);
         let taken = frame.written - before;
@@ -143,6 +201,7 @@ impl<S: Socket> Half<S> {
     pub(super) fn has_frame(&self) -> bool {
         let waits = self.interrupted.is_some() || !self.queue.is_empty();
         self.partial.is_some()
+            || self.gathered() > 0
             || !self.urgent.is_empty()
             || self.behind() > 0
             || waits && self.session_has_room()

@@ -13,6 +13,7 @@ use sinew_runtime::{
 
 use super::{
     LinkNumber, OutletCounts, OutletLimits, Socket,
+    batch::Pace,
     outstanding::{Outstanding, Sent},
     partial::{Partial, Sort, Written},
     resume::Session,
@@ -86,6 +87,7 @@ pub(super) struct Half<S> {
     /// Receipts of messages that were sent.
     pub(super) sent_receipts: Outstanding,
     pub(super) drainer: Option<Waker>,
+    pace: Pace,
     pub(super) counts: OutletCounts,
 }
 
@@ -107,6 +109,7 @@ impl<S: Socket> Half<S> {
             next_expiry: Time::MAX,
             sent_receipts: Outstanding::default(),
             drainer: None,
+            pace: Pace::new(),
             counts: OutletCounts::default(),
         }
     }
@@ -141,11 +144,12 @@ impl<S: Socket> Half<S> {
         if link.0 != self.number || matches!(self.link, Link::Closed(_)) {
             return true;
         }
+        let has_gathered = self.gathered() > 0;
         self.link = Link::Down;
         self.urgent.clear();
         after.wake = self.drainer.take();
         let partial = self.partial.take();
-        let was_whole = partial.as_ref().is_none_or(|partial| partial.written == 0);
+        let was_whole = !has_gathered && partial.as_ref().is_none_or(|partial| partial.written == 0);
         if self.session.is_some() {
             self.pause(partial);
         } else {
@@ -243,13 +247,20 @@ impl<S: Socket> Half<S> {
         if let Some(key) = self.held_line(&message.header) {
             return self.put_in_line(key, message).map(|()| Step::Done);
         }
-        if self.waiting() > 0 || !self.takes_new() {
-            return self.enqueue(message, bound, after).map(|()| Step::Done);
+        // Asked in any case: what comes while others wait counts, too.
+        let is_one_of_a_flood = self.is_one_of_a_flood(&message);
+        if self.waiting() > 0 || !self.takes_new() || is_one_of_a_flood {
+            self.enqueue(message, bound, after)?;
+            self.help(after);
+            return Ok(Step::Done);
         }
         let mut frame = self.frame(message);
         self.waiting_receipts += usize::from(frame.message.receipt.is_some());
         match self.write(&mut frame) {
-            Written::Whole => self.sent(frame),
+            Written::Whole => {
+                self.sent(frame);
+                self.pace.written(Time::now());
+            }
             Written::Piece => {
                 self.partial = Some(frame);
                 return Ok(Step::More);
@@ -278,7 +289,7 @@ impl<S: Socket> Half<S> {
             return Err(Refused::new(message, Rejection::QueueFull));
         }
         self.urgent.push_back(message);
-        if self.partial.is_none() && self.urgent.len() == 1 {
+        if self.partial.is_none() && self.gathered() == 0 && self.urgent.len() == 1 {
             self.write_next(after);
         }
         if self.urgent_left() > 0 {
@@ -365,6 +376,14 @@ impl<S: Socket> Half<S> {
         self.counts.refused -= 1;
     }
 
+    /// Whether messages come so fast that they had better be written many at once.
+    fn is_one_of_a_flood(&mut self, message: &Message) -> bool {
+        let Link::Up(socket) = &self.link else { return false };
+        // What the layers say carries no time.
+        let now = || if message.header.sent == Time::ZERO { Time::now() } else { message.header.sent };
+        socket.gathers() && self.pace.is_flood(now())
+    }
+
     /// Whether a message that was never sent may be written now.
     fn takes_new(&self) -> bool {
         matches!(self.link, Link::Up(_)) && self.session_has_room()
@@ -392,14 +411,17 @@ impl<S: Socket> Half<S> {
         let Link::Up(socket) = &mut self.link else { return Written::Broken };
         match frame.write_to(socket) {
             Ok(written) => written,
-            Err(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted) => {
-                Written::InPart
-            }
-            Err(error) => {
-                self.link = Link::Failed(error);
-                Written::Broken
-            }
+            Err(error) => self.note(error),
         }
+    }
+
+    /// A write has failed: for now, or for good.
+    pub(super) fn note(&mut self, error: io::Error) -> Written {
+        if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted) {
+            return Written::InPart;
+        }
+        self.link = Link::Failed(error);
+        Written::Broken
     }
 
     pub(super) fn sent(&mut self, frame: Partial) {
@@ -419,7 +441,8 @@ impl<S: Socket> Half<S> {
     }
 
     pub(super) fn waiting(&self) -> usize {
-        let single = [self.partial.is_some(), self.interrupted.is_some(), self.last.is_some()];
+        let single =
+            [self.partial.is_some(), self.gathered() > 0, self.interrupted.is_some(), self.last.is_some()];
         self.queue.len()
             + self.urgent.len()
             + self.behind()

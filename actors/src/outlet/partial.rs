@@ -41,6 +41,11 @@ impl Partial {
         Self { message, head, written: 0, sort }
     }
 
+    /// Lets the socket gather it whole; returns whether it did.
+    pub(super) fn gather_in(&self, socket: &mut impl Socket) -> bool {
+        self.written == 0 && socket.gather(&[IoSlice::new(&self.head), IoSlice::new(&self.message.payload)])
+    }
+
     /// Writes what the socket takes of the next piece.
     ///
     /// # Errors

@@ -21,6 +21,7 @@ use tokio_util::codec::Decoder;
 use super::*;
 
 mod accounts;
+mod floods;
 mod holding;
 
 /// A wire that takes `room` more bytes and keeps them.

@@ -1,0 +1,155 @@
+//! Many frames in one write, where they come faster than one write each would let them go.
+//!
+//! A write costs about as much as carrying a thousand bytes does. Who sends now and then pays one for each message, and the
+//! message is on its way when the call returns. Who has the next message ready as soon as the last one is written, again and again,
+//! is not helped by that: from the fifth on what comes waits for the drainer, which copies what waits into one
+//! buffer and writes that. A round trip is no flood, however quick: the answer takes longer than that.
+
+use std::{
+    io::{self, IoSlice},
+    task::{Context, Poll},
+    time::Duration,
+};
+
+use sinew_runtime::{time::Time, wire::Checksum};
+
+use super::{Account, Socket};
+
+/// Messages right behind each other that are written at once, each by its sender.
+const AT_ONCE: u32 = 4;
+/// Who sends the next message sooner than this after the last one was written has not waited for anybody: half of what a write to
+/// a socket takes, a quarter of the quickest answer over the loopback interface.
+const RIGHT_BEHIND: Duration = Duration::from_micros(2);
+/// Bytes that are gathered before they are written.
+const GATHERED_MAX: usize = 32 << 10;
+
+/// How fast messages come.
+#[derive(Debug)]
+pub(super) struct Pace {
+    /// When the last one was written, or came while others waited.
+    last: Time,
+    /// Messages right behind each other.
+    behind: u32,
+}
+
+impl Pace {
+    pub(super) const fn new() -> Self {
+        Self { last: Time::ZERO, behind: 0 }
+    }
+
+    /// A message comes that was sent at `sent`. Returns whether it is one of a flood.
+    pub(super) fn is_flood(&mut self, sent: Time) -> bool {
+        self.behind = if sent.since(self.last) < RIGHT_BEHIND { self.behind.saturating_add(1) } else { 0 };
+        self.last = self.last.max(sent);
+        self.behind >= AT_ONCE
+    }
+
+    /// The message was written by its sender, who was done `now`.
+    pub(super) const fn written(&mut self, now: Time) {
+        self.last = now;
+    }
+}
+
+/// A socket that gathers frames.
+#[derive(Debug)]
+pub(crate) struct Gathering<S> {
+    socket: S,
+    /// What is gathered; the socket has taken all before `taken`.
+    bytes: Vec<u8>,
+    taken: usize,
+}
+
+impl<S> Gathering<S> {
+    pub(crate) const fn new(socket: S) -> Self {
+        Self { socket, bytes: Vec::new(), taken: 0 }
+    }
+}
+
+impl<S: Socket> Socket for Gathering<S> {
+    fn checksum(&self) -> Checksum {
+        self.socket.checksum()
+    }
+
+    fn piece_max(&self) -> usize {
+        self.socket.piece_max()
+    }
+
+    fn try_write_vectored(&mut self, parts: &[IoSlice<'_>]) -> io::Result<usize> {
+        debug_assert_eq!(self.gathered(), 0, "what is gathered goes first");
+        self.socket.try_write_vectored(parts)
+    }
+
+    fn account(&mut self) -> Account {
+        self.socket.account()
+    }
+
+    fn poll_writable(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        self.socket.poll_writable(cx)
+    }
+
+    fn gathers(&self) -> bool {
+        true
+    }
+
+    fn gather(&mut self, parts: &[IoSlice<'_>]) -> bool {
+        let length: usize = parts.iter().map(|part| part.len()).sum();
+        let has_room = self.bytes.len() + length <= GATHERED_MAX;
+        if has_room {
+            parts.iter().for_each(|part| self.bytes.extend_from_slice(part));
+        }
+        has_room
+    }
+
+    fn gathered(&self) -> usize {
+        self.bytes.len() - self.taken
+    }
+
+    fn write_gathered(&mut self) -> io::Result<usize> {
+        let count = self.socket.try_write_vectored(&[IoSlice::new(&self.bytes[self.taken..])])?;
+        self.taken += count;
+        if self.taken == self.bytes.len() {
+            self.bytes.clear();
+            self.taken = 0;
+        }
+        Ok(count)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Whether a message is one of a flood that is sent `gap` nanoseconds after the last one, whose write took `write`.
+    fn floods(count: usize, gap: u64, write: u64) -> Vec<bool> {
+        let (mut pace, mut now) = (Pace::new(), 1_000_000);
+        let submit = |_| {
+            now += gap;
+            let is_flood = pace.is_flood(Time::from_nanos(now));
+            if !is_flood {
+                now += write;
+                pace.written(Time::from_nanos(now));
+            }
+            is_flood
+        };
+        (0..count).map(submit).collect()
+    }
+
+    #[test]
+    fn who_sends_right_behind_each_write_floods_from_the_fifth_message_on() {
+        assert_eq!(floods(8, 500, 4_000), [false, false, false, false, true, true, true, true]);
+    }
+
+    #[test]
+    fn the_quickest_round_trips_are_no_flood() {
+        assert!(!floods(1_000, 3_000, 1_500).contains(&true));
+    }
+
+    #[test]
+    fn what_comes_after_a_pause_is_written_at_once_again() {
+        let mut pace = Pace::new();
+        let at = |nanos: u64| Time::from_nanos(1_000_000 + nanos);
+        let floods: Vec<bool> = (0..9).map(|n| pace.is_flood(at(n * 100))).collect();
+        assert_eq!(floods[8..], [true]);
+        assert!(!pace.is_flood(at(3_000)));
+    }
+}
