@@ -222,7 +222,8 @@ impl NodeApi {
     /// Asks for a transport address, and waits until everything that the application requires is ready
     /// (the paper's RegisterTransportAddress).
     ///
-    /// A process may have up to 256 addresses, one for each of its threads if it likes.
+    /// A process may have several addresses, one for each of its threads if it likes: up to 64 by default
+    /// (`lncl.clients_per_process_max`).
     ///
     /// # Errors
     /// The node refused, in words; or the deadline passed. Nothing stays registered.

@@ -15,7 +15,8 @@ use crate::{
     status::{Fault, Status},
 };
 
-/// Endpoints of one process at most: as many as the node allows it.
+/// Endpoints of one process at most: as many as a node has places with the default configuration. The node's own bound for one
+/// process is 64 by default (`lncl.clients_per_process_max`).
 pub(crate) const ENDPOINTS_MAX: usize = 256;
 /// Nobody has the place.
 const FREE: usize = 0;
