@@ -1,0 +1,41 @@
+//! Two programs on one node, each in a process of its own: `knee drive` in one terminal, `knee sensor` in another.
+//!
+//! The sensor waits until the drive is there, sends it ten angles, and is told of each what became of it. The node is
+//! `sinew-node`, or any node whose `lncl.socket` is the path that is given as the second word.
+
+use std::time::Duration;
+
+use sinew::{ApiError, NodeApi, Registration, payload};
+
+payload!("demo.joint_angle" => struct JointAngle { degrees: f32 });
+
+const SECOND: Duration = Duration::from_secs(1);
+
+fn main() -> Result<(), ApiError> {
+    let words: Vec<String> = std::env::args().collect();
+    let role = words.get(1).map_or("sensor", String::as_str);
+    let path = words.get(2).map_or("/tmp/sinew-knee.sock", String::as_str);
+    let node = NodeApi::connect(path)?;
+    if role == "drive" { drive(&node) } else { sensor(&node) }
+}
+
+fn drive(node: &NodeApi) -> Result<(), ApiError> {
+    let mut drive = node.register_transport_address(Registration::new().name("knee.drive"))?;
+    while let Some(message) = drive.receive(10 * SECOND)? {
+        let angle: JointAngle = message.decode()?;
+        println!("{} is at {} degrees", message.source(), angle.degrees);
+    }
+    Ok(())
+}
+
+fn sensor(node: &NodeApi) -> Result<(), ApiError> {
+    let registration = Registration::new().requires(["knee.drive"]);
+    let mut sensor = node.register_transport_address(registration)?;
+    let drive = sensor.resolve("knee.drive", SECOND)?.expect("it is ready: it was required");
+    for number in 0..10_u8 {
+        let angle = JointAngle { degrees: f32::from(number) };
+        let outcome = sensor.send_confirmed(drive, &angle, SECOND)?;
+        println!("{} degrees: {outcome:?}", angle.degrees);
+    }
+    Ok(())
+}
