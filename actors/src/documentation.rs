@@ -11,12 +11,17 @@ pub(crate) fn block(page: &'static str, heading: &str, fence: &str) -> &'static 
 
 /// A Python program of a page, or `None`, which is said, on a machine without Python 3.
 pub(crate) fn python(page: &'static str, heading: &str) -> Option<Command> {
+    python_with(block(page, heading, "```python"))
+}
+
+/// This Python program, or `None` likewise.
+pub(crate) fn python_with(program: &str) -> Option<Command> {
     let is_there = Command::new("python3").arg("--version").stdout(Stdio::null()).status();
     if !is_there.is_ok_and(|status| status.success()) {
         println!("skipped: there is no python3 on this machine");
         return None;
     }
     let mut command = Command::new("python3");
-    command.args(["-c", block(page, heading, "```python")]);
+    command.args(["-c", program]);
     Some(command)
 }

@@ -11,7 +11,7 @@ use sinew_runtime::{supervision::ReadyGate, time::Time};
 use tokio::net::UnixListener;
 
 use super::{
-    Event,
+    Event, descriptors,
     listener::ListenError,
     registrar,
     server::{Server, accept},
@@ -39,6 +39,7 @@ impl Lncl {
     /// If the path was lost, and cannot be had again. That is how a layer's start fails: its supervisor reports these words.
     fn open_door(&mut self, ctx: &mut Context<Self>) {
         let Some(path) = self.server.stores.config.lncl.socket.clone() else { return };
+        descriptors::make_room(&self.server.stores.config.lncl);
         let in_words = |cause| ListenError::System { doing: "watch", path: path.clone(), cause };
         let opened = self.server.stores.door.open(&path);
         let opened = opened.and_then(|listener| UnixListener::from_std(listener).map_err(in_words));

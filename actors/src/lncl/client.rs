@@ -1,12 +1,14 @@
 //! One connection of another process, from its first frame to its end.
 
 mod end;
+mod life;
 mod notices;
 mod orders;
 
 use std::{ops::ControlFlow, rc::Rc, sync::Arc, time::Duration};
 
 use bytes::BytesMut;
+use rustix::net::Shutdown;
 use sinew_runtime::{
     monitor::DownClass,
     router::{LocalRoute, Outlet},
@@ -19,7 +21,10 @@ use tokio::net::{UnixStream, unix::UCred};
 
 pub(super) use self::notices::Notices;
 
-use self::end::{End, LAST_WORDS};
+use self::{
+    end::{End, LAST_WORDS},
+    life::Life,
+};
 use super::{
     core::{Address, ClientId, Owner, Request},
     introductions::Party,
@@ -75,10 +80,7 @@ pub(super) async fn serve(
         Err(why) => return refuse(&server, &stream, "registration", &why),
     };
     session.registered(client.tid);
-    let end = match client.wait_at_barrier(&mut reader, &mut session).await {
-        Some(end) => end,
-        None => client.run(reader, &mut session).await,
-    };
+    let end = client.live(reader, &mut session).await;
     client.finish(end).await;
 }
 
@@ -184,6 +186,37 @@ impl Client {
             wants_links,
             has_been_told,
             cause,
+        })
+    }
+
+    /// Serves it until its connection ends, or its process.
+    async fn live(&mut self, mut reader: Reader, session: &mut Session) -> End {
+        let (life, stream) = (self.life(), self.peer.stream.clone());
+        let served = async {
+            match self.wait_at_barrier(&mut reader, session).await {
+                Some(end) => end,
+                None => self.run(reader, session).await,
+            }
+        };
+        tokio::pin!(served);
+        tokio::select! {
+            end = &mut served => end,
+            // spec: LNCL-15
+            () = life.ended() => {
+                // A child of its may hold the socket open, which hangs up now. An error means that it did so already. What the
+                // process said before it ended still counts; it is there already.
+                let _ = rustix::net::shutdown(&stream, Shutdown::Both);
+                tokio::time::timeout(LAST_WORDS, served).await.unwrap_or(End::HungUp(None))
+            }
+        }
+    }
+
+    /// The life of its process.
+    fn life(&self) -> Life {
+        Life::of(self.peer.pid).unwrap_or_else(|cause| {
+            let detail = format!("{}, process {}: {cause}", self.tid, self.peer.pid);
+            self.server.refusals.count(Time::now(), "process cannot be watched", &detail);
+            Life::Unknown
         })
     }
 

@@ -19,10 +19,12 @@
 //! | LNCL-9 | A client that can, and says so, gets a ring in shared memory for each direction; the socket then carries descriptors and last words only, and tells either side's end. |
 //! | LNCL-13 | Connections that have not said who they are have bounds of their own, for all and for one process. |
 //! | LNCL-14 | What nobody has taken of a client's unconfirmed messages the client is told, with its number and once: the first at once, later ones together. |
+//! | LNCL-15 | A connection ends with the process that connected, also while a child that it forked holds the socket open. |
 
 mod actor;
 mod client;
 mod core;
+mod descriptors;
 mod door;
 mod facts;
 mod introductions;

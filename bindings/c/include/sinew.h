@@ -29,8 +29,9 @@
  *   only be unregistered; everything else goes on.
  * fork.  A child of fork may not use its parent's endpoints: they return SINEW_ERROR_FORKED there; nor may it write the
  *   bytes of its parent's messages, which may be shared memory. It may register its
- *   own if it may call malloc, that is if the parent had one thread. While a child lives that has not called exec, the
- *   node does not see the parent's end: the child has its connections, too. Endpoints do not survive exec.
+ *   own if it may call malloc, that is if the parent had one thread. The node sees the parent's end also while a child
+ *   lives that has its connections, too; a peer of a direct link does not, until that child ends or calls exec.
+ *   Endpoints do not survive exec.
  * Sizes.  sinew_options carries its size and may grow; all other structs and all numbers stay as they are as long as
  *   SINEW_ABI does.
  */
