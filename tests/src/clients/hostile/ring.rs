@@ -15,7 +15,7 @@ use sinew_shm::{BellKind, Capacity, Offer, Region};
 use super::stranger::{Frame, Stranger};
 use crate::dice::Dice;
 
-payload!("hostile.ring" => struct WithRing { ring: bool });
+payload!("hostile.ring" => struct WithRing { ring: bool, direct: bool });
 
 /// What is looked at of the node's answer.
 #[derive(serde::Deserialize)]
@@ -47,7 +47,7 @@ pub(super) struct HostileRing {
 /// Registers and asks for rings; returns the length of a ring.
 pub(super) fn ask_for_rings(socket: &Path) -> io::Result<(Stranger, Offer, Capacity)> {
     let mut stranger = Stranger::connect(socket)?;
-    let wish = Frame::of_lncl(Kind::LNCL_REGISTER, Tid::NONE, &WithRing { ring: true });
+    let wish = Frame::of_lncl(Kind::LNCL_REGISTER, Tid::NONE, &WithRing { ring: true, direct: true });
     stranger.write(&wish.bytes())?;
     let said = stranger.read()?.ok_or(io::ErrorKind::UnexpectedEof)?;
     stranger.tid = Tid::from_bits(said.source);

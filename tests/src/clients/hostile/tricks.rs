@@ -1,5 +1,7 @@
 //! What a hostile client does to a node, one trick after the other.
 
+mod meetings;
+
 use std::{
     fs::File,
     io,
@@ -70,7 +72,7 @@ impl Attacker {
 
     /// Plays one trick. What the node answers to it, or that it closes, is no error.
     pub(super) fn play_one(&mut self) {
-        const TRICKS: [Trick; 13] = [
+        const TRICKS: [Trick; 14] = [
             Attacker::garbage,
             Attacker::mutants,
             Attacker::forged_sources,
@@ -84,6 +86,7 @@ impl Attacker {
             Attacker::lying_ring,
             Attacker::deaf_ring,
             Attacker::odd_offers,
+            Attacker::meetings,
         ];
         self.tally.tricks += 1;
         let trick = TRICKS[self.dice.below(TRICKS.len() as u32) as usize];
