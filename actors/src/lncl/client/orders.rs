@@ -12,6 +12,7 @@ use sinew_runtime::{
 
 use super::{
     super::{
+        introductions::Question,
         payload::{self, Resolved},
         registrar,
         session::Order,
@@ -88,7 +89,9 @@ impl Client {
     fn introduce(&self, to: Tid, correlation: u64) {
         let number = lock(&self.server.stores.registry).new_link();
         let to = self.server.stores.router.absolute(to);
-        if let Err(why) = self.server.introductions.introduce(self.tid, to, number, correlation) {
+        let introductions = &self.server.introductions;
+        if let Err(why) = introductions.introduce(self.tid, to, Question { number, correlation }, Time::now())
+        {
             self.tell(to, correlation, Outcome::Rejected(why));
         }
     }
