@@ -11,6 +11,8 @@ use std::{
         },
     },
     path::{Path, PathBuf},
+    thread,
+    time::{Duration, Instant},
 };
 
 use rustix::fs::FlockOperation;
@@ -24,6 +26,10 @@ const DIRECTORY_MODE: u32 = 0o750;
 /// Connections that wait to be accepted; one that comes after that waits in its `connect`.
 const BACKLOG: i32 = 1_024;
 
+/// Longest wait for others that open a socket in the same directory, and how often it is looked whether they are done.
+const TURN_WITHIN: Duration = Duration::from_millis(500);
+const TURN_LOOK: Duration = Duration::from_millis(1);
+
 /// Why LNCL cannot listen. The environment or the configuration is at fault; nothing changed.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ListenError {
@@ -33,7 +39,9 @@ pub(crate) enum ListenError {
     NotASocket(PathBuf),
     #[error("another node listens at {0:?}; stop it, or set another `lncl.socket`")]
     InUse(PathBuf),
-    #[error("another node is just starting at {0:?}; set another `lncl.socket` for one of them")]
+    #[error(
+        "somebody has locked the directory of {0:?} for {TURN_WITHIN:?}; see who that is, or set another `lncl.socket`"
+    )]
     Contended(PathBuf),
     #[error("cannot {doing} {path:?}: {cause}; see to the permissions there, or set another `lncl.socket`")]
     System { doing: &'static str, path: PathBuf, cause: io::Error },
@@ -89,10 +97,15 @@ pub(crate) fn listen(path: &Path) -> Result<(UnixListener, SocketFile), ListenEr
 
 fn take_turn(directory: &Path, path: &Path) -> Result<File, ListenError> {
     let file = File::open(directory).map_err(system("open", directory))?;
-    match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
-        Ok(()) => Ok(file),
-        Err(rustix::io::Errno::WOULDBLOCK) => Err(ListenError::Contended(path.to_owned())),
-        Err(cause) => Err(system("lock", directory)(cause.into())),
+    let until = Instant::now() + TURN_WITHIN;
+    loop {
+        match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => return Ok(file),
+            // Most often a node with another socket in the same directory, which is done in a moment.
+            Err(rustix::io::Errno::WOULDBLOCK) if Instant::now() < until => thread::sleep(TURN_LOOK),
+            Err(rustix::io::Errno::WOULDBLOCK) => return Err(ListenError::Contended(path.to_owned())),
+            Err(cause) => return Err(system("lock", directory)(cause.into())),
+        }
     }
 }
 
@@ -179,6 +192,24 @@ mod tests {
         let refusal = listen(&path).unwrap_err();
         assert!(refusal.to_string().contains("another node listens"), "{refusal}");
         assert!(path.exists(), "the living node keeps its file");
+    }
+
+    #[test]
+    fn nodes_that_start_at_once_with_sockets_in_one_directory_all_start() {
+        let directory = TestDirectory::new();
+        // Longer than any of them takes, shorter than they wait.
+        let turn = take_turn(directory.path(), directory.path()).unwrap();
+        thread::scope(|scope| {
+            let nodes: Vec<_> = (0..4)
+                .map(|node| directory.path().join(format!("{node}.sock")))
+                .map(|path| scope.spawn(move || listen(&path).map(|(_, file)| file.is_there())))
+                .collect();
+            thread::sleep(20 * TURN_LOOK);
+            drop(turn);
+            for node in nodes {
+                assert!(matches!(node.join().unwrap(), Ok(true)));
+            }
+        });
     }
 
     #[test]
