@@ -42,7 +42,7 @@ pub struct Endpoint {
     /// Links to other processes that the node is not on the way of.
     pub(super) direct: Direct,
     pub(super) inbox: Inbox,
-    /// What the node has said of messages that nobody has taken.
+    /// What the node has said of messages that nobody has taken, and what this endpoint has refused.
     pub(super) refusals: Refusals,
     pub(super) sequence: u64,
     pub(super) correlation: u64,
@@ -80,7 +80,7 @@ impl Endpoint {
         let terms = Terms::of(&registered, &options);
         let Registered { node, app, node_name, payload_max, ring: _ } = registered;
         let control = reader.control().filter(|_| register.direct);
-        let inbox = Inbox::new(inbox_capacity, writer.clone());
+        let inbox = Inbox::new(inbox_capacity, payload_max as usize, writer.clone());
         register.former = Some(app);
         Self {
             tid: Tid::new(node, app),
@@ -168,7 +168,10 @@ impl Endpoint {
 
     /// Sends a value and waits for what becomes of it: [`Outcome::Unknown`] when nobody has said so `within` this
     /// time. The message expires where it waits when it is older. Messages that come meanwhile wait to be
-    /// [received](Self::receive).
+    /// [received](Self::receive), beyond the inbox's capacity too: 16,384 of each class, 4 MiB of payloads and one message. What
+    /// comes then is refused: who sent it confirmed is told, the others are [counted](Self::untaken). The same holds for
+    /// whatever else waits for an answer: [`ask`](Self::ask), [`resolve`](Self::resolve), [`join`](Self::join),
+    /// [`leave`](Self::leave).
     ///
     /// # Errors
     /// It was not sent. If the connection ends before the outcome is known that is [`Outcome::Unknown`].
@@ -285,7 +288,7 @@ impl Endpoint {
         }
     }
 
-    /// Gives the address back and waits until the node has taken it: the name is free when this returns.
+    /// Gives the address back and waits until the node has taken it, 2 s at most: the name is free when this returns.
     ///
     /// # Errors
     /// The node did not answer, or a message is lent ([`ApiError::Lent`]). The address is given back in any case.
@@ -295,7 +298,8 @@ impl Endpoint {
 
     pub(super) async fn take_leave(&mut self) -> Result<(), ApiError> {
         self.inbox.close();
-        self.part(self.home.options.patience).await;
+        let deadline = Time::now() + PROMPT;
+        self.part(self.home.options.patience.min(PROMPT)).await;
         if self.ended.is_some() {
             // The connection has taken the address with it.
             return Ok(());
@@ -304,8 +308,8 @@ impl Endpoint {
         // It may go on just now.
         self.stalled = None;
         let goodbye = Message::new(Header::new(Kind::LNCL_UNREGISTER, self.tid, LNCL), bytes::Bytes::new());
-        self.write(goodbye.into(), self.patience()).await?;
-        let deadline = Time::now() + PROMPT;
+        let limit = self.patience().and_in_all(deadline.since(Time::now()));
+        self.write(goodbye.into(), limit).await?;
         while self.ended.is_none() {
             self.take_in(None, WhenFull::Refuse, Time::now())?;
             self.inbox.close();

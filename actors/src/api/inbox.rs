@@ -3,11 +3,11 @@
 use std::sync::Arc;
 
 use sinew_runtime::{
-    mailbox::ClassQueue,
+    mailbox::{Bounds, ClassQueue},
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     tid::Tid,
     time::Time,
-    wire::{Class, Flags, Kind, Message},
+    wire::{Flags, Kind, Message},
 };
 
 use crate::lncl::payload::{self, Refusal, Resolved};
@@ -46,8 +46,12 @@ pub(super) enum Sorted {
     Nothing,
 }
 
-/// Bytes of their payloads from which on nothing more is taken, but for the newest value of a Stream.
+/// Bytes of their payloads from which on nothing more is taken, but by one who waits for an answer. That one refuses what would
+/// make one class longer than this and one message.
 const BYTES_ENOUGH: usize = 4 << 20;
+/// Messages of each class that are kept at most while an answer is waited for, which may be behind them; or the capacity, if
+/// that is more.
+const AWAITING_MAX: usize = 16_384;
 
 /// Messages that wait to be received, and the rule by which frames become messages or answers.
 pub(super) struct Inbox {
@@ -55,11 +59,22 @@ pub(super) struct Inbox {
     capacity: usize,
     /// Confirmations of what was received go out here.
     sink: Arc<dyn ReceiptSink>,
+    /// Messages that were refused and whose senders were told nothing.
+    untold: u64,
 }
 
 impl Inbox {
-    pub(super) fn new(capacity: usize, sink: Arc<dyn ReceiptSink>) -> Self {
-        Self { queue: ClassQueue::new(capacity), capacity, sink }
+    /// For messages with payloads of so many bytes at most.
+    pub(super) fn new(capacity: usize, payload_max: usize, sink: Arc<dyn ReceiptSink>) -> Self {
+        // Whoever leaves messages in the socket while there is no room is refused none.
+        let bounds =
+            Bounds { messages: capacity.max(AWAITING_MAX), bytes: BYTES_ENOUGH.saturating_add(payload_max) };
+        Self { queue: ClassQueue::new(bounds), capacity, sink, untold: 0 }
+    }
+
+    /// How many unconfirmed messages it has refused since the last time that somebody asked.
+    pub(super) fn take_untold(&mut self) -> u64 {
+        std::mem::take(&mut self.untold)
     }
 
     /// Confirms what comes from now on over another connection.
@@ -109,8 +124,9 @@ impl Inbox {
     }
 
     /// Refuses a message of the node for which there is no room elsewhere.
-    pub(super) fn refuse(&self, message: Message) {
-        with_receipt(&self.sink, message).reject(Rejection::QueueFull);
+    pub(super) fn refuse(&mut self, message: Message) {
+        let message = with_receipt(&self.sink, message);
+        self.reject(message, Rejection::QueueFull);
     }
 
     /// The next message, most urgent class first. What is too old is not handed out.
@@ -132,14 +148,18 @@ impl Inbox {
     }
 
     fn push(&mut self, message: Message) {
-        if self.queue.bytes() >= BYTES_ENOUGH && message.header.class != Class::Stream {
-            return message.reject(Rejection::QueueFull);
-        }
         match self.queue.push(message) {
             // Of a Stream the newest value wins; Stream messages have no receipts.
             Ok(_) => {}
-            Err(refused) => refused.message.reject(refused.why),
+            Err(refused) => self.reject(refused.message, refused.why),
         }
+    }
+
+    fn reject(&mut self, message: Message, why: Rejection) {
+        if !message.header.flags.has(Flags::CONFIRM) {
+            self.untold += 1;
+        }
+        message.reject(why);
     }
 }
 
@@ -214,17 +234,53 @@ mod tests {
     #[test]
     fn a_message_that_finds_no_room_is_refused_and_its_sender_told() {
         let ledger = Arc::new(Ledger::default());
-        let mut inbox = Inbox::new(1, ledger.clone());
+        let mut inbox = Inbox::new(1, 1 << 20, ledger.clone());
         inbox.sort(confirmed(1), None);
         assert!(!inbox.has_room());
-        inbox.sort(confirmed(2), None);
-        assert_eq!(*ledger.0.lock().unwrap(), [(2, Outcome::Rejected(Rejection::QueueFull))]);
+        for number in 2..=AWAITING_MAX as u64 + 1 {
+            inbox.sort(confirmed(number), None);
+        }
+        let last = AWAITING_MAX as u64 + 1;
+        assert_eq!(*ledger.0.lock().unwrap(), [(last, Outcome::Rejected(Rejection::QueueFull))]);
+        assert_eq!(inbox.take_untold(), 0, "its sender was told");
+    }
+
+    #[test]
+    fn each_class_is_bounded_in_bytes_and_what_is_refused_untold_is_counted() {
+        const LENGTH: usize = 64 << 10;
+        for class in [Class::Control, Class::Stream, Class::Bulk] {
+            let mut inbox = Inbox::new(4, LENGTH, Arc::new(Ledger::default()));
+            let payload = Bytes::from(vec![0; LENGTH]);
+            let kept = BYTES_ENOUGH / LENGTH + 1;
+            for number in 0..kept + 3 {
+                // Of as many kinds, so that none takes the place of another.
+                let kind = Kind::named(&number.to_string());
+                let mut header = Header::new(kind, Tid::from_bits(1), Tid::from_bits(2));
+                header.class = class;
+                inbox.sort(Message::new(header, payload.clone()), None);
+            }
+            assert_eq!((inbox.take_untold(), inbox.take_untold()), (3, 0), "{class:?}");
+            assert_eq!(std::iter::from_fn(|| inbox.pop(Time::ZERO)).count(), kept);
+        }
+    }
+
+    #[test]
+    fn whoever_leaves_messages_where_they_are_while_there_is_no_room_is_refused_none() {
+        const LONG: usize = 3 << 20;
+        let mut inbox = Inbox::new(100, LONG, Arc::new(Ledger::default()));
+        let mut taken = 0;
+        while inbox.has_room() {
+            let header = Header::new(Kind::named("x"), Tid::from_bits(1), Tid::from_bits(2));
+            inbox.sort(Message::new(header, Bytes::from(vec![0; LONG])), None);
+            taken += 1;
+        }
+        assert_eq!((taken, inbox.take_untold()), (2, 0));
     }
 
     #[test]
     fn a_message_that_became_too_old_is_not_handed_out() {
         let ledger = Arc::new(Ledger::default());
-        let mut inbox = Inbox::new(4, ledger.clone());
+        let mut inbox = Inbox::new(4, 1 << 20, ledger.clone());
         let mut message = confirmed(1);
         message.header.time_to_live_us = 10;
         inbox.sort(message, None);
@@ -234,7 +290,7 @@ mod tests {
 
     #[test]
     fn the_newest_value_of_a_stream_is_the_one_that_is_received() {
-        let mut inbox = Inbox::new(4, Arc::new(Ledger::default()));
+        let mut inbox = Inbox::new(4, 1 << 20, Arc::new(Ledger::default()));
         for value in [1, 2, 3] {
             let mut header = Header::new(Kind::named("angle"), Tid::from_bits(1), Tid::from_bits(2));
             header.class = Class::Stream;
@@ -246,7 +302,7 @@ mod tests {
 
     #[test]
     fn an_outcome_reaches_the_one_who_waits_for_it_and_nobody_else() {
-        let mut inbox = Inbox::new(4, Arc::new(Ledger::default()));
+        let mut inbox = Inbox::new(4, 1 << 20, Arc::new(Ledger::default()));
         let awaited = Some((7, Awaited::Outcome));
         assert!(matches!(inbox.sort(outcome(6, Outcome::Failed), awaited), Sorted::Nothing));
         let sorted = inbox.sort(outcome(7, Outcome::Failed), awaited);
@@ -255,7 +311,7 @@ mod tests {
 
     #[test]
     fn a_request_that_was_delivered_still_waits_for_its_reply() {
-        let mut inbox = Inbox::new(4, Arc::new(Ledger::default()));
+        let mut inbox = Inbox::new(4, 1 << 20, Arc::new(Ledger::default()));
         let awaited = Some((7, Awaited::Reply));
         assert!(matches!(inbox.sort(outcome(7, Outcome::Delivered), awaited), Sorted::Nothing));
         let mut reply = confirmed(7);
@@ -266,7 +322,7 @@ mod tests {
     proptest! {
         #[test]
         fn anything_that_a_node_may_say_is_sorted(kind: u32, layer in 0u32..0x50, payload: Vec<u8>) {
-            let mut inbox = Inbox::new(4, Arc::new(Ledger::default()));
+            let mut inbox = Inbox::new(4, 1 << 20, Arc::new(Ledger::default()));
             for kind in [kind, layer] {
                 let header = Header::new(Kind::from_bits(kind), Tid::from_bits(1), Tid::from_bits(2));
                 for awaited in [Awaited::Outcome, Awaited::Reply, Awaited::Resolved] {

@@ -29,7 +29,7 @@ const REST_AGAIN: Duration = Duration::from_millis(1);
 pub(super) enum WhenFull {
     /// They stay in the socket: somebody is about to make room.
     Leave,
-    /// They are refused: the answer that is waited for may be behind them.
+    /// They are kept beyond its capacity, and refused beyond a bound in bytes: the answer that is waited for may be behind them.
     Refuse,
 }
 
@@ -42,19 +42,26 @@ impl Endpoint {
         now: Time,
     ) -> Result<Option<Answer>, ApiError> {
         // The node first: there a peer may say that from now on its link is read.
-        let answer = self.take_in_from_node(wanted, when_full, now)?;
-        if answer.is_some() || self.direct.is_empty() {
-            return Ok(answer);
+        let answer = self.take_in_from_node(wanted, when_full, now);
+        let answer = answer.map(|answer| answer.or_else(|| self.take_in_directly(wanted, when_full, now)));
+        self.refusals.count_own(self.tid, self.inbox.take_untold(), now);
+        answer
+    }
+
+    /// Sorts in what has come past the node.
+    fn take_in_directly(&mut self, wanted: Option<Wanted>, when_full: WhenFull, now: Time) -> Option<Answer> {
+        if self.direct.is_empty() {
+            return None;
         }
         let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
         self.direct.look(now, &mut node);
         if let Some(answer) = self.take_in_early(wanted, when_full, now) {
-            return Ok(Some(answer));
+            return Some(answer);
         }
         // From the last one on: one that ends makes no other one's turn go by.
         let mut links = (0..self.direct.open.len()).rev();
         let answer = links.find_map(|index| self.take_in_from_link(index, wanted, when_full));
-        Ok(answer.or_else(|| self.take_in_early(wanted, when_full, now)))
+        answer.or_else(|| self.take_in_early(wanted, when_full, now))
     }
 
     /// Sorts in what has come on links that are about to end; what finds no room is refused.
@@ -68,7 +75,8 @@ impl Endpoint {
     fn take_in_early(&mut self, wanted: Option<Wanted>, when_full: WhenFull, now: Time) -> Option<Answer> {
         while when_full == WhenFull::Refuse || self.inbox.has_room() {
             let message = self.direct.next_early(now)?;
-            if let Sorted::Answer(answer) = self.inbox.sort(message, wanted.map(Wanted::at_node)) {
+            let awaited = self.at_node(&message, wanted);
+            if let Sorted::Answer(answer) = self.inbox.sort(message, awaited) {
                 return Some(answer);
             }
         }
@@ -115,7 +123,8 @@ impl Endpoint {
                     continue;
                 }
             };
-            match self.inbox.sort(message, wanted.map(Wanted::at_node)) {
+            let awaited = self.at_node(&message, wanted);
+            match self.inbox.sort(message, awaited) {
                 Sorted::Answer(answer) => return Ok(Some(answer)),
                 Sorted::Refusal(refusal) => self.end(refusal.into()),
                 Sorted::Untaken(untaken) => self.refusals.hear(&untaken),
@@ -123,6 +132,13 @@ impl Endpoint {
             }
         }
         Ok(None)
+    }
+
+    /// What is awaited, if it may be this message of the node's: what the node passes on is from whom it says it is, and what
+    /// it says itself of a message (nobody there, a full queue, lost) it says as from whom that was for. The number counts up by
+    /// one: who guesses it answers for nobody else.
+    fn at_node(&self, message: &Message, wanted: Option<Wanted>) -> Option<(u64, Awaited)> {
+        wanted.and_then(|wanted| wanted.from(self.absolute(message.header.source)))
     }
 
     /// Hands back what is not about direct links.
@@ -148,7 +164,7 @@ impl Endpoint {
         for read in 0.. {
             while when_full == WhenFull::Refuse || self.inbox.has_room() {
                 let link = &mut self.direct.open[index];
-                let awaited = wanted.and_then(|wanted| wanted.on_link_with(link.peer));
+                let awaited = wanted.and_then(|wanted| wanted.from(link.peer));
                 match link.next() {
                     Ok(Came::Nothing) => break,
                     Ok(Came::Refused) => {}
@@ -200,7 +216,9 @@ impl Endpoint {
                 reader.note(&ended);
                 self.direct.note(&ended);
             }
-            Reader::Ring(_) | Reader::Socket(_) => self.reader.wait(left),
+            Reader::Ring(_) => self.reader.wait(left),
+            // What another thread leaves owed to it nobody says here.
+            Reader::Socket(_) => self.reader.wait(left.min(NAP)),
         }
     }
 }
@@ -215,13 +233,8 @@ pub(super) struct Wanted {
 }
 
 impl Wanted {
-    /// What the node passes on is from whom it says it is.
-    const fn at_node(self) -> (u64, Awaited) {
-        (self.number, self.what)
-    }
-
-    /// On its own link nobody answers for others.
-    fn on_link_with(self, peer: Tid) -> Option<(u64, Awaited)> {
+    /// Nobody answers for others.
+    fn from(self, peer: Tid) -> Option<(u64, Awaited)> {
         (peer == self.of).then_some((self.number, self.what))
     }
 }

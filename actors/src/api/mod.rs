@@ -327,7 +327,8 @@ impl Registration {
         self
     }
 
-    /// How many received messages wait in this process at most, each class by itself. Default 256.
+    /// How many received messages wait in this process until no more are taken out of the socket or the rings. Default 256.
+    /// While an answer is waited for it is more, see [`Endpoint::send_confirmed`].
     #[must_use]
     pub const fn inbox_capacity(mut self, messages: usize) -> Self {
         self.inbox_capacity = messages;

@@ -84,12 +84,12 @@ impl Endpoint {
         self.correlation += 1;
         message.header.correlation = self.correlation;
         message.header.flags = message.header.flags.with(flags);
-        let of = self.absolute(message.header.destination);
-        let wanted = Wanted { number: self.correlation, what: awaited, of };
+        let (number, asked) = (self.correlation, message.header.destination);
         let mut now = Time::now();
         let deadline = now + within;
         // Who waits so long for the answer waits no longer for room.
         let way = self.dispatch(message, self.patience().and_in_all(within)).await?;
+        let wanted = Wanted { number, what: awaited, of: self.absolute(asked) };
         loop {
             if let Some(answer) = self.take_in(Some(wanted), WhenFull::Refuse, now)? {
                 return Ok(Some(answer));

@@ -71,6 +71,7 @@ macro_rules! on_every_transport {
     };
 }
 
+mod awaiting;
 mod loans;
 mod returns;
 mod room;

@@ -29,7 +29,9 @@ impl Endpoint {
         let has_stalled = self.stalled.is_some_and(|taken| taken == self.taken());
         let mut waiting = if has_stalled { Waiting::after_a_stall(limit) } else { Waiting::new(limit) };
         let written = self.write_within(draft, &mut waiting).await;
-        self.stalled = waiting.is_out_of_patience(Time::now()).then(|| self.taken());
+        let taken = self.taken();
+        let is_stalled = waiting.is_out_of_patience(Time::now()) || self.stalled == Some(taken);
+        self.stalled = is_stalled.then_some(taken);
         written
     }
 

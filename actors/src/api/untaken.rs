@@ -1,4 +1,6 @@
-//! Messages that were sent without asking for their outcome, and that nobody has taken: what the node says of them.
+//! Messages that were sent without asking for their outcome, and that nobody has taken: what the node says of them, and this endpoint.
+
+use std::time::Duration;
 
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
@@ -11,11 +13,14 @@ use crate::lncl::payload;
 
 /// Destinations and reasons that are told apart at most, until the application looks. Beyond them only the reasons are.
 const ENTRIES_MAX: usize = 64;
+/// Time between two lines in the log about messages that this endpoint has refused.
+const LOG_AGAIN: Duration = Duration::from_secs(10);
 
 /// Messages of one endpoint to one destination that were sent without asking for their outcome, and that nobody has taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Untaken {
-    /// Whom they were for; [`Tid::NONE`]: several that are not told apart any more.
+    /// Whom they were for; [`Tid::NONE`]: several that are not told apart any more. This endpoint itself, too: what others
+    /// have sent to it, or to a group of its, and it had no room for while it waited for an answer.
     pub destination: Tid,
     /// Why: mostly [`Rejection::QueueFull`], that is more came than the destination takes.
     pub why: Rejection,
@@ -27,7 +32,12 @@ pub struct Untaken {
 
 /// What the node has said, until the application looks.
 #[derive(Debug, Default)]
-pub(super) struct Refusals(Vec<Untaken>);
+pub(super) struct Refusals {
+    entries: Vec<Untaken>,
+    /// Messages that this endpoint has refused and that no line in the log tells of yet.
+    unlogged: u64,
+    logged: Option<Time>,
+}
 
 impl Refusals {
     /// The node says this.
@@ -44,23 +54,40 @@ impl Refusals {
         }
     }
 
+    /// This endpoint, `own`, has refused so many, and nobody was told.
+    pub(super) fn count_own(&mut self, own: Tid, count: u64, now: Time) {
+        if count > 0 {
+            self.add(Untaken { destination: own, why: Rejection::QueueFull, count, since: now });
+        }
+        self.unlogged = self.unlogged.saturating_add(count);
+        if self.unlogged > 0 && self.logged.is_none_or(|logged| now >= logged + LOG_AGAIN) {
+            let messages = std::mem::take(&mut self.unlogged);
+            self.logged = Some(now);
+            tracing::warn!(
+                endpoint = %own,
+                messages,
+                "messages for it were refused: while it waited for an answer more came than it keeps; it is to receive more often"
+            );
+        }
+    }
+
     fn add(&mut self, untaken: Untaken) {
         let known = self.find(untaken.destination, untaken.why);
-        let is_full = self.0.len() >= ENTRIES_MAX;
+        let is_full = self.entries.len() >= ENTRIES_MAX;
         let destination = if known.is_none() && is_full { Tid::NONE } else { untaken.destination };
         match known.or_else(|| self.find(destination, untaken.why)) {
-            Some(at) => self.0[at].count = self.0[at].count.saturating_add(untaken.count),
-            None => self.0.push(Untaken { destination, ..untaken }),
+            Some(at) => self.entries[at].count = self.entries[at].count.saturating_add(untaken.count),
+            None => self.entries.push(Untaken { destination, ..untaken }),
         }
     }
 
     fn find(&self, destination: Tid, why: Rejection) -> Option<usize> {
-        self.0.iter().position(|known| known.destination == destination && known.why == why)
+        self.entries.iter().position(|known| known.destination == destination && known.why == why)
     }
 
     /// The oldest.
     fn take(&mut self) -> Option<Untaken> {
-        (!self.0.is_empty()).then(|| self.0.remove(0))
+        (!self.entries.is_empty()).then(|| self.entries.remove(0))
     }
 }
 
@@ -69,6 +96,8 @@ impl Endpoint {
     /// node, and that nobody has taken: once for each destination and reason, with how many; `None` if there is nothing new.
     /// Looks, and does not wait. The first refusal is told at once, those after it every 100 ms together, so that a flood
     /// of refusals wakes nobody for each. What is not told when the connection ends is not told.
+    ///
+    /// What this endpoint itself has refused without anybody's being told is counted here too, with itself as the destination.
     ///
     /// Whoever needs to know it of one message sends that one [confirmed](Self::send_confirmed).
     pub fn untaken(&mut self) -> Option<Untaken> {
@@ -107,12 +136,27 @@ mod tests {
     }
 
     #[test]
+    fn what_this_endpoint_refuses_is_counted_and_the_log_says_it_once_in_a_while() {
+        let mut refusals = Refusals::default();
+        let at = |seconds| Time::ZERO + Duration::from_secs(seconds);
+        refusals.count_own(tid(1), 0, at(1));
+        assert_eq!((refusals.take(), refusals.logged), (None, None));
+        refusals.count_own(tid(1), 5, at(2));
+        refusals.count_own(tid(1), 2, at(3));
+        assert_eq!((refusals.unlogged, refusals.logged), (2, Some(at(2))), "the log says it of the first 5");
+        refusals.count_own(tid(1), 0, at(12));
+        assert_eq!((refusals.unlogged, refusals.logged), (0, Some(at(12))));
+        let expected = Untaken { destination: tid(1), why: Rejection::QueueFull, count: 7, since: at(2) };
+        assert_eq!((refusals.take(), refusals.take()), (Some(expected), None));
+    }
+
+    #[test]
     fn nothing_that_a_node_says_makes_it_longer_than_it_may_be_and_nothing_is_uncounted() {
         let mut refusals = Refusals::default();
         for app in 0..1_000 {
             refusals.hear(&said(tid(app), (app % 256) as u8, 1));
         }
-        assert!(refusals.0.len() <= ENTRIES_MAX + 11, "{} entries", refusals.0.len());
+        assert!(refusals.entries.len() <= ENTRIES_MAX + 11, "{} entries", refusals.entries.len());
         assert_eq!(std::iter::from_fn(|| refusals.take()).map(|untaken| untaken.count).sum::<u64>(), 1_000);
     }
 }

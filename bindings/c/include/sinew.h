@@ -362,7 +362,8 @@ typedef struct sinew_options {
      */
     uint64_t patience_ns;
     /**
-     * How many received messages wait in this process at most, each class by itself. Default: 256.
+     * How many received messages wait in this process until no more are taken out of the socket or the rings; more while an
+     * answer is waited for. Default: 256.
      */
     size_t inbox_capacity;
     /**
@@ -696,8 +697,9 @@ sinew_status sinew_receive_message(struct sinew_endpoint *endpoint,
 /**
  * The next thing that the node has said about messages that were sent without asking for their outcome, and that nobody has
  * taken: once for each destination and reason, with how many; `SINEW_NOTHING` if there is nothing new. Does not block. The
- * first refusal is told at once, those after it every 100 ms together. `*untaken` is set if this returns `SINEW_OK`. The
- * endpoint's thread. Does not block.
+ * first refusal is told at once, those after it every 100 ms together. `*untaken` is set if this returns `SINEW_OK`. What
+ * this endpoint itself has refused, since it came while an answer was waited for and was more than is kept then (16,384 messages
+ * of each class, 4 MiB and one message), is counted with its own TID as the destination. The endpoint's thread.
  */
 sinew_status sinew_next_untaken(struct sinew_endpoint *endpoint,
                                 struct sinew_untaken *untaken);

@@ -47,7 +47,8 @@ pub struct Options {
     /// How long a send waits while the node or, on a direct link, the receiver takes nothing; whatever it takes begins that time
     /// anew. Default: 1 s. For one send alone, and in all: `sinew_send_message_within`.
     pub patience_ns: u64,
-    /// How many received messages wait in this process at most, each class by itself. Default: 256.
+    /// How many received messages wait in this process until no more are taken out of the socket or the rings; more while an
+    /// answer is waited for. Default: 256.
     pub inbox_capacity: usize,
     /// How long a waiting thread looks before it sleeps. Looking keeps a CPU busy and saves the wake, which is most of a
     /// short message's way: for a thread with a CPU of its own. Default: it sleeps at once.

@@ -4,12 +4,23 @@ use super::*;
 
 /// Messages at most that wait for the rest of a ring of which the sender has said no more. One more is refused as `QueueFull`.
 const EARLY_MAX: usize = 4_096;
+/// Bytes of their payloads at most, and one message.
+const EARLY_BYTES_MAX: usize = 4 << 20;
 
 /// What one who has ended its link, or its next life, has sent through the node.
 pub(super) struct Early {
     /// The link that is read first.
     pub(super) after: LinkNumber,
     messages: VecDeque<Message>,
+    /// Of their payloads.
+    bytes: usize,
+}
+
+impl Early {
+    /// Nothing yet.
+    pub(super) const fn after(after: LinkNumber) -> Self {
+        Self { after, messages: VecDeque::new(), bytes: 0 }
+    }
 }
 
 /// What is to be done with a message that came through the node.
@@ -38,10 +49,13 @@ impl Direct {
                 Passed::AfterLink(after) => after,
             },
         };
-        if self.early.values().map(|early| early.messages.len()).sum::<usize>() >= EARLY_MAX {
+        let held = self.early.values().map(|early| (early.messages.len(), early.bytes));
+        let (messages, bytes) = held.fold((0, 0), |all, one| (all.0 + one.0, all.1 + one.1));
+        if messages >= EARLY_MAX || bytes >= EARLY_BYTES_MAX {
             return InTurn::Never(message);
         }
-        let early = self.early.entry(source).or_insert_with(|| Early { after, messages: VecDeque::new() });
+        let early = self.early.entry(source).or_insert_with(|| Early::after(after));
+        early.bytes += message.payload.len();
         early.messages.push_back(message);
         InTurn::Later
     }
@@ -62,6 +76,7 @@ impl Direct {
         let is_due = |(source, early): &(&Tid, &mut Early)| routes.link(**source) != Some(early.after);
         let (source, early) = self.early.iter_mut().find(is_due)?;
         let (source, message) = (*source, early.messages.pop_front());
+        early.bytes -= message.as_ref().map_or(0, |message| message.payload.len());
         if early.messages.is_empty() {
             self.early.remove(&source);
         }

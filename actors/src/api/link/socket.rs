@@ -21,7 +21,6 @@ use sinew_runtime::{
     time::Time,
     wire::{FrameCodec, HEADER_LEN, Message, encode_frame},
 };
-use sinew_shm::BellKind;
 use tokio::sync::Notify;
 use tokio_util::codec::Decoder;
 
@@ -45,7 +44,6 @@ pub(in crate::api) struct Writer {
     /// Told when some thread has left an outcome there: a task that waits looks again.
     pub(super) owing: Notify,
     patience: Duration,
-    waits: Waits,
 }
 
 /// What is on its way out. Kept for a moment only: nobody waits for room with it in hand.
@@ -55,15 +53,6 @@ struct Turn {
     backlog: BytesMut,
     /// Bytes that the socket took; wraps.
     taken: u32,
-}
-
-/// What who writes does where there is no room.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Waits {
-    /// It is a thread that may block.
-    Here,
-    /// It is a task.
-    Elsewhere,
 }
 
 /// How far a frame came.
@@ -77,8 +66,7 @@ enum Pushed {
 
 impl Writer {
     pub(in crate::api) fn new(socket: Arc<UnixStream>, options: &LinkOptions) -> Self {
-        let waits = if options.bell.kind() == BellKind::Futex { Waits::Here } else { Waits::Elsewhere };
-        Self { socket, turn: Mutex::default(), owing: Notify::new(), patience: options.patience, waits }
+        Self { socket, turn: Mutex::default(), owing: Notify::new(), patience: options.patience }
     }
 
     fn turn(&self) -> MutexGuard<'_, Turn> {
@@ -207,16 +195,8 @@ impl Writer {
 
 impl ReceiptSink for Writer {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
-        let outcome = Message::outcome(ticket, outcome);
-        match self.waits {
-            Waits::Here => {
-                // If the connection has ended the node tells the sender so; else it is said when there is room.
-                if self.write(&outcome).is_err() {
-                    self.owe(&outcome);
-                }
-            }
-            Waits::Elsewhere => self.owe(&outcome),
-        }
+        // Never waits: whoever settles may be in a loop of its own. If the connection has ended the node tells the sender so.
+        self.owe(&Message::outcome(ticket, outcome));
     }
 }
 
@@ -302,5 +282,57 @@ pub(super) fn wait(socket: &UnixStream, what: PollFlags, deadline: Time) -> Resu
             Ok(_) => return Ok(true),
             Err(error) => return Err(error),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{io::Read as _, sync::mpsc::sync_channel, thread};
+
+    use sinew_runtime::{
+        tid::Tid,
+        wire::{Header, Kind},
+    };
+
+    use super::*;
+    use crate::api::Registration;
+
+    const WATCHDOG: Duration = Duration::from_secs(10);
+
+    #[test]
+    fn an_outcome_that_finds_no_room_is_said_later_and_nobody_waits_for_that() {
+        // given: a socket that takes no more, and a patience without an end
+        let (ours, theirs) = UnixStream::pair().unwrap();
+        let options = Registration::new().patience(Duration::MAX).link;
+        let writer = Arc::new(Writer::new(Arc::new(ours), &options));
+        let filling =
+            || Message::new(Header::new(Kind::named("x"), Tid::NONE, Tid::NONE), vec![0; 4_096].into());
+        while matches!(writer.begin(filling()).unwrap(), Progress::Whole) {}
+        // when
+        let (say, settled) = sync_channel(1);
+        let settling = writer.clone();
+        thread::spawn(move || {
+            let ticket = Ticket { source: Tid::NONE, destination: Tid::NONE, correlation: 7 };
+            settling.settle(ticket, Outcome::Failed);
+            say.send(()).unwrap();
+        });
+        // then
+        settled.recv_timeout(WATCHDOG).expect("waited for the return of who settles");
+        let (mut codec, mut buffer) = (FrameCodec::new(4_096), BytesMut::new());
+        theirs.set_read_timeout(Some(WATCHDOG)).unwrap();
+        let outcome = loop {
+            writer.pay();
+            let mut chunk = [0; 65_536];
+            let count = (&theirs).read(&mut chunk).expect("waited for the outcome");
+            buffer.extend_from_slice(&chunk[..count]);
+            let mut frames = std::iter::from_fn(|| codec.decode(&mut buffer).unwrap());
+            if let Some(outcome) = frames.find(|message| message.header.kind == Kind::OUTCOME) {
+                break outcome;
+            }
+        };
+        assert_eq!(
+            (outcome.header.correlation, outcome.payload[..].to_vec()),
+            (7, vec![Outcome::Failed.code()])
+        );
     }
 }

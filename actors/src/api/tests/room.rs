@@ -22,6 +22,8 @@ on_every_transport! {
     who_has_time_waits_for_room_and_no_longer_than_it_has
     who_waits_so_long_for_an_answer_waits_no_longer_for_room
     patience_that_was_lost_once_is_not_lost_again_until_the_node_takes_something
+    who_has_a_time_of_its_own_gives_nobody_a_patience_back_that_was_lost
+    who_unregisters_waits_no_longer_than_is_said
     values_and_replies_may_have_a_time_too
     who_unregisters_waits_until_what_was_sent_is_out
 }
@@ -209,6 +211,38 @@ fn patience_that_was_lost_once_is_not_lost_again_until_the_node_takes_something(
     for number in 0..taken {
         assert_eq!(number_of(&node, SHORT), number);
     }
+}
+
+fn who_has_a_time_of_its_own_gives_nobody_a_patience_back_that_was_lost(under: Under) {
+    let patience = Duration::from_millis(500);
+    let node = PlayedNode::start();
+    let mut client = register(under, &node, patience);
+    fill(&mut client, SHORT);
+    let refused = message(&mut client, 0, SHORT);
+    assert!(matches!(client.send_message(refused), Err(ApiError::Stalled(_))));
+    // Each with a patience of its own, these would take eight minutes.
+    let deadline = std::time::Instant::now() + 100 * patience;
+    for _ in 0..1_000 {
+        let refused = message(&mut client, 0, SHORT);
+        assert!(matches!(client.send_message_within(refused, NO_TIME), Err(ApiError::Stalled(_))));
+        let refused = message(&mut client, 0, SHORT);
+        assert!(matches!(client.send_message(refused), Err(ApiError::Stalled(_))));
+        assert!(std::time::Instant::now() < deadline, "each waits anew");
+    }
+}
+
+fn who_unregisters_waits_no_longer_than_is_said(under: Under) {
+    // given: a node that takes nothing, and a patience without an end
+    let node = PlayedNode::start();
+    let mut client = register(under, &node, Duration::MAX);
+    fill(&mut client, SHORT);
+    fill(&mut client, 8);
+    // when
+    let (say, told) = std::sync::mpsc::sync_channel(1);
+    thread::spawn(move || say.send(client.unregister()));
+    // then
+    let told = told.recv_timeout(WATCHDOG).expect("waited for the end of who unregisters");
+    assert!(matches!(told, Err(ApiError::Stalled(_))), "{told:?}");
 }
 
 fn values_and_replies_may_have_a_time_too(under: Under) {

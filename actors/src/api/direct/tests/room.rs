@@ -1,9 +1,15 @@
 //! Rings without room, long messages, and the bounds on links and their memory.
 
-use sinew_runtime::tid::Tid;
+use sinew_runtime::{
+    tid::Tid,
+    wire::{Header, Message},
+};
 
 use super::*;
-use crate::api::{direct::budget::Budget, routes::LINKS_MAX};
+use crate::api::{
+    direct::{InTurn, budget::Budget, early::Early},
+    routes::LINKS_MAX,
+};
 
 #[test]
 fn of_a_stream_the_newest_value_waits_for_room_in_the_ring() {
@@ -293,4 +299,25 @@ fn a_peer_that_takes_nothing_costs_a_sender_its_patience_once_and_not_with_each_
     }
     one.send(other.tid(), &Counted(3)).unwrap();
     assert_eq!(other.receive(WATCHDOG).unwrap().expect("a message").decode::<Counted>().unwrap(), Counted(3));
+}
+
+#[test]
+fn what_waits_for_the_rest_of_a_ring_is_bounded_in_bytes() {
+    const LENGTH: usize = 64 << 10;
+    // given: one whose messages through the node come after what is in its ring
+    let node = TestNode::start();
+    let (mut one, mut other) = (endpoint(&node), endpoint(&node));
+    link(&mut one, &mut other);
+    let number = other.direct.open[0].number;
+    other.direct.early.insert(one.tid(), Early::after(number));
+    // when
+    let payload = bytes::Bytes::from(vec![0; LENGTH]);
+    let mut keep = || {
+        let header = Header::new(Counted::KIND, one.tid(), other.tid());
+        other.direct.keep_early(Message::new(header, payload.clone()))
+    };
+    let kept = (0..1_000).take_while(|_| matches!(keep(), InTurn::Later)).count();
+    // then
+    assert_eq!(kept * LENGTH, 4 << 20);
+    assert!(matches!(keep(), InTurn::Never(_)));
 }

@@ -1,0 +1,122 @@
+//! What comes while an answer is awaited: whose answer counts, and what is kept of the rest.
+
+use std::{thread, time::Duration};
+
+use sinew_runtime::{outcome::Ticket, wire::Header};
+
+use super::{
+    Class, Doubled, Flags, Message, Outcome, Rejection, TORQUE, TestNode, Time, Transport, WATCHDOG,
+    forms::{self, Client, Under},
+    on, register,
+};
+use crate::lncl::{
+    payload::Register,
+    testing::{PlayedApp, RawClient},
+};
+
+on_every_transport! {
+    nobody_answers_for_another_by_guessing_the_number
+    what_comes_while_an_answer_is_awaited_is_kept_beyond_the_capacity
+    what_is_not_kept_while_an_answer_is_awaited_is_counted
+}
+
+fn nobody_answers_for_another_by_guessing_the_number(under: Under) {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let mut endpoint = register(under, &node, on(under));
+    // given: a client that was asked once, and so knows about where the numbers are
+    let (mut hostile, its_tid) = RawClient::register(&node, &Register::default());
+    let tid = endpoint.tid();
+    let known = thread::scope(|scope| {
+        let asked = scope.spawn(|| {
+            let correlation = hostile.next().expect("the question").header.correlation;
+            let ticket = Ticket { source: tid, destination: its_tid, correlation };
+            hostile.send(&Message::outcome(ticket, Outcome::Failed));
+            correlation
+        });
+        let told = endpoint.send_confirmed(its_tid, &TORQUE, WATCHDOG).unwrap();
+        assert_eq!(told, Outcome::Failed);
+        asked.join().unwrap()
+    });
+    // when: it answers the next ones before they are asked
+    for number in known + 1..known + 32 {
+        let mut forged = Message::typed(its_tid, endpoint.tid(), &Doubled { newton_metres: -1.0 });
+        forged.header.flags = Flags::REPLY;
+        forged.header.correlation = number;
+        hostile.send(&forged);
+    }
+    hostile.send(&Message::typed(its_tid, app.tid, &TORQUE));
+    assert_eq!(app.next().header.source, its_tid, "the node has passed on all of it");
+    // then: who was asked answers
+    let asked = thread::scope(|scope| {
+        scope.spawn(|| {
+            let request = app.next();
+            let mut reply = Message::typed(app.tid, request.header.source, &Doubled { newton_metres: 5.0 });
+            reply.header.flags = Flags::REPLY;
+            reply.header.correlation = request.header.correlation;
+            node.stores.router.send(reply).unwrap();
+        });
+        endpoint.ask::<_, Doubled>(app.tid, &TORQUE, WATCHDOG).unwrap()
+    });
+    assert_eq!(asked, Doubled { newton_metres: 5.0 });
+}
+
+/// Sends so many messages while `endpoint` waits for an outcome, each as soon as the node has room for it. They are Bulk: the
+/// outcome must find room where they wait.
+fn flood(node: &TestNode, endpoint: &mut Client, app: &PlayedApp, count: usize, message: &Message) {
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            let mut asked = app.next();
+            let deadline = Time::now() + WATCHDOG * 3;
+            for number in 0..count {
+                let header = Header { class: Class::Bulk, ..message.header };
+                let copy = || Message::new(header, message.payload.clone());
+                while node.stores.router.send(copy()).is_err() {
+                    assert!(Time::now() < deadline, "waited for room for message {number}");
+                    thread::yield_now();
+                }
+            }
+            asked.settle(Outcome::Delivered);
+        });
+        let told = endpoint.send_confirmed(app.tid, &TORQUE, WATCHDOG * 3).unwrap();
+        assert_eq!(told, Outcome::Delivered);
+    });
+}
+
+/// Receives until so many have come, or were counted as refused; how many were refused.
+fn receive_all(endpoint: &mut Client, count: usize) -> u64 {
+    let (mut came, mut refused) = (0, 0);
+    let deadline = Time::now() + WATCHDOG;
+    while came + refused < count as u64 {
+        assert!(Time::now() < deadline, "waited for {count}; {came} came, {refused} were refused");
+        came += u64::from(endpoint.receive(Duration::from_millis(1)).unwrap().is_some());
+        while let Some(untaken) = endpoint.untaken() {
+            assert_eq!((untaken.destination, untaken.why), (endpoint.tid(), Rejection::QueueFull));
+            refused += untaken.count;
+        }
+    }
+    assert_eq!(came + refused, count as u64);
+    refused
+}
+
+fn what_comes_while_an_answer_is_awaited_is_kept_beyond_the_capacity(under: Under) {
+    const COUNT: usize = 3_000;
+    let node = TestNode::start();
+    let app = node.local(1);
+    let mut endpoint = register(under, &node, on(under).inbox_capacity(16));
+    let message = Message::typed(app.tid, endpoint.tid(), &TORQUE);
+    flood(&node, &mut endpoint, &app, COUNT, &message);
+    assert_eq!(receive_all(&mut endpoint, COUNT), 0);
+}
+
+fn what_is_not_kept_while_an_answer_is_awaited_is_counted(under: Under) {
+    // 19 MiB: more than a queue of the node's, a ring and what is kept.
+    const COUNT: usize = 300;
+    let node = TestNode::start();
+    let app = node.local(1);
+    let mut endpoint = register(under, &node, on(under));
+    let mut message = Message::typed(app.tid, endpoint.tid(), &TORQUE);
+    message.payload = vec![0; 64 << 10].into();
+    flood(&node, &mut endpoint, &app, COUNT, &message);
+    assert!(receive_all(&mut endpoint, COUNT) > 0);
+}
