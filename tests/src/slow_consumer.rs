@@ -45,7 +45,7 @@ pub struct Plan {
     pub length: usize,
     /// What a slow consumer takes for each.
     pub takes: Duration,
-    /// Time of each reference; [`reference`] if nothing speaks for another.
+    /// Time of each reference; [`reference()`] if nothing speaks for another.
     pub reference: Duration,
 }
 
