@@ -31,8 +31,9 @@ fn a_forged_source_costs_the_message_and_not_the_link() {
     let received = other.receive(WATCHDOG).unwrap().expect("a message");
     assert_eq!(received.decode::<Counted>().unwrap(), Counted(2), "the forged ones are not received");
     let link = &mut one.direct.open[0];
-    let mut told = Vec::new();
+    let (mut told, deadline) = (Vec::new(), Time::now() + WATCHDOG);
     while told.len() < 2 {
+        assert!(Time::now() < deadline, "waited for what became of the forged messages, told: {told:?}");
         link.take().unwrap();
         while let Came::Message(message) = link.next().unwrap() {
             told.push((message.header.correlation, Outcome::from_code(message.payload[0])));
