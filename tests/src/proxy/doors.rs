@@ -10,6 +10,7 @@ use std::{
     thread::JoinHandle,
 };
 
+use sinew::Time;
 use socket2::{Domain, Protocol, Socket, Type};
 use tokio::{
     net::{TcpListener, UdpSocket},
@@ -249,4 +250,12 @@ async fn serve(
     }
     // An error says that the owner is gone; all tasks end with the reactor.
     while ends.changed().await.is_ok() {}
+}
+
+/// From `now` until `wake`; for ever if that is `None`: something else wakes then.
+pub(super) async fn sleep_until(wake: Option<Time>, now: Time) {
+    match wake {
+        Some(at) => tokio::time::sleep(at.since(now)).await,
+        None => std::future::pending().await,
+    }
 }

@@ -15,7 +15,7 @@ use tokio::{
 };
 
 use super::{
-    doors::{Room, Shared, Weather, reopen},
+    doors::{Room, Shared, Weather, reopen, sleep_until},
     faults::{Cut, Side},
     stream::StreamWay,
 };
@@ -157,12 +157,6 @@ async fn pump(half: Half<'_>, shared: &Shared, mut weather: watch::Receiver<Weat
         let room = way.room().min(READ_LEN);
         let is_ready = !way.ready(now).is_empty();
         let wake = way.next_wake().filter(|_| !is_ready);
-        let sleep = async {
-            match wake {
-                Some(at) => tokio::time::sleep(at.since(now)).await,
-                None => std::future::pending().await,
-            }
-        };
         tokio::select! {
             // What is told to go wrong goes wrong with the next byte.
             biased;
@@ -191,7 +185,7 @@ async fn pump(half: Half<'_>, shared: &Shared, mut weather: watch::Receiver<Weat
                 }
                 shared.flips.fetch_add(way.new_flips(), Ordering::Relaxed);
             }
-            () = sleep => {}
+            () = sleep_until(wake, now) => {}
         }
     }
 }

@@ -15,7 +15,7 @@ use tokio::{
 
 use super::{
     datagrams::DatagramWay,
-    doors::{Room, Shared, Weather},
+    doors::{Room, Shared, Weather, sleep_until},
 };
 
 /// Senders that are known at a door at most. What further ones send is lost.
@@ -57,12 +57,6 @@ pub(super) async fn serve(
             shared.passed[side.other().index()].fetch_add(datagram.len() as u64, Ordering::Relaxed);
         }
         let wake = [there.next_wake(), back.next_wake()].into_iter().flatten().min();
-        let sleep = async {
-            match wake {
-                Some(at) => tokio::time::sleep(at.since(now)).await,
-                None => std::future::pending().await,
-            }
-        };
         tokio::select! {
             // What is told to go wrong goes wrong with the next datagram.
             biased;
@@ -83,7 +77,7 @@ pub(super) async fn serve(
                 }
             }
             Some((outer, datagram)) = answers.recv() => back.take(Time::now(), outer, datagram),
-            () = sleep => {}
+            () = sleep_until(wake, now) => {}
         }
         for way in [there.new_lost_and_flips(), back.new_lost_and_flips()] {
             shared.lost.fetch_add(way.0, Ordering::Relaxed);
