@@ -78,6 +78,12 @@
 #define SINEW_SPIN_ADAPTIVE 4
 
 /**
+ * For `links` of `sinew_options`: does not register again when the connection to the node has ended. Then every call says
+ * `SINEW_ERROR_CLOSED`. Without this the endpoint comes back by itself.
+ */
+#define SINEW_ONE_CONNECTION 8
+
+/**
  * What a call came to. Negative: an error, and `sinew_last_error` has a sentence about it.
  */
 enum sinew_status
@@ -372,14 +378,20 @@ typedef struct sinew_options {
      */
     uint64_t spin_ns;
     /**
-     * What carries the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT`, `SINEW_SPIN_ADAPTIVE`. Default: shared memory
-     * where the system has it, all through the node.
+     * What carries the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT`, `SINEW_SPIN_ADAPTIVE`, `SINEW_ONE_CONNECTION`. Default:
+     * shared memory where the system has it, all through the node, and again when the connection has ended.
      */
     uint32_t links;
     /**
      * Zero.
      */
     uint32_t reserved;
+    /**
+     * Bytes of this side's ring of each direct link, from 4 KiB to 1 MiB (less or more is taken for those), rounded up to a
+     * power of two and never more than the node's `lncl.ring_bytes`. A message longer than half of it goes in pieces. All
+     * rings for direct links that a process makes take 64 MiB at most. Default: 64 KiB.
+     */
+    size_t direct_ring_bytes;
 } sinew_options;
 
 /**

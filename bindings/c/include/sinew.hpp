@@ -94,6 +94,7 @@ struct options {
     std::size_t inbox_capacity = 0;
     duration spin{};
     std::uint32_t links = 0;
+    std::size_t direct_ring_bytes = 0;
 };
 
 /// A message that is being made: a container of writable bytes. One that is not sent is discarded at its end.
@@ -208,6 +209,7 @@ public:
         raw.inbox_capacity = wanted.inbox_capacity;
         raw.spin_ns = detail::nanoseconds(wanted.spin);
         raw.links = wanted.links;
+        raw.direct_ring_bytes = wanted.direct_ring_bytes;
         detail::check(sinew_register_transport_address(detail::text(socket), &raw, &raw_));
     }
     endpoint(endpoint &&other) noexcept : raw_(std::exchange(other.raw_, nullptr)) {}

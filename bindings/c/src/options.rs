@@ -19,6 +19,9 @@ pub const SINEW_SOCKET_ONLY: u32 = 1;
 pub const SINEW_DIRECT: u32 = 2;
 /// For `links` of `sinew_options`: `spin_ns` is the longest to look; it looks as long as messages lately took to come.
 pub const SINEW_SPIN_ADAPTIVE: u32 = 4;
+/// For `links` of `sinew_options`: does not register again when the connection to the node has ended. Then every call says
+/// `SINEW_ERROR_CLOSED`. Without this the endpoint comes back by itself.
+pub const SINEW_ONE_CONNECTION: u32 = 8;
 
 /// What an application asks for when it registers. Set all of it to zero, then `size`, then what is wanted; zero means the
 /// default everywhere. It grows at its end only: a program that was compiled with a shorter one is served as before.
@@ -53,12 +56,18 @@ pub struct Options {
     /// How long a waiting thread looks before it sleeps. Looking keeps a CPU busy and saves the wake, which is most of a
     /// short message's way: for a thread with a CPU of its own. Default: it sleeps at once.
     pub spin_ns: u64,
-    /// What carries the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT`, `SINEW_SPIN_ADAPTIVE`. Default: shared memory
-    /// where the system has it, all through the node.
+    /// What carries the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT`, `SINEW_SPIN_ADAPTIVE`, `SINEW_ONE_CONNECTION`. Default:
+    /// shared memory where the system has it, all through the node, and again when the connection has ended.
     pub links: u32,
     /// Zero.
     pub reserved: u32,
+    /// Bytes of this side's ring of each direct link, from 4 KiB to 1 MiB (less or more is taken for those), rounded up to a
+    /// power of two and never more than the node's `lncl.ring_bytes`. A message longer than half of it goes in pieces. All
+    /// rings for direct links that a process makes take 64 MiB at most. Default: 64 KiB.
+    pub direct_ring_bytes: usize,
 }
+
+const KNOWN_LINKS: u32 = SINEW_SOCKET_ONLY | SINEW_DIRECT | SINEW_SPIN_ADAPTIVE | SINEW_ONE_CONNECTION;
 
 /// What says how long the rest is.
 const SHORTEST: usize = size_of::<usize>();
@@ -128,7 +137,7 @@ impl Options {
         if self.reserved != 0 {
             return Err(Fault::argument(format!("`options.reserved` is {}: set it to 0", self.reserved)));
         }
-        if self.links & !(SINEW_SOCKET_ONLY | SINEW_DIRECT | SINEW_SPIN_ADAPTIVE) != 0 {
+        if self.links & !KNOWN_LINKS != 0 {
             return Err(Fault::argument(format!("`options.links` is {:#x}: no such links", self.links)));
         }
         if self.links & SINEW_SOCKET_ONLY != 0 {
@@ -136,6 +145,12 @@ impl Options {
         }
         if self.links & SINEW_DIRECT != 0 {
             registration = registration.direct(true);
+        }
+        if self.direct_ring_bytes != 0 {
+            registration = registration.direct_ring_bytes(self.direct_ring_bytes);
+        }
+        if self.links & SINEW_ONE_CONNECTION != 0 {
+            registration = registration.for_one_connection();
         }
         let longest = Duration::from_nanos(self.spin_ns);
         Ok(match (self.spin_ns, self.links & SINEW_SPIN_ADAPTIVE) {
@@ -230,12 +245,29 @@ mod tests {
     }
 
     #[test]
+    fn the_rings_of_direct_links_and_the_return_are_chosen() {
+        let mut options = zeroed(size_of::<Options>());
+        (options.links, options.direct_ring_bytes) = (SINEW_DIRECT | SINEW_ONE_CONNECTION, 1 << 18);
+        let asked = format!("{:?}", options.registration().unwrap());
+        let wanted = Registration::new().direct(true).direct_ring_bytes(1 << 18).for_one_connection();
+        assert_eq!(asked, format!("{wanted:?}"));
+    }
+
+    #[test]
+    fn a_program_compiled_before_there_were_ring_bytes_has_the_default() {
+        let mut options = zeroed(std::mem::offset_of!(Options, direct_ring_bytes));
+        (options.links, options.direct_ring_bytes) = (SINEW_DIRECT, 1 << 18);
+        let asked = format!("{:?}", Options::read(&options).unwrap().registration().unwrap());
+        assert_eq!(asked, format!("{:?}", Registration::new().direct(true)));
+    }
+
+    #[test]
     fn what_does_not_exist_cannot_be_asked_for() {
         let mut options = zeroed(size_of::<Options>());
         options.events = 4;
         assert!(options.registration().is_err());
         let mut options = zeroed(size_of::<Options>());
-        options.links = 8;
+        options.links = 16;
         assert!(options.registration().is_err());
         let mut options = zeroed(size_of::<Options>());
         options.reserved = 1;
