@@ -1,19 +1,17 @@
 //! The cases: by which way, what, on which CPUs, how often; and the roles of the processes that take part.
 
-use std::{
-    process::{ExitCode, Stdio},
-    thread,
-    time::{Duration, Instant},
-};
+use std::process::ExitCode;
 
-use sinew_figures::{Alone, Beside, End, Figures, Pinning};
+use sinew_figures::{Alone, Beside, End, Figures, Pace, Pinning, Rounds, process};
 
 use crate::{
     crowds,
     ends::{self, Memory},
-    processes, raw, tasks,
+    raw, tasks,
 };
 
+/// The environment variable that makes a run short.
+const SHORT: &str = "SINEW_LNCL_SHORT";
 /// The mean of the paper's Table 1, in nanoseconds.
 const PAPER_MEAN_NS: u64 = 46_200;
 
@@ -113,70 +111,6 @@ enum What {
     Flood,
 }
 
-/// How round trips follow each other.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Pace {
-    BackToBack,
-    EveryMillisecond,
-}
-
-impl Pace {
-    const fn name(self) -> &'static str {
-        match self {
-            Self::BackToBack => "back_to_back",
-            Self::EveryMillisecond => "1khz",
-        }
-    }
-}
-
-/// How many round trips, at which pace.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Rounds {
-    pace: Pace,
-    /// Not counted.
-    pub(crate) warm_up: u32,
-    pub(crate) counted: u32,
-}
-
-impl Rounds {
-    const fn of(bytes: usize, pace: Pace, is_short: bool) -> Self {
-        let (warm_up, counted) = match pace {
-            Pace::EveryMillisecond if bytes == 1_000 => (50, 1_500),
-            Pace::EveryMillisecond => (50, 300),
-            Pace::BackToBack if bytes > 100_000 => (50, 500),
-            Pace::BackToBack if bytes > 10_000 => (200, 4_000),
-            Pace::BackToBack => (1_000, 20_000),
-        };
-        let part = if is_short { 10 } else { 1 };
-        Self { pace, warm_up, counted: counted / part }
-    }
-
-    /// The pause before each.
-    pub(crate) const fn pause_us(self) -> u64 {
-        match self.pace {
-            Pace::BackToBack => 0,
-            Pace::EveryMillisecond => 1_000,
-        }
-    }
-
-    /// The times of these round trips.
-    pub(crate) fn time(self, mut round_trip: impl FnMut()) -> Figures {
-        let mut times = Figures::new();
-        for round in 0..self.warm_up + self.counted {
-            if self.pause_us() > 0 {
-                thread::sleep(Duration::from_micros(self.pause_us()));
-            }
-            let start = Instant::now();
-            round_trip();
-            let time = start.elapsed();
-            if round >= self.warm_up {
-                times.record(time);
-            }
-        }
-        times
-    }
-}
-
 /// One way, one thing to measure, some CPUs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Case {
@@ -228,8 +162,11 @@ impl Case {
     /// Runs it in a process of its own. Returns whether that went well.
     pub(crate) fn run(self, is_short: bool) -> bool {
         let role = format!("measure {}", self.name());
-        let status = processes::command(&role, is_short).stdin(Stdio::null()).status();
-        let is_well = status.is_ok_and(|status| status.success());
+        let mut command = process::command(&role);
+        if is_short {
+            command.env(SHORT, "1");
+        }
+        let is_well = process::has_run(command);
         if !is_well {
             eprintln!("{} failed", self.name());
         }
@@ -337,7 +274,7 @@ pub(crate) fn play(role: &str) -> ExitCode {
     let words: Vec<&str> = role.split(' ').collect();
     match words[..] {
         ["measure", name] => {
-            let is_short = processes::is_short();
+            let is_short = std::env::var_os(SHORT).is_some();
             let case = all(is_short).find(|case| case.name() == name);
             case.expect("a name that this program wrote itself").measure(is_short);
         }

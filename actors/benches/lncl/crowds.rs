@@ -5,13 +5,15 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew_figures::{Figures, Pinning};
+use sinew_figures::{
+    Figures, Pinning,
+    process::{Process, say_there},
+};
 use sinew_runtime::{time::Time, wire::Kind};
 
 use crate::{
     case::{Way, role},
     ends::{DEADLINE, Home, register},
-    processes::{Process, say_there},
 };
 
 /// Bytes of a packet.

@@ -3,13 +3,15 @@
 use std::{os::unix::process::CommandExt, path::PathBuf, process::Command, time::Duration};
 
 use sinew::{Endpoint, LentMessage, NodeApi, Registration, Spin, Transport, prelude::*};
-use sinew_figures::{Figures, Pinning};
+use sinew_figures::{
+    Figures, Pinning, Rounds,
+    process::{Process, await_end, say_there},
+};
 use sinew_runtime::{time::Time, wire::Kind};
 
 use crate::{
-    case::{Rounds, Way, role},
+    case::{Way, role},
     crowds::{Ages, PACKET},
-    processes::{Process, await_end, say_there},
 };
 
 /// No wait of this bench is longer.

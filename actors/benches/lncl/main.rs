@@ -24,15 +24,13 @@ mod crowds;
 #[cfg(target_os = "linux")]
 mod ends;
 #[cfg(target_os = "linux")]
-mod processes;
-#[cfg(target_os = "linux")]
 mod raw;
 #[cfg(target_os = "linux")]
 mod tasks;
 
 #[cfg(target_os = "linux")]
 fn main() -> std::process::ExitCode {
-    if let Ok(role) = std::env::var(processes::ROLE) {
+    if let Some(role) = sinew_figures::process::role() {
         return case::play(&role);
     }
     eprintln!("machine: {}", sinew_figures::machine());

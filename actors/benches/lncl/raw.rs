@@ -8,17 +8,19 @@ use std::{
 
 use rustix::{
     event::{PollFd, PollFlags, poll},
-    io::dup,
     stdio::stdin,
 };
-use sinew_figures::{End, Figures, Pinning};
+use sinew_figures::{
+    End, Figures, Pinning, Rounds,
+    process::{Process, say_there},
+    stream,
+};
 use sinew_runtime::time::Time;
 use sinew_shm::bare::{self, Waiting};
 
 use crate::{
-    case::{Reference, Rounds},
+    case::Reference,
     crowds::{ANSWERED_EACH, PACKET, SENDERS, WINDOW, paced},
-    processes::{Process, say_there},
 };
 
 /// Round trips of a reference.
@@ -36,12 +38,9 @@ pub(crate) fn round_trips(reference: Reference, bytes: usize, rounds: Rounds, pi
             })
         }
         Reference::UnixStream => {
-            let (mut socket, theirs) = UnixStream::pair().expect("a pair of sockets");
+            let (socket, theirs) = UnixStream::pair().expect("a pair of sockets");
             let _echo = Process::start_on(&role, theirs.into());
-            rounds.time(|| {
-                socket.write_all(&buffer).expect("the echo reads");
-                socket.read_exact(&mut buffer).expect("the echo answers");
-            })
+            stream::round_trips(socket, rounds)
         }
     }
 }
@@ -58,11 +57,7 @@ pub(crate) fn echo(reference: Reference, bytes: usize) {
                 end.send(&buffer);
             }
         }
-        Reference::UnixStream => {
-            let mut socket = input();
-            say_there();
-            while socket.read_exact(&mut buffer).and_then(|()| socket.write_all(&buffer)).is_ok() {}
-        }
+        Reference::UnixStream => stream::echo(bytes),
     }
 }
 
@@ -75,7 +70,7 @@ const fn waiting(reference: Reference) -> Waiting {
 
 /// The socket that this process was given as its input.
 fn input() -> UnixStream {
-    dup(stdin()).expect("the socket is the input").into()
+    stream::input().into()
 }
 
 /// Packets a second that a unix stream carries, answered as those of a flood are.
@@ -131,7 +126,7 @@ pub(crate) fn fan_in(packets: u64, pinning: Pinning) -> Figures {
         // One that has ended was read to its end.
         sockets.retain_mut(|socket| ready.next() != Some(true) || read_packet(socket, &mut figures));
     }
-    senders.into_iter().for_each(Process::wait);
+    senders.into_iter().for_each(|sender| drop(sender.wait()));
     figures
 }
 

@@ -1,14 +1,16 @@
 //! Sinew's ends as tasks of tokio, each on a runtime of one thread: the same round trips by `AsyncEndpoint`.
 
 use sinew::{AsyncEndpoint, LentMessage, NodeApi, Registration, Tid};
-use sinew_figures::{Figures, Pinning};
+use sinew_figures::{
+    Figures, Pinning, Rounds,
+    process::{Process, say_there},
+};
 use sinew_runtime::wire::Kind;
 use tokio::runtime::{Builder, Runtime};
 
 use crate::{
-    case::{Rounds, Way, role},
+    case::{Way, role},
     ends::{BLOCK, DEADLINE, Home},
-    processes::{Process, say_there},
 };
 
 fn runtime() -> Runtime {

@@ -13,14 +13,16 @@ use std::{
 };
 
 use sinew::{Confirmation, prelude::*};
-use sinew_figures::{Alone, Figures, Pinning};
+use sinew_figures::{
+    Alone, Figures, Pinning,
+    process::{Process, await_end, command, say_there},
+    stream,
+};
 use zenoh::Wait;
 
 use crate::{
+    DEADLINE,
     nodes::{self, Back, There},
-    processes::{Process, await_end, command, say_there},
-    raw,
-    rounds::{DEADLINE, Times},
     zenoh as peer,
 };
 
@@ -85,7 +87,7 @@ pub(crate) fn measure(carrier: &str, packets: usize, pinning: Pinning) {
         "sinew_confirmed" => sinew(packets, role),
         _ => panic!("no such carrier: {carrier}"),
     };
-    Times(vec![took]).hand_over();
+    println!("{}", took.as_nanos());
 }
 
 /// Takes them, and answers when the last one is there.
@@ -99,7 +101,7 @@ pub(crate) fn sink(carrier: &str, packets: usize, at: &str) {
 }
 
 fn tcp(packets: usize, role: impl Fn(&str) -> String) -> Duration {
-    let (mut ours, theirs) = raw::tcp_pair();
+    let (mut ours, theirs) = stream::tcp_pair();
     let _sink = Process::start_on(&role("-"), theirs.into());
     let mut framed = vec![COUNTS; 4 + PACKET];
     framed[..4].copy_from_slice(&(PACKET as u32).to_le_bytes());
@@ -112,7 +114,7 @@ fn tcp(packets: usize, role: impl Fn(&str) -> String) -> Duration {
 }
 
 fn tcp_sink(packets: usize) {
-    let stream = UnixStream::from(raw::input());
+    let stream = UnixStream::from(stream::input());
     let mut reader = BufReader::with_capacity(64 * 1024, &stream);
     let (mut length, mut packet) = ([0; 4], vec![0; PACKET]);
     say_there();

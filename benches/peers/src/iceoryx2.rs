@@ -4,16 +4,18 @@ use iceoryx2::{
     port::{listener::Listener, notifier::Notifier, publisher::Publisher, subscriber::Subscriber},
     prelude::*,
 };
-use sinew_figures::Pinning;
+use sinew_figures::{
+    Figures, Pinning, Rounds,
+    process::{Process, say_there},
+};
 
 use crate::{
+    DEADLINE,
     path::{Path, echo_role},
-    processes::{Process, say_there},
-    rounds::{DEADLINE, Rounds, Times},
 };
 
 /// Round trips.
-pub(crate) fn measure(path: Path, rounds: Rounds, pinning: Pinning) -> Times {
+pub(crate) fn measure(path: Path, rounds: Rounds, pinning: Pinning) -> Figures {
     let run = std::process::id().to_string();
     let mut end = End::new(&run, ["there", "back"], path, rounds.bytes);
     let _echo = Process::start(&echo_role(path, rounds.bytes, pinning, &run));

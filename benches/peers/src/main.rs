@@ -17,15 +17,16 @@ mod flood;
 mod iceoryx2;
 mod nodes;
 mod path;
-mod processes;
 mod raw;
-mod rounds;
 mod shared_memory;
 mod zenoh;
 
-use std::process::ExitCode;
+use std::{process::ExitCode, time::Duration};
 
 use clap::Parser;
+
+/// No wait of this program is longer.
+const DEADLINE: Duration = Duration::from_secs(60);
 
 /// Sinew beside iceoryx2, zenoh and what the system itself gives: round trips and floods, one table.
 #[derive(Parser)]
@@ -38,7 +39,7 @@ struct Arguments {
 }
 
 fn main() -> ExitCode {
-    if let Ok(role) = std::env::var(processes::ROLE) {
+    if let Some(role) = sinew_figures::process::role() {
         path::play(&role);
         return ExitCode::SUCCESS;
     }

@@ -8,12 +8,14 @@ use std::{
 
 use serde::{Deserialize, Serialize};
 use sinew::prelude::*;
-use sinew_figures::Pinning;
+use sinew_figures::{
+    Figures, Pinning, Rounds,
+    process::{Process, await_end, say_there},
+};
 
 use crate::{
+    DEADLINE,
     path::{Path, echo_role},
-    processes::{Process, await_end, say_there},
-    rounds::{DEADLINE, Rounds, Times},
 };
 
 /// Sent there.
@@ -58,8 +60,8 @@ struct Ping {
     rounds: Rounds,
     round: u32,
     sent: Instant,
-    times: Times,
-    done: SyncSender<Times>,
+    times: Figures,
+    done: SyncSender<Figures>,
 }
 
 impl Ping {
@@ -85,7 +87,7 @@ impl Handler<Delivery<Back>> for Ping {
     fn handle(&mut self, back: Delivery<Back>, context: &mut Self::Context) {
         assert_eq!(back.block.len(), self.rounds.bytes);
         if self.round >= self.rounds.warm_up {
-            self.times.0.push(self.sent.elapsed());
+            self.times.record(self.sent.elapsed());
         }
         self.round += 1;
         if self.round >= self.rounds.warm_up + self.rounds.counted {
@@ -114,7 +116,7 @@ pub(crate) fn group() -> String {
 }
 
 /// Round trips between two applications.
-pub(crate) fn measure(path: Path, rounds: Rounds, pinning: Pinning) -> Times {
+pub(crate) fn measure(path: Path, rounds: Rounds, pinning: Pinning) -> Figures {
     let group = group();
     let _echo = Process::start(&echo_role(path, rounds.bytes, pinning, &group));
     let (done, times) = sync_channel(1);
@@ -123,7 +125,7 @@ pub(crate) fn measure(path: Path, rounds: Rounds, pinning: Pinning) -> Times {
         rounds,
         round: 0,
         sent: Instant::now(),
-        times: Times::default(),
+        times: Figures::new(),
         done: done.clone(),
     };
     let ping = AppSpec::new("ping", make).handles::<Back>().requires(["echo"]);

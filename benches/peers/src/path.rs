@@ -2,13 +2,10 @@
 
 use std::process::Stdio;
 
-use sinew_figures::{Beside, End, Figures, Pinning};
+use sinew_figures::{Beside, End, Figures, Pace, Pinning, Rounds, process::command, stream};
 
 use crate::{
-    flood, iceoryx2, nodes,
-    processes::command,
-    raw,
-    rounds::{Pace, Rounds, Times},
+    flood, iceoryx2, nodes, raw,
     shared_memory::{self, Way},
     zenoh,
 };
@@ -64,7 +61,7 @@ impl Path {
         all.find(|path| path.name() == name).expect("a name that this program wrote itself")
     }
 
-    fn measure(self, rounds: Rounds, pinning: Pinning) -> Times {
+    fn measure(self, rounds: Rounds, pinning: Pinning) -> Figures {
         match self {
             Self::BareFutex | Self::BarePoll => raw::ring(self, rounds, pinning),
             Self::UnixStream => raw::unix(rounds, pinning),
@@ -80,7 +77,7 @@ impl Path {
     fn echo(self, bytes: usize, at: &str) {
         match self {
             Self::BareFutex | Self::BarePoll => raw::echo_ring(self, bytes),
-            Self::UnixStream | Self::Tcp => raw::echo_stream(bytes),
+            Self::UnixStream | Self::Tcp => stream::echo(bytes),
             Self::Iceoryx2Event | Self::Iceoryx2Poll => iceoryx2::echo(self, bytes, at),
             Self::Endpoints(way) => shared_memory::echo(way, at),
             Self::Zenoh => zenoh::echo(at),
@@ -144,7 +141,8 @@ impl Case {
         let (name, pace, pinning) = (path.name(), self.pace.name(), self.pinning.name());
         let role = format!("measure {name} {} {pace} {pinning} {is_short}", self.bytes);
         let output = command(&role).stdin(Stdio::null()).stderr(Stdio::piped()).output().ok()?;
-        let figures = Times::taken(&output.stdout).filter(|_| output.status.success());
+        let figures =
+            str::from_utf8(&output.stdout).ok().and_then(Figures::taken).filter(|_| output.status.success());
         if figures.is_none() {
             eprintln!("{name} failed: {}", String::from_utf8_lossy(&output.stderr));
         }
@@ -171,9 +169,7 @@ pub(crate) fn play(role: &str) {
     let words: Vec<&str> = role.split(' ').collect();
     match words[..] {
         ["measure", path, bytes, pace, pinning, is_short] => {
-            let pace = Pace::ALL.into_iter().find(|known| known.name() == pace);
-            let pace = pace.expect("a name that this program wrote itself");
-            let rounds = Rounds::of(number(bytes), pace, is_short == "true");
+            let rounds = Rounds::of(number(bytes), Pace::named(pace), is_short == "true");
             let pinning = Pinning::named(pinning);
             pinning.pin(End::Measuring);
             Path::named(path).measure(rounds, pinning).hand_over();

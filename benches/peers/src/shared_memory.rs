@@ -3,14 +3,16 @@
 use std::path::PathBuf;
 
 use sinew::{AsyncEndpoint, Endpoint, LentMessage, NodeApi, Registration, Spin, Tid, prelude::*};
-use sinew_figures::Pinning;
+use sinew_figures::{
+    Figures, Pinning, Rounds,
+    process::{Process, await_end, say_there},
+};
 use sinew_runtime::wire::Kind;
 use tokio::runtime::{Builder, Runtime};
 
 use crate::{
+    DEADLINE,
     path::{Path, echo_role},
-    processes::{Process, await_end, say_there},
-    rounds::{DEADLINE, Rounds, Times},
 };
 
 /// How long who looks before he sleeps does so: longer than any round trip.
@@ -97,7 +99,7 @@ pub(crate) fn node(socket: &str) {
 }
 
 /// Round trips between two endpoints.
-pub(crate) fn measure(way: Way, rounds: Rounds, pinning: Pinning) -> Times {
+pub(crate) fn measure(way: Way, rounds: Rounds, pinning: Pinning) -> Figures {
     let home = Home::start(pinning);
     let _echo = Process::start(&echo_role(Path::Endpoints(way), rounds.bytes, pinning, home.socket()));
     let mut buffer = vec![7; rounds.bytes];

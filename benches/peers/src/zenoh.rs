@@ -7,7 +7,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew_figures::Pinning;
+use sinew_figures::{
+    Figures, Pinning, Rounds,
+    process::{Process, await_end, say_there},
+};
 use zenoh::{
     Config, Session, Wait,
     pubsub::{Publisher, Subscriber},
@@ -16,9 +19,8 @@ use zenoh::{
 };
 
 use crate::{
+    DEADLINE,
     path::{Path, echo_role},
-    processes::{Process, await_end, say_there},
-    rounds::{DEADLINE, Rounds, Times},
 };
 
 const THERE: &str = "sinew/peers/there";
@@ -81,7 +83,7 @@ pub(crate) fn meet(publisher: &Publisher<'_>, answers: &Receiver<Sample>, payloa
 }
 
 /// Round trips.
-pub(crate) fn measure(rounds: Rounds, pinning: Pinning) -> Times {
+pub(crate) fn measure(rounds: Rounds, pinning: Pinning) -> Figures {
     let at = free_address();
     let _echo = Process::start(&echo_role(Path::Zenoh, rounds.bytes, pinning, &at));
     let session = session(false, &at);

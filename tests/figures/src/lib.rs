@@ -1,17 +1,24 @@
 //! Times of many runs, and the lines in which Sinew's benches say them: [`Beside`] where a reference of the same run stands
 //! next to the case, [`Alone`] where none does. JSON lines are on the standard output, all else is on the standard error.
+//!
+//! And what benches share besides: the processes that they start ([`process`]), how many round trips at which pace
+//! ([`Rounds`]), and the streams of the system beside which they measure ([`stream`]).
 
 mod alone;
 mod beside;
 mod pinning;
+pub mod process;
+mod rounds;
+pub mod stream;
 
 pub use alone::{Alone, head};
 pub use beside::Beside;
 pub use pinning::{End, Pinning};
+pub use rounds::{Pace, Rounds};
 
 use std::time::Duration;
 
-use hdrhistogram::Histogram;
+use hdrhistogram::{Histogram, iterators::IterationValue};
 
 /// The times of one run: 1 ns to 60 s, with three digits.
 #[derive(Debug)]
@@ -30,6 +37,33 @@ impl Figures {
     /// Counts one time; one that is longer than 60 s counts as 60 s.
     pub fn record(&mut self, time: Duration) {
         self.0.saturating_record(u64::try_from(time.as_nanos()).unwrap_or(u64::MAX).max(1));
+    }
+
+    /// Counts all those of another.
+    ///
+    /// # Panics
+    /// Never: all have the same bounds.
+    pub fn add(&mut self, other: &Self) {
+        self.0.add(&other.0).expect("all have the same bounds");
+    }
+
+    /// Prints them for the process that asked for them: how many times of how many nanoseconds, a line each.
+    pub fn hand_over(&self) {
+        let line =
+            |step: IterationValue<u64>| format!("{} {}\n", step.count_at_value(), step.value_iterated_to());
+        let lines: String = self.0.iter_recorded().map(line).collect();
+        print!("{lines}");
+    }
+
+    /// What [`hand_over`](Self::hand_over) has printed; `None` if these are no such lines.
+    #[must_use]
+    pub fn taken(printed: &str) -> Option<Self> {
+        let mut figures = Self::new();
+        for line in printed.lines() {
+            let (count, nanos) = line.split_once(' ')?;
+            figures.0.saturating_record_n(nanos.parse().ok()?, count.parse().ok()?);
+        }
+        (figures.rounds() > 0).then_some(figures)
     }
 
     /// How many times were counted.
