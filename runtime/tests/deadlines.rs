@@ -17,7 +17,7 @@ use std::{
 
 use actix::{Actor, Handler, Running};
 use rustix::{
-    process::{Pid, Signal, kill_process},
+    process::{Pid, Signal, WaitId, WaitIdOptions, kill_process, waitid},
     time::{ClockId, clock_gettime},
 };
 use sinew_runtime::{
@@ -213,6 +213,8 @@ fn a_start_has_its_time_though_its_whole_process_stood_still() {
     }
     let pid = Pid::from_child(&frozen);
     kill_process(pid, Signal::STOP).unwrap();
+    // Each of its threads stops when it comes to it, and only then it stands still.
+    waitid(WaitId::Pid(pid), WaitIdOptions::STOPPED | WaitIdOptions::NOWAIT).unwrap().expect("it stops");
     std::thread::sleep(Duration::from_secs(2)); // what this test is about
     kill_process(pid, Signal::CONT).unwrap();
     said.read_to_string(&mut line).unwrap();

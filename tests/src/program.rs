@@ -137,6 +137,15 @@ impl Program {
         kill_process(id, signal).unwrap_or_else(|error| panic!("{} takes no {signal:?}: {error}", self.name));
     }
 
+    /// Stops it, and returns when it stands still.
+    ///
+    /// # Panics
+    /// If it is no process any more.
+    pub fn freeze(&self) {
+        self.signal(Signal::STOP);
+        wait_until_frozen(self.child.id());
+    }
+
     /// Waits for its end; returns its exit code, `None` if a signal ended it.
     ///
     /// # Panics

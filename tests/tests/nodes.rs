@@ -81,7 +81,7 @@ fn a_frozen_node_is_lost_and_found_again_when_it_thaws() {
     let mut knee = scenario.start("knee", 2, &[]);
     hip.wait_for(&["NodeFound", "knee"]);
     knee.wait_for(&["NodeFound", "hip"]);
-    knee.signal(Signal::STOP);
+    knee.freeze();
     hip.wait_for(&["NodeLost", "knee", "Silent"]);
     knee.signal(Signal::CONT);
     hip.wait_for(&["NodeFound", "knee"]);

@@ -240,7 +240,7 @@ fn a_send_in_c_waits_for_room_as_long_as_it_says_and_loses_nothing() {
         let ground = Ground::new();
         let mut room = ground.start(&C.shared("tests/programs/room.c", &ground), &[way]);
         room.wait_for(&["stop it"]);
-        ground.node.signal(Signal::STOP);
+        ground.node.freeze();
         room.tell("go");
         room.wait_for(&["let it go on"]);
         ground.node.signal(Signal::CONT);

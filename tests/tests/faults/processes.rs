@@ -9,7 +9,7 @@ use sinew_tests::{
     orders::{Count, Me, Who},
     program,
     puppet::{Seen, Stage, desk},
-    until, wait_until_frozen,
+    until,
 };
 
 /// Processes of one scenario, and the network that a node of this process may share with them.
@@ -102,8 +102,7 @@ fn a_process_killed_under_confirmed_traffic_leaves_no_message_without_an_outcome
     let payload = || sinew_tests::puppet::Order { number: 1 };
     until("it is reached", || sender.send(tid, &payload()).ok());
     // Frozen: what is sent now cannot be answered any more.
-    knee.signal(Signal::STOP);
-    wait_until_frozen(knee.id());
+    knee.freeze();
     let sent: Vec<_> =
         (0..100).filter_map(|_| sender.send_confirmed(tid, &payload(), DEADLINE).ok()).collect();
     assert!(!sent.is_empty());
@@ -128,7 +127,7 @@ fn a_process_that_freezes_for_a_moment_is_not_lost_and_gets_every_message_in_ord
     let mut knee = scenario.start("knee", 101, &[]);
     let mut hip = scenario.start("hip", 102, &["--requires", "knee", "--sends-to", "knee"]);
     knee.wait_for(&["count 1 from"]);
-    knee.signal(Signal::STOP);
+    knee.freeze();
     // Until a query was missed, but fewer than make a loss: the hip goes on sending all the while.
     hip.wait_for(&["started"]);
     std::thread::sleep(Duration::from_millis(300)); // the length of the freeze, not a wait for anything

@@ -4,7 +4,7 @@ use std::{fs, time::Duration};
 
 use rustix::process::Signal;
 use sinew::Outcome;
-use sinew_tests::{OwnDirectory, orders::Order, process_under_test};
+use sinew_tests::{OwnDirectory, orders::Order, process_under_test, wait_until_frozen};
 
 use crate::fence::parent_of;
 use crate::scenario::{Scenario, Watched, configuration, signal};
@@ -87,7 +87,7 @@ fn a_node_that_was_stopped_does_not_accuse_its_processes_when_it_wakes() {
     let mut scenario = Scenario::start(&[]);
     let pid = scenario.who().pid;
     for _ in 0..3 {
-        scenario.node.signal(Signal::STOP);
+        scenario.node.freeze();
         // Longer than the progress budget of the application.
         std::thread::sleep(Duration::from_millis(1_500));
         scenario.node.signal(Signal::CONT);
@@ -114,6 +114,7 @@ fn a_stopped_process_dies_with_its_node_too() {
     let pid = scenario.who().pid;
     let process = Watched::new(pid);
     signal(pid, Signal::STOP);
+    wait_until_frozen(pid);
     scenario.node.signal(Signal::KILL);
     process.wait_for_end();
 }

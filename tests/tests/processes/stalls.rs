@@ -7,7 +7,7 @@ use sinew::{NodeApi, Registration};
 use sinew_tests::{
     DEADLINE, OwnDirectory, Program,
     orders::{Me, Who},
-    process_under_test,
+    process_under_test, wait_until_frozen,
 };
 
 use crate::scenario::{Scenario, Watched, configuration, signal};
@@ -18,7 +18,8 @@ const STALL: Duration = Duration::from_millis(2_500);
 /// Nothing of the node and of its process runs for a while, or nothing of the node.
 fn stall(node: &Program, process: Option<u32>) {
     process.into_iter().for_each(|id| signal(id, Signal::STOP));
-    node.signal(Signal::STOP);
+    node.freeze();
+    process.into_iter().for_each(wait_until_frozen);
     std::thread::sleep(STALL);
     node.signal(Signal::CONT);
     process.into_iter().for_each(|id| signal(id, Signal::CONT));
