@@ -4,6 +4,7 @@ mod end;
 mod life;
 mod notices;
 mod orders;
+mod outcomes;
 
 use std::{ops::ControlFlow, rc::Rc, sync::Arc, time::Duration};
 
@@ -24,6 +25,7 @@ pub(super) use self::notices::Notices;
 use self::{
     end::{End, LAST_WORDS},
     life::Life,
+    outcomes::Outcomes,
 };
 use super::{
     core::{Address, ClientId, Owner, Request},
@@ -138,6 +140,7 @@ struct Client {
     server: Rc<Server>,
     peer: Peer,
     outlet: Arc<ClientOutlet>,
+    outcomes: Arc<Outcomes>,
     notices: Rc<Notices>,
     /// Set while messages flow.
     link: Option<LinkNumber>,
@@ -165,6 +168,7 @@ impl Client {
         let tid = Tid::new(server.stores.node, app);
         let name = lock(&server.stores.registry).name_of(app);
         let outlet = Arc::new(StreamOutlet::sharing(limits(&server.stores), server.budget_of(peer.pid)));
+        let outcomes = Outcomes::new(outlet.clone(), server.stores.config.mailbox_capacity);
         let notices = Rc::new(Notices::new(tid, outlet.clone()));
         server.add_client(peer.id, outlet.clone(), notices.clone());
         crate::log::info!(%tid, name, pid = peer.pid, "an application of another process has registered");
@@ -176,6 +180,7 @@ impl Client {
             server,
             peer,
             outlet,
+            outcomes,
             notices,
             link,
             tid,
@@ -325,6 +330,7 @@ impl Client {
             if let ControlFlow::Break(end) = self.obey(session.handle(message)) {
                 return end;
             }
+            self.outcomes.may_come().await;
         }
     }
 

@@ -20,6 +20,7 @@
 //! | LNCL-13 | Connections that have not said who they are have bounds of their own, for all and for one process. |
 //! | LNCL-14 | What nobody has taken of a client's unconfirmed messages the client is told, with its number and once: the first at once, later ones together. |
 //! | LNCL-15 | A connection ends with the process that connected, also while a child that it forked holds the socket open. |
+//! | LNCL-16 | Each confirmed message of a client's has an outcome, also where its queue is full. Who takes none is not read. |
 
 mod actor;
 mod client;

@@ -268,6 +268,14 @@ impl RawClient {
         let _ = self.socket.write_all(bytes);
     }
 
+    /// Sends if the node goes on taking what is sent. If not, part of it may be sent: this is the last thing that is.
+    pub(crate) fn takes_at_once(&mut self, message: &Message) -> bool {
+        let mut bytes = BytesMut::new();
+        encode_frame(&message.header, &message.payload, &mut bytes);
+        self.socket.set_write_timeout(Some(Duration::from_millis(500))).unwrap();
+        self.socket.write_all(&bytes).is_ok()
+    }
+
     /// The next frame; `None` when the node has closed.
     pub(crate) fn next(&mut self) -> Option<Message> {
         loop {

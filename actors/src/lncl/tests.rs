@@ -1,6 +1,7 @@
 //! A real door, with clients spoken by hand: what a client in another language meets.
 
 mod forks;
+mod owed;
 
 use std::{sync::Arc, time::Duration};
 

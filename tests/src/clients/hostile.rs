@@ -82,14 +82,15 @@ struct Newcomers {
 }
 
 impl Report {
-    /// The most that the node may hold for all clients: full queues, a frame that is being read, the reading itself.
+    /// The most that the node may hold for all clients: full queues, outcomes that are owed, a frame that is being read, the reading itself.
     #[must_use]
     pub const fn bound_kib() -> u64 {
         let StageLimits { mailbox_capacity, payload_max, clients_max } = LIMITS;
         let queues = 3 * mailbox_capacity * (payload_max + 512);
+        let owed = 10 * mailbox_capacity * 512;
         let reading = 2 * (payload_max + 16 * 1024);
         // The node's own application is like one client more.
-        ((clients_max + 1) * (queues + reading) / 1024) as u64
+        ((clients_max + 1) * (queues + owed + reading) / 1024) as u64
     }
 
     /// The node lived within its bound, served the others, counted every refusal that it told, and gave all back.

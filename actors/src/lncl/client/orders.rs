@@ -1,10 +1,9 @@
 //! What a client's connection does with the orders of its session.
 
-use std::{ops::ControlFlow, sync::Arc};
+use std::ops::ControlFlow;
 
 use sinew_runtime::{
-    outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
-    router::Outlet,
+    outcome::{Outcome, Rejection, Ticket},
     tid::Tid,
     time::Time,
     wire::{Flags, Header, Kind, Message},
@@ -17,7 +16,7 @@ use super::{
         registrar,
         session::Order,
     },
-    Client, ClientOutlet,
+    Client,
     end::End,
 };
 use crate::stores::lock;
@@ -57,7 +56,8 @@ impl Client {
         if is_confirmed {
             let correlation = message.header.correlation;
             let ticket = Ticket { source: self.tid, destination, correlation };
-            message.receipt = Some(Receipt::new(Arc::new(OutcomeSink(self.outlet.clone())), ticket));
+            let Some(receipt) = self.outcomes.receipt(ticket) else { return };
+            message.receipt = Some(receipt);
         }
         if let Err(why) = router.send(message)
             && !is_confirmed
@@ -83,7 +83,7 @@ impl Client {
         let lncl = payload::lncl_of(self.tid.node);
         let mut answer = payload::frame(Kind::LNCL_RESOLVED, lncl, self.tid, &Resolved { tid });
         answer.header.correlation = correlation;
-        self.say(answer);
+        self.outcomes.answer(answer);
     }
 
     fn introduce(&self, to: Tid, correlation: u64) {
@@ -100,7 +100,7 @@ impl Client {
     fn switch(&self, to: Tid, number: u64, correlation: u64) {
         let to = self.server.stores.router.absolute(to);
         let ticket = Ticket { source: self.tid, destination: to, correlation };
-        let receipt = Receipt::new(Arc::new(OutcomeSink(self.outlet.clone())), ticket);
+        let Some(receipt) = self.outcomes.receipt(ticket) else { return };
         if let Err((receipt, why)) = self.server.introductions.pass_marks(self.tid, to, number, receipt) {
             receipt.settle(Outcome::Rejected(why));
         }
@@ -121,16 +121,6 @@ impl Client {
 
     fn tell(&self, about: Tid, correlation: u64, outcome: Outcome) {
         let ticket = Ticket { source: self.tid, destination: about, correlation };
-        self.say(Message::outcome(ticket, outcome));
-    }
-}
-
-/// Carries outcomes of a client's messages back to it. Any thread settles them, and writes to the socket itself.
-struct OutcomeSink(Arc<ClientOutlet>);
-
-impl ReceiptSink for OutcomeSink {
-    fn settle(&self, ticket: Ticket, outcome: Outcome) {
-        // Not taken: the client is gone, or does not read; its own deadline says `Unknown`.
-        let _ = self.0.submit(Message::outcome(ticket, outcome));
+        self.outcomes.tell(ticket, outcome);
     }
 }
