@@ -29,7 +29,7 @@ use std::{
     future::poll_fn,
     io::{self, IoSlice},
     sync::{Arc, Mutex, MutexGuard, PoisonError},
-    task::{Context, Poll},
+    task::{Context, Poll, Waker},
 };
 
 use sinew_runtime::{
@@ -351,10 +351,10 @@ impl<S: Socket> Outlet for StreamOutlet<S> {
         Ok(())
     }
 
-    fn offer(&self, message: Message) -> Result<(), Refused> {
+    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
         let result = self.submit(message);
-        if result.as_ref().is_err_and(|refused| refused.why == Rejection::QueueFull) {
-            self.lock().is_offered_again();
+        if let Err(Refused { message, why: Rejection::QueueFull }) = &result {
+            self.with(|half, after| half.is_offered_again(message, room, after));
         }
         result
     }

@@ -189,8 +189,8 @@ impl<O: Outlet> Outlet for AppOutlet<O> {
         }
     }
 
-    fn offer(&self, message: Message) -> Result<(), Refused> {
-        if is_answer(&message.header) { self.submit(message) } else { self.inbox.offer(message) }
+    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
+        if is_answer(&message.header) { self.submit(message) } else { self.inbox.offer(message, room) }
     }
 }
 

@@ -6,6 +6,7 @@ use std::{
         Arc, Mutex,
         atomic::{AtomicU64, Ordering},
     },
+    task::Waker,
 };
 
 use arc_swap::ArcSwap;
@@ -25,11 +26,14 @@ pub trait Outlet: Send + Sync {
     /// The message, untouched, and why it was not taken.
     fn submit(&self, message: Message) -> Result<(), Refused>;
 
-    /// As [`submit`](Self::submit), by one who keeps what finds a full queue and offers it again: that is not counted as refused.
+    /// As [`submit`](Self::submit), by one who keeps what finds a full queue and offers it again: that is not counted as refused. `room`
+    /// is woken, once, when a queue that was full has room again; of several who wait for that, only the last one. An outlet that cannot
+    /// tell wakes nobody.
     ///
     /// # Errors
     /// As `submit`.
-    fn offer(&self, message: Message) -> Result<(), Refused> {
+    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
+        let _ = room;
         self.submit(message)
     }
 }
@@ -153,14 +157,15 @@ impl Router {
     }
 
     /// Offers a message that came from another node to the one application of this node that it is for. One who is refused because of a
-    /// full queue may offer it again; any other refusal is to be [told](Self::refuse).
+    /// full queue may offer it again, and is woken for that by `room` as [`Outlet::offer`] says; any other refusal is to be
+    /// [told](Self::refuse).
     ///
     /// # Errors
     /// The message, and why it was not taken.
-    pub fn offer(&self, message: Message) -> Result<(), Refused> {
+    pub fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
         let table = self.table.load();
         match table.local.get(&message.header.destination.app) {
-            Some(route) => route.outlet.offer(message),
+            Some(route) => route.outlet.offer(message, room),
             None => Err(Refused::new(message, Rejection::NoSuchApplication)),
         }
     }

@@ -81,7 +81,7 @@ impl Inbound {
     }
 
     fn offer(&self, way: &Way, line: u64, message: Message) {
-        match self.stores.router.offer(message) {
+        match self.stores.router.offer(message, None) {
             Ok(()) => {}
             Err(Refused { message, why: Rejection::QueueFull }) => self.put_in_line(way, line, message),
             Err(refused) => self.stores.router.refuse(refused),
@@ -90,7 +90,9 @@ impl Inbound {
 
     fn put_in_line(&self, way: &Way, line: u64, message: Message) {
         match way.put_in_line(line, message) {
-            Ok(()) => self.stores.gncl.held_up.notify_one(),
+            // Only whoever is held already says when it takes more.
+            Ok(true) => self.stores.gncl.held_up.notify_one(),
+            Ok(false) => {}
             Err(message) => self.stores.router.refuse(Refused::new(message, Rejection::QueueFull)),
         }
     }

@@ -4,6 +4,7 @@ use std::{
     collections::BTreeMap,
     net::Shutdown,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
+    task::{Wake, Waker},
     time::Duration,
 };
 
@@ -20,7 +21,7 @@ use tokio::sync::Notify;
 
 use super::{
     core::{Attach, Lane},
-    way::{Ends, Way},
+    way::{Ends, Offered, Way},
 };
 use crate::{
     outlet::OutletCounts,
@@ -28,8 +29,9 @@ use crate::{
     stores::{Stores, lock},
 };
 
-/// How often what waits for an application that is full is offered to it. A mailbox that is full has work for longer.
-const OFFER_PERIOD: Duration = Duration::from_millis(1);
+/// How often what waits for an application that is full is offered to it, if it does not say itself that it takes more; so late at most
+/// its sender is told that something has expired there.
+const OFFER_PERIOD: Duration = Duration::from_millis(50);
 /// Peers at most that are gone and have left messages for applications that take nothing.
 const GONE_MAX: usize = 16;
 
@@ -115,14 +117,23 @@ pub(super) fn frame(here: NodeAddress, node: NodeAddress, kind: Kind, payload: B
     Message::new(header, payload)
 }
 
+/// Woken when an application takes more, for which messages wait.
+struct Room(Arc<Notify>);
+
+impl Wake for Room {
+    fn wake(self: Arc<Self>) {
+        self.0.notify_one();
+    }
+}
+
 /// What of GNCL outlives a restart of it.
 #[derive(Default)]
 pub(crate) struct Store {
     peers: Mutex<BTreeMap<NodeAddress, Arc<Peer>>>,
     /// Peers that are gone, as long as messages of theirs wait for applications here.
     gone: Mutex<Vec<Arc<Peer>>>,
-    /// Told when a message has to wait for an application here.
-    pub(super) held_up: Notify,
+    /// Told when messages begin to wait for an application here, and when one for which they wait takes more.
+    pub(super) held_up: Arc<Notify>,
     /// The socket that listens. It stays open while this layer is restarted: a peer that is refused would say that this
     /// node is lost.
     pub(super) listener: Mutex<Option<std::net::TcpListener>>,
@@ -175,22 +186,26 @@ impl Store {
         }
     }
 
-    /// Offers what waits for applications here to them again, and goes on as long as some does.
+    /// Offers what waits for applications here to them, whenever one of them takes more.
     pub(super) async fn serve_those_held_up(stores: Arc<Stores>) {
         let store = &stores.gncl;
+        let room = Waker::from(Arc::new(Room(store.held_up.clone())));
         let all = || store.peers().into_iter().chain(lock(&store.gone).clone()).collect::<Vec<_>>();
         all().iter().flat_map(|peer| &peer.ways).for_each(Way::forget_offers);
         loop {
             let ways = all();
             let now = Time::now();
-            let offer = |way: &&Way| way.offer_again(now, &stores.router);
-            let waits = ways.iter().flat_map(|peer| &peer.ways).filter(offer).count() > 0;
+            let offer = |way: &Way| way.offer_again(now, &stores.router, &room);
+            let offered = ways.iter().flat_map(|peer| &peer.ways).map(offer).max();
             lock(&store.gone).retain(|peer| peer.ways.iter().any(Way::is_held_up));
-            if waits {
-                tokio::time::sleep(OFFER_PERIOD).await;
-            } else {
-                store.held_up.notified().await;
+            match offered.unwrap_or(Offered::All) {
+                Offered::All => store.held_up.notified().await,
+                // Whether somebody was told or the time is over: it is tried again.
+                Offered::Full => drop(tokio::time::timeout(OFFER_PERIOD, store.held_up.notified()).await),
+                Offered::Turn => {}
             }
+            // Whoever is told again and again takes no other task's turn.
+            tokio::task::yield_now().await;
         }
     }
 

@@ -1,6 +1,9 @@
 //! One session with a peer: what is sent to it on the connections of a lane, and what was taken of its messages there.
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::{
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    task::Waker,
+};
 
 use bytes::Bytes;
 use sinew_runtime::{
@@ -49,6 +52,17 @@ pub(super) enum Taken {
     Yes,
     /// Its destination takes nothing now: it belongs behind what waits there. spec: CREDIT-1
     InLine(u64),
+}
+
+/// How far what waits for applications here came; of several the last one counts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Offered {
+    /// All was taken.
+    All,
+    /// Whoever did not take all says when it takes more.
+    Full,
+    /// Others have their turn; then it goes on.
+    Turn,
 }
 
 /// What was taken of a peer's messages, and those that wait for applications here.
@@ -167,11 +181,12 @@ impl Way {
         self.say(frame(self.ends.here, self.ends.node, Kind::GNCL_ACK, write(&ack)));
     }
 
-    /// Puts a message behind what waits for its destination; if that is held from now on, the peer is told so at once.
+    /// Puts a message behind what waits for its destination; if that is held from now on, the peer is told so at once. Returns whether
+    /// it is.
     ///
     /// # Errors
     /// The message: there is no room.
-    pub(super) fn put_in_line(&self, key: u64, message: Message) -> Result<(), Message> {
+    pub(super) fn put_in_line(&self, key: u64, message: Message) -> Result<bool, Message> {
         let bytes = message.size();
         let is_news = {
             let shelf = &mut self.inbox().shelf;
@@ -183,41 +198,41 @@ impl Way {
             // spec: CREDIT-2
             self.acknowledge();
         }
-        Ok(())
+        Ok(is_news)
     }
 
-    /// Offers what waits for applications here to them again. Returns whether some still waits.
-    pub(super) fn offer_again(&self, now: Time, router: &Router) -> bool {
+    /// Offers what waits for applications here to them again; `room` is woken when one of them takes more. Returns how far that came.
+    pub(super) fn offer_again(&self, now: Time, router: &Router, room: &Waker) -> Offered {
         let held = self.inbox().shelf.held();
-        let released = held.iter().filter(|key| self.offer_line(now, **key, router)).count();
-        if released > 0 {
+        let lines: Vec<_> = held.into_iter().map(|key| self.offer_line(now, key, router, room)).collect();
+        if lines.contains(&Offered::All) {
             self.acknowledge();
         }
-        released < held.len()
+        lines.into_iter().max().unwrap_or(Offered::All)
     }
 
-    /// Offers what waits in one line until its destination takes no more. Returns whether it is held no more.
-    fn offer_line(&self, now: Time, key: u64, router: &Router) -> bool {
+    /// Offers what waits in one line until its destination takes no more.
+    fn offer_line(&self, now: Time, key: u64, router: &Router, room: &Waker) -> Offered {
         for _ in 0..OFFERS_PER_TURN {
-            let Some((mut message, bytes)) = self.inbox().shelf.offer(key) else { return false };
+            let Some((mut message, bytes)) = self.inbox().shelf.offer(key) else { return Offered::Full };
             // Nobody is told anything with the lock in hand.
             if message.header.is_expired(now) {
                 message.settle(Outcome::Expired);
             } else {
-                match router.offer(message) {
+                match router.offer(message, Some(room)) {
                     Ok(()) => {}
                     Err(Refused { message, why: Rejection::QueueFull }) => {
                         self.inbox().shelf.put_back(key, message, bytes);
-                        return false;
+                        return Offered::Full;
                     }
                     Err(refused) => router.refuse(refused),
                 }
             }
             if self.inbox().shelf.taken(key) {
-                return true;
+                return Offered::All;
             }
         }
-        false
+        Offered::Turn
     }
 
     /// Whether messages wait for applications here.

@@ -27,6 +27,8 @@ const UNCONFIRMED_DESTINATIONS: usize = 8;
 pub(super) struct After {
     pub(super) settle: Vec<(Receipt, Outcome)>,
     pub(super) wake: Option<Waker>,
+    /// Whoever waited for room.
+    pub(super) room: Option<Waker>,
 }
 
 impl After {
@@ -34,9 +36,7 @@ impl After {
         for (receipt, outcome) in self.settle {
             receipt.settle(outcome);
         }
-        if let Some(waker) = self.wake {
-            waker.wake();
-        }
+        self.wake.into_iter().chain(self.room).for_each(Waker::wake);
     }
 }
 
@@ -86,6 +86,8 @@ pub(super) struct Half<S> {
     pub(super) next_expiry: Time,
     /// Receipts of messages that were sent.
     pub(super) sent_receipts: Outstanding,
+    /// Who waits until fewer of them are open.
+    outcomes_awaited: Option<Waker>,
     pub(super) drainer: Option<Waker>,
     pace: Pace,
     pub(super) counts: OutletCounts,
@@ -108,6 +110,7 @@ impl<S: Socket> Half<S> {
             waiting_receipts: 0,
             next_expiry: Time::MAX,
             sent_receipts: Outstanding::default(),
+            outcomes_awaited: None,
             drainer: None,
             pace: Pace::new(),
             counts: OutletCounts::default(),
@@ -202,6 +205,7 @@ impl<S: Socket> Half<S> {
         self.unknown(after);
         self.forget_kept();
         self.link = Link::Closed(why);
+        after.room = self.queue.awaited_no_more();
         let waiting = self.take_waiting();
         for message in waiting {
             self.counts.lost += 1;
@@ -372,8 +376,13 @@ impl<S: Socket> Half<S> {
     }
 
     /// What found no room is not refused: its sender keeps it.
-    pub(super) const fn is_offered_again(&mut self) {
+    pub(super) fn is_offered_again(&mut self, message: &Message, room: Option<&Waker>, after: &mut After) {
         self.counts.refused -= 1;
+        if message.receipt.is_some() && self.has_too_many_unconfirmed(message.header.destination) {
+            self.outcomes_awaited = room.cloned();
+        } else {
+            after.room = room.and_then(|room| self.queue.offered(message, room));
+        }
     }
 
     /// Whether messages come so fast that they had better be written many at once.
@@ -437,6 +446,9 @@ impl<S: Socket> Half<S> {
     pub(super) fn confirm(&mut self, ticket: Ticket, outcome: Outcome, after: &mut After) -> bool {
         let Some(receipt) = self.sent_receipts.take(ticket) else { return false };
         after.settle.push((receipt, outcome));
+        if self.unconfirmed() <= self.limits.unconfirmed_max / 2 {
+            after.room = self.outcomes_awaited.take();
+        }
         true
     }
 

@@ -23,6 +23,7 @@ use super::*;
 mod accounts;
 mod floods;
 mod holding;
+mod room;
 
 /// A wire that takes `room` more bytes and keeps them.
 #[derive(Default)]

@@ -9,6 +9,7 @@ use std::{
         Arc, Mutex, OnceLock,
         atomic::{AtomicU64, Ordering},
     },
+    task::Waker,
 };
 
 use sinew_runtime::{
@@ -290,8 +291,8 @@ impl Outlet for Link {
         self.take(message, |mailbox, message| mailbox.submit(message))
     }
 
-    fn offer(&self, message: Message) -> Result<(), Refused> {
-        self.take(message, |mailbox, message| mailbox.offer(message))
+    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
+        self.take(message, |mailbox, message| mailbox.offer(message, room))
     }
 }
 

@@ -33,6 +33,12 @@ impl Budget {
         self.held.load(Ordering::Relaxed)
     }
 
+    /// Whether there is room for so many bytes more.
+    pub(super) fn has_room_for(&self, bytes: usize) -> bool {
+        let has_room = self.held().checked_add(bytes).is_some_and(|sum| sum <= self.max);
+        has_room && self.whole.as_ref().is_none_or(|whole| whole.has_room_for(bytes))
+    }
+
     /// Holds so many bytes more, if there is room for them.
     pub(super) fn take(&self, bytes: usize) -> bool {
         let with = |held: usize| held.checked_add(bytes).filter(|sum| *sum <= self.max);

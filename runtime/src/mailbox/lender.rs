@@ -32,7 +32,11 @@ impl Lender {
     #[must_use]
     pub fn take(&self) -> Option<Message> {
         let mut shared = lock(&self.mailbox.shared);
-        if shared.epoch == self.epoch { shared.next() } else { None }
+        let (next, room) =
+            if shared.epoch == self.epoch { (shared.next(), shared.queue.room_made()) } else { (None, None) };
+        drop(shared);
+        room.into_iter().for_each(Waker::wake);
+        next
     }
 
     /// The next of the layers' events, if one waits.

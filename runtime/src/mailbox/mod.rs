@@ -8,6 +8,7 @@ mod budget;
 mod lender;
 mod queue;
 mod reader;
+mod room;
 mod source;
 mod tally;
 
@@ -204,31 +205,30 @@ impl Mailbox {
 
     /// Refuses everything that waits and everything that comes.
     pub fn close(&self) {
-        let (waiting, waker) = {
+        let (waiting, wakers) = {
             let mut shared = lock(&self.shared);
             shared.closed = true;
             let mut waiting = shared.take_events();
             waiting.extend(shared.empty());
-            (waiting, shared.waker.take())
+            (waiting, [shared.waker.take(), shared.queue.awaited_no_more()])
         };
         for message in waiting {
             message.reject(Rejection::Closed);
         }
-        if let Some(waker) = waker {
-            waker.wake();
-        }
+        wakers.into_iter().flatten().for_each(Waker::wake);
     }
 
     /// The application is away: refuses everything that waits and everything that comes, until it [is back](Self::is_back).
     pub fn refuse_while_away(&self) {
-        let waiting = {
+        let (waiting, waker) = {
             let mut shared = lock(&self.shared);
             shared.refuses = true;
-            shared.empty()
+            (shared.empty(), shared.queue.awaited_no_more())
         };
         for message in waiting {
             message.reject(Rejection::Away);
         }
+        waker.into_iter().for_each(Waker::wake);
     }
 
     /// Drops the layers' events that wait: the life that they were for has ended.
@@ -317,12 +317,16 @@ impl Outlet for Mailbox {
         taken.map(|waker| waker.into_iter().for_each(Waker::wake))
     }
 
-    fn offer(&self, message: Message) -> Result<(), Refused> {
-        let class = message.header.class as usize;
+    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
         let result = self.submit(message);
-        if result.as_ref().is_err_and(|refused| refused.why == Rejection::QueueFull) {
-            // It is offered again.
-            lock(&self.shared).tallies[class].refused -= 1;
+        if let Err(Refused { message, why: Rejection::QueueFull }) = &result {
+            let waker = {
+                let mut shared = lock(&self.shared);
+                // It is offered again.
+                shared.tallies[message.header.class as usize].refused -= 1;
+                room.and_then(|room| shared.queue.offered(message, room))
+            };
+            waker.into_iter().for_each(Waker::wake);
         }
         result
     }

@@ -1,8 +1,8 @@
 //! The pure queue behind mailboxes and connections: one lane a class, each with its own bound.
 
-use std::{collections::VecDeque, sync::Arc};
+use std::{collections::VecDeque, sync::Arc, task::Waker};
 
-use super::Budget;
+use super::{Budget, room::Awaited};
 use crate::{
     outcome::Rejection,
     router::Refused,
@@ -54,6 +54,8 @@ pub struct ClassQueue {
     budget: Option<Arc<Budget>>,
     /// Nothing that waits expires before this.
     earliest_expiry: Time,
+    /// Who waits for room.
+    awaited: Option<Awaited>,
 }
 
 impl ClassQueue {
@@ -67,6 +69,7 @@ impl ClassQueue {
             bounds: bounds.into(),
             budget: None,
             earliest_expiry: Time::MAX,
+            awaited: None,
         }
     }
 
@@ -134,6 +137,32 @@ impl ClassQueue {
         let class = message.header.class as usize;
         self.lanes[class].len() < self.bounds.messages
             && self.bounds.has_bytes_for(message.payload.len(), self.bytes[class])
+    }
+
+    /// Somebody keeps this message, which found no room, and waits for some: [`room_made`](Self::room_made) says when. Returns the waker if
+    /// there is room by now. One waits at most; another one takes its place.
+    pub fn offered(&mut self, message: &Message, room: &Waker) -> Option<Waker> {
+        let (class, length) = (message.header.class, message.payload.len());
+        self.awaited = Some(Awaited::with(self.awaited.take(), class, length, room));
+        self.room_made()
+    }
+
+    /// Whoever waits for room, once there is: half of the places of its class, and of the bytes half or what it needs. To be asked
+    /// whenever a message was taken out; to be woken without a lock.
+    pub fn room_made(&mut self) -> Option<Waker> {
+        let awaited = self.awaited.as_ref()?;
+        let has_room = awaited.any(|class, length| {
+            let (waits, held) = (self.lanes[class].len(), self.bytes[class]);
+            waits <= self.bounds.messages / 2
+                && self.bounds.has_bytes_for(length.max(self.bounds.bytes / 2), held)
+                && self.budget.as_ref().is_none_or(|budget| budget.has_room_for(length))
+        });
+        if has_room { self.awaited_no_more() } else { None }
+    }
+
+    /// Whoever waits for room, whether there is or not: it is told something else.
+    pub fn awaited_no_more(&mut self) -> Option<Waker> {
+        self.awaited.take().map(Awaited::into_waker)
     }
 
     /// Whether a newer value of this Stream message waits.

@@ -2,7 +2,7 @@
 
 use std::{
     sync::Arc,
-    task::{Context, Poll},
+    task::{Context, Poll, Waker},
 };
 
 use super::Mailbox;
@@ -39,6 +39,9 @@ impl MailboxReader {
         shared.paused = false;
         if let Some(message) = shared.next() {
             self.in_hand = shared.hands_out(&message);
+            let room = shared.queue.room_made();
+            drop(shared);
+            room.into_iter().for_each(Waker::wake);
             return Poll::Ready(Some(message));
         }
         if shared.closed {

@@ -1,9 +1,13 @@
 //! Applications that take nothing: their senders are held, nobody else is, and nothing is lost, double or out of order.
 
+use std::{future::poll_fn, sync::Arc};
+
 use futures_util::FutureExt;
 use sinew_runtime::{
+    mailbox::Mailbox,
     outcome::{Outcome, Rejection},
     post::PostStream,
+    router::LocalRoute,
     tid::Tid,
     time::Time,
     wire::{Class, Message},
@@ -120,6 +124,31 @@ fn an_application_that_takes_nothing_holds_its_senders_and_nobody_else() {
             next("a message for one that takes again", &mut slow).await.payload[..],
             taken.to_le_bytes()
         );
+    });
+}
+
+/// Messages that each go through a mailbox of two places: if they waited for the next look, it would be longer than the test waits.
+const MANY: u64 = 2_000;
+
+#[test]
+fn what_waits_for_a_mailbox_goes_on_as_soon_as_its_reader_has_taken_something() {
+    run(async {
+        let (a, b, _slow) = pair().await;
+        let mailbox = Mailbox::new(2);
+        let mut reader = mailbox.attach();
+        b.stores.router.set_local(b.tid(1).app, LocalRoute { outlet: mailbox, events: Arc::new([]) });
+        let mut sent = 0;
+        within("all messages", async {
+            for number in 0..MANY {
+                while sent < MANY && a.stores.router.send(bulk(&a, b.tid(1), sent)).is_ok() {
+                    sent += 1;
+                }
+                let message = poll_fn(|cx| reader.poll_take(cx)).await.expect("nobody else reads it");
+                assert_eq!(message.payload[..], number.to_le_bytes());
+                reader.finish(Outcome::Delivered);
+            }
+        })
+        .await;
     });
 }
 

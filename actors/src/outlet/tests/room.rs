@@ -1,0 +1,56 @@
+//! Who keeps a message for an outlet that is full is told when it has room.
+
+use std::task::Wake;
+
+use super::*;
+
+/// Counts how often its waker was woken.
+#[derive(Default)]
+struct Woken(AtomicUsize);
+
+impl Wake for Woken {
+    fn wake(self: Arc<Self>) {
+        self.0.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+fn waker() -> (Arc<Woken>, Waker) {
+    let woken = Arc::<Woken>::default();
+    (woken.clone(), Waker::from(woken))
+}
+
+#[test]
+fn who_keeps_a_message_for_a_full_queue_is_woken_when_half_of_it_has_gone_out() {
+    let (bench, (woken, waker)) = (Bench::new(0), waker());
+    (0..4).for_each(|value| bench.submit(message(Class::Bulk, value)));
+    let refused = bench.outlet.offer(message(Class::Bulk, 4), Some(&waker)).unwrap_err();
+    assert_eq!((refused.why, woken.0.load(Ordering::Relaxed)), (Rejection::QueueFull, 0));
+    bench.make_room(PLENTY);
+    assert_eq!((bench.seen().len(), woken.0.load(Ordering::Relaxed)), (4, 1));
+    assert_eq!(bench.outlet.counts().refused, 0, "what is offered again is not refused");
+}
+
+#[test]
+fn who_keeps_a_confirmed_message_because_too_many_are_open_is_woken_by_their_outcomes() {
+    let (bench, (woken, waker)) = (Bench::new(PLENTY), waker());
+    (1..=4).for_each(|correlation| bench.submit(bench.confirmed(correlation)));
+    // Nothing waits: there is room for all but for a confirmed one.
+    drop(bench.outlet.offer(bench.confirmed(5), Some(&waker)).unwrap_err());
+    let after_each: Vec<_> = (1..=4)
+        .map(|correlation| {
+            let ticket = Ticket { source: tid(0), destination: tid(1), correlation };
+            assert!(bench.outlet.confirm(ticket, Outcome::Delivered));
+            woken.0.load(Ordering::Relaxed)
+        })
+        .collect();
+    assert_eq!(after_each, [0, 1, 1, 1]);
+}
+
+#[test]
+fn who_keeps_a_message_for_an_outlet_that_ends_is_woken() {
+    let (bench, (woken, waker)) = (Bench::new(0), waker());
+    (0..4).for_each(|value| bench.submit(message(Class::Bulk, value)));
+    bench.outlet.offer(message(Class::Bulk, 4), Some(&waker)).unwrap_err();
+    bench.outlet.close(Rejection::Closed);
+    assert_eq!(woken.0.load(Ordering::Relaxed), 1);
+}
