@@ -28,8 +28,8 @@ use super::{
 ///
 /// It belongs to the runtime in which it was registered, with I/O and time enabled. A wait costs one wake of the task's
 /// thread, of which none is this endpoint's own: only registering, and coming back to a node, take a thread of the runtime's
-/// pool for blocking work meanwhile. With a direct link it looks every 20 ms, as a thread does that waits, and a direct link
-/// that is full is looked at again after 1 ms, doubling to 20.
+/// pool for blocking work meanwhile. With a direct link it looks every 20 ms, as a thread does that waits; for room in one that
+/// is full it is woken by what the peer takes.
 #[derive(Debug)]
 pub struct AsyncEndpoint {
     pub(super) endpoint: Endpoint,

@@ -6,6 +6,7 @@ mod budget;
 mod descriptors;
 mod early;
 mod meeting;
+mod room;
 mod standing;
 #[cfg(test)]
 mod tests;
@@ -45,6 +46,7 @@ use crate::{
 use budget::{Budget, PROCESS, Share};
 use early::Early;
 pub(super) use early::InTurn;
+pub(super) use room::Room;
 use standing::{Alone, Pair, Put};
 pub(super) use standing::{Came, Everything, Standing};
 
@@ -222,10 +224,8 @@ impl Direct {
         let Some(link) = self.standing(number) else { return Ok(Sent::Gone(draft)) };
         match link.send_draft(draft) {
             Err((ApiError::Closed(_), draft)) => {
-                // Its last words are read before it is forgotten.
                 let peer = link.peer;
-                let _ = self.routes.hung_up(peer, Left::Something, now);
-                self.look_at = now;
+                self.has_closed(peer, now);
                 Ok(Sent::Gone(draft))
             }
             Err((error, _)) => Err(error),
@@ -235,46 +235,6 @@ impl Direct {
                 Ok(Sent::Begun)
             }
             Ok(Put::Full(message)) => Ok(Sent::Full(message.into())),
-        }
-    }
-
-    /// A sender has lost its patience there. Until the peer takes something no other one waits.
-    pub(super) fn has_stalled(&mut self, number: LinkNumber) {
-        if let Some(link) = self.standing(number) {
-            link.is_stalled = true;
-        }
-    }
-
-    /// Whether a sender has lost its patience there, and the peer has taken nothing since.
-    pub(super) fn is_stalled(&mut self, number: LinkNumber) -> bool {
-        self.standing(number).is_some_and(|link| link.is_stalled)
-    }
-
-    /// A count of what the peer of a link takes.
-    pub(super) fn taken(&mut self, number: LinkNumber) -> u32 {
-        self.standing(number).map_or(0, Standing::taken)
-    }
-
-    /// Writes on with what was begun on a link.
-    pub(super) fn write_on(&mut self, number: LinkNumber) -> Writing {
-        match self.standing(number).map(Standing::is_whole) {
-            Some(true) => Writing::Whole,
-            Some(false) => Writing::Part,
-            None => self.cut.take().map_or(Writing::Whole, |message| Writing::Cut(message.into())),
-        }
-    }
-
-    /// Takes back what was begun on a link: the peer receives nothing of it.
-    pub(super) fn withdraw(&mut self, number: LinkNumber) {
-        if let Some(link) = self.standing(number) {
-            link.withdraw();
-        }
-    }
-
-    /// Waits until a link has room for the beginning of a frame of so many bytes, or ends, or `within` this time.
-    pub(super) fn await_room(&mut self, number: LinkNumber, length: usize, within: Duration) {
-        if let Some(link) = self.standing(number) {
-            link.await_room(length, within);
         }
     }
 
@@ -352,9 +312,10 @@ impl Direct {
         None
     }
 
-    /// When to look at the latest, if nothing comes before: what is owed is not said by itself.
-    pub(super) fn wake_by(&mut self, deadline: Time, now: Time) -> Time {
-        if !self.open.iter().chain(&self.held).any(Standing::owes) {
+    /// When to look at the latest, if nothing comes before: what is owed is not said by itself, but on the link that rings for room.
+    pub(super) fn wake_by(&mut self, deadline: Time, now: Time, rings: Option<LinkNumber>) -> Time {
+        let mut others = self.open.iter().chain(&self.held).filter(|link| Some(link.number) != rings);
+        if !others.any(Standing::owes) {
             return deadline;
         }
         self.flush_at = now + OWED_AGAIN;
@@ -410,7 +371,7 @@ impl Direct {
     /// Waits until something comes on an open link, for `left` at most. May end early without a reason.
     pub(super) fn wait(&mut self, left: Duration) {
         let now = Time::now();
-        let left = self.wake_by(now + left, now).since(now);
+        let left = self.wake_by(now + left, now, None).since(now);
         let ended = Waiter::new(Spin::Off).wait_within(&mut Alone(&mut self.open), left);
         let at = |index: usize| index + 1;
         self.note(&match ended {

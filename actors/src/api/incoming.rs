@@ -10,10 +10,12 @@ use sinew_runtime::{
 
 use super::{
     ApiError, Endpoint,
-    direct::{Came, Everything, InTurn, ToNode},
+    direct::{Came, Everything, InTurn, Room, ToNode},
     form::Form,
     inbox::{Answer, Awaited, Sorted},
     link::{Read, Reader, ring::NAP},
+    reactor::Until,
+    routes::LinkNumber,
 };
 use crate::ring::Taken;
 
@@ -191,20 +193,47 @@ impl Endpoint {
 
     /// Waits until something comes, from the node or from a link, or until there is something to do.
     pub(super) async fn wait(&mut self, deadline: Time, now: Time) {
+        let deadline = self.wake_by(deadline, now, None);
+        match &mut self.form {
+            Form::Thread => self.block(deadline.since(now)),
+            Form::Reactor(reactor) => {
+                let until = Until { deadline, room: None };
+                reactor.wait(&mut self.reader, &self.writer, &mut self.direct, until).await;
+            }
+        }
+    }
+
+    /// The same of a task, and until there may be room on a direct link. Without a node it waits for the links alone.
+    pub(super) async fn wait_for_room(&mut self, room: Room, deadline: Time, now: Time) {
+        let deadline = self.wake_by(deadline, now, Some(room.link)).min(now + NAP);
+        let Form::Reactor(reactor) = &mut self.form else { return };
+        let until = Until { deadline, room: Some(room) };
+        if !self.inbox.has_room() {
+            // What waits for it in a ring would end each wait at once.
+            reactor.wait_for_room(&mut self.direct, room, deadline).await;
+        } else if self.ended.is_some() || self.reader.has_ended(now) {
+            reactor.wait_for_links(&mut self.direct, until).await;
+        } else {
+            reactor.wait(&mut self.reader, &self.writer, &mut self.direct, until).await;
+        }
+    }
+
+    /// When to look at the latest, if nothing comes before.
+    fn wake_by(&mut self, deadline: Time, now: Time, rings: Option<LinkNumber>) -> Time {
         // The rest of a frame goes out meanwhile; that it was taken back is not urgent.
         let deadline = match &self.rest {
             Some(rest) if rest.is_withdrawn() => deadline.min(now + NAP),
             None if !self.is_within_frame() => deadline,
             Some(_) | None => deadline.min(now + REST_AGAIN),
         };
-        let deadline = self.direct.wake_by(deadline, now);
-        match &mut self.form {
-            Form::Thread => self.block(deadline.since(now)),
-            Form::Reactor(reactor) => {
-                let naps = self.writer.owes() || self.direct.is_to_be_looked_at();
-                let deadline = if naps { deadline.min(now + NAP) } else { deadline };
-                reactor.wait(&mut self.reader, &self.writer, &mut self.direct, deadline).await;
+        let deadline = self.direct.wake_by(deadline, now, rings);
+        match self.form {
+            // It naps in any case.
+            Form::Thread => deadline,
+            Form::Reactor(_) if self.writer.owes() || self.direct.is_to_be_looked_at() => {
+                deadline.min(now + NAP)
             }
+            Form::Reactor(_) => deadline,
         }
     }
 

@@ -11,7 +11,7 @@ use sinew_runtime::{
 
 use super::{
     ApiError, Endpoint, Received,
-    direct::{Sent, ToNode, Writing},
+    direct::{Room, Sent, ToNode, Writing},
     form::Form,
     inbox::{Answer, Awaited},
     incoming::{Wanted, WhenFull},
@@ -23,7 +23,7 @@ use super::{
 
 /// Looks for the last words of a node that has gone.
 const LAST_LOOKS: usize = 64;
-/// First pause between two looks at what others send while a direct link has no room; doubled up to a nap. Room ends it.
+/// First pause of a thread between two looks at what others send while a direct link has no room; doubled up to a nap. Room ends it.
 const ROOM_PAUSE: Duration = Duration::from_millis(1);
 
 impl Endpoint {
@@ -221,8 +221,8 @@ impl Endpoint {
             self.take_in_while_writing(link, now);
             match self.form {
                 Form::Thread => self.direct.await_room(link, length, pause.min(until.since(now))),
-                // Nobody rings for room here: it is looked for again after the pause, or when something comes.
-                Form::Reactor(_) => self.wait(until.min(now + pause), now).await,
+                // Rung for room, and for what comes.
+                Form::Reactor(_) => self.wait_for_room(Room { link, length }, until, now).await,
             }
             pause = (pause * 2).min(NAP);
         }

@@ -23,7 +23,7 @@ use tokio::{io::Interest, net::UnixStream, sync::oneshot, task::spawn_blocking};
 use links::{Heard, Links, forget};
 
 use super::{
-    direct::{Direct, Standing},
+    direct::{Direct, Room, Standing},
     link::{
         Link, Reader, Writer,
         ring::{self, NAP, Rest},
@@ -51,6 +51,14 @@ enum Ears {
     },
 }
 
+/// What a wait ends with, if nothing comes before.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Until {
+    pub(super) deadline: Time,
+    /// Room on a direct link, or what may be room.
+    pub(super) room: Option<Room>,
+}
+
 impl Reactor {
     /// Watches a link, for the runtime of the calling task.
     pub(super) fn new(reader: &Reader, writer: &Writer) -> io::Result<Self> {
@@ -58,13 +66,13 @@ impl Reactor {
         Ok(Self { ears, links, home: None, wanted: Arc::new(()) })
     }
 
-    /// Waits until there may be something to read, or to do, until `deadline` at most.
+    /// Waits until there may be something to read, or to do, or the room that is asked for, until `deadline` at most.
     pub(super) async fn wait(
         &mut self,
         reader: &mut Reader,
         writer: &Writer,
         direct: &mut Direct,
-        deadline: Time,
+        Until { deadline, room }: Until,
     ) {
         match (&self.ears, reader) {
             (Ears::Socket(socket), _) => tokio::select! {
@@ -73,8 +81,8 @@ impl Reactor {
                 () = until(deadline) => {}
             },
             (Ears::Ring { message, socket, .. }, Reader::Ring(reader)) => {
-                self.links.follow(&direct.open);
-                let Some(mut listening) = Listening::begin(Some(reader), &mut direct.open) else { return };
+                self.links.follow(direct, room);
+                let Some(mut listening) = Listening::begin(Some(reader), direct, room) else { return };
                 let links = &mut self.links;
                 let heard = tokio::select! {
                     () = rung(message) => Heard::Bell,
@@ -94,11 +102,9 @@ impl Reactor {
     }
 
     /// The same while there is no node: for direct links alone.
-    async fn wait_for_links(&mut self, direct: &mut Direct, deadline: Time) {
-        let now = Time::now();
-        let deadline = direct.wake_by(deadline.min(now + NAP), now);
-        self.links.follow(&direct.open);
-        let Some(listening) = Listening::begin(None, &mut direct.open) else { return };
+    pub(super) async fn wait_for_links(&mut self, direct: &mut Direct, Until { deadline, room }: Until) {
+        self.links.follow(direct, room);
+        let Some(listening) = Listening::begin(None, direct, room) else { return };
         let links = &mut self.links;
         let heard = tokio::select! {
             heard = poll_fn(|cx| links.poll(cx)) => heard,
@@ -106,6 +112,21 @@ impl Reactor {
         };
         drop(listening);
         direct.heard(heard == Heard::HungUp);
+    }
+
+    /// Waits for room on a direct link alone: of what others send nothing more can be taken in.
+    pub(super) async fn wait_for_room(&mut self, direct: &mut Direct, room: Room, deadline: Time) {
+        self.links.follow(direct, Some(room));
+        if direct.arm_room(room) == Armed::Ready {
+            return;
+        }
+        let links = &mut self.links;
+        // Not disarmed if this is dropped: the peer may ring once for nothing.
+        tokio::select! {
+            () = poll_fn(|cx| links.poll_room(cx)) => {}
+            () = until(deadline) => {}
+        }
+        direct.disarm_room(room);
     }
 
     /// Waits until there may be room for a frame of `length` bytes, or for the rest of one, until `deadline` at most.
@@ -168,7 +189,9 @@ impl Reactor {
             return Some(link);
         }
         if !direct.open.is_empty() {
-            self.wait_for_links(direct, deadline).await;
+            let now = Time::now();
+            let deadline = direct.wake_by(deadline.min(now + NAP), now, None);
+            self.wait_for_links(direct, Until { deadline, room: None }).await;
             return self.look_home(home);
         }
         let found = self.home.as_mut()?;
@@ -202,18 +225,21 @@ impl Ears {
     }
 }
 
-/// Readers that have announced that they sleep; awake again when dropped.
+/// Who has announced that he sleeps: the readers, and the sender that waits for room. Awake again when dropped.
 struct Listening<'a> {
     node: Option<&'a mut ring::Reader>,
-    links: &'a mut [Standing],
+    direct: &'a mut Direct,
+    room: Option<Room>,
 }
 
 impl<'a> Listening<'a> {
     /// `None` if there is something to do already.
-    fn begin(node: Option<&'a mut ring::Reader>, links: &'a mut [Standing]) -> Option<Self> {
-        let mut listening = Self { node, links };
-        let is_silent = listening.node.as_mut().is_none_or(|node| node.arm() == Armed::Sleep)
-            && listening.links.iter_mut().all(|link| link.arm() == Armed::Sleep);
+    fn begin(node: Option<&'a mut ring::Reader>, direct: &'a mut Direct, room: Option<Room>) -> Option<Self> {
+        let mut listening = Self { node, direct, room };
+        let Self { node, direct, room } = &mut listening;
+        let is_silent = node.as_mut().is_none_or(|node| node.arm() == Armed::Sleep)
+            && direct.open.iter_mut().all(|link| link.arm() == Armed::Sleep)
+            && room.is_none_or(|room| direct.arm_room(room) == Armed::Sleep);
         is_silent.then_some(listening)
     }
 
@@ -230,7 +256,10 @@ impl Drop for Listening<'_> {
         if let Some(node) = &mut self.node {
             node.disarm();
         }
-        self.links.iter_mut().for_each(Standing::disarm);
+        self.direct.open.iter_mut().for_each(Standing::disarm);
+        if let Some(room) = self.room {
+            self.direct.disarm_room(room);
+        }
     }
 }
 

@@ -172,8 +172,10 @@ impl Standing {
     }
 
     fn put(&mut self, message: Message) -> Result<Put, (ApiError, Message)> {
-        if !self.is_whole() {
-            return Ok(Put::Full(message));
+        match self.go_on() {
+            Ok(true) => {}
+            Ok(false) => return Ok(Put::Full(message)),
+            Err(error) => return Err((error, message)),
         }
         let begun = self.writer.begin(message)?;
         self.is_stalled &= matches!(begun, Begun::Full(_));
@@ -189,7 +191,8 @@ impl Standing {
 
     /// Writes what waits for room, as far as there is room.
     pub(in crate::api) fn flush(&mut self) {
-        while self.is_whole() && !self.parked.is_empty() {
+        // An error shows itself again when the ring is read: the socket is closed.
+        while self.go_on().unwrap_or(false) && !self.parked.is_empty() {
             let first = self.parked.remove(0);
             match self.put(first) {
                 Ok(Put::Taken | Put::Begun) => {}
@@ -216,12 +219,39 @@ impl Standing {
     }
 
     /// Writes on with a long frame; whether none is left half written.
-    pub(in crate::api) fn is_whole(&mut self) -> bool {
-        // An error shows itself again when the ring is read: the socket is closed.
-        if self.rest.as_mut().is_some_and(|rest| rest.go_on().unwrap_or(false)) {
+    ///
+    /// # Errors
+    /// The link cannot be written any more: its socket is closed.
+    pub(super) fn go_on(&mut self) -> Result<bool, ApiError> {
+        let is_whole = self.rest.as_mut().map_or(Ok(true), Rest::go_on)?;
+        if is_whole {
             self.rest = None;
         }
-        self.rest.is_none()
+        Ok(is_whole)
+    }
+
+    /// Announces that a task waits for room for a frame of `length` bytes, or for the rest of the one that is begun.
+    pub(super) fn arm_room(&mut self, length: usize) -> Armed {
+        match &mut self.rest {
+            Some(rest) => rest.arm(),
+            None => self.writer.arm(length),
+        }
+    }
+
+    /// Says that it is awake.
+    pub(super) fn disarm_room(&mut self) {
+        match &mut self.rest {
+            Some(rest) => rest.disarm(),
+            None => self.writer.disarm(),
+        }
+    }
+
+    /// Does something with the descriptor of the bell for room, if the ring has one and is not lent.
+    pub(super) fn with_room_bell<T>(&self, look: impl FnOnce(Option<BorrowedFd<'_>>) -> T) -> T {
+        match &self.rest {
+            Some(rest) => look(rest.bell()),
+            None => self.writer.with_bell(look),
+        }
     }
 
     /// A count of what the peer takes.

@@ -165,13 +165,13 @@ impl Writer {
     }
 
     /// Announces that a task waits for room for a frame of `length` bytes.
-    pub(super) fn arm(&self, length: usize) -> Armed {
+    pub(in crate::api) fn arm(&self, length: usize) -> Armed {
         let mut producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
         producer.as_deref_mut().map_or(Armed::Ready, |producer| writing::arm(producer, length))
     }
 
     /// Says that it is awake.
-    pub(super) fn disarm(&self) {
+    pub(in crate::api) fn disarm(&self) {
         if let Some(producer) = self.producer.lock().unwrap_or_else(PoisonError::into_inner).as_deref_mut() {
             producer.disarm();
         }

@@ -2,17 +2,25 @@
 
 use std::{cell::Cell, thread, time::Duration};
 
+use futures_util::poll;
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
     tid::Tid,
     time::Time,
-    wire::Class,
+    wire::{Class, HEADER_LEN},
 };
+use sinew_shm::Armed;
 use tokio::time::timeout;
 
-use super::{RAW, number_of, runtime};
+use super::{RAW, number_of, numbered, runtime};
 use crate::{
-    api::{AsyncEndpoint, Endpoint, NodeApi, Registration},
+    api::{
+        AsyncEndpoint, Endpoint, NodeApi, Registration,
+        direct::{Room, Sent},
+        form::Form,
+        incoming::WhenFull,
+        reactor::Until,
+    },
     lncl::testing::{TestNode, WATCHDOG},
 };
 
@@ -146,6 +154,66 @@ async fn expect_next(endpoint: &mut AsyncEndpoint, next: &Cell<u64>) {
     let received = endpoint.receive().await.unwrap();
     assert_eq!(number_of(received.bytes()), next.get());
     next.set(next.get() + 1);
+}
+
+/// Sends until the ring is full; what a sender would wait for then.
+fn fill(from: &mut AsyncEndpoint, to: Tid) -> Room {
+    let direct = &mut from.endpoint.direct;
+    let link = direct.link_to(to).expect("a link");
+    for number in 0..10_000 {
+        let message = numbered(number, 1_000, from.endpoint.tid, to);
+        match direct.send(link, message.into(), Time::now()).unwrap() {
+            Sent::Taken => {}
+            Sent::Full(_) => return Room { link, length: HEADER_LEN + 1_000 },
+            Sent::Begun | Sent::Gone(_) => panic!("it fits, and the peer lives"),
+        }
+    }
+    panic!("the ring takes no end of messages");
+}
+
+#[test]
+fn a_task_that_waits_for_room_is_woken_by_what_its_peer_takes() {
+    let node = TestNode::start();
+    runtime().block_on(async {
+        // given
+        let (mut one, mut other) = linked(&node).await;
+        drain(&mut other).await;
+        drain(&mut one).await;
+        let room = fill(&mut one, other.tid());
+        let Endpoint { form, reader, writer, direct, .. } = &mut one.endpoint;
+        let Form::Reactor(reactor) = form else { unreachable!("it is a task's") };
+        // when: no timer ends it
+        let until = Until { deadline: Time::MAX, room: Some(room) };
+        let mut waiting = Box::pin(reactor.wait(reader, writer, direct, until));
+        assert!(poll!(&mut waiting).is_pending(), "there is no room");
+        drop(other.receive().await.unwrap());
+        // then
+        timeout(WATCHDOG, &mut waiting).await.expect("it is rung for room");
+        drop(waiting);
+        assert_eq!(direct.arm_room(room), Armed::Ready);
+    });
+}
+
+#[test]
+fn a_task_that_waits_for_room_sleeps_although_its_inbox_is_full_and_more_waits_for_it() {
+    let node = TestNode::start();
+    runtime().block_on(async {
+        // given: both rings are full, and one has all that it can keep
+        let (mut one, mut other) = linked(&node).await;
+        drain(&mut other).await;
+        drain(&mut one).await;
+        let (room, back) = (fill(&mut one, other.tid()), one.tid());
+        while one.endpoint.inbox.has_room() {
+            fill(&mut other, back);
+            one.endpoint.take_in(None, WhenFull::Leave, Time::now()).unwrap();
+        }
+        fill(&mut other, back);
+        // when
+        let now = Time::now();
+        let mut waiting = Box::pin(one.endpoint.wait_for_room(room, now + WATCHDOG, now));
+        // then
+        assert!(poll!(&mut waiting).is_pending(), "it would go round and round");
+    });
 }
 
 #[test]

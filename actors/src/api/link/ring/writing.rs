@@ -2,7 +2,7 @@
 
 use std::{io::IoSlice, mem, sync::Arc, sync::PoisonError, time::Duration};
 
-use rustix::fd::AsFd;
+use rustix::fd::{AsFd, BorrowedFd};
 use sinew_runtime::wire::{HEADER_LEN, Message};
 use sinew_shm::{Armed, HangUp, LoanError, Producer, Wait};
 
@@ -173,6 +173,11 @@ impl Rest {
         if let Some(producer) = self.producer.as_deref_mut() {
             producer.disarm();
         }
+    }
+
+    /// The descriptor of the bell for room.
+    pub(in crate::api) fn bell(&self) -> Option<BorrowedFd<'_>> {
+        self.producer.as_deref().and_then(Producer::fd)
     }
 
     /// Waits until there is room for more, the peer's end, or `within` this time.
