@@ -5,7 +5,6 @@ pub mod clients;
 pub mod dice;
 mod ground;
 pub mod history;
-mod hosts;
 pub mod link_faults;
 pub mod load;
 mod log;
@@ -18,11 +17,11 @@ pub mod puppet;
 pub mod slow_consumer;
 
 pub use ground::{Ground, all_run, ready_for, sees};
-pub use hosts::{Host, Hosts};
 pub use log::{Log, until};
 pub use program::{
     Program, node_under_test, process_under_test, program, wait_until_asleep, wait_until_frozen,
 };
+pub use sinew_hosts::{Host, Hosts};
 
 use std::{
     net::SocketAddrV4,

@@ -1,79 +1,195 @@
-//! What messages between two nodes cost while others are under way between the same two.
+//! What messages between two nodes cost: round trips, floods, crowds of nodes, and one class beside another.
 //!
-//! `cargo bench -p sinew --bench gncl [-- WORD...]` runs the cases whose name holds every WORD, each in two fresh processes, a
-//! node in each. JSON lines are on the standard output, a table on the standard error. Times are microseconds, there and back.
-//! Nothing here asserts a time.
+//! `cargo bench -p sinew --bench gncl [-- [--short] WORD...]` runs the cases whose name holds every WORD, in fresh processes, a
+//! node in each. JSON lines are on the standard output, a table on the standard error. Times are microseconds, there and
+//! back. Nothing here asserts a time. `--short` does a tenth.
 //!
+//! - `rounds-THREAD-BYTES-PACE-CPUS`: round trips of 8 B, 64 B, 1000 B, 64 KiB and 1 MB in class Control, back to back and one
+//!   every millisecond, between applications on their nodes' IO threads or on threads of their own; beside blocking TCP.
+//! - `flood-CARRIER-CPUS`: packets of 1000 bytes in class Bulk one way, as fast as they go, confirmed or not, and through bare
+//!   TCP.
+//! - `table_2-N`: the paper's test, every node to every other one, 1000 bytes with a full echo, 3, 8 and 16 nodes at 2,000 round
+//!   trips a second together; `cpu_ns_each_message` is what all processes needed by what arrived.
 //! - `control_beside_bulk_N`: round trips of 64 bytes in class Control, one every millisecond: first alone, then beside a
 //!   flood of Bulk messages of N bytes to another application of the other node, as fast as they are taken. What counts is the
 //!   p99 beside the flood by the p99 alone (`p99_ratio_percent`).
 //! - `control_beside_slow_consumer`: the same, and the application that is flooded takes a millisecond for each of its messages.
+//! - `slow_link`: the same as `control_beside_bulk_1000`, and bare TCP, on two hosts with a link of 10 Mbit/s between them
+//!   (network namespaces: needs root, `ip` and `tc`).
 
-mod ends;
+mod beside;
+mod crowd;
+mod flood;
+mod nodes;
+#[path = "../ping/mod.rs"]
+mod ping;
+mod rounds;
+mod slow_link;
 
-use std::{
-    io::{BufRead, BufReader},
-    process::{Child, Command, ExitCode, Stdio},
-    time::Duration,
-};
+use std::{process::ExitCode, time::Duration};
 
-use sinew_figures::Alone;
+use sinew_figures::{Beside, End, Pace, Pinning, Rounds, process};
 
-/// The role of a process that this program starts of itself.
-const ROLE: &str = "SINEW_GNCL_ROLE";
+use crate::{flood::Carrier, nodes::At, rounds::Thread};
 
-/// A case: the length of the Bulk messages in bytes, and how long whoever takes them takes for each.
-struct Case {
-    name: &'static str,
-    bulk_bytes: usize,
-    pause_us: u64,
+/// What is measured.
+#[derive(Clone, Copy, Debug)]
+enum Case {
+    Rounds {
+        thread: Thread,
+        rounds: Rounds,
+        pinning: Pinning,
+    },
+    Flood {
+        carrier: Carrier,
+        packets: usize,
+        pinning: Pinning,
+    },
+    Crowd {
+        nodes: usize,
+        seconds: u64,
+    },
+    /// How many bytes a message of the flood has, and how long whoever takes them takes for each.
+    Beside {
+        name: &'static str,
+        bulk_bytes: usize,
+        pause_us: u64,
+        rounds: u64,
+    },
+    SlowLink,
 }
 
-const CASES: &[Case] = &[
-    Case { name: "control_beside_bulk_1000", bulk_bytes: 1_000, pause_us: 0 },
-    Case { name: "control_beside_bulk_65536", bulk_bytes: 65_536, pause_us: 0 },
-    Case { name: "control_beside_bulk_1000000", bulk_bytes: 1_000_000, pause_us: 0 },
-    Case { name: "control_beside_slow_consumer", bulk_bytes: 1_000, pause_us: 1_000 },
-];
+impl Case {
+    /// Every case, in the order in which they run.
+    fn all(is_short: bool) -> Vec<Self> {
+        let part = if is_short { 10 } else { 1 };
+        let mut cases = Vec::new();
+        for pinning in Pinning::ALL {
+            for (bytes, pace) in payloads(is_short) {
+                let rounds = Rounds::of(bytes, pace, is_short);
+                cases.extend(Thread::ALL.map(|thread| Self::Rounds { thread, rounds, pinning }));
+            }
+        }
+        for pinning in [Pinning::Anywhere, Pinning::OneCpuEach] {
+            cases.extend(Carrier::ALL.map(|carrier| Self::Flood {
+                carrier,
+                packets: 1_000_000 / part,
+                pinning,
+            }));
+        }
+        cases.extend(crowd::SIZES.map(|nodes| Self::Crowd { nodes, seconds: if is_short { 3 } else { 20 } }));
+        let beside = [
+            ("control_beside_bulk_1000", 1_000, 0),
+            ("control_beside_bulk_65536", 65_536, 0),
+            ("control_beside_bulk_1000000", 1_000_000, 0),
+            ("control_beside_slow_consumer", 1_000, 1_000),
+        ];
+        let rounds = 4_000 / part as u64;
+        cases.extend(beside.map(|(name, bulk_bytes, pause_us)| Self::Beside {
+            name,
+            bulk_bytes,
+            pause_us,
+            rounds,
+        }));
+        cases.push(Self::SlowLink);
+        cases
+    }
+
+    fn name(self) -> String {
+        match self {
+            Self::Rounds { thread, rounds: Rounds { bytes, pace, .. }, pinning } => {
+                format!("rounds-{}-{bytes}B-{}-{}", thread.name(), pace.name(), pinning.name())
+            }
+            Self::Flood { carrier, pinning, .. } => format!("flood-{}-{}", carrier.name(), pinning.name()),
+            Self::Crowd { nodes, .. } => format!("table_2-{nodes}"),
+            Self::Beside { name, .. } => name.to_owned(),
+            Self::SlowLink => "slow_link".to_owned(),
+        }
+    }
+
+    /// Runs it in a process of its own. Returns whether that went well.
+    fn run(self, is_short: bool) -> bool {
+        let worked = process::has_run(process::command(&format!("measure {is_short} {}", self.name())));
+        if !worked {
+            eprintln!("{}: failed", self.name());
+        }
+        worked
+    }
+
+    fn measure(self) {
+        match self {
+            Self::Rounds { thread, rounds, pinning } => {
+                pinning.pin(End::Measuring);
+                rounds::measure(thread, rounds, pinning);
+            }
+            Self::Flood { carrier, packets, pinning } => {
+                pinning.pin(End::Measuring);
+                flood::measure(carrier, packets, pinning);
+            }
+            Self::Crowd { nodes, seconds } => crowd::measure(nodes, seconds),
+            Self::Beside { name, bulk_bytes, pause_us, rounds } => {
+                let at = At::loopback();
+                let _other = process::Process::start(&format!("beside_echo {pause_us} {}", at.host(2)));
+                beside::measure(name, at, bulk_bytes, rounds);
+            }
+            Self::SlowLink => slow_link::measure("slow_link"),
+        }
+    }
+}
+
+/// What a message carries, and how round trips follow each other.
+fn payloads(is_short: bool) -> Vec<(usize, Pace)> {
+    let mut payloads = vec![(1000, Pace::BackToBack), (1000, Pace::EveryMillisecond)];
+    if !is_short {
+        let others = [8, 64, 65_536, 1_000_000];
+        payloads.extend(others.into_iter().flat_map(|bytes| Pace::ALL.map(|pace| (bytes, pace))));
+    }
+    payloads
+}
 
 fn main() -> ExitCode {
-    if let Ok(role) = std::env::var(ROLE) {
+    if let Some(role) = process::role() {
         return play(&role);
     }
     sinew_figures::head();
+    Beside::head();
     let words: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with('-')).collect();
-    let wanted = CASES.iter().filter(|case| words.iter().all(|word| case.name.contains(word.as_str())));
-    let failed = wanted.filter(|case| !run(case)).count();
+    let is_short = std::env::args().any(|arg| arg == "--short");
+    let cases = Case::all(is_short).into_iter();
+    let wanted = cases.filter(|case| words.iter().all(|word| case.name().contains(word.as_str())));
+    let failed = wanted.filter(|case| !case.run(is_short)).count();
     if failed == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
-/// Runs a case in a process of its own.
-fn run(case: &Case) -> bool {
-    let status = this_program(&format!("measure {}", case.name)).stdin(Stdio::null()).status();
-    let worked = status.is_ok_and(|status| status.success());
-    if !worked {
-        eprintln!("{}: failed", case.name);
-    }
-    worked
-}
-
-fn this_program(role: &str) -> Command {
-    let mut command = Command::new(std::env::current_exe().expect("this program has a path"));
-    command.env(ROLE, role);
-    command
-}
-
+/// Plays the part that another process of this program gave this one.
 fn play(role: &str) -> ExitCode {
     let words: Vec<&str> = role.split(' ').collect();
     match words[..] {
-        ["measure", name] => {
-            let case = CASES.iter().find(|case| case.name == name);
-            measure(case.expect("a name that this program wrote itself"));
+        ["measure", is_short, name] => {
+            let case = Case::all(is_short == "true").into_iter().find(|case| case.name() == name);
+            case.expect("a name that this program wrote itself").measure();
         }
-        ["echo", group, pause_us] => {
-            let pause_us = pause_us.parse().expect("a number that this program wrote itself");
-            ends::echo(group, Duration::from_micros(pause_us));
+        ["echo", thread, pinning, at] => {
+            Pinning::named(pinning).pin(End::Echoing);
+            rounds::echo(Thread::named(thread), At::read(at));
         }
+        ["raw_echo", bytes, pinning] => {
+            Pinning::named(pinning).pin(End::Echoing);
+            sinew_figures::stream::echo(number(bytes));
+        }
+        ["sink", carrier, packets, pinning, at] => {
+            Pinning::named(pinning).pin(End::Echoing);
+            flood::sink(Carrier::named(carrier), number(packets), At::read(at));
+        }
+        ["member", index, count, seconds, at] => {
+            crowd::member(number(index), number(count), number(seconds) as u64, At::read(at));
+        }
+        ["beside_echo", pause_us, at] => {
+            beside::echo(At::read(at), Duration::from_micros(number(pause_us) as u64));
+        }
+        ["slow_nodes", case, at] => slow_link::nodes(case, At::read(at)),
+        ["slow_raw_echo", address] => slow_link::raw_echo(address.parse().expect("an address of ours")),
+        ["slow_raw", case, address] => slow_link::raw(case, address.parse().expect("an address of ours")),
         _ => {
             eprintln!("no such role: {role}");
             return ExitCode::FAILURE;
@@ -82,46 +198,6 @@ fn play(role: &str) -> ExitCode {
     ExitCode::SUCCESS
 }
 
-fn measure(case: &Case) {
-    let process = std::process::id();
-    let group = format!("239.255.84.{}:{}", process % 200 + 1, 20_000 + process % 20_000);
-    let _other = Other::start(&group, case.pause_us);
-    let seen = ends::measure(&group, case.bulk_bytes);
-    let report = |figure, seen, counts: &[(&str, u64)]| {
-        Alone { bench: "gncl", case: case.name, figure, seen, counts }.report();
-    };
-    report("Control alone", &seen.alone, &[]);
-    let counts = [
-        ("bulk_mib_per_s", seen.bulk_bytes_per_s >> 20),
-        (
-            "p99_ratio_percent",
-            (seen.beside.p99().as_nanos() * 100 / seen.alone.p99().as_nanos().max(1)) as u64,
-        ),
-    ];
-    report("Control beside the flood", &seen.beside, &counts);
-}
-
-/// The other node's process; it is ended when this is dropped.
-struct Other(Child);
-
-impl Other {
-    fn start(group: &str, pause_us: u64) -> Self {
-        let mut command = this_program(&format!("echo {group} {pause_us}"));
-        let mut child = command
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .expect("a process for the other node");
-        let output = child.stdout.take().expect("its output is a pipe");
-        BufReader::new(output).read_line(&mut String::new()).expect("the other node says that it is there");
-        Self(child)
-    }
-}
-
-impl Drop for Other {
-    fn drop(&mut self) {
-        // It may have ended by itself.
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
+fn number(word: &str) -> usize {
+    word.parse().expect("a number that this program wrote itself")
 }

@@ -1,13 +1,10 @@
 //! The cases: which path, which payload, which reference.
 
-use std::{
-    io::{BufRead, BufReader},
-    process::{Child, Command, Stdio},
-};
+use std::os::unix::net::UnixStream;
 
-use sinew_figures::{Beside, End, Figures, Pinning};
+use sinew_figures::{Beside, End, Figures, Pinning, process::Process, stream};
 
-use crate::{ROLE, raw, sinew_ends};
+use crate::{raw, rounds, sinew_ends};
 
 /// One path, measured against one reference.
 pub(crate) struct Case {
@@ -25,10 +22,6 @@ enum Path {
     TwoThreads,
     /// An application of a node and an endpoint in another process; reference: a raw unix stream.
     TwoProcesses,
-    /// Applications of two nodes, each on its node's IO thread; reference: raw blocking TCP.
-    TwoNodesIo,
-    /// Applications of two nodes, each on a thread of its own; reference: raw blocking TCP.
-    TwoNodesOwn,
 }
 
 pub(crate) const CASES: &[Case] = &[
@@ -68,25 +61,6 @@ pub(crate) const CASES: &[Case] = &[
         payload_bytes: 65_536,
         reference: "raw_unix_stream",
     },
-    Case { name: "two_nodes_io_thread_8", path: Path::TwoNodesIo, payload_bytes: 8, reference: "raw_tcp" },
-    Case {
-        name: "two_nodes_io_thread_1000",
-        path: Path::TwoNodesIo,
-        payload_bytes: 1000,
-        reference: "raw_tcp",
-    },
-    Case {
-        name: "two_nodes_io_thread_65536",
-        path: Path::TwoNodesIo,
-        payload_bytes: 65_536,
-        reference: "raw_tcp",
-    },
-    Case {
-        name: "two_nodes_own_thread_1000",
-        path: Path::TwoNodesOwn,
-        payload_bytes: 1000,
-        reference: "raw_tcp",
-    },
 ];
 
 /// The measuring end.
@@ -101,9 +75,7 @@ pub(crate) fn measure(name: &str, pinning: &str) {
         Path::TwoThreads => {
             (sinew_ends::in_process(bytes, pinning, false), raw::actix_send(bytes, pinning, false))
         }
-        Path::TwoProcesses => (two_processes(bytes, pinning), raw_pair("raw_unix", bytes, pinning)),
-        Path::TwoNodesIo => (two_nodes("node_io", bytes, pinning), raw_pair("raw_tcp", bytes, pinning)),
-        Path::TwoNodesOwn => (two_nodes("node_own", bytes, pinning), raw_pair("raw_tcp", bytes, pinning)),
+        Path::TwoProcesses => (two_processes(bytes, pinning), raw_unix(bytes, pinning)),
     };
     Beside {
         bench: "paths",
@@ -120,69 +92,28 @@ pub(crate) fn measure(name: &str, pinning: &str) {
 
 /// The echoing end, in a process of its own: prints a line when it can be reached, ends when its input does.
 pub(crate) fn echo(kind: &str, pinning: &str, at: &str) {
-    let pinning = Pinning::named(pinning);
-    pinning.pin(End::Echoing);
+    Pinning::named(pinning).pin(End::Echoing);
     match kind {
-        "raw_unix" => raw::echo_unix(at),
-        "raw_tcp" => raw::echo_tcp(),
+        "raw_unix" => stream::echo(number(at)),
         "endpoint" => sinew_ends::echo_endpoint(at),
-        "node_io" => sinew_ends::echo_node(at, true),
-        "node_own" => sinew_ends::echo_node(at, false),
         _ => eprintln!("no such echo: {kind}"),
     }
 }
 
-/// Another process of this program; it is ended when this is dropped.
-pub(crate) struct Echo {
-    child: Child,
-    /// What it said when it could be reached.
-    pub(crate) line: String,
+fn number(word: &str) -> usize {
+    word.parse().expect("a number that this program wrote itself")
 }
 
-impl Echo {
-    fn start(kind: &str, at: &str, pinning: Pinning) -> Self {
-        let program = std::env::current_exe().expect("this program has a path");
-        let mut child = Command::new(program)
-            .env(ROLE, format!("echo {kind} {} {at}", pinning.name()))
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .expect("a process for the other end");
-        let mut line = String::new();
-        let output = child.stdout.take().expect("its output is a pipe");
-        BufReader::new(output).read_line(&mut line).expect("the other end says that it is there");
-        Self { child, line: line.trim().to_owned() }
-    }
-}
-
-impl Drop for Echo {
-    fn drop(&mut self) {
-        // It may have ended by itself.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-fn raw_pair(kind: &str, bytes: usize, pinning: Pinning) -> Figures {
-    let path = std::env::temp_dir().join(format!("sinew-paths-raw-{}", std::process::id()));
-    let echo = Echo::start(kind, &path.to_string_lossy(), pinning);
+fn raw_unix(bytes: usize, pinning: Pinning) -> Figures {
     pinning.pin(End::Measuring);
-    let figures = raw::measure(kind, &path, &echo.line, bytes);
-    // Left by the echo, which was killed.
-    let _ = std::fs::remove_file(path);
-    figures
+    let (ours, theirs) = UnixStream::pair().expect("a pair of sockets");
+    let _echo = Process::start_on(&format!("echo raw_unix {} {bytes}", pinning.name()), theirs.into());
+    stream::round_trips(ours, rounds(bytes))
 }
 
 fn two_processes(bytes: usize, pinning: Pinning) -> Figures {
     pinning.pin(End::Measuring);
     let path = std::env::temp_dir().join(format!("sinew-paths-lncl-{}", std::process::id()));
-    sinew_ends::through_lncl(&path, bytes, || Echo::start("endpoint", &path.to_string_lossy(), pinning))
-}
-
-fn two_nodes(kind: &str, bytes: usize, pinning: Pinning) -> Figures {
-    pinning.pin(End::Measuring);
-    let group =
-        format!("239.255.83.{}:{}", std::process::id() % 200 + 1, 20_000 + std::process::id() % 20_000);
-    let _echo = Echo::start(kind, &group, pinning);
-    sinew_ends::between_nodes(&group, bytes, kind == "node_io")
+    let role = format!("echo endpoint {} {}", pinning.name(), path.display());
+    sinew_ends::through_lncl(&path, bytes, || Process::start(&role))
 }

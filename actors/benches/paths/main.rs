@@ -1,29 +1,25 @@
-//! Round trips on each path a message can take, beside a raw reference of the same run.
+//! Round trips on each path a message can take within one node, beside a raw reference of the same run.
 //!
 //! `cargo bench -p sinew --bench paths [-- CASE...]` prints one JSON line a case. Every case runs in fresh processes,
 //! three times: wherever the scheduler likes, with everything on one CPU, and with one CPU for each end. Times are
 //! microseconds, there and back. Nothing here asserts a time.
 
 mod case;
+#[path = "../ping/mod.rs"]
+mod ping;
 mod raw;
 mod sinew_ends;
 
-use std::process::{Command, ExitCode, Stdio};
+use std::process::ExitCode;
 
 use case::{CASES, Case};
-use sinew_figures::Pinning;
+use sinew_figures::{Pace, Pinning, Rounds, process};
 
-/// The role of a process that this program starts of itself.
-const ROLE: &str = "SINEW_PATHS_ROLE";
-/// Round trips that are not counted.
-const WARM_UP: u64 = 1_000;
-/// Round trips that are.
-const ROUNDS: u64 = 20_000;
 /// The environment variable that says another number: a profile needs more.
 const ROUNDS_WANTED: &str = "SINEW_PATHS_ROUNDS";
 
 fn main() -> ExitCode {
-    if let Ok(role) = std::env::var(ROLE) {
+    if let Some(role) = process::role() {
         return play(&role);
     }
     let wanted: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with('-')).collect();
@@ -38,18 +34,16 @@ fn main() -> ExitCode {
     if failed { ExitCode::FAILURE } else { ExitCode::SUCCESS }
 }
 
-/// Round trips that are counted.
-fn rounds() -> u64 {
-    let wanted = std::env::var(ROUNDS_WANTED).ok();
-    wanted.and_then(|wanted| wanted.parse().ok()).unwrap_or(ROUNDS)
+/// How many round trips of so many bytes.
+fn rounds(bytes: usize) -> Rounds {
+    let rounds = Rounds::of(bytes, Pace::BackToBack, false);
+    let wanted = std::env::var(ROUNDS_WANTED).ok().and_then(|wanted| wanted.parse().ok());
+    Rounds { counted: wanted.unwrap_or(rounds.counted), ..rounds }
 }
 
 /// Runs a case in a process of its own.
 fn run(case: &Case, pinning: Pinning) -> bool {
-    let program = std::env::current_exe().expect("this program has a path");
-    let role = format!("measure {} {}", case.name, pinning.name());
-    let status = Command::new(program).env(ROLE, role).stdin(Stdio::null()).status();
-    let worked = status.is_ok_and(|status| status.success());
+    let worked = process::has_run(process::command(&format!("measure {} {}", case.name, pinning.name())));
     if !worked {
         eprintln!("{} {}: failed", case.name, pinning.name());
     }

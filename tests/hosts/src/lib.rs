@@ -2,9 +2,15 @@
 //!
 //! Nothing is made in the namespace of the machine itself, so nothing can leave it.
 
-use std::{net::Ipv4Addr, path::Path, process::Command};
+use std::{
+    net::Ipv4Addr,
+    path::Path,
+    process::Command,
+    sync::atomic::{AtomicU32, Ordering},
+};
 
-use crate::unique;
+/// How many hosts this process has made networks of: part of their names.
+static NETWORKS: AtomicU32 = AtomicU32::new(0);
 
 /// Some hosts on one network. The namespaces are removed when this is dropped.
 #[derive(Debug)]
@@ -29,11 +35,11 @@ impl Hosts {
     /// # Errors
     /// A sentence: no root, no `ip`, or a kernel without namespaces.
     pub fn new(count: u8) -> Result<Self, String> {
-        let number = unique();
+        let number = format!("{}-{}-", std::process::id(), NETWORKS.fetch_add(1, Ordering::Relaxed));
         let bridge = Namespace::new(format!("sw{number}br"))?;
         bridge.ip("link add bridge type bridge")?;
         bridge.ip("link set bridge up")?;
-        let hosts = (1..=count).map(|index| Host::new(number, index, &bridge)).collect::<Result<_, _>>()?;
+        let hosts = (1..=count).map(|index| Host::new(&number, index, &bridge)).collect::<Result<_, _>>()?;
         Ok(Self { bridge, hosts })
     }
 
@@ -59,6 +65,20 @@ impl Hosts {
         self.set_port(host, "up");
     }
 
+    /// Lets so many kilobits a second through from and to each host; a port keeps 50 ms of what comes faster, and loses the
+    /// rest, as a switch does.
+    ///
+    /// # Errors
+    /// A sentence: no `tc`, or a kernel without token buckets.
+    pub fn throttle(&self, kbit_per_s: u32) -> Result<(), String> {
+        let queue = format!("root tbf rate {kbit_per_s}kbit burst 16kb latency 50ms");
+        for host in &self.hosts {
+            host.namespace.tc(&format!("qdisc replace dev eth0 {queue}"))?;
+            self.bridge.tc(&format!("qdisc replace dev {} {queue}", host.port))?;
+        }
+        Ok(())
+    }
+
     fn set_port(&self, host: usize, state: &str) {
         let port = &self.hosts[host].port;
         self.bridge
@@ -68,7 +88,7 @@ impl Hosts {
 }
 
 impl Host {
-    fn new(number: u32, index: u8, bridge: &Namespace) -> Result<Self, String> {
+    fn new(number: &str, index: u8, bridge: &Namespace) -> Result<Self, String> {
         let namespace = Namespace::new(format!("sw{number}h{index}"))?;
         let port = format!("port{index}");
         let address = Ipv4Addr::new(10, 77, 0, index);
@@ -95,31 +115,41 @@ struct Namespace(String);
 
 impl Namespace {
     fn new(name: String) -> Result<Self, String> {
-        run(&["netns", "add", &name])?;
+        run("ip", &["netns", "add", &name])?;
         Ok(Self(name))
     }
 
     /// `ip` inside this namespace.
     fn ip(&self, arguments: &str) -> Result<(), String> {
+        self.run("ip", arguments)
+    }
+
+    /// `tc` inside this namespace.
+    fn tc(&self, arguments: &str) -> Result<(), String> {
+        self.run("tc", arguments)
+    }
+
+    fn run(&self, program: &str, arguments: &str) -> Result<(), String> {
         let mut all = vec!["-n", &self.0];
         all.extend(arguments.split(' '));
-        run(&all)
+        run(program, &all)
     }
 }
 
 impl Drop for Namespace {
     fn drop(&mut self) {
-        if let Err(error) = run(&["netns", "del", &self.0]) {
+        if let Err(error) = run("ip", &["netns", "del", &self.0]) {
             eprintln!("the namespace {} stays: {error}", self.0);
         }
     }
 }
 
-fn run(arguments: &[&str]) -> Result<(), String> {
-    let output =
-        Command::new("ip").args(arguments).output().map_err(|error| format!("no `ip` command: {error}"))?;
+fn run(program: &str, arguments: &[&str]) -> Result<(), String> {
+    let output = Command::new(program).args(arguments).output();
+    let output = output.map_err(|error| format!("no `{program}` command: {error}"))?;
     if output.status.success() {
         return Ok(());
     }
-    Err(format!("`ip {}`: {}", arguments.join(" "), String::from_utf8_lossy(&output.stderr).trim()))
+    let said = String::from_utf8_lossy(&output.stderr);
+    Err(format!("`{program} {}`: {}", arguments.join(" "), said.trim()))
 }

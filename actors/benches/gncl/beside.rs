@@ -1,8 +1,6 @@
-//! The two nodes: who asks and floods, who answers and takes.
+//! Control beside Bulk: who asks and floods, who answers and takes.
 
 use std::{
-    io::Read,
-    net::Ipv4Addr,
     sync::{
         Arc,
         atomic::{AtomicBool, AtomicU64, Ordering},
@@ -13,16 +11,17 @@ use std::{
 
 use serde::{Deserialize, Serialize};
 use sinew::{Sender, prelude::*};
-use sinew_figures::Figures;
+use sinew_figures::{
+    Alone, Figures,
+    process::{await_end, say_there},
+};
 
-/// No wait of this bench is longer.
-const DEADLINE: Duration = Duration::from_secs(60);
+use crate::{nodes::At, ping::DEADLINE};
+
 /// From one round trip to the next.
 const PERIOD: Duration = Duration::from_millis(1);
 /// Round trips before any is counted.
 const WARM_UP: u64 = 200;
-/// Round trips that are counted, each time.
-const ROUNDS: u64 = 4_000;
 /// Messages that wait for the other node at most: enough to saturate, and 64 MB of the longest.
 const QUEUE: usize = 64;
 
@@ -62,11 +61,11 @@ impl Payload for Load {
 }
 
 /// What was measured.
-pub(crate) struct Seen {
-    pub(crate) alone: Figures,
-    pub(crate) beside: Figures,
+struct Seen {
+    alone: Figures,
+    beside: Figures,
     /// Bytes of Bulk that were taken by the socket's outlet, a second.
-    pub(crate) bulk_bytes_per_s: u64,
+    bulk_bytes_per_s: u64,
 }
 
 struct Echo;
@@ -108,6 +107,7 @@ struct Asker {
     to: Option<Tid>,
     round: u64,
     clock: Instant,
+    rounds: u64,
     figures: Figures,
     flood: Arc<Flood>,
     done: SyncSender<Seen>,
@@ -168,7 +168,7 @@ impl Handler<Delivery<Answer>> for Asker {
         if self.round > WARM_UP {
             self.figures.record(Duration::from_nanos(self.now_ns() - answer.payload.sent_ns));
         }
-        if self.round == WARM_UP + ROUNDS {
+        if self.round == WARM_UP + self.rounds {
             self.next();
         }
     }
@@ -194,27 +194,21 @@ impl Flood {
     }
 }
 
-fn node(name: &str, host: u8, group: &str) -> NodeBuilder {
-    let group = group.parse().expect("a group that this program wrote itself");
-    Node::builder(name).address(Ipv4Addr::new(127, 0, 0, host)).configure(|config| {
-        config.ndl.multicast = Some(group);
-        config.ndl.mdns_port = None;
-        config.gncl.queue_capacity = QUEUE;
-    })
+fn node(name: &str, at: At) -> NodeBuilder {
+    at.node(name).configure(|config| config.gncl.queue_capacity = QUEUE)
 }
 
-/// The node that answers, until its input ends.
-pub(crate) fn echo(group: &str, pause: Duration) {
+/// The node that answers, until its input ends; `pause` is what the flooded application takes for each message.
+pub(crate) fn echo(at: At, pause: Duration) {
     let echo = AppSpec::new("echo", || Echo).handles::<Ask>().own_thread();
     let sink = AppSpec::new("sink", move || Sink { pause }).handles::<Load>().own_thread();
-    let _node = node("there", 2, group).app(echo).app(sink).start().expect("a node");
-    println!("there");
-    // Until the measuring end closes the pipe or ends this process.
-    let _ = std::io::stdin().read(&mut [0]);
+    let _node = node("there", at).app(echo).app(sink).start().expect("a node");
+    say_there();
+    await_end();
 }
 
-/// The node that asks, and then asks and floods.
-pub(crate) fn measure(group: &str, bulk_bytes: usize) -> Seen {
+/// The node that asks so many times, and then asks and floods.
+pub(crate) fn measure(case: &str, at: At, bulk_bytes: usize, rounds: u64) {
     let (done, seen) = sync_channel(1);
     let flood = Flood { runs: AtomicBool::new(false), bytes: AtomicU64::new(0), message_bytes: bulk_bytes };
     let flood = Arc::new(flood);
@@ -222,6 +216,7 @@ pub(crate) fn measure(group: &str, bulk_bytes: usize) -> Seen {
         to: None,
         round: 0,
         clock: Instant::now(),
+        rounds,
         figures: Figures::new(),
         flood: flood.clone(),
         done: done.clone(),
@@ -229,8 +224,23 @@ pub(crate) fn measure(group: &str, bulk_bytes: usize) -> Seen {
         began: Instant::now(),
     };
     let asker = AppSpec::new("asker", asker).handles::<Answer>().requires(["echo", "sink"]).own_thread();
-    let node = node("here", 1, group).app(asker).start().expect("a node");
+    let node = node("here", at).app(asker).start().expect("a node");
     let seen = seen.recv_timeout(DEADLINE).expect("the rounds end");
     node.stop();
-    seen
+    seen.report(case);
+}
+
+impl Seen {
+    fn report(&self, case: &str) {
+        let report = |figure, seen, counts: &[(&str, u64)]| {
+            Alone { bench: "gncl", case, figure, seen, counts }.report();
+        };
+        report("Control alone", &self.alone, &[]);
+        let ratio = self.beside.p99().as_nanos() * 100 / self.alone.p99().as_nanos().max(1);
+        let counts = [
+            ("bulk_kib_per_s", self.bulk_bytes_per_s >> 10),
+            ("p99_ratio_percent", u64::try_from(ratio).unwrap_or(u64::MAX)),
+        ];
+        report("Control beside the flood", &self.beside, &counts);
+    }
 }

@@ -1,0 +1,220 @@
+//! Packets one way, as fast as they go, until the last one is there: confirmed, unconfirmed, and through bare TCP.
+
+use std::{
+    collections::VecDeque,
+    io::{BufReader, Read, Write},
+    os::unix::net::UnixStream,
+    sync::mpsc::{SyncSender, sync_channel},
+    time::{Duration, Instant},
+};
+
+use serde::{Deserialize, Serialize};
+use sinew::{Confirmation, Sender, prelude::*};
+use sinew_figures::{
+    Alone, Figures, Pinning,
+    process::{Process, await_end, say_there},
+    stream,
+};
+
+use crate::{nodes::At, ping::DEADLINE};
+
+/// Bytes of a packet.
+const PACKET: usize = 1000;
+/// Confirmed packets that are under way at most: as many as a mailbox holds of which nothing was said.
+const UNDER_WAY: usize = 256;
+/// How long the sender waits when there is no room.
+const PAUSE: Duration = Duration::from_micros(100);
+
+/// What carries the packets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Carrier {
+    /// Bulk, with an outcome for each packet.
+    Confirmed,
+    /// Bulk, without.
+    Unconfirmed,
+    /// Bare TCP, a length before each packet, a write for each.
+    Tcp,
+}
+
+impl Carrier {
+    pub(crate) const ALL: [Self; 3] = [Self::Confirmed, Self::Unconfirmed, Self::Tcp];
+
+    pub(crate) const fn name(self) -> &'static str {
+        match self {
+            Self::Confirmed => "confirmed",
+            Self::Unconfirmed => "unconfirmed",
+            Self::Tcp => "raw_tcp",
+        }
+    }
+
+    /// # Panics
+    /// If there is none of that name.
+    pub(crate) fn named(name: &str) -> Self {
+        let found = Self::ALL.into_iter().find(|carrier| carrier.name() == name);
+        found.expect("a name that this program wrote itself")
+    }
+}
+
+#[derive(Serialize, Deserialize)]
+struct Packet {
+    #[serde(with = "serde_bytes")]
+    block: Vec<u8>,
+}
+
+impl Payload for Packet {
+    const NAME: &'static str = "gncl.packet";
+    const CLASS: Class = Class::Bulk;
+}
+
+#[derive(Serialize, Deserialize)]
+struct Last;
+
+impl Payload for Last {
+    const NAME: &'static str = "gncl.last";
+}
+
+/// Measures, and prints the line.
+pub(crate) fn measure(carrier: Carrier, packets: usize, pinning: Pinning) {
+    let at = At::loopback();
+    let role = format!("sink {} {packets} {} {}", carrier.name(), pinning.name(), at.host(2));
+    let took = match carrier {
+        Carrier::Confirmed | Carrier::Unconfirmed => between_nodes(carrier, packets, at, &role),
+        Carrier::Tcp => raw(packets, &role),
+    };
+    let mut seen = Figures::new();
+    seen.record(took / u32::try_from(packets).expect("no flood has so many"));
+    let rate = packets as u128 * 1_000_000_000 / took.as_nanos().max(1);
+    let counts = [("messages_per_s", u64::try_from(rate).unwrap_or(u64::MAX)), ("packets", packets as u64)];
+    let case = format!("flood_{}_{}", carrier.name(), pinning.name());
+    Alone { bench: "gncl", case: &case, figure: "time for each packet", seen: &seen, counts: &counts }
+        .report();
+}
+
+/// The end that takes them.
+pub(crate) fn sink(carrier: Carrier, packets: usize, at: At) {
+    if carrier == Carrier::Tcp {
+        return raw_sink(packets);
+    }
+    let app = AppSpec::new("sink", move || Sink { left: packets }).handles::<Packet>().own_thread();
+    let _node = at.node("sink").app(app).start().expect("a node");
+    say_there();
+    await_end();
+}
+
+struct Sink {
+    left: usize,
+}
+
+impl Actor for Sink {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<Packet>> for Sink {
+    type Result = ();
+
+    fn handle(&mut self, packet: Delivery<Packet>, context: &mut Self::Context) {
+        std::hint::black_box(packet.payload.block);
+        self.left -= 1;
+        if self.left == 0 {
+            context.send(packet.source, &Last).expect("the measuring end takes it");
+        }
+    }
+}
+
+struct Flooder {
+    carrier: Carrier,
+    packets: usize,
+    start: Instant,
+    done: SyncSender<Duration>,
+}
+
+impl Actor for Flooder {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        let (to, sender) = (context.resolve("sink").expect("it was required"), context.sender());
+        let (carrier, packets) = (self.carrier, self.packets);
+        self.start = Instant::now();
+        let flood = async move {
+            match carrier {
+                Carrier::Confirmed => confirmed(&sender, to, packets).await,
+                Carrier::Unconfirmed | Carrier::Tcp => unconfirmed(&sender, to, packets).await,
+            }
+        };
+        context.spawn(flood.into_actor(self));
+    }
+}
+
+impl Handler<Delivery<Last>> for Flooder {
+    type Result = ();
+
+    fn handle(&mut self, _: Delivery<Last>, _: &mut Self::Context) {
+        self.done.send(self.start.elapsed()).expect("somebody waits for it");
+    }
+}
+
+async fn confirmed(sender: &Sender, to: Tid, packets: usize) {
+    let (packet, mut under_way) = (Packet { block: vec![7; PACKET] }, VecDeque::new());
+    for _ in 0..packets {
+        if under_way.len() == UNDER_WAY {
+            arrived(under_way.pop_front()).await;
+        }
+        let sent = sender.send_confirmed(to, &packet, DEADLINE);
+        under_way.push_back(sent.expect("there is room for what is under way"));
+    }
+    while !under_way.is_empty() {
+        arrived(under_way.pop_front()).await;
+    }
+}
+
+async fn arrived(confirmation: Option<Confirmation>) {
+    if let Some(confirmation) = confirmation {
+        assert_eq!(confirmation.await, Outcome::Delivered);
+    }
+}
+
+async fn unconfirmed(sender: &Sender, to: Tid, packets: usize) {
+    let packet = Packet { block: vec![7; PACKET] };
+    for _ in 0..packets {
+        while sender.send(to, &packet).is_err() {
+            actix::clock::sleep(PAUSE).await;
+        }
+    }
+}
+
+fn between_nodes(carrier: Carrier, packets: usize, at: At, role: &str) -> Duration {
+    let _sink = Process::start(role);
+    let (done, took) = sync_channel(1);
+    let make = move || Flooder { carrier, packets, start: Instant::now(), done: done.clone() };
+    let app = AppSpec::new("flooder", make).handles::<Last>().requires(["sink"]).own_thread();
+    let node = at.node("flooder").app(app).start().expect("a node");
+    let took = took.recv_timeout(DEADLINE).expect("the flood ends");
+    node.stop();
+    took
+}
+
+fn raw(packets: usize, role: &str) -> Duration {
+    let (mut ours, theirs) = stream::tcp_pair();
+    let _sink = Process::start_on(role, theirs.into());
+    let mut framed = vec![7; 4 + PACKET];
+    framed[..4].copy_from_slice(&(PACKET as u32).to_le_bytes());
+    let start = Instant::now();
+    for _ in 0..packets {
+        ours.write_all(&framed).expect("the sink reads");
+    }
+    ours.read_exact(&mut [0]).expect("the sink answers");
+    start.elapsed()
+}
+
+fn raw_sink(packets: usize) {
+    let stream = UnixStream::from(stream::input());
+    let mut reader = BufReader::with_capacity(64 * 1024, &stream);
+    let (mut length, mut packet) = ([0; 4], vec![0; PACKET]);
+    say_there();
+    for _ in 0..packets {
+        reader.read_exact(&mut length).expect("the sender lives");
+        let length = u32::from_le_bytes(length) as usize;
+        reader.read_exact(&mut packet[..length]).expect("the sender lives");
+    }
+    (&stream).write_all(&[1]).expect("the sender waits");
+}

@@ -1,0 +1,90 @@
+//! Round trips between applications of two nodes, beside blocking TCP.
+
+use sinew::prelude::*;
+use sinew_figures::{
+    Beside, Figures, Pinning, Rounds,
+    process::{Process, await_end, say_there},
+    stream,
+};
+
+use crate::{
+    nodes::At,
+    ping::{self, DEADLINE},
+};
+
+/// Where the two applications live.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Thread {
+    /// On the IO threads of their nodes.
+    Io,
+    /// On threads of their own.
+    Own,
+}
+
+impl Thread {
+    pub(crate) const ALL: [Self; 2] = [Self::Io, Self::Own];
+
+    pub(crate) const fn name(self) -> &'static str {
+        match self {
+            Self::Io => "io_thread",
+            Self::Own => "own_thread",
+        }
+    }
+
+    /// # Panics
+    /// If there is none of that name.
+    pub(crate) fn named(name: &str) -> Self {
+        let found = Self::ALL.into_iter().find(|thread| thread.name() == name);
+        found.expect("a name that this program wrote itself")
+    }
+
+    fn place<A>(self, app: AppSpec<A>) -> AppSpec<A>
+    where
+        A: Actor<Context = AppContext<A>>,
+    {
+        match self {
+            Self::Io => app.on_io_thread(),
+            Self::Own => app.own_thread(),
+        }
+    }
+}
+
+/// Measures both, and prints the line.
+pub(crate) fn measure(thread: Thread, rounds: Rounds, pinning: Pinning) {
+    Beside {
+        bench: "gncl",
+        case: thread.name(),
+        payload_bytes: rounds.bytes,
+        pinning: pinning.name(),
+        pace: rounds.pace.name(),
+        seen: &between_nodes(thread, rounds, pinning),
+        reference: "raw_tcp",
+        raw: &raw(rounds, pinning),
+    }
+    .report();
+}
+
+fn between_nodes(thread: Thread, rounds: Rounds, pinning: Pinning) -> Figures {
+    let at = At::loopback();
+    let role = format!("echo {} {} {}", thread.name(), pinning.name(), at.host(2));
+    let _echo = Process::start(&role);
+    let (ping, figures) = ping::ping(rounds);
+    let node = at.node("ping").app(thread.place(ping)).start().expect("a node");
+    let figures = figures.recv_timeout(DEADLINE).expect("the rounds end");
+    node.stop();
+    figures
+}
+
+/// The node that echoes, until its input ends.
+pub(crate) fn echo(thread: Thread, at: At) {
+    let _node = at.node("echo").app(thread.place(ping::echo())).start().expect("a node");
+    say_there();
+    await_end();
+}
+
+/// The same between two processes by bare sockets.
+fn raw(rounds: Rounds, pinning: Pinning) -> Figures {
+    let (ours, theirs) = stream::tcp_pair();
+    let _echo = Process::start_on(&format!("raw_echo {} {}", rounds.bytes, pinning.name()), theirs.into());
+    stream::round_trips(ours, rounds)
+}
