@@ -14,6 +14,7 @@
 //! | `recorder` | the role of one that is stopped: says what it got |
 //! | `crowd` | the role of one that takes all places at the door that it can have |
 //! | `victim` | the role of a process that is killed with loans in its hands |
+//! | `heir` | a child that holds what its parent had |
 //! | `held` | what a process has of the host |
 //! | `conservation` | the claim: what was sent has one fate that is true, whoever is killed |
 //! | `kills` | the claim: a killed process leaves nothing behind, and the others do not feel it |
@@ -23,6 +24,7 @@ pub mod conservation;
 mod crowd;
 mod door;
 pub mod entry;
+mod heir;
 mod held;
 pub mod hostile;
 pub mod kills;

@@ -39,7 +39,7 @@ use super::{
     routes::{Answered, Directness, Farewell, Left, LinkNumber, Marked, Passed, Routes, Way},
 };
 use crate::{
-    lncl::payload::{self, Introduce, Introduction, Registered, Switch},
+    lncl::payload::{self, Gone, Introduce, Introduction, Registered, Switch},
     ring::{self as rings, Exchange, ExchangeError, RingError},
 };
 
@@ -283,13 +283,13 @@ impl Direct {
         self.open.is_empty() && self.held.is_empty() && self.offered.is_empty() && self.early.is_empty()
     }
 
-    /// Whether the answer to an introduction that was asked for may have come; true once a nap.
+    /// Whether the answer to an introduction that was asked for may have come, or why a peer takes nothing; true once a nap.
     pub(super) fn is_asking(&mut self, now: Time) -> bool {
         if now < self.hear_at {
             return false;
         }
         self.hear_at = now + NAP;
-        self.routes.is_asking()
+        self.routes.is_asking() || self.open.iter().chain(&self.held).any(|link| link.is_stalled)
     }
 
     /// Whether something may be due that nobody rings for: a SWITCH, the end of a link that is not read yet.

@@ -29,7 +29,7 @@ use self::{
 };
 use super::{
     core::{Address, ClientId, Owner, Request},
-    introductions::Party,
+    introductions::{Leaves, Party},
     link::{self, ClientReader, ClientSocket},
     payload::{self, REGISTER_BYTES_MAX, Register, Registered},
     reader::Reader,
@@ -152,6 +152,8 @@ struct Client {
     ring: Ring,
     /// Whether others may be introduced to it.
     wants_links: bool,
+    /// How it leaves those to whom it was introduced.
+    leaves: Leaves,
     /// Whether the peer knows why its connection ends.
     has_been_told: bool,
     /// How it ends, as far as it is known.
@@ -175,7 +177,7 @@ impl Client {
         let (link, events, has_been_told) = (None, events.into(), false);
         let cause = Cause::new(DownClass::Killed, registrar::LNCL_ENDED);
         let ring = if ring { Ring::Asked } else { Ring::None };
-        let wants_links = direct;
+        let (wants_links, leaves) = (direct, Leaves::WithItsLinks);
         Ok(Self {
             server,
             peer,
@@ -189,6 +191,7 @@ impl Client {
             events,
             ring,
             wants_links,
+            leaves,
             has_been_told,
             cause,
         })
@@ -203,7 +206,7 @@ impl Client {
                 None => self.run(reader, session).await,
             }
         };
-        tokio::pin!(served);
+        let mut served = Box::pin(served);
         tokio::select! {
             end = &mut served => end,
             // spec: LNCL-15
@@ -211,7 +214,9 @@ impl Client {
                 // A child of its may hold the socket open, which hangs up now. An error means that it did so already. What the
                 // process said before it ended still counts; it is there already.
                 let _ = rustix::net::shutdown(&stream, Shutdown::Both);
-                tokio::time::timeout(LAST_WORDS, served).await.unwrap_or(End::HungUp(None))
+                let end = tokio::time::timeout(LAST_WORDS, served).await.unwrap_or(End::HungUp(None));
+                self.leaves = Leaves::Dead;
+                end
             }
         }
     }

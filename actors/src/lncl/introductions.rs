@@ -4,6 +4,7 @@
 //! is not one. Its own copies are closed as soon as they are on their way: a hang-up of one end is the end of its holder. The asker's
 //! end waits here for the answer, within bounds of number and time.
 
+mod met;
 mod unanswered;
 
 use std::{
@@ -33,7 +34,11 @@ use sinew_runtime::{
     wire::{Class, Flags, Kind, Message},
 };
 
-use self::unanswered::{Processes, Unanswered};
+pub(super) use self::met::Leaves;
+use self::{
+    met::Met,
+    unanswered::{Processes, Unanswered},
+};
 use super::payload::{self, Introduction, Switch};
 use crate::outlet::{Socket, StreamOutlet};
 
@@ -68,6 +73,8 @@ pub(super) struct Party {
     pub(super) socket: Arc<dyn AsFd + Send + Sync>,
     unanswered: AtomicUsize,
     switches: AtomicUsize,
+    /// Those whom it has a link with.
+    met: Met,
 }
 
 impl Party {
@@ -78,7 +85,7 @@ impl Party {
         socket: Arc<dyn AsFd + Send + Sync>,
     ) -> Self {
         let none = || AtomicUsize::new(0);
-        Self { tid, pid, outlet, socket, unanswered: none(), switches: none() }
+        Self { tid, pid, outlet, socket, unanswered: none(), switches: none(), met: Met::default() }
     }
 }
 
@@ -104,10 +111,6 @@ type Open = Arc<Mutex<Unanswered<Asked>>>;
 impl Introductions {
     pub(super) fn add(&self, party: Party) {
         self.parties.borrow_mut().insert(party.tid.app, Arc::new(party));
-    }
-
-    pub(super) fn remove(&self, app: AppAddress) {
-        self.parties.borrow_mut().remove(&app);
     }
 
     /// Introduces `asker` to `to` as it has asked. The asker is told LNCL_INTRODUCED, or an outcome.
@@ -234,6 +237,8 @@ impl Asked {
         let Self { asker, peer, number, correlation, end } = self;
         let mut answer = match outcome {
             Outcome::Delivered if pass(&*asker.socket, number, &end).is_ok() => {
+                asker.met.add(&peer, number);
+                peer.met.add(&asker, number);
                 told(Kind::LNCL_INTRODUCED, &asker, &peer, number)
             }
             // Its socket takes nothing, or this process has no descriptors left. Later, perhaps.

@@ -21,6 +21,7 @@
 //! | LNCL-14 | What nobody has taken of a client's unconfirmed messages the client is told, with its number and once: the first at once, later ones together. |
 //! | LNCL-15 | A connection ends with the process that connected, also while a child that it forked holds the socket open. |
 //! | LNCL-16 | Each confirmed message of a client's has an outcome, also where its queue is full. Who takes none is not read. |
+//! | LNCL-17 | Who has a direct link with a process that has ended is told so, also while a child of that process holds the link's end. |
 
 mod actor;
 mod client;

@@ -118,6 +118,15 @@ pub(crate) struct Switch {
     pub(crate) number: u64,
 }
 
+/// The process at the other end of a direct link has ended, whoever else holds that end.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Gone {
+    /// 64 bits of the TID of the other side.
+    pub(crate) peer: u64,
+    /// The link's number.
+    pub(crate) number: u64,
+}
+
 /// Unconfirmed messages of the client that nobody has taken, since it was told so last.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Untaken {

@@ -30,7 +30,7 @@
  * fork.  A child of fork may not use its parent's endpoints: they return SINEW_ERROR_FORKED there; nor may it write the
  *   bytes of its parent's messages, which may be shared memory. It may register its
  *   own if it may call malloc, that is if the parent had one thread. The node sees the parent's end also while a child
- *   lives that has its connections, too; a peer of a direct link does not, until that child ends or calls exec.
+ *   lives that has its connections, too, and tells the peers of its direct links.
  *   Endpoints do not survive exec.
  * Sizes.  sinew_options carries its size and may grow; all other structs and all numbers stay as they are as long as
  *   SINEW_ABI does.

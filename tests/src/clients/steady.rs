@@ -14,6 +14,7 @@ use std::{
 use sinew::{ApiError, Endpoint, NodeApi, Payload as _};
 
 use super::{
+    heir,
     registration::{register, wishes},
     say, told,
 };
@@ -107,7 +108,7 @@ pub(super) fn play_pinger(arguments: &[String]) {
     }
 }
 
-/// `SOCKET NAME`: answers questions, and lets go of everything else.
+/// `SOCKET NAME`: answers questions, and lets go of everything else. Leaves a child behind if it is told to (`fork`).
 pub(super) fn play_taker(arguments: &[String]) {
     let api = NodeApi::connect(&arguments[0]).expect("the door is open");
     let endpoint = register(&api, &wishes().direct(true).name(&*arguments[1]));
@@ -115,7 +116,10 @@ pub(super) fn play_taker(arguments: &[String]) {
     let ends = over.clone();
     let taker = thread::spawn(move || take(endpoint, &ends));
     say(&"up");
-    told().for_each(drop);
+    for order in told() {
+        assert_eq!(order, "fork");
+        say(&format!("forked {}", heir::fork()));
+    }
     over.store(true, Ordering::Relaxed);
     taker.join().expect("the node lives as long as this");
 }

@@ -30,20 +30,28 @@ struct Scene {
     echo: Performer,
     asking: Endpoint,
     to: Tid,
+    said: Said,
+}
+
+/// What echoes have said.
+#[derive(Clone, Default)]
+struct Said {
     ups: Log<()>,
+    /// Their children.
+    heirs: Log<u32>,
 }
 
 impl Scene {
     fn new() -> Self {
         let limits = StageLimits { mailbox_capacity: 64, payload_max: 64 * 1024, clients_max: 16 };
         let stage = Stage::new(&program("client_kills"), limits);
-        let ups = Log::default();
-        let echo = start_echo(&stage, &ups, 1);
+        let said = Said::default();
+        let echo = start_echo(&stage, &said, 1);
         let api = NodeApi::connect(stage.socket()).expect("the door is open");
         let mut asking =
             api.register_transport_address(Registration::new().direct(true)).expect("an address");
         let to = asking.resolve("echo", DEADLINE).expect("the node answers").expect("it is registered");
-        Self { stage, echo, asking, to, ups }
+        Self { stage, echo, asking, to, said }
     }
 
     fn signal_node(&self, signal: Signal) {
@@ -80,14 +88,16 @@ impl Scene {
     }
 }
 
-fn start_echo(stage: &Stage, ups: &Log<()>, count: usize) -> Performer {
-    let says = ups.clone();
+fn start_echo(stage: &Stage, said: &Said, count: usize) -> Performer {
+    let says = said.clone();
     let echo = stage.start("taker", &["echo".to_owned()], move |line| {
         if line == "up" {
-            says.write(());
+            says.ups.write(());
+        } else if let Some(heir) = line.strip_prefix("forked ") {
+            says.heirs.write(heir.parse().expect("a process id"));
         }
     });
-    ups.wait_for_many((), count);
+    said.ups.wait_for_many((), count);
     echo
 }
 
@@ -108,15 +118,15 @@ fn the_death_of_a_peer_is_an_outcome_also_while_the_node_is_stopped() {
     let mut scene = Scene::new();
     scene.stop_the_node_when_it_is_not_needed();
     scene.echo.freeze();
-    let Scene { stage, echo, mut asking, to, ups } = scene;
-    let (say, said) = sync_channel(1);
+    let Scene { stage, echo, mut asking, to, said } = scene;
+    let (say, begun) = sync_channel(1);
     let waiting = thread::spawn(move || {
         say.send(gettid().as_raw_nonzero().get()).expect("the test waits for it");
         let answer = asking.ask::<Order, Order>(to, &Order { number: 7 }, DEADLINE * 3);
         (asking, answer)
     });
     // It sleeps when the question is in the ring, and not before.
-    wait_until_asleep(said.recv_timeout(DEADLINE).expect("the thread begins"));
+    wait_until_asleep(begun.recv_timeout(DEADLINE).expect("the thread begins"));
 
     // When: it is killed.
     assert!(echo.kill(), "it had lived until then");
@@ -126,8 +136,8 @@ fn the_death_of_a_peer_is_an_outcome_also_while_the_node_is_stopped() {
     assert!(matches!(answer, Err(ApiError::Ended(Outcome::Failed))), "{answer:?}");
     let node = Pid::from_raw(i32::try_from(stage.node_id()).expect("a process id")).expect("a process id");
     kill_process(node, Signal::CONT).expect("the node runs");
-    let echo = start_echo(&stage, &ups, 2);
-    let mut scene = Scene { stage, echo, asking, to, ups };
+    let echo = start_echo(&stage, &said, 2);
+    let mut scene = Scene { stage, echo, asking, to, said };
     scene.to = scene.asking.resolve("echo", DEADLINE).expect("the node answers").expect("it is registered");
     assert_eq!(scene.ask(8, DEADLINE).expect("an answer").number, 8);
     scene.end();
@@ -171,7 +181,7 @@ fn asks_while(times: u64, mut fails: impl FnMut(&mut Stage)) {
     scene.stop_the_node_when_it_is_not_needed();
     scene.signal_node(Signal::CONT);
     let is_over = AtomicBool::new(false);
-    let Scene { mut stage, echo, asking, to, ups } = scene;
+    let Scene { mut stage, echo, asking, to, said } = scene;
     let (asking, answered) = thread::scope(|scope| {
         let asks = scope.spawn(|| {
             let mut asking = asking;
@@ -187,7 +197,7 @@ fn asks_while(times: u64, mut fails: impl FnMut(&mut Stage)) {
         asks.join().expect("it does not panic")
     });
     assert!(answered > times, "{answered} questions in all");
-    let mut scene = Scene { stage, echo, asking, to, ups };
+    let mut scene = Scene { stage, echo, asking, to, said };
     is_whole_again(&mut scene, 2);
     scene.end();
 }
@@ -200,4 +210,37 @@ fn every_question_on_a_link_has_its_one_answer_while_the_node_is_killed_and_repl
 #[test]
 fn every_question_on_a_link_has_its_one_answer_while_lncl_panics() {
     asks_while(5, Stage::panic_lncl);
+}
+
+#[test]
+fn the_death_of_a_peer_is_an_outcome_also_where_a_child_of_its_holds_the_link() {
+    // Given: a question on a link, in the hand of a process that does nothing and has a child with all its descriptors.
+    let mut scene = Scene::new();
+    scene.stop_the_node_when_it_is_not_needed();
+    scene.signal_node(Signal::CONT);
+    scene.echo.tell("fork");
+    let heir = scene.said.heirs.wait("a child of the echo", |heirs| heirs.first().copied());
+    let heir = Pid::from_raw(i32::try_from(heir).expect("a process id")).expect("a process id");
+    scene.echo.freeze();
+    let Scene { stage, echo, mut asking, to, said } = scene;
+    let (say, begun) = sync_channel(1);
+    let waiting = thread::spawn(move || {
+        say.send(gettid().as_raw_nonzero().get()).expect("the test waits for it");
+        let answer = asking.ask::<Order, Order>(to, &Order { number: 7 }, DEADLINE);
+        (asking, answer)
+    });
+    wait_until_asleep(begun.recv_timeout(DEADLINE).expect("the thread begins"));
+
+    // When: it is killed, then: the question has failed although the child is there.
+    assert!(echo.kill(), "it had lived until then");
+    let (asking, answer) = waiting.join().expect("it does not panic");
+    assert!(matches!(answer, Err(ApiError::Ended(Outcome::Failed))), "{answer:?}");
+    kill_process(heir, Signal::KILL).expect("the child is there all the time");
+
+    // And a new life is asked.
+    let echo = start_echo(&stage, &said, 2);
+    let mut scene = Scene { stage, echo, asking, to, said };
+    scene.to = scene.asking.resolve("echo", DEADLINE).expect("the node answers").expect("it is registered");
+    assert_eq!(scene.ask(8, DEADLINE).expect("an answer").number, 8);
+    scene.end();
 }

@@ -14,6 +14,7 @@ impl Direct {
             Kind::LNCL_INTRODUCTION => self.meet(&message, now, node),
             Kind::LNCL_INTRODUCED => self.go_on(&message, now, node),
             Kind::LNCL_SWITCH => self.mark(&message, now, node),
+            Kind::LNCL_GONE => self.gone(&message),
             Kind::OUTCOME => return self.hear(message, now),
             // Not an enum of ours: an open set of numbers.
             _ => return Some(message),
@@ -144,6 +145,21 @@ impl Direct {
                 self.routes.ended(peer, now);
                 false
             }
+        }
+    }
+
+    /// The peer's process has ended, and perhaps a child of its holds the link's other end: it is as if that hung up.
+    fn gone(&mut self, message: &Message) {
+        let Ok(Gone { peer, number }) = payload::read(&message.payload) else { return };
+        let (peer, number) = (Tid::from_bits(peer), LinkNumber(number));
+        if self.routes.link(peer) != Some(number) {
+            return;
+        }
+        let standing = self.open.iter().chain(&self.held).map(|link| (link.number, &link.socket));
+        let offered = self.offered.iter().map(|link| (link.number, &link.socket));
+        if let Some((_, socket)) = standing.chain(offered).find(|(found, _)| *found == number) {
+            hang_up(socket);
+            self.look_at = Time::ZERO;
         }
     }
 

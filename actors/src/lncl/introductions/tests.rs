@@ -9,6 +9,7 @@ use rustix::net::{RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, recv, re
 use sinew_runtime::tid::NodeAddress;
 
 use super::*;
+use crate::lncl::payload::Gone;
 
 const NOW: Time = Time::from_nanos(1);
 
@@ -139,7 +140,7 @@ fn who_is_not_there_or_oneself_cannot_be_met() {
         Err(Rejection::Unsupported)
     );
     let gone = join(&introductions, 2, 4);
-    introductions.remove(gone.tid.app);
+    introductions.remove(gone.tid.app, Leaves::WithItsLinks);
     assert_eq!(
         introductions.introduce(asker.tid, gone.tid, question(1, 1), NOW),
         Err(Rejection::Unsupported)
@@ -274,4 +275,47 @@ fn a_mark_goes_behind_each_class_whatever_the_bounds_and_so_many_are_unconfirmed
     }
     assert_eq!(pass(peer.tid), Err(Rejection::QueueFull));
     assert_eq!(outcome.recv(), Ok(Outcome::Rejected(Rejection::QueueFull)));
+}
+
+/// The numbers of the links of which a client is told that their peer is dead.
+fn told_dead(client: &Client, dead: Tid) -> Vec<u64> {
+    let gone = client.marks.try_iter().filter(|mark| mark.header.kind == Kind::LNCL_GONE);
+    gone.map(|mark| payload::read::<Gone>(&mark.payload).unwrap())
+        .inspect(|gone| assert_eq!(gone.peer, dead.bits()))
+        .map(|gone| gone.number)
+        .collect()
+}
+
+// spec: LNCL-17
+#[test]
+fn who_has_met_one_that_is_dead_is_told_once_and_nobody_else_is() {
+    // Given: one who has met two others, by asking and by being asked, and one who has refused it.
+    let introductions = Introductions::default();
+    let [dead, asked, asking, shy] = [1, 2, 3, 4].map(|app| join(&introductions, app, 4));
+    for (from, to, number) in [(&asking, &dead, 8), (&dead, &asked, 7)] {
+        introductions.introduce(from.tid, to.tid, question(number, 1), NOW).unwrap();
+        to.next().settle(Outcome::Delivered);
+    }
+    introductions.introduce(dead.tid, shy.tid, question(9, 1), NOW).unwrap();
+    shy.next().settle(Outcome::Rejected(Rejection::Unsupported));
+
+    // When: its process ends, and another one has its address and ends, too.
+    introductions.remove(dead.tid.app, Leaves::Dead);
+    join(&introductions, 1, 4);
+    introductions.remove(dead.tid.app, Leaves::Dead);
+
+    // Then:
+    assert_eq!(told_dead(&asked, dead.tid), [7]);
+    assert_eq!(told_dead(&asking, dead.tid), [8]);
+    assert!(told_dead(&shy, dead.tid).is_empty());
+}
+
+#[test]
+fn a_link_outlives_the_connections_of_those_who_have_it() {
+    let introductions = Introductions::default();
+    let (one, other) = (join(&introductions, 1, 4), join(&introductions, 2, 4));
+    introductions.introduce(one.tid, other.tid, question(7, 1), NOW).unwrap();
+    other.next().settle(Outcome::Delivered);
+    introductions.remove(one.tid.app, Leaves::WithItsLinks);
+    assert!(told_dead(&other, one.tid).is_empty());
 }

@@ -12,7 +12,7 @@ use sinew_runtime::wire::{Flags, Header, Message};
 use super::*;
 use crate::{
     api::direct::Came,
-    lncl::payload::{self, Introduction, Switch},
+    lncl::payload::{self, Gone, Introduction, Switch},
 };
 
 #[test]
@@ -114,6 +114,29 @@ fn what_the_node_says_of_links_that_are_none_changes_nothing() {
     let received = one.receive(WATCHDOG).unwrap().expect("a message");
     assert_eq!(received.decode::<Counted>().unwrap(), Counted(5));
     assert!(has_link(&one, &other) && has_link(&other, &one));
+}
+
+// spec: LNCL-17
+#[test]
+fn who_only_sends_hears_of_the_end_of_a_peer_that_takes_nothing_and_whose_link_does_not_hang_up() {
+    // Given: a link that is full, whose peer takes nothing.
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let mut one = register(&node, Registration::new().direct(true).patience(Duration::from_millis(1)));
+    let mut other = endpoint(&node);
+    link(&mut one, &mut other);
+    while one.send(other.tid(), &Counted(1)).is_ok() {}
+    let number = one.direct.open[0].number;
+
+    // When: the node says that it is dead.
+    let gone = Gone { peer: other.tid().bits(), number: number.0 };
+    let lncl = payload::lncl_of(node.address());
+    node.stores.router.send(payload::frame(Kind::LNCL_GONE, lncl, one.tid(), &gone)).unwrap();
+
+    // Then: what is sent goes through the node; here its next life is there already.
+    let deadline = Time::now() + WATCHDOG;
+    while one.send(other.tid(), &Counted(2)).is_err() {
+        assert!(Time::now() < deadline, "waited for the way through the node");
+    }
 }
 
 /// Sends a descriptor where the protocol has none.
