@@ -3,7 +3,7 @@
 use bytes::{Buf, BufMut, Bytes, BytesMut};
 use tokio_util::codec::{Decoder, Encoder};
 
-use crate::wire::{HEADER_LEN, Header, HeaderError, Message};
+use crate::wire::{HEADER_LEN, Header, HeaderError, Message, long};
 
 /// Why a stream of frames cannot go on. The connection is of no use after it.
 #[derive(Debug, thiserror::Error)]
@@ -129,7 +129,7 @@ impl FrameCodec {
             // Where the one before it is not needed any more its memory is used again.
             source.reserve(whole - source.len());
         } else if source.capacity() < whole {
-            let mut own = BytesMut::with_capacity(whole);
+            let mut own = long::with_room(whole);
             own.put_slice(source);
             *source = own;
         }

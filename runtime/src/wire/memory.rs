@@ -11,6 +11,8 @@ use std::{
 
 use bytes::{Bytes, BytesMut};
 
+use super::long;
+
 /// Bytes of a buffer: a payload of 4 KiB and what MessagePack puts around it.
 const BUFFER_BYTES: usize = 4 * 1024 + 256;
 /// Buffers of one thread. More payloads than that under way at once are allocated one by one.
@@ -36,7 +38,7 @@ pub(super) fn written<E>(write: impl FnOnce(&mut Writer) -> Result<(), E>) -> Re
 /// Zeroed memory of `length` bytes.
 pub(super) fn zeroed(length: usize) -> BytesMut {
     if length > BUFFER_BYTES {
-        return BytesMut::zeroed(length);
+        return long::zeroed(length);
     }
     let mut buffer = Buffer::take();
     buffer.memory.resize(length, 0);

@@ -6,6 +6,7 @@
 mod codec;
 mod header;
 mod kind;
+mod long;
 mod memory;
 mod message;
 
