@@ -17,13 +17,18 @@ use std::{
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use sinew_runtime::time::Time;
-use sinew_shm::Armed;
-use tokio::{io::Interest, net::UnixStream, sync::oneshot, task::spawn_blocking};
+use sinew_shm::{Armed, Looked, Looking};
+use tokio::{
+    io::Interest,
+    net::UnixStream,
+    sync::oneshot,
+    task::{spawn_blocking, yield_now},
+};
 
 use links::{Heard, Links, forget};
 
 use super::{
-    direct::{Direct, Room, Standing},
+    direct::{Direct, Everything, Room, Standing},
     link::{
         Link, Reader, Writer,
         ring::{self, NAP, Rest},
@@ -72,33 +77,55 @@ impl Reactor {
         reader: &mut Reader,
         writer: &Writer,
         direct: &mut Direct,
-        Until { deadline, room }: Until,
+        until: Until,
     ) {
         match (&self.ears, reader) {
             (Ears::Socket(socket), _) => tokio::select! {
                 () = ready(socket, Interest::READABLE, PollFlags::IN) => {}
                 () = writer.owing() => {}
-                () = until(deadline) => {}
+                () = at(until.deadline) => {}
             },
-            (Ears::Ring { message, socket, .. }, Reader::Ring(reader)) => {
-                self.links.follow(direct, room);
-                let Some(mut listening) = Listening::begin(Some(reader), direct, room) else { return };
-                let links = &mut self.links;
-                let heard = tokio::select! {
-                    () = rung(message) => Heard::Bell,
-                    () = ready(socket, Interest::READABLE, PollFlags::RDHUP) => {
-                        listening.look_at_once();
-                        Heard::Bell
-                    }
-                    heard = poll_fn(|cx| links.poll(cx)) => heard,
-                    () = writer.owing() => Heard::Bell,
-                    () = until(deadline) => Heard::Bell,
+            (Ears::Ring { .. }, Reader::Ring(reader)) => {
+                let looking = reader.begin_looking();
+                let has_come = match &looking {
+                    Some(looking) => finds_something(looking, reader, &mut direct.open).await,
+                    None => false,
                 };
-                drop(listening);
-                direct.heard(heard == Heard::HungUp);
+                if !has_come {
+                    self.sleep(reader, writer, direct, until).await;
+                }
+                if let Some(looking) = looking {
+                    reader.end_looking(&looking);
+                }
             }
             (Ears::Ring { .. }, Reader::Socket(_)) => unreachable!("both are of one link"),
         }
+    }
+
+    /// Sleeps at the node's ring and the links, once.
+    async fn sleep(
+        &mut self,
+        reader: &mut ring::Reader,
+        writer: &Writer,
+        direct: &mut Direct,
+        Until { deadline, room }: Until,
+    ) {
+        let Ears::Ring { message, socket, .. } = &self.ears else { return };
+        self.links.follow(direct, room);
+        let Some(mut listening) = Listening::begin(Some(reader), direct, room) else { return };
+        let links = &mut self.links;
+        let heard = tokio::select! {
+            () = rung(message) => Heard::Bell,
+            () = ready(socket, Interest::READABLE, PollFlags::RDHUP) => {
+                listening.look_at_once();
+                Heard::Bell
+            }
+            heard = poll_fn(|cx| links.poll(cx)) => heard,
+            () = writer.owing() => Heard::Bell,
+            () = at(deadline) => Heard::Bell,
+        };
+        drop(listening);
+        direct.heard(heard == Heard::HungUp);
     }
 
     /// The same while there is no node: for direct links alone.
@@ -108,7 +135,7 @@ impl Reactor {
         let links = &mut self.links;
         let heard = tokio::select! {
             heard = poll_fn(|cx| links.poll(cx)) => heard,
-            () = until(deadline) => Heard::Bell,
+            () = at(deadline) => Heard::Bell,
         };
         drop(listening);
         direct.heard(heard == Heard::HungUp);
@@ -124,7 +151,7 @@ impl Reactor {
         // Not disarmed if this is dropped: the peer may ring once for nothing.
         tokio::select! {
             () = poll_fn(|cx| links.poll_room(cx)) => {}
-            () = until(deadline) => {}
+            () = at(deadline) => {}
         }
         direct.disarm_room(room);
     }
@@ -134,7 +161,7 @@ impl Reactor {
         match &self.ears {
             Ears::Socket(socket) => tokio::select! {
                 () = ready(socket, Interest::WRITABLE, PollFlags::OUT) => {}
-                () = until(deadline) => {}
+                () = at(deadline) => {}
             },
             Ears::Ring { room, socket, .. } => {
                 let armed = match rest {
@@ -148,7 +175,7 @@ impl Reactor {
                 tokio::select! {
                     () = rung(room) => {}
                     () = ready(socket, Interest::READABLE, PollFlags::RDHUP) => {}
-                    () = until(deadline) => {}
+                    () = at(deadline) => {}
                 }
                 match rest {
                     Some(rest) => rest.disarm(),
@@ -197,7 +224,7 @@ impl Reactor {
         let found = self.home.as_mut()?;
         let link = tokio::select! {
             link = found => link.ok(),
-            () = until(deadline) => return None,
+            () = at(deadline) => return None,
         };
         self.home = None;
         link
@@ -221,6 +248,17 @@ impl Ears {
             }
             (Reader::Socket(reader), _) => Ok(Self::Socket(watch(reader.fd())?)),
             (Reader::Ring(_), Writer::Socket(_)) => unreachable!("both are of one link"),
+        }
+    }
+}
+
+/// Looks as long as it is to before a sleep; whether something has come. Other tasks have their turn between.
+async fn finds_something(looking: &Looking, reader: &mut ring::Reader, links: &mut [Standing]) -> bool {
+    loop {
+        match reader.look(looking, |node| Everything { node, links }) {
+            Looked::Something => return true,
+            Looked::Nothing => return false,
+            Looked::NotYet => yield_now().await,
         }
     }
 }
@@ -296,7 +334,7 @@ async fn ready(socket: &UnixStream, interest: Interest, what: PollFlags) {
 }
 
 /// Ends at `deadline`.
-async fn until(deadline: Time) {
+async fn at(deadline: Time) {
     if deadline == Time::MAX {
         return std::future::pending().await;
     }

@@ -51,6 +51,45 @@ pub enum Any {
     TimedOut,
 }
 
+/// The longest that a reactor looks at once: between two such looks others that it runs have their turn.
+const SLICE: Duration = Duration::from_micros(10);
+
+/// A look before a sleep that a reactor sleeps by itself: [`Waiter::begin`].
+#[derive(Debug)]
+pub struct Looking {
+    started: Instant,
+    budget: Duration,
+}
+
+/// What a reactor's look has found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Looked {
+    /// There is something.
+    Something,
+    /// There is nothing, and it is to look again.
+    NotYet,
+    /// There is nothing, and it is to sleep.
+    Nothing,
+}
+
+impl Looking {
+    /// Looks for 10 microseconds at most.
+    pub fn look(&self, ends: &mut impl Ends) -> Looked {
+        // Corrupt memory shows when it is read.
+        if look(ends).map_or(true, |found| found.is_some()) {
+            return Looked::Something;
+        }
+        let left = self.budget.saturating_sub(self.started.elapsed());
+        if left.is_zero() {
+            return Looked::Nothing;
+        }
+        if spin(left.min(SLICE), || (0..ends.count()).any(|index| ends.consumer(index).has_moved())) {
+            return Looked::Something;
+        }
+        Looked::NotYet
+    }
+}
+
 /// A thread that waits for several consumers: what it does before it sleeps, and what it has learned about that.
 #[derive(Debug)]
 pub struct Waiter {
@@ -108,6 +147,20 @@ impl Waiter {
             self.spinner.learn(started.elapsed());
         }
         Ok(ended)
+    }
+
+    /// For a reactor, which sleeps by itself: the look before that. `None` if it is to sleep at once.
+    pub fn begin(&mut self) -> Option<Looking> {
+        let budget = self.spinner.begin();
+        let looks = !budget.is_zero() || self.spinner.learns();
+        looks.then(|| Looking { started: Instant::now(), budget })
+    }
+
+    /// The wait that began with this look is over, whether it slept or not.
+    pub fn end(&mut self, looking: &Looking) {
+        if self.spinner.learns() {
+            self.spinner.learn(looking.started.elapsed());
+        }
     }
 
     fn spin_or_sleep(

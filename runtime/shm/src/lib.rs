@@ -61,7 +61,7 @@ mod platform;
 #[path = "elsewhere.rs"]
 mod platform;
 
-pub use any::{Any, ENDS_MAX, Ends, Waiter};
+pub use any::{Any, ENDS_MAX, Ends, Looked, Looking, Waiter};
 pub use bell::{Bell, BellKind, CommonBell};
 pub use consumer::{Consumer, Lent, LentReader};
 pub use error::{

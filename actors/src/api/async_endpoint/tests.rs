@@ -4,13 +4,14 @@ mod links;
 
 use std::{
     cell::Cell,
+    future::Future,
     pin::pin,
     sync::{
         Arc,
         atomic::{AtomicU64, Ordering},
         mpsc::{SyncSender, sync_channel},
     },
-    task::Poll,
+    task::{Context, Poll, Wake, Waker},
     thread::{self, JoinHandle},
     time::Duration,
 };
@@ -21,6 +22,7 @@ use sinew_runtime::{
     tid::Tid,
     wire::{Class, Header, Kind, Message, Payload},
 };
+use sinew_shm::Spin;
 use tokio::{
     runtime::{Builder, Runtime},
     time::timeout,
@@ -300,4 +302,40 @@ fn a_registration_that_is_dropped_at_the_barrier_gives_its_name_back() {
         .await
         .expect("the name is free");
     });
+}
+
+/// Counts how often it is woken.
+#[derive(Default)]
+struct Wakes(AtomicU64);
+
+impl Wake for Wakes {
+    fn wake(self: Arc<Self>) {
+        self.0.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+#[test]
+fn a_task_looks_before_it_sleeps_if_that_was_asked_for() {
+    for (spin, looks) in [(Spin::Off, false), (Spin::For(WATCHDOG), true)] {
+        let node = TestNode::start();
+        let app = node.local(1);
+        runtime().block_on(async {
+            // given: nothing to receive
+            let api = NodeApi::connect(node.path()).unwrap();
+            let wish = Registration::new().spin(spin);
+            let mut endpoint = api.register_transport_address_async(wish).await.unwrap();
+            let _ = timeout(Duration::from_millis(30), endpoint.receive()).await;
+            let tid = endpoint.tid();
+            let wakes = Arc::new(Wakes::default());
+            let waker = Waker::from(wakes.clone());
+            let mut receiving = pin!(endpoint.receive());
+            // when
+            assert!(receiving.as_mut().poll(&mut Context::from_waker(&waker)).is_pending());
+            tokio::task::yield_now().await;
+            // then: it wants its turn again at once, or sleeps
+            assert_eq!(wakes.0.load(Ordering::Relaxed) > 0, looks, "{spin:?}");
+            node.stores.router.send(Message::typed(app.tid, tid, &TORQUE)).unwrap();
+            drop(timeout(WATCHDOG, receiving).await.expect("it comes").unwrap());
+        });
+    }
 }

@@ -27,8 +27,8 @@ use sinew_runtime::{
     wire::{FrameCodec, Kind, Message},
 };
 use sinew_shm::{
-    Any, AnyError, Armed, Bell, BellKind, Capacity, Consumer, Ends, HangUp, LoanError, Producer, Region,
-    RoomError, Spin, Wait, Waiter,
+    Any, AnyError, Armed, Bell, BellKind, Capacity, Consumer, Ends, HangUp, LoanError, Looked, Looking,
+    Producer, Region, RoomError, Spin, Wait, Waiter,
 };
 use tokio::sync::Notify;
 use tokio_util::codec::Decoder;
@@ -377,6 +377,25 @@ impl Reader {
         all: impl FnOnce(&'a mut End) -> E,
     ) -> Result<Any, AnyError> {
         self.waiter.wait_within(&mut all(&mut self.end), left.min(NAP))
+    }
+
+    /// The look of a task before it sleeps; `None` if it is to sleep at once.
+    pub(in crate::api) fn begin_looking(&mut self) -> Option<Looking> {
+        self.waiter.begin()
+    }
+
+    /// Looks at the ends that `all` makes of the node's and others.
+    pub(in crate::api) fn look<'a, E: Ends>(
+        &'a mut self,
+        looking: &Looking,
+        all: impl FnOnce(&'a mut End) -> E,
+    ) -> Looked {
+        looking.look(&mut all(&mut self.end))
+    }
+
+    /// The wait that began with this look is over.
+    pub(in crate::api) fn end_looking(&mut self, looking: &Looking) {
+        self.waiter.end(looking);
     }
 
     /// What the end of a wait says about the node.
