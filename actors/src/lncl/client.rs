@@ -171,7 +171,7 @@ impl Client {
         let name = lock(&server.stores.registry).name_of(app);
         let outlet = Arc::new(StreamOutlet::sharing(limits(&server.stores), server.budget_of(peer.pid)));
         let outcomes = Outcomes::new(outlet.clone(), server.stores.config.mailbox_capacity);
-        let notices = Rc::new(Notices::new(tid, outlet.clone()));
+        let notices = Rc::new(Notices::new(tid, outlet.clone(), server.stores.config.payload_max));
         server.add_client(peer.id, outlet.clone(), notices.clone());
         crate::log::info!(%tid, name, pid = peer.pid, "an application of another process has registered");
         let (link, events, has_been_told) = (None, events.into(), false);

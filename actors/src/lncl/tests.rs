@@ -190,6 +190,24 @@ fn who_sends_more_than_its_destination_takes_is_told_how_much_of_it_and_not_of_e
 }
 
 #[test]
+fn who_may_take_short_payloads_only_is_told_of_each_destination_all_the_same() {
+    let node = TestNode::start_with(|config| config.payload_max = 64);
+    let (mut client, tid) = RawClient::register(&node, &Register::default());
+    let mut nobodies: Vec<_> =
+        (1..=5).map(|index| Tid::new(node.address(), AppAddress::fixed(index).unwrap())).collect();
+    for nobody in &nobodies {
+        client.send(&Message::typed(tid, *nobody, &Angle { degrees: 1.0 }));
+    }
+    while !nobodies.is_empty() {
+        let said = client.next().expect("what nobody has taken");
+        let Untaken { entries } = payload::read(&said.payload).unwrap();
+        let [entry] = &entries[..] else { panic!("{entries:?} have no room in 64 bytes") };
+        let at = nobodies.iter().position(|nobody| nobody.bits() == entry.to).expect("told once");
+        nobodies.remove(at);
+    }
+}
+
+#[test]
 fn what_waits_for_the_clients_of_one_process_has_a_bound_together_and_goes_with_them() {
     // Given: two clients of this process that read nothing, with plenty of room for each and little for both.
     let node = TestNode::start_with(|config| {

@@ -15,18 +15,31 @@ use super::payload::{Untaken, UntakenEntry};
 
 /// Destinations and reasons that are told apart between two frames; what comes beyond them is told of no destination.
 pub(super) const ENTRIES_MAX: usize = 16;
+/// Bytes of a frame's payload beside its entries, at most.
+const FRAME_BYTES: usize = 12;
+/// Bytes of one entry, at most.
+const ENTRY_BYTES: usize = 49;
 /// Shortest time between two frames.
 const PAUSE: Duration = Duration::from_millis(100);
 
 /// What one client is to be told.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Ledger {
     entries: Vec<UntakenEntry>,
+    /// As many as one frame has.
+    told_at_once: usize,
     /// Nothing is told before this.
     not_before: Option<Time>,
 }
 
 impl Ledger {
+    /// That of a client whose longest payload has so many bytes. The shortest that can be configured has room for one entry; the
+    /// others have a frame of their own then.
+    pub(super) fn new(payload_max: usize) -> Self {
+        let told_at_once = (payload_max.saturating_sub(FRAME_BYTES) / ENTRY_BYTES).max(1);
+        Self { entries: Vec::new(), told_at_once, not_before: None }
+    }
+
     /// One more message to `destination` was refused at `now`.
     pub(super) fn count(&mut self, destination: Tid, why: Rejection, now: Time) {
         let why = Outcome::Rejected(why).code();
@@ -44,7 +57,8 @@ impl Ledger {
             return None;
         }
         self.not_before = Some(now + PAUSE);
-        Some(Untaken { entries: std::mem::take(&mut self.entries) })
+        let rest = self.entries.split_off(self.told_at_once.min(self.entries.len()));
+        Some(Untaken { entries: std::mem::replace(&mut self.entries, rest) })
     }
 
     /// It could not be told: it is told later, with what comes until then.
@@ -90,7 +104,7 @@ mod tests {
 
     #[test]
     fn the_first_refusal_is_told_at_once_and_those_after_it_together() {
-        let mut ledger = Ledger::default();
+        let mut ledger = Ledger::new(1 << 20);
         ledger.count(tid(1), FULL, at(0));
         assert_eq!(told(&mut ledger, at(0)), [(tid(1).bits(), 1)]);
         for millis in 1..100 {
@@ -106,7 +120,7 @@ mod tests {
 
     #[test]
     fn reasons_are_told_apart() {
-        let mut ledger = Ledger::default();
+        let mut ledger = Ledger::new(1 << 20);
         ledger.count(tid(1), FULL, at(0));
         ledger.count(tid(1), Rejection::NoSuchApplication, at(0));
         let whys: Vec<_> = ledger.take(at(0)).unwrap().entries.iter().map(|entry| entry.why).collect();
@@ -118,7 +132,7 @@ mod tests {
 
     #[test]
     fn destinations_beyond_the_bound_are_counted_together() {
-        let mut ledger = Ledger::default();
+        let mut ledger = Ledger::new(1 << 20);
         for app in 0..1_000 {
             ledger.count(tid(app), FULL, at(0));
         }
@@ -129,12 +143,36 @@ mod tests {
 
     #[test]
     fn what_could_not_be_told_is_told_later_with_what_came_since() {
-        let mut ledger = Ledger::default();
+        let mut ledger = Ledger::new(1 << 20);
         ledger.count(tid(1), FULL, at(0));
         let untold = ledger.take(at(0)).unwrap();
         ledger.count(tid(1), FULL, at(1));
         ledger.count(tid(2), FULL, at(1));
         ledger.put_back(untold);
         assert_eq!(told(&mut ledger, at(100)), [(tid(1).bits(), 2), (tid(2).bits(), 1)]);
+    }
+
+    #[test]
+    fn what_does_not_fit_into_a_short_payload_is_told_in_the_frames_after_it() {
+        let shortest = 64;
+        let mut ledger = Ledger::new(shortest);
+        for app in 0..1_000 {
+            ledger.count(tid(app), FULL, at(0));
+        }
+        let frames =
+            (0..).map(|tenth| told(&mut ledger, at(100 * tenth))).take_while(|told| !told.is_empty());
+        let told: Vec<_> = frames.inspect(|told| assert_eq!(told.len(), 1)).flatten().collect();
+        assert_eq!(told.len(), ENTRIES_MAX + 1);
+        assert_eq!(told.iter().map(|(_, count)| count).sum::<u64>(), 1_000);
+    }
+
+    #[test]
+    fn no_frame_is_longer_than_it_is_counted() {
+        let longest = || UntakenEntry { to: u64::MAX, why: u8::MAX, count: u64::MAX, since: u64::MAX };
+        for entries in [0, 1, 15, 16, ENTRIES_MAX + 11] {
+            let untaken = Untaken { entries: (0..entries).map(|_| longest()).collect() };
+            let bytes = rmp_serde::to_vec_named(&untaken).unwrap().len();
+            assert!(bytes <= FRAME_BYTES + entries * ENTRY_BYTES, "{entries} entries have {bytes} bytes");
+        }
     }
 }

@@ -17,8 +17,9 @@ pub(in crate::lncl) struct Notices {
 }
 
 impl Notices {
-    pub(super) fn new(tid: Tid, outlet: Arc<ClientOutlet>) -> Self {
-        Self { tid, outlet, ledger: RefCell::default() }
+    /// For a client whose longest payload has so many bytes.
+    pub(super) fn new(tid: Tid, outlet: Arc<ClientOutlet>, payload_max: usize) -> Self {
+        Self { tid, outlet, ledger: RefCell::new(Ledger::new(payload_max)) }
     }
 
     /// An unconfirmed message to `destination` was refused at `now`.
