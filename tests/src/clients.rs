@@ -18,6 +18,7 @@
 //! | `held` | what a process has of the host |
 //! | `conservation` | the claim: what was sent has one fate that is true, whoever is killed |
 //! | `kills` | the claim: a killed process leaves nothing behind, and the others do not feel it |
+//! | `host` | the role of one that lets everybody have a direct link with it, and answers whatever comes |
 //! | `hostile` | the claim: whatever a client does, the node lives within its bounds and serves the others |
 
 pub mod conservation;
@@ -26,6 +27,7 @@ mod door;
 pub mod entry;
 mod heir;
 mod held;
+mod host;
 pub mod hostile;
 pub mod kills;
 pub mod ledger;
@@ -67,6 +69,7 @@ pub fn play() -> Option<ExitCode> {
         "sleeper" => hostile::play_sleeper(&arguments),
         "pinger" => steady::play_pinger(&arguments),
         "recorder" => recorder::play(&arguments),
+        "host" => host::play(&arguments),
         "taker" => steady::play_taker(&arguments),
         "victim" => victim::play(&arguments),
         _ => panic!("nobody plays {role:?}"),

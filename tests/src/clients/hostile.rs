@@ -1,9 +1,10 @@
-//! The claim: whatever a client does, the node lives within its bounds, serves the others, and counts what it refuses.
+//! The claim: whatever a client does, the node lives within its bounds, serves the others, and counts what it refuses; and so do those
+//! who let it have a direct link with them.
 //!
 //! | file | what it is |
 //! | --- | --- |
 //! | `stranger` | a connection by hand |
-//! | `ring` | the hostile end of a link with rings |
+//! | `ring` | the hostile end of rings |
 //! | `tricks` | what a hostile client does |
 
 mod ring;
@@ -32,6 +33,7 @@ use self::{
 use super::{
     Performer, Stage, StageLimits,
     held::Held,
+    host::HOSTS,
     say,
     steady::{ECHO, Window},
     told,
@@ -70,7 +72,18 @@ pub struct Report {
     pub grown_kib: u64,
     held: (Held, Held),
     windows: [Window; 2],
+    hosts: Vec<Host>,
     newcomers: Newcomers,
+}
+
+/// What was seen of one that lets everybody have a direct link with it.
+#[derive(Debug)]
+struct Host {
+    name: &'static str,
+    grown_kib: u64,
+    held: (Held, Held),
+    /// Round trips of an honest one on a direct link with it.
+    windows: [Window; 2],
 }
 
 /// Honest ones that asked for an address during the attack.
@@ -93,6 +106,14 @@ impl Report {
         ((clients_max + 1) * (queues + owed + reading) / 1024) as u64
     }
 
+    /// The most that one who has direct links may hold for them: of each a ring of either side and a frame, and what waits to be
+    /// received.
+    #[must_use]
+    pub const fn host_bound_kib() -> u64 {
+        const LINKS: u64 = 64;
+        LINKS * (1_024 + 64 + 64) + 16 * 1_024
+    }
+
     /// The node lived within its bound, served the others, counted every refusal that it told, and gave all back.
     #[must_use]
     pub fn holds(&self) -> bool {
@@ -101,26 +122,50 @@ impl Report {
             && self.grown_kib <= Self::bound_kib()
             && self.held.1.is_back_at(&self.held.0)
             && self.windows.iter().all(|window| window.failed == 0)
+            && self.hosts.iter().all(Host::holds)
+            && self.tally.links > 0
             && self.newcomers.served > 0
             && self.newcomers.turned_away.is_empty()
     }
 }
 
+impl Host {
+    fn holds(&self) -> bool {
+        self.grown_kib <= Report::host_bound_kib()
+            && self.held.1.is_back_at(&self.held.0)
+            && self.windows.iter().all(|window| window.count > 0 && window.failed == 0)
+    }
+}
+
+impl fmt::Display for Host {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { name, grown_kib, held, windows } = self;
+        writeln!(
+            f,
+            "{name}: grown by {grown_kib} KiB at most; its bound is {} KiB",
+            Report::host_bound_kib()
+        )?;
+        writeln!(f, "     before {}\n     after  {}", held.0, held.1)?;
+        writeln!(f, "     asked, alone        {}\n     asked, under attack {}", windows[0], windows[1])
+    }
+}
+
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { seconds, tally, refused, grown_kib, held, windows, newcomers } = self;
-        let Tally { tricks, connections, bytes, refused: told, rings, lies } = tally;
+        let Self { seconds, tally, refused, grown_kib, held, windows, hosts, newcomers } = self;
+        let Tally { tricks, connections, bytes, refused: told, rings, lies, links } = tally;
         writeln!(f, "{seconds:.1} s, {tricks} tricks on {connections} connections, {bytes} bytes taken")?;
-        writeln!(f, "{rings} links with rings, {lies} lies written into their memory")?;
+        writeln!(f, "{rings} links with rings, {links} direct links, {lies} lies written into their memory")?;
         writeln!(f, "refusals: {told} told to the hostile ones, {refused} counted by the node")?;
         let Newcomers { served, turned_away } = newcomers;
         writeln!(f, "newcomers: {served} served, {} turned away {turned_away:?}", turned_away.len())?;
         writeln!(f, "node before {}\n     after  {}", held.0, held.1)?;
         writeln!(f, "node grown by {grown_kib} KiB at most; its bound is {} KiB", Self::bound_kib())?;
         writeln!(f, "others, alone        {}\nothers, under attack {}", windows[0], windows[1])?;
+        hosts.iter().try_for_each(|host| write!(f, "{host}"))?;
         write!(
             f,
-            "expected: the node lives, within its bound, all given back, no round trip failed, no newcomer turned away, every refusal counted; seen: {}",
+            "expected: the node and the hosts live, within their bounds, all given back, no round trip failed, no newcomer turned away, every refusal counted; seen: {}",
             if self.holds() { "so" } else { "NOT SO" }
         )
     }
@@ -134,8 +179,8 @@ pub(super) fn play_attacker(arguments: &[String]) {
     while Instant::now() < end {
         attacker.play_one();
     }
-    let Tally { tricks, connections, bytes, refused, rings, lies } = attacker.tally;
-    say(&format!("{tricks} {connections} {bytes} {refused} {rings} {lies}"));
+    let Tally { tricks, connections, bytes, refused, rings, lies, links } = attacker.tally;
+    say(&format!("{tricks} {connections} {bytes} {refused} {rings} {lies} {links}"));
 }
 
 /// The role of one that stops in mid-frame, `SOCKET`: stops itself, and goes on where it was if it is let.
@@ -159,7 +204,9 @@ struct Cast {
     plan: Plan,
     stage: Stage,
     echo: Performer,
-    pinger: Performer,
+    hosts: Vec<Performer>,
+    /// Of the echo, then of each host.
+    pingers: Vec<Performer>,
     answers: Receiver<String>,
     tally: Arc<Mutex<Tally>>,
     dice: Dice,
@@ -176,18 +223,44 @@ impl Cast {
             assert_eq!(answers.recv_timeout(DEADLINE).as_deref(), Ok("up"), "{role} comes up");
             performer
         };
-        let (echo, pinger) = (start("taker", &[ECHO.to_owned()]), start("pinger", &[]));
+        let echo = start("taker", &[ECHO.to_owned()]);
+        let names = HOSTS.map(|(name, _)| name.to_owned());
+        let hosts = names.iter().map(|name| start("host", std::slice::from_ref(name))).collect();
+        let of_hosts = names.iter().map(|name| start("pinger", std::slice::from_ref(name)));
+        let pingers = std::iter::once(start("pinger", &[])).chain(of_hosts).collect();
         let dice = Dice::new(plan.seed);
-        Self { plan, stage, echo, pinger, answers, tally: Arc::default(), dice }
+        Self { plan, stage, echo, hosts, pingers, answers, tally: Arc::default(), dice }
     }
 
-    /// What the others measured since the last one; at least one round trip.
-    fn window(&mut self) -> Window {
-        until("a round trip ends", || {
-            self.pinger.tell("window");
-            let window = Window::read(&self.answers.recv_timeout(DEADLINE).expect("the pinger answers"));
-            (window.count + window.failed > 0).then_some(window)
-        })
+    /// What each of the others measured since the last one; at least one round trip.
+    fn windows(&mut self) -> Vec<Window> {
+        let answers = &self.answers;
+        let window = |pinger: &mut Performer| {
+            until("a round trip ends", || {
+                pinger.tell("window");
+                let window = Window::read(&answers.recv_timeout(DEADLINE).expect("the pinger answers"));
+                (window.count + window.failed > 0).then_some(window)
+            })
+        };
+        self.pingers.iter_mut().map(window).collect()
+    }
+
+    /// What the node holds, then each host.
+    fn held(&self) -> Vec<Held> {
+        self.processes().into_iter().map(Held::of).collect()
+    }
+
+    fn processes(&self) -> Vec<u32> {
+        std::iter::once(self.stage.node_id()).chain(self.hosts.iter().map(Performer::id)).collect()
+    }
+
+    /// Ends all in order.
+    fn end(self) {
+        for one in self.pingers.into_iter().chain(self.hosts).chain([self.echo]) {
+            let status = one.end();
+            assert!(status.success(), "one of the others ended with {status}");
+        }
+        self.stage.end();
     }
 
     fn start_attacker(&mut self) -> Performer {
@@ -203,6 +276,7 @@ impl Cast {
             tally.refused += numbers[3];
             tally.rings += numbers[4];
             tally.lies += numbers[5];
+            tally.links += numbers[6];
         })
     }
 
@@ -238,11 +312,13 @@ impl Drop for EndsIt<'_> {
     }
 }
 
-/// Looks at a process's memory until it is told not to; returns the most that it had.
-fn watch(process: u32, over: &AtomicBool) -> u64 {
-    let mut most = 0;
+/// Looks at these processes' memory until it is told not to; returns the most that each had.
+fn watch(processes: &[u32], over: &AtomicBool) -> Vec<u64> {
+    let mut most = vec![0; processes.len()];
     while !over.load(Ordering::Relaxed) {
-        most = most.max(Held::of(process).own_kib);
+        for (most, process) in most.iter_mut().zip(processes) {
+            *most = Held::of(*process).own_kib.max(*most);
+        }
         thread::sleep(LOOK);
     }
     most
@@ -265,40 +341,42 @@ fn come(socket: &Path, over: &AtomicBool) -> Newcomers {
     newcomers
 }
 
-/// Lets hostile clients do what they like, and says what the node made of it.
+/// Lets hostile clients do what they like, and says what the node and the hosts made of it.
 ///
 /// # Panics
 /// If the node or one of the others ends.
 #[must_use]
 pub fn run(plan: Plan) -> Report {
     let mut cast = Cast::new(plan);
-    let node = cast.stage.node_id();
-    cast.window();
+    cast.windows();
     thread::sleep(cast.plan.lasts / 8);
-    let alone = cast.window();
-    let (before, over, began) = (Held::of(node), AtomicBool::new(false), Instant::now());
-    let socket = cast.stage.socket();
+    let alone = cast.windows();
+    let (before, over, began) = (cast.held(), AtomicBool::new(false), Instant::now());
+    let (socket, processes) = (cast.stage.socket(), cast.processes());
     let (most, newcomers) = thread::scope(|scope| {
-        let watching = scope.spawn(|| watch(node, &over));
+        let watching = scope.spawn(|| watch(&processes, &over));
         let coming = scope.spawn(|| come(&socket, &over));
         let ends = EndsIt(&over);
         cast.attack();
         drop(ends);
         (watching.join().expect("it only looks"), coming.join().expect("the door is open all the time"))
     });
-    let attacked = cast.window();
+    let attacked = cast.windows();
     let end = Instant::now() + DEADLINE;
-    while !Held::of(node).is_back_at(&before) && Instant::now() < end {
+    let is_back = |now: &[Held]| now.iter().zip(&before).all(|(now, before)| now.is_back_at(before));
+    while !is_back(&cast.held()) && Instant::now() < end {
         thread::sleep(LOOK);
     }
-    let (seconds, refused, held) =
-        (began.elapsed().as_secs_f64(), cast.stage.refused(), (before, Held::of(node)));
+    let (seconds, refused, after) = (began.elapsed().as_secs_f64(), cast.stage.refused(), cast.held());
+    let seen = |at: usize| Host {
+        name: at.checked_sub(1).map_or("node", |host| HOSTS[host].0),
+        grown_kib: most[at].max(after[at].own_kib).saturating_sub(before[at].own_kib),
+        held: (before[at], after[at]),
+        windows: [alone[at], attacked[at]],
+    };
+    let Host { grown_kib, held, windows, .. } = seen(0);
+    let hosts = (1..=HOSTS.len()).map(seen).collect();
     let tally = *cast.tally.lock().unwrap_or_else(PoisonError::into_inner);
-    for one in [cast.pinger, cast.echo] {
-        let status = one.end();
-        assert!(status.success(), "one of the others ended with {status}");
-    }
-    cast.stage.end();
-    let grown_kib = most.max(held.1.own_kib).saturating_sub(before.own_kib);
-    Report { seconds, tally, refused, grown_kib, held, windows: [alone, attacked], newcomers }
+    cast.end();
+    Report { seconds, tally, refused, grown_kib, held, windows, hosts, newcomers }
 }

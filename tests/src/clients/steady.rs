@@ -72,11 +72,13 @@ impl fmt::Display for Window {
     }
 }
 
-/// `SOCKET`: asks the echo, and says what it measured since it was last told to (`window`).
+/// `SOCKET [NAME]`: asks the one of this name, directly where it can, or the echo, and says what it measured since it was last told to (`window`).
 pub(super) fn play_pinger(arguments: &[String]) {
     let api = NodeApi::connect(&arguments[0]).expect("the door is open");
-    let mut endpoint = register(&api, &wishes().requires([ECHO]));
-    let echo = endpoint.resolve(ECHO, DEADLINE).expect("the node answers").expect("it is ready");
+    let (name, is_direct) = arguments.get(1).map_or((ECHO, false), |name| (&**name, true));
+    let wishes = wishes().requires([name]);
+    let mut endpoint = register(&api, &if is_direct { wishes.direct(true) } else { wishes });
+    let echo = endpoint.resolve(name, DEADLINE).expect("the node answers").expect("it is ready");
     let measured: Arc<Mutex<(Vec<Duration>, u64)>> = Arc::default();
     let measuring = measured.clone();
     thread::spawn(move || {

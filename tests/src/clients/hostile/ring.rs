@@ -1,7 +1,12 @@
-//! The hostile end of a link with rings: writes what it likes into all that it may write. The layout is in
-//! `docs/decisions/0010-shared-memory.md`.
+//! The hostile end of rings, to the node or to another process: writes what it likes into all that it may write. The layout is
+//! in `docs/decisions/0010-shared-memory.md`.
 
-use std::{io, os::fd::OwnedFd, path::Path};
+use std::{
+    io,
+    ops::{Deref, DerefMut},
+    os::fd::{AsFd, OwnedFd},
+    path::Path,
+};
 
 use rustix::{
     fs::{FallocateFlags, fallocate, ftruncate},
@@ -10,7 +15,7 @@ use rustix::{
 };
 use sinew::{Kind, Tid, payload};
 use sinew_runtime::wire::decode;
-use sinew_shm::{BellKind, Capacity, Offer, Region};
+use sinew_shm::{BellKind, Capacity, Offer, Producer, Region, Terms};
 
 use super::stranger::{Frame, Stranger};
 use crate::dice::Dice;
@@ -35,10 +40,17 @@ const SKIP: [u32; 2] = [0, 0x5C1B_0002];
 /// A link whose node has offered its memory.
 pub(super) struct HostileRing {
     pub(super) stranger: Stranger,
+    end: RingEnd,
+}
+
+/// One end of a pair of rings; the other has offered its memory.
+pub(super) struct RingEnd {
     capacity: u32,
     region: Region,
-    /// What the node has offered: its memory, its bells.
+    /// What the other has offered: its memory, its bells.
     victim: Offer,
+    /// What wakes one that sleeps at a futex.
+    ringer: Option<Producer>,
     /// A second descriptor of the own memory, for what the seals must not let through.
     key: OwnedFd,
     tail: u32,
@@ -63,13 +75,51 @@ impl HostileRing {
     /// A link as an honest client makes it.
     pub(super) fn join(socket: &Path) -> io::Result<Self> {
         let (stranger, victim, capacity) = ask_for_rings(socket)?;
-        let (region, offer) = Region::create(capacity, BellKind::Socket).map_err(io::Error::other)?;
+        let end = RingEnd::offer(&stranger.stream, victim, capacity, BellKind::Socket)?;
+        Ok(Self { stranger, end })
+    }
+}
+
+impl Deref for HostileRing {
+    type Target = RingEnd;
+
+    fn deref(&self) -> &RingEnd {
+        &self.end
+    }
+}
+
+impl DerefMut for HostileRing {
+    fn deref_mut(&mut self) -> &mut RingEnd {
+        &mut self.end
+    }
+}
+
+impl RingEnd {
+    /// Offers own memory over `socket` to who has offered `victim`.
+    pub(super) fn offer(
+        socket: impl AsFd,
+        victim: Offer,
+        capacity: Capacity,
+        bell: BellKind,
+    ) -> io::Result<Self> {
+        let (region, offer) = Region::create(capacity, bell).map_err(io::Error::other)?;
         let key = offer.descriptors()[0].try_clone()?;
-        offer.send(&stranger.stream).map_err(io::Error::other)?;
-        Ok(Self { stranger, capacity: capacity.bytes(), region, victim, key, tail: 0 })
+        offer.send(socket).map_err(io::Error::other)?;
+        Self::of(region, key, victim, capacity)
     }
 
-    /// A word of the node's memory.
+    /// The end whose own memory is `region`, which is offered, with a second descriptor of it.
+    pub(super) fn of(region: Region, key: OwnedFd, victim: Offer, capacity: Capacity) -> io::Result<Self> {
+        let ringer = ringer(&victim)?;
+        Ok(Self { capacity: capacity.bytes(), region, victim, ringer, key, tail: 0 })
+    }
+
+    /// Bytes of the longest record that an honest side writes.
+    pub(super) const fn record_max(&self) -> usize {
+        self.capacity as usize / 2 - 8
+    }
+
+    /// A word of the other's memory.
     fn read_word(&self, place: u32) -> io::Result<u32> {
         let mut word = [0; 4];
         pread(&self.victim.descriptors()[0], &mut word, u64::from(place * 4))?;
@@ -82,7 +132,7 @@ impl HostileRing {
         self.region.scribble(place + 1, mark[1]);
     }
 
-    /// Publishes a record as an honest client does; `false` if the node has not taken enough yet.
+    /// Publishes a record as an honest client does; `false` if the other has not taken enough yet.
     pub(super) fn publish(&mut self, bytes: &[u8]) -> io::Result<bool> {
         let length = u32::try_from(bytes.len()).map_err(io::Error::other)?;
         let record = 8 + length.next_multiple_of(8);
@@ -109,15 +159,19 @@ impl HostileRing {
         Ok(true)
     }
 
-    /// Takes all that the node has published, unread.
+    /// Takes all that the other has published, unread.
     pub(super) fn take(&mut self) -> io::Result<()> {
         let head = self.read_word(TAIL)?;
         self.region.scribble(HEAD, head);
         self.press(2)
     }
 
-    /// Rings one of the node's bells.
+    /// Rings one of the other's bells.
     fn press(&self, bell: usize) -> io::Result<()> {
+        if let Some(ringer) = &self.ringer {
+            ringer.ring();
+            return Ok(());
+        }
         let Some(button) = self.victim.descriptors().get(bell) else { return Ok(()) };
         match send(button, &[1], SendFlags::DONTWAIT | SendFlags::NOSIGNAL) {
             // It has been rung often enough.
@@ -129,7 +183,7 @@ impl HostileRing {
     /// One thing that no honest client does.
     pub(super) fn lie(&mut self, dice: &mut Dice) -> io::Result<()> {
         let (value, small) = (dice.roll() as u32, dice.below(600));
-        match dice.below(10) {
+        match dice.below(11) {
             0 => self.region.scribble(TAIL, value),
             1 => self.region.scribble(HEAD, value),
             2 => self.region.scribble(TAIL, self.tail.wrapping_add(small)),
@@ -139,10 +193,20 @@ impl HostileRing {
             6 => self.region.scribble(SLEEPS[small as usize % 2], value),
             7 => (0..small).try_for_each(|_| self.press(1 + small as usize % 2))?,
             8 => self.try_the_keys(value),
+            9 => self.forge_bells(value, small)?,
             // Any place: bytes of some message, perhaps while they are read.
             _ => self.region.scribble(value, dice.roll() as u32),
         }
         self.press(1 + small as usize % 2)
+    }
+
+    /// Counts on the page of a futex that nobody has rung for.
+    fn forge_bells(&self, value: u32, small: u32) -> io::Result<()> {
+        if self.ringer.is_some() {
+            let (page, word) = (&self.victim.descriptors()[1], small % 64);
+            pwrite(page, &value.to_le_bytes(), u64::from(4 * word))?;
+        }
+        Ok(())
     }
 
     /// What the seals must not let through.
@@ -157,4 +221,16 @@ impl HostileRing {
             assert_eq!(refused, [true; 3], "a sealed memory lets nothing through");
         }
     }
+}
+
+/// What wakes the one who has made this offer, if it sleeps at a futex: only who has mapped its page can do that.
+fn ringer(victim: &Offer) -> io::Result<Option<Producer>> {
+    if victim.bell() != BellKind::Futex {
+        return Ok(None);
+    }
+    let descriptors: io::Result<Vec<_>> = victim.descriptors().iter().map(OwnedFd::try_clone).collect();
+    let copy = Offer::from_parts(&victim.to_bytes(), descriptors?).map_err(io::Error::other)?;
+    let (spare, _) = Region::create(Capacity::MIN, BellKind::Futex).map_err(io::Error::other)?;
+    let (producer, _) = spare.connect(copy, &Terms::default()).map_err(io::Error::other)?;
+    Ok(Some(producer))
 }

@@ -96,13 +96,7 @@ impl Stranger {
 
     /// Writes the bytes with descriptors beside them.
     pub(super) fn pass(&self, bytes: &[u8], descriptors: &[OwnedFd]) -> io::Result<()> {
-        let descriptors: Vec<BorrowedFd<'_>> =
-            descriptors.iter().take(DESCRIPTORS_MAX).map(AsFd::as_fd).collect();
-        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(DESCRIPTORS_MAX))];
-        let mut control = SendAncillaryBuffer::new(&mut space);
-        assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)), "the space is for as many");
-        sendmsg(&self.stream, &[IoSlice::new(bytes)], &mut control, SendFlags::NOSIGNAL)?;
-        Ok(())
+        pass(&self.stream, bytes, descriptors)
     }
 
     /// The next frame; `None` at the end of the connection.
@@ -121,4 +115,15 @@ impl Stranger {
         let source = if kind == Kind::LNCL_REGISTERED { number(24, 8) } else { number(16, 8) };
         Ok(Some(Said { kind, source, correlation: number(40, 8), payload }))
     }
+}
+
+/// Writes the bytes to a socket, with descriptors beside them.
+pub(super) fn pass(socket: &UnixStream, bytes: &[u8], descriptors: &[OwnedFd]) -> io::Result<()> {
+    let descriptors: Vec<BorrowedFd<'_>> =
+        descriptors.iter().take(DESCRIPTORS_MAX).map(AsFd::as_fd).collect();
+    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(DESCRIPTORS_MAX))];
+    let mut control = SendAncillaryBuffer::new(&mut space);
+    assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)), "the space is for as many");
+    sendmsg(socket, &[IoSlice::new(bytes)], &mut control, SendFlags::NOSIGNAL)?;
+    Ok(())
 }

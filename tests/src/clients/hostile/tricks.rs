@@ -1,5 +1,6 @@
 //! What a hostile client does to a node, one trick after the other.
 
+mod links;
 mod meetings;
 
 use std::{
@@ -47,6 +48,8 @@ pub(super) struct Tally {
     pub(super) rings: u64,
     /// What was written into rings' memory that no honest client writes there.
     pub(super) lies: u64,
+    /// Direct links with other processes.
+    pub(super) links: u64,
 }
 
 /// A hostile client of the node at a socket.
@@ -72,7 +75,7 @@ impl Attacker {
 
     /// Plays one trick. What the node answers to it, or that it closes, is no error.
     pub(super) fn play_one(&mut self) {
-        const TRICKS: [Trick; 14] = [
+        const TRICKS: [Trick; 18] = [
             Attacker::garbage,
             Attacker::mutants,
             Attacker::forged_sources,
@@ -87,6 +90,10 @@ impl Attacker {
             Attacker::deaf_ring,
             Attacker::odd_offers,
             Attacker::meetings,
+            Attacker::lying_link,
+            Attacker::deaf_link,
+            Attacker::odd_link,
+            Attacker::lure,
         ];
         self.tally.tricks += 1;
         let trick = TRICKS[self.dice.below(TRICKS.len() as u32) as usize];
@@ -419,7 +426,11 @@ impl Attacker {
 
     /// The node's own application.
     fn witness(&mut self, stranger: &mut Stranger) -> io::Result<Tid> {
-        let name = Name { name: crate::clients::door::WITNESS.to_owned() };
+        self.resolve(stranger, crate::clients::door::WITNESS)
+    }
+
+    fn resolve(&mut self, stranger: &mut Stranger, name: &str) -> io::Result<Tid> {
+        let name = Name { name: name.to_owned() };
         let question = Frame::of_lncl(Kind::LNCL_RESOLVE, stranger.tid, &name);
         self.write(stranger, &question.bytes())?;
         let said = stranger.read()?.ok_or(io::ErrorKind::UnexpectedEof)?;
