@@ -317,6 +317,11 @@ impl<S: Socket> StreamOutlet<S> {
         half.waiting() + half.in_lines()
     }
 
+    /// Messages that were taken and have not arrived, as far as is known here; only where there is a session.
+    pub(crate) fn left(&self) -> usize {
+        self.lock().left()
+    }
+
     /// Messages that wait because their destinations take nothing.
     #[cfg(test)]
     pub(crate) fn in_lines(&self) -> usize {

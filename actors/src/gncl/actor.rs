@@ -82,6 +82,12 @@ impl Gncl {
         Self { stores, ready: Some(ready), core, wires: BTreeMap::new(), alarm: None, goes_at: None }
     }
 
+    /// Whether the node is being stopped.
+    pub(super) fn is_to_stop(&self) -> bool {
+        // SYNC: Relaxed; the order to stop came through the supervisor's lock, after the flag was set.
+        self.stores.stopping.load(Ordering::Relaxed)
+    }
+
     /// The listener: the one that is open already, if this layer was restarted.
     fn listen(&self) -> io::Result<tokio::net::TcpListener> {
         let mut kept = lock(&self.stores.gncl.listener);
@@ -280,6 +286,9 @@ impl Gncl {
         if !matches!(input, Input::Violated(..)) {
             self.input(Input::Heard(connection), ctx);
         }
+        if matches!(input, Input::GoodbyeReceived(_)) {
+            self.acknowledge_the_last(connection);
+        }
         self.input(input, ctx);
     }
 
@@ -306,9 +315,54 @@ impl Gncl {
         }
     }
 
+    /// The node is being stopped: says goodbye behind all that waits, and dials whom it is for. spec: GNCL-10
+    fn leave(&mut self, now: Time, ctx: &mut Context<Self>) {
+        self.goes_at = Some(now + LINGER);
+        let owed =
+            self.stores.gncl.peers().iter().filter(|peer| peer.left() > 0).map(|peer| peer.node).collect();
+        self.input(Input::LeaveRequested { owed }, ctx);
+        self.close_door();
+        ctx.run_interval(LINGER_LOOK, |actor, ctx| {
+            actor.close_door();
+            if actor.may_go(Time::now()) {
+                ctx.stop();
+            }
+        });
+    }
+
+    /// Nobody connects any more, but for the connections that links still lack.
+    fn close_door(&self) {
+        if !self.core.expects_sides() {
+            self.stores.gncl.close();
+        }
+    }
+
     /// Whether everybody has hung up, which a peer does at our GOODBYE, behind all that waited; or the time is over.
     fn may_go(&self, now: Time) -> bool {
-        self.goes_at.is_none_or(|at| at <= now) || self.wires.values().all(|wire| wire.link.is_none())
+        let is_through =
+            || self.wires.values().all(|wire| wire.link.is_none()) && !self.core.may_still_link();
+        self.goes_at.is_none_or(|at| at <= now) || is_through()
+    }
+
+    /// What has not arrived by now does not, and says so. spec: GNCL-10
+    fn give_up(&self) {
+        self.stores.gncl.close();
+        for peer in self.stores.gncl.peers() {
+            let messages = peer.left();
+            if messages > 0 {
+                self.stores.gncl.refusals.count(Time::now(), "not delivered", &peer.node);
+                crate::log::warn!(node = %peer.node, messages, "the node stops, and these have not arrived, as far as it knows");
+            }
+            peer.close();
+        }
+    }
+
+    /// The peer has said all: it hears what of it was taken, before it is left. spec: GNCL-10
+    fn acknowledge_the_last(&self, connection: ConnectionId) {
+        let Some(wire) = self.wires.get(&connection) else { return };
+        if let Mode::Linked(inbound) = &*wire.mode.borrow() {
+            inbound.acknowledge();
+        }
     }
 
     /// Cuts what a former instance of this layer, or this one, has connected.
@@ -406,22 +460,18 @@ impl Actor for Gncl {
     }
 
     fn stopping(&mut self, ctx: &mut Self::Context) -> Running {
-        // SYNC: Relaxed; the order to stop came through the supervisor's lock, after the flag was set.
-        if !self.stores.stopping.load(Ordering::Relaxed) {
+        if !self.is_to_stop() {
             return Running::Stop;
         }
         let now = Time::now();
         if self.goes_at.is_none() {
-            self.goes_at = Some(now + LINGER);
-            self.input(Input::LeaveRequested, ctx);
-            self.stores.gncl.close();
-            ctx.run_interval(LINGER_LOOK, |actor, ctx| {
-                if actor.may_go(Time::now()) {
-                    ctx.stop();
-                }
-            });
+            self.leave(now, ctx);
         }
-        if self.may_go(now) { Running::Stop } else { Running::Continue }
+        if !self.may_go(now) {
+            return Running::Continue;
+        }
+        self.give_up();
+        Running::Stop
     }
 }
 

@@ -49,6 +49,13 @@ impl Inbound {
         Ok(())
     }
 
+    /// Tells the peer what was taken, if it does not know.
+    pub(super) fn acknowledge(&self) {
+        if let Some(way) = self.peer.way(self.lane) {
+            way.acknowledge_if_owed();
+        }
+    }
+
     fn take(&self, now: Time, mut message: Message, way: &Way, taken: Taken) {
         let header = message.header;
         if header.source.node != self.peer.node {

@@ -15,7 +15,7 @@
 //! | GNCL-7 | A newer incarnation ends all that belongs to the older; an older one is refused. |
 //! | GNCL-8 | After a break both dial again: waits double from `redial_min` to `redial_max`, 20 % jitter, until NodeLost; from the least again once messages pass. |
 //! | GNCL-9 | A link on which nothing comes is pinged every second; after 3 unanswered pings it is broken. |
-//! | GNCL-10 | GOODBYE is the last frame of a node that leaves; it is not dialled again until it is found again. |
+//! | GNCL-10 | GOODBYE is the last frame of a node that leaves, behind all that waits; it is not dialled again until it is found again. |
 //! | GNCL-11 | A frame's source must be on the peer's node and its destination on this one; times are turned into our clock. |
 //! | GNCL-12 | CONFIRM is answered by OUTCOME on the peer's present connection. |
 //! | GNCL-14 | Where both know `classes`, whoever dialled a link dials a connection each for Stream and for Bulk as well. |

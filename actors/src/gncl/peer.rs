@@ -73,6 +73,16 @@ impl Peer {
         self.ways.iter().for_each(|way| way.outlet.cut());
     }
 
+    /// Messages for it that have not arrived, as far as is known here.
+    pub(super) fn left(&self) -> usize {
+        self.ways.iter().map(|way| way.outlet.left()).sum()
+    }
+
+    /// Nothing reaches it any more, because this node stops.
+    pub(super) fn close(&self) {
+        self.ways.iter().for_each(|way| way.outlet.close(Rejection::Closed));
+    }
+
     /// The peer says what became of the message that `ticket` names; if nobody waits for it any more, nothing happens.
     pub(super) fn confirm(&self, ticket: Ticket, outcome: Outcome) {
         // Stream is never confirmed, and the ticket does not say the class.

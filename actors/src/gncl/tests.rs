@@ -4,5 +4,6 @@ mod bench;
 mod classes;
 mod credit;
 mod handshakes;
+mod leaving;
 mod links;
 mod messages;

@@ -50,6 +50,12 @@ impl<S: Socket> Half<S> {
         self.session.as_ref().map_or(0, |session| session.sending.behind())
     }
 
+    /// What waits, and what is kept because nobody has said that it arrived.
+    pub(super) fn left(&self) -> usize {
+        let kept = self.session.as_ref().map_or(0, |session| session.sending.kept());
+        self.queue.len() + usize::from(self.interrupted.is_some()) + self.in_lines() + kept
+    }
+
     pub(super) fn epoch(&self) -> u64 {
         self.session.as_ref().map_or(0, |session| session.sending.epoch())
     }

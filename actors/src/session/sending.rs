@@ -74,6 +74,11 @@ impl<M> Sending<M> {
         self.kept.is_empty() || self.cursor == Some(self.end())
     }
 
+    /// Messages that were written, and that the peer has not said to have.
+    pub(crate) fn kept(&self) -> usize {
+        self.kept.len()
+    }
+
     /// Messages that are to be written again.
     pub(crate) fn behind(&self) -> usize {
         self.cursor.map_or(0, |cursor| (self.end() - cursor) as usize)

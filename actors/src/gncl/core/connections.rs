@@ -13,7 +13,8 @@ impl Core {
     pub(super) fn accepted(&mut self, now: Time, connection: ConnectionId) {
         let strangers =
             self.connections.values().filter(|c| matches!(c.stage, Stage::Stranger | Stage::Leaving));
-        if self.leaving || strangers.count() >= self.settings.strangers_max {
+        let takes_nobody = self.leaving && !self.expects_sides();
+        if takes_nobody || strangers.count() >= self.settings.strangers_max {
             self.count(
                 "too many strangers",
                 "a connection was closed at once; see `gncl.strangers_max`".to_owned(),
@@ -175,6 +176,10 @@ impl Core {
         let Some(peer) = self.peers.get_mut(&node) else { return };
         let (dial, dialled) =
             if welcome.is_some() { (theirs.dial, None) } else { (peer.dial_number, peer.wanted) };
+        if self.leaving {
+            // What waited goes out on it, and it is the last one.
+            peer.wanted = None;
+        }
         peer.linked(Link {
             connection,
             since: now,

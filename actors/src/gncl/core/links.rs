@@ -171,6 +171,12 @@ impl Core {
             self.drop_sides(node);
             return self.farewell(now, node);
         }
+        if self.leaving
+            && let Some(link) = self.peers.get_mut(&node).and_then(|peer| peer.link.as_mut())
+        {
+            // What the peer says there last, that all was taken, may not have been read yet; it hangs up itself.
+            link.sides = None;
+        }
         let Some(connection) = self.detach(now, node) else { return };
         self.connections.remove(&connection);
         let chance = self.chance();
@@ -233,22 +239,43 @@ impl Core {
         self.outputs.push_back(Output::Close(connection));
     }
 
-    pub(super) fn leave(&mut self, now: Time) {
+    /// spec: GNCL-10
+    pub(super) fn leave(&mut self, now: Time, owed: &[NodeAddress]) {
         self.leaving = true;
         let nodes: Vec<_> = self.peers.keys().copied().collect();
         for node in nodes {
-            self.drop_dial(node);
-            let Some(peer) = self.peers.get_mut(&node) else { continue };
-            peer.wanted = None;
-            peer.redial_at = None;
-            if peer.link.is_some() {
-                self.outputs.push_back(Output::SendGoodbye(node));
-            }
+            self.leave_peer(now, node, owed.contains(&node));
         }
-        let strangers: Vec<_> = self.connections.iter().filter(|(_, c)| c.stage == Stage::Stranger).collect();
-        let strangers: Vec<_> = strangers.into_iter().map(|(id, _)| *id).collect();
+        if self.expects_sides() {
+            // One of those who have not said hello may be such a side.
+            return;
+        }
+        let strangers = self.connections.iter().filter(|(_, c)| c.stage == Stage::Stranger);
+        let strangers: Vec<_> = strangers.map(|(id, _)| *id).collect();
         for connection in strangers {
             self.decline(now, connection, &super::Decline::Leaving);
         }
+    }
+
+    fn leave_peer(&mut self, now: Time, node: NodeAddress, is_owed: bool) {
+        let Some(peer) = self.peers.get_mut(&node) else { return };
+        let may_link = is_owed && peer.link.is_none() && peer.wanted.is_some();
+        if !may_link {
+            peer.wanted = None;
+            peer.redial_at = None;
+        }
+        if peer.link.is_some() || may_link {
+            self.outputs.push_back(Output::SendGoodbye(node));
+        }
+        if !may_link {
+            self.drop_dial(node);
+        } else if self.peers.get(&node).is_some_and(|peer| peer.dial.is_none()) {
+            self.dial(now, node);
+        }
+    }
+
+    /// Whether a link may still be made with a node for which messages wait, while ours is being stopped.
+    pub(in crate::gncl) fn may_still_link(&self) -> bool {
+        self.peers.values().any(|peer| peer.dial.is_some() || peer.redial_at.is_some())
     }
 }

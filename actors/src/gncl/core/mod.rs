@@ -100,8 +100,8 @@ pub(super) enum Input {
     Ended(ConnectionId),
     /// Time has passed, perhaps up to [`Core::next_wake`].
     TimePassed,
-    /// The node is being stopped in order.
-    LeaveRequested,
+    /// The node is being stopped in order; there are messages for these nodes that are not known to have arrived.
+    LeaveRequested { owed: Vec<NodeAddress> },
 }
 
 /// What is to be done.
@@ -226,7 +226,7 @@ impl Core {
             Input::GoodbyeReceived(connection) => self.goodbye(now, connection),
             Input::Ended(connection) => self.ended(now, connection),
             Input::TimePassed => self.time_passed(now),
-            Input::LeaveRequested => self.leave(now),
+            Input::LeaveRequested { owed } => self.leave(now, &owed),
         }
     }
 

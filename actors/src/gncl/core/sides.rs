@@ -100,6 +100,13 @@ impl Link {
 }
 
 impl Core {
+    /// Whether a peer is about to dial a connection for Stream or for Bulk.
+    pub(in crate::gncl) fn expects_sides(&self) -> bool {
+        let accepted = self.peers.values().filter_map(|peer| peer.link).filter(|link| link.dialled.is_none());
+        let mut sides = accepted.filter_map(|link| link.sides).flatten();
+        sides.any(|side| matches!(side.state, SideState::Down) && !side.is_through)
+    }
+
     /// A link stands: the sides are dialled by whoever dialled it.
     pub(super) fn dial_sides(&mut self, now: Time, node: NodeAddress) {
         for lane in Lane::SIDES {

@@ -281,8 +281,9 @@ fn who_says_goodbye_has_left_and_is_not_dialled() {
 #[test]
 fn a_node_that_leaves_says_goodbye_and_takes_nobody_any_more() {
     let mut core = core();
-    greet(&mut core, millis(0), hello_from(HIGH, 1, 1));
-    core.handle(millis(1), Input::LeaveRequested);
+    let one_for_all = Introduction { features: Vec::new(), ..hello_from(HIGH, 1, 1) };
+    greet(&mut core, millis(0), one_for_all);
+    core.handle(millis(1), Input::LeaveRequested { owed: Vec::new() });
     assert!(outputs(&mut core).contains(&Output::SendGoodbye(HIGH)));
     let connection = core.open();
     core.handle(millis(2), Input::Accepted(connection));

@@ -1,8 +1,12 @@
 //! What the tests of this layer are made with: nodes that have GNCL only, and peers written by hand.
 
-use std::{net::SocketAddr, sync::Arc, time::Duration};
+use std::{
+    net::SocketAddr,
+    sync::{Arc, atomic::Ordering},
+    time::Duration,
+};
 
-use actix::{Actor, Arbiter, System};
+use actix::{Actor, ActorContext, Addr, Arbiter, AsyncContext, System};
 use bytes::Bytes;
 use futures_util::{Stream, StreamExt};
 use sinew_runtime::{
@@ -71,6 +75,7 @@ impl ReceiptSink for Outcomes {
 pub(super) struct Node {
     pub(super) stores: Arc<Stores>,
     arbiter: Option<Arbiter>,
+    layer: Option<Addr<Gncl>>,
     facts: PostStream<ndl::Event>,
     outcomes: Post<(u64, Outcome)>,
     pub(super) settled: PostStream<(u64, Outcome)>,
@@ -89,7 +94,7 @@ impl Node {
         let outcomes = Post::new(10_000);
         let settled = outcomes.attach();
         let facts = stores.posts.ndl.attach();
-        let mut node = Self { stores, arbiter: None, facts, outcomes, settled };
+        let mut node = Self { stores, arbiter: None, layer: None, facts, outcomes, settled };
         node.start_layer().await;
         node
     }
@@ -99,7 +104,20 @@ impl Node {
         let (stores, gate) =
             (self.stores.clone(), ReadyGate::new(move || say.send(()).expect("the test waits")));
         let arbiter = Arbiter::new();
-        arbiter.spawn_fn(move || drop(Gncl::new(stores, gate).start()));
+        let (give, layer) = tokio::sync::oneshot::channel();
+        arbiter.spawn_fn(move || {
+            let layer = Gncl::create(|ctx| {
+                // As its supervisor would tell it.
+                ctx.run_interval(Duration::from_millis(1), |gncl, ctx| {
+                    if gncl.is_to_stop() {
+                        ctx.stop();
+                    }
+                });
+                Gncl::new(stores, gate)
+            });
+            drop(give.send(layer));
+        });
+        self.layer = Some(within("GNCL to be made", layer).await.expect("it is made"));
         within("GNCL to be ready", ready).await.expect("GNCL says that it is ready");
         self.arbiter = Some(arbiter);
     }
@@ -110,6 +128,21 @@ impl Node {
             arbiter.stop();
             arbiter.join().expect("the layer's thread ends without a panic");
         }
+    }
+
+    /// Has the layer end in order, as when its node is stopped.
+    pub(super) fn leave(&self) {
+        self.stores.stopping.store(true, Ordering::Relaxed);
+    }
+
+    /// Waits until the layer has ended.
+    pub(super) async fn ended(&self) {
+        within("the layer to end", async {
+            while self.layer.as_ref().is_some_and(Addr::connected) {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
     }
 
     pub(super) fn address(&self) -> NodeAddress {

@@ -17,7 +17,7 @@ fn of_class(class: Class, mut message: Message) -> Message {
 }
 
 /// The connection of `lane` to `node`, from a peer that has one for each class.
-async fn lane_by_hand(node: &Node, lane: Lane, dial: u64) -> ByHand {
+pub(super) async fn lane_by_hand(node: &Node, lane: Lane, dial: u64) -> ByHand {
     let link = if lane == Lane::Control { 0 } else { 1 };
     let features = vec![CLASSES.to_owned()];
     ByHand::greeting(node, &Introduction { lane, link, dial, features, ..introduction(node.address()) }).await

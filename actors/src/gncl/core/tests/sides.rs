@@ -121,3 +121,19 @@ fn a_silent_side_is_broken_alone() {
     assert!(out.contains(&Output::Close(bulk)), "{out:?}");
     assert!(!out.contains(&Output::Close(link)), "{out:?}");
 }
+
+#[test]
+fn a_node_that_leaves_takes_the_connections_that_its_links_lack_and_no_others() {
+    let mut core = core();
+    let (_, up) = greet(&mut core, millis(0), hello_from(HIGH, 1, 1));
+    assert!(up.iter().any(|output| matches!(output, Output::Attach(_))));
+    core.handle(millis(1), Input::LeaveRequested { owed: Vec::new() });
+    outputs(&mut core);
+    for (dial, lane) in [(2, Lane::Stream), (3, Lane::Bulk)] {
+        let (_, taken) = greet(&mut core, millis(2), side_of(1, lane, dial));
+        assert!(taken.iter().any(|output| matches!(output, Output::Attach(_))), "{taken:?}");
+    }
+    let last = core.open();
+    core.handle(millis(3), Input::Accepted(last));
+    assert!(outputs(&mut core).contains(&Output::Close(last)), "no link lacks one any more");
+}

@@ -1,0 +1,88 @@
+//! A node that stops: what waits goes out first, and what does not says so.
+
+use sinew_runtime::{
+    outcome::Outcome,
+    tid::Tid,
+    wire::{Class, Kind, Message},
+};
+
+use super::{
+    bench::{ByHand, NINE, Node, next, pair, run},
+    classes::lane_by_hand,
+};
+use crate::gncl::core::Lane;
+
+fn bulk(mut message: Message) -> Message {
+    message.header.class = Class::Bulk;
+    message
+}
+
+#[test]
+fn what_waits_for_a_connection_that_a_link_still_lacks_goes_out_before_its_node_is_gone() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut first = lane_by_hand(&node, Lane::Control, 1).await;
+        node.up().await;
+        let to = Tid::new(NINE, node.tid(1).app);
+        node.stores.router.send(bulk(node.message(to, b"before it is gone"))).expect("it waits");
+        node.leave();
+        assert_eq!(first.hear().await.header.kind, Kind::GNCL_GOODBYE);
+        let mut last = lane_by_hand(&node, Lane::Bulk, 2).await;
+        assert_eq!(last.hear().await.payload[..], *b"before it is gone");
+        assert_eq!(last.hear().await.header.kind, Kind::GNCL_GOODBYE);
+    });
+}
+
+#[test]
+fn what_waits_for_a_peer_whose_link_is_broken_goes_out_on_the_next_one_before_its_node_is_gone() {
+    run(async {
+        let (mut a, mut b) = pair().await;
+        let mut inbox = b.app(1);
+        b.stop_layer();
+        a.broken().await;
+        a.send(b.tid(1), b"of Control");
+        a.stores.router.send(bulk(a.message(b.tid(1), b"of Bulk"))).expect("it waits");
+        a.leave();
+        b.start_layer().await;
+        let mut came = Vec::new();
+        for _ in 0..2 {
+            came.push(next("what waited", &mut inbox).await.payload);
+        }
+        came.sort();
+        assert_eq!(came, [&b"of Bulk"[..], b"of Control"]);
+    });
+}
+
+#[test]
+fn what_waits_for_a_peer_that_does_not_come_back_is_told_of_when_the_node_stops() {
+    run(async {
+        let mut node = Node::start(1).await;
+        drop(ByHand::linked_to(&mut node).await);
+        node.broken().await;
+        let to = Tid::new(NINE, node.tid(1).app);
+        node.stores.router.send(node.confirmed(to, 1)).expect("it waits");
+        node.leave();
+        assert_eq!(next("the outcome", &mut node.settled).await, (1, Outcome::PeerLost));
+        node.ended().await;
+        assert_eq!(node.stores.gncl.refusals.of("not delivered"), 1);
+    });
+}
+
+#[test]
+fn what_has_arrived_before_the_node_stops_is_told_of_to_nobody() {
+    run(async {
+        let (a, b) = pair().await;
+        let mut inbox = b.app(1);
+        for class in Class::ALL {
+            let mut message = a.message(b.tid(1), b"arrived");
+            message.header.class = class;
+            a.stores.router.send(message).expect("the peer is linked");
+        }
+        a.leave();
+        for _ in Class::ALL {
+            assert_eq!(next("a message", &mut inbox).await.payload[..], *b"arrived");
+        }
+        a.ended().await;
+        assert_eq!(a.stores.gncl.refusals.of("not delivered"), 0);
+    });
+}
