@@ -49,6 +49,7 @@ pub(super) const STRANGERS_MAX: Range = range("gncl.strangers_max", 1, 1_024, "c
 pub(super) const HANDSHAKE: Range = range("gncl.handshake_ms", 10, 60_000, "ms");
 pub(super) const REDIAL_MIN: Range = range("gncl.redial_min_ms", 1, 10_000, "ms");
 pub(super) const REDIAL_MAX: Range = range("gncl.redial_max_ms", 1, 60_000, "ms");
+pub(super) const GIVE_UP: Range = range("gncl.give_up_ms", 100, 600_000, "ms");
 pub(super) const NDL_PORT: Range = range("ndl.port", 0, 65_535, "(0: any free port)");
 pub(super) const MDNS_PORT: Range = range("ndl.mdns_port", 1, 65_535, "or false");
 pub(super) const PERIOD: Range = range("ndl.period_ms", 10, 60_000, "ms");
@@ -161,6 +162,7 @@ impl NodeConfig {
         QUEUE_BYTES.count(faults, gncl.queue_bytes);
         STRANGERS_MAX.count(faults, gncl.strangers_max);
         HANDSHAKE.time(faults, gncl.handshake);
+        GIVE_UP.time(faults, gncl.give_up);
         REDIAL_MIN.time(faults, gncl.redial_min);
         let before = faults.len();
         REDIAL_MAX.time(faults, gncl.redial_max);

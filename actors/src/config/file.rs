@@ -29,7 +29,7 @@ const FILE_BYTES_MAX: u64 = 1 << 20;
 const SECTIONS: [&str; 6] = ["node", "lncl", "gncl", "ndl", "sync", "supervision"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 36] = [
+pub(super) const KEYS: [&str; 37] = [
     "node.name",
     "node.project",
     "node.address",
@@ -52,6 +52,7 @@ pub(super) const KEYS: [&str; 36] = [
     "gncl.handshake_ms",
     "gncl.redial_min_ms",
     "gncl.redial_max_ms",
+    "gncl.give_up_ms",
     "ndl.interface",
     "ndl.port",
     "ndl.multicast",
@@ -341,6 +342,7 @@ impl Reader<'_> {
         self.time(&check::HANDSHAKE, &mut gncl.handshake);
         self.time(&check::REDIAL_MIN, &mut gncl.redial_min);
         self.time(&check::REDIAL_MAX, &mut gncl.redial_max);
+        self.time(&check::GIVE_UP, &mut gncl.give_up);
     }
 
     fn read_ndl(&mut self, config: &mut NodeConfig) {

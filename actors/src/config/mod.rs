@@ -90,7 +90,7 @@ pub struct GnclConfig {
     /// Bytes of their payloads at most, each class by itself; one message waits however long it is. 4 KiB to 1 GiB;
     /// default 16 MiB.
     pub queue_bytes: usize,
-    /// Connections whose peer has not said who it is, at most. 1 to 1,024; default 64.
+    /// Connections whose peer has not said who it is, at most; for a further one the oldest is closed. 1 to 1,024; default 64.
     pub strangers_max: usize,
     /// Time for a handshake. 10 ms to 60 s; default 2 s.
     pub handshake: Duration,
@@ -98,6 +98,9 @@ pub struct GnclConfig {
     pub redial_min: Duration,
     /// Longest wait before dialling again. `redial_min` to 60 s; default 1 s.
     pub redial_max: Duration,
+    /// Time after which a connection ends whose other side takes nothing of what was written (TCP_USER_TIMEOUT). 100 ms to 10 min;
+    /// default 5 s.
+    pub give_up: Duration,
 }
 
 /// Node Discovery Layer: who is there, who is gone.
@@ -200,6 +203,7 @@ impl NodeConfig {
                 handshake: Duration::from_secs(2),
                 redial_min: Duration::from_millis(10),
                 redial_max: Duration::from_secs(1),
+                give_up: Duration::from_secs(5),
             },
             ndl: NdlConfig {
                 interface: Ipv4Addr::LOCALHOST,

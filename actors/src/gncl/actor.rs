@@ -150,15 +150,20 @@ impl Gncl {
 
     fn dial(&mut self, connection: ConnectionId, address: SocketAddr, ctx: &mut Context<Self>) {
         let mode = Rc::new(RefCell::new(Mode::Handshake));
-        let reading = Reading { mode: mode.clone(), payload_max: self.stores.config.payload_max };
+        let reading = self.reading(&mode);
         let reader = ctx.add_stream(link::dial(connection, address, reading));
         self.wires.insert(connection, Wire::new(None, mode, reader));
+    }
+
+    fn reading(&self, mode: &SharedMode) -> Reading {
+        let NodeConfig { payload_max, gncl, .. } = &self.stores.config;
+        Reading { mode: mode.clone(), payload_max: *payload_max, give_up: gncl.give_up }
     }
 
     fn accepted(&mut self, socket: TcpStream, ctx: &mut Context<Self>) {
         let (connection, socket) = (self.core.open(), Arc::new(socket));
         let mode = Rc::new(RefCell::new(Mode::Handshake));
-        let reading = Reading { mode: mode.clone(), payload_max: self.stores.config.payload_max };
+        let reading = self.reading(&mode);
         let reader = ctx.add_stream(link::read(connection, socket.clone(), reading));
         self.wires.insert(connection, Wire::new(Some(socket), mode, reader));
         self.input(Input::Accepted(connection), ctx);
@@ -444,7 +449,7 @@ impl Actor for Gncl {
         for KnownNode { node, incarnation, gncl: address, .. } in members {
             self.input(Input::NodeFound { node, incarnation, address }, ctx);
         }
-        ctx.add_stream(listener::accepted(listener));
+        ctx.add_stream(listener::accepted(listener, self.stores.config.gncl.give_up));
         ctx.add_stream(self.stores.posts.gncl.attach_keeping(Clone::clone));
         ctx.spawn(fut::wrap_future(Store::serve_those_held_up(self.stores.clone())));
         ctx.run_interval(EXPIRY_PERIOD, |actor, _| {
@@ -503,7 +508,12 @@ impl StreamHandler<io::Result<TcpStream>> for Gncl {
     fn handle(&mut self, accepted: io::Result<TcpStream>, ctx: &mut Context<Self>) {
         match accepted {
             Ok(socket) => self.accepted(socket, ctx),
-            Err(error) => self.stores.gncl.refusals.count(Time::now(), "not accepted", &error),
+            Err(error) => {
+                self.stores.gncl.refusals.count(Time::now(), "not accepted", &error);
+                if listener::is_starved(&error) {
+                    self.input(Input::Starved, ctx);
+                }
+            }
         }
     }
 }
@@ -518,6 +528,9 @@ impl StreamHandler<News> for Gncl {
             }
             What::DialFailed(error) => {
                 crate::log::debug!(%error, "dial failed");
+                if listener::is_starved(&error) {
+                    self.input(Input::Starved, ctx);
+                }
                 let refused = error.kind() == io::ErrorKind::ConnectionRefused;
                 self.input(Input::DialFailed { connection, refused }, ctx);
                 self.close(connection, ctx);

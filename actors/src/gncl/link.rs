@@ -1,6 +1,6 @@
 //! The reading half of a connection: bytes become frames, a bounded number at a time.
 
-use std::{cell::RefCell, io, net::SocketAddr, rc::Rc, sync::Arc};
+use std::{cell::RefCell, io, net::SocketAddr, rc::Rc, sync::Arc, time::Duration};
 
 use bytes::{BufMut, BytesMut};
 use futures_util::{Stream, stream};
@@ -92,6 +92,8 @@ pub(super) struct Reading {
     pub(super) mode: SharedMode,
     /// Longest payload on a link, in bytes.
     pub(super) payload_max: usize,
+    /// See [`tune`].
+    pub(super) give_up: Duration,
 }
 
 enum State {
@@ -103,7 +105,7 @@ enum State {
 fn news(connection: ConnectionId, state: State) -> impl Stream<Item = News> {
     stream::unfold(state, move |state| async move {
         let (what, state) = match state {
-            State::Dialling(address, reading) => match connect(address).await {
+            State::Dialling(address, reading) => match connect(address, reading.give_up).await {
                 Ok(socket) => {
                     let socket = Arc::new(socket);
                     (What::Connected(socket.clone()), State::Reading(Reader::new(socket, reading)))
@@ -120,15 +122,20 @@ fn news(connection: ConnectionId, state: State) -> impl Stream<Item = News> {
     })
 }
 
-async fn connect(address: SocketAddr) -> io::Result<TcpStream> {
+pub(super) async fn connect(address: SocketAddr, give_up: Duration) -> io::Result<TcpStream> {
     let socket = TcpStream::connect(address).await?;
-    tune(&socket)?;
+    tune(&socket, give_up)?;
     Ok(socket)
 }
 
-/// Sets what every connection between nodes has.
-pub(super) fn tune(socket: &TcpStream) -> io::Result<()> {
+/// Sets what every connection between nodes has. The system ends it when the peer's has taken nothing of what was written for
+/// `give_up`, or has not answered for so long: also where only one direction is cut, and the peer can still be heard.
+pub(super) fn tune(socket: &TcpStream, give_up: Duration) -> io::Result<()> {
     socket.set_nodelay(true)?;
+    #[cfg(target_os = "linux")]
+    SockRef::from(socket).set_tcp_user_timeout(Some(give_up))?;
+    #[cfg(not(target_os = "linux"))]
+    let _ = give_up;
     // What the kernel holds cannot be overtaken by Control nor superseded by a newer value: it shall hold little that
     // it cannot send yet, and leave the rest to the outlet's queue.
     #[cfg(target_os = "linux")]

@@ -24,14 +24,17 @@ pub(super) fn listen(address: SocketAddr) -> io::Result<std::net::TcpListener> {
     Ok(socket.into())
 }
 
-/// Each connection that is made to `listener`, and each error that made it wait.
-pub(super) fn accepted(listener: TcpListener) -> impl Stream<Item = io::Result<TcpStream>> {
-    stream::unfold((listener, Duration::ZERO), |(listener, wait)| async move {
+/// Each connection that is made to `listener`, and each error that made it wait. See [`tune`](super::link::tune).
+pub(super) fn accepted(
+    listener: TcpListener,
+    give_up: Duration,
+) -> impl Stream<Item = io::Result<TcpStream>> {
+    stream::unfold((listener, Duration::ZERO), move |(listener, wait)| async move {
         if wait > Duration::ZERO {
             tokio::time::sleep(wait).await;
         }
         let accepted = listener.accept().await.and_then(|(socket, _)| {
-            super::link::tune(&socket)?;
+            super::link::tune(&socket, give_up)?;
             Ok(socket)
         });
         let wait = accepted.as_ref().err().map_or(Duration::ZERO, |error| wait_after(error, wait));
@@ -39,13 +42,18 @@ pub(super) fn accepted(listener: TcpListener) -> impl Stream<Item = io::Result<T
     })
 }
 
+/// Whether there were no descriptors left, or no memory.
+pub(super) fn is_starved(error: &io::Error) -> bool {
+    matches!(Errno::from_io_error(error), Some(Errno::MFILE | Errno::NFILE | Errno::NOBUFS | Errno::NOMEM))
+}
+
 /// How long to wait after `error`, having waited `before` after the last one.
 fn wait_after(error: &io::Error, before: Duration) -> Duration {
     match Errno::from_io_error(error) {
         // The peer gave up before we took it: the next one may be fine.
         Some(Errno::CONNABORTED | Errno::INTR) => Duration::ZERO,
-        // No descriptors (MFILE, NFILE) or no memory (NOBUFS, NOMEM): the same call would fail at once again. Of an
-        // error that nobody foresaw nothing better is known.
+        // No descriptors or no memory: the same call would fail at once again. Of an error that nobody foresaw nothing
+        // better is known.
         Some(_) | None => (before * 2).clamp(BACK_OFF_MIN, BACK_OFF_MAX),
     }
 }
@@ -58,6 +66,7 @@ mod tests {
     fn a_lack_of_descriptors_or_memory_waits_longer_each_time_and_never_spins() {
         for errno in [Errno::MFILE, Errno::NFILE, Errno::NOBUFS, Errno::NOMEM] {
             let error = io::Error::from(errno);
+            assert!(is_starved(&error));
             let mut waits = vec![wait_after(&error, Duration::ZERO)];
             for _ in 0..5 {
                 waits.push(wait_after(&error, waits[waits.len() - 1]));
@@ -70,5 +79,6 @@ mod tests {
     fn a_peer_that_gave_up_does_not_make_the_next_one_wait() {
         let error = io::Error::from(Errno::CONNABORTED);
         assert_eq!(wait_after(&error, BACK_OFF_MAX), Duration::ZERO);
+        assert!(!is_starved(&error));
     }
 }

@@ -11,18 +11,38 @@ use super::{
 
 impl Core {
     pub(super) fn accepted(&mut self, now: Time, connection: ConnectionId) {
-        let strangers =
-            self.connections.values().filter(|c| matches!(c.stage, Stage::Stranger | Stage::Leaving));
-        let takes_nobody = self.leaving && !self.expects_sides();
-        if takes_nobody || strangers.count() >= self.settings.strangers_max {
-            self.count(
-                "too many strangers",
-                "a connection was closed at once; see `gncl.strangers_max`".to_owned(),
-            );
+        if self.leaving && !self.expects_sides() {
+            self.count("leaving", "a connection was closed at once".to_owned());
             self.outputs.push_back(Output::Close(connection));
             return;
         }
+        if self.strangers().count() >= self.settings.strangers_max {
+            let what = "the one that had said nothing for longest was closed; see `gncl.strangers_max`";
+            self.count("too many strangers", what.to_owned());
+            self.close_strangers(1);
+        }
         self.stage_for_handshake(now, connection, Stage::Stranger);
+    }
+
+    /// There are no descriptors left, or no memory: what strangers hold is needed for peers. spec: GNCL-2
+    pub(super) fn starved(&mut self) {
+        let half = self.strangers().count().div_ceil(2);
+        self.close_strangers(half);
+    }
+
+    /// Connections whose peer is not known, or was refused and has not closed: oldest first.
+    fn strangers(&self) -> impl Iterator<Item = ConnectionId> {
+        let is_stranger = |stage| matches!(stage, Stage::Stranger | Stage::Leaving);
+        self.connections.iter().filter(move |(_, c)| is_stranger(c.stage)).map(|(id, _)| *id)
+    }
+
+    /// Who is a peer says hello at once, so those that have not for longest are none.
+    fn close_strangers(&mut self, count: usize) {
+        let oldest: Vec<_> = self.strangers().take(count).collect();
+        for connection in oldest {
+            self.connections.remove(&connection);
+            self.outputs.push_back(Output::Close(connection));
+        }
     }
 
     /// Dials a peer that has neither a link nor a dial on its way.

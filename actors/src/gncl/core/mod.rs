@@ -45,7 +45,7 @@ pub(super) struct Settings {
     pub(super) redial_min: Duration,
     /// Longest wait before dialling again, before jitter.
     pub(super) redial_max: Duration,
-    /// Connections at most that are not links, of those that we accepted. Further ones are closed at once.
+    /// Connections at most that are not links, of those that we accepted. For a further one the oldest is closed.
     pub(super) strangers_max: usize,
     /// Peers known at most. Further ones are refused.
     pub(super) peers_max: usize,
@@ -98,6 +98,8 @@ pub(super) enum Input {
     GoodbyeReceived(ConnectionId),
     /// The connection ended.
     Ended(ConnectionId),
+    /// A connection could not be made for want of descriptors or memory.
+    Starved,
     /// Time has passed, perhaps up to [`Core::next_wake`].
     TimePassed,
     /// The node is being stopped in order; there are messages for these nodes that are not known to have arrived.
@@ -225,6 +227,7 @@ impl Core {
             }
             Input::GoodbyeReceived(connection) => self.goodbye(now, connection),
             Input::Ended(connection) => self.ended(now, connection),
+            Input::Starved => self.starved(),
             Input::TimePassed => self.time_passed(now),
             Input::LeaveRequested { owed } => self.leave(now, &owed),
         }

@@ -245,13 +245,31 @@ fn strangers_are_limited_in_number_and_in_time() {
     for stranger in &strangers {
         core.handle(millis(0), Input::Accepted(*stranger));
     }
-    assert!(outputs(&mut core).contains(&Output::Close(strangers[3])), "the fourth is one too many");
+    assert!(outputs(&mut core).contains(&Output::Close(strangers[0])), "with the fourth the oldest goes");
     core.handle(millis(2_000), Input::TimePassed);
     let refused = outputs(&mut core).iter().filter(|output| matches!(output, Output::Refuse(..))).count();
     assert_eq!(refused, 3);
     core.handle(millis(4_000), Input::TimePassed);
     assert_eq!(outputs(&mut core).len(), 3, "who does not go is closed");
     assert_eq!(core.next_wake(), None);
+}
+
+#[test]
+fn half_of_the_strangers_give_their_descriptors_back_when_there_are_none_left() {
+    let mut core = core();
+    let (link, _) = greet(&mut core, millis(0), hello_from(HIGH, 1, 1));
+    let strangers: Vec<_> = (0..3).map(|_| core.open()).collect();
+    for stranger in &strangers {
+        core.handle(millis(0), Input::Accepted(*stranger));
+    }
+    for gone in [&strangers[..2], &strangers[2..], &[]] {
+        core.handle(millis(1), Input::Starved);
+        assert_eq!(
+            outputs(&mut core),
+            gone.iter().map(|stranger| Output::Close(*stranger)).collect::<Vec<_>>()
+        );
+    }
+    assert!(core.linked(link).is_some(), "no link is touched");
 }
 
 #[test]

@@ -1,15 +1,16 @@
 //! Links that break, are made again, and end in order.
 
-use std::sync::atomic::Ordering;
+use std::{sync::atomic::Ordering, time::Duration};
 
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
     tid::Tid,
     wire::Kind,
 };
+use socket2::SockRef;
 
 use super::bench::{ByHand, Cable, NINE, Node, next, pair, run};
-use crate::gncl::{LinkFact, peer::frame};
+use crate::gncl::{LinkFact, link, listener, peer::frame};
 
 #[test]
 fn two_nodes_that_find_each_other_at_once_have_one_link_and_use_it_both_ways() {
@@ -235,11 +236,40 @@ fn a_restarted_layer_listens_where_it_did_and_sends_what_waited_in_order() {
 }
 
 #[test]
+fn both_ends_of_a_connection_give_it_up_when_nothing_is_taken_any_more() {
+    run(async {
+        let give_up = Duration::from_millis(1_234);
+        let listener = listener::listen(([127, 0, 0, 1], 0).into()).expect("loopback has a free port");
+        let address = listener.local_addr().expect("it is bound");
+        let listener = tokio::net::TcpListener::from_std(listener).expect("it does not block");
+        let mut accepted = Box::pin(listener::accepted(listener, give_up));
+        let dialled = link::connect(address, give_up).await.expect("it listens");
+        let accepted = next("a connection", &mut accepted).await.expect("it is accepted");
+        for end in [&dialled, &accepted] {
+            assert_eq!(SockRef::from(end).tcp_user_timeout().expect("the system says it"), Some(give_up));
+        }
+    });
+}
+
+#[test]
+fn a_peer_is_taken_while_more_connections_than_there_may_be_say_nothing() {
+    run(async {
+        let mut node = Node::start_with(1, |config| config.gncl.strangers_max = 4).await;
+        let mut silent = Vec::new();
+        for _ in 0..200 {
+            silent.push(ByHand::dial(&node).await);
+        }
+        let _peer = ByHand::linked_to(&mut node).await;
+        assert!(node.stores.gncl.refusals.of("too many strangers") > 0);
+    });
+}
+
+#[test]
 fn two_layers_cannot_have_one_port_and_the_second_says_so() {
     run(async {
         let a = Node::start(1).await;
         let port = a.listens_at().port();
-        let error = crate::gncl::listener::listen(([127, 0, 0, 1], port).into()).unwrap_err();
+        let error = listener::listen(([127, 0, 0, 1], port).into()).unwrap_err();
         assert_eq!(error.kind(), std::io::ErrorKind::AddrInUse);
     });
 }
