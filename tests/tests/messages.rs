@@ -5,7 +5,7 @@ use std::{
     sync::mpsc::{Receiver, SyncSender, sync_channel},
 };
 
-use sinew::{Rejection, prelude::*};
+use sinew::{Rejection, SendError, prelude::*};
 use sinew_tests::{DEADLINE, own_group};
 
 payload!("messages.question", Control => struct Question { number: u64 });
@@ -119,6 +119,41 @@ fn requests_to_another_node_are_answered_and_every_confirmed_send_has_its_outcom
             let nobody = Tid::new([127, 0, 0, 2].into(), AppAddress::fixed(7).expect("a fixed address"));
             let lost = sender.send_confirmed(nobody, &Unheard, DEADLINE).expect("it is sent").await;
             assert_eq!(lost, Outcome::Rejected(Rejection::NoSuchApplication));
+        },
+    );
+}
+
+#[test]
+fn requests_that_nobody_waits_for_any_more_take_no_places_and_their_late_replies_disturb_nobody() {
+    /// More than may be waited for at once.
+    const DROPPED: u64 = 5_000;
+    let (spec, _heard) = oracle("oracle");
+    let _nodes = tell(
+        |node| node.app(spec),
+        &["oracle"],
+        async |sender: sinew::Sender| {
+            let mut asked = 0;
+            while asked < DROPPED {
+                match sender.ask::<_, Answer>("oracle", &Question { number: 21 }, DEADLINE) {
+                    Ok(reply) => {
+                        drop(reply);
+                        asked += 1;
+                    }
+                    // The way there is full for the moment.
+                    Err(SendError::Rejected(Rejection::QueueFull)) => {
+                        actix::clock::sleep(Duration::from_millis(1)).await;
+                    }
+                    Err(other) => panic!("{other:?} after {asked}"),
+                }
+            }
+            // Behind all of them; what comes now is its own.
+            let last = loop {
+                match sender.ask::<_, Answer>("oracle", &Question { number: 21 }, DEADLINE) {
+                    Ok(reply) => break reply,
+                    Err(_) => actix::clock::sleep(Duration::from_millis(1)).await,
+                }
+            };
+            assert_eq!(last.await.expect("a reply").number, 42);
         },
     );
 }

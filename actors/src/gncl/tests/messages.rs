@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
-    tid::{NodeAddress, Tid},
+    tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     wire::{Class, Flags, Kind, Message},
 };
@@ -188,5 +188,28 @@ fn the_node_in_the_documentation_breaks_its_connection_twice_and_all_arrives_onc
         let said = String::from_utf8(output.stdout).expect("it writes text");
         let expected: String = (1..=10).map(|number| format!("outcome {number} 0\n")).collect();
         assert_eq!(said, expected);
+    });
+}
+
+#[test]
+fn a_group_and_a_broadcast_cross_to_a_node_once_however_many_are_there_and_share_their_payload() {
+    run(async {
+        let (a, b) = pair().await;
+        let group = AppAddress::group("listeners");
+        let mut members: Vec<_> = (1..=5).map(|number| b.app(number)).collect();
+        for number in 1..=5 {
+            assert!(b.stores.router.set_member(group, b.tid(number).app, true));
+        }
+        a.stores.router.set_remote_groups(b.address(), &[group]);
+        let peer = a.stores.gncl.peer(b.address()).expect("it is linked");
+        for (copies, app) in [(1, group), (2, AppAddress::ALL)] {
+            a.send(Tid::new(NodeAddress::ALL, app), &[7; 1_000]);
+            let mut payloads = Vec::new();
+            for member in &mut members {
+                payloads.push(next("a copy", member).await.payload);
+            }
+            assert!(payloads.iter().all(|payload| payload.as_ptr() == payloads[0].as_ptr()), "one payload");
+            assert_eq!(peer.counts().sent, copies, "one message on the wire for all of them");
+        }
     });
 }
