@@ -372,7 +372,7 @@ fn a_slow_one_that_comes_back_each_time_is_not_accused_nor_is_its_neighbour() {
     let (good, read) = scribe("good", Evil::WaitForEver);
     let stage = Stage::start(vec![slow.place(shared.clone()).into(), good.place(shared).into()]);
     stage.wait_ready(1);
-    // Twelve in one turn of the event loop: four budgets in which the neighbour's messages wait.
+    // Twelve turns one after the other: four budgets in which the neighbour's message may wait.
     for number in 0..12 {
         stage.send(0, number);
     }
@@ -380,6 +380,6 @@ fn a_slow_one_that_comes_back_each_time_is_not_accused_nor_is_its_neighbour() {
     for number in 0..12 {
         assert_eq!(heard.recv_timeout(DEADLINE), Ok(number));
     }
-    assert_eq!(next(&read), "1: 1", "the same life as before");
+    assert_eq!(next(&read), "1: 1", "the same life as before; {:?}", stage.facts_so_far());
     stage.stop();
 }

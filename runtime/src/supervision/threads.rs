@@ -20,6 +20,7 @@ use super::{
     place::Owner,
     system,
     tenant::{Fate, Tenant, WeakTenant},
+    vitals::Neighbours,
     watchdog::{Reprieve, Watchdog},
 };
 use crate::post::lock;
@@ -82,13 +83,17 @@ impl Seat {
         }
     }
 
-    /// Whether another of its tenants is in the middle of a turn.
-    pub(super) fn is_busy_with_another_than(&self, tenant: &Tenant) -> bool {
-        let tenants = lock(&self.tenants);
-        tenants
-            .iter()
-            .filter_map(WeakTenant::living)
-            .any(|other| !Arc::ptr_eq(other.vitals(), tenant.vitals()) && other.vitals().sight().is_busy())
+    /// What its tenants but this one do.
+    pub(super) fn others_than(&self, tenant: &Tenant) -> Neighbours {
+        let mut neighbours = Neighbours::default();
+        for other in lock(&self.tenants).iter().filter_map(WeakTenant::living) {
+            if !Arc::ptr_eq(other.vitals(), tenant.vitals()) {
+                let sight = other.vitals().sight();
+                neighbours.are_busy |= sight.is_busy();
+                neighbours.turns = neighbours.turns.wrapping_add(sight.turn);
+            }
+        }
+        neighbours
     }
 
     fn add(&self, tenant: &Tenant) {

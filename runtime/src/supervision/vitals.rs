@@ -82,6 +82,15 @@ impl Sight {
     }
 }
 
+/// What somebody saw who looked at the others of a thread.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Neighbours {
+    /// One of them is in the middle of a turn.
+    pub(super) are_busy: bool,
+    /// The sum of the numbers of their turns: another one if any of them had its turn meanwhile.
+    pub(super) turns: u64,
+}
+
 /// Where an application's messages wait.
 struct Inbox {
     mailbox: Arc<Mailbox>,

@@ -133,6 +133,11 @@ impl Stage {
         self.next_fact_at().1
     }
 
+    /// What the supervisor said and nobody has heard yet, for the words of a test that fails.
+    pub(crate) fn facts_so_far(&self) -> Vec<(Time, SupervisorFact)> {
+        self.facts.try_iter().collect()
+    }
+
     pub(crate) fn wait_ready(&self, child: u64) {
         while self.next_fact() != SupervisorFact::Ready(ChildId(child)) {}
     }

@@ -30,6 +30,7 @@ use super::{
     panics::{is_the_runtimes, words},
     place::make_realtime,
     tenant::{Fate, Tenant},
+    vitals::Neighbours,
 };
 use crate::{post::lock, time::Time};
 
@@ -220,7 +221,9 @@ impl Watched {
         }
         // Nothing where somebody is in the mailbox this very moment: then things go on.
         let Some((waiting, taken)) = vitals.backlog() else { return true };
-        match self.stall.look(look, waiting, taken, cpu) {
+        let neighbours =
+            || self.tenant.seat().map_or_else(Neighbours::default, |seat| seat.others_than(&self.tenant));
+        match self.stall.look(look, (waiting, taken), neighbours, cpu) {
             Stall::None => true,
             Stall::Probe => {
                 self.tenant.wake();
@@ -231,10 +234,6 @@ impl Watched {
                 self.accuse(hang, &what, false);
                 false
             }
-            Stall::ThreadIsAway(_) if self.is_neighbours_fault() => {
-                self.stall.calm(look.now);
-                true
-            }
             Stall::ThreadIsAway(hang) => {
                 let what = format!(
                     "its thread does not come back from something that is no actor's; {waiting} messages wait"
@@ -243,10 +242,6 @@ impl Watched {
                 false
             }
         }
-    }
-
-    fn is_neighbours_fault(&self) -> bool {
-        self.tenant.seat().is_some_and(|seat| seat.is_busy_with_another_than(&self.tenant))
     }
 
     /// Fences the life, says so, and only then does what may take time.

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use super::{account::Account, processor::Sample};
 use crate::{
-    supervision::vitals::{Doing, Sight},
+    supervision::vitals::{Doing, Neighbours, Sight},
     time::Time,
 };
 
@@ -109,7 +109,8 @@ pub(super) struct StallSuspect {
     /// `None` before the first look.
     taken: Option<u64>,
     since: Time,
-    probed: Option<u64>,
+    /// The turn that it had when it was probed, and what the others of its thread did.
+    probed: Option<(u64, Neighbours)>,
     account: Account,
 }
 
@@ -118,12 +119,13 @@ impl StallSuspect {
         Self { budget, taken: None, since: Time::ZERO, probed: None, account: Account::default() }
     }
 
-    /// Takes a look at an actor that should take messages; `waiting` wait and `taken` were taken so far.
+    /// Takes a look at an actor that should take messages; of its backlog so many wait, and so many were taken so far. Where it
+    /// matters it asks what the `neighbours` do, the others of its thread.
     pub(super) fn look(
         &mut self,
         look: Look,
-        waiting: usize,
-        taken: u64,
+        (waiting, taken): (usize, u64),
+        neighbours: impl FnOnce() -> Neighbours,
         sample: impl FnOnce() -> Option<Sample>,
     ) -> Stall {
         let Look { now, late, sight, .. } = look;
@@ -134,11 +136,11 @@ impl StallSuspect {
         }
         self.account.late += late;
         let lasted = now.since(self.since);
-        let Some(probed) = self.probed else {
+        let Some((turn, before)) = self.probed else {
             if lasted < self.budget / 2 {
                 return Stall::None;
             }
-            self.probed = Some(sight.turn);
+            self.probed = Some((sight.turn, neighbours()));
             self.account.enter(sample());
             return Stall::Probe;
         };
@@ -149,11 +151,17 @@ impl StallSuspect {
             return Stall::None;
         }
         let hang = |excused| Hang { since: self.since, lasted, excused };
-        if sight.turn >= probed + 2 {
+        if sight.turn >= turn + 2 {
             return Stall::Waits(hang(self.account.late));
         }
         let excused = self.account.excused();
         if waits_for_cpu || lasted < self.budget + excused {
+            return Stall::None;
+        }
+        let after = neighbours();
+        if after.are_busy || after != before {
+            // One of them has the thread, or has just had it: they are judged themselves.
+            self.calm(now);
             return Stall::None;
         }
         Stall::ThreadIsAway(hang(excused))

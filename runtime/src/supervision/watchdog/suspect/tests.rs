@@ -121,10 +121,22 @@ fn stall(
     waiting: usize,
     sample: impl Fn(u64) -> Option<Sample>,
 ) -> (Option<u64>, Option<(u64, Stall)>) {
+    stall_beside(|_| Neighbours::default(), turn, taken, waiting, sample)
+}
+
+/// The same beside others on its thread.
+fn stall_beside(
+    neighbours: impl Fn(u64) -> Neighbours,
+    turn: impl Fn(u64) -> u64,
+    taken: impl Fn(u64) -> u64,
+    waiting: usize,
+    sample: impl Fn(u64) -> Option<Sample>,
+) -> (Option<u64>, Option<(u64, Stall)>) {
     let mut suspect = StallSuspect::new(BUDGET);
     let mut probed = None;
     for now in (0..400).map(|look| look * 5) {
-        match suspect.look(on_time(now, busy(turn(now), None)), waiting, taken(now), || sample(now)) {
+        let look = on_time(now, busy(turn(now), None));
+        match suspect.look(look, (waiting, taken(now)), || neighbours(now), || sample(now)) {
             Stall::None => {}
             Stall::Probe => probed = Some(now),
             other @ (Stall::Waits(_) | Stall::ThreadIsAway(_)) => return (probed, Some((now, other))),
@@ -164,6 +176,20 @@ fn one_whose_thread_gets_a_moment_of_cpu_and_waits_again_is_not_called_away() {
         _ => cpu(1, 0, Condition::Runnable),
     };
     assert_eq!(stall(|_| 2, |_| 7, 3, rarely).1, None);
+}
+
+#[test]
+fn one_whose_thread_is_with_its_neighbours_is_let_wait_also_between_two_of_their_turns() {
+    let blocked = |_| cpu(0, 0, Condition::Blocked);
+    let in_a_long_turn = |_| Neighbours { are_busy: true, turns: 1 };
+    assert_eq!(stall_beside(in_a_long_turn, |_| 2, |_| 7, 3, blocked).1, None);
+    // They have one turn after the other, and every look falls between two of them.
+    let between_turns = |now| Neighbours { are_busy: false, turns: now / 50 * 2 };
+    assert_eq!(stall_beside(between_turns, |_| 2, |_| 7, 3, blocked).1, None);
+    // From 300 ms on none of them has a turn either: the thread is away.
+    let until_300 = |now: u64| Neighbours { are_busy: false, turns: now.min(300) / 50 * 2 };
+    let (_, end) = stall_beside(until_300, |_| 2, |_| 7, 3, blocked);
+    assert!(matches!(end, Some((400, Stall::ThreadIsAway(_)))), "{end:?}");
 }
 
 #[test]
