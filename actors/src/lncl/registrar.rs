@@ -90,7 +90,9 @@ pub(crate) fn unregister_local(stores: &Stores, app: AppAddress) {
 /// The TID that has `name` now, on this node or any.
 pub(crate) fn resolve(stores: &Stores, name: &str) -> Option<Tid> {
     let here = lock(&stores.registry).resolve(name).map(|app| Tid::new(stores.node, app));
-    here.or_else(|| lock(&stores.sync).resolve(name))
+    // The sync manager hears of this node's later: it may still have one that is gone.
+    let is_elsewhere = |tid: &Tid| tid.node != stores.node;
+    here.or_else(|| lock(&stores.sync).called(name).into_iter().find(is_elsewhere))
 }
 
 /// Makes `app` a member of `group`, or no longer one.
@@ -163,5 +165,43 @@ fn tell_sync(stores: &Stores, fact: AppFact) {
     if let Err(event) = stores.posts.sync.post(sync::Event::App(fact)) {
         // Thousands of events wait for it then, so it has stood still for long.
         crate::log::error!(?event, "the sync manager's post is full and this was not told: does it hang?");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew_runtime::{
+        mailbox::Mailbox,
+        pending::{AppOutlet, Pending},
+        tid::Incarnation,
+        time::Time,
+    };
+
+    use super::*;
+    use crate::NodeConfig;
+
+    #[test]
+    fn a_name_is_free_when_its_address_is_given_back_whenever_the_sync_manager_hears_of_it() {
+        // given: an application, of which the sync manager knows
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let outlet = Arc::new(AppOutlet { pending: Pending::new(1), inbox: Mailbox::new(1) });
+        let (name, address) = (Some("drive".to_owned()), None);
+        let app = LocalApp {
+            name: name.clone(),
+            address,
+            requires: vec![],
+            kinds: vec![],
+            outlet,
+            events: Arc::new([]),
+        };
+        let tid = register_local(&stores, app).expect("nothing is in the way");
+        let fact = AppFact::Registered { app: tid.app, name, requires: vec![] };
+        lock(&stores.sync).handle(Time::ZERO, sync::Input::AppChanged(fact));
+        assert_eq!(resolve(&stores, "drive"), Some(tid));
+        // when
+        unregister_local(&stores, tid.app);
+        // then: though the sync manager has not heard of it
+        assert_eq!(lock(&stores.sync).called("drive"), [tid]);
+        assert_eq!(resolve(&stores, "drive"), None);
     }
 }

@@ -25,6 +25,8 @@ mod list;
 
 pub(crate) use actor::SyncManager;
 pub(crate) use core::Core;
+#[cfg(test)]
+pub(crate) use core::Input;
 pub use facts::{DirectoryEntry, Waiting};
 pub(crate) use list::{NAME_BYTES_MAX, Name, at_most};
 

@@ -166,10 +166,11 @@ impl Core {
         [self.peers.next_due(), overdue, self.retry, silent].into_iter().flatten().min()
     }
 
-    /// The TID of the application called `name`: of this node first, else of a linked node, else of a node whose link
-    /// is down; of several nodes the one with the lowest address. It need not be ready. spec: SYNC-6
-    pub(crate) fn resolve(&self, name: &str) -> Option<Tid> {
-        self.all_called(name).into_iter().next()
+    /// The TIDs of the applications called `name`: of this node first, then of linked nodes, then of nodes whose link
+    /// is down; of several nodes the one with the lowest address first. They need not be ready. spec: SYNC-6
+    pub(crate) fn called(&self, name: &str) -> Vec<Tid> {
+        let here = self.apps.called(name).map(|(app, _)| Tid::new(self.node, app));
+        here.into_iter().chain(self.peers.resolve(name)).collect()
     }
 
     /// Every application that has a name, on this node and on all that are known and not lost, by name and address.
@@ -204,11 +205,6 @@ impl Core {
         }
         let lost = self.apps.get(address).into_iter().flat_map(|app| &app.lost);
         lost.filter_map(|name| Some((name.clone(), self.why_not(name)?.words()))).collect()
-    }
-
-    fn all_called(&self, name: &str) -> Vec<Tid> {
-        let here = self.apps.called(name).map(|(app, _)| Tid::new(self.node, app));
-        here.into_iter().chain(self.peers.resolve(name)).collect()
     }
 
     fn refuse(&mut self, cause: &'static str, detail: String) {
@@ -354,7 +350,7 @@ impl Core {
     }
 
     fn note_same_name(&mut self, name: &str) {
-        let tids = self.all_called(name);
+        let tids = self.called(name);
         if tids.len() > 1 && self.same_names.len() < SAME_NAMES_MAX && self.same_names.insert(name.to_owned())
         {
             self.outputs.push_back(Output::SameName { name: name.to_owned(), tids });
