@@ -45,7 +45,7 @@ static struct drive_report ask_report(sinew_endpoint *sensor, sinew_tid drive)
     sinew_received reply;
     sinew_kind kind = sinew_kind_named(SINEW_TEXT("demo.drive_report"));
     check(sinew_create_message(sensor, drive, kind, SINEW_CONTROL, 0, &request), "create");
-    check(sinew_ask(sensor, &request, SECOND, &reply, NULL), "ask");
+    check(sinew_ask(sensor, &request, 10 * SECOND, &reply, NULL), "ask");
     if (reply.length != sizeof report) {
         fprintf(stderr, "the drive's report has %zu bytes\n", reply.length);
         exit(EXIT_FAILURE);
@@ -64,7 +64,7 @@ static void send_last(sinew_endpoint *sensor, sinew_tid drive, uint32_t number)
     sinew_kind kind = sinew_kind_named(SINEW_TEXT("demo.joint_angle"));
     check(sinew_create_message(sensor, drive, kind, SINEW_CONTROL, sizeof angle, &message), "create");
     memcpy(message.bytes, &angle, sizeof angle);
-    check(sinew_send_message_confirmed(sensor, &message, SECOND, &outcome), "send confirmed");
+    check(sinew_send_message_confirmed(sensor, &message, 10 * SECOND, &outcome), "send confirmed");
     printf("last angle: %s\n", sinew_outcome_text(outcome));
 }
 
@@ -84,7 +84,7 @@ int main(int argc, char **argv)
         return EXIT_FAILURE;
     }
     check(sinew_register_transport_address(sinew_text_of(argv[1]), &options, &sensor), "register");
-    check(sinew_resolve(sensor, drive_name, SECOND, &drive), "resolve");
+    check(sinew_resolve(sensor, drive_name, 10 * SECOND, &drive), "resolve");
     clock_gettime(CLOCK_MONOTONIC, &next);
     for (uint32_t number = 1; number < angles; number++) {
         send_angle(sensor, drive, number);

@@ -73,7 +73,8 @@
 #define SINEW_DIRECT 2
 
 /**
- * For `links` of `sinew_options`: `spin_ns` is the longest to look; it looks as long as messages lately took to come.
+ * For `links` of `sinew_options`: `spin_ns` is the longest to look. It looks about twice as long as messages lately took to come,
+ * and not at all while they take longer than `spin_ns`. Without `spin_ns` this does nothing.
  */
 #define SINEW_SPIN_ADAPTIVE 4
 
@@ -373,8 +374,9 @@ typedef struct sinew_options {
      */
     size_t inbox_capacity;
     /**
-     * How long a waiting thread looks before it sleeps. Looking keeps a CPU busy and saves the wake, which is most of a
-     * short message's way: for a thread with a CPU of its own. Default: it sleeps at once.
+     * How long a thread that waits at a ring looks at it before it sleeps; at a socket (`SINEW_SOCKET_ONLY`) it never looks.
+     * Looking keeps a CPU busy and saves the wake, which is most of a short message's way: for a thread with a CPU of its
+     * own. Default: it sleeps at once.
      */
     uint64_t spin_ns;
     /**

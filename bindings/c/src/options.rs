@@ -17,7 +17,8 @@ pub const SINEW_REQUIREMENT_EVENTS: u32 = 2;
 pub const SINEW_SOCKET_ONLY: u32 = 1;
 /// For `links` of `sinew_options`: direct links to other processes that ask for them too.
 pub const SINEW_DIRECT: u32 = 2;
-/// For `links` of `sinew_options`: `spin_ns` is the longest to look; it looks as long as messages lately took to come.
+/// For `links` of `sinew_options`: `spin_ns` is the longest to look. It looks about twice as long as messages lately took to come,
+/// and not at all while they take longer than `spin_ns`. Without `spin_ns` this does nothing.
 pub const SINEW_SPIN_ADAPTIVE: u32 = 4;
 /// For `links` of `sinew_options`: does not register again when the connection to the node has ended. Then every call says
 /// `SINEW_ERROR_CLOSED`. Without this the endpoint comes back by itself.
@@ -53,8 +54,9 @@ pub struct Options {
     /// How many received messages wait in this process until no more are taken out of the socket or the rings; more while an
     /// answer is waited for. Default: 256.
     pub inbox_capacity: usize,
-    /// How long a waiting thread looks before it sleeps. Looking keeps a CPU busy and saves the wake, which is most of a
-    /// short message's way: for a thread with a CPU of its own. Default: it sleeps at once.
+    /// How long a thread that waits at a ring looks at it before it sleeps; at a socket (`SINEW_SOCKET_ONLY`) it never looks.
+    /// Looking keeps a CPU busy and saves the wake, which is most of a short message's way: for a thread with a CPU of its
+    /// own. Default: it sleeps at once.
     pub spin_ns: u64,
     /// What carries the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT`, `SINEW_SPIN_ADAPTIVE`, `SINEW_ONE_CONNECTION`. Default:
     /// shared memory where the system has it, all through the node, and again when the connection has ended.

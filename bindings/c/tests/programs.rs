@@ -42,8 +42,11 @@ fn the_sensor_in_c_and_the_drive_in_cpp_find_each_other_and_walk() {
         return;
     }
     let ground = Ground::new();
+    // Each waits for the other so long as it says, and not for a compiler.
+    let sensor = C.shared("examples/sensor.c", &ground);
     let mut drive = ground.start(&CPP.shared("examples/drive.cpp", &ground), &[]);
-    let mut sensor = ground.start(&C.shared("examples/sensor.c", &ground), &["200"]);
+    drive.wait_for(&["drive is"]);
+    let mut sensor = ground.start(&sensor, &["200"]);
     sensor.wait_for(&["last angle: delivered"]);
     sensor.wait_for(&["the drive of node knee is at number 200"]);
     assert_eq!(sensor.wait_for_end(), Some(0));
@@ -69,13 +72,29 @@ fn the_first_program_in_c_asks_and_prints_the_reply() {
 }
 
 #[test]
+fn the_first_program_in_c_is_greeted_by_the_one_beside_it() {
+    if !is_there("gcc") {
+        return;
+    }
+    let ground = Ground::new();
+    let hello = C.shared("examples/hello.c", &ground);
+    let mut greeter = ground.start(&C.shared("examples/greeter.c", &ground), &[]);
+    greeter.wait_for(&["the greeter is there"]);
+    let mut hello = ground.start(&hello, &[]);
+    hello.wait_for(&["Hello, Ankle"]);
+    assert_eq!((hello.wait_for_end(), greeter.wait_for_end()), (Some(0), Some(0)));
+}
+
+#[test]
 fn the_library_can_be_linked_statically_and_the_wrapper_compiled_as_cpp20() {
     if !is_there("gcc") || !is_there("g++") {
         return;
     }
     let ground = Ground::new();
+    let sensor = C.static_("examples/sensor.c", &ground);
     let mut drive = ground.start(&CPP20.shared("examples/drive.cpp", &ground), &[]);
-    let mut sensor = ground.start(&C.static_("examples/sensor.c", &ground), &["3"]);
+    drive.wait_for(&["drive is"]);
+    let mut sensor = ground.start(&sensor, &["3"]);
     assert_eq!(sensor.wait_for_end(), Some(0));
     drive.wait_for(&["last angle was number 3"]);
 }
