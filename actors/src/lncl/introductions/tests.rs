@@ -6,10 +6,14 @@ use std::{
 };
 
 use rustix::net::{RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, recv, recvmsg};
-use sinew_runtime::tid::NodeAddress;
+use sinew_runtime::tid::{Incarnation, NodeAddress};
 
 use super::*;
-use crate::lncl::payload::Gone;
+use crate::{
+    NodeConfig,
+    lncl::{payload::Gone, server::Server},
+    stores::Stores,
+};
 
 const NOW: Time = Time::from_nanos(1);
 
@@ -184,6 +188,17 @@ fn an_introduction_that_is_not_answered_in_time_is_given_up_and_the_node_keeps_n
     assert_eq!(recv(&theirs, &mut [0; 2][..], RecvFlags::DONTWAIT).unwrap().0, 0, "the link has ended");
     peer.next().settle(Outcome::Delivered);
     assert!(asker.frames.try_recv().is_err(), "it was told already");
+}
+
+#[test]
+fn what_nobody_answers_is_given_up_by_the_look_that_lncl_takes_at_its_clients() {
+    let server = Server::new(Stores::for_test(NodeConfig::new("test"), Incarnation(1)));
+    let introductions = &server.introductions;
+    let (asker, peer) = (join(introductions, 1, 64), join(introductions, 2, 64));
+    introductions.introduce(asker.tid, peer.tid, question(7, 99), NOW).unwrap();
+    server.tick(NOW + unanswered::ANSWERED_WITHIN);
+    let told = asker.next();
+    assert_eq!(outcome_of(&told), Outcome::Rejected(Rejection::QueueFull));
 }
 
 #[test]
