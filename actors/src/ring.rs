@@ -19,6 +19,10 @@ use tokio_util::codec::Decoder;
 
 /// Records that one look takes at most: a peer may cut its frames as small as it likes.
 const RECORDS_A_LOOK: usize = 64;
+/// What a ring has before each record, in bytes.
+const MARK_BYTES: usize = 8;
+/// Bytes that one look takes at least, if they are there: or half a ring, in the pieces in which long frames come, if that is less.
+const ENOUGH_MIN: usize = 128 * 1024;
 
 /// Why two ends did not come together. The caller falls back to the socket, or ends the link.
 #[derive(Debug, thiserror::Error)]
@@ -94,8 +98,8 @@ pub(crate) fn capacity(bytes: usize) -> Capacity {
 /// How much of `total` bytes goes into one record.
 pub(crate) const fn piece(producer: &Producer, total: usize) -> usize {
     let most = producer.payload_max();
-    // A quarter of the ring, so that one side writes while the other reads.
-    if total <= most { total } else { most / 2 }
+    // A quarter of the ring with its mark, so that four fill it: one side writes while the other reads.
+    if total <= most { total } else { most / 2 - MARK_BYTES / 2 }
 }
 
 /// Writes one record from the beginning of `parts`; how many bytes that was.
@@ -176,22 +180,27 @@ impl RingFrames {
         Header::payload_len(head).map_or(true, |length| self.buffer.len() >= HEADER_LEN + length as usize)
     }
 
-    /// Takes records, without waiting, until there are about `enough` bytes. Each byte is read once.
+    /// Takes records, without waiting, until there are about `enough` bytes, or half a ring's. Each byte is read once. The peer gets
+    /// their room back together: one that waits for it is woken once, and not for each.
     pub(crate) fn take(&mut self, consumer: &mut Consumer, enough: usize) -> Result<Taken, Corrupt> {
+        let half = consumer.payload_max() - MARK_BYTES;
+        let (enough, before) = (enough.max(half.min(ENOUGH_MIN)), self.buffer.len());
         let mut taken = Taken::Nothing;
         for _ in 0..RECORDS_A_LOOK {
             let Some(lent) = consumer.receive()? else { break };
             if lent.is_empty() {
                 self.forget_part();
             }
-            let before = self.buffer.len();
-            self.buffer.resize(before + lent.len(), 0);
-            lent.copy_to(&mut self.buffer[before..]);
+            let start = self.buffer.len();
+            self.buffer.resize(start + lent.len(), 0);
+            lent.copy_to(&mut self.buffer[start..]);
+            lent.keep();
             taken = Taken::Some;
-            if self.buffer.len() >= enough {
+            if self.buffer.len().saturating_sub(before) >= enough {
                 break;
             }
         }
+        consumer.give_back();
         Ok(taken)
     }
 
@@ -228,6 +237,25 @@ mod tests {
     fn frame(length: usize) -> Vec<u8> {
         let header = Header::new(Kind::named("test"), Tid::NONE, Tid::BROADCAST);
         [&header.encode_in_memory(length)[..], &vec![7; length]].concat()
+    }
+
+    #[test]
+    fn four_pieces_of_a_long_frame_fill_a_ring_and_one_look_takes_half_of_them() {
+        // given
+        let ((mut producer, mut consumer), mut frames) = (ring(), RingFrames::new(100_000));
+        let long = frame(50_000);
+        let mut left = &long[..];
+        // when
+        for piece in 1..=4 {
+            let written = write(&mut producer, &[IoSlice::new(left)]).expect("there is room");
+            assert_eq!(written + MARK_BYTES, Capacity::MIN.bytes() as usize / 4, "piece {piece}");
+            left = &left[written..];
+        }
+        // then
+        assert!(matches!(write(&mut producer, &[IoSlice::new(left)]), Err(LoanError::Full { .. })));
+        assert_eq!(frames.take(&mut consumer, 1).expect("an honest peer"), Taken::Some);
+        let taken = Capacity::MIN.bytes() - producer.untaken().expect("an honest peer");
+        assert_eq!(taken, Capacity::MIN.bytes() / 2);
     }
 
     #[test]

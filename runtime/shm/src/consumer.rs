@@ -56,6 +56,13 @@ impl Consumer {
         Ok(Lent { consumer: self, record })
     }
 
+    /// Gives the memory of the messages that were kept ([`Lent::keep`]) back to the peer, which is woken if it waits for room.
+    pub fn give_back(&mut self) {
+        if self.core.give_back() {
+            self.room_button.ring();
+        }
+    }
+
     /// Whether there is a message. It stays there.
     ///
     /// # Errors
@@ -214,6 +221,14 @@ impl Lent<'_> {
         let mut bytes = vec![0; self.len()];
         self.copy_to(&mut bytes);
         bytes
+    }
+
+    /// Ends the lending without giving the memory back yet: that is done with the next message's, or by
+    /// [`Consumer::give_back`]. For who reads several at once: a peer that waits for room is woken for all of them.
+    pub fn keep(self) {
+        let mut lent = std::mem::ManuallyDrop::new(self);
+        let record = lent.record;
+        lent.consumer.core.keep(record);
     }
 
     /// Reads it in pieces, for a decoder. Each byte is read once; a decoder that reads a length twice may see two.

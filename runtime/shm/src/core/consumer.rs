@@ -29,6 +29,8 @@ pub(crate) struct ConsumerCore<O, P> {
     capacity: Capacity,
     /// Bytes ever taken.
     head: u32,
+    /// Bytes of those that the producer knows to be free again.
+    given_back: u32,
     /// Bytes that the producer was last seen to have published; always at most `capacity` ahead of `head`.
     tail_seen: u32,
     sleep: Sleep,
@@ -43,6 +45,7 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
             peer,
             capacity,
             head: 0,
+            given_back: 0,
             tail_seen: 0,
             sleep: Sleep::new(Word::ConsumerSleep),
             waking: Waking::new(Word::ProducerSleep),
@@ -66,10 +69,25 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
         found
     }
 
-    /// Gives a message's memory back to the producer. True when the producer sleeps and has to be woken.
+    /// Gives a message's memory back to the producer, and that of those kept before it. True when the producer sleeps and has to
+    /// be woken.
     pub(crate) fn release(&mut self, record: Record) -> bool {
+        self.keep(record);
+        self.give_back()
+    }
+
+    /// Goes on to the next message. This one's memory is given back with that of a later one, or all that is kept together.
+    pub(crate) fn keep(&mut self, record: Record) {
         self.head = record.end;
-        // SYNC: this side's reads of the record are over for who reads this head and fences: `ProducerCore::look`.
+    }
+
+    /// Gives back what is kept. True when the producer sleeps and has to be woken.
+    pub(crate) fn give_back(&mut self) -> bool {
+        if self.given_back == self.head {
+            return false;
+        }
+        self.given_back = self.head;
+        // SYNC: this side's reads of the records are over for who reads this head and fences: `ProducerCore::look`.
         self.own.store(Word::Head, self.head, Ordering::Release);
         self.waking.is_owed(&self.peer)
     }
@@ -113,7 +131,7 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
     /// As if so much had been published and taken already.
     #[cfg(all(test, not(loom)))]
     pub(super) fn start_at(&mut self, count: u32) {
-        (self.head, self.tail_seen) = (count, count);
+        (self.head, self.given_back, self.tail_seen) = (count, count, count);
         self.own.store(Word::Head, count, Ordering::Relaxed);
     }
 

@@ -172,6 +172,35 @@ fn a_producer_that_sleeps_is_woken_for_room() {
 }
 
 #[test]
+fn a_producer_that_sleeps_is_woken_for_what_is_given_back_together() {
+    loom::model(|| {
+        let (mut sender, mut receiver) = ring(Capacity::tiny(32));
+        send(&mut sender, 8, 1);
+        send(&mut sender, 8, 2);
+        let bell = Bell::new();
+        let button = Arc::clone(&bell);
+        let receiving = thread::spawn(move || {
+            for number in 1..=2 {
+                let record = receiver.next().expect("an honest peer").expect("it was published before");
+                assert_eq!(read(&receiver, record), [number]);
+                receiver.keep(record);
+            }
+            if receiver.give_back() {
+                button.ring();
+            }
+        });
+        while sender.reserve(8).is_err() {
+            let heard = bell.listen();
+            if sender.arm(8).expect("an honest peer") == Armed::Sleep {
+                bell.sleep(heard);
+                sender.disarm();
+            }
+        }
+        receiving.join().unwrap();
+    });
+}
+
+#[test]
 fn a_loan_that_is_given_back_is_never_seen() {
     loom::model(|| {
         let (mut sender, mut receiver) = ring(Capacity::tiny(64));

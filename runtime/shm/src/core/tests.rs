@@ -171,6 +171,27 @@ fn a_message_that_does_not_fit_before_the_end_begins_anew_and_the_rest_is_skippe
 }
 
 #[test]
+fn what_is_kept_is_given_back_together_and_its_producer_is_woken_once() {
+    // given: a full ring, whose producer waits for room
+    let (mut sender, mut receiver) = ring(Capacity::tiny(32));
+    for _ in 0..2 {
+        sender.reserve(8).expect("room");
+        sender.publish();
+    }
+    assert_eq!(sender.arm(8), Ok(Armed::Sleep));
+    // when, then
+    for _ in 0..2 {
+        let record = receiver.next().expect("honest").expect("published");
+        receiver.keep(record);
+        assert_eq!(sender.arm(8), Ok(Armed::Sleep), "nothing is free");
+    }
+    assert_eq!(receiver.next(), Ok(None));
+    assert!(receiver.give_back(), "the producer is to be woken");
+    assert_eq!(sender.untaken(), Ok(0));
+    assert!(!receiver.give_back(), "there is nothing more");
+}
+
+#[test]
 fn counts_wrap_at_32_bits_without_a_trace() {
     // given: both halves a little before the end of counting; only whole capacities are added by hand
     let capacity = Capacity::tiny(64);
