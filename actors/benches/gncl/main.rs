@@ -5,7 +5,7 @@
 //! back. Nothing here asserts a time. `--short` does a tenth.
 //!
 //! - `rounds-THREAD-BYTES-PACE-CPUS`: round trips of 8 B, 64 B, 1000 B, 64 KiB and 1 MB in class Control, back to back and one
-//!   every millisecond, between applications on their nodes' IO threads or on threads of their own; beside blocking TCP.
+//!   every millisecond, between applications on their nodes' IO threads (also with `gncl.spin`) or on threads of their own; beside blocking TCP.
 //! - `flood-CARRIER-CPUS`: packets of 1000 bytes in class Bulk one way, as fast as they go, confirmed or not, and through bare
 //!   TCP.
 //! - `table_2-N`: the paper's test, every node to every other one, 1000 bytes with a full echo, 3, 8 and 16 nodes at 2,000 round
@@ -67,7 +67,9 @@ impl Case {
         for pinning in Pinning::ALL {
             for (bytes, pace) in payloads(is_short) {
                 let rounds = Rounds::of(bytes, pace, is_short);
-                cases.extend(Thread::ALL.map(|thread| Self::Rounds { thread, rounds, pinning }));
+                let threads = Thread::ALL.into_iter();
+                let threads = threads.filter(|thread| !(thread.spins() && pinning == Pinning::OneCpu));
+                cases.extend(threads.map(|thread| Self::Rounds { thread, rounds, pinning }));
             }
         }
         for pinning in [Pinning::Anywhere, Pinning::OneCpuEach] {

@@ -1,5 +1,7 @@
 //! Round trips between applications of two nodes, beside blocking TCP.
 
+use std::time::Duration;
+
 use sinew::prelude::*;
 use sinew_figures::{
     Beside, Figures, Pinning, Rounds,
@@ -12,21 +14,27 @@ use crate::{
     ping::{self, DEADLINE},
 };
 
+/// How long a thread that spins looks: longer than the pause of round trips that are paced.
+const SPIN: Duration = Duration::from_millis(2);
+
 /// Where the two applications live.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Thread {
     /// On the IO threads of their nodes.
     Io,
+    /// The same, and these look for a while before they sleep.
+    IoSpin,
     /// On threads of their own.
     Own,
 }
 
 impl Thread {
-    pub(crate) const ALL: [Self; 2] = [Self::Io, Self::Own];
+    pub(crate) const ALL: [Self; 3] = [Self::Io, Self::IoSpin, Self::Own];
 
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Io => "io_thread",
+            Self::IoSpin => "io_thread_spin",
             Self::Own => "own_thread",
         }
     }
@@ -38,12 +46,22 @@ impl Thread {
         found.expect("a name that this program wrote itself")
     }
 
+    /// Who looks without sleeping needs the other one to have another CPU.
+    pub(crate) fn spins(self) -> bool {
+        self == Self::IoSpin
+    }
+
+    fn node(self, name: &str, at: At) -> NodeBuilder {
+        let spin = if self.spins() { SPIN } else { Duration::ZERO };
+        at.node(name).configure(|config| config.gncl.spin = spin)
+    }
+
     fn place<A>(self, app: AppSpec<A>) -> AppSpec<A>
     where
         A: Actor<Context = AppContext<A>>,
     {
         match self {
-            Self::Io => app.on_io_thread(),
+            Self::Io | Self::IoSpin => app.on_io_thread(),
             Self::Own => app.own_thread(),
         }
     }
@@ -69,7 +87,7 @@ fn between_nodes(thread: Thread, rounds: Rounds, pinning: Pinning) -> Figures {
     let role = format!("echo {} {} {}", thread.name(), pinning.name(), at.host(2));
     let _echo = Process::start(&role);
     let (ping, figures) = ping::ping(rounds);
-    let node = at.node("ping").app(thread.place(ping)).start().expect("a node");
+    let node = thread.node("ping", at).app(thread.place(ping)).start().expect("a node");
     let figures = figures.recv_timeout(DEADLINE).expect("the rounds end");
     node.stop();
     figures
@@ -77,7 +95,7 @@ fn between_nodes(thread: Thread, rounds: Rounds, pinning: Pinning) -> Figures {
 
 /// The node that echoes, until its input ends.
 pub(crate) fn echo(thread: Thread, at: At) {
-    let _node = at.node("echo").app(thread.place(ping::echo())).start().expect("a node");
+    let _node = thread.node("echo", at).app(thread.place(ping::echo())).start().expect("a node");
     say_there();
     await_end();
 }

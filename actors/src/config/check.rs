@@ -50,6 +50,7 @@ pub(super) const HANDSHAKE: Range = range("gncl.handshake_ms", 10, 60_000, "ms")
 pub(super) const REDIAL_MIN: Range = range("gncl.redial_min_ms", 1, 10_000, "ms");
 pub(super) const REDIAL_MAX: Range = range("gncl.redial_max_ms", 1, 60_000, "ms");
 pub(super) const GIVE_UP: Range = range("gncl.give_up_ms", 100, 600_000, "ms");
+pub(super) const SPIN: Range = range("gncl.spin_ms", 0, 10, "ms");
 pub(super) const NDL_PORT: Range = range("ndl.port", 0, 65_535, "(0: any free port)");
 pub(super) const MDNS_PORT: Range = range("ndl.mdns_port", 1, 65_535, "or false");
 pub(super) const PERIOD: Range = range("ndl.period_ms", 10, 60_000, "ms");
@@ -172,6 +173,7 @@ impl NodeConfig {
             let remedy = "raise gncl.redial_max_ms or lower gncl.redial_min_ms";
             faults.push(fault(REDIAL_MAX.key, format!("{:?}", gncl.redial_max), legal, remedy));
         }
+        SPIN.time(faults, gncl.spin);
     }
 
     fn check_ndl(&self, faults: &mut Vec<ConfigFault>) {

@@ -29,7 +29,7 @@ const FILE_BYTES_MAX: u64 = 1 << 20;
 const SECTIONS: [&str; 6] = ["node", "lncl", "gncl", "ndl", "sync", "supervision"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 37] = [
+pub(super) const KEYS: [&str; 38] = [
     "node.name",
     "node.project",
     "node.address",
@@ -53,6 +53,7 @@ pub(super) const KEYS: [&str; 37] = [
     "gncl.redial_min_ms",
     "gncl.redial_max_ms",
     "gncl.give_up_ms",
+    "gncl.spin_ms",
     "ndl.interface",
     "ndl.port",
     "ndl.multicast",
@@ -343,6 +344,7 @@ impl Reader<'_> {
         self.time(&check::REDIAL_MIN, &mut gncl.redial_min);
         self.time(&check::REDIAL_MAX, &mut gncl.redial_max);
         self.time(&check::GIVE_UP, &mut gncl.give_up);
+        self.time(&check::SPIN, &mut gncl.spin);
     }
 
     fn read_ndl(&mut self, config: &mut NodeConfig) {

@@ -33,6 +33,7 @@ use super::{
     link::{self, Mode, News, Reading, SharedMode, What},
     listener,
     peer::{Store, frame},
+    spin::Spin,
 };
 use crate::{
     config::NodeConfig,
@@ -58,6 +59,7 @@ pub(crate) struct Gncl {
     ready: Option<ReadyGate>,
     core: Core,
     wires: BTreeMap<ConnectionId, Wire>,
+    spin: Rc<Spin>,
     alarm: Option<(Time, SpawnHandle)>,
     /// When it goes, whoever has not hung up; set once the node is being stopped.
     goes_at: Option<Time>,
@@ -79,7 +81,8 @@ impl Gncl {
     pub(crate) fn new(stores: Arc<Stores>, ready: ReadyGate) -> Self {
         let seed = Time::now().as_nanos() ^ u64::from(stores.node.bits());
         let core = Core::new(settings(&stores), seed);
-        Self { stores, ready: Some(ready), core, wires: BTreeMap::new(), alarm: None, goes_at: None }
+        let spin = Rc::new(Spin::new(stores.config.gncl.spin));
+        Self { stores, ready: Some(ready), core, wires: BTreeMap::new(), spin, alarm: None, goes_at: None }
     }
 
     /// Whether the node is being stopped.
@@ -215,7 +218,8 @@ impl Gncl {
         let payload_max = usize::try_from(attach.payload_max).unwrap_or(usize::MAX);
         let link = way.outlet.connect(Gathering::new(socket), payload_max, welcome);
         way.attach(link);
-        wire.set_mode(Mode::Linked(Inbound { stores: self.stores.clone(), peer: peer.clone(), lane, link }));
+        let (stores, spin) = (self.stores.clone(), self.spin.clone());
+        wire.set_mode(Mode::Linked(Inbound { stores, peer: peer.clone(), spin, lane, link }));
         self.stores.router.set_peer(node, peer.clone());
         let drainer = async move {
             match peer.way(lane) {
@@ -452,6 +456,8 @@ impl Actor for Gncl {
         ctx.add_stream(listener::accepted(listener, self.stores.config.gncl.give_up));
         ctx.add_stream(self.stores.posts.gncl.attach_keeping(Clone::clone));
         ctx.spawn(fut::wrap_future(Store::serve_those_held_up(self.stores.clone())));
+        let spin = self.spin.clone();
+        ctx.spawn(fut::wrap_future(async move { spin.keep_awake().await }));
         ctx.run_interval(EXPIRY_PERIOD, |actor, _| {
             let now = Time::now();
             for way in actor.stores.gncl.peers().iter().flat_map(|peer| peer.ways()) {

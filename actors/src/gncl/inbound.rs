@@ -1,6 +1,6 @@
 //! What is checked before a peer's frame becomes a message of this node. spec: GNCL-11
 
-use std::sync::Arc;
+use std::{rc::Rc, sync::Arc};
 
 use sinew_runtime::{
     outcome::{Outcome, Receipt, Rejection, Ticket},
@@ -13,6 +13,7 @@ use sinew_runtime::{
 use super::{
     core::{Decline, Lane, read},
     peer::Peer,
+    spin::Spin,
     way::{Taken, Way},
 };
 use crate::{
@@ -24,6 +25,7 @@ use crate::{
 pub(super) struct Inbound {
     pub(super) stores: Arc<Stores>,
     pub(super) peer: Arc<Peer>,
+    pub(super) spin: Rc<Spin>,
     /// Whose connections this is one of.
     pub(super) lane: Lane,
     /// The connection on which they come.
@@ -43,6 +45,7 @@ impl Inbound {
         }
         // Counted first: what panics from here on must not come again.
         let taken = way.arrive(self.link, &message)?;
+        self.spin.heard(now);
         if taken != Taken::No && !is_for_the_link(&message, Kind::GNCL_VOID) {
             self.take(now, message, way, taken);
         }

@@ -28,6 +28,7 @@
 //! | `way.rs` | one of these sessions, with its outlet |
 //! | `link.rs` | the reading half of a connection |
 //! | `inbound.rs` | what is checked before a frame becomes a message of this node |
+//! | `spin.rs` | how long the IO thread looks before it sleeps |
 //! | `listener.rs` | the accepting socket |
 //! | `actor.rs` | the shell that ties them together |
 
@@ -38,6 +39,7 @@ mod inbound;
 mod link;
 mod listener;
 mod peer;
+mod spin;
 #[cfg(test)]
 mod tests;
 mod way;
