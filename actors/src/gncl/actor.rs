@@ -1,5 +1,7 @@
 //! The shell: sockets and timers for the core's orders, events for what they do.
 
+mod leaving;
+
 use std::{
     cell::RefCell,
     collections::BTreeMap,
@@ -10,9 +12,7 @@ use std::{
     time::Duration,
 };
 
-use actix::{
-    Actor, ActorContext, ActorFutureExt, AsyncContext, Context, Running, SpawnHandle, StreamHandler, fut,
-};
+use actix::{Actor, ActorFutureExt, AsyncContext, Context, Running, SpawnHandle, StreamHandler, fut};
 use sinew_runtime::{
     post::Post,
     supervision::ReadyGate,
@@ -43,15 +43,10 @@ use crate::{
     stores::{Stores, lock},
     sync,
 };
+pub(crate) use leaving::LINGER;
 
 /// How often expired messages are looked for in the queues of peers without a connection.
 const EXPIRY_PERIOD: Duration = Duration::from_millis(50);
-
-/// Time that peers have, when the node is stopped, to take what waits for them and hang up. Whoever has more to send
-/// than goes over its network in this time loses it.
-pub(crate) const LINGER: Duration = Duration::from_secs(3);
-/// How often it is looked whether they have.
-const LINGER_LOOK: Duration = Duration::from_millis(1);
 
 /// GNCL's actor.
 pub(crate) struct Gncl {
@@ -269,13 +264,6 @@ impl Gncl {
         }
     }
 
-    /// spec: GNCL-10
-    fn say_goodbye(&self, node: NodeAddress) {
-        for way in self.stores.gncl.peer(node).iter().flat_map(|peer| peer.ways()) {
-            way.outlet.finish(frame(self.stores.node, node, Kind::GNCL_GOODBYE, bytes::Bytes::new()));
-        }
-    }
-
     fn tell(&self, fact: LinkFact) {
         crate::log::info!(?fact, "link");
         self.post(&self.stores.posts.ndl, ndl::Event::Link(fact));
@@ -321,56 +309,6 @@ impl Gncl {
             kind => {
                 Err(Decline::Violation(format!("a frame of kind {kind} came before the handshake was over")))
             }
-        }
-    }
-
-    /// The node is being stopped: says goodbye behind all that waits, and dials whom it is for. spec: GNCL-10
-    fn leave(&mut self, now: Time, ctx: &mut Context<Self>) {
-        self.goes_at = Some(now + LINGER);
-        let owed =
-            self.stores.gncl.peers().iter().filter(|peer| peer.left() > 0).map(|peer| peer.node).collect();
-        self.input(Input::LeaveRequested { owed }, ctx);
-        self.close_door();
-        ctx.run_interval(LINGER_LOOK, |actor, ctx| {
-            actor.close_door();
-            if actor.may_go(Time::now()) {
-                ctx.stop();
-            }
-        });
-    }
-
-    /// Nobody connects any more, but for the connections that links still lack.
-    fn close_door(&self) {
-        if !self.core.expects_sides() {
-            self.stores.gncl.close();
-        }
-    }
-
-    /// Whether everybody has hung up, which a peer does at our GOODBYE, behind all that waited; or the time is over.
-    fn may_go(&self, now: Time) -> bool {
-        let is_through =
-            || self.wires.values().all(|wire| wire.link.is_none()) && !self.core.may_still_link();
-        self.goes_at.is_none_or(|at| at <= now) || is_through()
-    }
-
-    /// What has not arrived by now does not, and says so. spec: GNCL-10
-    fn give_up(&self) {
-        self.stores.gncl.close();
-        for peer in self.stores.gncl.peers() {
-            let messages = peer.left();
-            if messages > 0 {
-                self.stores.gncl.refusals.count(Time::now(), "not delivered", &peer.node);
-                crate::log::warn!(node = %peer.node, messages, "the node stops, and these have not arrived, as far as it knows");
-            }
-            peer.close();
-        }
-    }
-
-    /// The peer has said all: it hears what of it was taken, before it is left. spec: GNCL-10
-    fn acknowledge_the_last(&self, connection: ConnectionId) {
-        let Some(wire) = self.wires.get(&connection) else { return };
-        if let Mode::Linked(inbound) = &*wire.mode.borrow() {
-            inbound.acknowledge();
         }
     }
 

@@ -30,7 +30,7 @@
 //! | `inbound.rs` | what is checked before a frame becomes a message of this node |
 //! | `spin.rs` | how long the IO thread looks before it sleeps |
 //! | `listener.rs` | the accepting socket |
-//! | `actor.rs` | the shell that ties them together |
+//! | `actor.rs`, `actor/` | the shell that ties them together; how it ends |
 
 mod actor;
 mod core;
