@@ -118,7 +118,8 @@ impl Case {
         worked
     }
 
-    fn measure(self) {
+    /// Returns whether that went well.
+    fn measure(self) -> bool {
         match self {
             Self::Rounds { thread, rounds, pinning } => {
                 pinning.pin(End::Measuring);
@@ -134,8 +135,9 @@ impl Case {
                 let _other = process::Process::start(&format!("beside_echo {pause_us} {}", at.host(2)));
                 beside::measure(name, at, bulk_bytes, rounds);
             }
-            Self::SlowLink => slow_link::measure("slow_link"),
+            Self::SlowLink => return slow_link::measure("slow_link"),
         }
+        true
     }
 }
 
@@ -169,7 +171,9 @@ fn play(role: &str) -> ExitCode {
     match words[..] {
         ["measure", is_short, name] => {
             let case = Case::all(is_short == "true").into_iter().find(|case| case.name() == name);
-            case.expect("a name that this program wrote itself").measure();
+            if !case.expect("a name that this program wrote itself").measure() {
+                return ExitCode::FAILURE;
+            }
         }
         ["echo", thread, pinning, at] => {
             Pinning::named(pinning).pin(End::Echoing);

@@ -25,12 +25,15 @@ const ROUNDS: u64 = 1_000;
 const ASKED: usize = 64;
 const FLOODED: usize = 1000;
 
-/// Makes the hosts, and runs both on them; says why where that is not possible.
-pub(crate) fn measure(case: &str) {
+/// Makes the hosts, and runs both on them; says why where that is not possible. Returns whether what ran went well.
+pub(crate) fn measure(case: &str) -> bool {
     let hosts = Hosts::new(2).and_then(|hosts| hosts.throttle(KBIT_PER_S).map(|()| hosts));
     let hosts = match hosts {
         Ok(hosts) => hosts,
-        Err(why) => return eprintln!("{case}: skipped: no slow link can be made here: {why}"),
+        Err(why) => {
+            eprintln!("{case}: skipped: no slow link can be made here: {why}");
+            return true;
+        }
     };
     let program = std::env::current_exe().expect("this program has a path");
     let [here, there] = [0, 1].map(|host| &hosts.all()[host]);
@@ -40,14 +43,17 @@ pub(crate) fn measure(case: &str) {
         command
     };
     let at = At::loopback();
-    {
-        let role = format!("beside_echo 0 {}", at.on(there.address));
-        let _echo = Process::start_command(on(there, &role), &role);
-        let _ = process::has_run(on(here, &format!("slow_nodes {case} {}", at.on(here.address))));
-    }
-    let role = format!("slow_raw_echo {}", there.address);
-    let _echo = Process::start_command(on(there, &role), &role);
-    let _ = process::has_run(on(here, &format!("slow_raw {case} {}", there.address)));
+    let both = [
+        (
+            format!("beside_echo 0 {}", at.on(there.address)),
+            format!("slow_nodes {case} {}", at.on(here.address)),
+        ),
+        (format!("slow_raw_echo {}", there.address), format!("slow_raw {case} {}", there.address)),
+    ];
+    both.iter().all(|(echo, measure)| {
+        let _echo = Process::start_command(on(there, echo), echo);
+        process::has_run(on(here, measure))
+    })
 }
 
 /// The measuring node.
