@@ -15,7 +15,7 @@
 //!   p99 beside the flood by the p99 alone (`p99_ratio_percent`).
 //! - `control_beside_slow_consumer`: the same, and the application that is flooded takes a millisecond for each of its messages.
 //! - `slow_link`: the same as `control_beside_bulk_1000`, and bare TCP, on two hosts with a link of 10 Mbit/s between them
-//!   (network namespaces: needs root, `ip` and `tc`).
+//!   (network namespaces: needs root, `ip` and `tc`); `slow_link_priorities`: the hosts send by priority what waits.
 
 mod beside;
 mod crowd;
@@ -29,6 +29,7 @@ mod slow_link;
 use std::{process::ExitCode, time::Duration};
 
 use sinew_figures::{Beside, End, Pace, Pinning, Rounds, process};
+use sinew_hosts::Queue;
 
 use crate::{flood::Carrier, nodes::At, rounds::Thread};
 
@@ -56,7 +57,7 @@ enum Case {
         pause_us: u64,
         rounds: u64,
     },
-    SlowLink,
+    SlowLink(Queue),
 }
 
 impl Case {
@@ -93,7 +94,7 @@ impl Case {
             pause_us,
             rounds,
         }));
-        cases.push(Self::SlowLink);
+        cases.extend([Queue::OneLine, Queue::Priorities].map(Self::SlowLink));
         cases
     }
 
@@ -105,7 +106,8 @@ impl Case {
             Self::Flood { carrier, pinning, .. } => format!("flood-{}-{}", carrier.name(), pinning.name()),
             Self::Crowd { nodes, .. } => format!("table_2-{nodes}"),
             Self::Beside { name, .. } => name.to_owned(),
-            Self::SlowLink => "slow_link".to_owned(),
+            Self::SlowLink(Queue::OneLine) => "slow_link".to_owned(),
+            Self::SlowLink(Queue::Priorities) => "slow_link_priorities".to_owned(),
         }
     }
 
@@ -135,7 +137,7 @@ impl Case {
                 let _other = process::Process::start(&format!("beside_echo {pause_us} {}", at.host(2)));
                 beside::measure(name, at, bulk_bytes, rounds);
             }
-            Self::SlowLink => return slow_link::measure("slow_link"),
+            Self::SlowLink(queue) => return slow_link::measure(&self.name(), queue),
         }
         true
     }

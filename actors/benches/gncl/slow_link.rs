@@ -12,7 +12,7 @@ use sinew_figures::{
     process::{self, Process, say_there},
     stream,
 };
-use sinew_hosts::Hosts;
+use sinew_hosts::{Hosts, Queue};
 
 use crate::{beside, nodes::At};
 
@@ -26,8 +26,8 @@ const ASKED: usize = 64;
 const FLOODED: usize = 1000;
 
 /// Makes the hosts, and runs both on them; says why where that is not possible. Returns whether what ran went well.
-pub(crate) fn measure(case: &str) -> bool {
-    let hosts = Hosts::new(2).and_then(|hosts| hosts.throttle(KBIT_PER_S).map(|()| hosts));
+pub(crate) fn measure(case: &str, queue: Queue) -> bool {
+    let hosts = Hosts::new(2).and_then(|hosts| hosts.throttle(KBIT_PER_S, queue).map(|()| hosts));
     let hosts = match hosts {
         Ok(hosts) => hosts,
         Err(why) => {

@@ -29,7 +29,7 @@ const FILE_BYTES_MAX: u64 = 1 << 20;
 const SECTIONS: [&str; 6] = ["node", "lncl", "gncl", "ndl", "sync", "supervision"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 38] = [
+pub(super) const KEYS: [&str; 39] = [
     "node.name",
     "node.project",
     "node.address",
@@ -53,6 +53,7 @@ pub(super) const KEYS: [&str; 38] = [
     "gncl.redial_min_ms",
     "gncl.redial_max_ms",
     "gncl.give_up_ms",
+    "gncl.marks",
     "gncl.spin_ms",
     "ndl.interface",
     "ndl.port",
@@ -277,6 +278,14 @@ impl<'t> Reader<'t> {
         }
     }
 
+    fn truth(&mut self, key: &str, target: &mut bool) {
+        let Some(value) = self.values.get(key).copied() else { return };
+        match value.get_ref().as_bool() {
+            Some(read) => *target = read,
+            None => self.reject(key, value, "true or false", format!("set {key} to one of them")),
+        }
+    }
+
     /// Whether the value of `key` is `false`: switched off.
     fn is_off(&self, key: &str) -> bool {
         self.values.get(key).is_some_and(|value| value.get_ref().as_bool() == Some(false))
@@ -344,6 +353,7 @@ impl Reader<'_> {
         self.time(&check::REDIAL_MIN, &mut gncl.redial_min);
         self.time(&check::REDIAL_MAX, &mut gncl.redial_max);
         self.time(&check::GIVE_UP, &mut gncl.give_up);
+        self.truth("gncl.marks", &mut gncl.marks);
         self.time(&check::SPIN, &mut gncl.spin);
     }
 

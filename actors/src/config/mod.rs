@@ -101,6 +101,9 @@ pub struct GnclConfig {
     /// Time after which a connection ends whose other side takes nothing of what was written (TCP_USER_TIMEOUT). 100 ms to 10 min;
     /// default 5 s.
     pub give_up: Duration,
+    /// Whether packets say which class they carry, so that switches, access points and this host's own queues send Control first:
+    /// DSCP EF, AF41 and AF11 for Control, Stream and Bulk (RFC 4594), `SO_PRIORITY` 6, 0 and 2. Default `true`.
+    pub marks: bool,
     /// How long the IO thread stays awake after a message of a peer, so that the next one need not wake it: costs a core, and
     /// saves the wake of an idle one, 10 to 50 us, for applications on the IO thread. 0 to 10 ms; default 0, it sleeps at once.
     pub spin: Duration,
@@ -205,6 +208,7 @@ impl NodeConfig {
                 strangers_max: 64,
                 handshake: Duration::from_secs(2),
                 redial_min: Duration::from_millis(10),
+                marks: true,
                 spin: Duration::ZERO,
                 redial_max: Duration::from_secs(1),
                 give_up: Duration::from_secs(5),

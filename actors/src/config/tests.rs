@@ -138,6 +138,8 @@ fn texts_are_legal_at_both_ends_and_not_beyond() {
         ("gncl.announce", "'0.0.0.0:6912'".to_owned(), false),
         ("gncl.announce", "'224.0.0.1:6912'".to_owned(), false),
         ("gncl.announce", "'10.0.0.7'".to_owned(), false),
+        ("gncl.marks", "false".to_owned(), true),
+        ("gncl.marks", "0".to_owned(), false),
         ("ndl.interface", "'127.0.0.1'".to_owned(), true),
         ("ndl.interface", "'0.0.0.0'".to_owned(), false),
         ("ndl.interface", "'224.0.0.1'".to_owned(), false),

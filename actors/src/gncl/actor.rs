@@ -31,7 +31,7 @@ use super::{
     },
     inbound::Inbound,
     link::{self, Mode, News, Reading, SharedMode, What},
-    listener,
+    listener, marks,
     peer::{Store, frame},
     spin::Spin,
 };
@@ -210,6 +210,9 @@ impl Gncl {
         let Some(way) = peer.way(lane) else { return };
         let words = attach.welcome.as_ref();
         let welcome = words.map(|words| frame(self.stores.node, node, Kind::GNCL_WELCOME, write(words)));
+        if attach.by_class && self.stores.config.gncl.marks {
+            marks::mark(&socket, lane);
+        }
         let payload_max = usize::try_from(attach.payload_max).unwrap_or(usize::MAX);
         let link = way.outlet.connect(Gathering::new(socket), payload_max, welcome);
         way.attach(link);

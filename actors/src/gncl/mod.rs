@@ -29,6 +29,7 @@
 //! | `link.rs` | the reading half of a connection |
 //! | `inbound.rs` | what is checked before a frame becomes a message of this node |
 //! | `spin.rs` | how long the IO thread looks before it sleeps |
+//! | `marks.rs` | what the network is told about a class |
 //! | `listener.rs` | the accepting socket |
 //! | `actor.rs`, `actor/` | the shell that ties them together; how it ends |
 
@@ -38,6 +39,7 @@ mod facts;
 mod inbound;
 mod link;
 mod listener;
+mod marks;
 mod peer;
 mod spin;
 #[cfg(test)]

@@ -29,6 +29,15 @@ pub struct Host {
     port: String,
 }
 
+/// In what order a throttled host sends what waits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Queue {
+    /// As it came.
+    OneLine,
+    /// By its priority first, as Linux does by itself where nothing else is set up (`pfifo_fast`).
+    Priorities,
+}
+
 impl Hosts {
     /// Makes `count` hosts, 10.77.0.1 and up; or says why that is not possible here.
     ///
@@ -65,16 +74,18 @@ impl Hosts {
         self.set_port(host, "up");
     }
 
-    /// Lets so many kilobits a second through from and to each host; a port keeps 50 ms of what comes faster, and loses the
-    /// rest, as a switch does.
+    /// Lets so many kilobits a second out of each host. A host keeps 50 ms of what its programs send faster, and loses the rest.
     ///
     /// # Errors
-    /// A sentence: no `tc`, or a kernel without token buckets.
-    pub fn throttle(&self, kbit_per_s: u32) -> Result<(), String> {
-        let queue = format!("root tbf rate {kbit_per_s}kbit burst 16kb latency 50ms");
-        for host in &self.hosts {
-            host.namespace.tc(&format!("qdisc replace dev eth0 {queue}"))?;
-            self.bridge.tc(&format!("qdisc replace dev {} {queue}", host.port))?;
+    /// A sentence: no `tc`, or a kernel without that queue.
+    pub fn throttle(&self, kbit_per_s: u32, queue: Queue) -> Result<(), String> {
+        for Host { namespace, .. } in &self.hosts {
+            let bucket = format!("tbf rate {kbit_per_s}kbit burst 16kb latency 50ms");
+            namespace.tc(&format!("qdisc replace dev eth0 root handle 1: {bucket}"))?;
+            match queue {
+                Queue::OneLine => {}
+                Queue::Priorities => namespace.tc("qdisc add dev eth0 parent 1:1 handle 10: pfifo_fast")?,
+            }
         }
         Ok(())
     }
