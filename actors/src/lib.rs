@@ -30,6 +30,7 @@ extern crate self as sinew;
 use sinew_runtime::log;
 
 pub mod api;
+pub mod audit;
 pub mod config;
 
 #[cfg(test)]
@@ -55,6 +56,7 @@ pub use sinew_runtime::supervision::fault;
 pub use api::{
     ApiError, AsyncEndpoint, Endpoint, LentMessage, NodeApi, Received, Registration, Transport, Untaken,
 };
+pub use audit::NodeAudit;
 pub use config::{ConfigFaults, NodeConfig};
 pub use lncl::RegisterError;
 pub use ndl::{KnownNode, LossReason, NodeEvent, Source};

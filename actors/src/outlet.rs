@@ -14,6 +14,7 @@
 //! All of it stands under one mutex. Receipts are never settled and nobody is woken with it in hand, because whoever
 //! is told may submit to this very outlet.
 
+mod account;
 mod batch;
 mod draining;
 mod expiry;
@@ -41,8 +42,9 @@ use sinew_runtime::{
 };
 use tokio::net::{TcpStream, UnixStream};
 
-use crate::session::Ack;
+use crate::session::{Ack, Sent};
 
+pub(crate) use account::OutletAccount;
 pub(crate) use batch::Gathering;
 use draining::Drained;
 use half::{After, Bound, Half, Step};
@@ -309,6 +311,11 @@ impl<S: Socket> StreamOutlet<S> {
     /// What became of the messages so far.
     pub(crate) fn counts(&self) -> OutletCounts {
         self.lock().counts()
+    }
+
+    /// Where every message is that it has taken, and how far its session is, if it has one.
+    pub(crate) fn account(&self) -> (OutletAccount, Option<Sent>) {
+        self.lock().account()
     }
 
     /// Messages that wait to be sent.

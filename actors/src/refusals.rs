@@ -46,6 +46,11 @@ impl Refusals {
         self.causes().values().map(|cause| cause.count).sum()
     }
 
+    /// How much was refused, for each cause.
+    pub(crate) fn by_cause(&self) -> Vec<(&'static str, u64)> {
+        self.causes().iter().map(|(cause, entry)| (*cause, entry.count)).collect()
+    }
+
     /// How much was refused because of `cause`.
     #[cfg(test)]
     pub(crate) fn of(&self, cause: &'static str) -> u64 {

@@ -15,7 +15,7 @@ use sinew_runtime::{
 };
 use tokio::sync::watch;
 
-use crate::{config::NodeConfig, gncl, lncl, monitors, ndl, node, refusals::Refusals, sync, wills};
+use crate::{audit, config::NodeConfig, gncl, lncl, monitors, ndl, node, refusals::Refusals, sync, wills};
 
 /// What the layers of one node share.
 pub(crate) struct Stores {
@@ -52,6 +52,8 @@ pub(crate) struct Stores {
     pub(crate) directory_changes: watch::Sender<u64>,
     /// Who is known on other nodes, and what waits for whom.
     pub(crate) sync: Mutex<sync::Core>,
+    /// Where messages are counted, beside GNCL's peers.
+    pub(crate) book: audit::Book,
     /// Who watches whom.
     pub(crate) monitors: Mutex<monitors::Core>,
     /// The last wills of applications, held for other nodes and by them.
@@ -90,6 +92,7 @@ impl Stores {
             registry: Mutex::new(lncl::Registry::counting_links_from(RandomState::new().hash_one(()))),
             directory_changes: watch::Sender::default(),
             sync: Mutex::new(sync::Core::new(&config, node, incarnation)),
+            book: audit::Book::default(),
             monitors: Mutex::new(monitors::Core::new(node, incarnation, config.ndl.nodes_max)),
             wills: Mutex::new(wills::Core::new(incarnation, config.ndl.nodes_max)),
             config,

@@ -55,7 +55,8 @@ pub enum Rejection {
 }
 
 impl Rejection {
-    const ALL: [Self; 11] = [
+    /// All of them, in the order in which they are declared.
+    pub(crate) const ALL: [Self; 11] = [
         Self::NoSuchApplication,
         Self::NoSuchNode,
         Self::UnknownKind,

@@ -78,7 +78,8 @@ pub struct Router {
     table: ArcSwap<Table>,
     /// Writers take turns; readers never wait for them.
     writing: Mutex<()>,
-    refused: AtomicU64,
+    /// For each reason in the order of [`Rejection`].
+    refused: [AtomicU64; Rejection::ALL.len()],
     /// Where everything goes, in a process that knows no route itself.
     uplink: Option<Arc<dyn Outlet>>,
 }
@@ -91,7 +92,7 @@ impl Router {
             node,
             table: ArcSwap::default(),
             writing: Mutex::new(()),
-            refused: AtomicU64::new(0),
+            refused: Default::default(),
             uplink: None,
         }
     }
@@ -185,12 +186,19 @@ impl Router {
     /// How many messages nobody took.
     #[must_use]
     pub fn refused(&self) -> u64 {
-        self.refused.load(Ordering::Relaxed)
+        self.refused.iter().map(|count| count.load(Ordering::Relaxed)).sum()
+    }
+
+    /// How many messages nobody took, for each reason that there was.
+    #[must_use]
+    pub fn refused_because(&self) -> Vec<(Rejection, u64)> {
+        let counts = self.refused.iter().map(|count| count.load(Ordering::Relaxed));
+        Rejection::ALL.into_iter().zip(counts).filter(|(_, count)| *count > 0).collect()
     }
 
     fn account(&self, result: Result<(), Refused>) -> Result<(), Rejection> {
         result.map_err(|refused| {
-            self.refused.fetch_add(1, Ordering::Relaxed);
+            self.refused[refused.why as usize].fetch_add(1, Ordering::Relaxed);
             refused.message.reject(refused.why);
             refused.why
         })

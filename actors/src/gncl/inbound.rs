@@ -11,6 +11,7 @@ use sinew_runtime::{
 };
 
 use super::{
+    arrivals::End,
     core::{Decline, Lane, read},
     peer::Peer,
     spin::Spin,
@@ -46,9 +47,12 @@ impl Inbound {
         // Counted first: what panics from here on must not come again.
         let taken = way.arrive(self.link, &message)?;
         self.spin.heard(now);
-        if taken != Taken::No && !is_for_the_link(&message, Kind::GNCL_VOID) {
-            self.take(now, message, way, taken);
+        if taken == Taken::No {
+            return Ok(());
         }
+        let hand = way.arrivals.take();
+        let is_void = is_for_the_link(&message, Kind::GNCL_VOID);
+        hand.ends(if is_void { Some(End::Void) } else { self.take(now, message, way, taken) });
         Ok(())
     }
 
@@ -59,51 +63,80 @@ impl Inbound {
         }
     }
 
-    fn take(&self, now: Time, mut message: Message, way: &Way, taken: Taken) {
+    /// Returns how it ended; `None`: it waits for its application.
+    fn take(&self, now: Time, mut message: Message, way: &Way, taken: Taken) -> Option<End> {
         let header = message.header;
         if header.source.node != self.peer.node {
             // No outcome is sent: the source that it names has not sent it.
-            return self.count(now, "forged source", &message);
+            self.count(now, "forged source", &message);
+            return Some(End::Refused);
         }
         if header.flags.has(Flags::OUTCOME) {
-            return self.outcome(now, &message);
+            self.outcome(now, &message);
+            return Some(End::Told);
         }
         self.attach_receipt(&mut message);
         if header.destination.node != self.stores.node && header.destination.node != NodeAddress::ALL {
             self.count(now, "not for this node", &message);
-            return message.reject(Rejection::NoSuchNode);
+            message.reject(Rejection::NoSuchNode);
+            return Some(End::Refused);
         }
         let is_one_of_many = header.class == Class::Stream || !header.destination.is_single();
         if message.receipt.is_some() && is_one_of_many {
             self.count(now, "unconfirmable", &message);
-            return message.reject(Rejection::Unsupported);
+            message.reject(Rejection::Unsupported);
+            return Some(End::Refused);
         }
         message.header.sent = self.in_our_clock(now, header.sent);
         if message.header.is_expired(now) {
-            return message.settle(Outcome::Expired);
+            message.settle(Outcome::Expired);
+            return Some(End::Expired);
         }
         match (taken, line_of(&message.header)) {
             (Taken::InLine(line), _) => self.put_in_line(way, line, message),
             (_, Some(line)) => self.offer(way, line, message),
+            (_, None) => Some(self.deliver(message)),
+        }
+    }
+
+    /// Hands over what never waits here.
+    fn deliver(&self, message: Message) -> End {
+        let header = message.header;
+        let is_told_here = !header.destination.is_single()
+            || header.destination.app.is_layer()
+            || header.flags.has(Flags::REPLY);
+        match self.stores.router.deliver(message) {
+            Ok(()) if is_told_here => End::Told,
+            Ok(()) => End::HandedOn,
             // The router counts what nobody takes, and settles it.
-            (_, None) => drop(self.stores.router.deliver(message)),
+            Err(_) => End::Refused,
         }
     }
 
-    fn offer(&self, way: &Way, line: u64, message: Message) {
+    fn offer(&self, way: &Way, line: u64, message: Message) -> Option<End> {
         match self.stores.router.offer(message, None) {
-            Ok(()) => {}
+            Ok(()) => Some(End::HandedOn),
             Err(Refused { message, why: Rejection::QueueFull }) => self.put_in_line(way, line, message),
-            Err(refused) => self.stores.router.refuse(refused),
+            Err(refused) => {
+                self.stores.router.refuse(refused);
+                Some(End::Refused)
+            }
         }
     }
 
-    fn put_in_line(&self, way: &Way, line: u64, message: Message) {
+    fn put_in_line(&self, way: &Way, line: u64, message: Message) -> Option<End> {
         match way.put_in_line(line, message) {
-            // Only whoever is held already says when it takes more.
-            Ok(true) => self.stores.gncl.held_up.notify_one(),
-            Ok(false) => {}
-            Err(message) => self.stores.router.refuse(Refused::new(message, Rejection::QueueFull)),
+            Ok(is_news) => {
+                if is_news {
+                    // Only whoever is held already says when it takes more.
+                    self.stores.gncl.held_up.notify_one();
+                }
+                None
+            }
+            Err(message) => {
+                self.stores.router.refuse(Refused::new(message, Rejection::QueueFull));
+                Some(End::Refused)
+            }
         }
     }
 

@@ -27,6 +27,7 @@
 //! | `peer.rs` | what a peer is to senders: its sessions, which outlive connections and this layer's restarts |
 //! | `way.rs` | one of these sessions, with its outlet |
 //! | `link.rs` | the reading half of a connection |
+//! | `arrivals.rs` | what became of what came, counted |
 //! | `inbound.rs` | what is checked before a frame becomes a message of this node |
 //! | `spin.rs` | how long the IO thread looks before it sleeps |
 //! | `marks.rs` | what the network is told about a class |
@@ -34,6 +35,7 @@
 //! | `actor.rs`, `actor/` | the shell that ties them together; how it ends |
 
 mod actor;
+mod arrivals;
 mod core;
 mod facts;
 mod inbound;
@@ -49,6 +51,7 @@ mod way;
 pub(crate) use actor::{Gncl, LINGER};
 pub(crate) use facts::LinkFact;
 pub(crate) use peer::{Peer, Store};
+pub(crate) use way::{Arrived, WayAccount};
 
 use crate::ndl::MembershipFact;
 

@@ -3,7 +3,7 @@
 use std::{
     collections::BTreeMap,
     net::Shutdown,
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    sync::{Arc, Mutex, MutexGuard, PoisonError, Weak},
     task::{Wake, Waker},
     time::Duration,
 };
@@ -21,10 +21,10 @@ use tokio::sync::Notify;
 
 use super::{
     core::{Attach, Lane},
-    way::{Ends, Offered, Way},
+    way::{Arrived, Ends, Offered, Way, WayAccount},
 };
 use crate::{
-    outlet::OutletCounts,
+    outlet::{OutletAccount, OutletCounts},
     refusals::Refusals,
     stores::{Stores, lock},
 };
@@ -41,6 +41,27 @@ pub(crate) struct Peer {
     pub(crate) incarnation: Incarnation,
     /// A session for each class, or one for all.
     ways: Vec<Way>,
+    buried: Arc<Mutex<Buried>>,
+}
+
+/// What became of the messages to and from lives of peers that are gone, all together.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Buried {
+    pub(crate) sent: OutletAccount,
+    pub(crate) arrived: Arrived,
+}
+
+impl Drop for Peer {
+    fn drop(&mut self) {
+        let accounts = self.accounts();
+        let mut buried = lock(&self.buried);
+        for WayAccount { sent, arrived, .. } in accounts {
+            buried.sent = buried.sent + sent;
+            // What still waited for applications is gone with it, and its receipts say so.
+            let failed = arrived.failed + arrived.waiting;
+            buried.arrived = buried.arrived + Arrived { failed, waiting: 0, ..arrived };
+        }
+    }
 }
 
 impl Peer {
@@ -50,7 +71,8 @@ impl Peer {
         let ways = if attach.by_class { Lane::ALL.len() } else { 1 };
         let refusals = &stores.gncl.refusals;
         let ways = (0..ways).map(|_| Way::new(now, ends, &stores.config, refusals)).collect();
-        Self { node: attach.node, incarnation: attach.incarnation, ways }
+        let buried = stores.gncl.buried.clone();
+        Self { node: attach.node, incarnation: attach.incarnation, ways, buried }
     }
 
     /// Its sessions.
@@ -87,6 +109,11 @@ impl Peer {
     pub(super) fn confirm(&self, ticket: Ticket, outcome: Outcome) {
         // Stream is never confirmed, and the ticket does not say the class.
         let _ = self.ways.iter().any(|way| way.outlet.confirm(ticket, outcome));
+    }
+
+    /// Where every message to it and from it is, session by session.
+    pub(crate) fn accounts(&self) -> Vec<WayAccount> {
+        self.ways.iter().map(Way::account).collect()
     }
 
     /// What became of the messages to it so far.
@@ -142,6 +169,10 @@ pub(crate) struct Store {
     peers: Mutex<BTreeMap<NodeAddress, Arc<Peer>>>,
     /// Peers that are gone, as long as messages of theirs wait for applications here.
     gone: Mutex<Vec<Arc<Peer>>>,
+    /// Every life of a peer that somebody still holds, for an audit; those that are gone are in `buried`.
+    met: Mutex<Vec<Weak<Peer>>>,
+    /// The accounts of those that nobody holds any more, both ways, all together.
+    buried: Arc<Mutex<Buried>>,
     /// Told when messages begin to wait for an application here, and when one for which they wait takes more.
     pub(super) held_up: Arc<Notify>,
     /// The socket that listens. It stays open while this layer is restarted: a peer that is refused would say that this
@@ -155,6 +186,16 @@ impl Store {
     /// The peers that are known now.
     pub(crate) fn peers(&self) -> Vec<Arc<Peer>> {
         self.lock().values().cloned().collect()
+    }
+
+    /// Every life of a peer that is known, or that messages still wait of.
+    pub(crate) fn met(&self) -> Vec<Arc<Peer>> {
+        lock(&self.met).iter().filter_map(Weak::upgrade).collect()
+    }
+
+    /// The accounts of those that are gone, all together.
+    pub(crate) fn buried(&self) -> Buried {
+        *lock(&self.buried)
     }
 
     /// The peer at `node`.
@@ -175,6 +216,11 @@ impl Store {
             None => {}
         }
         let peer = Arc::new(Peer::new(now, attach, stores));
+        {
+            let mut met = lock(&self.met);
+            met.retain(|former| former.strong_count() > 0);
+            met.push(Arc::downgrade(&peer));
+        }
         self.lock().insert(node, peer.clone());
         peer
     }

@@ -16,14 +16,15 @@ use sinew_runtime::{
 use tokio::net::TcpStream;
 
 use super::{
+    arrivals::{Arrivals, End},
     core::{Decline, write},
     peer::frame,
 };
 use crate::{
     config::NodeConfig,
-    outlet::{Gathering, LinkNumber, OutletLimits, Session, StreamOutlet, line_of},
+    outlet::{Gathering, LinkNumber, OutletAccount, OutletLimits, Session, StreamOutlet, line_of},
     refusals::Refusals,
-    session::{Ack, Arrival, Receiving, Shelf, ShelfLimits, Window},
+    session::{Ack, Arrival, Came, Receiving, Sent, Shelf, ShelfLimits, Window},
 };
 
 /// Bytes of frames for one peer that are kept unacknowledged, from which on further messages wait.
@@ -71,6 +72,47 @@ struct Inbox {
     shelf: Shelf<u64, Message>,
 }
 
+/// What became of the messages of a peer. `taken = handed_on + told + expired + refused + failed + waiting`, but for one that a
+/// thread has in hand.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Arrived {
+    pub(crate) taken: u64,
+    /// A mailbox or a client's queue of this node counts them from here on.
+    pub(crate) handed_on: u64,
+    /// For a layer, a group, or one who waited for an outcome or a reply.
+    pub(crate) told: u64,
+    pub(crate) expired: u64,
+    pub(crate) refused: u64,
+    pub(crate) failed: u64,
+    /// For applications that take nothing now.
+    pub(crate) waiting: u64,
+}
+
+impl std::ops::Add for Arrived {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Self {
+            taken: self.taken + other.taken,
+            handed_on: self.handed_on + other.handed_on,
+            told: self.told + other.told,
+            expired: self.expired + other.expired,
+            refused: self.refused + other.refused,
+            failed: self.failed + other.failed,
+            waiting: self.waiting + other.waiting,
+        }
+    }
+}
+
+/// Where every message of a session is, both ways.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct WayAccount {
+    pub(crate) sent: OutletAccount,
+    pub(crate) arrived: Arrived,
+    pub(crate) sending: Option<Sent>,
+    pub(crate) receiving: Came,
+}
+
 /// The two nodes of a session.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Ends {
@@ -83,6 +125,7 @@ pub(crate) struct Way {
     pub(crate) outlet: StreamOutlet<Gathering<Arc<TcpStream>>>,
     /// Locked for a moment, never with another lock in hand.
     inbox: Mutex<Inbox>,
+    pub(super) arrivals: Arrivals,
     outcomes_max: usize,
     ends: Ends,
     refusals: Arc<Refusals>,
@@ -113,7 +156,8 @@ impl Way {
         });
         let inbox = Mutex::new(Inbox { receiving: Receiving::new(memory), shelf });
         let outcomes_max = OUTCOMES_MAX * config.gncl.queue_capacity;
-        Self { outlet, inbox, outcomes_max, ends, refusals: refusals.clone() }
+        let arrivals = Arrivals::default();
+        Self { outlet, inbox, arrivals, outcomes_max, ends, refusals: refusals.clone() }
     }
 
     /// Its messages come on `link` from now on, and are taken from no other.
@@ -215,17 +259,23 @@ impl Way {
     fn offer_line(&self, now: Time, key: u64, router: &Router, room: &Waker) -> Offered {
         for _ in 0..OFFERS_PER_TURN {
             let Some((mut message, bytes)) = self.inbox().shelf.offer(key) else { return Offered::Full };
+            let hand = self.arrivals.take_again();
             // Nobody is told anything with the lock in hand.
             if message.header.is_expired(now) {
                 message.settle(Outcome::Expired);
+                hand.ends(Some(End::Expired));
             } else {
                 match router.offer(message, Some(room)) {
-                    Ok(()) => {}
+                    Ok(()) => hand.ends(Some(End::HandedOn)),
                     Err(Refused { message, why: Rejection::QueueFull }) => {
                         self.inbox().shelf.put_back(key, message, bytes);
+                        hand.ends(None);
                         return Offered::Full;
                     }
-                    Err(refused) => router.refuse(refused),
+                    Err(refused) => {
+                        router.refuse(refused);
+                        hand.ends(Some(End::Refused));
+                    }
                 }
             }
             if self.inbox().shelf.taken(key) {
@@ -233,6 +283,26 @@ impl Way {
             }
         }
         Offered::Turn
+    }
+
+    /// Where every message of this session is, both ways.
+    pub(crate) fn account(&self) -> WayAccount {
+        let (sent, sending) = self.outlet.account();
+        let (waiting, receiving) = {
+            let inbox = self.inbox();
+            (inbox.shelf.messages() as u64, inbox.receiving.position())
+        };
+        let ended = |end| self.arrivals.ended(end);
+        let arrived = Arrived {
+            taken: self.arrivals.taken().saturating_sub(ended(End::Void)),
+            handed_on: ended(End::HandedOn),
+            told: ended(End::Told),
+            expired: ended(End::Expired),
+            refused: ended(End::Refused),
+            failed: ended(End::Failed),
+            waiting,
+        };
+        WayAccount { sent, arrived, sending, receiving }
     }
 
     /// Whether messages wait for applications here.

@@ -173,6 +173,7 @@ impl Client {
         let outcomes = Outcomes::new(outlet.clone(), server.stores.config.mailbox_capacity);
         let notices = Rc::new(Notices::new(tid, outlet.clone(), server.stores.config.payload_max));
         server.add_client(peer.id, outlet.clone(), notices.clone());
+        server.stores.book.add_client(peer.id, app, &name, outlet.clone());
         crate::log::info!(%tid, name, pid = peer.pid, "an application of another process has registered");
         let (link, events, has_been_told) = (None, events.into(), false);
         let cause = Cause::new(DownClass::Killed, registrar::LNCL_ENDED);

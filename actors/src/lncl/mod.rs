@@ -46,7 +46,7 @@ mod untaken;
 
 pub(crate) use actor::Lncl;
 pub use core::RegisterError;
-pub(crate) use core::Registry;
+pub(crate) use core::{ClientId, Registry};
 pub(crate) use door::Door;
 pub(crate) use facts::AppFact;
 pub(crate) use reader::Reader;

@@ -157,6 +157,7 @@ impl Apps {
         if let Some(app) = table.apps.remove(&id) {
             table.by_address.remove(&app.tid.app);
             app.mailbox.close();
+            stores.book.remove_mailbox(app.tid.app);
             lncl::unregister_local(stores, app.tid.app);
         }
     }

@@ -13,6 +13,7 @@
 mod absences;
 mod apps;
 mod asker;
+mod audits;
 mod builder;
 mod commands;
 mod directory;

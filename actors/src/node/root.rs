@@ -374,6 +374,7 @@ impl Root {
         let directory = Arc::new(NodeDirectory(self.stores.clone()));
         let sender = Sender::new(tid, self.stores.router.clone(), directory, pending, config.payload_max);
         let id = self.child_ids.next();
+        self.stores.book.add_mailbox(tid.app, app.name(), &mailbox);
         self.apps.add(id, app, tid, mailbox.clone());
         let wiring = AppWiring { sender, mailbox };
         self.absences.keep(id, app.absence(wiring.clone()));

@@ -13,6 +13,7 @@ use sinew_runtime::{
 
 use super::{
     LinkNumber, OutletCounts, OutletLimits, Socket,
+    account::Tally,
     batch::Pace,
     outstanding::{Outstanding, Sent},
     partial::{Partial, Sort, Written},
@@ -91,6 +92,8 @@ pub(super) struct Half<S> {
     pub(super) drainer: Option<Waker>,
     pace: Pace,
     pub(super) counts: OutletCounts,
+    /// The rest of what an audit needs.
+    pub(super) tally: Tally,
 }
 
 impl<S: Socket> Half<S> {
@@ -114,6 +117,7 @@ impl<S: Socket> Half<S> {
             drainer: None,
             pace: Pace::new(),
             counts: OutletCounts::default(),
+            tally: Tally::default(),
         }
     }
 
@@ -232,10 +236,18 @@ impl<S: Socket> Half<S> {
 
     pub(super) fn submit(
         &mut self,
-        mut message: Message,
+        message: Message,
         bound: Bound,
         after: &mut After,
     ) -> Result<Step, Refused> {
+        let is_own = !message.header.kind.is_user();
+        let step = self.take(message, bound, after)?;
+        self.tally.taken += 1;
+        self.tally.own += u64::from(is_own);
+        Ok(step)
+    }
+
+    fn take(&mut self, mut message: Message, bound: Bound, after: &mut After) -> Result<Step, Refused> {
         if let Err(why) = self.admit(&message, bound) {
             self.counts.refused += 1;
             return Err(Refused::new(message, why));

@@ -13,7 +13,7 @@ use super::{
     held::LIMITS_OF_LINES,
     partial::{Partial, Sort},
 };
-use crate::session::{Ack, Heard, Held, Sending, ShelfLimits, Window};
+use crate::session::{Ack, Heard, Held, Sending, Sent, ShelfLimits, Window};
 
 /// What is kept for the peer.
 pub(crate) struct Session {
@@ -53,7 +53,20 @@ impl<S: Socket> Half<S> {
     /// What waits, and what is kept because nobody has said that it arrived.
     pub(super) fn left(&self) -> usize {
         let kept = self.session.as_ref().map_or(0, |session| session.sending.kept());
-        self.queue.len() + usize::from(self.interrupted.is_some()) + self.in_lines() + kept
+        self.waits_for_its_number() + kept
+    }
+
+    /// What waits and has no number yet.
+    pub(super) fn waits_for_its_number(&self) -> usize {
+        self.queue.len() + usize::from(self.interrupted.is_some()) + self.in_lines()
+    }
+
+    /// Messages that have a number and have not arrived, as far as is known here, and how far the session is.
+    pub(super) fn kept(&self, has_voids: bool) -> (u64, Option<Sent>) {
+        let Some(Session { sending, .. }) = &self.session else { return (0, None) };
+        // Looked through only where some may be voids.
+        let kept = if has_voids { sending.kept_with_a_use() } else { sending.kept() };
+        (kept as u64, Some(sending.position()))
     }
 
     pub(super) fn epoch(&self) -> u64 {
@@ -65,18 +78,22 @@ impl<S: Socket> Half<S> {
         if let Some(session) = &mut self.session {
             let kept = Message::new(message.header, message.payload.clone());
             message.header.number = session.sending.keep(kept, message.size()) as u16;
+            self.tally.numbered += 1;
         }
     }
 
     pub(super) fn take_back(&mut self) {
         if let Some(session) = &mut self.session {
             session.sending.take_back();
+            self.tally.numbered -= 1;
         }
     }
 
     pub(super) fn forget_kept(&mut self) {
         if let Some(session) = &mut self.session {
-            self.counts.lost += session.sending.drain().len() as u64;
+            let unknown = session.sending.drain().len() as u64;
+            self.counts.lost += unknown;
+            self.tally.unknown += unknown;
         }
     }
 
@@ -122,6 +139,7 @@ impl<S: Socket> Half<S> {
             }
             Heard::Reset(kept) => {
                 self.counts.lost += kept.len() as u64;
+                self.tally.unknown += kept.len() as u64;
                 self.unknown(after);
                 true
             }
@@ -142,6 +160,11 @@ impl<S: Socket> Half<S> {
             }
         });
         for message in void {
+            if message.header.is_expired(now) {
+                self.tally.void_expired += 1;
+            } else {
+                self.tally.void_superseded += 1;
+            }
             if message.header.flags.has(Flags::CONFIRM) {
                 self.confirm(message.ticket(), Outcome::Expired, after);
             }

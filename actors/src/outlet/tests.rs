@@ -21,6 +21,7 @@ use tokio_util::codec::Decoder;
 use super::*;
 
 mod accounts;
+mod audits;
 mod floods;
 mod holding;
 mod room;

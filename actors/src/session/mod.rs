@@ -62,6 +62,28 @@ pub(crate) struct Ack {
     pub(crate) held: Vec<u64>,
 }
 
+/// How far the sending half of a session is, at one moment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Sent {
+    pub(crate) epoch: u64,
+    /// The memory of the peer that this epoch's messages were for.
+    pub(crate) memory: Option<u64>,
+    /// The peer has said to have all before this number.
+    pub(crate) acknowledged: u64,
+    /// The number of the next message.
+    pub(crate) next: u64,
+}
+
+/// How far the receiving half is, at one moment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Came {
+    pub(crate) memory: u64,
+    /// Epoch of the peer; 0 before the first.
+    pub(crate) epoch: u64,
+    /// The number that is taken next.
+    pub(crate) next: u64,
+}
+
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde calls it with a reference")]
 const fn is_zero(number: &u64) -> bool {
     *number == 0

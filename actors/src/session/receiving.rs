@@ -1,6 +1,6 @@
 //! The receiving half: takes each number once, in order, from the latest connection.
 
-use super::{Ack, FIRST};
+use super::{Ack, Came, FIRST};
 
 /// Messages after which the sender is told, so that it need not keep them.
 const ACK_EVERY: u32 = 32;
@@ -77,6 +77,11 @@ impl Receiving {
     /// Whether something was taken that the sender has not been told.
     pub(crate) const fn owes_ack(&self) -> bool {
         self.unsaid > 0
+    }
+
+    /// What was taken, for an audit.
+    pub(crate) const fn position(&self) -> Came {
+        Came { memory: self.memory, epoch: self.epoch, next: self.next }
     }
 
     /// What the sender is told now; `epoch` is that of what goes the other way.

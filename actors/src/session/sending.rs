@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use super::{Ack, FIRST};
+use super::{Ack, FIRST, Sent};
 
 /// How much is kept without an acknowledgement. At least one message always is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -77,6 +77,17 @@ impl<M> Sending<M> {
     /// Messages that were written, and that the peer has not said to have.
     pub(crate) fn kept(&self) -> usize {
         self.kept.len()
+    }
+
+    /// Those of them that have not become voids.
+    pub(crate) fn kept_with_a_use(&self) -> usize {
+        self.kept.iter().filter(|kept| kept.message.is_some()).count()
+    }
+
+    /// How far the peer is, as far as is known here, for an audit.
+    pub(crate) fn position(&self) -> Sent {
+        let Self { epoch, peer, base, .. } = *self;
+        Sent { epoch, memory: peer, acknowledged: base, next: self.end() }
     }
 
     /// Messages that are to be written again.

@@ -5,7 +5,7 @@
 
 use std::{sync::Arc, task::Waker};
 
-use super::{Mailbox, is_event};
+use super::{Mailbox, Shared, is_event};
 use crate::{
     outcome::{Outcome, Rejection},
     post::lock,
@@ -17,6 +17,20 @@ use crate::{
 pub struct Lender {
     mailbox: Arc<Mailbox>,
     epoch: u64,
+}
+
+impl Shared {
+    fn lends(&mut self, message: Option<&Message>) {
+        if let Some(message) = message {
+            self.lent[message.header.class as usize] += 1;
+        }
+    }
+
+    /// A borrower that says more than it was lent must not end the node: the audit shows it.
+    fn lent_no_more(&mut self, class: Class) {
+        let lent = &mut self.lent[class as usize];
+        *lent = lent.saturating_sub(1);
+    }
 }
 
 impl Mailbox {
@@ -34,6 +48,7 @@ impl Lender {
         let mut shared = lock(&self.mailbox.shared);
         let (next, room) =
             if shared.epoch == self.epoch { (shared.next(), shared.queue.room_made()) } else { (None, None) };
+        shared.lends(next.as_ref());
         drop(shared);
         room.into_iter().for_each(Waker::wake);
         next
@@ -43,17 +58,23 @@ impl Lender {
     #[must_use]
     pub fn take_event(&self) -> Option<Message> {
         let mut shared = lock(&self.mailbox.shared);
-        if shared.epoch == self.epoch { shared.events.pop_front() } else { None }
+        let event = if shared.epoch == self.epoch { shared.events.pop_front() } else { None };
+        shared.lends(event.as_ref());
+        event
     }
 
     /// A lent message of this class has ended so.
     pub fn settle(&self, class: Class, outcome: Outcome) {
-        lock(&self.mailbox.shared).tallies[class as usize].count(outcome);
+        let mut shared = lock(&self.mailbox.shared);
+        shared.lent_no_more(class);
+        shared.tallies[class as usize].count(outcome);
     }
 
     /// A newer value took the place of a lent message of this class.
     pub fn supersede(&self, class: Class) {
-        lock(&self.mailbox.shared).tallies[class as usize].superseded += 1;
+        let mut shared = lock(&self.mailbox.shared);
+        shared.lent_no_more(class);
+        shared.tallies[class as usize].superseded += 1;
     }
 
     /// Gives back what was lent and never handled, oldest first: it is the next to be taken, in the same order. The
@@ -69,6 +90,7 @@ impl Lender {
             };
             for message in lent.into_iter().rev() {
                 let class = message.header.class as usize;
+                shared.lent_no_more(message.header.class);
                 if let Some(why) = refuses.or_else(|| is_event(&message.header).then_some(Rejection::Away)) {
                     shared.tallies[class].rejected += 1;
                     refused.push((message, why));
@@ -125,6 +147,7 @@ mod tests {
         assert_eq!(sequences(&second), [2, 3, 4]);
         let tally = mailbox.tally(Class::Bulk);
         assert_eq!((tally.taken, tally.failed, tally.open()), (4, 1, 3));
+        assert_eq!(mailbox.account(Class::Bulk), (tally, 3), "what is lent is counted one by one");
     }
 
     #[test]
@@ -150,6 +173,7 @@ mod tests {
             lender.give_back(vec![lent]);
             let tally = mailbox.tally(Class::Control);
             assert_eq!((tally.taken, tally.rejected, tally.open()), (1, 1, 0));
+            assert_eq!(mailbox.account(Class::Control), (tally, 0));
         }
     }
 }

@@ -56,6 +56,8 @@ struct Shared {
     in_hand: Option<Class>,
     /// Messages taken out so far.
     taken_out: u64,
+    /// Messages of each class that are out with a [`Lender`].
+    lent: [u64; 3],
     closed: bool,
     /// The application is away and wants nothing kept for it.
     refuses: bool,
@@ -101,6 +103,13 @@ impl Shared {
         self.events.push_back(event);
         self.high_water = self.high_water.max(self.waiting());
         Ok(self.waker.take())
+    }
+
+    /// Messages of `class` that wait, or are in hand, or lent: counted one by one.
+    fn held(&self, class: Class) -> u64 {
+        let events = self.events.iter().filter(|event| event.header.class == class).count();
+        let in_hand = u64::from(self.in_hand == Some(class));
+        (events + self.queue.len_of(class)) as u64 + in_hand + self.lent[class as usize]
     }
 
     const fn hands_out(&mut self, message: &Message) -> Option<Class> {
@@ -157,6 +166,7 @@ impl Mailbox {
             epoch: 0,
             in_hand: None,
             taken_out: 0,
+            lent: [0; 3],
             closed: false,
             refuses: false,
             tallies: [Tally::default(); 3],
@@ -259,6 +269,14 @@ impl Mailbox {
     #[must_use]
     pub fn high_water(&self) -> usize {
         lock(&self.shared).high_water
+    }
+
+    /// What became of the messages of `class`, and how many wait, are in hand or lent at that same moment:
+    /// [`Tally::open`] of the former is the latter.
+    #[must_use]
+    pub fn account(&self, class: Class) -> (Tally, u64) {
+        let shared = lock(&self.shared);
+        (shared.tallies[class as usize], shared.held(class))
     }
 
     /// What became of the messages of `class`.

@@ -239,6 +239,12 @@ impl ClassQueue {
         self.lanes.iter().map(VecDeque::len).sum()
     }
 
+    /// Messages of `class` that wait.
+    #[must_use]
+    pub fn len_of(&self, class: Class) -> usize {
+        self.lanes[class as usize].len()
+    }
+
     /// Bytes of the payloads that wait.
     #[must_use]
     pub fn bytes(&self) -> usize {

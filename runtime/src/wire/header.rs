@@ -23,6 +23,8 @@
 
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
+
 use crate::{tid::Tid, time::Time, wire::Kind};
 
 /// First two bytes of every frame.
@@ -33,7 +35,7 @@ pub const VERSION: u8 = 1;
 pub const HEADER_LEN: usize = 64;
 
 /// How urgent a message is, and what a newer one does to an older.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub enum Class {
     /// Ordered and ahead of all else.
     #[default]

@@ -146,5 +146,6 @@ impl Drop for Client {
         let _ = rustix::net::shutdown(&self.peer.stream, Shutdown::Both);
         // spec: LNCL-7. A peer that sleeps at a ring is woken by its end.
         self.outlet.end(Outcome::Failed, Rejection::Closed);
+        self.server.stores.book.remove_client(self.peer.id);
     }
 }

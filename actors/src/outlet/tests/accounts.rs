@@ -3,6 +3,7 @@
 use proptest::prelude::*;
 
 use super::*;
+use crate::audit::Account;
 
 #[derive(Clone, Debug)]
 enum Step {
@@ -65,6 +66,9 @@ proptest! {
             let OutletCounts { sent, superseded, expired, lost, refused } = counts;
             let known = sent + superseded + expired + lost + refused + bench.outlet.waiting() as u64;
             prop_assert_eq!(submitted, known, "{:?}", counts);
+            let (account, _) = bench.outlet.account();
+            prop_assert_eq!(Account::of_outlet(&account).unexplained(), 0, "{:?}", account);
+            prop_assert_eq!(submitted, account.taken + account.refused, "{:?}", account);
         }
         seen.extend(frames(&bench.wire.bytes.lock().unwrap()));
         for class in Class::ALL {

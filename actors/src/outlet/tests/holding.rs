@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use proptest::prelude::*;
 
 use super::*;
-use crate::session::Window;
+use crate::{audit::Account, session::Window};
 
 /// The held application of this number, in class Control.
 fn key(application: u8) -> u64 {
@@ -116,6 +116,8 @@ impl World {
         let OutletCounts { sent, superseded, expired, lost, refused } = self.bench.outlet.counts();
         let known = sent + superseded + expired + lost + refused + self.bench.outlet.waiting() as u64;
         assert_eq!(self.submitted, known, "all are accounted for");
+        let (account, _) = self.bench.outlet.account();
+        assert_eq!(Account::of_outlet(&account).unexplained(), 0, "{account:?}");
         for to in 0..3 {
             let seen = self.seen(to);
             assert!(seen.is_sorted(), "{to}: {seen:?}");

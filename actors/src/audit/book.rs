@@ -1,0 +1,123 @@
+//! Which places of a node there are, and the accounts of those that are gone.
+
+use std::{
+    collections::BTreeMap,
+    sync::{Arc, Mutex},
+};
+
+use sinew_runtime::{mailbox::Mailbox, tid::AppAddress, wire::Class};
+
+use super::account::{Account, Place};
+use crate::{
+    lncl::ClientId,
+    outlet::{OutletAccount, Socket, StreamOutlet},
+    stores::lock,
+};
+
+/// Mailboxes at most that are gone and still have a message out. Of a further one the first is written off.
+const CLOSING_MAX: usize = 64;
+
+/// Something that counts as an outlet does.
+pub(crate) trait Accounted: Send + Sync {
+    /// Where every message is that it has taken.
+    fn account(&self) -> OutletAccount;
+}
+
+impl<S: Socket> Accounted for StreamOutlet<S> {
+    fn account(&self) -> OutletAccount {
+        self.account().0
+    }
+}
+
+/// The places of a node. It outlives every layer.
+#[derive(Default)]
+pub(crate) struct Book(Mutex<Places>);
+
+#[derive(Default)]
+struct Places {
+    mailboxes: BTreeMap<AppAddress, (String, Arc<Mailbox>)>,
+    /// Mailboxes that are gone, of which a message is in hand.
+    closing: Vec<Arc<Mailbox>>,
+    clients: BTreeMap<ClientId, Client>,
+    former_mailboxes: Account,
+    former_clients: Account,
+}
+
+struct Client {
+    app: AppAddress,
+    name: String,
+    outlet: Arc<dyn Accounted>,
+}
+
+impl Book {
+    /// The mailbox of the application at `app`.
+    pub(crate) fn add_mailbox(&self, app: AppAddress, name: &str, mailbox: &Arc<Mailbox>) {
+        lock(&self.0).mailboxes.insert(app, (name.to_owned(), mailbox.clone()));
+    }
+
+    /// The application at `app` is gone for good, and its mailbox closed.
+    pub(crate) fn remove_mailbox(&self, app: AppAddress) {
+        let mut places = lock(&self.0);
+        if let Some((_, mailbox)) = places.mailboxes.remove(&app) {
+            places.closing.push(mailbox);
+            let surplus = places.closing.len().saturating_sub(CLOSING_MAX);
+            places.write_off(surplus);
+        }
+    }
+
+    /// What waits for a client.
+    pub(crate) fn add_client(&self, id: ClientId, app: AppAddress, name: &str, outlet: Arc<dyn Accounted>) {
+        lock(&self.0).clients.insert(id, Client { app, name: name.to_owned(), outlet });
+    }
+
+    /// The client is gone, and its outlet has ended.
+    pub(crate) fn remove_client(&self, id: ClientId) {
+        let mut places = lock(&self.0);
+        if let Some(Client { outlet, .. }) = places.clients.remove(&id) {
+            places.former_clients = places.former_clients + Account::of_outlet(&outlet.account()).over();
+        }
+    }
+
+    /// The accounts of all places, now.
+    pub(super) fn read(&self) -> Vec<(Place, Account)> {
+        let mut places = lock(&self.0);
+        places.write_off(0);
+        let mut read = Vec::new();
+        for (app, (name, mailbox)) in &places.mailboxes {
+            read.extend(Class::ALL.map(|class| {
+                let place = Place::Mailbox { app: *app, name: name.clone(), class };
+                (place, Account::of_mailbox(mailbox.account(class)))
+            }));
+        }
+        for Client { app, name, outlet } in places.clients.values() {
+            let place = Place::Client { app: *app, name: name.clone() };
+            read.push((place, Account::of_outlet(&outlet.account())));
+        }
+        let closing: Account = places.closing.iter().map(|mailbox| whole(mailbox)).sum();
+        read.push((Place::OtherMailboxes, places.former_mailboxes + closing));
+        read.push((Place::OtherClients, places.former_clients));
+        read
+    }
+}
+
+impl Places {
+    /// Closes the accounts of mailboxes that have nothing out any more, and of the `surplus` oldest in any case.
+    fn write_off(&mut self, surplus: usize) {
+        let mut at = 0;
+        let former = &mut self.former_mailboxes;
+        self.closing.retain(|mailbox| {
+            let account = whole(mailbox);
+            let is_over = at < surplus || account.waiting == 0;
+            at += 1;
+            if is_over {
+                *former = *former + account.over();
+            }
+            !is_over
+        });
+    }
+}
+
+/// All classes of a mailbox.
+fn whole(mailbox: &Mailbox) -> Account {
+    Class::ALL.iter().map(|class| Account::of_mailbox(mailbox.account(*class))).sum()
+}

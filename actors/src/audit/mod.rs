@@ -1,0 +1,21 @@
+//! The audit: where is every message that was ever sent?
+//!
+//! A message is always in one place: a mailbox, what waits for a client, what goes to a node, what came from one. Each place counts what
+//! it took and how each of these ended, and each has a law of its own: `taken = ends + waiting`. Between two nodes the numbers of the
+//! session are the law: what one knows to have arrived, the other has taken. So a message that nobody can explain has a name: of a
+//! place, or of a link.
+//!
+//! | file | what it is |
+//! | --- | --- |
+//! | `account.rs` | the counters of one place, and their law |
+//! | `book.rs` | which places there are, and the accounts of those that are gone |
+//! | `reading.rs` | what a node says of itself |
+
+mod account;
+mod book;
+mod reading;
+
+pub use account::{Account, Place};
+pub(crate) use book::Book;
+pub(crate) use reading::read;
+pub use reading::{Entry, NodeAudit, Receiving, Sending, Session};

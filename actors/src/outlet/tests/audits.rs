@@ -1,0 +1,148 @@
+//! Any life of a session: cuts, acknowledgements, peers that forget, messages that lose their use. At every moment its audit says where
+//! each message is.
+
+use proptest::prelude::*;
+
+use super::*;
+use crate::{audit::Account, session::Window};
+
+#[derive(Clone, Debug)]
+enum Step {
+    Submit {
+        class: u8,
+        expires: bool,
+    },
+    Room(usize),
+    /// The peer has a part of what was written, in hundredths.
+    Acknowledge(u64),
+    /// The next connection; the peer has a part of what was written.
+    Reconnect(u64),
+    /// The next connection, to a peer that knows nothing of this session.
+    Forget,
+    Expire,
+}
+
+fn any_step() -> impl Strategy<Value = Step> {
+    prop_oneof![
+        8 => (0u8..3, any::<bool>()).prop_map(|(class, expires)| Step::Submit { class, expires }),
+        5 => (0usize..400).prop_map(Step::Room),
+        3 => (0u64..=100).prop_map(Step::Acknowledge),
+        2 => (0u64..=100).prop_map(Step::Reconnect),
+        1 => Just(Step::Forget),
+        1 => Just(Step::Expire),
+    ]
+}
+
+struct World {
+    bench: Bench,
+    submitted: u64,
+    /// The peer's memory.
+    memory: u64,
+    /// The number after the last one that was written whole.
+    written: u64,
+}
+
+impl World {
+    fn new() -> Self {
+        let window = Window { messages: 6, bytes: PLENTY };
+        let void = message(Class::Control, 0).header;
+        let outlet = StreamOutlet::with_session(LIMITS, Session::new(1, window, void));
+        let wire = Arc::new(Wire::default());
+        let link = outlet.connect(wire.clone(), usize::MAX, None);
+        let bench = Bench { outlet, wire, link, ledger: Arc::default() };
+        let world = Self { bench, submitted: 0, memory: 1, written: 1 };
+        world.hear(1);
+        world
+    }
+
+    fn hear(&self, next: u64) {
+        let of = self.bench.outlet.epoch();
+        let ack = Ack { memory: self.memory, epoch: 1, of, next, change: 0, held: Vec::new() };
+        self.bench.outlet.heard(self.bench.link, &ack, Time::now());
+    }
+
+    /// What the peer says to have when it has so much of what was written.
+    fn part(&self, hundredths: u64) -> u64 {
+        let said = self.bench.outlet.account().1.expect("it has a session").acknowledged;
+        said + self.written.saturating_sub(said) * hundredths / 100
+    }
+
+    fn submit(&mut self, class: u8, expires: bool) {
+        self.submitted += 1;
+        let mut message = message(Class::ALL[usize::from(class)], class);
+        if expires {
+            (message.header.sent, message.header.time_to_live_us) = (Time::now(), 3_000_000);
+        }
+        // Handed back or not, it is accounted for.
+        let _ = self.bench.outlet.submit(message);
+    }
+
+    fn step(&mut self, step: &Step) {
+        match *step {
+            Step::Submit { class, expires } => self.submit(class, expires),
+            Step::Room(room) => self.bench.make_room(room),
+            Step::Acknowledge(part) => self.hear(self.part(part)),
+            Step::Reconnect(part) => {
+                let next = self.part(part);
+                self.bench.outlet.disconnect(self.bench.link);
+                self.bench.reconnect(0);
+                self.hear(next);
+            }
+            Step::Forget => {
+                self.bench.outlet.disconnect(self.bench.link);
+                self.bench.reconnect(0);
+                self.memory += 1;
+                self.hear(1);
+                self.written = 1;
+            }
+            Step::Expire => self.bench.outlet.expire(Time::MAX),
+        }
+        let frames = frames(&self.bench.wire.bytes.lock().unwrap());
+        if let Some(last) = frames.last() {
+            self.written = u64::from(last.header.number) + 1;
+        }
+        self.balances();
+    }
+
+    fn balances(&self) {
+        let (account, sent) = self.bench.outlet.account();
+        assert_eq!(Account::of_outlet(&account).unexplained(), 0, "{account:?}");
+        assert_eq!(self.submitted, account.taken + account.refused, "{account:?}");
+        let sent = sent.expect("it has a session");
+        assert!(sent.next - sent.acknowledged >= account.unacknowledged, "{account:?} {sent:?}");
+    }
+}
+
+proptest! {
+    #[test]
+    fn a_session_knows_at_every_moment_where_each_message_is(
+        steps in proptest::collection::vec(any_step(), 1..100),
+    ) {
+        let mut world = World::new();
+        for step in &steps {
+            world.step(step);
+        }
+        world.step(&Step::Reconnect(100));
+        for _ in 0..steps.len() {
+            world.step(&Step::Room(PLENTY));
+            world.step(&Step::Acknowledge(100));
+        }
+        let (account, _) = world.bench.outlet.account();
+        prop_assert_eq!((account.waiting, account.unacknowledged), (0, 0), "{:?}", account);
+        world.bench.outlet.close(Rejection::Closed);
+        world.balances();
+    }
+}
+
+#[test]
+fn what_is_under_way_when_the_peer_is_gone_is_unknown_and_what_waits_is_lost() {
+    let mut world = World::new();
+    world.step(&Step::Room(PLENTY));
+    world.step(&Step::Submit { class: 0, expires: false });
+    world.bench.wire.room.store(0, Ordering::Relaxed);
+    world.step(&Step::Submit { class: 2, expires: false });
+    world.bench.outlet.close(Rejection::NoSuchNode);
+    let (account, _) = world.bench.outlet.account();
+    assert_eq!((account.taken, account.unknown, account.lost, account.waiting), (2, 1, 1, 0));
+    world.balances();
+}

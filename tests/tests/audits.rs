@@ -1,0 +1,107 @@
+//! Where is every message? What the audit says of a node, of two, and of two with a faulty network between them.
+
+use std::sync::{Mutex, mpsc::sync_channel};
+
+use sinew::{
+    Sender,
+    audit::{Account, NodeAudit, Place},
+    prelude::*,
+};
+use sinew_tests::{
+    DEADLINE, Ground, all_run,
+    puppet::{Job, Order, Stage, Value, desk, wait},
+    until,
+};
+
+/// What holds the application up.
+const HOLD: u64 = 1;
+/// What it refuses.
+const REFUSED: u64 = 99;
+/// What it panics at.
+const FATAL: u64 = 13;
+/// Messages of a class that wait for it at most.
+const MAILBOX: usize = 16;
+
+/// Of all classes of the mailbox of the application called `name`.
+fn mailbox(audit: &NodeAudit, wanted: &str) -> Account {
+    let is_it = |place: &Place| matches!(place, Place::Mailbox { name, .. } if name == wanted);
+    audit.entries.iter().filter(|entry| is_it(&entry.place)).map(|entry| entry.account).sum()
+}
+
+/// Every place of this node knows where each of its messages is.
+#[track_caller]
+fn balances(audit: &NodeAudit) {
+    for entry in &audit.entries {
+        assert_eq!(entry.account.unexplained(), 0, "{}: {:?}", entry.place, entry.account);
+    }
+}
+
+/// One message of every sort for the held application: 3 values, 1 that expires, 1 refused, 1 fatal, jobs until nothing has room.
+/// Returns how many jobs were taken.
+fn send_every_sort(sender: &Sender, to: &str) -> u64 {
+    for number in 2..5 {
+        sender.send(to, &Value { number }).expect("it replaces the one before");
+    }
+    let late =
+        sender.send_confirmed(to, &Order { number: 5 }, Duration::from_millis(1)).expect("it is taken");
+    assert_eq!(wait(late), Outcome::Unknown, "nobody has said anything in its time");
+    for number in [REFUSED, FATAL, 6] {
+        sender.send(to, &Order { number }).expect("there is room");
+    }
+    (0..).take_while(|number| sender.send(to, &Job { number: 100 + number }).is_ok()).count() as u64
+}
+
+#[test]
+fn every_sort_of_end_in_a_node_is_counted_and_nothing_is_unexplained() {
+    // Given: an application that is held up
+    let ((go, gate), (say, held)) = (sync_channel::<()>(1), sync_channel(1));
+    let gate = Mutex::new(gate);
+    let (sink, _log) = Stage::new()
+        .got(move |puppet, context| match puppet.number {
+            HOLD => {
+                say.send(()).expect("the test waits");
+                gate.lock().expect("one has it").recv().expect("the test lets it go");
+            }
+            REFUSED => context.reject(),
+            FATAL => panic!("thirteen"),
+            _ => {}
+        })
+        .app("sink");
+    let (desk, key) = desk("desk");
+    let ground = Ground::new();
+    let node = ground.node("one").configure(|config| config.mailbox_capacity = MAILBOX);
+    let node = node.app(sink.progress_within(DEADLINE)).app(desk).start().expect("a node");
+    all_run(&[&node]);
+    let (handle, sender) = (node.handle(), key.sender());
+    sender.send("sink", &Order { number: HOLD }).expect("there is room");
+    held.recv().expect("it is held");
+    // When: it is sent every sort of message
+    let jobs = send_every_sort(&sender, "sink");
+    let nobody = Tid::new(node.address(), AppAddress::fixed(7).expect("a fixed one"));
+    sender.send(nobody, &Job { number: 0 }).expect_err("nobody has this address");
+    // Then: what waits is counted while it waits, and what became of it when it has ended
+    let audit = handle.audit_here();
+    balances(&audit);
+    let account = mailbox(&audit, "sink");
+    assert_eq!(account.waiting, 1 + 1 + 3 + jobs, "held, value, orders, jobs: {account:?}");
+    // What was late made way when there was no room.
+    assert_eq!((account.expired, account.superseded, account.refused), (1, 2, 1), "{account:?}");
+    assert_eq!(jobs, MAILBOX as u64);
+    assert_eq!(audit.refused.get("not taken: NoSuchApplication"), Some(&1), "{:?}", audit.refused);
+    go.send(()).expect("it waits");
+    let audit = until("all has ended", || {
+        let audit = handle.audit_here();
+        balances(&audit);
+        (mailbox(&audit, "sink").waiting == 0).then_some(audit)
+    });
+    let account = mailbox(&audit, "sink");
+    assert_eq!((account.rejected, account.failed, account.expired), (1, 1, 1), "{account:?}");
+    assert_eq!(account.delivered, 1 + 1 + 1 + jobs, "held, value, order, jobs: {account:?}");
+    // And: of one that is gone it is still known
+    handle.stop_app("sink").expect("it is there");
+    handle.remove_app("sink").expect("it has stopped");
+    let audit = handle.audit_here();
+    balances(&audit);
+    assert_eq!(mailbox(&audit, "sink"), Account::default());
+    assert_eq!(audit.account(&Place::OtherMailboxes).taken, account.taken);
+}
