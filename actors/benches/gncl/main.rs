@@ -6,6 +6,7 @@
 //!
 //! - `rounds-THREAD-BYTES-PACE-CPUS`: round trips of 8 B, 64 B, 1000 B, 64 KiB and 1 MB in class Control, back to back and one
 //!   every millisecond, between applications on their nodes' IO threads (also with `gncl.spin`) or on threads of their own; beside blocking TCP.
+//!   `sleeps` is how often a thread of either process went to sleep for each message, which another one had to end.
 //! - `flood-CARRIER-CPUS`: packets of 1000 bytes in class Bulk one way, as fast as they go, confirmed or not, and through bare
 //!   TCP.
 //! - `table_2-N`: the paper's test, every node to every other one, 1000 bytes with a full echo, 3, 8 and 16 nodes at 2,000 round

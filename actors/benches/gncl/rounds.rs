@@ -5,7 +5,7 @@ use std::time::Duration;
 use sinew::prelude::*;
 use sinew_figures::{
     Beside, Figures, Pinning, Rounds,
-    process::{Process, await_end, say_there},
+    process::{self, Process, await_end, say_there},
     stream,
 };
 
@@ -69,28 +69,40 @@ impl Thread {
 
 /// Measures both, and prints the line.
 pub(crate) fn measure(thread: Thread, rounds: Rounds, pinning: Pinning) {
+    let (seen, sleeps) = between_nodes(thread, rounds, pinning);
+    let (raw, raw_sleeps) = raw(rounds, pinning);
     Beside {
         bench: "gncl",
         case: thread.name(),
         payload_bytes: rounds.bytes,
         pinning: pinning.name(),
         pace: rounds.pace.name(),
-        seen: &between_nodes(thread, rounds, pinning),
+        seen: &seen,
         reference: "raw_tcp",
-        raw: &raw(rounds, pinning),
+        raw: &raw,
+        counts: &[("sleeps", sleeps), ("reference_sleeps", raw_sleeps)],
     }
     .report();
 }
 
-fn between_nodes(thread: Thread, rounds: Rounds, pinning: Pinning) -> Figures {
+/// What is measured, and how often a thread of either process went to sleep for each message.
+fn counting_sleeps(other: &Process, rounds: Rounds, measure: impl FnOnce() -> Figures) -> (Figures, f64) {
+    let sleeps = || process::sleeps() + other.sleeps();
+    let before = sleeps();
+    let figures = measure();
+    let messages = 2 * (rounds.warm_up + rounds.counted);
+    (figures, (sleeps() - before) as f64 / f64::from(messages))
+}
+
+fn between_nodes(thread: Thread, rounds: Rounds, pinning: Pinning) -> (Figures, f64) {
     let at = At::loopback();
     let role = format!("echo {} {} {}", thread.name(), pinning.name(), at.host(2));
-    let _echo = Process::start(&role);
+    let echo = Process::start(&role);
     let (ping, figures) = ping::ping(rounds);
     let node = thread.node("ping", at).app(thread.place(ping)).start().expect("a node");
-    let figures = figures.recv_timeout(DEADLINE).expect("the rounds end");
+    let seen = counting_sleeps(&echo, rounds, || figures.recv_timeout(DEADLINE).expect("the rounds end"));
     node.stop();
-    figures
+    seen
 }
 
 /// The node that echoes, until its input ends.
@@ -101,8 +113,8 @@ pub(crate) fn echo(thread: Thread, at: At) {
 }
 
 /// The same between two processes by bare sockets.
-fn raw(rounds: Rounds, pinning: Pinning) -> Figures {
+fn raw(rounds: Rounds, pinning: Pinning) -> (Figures, f64) {
     let (ours, theirs) = stream::tcp_pair();
-    let _echo = Process::start_on(&format!("raw_echo {} {}", rounds.bytes, pinning.name()), theirs.into());
-    stream::round_trips(ours, rounds)
+    let echo = Process::start_on(&format!("raw_echo {} {}", rounds.bytes, pinning.name()), theirs.into());
+    counting_sleeps(&echo, rounds, || stream::round_trips(ours, rounds))
 }

@@ -205,6 +205,7 @@ impl Case {
                 seen: &seen,
                 reference,
                 raw,
+                counts: &[],
             }
             .report();
         }
@@ -226,6 +227,7 @@ impl Case {
             seen: &seen,
             reference: "the same copied",
             raw: &copied,
+            counts: &[],
         }
         .report();
     }
@@ -248,6 +250,7 @@ impl Case {
             seen: &seen,
             reference: "raw_unix_stream",
             raw: &raw,
+            counts: &[],
         }
         .report();
         assert_eq!(lost, 0, "packets that never came");

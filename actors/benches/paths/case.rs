@@ -86,6 +86,7 @@ pub(crate) fn measure(name: &str, pinning: &str) {
         seen: &seen,
         reference: case.reference,
         raw: &reference,
+        counts: &[],
     }
     .report();
 }

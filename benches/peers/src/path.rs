@@ -159,6 +159,7 @@ impl Case {
             seen,
             reference: self.paths[0].name(),
             raw,
+            counts: &[],
         }
         .report();
     }

@@ -1,6 +1,6 @@
 //! A case beside its reference, as a JSON line.
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use crate::{Figures, round};
 
@@ -23,6 +23,8 @@ pub struct Beside<'a> {
     pub reference: &'a str,
     /// The reference's times.
     pub raw: &'a Figures,
+    /// Counts beside the times.
+    pub counts: &'a [(&'a str, f64)],
 }
 
 impl Beside<'_> {
@@ -34,11 +36,11 @@ impl Beside<'_> {
 
     /// Prints the line, and a row of a table for a page of documentation.
     pub fn report(&self) {
-        let Self { bench, case, payload_bytes, pinning, pace, seen, reference, raw } = self;
+        let Self { bench, case, payload_bytes, pinning, pace, seen, reference, raw, counts } = self;
         let [p50, p99, p999, max] = seen.quantiles_us(3);
         let [reference_p50, reference_p99, ..] = raw.quantiles_us(3);
         let ratio = seen.us(0.5) / raw.us(0.5);
-        let line = json!({
+        let mut line = json!({
             "bench": bench,
             "case": case,
             "payload_bytes": payload_bytes,
@@ -54,9 +56,13 @@ impl Beside<'_> {
             "reference_p99_us": reference_p99,
             "ratio_p50": round(ratio, 3),
         });
+        if let Value::Object(fields) = &mut line {
+            fields.extend(counts.iter().map(|(name, count)| ((*name).to_owned(), json!(round(*count, 3)))));
+        }
         println!("{line}");
+        let counts: String = counts.iter().map(|(name, count)| format!(" {name} {count:.2}")).collect();
         eprintln!(
-            "| {case} | {payload_bytes} | {pinning} | {pace} | {p50:.2} | {p99:.2} | {p999:.2} | {max:.1} | {reference} | {reference_p50:.2} | {ratio:.2} |"
+            "| {case} | {payload_bytes} | {pinning} | {pace} | {p50:.2} | {p99:.2} | {p999:.2} | {max:.1} | {reference} | {reference_p50:.2} | {ratio:.2} |{counts}"
         );
     }
 }

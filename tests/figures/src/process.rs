@@ -77,6 +77,12 @@ impl Process {
         process
     }
 
+    /// How often its threads have gone to sleep so far.
+    #[must_use]
+    pub fn sleeps(&self) -> u64 {
+        sleeps_of(&self.child.id().to_string())
+    }
+
     /// The next line that it says.
     ///
     /// # Panics
@@ -105,6 +111,25 @@ impl Drop for Process {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// How often the threads of this process have gone to sleep so far: each time, something must wake them.
+#[must_use]
+pub fn sleeps() -> u64 {
+    sleeps_of("self")
+}
+
+/// What Linux counts as voluntary context switches, of all threads that live now; 0 where it does not say.
+fn sleeps_of(process: &str) -> u64 {
+    let tasks = std::fs::read_dir(format!("/proc/{process}/task"));
+    let statuses = tasks.into_iter().flatten().flatten();
+    let statuses = statuses.filter_map(|task| std::fs::read_to_string(task.path().join("status")).ok());
+    statuses.filter_map(|status| counted(&status)).sum()
+}
+
+fn counted(status: &str) -> Option<u64> {
+    let line = status.lines().find_map(|line| line.strip_prefix("voluntary_ctxt_switches:"))?;
+    line.trim().parse().ok()
 }
 
 /// Tells the process that started this one that it can go on.

@@ -120,6 +120,7 @@ pub(crate) fn run(case: Case) {
         seen: &seen,
         reference: reference.name(),
         raw: &raw,
+        counts: &[],
     }
     .report();
 }
