@@ -56,13 +56,13 @@ pub use sinew_runtime::supervision::fault;
 pub use api::{
     ApiError, AsyncEndpoint, Endpoint, LentMessage, NodeApi, Received, Registration, Transport, Untaken,
 };
-pub use audit::NodeAudit;
+pub use audit::{Audit, NodeAudit};
 pub use config::{ConfigFaults, NodeConfig};
 pub use lncl::RegisterError;
 pub use ndl::{KnownNode, LossReason, NodeEvent, Source};
 pub use node::{
-    CommandError, LifeState, MailboxState, Node, NodeBuilder, NodeEnd, NodeHandle, StartError, Supervised,
-    Supervises, SupervisionTree, SupervisorSpec, Traffic,
+    AuditError, CommandError, LifeState, MailboxState, Node, NodeBuilder, NodeEnd, NodeHandle, StartError,
+    Supervised, Supervises, SupervisionTree, SupervisorSpec, Traffic,
 };
 pub use outlet::OutletCounts;
 pub use serde;

@@ -54,6 +54,8 @@ pub(crate) struct Stores {
     pub(crate) sync: Mutex<sync::Core>,
     /// Where messages are counted, beside GNCL's peers.
     pub(crate) book: audit::Book,
+    /// Who was asked for an audit, and who has asked.
+    pub(crate) questions: audit::Questions,
     /// Who watches whom.
     pub(crate) monitors: Mutex<monitors::Core>,
     /// The last wills of applications, held for other nodes and by them.
@@ -93,6 +95,7 @@ impl Stores {
             directory_changes: watch::Sender::default(),
             sync: Mutex::new(sync::Core::new(&config, node, incarnation)),
             book: audit::Book::default(),
+            questions: audit::Questions::default(),
             monitors: Mutex::new(monitors::Core::new(node, incarnation, config.ndl.nodes_max)),
             wills: Mutex::new(wills::Core::new(incarnation, config.ndl.nodes_max)),
             config,

@@ -87,6 +87,6 @@ pub fn run(plan: &Plan) -> Report {
         std::thread::sleep(pause.saturating_sub(struck.elapsed()));
     }
     let seconds = began.elapsed();
-    let (verdict, network) = pair.finish();
-    Report { plan: plan.clone(), seconds: seconds.as_secs_f64(), verdict, network, gaps }
+    let (verdict, network, audit) = pair.finish();
+    Report { plan: plan.clone(), seconds: seconds.as_secs_f64(), verdict, network, gaps, audit }
 }

@@ -3,14 +3,14 @@
 use std::sync::{Mutex, mpsc::sync_channel};
 
 use sinew::{
-    Sender,
-    audit::{Account, NodeAudit, Place},
+    NodeHandle, Sender,
+    audit::{Account, Audit, NodeAudit, Place},
     prelude::*,
 };
 use sinew_tests::{
     DEADLINE, Ground, all_run,
-    puppet::{Job, Order, Stage, Value, desk, wait},
-    until,
+    puppet::{Job, Order, Stage, Value, desk, outcome_of_job, wait},
+    sees, until,
 };
 
 /// What holds the application up.
@@ -104,4 +104,74 @@ fn every_sort_of_end_in_a_node_is_counted_and_nothing_is_unexplained() {
     balances(&audit);
     assert_eq!(mailbox(&audit, "sink"), Account::default());
     assert_eq!(audit.account(&Place::OtherMailboxes).taken, account.taken);
+}
+
+/// The audit of the whole system once nothing waits or is under way. At every moment before, nothing is unexplained.
+fn once_quiet(node: &NodeHandle) -> Audit {
+    until("nothing waits or is under way", || {
+        let audit = node.audit(DEADLINE).expect("it runs, and few ask");
+        assert_eq!(audit.missing(), 0, "{audit}");
+        let total = audit.total();
+        // Of the audit itself an answer may be under way.
+        (total.waiting == 0 && total.unacknowledged <= 1).then_some(audit)
+    })
+}
+
+#[test]
+fn an_audit_of_two_nodes_explains_every_message_while_they_flow_and_when_all_is_quiet() {
+    // Given: two nodes, and messages of every class from one to the other
+    const JOBS: u64 = 300;
+    let ground = Ground::new();
+    let (sink, _log) = Stage::new().app("sink");
+    let (desk, key) = desk("desk");
+    let there = ground.node("there").app(sink).start().expect("a node");
+    let here = ground.node("here").app(desk).start().expect("a node");
+    all_run(&[&there, &here]);
+    let (handle, sender) = (here.handle(), key.sender());
+    sees(&handle, there.address());
+    until("the name is known", || sender.resolve("sink"));
+    for number in 0..JOBS {
+        sender.send("sink", &Job { number }).expect("there is room");
+        sender.send("sink", &Value { number }).expect("it replaces the one before");
+        if number % 100 == 0 {
+            // While they flow, too.
+            let audit = handle.audit(DEADLINE).expect("it runs, and few ask");
+            assert_eq!((audit.missing(), audit.nodes.len()), (0, 2), "{audit}");
+        }
+    }
+    assert_eq!(outcome_of_job(&sender, "sink", JOBS), Outcome::Delivered);
+    let nobody = Tid::new(there.address(), AppAddress::fixed(7).expect("a fixed one"));
+    sender.send(nobody, &Job { number: 0 }).expect("its node is there");
+    // When
+    let audit = once_quiet(&handle);
+    // Then: each message that the desk has sent is where it ended, and both ends of every link agree
+    assert_eq!((audit.silent.len(), audit.nodes.len(), audit.links.len()), (0, 2, 6), "{audit}");
+    for link in &audit.links {
+        let taken = link.taken.unwrap_or_else(|| panic!("both speak of one session: {audit}"));
+        // The audit's own question and answer may lie between the readings.
+        assert!(link.sent.abs_diff(taken) <= 1, "{link}\n{audit}");
+    }
+    let there = audit.nodes.iter().find(|node| node.name == "there").expect("it answered");
+    let of = |class| {
+        let is_it = |place: &Place| matches!(place, Place::Mailbox { name, class: its, .. } if name == "sink" && *its == class);
+        there
+            .entries
+            .iter()
+            .find(|entry| is_it(&entry.place))
+            .map(|entry| entry.account)
+            .expect("it got some")
+    };
+    assert_eq!((of(Class::Bulk).taken, of(Class::Bulk).delivered), (JOBS + 1, JOBS + 1), "{audit}");
+    let (values, on_the_way) = (of(Class::Stream), to(&audit, &handle, there.node, Class::Stream));
+    assert_eq!(values.delivered + values.superseded + on_the_way.superseded, JOBS, "{audit}");
+    assert_eq!(there.refused.get("not taken: NoSuchApplication"), Some(&1), "{audit}");
+    let json = serde_json::to_string(&audit).expect("every field can be written");
+    assert_eq!(serde_json::from_str::<Audit>(&json).expect("and read"), audit);
+    assert!(audit.to_string().contains("every message is explained"), "{audit}");
+}
+
+/// What a node says of what it has sent to another one.
+fn to(audit: &Audit, from: &NodeHandle, to: NodeAddress, class: Class) -> Account {
+    let from = audit.nodes.iter().find(|node| node.node == from.address()).expect("it asked");
+    from.account(&Place::ToNode { node: to, class: Some(class) })
 }

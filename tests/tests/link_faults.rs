@@ -37,6 +37,20 @@ fn cuts_and_panics_of_gncl_on_both_sides_lose_double_and_reorder_nothing() {
     let report = report(&troubles, 40);
     assert!(report.holds() && report.verdict.is_perfect(), "{report}");
     assert!(report.verdict.asked > 0 && report.network.cut > 0, "{report}");
+    agrees(&report);
+}
+
+/// Where no node was lost, what the nodes say of the messages is what the history says.
+#[track_caller]
+fn agrees(report: &Report) {
+    let total = report.audit.total();
+    assert_eq!(total.superseded, report.verdict.superseded, "{report}");
+    assert_eq!((total.expired, total.failed, total.lost, total.unknown), (0, 0, 0, 0), "{report}");
+    for link in &report.audit.links {
+        // The audit's own question and answer may lie between the readings.
+        let taken = link.taken.expect("both ends speak of one session");
+        assert!(link.sent.abs_diff(taken) <= 1, "{link}\n{report}");
+    }
 }
 
 #[test]
@@ -47,12 +61,14 @@ fn flipped_bits_cost_connections_and_no_message() {
     });
     assert!(report.holds() && report.verdict.is_perfect(), "{report}");
     assert!(report.network.flips > 0, "{report}");
+    agrees(&report);
 }
 
 #[test]
 fn a_link_that_is_stalled_or_parted_for_less_than_a_loss_takes_loses_nothing() {
     let report = report(&[Trouble::Stall, Trouble::PartThere, Trouble::PartBack], 3);
     assert!(report.verdict.is_perfect(), "{report}");
+    agrees(&report);
 }
 
 #[test]

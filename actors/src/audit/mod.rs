@@ -10,12 +10,22 @@
 //! | `account.rs` | the counters of one place, and their law |
 //! | `book.rs` | which places there are, and the accounts of those that are gone |
 //! | `reading.rs` | what a node says of itself |
+//! | `asking.rs`, `words.rs` | what nodes say to each other |
+//! | `compare.rs` | two readings of all nodes, and what cannot be explained in them |
+//! | `system.rs`, `table.rs` | the result, and how it is shown |
 
 mod account;
+mod asking;
 mod book;
+mod compare;
 mod reading;
+mod system;
+mod table;
+mod words;
 
 pub use account::{Account, Place};
+pub(crate) use asking::{Questions, audit, receive};
 pub(crate) use book::Book;
 pub(crate) use reading::read;
 pub use reading::{Entry, NodeAudit, Receiving, Sending, Session};
+pub use system::{At, Audit, Link, LinkState, Unexplained};

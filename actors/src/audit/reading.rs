@@ -87,8 +87,10 @@ pub(crate) fn read(stores: &Stores) -> NodeAudit {
     for (place, account) in stores.book.read() {
         count(place, account);
     }
-    for peer in stores.gncl.met() {
-        for (class, way) in ways(&peer) {
+    // Held until the accounts of those that are gone are read: none is in both.
+    let met = stores.gncl.met();
+    for peer in &met {
+        for (class, way) in ways(peer) {
             let node = peer.node;
             count(Place::ToNode { node, class }, Account::of_outlet(&way.sent));
             count(Place::FromNode { node, class }, Account::of_arrivals(&way.arrived));

@@ -1,7 +1,5 @@
 //! What became of the messages that a peer's session brought: each is counted in, and ends once, whatever panics.
 
-use std::sync::atomic::{AtomicU64, Ordering};
-
 /// How a message ended that had come from a peer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum End {
@@ -19,52 +17,49 @@ pub(super) enum End {
 }
 
 /// Counters of one session.
-#[derive(Debug, Default)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Arrivals {
-    taken: AtomicU64,
-    ends: [AtomicU64; 6],
-}
-
-/// A message in hand. If nobody says how it ended, it has failed.
-pub(super) struct Hand<'a> {
-    arrivals: &'a Arrivals,
-    end: Option<End>,
+    taken: u64,
+    /// Neither ended nor in a line.
+    in_hand: u64,
+    ends: [u64; 6],
 }
 
 impl Arrivals {
-    /// One more has come.
-    pub(super) fn take(&self) -> Hand<'_> {
-        self.taken.fetch_add(1, Ordering::Relaxed);
-        self.take_again()
+    /// One more has come, and is in hand.
+    pub(super) const fn take(&mut self) {
+        self.taken += 1;
+        self.in_hand += 1;
     }
 
     /// One that has waited for its application is in hand again.
-    pub(super) const fn take_again(&self) -> Hand<'_> {
-        Hand { arrivals: self, end: Some(End::Failed) }
+    pub(super) const fn take_again(&mut self) {
+        self.in_hand += 1;
     }
 
-    /// Messages that have come.
-    pub(super) fn taken(&self) -> u64 {
-        self.taken.load(Ordering::Relaxed)
+    /// What was in hand waits for its application.
+    pub(super) const fn put_away(&mut self) {
+        self.in_hand = self.in_hand.saturating_sub(1);
+    }
+
+    /// What was in hand has ended so.
+    pub(super) const fn end(&mut self, end: End) {
+        self.put_away();
+        self.ends[end as usize] += 1;
+    }
+
+    /// Messages that have come, and not those that had lost their use.
+    pub(super) const fn taken(&self) -> u64 {
+        self.taken.saturating_sub(self.ended(End::Void))
     }
 
     /// Messages that have ended so.
-    pub(super) fn ended(&self, end: End) -> u64 {
-        self.ends[end as usize].load(Ordering::Relaxed)
+    pub(super) const fn ended(&self, end: End) -> u64 {
+        self.ends[end as usize]
     }
-}
 
-impl Hand<'_> {
-    /// It has ended so; `None`: it waits for its application.
-    pub(super) fn ends(mut self, end: Option<End>) {
-        self.end = end;
-    }
-}
-
-impl Drop for Hand<'_> {
-    fn drop(&mut self) {
-        if let Some(end) = self.end {
-            self.arrivals.ends[end as usize].fetch_add(1, Ordering::Relaxed);
-        }
+    /// Messages that a thread handles now.
+    pub(super) const fn in_hand(&self) -> u64 {
+        self.in_hand
     }
 }

@@ -50,9 +50,12 @@ impl Inbound {
         if taken == Taken::No {
             return Ok(());
         }
-        let hand = way.arrivals.take();
+        let hand = way.hand();
         let is_void = is_for_the_link(&message, Kind::GNCL_VOID);
-        hand.ends(if is_void { Some(End::Void) } else { self.take(now, message, way, taken) });
+        match if is_void { Some(End::Void) } else { self.take(now, message, way, taken) } {
+            Some(end) => hand.ends(end),
+            None => hand.empty(),
+        }
         Ok(())
     }
 

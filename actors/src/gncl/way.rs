@@ -70,10 +70,10 @@ pub(super) enum Offered {
 struct Inbox {
     receiving: Receiving,
     shelf: Shelf<u64, Message>,
+    arrivals: Arrivals,
 }
 
-/// What became of the messages of a peer. `taken = handed_on + told + expired + refused + failed + waiting`, but for one that a
-/// thread has in hand.
+/// What became of the messages of a peer. `taken = handed_on + told + expired + refused + failed + waiting`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Arrived {
     pub(crate) taken: u64,
@@ -84,7 +84,7 @@ pub(crate) struct Arrived {
     pub(crate) expired: u64,
     pub(crate) refused: u64,
     pub(crate) failed: u64,
-    /// For applications that take nothing now.
+    /// For applications that take nothing now, or in the hand of a thread.
     pub(crate) waiting: u64,
 }
 
@@ -125,7 +125,6 @@ pub(crate) struct Way {
     pub(crate) outlet: StreamOutlet<Gathering<Arc<TcpStream>>>,
     /// Locked for a moment, never with another lock in hand.
     inbox: Mutex<Inbox>,
-    pub(super) arrivals: Arrivals,
     outcomes_max: usize,
     ends: Ends,
     refusals: Arc<Refusals>,
@@ -154,10 +153,10 @@ impl Way {
             messages: SHELF_WINDOWS * line_messages,
             bytes: SHELF_WINDOWS * line_bytes,
         });
-        let inbox = Mutex::new(Inbox { receiving: Receiving::new(memory), shelf });
+        let inbox =
+            Mutex::new(Inbox { receiving: Receiving::new(memory), shelf, arrivals: Arrivals::default() });
         let outcomes_max = OUTCOMES_MAX * config.gncl.queue_capacity;
-        let arrivals = Arrivals::default();
-        Self { outlet, inbox, arrivals, outcomes_max, ends, refusals: refusals.clone() }
+        Self { outlet, inbox, outcomes_max, ends, refusals: refusals.clone() }
     }
 
     /// Its messages come on `link` from now on, and are taken from no other.
@@ -166,7 +165,7 @@ impl Way {
         self.acknowledge();
     }
 
-    /// A message came on `link`. Says whether it is to be taken, and where it belongs.
+    /// A message came on `link`. Says whether it is to be taken, and where it belongs; one that is is in [hand](Self::hand) then.
     ///
     /// # Errors
     /// It is not the next one.
@@ -175,6 +174,9 @@ impl Way {
         let (arrival, line) = {
             let mut inbox = self.inbox();
             let arrival = inbox.receiving.arrive(link.number(), number, message.size());
+            if matches!(arrival, Arrival::Take { .. }) {
+                inbox.arrivals.take();
+            }
             (arrival, inbox.line(message))
         };
         match arrival {
@@ -219,7 +221,7 @@ impl Way {
     fn acknowledge(&self) {
         let epoch = self.outlet.epoch();
         let ack = {
-            let Inbox { receiving, shelf } = &mut *self.inbox();
+            let Inbox { receiving, shelf, .. } = &mut *self.inbox();
             Ack { change: shelf.change(), held: shelf.held(), ..receiving.ack(epoch) }
         };
         self.say(frame(self.ends.here, self.ends.node, Kind::GNCL_ACK, write(&ack)));
@@ -233,9 +235,10 @@ impl Way {
     pub(super) fn put_in_line(&self, key: u64, message: Message) -> Result<bool, Message> {
         let bytes = message.size();
         let is_news = {
-            let shelf = &mut self.inbox().shelf;
+            let Inbox { shelf, arrivals, .. } = &mut *self.inbox();
             let before = shelf.change();
             shelf.put(key, message, bytes)?;
+            arrivals.put_away();
             shelf.change() != before
         };
         if is_news {
@@ -258,23 +261,23 @@ impl Way {
     /// Offers what waits in one line until its destination takes no more.
     fn offer_line(&self, now: Time, key: u64, router: &Router, room: &Waker) -> Offered {
         for _ in 0..OFFERS_PER_TURN {
-            let Some((mut message, bytes)) = self.inbox().shelf.offer(key) else { return Offered::Full };
-            let hand = self.arrivals.take_again();
+            let Some((mut message, bytes)) = self.inbox().offer(key) else { return Offered::Full };
+            let hand = self.hand();
             // Nobody is told anything with the lock in hand.
             if message.header.is_expired(now) {
                 message.settle(Outcome::Expired);
-                hand.ends(Some(End::Expired));
+                hand.ends(End::Expired);
             } else {
                 match router.offer(message, Some(room)) {
-                    Ok(()) => hand.ends(Some(End::HandedOn)),
+                    Ok(()) => hand.ends(End::HandedOn),
                     Err(Refused { message, why: Rejection::QueueFull }) => {
-                        self.inbox().shelf.put_back(key, message, bytes);
-                        hand.ends(None);
+                        self.inbox().put_back(key, message, bytes);
+                        hand.empty();
                         return Offered::Full;
                     }
                     Err(refused) => {
                         router.refuse(refused);
-                        hand.ends(Some(End::Refused));
+                        hand.ends(End::Refused);
                     }
                 }
             }
@@ -288,21 +291,26 @@ impl Way {
     /// Where every message of this session is, both ways.
     pub(crate) fn account(&self) -> WayAccount {
         let (sent, sending) = self.outlet.account();
-        let (waiting, receiving) = {
+        let (lines, arrivals, receiving) = {
             let inbox = self.inbox();
-            (inbox.shelf.messages() as u64, inbox.receiving.position())
+            (inbox.shelf.messages() as u64, inbox.arrivals, inbox.receiving.position())
         };
-        let ended = |end| self.arrivals.ended(end);
+        let ended = |end| arrivals.ended(end);
         let arrived = Arrived {
-            taken: self.arrivals.taken().saturating_sub(ended(End::Void)),
+            taken: arrivals.taken(),
             handed_on: ended(End::HandedOn),
             told: ended(End::Told),
             expired: ended(End::Expired),
             refused: ended(End::Refused),
             failed: ended(End::Failed),
-            waiting,
+            waiting: lines + arrivals.in_hand(),
         };
         WayAccount { sent, arrived, sending, receiving }
+    }
+
+    /// The message that has just been taken.
+    pub(super) const fn hand(&self) -> Hand<'_> {
+        Hand(Some(self))
     }
 
     /// Whether messages wait for applications here.
@@ -345,7 +353,45 @@ impl Way {
     }
 }
 
+/// A message in hand. If nobody says how it ended, it has failed.
+pub(super) struct Hand<'a>(Option<&'a Way>);
+
+impl Hand<'_> {
+    /// The message has ended so.
+    pub(super) fn ends(mut self, end: End) {
+        if let Some(way) = self.0.take() {
+            way.inbox().arrivals.end(end);
+        }
+    }
+
+    /// The message waits in a line.
+    pub(super) fn empty(mut self) {
+        self.0 = None;
+    }
+}
+
+impl Drop for Hand<'_> {
+    fn drop(&mut self) {
+        if let Some(way) = self.0 {
+            way.inbox().arrivals.end(End::Failed);
+        }
+    }
+}
+
 impl Inbox {
+    /// Takes the first message of a line into the hand.
+    fn offer(&mut self, key: u64) -> Option<(Message, usize)> {
+        let offered = self.shelf.offer(key)?;
+        self.arrivals.take_again();
+        Some(offered)
+    }
+
+    /// Puts what was in hand back.
+    fn put_back(&mut self, key: u64, message: Message, bytes: usize) {
+        self.shelf.put_back(key, message, bytes);
+        self.arrivals.put_away();
+    }
+
     /// The line of a message whose destination is held.
     fn line(&self, message: &Message) -> Option<u64> {
         if self.shelf.is_empty() {

@@ -27,6 +27,7 @@ mod tree;
 mod wind_up;
 
 use asker::Asker;
+pub use audits::AuditError;
 pub use builder::{NodeBuilder, StartError};
 pub use commands::CommandError;
 #[cfg(feature = "fault-points")]

@@ -19,7 +19,7 @@ use super::{
     Event,
     core::{Core, Input, Output, Reason},
 };
-use crate::{lncl::AppFact, monitors, node::RootEvent, refusals::Refusals, stores::Stores, wills};
+use crate::{audit, lncl::AppFact, monitors, node::RootEvent, refusals::Refusals, stores::Stores, wills};
 
 /// The sync manager of a node: a new one after each fault, on the same core.
 pub(crate) struct SyncManager {
@@ -123,7 +123,8 @@ impl SyncManager {
         let Tid { node, app } = message.header.source;
         let is_about_lives =
             matches!(message.header.kind, Kind::SYNC_WATCH | Kind::SYNC_LIVES | Kind::SYNC_WILLS);
-        if message.header.kind != Kind::SYNC_DIRECTORY && !is_about_lives {
+        let is_audit = matches!(message.header.kind, Kind::SYNC_AUDIT_ASK | Kind::SYNC_AUDIT);
+        if message.header.kind != Kind::SYNC_DIRECTORY && !is_about_lives && !is_audit {
             let kind = message.header.kind;
             self.refuse(
                 "kind",
@@ -133,6 +134,11 @@ impl SyncManager {
         } else if app != AppAddress::SYNC || node == self.stores.node {
             self.refuse("source", &format_args!("{node}/{app} is no other node's sync manager"));
             message.reject(Rejection::ForgedSource);
+        } else if is_audit {
+            if let Err(fault) = audit::receive(&self.stores, node, &message) {
+                self.refuse("audit", &fault);
+            }
+            message.settle(Outcome::Delivered);
         } else if is_about_lives {
             let received = if message.header.kind == Kind::SYNC_WILLS {
                 wills::receive(&self.stores, node, &message)

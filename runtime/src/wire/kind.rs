@@ -57,6 +57,10 @@ impl Kind {
     pub const SYNC_LIVES: Self = Self(0x32);
     /// The last wills of a node's applications, to be held.
     pub const SYNC_WILLS: Self = Self(0x33);
+    /// A node asks another where every message is.
+    pub const SYNC_AUDIT_ASK: Self = Self(0x34);
+    /// What it says of itself.
+    pub const SYNC_AUDIT: Self = Self(0x35);
     /// A process asks for a transport address.
     pub const LNCL_REGISTER: Self = Self(0x40);
     /// The address it got.

@@ -161,6 +161,10 @@ fn serve(node: &Node, pacer: Pacer, lull: &Lull) {
             ["panic"] => println!("ready {}", panic_gncl(&handle).as_nanos()),
             ["gap"] => println!("gap {}", lull.longest_ns.swap(0, Ordering::Relaxed)),
             ["say"] => clerk.say(),
+            ["audit"] => {
+                let audit = handle.audit(DEADLINE).expect("it runs, and nobody else asks");
+                println!("audit {}", serde_json::to_string(&audit).expect("every field can be written"));
+            }
             ["quiet"] => {
                 numbers.quiet.store(true, Ordering::Relaxed);
                 until("the pacer ends", || pacing.is_finished().then_some(()));

@@ -11,7 +11,7 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew::Class;
+use sinew::{Audit, Class};
 
 use super::{Plan, trouble::Trouble};
 use crate::{
@@ -175,7 +175,7 @@ impl Pair {
     }
 
     /// No more is sent; waits until what was sent has arrived, and says what became of everything.
-    pub(super) fn finish(mut self) -> (Verdict, Counts) {
+    pub(super) fn finish(mut self) -> (Verdict, Counts, Audit) {
         for side in [Side::Left, Side::Right] {
             self.proxy.change(side, |faults| faults.one_flip_in = None);
         }
@@ -189,12 +189,23 @@ impl Pair {
             std::thread::sleep(Duration::from_millis(100));
             verdict = lock(&self.history).verdict();
         }
+        let audit = self.audit_once_quiet();
         let network = self.proxy.counts();
         for member in self.members {
             let status = member.performer.end();
             assert!(status.success(), "node {} ended with {status}", member.station);
         }
-        (verdict, network)
+        (verdict, network, audit)
+    }
+
+    /// What both nodes say of all messages, once none waits.
+    fn audit_once_quiet(&mut self) -> Audit {
+        let first = self.member(FIRST);
+        until("both nodes have answered, and nothing waits", || {
+            let audit: Audit = serde_json::from_str(&first.ask("audit")).expect("an audit");
+            let is_quiet = audit.nodes.len() == 2 && audit.total().waiting == 0;
+            is_quiet.then_some(audit)
+        })
     }
 }
 

@@ -3,6 +3,7 @@
 use std::{collections::BTreeMap, fmt, time::Duration};
 
 use serde_json::{Value, json};
+use sinew::Audit;
 
 use super::{Plan, trouble::Trouble};
 use crate::{history::Verdict, load::Times, proxy::Counts};
@@ -27,12 +28,18 @@ pub struct Report {
     /// What the network did.
     pub network: Counts,
     pub(super) gaps: Gaps,
+    /// What the nodes themselves say of all messages, at the end.
+    pub audit: Audit,
 }
 
 impl Report {
-    /// Nothing was lost in silence, double, out of order or told falsely; where no node was lost, everything arrived.
+    /// Nothing was lost in silence, double, out of order or told falsely; where no node was lost, everything arrived. And the nodes can
+    /// explain every message.
     #[must_use]
     pub fn holds(&self) -> bool {
+        if self.audit.missing() > 0 {
+            return false;
+        }
         if self.plan.troubles.iter().all(|trouble| trouble.is_short()) {
             self.verdict.is_perfect()
         } else {
@@ -49,7 +56,7 @@ impl Report {
         json!({
             "bench": "link_faults", "holds": self.holds(), "seed": self.plan.seed, "faults": self.plan.faults,
             "rate": self.plan.rate, "back_rate": self.plan.back_rate, "filling": self.plan.filling,
-            "seconds": self.seconds, "messages": self.verdict.json(), "gaps": gaps,
+            "unexplained": self.audit.missing(), "seconds": self.seconds, "messages": self.verdict.json(), "gaps": gaps,
             "network": {
                 "connections": made, "cut": cut, "bits_flipped": flips, "datagrams_lost": lost,
                 "bytes_there": passed[1], "bytes_back": passed[0],
@@ -60,7 +67,7 @@ impl Report {
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { plan, seconds, verdict, network, gaps } = self;
+        let Self { plan, seconds, verdict, network, gaps, audit } = self;
         let per_second = verdict.sent as f64 / seconds;
         writeln!(
             f,
@@ -69,6 +76,7 @@ impl fmt::Display for Report {
         )?;
         writeln!(f, "{verdict}")?;
         write!(f, "{:<16} {:>6} {:>9} {:>9} {:>9}", "longest gap", "faults", "p50 ms", "p99 ms", "max ms")?;
-        gaps.0.iter().try_for_each(|(trouble, gaps)| write!(f, "\n{trouble:<16} {gaps}"))
+        gaps.0.iter().try_for_each(|(trouble, gaps)| write!(f, "\n{trouble:<16} {gaps}"))?;
+        write!(f, "\n{audit}")
     }
 }

@@ -1,0 +1,241 @@
+//! Asks other nodes, and answers them. Not for who holds a lock of the node's.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::{
+        Mutex,
+        mpsc::{Receiver, SyncSender, sync_channel},
+    },
+    time::Duration,
+};
+
+use bytes::Bytes;
+use sinew_runtime::{
+    outcome::Rejection,
+    tid::{AppAddress, NodeAddress, Tid},
+    time::Time,
+    wire::{Class, Header, Kind, Message},
+};
+
+use super::{
+    reading::{self, NodeAudit},
+    system::Audit,
+    words,
+};
+use crate::stores::{Stores, lock};
+
+/// Questions at most that are open at once, from all threads. A further one is refused.
+const OPEN_MAX: usize = 16;
+/// A node is answered so often at most in [`PERIOD`], which an audit asks twice; further questions are refused, and counted.
+const ANSWERS_MAX: u32 = 16;
+const PERIOD: Duration = Duration::from_secs(1);
+/// Of a node whose longest payload is shorter than an answer: it is tried with half so many bytes, down to this.
+const ANSWER_BYTES_MIN: usize = 1 << 10;
+
+/// Which questions are open, and who was answered. It outlives the sync manager.
+#[derive(Default)]
+pub(crate) struct Questions(Mutex<Open>);
+
+#[derive(Default)]
+struct Open {
+    /// Number of the last question.
+    last: u64,
+    open: BTreeMap<u64, Question>,
+    /// Who asked lately: since when, and how often. Of each node that is linked one at most.
+    askers: BTreeMap<NodeAddress, (Time, u32)>,
+}
+
+struct Question {
+    /// Who has not answered.
+    awaited: BTreeSet<NodeAddress>,
+    answers: SyncSender<NodeAudit>,
+}
+
+/// Too many questions are open.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct TooManyQuestions;
+
+impl Questions {
+    fn open(&self, awaited: BTreeSet<NodeAddress>) -> Result<(u64, Receiver<NodeAudit>), TooManyQuestions> {
+        let mut questions = lock(&self.0);
+        if questions.open.len() >= OPEN_MAX {
+            return Err(TooManyQuestions);
+        }
+        questions.last += 1;
+        let number = questions.last;
+        // Each of them answers once.
+        let (answers, answered) = sync_channel(awaited.len());
+        questions.open.insert(number, Question { awaited, answers });
+        Ok((number, answered))
+    }
+
+    fn close(&self, number: u64) {
+        lock(&self.0).open.remove(&number);
+    }
+
+    /// Takes an answer, if it is awaited; a late one is nobody's.
+    fn answered(&self, number: u64, answer: NodeAudit) {
+        if let Some(question) = lock(&self.0).open.get_mut(&number)
+            && question.awaited.remove(&answer.node)
+        {
+            // Whoever asked may wait no more.
+            let _ = question.answers.try_send(answer);
+        }
+    }
+
+    /// Whether `asker` is answered at `now`.
+    fn admits(&self, asker: NodeAddress, now: Time) -> bool {
+        let askers = &mut lock(&self.0).askers;
+        askers.retain(|_, (since, _)| now.since(*since) < PERIOD);
+        let (_, asked) = askers.entry(asker).or_insert((now, 0));
+        *asked = asked.saturating_add(1);
+        *asked <= ANSWERS_MAX
+    }
+}
+
+/// Where every message of the system is, as far as these nodes and this one say within this time.
+///
+/// # Errors
+/// Too many such questions are open; nothing changed.
+pub(crate) fn audit(
+    stores: &Stores,
+    others: &BTreeSet<NodeAddress>,
+    within: Duration,
+) -> Result<Audit, TooManyQuestions> {
+    let began = Time::now();
+    let mut before = ask(stores, others, within / 2)?;
+    before.push(reading::read(stores));
+    let answered = before.iter().map(|node| node.node).filter(|node| *node != stores.node).collect();
+    // All were read once before any is read again.
+    let mut after = vec![reading::read(stores)];
+    after.extend(ask(stores, &answered, within.saturating_sub(Time::now().since(began)))?);
+    let is_same_life = |node: &NodeAudit| {
+        before.iter().any(|former| (former.node, former.incarnation) == (node.node, node.incarnation))
+    };
+    after.retain(is_same_life);
+    after.sort_by_key(|node| node.node);
+    let silent =
+        others.iter().filter(|other| after.iter().all(|node| node.node != **other)).copied().collect();
+    Ok(Audit::of(stores.node, &before, after, silent))
+}
+
+/// What the others say of themselves within this time.
+fn ask(
+    stores: &Stores,
+    others: &BTreeSet<NodeAddress>,
+    within: Duration,
+) -> Result<Vec<NodeAudit>, TooManyQuestions> {
+    let (number, answered) = stores.questions.open(others.clone())?;
+    let began = Time::now();
+    // One that cannot be sent to does not answer.
+    let sent =
+        |other: &&NodeAddress| say(stores, **other, (Kind::SYNC_AUDIT_ASK, number), Bytes::new()).is_ok();
+    let asked = others.iter().filter(sent).count();
+    let mut answers = Vec::new();
+    while answers.len() < asked {
+        let left = within.saturating_sub(Time::now().since(began));
+        let Ok(answer) = answered.recv_timeout(left) else { break };
+        answers.push(answer);
+    }
+    stores.questions.close(number);
+    Ok(answers)
+}
+
+/// Takes another node's question, or its answer.
+///
+/// # Errors
+/// What is wrong with it, in words.
+pub(crate) fn receive(stores: &Stores, from: NodeAddress, message: &Message) -> Result<(), String> {
+    let number = message.header.correlation;
+    if message.header.kind == Kind::SYNC_AUDIT_ASK {
+        return answer(stores, from, number);
+    }
+    let said = words::read(&message.payload).map_err(|error| format!("from {from}, {error}"))?;
+    if said.node != from {
+        return Err(format!("from {from}, an audit of {}", said.node));
+    }
+    stores.questions.answered(number, said);
+    Ok(())
+}
+
+fn answer(stores: &Stores, to: NodeAddress, number: u64) -> Result<(), String> {
+    if !stores.questions.admits(to, Time::now()) {
+        return Err(format!("from {to}, more than {ANSWERS_MAX} questions for an audit in {PERIOD:?}"));
+    }
+    let (audit, mut bytes_max) = (reading::read(stores), stores.config.payload_max);
+    loop {
+        let bytes = words::write(&audit, bytes_max).ok_or("an audit has no room in an answer")?;
+        let length = bytes.len();
+        match say(stores, to, (Kind::SYNC_AUDIT, number), bytes) {
+            Ok(()) => return Ok(()),
+            // That node's own bound.
+            Err(Rejection::TooLong) if length > ANSWER_BYTES_MIN => bytes_max = length / 2,
+            Err(why) => return Err(format!("an answer to {to}: {why}")),
+        }
+    }
+}
+
+fn say(
+    stores: &Stores,
+    to: NodeAddress,
+    (kind, number): (Kind, u64),
+    payload: Bytes,
+) -> Result<(), Rejection> {
+    let source = Tid::new(stores.node, AppAddress::SYNC);
+    let mut header = Header::new(kind, source, Tid::new(to, AppAddress::SYNC));
+    // An answer is long, and nothing more urgent waits for it.
+    header.class = Class::Bulk;
+    header.correlation = number;
+    header.sequence = lock(&stores.sync).next_sequence();
+    header.sent = Time::now();
+    stores.router.send(Message::new(header, payload))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::NodeConfig;
+    use sinew_runtime::tid::Incarnation;
+
+    const OTHER: NodeAddress = NodeAddress::new(2);
+
+    fn stores() -> std::sync::Arc<Stores> {
+        Stores::for_test(NodeConfig::new("test"), Incarnation(1))
+    }
+
+    #[test]
+    fn who_asks_too_often_is_not_answered_until_a_second_is_over() {
+        let questions = Questions::default();
+        let begin = Time::ZERO + PERIOD;
+        assert!((0..ANSWERS_MAX).all(|_| questions.admits(OTHER, begin)));
+        assert!(!questions.admits(OTHER, begin));
+        assert!(questions.admits(NodeAddress::new(3), begin), "others are");
+        assert!(questions.admits(OTHER, begin + PERIOD));
+    }
+
+    #[test]
+    fn questions_are_bounded_and_an_answer_counts_once_and_from_whom_was_asked() {
+        let (questions, said) = (Questions::default(), NodeAudit { node: OTHER, ..reading::read(&stores()) });
+        let (number, answered) = questions.open(BTreeSet::from([OTHER])).unwrap();
+        questions.answered(number, NodeAudit { node: NodeAddress::new(3), ..said.clone() });
+        questions.answered(number + 1, said.clone());
+        assert!(answered.try_recv().is_err());
+        questions.answered(number, said.clone());
+        questions.answered(number, said.clone());
+        assert_eq!(answered.try_recv(), Ok(said));
+        assert!(answered.try_recv().is_err());
+        for _ in 1..OPEN_MAX {
+            questions.open(BTreeSet::new()).unwrap();
+        }
+        assert_eq!(questions.open(BTreeSet::new()).err(), Some(TooManyQuestions));
+        questions.close(number);
+        assert!(questions.open(BTreeSet::new()).is_ok());
+    }
+
+    #[test]
+    fn a_node_that_cannot_be_reached_is_silent_and_costs_no_time() {
+        let stores = stores();
+        let audit = audit(&stores, &BTreeSet::from([OTHER]), Duration::from_secs(3_600)).unwrap();
+        assert_eq!((audit.silent, audit.nodes.len()), (vec![OTHER], 1));
+    }
+}

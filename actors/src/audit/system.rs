@@ -1,0 +1,153 @@
+//! The audit of the whole system: what all nodes say, side by side.
+
+use serde::{Deserialize, Serialize};
+use sinew_runtime::{tid::NodeAddress, wire::Class};
+
+use super::{
+    account::{Account, Place},
+    compare,
+    reading::NodeAudit,
+};
+
+/// Where every message is that was ever sent, as far as the nodes say. Shown with `{}` it is a table to read; every field can be written by
+/// serde, as JSON for instance.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Audit {
+    /// The node that has asked.
+    pub asked_by: NodeAddress,
+    /// What each node says of itself.
+    pub nodes: Vec<NodeAudit>,
+    /// Nodes that are there and did not answer: too slow, too old to know the question, or without a connection.
+    pub silent: Vec<NodeAddress>,
+    /// Both ends of each link beside each other.
+    pub links: Vec<Link>,
+    /// What cannot be explained. Empty when all is well.
+    pub unexplained: Vec<Unexplained>,
+}
+
+/// One direction of a link between two nodes: what one says that it has sent, and the other that it has taken.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Link {
+    /// Who sends.
+    pub from: NodeAddress,
+    /// Who takes.
+    pub to: NodeAddress,
+    /// Of which messages; `None`: of all.
+    pub class: Option<Class>,
+    /// What can be compared.
+    pub state: LinkState,
+    /// Messages, and voids in the place of some, that the sender has numbered since the session began.
+    pub sent: u64,
+    /// Of these, those of which it knows that they have arrived.
+    pub acknowledged: u64,
+    /// Those that the other has taken, where both speak of one session.
+    pub taken: Option<u64>,
+}
+
+/// What the two ends of a link speak of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum LinkState {
+    /// The same session.
+    OneSession,
+    /// One of them has begun anew, and the other does not know it yet: what was under way ends as `Unknown`.
+    BegunAnew,
+    /// The other end says nothing of it.
+    OneEndOnly,
+}
+
+/// Messages that nobody can explain.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Unexplained {
+    /// Where.
+    pub at: At,
+    /// How many are missing; negative: how many are too many.
+    pub messages: i64,
+}
+
+/// Where messages cannot be explained.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum At {
+    /// They were taken there, and neither ended nor wait.
+    Place {
+        /// On which node.
+        node: NodeAddress,
+        /// In which place.
+        place: Place,
+    },
+    /// One end says that they arrived, and the other that they did not.
+    Link {
+        /// Who sends.
+        from: NodeAddress,
+        /// Who takes.
+        to: NodeAddress,
+        /// Of which messages; `None`: of all.
+        class: Option<Class>,
+    },
+}
+
+impl Audit {
+    /// Puts two readings together. Each node of `after` was read before, too, and all of `before` before any of `after`.
+    pub(super) fn of(
+        asked_by: NodeAddress,
+        before: &[NodeAudit],
+        after: Vec<NodeAudit>,
+        silent: Vec<NodeAddress>,
+    ) -> Self {
+        let (links, unexplained) = (compare::links(&after), compare::unexplained(before, &after));
+        Self { asked_by, nodes: after, silent, links, unexplained }
+    }
+
+    /// Messages that nobody can explain, all together: 0 when all is well. Those that are missing and those that are too
+    /// many do not make up for each other.
+    #[must_use]
+    pub fn missing(&self) -> u64 {
+        self.unexplained.iter().fold(0, |sum, found| sum.saturating_add(found.messages.unsigned_abs()))
+    }
+
+    /// What became of the messages of all nodes: each is counted where it is, and none twice for having come from another node.
+    ///
+    /// Exact once nothing moves and as long as no session was begun anew: of what ended as unknown some may have arrived.
+    #[must_use]
+    pub fn total(&self) -> Account {
+        self.nodes
+            .iter()
+            .flat_map(|node| node.entries.iter().map(|entry| self.part(node, &entry.place, entry.account)))
+            .sum()
+    }
+
+    /// What a place adds to the total.
+    fn part(&self, node: &NodeAudit, place: &Place, account: Account) -> Account {
+        let has = |address: NodeAddress| self.nodes.iter().find(|other| other.node == address);
+        match place {
+            Place::ToNode { node: to, class } => match has(*to) {
+                // What has arrived is counted by the other node.
+                Some(to) => {
+                    let there = to.account(&Place::FromNode { node: node.node, class: *class }).taken;
+                    let sent = account.delivered.wrapping_add(account.unacknowledged);
+                    Account { delivered: 0, unacknowledged: sent.saturating_sub(there), ..account }
+                }
+                None => account,
+            },
+            Place::FromNode { node: from, .. } => {
+                let told = account.delivered.wrapping_sub(account.handed_on);
+                let taken = if has(*from).is_some() { 0 } else { account.taken };
+                Account {
+                    taken: taken.wrapping_sub(account.handed_on),
+                    delivered: told,
+                    handed_on: 0,
+                    ..account
+                }
+            }
+            Place::FromFormerNodes => {
+                let told = account.delivered.wrapping_sub(account.handed_on);
+                let taken = account.taken.wrapping_sub(account.handed_on);
+                Account { taken, delivered: told, handed_on: 0, ..account }
+            }
+            Place::Mailbox { .. }
+            | Place::Client { .. }
+            | Place::OtherMailboxes
+            | Place::OtherClients
+            | Place::ToFormerNodes => account,
+        }
+    }
+}

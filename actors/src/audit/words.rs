@@ -1,0 +1,136 @@
+//! What goes between nodes for an audit: a question without a payload, and its answer. Bytes from another node are bounded here.
+
+use bytes::Bytes;
+use sinew_runtime::wire::decode;
+
+use super::{
+    account::Place,
+    reading::{Entry, NodeAudit},
+};
+
+/// Bytes of an answer at most, on both sides: more than 200 nodes with their sessions need.
+pub(super) const ANSWER_BYTES_MAX: usize = 256 << 10;
+
+/// The bytes of an answer that has at most so many; applications that have no room go together. `None`: not even so.
+pub(super) fn write(audit: &NodeAudit, bytes_max: usize) -> Option<Bytes> {
+    let mut audit = audit.clone();
+    loop {
+        let bytes = rmp_serde::to_vec_named(&audit).expect("these types have no map with equal keys");
+        if bytes.len() <= bytes_max.min(ANSWER_BYTES_MAX) {
+            return Some(bytes.into());
+        }
+        if !put_together(&mut audit) {
+            return None;
+        }
+    }
+}
+
+/// The answer in these bytes.
+///
+/// # Errors
+/// What is wrong with them, in words.
+pub(super) fn read(bytes: &Bytes) -> Result<NodeAudit, String> {
+    if bytes.len() > ANSWER_BYTES_MAX {
+        return Err(format!("an audit of {} bytes; {ANSWER_BYTES_MAX} are read at most", bytes.len()));
+    }
+    decode(bytes).map_err(|error| format!("this is no audit: {error}"))
+}
+
+/// Puts the accounts of half of the applications together. Returns whether there were any.
+fn put_together(audit: &mut NodeAudit) -> bool {
+    let others = |place: &Place| match place {
+        Place::Mailbox { .. } => Some(Place::OtherMailboxes),
+        Place::Client { .. } => Some(Place::OtherClients),
+        Place::ToNode { .. }
+        | Place::FromNode { .. }
+        | Place::OtherMailboxes
+        | Place::OtherClients
+        | Place::ToFormerNodes
+        | Place::FromFormerNodes => None,
+    };
+    let mut left = audit.entries.iter().filter(|entry| others(&entry.place).is_some()).count().div_ceil(2);
+    let had_any = left > 0;
+    let mut kept: Vec<Entry> = Vec::new();
+    // From the end, so that those that stay are the first ones.
+    for entry in std::mem::take(&mut audit.entries).into_iter().rev() {
+        let Entry { place, account } = entry;
+        let place = match others(&place) {
+            Some(other) if left > 0 => {
+                left -= 1;
+                other
+            }
+            Some(_) | None => place,
+        };
+        match kept.iter_mut().find(|entry| entry.place == place) {
+            Some(entry) => entry.account = entry.account + account,
+            None => kept.push(Entry { place, account }),
+        }
+    }
+    kept.sort_by(|one, other| one.place.cmp(&other.place));
+    audit.entries = kept;
+    had_any
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use sinew_runtime::{
+        tid::{AppAddress, Incarnation, NodeAddress},
+        wire::Class,
+    };
+
+    use super::*;
+    use crate::audit::Account;
+
+    fn with_applications(count: u32) -> NodeAudit {
+        let entry = |number: u32| Entry {
+            place: Place::Mailbox {
+                app: AppAddress::new(0x1000 + number),
+                name: "n".repeat(63),
+                class: Class::Control,
+            },
+            account: Account { taken: 1_000, delivered: 1_000, ..Account::default() },
+        };
+        NodeAudit {
+            node: NodeAddress::new(1),
+            name: "test".to_owned(),
+            incarnation: Incarnation(1),
+            entries: (0..count).map(entry).collect(),
+            sessions: Vec::new(),
+            refused: std::collections::BTreeMap::new(),
+        }
+    }
+
+    #[test]
+    fn an_answer_that_is_too_long_puts_applications_together_and_loses_no_message() {
+        let all = with_applications(500);
+        for bytes_max in [usize::MAX, 8_000, 500] {
+            let bytes = write(&all, bytes_max).expect("it has room");
+            let said = read(&bytes).expect("it is an audit");
+            assert_eq!(said.entries.iter().map(|entry| entry.account).sum::<Account>().taken, 500_000);
+            assert!(bytes.len() <= bytes_max);
+        }
+        assert_eq!(write(&all, 10), None);
+        assert_eq!(read(&write(&all, usize::MAX).unwrap()).unwrap(), all);
+    }
+
+    #[test]
+    fn more_bytes_than_an_answer_may_have_are_not_read() {
+        assert!(read(&vec![0x90; ANSWER_BYTES_MAX + 1].into()).is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes_are_an_audit_or_none(bytes: Vec<u8>, at: prop::sample::Index, new: u8) {
+            let _ = read(&bytes.into());
+            let mut damaged = write(&with_applications(3), usize::MAX).unwrap().to_vec();
+            let at = at.index(damaged.len());
+            damaged[at] = new;
+            if let Ok(said) = read(&damaged.into()) {
+                let before = std::slice::from_ref(&said);
+                let audit = crate::audit::Audit::of(said.node, before, vec![said.clone()], Vec::new());
+                let _ = audit.to_string();
+            }
+        }
+    }
+}
