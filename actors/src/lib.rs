@@ -36,6 +36,7 @@ pub mod config;
 #[cfg(test)]
 mod documentation;
 mod gncl;
+pub mod inspect;
 mod lncl;
 mod monitors;
 mod ndl;

@@ -232,6 +232,11 @@ impl<S: Socket> StreamOutlet<S> {
         self.with(|half, after| half.connect(socket, payload_max, preface, after))
     }
 
+    /// Whether there is a connection now.
+    pub(crate) fn is_connected(&self) -> bool {
+        self.lock().is_connected()
+    }
+
     /// The connection has ended. What was sent and not confirmed has the outcome [`Outcome::Unknown`]; what was not
     /// sent waits for the next connection. Returns whether the last frame was written whole.
     pub(crate) fn disconnect(&self, link: LinkNumber) -> bool {

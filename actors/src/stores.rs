@@ -11,7 +11,7 @@ use std::{
 use sinew_runtime::{
     post::Post,
     router::Router,
-    tid::{Incarnation, NodeAddress},
+    tid::{AppAddress, Incarnation, NodeAddress},
 };
 use tokio::sync::watch;
 
@@ -107,6 +107,7 @@ impl Stores {
     /// The node has ended: what it was reached by is free for another one, even where a thread that hangs still holds it.
     pub(crate) fn close(&self) {
         self.door.close();
+        self.router.remove_local(AppAddress::INSPECT);
         self.gncl.close();
         lock(&self.ndl_socket).take();
     }

@@ -12,7 +12,7 @@
 //! | range | use |
 //! | --- | --- |
 //! | `0` | nobody; never a destination |
-//! | `1..=15` | layers: LNCL 1, sync manager 2, GNCL 3, NDL 4 |
+//! | `1..=15` | layers: LNCL 1, sync manager 2, GNCL 3, NDL 4; inspection 5 |
 //! | `16..=0x0fff` | reserved |
 //! | `0x1000..=0x7fff_ffff` | fixed: chosen by the user |
 //! | `0x8000_0000..=0xefff_ffff` | dynamic: given by LNCL |
@@ -109,6 +109,8 @@ impl AppAddress {
     pub const GNCL: Self = Self(3);
     /// Node Discovery Layer.
     pub const NDL: Self = Self(4);
+    /// Answers questions about its node, for tools; no layer, but a static address like one.
+    pub const INSPECT: Self = Self(5);
     /// Every application of a node.
     pub const ALL: Self = Self(u32::MAX);
 
@@ -187,6 +189,7 @@ impl fmt::Display for AppAddress {
             Self::SYNC => f.write_str("sync"),
             Self::GNCL => f.write_str("gncl"),
             Self::NDL => f.write_str("ndl"),
+            Self::INSPECT => f.write_str("inspect"),
             Self::ALL => f.write_str("*"),
             Self(bits) => write!(f, "{bits:x}"),
         }
@@ -208,6 +211,7 @@ impl FromStr for AppAddress {
             "sync" => Ok(Self::SYNC),
             "gncl" => Ok(Self::GNCL),
             "ndl" => Ok(Self::NDL),
+            "inspect" => Ok(Self::INSPECT),
             "*" => Ok(Self::ALL),
             _ if text.starts_with('+') => Err(ParseTidError::Application(text.to_owned())),
             _ => u32::from_str_radix(text, 16)
@@ -309,7 +313,9 @@ pub enum ParseTidError {
     #[error("'{0}' is not a node address: write an IPv4 address, '*' for every node or 'here'")]
     Node(String),
     /// The part after the slash is no application address.
-    #[error("'{0}' is not an application address: write hexadecimal digits, lncl, sync, gncl, ndl or '*'")]
+    #[error(
+        "'{0}' is not an application address: write hexadecimal digits, lncl, sync, gncl, ndl, inspect or '*'"
+    )]
     Application(String),
 }
 

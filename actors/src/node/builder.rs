@@ -19,7 +19,7 @@ use super::{
 };
 use crate::{
     config::{ConfigFaults, NodeConfig},
-    log, process,
+    inspect, log, process,
     stores::Stores,
     sync::Waiting,
 };
@@ -249,6 +249,7 @@ impl NodeBuilder {
         }
         // Before any layer: one that cannot have it would fail again and again, with the same words.
         open_door(&stores)?;
+        inspect::begin(&stores)?;
         let (tree, heed_signals) = (self.tree, self.heed_signals);
         if heed_signals && handle.root.post(RootEvent::HeedSignals).is_err() {
             return Err(StartError::Layers("the root's post is full before it was read".to_owned()));

@@ -204,6 +204,11 @@ impl Drop for Node {
 }
 
 impl NodeHandle {
+    /// A handle of the node that has these stores.
+    pub(crate) fn of(stores: Arc<Stores>) -> Self {
+        Self { root: stores.posts.root.clone(), stores, is_bystander: false }
+    }
+
     /// The node's address.
     #[must_use]
     pub fn address(&self) -> NodeAddress {

@@ -107,6 +107,11 @@ impl NodeHandle {
     /// # Errors
     /// The node does not run, or its root has too many orders.
     pub fn tree(&self) -> Result<SupervisionTree, CommandError> {
+        self.tree_within(WITHIN)
+    }
+
+    /// The same, with the time that the root has for its answer.
+    pub(crate) fn tree_within(&self, within: Duration) -> Result<SupervisionTree, CommandError> {
         if self.is_bystander || self.stores.stopping.load(Ordering::Relaxed) {
             return Err(CommandError::NotRunning);
         }
@@ -114,7 +119,7 @@ impl NodeHandle {
         if self.tell(RootEvent::TellTree(answer)) == Told::TooMany {
             return Err(CommandError::Busy);
         }
-        answered.recv_timeout(WITHIN).map_err(|_| CommandError::NotRunning)
+        answered.recv_timeout(within).map_err(|_| CommandError::NotRunning)
     }
 }
 

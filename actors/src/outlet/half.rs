@@ -126,6 +126,10 @@ impl<S: Socket> Half<S> {
         self.queue = ClassQueue::sharing(bounds(self.limits), budget);
     }
 
+    pub(super) const fn is_connected(&self) -> bool {
+        matches!(self.link, Link::Up(_))
+    }
+
     pub(super) fn connect(
         &mut self,
         socket: S,

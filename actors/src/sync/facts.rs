@@ -2,7 +2,7 @@
 
 use std::{fmt, time::Duration};
 
-use sinew_runtime::tid::Tid;
+use sinew_runtime::tid::{AppAddress, Tid};
 
 /// An application that waits at the start-up barrier.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -36,4 +36,20 @@ pub struct DirectoryEntry {
     pub tid: Tid,
     /// Whether it has started, takes messages, and can be reached now.
     pub ready: bool,
+}
+
+/// An application of this node, as a tool sees it.
+pub(crate) struct OwnApp {
+    /// Its address.
+    pub(crate) app: AppAddress,
+    /// Its name, if it has one.
+    pub(crate) name: Option<String>,
+    /// Whether it has started and takes messages.
+    pub(crate) ready: bool,
+    /// What it lacks of what it requires, and why.
+    pub(crate) missing: Vec<(String, &'static str)>,
+    /// How long it has waited at the barrier, if it waits there.
+    pub(crate) waits: Option<Duration>,
+    /// How its former life ended, while this one is not ready.
+    pub(crate) ended: Option<&'static str>,
 }

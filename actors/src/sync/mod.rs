@@ -27,6 +27,7 @@ pub(crate) use actor::SyncManager;
 pub(crate) use core::Core;
 #[cfg(test)]
 pub(crate) use core::Input;
+pub(crate) use facts::OwnApp;
 pub use facts::{DirectoryEntry, Waiting};
 pub(crate) use list::{NAME_BYTES_MAX, Name, at_most};
 

@@ -210,8 +210,9 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         }
         let handler = self.handlers.iter().find(|(kind, _)| *kind == message.header.kind);
         let Some((_, dispatch)) = handler else {
-            // An event that nobody handles has served its policy.
-            let served = event.map(|_| Outcome::Delivered);
+            // An event that nobody handles has served its policy; who asks for a sign of life has it.
+            let is_served = event.is_some() || message.header.kind == Kind::PING;
+            let served = is_served.then_some(Outcome::Delivered);
             return served.unwrap_or(Outcome::Rejected(Rejection::UnknownKind));
         };
         context.verdict = None;

@@ -107,6 +107,9 @@ impl Kind {
     /// Who has some names now.
     pub const HOST_NAMES: Self = Self(0x58);
 
+    /// Asks for a sign of life: confirmed, it ends as `Delivered` once whoever it is for has come to it.
+    pub const PING: Self = Self::named("sinew.ping");
+
     /// Whether this is said only between a node and a process that it started.
     #[must_use]
     pub const fn is_host(self) -> bool {

@@ -32,7 +32,7 @@ use self::{
     peers::{Accepted, Peers},
 };
 use super::{
-    facts::{DirectoryEntry, Waiting},
+    facts::{DirectoryEntry, OwnApp, Waiting},
     list::{ENTRIES_MAX, List},
 };
 use crate::{
@@ -190,6 +190,21 @@ impl Core {
     /// Who waits at the barrier, for what, since when and why.
     pub(crate) fn waiting(&self, now: Time) -> Vec<Waiting> {
         self.apps.waiting().map(|(address, _, _)| address).filter_map(|app| self.wait_of(now, app)).collect()
+    }
+
+    /// The applications of this node, in the order of their addresses, at most `max`; and how many more there are.
+    pub(crate) fn own_apps(&self, now: Time, max: usize) -> (Vec<OwnApp>, usize) {
+        let view = |(address, app): (AppAddress, &apps::App)| OwnApp {
+            app: address,
+            name: app.name.as_ref().map(ToString::to_string),
+            ready: app.state == State::Ready,
+            missing: self.missing(now, address),
+            waits: app.wait().map(|wait| now.since(wait.since)),
+            ended: app.ended.map(Reason::words),
+        };
+        let apps: Vec<_> = self.apps.iter().take(max).map(view).collect();
+        let more = self.apps.iter().count() - apps.len();
+        (apps, more)
     }
 
     /// The number of the sync manager's next message. It counts on when the actor is restarted.

@@ -1,0 +1,200 @@
+//! What a node says about itself: reads its stores, and asks the root for the tree.
+
+use std::{
+    collections::BTreeMap,
+    sync::{Arc, Weak, atomic::Ordering},
+    time::Duration,
+};
+
+use sinew_runtime::{
+    outcome::Rejection,
+    supervision::Strategy,
+    tid::{NodeAddress, Tid},
+    time::Time,
+};
+
+use super::reports::{
+    APPS_MAX, AppReport, AppsReport, LinkReport, Missing, NodeReport, PEERS_MAX, PeerReport, TREE_MAX,
+    TreeLine, TreeReport,
+};
+use crate::{
+    gncl::Peer,
+    ndl::{KnownNode, Source},
+    node::{CommandError, NodeHandle, Supervised},
+    stores::{Stores, lock},
+    sync::OwnApp,
+};
+
+/// Time for the root's answer: one that hangs does not keep the other questions waiting for long.
+const ROOT_WITHIN: Duration = Duration::from_secs(1);
+/// Longest text that an application has chosen, in characters: the words of a panic.
+const TEXT_MAX: usize = 256;
+
+/// What the answers are made from.
+pub(super) struct Answers {
+    /// Not kept alive by this.
+    stores: Weak<Stores>,
+    began: Time,
+}
+
+impl Answers {
+    pub(super) const fn new(stores: Weak<Stores>, began: Time) -> Self {
+        Self { stores, began }
+    }
+
+    /// `None` when the node has ended.
+    pub(super) fn stores(&self) -> Option<Arc<Stores>> {
+        self.stores.upgrade()
+    }
+
+    #[expect(clippy::unnecessary_wraps, reason = "all answers have one form")]
+    pub(super) fn node(&self, stores: &Arc<Stores>) -> Result<NodeReport, Rejection> {
+        let now = Time::now();
+        let mut peers: Vec<_> = peers(stores, now).into_values().collect();
+        let left_out = peers.len().saturating_sub(PEERS_MAX) as u64;
+        peers.truncate(PEERS_MAX);
+        Ok(NodeReport {
+            node: stores.node,
+            name: stores.config.name.clone(),
+            incarnation: stores.incarnation,
+            up_us: micros(now.since(self.began)),
+            pid: std::process::id(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            stopping: stores.stopping.load(Ordering::Relaxed),
+            refused: NodeHandle::of(stores.clone()).refused(),
+            peers,
+            left_out,
+        })
+    }
+
+    #[expect(clippy::unnecessary_wraps, reason = "all answers have one form")]
+    pub(super) fn apps(&self, stores: &Arc<Stores>) -> Result<AppsReport, Rejection> {
+        let (apps, more) = lock(&stores.sync).own_apps(Time::now(), APPS_MAX);
+        let apps = apps.into_iter().map(|app| app_report(stores.node, app)).collect();
+        Ok(AppsReport { name: stores.config.name.clone(), apps, left_out: more as u64 })
+    }
+
+    pub(super) fn tree(&self, stores: &Arc<Stores>) -> Result<TreeReport, Rejection> {
+        let tree = NodeHandle::of(stores.clone()).tree_within(ROOT_WITHIN).map_err(|why| {
+            if matches!(why, CommandError::Busy) { Rejection::QueueFull } else { Rejection::Closed }
+        })?;
+        let mut lines = Vec::new();
+        tree.supervisors.iter().for_each(|top| add_lines(&mut lines, 0, top));
+        let left_out = lines.len().saturating_sub(TREE_MAX) as u64;
+        lines.truncate(TREE_MAX);
+        Ok(TreeReport { name: tree.node, lines, left_out })
+    }
+}
+
+/// Those that answer, and those that GNCL still has something for.
+fn peers(stores: &Stores, now: Time) -> BTreeMap<NodeAddress, PeerReport> {
+    let known = lock(&stores.ndl).members(now);
+    let mut peers: BTreeMap<_, _> = known.iter().map(|known| (known.node, peer_report(known, now))).collect();
+    for peer in stores.gncl.peers() {
+        peers.entry(peer.node).or_insert_with(|| lost(&peer)).links = links(&peer);
+    }
+    peers
+}
+
+fn peer_report(known: &KnownNode, now: Time) -> PeerReport {
+    let word = |source: &Source| match source {
+        Source::Seed => "seed",
+        Source::Multicast => "multicast",
+        Source::Mdns => "mdns",
+        Source::Query => "query",
+    };
+    PeerReport {
+        node: known.node,
+        name: Some(known.name.clone()),
+        incarnation: known.incarnation,
+        is_there: true,
+        found_us: known.sources.values().min().map(|found| micros(now.since(*found))),
+        found_by: known.sources.keys().map(|source| word(source).to_owned()).collect(),
+        silent_us: Some(micros(now.since(known.heard))),
+        missed: known.missed,
+        round_trip_ns: known.round_trip.map(nanos),
+        offset_ns: known.offset.map(|offset| offset.theirs_minus_ours_ns),
+        offset_bound_ns: known.offset.map(|offset| nanos(offset.bound)),
+        links: Vec::new(),
+    }
+}
+
+fn lost(peer: &Peer) -> PeerReport {
+    PeerReport {
+        node: peer.node,
+        name: None,
+        incarnation: peer.incarnation,
+        is_there: false,
+        found_us: None,
+        found_by: Vec::new(),
+        silent_us: None,
+        missed: 0,
+        round_trip_ns: None,
+        offset_ns: None,
+        offset_bound_ns: None,
+        links: Vec::new(),
+    }
+}
+
+fn links(peer: &Peer) -> Vec<LinkReport> {
+    let names: &[&str] = if peer.ways().len() == 1 { &["all"] } else { &["control", "stream", "bulk"] };
+    let links = names.iter().zip(peer.ways()).map(|(class, way)| LinkReport {
+        class: (*class).to_owned(),
+        is_up: way.outlet.is_connected(),
+        waiting: way.outlet.waiting() as u64,
+        unconfirmed: way.outlet.unconfirmed() as u64,
+    });
+    links.collect()
+}
+
+fn app_report(node: NodeAddress, app: OwnApp) -> AppReport {
+    let missing = app.missing.into_iter().map(|(name, why)| Missing { name, why: why.to_owned() });
+    AppReport {
+        tid: Tid::new(node, app.app),
+        name: app.name,
+        ready: app.ready,
+        waits_us: app.waits.map(micros),
+        missing: missing.collect(),
+        ended: app.ended.map(str::to_owned),
+    }
+}
+
+/// A tree has as many lines as the node has actors; it is bounded before it is sent.
+fn add_lines(lines: &mut Vec<TreeLine>, depth: u32, one: &Supervised) {
+    lines.push(TreeLine {
+        depth,
+        name: one.name.clone(),
+        tid: one.tid,
+        state: one.state.to_string(),
+        since_us: micros(one.since),
+        life: one.generation,
+        restarts: one.restarts,
+        last_reason: one
+            .last_reason
+            .as_ref()
+            .map(|reason| reason.to_string().chars().take(TEXT_MAX).collect()),
+        place: one.place.clone(),
+        waiting: one.mailbox.map(|mailbox| mailbox.depth as u64),
+        waiting_most: one.mailbox.map(|mailbox| mailbox.high_water as u64),
+        strategy: one.supervises.as_ref().map(|below| strategy(below.flags.strategy).to_owned()),
+    });
+    for child in one.supervises.iter().flat_map(|below| &below.children) {
+        add_lines(lines, depth + 1, child);
+    }
+}
+
+const fn strategy(strategy: Strategy) -> &'static str {
+    match strategy {
+        Strategy::OneForOne => "one-for-one",
+        Strategy::RestForOne => "rest-for-one",
+        Strategy::OneForAll => "one-for-all",
+    }
+}
+
+fn micros(time: Duration) -> u64 {
+    u64::try_from(time.as_micros()).unwrap_or(u64::MAX)
+}
+
+fn nanos(time: Duration) -> u64 {
+    u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
+}

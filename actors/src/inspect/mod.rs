@@ -1,0 +1,29 @@
+//! Inspection: every node answers questions about itself, for tools like `sinew`.
+//!
+//! Whoever can send a message can ask, from any node: the questions go to `node/inspect` ([`AppAddress::INSPECT`]) by
+//! [`ask`](crate::Endpoint::ask), as to any application. It only reads.
+//!
+//! | rule | |
+//! | --- | --- |
+//! | INSPECT-1 | Every node has it from its start to its end, without configuration. It is in no list of applications and in no broadcast. |
+//! | INSPECT-2 | One thread answers, one question after the other; 32 wait at most, a further one is refused as `QueueFull`. No layer and no application waits for it. |
+//! | INSPECT-3 | An answer has the bounds of its type, and is no longer than `node.payload_max`. What has no room is left out, last ones first, and counted in `left_out`. |
+//! | INSPECT-4 | A kind that is no question is refused as `UnknownKind`. `sinew.ping`, confirmed, ends as `Delivered`. |
+//! | INSPECT-5 | A panic in an answer costs that answer, which ends as `Failed`, and nothing else. |
+//!
+//! `docs/protocol/inspect.md` has the fields.
+
+mod answers;
+mod inspector;
+mod reports;
+#[cfg(test)]
+mod tests;
+
+pub(crate) use inspector::begin;
+pub use reports::{
+    APPS_MAX, AppReport, AppsReport, AskApps, AskNode, AskTree, LinkReport, Missing, NodeReport, PEERS_MAX,
+    PeerReport, Ping, TREE_MAX, TreeLine, TreeReport,
+};
+
+#[cfg(doc)]
+use crate::AppAddress;

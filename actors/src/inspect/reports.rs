@@ -1,0 +1,229 @@
+//! The questions and what answers them. Times are microseconds before the answer was made, unless a name says otherwise.
+
+use serde::{Deserialize, Serialize};
+use sinew_runtime::tid::{Incarnation, NodeAddress, Tid};
+
+use crate::{payload, sync::at_most};
+
+/// Nodes in one answer at most.
+pub const PEERS_MAX: usize = 1_024;
+/// Applications in one answer at most.
+pub const APPS_MAX: usize = 1_024;
+/// Lines of a tree in one answer at most.
+pub const TREE_MAX: usize = 1_024;
+/// Names that one application lacks at most: as many as it may require.
+const MISSING_MAX: usize = 64;
+/// Connections to one node at most, and ways in which it was found.
+const LINKS_MAX: usize = 8;
+
+payload!("sinew.ping" =>
+    /// Asks for a sign of life, confirmed: whoever it is for need not know it.
+    #[derive(Clone, Copy, Debug, Default)]
+    pub struct Ping {}
+);
+
+payload!("sinew.inspect.node" =>
+    /// Who are you, and whom do you know? [`NodeReport`] answers.
+    #[derive(Clone, Copy, Debug, Default)]
+    pub struct AskNode {}
+);
+
+payload!("sinew.inspect.apps" =>
+    /// Which applications do you have, and whom do they wait for? [`AppsReport`] answers.
+    #[derive(Clone, Copy, Debug, Default)]
+    pub struct AskApps {}
+);
+
+payload!("sinew.inspect.tree" =>
+    /// Who supervises whom? [`TreeReport`] answers.
+    #[derive(Clone, Copy, Debug, Default)]
+    pub struct AskTree {}
+);
+
+payload!("sinew.inspect.node_report" =>
+    /// A node, and the nodes that it knows.
+    #[derive(Clone, Debug, PartialEq, Eq)]
+    pub struct NodeReport {
+        /// Its address.
+        pub node: NodeAddress,
+        /// Its name.
+        pub name: String,
+        /// Which life of it this is.
+        pub incarnation: Incarnation,
+        /// Time since it started.
+        pub up_us: u64,
+        /// Its process.
+        pub pid: u32,
+        /// The version of Sinew that it runs.
+        pub version: String,
+        /// Whether it is about to end.
+        pub stopping: bool,
+        /// What it refused that came from outside, and messages that nobody took.
+        pub refused: u64,
+        /// The nodes that it knows, in the order of their addresses.
+        #[serde(deserialize_with = "at_most::<_, _, PEERS_MAX>")]
+        pub peers: Vec<PeerReport>,
+        /// Further ones that had no room.
+        pub left_out: u64,
+    }
+);
+
+/// A node as another one sees it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PeerReport {
+    /// Its address.
+    pub node: NodeAddress,
+    /// Its name, if it is there.
+    pub name: Option<String>,
+    /// Which life of it this is.
+    pub incarnation: Incarnation,
+    /// Whether it answers; else it is lost, and there is still something for it or from it.
+    pub is_there: bool,
+    /// Time since it was found.
+    pub found_us: Option<u64>,
+    /// How it was found: `seed`, `multicast`, `mdns`, `query`.
+    #[serde(deserialize_with = "at_most::<_, _, LINKS_MAX>")]
+    pub found_by: Vec<String>,
+    /// Time since its last sign of life.
+    pub silent_us: Option<u64>,
+    /// Answers that it missed in a row.
+    pub missed: u32,
+    /// Time of the last query and its answer on the network, in nanoseconds.
+    pub round_trip_ns: Option<u64>,
+    /// Its clock minus that of the node that answers, in nanoseconds.
+    pub offset_ns: Option<i64>,
+    /// The error of that at most, in nanoseconds.
+    pub offset_bound_ns: Option<u64>,
+    /// The connections to it.
+    #[serde(deserialize_with = "at_most::<_, _, LINKS_MAX>")]
+    pub links: Vec<LinkReport>,
+}
+
+/// What carries the messages of a class to a node.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LinkReport {
+    /// `control`, `stream`, `bulk`; `all` where one connection carries all.
+    pub class: String,
+    /// Whether it is connected now.
+    pub is_up: bool,
+    /// Messages that wait to be sent.
+    pub waiting: u64,
+    /// Confirmed ones whose outcome is not known yet.
+    pub unconfirmed: u64,
+}
+
+payload!("sinew.inspect.apps_report" =>
+    /// The applications of a node.
+    #[derive(Clone, Debug, PartialEq, Eq)]
+    pub struct AppsReport {
+        /// The node's name.
+        pub name: String,
+        /// Its applications, in the order of their addresses.
+        #[serde(deserialize_with = "at_most::<_, _, APPS_MAX>")]
+        pub apps: Vec<AppReport>,
+        /// Further ones that had no room.
+        pub left_out: u64,
+    }
+);
+
+/// An application, in the node's process or another.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct AppReport {
+    /// Its address.
+    pub tid: Tid,
+    /// Its name, if it has one.
+    pub name: Option<String>,
+    /// Whether it has started and takes messages.
+    pub ready: bool,
+    /// How long it has waited at the start-up barrier, if it waits there.
+    pub waits_us: Option<u64>,
+    /// What it lacks of what it requires: before its start what it waits for, later what it lost.
+    #[serde(deserialize_with = "at_most::<_, _, MISSING_MAX>")]
+    pub missing: Vec<Missing>,
+    /// How its former life ended, while this one is not ready.
+    pub ended: Option<String>,
+}
+
+/// A name that is required and not ready.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Missing {
+    /// The name.
+    pub name: String,
+    /// The last that is known of it.
+    pub why: String,
+}
+
+payload!("sinew.inspect.tree_report" =>
+    /// The supervision tree of a node, each below its supervisor.
+    #[derive(Clone, Debug, PartialEq, Eq)]
+    pub struct TreeReport {
+        /// The node's name.
+        pub name: String,
+        /// The tree from above, each supervisor's children after it.
+        #[serde(deserialize_with = "at_most::<_, _, TREE_MAX>")]
+        pub lines: Vec<TreeLine>,
+        /// Further ones that had no room.
+        pub left_out: u64,
+    }
+);
+
+/// An actor or a supervisor.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TreeLine {
+    /// How many supervisors are above it.
+    pub depth: u32,
+    /// Its name.
+    pub name: String,
+    /// Its address, if it is an application.
+    pub tid: Option<Tid>,
+    /// Where it is in its life, in words.
+    pub state: String,
+    /// How long it has been there.
+    pub since_us: u64,
+    /// Which life of it this is, from 1; 0 before its first.
+    pub life: u64,
+    /// How often it was started again.
+    pub restarts: u64,
+    /// How its last life ended.
+    pub last_reason: Option<String>,
+    /// The name of its thread, or `own process`.
+    pub place: Option<String>,
+    /// Messages that wait for it.
+    pub waiting: Option<u64>,
+    /// The most that ever waited at once.
+    pub waiting_most: Option<u64>,
+    /// Of a supervisor: whom it restarts when one fails.
+    pub strategy: Option<String>,
+}
+
+/// An answer that has a list, from which what has no room is left out.
+pub(super) trait Report {
+    /// Leaves out the second half of its list; whether there was any.
+    fn halve(&mut self) -> bool;
+}
+
+fn halve<T>(list: &mut Vec<T>, left_out: &mut u64) -> bool {
+    let kept = list.len() / 2;
+    *left_out += (list.len() - kept) as u64;
+    let had_any = !list.is_empty();
+    list.truncate(kept);
+    had_any
+}
+
+impl Report for NodeReport {
+    fn halve(&mut self) -> bool {
+        halve(&mut self.peers, &mut self.left_out)
+    }
+}
+
+impl Report for AppsReport {
+    fn halve(&mut self) -> bool {
+        halve(&mut self.apps, &mut self.left_out)
+    }
+}
+
+impl Report for TreeReport {
+    fn halve(&mut self) -> bool {
+        halve(&mut self.lines, &mut self.left_out)
+    }
+}

@@ -1,0 +1,160 @@
+//! `sinew apps` and `sinew barriers`: every application, and who waits for whom.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde_json::{Value, json};
+use sinew::inspect::{AppReport, AppsReport, AskApps};
+
+use crate::{
+    Said,
+    system::{Answer, Fault, System},
+    table::{Table, clean, or_dash, time},
+};
+
+/// Asks every node for its applications.
+pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
+    let answers = ask(system)?;
+    let mut table = Table::new(["TID", "NAME", "NODE", "STATE", "WHY"]);
+    let mut rows = Vec::new();
+    for (node, app) in all(&answers) {
+        table.row([
+            app.tid.to_string(),
+            or_dash(app.name.clone()),
+            node.to_owned(),
+            state(app).to_owned(),
+            why(app),
+        ]);
+        rows.push(app_json(node, app));
+    }
+    let is_fine = is_complete(&answers) && all(&answers).all(|(_, app)| app.ready && app.missing.is_empty());
+    let text = table.text() + &silent(&answers);
+    Ok(Said { text, json: json!({ "apps": rows, "silent": silent_json(&answers) }), is_fine })
+}
+
+/// Asks every node who waits there, and says who is waited for.
+pub(crate) fn barriers(system: &mut System) -> Result<Said, Fault> {
+    let answers = ask(system)?;
+    let waiting: Vec<_> = all(&answers).filter(|(_, app)| !app.missing.is_empty()).collect();
+    let mut blocked: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+    let mut reasons: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+    for (_, app) in &waiting {
+        for missing in &app.missing {
+            let name = app.name.as_deref().unwrap_or("without a name");
+            blocked.entry(&missing.name).or_default().insert(name);
+            reasons.entry(&missing.name).or_default().insert(&missing.why);
+        }
+    }
+    let is_fine = waiting.is_empty() && is_complete(&answers);
+    let waiters = waiting.iter().map(|(node, app)| app_json(node, app)).collect::<Vec<_>>();
+    let blockers = blocked
+        .iter()
+        .map(|(name, who)| json!({ "name": name, "why": reasons[name], "blocks": who }))
+        .collect::<Vec<_>>();
+    let json = json!({ "waiting": waiters, "missing": blockers, "silent": silent_json(&answers) });
+    let text = if waiting.is_empty() {
+        "nobody waits\n".to_owned()
+    } else {
+        let mut table = Table::new(["WAITS", "NODE", "SINCE", "FOR"]);
+        for (node, app) in &waiting {
+            let since = app.waits_us.map_or_else(|| "lost it".to_owned(), time);
+            table.row([or_dash(app.name.clone()), (*node).to_owned(), since, lacks(app)]);
+        }
+        let mut missing = Table::new(["MISSING", "WHY", "BLOCKS"]);
+        for (name, who) in &blocked {
+            missing.row([(*name).to_owned(), joined(&reasons[name]), joined(who)]);
+        }
+        format!("{}\n{}", table.text(), missing.text())
+    };
+    Ok(Said { text: text + &silent(&answers), json, is_fine })
+}
+
+fn ask(system: &mut System) -> Result<Vec<Answer<AppsReport>>, Fault> {
+    let here = system.here()?;
+    let mut answers = system.ask_all::<AskApps, AppsReport>(&here);
+    // Those that only ask are no part of the system that is shown.
+    for answer in &mut answers {
+        if let Ok(said) = &mut answer.said {
+            said.apps.retain(|app| !system.own.contains(&app.tid));
+        }
+    }
+    Ok(answers)
+}
+
+/// Each with the name of its node.
+fn all(answers: &[Answer<AppsReport>]) -> impl Iterator<Item = (&str, &AppReport)> {
+    let said = answers.iter().filter_map(|answer| answer.said.as_ref().ok());
+    said.flat_map(|said| said.apps.iter().map(|app| (said.name.as_str(), app)))
+}
+
+fn is_complete(answers: &[Answer<AppsReport>]) -> bool {
+    answers.iter().all(|answer| answer.said.as_ref().is_ok_and(|said| said.left_out == 0))
+}
+
+const fn state(app: &AppReport) -> &'static str {
+    match (app.ready, app.waits_us) {
+        (true, _) if !app.missing.is_empty() => "ready, lacks",
+        (true, _) => "ready",
+        (false, Some(_)) => "waits",
+        (false, None) => "not ready",
+    }
+}
+
+/// Why it is not ready, in words.
+fn why(app: &AppReport) -> String {
+    let mut parts = Vec::new();
+    match app.waits_us {
+        Some(waits) if !app.missing.is_empty() => {
+            parts.push(format!("has waited {} for {}", time(waits), lacks(app)));
+        }
+        Some(waits) => parts.push(format!("has waited {}", time(waits))),
+        None if !app.missing.is_empty() => parts.push(lacks(app)),
+        None if !app.ready && app.ended.is_none() => parts.push("it starts".to_owned()),
+        None => {}
+    }
+    parts.extend(app.ended.clone().filter(|_| !app.ready));
+    parts.join("; ")
+}
+
+fn lacks(app: &AppReport) -> String {
+    let one = |missing: &sinew::inspect::Missing| format!("{} ({})", missing.name, missing.why);
+    app.missing.iter().map(one).collect::<Vec<_>>().join(", ")
+}
+
+fn joined(words: &BTreeSet<&str>) -> String {
+    words.iter().copied().collect::<Vec<_>>().join(", ")
+}
+
+fn app_json(node: &str, app: &AppReport) -> Value {
+    let missing = app.missing.iter().map(|missing| json!({ "name": missing.name, "why": missing.why }));
+    json!({
+        "tid": app.tid.to_string(),
+        "name": app.name,
+        "node": app.tid.node.to_string(),
+        "node_name": node,
+        "ready": app.ready,
+        "state": state(app),
+        "waits_us": app.waits_us,
+        "missing": missing.collect::<Vec<_>>(),
+        "ended": app.ended,
+    })
+}
+
+/// The nodes that have not answered, or not all.
+fn silent(answers: &[Answer<AppsReport>]) -> String {
+    let line = |answer: &Answer<AppsReport>| match &answer.said {
+        Ok(said) if said.left_out == 0 => None,
+        Ok(said) => Some(format!(
+            "{}: {} further applications had no room in its answer\n",
+            answer.node, said.left_out
+        )),
+        Err(why) => Some(format!("{} {}: {}\n", answer.node, clean(&answer.name), clean(why))),
+    };
+    answers.iter().filter_map(line).collect()
+}
+
+fn silent_json(answers: &[Answer<AppsReport>]) -> Value {
+    let line = |answer: &Answer<AppsReport>| {
+        Some(json!({ "node": answer.node.to_string(), "why": answer.said.as_ref().err()? }))
+    };
+    answers.iter().filter_map(line).collect()
+}

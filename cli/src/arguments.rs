@@ -1,0 +1,56 @@
+//! What can be said on the command line.
+
+use std::{path::PathBuf, time::Duration};
+
+use clap::{Parser, Subcommand};
+
+/// Shows a running Sinew system, from any one node of it. It changes nothing.
+///
+/// It comes in through the socket of a node on this machine (`lncl.socket` in the node's configuration) and asks that node, and through
+/// it all others.
+#[derive(Debug, Parser)]
+#[command(name = "sinew", version, after_help = AFTER)]
+pub(crate) struct Arguments {
+    /// The socket of a node on this machine. Without it: $SINEW_SOCKET, else the first that answers of $XDG_RUNTIME_DIR/sinew/*.sock,
+    /// /run/sinew/*.sock, /tmp/sinew-*.sock
+    #[arg(long, global = true, value_name = "PATH")]
+    pub(crate) socket: Option<PathBuf>,
+    /// Print JSON instead of tables
+    #[arg(long, global = true)]
+    pub(crate) json: bool,
+    /// How long each node has for its answer
+    #[arg(long, global = true, value_name = "MS", default_value_t = 2_000, value_parser = clap::value_parser!(u32).range(1..=60_000))]
+    deadline_ms: u32,
+    /// What to show
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+/// What to show.
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Every node: address, name, life, since when, what connects it, round trip and clock
+    Nodes,
+    /// Every application: address, name, node, ready or why not
+    Apps,
+    /// Who waits for whom, and who blocks most
+    Barriers,
+}
+
+impl Arguments {
+    /// How long each node has for its answer.
+    pub(crate) fn within(&self) -> Duration {
+        Duration::from_millis(self.deadline_ms.into())
+    }
+}
+
+const AFTER: &str = "\
+Exit codes:
+  0  all is fine
+  1  something was found (a node does not answer, an application is not ready), or the command failed
+  2  the command line is wrong
+
+Examples:
+  sinew nodes
+  sinew apps --json | jq '.apps[] | select(.ready | not)'
+  sinew --socket /run/sinew/knee.sock barriers";

@@ -1,0 +1,140 @@
+//! `sinew nodes`: every node, its life, what connects it, its clock.
+
+use serde_json::{Value, json};
+use sinew::inspect::{AskNode, LinkReport, NodeReport, PeerReport};
+
+use crate::{
+    Said,
+    system::{Answer, Fault, System},
+    table::{Table, clean, or_dash, time},
+};
+
+/// Asks every node.
+pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
+    let here = system.here()?;
+    let answers = system.ask_all::<AskNode, NodeReport>(&here);
+    let rows: Vec<_> = answers.iter().map(|answer| Row::of(&here, answer)).collect();
+    let is_fine = rows.iter().all(Row::is_fine) && here.left_out == 0;
+    let json = json!({
+        "through": system.path,
+        "here": here.node.to_string(),
+        "nodes": rows.iter().map(Row::json).collect::<Vec<_>>(),
+        "left_out": here.left_out,
+    });
+    Ok(Said { text: text(&here, &rows), json, is_fine })
+}
+
+/// A node: what it says, and what the node says through which we came.
+struct Row<'a> {
+    answer: &'a Answer<NodeReport>,
+    seen: Option<&'a PeerReport>,
+}
+
+impl<'a> Row<'a> {
+    fn of(here: &'a NodeReport, answer: &'a Answer<NodeReport>) -> Self {
+        Self { answer, seen: here.peers.iter().find(|peer| peer.node == answer.node) }
+    }
+
+    fn name(&self) -> &str {
+        self.answer.said.as_ref().map_or(&self.answer.name, |said| &said.name)
+    }
+
+    fn life(&self) -> Option<u64> {
+        let said = self.answer.said.as_ref().ok().map(|said| said.incarnation.0);
+        said.or_else(|| self.seen.map(|seen| seen.incarnation.0))
+    }
+
+    fn state(&self) -> &'static str {
+        match (&self.answer.said, self.seen) {
+            (Ok(said), _) if said.stopping => "stops",
+            (Ok(_), None) => "here",
+            (Ok(_), Some(_)) => "ready",
+            (Err(_), Some(seen)) if !seen.is_there => "lost",
+            (Err(_), _) => "does not answer",
+        }
+    }
+
+    fn is_fine(&self) -> bool {
+        let is_linked = self.seen.is_none_or(|seen| seen.links.iter().all(|link| link.is_up));
+        self.answer.said.as_ref().is_ok_and(|said| !said.stopping) && is_linked
+    }
+
+    fn links(&self) -> String {
+        let Some(seen) = self.seen else { return "-".to_owned() };
+        let link = |link: &LinkReport| format!("{} {}", link.class, if link.is_up { "up" } else { "DOWN" });
+        if seen.links.is_empty() {
+            return "none".to_owned();
+        }
+        if seen.links.iter().all(|link| link.is_up) && seen.links.len() > 1 {
+            return format!("{} up", seen.links.len());
+        }
+        seen.links.iter().map(link).collect::<Vec<_>>().join(", ")
+    }
+
+    fn clock(&self) -> String {
+        let Some((offset, bound)) = self.seen.and_then(|seen| seen.offset_ns.zip(seen.offset_bound_ns))
+        else {
+            return "-".to_owned();
+        };
+        format!("{:+.1} us +- {:.1} us", offset as f64 / 1e3, bound as f64 / 1e3)
+    }
+
+    fn cells(&self) -> [String; 8] {
+        let said = self.answer.said.as_ref().ok();
+        [
+            self.answer.node.to_string(),
+            self.name().to_owned(),
+            or_dash(self.life().map(|life| life.to_string())),
+            or_dash(said.map(|said| time(said.up_us))),
+            self.state().to_owned(),
+            self.links(),
+            or_dash(self.seen.and_then(|seen| seen.round_trip_ns).map(|ns| time(ns / 1_000))),
+            self.clock(),
+        ]
+    }
+
+    fn json(&self) -> Value {
+        let said = self.answer.said.as_ref();
+        let seen = self.seen;
+        json!({
+            "node": self.answer.node.to_string(),
+            "name": self.name(),
+            "incarnation": self.life(),
+            "state": self.state(),
+            "fault": said.err(),
+            "up_us": said.ok().map(|said| said.up_us),
+            "pid": said.ok().map(|said| said.pid),
+            "version": said.ok().map(|said| &said.version),
+            "refused": said.ok().map(|said| said.refused),
+            "found_us": seen.and_then(|seen| seen.found_us),
+            "found_by": seen.map(|seen| &seen.found_by),
+            "silent_us": seen.and_then(|seen| seen.silent_us),
+            "missed": seen.map(|seen| seen.missed),
+            "round_trip_ns": seen.and_then(|seen| seen.round_trip_ns),
+            "clock_offset_ns": seen.and_then(|seen| seen.offset_ns),
+            "clock_offset_bound_ns": seen.and_then(|seen| seen.offset_bound_ns),
+            "links": seen.map(|seen| seen.links.iter().map(link_json).collect::<Vec<_>>()),
+        })
+    }
+}
+
+fn link_json(link: &LinkReport) -> Value {
+    let LinkReport { class, is_up, waiting, unconfirmed } = link;
+    json!({ "class": class, "up": is_up, "waiting": waiting, "unconfirmed": unconfirmed })
+}
+
+fn text(here: &NodeReport, rows: &[Row<'_>]) -> String {
+    let heading = ["NODE", "NAME", "LIFE", "UP", "STATE", "LINKS", "ROUND TRIP", "CLOCK"];
+    let mut table = Table::new(heading);
+    rows.iter().for_each(|row| table.row(row.cells()));
+    let mut text = table.text();
+    for row in rows {
+        if let Err(why) = &row.answer.said {
+            text += &format!("{} {}: {}\n", row.answer.node, clean(row.name()), clean(why));
+        }
+    }
+    if here.left_out > 0 {
+        text += &format!("{} further nodes had no room in the answer of {}\n", here.left_out, here.node);
+    }
+    text
+}

@@ -1,0 +1,142 @@
+//! The way into the system: an endpoint at one node, from which all nodes are asked.
+
+use std::{collections::BTreeSet, path::Path, time::Duration};
+
+use sinew::{
+    ApiError, AppAddress, Endpoint, NodeAddress, NodeApi, Outcome, Payload, Registration, Rejection, Tid,
+    inspect::{AskNode, NodeReport},
+};
+
+use crate::door::{self, NoDoor};
+
+/// Endpoints that ask at the same time at most: a node that does not answer holds up a part of the others only.
+const ASKERS_MAX: usize = 8;
+/// Time for the registration.
+const REGISTERED_WITHIN: Duration = Duration::from_secs(5);
+
+/// Why a command cannot be carried out.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum Fault {
+    /// No way in.
+    #[error(transparent)]
+    NoDoor(#[from] NoDoor),
+    /// The node lets nobody in.
+    #[error("the node at {0} does not take part: {1}")]
+    NotTaken(String, ApiError),
+    /// The node does not answer.
+    #[error("the node at {0}: {1}")]
+    NoAnswer(String, String),
+}
+
+/// A running system, seen from one node.
+pub(crate) struct System {
+    api: NodeApi,
+    /// At the node through which we came.
+    pub(crate) endpoint: Endpoint,
+    /// Its socket.
+    pub(crate) path: String,
+    /// How long each node has for its answer.
+    pub(crate) within: Duration,
+    /// Addresses that this program has or had: no part of the system that it shows.
+    pub(crate) own: BTreeSet<Tid>,
+}
+
+/// What a node has answered, or why it has not.
+pub(crate) struct Answer<R> {
+    pub(crate) node: NodeAddress,
+    /// As the others call it.
+    pub(crate) name: String,
+    pub(crate) said: Result<R, String>,
+}
+
+impl System {
+    /// Enters through the socket that was named, else through the first that lets us in.
+    pub(crate) fn enter(socket: Option<&Path>, within: Duration) -> Result<Self, Fault> {
+        let (path, api) = door::find(socket)?;
+        let path = path.display().to_string();
+        let endpoint = register(&api).map_err(|why| Fault::NotTaken(path.clone(), why))?;
+        let own = BTreeSet::from([endpoint.tid()]);
+        Ok(Self { api, endpoint, path, within, own })
+    }
+
+    /// What the node through which we came says of itself and of those that it knows.
+    pub(crate) fn here(&mut self) -> Result<NodeReport, Fault> {
+        let node = self.endpoint.tid().node;
+        let within = self.within;
+        ask::<AskNode, NodeReport>(&mut self.endpoint, node, within)
+            .map_err(|why| Fault::NoAnswer(self.path.clone(), why))
+    }
+
+    /// Asks this node and all that it knows, in the order of their addresses.
+    pub(crate) fn ask_all<Q, R>(&mut self, here: &NodeReport) -> Vec<Answer<R>>
+    where
+        Q: Payload + Default,
+        R: Payload,
+    {
+        let mut nodes = vec![(here.node, here.name.clone())];
+        nodes.extend(here.peers.iter().map(|peer| (peer.node, peer.name.clone().unwrap_or_default())));
+        nodes.sort();
+        let askers = nodes.len().min(ASKERS_MAX);
+        let (api, within) = (&self.api, self.within);
+        let parts: Vec<_> = std::thread::scope(|scope| {
+            let askers: Vec<_> = (0..askers)
+                .map(|asker| nodes.iter().skip(asker).step_by(askers).cloned().collect::<Vec<_>>())
+                .map(|part| scope.spawn(move || ask_each::<Q, R>(api, part, within)))
+                .collect();
+            askers.into_iter().map(|asker| asker.join().expect("an asker does not panic")).collect()
+        });
+        let mut answers = Vec::new();
+        for (asker, part) in parts {
+            self.own.extend(asker);
+            answers.extend(part);
+        }
+        answers.sort_by_key(|answer| answer.node);
+        answers
+    }
+}
+
+fn register(api: &NodeApi) -> Result<Endpoint, ApiError> {
+    api.register_transport_address(Registration::new().deadline(REGISTERED_WITHIN))
+}
+
+/// Asks these one after the other; returns from which address.
+fn ask_each<Q, R>(
+    api: &NodeApi,
+    nodes: Vec<(NodeAddress, String)>,
+    within: Duration,
+) -> (Option<Tid>, Vec<Answer<R>>)
+where
+    Q: Payload + Default,
+    R: Payload,
+{
+    let mut endpoint = register(api);
+    let asker = endpoint.as_ref().ok().map(Endpoint::tid);
+    let mut ask_one = |node| match &mut endpoint {
+        Ok(endpoint) => ask::<Q, R>(endpoint, node, within),
+        Err(why) => Err(why.to_string()),
+    };
+    let answers = nodes.into_iter().map(|(node, name)| Answer { node, name, said: ask_one(node) }).collect();
+    (asker, answers)
+}
+
+fn ask<Q, R>(endpoint: &mut Endpoint, node: NodeAddress, within: Duration) -> Result<R, String>
+where
+    Q: Payload + Default,
+    R: Payload,
+{
+    let to = Tid::new(node, AppAddress::INSPECT);
+    endpoint.ask::<Q, R>(to, &Q::default(), within).map_err(|error| in_words(&error))
+}
+
+/// What a question to a node ended with, and what to do.
+pub(crate) fn in_words(error: &ApiError) -> String {
+    if let ApiError::Ended(Outcome::Rejected(Rejection::NoSuchApplication)) = error {
+        return "it runs a version of Sinew that cannot be asked; update it".to_owned();
+    }
+    if let ApiError::NoReply(within) = error {
+        return format!(
+            "no answer within {within:?}; is it stopped, or cut off? `sinew nodes` shows its links"
+        );
+    }
+    error.to_string()
+}

@@ -1,0 +1,180 @@
+//! The command itself, against real node processes: what it says of two nodes from one of them, and how it fails.
+
+use std::{
+    net::SocketAddrV4,
+    path::{Path, PathBuf},
+    process::{Command, Output},
+};
+
+use serde_json::Value;
+use sinew_tests::{OwnDirectory, Program, own_group, program, until};
+
+/// Nodes of a test's own, each with a socket.
+struct Scenario {
+    directory: OwnDirectory,
+    group: SocketAddrV4,
+}
+
+/// What the command said.
+struct Answer {
+    code: Option<i32>,
+    out: String,
+    err: String,
+}
+
+impl Answer {
+    fn json(&self) -> Value {
+        serde_json::from_str(&self.out).unwrap_or_else(|error| panic!("{error}: {}{}", self.out, self.err))
+    }
+}
+
+impl Scenario {
+    fn new() -> Self {
+        Self { directory: OwnDirectory::new(), group: own_group() }
+    }
+
+    fn socket(&self, name: &str) -> PathBuf {
+        self.directory.join(&format!("{name}.sock"))
+    }
+
+    /// A node with the application of its name; returns when its layers are up.
+    fn start(&self, name: &str, address: u8, more: &[&str]) -> Program {
+        let path = self.directory.join(&format!("{name}.toml"));
+        let text = format!(
+            "[node]\nname = \"{name}\"\naddress = \"127.0.0.{address}\"\nproject = \"cli\"\n\
+             [lncl]\nsocket = \"{}\"\n[ndl]\nmulticast = \"{}\"\nmdns_port = false\n",
+            self.socket(name).display(),
+            self.group
+        );
+        std::fs::write(&path, text).expect("the test's own directory");
+        let node = program("node_under_test");
+        assert!(node.exists(), "there is no {}; build it: cargo build -p sinew-tests", node.display());
+        let mut command = Command::new(node);
+        command.arg(&path).args(more);
+        let mut node = Program::start(name, command);
+        node.wait_for(&["up"]);
+        node
+    }
+
+    /// Runs `sinew` through the socket of the node called `name`.
+    fn sinew(&self, name: &str, words: &[&str]) -> Answer {
+        sinew(
+            &[&["--socket", self.socket(name).to_str().expect("a short path")], words].concat(),
+            Path::new("/"),
+        )
+    }
+
+    /// Asks again until the JSON that comes is as it is to be.
+    fn until(&self, what: &str, name: &str, words: &[&str], is_so: impl Fn(&Value) -> bool) -> Value {
+        let words = [words, &["--json"]].concat();
+        until(what, || Some(self.sinew(name, &words).json()).filter(&is_so))
+    }
+}
+
+fn sinew(words: &[&str], runtime_directory: &Path) -> Answer {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
+    command.args(words).env("XDG_RUNTIME_DIR", runtime_directory).env_remove("SINEW_SOCKET");
+    let Output { status, stdout, stderr } = command.output().expect("the command starts");
+    let text = |bytes| String::from_utf8(bytes).expect("it writes text");
+    Answer { code: status.code(), out: text(stdout), err: text(stderr) }
+}
+
+/// The element of `list` whose `name` is this one.
+fn named<'a>(list: &'a Value, name: &str) -> Option<&'a Value> {
+    list.as_array()?.iter().find(|one| one["name"] == name)
+}
+
+#[test]
+fn both_nodes_are_seen_from_either_of_them_with_their_links_and_lives() {
+    // Given: two nodes, connected
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee"]);
+    let knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["started"]);
+    for (here, other) in [("hip", "knee"), ("knee", "hip")] {
+        // When: each is asked, which knows the other's clock after a query
+        let said = scenario.until("the other is linked and measured", here, &["nodes"], |said| {
+            named(&said["nodes"], other).is_some_and(|node| {
+                let links = node["links"].as_array().map_or(&[][..], Vec::as_slice);
+                let all_up = links.len() == 3 && links.iter().all(|link| link["up"] == true);
+                all_up && node["round_trip_ns"].is_u64() && node["clock_offset_ns"].is_i64()
+            })
+        });
+        // Then
+        assert_eq!(said["nodes"].as_array().map(Vec::len), Some(2), "{said}");
+        let (own, far) =
+            (named(&said["nodes"], here).expect("itself"), named(&said["nodes"], other).expect("the other"));
+        assert_eq!((&own["state"], &far["state"]), (&"here".into(), &"ready".into()), "{said}");
+        assert!(far["incarnation"].is_u64() && far["up_us"].is_u64(), "{far}");
+    }
+    let said = scenario
+        .until("the knee is there", "hip", &["nodes"], |said| named(&said["nodes"], "knee").is_some());
+    assert_eq!(named(&said["nodes"], "knee").expect("it")["pid"], knee.id(), "it has answered itself");
+    let table = scenario.sinew("hip", &["nodes"]);
+    assert_eq!((table.code, table.out.lines().count()), (Some(0), 3), "{}{}", table.out, table.err);
+    assert!(table.out.contains("127.0.0.2") && table.out.contains("3 up"), "{}", table.out);
+}
+
+#[test]
+fn who_waits_and_who_is_missing_is_seen_from_another_node() {
+    // Given: an application that waits for one that is nowhere
+    let scenario = Scenario::new();
+    let _hip = scenario.start("hip", 1, &["--requires", "ankle"]);
+    let _knee = scenario.start("knee", 2, &[]);
+    // When: the other node is asked
+    let waits = |said: &Value| named(&said["apps"], "hip").is_some_and(|app| app["state"] == "waits");
+    let ready = |said: &Value| named(&said["apps"], "knee").is_some_and(|app| app["ready"] == true);
+    let said =
+        scenario.until("the hip waits, the knee runs", "knee", &["apps"], |said| waits(said) && ready(said));
+    // Then
+    let hip = named(&said["apps"], "hip").expect("it was there");
+    assert_eq!((&hip["node"], &hip["ready"]), (&"127.0.0.1".into(), &false.into()), "{said}");
+    assert_eq!(hip["missing"], serde_json::json!([{ "name": "ankle", "why": "never seen" }]));
+    assert_eq!(said["apps"].as_array().map(Vec::len), Some(2), "the command shows nothing of itself: {said}");
+    let barriers = scenario.sinew("knee", &["barriers", "--json"]);
+    let said = barriers.json();
+    assert_eq!(barriers.code, Some(1), "that somebody waits is a finding");
+    assert_eq!(
+        named(&said["missing"], "ankle").expect("it is missing")["blocks"],
+        serde_json::json!(["hip"]),
+        "{said}"
+    );
+    let table = scenario.sinew("knee", &["barriers"]).out;
+    assert!(table.contains("ankle (never seen)") && table.contains("hip"), "{table}");
+}
+
+#[test]
+fn where_no_node_is_it_says_where_it_looked_and_how_to_start_one() {
+    let directory = OwnDirectory::new();
+    std::fs::create_dir(directory.join("sinew")).expect("the test's own directory");
+    std::fs::write(directory.join("sinew/old.sock"), "").expect("the test's own directory");
+    let nowhere = directory.join("gone.sock");
+    let answer = sinew(&["--socket", nowhere.to_str().expect("a short path"), "nodes"], &directory.join(""));
+    assert_eq!(answer.code, Some(1));
+    for words in ["gone.sock", "--socket", "lncl", "sinew-node"] {
+        assert!(answer.err.contains(words), "{words}: {}", answer.err);
+    }
+}
+
+#[test]
+fn a_node_is_found_in_the_usual_directory_beside_the_socket_of_one_that_has_gone() {
+    // Given: a file of a node that was killed, and a node
+    let scenario = Scenario::new();
+    let sinew_directory = scenario.directory.join("sinew");
+    std::fs::create_dir(&sinew_directory).expect("the test's own directory");
+    std::fs::write(sinew_directory.join("a-former.sock"), "").expect("the test's own directory");
+    let _knee = scenario.start("sinew/knee", 1, &[]);
+    // When, then
+    let answer = sinew(&["nodes"], &scenario.directory.join(""));
+    assert!(answer.code == Some(0) && answer.out.contains("sinew/knee"), "{}{}", answer.out, answer.err);
+}
+
+#[test]
+fn a_wrong_command_line_is_2_and_help_names_the_exit_codes() {
+    assert_eq!(sinew(&["nodse"], Path::new("/")).code, Some(2));
+    let help = sinew(&["--help"], Path::new("/"));
+    assert_eq!(help.code, Some(0));
+    for words in ["nodes", "apps", "barriers", "Exit codes", "SINEW_SOCKET"] {
+        assert!(help.out.contains(words), "{words}: {}", help.out);
+    }
+}
