@@ -86,9 +86,10 @@ impl Reactor {
                 () = at(until.deadline) => {}
             },
             (Ears::Ring { .. }, Reader::Ring(reader)) => {
-                let looking = reader.begin_looking();
+                // Looking sees no room.
+                let looking = until.room.is_none().then(|| reader.begin_looking()).flatten();
                 let has_come = match &looking {
-                    Some(looking) => finds_something(looking, reader, &mut direct.open).await,
+                    Some(looking) => finds_something(looking, until.deadline, reader, &mut direct.open).await,
                     None => false,
                 };
                 if !has_come {
@@ -252,12 +253,18 @@ impl Ears {
     }
 }
 
-/// Looks as long as it is to before a sleep; whether something has come. Other tasks have their turn between.
-async fn finds_something(looking: &Looking, reader: &mut ring::Reader, links: &mut [Standing]) -> bool {
+/// Looks as long as it is to before a sleep, and not beyond `deadline`; whether something has come. Other tasks have their turn between.
+async fn finds_something(
+    looking: &Looking,
+    deadline: Time,
+    reader: &mut ring::Reader,
+    links: &mut [Standing],
+) -> bool {
     loop {
         match reader.look(looking, |node| Everything { node, links }) {
             Looked::Something => return true,
             Looked::Nothing => return false,
+            Looked::NotYet if Time::now() >= deadline => return false,
             Looked::NotYet => yield_now().await,
         }
     }

@@ -79,6 +79,12 @@ impl Inbound {
             return Some(End::Told);
         }
         self.attach_receipt(&mut message);
+        if !header.kind.is_user() && !header.destination.app.is_layer() {
+            // An application takes such words for those of its own node's layers.
+            self.count(now, "a layer's words for an application", &message);
+            message.reject(Rejection::Unsupported);
+            return Some(End::Refused);
+        }
         if header.destination.node != self.stores.node && header.destination.node != NodeAddress::ALL {
             self.count(now, "not for this node", &message);
             message.reject(Rejection::NoSuchNode);

@@ -270,6 +270,9 @@ impl Client {
     async fn run(&mut self, reader: Reader, session: &mut Session) -> End {
         // What is sent to it from now on waits in the outlet. So whoever knows that it is registered can send to it.
         session.released(self.tid);
+        if self.wants_links && self.ring == Ring::Asked {
+            self.server.introductions.expect(self.tid.app);
+        }
         let route = LocalRoute { outlet: self.outlet.clone(), events: self.events.clone() };
         registrar::open(&self.server.stores, self.tid.app, route);
         let (mut reader, link) = match self.open_link(reader).await {
@@ -296,6 +299,7 @@ impl Client {
         let ring = (self.ring == Ring::Asked).then(|| link::prepare(ring_bytes)).flatten();
         let Some((capacity, exchange)) = ring else {
             reader.set_payload_max(payload_max);
+            self.server.introductions.expect_no_more(self.tid.app);
             let socket = ClientSocket::Plain(self.peer.stream.clone());
             let link = self.outlet.connect(socket, payload_max, Some(self.registered(None)));
             return Ok((ClientReader::Plain(reader), link));

@@ -9,7 +9,7 @@ mod unanswered;
 
 use std::{
     cell::RefCell,
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     io::IoSlice,
     mem::MaybeUninit,
     os::fd::{AsFd, BorrowedFd, OwnedFd},
@@ -102,6 +102,8 @@ pub(super) struct Question {
 #[derive(Default)]
 pub(super) struct Introductions {
     parties: RefCell<BTreeMap<AppAddress, Arc<Party>>>,
+    /// Those whose rings are being made: they can be met in a moment.
+    coming: RefCell<BTreeSet<AppAddress>>,
     open: Open,
 }
 
@@ -109,7 +111,18 @@ pub(super) struct Introductions {
 type Open = Arc<Mutex<Unanswered<Asked>>>;
 
 impl Introductions {
+    /// `app` can be met soon: who asks for it until then is to ask again, instead of taking it for one that has no links.
+    pub(super) fn expect(&self, app: AppAddress) {
+        self.coming.borrow_mut().insert(app);
+    }
+
+    /// `app` will have no links, or has gone.
+    pub(super) fn expect_no_more(&self, app: AppAddress) {
+        self.coming.borrow_mut().remove(&app);
+    }
+
     pub(super) fn add(&self, party: Party) {
+        self.expect_no_more(party.tid.app);
         self.parties.borrow_mut().insert(party.tid.app, Arc::new(party));
     }
 
@@ -199,6 +212,9 @@ impl Introductions {
     }
 
     fn party(&self, tid: Tid) -> Result<Arc<Party>, Rejection> {
+        if self.coming.borrow().contains(&tid.app) {
+            return Err(Rejection::QueueFull);
+        }
         let parties = self.parties.borrow();
         let party = parties.get(&tid.app).filter(|party| party.tid == tid);
         party.cloned().ok_or(Rejection::Unsupported)
@@ -251,7 +267,10 @@ impl Asked {
         };
         answer.header.correlation = correlation;
         // Not taken: it is gone, or it does not read and goes on through the node.
-        let _ = asker.outlet.submit(answer);
+        if asker.outlet.submit(answer).is_err() {
+            // It knows of no link, so nobody's death on it concerns it.
+            peer.met.forget(asker.tid.app);
+        }
     }
 }
 

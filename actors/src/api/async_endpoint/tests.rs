@@ -339,3 +339,20 @@ fn a_task_looks_before_it_sleeps_if_that_was_asked_for() {
         });
     }
 }
+
+#[test]
+fn a_task_that_looks_before_it_sleeps_keeps_its_deadlines() {
+    let node = TestNode::start();
+    let app = node.local(1);
+    runtime().block_on(async {
+        let api = NodeApi::connect(node.path()).unwrap();
+        let wish = Registration::new().spin(Spin::For(10 * WATCHDOG));
+        let mut endpoint = api.register_transport_address_async(wish).await.unwrap();
+        // Nobody takes it out of the mailbox.
+        let confirmed = endpoint.send_confirmed(app.tid, &TORQUE, Duration::from_millis(20));
+        let outcome = timeout(WATCHDOG, confirmed)
+            .await
+            .expect("it ends at its deadline, not when it has looked enough");
+        assert_eq!(outcome.unwrap(), Outcome::Unknown);
+    });
+}

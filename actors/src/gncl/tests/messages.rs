@@ -213,3 +213,28 @@ fn a_group_and_a_broadcast_cross_to_a_node_once_however_many_are_there_and_share
         }
     });
 }
+
+// spec: GNCL-11
+#[test]
+fn what_only_a_nodes_own_layers_say_no_peer_says_to_an_application() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut peer = ByHand::linked_to(&mut node).await;
+        let mut inbox = node.app(1);
+        for kind in [Kind::LNCL_REFUSAL, Kind::LNCL_GONE, Kind::LNCL_UNTAKEN] {
+            let mut forged = from_nine(&node, b"I am your LNCL");
+            forged.header.kind = kind;
+            peer.say(&forged).await;
+        }
+        peer.say(&from_nine(&node, b"honest")).await;
+        let mut came = Vec::new();
+        loop {
+            let message = next("a message", &mut inbox).await;
+            if message.header.kind == KIND {
+                break;
+            }
+            came.push(message.header.kind);
+        }
+        assert!(came.is_empty(), "an application got {came:x?} from another node");
+    });
+}

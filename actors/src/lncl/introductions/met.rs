@@ -35,7 +35,7 @@ impl Met {
         }
     }
 
-    fn forget(&self, other: AppAddress) {
+    pub(super) fn forget(&self, other: AppAddress) {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).remove(&other);
     }
 
@@ -47,6 +47,7 @@ impl Met {
 impl Introductions {
     /// `app` cannot be met any more. If it is dead, those who have a link with it are told.
     pub(in crate::lncl) fn remove(&self, app: AppAddress, leaves: Leaves) {
+        self.expect_no_more(app);
         let Some(party) = self.parties.borrow_mut().remove(&app) else { return };
         for (other, number) in party.met.take() {
             let other = self.parties.borrow().get(&other).cloned();

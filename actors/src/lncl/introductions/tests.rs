@@ -334,3 +334,35 @@ fn a_link_outlives_the_connections_of_those_who_have_it() {
     introductions.remove(one.tid.app, Leaves::WithItsLinks);
     assert!(told_dead(&other, one.tid).is_empty());
 }
+
+// spec: LNCL-10
+#[test]
+fn one_that_has_just_registered_is_to_be_asked_for_again_and_one_without_links_is_not() {
+    let introductions = Introductions::default();
+    let asker = join(&introductions, 1, 4);
+    let ask = || introductions.introduce(asker.tid, tid(2), question(7, 1), NOW);
+    assert_eq!(ask(), Err(Rejection::Unsupported));
+    introductions.expect(tid(2).app);
+    assert_eq!(ask(), Err(Rejection::QueueFull), "its rings are being made");
+    introductions.expect_no_more(tid(2).app);
+    assert_eq!(ask(), Err(Rejection::Unsupported), "it has none");
+    introductions.expect(tid(2).app);
+    let _there = join(&introductions, 2, 4);
+    assert_eq!(ask(), Ok(()));
+}
+
+// spec: LNCL-17
+#[test]
+fn who_takes_nothing_is_not_owed_the_deaths_of_more_and_more_whom_it_has_asked_for() {
+    // Given: one whose queue takes nothing, and who takes its ends from the socket.
+    let introductions = Introductions::default();
+    let deaf = join(&introductions, 1, 0);
+    for round in 0..100 {
+        let dead = join(&introductions, 2, 4);
+        introductions.introduce(deaf.tid, dead.tid, question(round, 1), NOW).unwrap();
+        dead.next().settle(Outcome::Delivered);
+        drop(deaf.end());
+        introductions.remove(dead.tid.app, Leaves::Dead);
+    }
+    assert_eq!(deaf.marks.try_iter().count(), 0);
+}

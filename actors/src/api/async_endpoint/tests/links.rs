@@ -9,7 +9,7 @@ use sinew_runtime::{
     time::Time,
     wire::{Class, HEADER_LEN},
 };
-use sinew_shm::Armed;
+use sinew_shm::{Armed, Spin};
 use tokio::time::timeout;
 
 use super::{RAW, number_of, numbered, runtime};
@@ -29,8 +29,12 @@ fn wish() -> Registration {
 }
 
 async fn task(node: &TestNode) -> AsyncEndpoint {
+    task_with(node, wish()).await
+}
+
+async fn task_with(node: &TestNode, wish: Registration) -> AsyncEndpoint {
     let api = NodeApi::connect(node.path()).unwrap();
-    api.register_transport_address_async(wish()).await.unwrap()
+    api.register_transport_address_async(wish).await.unwrap()
 }
 
 fn has_link(from: &Endpoint, to: Tid) -> bool {
@@ -46,7 +50,11 @@ async fn send(from: &mut AsyncEndpoint, to: Tid, number: u64, length: usize) {
 
 /// Two tasks, each with an open link with the other.
 async fn linked(node: &TestNode) -> (AsyncEndpoint, AsyncEndpoint) {
-    let (mut one, mut other) = (task(node).await, task(node).await);
+    linked_with(node, wish()).await
+}
+
+async fn linked_with(node: &TestNode, first: Registration) -> (AsyncEndpoint, AsyncEndpoint) {
+    let (mut one, mut other) = (task_with(node, first).await, task(node).await);
     let (to, back) = (other.tid(), one.tid());
     send(&mut one, to, 0, 8).await;
     let deadline = Time::now() + WATCHDOG;
@@ -173,10 +181,16 @@ fn fill(from: &mut AsyncEndpoint, to: Tid) -> Room {
 
 #[test]
 fn a_task_that_waits_for_room_is_woken_by_what_its_peer_takes() {
+    for spin in [Spin::Off, Spin::For(10 * WATCHDOG)] {
+        room_is_rung_for(spin);
+    }
+}
+
+fn room_is_rung_for(spin: Spin) {
     let node = TestNode::start();
     runtime().block_on(async {
         // given
-        let (mut one, mut other) = linked(&node).await;
+        let (mut one, mut other) = linked_with(&node, wish().spin(spin)).await;
         drain(&mut other).await;
         drain(&mut one).await;
         let room = fill(&mut one, other.tid());
@@ -188,7 +202,9 @@ fn a_task_that_waits_for_room_is_woken_by_what_its_peer_takes() {
         assert!(poll!(&mut waiting).is_pending(), "there is no room");
         drop(other.receive().await.unwrap());
         // then
-        timeout(WATCHDOG, &mut waiting).await.expect("it is rung for room");
+        timeout(WATCHDOG, &mut waiting)
+            .await
+            .expect("it is rung for room, however long it would look for messages");
         drop(waiting);
         assert_eq!(direct.arm_room(room), Armed::Ready);
     });
