@@ -173,6 +173,7 @@ impl<S: Socket> Half<S> {
     /// What was sent and not confirmed may have been handled or not.
     pub(super) fn unknown(&mut self, after: &mut After) {
         after.settle.extend(self.sent_receipts.take_all().map(|sent| (sent.receipt, Outcome::Unknown)));
+        after.room = self.outcomes_awaited.take().or_else(|| after.room.take());
     }
 
     /// The frame that was being written goes out on the next connection.
@@ -213,7 +214,7 @@ impl<S: Socket> Half<S> {
         self.unknown(after);
         self.forget_kept();
         self.link = Link::Closed(why);
-        after.room = self.queue.awaited_no_more();
+        after.room = self.queue.awaited_no_more().or_else(|| after.room.take());
         let waiting = self.take_waiting();
         for message in waiting {
             self.counts.lost += 1;

@@ -73,6 +73,7 @@ impl Report {
             after.is_back_at(before) && after.own_kib <= before.own_kib + GROWTH_MAX_KIB
         };
         self.left.is_empty()
+            && self.held_loans > 0
             && self.ended_by_themselves == 0
             && self.held.iter().all(is_back)
             && self.windows.iter().all(|window| window.failed == 0)
