@@ -100,7 +100,7 @@ const fn state(app: &AppReport) -> &'static str {
 }
 
 /// Why it is not ready, in words.
-fn why(app: &AppReport) -> String {
+pub(crate) fn why(app: &AppReport) -> String {
     let mut parts = Vec::new();
     match app.waits_us {
         Some(waits) if !app.missing.is_empty() => {

@@ -1,6 +1,6 @@
 //! What can be said on the command line.
 
-use std::{path::PathBuf, time::Duration};
+use std::{net::Ipv4Addr, path::PathBuf, time::Duration};
 
 use clap::{Parser, Subcommand};
 
@@ -33,8 +33,31 @@ pub(crate) enum Command {
     Nodes,
     /// Every application: address, name, node, ready or why not
     Apps,
-    /// Who waits for whom, and who blocks most
+    /// Who supervises whom, with lives, restarts, and how the last life ended
+    Tree {
+        /// A node's address or name; without it: every node
+        node: Option<String>,
+    },
+    /// How long a message and its confirmation take
+    ///
+    /// The ping goes to the application's own thread, or to the node's inspection, and is answered there without the application's code.
+    /// An application in a process of its own that came in through a socket answers it when it receives.
+    Ping {
+        /// An application's TID (127.0.0.2/80000001) or name, a node's address or name: the first that it is, in this order
+        whom: String,
+        /// How many, each when the one before was answered; after three in a row without an answer no more
+        #[arg(long, short, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+        count: u32,
+    },
+    /// Who waits for whom at start-up barriers, and who blocks them
     Barriers,
+    /// Whether this machine gives a node what it needs: multicast, open files, real-time rights, shared memory, a socket directory; each
+    /// finding with the command that mends it
+    Doctor {
+        /// Address of the interface that multicast is tried on: the `ndl.interface` of the nodes. What is sent does not leave this machine
+        #[arg(long, default_value_t = Ipv4Addr::LOCALHOST)]
+        interface: Ipv4Addr,
+    },
 }
 
 impl Arguments {
@@ -52,5 +75,6 @@ Exit codes:
 
 Examples:
   sinew nodes
+  sinew ping knee.drive --count 1000
   sinew apps --json | jq '.apps[] | select(.ready | not)'
   sinew --socket /run/sinew/knee.sock barriers";

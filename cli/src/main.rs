@@ -5,17 +5,20 @@
 
 mod apps;
 mod arguments;
+mod doctor;
 mod door;
 mod nodes;
+mod ping;
 mod system;
 mod table;
+mod tree;
 
 use std::process::ExitCode;
 
 use clap::Parser;
 
 use arguments::{Arguments, Command};
-use system::System;
+use system::{Fault, System};
 
 /// Exit code where all is fine.
 const FINE: u8 = 0;
@@ -49,11 +52,19 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(arguments: &Arguments) -> Result<Said, system::Fault> {
-    let system = || System::enter(arguments.socket.as_deref(), arguments.within());
+fn run(arguments: &Arguments) -> Result<Said, Fault> {
+    let inside = |show: &dyn Fn(&mut System) -> Result<Said, Fault>| {
+        let mut system = System::enter(arguments.socket.as_deref(), arguments.within())?;
+        let said = show(&mut system);
+        system.leave();
+        said
+    };
     match &arguments.command {
-        Command::Nodes => Ok(nodes::show(&mut system()?)?),
-        Command::Apps => Ok(apps::show(&mut system()?)?),
-        Command::Barriers => Ok(apps::barriers(&mut system()?)?),
+        Command::Nodes => inside(&nodes::show),
+        Command::Apps => inside(&apps::show),
+        Command::Tree { node } => inside(&|system| tree::show(system, node.as_deref())),
+        Command::Ping { whom, count } => inside(&|system| ping::show(system, whom, *count)),
+        Command::Barriers => inside(&apps::barriers),
+        Command::Doctor { interface } => Ok(doctor::show(*interface, arguments.socket.as_deref())),
     }
 }

@@ -7,7 +7,10 @@ use sinew::{
     inspect::{AskNode, NodeReport},
 };
 
-use crate::door::{self, NoDoor};
+use crate::{
+    door::{self, NoDoor},
+    table::clean,
+};
 
 /// Endpoints that ask at the same time at most: a node that does not answer holds up a part of the others only.
 const ASKERS_MAX: usize = 8;
@@ -21,11 +24,16 @@ pub(crate) enum Fault {
     #[error(transparent)]
     NoDoor(#[from] NoDoor),
     /// The node lets nobody in.
-    #[error("the node at {0} does not take part: {1}")]
+    #[error(
+        "the node at {0} lets nobody in now: {1}. It may be stopping: try again, or another one with --socket PATH"
+    )]
     NotTaken(String, ApiError),
     /// The node does not answer.
     #[error("the node at {0}: {1}")]
     NoAnswer(String, String),
+    /// Nobody is called so.
+    #[error("{0}")]
+    Whom(String),
 }
 
 /// A running system, seen from one node.
@@ -59,6 +67,11 @@ impl System {
         Ok(Self { api, endpoint, path, within, own })
     }
 
+    /// Leaves the system as if we had not been there.
+    pub(crate) fn leave(self) {
+        leave(self.endpoint);
+    }
+
     /// What the node through which we came says of itself and of those that it knows.
     pub(crate) fn here(&mut self) -> Result<NodeReport, Fault> {
         let node = self.endpoint.tid().node;
@@ -73,9 +86,15 @@ impl System {
         Q: Payload + Default,
         R: Payload,
     {
-        let mut nodes = vec![(here.node, here.name.clone())];
-        nodes.extend(here.peers.iter().map(|peer| (peer.node, peer.name.clone().unwrap_or_default())));
-        nodes.sort();
+        self.ask_these::<Q, R>(all(here))
+    }
+
+    /// Asks these nodes; the answers come in the order of their addresses.
+    pub(crate) fn ask_these<Q, R>(&mut self, nodes: Vec<(NodeAddress, String)>) -> Vec<Answer<R>>
+    where
+        Q: Payload + Default,
+        R: Payload,
+    {
         let askers = nodes.len().min(ASKERS_MAX);
         let (api, within) = (&self.api, self.within);
         let parts: Vec<_> = std::thread::scope(|scope| {
@@ -93,6 +112,29 @@ impl System {
         answers.sort_by_key(|answer| answer.node);
         answers
     }
+}
+
+/// This node and all that it knows.
+fn all(here: &NodeReport) -> Vec<(NodeAddress, String)> {
+    let mut nodes = vec![(here.node, here.name.clone())];
+    nodes.extend(here.peers.iter().map(|peer| (peer.node, peer.name.clone().unwrap_or_default())));
+    nodes.sort();
+    nodes
+}
+
+/// Of all nodes those that have this address or name, at least one; all of them where none is wanted.
+pub(crate) fn chosen(here: &NodeReport, wanted: Option<&str>) -> Result<Vec<(NodeAddress, String)>, Fault> {
+    let mut nodes = all(here);
+    if let Some(wanted) = wanted {
+        nodes.retain(|(node, name)| node.to_string() == wanted || name == wanted);
+        if nodes.is_empty() {
+            let wanted = clean(wanted);
+            return Err(Fault::Whom(format!(
+                "no node has the address or name '{wanted}'; `sinew nodes` shows those that are there"
+            )));
+        }
+    }
+    Ok(nodes)
 }
 
 fn register(api: &NodeApi) -> Result<Endpoint, ApiError> {
@@ -116,7 +158,14 @@ where
         Err(why) => Err(why.to_string()),
     };
     let answers = nodes.into_iter().map(|(node, name)| Answer { node, name, said: ask_one(node) }).collect();
+    endpoint.into_iter().for_each(leave);
     (asker, answers)
+}
+
+/// Gives the address back and waits for that, so that the next command does not see it.
+fn leave(endpoint: Endpoint) {
+    // It is given back in any case when the connection ends.
+    let _ = endpoint.unregister();
 }
 
 fn ask<Q, R>(endpoint: &mut Endpoint, node: NodeAddress, within: Duration) -> Result<R, String>

@@ -4,9 +4,12 @@ use std::{
     net::SocketAddrV4,
     path::{Path, PathBuf},
     process::{Command, Output},
+    time::Duration,
 };
 
+use rustix::process::Signal;
 use serde_json::Value;
+use sinew::{NodeApi, Registration};
 use sinew_tests::{OwnDirectory, Program, own_group, program, until};
 
 /// Nodes of a test's own, each with a socket.
@@ -174,7 +177,143 @@ fn a_wrong_command_line_is_2_and_help_names_the_exit_codes() {
     assert_eq!(sinew(&["nodse"], Path::new("/")).code, Some(2));
     let help = sinew(&["--help"], Path::new("/"));
     assert_eq!(help.code, Some(0));
-    for words in ["nodes", "apps", "barriers", "Exit codes", "SINEW_SOCKET"] {
+    for words in ["nodes", "apps", "tree", "ping", "barriers", "doctor", "Exit codes", "SINEW_SOCKET"] {
         assert!(help.out.contains(words), "{words}: {}", help.out);
     }
+}
+
+#[test]
+fn every_application_and_node_is_pinged_by_tid_and_by_name_from_either_node() {
+    // Given: two nodes with their applications, and one in another process, which receives
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee"]);
+    let mut knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["started"]);
+    let tid = knee.wait_for(&["started"]);
+    let tid = tid.split_once(' ').expect("it says its TID").1;
+    let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
+    let mut client =
+        api.register_transport_address(Registration::new().name("client")).expect("it is registered");
+    let (say_over, over) = std::sync::mpsc::sync_channel(1);
+    let receiving = std::thread::spawn(move || {
+        while over.try_recv().is_err() {
+            let received = client.receive(Duration::from_millis(10)).expect("its node lives");
+            assert!(received.is_none(), "a ping is answered without the program");
+        }
+    });
+    scenario.until("the client is known on the hip", "hip", &["apps"], |said| {
+        named(&said["apps"], "client").is_some_and(|app| app["ready"] == true)
+    });
+    for here in ["hip", "knee"] {
+        for whom in [tid, "knee", "hip", "client", "127.0.0.1", "127.0.0.2", "127.0.0.2/inspect"] {
+            // When
+            let answer = scenario.sinew(here, &["ping", whom, "--count", "20", "--json"]);
+            // Then
+            assert_eq!(answer.code, Some(0), "{whom}: {}{}", answer.out, answer.err);
+            let said = answer.json();
+            assert_eq!((&said["sent"], &said["answered"]), (&20.into(), &20.into()), "{whom}: {said}");
+            assert_eq!(said["outcome"], "Delivered", "whoever it is knows a ping: {whom}: {said}");
+            let [p50, p99] = ["p50_ns", "p99_ns"].map(|key| said[key].as_u64().expect("a time"));
+            assert!(0 < p50 && p50 <= p99, "{said}");
+        }
+    }
+    say_over.send(()).expect("it still receives");
+    receiving.join().expect("it got nothing");
+    // And: it was handled nowhere, so that the nodes say nothing of it
+    let silent = |node: &Program| !node.said().iter().any(|line| line.starts_with("count"));
+    assert!(silent(&hip) && silent(&knee));
+}
+
+#[test]
+fn who_does_not_answer_a_ping_is_a_finding_with_a_reason() {
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &[]);
+    hip.wait_for(&["started"]);
+    let _knee = scenario.start("knee", 2, &["--requires", "ankle"]);
+    scenario.until("the knee waits", "hip", &["apps"], |said| {
+        named(&said["apps"], "knee").is_some_and(|app| app["state"] == "waits")
+    });
+    let answer = scenario.sinew("hip", &["ping", "knee", "--deadline-ms", "50"]);
+    assert!(
+        answer.code == Some(1) && answer.out.contains("ankle (never seen)"),
+        "{}{}",
+        answer.out,
+        answer.err
+    );
+    for (whom, words) in [
+        ("ankle", "ankle"),
+        ("127.0.0.9", "not known"),
+        ("127.0.0.1/1fff", "no application"),
+        ("x/y", "node address"),
+    ] {
+        let answer = scenario.sinew("hip", &["ping", whom]);
+        let said = answer.out + &answer.err;
+        assert!(answer.code == Some(1) && said.contains(words), "{whom}: {said}");
+    }
+}
+
+#[test]
+fn a_node_that_is_stopped_is_shown_as_such_and_does_not_hide_the_other() {
+    // Given: two nodes that know each other, of which one is stopped
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee"]);
+    let knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["started"]);
+    knee.freeze();
+    // When
+    let said =
+        scenario.until("it does not answer, or is lost", "hip", &["nodes", "--deadline-ms", "200"], |said| {
+            named(&said["nodes"], "knee").is_none_or(|node| node["state"] != "ready")
+        });
+    // Then
+    assert_eq!(named(&said["nodes"], "hip").expect("the one that lives")["state"], "here", "{said}");
+    knee.signal(Signal::CONT);
+}
+
+#[test]
+fn the_tree_of_another_node_has_its_layers_and_its_application() {
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee"]);
+    let _knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["started"]);
+    let said = scenario.sinew("hip", &["tree", "knee", "--json"]).json();
+    let nodes = said["nodes"].as_array().expect("a list");
+    assert_eq!(nodes.len(), 1, "the one that was asked for: {said}");
+    let tree = &nodes[0]["tree"];
+    for name in ["layers", "LNCL", "sync manager", "GNCL", "NDL", "applications"] {
+        assert_eq!(named(tree, name).unwrap_or_else(|| panic!("no {name}: {said}"))["state"], "ready");
+    }
+    let app = named(tree, "knee").expect("its application");
+    assert_eq!(
+        (&app["depth"], &app["restarts"], &app["state"]),
+        (&1.into(), &0.into(), &"ready".into()),
+        "{app}"
+    );
+    let text = scenario.sinew("hip", &["tree"]).out;
+    assert!(text.contains("127.0.0.1 hip\n") && text.contains("127.0.0.2 knee\n"), "{text}");
+    assert_eq!(scenario.sinew("hip", &["tree", "ankle"]).code, Some(1));
+}
+
+#[test]
+fn the_doctor_tries_each_thing_and_every_finding_has_what_mends_it() {
+    let scenario = Scenario::new();
+    let _hip = scenario.start("hip", 1, &[]);
+    let answer = scenario.sinew("hip", &["doctor", "--json"]);
+    let said = answer.json();
+    let checks = said["checks"].as_array().expect("a list");
+    let names: Vec<_> = checks.iter().filter_map(|check| check["check"].as_str()).collect();
+    assert_eq!(
+        names,
+        ["multicast", "open files", "real-time rights", "shared memory", "socket directory", "node"]
+    );
+    assert!(checks.iter().all(|check| check["fine"] == check["mend"].is_null()), "{said}");
+    assert_eq!(answer.code, Some(i32::from(checks.iter().any(|check| check["fine"] == false))));
+    // Its nodes have found each other in a group, and its socket is there.
+    for name in ["multicast", "shared memory", "node"] {
+        let check = checks.iter().find(|check| check["check"] == name).expect("it is there");
+        assert_eq!(check["fine"], true, "{check}");
+    }
+    // What cannot be is a finding: nobody has this address.
+    let said = scenario.sinew("hip", &["doctor", "--interface", "192.0.2.1", "--json"]).json();
+    assert_eq!(said["checks"][0]["fine"], false, "{said}");
 }

@@ -1,0 +1,154 @@
+//! `sinew ping`: how long a message to an application or a node and its confirmation take.
+
+use std::time::Duration;
+
+use serde_json::json;
+use sinew::{
+    AppAddress, NodeAddress, Outcome, Rejection, Tid, Time,
+    inspect::{AppsReport, AskApps, Ping},
+};
+
+use crate::{
+    Said, apps,
+    system::{Fault, System, chosen},
+    table::clean,
+};
+
+/// So many without an answer, one after the other, are enough.
+const IN_VAIN_MAX: u32 = 3;
+
+/// What came of the pings.
+#[derive(Default)]
+struct Tally {
+    /// In nanoseconds, sorted in the end.
+    round_trips: Vec<u64>,
+    sent: u32,
+    /// What became of the last one.
+    outcome: Option<Outcome>,
+    /// Why the last one that failed did.
+    fault: Option<String>,
+}
+
+/// Sends `count` pings to a TID, a name or a node, each when the one before was answered.
+pub(crate) fn show(system: &mut System, whom: &str, count: u32) -> Result<Said, Fault> {
+    let to = find(system, whom)?;
+    let mut tally = Tally::default();
+    let mut in_vain = 0;
+    while tally.sent < count && in_vain < IN_VAIN_MAX {
+        let began = Time::now();
+        let outcome = system.endpoint.send_confirmed(to, &Ping {}, system.within);
+        tally.sent += 1;
+        tally.outcome = outcome.as_ref().ok().copied();
+        match outcome.map_err(|error| error.to_string()).and_then(|outcome| judged(outcome, system.within)) {
+            Ok(()) => {
+                in_vain = 0;
+                tally.round_trips.push(nanos(Time::now().since(began)));
+            }
+            Err(why) => {
+                in_vain += 1;
+                tally.fault = Some(why);
+            }
+        }
+    }
+    if let (Some(fault), Some(why)) = (&mut tally.fault, not_ready(system, to)) {
+        *fault = why;
+    }
+    tally.round_trips.sort_unstable();
+    Ok(tally.said(whom, to))
+}
+
+/// Whether whoever it was for has come to it.
+fn judged(outcome: Outcome, within: Duration) -> Result<(), String> {
+    match outcome {
+        // Who does not know the kind has come to it all the same.
+        Outcome::Delivered | Outcome::Rejected(Rejection::UnknownKind | Rejection::ByHandler) => Ok(()),
+        Outcome::Rejected(why) => Err(why.to_string()),
+        Outcome::Unknown => Err(format!(
+            "no answer within {within:?}: its thread is busy or hangs, or its node is cut off; look at `sinew tree` and `sinew nodes`"
+        )),
+        Outcome::Expired => Err(format!(
+            "it did not come to it within {within:?}: it is busy or hangs; look at `sinew tree`, or give more time: --deadline-ms"
+        )),
+        Outcome::Failed => Err("it failed or ended with it in hand; look at `sinew tree`".to_owned()),
+        Outcome::PeerLost => Err("its node was lost; look at `sinew nodes`".to_owned()),
+    }
+}
+
+/// Why the application at `to` is not ready, if it is not: better known than that it does not answer.
+fn not_ready(system: &mut System, to: Tid) -> Option<String> {
+    let answers = system.ask_these::<AskApps, AppsReport>(vec![(to.node, String::new())]);
+    let said = answers.into_iter().find_map(|answer| answer.said.ok())?;
+    let app = said.apps.iter().find(|app| app.tid == to && !app.ready)?;
+    Some(format!("it is not ready: {}", apps::why(app)))
+}
+
+/// An application's TID, a node's address, an application's name, a node's name: the first that it is.
+fn find(system: &mut System, whom: &str) -> Result<Tid, Fault> {
+    if whom.contains('/') {
+        return whom.parse().map_err(|why| Fault::Whom(format!("{why}")));
+    }
+    let inspection = |node: NodeAddress| Tid::new(node, AppAddress::INSPECT);
+    if let Ok(node) = whom.parse::<NodeAddress>() {
+        return Ok(inspection(node));
+    }
+    let within = system.within;
+    let resolved = system.endpoint.resolve(whom, within);
+    if let Some(tid) = resolved.map_err(|why| Fault::NoAnswer(system.path.clone(), why.to_string()))? {
+        return Ok(tid);
+    }
+    let here = system.here()?;
+    let nobody = || {
+        let whom = clean(whom);
+        Fault::Whom(format!(
+            "no application and no node is called '{whom}'; `sinew apps` and `sinew nodes` show those that are there"
+        ))
+    };
+    let nodes = chosen(&here, Some(whom)).map_err(|_| nobody())?;
+    nodes.first().map(|(node, _)| inspection(*node)).ok_or_else(nobody)
+}
+
+impl Tally {
+    /// The round trip that this share of all did not exceed, in nanoseconds.
+    fn quantile(&self, share: f64) -> Option<u64> {
+        let rank = (share * self.round_trips.len() as f64).ceil() as usize;
+        self.round_trips.get(rank.saturating_sub(1)).copied()
+    }
+
+    fn said(&self, whom: &str, to: Tid) -> Said {
+        let answered = self.round_trips.len();
+        let quantiles = [self.quantile(0.0), self.quantile(0.5), self.quantile(0.99), self.quantile(1.0)];
+        let [min, p50, p99, max] = quantiles;
+        let mut text = format!("{} ({to}): {answered} of {} answered\n", clean(whom), self.sent);
+        if let (Some(min), Some(p50), Some(p99), Some(max)) = (min, p50, p99, max) {
+            let us = |ns: u64| format!("{:.1} us", ns as f64 / 1e3);
+            text +=
+                &format!("round trip min {}, p50 {}, p99 {}, max {}\n", us(min), us(p50), us(p99), us(max));
+        }
+        if let Some(why) = &self.fault {
+            text += &format!("{}\n", clean(why));
+        }
+        let json = json!({
+            "tid": to.to_string(), "sent": self.sent, "answered": answered, "fault": self.fault,
+            "outcome": self.outcome.map(|outcome| format!("{outcome:?}")),
+            "min_ns": min, "p50_ns": p50, "p99_ns": p99, "max_ns": max,
+        });
+        Said { text, json, is_fine: self.fault.is_none() }
+    }
+}
+
+fn nanos(time: Duration) -> u64 {
+    u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_quantile_is_the_round_trip_that_so_many_did_not_exceed() {
+        let tally = Tally { round_trips: (1..=200).collect(), ..Tally::default() };
+        let [min, p50, p99, max] = [0.0, 0.5, 0.99, 1.0].map(|share| tally.quantile(share));
+        assert_eq!([min, p50, p99, max], [Some(1), Some(100), Some(198), Some(200)]);
+        assert_eq!(Tally::default().quantile(0.5), None);
+    }
+}
