@@ -186,6 +186,9 @@ impl Core {
     pub(super) fn taken_leave_of(&mut self, now: Time, from: SocketAddr, announcement: &Announcement) {
         if self.is_member_at(from, announcement) {
             self.lose(now, announcement.node, LossReason::Left);
+        } else if self.is_former_at(from, announcement) {
+            // It was silent, and has been asked since: what it answered before it left is no sign of life any more.
+            self.drop_contact(now, from);
         } else {
             let what =
                 format_args!("{from} says that {} leaves, which is no member there", announcement.node);

@@ -360,8 +360,18 @@ impl Core {
         self.contacts.entry(address).or_insert_with(|| Contact::new(now, Source::Query))
     }
 
+    /// Whether this is the last life of a lost node, which is still asked where it was.
+    pub(super) fn is_former_at(&self, address: SocketAddr, announcement: &Announcement) -> bool {
+        let Announcement { node, incarnation, boot_nonce, .. } = *announcement;
+        let is_asked = self.contacts.get(&address).is_some_and(
+            |contact| matches!(contact.role, Role::Former { node: former, .. } if former == node),
+        );
+        let is_it = |gone: &Gone| (gone.incarnation, gone.boot_nonce) == (incarnation, boot_nonce);
+        is_asked && self.gone.get(&node).is_some_and(is_it)
+    }
+
     /// Nobody that we know is at `address` any more; a seed is still asked.
-    fn drop_contact(&mut self, now: Time, address: SocketAddr) {
+    pub(super) fn drop_contact(&mut self, now: Time, address: SocketAddr) {
         let Some(contact) = self.contacts.remove(&address) else { return };
         if contact.is_seed {
             self.contacts.insert(address, Contact::new(now, Source::Seed));

@@ -19,6 +19,8 @@ mod cycle;
 mod heard;
 mod lives;
 #[cfg(test)]
+mod simulation;
+#[cfg(test)]
 mod tests;
 mod view;
 

@@ -225,6 +225,24 @@ fn a_goodbye_with_a_forged_source_or_of_another_life_changes_nothing() {
     assert_eq!(world.at(1).core.refusals().of("NDL leave of a stranger"), 2);
 }
 
+/// Found by the simulation.
+#[test]
+fn what_a_node_answered_before_its_goodbye_does_not_bring_it_back_though_it_was_lost_as_silent() {
+    // given: lost as silent, it is asked again; its answer is overtaken by its goodbye
+    let mut world = World::of_members(2);
+    world.cut(2, 1);
+    world.run_until(PERIOD * 5, |world| !world.knows(1, 2));
+    let contact = &world.at(1).core.contacts[&udp(2)];
+    let correlation = contact.questions.newest().expect("it is asked again at once").correlation;
+    let announcement = world.at(2).core.announcement().clone();
+    // when
+    world.forge(udp(2), 1, &bytes(0, Body::Leave(announcement.clone())));
+    let answer = Answer { announcement, query_sent_ns: 0, query_received_ns: 0 };
+    world.forge(udp(2), 1, &bytes(correlation, Body::Answer(answer)));
+    // then
+    assert!(!world.knows(1, 2));
+}
+
 #[test]
 fn goodbye_on_the_connection_counts_as_well() {
     let mut world = World::of_members(2);

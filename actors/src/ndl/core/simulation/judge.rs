@@ -1,0 +1,347 @@
+//! What must hold, whatever the scenario. The judge knows the truth and the network, and of a core what it sends and says.
+//!
+//! 1. No false loss: who is called silent did not answer `missed_max` questions in a row, each of which had half a
+//!    period. An answer counts from when it is in the asker's socket: that it was not read yet is the asker's own stall.
+//! 2. A loss is seen within `missed_max` plus one periods of the last sign, and the asker's own stalls.
+//! 3. A goodbye counts when it is heard, and is said to everybody who is known.
+//! 4. A life that ended never comes back after its loss or its goodbye, a former life never after a later one.
+//! 5. Found and lost alternate. Refused, left and restarted are said of lives that ended.
+//! 6. A clock is as far from ours as is said, within the bound that is said.
+//! 7. A stall of one's own is reported.
+//! 8. When the network is well again, everybody knows exactly who is there.
+
+use std::{
+    collections::{BTreeMap, BTreeSet, VecDeque},
+    net::SocketAddr,
+    time::Duration,
+};
+
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
+
+use super::plan::Plan;
+use crate::{ndl::LossReason, stores::ClockOffset};
+
+/// Questions to one address of which the judge knows when they were asked.
+const QUESTIONS_KEPT: usize = 64;
+/// What clocks and rounding add to a period, for each period: drifts are below 100 ppm.
+const DRIFT_PER_MILLE: u32 = 1;
+
+/// A question, and whether its answer has been in the asker's socket.
+struct Question {
+    correlation: u64,
+    asked: Time,
+    is_answered: bool,
+    /// Within a period; a later answer is none to a core that has asked four times since.
+    is_answered_in_time: bool,
+}
+
+/// What one process has of another one.
+struct Sight {
+    is_member: bool,
+    /// It ended before its loss, or its goodbye was heard: it cannot come back.
+    is_over: bool,
+    /// The last answer within a period of its question: when it was in the socket.
+    answered: Time,
+    /// The last sign of life that was read.
+    read: Time,
+}
+
+struct Life {
+    node: NodeAddress,
+    incarnation: Incarnation,
+    address: SocketAddr,
+    ended: Option<Time>,
+    sights: BTreeMap<usize, Sight>,
+    questions: BTreeMap<SocketAddr, VecDeque<Question>>,
+    newest: BTreeMap<NodeAddress, Incarnation>,
+    /// When it got no processor, and for how long.
+    stalls: Vec<(Time, Duration)>,
+    shells: Vec<Time>,
+    has_reported_a_stall: bool,
+}
+
+pub(super) struct Judge {
+    period: Duration,
+    missed_max: u32,
+    lateness: Duration,
+    lives: Vec<Life>,
+    pub(super) violations: Vec<String>,
+}
+
+impl Judge {
+    pub(super) const fn new(plan: &Plan) -> Self {
+        Self {
+            period: plan.period,
+            missed_max: plan.missed_max,
+            lateness: plan.lateness,
+            lives: Vec::new(),
+            violations: Vec::new(),
+        }
+    }
+
+    /// A process starts; they are counted from 0.
+    pub(super) fn started(&mut self, node: NodeAddress, incarnation: Incarnation, address: SocketAddr) {
+        self.lives.push(Life {
+            node,
+            incarnation,
+            address,
+            ended: None,
+            sights: BTreeMap::new(),
+            questions: BTreeMap::new(),
+            newest: BTreeMap::new(),
+            stalls: Vec::new(),
+            shells: Vec::new(),
+            has_reported_a_stall: false,
+        });
+    }
+
+    pub(super) fn ended(&mut self, process: usize, now: Time) {
+        self.lives[process].ended = Some(now);
+    }
+
+    pub(super) fn said_goodbye(&mut self, now: Time, process: usize, to: &BTreeSet<SocketAddr>) {
+        let sights = &self.lives[process].sights;
+        let forgotten: Vec<usize> = sights
+            .iter()
+            .filter(|(other, sight)| sight.is_member && !to.contains(&self.lives[**other].address))
+            .map(|(other, _)| *other)
+            .collect();
+        for other in forgotten {
+            self.violate(now, process, other, "is not told goodbye");
+        }
+    }
+
+    pub(super) fn shell_restarted(&mut self, process: usize, now: Time) {
+        self.lives[process].shells.push(now);
+    }
+
+    pub(super) fn stalled(&mut self, process: usize, now: Time, lasts: Duration) {
+        self.lives[process].stalls.push((now, lasts));
+    }
+
+    pub(super) fn reported_a_stall(&mut self, process: usize) {
+        self.lives[process].has_reported_a_stall = true;
+    }
+
+    pub(super) fn stall_is_over(&mut self, now: Time, process: usize, lasted: Duration) {
+        if lasted > self.period * 2 + self.lateness && !self.lives[process].has_reported_a_stall {
+            self.violate(now, process, process, &format!("does not report its own stall of {lasted:?}"));
+        }
+    }
+
+    pub(super) fn asked(&mut self, now: Time, process: usize, to: SocketAddr, correlation: u64) {
+        let questions = self.lives[process].questions.entry(to).or_default();
+        if questions.len() == QUESTIONS_KEPT {
+            questions.pop_front();
+        }
+        questions.push_back(Question {
+            correlation,
+            asked: now,
+            is_answered: false,
+            is_answered_in_time: false,
+        });
+    }
+
+    /// An answer is in the asker's socket.
+    pub(super) fn answered(&mut self, now: Time, process: usize, by: usize, correlation: u64) {
+        let from = self.lives[by].address;
+        let life = &mut self.lives[process];
+        let questions = life.questions.entry(from).or_default();
+        let Some(question) = questions
+            .iter_mut()
+            .find(|question| question.correlation == correlation && !question.is_answered)
+        else {
+            return;
+        };
+        question.is_answered = true;
+        question.is_answered_in_time = now.since(question.asked) <= self.period;
+        if question.is_answered_in_time
+            && let Some(sight) = life.sights.get_mut(&by)
+        {
+            sight.answered = now;
+        }
+    }
+
+    /// An answer was read.
+    pub(super) fn read(&mut self, now: Time, process: usize, by: usize) {
+        if let Some(sight) = self.lives[process].sights.get_mut(&by) {
+            sight.read = now;
+        }
+    }
+
+    pub(super) fn heard_goodbye(&mut self, now: Time, process: usize, from: usize) {
+        let Some(sight) = self.lives[process].sights.get_mut(&from) else { return };
+        sight.is_over = true;
+        if sight.is_member {
+            self.violate(now, process, from, "said goodbye, which was heard, and is still a member");
+        }
+    }
+
+    pub(super) fn found(&mut self, now: Time, process: usize, node: NodeAddress, incarnation: Incarnation) {
+        let Some(other) = self.life(node, incarnation) else {
+            self.violations
+                .push(format!("{now:?}: {process} found {node} in life {incarnation}, which never was"));
+            return;
+        };
+        let life = &mut self.lives[process];
+        let newest = life.newest.entry(node).or_insert(incarnation);
+        let is_former = incarnation < *newest;
+        *newest = incarnation.max(*newest);
+        let sight = life.sights.entry(other).or_insert(Sight {
+            is_member: false,
+            is_over: false,
+            answered: now,
+            read: now,
+        });
+        let was_member = std::mem::replace(&mut sight.is_member, true);
+        let came_back = sight.is_over;
+        (sight.answered, sight.read) = (now, now);
+        if was_member {
+            self.violate(now, process, other, "is found, and was a member already");
+        }
+        if came_back {
+            self.violate(now, process, other, "has ended, which was known, and is found again");
+        }
+        if is_former {
+            self.violate(now, process, other, "is found again in a former life");
+        }
+    }
+
+    pub(super) fn lost(
+        &mut self,
+        now: Time,
+        process: usize,
+        (node, incarnation): (NodeAddress, Incarnation),
+        why: LossReason,
+    ) {
+        let Some(other) = self.life(node, incarnation) else {
+            self.violations
+                .push(format!("{now:?}: {process} lost {node} in life {incarnation}, which never was"));
+            return;
+        };
+        self.check_reason(now, process, other, why);
+        self.check_in_time(now, process, other);
+        let has_ended = self.lives[other].ended.is_some();
+        let was_member = self.lives[process].sights.get_mut(&other).is_some_and(|sight| {
+            sight.is_over |= has_ended;
+            std::mem::replace(&mut sight.is_member, false)
+        });
+        if !was_member {
+            self.violate(now, process, other, "is lost, and was no member");
+        }
+    }
+
+    fn check_reason(&mut self, now: Time, process: usize, other: usize, why: LossReason) {
+        let lives = self.lives[other].ended.is_none();
+        match why {
+            LossReason::Left | LossReason::ConnectionRefused | LossReason::Restarted if lives => {
+                self.violate(now, process, other, &format!("lives, and is lost as {why:?}"));
+            }
+            LossReason::Left | LossReason::ConnectionRefused | LossReason::Restarted => {}
+            LossReason::Silent => {
+                let unanswered = self.unanswered(now, process, other);
+                if unanswered < self.missed_max as usize && lives {
+                    let words =
+                        format!("lives, did not answer {unanswered} questions, and is lost as silent");
+                    self.violate(now, process, other, &words);
+                }
+            }
+        }
+    }
+
+    /// Questions since the last answer that had half a period to be answered.
+    fn unanswered(&self, now: Time, process: usize, other: usize) -> usize {
+        let (life, address) = (&self.lives[process], self.lives[other].address);
+        let Some(sight) = life.sights.get(&other) else { return 0 };
+        let least = self.period * 49 / 100;
+        let is_missed = |question: &&Question| {
+            question.asked >= sight.answered
+                && now.since(question.asked) >= least
+                && !question.is_answered_in_time
+        };
+        life.questions.get(&address).map_or(0, |questions| questions.iter().filter(is_missed).count())
+    }
+
+    /// A member was heard of within the bound.
+    fn check_in_time(&mut self, now: Time, process: usize, other: usize) {
+        let life = &self.lives[process];
+        let Some(sight) = life.sights.get(&other) else { return };
+        let own: Duration = life
+            .stalls
+            .iter()
+            .filter(|(began, lasted)| *began + *lasted >= sight.read)
+            .map(|(_, lasted)| *lasted + self.period)
+            .sum();
+        let shells = life.shells.iter().filter(|at| **at >= sight.read).count();
+        let shells = self.period * u32::try_from(shells).expect("few restarts");
+        let periods = self.period * (self.missed_max + 1);
+        let bound = periods + periods * DRIFT_PER_MILLE / 1_000 + self.lateness * 2 + own + shells;
+        let silent = now.since(sight.read);
+        if silent > bound {
+            let words = format!("was silent for {silent:?} and is lost only now; the bound is {bound:?}");
+            self.violate(now, process, other, &words);
+        }
+    }
+
+    /// `truth` is the peer's clock minus the process's, now.
+    pub(super) fn measured(
+        &mut self,
+        now: Time,
+        process: usize,
+        (node, offset): (NodeAddress, ClockOffset),
+        truth: i64,
+    ) {
+        let error = u128::from(offset.theirs_minus_ours_ns.abs_diff(truth));
+        if error > offset.bound.as_nanos() + 2 {
+            self.violations.push(format!(
+                "{now:?}: {process} says that {node}'s clock is {} ns ahead, within {:?}: it is wrong by {error} ns",
+                offset.theirs_minus_ours_ns, offset.bound
+            ));
+        }
+    }
+
+    /// All has been well for long: `views` are the living processes and whom each core has.
+    pub(super) fn at_rest(&mut self, now: Time, views: &[(usize, BTreeSet<(NodeAddress, Incarnation)>)]) {
+        let there: BTreeSet<_> = self
+            .lives
+            .iter()
+            .filter(|life| life.ended.is_none())
+            .map(|life| (life.node, life.incarnation))
+            .collect();
+        for (process, view) in views {
+            let life = &self.lives[*process];
+            let told: BTreeSet<_> = life
+                .sights
+                .iter()
+                .filter(|(_, sight)| sight.is_member)
+                .map(|(other, _)| (self.lives[*other].node, self.lives[*other].incarnation))
+                .collect();
+            let others: BTreeSet<_> = there.iter().copied().filter(|(node, _)| *node != life.node).collect();
+            for (whose, has) in [("its core has", view), ("it has said", &told)] {
+                if *has != others {
+                    let (missing, gone): (Vec<_>, Vec<_>) =
+                        (others.difference(has).collect(), has.difference(&others).collect());
+                    self.violations.push(format!(
+                        "{now:?}: at rest, {process} ({}): {whose} not {missing:?}, who are there, and has {gone:?}, who are not",
+                        life.node
+                    ));
+                }
+            }
+        }
+    }
+
+    fn life(&self, node: NodeAddress, incarnation: Incarnation) -> Option<usize> {
+        self.lives.iter().position(|life| life.node == node && life.incarnation == incarnation)
+    }
+
+    fn violate(&mut self, now: Time, process: usize, other: usize, words: &str) {
+        let [own, other] = [process, other].map(|index| {
+            let life = &self.lives[index];
+            format!("process {index} ({} in life {})", life.node, life.incarnation)
+        });
+        self.violations.push(format!("{now:?}: to {own}, {other} {words}"));
+    }
+}

@@ -1,0 +1,84 @@
+//! What becomes of a datagram: lost, late, twice, out of order, cut off.
+
+use std::{collections::BTreeSet, net::SocketAddr, rc::Rc, time::Duration};
+
+use super::{chance::Chance, plan::Quality};
+use crate::ndl::core::Way;
+
+/// Least time on the network.
+const DELAY_MIN: Duration = Duration::from_micros(50);
+/// What the network does when all is well again.
+const HEALED: Quality = Quality {
+    lost_per_mille: 0,
+    twice_per_mille: 0,
+    delay_max: Duration::from_micros(200),
+    late_per_mille: 0,
+    late_max: Duration::ZERO,
+};
+
+/// What a datagram is, for the judge.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum What {
+    Query,
+    Answer(u64),
+    Leave,
+}
+
+/// A datagram under way; processes are counted from 0, in the order of their starts.
+#[derive(Clone, Debug)]
+pub(super) struct Flying {
+    pub(super) sender: usize,
+    pub(super) from: SocketAddr,
+    pub(super) to: SocketAddr,
+    pub(super) way: Way,
+    pub(super) what: What,
+    pub(super) bytes: Rc<[u8]>,
+}
+
+pub(super) struct Network {
+    quality: Quality,
+    /// From which node to which nothing gets through.
+    cut: BTreeSet<(usize, usize)>,
+}
+
+impl Network {
+    pub(super) const fn new(quality: Quality) -> Self {
+        Self { quality, cut: BTreeSet::new() }
+    }
+
+    pub(super) fn cut(&mut self, from: usize, to: usize) {
+        self.cut.insert((from, to));
+    }
+
+    pub(super) fn mend(&mut self, from: usize, to: usize) {
+        self.cut.remove(&(from, to));
+    }
+
+    pub(super) fn heal(&mut self) {
+        self.cut.clear();
+        self.quality = HEALED;
+    }
+
+    pub(super) fn is_cut(&self, from: usize, to: usize) -> bool {
+        self.cut.contains(&(from, to))
+    }
+
+    /// After which times a datagram arrives: not at all, once, or twice.
+    pub(super) fn delays(&self, chance: &mut Chance, from: usize, to: usize) -> Vec<Duration> {
+        let quality = self.quality;
+        if self.is_cut(from, to) || chance.happens(quality.lost_per_mille) {
+            return Vec::new();
+        }
+        let copies = if chance.happens(quality.twice_per_mille) { 2 } else { 1 };
+        (0..copies).map(|_| self.delay(chance)).collect()
+    }
+
+    fn delay(&self, chance: &mut Chance) -> Duration {
+        let most = if chance.happens(self.quality.late_per_mille) {
+            self.quality.late_max
+        } else {
+            self.quality.delay_max
+        };
+        chance.between(DELAY_MIN, most)
+    }
+}

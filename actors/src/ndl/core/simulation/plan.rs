@@ -1,0 +1,181 @@
+//! What a seed says: the nodes, the network, and what happens to them when.
+
+use std::time::Duration;
+
+use super::chance::Chance;
+
+/// How nodes find each other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Finding {
+    /// By the multicast group.
+    Group,
+    /// By lists of addresses, without multicast.
+    Seeds,
+    /// By mDNS, which tells of a node once, when it starts.
+    Mdns,
+}
+
+/// What the network does to datagrams.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Quality {
+    pub(super) lost_per_mille: u64,
+    pub(super) twice_per_mille: u64,
+    pub(super) delay_max: Duration,
+    pub(super) late_per_mille: u64,
+    pub(super) late_max: Duration,
+}
+
+/// A host's clock.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Clock {
+    pub(super) ahead_ns: i64,
+    pub(super) fast_ppm: i64,
+}
+
+/// Something that happens; nodes are counted from 0.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Happening {
+    Start { node: usize, elsewhere: bool },
+    Kill { node: usize, refuses: bool },
+    Leave { node: usize },
+    RestartShell { node: usize },
+    Stall { node: usize, lasts: Duration },
+    Cut { from: usize, to: usize },
+    Mend { from: usize, to: usize },
+    Heal,
+}
+
+/// All that a seed says.
+#[derive(Clone, Debug)]
+pub(super) struct Plan {
+    pub(super) seed: u64,
+    pub(super) nodes: usize,
+    pub(super) period: Duration,
+    pub(super) missed_max: u32,
+    pub(super) finding: Finding,
+    pub(super) quality: Quality,
+    /// How late a timer wakes a node that is not stalled, at most.
+    pub(super) lateness: Duration,
+    pub(super) clocks: Vec<Clock>,
+    /// When what happens, in order of time.
+    pub(super) happenings: Vec<(Duration, Happening)>,
+    pub(super) end: Duration,
+}
+
+impl Plan {
+    pub(super) fn of(seed: u64) -> Self {
+        let mut chance = Chance::new(seed);
+        let period = Duration::from_millis(chance.of(&[10, 50, 500]));
+        let nodes = if chance.happens(30) { 12 + chance.index(13) } else { 3 + chance.index(4) };
+        let finding = chance.of(&[Finding::Group, Finding::Group, Finding::Seeds, Finding::Mdns]);
+        let missed_max = chance.of(&[2, 3, 3, 5]);
+        let mut plan = Self {
+            seed,
+            nodes,
+            period,
+            missed_max,
+            finding,
+            quality: quality(&mut chance, period),
+            lateness: chance.of(&[Duration::ZERO, period / 50, period / 4]),
+            clocks: (0..nodes).map(|_| clock(&mut chance)).collect(),
+            happenings: Vec::new(),
+            end: Duration::ZERO,
+        };
+        let heals = period * (12 + u32::try_from(chance.below(12)).expect("below 12"));
+        plan.starts(&mut chance);
+        for _ in 0..chance.below(7) {
+            plan.fault(&mut chance, heals);
+        }
+        plan.happenings.push((heals, Happening::Heal));
+        plan.happenings.sort_by_key(|(at, _)| *at);
+        // An address where nobody answered is asked every 16 periods at last.
+        let found_again = if finding == Finding::Mdns { 18 } else { 3 };
+        plan.end = heals + plan.quality.late_max + period * (missed_max + 2 + found_again);
+        plan
+    }
+
+    fn starts(&mut self, chance: &mut Chance) {
+        let spread = if chance.happens(500) { Duration::ZERO } else { self.period * 3 };
+        for node in 0..self.nodes {
+            let at = chance.between(Duration::ZERO, spread);
+            self.happenings.push((at, Happening::Start { node, elsewhere: false }));
+        }
+    }
+
+    fn fault(&mut self, chance: &mut Chance, heals: Duration) {
+        let node = chance.index(self.nodes);
+        let begins = chance.between(self.period, heals);
+        let ends = (begins + chance.between(self.period / 10, self.period * 9)).min(heals);
+        // Nobody passes on whom it knows: two that are both where no list has them could not meet.
+        let elsewhere = chance.happens(300) && self.finding != Finding::Seeds;
+        let start = Happening::Start { node, elsewhere };
+        let mut happens = |at, what| self.happenings.push((at, what));
+        match chance.below(11) {
+            0 | 1 => happens(begins, Happening::Stall { node, lasts: ends - begins }),
+            2 => {
+                happens(begins, Happening::Kill { node, refuses: chance.happens(300) });
+                happens(ends, start);
+            }
+            3 => happens(begins, Happening::Kill { node, refuses: chance.happens(300) }),
+            4 => happens(begins, Happening::Leave { node }),
+            5 => {
+                happens(begins, Happening::Leave { node });
+                happens(ends, start);
+            }
+            6 => happens(begins, Happening::RestartShell { node }),
+            9 => {
+                // In its former life's place, while that one's answers are under way.
+                happens(begins, Happening::Kill { node, refuses: false });
+                let again = (begins + chance.between(Duration::ZERO, self.period)).min(heals);
+                happens(again, Happening::Start { node, elsewhere: false });
+            }
+            7 => self.one_way(chance.index(self.nodes), node, begins, ends),
+            8 => self.part(chance, begins, ends),
+            _ => self.flap(chance.index(self.nodes), node, begins, ends),
+        }
+    }
+
+    fn one_way(&mut self, from: usize, to: usize, begins: Duration, ends: Duration) {
+        self.happenings.push((begins, Happening::Cut { from, to }));
+        self.happenings.push((ends, Happening::Mend { from, to }));
+    }
+
+    /// Some cannot hear the others for a time, or neither side the other.
+    fn part(&mut self, chance: &mut Chance, begins: Duration, ends: Duration) {
+        let (side, both_ways) = (chance.draw(), chance.happens(500));
+        let is_there = |node: usize| side >> node & 1 == 1;
+        for from in 0..self.nodes {
+            for to in 0..self.nodes {
+                if is_there(from) && !is_there(to) || both_ways && !is_there(from) && is_there(to) {
+                    self.one_way(from, to, begins, ends);
+                }
+            }
+        }
+    }
+
+    fn flap(&mut self, from: usize, to: usize, begins: Duration, ends: Duration) {
+        let mut at = begins;
+        while at < ends {
+            let up = at + self.period / 2;
+            self.one_way(from, to, at, up.min(ends));
+            self.one_way(to, from, at, up.min(ends));
+            at = up + self.period / 3;
+        }
+    }
+}
+
+fn quality(chance: &mut Chance, period: Duration) -> Quality {
+    Quality {
+        lost_per_mille: chance.of(&[0, 0, 10, 100, 300]),
+        twice_per_mille: chance.of(&[0, 10, 200]),
+        delay_max: chance.of(&[Duration::from_micros(200), period / 20, period / 3]),
+        late_per_mille: chance.of(&[0, 0, 20, 200]),
+        late_max: chance.of(&[period, period * 6]),
+    }
+}
+
+fn clock(chance: &mut Chance) -> Clock {
+    let signed = |number: u64, most: u64| number.cast_signed() - most.cast_signed();
+    let ahead_ns = signed(chance.below(200_000_000_001), 100_000_000_000);
+    Clock { ahead_ns, fast_ppm: signed(chance.below(199), 99) }
+}

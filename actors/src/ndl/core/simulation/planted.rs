@@ -1,0 +1,154 @@
+//! Faults in the core's behaviour, planted from outside: each must be found.
+
+use std::collections::BTreeMap;
+
+use sinew_runtime::time::Time;
+
+use super::network::{Flying, What};
+use crate::ndl::{
+    LossReason, MembershipFact,
+    core::{
+        Core, Input, Output,
+        contact::{Question, Role},
+    },
+    datagram::{Announcement, Body, Datagram, parse},
+};
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Fault {
+    /// An answer does not clear what was missed before it.
+    ForgetsAnAnswer,
+    /// A late timer is taken for a timely one.
+    CountsItsOwnStall,
+    /// A former life that answers replaces the present one.
+    IgnoresIncarnation,
+    /// A goodbye is not heard.
+    DropsALeave,
+    /// A node that stops tells nobody.
+    SaysNoGoodbye,
+    /// Answers to questions from before a loss count.
+    TakesLateAnswers,
+    /// One missed answer fewer than is allowed is a loss.
+    LosesEarly,
+    /// One missed answer more than is allowed is none.
+    LosesLate,
+    /// Who is lost is never asked again.
+    ForgetsTheFormer,
+    /// What the bound of a clock is, is said to be half of it.
+    BoastsOfItsClock,
+    /// Nobody is told of a loss by silence.
+    KeepsALossToItself,
+}
+
+impl Fault {
+    pub(super) const ALL: [Self; 11] = [
+        Self::ForgetsAnAnswer,
+        Self::CountsItsOwnStall,
+        Self::IgnoresIncarnation,
+        Self::DropsALeave,
+        Self::SaysNoGoodbye,
+        Self::TakesLateAnswers,
+        Self::LosesEarly,
+        Self::LosesLate,
+        Self::ForgetsTheFormer,
+        Self::BoastsOfItsClock,
+        Self::KeepsALossToItself,
+    ];
+}
+
+/// A core, and the fault of it.
+pub(super) struct Patient {
+    pub(super) core: Core,
+    fault: Option<Fault>,
+}
+
+impl Patient {
+    pub(super) fn new(mut core: Core, fault: Option<Fault>) -> Self {
+        match fault {
+            Some(Fault::LosesEarly) => core.missed_max -= 1,
+            Some(Fault::LosesLate) => core.missed_max += 1,
+            Some(_) | None => {}
+        }
+        Self { core, fault }
+    }
+
+    pub(super) fn receive(&mut self, now: Time, flying: &Flying) {
+        match self.fault {
+            Some(Fault::DropsALeave) if flying.what == What::Leave => return,
+            Some(Fault::IgnoresIncarnation) => self.make_way_for_former_life(now, flying),
+            Some(Fault::TakesLateAnswers) => self.ask_again(now, flying),
+            Some(_) | None => {}
+        }
+        let missed: BTreeMap<_, _> =
+            self.core.members.iter().map(|(node, member)| (*node, member.missed)).collect();
+        self.core.receive(now, flying.from, flying.way, &flying.bytes);
+        if self.fault == Some(Fault::ForgetsAnAnswer) {
+            for (node, member) in &mut self.core.members {
+                member.missed = missed.get(node).copied().unwrap_or(0);
+            }
+        }
+    }
+
+    fn make_way_for_former_life(&mut self, now: Time, flying: &Flying) {
+        let Ok(Datagram { correlation, body: Body::Answer(answer), .. }) =
+            parse(self.core.me.node, &flying.bytes)
+        else {
+            return;
+        };
+        let Announcement { node, incarnation, .. } = answer.announcement;
+        let member = self.core.members.get(&node).map(|member| member.announcement.incarnation);
+        let is_taken =
+            self.core.contacts.get(&flying.from).is_some_and(|contact| contact.questions.has(correlation));
+        if is_taken && member.is_some_and(|known| incarnation < known) {
+            self.core.lose(now, node, LossReason::Restarted);
+            self.core.gone.remove(&node);
+            self.ask_again(now, flying);
+        }
+    }
+
+    fn ask_again(&mut self, now: Time, flying: &Flying) {
+        if let What::Answer(correlation) = flying.what
+            && let Some(contact) = self.core.contacts.get_mut(&flying.from)
+            && !contact.questions.has(correlation)
+        {
+            contact.questions.push(Question { correlation, asked: now });
+        }
+    }
+
+    pub(super) fn time_passed(&mut self, now: Time) {
+        while self.fault == Some(Fault::CountsItsOwnStall)
+            && let Some(due) = self.core.next_wake().filter(|due| *due < now)
+        {
+            self.core.handle(due, Input::TimePassed);
+        }
+        self.core.handle(now, Input::TimePassed);
+    }
+
+    pub(super) fn poll(&mut self) -> Option<Output> {
+        loop {
+            let mut output = self.core.poll()?;
+            match (self.fault, &mut output) {
+                (Some(Fault::SaysNoGoodbye), Output::SendLeave { .. }) => {}
+                (Some(Fault::BoastsOfItsClock), Output::ClockMeasured { offset, .. }) => {
+                    offset.bound /= 2;
+                    return Some(output);
+                }
+                (Some(Fault::KeepsALossToItself), Output::Fact(fact)) if is_silence(fact) => {}
+                (Some(Fault::ForgetsTheFormer), Output::Fact(fact)) if is_silence(fact) => {
+                    self.forget_the_former();
+                    return Some(output);
+                }
+                _ => return Some(output),
+            }
+        }
+    }
+
+    fn forget_the_former(&mut self) {
+        let contacts = &mut self.core.contacts;
+        contacts.retain(|_, contact| !matches!(contact.role, Role::Former { .. }));
+    }
+}
+
+const fn is_silence(fact: &MembershipFact) -> bool {
+    matches!(fact, MembershipFact::NodeLost { why: LossReason::Silent, .. })
+}

@@ -1,0 +1,335 @@
+//! Virtual time, one queue of events, and processes that each run a core.
+
+mod happenings;
+mod said;
+
+use std::{
+    collections::{BTreeMap, BTreeSet, VecDeque},
+    hash::{DefaultHasher, Hash, Hasher},
+    net::{Ipv4Addr, SocketAddr, SocketAddrV4},
+    rc::Rc,
+    time::{Duration, Instant},
+};
+
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
+
+use super::{
+    chance::Chance,
+    judge::Judge,
+    network::{Flying, Network, What},
+    plan::{Clock, Finding, Happening, Plan},
+    planted::{Fault, Patient},
+};
+use crate::{
+    config::NodeConfig,
+    gncl::LinkFact,
+    ndl::{
+        MembershipFact,
+        core::{Core, Input, Output, Way},
+        datagram::{Answer, Body, Datagram, encode},
+    },
+};
+
+/// Later than any clock is behind.
+const BEGIN: Time = Time::from_nanos(1_000_000_000_000);
+const PORT: u16 = 7_400;
+/// Datagrams that wait in a socket, at most: about what Linux keeps of this size by default.
+const SOCKET_MAX: usize = 256;
+/// Longest time until mDNS tells of a node, or a peer's host refuses a connection.
+const WORD_MAX: Duration = Duration::from_millis(5);
+
+/// What a run was like.
+pub(super) struct Outcome {
+    pub(super) violations: Vec<String>,
+    pub(super) seen: Seen,
+    /// Of all that was said, in order.
+    pub(super) digest: u64,
+}
+
+/// What came up, so that a plan that tries nothing is noticed.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct Seen {
+    pub(super) datagrams: u64,
+    pub(super) dropped: u64,
+    pub(super) found: u64,
+    pub(super) silent: u64,
+    pub(super) left: u64,
+    pub(super) refused: u64,
+    pub(super) restarted: u64,
+    pub(super) stalls: u64,
+}
+
+impl Seen {
+    pub(super) const fn add(&mut self, other: &Self) {
+        self.datagrams += other.datagrams;
+        self.dropped += other.dropped;
+        self.found += other.found;
+        self.silent += other.silent;
+        self.left += other.left;
+        self.refused += other.refused;
+        self.restarted += other.restarted;
+        self.stalls += other.stalls;
+    }
+
+    pub(super) fn must_cover_everything(&self, seeds: u64) {
+        let Self { datagrams, dropped, found, silent, left, refused, restarted, stalls } = *self;
+        let rarest = [datagrams, dropped, found, silent, left, refused, restarted, stalls].into_iter().min();
+        assert!(rarest.is_some_and(|count| count >= seeds / 20), "something was hardly tried: {self:?}");
+    }
+}
+
+enum Event {
+    Land(Flying),
+    Wake(usize),
+    Resume(usize),
+    Tell(usize, Input),
+    Happen(Happening),
+}
+
+struct Process {
+    node: usize,
+    patient: Patient,
+    address: SocketAddr,
+    clock: Clock,
+    is_alive: bool,
+    stalled_until: Time,
+    stalled_since: Time,
+    /// What waits in its socket while it is stalled.
+    socket: VecDeque<Flying>,
+    /// When it will look at its timer.
+    wake: Option<Time>,
+    /// Whom mDNS need not tell it of.
+    met: BTreeSet<SocketAddr>,
+    /// Whom it said goodbye to.
+    goodbyes: BTreeSet<SocketAddr>,
+}
+
+pub(super) struct World {
+    plan: Plan,
+    fault: Option<Fault>,
+    is_traced: bool,
+    chance: Chance,
+    pub(super) now: Time,
+    events: BTreeMap<(Time, u64), Event>,
+    sequence: u64,
+    network: Network,
+    judge: Judge,
+    processes: Vec<Process>,
+    /// The process of each node, and its number.
+    current: BTreeMap<usize, usize>,
+    at: BTreeMap<SocketAddr, usize>,
+    seen: Seen,
+    digest: DefaultHasher,
+    /// Time of the host that cores have taken, reading of datagrams included.
+    pub(super) in_cores: Duration,
+}
+
+fn node_address(node: usize) -> NodeAddress {
+    NodeAddress::new(0x0a00_0001 + u32::try_from(node).expect("few nodes"))
+}
+
+fn ip(node: usize) -> Ipv4Addr {
+    Ipv4Addr::from(node_address(node).bits())
+}
+
+impl World {
+    pub(super) fn new(plan: Plan, fault: Option<Fault>) -> Self {
+        let mut world = Self {
+            fault,
+            is_traced: false,
+            chance: Chance::new(!plan.seed),
+            now: BEGIN,
+            events: BTreeMap::new(),
+            sequence: 0,
+            network: Network::new(plan.quality),
+            judge: Judge::new(&plan),
+            processes: Vec::new(),
+            current: BTreeMap::new(),
+            at: BTreeMap::new(),
+            seen: Seen::default(),
+            digest: DefaultHasher::new(),
+            in_cores: Duration::ZERO,
+            plan,
+        };
+        for (at, what) in std::mem::take(&mut world.plan.happenings) {
+            world.push(BEGIN + at, Event::Happen(what));
+        }
+        world
+    }
+
+    /// Tells on standard output all that happens, if that is asked for.
+    pub(super) fn traced(mut self, is_traced: bool) -> Self {
+        self.is_traced = is_traced;
+        self.trace(|| format!("{:?}", self.plan));
+        self
+    }
+
+    fn trace(&self, words: impl FnOnce() -> String) {
+        if self.is_traced {
+            println!("{:>12.3} ms  {}", self.now.since(BEGIN).as_secs_f64() * 1e3, words());
+        }
+    }
+
+    pub(super) fn run(mut self) -> Outcome {
+        let end = BEGIN + self.plan.end;
+        self.run_until(end);
+        let views: Vec<_> = self.current.values().map(|process| (*process, self.view(*process))).collect();
+        if self.judge.violations.is_empty() {
+            self.judge.at_rest(self.now, &views);
+        }
+        let Self { judge, seen, digest, .. } = self;
+        Outcome { violations: judge.violations, seen, digest: digest.finish() }
+    }
+
+    pub(super) fn run_until(&mut self, end: Time) {
+        while let Some(entry) = self.events.first_entry().filter(|entry| entry.key().0 <= end) {
+            let ((now, _), event) = entry.remove_entry();
+            self.now = now;
+            self.happen(event);
+            if !self.judge.violations.is_empty() {
+                return;
+            }
+        }
+        self.now = end;
+    }
+
+    pub(super) fn view(&self, process: usize) -> BTreeSet<(NodeAddress, Incarnation)> {
+        let now = self.local(process);
+        let members = self.processes[process].patient.core.members(now);
+        members.into_iter().map(|member| (member.node, member.incarnation)).collect()
+    }
+
+    pub(super) const fn seen(&self) -> &Seen {
+        &self.seen
+    }
+
+    fn push(&mut self, at: Time, event: Event) {
+        self.sequence += 1;
+        self.events.insert((at, self.sequence), event);
+    }
+
+    fn happen(&mut self, event: Event) {
+        match event {
+            Event::Land(flying) => self.land(flying),
+            Event::Wake(process) => self.wake(process),
+            Event::Resume(process) => self.resume(process),
+            Event::Tell(process, input) => self.tell(process, input),
+            Event::Happen(what) => self.strike(what),
+        }
+    }
+
+    fn is_stalled(&self, process: usize) -> bool {
+        self.processes[process].stalled_until > self.now
+    }
+
+    fn wake(&mut self, process: usize) {
+        let Process { is_alive, wake, .. } = self.processes[process];
+        if is_alive && wake == Some(self.now) && !self.is_stalled(process) {
+            self.look_at_timer(process);
+        }
+    }
+
+    fn look_at_timer(&mut self, process: usize) {
+        self.processes[process].wake = None;
+        self.with(process, Patient::time_passed);
+    }
+
+    /// A process goes on after a stall: its timer and its socket are ready, and either may be first.
+    fn resume(&mut self, process: usize) {
+        if !self.processes[process].is_alive {
+            return;
+        }
+        self.trace(|| format!("{process} goes on"));
+        let is_timer_first = self.chance.happens(500);
+        if is_timer_first {
+            self.look_at_timer(process);
+        }
+        for flying in std::mem::take(&mut self.processes[process].socket) {
+            self.read(process, &flying);
+        }
+        self.look_at_timer(process);
+        let lasted = self.now.since(self.processes[process].stalled_since);
+        self.judge.stall_is_over(self.now, process, lasted);
+    }
+
+    fn tell(&mut self, process: usize, input: Input) {
+        if self.is_stalled(process) {
+            let until = self.processes[process].stalled_until;
+            self.push(until, Event::Tell(process, input));
+        } else if self.processes[process].is_alive {
+            self.trace(|| format!("{process} is told {input:?}"));
+            self.with(process, |patient, now| patient.core.handle(now, input));
+        }
+    }
+
+    fn land(&mut self, flying: Flying) {
+        let Some(process) = self.at.get(&flying.to).copied() else { return };
+        let is_stalled = self.is_stalled(process);
+        if is_stalled && self.processes[process].socket.len() >= SOCKET_MAX {
+            self.seen.dropped += 1;
+            return;
+        }
+        if let What::Answer(correlation) = flying.what {
+            self.judge.answered(self.now, process, flying.sender, correlation);
+        }
+        if is_stalled {
+            self.processes[process].socket.push_back(flying);
+        } else {
+            self.read(process, &flying);
+        }
+    }
+
+    fn read(&mut self, process: usize, flying: &Flying) {
+        if let What::Answer(_) = flying.what {
+            self.judge.read(self.now, process, flying.sender);
+        }
+        self.with(process, |patient, now| patient.receive(now, flying));
+        if flying.what == What::Leave {
+            self.judge.heard_goodbye(self.now, process, flying.sender);
+        }
+    }
+
+    /// The process's own clock.
+    fn local(&self, process: usize) -> Time {
+        let Clock { ahead_ns, fast_ppm } = self.processes[process].clock;
+        let elapsed = self.now.since(BEGIN).as_nanos().cast_signed();
+        let drift = elapsed * i128::from(fast_ppm) / 1_000_000;
+        self.now.shifted(ahead_ns + i64::try_from(drift).expect("a short run"))
+    }
+
+    /// After how long the process's clock shows `then`, never too early.
+    fn until(&self, process: usize, then: Time) -> Duration {
+        let wait = then.since(self.local(process));
+        let fast_ppm = self.processes[process].clock.fast_ppm;
+        let nanos = wait.as_nanos() * 1_000_000 / u128::from((1_000_000 + fast_ppm).unsigned_abs()) + 2;
+        if wait.is_zero() { wait } else { Duration::from_nanos(u64::try_from(nanos).expect("a short wait")) }
+    }
+
+    fn with(&mut self, process: usize, act: impl FnOnce(&mut Patient, Time)) {
+        let now = self.local(process);
+        let began = Instant::now();
+        act(&mut self.processes[process].patient, now);
+        self.in_cores += began.elapsed();
+        while let Some(output) = self.processes[process].patient.poll() {
+            self.obey(process, now, output);
+        }
+        self.set_timer(process);
+    }
+
+    fn set_timer(&mut self, process: usize) {
+        let Some(due) = self.processes[process].patient.core.next_wake() else { return };
+        let wait = self.until(process, due);
+        let on_time = self.now + wait;
+        let is_set = self.processes[process].wake.is_some_and(|wake| {
+            wake >= on_time && wake <= on_time + self.plan.lateness + Duration::from_nanos(9)
+        });
+        if !is_set {
+            let wake = on_time + self.chance.between(Duration::ZERO, self.plan.lateness);
+            self.processes[process].wake = Some(wake);
+            self.push(wake, Event::Wake(process));
+        }
+    }
+}

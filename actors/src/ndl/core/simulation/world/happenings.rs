@@ -1,0 +1,170 @@
+//! What happens to processes and to the network, as the plan says.
+
+use super::*;
+
+impl World {
+    pub(super) fn strike(&mut self, what: Happening) {
+        self.trace(|| format!("{what:?}"));
+        match what {
+            Happening::Start { node, elsewhere } => self.start(node, elsewhere),
+            Happening::Kill { node, refuses } => self.kill(node, refuses),
+            Happening::Leave { node } => self.leave(node),
+            Happening::RestartShell { node } => self.restart_shell(node),
+            Happening::Stall { node, lasts } => self.stall(node, lasts),
+            Happening::Cut { from, to } => self.network.cut(from, to),
+            Happening::Mend { from, to } => self.network.mend(from, to),
+            Happening::Heal => self.heal(),
+        }
+    }
+
+    fn config(&self, node: usize) -> NodeConfig {
+        let mut config = NodeConfig::new(format!("node-{node}"));
+        config.ndl.period = self.plan.period;
+        config.ndl.missed_max = self.plan.missed_max;
+        config.ndl.nodes_max = 64.max(self.plan.nodes + 16);
+        if self.plan.finding != Finding::Group {
+            config.ndl.multicast = None;
+        }
+        if self.plan.finding == Finding::Seeds {
+            config.ndl.seeds = (0..self.plan.nodes)
+                .filter(|other| *other != node)
+                .map(|other| SocketAddr::from((ip(other), PORT)))
+                .collect();
+        }
+        config
+    }
+
+    fn start(&mut self, node: usize, elsewhere: bool) {
+        if self.current.contains_key(&node) {
+            return;
+        }
+        let index = self.processes.len();
+        let incarnation = Incarnation(index as u64 + 1);
+        let port = if elsewhere { PORT + 1 + u16::try_from(index).expect("few lives") } else { PORT };
+        let address = SocketAddr::from((ip(node), port));
+        let (nonce, secret) = (self.chance.draw(), u128::from(self.chance.draw()));
+        let core = Core::new(&self.config(node), node_address(node), incarnation, nonce, secret);
+        self.processes.push(Process {
+            node,
+            patient: Patient::new(core, self.fault),
+            address,
+            clock: self.plan.clocks[node],
+            is_alive: true,
+            stalled_until: Time::ZERO,
+            stalled_since: Time::ZERO,
+            socket: VecDeque::new(),
+            wake: None,
+            met: BTreeSet::new(),
+            goodbyes: BTreeSet::new(),
+        });
+        self.current.insert(node, index);
+        self.at.insert(address, index);
+        self.judge.started(node_address(node), incarnation, address);
+        self.begin(index);
+        self.tell_through_mdns(index);
+    }
+
+    fn begin(&mut self, process: usize) {
+        let Process { address, node, .. } = self.processes[process];
+        let gncl = SocketAddrV4::new(ip(node), 5_000);
+        self.with(process, |patient, now| {
+            patient.core.start(now, address, gncl);
+        });
+    }
+
+    fn restart_shell(&mut self, node: usize) {
+        let Some(process) = self.current.get(&node).copied() else { return };
+        if self.processes[process].stalled_until <= self.now {
+            self.judge.shell_restarted(process, self.now);
+            self.begin(process);
+        }
+    }
+
+    /// Everybody learns of the newcomer, and it of everybody.
+    fn tell_through_mdns(&mut self, newcomer: usize) {
+        if self.plan.finding != Finding::Mdns {
+            return;
+        }
+        let others: Vec<usize> = self.current.values().copied().filter(|other| *other != newcomer).collect();
+        for other in others {
+            self.resolve(other, newcomer);
+            self.resolve(newcomer, other);
+        }
+    }
+
+    fn resolve(&mut self, process: usize, other: usize) {
+        let at = self.now + self.chance.between(Duration::ZERO, WORD_MAX);
+        let address = self.processes[other].address;
+        self.push(at, Event::Tell(process, Input::MdnsResolved { address }));
+    }
+
+    fn kill(&mut self, node: usize, refuses: bool) {
+        let Some(process) = self.end(node) else { return };
+        if !refuses {
+            return;
+        }
+        // Its host refuses connections from now on.
+        let incarnation = self.processes[process].patient.core.announcement().incarnation;
+        let (node_address, others) = (node_address(node), self.current.clone());
+        for (other, index) in others {
+            if self.network.is_cut(other, node) || self.network.is_cut(node, other) {
+                continue;
+            }
+            let at = self.now + self.chance.between(Duration::ZERO, WORD_MAX);
+            let broken = LinkFact::LinkBroken { node: node_address, incarnation };
+            let refused = LinkFact::DialRefused { node: node_address, incarnation };
+            self.push(at, Event::Tell(index, Input::Link(broken)));
+            self.push(at + WORD_MAX, Event::Tell(index, Input::Link(refused)));
+        }
+    }
+
+    fn leave(&mut self, node: usize) {
+        let Some(process) = self.current.get(&node).copied() else { return };
+        if self.processes[process].stalled_until > self.now {
+            return;
+        }
+        self.with(process, |patient, now| patient.core.handle(now, Input::Stopping));
+        let goodbyes = std::mem::take(&mut self.processes[process].goodbyes);
+        self.judge.said_goodbye(self.now, process, &goodbyes);
+        self.end(node);
+    }
+
+    fn end(&mut self, node: usize) -> Option<usize> {
+        let index = self.current.remove(&node)?;
+        let process = &mut self.processes[index];
+        process.is_alive = false;
+        process.socket.clear();
+        self.at.remove(&process.address);
+        self.judge.ended(index, self.now);
+        Some(index)
+    }
+
+    fn stall(&mut self, node: usize, lasts: Duration) {
+        let Some(index) = self.current.get(&node).copied() else { return };
+        let process = &mut self.processes[index];
+        if process.stalled_until > self.now {
+            return;
+        }
+        (process.stalled_since, process.stalled_until) = (self.now, self.now + lasts);
+        let until = process.stalled_until;
+        self.judge.stalled(index, self.now, lasts);
+        self.seen.stalls += 1;
+        self.push(until, Event::Resume(index));
+    }
+
+    fn heal(&mut self) {
+        self.network.heal();
+        if self.plan.finding != Finding::Mdns {
+            return;
+        }
+        // mDNS says its records again, and again; here only what was not of use yet.
+        let living: Vec<usize> = self.current.values().copied().collect();
+        for process in &living {
+            for other in living.iter().filter(|other| *other != process) {
+                if !self.processes[*process].met.contains(&self.processes[*other].address) {
+                    self.resolve(*process, *other);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,108 @@
+//! What cores say: datagrams go to the network, facts to the judge.
+
+use super::*;
+
+impl World {
+    pub(super) fn obey(&mut self, from: usize, now: Time, output: Output) {
+        let me = || self.processes[from].patient.core.announcement().clone();
+        match output {
+            Output::SendQuery { to, correlation } => {
+                self.judge.asked(self.now, from, to, correlation);
+                let datagram = Datagram { correlation, sent: now, body: Body::Query(me()) };
+                self.send(from, to, What::Query, &datagram);
+            }
+            Output::SendMulticastQuery { correlation } => {
+                let datagram = Datagram { correlation, sent: now, body: Body::Query(me()) };
+                self.send_to_all(from, &datagram);
+            }
+            Output::SendAnswer { to, correlation, query_sent, query_received, .. } => {
+                let (query_sent_ns, query_received_ns) = (query_sent.as_nanos(), query_received.as_nanos());
+                let answer = Answer { announcement: me(), query_sent_ns, query_received_ns };
+                let datagram = Datagram { correlation, sent: now, body: Body::Answer(answer) };
+                self.send(from, to, What::Answer(correlation), &datagram);
+            }
+            Output::SendLeave { to, .. } => {
+                let datagram = Datagram { correlation: 0, sent: now, body: Body::Leave(me()) };
+                self.processes[from].goodbyes.insert(to);
+                self.send(from, to, What::Leave, &datagram);
+            }
+            Output::Fact(fact) => self.told(from, fact),
+            Output::ClockMeasured { node, offset } => {
+                let Some(peer) = self.current.values().find(|peer| self.is_of(**peer, node)).copied() else {
+                    return;
+                };
+                let truth =
+                    self.local(peer).as_nanos().cast_signed() - self.local(from).as_nanos().cast_signed();
+                self.judge.measured(self.now, from, (node, offset), truth);
+            }
+            Output::Stalled { late } => {
+                self.trace(|| format!("{from} was late by {late:?}"));
+                self.judge.reported_a_stall(from);
+            }
+            Output::Collision { .. } | Output::AddressTaken { .. } => {
+                self.judge.violations.push(format!("{:?}: {from} says {output:?}", self.now));
+            }
+            Output::Event { .. } => {}
+        }
+    }
+
+    fn is_of(&self, process: usize, node: NodeAddress) -> bool {
+        node_address(self.processes[process].node) == node
+    }
+
+    fn told(&mut self, process: usize, fact: MembershipFact) {
+        self.trace(|| format!("{process} says {fact:?}"));
+        format!("{:?} {process} {fact:?}", self.now).hash(&mut self.digest);
+        match fact {
+            MembershipFact::NodeFound { node, incarnation, .. } => {
+                self.seen.found += 1;
+                if let Some(other) = self.current.values().copied().find(|other| self.is_of(*other, node)) {
+                    let address = self.processes[other].address;
+                    self.processes[process].met.insert(address);
+                }
+                self.judge.found(self.now, process, node, incarnation);
+            }
+            MembershipFact::NodeLost { node, incarnation, why } => {
+                use crate::ndl::LossReason::{ConnectionRefused, Left, Restarted, Silent};
+                match why {
+                    Left => self.seen.left += 1,
+                    Silent => self.seen.silent += 1,
+                    ConnectionRefused => self.seen.refused += 1,
+                    Restarted => self.seen.restarted += 1,
+                }
+                self.judge.lost(self.now, process, (node, incarnation), why);
+            }
+        }
+    }
+
+    fn send_to_all(&mut self, sender: usize, datagram: &Datagram) {
+        let from = self.processes[sender].address;
+        let bytes: Rc<[u8]> = encode(datagram, NodeAddress::ALL).as_ref().into();
+        let all: Vec<SocketAddr> = self.at.keys().copied().collect();
+        for to in all {
+            let (way, what, bytes) = (Way::Multicast, What::Query, bytes.clone());
+            self.fly(&Flying { sender, from, to, way, what, bytes });
+        }
+    }
+
+    fn send(&mut self, sender: usize, to: SocketAddr, what: What, datagram: &Datagram) {
+        let from = self.processes[sender].address;
+        let bytes = encode(datagram, NodeAddress::ALL).as_ref().into();
+        self.fly(&Flying { sender, from, to, way: Way::Unicast, what, bytes });
+    }
+
+    fn fly(&mut self, flying: &Flying) {
+        let Flying { sender, to, what, .. } = *flying;
+        self.seen.datagrams += 1;
+        let Some(receiver) = self.at.get(&to).map(|process| self.processes[*process].node) else {
+            self.trace(|| format!("{sender} sends {what:?} to {to}, where nobody is"));
+            return;
+        };
+        let delays = self.network.delays(&mut self.chance, self.processes[sender].node, receiver);
+        self.trace(|| format!("{sender} sends {what:?} to {to}, there after {delays:?}"));
+        self.seen.dropped += u64::from(delays.is_empty());
+        for delay in delays {
+            self.push(self.now + delay, Event::Land(flying.clone()));
+        }
+    }
+}
