@@ -20,7 +20,7 @@
 //! | NDL-3.2 | Such an answer, and nothing else, makes a member. |
 //! | NDL-4 | A member is lost |
 //! | NDL-4.1 | when it missed `missed_max` answers in a row: `Silent`; |
-//! | NDL-4.2 | but nobody is accused in a cycle to which our own timer came late by more than half a period; |
+//! | NDL-4.2 | but nobody is accused in a cycle to which our own timer came late by more than half a period; where it came late by less, as long again is given to read what was answered; |
 //! | NDL-4.3 | when its connection broke and is refused: `ConnectionRefused`, until it answers a later query; |
 //! | NDL-4.4 | when it says so, from its own address, in its own life: `Left`. |
 //! | NDL-5 | A node has one life at a time. |

@@ -5,7 +5,7 @@ use std::{net::SocketAddr, time::Duration};
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
 use super::{
-    Core, Output, Source,
+    Core, Member, Output, Source,
     contact::{Contact, Question, Role},
 };
 use crate::ndl::LossReason;
@@ -14,6 +14,13 @@ use crate::ndl::LossReason;
 const FORMER_WAIT_MAX: u32 = 16;
 /// Time between two reports that our own timer is late.
 const STALL_REPORT_PERIOD: Duration = Duration::from_secs(1);
+
+/// Who missed too much is lost at its end: our own timer was late, and what was answered may wait in our socket.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Respite {
+    pub(super) until: Time,
+    lasts: Duration,
+}
 
 impl Core {
     /// A shell starts, the first one or one after it: what came while there was none is its own fault, not the peers'.
@@ -24,8 +31,10 @@ impl Core {
         }
         for member in self.members.values_mut() {
             member.is_awaited = false;
+            member.missed = member.missed.min(self.missed_max - 1);
         }
         self.contests.clear();
+        self.respite = None;
         // spec: NDL-5.5
         self.settles.get_or_insert(now + self.period * (self.missed_max + 1));
         self.cycle_due = Some(now);
@@ -34,6 +43,7 @@ impl Core {
 
     pub(super) fn time_passed(&mut self, now: Time) {
         self.decide_contests(now);
+        self.end_respite(now);
         let Some(due) = self.cycle_due.filter(|due| *due <= now) else { return };
         let late = now.since(due);
         // Lifeguard's rule: who was starved himself does not accuse others. The answers that came meanwhile are still
@@ -42,7 +52,8 @@ impl Core {
             self.report_stall(now, late);
             self.cycle_due = Some(now + self.period);
         } else {
-            self.count_missed(now);
+            self.count_missed();
+            self.lose_the_silent(now, late, Duration::ZERO);
             self.cycle_due = Some(due + self.period);
         }
         self.ask_everybody(now);
@@ -55,17 +66,32 @@ impl Core {
         }
     }
 
-    // spec: NDL-4.1
-    fn count_missed(&mut self, now: Time) {
-        let mut lost: Vec<NodeAddress> = Vec::new();
-        for (node, member) in self.members.iter_mut().filter(|(_, member)| member.is_awaited) {
+    fn count_missed(&mut self) {
+        for member in self.members.values_mut().filter(|member| member.is_awaited) {
             member.missed += 1;
-            if member.missed >= self.missed_max {
-                lost.push(*node);
-            }
         }
-        for node in lost {
+    }
+
+    /// Who missed too much is lost, unless our own timer was later than is `allowed`: then what waits in our socket is
+    /// read first. Each respite allows twice what made it, so that a timer that is always late puts nothing off for ever.
+    // spec: NDL-4.1, NDL-4.2
+    fn lose_the_silent(&mut self, now: Time, late: Duration, allowed: Duration) {
+        let is_silent = |member: &Member| member.missed >= self.missed_max;
+        let silent: Vec<NodeAddress> =
+            self.members.iter().filter(|(_, member)| is_silent(member)).map(|(node, _)| *node).collect();
+        if late > allowed && !silent.is_empty() {
+            let lasts = late.min(self.period / 2);
+            self.respite = Some(Respite { until: now + lasts, lasts });
+            return;
+        }
+        for node in silent {
             self.lose(now, node, LossReason::Silent);
+        }
+    }
+
+    fn end_respite(&mut self, now: Time) {
+        if let Some(respite) = self.respite.take_if(|respite| respite.until <= now) {
+            self.lose_the_silent(now, now.since(respite.until), respite.lasts * 2);
         }
     }
 
@@ -113,6 +139,7 @@ impl Core {
             self.outputs.push_back(Output::SendLeave { to: member.address, node: *node });
         }
         self.cycle_due = None;
+        self.respite = None;
         self.contests.clear();
     }
 }

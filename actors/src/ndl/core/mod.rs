@@ -41,6 +41,7 @@ use self::{
     budget::Strangers,
     clock::PeerClock,
     contact::{Contact, Question, Questions},
+    cycle::Respite,
     lives::{Contest, Gone},
 };
 use super::{
@@ -192,6 +193,7 @@ pub(crate) struct Core {
     /// Until then, a living node with our address means that we are the newcomer.
     settles: Option<Time>,
     stall_reported: Option<Time>,
+    respite: Option<Respite>,
 
     members: BTreeMap<NodeAddress, Member>,
     gone: BTreeMap<NodeAddress, Gone>,
@@ -242,6 +244,7 @@ impl Core {
             cycle_due: None,
             settles: None,
             stall_reported: None,
+            respite: None,
             members: BTreeMap::new(),
             gone: BTreeMap::new(),
             contests: BTreeMap::new(),
@@ -335,7 +338,8 @@ impl Core {
 
     /// When [`Input::TimePassed`] is due.
     pub(crate) fn next_wake(&self) -> Option<Time> {
-        self.contests.values().map(|contest| contest.until).chain(self.cycle_due).min()
+        let contests = self.contests.values().map(|contest| contest.until);
+        contests.chain(self.respite.map(|respite| respite.until)).chain(self.cycle_due).min()
     }
 
     /// What this node says about itself.

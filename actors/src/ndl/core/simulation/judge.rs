@@ -278,7 +278,9 @@ impl Judge {
         let shells = life.shells.iter().filter(|at| **at >= sight.read).count();
         let shells = self.period * u32::try_from(shells).expect("few restarts");
         let periods = self.period * (self.missed_max + 1);
-        let bound = periods + periods * DRIFT_PER_MILLE / 1_000 + self.lateness * 2 + own + shells;
+        // Respites: each is more than twice as long as the one before, and none is longer than a timer was late.
+        let respites = self.lateness * 5;
+        let bound = periods + periods * DRIFT_PER_MILLE / 1_000 + respites + own + shells;
         let silent = now.since(sight.read);
         if silent > bound {
             let words = format!("was silent for {silent:?} and is lost only now; the bound is {bound:?}");

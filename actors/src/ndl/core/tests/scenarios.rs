@@ -135,6 +135,23 @@ fn a_starved_node_accuses_nobody() {
     }
 }
 
+/// Found by the simulation.
+#[test]
+fn an_answer_that_waits_in_our_own_socket_is_no_silence() {
+    // given: two answers are lost
+    let mut world = World::of_members(2);
+    world.run(PERIOD - ms(200));
+    world.cut(2, 1);
+    world.run(PERIOD * 2);
+    world.mend();
+    // when: the third comes while we get no processor, and we look at our timer before our socket
+    world.run(ms(100));
+    world.stall(1, PERIOD + ms(100));
+    world.run(PERIOD * 2);
+    // then
+    assert_eq!(world.losses(1), []);
+}
+
 #[test]
 fn a_restarted_shell_goes_on_with_the_members_and_accuses_nobody() {
     // given: a shell that was away for three periods, its datagrams lost
