@@ -3,12 +3,12 @@
 use std::sync::{Mutex, mpsc::sync_channel};
 
 use sinew::{
-    NodeHandle, Sender,
+    NodeApi, NodeHandle, Registration, Sender,
     audit::{Account, Audit, NodeAudit, Place},
     prelude::*,
 };
 use sinew_tests::{
-    DEADLINE, Ground, all_run,
+    DEADLINE, Ground, OwnDirectory, all_run,
     puppet::{Job, Order, Stage, Value, desk, outcome_of_job, wait},
     sees, until,
 };
@@ -104,6 +104,44 @@ fn every_sort_of_end_in_a_node_is_counted_and_nothing_is_unexplained() {
     balances(&audit);
     assert_eq!(mailbox(&audit, "sink"), Account::default());
     assert_eq!(audit.account(&Place::OtherMailboxes).taken, account.taken);
+}
+
+#[test]
+fn what_a_client_is_given_is_counted_while_it_is_there_and_when_it_has_gone() {
+    let (directory, ground) = (OwnDirectory::new(), Ground::new());
+    let socket = directory.join("node.sock");
+    let ((sink, _log), (desk, key)) = (Stage::new().app("sink"), desk("desk"));
+    let door = socket.clone();
+    let node = ground.node("one").configure(move |config| config.lncl.socket = Some(door));
+    let node = node.app(sink).app(desk).start().expect("a node");
+    all_run(&[&node]);
+    let (handle, sender) = (node.handle(), key.sender());
+    // Given
+    let api = NodeApi::connect(&socket).expect("the door is open");
+    let mut far = api.register_transport_address(Registration::new().name("far")).expect("the name is free");
+    // When
+    for number in 0..7 {
+        sender.send(far.tid(), &Job { number }).expect("there is room");
+    }
+    let sink = handle.resolve("sink").expect("it is registered");
+    assert_eq!(
+        far.send_confirmed(sink, &Job { number: 7 }, DEADLINE).expect("an outcome"),
+        Outcome::Delivered
+    );
+    // Then: beside the 7 messages it was sent an outcome
+    let audit = handle.audit_here();
+    balances(&audit);
+    let place = Place::Client { app: far.tid().app, name: "far".to_owned() };
+    let account = audit.account(&place);
+    assert_eq!((account.taken, account.own, account.delivered), (8, 1, 8), "{account:?}");
+    // And
+    far.unregister().expect("the node answers");
+    let former = until("it has gone", || {
+        let audit = handle.audit_here();
+        balances(&audit);
+        (audit.account(&place) == Account::default()).then(|| audit.account(&Place::OtherClients))
+    });
+    assert_eq!(former.delivered - former.own, 7, "{former:?}");
 }
 
 /// The audit of the whole system once nothing waits or is under way. At every moment before, nothing is unexplained.

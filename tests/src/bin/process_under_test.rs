@@ -3,13 +3,14 @@
 //! `process_under_test CONFIG.toml [--place thread|process|io] [--requires NAME] [--on-lost pause|restart]
 //! [--dies-at-start CODE] [--neighbour-hangs MILLIS] [--talks] [--stays]
 //! [--swells-at-start MIB] [--starts-in MILLIS] [--starts-within MILLIS] [--ramps-for MILLIS]
-//! [--tree rest-for-one|escalation] [--hangs-in started|factory TOKEN]`
+//! [--tree rest-for-one|escalation] [--hangs-in started|factory TOKEN] [--audits]`
 //!
 //! The application `drive` does as it is told (`Order`), and says what it sees, one line each. With a neighbour there is another
 //! one on the `io` thread, which blocks that thread a moment after its start for so long; if for 0 ms, each life of it for ever.
 //! A drive that talks tells its number to an application `witness` all the time, which says whom it heard. A program that
 //! stays goes on after the end of its node, until its standard input ends. In a tree it is under the supervisor `leg`, behind
-//! an application `leader` of the same kind in a thread; for an escalation, `leg` restarts one by one, and once.
+//! an application `leader` of the same kind in a thread; for an escalation, `leg` restarts one by one, and once. A node that audits says what
+//! became of the drive's messages whenever that has changed.
 
 use std::{
     os::unix::process::CommandExt,
@@ -18,7 +19,11 @@ use std::{
 };
 
 use rustix::process::{Signal, getpid, kill_process};
-use sinew::{ReadyGate, prelude::*};
+use sinew::{
+    NodeHandle, ReadyGate,
+    audit::{Account, Place},
+    prelude::*,
+};
 use sinew_tests::orders::{Count, Level, Me, Order, Who};
 
 #[derive(Default)]
@@ -308,8 +313,33 @@ impl Handler<Delivery<Count>> for Witness {
     }
 }
 
-/// Runs the node to its end, and the program beyond it if it `stays`.
-fn run(node: Node, stays: bool) -> ExitCode {
+/// Says what became of the messages of the drive, and of how many that is not known, whenever it has changed.
+fn audit(node: &NodeHandle) {
+    let mut said = String::new();
+    loop {
+        let audit = node.audit_here();
+        let is_drives = |place: &Place| matches!(place, Place::Mailbox { name, .. } if name == "drive");
+        let entries = audit.entries.iter().filter(|entry| is_drives(&entry.place));
+        let account: Account = entries.map(|entry| entry.account).sum();
+        let Account { delivered, failed, waiting, .. } = account;
+        let unexplained: i64 = audit.entries.iter().map(|entry| entry.account.unexplained()).sum();
+        let words = format!(
+            "audit: {delivered} delivered, {failed} failed, {waiting} waiting, {unexplained} unexplained"
+        );
+        if words != said {
+            say(&words);
+            said = words;
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+/// Runs the node to its end, and the program beyond it if it `stays`; says meanwhile what became of messages if it `audits`.
+fn run(node: Node, stays: bool, audits: bool) -> ExitCode {
+    if audits {
+        let handle = node.handle();
+        std::thread::spawn(move || audit(&handle));
+    }
     let code = node.run();
     if stays {
         say("node has ended");
@@ -381,7 +411,7 @@ fn main() -> ExitCode {
     match builder.start() {
         Ok(node) => {
             say("is up");
-            run(node, stays)
+            run(node, stays, is_set("--audits"))
         }
         Err(error) => {
             say(&format!("refused {error}"));

@@ -8,6 +8,8 @@ use std::{
     time::{Duration, Instant},
 };
 
+use sinew::Audit;
+
 use super::{
     Performer, Stage, StageLimits,
     entry::{Entry, Poster},
@@ -44,26 +46,37 @@ pub struct Report {
     seconds: f64,
     seed: u64,
     refused: u64,
+    /// What the node itself says of all messages, at the end.
+    pub audit: Audit,
 }
 
 impl Report {
-    /// The law held, and every kind of message was there.
+    /// The law held, in the history and in the node's own counters, and every kind of message was there.
     #[must_use]
     pub fn holds(&self) -> bool {
-        self.account.holds() && self.account.of(Fate::Delivered) > 0 && self.account.confirmed > 0
+        self.audit.missing() == 0
+            && self.account.holds()
+            && self.account.of(Fate::Delivered) > 0
+            && self.account.confirmed > 0
     }
 }
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { account, seconds, seed, refused } = self;
+        let Self { account, seconds, seed, refused, audit } = self;
         let rate = account.sent() as f64 / seconds;
         writeln!(
             f,
             "seed {seed}: {} messages in {seconds:.1} s, {rate:.0} a second; the node refused {refused}",
             account.sent()
         )?;
-        write!(f, "{account}")
+        write!(f, "{account}")?;
+        // A line for each of so many applications is read when something is wrong.
+        if audit.missing() > 0 {
+            write!(f, "\n{audit}")
+        } else {
+            write!(f, "\nthe audit explains every message")
+        }
     }
 }
 
@@ -188,7 +201,8 @@ pub fn run(plan: Plan) -> Report {
     let ledger = cast.ledger.clone();
     let mut stage = cast.end();
     let refused = stage.refused();
+    let audit = stage.audit();
     stage.end();
     let account = lock(&ledger).account();
-    Report { account, seconds: began.elapsed().as_secs_f64(), seed, refused }
+    Report { account, seconds: began.elapsed().as_secs_f64(), seed, refused, audit }
 }

@@ -47,6 +47,11 @@ pub(super) fn play(arguments: &[String]) {
         match &*question {
             "quiet" => poster::be_quiet(),
             "panic" => node.handle().inject("LNCL", Fault::panic()).expect("every node has it"),
+            "audit" => {
+                let audit = node.handle().audit(DEADLINE).expect("it runs, and nobody else asks");
+                let line = serde_json::to_string(&audit).expect("every field can be written");
+                say(&format!("audit {line}"));
+            }
             "refused" => say(&format!("refused {}", node.handle().refused())),
             _ => panic!("{question:?} is nothing that the node answers"),
         }

@@ -5,6 +5,8 @@ use std::{
     sync::mpsc::{Receiver, sync_channel},
 };
 
+use sinew::Audit;
+
 use super::Performer;
 use crate::{DEADLINE, OwnDirectory};
 
@@ -127,6 +129,15 @@ impl Stage {
     pub fn refused(&mut self) -> u64 {
         self.node.tell("refused");
         self.wait_for("refused").parse().expect("a number")
+    }
+
+    /// What the node says of where every message is.
+    ///
+    /// # Panics
+    /// If it does not say.
+    pub fn audit(&mut self) -> Audit {
+        self.node.tell("audit");
+        serde_json::from_str(&self.wait_for("audit")).expect("an audit")
     }
 
     /// The files in the directories that the node and the cast may write to: beside the socket, and temporary ones.

@@ -34,6 +34,19 @@ fn a_killed_process_is_replaced_and_the_messages_behind_are_kept_in_order() {
 }
 
 #[test]
+fn an_audit_knows_what_is_lent_to_a_process_and_what_fails_when_it_is_killed() {
+    let mut scenario = Scenario::start(&["--audits"]);
+    let first = scenario.who();
+    scenario.order(Order::Hold(500));
+    scenario.node.wait_for(&["holds"]);
+    (1..=20).for_each(|number| scenario.count(number));
+    // The order that is in its hand, and those behind it, wherever they wait.
+    scenario.node.wait_for(&["audit: 1 delivered, 0 failed, 21 waiting, 0 unexplained"]);
+    signal(first.pid, Signal::KILL);
+    scenario.node.wait_for(&["audit: 21 delivered, 1 failed, 0 waiting, 0 unexplained"]);
+}
+
+#[test]
 fn every_death_is_survived_and_named_and_fails_the_message_in_hand() {
     let deaths = [
         (Order::Exit(3), "its process ended: exit code 3"),
