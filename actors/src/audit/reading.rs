@@ -97,8 +97,8 @@ pub(crate) fn read(stores: &Stores) -> NodeAudit {
         }
     }
     let buried = stores.gncl.buried();
-    count(Place::ToFormerNodes, Account::of_outlet(&buried.sent));
-    count(Place::FromFormerNodes, Account::of_arrivals(&buried.arrived));
+    count(Place::ToFormerNodes, buried.sent);
+    count(Place::FromFormerNodes, buried.arrived);
     let entries = entries.into_iter().filter(|(_, account)| !account.is_empty());
     NodeAudit {
         node: stores.node,

@@ -21,10 +21,11 @@ use tokio::sync::Notify;
 
 use super::{
     core::{Attach, Lane},
-    way::{Arrived, Ends, Offered, Way, WayAccount},
+    way::{Ends, Offered, Way, WayAccount},
 };
 use crate::{
-    outlet::{OutletAccount, OutletCounts},
+    audit::Account,
+    outlet::OutletCounts,
     refusals::Refusals,
     stores::{Stores, lock},
 };
@@ -47,8 +48,8 @@ pub(crate) struct Peer {
 /// What became of the messages to and from lives of peers that are gone, all together.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Buried {
-    pub(crate) sent: OutletAccount,
-    pub(crate) arrived: Arrived,
+    pub(crate) sent: Account,
+    pub(crate) arrived: Account,
 }
 
 impl Drop for Peer {
@@ -56,10 +57,9 @@ impl Drop for Peer {
         let accounts = self.accounts();
         let mut buried = lock(&self.buried);
         for WayAccount { sent, arrived, .. } in accounts {
-            buried.sent = buried.sent + sent;
+            buried.sent = buried.sent + Account::of_outlet(&sent);
             // What still waited for applications is gone with it, and its receipts say so.
-            let failed = arrived.failed + arrived.waiting;
-            buried.arrived = buried.arrived + Arrived { failed, waiting: 0, ..arrived };
+            buried.arrived = buried.arrived + Account::of_arrivals(&arrived).over();
         }
     }
 }

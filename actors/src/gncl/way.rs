@@ -88,22 +88,6 @@ pub(crate) struct Arrived {
     pub(crate) waiting: u64,
 }
 
-impl std::ops::Add for Arrived {
-    type Output = Self;
-
-    fn add(self, other: Self) -> Self {
-        Self {
-            taken: self.taken + other.taken,
-            handed_on: self.handed_on + other.handed_on,
-            told: self.told + other.told,
-            expired: self.expired + other.expired,
-            refused: self.refused + other.refused,
-            failed: self.failed + other.failed,
-            waiting: self.waiting + other.waiting,
-        }
-    }
-}
-
 /// Where every message of a session is, both ways.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct WayAccount {

@@ -48,25 +48,6 @@ pub(crate) struct OutletAccount {
     pub(crate) unacknowledged: u64,
 }
 
-impl std::ops::Add for OutletAccount {
-    type Output = Self;
-
-    fn add(self, other: Self) -> Self {
-        Self {
-            taken: self.taken + other.taken,
-            own: self.own + other.own,
-            refused: self.refused + other.refused,
-            arrived: self.arrived + other.arrived,
-            superseded: self.superseded + other.superseded,
-            expired: self.expired + other.expired,
-            lost: self.lost + other.lost,
-            unknown: self.unknown + other.unknown,
-            waiting: self.waiting + other.waiting,
-            unacknowledged: self.unacknowledged + other.unacknowledged,
-        }
-    }
-}
-
 impl<S: Socket> Half<S> {
     pub(super) fn account(&self) -> (OutletAccount, Option<Sent>) {
         let (counts, tally) = (self.counts, self.tally);
