@@ -7,6 +7,7 @@ use std::{
         Arc,
         mpsc::{Receiver, SyncSender, TrySendError, sync_channel},
     },
+    time::Duration,
 };
 
 use sinew_runtime::{
@@ -23,6 +24,8 @@ use super::{
 };
 use crate::{log, stores::Stores};
 
+/// After each report: whoever asks without end takes neither the core nor the layers' locks for itself.
+const REST: Duration = Duration::from_millis(1);
 /// Questions that wait at most.
 pub(super) const WAITING_MAX: usize = 32;
 
@@ -55,8 +58,13 @@ pub(crate) fn begin(stores: &Arc<Stores>) -> io::Result<()> {
 fn serve(questions: &Receiver<Message>, answers: &Answers) {
     for (number, question) in (1..).zip(questions) {
         // spec: INSPECT-5. The question is dropped with the panic, and its receipt says `Failed`.
+        let is_ping = question.header.kind == Kind::PING;
         if catch_unwind(AssertUnwindSafe(|| answer(answers, number, question))).is_err() {
             log::error!("an answer of the inspection panicked; the next question is answered");
+        }
+        // spec: INSPECT-2
+        if !is_ping {
+            std::thread::sleep(REST);
         }
     }
 }

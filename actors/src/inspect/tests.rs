@@ -1,17 +1,23 @@
 //! What becomes of questions: answered within bounds, refused, or too many.
 
-use std::sync::mpsc::sync_channel;
+use std::{
+    sync::{
+        Arc,
+        mpsc::{Receiver, SyncSender, sync_channel},
+    },
+    time::Duration,
+};
 
 use sinew_runtime::{
-    outcome::Rejection,
-    router::Outlet as _,
+    outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
+    router::{LocalRoute, Outlet as _},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
-    wire::{Header, Kind, Message, decode, encode},
+    wire::{Flags, Header, Kind, Message, Payload as _, decode, encode},
 };
 
 use super::{
     inspector::{Inbox, WAITING_MAX},
-    reports::{AppReport, AppsReport, Report as _},
+    reports::{AppReport, AppsReport, AskApps, AskNode, AskTree, NodeReport, Report as _},
 };
 use crate::{config::NodeConfig, stores::Stores};
 
@@ -45,7 +51,7 @@ fn more_questions_than_may_wait_are_refused() {
 fn the_thread_that_answers_does_not_keep_a_node_alive() {
     let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
     super::begin(&stores).expect("a thread");
-    let weak = std::sync::Arc::downgrade(&stores);
+    let weak = Arc::downgrade(&stores);
     drop(stores);
     assert!(weak.upgrade().is_none(), "nobody has asked, so that nobody has it in hand");
 }
@@ -64,4 +70,90 @@ fn what_has_no_room_in_an_answer_is_counted() {
 fn an_answer_has_its_maximum_of_entries_and_not_one_more() {
     assert!(decode::<AppsReport>(&encode(&report(super::APPS_MAX as u32))).is_ok());
     assert!(decode::<AppsReport>(&encode(&report(super::APPS_MAX as u32 + 1))).is_err());
+}
+
+/// The watchdog of a test that waits.
+const DEADLINE: Duration = Duration::from_secs(10);
+
+struct Ledger(SyncSender<Outcome>);
+
+impl ReceiptSink for Ledger {
+    fn settle(&self, _: Ticket, outcome: Outcome) {
+        self.0.send(outcome).expect("the test waits");
+    }
+}
+
+/// A node without layers, and an application of it that asks.
+struct Bench {
+    stores: Arc<Stores>,
+    asker: Tid,
+    replies: Receiver<Message>,
+}
+
+impl Bench {
+    fn new(config: NodeConfig) -> Self {
+        let stores = Stores::for_test(config, Incarnation(1));
+        super::begin(&stores).expect("a thread");
+        let (put, replies) = sync_channel(8);
+        let asker = Tid::new(stores.node, AppAddress::fixed(0).expect("the first one"));
+        let route = LocalRoute { outlet: Arc::new(Inbox(put)), events: Arc::new([]) };
+        stores.router.set_local(asker.app, route);
+        Self { stores, asker, replies }
+    }
+
+    /// What becomes of a question of this kind.
+    fn outcome(&self, kind: Kind, flags: Flags) -> Outcome {
+        let (say, heard) = sync_channel(1);
+        let to = Tid::new(self.stores.node, AppAddress::INSPECT);
+        let mut message = Message::new(Header::new(kind, self.asker, to), bytes::Bytes::from_static(&[0x80]));
+        message.header.flags = flags;
+        message.header.correlation = 7;
+        message.receipt = Some(Receipt::new(Arc::new(Ledger(say)), message.ticket()));
+        self.stores.router.send(message).expect("there is room");
+        heard.recv_timeout(DEADLINE).expect("every question ends")
+    }
+
+    fn reply(&self) -> Message {
+        self.replies.recv_timeout(DEADLINE).expect("a reply")
+    }
+}
+
+#[test]
+fn a_question_is_answered_and_what_is_none_is_refused() {
+    // Given
+    let bench = Bench::new(NodeConfig::new("knee"));
+    // When, then
+    assert_eq!(bench.outcome(AskNode::KIND, Flags::ASK), Outcome::Delivered);
+    let reply = bench.reply();
+    let said: NodeReport = reply.decode().expect("a report");
+    assert_eq!((said.name.as_str(), said.incarnation, said.peers.len()), ("knee", Incarnation(1), 0));
+    assert!(reply.header.flags.has(Flags::REPLY) && reply.header.correlation == 7);
+    let refused = Outcome::Rejected;
+    assert_eq!(bench.outcome(AskNode::KIND, Flags::NONE), refused(Rejection::Unsupported));
+    assert_eq!(bench.outcome(Kind::named("test.other"), Flags::ASK), refused(Rejection::UnknownKind));
+    assert_eq!(bench.outcome(Kind::PING, Flags::NONE), Outcome::Delivered);
+    // And: a question whose answer cannot be had does not cost the next one
+    drop(bench.stores.posts.root.close());
+    assert_eq!(bench.outcome(AskTree::KIND, Flags::ASK), refused(Rejection::Closed));
+    assert_eq!(bench.outcome(AskApps::KIND, Flags::ASK), Outcome::Delivered);
+}
+
+#[test]
+fn an_answer_is_no_longer_than_a_payload_may_be() {
+    let mut config = NodeConfig::new("knee");
+    config.payload_max = 64;
+    let bench = Bench::new(config);
+    // Without a peer there is nothing to leave out of it.
+    assert_eq!(bench.outcome(AskNode::KIND, Flags::ASK), Outcome::Rejected(Rejection::TooLong));
+    assert_eq!(bench.outcome(AskApps::KIND, Flags::ASK), Outcome::Delivered);
+    assert!(bench.reply().payload.len() <= 64);
+}
+
+#[test]
+fn nobody_answers_for_a_node_that_has_ended() {
+    let bench = Bench::new(NodeConfig::new("knee"));
+    bench.stores.close();
+    let to = Tid::new(bench.stores.node, AppAddress::INSPECT);
+    let late = Message::new(Header::new(Kind::PING, bench.asker, to), bytes::Bytes::new());
+    assert_eq!(bench.stores.router.send(late), Err(Rejection::NoSuchApplication));
 }
