@@ -243,7 +243,8 @@ fn run(
         });
         let listener = move |fact: SupervisorFact| {
             let is_last = matches!(fact, SupervisorFact::Ended(_));
-            say.send((Time::now(), fact)).unwrap();
+            // A test that has seen enough listens no more.
+            let _ = say.send((Time::now(), fact));
             if is_last {
                 actix::System::current().stop();
             }
