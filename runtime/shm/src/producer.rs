@@ -145,7 +145,7 @@ impl Producer {
     }
 
     /// Whether the consumer has announced that it sleeps.
-    #[cfg(test)]
+    #[cfg(all(test, not(any(loom, miri))))]
     pub(crate) fn peer_sleeps(&self) -> bool {
         self.core.peer_sleeps()
     }

@@ -122,7 +122,7 @@ impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
     }
 
     /// Whether the consumer has announced that it sleeps.
-    #[cfg(test)]
+    #[cfg(all(test, not(any(loom, miri))))]
     pub(crate) fn peer_sleeps(&self) -> bool {
         self.peer.load(Word::ConsumerSleep) % 2 == 1
     }
