@@ -2,6 +2,7 @@
 
 mod forks;
 mod owed;
+mod unread;
 
 use std::{sync::Arc, time::Duration};
 
@@ -405,22 +406,6 @@ fn what_a_slow_client_has_not_read_waits_and_comes_in_order() {
 }
 
 #[test]
-fn a_client_that_never_reads_costs_a_bounded_queue() {
-    let node = TestNode::start_with(|config| config.mailbox_capacity = 4);
-    let app = node.local(1);
-    let (_client, tid) = RawClient::register(&node, &Register::default());
-    let mut refused = 0;
-    // The socket takes some hundred kilobytes.
-    for _ in 0..200 {
-        let header = Header::new(Kind::named("blob"), app.tid, tid);
-        let result = node.stores.router.send(Message::new(header, vec![0; 8_192].into()));
-        refused += u32::from(result == Err(Rejection::QueueFull));
-    }
-    assert!(refused > 0);
-    assert_alive(&node);
-}
-
-#[test]
 fn the_end_of_lncl_is_told_and_frees_what_it_served() {
     let mut node = TestNode::start();
     let (mut client, tid) = RawClient::register(&node, &named("drive"));
@@ -432,55 +417,10 @@ fn the_end_of_lncl_is_told_and_frees_what_it_served() {
     assert!(!node.path().exists());
 }
 
-#[test]
-fn what_expires_while_a_client_does_not_read_is_said_to_its_sender() {
-    let node = TestNode::start();
-    let app = node.local(1);
-    let (_client, tid) = RawClient::register(&node, &Register::default());
-    let deadline = Time::now() + WATCHDOG;
-    for correlation in 1.. {
-        assert!(Time::now() < deadline, "waited for a message to expire in the queue");
-        // Given: the queue is full; soon the socket is, too.
-        while node.stores.router.send(filler(app.tid, tid)).is_ok() {}
-        // When: a message with a time to live waits in another class, if it does not find room in the socket just now.
-        let outcome = send_for_5_ms(&node, app.tid, tid, correlation);
-        // Then
-        match outcome.recv_timeout(Duration::from_millis(200)) {
-            Ok(outcome) => return assert_eq!(outcome, Outcome::Expired),
-            Err(_) => continue,
-        }
-    }
-}
-
-fn send_for_5_ms(
-    node: &TestNode,
-    from: Tid,
-    to: Tid,
-    correlation: u64,
-) -> std::sync::mpsc::Receiver<Outcome> {
-    let (outcome, receiver) = std::sync::mpsc::sync_channel(1);
-    let mut message = confirmed(from, to, correlation);
-    message.header.sent = Time::now();
-    message.header.time_to_live_us = u32::try_from(Duration::from_millis(5).as_micros()).unwrap();
-    let ticket = sinew_runtime::outcome::Ticket { source: from, destination: to, correlation };
-    message.receipt = Some(sinew_runtime::outcome::Receipt::new(Arc::new(Told(outcome)), ticket));
-    node.stores.router.send(message).unwrap();
-    receiver
-}
-
 fn filler(source: Tid, destination: Tid) -> Message {
     let mut header = Header::new(Kind::named("blob"), source, destination);
     header.class = Class::Bulk;
     Message::new(header, vec![0; 8_192 - HEADER_LEN].into())
-}
-
-struct Told(std::sync::mpsc::SyncSender<Outcome>);
-
-impl sinew_runtime::outcome::ReceiptSink for Told {
-    fn settle(&self, _: sinew_runtime::outcome::Ticket, outcome: Outcome) {
-        // Nobody waits for one that found room in the socket.
-        let _ = self.0.send(outcome);
-    }
 }
 
 const DOCUMENTATION: &str = include_str!("../../../docs/protocol/lncl.md");
