@@ -8,7 +8,7 @@ use sinew_runtime::{
     router::Refused,
     tid::Tid,
     time::Time,
-    wire::{Checksum, Class, Flags, Message},
+    wire::{Checksum, Class, Flags, Kind, Message},
 };
 
 use super::{
@@ -305,6 +305,14 @@ impl<S: Socket> Half<S> {
     ) -> Result<(), Refused> {
         if !matches!(self.link, Link::Up(_)) {
             return Err(Refused::new(message, Rejection::Closed));
+        }
+        if message.header.kind == Kind::GNCL_ACK
+            && let Some(older) = self.urgent.iter_mut().find(|older| older.header.kind == Kind::GNCL_ACK)
+        {
+            // The newer one says all that the older one does. So it is never one too many: without the last one, the peer would keep for
+            // ever what was taken, and hold back what is for an application that takes again.
+            *older = message;
+            return Ok(());
         }
         if self.urgent.len() >= waiting_max {
             return Err(Refused::new(message, Rejection::QueueFull));

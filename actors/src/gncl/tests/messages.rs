@@ -9,8 +9,12 @@ use sinew_runtime::{
     wire::{Class, Flags, Kind, Message},
 };
 
-use super::bench::{ByHand, KIND, NINE, Node, next, pair, run, within};
-use crate::stores::ClockOffset;
+use super::bench::{ByHand, KIND, LONGEST, NINE, Node, introduction, next, pair, run, within};
+use crate::{
+    gncl::core::{Introduction, read},
+    session::Ack,
+    stores::ClockOffset,
+};
 
 /// A message as the peer that is written by hand sends it.
 fn from_nine(node: &Node, payload: &[u8]) -> Message {
@@ -236,5 +240,38 @@ fn what_only_a_nodes_own_layers_say_no_peer_says_to_an_application() {
             came.push(message.header.kind);
         }
         assert!(came.is_empty(), "an application got {came:x?} from another node");
+    });
+}
+
+#[test]
+fn a_peer_that_did_not_read_for_long_hears_in_the_end_all_that_was_taken() {
+    run(async {
+        const COUNT: u64 = 1_500;
+        // Given a peer that does not read, and a node whose connection to it takes no more.
+        let mut node = Node::start_with(1, |config| config.payload_max = LONGEST).await;
+        let hello = Introduction { payload_max: LONGEST as u64, ..introduction(node.address()) };
+        let mut peer = ByHand::greeting(&node, &hello).await;
+        node.up().await;
+        let outlet = |node: &Node| node.stores.gncl.peer(NINE).expect("it is linked");
+        while outlet(&node).waiting() == 0 {
+            node.send(Tid::new(NINE, AppAddress::new(0x1001)), &vec![0; LONGEST]);
+        }
+        // When it sends more than has room in as many words as may wait.
+        let mut inbox = node.app(1);
+        for _ in 0..COUNT {
+            peer.say(&from_nine(&node, b"")).await;
+        }
+        for _ in 0..COUNT {
+            next("its message", &mut inbox).await;
+        }
+        // Then it hears, as soon as it reads, that all of them were taken.
+        let mut heard = 0;
+        while heard <= COUNT {
+            let message = peer.try_hear_any().await.expect("the node has a word about the rest");
+            if message.header.kind == Kind::GNCL_ACK {
+                heard = read::<Ack>(&message.payload).expect("an ACK has a payload").next;
+            }
+        }
+        assert_eq!(heard, COUNT + 1);
     });
 }
