@@ -14,8 +14,6 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rustix::process::setpriority_process;
-
 use super::{
     Performer, Stage, StageLimits,
     held::{Held, files_of_the_host},
@@ -27,6 +25,9 @@ use crate::{DEADLINE, dice::Dice, until};
 const VICTIMS: u16 = 4;
 /// Kills before anything is measured.
 const WARM_UP: u32 = 20;
+/// Processes that wait to take the place of those that end: they are started while nothing is measured, since what starting
+/// a program costs a machine of two CPUs is not what is asked here.
+const UNDERSTUDIES: u32 = 20;
 /// Growth of the memory of one process that its allocator may have for itself.
 const GROWTH_MAX_KIB: u64 = 2 * 1024;
 
@@ -43,9 +44,6 @@ pub struct Plan {
     pub reference: Duration,
     /// Decides who is killed when.
     pub seed: u64,
-    /// Those that are killed yield the CPUs to all others: what is measured is what their end costs the node and its other
-    /// clients, not what starting a process costs a machine of two CPUs.
-    pub yields: bool,
 }
 
 /// What was seen.
@@ -113,11 +111,21 @@ struct Cast {
     stage: Stage,
     steady: Vec<(&'static str, Performer)>,
     answers: Receiver<String>,
-    victims: Vec<Option<(Performer, Arc<AtomicBool>)>>,
+    victims: Vec<Option<Victim>>,
+    understudies: Vec<Victim>,
     started: u64,
     dice: Dice,
     held_loans: u32,
     ended_by_themselves: u32,
+}
+
+/// A process that is killed, and what it has said.
+struct Victim {
+    performer: Performer,
+    /// It runs, and waits for its place.
+    waits: Arc<AtomicBool>,
+    /// All its addresses hold loans.
+    holds: Arc<AtomicBool>,
 }
 
 /// How a victim ends.
@@ -152,32 +160,50 @@ impl Cast {
             steady,
             answers,
             victims,
+            understudies: Vec::new(),
             started: 0,
             dice,
             held_loans: 0,
             ended_by_themselves: 0,
         };
-        if cast.plan.yields {
-            // Inherited by every process that this thread starts from now on.
-            setpriority_process(None, 19).expect("anybody may be nicer");
-        }
-        (0..VICTIMS).for_each(|victim| cast.start(victim));
+        cast.fill();
         cast
     }
 
-    fn start(&mut self, victim: u16) {
-        self.started += 1;
-        let holds = Arc::new(AtomicBool::new(false));
-        let arguments = [victim.into(), VICTIMS.into(), self.plan.seed ^ self.started];
-        let arguments = arguments.map(|number: u64| number.to_string());
-        let says_so = holds.clone();
-        let hear = move |line: &str| says_so.store(line == "holds", Ordering::Relaxed);
-        let performer = self.stage.start("victim", &arguments, hear);
-        self.victims[usize::from(victim)] = Some((performer, holds));
+    /// Starts processes that wait for their place.
+    fn prepare(&mut self, how_many: u32) {
+        for _ in 0..how_many {
+            self.started += 1;
+            let (waits, holds) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
+            let (says_it_waits, says_it_holds) = (waits.clone(), holds.clone());
+            let hear = move |line: &str| match line {
+                "waits" => says_it_waits.store(true, Ordering::Relaxed),
+                "holds" => says_it_holds.store(true, Ordering::Relaxed),
+                _ => panic!("no victim says {line:?}"),
+            };
+            let seed = (self.plan.seed ^ self.started).to_string();
+            let performer = self.stage.start("victim", &[VICTIMS.to_string(), seed], hear);
+            self.understudies.push(Victim { performer, waits, holds });
+        }
+        until("all understudies wait", || {
+            self.understudies.iter().all(|one| one.waits.load(Ordering::Relaxed)).then_some(())
+        });
     }
 
-    fn end(&mut self, victim: u16, how: End) {
-        let Some((performer, holds)) = self.victims[usize::from(victim)].take() else { return };
+    /// Every place is taken.
+    fn fill(&mut self) {
+        self.prepare(VICTIMS.into());
+        (0..VICTIMS).for_each(|place| self.take_place(place));
+    }
+
+    fn take_place(&mut self, place: u16) {
+        let mut victim = self.understudies.pop().expect("as many were started as end");
+        victim.performer.tell(&place.to_string());
+        self.victims[usize::from(place)] = Some(victim);
+    }
+
+    fn end(&mut self, place: u16, how: End) {
+        let Some(Victim { performer, holds, .. }) = self.victims[usize::from(place)].take() else { return };
         match how {
             End::Killed => self.ended_by_themselves += u32::from(!performer.kill()),
             End::InOrder => self.ended_by_themselves += u32::from(!performer.end().success()),
@@ -185,19 +211,33 @@ impl Cast {
         self.held_loans += u32::from(holds.load(Ordering::Relaxed));
     }
 
+    /// Measures only while somebody ends and another one takes the place, not while processes are started.
     fn end_some(&mut self, times: u32, how: End) {
-        for _ in 0..times {
-            thread::sleep(self.dice.time_below(self.plan.spacing * 2));
-            let victim = self.dice.below(VICTIMS.into()) as u16;
-            self.end(victim, how);
-            self.start(victim);
+        let mut left = times;
+        while left > 0 {
+            let bout = left.min(UNDERSTUDIES);
+            left -= bout;
+            self.tell_pinger("rest");
+            self.prepare(bout);
+            self.tell_pinger("measure");
+            for _ in 0..bout {
+                thread::sleep(self.dice.time_below(self.plan.spacing * 2));
+                let place = self.dice.below(VICTIMS.into()) as u16;
+                self.end(place, how);
+                self.take_place(place);
+            }
+            thread::sleep(self.plan.spacing);
         }
+    }
+
+    fn tell_pinger(&mut self, order: &str) {
+        self.steady.last_mut().expect("it is the pinger").1.tell(order);
     }
 
     /// What the pinger measured since the last one; at least one round trip.
     fn window(&mut self) -> Window {
         until("a round trip ends", || {
-            self.steady.last_mut().expect("it is the pinger").1.tell("window");
+            self.tell_pinger("window");
             let window = Window::read(&self.answers.recv_timeout(DEADLINE).expect("the pinger answers"));
             (window.count + window.failed > 0).then_some(window)
         })
@@ -245,7 +285,7 @@ pub fn run(plan: Plan) -> Report {
     cast.window();
     let before = cast.held_at_rest(None);
     let files = cast.files();
-    (0..VICTIMS).for_each(|victim| cast.start(victim));
+    cast.fill();
     thread::sleep(cast.plan.spacing * 2);
 
     cast.window();

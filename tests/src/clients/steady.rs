@@ -73,6 +73,7 @@ impl fmt::Display for Window {
 }
 
 /// `SOCKET [NAME]`: asks the one of this name, directly where it can, or the echo, and says what it measured since it was last told to (`window`).
+/// What it asks while it is told to `rest` is not measured, until it is told to `measure`.
 pub(super) fn play_pinger(arguments: &[String]) {
     let api = NodeApi::connect(&arguments[0]).expect("the door is open");
     let (name, is_direct) = arguments.get(1).map_or((ECHO, false), |name| (&**name, true));
@@ -81,16 +82,18 @@ pub(super) fn play_pinger(arguments: &[String]) {
     let echo = endpoint.resolve(name, DEADLINE).expect("the node answers").expect("it is ready");
     let measured: Arc<Mutex<(Vec<Duration>, u64)>> = Arc::default();
     let measuring = measured.clone();
+    let measures = Arc::new(AtomicBool::new(true));
+    let is_measured = measures.clone();
     thread::spawn(move || {
         for number in 0.. {
-            let asked = Instant::now();
+            let (asked, counts) = (Instant::now(), is_measured.load(Ordering::Relaxed));
             let answer = endpoint.ask::<Order, Order>(echo, &Order { number }, DEADLINE);
             let took = asked.elapsed();
             let mut measured = measuring.lock().unwrap_or_else(PoisonError::into_inner);
             match answer {
                 Ok(answer) => {
                     assert_eq!(answer.number, number, "the answer to another question");
-                    measured.0.push(took);
+                    measured.0.extend(counts.then_some(took));
                 }
                 Err(error) => {
                     eprintln!("question {number} after {took:?}: {error}");
@@ -103,11 +106,19 @@ pub(super) fn play_pinger(arguments: &[String]) {
     });
     say(&"up");
     for order in told() {
-        assert_eq!(order, "window");
-        let (times, failed) = std::mem::take(&mut *measured.lock().unwrap_or_else(PoisonError::into_inner));
-        let Window { count, failed, p50_us, p99_us, max_us } = Window::of(times, failed);
-        say(&format!("{count} {failed} {p50_us} {p99_us} {max_us}"));
+        match &*order {
+            "rest" => measures.store(false, Ordering::Relaxed),
+            "measure" => measures.store(true, Ordering::Relaxed),
+            "window" => say_window(&measured),
+            _ => panic!("the pinger is told {order:?}"),
+        }
     }
+}
+
+fn say_window(measured: &Mutex<(Vec<Duration>, u64)>) {
+    let (times, failed) = std::mem::take(&mut *measured.lock().unwrap_or_else(PoisonError::into_inner));
+    let Window { count, failed, p50_us, p99_us, max_us } = Window::of(times, failed);
+    say(&format!("{count} {failed} {p50_us} {p99_us} {max_us}"));
 }
 
 /// `SOCKET NAME`: answers questions, and lets go of everything else. Leaves a child behind if it is told to (`fork`).

@@ -29,14 +29,16 @@ const WHILE: Duration = Duration::from_millis(8);
 /// What is written to memory that was lent and is never sent.
 const SCRAP: &str = "victim.scrap";
 
-/// `SOCKET PROCESS PROCESSES SEED`
+/// `SOCKET PROCESSES SEED`: waits until it is told which of the processes it is.
 pub(super) fn play(arguments: &[String]) {
     let number = |index: usize| arguments[index].parse::<u64>().expect("a number");
-    let (process, processes) = (number(1) as u16, number(2) as u16);
+    say(&"waits");
+    let Some(place) = told().next() else { return };
+    let (process, processes) = (place.parse::<u16>().expect("a number"), number(1) as u16);
     let api = NodeApi::connect(&arguments[0]).expect("the door is open");
     for index in 0..ADDRESSES {
         let (api, me) = (api.clone(), process * ADDRESSES + index);
-        let dice = Dice::new(number(3) ^ u64::from(me) << 40);
+        let dice = Dice::new(number(2) ^ u64::from(me) << 40);
         thread::spawn(move || Victim::register(&api, me, processes * ADDRESSES, dice).work());
     }
     told().for_each(drop);
