@@ -77,10 +77,7 @@ impl Payload for Last {
 pub(crate) fn measure(carrier: Carrier, packets: usize, pinning: Pinning) {
     let at = At::loopback();
     let role = format!("sink {} {packets} {} {}", carrier.name(), pinning.name(), at.host(2));
-    let took = match carrier {
-        Carrier::Confirmed | Carrier::Unconfirmed => between_nodes(carrier, packets, at, &role),
-        Carrier::Tcp => raw(packets, &role),
-    };
+    let took = run(carrier, packets, at, &role);
     let mut seen = Figures::new();
     seen.record(took / u32::try_from(packets).expect("no flood has so many"));
     let rate = packets as u128 * 1_000_000_000 / took.as_nanos().max(1);
@@ -88,6 +85,14 @@ pub(crate) fn measure(carrier: Carrier, packets: usize, pinning: Pinning) {
     let case = format!("flood_{}_{}", carrier.name(), pinning.name());
     Alone { bench: "gncl", case: &case, figure: "time for each packet", seen: &seen, counts: &counts }
         .report();
+}
+
+/// How long all of them take to the process of this role, which is the [`sink`] at the second address.
+pub(crate) fn run(carrier: Carrier, packets: usize, at: At, role: &str) -> Duration {
+    match carrier {
+        Carrier::Confirmed | Carrier::Unconfirmed => between_nodes(carrier, packets, at, role),
+        Carrier::Tcp => raw(packets, role),
+    }
 }
 
 /// The end that takes them.

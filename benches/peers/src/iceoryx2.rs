@@ -10,8 +10,8 @@ use sinew_figures::{
 };
 
 use crate::{
-    DEADLINE,
     path::{Path, echo_role},
+    ping::DEADLINE,
 };
 
 /// Round trips.

@@ -12,21 +12,28 @@
 //! their node's IO thread and on threads of their own.
 //!
 //! A flood is one way: 1000 bytes as fast as they go until the last one is there, each kept until it can be sent.
+//!
+//! Sinew's applications are those of its own bench, `cargo bench -p sinew --bench gncl`.
 
+mod applications;
 mod flood;
 mod iceoryx2;
+#[path = "../../../actors/benches/gncl/nodes.rs"]
+#[allow(dead_code, reason = "the bench has cases in namespaces besides")]
 mod nodes;
+#[path = "../../../actors/benches/gncl/flood.rs"]
+#[allow(dead_code, reason = "the bench has a report of its own")]
+mod one_way;
 mod path;
+#[path = "../../../actors/benches/ping/mod.rs"]
+mod ping;
 mod raw;
 mod shared_memory;
 mod zenoh;
 
-use std::{process::ExitCode, time::Duration};
+use std::process::ExitCode;
 
 use clap::Parser;
-
-/// No wait of this program is longer.
-const DEADLINE: Duration = Duration::from_secs(60);
 
 /// Sinew beside iceoryx2, zenoh and what the system itself gives: round trips and floods, one table.
 #[derive(Parser)]

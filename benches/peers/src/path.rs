@@ -5,7 +5,7 @@ use std::process::Stdio;
 use sinew_figures::{Beside, End, Figures, Pace, Pinning, Rounds, process::command, stream};
 
 use crate::{
-    flood, iceoryx2, nodes, raw,
+    applications, flood, iceoryx2, raw,
     shared_memory::{self, Way},
     zenoh,
 };
@@ -69,7 +69,7 @@ impl Path {
             Self::Iceoryx2Event | Self::Iceoryx2Poll => iceoryx2::measure(self, rounds, pinning),
             Self::Endpoints(way) => shared_memory::measure(way, rounds, pinning),
             Self::Zenoh => zenoh::measure(rounds, pinning),
-            Self::NodesIo | Self::NodesOwn => nodes::measure(self, rounds, pinning),
+            Self::NodesIo | Self::NodesOwn => applications::measure(self, rounds, pinning),
         }
     }
 
@@ -81,7 +81,7 @@ impl Path {
             Self::Iceoryx2Event | Self::Iceoryx2Poll => iceoryx2::echo(self, bytes, at),
             Self::Endpoints(way) => shared_memory::echo(way, at),
             Self::Zenoh => zenoh::echo(at),
-            Self::NodesIo | Self::NodesOwn => nodes::echo(self, at),
+            Self::NodesIo | Self::NodesOwn => applications::echo(self, at),
         }
     }
 }

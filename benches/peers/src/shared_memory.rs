@@ -11,8 +11,8 @@ use sinew_runtime::wire::Kind;
 use tokio::runtime::{Builder, Runtime};
 
 use crate::{
-    DEADLINE,
     path::{Path, echo_role},
+    ping::DEADLINE,
 };
 
 /// How long who looks before he sleeps does so: longer than any round trip.

@@ -19,8 +19,8 @@ use zenoh::{
 };
 
 use crate::{
-    DEADLINE,
     path::{Path, echo_role},
+    ping::DEADLINE,
 };
 
 const THERE: &str = "sinew/peers/there";
