@@ -375,4 +375,8 @@ impl<S: Socket> Outlet for StreamOutlet<S> {
         }
         result
     }
+
+    fn cancel(&self, ticket: Ticket) -> bool {
+        self.with(|half, after| half.cancel(ticket, after))
+    }
 }

@@ -17,7 +17,7 @@ pub enum Outcome {
     Delivered,
     /// It was refused and not handled.
     Rejected(Rejection),
-    /// Its time to live ran out before it was handled.
+    /// Its time to live ran out before it was handled, or, of a request, whoever asked waited no more before it was.
     Expired,
     /// The destination's handler panicked, or its application ended with the message in hand.
     Failed,

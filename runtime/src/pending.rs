@@ -1,7 +1,7 @@
 //! What an application waits for: outcomes of its confirmed messages and replies to its requests.
 
 use std::{
-    collections::HashMap,
+    collections::{HashMap, VecDeque},
     sync::{Arc, Mutex},
     task::{Context, Poll, Waker},
 };
@@ -11,10 +11,15 @@ use crate::{
     post::lock,
     router::{Outlet, Refused},
     tid::Tid,
+    time::Time,
     wire::{Flags, Header, Kind, Message},
 };
 
-/// The table of what one application waits for. It outlives the application's incarnations.
+/// Requests to one application of which it is known that nobody waits any more: of more the oldest is forgotten, and its
+/// deadline is all that says so.
+const UNWANTED_MAX: usize = 1_024;
+
+/// The table of what one application waits for, and of who does not wait for it any more. It outlives the application's incarnations.
 #[derive(Debug)]
 pub struct Pending {
     inner: Mutex<Inner>,
@@ -26,6 +31,11 @@ struct Inner {
     next: u64,
     /// Not a tree: that would allocate whenever the first wait is opened.
     slots: HashMap<u64, Slot>,
+    /// Replies that came when nobody waited for them any more.
+    late: u64,
+    /// Requests that were taken out of the mailbox before they were given up: who asked, the request's number, and when it was
+    /// given up: a later life of whoever asked counts anew.
+    unwanted: VecDeque<(Tid, u64, Time)>,
 }
 
 #[derive(Debug)]
@@ -66,7 +76,8 @@ impl Pending {
     /// to the former is taken for one to its own.
     #[must_use]
     pub fn numbered_from(first: u64, capacity: usize) -> Arc<Self> {
-        Arc::new(Self { inner: Mutex::new(Inner { next: first, slots: HashMap::new() }), capacity })
+        let inner = Inner { next: first, slots: HashMap::new(), late: 0, unwanted: VecDeque::new() };
+        Arc::new(Self { inner: Mutex::new(inner), capacity })
     }
 
     /// Opens a wait for what `from` says; its number is the message's correlation. `None` if too many are open.
@@ -101,11 +112,36 @@ impl Pending {
         Err(message)
     }
 
+    /// Replies that came when nobody waited for them any more, and were dropped.
+    #[must_use]
+    pub fn late_replies(&self) -> u64 {
+        lock(&self.inner).late
+    }
+
+    /// Nobody waits any more for the reply to this request, which is not in the mailbox.
+    fn give_up(&self, ticket: Ticket) {
+        let unwanted = &mut lock(&self.inner).unwanted;
+        if unwanted.len() >= UNWANTED_MAX {
+            unwanted.pop_front();
+        }
+        unwanted.push_back((ticket.source, ticket.correlation, Time::now()));
+    }
+
+    /// Whether `source` is known to have given up its request of this number, which it sent at `sent`.
+    pub(crate) fn is_given_up(&self, source: Tid, correlation: u64, sent: Time) -> bool {
+        let is_it =
+            |(by, number, at): &(Tid, u64, Time)| (*by, *number) == (source, correlation) && sent <= *at;
+        lock(&self.inner).unwanted.iter().any(is_it)
+    }
+
     fn settle_with(&self, id: u64, from: Tid, settlement: Settlement) {
         let waker = {
             let mut inner = lock(&self.inner);
-            // Nobody waits any more: the deadline passed, or the asking incarnation is gone.
-            let Some(slot) = inner.slots.get_mut(&id) else { return };
+            let Some(slot) = inner.slots.get_mut(&id) else {
+                // Nobody waits any more: the deadline passed, or the asking incarnation is gone.
+                inner.late += u64::from(matches!(settlement, Settlement::Reply(_)));
+                return;
+            };
             let is_answer = match (&settlement, slot.awaited) {
                 (Settlement::Outcome(_), Awaited::Outcome) | (Settlement::Reply(_), Awaited::Reply) => true,
                 (Settlement::Outcome(outcome), Awaited::Reply) => *outcome != Outcome::Delivered,
@@ -157,6 +193,12 @@ impl Wait {
         slot.waker = Some(cx.waker().clone());
         Poll::Pending
     }
+
+    /// Whether nothing has come yet.
+    pub(crate) fn is_open(&self) -> bool {
+        let inner = lock(&self.pending.inner);
+        inner.slots.get(&self.id).is_some_and(|slot| slot.settled.is_none())
+    }
 }
 
 impl Drop for Wait {
@@ -191,6 +233,14 @@ impl<O: Outlet> Outlet for AppOutlet<O> {
 
     fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
         if is_answer(&message.header) { self.submit(message) } else { self.inbox.offer(message, room) }
+    }
+
+    fn cancel(&self, ticket: Ticket) -> bool {
+        if !self.inbox.cancel(ticket) {
+            // Its handler has it, or had it, and may reply yet.
+            self.pending.give_up(ticket);
+        }
+        true
     }
 }
 
@@ -240,6 +290,30 @@ mod tests {
         assert!(pending.open(Awaited::Outcome, Tid::NONE).is_none());
         drop(wait);
         assert!(pending.open(Awaited::Outcome, Tid::NONE).is_some());
+    }
+
+    #[test]
+    fn a_reply_that_comes_too_late_is_counted() {
+        let pending = Pending::new(1);
+        let late = pending.open(Awaited::Reply, Tid::NONE).unwrap();
+        let mut header = Header::new(Kind::named("reply"), Tid::NONE, Tid::NONE);
+        (header.flags, header.correlation) = (Flags::REPLY, late.correlation());
+        drop(late);
+        pending.intercept(Message::new(header, bytes::Bytes::new())).unwrap();
+        assert_eq!(pending.late_replies(), 1);
+    }
+
+    #[test]
+    fn of_requests_that_were_given_up_the_newest_are_known_and_a_later_life_counts_anew() {
+        let pending = Pending::new(1);
+        let asker = Tid::from_bits(7);
+        let request = |correlation| Ticket { source: asker, destination: Tid::NONE, correlation };
+        let before = Time::now();
+        (0..=UNWANTED_MAX as u64).for_each(|number| pending.give_up(request(number)));
+        assert!(!pending.is_given_up(asker, 0, before), "the oldest is forgotten");
+        assert!(pending.is_given_up(asker, 1, before));
+        assert!(!pending.is_given_up(Tid::from_bits(8), 1, before), "somebody else's");
+        assert!(!pending.is_given_up(asker, 1, Time::now() + std::time::Duration::from_secs(1)));
     }
 
     #[test]

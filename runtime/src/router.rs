@@ -12,7 +12,7 @@ use std::{
 use arc_swap::ArcSwap;
 
 use crate::{
-    outcome::Rejection,
+    outcome::{Rejection, Ticket},
     post::lock,
     tid::{AppAddress, NodeAddress, Tid},
     wire::{Flags, Kind, Message},
@@ -35,6 +35,13 @@ pub trait Outlet: Send + Sync {
     fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
         let _ = room;
         self.submit(message)
+    }
+
+    /// Nobody waits any more for the reply to the request that `ticket` names: if it waits here, it is taken out and ends as
+    /// [`Outcome::Expired`](crate::outcome::Outcome::Expired), as if its time were over. Returns whether it was, or whoever has it is told.
+    fn cancel(&self, ticket: Ticket) -> bool {
+        let _ = ticket;
+        false
     }
 }
 
@@ -169,6 +176,21 @@ impl Router {
             Some(route) => route.outlet.offer(message, room),
             None => Err(Refused::new(message, Rejection::NoSuchApplication)),
         }
+    }
+
+    /// Nobody waits any more for the reply to this request, which came from here or from another node; see [`Outlet::cancel`].
+    pub fn cancel(&self, ticket: Ticket) -> bool {
+        let Tid { node, app } = ticket.destination;
+        if let Some(uplink) = &self.uplink {
+            return uplink.cancel(ticket);
+        }
+        let table = self.table.load();
+        let outlet = if node == self.node {
+            table.local.get(&app).map(|route| &route.outlet)
+        } else {
+            table.peers.get(&node)
+        };
+        outlet.is_some_and(|outlet| outlet.cancel(ticket))
     }
 
     /// Counts a message that nobody takes, and settles it so.

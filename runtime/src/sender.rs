@@ -270,8 +270,25 @@ impl Sender {
         message.header.class = Class::Control;
         message.header.flags = Flags::ASK;
         let wait = self.expect_answer(&mut message, Awaited::Reply, within)?;
+        let destination = self.shared.router.absolute(message.header.destination);
+        let ticket = Ticket { source: self.shared.tid, destination, correlation: wait.correlation() };
         self.dispatch(message)?;
-        Ok(Reply { deadline: Deadline::new(wait, within), within, reply: PhantomData })
+        let request = Some(Request { router: self.shared.router.clone(), ticket });
+        Ok(Reply { deadline: Deadline::new(wait, within), within, request, reply: PhantomData })
+    }
+
+    /// Whether whoever asked still waits for the reply, as far as is known here: its deadline is not over, and it has not given
+    /// up. For a handler that works long, or replies later: what nobody wants need not be done.
+    #[must_use]
+    pub fn is_wanted(&self, request: &ReplyTo) -> bool {
+        let ReplyTo { source, correlation, sent, until } = *request;
+        Time::now() <= until && !self.shared.pending.is_given_up(source, correlation, sent)
+    }
+
+    /// Replies to requests of this application that came when nobody waited for them any more, and were dropped.
+    #[must_use]
+    pub fn late_replies(&self) -> u64 {
+        self.shared.pending.late_replies()
     }
 
     /// Answers a request.
@@ -369,6 +386,28 @@ impl Sender {
 pub struct ReplyTo {
     pub(crate) source: Tid,
     pub(crate) correlation: u64,
+    pub(crate) sent: Time,
+    pub(crate) until: Time,
+}
+
+impl ReplyTo {
+    /// When whoever asked stops waiting, in this host's clock; [`Time::MAX`] if it never does.
+    #[must_use]
+    pub const fn deadline(&self) -> Time {
+        self.until
+    }
+}
+
+/// A request whose reply is awaited.
+struct Request {
+    router: Arc<Router>,
+    ticket: Ticket,
+}
+
+impl std::fmt::Debug for Request {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Request({:?})", self.ticket)
+    }
 }
 
 /// A wait with its deadline. The timer is made at the first poll: by the runtime of the thread that polls, and where there is
@@ -420,11 +459,16 @@ impl Future for Confirmation {
 
 /// The future reply to a request. Any thread may poll it, with any executor; in a runtime of tokio's, one whose time is
 /// enabled.
+///
+/// Dropping it before it has ended gives the request up: where it still waits for its handler it is taken back, on any node, and
+/// a handler that has begun can [see](Sender::is_wanted) it.
 #[derive(Debug)]
 #[must_use = "a reply that nobody reads need not be asked for"]
 pub struct Reply<R> {
     deadline: Deadline,
     within: Duration,
+    /// `None` once this has ended.
+    request: Option<Request>,
     reply: PhantomData<fn() -> R>,
 }
 
@@ -432,10 +476,22 @@ impl<R: Payload> Future for Reply<R> {
     type Output = Result<R, AskError>;
 
     fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Self::Output> {
-        Poll::Ready(match ready!(self.deadline.poll(cx)) {
+        let settled = ready!(self.deadline.poll(cx));
+        // At its deadline it expires where it waits, by itself.
+        self.request = None;
+        Poll::Ready(match settled {
             Some(Settlement::Reply(message)) => message.decode().map_err(AskError::from),
             Some(Settlement::Outcome(outcome)) => Err(AskError::Ended(outcome)),
             None => Err(AskError::Deadline(self.within)),
         })
+    }
+}
+
+impl<R> Drop for Reply<R> {
+    fn drop(&mut self) {
+        let Some(Request { router, ticket }) = self.request.take() else { return };
+        if self.deadline.wait.is_open() {
+            router.cancel(ticket);
+        }
     }
 }

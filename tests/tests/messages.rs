@@ -158,6 +158,52 @@ fn requests_that_nobody_waits_for_any_more_take_no_places_and_their_late_replies
     );
 }
 
+/// Replies only when nobody waits any more.
+struct Ponderer;
+
+impl Actor for Ponderer {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<Question>> for Ponderer {
+    type Result = ();
+
+    fn handle(&mut self, question: Delivery<Question>, context: &mut Self::Context) {
+        let Some(to) = question.reply_to() else { return };
+        assert!(context.is_wanted(&question), "it was not given up before it was handled");
+        let sender = context.sender();
+        let pondering = async move {
+            while sender.is_wanted(&to) {
+                actix::clock::sleep(Duration::from_millis(1)).await;
+            }
+            sender.reply(to, &Answer { number: question.number }).expect("the way back is free");
+        };
+        context.spawn(pondering.into_actor(self));
+    }
+}
+
+#[test]
+fn a_handler_sees_that_nobody_waits_for_its_reply_any_more_and_a_late_reply_is_counted() {
+    let _nodes = tell(
+        |node| node.app(AppSpec::new("ponderer", || Ponderer).handles::<Question>()),
+        &["ponderer"],
+        async |sender: sinew::Sender| {
+            let ask = |within| sender.ask::<_, Answer>("ponderer", &Question { number: 1 }, within);
+            // Given up by whoever asked: the deadline is beyond the test's.
+            let reply = ask(DEADLINE * 2).expect("it is sent");
+            let behind = sender.send_confirmed("ponderer", &Question { number: 2 }, DEADLINE);
+            assert_eq!(behind.expect("it is sent").await, Outcome::Delivered, "so the request is handled");
+            drop(reply);
+            // Its time is over.
+            let over = ask(Duration::from_millis(100)).expect("it is sent").await;
+            assert!(over.is_err(), "nobody replied in time");
+            while sender.late_replies() < 2 {
+                actix::clock::sleep(Duration::from_millis(1)).await;
+            }
+        },
+    );
+}
+
 #[test]
 fn all_that_was_sent_arrives_before_the_node_that_sent_it_is_gone() {
     const WORDS: usize = 900;

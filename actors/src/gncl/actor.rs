@@ -26,8 +26,8 @@ use tokio::net::TcpStream;
 use super::{
     Event, LinkFact,
     core::{
-        Attach, CLASSES, ConnectionId, Core, Decline, Input, Introduction, Lane, Output, Refusal, Settings,
-        read, write,
+        Attach, CANCEL, CLASSES, ConnectionId, Core, Decline, Input, Introduction, Lane, Output, Refusal,
+        Settings, read, write,
     },
     inbound::Inbound,
     link::{self, Mode, News, Reading, SharedMode, What},
@@ -357,7 +357,7 @@ fn settings(stores: &Stores) -> Settings {
             peer: NodeAddress::HERE,
             dial: 0,
             payload_max: payload_max as u64,
-            features: vec![CLASSES.to_owned()],
+            features: [CLASSES, CANCEL].map(str::to_owned).to_vec(),
             lane: Lane::Control,
             link: 0,
         },

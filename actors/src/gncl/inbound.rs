@@ -78,6 +78,10 @@ impl Inbound {
             self.outcome(now, &message);
             return Some(End::Told);
         }
+        if header.kind == Kind::CANCEL {
+            self.cancel(way, message.ticket());
+            return Some(End::Told);
+        }
         self.attach_receipt(&mut message);
         if !header.kind.is_user() && !header.destination.app.is_layer() {
             // An application takes such words for those of its own node's layers.
@@ -161,6 +165,16 @@ impl Inbound {
     fn attach_receipt(&self, message: &mut Message) {
         if message.header.flags.has(Flags::CONFIRM) {
             message.receipt = Some(Receipt::new(self.peer.clone(), message.ticket()));
+        }
+    }
+
+    /// Whoever asked waits no more: what it asked for is taken back where it waits here. spec: GNCL-15
+    fn cancel(&self, way: &Way, ticket: Ticket) {
+        let line = (Class::Control as u64) << 32 | u64::from(ticket.destination.app.bits());
+        if let Some(mut request) = way.take_back(line, ticket) {
+            request.settle(Outcome::Expired);
+        } else if ticket.destination.node == self.stores.node {
+            self.stores.router.cancel(ticket);
         }
     }
 

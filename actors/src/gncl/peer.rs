@@ -42,6 +42,8 @@ pub(crate) struct Peer {
     pub(crate) incarnation: Incarnation,
     /// A session for each class, or one for all.
     ways: Vec<Way>,
+    /// Whether it knows [`CANCEL`](Kind::CANCEL).
+    takes_cancels: bool,
     buried: Arc<Mutex<Buried>>,
 }
 
@@ -72,7 +74,8 @@ impl Peer {
         let refusals = &stores.gncl.refusals;
         let ways = (0..ways).map(|_| Way::new(now, ends, &stores.config, refusals)).collect();
         let buried = stores.gncl.buried.clone();
-        Self { node: attach.node, incarnation: attach.incarnation, ways, buried }
+        let Attach { node, incarnation, takes_cancels, .. } = *attach;
+        Self { node, incarnation, ways, takes_cancels, buried }
     }
 
     /// Its sessions.
@@ -135,6 +138,18 @@ impl Peer {
 impl Outlet for Peer {
     fn submit(&self, message: Message) -> Result<(), Refused> {
         self.way_of(message.header.class).outlet.submit(message)
+    }
+
+    /// Requests are of class Control, and so is what takes them back: it comes behind them. spec: GNCL-15
+    fn cancel(&self, ticket: Ticket) -> bool {
+        let outlet = &self.way_of(Class::Control).outlet;
+        if outlet.cancel(ticket) {
+            return true;
+        }
+        let mut cancel = Message::cancel(ticket);
+        cancel.header.sent = Time::now();
+        // One that finds the queue full leaves its request to its time to live.
+        self.takes_cancels && outlet.submit(cancel).is_ok()
     }
 }
 

@@ -2,6 +2,7 @@
 
 mod audits;
 mod bench;
+mod cancels;
 mod classes;
 mod credit;
 mod handshakes;

@@ -7,7 +7,7 @@ use std::{
 
 use bytes::Bytes;
 use sinew_runtime::{
-    outcome::{Outcome, Rejection},
+    outcome::{Outcome, Rejection, Ticket},
     router::{Outlet as _, Refused, Router},
     tid::NodeAddress,
     time::Time,
@@ -230,6 +230,23 @@ impl Way {
             self.acknowledge();
         }
         Ok(is_news)
+    }
+
+    /// Takes a request out of its line that nobody waits for any more; if its destination is held no more, the peer is told so.
+    pub(super) fn take_back(&self, line: u64, ticket: Ticket) -> Option<Message> {
+        let (request, is_news) = {
+            let Inbox { shelf, arrivals, .. } = &mut *self.inbox();
+            let before = shelf.change();
+            let request = shelf.take_back(line, |message| message.is_request(ticket))?;
+            arrivals.take_again();
+            arrivals.end(End::Expired);
+            (request, shelf.change() != before)
+        };
+        if is_news {
+            // spec: CREDIT-2
+            self.acknowledge();
+        }
+        Some(request)
     }
 
     /// Offers what waits for applications here to them again; `room` is woken when one of them takes more. Returns how far that came.

@@ -2,7 +2,11 @@
 
 use std::time::Duration;
 
-use sinew_runtime::{outcome::Outcome, time::Time, wire::Message};
+use sinew_runtime::{
+    outcome::{Outcome, Ticket},
+    time::Time,
+    wire::Message,
+};
 
 use super::{
     Socket,
@@ -23,6 +27,17 @@ impl<S: Socket> Half<S> {
     fn give_up_overdue(&mut self, now: Time, after: &mut After) {
         let overdue = self.sent_receipts.take_overdue(now, OUTCOME_GRACE);
         after.settle.extend(overdue.into_iter().map(|receipt| (receipt, Outcome::Unknown)));
+    }
+
+    /// Nobody waits any more for the reply to this request: its time is over, if it has not been begun. Returns whether it waited here.
+    pub(super) fn cancel(&mut self, ticket: Ticket, after: &mut After) -> bool {
+        let is_interrupted = self.interrupted.as_ref().is_some_and(|message| message.is_request(ticket));
+        let waited = if is_interrupted { self.interrupted.take() } else { self.queue.take_request(ticket) };
+        let Some(message) = waited.or_else(|| self.take_request_in_line(ticket)) else { return false };
+        after.room = self.queue.room_made().or_else(|| after.room.take());
+        self.waiting_receipts -= usize::from(message.receipt.is_some());
+        self.expired(message, after);
+        true
     }
 
     pub(super) fn expire(&mut self, now: Time, after: &mut After) {

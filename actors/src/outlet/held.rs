@@ -1,10 +1,10 @@
 //! What waits for destinations that take nothing now, so that what is for others passes it. spec: CREDIT-3
 
 use sinew_runtime::{
-    outcome::Rejection,
+    outcome::{Rejection, Ticket},
     router::Refused,
     time::Time,
-    wire::{Class, Flags, Header, Message},
+    wire::{Class, Flags, Header, Kind, Message},
 };
 
 use super::{
@@ -24,7 +24,9 @@ pub(crate) fn line_of(header: &Header) -> Option<u64> {
         && !header.destination.app.is_layer()
         // One that waits for an answer may take nothing else before it.
         && !header.flags.has(Flags::OUTCOME)
-        && !header.flags.has(Flags::REPLY);
+        && !header.flags.has(Flags::REPLY)
+        // It takes a message back that may wait in the line.
+        && header.kind != Kind::CANCEL;
     match header.class {
         Class::Control | Class::Bulk if is_for_a_mailbox => {
             Some((header.class as u64) << 32 | u64::from(header.destination.app.bits()))
@@ -99,6 +101,11 @@ impl<S: Socket> Half<S> {
             self.waiting_receipts -= usize::from(message.receipt.is_some());
             self.expired(message, after);
         }
+    }
+
+    /// Takes the request that `ticket` names out of its line, if it waits in one.
+    pub(super) fn take_request_in_line(&mut self, ticket: Ticket) -> Option<Message> {
+        self.session.as_mut()?.held.take_useless(|message| message.is_request(ticket)).pop()
     }
 
     /// Takes all out of the lines.

@@ -1,10 +1,12 @@
 //! The session of an outlet: numbers on the way out, and what is sent again on the next connection.
 
+use std::collections::BTreeSet;
+
 use sinew_runtime::{
     mailbox::is_same_stream,
     outcome::Outcome,
     time::Time,
-    wire::{Class, Flags, Header, Message},
+    wire::{Class, Flags, Header, Kind, Message},
 };
 
 use super::{
@@ -150,17 +152,24 @@ impl<S: Socket> Half<S> {
     fn void(&mut self, now: Time, after: &mut After) {
         let Some(session) = &mut self.session else { return };
         let (queue, mut newer) = (&self.queue, Vec::<Header>::new());
+        // What tells the peer that a request was given up waits behind it.
+        let cancels = queue.iter().filter(|message| message.header.kind == Kind::CANCEL);
+        let given_up: BTreeSet<_> =
+            cancels.map(|message| (message.header.source, message.header.correlation)).collect();
+        let is_given_up = |header: &Header| {
+            header.flags.has(Flags::ASK) && given_up.contains(&(header.source, header.correlation))
+        };
         let void = session.sending.void(|Message { header, .. }| {
             let is_old = queue.supersedes(header) || newer.iter().any(|newer| is_same_stream(newer, header));
             if header.class == Class::Stream {
                 newer.push(*header);
                 is_old || header.is_expired(now)
             } else {
-                header.is_expired(now)
+                header.is_expired(now) || is_given_up(header)
             }
         });
         for message in void {
-            if message.header.is_expired(now) {
+            if message.header.is_expired(now) || message.header.flags.has(Flags::ASK) {
                 self.tally.void_expired += 1;
             } else {
                 self.tally.void_superseded += 1;

@@ -24,6 +24,7 @@ mod accounts;
 mod audits;
 mod floods;
 mod holding;
+mod requests;
 mod room;
 
 /// A wire that takes `room` more bytes and keeps them.

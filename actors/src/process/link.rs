@@ -294,6 +294,11 @@ impl Outlet for Link {
     fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
         self.take(message, |mailbox, message| mailbox.offer(message, room))
     }
+
+    /// What the child has been lent already it handles.
+    fn cancel(&self, ticket: Ticket) -> bool {
+        self.mailbox.cancel(ticket)
+    }
 }
 
 impl Link {

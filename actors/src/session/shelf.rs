@@ -163,6 +163,21 @@ impl<K: Copy + Ord, M> Shelf<K, M> {
         self.bytes += bytes;
     }
 
+    /// Takes out of a line, the newest first, the one message that `is_it`, unless it is offered.
+    pub(crate) fn take_back(&mut self, key: K, is_it: impl FnMut(&M) -> bool) -> Option<M> {
+        let line = self.lines.get_mut(&key)?;
+        let mut is_it = is_it;
+        let at = line.messages.iter().rposition(|(message, _)| is_it(message))?;
+        let (message, bytes) = line.messages.remove(at)?;
+        line.bytes -= bytes;
+        (self.messages, self.bytes) = (self.messages - 1, self.bytes - bytes);
+        if line.messages.is_empty() && !line.is_offered {
+            self.lines.remove(&key);
+            self.change += 1;
+        }
+        Some(message)
+    }
+
     /// Whoever was offering has ended; what it had in its hand is gone.
     pub(crate) fn forget_offers(&mut self) {
         self.lines.values_mut().for_each(|line| line.is_offered = false);

@@ -162,6 +162,12 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         self.sender.reply(to, value)
     }
 
+    /// Whether the sender of `request` still waits for a reply; see [`Sender::is_wanted`].
+    #[must_use]
+    pub fn is_wanted<P>(&self, request: &Delivery<P>) -> bool {
+        request.reply_to().is_some_and(|to| self.sender.is_wanted(&to))
+    }
+
     /// Refuses the message in hand: its sender gets `Rejected(ByHandler)` instead of `Delivered`.
     pub fn reject(&mut self) {
         self.verdict = Some(Outcome::Rejected(Rejection::ByHandler));

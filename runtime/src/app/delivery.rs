@@ -33,7 +33,8 @@ pub struct Delivery<P> {
 
 impl<P> Delivery<P> {
     pub(crate) fn new(payload: P, header: &Header, now: Time) -> Self {
-        let reply_to = ReplyTo { source: header.source, correlation: header.correlation };
+        let Header { source, correlation, sent, .. } = *header;
+        let reply_to = ReplyTo { source, correlation, sent, until: header.expiry() };
         Self {
             payload,
             source: header.source,

@@ -8,6 +8,7 @@ mod budget;
 mod lender;
 mod queue;
 mod reader;
+mod request;
 mod room;
 mod source;
 mod tally;
@@ -26,7 +27,7 @@ pub use source::Source;
 pub use tally::Tally;
 
 use crate::{
-    outcome::{Outcome, Rejection},
+    outcome::{Outcome, Rejection, Ticket},
     post::lock,
     router::{Outlet, Refused},
     time::Time,
@@ -347,6 +348,10 @@ impl Outlet for Mailbox {
             waker.into_iter().for_each(Waker::wake);
         }
         result
+    }
+
+    fn cancel(&self, ticket: Ticket) -> bool {
+        self.take_back(ticket)
     }
 }
 

@@ -4,7 +4,7 @@ use std::{collections::VecDeque, sync::Arc, task::Waker};
 
 use super::{Budget, room::Awaited};
 use crate::{
-    outcome::Rejection,
+    outcome::{Rejection, Ticket},
     router::Refused,
     time::Time,
     wire::{Class, Header, Message},
@@ -231,6 +231,22 @@ impl ClassQueue {
         }
         self.give(expired.iter().map(|message| message.payload.len()).sum());
         expired
+    }
+
+    /// Takes the request that `ticket` names out, if it waits.
+    pub fn take_request(&mut self, ticket: Ticket) -> Option<Message> {
+        // Who gives a request up has mostly just made it.
+        let place = |lane: &VecDeque<Message>| lane.iter().rposition(|message| message.is_request(ticket));
+        let (lane, at) = (0..3).find_map(|lane| Some((lane, place(&self.lanes[lane])?)))?;
+        let request = self.lanes[lane].remove(at)?;
+        self.bytes[lane] -= request.payload.len();
+        self.give(request.payload.len());
+        Some(request)
+    }
+
+    /// All that waits, most urgent class first.
+    pub fn iter(&self) -> impl Iterator<Item = &Message> {
+        self.lanes.iter().flatten()
     }
 
     /// Messages that wait.

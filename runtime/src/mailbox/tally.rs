@@ -16,7 +16,7 @@ pub struct Tally {
     pub superseded: u64,
     /// Taken, then refused by the application.
     pub rejected: u64,
-    /// Too old when their turn came.
+    /// Too old when their turn came, or requests whose asker waited no more.
     pub expired: u64,
     /// In the hand of an actor that panicked or ended.
     pub failed: u64,

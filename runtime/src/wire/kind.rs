@@ -27,6 +27,8 @@ pub struct Kind(u32);
 impl Kind {
     /// The outcome of a confirmed message: one byte, see [`Outcome::code`](crate::outcome::Outcome::code).
     pub const OUTCOME: Self = Self(1);
+    /// Nobody waits any more for the reply to the request that its correlation names.
+    pub const CANCEL: Self = Self(2);
     /// First frame of a connection between nodes.
     pub const GNCL_HELLO: Self = Self(0x10);
     /// Answer to a hello that is accepted.

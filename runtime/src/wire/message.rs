@@ -68,6 +68,14 @@ impl Message {
         Self::new(header, code_of(outcome))
     }
 
+    /// Says to whoever was asked that nobody waits any more for the reply to the request that `ticket` names.
+    #[must_use]
+    pub const fn cancel(ticket: Ticket) -> Self {
+        let mut header = Header::new(Kind::CANCEL, ticket.source, ticket.destination);
+        header.correlation = ticket.correlation;
+        Self::new(header, Bytes::new())
+    }
+
     /// A message of the given type, in its own class.
     ///
     /// # Panics
@@ -104,6 +112,12 @@ impl Message {
     pub const fn ticket(&self) -> Ticket {
         let Header { source, destination, correlation, .. } = self.header;
         Ticket { source, destination, correlation }
+    }
+
+    /// Whether this is the request that `ticket` names.
+    #[must_use]
+    pub fn is_request(&self, ticket: Ticket) -> bool {
+        self.header.flags.has(Flags::ASK) && self.ticket() == ticket
     }
 
     /// Bytes that this message takes in a queue: its header and its payload.

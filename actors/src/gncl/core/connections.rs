@@ -3,7 +3,8 @@
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
 use super::{
-    Attach, Connection, ConnectionId, Core, Decline, Introduction, Lane, LinkFact, Output, Refusal, Stage,
+    Attach, CANCEL, Connection, ConnectionId, Core, Decline, Introduction, Lane, LinkFact, Output, Refusal,
+    Stage,
     acquaintance::{Acquaintance, Link, Pulse},
     handshake::check,
     sides::Side,
@@ -217,6 +218,7 @@ impl Core {
             incarnation,
             lane: Lane::Control,
             by_class,
+            takes_cancels: theirs.knows(CANCEL),
             payload_max: theirs.payload_max,
             welcome,
         }));

@@ -15,6 +15,9 @@ const NAME_MAX: usize = 63;
 /// The ability to have a connection for each class.
 pub(crate) const CLASSES: &str = "classes";
 
+/// The ability to take a request back that nobody waits for any more.
+pub(crate) const CANCEL: &str = "cancel";
+
 /// Whose messages a connection carries: those of one class, where both nodes know [`CLASSES`]. Where one does not, the first
 /// carries all.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -55,7 +58,7 @@ pub(crate) struct Introduction {
     pub(crate) dial: u64,
     /// Longest payload that the sender takes, in bytes.
     pub(crate) payload_max: u64,
-    /// Optional abilities of the sender; what both have may be used: [`CLASSES`].
+    /// Optional abilities of the sender; what both have may be used: [`CLASSES`], [`CANCEL`].
     #[serde(default)]
     pub(crate) features: Vec<String>,
     /// What travels on this connection.
@@ -74,7 +77,12 @@ const fn is_zero(number: &u64) -> bool {
 impl Introduction {
     /// Whether the sender can have a connection for each class.
     pub(crate) fn knows_classes(&self) -> bool {
-        self.features.iter().any(|feature| feature == CLASSES)
+        self.knows(CLASSES)
+    }
+
+    /// Whether the sender has this ability.
+    pub(crate) fn knows(&self, ability: &str) -> bool {
+        self.features.iter().any(|feature| feature == ability)
     }
 }
 

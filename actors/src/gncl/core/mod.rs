@@ -31,7 +31,7 @@ use sinew_runtime::{
 use super::LinkFact;
 use acquaintance::Acquaintance;
 pub(super) use handshake::{
-    CLASSES, Decline, HANDSHAKE_PAYLOAD_MAX, Introduction, Lane, Refusal, read, write,
+    CANCEL, CLASSES, Decline, HANDSHAKE_PAYLOAD_MAX, Introduction, Lane, Refusal, read, write,
 };
 
 /// What the core is set to.
@@ -145,6 +145,8 @@ pub(super) struct Attach {
     pub(super) lane: Lane,
     /// Whether each class has a connection of its own.
     pub(super) by_class: bool,
+    /// Whether the peer takes back what nobody waits for any more.
+    pub(super) takes_cancels: bool,
     /// Longest payload that the peer takes, in bytes.
     pub(super) payload_max: u64,
     /// To be sent before all else.

@@ -10,7 +10,7 @@ use std::time::Duration;
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
 use super::{
-    Attach, Connection, ConnectionId, Core, Decline, Introduction, Lane, Output, Settings, Stage,
+    Attach, CANCEL, Connection, ConnectionId, Core, Decline, Introduction, Lane, Output, Settings, Stage,
     acquaintance::{Link, Pulse},
     handshake::check,
 };
@@ -200,6 +200,7 @@ impl Core {
             incarnation,
             lane,
             by_class: true,
+            takes_cancels: theirs.knows(CANCEL),
             payload_max: theirs.payload_max,
             welcome,
         }));

@@ -17,6 +17,8 @@ enum Step {
     Acknowledge(u64),
     /// The next connection; the peer has a part of what was written.
     Reconnect(u64),
+    /// Nobody waits any more for the reply to the request that was submitted so many messages ago.
+    Cancel(u64),
     /// The next connection, to a peer that knows nothing of this session.
     Forget,
     Expire,
@@ -28,6 +30,7 @@ fn any_step() -> impl Strategy<Value = Step> {
         5 => (0usize..400).prop_map(Step::Room),
         3 => (0u64..=100).prop_map(Step::Acknowledge),
         2 => (0u64..=100).prop_map(Step::Reconnect),
+        3 => (0u64..4).prop_map(Step::Cancel),
         1 => Just(Step::Forget),
         1 => Just(Step::Expire),
     ]
@@ -73,8 +76,21 @@ impl World {
         if expires {
             (message.header.sent, message.header.time_to_live_us) = (Time::now(), 3_000_000);
         }
+        if message.header.class == Class::Control {
+            message.header.flags = Flags::ASK;
+            message.header.correlation = self.submitted;
+        }
         // Handed back or not, it is accounted for.
         let _ = self.bench.outlet.submit(message);
+    }
+
+    fn cancel(&mut self, ago: u64) {
+        let correlation = self.submitted.saturating_sub(ago);
+        let ticket = Ticket { correlation, ..message(Class::Control, 0).ticket() };
+        if !self.bench.outlet.cancel(ticket) {
+            self.submitted += 1;
+            let _ = self.bench.outlet.submit(Message::cancel(ticket));
+        }
     }
 
     fn step(&mut self, step: &Step) {
@@ -88,6 +104,7 @@ impl World {
                 self.bench.reconnect(0);
                 self.hear(next);
             }
+            Step::Cancel(ago) => self.cancel(ago),
             Step::Forget => {
                 self.bench.outlet.disconnect(self.bench.link);
                 self.bench.reconnect(0);
