@@ -102,7 +102,8 @@ pub struct GnclConfig {
     /// default 5 s.
     pub give_up: Duration,
     /// Whether packets say which class they carry, so that switches, access points and this host's own queues send Control first:
-    /// DSCP EF, AF41 and AF11 for Control, Stream and Bulk (RFC 4594), `SO_PRIORITY` 6, 0 and 2. Default `true`.
+    /// DSCP EF, AF41 and AF11 for Control, Stream and Bulk (RFC 4594), `SO_PRIORITY` 6, 0 and 2; CS6 and 6 for NDL's datagrams.
+    /// Default `true`.
     pub marks: bool,
     /// How long the IO thread stays awake after a message of a peer, so that the next one need not wake it: costs a core, and
     /// saves the wake of an idle one, 10 to 50 us, for applications on the IO thread. 0 to 10 ms; default 0, it sleeps at once.

@@ -298,6 +298,9 @@ fn open_socket(stores: &Stores) -> io::Result<std::net::UdpSocket> {
     }
     let ndl = &stores.config.ndl;
     let socket = socket::bind_unicast(ndl.interface, ndl.port)?;
+    if stores.config.gncl.marks {
+        socket::mark(&socket);
+    }
     *kept = Some(socket.try_clone()?);
     Ok(socket)
 }

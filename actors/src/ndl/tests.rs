@@ -330,3 +330,19 @@ fn what_cannot_be_had_is_named_with_its_place_and_remedy() {
     let said = words(&Node::new(1, 1, |ndl| ndl.interface = Ipv4Addr::new(192, 0, 2, 1)));
     assert!(said.contains("192.0.2.1:0") && said.contains("`ndl.interface`"), "{said}");
 }
+
+#[cfg(target_os = "linux")]
+#[test]
+fn its_datagrams_are_marked_as_what_keeps_the_network_up_unless_marks_are_off() {
+    for (marks, expected) in [(true, (48, 6)), (false, (0, 0))] {
+        let mut config = NodeConfig::new("marked");
+        config.gncl.marks = marks;
+        let stores = Stores::for_test(config, Incarnation(1));
+        stores.gncl_listen.get_or_init(|| (LOOPBACK, 1).into());
+        super::actor::start_words(stores.clone()).expect("any free port");
+        let kept = crate::stores::lock(&stores.ndl_socket);
+        let socket = socket2::SockRef::from(kept.as_ref().expect("it is kept for the next instance"));
+        let seen = (socket.tos_v4().expect("Linux tells") >> 2, socket.priority().expect("Linux tells"));
+        assert_eq!(seen, expected, "with gncl.marks = {marks}");
+    }
+}
