@@ -109,6 +109,7 @@ impl Stores {
         self.door.close();
         self.router.remove_local(AppAddress::INSPECT);
         self.gncl.close();
+        self.gncl.end_bulk();
         lock(&self.ndl_socket).take();
     }
 

@@ -3,12 +3,10 @@
 mod leaving;
 
 use std::{
-    cell::RefCell,
     collections::BTreeMap,
     io,
     net::{Shutdown, SocketAddr},
-    rc::Rc,
-    sync::{Arc, atomic::Ordering},
+    sync::{Arc, Mutex, atomic::Ordering},
     time::Duration,
 };
 
@@ -34,6 +32,7 @@ use super::{
     listener, marks,
     peer::{Store, frame},
     spin::Spin,
+    task::{self, Move},
 };
 use crate::{
     config::NodeConfig,
@@ -54,7 +53,7 @@ pub(crate) struct Gncl {
     ready: Option<ReadyGate>,
     core: Core,
     wires: BTreeMap<ConnectionId, Wire>,
-    spin: Rc<Spin>,
+    spin: Arc<Spin>,
     alarm: Option<(Time, SpawnHandle)>,
     /// When it goes, whoever has not hung up; set once the node is being stopped.
     goes_at: Option<Time>,
@@ -76,7 +75,7 @@ impl Gncl {
     pub(crate) fn new(stores: Arc<Stores>, ready: ReadyGate) -> Self {
         let seed = Time::now().as_nanos() ^ u64::from(stores.node.bits());
         let core = Core::new(settings(&stores), seed);
-        let spin = Rc::new(Spin::new(stores.config.gncl.spin));
+        let spin = Arc::new(Spin::new(stores.config.gncl.spin));
         Self { stores, ready: Some(ready), core, wires: BTreeMap::new(), spin, alarm: None, goes_at: None }
     }
 
@@ -147,7 +146,7 @@ impl Gncl {
     }
 
     fn dial(&mut self, connection: ConnectionId, address: SocketAddr, ctx: &mut Context<Self>) {
-        let mode = Rc::new(RefCell::new(Mode::Handshake));
+        let mode = Arc::new(Mutex::new(Mode::Handshake));
         let reading = self.reading(&mode);
         let reader = ctx.add_stream(link::dial(connection, address, reading));
         self.wires.insert(connection, Wire::new(None, mode, reader));
@@ -160,7 +159,7 @@ impl Gncl {
 
     fn accepted(&mut self, socket: TcpStream, ctx: &mut Context<Self>) {
         let (connection, socket) = (self.core.open(), Arc::new(socket));
-        let mode = Rc::new(RefCell::new(Mode::Handshake));
+        let mode = Arc::new(Mutex::new(Mode::Handshake));
         let reading = self.reading(&mode);
         let reader = ctx.add_stream(link::read(connection, socket.clone(), reading));
         self.wires.insert(connection, Wire::new(Some(socket), mode, reader));
@@ -214,18 +213,20 @@ impl Gncl {
             marks::mark(&socket, lane);
         }
         let payload_max = usize::try_from(attach.payload_max).unwrap_or(usize::MAX);
-        let link = way.outlet.connect(Gathering::new(socket), payload_max, welcome);
+        let Move { place, socket } = self.stores.gncl.place(lane, socket);
+        wire.socket = Some(socket.clone());
+        let link = way.outlet.connect(Gathering::new(socket.clone()), payload_max, welcome);
         way.attach(link);
-        let (stores, spin) = (self.stores.clone(), self.spin.clone());
-        wire.set_mode(Mode::Linked(Inbound { stores, peer: peer.clone(), spin, lane, link }));
+        let spin = if place.is_here() { self.spin.clone() } else { Arc::default() };
+        let inbound = Inbound { stores: self.stores.clone(), peer: peer.clone(), spin, lane, link };
+        wire.set_mode(Mode::Moves(inbound, Move { place: place.clone(), socket }));
         self.stores.router.set_peer(node, peer.clone());
-        let drainer = async move {
-            match peer.way(lane) {
-                Some(way) => way.outlet.drain(link).await,
-                None => io::ErrorKind::NotConnected.into(),
+        let drainer = place.begin(async move {
+            if let Some(way) = peer.way(lane) {
+                way.outlet.drain(link).await;
             }
-        };
-        let drainer = fut::wrap_future::<_, Self>(drainer);
+        });
+        let drainer = fut::wrap_future::<_, Self>(task::end_of(drainer));
         let drainer = ctx.spawn(drainer.map(move |_, actor, ctx| actor.ended(connection, ctx)));
         wire.link = Some((link, drainer));
     }
@@ -336,7 +337,7 @@ impl Wire {
     }
 
     fn set_mode(&self, mode: Mode) {
-        *self.mode.borrow_mut() = mode;
+        *lock(&self.mode) = mode;
     }
 }
 

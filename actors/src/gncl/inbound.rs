@@ -1,6 +1,6 @@
 //! What is checked before a peer's frame becomes a message of this node. spec: GNCL-11
 
-use std::{rc::Rc, sync::Arc};
+use std::sync::Arc;
 
 use sinew_runtime::{
     outcome::{Outcome, Receipt, Rejection, Ticket},
@@ -26,7 +26,7 @@ use crate::{
 pub(super) struct Inbound {
     pub(super) stores: Arc<Stores>,
     pub(super) peer: Arc<Peer>,
-    pub(super) spin: Rc<Spin>,
+    pub(super) spin: Arc<Spin>,
     /// Whose connections this is one of.
     pub(super) lane: Lane,
     /// The connection on which they come.

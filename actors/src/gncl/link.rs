@@ -1,6 +1,11 @@
 //! The reading half of a connection: bytes become frames, a bounded number at a time.
 
-use std::{cell::RefCell, io, net::SocketAddr, rc::Rc, sync::Arc, time::Duration};
+use std::{
+    io,
+    net::SocketAddr,
+    sync::{Arc, Mutex},
+    time::Duration,
+};
 
 use bytes::{BufMut, BytesMut};
 use futures_util::{Stream, stream};
@@ -17,7 +22,9 @@ use tokio_util::codec::Decoder;
 use super::{
     core::{ConnectionId, Decline, HANDSHAKE_PAYLOAD_MAX},
     inbound::Inbound,
+    task::{Move, ReadingTask},
 };
+use crate::stores::lock;
 
 /// Frames that are handled before other tasks of the thread have their turn.
 const FRAMES_PER_WAKE: usize = 64;
@@ -60,6 +67,8 @@ pub(super) enum What {
 pub(super) enum Mode {
     /// The shell gets them, one by one.
     Handshake,
+    /// They are messages of this peer, and what comes from now on is read elsewhere, once.
+    Moves(Inbound, Move),
     /// They are messages of this peer.
     Linked(Inbound),
     /// Nobody wants them: the peer was refused and may still be sending.
@@ -67,7 +76,7 @@ pub(super) enum Mode {
 }
 
 /// Set by the shell while it handles the news of the connection, before the next frame is looked at.
-pub(super) type SharedMode = Rc<RefCell<Mode>>;
+pub(super) type SharedMode = Arc<Mutex<Mode>>;
 
 /// Dials `address`, then reads.
 pub(super) fn dial(
@@ -99,6 +108,7 @@ pub(super) struct Reading {
 enum State {
     Dialling(SocketAddr, Reading),
     Reading(Reader),
+    Linked(ReadingTask),
     Over,
 }
 
@@ -114,12 +124,23 @@ fn news(connection: ConnectionId, state: State) -> impl Stream<Item = News> {
             },
             State::Reading(mut reader) => match reader.next().await {
                 Some(what) => (what, State::Reading(reader)),
-                None => (What::Ended, State::Over),
+                None => match reader.moves() {
+                    Some(task) => linked(task).await,
+                    None => (What::Ended, State::Over),
+                },
             },
+            State::Linked(task) => linked(task).await,
             State::Over => return None,
         };
         Some((News { connection, what }, state))
     })
+}
+
+async fn linked(task: ReadingTask) -> (What, State) {
+    match task.next().await {
+        Some((what, task)) => (what, State::Linked(task)),
+        None => (What::Ended, State::Over),
+    }
 }
 
 pub(super) async fn connect(address: SocketAddr, give_up: Duration) -> io::Result<TcpStream> {
@@ -159,7 +180,7 @@ pub(super) async fn write_frame(socket: &TcpStream, message: &Message) -> io::Re
     Ok(())
 }
 
-struct Reader {
+pub(super) struct Reader {
     socket: Arc<TcpStream>,
     buffer: BytesMut,
     codec: FrameCodec,
@@ -178,6 +199,7 @@ struct Reader {
 enum Look {
     Tell(What),
     Again,
+    Moves,
     Empty,
 }
 
@@ -195,23 +217,42 @@ impl Reader {
         }
     }
 
-    /// What the shell must know next; `None` when the connection has ended.
-    async fn next(&mut self) -> Option<What> {
+    /// What the shell must know next; `None` when the connection has ended, or [moves](Self::moves).
+    pub(super) async fn next(&mut self) -> Option<What> {
         loop {
             match self.look() {
                 Look::Tell(what) => return Some(what),
                 Look::Again => self.give_way().await,
+                Look::Moves => return None,
                 Look::Empty if std::mem::take(&mut self.heard) => return Some(What::Heard),
                 Look::Empty => self.fill().await.ok()?,
             }
         }
     }
 
+    /// Goes on in a task of its own, if that was said.
+    fn moves(self) -> Option<ReadingTask> {
+        let mut mode = lock(&self.reading.mode);
+        let to = match std::mem::replace(&mut *mode, Mode::Discard) {
+            Mode::Moves(inbound, to) => {
+                *mode = Mode::Linked(inbound);
+                to
+            }
+            stays @ (Mode::Handshake | Mode::Linked(_) | Mode::Discard) => {
+                *mode = stays;
+                return None;
+            }
+        };
+        drop(mode);
+        Some(ReadingTask::begin(Self { socket: to.socket, ..self }, &to.place))
+    }
+
     fn look(&mut self) -> Look {
-        let mode = self.reading.mode.borrow();
+        let mode = lock(&self.reading.mode);
         let payload_max = match *mode {
             Mode::Handshake => HANDSHAKE_PAYLOAD_MAX,
             Mode::Linked(_) => self.reading.payload_max,
+            Mode::Moves(..) => return Look::Moves,
             Mode::Discard => {
                 self.buffer.clear();
                 return Look::Empty;
@@ -246,9 +287,9 @@ impl Reader {
     }
 
     async fn fill(&mut self) -> io::Result<()> {
-        let room = match *self.reading.mode.borrow() {
+        let room = match *lock(&self.reading.mode) {
             Mode::Linked(_) => READ_LEN,
-            Mode::Handshake | Mode::Discard => HANDSHAKE_PAYLOAD_MAX,
+            Mode::Handshake | Mode::Moves(..) | Mode::Discard => HANDSHAKE_PAYLOAD_MAX,
         };
         let left = self.buffer.capacity() - self.buffer.len();
         // A quarter of room left is room enough: copying the rest of a frame for each read would cost more. A larger buffer

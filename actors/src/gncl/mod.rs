@@ -27,6 +27,8 @@
 //! | `peer.rs` | what a peer is to senders: its sessions, which outlive connections and this layer's restarts |
 //! | `way.rs` | one of these sessions, with its outlet |
 //! | `link.rs` | the reading half of a connection |
+//! | `task.rs` | the tasks that read and write a link, one each |
+//! | `bulk.rs` | the thread of those of Bulk |
 //! | `arrivals.rs` | what became of what came, counted |
 //! | `inbound.rs` | what is checked before a frame becomes a message of this node |
 //! | `spin.rs` | how long the IO thread looks before it sleeps |
@@ -36,6 +38,7 @@
 
 mod actor;
 mod arrivals;
+mod bulk;
 mod core;
 mod facts;
 mod inbound;
@@ -44,6 +47,7 @@ mod listener;
 mod marks;
 mod peer;
 mod spin;
+mod task;
 #[cfg(test)]
 mod tests;
 mod way;

@@ -2,6 +2,7 @@
 
 use std::{
     collections::BTreeMap,
+    io,
     net::Shutdown,
     sync::{Arc, Mutex, MutexGuard, PoisonError, Weak},
     task::{Wake, Waker},
@@ -17,10 +18,12 @@ use sinew_runtime::{
     wire::{Class, Header, Kind, Message},
 };
 use socket2::SockRef;
-use tokio::sync::Notify;
+use tokio::{net::TcpStream, sync::Notify};
 
 use super::{
+    bulk::BulkThread,
     core::{Attach, Lane},
+    task::{Move, Place},
     way::{Ends, Offered, Way, WayAccount},
 };
 use crate::{
@@ -193,6 +196,8 @@ pub(crate) struct Store {
     /// The socket that listens. It stays open while this layer is restarted: a peer that is refused would say that this
     /// node is lost.
     pub(super) listener: Mutex<Option<std::net::TcpListener>>,
+    /// The thread of Bulk, from its first connection until the node ends.
+    bulk: Mutex<Option<BulkThread>>,
     /// What GNCL refused, and why.
     pub(crate) refusals: Arc<Refusals>,
 }
@@ -278,6 +283,33 @@ impl Store {
             // Whoever is told again and again takes no other task's turn.
             tokio::task::yield_now().await;
         }
+    }
+
+    /// Where the connections of a lane are read and written from now on, and this one, `socket`, as it is to be used there.
+    pub(super) fn place(&self, lane: Lane, socket: Arc<TcpStream>) -> Move {
+        match lane {
+            Lane::Control | Lane::Stream => Move { place: Place::Here, socket },
+            Lane::Bulk => self.bulk_place(&socket).unwrap_or_else(|error| {
+                // It works there, too; only that Control may wait for Bulk.
+                self.refusals.count(Time::now(), "Bulk stays on the IO thread", &error);
+                Move { place: Place::Here, socket }
+            }),
+        }
+    }
+
+    fn bulk_place(&self, socket: &TcpStream) -> io::Result<Move> {
+        let mut bulk = lock(&self.bulk);
+        if bulk.is_none() {
+            *bulk = Some(BulkThread::begin()?);
+        }
+        let thread = bulk.as_ref().expect("it was made if there was none");
+        let place = Place::There(thread.runtime().clone());
+        Ok(Move { place, socket: Arc::new(thread.adopt(socket)?) })
+    }
+
+    /// Whoever carried Bulk is not needed any more.
+    pub(crate) fn end_bulk(&self) {
+        lock(&self.bulk).take();
     }
 
     /// Nobody connects any more, and the port is free, whoever still holds the socket.

@@ -1,24 +1,27 @@
 //! Looking before sleeping: the IO thread stays awake for a while after a peer's message, so that the next one need not wake
 //! a core that has gone idle.
 
-use std::{cell::Cell, time::Duration};
+use std::{
+    sync::atomic::{AtomicU64, Ordering},
+    time::Duration,
+};
 
 use sinew_runtime::time::Time;
 use tokio::sync::Notify;
 
 /// Whether the IO thread stays awake, and until when.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Spin {
     within: Duration,
-    /// When it may sleep.
-    until: Cell<Time>,
+    /// When it may sleep, in nanoseconds. SYNC: Relaxed; it belongs to one thread.
+    until: AtomicU64,
     begins: Notify,
 }
 
 impl Spin {
     /// After each message for so long; not at all if that is zero.
     pub(super) fn new(within: Duration) -> Self {
-        Self { within, until: Cell::new(Time::ZERO), begins: Notify::new() }
+        Self { within, until: AtomicU64::new(0), begins: Notify::new() }
     }
 
     /// A message came.
@@ -26,7 +29,7 @@ impl Spin {
         if self.within.is_zero() {
             return;
         }
-        if self.until.replace(now + self.within) <= now {
+        if self.until.swap((now + self.within).as_nanos(), Ordering::Relaxed) <= now.as_nanos() {
             self.begins.notify_one();
         }
     }
@@ -36,7 +39,7 @@ impl Spin {
     pub(super) async fn keep_awake(&self) {
         loop {
             self.begins.notified().await;
-            while Time::now() < self.until.get() {
+            while Time::now().as_nanos() < self.until.load(Ordering::Relaxed) {
                 tokio::task::yield_now().await;
             }
         }
@@ -47,10 +50,7 @@ impl Spin {
 mod tests {
     use std::{
         pin::{Pin, pin},
-        sync::{
-            Arc,
-            atomic::{AtomicBool, Ordering},
-        },
+        sync::{Arc, atomic::AtomicBool},
         task::{Context, Wake},
     };
 
@@ -79,7 +79,7 @@ mod tests {
         assert!(!looks_again(&mut awake), "nothing came");
         spin.heard(Time::now());
         assert!(looks_again(&mut awake) && looks_again(&mut awake), "a message came");
-        spin.until.set(Time::ZERO);
+        spin.until.store(0, Ordering::Relaxed);
         assert!(!looks_again(&mut awake), "the time is over");
         spin.heard(Time::now());
         assert!(looks_again(&mut awake), "another message came");

@@ -9,3 +9,4 @@ mod handshakes;
 mod leaving;
 mod links;
 mod messages;
+mod threads;

@@ -13,6 +13,7 @@ use super::{
     },
     Gncl,
 };
+use crate::stores::lock;
 
 /// Time that peers have, when the node is stopped, to take what waits for them and hang up. Whoever has more to send
 /// than goes over its network in this time loses it.
@@ -73,7 +74,7 @@ impl Gncl {
     /// The peer has said all: it hears what of it was taken, before it is left. spec: GNCL-10
     pub(super) fn acknowledge_the_last(&self, connection: ConnectionId) {
         let Some(wire) = self.wires.get(&connection) else { return };
-        if let Mode::Linked(inbound) = &*wire.mode.borrow() {
+        if let Mode::Linked(inbound) | Mode::Moves(inbound, _) = &*lock(&wire.mode) {
             inbound.acknowledge();
         }
     }
