@@ -63,12 +63,19 @@ impl History {
                 for (class, upto) in [Class::Control, Class::Stream, Class::Bulk].into_iter().zip(upto) {
                     self.flows.entry(Path { from: who, to, class }).or_default().peer_lost(upto);
                 }
-                let of_the_lost = self
-                    .flows
-                    .iter_mut()
-                    .filter(|(path, _)| path.from.station == to && path.to == who.station);
-                of_the_lost.for_each(|(_, flow)| flow.forgotten += 1);
+                self.give_up(who, to);
             }
+        }
+    }
+
+    /// `who` was told that the node of `lost` is lost: that is the life of which it has got something last.
+    fn give_up(&mut self, who: Party, lost: Station) {
+        let classes = [Class::Control, Class::Stream, Class::Bulk];
+        let heard = |class| self.heard.get(&(who, lost, class)).copied();
+        let Some(life) = classes.into_iter().filter_map(heard).max() else { return };
+        for class in classes {
+            let path = Path { from: Party { station: lost, life }, to: who.station, class };
+            self.flows.entry(path).or_default().forgotten();
         }
     }
 
@@ -81,7 +88,7 @@ impl History {
         *heard = from.life.max(*heard);
         let flow = self.flows.entry(path).or_default();
         for number in numbers {
-            let noted = flow.got(number);
+            let noted = flow.got(who.life, number);
             self.judge.add(path, noted);
         }
     }
@@ -108,8 +115,9 @@ impl History {
     pub fn verdict(&self) -> Verdict {
         let mut judge = self.judge.clone();
         for (path, flow) in &self.flows {
-            let deaths = self.killed.iter().filter(|killed| killed.station == path.to).count();
-            judge.judge(*path, flow, self.killed.contains(&path.from), deaths);
+            let killed = self.killed.iter().filter(|killed| killed.station == path.to);
+            let last_killed = killed.map(|killed| killed.life).max().unwrap_or(0);
+            judge.judge(*path, flow, self.killed.contains(&path.from), last_killed);
         }
         judge.into_verdict()
     }

@@ -137,23 +137,87 @@ fn delivered_and_not_got_is_caught_also_where_a_loss_excuses_that_it_did_not_com
 #[test]
 fn got_and_denied_is_caught() {
     for denial in [Outcome::Expired, Outcome::PeerLost, Outcome::Rejected(Rejection::QueueFull)] {
-        let notes = [asked(1, 1), got(Class::Control, 1, 1), ended(1, denial)];
+        let notes = [asked(1, 1), got(Class::Control, 1, 1), ended(1, denial), lost([1, 0, 0])];
         assert_eq!(faults(&notes), [(GotAndDenied, 1)], "{denial:?}");
-        let told = history(&[asked(1, 1), ended(1, denial)]).verdict();
+        let told = history(&[notes[0], notes[2], notes[3]]).verdict();
         assert!(told.holds() && !told.is_perfect() && told.told == 1, "{told}");
     }
 }
 
 #[test]
-fn unknown_is_true_only_where_a_node_was_lost() {
+fn unknown_is_true_only_where_a_node_was_lost_after_it_was_sent() {
     for outcome in [Outcome::Unknown, Outcome::Failed] {
-        let notes = [asked(1, 1), got(Class::Control, 1, 1), ended(1, outcome)];
+        const LAST: u64 = 2_000;
+        let mut notes = vec![asked(1, LAST), got(Class::Control, 1, LAST), ended(LAST, outcome)];
+        notes.extend((1..LAST).map(|number| ended(number, Outcome::Delivered)));
+        let with = |note: (Party, Note)| faults(&[&notes[..], &[note]].concat());
         assert_eq!(faults(&notes), [(UnknownWithoutLoss, 1)], "{outcome:?}");
-        assert_eq!(faults(&[notes[0], notes[1], notes[2], lost([1, 0, 0])]), []);
-        let mut killed = history(&notes);
-        killed.killed(TWO);
-        assert!(killed.verdict().holds());
+        assert_eq!(with(lost([1, 0, 0])), [(UnknownWithoutLoss, 1)], "{outcome:?}");
+        assert_eq!(with(lost([LAST, 0, 0])), []);
+        assert_eq!(with((TWO, Note::PeerLost { to: 1, upto: [0; 3] })), []);
     }
+}
+
+#[test]
+fn peer_lost_is_true_only_where_a_node_was_lost() {
+    let notes = [asked(1, 1), ended(1, Outcome::PeerLost)];
+    assert_eq!(faults(&notes), [(UnknownWithoutLoss, 1)]);
+    assert_eq!(faults(&[notes[0], notes[1], lost([1, 0, 0])]), []);
+}
+
+/// What the second life of the destination has got.
+fn got_later(first: u64, count: u64) -> (Party, Note) {
+    (Party { life: 2, ..TWO }, Note::Got { from: ONE, class: Class::Bulk, first, count })
+}
+
+#[test]
+fn a_kill_excuses_what_is_missing_between_two_lives_and_nothing_in_the_midst_of_one() {
+    let judge = |notes: &[(Party, Note)]| {
+        let mut killed = history(&[&[sent(Class::Bulk, 1, 20), lost([0, 0, 12])], notes].concat());
+        killed.killed(TWO);
+        killed.verdict().faults.into_iter().collect::<Vec<_>>()
+    };
+    assert_eq!(judge(&[got(Class::Bulk, 1, 8), got_later(13, 8)]), []);
+    assert_eq!(judge(&[got(Class::Bulk, 1, 8)]), []);
+    let early = [got(Class::Bulk, 1, 3), got(Class::Bulk, 6, 5), got_later(11, 10)];
+    assert_eq!(judge(&early), [(Lost, 2)]);
+    assert_eq!(judge(&[early[0], early[1], got_later(13, 8)]), [(Lost, 2)]);
+    let late = [got(Class::Bulk, 1, 10), got_later(11, 3), got_later(16, 5)];
+    assert_eq!(judge(&late), [(Lost, 2)]);
+}
+
+#[test]
+fn a_destination_that_was_killed_before_the_source_began_takes_no_excuse_from_a_later_loss() {
+    let life = |got: &[(Party, Note)]| {
+        let mut killed = history(&[&[sent(Class::Bulk, 1, 20), lost([0, 0, 12])], got].concat());
+        killed.killed(TWO);
+        killed.verdict().faults.into_iter().collect::<Vec<_>>()
+    };
+    assert_eq!(life(&[got_later(1, 6), got_later(9, 12)]), []);
+    assert_eq!(life(&[got_later(1, 6), got_later(9, 10)]), [(Lost, 2)]);
+}
+
+#[test]
+fn that_a_former_life_was_lost_excuses_nothing_of_a_later_one() {
+    let later = Party { life: 2, ..ONE };
+    let from_later = |first, count| (TWO, Note::Got { from: later, class: Class::Bulk, first, count });
+    let notes = [
+        sent(Class::Bulk, 1, 3),
+        got(Class::Bulk, 1, 3),
+        (later, Note::Sent { to: 2, class: Class::Bulk, first: 1, count: 10, asked: false }),
+        (TWO, Note::PeerLost { to: 1, upto: [0; 3] }),
+        from_later(1, 4),
+        from_later(7, 4),
+    ];
+    assert_eq!(faults(&notes), [(Lost, 2)]);
+}
+
+#[test]
+fn what_was_missing_before_the_source_was_given_up_is_not_excused_by_that() {
+    let given_up = (TWO, Note::PeerLost { to: 1, upto: [0; 3] });
+    let notes = [sent(Class::Bulk, 1, 10), got(Class::Bulk, 1, 3), got(Class::Bulk, 5, 2)];
+    assert_eq!(faults(&[notes[0], notes[1], given_up, notes[2], got(Class::Bulk, 7, 4)]), []);
+    assert_eq!(faults(&[notes[0], notes[1], notes[2], given_up, got(Class::Bulk, 7, 4)]), [(Lost, 1)]);
 }
 
 #[test]
@@ -174,8 +238,8 @@ fn a_source_that_its_destination_lost_may_lose_one_row_and_no_more() {
     let lost = (TWO, Note::PeerLost { to: 1, upto: [0; 3] });
     let notes =
         [sent(Class::Bulk, 1, 10), got(Class::Bulk, 1, 4), got(Class::Bulk, 6, 3), got(Class::Bulk, 10, 1)];
-    assert_eq!(faults(&[notes[0], notes[1], notes[2], notes[3], lost]), [(Lost, 1)]);
-    assert_eq!(faults(&[notes[0], notes[1], notes[2], notes[3], lost, lost]), []);
+    assert_eq!(faults(&[notes[0], notes[1], lost, notes[2], notes[3]]), [(Lost, 1)]);
+    assert_eq!(faults(&[notes[0], notes[1], lost, notes[2], lost, notes[3]]), []);
     let unknown = [asked(1, 1), got(Class::Control, 1, 1), ended(1, Outcome::Unknown)];
     assert_eq!(faults(&[unknown[0], unknown[1], lost, unknown[2]]), []);
 }

@@ -31,7 +31,7 @@ pub enum Fault {
     DeliveredAndNotGot,
     /// Its sender was told that it would not be handled, and it came.
     GotAndDenied,
-    /// Its sender was told that nobody knows, or that its destination failed, and no node was lost.
+    /// Its sender was told that nobody knows, that its destination failed or that its node is lost, and no node was lost since it was sent.
     UnknownWithoutLoss,
     /// The notes themselves are wrong: a number out of its row, an outcome of what nobody asked for.
     WrongNote,
@@ -156,8 +156,8 @@ impl Judge {
         }
     }
 
-    /// Looks at a flow whose source was killed or not, and whose destination was killed so often.
-    pub(super) fn judge(&mut self, path: Path, flow: &Flow, source_was_killed: bool, deaths: usize) {
+    /// Looks at a flow whose source was killed or not, and whose destination was killed up to this life.
+    pub(super) fn judge(&mut self, path: Path, flow: &Flow, source_was_killed: bool, last_killed: u32) {
         let end = if source_was_killed { flow.sent.max(flow.last_got()) } else { flow.sent };
         for number in end + 1..=flow.last_got() {
             if flow.has_come(number) {
@@ -167,12 +167,13 @@ impl Judge {
         self.0.sent += end;
         self.0.got += (1..=end).filter(|number| flow.has_come(*number)).count() as u64;
         self.0.told += flow.asked.keys().filter(|n| flow.is_told(**n) && !flow.has_come(**n)).count() as u64;
-        self.judge_holes(path, flow, end, source_was_killed);
+        self.judge_holes((path, flow), end, source_was_killed, last_killed);
         for (number, outcome) in &flow.asked {
             self.0.asked += 1;
             match outcome {
                 Some(outcome) => {
-                    let could_be_lost = deaths > 0 || flow.forgotten > 0 || !flow.losses.is_empty();
+                    // A source that was killed may have been told of a loss, and not have written that down.
+                    let could_be_lost = flow.could_be_lost(*number) || source_was_killed && last_killed > 0;
                     self.judge_outcome(path, (*number, *outcome), flow.has_come(*number), could_be_lost);
                 }
                 None if source_was_killed => self.0.ended_with_source += 1,
@@ -181,29 +182,25 @@ impl Judge {
         }
     }
 
-    /// What did not come. Each loss of the destination's node excuses one row of messages that its source had sent before it
-    /// was told; so does each loss of the source's node that the destination was told of; and the source's own end excuses the
-    /// last.
-    fn judge_holes(&mut self, path: Path, flow: &Flow, end: u64, source_was_killed: bool) {
-        let (mut losses, mut forgotten) = (flow.losses.clone(), flow.forgotten);
-        losses.sort_unstable();
+    /// What did not come. The end of each life of the destination excuses one row, between what that life and the next one have got;
+    /// every other loss of its node that the source was told of, one row that begins before that; each loss of the source's node that
+    /// the destination was told of, one row behind what had come by then; and the source's own end excuses the last one.
+    fn judge_holes(
+        &mut self,
+        (path, flow): (Path, &Flow),
+        end: u64,
+        source_was_killed: bool,
+        last_killed: u32,
+    ) {
+        let mut excuses = flow.excuses(last_killed);
         for (first, last) in flow.holes(end) {
             let count = (first..=last).filter(|n| !flow.has_come(*n) && !flow.is_told(*n)).count() as u64;
             if path.class == Class::Stream && flow.last_got() > last {
                 self.0.superseded += count;
-                continue;
-            }
-            let excuse = losses.iter().position(|upto| first <= *upto);
-            if let Some(at) = excuse {
-                losses.remove(at);
-                self.0.lost_with_node += count;
-            } else if source_was_killed && last == end {
-                self.0.lost_with_node += count;
-            } else if forgotten > 0 {
-                forgotten -= 1;
+            } else if source_was_killed && last == end || excuses.take(flow, first) {
                 self.0.lost_with_node += count;
             } else {
-                let more = format!("to {last}; {count} in a row of {end}; losses told at {:?}", flow.losses);
+                let more = format!("to {last}; {count} in a row of {end}; {excuses:?} left");
                 self.fault(path, Fault::Lost, first, more);
                 *self.0.faults.entry(Fault::Lost).or_default() += count - 1;
             }
@@ -229,7 +226,9 @@ impl Judge {
         let fault = match outcome {
             Outcome::Delivered if !has_come => Fault::DeliveredAndNotGot,
             Outcome::Rejected(_) | Outcome::Expired | Outcome::PeerLost if has_come => Fault::GotAndDenied,
-            Outcome::Unknown | Outcome::Failed if !could_be_lost => Fault::UnknownWithoutLoss,
+            Outcome::Unknown | Outcome::Failed | Outcome::PeerLost if !could_be_lost => {
+                Fault::UnknownWithoutLoss
+            }
             Outcome::Delivered
             | Outcome::Rejected(_)
             | Outcome::Expired

@@ -24,6 +24,8 @@ const TICK: Duration = Duration::from_millis(1);
 const SHARE: u64 = 20;
 /// Confirmed messages under way at most.
 const WAITS_MAX: usize = 1_000;
+/// The time to live of what is confirmed: more than a run takes, so that each outcome is somebody's word and not the end of a wait.
+const OUTCOME_WITHIN: Duration = Duration::from_secs(3_600);
 /// What could not be sent for longer than this is not made up for.
 const DEBT: Duration = Duration::from_millis(100);
 /// Longest filling of a message, in bytes.
@@ -166,7 +168,7 @@ impl Work {
                     return Err(SendError::TooManyWaits);
                 }
                 let control = Control { life, number, asked, filling };
-                let confirmation = sender.send_confirmed(name, &control, DEADLINE)?;
+                let confirmation = sender.send_confirmed(name, &control, OUTCOME_WITHIN)?;
                 self.waiting.push_back((number, confirmation));
                 Ok(())
             }
