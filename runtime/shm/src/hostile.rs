@@ -49,24 +49,53 @@ impl Tally {
     }
 }
 
-/// Numbers that a seed decides: xorshift64*.
+/// What decides: numbers of a seed, or bytes that somebody wrote.
 #[derive(Clone, Debug)]
-pub(crate) struct Dice(u64);
+enum Dice {
+    /// xorshift64*.
+    Seeded(u64),
+    /// Read from the end; zeros when it is over.
+    Written(Vec<u8>),
+}
 
 impl Dice {
-    pub(crate) const fn new(seed: u64) -> Self {
-        Self(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1)
+    const fn new(seed: u64) -> Self {
+        Self::Seeded(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1)
     }
 
-    fn next(&mut self) -> u64 {
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        self.0.wrapping_mul(0x2545_F491_4F6C_DD1D)
+    fn next(&mut self) -> u32 {
+        match self {
+            Self::Seeded(state) => {
+                *state ^= *state >> 12;
+                *state ^= *state << 25;
+                *state ^= *state >> 27;
+                (state.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 32) as u32
+            }
+            Self::Written(bytes) => u32::from_le_bytes([0; 4].map(|_: u8| bytes.pop().unwrap_or_default())),
+        }
     }
 
+    /// Of what was written, no more than the limit needs is read: one more byte is one more decision.
     fn below(&mut self, limit: u32) -> u32 {
-        (self.next() >> 32) as u32 % limit
+        match self {
+            Self::Written(bytes) if limit <= 1 << 8 => u32::from(bytes.pop().unwrap_or_default()) % limit,
+            Self::Seeded(_) | Self::Written(_) => self.next() % limit,
+        }
+    }
+
+    /// How long a wait is, in microseconds, at most: whoever wrote the script wants to see the end of it.
+    const fn patience_us(&self) -> u32 {
+        match self {
+            Self::Seeded(_) => 300,
+            Self::Written(_) => 1,
+        }
+    }
+
+    const fn is_over(&self) -> bool {
+        match self {
+            Self::Seeded(_) => false,
+            Self::Written(bytes) => bytes.is_empty(),
+        }
     }
 }
 
@@ -85,7 +114,46 @@ pub fn assault(seed: u64, lives: u64) -> Tally {
     tally
 }
 
+/// One connection to a hostile peer in which a script says what either side does next, on one thread: for a fuzzer, which
+/// finds by what is reached which script is worth another try.
+///
+/// # Panics
+/// As [`assault`].
+#[must_use]
+pub fn play(script: &[u8]) -> Tally {
+    let mut dice = Dice::Written(script.iter().rev().copied().collect());
+    let (mut tally, (mut user, mut attacker)) = (Tally { lives: 1, ..Tally::default() }, meet(&mut dice));
+    while !dice.is_over() && user.caught != (true, true) {
+        if dice.below(2) == 0 {
+            attacker.write(&mut dice);
+            tally.writes += 1;
+        } else {
+            user.act(&mut dice, &mut tally);
+        }
+    }
+    user.judge(attacker.wild);
+    tally
+}
+
 fn one_life(dice: &mut Dice, tally: &mut Tally) {
+    let (mut user, mut attacker) = meet(dice);
+    let (mut attack, wild, over) = (dice.clone(), attacker.wild, AtomicBool::new(false));
+    thread::scope(|scope| {
+        let writes = scope.spawn(|| {
+            let unless_over = || (!over.load(Ordering::Relaxed)).then_some(());
+            std::iter::from_fn(unless_over).map(|()| attacker.write(&mut attack)).count()
+        });
+        let ends = EndsIt(&over);
+        user.act_until_caught(dice, tally);
+        drop(ends);
+        tally.writes += writes.join().expect("the attacker has no claims that could fail") as u64;
+    });
+    user.judge(wild);
+    tally.lives += 1;
+}
+
+/// Two sides that are connected: one that uses it, and one that is hostile.
+fn meet(dice: &mut Dice) -> (User, Attacker) {
     let bells = [BellKind::Futex, BellKind::EventFd, BellKind::Socket];
     let bell = bells[dice.below(3) as usize];
     let capacity = Capacity::new(4096 << dice.below(3)).expect("a power of two");
@@ -94,21 +162,9 @@ fn one_life(dice: &mut Dice, tally: &mut Tally) {
     let keys = [&our_offer, &their_offer].map(|offer| duplicate(&offer.descriptors()[0])).into();
     let terms = Terms { bells: bells.to_vec(), ..Terms::default() };
     let (producer, consumer) = ours.connect(their_offer, &terms).expect("honest so far");
-    // Of 64 writes so many are wild; the others are what an honest peer might write, to get further.
-    let wild = [0, 1, 1, 8, 64][dice.below(5) as usize];
-    let attacker = Attacker::new(theirs, our_offer, keys, dice.clone(), wild);
-    let caught_before = tally.caught.values().sum::<u64>();
-    let over = AtomicBool::new(false);
-    thread::scope(|scope| {
-        let attack = scope.spawn(|| attacker.attack_until(&over));
-        let ends = EndsIt(&over);
-        use_connection(producer, consumer, dice, tally);
-        drop(ends);
-        tally.writes += attack.join().expect("the attacker has no claims that could fail");
-    });
-    let caught = tally.caught.values().sum::<u64>() - caught_before;
-    assert!(wild > 0 || caught == 0, "an honest peer is never accused: {:?}", tally.caught);
-    tally.lives += 1;
+    // Of 256 writes so many are wild; the others are what an honest peer might write, to get further.
+    let wild = [0, 1, 4, 32, 256][dice.below(5) as usize];
+    (User { producer, consumer, caught: (false, false) }, Attacker::new(theirs, our_offer, keys, wild))
 }
 
 /// Ends the attack also when this side panics: else nobody would hear of it.
@@ -124,18 +180,40 @@ fn duplicate(fd: &OwnedFd) -> OwnedFd {
     fd.try_clone().expect("a descriptor")
 }
 
-/// What an application does, in any order, until the peer is caught by both halves or there was enough of it.
-fn use_connection(mut producer: Producer, mut consumer: Consumer, dice: &mut Dice, tally: &mut Tally) {
-    let mut caught = (false, false);
-    for _ in 0..3_000 {
+/// This side, as an application has it.
+struct User {
+    producer: Producer,
+    consumer: Consumer,
+    /// Whether the peer was caught: by the consumer, by the producer.
+    caught: (bool, bool),
+}
+
+impl User {
+    /// What an application does, in any order, until the peer is caught by both halves or there was enough of it.
+    fn act_until_caught(&mut self, dice: &mut Dice, tally: &mut Tally) {
+        for _ in 0..3_000 {
+            self.act(dice, tally);
+            if self.caught == (true, true) {
+                return;
+            }
+        }
+    }
+
+    fn act(&mut self, dice: &mut Dice, tally: &mut Tally) {
+        let Self { producer, consumer, caught } = self;
         if dice.below(2) == 0 {
-            caught.0 |= receive(&mut consumer, dice, tally, caught.0);
+            caught.0 |= receive(consumer, dice, tally, caught.0);
         } else {
-            caught.1 |= send(&mut producer, dice, tally, caught.1);
+            caught.1 |= send(producer, dice, tally, caught.1);
         }
-        if caught == (true, true) {
-            return;
-        }
+    }
+
+    fn judge(&self, wild: u32) {
+        assert!(
+            wild > 0 || self.caught == (false, false),
+            "an honest peer is never accused: {:?}",
+            self.caught
+        );
     }
 }
 
@@ -224,7 +302,7 @@ fn send(producer: &mut Producer, dice: &mut Dice, tally: &mut Tally, known: bool
 }
 
 fn shortly(dice: &mut Dice) -> Wait<'static> {
-    Wait::within(Duration::from_micros(u64::from(dice.below(300))))
+    Wait::within(Duration::from_micros(u64::from(dice.below(dice.patience_us()))))
 }
 
 /// The other side: its own memory to write, this side's to try to.
@@ -235,37 +313,33 @@ struct Attacker {
     /// Descriptors of this side's and its own memory.
     keys: Vec<OwnedFd>,
     buttons: [Box<dyn crate::bell::Doorbell>; 2],
-    dice: Dice,
     wild: u32,
     tail: u32,
     head: u32,
 }
 
 impl Attacker {
-    fn new(region: Region, victim: Offer, keys: Vec<OwnedFd>, dice: Dice, wild: u32) -> Self {
+    fn new(region: Region, victim: Offer, keys: Vec<OwnedFd>, wild: u32) -> Self {
         let mut fds = victim.descriptors.into_iter();
         let memory = platform::adopt(fds.next().expect("it comes first"), victim.capacity);
         let (message, room) = platform::buttons(victim.bell, fds.collect()).expect("honest bells");
         let victim = memory.expect("honest memory");
-        Self { region, victim, keys, buttons: [message, room], dice, wild, tail: 0, head: 0 }
+        Self { region, victim, keys, buttons: [message, room], wild, tail: 0, head: 0 }
     }
 
-    fn attack_until(mut self, over: &AtomicBool) -> u64 {
-        let mut writes = 0;
-        while !over.load(Ordering::Relaxed) {
-            if self.dice.below(64) < self.wild {
-                self.write_anything();
-            } else {
-                self.write_something_likely();
-            }
-            writes += 1;
+    fn write(&mut self, dice: &mut Dice) {
+        if dice.below(256) >= self.wild {
+            self.write_as_the_honest_do(dice);
+        } else if dice.below(2) == 0 {
+            self.lie(dice);
+        } else {
+            self.write_anything(dice);
         }
-        writes
     }
 
-    fn write_anything(&mut self) {
-        let (place, value) = (self.dice.next() as u32, self.dice.next() as u32);
-        match self.dice.below(8) {
+    fn write_anything(&mut self, dice: &mut Dice) {
+        let (place, value) = (dice.next(), dice.next());
+        match dice.below(8) {
             0 => self.region.scribble(Word::Tail.index() as u32, value),
             1 => self.region.scribble(Word::Head.index() as u32, value),
             2 => self.try_the_keys(value),
@@ -286,22 +360,32 @@ impl Attacker {
         }
     }
 
-    fn write_something_likely(&mut self) {
-        let small = self.dice.below(600);
-        match self.dice.below(13) {
+    fn write_as_the_honest_do(&mut self, dice: &mut Dice) {
+        let small = dice.below(600);
+        match dice.below(10) {
             0..4 => self.publish(small),
-            4..6 => self.take(),
+            4..6 => self.take(dice),
             6 => self.region.scribble(Word::ConsumerSleep.index() as u32, small),
             7 => self.region.scribble(Word::ProducerSleep.index() as u32, small),
             8 => self.region.scribble(Word::Rung.index() as u32, small),
-            9 => self.buttons[small as usize % 2].ring(),
-            _ if self.wild == 0 => {}
-            10 => self.change_a_mark(Mark::Message(small * 9)),
-            11 => self.change_a_mark(Mark::Skip),
+            _ => self.buttons[small as usize % 2].ring(),
+        }
+    }
+
+    /// What a check has to see, just beside what it lets through.
+    fn lie(&mut self, dice: &mut Dice) {
+        let position = self.position_of_a_mark(dice);
+        match dice.below(4) {
+            0 => {
+                let length = self.length_at_an_edge(position, dice);
+                self.put_mark(position, Mark::Message(length));
+            }
+            1 => self.put_mark(position, Mark::Skip),
+            2 => self.miscount(dice),
             // Bytes of some message, perhaps while it is copied.
             _ => {
-                let place = HEADER_BYTES as u32 / 4 + self.dice.below(self.region.capacity.bytes() / 4);
-                self.region.scribble(place, small);
+                let place = HEADER_BYTES as u32 / 4 + dice.below(self.region.capacity.bytes() / 4);
+                self.region.scribble(place, dice.next());
             }
         }
     }
@@ -329,20 +413,40 @@ impl Attacker {
     }
 
     /// As an honest consumer does, in any pieces.
-    fn take(&mut self) {
+    fn take(&mut self, dice: &mut Dice) {
         let untaken = self.victim.load(Word::Tail).wrapping_sub(self.head);
-        self.head = self.head.wrapping_add(self.dice.below(untaken + 1) & !7);
+        self.head = self.head.wrapping_add(dice.below(untaken + 1) & !7);
         self.region.scribble(Word::Head.index() as u32, self.head);
     }
 
     /// Any, or the one that the victim reads next.
-    fn change_a_mark(&mut self, mark: Mark) {
+    fn position_of_a_mark(&self, dice: &mut Dice) -> u32 {
         let capacity = self.region.capacity;
-        let position = match self.dice.below(2) {
-            0 => self.dice.below(capacity.bytes() / 8) * 8,
+        match dice.below(2) {
+            0 => dice.below(capacity.bytes() / 8) * 8,
             _ => capacity.position(self.victim.load(Word::Head)),
+        }
+    }
+
+    /// A little below or above what a check of the victim's lets through, whichever of them it is; or any short one.
+    fn length_at_an_edge(&self, position: u32, dice: &mut Dice) -> u32 {
+        let capacity = self.region.capacity;
+        let edge = match dice.below(4) {
+            0 => capacity.rest(position),
+            1 => capacity.payload_max(),
+            2 => capacity.bytes(),
+            _ => return dice.below(5_400),
         };
-        self.put_mark(position, mark);
+        edge.wrapping_add(dice.below(64)).wrapping_sub(24)
+    }
+
+    /// A tail or a head that is a little beside the true one.
+    fn miscount(&mut self, dice: &mut Dice) {
+        let beside = |count: u32, by: u32| count.wrapping_add(by).wrapping_sub(32);
+        match dice.below(2) {
+            0 => self.region.scribble(Word::Tail.index() as u32, beside(self.tail, dice.below(64))),
+            _ => self.region.scribble(Word::Head.index() as u32, beside(self.head, dice.below(64))),
+        }
     }
 
     fn put_mark(&mut self, position: u32, mark: Mark) {
@@ -373,5 +477,13 @@ mod tests {
             "the attack reaches every check: {all:?}"
         );
         assert!(all.taken > 0 && all.published > 0, "and what lies behind them: {all:?}");
+    }
+
+    proptest::proptest! {
+        #[test]
+        fn any_script_of_a_hostile_peer_harms_nobody(script in proptest::collection::vec(proptest::num::u8::ANY, 0..4_000)) {
+            let tally = play(&script);
+            proptest::prop_assert_eq!(tally.lives, 1);
+        }
     }
 }
