@@ -34,8 +34,13 @@ use super::{
 };
 use crate::{post::lock, time::Time};
 
-/// Time between two looks at most.
+/// Time between two looks at most, at who is in the middle of something.
 const PERIOD_MAX: Duration = Duration::from_millis(5);
+/// The same while nobody is, and nobody lets messages wait: each look wakes a CPU.
+const REST_MAX: Duration = Duration::from_millis(40);
+/// Of a budget: so much at most goes by before it is seen that somebody is in the middle of something, and what he was not given
+/// meanwhile is not excused.
+const REST_OF_BUDGET: u32 = 25;
 /// Time between two looks at least, however small a budget is.
 const PERIOD_MIN: Duration = Duration::from_millis(1);
 /// Above every actor: it runs for microseconds at a time.
@@ -154,10 +159,11 @@ impl Shared {
         let before = table.len();
         table.retain_mut(|watched| look_at(watched, now, late, period));
         self.count.fetch_sub(before - table.len(), Ordering::Relaxed);
+        let rest = table.iter().map(Watched::rest).chain(reading).min()?;
         let deadline = table.iter().filter_map(Watched::deadline).min();
         // One that is over already waits for a CPU, or has just been seen: it is looked at again after a period.
         let deadline = deadline.filter(|deadline| *deadline > now);
-        Some(deadline.map_or(now + period, |deadline| deadline.min(now + period)))
+        Some(deadline.map_or(now + rest, |deadline| deadline.min(now + rest)))
     }
 }
 
@@ -194,6 +200,14 @@ impl Watched {
     fn new(tenant: Tenant, budget: Duration) -> Self {
         let period = (budget / 10).clamp(PERIOD_MIN, PERIOD_MAX);
         Self { tenant, budget, period, turn: TurnSuspect::new(budget), stall: StallSuspect::new(budget) }
+    }
+
+    /// Time until the next look, unless a deadline comes first.
+    fn rest(&self) -> Duration {
+        if self.turn.is_open() || self.stall.is_open() {
+            return self.period;
+        }
+        (self.budget / REST_OF_BUDGET).clamp(self.period, REST_MAX)
     }
 
     fn deadline(&self) -> Option<Time> {
@@ -291,6 +305,33 @@ mod tests {
         let fate = heard.recv_timeout(Duration::from_secs(20)).expect("the other one is accused");
         assert!(fate.contains("in a timer has not come back"), "{fate}");
         assert!(told.vitals().is_over());
+    }
+
+    /// Time until the next look at a life with this budget.
+    fn rest(vitals: &Arc<Vitals>, budget: Duration) -> Duration {
+        let tenant = Tenant::new(vitals.clone(), None, Some(budget), Box::new(|fate| panic!("{fate:?}")));
+        let mut watched = Watched::new(tenant, budget);
+        assert!(watched.look(Time::from_nanos(2), Duration::ZERO, PERIOD_MAX));
+        watched.rest()
+    }
+
+    #[test]
+    fn who_is_in_the_middle_of_nothing_is_looked_at_seldom() {
+        let vitals = Vitals::new("calm");
+        let rests =
+            [20, 100, 500, 1_000, 60_000].map(|ms| rest(&vitals, Duration::from_millis(ms)).as_millis());
+        assert_eq!(
+            rests,
+            [2, 5, 20, 40, 40],
+            "a 25th of its budget, 40 ms at most, and not less than a period"
+        );
+        vitals.begins(Doing::Timer, Some(Time::from_nanos(1)));
+        let rests = [20, 100, 1_000].map(|ms| rest(&vitals, Duration::from_millis(ms)).as_millis());
+        assert_eq!(
+            rests,
+            [2, 5, 5],
+            "once it is in the middle of something, as often as its end is to be seen"
+        );
     }
 
     #[test]

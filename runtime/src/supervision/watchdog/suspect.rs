@@ -40,6 +40,7 @@ pub(super) struct Hang {
 pub(super) struct TurnSuspect {
     budget: Duration,
     turn: u64,
+    is_busy: bool,
     first_seen: Time,
     looks: u32,
     account: Account,
@@ -47,7 +48,14 @@ pub(super) struct TurnSuspect {
 
 impl TurnSuspect {
     pub(super) fn new(budget: Duration) -> Self {
-        Self { budget, turn: 0, first_seen: Time::ZERO, looks: 0, account: Account::default() }
+        Self {
+            budget,
+            turn: 0,
+            is_busy: false,
+            first_seen: Time::ZERO,
+            looks: 0,
+            account: Account::default(),
+        }
     }
 
     /// Takes a look. `sample` reads the CPU's account; it is called only when that matters.
@@ -58,6 +66,7 @@ impl TurnSuspect {
         sample: impl FnOnce() -> Option<Sample>,
     ) -> Option<Hang> {
         let Look { now, late, sight } = look;
+        self.is_busy = sight.is_busy();
         if sight.turn != self.turn || !sight.is_busy() {
             let (account, turn) = (Account::opened(late), sight.turn);
             *self = Self { turn, first_seen: now, looks: 0, account, ..*self };
@@ -74,6 +83,11 @@ impl TurnSuspect {
         let excused = self.account.excused();
         let hangs = lasted >= self.budget_of(sight) + excused && !waits_for_cpu;
         hangs.then_some(Hang { since, lasted, excused })
+    }
+
+    /// Whether it was in the middle of a turn at the last look.
+    pub(super) const fn is_open(&self) -> bool {
+        self.is_busy
     }
 
     /// One that panicked is on its way out, and has time for it.
@@ -109,6 +123,8 @@ pub(super) struct StallSuspect {
     /// `None` before the first look.
     taken: Option<u64>,
     since: Time,
+    /// Messages waited at the last look, and none had been taken since the one before.
+    is_open: bool,
     /// The turn that it had when it was probed, and what the others of its thread did.
     probed: Option<(u64, Neighbours)>,
     account: Account,
@@ -116,7 +132,14 @@ pub(super) struct StallSuspect {
 
 impl StallSuspect {
     pub(super) fn new(budget: Duration) -> Self {
-        Self { budget, taken: None, since: Time::ZERO, probed: None, account: Account::default() }
+        Self {
+            budget,
+            taken: None,
+            since: Time::ZERO,
+            is_open: false,
+            probed: None,
+            account: Account::default(),
+        }
     }
 
     /// Takes a look at an actor that should take messages; of its backlog so many wait, and so many were taken so far. Where it
@@ -134,6 +157,7 @@ impl StallSuspect {
             self.calm(now);
             return Stall::None;
         }
+        self.is_open = true;
         self.account.late += late;
         let lasted = now.since(self.since);
         let Some((turn, before)) = self.probed else {
@@ -169,7 +193,12 @@ impl StallSuspect {
 
     /// Begins anew: whatever there was has an excuse.
     pub(super) fn calm(&mut self, now: Time) {
-        (self.since, self.probed, self.account) = (now, None, Account::default());
+        (self.since, self.is_open, self.probed, self.account) = (now, false, None, Account::default());
+    }
+
+    /// Whether it let messages wait at the last look.
+    pub(super) const fn is_open(&self) -> bool {
+        self.is_open
     }
 }
 

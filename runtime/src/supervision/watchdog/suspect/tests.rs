@@ -163,6 +163,20 @@ fn one_whose_thread_does_not_come_to_it_is_told_apart() {
 }
 
 #[test]
+fn one_that_lets_messages_wait_is_looked_at_more_often_until_it_takes_one() {
+    let mut suspect = StallSuspect::new(BUDGET);
+    let mut is_open = |now, waiting, taken| {
+        suspect.look(on_time(now, busy(2, None)), (waiting, taken), Neighbours::default, || None);
+        suspect.is_open()
+    };
+    assert!(!is_open(0, 3, 7), "the first look");
+    assert!(is_open(5, 3, 7));
+    assert!(!is_open(10, 3, 8), "it has taken one");
+    assert!(is_open(15, 3, 8));
+    assert!(!is_open(20, 0, 8), "none waits");
+}
+
+#[test]
 fn one_that_takes_messages_or_has_none_is_left_alone() {
     assert_eq!(stall(|_| 2, |now| now / 90, 3, |_| None).1, None);
     assert_eq!(stall(|_| 2, |_| 7, 0, |_| None), (None, None));
