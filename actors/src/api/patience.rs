@@ -77,6 +77,11 @@ impl Waiting {
         (now < until).then_some(until)
     }
 
+    /// Whether there was no room at some time.
+    pub(super) const fn has_begun(&self) -> bool {
+        self.turn.is_some()
+    }
+
     /// Whether the peer has taken nothing for as long as the patience lasts.
     pub(super) fn is_out_of_patience(&self, now: Time) -> bool {
         !self.limit.is_in_all() && self.turn.is_some_and(|(_, until)| now >= until)

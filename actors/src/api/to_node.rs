@@ -29,9 +29,12 @@ impl Endpoint {
         let has_stalled = self.stalled.is_some_and(|taken| taken == self.taken());
         let mut waiting = if has_stalled { Waiting::after_a_stall(limit) } else { Waiting::new(limit) };
         let written = self.write_within(draft, &mut waiting).await;
-        let taken = self.taken();
-        let is_stalled = waiting.is_out_of_patience(Time::now()) || self.stalled == Some(taken);
-        self.stalled = is_stalled.then_some(taken);
+        // Where there was room at once, as nearly always, there is nothing to ask the clock or the node's end of the ring.
+        if self.stalled.is_some() || waiting.has_begun() {
+            let taken = self.taken();
+            let is_stalled = waiting.is_out_of_patience(Time::now()) || self.stalled == Some(taken);
+            self.stalled = is_stalled.then_some(taken);
+        }
         written
     }
 
