@@ -7,7 +7,7 @@
 use std::{
     sync::{
         Arc,
-        atomic::{AtomicUsize, Ordering},
+        atomic::{AtomicBool, AtomicUsize, Ordering},
     },
     time::Duration,
 };
@@ -33,13 +33,16 @@ pub(super) struct Outcomes {
     pending_max: usize,
     /// Outcomes that wait ahead of its queue while it is read.
     waiting_max: usize,
+    /// Whether some may: to count them takes a lock, which others hold while they write to the client.
+    may_wait: AtomicBool,
 }
 
 impl Outcomes {
     /// Of a client whose queue holds so many messages of a class.
     pub(super) fn new(outlet: Arc<ClientOutlet>, queue_capacity: usize) -> Arc<Self> {
         let pending_max = PENDING_QUEUES * queue_capacity;
-        Arc::new(Self { outlet, pending: AtomicUsize::new(0), pending_max, waiting_max: queue_capacity })
+        let (pending, may_wait) = (AtomicUsize::new(0), AtomicBool::new(false));
+        Arc::new(Self { outlet, pending, pending_max, waiting_max: queue_capacity, may_wait })
     }
 
     /// The receipt of a message of the client's; `None` if too many are without an outcome, which is told to it.
@@ -67,13 +70,27 @@ impl Outcomes {
             let most = self.pending_max + 2 * self.waiting_max;
             // Not taken: its connection has ended.
             let _ = self.outlet.submit_urgent(refused.message, most);
+            // SYNC: Release, for `may_come`: who sees this sees what waits.
+            self.may_wait.store(true, Ordering::Release);
         }
     }
 
     /// Resolves when so few answers wait that the client may be read.
     pub(super) async fn may_come(&self) {
-        // Its end is noticed by who writes to it.
-        while self.outlet.urgent_left() >= self.waiting_max {
+        if !self.may_wait.load(Ordering::Relaxed) {
+            return;
+        }
+        // SYNC: Acquire, with the Release in `answer`: what waits by now is counted below, and what comes later says so again.
+        self.may_wait.swap(false, Ordering::Acquire);
+        loop {
+            let left = self.outlet.urgent_left();
+            if left < self.waiting_max {
+                if left > 0 {
+                    self.may_wait.store(true, Ordering::Relaxed);
+                }
+                return;
+            }
+            // Its end is noticed by who writes to it.
             tokio::time::sleep(LOOK_AGAIN).await;
         }
     }
