@@ -11,9 +11,15 @@ use std::{
     time::Duration,
 };
 
-use sinew_runtime::{time::Time, wire::Checksum};
+use sinew_runtime::{
+    time::Time,
+    wire::{Checksum, Message},
+};
 
-use super::{Account, Socket};
+use super::{
+    Account, Socket,
+    half::{Half, Link},
+};
 
 /// Messages right behind each other that are written at once, each by its sender.
 const AT_ONCE: u32 = 4;
@@ -47,6 +53,23 @@ impl Pace {
     /// The message was written by its sender, who was done `now`.
     pub(super) const fn written(&mut self, now: Time) {
         self.last = now;
+    }
+}
+
+impl<S: Socket> Half<S> {
+    /// Whether messages come so fast that they had better be written many at once.
+    pub(super) fn is_one_of_a_flood(&mut self, message: &Message) -> bool {
+        let Link::Up(socket) = &self.link else { return false };
+        // What the layers say carries no time.
+        let now = || if message.header.sent == Time::ZERO { Time::now() } else { message.header.sent };
+        socket.gathers() && self.pace.is_flood(now())
+    }
+
+    /// Its sender has just written a message; the clock is read only where that matters.
+    pub(super) fn note_pace(&mut self) {
+        if matches!(&self.link, Link::Up(socket) if socket.gathers()) {
+            self.pace.written(Time::now());
+        }
     }
 }
 

@@ -90,7 +90,7 @@ pub(super) struct Half<S> {
     /// Who waits until fewer of them are open.
     outcomes_awaited: Option<Waker>,
     pub(super) drainer: Option<Waker>,
-    pace: Pace,
+    pub(super) pace: Pace,
     pub(super) counts: OutletCounts,
     /// The rest of what an audit needs.
     pub(super) tally: Tally,
@@ -280,7 +280,7 @@ impl<S: Socket> Half<S> {
         match self.write(&mut frame) {
             Written::Whole => {
                 self.sent(frame);
-                self.pace.written(Time::now());
+                self.note_pace();
             }
             Written::Piece => {
                 self.partial = Some(frame);
@@ -408,14 +408,6 @@ impl<S: Socket> Half<S> {
         } else {
             after.room = room.and_then(|room| self.queue.offered(message, room));
         }
-    }
-
-    /// Whether messages come so fast that they had better be written many at once.
-    fn is_one_of_a_flood(&mut self, message: &Message) -> bool {
-        let Link::Up(socket) = &self.link else { return false };
-        // What the layers say carries no time.
-        let now = || if message.header.sent == Time::ZERO { Time::now() } else { message.header.sent };
-        socket.gathers() && self.pace.is_flood(now())
     }
 
     /// Whether a message that was never sent may be written now.
