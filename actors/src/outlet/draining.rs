@@ -167,9 +167,7 @@ impl<S: Socket> Half<S> {
             return None;
         }
         let message = self.interrupted.take().or_else(|| self.queue.pop())?;
-        if let Some(waker) = self.queue.room_made() {
-            after.room = Some(waker);
-        }
+        after.room.extend(self.queue.room_made());
         if message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
             self.waiting_receipts -= usize::from(message.receipt.is_some());
             self.expired(message, after);

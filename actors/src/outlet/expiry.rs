@@ -34,7 +34,7 @@ impl<S: Socket> Half<S> {
         let is_interrupted = self.interrupted.as_ref().is_some_and(|message| message.is_request(ticket));
         let waited = if is_interrupted { self.interrupted.take() } else { self.queue.take_request(ticket) };
         let Some(message) = waited.or_else(|| self.take_request_in_line(ticket)) else { return false };
-        after.room = self.queue.room_made().or_else(|| after.room.take());
+        after.room.extend(self.queue.room_made());
         self.waiting_receipts -= usize::from(message.receipt.is_some());
         self.expired(message, after);
         true

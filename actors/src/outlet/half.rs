@@ -28,8 +28,8 @@ const UNCONFIRMED_DESTINATIONS: usize = 8;
 pub(super) struct After {
     pub(super) settle: Vec<(Receipt, Outcome)>,
     pub(super) wake: Option<Waker>,
-    /// Whoever waited for room.
-    pub(super) room: Option<Waker>,
+    /// Those who waited for room.
+    pub(super) room: Vec<Waker>,
 }
 
 impl After {
@@ -173,7 +173,7 @@ impl<S: Socket> Half<S> {
     /// What was sent and not confirmed may have been handled or not.
     pub(super) fn unknown(&mut self, after: &mut After) {
         after.settle.extend(self.sent_receipts.take_all().map(|sent| (sent.receipt, Outcome::Unknown)));
-        after.room = self.outcomes_awaited.take().or_else(|| after.room.take());
+        after.room.extend(self.outcomes_awaited.take());
     }
 
     /// The frame that was being written goes out on the next connection.
@@ -214,7 +214,7 @@ impl<S: Socket> Half<S> {
         self.unknown(after);
         self.forget_kept();
         self.link = Link::Closed(why);
-        after.room = self.queue.awaited_no_more().or_else(|| after.room.take());
+        after.room.extend(self.queue.awaited_no_more());
         let waiting = self.take_waiting();
         for message in waiting {
             self.counts.lost += 1;
@@ -406,7 +406,7 @@ impl<S: Socket> Half<S> {
         if message.receipt.is_some() && self.has_too_many_unconfirmed(message.header.destination) {
             self.outcomes_awaited = room.cloned();
         } else {
-            after.room = room.and_then(|room| self.queue.offered(message, room));
+            after.room.extend(room.and_then(|room| self.queue.offered(message, room)));
         }
     }
 
@@ -464,7 +464,7 @@ impl<S: Socket> Half<S> {
         let Some(receipt) = self.sent_receipts.take(ticket) else { return false };
         after.settle.push((receipt, outcome));
         if self.unconfirmed() <= self.limits.unconfirmed_max / 2 {
-            after.room = self.outcomes_awaited.take();
+            after.room.extend(self.outcomes_awaited.take());
         }
         true
     }

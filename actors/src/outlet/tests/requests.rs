@@ -3,7 +3,7 @@
 use super::*;
 use crate::session::Window;
 
-fn session(room: usize) -> Bench {
+pub(super) fn session(room: usize) -> Bench {
     let void = Header::new(Kind::GNCL_VOID, tid(0), tid(1));
     let window = Window { messages: 64, bytes: PLENTY };
     let outlet = StreamOutlet::with_session(LIMITS, Session::new(1, window, void));

@@ -2,7 +2,7 @@
 
 use std::task::Wake;
 
-use super::*;
+use super::{requests::session, *};
 
 /// Counts how often its waker was woken.
 #[derive(Default)]
@@ -44,6 +44,26 @@ fn who_keeps_a_confirmed_message_because_too_many_are_open_is_woken_by_their_out
         })
         .collect();
     assert_eq!(after_each, [0, 1, 1, 1]);
+}
+
+#[test]
+fn who_keeps_a_confirmed_message_is_woken_also_by_several_outcomes_at_once() {
+    // given: as many are open as may be
+    let (mut bench, (woken, waker)) = (session(PLENTY), waker());
+    for correlation in 1..=4 {
+        let mut message = bench.confirmed(correlation);
+        (message.header.sent, message.header.time_to_live_us) = (Time::now(), 3_000_000);
+        bench.submit(message);
+    }
+    drop(bench.outlet.offer(bench.confirmed(5), Some(&waker)).unwrap_err());
+    // when: none has arrived before a cut, and the time of all is over
+    bench.outlet.disconnect(bench.link);
+    bench.reconnect(PLENTY);
+    let ack = Ack { memory: 1, epoch: 1, of: 1, next: 1, change: 1, held: Vec::new() };
+    bench.outlet.heard(bench.link, &ack, Time::MAX);
+    // then
+    assert_eq!(bench.ledger.take().len(), 4 + 1, "the one that was kept ends here, too");
+    assert_eq!(woken.0.load(Ordering::Relaxed), 1);
 }
 
 #[test]
