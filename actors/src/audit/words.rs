@@ -1,10 +1,12 @@
 //! What goes between nodes for an audit: a question without a payload, and its answer. Bytes from another node are bounded here.
 
+use std::collections::BTreeMap;
+
 use bytes::Bytes;
 use sinew_runtime::wire::decode;
 
 use super::{
-    account::Place,
+    account::{Account, Place},
     reading::{Entry, NodeAudit},
 };
 
@@ -50,10 +52,9 @@ fn put_together(audit: &mut NodeAudit) -> bool {
     };
     let mut left = audit.entries.iter().filter(|entry| others(&entry.place).is_some()).count().div_ceil(2);
     let had_any = left > 0;
-    let mut kept: Vec<Entry> = Vec::new();
+    let mut kept: BTreeMap<Place, Account> = BTreeMap::new();
     // From the end, so that those that stay are the first ones.
-    for entry in std::mem::take(&mut audit.entries).into_iter().rev() {
-        let Entry { place, account } = entry;
+    for Entry { place, account } in std::mem::take(&mut audit.entries).into_iter().rev() {
         let place = match others(&place) {
             Some(other) if left > 0 => {
                 left -= 1;
@@ -61,13 +62,10 @@ fn put_together(audit: &mut NodeAudit) -> bool {
             }
             Some(_) | None => place,
         };
-        match kept.iter_mut().find(|entry| entry.place == place) {
-            Some(entry) => entry.account = entry.account + account,
-            None => kept.push(Entry { place, account }),
-        }
+        let entry = kept.entry(place).or_default();
+        *entry = *entry + account;
     }
-    kept.sort_by(|one, other| one.place.cmp(&other.place));
-    audit.entries = kept;
+    audit.entries = kept.into_iter().map(|(place, account)| Entry { place, account }).collect();
     had_any
 }
 
@@ -80,7 +78,6 @@ mod tests {
     };
 
     use super::*;
-    use crate::audit::Account;
 
     fn with_applications(count: u32) -> NodeAudit {
         let entry = |number: u32| Entry {
@@ -97,7 +94,7 @@ mod tests {
             incarnation: Incarnation(1),
             entries: (0..count).map(entry).collect(),
             sessions: Vec::new(),
-            refused: std::collections::BTreeMap::new(),
+            refused: BTreeMap::new(),
         }
     }
 
