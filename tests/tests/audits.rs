@@ -74,7 +74,7 @@ fn every_sort_of_end_in_a_node_is_counted_and_nothing_is_unexplained() {
     all_run(&[&node]);
     let (handle, sender) = (node.handle(), key.sender());
     sender.send("sink", &Order { number: HOLD }).expect("there is room");
-    held.recv().expect("it is held");
+    held.recv_timeout(DEADLINE).expect("waited for it to be held");
     // When: it is sent every sort of message
     let jobs = send_every_sort(&sender, "sink");
     let nobody = Tid::new(node.address(), AppAddress::fixed(7).expect("a fixed one"));

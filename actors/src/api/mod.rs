@@ -389,8 +389,8 @@ impl Registration {
 
     /// What the thread does before it sleeps at a ring: looks for a while, or sleeps at once. Looking keeps a CPU busy and
     /// saves the wake, which is most of a short message's way. A task ([`AsyncEndpoint`]) looks for 10 us at once, and between two
-    /// such looks others of its runtime have their turn; so its runtime does not sleep meanwhile. Over plain sockets, and while the node is away,
-    /// it does nothing. Default [`Spin::Off`].
+    /// such looks others of its runtime have their turn; so its runtime does not sleep meanwhile. Over plain sockets, and while
+    /// the node is away, it does nothing. Default [`Spin::Off`].
     #[must_use]
     pub const fn spin(mut self, spin: Spin) -> Self {
         self.link.spin = spin;

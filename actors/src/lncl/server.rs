@@ -115,7 +115,8 @@ impl Server {
         self.clients.borrow_mut().remove(&id);
     }
 
-    /// Settles messages that expired while their client did not read, gives up introductions that nobody answers, and tells clients what nobody has taken of theirs.
+    /// Settles messages that expired while their client did not read, gives up introductions that nobody answers, and tells clients
+    /// what nobody has taken of theirs.
     pub(super) fn tick(&self, now: Time) {
         self.introductions.give_up(now);
         for Served { outlet, notices } in self.clients.borrow().values() {

@@ -72,8 +72,8 @@ impl fmt::Display for Window {
     }
 }
 
-/// `SOCKET [NAME]`: asks the one of this name, directly where it can, or the echo, and says what it measured since it was last told to (`window`).
-/// What it asks while it is told to `rest` is not measured, until it is told to `measure`.
+/// `SOCKET [NAME]`: asks the one of this name, directly where it can, or the echo, and says what it measured since it was last told to
+/// (`window`). What it asks while it is told to `rest` is not measured, until it is told to `measure`.
 pub(super) fn play_pinger(arguments: &[String]) {
     let api = NodeApi::connect(&arguments[0]).expect("the door is open");
     let (name, is_direct) = arguments.get(1).map_or((ECHO, false), |name| (&**name, true));

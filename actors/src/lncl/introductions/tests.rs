@@ -282,14 +282,14 @@ fn a_mark_goes_behind_each_class_whatever_the_bounds_and_so_many_are_unconfirmed
     );
     assert_eq!(third.header.correlation, 5);
     third.settle(Outcome::Delivered);
-    assert_eq!(outcome.recv(), Ok(Outcome::Delivered));
+    assert_eq!(outcome.try_recv(), Ok(Outcome::Delivered));
     assert_eq!(pass(tid(9)), Err(Rejection::NoSuchApplication));
-    assert_eq!(outcome.recv(), Ok(Outcome::Rejected(Rejection::NoSuchApplication)));
+    assert_eq!(outcome.try_recv(), Ok(Outcome::Rejected(Rejection::NoSuchApplication)));
     for _ in 0..SWITCHES_MAX {
         assert_eq!(pass(peer.tid), Ok(()));
     }
     assert_eq!(pass(peer.tid), Err(Rejection::QueueFull));
-    assert_eq!(outcome.recv(), Ok(Outcome::Rejected(Rejection::QueueFull)));
+    assert_eq!(outcome.try_recv(), Ok(Outcome::Rejected(Rejection::QueueFull)));
 }
 
 /// The numbers of the links of which a client is told that their peer is dead.
