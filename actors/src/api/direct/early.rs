@@ -21,6 +21,17 @@ impl Early {
     pub(super) const fn after(after: LinkNumber) -> Self {
         Self { after, messages: VecDeque::new(), bytes: 0 }
     }
+
+    fn push(&mut self, message: Message) {
+        self.bytes += message.payload.len();
+        self.messages.push_back(message);
+    }
+
+    fn pop(&mut self) -> Option<Message> {
+        let message = self.messages.pop_front()?;
+        self.bytes -= message.payload.len();
+        Some(message)
+    }
 }
 
 /// What is to be done with a message that came through the node.
@@ -54,9 +65,7 @@ impl Direct {
         if messages >= EARLY_MAX || bytes >= EARLY_BYTES_MAX {
             return InTurn::Never(message);
         }
-        let early = self.early.entry(source).or_insert_with(|| Early::after(after));
-        early.bytes += message.payload.len();
-        early.messages.push_back(message);
+        self.early.entry(source).or_insert_with(|| Early::after(after)).push(message);
         InTurn::Later
     }
 
@@ -75,11 +84,33 @@ impl Direct {
         let routes = &self.routes;
         let is_due = |(source, early): &(&Tid, &mut Early)| routes.link(**source) != Some(early.after);
         let (source, early) = self.early.iter_mut().find(is_due)?;
-        let (source, message) = (*source, early.messages.pop_front());
-        early.bytes -= message.as_ref().map_or(0, |message| message.payload.len());
+        let (source, message) = (*source, early.pop());
         if early.messages.is_empty() {
             self.early.remove(&source);
         }
         message
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew_runtime::wire::{Header, Kind};
+
+    use super::*;
+
+    #[test]
+    fn what_has_had_its_turn_takes_no_room_any_more() {
+        let message = |length: usize| {
+            let header = Header::new(Kind::named("early"), Tid::from_bits(1), Tid::from_bits(2));
+            Message::new(header, vec![0; length].into())
+        };
+        let mut early = Early::after(LinkNumber(1));
+        [100, 0, 7].into_iter().for_each(|length| early.push(message(length)));
+        assert_eq!(early.bytes, 107);
+
+        let lengths: Vec<usize> =
+            std::iter::from_fn(|| early.pop()).map(|message| message.payload.len()).collect();
+
+        assert_eq!((lengths, early.bytes), (vec![100, 0, 7], 0));
     }
 }
