@@ -51,6 +51,10 @@ pub(crate) enum Command {
     },
     /// Who waits for whom at start-up barriers, and who blocks them
     Barriers,
+    /// Where every message is that was ever sent: what each mailbox, client and link took, and how each of these ended
+    ///
+    /// Each node is read twice, and both ends of each link are compared. What nobody can explain is named, with its place or link.
+    Audit,
     /// Whether this machine gives a node what it needs: multicast, open files, real-time rights, shared memory, a socket directory; each
     /// finding with the command that mends it
     Doctor {

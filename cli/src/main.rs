@@ -5,6 +5,7 @@
 
 mod apps;
 mod arguments;
+mod audit;
 mod doctor;
 mod door;
 mod nodes;
@@ -65,6 +66,7 @@ fn run(arguments: &Arguments) -> Result<Said, Fault> {
         Command::Tree { node } => inside(&|system| tree::show(system, node.as_deref())),
         Command::Ping { whom, count } => inside(&|system| ping::show(system, whom, *count)),
         Command::Barriers => inside(&apps::barriers),
+        Command::Audit => inside(&audit::show),
         Command::Doctor { interface } => Ok(doctor::show(*interface, arguments.socket.as_deref())),
     }
 }

@@ -177,7 +177,9 @@ fn a_wrong_command_line_is_2_and_help_names_the_exit_codes() {
     assert_eq!(sinew(&["nodse"], Path::new("/")).code, Some(2));
     let help = sinew(&["--help"], Path::new("/"));
     assert_eq!(help.code, Some(0));
-    for words in ["nodes", "apps", "tree", "ping", "barriers", "doctor", "Exit codes", "SINEW_SOCKET"] {
+    for words in
+        ["nodes", "apps", "tree", "ping", "barriers", "audit", "doctor", "Exit codes", "SINEW_SOCKET"]
+    {
         assert!(help.out.contains(words), "{words}: {}", help.out);
     }
 }
@@ -292,6 +294,41 @@ fn the_tree_of_another_node_has_its_layers_and_its_application() {
     let text = scenario.sinew("hip", &["tree"]).out;
     assert!(text.contains("127.0.0.1 hip\n") && text.contains("127.0.0.2 knee\n"), "{text}");
     assert_eq!(scenario.sinew("hip", &["tree", "ankle"]).code, Some(1));
+}
+
+#[test]
+fn an_audit_explains_every_message_of_both_nodes_while_they_talk_and_names_who_does_not_answer() {
+    // Given: the hip sends to the knee all the time
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee", "--sends-to", "knee"]);
+    let mut knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["started"]);
+    knee.wait_for(&["count 5 "]);
+    for here in ["hip", "knee"] {
+        // When
+        let answer = scenario.sinew(here, &["audit", "--json"]);
+        // Then: what was sent is where it was handled, and nothing is missing
+        let said = answer.json();
+        assert_eq!(answer.code, Some(0), "{said}");
+        assert_eq!((&said["unexplained"], &said["silent"]), (&serde_json::json!([]), &serde_json::json!([])));
+        let knee = named(&said["nodes"], "knee").expect("it has answered");
+        let is_bulk_of_the_knee = |entry: &&Value| {
+            let mailbox = &entry["place"]["Mailbox"];
+            mailbox["name"] == "knee" && mailbox["class"] == "Bulk"
+        };
+        let entry = knee["entries"].as_array().and_then(|entries| entries.iter().find(is_bulk_of_the_knee));
+        let entry = entry.unwrap_or_else(|| panic!("no mailbox of the knee: {said}"));
+        assert!(entry["account"]["delivered"].as_u64() >= Some(5), "{entry}");
+    }
+    let table = scenario.sinew("knee", &["audit"]).out;
+    for words in ["every message is explained", "mailbox knee", "127.0.0.1 -> 127.0.0.2, Bulk"] {
+        assert!(table.contains(words), "{words}: {table}");
+    }
+    // And: who is stopped is named, and a finding
+    knee.freeze();
+    let answer = scenario.sinew("hip", &["audit", "--deadline-ms", "200"]);
+    assert!(answer.code == Some(1) && answer.out.contains("127.0.0.2 did not answer"), "{}", answer.out);
+    knee.signal(Signal::CONT);
 }
 
 #[test]

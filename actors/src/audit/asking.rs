@@ -109,14 +109,7 @@ pub(crate) fn audit(
     // All were read once before any is read again.
     let mut after = vec![reading::read(stores)];
     after.extend(ask(stores, &answered, within.saturating_sub(Time::now().since(began)))?);
-    let is_same_life = |node: &NodeAudit| {
-        before.iter().any(|former| (former.node, former.incarnation) == (node.node, node.incarnation))
-    };
-    after.retain(is_same_life);
-    after.sort_by_key(|node| node.node);
-    let silent =
-        others.iter().filter(|other| after.iter().all(|node| node.node != **other)).copied().collect();
-    Ok(Audit::of(stores.node, &before, after, silent))
+    Ok(Audit::of_readings(stores.node, others, &before, after))
 }
 
 /// What the others say of themselves within this time.

@@ -29,3 +29,4 @@ pub(crate) use book::Book;
 pub(crate) use reading::read;
 pub use reading::{Entry, NodeAudit, Receiving, Sending, Session};
 pub use system::{At, Audit, Link, LinkState, Unexplained};
+pub(crate) use words::put_together;

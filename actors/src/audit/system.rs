@@ -1,5 +1,7 @@
 //! The audit of the whole system: what all nodes say, side by side.
 
+use std::collections::BTreeSet;
+
 use serde::{Deserialize, Serialize};
 use sinew_runtime::{tid::NodeAddress, wire::Class};
 
@@ -86,7 +88,26 @@ pub enum At {
 }
 
 impl Audit {
-    /// Puts two readings together. Each node of `after` was read before, too, and all of `before` before any of `after`.
+    /// Puts two readings of these nodes side by side: all of `before` were read before any of `after`. Who is not in both of them, in the
+    /// same life, is silent.
+    #[must_use]
+    pub fn of_readings(
+        asked_by: NodeAddress,
+        asked: &BTreeSet<NodeAddress>,
+        before: &[NodeAudit],
+        mut after: Vec<NodeAudit>,
+    ) -> Self {
+        let is_same_life = |node: &NodeAudit| {
+            before.iter().any(|former| (former.node, former.incarnation) == (node.node, node.incarnation))
+        };
+        after.retain(is_same_life);
+        after.sort_by_key(|node| node.node);
+        let silent = asked.iter().filter(|asked| after.iter().all(|node| node.node != **asked));
+        let silent = silent.copied().collect();
+        Self::of(asked_by, before, after, silent)
+    }
+
+    /// Each node of `after` was read before, too.
     pub(super) fn of(
         asked_by: NodeAddress,
         before: &[NodeAudit],

@@ -39,7 +39,7 @@ pub(super) fn read(bytes: &Bytes) -> Result<NodeAudit, String> {
 }
 
 /// Puts the accounts of half of the applications together. Returns whether there were any.
-fn put_together(audit: &mut NodeAudit) -> bool {
+pub(crate) fn put_together(audit: &mut NodeAudit) -> bool {
     let others = |place: &Place| match place {
         Place::Mailbox { .. } => Some(Place::OtherMailboxes),
         Place::Client { .. } => Some(Place::OtherClients),

@@ -14,10 +14,11 @@ use sinew_runtime::{
 };
 
 use super::reports::{
-    APPS_MAX, AppReport, AppsReport, LinkReport, Missing, NodeReport, PEERS_MAX, PeerReport, TREE_MAX,
-    TreeLine, TreeReport,
+    APPS_MAX, AppReport, AppsReport, AuditReport, LinkReport, Missing, NodeReport, PEERS_MAX, PeerReport,
+    TREE_MAX, TreeLine, TreeReport,
 };
 use crate::{
+    audit,
     gncl::Peer,
     ndl::{KnownNode, Source},
     node::{CommandError, NodeHandle, Supervised},
@@ -83,6 +84,11 @@ impl Answers {
         let left_out = lines.len().saturating_sub(TREE_MAX) as u64;
         lines.truncate(TREE_MAX);
         Ok(TreeReport { name: tree.node, lines, left_out })
+    }
+
+    #[expect(clippy::unnecessary_wraps, reason = "all answers have one form")]
+    pub(super) fn audit(&self, stores: &Arc<Stores>) -> Result<AuditReport, Rejection> {
+        Ok(AuditReport { audit: audit::read(stores) })
     }
 }
 

@@ -20,7 +20,7 @@ use sinew_runtime::{
 
 use super::{
     answers::Answers,
-    reports::{AskApps, AskNode, AskTree, Report},
+    reports::{AskApps, AskAudit, AskNode, AskTree, Report},
 };
 use crate::{log, stores::Stores};
 
@@ -78,6 +78,7 @@ fn answer(answers: &Answers, number: u64, mut question: Message) {
         AskNode::KIND => reply(answers, number, &question, Answers::node),
         AskApps::KIND => reply(answers, number, &question, Answers::apps),
         AskTree::KIND => reply(answers, number, &question, Answers::tree),
+        AskAudit::KIND => reply(answers, number, &question, Answers::audit),
         // spec: INSPECT-4
         _ => Err(Rejection::UnknownKind),
     };

@@ -21,8 +21,8 @@ mod tests;
 
 pub(crate) use inspector::begin;
 pub use reports::{
-    APPS_MAX, AppReport, AppsReport, AskApps, AskNode, AskTree, LinkReport, Missing, NodeReport, PEERS_MAX,
-    PeerReport, Ping, TREE_MAX, TreeLine, TreeReport,
+    APPS_MAX, AppReport, AppsReport, AskApps, AskAudit, AskNode, AskTree, AuditReport, LinkReport, Missing,
+    NodeReport, PEERS_MAX, PeerReport, Ping, TREE_MAX, TreeLine, TreeReport,
 };
 
 #[cfg(doc)]

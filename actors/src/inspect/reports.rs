@@ -3,7 +3,11 @@
 use serde::{Deserialize, Serialize};
 use sinew_runtime::tid::{Incarnation, NodeAddress, Tid};
 
-use crate::{payload, sync::at_most};
+use crate::{
+    audit::{NodeAudit, put_together},
+    payload,
+    sync::at_most,
+};
 
 /// Nodes in one answer at most.
 pub const PEERS_MAX: usize = 1_024;
@@ -38,6 +42,12 @@ payload!("sinew.inspect.tree" =>
     /// Who supervises whom? [`TreeReport`] answers.
     #[derive(Clone, Copy, Debug, Default)]
     pub struct AskTree {}
+);
+
+payload!("sinew.inspect.audit" =>
+    /// Where is every message that you ever had? [`AuditReport`] answers.
+    #[derive(Clone, Copy, Debug, Default)]
+    pub struct AskAudit {}
 );
 
 payload!("sinew.inspect.node_report" =>
@@ -196,6 +206,16 @@ pub struct TreeLine {
     pub strategy: Option<String>,
 }
 
+payload!("sinew.inspect.audit_report" =>
+    /// What became of the messages of a node, as it was at one moment.
+    /// [`Audit::of_readings`](crate::Audit::of_readings) puts those of all nodes side by side.
+    #[derive(Clone, Debug, PartialEq, Eq)]
+    pub struct AuditReport {
+        /// What it says of itself. Applications that have no room are counted together.
+        pub audit: NodeAudit,
+    }
+);
+
 /// An answer that has a list, from which what has no room is left out.
 pub(super) trait Report {
     /// Leaves out the second half of its list; whether there was any.
@@ -225,5 +245,11 @@ impl Report for AppsReport {
 impl Report for TreeReport {
     fn halve(&mut self) -> bool {
         halve(&mut self.lines, &mut self.left_out)
+    }
+}
+
+impl Report for AuditReport {
+    fn halve(&mut self) -> bool {
+        put_together(&mut self.audit)
     }
 }
