@@ -10,6 +10,7 @@
 //! | `clerk` | writes down what was sent and got, in rows |
 //! | `pair` | both nodes with the faulty network between them, as their director sees them |
 //! | `trouble` | what can happen to a link, and how it is healed |
+//! | `wall_clock` | a wall clock of each node's own, which can be set |
 //! | `report` | what was seen, as a table and as JSON |
 
 mod clerk;
@@ -18,6 +19,7 @@ mod pacer;
 mod pair;
 mod report;
 mod trouble;
+mod wall_clock;
 
 use std::{
     path::PathBuf,

@@ -77,3 +77,14 @@ fn of_a_killed_node_every_confirmed_message_has_its_outcome() {
     assert!(report.holds(), "{report}");
     assert!(report.verdict.got > 0 && report.verdict.asked > 0, "{report}");
 }
+
+#[test]
+fn wall_clocks_that_jump_by_a_day_are_noticed_by_no_message() {
+    if std::process::Command::new("cc").arg("--version").output().is_err() {
+        println!("skipped: there is no cc on this machine, which a clock that is set needs");
+        return;
+    }
+    let report = report(&[Trouble::ClockOn, Trouble::ClockBack, Trouble::ClockBack, Trouble::Cut], 12);
+    assert!(report.holds() && report.verdict.is_perfect(), "{report}");
+    agrees(&report);
+}

@@ -11,14 +11,16 @@ use sinew_tests::link_faults::{Plan, Trouble, play, run};
 
 /// Lets things happen to the link between two nodes, each in turn, and counts the messages.
 ///
-/// The nodes are processes of their own, with a faulty network between them. Nothing in a running node reads the wall clock (time is
-/// the monotonic clock, which nobody can set), so there is no option that sets it: a start reads it once, for the node's incarnation.
+/// The nodes are processes of their own, with a faulty network between them. Clocks that jump are their wall clocks, and theirs alone; they
+/// need a C compiler, `cc`. (Nobody can set the monotonic clock, which is all that a running node reads; its start reads the wall clock once,
+/// for its incarnation.)
 #[derive(Parser)]
 struct Arguments {
     /// How often something happens, over all.
     #[arg(long, default_value_t = 1_000)]
     faults: u64,
-    /// What happens: cut, finish, panic-sender, panic-receiver, stall, part-there, part-back, freeze, kill-receiver, kill-sender.
+    /// What happens: cut, finish, panic-sender, panic-receiver, stall, part-there, part-back, freeze, kill-receiver, kill-sender,
+    /// clock-on, clock-back.
     #[arg(long, value_delimiter = ',', default_value = "cut,panic-sender,finish,panic-receiver")]
     what: Vec<Trouble>,
     /// Messages from the first node to the second, a second.

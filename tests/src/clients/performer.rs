@@ -30,10 +30,24 @@ impl Performer {
         role: &str,
         arguments: &[String],
         temporary: &Path,
+        hear: impl FnMut(&str) + Send + 'static,
+    ) -> Self {
+        Self::start_with(program, role, arguments, &[("TMPDIR", temporary)], hear)
+    }
+
+    /// The same, with this in its environment.
+    ///
+    /// # Panics
+    /// If it cannot be started.
+    pub(crate) fn start_with(
+        program: &Path,
+        role: &str,
+        arguments: &[String],
+        environment: &[(&str, &Path)],
         mut hear: impl FnMut(&str) + Send + 'static,
     ) -> Self {
         let mut command = Command::new(program);
-        command.arg("--role").arg(role).args(arguments).env("TMPDIR", temporary);
+        command.arg("--role").arg(role).args(arguments).envs(environment.iter().copied());
         let spawned = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
         let mut child = spawned.unwrap_or_else(|error| panic!("{role} does not start: {error}"));
         let (input, output) = (child.stdin.take(), child.stdout.take().expect("its output is a pipe"));

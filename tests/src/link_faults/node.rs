@@ -6,6 +6,7 @@ use std::{
         Arc, Mutex, PoisonError,
         atomic::{AtomicU64, Ordering},
     },
+    time::SystemTime,
 };
 
 use sinew::{Class, NodeHandle, Time, fault::Fault, prelude::*};
@@ -161,6 +162,7 @@ fn serve(node: &Node, pacer: Pacer, lull: &Lull) {
             ["panic"] => println!("ready {}", panic_gncl(&handle).as_nanos()),
             ["gap"] => println!("gap {}", lull.longest_ns.swap(0, Ordering::Relaxed)),
             ["say"] => clerk.say(),
+            ["wall"] => println!("wall {}", wall_seconds()),
             ["audit"] => {
                 let audit = handle.audit(DEADLINE).expect("it runs, and nobody else asks");
                 println!("audit {}", serde_json::to_string(&audit).expect("every field can be written"));
@@ -175,6 +177,12 @@ fn serve(node: &Node, pacer: Pacer, lull: &Lull) {
         }
     }
     clerk.say();
+}
+
+/// Seconds since 1970, as the wall clock says.
+#[expect(clippy::disallowed_methods, reason = "it is the very clock that is to jump")]
+pub(super) fn wall_seconds() -> u64 {
+    SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).expect("it is later").as_secs()
 }
 
 /// GNCL panics; returns the time until it was ready again.

@@ -13,7 +13,12 @@ use std::{
 use rustix::process::Signal;
 use sinew::{Audit, Class};
 
-use super::{Plan, trouble::Trouble};
+use super::{
+    Plan,
+    node::wall_seconds,
+    trouble::Trouble,
+    wall_clock::{JUMP, Library, WallClock},
+};
 use crate::{
     DEADLINE, OwnDirectory,
     clients::Performer,
@@ -44,6 +49,8 @@ struct Member {
     life: u32,
     interface: Ipv4Addr,
     performer: Performer,
+    /// Where it has one of its own.
+    clock: Option<WallClock>,
     answers: Receiver<String>,
 }
 
@@ -53,6 +60,8 @@ pub(super) struct Pair {
     history: Shared,
     members: [Member; 2],
     directory: OwnDirectory,
+    /// Where wall clocks are to be set.
+    clocks: Option<Library>,
 }
 
 impl Pair {
@@ -68,11 +77,14 @@ impl Pair {
             });
         }
         let (history, directory) = (Shared::default(), OwnDirectory::new());
+        let sets_clocks =
+            plan.troubles.iter().any(|one| matches!(one, Trouble::ClockOn | Trouble::ClockBack));
+        let clocks = sets_clocks.then(|| Library::build(&directory.join("")));
         let members = [FIRST, SECOND].map(|station| {
             let interface = own_interface();
-            start((station, 1), interface, (plan, &proxy), (&history, &directory))
+            start((station, 1), interface, (plan, &proxy), (&history, &directory, clocks.as_ref()))
         });
-        let mut pair = Self { plan: plan.clone(), proxy, history, members, directory };
+        let mut pair = Self { plan: plan.clone(), proxy, history, members, directory, clocks };
         [FIRST, SECOND].into_iter().for_each(|station| pair.begin(station));
         pair.wait_for_flow();
         pair
@@ -134,6 +146,22 @@ impl Pair {
             }
             Trouble::KillReceiver => self.replace(SECOND),
             Trouble::KillSender => self.replace(FIRST),
+            Trouble::ClockOn => self.set_clocks(JUMP),
+            Trouble::ClockBack => self.set_clocks(-JUMP),
+        }
+    }
+
+    /// The wall clocks of both nodes jump, and both see it.
+    fn set_clocks(&mut self, jump: i64) {
+        for member in &mut self.members {
+            let clock = member.clock.as_mut().expect("it was made where clocks are to be set");
+            clock.jump(jump);
+            let right = wall_seconds().checked_add_signed(clock.off_by).expect("a day after 1970");
+            let seen: u64 = member.ask("wall").parse().expect("a number");
+            assert!(
+                seen.abs_diff(right) <= DEADLINE.as_secs(),
+                "the clock says {seen} s, and was set to {right}"
+            );
         }
     }
 
@@ -167,7 +195,7 @@ impl Pair {
             (station, party.life + 1),
             interface,
             (&self.plan, &self.proxy),
-            (&self.history, &self.directory),
+            (&self.history, &self.directory, self.clocks.as_ref()),
         );
         *self.member(station) = next;
         self.proxy.refuse(false);
@@ -219,7 +247,7 @@ fn start(
     (station, life): (Station, u32),
     interface: Ipv4Addr,
     (plan, proxy): (&Plan, &Proxy),
-    (history, directory): (&Shared, &OwnDirectory),
+    (history, directory, clocks): (&Shared, &OwnDirectory, Option<&Library>),
 ) -> Member {
     let (announce, seeds) = if station == FIRST {
         (proxy.address(TO_FIRST), format!("[\"{}\"]", proxy.address(TO_SECOND_UDP)))
@@ -241,8 +269,11 @@ fn start(
     let (say, answers) = sync_channel(64);
     let (party, notes) = (Party { station, life }, history.clone());
     let hear = move |line: &str| hear(party, &notes, &say, line);
-    let performer = Performer::start(&plan.program, "node", &arguments, &std::env::temp_dir(), hear);
-    let member = Member { station, life, interface, performer, answers };
+    // A new life's clock is right again.
+    let clock = clocks.map(|library| WallClock::new(library, &format!("clock-{station}-{life}")));
+    let environment: Vec<_> = clock.iter().flat_map(WallClock::environment).collect();
+    let performer = Performer::start_with(&plan.program, "node", &arguments, &environment, hear);
+    let member = Member { station, life, interface, performer, clock, answers };
     let places = member.wait_for("up");
     let places: Vec<SocketAddr> =
         places.split_whitespace().map(|place| place.parse().expect("an address")).collect();

@@ -25,11 +25,15 @@ pub enum Trouble {
     KillReceiver,
     /// The first node's process is killed, and another one started.
     KillSender,
+    /// The wall clocks of both nodes are set a day on.
+    ClockOn,
+    /// They are set a day back.
+    ClockBack,
 }
 
 impl Trouble {
     /// All of them, with their names.
-    pub const ALL: [(&'static str, Self); 10] = [
+    pub const ALL: [(&'static str, Self); 12] = [
         ("cut", Self::Cut),
         ("finish", Self::Finish),
         ("panic-sender", Self::PanicSender),
@@ -40,13 +44,20 @@ impl Trouble {
         ("freeze", Self::Freeze),
         ("kill-receiver", Self::KillReceiver),
         ("kill-sender", Self::KillSender),
+        ("clock-on", Self::ClockOn),
+        ("clock-back", Self::ClockBack),
     ];
 
     /// Whether it ends no node and lasts for no time, so that every message must arrive.
     #[must_use]
     pub const fn is_short(self) -> bool {
         match self {
-            Self::Cut | Self::Finish | Self::PanicSender | Self::PanicReceiver => true,
+            Self::Cut
+            | Self::Finish
+            | Self::PanicSender
+            | Self::PanicReceiver
+            | Self::ClockOn
+            | Self::ClockBack => true,
             Self::Stall
             | Self::PartThere
             | Self::PartBack
