@@ -23,6 +23,8 @@ mod held;
 mod outstanding;
 mod partial;
 mod resume;
+#[cfg_attr(not(target_os = "linux"), path = "outlet/rouser_elsewhere.rs")]
+mod rouser;
 #[cfg(test)]
 mod tests;
 
@@ -96,6 +98,16 @@ pub(crate) trait Socket: Send + 'static {
     /// As [`try_write_vectored`](Self::try_write_vectored).
     fn write_gathered(&mut self) -> io::Result<usize> {
         Ok(0)
+    }
+
+    /// Has the drainer woken in a moment, with what else has come by then. Returns whether it will be; if not, it is to be woken now.
+    fn rouse_later(&mut self) -> bool {
+        false
+    }
+
+    /// The drainer is awake, and is to be woken when [`rouse_later`](Self::rouse_later) says so.
+    fn poll_roused(&mut self, cx: &mut Context<'_>) {
+        let _ = cx;
     }
 
     /// Ready when the socket may take something. For one task only: the drainer.
@@ -283,7 +295,18 @@ impl<S: Socket> StreamOutlet<S> {
     /// # Errors
     /// The frame: there will be no further connection.
     pub(crate) fn submit_beyond(&self, message: Message) -> Result<(), Refused> {
-        let step = self.with(|half, after| half.submit(message, Bound::Waived, after))?;
+        self.submit_beyond_up_to(usize::MAX, message)
+    }
+
+    /// The same as long as fewer than `waiting_max` wait; then the bounds hold.
+    ///
+    /// # Errors
+    /// The frame: too many wait, or there will be no further connection.
+    pub(crate) fn submit_beyond_up_to(&self, waiting_max: usize, message: Message) -> Result<(), Refused> {
+        let step = self.with(|half, after| {
+            let is_waived = half.waiting() + half.in_lines() < waiting_max;
+            half.submit(message, if is_waived { Bound::Waived } else { Bound::Kept }, after)
+        })?;
         if step == Step::More {
             self.with(Half::hand_to_drainer);
         }
@@ -311,6 +334,13 @@ impl<S: Socket> StreamOutlet<S> {
     /// The peer says what became of the message that `ticket` names. Returns whether that message was waited for.
     pub(crate) fn confirm(&self, ticket: Ticket, outcome: Outcome) -> bool {
         self.with(|half, after| half.confirm(ticket, outcome, after))
+    }
+
+    /// The same of several, in one go; those that were not waited for are left.
+    pub(crate) fn confirm_all(&self, outcomes: &mut Vec<(Ticket, Outcome)>) {
+        if !outcomes.is_empty() {
+            self.with(|half, after| half.confirm_all(outcomes, after));
+        }
     }
 
     /// What became of the messages so far.

@@ -12,6 +12,7 @@
 //! | [`post`] | events into an actor that outlive it |
 //! | [`mailbox`] | messages into an application that outlive it |
 //! | [`monitor`] | who is told of an end |
+//! | [`wakes`] | one wake for a batch of messages |
 //! | [`pending`], [`sender`] | sending, and waiting for what comes of it |
 //! | [`schedule`] | what an actor does when |
 //! | [`app`] | what an application is |
@@ -31,4 +32,5 @@ pub mod sender;
 pub mod supervision;
 pub mod tid;
 pub mod time;
+pub mod wakes;
 pub mod wire;

@@ -2,6 +2,7 @@
 
 use std::{
     collections::{HashMap, VecDeque},
+    hash::{BuildHasherDefault, Hasher},
     sync::{Arc, Mutex},
     task::{Context, Poll, Waker},
 };
@@ -12,6 +13,7 @@ use crate::{
     router::{Outlet, Refused},
     tid::Tid,
     time::Time,
+    wakes,
     wire::{Flags, Header, Kind, Message},
 };
 
@@ -30,12 +32,31 @@ pub struct Pending {
 struct Inner {
     next: u64,
     /// Not a tree: that would allocate whenever the first wait is opened.
-    slots: HashMap<u64, Slot>,
+    slots: HashMap<u64, Slot, BuildHasherDefault<Scatter>>,
     /// Replies that came when nobody waited for them any more.
     late: u64,
     /// Requests that were taken out of the mailbox before they were given up: who asked, the request's number, and when it was
     /// given up: a later life of whoever asked counts anew.
     unwanted: VecDeque<(Tid, u64, Time)>,
+}
+
+/// Spreads numbers that this table gave out itself, one after the other: nobody can choose those that fall together.
+#[derive(Clone, Copy, Debug, Default)]
+struct Scatter(u64);
+
+impl Hasher for Scatter {
+    fn finish(&self) -> u64 {
+        self.0
+    }
+
+    fn write(&mut self, bytes: &[u8]) {
+        bytes.iter().for_each(|byte| self.write_u64(u64::from(*byte)));
+    }
+
+    fn write_u64(&mut self, number: u64) {
+        // 2^64 by the golden ratio: the upper bits, which the table takes as well as the lower ones, differ from number to number.
+        self.0 = (self.0 ^ number).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    }
 }
 
 #[derive(Debug)]
@@ -76,7 +97,7 @@ impl Pending {
     /// to the former is taken for one to its own.
     #[must_use]
     pub fn numbered_from(first: u64, capacity: usize) -> Arc<Self> {
-        let inner = Inner { next: first, slots: HashMap::new(), late: 0, unwanted: VecDeque::new() };
+        let inner = Inner { next: first, slots: HashMap::default(), late: 0, unwanted: VecDeque::new() };
         Arc::new(Self { inner: Mutex::new(inner), capacity })
     }
 
@@ -154,9 +175,7 @@ impl Pending {
             slot.settled = Some(settlement);
             slot.waker.take()
         };
-        if let Some(waker) = waker {
-            waker.wake();
-        }
+        waker.into_iter().for_each(wakes::wake);
     }
 }
 

@@ -3,6 +3,7 @@
 mod leaving;
 
 use std::{
+    cell::RefCell,
     collections::BTreeMap,
     io,
     net::{Shutdown, SocketAddr},
@@ -218,7 +219,8 @@ impl Gncl {
         let link = way.outlet.connect(Gathering::new(socket.clone()), payload_max, welcome);
         way.attach(link);
         let spin = if place.is_here() { self.spin.clone() } else { Arc::default() };
-        let inbound = Inbound { stores: self.stores.clone(), peer: peer.clone(), spin, lane, link };
+        let (stores, peer_there) = (self.stores.clone(), peer.clone());
+        let inbound = Inbound { stores, peer: peer_there, spin, lane, link, outcomes: RefCell::default() };
         wire.set_mode(Mode::Moves(inbound, Move { place: place.clone(), socket }));
         self.stores.router.set_peer(node, peer.clone());
         let drainer = place.begin(async move {

@@ -1,12 +1,13 @@
 //! What is checked before a peer's frame becomes a message of this node. spec: GNCL-11
 
-use std::sync::Arc;
+use std::{cell::RefCell, sync::Arc};
 
 use sinew_runtime::{
     outcome::{Outcome, Receipt, Rejection, Ticket},
     router::Refused,
     tid::{AppAddress, NodeAddress},
     time::Time,
+    wakes,
     wire::{Class, Flags, Kind, Message},
 };
 
@@ -31,9 +32,36 @@ pub(super) struct Inbound {
     pub(super) lane: Lane,
     /// The connection on which they come.
     pub(super) link: LinkNumber,
+    /// What the peer said in this [`Batch`] of the fate of messages to it: no more than the frames of one.
+    pub(super) outcomes: RefCell<Vec<(Ticket, Outcome)>>,
+}
+
+/// Frames that came at once. At the end of it, or at a panic, outcomes that were among them are told, what was taken is acknowledged if
+/// that is due, and then everybody is woken who has got something.
+pub(super) struct Batch<'a> {
+    inbound: &'a Inbound,
+    _wakes: wakes::Batch,
+}
+
+impl Drop for Batch<'_> {
+    fn drop(&mut self) {
+        // Whoever is told runs into nothing that is borrowed here.
+        let mut outcomes = self.inbound.outcomes.take();
+        self.inbound.peer.confirm(&mut outcomes);
+        outcomes.clear();
+        self.inbound.outcomes.replace(outcomes);
+        if let Some(way) = self.inbound.peer.way(self.inbound.lane) {
+            way.acknowledge_if_due();
+        }
+    }
 }
 
 impl Inbound {
+    /// Frames that came at once are [received](Self::receive) as long as this lives.
+    pub(super) fn batch(&self) -> Batch<'_> {
+        Batch { inbound: self, _wakes: wakes::Batch::begin() }
+    }
+
     /// Takes a frame that came at `now`, if it is the next one: delivers it, settles it, or refuses and counts it.
     ///
     /// # Errors
@@ -191,7 +219,7 @@ impl Inbound {
         };
         match outcome {
             // One that nobody waits for any more was settled as Unknown when an earlier connection ended.
-            Some(outcome) => self.peer.confirm(ticket, outcome),
+            Some(outcome) => self.outcomes.borrow_mut().push((ticket, outcome)),
             None => self.count(now, "no such outcome", message),
         }
     }

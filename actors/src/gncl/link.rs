@@ -28,7 +28,7 @@ use crate::stores::lock;
 
 /// Frames that are handled before other tasks of the thread have their turn.
 const FRAMES_PER_WAKE: usize = 64;
-/// Bytes that are asked of the kernel at once, on a link.
+/// Bytes that are asked of the kernel at once, on a link; up to [`BYTES_PER_TURN`] where as much comes.
 const READ_LEN: usize = 16 << 10;
 /// Bytes that are taken from one connection before others have their turn, however long its frames are: about 20 us of
 /// copying and checking.
@@ -193,6 +193,8 @@ pub(super) struct Reader {
     carried: bool,
     /// Bytes that were taken since others had their turn.
     turn: usize,
+    /// Bytes that are asked for next, on a link: more where the last ones came all at once.
+    asked: usize,
 }
 
 /// How a look at the buffer ended.
@@ -214,6 +216,7 @@ impl Reader {
             greeted: false,
             carried: false,
             turn: 0,
+            asked: READ_LEN,
         }
     }
 
@@ -258,12 +261,17 @@ impl Reader {
                 return Look::Empty;
             }
         };
+        if self.buffer.is_empty() {
+            return Look::Empty;
+        }
         self.codec.set_payload_max(payload_max);
+        let _batch = if let Mode::Linked(inbound) = &*mode { Some(inbound.batch()) } else { None };
+        let now = Time::now();
         for _ in 0..FRAMES_PER_WAKE {
             match (self.codec.decode(&mut self.buffer), &*mode) {
                 (Ok(Some(message)), Mode::Linked(inbound)) if !is_for_the_shell(&message) => {
                     self.heard = true;
-                    if let Err(decline) = inbound.receive(Time::now(), message) {
+                    if let Err(decline) = inbound.receive(now, message) {
                         return Look::Tell(What::Violated(decline));
                     }
                     // The first frame is an ACK in any case. A later one says that our messages arrive.
@@ -288,7 +296,7 @@ impl Reader {
 
     async fn fill(&mut self) -> io::Result<()> {
         let room = match *lock(&self.reading.mode) {
-            Mode::Linked(_) => READ_LEN,
+            Mode::Linked(_) => self.asked,
             Mode::Handshake | Mode::Moves(..) | Mode::Discard => HANDSHAKE_PAYLOAD_MAX,
         };
         let left = self.buffer.capacity() - self.buffer.len();
@@ -308,7 +316,10 @@ impl Reader {
                 Ok(count) => {
                     self.turn += count;
                     if count < room {
+                        self.asked = READ_LEN;
                         expect_more(&self.socket);
+                    } else {
+                        self.asked = BYTES_PER_TURN.min(2 * self.asked);
                     }
                     return Ok(());
                 }

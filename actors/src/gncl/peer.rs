@@ -111,10 +111,10 @@ impl Peer {
         self.ways.iter().for_each(|way| way.outlet.close(Rejection::Closed));
     }
 
-    /// The peer says what became of the message that `ticket` names; if nobody waits for it any more, nothing happens.
-    pub(super) fn confirm(&self, ticket: Ticket, outcome: Outcome) {
-        // Stream is never confirmed, and the ticket does not say the class.
-        let _ = self.ways.iter().any(|way| way.outlet.confirm(ticket, outcome));
+    /// The peer says what became of these messages; those that nobody waits for any more are left.
+    pub(super) fn confirm(&self, outcomes: &mut Vec<(Ticket, Outcome)>) {
+        // A ticket does not say the class.
+        self.ways.iter().for_each(|way| way.outlet.confirm_all(outcomes));
     }
 
     /// Where every message to it and from it is, session by session.

@@ -8,7 +8,7 @@ use std::{
 use bytes::Bytes;
 use sinew_runtime::{
     outcome::{Outcome, Rejection, Ticket},
-    router::{Outlet as _, Refused, Router},
+    router::{Refused, Router},
     tid::NodeAddress,
     time::Time,
     wire::{Kind, Message},
@@ -71,6 +71,8 @@ struct Inbox {
     receiving: Receiving,
     shelf: Shelf<u64, Message>,
     arrivals: Arrivals,
+    /// The peer is to be told what was taken, as soon as what came with it has been taken, too.
+    ack_is_due: bool,
 }
 
 /// What became of the messages of a peer. `taken = handed_on + told + expired + refused + failed + waiting`.
@@ -137,8 +139,12 @@ impl Way {
             messages: SHELF_WINDOWS * line_messages,
             bytes: SHELF_WINDOWS * line_bytes,
         });
-        let inbox =
-            Mutex::new(Inbox { receiving: Receiving::new(memory), shelf, arrivals: Arrivals::default() });
+        let inbox = Mutex::new(Inbox {
+            receiving: Receiving::new(memory),
+            shelf,
+            arrivals: Arrivals::default(),
+            ack_is_due: false,
+        });
         let outcomes_max = OUTCOMES_MAX * config.gncl.queue_capacity;
         Self { outlet, inbox, outcomes_max, ends, refusals: refusals.clone() }
     }
@@ -158,18 +164,14 @@ impl Way {
         let (arrival, line) = {
             let mut inbox = self.inbox();
             let arrival = inbox.receiving.arrive(link.number(), number, message.size());
-            if matches!(arrival, Arrival::Take { .. }) {
+            if let Arrival::Take { ack_is_due } = arrival {
                 inbox.arrivals.take();
+                inbox.ack_is_due |= ack_is_due;
             }
             (arrival, inbox.line(message))
         };
         match arrival {
-            Arrival::Take { ack_is_due } => {
-                if ack_is_due {
-                    self.acknowledge();
-                }
-                Ok(line.map_or(Taken::Yes, Taken::InLine))
-            }
+            Arrival::Take { .. } => Ok(line.map_or(Taken::Yes, Taken::InLine)),
             Arrival::Fenced => Ok(Taken::No),
             Arrival::OutOfStep { expected } => Err(Decline::Violation(format!(
                 "message {number} came where {} is the next one",
@@ -194,6 +196,14 @@ impl Way {
         }
     }
 
+    /// All that came at once has been taken: tells the peer so, if there was much since it was told.
+    pub(super) fn acknowledge_if_due(&self) {
+        let is_due = self.inbox().ack_is_due;
+        if is_due {
+            self.acknowledge();
+        }
+    }
+
     /// Tells the peer what was taken, if it does not know.
     pub(super) fn acknowledge_if_owed(&self) {
         let owes = self.inbox().receiving.owes_ack();
@@ -205,7 +215,8 @@ impl Way {
     fn acknowledge(&self) {
         let epoch = self.outlet.epoch();
         let ack = {
-            let Inbox { receiving, shelf, .. } = &mut *self.inbox();
+            let Inbox { receiving, shelf, ack_is_due, .. } = &mut *self.inbox();
+            *ack_is_due = false;
             Ack { change: shelf.change(), held: shelf.held(), ..receiving.ack(epoch) }
         };
         self.say(frame(self.ends.here, self.ends.node, Kind::GNCL_ACK, write(&ack)));
@@ -341,12 +352,7 @@ impl Way {
 
     /// Sends an outcome: more of them than other messages may wait, for one that is lost leaves its sender waiting.
     pub(super) fn send_outcome(&self, message: Message) {
-        let result = if self.outlet.waiting() < self.outcomes_max {
-            self.outlet.submit_beyond(message)
-        } else {
-            self.outlet.submit(message)
-        };
-        if let Err(refused) = result {
+        if let Err(refused) = self.outlet.submit_beyond_up_to(self.outcomes_max, message) {
             let kind = refused.message.header.kind;
             let detail = format!("a frame of kind {kind} for node {}: {}", self.ends.node, refused.why);
             self.refusals.count(Time::now(), "own frame not sent", &detail);

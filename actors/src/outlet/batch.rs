@@ -2,8 +2,9 @@
 //!
 //! A write costs about as much as carrying a thousand bytes does. Who sends now and then pays one for each message, and the
 //! message is on its way when the call returns. Who has the next message ready as soon as the last one is written, again and again,
-//! is not helped by that: from the fifth on what comes waits for the drainer, which copies what waits into one
-//! buffer and writes that. A round trip is no flood, however quick: the answer takes longer than that.
+//! is not helped by that: from the fifth on what comes waits until it is much, and then the sender copies it into one
+//! buffer and writes that. What is less, the drainer writes: of Bulk and of outcomes in a [moment](super::rouser), so that neither
+//! has to switch to the other's thread for it, of the rest at once. A round trip is no flood, however quick: the answer takes longer than that.
 
 use std::{
     io::{self, IoSlice},
@@ -19,38 +20,51 @@ use sinew_runtime::{
 use super::{
     Account, Socket,
     half::{Half, Link},
+    rouser::Rouser,
 };
 
 /// Messages right behind each other that are written at once, each by its sender.
-const AT_ONCE: u32 = 4;
+const AT_ONCE: u64 = 4;
 /// Who sends the next message sooner than this after the last one was written has not waited for anybody: half of what a write to
 /// a socket takes, a quarter of the quickest answer over the loopback interface.
 const RIGHT_BEHIND: Duration = Duration::from_micros(2);
-/// Bytes that are gathered before they are written.
-const GATHERED_MAX: usize = 32 << 10;
+/// Who has not waited for anybody may send one more at once for so long a pause, beside the one after it: whoever floods and is interrupted
+/// floods on.
+const PAUSE: Duration = Duration::from_micros(25);
+/// Bytes that are gathered before they are written: what a sender [writes himself](super::draining), and one message more.
+const GATHERED_MAX: usize = 40 << 10;
+
+/// Bytes of a frame that is gathered with others rather than written alone.
+pub(super) const SHORT: usize = 4 << 10;
 
 /// How fast messages come.
 #[derive(Debug)]
 pub(super) struct Pace {
     /// When the last one was written, or came while others waited.
     last: Time,
-    /// Messages right behind each other.
-    behind: u32,
+    /// Messages that may be written at once.
+    credit: u64,
 }
 
 impl Pace {
     pub(super) const fn new() -> Self {
-        Self { last: Time::ZERO, behind: 0 }
+        Self { last: Time::ZERO, credit: AT_ONCE }
     }
 
     /// A message comes that was sent at `sent`. Returns whether it is one of a flood.
     pub(super) fn is_flood(&mut self, sent: Time) -> bool {
-        self.behind = if sent.since(self.last) < RIGHT_BEHIND { self.behind.saturating_add(1) } else { 0 };
+        let pause = sent.since(self.last);
+        if pause >= RIGHT_BEHIND {
+            let regained = 1 + (pause.as_nanos() / PAUSE.as_nanos()) as u64;
+            self.credit = AT_ONCE.min(self.credit.saturating_add(regained));
+        }
         self.last = self.last.max(sent);
-        self.behind >= AT_ONCE
+        let is_flood = self.credit == 0;
+        self.credit = self.credit.saturating_sub(1);
+        is_flood
     }
 
-    /// The message was written by its sender, who was done `now`.
+    /// Messages were written by their sender, who was done `now`.
     pub(super) const fn written(&mut self, now: Time) {
         self.last = now;
     }
@@ -80,11 +94,12 @@ pub(crate) struct Gathering<S> {
     /// What is gathered; the socket has taken all before `taken`.
     bytes: Vec<u8>,
     taken: usize,
+    rouser: Rouser,
 }
 
 impl<S> Gathering<S> {
-    pub(crate) const fn new(socket: S) -> Self {
-        Self { socket, bytes: Vec::new(), taken: 0 }
+    pub(crate) fn new(socket: S) -> Self {
+        Self { socket, bytes: Vec::new(), taken: 0, rouser: Rouser::default() }
     }
 }
 
@@ -108,6 +123,14 @@ impl<S: Socket> Socket for Gathering<S> {
 
     fn poll_writable(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
         self.socket.poll_writable(cx)
+    }
+
+    fn rouse_later(&mut self) -> bool {
+        self.rouser.rouse_later()
+    }
+
+    fn poll_roused(&mut self, cx: &mut Context<'_>) {
+        self.rouser.poll(cx);
     }
 
     fn gathers(&self) -> bool {
@@ -165,6 +188,18 @@ mod tests {
     #[test]
     fn the_quickest_round_trips_are_no_flood() {
         assert!(!floods(1_000, 3_000, 1_500).contains(&true));
+    }
+
+    #[test]
+    fn who_is_interrupted_in_a_flood_sends_one_at_once_and_floods_on() {
+        let mut pace = Pace::new();
+        let mut at = |nanos: u64| pace.is_flood(Time::from_nanos(1_000_000 + nanos));
+        let flood: Vec<bool> = (0..6).map(|n| at(n * 100)).collect();
+        assert_eq!(flood, [false, false, false, false, true, true]);
+        let after: Vec<bool> = (0..4).map(|n| at(10_000 + n * 100)).collect();
+        assert_eq!(after, [false, true, true, true]);
+        let rested: Vec<bool> = (0..6).map(|n| at(1_000_000 + n * 100)).collect();
+        assert_eq!(rested, [false, false, false, false, true, true]);
     }
 
     #[test]

@@ -5,10 +5,11 @@ use std::{
     task::{Context, Poll},
 };
 
-use sinew_runtime::time::Time;
+use sinew_runtime::{time::Time, wire::HEADER_LEN};
 
 use super::{
     LinkNumber, Socket,
+    batch::SHORT,
     half::{After, Half, Link, Step},
     partial::{Partial, Written},
 };
@@ -18,8 +19,12 @@ const WRITES_PER_WAKE: usize = 64;
 /// Bytes that it writes before.
 const BYTES_PER_WAKE: usize = 64 << 10;
 
-/// Messages that wait before a sender writes them itself: the drainer does not keep up.
-const HELP_AT: usize = 32;
+/// Bytes of short frames that wait before a sender writes them itself, all at once.
+const HELP_AT_BYTES: usize = 32 << 10;
+/// Messages that wait before, however short they are.
+const HELP_AT: usize = 128;
+/// The same of longer ones, which the drainer writes better as long as it keeps up: each takes about as long as waking it.
+const HELP_AT_LONG: usize = 32;
 
 /// Why the drainer does not write on.
 pub(super) enum Drained {
@@ -36,6 +41,9 @@ impl<S: Socket> Half<S> {
         cx: &mut Context<'_>,
         after: &mut After,
     ) -> Poll<Drained> {
+        if let Link::Up(socket) = &mut self.link {
+            socket.poll_roused(cx);
+        }
         let mut bytes = 0;
         for _ in 0..WRITES_PER_WAKE {
             if let Some(end) = self.end_of(link) {
@@ -65,17 +73,40 @@ impl<S: Socket> Half<S> {
     pub(super) fn help(&mut self, after: &mut After) {
         let Link::Up(socket) = &self.link else { return };
         let is_stuck = self.partial.is_some() || socket.gathered() > 0;
-        if !socket.gathers() || is_stuck || self.queue.len() < HELP_AT {
+        if !socket.gathers() || is_stuck || !self.has_much() {
             return;
         }
         let mut bytes = 0;
-        for _ in 0..WRITES_PER_WAKE {
+        for _ in 0..HELP_AT {
             if bytes >= BYTES_PER_WAKE || !self.has_frame() {
                 break;
             }
             bytes += self.gather_next(after);
         }
         self.write_gathered();
+        self.pace.written(Time::now());
+    }
+
+    /// Whether so much waits that its sender had better write it.
+    fn has_much(&self) -> bool {
+        let messages = self.queue.len();
+        let bytes = messages * HEADER_LEN + self.queue.bytes();
+        if bytes <= messages * SHORT {
+            bytes >= HELP_AT_BYTES || messages >= HELP_AT
+        } else {
+            messages >= HELP_AT_LONG
+        }
+    }
+
+    /// Has the drainer write on what waits: in a moment if `is_patient`, for more of its sort is to be expected.
+    pub(super) fn rouse(&mut self, is_patient: bool, after: &mut After) {
+        let (has_frame, is_stuck) = (self.has_frame(), self.partial.is_some() || self.gathered() > 0);
+        if let Link::Up(socket) = &mut self.link
+            && (!has_frame || is_patient && !is_stuck && socket.rouse_later())
+        {
+            return;
+        }
+        after.wake = self.drainer.take();
     }
 
     /// Why the connection `link` cannot be written to, if it cannot.
@@ -101,18 +132,28 @@ impl<S: Socket> Half<S> {
     /// returns how many bytes the socket has taken.
     fn gather_next(&mut self, after: &mut After) -> usize {
         let Some(frame) = self.next_frame(after) else { return self.write_gathered() };
-        if let Link::Up(socket) = &mut self.link
-            && frame.gather_in(socket)
-        {
-            self.sent(frame);
-            return 0;
-        }
+        let Err(frame) = self.gather(frame) else { return 0 };
         let taken = self.write_gathered();
         if self.gathered() > 0 {
             self.partial = Some(frame);
             return taken;
         }
-        taken + self.write_frame(frame)
+        // With those behind it, if it is not as long as many.
+        match self.gather(frame) {
+            Ok(()) => taken,
+            Err(frame) => taken + self.write_frame(frame),
+        }
+    }
+
+    /// Gathers a frame that has not been begun, if there is room.
+    fn gather(&mut self, frame: Partial) -> Result<(), Partial> {
+        if let Link::Up(socket) = &mut self.link
+            && frame.gather_in(socket)
+        {
+            self.sent(frame);
+            return Ok(());
+        }
+        Err(frame)
     }
 
     fn write_gathered(&mut self) -> usize {

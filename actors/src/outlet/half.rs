@@ -4,17 +4,18 @@ use std::{collections::VecDeque, io, sync::Arc, task::Waker};
 
 use sinew_runtime::{
     mailbox::{Bounds, Budget, ClassQueue},
-    outcome::{Outcome, Receipt, Rejection, Ticket},
+    outcome::{Outcome, Receipt, Rejection},
     router::Refused,
     tid::Tid,
     time::Time,
+    wakes,
     wire::{Checksum, Class, Flags, Kind, Message},
 };
 
 use super::{
     LinkNumber, OutletCounts, OutletLimits, Socket,
     account::Tally,
-    batch::Pace,
+    batch::{Pace, SHORT},
     outstanding::{Outstanding, Sent},
     partial::{Partial, Sort, Written},
     resume::Session,
@@ -37,7 +38,7 @@ impl After {
         for (receipt, outcome) in self.settle {
             receipt.settle(outcome);
         }
-        self.wake.into_iter().chain(self.room).for_each(Waker::wake);
+        self.wake.into_iter().chain(self.room).for_each(wakes::wake);
     }
 }
 
@@ -66,7 +67,7 @@ pub(super) enum Step {
 }
 
 pub(super) struct Half<S> {
-    limits: OutletLimits,
+    pub(super) limits: OutletLimits,
     payload_max: usize,
     pub(super) link: Link<S>,
     pub(super) number: u64,
@@ -88,7 +89,7 @@ pub(super) struct Half<S> {
     /// Receipts of messages that were sent.
     pub(super) sent_receipts: Outstanding,
     /// Who waits until fewer of them are open.
-    outcomes_awaited: Option<Waker>,
+    pub(super) outcomes_awaited: Option<Waker>,
     pub(super) drainer: Option<Waker>,
     pub(super) pace: Pace,
     pub(super) counts: OutletCounts,
@@ -271,8 +272,10 @@ impl<S: Socket> Half<S> {
         // Asked in any case: what comes while others wait counts, too.
         let is_one_of_a_flood = self.is_one_of_a_flood(&message);
         if self.waiting() > 0 || !self.takes_new() || is_one_of_a_flood {
-            self.enqueue(message, bound, after)?;
+            let is_patient = is_patient(&message);
+            self.enqueue(message, bound)?;
             self.help(after);
+            self.rouse(is_patient, after);
             return Ok(Step::Done);
         }
         let mut frame = self.frame(message);
@@ -357,7 +360,9 @@ impl<S: Socket> Half<S> {
     fn requeue(&mut self, frame: Partial, bound: Bound, after: &mut After) -> Result<(), Refused> {
         self.waiting_receipts -= usize::from(frame.message.receipt.is_some());
         self.take_back();
-        self.enqueue(frame.message, bound, after)
+        self.enqueue(frame.message, bound)?;
+        self.rouse(false, after);
+        Ok(())
     }
 
     fn admit(&self, message: &Message, bound: Bound) -> Result<(), Rejection> {
@@ -381,7 +386,7 @@ impl<S: Socket> Half<S> {
         }
     }
 
-    fn enqueue(&mut self, message: Message, bound: Bound, after: &mut After) -> Result<(), Refused> {
+    fn enqueue(&mut self, message: Message, bound: Bound) -> Result<(), Refused> {
         let confirmed = message.receipt.is_some();
         let expiry = message.header.expiry();
         match bound {
@@ -396,7 +401,6 @@ impl<S: Socket> Half<S> {
         }
         self.waiting_receipts += usize::from(confirmed);
         self.next_expiry = self.next_expiry.min(expiry);
-        after.wake = self.drainer.take();
         Ok(())
     }
 
@@ -460,15 +464,6 @@ impl<S: Socket> Half<S> {
         }
     }
 
-    pub(super) fn confirm(&mut self, ticket: Ticket, outcome: Outcome, after: &mut After) -> bool {
-        let Some(receipt) = self.sent_receipts.take(ticket) else { return false };
-        after.settle.push((receipt, outcome));
-        if self.unconfirmed() <= self.limits.unconfirmed_max / 2 {
-            after.room.extend(self.outcomes_awaited.take());
-        }
-        true
-    }
-
     pub(super) fn waiting(&self) -> usize {
         let single =
             [self.partial.is_some(), self.gathered() > 0, self.interrupted.is_some(), self.last.is_some()];
@@ -485,6 +480,12 @@ impl<S: Socket> Half<S> {
     pub(super) const fn counts(&self) -> OutletCounts {
         self.counts
     }
+}
+
+/// Whether a message that has to wait may wait for the next one.
+fn is_patient(message: &Message) -> bool {
+    let header = &message.header;
+    message.size() <= SHORT && (header.class == Class::Bulk || header.flags.has(Flags::OUTCOME))
 }
 
 const fn bounds(limits: OutletLimits) -> Bounds {

@@ -6,9 +6,14 @@ use std::{
 };
 
 use sinew_runtime::{
-    outcome::{Receipt, Ticket},
+    outcome::{Outcome, Receipt, Ticket},
     tid::Tid,
     time::Time,
+};
+
+use super::{
+    Socket,
+    half::{After, Half},
 };
 
 /// Lines that are kept though nothing is in them: most destinations are sent to again.
@@ -75,5 +80,23 @@ impl Outstanding {
     pub(super) fn take_all(&mut self) -> impl Iterator<Item = Sent> {
         self.count = 0;
         std::mem::take(&mut self.lines).into_values().flatten()
+    }
+}
+
+impl<S: Socket> Half<S> {
+    /// Settles those that were waited for, and leaves the others.
+    pub(super) fn confirm_all(&mut self, outcomes: &mut Vec<(Ticket, Outcome)>, after: &mut After) {
+        if self.sent_receipts.len() > 0 {
+            outcomes.retain(|(ticket, outcome)| !self.confirm(*ticket, *outcome, after));
+        }
+    }
+
+    pub(super) fn confirm(&mut self, ticket: Ticket, outcome: Outcome, after: &mut After) -> bool {
+        let Some(receipt) = self.sent_receipts.take(ticket) else { return false };
+        after.settle.push((receipt, outcome));
+        if self.unconfirmed() <= self.limits.unconfirmed_max / 2 {
+            after.room.extend(self.outcomes_awaited.take());
+        }
+        true
     }
 }

@@ -31,6 +31,7 @@ use crate::{
     post::lock,
     router::{Outlet, Refused},
     time::Time,
+    wakes,
     wire::{Class, Header, Message},
 };
 
@@ -301,7 +302,7 @@ impl Outlet for Mailbox {
             if is_event {
                 let waker = shared.submit_event(message)?;
                 drop(shared);
-                waker.into_iter().for_each(Waker::wake);
+                waker.into_iter().for_each(wakes::wake);
                 return Ok(());
             }
             if shared.refuses {
@@ -333,7 +334,7 @@ impl Outlet for Mailbox {
         for mut message in expired {
             message.settle(Outcome::Expired);
         }
-        taken.map(|waker| waker.into_iter().for_each(Waker::wake))
+        taken.map(|waker| waker.into_iter().for_each(wakes::wake))
     }
 
     fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {

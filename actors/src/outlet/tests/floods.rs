@@ -1,5 +1,7 @@
 //! Messages that come faster than a write each would carry them.
 
+use std::thread;
+
 use super::*;
 
 /// Counts the writes to a wire.
@@ -20,7 +22,7 @@ impl Socket for Counting {
 }
 
 struct Flood {
-    outlet: StreamOutlet<Gathering<Counting>>,
+    outlet: Arc<StreamOutlet<Gathering<Counting>>>,
     wire: Arc<Wire>,
     writes: Arc<AtomicUsize>,
     link: LinkNumber,
@@ -29,7 +31,8 @@ struct Flood {
 impl Flood {
     fn new(room: usize) -> Self {
         let limits = OutletLimits { queue_capacity: 200, ..LIMITS };
-        let (outlet, wire, writes) = (StreamOutlet::new(limits), Arc::new(Wire::default()), Arc::default());
+        let (outlet, wire, writes) =
+            (Arc::new(StreamOutlet::new(limits)), Arc::new(Wire::default()), Arc::default());
         wire.room.store(room, Ordering::Relaxed);
         let socket = Counting { wire: Arc::clone(&wire), writes: Arc::clone(&writes) };
         let link = outlet.connect(Gathering::new(socket), usize::MAX, None);
@@ -47,6 +50,16 @@ impl Flood {
 
     fn drain(&self) {
         assert!((0..16).find_map(|_| self.outlet.drain(self.link).now_or_never()).is_none());
+    }
+
+    /// Waits until so many frames are there, whoever writes them.
+    async fn come(&self, frames: usize) {
+        let come = async {
+            while self.seen().len() < frames {
+                tokio::time::sleep(Duration::from_millis(1)).await;
+            }
+        };
+        tokio::time::timeout(Duration::from_secs(10), come).await.expect("all frames within 10 s");
     }
 
     fn seen(&self) -> Vec<u8> {
@@ -71,8 +84,8 @@ fn the_first_messages_of_a_flood_are_written_at_once_and_the_others_together() {
 #[test]
 fn who_floods_writes_himself_when_the_drainer_does_not_keep_up() {
     let flood = Flood::new(PLENTY);
-    flood.submit(0..36);
-    assert_eq!((flood.seen(), flood.writes(), flood.outlet.waiting()), ((0..36).collect(), 5, 0));
+    flood.submit(0..132);
+    assert_eq!((flood.seen(), flood.writes(), flood.outlet.waiting()), ((0..132).collect(), 5, 0));
 }
 
 #[test]
@@ -113,4 +126,21 @@ fn a_connection_that_ends_with_gathered_frames_has_not_ended_behind_a_whole_one(
     flood.wire.room.store(100, Ordering::Relaxed);
     flood.drain();
     assert!(!flood.outlet.disconnect(flood.link));
+}
+
+#[cfg(target_os = "linux")]
+#[tokio::test(flavor = "current_thread")]
+async fn what_the_end_of_another_threads_flood_leaves_goes_out_in_a_moment_and_nobody_is_woken_at_once() {
+    let flood = Flood::new(PLENTY);
+    let (outlet, link) = (flood.outlet.clone(), flood.link);
+    let drainer = tokio::spawn(async move { outlet.drain(link).await });
+    // The first flood has the timer made.
+    flood.submit(0..20);
+    flood.come(20).await;
+    thread::scope(|scope| scope.spawn(|| flood.submit(20..40)).join().unwrap());
+    let is_asleep = flood.outlet.lock().drainer.is_some();
+    assert!(is_asleep && flood.outlet.waiting() > 0);
+    flood.come(40).await;
+    assert_eq!(flood.seen(), (0..40).collect::<Vec<u8>>());
+    drainer.abort();
 }
