@@ -2,51 +2,16 @@
 //! shares nothing with the core but the vocabulary. Each rule cites the manual of stdlib's `supervisor`, or says that it is
 //! one of Sinew's own.
 
+mod child;
+
 use std::time::Duration;
 
+use self::child::{Child, Fate, Pid, child_is_significant};
 use super::{
     AutoShutdown, ChildId, Command, Flags, Generation, Input, Order, Policy, Reason, Refusal, Restart,
     Strategy,
 };
 use crate::time::Time;
-
-/// OTP's `pid()`, `undefined` and `restarting`, with the wishes that Sinew adds.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Pid {
-    /// Terminated, or ended by itself.
-    Undefined,
-    /// To be started when its turn comes.
-    Due,
-    /// Failed; not to be started before.
-    Restarting(Time),
-    /// Lives: which life, until when it has to be ready.
-    Starting(Generation, Time),
-    Up(Generation),
-    /// Was told to stop; until when.
-    Stopping(Generation, Time),
-}
-
-#[derive(Clone, Debug)]
-struct Child {
-    id: ChildId,
-    policy: Policy,
-    pid: Pid,
-    lives: Generation,
-    released: bool,
-    /// What is to become of it once its present life has ended. `None`: what its restart type says.
-    fate: Option<Fate>,
-    asked: usize,
-    in_a_row: u32,
-    up_since: Option<Time>,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Fate {
-    /// Its group is restarted.
-    StartAgain,
-    /// A command said so, or the end of all.
-    StayDown,
-}
 
 /// The rules as a machine that predicts orders.
 pub(super) struct Model {
@@ -68,20 +33,6 @@ pub(super) struct Model {
 enum End {
     Shutdown,
     GaveUp,
-}
-
-impl Child {
-    fn alive(&self) -> Option<Generation> {
-        match self.pid {
-            Pid::Starting(life, _) | Pid::Up(life) | Pid::Stopping(life, _) => Some(life),
-            Pid::Undefined | Pid::Due | Pid::Restarting(_) => None,
-        }
-    }
-
-    /// Sinew: a held child waits for its release, and those after it, where they are started in order, with it.
-    fn held_back(&self) -> bool {
-        self.pid == Pid::Due && self.policy.held && !self.released
-    }
 }
 
 /// "A permanent child process is always restarted. A temporary child process is never restarted. A transient child process is
@@ -494,37 +445,5 @@ impl Model {
     /// What must hold between events, whatever came before.
     pub(super) fn is_ended(&self) -> bool {
         self.ended
-    }
-}
-
-fn child_is_significant(child: &Child) -> bool {
-    child.policy.significant
-}
-
-impl Child {
-    /// Is one whose end counts as the end of work: lives for itself, or will.
-    fn works(&self) -> bool {
-        self.pid != Pid::Undefined && self.fate != Some(Fate::StayDown)
-    }
-
-    fn go_with_the_group(&mut self) {
-        let temporary = self.policy.restart == Restart::Temporary;
-        match (self.pid, temporary) {
-            // "the child process can later be restarted by the supervisor"
-            (Pid::Undefined, false) => self.pid = Pid::Due,
-            (Pid::Undefined | Pid::Due | Pid::Restarting(_), _) => {}
-            (Pid::Starting(..) | Pid::Up(_) | Pid::Stopping(..), true) => self.fate = Some(Fate::StayDown),
-            (Pid::Starting(..) | Pid::Up(_) | Pid::Stopping(..), false) => self.fate = Some(Fate::StartAgain),
-        }
-    }
-
-    /// Sinew: doubled by each failure in a row, forgotten after a life of more than a window.
-    fn longest_wait(&mut self, now: Time, window: Duration) -> Duration {
-        if self.up_since.is_some_and(|since| now.since(since) > window) {
-            self.in_a_row = 0;
-        }
-        let wait = (0..self.in_a_row).fold(self.policy.backoff_min, |wait, _| wait.saturating_mul(2));
-        self.in_a_row += 1;
-        wait.min(self.policy.backoff_max)
     }
 }
