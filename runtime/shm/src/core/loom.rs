@@ -76,6 +76,16 @@ fn take_sleeping(receiver: &mut Receiver, bell: &Bell) -> (Vec<u64>, bool) {
     }
 }
 
+fn reserve_sleeping(sender: &mut Sender, bell: &Bell) {
+    while sender.reserve(8).is_err() {
+        let heard = bell.listen();
+        if sender.arm(8).expect("an honest peer") == Armed::Sleep {
+            bell.sleep(heard);
+            sender.disarm();
+        }
+    }
+}
+
 #[test]
 fn a_message_that_is_seen_is_seen_whole() {
     loom::model(|| {
@@ -155,13 +165,7 @@ fn a_producer_that_sleeps_is_woken_for_room() {
             }
             receiver
         });
-        while sender.reserve(8).is_err() {
-            let heard = bell.listen();
-            if sender.arm(8).expect("an honest peer") == Armed::Sleep {
-                bell.sleep(heard);
-                sender.disarm();
-            }
-        }
+        reserve_sleeping(&mut sender, &bell);
         let reserved = sender.reserved().expect("just reserved");
         fill(&sender, reserved, 3);
         sender.publish();
@@ -189,13 +193,7 @@ fn a_producer_that_sleeps_is_woken_for_what_is_given_back_together() {
                 button.ring();
             }
         });
-        while sender.reserve(8).is_err() {
-            let heard = bell.listen();
-            if sender.arm(8).expect("an honest peer") == Armed::Sleep {
-                bell.sleep(heard);
-                sender.disarm();
-            }
-        }
+        reserve_sleeping(&mut sender, &bell);
         receiving.join().unwrap();
     });
 }

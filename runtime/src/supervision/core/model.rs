@@ -442,7 +442,7 @@ impl Model {
         }
     }
 
-    /// What must hold between events, whatever came before.
+    /// Whether it has said that it ended.
     pub(super) fn is_ended(&self) -> bool {
         self.ended
     }
