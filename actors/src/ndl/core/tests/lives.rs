@@ -1,0 +1,117 @@
+//! A node has one life at a time: restarts, former lives, two processes with one address.
+
+use sinew_runtime::tid::Incarnation;
+
+use super::world::{PERIOD, Spec, World, ms, node, udp};
+use crate::ndl::{LossReason, MembershipFact, NodeEvent, core::Output};
+
+// spec: NDL-5.1
+#[test]
+fn a_restart_is_one_event_for_applications_and_two_facts_for_layers() {
+    for (index, what) in [(2, "at the same port"), (3, "at another port")] {
+        let mut world = World::of_members(2);
+        world.kill(2);
+        world.run(ms(20));
+        world.start(index, &Spec { incarnation: 2, ..Spec::of(2) });
+        world.run_until(ms(150), |world| !world.at(1).events.is_empty());
+        let restarted =
+            NodeEvent::NodeRestarted { node: node(2), name: "node-2".into(), incarnation: Incarnation(2) };
+        assert_eq!(world.at(1).events, [restarted], "{what}");
+        let [lost, found] = &world.at(1).facts[..] else { panic!("{what}: {:?}", world.at(1).facts) };
+        let why = LossReason::Restarted;
+        assert_eq!(*lost, MembershipFact::NodeLost { node: node(2), incarnation: Incarnation(1), why });
+        assert!(matches!(found, MembershipFact::NodeFound { incarnation: Incarnation(2), .. }));
+        world.run(PERIOD * 10);
+        assert_eq!(world.at(1).facts.len(), 2, "{what}: and then all is quiet");
+    }
+}
+
+#[test]
+fn a_new_life_after_a_loss_is_a_restart_too() {
+    let mut world = World::of_members(2);
+    world.kill(2);
+    world.run(PERIOD * 5);
+    world.start(2, &Spec { incarnation: 2, ..Spec::of(2) });
+    world.run(ms(10));
+    assert!(matches!(world.at(1).events[..], [NodeEvent::NodeLost { .. }, NodeEvent::NodeRestarted { .. }]));
+}
+
+// spec: NDL-5.2
+#[test]
+fn a_former_life_is_refused_also_after_the_later_one_is_lost() {
+    let mut world = World::new();
+    world.start(1, &Spec::of(1));
+    world.start(2, &Spec { incarnation: 7, ..Spec::of(2) });
+    world.run(ms(10));
+    world.start(3, &Spec { incarnation: 6, ..Spec::of(2) });
+    world.run(ms(10));
+    assert!(world.at(1).core.refusals().of("NDL answer of a former life") > 0);
+    world.kill(2);
+    world.run(PERIOD * 8);
+    assert!(!world.knows(1, 2));
+}
+
+// spec: NDL-5.4
+#[test]
+fn of_two_living_processes_with_one_address_the_newcomer_is_refused() {
+    for incarnation in [1, 2] {
+        // given: the newcomer knows nothing of the holder
+        let mut world = World::of_members(2);
+        world.cut(2, 3);
+        world.cut(3, 2);
+        // when
+        world.start(3, &Spec { incarnation, ..Spec::of(2) });
+        world.run(PERIOD * 6);
+        // then
+        assert_eq!(world.at(1).facts, [], "life {incarnation}");
+        let collision = Output::Collision { node: node(2), holder: udp(2), newcomer: udp(3) };
+        assert_eq!(world.at(1).others, [collision], "reported once in 10 s");
+        assert!(world.at(1).core.refusals().of("NDL node address used twice") > 1);
+        // when: the holder goes
+        world.kill(2);
+        world.run(PERIOD * 8);
+        // then: a later life takes over, an equal one never does
+        assert_eq!(world.knows(1, 2), incarnation == 2);
+    }
+}
+
+#[test]
+fn a_starved_judge_asks_again_before_a_newcomer_replaces_a_member() {
+    let mut world = World::of_members(2);
+    world.cut(2, 3);
+    world.cut(3, 2);
+    world.start(3, &Spec { incarnation: 2, ..Spec::of(2) });
+    world.run_until(ms(10), |world| !world.at(1).core.contests.is_empty());
+    world.stall(1, ms(200));
+    world.run(PERIOD * 2);
+    assert_eq!(world.at(1).facts, []);
+}
+
+// spec: NDL-5.5
+#[test]
+fn a_newcomer_that_finds_its_own_address_in_use_gives_up_and_the_holder_does_not() {
+    let mut world = World::of_members(2);
+    world.run(PERIOD * 5);
+    world.start(3, &Spec::of(2));
+    world.run(ms(10));
+    assert_eq!(world.at(3).others, [Output::AddressTaken { holder: udp(2) }]);
+    assert_eq!(world.at(3).core.next_wake(), None, "it is silent from now on");
+    assert_eq!(world.at(2).others, [Output::Collision { node: node(2), holder: udp(2), newcomer: udp(3) }]);
+    assert_eq!(world.at(1).facts, []);
+}
+
+// spec: NDL-5.5
+#[test]
+fn of_two_that_start_together_with_one_address_the_later_life_gives_up_alone() {
+    let mut world = World::new();
+    world.start(1, &Spec::of(1));
+    world.start(2, &Spec::of(2));
+    world.start(3, &Spec { incarnation: 2, ..Spec::of(2) });
+    world.run(PERIOD * 6);
+    let gave_up = |world: &World, index| {
+        world.at(index).others.iter().any(|output| matches!(output, Output::AddressTaken { .. }))
+    };
+    assert!(gave_up(&world, 3));
+    assert!(!gave_up(&world, 2));
+    assert!(world.knows(1, 2));
+}
