@@ -3,7 +3,7 @@
 use std::{
     collections::BTreeMap,
     hash::{BuildHasher, RandomState},
-    net::{SocketAddr, UdpSocket},
+    net::{SocketAddr, SocketAddrV4, UdpSocket},
     sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, atomic::AtomicBool},
     time::Duration,
 };
@@ -36,6 +36,8 @@ pub(crate) struct Stores {
     pub(crate) clocks: ClockOffsets,
     /// Address of GNCL's listener, known once it listens; announced by NDL. A restarted GNCL binds it again.
     pub(crate) gncl_listen: OnceLock<SocketAddr>,
+    /// Where GNCL listens besides; set with it.
+    pub(crate) gncl_further: OnceLock<Vec<SocketAddrV4>>,
     /// What LNCL, the sync manager and NDL's sockets refused.
     pub(crate) refusals: Arc<Refusals>,
     /// GNCL's peers with the messages that wait for them, and what GNCL refused.
@@ -86,6 +88,7 @@ impl Stores {
             },
             clocks: ClockOffsets::default(),
             gncl_listen: OnceLock::new(),
+            gncl_further: OnceLock::new(),
             refusals: Arc::default(),
             gncl: gncl::Store::default(),
             ndl_socket: Mutex::default(),

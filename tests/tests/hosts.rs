@@ -1,4 +1,4 @@
-//! Four nodes on four hosts: found, held at the barrier, talking, cut off, back.
+//! Nodes on hosts of their own: found, held at the barrier, talking, cut off, back; and with two interfaces each, of which one goes.
 
 use std::{fmt::Write, net::SocketAddrV4};
 
@@ -75,4 +75,53 @@ fn four_hosts_find_each_other_wait_talk_and_notice_a_cut_link() {
     central.wait_for(&["requirement", "Met", "ankle"]);
     ankle.wait_for(&["NodeFound", "central"]);
     ankle.wait_for(&["count", "from 10.77.0.1"]);
+}
+
+/// A node with an interface in each of two networks.
+fn start_in_both(hosts: &Hosts, directory: &OwnDirectory, index: usize, more: &[&str]) -> Program {
+    let (name, address) = (NAMES[index], index + 1);
+    let path = directory.join(&format!("{name}.toml"));
+    let other = 3 - address;
+    let text = format!(
+        "[node]\nname = \"{name}\"\nproject = \"hosts\"\n\
+         [gncl]\nfurther = [\"10.78.0.{address}\"]\n\
+         [ndl]\ninterface = \"10.77.0.{address}\"\nport = 6911\nseeds = [\"10.77.0.{other}:6911\"]\n\
+         multicast = false\nmdns_port = false\nperiod_ms = 100\n"
+    );
+    std::fs::write(&path, text).expect("the test's own directory");
+    node_under_test(Some(&hosts.all()[index]), &path, more)
+}
+
+/// The number and the one before it in a line that says which count came.
+fn count_in(line: &str) -> Option<(u64, u64)> {
+    let words: Vec<_> = line.split(' ').collect();
+    match words[..] {
+        ["count", number, "from", _, "after", last] => Some((number.parse().ok()?, last.parse().ok()?)),
+        _ => None,
+    }
+}
+
+#[test]
+fn a_link_whose_interface_is_taken_down_is_back_over_the_other_one_and_nothing_is_lost_or_comes_twice() {
+    let hosts = match Hosts::in_networks(2, 2) {
+        Ok(hosts) => hosts,
+        Err(why) => {
+            println!("skipped: no hosts can be made here: {why}");
+            return;
+        }
+    };
+    let directory = OwnDirectory::new();
+    let mut central = start_in_both(&hosts, &directory, 0, &["--requires", "hip", "--sends-to", "hip"]);
+    let mut hip = start_in_both(&hosts, &directory, 1, &[]);
+    central.wait_for(&["started"]);
+    hip.wait_for(&["count 50 from 10.77.0.1"]);
+    // When
+    hosts.take_down(0, 0);
+    // Then
+    hip.wait_for(&["count 350 from 10.77.0.1"]);
+    let counts: Vec<_> = hip.said().iter().filter_map(|line| count_in(line)).collect();
+    assert!(counts.iter().all(|(number, last)| *number == last + 1), "{counts:?}");
+    for node in [&central, &hip] {
+        assert!(node.said().iter().all(|line| !line.contains("NodeLost")), "{:?}", node.said());
+    }
 }

@@ -7,7 +7,7 @@ use std::{
 };
 
 use super::{ConfigFault, ConfigFaults, NodeConfig, faults::quoted};
-use crate::sync::NAME_BYTES_MAX;
+use crate::{ndl::FURTHER_MAX, sync::NAME_BYTES_MAX};
 
 /// Longest path of a unix socket in bytes: what every system takes, with the closing zero.
 const SOCKET_BYTES_MAX: usize = 100;
@@ -151,6 +151,23 @@ impl NodeConfig {
         RING_BYTES.count(faults, self.lncl.ring_bytes);
     }
 
+    fn check_further(&self, faults: &mut Vec<ConfigFault>) {
+        let further = &self.gncl.further;
+        let legal =
+            format!("at most {FURTHER_MAX} addresses of this host, each another one than ndl.interface");
+        if further.len() > FURTHER_MAX {
+            let remedy = "list one address for each further interface";
+            faults.push(fault("gncl.further", format!("{} addresses", further.len()), legal.clone(), remedy));
+        }
+        let is_unfit = |(at, ip): &(usize, &Ipv4Addr)| {
+            !is_host_address(**ip) || **ip == self.ndl.interface || further[..*at].contains(ip)
+        };
+        for (_, ip) in further.iter().enumerate().take(FURTHER_MAX).filter(is_unfit) {
+            let remedy = "write another interface's address, or leave it out";
+            faults.push(fault("gncl.further", quoted(&ip.to_string()), legal.clone(), remedy));
+        }
+    }
+
     fn check_gncl(&self, faults: &mut Vec<ConfigFault>) {
         let gncl = &self.gncl;
         if let Some(outer) = gncl.announce.filter(|outer| !is_host_address(*outer.ip()) || outer.port() == 0)
@@ -159,6 +176,7 @@ impl NodeConfig {
             let remedy = "write where the others' connections are forwarded from, or leave it out";
             faults.push(fault("gncl.announce", quoted(&outer.to_string()), legal, remedy));
         }
+        self.check_further(faults);
         QUEUE_CAPACITY.count(faults, gncl.queue_capacity);
         QUEUE_BYTES.count(faults, gncl.queue_bytes);
         STRANGERS_MAX.count(faults, gncl.strangers_max);

@@ -4,7 +4,7 @@ use std::{
     collections::BTreeMap,
     fs::File,
     io::Read,
-    net::{Ipv4Addr, SocketAddr, SocketAddrV4},
+    net::{Ipv4Addr, SocketAddrV4},
     ops::Range as Span,
     path::Path,
     str::FromStr,
@@ -29,7 +29,7 @@ const FILE_BYTES_MAX: u64 = 1 << 20;
 const SECTIONS: [&str; 6] = ["node", "lncl", "gncl", "ndl", "sync", "supervision"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 39] = [
+pub(super) const KEYS: [&str; 40] = [
     "node.name",
     "node.project",
     "node.address",
@@ -46,6 +46,7 @@ pub(super) const KEYS: [&str; 39] = [
     "lncl.ring_bytes",
     "gncl.port",
     "gncl.announce",
+    "gncl.further",
     "gncl.queue_capacity",
     "gncl.queue_bytes",
     "gncl.strangers_max",
@@ -346,6 +347,8 @@ impl Reader<'_> {
         self.number(&check::GNCL_PORT, &mut gncl.port);
         let example = "\"192.168.1.7:6912\" or false";
         self.text_or_off::<SocketAddrV4>("gncl.announce", example, &mut gncl.announce);
+        let remedy = "set gncl.further as in [\"192.168.2.7\"]";
+        self.read_list("gncl.further", "a list of addresses of this host", remedy, &mut gncl.further);
         self.number(&check::QUEUE_CAPACITY, &mut gncl.queue_capacity);
         self.number(&check::QUEUE_BYTES, &mut gncl.queue_bytes);
         self.number(&check::STRANGERS_MAX, &mut gncl.strangers_max);
@@ -368,7 +371,8 @@ impl Reader<'_> {
         } else if let Some(port) = &mut ndl.mdns_port {
             self.number(&check::MDNS_PORT, port);
         }
-        self.read_seeds(&mut ndl.seeds);
+        let remedy = "set ndl.seeds as in [\"192.168.1.7:6911\"]";
+        self.read_list("ndl.seeds", "a list of addresses with their ports", remedy, &mut ndl.seeds);
         self.time(&check::PERIOD, &mut ndl.period);
         self.number(&check::MISSED_MAX, &mut ndl.missed_max);
         self.number(&check::NODES_MAX, &mut ndl.nodes_max);
@@ -382,18 +386,21 @@ impl Reader<'_> {
         self.time(&check::APP_WINDOW, &mut supervision.app_window);
     }
 
-    fn read_seeds(&mut self, seeds: &mut Vec<SocketAddr>) {
-        const KEY: &str = "ndl.seeds";
-        const LEGAL: &str = "a list of addresses with their ports";
-        const REMEDY: &str = "set ndl.seeds as in [\"192.168.1.7:6911\"]";
-        let Some(value) = self.values.get(KEY).copied() else { return };
-        let Some(list) = value.get_ref().as_array() else {
-            return self.reject(KEY, value, LEGAL, REMEDY);
+    fn read_list<T: FromStr>(
+        &mut self,
+        key: &'static str,
+        legal: &'static str,
+        remedy: &'static str,
+        list: &mut Vec<T>,
+    ) {
+        let Some(value) = self.values.get(key).copied() else { return };
+        let Some(texts) = value.get_ref().as_array() else {
+            return self.reject(key, value, legal, remedy);
         };
-        for seed in list {
-            match seed.get_ref().as_str().map(str::parse) {
-                Some(Ok(address)) => seeds.push(address),
-                Some(Err(_)) | None => self.reject(KEY, seed, LEGAL, REMEDY),
+        for text in texts {
+            match text.get_ref().as_str().map(str::parse) {
+                Some(Ok(item)) => list.push(item),
+                Some(Err(_)) | None => self.reject(key, text, legal, remedy),
             }
         }
     }

@@ -85,6 +85,9 @@ pub struct GnclConfig {
     /// Where the others reach the listener, if not where it listens: the outer side of a forwarded port. Default: none, where it
     /// listens.
     pub announce: Option<SocketAddrV4>,
+    /// Further addresses of this host at which GNCL listens, one for each interface beside [`NdlConfig::interface`], the one that is
+    /// preferred first; at most 7. The others dial all of them, and again when a link breaks. Default: none.
+    pub further: Vec<Ipv4Addr>,
     /// Messages that wait for one peer at most, each class by itself. 1 to 65,536; default 1,024.
     pub queue_capacity: usize,
     /// Bytes of their payloads at most, each class by itself; one message waits however long it is. 4 KiB to 1 GiB;
@@ -204,6 +207,7 @@ impl NodeConfig {
             gncl: GnclConfig {
                 port: 0,
                 announce: None,
+                further: Vec::new(),
                 queue_capacity: 1_024,
                 queue_bytes: 16 << 20,
                 strangers_max: 64,

@@ -86,18 +86,19 @@ impl Gncl {
         self.stores.stopping.load(Ordering::Relaxed)
     }
 
-    /// The listener: the one that is open already, if this layer was restarted.
-    fn listen(&self) -> io::Result<tokio::net::TcpListener> {
-        let mut kept = lock(&self.stores.gncl.listener);
-        if let Some(listener) = &*kept {
-            return tokio::net::TcpListener::from_std(listener.try_clone()?);
+    /// The listeners, one for each address: those that are open already, if this layer was restarted.
+    fn listen(&self) -> io::Result<Vec<tokio::net::TcpListener>> {
+        let mut kept = lock(&self.stores.gncl.listeners);
+        if kept.is_empty() {
+            let config = &self.stores.config;
+            let listener = listener::listen((config.ndl.interface, config.gncl.port).into())?;
+            let address = listener.local_addr()?;
+            let further = listener::listen_at_further(&config.gncl, &self.stores.gncl.refusals);
+            self.stores.gncl_further.get_or_init(|| listener::addresses_of(&further));
+            *kept = std::iter::once(listener).chain(further).collect();
+            self.stores.gncl_listen.get_or_init(|| address);
         }
-        let config = &self.stores.config;
-        let listener = listener::listen((config.ndl.interface, config.gncl.port).into())?;
-        let address = listener.local_addr()?;
-        *kept = Some(listener.try_clone()?);
-        self.stores.gncl_listen.get_or_init(|| address);
-        tokio::net::TcpListener::from_std(listener)
+        kept.iter().map(|listener| tokio::net::TcpListener::from_std(listener.try_clone()?)).collect()
     }
 
     fn input(&mut self, input: Input, ctx: &mut Context<Self>) {
@@ -380,7 +381,7 @@ impl Actor for Gncl {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Context<Self>) {
-        let listener = self.listen().unwrap_or_else(|error| {
+        let listeners = self.listen().unwrap_or_else(|error| {
             let config = &self.stores.config;
             let (interface, port) = (config.ndl.interface, config.gncl.port);
             panic!(
@@ -394,10 +395,12 @@ impl Actor for Gncl {
         }
         // NDL tells each change once, and a former instance may have had the last one in its hand.
         let members = lock(&self.stores.ndl).members(Time::now());
-        for KnownNode { node, incarnation, gncl: address, .. } in members {
-            self.input(Input::NodeFound { node, incarnation, address }, ctx);
+        for KnownNode { node, incarnation, gncl: addresses, .. } in members {
+            self.input(Input::NodeFound { node, incarnation, addresses }, ctx);
         }
-        ctx.add_stream(listener::accepted(listener, self.stores.config.gncl.give_up));
+        for listener in listeners {
+            ctx.add_stream(listener::accepted(listener, self.stores.config.gncl.give_up));
+        }
         ctx.add_stream(self.stores.posts.gncl.attach_keeping(Clone::clone));
         ctx.spawn(fut::wrap_future(Store::serve_those_held_up(self.stores.clone())));
         let spin = self.spin.clone();
@@ -441,7 +444,7 @@ impl StreamHandler<Event> for Gncl {
     fn handle(&mut self, event: Event, ctx: &mut Context<Self>) {
         let input = match event {
             Event::Membership(MembershipFact::NodeFound { node, incarnation, gncl }) => {
-                Input::NodeFound { node, incarnation, address: gncl }
+                Input::NodeFound { node, incarnation, addresses: gncl }
             }
             Event::Membership(MembershipFact::NodeLost { node, incarnation, why: LossReason::Left }) => {
                 Input::NodeLeaves { node, incarnation }

@@ -1,11 +1,18 @@
 //! The accepting socket: waits when the system has no more to give, and never spins.
 
-use std::{io, net::SocketAddr, time::Duration};
+use std::{
+    io,
+    net::{Ipv4Addr, SocketAddr, SocketAddrV4},
+    time::Duration,
+};
 
 use futures_util::{Stream, stream};
 use rustix::io::Errno;
+use sinew_runtime::time::Time;
 use socket2::{Domain, Socket, Type};
 use tokio::net::{TcpListener, TcpStream};
+
+use crate::{config::GnclConfig, refusals::Refusals};
 
 /// Connections that wait to be accepted at most; the kernel refuses further ones.
 const BACKLOG: i32 = 1_024;
@@ -17,11 +24,50 @@ const BACK_OFF_MAX: Duration = Duration::from_millis(100);
 /// # Errors
 /// What the system says.
 pub(super) fn listen(address: SocketAddr) -> io::Result<std::net::TcpListener> {
-    let socket = Socket::new(Domain::for_address(address), Type::STREAM.nonblocking().cloexec(), None)?;
+    begin_to_listen(&new_socket(address)?, address)
+}
+
+/// Listens at the further addresses of this node. One that this host does not have now it may have later: an interface that is
+/// down, or has no address yet, keeps no node from its start. What cannot be listened at in any case is counted, and not announced.
+pub(super) fn listen_at_further(gncl: &GnclConfig, refusals: &Refusals) -> Vec<std::net::TcpListener> {
+    let listen = |address: SocketAddr| {
+        let socket = new_socket(address)?;
+        #[cfg(target_os = "linux")]
+        socket.set_freebind_v4(true)?;
+        begin_to_listen(&socket, address)
+    };
+    let listen = |ip: &Ipv4Addr| {
+        let address = (*ip, gncl.port).into();
+        let noted = |error: &io::Error| {
+            refusals.count(
+                Time::now(),
+                "further address not listened at",
+                &format_args!("{address}: {error}"),
+            );
+        };
+        listen(address).inspect_err(noted).ok()
+    };
+    gncl.further.iter().filter_map(listen).collect()
+}
+
+/// Where these listen.
+pub(super) fn addresses_of(listeners: &[std::net::TcpListener]) -> Vec<SocketAddrV4> {
+    let addresses = listeners.iter().filter_map(|listener| match listener.local_addr() {
+        Ok(SocketAddr::V4(address)) => Some(address),
+        Ok(SocketAddr::V6(_)) | Err(_) => None,
+    });
+    addresses.collect()
+}
+
+fn new_socket(address: SocketAddr) -> io::Result<Socket> {
+    Socket::new(Domain::for_address(address), Type::STREAM.nonblocking().cloexec(), None)
+}
+
+fn begin_to_listen(socket: &Socket, address: SocketAddr) -> io::Result<std::net::TcpListener> {
     socket.set_reuse_address(true)?;
     socket.bind(&address.into())?;
     socket.listen(BACKLOG)?;
-    Ok(socket.into())
+    Ok(socket.try_clone()?.into())
 }
 
 /// Each connection that is made to `listener`, and each error that made it wait. See [`tune`](super::link::tune).

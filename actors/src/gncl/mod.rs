@@ -19,6 +19,8 @@
 //! | GNCL-11 | A frame's source must be on the peer's node and its destination on this one; times are turned into our clock. |
 //! | GNCL-12 | CONFIRM is answered by OUTCOME on the peer's present connection. |
 //! | GNCL-14 | Where both know `classes`, whoever dialled a link dials a connection each for Stream and for Bulk as well. |
+//! | GNCL-15 | Who waits no more for a reply says CANCEL, to a peer that knows it: a request that still waits is taken out as `Expired`. |
+//! | GNCL-16 | All addresses that a peer announces are dialled, 20 ms apart; the first that is reached stays, the others are closed. |
 //! | GNCL-13 | When a connection ends, nothing is lost (`session/`); when the node is, what was sent is `Unknown`, what waited `PeerLost`. |
 //!
 //! | file | what it is |

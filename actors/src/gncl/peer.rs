@@ -193,11 +193,11 @@ pub(crate) struct Store {
     buried: Arc<Mutex<Buried>>,
     /// Told when messages begin to wait for an application here, and when one for which they wait takes more.
     pub(super) held_up: Arc<Notify>,
-    /// The socket that listens. It stays open while this layer is restarted: a peer that is refused would say that this
-    /// node is lost.
-    pub(super) listener: Mutex<Option<std::net::TcpListener>>,
     /// The thread of Bulk, from its first connection until the node ends.
     bulk: Mutex<Option<BulkThread>>,
+    /// The sockets that listen, that of the node's interface first. They stay open while this layer is restarted: a peer that is
+    /// refused would say that this node is lost.
+    pub(super) listeners: Mutex<Vec<std::net::TcpListener>>,
     /// What GNCL refused, and why.
     pub(crate) refusals: Arc<Refusals>,
 }
@@ -312,9 +312,9 @@ impl Store {
         lock(&self.bulk).take();
     }
 
-    /// Nobody connects any more, and the port is free, whoever still holds the socket.
+    /// Nobody connects any more, and the ports are free, whoever still holds the sockets.
     pub(crate) fn close(&self) {
-        if let Some(listener) = lock(&self.listener).take() {
+        for listener in lock(&self.listeners).drain(..) {
             // An error says that it does not listen any more.
             let _ = SockRef::from(&listener).shutdown(Shutdown::Both);
         }

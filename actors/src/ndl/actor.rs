@@ -151,7 +151,11 @@ impl Shell {
         let socket = open_socket(&stores).map_err(unbound)?;
         let udp = socket.local_addr().map_err(unbound)?;
         let reader = socket.try_clone().map_err(unbound)?;
-        let epoch = lock(&stores).start(Time::now(), udp, gncl);
+        let epoch = {
+            let mut core = lock(&stores);
+            core.announce_further(stores.gncl_further.get().map_or(&[], Vec::as_slice));
+            core.start(Time::now(), udp, gncl)
+        };
         crate::log::info!(%udp, %gncl, "NDL asks and answers");
         let (rewind, refusals) = (Notify::new(), stores.refusals.clone());
         Ok((Self { stores, epoch, socket, rewind, refusals }, reader))

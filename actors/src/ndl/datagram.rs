@@ -1,6 +1,6 @@
 //! NDL's datagrams: one frame each, at most 1,200 bytes, their payloads MessagePack maps.
 
-use std::net::{Ipv4Addr, SocketAddrV4};
+use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 
 use bytes::BytesMut;
 use serde::{Deserialize, Serialize};
@@ -15,6 +15,9 @@ pub(crate) const DATAGRAM_MAX: usize = 1_200;
 
 /// Longest name of a project or node, in bytes.
 const NAME_MAX: usize = 63;
+
+/// Addresses of a node's GNCL at most, beside the first: with the longest names an answer has 400 bytes.
+pub(crate) const FURTHER_MAX: usize = 7;
 
 /// What a node says about itself in every datagram.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -35,12 +38,21 @@ pub(crate) struct Announcement {
     pub(crate) gncl_port: u16,
     /// Time between two queries of the node, in microseconds.
     pub(crate) period_us: u32,
+    /// Further addresses and ports of the listener, [`FURTHER_MAX`] at most: those of other interfaces.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(crate) gncl_further: Vec<(u32, u16)>,
 }
 
 impl Announcement {
     /// Where the node's GNCL listens.
     pub(crate) fn gncl(&self) -> SocketAddrV4 {
         SocketAddrV4::new(Ipv4Addr::from(self.gncl_ip), self.gncl_port)
+    }
+
+    /// All addresses where it listens, the one that it prefers first.
+    pub(crate) fn gncl_addresses(&self) -> Vec<SocketAddr> {
+        let further = self.gncl_further.iter().map(|(ip, port)| (Ipv4Addr::from(*ip), *port).into());
+        std::iter::once(self.gncl().into()).chain(further).collect()
     }
 
     /// Whether both are from one process.
@@ -51,17 +63,19 @@ impl Announcement {
     fn check(self) -> Result<Self, DatagramError> {
         let name_is_fit =
             |name: &str| (1..=NAME_MAX).contains(&name.len()) && !name.contains(char::is_control);
-        let gncl = self.gncl();
+        let leads_nowhere = |gncl: SocketAddr| {
+            let SocketAddr::V4(gncl) = gncl else { return true };
+            let ip = gncl.ip();
+            gncl.port() == 0 || ip.is_unspecified() || ip.is_multicast() || ip.is_broadcast()
+        };
         let fault = if !name_is_fit(&self.project) || !name_is_fit(&self.name) {
             "a name is empty, longer than 63 bytes, or has control characters"
         } else if !self.node.is_single() {
             "its node address names no single node"
-        } else if gncl.port() == 0
-            || gncl.ip().is_unspecified()
-            || gncl.ip().is_multicast()
-            || gncl.ip().is_broadcast()
-        {
-            "nobody can be reached at the address of its GNCL"
+        } else if self.gncl_further.len() > FURTHER_MAX {
+            "its GNCL has too many addresses"
+        } else if self.gncl_addresses().into_iter().any(leads_nowhere) {
+            "nobody can be reached at an address of its GNCL"
         } else {
             return Ok(self);
         };
@@ -210,8 +224,17 @@ mod tests {
 
     fn any_announcement() -> impl Strategy<Value = Announcement> {
         let names = ("[a-zäöü ]{1,30}", "[a-z.-]{1,63}");
-        (names, 1..u32::MAX, any::<[u64; 2]>(), 1..0xe000_0000_u32, 1..u16::MAX, any::<u32>()).prop_map(
-            |((name, project), node, [incarnation, boot_nonce], gncl_ip, gncl_port, period_us)| {
+        let place = || (1..0xe000_0000_u32, 1..u16::MAX);
+        let further = proptest::collection::vec(place(), 0..=FURTHER_MAX);
+        (names, 1..u32::MAX, any::<[u64; 2]>(), place(), further, any::<u32>()).prop_map(
+            |(
+                (name, project),
+                node,
+                [incarnation, boot_nonce],
+                (gncl_ip, gncl_port),
+                gncl_further,
+                period_us,
+            )| {
                 Announcement {
                     project,
                     node: NodeAddress::new(node),
@@ -221,6 +244,7 @@ mod tests {
                     gncl_ip,
                     gncl_port,
                     period_us,
+                    gncl_further,
                 }
             },
         )
@@ -296,6 +320,7 @@ mod tests {
             gncl_ip: 0x7f00_0001,
             gncl_port: 4,
             period_us: 5,
+            gncl_further: Vec::new(),
         }
     }
 
@@ -313,6 +338,9 @@ mod tests {
             Announcement { node: NodeAddress::ALL, ..sound() },
             Announcement { gncl_port: 0, ..sound() },
             Announcement { gncl_ip: 0xe000_0001, ..sound() },
+            Announcement { gncl_further: vec![(0x7f00_0002, 4), (0x7f00_0003, 0)], ..sound() },
+            Announcement { gncl_further: vec![(0, 4)], ..sound() },
+            Announcement { gncl_further: vec![(0x7f00_0002, 4); FURTHER_MAX + 1], ..sound() },
         ];
         for announcement in unfit {
             assert!(matches!(refusal(&announcement), DatagramError::Announcement(_)), "{announcement:?}");

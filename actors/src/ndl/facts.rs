@@ -15,8 +15,8 @@ pub(crate) enum MembershipFact {
     NodeFound {
         node: NodeAddress,
         incarnation: Incarnation,
-        /// Where its GNCL listens.
-        gncl: SocketAddr,
+        /// Where its GNCL listens: the address that it prefers first.
+        gncl: Vec<SocketAddr>,
     },
     /// A node is not there any more.
     NodeLost { node: NodeAddress, incarnation: Incarnation, why: LossReason },

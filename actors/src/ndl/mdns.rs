@@ -119,6 +119,7 @@ mod tests {
             gncl_ip: 0,
             gncl_port: 0,
             period_us: 0,
+            gncl_further: Vec::new(),
         };
         let mdns = Mdns::start(port, "127.0.0.1:9".parse().unwrap(), &me).unwrap();
         let events = mdns.monitor().unwrap();

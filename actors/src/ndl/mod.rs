@@ -47,6 +47,7 @@ mod tests;
 pub(crate) use actor::{NdlActor, new_core};
 pub(crate) use core::Core;
 pub use core::{KnownNode, Source};
+pub(crate) use datagram::FURTHER_MAX;
 pub(crate) use facts::MembershipFact;
 pub use facts::{LossReason, NodeEvent};
 

@@ -120,7 +120,7 @@ impl Node {
 
     async fn finds(&mut self, other: &Self) {
         let (node, incarnation) = (other.stores.node, other.stores.incarnation);
-        let found = MembershipFact::NodeFound { node, incarnation, gncl: gncl_of(node.bits()) };
+        let found = MembershipFact::NodeFound { node, incarnation, gncl: vec![gncl_of(node.bits())] };
         assert_eq!(self.fact(&format!("node {node} to be found")).await, found);
     }
 

@@ -1,4 +1,5 @@
-//! Hosts made of network namespaces: each has one interface, all are joined by a bridge in a namespace of its own.
+//! Hosts made of network namespaces: each has one interface, or one in each of several networks; those of a network are joined by a
+//! bridge, in a namespace of its own.
 //!
 //! Nothing is made in the namespace of the machine itself, so nothing can leave it.
 
@@ -23,10 +24,9 @@ pub struct Hosts {
 #[derive(Debug)]
 pub struct Host {
     namespace: Namespace,
-    /// Its address.
+    /// Its address in the first network.
     pub address: Ipv4Addr,
-    /// Its port of the bridge.
-    port: String,
+    index: u8,
 }
 
 /// In what order a throttled host sends what waits.
@@ -44,11 +44,22 @@ impl Hosts {
     /// # Errors
     /// A sentence: no root, no `ip`, or a kernel without namespaces.
     pub fn new(count: u8) -> Result<Self, String> {
+        Self::in_networks(count, 1)
+    }
+
+    /// The same with an interface in each of so many networks: 10.77.0.1 and up, 10.78.0.1 and up, and so on.
+    ///
+    /// # Errors
+    /// As `new`.
+    pub fn in_networks(count: u8, networks: u8) -> Result<Self, String> {
         let number = format!("{}-{}-", std::process::id(), NETWORKS.fetch_add(1, Ordering::Relaxed));
         let bridge = Namespace::new(format!("sw{number}br"))?;
-        bridge.ip("link add bridge type bridge")?;
-        bridge.ip("link set bridge up")?;
-        let hosts = (1..=count).map(|index| Host::new(&number, index, &bridge)).collect::<Result<_, _>>()?;
+        for network in 0..networks {
+            bridge.ip(&format!("link add bridge{network} type bridge"))?;
+            bridge.ip(&format!("link set bridge{network} up"))?;
+        }
+        let host = |index| Host::new(&number, index, &bridge, networks);
+        let hosts = (1..=count).map(host).collect::<Result<_, _>>()?;
         Ok(Self { bridge, hosts })
     }
 
@@ -58,7 +69,7 @@ impl Hosts {
         &self.hosts
     }
 
-    /// Cuts a host's link: its port of the bridge goes down.
+    /// Cuts a host's link to the first network: its port of the bridge goes down.
     ///
     /// # Panics
     /// If the kernel refuses.
@@ -72,6 +83,15 @@ impl Hosts {
     /// If the kernel refuses.
     pub fn join(&self, host: usize) {
         self.set_port(host, "up");
+    }
+
+    /// Takes a host's own interface in a network down.
+    ///
+    /// # Panics
+    /// If the kernel refuses.
+    pub fn take_down(&self, host: usize, network: u8) {
+        let taken = self.hosts[host].namespace.ip(&format!("link set eth{network} down"));
+        taken.unwrap_or_else(|error| panic!("eth{network} down: {error}"));
     }
 
     /// Lets so many kilobits a second out of each host. A host keeps 50 ms of what its programs send faster, and loses the rest.
@@ -91,25 +111,31 @@ impl Hosts {
     }
 
     fn set_port(&self, host: usize, state: &str) {
-        let port = &self.hosts[host].port;
+        let port = port(self.hosts[host].index, 0);
         self.bridge
             .ip(&format!("link set {port} {state}"))
             .unwrap_or_else(|error| panic!("{port} {state}: {error}"));
     }
 }
 
+/// The port of a network's bridge that a host is at.
+fn port(host: u8, network: u8) -> String {
+    format!("port{host}-{network}")
+}
+
 impl Host {
-    fn new(number: &str, index: u8, bridge: &Namespace) -> Result<Self, String> {
+    fn new(number: &str, index: u8, bridge: &Namespace, networks: u8) -> Result<Self, String> {
         let namespace = Namespace::new(format!("sw{number}h{index}"))?;
-        let port = format!("port{index}");
-        let address = Ipv4Addr::new(10, 77, 0, index);
-        bridge.ip(&format!("link add {port} type veth peer name eth0 netns {}", namespace.0))?;
-        bridge.ip(&format!("link set {port} master bridge"))?;
-        bridge.ip(&format!("link set {port} up"))?;
         namespace.ip("link set lo up")?;
-        namespace.ip(&format!("address add {address}/24 dev eth0"))?;
-        namespace.ip("link set eth0 up")?;
-        Ok(Self { namespace, address, port })
+        for network in 0..networks {
+            let (port, name) = (port(index, network), format!("eth{network}"));
+            bridge.ip(&format!("link add {port} type veth peer name {name} netns {}", namespace.0))?;
+            bridge.ip(&format!("link set {port} master bridge{network}"))?;
+            bridge.ip(&format!("link set {port} up"))?;
+            namespace.ip(&format!("address add {}/24 dev {name}", address(index, network)))?;
+            namespace.ip(&format!("link set {name} up"))?;
+        }
+        Ok(Self { namespace, address: address(index, 0), index })
     }
 
     /// A command that runs `program` on this host.
@@ -119,6 +145,11 @@ impl Host {
         command.args(["netns", "exec", &self.namespace.0]).arg(program);
         command
     }
+}
+
+/// The address of a host in a network.
+const fn address(host: u8, network: u8) -> Ipv4Addr {
+    Ipv4Addr::new(10, 77 + network, 0, host)
 }
 
 #[derive(Debug)]

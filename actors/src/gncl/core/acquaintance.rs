@@ -4,7 +4,7 @@ use std::{net::SocketAddr, time::Duration};
 
 use sinew_runtime::{tid::Incarnation, time::Time};
 
-use super::{ConnectionId, Settings, sides::Side};
+use super::{ConnectionId, Settings, dials::Dial, sides::Side};
 
 /// What is known of one peer.
 #[derive(Debug)]
@@ -14,11 +14,13 @@ pub(super) struct Acquaintance {
     /// The life of it that NDL told of last.
     pub(super) found: Option<Incarnation>,
     /// Where to dial it, as long as NDL says that it is there.
-    pub(super) wanted: Option<SocketAddr>,
+    pub(super) wanted: Option<Vec<SocketAddr>>,
     /// The link, if there is one.
     pub(super) link: Option<Link>,
     /// Our dial on its way, if there is one.
-    pub(super) dial: Option<ConnectionId>,
+    pub(super) dial: Option<Dial>,
+    /// Which of its addresses is dialled first, modulo their number.
+    pub(super) first: usize,
     /// Number of our last dial.
     pub(super) dial_number: u64,
     /// Its dials up to this number are void.
@@ -63,6 +65,7 @@ impl Acquaintance {
             wanted: None,
             link: None,
             dial: None,
+            first: 0,
             dial_number: 0,
             void_dial: 0,
             redial_at: None,
@@ -113,7 +116,8 @@ impl Acquaintance {
     /// When something is to be done about it without further news.
     pub(super) fn next_wake(&self, settings: &Settings) -> Option<Time> {
         let link = self.link.as_ref().and_then(|link| link.next_wake(settings));
-        [link, self.redial_at, self.orphan_at].into_iter().flatten().min()
+        let attempt = self.dial.as_ref().map(|dial| dial.next_at).filter(|at| *at != Time::MAX);
+        [link, self.redial_at, self.orphan_at, attempt].into_iter().flatten().min()
     }
 }
 

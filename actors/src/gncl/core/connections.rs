@@ -6,6 +6,7 @@ use super::{
     Attach, CANCEL, Connection, ConnectionId, Core, Decline, Introduction, Lane, LinkFact, Output, Refusal,
     Stage,
     acquaintance::{Acquaintance, Link, Pulse},
+    dials::Dial,
     handshake::check,
     sides::Side,
 };
@@ -46,20 +47,11 @@ impl Core {
         }
     }
 
-    /// Dials a peer that has neither a link nor a dial on its way.
-    pub(super) fn dial(&mut self, now: Time, node: NodeAddress) {
-        let connection = self.open();
-        let Some(peer) = self.peers.get_mut(&node) else { return };
-        let Some(address) = peer.wanted else { return };
-        debug_assert!(peer.link.is_none() && peer.dial.is_none(), "one connection to a peer is enough");
-        peer.redial_at = None;
-        peer.dial = Some(connection);
-        self.stage_for_handshake(now, connection, Stage::Dialling(node, Lane::Control));
-        self.outputs.push_back(Output::Dial { connection, address });
-    }
-
     pub(super) fn connected(&mut self, now: Time, connection: ConnectionId) {
         let Some(Stage::Dialling(node, lane)) = self.stage(connection) else { return };
+        if lane == Lane::Control {
+            self.reached(node, connection);
+        }
         let Some(peer) = self.peers.get_mut(&node) else { return };
         // The clock makes the number grow through restarts of this layer as well. spec: GNCL-6
         peer.dial_number = now.as_nanos().max(peer.dial_number + 1);
@@ -78,11 +70,7 @@ impl Core {
             // The first connection tells whether the node is there.
             return self.side_over(now, node, lane);
         }
-        if let (true, Some(peer)) = (refused, self.peers.get(&node)) {
-            let incarnation = peer.incarnation;
-            self.fact(LinkFact::DialRefused { node, incarnation });
-        }
-        self.dial_over(now, node);
+        self.attempt_over(now, node, connection, refused);
     }
 
     pub(super) fn hello(&mut self, now: Time, connection: ConnectionId, hello: &Introduction) {
@@ -129,7 +117,8 @@ impl Core {
         // spec: GNCL-6
         let is_void = hello.incarnation == peer.incarnation && hello.dial <= peer.void_dial;
         // A dial that has not said hello yet loses against one that has. spec: GNCL-4
-        let said_hello = peer.dial.is_some_and(|dial| matches!(self.stage(dial), Some(Stage::HelloSent(..))));
+        let mut dials = peer.dial.iter().flat_map(Dial::connections);
+        let said_hello = dials.any(|dial| matches!(self.stage(dial), Some(Stage::HelloSent(..))));
         if is_void || (said_hello && self.settings.ours.node < hello.node) {
             return Err(Decline::Duplicate);
         }
@@ -163,7 +152,6 @@ impl Core {
         }
         self.meet(now, node, welcome.incarnation);
         let Some(peer) = self.peers.get_mut(&node) else { return };
-        peer.dial = None;
         peer.void_dial = peer.void_dial.max(welcome.dial);
         self.link(now, connection, welcome, None);
     }
@@ -195,8 +183,8 @@ impl Core {
         let by_class = theirs.knows_classes() && self.settings.ours.knows_classes();
         let redial_min = self.settings.redial_min;
         let Some(peer) = self.peers.get_mut(&node) else { return };
-        let (dial, dialled) =
-            if welcome.is_some() { (theirs.dial, None) } else { (peer.dial_number, peer.wanted) };
+        let ours = peer.dial.take().and_then(|dial| dial.address_of(connection));
+        let (dial, dialled) = if welcome.is_some() { (theirs.dial, None) } else { (peer.dial_number, ours) };
         if self.leaving {
             // What waited goes out on it, and it is the last one.
             peer.wanted = None;
@@ -280,9 +268,13 @@ impl Core {
     /// The connection is not in `stage` any more: the peer's side of that.
     fn leave_stage(&mut self, now: Time, connection: ConnectionId, stage: Stage) {
         match stage {
-            Stage::Dialling(node, Lane::Control) | Stage::HelloSent(node, Lane::Control) => {
+            Stage::Dialling(node, Lane::Control) => {
                 self.connections.remove(&connection);
-                self.dial_over(now, node);
+                self.attempt_over(now, node, connection, false);
+            }
+            Stage::HelloSent(node, Lane::Control) => {
+                self.connections.remove(&connection);
+                self.handshake_failed(now, node);
             }
             Stage::Linked(node, Lane::Control) => self.link_over(now, node),
             Stage::Dialling(node, lane) | Stage::HelloSent(node, lane) => {
@@ -297,23 +289,6 @@ impl Core {
             Stage::Stranger | Stage::Leaving => {
                 self.connections.remove(&connection);
             }
-        }
-    }
-
-    fn dial_over(&mut self, now: Time, node: NodeAddress) {
-        let chance = self.chance();
-        if let Some(peer) = self.peers.get_mut(&node) {
-            peer.dial = None;
-            peer.plan(now, &self.settings, chance);
-        }
-    }
-
-    /// Gives up our dial to `node`, if there is one.
-    pub(super) fn drop_dial(&mut self, node: NodeAddress) {
-        let dial = self.peers.get_mut(&node).and_then(|peer| peer.dial.take());
-        if let Some(connection) = dial {
-            self.connections.remove(&connection);
-            self.outputs.push_back(Output::Close(connection));
         }
     }
 

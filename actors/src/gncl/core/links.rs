@@ -18,7 +18,7 @@ impl Core {
         now: Time,
         node: NodeAddress,
         incarnation: Incarnation,
-        address: SocketAddr,
+        addresses: Vec<SocketAddr>,
     ) {
         if self.leaving || node == self.settings.ours.node || !node.is_single() {
             return;
@@ -43,7 +43,7 @@ impl Core {
         };
         peer.orphan_at = None;
         peer.found = Some(incarnation);
-        peer.wanted = Some(address);
+        peer.wanted = Some(addresses);
         if peer.link.is_none() && peer.dial.is_none() {
             // spec: GNCL-1
             self.dial(now, node);
@@ -211,6 +211,8 @@ impl Core {
             self.forget(now, node);
         } else if peer.redial_at.is_some_and(|at| at <= now) {
             self.dial(now, node);
+        } else if peer.dial.as_ref().is_some_and(|dial| dial.next_at <= now) {
+            self.attempt(now, node);
         } else {
             self.ping_due(now, node, Lane::Control);
             for lane in Lane::SIDES {

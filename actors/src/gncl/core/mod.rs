@@ -11,6 +11,7 @@
 
 mod acquaintance;
 mod connections;
+mod dials;
 mod handshake;
 mod links;
 mod sides;
@@ -68,8 +69,8 @@ pub(super) struct ConnectionId(u64);
 pub(super) enum Input {
     /// A former instance of this layer left messages for this peer behind.
     Restored { node: NodeAddress, incarnation: Incarnation },
-    /// NDL found a node.
-    NodeFound { node: NodeAddress, incarnation: Incarnation, address: SocketAddr },
+    /// NDL found a node, which announces these addresses, the one that it prefers first.
+    NodeFound { node: NodeAddress, incarnation: Incarnation, addresses: Vec<SocketAddr> },
     /// NDL lost a node.
     NodeLost { node: NodeAddress, incarnation: Incarnation },
     /// NDL heard a node say that it leaves. What it had sent before may still be on its way, and its GOODBYE behind that.
@@ -211,7 +212,9 @@ impl Core {
     pub(super) fn handle(&mut self, now: Time, input: Input) {
         match input {
             Input::Restored { node, incarnation } => self.restored(now, node, incarnation),
-            Input::NodeFound { node, incarnation, address } => self.found(now, node, incarnation, address),
+            Input::NodeFound { node, incarnation, addresses } => {
+                self.found(now, node, incarnation, addresses)
+            }
             Input::NodeLost { node, incarnation } => self.lost(now, node, incarnation),
             Input::NodeLeaves { node, incarnation } => self.leaves(now, node, incarnation),
             Input::Accepted(connection) => self.accepted(now, connection),

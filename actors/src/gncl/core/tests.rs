@@ -4,6 +4,7 @@ use proptest::prelude::*;
 
 use super::*;
 
+mod dials;
 mod sides;
 mod virtual_wire;
 
@@ -44,8 +45,11 @@ proptest! {
     fn whatever_breaks_both_end_with_the_same_one_link(
         seed: u64, delay_max_us in 1u64..40_000,
         mishaps in proptest::collection::vec((0u64..4_000, any_mishap()), 0..12),
+        dead_before in 0u16..3, dead_after in 0u16..3,
     ) {
         let mut world = World::new(seed, delay_max_us);
+        let dead = |number: u16| SocketAddr::from(([192, 0, 2, 1], number + 1));
+        world.addresses = (0..dead_before).map(dead).chain([address()]).chain((5..5 + dead_after).map(dead)).collect();
         world.find_each_other_at([millis(0), millis(3)]);
         let mut mishaps = mishaps;
         mishaps.sort_by_key(|(at, _)| *at);
@@ -119,7 +123,7 @@ fn address() -> SocketAddr {
 }
 
 fn found(incarnation: u64) -> Input {
-    Input::NodeFound { node: HIGH, incarnation: Incarnation(incarnation), address: address() }
+    Input::NodeFound { node: HIGH, incarnation: Incarnation(incarnation), addresses: vec![address()] }
 }
 
 #[test]

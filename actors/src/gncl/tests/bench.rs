@@ -164,6 +164,11 @@ impl Node {
     }
 
     pub(super) fn find(&self, node: NodeAddress, gncl: SocketAddr) {
+        self.find_at(node, vec![gncl]);
+    }
+
+    /// The same of a node that announces several addresses.
+    pub(super) fn find_at(&self, node: NodeAddress, gncl: Vec<SocketAddr>) {
         self.tell(Event::Membership(MembershipFact::NodeFound { node, incarnation: Incarnation(1), gncl }));
     }
 
@@ -435,6 +440,11 @@ impl Cable {
     /// Ends all present connections.
     pub(super) fn cut(&self) {
         self.cut.send_modify(|(at, cut)| (*at, *cut) = (*at + 1, Cut::All));
+    }
+
+    /// Nobody can be reached through it any more.
+    pub(super) fn remove(&self) {
+        self.accepting.abort();
     }
 
     /// Ends the connection with this number, of those that were made, from 0.

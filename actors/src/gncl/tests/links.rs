@@ -1,6 +1,6 @@
 //! Links that break, are made again, and end in order.
 
-use std::{sync::atomic::Ordering, time::Duration};
+use std::{net::Ipv4Addr, sync::atomic::Ordering, time::Duration};
 
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
@@ -271,5 +271,44 @@ fn two_layers_cannot_have_one_port_and_the_second_says_so() {
         let port = a.listens_at().port();
         let error = listener::listen(([127, 0, 0, 1], port).into()).unwrap_err();
         assert_eq!(error.kind(), std::io::ErrorKind::AddrInUse);
+    });
+}
+
+#[test]
+fn a_link_whose_way_is_gone_is_back_over_another_address_of_its_peer_and_nothing_is_lost() {
+    run(async {
+        let mut a = Node::start(1).await;
+        let further = Ipv4Addr::new(127, 0, 0, 2);
+        let b = Node::start_with(2, |config| config.gncl.further = vec![further]).await;
+        let other_way = b.stores.gncl_further.get().expect("GNCL listens")[0];
+        assert_eq!(*other_way.ip(), further);
+        let mut inbox = b.app(1);
+        let cable = Cable::to(b.listens_at()).await;
+        a.find_at(b.address(), vec![cable.address, other_way.into()]);
+        a.up().await;
+        for number in 0..100u8 {
+            if number == 50 {
+                cable.cut();
+                cable.remove();
+                a.broken().await;
+            }
+            a.send(b.tid(1), &[number]);
+        }
+        for number in 0..100u8 {
+            assert_eq!(next("a message", &mut inbox).await.payload[..], [number]);
+        }
+        a.up().await;
+    });
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn an_address_that_this_host_does_not_have_yet_keeps_no_node_from_its_start() {
+    run(async {
+        // 192.0.2.0/24 is for documentation.
+        let absent = Ipv4Addr::new(192, 0, 2, 1);
+        let node = Node::start_with(1, |config| config.gncl.further = vec![absent]).await;
+        let further = node.stores.gncl_further.get().expect("GNCL listens");
+        assert_eq!(further.iter().map(|address| *address.ip()).collect::<Vec<_>>(), [absent]);
     });
 }

@@ -76,7 +76,7 @@ impl Core {
     /// read first. Each respite allows twice what made it, so that a timer that is always late puts nothing off for ever.
     // spec: NDL-4.1, NDL-4.2
     fn lose_the_silent(&mut self, now: Time, late: Duration, allowed: Duration) {
-        let is_silent = |member: &Member| member.missed >= self.missed_max;
+        let is_silent = |member: &Member| member.is_silent(now, self.missed_max);
         let silent: Vec<NodeAddress> =
             self.members.iter().filter(|(_, member)| is_silent(member)).map(|(node, _)| *node).collect();
         if late > allowed && !silent.is_empty() {

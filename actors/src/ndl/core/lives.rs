@@ -19,6 +19,8 @@ use crate::{
 
 /// Longest time that a node has to show that it lives, when another process comes with its address.
 const CHALLENGE_MAX: Duration = Duration::from_millis(100);
+/// Time in which a broken connection may be made again at another address.
+const LINK_GRACE: Duration = Duration::from_secs(1);
 /// Time between two reports that a node address is used twice.
 const COLLISION_REPORT_PERIOD: Duration = Duration::from_secs(10);
 
@@ -185,7 +187,7 @@ impl Core {
         let Proof { from, announcement, exchange, .. } = proof;
         let Announcement { node, incarnation, ref name, .. } = announcement;
         let name = name.clone();
-        let gncl = SocketAddr::V4(announcement.gncl());
+        let gncl = announcement.gncl_addresses();
         if let Some(gone) = self.gone.remove(&node)
             && gone.address != from
         {
@@ -200,6 +202,7 @@ impl Core {
             is_awaited: false,
             clock: PeerClock::default(),
             is_link_broken: false,
+            link_until: Time::ZERO,
         };
         self.members.insert(node, member);
         // Before the fact, so that GNCL knows the clock of a peer when it connects.
@@ -307,8 +310,10 @@ impl Core {
             return;
         };
         match fact {
-            LinkFact::LinkUp { .. } => member.is_link_broken = false,
-            LinkFact::LinkBroken { .. } => member.is_link_broken = true,
+            LinkFact::LinkUp { .. } => (member.is_link_broken, member.link_until) = (false, Time::MAX),
+            LinkFact::LinkBroken { .. } => {
+                (member.is_link_broken, member.link_until) = (true, now + LINK_GRACE);
+            }
             LinkFact::DialRefused { .. } if member.is_link_broken => {
                 self.lose(now, node, LossReason::ConnectionRefused);
             }

@@ -46,7 +46,7 @@ use self::{
 };
 use super::{
     MembershipFact, NodeEvent,
-    datagram::{Announcement, Answer},
+    datagram::{Announcement, Answer, FURTHER_MAX},
 };
 use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, refusals::Refusals, stores::ClockOffset};
 
@@ -169,6 +169,17 @@ struct Member {
     clock: PeerClock,
     /// Its connection ended and did not come back yet.
     is_link_broken: bool,
+    /// Until then its connection stands, or is being made again.
+    link_until: Time,
+}
+
+impl Member {
+    /// Whether it is to be counted as lost for its silence. One with several addresses may only be out of reach at the one where it
+    /// is asked; as long as its connection stands, it is there. // spec: NDL-4.1, NDL-4.5
+    fn is_silent(&self, now: Time, missed_max: u32) -> bool {
+        let has_another_way = !self.announcement.gncl_further.is_empty() && now < self.link_until;
+        self.missed >= missed_max && !has_another_way
+    }
 }
 
 /// Who is there.
@@ -229,6 +240,7 @@ impl Core {
             gncl_ip: 0,
             gncl_port: 0,
             period_us: u32::try_from(ndl.period.as_micros()).unwrap_or(u32::MAX),
+            gncl_further: Vec::new(),
         };
         Self {
             me,
@@ -256,6 +268,12 @@ impl Core {
             outputs: VecDeque::new(),
             refusals: Refusals::default(),
         }
+    }
+
+    /// GNCL listens at these addresses, too.
+    pub(crate) fn announce_further(&mut self, further: &[SocketAddrV4]) {
+        let further = further.iter().take(FURTHER_MAX);
+        self.me.gncl_further = further.map(|gncl| (gncl.ip().to_bits(), gncl.port())).collect();
     }
 
     /// A shell has bound its sockets: `udp` is our address for queries, `gncl` that of GNCL's listener. The first

@@ -3,4 +3,5 @@
 mod lives;
 mod properties;
 mod scenarios;
+mod several_addresses;
 mod world;

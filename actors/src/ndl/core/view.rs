@@ -21,8 +21,8 @@ pub struct KnownNode {
     pub incarnation: Incarnation,
     /// Where its NDL answers.
     pub udp: SocketAddr,
-    /// Where its GNCL listens.
-    pub gncl: SocketAddr,
+    /// Where its GNCL listens: the address that it prefers first.
+    pub gncl: Vec<SocketAddr>,
     /// Time between two of its queries.
     pub period: Duration,
     /// How it was found, and when in each way first.
@@ -45,7 +45,7 @@ impl Core {
             name: member.announcement.name.clone(),
             incarnation: member.announcement.incarnation,
             udp: member.address,
-            gncl: member.announcement.gncl().into(),
+            gncl: member.announcement.gncl_addresses(),
             period: Duration::from_micros(member.announcement.period_us.into()),
             sources: self.contacts.get(&member.address).map(|c| c.sources.clone()).unwrap_or_default(),
             heard: member.heard,

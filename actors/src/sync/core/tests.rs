@@ -410,7 +410,7 @@ fn groups_of_a_node_are_routed_until_it_is_lost() {
     let found = MembershipFact::NodeFound {
         node: KNEE,
         incarnation: LIFE,
-        gncl: SocketAddr::from(([127, 0, 0, 2], 1)),
+        gncl: vec![SocketAddr::from(([127, 0, 0, 2], 1))],
     };
     let groups = vec![AppAddress::group("drives")];
     let route = |groups: &[AppAddress]| Output::RouteGroups { node: KNEE, groups: groups.to_vec() };

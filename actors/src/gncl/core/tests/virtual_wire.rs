@@ -76,6 +76,8 @@ pub(super) struct World {
     posted: u64,
     random: u64,
     delay_max_us: u64,
+    /// Where each node is told that the other can be reached.
+    pub(super) addresses: Vec<SocketAddr>,
     story: String,
 }
 
@@ -98,6 +100,7 @@ impl World {
             posted: 0,
             random: seed,
             delay_max_us,
+            addresses: vec![address()],
             story: String::new(),
         }
     }
@@ -172,7 +175,8 @@ impl World {
     fn told_found(&mut self, node: usize, at: Time) {
         let other = 1 - node;
         let incarnation = Incarnation(self.nodes[other].incarnation);
-        let input = Input::NodeFound { node: ADDRESSES[other], incarnation, address: address() };
+        let addresses = self.addresses.clone();
+        let input = Input::NodeFound { node: ADDRESSES[other], incarnation, addresses };
         let life = self.nodes[node].life;
         self.post(at, Event::Input { node, life, input });
     }
@@ -261,7 +265,9 @@ impl World {
 
     fn obey(&mut self, node: usize, output: Output) {
         match output {
-            Output::Dial { connection, .. } => self.dial(node, connection),
+            Output::Dial { connection, address: to } if to == address() => self.dial(node, connection),
+            // Nobody answers there.
+            Output::Dial { .. } => {}
             Output::SendHello(connection, hello) => self.send(node, connection, Parcel::Hello(hello)),
             Output::Attach(attach) => {
                 if let Some(welcome) = attach.welcome {

@@ -32,6 +32,7 @@ pub(super) fn stranger(address: u32) -> Announcement {
         gncl_ip: 0x0a00_0001,
         gncl_port: 1,
         period_us: 500_000,
+        gncl_further: Vec::new(),
     }
 }
 
@@ -48,7 +49,7 @@ fn a_node_that_starts_is_known_within_a_millisecond_and_knows_the_others() {
     let found =
         NodeEvent::NodeFound { node: node(2), name: "node-2".to_owned(), incarnation: Incarnation(1) };
     assert_eq!(world.at(1).events, [found]);
-    let gncl = SocketAddr::from(([10, 0, 0, 1], 5_002));
+    let gncl = vec![SocketAddr::from(([10, 0, 0, 1], 5_002))];
     let fact = MembershipFact::NodeFound { node: node(2), incarnation: Incarnation(1), gncl };
     assert_eq!(world.at(1).facts, [fact]);
 }

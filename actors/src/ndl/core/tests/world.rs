@@ -53,6 +53,8 @@ pub(super) struct Spec {
     pub(super) nodes_max: usize,
     /// Its clock minus the world's.
     pub(super) clock_ns: i64,
+    /// Where its GNCL listens besides.
+    pub(super) further: Vec<SocketAddrV4>,
 }
 
 impl Spec {
@@ -65,6 +67,7 @@ impl Spec {
             multicast: true,
             nodes_max: 64,
             clock_ns: 0,
+            further: Vec::new(),
         }
     }
 
@@ -78,7 +81,9 @@ impl Spec {
             config.ndl.multicast = None;
         }
         let secret = u128::from(boot_nonce) << 3;
-        Core::new(&config, node(self.node), Incarnation(self.incarnation), boot_nonce, secret)
+        let mut core = Core::new(&config, node(self.node), Incarnation(self.incarnation), boot_nonce, secret);
+        core.announce_further(&self.further);
+        core
     }
 }
 

@@ -1,0 +1,148 @@
+//! Peers that announce several addresses.
+
+use super::*;
+use crate::gncl::core::dials::STAGGER;
+
+/// The n-th address of the peer.
+fn at(number: u16) -> SocketAddr {
+    SocketAddr::from(([127, 0, 0, 1], 7_000 + number))
+}
+
+/// A core that has found a peer with so many addresses.
+fn finding(count: u16) -> Core {
+    let mut core = core();
+    let addresses = (0..count).map(at).collect();
+    core.handle(millis(0), Input::NodeFound { node: HIGH, incarnation: Incarnation(1), addresses });
+    core
+}
+
+/// What is dialled in the core's orders.
+fn dialled(outputs: &[Output]) -> Vec<(ConnectionId, SocketAddr)> {
+    let dials = outputs.iter().filter_map(|output| {
+        let Output::Dial { connection, address } = output else { return None };
+        Some((*connection, *address))
+    });
+    dials.collect()
+}
+
+/// The one address that is dialled now.
+fn next_dial(core: &mut Core) -> (ConnectionId, SocketAddr) {
+    let outputs = outputs(core);
+    let [dial] = dialled(&outputs)[..] else { panic!("one address is dialled: {outputs:?}") };
+    dial
+}
+
+/// Lets time pass up to the core's next wake.
+fn wait(core: &mut Core) -> Time {
+    let at = core.next_wake().expect("it waits for something");
+    core.handle(at, Input::TimePassed);
+    at
+}
+
+fn welcome_for(hello: &Introduction) -> Introduction {
+    Introduction { dial: 0, lane: hello.lane, link: hello.link, ..hello_from(HIGH, 1, 0) }
+}
+
+fn hello_in(outputs: &[Output]) -> (ConnectionId, Introduction) {
+    let hello = outputs.iter().find_map(|output| {
+        let Output::SendHello(connection, hello) = output else { return None };
+        Some((*connection, hello.clone()))
+    });
+    hello.expect("a hello is sent")
+}
+
+fn has_refusal(outputs: &[Output]) -> bool {
+    outputs.contains(&Output::Fact(LinkFact::DialRefused { node: HIGH, incarnation: Incarnation(1) }))
+}
+
+#[test]
+fn the_addresses_of_a_peer_are_dialled_one_shortly_after_the_other_and_the_first_that_answers_stays() {
+    // Given
+    let mut core = finding(4);
+    let (first, to) = next_dial(&mut core);
+    assert_eq!(to, at(0));
+    assert_eq!(wait(&mut core), millis(0) + STAGGER);
+    let (second, to) = next_dial(&mut core);
+    assert_eq!(to, at(1));
+    let later = wait(&mut core);
+    let (third, to) = next_dial(&mut core);
+    assert_eq!(to, at(2));
+    // When
+    core.handle(later, Input::Connected(second));
+    // Then
+    let out = outputs(&mut core);
+    assert!(out.contains(&Output::Close(first)) && out.contains(&Output::Close(third)), "{out:?}");
+    let (connection, hello) = hello_in(&out);
+    assert_eq!((connection, dialled(&out)), (second, Vec::new()));
+    core.handle(later, Input::WelcomeReceived(second, welcome_for(&hello)));
+    let sides = dialled(&outputs(&mut core));
+    assert_eq!(
+        sides.iter().map(|(_, to)| *to).collect::<Vec<_>>(),
+        [at(1), at(1)],
+        "its sides go the same way"
+    );
+    // What was on its way from the others is nobody's.
+    core.handle(later, Input::Connected(first));
+    core.handle(later, Input::DialFailed { connection: third, refused: true });
+    assert_eq!(outputs(&mut core), []);
+}
+
+#[test]
+fn an_address_that_fails_has_the_next_one_dialled_at_once_and_a_refusal_is_told_only_if_all_refuse() {
+    for (refusals, is_told) in [([true, true, true], true), ([true, false, true], false)] {
+        let mut core = finding(3);
+        for (number, refused) in refusals.into_iter().enumerate() {
+            let out = outputs(&mut core);
+            assert!(!has_refusal(&out), "not before the last one has");
+            let [(connection, to)] = dialled(&out)[..] else { panic!("one is dialled: {out:?}") };
+            assert_eq!(to, at(number as u16));
+            core.handle(millis(1), Input::DialFailed { connection, refused });
+        }
+        assert_eq!(has_refusal(&outputs(&mut core)), is_told);
+        let again = wait(&mut core);
+        assert!(again >= millis(9) && again < millis(14), "{again:?}");
+        assert_eq!(next_dial(&mut core).1, at(0), "the preferred one comes first again");
+    }
+}
+
+#[test]
+fn one_that_is_reached_and_says_nothing_has_the_next_one_dialled_first() {
+    let mut core = finding(2);
+    let (first, _) = next_dial(&mut core);
+    core.handle(millis(0), Input::Connected(first));
+    outputs(&mut core);
+    let over = wait(&mut core);
+    assert_eq!(over, millis(2_000), "the handshake's time");
+    core.handle(over, Input::Ended(first));
+    outputs(&mut core);
+    wait(&mut core);
+    assert_eq!(next_dial(&mut core).1, at(1));
+}
+
+#[test]
+fn a_link_that_breaks_is_dialled_again_at_all_addresses() {
+    let mut core = finding(2);
+    let (first, _) = next_dial(&mut core);
+    core.handle(millis(0), Input::Connected(first));
+    let (_, hello) = hello_in(&outputs(&mut core));
+    core.handle(millis(0), Input::WelcomeReceived(first, welcome_for(&hello)));
+    outputs(&mut core);
+    core.handle(millis(1), Input::Ended(first));
+    outputs(&mut core);
+    wait(&mut core);
+    assert_eq!(next_dial(&mut core).1, at(0));
+    wait(&mut core);
+    assert_eq!(next_dial(&mut core).1, at(1));
+}
+
+#[test]
+fn a_node_that_is_lost_has_none_of_its_addresses_dialled_any_more() {
+    let mut core = finding(3);
+    let (first, _) = next_dial(&mut core);
+    wait(&mut core);
+    let (second, _) = next_dial(&mut core);
+    core.handle(millis(30), Input::NodeLost { node: HIGH, incarnation: Incarnation(1) });
+    let out = outputs(&mut core);
+    assert!(out.contains(&Output::Close(first)) && out.contains(&Output::Close(second)), "{out:?}");
+    assert_eq!(core.next_wake(), None);
+}

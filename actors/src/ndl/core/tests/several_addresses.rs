@@ -1,0 +1,66 @@
+//! Nodes whose GNCL listens at several addresses. spec: NDL-4.5
+
+use std::net::{Ipv4Addr, SocketAddrV4};
+
+use sinew_runtime::tid::Incarnation;
+
+use super::world::{PERIOD, Spec, World, ms, node};
+use crate::{
+    gncl::LinkFact,
+    ndl::{LossReason, MembershipFact},
+};
+
+const FURTHER: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 1, 0, 1), 6_000);
+
+/// Two nodes that know each other; the second has another address.
+fn two() -> World {
+    let mut world = World::new();
+    world.start(1, &Spec::of(1));
+    world.start(2, &Spec { further: vec![FURTHER], ..Spec::of(2) });
+    world.run_until(ms(1), |world| world.knows(1, 2) && world.knows(2, 1));
+    world
+}
+
+fn up() -> LinkFact {
+    LinkFact::LinkUp { node: node(2), incarnation: Incarnation(1) }
+}
+
+fn broken() -> LinkFact {
+    LinkFact::LinkBroken { node: node(2), incarnation: Incarnation(1) }
+}
+
+#[test]
+fn all_addresses_of_a_node_are_told_with_the_preferred_one_first() {
+    let world = two();
+    let [MembershipFact::NodeFound { gncl, .. }] = &world.at(1).facts[..] else {
+        panic!("one node is found: {:?}", world.at(1).facts)
+    };
+    assert_eq!(gncl[..], [([10, 0, 0, 1], 5_002).into(), FURTHER.into()]);
+    assert_eq!(world.at(1).core.members(world.now)[0].gncl, *gncl);
+}
+
+#[test]
+fn a_silent_node_with_another_address_is_there_as_long_as_its_link_stands_or_is_made_again() {
+    let mut world = two();
+    world.link(1, up());
+    world.kill(2);
+    world.run(PERIOD * 8);
+    assert_eq!(world.losses(1), []);
+    world.link(1, broken());
+    world.run(ms(900));
+    assert_eq!(world.losses(1), []);
+    world.link(1, up());
+    world.run(PERIOD * 8);
+    assert_eq!(world.losses(1), [], "it is back over the other address");
+    world.link(1, broken());
+    world.run(ms(1_000) + PERIOD);
+    assert_eq!(world.losses(1), [(2, LossReason::Silent)]);
+}
+
+#[test]
+fn a_silent_node_with_another_address_and_no_link_is_lost_like_any_other() {
+    let mut world = two();
+    world.kill(2);
+    world.run(PERIOD * 4);
+    assert_eq!(world.losses(1), [(2, LossReason::Silent)]);
+}
