@@ -1,6 +1,8 @@
 //! The shell: sockets and timers for the core's orders, events for what they do.
 
 mod leaving;
+#[cfg(target_os = "linux")]
+mod lost_addresses;
 
 use std::{
     cell::RefCell,
@@ -401,6 +403,8 @@ impl Actor for Gncl {
         for listener in listeners {
             ctx.add_stream(listener::accepted(listener, self.stores.config.gncl.give_up));
         }
+        #[cfg(target_os = "linux")]
+        self.watch_interfaces(ctx);
         ctx.add_stream(self.stores.posts.gncl.attach_keeping(Clone::clone));
         ctx.spawn(fut::wrap_future(Store::serve_those_held_up(self.stores.clone())));
         let spin = self.spin.clone();

@@ -14,7 +14,7 @@
 //! | GNCL-6 | Dials are numbered; a WELCOME voids its sender's dials so far, and a void HELLO is refused. |
 //! | GNCL-7 | A newer incarnation ends all that belongs to the older; an older one is refused. |
 //! | GNCL-8 | After a break both dial again: waits double from `redial_min` to `redial_max`, 20 % jitter, until NodeLost; from the least again once messages pass. |
-//! | GNCL-9 | A link on which nothing comes is pinged every second; after 3 unanswered pings it is broken. |
+//! | GNCL-9 | A link on which nothing comes is pinged every second; after 3 unanswered pings it is broken. One whose own address is lost is so at once. |
 //! | GNCL-10 | GOODBYE is the last frame of a node that leaves, behind all that waits; it is not dialled again until it is found again. |
 //! | GNCL-11 | A frame's source must be on the peer's node and its destination on this one; times are turned into our clock. |
 //! | GNCL-12 | CONFIRM is answered by OUTCOME on the peer's present connection. |
@@ -33,6 +33,7 @@
 //! | `bulk.rs` | the thread of those of Bulk |
 //! | `arrivals.rs` | what became of what came, counted |
 //! | `inbound.rs` | what is checked before a frame becomes a message of this node |
+//! | `interfaces.rs` | which of this host's addresses are lost, as the kernel says |
 //! | `spin.rs` | how long the IO thread looks before it sleeps |
 //! | `marks.rs` | what the network is told about a class |
 //! | `listener.rs` | the accepting socket |
@@ -44,6 +45,8 @@ mod bulk;
 mod core;
 mod facts;
 mod inbound;
+#[cfg(target_os = "linux")]
+mod interfaces;
 mod link;
 mod listener;
 mod marks;

@@ -1,8 +1,8 @@
 //! A node for the scenarios: one application that sends, and says what it sees, one line each.
 //!
-//! `node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--will NAME]...`
+//! `node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--will NAME]... [--logs]`
 //!
-//! A will is a count of 1,000,000.
+//! A will is a count of 1,000,000. What it logs goes to its standard error, with `--logs` to its output.
 
 use std::process::ExitCode;
 
@@ -62,11 +62,15 @@ impl Handler<Delivery<RequirementEvent>> for Probe {
 }
 
 fn main() -> ExitCode {
-    tracing_subscriber::fmt()
-        .with_env_filter(tracing_subscriber::EnvFilter::from_default_env())
-        .with_writer(std::io::stderr)
-        .init();
     let arguments: Vec<String> = std::env::args().skip(1).collect();
+    if arguments.iter().any(|argument| argument == "--logs") {
+        tracing_subscriber::fmt().with_max_level(tracing::Level::WARN).init();
+    } else {
+        tracing_subscriber::fmt()
+            .with_env_filter(tracing_subscriber::EnvFilter::from_default_env())
+            .with_writer(std::io::stderr)
+            .init();
+    }
     let after = |flag: &str| {
         let pairs = arguments.windows(2).filter(|pair| pair[0] == flag);
         pairs.map(|pair| pair[1].clone()).collect::<Vec<_>>()

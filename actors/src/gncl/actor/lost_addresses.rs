@@ -1,0 +1,44 @@
+//! Connections over an address that this host has lost: cut at once, and made again at whichever address there is.
+
+use actix::{AsyncContext, Context, StreamHandler};
+use sinew_runtime::time::Time;
+
+use super::Gncl;
+use crate::gncl::{
+    core::ConnectionId,
+    interfaces::{self, AddressLost},
+};
+
+impl Gncl {
+    /// Has the kernel say which addresses are lost. Where it does not, they are found out by what is not answered.
+    pub(super) fn watch_interfaces(&self, ctx: &mut Context<Self>) {
+        match interfaces::lost() {
+            Ok(lost) => drop(ctx.add_stream(lost)),
+            Err(error) => self.stores.gncl.refusals.count(Time::now(), "interfaces not watched", &error),
+        }
+    }
+
+    /// Connections that are bound to this address.
+    fn connections_at(&self, AddressLost(lost): AddressLost) -> Vec<ConnectionId> {
+        let is_there = |wire: &super::Wire| {
+            let local = wire.socket.as_ref().and_then(|socket| socket.local_addr().ok());
+            local.is_some_and(|local| local.ip() == lost)
+        };
+        self.wires.iter().filter(|(_, wire)| is_there(wire)).map(|(connection, _)| *connection).collect()
+    }
+}
+
+impl StreamHandler<AddressLost> for Gncl {
+    // spec: GNCL-9
+    fn handle(&mut self, lost: AddressLost, ctx: &mut Context<Self>) {
+        for connection in self.connections_at(lost) {
+            let detail =
+                format!("{} is gone, or its interface is down; what went over it goes another way", lost.0);
+            self.stores.gncl.refusals.count(Time::now(), "address lost", &detail);
+            self.ended(connection, ctx);
+        }
+    }
+
+    /// The kernel's silence is not this layer's end.
+    fn finished(&mut self, _: &mut Context<Self>) {}
+}

@@ -1,0 +1,293 @@
+//! Which of this host's addresses are lost, because their interface went down or they were taken away: the kernel says so (rtnetlink).
+//!
+//! A connection does not notice it by itself: what it writes waits for an interface to come back.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    io,
+    net::Ipv4Addr,
+    os::fd::OwnedFd,
+};
+
+use futures_util::{Stream, stream};
+use rustix::net::{
+    AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, bind, netlink::SocketAddrNetlink, recv,
+    send, socket_with,
+};
+use tokio::io::unix::AsyncFd;
+
+/// An address that is of no use any more to those that are bound to it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct AddressLost(pub(super) Ipv4Addr);
+
+/// Addresses that are known at most. One more is found to be lost by what is not answered, as everywhere but on Linux.
+const ADDRESSES_MAX: usize = 1_024;
+/// More than the kernel says at once.
+const BUFFER_LEN: usize = 32 << 10;
+
+/// Kinds of messages, and the parts of them that are looked at: `linux/rtnetlink.h`, `linux/if_link.h`, `linux/if_addr.h`.
+const NEW_LINK: u16 = 16;
+const GONE_LINK: u16 = 17;
+const NEW_ADDRESS: u16 = 20;
+const GONE_ADDRESS: u16 = 21;
+const GET_ADDRESSES: u16 = 22;
+const HEADER_LEN: usize = 16;
+/// An interface's index is in the same place of both bodies; its flags follow it, and an address's attributes.
+const INDEX_AT: usize = HEADER_LEN + 4;
+const FLAGS_AT: usize = HEADER_LEN + 8;
+const ATTRIBUTES_AT: usize = HEADER_LEN + 8;
+/// `IFF_UP | IFF_RUNNING`: wanted up, and able to carry packets.
+const UP: u32 = 0x41;
+/// `IFA_LOCAL`, `IFA_ADDRESS`: where there is a peer, the second is the peer's.
+const LOCAL: u16 = 2;
+const ADDRESS: u16 = 1;
+const IPV4: u8 = 2;
+/// `RTMGRP_LINK | RTMGRP_IPV4_IFADDR`.
+const GROUPS: u32 = 0x11;
+/// `NLM_F_REQUEST | NLM_F_DUMP`.
+const DUMP: u16 = 0x301;
+
+/// The addresses of this host, by the index of their interface.
+#[derive(Debug, Default)]
+struct Interfaces(BTreeMap<u32, BTreeSet<Ipv4Addr>>);
+
+impl Interfaces {
+    /// Takes in what the kernel says; returns the addresses that are lost with it.
+    fn hear(&mut self, mut said: &[u8]) -> Vec<Ipv4Addr> {
+        let mut lost = Vec::new();
+        while let Some((message, rest)) = first_of(said) {
+            lost.extend(self.hear_one(message).unwrap_or_default());
+            said = rest;
+        }
+        lost
+    }
+
+    /// `None`: it is about something else, or too short.
+    fn hear_one(&mut self, message: &[u8]) -> Option<Vec<Ipv4Addr>> {
+        let kind = u16::from_ne_bytes(field(message, 4)?);
+        let index = u32::from_ne_bytes(field(message, INDEX_AT)?);
+        match kind {
+            NEW_LINK if u32::from_ne_bytes(field(message, FLAGS_AT)?) & UP != UP => {
+                // It may have them again as soon as it is up: they are not forgotten.
+                Some(self.0.get(&index)?.iter().copied().collect())
+            }
+            GONE_LINK => Some(self.0.remove(&index)?.into_iter().collect()),
+            NEW_ADDRESS => {
+                let address = address_in(message)?;
+                if self.0.values().map(BTreeSet::len).sum::<usize>() < ADDRESSES_MAX {
+                    self.0.entry(index).or_default().insert(address);
+                }
+                None
+            }
+            GONE_ADDRESS => {
+                let address = address_in(message)?;
+                let addresses = self.0.get_mut(&index)?;
+                addresses.remove(&address);
+                if addresses.is_empty() {
+                    self.0.remove(&index);
+                }
+                Some(vec![address])
+            }
+            _ => None,
+        }
+    }
+}
+
+/// The first message, and what is behind it.
+fn first_of(said: &[u8]) -> Option<(&[u8], &[u8])> {
+    let length = u32::from_ne_bytes(field(said, 0)?) as usize;
+    if length < HEADER_LEN {
+        return None;
+    }
+    let message = said.get(..length)?;
+    Some((message, said.get(length.next_multiple_of(4)..).unwrap_or_default()))
+}
+
+fn address_in(message: &[u8]) -> Option<Ipv4Addr> {
+    if *message.get(HEADER_LEN)? != IPV4 {
+        return None;
+    }
+    let mut attributes = message.get(ATTRIBUTES_AT..)?;
+    let (mut local, mut address) = (None, None);
+    while let Some(length) = field(attributes, 0).map(u16::from_ne_bytes).filter(|length| *length >= 4) {
+        let value = field(attributes, 4).map(Ipv4Addr::from);
+        match u16::from_ne_bytes(field(attributes, 2)?) {
+            LOCAL => local = value,
+            ADDRESS => address = value,
+            _ => {}
+        }
+        attributes = attributes.get(usize::from(length).next_multiple_of(4)..).unwrap_or_default();
+    }
+    local.or(address)
+}
+
+fn field<const N: usize>(bytes: &[u8], at: usize) -> Option<[u8; N]> {
+    bytes.get(at..at + N)?.try_into().ok()
+}
+
+/// Asks for all addresses that there are.
+fn request() -> [u8; 24] {
+    let mut bytes = [0; 24];
+    bytes[..4].copy_from_slice(&24_u32.to_ne_bytes());
+    bytes[4..6].copy_from_slice(&GET_ADDRESSES.to_ne_bytes());
+    bytes[6..8].copy_from_slice(&DUMP.to_ne_bytes());
+    bytes[HEADER_LEN] = IPV4;
+    bytes
+}
+
+/// Every address that is lost from now on.
+///
+/// # Errors
+/// The kernel says nothing to this process; then what is lost is found out by what is not answered.
+pub(super) fn lost() -> io::Result<impl Stream<Item = AddressLost>> {
+    let watch = Watch::begin()?;
+    Ok(stream::unfold((watch, Vec::new()), async |(mut watch, mut lost)| {
+        while lost.is_empty() {
+            lost = watch
+                .hear()
+                .await
+                .inspect_err(|error| {
+                    crate::log::warn!(%error, "the kernel does not say any more which interfaces go down");
+                })
+                .ok()?;
+        }
+        lost.pop().map(|address| (AddressLost(address), (watch, lost)))
+    }))
+}
+
+/// What the kernel says, and what is known from it.
+struct Watch {
+    socket: AsyncFd<OwnedFd>,
+    interfaces: Interfaces,
+    buffer: Vec<u8>,
+}
+
+impl Watch {
+    fn begin() -> io::Result<Self> {
+        let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
+        let socket = socket_with(AddressFamily::NETLINK, SocketType::RAW, flags, None)?;
+        bind(&socket, &SocketAddrNetlink::new(0, GROUPS))?;
+        send(&socket, &request(), SendFlags::empty())?;
+        #[expect(
+            deprecated,
+            reason = "sound for an OwnedFd, which keeps its descriptor; its successor is an unsafe fn, and unsafe code lives in sinew-shm alone"
+        )]
+        let socket = AsyncFd::new(socket)?;
+        Ok(Self { socket, interfaces: Interfaces::default(), buffer: vec![0; BUFFER_LEN] })
+    }
+
+    /// Waits for the kernel's next words; returns what is lost with them.
+    async fn hear(&mut self) -> io::Result<Vec<Ipv4Addr>> {
+        loop {
+            let mut ready = self.socket.readable().await?;
+            let buffer = &mut self.buffer;
+            let read =
+                ready.try_io(|socket| Ok(recv(socket.get_ref(), &mut buffer[..], RecvFlags::empty())?.0));
+            match read {
+                Ok(Ok(length)) => return Ok(self.interfaces.hear(&self.buffer[..length.min(BUFFER_LEN)])),
+                // More was said than there is room for: some of it is not known. What there is now is asked for again.
+                Ok(Err(error)) if error.raw_os_error() == Some(rustix::io::Errno::NOBUFS.raw_os_error()) => {
+                    send(self.socket.get_ref(), &request(), SendFlags::empty())?;
+                }
+                Ok(Err(error)) if error.kind() == io::ErrorKind::Interrupted => {}
+                Ok(Err(error)) => return Err(error),
+                Err(_would_block) => {}
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const ETH0: u32 = 2;
+    const OURS: Ipv4Addr = Ipv4Addr::new(10, 77, 0, 1);
+    const OTHER: Ipv4Addr = Ipv4Addr::new(10, 77, 0, 9);
+
+    fn message(kind: u16, body: &[u8]) -> Vec<u8> {
+        let mut bytes = vec![0; HEADER_LEN];
+        bytes[..4].copy_from_slice(&((HEADER_LEN + body.len()) as u32).to_ne_bytes());
+        bytes[4..6].copy_from_slice(&kind.to_ne_bytes());
+        bytes.extend(body);
+        bytes
+    }
+
+    fn link(kind: u16, index: u32, flags: u32) -> Vec<u8> {
+        let words = [0, index, flags, 0].map(u32::to_ne_bytes);
+        message(kind, words.as_flattened())
+    }
+
+    /// As the kernel says it of an address with a peer: the peer's first.
+    fn address(kind: u16, index: u32, address: Ipv4Addr) -> Vec<u8> {
+        let mut body = vec![IPV4, 24, 0, 0];
+        body.extend(index.to_ne_bytes());
+        for (attribute, value) in [(ADDRESS, OTHER), (LOCAL, address)] {
+            body.extend(8_u16.to_ne_bytes());
+            body.extend(attribute.to_ne_bytes());
+            body.extend(value.octets());
+        }
+        message(kind, &body)
+    }
+
+    #[test]
+    fn the_addresses_of_an_interface_that_goes_down_are_lost_each_time_and_no_others() {
+        let mut interfaces = Interfaces::default();
+        let said = [address(NEW_ADDRESS, ETH0, OURS), address(NEW_ADDRESS, 3, OTHER)].concat();
+        assert!(interfaces.hear(&said).is_empty());
+        for _ in 0..2 {
+            assert!(interfaces.hear(&link(NEW_LINK, ETH0, UP | 0x1000)).is_empty());
+            assert_eq!(interfaces.hear(&link(NEW_LINK, ETH0, 0x1001)), [OURS], "it cannot carry packets");
+        }
+        assert_eq!(interfaces.hear(&link(GONE_LINK, ETH0, UP)), [OURS]);
+        assert!(interfaces.hear(&link(GONE_LINK, ETH0, UP)).is_empty());
+    }
+
+    #[test]
+    fn an_address_that_is_taken_away_is_lost() {
+        let mut interfaces = Interfaces::default();
+        interfaces.hear(&address(NEW_ADDRESS, ETH0, OURS));
+        assert_eq!(interfaces.hear(&address(GONE_ADDRESS, ETH0, OURS)), [OURS]);
+        assert!(interfaces.hear(&link(NEW_LINK, ETH0, 0)).is_empty());
+    }
+
+    #[test]
+    fn more_addresses_than_are_kept_are_not_known() {
+        let mut interfaces = Interfaces::default();
+        for number in 0..2 * ADDRESSES_MAX as u32 {
+            interfaces.hear(&address(NEW_ADDRESS, ETH0, Ipv4Addr::from(number)));
+        }
+        assert_eq!(interfaces.hear(&link(NEW_LINK, ETH0, 0)).len(), ADDRESSES_MAX);
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes_are_survived(bytes: Vec<u8>, cut in 0usize..60, word in 0usize..60, value: u8) {
+            let mut interfaces = Interfaces::default();
+            interfaces.hear(&bytes);
+            let mut said = address(NEW_ADDRESS, ETH0, OURS);
+            said.truncate(cut);
+            if let Some(byte) = said.get_mut(word) {
+                *byte = value;
+            }
+            interfaces.hear(&said);
+        }
+    }
+
+    #[tokio::test(flavor = "current_thread")]
+    async fn the_kernel_says_which_addresses_there_are() {
+        let mut watch = Watch::begin().expect("any process may listen");
+        let known = async {
+            while !watch.interfaces.0.values().flatten().any(|address| *address == Ipv4Addr::LOCALHOST) {
+                watch.hear().await.expect("the kernel speaks");
+            }
+        };
+        tokio::time::timeout(Duration::from_secs(10), known)
+            .await
+            .expect("the loopback address is told within 10 s");
+    }
+}
