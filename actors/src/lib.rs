@@ -68,7 +68,10 @@ pub use node::{
 pub use outlet::OutletCounts;
 pub use serde;
 pub use sinew_runtime::{
-    app::{AppContext, AppSpec, Away, Delivery, LastWill, Raw, RequirementEvent, RequirementPolicy, Silence},
+    app::{
+        AppContext, AppSpec, Away, Delivery, LastWill, Raw, RequirementEvent, RequirementPolicy, Silence,
+        Told,
+    },
     monitor::{Down, DownClass, MonitorError, MonitorId},
     outcome::{Outcome, Rejection},
     schedule::{Tick, TimerId},
@@ -91,7 +94,8 @@ pub mod prelude {
     pub use crate::{
         AppAddress, AppContext, AppSpec, AutoShutdown, Away, Class, Delivery, Down, LastWill, Node,
         NodeAddress, NodeBuilder, NodeConfig, NodeEvent, Outcome, Payload, Place, RequirementEvent,
-        RequirementPolicy, Restart, Silence, StartError, Strategy, SupervisorSpec, Tick, Tid, Time, payload,
+        RequirementPolicy, Restart, Silence, StartError, Strategy, SupervisorSpec, Tick, Tid, Time, Told,
+        payload,
     };
 }
 

@@ -15,7 +15,7 @@ use std::{
 use actix::{Actor, ActorContext, AsyncContext, Handler, Running, fut::WrapFuture};
 use serde::{Deserialize, Serialize};
 use sinew_runtime::{
-    app::{AppContext, AppSpec, AppWiring, Delivery, DynApp},
+    app::{AppContext, AppSpec, AppWiring, Delivery, DynApp, Told},
     mailbox::Mailbox,
     outcome::{Outcome, Rejection},
     pending::{AppOutlet, Pending},
@@ -211,6 +211,47 @@ fn every_confirmed_send_ends_in_one_outcome_and_requests_get_their_reply() {
     let told: Vec<_> = (0..4).map(|_| told.recv_timeout(DEADLINE).expect("an outcome")).collect();
     assert_eq!(told, ["Delivered", "Failed", "Rejected(ByHandler)", "42"]);
     bench.stop();
+}
+
+/// Sends three numbers to each of two, and writes down what it is told of them.
+struct Clerk {
+    to: [Tid; 2],
+    written: SyncSender<(u64, Outcome)>,
+}
+
+impl Actor for Clerk {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        for (tag, number) in [7, 13, 99].into_iter().enumerate() {
+            context.send_told(self.to[0], &Number(number), DEADLINE, tag as u64).unwrap();
+        }
+        let nobody = context.send_told(self.to[1], &Number(1), DEADLINE, 3);
+        assert!(nobody.is_err(), "nobody takes it, and nobody tells of it");
+    }
+}
+
+impl Handler<Told> for Clerk {
+    type Result = ();
+
+    fn handle(&mut self, told: Told, _: &mut Self::Context) {
+        self.written.send((told.tag, told.outcome)).unwrap();
+    }
+}
+
+#[test]
+fn outcomes_come_as_messages_once_each_to_who_wants_them_so() {
+    let (spec, _read) = scribe();
+    let (written, told) = sync_channel(10);
+    let to = [0, 7].map(|app| Tid::new(NODE, AppAddress::fixed(app).unwrap()));
+    let clerk = AppSpec::new("clerk", move || Clerk { to, written: written.clone() });
+    let bench = Bench::start(vec![spec.into(), clerk.into()]);
+    let mut seen: Vec<_> = (0..3).map(|_| told.recv_timeout(DEADLINE).expect("an outcome")).collect();
+    seen.sort_by_key(|(tag, _)| *tag);
+    let outcomes = [Outcome::Delivered, Outcome::Failed, Outcome::Rejected(Rejection::ByHandler)];
+    assert_eq!(seen, [(0, outcomes[0]), (1, outcomes[1]), (2, outcomes[2])]);
+    bench.stop();
+    assert!(told.try_recv().is_err(), "each is told once");
 }
 
 /// Ticks each millisecond, and waits for numbers that stay away.

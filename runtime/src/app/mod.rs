@@ -12,9 +12,11 @@ mod delivery;
 mod drive;
 mod requirement;
 mod spec;
+mod told;
 
 pub use away::{Absence, Away, Heir, LastWill, WILLS_MAX, Will};
 pub use context::{AppContext, Silence, WatchId};
 pub use delivery::{Delivery, Raw};
 pub use requirement::{RequirementEvent, RequirementPolicy};
 pub use spec::{AppSpec, AppWiring, DynApp};
+pub use told::Told;
