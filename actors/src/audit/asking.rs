@@ -28,6 +28,8 @@ use crate::stores::{Stores, lock};
 const OPEN_MAX: usize = 16;
 /// A node is answered so often at most in [`PERIOD`], which an audit asks twice; further questions are refused, and counted.
 const ANSWERS_MAX: u32 = 16;
+/// All of them together so often: the thread that answers has Control to carry.
+const ANSWERS_ALL_MAX: u32 = 64;
 const PERIOD: Duration = Duration::from_secs(1);
 /// Of a node whose longest payload is shorter than an answer: it is tried with half so many bytes, down to this.
 const ANSWER_BYTES_MIN: usize = 1 << 10;
@@ -41,7 +43,7 @@ struct Open {
     /// Number of the last question.
     last: u64,
     open: BTreeMap<u64, Question>,
-    /// Who asked lately: since when, and how often. Of each node that is linked one at most.
+    /// Who asked lately: since when, and how often it was answered. Of each node that is linked one at most.
     askers: BTreeMap<NodeAddress, (Time, u32)>,
 }
 
@@ -87,9 +89,11 @@ impl Questions {
     fn admits(&self, asker: NodeAddress, now: Time) -> bool {
         let askers = &mut lock(&self.0).askers;
         askers.retain(|_, (since, _)| now.since(*since) < PERIOD);
-        let (_, asked) = askers.entry(asker).or_insert((now, 0));
-        *asked = asked.saturating_add(1);
-        *asked <= ANSWERS_MAX
+        let answered: u32 = askers.values().map(|(_, answered)| answered).sum();
+        let (_, theirs) = askers.entry(asker).or_insert((now, 0));
+        let is_answered = *theirs < ANSWERS_MAX && answered < ANSWERS_ALL_MAX;
+        *theirs += u32::from(is_answered);
+        is_answered
     }
 }
 
@@ -153,7 +157,9 @@ pub(crate) fn receive(stores: &Stores, from: NodeAddress, message: &Message) -> 
 
 fn answer(stores: &Stores, to: NodeAddress, number: u64) -> Result<(), String> {
     if !stores.questions.admits(to, Time::now()) {
-        return Err(format!("from {to}, more than {ANSWERS_MAX} questions for an audit in {PERIOD:?}"));
+        return Err(format!(
+            "from {to}, more than {ANSWERS_MAX} questions for an audit in {PERIOD:?}, or of all more than {ANSWERS_ALL_MAX}"
+        ));
     }
     let (audit, mut bytes_max) = (reading::read(stores), stores.config.payload_max);
     loop {
@@ -203,6 +209,15 @@ mod tests {
         assert!((0..ANSWERS_MAX).all(|_| questions.admits(OTHER, begin)));
         assert!(!questions.admits(OTHER, begin));
         assert!(questions.admits(NodeAddress::new(3), begin), "others are");
+        assert!(questions.admits(OTHER, begin + PERIOD));
+    }
+
+    #[test]
+    fn all_together_are_answered_so_often_and_no_more_until_a_second_is_over() {
+        let questions = Questions::default();
+        let begin = Time::ZERO + PERIOD;
+        let asked = (0..1_000).map(|asker| questions.admits(NodeAddress::new(asker), begin));
+        assert_eq!(asked.filter(|is_answered| *is_answered).count(), ANSWERS_ALL_MAX as usize);
         assert!(questions.admits(OTHER, begin + PERIOD));
     }
 

@@ -29,7 +29,7 @@ impl NodeHandle {
     /// answered; half of it for the first answers. Not for an actor's handler, which it would hold up: for a thread of its own.
     ///
     /// It costs each node what [`audit_here`](Self::audit_here) costs, twice, and two messages of class Bulk. A node answers 8 audits
-    /// a second of each other one.
+    /// a second of each other one, and 32 of all together.
     ///
     /// # Errors
     /// The node does not run, or too many threads are at it already.
