@@ -22,7 +22,7 @@ fn an_application_in_a_process_of_its_own_answers_from_there() {
 fn a_killed_process_is_replaced_and_the_messages_behind_are_kept_in_order() {
     let mut scenario = Scenario::start(&[]);
     let first = scenario.who();
-    scenario.order(Order::Hold(500));
+    scenario.order(Order::Hold(60_000));
     scenario.node.wait_for(&["holds"]);
     (1..=200).for_each(|number| scenario.count(number));
     signal(first.pid, Signal::KILL);
@@ -37,7 +37,7 @@ fn a_killed_process_is_replaced_and_the_messages_behind_are_kept_in_order() {
 fn an_audit_knows_what_is_lent_to_a_process_and_what_fails_when_it_is_killed() {
     let mut scenario = Scenario::start(&["--audits"]);
     let first = scenario.who();
-    scenario.order(Order::Hold(500));
+    scenario.order(Order::Hold(60_000));
     scenario.node.wait_for(&["holds"]);
     (1..=20).for_each(|number| scenario.count(number));
     // The order that is in its hand, and those behind it, wherever they wait.
