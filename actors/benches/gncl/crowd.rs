@@ -1,7 +1,7 @@
 //! The paper's Table 2: every node sends to every other one, 1000 bytes, and gets them back.
 //!
 //! The rate of all nodes together is the same however many they are, so that what a message costs can be compared: the time
-//! that all their processes had a CPU, by the messages that arrived, there and back.
+//! that all their processes had a CPU, by the messages that arrived, there and back. A rate of nothing shows what nodes take that have nothing to do.
 
 use std::{
     net::Ipv4Addr,
@@ -14,19 +14,27 @@ use serde::{Deserialize, Serialize};
 use sinew::prelude::*;
 use sinew_figures::{
     Alone, Figures,
-    process::{Process, await_end, say_there},
+    process::{self, Process, await_end, say_there},
 };
 
 use crate::{nodes::At, ping::DEADLINE};
 
+/// How they are connected.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum By {
+    Nodes,
+    /// Bare TCP: [`crowd_raw`](crate::crowd_raw).
+    Tcp,
+}
+
 /// How many nodes there are.
 pub(crate) const SIZES: [usize; 3] = [3, 8, 16];
 /// Round trips of all nodes together, a second.
-const RATE: u64 = 2_000;
+pub(crate) const RATE: u64 = 2_000;
 /// Bytes of a packet.
-const PACKET: usize = 1000;
+pub(crate) const PACKET: usize = 1000;
 /// Until connections stand and buffers are warm.
-const WARM_UP: Duration = Duration::from_secs(2);
+pub(crate) const WARM_UP: Duration = Duration::from_secs(2);
 /// The paper's own mean there and back between three Raspberry Pis, in nanoseconds.
 const PAPER_MEAN_NS: u64 = 552_600;
 
@@ -54,18 +62,54 @@ impl Payload for Back {
     const NAME: &'static str = "gncl.back";
 }
 
-/// What one node has seen.
-struct Seen {
+/// What one of them is to do.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Share {
+    pub(crate) index: usize,
+    pub(crate) count: usize,
+    pub(crate) seconds: u64,
+    /// Round trips of all together, a second.
+    pub(crate) rate: u64,
+}
+
+impl Share {
+    /// From one of its own to the next.
+    pub(crate) fn period(self) -> Option<Duration> {
+        (self.count as u64 * 1_000_000_000).checked_div(self.rate).map(Duration::from_nanos)
+    }
+}
+
+/// What one of them has seen.
+pub(crate) struct Seen {
     figures: Figures,
     total_ns: u64,
     /// Of its process, while the others were counted.
     cpu: Duration,
+    /// How often a thread of its process went to sleep meanwhile.
+    sleeps: u64,
+}
+
+impl Seen {
+    pub(crate) fn begin() -> Self {
+        Self { figures: Figures::new(), total_ns: 0, cpu: cpu_time(), sleeps: process::sleeps() }
+    }
+
+    pub(crate) fn record(&mut self, took_ns: u64) {
+        self.figures.record(Duration::from_nanos(took_ns));
+        self.total_ns += took_ns;
+    }
+
+    pub(crate) fn end(mut self) -> Self {
+        self.cpu = cpu_time().saturating_sub(self.cpu);
+        self.sleeps = process::sleeps().saturating_sub(self.sleeps);
+        self
+    }
 }
 
 struct Member {
     others: Vec<String>,
     next: usize,
-    period: Duration,
+    period: Option<Duration>,
     measured: Duration,
     clock: Instant,
     seen: Option<Seen>,
@@ -76,8 +120,9 @@ impl Actor for Member {
     type Context = AppContext<Self>;
 
     fn started(&mut self, context: &mut Self::Context) {
-        context
-            .every(self.period, |member: &mut Self, _, context: &mut AppContext<Self>| member.ask(context));
+        if let Some(period) = self.period {
+            context.every(period, |member: &mut Self, _, context: &mut AppContext<Self>| member.ask(context));
+        }
         context.after(WARM_UP, |member: &mut Self, _, _| member.begin());
         context.after(WARM_UP + self.measured, |member: &mut Self, _, _| member.end());
     }
@@ -92,13 +137,12 @@ impl Member {
     }
 
     fn begin(&mut self) {
-        self.seen = Some(Seen { figures: Figures::new(), total_ns: 0, cpu: cpu_time() });
+        self.seen = Some(Seen::begin());
     }
 
     fn end(&mut self) {
-        if let Some(mut seen) = self.seen.take() {
-            seen.cpu = cpu_time().saturating_sub(seen.cpu);
-            self.done.send(seen).expect("somebody waits for it");
+        if let Some(seen) = self.seen.take() {
+            self.done.send(seen.end()).expect("somebody waits for it");
         }
     }
 
@@ -130,20 +174,14 @@ impl Handler<Delivery<Back>> for Member {
         let took = self.now_ns() - back.payload.sent_ns;
         std::hint::black_box(back.payload.block);
         if let Some(seen) = &mut self.seen {
-            seen.figures.record(Duration::from_nanos(took));
-            seen.total_ns += took;
+            seen.record(took);
         }
     }
 }
 
-/// The time that this process had a CPU, with all its threads.
-fn cpu_time() -> Duration {
-    let time = clock_gettime(ClockId::ProcessCPUTime);
-    Duration::new(time.tv_sec as u64, time.tv_nsec as u32)
-}
-
 /// One of them, in a process of its own: hands over what it has seen.
-pub(crate) fn member(index: usize, count: usize, seconds: u64, at: At) {
+pub(crate) fn member(share: Share, at: At) {
+    let Share { index, count, seconds, .. } = share;
     let others: Vec<_> =
         (0..count).filter(|other| *other != index).map(|other| format!("echo-{other}")).collect();
     let echo = AppSpec::new(format!("echo-{index}"), || Echo).handles::<There>().on_io_thread();
@@ -153,7 +191,7 @@ pub(crate) fn member(index: usize, count: usize, seconds: u64, at: At) {
         // Everybody begins with another one.
         next: index,
         others: others.clone(),
-        period: Duration::from_nanos(1_000_000_000 * count as u64 / RATE),
+        period: share.period(),
         measured: Duration::from_secs(seconds),
         clock: Instant::now(),
         seen: None,
@@ -162,30 +200,47 @@ pub(crate) fn member(index: usize, count: usize, seconds: u64, at: At) {
     let member = AppSpec::new("member", make).handles::<Back>().requires(required).on_io_thread();
     let node = at.node(&format!("node-{index}")).app(echo).app(member).start().expect("a node");
     say_there();
-    let seen = seen.recv_timeout(DEADLINE).expect("the rounds end");
-    println!("{} {}", seen.total_ns, seen.cpu.as_nanos());
+    hand_over(seen.recv_timeout(DEADLINE).expect("the rounds end"));
+    node.stop();
+}
+
+/// Says what was seen, and waits until all have.
+pub(crate) fn hand_over(seen: Seen) {
+    println!("{} {} {} {}", seen.total_ns, seen.cpu.as_nanos(), seen.sleeps, resident_kib());
     seen.figures.hand_over();
     println!("end");
     // The others may not be through.
     await_end();
-    node.stop();
 }
 
-/// So many of them, and the line of all together.
-pub(crate) fn measure(count: usize, seconds: u64) {
-    let at = At::loopback();
-    let role = |index| {
-        format!("member {index} {count} {seconds} {}", at.on(Ipv4Addr::new(127, 0, 1, index as u8 + 1)))
-    };
-    let members: Vec<_> = (0..count).map(|index| Process::start(&role(index))).collect();
-    let (mut figures, mut total_ns, mut cpu_ns) = (Figures::new(), 0, 0);
-    // All of them live until the last one has been heard.
-    let mut heard = Vec::new();
-    for mut member in members {
+/// Memory of this process that is there; 0 where the system does not say.
+fn resident_kib() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+    line.and_then(|line| line.split_whitespace().next()?.parse().ok()).unwrap_or(0)
+}
+
+/// What all of them have seen.
+#[derive(Default)]
+struct Sum {
+    figures: Figures,
+    total_ns: u64,
+    cpu_ns: u64,
+    sleeps: u64,
+    resident_kib_max: u64,
+}
+
+impl Sum {
+    fn add(&mut self, member: &mut Process) {
         let line = member.line();
-        let (total, cpu) = line.split_once(' ').expect("a member hands over what it has seen");
-        total_ns += number(total);
-        cpu_ns += number(cpu);
+        let numbers: Vec<u64> = line.split(' ').map(number).collect();
+        let [total_ns, cpu_ns, sleeps, resident_kib] = numbers[..] else {
+            panic!("a member hands over what it has seen");
+        };
+        self.total_ns += total_ns;
+        self.cpu_ns += cpu_ns;
+        self.sleeps += sleeps;
+        self.resident_kib_max = self.resident_kib_max.max(resident_kib);
         let mut lines = String::new();
         loop {
             let line = member.line();
@@ -196,18 +251,58 @@ pub(crate) fn measure(count: usize, seconds: u64) {
             lines += &line;
             lines.push('\n');
         }
-        figures.add(&Figures::taken(&lines).expect("a member hands over its times"));
-        heard.push(member);
+        self.figures.add(&Figures::taken(&lines).expect("a member hands over its times"));
     }
-    let rounds = figures.rounds().max(1);
-    let counts = [
-        ("mean_ns", total_ns / rounds),
-        ("paper_mean_ns", PAPER_MEAN_NS),
-        ("cpu_ns_each_message", cpu_ns / (2 * rounds)),
-        ("round_trips_per_s", rounds / seconds),
-    ];
-    let case = format!("table_2_{count}_nodes");
-    Alone { bench: "gncl", case: &case, figure: "there and back", seen: &figures, counts: &counts }.report();
+}
+
+/// All of them together, and their line.
+pub(crate) fn measure(case: &str, by: By, share: Share) {
+    let Share { count, seconds, rate, .. } = share;
+    let at = At::loopback();
+    let role = |index: usize| match by {
+        By::Nodes => {
+            let at = at.on(Ipv4Addr::new(127, 0, 1, index as u8 + 1));
+            format!("member {index} {count} {seconds} {rate} {at}")
+        }
+        By::Tcp => format!("raw_member {index} {count} {seconds} {rate} {}", at.port()),
+    };
+    let mut members: Vec<_> = (0..count).map(|index| Process::start(&role(index))).collect();
+    let mut sum = Sum::default();
+    // All of them live until the last one has been heard.
+    members.iter_mut().for_each(|member| sum.add(member));
+    if rate == 0 { sum.report_rest(case, share) } else { sum.report(case, share) }
+}
+
+impl Sum {
+    fn report(&self, case: &str, share: Share) {
+        let rounds = self.figures.rounds().max(1);
+        let counts = [
+            ("mean_ns", self.total_ns / rounds),
+            ("paper_mean_ns", PAPER_MEAN_NS),
+            ("cpu_ns_each_message", self.cpu_ns / (2 * rounds)),
+            ("sleeps_each_1000_messages", 1_000 * self.sleeps / (2 * rounds)),
+            ("round_trips_per_s", rounds / share.seconds),
+        ];
+        Alone { bench: "gncl", case, figure: "there and back", seen: &self.figures, counts: &counts }
+            .report();
+    }
+
+    /// Nobody sent anything.
+    fn report_rest(&self, case: &str, share: Share) {
+        let mut seen = Figures::new();
+        let nodes_and_seconds = share.count as u64 * share.seconds;
+        seen.record(Duration::from_nanos(self.cpu_ns / nodes_and_seconds));
+        let counts =
+            [("sleeps_per_s", self.sleeps / nodes_and_seconds), ("resident_kib_max", self.resident_kib_max)];
+        Alone { bench: "gncl", case, figure: "CPU of a node each second", seen: &seen, counts: &counts }
+            .report();
+    }
+}
+
+/// The time that this process had a CPU, with all its threads.
+fn cpu_time() -> Duration {
+    let time = clock_gettime(ClockId::ProcessCPUTime);
+    Duration::new(time.tv_sec as u64, time.tv_nsec as u32)
 }
 
 fn number(word: &str) -> u64 {

@@ -10,7 +10,9 @@
 //! - `flood-CARRIER-CPUS`: packets of 1000 bytes in class Bulk one way, as fast as they go, confirmed or not, and through bare
 //!   TCP.
 //! - `table_2-N`: the paper's test, every node to every other one, 1000 bytes with a full echo, 3, 8 and 16 nodes at 2,000 round
-//!   trips a second together; `cpu_ns_each_message` is what all processes needed by what arrived.
+//!   trips a second together; `cpu_ns_each_message` is what all processes needed by what arrived, `sleeps_each_1000_messages` how often a thread of theirs
+//!   went to sleep. `table_2_raw_tcp-N`: the same by bare TCP, one thread a process.
+//! - `idle-N`: so many nodes that know each other and have nothing to do.
 //! - `control_beside_bulk_N`: round trips of 64 bytes in class Control, one every millisecond: first alone, then beside a
 //!   flood of Bulk messages of N bytes to another application of the other node, as fast as they are taken. What counts is the
 //!   p99 beside the flood by the p99 alone (`p99_ratio_percent`).
@@ -20,6 +22,7 @@
 
 mod beside;
 mod crowd;
+mod crowd_raw;
 mod flood;
 mod nodes;
 #[path = "../ping/mod.rs"]
@@ -32,7 +35,12 @@ use std::{process::ExitCode, time::Duration};
 use sinew_figures::{Beside, End, Pace, Pinning, Rounds, process};
 use sinew_hosts::Queue;
 
-use crate::{flood::Carrier, nodes::At, rounds::Thread};
+use crate::{
+    crowd::{By, Share},
+    flood::Carrier,
+    nodes::At,
+    rounds::Thread,
+};
 
 /// What is measured.
 #[derive(Clone, Copy, Debug)]
@@ -48,8 +56,11 @@ enum Case {
         pinning: Pinning,
     },
     Crowd {
+        by: By,
         nodes: usize,
         seconds: u64,
+        /// Round trips of all together, a second.
+        rate: u64,
     },
     /// How many bytes a message of the flood has, and how long whoever takes them takes for each.
     Beside {
@@ -81,7 +92,12 @@ impl Case {
                 pinning,
             }));
         }
-        cases.extend(crowd::SIZES.map(|nodes| Self::Crowd { nodes, seconds: if is_short { 3 } else { 20 } }));
+        let seconds = if is_short { 3 } else { 20 };
+        let crowd = |by, nodes, rate| Self::Crowd { by, nodes, seconds, rate };
+        for nodes in crowd::SIZES {
+            cases.extend([By::Nodes, By::Tcp].map(|by| crowd(by, nodes, crowd::RATE)));
+        }
+        cases.extend([4, 16].map(|nodes| crowd(By::Nodes, nodes, 0)));
         let beside = [
             ("control_beside_bulk_1000", 1_000, 0),
             ("control_beside_bulk_65536", 65_536, 0),
@@ -105,7 +121,9 @@ impl Case {
                 format!("rounds-{}-{bytes}B-{}-{}", thread.name(), pace.name(), pinning.name())
             }
             Self::Flood { carrier, pinning, .. } => format!("flood-{}-{}", carrier.name(), pinning.name()),
-            Self::Crowd { nodes, .. } => format!("table_2-{nodes}"),
+            Self::Crowd { nodes, rate: 0, .. } => format!("idle-{nodes}"),
+            Self::Crowd { by: By::Nodes, nodes, .. } => format!("table_2-{nodes}"),
+            Self::Crowd { by: By::Tcp, nodes, .. } => format!("table_2_raw_tcp-{nodes}"),
             Self::Beside { name, .. } => name.to_owned(),
             Self::SlowLink(Queue::OneLine) => "slow_link".to_owned(),
             Self::SlowLink(Queue::Priorities) => "slow_link_priorities".to_owned(),
@@ -132,7 +150,9 @@ impl Case {
                 pinning.pin(End::Measuring);
                 flood::measure(carrier, packets, pinning);
             }
-            Self::Crowd { nodes, seconds } => crowd::measure(nodes, seconds),
+            Self::Crowd { by, nodes: count, seconds, rate } => {
+                crowd::measure(&self.name(), by, Share { index: 0, count, seconds, rate });
+            }
             Self::Beside { name, bulk_bytes, pause_us, rounds } => {
                 let at = At::loopback();
                 let _other = process::Process::start(&format!("beside_echo {pause_us} {}", at.host(2)));
@@ -190,8 +210,11 @@ fn play(role: &str) -> ExitCode {
             Pinning::named(pinning).pin(End::Echoing);
             flood::sink(Carrier::named(carrier), number(packets), At::read(at));
         }
-        ["member", index, count, seconds, at] => {
-            crowd::member(number(index), number(count), number(seconds) as u64, At::read(at));
+        ["member", index, count, seconds, rate, at] => {
+            crowd::member(share(index, count, seconds, rate), At::read(at));
+        }
+        ["raw_member", index, count, seconds, rate, port] => {
+            crowd_raw::member(share(index, count, seconds, rate), number(port) as u16);
         }
         ["beside_echo", pause_us, at] => {
             beside::echo(At::read(at), Duration::from_micros(number(pause_us) as u64));
@@ -205,6 +228,11 @@ fn play(role: &str) -> ExitCode {
         }
     }
     ExitCode::SUCCESS
+}
+
+fn share(index: &str, count: &str, seconds: &str, rate: &str) -> Share {
+    let (seconds, rate) = (number(seconds) as u64, number(rate) as u64);
+    Share { index: number(index), count: number(count), seconds, rate }
 }
 
 fn number(word: &str) -> usize {

@@ -22,6 +22,11 @@ impl At {
         Self { address: Ipv4Addr::LOCALHOST, group: SocketAddrV4::new(group, 20_000 + (id % 20_000) as u16) }
     }
 
+    /// The port of the group, which is this run's own.
+    pub(crate) fn port(self) -> u16 {
+        self.group.port()
+    }
+
     /// Another address, the same group.
     pub(crate) fn on(self, address: Ipv4Addr) -> Self {
         Self { address, ..self }

@@ -1,0 +1,127 @@
+//! The same as [`crowd`](crate::crowd) by bare sockets: what the machine itself makes of so many processes.
+//!
+//! Each has one thread, a connection to every other one, and a task that reads it.
+
+use std::{
+    cell::RefCell,
+    net::{Ipv4Addr, SocketAddrV4},
+    rc::Rc,
+    time::{Duration, Instant},
+};
+
+use sinew_figures::process::say_there;
+use tokio::{
+    net::{TcpListener, TcpStream},
+    task::LocalSet,
+    time::{MissedTickBehavior, interval, sleep},
+};
+
+use crate::crowd::{PACKET, Seen, Share, WARM_UP, hand_over};
+
+/// A packet with whether it goes back, and when it was sent.
+const FRAME: usize = 9 + PACKET;
+const THERE: u8 = 1;
+const BACK: u8 = 2;
+
+struct Member {
+    others: Vec<Rc<TcpStream>>,
+    clock: Instant,
+    seen: Option<Seen>,
+}
+
+type Shared = Rc<RefCell<Member>>;
+
+/// One of them, in a process of its own: hands over what it has seen.
+pub(crate) fn member(share: Share, port: u16) {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a reactor");
+    let seen = LocalSet::new().block_on(&runtime, run(share, port));
+    hand_over(seen);
+}
+
+/// Where the n-th one listens.
+const fn address(index: usize, port: u16) -> SocketAddrV4 {
+    SocketAddrV4::new(Ipv4Addr::new(127, 0, 1, index as u8 + 1), port)
+}
+
+async fn run(share: Share, port: u16) -> Seen {
+    let Share { index, count, seconds, .. } = share;
+    let listener = TcpListener::bind(address(index, port)).await.expect("a free port");
+    let mut others = Vec::new();
+    for other in 0..index {
+        others.push(TcpStream::connect(address(other, port)).await.expect("it was there before"));
+    }
+    say_there();
+    while others.len() < count - 1 {
+        others.push(listener.accept().await.expect("one that comes later").0);
+    }
+    let others = others.into_iter().map(|other| {
+        other.set_nodelay(true).expect("TCP has no delay");
+        Rc::new(other)
+    });
+    let member = Member { others: others.collect(), clock: Instant::now(), seen: None };
+    let member = Rc::new(RefCell::new(member));
+    for other in member.borrow().others.clone() {
+        tokio::task::spawn_local(read(member.clone(), other));
+    }
+    if let Some(period) = share.period() {
+        tokio::task::spawn_local(ask(member.clone(), index, period));
+    }
+    sleep(WARM_UP).await;
+    member.borrow_mut().seen = Some(Seen::begin());
+    sleep(Duration::from_secs(seconds)).await;
+    let seen = member.borrow_mut().seen.take().expect("it was begun");
+    seen.end()
+}
+
+async fn ask(member: Shared, first: usize, period: Duration) {
+    let mut ticks = interval(period);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Burst);
+    for next in first.. {
+        ticks.tick().await;
+        let member = member.borrow();
+        write(&member.others[next % member.others.len()], THERE, now_ns(&member));
+    }
+}
+
+fn now_ns(member: &Member) -> u64 {
+    u64::try_from(member.clock.elapsed().as_nanos()).expect("a bench does not last for centuries")
+}
+
+fn write(to: &TcpStream, kind: u8, sent_ns: u64) {
+    let mut frame = [7; FRAME];
+    frame[0] = kind;
+    frame[1..9].copy_from_slice(&sent_ns.to_le_bytes());
+    let written = to.try_write(&frame).expect("the other one reads");
+    assert_eq!(written, FRAME, "so little always has room");
+}
+
+async fn read(member: Shared, from: Rc<TcpStream>) {
+    let mut buffer = Vec::with_capacity(4 * FRAME);
+    loop {
+        from.readable().await.expect("the other one lives");
+        match from.try_read_buf(&mut buffer) {
+            // It has ended.
+            Ok(0) => return,
+            Ok(_) => {}
+            Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => continue,
+            Err(_) => return,
+        }
+        let whole = buffer.len() / FRAME * FRAME;
+        for frame in buffer[..whole].chunks_exact(FRAME) {
+            came(&member, &from, frame);
+        }
+        buffer.drain(..whole);
+    }
+}
+
+fn came(member: &Shared, from: &TcpStream, frame: &[u8]) {
+    let sent_ns = u64::from_le_bytes(frame[1..9].try_into().expect("eight bytes"));
+    if frame[0] == THERE {
+        return write(from, BACK, sent_ns);
+    }
+    let mut member = member.borrow_mut();
+    let took = now_ns(&member) - sent_ns;
+    if let Some(seen) = &mut member.seen {
+        seen.record(took);
+    }
+}
