@@ -326,9 +326,9 @@ impl<S: Socket> StreamOutlet<S> {
         self.lock().urgent_left()
     }
 
-    /// Settles what has expired by `now` while it waited.
-    pub(crate) fn expire(&self, now: Time) {
-        self.with(|half, after| half.expire(now, after));
+    /// Settles what has expired by `now` while it waited. Returns whether anything is left that can expire.
+    pub(crate) fn expire(&self, now: Time) -> bool {
+        self.with(|half, after| half.expire(now, after))
     }
 
     /// The peer says what became of the message that `ticket` names. Returns whether that message was waited for.

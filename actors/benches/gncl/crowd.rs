@@ -207,7 +207,9 @@ pub(crate) fn member(share: Share, at: At) {
 /// Says what was seen, and waits until all have.
 pub(crate) fn hand_over(seen: Seen) {
     println!("{} {} {} {}", seen.total_ns, seen.cpu.as_nanos(), seen.sleeps, resident_kib());
-    seen.figures.hand_over();
+    if seen.figures.rounds() > 0 {
+        seen.figures.hand_over();
+    }
     println!("end");
     // The others may not be through.
     await_end();
@@ -251,7 +253,9 @@ impl Sum {
             lines += &line;
             lines.push('\n');
         }
-        self.figures.add(&Figures::taken(&lines).expect("a member hands over its times"));
+        if !lines.is_empty() {
+            self.figures.add(&Figures::taken(&lines).expect("a member hands over its times"));
+        }
     }
 }
 

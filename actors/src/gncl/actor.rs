@@ -47,9 +47,6 @@ use crate::{
 };
 pub(crate) use leaving::LINGER;
 
-/// How often expired messages are looked for in the queues of peers without a connection.
-const EXPIRY_PERIOD: Duration = Duration::from_millis(50);
-
 /// GNCL's actor.
 pub(crate) struct Gncl {
     stores: Arc<Stores>,
@@ -245,8 +242,11 @@ impl Gncl {
         let Some(wire) = self.wires.get_mut(&connection) else { return };
         let Some((link, drainer)) = wire.link.take() else { return };
         ctx.cancel_future(drainer);
-        if let Some(way) = self.stores.gncl.peer(node).as_ref().and_then(|peer| peer.way(lane)) {
+        if let Some(peer) = self.stores.gncl.peer(node)
+            && let Some(way) = peer.way(lane)
+        {
             wire.may_speak = way.outlet.disconnect(link);
+            peer.holds_what_may_expire();
         }
     }
 
@@ -409,13 +409,8 @@ impl Actor for Gncl {
         ctx.spawn(fut::wrap_future(Store::serve_those_held_up(self.stores.clone())));
         let spin = self.spin.clone();
         ctx.spawn(fut::wrap_future(async move { spin.keep_awake().await }));
-        ctx.run_interval(EXPIRY_PERIOD, |actor, _| {
-            let now = Time::now();
-            for way in actor.stores.gncl.peers().iter().flat_map(|peer| peer.ways()) {
-                way.outlet.expire(now);
-                way.acknowledge_if_owed();
-            }
-        });
+        ctx.spawn(fut::wrap_future(Store::look_for_expired(self.stores.clone())));
+        ctx.spawn(fut::wrap_future(Store::acknowledge_late(self.stores.clone())));
         if let Some(ready) = self.ready.take() {
             ready.reached();
         }

@@ -20,6 +20,7 @@ use super::{
 };
 use crate::{
     outlet::{LinkNumber, line_of},
+    session::Ack,
     stores::Stores,
 };
 
@@ -69,7 +70,11 @@ impl Inbound {
     pub(super) fn receive(&self, now: Time, message: Message) -> Result<(), Decline> {
         let Some(way) = self.peer.way(self.lane) else { return Ok(()) };
         if is_for_the_link(&message, Kind::GNCL_ACK) {
-            way.heard(self.link, &read(&message.payload)?, now);
+            let ack: Ack = read(&message.payload)?;
+            way.heard(self.link, &ack, now);
+            if !ack.held.is_empty() {
+                self.peer.holds_what_may_expire();
+            }
             return Ok(());
         }
         // Counted first: what panics from here on must not come again.

@@ -35,6 +35,7 @@
 //! | `inbound.rs` | what is checked before a frame becomes a message of this node |
 //! | `interfaces.rs` | which of this host's addresses are lost, as the kernel says |
 //! | `spin.rs` | how long the IO thread looks before it sleeps |
+//! | `ticks.rs` | looks at what has a time, only as long as there is something |
 //! | `marks.rs` | what the network is told about a class |
 //! | `listener.rs` | the accepting socket |
 //! | `actor.rs`, `actor/` | the shell that ties them together; how it ends |
@@ -55,6 +56,7 @@ mod spin;
 mod task;
 #[cfg(test)]
 mod tests;
+mod ticks;
 mod way;
 
 pub(crate) use actor::{Gncl, LINGER};

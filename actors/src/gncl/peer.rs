@@ -24,6 +24,7 @@ use super::{
     bulk::BulkThread,
     core::{Attach, Lane},
     task::{Move, Place},
+    ticks::Ticks,
     way::{Ends, Offered, Way, WayAccount},
 };
 use crate::{
@@ -36,6 +37,10 @@ use crate::{
 /// How often what waits for an application that is full is offered to it, if it does not say itself that it takes more; so late at most
 /// its sender is told that something has expired there.
 const OFFER_PERIOD: Duration = Duration::from_millis(50);
+/// How often it is looked for messages that have expired while they wait.
+const EXPIRY_PERIOD: Duration = Duration::from_millis(50);
+/// After so long at most a peer is told what was taken of it. It keeps that so long and needs no more: where more comes, it is told before.
+const ACK_PERIOD: Duration = Duration::from_secs(1);
 /// Peers at most that are gone and have left messages for applications that take nothing.
 const GONE_MAX: usize = 16;
 
@@ -48,6 +53,7 @@ pub(crate) struct Peer {
     /// Whether it knows [`CANCEL`](Kind::CANCEL).
     takes_cancels: bool,
     buried: Arc<Mutex<Buried>>,
+    expiring: Arc<Ticks>,
 }
 
 /// What became of the messages to and from lives of peers that are gone, all together.
@@ -75,10 +81,11 @@ impl Peer {
         let ends = Ends { here: stores.node, node: attach.node };
         let ways = if attach.by_class { Lane::ALL.len() } else { 1 };
         let refusals = &stores.gncl.refusals;
-        let ways = (0..ways).map(|_| Way::new(now, ends, &stores.config, refusals)).collect();
-        let buried = stores.gncl.buried.clone();
+        let acks = &stores.gncl.acks;
+        let ways = (0..ways).map(|_| Way::new(now, ends, &stores.config, refusals, acks)).collect();
+        let (buried, expiring) = (stores.gncl.buried.clone(), stores.gncl.expiring.clone());
         let Attach { node, incarnation, takes_cancels, .. } = *attach;
-        Self { node, incarnation, ways, takes_cancels, buried }
+        Self { node, incarnation, ways, takes_cancels, buried, expiring }
     }
 
     /// Its sessions.
@@ -94,6 +101,11 @@ impl Peer {
     /// The session of this class.
     fn way_of(&self, class: Class) -> &Way {
         self.ways.get(class as usize).unwrap_or(&self.ways[0])
+    }
+
+    /// Something waits here again that had gone out.
+    pub(super) fn holds_what_may_expire(&self) {
+        self.expiring.want();
     }
 
     /// Cuts every connection.
@@ -140,7 +152,12 @@ impl Peer {
 
 impl Outlet for Peer {
     fn submit(&self, message: Message) -> Result<(), Refused> {
-        self.way_of(message.header.class).outlet.submit(message)
+        let has_a_time = message.header.time_to_live_us != 0 || message.receipt.is_some();
+        self.way_of(message.header.class).outlet.submit(message)?;
+        if has_a_time {
+            self.expiring.want();
+        }
+        Ok(())
     }
 
     /// Requests are of class Control, and so is what takes them back: it comes behind them. spec: GNCL-15
@@ -198,6 +215,9 @@ pub(crate) struct Store {
     /// The sockets that listen, that of the node's interface first. They stay open while this layer is restarted: a peer that is
     /// refused would say that this node is lost.
     pub(super) listeners: Mutex<Vec<std::net::TcpListener>>,
+    /// Who looks for what has expired, and who for what was taken and not acknowledged.
+    expiring: Arc<Ticks>,
+    acks: Arc<Ticks>,
     /// What GNCL refused, and why.
     pub(crate) refusals: Arc<Refusals>,
 }
@@ -305,6 +325,28 @@ impl Store {
         let thread = bulk.as_ref().expect("it was made if there was none");
         let place = Place::There(thread.runtime().clone());
         Ok(Move { place, socket: Arc::new(thread.adopt(socket)?) })
+    }
+
+    /// Settles what has expired while it waited, and outcomes that do not come any more.
+    pub(super) async fn look_for_expired(stores: Arc<Stores>) {
+        let store = &stores.gncl;
+        let look = || {
+            let now = Time::now();
+            // All of them, whatever the first says.
+            store.all_ways(|way| way.outlet.expire(now)) > 0
+        };
+        store.expiring.run(EXPIRY_PERIOD, look).await;
+    }
+
+    /// Acknowledges what came so seldom that nothing else did.
+    pub(super) async fn acknowledge_late(stores: Arc<Stores>) {
+        let store = &stores.gncl;
+        store.acks.run(ACK_PERIOD, || store.all_ways(Way::acknowledge_if_owed) > 0).await;
+    }
+
+    /// Of how many sessions `what` is true.
+    fn all_ways(&self, what: impl Fn(&Way) -> bool) -> usize {
+        self.peers().iter().flat_map(|peer| &peer.ways).filter(|way| what(way)).count()
     }
 
     /// Whoever carried Bulk is not needed any more.

@@ -10,3 +10,4 @@ mod leaving;
 mod links;
 mod messages;
 mod threads;
+mod ticks;

@@ -19,6 +19,7 @@ use super::{
     arrivals::{Arrivals, End},
     core::{Decline, write},
     peer::frame,
+    ticks::Ticks,
 };
 use crate::{
     config::NodeConfig,
@@ -31,6 +32,8 @@ use crate::{
 const WINDOW_BYTES: usize = 4 << 20;
 /// Messages that are kept at most: half of what their numbers' 16 bits on the wire can tell apart.
 const WINDOW_MESSAGES_MAX: usize = 1 << 15;
+/// Messages that are kept at least: twice as many as are acknowledged at once, so that nobody waits for an acknowledgement.
+const WINDOW_MESSAGES_MIN: usize = 64;
 /// Frames of this layer itself that wait for a socket at most: more than a peer's ACKs, PINGs and PONGs ever are.
 const WORDS_MAX: usize = 32;
 
@@ -114,18 +117,26 @@ pub(crate) struct Way {
     outcomes_max: usize,
     ends: Ends,
     refusals: Arc<Refusals>,
+    /// Told when something was taken that the peer does not know of.
+    acks: Arc<Ticks>,
 }
 
 impl Way {
     /// `now` numbers what is remembered: a later session with the same life of the peer has a larger number.
-    pub(super) fn new(now: Time, ends: Ends, config: &NodeConfig, refusals: &Arc<Refusals>) -> Self {
+    pub(super) fn new(
+        now: Time,
+        ends: Ends,
+        config: &NodeConfig,
+        refusals: &Arc<Refusals>,
+        acks: &Arc<Ticks>,
+    ) -> Self {
         let limits = OutletLimits {
             queue_capacity: config.gncl.queue_capacity,
             queue_bytes: config.gncl.queue_bytes,
             unconfirmed_max: config.gncl.queue_capacity,
             payload_max: config.payload_max,
         };
-        let messages = config.gncl.queue_capacity.min(WINDOW_MESSAGES_MAX);
+        let messages = config.gncl.queue_capacity.clamp(WINDOW_MESSAGES_MIN, WINDOW_MESSAGES_MAX);
         let window = Window { messages, bytes: WINDOW_BYTES };
         let memory = now.as_nanos();
         let void = frame(ends.here, ends.node, Kind::GNCL_VOID, Bytes::new()).header;
@@ -146,7 +157,7 @@ impl Way {
             ack_is_due: false,
         });
         let outcomes_max = OUTCOMES_MAX * config.gncl.queue_capacity;
-        Self { outlet, inbox, outcomes_max, ends, refusals: refusals.clone() }
+        Self { outlet, inbox, outcomes_max, ends, refusals: refusals.clone(), acks: acks.clone() }
     }
 
     /// Its messages come on `link` from now on, and are taken from no other.
@@ -171,7 +182,10 @@ impl Way {
             (arrival, inbox.line(message))
         };
         match arrival {
-            Arrival::Take { .. } => Ok(line.map_or(Taken::Yes, Taken::InLine)),
+            Arrival::Take { .. } => {
+                self.acks.want();
+                Ok(line.map_or(Taken::Yes, Taken::InLine))
+            }
             Arrival::Fenced => Ok(Taken::No),
             Arrival::OutOfStep { expected } => Err(Decline::Violation(format!(
                 "message {number} came where {} is the next one",
@@ -204,12 +218,13 @@ impl Way {
         }
     }
 
-    /// Tells the peer what was taken, if it does not know.
-    pub(super) fn acknowledge_if_owed(&self) {
+    /// Tells the peer what was taken, if it does not know. Returns whether it did not.
+    pub(super) fn acknowledge_if_owed(&self) -> bool {
         let owes = self.inbox().receiving.owes_ack();
         if owes {
             self.acknowledge();
         }
+        owes
     }
 
     fn acknowledge(&self) {

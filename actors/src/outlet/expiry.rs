@@ -40,11 +40,16 @@ impl<S: Socket> Half<S> {
         true
     }
 
-    pub(super) fn expire(&mut self, now: Time, after: &mut After) {
+    /// Returns whether anything is left that can expire, or an outcome that may be overdue one day.
+    pub(super) fn expire(&mut self, now: Time, after: &mut After) -> bool {
         self.give_up_overdue(now, after);
-        if now <= self.next_expiry {
-            return;
+        if now > self.next_expiry {
+            self.expire_waiting(now, after);
         }
+        self.next_expiry != Time::MAX || self.sent_receipts.len() > 0
+    }
+
+    fn expire_waiting(&mut self, now: Time, after: &mut After) {
         self.next_expiry = Time::MAX;
         self.expire_lines(now, after);
         if let Some(message) = self.interrupted.take() {

@@ -54,7 +54,7 @@ proptest! {
                     bench.outlet.disconnect(bench.link);
                     bench.reconnect(0);
                 }
-                Step::Expire => bench.outlet.expire(Time::MAX),
+                Step::Expire => drop(bench.outlet.expire(Time::MAX)),
                 Step::ConfirmOldest => {
                     let oldest = confirmed.first().copied().unwrap_or_default();
                     let ticket = Ticket { source: tid(0), destination: tid(1), correlation: oldest };

@@ -112,7 +112,7 @@ impl World {
                 self.hear(1);
                 self.written = 1;
             }
-            Step::Expire => self.bench.outlet.expire(Time::MAX),
+            Step::Expire => drop(self.bench.outlet.expire(Time::MAX)),
         }
         let frames = frames(&self.bench.wire.bytes.lock().unwrap());
         if let Some(last) = frames.last() {

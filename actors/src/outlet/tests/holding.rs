@@ -111,7 +111,7 @@ impl World {
             Step::Submit { to, confirm } => self.submit(to, confirm),
             Step::Room(room) => self.bench.make_room(room),
             Step::Hear { held, is_stale } => self.hear(held, is_stale),
-            Step::Expire => self.bench.outlet.expire(Time::MAX),
+            Step::Expire => drop(self.bench.outlet.expire(Time::MAX)),
         }
         let OutletCounts { sent, superseded, expired, lost, refused } = self.bench.outlet.counts();
         let known = sent + superseded + expired + lost + refused + self.bench.outlet.waiting() as u64;

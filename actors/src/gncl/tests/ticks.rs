@@ -1,0 +1,62 @@
+//! Who looks, and when nobody does.
+
+use std::{cell::Cell, rc::Rc, time::Duration};
+
+use tokio::time::timeout;
+
+use super::bench::{run, within};
+use crate::gncl::ticks::Ticks;
+
+const PERIOD: Duration = Duration::from_millis(1);
+
+#[test]
+fn nobody_looks_while_there_is_nothing() {
+    run(async {
+        let (ticks, left, looks) = (Ticks::default(), Cell::new(3), Rc::new(Cell::new(0)));
+        let counted = looks.clone();
+        let look = move || {
+            counted.set(counted.get() + 1);
+            left.set(left.get() - 1);
+            left.get() > 0
+        };
+        let mut looking = std::pin::pin!(ticks.run(PERIOD, look));
+        let mut for_a_while =
+            async || timeout(50 * PERIOD, looking.as_mut()).await.expect_err("it never ends");
+        for_a_while().await;
+        assert_eq!(looks.get(), 4, "twice there was something, and twice nothing");
+        for_a_while().await;
+        assert_eq!(looks.get(), 4, "nothing was wanted");
+        ticks.want();
+        ticks.want();
+        for_a_while().await;
+        assert_eq!(looks.get(), 6, "nothing, looked at twice");
+    });
+}
+
+#[test]
+fn what_is_wanted_again_and_again_is_looked_at_every_time() {
+    run(async {
+        let (ticks, waits, taken) = (Ticks::default(), Cell::new(false), Cell::new(0));
+        let look = || {
+            taken.set(taken.get() + u32::from(waits.replace(false)));
+            false
+        };
+        let want = async {
+            for n in 1..=100 {
+                waits.set(true);
+                ticks.want();
+                within("a look", async {
+                    while taken.get() < n {
+                        tokio::task::yield_now().await;
+                    }
+                })
+                .await;
+            }
+        };
+        tokio::select! {
+            () = ticks.run(PERIOD, look) => {}
+            () = want => {}
+        }
+        assert_eq!(taken.get(), 100);
+    });
+}
