@@ -27,8 +27,8 @@ use tokio::net::TcpStream;
 use super::{
     Event, LinkFact,
     core::{
-        Attach, CANCEL, CLASSES, ConnectionId, Core, Decline, Input, Introduction, Lane, Output, Refusal,
-        Settings, read, write,
+        Attach, CANCEL, CLASSES, ConnectionId, Core, Decline, GUARD, Input, Introduction, Lane, Output,
+        Refusal, Settings, read, write,
     },
     inbound::Inbound,
     link::{self, Mode, News, Reading, SharedMode, What},
@@ -216,11 +216,13 @@ impl Gncl {
         let payload_max = usize::try_from(attach.payload_max).unwrap_or(usize::MAX);
         let Move { place, socket } = self.stores.gncl.place(lane, socket);
         wire.socket = Some(socket.clone());
-        let link = way.outlet.connect(Gathering::new(socket.clone()), payload_max, welcome);
+        let checksum = attach.checksum();
+        let link = way.outlet.connect(Gathering::new(socket.clone(), checksum), payload_max, welcome);
         way.attach(link);
         let spin = if place.is_here() { self.spin.clone() } else { Arc::default() };
         let (stores, peer_there) = (self.stores.clone(), peer.clone());
-        let inbound = Inbound { stores, peer: peer_there, spin, lane, link, outcomes: RefCell::default() };
+        let outcomes = RefCell::default();
+        let inbound = Inbound { stores, peer: peer_there, spin, lane, link, checksum, outcomes };
         wire.set_mode(Mode::Moves(inbound, Move { place: place.clone(), socket }));
         self.stores.router.set_peer(node, peer.clone());
         let drainer = place.begin(async move {
@@ -363,7 +365,7 @@ fn settings(stores: &Stores) -> Settings {
             peer: NodeAddress::HERE,
             dial: 0,
             payload_max: payload_max as u64,
-            features: [CLASSES, CANCEL].map(str::to_owned).to_vec(),
+            features: [CLASSES, CANCEL, GUARD].map(str::to_owned).to_vec(),
             lane: Lane::Control,
             link: 0,
         },

@@ -8,7 +8,7 @@ use sinew_runtime::{
     tid::{AppAddress, NodeAddress},
     time::Time,
     wakes,
-    wire::{Class, Flags, Kind, Message},
+    wire::{Checksum, Class, Flags, Kind, Message},
 };
 
 use super::{
@@ -33,6 +33,8 @@ pub(super) struct Inbound {
     pub(super) lane: Lane,
     /// The connection on which they come.
     pub(super) link: LinkNumber,
+    /// What they have for a checksum.
+    pub(super) checksum: Checksum,
     /// What the peer said in this [`Batch`] of the fate of messages to it: no more than the frames of one.
     pub(super) outcomes: RefCell<Vec<(Ticket, Outcome)>>,
 }

@@ -12,7 +12,7 @@ use futures_util::{Stream, stream};
 use sinew_runtime::{
     tid::AppAddress,
     time::Time,
-    wire::{FrameCodec, FrameError, HeaderError, Kind, Message, encode_frame},
+    wire::{Checksum, FrameCodec, FrameError, HeaderError, Kind, Message},
 };
 #[cfg(target_os = "linux")]
 use socket2::SockRef;
@@ -167,7 +167,9 @@ pub(super) fn tune(socket: &TcpStream, give_up: Duration) -> io::Result<()> {
 /// Writes one frame to a connection that is not a link.
 pub(super) async fn write_frame(socket: &TcpStream, message: &Message) -> io::Result<()> {
     let mut bytes = BytesMut::with_capacity(message.size());
-    encode_frame(&message.header, &message.payload, &mut bytes);
+    // Whoever knows no guard reads it, too: nobody looks at its sequence. spec: FRAME-3.1
+    bytes.put_slice(&Checksum::Guarded.encode(&message.header, &message.payload));
+    bytes.put_slice(&message.payload);
     let mut rest = &bytes[..];
     while !rest.is_empty() {
         socket.writable().await?;
@@ -252,9 +254,9 @@ impl Reader {
 
     fn look(&mut self) -> Look {
         let mode = lock(&self.reading.mode);
-        let payload_max = match *mode {
-            Mode::Handshake => HANDSHAKE_PAYLOAD_MAX,
-            Mode::Linked(_) => self.reading.payload_max,
+        let (payload_max, checksum) = match &*mode {
+            Mode::Handshake => (HANDSHAKE_PAYLOAD_MAX, Checksum::Crc),
+            Mode::Linked(inbound) => (self.reading.payload_max, inbound.checksum),
             Mode::Moves(..) => return Look::Moves,
             Mode::Discard => {
                 self.buffer.clear();
@@ -265,6 +267,7 @@ impl Reader {
             return Look::Empty;
         }
         self.codec.set_payload_max(payload_max);
+        self.codec.set_checksum(checksum);
         let _batch = if let Mode::Linked(inbound) = &*mode { Some(inbound.batch()) } else { None };
         let now = Time::now();
         for _ in 0..FRAMES_PER_WAKE {

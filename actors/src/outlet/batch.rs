@@ -91,6 +91,7 @@ impl<S: Socket> Half<S> {
 #[derive(Debug)]
 pub(crate) struct Gathering<S> {
     socket: S,
+    checksum: Checksum,
     /// What is gathered; the socket has taken all before `taken`.
     bytes: Vec<u8>,
     taken: usize,
@@ -98,14 +99,14 @@ pub(crate) struct Gathering<S> {
 }
 
 impl<S> Gathering<S> {
-    pub(crate) fn new(socket: S) -> Self {
-        Self { socket, bytes: Vec::new(), taken: 0, rouser: Rouser::default() }
+    pub(crate) fn new(socket: S, checksum: Checksum) -> Self {
+        Self { socket, checksum, bytes: Vec::new(), taken: 0, rouser: Rouser::default() }
     }
 }
 
 impl<S: Socket> Socket for Gathering<S> {
     fn checksum(&self) -> Checksum {
-        self.socket.checksum()
+        self.checksum
     }
 
     fn piece_max(&self) -> usize {

@@ -48,6 +48,8 @@ pub struct FrameCodec {
 pub enum Checksum {
     /// The CRC-32 of header and payload: the bytes went over a wire.
     Crc,
+    /// The same, and the length has a guard of its own, which is checked before the rest is waited for.
+    Guarded,
     /// Zero, and not looked at: the bytes stayed in memory.
     None,
 }
@@ -58,6 +60,7 @@ impl Checksum {
     pub fn encode(self, header: &Header, payload: &[u8]) -> [u8; HEADER_LEN] {
         match self {
             Self::Crc => header.encode(payload),
+            Self::Guarded => header.encode_guarded(payload),
             Self::None => header.encode_in_memory(payload.len()),
         }
     }
@@ -65,6 +68,7 @@ impl Checksum {
     fn decode(self, bytes: &[u8; HEADER_LEN], payload: &[u8]) -> Result<Header, HeaderError> {
         match self {
             Self::Crc => Header::decode(bytes, payload),
+            Self::Guarded => Header::decode_guarded(bytes, payload),
             Self::None => Header::decode_in_memory(bytes),
         }
     }
@@ -80,6 +84,11 @@ impl FrameCodec {
     /// Takes payloads of at most `payload_max` bytes from now on.
     pub const fn set_payload_max(&mut self, payload_max: usize) {
         self.payload_max = payload_max;
+    }
+
+    /// Frames have this for a checksum from now on.
+    pub const fn set_checksum(&mut self, checksum: Checksum) {
+        self.checksum = checksum;
     }
 
     /// A codec for frames that stay in memory: without checksums.
@@ -99,8 +108,18 @@ impl Decoder for FrameCodec {
         if said > self.payload_max {
             return Err(FrameError::TooLong { said, limit: self.payload_max });
         }
-        let whole = HEADER_LEN + said;
         self.watch(source);
+        if self.checksum == Checksum::Guarded {
+            match source.first_chunk::<HEADER_LEN>() {
+                Some(head) => Header::check_guard(head)?,
+                None => {
+                    // Nothing is believed of the length yet.
+                    self.make_room(source, HEADER_LEN);
+                    return Ok(None);
+                }
+            }
+        }
+        let whole = HEADER_LEN + said;
         if source.len() < whole {
             self.make_room(source, whole);
             return Ok(None);
@@ -348,5 +367,23 @@ mod tests {
         let lines: Vec<_> = hex.chunks(16).map(|line| line.join(" ")).collect();
         let page = include_str!("../../../docs/protocol/frame.md");
         assert!(page.contains(&lines.join("\n")), "the page should show:\n{}", lines.join("\n"));
+    }
+
+    #[test]
+    fn nothing_is_done_for_a_guarded_length_before_its_guard_has_come_and_a_damaged_one_is_refused_then() {
+        let mut codec = FrameCodec::new(1 << 20);
+        codec.set_checksum(Checksum::Guarded);
+        let header = Header::new(Kind::OUTCOME, Tid::NONE, Tid::NONE);
+        let mut bytes = Checksum::Guarded.encode(&header, b"four");
+        let mut sound = BytesMut::from(&bytes[..]);
+        sound.put_slice(b"four");
+        assert_eq!(codec.decode(&mut sound).unwrap().expect("it is whole").payload[..], b"four"[..]);
+        // 4 bytes become 512 KiB and 4.
+        bytes[6] ^= 8;
+        let mut source = BytesMut::from(&bytes[..40]);
+        assert!(matches!(codec.decode(&mut source), Ok(None)));
+        assert!(source.capacity() < 1_024, "{}", source.capacity());
+        source.put_slice(&bytes[40..]);
+        assert!(matches!(codec.decode(&mut source), Err(FrameError::Header(HeaderError::Guard))));
     }
 }

@@ -15,6 +15,9 @@ const NAME_MAX: usize = 63;
 /// The ability to have a connection for each class.
 pub(crate) const CLASSES: &str = "classes";
 
+/// The ability to read a guard of each frame's length.
+pub(crate) const GUARD: &str = "guard";
+
 /// The ability to take a request back that nobody waits for any more.
 pub(crate) const CANCEL: &str = "cancel";
 
@@ -58,7 +61,7 @@ pub(crate) struct Introduction {
     pub(crate) dial: u64,
     /// Longest payload that the sender takes, in bytes.
     pub(crate) payload_max: u64,
-    /// Optional abilities of the sender; what both have may be used: [`CLASSES`], [`CANCEL`].
+    /// Optional abilities of the sender; what both have may be used: [`CLASSES`], [`CANCEL`], [`GUARD`].
     #[serde(default)]
     pub(crate) features: Vec<String>,
     /// What travels on this connection.

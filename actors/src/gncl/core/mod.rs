@@ -27,12 +27,13 @@ use std::{
 use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
     time::Time,
+    wire::Checksum,
 };
 
 use super::LinkFact;
 use acquaintance::Acquaintance;
 pub(super) use handshake::{
-    CANCEL, CLASSES, Decline, HANDSHAKE_PAYLOAD_MAX, Introduction, Lane, Refusal, read, write,
+    CANCEL, CLASSES, Decline, GUARD, HANDSHAKE_PAYLOAD_MAX, Introduction, Lane, Refusal, read, write,
 };
 
 /// What the core is set to.
@@ -148,10 +149,19 @@ pub(super) struct Attach {
     pub(super) by_class: bool,
     /// Whether the peer takes back what nobody waits for any more.
     pub(super) takes_cancels: bool,
+    /// Whether the peer's frames have guards, and ours.
+    pub(super) is_guarded: bool,
     /// Longest payload that the peer takes, in bytes.
     pub(super) payload_max: u64,
     /// To be sent before all else.
     pub(super) welcome: Option<Introduction>,
+}
+
+impl Attach {
+    /// What the frames on this connection have for a checksum. spec: FRAME-3.1
+    pub(super) const fn checksum(&self) -> Checksum {
+        if self.is_guarded { Checksum::Guarded } else { Checksum::Crc }
+    }
 }
 
 /// How far a connection has come.

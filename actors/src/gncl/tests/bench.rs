@@ -16,13 +16,13 @@ use sinew_runtime::{
     supervision::ReadyGate,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
-    wire::{Flags, FrameCodec, Header, Kind, Message},
+    wire::{Checksum, Flags, FrameCodec, Header, Kind, Message},
 };
 use tokio::{
     net::{TcpListener, TcpStream},
     task::JoinHandle,
 };
-use tokio_util::codec::{Decoder, Encoder};
+use tokio_util::codec::Decoder;
 
 use crate::{
     config::NodeConfig,
@@ -269,6 +269,8 @@ pub(super) struct ByHand {
     buffer: bytes::BytesMut,
     /// The number of what it sends next in its session.
     number: u16,
+    /// What its frames have for a checksum.
+    checksum: Checksum,
 }
 
 impl ByHand {
@@ -279,7 +281,7 @@ impl ByHand {
     }
 
     pub(super) fn on(socket: TcpStream) -> Self {
-        Self { socket, buffer: bytes::BytesMut::new(), number: 1 }
+        Self { socket, buffer: bytes::BytesMut::new(), number: 1, checksum: Checksum::Crc }
     }
 
     /// A link to `node`, as its peer number 9.
@@ -298,6 +300,9 @@ impl ByHand {
         let welcome: Introduction = read(&welcome.payload).expect("a WELCOME has a payload");
         assert_eq!((welcome.node, welcome.peer), (node.address(), NINE));
         assert_eq!((welcome.lane, welcome.link), (hello.lane, hello.link));
+        if hello.knows("guard") {
+            peer.checksum = Checksum::Guarded;
+        }
         peer.begin(node).await;
         peer
     }
@@ -324,7 +329,8 @@ impl ByHand {
             message.header.number = self.number;
             self.number = self.number.wrapping_add(1);
         }
-        FrameCodec::new(usize::MAX).encode(&message, &mut bytes).unwrap();
+        bytes.extend_from_slice(&self.checksum.encode(&message.header, &message.payload));
+        bytes.extend_from_slice(&message.payload);
         self.say_bytes(&bytes).await;
     }
 

@@ -1,9 +1,12 @@
 //! Who is taken and who is refused, in which words.
 
-use sinew_runtime::wire::Kind;
+use sinew_runtime::{
+    tid::Tid,
+    wire::{Checksum, Header, Kind, Message},
+};
 use tokio::net::TcpListener;
 
-use super::bench::{ByHand, NINE, Node, introduction, run, within};
+use super::bench::{ByHand, KIND, NINE, Node, introduction, run, within};
 use crate::gncl::{
     LinkFact,
     core::{Introduction, read, write},
@@ -164,5 +167,26 @@ fn a_hello_of_ours_carries_who_we_are_and_whom_we_want() {
         assert_eq!((said.node, said.peer, said.name.as_str()), (node.address(), NINE, "node-1"));
         assert_eq!(said.payload_max, 1 << 20);
         assert!(said.dial > 0);
+    });
+}
+
+#[test]
+fn a_length_that_was_damaged_on_the_way_ends_its_link_with_the_header_where_both_know_guards() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let hello = Introduction { features: vec!["guard".to_owned()], ..introduction(node.address()) };
+        let mut peer = ByHand::greeting(&node, &hello).await;
+        node.up().await;
+        let mut message = Message::new(
+            Header::new(KIND, Tid::new(NINE, node.tid(1).app), node.tid(2)),
+            vec![7; 100].into(),
+        );
+        message.header.number = 1;
+        let mut head = Checksum::Guarded.encode(&message.header, &message.payload);
+        // 100 bytes become 65,636.
+        head[6] ^= 1;
+        peer.say_bytes(&head).await;
+        peer.say_bytes(&message.payload).await;
+        assert_eq!(peer.refusal().await.cause, "violation");
     });
 }

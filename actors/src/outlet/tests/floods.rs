@@ -35,7 +35,7 @@ impl Flood {
             (Arc::new(StreamOutlet::new(limits)), Arc::new(Wire::default()), Arc::default());
         wire.room.store(room, Ordering::Relaxed);
         let socket = Counting { wire: Arc::clone(&wire), writes: Arc::clone(&writes) };
-        let link = outlet.connect(Gathering::new(socket), usize::MAX, None);
+        let link = outlet.connect(Gathering::new(socket, Checksum::Crc), usize::MAX, None);
         Self { outlet, wire, writes, link }
     }
 
