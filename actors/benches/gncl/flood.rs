@@ -22,6 +22,8 @@ use crate::{nodes::At, ping::DEADLINE};
 const PACKET: usize = 1000;
 /// Confirmed packets that are under way at most: as many as a mailbox holds of which nothing was said.
 const UNDER_WAY: usize = 256;
+/// Packets that bare TCP gets in one write, where it gets many.
+const TOGETHER: usize = 32;
 /// How long the sender waits when there is no room.
 const PAUSE: Duration = Duration::from_micros(100);
 
@@ -34,16 +36,19 @@ pub(crate) enum Carrier {
     Unconfirmed,
     /// Bare TCP, a length before each packet, a write for each.
     Tcp,
+    /// The same, a write for 32 KiB.
+    TcpTogether,
 }
 
 impl Carrier {
-    pub(crate) const ALL: [Self; 3] = [Self::Confirmed, Self::Unconfirmed, Self::Tcp];
+    pub(crate) const ALL: [Self; 4] = [Self::Confirmed, Self::Unconfirmed, Self::Tcp, Self::TcpTogether];
 
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Confirmed => "confirmed",
             Self::Unconfirmed => "unconfirmed",
             Self::Tcp => "raw_tcp",
+            Self::TcpTogether => "raw_tcp_together",
         }
     }
 
@@ -91,13 +96,14 @@ pub(crate) fn measure(carrier: Carrier, packets: usize, pinning: Pinning) {
 pub(crate) fn run(carrier: Carrier, packets: usize, at: At, role: &str) -> Duration {
     match carrier {
         Carrier::Confirmed | Carrier::Unconfirmed => between_nodes(carrier, packets, at, role),
-        Carrier::Tcp => raw(packets, role),
+        Carrier::Tcp => raw(packets, 1, role),
+        Carrier::TcpTogether => raw(packets, TOGETHER, role),
     }
 }
 
 /// The end that takes them.
 pub(crate) fn sink(carrier: Carrier, packets: usize, at: At) {
-    if carrier == Carrier::Tcp {
+    if matches!(carrier, Carrier::Tcp | Carrier::TcpTogether) {
         return raw_sink(packets);
     }
     let app = AppSpec::new("sink", move || Sink { left: packets }).handles::<Packet>().own_thread();
@@ -143,7 +149,9 @@ impl Actor for Flooder {
         let flood = async move {
             match carrier {
                 Carrier::Confirmed => confirmed(&sender, to, packets).await,
-                Carrier::Unconfirmed | Carrier::Tcp => unconfirmed(&sender, to, packets).await,
+                Carrier::Unconfirmed | Carrier::Tcp | Carrier::TcpTogether => {
+                    unconfirmed(&sender, to, packets).await;
+                }
             }
         };
         context.spawn(flood.into_actor(self));
@@ -198,14 +206,19 @@ fn between_nodes(carrier: Carrier, packets: usize, at: At, role: &str) -> Durati
     took
 }
 
-fn raw(packets: usize, role: &str) -> Duration {
+fn raw(packets: usize, together: usize, role: &str) -> Duration {
     let (mut ours, theirs) = stream::tcp_pair();
     let _sink = Process::start_on(role, theirs.into());
     let mut framed = vec![7; 4 + PACKET];
     framed[..4].copy_from_slice(&(PACKET as u32).to_le_bytes());
+    let mut buffer = Vec::new();
     let start = Instant::now();
-    for _ in 0..packets {
-        ours.write_all(&framed).expect("the sink reads");
+    for packet in 1..=packets {
+        buffer.extend_from_slice(&framed);
+        if packet % together == 0 || packet == packets {
+            ours.write_all(&buffer).expect("the sink reads");
+            buffer.clear();
+        }
     }
     ours.read_exact(&mut [0]).expect("the sink answers");
     start.elapsed()

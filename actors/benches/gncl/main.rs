@@ -8,7 +8,7 @@
 //!   every millisecond, between applications on their nodes' IO threads (also with `gncl.spin`) or on threads of their own; beside blocking TCP.
 //!   `sleeps` is how often a thread of either process went to sleep for each message, which another one had to end.
 //! - `flood-CARRIER-CPUS`: packets of 1000 bytes in class Bulk one way, as fast as they go, confirmed or not, and through bare
-//!   TCP.
+//!   TCP, with a write for each and with one for 32.
 //! - `table_2-N`: the paper's test, every node to every other one, 1000 bytes with a full echo, 3, 8 and 16 nodes at 2,000 round
 //!   trips a second together; `cpu_ns_each_message` is what all processes needed by what arrived, `sleeps_each_1000_messages` how often a thread of theirs
 //!   went to sleep. `table_2_raw_tcp-N`: the same by bare TCP, one thread a process.

@@ -14,7 +14,7 @@ use std::{
 
 use sinew_runtime::{
     time::Time,
-    wire::{Checksum, Message},
+    wire::{Checksum, Class, Flags, Message},
 };
 
 use super::{
@@ -28,9 +28,8 @@ const AT_ONCE: u64 = 4;
 /// Who sends the next message sooner than this after the last one was written has not waited for anybody: half of what a write to
 /// a socket takes, a quarter of the quickest answer over the loopback interface.
 const RIGHT_BEHIND: Duration = Duration::from_micros(2);
-/// Who has not waited for anybody may send one more at once for so long a pause, beside the one after it: whoever floods and is interrupted
-/// floods on.
-const PAUSE: Duration = Duration::from_micros(25);
+/// Who has flooded and pauses may send one at once for each such time: whoever is interrupted floods on.
+const PAUSE: Duration = Duration::from_micros(50);
 /// Bytes that are gathered before they are written: what a sender [writes himself](super::draining), and one message more.
 const GATHERED_MAX: usize = 40 << 10;
 
@@ -44,23 +43,27 @@ pub(super) struct Pace {
     last: Time,
     /// Messages that may be written at once.
     credit: u64,
+    /// More came right behind each other than that.
+    floods: bool,
 }
 
 impl Pace {
     pub(super) const fn new() -> Self {
-        Self { last: Time::ZERO, credit: AT_ONCE }
+        Self { last: Time::ZERO, credit: AT_ONCE, floods: false }
     }
 
-    /// A message comes that was sent at `sent`. Returns whether it is one of a flood.
-    pub(super) fn is_flood(&mut self, sent: Time) -> bool {
+    /// A message comes that was sent at `sent`. Returns whether it is one of a flood. One that is not patient goes at once after any pause.
+    pub(super) fn is_flood(&mut self, sent: Time, is_patient: bool) -> bool {
         let pause = sent.since(self.last);
         if pause >= RIGHT_BEHIND {
-            let regained = 1 + (pause.as_nanos() / PAUSE.as_nanos()) as u64;
-            self.credit = AT_ONCE.min(self.credit.saturating_add(regained));
+            let of_a_flood = u64::from(!is_patient) + (pause.as_nanos() / PAUSE.as_nanos()) as u64;
+            self.credit = if self.floods { AT_ONCE.min(of_a_flood) } else { AT_ONCE };
+            self.floods = false;
         }
         self.last = self.last.max(sent);
         let is_flood = self.credit == 0;
         self.credit = self.credit.saturating_sub(1);
+        self.floods |= is_flood;
         is_flood
     }
 
@@ -76,7 +79,7 @@ impl<S: Socket> Half<S> {
         let Link::Up(socket) = &self.link else { return false };
         // What the layers say carries no time.
         let now = || if message.header.sent == Time::ZERO { Time::now() } else { message.header.sent };
-        socket.gathers() && self.pace.is_flood(now())
+        socket.gathers() && self.pace.is_flood(now(), is_patient(message))
     }
 
     /// Its sender has just written a message; the clock is read only where that matters.
@@ -85,6 +88,12 @@ impl<S: Socket> Half<S> {
             self.pace.written(Time::now());
         }
     }
+}
+
+/// Whether a message that has to wait may wait for the next one.
+pub(super) fn is_patient(message: &Message) -> bool {
+    let header = &message.header;
+    message.size() <= SHORT && (header.class == Class::Bulk || header.flags.has(Flags::OUTCOME))
 }
 
 /// A socket that gathers frames.
@@ -171,7 +180,7 @@ mod tests {
         let (mut pace, mut now) = (Pace::new(), 1_000_000);
         let submit = |_| {
             now += gap;
-            let is_flood = pace.is_flood(Time::from_nanos(now));
+            let is_flood = pace.is_flood(Time::from_nanos(now), false);
             if !is_flood {
                 now += write;
                 pace.written(Time::from_nanos(now));
@@ -192,23 +201,35 @@ mod tests {
     }
 
     #[test]
-    fn who_is_interrupted_in_a_flood_sends_one_at_once_and_floods_on() {
+    fn nor_are_those_with_several_messages_each() {
         let mut pace = Pace::new();
-        let mut at = |nanos: u64| pace.is_flood(Time::from_nanos(1_000_000 + nanos));
-        let flood: Vec<bool> = (0..6).map(|n| at(n * 100)).collect();
-        assert_eq!(flood, [false, false, false, false, true, true]);
-        let after: Vec<bool> = (0..4).map(|n| at(10_000 + n * 100)).collect();
-        assert_eq!(after, [false, true, true, true]);
-        let rested: Vec<bool> = (0..6).map(|n| at(1_000_000 + n * 100)).collect();
-        assert_eq!(rested, [false, false, false, false, true, true]);
+        let times = (0..1_000).flat_map(|round| (0..4).map(move |n| 1_000_000 + round * 5_000 + n * 100));
+        assert!(!times.into_iter().any(|nanos| pace.is_flood(Time::from_nanos(nanos), false)));
+    }
+
+    /// Of six messages right behind each other: which are of a flood, in one that begins, after 10 us, and after a millisecond.
+    fn interrupted(is_patient: bool) -> [Vec<bool>; 3] {
+        let mut pace = Pace::new();
+        [0, 10_000, 1_000_000].map(|begins| {
+            let times = (0..6).map(|n| Time::from_nanos(1_000_000 + begins + n * 100));
+            times.map(|sent| pace.is_flood(sent, is_patient)).collect()
+        })
+    }
+
+    #[test]
+    fn who_is_interrupted_in_a_flood_floods_on_but_for_one_that_is_not_patient() {
+        let begins = vec![false, false, false, false, true, true];
+        let goes_on = vec![false, true, true, true, true, true];
+        assert_eq!(interrupted(false), [begins.clone(), goes_on, begins.clone()]);
+        assert_eq!(interrupted(true), [begins.clone(), vec![true; 6], begins]);
     }
 
     #[test]
     fn what_comes_after_a_pause_is_written_at_once_again() {
         let mut pace = Pace::new();
         let at = |nanos: u64| Time::from_nanos(1_000_000 + nanos);
-        let floods: Vec<bool> = (0..9).map(|n| pace.is_flood(at(n * 100))).collect();
+        let floods: Vec<bool> = (0..9).map(|n| pace.is_flood(at(n * 100), false)).collect();
         assert_eq!(floods[8..], [true]);
-        assert!(!pace.is_flood(at(3_000)));
+        assert!(!pace.is_flood(at(3_000), false));
     }
 }

@@ -15,7 +15,7 @@ use sinew_runtime::{
 use super::{
     LinkNumber, OutletCounts, OutletLimits, Socket,
     account::Tally,
-    batch::{Pace, SHORT},
+    batch::{Pace, is_patient},
     outstanding::{Outstanding, Sent},
     partial::{Partial, Sort, Written},
     resume::Session,
@@ -480,12 +480,6 @@ impl<S: Socket> Half<S> {
     pub(super) const fn counts(&self) -> OutletCounts {
         self.counts
     }
-}
-
-/// Whether a message that has to wait may wait for the next one.
-fn is_patient(message: &Message) -> bool {
-    let header = &message.header;
-    message.size() <= SHORT && (header.class == Class::Bulk || header.flags.has(Flags::OUTCOME))
 }
 
 const fn bounds(limits: OutletLimits) -> Bounds {

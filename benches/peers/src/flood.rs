@@ -31,8 +31,13 @@ const ZENOH: &str = "zenoh";
 
 /// What carries the packets: TCP with a length before each; zenoh; Sinew from application to application on threads of their
 /// own, each packet confirmed, or none.
-const CARRIERS: [&str; 4] =
-    [Carrier::Tcp.name(), ZENOH, Carrier::Confirmed.name(), Carrier::Unconfirmed.name()];
+const CARRIERS: [&str; 5] = [
+    Carrier::Tcp.name(),
+    Carrier::TcpTogether.name(),
+    ZENOH,
+    Carrier::Confirmed.name(),
+    Carrier::Unconfirmed.name(),
+];
 
 /// Runs every case whose name holds every word.
 pub(crate) fn run(is_short: bool, words: &[String]) {
