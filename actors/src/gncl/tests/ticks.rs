@@ -20,16 +20,23 @@ fn nobody_looks_while_there_is_nothing() {
             left.get() > 0
         };
         let mut looking = std::pin::pin!(ticks.run(PERIOD, look));
-        let mut for_a_while =
-            async || timeout(50 * PERIOD, looking.as_mut()).await.expect_err("it never ends");
-        for_a_while().await;
-        assert_eq!(looks.get(), 4, "twice there was something, and twice nothing");
-        for_a_while().await;
-        assert_eq!(looks.get(), 4, "nothing was wanted");
+        let mut comes_to = async |count| {
+            let reached = async {
+                while looks.get() < count {
+                    let looked = timeout(PERIOD, looking.as_mut()).await;
+                    looked.expect_err("it never ends");
+                }
+            };
+            within("so many looks", reached).await;
+            timeout(20 * PERIOD, looking.as_mut()).await.expect_err("it never ends");
+            assert_eq!(looks.get(), count, "then nothing was wanted");
+        };
+        // Twice there is something, and twice nothing.
+        comes_to(4).await;
         ticks.want();
         ticks.want();
-        for_a_while().await;
-        assert_eq!(looks.get(), 6, "nothing, looked at twice");
+        // There is nothing, looked at twice.
+        comes_to(6).await;
     });
 }
 
