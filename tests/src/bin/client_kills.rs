@@ -27,6 +27,9 @@ struct Arguments {
     /// How long the others are measured with nobody killed, before and after, in milliseconds.
     #[arg(long, default_value_t = 10_000)]
     reference_ms: u64,
+    /// Those that are killed have the lowest priority (nice 19).
+    #[arg(long)]
+    yields: bool,
     /// What all chance comes from; another one each time if it is not given.
     #[arg(long, default_value_t = u64::from(std::process::id()))]
     seed: u64,
@@ -36,7 +39,7 @@ fn main() -> ExitCode {
     if let Some(code) = play() {
         return code;
     }
-    let Arguments { kills, spacing_ms, reference_ms, seed } = Arguments::parse();
+    let Arguments { kills, spacing_ms, reference_ms, yields, seed } = Arguments::parse();
     println!("seed {seed}");
     let report = run(Plan {
         program: std::env::current_exe().expect("a program has a path"),
@@ -44,6 +47,7 @@ fn main() -> ExitCode {
         spacing: Duration::from_millis(spacing_ms),
         reference: Duration::from_millis(reference_ms),
         seed,
+        yields,
     });
     println!("{report}");
     if report.holds() { ExitCode::SUCCESS } else { ExitCode::FAILURE }

@@ -14,6 +14,8 @@ use std::{
     time::{Duration, Instant},
 };
 
+use rustix::process::setpriority_process;
+
 use super::{
     Performer, Stage, StageLimits,
     held::{Held, files_of_the_host},
@@ -44,6 +46,9 @@ pub struct Plan {
     pub reference: Duration,
     /// Decides who is killed when.
     pub seed: u64,
+    /// Those that are killed have the lowest priority, as programs beside a control loop should: what is measured is what they cost
+    /// the node and its other clients, not what four busy processes cost a machine of two CPUs.
+    pub yields: bool,
 }
 
 /// What was seen.
@@ -166,6 +171,10 @@ impl Cast {
             held_loans: 0,
             ended_by_themselves: 0,
         };
+        if cast.plan.yields {
+            // Inherited by every process that this thread starts from now on.
+            setpriority_process(None, 19).expect("anybody may be nicer");
+        }
         cast.fill();
         cast
     }

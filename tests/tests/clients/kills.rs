@@ -15,6 +15,7 @@ fn twenty_killed_processes_that_held_loans_leave_nothing_behind() {
         spacing: Duration::from_millis(40),
         reference: Duration::from_millis(400),
         seed: u64::from(std::process::id()),
+        yields: false,
     });
     println!("{report}");
     assert!(report.holds(), "{report}");
