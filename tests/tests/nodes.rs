@@ -1,10 +1,17 @@
 //! Whole nodes on this host: found, killed, restarted, stopped in order, configured wrongly.
 
-use std::{net::SocketAddrV4, path::PathBuf};
+use std::{
+    net::SocketAddrV4,
+    path::PathBuf,
+    time::{Duration, Instant},
+};
 
 use rustix::process::Signal;
 use sinew::{NodeApi, Registration, StartError};
 use sinew_tests::{Ground, OwnDirectory, Program, node_under_test, own_group, process_under_test};
+
+/// How often a node that is told to sends.
+const SENT_EVERY: Duration = Duration::from_millis(20);
 
 /// A node of a scenario: its own address on loopback, the scenario's own multicast group.
 struct Scenario {
@@ -103,16 +110,20 @@ fn a_wrong_configuration_is_refused_with_all_its_faults() {
 
 #[test]
 fn a_second_node_with_the_same_address_is_not_let_in() {
-    let scenario = Scenario::new();
-    let mut hip = scenario.start("hip", 1, &[]);
+    // Given: two nodes, of which one sends to the other
+    let (scenario, began) = (Scenario::new(), Instant::now());
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee", "--sends-to", "knee"]);
     let mut knee = scenario.start("knee", 2, &[]);
-    hip.wait_for(&["NodeFound", "knee"]);
+    knee.wait_for(&["count 1 ", "from 127.0.0.1"]);
+    // When: another one claims the address of the second, and then a newcomer meets all of them
     let mut impostor = scenario.start("impostor", 2, &[]);
     impostor.wait_for(&["up"]);
-    // Whoever it is that the newcomer meets, the two that were there go on.
-    let mut ankle = scenario.start("ankle", 3, &["--requires", "knee", "--sends-to", "knee"]);
+    let mut ankle = scenario.start("ankle", 3, &["--requires", "hip", "--sends-to", "hip"]);
     ankle.wait_for(&["started"]);
-    knee.wait_for(&["count", "from 127.0.0.3"]);
+    hip.wait_for(&["count", "from 127.0.0.3"]);
+    // Then: whichever of the two it is that the newcomer takes for the second, the two that were there go on
+    let not_sent_yet = began.elapsed().as_millis() / SENT_EVERY.as_millis() + 1;
+    knee.wait_for(&[&format!("count {not_sent_yet} "), "from 127.0.0.1"]);
     assert!(hip.said().iter().all(|line| !line.contains("impostor")));
 }
 
