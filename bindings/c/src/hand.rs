@@ -1,19 +1,26 @@
 //! What a program in C has in hand: values behind numbers, so that one that was given back is refused, not followed.
 
-/// Values in the hand of a program, each behind a token that no other value ever had.
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// Bits of a token that say its place.
+const PLACE_BITS: u32 = 16;
+/// Values that were ever taken into any hand of this process: what one endpoint has in hand is nobody else's.
+static TAKEN: AtomicU64 = AtomicU64::new(1);
+
+/// Values in the hand of a program, each behind a token that no other value of this process ever had.
 #[derive(Debug)]
 pub(crate) struct Hand<T> {
     /// The token of each place's value, and the value.
     places: Vec<(u64, Option<T>)>,
     free: Vec<usize>,
     limit: usize,
-    taken: u64,
 }
 
 impl<T> Hand<T> {
-    /// A hand for at most `limit` values.
+    /// A hand for at most `limit` values, which is below 65,536.
     pub(crate) const fn new(limit: usize) -> Self {
-        Self { places: Vec::new(), free: Vec::new(), limit, taken: 0 }
+        assert!(limit < 1 << PLACE_BITS, "a place has so many bits");
+        Self { places: Vec::new(), free: Vec::new(), limit }
     }
 
     pub(crate) const fn is_full(&self) -> bool {
@@ -30,21 +37,19 @@ impl<T> Hand<T> {
                 self.places.len() - 1
             }
         };
-        self.taken += 1;
-        let token = self.taken * self.limit as u64 + place as u64;
+        let token = TAKEN.fetch_add(1, Ordering::Relaxed) << PLACE_BITS | place as u64;
         self.places[place] = (token, Some(value));
         Ok(token)
     }
 
     pub(crate) fn get_mut(&mut self, token: u64) -> Option<&mut T> {
-        let place = self.place_of(token);
-        let (held, value) = self.places.get_mut(place)?;
+        let (held, value) = self.places.get_mut(place_of(token))?;
         if *held == token { value.as_mut() } else { None }
     }
 
     /// Gives a value out of the hand.
     pub(crate) fn give(&mut self, token: u64) -> Option<T> {
-        let place = self.place_of(token);
+        let place = place_of(token);
         let (held, value) = self.places.get_mut(place)?;
         if *held != token {
             return None;
@@ -59,10 +64,10 @@ impl<T> Hand<T> {
         self.free.clear();
         std::mem::take(&mut self.places).into_iter().filter_map(|(_, value)| value)
     }
+}
 
-    const fn place_of(&self, token: u64) -> usize {
-        (token % self.limit as u64) as usize
-    }
+const fn place_of(token: u64) -> usize {
+    (token & ((1 << PLACE_BITS) - 1)) as usize
 }
 
 #[cfg(test)]
@@ -83,6 +88,14 @@ mod tests {
         }
         assert_eq!(hand.give(second), Some('b'));
         assert_eq!(hand.give(second), None);
+    }
+
+    #[test]
+    fn a_token_of_another_hand_is_good_for_nothing() {
+        let (mut one, mut other) = (Hand::new(2), Hand::new(1));
+        let (here, there) = (one.take('a').unwrap(), other.take('b').unwrap());
+        assert_eq!((one.give(there), other.give(here)), (None, None));
+        assert_eq!((one.give(here), other.give(there)), (Some('a'), Some('b')));
     }
 
     #[test]

@@ -212,6 +212,38 @@ static void used_twice(sinew_endpoint *endpoint)
     EXPECT(sinew_unregister(&other), SINEW_OK);
 }
 
+static void have_in_hand(sinew_endpoint *endpoint, sinew_received *received)
+{
+    EXPECT(sinew_send_bytes(endpoint, sinew_endpoint_tid(endpoint), kind, SINEW_CONTROL, NULL, 0), SINEW_OK);
+    EXPECT(sinew_receive_message(endpoint, 10 * SECOND, received), SINEW_OK);
+}
+
+/* What one endpoint has in hand is not another one's, whatever that has in hand at the same place, and whenever it came. */
+static void in_another_hand(sinew_endpoint *endpoint)
+{
+    sinew_endpoint *other = new_endpoint();
+    sinew_message mine = new_message(endpoint, sinew_endpoint_tid(other), 1), theirs = new_message(other, sinew_endpoint_tid(other), 1);
+    sinew_received here, there, later;
+    mine.bytes[0] = 1;
+    theirs.bytes[0] = 2;
+    EXPECT(sinew_send_message(other, &mine), SINEW_ERROR_NO_SUCH_MESSAGE);
+    EXPECT(sinew_send_message(endpoint, &mine), SINEW_OK);
+    EXPECT(sinew_discard_message(other, &theirs), SINEW_OK);
+    EXPECT(sinew_receive_message(other, 10 * SECOND, &there), SINEW_OK);
+    EXPECT(there.bytes[0], 1);
+    have_in_hand(endpoint, &here);
+    EXPECT(sinew_settle_message(other, &here, SINEW_DELIVERED), SINEW_ERROR_NO_SUCH_MESSAGE);
+    theirs = new_message(other, here.source, 1);
+    EXPECT_WORDS(sinew_reply(other, &here, &theirs), SINEW_ERROR_NO_SUCH_MESSAGE, "the request");
+    EXPECT(sinew_settle_message(endpoint, &here, SINEW_DELIVERED), SINEW_OK);
+    EXPECT(sinew_unregister(&other), SINEW_OK);
+    other = new_endpoint();
+    have_in_hand(other, &later);
+    EXPECT(sinew_settle_message(other, &there, SINEW_DELIVERED), SINEW_ERROR_NO_SUCH_MESSAGE);
+    EXPECT(sinew_settle_message(other, &later, SINEW_DELIVERED), SINEW_OK);
+    EXPECT(sinew_unregister(&other), SINEW_OK);
+}
+
 /* One message is lent at a time, on every way, and nothing else goes out before it. */
 static void one_at_a_time(const char *way, uint32_t links)
 {
@@ -328,6 +360,7 @@ int main(int argc, char **argv)
     null_arguments(endpoint);
     wrong_values(endpoint);
     used_twice(endpoint);
+    in_another_hand(endpoint);
     whose_it_is_after_an_error(endpoint);
     one_at_a_time("rings", 0);
     one_at_a_time("direct links", SINEW_DIRECT);
