@@ -140,6 +140,8 @@ impl Router {
         let table = self.table.load();
         let result = if destination.is_single() {
             Self::send_to_one(&table, self.node, message)
+        } else if destination.app == AppAddress::NONE {
+            Err(Refused::new(message, Rejection::NoSuchApplication))
         } else if message.receipt.is_some() || message.header.flags.has(Flags::ASK) {
             Err(Refused::new(message, Rejection::Unsupported))
         } else {

@@ -160,6 +160,19 @@ fn so_many_of_a_process_may_be_silent_and_those_that_have_spoken_do_not_count() 
 }
 
 #[test]
+fn who_sends_to_nobody_at_all_is_told() {
+    // As whoever overlooks that a name is nobody's does.
+    let node = TestNode::start();
+    let (mut client, tid) = RawClient::register(&node, &Register::default());
+    client.send(&Message::typed(tid, Tid::NONE, &Angle { degrees: 1.0 }));
+    let said = client.next().expect("what nobody has taken");
+    let Untaken { entries } = payload::read(&said.payload).unwrap();
+    let [entry] = &entries[..] else { panic!("{entries:?} of one destination") };
+    assert_eq!((entry.to, entry.count), (Tid::NONE.bits(), 1));
+    assert_eq!(Outcome::from_code(entry.why), Some(Outcome::Rejected(Rejection::NoSuchApplication)));
+}
+
+#[test]
 fn who_sends_more_than_its_destination_takes_is_told_how_much_of_it_and_not_of_each_message() {
     // What the application that the test plays takes.
     const ROOM: u64 = 1_024;

@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 
 use sinew_runtime::{
     outcome::{Outcome, Rejection, Ticket},
-    tid::Tid,
+    tid::{AppAddress, Tid},
     time::Time,
     wire::{Flags, Header, Kind, Message},
 };
@@ -61,9 +61,9 @@ impl Client {
         }
         if let Err(why) = router.send(message)
             && !is_confirmed
-            && destination.is_single()
+            && (destination.is_single() || destination.app == AppAddress::NONE)
         {
-            // The source of a confirmed message knows; a group without members is no fault.
+            // The source of a confirmed message knows; a group without members is no fault, nobody at all is one.
             let (detail, now) = (format!("from {} to {destination}: {why}", self.tid), Time::now());
             self.server.refusals.count(now, "unconfirmed message not taken", &detail);
             self.notices.count(destination, why, now);
