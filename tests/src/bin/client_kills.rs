@@ -24,7 +24,7 @@ struct Arguments {
     /// From one kill to the next, in milliseconds.
     #[arg(long, default_value_t = 40)]
     spacing_ms: u64,
-    /// How long the others are measured with nobody killed, before and after, in milliseconds.
+    /// How long the others are measured with nobody killed, before the kills, in milliseconds.
     #[arg(long, default_value_t = 10_000)]
     reference_ms: u64,
     /// Those that are killed have the lowest priority (nice 19).
