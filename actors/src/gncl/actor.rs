@@ -3,6 +3,7 @@
 mod leaving;
 #[cfg(target_os = "linux")]
 mod lost_addresses;
+mod wire;
 
 use std::{
     cell::RefCell,
@@ -21,7 +22,6 @@ use sinew_runtime::{
     time::Time,
     wire::{Kind, Message},
 };
-use socket2::SockRef;
 use tokio::net::TcpStream;
 
 use super::{
@@ -41,11 +41,12 @@ use crate::{
     config::NodeConfig,
     ndl,
     ndl::{KnownNode, LossReason, MembershipFact},
-    outlet::{Gathering, LinkNumber},
+    outlet::Gathering,
     stores::{Stores, lock},
     sync,
 };
 pub(crate) use leaving::LINGER;
+use wire::{Wire, shut};
 
 /// GNCL's actor.
 pub(crate) struct Gncl {
@@ -57,17 +58,6 @@ pub(crate) struct Gncl {
     alarm: Option<(Time, SpawnHandle)>,
     /// When it goes, whoever has not hung up; set once the node is being stopped.
     goes_at: Option<Time>,
-}
-
-/// One connection and what runs for it.
-struct Wire {
-    socket: Option<Arc<TcpStream>>,
-    mode: SharedMode,
-    /// Which of its peer's connections it is, and what writes there, as long as it is a link.
-    link: Option<(LinkNumber, SpawnHandle)>,
-    /// Whether what was written so far ends with a whole frame, so that words can follow.
-    may_speak: bool,
-    tasks: Vec<SpawnHandle>,
 }
 
 impl Gncl {
@@ -336,22 +326,6 @@ impl Gncl {
 enum AfterSpeaking {
     Listen,
     Hush,
-}
-
-impl Wire {
-    fn new(socket: Option<Arc<TcpStream>>, mode: SharedMode, reader: SpawnHandle) -> Self {
-        Self { socket, mode, link: None, may_speak: true, tasks: vec![reader] }
-    }
-
-    fn set_mode(&self, mode: Mode) {
-        *lock(&self.mode) = mode;
-    }
-}
-
-/// Shuts a socket that others may still hold.
-fn shut(socket: &TcpStream, how: Shutdown) {
-    // It fails if the peer was faster, and then there is nothing left to shut.
-    let _ = SockRef::from(socket).shutdown(how);
 }
 
 fn settings(stores: &Stores) -> Settings {
