@@ -16,6 +16,7 @@
 //! | [`pending`], [`sender`] | sending, and waiting for what comes of it |
 //! | [`schedule`] | what an actor does when |
 //! | [`app`] | what an application is |
+//! | [`timer`] | the kernel's timer, exact to microseconds |
 //! | [`supervision`] | who is started, when, and again after a fault |
 //! | [`log`] | what the runtime says of itself, without waiting for who reads it |
 
@@ -32,5 +33,6 @@ pub mod sender;
 pub mod supervision;
 pub mod tid;
 pub mod time;
+pub mod timer;
 pub mod wakes;
 pub mod wire;

@@ -7,9 +7,8 @@ use std::{
     thread::{self, ThreadId},
 };
 
-use rustix::time::{
-    Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec, timerfd_create, timerfd_settime,
-};
+use rustix::time::{Itimerspec, TimerfdTimerFlags, Timespec, timerfd_settime};
+use sinew_runtime::timer::kernel_timer;
 use tokio::{io::unix::AsyncFd, runtime::Handle};
 
 /// How long what is patient waits for more of its sort, in nanoseconds. Waking a thread of a CPU that has gone idle takes about half of
@@ -58,14 +57,7 @@ impl Rouser {
 
 impl Timer {
     fn new() -> io::Result<Self> {
-        let timer =
-            timerfd_create(TimerfdClockId::Monotonic, TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC)?;
-        #[expect(
-            deprecated,
-            reason = "sound for an OwnedFd, whose descriptor never changes; its successor is an unsafe fn, and unsafe code lives in sinew-shm alone"
-        )]
-        let timer = AsyncFd::new(timer)?;
-        Ok(Self { timer, is_set: false, drainer: thread::current().id() })
+        Ok(Self { timer: kernel_timer()?, is_set: false, drainer: thread::current().id() })
     }
 
     fn rouse_later(&mut self) -> bool {

@@ -6,12 +6,10 @@ use std::{
     task::{Context, Poll},
 };
 
-use rustix::time::{
-    Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec, timerfd_create, timerfd_settime,
-};
+use rustix::time::{Itimerspec, TimerfdTimerFlags, Timespec, timerfd_settime};
 use tokio::io::unix::AsyncFd;
 
-use crate::time::Time;
+use crate::{time::Time, timer::kernel_timer};
 
 /// One timer of the kernel's, on the monotonic clock.
 #[derive(Debug)]
@@ -23,14 +21,7 @@ pub(super) struct Alarm {
 impl Alarm {
     /// A timer that is not set, in the reactor of the calling thread.
     pub(super) fn new() -> io::Result<Self> {
-        let timer =
-            timerfd_create(TimerfdClockId::Monotonic, TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC)?;
-        #[expect(
-            deprecated,
-            reason = "sound for an OwnedFd, whose descriptor never changes; its successor is an unsafe fn, and unsafe code lives in sinew-shm alone"
-        )]
-        let timer = AsyncFd::new(timer)?;
-        Ok(Self { timer, set_for: None })
+        Ok(Self { timer: kernel_timer()?, set_for: None })
     }
 
     /// Wakes the task at `at`, or soon if that has passed; never if `at` is `None`.
