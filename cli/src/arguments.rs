@@ -4,7 +4,9 @@ use std::{net::Ipv4Addr, path::PathBuf, time::Duration};
 
 use clap::{Parser, Subcommand};
 
-/// Shows a running Sinew system, from any one node of it. It changes nothing.
+use crate::send::Order;
+
+/// Shows a running Sinew system, from any one node of it. It changes nothing, but for what `send` sends.
 ///
 /// It comes in through the socket of a node on this machine (`lncl.socket` in the node's configuration) and asks that node, and through
 /// it all others.
@@ -49,6 +51,10 @@ pub(crate) enum Command {
         #[arg(long, short, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
         count: u32,
     },
+    /// Sends a message, and says what became of it
+    ///
+    /// The payload is written as MessagePack, as every typed payload is: what its type calls its fields are the keys of the JSON object.
+    Send(Order),
     /// Who waits for whom at start-up barriers, and who blocks them
     Barriers,
     /// Where every message is that was ever sent: what each mailbox, client and link took, and how each of these ended
@@ -62,6 +68,11 @@ pub(crate) enum Command {
         #[arg(long, default_value_t = Ipv4Addr::LOCALHOST)]
         interface: Ipv4Addr,
     },
+    /// Prints what makes the shell complete this command's words
+    Completions {
+        /// Which shell
+        shell: clap_complete::Shell,
+    },
 }
 
 impl Arguments {
@@ -74,11 +85,14 @@ impl Arguments {
 const AFTER: &str = "\
 Exit codes:
   0  all is fine
-  1  something was found (a node does not answer, an application is not ready), or the command failed
+  1  something was found: a node does not answer, an application is not ready, a message was not delivered, nobody is called so
   2  the command line is wrong
+  3  no node lets this command in, or that node does not answer
 
 Examples:
   sinew nodes
   sinew ping knee.drive --count 1000
+  sinew send knee.drive demo.angle '{\"degrees\": 5}'
   sinew apps --json | jq '.apps[] | select(.ready | not)'
-  sinew --socket /run/sinew/knee.sock barriers";
+  sinew --socket /run/sinew/knee.sock barriers
+  sinew completions bash > ~/.local/share/bash-completion/completions/sinew";

@@ -1,30 +1,36 @@
 //! `sinew`: shows a running system, from any one node of it.
 //!
 //! It comes in through a node's socket like any other program, and asks each node's inspection (`sinew::inspect`) through ordinary
-//! messages. It changes nothing.
+//! messages. It changes nothing, but for what `send` sends.
 
 mod apps;
 mod arguments;
 mod audit;
 mod doctor;
 mod door;
+mod messagepack;
 mod nodes;
 mod ping;
+mod send;
 mod system;
 mod table;
 mod tree;
 
 use std::process::ExitCode;
 
-use clap::Parser;
+use clap::{CommandFactory, Parser};
 
 use arguments::{Arguments, Command};
 use system::{Fault, System};
 
 /// Exit code where all is fine.
 const FINE: u8 = 0;
-/// Exit code where something was found, or could not be done.
+/// Exit code where something was found.
 const FINDING: u8 = 1;
+/// Exit code of a wrong command line; clap has the same.
+const USAGE: u8 = 2;
+/// Exit code where no node lets us in, or the one that does gives no answer.
+const NOBODY: u8 = 3;
 
 /// What a command has to say.
 struct Said {
@@ -48,7 +54,10 @@ fn main() -> ExitCode {
         }
         Err(error) => {
             eprintln!("sinew: {error}");
-            ExitCode::from(FINDING)
+            if arguments.json {
+                println!("{:#}", serde_json::json!({ "fault": error.to_string() }));
+            }
+            ExitCode::from(error.code())
         }
     }
 }
@@ -65,8 +74,18 @@ fn run(arguments: &Arguments) -> Result<Said, Fault> {
         Command::Apps => inside(&apps::show),
         Command::Tree { node } => inside(&|system| tree::show(system, node.as_deref())),
         Command::Ping { whom, count } => inside(&|system| ping::show(system, whom, *count)),
+        Command::Send(order) => inside(&|system| send::show(system, order)),
         Command::Barriers => inside(&apps::barriers),
         Command::Audit => inside(&audit::show),
         Command::Doctor { interface } => Ok(doctor::show(*interface, arguments.socket.as_deref())),
+        Command::Completions { shell } => Ok(completions(*shell)),
     }
+}
+
+/// The shell's file, as it is, whatever else was asked for.
+fn completions(shell: clap_complete::Shell) -> Said {
+    let mut bytes = Vec::new();
+    clap_complete::generate(shell, &mut Arguments::command(), "sinew", &mut bytes);
+    let text = String::from_utf8_lossy(&bytes).into_owned();
+    Said { json: serde_json::json!({ "shell": shell.to_string(), "text": text }), text, is_fine: true }
 }

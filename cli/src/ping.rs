@@ -4,13 +4,13 @@ use std::time::Duration;
 
 use serde_json::json;
 use sinew::{
-    AppAddress, NodeAddress, Outcome, Rejection, Tid, Time,
+    Outcome, Rejection, Tid, Time,
     inspect::{AppsReport, AskApps, Ping},
 };
 
 use crate::{
     Said, apps,
-    system::{Fault, System, chosen},
+    system::{Fault, System},
     table::clean,
 };
 
@@ -31,7 +31,7 @@ struct Tally {
 
 /// Sends `count` pings to a TID, a name or a node, each when the one before was answered.
 pub(crate) fn show(system: &mut System, whom: &str, count: u32) -> Result<Said, Fault> {
-    let to = find(system, whom)?;
+    let to = system.find(whom)?;
     let mut tally = Tally::default();
     let mut in_vain = 0;
     while tally.sent < count && in_vain < IN_VAIN_MAX {
@@ -80,31 +80,6 @@ fn not_ready(system: &mut System, to: Tid) -> Option<String> {
     let said = answers.into_iter().find_map(|answer| answer.said.ok())?;
     let app = said.apps.iter().find(|app| app.tid == to && !app.ready)?;
     Some(format!("it is not ready: {}", apps::why(app)))
-}
-
-/// An application's TID, a node's address, an application's name, a node's name: the first that it is.
-fn find(system: &mut System, whom: &str) -> Result<Tid, Fault> {
-    if whom.contains('/') {
-        return whom.parse().map_err(|why| Fault::Whom(format!("{why}")));
-    }
-    let inspection = |node: NodeAddress| Tid::new(node, AppAddress::INSPECT);
-    if let Ok(node) = whom.parse::<NodeAddress>() {
-        return Ok(inspection(node));
-    }
-    let within = system.within;
-    let resolved = system.endpoint.resolve(whom, within);
-    if let Some(tid) = resolved.map_err(|why| Fault::NoAnswer(system.path.clone(), why.to_string()))? {
-        return Ok(tid);
-    }
-    let here = system.here()?;
-    let nobody = || {
-        let whom = clean(whom);
-        Fault::Whom(format!(
-            "no application and no node is called '{whom}'; `sinew apps` and `sinew nodes` show those that are there"
-        ))
-    };
-    let nodes = chosen(&here, Some(whom)).map_err(|_| nobody())?;
-    nodes.first().map(|(node, _)| inspection(*node)).ok_or_else(nobody)
 }
 
 impl Tally {

@@ -8,6 +8,7 @@ use sinew::{
 };
 
 use crate::{
+    FINDING, NOBODY, USAGE,
     door::{self, NoDoor},
     table::clean,
 };
@@ -34,6 +35,20 @@ pub(crate) enum Fault {
     /// Nobody is called so.
     #[error("{0}")]
     Whom(String),
+    /// What was said on the command line cannot be meant.
+    #[error("{0}")]
+    Usage(String),
+}
+
+impl Fault {
+    /// What the command ends with: see [`Arguments`](crate::arguments::Arguments).
+    pub(crate) const fn code(&self) -> u8 {
+        match self {
+            Self::Whom(_) => FINDING,
+            Self::Usage(_) => USAGE,
+            Self::NoDoor(_) | Self::NotTaken(..) | Self::NoAnswer(..) => NOBODY,
+        }
+    }
 }
 
 /// A running system, seen from one node.
@@ -78,6 +93,30 @@ impl System {
         let within = self.within;
         ask::<AskNode, NodeReport>(&mut self.endpoint, node, within)
             .map_err(|why| Fault::NoAnswer(self.path.clone(), why))
+    }
+
+    /// An application's TID, a node's address, an application's name, a node's name: the first that it is. A node is its inspection.
+    pub(crate) fn find(&mut self, whom: &str) -> Result<Tid, Fault> {
+        if whom.contains('/') {
+            return whom.parse().map_err(|why| Fault::Whom(format!("{why}")));
+        }
+        let inspection = |node: NodeAddress| Tid::new(node, AppAddress::INSPECT);
+        if let Ok(node) = whom.parse::<NodeAddress>() {
+            return Ok(inspection(node));
+        }
+        let resolved = self.endpoint.resolve(whom, self.within);
+        if let Some(tid) = resolved.map_err(|why| Fault::NoAnswer(self.path.clone(), why.to_string()))? {
+            return Ok(tid);
+        }
+        let here = self.here()?;
+        let nobody = || {
+            let whom = clean(whom);
+            Fault::Whom(format!(
+                "no application and no node is called '{whom}'; `sinew apps` and `sinew nodes` show those that are there"
+            ))
+        };
+        let nodes = chosen(&here, Some(whom)).map_err(|_| nobody())?;
+        nodes.first().map(|(node, _)| inspection(*node)).ok_or_else(nobody)
     }
 
     /// Asks this node and all that it knows, in the order of their addresses.

@@ -1,91 +1,16 @@
 //! The command itself, against real node processes: what it says of two nodes from one of them, and how it fails.
 
-use std::{
-    net::SocketAddrV4,
-    path::{Path, PathBuf},
-    process::{Command, Output},
-    time::Duration,
-};
+mod scenario;
+mod send;
+
+use std::{path::Path, time::Duration};
 
 use rustix::process::Signal;
 use serde_json::Value;
 use sinew::{NodeApi, Registration};
-use sinew_tests::{OwnDirectory, Program, own_group, program, until};
+use sinew_tests::{OwnDirectory, Program};
 
-/// Nodes of a test's own, each with a socket.
-struct Scenario {
-    directory: OwnDirectory,
-    group: SocketAddrV4,
-}
-
-/// What the command said.
-struct Answer {
-    code: Option<i32>,
-    out: String,
-    err: String,
-}
-
-impl Answer {
-    fn json(&self) -> Value {
-        serde_json::from_str(&self.out).unwrap_or_else(|error| panic!("{error}: {}{}", self.out, self.err))
-    }
-}
-
-impl Scenario {
-    fn new() -> Self {
-        Self { directory: OwnDirectory::new(), group: own_group() }
-    }
-
-    fn socket(&self, name: &str) -> PathBuf {
-        self.directory.join(&format!("{name}.sock"))
-    }
-
-    /// A node with the application of its name; returns when its layers are up.
-    fn start(&self, name: &str, address: u8, more: &[&str]) -> Program {
-        let path = self.directory.join(&format!("{name}.toml"));
-        let text = format!(
-            "[node]\nname = \"{name}\"\naddress = \"127.0.0.{address}\"\nproject = \"cli\"\n\
-             [lncl]\nsocket = \"{}\"\n[ndl]\nmulticast = \"{}\"\nmdns_port = false\n",
-            self.socket(name).display(),
-            self.group
-        );
-        std::fs::write(&path, text).expect("the test's own directory");
-        let node = program("node_under_test");
-        assert!(node.exists(), "there is no {}; build it: cargo build -p sinew-tests", node.display());
-        let mut command = Command::new(node);
-        command.arg(&path).args(more);
-        let mut node = Program::start(name, command);
-        node.wait_for(&["up"]);
-        node
-    }
-
-    /// Runs `sinew` through the socket of the node called `name`.
-    fn sinew(&self, name: &str, words: &[&str]) -> Answer {
-        sinew(
-            &[&["--socket", self.socket(name).to_str().expect("a short path")], words].concat(),
-            Path::new("/"),
-        )
-    }
-
-    /// Asks again until the JSON that comes is as it is to be.
-    fn until(&self, what: &str, name: &str, words: &[&str], is_so: impl Fn(&Value) -> bool) -> Value {
-        let words = [words, &["--json"]].concat();
-        until(what, || Some(self.sinew(name, &words).json()).filter(&is_so))
-    }
-}
-
-fn sinew(words: &[&str], runtime_directory: &Path) -> Answer {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
-    command.args(words).env("XDG_RUNTIME_DIR", runtime_directory).env_remove("SINEW_SOCKET");
-    let Output { status, stdout, stderr } = command.output().expect("the command starts");
-    let text = |bytes| String::from_utf8(bytes).expect("it writes text");
-    Answer { code: status.code(), out: text(stdout), err: text(stderr) }
-}
-
-/// The element of `list` whose `name` is this one.
-fn named<'a>(list: &'a Value, name: &str) -> Option<&'a Value> {
-    list.as_array()?.iter().find(|one| one["name"] == name)
-}
+use scenario::{Scenario, named, sinew};
 
 #[test]
 fn both_nodes_are_seen_from_either_of_them_with_their_links_and_lives() {
@@ -153,7 +78,7 @@ fn where_no_node_is_it_says_where_it_looked_and_how_to_start_one() {
     std::fs::write(directory.join("sinew/old.sock"), "").expect("the test's own directory");
     let nowhere = directory.join("gone.sock");
     let answer = sinew(&["--socket", nowhere.to_str().expect("a short path"), "nodes"], &directory.join(""));
-    assert_eq!(answer.code, Some(1));
+    assert_eq!(answer.code, Some(3));
     for words in ["gone.sock", "--socket", "lncl", "sinew-node"] {
         assert!(answer.err.contains(words), "{words}: {}", answer.err);
     }
@@ -174,11 +99,15 @@ fn a_node_is_found_in_the_usual_directory_beside_the_socket_of_one_that_has_gone
 
 #[test]
 fn a_wrong_command_line_is_2_and_help_names_the_exit_codes() {
-    assert_eq!(sinew(&["nodse"], Path::new("/")).code, Some(2));
+    for words in
+        [&["nodse"][..], &["send", "knee"], &["ping", "knee", "--count", "0"], &["completions", "tcsh"]]
+    {
+        assert_eq!(sinew(words, Path::new("/")).code, Some(2), "{words:?}");
+    }
     let help = sinew(&["--help"], Path::new("/"));
     assert_eq!(help.code, Some(0));
     for words in
-        ["nodes", "apps", "tree", "ping", "barriers", "audit", "doctor", "Exit codes", "SINEW_SOCKET"]
+        ["nodes", "apps", "tree", "ping", "send", "barriers", "audit", "doctor", "Exit codes", "SINEW_SOCKET"]
     {
         assert!(help.out.contains(words), "{words}: {}", help.out);
     }
@@ -353,4 +282,17 @@ fn the_doctor_tries_each_thing_and_every_finding_has_what_mends_it() {
     // What cannot be is a finding: nobody has this address.
     let said = scenario.sinew("hip", &["doctor", "--interface", "192.0.2.1", "--json"]).json();
     assert_eq!(said["checks"][0]["fine"], false, "{said}");
+}
+
+#[test]
+fn every_shell_is_told_the_commands() {
+    for shell in ["bash", "zsh", "fish"] {
+        let answer = sinew(&["completions", shell], Path::new("/"));
+        assert!(
+            answer.code == Some(0) && answer.out.contains("barriers"),
+            "{shell}: {}{}",
+            answer.out,
+            answer.err
+        );
+    }
 }

@@ -1,0 +1,171 @@
+//! `sinew send`: one message, and what became of it.
+
+use std::io::Read;
+
+use clap::{Args, ValueEnum};
+use serde_json::{Value, json};
+use sinew::{ApiError, Class, Kind, LentMessage, Outcome, Tid, Time};
+
+use crate::{
+    Said, messagepack,
+    system::{Fault, System},
+    table::{clean, time},
+};
+
+/// Longest payload that is read from the standard input, in bytes: no node takes more.
+const INPUT_MAX: u64 = 64 << 20;
+
+/// What to send, and how.
+#[derive(Debug, Args)]
+pub(crate) struct Order {
+    /// An application's TID (127.0.0.2/80000001) or name
+    pub(crate) whom: String,
+    /// The payload's type as its program calls it (demo.angle), or its number (0x9c1b6bda)
+    kind: String,
+    /// The payload, as JSON; `-` reads it from the standard input
+    #[arg(default_value = "{}")]
+    payload: String,
+    /// Wait for a reply, and print it
+    #[arg(long, conflicts_with_all = ["class", "unconfirmed"])]
+    ask: bool,
+    /// How it travels. A Stream cannot be confirmed
+    #[arg(long, value_enum, default_value = "control")]
+    class: ClassName,
+    /// Do not wait for what becomes of it
+    #[arg(long)]
+    unconfirmed: bool,
+    /// How long it may take. It expires where it waits when it is older
+    #[arg(long, value_name = "MS", default_value_t = 2_000, value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
+    within: u32,
+}
+
+/// A class, as it is called here.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum ClassName {
+    /// Ordered, ahead of all else
+    Control,
+    /// The newest value wins
+    Stream,
+    /// Ordered, yields
+    Bulk,
+}
+
+impl From<ClassName> for Class {
+    fn from(name: ClassName) -> Self {
+        match name {
+            ClassName::Control => Self::Control,
+            ClassName::Stream => Self::Stream,
+            ClassName::Bulk => Self::Bulk,
+        }
+    }
+}
+
+/// What came of it.
+struct Ended {
+    outcome: Option<Outcome>,
+    reply: Option<Value>,
+    fault: Option<String>,
+}
+
+/// Sends it, and says what became of it.
+pub(crate) fn show(system: &mut System, order: &Order) -> Result<Said, Fault> {
+    let to = system.find(&order.whom)?;
+    let kind = kind(&order.kind)?;
+    let payload = payload(&order.payload)?;
+    let began = Time::now();
+    let ended = send(system, to, (kind, &payload), order);
+    let took = Time::now().since(began);
+    let micros = u64::try_from(took.as_micros()).unwrap_or(u64::MAX);
+    let said = match (&ended.fault, &ended.reply, ended.outcome) {
+        (Some(why), ..) => clean(why),
+        (None, Some(reply), _) => format!("{reply:#}"),
+        (None, None, Some(outcome)) => format!("{outcome:?}"),
+        (None, None, None) => "sent; nobody was asked what becomes of it".to_owned(),
+    };
+    let text = if ended.reply.is_some() && ended.fault.is_none() {
+        // Alone, for a pipe.
+        said + "\n"
+    } else {
+        format!("{} ({to}): {said}, after {}\n", clean(&order.whom), time(micros))
+    };
+    let json = json!({
+        "tid": to.to_string(), "kind": kind.to_string(), "bytes": payload.len(), "took_us": micros, "fault": ended.fault,
+        "outcome": ended.outcome.map(|outcome| format!("{outcome:?}")), "reply": ended.reply,
+    });
+    Ok(Said { text, json, is_fine: ended.fault.is_none() })
+}
+
+fn send(system: &mut System, to: Tid, (kind, payload): (Kind, &[u8]), order: &Order) -> Ended {
+    let within = std::time::Duration::from_millis(order.within.into());
+    let endpoint = &mut system.endpoint;
+    let lent = endpoint.create_message(to, kind, payload.len()).map(|mut lent: LentMessage| {
+        lent.copy_from_slice(payload);
+        lent.set_class(order.class.into());
+        lent
+    });
+    let ended = lent.and_then(|lent| {
+        if order.ask {
+            let reply = endpoint.ask_message(lent, within)?;
+            return Ok((Some(Outcome::Delivered), Some(messagepack::shown_or_raw(reply.bytes()))));
+        }
+        // spec: FRAME-5
+        if order.unconfirmed || order.class == ClassName::Stream {
+            return endpoint.send_message(lent).map(|()| (None, None));
+        }
+        endpoint.send_message_confirmed(lent, within).map(|outcome| (Some(outcome), None))
+    });
+    match ended {
+        Ok((outcome, reply)) => {
+            Ended { outcome, reply, fault: outcome.and_then(|outcome| fault(outcome, order)) }
+        }
+        Err(ApiError::Ended(outcome)) => {
+            Ended { outcome: Some(outcome), reply: None, fault: Some(ApiError::Ended(outcome).to_string()) }
+        }
+        Err(error) => Ended { outcome: None, reply: None, fault: Some(error.to_string()) },
+    }
+}
+
+/// In words, unless it was delivered.
+fn fault(outcome: Outcome, order: &Order) -> Option<String> {
+    let within = order.within;
+    let why = match outcome {
+        Outcome::Delivered => return None,
+        Outcome::Rejected(why) => why.to_string(),
+        Outcome::Expired => {
+            format!("it was not come to within {within} ms; is the receiver busy? Give it more: --within")
+        }
+        Outcome::Failed => "its receiver failed, or ended with it in hand; look at `sinew tree`".to_owned(),
+        Outcome::PeerLost => "its node was lost before it was sent; look at `sinew nodes`".to_owned(),
+        Outcome::Unknown => format!("nobody has said within {within} ms; it may have been handled"),
+    };
+    Some(format!("{outcome:?}: {why}"))
+}
+
+/// The type of a payload, by name or by number.
+pub(crate) fn kind(text: &str) -> Result<Kind, Fault> {
+    let kind = match text.strip_prefix("0x") {
+        Some(digits) => u32::from_str_radix(digits, 16).ok().map(Kind::from_bits),
+        None => Some(Kind::named(text)).filter(|_| !text.is_empty()),
+    };
+    kind.filter(|kind| kind.is_user()).ok_or_else(|| {
+        let text = clean(text);
+        Fault::Usage(format!(
+            "'{text}' is no type of an application's payload: a name, or 0x80000000 to 0xffffffff"
+        ))
+    })
+}
+
+fn payload(json: &str) -> Result<Vec<u8>, Fault> {
+    let mut read = String::new();
+    let text = if json == "-" {
+        let input = std::io::stdin().take(INPUT_MAX).read_to_string(&mut read);
+        input.map_err(|error| Fault::Usage(format!("the standard input cannot be read: {error}")))?;
+        &read
+    } else {
+        json
+    };
+    let value: Value = serde_json::from_str(text).map_err(|error| {
+        Fault::Usage(format!("the payload is no JSON: {error}. A text needs its quotes: '\"on\"'"))
+    })?;
+    messagepack::written(&value).map_err(Fault::Usage)
+}

@@ -1,0 +1,91 @@
+//! Real nodes of a test's own, and the command itself.
+
+use std::{
+    net::SocketAddrV4,
+    path::{Path, PathBuf},
+    process::{Command, Output},
+};
+
+use serde_json::Value;
+use sinew_tests::{OwnDirectory, Program, own_group, program, until};
+
+/// Nodes of a test's own, each with a socket.
+pub(crate) struct Scenario {
+    pub(crate) directory: OwnDirectory,
+    pub(crate) group: SocketAddrV4,
+}
+
+/// What the command said.
+pub(crate) struct Answer {
+    pub(crate) code: Option<i32>,
+    pub(crate) out: String,
+    pub(crate) err: String,
+}
+
+impl Answer {
+    pub(crate) fn json(&self) -> Value {
+        serde_json::from_str(&self.out).unwrap_or_else(|error| panic!("{error}: {}{}", self.out, self.err))
+    }
+}
+
+impl Scenario {
+    pub(crate) fn new() -> Self {
+        Self { directory: OwnDirectory::new(), group: own_group() }
+    }
+
+    pub(crate) fn socket(&self, name: &str) -> PathBuf {
+        self.directory.join(&format!("{name}.sock"))
+    }
+
+    /// A node with the application of its name; returns when its layers are up.
+    pub(crate) fn start(&self, name: &str, address: u8, more: &[&str]) -> Program {
+        let path = self.directory.join(&format!("{name}.toml"));
+        let text = format!(
+            "[node]\nname = \"{name}\"\naddress = \"127.0.0.{address}\"\nproject = \"cli\"\n\
+             [lncl]\nsocket = \"{}\"\n[ndl]\nmulticast = \"{}\"\nmdns_port = false\n",
+            self.socket(name).display(),
+            self.group
+        );
+        std::fs::write(&path, text).expect("the test's own directory");
+        let node = program("node_under_test");
+        assert!(node.exists(), "there is no {}; build it: cargo build -p sinew-tests", node.display());
+        let mut command = Command::new(node);
+        command.arg(&path).args(more);
+        let mut node = Program::start(name, command);
+        node.wait_for(&["up"]);
+        node
+    }
+
+    /// Runs `sinew` through the socket of the node called `name`.
+    pub(crate) fn sinew(&self, name: &str, words: &[&str]) -> Answer {
+        sinew(
+            &[&["--socket", self.socket(name).to_str().expect("a short path")], words].concat(),
+            Path::new("/"),
+        )
+    }
+
+    /// Asks again until the JSON that comes is as it is to be.
+    pub(crate) fn until(
+        &self,
+        what: &str,
+        name: &str,
+        words: &[&str],
+        is_so: impl Fn(&Value) -> bool,
+    ) -> Value {
+        let words = [words, &["--json"]].concat();
+        until(what, || Some(self.sinew(name, &words).json()).filter(&is_so))
+    }
+}
+
+pub(crate) fn sinew(words: &[&str], runtime_directory: &Path) -> Answer {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
+    command.args(words).env("XDG_RUNTIME_DIR", runtime_directory).env_remove("SINEW_SOCKET");
+    let Output { status, stdout, stderr } = command.output().expect("the command starts");
+    let text = |bytes| String::from_utf8(bytes).expect("it writes text");
+    Answer { code: status.code(), out: text(stdout), err: text(stderr) }
+}
+
+/// The element of `list` whose `name` is this one.
+pub(crate) fn named<'a>(list: &'a Value, name: &str) -> Option<&'a Value> {
+    list.as_array()?.iter().find(|one| one["name"] == name)
+}

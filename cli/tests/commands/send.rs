@@ -1,0 +1,89 @@
+//! `sinew send` to applications in a node's process and in one of their own, here and on another node.
+
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use sinew::{Kind, NodeApi, Outcome, Registration};
+
+use crate::scenario::{Scenario, named};
+
+#[test]
+fn what_is_sent_arrives_with_its_fields_and_its_outcome_is_said() {
+    // Given: two nodes, of which one is sent to through the other
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee"]);
+    let mut knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["started"]);
+    let tid = knee.wait_for(&["started"]).split_once(' ').expect("it says its TID").1.to_owned();
+    for (whom, number) in [("knee", 7), (&tid, 8)] {
+        // When
+        let payload = json!({ "number": number }).to_string();
+        let answer = scenario.sinew("hip", &["send", whom, "scenario.count", &payload, "--json"]);
+        // Then
+        assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
+        assert_eq!((&answer.json()["outcome"], &answer.json()["tid"]), (&json!("Delivered"), &json!(tid)));
+        knee.wait_for(&[&format!("count {number} ")]);
+    }
+    // And: as a Stream, which nobody confirms, and by the number of its kind
+    let kind = format!("{:#x}", Kind::named("scenario.count").bits());
+    let answer = scenario.sinew("hip", &["send", "knee", &kind, r#"{"number":9}"#, "--class", "stream"]);
+    assert!(answer.code == Some(0) && answer.out.contains("sent"), "{}{}", answer.out, answer.err);
+    knee.wait_for(&["count 9 "]);
+}
+
+#[test]
+fn what_is_not_delivered_is_a_finding_with_the_reason() {
+    let scenario = Scenario::new();
+    let mut knee = scenario.start("knee", 2, &[]);
+    let tid = knee.wait_for(&["started"]).split_once(' ').expect("it says its TID").1.to_owned();
+    for (words, code, part) in [
+        (&[&*tid, "scenario.other"][..], 1, "UnknownKind"),
+        (&[&*tid, "scenario.count", r#"{"nummer":1}"#], 1, "Malformed"),
+        (&["127.0.0.2/1fff", "scenario.count"], 1, "NoSuchApplication"),
+        (&["127.0.0.9/1fff", "scenario.count"], 1, "NoSuchNode"),
+        (&["ankle", "scenario.count"], 1, "ankle"),
+        (&[&*tid, "scenario.count", "{number:1}"], 2, "JSON"),
+        (&[&*tid, "0x13"], 2, "0x13"),
+    ] {
+        let answer = scenario.sinew("knee", &[&["send"], words].concat());
+        let said = answer.out + &answer.err;
+        assert!(answer.code == Some(code) && said.contains(part), "{words:?}: {said}");
+    }
+    // Where JSON is asked for, a failure is JSON, too.
+    let answer = scenario.sinew("knee", &["send", "ankle", "scenario.count", "--json"]);
+    assert!(answer.json()["fault"].as_str().is_some_and(|why| why.contains("ankle")), "{}", answer.out);
+}
+
+#[test]
+fn a_reply_is_printed_decoded() {
+    // Given: an application of another process that replies with what it got, and one that takes its time
+    let scenario = Scenario::new();
+    let _knee = scenario.start("knee", 2, &[]);
+    let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
+    let mut client =
+        api.register_transport_address(Registration::new().name("echo")).expect("it is registered");
+    let echo = std::thread::spawn(move || {
+        let request = client.receive(Duration::from_secs(60)).expect("its node lives").expect("a request");
+        let mut reply = client
+            .create_message(request.source(), request.kind(), request.bytes().len())
+            .expect("there is room");
+        reply.copy_from_slice(request.bytes());
+        client.reply_message(&request, reply).expect("it is sent");
+        request.settle(Outcome::Delivered);
+        client
+    });
+    scenario.until("it is ready", "knee", &["apps"], |said| {
+        named(&said["apps"], "echo").is_some_and(|app| app["ready"] == true)
+    });
+    // When
+    let payload = json!({ "joints": ["hip", "knee"], "gain": 0.25, "on": null });
+    let answer = scenario.sinew("knee", &["send", "echo", "test.echo", &payload.to_string(), "--ask"]);
+    // Then: alone, for a pipe
+    assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
+    assert_eq!(serde_json::from_str::<Value>(&answer.out).ok(), Some(payload));
+    // And: who does not reply is a finding
+    let client = echo.join().expect("it has replied");
+    let answer = scenario.sinew("knee", &["send", "echo", "test.echo", "--ask", "--within", "50"]);
+    assert!(answer.code == Some(1) && answer.out.contains("50ms"), "{}{}", answer.out, answer.err);
+    drop(client);
+}
