@@ -424,6 +424,9 @@ impl StreamHandler<Event> for Gncl {
             Event::Membership(MembershipFact::NodeLost { node, incarnation, why: LossReason::Left }) => {
                 Input::NodeLeaves { node, incarnation }
             }
+            Event::Membership(MembershipFact::NodeLost { node, incarnation, why: LossReason::Duplicate }) => {
+                Input::NodeDisowned { node, incarnation }
+            }
             Event::Membership(MembershipFact::NodeLost { node, incarnation, .. }) => {
                 Input::NodeLost { node, incarnation }
             }

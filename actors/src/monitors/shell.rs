@@ -29,6 +29,7 @@ impl From<&MembershipFact> for Input {
                     LossReason::Silent => "its node was lost: it is silent",
                     LossReason::ConnectionRefused => "its node was lost: its process ended",
                     LossReason::Restarted => "its node was restarted",
+                    LossReason::Duplicate => "its node is none: another process holds that node address",
                 };
                 Self::NodeLost { node, incarnation, why }
             }

@@ -134,6 +134,21 @@ fn a_node_that_is_lost_ends_all_its_lives_and_one_that_is_only_cut_off_none() {
 
 // spec: MON-3
 #[test]
+fn the_elder_life_of_a_node_is_watched_after_a_later_one_was_another_process() {
+    let mut bench = Bench::new();
+    let elder = Incarnation(LIFE.0 - 1);
+    bench.hears(Input::NodeFound { node: THERE, incarnation: LIFE });
+    bench.hears(Input::LinkUp { node: THERE, incarnation: LIFE });
+    bench.hears(Input::NodeLost { node: THERE, incarnation: LIFE, why: "it was another process" });
+    bench.hears(Input::NodeFound { node: THERE, incarnation: elder });
+    bench.hears(Input::LinkUp { node: THERE, incarnation: elder });
+    bench.monitors(1, Tid::new(THERE, app(0))).0.unwrap();
+    let lost = bench.hears(Input::NodeLost { node: THERE, incarnation: elder, why: "it is silent" });
+    assert_eq!(classes(&lost), [DownClass::NodeLost]);
+}
+
+// spec: MON-3
+#[test]
 fn a_node_in_a_new_life_has_lost_the_old_one_whoever_says_so_first() {
     let mut bench = Bench::new();
     bench.hears(Input::LinkUp { node: THERE, incarnation: LIFE });

@@ -19,6 +19,45 @@ const NAME_MAX: usize = 63;
 /// Addresses of a node's GNCL at most, beside the first: with the longest names an answer has 400 bytes.
 pub(crate) const FURTHER_MAX: usize = 7;
 
+/// How a node stands to its address, in the datagram as a number: 1, 2, or not there at all.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "u8", into = "u8")]
+pub(crate) enum Claim {
+    /// The address is its own: it has been there for so long that another process with it would have been heard.
+    #[default]
+    Held,
+    /// It has just come, or come back, and gives the address up if another process has it.
+    Settling,
+    /// It gives the address up, which another process has.
+    Yielded,
+}
+
+impl From<u8> for Claim {
+    fn from(number: u8) -> Self {
+        match number {
+            1 => Self::Settling,
+            2 => Self::Yielded,
+            _ => Self::Held,
+        }
+    }
+}
+
+impl From<Claim> for u8 {
+    fn from(claim: Claim) -> Self {
+        match claim {
+            Claim::Held => 0,
+            Claim::Settling => 1,
+            Claim::Yielded => 2,
+        }
+    }
+}
+
+impl Claim {
+    const fn is_held(&self) -> bool {
+        matches!(self, Self::Held)
+    }
+}
+
 /// What a node says about itself in every datagram.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Announcement {
@@ -41,6 +80,9 @@ pub(crate) struct Announcement {
     /// Further addresses and ports of the listener, [`FURTHER_MAX`] at most: those of other interfaces.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(crate) gncl_further: Vec<(u32, u16)>,
+    /// Whether the address is its own already, and still.
+    #[serde(default, skip_serializing_if = "Claim::is_held")]
+    pub(crate) claim: Claim,
 }
 
 impl Announcement {
@@ -58,6 +100,13 @@ impl Announcement {
     /// Whether both are from one process.
     pub(crate) fn is_same_life(&self, other: &Self) -> bool {
         self.incarnation == other.incarnation && self.boot_nonce == other.boot_nonce
+    }
+
+    /// Whether the node address is this process's rather than `other`'s, if both live: who has settled goes before who settles, and
+    /// then the elder life before the later one. // spec: NDL-5.6
+    pub(crate) fn precedes(&self, other: &Self) -> bool {
+        let rank = |of: &Self| (of.claim != Claim::Held, of.incarnation, of.boot_nonce);
+        rank(self) < rank(other)
     }
 
     fn check(self) -> Result<Self, DatagramError> {
@@ -226,7 +275,7 @@ mod tests {
         let names = ("[a-zäöü ]{1,30}", "[a-z.-]{1,63}");
         let place = || (1..0xe000_0000_u32, 1..u16::MAX);
         let further = proptest::collection::vec(place(), 0..=FURTHER_MAX);
-        (names, 1..u32::MAX, any::<[u64; 2]>(), place(), further, any::<u32>()).prop_map(
+        (names, 1..u32::MAX, any::<[u64; 2]>(), place(), further, any::<u32>(), 0..3u8).prop_map(
             |(
                 (name, project),
                 node,
@@ -234,6 +283,7 @@ mod tests {
                 (gncl_ip, gncl_port),
                 gncl_further,
                 period_us,
+                claim,
             )| {
                 Announcement {
                     project,
@@ -245,6 +295,7 @@ mod tests {
                     gncl_port,
                     period_us,
                     gncl_further,
+                    claim: Claim::from(claim),
                 }
             },
         )
@@ -321,6 +372,7 @@ mod tests {
             gncl_port: 4,
             period_us: 5,
             gncl_further: Vec::new(),
+            claim: Claim::Held,
         }
     }
 

@@ -74,4 +74,6 @@ pub enum LossReason {
     ConnectionRefused,
     /// It is there in a new life.
     Restarted,
+    /// Another process holds its node address, and held it before: nodes listen to that one.
+    Duplicate,
 }

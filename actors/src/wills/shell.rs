@@ -29,7 +29,11 @@ impl Input {
             MembershipFact::NodeLost {
                 node,
                 incarnation,
-                why: LossReason::Silent | LossReason::ConnectionRefused | LossReason::Restarted,
+                why:
+                    LossReason::Silent
+                    | LossReason::ConnectionRefused
+                    | LossReason::Restarted
+                    | LossReason::Duplicate,
             } => Some(Self::NodeLost { node, incarnation }),
         }
     }

@@ -60,6 +60,14 @@ impl Core {
         self.forget(now, node);
     }
 
+    /// What was known of `node` was about another process than the one that has its address. spec: GNCL-7
+    pub(super) fn disowned(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
+        self.lost(now, node, incarnation);
+        if self.peers.get(&node).is_some_and(Acquaintance::is_idle) {
+            self.peers.remove(&node);
+        }
+    }
+
     /// A link outlives the word of its node that it leaves: GOODBYE, or its break, ends it. spec: GNCL-10
     pub(super) fn leaves(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
         match self.peers.get_mut(&node) {

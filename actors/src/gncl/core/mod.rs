@@ -74,6 +74,8 @@ pub(super) enum Input {
     NodeFound { node: NodeAddress, incarnation: Incarnation, addresses: Vec<SocketAddr> },
     /// NDL lost a node.
     NodeLost { node: NodeAddress, incarnation: Incarnation },
+    /// NDL lost a node whose address is another process's: that one may be in an elder life.
+    NodeDisowned { node: NodeAddress, incarnation: Incarnation },
     /// NDL heard a node say that it leaves. What it had sent before may still be on its way, and its GOODBYE behind that.
     NodeLeaves { node: NodeAddress, incarnation: Incarnation },
     /// The listener accepted a connection; `connection` is from [`Core::open`].
@@ -226,6 +228,7 @@ impl Core {
                 self.found(now, node, incarnation, addresses)
             }
             Input::NodeLost { node, incarnation } => self.lost(now, node, incarnation),
+            Input::NodeDisowned { node, incarnation } => self.disowned(now, node, incarnation),
             Input::NodeLeaves { node, incarnation } => self.leaves(now, node, incarnation),
             Input::Accepted(connection) => self.accepted(now, connection),
             Input::Connected(connection) => self.connected(now, connection),

@@ -341,6 +341,20 @@ fn a_second_process_with_a_members_address_does_not_take_the_members_place() {
 }
 
 #[test]
+fn an_elder_life_is_welcome_once_the_later_one_has_turned_out_to_be_another_process() {
+    let mut core = core();
+    core.handle(millis(0), found(6));
+    let (impostor, _) = greet(&mut core, millis(1), hello_from(HIGH, 6, 1));
+    core.handle(millis(2), Input::NodeDisowned { node: HIGH, incarnation: Incarnation(6) });
+    let out = outputs(&mut core);
+    assert!(out.contains(&Output::Close(impostor)) && out.contains(&Output::Forget(HIGH)), "{out:?}");
+    core.handle(millis(3), found(5));
+    outputs(&mut core);
+    let (_, elder) = greet(&mut core, millis(4), hello_from(HIGH, 5, 1));
+    assert!(elder.contains(&Output::Fact(LinkFact::LinkUp { node: HIGH, incarnation: Incarnation(5) })));
+}
+
+#[test]
 fn the_life_that_ndl_finds_takes_the_place_of_one_that_only_said_hello() {
     let mut core = core();
     let (impostor, _) = greet(&mut core, millis(0), hello_from(HIGH, 6, 1));

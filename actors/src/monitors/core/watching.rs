@@ -41,6 +41,8 @@ pub(super) struct Peer {
     life: Incarnation,
     is_found: bool,
     is_linked: bool,
+    /// That life was lost, though its link has not broken yet.
+    is_lost: bool,
     /// When it counts as lost, if its link does not come back.
     orphan: Option<Time>,
     version: u64,
@@ -188,8 +190,9 @@ impl Watching {
 
     pub(super) fn found(&mut self, node: NodeAddress, incarnation: Incarnation) {
         if let Some(peer) = self.at(node) {
-            peer.life = peer.life.max(incarnation);
-            (peer.is_found, peer.orphan) = (true, None);
+            // Lost and found in an elder life: the later one was another process with that node address.
+            peer.life = if peer.is_lost { incarnation } else { peer.life.max(incarnation) };
+            (peer.is_found, peer.is_lost, peer.orphan) = (true, false, None);
         }
     }
 
@@ -200,7 +203,7 @@ impl Watching {
         {
             if peer.is_linked {
                 // The link will break, or the node is found again behind it.
-                peer.is_found = false;
+                (peer.is_found, peer.is_lost) = (false, true);
             } else {
                 self.peers.remove(&node);
             }

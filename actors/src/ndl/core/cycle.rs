@@ -36,7 +36,9 @@ impl Core {
         self.contests.clear();
         self.respite = None;
         // spec: NDL-5.5
-        self.settles.get_or_insert(now + self.period * (self.missed_max + 1));
+        if self.settles.is_none() {
+            self.settle(now);
+        }
         self.cycle_due = Some(now);
         self.time_passed(now);
     }
@@ -44,6 +46,7 @@ impl Core {
     pub(super) fn time_passed(&mut self, now: Time) {
         self.decide_contests(now);
         self.end_respite(now);
+        self.end_settling(now);
         let Some(due) = self.cycle_due.filter(|due| *due <= now) else { return };
         let late = now.since(due);
         // Lifeguard's rule: who was starved himself does not accuse others. The answers that came meanwhile are still
@@ -131,6 +134,11 @@ impl Core {
             }
         }
         self.ask(now, address);
+    }
+
+    /// Time after its last sign of life within which a member is lost, if our own timer is on time.
+    pub(super) fn loss_bound(&self) -> Duration {
+        self.period * (self.missed_max + 1)
     }
 
     /// The node stops: it says so, and is silent from now on. // spec: NDL-4.4

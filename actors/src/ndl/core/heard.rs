@@ -15,7 +15,7 @@ use super::{
 };
 use crate::ndl::{
     LossReason,
-    datagram::{Announcement, Answer, Body, parse, peek_answer},
+    datagram::{Announcement, Answer, Body, Claim, parse, peek_answer},
 };
 
 /// Time between two questions to one address outside the cycle, so that nobody makes us flood a third.
@@ -185,7 +185,9 @@ impl Core {
     // spec: NDL-4.4
     pub(super) fn taken_leave_of(&mut self, now: Time, from: SocketAddr, announcement: &Announcement) {
         if self.is_member_at(from, announcement) {
-            self.lose(now, announcement.node, LossReason::Left);
+            let yields = announcement.claim == Claim::Yielded;
+            let why = if yields { LossReason::Duplicate } else { LossReason::Left };
+            self.lose(now, announcement.node, why);
         } else if self.is_former_at(from, announcement) {
             // It was silent, and has been asked since: what it answered before it left is no sign of life any more.
             self.drop_contact(now, from);

@@ -1,4 +1,4 @@
-//! Who comes, goes, comes again in a new life, and who has an address that is taken.
+//! Who comes, goes, and comes again in a new life.
 
 use std::{net::SocketAddr, time::Duration};
 
@@ -21,8 +21,6 @@ use crate::{
 const CHALLENGE_MAX: Duration = Duration::from_millis(100);
 /// Time in which a broken connection may be made again at another address.
 const LINK_GRACE: Duration = Duration::from_secs(1);
-/// Time between two reports that a node address is used twice.
-const COLLISION_REPORT_PERIOD: Duration = Duration::from_secs(10);
 
 /// An answer to a question that was asked at one address: somebody is there and says this.
 #[derive(Clone, Debug)]
@@ -71,8 +69,9 @@ impl Core {
         // A newcomer whose address turns out to be another's has none to come from.
         self.contests
             .retain(|_, contest| contest.newcomer.from != proof.from || contest.newcomer.is_of(claimed));
+        self.end_loneliness(now);
         if claimed.node == self.me.node {
-            self.own_address_used(now, proof.from, proof.announcement.incarnation);
+            self.own_address_used(now, &proof);
             return;
         }
         self.release_address(now, proof.from, claimed.node);
@@ -83,6 +82,8 @@ impl Core {
         let known = &member.announcement;
         if known.is_same_life(claimed) {
             self.alive(now, proof);
+        } else if claimed.incarnation <= known.incarnation && claimed.precedes(known) {
+            self.elder_came(now, proof);
         } else if claimed.incarnation < known.incarnation {
             self.refuse_stale(now, &proof, known.incarnation);
         } else if claimed.incarnation == known.incarnation {
@@ -107,7 +108,13 @@ impl Core {
 
     fn alive(&mut self, now: Time, proof: Proof) {
         let node = proof.announcement.node;
-        self.settle_contest(now, &proof);
+        if let Some(member) = self.members.get_mut(&node) {
+            member.announcement.claim = proof.announcement.claim;
+        }
+        if let Some(newcomer) = self.settle_contest(now, &proof) {
+            self.replace(now, newcomer);
+            return;
+        }
         let Some(member) = self.members.get_mut(&node) else { return };
         if member.address != proof.from {
             // One life at two addresses: it has moved if it does not answer at the first any more.
@@ -125,18 +132,21 @@ impl Core {
         self.measure(now, node, proof.exchange);
     }
 
-    /// The member lives, and was asked after the newcomer came: there are two.
-    fn settle_contest(&mut self, now: Time, proof: &Proof) {
+    /// The member lives, and was asked after the newcomer came: there are two. The newcomer, if the address is its own.
+    fn settle_contest(&mut self, now: Time, proof: &Proof) -> Option<Proof> {
         let node = proof.announcement.node;
-        let holder = self.members.get(&node).map(|member| member.address);
-        if let Some(contest) = self.contests.get(&node)
-            && holder == Some(proof.from)
-            && proof.asked >= contest.since
+        if self.members.get(&node).map(|member| member.address) != Some(proof.from)
+            || self.contests.get(&node).is_none_or(|contest| proof.asked < contest.since)
         {
-            let newcomer = contest.newcomer.from;
-            self.contests.remove(&node);
-            self.collide(now, node, proof.from, newcomer);
+            return None;
         }
+        let newcomer = self.contests.remove(&node)?.newcomer;
+        if newcomer.announcement.precedes(&proof.announcement) {
+            self.collide(now, node, newcomer.from, proof.from);
+            return Some(newcomer);
+        }
+        self.collide(now, node, proof.from, newcomer.from);
+        None
     }
 
     fn measure(&mut self, now: Time, node: NodeAddress, exchange: Option<Exchange>) {
@@ -153,11 +163,15 @@ impl Core {
     }
 
     /// Nobody with this address is a member.
-    fn arrive(&mut self, now: Time, proof: Proof) {
+    pub(super) fn arrive(&mut self, now: Time, proof: Proof) {
         let claimed = &proof.announcement;
+        let mut fence = None;
         let arrival = match self.gone.get(&claimed.node) {
             None => Arrival::Found,
-            Some(gone) if claimed.incarnation > gone.incarnation => Arrival::Restarted,
+            Some(gone) if claimed.incarnation > gone.incarnation => {
+                fence = Some(gone.incarnation);
+                Arrival::Restarted
+            }
             Some(gone)
                 if claimed.incarnation == gone.incarnation && claimed.boot_nonce == gone.boot_nonce =>
             {
@@ -172,18 +186,18 @@ impl Core {
             self.refusals.count(now, "more nodes than `ndl.nodes_max`", &proof.from);
             return;
         }
-        self.join(now, proof, arrival);
+        self.join(now, proof, arrival, fence);
     }
 
     // spec: NDL-5.2
-    fn refuse_stale(&self, now: Time, proof: &Proof, known: Incarnation) {
+    pub(super) fn refuse_stale(&self, now: Time, proof: &Proof, known: Incarnation) {
         let Announcement { node, incarnation, .. } = proof.announcement;
         let what =
             format_args!("{node} at {} is in life {incarnation}, and life {known} was seen", proof.from);
         self.refusals.count(now, "NDL answer of a former life", &what);
     }
 
-    fn join(&mut self, now: Time, proof: Proof, arrival: Arrival) {
+    fn join(&mut self, now: Time, proof: Proof, arrival: Arrival, fence: Option<Incarnation>) {
         let Proof { from, announcement, exchange, .. } = proof;
         let Announcement { node, incarnation, ref name, .. } = announcement;
         let name = name.clone();
@@ -203,6 +217,8 @@ impl Core {
             clock: PeerClock::default(),
             is_link_broken: false,
             link_until: Time::ZERO,
+            since: now,
+            fence,
         };
         self.members.insert(node, member);
         // Before the fact, so that GNCL knows the clock of a peer when it connects.
@@ -225,7 +241,7 @@ impl Core {
         let incarnation = former.announcement.incarnation;
         let why = LossReason::Restarted;
         self.outputs.push_back(Output::Fact(MembershipFact::NodeLost { node, incarnation, why }));
-        self.join(now, proof, Arrival::Restarted);
+        self.join(now, proof, Arrival::Restarted, Some(incarnation));
     }
 
     /// A newcomer with a member's address: has the member been restarted, or are there two? // spec: NDL-5.3
@@ -270,34 +286,6 @@ impl Core {
         }
     }
 
-    // spec: NDL-5.4
-    fn collide(&mut self, now: Time, node: NodeAddress, holder: SocketAddr, newcomer: SocketAddr) {
-        let what =
-            format_args!("{node} is at {holder}; the process at {newcomer} claims the same node address");
-        self.refusals.count(now, "NDL node address used twice", &what);
-        let last = self.collisions_reported.get(&node);
-        if last.is_none_or(|last| now.since(*last) >= COLLISION_REPORT_PERIOD) {
-            self.collisions_reported.insert(node, now);
-            self.outputs.push_back(Output::Collision { node, holder, newcomer });
-        }
-    }
-
-    /// A living process has our own node address. // spec: NDL-5.5
-    fn own_address_used(&mut self, now: Time, other: SocketAddr, incarnation: Incarnation) {
-        let Some(settles) = self.settles else { return };
-        // Two that start together: the later life gives up at once, the earlier one only if the other stays.
-        let is_later = incarnation <= self.me.incarnation;
-        let is_nearly_settled = now + self.period > settles;
-        if now < settles && (is_later || is_nearly_settled) {
-            // The next start begins anew: the other may be gone by then.
-            self.settles = None;
-            self.cycle_due = None;
-            self.outputs.push_back(Output::AddressTaken { holder: other });
-        } else if let Some(own) = self.udp {
-            self.collide(now, self.me.node, own, other);
-        }
-    }
-
     /// What GNCL's connections tell. // spec: NDL-4.3
     pub(super) fn linked(&mut self, now: Time, fact: LinkFact) {
         let (LinkFact::LinkUp { node, incarnation }
@@ -327,7 +315,12 @@ impl Core {
     pub(super) fn lose(&mut self, now: Time, node: NodeAddress, why: LossReason) {
         let Some(member) = self.members.remove(&node) else { return };
         let contest = self.contests.remove(&node);
-        self.remember(now, &member);
+        self.is_lonely |= self.members.is_empty() && why == LossReason::Silent;
+        if why == LossReason::Duplicate {
+            // An elder life has its address: this one is no bar to that.
+        } else {
+            self.remember(now, &member);
+        }
         if why == LossReason::Left {
             self.drop_contact(now, member.address);
         } else {

@@ -9,13 +9,15 @@
 //! | `contact` | an address that is talked to |
 //! | `cycle` | who is asked when, and who missed too much |
 //! | `heard` | what a datagram means, and what it proves |
-//! | `lives` | who comes, goes, comes again, and who has an address that is taken |
+//! | `lives` | who comes, goes, comes again |
+//! | `duplicates` | which of two processes has a node address |
 //! | `clock` | how far a peer's clock is from ours |
 
 mod budget;
 mod clock;
 mod contact;
 mod cycle;
+mod duplicates;
 mod heard;
 mod lives;
 #[cfg(test)]
@@ -42,11 +44,12 @@ use self::{
     clock::PeerClock,
     contact::{Contact, Question, Questions},
     cycle::Respite,
+    duplicates::Trial,
     lives::{Contest, Gone},
 };
 use super::{
     MembershipFact, NodeEvent,
-    datagram::{Announcement, Answer, FURTHER_MAX},
+    datagram::{Announcement, Answer, Claim, FURTHER_MAX},
 };
 use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, refusals::Refusals, stores::ClockOffset};
 
@@ -103,7 +106,7 @@ pub(crate) enum Output {
         node: NodeAddress,
         offset: ClockOffset,
     },
-    /// Two living processes have one node address; the newcomer is not made a member.
+    /// Two living processes have one node address; the newcomer is no member, or not any more.
     Collision {
         node: NodeAddress,
         holder: SocketAddr,
@@ -171,6 +174,10 @@ struct Member {
     is_link_broken: bool,
     /// Until then its connection stands, or is being made again.
     link_until: Time,
+    /// Since when it has been a member.
+    since: Time,
+    /// The life before this one whose end is known: neither that one nor one before it comes back.
+    fence: Option<Incarnation>,
 }
 
 impl Member {
@@ -203,6 +210,10 @@ pub(crate) struct Core {
     cycle_due: Option<Time>,
     /// Until then, a living node with our address means that we are the newcomer.
     settles: Option<Time>,
+    /// It had members and has none any more: others may have given its address to a later life.
+    is_lonely: bool,
+    /// Another process is about to be believed that our address is its own.
+    trial: Option<Trial>,
     stall_reported: Option<Time>,
     respite: Option<Respite>,
 
@@ -241,6 +252,7 @@ impl Core {
             gncl_port: 0,
             period_us: u32::try_from(ndl.period.as_micros()).unwrap_or(u32::MAX),
             gncl_further: Vec::new(),
+            claim: Claim::Settling,
         };
         Self {
             me,
@@ -255,6 +267,8 @@ impl Core {
             udp: None,
             cycle_due: None,
             settles: None,
+            is_lonely: false,
+            trial: None,
             stall_reported: None,
             respite: None,
             members: BTreeMap::new(),
@@ -298,8 +312,10 @@ impl Core {
             self.app_changed(&fact);
             return;
         }
-        if self.cycle_due.is_none() {
-            return;
+        let Some(due) = self.cycle_due else { return };
+        if now.since(due) > self.loss_bound() {
+            // We got no processor for so long that others may have lost us, and have found a later life.
+            self.settle(now);
         }
         match input {
             Input::QueryReceived(query) => {

@@ -1,5 +1,6 @@
 //! Whole conversations of cores on a simulated network, in virtual time.
 
+mod duplicates;
 mod lives;
 mod properties;
 mod scenarios;

@@ -303,9 +303,10 @@ impl Core {
             MembershipFact::NodeLost { node, incarnation, why } => {
                 let reason = match why {
                     LossReason::Left => Reason::NodeLeft,
-                    LossReason::Silent | LossReason::ConnectionRefused | LossReason::Restarted => {
-                        Reason::NodeLost
-                    }
+                    LossReason::Silent
+                    | LossReason::ConnectionRefused
+                    | LossReason::Restarted
+                    | LossReason::Duplicate => Reason::NodeLost,
                 };
                 self.peers.lost(node, incarnation, reason);
                 self.route_groups(node);

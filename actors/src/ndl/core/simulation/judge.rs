@@ -240,7 +240,10 @@ impl Judge {
             LossReason::Left | LossReason::ConnectionRefused | LossReason::Restarted if lives => {
                 self.violate(now, process, other, &format!("lives, and is lost as {why:?}"));
             }
-            LossReason::Left | LossReason::ConnectionRefused | LossReason::Restarted => {}
+            LossReason::Left
+            | LossReason::ConnectionRefused
+            | LossReason::Restarted
+            | LossReason::Duplicate => {}
             LossReason::Silent => {
                 let unanswered = self.unanswered(now, process, other);
                 if unanswered < self.missed_max as usize && lives {

@@ -22,6 +22,7 @@ mod plan;
 mod planted;
 mod world;
 
+pub(super) use self::chance::Chance;
 use self::{
     plan::Plan,
     planted::Fault,

@@ -39,13 +39,25 @@ fn a_new_life_after_a_loss_is_a_restart_too() {
 // spec: NDL-5.2
 #[test]
 fn a_former_life_is_refused_also_after_the_later_one_is_lost() {
+    // given: life 6 is lost, and life 7 found, which cannot hear of it
     let mut world = World::new();
     world.start(1, &Spec::of(1));
-    world.start(2, &Spec { incarnation: 7, ..Spec::of(2) });
-    world.run(ms(10));
     world.start(3, &Spec { incarnation: 6, ..Spec::of(2) });
     world.run(ms(10));
+    for (from, to) in [(1, 3), (3, 1), (2, 3), (3, 2)] {
+        world.cut(from, to);
+    }
+    world.run(PERIOD * 5);
+    world.start(2, &Spec { incarnation: 7, ..Spec::of(2) });
+    world.run(PERIOD * 5);
+    // when: life 6 is heard again
+    world.mend();
+    world.cut(2, 3);
+    world.cut(3, 2);
+    world.run(PERIOD * 2);
+    // then
     assert!(world.at(1).core.refusals().of("NDL answer of a former life") > 0);
+    assert_eq!(world.at(1).core.members[&node(2)].announcement.incarnation, Incarnation(7));
     world.kill(2);
     world.run(PERIOD * 8);
     assert!(!world.knows(1, 2));

@@ -14,7 +14,7 @@ use crate::{
     ndl::{
         LossReason, MembershipFact, NodeEvent,
         core::{Input, Output, Source},
-        datagram::{Announcement, Answer, Body, Datagram, encode},
+        datagram::{Announcement, Answer, Body, Claim, Datagram, encode},
     },
 };
 
@@ -33,6 +33,7 @@ pub(super) fn stranger(address: u32) -> Announcement {
         gncl_port: 1,
         period_us: 500_000,
         gncl_further: Vec::new(),
+        claim: Claim::Held,
     }
 }
 

@@ -115,6 +115,8 @@ pub(super) struct World {
     flying: BTreeMap<(Time, u64), Flying>,
     sequence: u64,
     cut: BTreeSet<(SocketAddr, SocketAddr)>,
+    /// No goodbye arrives.
+    pub(super) loses_goodbyes: bool,
 }
 
 impl World {
@@ -126,6 +128,7 @@ impl World {
             flying: BTreeMap::new(),
             sequence: 0,
             cut: BTreeSet::new(),
+            loses_goodbyes: false,
         }
     }
 
@@ -305,6 +308,7 @@ impl World {
                 let answer = Answer { announcement: me, query_sent_ns, query_received_ns };
                 self.send(from, to, Datagram { correlation, sent: now, body: Body::Answer(answer) });
             }
+            Output::SendLeave { .. } if self.loses_goodbyes => {}
             Output::SendLeave { to, .. } => {
                 self.send(from, to, Datagram { correlation: 0, sent: now, body: Body::Leave(me) });
             }

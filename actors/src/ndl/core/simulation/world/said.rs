@@ -63,12 +63,16 @@ impl World {
                 self.judge.found(self.now, process, node, incarnation);
             }
             MembershipFact::NodeLost { node, incarnation, why } => {
-                use crate::ndl::LossReason::{ConnectionRefused, Left, Restarted, Silent};
+                use crate::ndl::LossReason::{ConnectionRefused, Duplicate, Left, Restarted, Silent};
                 match why {
                     Left => self.seen.left += 1,
                     Silent => self.seen.silent += 1,
                     ConnectionRefused => self.seen.refused += 1,
                     Restarted => self.seen.restarted += 1,
+                    Duplicate => {
+                        self.judge.violations.push(format!("{:?}: {process} says {fact:?}", self.now));
+                        return;
+                    }
                 }
                 self.judge.lost(self.now, process, (node, incarnation), why);
             }

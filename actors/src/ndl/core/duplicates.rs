@@ -1,0 +1,118 @@
+//! Two living processes with one node address: which of them has it, for others and for themselves.
+//!
+//! Each says how it stands to its address ([`Claim`]). Who has settled goes before who settles, and the elder life before the later
+//! one. Others listen to that one as soon as they know that both live; the other one gives the address up when it hears of it.
+
+use std::{net::SocketAddr, time::Duration};
+
+use sinew_runtime::{tid::NodeAddress, time::Time};
+
+use super::{Core, Output, lives::Proof};
+use crate::ndl::{LossReason, datagram::Claim};
+
+/// Time between two reports that a node address is used twice.
+const COLLISION_REPORT_PERIOD: Duration = Duration::from_secs(10);
+/// How often who gives its address up says so: a datagram may be lost, and who does not hear it keeps the rightful one out.
+const YIELDS: usize = 3;
+
+/// Another process has our address, and goes before us: it is believed when it stays.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Trial {
+    since: Time,
+    heard: Time,
+}
+
+impl Core {
+    /// The address is ours from then on, if nobody else shows that it is his. // spec: NDL-5.5
+    pub(super) fn settle(&mut self, now: Time) {
+        self.settles = Some(now + self.loss_bound());
+        self.me.claim = Claim::Settling;
+    }
+
+    pub(super) fn end_settling(&mut self, now: Time) {
+        if self.settles.is_some_and(|settles| settles <= now) {
+            self.me.claim = Claim::Held;
+        }
+    }
+
+    /// Somebody is there again after all others were lost: to them we may have been the one who was lost. // spec: NDL-5.7
+    pub(super) fn end_loneliness(&mut self, now: Time) {
+        if std::mem::take(&mut self.is_lonely) {
+            self.settle(now);
+        }
+    }
+
+    /// Who goes before a member in its address proved to be there. // spec: NDL-5.6
+    pub(super) fn elder_came(&mut self, now: Time, proof: Proof) {
+        let claimed = &proof.announcement;
+        let node = claimed.node;
+        let Some(member) = self.members.get(&node) else { return };
+        if member.fence.is_some_and(|fence| claimed.incarnation <= fence) {
+            let known = member.announcement.incarnation;
+            self.refuse_stale(now, &proof, known);
+            return;
+        }
+        // Asked before the member came, it may have ended since, to make way for it.
+        if proof.asked < member.since {
+            return;
+        }
+        let newcomer = member.address;
+        self.collide(now, node, proof.from, newcomer);
+        self.contests.remove(&node);
+        self.lose(now, node, LossReason::Duplicate);
+        self.arrive(now, proof);
+    }
+
+    // spec: NDL-5.4
+    pub(super) fn collide(&mut self, now: Time, node: NodeAddress, holder: SocketAddr, newcomer: SocketAddr) {
+        let what =
+            format_args!("{node} is at {holder}; the process at {newcomer} claims the same node address");
+        self.refusals.count(now, "NDL node address used twice", &what);
+        let last = self.collisions_reported.get(&node);
+        if last.is_none_or(|last| now.since(*last) >= COLLISION_REPORT_PERIOD) {
+            self.collisions_reported.insert(node, now);
+            self.outputs.push_back(Output::Collision { node, holder, newcomer });
+        }
+    }
+
+    /// A living process has our own node address. // spec: NDL-5.5
+    pub(super) fn own_address_used(&mut self, now: Time, proof: &Proof) {
+        let (Some(settles), Some(own)) = (self.settles, self.udp) else { return };
+        let theirs = &proof.announcement;
+        if now < settles {
+            // Two that start together: the later life gives up at once, the earlier one only if the other stays.
+            let is_later =
+                (theirs.incarnation, theirs.boot_nonce) < (self.me.incarnation, self.me.boot_nonce);
+            if is_later || now + self.period > settles {
+                return self.give_address_up(proof.from);
+            }
+        }
+        if !theirs.precedes(&self.me) {
+            return self.collide(now, self.me.node, own, proof.from);
+        }
+        self.collide(now, self.me.node, proof.from, own);
+        if now >= settles {
+            self.try_other(now, proof.from);
+        }
+    }
+
+    /// Both have settled, apart from each other: who goes before us is given the time that a newcomer has. // spec: NDL-5.7
+    fn try_other(&mut self, now: Time, other: SocketAddr) {
+        let is_on = |trial: &Trial| now.since(trial.heard) <= self.loss_bound();
+        let since = self.trial.filter(is_on).map_or(now, |trial| trial.since);
+        if now.since(since) >= self.period * self.missed_max {
+            return self.give_address_up(other);
+        }
+        self.trial = Some(Trial { since, heard: now });
+    }
+
+    fn give_address_up(&mut self, holder: SocketAddr) {
+        // The next start begins anew: the other may be gone by then.
+        (self.settles, self.trial) = (None, None);
+        self.me.claim = Claim::Yielded;
+        for _ in 0..YIELDS {
+            self.leave();
+        }
+        self.outputs.push_back(Output::AddressTaken { holder });
+    }
+}
