@@ -69,8 +69,8 @@ pub use outlet::OutletCounts;
 pub use serde;
 pub use sinew_runtime::{
     app::{
-        AppContext, AppSpec, Away, Delivery, LastWill, Raw, RequirementEvent, RequirementPolicy, Silence,
-        Told,
+        AppContext, AppSpec, Away, Delivery, LastWill, Raw, Requirement, RequirementEvent, RequirementPolicy,
+        Silence, Told,
     },
     monitor::{Down, DownClass, MonitorError, MonitorId},
     outcome::{Outcome, Rejection},

@@ -301,7 +301,8 @@ impl Registration {
         self
     }
 
-    /// Adds names that must be ready, on this node or any, before this application is; at most 64.
+    /// Adds what must be met, on this node or any, before this application is ready; at most 64. Names, patterns, any of several,
+    /// so many of them, with a limit to the wait or without: see [`Requirement`](crate::Requirement).
     #[must_use]
     pub fn requires<N: Into<String>>(mut self, names: impl IntoIterator<Item = N>) -> Self {
         self.register.requires.extend(names.into_iter().map(Into::into));

@@ -5,11 +5,15 @@ mod tests;
 
 use std::{collections::BTreeMap, fmt};
 
-use sinew_runtime::{tid::AppAddress, wire::Kind};
+use sinew_runtime::{
+    app::{Requirement, RequirementError},
+    tid::AppAddress,
+    wire::Kind,
+};
 
 /// Longest name in bytes.
 pub(crate) const NAME_MAX: usize = 63;
-/// Names that one application may require, and payload types that it may name, at most.
+/// Requirements of one application, and payload types that it may name, at most.
 pub(crate) const NAMES_MAX: usize = 64;
 
 /// How many there may be.
@@ -63,7 +67,7 @@ pub(crate) struct Request {
     pub(crate) address: Address,
     /// Its name, unique on the node.
     pub(crate) name: Option<String>,
-    /// The names that it requires.
+    /// What it requires.
     pub(crate) requires: Vec<String>,
     /// Names of the payload types that it sends or handles, as far as it tells.
     pub(crate) kinds: Vec<String>,
@@ -139,6 +143,9 @@ pub enum RegisterError {
         /// The limit.
         limit: usize,
     },
+    /// The caller requires something in words that say nothing.
+    #[error(transparent)]
+    BadRequirement(#[from] RequirementError),
     /// Two names of payload types have the same id on the wire.
     #[error("payload type '{name}' has the same id {kind} as '{other}', already in use; rename one of them")]
     KindCollision {
@@ -358,11 +365,12 @@ fn check_spelling(name: &str) -> Result<(), RegisterError> {
 }
 
 fn check_lists(request: &Request) -> Result<(), RegisterError> {
-    for (what, list) in [("required names", &request.requires), ("payload types", &request.kinds)] {
+    for (what, list) in [("requirements", &request.requires), ("payload types", &request.kinds)] {
         if list.len() > NAMES_MAX {
             return Err(RegisterError::TooMany { what, found: list.len(), limit: NAMES_MAX });
         }
-        list.iter().try_for_each(|name| check_spelling(name))?;
     }
+    request.kinds.iter().try_for_each(|name| check_spelling(name))?;
+    request.requires.iter().try_for_each(|text| text.parse::<Requirement>().map(drop))?;
     Ok(())
 }

@@ -8,7 +8,7 @@ use sinew_runtime::{
 };
 
 /// Longest payload of a connection's first frame, in bytes: enough for the longest lists that are allowed.
-pub(crate) const REGISTER_BYTES_MAX: usize = 16 * 1024;
+pub(crate) const REGISTER_BYTES_MAX: usize = 24 * 1024;
 
 /// A process asks for a transport address.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -19,7 +19,7 @@ pub(crate) struct Register {
     /// The fixed address that it wants; none = a dynamic one.
     #[serde(default)]
     pub(crate) address: Option<AppAddress>,
-    /// The names that it requires.
+    /// What it requires.
     #[serde(default)]
     pub(crate) requires: Vec<String>,
     /// The layers' events that it wants.

@@ -6,7 +6,7 @@ use std::{
 };
 
 use sinew_runtime::{
-    app::DynApp,
+    app::{DynApp, Requirement},
     supervision::{AutoShutdown, Flags, Intensity, Policy, Restart, Strategy},
 };
 
@@ -222,7 +222,7 @@ impl SupervisorSpec {
         for member in &self.members {
             match member {
                 Member::App(app) => {
-                    edges.requires.insert(app.name(), app.requires().iter().map(String::as_str).collect());
+                    edges.requires.insert(app.name(), required_names(app.requires()));
                 }
                 Member::Supervisor(below) => below.enter(edges),
             }
@@ -265,7 +265,7 @@ impl Member {
 /// Who waits for whom on this node: by what it requires, and by the order of start.
 #[derive(Default)]
 struct Edges<'a> {
-    requires: BTreeMap<&'a str, Vec<&'a str>>,
+    requires: BTreeMap<&'a str, Vec<String>>,
     follows: Vec<(&'a str, &'a str)>,
 }
 
@@ -283,11 +283,11 @@ impl<'a> Edges<'a> {
     }
 
     /// How `from` comes to wait for `to`, if it does: both ends included.
-    fn path(&self, from: &'a str, to: &'a str) -> Option<Vec<&'a str>> {
+    fn path<'b>(&'b self, from: &'b str, to: &'b str) -> Option<Vec<&'b str>> {
         let mut reached = BTreeMap::from([(from, from)]);
         let mut next = vec![from];
         while let Some(name) = next.pop() {
-            let required = self.requires.get(name).into_iter().flatten().copied();
+            let required = self.requires.get(name).into_iter().flatten().map(String::as_str);
             let before = self.follows.iter().filter(|(after, _)| *after == name).map(|(_, before)| *before);
             for other in required.chain(before) {
                 if reached.contains_key(other) {
@@ -304,6 +304,12 @@ impl<'a> Edges<'a> {
         path.reverse();
         Some(path)
     }
+}
+
+/// The names without which an application is not started, whatever else comes.
+fn required_names(requires: &[String]) -> Vec<String> {
+    let read = requires.iter().filter_map(|text| text.parse::<Requirement>().ok());
+    read.filter_map(|requirement| requirement.only_name().map(str::to_owned)).collect()
 }
 
 #[cfg(test)]

@@ -221,6 +221,10 @@ impl SyncManager {
                 let why = why.map_or("it is ready again by now", Reason::words);
                 crate::log::warn!(%app, name, why, "an application lost what it requires");
             }
+            RequirementEvent::Without { name } => {
+                let why = why.map_or("it is ready again by now", Reason::words);
+                crate::log::warn!(%app, name, why, "an application goes on without what it can do without");
+            }
             RequirementEvent::Met { name } => {
                 crate::log::info!(%app, name, "an application's requirement is met again")
             }

@@ -9,13 +9,16 @@ use serde::{
     Deserialize, Deserializer, Serialize,
     de::{Error as _, SeqAccess, Visitor},
 };
-use sinew_runtime::tid::{AppAddress, Incarnation};
+use sinew_runtime::{
+    app::Requirement,
+    tid::{AppAddress, Incarnation},
+};
 
 /// Applications in one list at most.
 pub(crate) const ENTRIES_MAX: usize = 1_024;
 /// Groups in one list at most.
 pub(crate) const GROUPS_MAX: usize = 1_024;
-/// Names that one application requires at most, as far as a list says.
+/// Requirements of one application at most, as far as a list says.
 pub(crate) const REQUIRES_MAX: usize = 64;
 /// Longest name in bytes.
 pub(crate) const NAME_BYTES_MAX: usize = 63;
@@ -44,9 +47,9 @@ pub(crate) struct Entry {
     pub(crate) app: AppAddress,
     /// Whether it has started and takes messages.
     pub(crate) ready: bool,
-    /// The names that it requires, so that every node can see a cycle.
+    /// What it requires, so that every node can see a cycle.
     #[serde(default, deserialize_with = "at_most::<_, _, REQUIRES_MAX>")]
-    pub(crate) requires: Vec<Name>,
+    pub(crate) requires: Vec<Requirement>,
 }
 
 /// A legal name: 1 to 63 bytes of UTF-8, no control characters (they would forge log lines).
@@ -224,7 +227,7 @@ mod tests {
                     name: name(&format!("{n}{}", &text[..text.len().min(60)])),
                     app: AppAddress::fixed(n).unwrap(),
                     ready,
-                    requires: requires.iter().map(|text| name(text)).collect(),
+                    requires: requires.iter().map(|text| text.parse().unwrap()).collect(),
                 })
                 .collect(),
             groups: Vec::new(),

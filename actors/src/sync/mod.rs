@@ -10,9 +10,9 @@
 //! | SYNC-2 | The whole list goes to a peer when its link comes up, at each change (not sooner than 5 ms after the one before), and again every 2 s. |
 //! | SYNC-3 | An entry counts as ready while its list says so, its node's link is up, a list has come since it came up, and the node is not lost. |
 //! | SYNC-4 | A list has at most 1,024 entries of at most 64 requirements, and 1,024 groups; names have 1 to 63 bytes and no control characters; nothing stands in it twice. Another one is refused whole, counted and logged. |
-//! | SYNC-5 | An application is released once in each of its lives, when every name that it requires is ready. A life begins when it registers (not so again) and when it fails. |
+//! | SYNC-5 | An application is released once in each of its lives, when all that it requires is met. A life begins when it registers (not so again) and when it fails. |
 //! | SYNC-6 | A name belongs to the application of this node; else to that of a linked node; else to that of a node whose link is down. Of several nodes the lowest address wins. Any application of the name satisfies a requirement. |
-//! | SYNC-7 | Applications that require each other in a circle are not released, whoever came first; the circle is spelled out. Those that run already are not stopped. |
+//! | SYNC-7 | Applications that require each other in a circle are not released, whoever came first; the circle is spelled out. Those that run already are not stopped. Patterns, names that nobody has, what can be done without, and counts for which too few are known are ways out. |
 //! | SYNC-8 | A released application is told when a requirement is lost and when it is met again, each once, in that order, as far as its mailbox takes it; what it does not take is offered again every 10 ms in its last form. That nobody can hear of a requirement (its link is down, or up without a list, and its node neither lost nor restarted) is told after 50 ms. |
 //! | SYNC-9 | A wait that reaches its deadline is reported with what is missing, since when and why; again each time that the deadline passes. The wait goes on. |
 

@@ -335,7 +335,8 @@ typedef struct sinew_options {
      */
     struct sinew_text name;
     /**
-     * Names that must be ready, on this node or any, before this application is. At most 64. Default: none.
+     * What must be met, on this node or any, before this application is ready: `knee.drive`, `*.drive`, `hip.imu | knee.imu`,
+     * `2 of *.drive`, `camera ?2s`. At most 64. Default: none.
      */
     const struct sinew_text *required;
     /**

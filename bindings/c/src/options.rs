@@ -33,7 +33,8 @@ pub struct Options {
     pub size: usize,
     /// The name, 1 to 63 bytes without control characters, unique on the node. Default: none.
     pub name: Text,
-    /// Names that must be ready, on this node or any, before this application is. At most 64. Default: none.
+    /// What must be met, on this node or any, before this application is ready: `knee.drive`, `*.drive`, `hip.imu | knee.imu`,
+    /// `2 of *.drive`, `camera ?2s`. At most 64. Default: none.
     pub required: *const Text,
     /// How many.
     pub required_count: usize,

@@ -10,6 +10,7 @@ mod away;
 mod context;
 mod delivery;
 mod drive;
+mod required;
 mod requirement;
 mod spec;
 mod told;
@@ -17,6 +18,9 @@ mod told;
 pub use away::{Absence, Away, Heir, LastWill, WILLS_MAX, Will};
 pub use context::{AppContext, Silence, WatchId};
 pub use delivery::{Delivery, Raw};
+pub use required::{
+    ALTERNATIVES_MAX, REQUIREMENT_BYTES_MAX, Requirement, RequirementError, is_pattern, matches,
+};
 pub use requirement::{RequirementEvent, RequirementPolicy};
 pub use spec::{AppSpec, AppWiring, DynApp};
 pub use told::Told;

@@ -19,22 +19,28 @@ use crate::{
 pub enum RequirementEvent {
     /// What this application requires is not ready any more.
     Lost {
-        /// The name that it requires.
+        /// The requirement's text: the name, where it is one.
         name: String,
     },
     /// It is ready again.
     Met {
-        /// The name that it requires.
+        /// The requirement's text.
+        name: String,
+    },
+    /// What this application can do without ([`Requirement::or_after`](crate::app::Requirement::or_after)) is not there: it was
+    /// started without it, or it went later. No policy applies. `Met` follows when it is there.
+    Without {
+        /// The requirement's text.
         name: String,
     },
 }
 
 impl RequirementEvent {
-    /// The name that is lost or met.
+    /// The text of the requirement that is lost, met or missing.
     #[must_use]
     pub fn name(&self) -> &str {
         match self {
-            Self::Lost { name } | Self::Met { name } => name,
+            Self::Lost { name } | Self::Met { name } | Self::Without { name } => name,
         }
     }
 }
@@ -106,13 +112,15 @@ pub(super) struct Requirements<A: Actor<Context = AppContext<A>>> {
     safe_state: Option<SafeState<A>>,
     /// The names that are not ready, as far as it was told.
     lost: BTreeSet<String>,
+    /// The same of what it can do without.
+    without: BTreeSet<String>,
     paused: Option<Time>,
     parting: Parting,
 }
 
 impl<A: Actor<Context = AppContext<A>>> Requirements<A> {
     pub(super) fn new(policy: RequirementPolicy, safe_state: Option<SafeState<A>>, parting: Parting) -> Self {
-        Self { policy, safe_state, lost: BTreeSet::new(), paused: None, parting }
+        Self { policy, safe_state, lost: BTreeSet::new(), without: BTreeSet::new(), paused: None, parting }
     }
 
     /// Whether neither messages nor timers are handled.
@@ -138,12 +146,13 @@ impl<A: Actor<Context = AppContext<A>>> Requirements<A> {
                 is_news
             }
             RequirementEvent::Met { name } => {
-                let is_news = self.lost.remove(name);
-                if is_news && self.lost.is_empty() {
+                let was_lost = self.lost.remove(name);
+                if was_lost && self.lost.is_empty() {
                     self.on_all_met(actor, context, event, now);
                 }
-                is_news
+                self.without.remove(name) || was_lost
             }
+            RequirementEvent::Without { name } => self.without.insert(name.clone()),
         }
     }
 

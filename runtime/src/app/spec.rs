@@ -109,7 +109,9 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self
     }
 
-    /// It starts when all these names are ready, on this node or on any other.
+    /// It starts when all of these are met, on this node or on any other: names (`knee.drive`), patterns (`*.drive`), any of
+    /// several (`hip.imu | knee.imu`), so many of them (`2 of *.drive`), or what it waits for no longer than a time
+    /// (`camera ?2s`). See [`Requirement`](crate::app::Requirement), which can be given instead of its text.
     #[must_use]
     pub fn requires<N: Into<String>>(mut self, names: impl IntoIterator<Item = N>) -> Self {
         self.common.requires.extend(names.into_iter().map(Into::into));
@@ -286,7 +288,7 @@ impl DynApp {
         self.common.address
     }
 
-    /// The names that it requires.
+    /// What it requires.
     #[must_use]
     pub fn requires(&self) -> &[String] {
         &self.common.requires

@@ -166,3 +166,11 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn a_requirement_that_says_nothing_is_refused_with_words() {
+    let mut registry = Registry::default();
+    let asked = Request { requires: vec!["0 of knee".to_owned()], ..request(fixed(1), Some("hip")) };
+    let refused = registry.register(asked, LIMITS).unwrap_err();
+    assert!(refused.to_string().contains("0 of something is no requirement"), "{refused}");
+}

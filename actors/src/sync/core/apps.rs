@@ -5,7 +5,11 @@ use std::{
     time::Duration,
 };
 
-use sinew_runtime::{tid::AppAddress, time::Time};
+use sinew_runtime::{
+    app::{Requirement, matches},
+    tid::AppAddress,
+    time::Time,
+};
 
 use super::reason::Reason;
 use crate::sync::list::{Entry, Name, REQUIRES_MAX};
@@ -21,7 +25,7 @@ pub(super) struct Apps {
 #[derive(Debug)]
 pub(super) struct App {
     pub(super) name: Option<Name>,
-    pub(super) requires: Vec<String>,
+    pub(super) requires: Vec<Requirement>,
     pub(super) state: State,
     /// How its former life ended, while this one is not ready yet.
     pub(super) ended: Option<Reason>,
@@ -29,6 +33,8 @@ pub(super) struct App {
     pub(super) lost: BTreeSet<String>,
     /// Of what it requires, what nobody can hear of, and until when that is not told.
     pub(super) silent: BTreeMap<String, Time>,
+    /// When the next time ends for which it waits for what it can do without.
+    pub(super) patience: Option<Time>,
 }
 
 /// How far an application has come in its present life.
@@ -65,6 +71,14 @@ impl App {
         }
     }
 
+    /// Why it is not ready; `None`: it is.
+    pub(super) fn why_not(&self) -> Option<Reason> {
+        match self.state {
+            State::Waiting(_) | State::Released => Some(self.ended.unwrap_or(Reason::NotReady)),
+            State::Ready => None,
+        }
+    }
+
     /// The application's name, or its address where it has none.
     pub(super) fn title(&self, app: AppAddress) -> String {
         self.name.as_ref().map_or_else(|| app.to_string(), |name| name.to_string())
@@ -74,7 +88,9 @@ impl App {
 impl Apps {
     /// Whether `app` is registered just so already.
     pub(super) fn knows(&self, app: AppAddress, name: Option<&str>, requires: &[String]) -> bool {
-        self.apps.get(&app).is_some_and(|app| app.name.as_deref() == name && app.requires == requires)
+        self.apps.get(&app).is_some_and(|app| {
+            app.name.as_deref() == name && app.requires.iter().map(Requirement::as_str).eq(requires)
+        })
     }
 
     /// A life of `app` begins; one that waits already goes on waiting. Returns the name, if it cannot be had.
@@ -82,17 +98,17 @@ impl Apps {
         &mut self,
         app: AppAddress,
         name: Option<String>,
-        mut requires: Vec<String>,
+        mut requires: Vec<Requirement>,
         wait: Wait,
     ) -> Option<String> {
         let mut seen = BTreeSet::new();
-        requires.retain(|name| seen.insert(name.clone()));
+        requires.retain(|requirement| seen.insert(requirement.to_string()));
         let former = self.remove(app);
         let wait = former.as_ref().and_then(App::wait).copied().unwrap_or(wait);
         let (name, refused) = self.claim(app, name);
         let state = State::Waiting(wait);
-        let (ended, lost, silent) = (None, BTreeSet::new(), BTreeMap::new());
-        self.apps.insert(app, App { name, requires, state, ended, lost, silent });
+        let (ended, lost, silent, patience) = (None, BTreeSet::new(), BTreeMap::new(), None);
+        self.apps.insert(app, App { name, requires, state, ended, lost, silent, patience });
         refused
     }
 
@@ -142,32 +158,21 @@ impl Apps {
         self.iter().filter_map(|(address, app)| Some((address, app, app.wait()?)))
     }
 
-    /// Whether the application called `name` is ready.
-    pub(super) fn is_ready(&self, name: &str) -> bool {
-        self.called(name).is_some_and(|(_, app)| app.state == State::Ready)
-    }
-
-    /// Why the application called `name` is not ready; `None` if it is, or is not here.
-    pub(super) fn why_not(&self, name: &str) -> Option<Reason> {
-        let app = self.called(name)?.1;
-        match app.state {
-            State::Waiting(_) | State::Released => Some(app.ended.unwrap_or(Reason::NotReady)),
-            State::Ready => None,
-        }
+    /// The applications whose names match `pattern`.
+    pub(super) fn matching(&self, pattern: &str) -> impl Iterator<Item = (&Name, AppAddress, &App)> {
+        let names = self.names.iter().filter(|(name, _)| matches(pattern, name));
+        names.filter_map(|(name, address)| Some((name, *address, self.apps.get(address)?)))
     }
 
     /// What the node's list says about them.
     pub(super) fn entries(&self) -> Vec<Entry> {
         let named = self.names.iter().filter_map(|(name, app)| Some((name, *app, self.apps.get(app)?)));
         named
-            .map(|(name, address, app)| {
-                let legal = app.requires.iter().filter_map(|name| Name::try_from(name.clone()).ok());
-                Entry {
-                    name: name.clone(),
-                    app: address,
-                    ready: app.state == State::Ready,
-                    requires: legal.take(REQUIRES_MAX).collect(),
-                }
+            .map(|(name, address, app)| Entry {
+                name: name.clone(),
+                app: address,
+                ready: app.state == State::Ready,
+                requires: app.requires.iter().take(REQUIRES_MAX).cloned().collect(),
             })
             .collect()
     }

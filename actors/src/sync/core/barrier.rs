@@ -5,7 +5,11 @@ use std::{
     time::Duration,
 };
 
-use sinew_runtime::{app::RequirementEvent, tid::AppAddress, time::Time};
+use sinew_runtime::{
+    app::{Requirement, RequirementEvent},
+    tid::AppAddress,
+    time::Time,
+};
 
 use super::{
     Core, Output, Reason,
@@ -24,13 +28,7 @@ impl Core {
     /// Releases whoever has all that it requires, and tells running applications what they lost or got back.
     pub(super) fn evaluate(&mut self, now: Time) {
         self.find_cycles();
-        let mut missing = BTreeMap::new();
-        for (address, app) in self.apps.iter().filter(|(_, app)| !app.requires.is_empty()) {
-            let unready: Vec<(String, Reason)> =
-                app.requires.iter().filter_map(|name| Some((name.clone(), self.why_not(name)?))).collect();
-            missing.insert(address, unready);
-        }
-        self.remember_seen(&missing);
+        let mut missing = self.find_missing();
         let in_cycle: BTreeSet<&str> = self.cycles.iter().flatten().map(String::as_str).collect();
         let mut released = Vec::new();
         for (address, app) in self.apps.iter_mut() {
@@ -41,7 +39,9 @@ impl Core {
                     self.not_taken.remove(&(address, Some(event.name().to_owned())));
                     self.outputs.push_back(Output::Tell { app: address, event, why });
                 }
-            } else if unready.is_empty() && !app.name.as_deref().is_some_and(|name| in_cycle.contains(name)) {
+            } else if is_free(now, app, &unready)
+                && !app.name.as_deref().is_some_and(|name| in_cycle.contains(name))
+            {
                 // spec: SYNC-5
                 app.state = State::Released;
                 released.push(address);
@@ -50,25 +50,24 @@ impl Core {
         self.outputs.extend(released.into_iter().map(|app| Output::Release { app }));
     }
 
-    /// Why `name` is not ready anywhere; `None`: it is.
-    pub(super) fn why_not(&self, name: &str) -> Option<Reason> {
-        if self.apps.is_ready(name) || self.peers.is_ready(name) {
-            return None;
+    /// What each application lacks of what it requires. Remembers which of the required names somebody had at some time, and
+    /// forgets those that nobody requires any more.
+    fn find_missing(&mut self) -> BTreeMap<AppAddress, Vec<(String, Reason)>> {
+        let (mut missing, mut seen) = (BTreeMap::new(), BTreeSet::new());
+        for (address, app) in self.apps.iter().filter(|(_, app)| !app.requires.is_empty()) {
+            let mut unmet = Vec::new();
+            for requirement in &app.requires {
+                let standing = self.standing(address, requirement);
+                if let Some(why) = standing.why_not(requirement) {
+                    unmet.push((requirement.to_string(), why));
+                }
+                let remembered = requirement.alternatives().iter().filter(|name| self.seen.contains(*name));
+                seen.extend(remembered.cloned().chain(standing.had));
+            }
+            missing.insert(address, unmet);
         }
-        let unknown = || if self.seen.contains(name) { Reason::Unregistered } else { Reason::NeverSeen };
-        Some(self.apps.why_not(name).or_else(|| self.peers.why_not(name)).unwrap_or_else(unknown))
-    }
-
-    /// Remembers which required names were known at some time, and forgets those that nobody requires any more.
-    fn remember_seen(&mut self, missing: &BTreeMap<AppAddress, Vec<(String, Reason)>>) {
-        let never: BTreeSet<&String> = missing
-            .values()
-            .flatten()
-            .filter(|(_, reason)| *reason == Reason::NeverSeen)
-            .map(|(name, _)| name)
-            .collect();
-        let required = self.apps.iter().flat_map(|(_, app)| &app.requires);
-        self.seen = required.filter(|name| !never.contains(name)).cloned().collect();
+        self.seen = seen;
+        missing
     }
 
     /// Looks for circles among what waiting applications require. spec: SYNC-7
@@ -93,11 +92,7 @@ impl Core {
     pub(super) fn wait_of(&self, now: Time, address: AppAddress) -> Option<Waiting> {
         let app = self.apps.get(address)?;
         let since = app.wait()?.since;
-        let in_cycle = |name: &String| self.cycles.iter().any(|cycle| cycle.contains(name));
-        let missing = app.requires.iter().filter_map(|name| {
-            let reason = if in_cycle(name) { Reason::Cycle } else { self.why_not(name)? };
-            Some((name.clone(), reason.words()))
-        });
+        let missing = app.requires.iter().flat_map(|requirement| self.missing_parts(address, requirement));
         Some(Waiting { application: app.title(address), missing: missing.collect(), since: now.since(since) })
     }
 
@@ -134,11 +129,19 @@ impl Core {
             let output = match name {
                 None if app.state == State::Released => Output::Release { app: address },
                 None => continue,
-                Some(name) if app.lost.contains(&name) => {
-                    let why = self.why_not(&name);
-                    Output::Tell { app: address, event: RequirementEvent::Lost { name }, why }
+                Some(name) => {
+                    let requirement = app.requires.iter().find(|requirement| requirement.as_str() == name);
+                    match requirement.filter(|_| app.lost.contains(&name)) {
+                        Some(requirement) => {
+                            let why = self.standing(address, requirement).why_not(requirement);
+                            Output::Tell { app: address, event: absence(requirement), why }
+                        }
+                        None => {
+                            let event = RequirementEvent::Met { name };
+                            Output::Tell { app: address, event, why: None }
+                        }
+                    }
                 }
-                Some(name) => Output::Tell { app: address, event: RequirementEvent::Met { name }, why: None },
             };
             self.outputs.push_back(output);
         }
@@ -146,6 +149,31 @@ impl Core {
 
     pub(super) fn forget_not_taken(&mut self, app: AppAddress) {
         self.not_taken.retain(|(other, _)| *other != app);
+    }
+}
+
+/// Whether nothing keeps a waiting application: what it lacks it can do without, and has waited for long enough. Sets when to look
+/// again. spec: SYNC-5
+fn is_free(now: Time, app: &mut App, unready: &[(String, Reason)]) -> bool {
+    let Some(since) = app.wait().map(|wait| wait.since) else { return false };
+    let lacks = |requirement: &&Requirement| unready.iter().any(|(text, _)| text == requirement.as_str());
+    let limits: Vec<Option<Time>> = app
+        .requires
+        .iter()
+        .filter(lacks)
+        .map(|requirement| requirement.wait_max().map(|wait| since + wait))
+        .filter(|limit| limit.is_none_or(|limit| now < limit))
+        .collect();
+    app.patience = limits.iter().flatten().min().copied();
+    limits.is_empty()
+}
+
+/// How an application is told that what it requires is not there.
+fn absence(requirement: &Requirement) -> RequirementEvent {
+    let name = requirement.to_string();
+    match requirement.wait_max() {
+        None => RequirementEvent::Lost { name },
+        Some(_) => RequirementEvent::Without { name },
     }
 }
 
@@ -157,22 +185,23 @@ fn changes(
 ) -> Vec<(RequirementEvent, Option<Reason>)> {
     let App { requires, lost, silent, .. } = app;
     let mut changes = Vec::new();
-    for name in requires.iter() {
+    for requirement in requires.iter() {
+        let name = requirement.as_str();
         let reason = unready.iter().find(|(other, _)| other == name).map(|(_, reason)| *reason);
         let is_told = lost.contains(name);
         match reason {
             Some(_) if is_told => {}
             Some(reason)
-                if reason.is_silence() && now < *silent.entry(name.clone()).or_insert(now + SILENCE) => {}
+                if reason.is_silence() && now < *silent.entry(name.to_owned()).or_insert(now + SILENCE) => {}
             Some(reason) => {
                 silent.remove(name);
-                lost.insert(name.clone());
-                changes.push((RequirementEvent::Lost { name: name.clone() }, Some(reason)));
+                lost.insert(name.to_owned());
+                changes.push((absence(requirement), Some(reason)));
             }
             None => {
                 silent.remove(name);
                 if lost.remove(name) {
-                    changes.push((RequirementEvent::Met { name: name.clone() }, None));
+                    changes.push((RequirementEvent::Met { name: name.to_owned() }, None));
                 }
             }
         }

@@ -9,6 +9,7 @@ mod barrier;
 mod cycles;
 mod peers;
 mod reason;
+mod requirements;
 #[cfg(test)]
 mod simulation;
 #[cfg(test)]
@@ -21,7 +22,7 @@ use std::{
 
 use bytes::Bytes;
 use sinew_runtime::{
-    app::RequirementEvent,
+    app::{Requirement, RequirementEvent},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
 };
@@ -69,7 +70,7 @@ pub(crate) enum Input {
 /// What is to be done, or to be known.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Output {
-    /// All that this application requires is ready: it may start. Once for each life of it.
+    /// All that this application requires is met: it may start. Once for each life of it.
     Release { app: AppAddress },
     /// Tell a running application that a requirement changed; of one that is lost, why.
     Tell { app: AppAddress, event: RequirementEvent, why: Option<Reason> },
@@ -97,7 +98,7 @@ pub(crate) struct Core {
     apps: Apps,
     groups: Vec<AppAddress>,
     peers: Peers,
-    /// Of what is required here, what was known at some time.
+    /// Of the names and patterns that are required here, those that somebody had at some time.
     seen: BTreeSet<String>,
     /// The cycles that stand, each without its closing name.
     cycles: BTreeSet<Vec<String>>,
@@ -162,7 +163,8 @@ impl Core {
     /// When to come back with [`Input::TimePassed`].
     pub(crate) fn next_wake(&self) -> Option<Time> {
         let overdue = self.apps.waiting().map(|(_, _, wait)| wait.overdue).min();
-        let silent = self.apps.iter().flat_map(|(_, app)| app.silent.values().copied()).min();
+        let silent =
+            self.apps.iter().flat_map(|(_, app)| app.silent.values().chain(&app.patience).copied()).min();
         [self.peers.next_due(), overdue, self.retry, silent].into_iter().flatten().min()
     }
 
@@ -218,8 +220,9 @@ impl Core {
         if let Some(waiting) = self.wait_of(now, address) {
             return waiting.missing;
         }
-        let lost = self.apps.get(address).into_iter().flat_map(|app| &app.lost);
-        lost.filter_map(|name| Some((name.clone(), self.why_not(name)?.words()))).collect()
+        let Some(app) = self.apps.get(address) else { return Vec::new() };
+        let lost = app.requires.iter().filter(|requirement| app.lost.contains(requirement.as_str()));
+        lost.flat_map(|requirement| self.missing_parts(address, requirement)).collect()
     }
 
     fn refuse(&mut self, cause: &'static str, detail: String) {
@@ -236,6 +239,7 @@ impl Core {
                 if self.apps.knows(app, name.as_deref(), &requires) => {}
             AppFact::Registered { app, name, requires } => {
                 let wait = Wait::begun(now, self.requirement_deadline);
+                let requires = self.read_requirements(app, requires);
                 let refused = self.apps.register(app, name.clone(), requires, wait);
                 if let Some(name) = refused {
                     self.refuse(
@@ -258,6 +262,17 @@ impl Core {
             // The shell looks up which they are and says so by `Input::GroupsChanged`.
             AppFact::GroupsChanged => {}
         }
+    }
+
+    /// What its door has checked. A text that is none all the same is a name that nobody has: who asks for it does not start.
+    fn read_requirements(&mut self, app: AppAddress, texts: Vec<String>) -> Vec<Requirement> {
+        let read = |text: String| {
+            text.parse().unwrap_or_else(|fault| {
+                self.refuse("requirement", format!("of {app}: {fault}"));
+                Requirement::name(text)
+            })
+        };
+        texts.into_iter().map(read).collect()
     }
 
     fn app_ready(&mut self, now: Time, address: AppAddress) {

@@ -6,6 +6,7 @@ use std::{
 };
 
 use sinew_runtime::{
+    app::{Requirement, matches},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
 };
@@ -215,7 +216,7 @@ impl Peers {
     }
 
     /// The applications called `name`, by node address, and why they are not ready.
-    fn called<'a>(&'a self, name: &'a str) -> impl Iterator<Item = (Tid, &'a Peer, &'a Entry)> {
+    fn called<'a>(&'a self, name: &str) -> impl Iterator<Item = (Tid, &'a Peer, &'a Entry)> {
         self.names.get(name).into_iter().flatten().filter_map(move |node| {
             let peer = self.nodes.get(node)?;
             let entry = peer.entry(name)?;
@@ -223,20 +224,20 @@ impl Peers {
         })
     }
 
-    /// Whether an application called `name` is ready on a linked node.
-    pub(super) fn is_ready(&self, name: &str) -> bool {
-        self.called(name).any(|(_, peer, entry)| peer.why_not(entry).is_none())
+    /// The applications called `name`, and why each is not ready.
+    pub(super) fn standing<'a>(&'a self, name: &'a str) -> impl Iterator<Item = (Tid, Option<Reason>)> {
+        self.called(name).map(|(tid, peer, entry)| (tid, peer.why_not(entry)))
     }
 
-    /// Why no application called `name` is ready, as far as other nodes know: of several, the nearest to readiness.
-    pub(super) fn why_not(&self, name: &str) -> Option<Reason> {
-        self.called(name).filter_map(|(_, peer, entry)| peer.why_not(entry)).min()
+    /// The names that match `pattern`.
+    pub(super) fn names_like(&self, pattern: &str) -> impl Iterator<Item = &Name> {
+        self.names.keys().filter(move |name| matches(pattern, name))
     }
 
     /// The requirements of each application called `name` on a linked node.
-    pub(super) fn requirements(&self, name: &str) -> Vec<Vec<String>> {
+    pub(super) fn requirements(&self, name: &str) -> Vec<Vec<Requirement>> {
         let current = self.called(name).filter(|(_, peer, _)| peer.is_current());
-        current.map(|(_, _, entry)| entry.requires.iter().map(|name| name.to_string()).collect()).collect()
+        current.map(|(_, _, entry)| entry.requires.clone()).collect()
     }
 
     /// The applications called `name` on nodes that are not lost: linked nodes first, then by address. spec: SYNC-6

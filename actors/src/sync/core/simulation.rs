@@ -13,7 +13,7 @@ const APPS: usize = 3;
 
 #[derive(Clone, Debug)]
 enum Step {
-    Register { node: usize, app: usize, requires: BTreeSet<usize> },
+    Register { node: usize, app: usize, requires: Vec<Wanted> },
     Start { node: usize, app: usize },
     Fail { node: usize, app: usize },
     Unregister { node: usize, app: usize },
@@ -25,9 +25,60 @@ enum Step {
     Pass { millis: u64 },
 }
 
+/// A requirement of any form.
+#[derive(Clone, Debug, PartialEq)]
+enum Wanted {
+    /// At least so many of these applications.
+    AtLeast { count: usize, of: BTreeSet<usize> },
+    /// At least so many of this node's.
+    OfNode { count: usize, node: usize },
+}
+
+fn any_wanted() -> impl Strategy<Value = Wanted> {
+    let of = |sizes| proptest::collection::btree_set(0..NODES * APPS, sizes);
+    prop_oneof![
+        3 => of(1..2).prop_map(|of| Wanted::AtLeast { count: 1, of }),
+        1 => of(2..4).prop_map(|of| Wanted::AtLeast { count: 1, of }),
+        1 => of(2..4).prop_map(|of| Wanted::AtLeast { count: 2, of }),
+        1 => (1usize..3, 0..NODES).prop_map(|(count, node)| Wanted::OfNode { count, node }),
+    ]
+}
+
+impl Wanted {
+    /// What an application may require so that there is no circle: those with a smaller number than its own.
+    fn below(self, index: usize) -> Option<Self> {
+        match self {
+            Self::AtLeast { count, of } => {
+                let of: BTreeSet<usize> = of.into_iter().filter(|wanted| *wanted < index).collect();
+                (of.len() >= count).then_some(Self::AtLeast { count, of })
+            }
+            Self::OfNode { count, node } => {
+                ((node + 1) * APPS <= index).then_some(Self::OfNode { count, node })
+            }
+        }
+    }
+
+    fn requirement(&self) -> Requirement {
+        match self {
+            Self::AtLeast { count, of } => Requirement::at_least(*count, of.iter().map(|index| name(*index))),
+            Self::OfNode { count, node } => Requirement::at_least(*count, [format!("{node}.*")]),
+        }
+    }
+
+    /// The judge's own reading of it.
+    fn is_met_by(&self, is_there: impl Fn(usize) -> bool) -> bool {
+        match self {
+            Self::AtLeast { count, of } => of.iter().filter(|index| is_there(**index)).count() >= *count,
+            Self::OfNode { count, node } => {
+                (node * APPS..(node + 1) * APPS).filter(|index| is_there(*index)).count() >= *count
+            }
+        }
+    }
+}
+
 fn any_step() -> impl Strategy<Value = Step> {
     let pair = (0..NODES, 0..APPS);
-    let requires = proptest::collection::btree_set(0..NODES * APPS, 0..4);
+    let requires = proptest::collection::vec(any_wanted(), 0..4);
     let link = 0..NODES;
     prop_oneof![
         4 => (pair.clone(), requires).prop_map(|((node, app), requires)| Step::Register { node, app, requires }),
@@ -46,7 +97,7 @@ fn any_step() -> impl Strategy<Value = Step> {
 /// An application as its own node's root sees it.
 #[derive(Clone, Debug, PartialEq)]
 struct Life {
-    requires: Vec<usize>,
+    requires: Vec<Wanted>,
     released: u32,
     running: bool,
 }
@@ -140,8 +191,11 @@ impl World {
         let (_, life) = self.life(node, app);
         life.released += 1;
         assert_eq!(life.released, 1, "released twice in one life");
-        for required in &life.requires {
-            assert!(ready.contains(&name(*required)), "{} is not ready", name(*required));
+        for wanted in &life.requires {
+            assert!(
+                wanted.is_met_by(|index| ready.contains(&name(index))),
+                "too early: {wanted:?} is not met"
+            );
         }
     }
 
@@ -182,16 +236,17 @@ impl World {
         }
     }
 
-    fn register(&mut self, node: usize, app: usize, requires: BTreeSet<usize>) {
+    fn register(&mut self, node: usize, app: usize, wanted: Vec<Wanted>) {
         // Requirements point to smaller numbers only, so that there is no cycle.
         let index = node * APPS + app;
-        let requires: Vec<usize> = requires.into_iter().filter(|required| *required < index).collect();
+        let mut requires: Vec<Wanted> = wanted.into_iter().filter_map(|wanted| wanted.below(index)).collect();
+        requires.dedup();
         // Told again, it is no new life.
         if self.apps[node].get(&app).is_none_or(|life| life.requires != requires) {
             let life = Life { requires: requires.clone(), released: 0, running: false };
             self.apps[node].insert(app, life);
         }
-        let requires = requires.into_iter().map(name).collect();
+        let requires = requires.iter().map(|wanted| wanted.requirement().to_string()).collect();
         let fact = AppFact::Registered { app: app_address(app), name: Some(name(index)), requires };
         self.tell(node, Input::AppChanged(fact));
     }
@@ -275,7 +330,9 @@ impl World {
         let mut possible = BTreeSet::new();
         for index in 0..NODES * APPS {
             let life = self.apps[index / APPS].get(&(index % APPS));
-            if life.is_some_and(|life| life.requires.iter().all(|required| possible.contains(required))) {
+            if life.is_some_and(|life| {
+                life.requires.iter().all(|wanted| wanted.is_met_by(|index| possible.contains(&index)))
+            }) {
                 possible.insert(index);
             }
         }

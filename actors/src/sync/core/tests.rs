@@ -2,6 +2,9 @@
 
 use std::net::SocketAddr;
 
+#[path = "forms_tests.rs"]
+mod forms;
+
 use super::{
     barrier::{RETRY, SILENCE},
     peers::{REPEAT, SPACING},
@@ -94,7 +97,7 @@ fn list(version: u64, entries: &[(&str, bool, &[&str])]) -> List {
         name: name(text),
         app: app(index),
         ready: *ready,
-        requires: requires.iter().map(|text| name(text)).collect(),
+        requires: requires.iter().map(|text| text.parse().unwrap()).collect(),
     });
     List { incarnation: LIFE, version, entries: entries.collect(), groups: Vec::new() }
 }

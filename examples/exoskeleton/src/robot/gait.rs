@@ -307,7 +307,9 @@ impl Handler<Delivery<RequirementEvent>> for Gait {
     fn handle(&mut self, event: Delivery<RequirementEvent>, _: &mut Self::Context) {
         let Some(joint) = joint_of_sensor(event.name()) else { return };
         match event.payload {
-            RequirementEvent::Lost { .. } => self.learn(joint, |gone| gone.sensor = true),
+            RequirementEvent::Lost { .. } | RequirementEvent::Without { .. } => {
+                self.learn(joint, |gone| gone.sensor = true)
+            }
             RequirementEvent::Met { .. } => self.learn(joint, |gone| gone.sensor = false),
         }
     }

@@ -1,0 +1,110 @@
+//! Requirements of every form: any of several, so many, patterns, what can be done without.
+
+use super::*;
+
+fn words(missing: &[(String, &'static str)]) -> Vec<String> {
+    missing.iter().map(|(part, why)| format!("{part}: {why}")).collect()
+}
+
+#[test]
+fn any_of_several_is_enough_and_another_may_take_over() {
+    let mut bench = Bench::new();
+    assert_eq!(bench.registers(0, "gait", &["hip.imu | knee.imu"]), []);
+    bench.registers(1, "hip.imu", &[]);
+    bench.registers(2, "knee.imu", &[]);
+    assert_eq!(
+        words(&bench.missing()),
+        [
+            "hip.imu | knee.imu (0 ready): hip.imu: registered, not ready",
+            "hip.imu | knee.imu (0 ready): knee.imu: registered, not ready",
+        ]
+    );
+    assert_eq!(bench.ready(2), [release(0)]);
+    bench.ready(0);
+    assert_eq!(bench.ready(1), []);
+    assert!(
+        !bench.down(2).contains(&lost(0, "hip.imu | knee.imu", Reason::Failed)),
+        "the other one is ready"
+    );
+    assert!(bench.down(1).contains(&lost(0, "hip.imu | knee.imu", Reason::Failed)));
+    assert_eq!(bench.ready(2), [met(0, "hip.imu | knee.imu")]);
+}
+
+#[test]
+fn so_many_that_match_are_enough_wherever_they_are() {
+    let mut bench = Bench::new();
+    bench.registers(0, "gait", &["2 of *.drive"]);
+    bench.registers(1, "hip.drive", &[]);
+    bench.registers(2, "driver", &[]);
+    bench.ready(2);
+    assert_eq!(bench.ready(1), []);
+    assert_eq!(
+        words(&bench.missing()),
+        ["2 of *.drive (1 ready): never seen"],
+        "of a second one nothing is known"
+    );
+    bench.links(KNEE, LIFE);
+    let outputs = bench.list(KNEE, list(1, &[("knee.drive", false, &[])]));
+    assert!(!outputs.contains(&release(0)));
+    assert_eq!(words(&bench.missing()), ["2 of *.drive (1 ready): knee.drive: registered, not ready"]);
+    assert!(bench.list(KNEE, list(2, &[("knee.drive", true, &[])])).contains(&release(0)));
+}
+
+#[test]
+fn one_name_on_two_nodes_counts_twice_and_who_requires_never_for_itself() {
+    let mut bench = Bench::new();
+    bench.registers(0, "a.drive", &["2 of *.drive"]);
+    bench.links(KNEE, LIFE);
+    bench.links(ANKLE, LIFE);
+    bench.list(KNEE, list(1, &[("b.drive", true, &[])]));
+    assert!(bench.list(ANKLE, list(1, &[("b.drive", true, &[])])).contains(&release(0)));
+    bench.ready(0);
+    let outputs = bench.lost(ANKLE, LossReason::Silent);
+    assert!(
+        outputs.contains(&lost(0, "2 of *.drive", Reason::NodeLost)),
+        "its own readiness is not counted: {outputs:?}"
+    );
+    bench.registers(1, "a", &["1 of a | b | c", "b"]);
+    bench.registers(2, "b", &[]);
+    bench.ready(2);
+    bench.ready(1);
+    assert!(bench.down(2).contains(&lost(1, "1 of a | b | c", Reason::Failed)), "nor is it by its own name");
+}
+
+#[test]
+fn what_can_be_done_without_is_waited_for_only_so_long() {
+    let mut bench = Bench::new();
+    assert_eq!(bench.registers(0, "gait", &["camera ?500ms", "knee"]), []);
+    assert_eq!(bench.core.next_wake(), Some(bench.now + Duration::from_millis(500)));
+    assert_eq!(bench.passes(Duration::from_millis(500)), [], "the knee cannot be done without");
+    assert_ne!(bench.core.next_wake(), Some(bench.now), "it does not turn in place");
+    bench.registers(1, "knee", &[]);
+    assert_eq!(bench.ready(1), [release(0)]);
+    let event = RequirementEvent::Without { name: "camera ?500ms".to_owned() };
+    let without = |why| Output::Tell { app: app(0), event: event.clone(), why: Some(why) };
+    assert_eq!(bench.ready(0), [without(Reason::NeverSeen)]);
+    bench.registers(2, "camera", &[]);
+    assert_eq!(bench.ready(2), [met(0, "camera ?500ms")]);
+    assert_eq!(bench.down(2), [without(Reason::Failed), release(2)]);
+}
+
+#[test]
+fn what_comes_within_its_time_is_not_done_without() {
+    let mut bench = Bench::new();
+    bench.registers(0, "gait", &["camera ?500ms"]);
+    bench.registers(1, "camera", &[]);
+    assert_eq!(bench.ready(1), [release(0)]);
+    assert_eq!(bench.ready(0), []);
+}
+
+#[test]
+fn a_circle_through_a_choice_is_refused_only_if_no_way_is_left() {
+    let mut bench = Bench::new();
+    bench.registers(0, "a", &["b | c"]);
+    bench.registers(1, "b", &["a"]);
+    let outputs = bench.registers(2, "c", &["a"]);
+    let names = ["a", "b", "a"].map(str::to_owned).to_vec();
+    assert_eq!(outputs, [Output::Cycle { names }]);
+    bench.links(KNEE, LIFE);
+    assert!(bench.list(KNEE, list(1, &[("c", true, &[])])).contains(&release(0)));
+}

@@ -1,0 +1,106 @@
+//! How a requirement stands: who counts for it, how many of them are ready, and why the others are not.
+
+use std::collections::BTreeSet;
+
+use sinew_runtime::{
+    app::{Requirement, is_pattern},
+    tid::{AppAddress, Tid},
+};
+
+use super::{Core, Reason};
+
+/// Of those that a requirement with a pattern or a choice lacks, so many are named at most.
+const NAMED_MAX: usize = 8;
+
+/// How one requirement of one application stands.
+#[derive(Debug, Default)]
+pub(super) struct Standing {
+    /// Applications that count for it and are ready.
+    pub(super) ready: BTreeSet<Tid>,
+    /// Names that count for it, and the last that is known of each; patterns that nobody matches.
+    pub(super) unready: Vec<(String, Reason)>,
+    /// Those of its names and patterns that somebody has, ready or not.
+    pub(super) had: Vec<String>,
+}
+
+impl Standing {
+    /// Why `requirement` is not met, the nearest to it of several reasons; `None`: it is.
+    pub(super) fn why_not(&self, requirement: &Requirement) -> Option<Reason> {
+        if self.ready.len() >= requirement.count() {
+            return None;
+        }
+        // Every application that counts is ready, and they are too few: of the others nobody has been seen.
+        Some(self.unready.iter().map(|(_, reason)| *reason).min().unwrap_or(Reason::NeverSeen))
+    }
+}
+
+impl Core {
+    /// How a requirement of the application at `of` stands. It never counts for itself.
+    pub(super) fn standing(&self, of: AppAddress, requirement: &Requirement) -> Standing {
+        let mut standing = Standing::default();
+        for alternative in requirement.alternatives() {
+            let names: BTreeSet<&str> = if is_pattern(alternative) {
+                let here = self.apps.matching(alternative).map(|(name, ..)| &**name);
+                here.chain(self.peers.names_like(alternative).map(|name| &**name)).collect()
+            } else {
+                BTreeSet::from([alternative.as_str()])
+            };
+            let before = standing.had.len();
+            for name in names {
+                self.count(of, name, alternative, &mut standing);
+            }
+            if standing.had.len() == before {
+                let is_known = self.seen.contains(alternative);
+                let reason = if is_known { Reason::Unregistered } else { Reason::NeverSeen };
+                standing.unready.push((alternative.clone(), reason));
+            }
+        }
+        standing
+    }
+
+    /// Counts those that have `name`, but for the application at `of`.
+    fn count(&self, of: AppAddress, name: &str, alternative: &str, standing: &mut Standing) {
+        let here = self.apps.called(name).map(|(address, app)| (Tid::new(self.node, address), app.why_not()));
+        let mut reasons = Vec::new();
+        for (tid, why_not) in here.into_iter().chain(self.peers.standing(name)) {
+            match why_not {
+                // It neither counts nor is missing.
+                _ if tid == Tid::new(self.node, of) => {}
+                None => drop(standing.ready.insert(tid)),
+                Some(reason) => reasons.push(reason),
+            }
+            standing.had.push(alternative.to_owned());
+        }
+        // A name of which one application is ready still lacks the others, where more are needed.
+        if let Some(nearest) = reasons.into_iter().min()
+            && !standing.unready.iter().any(|(known, _)| known == name)
+        {
+            standing.unready.push((name.to_owned(), nearest));
+        }
+    }
+
+    /// What `requirement` of the application at `of` lacks, part by part, with the last that is known of each; nothing: it is met.
+    pub(super) fn missing_parts(
+        &self,
+        of: AppAddress,
+        requirement: &Requirement,
+    ) -> Vec<(String, &'static str)> {
+        let standing = self.standing(of, requirement);
+        let Some(nearest) = standing.why_not(requirement) else { return Vec::new() };
+        let in_cycle = |name: &str| self.cycles.iter().any(|cycle| cycle.iter().any(|other| other == name));
+        let words = |name: &str, reason: Reason| {
+            if in_cycle(name) { Reason::Cycle.words() } else { reason.words() }
+        };
+        if let Some(name) = requirement.only_name() {
+            return vec![(name.to_owned(), words(name, nearest))];
+        }
+        let ready = standing.ready.len();
+        if standing.unready.is_empty() {
+            return vec![(format!("{requirement} ({ready} ready)"), nearest.words())];
+        }
+        let named = standing.unready.iter().take(NAMED_MAX);
+        named
+            .map(|(name, reason)| (format!("{requirement} ({ready} ready): {name}"), words(name, *reason)))
+            .collect()
+    }
+}

@@ -1,0 +1,319 @@
+//! What an application requires: names of the system, so many of them, and for how long it waits for what it can do without.
+//!
+//! A requirement is a line of text, the same in an `AppSpec`, over LNCL and in C; the list of an application's
+//! requirements is met when each of them is.
+//!
+//! | text | met when |
+//! | --- | --- |
+//! | `knee.drive` | an application of this name is ready |
+//! | `*.drive` | one whose name matches is: `*` stands for any characters, also for none |
+//! | `hip.imu \| knee.imu` | any of these is |
+//! | `2 of *.drive` | at least 2 applications are, each counted once, where several nodes have a name each of them |
+//! | `camera ?500ms`, `2 of *.drive ?2s` | it is, or the application has waited so long: then it starts without |
+
+use std::{fmt, str::FromStr, time::Duration};
+
+use serde::{Deserialize, Serialize};
+
+/// Longest requirement in bytes.
+pub const REQUIREMENT_BYTES_MAX: usize = 255;
+/// Names or patterns between which one requirement chooses, at most.
+pub const ALTERNATIVES_MAX: usize = 16;
+/// Longest name in bytes.
+const NAME_BYTES_MAX: usize = 63;
+/// What ends the count of a requirement.
+const OF: &str = " of ";
+
+/// One requirement of an application: its text, and what it says.
+///
+/// ```
+/// use std::time::Duration;
+/// use sinew_runtime::app::{AppSpec, Requirement};
+/// # use actix::Actor;
+/// # struct Gait;
+/// # impl Actor for Gait { type Context = sinew_runtime::app::AppContext<Self>; }
+///
+/// let spec = AppSpec::new("gait", || Gait).requires(["knee.drive", "hip.imu | knee.imu", "2 of *.drive", "camera ?2s"]);
+/// let same = AppSpec::new("gait", || Gait).requires([
+///     Requirement::name("knee.drive"),
+///     Requirement::any(["hip.imu", "knee.imu"]),
+///     Requirement::at_least(2, ["*.drive"]),
+///     Requirement::name("camera").or_after(Duration::from_secs(2)),
+/// ]);
+/// ```
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct Requirement {
+    text: String,
+    at_least: usize,
+    of: Vec<String>,
+    or_after: Option<Duration>,
+}
+
+/// Why a text is no requirement. The caller is at fault.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("the requirement {text:?} cannot be used: {why}")]
+pub struct RequirementError {
+    /// The text, or its beginning.
+    pub text: String,
+    /// What is wrong with it, and what would be right.
+    pub why: &'static str,
+}
+
+impl Requirement {
+    /// An application of this name, or whose name matches this pattern, is ready.
+    #[must_use]
+    pub fn name(name: impl Into<String>) -> Self {
+        Self::at_least(1, [name])
+    }
+
+    /// An application of any of these names or patterns is ready.
+    #[must_use]
+    pub fn any<N: Into<String>>(names: impl IntoIterator<Item = N>) -> Self {
+        Self::at_least(1, names)
+    }
+
+    /// At least `count` applications whose names are among these or match them are ready. Each application counts once, and
+    /// where several nodes have one of a name, each of them does; the one that requires it does not.
+    #[must_use]
+    pub fn at_least<N: Into<String>>(count: usize, names: impl IntoIterator<Item = N>) -> Self {
+        let of: Vec<String> = names.into_iter().map(Into::into).collect();
+        let choice = of.join(" | ");
+        let text = if count == 1 { choice } else { format!("{count}{OF}{choice}") };
+        Self { text, at_least: count, of, or_after: None }
+    }
+
+    /// After this time at the barrier the application starts without it, and is told so
+    /// ([`RequirementEvent::Without`](crate::app::RequirementEvent::Without)). Whole milliseconds.
+    #[must_use]
+    pub fn or_after(mut self, wait: Duration) -> Self {
+        self.text = format!("{} ?{}ms", self.text, wait.as_millis());
+        self.or_after = Some(wait);
+        self
+    }
+
+    /// Its text.
+    #[must_use]
+    pub fn as_str(&self) -> &str {
+        &self.text
+    }
+
+    /// How many applications it takes.
+    #[must_use]
+    pub const fn count(&self) -> usize {
+        self.at_least
+    }
+
+    /// The names and patterns that count for it.
+    #[must_use]
+    pub fn alternatives(&self) -> &[String] {
+        &self.of
+    }
+
+    /// For how long an application waits for it at most; `None`: it does not start without.
+    #[must_use]
+    pub const fn wait_max(&self) -> Option<Duration> {
+        self.or_after
+    }
+
+    /// The one name that it asks for, if that is all that it asks for.
+    #[must_use]
+    pub fn only_name(&self) -> Option<&str> {
+        match self.of.as_slice() {
+            [name] if self.at_least == 1 && self.or_after.is_none() && !is_pattern(name) => Some(name),
+            _ => None,
+        }
+    }
+
+    /// Whether an application of this name counts for it.
+    #[must_use]
+    pub fn counts(&self, name: &str) -> bool {
+        self.of.iter().any(|pattern| matches(pattern, name))
+    }
+}
+
+/// Whether a text stands for more than the one name that it spells.
+#[must_use]
+pub fn is_pattern(text: &str) -> bool {
+    text.contains('*')
+}
+
+/// Whether `name` is what `pattern` says, in which `*` stands for any characters, also for none.
+#[must_use]
+pub fn matches(pattern: &str, name: &str) -> bool {
+    let mut parts = pattern.split('*');
+    let first = parts.next().unwrap_or_default();
+    let Some(mut rest) = name.strip_prefix(first) else { return false };
+    let Some(last) = parts.next_back() else { return rest.is_empty() };
+    // The earliest place of each part leaves the most to those behind it.
+    for part in parts {
+        let Some(at) = rest.find(part) else { return false };
+        rest = &rest[at + part.len()..];
+    }
+    rest.ends_with(last)
+}
+
+impl FromStr for Requirement {
+    type Err = RequirementError;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        parse(text).map_err(|why| RequirementError { text: text.chars().take(NAME_BYTES_MAX).collect(), why })
+    }
+}
+
+fn parse(text: &str) -> Result<Requirement, &'static str> {
+    if text.len() > REQUIREMENT_BYTES_MAX {
+        return Err("it has more than 255 bytes; require less, or use patterns");
+    }
+    let (choice, or_after) = match text.rsplit_once(" ?") {
+        Some((choice, wait)) => {
+            (choice, Some(duration(wait).ok_or("what follows ` ?` is a time: `500ms` or `2s`")?))
+        }
+        None => (text, None),
+    };
+    let counted = choice.split_once(OF).and_then(|(count, of)| Some((count.parse::<u16>().ok()?, of)));
+    let (at_least, choice) = counted.unwrap_or((1, choice));
+    if at_least == 0 {
+        return Err("0 of something is no requirement; leave it out");
+    }
+    let mut of = Vec::new();
+    for name in choice.split('|').map(str::trim) {
+        if name.is_empty() || name.len() > NAME_BYTES_MAX {
+            return Err("each name in it has 1 to 63 bytes");
+        }
+        if name.chars().any(char::is_control) {
+            return Err("a name has no control characters");
+        }
+        if !of.iter().any(|known| known == name) {
+            of.push(name.to_owned());
+        }
+    }
+    if of.len() > ALTERNATIVES_MAX {
+        return Err("it chooses between more than 16 names; use a pattern");
+    }
+    Ok(Requirement { text: text.to_owned(), at_least: usize::from(at_least), of, or_after })
+}
+
+/// `500ms`, `2s`.
+fn duration(text: &str) -> Option<Duration> {
+    let (number, unit_ms) = match text.strip_suffix("ms") {
+        Some(number) => (number, 1),
+        None => (text.strip_suffix('s')?, 1_000),
+    };
+    let number: u32 = number.parse().ok()?;
+    Some(Duration::from_millis(u64::from(number) * unit_ms))
+}
+
+impl TryFrom<String> for Requirement {
+    type Error = RequirementError;
+
+    fn try_from(text: String) -> Result<Self, Self::Error> {
+        text.parse()
+    }
+}
+
+impl From<Requirement> for String {
+    fn from(requirement: Requirement) -> Self {
+        requirement.text
+    }
+}
+
+impl fmt::Display for Requirement {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.text)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn read(text: &str) -> Requirement {
+        text.parse().unwrap()
+    }
+
+    #[test]
+    fn each_form_says_what_its_text_says() {
+        assert_eq!(read("knee.drive").only_name(), Some("knee.drive"));
+        assert_eq!(read("a | b|c").alternatives(), ["a", "b", "c"]);
+        let counted = read("2 of *.drive ?1500ms");
+        assert_eq!((counted.count(), counted.wait_max()), (2, Some(Duration::from_millis(1_500))));
+        assert_eq!(read("camera ?2s").wait_max(), Some(Duration::from_secs(2)));
+        assert_eq!(read("king of spain").only_name(), Some("king of spain"), "no number, no count");
+        assert_eq!((read("*.drive").only_name(), read("a ?1s").only_name()), (None, None));
+    }
+
+    #[test]
+    fn what_is_built_reads_as_it_was_built() {
+        let built = [
+            Requirement::name("knee"),
+            Requirement::any(["a", "b*"]),
+            Requirement::at_least(3, ["*.drive"]).or_after(Duration::from_millis(20)),
+        ];
+        for requirement in built {
+            assert_eq!(read(requirement.as_str()), requirement);
+        }
+    }
+
+    #[test]
+    fn what_is_no_requirement_is_refused_with_words() {
+        let long = "x".repeat(64);
+        let many = vec!["a"; 300].join("|");
+        for bad in ["", "a |", "0 of a", "a ?soon", "a ?", "a\nb", long.as_str(), many.as_str()] {
+            assert!(bad.parse::<Requirement>().is_err(), "{bad:?}");
+        }
+        let names: Vec<String> = (0..=ALTERNATIVES_MAX).map(|index| index.to_string()).collect();
+        assert!(names.join("|").parse::<Requirement>().is_err());
+        assert_eq!(
+            "0 of a".parse::<Requirement>().unwrap_err().to_string(),
+            "the requirement \"0 of a\" cannot be used: 0 of something is no requirement; leave it out"
+        );
+    }
+
+    #[test]
+    fn a_star_stands_for_any_characters() {
+        for (pattern, name, expected) in [
+            ("*.drive", "knee.drive", true),
+            ("*.drive", "drive", false),
+            ("*.drive", "knee.drive.left", false),
+            ("leg*", "leg", true),
+            ("a*b*c", "aXbYbZc", true),
+            ("a*b*c", "acb", false),
+            ("ab*ba", "aba", false),
+            ("*", "", true),
+            ("plain", "plainer", false),
+        ] {
+            assert_eq!(matches(pattern, name), expected, "{pattern} {name}");
+        }
+    }
+
+    /// The plain definition: a star is nothing, or one character and a star.
+    fn by_definition(pattern: &[u8], name: &[u8]) -> bool {
+        match (pattern.split_first(), name.split_first()) {
+            (None, None) => true,
+            (Some((b'*', rest)), None) => by_definition(rest, name),
+            (Some((b'*', rest)), Some((_, less))) => {
+                by_definition(rest, name) || by_definition(pattern, less)
+            }
+            (Some((a, rest)), Some((b, less))) => a == b && by_definition(rest, less),
+            (None, Some(_)) | (Some(_), None) => false,
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn matching_is_what_a_star_says(pattern in "[ab*]{0,7}", name in "[ab]{0,8}") {
+            prop_assert_eq!(matches(&pattern, &name), by_definition(pattern.as_bytes(), name.as_bytes()));
+        }
+
+        #[test]
+        fn any_text_is_a_requirement_or_refused(text in ".{0,40}") {
+            if let Ok(requirement) = text.parse::<Requirement>() {
+                prop_assert_eq!(requirement.as_str(), text.as_str());
+                prop_assert!(requirement.count() > 0 && !requirement.alternatives().is_empty());
+            }
+        }
+    }
+}
