@@ -1,5 +1,7 @@
 //! Where messages go: the routing table of a node, read by senders without a lock.
 
+pub mod tap;
+
 use std::{
     collections::BTreeMap,
     sync::{
@@ -11,6 +13,7 @@ use std::{
 
 use arc_swap::ArcSwap;
 
+use self::tap::Tap;
 use crate::{
     outcome::{Rejection, Ticket},
     post::lock,
@@ -73,6 +76,8 @@ pub struct LocalRoute {
 
 #[derive(Clone, Default)]
 struct Table {
+    /// Who watches; nobody, as a rule.
+    tap: Option<Arc<dyn Tap>>,
     local: BTreeMap<AppAddress, LocalRoute>,
     groups: BTreeMap<AppAddress, Vec<AppAddress>>,
     peers: BTreeMap<NodeAddress, Arc<dyn Outlet>>,
@@ -158,7 +163,8 @@ impl Router {
         let table = self.table.load();
         let app = message.header.destination.app;
         let result = if message.header.destination.is_single() {
-            submit_to(table.local.get(&app).map(|route| &route.outlet), message, Rejection::NoSuchApplication)
+            let outlet = table.local.get(&app).map(|route| &route.outlet);
+            submit_to(&table, outlet, message, Rejection::NoSuchApplication)
         } else {
             self.fan_out(&table, app, &message);
             Ok(())
@@ -175,7 +181,9 @@ impl Router {
     pub fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
         let table = self.table.load();
         match table.local.get(&message.header.destination.app) {
-            Some(route) => route.outlet.offer(message, room),
+            Some(route) => {
+                tap::hand_over(table.tap.as_ref(), message, true, |message| route.outlet.offer(message, room))
+            }
             None => Err(Refused::new(message, Rejection::NoSuchApplication)),
         }
     }
@@ -241,9 +249,9 @@ impl Router {
         let Tid { node, app } = message.header.destination;
         if node == here {
             let route = table.local.get(&app).map(|route| &route.outlet);
-            submit_to(route, message, Rejection::NoSuchApplication)
+            submit_to(table, route, message, Rejection::NoSuchApplication)
         } else {
-            submit_to(table.peers.get(&node), message, Rejection::NoSuchNode)
+            submit_to(table, table.peers.get(&node), message, Rejection::NoSuchNode)
         }
     }
 
@@ -251,6 +259,7 @@ impl Router {
     fn multicast(&self, table: &Table, message: Message) -> Result<(), Refused> {
         let Tid { node, app } = message.header.destination;
         let mut taken = 0;
+        tap::saw_sent_to_many(table.tap.as_ref(), &message);
         if node == self.node || node == NodeAddress::ALL {
             taken += self.fan_out(table, app, &message);
         }
@@ -271,7 +280,12 @@ impl Router {
         let here = self.node;
         let submit = |(member, outlet): (AppAddress, &Arc<dyn Outlet>)| {
             let is_sender = here == message.header.source.node && member == message.header.source.app;
-            !is_sender && outlet.submit(copy_of(message)).is_ok()
+            if is_sender {
+                return false;
+            }
+            let refused = outlet.submit(copy_of(message)).err().map(|refused| refused.why);
+            tap::saw_one_of_many(table.tap.as_ref(), Tid::new(here, member), message, refused);
+            refused.is_none()
         };
         if app.is_group() {
             let members = table.groups.get(&app).map_or(&[][..], Vec::as_slice);
@@ -328,6 +342,11 @@ impl Router {
         changed
     }
 
+    /// Shows messages to `tap` from now on; to nobody, if there is none.
+    pub fn set_tap(&self, tap: Option<Arc<dyn Tap>>) {
+        self.change(|table| table.tap = tap);
+    }
+
     /// Groups that have a member on this node.
     #[must_use]
     pub fn groups(&self) -> Vec<AppAddress> {
@@ -364,14 +383,15 @@ impl Router {
 }
 
 fn submit_to(
+    table: &Table,
     outlet: Option<&Arc<dyn Outlet>>,
     message: Message,
     otherwise: Rejection,
 ) -> Result<(), Refused> {
-    match outlet {
+    tap::hand_over(table.tap.as_ref(), message, false, |message| match outlet {
         Some(outlet) => outlet.submit(message),
         None => Err(Refused::new(message, otherwise)),
-    }
+    })
 }
 
 /// A copy that shares the payload; receipts are never shared.
