@@ -4,7 +4,7 @@ use std::{net::Ipv4Addr, path::PathBuf, time::Duration};
 
 use clap::{Parser, Subcommand};
 
-use crate::send::Order;
+use crate::{send, watch};
 
 /// Shows a running Sinew system, from any one node of it. It changes nothing, but for what `send` sends.
 ///
@@ -54,7 +54,12 @@ pub(crate) enum Command {
     /// Sends a message, and says what became of it
     ///
     /// The payload is written as MessagePack, as every typed payload is: what its type calls its fields are the keys of the JSON object.
-    Send(Order),
+    Send(send::Order),
+    /// Shows what an application gets and sends: decoded payloads, type, class, source, age, and each type's rate once a second
+    ///
+    /// The copies come from the application's node, as far as it has room for them: what has none is counted, the application does not
+    /// wait. Not seen is what goes over direct links between processes (`Registration::direct`). With --json each line is an object.
+    Watch(watch::Order),
     /// Who waits for whom at start-up barriers, and who blocks them
     Barriers,
     /// Where every message is that was ever sent: what each mailbox, client and link took, and how each of these ended
@@ -93,6 +98,7 @@ Examples:
   sinew nodes
   sinew ping knee.drive --count 1000
   sinew send knee.drive demo.angle '{\"degrees\": 5}'
+  sinew watch knee.drive --received
   sinew apps --json | jq '.apps[] | select(.ready | not)'
   sinew --socket /run/sinew/knee.sock barriers
   sinew completions bash > ~/.local/share/bash-completion/completions/sinew";

@@ -15,6 +15,7 @@ mod send;
 mod system;
 mod table;
 mod tree;
+mod watch;
 
 use std::process::ExitCode;
 
@@ -46,7 +47,7 @@ fn main() -> ExitCode {
     let arguments = Arguments::parse();
     match run(&arguments) {
         Ok(said) => {
-            let json = || format!("{:#}\n", said.json);
+            let json = || if said.json.is_null() { String::new() } else { format!("{:#}\n", said.json) };
             let text = if arguments.json { json() } else { said.text };
             // A reader that has seen enough, as `head`, is no fault.
             let _ = std::io::Write::write_all(&mut std::io::stdout(), text.as_bytes());
@@ -75,6 +76,7 @@ fn run(arguments: &Arguments) -> Result<Said, Fault> {
         Command::Tree { node } => inside(&|system| tree::show(system, node.as_deref())),
         Command::Ping { whom, count } => inside(&|system| ping::show(system, whom, *count)),
         Command::Send(order) => inside(&|system| send::show(system, order)),
+        Command::Watch(order) => inside(&|system| watch::show(system, order, arguments.json)),
         Command::Barriers => inside(&apps::barriers),
         Command::Audit => inside(&audit::show),
         Command::Doctor { interface } => Ok(doctor::show(*interface, arguments.socket.as_deref())),

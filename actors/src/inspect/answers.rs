@@ -8,15 +8,18 @@ use std::{
 
 use sinew_runtime::{
     outcome::Rejection,
+    router::tap::Way,
     supervision::Strategy,
     tid::{NodeAddress, Tid},
     time::Time,
+    wire::Flags,
 };
 
 use super::reports::{
     APPS_MAX, AppReport, AppsReport, AuditReport, LinkReport, Missing, NodeReport, PEERS_MAX, PeerReport,
-    TREE_MAX, TreeLine, TreeReport,
+    SeenMessage, TREE_MAX, TreeLine, TreeReport, WatchReport,
 };
+use super::watches::{Fetched, Sight};
 use crate::{
     audit,
     gncl::Peer,
@@ -86,6 +89,18 @@ impl Answers {
         Ok(TreeReport { name: tree.node, lines, left_out })
     }
 
+    /// What a watcher has not seen yet, with the names of the types.
+    pub(super) fn seen(&self, stores: &Stores, fetched: Fetched) -> WatchReport {
+        let Fetched { sights, dropped, more } = fetched;
+        let now = Time::now();
+        let registry = lock(&stores.registry);
+        let seen = sights.into_iter().map(|sight| {
+            let name = registry.kind_name(sight.header.kind).map(str::to_owned);
+            seen_message(now, sight, name)
+        });
+        WatchReport { seen: seen.collect(), dropped, more, refused: None }
+    }
+
     #[expect(clippy::unnecessary_wraps, reason = "all answers have one form")]
     pub(super) fn audit(&self, stores: &Arc<Stores>) -> Result<AuditReport, Rejection> {
         Ok(AuditReport { audit: audit::read(stores) })
@@ -151,6 +166,27 @@ fn links(peer: &Peer) -> Vec<LinkReport> {
         unconfirmed: way.outlet.unconfirmed() as u64,
     });
     links.collect()
+}
+
+fn seen_message(now: Time, sight: Sight, name: Option<String>) -> SeenMessage {
+    let Sight { at, way, header, length, payload, refused } = sight;
+    let wants = [(Flags::ASK, "ask"), (Flags::REPLY, "reply"), (Flags::CONFIRM, "confirm")];
+    let wants = wants.into_iter().find(|(flag, _)| header.flags.has(*flag));
+    SeenMessage {
+        seen_us: micros(now.since(at)),
+        age_ns: nanos(at.since(header.sent)),
+        is_sent: way == Way::Out,
+        source: header.source,
+        target: header.destination,
+        kind: header.kind,
+        name,
+        class: header.class,
+        sequence: header.sequence,
+        wants: wants.map(|(_, word)| word.to_owned()),
+        length: length as u64,
+        payload,
+        refused,
+    }
 }
 
 fn app_report(node: NodeAddress, app: OwnApp) -> AppReport {

@@ -5,7 +5,7 @@ use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{
         Arc,
-        mpsc::{Receiver, SyncSender, TrySendError, sync_channel},
+        mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel},
     },
     time::Duration,
 };
@@ -13,19 +13,23 @@ use std::{
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
     router::{LocalRoute, Outlet, Refused},
-    tid::AppAddress,
+    tid::{AppAddress, Tid},
     time::Time,
-    wire::{Class, Flags, Kind, Message, Payload},
+    wire::{Flags, Kind, Message, Payload},
 };
 
 use super::{
     answers::Answers,
-    reports::{AskApps, AskAudit, AskNode, AskTree, Report},
+    reports::{AskApps, AskAudit, AskNode, AskTree, AskWatch, Report, WatchReport},
+    watches::{NewTap, WATCHES_MAX, Watches, Ways},
 };
 use crate::{log, stores::Stores};
 
 /// After each report: whoever asks without end takes neither the core nor the layers' locks for itself.
 const REST: Duration = Duration::from_millis(1);
+/// Payloads of messages that are watched in one answer, in bytes and one payload: with the lists' own bytes well below 100 KiB, ten times a
+/// second, so that the link to the watcher is not filled.
+const WATCH_BYTES: usize = 32 * 1024;
 /// Questions that wait at most.
 pub(super) const WAITING_MAX: usize = 32;
 
@@ -56,10 +60,14 @@ pub(crate) fn begin(stores: &Arc<Stores>) -> io::Result<()> {
 }
 
 fn serve(questions: &Receiver<Message>, answers: &Answers) {
-    for (number, question) in (1..).zip(questions) {
+    let mut watches = Watches::default();
+    let mut number = 0;
+    while let Some(question) = next(questions, answers, &mut watches) {
+        number += 1;
         // spec: INSPECT-5. The question is dropped with the panic, and its receipt says `Failed`.
         let is_ping = question.header.kind == Kind::PING;
-        if catch_unwind(AssertUnwindSafe(|| answer(answers, number, question))).is_err() {
+        let answer = AssertUnwindSafe(|| answer(answers, number, &mut watches, question));
+        if catch_unwind(answer).is_err() {
             log::error!("an answer of the inspection panicked; the next question is answered");
         }
         // spec: INSPECT-2
@@ -69,7 +77,27 @@ fn serve(questions: &Receiver<Message>, answers: &Answers) {
     }
 }
 
-fn answer(answers: &Answers, number: u64, mut question: Message) {
+/// The next question; meanwhile it ends the watches that nobody asks for. `None` when the node has ended. spec: INSPECT-6
+fn next(questions: &Receiver<Message>, answers: &Answers, watches: &mut Watches) -> Option<Message> {
+    loop {
+        let Some(end) = watches.next_end() else { return questions.recv().ok() };
+        match questions.recv_timeout(end.since(Time::now())) {
+            Ok(question) => return Some(question),
+            Err(RecvTimeoutError::Disconnected) => return None,
+            Err(RecvTimeoutError::Timeout) => {}
+        }
+        let tap = watches.expire(Time::now());
+        put_up(&*answers.stores()?, tap);
+    }
+}
+
+fn put_up(stores: &Stores, tap: NewTap) {
+    if let Some(tap) = tap {
+        stores.router.set_tap(tap);
+    }
+}
+
+fn answer(answers: &Answers, number: u64, watches: &mut Watches, mut question: Message) {
     if question.header.is_expired(Time::now()) {
         return question.settle(Outcome::Expired);
     }
@@ -79,10 +107,37 @@ fn answer(answers: &Answers, number: u64, mut question: Message) {
         AskApps::KIND => reply(answers, number, &question, Answers::apps),
         AskTree::KIND => reply(answers, number, &question, Answers::tree),
         AskAudit::KIND => reply(answers, number, &question, Answers::audit),
+        AskWatch::KIND => {
+            reply(answers, number, &question, |answers, stores| watch(answers, stores, watches, &question))
+        }
         // spec: INSPECT-4
         _ => Err(Rejection::UnknownKind),
     };
     question.settle(outcome.map_or_else(Outcome::Rejected, |()| Outcome::Delivered));
+}
+
+/// What the application that the question names got and sent since the last one. spec: INSPECT-6
+fn watch(
+    answers: &Answers,
+    stores: &Arc<Stores>,
+    watches: &mut Watches,
+    question: &Message,
+) -> Result<WatchReport, Rejection> {
+    let AskWatch { app, received, sent } = question.decode().map_err(|_| Rejection::Malformed)?;
+    let now = Time::now();
+    // One whose end has come makes room for another.
+    put_up(stores, watches.expire(now));
+    let watched = Tid::new(stores.node, app.app);
+    let bytes_max = WATCH_BYTES.min(stores.config.payload_max / 2);
+    let ways = Ways { received, sent };
+    let (fetched, tap) = watches.fetch(now, (question.header.source, watched), ways, bytes_max);
+    put_up(stores, tap);
+    let Some(fetched) = fetched else {
+        let refused =
+            format!("this node shows {WATCHES_MAX} watches at once, and so many are there; end another one");
+        return Ok(WatchReport { seen: Vec::new(), dropped: 0, more: false, refused: Some(refused) });
+    };
+    Ok(answers.seen(stores, fetched))
 }
 
 fn reply<R: Report + Payload>(
@@ -97,7 +152,7 @@ fn reply<R: Report + Payload>(
     let stores = answers.stores().ok_or(Rejection::Closed)?;
     let asked = question.header;
     let mut message = written(question, report(answers, &stores)?, stores.config.payload_max)?;
-    message.header.class = Class::Control;
+    message.header.class = R::TRAVELS;
     message.header.flags = Flags::REPLY;
     message.header.correlation = asked.correlation;
     message.header.sequence = number;

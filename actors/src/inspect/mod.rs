@@ -10,6 +10,7 @@
 //! | INSPECT-3 | An answer has the bounds of its type, and is no longer than `node.payload_max`. What has no room is left out, last ones first, and counted in `left_out`. |
 //! | INSPECT-4 | A kind that is no question is refused as `UnknownKind`. `sinew.ping`, confirmed, ends as `Delivered`. |
 //! | INSPECT-5 | A panic in an answer costs that answer, which ends as `Failed`, and nothing else. |
+//! | INSPECT-6 | A watch sees what the routing table hands over: all that an application of this node sends and gets, but for direct links between processes. At most 8 watches; each keeps 2,048 messages and 1 MiB of payloads until it is asked, further ones are counted as dropped. Nobody who sends waits for it. It is over 3 s after the last question, and without one it costs a sender one look at a pointer. Its answers travel as Bulk. |
 //!
 //! `docs/protocol/inspect.md` has the fields.
 
@@ -18,11 +19,13 @@ mod inspector;
 mod reports;
 #[cfg(test)]
 mod tests;
+mod watches;
 
 pub(crate) use inspector::begin;
 pub use reports::{
-    APPS_MAX, AppReport, AppsReport, AskApps, AskAudit, AskNode, AskTree, AuditReport, LinkReport, Missing,
-    NodeReport, PEERS_MAX, PeerReport, Ping, TREE_MAX, TreeLine, TreeReport,
+    APPS_MAX, AppReport, AppsReport, AskApps, AskAudit, AskNode, AskTree, AskWatch, AuditReport, LinkReport,
+    Missing, NodeReport, PEERS_MAX, PeerReport, Ping, SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, TREE_MAX,
+    TreeLine, TreeReport, WatchReport,
 };
 
 #[cfg(doc)]

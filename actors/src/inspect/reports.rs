@@ -1,7 +1,11 @@
 //! The questions and what answers them. Times are microseconds before the answer was made, unless a name says otherwise.
 
 use serde::{Deserialize, Serialize};
-use sinew_runtime::tid::{Incarnation, NodeAddress, Tid};
+use sinew_runtime::{
+    outcome::Rejection,
+    tid::{Incarnation, NodeAddress, Tid},
+    wire::{Class, Kind},
+};
 
 use crate::{
     audit::{NodeAudit, put_together},
@@ -19,6 +23,11 @@ pub const TREE_MAX: usize = 1_024;
 const MISSING_MAX: usize = 64;
 /// Connections to one node at most, and ways in which it was found.
 const LINKS_MAX: usize = 8;
+
+/// Messages of an application that is watched in one answer, at most.
+pub const SEEN_MAX: usize = 256;
+/// Longest payload that is shown to a watcher, in bytes; of a longer one only its length is.
+pub const SEEN_BYTES_MAX: usize = 16 * 1024;
 
 payload!("sinew.ping" =>
     /// Asks for a sign of life, confirmed: whoever it is for need not know it.
@@ -48,6 +57,21 @@ payload!("sinew.inspect.audit" =>
     /// Where is every message that you ever had? [`AuditReport`] answers.
     #[derive(Clone, Copy, Debug, Default)]
     pub struct AskAudit {}
+);
+
+payload!("sinew.inspect.watch" =>
+    /// Which messages has this application of yours got and sent, since I asked last? [`WatchReport`] answers.
+    ///
+    /// The first question begins the watch, and is answered with nothing. It is over 3 s after the last one.
+    #[derive(Clone, Copy, Debug)]
+    pub struct AskWatch {
+        /// The application.
+        pub app: Tid,
+        /// Whether to show what it gets.
+        pub received: bool,
+        /// Whether to show what it sends.
+        pub sent: bool,
+    }
 );
 
 payload!("sinew.inspect.node_report" =>
@@ -216,8 +240,59 @@ payload!("sinew.inspect.audit_report" =>
     }
 );
 
+payload!("sinew.inspect.watch_report" =>
+    /// What an application got and sent.
+    #[derive(Clone, Debug, PartialEq, Eq)]
+    pub struct WatchReport {
+        /// In the order in which it was seen.
+        #[serde(deserialize_with = "at_most::<_, _, SEEN_MAX>")]
+        pub seen: Vec<SeenMessage>,
+        /// Further ones, since the last answer, that had no room.
+        pub dropped: u64,
+        /// Whether more wait to be asked for.
+        pub more: bool,
+        /// Why nothing is watched, in words.
+        pub refused: Option<String>,
+    }
+);
+
+/// A message that the routing table of a node handed over, or did not.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SeenMessage {
+    /// Time since then.
+    pub seen_us: u64,
+    /// How old it was then, in nanoseconds.
+    pub age_ns: u64,
+    /// Whether the application has sent it; else it was for it.
+    pub is_sent: bool,
+    /// Who sent it.
+    pub source: Tid,
+    /// Whom it was for; a group's members get it, too.
+    pub target: Tid,
+    /// Type of its payload.
+    pub kind: Kind,
+    /// What that is called, if the node knows.
+    pub name: Option<String>,
+    /// Its class.
+    pub class: Class,
+    /// The source's n-th message.
+    pub sequence: u64,
+    /// `confirm`, `ask`, `reply` or nothing: what is asked of its receiver.
+    pub wants: Option<String>,
+    /// Length of its payload in bytes.
+    pub length: u64,
+    /// The payload, unless it is longer than [`SEEN_BYTES_MAX`].
+    #[serde(with = "serde_bytes")]
+    pub payload: Vec<u8>,
+    /// Why it was not taken; else a queue or a connection has it.
+    pub refused: Option<Rejection>,
+}
+
 /// An answer that has a list, from which what has no room is left out.
 pub(super) trait Report {
+    /// What it travels in.
+    const TRAVELS: Class = Class::Control;
+
     /// Leaves out the second half of its list; whether there was any.
     fn halve(&mut self) -> bool;
 }
@@ -251,5 +326,14 @@ impl Report for TreeReport {
 impl Report for AuditReport {
     fn halve(&mut self) -> bool {
         put_together(&mut self.audit)
+    }
+}
+
+/// It yields to all that the application sends and gets.
+impl Report for WatchReport {
+    const TRAVELS: Class = Class::Bulk;
+
+    fn halve(&mut self) -> bool {
+        halve(&mut self.seen, &mut self.dropped)
     }
 }

@@ -322,6 +322,11 @@ impl Registry {
         }
     }
 
+    /// What the type of this id is called, if an application has said so.
+    pub(crate) fn kind_name(&self, kind: Kind) -> Option<&str> {
+        self.kinds.get(&kind).map(String::as_str)
+    }
+
     fn free_fixed(&self, app: AppAddress) -> Result<AppAddress, RegisterError> {
         if !app.is_fixed() {
             return Err(RegisterError::NotFixed(app));

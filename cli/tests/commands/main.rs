@@ -2,6 +2,7 @@
 
 mod scenario;
 mod send;
+mod watch;
 
 use std::{path::Path, time::Duration};
 
@@ -106,9 +107,19 @@ fn a_wrong_command_line_is_2_and_help_names_the_exit_codes() {
     }
     let help = sinew(&["--help"], Path::new("/"));
     assert_eq!(help.code, Some(0));
-    for words in
-        ["nodes", "apps", "tree", "ping", "send", "barriers", "audit", "doctor", "Exit codes", "SINEW_SOCKET"]
-    {
+    for words in [
+        "nodes",
+        "apps",
+        "tree",
+        "ping",
+        "send",
+        "watch",
+        "barriers",
+        "audit",
+        "doctor",
+        "Exit codes",
+        "SINEW_SOCKET",
+    ] {
         assert!(help.out.contains(words), "{words}: {}", help.out);
     }
 }

@@ -1,0 +1,151 @@
+//! How often messages of each type go by, and how old they are.
+
+use std::{collections::BTreeMap, time::Duration};
+
+use serde_json::{Value, json};
+use sinew::inspect::SeenMessage;
+
+use crate::table::time;
+
+/// Types that are told apart at most; further ones are counted together.
+const KINDS_MAX: usize = 256;
+
+/// Counts since the last time that they were said.
+#[derive(Debug, Default)]
+pub(super) struct Rates {
+    kinds: BTreeMap<(String, bool), Kind>,
+    dropped: u64,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Kind {
+    count: u64,
+    bytes: u64,
+    age_sum_ns: u128,
+    age_max_ns: u64,
+    refused: u64,
+}
+
+/// What is said of a time that is over.
+#[derive(Debug)]
+pub(super) struct Rated {
+    rates: Rates,
+    over: Duration,
+}
+
+impl Rates {
+    pub(super) fn add(&mut self, message: &SeenMessage) {
+        let mut key = (super::kind(message), message.is_sent);
+        if self.kinds.len() >= KINDS_MAX && !self.kinds.contains_key(&key) {
+            key.0 = "(others)".to_owned();
+        }
+        let kind = self.kinds.entry(key).or_default();
+        kind.count += 1;
+        kind.bytes += message.length;
+        kind.age_sum_ns += u128::from(message.age_ns);
+        kind.age_max_ns = kind.age_max_ns.max(message.age_ns);
+        kind.refused += u64::from(message.refused.is_some());
+    }
+
+    /// So many were not seen.
+    pub(super) const fn drop(&mut self, count: u64) {
+        self.dropped += count;
+    }
+
+    /// Begins anew; returns what was counted in this time.
+    pub(super) fn end(&mut self, over: Duration) -> Rated {
+        Rated { rates: std::mem::take(self), over }
+    }
+}
+
+impl Rated {
+    pub(super) fn text(&self) -> String {
+        let seconds = self.over.as_secs_f64().max(1e-3);
+        let line = |((name, is_sent), kind): (&(String, bool), &Kind)| {
+            let arrow = if *is_sent { "<-" } else { "->" };
+            let refused =
+                if kind.refused > 0 { format!(", {} REFUSED", kind.refused) } else { String::new() };
+            format!(
+                "   --- {arrow} {name}: {:.1}/s, {:.0} B/s, age mean {} max {}{refused}\n",
+                kind.count as f64 / seconds,
+                kind.bytes as f64 / seconds,
+                time(kind.age_mean_ns() / 1_000),
+                time(kind.age_max_ns / 1_000),
+            )
+        };
+        let mut text: String = self.rates.kinds.iter().map(line).collect();
+        if text.is_empty() {
+            text += &format!("   --- nothing in {seconds:.1} s\n");
+        }
+        if self.rates.dropped > 0 {
+            text += &format!(
+                "   --- {} further ones are not shown: they came faster than they are fetched, the application did not wait for it\n",
+                self.rates.dropped
+            );
+        }
+        text
+    }
+
+    pub(super) fn json(&self) -> Value {
+        let seconds = self.over.as_secs_f64().max(1e-3);
+        let kinds = self.rates.kinds.iter().map(|((name, is_sent), kind)| {
+            json!({
+                "kind": name, "sent": is_sent, "count": kind.count, "per_s": kind.count as f64 / seconds,
+                "bytes_per_s": kind.bytes as f64 / seconds, "age_mean_ns": kind.age_mean_ns(),
+                "age_max_ns": kind.age_max_ns, "refused": kind.refused,
+            })
+        });
+        let kinds: Vec<_> = kinds.collect();
+        json!({ "event": "rates", "over_s": seconds, "dropped": self.rates.dropped, "kinds": kinds })
+    }
+}
+
+impl Kind {
+    fn age_mean_ns(&self) -> u64 {
+        u64::try_from(self.age_sum_ns / u128::from(self.count.max(1))).unwrap_or(u64::MAX)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew::{AppAddress, Class, NodeAddress, Rejection, Tid};
+
+    use super::*;
+
+    fn message(name: &str, age_ns: u64, refused: Option<Rejection>) -> SeenMessage {
+        let tid = Tid::new(NodeAddress::from([127, 0, 0, 1]), AppAddress::new(0x1000));
+        SeenMessage {
+            seen_us: 0,
+            age_ns,
+            is_sent: false,
+            source: tid,
+            target: tid,
+            kind: sinew::Kind::named(name),
+            name: Some(name.to_owned()),
+            class: Class::Control,
+            sequence: 1,
+            wants: None,
+            length: 100,
+            payload: Vec::new(),
+            refused,
+        }
+    }
+
+    #[test]
+    fn each_type_has_a_line_and_what_was_dropped_has_one() {
+        let mut rates = Rates::default();
+        (0..10).for_each(|number| rates.add(&message("a", number * 2_000, None)));
+        rates.add(&message("b", 0, Some(Rejection::QueueFull)));
+        rates.drop(7);
+        let said = rates.end(Duration::from_secs(2));
+        assert_eq!(
+            said.text().lines().take(2).collect::<Vec<_>>(),
+            [
+                "   --- -> a: 5.0/s, 500 B/s, age mean 9 us max 18 us",
+                "   --- -> b: 0.5/s, 50 B/s, age mean 0 us max 0 us, 1 REFUSED"
+            ]
+        );
+        assert!(said.text().contains("   --- 7 further ones"));
+        assert_eq!(rates.end(Duration::from_secs(1)).text(), "   --- nothing in 1.0 s\n", "it begins anew");
+    }
+}
