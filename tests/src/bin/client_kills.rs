@@ -21,12 +21,9 @@ struct Arguments {
     /// How many processes are killed.
     #[arg(long, default_value_t = 1_000)]
     kills: u32,
-    /// From one kill to the next, in milliseconds.
+    /// One process ends in each such time, in milliseconds. As long as with kills the others are measured with orderly ends, and with none.
     #[arg(long, default_value_t = 40)]
     spacing_ms: u64,
-    /// How long the others are measured with nobody killed, before the kills, in milliseconds.
-    #[arg(long, default_value_t = 10_000)]
-    reference_ms: u64,
     /// Those that are killed have the lowest priority (nice 19).
     #[arg(long)]
     yields: bool,
@@ -39,13 +36,12 @@ fn main() -> ExitCode {
     if let Some(code) = play() {
         return code;
     }
-    let Arguments { kills, spacing_ms, reference_ms, yields, seed } = Arguments::parse();
+    let Arguments { kills, spacing_ms, yields, seed } = Arguments::parse();
     println!("seed {seed}");
     let report = run(Plan {
         program: std::env::current_exe().expect("a program has a path"),
         kills,
         spacing: Duration::from_millis(spacing_ms),
-        reference: Duration::from_millis(reference_ms),
         seed,
         yields,
     });

@@ -1,5 +1,8 @@
 //! The claim: processes that are killed at any instant, with loans in their hands, leave nothing behind, and the others do not
 //! feel it.
+//!
+//! Times in which nobody ends, in which processes end in order, and in which they are killed follow each other in short segments of one
+//! length, each first as often as the others: what the machine does besides is in all of them alike.
 
 use std::{
     collections::BTreeSet,
@@ -19,7 +22,7 @@ use rustix::process::setpriority_process;
 use super::{
     Performer, Stage, StageLimits,
     held::{Held, files_of_the_host},
-    steady::{ECHO, SINK, Window},
+    steady::{ECHO, PARTS, SINK, Window},
 };
 use crate::{DEADLINE, dice::Dice, until};
 
@@ -27,9 +30,9 @@ use crate::{DEADLINE, dice::Dice, until};
 const VICTIMS: u16 = 4;
 /// Kills before anything is measured.
 const WARM_UP: u32 = 20;
-/// Processes that wait to take the place of those that end: they are started while nothing is measured, since what starting
-/// a program costs a machine of two CPUs is not what is asked here.
-const UNDERSTUDIES: u32 = 20;
+/// Processes that end in one segment. Those that take their places are started while nothing is measured, since what starting a program
+/// costs a machine of two CPUs is not what is asked here.
+const ENDS_A_SEGMENT: u32 = 20;
 /// Growth of the memory of one process that its allocator may have for itself.
 const GROWTH_MAX_KIB: u64 = 2 * 1024;
 
@@ -40,10 +43,8 @@ pub struct Plan {
     pub program: PathBuf,
     /// How often a process is killed.
     pub kills: u32,
-    /// Mean time between two kills.
+    /// One process ends in each such time, at any instant of it.
     pub spacing: Duration,
-    /// How long it is measured without kills, and with processes that end in order.
-    pub reference: Duration,
     /// Decides who is killed when.
     pub seed: u64,
     /// Those that are killed have the lowest priority, as programs beside a control loop should: what is measured is what they cost
@@ -62,8 +63,11 @@ pub struct Report {
     pub ended_by_themselves: u32,
     /// Of each process that lives on: before and after the kills.
     pub held: Vec<(&'static str, Held, Held)>,
-    /// Round trips of others: nobody is killed; as many end in order; the kills.
+    /// Round trips of others, in all segments of each sort: nobody ends, as many as are killed end in order, they are killed.
     pub windows: [Window; 3],
+    /// Those in which nobody ends, every other one of them: two figures that would be one, were there enough of them and no chance.
+    pub halves: [Window; 2],
+    spacing: Duration,
     /// Files that were not there before.
     pub left: Vec<PathBuf>,
 }
@@ -85,22 +89,28 @@ impl Report {
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { kills, seconds, held_loans, ended_by_themselves, held, windows, left } = self;
-        writeln!(f, "{kills} kills in {seconds:.1} s; {held_loans} of them while every address held loans")?;
+        let Self { kills, seconds, held_loans, ended_by_themselves, held, windows, halves, left, spacing } =
+            self;
+        writeln!(
+            f,
+            "{kills} kills, one in {spacing:?}, in {seconds:.1} s; {held_loans} of them while every address held loans"
+        )?;
         writeln!(f, "{ended_by_themselves} processes ended by themselves")?;
         for (who, before, after) in held {
             writeln!(f, "{who:<8} before {before}\n{:<8} after  {after}", "")?;
         }
-        for (what, window) in ["nobody is killed", "they end in order", "they are killed"].iter().zip(windows)
-        {
+        for (what, window) in ["nobody ends", "they end in order", "they are killed"].iter().zip(windows) {
             writeln!(f, "{what:<18} {window}")?;
         }
         let ratio = |index: usize| windows[2].p99_us as f64 / windows[index].p99_us.max(1) as f64;
         writeln!(
             f,
-            "p99 with kills: {:.2} of that without, {:.2} of that with orderly ends",
+            "p99 with kills: {:.2} of that while nobody ends, {:.2} of that with orderly ends; while nobody ends, in every \
+             other segment: {} and {} us",
             ratio(0),
-            ratio(1)
+            ratio(1),
+            halves[0].p99_us,
+            halves[1].p99_us
         )?;
         write!(
             f,
@@ -138,6 +148,28 @@ struct Victim {
 enum End {
     Killed,
     InOrder,
+}
+
+/// What is measured by itself.
+#[derive(Clone, Copy)]
+enum Part {
+    NobodyEnds,
+    /// Every other segment of these.
+    NobodyEndsEither,
+    InOrder,
+    Killed,
+}
+
+const _: () = assert!(Part::Killed as usize + 1 == PARTS, "the pinger tells so many apart");
+
+impl Part {
+    const fn ends(self) -> Option<End> {
+        match self {
+            Self::NobodyEnds | Self::NobodyEndsEither => None,
+            Self::InOrder => Some(End::InOrder),
+            Self::Killed => Some(End::Killed),
+        }
+    }
 }
 
 impl Cast {
@@ -214,28 +246,45 @@ impl Cast {
     fn end(&mut self, place: u16, how: End) {
         let Some(Victim { performer, holds, .. }) = self.victims[usize::from(place)].take() else { return };
         match how {
-            End::Killed => self.ended_by_themselves += u32::from(!performer.kill()),
+            End::Killed => {
+                self.ended_by_themselves += u32::from(!performer.kill());
+                self.held_loans += u32::from(holds.load(Ordering::Relaxed));
+            }
             End::InOrder => self.ended_by_themselves += u32::from(!performer.end().success()),
         }
-        self.held_loans += u32::from(holds.load(Ordering::Relaxed));
     }
 
-    /// Measures only while somebody ends and another one takes the place, not while processes are started.
-    fn end_some(&mut self, times: u32, how: End) {
-        let mut left = times;
-        while left > 0 {
-            let bout = left.min(UNDERSTUDIES);
-            left -= bout;
-            self.tell_pinger("rest");
-            self.prepare(bout);
-            self.tell_pinger("measure");
-            for _ in 0..bout {
-                thread::sleep(self.dice.time_below(self.plan.spacing * 2));
-                let place = self.dice.below(VICTIMS.into()) as u16;
-                self.end(place, how);
-                self.take_place(place);
+    /// One segment: each process ends at any instant of its part of the time, and another one takes its place at once.
+    fn measure(&mut self, part: Part, times: u32) {
+        self.tell_pinger(&format!("measure {}", part as usize));
+        let (began, spacing) = (Instant::now(), self.plan.spacing);
+        for time in 0..times {
+            let instant = spacing * time + self.dice.time_below(spacing);
+            thread::sleep((began + instant).saturating_duration_since(Instant::now()));
+            let Some(how) = part.ends() else { continue };
+            let place = self.dice.below(VICTIMS.into()) as u16;
+            self.end(place, how);
+            self.take_place(place);
+        }
+        // What the last one has left is felt here, and not in the next segment.
+        thread::sleep((began + spacing * (times + 1)).saturating_duration_since(Instant::now()));
+        self.tell_pinger("rest");
+    }
+
+    /// All segments.
+    fn measure_all(&mut self) {
+        let mut left = self.plan.kills;
+        for round in 0.. {
+            let times = left.min(ENDS_A_SEGMENT);
+            if times == 0 {
+                return;
             }
-            thread::sleep(self.plan.spacing);
+            left -= times;
+            self.prepare(2 * times);
+            let quiet = if round % 2 == 0 { Part::NobodyEnds } else { Part::NobodyEndsEither };
+            let mut parts = [quiet, Part::InOrder, Part::Killed];
+            parts.rotate_left(round % 3);
+            parts.into_iter().for_each(|part| self.measure(part, times));
         }
     }
 
@@ -243,13 +292,11 @@ impl Cast {
         self.steady.last_mut().expect("it is the pinger").1.tell(order);
     }
 
-    /// What the pinger measured since the last one; at least one round trip.
-    fn window(&mut self) -> Window {
-        until("a round trip ends", || {
-            self.tell_pinger("window");
-            let window = Window::read(&self.answers.recv_timeout(DEADLINE).expect("the pinger answers"));
-            (window.count + window.failed > 0).then_some(window)
-        })
+    /// What the pinger measured in these parts.
+    fn window(&mut self, parts: &[Part]) -> Window {
+        let parts: Vec<_> = parts.iter().map(|part| (*part as usize).to_string()).collect();
+        self.tell_pinger(&format!("window {}", parts.join(" ")));
+        Window::read(&self.answers.recv_timeout(DEADLINE).expect("the pinger answers"))
     }
 
     /// What everybody holds who lives on, when all victims are gone.
@@ -288,26 +335,22 @@ impl Cast {
 /// If one does not start, or those that are not killed end.
 #[must_use]
 pub fn run(plan: Plan) -> Report {
-    let (kills, reference) = (plan.kills, plan.reference);
+    let (kills, spacing) = (plan.kills, plan.spacing);
     let mut cast = Cast::new(plan);
-    cast.end_some(WARM_UP, End::Killed);
-    cast.window();
+    cast.prepare(WARM_UP);
+    cast.measure(Part::Killed, WARM_UP);
     let before = cast.held_at_rest(None);
     let files = cast.files();
     cast.fill();
-    thread::sleep(cast.plan.spacing * 2);
+    cast.tell_pinger("forget");
 
-    cast.window();
-    thread::sleep(reference);
-    let nobody = cast.window();
-    let in_order = u32::try_from(reference.as_millis() / cast.plan.spacing.as_millis().max(1)).unwrap_or(1);
-    cast.end_some(in_order.clamp(1, kills), End::InOrder);
-    let in_order = cast.window();
     cast.held_loans = 0;
     let began = Instant::now();
-    cast.end_some(kills, End::Killed);
-    let killed = cast.window();
+    cast.measure_all();
     let (seconds, held_loans) = (began.elapsed().as_secs_f64(), cast.held_loans);
+    let halves = [Part::NobodyEnds, Part::NobodyEndsEither].map(|part| cast.window(&[part]));
+    let windows = [&[Part::NobodyEnds, Part::NobodyEndsEither][..], &[Part::InOrder], &[Part::Killed]];
+    let windows = windows.map(|parts| cast.window(parts));
     let ended_by_themselves = cast.ended_by_themselves;
 
     let after = cast.held_at_rest(Some(&before));
@@ -321,13 +364,5 @@ pub fn run(plan: Plan) -> Report {
         assert!(status.success(), "{who} ended with {status}");
     }
     cast.stage.end();
-    Report {
-        kills,
-        seconds,
-        held_loans,
-        ended_by_themselves,
-        held,
-        windows: [nobody, in_order, killed],
-        left,
-    }
+    Report { kills, seconds, held_loans, ended_by_themselves, held, windows, halves, spacing, left }
 }

@@ -4,8 +4,8 @@
 use std::{
     fmt,
     sync::{
-        Arc, Mutex, PoisonError,
-        atomic::{AtomicBool, Ordering},
+        Arc, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, AtomicUsize, Ordering},
     },
     thread,
     time::{Duration, Instant},
@@ -44,15 +44,6 @@ pub struct Window {
 }
 
 impl Window {
-    fn of(mut times: Vec<Duration>, failed: u64) -> Self {
-        times.sort_unstable();
-        let at = |share: usize| {
-            let index = (times.len() * share / 100).min(times.len().saturating_sub(1));
-            times.get(index).map_or(0, |time| time.as_micros() as u64)
-        };
-        Self { count: times.len() as u64, failed, p50_us: at(50), p99_us: at(99), max_us: at(100) }
-    }
-
     /// As it was said by the one that asks.
     ///
     /// # Panics
@@ -72,32 +63,76 @@ impl fmt::Display for Window {
     }
 }
 
-/// `SOCKET [NAME]`: asks the one of this name, directly where it can, or the echo, and says what it measured since it was last told to
-/// (`window`). What it asks while it is told to `rest` is not measured, until it is told to `measure`.
+/// Parts of a measurement that are told apart.
+pub(super) const PARTS: usize = 4;
+/// What takes longer is counted as this long: then only the longest is known exactly.
+const TIME_MAX_US: usize = 1 << 16;
+
+/// How many answers of one part took how many microseconds. Its memory does not grow with them: what the one that asks holds is counted.
+#[derive(Clone, Debug)]
+struct Times {
+    counts: Vec<u32>,
+    failed: u64,
+    max_us: u64,
+}
+
+impl Times {
+    fn new() -> Self {
+        Self { counts: vec![0; TIME_MAX_US + 1], failed: 0, max_us: 0 }
+    }
+
+    fn count(&mut self, took: Duration) {
+        let us = took.as_micros() as u64;
+        self.counts[(us as usize).min(TIME_MAX_US)] += 1;
+        self.max_us = self.max_us.max(us);
+    }
+
+    /// What was measured in these parts together.
+    fn window(parts: &[&Self]) -> Window {
+        let at = |us: usize| parts.iter().map(|part| u64::from(part.counts[us])).sum::<u64>();
+        let count: u64 = (0..=TIME_MAX_US).map(at).sum();
+        let below = |share: u64| {
+            let mut seen = 0;
+            let found = (0..=TIME_MAX_US).find(|us| {
+                seen += at(*us);
+                seen > count * share / 100
+            });
+            found.unwrap_or_default() as u64
+        };
+        let failed = parts.iter().map(|part| part.failed).sum();
+        let max_us = parts.iter().map(|part| part.max_us).max().unwrap_or_default();
+        Window { count, failed, p50_us: below(50), p99_us: below(99), max_us }
+    }
+}
+
+/// `SOCKET [NAME]`: asks the one of this name, directly where it can, or the echo. `measure PART`: what it asks from now on belongs to
+/// this part, at first to part 0; `rest`: to none. `window [PARTS]`: it says what it measured in these parts, else in part 0; `forget`: it
+/// begins anew with all.
 pub(super) fn play_pinger(arguments: &[String]) {
     let api = NodeApi::connect(&arguments[0]).expect("the door is open");
     let (name, is_direct) = arguments.get(1).map_or((ECHO, false), |name| (&**name, true));
     let wishes = wishes().requires([name]);
     let mut endpoint = register(&api, &if is_direct { wishes.direct(true) } else { wishes });
     let echo = endpoint.resolve(name, DEADLINE).expect("the node answers").expect("it is ready");
-    let measured: Arc<Mutex<(Vec<Duration>, u64)>> = Arc::default();
+    let measured = Arc::new(Mutex::new(vec![Times::new(); PARTS]));
     let measuring = measured.clone();
-    let measures = Arc::new(AtomicBool::new(true));
-    let is_measured = measures.clone();
+    let part = Arc::new(AtomicUsize::new(0));
+    let present = part.clone();
     thread::spawn(move || {
         for number in 0.. {
-            let (asked, counts) = (Instant::now(), is_measured.load(Ordering::Relaxed));
+            let (asked, part) = (Instant::now(), present.load(Ordering::Relaxed));
             let answer = endpoint.ask::<Order, Order>(echo, &Order { number }, DEADLINE);
             let took = asked.elapsed();
-            let mut measured = measuring.lock().unwrap_or_else(PoisonError::into_inner);
+            let mut measured = lock(&measuring);
             match answer {
                 Ok(answer) => {
                     assert_eq!(answer.number, number, "the answer to another question");
-                    measured.0.extend(counts.then_some(took));
+                    measured.get_mut(part).into_iter().for_each(|times| times.count(took));
                 }
                 Err(error) => {
                     eprintln!("question {number} after {took:?}: {error}");
-                    measured.1 += 1;
+                    // Wherever it belongs: none may fail.
+                    measured[part.min(PARTS - 1)].failed += 1;
                 }
             }
             drop(measured);
@@ -106,18 +141,30 @@ pub(super) fn play_pinger(arguments: &[String]) {
     });
     say(&"up");
     for order in told() {
-        match &*order {
-            "rest" => measures.store(false, Ordering::Relaxed),
-            "measure" => measures.store(true, Ordering::Relaxed),
-            "window" => say_window(&measured),
+        let mut words = order.split_whitespace();
+        let word = words.next().unwrap_or_default();
+        let parts: Vec<usize> = words.map(|part| part.parse().expect("the number of a part")).collect();
+        match word {
+            "rest" => part.store(usize::MAX, Ordering::Relaxed),
+            "measure" => part.store(parts[0], Ordering::Relaxed),
+            "forget" => lock(&measured).fill(Times::new()),
+            "window" if parts.is_empty() => {
+                say_window(&lock(&measured), &[0]);
+                lock(&measured)[0] = Times::new();
+            }
+            "window" => say_window(&lock(&measured), &parts),
             _ => panic!("the pinger is told {order:?}"),
         }
     }
 }
 
-fn say_window(measured: &Mutex<(Vec<Duration>, u64)>) {
-    let (times, failed) = std::mem::take(&mut *measured.lock().unwrap_or_else(PoisonError::into_inner));
-    let Window { count, failed, p50_us, p99_us, max_us } = Window::of(times, failed);
+fn lock(measured: &Mutex<Vec<Times>>) -> MutexGuard<'_, Vec<Times>> {
+    measured.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn say_window(measured: &[Times], parts: &[usize]) {
+    let parts: Vec<_> = parts.iter().map(|part| &measured[*part]).collect();
+    let Window { count, failed, p50_us, p99_us, max_us } = Times::window(&parts);
     say(&format!("{count} {failed} {p50_us} {p99_us} {max_us}"));
 }
 
