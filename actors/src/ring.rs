@@ -39,6 +39,11 @@ pub(crate) enum ExchangeError {
     /// The peer's fault: it says that it has offered something.
     #[error("the peer has offered no shared memory")]
     Missing,
+    /// Our own fault.
+    #[error(
+        "the thread that maps shared memory has panicked, which is a fault of this node's; connect again"
+    )]
+    Fault,
     /// Other rings have all that there may be.
     #[error("the rings of this process's direct links have their most in bytes")]
     Budget,

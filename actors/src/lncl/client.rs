@@ -17,7 +17,7 @@ use sinew_runtime::{
     time::Time,
     wire::{Kind, Message, encode_frame},
 };
-use sinew_shm::PassError;
+use sinew_shm::{Capacity, PassError};
 use tokio::net::{UnixStream, unix::UCred};
 
 pub(super) use self::notices::Notices;
@@ -34,6 +34,7 @@ use super::{
     payload::{self, REGISTER_BYTES_MAX, Register, Registered},
     reader::Reader,
     registrar,
+    rings::Kept,
     server::{Server, refuse},
     session::{Order, Session},
     strangers::Place,
@@ -41,7 +42,7 @@ use super::{
 use crate::{
     monitors::Cause,
     outlet::{LinkNumber, OutletLimits, StreamOutlet},
-    ring::ExchangeError,
+    ring::{Exchange, ExchangeError},
     stores::{Stores, lock},
 };
 
@@ -271,7 +272,7 @@ impl Client {
         // What is sent to it from now on waits in the outlet. So whoever knows that it is registered can send to it.
         session.released(self.tid);
         if self.wants_links && self.ring == Ring::Asked {
-            self.server.introductions.expect(self.tid.app);
+            self.server.introductions.expect(self.tid, self.pid());
         }
         let route = LocalRoute { outlet: self.outlet.clone(), events: self.events.clone() };
         registrar::open(&self.server.stores, self.tid.app, route);
@@ -296,10 +297,10 @@ impl Client {
         let config = &self.server.stores.config;
         let payload_max = config.payload_max;
         let ring_bytes = config.lncl.ring_bytes;
-        let ring = (self.ring == Ring::Asked).then(|| link::prepare(ring_bytes)).flatten();
+        let ring = if self.ring == Ring::Asked { self.prepare(ring_bytes).await } else { None };
         let Some((capacity, exchange)) = ring else {
             reader.set_payload_max(payload_max);
-            self.server.introductions.expect_no_more(self.tid.app);
+            self.server.introductions.expect_no_more(self.tid);
             let socket = ClientSocket::Plain(self.peer.stream.clone());
             let link = self.outlet.connect(socket, payload_max, Some(self.registered(None)));
             return Ok((ClientReader::Plain(reader), link));
@@ -307,7 +308,7 @@ impl Client {
         // spec: LNCL-9
         write_now(&self.peer.stream, &self.registered(Some(capacity.bytes())))?;
         self.ring = Ring::Told;
-        let exchange = link::exchange(exchange, &self.peer.stream, payload_max);
+        let exchange = link::exchange(exchange, &self.peer.stream, payload_max, self.server.rings());
         let (socket, reader) = match tokio::time::timeout(HANDSHAKE, exchange).await {
             Ok(Ok(both)) => both,
             Ok(Err(ExchangeError::Pass(PassError::Closed))) => return Err(End::HungUp(None)),
@@ -321,13 +322,26 @@ impl Client {
         Ok((reader, link))
     }
 
+    /// The node's half of its rings; `None` if it is to have none.
+    async fn prepare(&self, ring_bytes: usize) -> Option<(Capacity, Kept<Exchange>)> {
+        let prepare = link::prepare(ring_bytes, self.server.rings());
+        tokio::time::timeout(HANDSHAKE, prepare).await.unwrap_or_else(|_| {
+            let tid = self.tid;
+            crate::log::warn!(%tid, "no rings were made within {HANDSHAKE:?}; this client gets a plain socket");
+            None
+        })
+    }
+
     /// Its socket takes descriptors from now on.
     fn let_meet_others(&self) {
         if self.wants_links {
-            let pid = u32::try_from(self.peer.pid).unwrap_or_default();
-            let party = Party::new(self.tid, pid, self.outlet.clone(), self.peer.stream.clone());
+            let party = Party::new(self.tid, self.pid(), self.outlet.clone(), self.peer.stream.clone());
             self.server.introductions.add(party);
         }
+    }
+
+    fn pid(&self) -> u32 {
+        u32::try_from(self.peer.pid).unwrap_or_default()
     }
 
     async fn receive(&self, reader: &mut ClientReader, session: &mut Session) -> End {

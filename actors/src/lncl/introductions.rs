@@ -4,12 +4,13 @@
 //! is not one. Its own copies are closed as soon as they are on their way: a hang-up of one end is the end of its holder. The asker's
 //! end waits here for the answer, within bounds of number and time.
 
+mod coming;
 mod met;
 mod unanswered;
 
 use std::{
     cell::RefCell,
-    collections::{BTreeMap, BTreeSet},
+    collections::BTreeMap,
     io::IoSlice,
     mem::MaybeUninit,
     os::fd::{AsFd, BorrowedFd, OwnedFd},
@@ -36,6 +37,7 @@ use sinew_runtime::{
 
 pub(super) use self::met::Leaves;
 use self::{
+    coming::Coming,
     met::Met,
     unanswered::{Processes, Unanswered},
 };
@@ -103,7 +105,7 @@ pub(super) struct Question {
 pub(super) struct Introductions {
     parties: RefCell<BTreeMap<AppAddress, Arc<Party>>>,
     /// Those whose rings are being made: they can be met in a moment.
-    coming: RefCell<BTreeSet<AppAddress>>,
+    coming: Coming,
     open: Open,
 }
 
@@ -111,22 +113,19 @@ pub(super) struct Introductions {
 type Open = Arc<Mutex<Unanswered<Asked>>>;
 
 impl Introductions {
-    /// `app` can be met soon: who asks for it until then is to ask again, instead of taking it for one that has no links.
-    pub(super) fn expect(&self, app: AppAddress) {
-        self.coming.borrow_mut().insert(app);
-    }
-
-    /// `app` will have no links, or has gone.
-    pub(super) fn expect_no_more(&self, app: AppAddress) {
-        self.coming.borrow_mut().remove(&app);
-    }
-
+    /// A client that can be met from now on, also by those who have asked for it before.
     pub(super) fn add(&self, party: Party) {
-        self.expect_no_more(party.tid.app);
-        self.parties.borrow_mut().insert(party.tid.app, Arc::new(party));
+        let party = Arc::new(party);
+        self.parties.borrow_mut().insert(party.tid.app, party.clone());
+        for (asked, since) in self.coming.arrived(party.tid) {
+            let coming::Asked { asker, question, .. } = asked;
+            if let Err(why) = self.begin(asker.clone(), party.clone(), question, since) {
+                tell_refused(&asker, party.tid, question, why);
+            }
+        }
     }
 
-    /// Introduces `asker` to `to` as it has asked. The asker is told LNCL_INTRODUCED, or an outcome.
+    /// Introduces `asker` to `to` as it has asked, at once or when `to` can be met. The asker is told LNCL_INTRODUCED, or an outcome.
     ///
     /// # Errors
     /// Why not, to be told to the asker.
@@ -137,8 +136,22 @@ impl Introductions {
         question: Question,
         now: Time,
     ) -> Result<(), Rejection> {
+        let asker = self.party(asker)?;
+        if self.coming.is_expected(to) {
+            return self.coming.wait(coming::Asked { asker, to, question }, now);
+        }
+        let peer = self.party(to)?;
+        self.begin(asker, peer, question, now)
+    }
+
+    fn begin(
+        &self,
+        asker: Arc<Party>,
+        peer: Arc<Party>,
+        question: Question,
+        now: Time,
+    ) -> Result<(), Rejection> {
         let Question { number, correlation } = question;
-        let (asker, peer) = (self.party(asker)?, self.party(to)?);
         if asker.tid == peer.tid {
             return Err(Rejection::Unsupported);
         }
@@ -157,7 +170,8 @@ impl Introductions {
         message.receipt = Some(Receipt::new(Arc::new(answer), ticket));
         let asked = Asked { asker, peer: peer.clone(), number, correlation, end };
         lock(&self.open).insert(number, of, asked, now);
-        if let Err(refused) = peer.outlet.submit(message) {
+        // Few, and where its queue is full it is in use: one that has just come had messages before.
+        if let Err(refused) = peer.outlet.submit_mark(message) {
             // The asker is told by the receipt.
             refused.message.reject(refused.why);
         }
@@ -170,6 +184,7 @@ impl Introductions {
         for asked in late {
             asked.answer(Outcome::Rejected(Rejection::QueueFull));
         }
+        self.coming.give_up(now);
     }
 
     /// Tells `to` by marks that `source` goes on on their link: one behind all that waits in each class, for only within a
@@ -212,9 +227,6 @@ impl Introductions {
     }
 
     fn party(&self, tid: Tid) -> Result<Arc<Party>, Rejection> {
-        if self.coming.borrow().contains(&tid.app) {
-            return Err(Rejection::QueueFull);
-        }
         let parties = self.parties.borrow();
         let party = parties.get(&tid.app).filter(|party| party.tid == tid);
         party.cloned().ok_or(Rejection::Unsupported)
@@ -315,6 +327,14 @@ fn lock(open: &Mutex<Unanswered<Asked>>) -> MutexGuard<'_, Unanswered<Asked>> {
 fn told(kind: Kind, to: &Party, peer: &Party, number: u64) -> Message {
     let introduction = Introduction { peer: peer.tid.bits(), pid: peer.pid, number };
     payload::frame(kind, payload::lncl_of(to.tid.node), to.tid, &introduction)
+}
+
+/// Tells `asker` that it is not introduced to `to`.
+fn tell_refused(asker: &Party, to: Tid, question: Question, why: Rejection) {
+    let mut answer = outcome_frame(to, asker.tid, Outcome::Rejected(why));
+    answer.header.correlation = question.correlation;
+    // Not taken: it is gone, or it does not read and goes on through the node.
+    let _ = asker.outlet.submit(answer);
 }
 
 fn outcome_frame(about: Tid, to: Tid, outcome: Outcome) -> Message {

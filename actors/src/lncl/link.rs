@@ -14,7 +14,10 @@ use tokio::{
     net::UnixStream,
 };
 
-use super::reader::Reader;
+use super::{
+    reader::Reader,
+    rings::{Kept, Rings},
+};
 use crate::{
     outlet::{Account, Socket},
     ring::{self, Exchange, ExchangeError, RingError, RingFrames, Taken},
@@ -41,10 +44,12 @@ impl From<FrameError> for LinkError {
     }
 }
 
-/// Makes the node's half of the rings; `None` where the system has no memory for it, which is said once a link.
-pub(super) fn prepare(ring_bytes: usize) -> Option<(Capacity, Exchange)> {
-    let capacity = ring::capacity(ring_bytes);
-    match Exchange::prepare(capacity, BellKind::Socket) {
+/// Makes the node's half of the rings; `None` where the system has no memory for it, which is said once a link. The caller has a
+/// deadline.
+pub(super) async fn prepare(ring_bytes: usize, rings: &Rings) -> Option<(Capacity, Kept<Exchange>)> {
+    let (capacity, keeper) = (ring::capacity(ring_bytes), rings.clone());
+    let make = move || Exchange::prepare(capacity, BellKind::Socket).map(|exchange| keeper.keep(exchange));
+    match rings.run(make).await? {
         Ok(exchange) => Some((capacity, exchange)),
         Err(why) => {
             crate::log::warn!(%why, "a client that asked for rings gets a plain socket");
@@ -55,9 +60,10 @@ pub(super) fn prepare(ring_bytes: usize) -> Option<(Capacity, Exchange)> {
 
 /// Exchanges offers with the client. Ends with its offer, or never; the caller has a deadline.
 pub(super) async fn exchange(
-    exchange: Exchange,
+    exchange: Kept<Exchange>,
     stream: &UnixStream,
     payload_max: usize,
+    rings: &Rings,
 ) -> Result<(ClientSocket, ClientReader), ExchangeError> {
     exchange.offer(stream)?;
     let theirs = loop {
@@ -73,7 +79,12 @@ pub(super) async fn exchange(
             Err(cause) => return Err(PassError::System(cause).into()),
         }
     };
-    let (producer, consumer) = exchange.finish(theirs)?;
+    let keeper = rings.clone();
+    let map = move || {
+        let (producer, consumer) = exchange.into_inner().finish(theirs)?;
+        Ok::<_, ExchangeError>((keeper.keep(producer), keeper.keep(consumer)))
+    };
+    let (producer, consumer) = rings.run(map).await.ok_or(ExchangeError::Fault)??;
     let socket = RingSocket { producer: watch(Out(producer))?, wanted: 0, written: 0 };
     let consumer = watch(In(consumer))?;
     let reader = RingReader { consumer, frames: RingFrames::new(payload_max), looks: 0, has_hung_up: false };
@@ -127,7 +138,7 @@ impl Socket for ClientSocket {
 }
 
 /// A producer whose bell for room the reactor watches.
-struct Out(Producer);
+struct Out(Kept<Producer>);
 
 impl AsRawFd for Out {
     fn as_raw_fd(&self) -> RawFd {
@@ -136,7 +147,7 @@ impl AsRawFd for Out {
 }
 
 /// A consumer whose bell for messages the reactor watches.
-struct In(Consumer);
+struct In(Kept<Consumer>);
 
 impl AsRawFd for In {
     fn as_raw_fd(&self) -> RawFd {

@@ -35,6 +35,7 @@ mod listener;
 pub(crate) mod payload;
 mod reader;
 mod registrar;
+mod rings;
 mod server;
 pub(crate) mod session;
 mod strangers;

@@ -1,7 +1,7 @@
 //! The door for other processes: accepts connections, and refuses them in words.
 
 use std::{
-    cell::RefCell,
+    cell::{OnceCell, RefCell},
     collections::BTreeMap,
     io,
     rc::Rc,
@@ -26,6 +26,7 @@ use super::{
     core::ClientId,
     introductions::Introductions,
     payload::{self, Refusal},
+    rings::Rings,
     strangers::{Bounds, NoPlace, Place, Strangers},
 };
 use crate::{
@@ -51,6 +52,8 @@ pub(super) struct Server {
     shares: RefCell<BTreeMap<i32, Weak<Budget>>>,
     /// Who may be introduced to whom.
     pub(super) introductions: Introductions,
+    /// What makes the rings of clients, once one has asked for them.
+    rings: OnceCell<Rings>,
     /// Who waits at the barrier.
     releases: RefCell<BTreeMap<AppAddress, oneshot::Sender<()>>>,
     /// The connections, for what is to be done now and then.
@@ -69,7 +72,8 @@ impl Server {
         let refusals = stores.refusals.clone();
         let (strangers, introductions) = (Strangers::default(), Introductions::default());
         let (budget, shares) = (Budget::new(stores.config.lncl.clients_bytes), RefCell::default());
-        Rc::new(Self { stores, refusals, budget, shares, strangers, introductions, releases, clients })
+        let rings = OnceCell::new();
+        Rc::new(Self { stores, refusals, budget, shares, strangers, introductions, rings, releases, clients })
     }
 
     /// The bytes that may wait for the clients of the process `pid`, together.
@@ -83,6 +87,11 @@ impl Server {
         let share = Budget::part_of(&self.budget, self.stores.config.lncl.clients_bytes / PROCESSES_MIN);
         shares.insert(pid, Arc::downgrade(&share));
         share
+    }
+
+    /// What makes the rings of clients.
+    pub(super) fn rings(&self) -> &Rings {
+        self.rings.get_or_init(Rings::begin)
     }
 
     /// Resolves when the barrier opens for `app`.

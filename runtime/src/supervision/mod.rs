@@ -59,7 +59,7 @@ pub use self::{
     guard::{Life, life},
     own_system::{part_from_threads, tell_of_a_stop},
     panics::UNWINDS,
-    place::{Owner, Place},
+    place::{Owner, Place, make_ordinary},
     ready::{ReadyGate, ReadyPart},
     roster::{Listed, Roster},
     supervisor::{ChildSpec, Launch, PlannedChild, Supervisor, SupervisorFact, SupervisorPlan},

@@ -169,7 +169,7 @@ pub(super) fn make_realtime(priority: u8) -> Result<(), thread_priority::Error> 
 const MIDDLE: u8 = 48;
 
 /// Puts the calling thread under the ordinary schedule: a thread begins with that of who made it.
-pub(super) fn make_ordinary() {
+pub fn make_ordinary() {
     let policy = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Other);
     let level = ThreadPriority::Crossplatform(MIDDLE.try_into().expect("it is on the scale"));
     // The schedule itself is refused to nobody; the niceness stays where that is.

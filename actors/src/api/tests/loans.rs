@@ -95,7 +95,7 @@ fn another_endpoint_may_send_what_this_one_has_lent_if_it_has_lent_nothing_itsel
 fn who_unregisters_while_a_message_is_lent_is_told_and_gives_the_address_back(under: Under) {
     let node = TestNode::start();
     for length in LENGTHS {
-        let mut client = register(under, &node, on(under).name("knee"));
+        let mut client = register_when_free(under, &node, on(under).name("knee"));
         let mut message = client.create_message(Tid::NONE, RAW, length).unwrap();
         lent(client.unregister());
         message.fill(7);

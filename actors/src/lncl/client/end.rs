@@ -135,7 +135,7 @@ impl Client {
 
 impl Drop for Client {
     fn drop(&mut self) {
-        self.server.introductions.remove(self.tid.app, self.leaves);
+        self.server.introductions.remove(self.tid, self.leaves);
         registrar::owner_gone(&self.server.stores, self.peer.owner(), &self.cause);
         self.server.remove_client(self.peer.id);
         if !self.has_been_told {

@@ -6,7 +6,10 @@ use std::{
     sync::{Arc, Mutex, PoisonError},
 };
 
-use sinew_runtime::{tid::AppAddress, wire::Kind};
+use sinew_runtime::{
+    tid::{AppAddress, Tid},
+    wire::Kind,
+};
 
 use super::{Introductions, Party};
 use crate::lncl::payload::{self, Gone};
@@ -45,9 +48,10 @@ impl Met {
 }
 
 impl Introductions {
-    /// `app` cannot be met any more. If it is dead, those who have a link with it are told.
-    pub(in crate::lncl) fn remove(&self, app: AppAddress, leaves: Leaves) {
-        self.expect_no_more(app);
+    /// `tid` cannot be met any more. If it is dead, those who have a link with it are told.
+    pub(in crate::lncl) fn remove(&self, tid: Tid, leaves: Leaves) {
+        self.coming.gone(tid);
+        let app = tid.app;
         let Some(party) = self.parties.borrow_mut().remove(&app) else { return };
         for (other, number) in party.met.take() {
             let other = self.parties.borrow().get(&other).cloned();

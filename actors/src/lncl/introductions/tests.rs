@@ -69,7 +69,7 @@ fn join_of(introductions: &Introductions, app: u32, pid: u32, room: usize) -> Cl
 
 impl Client {
     fn next(&self) -> Message {
-        self.frames.try_recv().expect("a frame")
+        self.frames.try_recv().or_else(|_| self.marks.try_recv()).expect("a frame")
     }
 
     /// The number and the descriptor that came over the socket.
@@ -144,7 +144,7 @@ fn who_is_not_there_or_oneself_cannot_be_met() {
         Err(Rejection::Unsupported)
     );
     let gone = join(&introductions, 2, 4);
-    introductions.remove(gone.tid.app, Leaves::WithItsLinks);
+    introductions.remove(gone.tid, Leaves::WithItsLinks);
     assert_eq!(
         introductions.introduce(asker.tid, gone.tid, question(1, 1), NOW),
         Err(Rejection::Unsupported)
@@ -238,17 +238,11 @@ fn clients_that_never_answer_cost_the_node_so_many_descriptors_and_leave_others_
 }
 
 #[test]
-fn a_peer_that_takes_no_frames_or_dies_is_an_answer() {
+fn a_peer_whose_queue_is_full_is_asked_all_the_same_and_its_end_is_an_answer() {
     let introductions = Introductions::default();
-    let (asker, peer) = (join(&introductions, 1, 4), join(&introductions, 2, 1));
+    let (asker, peer) = (join(&introductions, 1, 4), join(&introductions, 2, 0));
     introductions.introduce(asker.tid, peer.tid, question(1, 1), NOW).unwrap();
-    introductions.introduce(asker.tid, peer.tid, question(2, 2), NOW).unwrap();
-    let refused = asker.next();
-    assert_eq!(
-        (refused.header.correlation, outcome_of(&refused)),
-        (2, Outcome::Rejected(Rejection::QueueFull))
-    );
-    drop(peer);
+    introduction_of(&peer.next(), Kind::LNCL_INTRODUCTION);
     let failed = asker.next();
     assert_eq!((failed.header.correlation, outcome_of(&failed)), (1, Outcome::Failed));
 }
@@ -315,9 +309,9 @@ fn who_has_met_one_that_is_dead_is_told_once_and_nobody_else_is() {
     shy.next().settle(Outcome::Rejected(Rejection::Unsupported));
 
     // When: its process ends, and another one has its address and ends, too.
-    introductions.remove(dead.tid.app, Leaves::Dead);
+    introductions.remove(dead.tid, Leaves::Dead);
     join(&introductions, 1, 4);
-    introductions.remove(dead.tid.app, Leaves::Dead);
+    introductions.remove(dead.tid, Leaves::Dead);
 
     // Then:
     assert_eq!(told_dead(&asked, dead.tid), [7]);
@@ -331,24 +325,78 @@ fn a_link_outlives_the_connections_of_those_who_have_it() {
     let (one, other) = (join(&introductions, 1, 4), join(&introductions, 2, 4));
     introductions.introduce(one.tid, other.tid, question(7, 1), NOW).unwrap();
     other.next().settle(Outcome::Delivered);
-    introductions.remove(one.tid.app, Leaves::WithItsLinks);
+    introductions.remove(one.tid, Leaves::WithItsLinks);
     assert!(told_dead(&other, one.tid).is_empty());
 }
 
 // spec: LNCL-10
 #[test]
-fn one_that_has_just_registered_is_to_be_asked_for_again_and_one_without_links_is_not() {
+fn one_whose_rings_are_being_made_is_waited_for_and_met_when_they_are() {
+    // Given: one who asks for another that has just registered.
     let introductions = Introductions::default();
     let asker = join(&introductions, 1, 4);
-    let ask = || introductions.introduce(asker.tid, tid(2), question(7, 1), NOW);
-    assert_eq!(ask(), Err(Rejection::Unsupported));
-    introductions.expect(tid(2).app);
-    assert_eq!(ask(), Err(Rejection::QueueFull), "its rings are being made");
-    introductions.expect_no_more(tid(2).app);
-    assert_eq!(ask(), Err(Rejection::Unsupported), "it has none");
-    introductions.expect(tid(2).app);
-    let _there = join(&introductions, 2, 4);
-    assert_eq!(ask(), Ok(()));
+    introductions.expect(tid(2), 2);
+    introductions.introduce(asker.tid, tid(2), question(7, 99), NOW).unwrap();
+    assert!(asker.frames.try_recv().is_err(), "its rings are being made");
+
+    // When: they are there.
+    let peer = join(&introductions, 2, 4);
+
+    // Then: the introduction takes its way.
+    let mut message = peer.next();
+    assert_eq!(introduction_of(&message, Kind::LNCL_INTRODUCTION).number, 7);
+    message.settle(Outcome::Delivered);
+    let answer = asker.next();
+    assert_eq!(introduction_of(&answer, Kind::LNCL_INTRODUCED).number, 7);
+    assert_eq!(answer.header.correlation, 99);
+    assert_eq!((asker.end().0, peer.end().0), (7, 7));
+}
+
+// spec: LNCL-10
+#[test]
+fn who_waits_for_one_that_will_have_no_links_or_goes_or_takes_too_long_is_told() {
+    let introductions = Introductions::default();
+    let asker = join(&introductions, 1, 4);
+    let late = NOW + unanswered::ANSWERED_WITHIN;
+    let ends: [(&dyn Fn(Tid), _); 3] = [
+        (&|it| introductions.expect_no_more(it), Rejection::Unsupported),
+        (&|it| introductions.remove(it, Leaves::Dead), Rejection::Unsupported),
+        (&|_| introductions.give_up(late), Rejection::QueueFull),
+    ];
+    for ((end, why), number) in ends.into_iter().zip(1..) {
+        introductions.expect(tid(2), 2);
+        introductions.introduce(asker.tid, tid(2), question(number, number), NOW).unwrap();
+        introductions.give_up(late.shifted(-1));
+        assert!(asker.frames.try_recv().is_err(), "there is time yet");
+        end(tid(2));
+        let told = asker.next();
+        assert_eq!((told.header.correlation, outcome_of(&told)), (number, Outcome::Rejected(why)));
+    }
+    assert!(asker.frames.try_recv().is_err(), "each is told once");
+}
+
+// spec: LNCL-10
+#[test]
+fn so_many_of_one_process_wait_for_those_whose_rings_are_being_made_and_who_has_gone_does_not() {
+    // Given: two that have just registered, and as many questions as one process may have.
+    let introductions = Introductions::default();
+    let asker = join(&introductions, 1, 4);
+    [2, 3].into_iter().for_each(|app| introductions.expect(tid(app), app));
+    let ask = |from, to, number| introductions.introduce(from, tid(to), question(number, number), NOW);
+    for number in 0..unanswered::PROCESS_MAX as u64 {
+        assert_eq!(ask(asker.tid, 2, number), Ok(()));
+    }
+    assert_eq!(ask(asker.tid, 3, 90), Err(Rejection::QueueFull));
+
+    // When: the asker goes, and another one has its address.
+    introductions.remove(asker.tid, Leaves::Dead);
+    let next = join(&introductions, 1, 4);
+
+    // Then: there is room, and what its former life has asked for comes to nothing.
+    assert_eq!(ask(next.tid, 3, 91), Ok(()));
+    let peer = join(&introductions, 2, 4);
+    assert!(peer.frames.try_recv().is_err(), "nobody who is there has asked for it");
+    assert!(next.frames.try_recv().is_err());
 }
 
 // spec: LNCL-17
@@ -362,7 +410,7 @@ fn who_takes_nothing_is_not_owed_the_deaths_of_more_and_more_whom_it_has_asked_f
         introductions.introduce(deaf.tid, dead.tid, question(round, 1), NOW).unwrap();
         dead.next().settle(Outcome::Delivered);
         drop(deaf.end());
-        introductions.remove(dead.tid.app, Leaves::Dead);
+        introductions.remove(dead.tid, Leaves::Dead);
     }
     assert_eq!(deaf.marks.try_iter().count(), 0);
 }

@@ -57,6 +57,12 @@ impl<T> Unanswered<T> {
         self.0.remove(&number).map(|waiting| waiting.what)
     }
 
+    /// What is like that waits no more; with each the time from when on it has waited.
+    pub(super) fn remove_if(&mut self, is_it: impl Fn(&T) -> bool) -> Vec<(T, Time)> {
+        let found = self.0.extract_if(.., |_, waiting| is_it(&waiting.what));
+        found.map(|(_, waiting)| (waiting.what, waiting.since)).collect()
+    }
+
     /// What has waited too long at `now`. It waits no more.
     pub(super) fn give_up(&mut self, now: Time) -> Vec<T> {
         let late = self.0.extract_if(.., |_, waiting| now.since(waiting.since) >= ANSWERED_WITHIN);
