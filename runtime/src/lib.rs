@@ -14,6 +14,7 @@
 //! | [`monitor`] | who is told of an end |
 //! | [`wakes`] | one wake for a batch of messages |
 //! | [`pending`], [`sender`] | sending, and waiting for what comes of it |
+//! | [`protection`] | end-to-end protection of commands, and outputs that are safe without them |
 //! | [`schedule`] | what an actor does when |
 //! | [`app`] | what an application is |
 //! | [`timer`] | the kernel's timer, exact to microseconds |
@@ -27,6 +28,7 @@ pub mod monitor;
 pub mod outcome;
 pub mod pending;
 pub mod post;
+pub mod protection;
 pub mod router;
 pub mod schedule;
 pub mod sender;

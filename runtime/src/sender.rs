@@ -19,11 +19,12 @@ use crate::{
     monitor::{MonitorError, MonitorId},
     outcome::{Outcome, Receipt, Rejection, Ticket},
     pending::{Awaited, Pending, Settlement, Wait},
+    protection::{Echo, Flows},
     router::Router,
     supervision::vitals::Vitals,
     tid::{AppAddress, Tid},
     time::Time,
-    wire::{Class, DecodeError, Flags, Header, Kind, Message, MessageBuffer, Payload},
+    wire::{Class, DecodeError, Flags, Header, Kind, Message, MessageBuffer, Payload, encode},
 };
 
 /// Messages that one process can send at most in its life: at a million a second it is twelve days.
@@ -91,6 +92,11 @@ pub enum SendError {
     /// Too many confirmed messages and requests wait for their end.
     #[error("too many confirmed messages and requests are under way; wait for some to end")]
     TooManyWaits,
+    /// This life of the application has sent protected messages to 1,024 receivers.
+    #[error(
+        "this application sends protected messages to 1,024 receivers already, and can to no further one"
+    )]
+    TooManyProtectedFlows,
 }
 
 /// Why a request has no reply.
@@ -116,6 +122,8 @@ pub struct Sender {
     shared: Arc<Shared>,
     /// The life of the application that sends with this; `None` where nobody takes lives.
     life: Option<Arc<Vitals>>,
+    /// Its flows of protected messages.
+    flows: Arc<Flows>,
 }
 
 struct Shared {
@@ -145,13 +153,13 @@ impl Sender {
     ) -> Self {
         let sequence = AtomicU64::new(0);
         let shared = Arc::new(Shared { tid, router, directory, pending, sequence, payload_max });
-        Self { shared, life: None }
+        Self { shared, life: None, flows: Arc::new(Flows::new(Time::now())) }
     }
 
     /// The same sending side for one life of its application: with that, it is over.
     #[must_use]
     pub(crate) fn in_life(&self, life: Arc<Vitals>) -> Self {
-        Self { shared: self.shared.clone(), life: Some(life) }
+        Self { shared: self.shared.clone(), life: Some(life), flows: Arc::new(Flows::new(Time::now())) }
     }
 
     fn is_over(&self) -> bool {
@@ -230,7 +238,7 @@ impl Sender {
         destination: impl Into<Destination<'a>>,
         value: &P,
     ) -> Result<(), SendError> {
-        let message = Message::typed(self.shared.tid, self.find(destination.into())?, value);
+        let message = self.typed(destination.into(), value)?;
         self.dispatch(message)
     }
 
@@ -246,7 +254,7 @@ impl Sender {
         value: &P,
         within: Duration,
     ) -> Result<Confirmation, SendError> {
-        let mut message = Message::typed(self.shared.tid, self.find(destination.into())?, value);
+        let mut message = self.typed(destination.into(), value)?;
         if message.header.class == Class::Stream {
             // Newest wins, so an older one has no fate of its own.
             return Err(Rejection::Unsupported.into());
@@ -266,6 +274,7 @@ impl Sender {
         request: &P,
         within: Duration,
     ) -> Result<Reply<R>, SendError> {
+        const { assert!(R::PROTECTION.is_none(), "a protected payload is sent, not asked for") };
         let mut message = Message::typed(self.shared.tid, self.find(destination.into())?, request);
         message.header.class = Class::Control;
         message.header.flags = Flags::ASK;
@@ -339,6 +348,27 @@ impl Sender {
         let mut header = Header::new(kind, self.shared.tid, self.find(destination)?);
         header.class = class;
         self.dispatch(Message::new(header, payload))
+    }
+
+    /// A message of the value, in its envelope if its type is protected.
+    fn typed<P: Payload>(&self, destination: Destination<'_>, value: &P) -> Result<Message, SendError> {
+        let destination = self.find(destination)?;
+        if P::PROTECTION.is_none() {
+            return Ok(Message::of_type::<P>(self.shared.tid, destination, encode(value)));
+        }
+        let receiver = self.shared.router.absolute(destination);
+        if !receiver.is_single() {
+            // Each receiver has its own echo, and its own codename.
+            return Err(Rejection::Unsupported.into());
+        }
+        let payload =
+            self.flows.seal(self.shared.tid, receiver, value).ok_or(SendError::TooManyProtectedFlows)?;
+        Ok(Message::of_type::<P>(self.shared.tid, destination, payload))
+    }
+
+    /// A receiver of protected messages wants this time quoted.
+    pub(crate) fn echoed(&self, from: Tid, echo: Echo) {
+        self.flows.heard(from, echo);
     }
 
     fn find(&self, destination: Destination<'_>) -> Result<Tid, SendError> {

@@ -1,6 +1,6 @@
 //! What an application's handlers can do.
 
-use std::time::Duration;
+use std::{fmt, io, sync::Arc, time::Duration};
 
 use actix::{
     Actor, ActorContext, ActorFuture, ActorState, Addr, AsyncContext, Handler, Message, SpawnHandle,
@@ -11,12 +11,13 @@ use crate::{
     app::Delivery,
     monitor::{MonitorError, MonitorId},
     outcome::{Outcome, Rejection},
+    protection::{Cause, Codename, Echo, Guard, Guarded},
     schedule::{Schedule, Tick, TimerId},
     sender::{Confirmation, Destination, Reply, SendError, Sender},
     supervision::{ReadyGate, vitals::Vitals},
     tid::Tid,
     time::Time,
-    wire::{DecodeError, Kind, Payload},
+    wire::{Kind, Payload},
 };
 
 /// The context of an application's actor: actix's, and what Sinew adds to it.
@@ -31,6 +32,8 @@ pub struct AppContext<A: Actor<Context = Self>> {
     warned: Option<Time>,
     /// What the handler says of the message in hand, if it does not take it.
     pub(super) verdict: Option<Outcome>,
+    /// The outputs that protected messages move.
+    guards: Vec<Arc<dyn Guarded>>,
 }
 
 pub(super) type Timer<A> = Box<dyn FnMut(&mut A, Tick, &mut <A as Actor>::Context)>;
@@ -83,6 +86,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
             ready: Some(ready),
             warned: None,
             verdict: None,
+            guards: Vec::new(),
         };
         let mailbox = context.mailbox.take().expect("it was put there three lines above");
         ContextFut::new(context, actor, mailbox)
@@ -174,7 +178,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     }
 
     /// Logs a payload that cannot be read, once a second at most: the mailbox counts them all.
-    pub(super) fn warn_of_payload(&mut self, source: Tid, error: &DecodeError, now: Time) {
+    pub(super) fn warn_of_payload(&mut self, source: Tid, error: &dyn fmt::Display, now: Time) {
         if self.warned.is_none_or(|last| now.since(last) >= Duration::from_secs(1)) {
             self.warned = Some(now);
             crate::log::warn!(tid = %self.tid(), %source, %error, "payloads are refused");
@@ -230,6 +234,50 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         self.watches.push(watch);
         self.schedule.once(now + within, Action::CheckWatch(id));
         id
+    }
+
+    /// Has `output` moved by what `source` sends of type `P`, which is protected, and made safe by `safe` when that is not as it has
+    /// to be; see [`Guard::new`]. From now on only messages that are good, and that come while the output is live, reach the handler
+    /// of `P`; others are refused. The sender is sent an echo four times in the greatest age of a message.
+    ///
+    /// # Errors
+    /// The thread that keeps the watchdogs cannot be started, or this is guarded already.
+    pub fn guard<P: Payload, O: Send + 'static>(
+        &mut self,
+        source: Tid,
+        output: O,
+        safe: impl FnMut(&mut O, Cause) + Send + 'static,
+    ) -> io::Result<Guard<O>> {
+        if self.guard_of::<P>(source).is_some() {
+            let words = format!(
+                "what {source} sends of '{}' is guarded already: keep that guard, or clone it",
+                P::NAME
+            );
+            return Err(io::Error::new(io::ErrorKind::AlreadyExists, words));
+        }
+        let guard = Guard::new::<P>(source, self.tid(), output, safe)?;
+        let guarded = guard.guarded();
+        self.guards.push(guarded.clone());
+        let protection =
+            P::PROTECTION.expect("a guard is for a protected type: that was asserted when this was compiled");
+        let echo = move |context: &Self| {
+            // Whoever cannot be reached does not answer either: the watchdog knows.
+            let _ = context.send(source, &Echo::new(P::KIND, guarded.echo()));
+        };
+        echo(self);
+        self.every(protection.echo_period(), move |_, _, context| echo(context));
+        Ok(guard)
+    }
+
+    /// The guard of what `source` sends of type `P`.
+    pub(super) fn guard_of<P: Payload>(&self, source: Tid) -> Option<&Arc<dyn Guarded>> {
+        let codename = Codename::of::<P>(source, self.tid());
+        self.guards.iter().find(|guard| guard.codename() == codename)
+    }
+
+    /// The sender's side hears an echo.
+    pub(super) fn echoed(&self, from: Tid, echo: Echo) {
+        self.sender.echoed(from, echo);
     }
 
     /// A pause from `since` until `now` is over: periods go on on their grid, and input watchdogs count as if it had not

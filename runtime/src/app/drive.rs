@@ -12,6 +12,8 @@ use std::{
 
 use actix::{Actor, ActorContext, ActorFuture, ActorState, Handler};
 
+use bytes::Bytes;
+
 use crate::{
     app::{
         AppContext, Delivery, Raw, Silence, WatchId,
@@ -21,10 +23,11 @@ use crate::{
     },
     mailbox::MailboxReader,
     outcome::{Outcome, Rejection},
+    protection::{Echo, Fault, Verdict},
     schedule::Due,
     supervision::vitals::{Doing, Vitals},
     time::Time,
-    wire::{Kind, Message, Payload},
+    wire::{Kind, Message, Payload, decode_as},
 };
 
 /// Messages and timers that are handled before the other tasks of the thread have their turn.
@@ -47,7 +50,11 @@ where
     A: Actor<Context = AppContext<A>> + Handler<Delivery<P>, Result = ()>,
     P: Payload,
 {
-    let payload = message.decode::<P>().map_err(|error| {
+    let decoded = match P::PROTECTION {
+        None => message.decode::<P>(),
+        Some(_) => decode_as(&unseal::<A, P>(context, message, now)?),
+    };
+    let payload = decoded.map_err(|error| {
         context.warn_of_payload(message.header.source, &error, now);
         Rejection::Malformed
     })?;
@@ -55,6 +62,27 @@ where
     note_arrival(context, message, now);
     actor.handle(Delivery::new(payload, &message.header, now), context);
     Ok(())
+}
+
+/// The bytes of a protected payload, if they are good and its output is live.
+fn unseal<A, P>(context: &mut AppContext<A>, message: &Message, now: Time) -> Result<Bytes, Rejection>
+where
+    A: Actor<Context = AppContext<A>>,
+    P: Payload,
+{
+    let source = message.header.source;
+    let Some(guard) = context.guard_of::<P>(source) else {
+        context.warn_of_payload(source, &"it is protected, and nothing here is guarded for this sender", now);
+        return Err(Rejection::Unsupported);
+    };
+    match guard.take(&message.payload) {
+        Verdict::Apply(payload) => Ok(payload),
+        Verdict::Hold => Err(Rejection::ByHandler),
+        Verdict::Refused(fault) => {
+            context.warn_of_payload(source, &fault, now);
+            Err(if fault == Fault::Corrupt { Rejection::Malformed } else { Rejection::ByHandler })
+        }
+    }
 }
 
 /// Calls `Handler<Delivery<Raw>>`.
@@ -207,6 +235,15 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
             && !self.requirements.take(actor, context, event, now)
         {
             return Outcome::Delivered;
+        }
+        if message.header.kind == Echo::KIND {
+            return match message.decode() {
+                Ok(echo) => {
+                    context.echoed(message.header.source, echo);
+                    Outcome::Delivered
+                }
+                Err(_) => Outcome::Rejected(Rejection::Malformed),
+            };
         }
         let handler = self.handlers.iter().find(|(kind, _)| *kind == message.header.kind);
         let Some((_, dispatch)) = handler else {

@@ -7,6 +7,7 @@ use serde::{Serialize, de::DeserializeOwned};
 
 use crate::{
     outcome::{Outcome, Receipt, Rejection, Ticket},
+    protection::Protection,
     tid::Tid,
     wire::{Class, Flags, Header, Kind, memory},
 };
@@ -31,6 +32,8 @@ pub trait Payload: Serialize + DeserializeOwned + Send + 'static {
     const KIND: Kind = Kind::named(Self::NAME);
     /// Class that this type travels in unless the sender says otherwise.
     const CLASS: Class = Class::Control;
+    /// What a receiver bears, for a type that is protected from end to end: see [`protection`](crate::protection).
+    const PROTECTION: Option<Protection> = None;
 }
 
 /// Why a payload could not be read. The peer is at fault: its type of this name is another one.
@@ -76,15 +79,22 @@ impl Message {
         Self::new(header, Bytes::new())
     }
 
-    /// A message of the given type, in its own class.
+    /// A message of the given type, in its own class. A type that is [protected](crate::protection) does not compile here: its messages
+    /// are made by the context, or the [`Sender`](crate::sender::Sender), of an application.
     ///
     /// # Panics
     /// If the type's `Serialize` refuses its own value (a map with two equal keys, say): a fault of the program.
     #[must_use]
     pub fn typed<P: Payload>(source: Tid, destination: Tid, value: &P) -> Self {
+        const { assert!(P::PROTECTION.is_none(), "a protected payload is sent by the context of an application") };
+        Self::of_type::<P>(source, destination, encode(value))
+    }
+
+    /// The same, of bytes that stand for a `P`.
+    pub(crate) const fn of_type<P: Payload>(source: Tid, destination: Tid, payload: Bytes) -> Self {
         let mut header = Header::new(P::KIND, source, destination);
         header.class = P::CLASS;
-        Self::new(header, encode(value))
+        Self::new(header, payload)
     }
 
     /// Reads the payload as a `P`.
@@ -92,7 +102,7 @@ impl Message {
     /// # Errors
     /// The bytes are not a `P`.
     pub fn decode<P: Payload>(&self) -> Result<P, DecodeError> {
-        decode(&self.payload).map_err(|cause| DecodeError { name: P::NAME, cause })
+        decode_as(&self.payload)
     }
 
     /// Says what became of this message, if anybody wants to know.
@@ -149,6 +159,11 @@ fn code_of(outcome: Outcome) -> Bytes {
 pub fn encode<P: Payload>(value: &P) -> Bytes {
     memory::written(|writer| rmp_serde::encode::write_named(writer, value))
         .expect("a payload type can be written as MessagePack")
+}
+
+/// Reads a value from the bytes of a payload that is a `P`.
+pub(crate) fn decode_as<P: Payload>(bytes: &[u8]) -> Result<P, DecodeError> {
+    decode(bytes).map_err(|cause| DecodeError { name: P::NAME, cause })
 }
 
 /// Reads a value from its MessagePack form.

@@ -13,4 +13,5 @@ mod message;
 pub use codec::{Checksum, FrameCodec, FrameError, decode_datagram, encode_frame};
 pub use header::{Class, Flags, HEADER_LEN, Header, HeaderError, MAGIC, VERSION};
 pub use kind::{Kind, fnv1a};
+pub(crate) use message::decode_as;
 pub use message::{DecodeError, Message, MessageBuffer, Payload, decode, encode};

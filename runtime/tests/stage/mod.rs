@@ -34,6 +34,11 @@ pub(crate) const DEADLINE: Duration = Duration::from_secs(60);
 
 const NODE: NodeAddress = NodeAddress::new(0x7f00_0001);
 
+/// The TID of the n-th application.
+pub(crate) fn tid(index: usize) -> Tid {
+    Tid::new(NODE, AppAddress::fixed(index as u32).unwrap())
+}
+
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Number(pub(crate) u64);
 
@@ -88,8 +93,8 @@ impl Stage {
         for (index, app) in apps.into_iter().enumerate() {
             let mailbox = Mailbox::new(patience.mailbox_capacity());
             let pending = Pending::new(64);
-            let address = AppAddress::fixed(index as u32).unwrap();
-            let tid = Tid::new(NODE, address);
+            let tid = tid(index);
+            let address = tid.app;
             let sender = Sender::new(tid, router.clone(), Arc::new(Nobody), pending.clone(), 1 << 20);
             let outlet = Arc::new(AppOutlet { pending, inbox: mailbox.clone() });
             router.set_local(address, LocalRoute { outlet, events: Arc::new([]) });

@@ -1,0 +1,95 @@
+//! The bytes around a protected payload.
+//!
+//! Little-endian: version (1 byte), flags (1, all zero), zero (2), length of the payload (4), counter (8), incarnation (8),
+//! echo (8), payload, CRC-64 (8). The CRC is CRC-64/XZ (ECMA-182, reflected), as in AUTOSAR's E2E profile 7; it is taken over the
+//! codename, then all that stands before it. The codename itself is not sent: whoever is not meant computes another one.
+
+use bytes::{BufMut, Bytes, BytesMut};
+use crc64fast::Digest;
+
+use crate::{tid::Tid, time::Time, wire::Payload};
+
+/// Bytes before the payload.
+pub(super) const HEAD: usize = 32;
+/// Bytes behind it.
+const TAIL: usize = 8;
+/// Bytes that protection adds to a payload.
+pub const OVERHEAD: usize = HEAD + TAIL;
+
+const VERSION: u8 = 1;
+
+/// What a flow of protected messages is called by both of its ends: who sends, who receives, what it is. Not sent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Codename {
+    /// Who sends.
+    pub source: Tid,
+    /// Who receives. One application: a group has no codename.
+    pub destination: Tid,
+    /// [`Payload::NAME`].
+    pub name: &'static str,
+}
+
+impl Codename {
+    /// That of the values of type `P` from `source` to `destination`.
+    #[must_use]
+    pub const fn of<P: Payload>(source: Tid, destination: Tid) -> Self {
+        Self { source, destination, name: P::NAME }
+    }
+
+    fn digest(&self) -> Digest {
+        let mut digest = Digest::new();
+        digest.write(&self.source.bits().to_le_bytes());
+        digest.write(&self.destination.bits().to_le_bytes());
+        digest.write(&(self.name.len() as u64).to_le_bytes());
+        digest.write(self.name.as_bytes());
+        digest
+    }
+}
+
+/// What the sender says of one message.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stamp {
+    /// Counts the messages of the flow, from 1.
+    pub counter: u64,
+    /// Which life of the sender counts.
+    pub incarnation: u64,
+    /// The newest time of the receiver's clock that the sender has heard from it; [`Time::ZERO`] for none.
+    pub echo: Time,
+}
+
+/// Puts `payload` into an envelope.
+#[must_use]
+pub fn seal(codename: &Codename, stamp: Stamp, payload: &[u8]) -> Bytes {
+    let mut bytes = BytesMut::with_capacity(OVERHEAD + payload.len());
+    bytes.put_u8(VERSION);
+    bytes.put_bytes(0, 3);
+    // A length that 32 bits cannot say is refused by `payload_max`, which is smaller.
+    bytes.put_u32_le(payload.len() as u32);
+    bytes.put_u64_le(stamp.counter);
+    bytes.put_u64_le(stamp.incarnation);
+    bytes.put_u64_le(stamp.echo.as_nanos());
+    bytes.extend_from_slice(payload);
+    let mut digest = codename.digest();
+    digest.write(&bytes);
+    bytes.put_u64_le(digest.sum64());
+    bytes.freeze()
+}
+
+/// Takes the payload out of its envelope; `None` if these are not the bytes that were sealed under this codename.
+#[must_use]
+pub fn open(codename: &Codename, bytes: &Bytes) -> Option<(Stamp, Bytes)> {
+    let (sealed, sum) = bytes.split_last_chunk::<TAIL>()?;
+    let mut digest = codename.digest();
+    digest.write(sealed);
+    if digest.sum64() != u64::from_le_bytes(*sum) {
+        return None;
+    }
+    let (head, payload) = sealed.split_first_chunk::<HEAD>()?;
+    let word = |at: usize| head.get(at..at + 8).and_then(|word| word.try_into().ok()).map(u64::from_le_bytes);
+    let (first, counter, incarnation, echo) = (word(0)?, word(8)?, word(16)?, word(24)?);
+    // Version, flags and zeros are the lower half of the first word, the length is the upper one.
+    let is_known = first as u32 == u32::from(VERSION);
+    let is_whole = first >> 32 == payload.len() as u64;
+    let stamp = Stamp { counter, incarnation, echo: Time::from_nanos(echo) };
+    (is_known && is_whole).then(|| (stamp, bytes.slice(HEAD..bytes.len() - TAIL)))
+}
