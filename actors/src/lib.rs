@@ -55,7 +55,8 @@ mod wills;
 pub use sinew_runtime::supervision::fault;
 
 pub use api::{
-    ApiError, AsyncEndpoint, Endpoint, LentMessage, NodeApi, Received, Registration, Transport, Untaken,
+    ApiError, AsyncEndpoint, Barrier, BarrierError, Endpoint, LentMessage, Meet, Meeting, NodeApi, Received,
+    Registration, Transport, Untaken,
 };
 pub use audit::{Audit, NodeAudit};
 pub use config::{ConfigFaults, NodeConfig};
@@ -83,7 +84,9 @@ pub use sinew_runtime::{
 };
 pub use sinew_shm::Spin;
 pub use stores::ClockOffset;
-pub use sync::{DirectoryEntry, Waiting};
+pub use sync::{
+    ArriveAtBarrier, BarrierAnswer, BarrierStatus, DirectoryEntry, LeaveBarrier, OnPartyLoss, Waiting,
+};
 
 /// Everything that an ordinary program needs, in one line: `use sinew::prelude::*;`
 pub mod prelude {

@@ -164,6 +164,7 @@
 //! The protocol underneath is `docs/protocol/lncl.md`; it can be spoken from any language.
 
 mod async_endpoint;
+mod barrier;
 mod direct;
 mod endpoint;
 mod error;
@@ -198,6 +199,7 @@ use sinew_runtime::{
 use sinew_shm::{BellKind, Spin};
 
 pub use async_endpoint::AsyncEndpoint;
+pub use barrier::{Barrier, BarrierError, Meet, Meeting};
 pub use endpoint::Endpoint;
 pub use error::ApiError;
 pub use lent::LentMessage;

@@ -59,7 +59,7 @@ use crate::{
     ndl::KnownNode,
     outlet::OutletCounts,
     stores::{Stores, lock},
-    sync::{DirectoryEntry, Waiting},
+    sync::{BarrierStatus, DirectoryEntry, Waiting},
 };
 
 /// Time at its end for what the node has logged to be written.
@@ -231,6 +231,12 @@ impl NodeHandle {
     #[must_use]
     pub fn waiting(&self) -> Vec<Waiting> {
         lock(&self.stores.sync).waiting(Time::now())
+    }
+
+    /// The run-time barriers at which applications of this node wait, and who is missing at each.
+    #[must_use]
+    pub fn barriers(&self) -> Vec<BarrierStatus> {
+        lock(&self.stores.sync).barriers(Time::now())
     }
 
     /// The nodes that are there, as this node's NDL sees them, in the order of their addresses.

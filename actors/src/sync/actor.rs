@@ -12,12 +12,13 @@ use sinew_runtime::{
     supervision::ReadyGate,
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
-    wire::{Header, Kind, Message, Payload},
+    wire::{Flags, Header, Kind, Message, Payload},
 };
 
 use super::{
     Event,
     core::{Core, Input, Output, Reason},
+    words::{ArriveAtBarrier, BarrierAnswer, LeaveBarrier},
 };
 use crate::{audit, lncl::AppFact, monitors, node::RootEvent, refusals::Refusals, stores::Stores, wills};
 
@@ -121,10 +122,16 @@ impl SyncManager {
     /// Takes a peer's list; anything else that is sent here is refused.
     fn receive(&mut self, mut message: Message, ctx: &mut Context<Self>) {
         let Tid { node, app } = message.header.source;
+        if matches!(message.header.kind, ArriveAtBarrier::KIND | LeaveBarrier::KIND) {
+            return self.take_word(message, ctx);
+        }
         let is_about_lives =
             matches!(message.header.kind, Kind::SYNC_WATCH | Kind::SYNC_LIVES | Kind::SYNC_WILLS);
         let is_audit = matches!(message.header.kind, Kind::SYNC_AUDIT_ASK | Kind::SYNC_AUDIT);
-        if message.header.kind != Kind::SYNC_DIRECTORY && !is_about_lives && !is_audit {
+        if !matches!(message.header.kind, Kind::SYNC_DIRECTORY | Kind::SYNC_ARRIVALS)
+            && !is_about_lives
+            && !is_audit
+        {
             let kind = message.header.kind;
             self.refuse(
                 "kind",
@@ -151,8 +158,42 @@ impl SyncManager {
             message.settle(Outcome::Delivered);
         } else {
             let payload = message.payload.clone();
-            self.handle(Input::ListReceived { from: node, payload }, ctx);
+            let input = if message.header.kind == Kind::SYNC_ARRIVALS {
+                Input::ArrivalsReceived { from: node, payload }
+            } else {
+                Input::ListReceived { from: node, payload }
+            };
+            self.handle(input, ctx);
             message.settle(Outcome::Delivered);
+        }
+    }
+
+    /// Takes what an application of this node says about a barrier. spec: SYNC-10
+    fn take_word(&mut self, mut message: Message, ctx: &mut Context<Self>) {
+        let Tid { node, app } = message.header.source;
+        let is_arrival = message.header.kind == ArriveAtBarrier::KIND;
+        if node != self.stores.node {
+            self.refuse("barrier", &format_args!("{node}/{app} waits at barriers by its own node"));
+            return message.reject(Rejection::ForgedSource);
+        }
+        if is_arrival && !message.header.flags.has(Flags::ASK) {
+            return message.reject(Rejection::Unsupported);
+        }
+        let correlation = message.header.correlation;
+        let input = if is_arrival {
+            message.decode().map(|asked| Input::Arrived { app, correlation, asked })
+        } else {
+            message.decode().map(|LeaveBarrier { barrier }| Input::Left { app, barrier })
+        };
+        match input {
+            Ok(input) => {
+                self.handle(input, ctx);
+                message.settle(Outcome::Delivered);
+            }
+            Err(fault) => {
+                self.refuse("barrier", &format_args!("{app}: {fault}"));
+                message.reject(Rejection::Malformed);
+            }
         }
     }
 
@@ -195,6 +236,8 @@ impl SyncManager {
             }
             Output::Tell { app, event, why } => self.tell(app, event, why),
             Output::Publish { to, list } => self.publish(to, list),
+            Output::PublishArrivals { to, said } => self.publish_arrivals(to, said),
+            Output::AnswerBarrier { app, correlation, answer } => self.answer(app, correlation, &answer),
             Output::RouteGroups { node, groups } => self.stores.router.set_remote_groups(node, &groups),
             Output::Cycle { names } => self.refuse_cycle(names),
             Output::Overdue(waiting) => crate::log::warn!(
@@ -257,6 +300,26 @@ impl SyncManager {
         self.stamp(&mut header);
         if let Err(why) = self.stores.router.send(Message::new(header, list)) {
             self.refuse("peer", &format_args!("{to} was not sent this node's directory, tried again: {why}"));
+        }
+    }
+
+    /// Says who waits at barriers. They wait for it: what the queue does not take is said again in 10 ms.
+    fn publish_arrivals(&self, to: NodeAddress, said: Bytes) {
+        let mut header = Header::new(Kind::SYNC_ARRIVALS, self.tid(), Tid::new(to, AppAddress::SYNC));
+        self.stamp(&mut header);
+        if let Err(why) = self.stores.router.send(Message::new(header, said)) {
+            self.refuse("peer", &format_args!("{to} was not told who waits at barriers, tried again: {why}"));
+            self.core().handle(Time::now(), Input::ArrivalsNotTaken { to });
+        }
+    }
+
+    fn answer(&self, app: AppAddress, correlation: u64, answer: &BarrierAnswer) {
+        let mut message = Message::typed(self.tid(), Tid::new(self.stores.node, app), answer);
+        self.stamp(&mut message.header);
+        message.header.flags = Flags::REPLY;
+        message.header.correlation = correlation;
+        if let Err(why) = self.stores.router.send(message) {
+            self.refuse("application", &format_args!("{app} was not told what became of its barrier: {why}"));
         }
     }
 

@@ -15,13 +15,19 @@
 //! | SYNC-7 | Applications that require each other in a circle are not released, whoever came first; the circle is spelled out. Those that run already are not stopped. Patterns, names that nobody has, what can be done without, and counts for which too few are known are ways out. |
 //! | SYNC-8 | A released application is told when a requirement is lost and when it is met again, each once, in that order, as far as its mailbox takes it; what it does not take is offered again every 10 ms in its last form. That nobody can hear of a requirement (its link is down, or up without a list, and its node neither lost nor restarted) is told after 50 ms. |
 //! | SYNC-9 | A wait that reaches its deadline is reported with what is missing, since when and why; again each time that the deadline passes. The wait goes on. |
+//! | SYNC-10 | An application waits at a barrier of its own node: a name, and parties that are requirements of those who wait there. It must be one of them. It waits until the barrier opens, its deadline, its leave or its end. |
+//! | SYNC-11 | What a node knows of barriers goes to each linked node when the link comes up, at each change (not sooner than 1 ms after the one before), and every 2 s. A node that has somebody waiting opens a barrier when all parties wait behind the generation that it knows as the last one; of other nodes that counts which can be heard. The opening is one generation more, and those who waited are its members. |
+//! | SYNC-12 | Who hears of a generation that is higher than the known one takes it over, with its members; of the same one the members are put together. Whoever waits behind an earlier one passes if it is a member, and waits for the next one if not. |
+//! | SYNC-13 | A named party that is missing and has failed, was stopped, or whose node is lost, for 50 ms, ends the wait of those who do not want to wait for it. |
 
 mod actor;
 #[cfg(test)]
 mod actor_tests;
+mod arrivals;
 mod core;
 mod facts;
 mod list;
+mod words;
 
 pub(crate) use actor::SyncManager;
 pub(crate) use core::Core;
@@ -30,6 +36,7 @@ pub(crate) use core::Input;
 pub(crate) use facts::OwnApp;
 pub use facts::{DirectoryEntry, Waiting};
 pub(crate) use list::{NAME_BYTES_MAX, Name, at_most};
+pub use words::{ArriveAtBarrier, BarrierAnswer, BarrierStatus, LeaveBarrier, OnPartyLoss};
 
 use sinew_runtime::wire::Message;
 

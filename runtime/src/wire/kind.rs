@@ -63,6 +63,8 @@ impl Kind {
     pub const SYNC_AUDIT_ASK: Self = Self(0x34);
     /// What it says of itself.
     pub const SYNC_AUDIT: Self = Self(0x35);
+    /// Who waits at run-time barriers on a node, and which generation of each has opened.
+    pub const SYNC_ARRIVALS: Self = Self(0x36);
     /// A process asks for a transport address.
     pub const LNCL_REGISTER: Self = Self(0x40);
     /// The address it got.

@@ -50,8 +50,8 @@ impl Core {
         self.outputs.extend(released.into_iter().map(|app| Output::Release { app }));
     }
 
-    /// What each application lacks of what it requires. Remembers which of the required names somebody had at some time, and
-    /// forgets those that nobody requires any more.
+    /// What each application lacks of what it requires. Remembers which of the names that are required, or waited for at a barrier,
+    /// somebody had at some time, and forgets those that nobody asks for any more.
     fn find_missing(&mut self) -> BTreeMap<AppAddress, Vec<(String, Reason)>> {
         let (mut missing, mut seen) = (BTreeMap::new(), BTreeSet::new());
         for (address, app) in self.apps.iter().filter(|(_, app)| !app.requires.is_empty()) {
@@ -65,6 +65,10 @@ impl Core {
                 seen.extend(remembered.cloned().chain(standing.had));
             }
             missing.insert(address, unmet);
+        }
+        for party in self.rendezvous.awaited() {
+            let remembered = party.alternatives().iter().filter(|name| self.seen.contains(*name));
+            seen.extend(remembered.cloned().chain(self.standing(AppAddress::NONE, party).had));
         }
         self.seen = seen;
         missing

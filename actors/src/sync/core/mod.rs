@@ -7,8 +7,10 @@
 mod apps;
 mod barrier;
 mod cycles;
+mod meet;
 mod peers;
 mod reason;
+mod rendezvous;
 mod requirements;
 #[cfg(test)]
 mod simulation;
@@ -31,10 +33,12 @@ pub(crate) use self::reason::Reason;
 use self::{
     apps::{Apps, State, Wait},
     peers::{Accepted, Peers},
+    rendezvous::Rendezvous,
 };
 use super::{
     facts::{DirectoryEntry, OwnApp, Waiting},
     list::{ENTRIES_MAX, List},
+    words::{ArriveAtBarrier, BarrierAnswer},
 };
 use crate::{
     config::NodeConfig,
@@ -59,6 +63,14 @@ pub(crate) enum Input {
     LinkChanged(LinkFact),
     /// The sync manager of `from` sent its list.
     ListReceived { from: NodeAddress, payload: Bytes },
+    /// An application of this node has arrived at a barrier; the request has this correlation.
+    Arrived { app: AppAddress, correlation: u64, asked: ArriveAtBarrier },
+    /// It waits there no more.
+    Left { app: AppAddress, barrier: String },
+    /// The sync manager of `from` said who waits at barriers.
+    ArrivalsReceived { from: NodeAddress, payload: Bytes },
+    /// The queue to `to` did not take who waits at barriers.
+    ArrivalsNotTaken { to: NodeAddress },
     /// The root did not take the release of this application.
     ReleaseNotTaken { app: AppAddress },
     /// This application did not take an event about the requirement `name`.
@@ -76,6 +88,10 @@ pub(crate) enum Output {
     Tell { app: AppAddress, event: RequirementEvent, why: Option<Reason> },
     /// Send this list to the sync manager of `to`.
     Publish { to: NodeAddress, list: Bytes },
+    /// Tell the sync manager of `to` who waits at barriers.
+    PublishArrivals { to: NodeAddress, said: Bytes },
+    /// Answer this request of an application that waited at a barrier.
+    AnswerBarrier { app: AppAddress, correlation: u64, answer: BarrierAnswer },
     /// These groups have members on `node`.
     RouteGroups { node: NodeAddress, groups: Vec<AppAddress> },
     /// These names require each other in a circle, the first one again at the end: none of them is released.
@@ -98,6 +114,7 @@ pub(crate) struct Core {
     apps: Apps,
     groups: Vec<AppAddress>,
     peers: Peers,
+    rendezvous: Rendezvous,
     /// Of the names and patterns that are required here, those that somebody had at some time.
     seen: BTreeSet<String>,
     /// The cycles that stand, each without its closing name.
@@ -125,6 +142,7 @@ impl Core {
             apps: Apps::default(),
             groups: Vec::new(),
             peers: Peers::new(config.ndl.nodes_max),
+            rendezvous: Rendezvous::new(node, incarnation),
             seen: BTreeSet::new(),
             cycles: BTreeSet::new(),
             same_names: BTreeSet::new(),
@@ -143,6 +161,10 @@ impl Core {
             Input::AppChanged(fact) => self.app_changed(now, fact),
             Input::GroupsChanged(groups) => self.groups_changed(now, groups),
             Input::MembershipChanged(fact) => self.membership_changed(fact),
+            Input::Arrived { app, correlation, asked } => self.arrived(now, app, correlation, asked),
+            Input::Left { app, barrier } => self.rendezvous.leave(now, app, &barrier),
+            Input::ArrivalsReceived { from, payload } => self.arrivals_received(now, from, &payload),
+            Input::ArrivalsNotTaken { to } => self.rendezvous.not_taken(now, to),
             Input::LinkChanged(fact) => self.link_changed(now, fact),
             Input::ListReceived { from, payload } => self.list_received(from, &payload),
             Input::ReleaseNotTaken { app } => self.keep(now, app, None),
@@ -153,6 +175,7 @@ impl Core {
         self.evaluate(now);
         self.report_overdue(now);
         self.publish(now);
+        self.meet(now);
     }
 
     /// The next thing to be done; take until there is none.
@@ -165,7 +188,10 @@ impl Core {
         let overdue = self.apps.waiting().map(|(_, _, wait)| wait.overdue).min();
         let silent =
             self.apps.iter().flat_map(|(_, app)| app.silent.values().chain(&app.patience).copied()).min();
-        [self.peers.next_due(), overdue, self.retry, silent].into_iter().flatten().min()
+        [self.peers.next_due(), overdue, self.retry, silent, self.rendezvous.next_wake()]
+            .into_iter()
+            .flatten()
+            .min()
     }
 
     /// The TIDs of the applications called `name`: of this node first, then of linked nodes, then of nodes whose link
@@ -248,6 +274,7 @@ impl Core {
                     );
                 }
                 self.forget_not_taken(app);
+                self.rendezvous.ended(now, app);
                 self.note_same_name(name.as_deref().unwrap_or_default());
                 self.own_list_changed(now);
             }
@@ -257,6 +284,7 @@ impl Core {
             AppFact::Unregistered { app } => {
                 self.apps.remove(app);
                 self.forget_not_taken(app);
+                self.rendezvous.ended(now, app);
                 self.own_list_changed(now);
             }
             // The shell looks up which they are and says so by `Input::GroupsChanged`.
@@ -286,6 +314,7 @@ impl Core {
 
     /// It waits again for all that it requires; one that waits already was not started yet and goes on waiting.
     fn app_ended(&mut self, now: Time, address: AppAddress, how: Reason) {
+        self.rendezvous.ended(now, address);
         let wait = Wait::begun(now, self.requirement_deadline);
         if let Some(app) = self.apps.get_mut(address)
             && app.wait().is_none()
@@ -324,6 +353,7 @@ impl Core {
                     | LossReason::Duplicate => Reason::NodeLost,
                 };
                 self.peers.lost(node, incarnation, reason);
+                self.hear_no_more(node);
                 self.route_groups(node);
             }
         }
@@ -338,14 +368,19 @@ impl Core {
                         format!("{node} is linked, but `ndl.nodes_max` nodes are known already"),
                     );
                 }
+                self.rendezvous.link_up(now, node);
                 self.route_groups(node);
             }
-            LinkFact::LinkBroken { node, incarnation } => self.peers.link_broken(node, incarnation),
+            LinkFact::LinkBroken { node, incarnation } => {
+                self.peers.link_broken(node, incarnation);
+                self.hear_no_more(node);
+            }
             // A link that was refused was down before. Whether its node is lost, NDL says.
             LinkFact::DialRefused { .. } => {}
             LinkFact::PeerLeft { node, incarnation } => {
                 self.peers.lost(node, incarnation, Reason::NodeLeft);
                 self.peers.link_broken(node, incarnation);
+                self.hear_no_more(node);
                 self.route_groups(node);
             }
         }
@@ -371,6 +406,13 @@ impl Core {
                 }
                 Ok(Accepted::Same | Accepted::Old) => {}
             },
+        }
+    }
+
+    /// What `node` said of barriers does not count any more, unless news of a former life changed nothing.
+    fn hear_no_more(&mut self, node: NodeAddress) {
+        if self.peers.current(node).is_none() {
+            self.rendezvous.silent(node);
         }
     }
 

@@ -204,6 +204,26 @@ impl Peers {
         }
     }
 
+    /// The linked life of `node`, if what it says counts. spec: SYNC-3
+    pub(super) fn current(&self, node: NodeAddress) -> Option<Incarnation> {
+        self.nodes.get(&node).filter(|peer| peer.is_current())?.linked
+    }
+
+    /// The life of `node` that messages can reach.
+    pub(super) fn linked(&self, node: NodeAddress) -> Option<Incarnation> {
+        self.nodes.get(&node)?.linked
+    }
+
+    /// Whether anything is known of `node`.
+    pub(super) fn knows(&self, node: NodeAddress) -> bool {
+        self.nodes.contains_key(&node)
+    }
+
+    /// Whether there is room to know something of `node`.
+    pub(super) fn admit(&mut self, node: NodeAddress) -> bool {
+        self.at(node).is_some()
+    }
+
     /// The record of `node`; where the table is full, in place of a node that was lost.
     fn at(&mut self, node: NodeAddress) -> Option<&mut Peer> {
         if !self.nodes.contains_key(&node) && self.nodes.len() >= self.nodes_max {

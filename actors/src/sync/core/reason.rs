@@ -49,6 +49,19 @@ impl Reason {
         }
     }
 
+    /// Whether the life that was known is over, as far as is known.
+    pub(super) const fn is_end(self) -> bool {
+        match self {
+            Self::Failed
+            | Self::Stopped
+            | Self::NodeRestarted
+            | Self::NodeLeft
+            | Self::NodeLost
+            | Self::Unregistered => true,
+            Self::NotReady | Self::ListAwaited | Self::LinkDown | Self::NeverSeen | Self::Cycle => false,
+        }
+    }
+
     /// Whether it says nothing about the application itself, only that nobody can hear of it at this moment.
     pub(super) const fn is_silence(self) -> bool {
         match self {

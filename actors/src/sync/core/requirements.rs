@@ -35,6 +35,12 @@ impl Standing {
 }
 
 impl Core {
+    /// Why no application called `name` is ready; `None`: one is.
+    pub(super) fn why_not(&self, name: &str) -> Option<Reason> {
+        let requirement = Requirement::name(name);
+        self.standing(AppAddress::NONE, &requirement).why_not(&requirement)
+    }
+
     /// How a requirement of the application at `of` stands. It never counts for itself.
     pub(super) fn standing(&self, of: AppAddress, requirement: &Requirement) -> Standing {
         let mut standing = Standing::default();

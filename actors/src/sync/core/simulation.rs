@@ -168,7 +168,9 @@ impl World {
                 assert!(self.apps[node][&index].released == 1, "told before it was released: {event:?}");
             }
             Output::Refused { cause, detail } => panic!("refused because of {cause}: {detail}"),
-            Output::RouteGroups { .. }
+            Output::PublishArrivals { .. }
+            | Output::AnswerBarrier { .. }
+            | Output::RouteGroups { .. }
             | Output::Cycle { .. }
             | Output::Overdue(_)
             | Output::SameName { .. } => {}

@@ -1,0 +1,254 @@
+//! Run-time barriers: several applications, on any nodes, go on together.
+
+use std::{
+    future::Future,
+    pin::Pin,
+    task::{Context, Poll},
+    time::Duration,
+};
+
+use actix::Actor;
+use sinew_runtime::{
+    app::AppContext,
+    sender::{AskError, Reply, SendError, Sender},
+    tid::{AppAddress, Tid},
+};
+
+use super::{ApiError, AsyncEndpoint, Endpoint};
+use crate::sync::{ArriveAtBarrier, BarrierAnswer, LeaveBarrier, OnPartyLoss};
+
+/// How much later than the barrier's own deadline its answer may come: the node says who is missing.
+const SAYING: Duration = Duration::from_secs(2);
+/// How long one waits at a barrier that says nothing else.
+const WITHIN: Duration = Duration::from_secs(60);
+
+/// A point at which several applications, on any nodes, wait for each other.
+///
+/// It has no owner and need not be made: it is there when somebody arrives. When all parties wait it opens for all of them, and
+/// can be used again: the next round is its next generation. What is promised when a node dies meanwhile stands in
+/// `docs/SEMANTICS.md`, "Barriers".
+///
+/// ```no_run
+/// use sinew::{Barrier, prelude::*};
+///
+/// let node = NodeApi::connect("/run/sinew/hip.sock");
+/// let mut calibration = node.register_transport_address(Registration::new().name("hip.calibration"))?;
+/// let calibrated = Barrier::new("calibrated", ["hip.calibration", "knee.calibration", "2 of *.imu"]);
+/// let generation = calibration.meet(&calibrated)?;
+/// println!("all are calibrated, for the {generation}. time");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Barrier {
+    name: String,
+    parties: Vec<String>,
+    within: Duration,
+    on_loss: OnPartyLoss,
+}
+
+impl Barrier {
+    /// The barrier of this name, 1 to 63 bytes, at which these parties meet. They are given as in `requires`: names, patterns, any
+    /// of several, so many of them; all must be met by those who wait there. Whoever arrives must be one of them, and must name the
+    /// same ones: with other parties it is another barrier.
+    #[must_use]
+    pub fn new<N: Into<String>>(name: impl Into<String>, parties: impl IntoIterator<Item = N>) -> Self {
+        let parties = parties.into_iter().map(Into::into).collect();
+        Self { name: name.into(), parties, within: WITHIN, on_loss: OnPartyLoss::default() }
+    }
+
+    /// The barrier at which any `count` applications meet. Exactly so many should take part: with more, those that the others
+    /// are not waiting for meet in the next generation.
+    #[must_use]
+    pub fn of(count: usize, name: impl Into<String>) -> Self {
+        Self::new(name, [format!("{count} of *")])
+    }
+
+    /// How long one waits; whole milliseconds. Default: 60 s.
+    #[must_use]
+    pub const fn within(mut self, within: Duration) -> Self {
+        self.within = within;
+        self
+    }
+
+    /// Whether one goes on waiting when a named party is lost. Default: yes, it may come back.
+    #[must_use]
+    pub const fn on_loss(mut self, on_loss: OnPartyLoss) -> Self {
+        self.on_loss = on_loss;
+        self
+    }
+
+    /// Its name.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn request(&self) -> ArriveAtBarrier {
+        ArriveAtBarrier {
+            barrier: self.name.clone(),
+            parties: self.parties.clone(),
+            within_ms: u32::try_from(self.within.as_millis()).unwrap_or(u32::MAX),
+            on_loss: self.on_loss,
+        }
+    }
+
+    /// How long the request itself may take.
+    fn patience(&self) -> Duration {
+        self.within.saturating_add(SAYING)
+    }
+
+    fn judge(&self, answer: BarrierAnswer) -> Result<u64, BarrierError> {
+        let barrier = self.name.clone();
+        match answer {
+            BarrierAnswer::Opened { generation } => Ok(generation),
+            BarrierAnswer::TimedOut { missing } => {
+                Err(BarrierError::TimedOut { barrier, waited: self.within, missing })
+            }
+            BarrierAnswer::Lost { missing } => Err(BarrierError::Lost { barrier, missing }),
+            BarrierAnswer::Refused { why } => Err(BarrierError::Refused(why)),
+        }
+    }
+}
+
+/// Why one does not wait at a barrier any more.
+#[derive(Debug, thiserror::Error)]
+pub enum BarrierError {
+    /// Not all were there in time. The others go on waiting.
+    #[error("the barrier '{barrier}' did not open in {waited:?}: {}", in_words(missing))]
+    TimedOut {
+        /// Its name.
+        barrier: String,
+        /// How long it was waited for.
+        waited: Duration,
+        /// Who is missing, and the last that is known of each.
+        missing: Vec<(String, String)>,
+    },
+    /// A party was lost, and it was not to be waited for.
+    #[error("a party of the barrier '{barrier}' was lost: {}", in_words(missing))]
+    Lost {
+        /// Its name.
+        barrier: String,
+        /// Who is missing, and the last that is known of each.
+        missing: Vec<(String, String)>,
+    },
+    /// The node does not let it wait there.
+    #[error("{0}")]
+    Refused(String),
+    /// The node was not asked.
+    #[error("the node was not asked: {0}")]
+    Send(#[from] SendError),
+    /// The node has not answered.
+    #[error("the node has not said what became of the barrier: {0}")]
+    Ask(#[from] AskError),
+    /// The node was not asked by an endpoint, or has not answered it.
+    #[error("the node has not said what became of the barrier: {0}")]
+    Api(#[from] ApiError),
+}
+
+fn in_words(missing: &[(String, String)]) -> String {
+    let parts: Vec<String> = missing.iter().map(|(name, why)| format!("{name} is missing ({why})")).collect();
+    parts.join(", ")
+}
+
+/// Whoever has a [`Sender`] can wait at a barrier.
+pub trait Meet {
+    /// Arrives at the barrier and waits there; the future ends with the generation that opened. Dropped before, it leaves the
+    /// barrier. In an actor: `context.spawn` or `context.wait` it.
+    fn meet(&self, barrier: &Barrier) -> Meeting;
+}
+
+impl Meet for Sender {
+    fn meet(&self, barrier: &Barrier) -> Meeting {
+        let to = Tid::new(self.tid().node, AppAddress::SYNC);
+        let reply = self.ask(to, &barrier.request(), barrier.patience());
+        Meeting { barrier: barrier.clone(), sender: self.clone(), wait: Wait::from(reply) }
+    }
+}
+
+impl<A: Actor<Context = Self>> Meet for AppContext<A> {
+    fn meet(&self, barrier: &Barrier) -> Meeting {
+        self.sender().meet(barrier)
+    }
+}
+
+/// A wait at a barrier; see [`Meet::meet`].
+#[must_use = "who does not wait for it leaves the barrier"]
+#[derive(Debug)]
+pub struct Meeting {
+    barrier: Barrier,
+    sender: Sender,
+    wait: Wait,
+}
+
+#[derive(Debug)]
+enum Wait {
+    Refused(Option<SendError>),
+    For(Reply<BarrierAnswer>),
+    Over,
+}
+
+impl From<Result<Reply<BarrierAnswer>, SendError>> for Wait {
+    fn from(reply: Result<Reply<BarrierAnswer>, SendError>) -> Self {
+        reply.map_or_else(|error| Self::Refused(Some(error)), Self::For)
+    }
+}
+
+impl Future for Meeting {
+    type Output = Result<u64, BarrierError>;
+
+    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Self::Output> {
+        let this = &mut *self;
+        let result = match &mut this.wait {
+            Wait::Refused(error) => {
+                error.take().map_or(Poll::Pending, |error| Poll::Ready(Err(error.into())))
+            }
+            Wait::For(reply) => match Pin::new(reply).poll(cx) {
+                Poll::Pending => Poll::Pending,
+                Poll::Ready(answer) => Poll::Ready(
+                    answer.map_err(BarrierError::from).and_then(|answer| this.barrier.judge(answer)),
+                ),
+            },
+            Wait::Over => Poll::Pending,
+        };
+        if result.is_ready() {
+            this.wait = Wait::Over;
+        }
+        result
+    }
+}
+
+impl Drop for Meeting {
+    fn drop(&mut self) {
+        if matches!(self.wait, Wait::For(_)) {
+            let to = Tid::new(self.sender.tid().node, AppAddress::SYNC);
+            // Where the node does not take it, the wait there ends with its deadline or with this life.
+            let _ = self.sender.send(to, &LeaveBarrier { barrier: self.barrier.name.clone() });
+        }
+    }
+}
+
+impl Endpoint {
+    /// Arrives at the barrier and waits there. Returns the generation that opened. Messages that come meanwhile wait to be
+    /// received, as with [`ask`](Self::ask).
+    ///
+    /// # Errors
+    /// Not all were there in time, a party was lost, or the node did not let it wait.
+    pub fn meet(&mut self, barrier: &Barrier) -> Result<u64, BarrierError> {
+        let to = Tid::new(self.tid().node, AppAddress::SYNC);
+        let answer = self.ask(to, &barrier.request(), barrier.patience())?;
+        barrier.judge(answer)
+    }
+}
+
+impl AsyncEndpoint {
+    /// Arrives at the barrier and waits there; see [`Endpoint::meet`]. If the future is dropped before, it still counts as
+    /// arrived, until the barrier's deadline.
+    ///
+    /// # Errors
+    /// Not all were there in time, a party was lost, or the node did not let it wait.
+    pub async fn meet(&mut self, barrier: &Barrier) -> Result<u64, BarrierError> {
+        let to = Tid::new(self.tid().node, AppAddress::SYNC);
+        let answer = self.ask(to, &barrier.request(), barrier.patience()).await?;
+        barrier.judge(answer)
+    }
+}

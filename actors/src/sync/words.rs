@@ -1,0 +1,83 @@
+//! What an application says at a run-time barrier, and what it is told; by these kinds any process can do it.
+
+use serde::{Deserialize, Serialize};
+
+use crate::payload;
+
+payload!("sinew.barrier.arrive" =>
+    /// Its sender has arrived at a barrier of its own node, and waits there. A request to the node's sync manager (`node/2`);
+    /// [`BarrierAnswer`] answers.
+    #[derive(Clone, Debug, PartialEq, Eq)]
+    pub struct ArriveAtBarrier {
+        /// The barrier's name, 1 to 63 bytes.
+        pub barrier: String,
+        /// Who has to be there, as in `requires`: names, patterns, any of several, so many of them; at most 64, without wait limits.
+        /// The same for all that meet.
+        pub parties: Vec<String>,
+        /// How long it waits, in milliseconds.
+        pub within_ms: u32,
+        /// What it does when a party is lost.
+        pub on_loss: OnPartyLoss,
+    }
+);
+
+payload!("sinew.barrier.leave" =>
+    /// Its sender waits there no more. Nothing answers.
+    #[derive(Clone, Debug, PartialEq, Eq)]
+    pub struct LeaveBarrier {
+        /// The barrier's name.
+        pub barrier: String,
+    }
+);
+
+payload!("sinew.barrier.answer" =>
+    /// What became of a wait at a barrier.
+    #[derive(Clone, Debug, PartialEq, Eq)]
+    pub enum BarrierAnswer {
+        /// All parties have arrived.
+        Opened {
+            /// How often this barrier has opened, as far as those who met know: the same number for all of them.
+            generation: u64,
+        },
+        /// The time was over first. Whoever waits still goes on waiting.
+        TimedOut {
+            /// Who is missing, and the last that is known of each.
+            missing: Vec<(String, String)>,
+        },
+        /// A party was lost, and this application wanted to be told so instead of waiting for its return.
+        Lost {
+            /// Who is missing, and the last that is known of each.
+            missing: Vec<(String, String)>,
+        },
+        /// The node does not let it wait there: what it asked for is wrong, or there is no room.
+        Refused {
+            /// Why, in words.
+            why: String,
+        },
+    }
+);
+
+/// What whoever waits at a barrier does when a party that it asks for by its name has failed, was stopped, or its node is lost.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub enum OnPartyLoss {
+    /// It goes on waiting: the party may come back and arrive.
+    #[default]
+    Wait,
+    /// It waits no more, 50 ms after the loss was known here: [`BarrierAnswer::Lost`].
+    Fail,
+}
+
+/// A run-time barrier at which somebody waits, as this node sees it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct BarrierStatus {
+    /// The barrier's name.
+    pub barrier: String,
+    /// Who has to be there.
+    pub parties: Vec<String>,
+    /// How often it has opened, as far as is known here.
+    pub generation: u64,
+    /// Applications of this node that wait there: name or address, and for how long.
+    pub waiting: Vec<(String, std::time::Duration)>,
+    /// Who is missing, and the last that is known of each.
+    pub missing: Vec<(String, String)>,
+}
