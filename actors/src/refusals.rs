@@ -11,6 +11,8 @@ use sinew_runtime::time::Time;
 
 /// A peer that sends rubbish at line rate costs one log line a second, not a full disk.
 const LOG_PERIOD: Duration = Duration::from_secs(1);
+/// What is kept of a detail, in characters: a peer's own words may be among it.
+const DETAIL_MAX: usize = 256;
 
 /// Counters of refusals. The causes are literals of this program, so their number is bounded.
 #[derive(Debug, Default)]
@@ -21,6 +23,18 @@ struct Cause {
     count: u64,
     logged: Option<Time>,
     suppressed: u64,
+    /// What the last one was about that was logged.
+    detail: String,
+}
+
+/// What was refused because of one cause, for whoever asks.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Told {
+    pub(crate) cause: &'static str,
+    pub(crate) count: u64,
+    /// What the last one was about that was logged, and when.
+    pub(crate) detail: String,
+    pub(crate) at: Time,
 }
 
 impl Refusals {
@@ -36,6 +50,8 @@ impl Refusals {
         }
         entry.logged = Some(now);
         let suppressed = std::mem::take(&mut entry.suppressed);
+        let detail = detail.to_string();
+        entry.detail = detail.chars().take(DETAIL_MAX).collect();
         // Whoever reads the log may be slow: nobody waits for it with the lock in hand.
         drop(causes);
         crate::log::warn!(cause, suppressed, "refused: {detail}");
@@ -49,6 +65,16 @@ impl Refusals {
     /// How much was refused, for each cause.
     pub(crate) fn by_cause(&self) -> Vec<(&'static str, u64)> {
         self.causes().iter().map(|(cause, entry)| (*cause, entry.count)).collect()
+    }
+
+    /// What was refused, for each cause, with the last one of each that was logged.
+    pub(crate) fn told(&self) -> Vec<Told> {
+        let causes = self.causes();
+        let told = causes.iter().filter_map(|(cause, entry)| {
+            let Cause { count, ref detail, logged, .. } = *entry;
+            Some(Told { cause, count, detail: detail.clone(), at: logged? })
+        });
+        told.collect()
     }
 
     /// How much was refused because of `cause`.
@@ -75,6 +101,8 @@ mod tests {
         refusals.count(Time::ZERO, "too long", &"a whale");
         assert_eq!((refusals.of("garbage"), refusals.of("too long"), refusals.of("never")), (4, 1, 0));
         assert_eq!(refusals.total(), 5);
+        let told = refusals.told();
+        assert_eq!((told[0].cause, told[0].count, told[0].detail.as_str()), ("garbage", 4, "noise"));
         let causes = refusals.causes();
         assert_eq!(
             (causes["garbage"].suppressed, causes["garbage"].logged),

@@ -267,6 +267,7 @@ impl Gncl {
 
     fn tell(&self, fact: LinkFact) {
         crate::log::info!(?fact, "link");
+        self.stores.gncl.notes.fact(Time::now(), &fact);
         self.post(&self.stores.posts.ndl, ndl::Event::Link(fact));
         self.post(&self.stores.posts.sync, sync::Event::Link(fact));
     }
@@ -461,6 +462,9 @@ impl StreamHandler<News> for Gncl {
                 crate::log::debug!(%error, "dial failed");
                 if listener::is_starved(&error) {
                     self.input(Input::Starved, ctx);
+                }
+                if let Some((node, address)) = self.core.dialled(connection) {
+                    self.stores.gncl.notes.dial_failed(Time::now(), node, address, error.to_string());
                 }
                 let refused = error.kind() == io::ErrorKind::ConnectionRefused;
                 self.input(Input::DialFailed { connection, refused }, ctx);

@@ -51,6 +51,7 @@ mod interfaces;
 mod link;
 mod listener;
 mod marks;
+mod notes;
 mod peer;
 mod spin;
 mod task;

@@ -23,6 +23,7 @@ use tokio::{net::TcpStream, sync::Notify};
 use super::{
     bulk::BulkThread,
     core::{Attach, Lane},
+    notes::Notes,
     task::{Move, Place},
     ticks::Ticks,
     way::{Ends, Offered, Way, WayAccount},
@@ -218,6 +219,8 @@ pub(crate) struct Store {
     /// Who looks for what has expired, and who for what was taken and not acknowledged.
     expiring: Arc<Ticks>,
     acks: Arc<Ticks>,
+    /// What is told of connections to whoever asks.
+    pub(crate) notes: Notes,
     /// What GNCL refused, and why.
     pub(crate) refusals: Arc<Refusals>,
 }

@@ -16,14 +16,15 @@ use sinew_runtime::{
 };
 
 use super::reports::{
-    APPS_MAX, AppReport, AppsReport, AuditReport, LinkReport, Missing, NodeReport, PEERS_MAX, PeerReport,
-    SeenMessage, TREE_MAX, TreeLine, TreeReport, WatchReport,
+    APPS_MAX, AppReport, AppsReport, AuditReport, DialReport, ForeignReport, LinkReport, LostReport, Missing,
+    NodeReport, PEERS_MAX, PeerReport, RefusalReport, SeenMessage, TOLD_MAX, TREE_MAX, TreeLine, TreeReport,
+    WatchReport,
 };
 use super::watches::{Fetched, Sight};
 use crate::{
     audit,
     gncl::Peer,
-    ndl::{KnownNode, Source},
+    ndl::{KnownNode, LossReason, LostNode, Source},
     node::{CommandError, NodeHandle, Supervised},
     stores::{Stores, lock},
     sync::OwnApp,
@@ -57,6 +58,7 @@ impl Answers {
         let mut peers: Vec<_> = peers(stores, now).into_values().collect();
         let left_out = peers.len().saturating_sub(PEERS_MAX) as u64;
         peers.truncate(PEERS_MAX);
+        let ndl = Discovery::of(stores, now);
         Ok(NodeReport {
             node: stores.node,
             name: stores.config.name.clone(),
@@ -66,6 +68,15 @@ impl Answers {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             stopping: stores.stopping.load(Ordering::Relaxed),
             refused: NodeHandle::of(stores.clone()).refused(),
+            project: stores.config.project.clone(),
+            interface: stores.config.ndl.interface.to_string(),
+            udp: ndl.udp,
+            gncl: ndl.gncl,
+            group: stores.config.ndl.multicast.map(|group| group.to_string()),
+            seeds: stores.config.ndl.seeds.iter().take(TOLD_MAX).map(ToString::to_string).collect(),
+            lost: ndl.lost,
+            foreign: ndl.foreign,
+            refusals: refusals(stores, now),
             peers,
             left_out,
         })
@@ -107,6 +118,77 @@ impl Answers {
     }
 }
 
+/// What NDL says of itself, and of those that are no members.
+struct Discovery {
+    udp: Option<String>,
+    gncl: Option<String>,
+    lost: Vec<LostReport>,
+    foreign: Vec<ForeignReport>,
+}
+
+impl Discovery {
+    fn of(stores: &Stores, now: Time) -> Self {
+        let (udp, me, lost, foreign) = {
+            let core = lock(&stores.ndl);
+            (core.udp(), core.announcement().clone(), core.lost_nodes(), core.neighbours())
+        };
+        let mut lost: Vec<_> = lost.into_iter().map(|(node, lost)| lost_report(node, lost, now)).collect();
+        lost.sort_by_key(|lost| lost.lost_us);
+        let foreign = foreign.into_iter().map(|(from, other)| ForeignReport {
+            node: other.node,
+            name: other.name,
+            project: other.project,
+            udp: from.to_string(),
+            ago_us: micros(now.since(other.heard)),
+        });
+        let gncl = udp.map(|_| me.gncl().to_string());
+        Self { udp: udp.map(|udp| udp.to_string()), gncl, lost, foreign: foreign.collect() }
+    }
+}
+
+fn lost_report(node: NodeAddress, lost: LostNode, now: Time) -> LostReport {
+    let why = match lost.why {
+        LossReason::Left => "left",
+        LossReason::Silent => "silent",
+        LossReason::ConnectionRefused => "connection refused",
+        LossReason::Restarted => "restarted",
+        LossReason::Duplicate => "duplicate",
+    };
+    LostReport {
+        node,
+        name: lost.name,
+        incarnation: lost.incarnation,
+        udp: lost.address.to_string(),
+        lost_us: micros(now.since(lost.lost)),
+        why: why.to_owned(),
+        silent_us: micros(lost.silent),
+        found_by: lost.sources.iter().map(|source| word(*source).to_owned()).collect(),
+    }
+}
+
+/// Of NDL, GNCL and the other layers: what came from outside and was refused.
+fn refusals(stores: &Stores, now: Time) -> Vec<RefusalReport> {
+    let told = [lock(&stores.ndl).refusals().told(), stores.gncl.refusals.told(), stores.refusals.told()];
+    let mut told: Vec<_> = told.into_iter().flatten().collect();
+    told.sort_by_key(|told| std::cmp::Reverse(told.at));
+    let reports = told.into_iter().take(TOLD_MAX).map(|told| RefusalReport {
+        cause: told.cause.to_owned(),
+        count: told.count,
+        detail: told.detail,
+        ago_us: micros(now.since(told.at)),
+    });
+    reports.collect()
+}
+
+const fn word(source: Source) -> &'static str {
+    match source {
+        Source::Seed => "seed",
+        Source::Multicast => "multicast",
+        Source::Mdns => "mdns",
+        Source::Query => "query",
+    }
+}
+
 /// Those that answer, and those that GNCL still has something for.
 fn peers(stores: &Stores, now: Time) -> BTreeMap<NodeAddress, PeerReport> {
     let known = lock(&stores.ndl).members(now);
@@ -114,28 +196,36 @@ fn peers(stores: &Stores, now: Time) -> BTreeMap<NodeAddress, PeerReport> {
     for peer in stores.gncl.peers() {
         peers.entry(peer.node).or_insert_with(|| lost(&peer)).links = links(&peer);
     }
+    for (node, peer) in &mut peers {
+        let note = stores.gncl.notes.of(*node);
+        peer.linked_us = note.linked.map(|at| micros(now.since(at)));
+        peer.broken_us = note.broken.map(|at| micros(now.since(at)));
+        peer.dial = note.dial.map(|dial| DialReport {
+            address: dial.address.to_string(),
+            error: dial.error,
+            ago_us: micros(now.since(dial.at)),
+            failed: dial.count,
+        });
+    }
     peers
 }
 
 fn peer_report(known: &KnownNode, now: Time) -> PeerReport {
-    let word = |source: &Source| match source {
-        Source::Seed => "seed",
-        Source::Multicast => "multicast",
-        Source::Mdns => "mdns",
-        Source::Query => "query",
-    };
     PeerReport {
         node: known.node,
         name: Some(known.name.clone()),
         incarnation: known.incarnation,
         is_there: true,
         found_us: known.sources.values().min().map(|found| micros(now.since(*found))),
-        found_by: known.sources.keys().map(|source| word(source).to_owned()).collect(),
+        found_by: known.sources.keys().map(|source| word(*source).to_owned()).collect(),
         silent_us: Some(micros(now.since(known.heard))),
         missed: known.missed,
         round_trip_ns: known.round_trip.map(nanos),
         offset_ns: known.offset.map(|offset| offset.theirs_minus_ours_ns),
         offset_bound_ns: known.offset.map(|offset| nanos(offset.bound)),
+        linked_us: None,
+        broken_us: None,
+        dial: None,
         links: Vec::new(),
     }
 }
@@ -153,6 +243,9 @@ fn lost(peer: &Peer) -> PeerReport {
         round_trip_ns: None,
         offset_ns: None,
         offset_bound_ns: None,
+        linked_us: None,
+        broken_us: None,
+        dial: None,
         links: Vec::new(),
     }
 }

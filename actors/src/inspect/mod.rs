@@ -23,9 +23,9 @@ mod watches;
 
 pub(crate) use inspector::begin;
 pub use reports::{
-    APPS_MAX, AppReport, AppsReport, AskApps, AskAudit, AskNode, AskTree, AskWatch, AuditReport, LinkReport,
-    Missing, NodeReport, PEERS_MAX, PeerReport, Ping, SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, TREE_MAX,
-    TreeLine, TreeReport, WatchReport,
+    APPS_MAX, AppReport, AppsReport, AskApps, AskAudit, AskNode, AskTree, AskWatch, AuditReport, DialReport,
+    ForeignReport, LinkReport, LostReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping, RefusalReport,
+    SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, TREE_MAX, TreeLine, TreeReport, WatchReport,
 };
 
 #[cfg(doc)]

@@ -19,6 +19,8 @@ pub const PEERS_MAX: usize = 1_024;
 pub const APPS_MAX: usize = 1_024;
 /// Lines of a tree in one answer at most.
 pub const TREE_MAX: usize = 1_024;
+/// Lost nodes, or causes of refusals, in one answer at most.
+pub(super) const TOLD_MAX: usize = 64;
 /// Names that one application lacks at most: as many as it may require.
 const MISSING_MAX: usize = 64;
 /// Connections to one node at most, and ways in which it was found.
@@ -94,6 +96,33 @@ payload!("sinew.inspect.node_report" =>
         pub stopping: bool,
         /// What it refused that came from outside, and messages that nobody took.
         pub refused: u64,
+        /// The project that it is of.
+        #[serde(default)]
+        pub project: String,
+        /// Address of the interface where it looks for others.
+        #[serde(default)]
+        pub interface: String,
+        /// Where its NDL answers.
+        #[serde(default)]
+        pub udp: Option<String>,
+        /// Where its GNCL listens, as it announces it.
+        #[serde(default)]
+        pub gncl: Option<String>,
+        /// The multicast group that it asks, if it takes part.
+        #[serde(default)]
+        pub group: Option<String>,
+        /// The addresses that it was told to ask.
+        #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
+        pub seeds: Vec<String>,
+        /// Nodes that it knew and that have not come back, as far as it remembers.
+        #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
+        pub lost: Vec<LostReport>,
+        /// Nodes of other projects that it hears.
+        #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
+        pub foreign: Vec<ForeignReport>,
+        /// What its layers refused that came from outside, for each cause.
+        #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
+        pub refusals: Vec<RefusalReport>,
         /// The nodes that it knows, in the order of their addresses.
         #[serde(deserialize_with = "at_most::<_, _, PEERS_MAX>")]
         pub peers: Vec<PeerReport>,
@@ -101,6 +130,69 @@ payload!("sinew.inspect.node_report" =>
         pub left_out: u64,
     }
 );
+
+/// A node that was there.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LostReport {
+    /// Its address.
+    pub node: NodeAddress,
+    /// Its name.
+    pub name: String,
+    /// Which life of it that was.
+    pub incarnation: Incarnation,
+    /// Where its NDL answered.
+    pub udp: String,
+    /// Time since it was lost.
+    pub lost_us: u64,
+    /// How that was noticed: `left`, `silent`, `connection refused`, `restarted`, `duplicate`.
+    pub why: String,
+    /// How long it had been silent then.
+    pub silent_us: u64,
+    /// How it had been found: `seed`, `multicast`, `mdns`, `query`.
+    #[serde(deserialize_with = "at_most::<_, _, LINKS_MAX>")]
+    pub found_by: Vec<String>,
+}
+
+/// A node of another project that is heard.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ForeignReport {
+    /// Its address.
+    pub node: NodeAddress,
+    /// Its name.
+    pub name: String,
+    /// Its project.
+    pub project: String,
+    /// Where it speaks.
+    pub udp: String,
+    /// Time since it was heard.
+    pub ago_us: u64,
+}
+
+/// What was refused because of one cause.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RefusalReport {
+    /// The cause.
+    pub cause: String,
+    /// How often.
+    pub count: u64,
+    /// What the last one was about that was logged.
+    pub detail: String,
+    /// Time since then.
+    pub ago_us: u64,
+}
+
+/// The last dial to a node, if it failed and none has led to a connection since.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DialReport {
+    /// Where to.
+    pub address: String,
+    /// What the system said.
+    pub error: String,
+    /// Time since then.
+    pub ago_us: u64,
+    /// How many have failed since there was a connection.
+    pub failed: u64,
+}
 
 /// A node as another one sees it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -128,6 +220,15 @@ pub struct PeerReport {
     pub offset_ns: Option<i64>,
     /// The error of that at most, in nanoseconds.
     pub offset_bound_ns: Option<u64>,
+    /// Since when there is a connection to it.
+    #[serde(default)]
+    pub linked_us: Option<u64>,
+    /// When the last one broke, if there is none.
+    #[serde(default)]
+    pub broken_us: Option<u64>,
+    /// The last dial, if it failed.
+    #[serde(default)]
+    pub dial: Option<DialReport>,
     /// The connections to it.
     #[serde(deserialize_with = "at_most::<_, _, LINKS_MAX>")]
     pub links: Vec<LinkReport>,

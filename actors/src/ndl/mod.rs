@@ -48,6 +48,7 @@ mod tests;
 
 pub(crate) use actor::{NdlActor, new_core};
 pub(crate) use core::Core;
+pub(crate) use core::LostNode;
 pub use core::{KnownNode, Source};
 pub(crate) use datagram::FURTHER_MAX;
 pub(crate) use facts::MembershipFact;

@@ -99,6 +99,12 @@ impl Core {
         self.dial_over(now, node);
     }
 
+    /// Whom a dial that is on its way is to reach, and where.
+    pub(in crate::gncl) fn dialled(&self, connection: ConnectionId) -> Option<(NodeAddress, SocketAddr)> {
+        let dials = self.peers.iter().filter_map(|(node, peer)| Some((*node, peer.dial.as_ref()?)));
+        dials.into_iter().find_map(|(node, dial)| Some((node, dial.address_of(connection)?)))
+    }
+
     fn dial_over(&mut self, now: Time, node: NodeAddress) {
         let chance = self.chance();
         if let Some(peer) = self.peers.get_mut(&node) {

@@ -221,6 +221,7 @@ impl Core {
             fence,
         };
         self.members.insert(node, member);
+        self.recall.found(node);
         // Before the fact, so that GNCL knows the clock of a peer when it connects.
         self.measure(now, node, exchange);
         self.outputs.push_back(Output::Fact(MembershipFact::NodeFound { node, incarnation, gncl }));
@@ -315,6 +316,9 @@ impl Core {
     pub(super) fn lose(&mut self, now: Time, node: NodeAddress, why: LossReason) {
         let Some(member) = self.members.remove(&node) else { return };
         let contest = self.contests.remove(&node);
+        let sources =
+            self.contacts.get(&member.address).map(|contact| contact.sources.keys().copied().collect());
+        self.recall.lost(now, &member, sources.unwrap_or_default(), why);
         self.is_lonely |= self.members.is_empty() && why == LossReason::Silent;
         if why == LossReason::Duplicate {
             // An elder life has its address: this one is no bar to that.

@@ -12,6 +12,7 @@
 //! | `lives` | who comes, goes, comes again |
 //! | `duplicates` | which of two processes has a node address |
 //! | `clock` | how far a peer's clock is from ours |
+//! | `recall` | what is told to whoever asks, and decides nothing |
 
 mod budget;
 mod clock;
@@ -20,6 +21,7 @@ mod cycle;
 mod duplicates;
 mod heard;
 mod lives;
+mod recall;
 #[cfg(test)]
 mod simulation;
 #[cfg(test)]
@@ -38,6 +40,7 @@ use sinew_runtime::{
     time::Time,
 };
 
+pub(crate) use self::recall::{LostNode, Neighbour};
 pub use self::view::KnownNode;
 use self::{
     budget::Strangers,
@@ -46,6 +49,7 @@ use self::{
     cycle::Respite,
     duplicates::Trial,
     lives::{Contest, Gone},
+    recall::Recall,
 };
 use super::{
     MembershipFact, NodeEvent,
@@ -229,6 +233,7 @@ pub(crate) struct Core {
     subscribers: BTreeSet<AppAddress>,
     outputs: VecDeque<Output>,
     refusals: Refusals,
+    recall: Recall,
 }
 
 impl Core {
@@ -281,6 +286,7 @@ impl Core {
             subscribers: BTreeSet::new(),
             outputs: VecDeque::new(),
             refusals: Refusals::default(),
+            recall: Recall::default(),
         }
     }
 
@@ -319,17 +325,17 @@ impl Core {
         }
         match input {
             Input::QueryReceived(query) => {
-                if self.concerns_us(&query.announcement) {
+                if self.concerns_us(now, query.from, &query.announcement) {
                     self.queried(now, &query);
                 }
             }
             Input::AnswerReceived { from, correlation, sent, answer } => {
-                if self.concerns_us(&answer.announcement) {
+                if self.concerns_us(now, from, &answer.announcement) {
                     self.answered(now, from, (correlation, sent), answer);
                 }
             }
             Input::LeaveReceived { from, announcement } => {
-                if self.concerns_us(&announcement) {
+                if self.concerns_us(now, from, &announcement) {
                     self.taken_leave_of(now, from, &announcement);
                 }
             }
@@ -409,7 +415,11 @@ impl Core {
     }
 
     /// Other projects and our own echo are none of our business. // spec: NDL-1.2
-    fn concerns_us(&self, announcement: &Announcement) -> bool {
-        announcement.project == self.me.project && announcement.boot_nonce != self.me.boot_nonce
+    fn concerns_us(&mut self, now: Time, from: SocketAddr, announcement: &Announcement) -> bool {
+        if announcement.project != self.me.project {
+            self.recall.heard(now, from, announcement);
+            return false;
+        }
+        announcement.boot_nonce != self.me.boot_nonce
     }
 }

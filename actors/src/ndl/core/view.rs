@@ -7,7 +7,7 @@ use sinew_runtime::{
     time::Time,
 };
 
-use super::{Core, Source};
+use super::{Core, LostNode, Neighbour, Source};
 use crate::stores::ClockOffset;
 
 /// A node that is there.
@@ -54,5 +54,15 @@ impl Core {
             offset: member.clock.offset(now, Duration::ZERO),
         });
         views.collect()
+    }
+
+    /// Who was there and has not come back, as far as is remembered.
+    pub(crate) fn lost_nodes(&self) -> Vec<(NodeAddress, LostNode)> {
+        self.recall.lost_nodes()
+    }
+
+    /// Nodes of other projects that are heard, and where.
+    pub(crate) fn neighbours(&self) -> Vec<(SocketAddr, Neighbour)> {
+        self.recall.neighbours()
     }
 }

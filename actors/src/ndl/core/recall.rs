@@ -1,0 +1,104 @@
+//! What is remembered for whoever asks, and decides nothing: nodes that were lost, and those of other projects that are heard.
+
+use std::{collections::BTreeMap, net::SocketAddr, time::Duration};
+
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
+
+use super::{Member, Source};
+use crate::ndl::{LossReason, datagram::Announcement};
+
+/// Lost nodes that are remembered; the one that was lost first makes room.
+const LOST_MAX: usize = 64;
+/// Addresses of other projects that are remembered; the one that was heard longest ago makes room.
+const NEIGHBOURS_MAX: usize = 16;
+
+/// A node that was there, and has not come back.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct LostNode {
+    pub(crate) name: String,
+    pub(crate) incarnation: Incarnation,
+    pub(crate) address: SocketAddr,
+    pub(crate) sources: Vec<Source>,
+    pub(crate) lost: Time,
+    pub(crate) why: LossReason,
+    /// Time between its last sign of life and its loss.
+    pub(crate) silent: Duration,
+}
+
+/// A node of another project.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Neighbour {
+    pub(crate) project: String,
+    pub(crate) node: NodeAddress,
+    pub(crate) name: String,
+    /// Heard last.
+    pub(crate) heard: Time,
+}
+
+/// All that is remembered so.
+#[derive(Debug, Default)]
+pub(super) struct Recall {
+    lost: BTreeMap<NodeAddress, LostNode>,
+    neighbours: BTreeMap<SocketAddr, Neighbour>,
+}
+
+impl Recall {
+    /// A member is gone.
+    pub(super) fn lost(&mut self, now: Time, member: &Member, sources: Vec<Source>, why: LossReason) {
+        let Announcement { node, incarnation, ref name, .. } = member.announcement;
+        make_room(&mut self.lost, LOST_MAX, &node, |lost| lost.lost);
+        let (address, silent) = (member.address, now.since(member.heard));
+        let lost = LostNode { name: name.clone(), incarnation, address, sources, lost: now, why, silent };
+        self.lost.insert(node, lost);
+    }
+
+    /// A node is there.
+    pub(super) fn found(&mut self, node: NodeAddress) {
+        self.lost.remove(&node);
+    }
+
+    /// Somebody of another project spoke at `from`.
+    pub(super) fn heard(&mut self, now: Time, from: SocketAddr, announcement: &Announcement) {
+        make_room(&mut self.neighbours, NEIGHBOURS_MAX, &from, |neighbour| neighbour.heard);
+        let Announcement { project, node, name, .. } = announcement;
+        let neighbour = Neighbour { project: project.clone(), node: *node, name: name.clone(), heard: now };
+        self.neighbours.insert(from, neighbour);
+    }
+
+    pub(super) fn lost_nodes(&self) -> Vec<(NodeAddress, LostNode)> {
+        self.lost.iter().map(|(node, lost)| (*node, lost.clone())).collect()
+    }
+
+    pub(super) fn neighbours(&self) -> Vec<(SocketAddr, Neighbour)> {
+        self.neighbours.iter().map(|(from, neighbour)| (*from, neighbour.clone())).collect()
+    }
+}
+
+/// The oldest one goes, if `key` is new and all places are taken.
+fn make_room<K: Ord + Copy, V>(map: &mut BTreeMap<K, V>, most: usize, key: &K, age: impl Fn(&V) -> Time) {
+    if map.len() >= most
+        && !map.contains_key(key)
+        && let Some(oldest) = map.iter().min_by_key(|(_, value)| age(value)).map(|(key, _)| *key)
+    {
+        map.remove(&oldest);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_oldest_makes_room_for_a_new_one_and_for_none_that_is_there() {
+        let at = |seconds: u64| Time::ZERO + Duration::from_secs(seconds);
+        let mut map: BTreeMap<u32, Time> = (0..4).map(|key| (key, at(u64::from(key)))).collect();
+        make_room(&mut map, 4, &2, |time| *time);
+        assert_eq!(map.len(), 4, "it has a place already");
+        map.insert(0, at(100));
+        make_room(&mut map, 4, &9, |time| *time);
+        assert_eq!(map.keys().copied().collect::<Vec<_>>(), [0, 2, 3]);
+    }
+}
