@@ -115,7 +115,7 @@ pub(crate) fn why(app: &AppReport) -> String {
     parts.join("; ")
 }
 
-fn lacks(app: &AppReport) -> String {
+pub(crate) fn lacks(app: &AppReport) -> String {
     let one = |missing: &sinew::inspect::Missing| format!("{} ({})", missing.name, missing.why);
     app.missing.iter().map(one).collect::<Vec<_>>().join(", ")
 }

@@ -4,7 +4,7 @@ use std::{net::Ipv4Addr, path::PathBuf, time::Duration};
 
 use clap::{Parser, Subcommand};
 
-use crate::{send, watch};
+use crate::{send, watch, why};
 
 /// Shows a running Sinew system, from any one node of it. It changes nothing, but for what `send` sends.
 ///
@@ -60,14 +60,19 @@ pub(crate) enum Command {
     /// The copies come from the application's node, as far as it has room for them: what has none is counted, the application does not
     /// wait. Not seen is what goes over direct links between processes (`Registration::direct`). With --json each line is an object.
     Watch(watch::Order),
+    /// What stands in the way between two nodes or applications: each step, seen from both ends, with what mends it
+    ///
+    /// All nodes are asked that can be reached through any socket of this host, so that two nodes that do not know each other are asked
+    /// both. Exit code 0 if the way is free.
+    Why(why::Order),
     /// Who waits for whom at start-up barriers, and who blocks them
     Barriers,
     /// Where every message is that was ever sent: what each mailbox, client and link took, and how each of these ended
     ///
     /// Each node is read twice, and both ends of each link are compared. What nobody can explain is named, with its place or link.
     Audit,
-    /// Whether this machine gives a node what it needs: multicast, open files, real-time rights, shared memory, a socket directory; each
-    /// finding with the command that mends it
+    /// Whether this machine gives a node what it needs: interfaces, multicast, limits, real-time rights, CPU governor, clock, shared memory,
+    /// sockets; each finding with the command that mends it
     Doctor {
         /// Address of the interface that multicast is tried on: the `ndl.interface` of the nodes. What is sent does not leave this machine
         #[arg(long, default_value_t = Ipv4Addr::LOCALHOST)]
@@ -99,6 +104,7 @@ Examples:
   sinew ping knee.drive --count 1000
   sinew send knee.drive demo.angle '{\"degrees\": 5}'
   sinew watch knee.drive --received
+  sinew why hip knee.drive
   sinew apps --json | jq '.apps[] | select(.ready | not)'
   sinew --socket /run/sinew/knee.sock barriers
   sinew completions bash > ~/.local/share/bash-completion/completions/sinew";

@@ -1,7 +1,9 @@
 //! Finds the socket of a node on this machine.
 
 use std::{
+    collections::BTreeSet,
     fmt::Write as _,
+    io,
     path::{Path, PathBuf},
 };
 
@@ -9,6 +11,8 @@ use sinew::{ApiError, NodeApi};
 
 /// Sockets in one directory that are tried at most.
 const SOCKETS_MAX: usize = 64;
+/// Further nodes that are asked at most.
+const OTHERS_MAX: usize = 16;
 
 /// Nobody let us in.
 #[derive(Debug, thiserror::Error)]
@@ -55,6 +59,29 @@ pub(crate) fn find(named: Option<&Path>) -> Result<(PathBuf, NodeApi), NoDoor> {
         }
     }
     Err(NoDoor::Nowhere { places })
+}
+
+/// Further nodes: at the usual places, beside the socket at `known`, and at these paths; not the one at `known`.
+pub(crate) fn others(known: &Path, named: &[PathBuf]) -> Vec<(PathBuf, NodeApi)> {
+    let beside = known.parent().map(|directory| sockets(directory, "")).unwrap_or_default();
+    let usual = usual_places().into_iter().flat_map(|(directory, prefix)| sockets(&directory, prefix));
+    let mut seen = BTreeSet::from([real(known)]);
+    let paths = named.iter().cloned().chain(beside).chain(usual).filter(|path| seen.insert(real(path)));
+    paths.filter_map(|path| Some((path.clone(), NodeApi::connect(&path).ok()?))).take(OTHERS_MAX).collect()
+}
+
+/// Sockets at the usual places behind which nobody listens.
+pub(crate) fn dead() -> Vec<PathBuf> {
+    let usual = usual_places().into_iter().flat_map(|(directory, prefix)| sockets(&directory, prefix));
+    let is_dead = |path: &PathBuf| {
+        let refused = NodeApi::connect(path).err();
+        matches!(refused, Some(ApiError::NoNode { cause, .. }) if cause.kind() == io::ErrorKind::ConnectionRefused)
+    };
+    usual.filter(is_dead).collect()
+}
+
+fn real(path: &Path) -> PathBuf {
+    path.canonicalize().unwrap_or_else(|_| path.to_owned())
 }
 
 /// Directories, and how a socket's name begins there.

@@ -16,6 +16,7 @@ mod system;
 mod table;
 mod tree;
 mod watch;
+mod why;
 
 use std::process::ExitCode;
 
@@ -77,6 +78,7 @@ fn run(arguments: &Arguments) -> Result<Said, Fault> {
         Command::Ping { whom, count } => inside(&|system| ping::show(system, whom, *count)),
         Command::Send(order) => inside(&|system| send::show(system, order)),
         Command::Watch(order) => inside(&|system| watch::show(system, order, arguments.json)),
+        Command::Why(order) => inside(&|system| why::show(system, order)),
         Command::Barriers => inside(&apps::barriers),
         Command::Audit => inside(&audit::show),
         Command::Doctor { interface } => Ok(doctor::show(*interface, arguments.socket.as_deref())),

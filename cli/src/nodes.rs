@@ -1,12 +1,13 @@
 //! `sinew nodes`: every node, its life, what connects it, its clock.
 
 use serde_json::{Value, json};
-use sinew::inspect::{AskNode, LinkReport, NodeReport, PeerReport};
+use sinew::inspect::{AskNode, LinkReport, LostReport, NodeReport, PeerReport};
 
 use crate::{
     Said,
     system::{Answer, Fault, System},
     table::{Table, clean, or_dash, time},
+    why::lost_in_words,
 };
 
 /// Asks every node.
@@ -14,14 +15,19 @@ pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
     let here = system.here()?;
     let answers = system.ask_all::<AskNode, NodeReport>(&here);
     let rows: Vec<_> = answers.iter().map(|answer| Row::of(&here, answer)).collect();
-    let is_fine = rows.iter().all(Row::is_fine) && here.left_out == 0;
+    let lost: Vec<_> =
+        here.lost.iter().filter(|lost| rows.iter().all(|row| row.answer.node != lost.node)).collect();
+    // Who has left in order is missed by nobody.
+    let none_is_missed = here.lost.iter().all(|lost| lost.why == "left");
+    let is_fine = rows.iter().all(Row::is_fine) && here.left_out == 0 && none_is_missed;
     let json = json!({
         "through": system.path,
         "here": here.node.to_string(),
         "nodes": rows.iter().map(Row::json).collect::<Vec<_>>(),
+        "lost": here.lost.iter().map(lost_json).collect::<Vec<_>>(),
         "left_out": here.left_out,
     });
-    Ok(Said { text: text(&here, &rows), json, is_fine })
+    Ok(Said { text: text(&here, &rows, &lost), json, is_fine })
 }
 
 /// A node: what it says, and what the node says through which we came.
@@ -79,7 +85,11 @@ impl<'a> Row<'a> {
         format!("{:+.1} us +- {:.1} us", offset as f64 / 1e3, bound as f64 / 1e3)
     }
 
-    fn cells(&self) -> [String; 8] {
+    fn found_by(&self) -> String {
+        or_dash(self.seen.map(|seen| seen.found_by.join(", ")).filter(|words| !words.is_empty()))
+    }
+
+    fn cells(&self) -> [String; 9] {
         let said = self.answer.said.as_ref().ok();
         [
             self.answer.node.to_string(),
@@ -87,6 +97,7 @@ impl<'a> Row<'a> {
             or_dash(self.life().map(|life| life.to_string())),
             or_dash(said.map(|said| time(said.up_us))),
             self.state().to_owned(),
+            self.found_by(),
             self.links(),
             or_dash(self.seen.and_then(|seen| seen.round_trip_ns).map(|ns| time(ns / 1_000))),
             self.clock(),
@@ -123,11 +134,40 @@ fn link_json(link: &LinkReport) -> Value {
     json!({ "class": class, "up": is_up, "waiting": waiting, "unconfirmed": unconfirmed })
 }
 
-fn text(here: &NodeReport, rows: &[Row<'_>]) -> String {
-    let heading = ["NODE", "NAME", "LIFE", "UP", "STATE", "LINKS", "ROUND TRIP", "CLOCK"];
+fn lost_cells(lost: &LostReport) -> [String; 9] {
+    let dash = || "-".to_owned();
+    let found_by = or_dash(Some(lost.found_by.join(", ")).filter(|words| !words.is_empty()));
+    let life = lost.incarnation.to_string();
+    [
+        lost.node.to_string(),
+        lost.name.clone(),
+        life,
+        dash(),
+        "lost".to_owned(),
+        found_by,
+        dash(),
+        dash(),
+        dash(),
+    ]
+}
+
+fn lost_json(lost: &LostReport) -> Value {
+    json!({
+        "node": lost.node.to_string(), "name": lost.name, "incarnation": lost.incarnation.0, "lost_us": lost.lost_us,
+        "why": lost.why, "silent_us": lost.silent_us, "found_by": lost.found_by,
+    })
+}
+
+fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport]) -> String {
+    let heading = ["NODE", "NAME", "LIFE", "UP", "STATE", "FOUND BY", "LINKS", "ROUND TRIP", "CLOCK"];
     let mut table = Table::new(heading);
     rows.iter().for_each(|row| table.row(row.cells()));
+    lost.iter().for_each(|lost| table.row(lost_cells(lost)));
     let mut text = table.text();
+    for lost in &here.lost {
+        let (seen, mend) = lost_in_words(lost);
+        text += &format!("{} {}: {seen}; {mend}\n", lost.node, clean(&lost.name));
+    }
     for row in rows {
         if let Err(why) = &row.answer.said {
             text += &format!("{} {}: {}\n", row.answer.node, clean(row.name()), clean(why));

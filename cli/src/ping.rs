@@ -58,7 +58,7 @@ pub(crate) fn show(system: &mut System, whom: &str, count: u32) -> Result<Said, 
 }
 
 /// Whether whoever it was for has come to it.
-fn judged(outcome: Outcome, within: Duration) -> Result<(), String> {
+pub(crate) fn judged(outcome: Outcome, within: Duration) -> Result<(), String> {
     match outcome {
         // Who does not know the kind has come to it all the same.
         Outcome::Delivered | Outcome::Rejected(Rejection::UnknownKind | Rejection::ByHandler) => Ok(()),

@@ -1,6 +1,10 @@
 //! The way into the system: an endpoint at one node, from which all nodes are asked.
 
-use std::{collections::BTreeSet, path::Path, time::Duration};
+use std::{
+    collections::BTreeSet,
+    path::{Path, PathBuf},
+    time::Duration,
+};
 
 use sinew::{
     ApiError, AppAddress, Endpoint, NodeAddress, NodeApi, Outcome, Payload, Registration, Rejection, Tid,
@@ -76,8 +80,30 @@ impl System {
     /// Enters through the socket that was named, else through the first that lets us in.
     pub(crate) fn enter(socket: Option<&Path>, within: Duration) -> Result<Self, Fault> {
         let (path, api) = door::find(socket)?;
+        Self::through(&path, api, within, REGISTERED_WITHIN)
+    }
+
+    /// Enters through each further socket of this host; returns also those that let nobody in, with the reason.
+    pub(crate) fn beside(first: &Self, named: &[PathBuf]) -> (Vec<Self>, Vec<String>) {
+        let (mut inside, mut shut) = (Vec::new(), Vec::new());
+        for (path, api) in door::others(Path::new(&first.path), named) {
+            // One that is stopped does not keep us for longer than a node that does not answer.
+            match Self::through(&path, api, first.within, first.within.min(REGISTERED_WITHIN)) {
+                Ok(system) => inside.push(system),
+                Err(why) => shut.push(format!("the socket {} lets nobody in: {why}", path.display())),
+            }
+        }
+        (inside, shut)
+    }
+
+    fn through(
+        path: &Path,
+        api: NodeApi,
+        within: Duration,
+        registered_within: Duration,
+    ) -> Result<Self, Fault> {
         let path = path.display().to_string();
-        let endpoint = register(&api).map_err(|why| Fault::NotTaken(path.clone(), why))?;
+        let endpoint = register(&api, registered_within).map_err(|why| Fault::NotTaken(path.clone(), why))?;
         let own = BTreeSet::from([endpoint.tid()]);
         Ok(Self { api, endpoint, path, within, own })
     }
@@ -176,8 +202,8 @@ pub(crate) fn chosen(here: &NodeReport, wanted: Option<&str>) -> Result<Vec<(Nod
     Ok(nodes)
 }
 
-fn register(api: &NodeApi) -> Result<Endpoint, ApiError> {
-    api.register_transport_address(Registration::new().deadline(REGISTERED_WITHIN))
+fn register(api: &NodeApi, within: Duration) -> Result<Endpoint, ApiError> {
+    api.register_transport_address(Registration::new().deadline(within))
 }
 
 /// Asks these one after the other; returns from which address.
@@ -190,7 +216,7 @@ where
     Q: Payload + Default,
     R: Payload,
 {
-    let mut endpoint = register(api);
+    let mut endpoint = register(api, REGISTERED_WITHIN);
     let asker = endpoint.as_ref().ok().map(Endpoint::tid);
     let mut ask_one = |node| match &mut endpoint {
         Ok(endpoint) => ask::<Q, R>(endpoint, node, within),

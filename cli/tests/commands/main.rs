@@ -3,6 +3,7 @@
 mod scenario;
 mod send;
 mod watch;
+mod why;
 
 use std::{path::Path, time::Duration};
 
@@ -114,6 +115,7 @@ fn a_wrong_command_line_is_2_and_help_names_the_exit_codes() {
         "ping",
         "send",
         "watch",
+        "why",
         "barriers",
         "audit",
         "doctor",
@@ -281,18 +283,54 @@ fn the_doctor_tries_each_thing_and_every_finding_has_what_mends_it() {
     let names: Vec<_> = checks.iter().filter_map(|check| check["check"].as_str()).collect();
     assert_eq!(
         names,
-        ["multicast", "open files", "real-time rights", "shared memory", "socket directory", "node"]
+        [
+            "interfaces",
+            "multicast",
+            "open files",
+            "locked memory",
+            "real-time rights",
+            "CPU governor",
+            "clock",
+            "shared memory",
+            "socket directory",
+            "leftover sockets",
+            "node"
+        ]
     );
     assert!(checks.iter().all(|check| check["fine"] == check["mend"].is_null()), "{said}");
     assert_eq!(answer.code, Some(i32::from(checks.iter().any(|check| check["fine"] == false))));
     // Its nodes have found each other in a group, and its socket is there.
+    let is_fine = |said: &Value, name: &str| {
+        let checks = said["checks"].as_array().expect("a list");
+        checks.iter().find(|check| check["check"] == name).expect("it is there")["fine"] == true
+    };
     for name in ["multicast", "shared memory", "node"] {
-        let check = checks.iter().find(|check| check["check"] == name).expect("it is there");
-        assert_eq!(check["fine"], true, "{check}");
+        assert!(is_fine(&said, name), "{name}: {said}");
     }
     // What cannot be is a finding: nobody has this address.
     let said = scenario.sinew("hip", &["doctor", "--interface", "192.0.2.1", "--json"]).json();
-    assert_eq!(said["checks"][0]["fine"], false, "{said}");
+    assert!(!is_fine(&said, "multicast"), "{said}");
+}
+
+#[test]
+fn the_socket_of_a_node_that_was_killed_is_a_finding_and_one_of_a_node_that_lives_is_none() {
+    // Given
+    let scenario = Scenario::new();
+    std::fs::create_dir(scenario.directory.join("sinew")).expect("the test's own directory");
+    let _knee = scenario.start("sinew/knee", 1, &[]);
+    let hip = scenario.start("sinew/hip", 2, &[]);
+    let leftover = || {
+        let said = sinew(&["doctor", "--json"], &scenario.directory.join("")).json();
+        let checks = said["checks"].as_array().expect("a list").iter();
+        checks.into_iter().find(|check| check["check"] == "leftover sockets").expect("it is there").clone()
+    };
+    let names = |check: &Value, name: &str| check["mend"].as_str().is_some_and(|mend| mend.contains(name));
+    assert!(!names(&leftover(), "knee.sock") && !names(&leftover(), "hip.sock"));
+    // When: killed
+    drop(hip);
+    // Then
+    let check = leftover();
+    assert!(names(&check, "hip.sock") && !names(&check, "knee.sock"), "{check}");
 }
 
 #[test]

@@ -39,6 +39,17 @@ impl Scenario {
 
     /// A node with the application of its name; returns when its layers are up.
     pub(crate) fn start(&self, name: &str, address: u8, more: &[&str]) -> Program {
+        self.start_changed(name, address, &[], more)
+    }
+
+    /// As `start`, with these texts of its configuration replaced by others.
+    pub(crate) fn start_changed(
+        &self,
+        name: &str,
+        address: u8,
+        changes: &[(&str, &str)],
+        more: &[&str],
+    ) -> Program {
         let path = self.directory.join(&format!("{name}.toml"));
         let text = format!(
             "[node]\nname = \"{name}\"\naddress = \"127.0.0.{address}\"\nproject = \"cli\"\n\
@@ -46,6 +57,7 @@ impl Scenario {
             self.socket(name).display(),
             self.group
         );
+        let text = changes.iter().fold(text, |text, (from, to)| text.replace(from, to));
         std::fs::write(&path, text).expect("the test's own directory");
         let node = program("node_under_test");
         assert!(node.exists(), "there is no {}; build it: cargo build -p sinew-tests", node.display());

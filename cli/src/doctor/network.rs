@@ -1,0 +1,214 @@
+//! Interfaces, and whether multicast comes back at one of them.
+
+use std::{
+    collections::BTreeMap,
+    fs, io,
+    net::{IpAddr, Ipv4Addr, SocketAddrV4, UdpSocket},
+    time::Duration,
+};
+
+use socket2::{Domain, Protocol, SockAddr, Socket, Type};
+
+use super::Check;
+
+/// Time for a datagram to come back from this machine's own interface.
+const HEARD_WITHIN: Duration = Duration::from_millis(500);
+/// The group of the trial; nothing of Sinew's is there.
+const GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 255, 77);
+/// Flags of an interface (`linux/if.h`).
+const UP: u32 = 0x1;
+const MULTICAST: u32 = 0x1000;
+
+/// An interface of this machine.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Interface {
+    pub(super) name: String,
+    pub(super) addresses: Vec<Ipv4Addr>,
+    pub(super) flags: u32,
+    /// Whether there is a carrier: a cable, a radio link.
+    pub(super) has_carrier: bool,
+}
+
+impl Interface {
+    fn is_loopback(&self) -> bool {
+        self.addresses.iter().any(Ipv4Addr::is_loopback)
+    }
+
+    /// What it lacks to carry nodes' words to other hosts, and what mends that.
+    fn lacks(&self) -> Option<(&'static str, String)> {
+        let name = &self.name;
+        if self.flags & UP == 0 {
+            return Some(("down", format!("sudo ip link set dev {name} up")));
+        }
+        if !self.has_carrier {
+            return Some(("no carrier", format!("plug the cable of {name} in, or bring its link up")));
+        }
+        if self.addresses.is_empty() {
+            return Some((
+                "no IPv4 address",
+                format!("sudo ip address add 10.0.0.1/24 dev {name} (an address of your network)"),
+            ));
+        }
+        if self.flags & MULTICAST == 0 {
+            return Some((
+                "no multicast",
+                format!("sudo ip link set dev {name} multicast on; or [ndl] seeds = [..]"),
+            ));
+        }
+        None
+    }
+
+    fn in_words(&self) -> String {
+        let addresses: Vec<_> = self.addresses.iter().map(Ipv4Addr::to_string).collect();
+        let state = match self.lacks() {
+            // Linux carries multicast there without the flag.
+            _ if self.is_loopback() => "this host only",
+            Some((lack, _)) => lack,
+            None => "usable",
+        };
+        let addresses = if addresses.is_empty() { "-".to_owned() } else { addresses.join(" ") };
+        format!("{} {addresses} ({state})", self.name)
+    }
+}
+
+/// Whether an interface leads to other hosts.
+pub(super) fn interfaces(all: &[Interface]) -> Check {
+    const NAME: &str = "interfaces";
+    let seen: Vec<_> = all.iter().map(Interface::in_words).collect();
+    let seen = if seen.is_empty() { "none can be seen".to_owned() } else { seen.join(", ") };
+    if all.iter().any(|interface| !interface.is_loopback() && interface.lacks().is_none()) {
+        return Check::fine(NAME, seen);
+    }
+    // The one that lacks least: what is behind the last check it passes.
+    let likeliest = all.iter().filter(|interface| !interface.is_loopback());
+    let likeliest = likeliest.max_by_key(|interface| {
+        (interface.flags & UP, interface.has_carrier, !interface.addresses.is_empty())
+    });
+    let mend = likeliest.and_then(Interface::lacks).map_or_else(
+        || "nodes of this host find each other; for others: a network interface".to_owned(),
+        |(_, mend)| mend,
+    );
+    Check::finding(NAME, format!("none leads to other hosts: {seen}"), mend)
+}
+
+/// All interfaces, with what the kernel says of them.
+pub(super) fn found() -> Vec<Interface> {
+    let mut addresses: BTreeMap<String, Vec<Ipv4Addr>> = BTreeMap::new();
+    for interface in if_addrs::get_if_addrs().unwrap_or_default() {
+        if let IpAddr::V4(address) = interface.ip() {
+            addresses.entry(interface.name).or_default().push(address);
+        }
+    }
+    let entries = fs::read_dir("/sys/class/net").into_iter().flatten().flatten();
+    let names: Vec<_> = entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();
+    let mut found: Vec<_> = names
+        .into_iter()
+        .filter_map(|name| {
+            let read =
+                |what: &str| fs::read_to_string(format!("/sys/class/net/{name}/{what}")).unwrap_or_default();
+            let flags = u32::from_str_radix(read("flags").trim().trim_start_matches("0x"), 16).ok()?;
+            let has_carrier = read("carrier").trim() == "1";
+            let addresses = addresses.remove(&name).unwrap_or_default();
+            // What has never had an address and is down is no way that anybody means (tunnels, shapers).
+            let is_meant = flags & UP != 0
+                || !addresses.is_empty()
+                || fs::exists(format!("/sys/class/net/{name}/device")).unwrap_or(false);
+            is_meant.then_some(Interface { name, addresses, flags, has_carrier })
+        })
+        .collect();
+    found.sort_by(|one, other| one.name.cmp(&other.name));
+    found
+}
+
+/// Whether a datagram to a group comes back at the interface that has this address.
+pub(super) fn multicast(address: Ipv4Addr, all: &[Interface]) -> Check {
+    const NAME: &str = "multicast";
+    let Some(interface) = all.iter().find(|interface| {
+        interface.addresses.contains(&address) || (address.is_loopback() && interface.is_loopback())
+    }) else {
+        let others: Vec<_> =
+            all.iter().flat_map(|interface| &interface.addresses).map(Ipv4Addr::to_string).collect();
+        let mend = format!(
+            "set `ndl.interface`, and --interface here, to an address of this host: {}",
+            others.join(", ")
+        );
+        return Check::finding(NAME, format!("no interface of this host has the address {address}"), mend);
+    };
+    let device = &interface.name;
+    let mend = || {
+        format!(
+            "sudo ip link set dev {device} multicast on && sudo ip route add 239.0.0.0/8 dev {device}; or do without it: [ndl] multicast = \
+             false, seeds = [..]"
+        )
+    };
+    match hears_itself(address) {
+        Ok(true) => Check::fine(NAME, format!("a datagram to a group came back at {address} ({device})")),
+        Ok(false) => {
+            let seen = format!(
+                "a datagram to a group at {address} ({device}) did not come back within {HEARD_WITHIN:?}"
+            );
+            Check::finding(NAME, seen, mend())
+        }
+        Err(error) => {
+            Check::finding(NAME, format!("no group can be joined at {address} ({device}): {error}"), mend())
+        }
+    }
+}
+
+/// Whether what is sent to a group at this interface comes back, never farther than this link.
+fn hears_itself(interface: Ipv4Addr) -> io::Result<bool> {
+    let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
+    socket.bind(&SockAddr::from(SocketAddrV4::new(Ipv4Addr::UNSPECIFIED, 0)))?;
+    socket.set_multicast_if_v4(&interface)?;
+    // Not even beyond this machine.
+    socket.set_multicast_ttl_v4(0)?;
+    socket.set_multicast_loop_v4(true)?;
+    socket.join_multicast_v4(&GROUP, &interface)?;
+    let socket = UdpSocket::from(socket);
+    socket.set_read_timeout(Some(HEARD_WITHIN))?;
+    let said = std::process::id().to_le_bytes();
+    socket.send_to(&said, SocketAddrV4::new(GROUP, socket.local_addr()?.port()))?;
+    let mut heard = [0; 8];
+    match socket.recv_from(&mut heard) {
+        Ok((length, _)) => Ok(heard[..length] == said),
+        Err(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {
+            Ok(false)
+        }
+        Err(error) => Err(error),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn interface(name: &str, address: Option<[u8; 4]>, flags: u32, has_carrier: bool) -> Interface {
+        let addresses = address.into_iter().map(Ipv4Addr::from).collect();
+        Interface { name: name.to_owned(), addresses, flags, has_carrier }
+    }
+
+    #[test]
+    fn what_an_interface_lacks_has_the_command_that_mends_it() {
+        let lo = || interface("lo", Some([127, 0, 0, 1]), UP, true);
+        let usable = interface("eth0", Some([10, 0, 0, 5]), UP | MULTICAST, true);
+        assert!(interfaces(&[lo(), usable]).mend.is_none());
+        for (one, mend) in [
+            (interface("eth0", None, MULTICAST, false), "ip link set dev eth0 up"),
+            (interface("eth0", None, UP | MULTICAST, false), "cable of eth0"),
+            (interface("eth0", None, UP | MULTICAST, true), "ip address add"),
+            (interface("eth0", Some([10, 0, 0, 5]), UP, true), "eth0 multicast on"),
+        ] {
+            let check = interfaces(&[lo(), one]);
+            assert!(check.mend.as_ref().is_some_and(|said| said.contains(mend)), "{mend}: {:?}", check.mend);
+        }
+        assert!(interfaces(&[lo()]).mend.is_some(), "there is only this host");
+        assert!(interfaces(&[]).mend.is_some());
+    }
+
+    #[test]
+    fn an_address_that_nobody_has_is_told_with_those_that_there_are() {
+        let all = [interface("lo", Some([127, 0, 0, 1]), UP, true)];
+        let check = multicast(Ipv4Addr::new(192, 0, 2, 1), &all);
+        assert!(check.mend.is_some_and(|mend| mend.contains("127.0.0.1")));
+    }
+}

@@ -1,0 +1,143 @@
+//! Limits, real-time rights, and what the CPUs do when nothing is to be done.
+
+use std::{collections::BTreeSet, fs};
+
+use rustix::{
+    fs::{MemfdFlags, SealFlags, fcntl_add_seals, ftruncate, memfd_create},
+    process::{Resource, getrlimit},
+    thread::{CapabilitySet, capabilities},
+};
+use thread_priority::{
+    RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue, ThreadSchedulePolicy,
+    set_thread_priority_and_policy, thread_native_id,
+};
+
+use super::Check;
+
+/// Open files that a node with all its clients and their rings may need.
+const FILES_WANTED: u64 = 4_096;
+/// Memory that a control program may want to lock, in bytes: its stacks, its heap, the rings.
+const LOCKED_WANTED: u64 = 64 << 20;
+/// Where the limits of users are.
+const LIMITS: &str = "/etc/security/limits.d/sinew.conf";
+
+pub(super) fn open_files() -> Check {
+    let limit = getrlimit(Resource::Nofile);
+    let (now, most) = (limit.current.unwrap_or(u64::MAX), limit.maximum.unwrap_or(u64::MAX));
+    let seen = format!(
+        "a process may have {now} files open (RLIMIT_NOFILE), at most {most}; {FILES_WANTED} are enough for a full node"
+    );
+    if now >= FILES_WANTED {
+        return Check::fine("open files", seen);
+    }
+    let mend = if most >= FILES_WANTED {
+        format!("ulimit -n {FILES_WANTED}, or LimitNOFILE={FILES_WANTED} in the service's unit")
+    } else {
+        format!("echo '* - nofile {FILES_WANTED}' | sudo tee -a {LIMITS}, then log in again")
+    };
+    Check::finding("open files", seen, mend)
+}
+
+/// Sinew locks nothing itself; a program with a control loop does.
+pub(super) fn locked_memory() -> Check {
+    const NAME: &str = "locked memory";
+    let limit = getrlimit(Resource::Memlock).current;
+    if limit.is_none_or(|limit| limit >= LOCKED_WANTED) || has(CapabilitySet::IPC_LOCK) {
+        let most = limit.map_or_else(|| "any".to_owned(), |limit| format!("{} KiB", limit >> 10));
+        return Check::fine(NAME, format!("a process may lock {most} (RLIMIT_MEMLOCK, or CAP_IPC_LOCK)"));
+    }
+    Check::finding(
+        NAME,
+        format!(
+            "a process may lock {} KiB (RLIMIT_MEMLOCK); a control loop that calls mlockall needs more, else it waits for the disk",
+            limit.unwrap_or(0) >> 10
+        ),
+        format!(
+            "echo \"$USER - memlock unlimited\" | sudo tee -a {LIMITS}, then log in again; or LimitMEMLOCK=infinity in the service's unit"
+        ),
+    )
+}
+
+/// Tried on a thread that ends with it: what the limits say is not always so (in containers).
+pub(super) fn real_time() -> Check {
+    const NAME: &str = "real-time rights";
+    let trial = || {
+        let level = ThreadPriorityValue::try_from(1).map_err(|_| thread_priority::Error::Priority("1"))?;
+        let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
+        set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(level), policy)
+    };
+    let limit =
+        getrlimit(Resource::Rtprio).current.map_or_else(|| "any".to_owned(), |limit| limit.to_string());
+    let capability = if has(CapabilitySet::SYS_NICE) { "with" } else { "without" };
+    let known = format!("RLIMIT_RTPRIO {limit}, {capability} CAP_SYS_NICE");
+    match std::thread::spawn(trial).join() {
+        Ok(Ok(())) => Check::fine(NAME, format!("a thread got SCHED_FIFO ({known}){}", throttled())),
+        Ok(Err(error)) => Check::finding(
+            NAME,
+            format!("a thread did not get SCHED_FIFO: {error:?} ({known})"),
+            format!(
+                "echo \"$USER - rtprio 80\" | sudo tee -a {LIMITS}, then log in again; or sudo setcap cap_sys_nice+ep PROGRAM; in a \
+                 container: --cap-add SYS_NICE --ulimit rtprio=80"
+            ),
+        ),
+        Err(_) => Check::finding(NAME, "the trial panicked".to_owned(), "report it, please"),
+    }
+}
+
+/// The kernel takes the CPU from real-time threads that never sleep: good to know, not to be mended.
+fn throttled() -> String {
+    let read = |name| fs::read_to_string(format!("/proc/sys/kernel/{name}")).ok()?.trim().parse::<i64>().ok();
+    match (read("sched_rt_runtime_us"), read("sched_rt_period_us")) {
+        (Some(runtime), Some(period)) if 0 < runtime && runtime < period => {
+            format!("; all of them together have {runtime} us of each {period} us (sched_rt_runtime_us)")
+        }
+        _ => String::new(),
+    }
+}
+
+fn has(capability: CapabilitySet) -> bool {
+    capabilities(None).is_ok_and(|sets| sets.effective.contains(capability))
+}
+
+/// A CPU that was clocked down answers its first message late.
+pub(super) fn governor() -> Check {
+    const NAME: &str = "CPU governor";
+    let cpus = fs::read_dir("/sys/devices/system/cpu").into_iter().flatten().flatten();
+    let governors =
+        cpus.filter_map(|cpu| fs::read_to_string(cpu.path().join("cpufreq/scaling_governor")).ok());
+    let governors: BTreeSet<_> = governors.map(|governor| governor.trim().to_owned()).collect();
+    let seen = governors.iter().cloned().collect::<Vec<_>>().join(", ");
+    if governors.is_empty() {
+        return Check::fine(
+            NAME,
+            "the kernel does not choose the clock here (a virtual machine, or it is fixed)".to_owned(),
+        );
+    }
+    if governors.iter().all(|governor| governor == "performance") {
+        return Check::fine(NAME, seen);
+    }
+    Check::finding(
+        NAME,
+        format!("{seen}: a CPU that has slept is slow at first, which a control loop sees as jitter"),
+        "echo performance | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor",
+    )
+}
+
+pub(super) fn shared_memory() -> Check {
+    const NAME: &str = "shared memory";
+    let trial = || -> rustix::io::Result<()> {
+        let file = memfd_create("sinew-doctor", MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING)?;
+        ftruncate(&file, 4_096)?;
+        fcntl_add_seals(&file, SealFlags::SHRINK | SealFlags::GROW | SealFlags::SEAL)
+    };
+    match trial() {
+        Ok(()) => Check::fine(NAME, "memfd_create and its seals work".to_owned()),
+        Err(error) => Check::finding(
+            NAME,
+            format!(
+                "no sealed memory: {error}; other processes are reached through sockets, which is slower"
+            ),
+            "allow memfd_create in the container's seccomp profile, as podman run --security-opt seccomp=unconfined ..",
+        ),
+    }
+}

@@ -1,0 +1,64 @@
+//! What is known of two ends and of the way between them.
+
+use std::collections::BTreeMap;
+
+use sinew::{
+    NodeAddress,
+    inspect::{AppReport, NodeReport, PeerReport, TreeLine},
+};
+
+/// All that the rules look at.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Facts {
+    pub(super) ends: [End; 2],
+    /// From the node of the first to the second, and back: microseconds until it was confirmed, or why not. `None`: not tried.
+    pub(super) pings: [Option<Result<u64, String>>; 2],
+    /// Sockets of this host that let nobody in, with the reason.
+    pub(super) shut: Vec<String>,
+    /// Who waits at a start-up barrier, and for whom, on all nodes that were asked.
+    pub(super) waits: BTreeMap<String, Vec<String>>,
+}
+
+/// A node, or an application on one.
+#[derive(Clone, Debug, Default)]
+pub(super) struct End {
+    /// As the user called it.
+    pub(super) wanted: String,
+    pub(super) node: Option<NodeAddress>,
+    /// What its node says; `None` if it could not be asked.
+    pub(super) report: Option<NodeReport>,
+    /// Why it could not.
+    pub(super) silence: Option<String>,
+    /// Other processes with its address.
+    pub(super) doubles: Vec<String>,
+    /// If an application was meant.
+    pub(super) app: Option<App>,
+}
+
+/// An application.
+#[derive(Clone, Debug, Default)]
+pub(super) struct App {
+    /// What its node says of it; `None` if it has none such.
+    pub(super) report: Option<AppReport>,
+    /// Its line in the supervision tree, if it is supervised there.
+    pub(super) line: Option<TreeLine>,
+    /// Messages for it that were refused so far.
+    pub(super) refused: u64,
+}
+
+impl End {
+    /// As it is called in what is said.
+    pub(super) fn label(&self) -> &str {
+        &self.wanted
+    }
+
+    /// The node, as it is called.
+    pub(super) fn node_label(&self) -> &str {
+        self.report.as_ref().map_or(&self.wanted, |report| &report.name)
+    }
+
+    /// What its node says of another one.
+    pub(super) fn peer(&self, node: NodeAddress) -> Option<&PeerReport> {
+        self.report.as_ref()?.peers.iter().find(|peer| peer.node == node)
+    }
+}

@@ -1,0 +1,234 @@
+//! What all nodes say that can be asked, through every socket of this host that lets us in.
+
+use std::collections::BTreeMap;
+
+use sinew::{
+    AppAddress, NodeAddress, Tid, Time,
+    audit::Place,
+    inspect::{
+        AppReport, AppsReport, AskApps, AskAudit, AskNode, AskTree, AuditReport, NodeReport, Ping, TreeReport,
+    },
+};
+
+use super::facts::{App, End, Facts};
+use crate::{
+    ping,
+    system::{Fault, System},
+};
+
+/// Every node that was asked.
+pub(super) struct Gathered<'a> {
+    first: &'a mut System,
+    others: Vec<System>,
+    nodes: Vec<Asked>,
+}
+
+/// A node that was asked, or could not be.
+struct Asked {
+    node: NodeAddress,
+    name: String,
+    said: Result<NodeReport, String>,
+    apps: Vec<AppReport>,
+    /// Through which socket.
+    through: usize,
+    /// Whether that is its own.
+    is_own_door: bool,
+}
+
+impl Asked {
+    fn new(through: usize, (node, name): (NodeAddress, String), said: Result<NodeReport, String>) -> Self {
+        let name = said.as_ref().map_or(name, |said| said.name.clone());
+        Self { node, name, said, apps: Vec::new(), through, is_own_door: false }
+    }
+
+    fn at_its_door(self) -> Self {
+        Self { is_own_door: true, ..self }
+    }
+}
+
+impl<'a> Gathered<'a> {
+    /// Asks the nodes behind these sockets, and all that they know.
+    pub(super) fn from(first: &'a mut System, others: Vec<System>) -> Result<Self, Fault> {
+        let mut gathered = Self { first, others, nodes: Vec::new() };
+        let mut heres = vec![(0, gathered.first.here()?)];
+        for (at, other) in gathered.others.iter_mut().enumerate() {
+            // One that does not answer is known by what the others say of it.
+            heres.extend(other.here().ok().map(|here| (at + 1, here)));
+        }
+        for (through, here) in &heres {
+            gathered
+                .add(Asked::new(*through, (here.node, here.name.clone()), Ok(here.clone())).at_its_door());
+        }
+        for (through, here) in heres {
+            let unknown = |node: NodeAddress| {
+                gathered.nodes.iter().all(|asked| asked.node != node || asked.said.is_err())
+            };
+            let peers = here.peers.iter().filter(|peer| unknown(peer.node));
+            let peers: Vec<_> =
+                peers.map(|peer| (peer.node, peer.name.clone().unwrap_or_default())).collect();
+            for answer in gathered.system(through).ask_these::<AskNode, NodeReport>(peers) {
+                gathered.add(Asked::new(through, (answer.node, answer.name), answer.said));
+            }
+        }
+        for at in 0..gathered.nodes.len() {
+            let asked = &gathered.nodes[at];
+            if asked.said.is_err() {
+                continue;
+            }
+            let (through, whom) = (asked.through, (asked.node, asked.name.clone()));
+            let answer = gathered.system(through).ask_these::<AskApps, AppsReport>(vec![whom]).pop();
+            gathered.nodes[at].apps =
+                answer.and_then(|answer| answer.said.ok()).map_or_else(Vec::new, |said| said.apps);
+        }
+        Ok(gathered)
+    }
+
+    /// Gives back the addresses that it had at other nodes.
+    pub(super) fn leave(self) {
+        self.others.into_iter().for_each(System::leave);
+    }
+
+    /// Takes down what one said who was asked, unless it is known already.
+    fn add(&mut self, new: Asked) {
+        let same = |other: &Asked| other.node == new.node;
+        let is_new =
+            match &new.said {
+                // Two lives with one address are two.
+                Ok(said) => self.nodes.iter().filter(|other| same(other)).all(|other| {
+                    other.said.as_ref().is_ok_and(|other| other.incarnation != said.incarnation)
+                }),
+                Err(_) => !self.nodes.iter().any(same),
+            };
+        if is_new {
+            self.nodes.push(new);
+        } else if new.said.is_ok() {
+            // Who did not answer one of the others has answered now.
+            for other in self.nodes.iter_mut().filter(|other| same(other) && other.said.is_err()) {
+                (other.said, other.through) = (new.said.clone(), new.through);
+            }
+        }
+    }
+
+    fn system(&mut self, through: usize) -> &mut System {
+        match through.checked_sub(1) {
+            None => self.first,
+            Some(at) => &mut self.others[at],
+        }
+    }
+
+    /// What the rules look at.
+    pub(super) fn facts(&mut self, wanted: [&str; 2]) -> Facts {
+        let found = wanted.map(|wanted| self.find(wanted));
+        let ends = [self.end(wanted[0], found[0]), self.end(wanted[1], found[1])];
+        let targets = found.map(|found| {
+            let node = found.node?;
+            Some(Tid::new(node, found.app.map_or(AppAddress::INSPECT, |tid| tid.app)))
+        });
+        let pings = [self.ping(found[0].at, targets[1]), self.ping(found[1].at, targets[0])];
+        let waits = self.nodes.iter().flat_map(|asked| &asked.apps).filter(|app| !app.ready);
+        let waits: BTreeMap<_, _> = waits
+            .filter_map(|app| {
+                Some((app.name.clone()?, app.missing.iter().map(|missing| missing.name.clone()).collect()))
+            })
+            .collect();
+        Facts { ends, pings, waits, shut: Vec::new() }
+    }
+
+    /// An application's TID, a node's address, an application's name, a node's name: the first that it is.
+    fn find(&self, wanted: &str) -> Found {
+        let at_address = |node| self.nodes.iter().position(|asked| asked.node == node);
+        if let Ok(tid) = wanted.parse::<Tid>() {
+            return Found { at: at_address(tid.node), node: Some(tid.node), app: Some(tid) };
+        }
+        if let Ok(node) = wanted.parse::<NodeAddress>() {
+            return Found { at: at_address(node), node: Some(node), app: None };
+        }
+        for (at, asked) in self.nodes.iter().enumerate() {
+            if let Some(app) = asked.apps.iter().find(|app| app.name.as_deref() == Some(wanted)) {
+                return Found { at: Some(at), node: Some(asked.node), app: Some(app.tid) };
+            }
+        }
+        if let Some(at) = self.nodes.iter().position(|asked| asked.name == wanted) {
+            return Found { at: Some(at), node: Some(self.nodes[at].node), app: None };
+        }
+        // Nobody who answers: one that was lost, or is of another project.
+        let reports = || self.nodes.iter().filter_map(|asked| asked.said.as_ref().ok());
+        let lost =
+            reports().flat_map(|report| &report.lost).find(|lost| lost.name == wanted).map(|lost| lost.node);
+        let foreign = || reports().flat_map(|report| &report.foreign).find(|other| other.name == wanted);
+        Found { at: None, node: lost.or_else(|| foreign().map(|other| other.node)), app: None }
+    }
+
+    fn end(&mut self, wanted: &str, Found { at, node, app }: Found) -> End {
+        let mut end = End { wanted: wanted.to_owned(), node, ..End::default() };
+        let Some(at) = at else {
+            end.app = app.map(|_| App::default());
+            return end;
+        };
+        let asked = &self.nodes[at];
+        match &asked.said {
+            Ok(report) => end.report = Some(report.clone()),
+            Err(why) => end.silence = Some(why.clone()),
+        }
+        let others = self.nodes.iter().enumerate().filter(|(other, _)| *other != at);
+        let others = others.filter(|(_, other)| other.node == asked.node);
+        end.doubles = others
+            .filter_map(|(_, other)| other.said.as_ref().ok())
+            .map(|other| format!("node {} (process {})", other.name, other.pid))
+            .collect();
+        if let Some(tid) = app {
+            let report = asked.apps.iter().find(|app| app.tid == tid).cloned();
+            end.app = Some(self.application(at, tid, report));
+        }
+        end
+    }
+
+    fn application(&mut self, at: usize, tid: Tid, report: Option<AppReport>) -> App {
+        let asked = &self.nodes[at];
+        let (through, whom) = (asked.through, (asked.node, asked.name.clone()));
+        let system = self.system(through);
+        let tree = system.ask_these::<AskTree, TreeReport>(vec![whom.clone()]).pop();
+        let lines = tree.and_then(|answer| answer.said.ok()).map_or_else(Vec::new, |said| said.lines);
+        let audit = system.ask_these::<AskAudit, AuditReport>(vec![whom]).pop();
+        let entries =
+            audit.and_then(|answer| answer.said.ok()).map_or_else(Vec::new, |said| said.audit.entries);
+        let is_its = |place: &Place| match place {
+            Place::Mailbox { app, .. } | Place::Client { app, .. } => *app == tid.app,
+            Place::ToNode { .. }
+            | Place::FromNode { .. }
+            | Place::OtherMailboxes
+            | Place::OtherClients
+            | Place::ToFormerNodes
+            | Place::FromFormerNodes => false,
+        };
+        let refused =
+            entries.iter().filter(|entry| is_its(&entry.place)).map(|entry| entry.account.refused).sum();
+        App { report, line: lines.into_iter().find(|line| line.tid == Some(tid)), refused }
+    }
+
+    /// A ping from the very node, if it has a door here.
+    fn ping(&mut self, from: Option<usize>, to: Option<Tid>) -> Option<Result<u64, String>> {
+        let (asked, to) = (&self.nodes[from?], to?);
+        if !asked.is_own_door {
+            return None;
+        }
+        let through = asked.through;
+        let system = self.system(through);
+        let began = Time::now();
+        let outcome = system.endpoint.send_confirmed(to, &Ping {}, system.within);
+        let took = u64::try_from(Time::now().since(began).as_micros()).unwrap_or(u64::MAX);
+        let judged = outcome
+            .map_err(|error| error.to_string())
+            .and_then(|outcome| ping::judged(outcome, system.within));
+        Some(judged.map(|()| took))
+    }
+}
+
+/// Whom a word means.
+#[derive(Clone, Copy)]
+struct Found {
+    /// Among those that were asked.
+    at: Option<usize>,
+    node: Option<NodeAddress>,
+    app: Option<Tid>,
+}

@@ -1,0 +1,431 @@
+//! From what two ends say to what stands in the way between them: facts in, steps out, nothing asked and nothing waited for.
+
+use std::collections::BTreeSet;
+
+use sinew::inspect::{LostReport, NodeReport, PeerReport};
+
+use super::facts::{App, End, Facts};
+use crate::table::time;
+
+/// A step of the way, and how it is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Step {
+    /// What was looked at.
+    pub(super) what: String,
+    pub(super) state: State,
+    /// What is so, in words.
+    pub(super) seen: String,
+    /// What mends it, where something is to be mended.
+    pub(super) mend: Option<String>,
+}
+
+/// How a step is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum State {
+    /// It is as it should be.
+    Fine,
+    /// It does not stand in the way, and should be known.
+    Note,
+    /// It stands in the way.
+    Blocked,
+}
+
+/// Refusals that are older say nothing of now, in microseconds.
+const RECENT_US: u64 = 60_000_000;
+
+/// Every step from the one to the other and back, in the order in which a message meets them.
+pub(super) fn judge(facts: &Facts) -> Vec<Step> {
+    let mut steps = Steps(Vec::new());
+    let [a, b] = &facts.ends;
+    for end in [a, b] {
+        steps.there(end, &facts.shut);
+    }
+    steps.address(a, b);
+    if a.node.is_some() && a.node != b.node {
+        steps.project(a, b);
+        for (from, to) in [(a, b), (b, a)] {
+            steps.known(from, to);
+            steps.linked(from, to);
+        }
+    }
+    for end in [a, b] {
+        steps.application(end, facts);
+    }
+    for (ping, (from, to)) in facts.pings.iter().zip([(a, b), (b, a)]) {
+        steps.ping(ping.as_ref(), from, to);
+    }
+    steps.0
+}
+
+struct Steps(Vec<Step>);
+
+impl Steps {
+    fn fine(&mut self, what: impl Into<String>, seen: impl Into<String>) {
+        self.0.push(Step { what: what.into(), state: State::Fine, seen: seen.into(), mend: None });
+    }
+
+    fn note(&mut self, what: impl Into<String>, seen: impl Into<String>, mend: impl Into<String>) {
+        let (what, seen) = (what.into(), seen.into());
+        self.0.push(Step { what, state: State::Note, seen, mend: Some(mend.into()) });
+    }
+
+    fn blocked(&mut self, what: impl Into<String>, seen: impl Into<String>, mend: impl Into<String>) {
+        let (what, seen) = (what.into(), seen.into());
+        self.0.push(Step { what, state: State::Blocked, seen, mend: Some(mend.into()) });
+    }
+
+    /// Whether its node runs and can be asked.
+    fn there(&mut self, end: &End, shut: &[String]) {
+        let what = format!("{} is there", end.label());
+        // Perhaps its own.
+        let shut: String = shut.iter().map(|door| format!("; {door}")).collect();
+        match (&end.report, end.node) {
+            (Some(report), _) if report.stopping => self.blocked(
+                what,
+                "its node is about to end",
+                "wait until it is started again, or start it",
+            ),
+            (Some(report), _) => {
+                let NodeReport { node, name, pid, up_us, .. } = report;
+                self.fine(what, format!("node {name} at {node}, process {pid}, up {}", time(*up_us)));
+            }
+            (None, Some(node)) => self.blocked(
+                what,
+                format!("its node {node} cannot be asked: {}{shut}", end.silence.as_deref().unwrap_or("no answer")),
+                "is it running? Start it; if it runs on another host, run `sinew why` there, too; if its socket is elsewhere on this one: \
+                 --other-socket PATH",
+            ),
+            (None, None) => self.blocked(
+                what,
+                format!("no node and no application called '{}' is known to any node that was asked{shut}", end.wanted),
+                "is it spelled right (`sinew apps`, `sinew nodes`)? Is its node started? If its socket is elsewhere on this host: \
+                 --other-socket PATH",
+            ),
+        }
+    }
+
+    /// No two processes have one address.
+    fn address(&mut self, a: &End, b: &End) {
+        for end in [a, b] {
+            if let (Some(node), Some(double)) = (end.node, end.doubles.first()) {
+                self.blocked(
+                    format!("{} has its address alone", end.label()),
+                    format!("node address {node} is used by {double}, too"),
+                    "give one of them another `address` under [node]",
+                );
+                continue;
+            }
+            let refusals = end.report.iter().flat_map(|report| &report.refusals);
+            let mut twice = refusals.filter(|refusal| refusal.cause == "NDL node address used twice");
+            if let Some(refusal) = twice.find(|refusal| refusal.ago_us < RECENT_US) {
+                self.blocked(
+                    format!("{} sees every address once", end.label()),
+                    format!("{} ago: {}", time(refusal.ago_us), refusal.detail),
+                    "give one of the two another `address` under [node]",
+                );
+            }
+        }
+    }
+
+    fn project(&mut self, a: &End, b: &End) {
+        let (Some(ours), Some(theirs)) = (&a.report, &b.report) else { return };
+        let what = "both are of one project";
+        if ours.project == theirs.project {
+            self.fine(what, format!("'{}'", ours.project));
+        } else {
+            self.blocked(
+                what,
+                format!("{} is of '{}', {} of '{}'", a.label(), ours.project, b.label(), theirs.project),
+                "set the same `project` under [node] in both configurations",
+            );
+        }
+    }
+
+    /// Whether `from` has found `to`, and still hears it.
+    fn known(&mut self, from: &End, to: &End) {
+        let (Some(report), Some(node)) = (&from.report, to.node) else { return };
+        let what = format!("{} knows {}", from.label(), to.label());
+        if let Some(peer) = from.peer(node).filter(|peer| peer.is_there) {
+            let seen = heard(peer);
+            if peer.missed == 0 {
+                return self.fine(what, seen);
+            }
+            let mend =
+                "is it stopped, or its host overloaded? `sinew ping` it, `sinew tree` shows what it does";
+            return self.note(what, format!("{seen}; missed its last {} answers", peer.missed), mend);
+        }
+        if let Some(lost) = report.lost.iter().find(|lost| lost.node == node) {
+            let (seen, mend) = lost_in_words(lost);
+            return self.blocked(what, seen, mend);
+        }
+        for (seen, mend) in why_unknown(report, to) {
+            self.blocked(what.clone(), seen, mend);
+        }
+    }
+
+    /// Whether messages flow from `from` to `to`.
+    fn linked(&mut self, from: &End, to: &End) {
+        let Some(node) = to.node else { return };
+        let Some(peer) = from.peer(node) else { return };
+        let what = format!("{} is connected to {}", from.label(), to.label());
+        let down: Vec<_> =
+            peer.links.iter().filter(|link| !link.is_up).map(|link| link.class.as_str()).collect();
+        if peer.links.is_empty() || !down.is_empty() {
+            let which = if peer.links.is_empty() {
+                "never connected".to_owned()
+            } else {
+                format!("{} down", down.join(", "))
+            };
+            let since = peer.broken_us.map_or_else(String::new, |us| format!(", broken {} ago", time(us)));
+            let (dial, mend) = dial_in_words(peer);
+            self.blocked(what, format!("{which}{since}{dial}{}", refused_because(from, to)), mend);
+            return;
+        }
+        let since = peer.linked_us.map_or_else(String::new, |us| format!(" since {}", time(us)));
+        let sum = |count: fn(&sinew::inspect::LinkReport) -> u64| peer.links.iter().map(count).sum::<u64>();
+        let (waiting, unconfirmed) = (sum(|link| link.waiting), sum(|link| link.unconfirmed));
+        let mut seen = format!("{} up{since}", peer.links.len());
+        if waiting + unconfirmed > 0 {
+            seen += &format!(", {waiting} messages wait, {unconfirmed} are not confirmed yet");
+        }
+        self.fine(what, seen);
+    }
+
+    /// Whether the application that was asked for takes messages.
+    fn application(&mut self, end: &End, facts: &Facts) {
+        let Some(app) = &end.app else { return };
+        let what = format!("{} takes messages", end.label());
+        let Some(report) = &app.report else {
+            if end.report.is_some() {
+                self.blocked(
+                    what,
+                    "its node has no such application now",
+                    "is it registered, and spelled right? `sinew apps` shows all that are there",
+                );
+            }
+            return;
+        };
+        if let Some(circle) = report.name.as_ref().and_then(|name| circle(name, facts)) {
+            return self.blocked(
+                what,
+                format!("requirements in a circle: {}", circle.join(" -> ")),
+                "take one of these `requires` away: none of them can start before the others",
+            );
+        }
+        if !report.ready {
+            let mend = if report.missing.is_empty() {
+                "`sinew tree` shows how its last life ended, its log says more".to_owned()
+            } else {
+                let names: Vec<_> = report.missing.iter().map(|missing| missing.name.as_str()).collect();
+                format!(
+                    "start what it waits for: {}; `sinew why` from it to each says what stands there",
+                    names.join(", ")
+                )
+            };
+            let why = crate::apps::why(report);
+            let why = if why.is_empty() { "not ready".to_owned() } else { why };
+            return self.blocked(what, why, mend);
+        }
+        if let Some((seen, mend)) = troubled(app) {
+            return self.blocked(what, seen, mend);
+        }
+        if !report.missing.is_empty() {
+            let mend = "see what has become of it; what it does meanwhile is its `on_requirement_lost`";
+            return self.note(what, format!("ready, but it lost {}", crate::apps::lacks(report)), mend);
+        }
+        let mailbox = app.line.as_ref().and_then(|line| line.waiting.zip(line.waiting_most));
+        let mailbox = mailbox
+            .map_or_else(String::new, |(now, most)| format!(", {now} messages wait for it (at most {most})"));
+        let refused = app.refused;
+        if refused > 0 {
+            let mend = "`sinew watch` shows each refusal with its reason, `sinew audit` the sums; is it slower than its senders?";
+            return self.note(what, format!("ready{mailbox}; {refused} messages were refused so far"), mend);
+        }
+        self.fine(what, format!("ready{mailbox}"));
+    }
+
+    fn ping(&mut self, ping: Option<&Result<u64, String>>, from: &End, to: &End) {
+        let what = format!("a message goes from {} to {}", from.node_label(), to.label());
+        match ping {
+            Some(Ok(micros)) => self.fine(what, format!("confirmed after {}", time(*micros))),
+            Some(Err(why)) => {
+                // What was found before explains it.
+                let is_explained = self.0.iter().any(|step| step.state == State::Blocked);
+                let mend = "`sinew tree` of its node shows what it does; is it busy, or does it hang?";
+                let mend = (!is_explained).then(|| mend.to_owned());
+                self.0.push(Step { what, state: State::Blocked, seen: why.clone(), mend });
+            }
+            None => {}
+        }
+    }
+}
+
+fn heard(peer: &PeerReport) -> String {
+    let silent = peer.silent_us.map_or_else(|| "heard".to_owned(), |us| format!("heard {} ago", time(us)));
+    let found = peer.found_us.map_or_else(String::new, |us| format!(", found {} ago", time(us)));
+    format!("{silent}{found} by {}", joined(&peer.found_by))
+}
+
+fn joined(words: &[String]) -> String {
+    if words.is_empty() { "another way".to_owned() } else { words.join(", ") }
+}
+
+/// How it was lost, and what to do.
+pub(crate) fn lost_in_words(lost: &LostReport) -> (String, &'static str) {
+    let ago = time(lost.lost_us);
+    match lost.why.as_str() {
+        "left" => (format!("lost {ago} ago: it stopped in order"), "start it again"),
+        "connection refused" => (
+            format!("lost {ago} ago: its process has ended, nobody listens at its address"),
+            "start it again; its log says why it ended",
+        ),
+        "silent" => (
+            format!("lost {ago} ago: it had not answered for {}", time(lost.silent_us)),
+            "does its process run (a stopped one answers nobody)? Is the cable in, the interface up (`ip link`), the way free (`ping` its host)?",
+        ),
+        why => (format!("lost {ago} ago: {why}"), "its log says more"),
+    }
+}
+
+/// Why `from` has never found `to`: in what their configurations do not meet.
+fn why_unknown(from: &NodeReport, to: &End) -> Vec<(String, String)> {
+    let ours = |report: &NodeReport| {
+        let group = report.group.as_deref().unwrap_or("no group");
+        let seeds = if report.seeds.is_empty() {
+            "no seeds".to_owned()
+        } else {
+            format!("seeds {}", report.seeds.join(", "))
+        };
+        format!("{group} at {}, {seeds}", report.interface)
+    };
+    if let Some(foreign) = from.foreign.iter().find(|foreign| Some(foreign.node) == to.node) {
+        let seen = format!(
+            "{} at that address speaks for project '{}', not '{}', {} ago",
+            foreign.name,
+            foreign.project,
+            from.project,
+            time(foreign.ago_us)
+        );
+        return vec![(seen, "set the same `project` under [node] in both configurations".to_owned())];
+    }
+    let Some(theirs) = &to.report else {
+        let mend = "is it started, of the same project, and in the same group? Where multicast does not reach: [ndl] seeds = [\"ITS_ADDRESS:PORT\"]";
+        return vec![(format!("never heard of it; it asks {}", ours(from)), mend.to_owned())];
+    };
+    if from.project != theirs.project {
+        // It was said already, and is reason enough.
+        return vec![("not found, as it is of another project".to_owned(), "as above".to_owned())];
+    }
+    let seeded =
+        |of: &NodeReport, other: &NodeReport| other.udp.as_ref().is_some_and(|udp| of.seeds.contains(udp));
+    if seeded(from, theirs) || seeded(theirs, from) {
+        let mend = "is UDP let through by the firewalls of both hosts (`sudo nft list ruleset`), and is `ndl.port` the one that the seed names?";
+        return vec![("a seed names it, and no answer has come".to_owned(), mend.to_owned())];
+    }
+    let udp = theirs.udp.as_deref().unwrap_or("ITS_ADDRESS:PORT");
+    let seed = format!("[ndl] seeds = [\"{udp}\"] in the configuration of {}", from.name);
+    let Some((one, other)) = from.group.as_ref().zip(theirs.group.as_ref()) else {
+        let who = if from.group.is_none() { &from.name } else { &theirs.name };
+        let seen = format!("{who} takes no part in multicast, and no seed names the other");
+        return vec![(seen, format!("{seed}; or [ndl] multicast in both"))];
+    };
+    if one != other {
+        let seen = format!("it asks in the group {one}, the other in {other}");
+        return vec![(seen, format!("set the same `multicast` under [ndl] in both; or {seed}"))];
+    }
+    let is_loopback = |report: &NodeReport| report.interface.starts_with("127.");
+    if is_loopback(from) != is_loopback(theirs) {
+        let seen = format!(
+            "it asks at {}, the other at {}: one of them on its own host only",
+            from.interface, theirs.interface
+        );
+        return vec![(
+            seen,
+            "set `interface` under [ndl] to the address of the interface between the hosts, in both"
+                .to_owned(),
+        )];
+    }
+    let mend = format!(
+        "does multicast pass between the two interfaces ({} and {})? `sinew doctor --interface ADDRESS` on both hosts, firewalls, IGMP \
+         snooping of the switch; or {seed}",
+        from.interface, theirs.interface
+    );
+    vec![(format!("both ask in the group {one}, and it has not heard the other"), mend)]
+}
+
+fn dial_in_words(peer: &PeerReport) -> (String, String) {
+    let Some(dial) = &peer.dial else {
+        return (
+            String::new(),
+            "is it just starting? Else its log and that of the other say which of them refuses the connection".to_owned(),
+        );
+    };
+    let said = format!(
+        "; {} dials in vain, the last of {} {} ago: {}",
+        dial.failed,
+        dial.address,
+        time(dial.ago_us),
+        dial.error
+    );
+    let mend = if dial.error.contains("refused") {
+        format!(
+            "nobody listens at {}: does `gncl.announce` of the other name its real address, does a firewall reject TCP there?",
+            dial.address
+        )
+    } else {
+        format!(
+            "TCP does not reach {}: is there a route (`ip route get {}`), does a firewall drop it?",
+            dial.address,
+            dial.address.rsplit_once(':').map_or(dial.address.as_str(), |(host, _)| host)
+        )
+    };
+    (said, mend)
+}
+
+/// What either of them has refused of the other just now, in the words of its node.
+fn refused_because(from: &End, to: &End) -> String {
+    let of = |end: &End, other: &End| {
+        let node = other.node.map(|node| node.to_string()).unwrap_or_default();
+        let refusals = end.report.iter().flat_map(|report| &report.refusals);
+        let concerns =
+            refusals.filter(|refusal| refusal.ago_us < RECENT_US && refusal.detail.contains(&node));
+        concerns
+            .map(|refusal| format!("; {} refused: {} ({})", end.label(), refusal.detail, refusal.cause))
+            .collect::<String>()
+    };
+    of(from, to) + &of(to, from)
+}
+
+/// An application that is ready by name, and whose actor does not come to its messages.
+fn troubled(app: &App) -> Option<(String, &'static str)> {
+    let line = app.line.as_ref()?;
+    let is_well = line.state == "ready";
+    (!is_well).then(|| {
+        let reason =
+            line.last_reason.as_ref().map_or_else(String::new, |reason| format!(", the last life {reason}"));
+        let seen = format!("{} for {}{reason}", line.state, time(line.since_us));
+        (seen, "`sinew tree` shows its supervisor, its log says more")
+    })
+}
+
+/// The names that wait for each other in a circle with `name`, with `name` at both ends.
+fn circle<'a>(name: &'a str, facts: &'a Facts) -> Option<Vec<&'a str>> {
+    let mut ways = vec![vec![name]];
+    let mut been = BTreeSet::new();
+    while let Some(way) = ways.pop() {
+        let last = way.last().copied()?;
+        for next in facts.waits.get(last).into_iter().flatten() {
+            let longer: Vec<_> = way.iter().copied().chain([next.as_str()]).collect();
+            if next == name {
+                return Some(longer);
+            }
+            if been.insert(next.as_str()) {
+                ways.push(longer);
+            }
+        }
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,365 @@
+//! A way that is free, and each thing that can stand in it.
+
+use sinew::{
+    AppAddress, Incarnation, NodeAddress, Tid,
+    inspect::{AppReport, DialReport, ForeignReport, LinkReport, Missing, RefusalReport, TreeLine},
+};
+
+use super::*;
+
+fn node(number: u8) -> NodeAddress {
+    NodeAddress::from([10, 0, 0, number])
+}
+
+fn peer(number: u8) -> PeerReport {
+    let link = |class: &str| LinkReport { class: class.to_owned(), is_up: true, waiting: 0, unconfirmed: 0 };
+    PeerReport {
+        node: node(number),
+        name: None,
+        incarnation: Incarnation(1),
+        is_there: true,
+        found_us: Some(5_000_000),
+        found_by: vec!["multicast".to_owned()],
+        silent_us: Some(120_000),
+        missed: 0,
+        round_trip_ns: None,
+        offset_ns: None,
+        offset_bound_ns: None,
+        linked_us: Some(4_000_000),
+        broken_us: None,
+        dial: None,
+        links: ["control", "stream", "bulk"].map(link).to_vec(),
+    }
+}
+
+fn report(number: u8, name: &str, other: u8) -> NodeReport {
+    NodeReport {
+        node: node(number),
+        name: name.to_owned(),
+        incarnation: Incarnation(1),
+        up_us: 9_000_000,
+        pid: 7,
+        version: "0".to_owned(),
+        stopping: false,
+        refused: 0,
+        project: "leg".to_owned(),
+        interface: node(number).to_string(),
+        udp: Some(format!("{}:7000", node(number))),
+        gncl: Some(format!("{}:7001", node(number))),
+        group: Some("239.0.0.1:7000".to_owned()),
+        seeds: Vec::new(),
+        lost: Vec::new(),
+        foreign: Vec::new(),
+        refusals: Vec::new(),
+        peers: vec![peer(other)],
+        left_out: 0,
+    }
+}
+
+fn app(name: &str) -> App {
+    let tid = Tid::new(node(2), AppAddress::new(0x1001));
+    let report = AppReport {
+        tid,
+        name: Some(name.to_owned()),
+        ready: true,
+        waits_us: None,
+        missing: Vec::new(),
+        ended: None,
+    };
+    let line = TreeLine {
+        depth: 1,
+        name: name.to_owned(),
+        tid: Some(tid),
+        state: "ready".to_owned(),
+        since_us: 1,
+        life: 1,
+        restarts: 0,
+        last_reason: None,
+        place: None,
+        waiting: Some(0),
+        waiting_most: Some(3),
+        strategy: None,
+    };
+    App { report: Some(report), line: Some(line), refused: 0 }
+}
+
+/// The hip at 10.0.0.1, and knee.drive on the knee at 10.0.0.2.
+fn free() -> Facts {
+    let end = |wanted: &str, report: NodeReport| End {
+        wanted: wanted.to_owned(),
+        node: Some(report.node),
+        report: Some(report),
+        ..End::default()
+    };
+    let mut facts = Facts {
+        ends: [end("hip", report(1, "hip", 2)), end("knee.drive", report(2, "knee", 1))],
+        pings: [Some(Ok(300)), Some(Ok(400))],
+        ..Facts::default()
+    };
+    facts.ends[1].app = Some(app("knee.drive"));
+    facts
+}
+
+fn hip(facts: &mut Facts) -> &mut NodeReport {
+    facts.ends[0].report.as_mut().expect("it answers")
+}
+
+fn knee(facts: &mut Facts) -> &mut NodeReport {
+    facts.ends[1].report.as_mut().expect("it answers")
+}
+
+fn drive(facts: &mut Facts) -> &mut App {
+    facts.ends[1].app.as_mut().expect("an application is meant")
+}
+
+fn lost(why: &str) -> LostReport {
+    LostReport {
+        node: node(2),
+        name: "knee".to_owned(),
+        incarnation: Incarnation(1),
+        udp: "10.0.0.2:7000".to_owned(),
+        lost_us: 3_000_000,
+        why: why.to_owned(),
+        silent_us: 1_500_000,
+        found_by: Vec::new(),
+    }
+}
+
+/// Neither has found the other.
+fn strangers(facts: &mut Facts) {
+    hip(facts).peers.clear();
+    knee(facts).peers.clear();
+}
+
+fn never_answered(facts: &mut Facts) {
+    facts.ends[1] = End { wanted: "10.0.0.2".to_owned(), node: Some(node(2)), ..End::default() };
+    hip(facts).peers.clear();
+}
+
+fn waits(facts: &mut Facts, missing: &str) {
+    let report = drive(facts).report.as_mut().expect("it is there");
+    report.ready = false;
+    report.waits_us = Some(2_000_000);
+    report.missing = vec![Missing { name: missing.to_owned(), why: "never seen".to_owned() }];
+    facts.waits.insert("knee.drive".to_owned(), vec![missing.to_owned()]);
+}
+
+/// What stands in the way of facts that were changed so: the step, what is seen, what mends it.
+struct Case(fn(&mut Facts), [&'static str; 3]);
+
+const CASES: &[Case] = &[
+    Case(
+        |facts| facts.ends[1] = End { wanted: "ankle".to_owned(), ..End::default() },
+        ["ankle is there", "'ankle'", "sinew apps"],
+    ),
+    Case(|facts| facts.ends[1].report = None, ["knee.drive is there", "cannot be asked", "--other-socket"]),
+    Case(|facts| knee(facts).stopping = true, ["knee.drive is there", "about to end", "start it"]),
+    Case(
+        |facts| facts.ends[1].doubles.push("node shank (process 9)".to_owned()),
+        ["its address alone", "10.0.0.2 is used by node shank", "another `address`"],
+    ),
+    Case(
+        |facts| {
+            let cause = "NDL node address used twice".to_owned();
+            let detail = "10.0.0.2 is at 10.0.0.2:7000; the process at 10.0.0.9:7000 claims it".to_owned();
+            hip(facts).refusals.push(RefusalReport { cause, count: 4, detail, ago_us: 1_000_000 });
+        },
+        ["hip sees every address once", "10.0.0.9", "another `address`"],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            knee(facts).project = "arm".to_owned();
+        },
+        ["one project", "'leg', knee.drive of 'arm'", "same `project`"],
+    ),
+    Case(
+        |facts| {
+            hip(facts).peers.clear();
+            hip(facts).lost.push(lost("silent"));
+        },
+        ["hip knows knee.drive", "had not answered for 1.5 s", "cable"],
+    ),
+    Case(
+        |facts| {
+            hip(facts).peers.clear();
+            hip(facts).lost.push(lost("connection refused"));
+        },
+        ["hip knows knee.drive", "its process has ended", "start it again"],
+    ),
+    Case(
+        |facts| {
+            hip(facts).peers.clear();
+            hip(facts).lost.push(lost("left"));
+        },
+        ["hip knows knee.drive", "stopped in order", "start it again"],
+    ),
+    Case(
+        |facts| {
+            never_answered(facts);
+            let project = "arm".to_owned();
+            let foreign = ForeignReport {
+                node: node(2),
+                name: "knee".to_owned(),
+                project,
+                udp: String::new(),
+                ago_us: 1,
+            };
+            hip(facts).foreign.push(foreign);
+        },
+        ["hip knows 10.0.0.2", "project 'arm', not 'leg'", "same `project`"],
+    ),
+    Case(never_answered, ["hip knows 10.0.0.2", "never heard of it; it asks 239.0.0.1:7000", "seeds"]),
+    Case(
+        |facts| {
+            strangers(facts);
+            knee(facts).group = Some("239.0.0.2:7000".to_owned());
+        },
+        ["hip knows knee.drive", "the other in 239.0.0.2:7000", "same `multicast`"],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            knee(facts).group = None;
+        },
+        ["hip knows knee.drive", "knee takes no part in multicast", "seeds = [\"10.0.0.2:7000\"]"],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            knee(facts).interface = "127.0.0.1".to_owned();
+        },
+        ["hip knows knee.drive", "its own host only", "`interface`"],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            hip(facts).seeds.push("10.0.0.2:7000".to_owned());
+        },
+        ["hip knows knee.drive", "a seed names it", "firewalls"],
+    ),
+    Case(strangers, ["hip knows knee.drive", "has not heard the other", "IGMP"]),
+    Case(
+        |facts| {
+            let peer = &mut hip(facts).peers[0];
+            peer.links[0].is_up = false;
+            peer.broken_us = Some(2_000_000);
+            let (address, error) =
+                ("10.0.0.2:7001".to_owned(), "Connection refused (os error 111)".to_owned());
+            peer.dial = Some(DialReport { address, error, ago_us: 100_000, failed: 5 });
+        },
+        [
+            "hip is connected to knee.drive",
+            "control down, broken 2.0 s ago; 5 dials in vain",
+            "nobody listens at 10.0.0.2:7001",
+        ],
+    ),
+    Case(
+        |facts| {
+            let peer = &mut hip(facts).peers[0];
+            peer.links.clear();
+            let (address, error) = ("10.0.0.2:7001".to_owned(), "No route to host".to_owned());
+            peer.dial = Some(DialReport { address, error, ago_us: 100_000, failed: 5 });
+        },
+        ["hip is connected to knee.drive", "never connected", "ip route get 10.0.0.2"],
+    ),
+    Case(
+        |facts| {
+            knee(facts).peers[0].links.clear();
+            let detail = "node 10.0.0.1 says: your clock is odd".to_owned();
+            let cause = "violation".to_owned();
+            knee(facts).refusals.push(RefusalReport { cause, count: 1, detail, ago_us: 1_000 });
+        },
+        ["knee.drive is connected to hip", "your clock is odd", "log"],
+    ),
+    Case(
+        |facts| drive(facts).report = None,
+        ["knee.drive takes messages", "no such application", "sinew apps"],
+    ),
+    Case(
+        |facts| waits(facts, "ankle"),
+        ["knee.drive takes messages", "ankle (never seen)", "start what it waits for: ankle"],
+    ),
+    Case(
+        |facts| {
+            waits(facts, "gait");
+            facts.waits.insert("gait".to_owned(), vec!["clock".to_owned(), "knee.drive".to_owned()]);
+        },
+        ["knee.drive takes messages", "knee.drive -> gait -> knee.drive", "`requires`"],
+    ),
+    Case(
+        |facts| drive(facts).line.as_mut().expect("supervised").state = "hung".to_owned(),
+        ["knee.drive takes messages", "hung for", "sinew tree"],
+    ),
+    Case(
+        |facts| {
+            facts.ends[1].report = None;
+            facts.shut.push("the socket /run/knee.sock lets nobody in".to_owned());
+        },
+        ["knee.drive is there", "/run/knee.sock lets nobody in", "is it running"],
+    ),
+    Case(
+        |facts| facts.pings[0] = Some(Err("no answer within 2s".to_owned())),
+        ["a message goes from hip to knee.drive", "no answer", "tree"],
+    ),
+];
+
+#[test]
+fn a_free_way_has_nothing_to_mend() {
+    let steps = judge(&free());
+    let not_fine: Vec<_> =
+        steps.iter().filter(|step| step.state != State::Fine || step.mend.is_some()).collect();
+    assert!(not_fine.is_empty(), "{not_fine:?}");
+    // Each end, one project, both ways known, linked and pinged, and the application.
+    assert_eq!(steps.len(), 10, "{steps:?}");
+}
+
+#[test]
+fn whatever_stands_in_the_way_is_named_with_what_mends_it() {
+    for (number, Case(change, [what, seen, mend])) in CASES.iter().enumerate() {
+        let mut facts = free();
+        change(&mut facts);
+        let steps = judge(&facts);
+        let blocked: Vec<_> = steps.iter().filter(|step| step.state == State::Blocked).collect();
+        let is_it = |step: &&&Step| {
+            step.what.contains(what)
+                && step.seen.contains(seen)
+                && step.mend.as_ref().is_some_and(|said| said.contains(mend))
+        };
+        assert!(blocked.iter().any(|step| is_it(&step)), "case {number}, {what}: {blocked:#?}");
+    }
+}
+
+/// A change, and what is seen of it.
+type Note = (fn(&mut Facts), &'static str);
+
+#[test]
+fn what_should_be_known_does_not_stand_in_the_way() {
+    let notes: [Note; 3] = [
+        (|facts| hip(facts).peers[0].missed = 2, "missed its last 2 answers"),
+        (|facts| drive(facts).refused = 9, "9 messages were refused"),
+        (
+            |facts| {
+                let missing = Missing { name: "ankle".to_owned(), why: "its node is lost".to_owned() };
+                drive(facts).report.as_mut().expect("it is there").missing.push(missing);
+            },
+            "it lost ankle",
+        ),
+    ];
+    for (change, seen) in notes {
+        let mut facts = free();
+        change(&mut facts);
+        let steps = judge(&facts);
+        assert!(steps.iter().all(|step| step.state != State::Blocked), "{steps:#?}");
+        assert!(steps.iter().any(|step| step.state == State::Note && step.seen.contains(seen)), "{steps:#?}");
+    }
+}
+
+#[test]
+fn two_applications_of_one_node_need_no_connection() {
+    let mut facts = free();
+    facts.ends[0] = End { app: Some(app("knee.sensor")), ..facts.ends[1].clone() };
+    facts.ends[0].wanted = "knee.sensor".to_owned();
+    knee(&mut facts).peers.clear();
+    assert!(judge(&facts).iter().all(|step| step.state == State::Fine));
+}

@@ -1,0 +1,101 @@
+//! `sinew why` between real nodes: the way is free, or what stands in it is named.
+
+use serde_json::Value;
+
+use crate::scenario::{Scenario, named};
+
+/// The steps that are blocked, in words.
+fn blocked(said: &Value) -> String {
+    let steps = said["steps"].as_array().expect("a list").iter();
+    let blocked = steps.filter(|step| step["state"] == "blocked");
+    blocked.map(|step| format!("{}: {} - {}\n", step["step"], step["seen"], step["mend"])).collect()
+}
+
+#[test]
+fn the_way_between_two_nodes_and_their_applications_is_free_from_both_ends() {
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee"]);
+    let mut knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["started"]);
+    let tid = knee.wait_for(&["started"]).split_once(' ').expect("it says its TID").1.to_owned();
+    for (from, to) in [("hip", "knee"), ("127.0.0.2", "127.0.0.1"), (&*tid, "hip")] {
+        let said = scenario.until("all links are up", "hip", &["why", from, to], |said| said["free"] == true);
+        // Both were asked themselves, and each has pinged the other.
+        let steps = said["steps"].as_array().expect("a list");
+        let pings =
+            steps.iter().filter(|step| step["seen"].as_str().is_some_and(|s| s.starts_with("confirmed")));
+        assert_eq!(pings.count(), 2, "{said}");
+    }
+    let answer = scenario.sinew("knee", &["why", "hip", "knee"]);
+    assert!(answer.code == Some(0) && answer.out.contains("The way is free"), "{}{}", answer.out, answer.err);
+    // Nothing of the questions is left.
+    let apps = scenario.sinew("hip", &["apps", "--json"]).json();
+    assert_eq!(apps["apps"].as_array().map(Vec::len), Some(2), "{apps}");
+}
+
+#[test]
+fn nodes_of_two_projects_and_of_two_groups_are_told_so_though_neither_knows_the_other() {
+    // Given: three nodes beside each other, of which no two find each other
+    let scenario = Scenario::new();
+    let _hip = scenario.start("hip", 1, &[]);
+    let _arm = scenario.start_changed("arm", 2, &[("project = \"cli\"", "project = \"arm\"")], &[]);
+    let group = scenario.group.to_string();
+    let _lone = scenario.start_changed("lone", 3, &[(&group, "239.255.1.1:19999")], &[]);
+    for here in ["hip", "arm"] {
+        // When
+        let answer = scenario.sinew(here, &["why", "hip", "arm", "--json"]);
+        // Then
+        let said = blocked(&answer.json());
+        assert!(answer.code == Some(1) && said.contains("'cli'") && said.contains("'arm'"), "{said}");
+    }
+    let answer = scenario.sinew("hip", &["why", "hip", "lone", "--json"]);
+    let said = blocked(&answer.json());
+    assert!(
+        answer.code == Some(1) && said.contains("239.255.1.1:19999") && said.contains("`multicast`"),
+        "{said}"
+    );
+}
+
+#[test]
+fn a_node_that_was_killed_is_shown_as_lost_with_how_it_was_found_and_why_says_what_became_of_it() {
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee"]);
+    let knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["started"]);
+    drop(knee);
+    // When
+    let said = scenario.until("it is lost", "hip", &["nodes"], |said| named(&said["lost"], "knee").is_some());
+    // Then
+    let lost = named(&said["lost"], "knee").expect("it was there");
+    assert_eq!((&lost["node"], &lost["why"]), (&"127.0.0.2".into(), &"connection refused".into()), "{lost}");
+    assert!(lost["found_by"].as_array().is_some_and(|by| !by.is_empty()), "{lost}");
+    let table = scenario.sinew("hip", &["nodes"]);
+    assert!(table.code == Some(1) && table.out.contains("its process has ended"), "{}", table.out);
+    let answer = scenario.sinew("hip", &["why", "hip", "knee", "--json"]);
+    let said = blocked(&answer.json());
+    assert!(
+        answer.code == Some(1) && said.contains("its process has ended") && said.contains("start it"),
+        "{said}"
+    );
+    // And: when it is back, it is lost no more
+    let _knee = scenario.start("knee", 2, &[]);
+    scenario.until("it is back", "hip", &["nodes"], |said| {
+        said["lost"].as_array().is_some_and(Vec::is_empty) && named(&said["nodes"], "knee").is_some()
+    });
+}
+
+#[test]
+fn applications_that_wait_for_each_other_in_a_circle_are_told_the_circle() {
+    let scenario = Scenario::new();
+    let _hip = scenario.start("hip", 1, &["--requires", "knee"]);
+    let _knee = scenario.start("knee", 2, &["--requires", "hip"]);
+    let waits =
+        |name| move |said: &Value| named(&said["apps"], name).is_some_and(|app| app["state"] == "waits");
+    scenario.until("both wait", "hip", &["apps"], |said| waits("hip")(said) && waits("knee")(said));
+    let answer = scenario.sinew("hip", &["why", "hip", "knee", "--json"]);
+    let said = blocked(&answer.json());
+    assert!(answer.code == Some(1) && said.contains("hip -> knee -> hip"), "{said}");
+    // And: who is nowhere is said to be
+    let answer = scenario.sinew("hip", &["why", "hip", "ankle"]);
+    assert!(answer.code == Some(1) && answer.out.contains("'ankle'"), "{}", answer.out);
+}
