@@ -8,6 +8,7 @@ pub mod history;
 pub mod link_faults;
 pub mod load;
 mod log;
+pub mod meetings;
 mod numbers;
 mod program;
 

@@ -1,0 +1,78 @@
+//! One node with one application, as a process: it starts when what it requires is ready, and meets the others for ever.
+
+use std::io::BufRead;
+
+use sinew::{Barrier, Meet, NodeBuilder, prelude::*};
+
+use super::{Event, PARTIES};
+
+/// From one round to the next arrival.
+const PAUSE: Duration = Duration::from_millis(5);
+/// How long a party waits; longer than any scenario lets it.
+const WITHIN: Duration = Duration::from_secs(600);
+
+struct Party {
+    barrier: Barrier,
+}
+
+impl Actor for Party {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        Event::Started(Time::now().as_nanos()).tell();
+        self.arrive(context);
+    }
+}
+
+impl Party {
+    fn arrive(&mut self, context: &mut AppContext<Self>) {
+        Event::Arrived(Time::now().as_nanos()).tell();
+        let meeting = context.meet(&self.barrier).into_actor(self);
+        context.spawn(meeting.map(|passed, _, context| {
+            match passed {
+                Ok(generation) => Event::Passed(Time::now().as_nanos(), generation).tell(),
+                Err(error) => println!("failed {error}"),
+            }
+            context.run_later(PAUSE, Self::arrive);
+        }));
+    }
+}
+
+/// Plays the node of the party that the arguments name: `--role INDEX GROUP`. `None`: this process has no role.
+#[must_use]
+pub fn play() -> Option<std::process::ExitCode> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [role, index, group] = arguments.as_slice() else { return None };
+    if role != "--role" {
+        return None;
+    }
+    let index: usize = index.parse().expect("the director counts");
+    let node = node(index, group.parse().expect("the director's group")).start();
+    let node = node.unwrap_or_else(|error| panic!("{error}"));
+    for line in std::io::stdin().lock().lines() {
+        if line.is_err() {
+            break;
+        }
+        let directory = node.handle().directory();
+        let ready: Vec<String> =
+            directory.iter().map(|entry| format!("{}={}", entry.name, entry.ready)).collect();
+        println!("directory {}", ready.join(" "));
+    }
+    Some(std::process::ExitCode::SUCCESS)
+}
+
+fn node(index: usize, group: std::net::SocketAddrV4) -> NodeBuilder {
+    let (name, requires) = PARTIES[index];
+    let barrier = Barrier::new("step", PARTIES.map(|(name, _)| name)).within(WITHIN);
+    let party = AppSpec::new(name, move || Party { barrier: barrier.clone() })
+        .requires(requires.iter().copied())
+        .address(AppAddress::fixed(0).expect("the first fixed address"));
+    let address = u8::try_from(index + 1).expect("four of them");
+    Node::builder(name)
+        .address([127, 0, 0, address])
+        .configure(move |config| {
+            config.ndl.multicast = Some(group);
+            config.ndl.mdns_port = None;
+        })
+        .app(party)
+}
