@@ -20,6 +20,7 @@ mod draining;
 mod expiry;
 mod half;
 mod held;
+mod outcomes;
 mod outstanding;
 mod partial;
 mod resume;
@@ -51,6 +52,7 @@ pub(crate) use batch::Gathering;
 use draining::Drained;
 use half::{After, Bound, Half, Step};
 pub(crate) use held::line_of;
+pub(crate) use outcomes::{OUTCOMES_MAX, read as read_outcomes};
 pub(crate) use resume::Session;
 
 /// A non-blocking socket, or what is like one, that can be written to from any thread.

@@ -27,8 +27,8 @@ use tokio::net::TcpStream;
 use super::{
     Event, LinkFact,
     core::{
-        Attach, CANCEL, CLASSES, ConnectionId, Core, Decline, GUARD, Input, Introduction, Lane, Output,
-        Refusal, Settings, read, write,
+        Attach, CANCEL, CLASSES, ConnectionId, Core, Decline, GUARD, Input, Introduction, Lane, OUTCOMES,
+        Output, Refusal, Settings, read, write,
     },
     inbound::Inbound,
     link::{self, Mode, News, Reading, SharedMode, What},
@@ -340,7 +340,7 @@ fn settings(stores: &Stores) -> Settings {
             peer: NodeAddress::HERE,
             dial: 0,
             payload_max: payload_max as u64,
-            features: [CLASSES, CANCEL, GUARD].map(str::to_owned).to_vec(),
+            features: [CLASSES, CANCEL, GUARD, OUTCOMES].map(str::to_owned).to_vec(),
             lane: Lane::Control,
             link: 0,
         },

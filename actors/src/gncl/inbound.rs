@@ -19,10 +19,13 @@ use super::{
     way::{Taken, Way},
 };
 use crate::{
-    outlet::{LinkNumber, line_of},
+    outlet::{LinkNumber, OUTCOMES_MAX, line_of, read_outcomes},
     session::Ack,
     stores::Stores,
 };
+
+/// Outcomes that are told together at most, but for those of one frame.
+const OUTCOMES_AT_ONCE: usize = 1_024;
 
 /// The way in for the frames of one peer.
 pub(super) struct Inbound {
@@ -35,7 +38,7 @@ pub(super) struct Inbound {
     pub(super) link: LinkNumber,
     /// What they have for a checksum.
     pub(super) checksum: Checksum,
-    /// What the peer said in this [`Batch`] of the fate of messages to it: no more than the frames of one.
+    /// What the peer said in this [`Batch`] of the fate of messages to it, and was not told on: [`OUTCOMES_AT_ONCE`] and one frame's at most.
     pub(super) outcomes: RefCell<Vec<(Ticket, Outcome)>>,
 }
 
@@ -48,11 +51,7 @@ pub(super) struct Batch<'a> {
 
 impl Drop for Batch<'_> {
     fn drop(&mut self) {
-        // Whoever is told runs into nothing that is borrowed here.
-        let mut outcomes = self.inbound.outcomes.take();
-        self.inbound.peer.confirm(&mut outcomes);
-        outcomes.clear();
-        self.inbound.outcomes.replace(outcomes);
+        self.inbound.tell_outcomes();
         if let Some(way) = self.inbound.peer.way(self.inbound.lane) {
             way.acknowledge_if_due();
         }
@@ -86,8 +85,15 @@ impl Inbound {
             return Ok(());
         }
         let hand = way.hand();
-        let is_void = is_for_the_link(&message, Kind::GNCL_VOID);
-        match if is_void { Some(End::Void) } else { self.take(now, message, way, taken) } {
+        let end = if is_for_the_link(&message, Kind::GNCL_VOID) {
+            Some(End::Void)
+        } else if is_for_the_link(&message, Kind::GNCL_OUTCOMES) {
+            self.outcomes_at_once(now, &message)?;
+            Some(End::Told)
+        } else {
+            self.take(now, message, way, taken)
+        };
+        match end {
             Some(end) => hand.ends(end),
             None => hand.empty(),
         }
@@ -229,6 +235,37 @@ impl Inbound {
             Some(outcome) => self.outcomes.borrow_mut().push((ticket, outcome)),
             None => self.count(now, "no such outcome", message),
         }
+    }
+
+    /// Several in one frame; a code that is no outcome's spoils its own alone. spec: GNCL-17
+    fn outcomes_at_once(&self, now: Time, message: &Message) -> Result<(), Decline> {
+        let Some(all) = read_outcomes(&message.payload) else {
+            let length = message.payload.len();
+            return Err(Decline::Violation(format!(
+                "OUTCOMES of {length} bytes are not 1 to {OUTCOMES_MAX}"
+            )));
+        };
+        for said in all {
+            match said.outcome {
+                Some(outcome) => {
+                    let ticket = said.ticket(self.stores.node, self.peer.node);
+                    self.outcomes.borrow_mut().push((ticket, outcome));
+                }
+                None => self.count(now, "no such outcome", message),
+            }
+        }
+        if self.outcomes.borrow().len() >= OUTCOMES_AT_ONCE {
+            self.tell_outcomes();
+        }
+        Ok(())
+    }
+
+    /// Whoever is told runs into nothing that is borrowed here.
+    fn tell_outcomes(&self) {
+        let mut outcomes = self.outcomes.take();
+        self.peer.confirm(&mut outcomes);
+        outcomes.clear();
+        self.outcomes.replace(outcomes);
     }
 
     fn count(&self, now: Time, cause: &'static str, message: &Message) {

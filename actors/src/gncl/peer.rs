@@ -79,7 +79,7 @@ impl Drop for Peer {
 impl Peer {
     /// `now` numbers what is remembered of the peer: a later peer of the same life has a larger number.
     fn new(now: Time, attach: &Attach, stores: &Stores) -> Self {
-        let ends = Ends { here: stores.node, node: attach.node };
+        let ends = Ends { here: stores.node, node: attach.node, takes_outcomes: attach.takes_outcomes };
         let ways = if attach.by_class { Lane::ALL.len() } else { 1 };
         let refusals = &stores.gncl.refusals;
         let acks = &stores.gncl.acks;

@@ -9,5 +9,6 @@ mod handshakes;
 mod leaving;
 mod links;
 mod messages;
+mod outcomes;
 mod threads;
 mod ticks;

@@ -107,6 +107,8 @@ pub(crate) struct WayAccount {
 pub(super) struct Ends {
     pub(super) here: NodeAddress,
     pub(super) node: NodeAddress,
+    /// Whether the peer takes several outcomes in one frame.
+    pub(super) takes_outcomes: bool,
 }
 
 /// A session with a peer.
@@ -139,8 +141,10 @@ impl Way {
         let messages = config.gncl.queue_capacity.clamp(WINDOW_MESSAGES_MIN, WINDOW_MESSAGES_MAX);
         let window = Window { messages, bytes: WINDOW_BYTES };
         let memory = now.as_nanos();
-        let void = frame(ends.here, ends.node, Kind::GNCL_VOID, Bytes::new()).header;
-        let outlet = StreamOutlet::with_session(limits, Session::new(memory, window, void));
+        let header = |kind| frame(ends.here, ends.node, kind, Bytes::new()).header;
+        let void = header(Kind::GNCL_VOID);
+        let outcomes = ends.takes_outcomes.then(|| header(Kind::GNCL_OUTCOMES));
+        let outlet = StreamOutlet::with_session(limits, Session::new(memory, window, void, outcomes));
         // A message may be acknowledged before it is known that its destination is full: one more than a window.
         let (line_messages, line_bytes) = (messages + 1, WINDOW_BYTES + config.payload_max);
         let shelf = Shelf::new(ShelfLimits {

@@ -214,6 +214,7 @@ impl<S: Socket> Half<S> {
             self.expired(message, after);
             return None;
         }
+        let message = self.with_outcomes_behind(message);
         Some(self.frame(message))
     }
 

@@ -16,6 +16,7 @@ use super::{
     LinkNumber, OutletCounts, OutletLimits, Socket,
     account::Tally,
     batch::{Pace, is_patient},
+    outcomes::messages_in,
     outstanding::{Outstanding, Sent},
     partial::{Partial, Sort, Written},
     resume::Session,
@@ -68,7 +69,8 @@ pub(super) enum Step {
 
 pub(super) struct Half<S> {
     pub(super) limits: OutletLimits,
-    payload_max: usize,
+    /// Longest payload that both sides take.
+    pub(super) payload_max: usize,
     pub(super) link: Link<S>,
     pub(super) number: u64,
     /// What makes a message arrive once through any number of connections; `None` where there is only ever one.
@@ -455,7 +457,9 @@ impl<S: Socket> Half<S> {
     }
 
     pub(super) fn sent(&mut self, frame: Partial) {
-        self.counts.sent += u64::from(frame.sort == Sort::Message);
+        if frame.sort == Sort::Message {
+            self.counts.sent += messages_in(&frame.message);
+        }
         let expiry = frame.message.header.expiry();
         if let Some(receipt) = frame.message.receipt {
             self.waiting_receipts -= 1;

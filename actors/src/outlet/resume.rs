@@ -24,17 +24,19 @@ pub(crate) struct Session {
     pub(super) held: Held<u64, Message>,
     /// The header of what stands for a message that has lost its use.
     void: Header,
+    /// That of several outcomes in one frame, where the peer takes them.
+    pub(super) outcomes: Option<Header>,
 }
 
 impl Session {
     /// Nothing was sent yet; see [`Sending::new`].
-    pub(crate) fn new(epoch: u64, window: Window, void: Header) -> Self {
+    pub(crate) fn new(epoch: u64, window: Window, void: Header, outcomes: Option<Header>) -> Self {
         let lines = ShelfLimits {
             line_messages: window.messages.div_ceil(4),
             messages: window.messages,
             ..LIMITS_OF_LINES
         };
-        Self { sending: Sending::new(epoch, window), held: Held::new(lines), void }
+        Self { sending: Sending::new(epoch, window), held: Held::new(lines), void, outcomes }
     }
 }
 

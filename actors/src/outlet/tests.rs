@@ -24,6 +24,7 @@ mod accounts;
 mod audits;
 mod floods;
 mod holding;
+mod outcomes;
 mod requests;
 mod room;
 

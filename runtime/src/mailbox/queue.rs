@@ -204,6 +204,14 @@ impl ClassQueue {
         Some(next)
     }
 
+    /// The next message of a class, if it is of the sort that goes with one that was [popped](Self::pop).
+    pub fn pop_if(&mut self, class: Class, is_it: impl FnOnce(&Message) -> bool) -> Option<Message> {
+        let next = self.lanes[class as usize].pop_front_if(|message| is_it(message))?;
+        self.bytes[class as usize] -= next.payload.len();
+        self.give(next.payload.len());
+        Some(next)
+    }
+
     /// So many bytes are held no more.
     fn give(&self, bytes: usize) {
         if let Some(budget) = &self.budget {

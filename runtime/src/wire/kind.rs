@@ -45,6 +45,8 @@ impl Kind {
     pub const GNCL_ACK: Self = Self(0x16);
     /// Stands for a message that lost its use before it arrived.
     pub const GNCL_VOID: Self = Self(0x17);
+    /// Several outcomes of confirmed messages.
+    pub const GNCL_OUTCOMES: Self = Self(0x18);
     /// A node asks who is there, or whether a known node lives.
     pub const NDL_QUERY: Self = Self(0x20);
     /// The matched answer.

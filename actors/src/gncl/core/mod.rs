@@ -33,7 +33,8 @@ use sinew_runtime::{
 use super::LinkFact;
 use acquaintance::Acquaintance;
 pub(super) use handshake::{
-    CANCEL, CLASSES, Decline, GUARD, HANDSHAKE_PAYLOAD_MAX, Introduction, Lane, Refusal, read, write,
+    CANCEL, CLASSES, Decline, GUARD, HANDSHAKE_PAYLOAD_MAX, Introduction, Lane, OUTCOMES, Refusal, read,
+    write,
 };
 
 /// What the core is set to.
@@ -151,6 +152,8 @@ pub(super) struct Attach {
     pub(super) by_class: bool,
     /// Whether the peer takes back what nobody waits for any more.
     pub(super) takes_cancels: bool,
+    /// Whether the peer takes several outcomes in one frame.
+    pub(super) takes_outcomes: bool,
     /// Whether the peer's frames have guards, and ours.
     pub(super) is_guarded: bool,
     /// Longest payload that the peer takes, in bytes.

@@ -10,8 +10,8 @@ use std::time::Duration;
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
 use super::{
-    Attach, CANCEL, Connection, ConnectionId, Core, Decline, GUARD, Introduction, Lane, Output, Settings,
-    Stage,
+    Attach, CANCEL, Connection, ConnectionId, Core, Decline, GUARD, Introduction, Lane, OUTCOMES, Output,
+    Settings, Stage,
     acquaintance::{Link, Pulse},
     handshake::check,
 };
@@ -202,6 +202,7 @@ impl Core {
             lane,
             by_class: true,
             takes_cancels: theirs.knows(CANCEL),
+            takes_outcomes: theirs.knows(OUTCOMES),
             is_guarded: theirs.knows(GUARD) && self.settings.ours.knows(GUARD),
             payload_max: theirs.payload_max,
             welcome,

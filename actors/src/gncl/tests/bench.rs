@@ -325,7 +325,7 @@ impl ByHand {
     pub(super) async fn say(&mut self, message: &Message) {
         let mut bytes = bytes::BytesMut::new();
         let mut message = Message::new(message.header, message.payload.clone());
-        if message.header.destination.app != AppAddress::GNCL {
+        if message.header.destination.app != AppAddress::GNCL || message.header.kind == Kind::GNCL_OUTCOMES {
             message.header.number = self.number;
             self.number = self.number.wrapping_add(1);
         }

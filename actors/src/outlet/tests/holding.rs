@@ -50,7 +50,7 @@ impl World {
     fn new() -> Self {
         let window = Window { messages: 64, bytes: PLENTY };
         let void = message(Class::Control, 0).header;
-        let outlet = StreamOutlet::with_session(LIMITS, Session::new(1, window, void));
+        let outlet = StreamOutlet::with_session(LIMITS, Session::new(1, window, void, None));
         let wire = Arc::new(Wire::default());
         let link = outlet.connect(wire.clone(), usize::MAX, None);
         let bench = Bench { outlet, wire, link, ledger: Arc::default() };

@@ -6,7 +6,7 @@ use crate::session::Window;
 pub(super) fn session(room: usize) -> Bench {
     let void = Header::new(Kind::GNCL_VOID, tid(0), tid(1));
     let window = Window { messages: 64, bytes: PLENTY };
-    let outlet = StreamOutlet::with_session(LIMITS, Session::new(1, window, void));
+    let outlet = StreamOutlet::with_session(LIMITS, Session::new(1, window, void, None));
     let wire = Arc::new(Wire::default());
     wire.room.store(room, Ordering::Relaxed);
     let link = outlet.connect(wire.clone(), usize::MAX, None);
