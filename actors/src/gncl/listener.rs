@@ -9,7 +9,7 @@ use std::{
 use futures_util::{Stream, stream};
 use rustix::io::Errno;
 use sinew_runtime::time::Time;
-use socket2::{Domain, Socket, Type};
+use socket2::{Domain, SockRef, Socket, Type};
 use tokio::net::{TcpListener, TcpStream};
 
 use crate::{config::GnclConfig, refusals::Refusals};
@@ -83,9 +83,18 @@ pub(super) fn accepted(
             super::link::tune(&socket, give_up)?;
             Ok(socket)
         });
+        if accepted.is_err() && is_closed(&listener) {
+            // The node is being stopped: nobody comes any more, which is no fault.
+            std::future::pending::<()>().await;
+        }
         let wait = accepted.as_ref().err().map_or(Duration::ZERO, |error| wait_after(error, wait));
         Some((accepted, (listener, wait)))
     })
+}
+
+/// Whether this socket does not listen any more.
+fn is_closed(listener: &TcpListener) -> bool {
+    matches!(SockRef::from(listener).is_listener(), Ok(false))
 }
 
 /// Whether there were no descriptors left, or no memory.
@@ -106,6 +115,10 @@ fn wait_after(error: &io::Error, before: Duration) -> Duration {
 
 #[cfg(test)]
 mod tests {
+    use std::pin::pin;
+
+    use futures_util::{FutureExt, StreamExt};
+
     use super::*;
 
     #[test]
@@ -119,6 +132,18 @@ mod tests {
             }
             assert_eq!(waits.iter().map(Duration::as_millis).collect::<Vec<_>>(), [10, 20, 40, 80, 100, 100]);
         }
+    }
+
+    #[tokio::test]
+    async fn a_socket_that_was_closed_in_order_is_no_fault_and_nobody_comes_any_more() {
+        let listener = listen(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
+        let theirs = TcpListener::from_std(listener.try_clone().unwrap()).unwrap();
+        let mut accepted = pin!(accepted(theirs, Duration::from_secs(1)));
+        assert!(accepted.next().now_or_never().is_none());
+        // As GNCL's store does when the node is stopped.
+        SockRef::from(&listener).shutdown(std::net::Shutdown::Both).unwrap();
+        let told = tokio::time::timeout(Duration::from_millis(100), accepted.next()).await;
+        assert!(told.is_err(), "{told:?}");
     }
 
     #[test]
