@@ -239,12 +239,12 @@ impl Sender {
         value: &P,
     ) -> Result<(), SendError> {
         let message = self.typed(destination.into(), value)?;
-        self.dispatch(message)
+        self.dispatch(message).map(drop)
     }
 
     /// Sends a value and wants to know what becomes of it: the returned future ends in exactly one [`Outcome`]. The
     /// message expires where it waits once it is older than `within`; the future ends as [`Outcome::Unknown`] when
-    /// nobody has said anything by then.
+    /// nobody has said anything by then, whenever it is polled first.
     ///
     /// # Errors
     /// Nobody took it.
@@ -260,8 +260,8 @@ impl Sender {
             return Err(Rejection::Unsupported.into());
         }
         let wait = self.expect_answer(&mut message, Awaited::Outcome, within)?;
-        self.dispatch(message)?;
-        Ok(Confirmation(Deadline::new(wait, within)))
+        let sent = self.dispatch(message)?;
+        Ok(Confirmation(Deadline::new(wait, sent + within)))
     }
 
     /// Sends a request; the returned future ends with the reply, an error, or at the deadline.
@@ -281,9 +281,9 @@ impl Sender {
         let wait = self.expect_answer(&mut message, Awaited::Reply, within)?;
         let destination = self.shared.router.absolute(message.header.destination);
         let ticket = Ticket { source: self.shared.tid, destination, correlation: wait.correlation() };
-        self.dispatch(message)?;
+        let sent = self.dispatch(message)?;
         let request = Some(Request { router: self.shared.router.clone(), ticket });
-        Ok(Reply { deadline: Deadline::new(wait, within), within, request, reply: PhantomData })
+        Ok(Reply { deadline: Deadline::new(wait, sent + within), within, request, reply: PhantomData })
     }
 
     /// Whether whoever asked still waits for the reply, as far as is known here: its deadline is not over, and it has not given
@@ -309,7 +309,7 @@ impl Sender {
         message.header.class = Class::Control;
         message.header.flags = Flags::REPLY;
         message.header.correlation = to.correlation;
-        self.dispatch(message)
+        self.dispatch(message).map(drop)
     }
 
     /// Writable memory of `length` bytes for a raw payload of `kind` (the paper's CreateMessage).
@@ -334,7 +334,7 @@ impl Sender {
     /// # Errors
     /// Nobody took it.
     pub fn send_message(&self, buffer: MessageBuffer) -> Result<(), SendError> {
-        self.dispatch(buffer.freeze())
+        self.dispatch(buffer.freeze()).map(drop)
     }
 
     /// Sends a payload that was encoded before.
@@ -347,7 +347,7 @@ impl Sender {
     ) -> Result<(), SendError> {
         let mut header = Header::new(kind, self.shared.tid, self.find(destination)?);
         header.class = class;
-        self.dispatch(Message::new(header, payload))
+        self.dispatch(Message::new(header, payload)).map(drop)
     }
 
     /// A message of the value, in its envelope if its type is protected.
@@ -396,7 +396,8 @@ impl Sender {
         Ok(wait)
     }
 
-    fn dispatch(&self, mut message: Message) -> Result<(), SendError> {
+    /// Returns when it was sent.
+    fn dispatch(&self, mut message: Message) -> Result<Time, SendError> {
         if self.is_over() {
             message.reject(Rejection::Closed);
             return Err(SendError::Over);
@@ -406,8 +407,10 @@ impl Sender {
             return Err(Rejection::TooLong.into());
         }
         message.header.sequence = self.shared.sequence.fetch_add(1, Ordering::Relaxed).wrapping_add(1);
-        message.header.sent = Time::now();
-        Ok(self.shared.router.send(message)?)
+        let sent = Time::now();
+        message.header.sent = sent;
+        self.shared.router.send(message)?;
+        Ok(sent)
     }
 }
 
@@ -440,18 +443,18 @@ impl std::fmt::Debug for Request {
     }
 }
 
-/// A wait with its deadline. The timer is made at the first poll: by the runtime of the thread that polls, and where there is
+/// A wait with its deadline, which counts from the send. The timer is made at the first poll: by the runtime of the thread that polls, and where there is
 /// none by one that is kept for that.
 #[derive(Debug)]
 struct Deadline {
     wait: Wait,
-    within: Duration,
+    until: Time,
     timer: Option<Pin<Box<tokio::time::Sleep>>>,
 }
 
 impl Deadline {
-    const fn new(wait: Wait, within: Duration) -> Self {
-        Self { wait, within, timer: None }
+    const fn new(wait: Wait, until: Time) -> Self {
+        Self { wait, until, timer: None }
     }
 
     /// What came, or `None` at the deadline.
@@ -460,7 +463,11 @@ impl Deadline {
             return Poll::Ready(Some(settlement));
         }
         if self.timer.is_none() {
-            self.timer = clock::sleep(self.within);
+            let now = Time::now();
+            if self.until <= now {
+                return Poll::Ready(None);
+            }
+            self.timer = clock::sleep(self.until.since(now));
         }
         // Where there is no timer nobody can say when the deadline is: it is now.
         if let Some(timer) = &mut self.timer {

@@ -80,5 +80,14 @@ fn outcomes_and_replies_that_are_polled_without_tokio_come_and_have_their_deadli
     let reply = sender.ask::<_, Number>(sender.tid(), &Number(3), within).unwrap();
     let answer = block_on(reply);
     assert!(matches!(answer, Err(AskError::Deadline(after)) if after == within), "{answer:?}");
+    // When it is over before anybody polls, then it is: it counts from the send.
+    let (confirmation, sent) = (confirmed(4, within), Instant::now());
+    let reply = sender.ask::<_, Number>(sender.tid(), &Number(5), within).unwrap();
+    while sent.elapsed() <= within * 2 {
+        std::thread::park_timeout(within);
+    }
+    let mut context = Context::from_waker(Waker::noop());
+    assert_eq!(pin!(confirmation).poll(&mut context), Poll::Ready(Outcome::Unknown));
+    assert!(matches!(pin!(reply).poll(&mut context), Poll::Ready(Err(AskError::Deadline(_)))));
     stage.order_stop();
 }
