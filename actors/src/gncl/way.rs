@@ -74,6 +74,8 @@ struct Inbox {
     receiving: Receiving,
     shelf: Shelf<u64, Message>,
     arrivals: Arrivals,
+    /// Nothing in the lines expires before this.
+    next_expiry: Time,
     /// The peer is to be told what was taken, as soon as what came with it has been taken, too.
     ack_is_due: bool,
 }
@@ -158,6 +160,7 @@ impl Way {
             receiving: Receiving::new(memory),
             shelf,
             arrivals: Arrivals::default(),
+            next_expiry: Time::MAX,
             ack_is_due: false,
         });
         let outcomes_max = OUTCOMES_MAX * config.gncl.queue_capacity;
@@ -247,11 +250,12 @@ impl Way {
     /// # Errors
     /// The message: there is no room.
     pub(super) fn put_in_line(&self, key: u64, message: Message) -> Result<bool, Message> {
-        let bytes = message.size();
+        let (bytes, expiry) = (message.size(), message.header.expiry());
         let is_news = {
-            let Inbox { shelf, arrivals, .. } = &mut *self.inbox();
+            let Inbox { shelf, arrivals, next_expiry, .. } = &mut *self.inbox();
             let before = shelf.change();
             shelf.put(key, message, bytes)?;
+            *next_expiry = expiry.min(*next_expiry);
             arrivals.put_away();
             shelf.change() != before
         };
@@ -281,12 +285,44 @@ impl Way {
 
     /// Offers what waits for applications here to them again; `room` is woken when one of them takes more. Returns how far that came.
     pub(super) fn offer_again(&self, now: Time, router: &Router, room: &Waker) -> Offered {
+        let has_fewer = self.expire_lines(now);
         let held = self.inbox().shelf.held();
         let lines: Vec<_> = held.into_iter().map(|key| self.offer_line(now, key, router, room)).collect();
-        if lines.contains(&Offered::All) {
+        if has_fewer || lines.contains(&Offered::All) {
+            // spec: CREDIT-2
             self.acknowledge();
         }
         lines.into_iter().max().unwrap_or(Offered::All)
+    }
+
+    /// Settles what has expired in the lines, also behind a message that may wait longer. Returns whether somebody is held no more.
+    fn expire_lines(&self, now: Time) -> bool {
+        let (expired, has_fewer) = {
+            let Inbox { shelf, arrivals, next_expiry, .. } = &mut *self.inbox();
+            if now <= *next_expiry {
+                return false;
+            }
+            let before = shelf.change();
+            let mut next = Time::MAX;
+            let expired = shelf.take_useless(|message| {
+                let is_expired = message.header.is_expired(now);
+                if !is_expired {
+                    next = next.min(message.header.expiry());
+                }
+                is_expired
+            });
+            *next_expiry = next;
+            for _ in &expired {
+                arrivals.take_again();
+                arrivals.end(End::Expired);
+            }
+            (expired, shelf.change() != before)
+        };
+        // Nobody is told anything with the lock in hand.
+        for mut message in expired {
+            message.settle(Outcome::Expired);
+        }
+        has_fewer
     }
 
     /// Offers what waits in one line until its destination takes no more.
@@ -414,6 +450,7 @@ impl Inbox {
 
     /// Puts what was in hand back.
     fn put_back(&mut self, key: u64, message: Message, bytes: usize) {
+        self.next_expiry = self.next_expiry.min(message.header.expiry());
         self.shelf.put_back(key, message, bytes);
         self.arrivals.put_away();
     }

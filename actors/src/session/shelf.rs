@@ -194,8 +194,9 @@ impl<K: Copy + Ord, M> Shelf<K, M> {
         line.messages.into_iter().map(|(message, _)| message)
     }
 
-    /// Takes everything out that `has_no_use`, oldest first in each line.
-    fn take_useless(&mut self, mut has_no_use: impl FnMut(&M) -> bool) -> Vec<M> {
+    /// Takes everything out that `has_no_use`, oldest first in each line. A line in which nothing is left is over, but for one of which
+    /// a message is offered.
+    pub(crate) fn take_useless(&mut self, mut has_no_use: impl FnMut(&M) -> bool) -> Vec<M> {
         let mut useless = Vec::new();
         for line in self.lines.values_mut() {
             for (message, bytes) in std::mem::take(&mut line.messages) {
@@ -208,6 +209,9 @@ impl<K: Copy + Ord, M> Shelf<K, M> {
                 }
             }
         }
+        let lines = self.lines.len();
+        self.lines.retain(|_, line| line.is_offered || !line.messages.is_empty());
+        self.change += u64::from(self.lines.len() < lines);
         useless
     }
 }

@@ -10,10 +10,10 @@ use sinew_runtime::{
     router::LocalRoute,
     tid::Tid,
     time::Time,
-    wire::{Class, Message},
+    wire::{Class, Flags, Message},
 };
 
-use super::bench::{Node, next, run, within};
+use super::bench::{ByHand, NINE, Node, next, run, within};
 use crate::gncl::core::Lane;
 
 /// Messages that wait for a peer at most, in these tests: a window, too.
@@ -180,6 +180,31 @@ fn what_waits_at_its_sender_expires_there() {
         a.stores.router.send(message).expect("there is room for it");
         assert_eq!(held_at(&a, &b), before + 1, "it waits here");
         assert_eq!(next("its outcome", &mut a.settled).await, (77, Outcome::Expired));
+    });
+}
+
+#[test]
+fn what_waits_at_its_receiver_behind_what_may_wait_longer_expires_there() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut peer = ByHand::linked_to(&mut node).await;
+        // Its mailbox has room for the first one.
+        let mut slow = node.app_of(1, 1);
+        for (number, time_to_live_us) in [(1, 0), (2, 0), (3, 200_000)] {
+            let mut message = node.message(node.tid(1), &[number]);
+            message.header.source.node = NINE;
+            message.header.flags = Flags::CONFIRM;
+            message.header.correlation = number.into();
+            message.header.time_to_live_us = time_to_live_us;
+            peer.say(&message).await;
+        }
+        let outcome = peer.hear().await;
+        assert_eq!((outcome.header.correlation, outcome.payload[0]), (3, Outcome::Expired.code()));
+        for number in [1, 2] {
+            let mut message = next("what was before it", &mut slow).await;
+            assert_eq!(message.payload[..], [number]);
+            message.settle(Outcome::Delivered);
+        }
     });
 }
 
