@@ -11,7 +11,7 @@ use sinew_runtime::{
     router::{Refused, Router},
     tid::NodeAddress,
     time::Time,
-    wire::{Kind, Message},
+    wire::{HEADER_LEN, Kind, Message},
 };
 use tokio::net::TcpStream;
 
@@ -118,6 +118,10 @@ pub(crate) struct Way {
     pub(crate) outlet: StreamOutlet<Gathering<Arc<TcpStream>>>,
     /// Locked for a moment, never with another lock in hand.
     inbox: Mutex<Inbox>,
+    /// What the peer may have on its way, where applications take what comes.
+    window: Window,
+    /// Bytes of the longest frame.
+    longest: usize,
     outcomes_max: usize,
     ends: Ends,
     refusals: Arc<Refusals>,
@@ -147,13 +151,15 @@ impl Way {
         let void = header(Kind::GNCL_VOID);
         let outcomes = ends.takes_outcomes.then(|| header(Kind::GNCL_OUTCOMES));
         let outlet = StreamOutlet::with_session(limits, Session::new(memory, window, void, outcomes));
+        let longest = HEADER_LEN + config.payload_max;
         // A message may be acknowledged before it is known that its destination is full: one more than a window.
-        let (line_messages, line_bytes) = (messages + 1, WINDOW_BYTES + config.payload_max);
+        let (line_messages, line_bytes) = (messages + 1, WINDOW_BYTES + longest);
         let shelf = Shelf::new(ShelfLimits {
             lines: LINES_MAX,
             line_messages,
             line_bytes,
-            messages: SHELF_WINDOWS * line_messages,
+            // The peer may always begin one message, which may be for one more that is full.
+            messages: SHELF_WINDOWS * line_messages + LINES_MAX,
             bytes: SHELF_WINDOWS * line_bytes,
         });
         let inbox = Mutex::new(Inbox {
@@ -164,7 +170,8 @@ impl Way {
             ack_is_due: false,
         });
         let outcomes_max = OUTCOMES_MAX * config.gncl.queue_capacity;
-        Self { outlet, inbox, outcomes_max, ends, refusals: refusals.clone(), acks: acks.clone() }
+        let (refusals, acks) = (refusals.clone(), acks.clone());
+        Self { outlet, inbox, window, longest, outcomes_max, ends, refusals, acks }
     }
 
     /// Its messages come on `link` from now on, and are taken from no other.
@@ -239,7 +246,8 @@ impl Way {
         let ack = {
             let Inbox { receiving, shelf, ack_is_due, .. } = &mut *self.inbox();
             *ack_is_due = false;
-            Ack { change: shelf.change(), held: shelf.held(), ..receiving.ack(epoch) }
+            let room = shelf.room(self.window, self.longest);
+            Ack { change: shelf.change(), held: shelf.held(), ..receiving.ack(epoch, Some(room)) }
         };
         self.say(frame(self.ends.here, self.ends.node, Kind::GNCL_ACK, write(&ack)));
     }
@@ -276,7 +284,7 @@ impl Way {
             arrivals.end(End::Expired);
             (request, shelf.change() != before)
         };
-        if is_news {
+        if is_news || self.owes_room() {
             // spec: CREDIT-2
             self.acknowledge();
         }
@@ -288,11 +296,17 @@ impl Way {
         let has_fewer = self.expire_lines(now);
         let held = self.inbox().shelf.held();
         let lines: Vec<_> = held.into_iter().map(|key| self.offer_line(now, key, router, room)).collect();
-        if has_fewer || lines.contains(&Offered::All) {
+        if has_fewer || lines.contains(&Offered::All) || self.owes_room() {
             // spec: CREDIT-2
             self.acknowledge();
         }
         lines.into_iter().max().unwrap_or(Offered::All)
+    }
+
+    /// Whether there is much more room than the peer knows of.
+    fn owes_room(&self) -> bool {
+        let Inbox { receiving, shelf, .. } = &*self.inbox();
+        receiving.owes_room(shelf.room(self.window, self.longest))
     }
 
     /// Settles what has expired in the lines, also behind a message that may wait longer. Returns whether somebody is held no more.

@@ -96,7 +96,7 @@ struct Pair {
 
 impl Pair {
     fn say(&self, receiver: &mut Receiver) -> Ack {
-        let ack = receiver.receiving.ack(1);
+        let ack = receiver.receiving.ack(1, None);
         let (held, change) = (receiver.shelf.held(), receiver.shelf.change());
         if self.planted == Planted::Unsaid { ack } else { Ack { change, held, ..ack } }
     }

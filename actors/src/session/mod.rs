@@ -27,6 +27,8 @@ mod credit_model;
 #[cfg(test)]
 mod model;
 mod receiving;
+#[cfg(test)]
+mod room_tests;
 mod sending;
 mod shelf;
 #[cfg(test)]
@@ -60,6 +62,9 @@ pub(crate) struct Ack {
     /// Destinations that take nothing now; see [`Shelf`].
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(crate) held: Vec<u64>,
+    /// Messages, and bytes of their frames, that may come from `next` on; see [`Shelf::room`]. What was said before holds as well.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) room: Option<(u64, u64)>,
 }
 
 /// How far the sending half of a session is, at one moment.

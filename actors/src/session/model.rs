@@ -93,7 +93,7 @@ impl Side {
     }
 
     fn ack(&mut self, planted: Planted) -> Frame {
-        let mut ack = self.receiving.ack(self.sending.epoch());
+        let mut ack = self.receiving.ack(self.sending.epoch(), None);
         if planted == Planted::NamelessMemory {
             ack.memory = 0;
         }

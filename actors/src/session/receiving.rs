@@ -1,9 +1,9 @@
 //! The receiving half: takes each number once, in order, from the latest connection.
 
-use super::{Ack, Came, FIRST};
+use super::{Ack, Came, FIRST, Window};
 
 /// Messages after which the sender is told, so that it need not keep them.
-const ACK_EVERY: u32 = 32;
+const ACK_EVERY: usize = 32;
 /// Bytes of frames after which it is told.
 const ACK_EVERY_BYTES: usize = 64 << 10;
 
@@ -31,8 +31,10 @@ pub(crate) struct Receiving {
     epoch: u64,
     next: u64,
     /// Taken, and not acknowledged.
-    unsaid: u32,
+    unsaid: usize,
     unsaid_bytes: usize,
+    /// The room that the sender was told last, if it was.
+    room: Option<Window>,
 }
 
 impl Receiving {
@@ -71,7 +73,18 @@ impl Receiving {
         self.next += 1;
         self.unsaid += 1;
         self.unsaid_bytes += bytes;
-        Arrival::Take { ack_is_due: self.unsaid >= ACK_EVERY || self.unsaid_bytes >= ACK_EVERY_BYTES }
+        // Whoever has little room must not wait for the rest of it.
+        let (messages, bytes) = self.room.map_or((ACK_EVERY, ACK_EVERY_BYTES), |room| {
+            (ACK_EVERY.min(room.messages / 2), ACK_EVERY_BYTES.min(room.bytes / 2))
+        });
+        Arrival::Take { ack_is_due: self.unsaid >= messages || self.unsaid_bytes >= bytes }
+    }
+
+    /// Whether the sender is to be told at once that there is `room`: twice what it knows of, where that is less than all. spec: CREDIT-5
+    pub(crate) fn owes_room(&self, room: Window) -> bool {
+        let has_grown = |told: usize, now: usize| now > told && now >= told.saturating_mul(2);
+        self.room
+            .is_some_and(|told| has_grown(told.messages, room.messages) || has_grown(told.bytes, room.bytes))
     }
 
     /// Whether something was taken that the sender has not been told.
@@ -84,11 +97,13 @@ impl Receiving {
         Came { memory: self.memory, epoch: self.epoch, next: self.next }
     }
 
-    /// What the sender is told now; `epoch` is that of what goes the other way.
-    pub(crate) const fn ack(&mut self, epoch: u64) -> Ack {
+    /// What the sender is told now; `epoch` is that of what goes the other way. `None`: as much as it likes.
+    pub(crate) fn ack(&mut self, epoch: u64, room: Option<Window>) -> Ack {
         self.unsaid = 0;
         self.unsaid_bytes = 0;
+        self.room = room;
+        let room = room.map(|room| (room.messages as u64, room.bytes as u64));
         let held = Vec::new();
-        Ack { memory: self.memory, epoch, of: self.epoch, next: self.next, change: 0, held }
+        Ack { memory: self.memory, epoch, of: self.epoch, next: self.next, change: 0, held, room }
     }
 }

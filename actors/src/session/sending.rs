@@ -45,12 +45,17 @@ pub(crate) struct Sending<M> {
     cursor: Option<u64>,
     /// The memory of the peer that this epoch's messages were for.
     peer: Option<u64>,
+    /// Bytes of this epoch's messages that have arrived.
+    arrived: u64,
+    /// How far the peer has said that it has room: before this number, and for messages that begin before so many bytes. spec: CREDIT-5
+    until: Option<(u64, u64)>,
 }
 
 impl<M> Sending<M> {
     /// Nothing was sent yet. `epoch` is larger than any before it between the same two lives of nodes, and not 0.
     pub(crate) const fn new(epoch: u64, window: Window) -> Self {
-        Self { window, epoch, base: FIRST, kept: VecDeque::new(), bytes: 0, cursor: None, peer: None }
+        let kept = VecDeque::new();
+        Self { window, epoch, base: FIRST, kept, bytes: 0, cursor: None, peer: None, arrived: 0, until: None }
     }
 
     /// The epoch that the peer is told.
@@ -66,7 +71,12 @@ impl<M> Sending<M> {
     /// Whether a message that was never sent may be sent now.
     pub(crate) fn has_room(&self) -> bool {
         let has_room = self.kept.len() < self.window.messages && self.bytes < self.window.bytes;
-        self.cursor == Some(self.end()) && (has_room || self.kept.is_empty())
+        self.cursor == Some(self.end()) && (has_room || self.kept.is_empty()) && self.peer_has_room()
+    }
+
+    fn peer_has_room(&self) -> bool {
+        let begins_at = self.arrived + self.bytes as u64;
+        self.until.is_none_or(|(number, bytes)| self.end() < number && begins_at < bytes)
     }
 
     /// Whether everything that has a number was written on this connection, or has arrived.
@@ -147,13 +157,28 @@ impl<M> Sending<M> {
         // A peer that has not heard of this epoch yet has taken nothing of it.
         let next = if ack.of == self.epoch { ack.next } else { FIRST };
         if remembers && (self.base..=self.end()).contains(&next) {
-            return self.arrived(next);
+            let heard = self.arrived(next);
+            self.allow(ack.room);
+            return heard;
         }
         if remembers && next < self.base && self.cursor.is_some() {
             // Two threads said it, and the older word came last.
             return Heard::Known;
         }
-        self.reset()
+        let heard = self.reset();
+        self.allow(ack.room);
+        heard
+    }
+
+    /// The peer has room for so much from the oldest message on that is kept. It never takes its word back: an earlier one may have
+    /// reached further.
+    fn allow(&mut self, room: Option<(u64, u64)>) {
+        let Some((messages, bytes)) = room else { return };
+        let (number, at) = self.until.unwrap_or_default();
+        self.until = Some((
+            number.max(self.base.saturating_add(messages)),
+            at.max(self.arrived.saturating_add(bytes)),
+        ));
     }
 
     /// The peer has everything before `next`. spec: SESSION-2, SESSION-3
@@ -161,6 +186,7 @@ impl<M> Sending<M> {
         while self.base < next {
             let kept = self.kept.pop_front().expect("a number between base and end is kept");
             self.bytes -= kept.bytes;
+            self.arrived += kept.bytes as u64;
             self.base += 1;
         }
         match self.cursor {
@@ -180,6 +206,7 @@ impl<M> Sending<M> {
         let lost = self.drain();
         self.epoch += 1;
         self.base = FIRST;
+        (self.arrived, self.until) = (0, None);
         self.cursor = Some(FIRST);
         Heard::Reset(lost)
     }

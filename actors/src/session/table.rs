@@ -55,7 +55,7 @@ fn rows<H: Clone>(
 }
 
 fn ack(memory: u64, of: u64, next: u64) -> Ack {
-    Ack { memory, epoch: 1, of, next, change: 0, held: Vec::new() }
+    Ack { memory, epoch: 1, of, next, change: 0, held: Vec::new(), room: None }
 }
 
 fn sending() -> String {
@@ -149,7 +149,7 @@ fn receiving() -> String {
             ("message 2 of 64 KiB on link 5", |half| format!("{:?}", half.arrive(5, 2, 64 << 10))),
         ],
         |half| {
-            let Ack { memory, of, next, .. } = half.clone().ack(1);
+            let Ack { memory, of, next, .. } = half.clone().ack(1, None);
             format!("memory {memory}, of {of}, next {next}, owes {}", half.owes_ack())
         },
     )

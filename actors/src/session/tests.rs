@@ -17,7 +17,7 @@ enum Frame {
 
 /// An Ack with this memory, epoch, epoch of the other and next number; nobody is held.
 fn word([memory, epoch, of, next]: [u64; 4]) -> Ack {
-    Ack { memory, epoch, of, next, change: 0, held: Vec::new() }
+    Ack { memory, epoch, of, next, change: 0, held: Vec::new(), room: None }
 }
 
 /// One of the two nodes.
@@ -50,7 +50,7 @@ impl Side {
     }
 
     fn say_ack(&mut self, out: &mut VecDeque<Frame>) {
-        out.push_back(Frame::Ack(self.receiving.ack(self.sending.epoch())));
+        out.push_back(Frame::Ack(self.receiving.ack(self.sending.epoch(), None)));
     }
 
     fn attach(&mut self, link: u64, out: &mut VecDeque<Frame>) {
@@ -313,7 +313,7 @@ fn a_former_connection_brings_nothing_in() {
     assert_eq!(receiving.arrive(2, 2, 10), Arrival::OutOfStep { expected: 2 }, "the epoch was not said");
     assert!(receiving.heard(2, 5));
     assert!(matches!(receiving.arrive(2, 2, 10), Arrival::Take { .. }));
-    assert_eq!(receiving.ack(9), word([1, 9, 5, 3]));
+    assert_eq!(receiving.ack(9, None), word([1, 9, 5, 3]));
 }
 
 #[test]
@@ -324,5 +324,5 @@ fn numbers_go_on_beyond_sixteen_bits() {
     for number in 1..=70_000u32 {
         assert!(matches!(receiving.arrive(1, number as u16, 1), Arrival::Take { .. }));
     }
-    assert_eq!(receiving.ack(1).next, 70_001);
+    assert_eq!(receiving.ack(1, None).next, 70_001);
 }

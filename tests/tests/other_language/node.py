@@ -171,7 +171,7 @@ link = None
 memory = epoch = time.monotonic_ns()
 their_epoch, their_next, untold = 0, 1, 0
 next_number, kept = 1, []  # what the peer has not acknowledged: (number, everything that its frame is made of)
-change, held = -1, []
+change, held, until = -1, [], 0  # whom the peer holds back; the number before which it has room
 version, sequence = 0, 0
 sent, told, confirmed = 0, 0, 0
 destination = None
@@ -209,12 +209,14 @@ def introduced(hello):
 
 
 def heard(ack):
-    """Who the peer says that it is, what it has, and whom it holds back (SESSION-5, CREDIT-2)."""
-    global their_epoch, their_next, change, held
+    """Who the peer says that it is, what it has, whom it holds back, and for how much it has room (SESSION-5, CREDIT-2, CREDIT-5)."""
+    global their_epoch, their_next, change, held, until
     if ack["epoch"] > their_epoch:
         their_epoch, their_next = ack["epoch"], 1
     has_before = ack["next"] if ack["of"] == epoch else 1
     kept[:] = [one for one in kept if one[0] >= has_before]
+    # Our frames are too short for the bytes to count.
+    until = max(until, has_before + ack.get("room", [1024])[0])
     if ack.get("change", 0) > change:
         change, held = ack.get("change", 0), ack.get("held", [])
     if not link.has_heard:
@@ -304,7 +306,8 @@ while not is_done():
         if untold >= 32 or untold and now - acknowledged >= 1:
             acknowledged = now
             acknowledge()
-        if destination and sent < count and destination & 0xffffffff not in held:  # class Control is 0
+        is_held = destination and destination & 0xffffffff in held  # class Control is 0
+        if destination and sent < count and next_number < until and not is_held:
             sent += 1
             send(kind_of(kind_name), us, destination, pack({"number": sent}), CONFIRM, sent)
 

@@ -312,7 +312,7 @@ impl ByHand {
         let theirs = self.try_hear_any().await.expect("the node says what it takes next");
         assert_eq!(theirs.header.kind, Kind::GNCL_ACK);
         let memory = Time::now().as_nanos();
-        let ours = Ack { memory, epoch: memory, of: 0, next: 1, change: 0, held: Vec::new() };
+        let ours = Ack { memory, epoch: memory, of: 0, next: 1, change: 0, held: Vec::new(), room: None };
         self.say(&frame(NINE, node.address(), Kind::GNCL_ACK, write(&ours))).await;
     }
 

@@ -2,7 +2,7 @@
 
 use std::{future::poll_fn, sync::Arc};
 
-use futures_util::FutureExt;
+use futures_util::{FutureExt, StreamExt};
 use sinew_runtime::{
     mailbox::Mailbox,
     outcome::{Outcome, Rejection},
@@ -10,11 +10,14 @@ use sinew_runtime::{
     router::LocalRoute,
     tid::Tid,
     time::Time,
-    wire::{Class, Flags, Message},
+    wire::{Class, Flags, Kind, Message},
 };
 
 use super::bench::{ByHand, NINE, Node, next, run, within};
-use crate::gncl::core::Lane;
+use crate::{
+    gncl::core::{Lane, read},
+    session::Ack,
+};
 
 /// Messages that wait for a peer at most, in these tests: a window, too.
 const QUEUE: usize = 64;
@@ -95,7 +98,7 @@ trait NextNow {
 
 impl NextNow for PostStream<Message> {
     fn next_now(&mut self) -> Option<Message> {
-        futures_util::StreamExt::next(self).now_or_never().flatten()
+        self.next().now_or_never().flatten()
     }
 }
 
@@ -269,5 +272,53 @@ fn what_waits_for_an_application_that_goes_is_refused_and_its_sender_is_held_no_
         a.stores.router.send(message).expect("there is room for it");
         let gone = Outcome::Rejected(Rejection::NoSuchApplication);
         assert_eq!(next("its outcome", &mut a.settled).await, (1, gone));
+    });
+}
+
+// spec: CREDIT-5
+#[test]
+fn a_peer_that_sends_what_it_may_to_many_who_take_nothing_is_refused_nothing() {
+    run(async {
+        const APPS: u32 = 12;
+        let mut node = Node::start_with(1, |config| config.gncl.queue_capacity = QUEUE).await;
+        let mut peer = ByHand::linked_to(&mut node).await;
+        let mut inboxes: Vec<_> = (1..=APPS).map(|number| node.app_of(number, MAILBOX)).collect();
+        // Given a peer that hears only when it has sent all that it may who takes nothing.
+        let (mut sent, mut until, mut bursts) = (0, 1 + QUEUE as u64, Vec::new());
+        for number in 1..=APPS {
+            let line = u64::from(node.tid(number).app.bits());
+            // To be held it must have more than its mailbox takes.
+            let (mut burst, mut is_held) = (0, false);
+            while !is_held || burst <= MAILBOX as u64 {
+                assert!(burst <= 2 * QUEUE as u64, "it is not held, and was sent {burst}");
+                while sent + 1 < until {
+                    let mut message = node.message(node.tid(number), b"");
+                    message.header.source.node = NINE;
+                    peer.say(&message).await;
+                    (sent, burst) = (sent + 1, burst + 1);
+                }
+                let word = peer.try_hear_any().await.expect("the link stands");
+                assert_eq!(word.header.kind, Kind::GNCL_ACK);
+                let ack: Ack = read(&word.payload).expect("an ACK has a payload");
+                until = until.max(ack.next + ack.room.expect("it says how much may come").0);
+                is_held = ack.held.contains(&line);
+            }
+            bursts.push(burst);
+        }
+        let way = node.stores.gncl.peer(NINE).expect("it is linked");
+        let arrived = || way.way(Lane::Control).expect("it has one").account().arrived;
+        within("all to have come", async {
+            while arrived().taken < sent {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        // Then more than three windows wait, and nothing was refused.
+        assert!(arrived().waiting as usize > 3 * QUEUE && arrived().refused == 0, "{:?}", arrived());
+        for (inbox, burst) in inboxes.iter_mut().zip(bursts) {
+            for _ in 0..burst {
+                next("a message for one of them", inbox).await;
+            }
+        }
     });
 }

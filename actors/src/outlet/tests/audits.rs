@@ -66,7 +66,7 @@ impl World {
 
     fn hear(&self, next: u64) {
         let of = self.bench.outlet.epoch();
-        let ack = Ack { memory: self.memory, epoch: 1, of, next, change: 0, held: Vec::new() };
+        let ack = Ack { memory: self.memory, epoch: 1, of, next, change: 0, held: Vec::new(), room: None };
         self.bench.outlet.heard(self.bench.link, &ack, Time::now());
     }
 

@@ -96,7 +96,7 @@ impl World {
         let held: BTreeSet<u8> = (0..3).filter(|to| held >> to & 1 == 1).collect();
         self.change += u64::from(!is_stale);
         let keys = held.iter().copied().map(key).collect();
-        let ack = Ack { memory: 1, epoch: 1, of: 1, next: 1, change: self.change, held: keys };
+        let ack = Ack { memory: 1, epoch: 1, of: 1, next: 1, change: self.change, held: keys, room: None };
         self.bench.outlet.heard(self.bench.link, &ack, Time::now());
         if !is_stale {
             for to in held.difference(&self.held) {

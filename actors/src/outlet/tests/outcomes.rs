@@ -27,7 +27,7 @@ fn bench(takes_outcomes: bool, payload_max: usize) -> Bench {
 }
 
 fn hear(bench: &Bench, next: u64) {
-    let ack = Ack { memory: 1, epoch: 1, of: 1, next, change: 0, held: Vec::new() };
+    let ack = Ack { memory: 1, epoch: 1, of: 1, next, change: 0, held: Vec::new(), room: None };
     bench.outlet.heard(bench.link, &ack, Time::now());
 }
 

@@ -17,7 +17,7 @@ pub(super) fn session(room: usize) -> Bench {
 
 fn hear(bench: &Bench, next: u64, held: Vec<u64>) {
     let change = held.len() as u64 + 1;
-    let ack = Ack { memory: 1, epoch: 1, of: 1, next, change, held };
+    let ack = Ack { memory: 1, epoch: 1, of: 1, next, change, held, room: None };
     bench.outlet.heard(bench.link, &ack, Time::now());
 }
 

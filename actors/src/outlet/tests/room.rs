@@ -59,7 +59,7 @@ fn who_keeps_a_confirmed_message_is_woken_also_by_several_outcomes_at_once() {
     // when: none has arrived before a cut, and the time of all is over
     bench.outlet.disconnect(bench.link);
     bench.reconnect(PLENTY);
-    let ack = Ack { memory: 1, epoch: 1, of: 1, next: 1, change: 1, held: Vec::new() };
+    let ack = Ack { memory: 1, epoch: 1, of: 1, next: 1, change: 1, held: Vec::new(), room: None };
     bench.outlet.heard(bench.link, &ack, Time::MAX);
     // then
     assert_eq!(bench.ledger.take().len(), 4 + 1, "the one that was kept ends here, too");
