@@ -19,7 +19,10 @@ use sinew_runtime::{
 };
 
 use super::bench::{ByHand, NINE, Node, introduction, pair, run, within};
-use crate::gncl::core::{Introduction, Lane};
+use crate::{
+    gncl::core::{Introduction, Lane},
+    stores::ClockOffset,
+};
 
 /// Longer than any test.
 const LONG: Duration = Duration::from_secs(60);
@@ -142,6 +145,8 @@ fn a_request_that_waits_at_the_other_node_for_a_full_mailbox_is_taken_back() {
 fn a_request_whose_time_is_over_is_not_handled_though_nobody_takes_it_back() {
     run(async {
         let (a, b) = pair().await;
+        // Else it would count as sent when it came.
+        b.stores.clocks.set(a.address(), ClockOffset { theirs_minus_ours_ns: 0, bound: Duration::ZERO });
         let (asker, mut asked) = (App::of(&a, 1, 8), App::of(&b, 1, 8));
         let reply = asker.ask(b.tid(1), 1, Duration::from_millis(30));
         asked.holds(1).await;

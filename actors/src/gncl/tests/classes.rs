@@ -2,7 +2,7 @@
 
 use sinew_runtime::{
     outcome::Outcome,
-    wire::{Class, Message},
+    wire::{Class, Kind, Message},
 };
 
 use super::bench::{ByHand, Cable, NINE, Node, introduction, next, pair, run};
@@ -56,7 +56,12 @@ fn control_arrives_while_bulk_is_not_read() {
         // Until the socket and the queue before it are full.
         while node.stores.router.send(of_class(Class::Bulk, node.message(to, &long))).is_ok() {}
         node.send(to, b"in time");
-        assert_eq!(first.hear().await.payload[..], *b"in time");
+        let mut heard = first.hear().await;
+        while heard.header.kind == Kind::GNCL_PING {
+            // Filling the other one took long.
+            heard = first.hear().await;
+        }
+        assert_eq!(heard.payload[..], *b"in time");
     });
 }
 
