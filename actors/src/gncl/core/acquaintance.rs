@@ -79,6 +79,11 @@ impl Acquaintance {
         self.found.filter(|_| self.wanted.is_some())
     }
 
+    /// Whether only its own hello tells of it, and something is kept for it.
+    pub(super) fn is_claim(&self) -> bool {
+        self.vouched().is_none() && (self.link.is_some() || self.orphan_at.is_some())
+    }
+
     /// Whether nothing would be lost by forgetting it.
     pub(super) const fn is_idle(&self) -> bool {
         self.wanted.is_none() && self.link.is_none() && self.dial.is_none()

@@ -106,6 +106,7 @@ impl Core {
             return Err(Decline::Leaving);
         }
         check(hello, &self.settings.ours)?;
+        self.room_for_claim(hello.node)?;
         let Some(peer) = self.peers.get(&hello.node) else { return self.room() };
         // spec: GNCL-7
         if hello.incarnation < peer.incarnation {
@@ -121,6 +122,16 @@ impl Core {
         let said_hello = dials.any(|dial| matches!(self.stage(dial), Some(Stage::HelloSent(..))));
         if is_void || (said_hello && self.settings.ours.node < hello.node) {
             return Err(Decline::Duplicate);
+        }
+        Ok(())
+    }
+
+    /// Whether one more peer can be taken of which nobody but itself has told: whoever can connect can say that it is any node.
+    fn room_for_claim(&self, node: NodeAddress) -> Result<(), Decline> {
+        let strangers_max = self.settings.strangers_max;
+        let is_new = self.peers.get(&node).is_none_or(|peer| peer.vouched().is_none() && !peer.is_claim());
+        if is_new && self.peers.values().filter(|peer| peer.is_claim()).count() >= strangers_max {
+            return Err(Decline::TooManyClaims { strangers_max });
         }
         Ok(())
     }

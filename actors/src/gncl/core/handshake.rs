@@ -131,6 +131,9 @@ pub(crate) enum Decline {
     TooManyPeers {
         peers_max: usize,
     },
+    TooManyClaims {
+        strangers_max: usize,
+    },
     TooLate,
     Leaving,
 }
@@ -147,7 +150,7 @@ impl Decline {
             Self::Stale { .. } => "stale incarnation",
             Self::Contested { .. } => "contested",
             Self::Duplicate => "duplicate",
-            Self::TooManyPeers { .. } => "too many peers",
+            Self::TooManyPeers { .. } | Self::TooManyClaims { .. } => "too many peers",
             Self::TooLate => "too late",
             Self::Leaving => "leaving",
         }
@@ -192,6 +195,11 @@ impl fmt::Display for Decline {
             Self::TooManyPeers { peers_max } => {
                 write!(f, "I have {peers_max} peers, which is my limit; raise `ndl.nodes_max`")
             }
+            Self::TooManyClaims { strangers_max } => write!(
+                f,
+                "I have {strangers_max} peers of which my NDL has not told me, which is my limit; see that our nodes find each \
+                 other, or raise `gncl.strangers_max`"
+            ),
             Self::TooLate => f.write_str("the handshake took longer than `gncl.handshake` allows"),
             Self::Leaving => f.write_str("this node is being stopped"),
         }

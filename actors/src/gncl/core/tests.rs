@@ -289,6 +289,24 @@ fn a_full_table_refuses_newcomers_unless_somebody_in_it_is_gone() {
 }
 
 #[test]
+fn of_peers_that_only_their_own_hello_tells_of_there_are_as_many_as_of_other_strangers() {
+    let mut core = Core::new(Settings { peers_max: 10, ..settings(LOW, 1) }, 7);
+    let node = |number| NodeAddress::new(HIGH.bits() + number);
+    for number in 0..3 {
+        let (_, taken) = greet(&mut core, millis(0), hello_from(node(number), 1, 1));
+        assert_eq!(refusal(&taken), None);
+    }
+    let (_, refused) = greet(&mut core, millis(1), hello_from(node(3), 1, 1));
+    assert_eq!(refusal(&refused), Some("too many peers"));
+    let (_, again) = greet(&mut core, millis(2), hello_from(node(0), 1, 2));
+    assert_eq!(refusal(&again), None, "it is one of them");
+    core.handle(millis(3), found(1));
+    outputs(&mut core);
+    let (_, taken) = greet(&mut core, millis(4), hello_from(node(3), 1, 2));
+    assert_eq!(refusal(&taken), None, "NDL has told of one of the others");
+}
+
+#[test]
 fn who_says_goodbye_has_left_and_is_not_dialled() {
     let mut core = core();
     core.handle(millis(0), found(1));
