@@ -3,6 +3,10 @@
 //!
 //! Nothing is made in the namespace of the machine itself, so nothing can leave it.
 
+mod radio;
+
+pub use self::radio::{Carried, Radio, Weather};
+
 use std::{
     net::Ipv4Addr,
     path::Path,

@@ -8,7 +8,7 @@ use exoskeleton::robot::launch::faults::{self, ContrastRun, FaultOptions, FaultR
 
 use super::{RunError, Verdict};
 
-/// Injects the faults of steps 4 to 9 and 11 of the demonstration into a walking robot and says what came of them.
+/// Injects the faults of steps 4 to 11 of the demonstration into a walking robot and says what came of them.
 ///
 /// Five processes walk on this host until the phase is found and assistance has risen. Then one fault after the other
 /// is injected at a phase of the stride, and the traces of all processes are held against what is claimed:
@@ -17,7 +17,8 @@ use super::{RunError, Verdict};
 /// pulled (SIGKILL) | 7 it returns | 8 e-stop (software, not a safety function) | 9 insane commands | 11 central is killed
 ///
 /// Where root and network namespaces are to be had, 6 and 7 are done once more with the link of the knee's node, on a
-/// second robot with a host for each process (link-down); elsewhere the report says why not.
+/// second robot with a host for each process (link-down), and 10 with a third one, whose nodes' network loses and
+/// delays packets; elsewhere the report says why not.
 ///
 /// In the end the contrast: the ankle's drive hangs at push-off (SIGSTOP; a killed one would be back too soon to show it),
 /// with and without a device watchdog; faults.svg in the run folder has both beside each other.
@@ -29,7 +30,7 @@ use super::{RunError, Verdict};
 #[derive(Debug, clap::Args)]
 #[command(verbatim_doc_comment)]
 pub(super) struct FaultArguments {
-    /// Only these of 4, 5, 6, 7, 8, 9, 11, link-down and contrast, for example 4,6,contrast.
+    /// Only these of 4, 5, 6, 7, 8, 9, 10, 11, link-down and contrast, for example 4,6,contrast.
     #[arg(long, value_delimiter = ',', value_name = "STEPS")]
     only: Vec<Item>,
     /// Phases of the stride at which the knee's drive is killed, 0 to 1.
@@ -47,7 +48,7 @@ pub(super) struct FaultArguments {
     /// Silence after which a device damps by itself, ms.
     #[arg(long, value_name = "MS", default_value_t = 8, value_parser = clap::value_parser!(u64).range(1..=10_000))]
     device_watchdog: u64,
-    /// For machines that others share: one phase, no link-down, the contrast in virtual time, and only what has to hold
+    /// For machines that others share: one phase, no link-down, no 10, the contrast in virtual time, and only what has to hold
     /// on every machine counts for the exit code.
     #[arg(long)]
     short: bool,
@@ -58,6 +59,7 @@ pub(super) struct FaultArguments {
 enum Item {
     Step(Step),
     LinkDown,
+    RoughNetwork,
     Contrast,
 }
 
@@ -68,6 +70,7 @@ impl FromStr for Item {
         match text.trim() {
             "contrast" => Ok(Self::Contrast),
             "link-down" => Ok(Self::LinkDown),
+            "10" => Ok(Self::RoughNetwork),
             number => number.parse().map(Self::Step),
         }
     }
@@ -91,7 +94,7 @@ fn options(arguments: &FaultArguments) -> Result<FaultOptions, RunError> {
     let only = &arguments.only;
     let step = |item: &Item| match item {
         Item::Step(step) => Some(*step),
-        Item::LinkDown | Item::Contrast => None,
+        Item::LinkDown | Item::RoughNetwork | Item::Contrast => None,
     };
     let steps = if only.is_empty() { Step::ALL.to_vec() } else { only.iter().filter_map(step).collect() };
     let with_contrast = only.is_empty() || only.contains(&Item::Contrast);
@@ -104,6 +107,7 @@ fn options(arguments: &FaultArguments) -> Result<FaultOptions, RunError> {
         seed: arguments.seed,
         device_watchdog: Duration::from_millis(arguments.device_watchdog),
         link_down: only.is_empty() && !arguments.short || only.contains(&Item::LinkDown),
+        rough_network: only.is_empty() && !arguments.short || only.contains(&Item::RoughNetwork),
         contrast: with_contrast.then_some(if arguments.short {
             ContrastRun::LockStep
         } else {

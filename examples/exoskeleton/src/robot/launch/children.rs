@@ -12,6 +12,8 @@ use rustix::process::{Pid, Signal, kill_process};
 use sinew::Time;
 
 use super::LaunchError;
+use sinew_hosts::{Carried, Weather};
+
 use super::hosts::{Hosts, Link};
 use crate::robot::role::Role;
 
@@ -105,6 +107,18 @@ impl Children {
         let at = Time::now();
         hosts.set(role, link)?;
         Ok(at)
+    }
+
+    /// From now on this happens to what the nodes send each other; when, and what became of it before.
+    ///
+    /// # Errors
+    /// The nodes are not on a radio.
+    pub(super) fn set_weather(&self, weather: Weather) -> io::Result<(Time, Carried)> {
+        let Some(hosts) = &self.hosts else {
+            return Err(io::Error::other("all processes share this host: there is no network between them"));
+        };
+        let at = Time::now();
+        Ok((at, hosts.set_weather(weather)?))
     }
 
     /// The processes that a process of the run has started itself: those of its node's applications.

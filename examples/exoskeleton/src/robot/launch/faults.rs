@@ -21,7 +21,7 @@ use serde::Serialize;
 use sinew::{NodeAddress, Outcome, Time};
 use thiserror::Error;
 
-use super::hosts::Hosts;
+use super::hosts::{Hosts, Network};
 use super::{LaunchError, new_folder};
 use crate::joint::Joint;
 use crate::lockstep::LockStepError;
@@ -56,6 +56,8 @@ pub struct FaultOptions {
     /// Whether the node is also pulled by its link, on hosts made of network namespaces; where they cannot be made the
     /// report says so.
     pub link_down: bool,
+    /// Whether the nodes are also joined by a network that loses and delays packets; where that cannot be made the report says so.
+    pub rough_network: bool,
     /// How the contrast is run; none: not.
     pub contrast: Option<ContrastRun>,
     /// Folder for the run folders.
@@ -146,10 +148,13 @@ pub fn run(options: &FaultOptions) -> Result<FaultReport, FaultError> {
         left = one_robot(options, robot, &folder, left, &mut report)?;
     }
     if options.link_down {
-        on_hosts(options, &folder, &mut report);
+        on_hosts(options, Network::Cables, &folder, &mut report);
     } else if options.steps.contains(&Step::PullNode) {
         let words = "steps 6 and 7 with a link that is cut: not asked for, see --only link-down";
         report.skipped.push(words.to_owned());
+    }
+    if options.rough_network {
+        on_hosts(options, Network::Radio(options.seed), &folder, &mut report);
     }
     report.claims.sort_by_key(|claim| claim.step.map_or(u8::MAX, u8::from));
     if let Some(how) = options.contrast {
@@ -165,24 +170,28 @@ pub fn run(options: &FaultOptions) -> Result<FaultReport, FaultError> {
     Ok(report)
 }
 
-/// The steps that take a link to cut: a robot with a host for each process.
-fn on_hosts(options: &FaultOptions, folder: &Path, report: &mut FaultReport) {
-    let hosts = match Hosts::new() {
+/// The steps that take a network of one's own: a robot with a host for each process.
+fn on_hosts(options: &FaultOptions, network: Network, folder: &Path, report: &mut FaultReport) {
+    let (what, steps, name) = match network {
+        Network::Cables => ("steps 6 and 7 with a link that is cut", &Step::ON_HOSTS[..], "robot-on-hosts"),
+        Network::Radio(_) => ("step 10", &Step::ON_RADIO[..], "robot-on-radio"),
+    };
+    let hosts = match Hosts::new(network) {
         Ok(hosts) => hosts,
         Err(why) => {
-            let words = format!("steps 6 and 7 with a link that is cut: no hosts can be made here, {why}");
+            let words = format!("{what}: no hosts can be made here, {why}");
             say(&words);
             report.skipped.push(words);
             return;
         }
     };
-    let folder = folder.join("robot-on-hosts");
+    let folder = folder.join(name);
     let walked = std::fs::create_dir(&folder).map_err(FaultError::from).and_then(|()| {
         let robot = Robot::start(&topology_on_hosts(options)?, Some(hosts), &folder)?;
-        one_robot(options, robot, &folder, &Step::ON_HOSTS, report)
+        one_robot(options, robot, &folder, steps, report)
     });
     if let Err(error) = walked {
-        report.failures.push(format!("steps 6 and 7 with a link that is cut: {error}"));
+        report.failures.push(format!("{what}: {error}"));
     }
 }
 

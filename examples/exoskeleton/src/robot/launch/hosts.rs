@@ -11,6 +11,7 @@ use std::os::fd::AsFd;
 use std::process::{Child, Command, Stdio};
 
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
+use sinew_hosts::{Carried, Radio, Weather};
 
 use crate::robot::role::Role;
 
@@ -22,7 +23,27 @@ const NETWORKS: [&str; 2] = ["nodes", "devices"];
 pub(super) struct Hosts {
     /// The namespace of each process, in the order of [`Role::ALL`].
     namespaces: Vec<File>,
-    switch: Switch,
+    /// That of the bridges, which is there as long as somebody holds it.
+    _bridges: File,
+    between: Between,
+}
+
+/// What joins the nodes.
+#[derive(Debug)]
+enum Between {
+    /// A bridge whose ports come and go.
+    Bridge(Switch),
+    /// A network that loses and delays packets.
+    Radio(Radio),
+}
+
+/// What is to join the nodes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Network {
+    /// A cable each.
+    Cables,
+    /// One that can lose and delay packets; all chance comes from this seed.
+    Radio(u64),
 }
 
 /// Whether a host hears the others.
@@ -33,21 +54,30 @@ pub(super) enum Link {
 }
 
 impl Hosts {
-    /// Makes a host for each process.
+    /// Makes a host for each process, the nodes joined by `network`.
     ///
     /// # Errors
     /// A sentence why that is not possible here: no root, no `ip`, or a kernel without namespaces.
-    pub(super) fn new() -> Result<Self, String> {
+    pub(super) fn new(network: Network) -> Result<Self, String> {
         let bridges = Named::new("bridges")?;
         for network in NETWORKS {
             bridges.ip(&format!("link add {network} type bridge"))?;
             bridges.ip(&format!("link set {network} up"))?;
         }
-        let namespaces = Role::ALL.map(|role| Self::host(role, &bridges));
-        Ok(Self {
-            namespaces: namespaces.into_iter().collect::<Result<_, _>>()?,
-            switch: Switch::start(&bridges)?,
-        })
+        let hosts = Role::ALL.map(|role| Self::host(role, &bridges, network));
+        let hosts = hosts.into_iter().collect::<Result<Vec<_>, _>>()?;
+        let namespaces = hosts.iter().map(Named::open).collect::<Result<Vec<_>, _>>()?;
+        let between = match network {
+            Network::Cables => Between::Bridge(Switch::start(&bridges)?),
+            Network::Radio(seed) => Between::Radio(Radio::between(&namespaces, NETWORKS[0], seed)?),
+        };
+        for (role, host) in Role::ALL.into_iter().zip(&hosts) {
+            for (index, network) in NETWORKS.into_iter().enumerate() {
+                host.ip(&format!("address add {}/24 dev {network}", address(index, role)))?;
+                host.ip(&format!("link set {network} up"))?;
+            }
+        }
+        Ok(Self { namespaces, _bridges: bridges.open()?, between })
     }
 
     /// Address of a process's host among the nodes.
@@ -60,19 +90,18 @@ impl Hosts {
         address(1, role)
     }
 
-    /// A host on both networks.
-    fn host(role: Role, bridges: &Named) -> Result<File, String> {
+    /// A host with its cables to both networks, or to the devices alone.
+    fn host(role: Role, bridges: &Named, nodes: Network) -> Result<Named, String> {
         let host = Named::new(role.name())?;
         host.ip("link set lo up")?;
-        for (index, network) in NETWORKS.into_iter().enumerate() {
+        let cables = if nodes == Network::Cables { &NETWORKS[..] } else { &NETWORKS[1..] };
+        for network in cables.iter().copied() {
             let port = port(network, role);
             bridges.ip(&format!("link add {port} type veth peer name {network} netns {}", host.0))?;
             bridges.ip(&format!("link set {port} master {network}"))?;
             bridges.ip(&format!("link set {port} up"))?;
-            host.ip(&format!("address add {}/24 dev {network}", address(index, role)))?;
-            host.ip(&format!("link set {network} up"))?;
         }
-        host.open()
+        Ok(host)
     }
 
     /// Starts a process on its host.
@@ -86,7 +115,21 @@ impl Hosts {
             Link::Up => "up",
             Link::Down => "down",
         };
-        self.switch.order(&format!("link set {} {state}", port(NETWORKS[0], role)))
+        match &mut self.between {
+            Between::Bridge(switch) => switch.order(&format!("link set {} {state}", port(NETWORKS[0], role))),
+            Between::Radio(_) => Err(io::Error::other("nodes on a radio have no cable to pull")),
+        }
+    }
+
+    /// From now on this happens to what the nodes send. What became of it so far is returned.
+    pub(super) fn set_weather(&self, weather: Weather) -> io::Result<Carried> {
+        match &self.between {
+            Between::Radio(radio) => {
+                radio.set(weather);
+                Ok(radio.carried())
+            }
+            Between::Bridge(_) => Err(io::Error::other("cables have no weather")),
+        }
     }
 }
 

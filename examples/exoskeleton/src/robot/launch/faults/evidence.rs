@@ -51,6 +51,17 @@ pub(super) const fn span(from: Time, to: Time) -> Span {
     from.as_nanos()..to.as_nanos()
 }
 
+/// Some values in their order.
+pub(super) struct Quantiles(Vec<u32>);
+
+impl Quantiles {
+    /// The value that a share of them does not exceed.
+    pub(super) fn at(&self, share: f64) -> Option<f64> {
+        let last = self.0.len().checked_sub(1)?;
+        self.0.get((last as f64 * share).round() as usize).map(|value| f64::from(*value))
+    }
+}
+
 impl Evidence {
     pub(super) fn read(folder: &Path, stop: Time) -> io::Result<Self> {
         let traces = Traces::read(folder, stop)?;
@@ -158,6 +169,14 @@ impl Evidence {
             entries.count()
         };
         joints.iter().map(entered).sum()
+    }
+
+    /// Ages of the gait states that the drives used, us.
+    pub(super) fn gait_ages_us(&self, span: &Span) -> Quantiles {
+        let rows = Joint::ALL.into_iter().flat_map(|joint| self.drive(joint, span.clone()));
+        let mut ages: Vec<u32> = rows.filter_map(|row| row.gait_age_us).collect();
+        ages.sort_unstable();
+        Quantiles(ages)
     }
 
     /// Share of the ticks of these drives in `state`, per cent, of the one that has the least; without those around a

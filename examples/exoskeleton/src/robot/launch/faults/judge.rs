@@ -54,6 +54,8 @@ const STOPPED_BELOW_NM: f64 = 0.1;
 const SETTLED_NS: u64 = 50_000_000;
 /// From an e-stop to torques that are exactly zero, ns.
 const STOPPED_NS: u64 = 200_000_000;
+/// How much worse the leg may follow the person on a rough network, degrees.
+const ROUGH_GROWS_DEG: f64 = 0.3;
 /// A stride and a bit, ns.
 const STRIDE_NS: u64 = 1_400_000_000;
 
@@ -70,6 +72,7 @@ pub(super) fn judge(evidence: &Evidence, injection: &Injection, failure: Option<
         Step::KillCentral => kill_central(&mut claims, evidence, injection),
         Step::CutLink => cut_link(&mut claims, evidence, injection),
         Step::JoinLink => join_link(&mut claims, evidence, injection),
+        Step::RoughNetwork => rough_network(&mut claims, evidence, injection),
     }
     let whole = span(injection.at, injection.until);
     claims.exactly("samples with a torque above the limit", 0, evidence.above_limit(&whole));
@@ -338,6 +341,38 @@ fn insane_commands(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Inj
     claims.timing("SAFE without a stall of the host", [0.0, 0.0, REPORTED], Some(unexplained as f64));
     let deviation = evidence.deviation_max_deg(Joint::Ankle, whole);
     claims.told("greatest deviation of the ankle meanwhile, deg", deviation);
+}
+
+/// Nobody stops for a network that loses some packets, and the leg walks as well as before.
+fn rough_network(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection) {
+    let rough = span(injection.at, injection.until);
+    let safe = evidence.unexplained_safe(&Joint::ALL, &rough);
+    claims.timing("SAFE without a stall of the host", [0.0, 0.0, REPORTED], Some(safe as f64));
+    let assisted = evidence.share_in_percent(DriveState::Walk, &Joint::ALL, &rough);
+    claims.told("ticks in which the least of the drives assists, %", Some(assisted));
+    let ages = evidence.gait_ages_us(&rough);
+    for (name, share) in [("p50", 0.5), ("p99", 0.99), ("p99.9", 0.999)] {
+        claims.told(
+            &format!("age of the gait state in the drives, {name}, ms"),
+            ages.at(share).map(|us| us * 1e-3),
+        );
+    }
+    let clear = span(injection.when(Mark::Clear).unwrap_or(injection.at), injection.at);
+    for joint in Joint::ALL {
+        let [before, after] = [&clear, &rough].map(|span| evidence.deviation_rms_deg(joint, span.clone()));
+        let grows = before.zip(after).map(|(before, after)| after - before);
+        claims.timing(
+            &format!("RMS of the {joint} grows by, deg"),
+            [ROUGH_GROWS_DEG, ROUGH_GROWS_DEG, REPORTED],
+            grows,
+        );
+    }
+    let lost = Part::ALL.into_iter().flat_map(|part| evidence.events(part, rough.clone()));
+    claims.exactly(
+        "nodes that were said to be lost",
+        0,
+        lost.filter(|event| event.what == "node_lost").count(),
+    );
 }
 
 fn kill_central(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection) {

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use rustix::process::Pid;
 use sinew::Time;
+use sinew_hosts::{Carried, Weather};
 
 use super::operator::Operator;
 use super::{FaultError, say};
@@ -96,6 +97,11 @@ impl Robot {
     /// Cuts the link of a joint's node to the others, or joins it again; returns when.
     pub(super) fn set_link(&mut self, joint: Joint, link: Link) -> Result<Time, FaultError> {
         Ok(self.children.set_link(Role::Node(Part::Joint(joint)), link)?)
+    }
+
+    /// From now on this happens to what the nodes send each other; when, and what became of it before.
+    pub(super) fn set_weather(&self, weather: Weather) -> Result<(Time, Carried), FaultError> {
+        Ok(self.children.set_weather(weather)?)
     }
 
     /// The process of a joint's drive, a child of its node's.

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use rustix::process::{Signal, kill_process};
 use sinew::{Outcome, Time};
+use sinew_hosts::Weather;
 
 use super::operator::Word;
 use super::robot::Robot;
@@ -39,6 +40,14 @@ const REJOINED: Duration = Duration::from_millis(500);
 const OUTAGE: Duration = Duration::from_secs(1);
 /// How long it is watched after a release whether it walks as before: five seconds are allowed, the last stride counts whole.
 const WATCHED: Duration = Duration::from_millis(6_500);
+/// What a rough network does to packets: the share that is lost, per cent, beside a delay of this much, give or take.
+const ROUGH: [(f64, &str); 3] =
+    [(0.0, "none lost, 2 ms +- 1 ms"), (1.0, "1 % lost, 2 ms +- 1 ms"), (5.0, "5 % lost, 2 ms +- 1 ms")];
+const ROUGH_DELAY: Duration = Duration::from_millis(2);
+const ROUGH_JITTER: Duration = Duration::from_millis(1);
+/// Strides in a clear network that those in a rough one are held against.
+const STRIDES_CLEAR: u32 = 6;
+const STRIDES_ROUGH: u32 = 12;
 /// How long it is watched that nothing moves.
 const STILL: Duration = Duration::from_secs(1);
 /// Time for things to happen that are looked at afterwards.
@@ -72,6 +81,8 @@ pub(super) enum Mark {
     Started,
     /// What was stopped goes on.
     Continued,
+    /// The network is clear, from here on.
+    Clear,
     /// All parts are there, the leg is held.
     Held,
     /// The operator has released walking.
@@ -136,7 +147,8 @@ impl Injection {
             | Step::EmergencyStop
             | Step::InsaneCommands
             | Step::KillCentral
-            | Step::CutLink => 0,
+            | Step::CutLink
+            | Step::RoughNetwork => 0,
         }
     }
 
@@ -175,6 +187,7 @@ pub(super) fn perform(
         Step::KillCentral => kill_central(robot, out),
         Step::CutLink => cut_link(robot, out),
         Step::JoinLink => join_link(robot, out),
+        Step::RoughNetwork => rough_network(robot, out),
     }
 }
 
@@ -258,6 +271,27 @@ fn join_link(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), FaultErr
     let at = robot.set_link(Joint::Knee, Link::Up)?;
     out.push(Injection::begun(Step::JoinLink, "link up", at));
     hold_and_release(robot, out.last_mut().expect("it was just pushed"))
+}
+
+/// All that the nodes send each other is delayed, and a share of it lost; before that the same robot walks in clear weather.
+fn rough_network(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), FaultError> {
+    for (percent, label) in ROUGH {
+        robot.set_weather(Weather::default())?;
+        robot.wait_converged()?;
+        let clear = Time::now();
+        robot.wait_strides(STRIDES_CLEAR)?;
+        let weather = Weather { loss: percent / 100.0, delay: ROUGH_DELAY, jitter: ROUGH_JITTER };
+        let (at, before) = robot.set_weather(weather)?;
+        out.push(Injection::begun(Step::RoughNetwork, label, at));
+        let injection = out.last_mut().expect("it was just pushed");
+        injection.mark(Mark::Clear, clear);
+        robot.wait_strides(STRIDES_ROUGH)?;
+        let (until, after) = robot.set_weather(Weather::default())?;
+        injection.until = until;
+        let (arrived, lost) = (after.arrived - before.arrived, after.lost - before.lost);
+        say(&format!("  {arrived} packets arrived, {lost} were lost"));
+    }
+    Ok(())
 }
 
 /// From all parts being there to walking: a second in which nothing moves, the release, the ramp, three strides or more.

@@ -27,6 +27,8 @@ pub enum Step {
     CutLink,
     /// 7 too: it is joined again.
     JoinLink,
+    /// 10: the network between the nodes loses and delays packets.
+    RoughNetwork,
 }
 
 impl Step {
@@ -44,6 +46,9 @@ impl Step {
     /// Those of a robot whose nodes have hosts of their own.
     pub(super) const ON_HOSTS: [Self; 2] = [Self::CutLink, Self::JoinLink];
 
+    /// Those of a robot whose nodes have a network that can lose and delay packets.
+    pub(super) const ON_RADIO: [Self; 1] = [Self::RoughNetwork];
+
     /// What it does, in a few words.
     #[must_use]
     pub const fn words(self) -> &'static str {
@@ -57,6 +62,7 @@ impl Step {
             Self::KillCentral => "the central unit is killed",
             Self::CutLink => "the link of the knee's node is cut",
             Self::JoinLink => "its link is joined again",
+            Self::RoughNetwork => "the network of the nodes loses and delays packets",
         }
     }
 }
@@ -70,6 +76,7 @@ impl From<Step> for u8 {
             Step::ReturnNode | Step::JoinLink => 7,
             Step::EmergencyStop => 8,
             Step::InsaneCommands => 9,
+            Step::RoughNetwork => 10,
             Step::KillCentral => 11,
         }
     }
@@ -97,7 +104,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn step_reads_back_from_its_number_and_ten_is_none() {
+    fn step_reads_back_from_its_number_and_ten_is_for_another_robot() {
         for step in Step::ALL {
             assert_eq!(step.to_string().parse(), Ok(step));
         }
