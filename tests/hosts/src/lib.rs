@@ -1,18 +1,23 @@
 //! Hosts made of network namespaces: each has one interface, or one in each of several networks; those of a network are joined by a
-//! bridge, in a namespace of its own.
+//! bridge, in a namespace of its own, or by a [`Radio`].
 //!
 //! Nothing is made in the namespace of the machine itself, so nothing can leave it.
 
-mod radio;
-
-pub use self::radio::{Carried, Radio, Weather};
-
 use std::{
+    fs::File,
     net::Ipv4Addr,
+    os::fd::AsFd,
     path::Path,
     process::Command,
     sync::atomic::{AtomicU32, Ordering},
+    thread,
 };
+
+use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
+
+pub use self::radio::{Carried, Radio, Weather};
+
+mod radio;
 
 /// How many hosts this process has made networks of: part of their names.
 static NETWORKS: AtomicU32 = AtomicU32::new(0);
@@ -22,6 +27,7 @@ static NETWORKS: AtomicU32 = AtomicU32::new(0);
 pub struct Hosts {
     bridge: Namespace,
     hosts: Vec<Host>,
+    radio: Option<Radio>,
 }
 
 /// One host.
@@ -64,7 +70,34 @@ impl Hosts {
         }
         let host = |index| Host::new(&number, index, &bridge, networks);
         let hosts = (1..=count).map(host).collect::<Result<_, _>>()?;
-        Ok(Self { bridge, hosts })
+        Ok(Self { bridge, hosts, radio: None })
+    }
+
+    /// Makes `count` hosts, 10.77.0.1 and up, whose network can lose and delay packets ([`set_weather`](Self::set_weather)). All chance
+    /// comes from `seed`.
+    ///
+    /// # Errors
+    /// A sentence: no root, no `ip`, or a kernel without namespaces or TAP devices.
+    pub fn on_radio(count: u8, seed: u64) -> Result<Self, String> {
+        let mut hosts = Self::in_networks(count, 0)?;
+        let namespaces =
+            hosts.hosts.iter().map(|host| host.namespace.open()).collect::<Result<Vec<_>, _>>()?;
+        hosts.radio = Some(Radio::between(&namespaces, "eth0", seed)?);
+        for host in &hosts.hosts {
+            host.namespace.ip(&format!("address add {}/24 dev eth0", host.address))?;
+            host.namespace.ip("link set eth0 up")?;
+        }
+        Ok(hosts)
+    }
+
+    /// From now on this happens to each frame. What became of those before is returned.
+    ///
+    /// # Panics
+    /// If these hosts are not on a radio.
+    pub fn set_weather(&self, weather: Weather) -> Carried {
+        let radio = self.radio.as_ref().expect("hosts that `on_radio` has made");
+        radio.set(weather);
+        radio.carried()
     }
 
     /// The hosts.
@@ -142,6 +175,21 @@ impl Host {
         Ok(Self { namespace, address: address(index, 0), index })
     }
 
+    /// Runs `work` on this host, on a thread of its own.
+    ///
+    /// # Panics
+    /// If the host has gone, or `work` panics.
+    pub fn run<R: Send>(&self, work: impl FnOnce() -> R + Send) -> R {
+        let namespace = self.namespace.open().unwrap_or_else(|error| panic!("{error}"));
+        let work = || {
+            let entered = move_into_link_name_space(namespace.as_fd(), Some(LinkNameSpaceType::Network));
+            entered.unwrap_or_else(|error| panic!("the namespace of {}: {error}", self.address));
+            work()
+        };
+        thread::scope(|scope| scope.spawn(work).join())
+            .unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+    }
+
     /// A command that runs `program` on this host.
     #[must_use]
     pub fn command(&self, program: &Path) -> Command {
@@ -163,6 +211,12 @@ impl Namespace {
     fn new(name: String) -> Result<Self, String> {
         run("ip", &["netns", "add", &name])?;
         Ok(Self(name))
+    }
+
+    /// Itself, to be entered.
+    fn open(&self) -> Result<File, String> {
+        File::open(format!("/run/netns/{}", self.0))
+            .map_err(|error| format!("the namespace {}: {error}", self.0))
     }
 
     /// `ip` inside this namespace.
