@@ -133,7 +133,7 @@ impl AsyncEndpoint {
     /// # Errors
     /// The message asks for no reply, or the reply was not sent.
     pub async fn reply_message(&mut self, request: &Received, message: LentMessage) -> Result<(), ApiError> {
-        let request = Request::of(request)?;
+        let request = Request::of(request, self.tid())?;
         self.endpoint.answer(request, message.into(), self.endpoint.patience()).await
     }
 
@@ -179,7 +179,7 @@ impl AsyncEndpoint {
     /// # Errors
     /// The message asks for no reply, or the reply was not sent.
     pub async fn reply<R: Payload>(&mut self, request: &Received, value: &R) -> Result<(), ApiError> {
-        let request = Request::of(request)?;
+        let request = Request::of(request, self.tid())?;
         let message = Message::typed(self.tid(), request.source, value);
         self.endpoint.answer(request, message.into(), self.endpoint.patience()).await
     }

@@ -82,6 +82,7 @@ impl Endpoint {
         let control = reader.control().filter(|_| register.direct);
         let inbox = Inbox::new(inbox_capacity, payload_max as usize, writer.clone());
         register.former = Some(app);
+        tracing::debug!(tid = %Tid::new(node, app), node = node_name, "registered");
         Self {
             tid: Tid::new(node, app),
             node_name,
@@ -204,7 +205,7 @@ impl Endpoint {
     /// The message asks for no reply, or the reply was not sent.
     pub fn reply<R: Payload>(&mut self, request: &Received, value: &R) -> Result<(), ApiError> {
         let message = Message::typed(self.tid, request.source(), value);
-        at_once(self.answer(Request::of(request)?, message.into(), self.patience()))
+        at_once(self.answer(Request::of(request, self.tid())?, message.into(), self.patience()))
     }
 
     /// Waits for a message, at most `within` this time; `None` if none came (the paper's ReceiveMessage). Control

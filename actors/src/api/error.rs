@@ -4,6 +4,7 @@ use std::{io, path::PathBuf, time::Duration};
 
 use sinew_runtime::{
     outcome::Outcome,
+    tid::Tid,
     wire::{DecodeError, FrameError, Kind},
 };
 
@@ -17,6 +18,16 @@ pub enum ApiError {
         path: PathBuf,
         /// What the system said.
         cause: io::Error,
+    },
+    /// No socket can have this path. The caller is at fault; nothing changed.
+    #[error(
+        "{path:?} is not the path of a node's socket: {why}; give the one that the node's configuration has as its `lncl.socket`"
+    )]
+    NotAPath {
+        /// The path.
+        path: PathBuf,
+        /// What is wrong with it.
+        why: &'static str,
     },
     /// The node refused, in its words. The connection is closed and nothing is registered.
     #[error("the node refused: {0}")]
@@ -88,6 +99,12 @@ pub enum ApiError {
         "the message asks for no reply; only what was sent with `ask` does: look at `Received::wants_reply` first"
     )]
     NotAsked,
+    /// The request came to another endpoint, or to an address that this one had before. The caller is at fault; nothing was sent.
+    #[error(
+        "the request came to {0}, which is not this endpoint's address; who asked takes a reply from there only: reply with the endpoint \
+         that received it"
+    )]
+    OthersRequest(Tid),
     /// The payload of a message or of a reply is not what its kind says. The peer is at fault.
     #[error("the payload is not what its kind says: {0}; do both programs use the same type?")]
     Malformed(#[from] DecodeError),
@@ -124,6 +141,7 @@ mod tests {
         let second = Duration::from_secs(1);
         let mut all = vec![
             ApiError::NoNode { path: "/run/knee.sock".into(), cause: io::ErrorKind::NotFound.into() },
+            ApiError::NotAPath { path: PathBuf::new(), why: "it is empty" },
             ApiError::Waiting { requires: vec!["hip".to_owned()], waited: second },
             ApiError::NoAnswer(second),
             ApiError::Closed("why".to_owned()),
@@ -134,6 +152,7 @@ mod tests {
             ApiError::NotYours(Kind::OUTCOME),
             ApiError::NoReply(second),
             ApiError::NotAsked,
+            ApiError::OthersRequest(Tid::NONE),
             ApiError::TooManyGroups,
         ];
         let outcomes =

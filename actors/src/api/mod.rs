@@ -226,7 +226,7 @@ impl NodeApi {
     /// Nobody listens there, or this user may not connect.
     pub fn connect(path: impl AsRef<Path>) -> Result<Self, ApiError> {
         let path = path.as_ref().to_owned();
-        link::connect(&path)?;
+        link::connect(&path, Time::now() + link::CONNECT)?;
         Ok(Self { path })
     }
 
@@ -403,7 +403,7 @@ impl Registration {
     /// Registers, and blocks meanwhile. Each `look` it is looked whether that is still wanted.
     fn greet(&self, path: &Path, look: Duration, is_wanted: impl Fn() -> bool) -> Result<Link, ApiError> {
         let deadline = Time::now() + self.deadline;
-        let mut greeting = Greeting::begin(path, &self.register, self.link.clone())?;
+        let mut greeting = Greeting::begin(path, &self.register, self.link.clone(), deadline)?;
         while is_wanted() {
             if let Some(link) = greeting.wait(deadline.min(Time::now() + look))? {
                 return Ok(link);

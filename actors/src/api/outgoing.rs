@@ -290,10 +290,13 @@ pub(super) struct Request {
 }
 
 impl Request {
-    /// What `received` asks for.
-    pub(super) fn of(received: &Received) -> Result<Self, ApiError> {
+    /// What `received` asks of `own`: who asked takes the reply of nobody else.
+    pub(super) fn of(received: &Received, own: Tid) -> Result<Self, ApiError> {
         if !received.wants_reply() {
             return Err(ApiError::NotAsked);
+        }
+        if received.destination() != own {
+            return Err(ApiError::OthersRequest(received.destination()));
         }
         Ok(Self { source: received.source(), correlation: received.correlation() })
     }

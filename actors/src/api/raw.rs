@@ -33,6 +33,6 @@ impl Endpoint {
     /// # Errors
     /// The message asks for no reply, or the reply was not sent.
     pub fn reply_message(&mut self, request: &Received, message: LentMessage) -> Result<(), ApiError> {
-        at_once(self.answer(Request::of(request)?, message.into(), self.patience()))
+        at_once(self.answer(Request::of(request, self.tid())?, message.into(), self.patience()))
     }
 }

@@ -87,8 +87,8 @@ impl Home {
         let (answer, until) = match way.greeting.take() {
             Some(greeting) => (Ok(greeting), until),
             None => {
-                let asked = Greeting::begin(&path, &register, options);
-                (asked, until.max(Time::now() + ANSWERED_WITHIN))
+                let until = until.max(Time::now() + ANSWERED_WITHIN);
+                (Greeting::begin(&path, &register, options, until), until)
             }
         };
         let answer = answer.and_then(|mut greeting| match greeting.wait(until)? {

@@ -88,6 +88,7 @@ on_every_transport! {
     two_endpoints_of_one_process_ask_and_reply
     a_request_that_cannot_be_handled_ends_at_once
     what_asks_for_no_reply_gets_none
+    another_endpoint_cannot_reply_to_what_this_one_was_asked
     a_received_message_counts_as_handled_when_it_is_dropped
     a_message_that_is_in_hand_at_a_panic_has_failed
     what_waited_in_a_dropped_endpoint_was_not_handled
@@ -304,6 +305,22 @@ fn what_asks_for_no_reply_gets_none(under: Under) {
     node.stores.router.send(Message::typed(app.tid, endpoint.tid(), &TORQUE)).unwrap();
     let received = endpoint.receive(WATCHDOG).unwrap().expect("a message");
     assert!(matches!(endpoint.reply(&received, &TORQUE), Err(ApiError::NotAsked)));
+}
+
+fn another_endpoint_cannot_reply_to_what_this_one_was_asked(under: Under) {
+    // Given: two endpoints of a program, one of which is asked.
+    let node = TestNode::start();
+    let (mut asked, mut other) = (register(under, &node, on(under)), register(under, &node, on(under)));
+    let (to, mut asking) = (asked.tid(), register(under, &node, on(under)));
+    let asks = thread::spawn(move || asking.ask::<_, Doubled>(to, &TORQUE, WATCHDOG));
+    let request = asked.receive(WATCHDOG).unwrap().expect("a request");
+    // When the other one replies, by mistake:
+    let refused = other.reply(&request, &Doubled { newton_metres: 3.0 });
+    // Then it is told, and who was asked can still do it.
+    assert!(matches!(refused, Err(ApiError::OthersRequest(tid)) if tid == to), "{refused:?}");
+    asked.reply(&request, &Doubled { newton_metres: 5.0 }).unwrap();
+    drop(request);
+    assert_eq!(asks.join().unwrap().unwrap().newton_metres, 5.0);
 }
 
 fn a_received_message_counts_as_handled_when_it_is_dropped(under: Under) {

@@ -72,7 +72,7 @@ impl Endpoint {
         within: Duration,
     ) -> Result<(), ApiError> {
         let message = Message::typed(self.tid, request.source(), value);
-        at_once(self.answer(Request::of(request)?, message.into(), Limit::in_all(within)))
+        at_once(self.answer(Request::of(request, self.tid())?, message.into(), Limit::in_all(within)))
     }
 
     /// As [`reply_message`](Self::reply_message), for `within` at most: see [`send_within`](Self::send_within).
@@ -85,7 +85,7 @@ impl Endpoint {
         message: LentMessage,
         within: Duration,
     ) -> Result<(), ApiError> {
-        at_once(self.answer(Request::of(request)?, message.into(), Limit::in_all(within)))
+        at_once(self.answer(Request::of(request, self.tid())?, message.into(), Limit::in_all(within)))
     }
 }
 
@@ -126,7 +126,7 @@ impl AsyncEndpoint {
         value: &R,
         within: Duration,
     ) -> Result<(), ApiError> {
-        let request = Request::of(request)?;
+        let request = Request::of(request, self.tid())?;
         let message = Message::typed(self.tid(), request.source, value);
         self.endpoint.answer(request, message.into(), Limit::in_all(within)).await
     }
@@ -141,7 +141,7 @@ impl AsyncEndpoint {
         message: LentMessage,
         within: Duration,
     ) -> Result<(), ApiError> {
-        let request = Request::of(request)?;
+        let request = Request::of(request, self.tid())?;
         self.endpoint.answer(request, message.into(), Limit::in_all(within)).await
     }
 }

@@ -4,6 +4,8 @@ use std::{cell::RefCell, ffi::CStr, ffi::CString};
 
 use sinew::ApiError;
 
+use crate::words::text_of;
+
 /// What a call came to. Negative: an error, and `sinew_last_error` has a sentence about it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(i32)]
@@ -179,9 +181,10 @@ impl Fault {
 
 impl From<ApiError> for Fault {
     fn from(error: ApiError) -> Self {
-        let sentence = error.to_string();
+        let sentence = in_c(&error);
         let status = match error {
             ApiError::NoNode { .. } => Status::SinewErrorNoNode,
+            ApiError::NotAPath { .. } => Status::SinewErrorInvalidArgument,
             ApiError::Refused(_) => Status::SinewErrorRefused,
             ApiError::Waiting { .. } => Status::SinewErrorWaiting,
             ApiError::NoAnswer(_) => Status::SinewErrorNoAnswer,
@@ -193,10 +196,44 @@ impl From<ApiError> for Fault {
             ApiError::NoReply(_) => Status::SinewErrorNoReply,
             ApiError::Malformed(_) => Status::SinewErrorMalformed,
             ApiError::NotAsked => Status::SinewErrorNotAsked,
+            ApiError::OthersRequest(_) => Status::SinewErrorNoSuchMessage,
             ApiError::Lent => Status::SinewErrorLent,
             ApiError::NotYours(_) => Status::SinewErrorInvalidArgument,
         };
         Self::new(status, sentence)
+    }
+}
+
+/// What an error says, with the names that things have in C.
+fn in_c(error: &ApiError) -> String {
+    match error {
+        ApiError::NotAsked => {
+            "the message asks for no reply; only what was sent with sinew_ask does: look at its \
+                               `wants_reply` first"
+                .to_owned()
+        }
+        ApiError::NotYours(kind) => {
+            format!("the kind {kind} belongs to Sinew's layers; take one from sinew_kind_named")
+        }
+        ApiError::Ended(outcome) => text_of(*outcome).to_string_lossy().into_owned(),
+        ApiError::Away(why) => format!(
+            "the connection to the node has ended: {why}; the endpoint registers again by itself, go on with \
+             sinew_receive_message"
+        ),
+        ApiError::Waiting { .. }
+        | ApiError::NoNode { .. }
+        | ApiError::NotAPath { .. }
+        | ApiError::Refused(_)
+        | ApiError::NoAnswer(_)
+        | ApiError::Closed(_)
+        | ApiError::Stalled(_)
+        | ApiError::Lent
+        | ApiError::TooLong { .. }
+        | ApiError::TooManyGroups
+        | ApiError::NoReply(_)
+        | ApiError::OthersRequest(_)
+        | ApiError::Malformed(_)
+        | ApiError::Frame(_) => error.to_string(),
     }
 }
 
@@ -221,6 +258,20 @@ mod tests {
         let texts: HashSet<_> = numbers.iter().map(|number| Status::text_of(*number)).collect();
         assert_eq!((numbers.len(), texts.len()), (Status::ALL.len(), Status::ALL.len()));
         assert!(!texts.contains(Status::text_of(1_000)));
+    }
+
+    #[test]
+    fn what_an_error_says_names_nothing_of_rusts() {
+        let kind = sinew::Kind::from_bits(1);
+        let outcomes = (0..=u8::MAX).filter_map(sinew::Outcome::from_code).map(ApiError::Ended);
+        let spoken =
+            [ApiError::NotAsked, ApiError::NotYours(kind), ApiError::Away("why".to_owned()), ApiError::Lent];
+        for error in spoken.into_iter().chain(outcomes) {
+            let Fault { sentence, .. } = error.into();
+            for rusts in ["::", "`ask`", "Rejected(", "PeerLost"] {
+                assert!(!sentence.contains(rusts), "{sentence}");
+            }
+        }
     }
 
     #[test]

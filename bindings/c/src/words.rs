@@ -91,7 +91,7 @@ pub(crate) const fn code_of(outcome: sinew::Outcome) -> Outcome {
     }
 }
 
-const fn text_of(outcome: sinew::Outcome) -> &'static CStr {
+pub(crate) const fn text_of(outcome: sinew::Outcome) -> &'static CStr {
     match code_of(outcome) {
         Outcome::SinewDelivered => c"delivered: the destination has handled it",
         Outcome::SinewExpired => c"expired before it was handled",

@@ -203,6 +203,7 @@ impl Letters {
             ApiError::Closed(_)
             | ApiError::Away(_)
             | ApiError::NoNode { .. }
+            | ApiError::NotAPath { .. }
             | ApiError::Refused(_)
             | ApiError::Waiting { .. }
             | ApiError::NoAnswer(_)
@@ -213,6 +214,7 @@ impl Letters {
             | ApiError::Lent
             | ApiError::NotYours(_)
             | ApiError::NotAsked
+            | ApiError::OthersRequest(_)
             | ApiError::Malformed(_)
             | ApiError::Frame(_) => Entry::Broken(format!("number {number} to {way:?}: {error}")),
         };

@@ -1,6 +1,11 @@
 //! How a link begins: the registration, the node's answer, and what carries the messages from then on.
 
-use std::{os::unix::net::UnixStream, path::Path, sync::Arc, time::Duration};
+use std::{
+    os::unix::net::UnixStream,
+    path::Path,
+    sync::{Arc, Mutex, PoisonError},
+    time::Duration,
+};
 
 use bytes::BytesMut;
 use rustix::{
@@ -19,6 +24,7 @@ use super::{Link, LinkOptions, Reader, Writer, asked, connect, ring, socket};
 use crate::{
     api::ApiError,
     lncl::payload::{self, Refusal, Register, Registered},
+    ring::{self as rings, Exchange, ExchangeError},
 };
 
 /// Time that the node has for its part of the exchange of offers.
@@ -33,21 +39,34 @@ pub(in crate::api) struct Greeting {
     /// The answer, as far as it has come, and no byte more: descriptors may come with the next.
     frame: BytesMut,
     filled: usize,
+    /// The address is given; the node's half of the rings has not come yet.
+    offered: Option<Offered>,
+}
+
+/// This side's half of the rings, which the node knows.
+struct Offered {
+    registered: Registered,
+    /// Nobody else has it: locked so that whoever has a reference to the endpoint may be on any thread.
+    exchange: Mutex<Exchange>,
+    /// Until then the node may take for its own.
+    until: Time,
 }
 
 impl Greeting {
-    /// Connects, and asks for an address.
+    /// Connects, and asks for an address, until `deadline` at most.
     pub(in crate::api) fn begin(
         path: &Path,
         register: &Register,
         options: LinkOptions,
+        deadline: Time,
     ) -> Result<Self, ApiError> {
-        let socket = Arc::new(connect(path)?);
+        let socket = Arc::new(connect(path, deadline)?);
         let lncl = payload::lncl_of(NodeAddress::HERE);
         let asked = asked(register, options.transport);
         let frame = payload::frame(Kind::LNCL_REGISTER, Tid::NONE, lncl, &asked);
         let written = socket::Writer::new(socket.clone(), &options).write(&frame);
-        let mut greeting = Self { socket, options, frame: BytesMut::zeroed(HEADER_LEN), filled: 0 };
+        let frame = BytesMut::zeroed(HEADER_LEN);
+        let mut greeting = Self { socket, options, frame, filled: 0, offered: None };
         match written {
             Ok(()) => Ok(greeting),
             Err(error) => Err(greeting.explain(error)),
@@ -65,6 +84,16 @@ impl Greeting {
 
     /// Waits for the answer; `None` if the node has not given it by the deadline. May be called again then.
     pub(in crate::api) fn wait(&mut self, deadline: Time) -> Result<Option<Link>, ApiError> {
+        if self.offered.is_none() {
+            let Some(registered) = self.hear(deadline)? else { return Ok(None) };
+            let Some(ring_bytes) = registered.ring else { return Ok(Some(self.plain(registered))) };
+            self.offered = Some(self.offer(registered, ring_bytes)?);
+        }
+        self.exchange(deadline)
+    }
+
+    /// What the node has answered; `None` if it has not.
+    fn hear(&mut self, deadline: Time) -> Result<Option<Registered>, ApiError> {
         if !self.fill(deadline)? {
             return Ok(None);
         }
@@ -78,27 +107,47 @@ impl Greeting {
         }
         let unreadable = || ApiError::Closed("the node's first frame cannot be read".to_owned());
         let message = FrameCodec::new(GREETING_BYTES_MAX).decode(&mut self.frame)?.ok_or_else(unreadable)?;
-        self.finish(read_greeting(&message)?).map(Some)
+        read_greeting(&message).map(Some)
     }
 
-    /// Agrees with the node on what carries the messages.
-    fn finish(&self, registered: Registered) -> Result<Link, ApiError> {
-        let (socket, options) = (self.socket.clone(), &self.options);
-        let payload_max = registered.payload_max as usize;
-        let (writer, reader) = match registered.ring {
-            None => {
-                let writer = socket::Writer::new(socket.clone(), options);
-                (Writer::Socket(writer), Reader::Socket(socket::Reader::new(socket, payload_max)))
+    /// Everything goes through the socket.
+    fn plain(&self, registered: Registered) -> Link {
+        let (socket, payload_max) = (self.socket.clone(), registered.payload_max as usize);
+        let writer = Writer::Socket(socket::Writer::new(socket.clone(), &self.options));
+        let reader = Reader::Socket(socket::Reader::new(socket, payload_max));
+        Link { registered, writer: Arc::new(writer), reader }
+    }
+
+    fn offer(&self, registered: Registered, ring_bytes: u32) -> Result<Offered, ApiError> {
+        let capacity = rings::capacity(ring_bytes as usize);
+        let exchange = Exchange::prepare(capacity, self.options.bell.clone()).map_err(no_rings)?;
+        exchange.offer(&self.socket).map_err(no_rings)?;
+        Ok(Offered { registered, exchange: Mutex::new(exchange), until: Time::now() + EXCHANGE })
+    }
+
+    /// Maps what the node has offered; `None` if it has not by the deadline.
+    fn exchange(&mut self, deadline: Time) -> Result<Option<Link>, ApiError> {
+        let theirs = loop {
+            if let Some(theirs) = Exchange::receive(&self.socket).map_err(no_rings)? {
+                break theirs;
             }
-            Some(ring_bytes) => {
-                let (producer, consumer) =
-                    ring::exchange(&socket, ring_bytes, options.bell.clone(), Time::now() + EXCHANGE)?;
-                let reader = ring::Reader::new(socket.clone(), consumer, payload_max, options.spin);
-                let writer = Arc::new(ring::Writer::new(socket, producer, options));
-                (Writer::Ring(writer), Reader::Ring(Box::new(reader)))
+            let Some(Offered { until, .. }) = self.offered else { return Ok(None) };
+            let has_come = socket::wait(&self.socket, PollFlags::IN, deadline.min(until));
+            if !has_come.map_err(|error| ApiError::Closed(error.to_string()))? {
+                if deadline < until {
+                    return Ok(None);
+                }
+                return Err(ApiError::Closed("it offered no shared memory in time".to_owned()));
             }
         };
-        Ok(Link { registered, writer: Arc::new(writer), reader })
+        let Some(Offered { registered, exchange, .. }) = self.offered.take() else { return Ok(None) };
+        let exchange = exchange.into_inner().unwrap_or_else(PoisonError::into_inner);
+        let (producer, consumer) = exchange.finish(theirs).map_err(no_rings)?;
+        let (socket, options, payload_max) =
+            (self.socket.clone(), &self.options, registered.payload_max as usize);
+        let reader = ring::Reader::new(socket.clone(), consumer, payload_max, options.spin);
+        let writer = Writer::Ring(Arc::new(ring::Writer::new(socket, producer, options)));
+        Ok(Some(Link { registered, writer: Arc::new(writer), reader: Reader::Ring(Box::new(reader)) }))
     }
 
     /// Whether all that is wanted has come by the deadline.
@@ -121,6 +170,10 @@ impl Greeting {
     }
 }
 
+fn no_rings(error: ExchangeError) -> ApiError {
+    ApiError::Closed(error.to_string())
+}
+
 fn read_greeting(message: &Message) -> Result<Registered, ApiError> {
     let unreadable = |error: rmp_serde::decode::Error| ApiError::Closed(error.to_string());
     match message.header.kind {
@@ -131,5 +184,92 @@ fn read_greeting(message: &Message) -> Result<Registered, ApiError> {
         }
         // Not an enum of ours: an open set of numbers.
         kind => Err(ApiError::Closed(format!("the node's first frame has kind {kind}"))),
+    }
+}
+
+#[cfg(all(test, target_os = "linux"))]
+mod tests {
+    use std::{io::Write, os::unix::net::UnixListener};
+
+    use rustix::net::{AddressFamily, SocketAddrUnix, SocketType, bind, listen, socket};
+    use sinew_runtime::{tid::AppAddress, wire::encode_frame};
+    use sinew_shm::BellKind;
+
+    use super::*;
+    use crate::{
+        api::{NodeApi, Registration},
+        lncl::testing::{TestDirectory, WATCHDOG},
+    };
+
+    const SHORT: Duration = Duration::from_millis(50);
+
+    /// Plays a node as far as its answer: the address, and that rings are to follow.
+    fn answer(listener: &UnixListener) -> UnixStream {
+        let (mut client, _) = listener.accept().unwrap();
+        let (node, app) = (NodeAddress::new(1), AppAddress::new(0x8000_0001));
+        let node_name = "played".to_owned();
+        let registered = Registered { node, app, node_name, payload_max: 4_096, ring: Some(4_096) };
+        let tid = Tid::new(node, app);
+        let frame = payload::frame(Kind::LNCL_REGISTERED, payload::lncl_of(node), tid, &registered);
+        let mut bytes = BytesMut::new();
+        encode_frame(&frame.header, &frame.payload, &mut bytes);
+        client.write_all(&bytes).unwrap();
+        client
+    }
+
+    #[test]
+    fn a_node_that_has_no_rings_yet_is_waited_for_in_as_many_calls_as_it_takes() {
+        // given
+        let directory = TestDirectory::new();
+        let path = directory.path().join("node.sock");
+        let listener = UnixListener::bind(&path).unwrap();
+        let registration = Registration::new();
+        let until = || Time::now() + SHORT;
+        let begun = Greeting::begin(&path, &registration.register, registration.link.clone(), until());
+        let mut greeting = begun.unwrap();
+        assert!(greeting.wait(Time::now()).unwrap().is_none(), "it has said nothing");
+        let node = answer(&listener);
+        assert!(greeting.wait(until()).unwrap().is_none(), "it has offered nothing");
+        // when
+        Exchange::prepare(rings::capacity(4_096), BellKind::Socket).unwrap().offer(&node).unwrap();
+        // then
+        let link = greeting.wait(Time::now() + WATCHDOG).unwrap().expect("both have offered");
+        assert_eq!(link.registered.node_name, "played");
+    }
+
+    #[test]
+    fn a_registration_waits_for_the_nodes_rings_no_longer_than_it_may() {
+        let directory = TestDirectory::new();
+        let path = directory.path().join("node.sock");
+        let listener = UnixListener::bind(&path).unwrap();
+        let api = NodeApi { path };
+        let node = std::thread::spawn(move || answer(&listener));
+        let error = api.register_transport_address(Registration::new().deadline(SHORT)).unwrap_err();
+        assert!(matches!(error, ApiError::NoAnswer(SHORT)), "{error}");
+        drop(node.join().unwrap());
+    }
+
+    #[test]
+    fn a_registration_waits_for_a_place_at_the_door_no_longer_than_it_may() {
+        // Given: somebody who listens, takes nobody, and has as many who wait as may.
+        let directory = TestDirectory::new();
+        let path = directory.path().join("node.sock");
+        let door = socket(AddressFamily::UNIX, SocketType::STREAM, None).unwrap();
+        bind(&door, &SocketAddrUnix::new(&path).unwrap()).unwrap();
+        listen(&door, 0).unwrap();
+        let _waiting = UnixStream::connect(&path).unwrap();
+        // When:
+        let registered = NodeApi { path }.register_transport_address(Registration::new().deadline(SHORT));
+        // Then:
+        let error = registered.unwrap_err();
+        assert!(matches!(error, ApiError::NoAnswer(within) if within <= SHORT), "{error}");
+    }
+
+    #[test]
+    fn what_is_no_path_of_a_socket_is_said_to_be_none() {
+        for path in [String::new(), "x".repeat(108)] {
+            let error = NodeApi::connect(&path).unwrap_err();
+            assert!(matches!(error, ApiError::NotAPath { .. }), "{error}");
+        }
     }
 }

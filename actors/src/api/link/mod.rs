@@ -7,6 +7,7 @@ pub(super) mod ring;
 pub(super) mod socket;
 
 use std::{
+    io::ErrorKind,
     os::{fd::OwnedFd, unix::net::UnixStream},
     path::Path,
     sync::Arc,
@@ -31,8 +32,8 @@ pub(super) use greeting::Greeting;
 use loan::InRing;
 use ring::{Begun, Rest};
 
-/// How long to wait for a place in the queue of a node that does not accept.
-const CONNECT: Duration = Duration::from_secs(2);
+/// How long to wait for a place in the queue of a node that does not accept, if the caller has as long.
+pub(super) const CONNECT: Duration = Duration::from_secs(2);
 
 /// What carries an endpoint's messages to its node and back.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -65,17 +66,33 @@ pub(super) struct Link {
     pub(super) reader: Reader,
 }
 
-/// Connects to the node that listens at `path`.
-pub(super) fn connect(path: &Path) -> Result<UnixStream, ApiError> {
+/// Connects to the node that listens at `path`, until `deadline` at most.
+pub(super) fn connect(path: &Path, deadline: Time) -> Result<UnixStream, ApiError> {
+    // To the system no time at all is as long as it takes.
+    let within = deadline.since(Time::now()).clamp(Duration::from_millis(1), CONNECT);
+    let address = address_of(path)?;
     let try_to = || -> std::io::Result<UnixStream> {
         let socket = Socket::new(Domain::UNIX, Type::STREAM, None)?;
         // Linux bounds a unix socket's `connect` by the time allowed for sending.
-        socket.set_write_timeout(Some(CONNECT))?;
-        socket.connect(&SockAddr::unix(path)?)?;
+        socket.set_write_timeout(Some(within))?;
+        socket.connect(&address)?;
         socket.set_nonblocking(true)?;
         Ok(UnixStream::from(OwnedFd::from(socket)))
     };
-    try_to().map_err(|cause| ApiError::NoNode { path: path.to_owned(), cause })
+    try_to().map_err(|cause| match cause.kind() {
+        // Somebody listens, and takes nobody.
+        ErrorKind::WouldBlock | ErrorKind::TimedOut => ApiError::NoAnswer(within),
+        _ => ApiError::NoNode { path: path.to_owned(), cause },
+    })
+}
+
+fn address_of(path: &Path) -> Result<SockAddr, ApiError> {
+    let not_a_path = |why| ApiError::NotAPath { path: path.to_owned(), why };
+    if path.as_os_str().is_empty() {
+        // To the system that is a socket without a name.
+        return Err(not_a_path("it is empty"));
+    }
+    SockAddr::unix(path).map_err(|_| not_a_path("it has more than 107 bytes, or a zero among them"))
 }
 
 /// How far a frame came.

@@ -17,18 +17,15 @@ use std::{
 };
 
 use bytes::BytesMut;
-use rustix::{
-    event::PollFlags,
-    net::{RecvFlags, Shutdown, recv},
-};
+use rustix::net::{RecvFlags, Shutdown, recv};
 use sinew_runtime::{
     outcome::{Outcome, ReceiptSink, Ticket},
     time::Time,
     wire::{FrameCodec, Kind, Message},
 };
 use sinew_shm::{
-    Any, AnyError, Armed, Bell, BellKind, Capacity, Consumer, Ends, HangUp, LoanError, Looked, Looking,
-    Producer, Region, RoomError, Spin, Wait, Waiter,
+    Any, AnyError, Armed, BellKind, Capacity, Consumer, Ends, HangUp, LoanError, Looked, Looking, Producer,
+    Region, RoomError, Spin, Wait, Waiter,
 };
 use tokio::sync::Notify;
 use tokio_util::codec::Decoder;
@@ -37,7 +34,7 @@ use super::{Ended, LinkOptions, Read, socket};
 use crate::{
     api::ApiError,
     lncl::payload::{self, Refusal},
-    ring::{self, Exchange, ExchangeError, RingFrames, Taken},
+    ring::{self, RingFrames, Taken},
 };
 
 pub(in crate::api) use writing::{Begun, Rest};
@@ -63,28 +60,6 @@ pub(super) fn is_available() -> bool {
             false
         }
     })
-}
-
-/// Exchanges offers with the other end of `socket`, until the deadline at most.
-pub(in crate::api) fn exchange(
-    socket: &UnixStream,
-    ring_bytes: u32,
-    bell: impl Into<Bell>,
-    deadline: Time,
-) -> Result<(Producer, Consumer), ApiError> {
-    let closed = |error: ExchangeError| ApiError::Closed(error.to_string());
-    let exchange = Exchange::prepare(ring::capacity(ring_bytes as usize), bell).map_err(closed)?;
-    exchange.offer(socket).map_err(closed)?;
-    loop {
-        if let Some(theirs) = Exchange::receive(socket).map_err(closed)? {
-            return exchange.finish(theirs).map_err(closed);
-        }
-        if !socket::wait(socket, PollFlags::IN, deadline)
-            .map_err(|error| ApiError::Closed(error.to_string()))?
-        {
-            return Err(ApiError::Closed("it offered no shared memory in time".to_owned()));
-        }
-    }
 }
 
 /// The writing half.

@@ -272,7 +272,7 @@ pub(in crate::api) fn which_hung_up<'a>(sockets: impl Iterator<Item = &'a UnixSt
 }
 
 /// Waits for the socket; returns whether it is ready, `false` at the deadline. One wake of the calling thread.
-pub(super) fn wait(socket: &UnixStream, what: PollFlags, deadline: Time) -> Result<bool, Errno> {
+pub(in crate::api) fn wait(socket: &UnixStream, what: PollFlags, deadline: Time) -> Result<bool, Errno> {
     loop {
         let left = deadline.since(Time::now());
         let timeout = Timespec::try_from(left).unwrap_or(Timespec { tv_sec: i64::MAX, tv_nsec: 0 });

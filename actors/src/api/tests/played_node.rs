@@ -11,6 +11,7 @@ use std::{
 };
 
 use bytes::BytesMut;
+use rustix::event::PollFlags;
 use sinew_runtime::{
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
@@ -20,12 +21,12 @@ use sinew_shm::{BellKind, Consumer, Producer};
 use tokio_util::codec::Decoder;
 
 use crate::{
-    api::link::ring as rings,
+    api::link::socket,
     lncl::{
         payload::{self, Register, Registered},
         testing::{TestDirectory, WATCHDOG},
     },
-    ring::{RingFrames, Taken},
+    ring::{self, Exchange, RingFrames, Taken},
 };
 
 /// Bytes of its ring: messages are longer.
@@ -148,7 +149,20 @@ fn greet(socket: &UnixStream) -> Option<(Producer, Consumer)> {
     encode_frame(&answer.header, &answer.payload, &mut bytes);
     { socket }.write_all(&bytes).unwrap();
     socket.set_nonblocking(true).unwrap();
-    ring.map(|bytes| rings::exchange(socket, bytes, BellKind::Futex, Time::now() + WATCHDOG).unwrap())
+    ring.map(|bytes| exchange(socket, bytes))
+}
+
+/// Exchanges offers with the client.
+fn exchange(socket: &UnixStream, ring_bytes: u32) -> (Producer, Consumer) {
+    let exchange = Exchange::prepare(ring::capacity(ring_bytes as usize), BellKind::Futex).unwrap();
+    exchange.offer(socket).unwrap();
+    let until = Time::now() + WATCHDOG;
+    loop {
+        if let Some(theirs) = Exchange::receive(socket).unwrap() {
+            return exchange.finish(theirs).unwrap();
+        }
+        assert!(socket::wait(socket, PollFlags::IN, until).unwrap(), "waited for the client's offer");
+    }
 }
 
 struct Played {
