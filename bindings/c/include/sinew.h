@@ -32,6 +32,9 @@
  *   own if it may call malloc, that is if the parent had one thread. The node sees the parent's end also while a child
  *   lives that has its connections, too, and tells the peers of its direct links.
  *   Endpoints do not survive exec.
+ * Log.  What no status tells (a link that was not made, no shared memory) is a line on the standard error, warnings and
+ *   errors only. The environment variable SINEW_LOG says otherwise: off, error, warn, info, debug; it is read at the first
+ *   registration.
  * Sizes.  sinew_options carries its size and may grow; all other structs and all numbers stay as they are as long as
  *   SINEW_ABI does.
  */
@@ -644,7 +647,7 @@ sinew_status sinew_send_bytes(struct sinew_endpoint *endpoint,
                               sinew_tid destination,
                               sinew_kind kind,
                               int32_t message_class,
-                              const uint8_t *bytes,
+                              const void *bytes,
                               size_t length);
 
 /**
@@ -654,7 +657,7 @@ sinew_status sinew_send_bytes_within(struct sinew_endpoint *endpoint,
                                      sinew_tid destination,
                                      sinew_kind kind,
                                      int32_t message_class,
-                                     const uint8_t *bytes,
+                                     const void *bytes,
                                      size_t length,
                                      uint64_t within_ns);
 

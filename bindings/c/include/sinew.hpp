@@ -218,6 +218,8 @@ public:
         std::swap(raw_, other.raw_);
         return *this;
     }
+    /// Gives the address back, and blocks until the node has taken it: 2 s at most, if the node hangs. What was received and not
+    /// settled ends as failed. To learn whether it was taken call `unregister` first.
     ~endpoint()
     {
         if (raw_ != nullptr)

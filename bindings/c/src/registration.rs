@@ -6,7 +6,7 @@ use sinew::NodeApi;
 
 use crate::{
     border::{call, present, value, write},
-    fork,
+    fork, log,
     message::{Endpoint, TidBits},
     options::Options,
     session::Session,
@@ -36,6 +36,7 @@ pub extern "C" fn sinew_register_transport_address(
     endpoint: Option<&mut MaybeUninit<*mut Endpoint>>,
 ) -> Status {
     call(|| {
+        log::begin();
         let endpoint = present(endpoint, "endpoint")?;
         let path = socket.path("socket")?;
         let registration = if options.is_null() {

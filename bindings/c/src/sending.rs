@@ -1,6 +1,6 @@
 //! Messages out: lent, filled, sent.
 
-use std::{mem::MaybeUninit, time::Duration};
+use std::{ffi::c_void, mem::MaybeUninit, time::Duration};
 
 use sinew::{Kind, Tid};
 
@@ -86,7 +86,7 @@ pub extern "C" fn sinew_send_bytes(
     destination: TidBits,
     kind: KindBits,
     message_class: i32,
-    bytes: *const u8,
+    bytes: *const c_void,
     length: usize,
 ) -> Status {
     call(|| {
@@ -105,7 +105,7 @@ pub extern "C" fn sinew_send_bytes_within(
     destination: TidBits,
     kind: KindBits,
     message_class: i32,
-    bytes: *const u8,
+    bytes: *const c_void,
     length: usize,
     within_ns: u64,
 ) -> Status {
@@ -214,12 +214,12 @@ fn filled(
     destination: TidBits,
     kind: KindBits,
     message_class: i32,
-    (bytes, length): (*const u8, usize),
+    (bytes, length): (*const c_void, usize),
 ) -> Result<Message, Fault> {
     // First, since it says whether so many bytes can be sent at all.
     let mut message = session.create(Tid::from_bits(destination), kind_of(kind)?, message_class, length)?;
     // SAFETY: the header asks of the caller that so many bytes are there while the call lasts; they fit a message.
-    let Some(payload) = (unsafe { text::memory(bytes, length) }) else {
+    let Some(payload) = (unsafe { text::memory(bytes.cast::<u8>(), length) }) else {
         session.discard(&mut message)?;
         return Err(Fault::argument("`bytes` is NULL, but has a length"));
     };

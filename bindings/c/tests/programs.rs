@@ -72,6 +72,17 @@ fn the_first_program_in_c_asks_and_prints_the_reply() {
 }
 
 #[test]
+fn the_library_says_on_the_standard_error_what_sinew_log_asks_for() {
+    if !is_there("gcc") {
+        return;
+    }
+    let ground = Ground::new();
+    let greeter = C.shared("examples/greeter.c", &ground);
+    let mut greeter = ground.start_under(&["env", "SINEW_LOG=debug"], &greeter, &[]);
+    greeter.wait_for(&["registered", "knee"]);
+}
+
+#[test]
 fn the_first_program_in_c_is_greeted_by_the_one_beside_it() {
     if !is_there("gcc") {
         return;

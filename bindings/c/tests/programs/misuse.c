@@ -47,8 +47,13 @@ static void null_arguments(sinew_endpoint *endpoint)
     sinew_tid tid;
     sinew_endpoint *no_endpoint = NULL;
     sinew_text no_text = { NULL, 3 };
+    char long_path[200];
+    memset(long_path, 'x', sizeof long_path - 1);
+    long_path[sizeof long_path - 1] = 0;
     EXPECT_WORDS(sinew_register_transport_address(node, NULL, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`endpoint` is NULL");
     EXPECT_WORDS(sinew_register_transport_address(no_text, NULL, &endpoint), SINEW_ERROR_INVALID_ARGUMENT, "`socket`");
+    EXPECT_WORDS(sinew_register_transport_address(sinew_text_of(""), NULL, &no_endpoint), SINEW_ERROR_INVALID_ARGUMENT, "is empty");
+    EXPECT_WORDS(sinew_register_transport_address(sinew_text_of(long_path), NULL, &no_endpoint), SINEW_ERROR_INVALID_ARGUMENT, "107");
     EXPECT_WORDS(sinew_unregister(NULL), SINEW_ERROR_NO_SUCH_ENDPOINT, "is it NULL");
     EXPECT_WORDS(sinew_unregister(&no_endpoint), SINEW_ERROR_NO_SUCH_ENDPOINT, "is it NULL");
     EXPECT_WORDS(sinew_create_message(endpoint, 1, kind, 0, 1, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`message` is NULL");
@@ -207,7 +212,7 @@ static void used_twice(sinew_endpoint *endpoint)
     EXPECT(sinew_settle_message(endpoint, &received, SINEW_DELIVERED), SINEW_OK);
     EXPECT(sinew_settle_message(endpoint, &received_copy, SINEW_DELIVERED), SINEW_ERROR_NO_SUCH_MESSAGE);
     message = new_message(endpoint, UINT64_C(0x7777), 1);
-    EXPECT_WORDS(sinew_ask(endpoint, &message, SECOND, &reply, &outcome), SINEW_ERROR_NOT_HANDLED, "NoSuchApplication");
+    EXPECT_WORDS(sinew_ask(endpoint, &message, SECOND, &reply, &outcome), SINEW_ERROR_NOT_HANDLED, "no application has this TID");
     EXPECT(outcome, SINEW_REJECTED_NO_SUCH_APPLICATION);
     EXPECT(sinew_unregister(&other), SINEW_OK);
 }
@@ -270,7 +275,7 @@ static void one_at_a_time(const char *way, uint32_t links)
         EXPECT(sinew_settle_message(endpoint, &received, SINEW_DELIVERED), SINEW_OK);
         first = new_message(endpoint, to, length);
         EXPECT(sinew_discard_message(endpoint, &first), SINEW_OK);
-        EXPECT(sinew_send_bytes_within(endpoint, to, kind, SINEW_CONTROL, (const uint8_t *)"second", 6, SECOND), SINEW_OK);
+        EXPECT(sinew_send_bytes_within(endpoint, to, kind, SINEW_CONTROL, "second", 6, SECOND), SINEW_OK);
         EXPECT(sinew_receive_message(endpoint, 10 * SECOND, &received), SINEW_OK);
         EXPECT(received.length == 6 && memcmp(received.bytes, "second", 6) == 0, 1);
         EXPECT(sinew_settle_message(endpoint, &received, SINEW_DELIVERED), SINEW_OK);
