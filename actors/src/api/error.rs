@@ -35,11 +35,11 @@ pub enum ApiError {
     /// The registration's deadline passed at the start-up barrier. Nothing is registered.
     #[error(
         "after {waited:?} still waiting for these to be ready: {}; start what is missing, or give the registration a longer deadline",
-        requires.join(", ")
+        missing.join(", ")
     )]
     Waiting {
-        /// The names that were required; at least one of them is not ready.
-        requires: Vec<String>,
+        /// What was missing last, each with what the node knows of it; all that was required, if the deadline was over before it had looked.
+        missing: Vec<String>,
         /// How long it waited.
         waited: Duration,
     },
@@ -142,7 +142,7 @@ mod tests {
         let mut all = vec![
             ApiError::NoNode { path: "/run/knee.sock".into(), cause: io::ErrorKind::NotFound.into() },
             ApiError::NotAPath { path: PathBuf::new(), why: "it is empty" },
-            ApiError::Waiting { requires: vec!["hip".to_owned()], waited: second },
+            ApiError::Waiting { missing: vec!["hip".to_owned()], waited: second },
             ApiError::NoAnswer(second),
             ApiError::Closed("why".to_owned()),
             ApiError::Away("why".to_owned()),

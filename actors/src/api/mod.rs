@@ -412,10 +412,13 @@ impl Registration {
                 break;
             }
         }
-        Err(if self.register.requires.is_empty() {
-            ApiError::NoAnswer(self.deadline)
-        } else {
-            ApiError::Waiting { requires: self.register.requires.clone(), waited: self.deadline }
+        Err(match greeting.missing() {
+            None => ApiError::NoAnswer(self.deadline),
+            // The deadline was over before the node had looked.
+            Some(missing) if missing.is_empty() => {
+                ApiError::Waiting { missing: self.register.requires.clone(), waited: self.deadline }
+            }
+            Some(missing) => ApiError::Waiting { missing, waited: self.deadline },
         })
     }
 

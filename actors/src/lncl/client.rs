@@ -1,5 +1,6 @@
 //! One connection of another process, from its first frame to its end.
 
+mod barrier;
 mod end;
 mod life;
 mod notices;
@@ -148,6 +149,8 @@ struct Client {
     tid: Tid,
     name: String,
     requires: Vec<String>,
+    /// Whether the peer wants to be told what it waits for.
+    waits: bool,
     events: Arc<[Kind]>,
     /// Whether the peer can use rings; later, whether it was told that it does.
     ring: Ring,
@@ -163,7 +166,7 @@ struct Client {
 
 impl Client {
     fn register(server: Rc<Server>, peer: Peer, asked: Register) -> Result<Self, super::RegisterError> {
-        let Register { name, address, requires, events, kinds, pid: _, direct, ring, former } = asked;
+        let Register { name, address, requires, events, kinds, pid: _, direct, ring, former, waits } = asked;
         let any = former.map_or(Address::Dynamic, Address::Former);
         let address = address.map_or(any, Address::Fixed);
         let request = Request { address, name, requires: requires.clone(), kinds, owner: peer.owner() };
@@ -190,6 +193,7 @@ impl Client {
             tid,
             name,
             requires,
+            waits,
             events,
             ring,
             wants_links,
@@ -230,41 +234,6 @@ impl Client {
             self.server.refusals.count(Time::now(), "process cannot be watched", &detail);
             Life::Unknown
         })
-    }
-
-    /// Holds the client until all that it requires is ready. Returns why its connection ended, if it did.
-    async fn wait_at_barrier(&self, reader: &mut Reader, session: &mut Session) -> Option<End> {
-        // spec: LNCL-6
-        if self.requires.is_empty() {
-            return None;
-        }
-        // The release comes through this very thread, so that it cannot come before somebody waits for it.
-        let released = self.server.wait_for_release(self.tid.app);
-        let early = async {
-            match reader.next(&self.peer.stream).await {
-                Ok(Some(message)) => match session.handle(message) {
-                    Order::Unregister => End::Unregistered,
-                    Order::End(violation) => End::Refused(violation.to_string()),
-                    Order::Register(_)
-                    | Order::Route(_)
-                    | Order::Settle { .. }
-                    | Order::SetMember { .. }
-                    | Order::Tell { .. }
-                    | Order::Resolve { .. }
-                    | Order::Introduce { .. }
-                    | Order::Switch { .. }
-                    | Order::RefuseMessage { .. } => End::Refused("wait for LNCL_REGISTERED".to_owned()),
-                },
-                Ok(None) => End::HungUp(None),
-                Err(error) => End::from(error),
-            }
-        };
-        let end = tokio::select! {
-            end = early => Some(end),
-            released = released => released.is_err().then(|| End::Refused("LNCL ended".to_owned())),
-        };
-        self.server.forget_release(self.tid.app);
-        end
     }
 
     /// Opens the connection and carries frames both ways.

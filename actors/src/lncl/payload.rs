@@ -40,6 +40,25 @@ pub(crate) struct Register {
     /// The dynamic address that it had before its connection ended; given to it again if it is free.
     #[serde(default)]
     pub(crate) former: Option<AppAddress>,
+    /// Whether it wants to be told what it waits for.
+    #[serde(default)]
+    pub(crate) waits: bool,
+}
+
+/// What a client waits for that is not registered yet.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Waiting {
+    /// Nothing: it is not known yet.
+    pub(crate) missing: Vec<Missing>,
+}
+
+/// One thing that is required and not ready.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Missing {
+    /// Its name, or as it was required.
+    pub(crate) what: String,
+    /// For people.
+    pub(crate) why: String,
 }
 
 /// The address that a process got.

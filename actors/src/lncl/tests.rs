@@ -19,13 +19,15 @@ use sinew_runtime::{
 
 use super::{
     AppFact,
-    payload::{self, Group, Register, Resolve, Resolved, Untaken},
+    payload::{self, Group, Register, Resolve, Resolved, Untaken, Waiting},
     registrar,
     testing::{RawClient, TestNode, WATCHDOG},
 };
 use crate::{
     documentation::{block, python},
     ndl::{self, NodeEvent},
+    stores::lock,
+    sync,
 };
 
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
@@ -119,6 +121,33 @@ fn a_silent_stranger_is_sent_away() {
     let node = TestNode::start();
     let refusal = RawClient::connect(&node).expect_refusal();
     assert!(refusal.contains("LNCL_REGISTER"), "{refusal}");
+}
+
+// spec: LNCL-6
+#[test]
+fn a_client_that_wants_to_know_what_it_waits_for_is_told_and_told_again_when_that_changes() {
+    // Given: a client that requires what is not there.
+    let mut node = TestNode::start();
+    let mut client = RawClient::connect(&node);
+    client.ask_for_address(&Register { waits: true, ..requiring("hip") });
+    let mut next = || {
+        let frame = client.next().expect("what it waits for");
+        assert_eq!(frame.header.kind, Kind::LNCL_WAITING, "{frame:?}");
+        payload::read::<Waiting>(&frame.payload).unwrap().missing
+    };
+    assert_eq!(next(), [], "nobody knows yet");
+
+    // When: the sync manager hears of it.
+    let fact = node.fact();
+    let AppFact::Registered { app, .. } = fact else { panic!("{fact:?} is no registration") };
+    lock(&node.stores.sync).handle(Time::now(), sync::Input::AppChanged(fact));
+
+    // Then:
+    let [missing] = &next()[..] else { panic!("one thing is missing") };
+    assert_eq!(missing.what, "hip");
+    assert!(!missing.why.is_empty());
+    node.release(app);
+    client.expect_registered();
 }
 
 #[test]

@@ -93,6 +93,8 @@ impl Kind {
     pub const LNCL_UNTAKEN: Self = Self(0x4c);
     /// A process is told that the one at the other end of a direct link has ended.
     pub const LNCL_GONE: Self = Self(0x4d);
+    /// LNCL tells a client that waits what it waits for.
+    pub const LNCL_WAITING: Self = Self(0x4e);
 
     /// A node tells the process that it started for an application who it is: the first frame.
     pub const HOST_WELCOME: Self = Self(0x50);

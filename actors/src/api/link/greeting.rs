@@ -23,7 +23,7 @@ use tokio_util::codec::Decoder;
 use super::{Link, LinkOptions, Reader, Writer, asked, connect, ring, socket};
 use crate::{
     api::ApiError,
-    lncl::payload::{self, Refusal, Register, Registered},
+    lncl::payload::{self, Missing, Refusal, Register, Registered, Waiting},
     ring::{self as rings, Exchange, ExchangeError},
 };
 
@@ -39,6 +39,8 @@ pub(in crate::api) struct Greeting {
     /// The answer, as far as it has come, and no byte more: descriptors may come with the next.
     frame: BytesMut,
     filled: usize,
+    /// What the node says that it waits for; `None` if it has said nothing at all.
+    missing: Option<Vec<String>>,
     /// The address is given; the node's half of the rings has not come yet.
     offered: Option<Offered>,
 }
@@ -66,7 +68,7 @@ impl Greeting {
         let frame = payload::frame(Kind::LNCL_REGISTER, Tid::NONE, lncl, &asked);
         let written = socket::Writer::new(socket.clone(), &options).write(&frame);
         let frame = BytesMut::zeroed(HEADER_LEN);
-        let mut greeting = Self { socket, options, frame, filled: 0, offered: None };
+        let mut greeting = Self { socket, options, frame, filled: 0, missing: None, offered: None };
         match written {
             Ok(()) => Ok(greeting),
             Err(error) => Err(greeting.explain(error)),
@@ -92,8 +94,26 @@ impl Greeting {
         self.exchange(deadline)
     }
 
+    /// What the node says that the registration waits for: nothing, if that is not known yet. `None` if it has said nothing at all.
+    pub(in crate::api) fn missing(self) -> Option<Vec<String>> {
+        self.missing
+    }
+
     /// What the node has answered; `None` if it has not.
     fn hear(&mut self, deadline: Time) -> Result<Option<Registered>, ApiError> {
+        while let Some(message) = self.next(deadline)? {
+            if message.header.kind != Kind::LNCL_WAITING {
+                return read_greeting(&message).map(Some);
+            }
+            let waiting: Waiting = payload::read(&message.payload).map_err(unreadable)?;
+            let words = |missing: Missing| format!("{} ({})", missing.what, missing.why);
+            self.missing = Some(waiting.missing.into_iter().map(words).collect());
+        }
+        Ok(None)
+    }
+
+    /// The next frame; `None` if it has not come by the deadline.
+    fn next(&mut self, deadline: Time) -> Result<Option<Message>, ApiError> {
         if !self.fill(deadline)? {
             return Ok(None);
         }
@@ -105,9 +125,10 @@ impl Greeting {
                 return Ok(None);
             }
         }
-        let unreadable = || ApiError::Closed("the node's first frame cannot be read".to_owned());
-        let message = FrameCodec::new(GREETING_BYTES_MAX).decode(&mut self.frame)?.ok_or_else(unreadable)?;
-        read_greeting(&message).map(Some)
+        let nothing = || ApiError::Closed("the node's first frame cannot be read".to_owned());
+        let message = FrameCodec::new(GREETING_BYTES_MAX).decode(&mut self.frame)?.ok_or_else(nothing)?;
+        (self.frame, self.filled) = (BytesMut::zeroed(HEADER_LEN), 0);
+        Ok(Some(message))
     }
 
     /// Everything goes through the socket.
@@ -174,8 +195,11 @@ fn no_rings(error: ExchangeError) -> ApiError {
     ApiError::Closed(error.to_string())
 }
 
+fn unreadable(error: rmp_serde::decode::Error) -> ApiError {
+    ApiError::Closed(error.to_string())
+}
+
 fn read_greeting(message: &Message) -> Result<Registered, ApiError> {
-    let unreadable = |error: rmp_serde::decode::Error| ApiError::Closed(error.to_string());
     match message.header.kind {
         Kind::LNCL_REGISTERED => payload::read(&message.payload).map_err(unreadable),
         Kind::LNCL_REFUSAL => {
@@ -263,6 +287,42 @@ mod tests {
         // Then:
         let error = registered.unwrap_err();
         assert!(matches!(error, ApiError::NoAnswer(within) if within <= SHORT), "{error}");
+    }
+
+    #[test]
+    fn a_registration_that_takes_too_long_says_what_is_missing_or_that_the_node_says_nothing() {
+        // Given: a node that says so much, and then nothing.
+        let hip = Missing { what: "hip".to_owned(), why: "not registered".to_owned() };
+        let ends: [(Option<Vec<Missing>>, &[&str]); 3] =
+            [(Some(vec![hip]), &["hip (not registered)"]), (Some(vec![]), &["hip", "knee"]), (None, &[])];
+        for (said, told) in ends {
+            let directory = TestDirectory::new();
+            let path = directory.path().join("node.sock");
+            let listener = UnixListener::bind(&path).unwrap();
+            let node = std::thread::spawn(move || {
+                let (mut client, _) = listener.accept().unwrap();
+                let frames = said.map(|missing| {
+                    let (kind, waiting) = (Kind::LNCL_WAITING, Waiting { missing });
+                    payload::frame(kind, payload::lncl_of(NodeAddress::new(1)), Tid::NONE, &waiting)
+                });
+                let mut bytes = BytesMut::new();
+                if let Some(frame) = frames {
+                    encode_frame(&frame.header, &frame.payload, &mut bytes);
+                }
+                client.write_all(&bytes).unwrap();
+                client
+            });
+            // When: the deadline passes.
+            let registration = Registration::new().requires(["hip", "knee"]).deadline(SHORT);
+            let error = NodeApi { path }.register_transport_address(registration).unwrap_err();
+            // Then:
+            match error {
+                ApiError::Waiting { missing, .. } if !told.is_empty() => assert_eq!(missing, told),
+                ApiError::NoAnswer(SHORT) => assert!(told.is_empty()),
+                other => panic!("{other}"),
+            }
+            drop(node.join().unwrap());
+        }
     }
 
     #[test]

@@ -352,5 +352,6 @@ impl Reader {
 
 /// What is asked of the node, of which the link's own part is not the caller's to fill in.
 fn asked(register: &Register, transport: Transport) -> Register {
-    Register { ring: transport == Transport::Ring && ring::is_available(), ..register.clone() }
+    let ring = transport == Transport::Ring && ring::is_available();
+    Register { ring, waits: !register.requires.is_empty(), ..register.clone() }
 }
