@@ -21,9 +21,12 @@ struct Arguments {
     /// How many processes are killed.
     #[arg(long, default_value_t = 1_000)]
     kills: u32,
-    /// One process ends in each such time, in milliseconds. As long as with kills the others are measured with orderly ends, and with none.
+    /// One process ends in each such time, in milliseconds.
     #[arg(long, default_value_t = 40)]
     spacing_ms: u64,
+    /// Of so many times twenty kills one has as long with orderly ends beside it, and as long with none.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    reference_each: u32,
     /// Those that are killed have the lowest priority (nice 19).
     #[arg(long)]
     yields: bool,
@@ -36,12 +39,13 @@ fn main() -> ExitCode {
     if let Some(code) = play() {
         return code;
     }
-    let Arguments { kills, spacing_ms, yields, seed } = Arguments::parse();
+    let Arguments { kills, spacing_ms, reference_each, yields, seed } = Arguments::parse();
     println!("seed {seed}");
     let report = run(Plan {
         program: std::env::current_exe().expect("a program has a path"),
         kills,
         spacing: Duration::from_millis(spacing_ms),
+        reference_each,
         seed,
         yields,
     });

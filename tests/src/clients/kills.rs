@@ -45,6 +45,8 @@ pub struct Plan {
     pub kills: u32,
     /// One process ends in each such time, at any instant of it.
     pub spacing: Duration,
+    /// Of so many segments with kills one has a segment with orderly ends beside it, and one in which nobody ends.
+    pub reference_each: u32,
     /// Decides who is killed when.
     pub seed: u64,
     /// Those that are killed have the lowest priority, as programs beside a control loop should: what is measured is what they cost
@@ -274,16 +276,22 @@ impl Cast {
     /// All segments.
     fn measure_all(&mut self) {
         let mut left = self.plan.kills;
-        for round in 0.. {
+        for round in 0_usize.. {
             let times = left.min(ENDS_A_SEGMENT);
             if times == 0 {
                 return;
             }
             left -= times;
+            if round % self.plan.reference_each as usize != 0 {
+                self.prepare(times);
+                self.measure(Part::Killed, times);
+                continue;
+            }
             self.prepare(2 * times);
-            let quiet = if round % 2 == 0 { Part::NobodyEnds } else { Part::NobodyEndsEither };
+            let reference = round / self.plan.reference_each as usize;
+            let quiet = if reference % 2 == 0 { Part::NobodyEnds } else { Part::NobodyEndsEither };
             let mut parts = [quiet, Part::InOrder, Part::Killed];
-            parts.rotate_left(round % 3);
+            parts.rotate_left(reference % 3);
             parts.into_iter().for_each(|part| self.measure(part, times));
         }
     }

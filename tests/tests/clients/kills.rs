@@ -13,6 +13,7 @@ fn twenty_killed_processes_that_held_loans_leave_nothing_behind() {
         program: program("client_kills"),
         kills: 20,
         spacing: Duration::from_millis(40),
+        reference_each: 1,
         seed: u64::from(std::process::id()),
         yields: false,
     });
