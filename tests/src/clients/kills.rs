@@ -282,14 +282,14 @@ impl Cast {
                 return;
             }
             left -= times;
-            if round % self.plan.reference_each as usize != 0 {
+            if !round.is_multiple_of(self.plan.reference_each as usize) {
                 self.prepare(times);
                 self.measure(Part::Killed, times);
                 continue;
             }
             self.prepare(2 * times);
             let reference = round / self.plan.reference_each as usize;
-            let quiet = if reference % 2 == 0 { Part::NobodyEnds } else { Part::NobodyEndsEither };
+            let quiet = if reference.is_multiple_of(2) { Part::NobodyEnds } else { Part::NobodyEndsEither };
             let mut parts = [quiet, Part::InOrder, Part::Killed];
             parts.rotate_left(reference % 3);
             parts.into_iter().for_each(|part| self.measure(part, times));

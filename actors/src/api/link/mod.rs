@@ -79,10 +79,12 @@ pub(super) fn connect(path: &Path, deadline: Time) -> Result<UnixStream, ApiErro
         socket.set_nonblocking(true)?;
         Ok(UnixStream::from(OwnedFd::from(socket)))
     };
-    try_to().map_err(|cause| match cause.kind() {
-        // Somebody listens, and takes nobody.
-        ErrorKind::WouldBlock | ErrorKind::TimedOut => ApiError::NoAnswer(within),
-        _ => ApiError::NoNode { path: path.to_owned(), cause },
+    try_to().map_err(|cause| {
+        if matches!(cause.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) {
+            // Somebody listens, and takes nobody.
+            return ApiError::NoAnswer(within);
+        }
+        ApiError::NoNode { path: path.to_owned(), cause }
     })
 }
 
