@@ -74,9 +74,10 @@ pub(crate) enum Command {
     /// Whether this machine gives a node what it needs: interfaces, multicast, limits, real-time rights, CPU governor, clock, shared memory,
     /// sockets; each finding with the command that mends it
     Doctor {
-        /// Address of the interface that multicast is tried on: the `ndl.interface` of the nodes. What is sent does not leave this machine
-        #[arg(long, default_value_t = Ipv4Addr::LOCALHOST)]
-        interface: Ipv4Addr,
+        /// Address of the interface that multicast is tried on. Without it: the `ndl.interface` of the node that lets us in, else 127.0.0.1.
+        /// What is sent does not leave this machine
+        #[arg(long, value_name = "ADDRESS")]
+        interface: Option<Ipv4Addr>,
     },
     /// Prints what makes the shell complete this command's words
     Completions {

@@ -7,12 +7,13 @@ mod network;
 mod rights;
 mod sockets;
 
-use std::{net::Ipv4Addr, path::Path};
+use std::{net::Ipv4Addr, path::Path, time::Duration};
 
 use serde_json::{Value, json};
 
 use crate::{
     Said,
+    system::System,
     table::{Table, clean},
 };
 
@@ -35,9 +36,10 @@ impl Check {
     }
 }
 
-/// Tries everything; multicast at the interface that has this address.
-pub(crate) fn show(interface: Ipv4Addr, socket: Option<&Path>) -> Said {
+/// Tries everything; multicast at the interface that has this address, without one where the node looks that lets us in.
+pub(crate) fn show(interface: Option<Ipv4Addr>, socket: Option<&Path>, within: Duration) -> Said {
     let interfaces = network::found();
+    let interface = interface.or_else(|| of_node(socket, within)).unwrap_or(Ipv4Addr::LOCALHOST);
     let checks = [
         network::interfaces(&interfaces),
         network::multicast(interface, &interfaces),
@@ -62,6 +64,14 @@ pub(crate) fn show(interface: Ipv4Addr, socket: Option<&Path>) -> Said {
     let mends: String = mends.map(|(name, mend)| format!("{name}: {}\n", clean(mend))).collect();
     let text = if is_fine { table.text() } else { format!("{}\nWhat mends it\n{mends}", table.text()) };
     Said { text, json, is_fine }
+}
+
+/// The interface at which a node of this machine looks for others.
+fn of_node(socket: Option<&Path>, within: Duration) -> Option<Ipv4Addr> {
+    let mut system = System::enter(socket, within).ok()?;
+    let here = system.here();
+    system.leave();
+    here.ok()?.interface.parse().ok()
 }
 
 fn check_json(check: &Check) -> Value {

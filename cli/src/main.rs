@@ -81,7 +81,9 @@ fn run(arguments: &Arguments) -> Result<Said, Fault> {
         Command::Why(order) => inside(&|system| why::show(system, order)),
         Command::Barriers => inside(&apps::barriers),
         Command::Audit => inside(&audit::show),
-        Command::Doctor { interface } => Ok(doctor::show(*interface, arguments.socket.as_deref())),
+        Command::Doctor { interface } => {
+            Ok(doctor::show(*interface, arguments.socket.as_deref(), arguments.within()))
+        }
         Command::Completions { shell } => Ok(completions(*shell)),
     }
 }

@@ -11,7 +11,7 @@ use std::{
 use clap::Args;
 use serde_json::{Value, json};
 use sinew::{
-    Tid,
+    AppAddress, Tid,
     inspect::{AppsReport, AskApps, AskWatch, SeenMessage, WatchReport},
 };
 
@@ -56,10 +56,10 @@ pub(crate) struct Order {
 
 /// Shows it until the end that was asked for, or the user's.
 pub(crate) fn show(system: &mut System, order: &Order, is_json: bool) -> Result<Said, Fault> {
-    let app = system.find(&order.whom)?;
+    let app = application(system, &order.whom)?;
     let kinds = order.kind.iter().map(|kind| crate::send::kind(kind)).collect::<Result<Vec<_>, _>>()?;
     let screen = Screen { names: names(system)?, is_json, rates_only: order.rates };
-    let question = AskWatch { app, received: !order.sent, sent: !order.received };
+    let mut question = AskWatch { app, received: !order.sent, sent: !order.received };
     let began = Instant::now();
     let ends = order.lasts.map(|seconds| began + Duration::from_secs(seconds));
     let (mut rates, mut rates_due) = (Rates::default(), began + RATES_PERIOD);
@@ -84,21 +84,52 @@ pub(crate) fn show(system: &mut System, order: &Order, is_json: bool) -> Result<
                 }
             }
             Err(why) if in_vain + 1 == IN_VAIN_MAX => return Err(Fault::NoAnswer(system.path.clone(), why)),
-            Err(_) => in_vain += 1,
+            Err(_) => {
+                in_vain += 1;
+                std::thread::sleep(PERIOD);
+            }
         }
         let now = Instant::now();
         is_over |= ends.is_some_and(|ends| now >= ends);
         if now >= rates_due || is_over {
             is_over |= !screen.rates(&rates.end(now.duration_since(rates_due - RATES_PERIOD)));
             rates_due = now + RATES_PERIOD;
+            follow(system, &order.whom, &mut question);
         }
     }
     // All was said as it came.
     Ok(Said { text: String::new(), json: Value::Null, is_fine: true })
 }
 
+fn application(system: &mut System, whom: &str) -> Result<Tid, Fault> {
+    let app = system.find(whom)?;
+    if app.app == AppAddress::INSPECT && is_name(whom) {
+        let whom = clean(whom);
+        return Err(Fault::Whom(format!(
+            "'{whom}' is a node; `sinew apps` shows the applications that it has"
+        )));
+    }
+    Ok(app)
+}
+
+/// A name is followed to where it is now: its application may have been started again elsewhere. One that is gone keeps its address until
+/// the name has another.
+fn follow(system: &mut System, whom: &str, question: &mut AskWatch) {
+    if is_name(whom)
+        && let Ok(Some(tid)) = system.endpoint.resolve(whom, system.within)
+        && tid != question.app
+    {
+        question.app = tid;
+        eprintln!("{} is {tid} now", clean(whom));
+    }
+}
+
+fn is_name(whom: &str) -> bool {
+    !whom.contains('/')
+}
+
 fn ask(system: &mut System, question: &AskWatch) -> Result<WatchReport, String> {
-    let to = Tid::new(question.app.node, sinew::AppAddress::INSPECT);
+    let to = Tid::new(question.app.node, AppAddress::INSPECT);
     let report: WatchReport =
         system.endpoint.ask(to, question, system.within).map_err(|error| in_words(&error))?;
     report.refused.clone().map_or(Ok(report), Err)

@@ -1,14 +1,51 @@
 //! `sinew watch` of applications here and on another node.
 
 use std::{
-    io::{BufRead, BufReader},
-    process::{Command, Stdio},
+    io::{BufRead, BufReader, Lines},
+    process::{Child, ChildStdout, Command, Stdio},
 };
 
 use serde_json::Value;
-use sinew::Kind;
+use sinew::{Kind, NodeApi, Registration};
 
-use crate::scenario::Scenario;
+use crate::scenario::{Answer, Scenario};
+
+/// `sinew watch`, until it is dropped.
+struct Watcher {
+    command: Child,
+    out: Lines<BufReader<ChildStdout>>,
+}
+
+impl Watcher {
+    fn of(scenario: &Scenario, whom: &str) -> Self {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
+        command.arg("--socket").arg(scenario.socket("knee")).args(["watch", whom, "--json"]);
+        let mut command = command.stdout(Stdio::piped()).spawn().expect("the command starts");
+        let out = BufReader::new(command.stdout.take().expect("its output is a pipe")).lines();
+        Self { command, out }
+    }
+
+    /// The next message that is seen. Whenever there was none for as long as rates are said, it is sent again: the watch begins some time.
+    fn message(&mut self, send: impl Fn() -> Answer) -> Value {
+        loop {
+            let line = self.out.next().expect("it lives").expect("it says a line");
+            let line: Value = serde_json::from_str(&line).expect("JSON");
+            if line["event"] == "message" {
+                return line;
+            }
+            let sent = send();
+            assert_eq!(sent.code, Some(0), "{}{}", sent.out, sent.err);
+        }
+    }
+}
+
+impl Drop for Watcher {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.command.kill();
+        let _ = self.command.wait();
+    }
+}
 
 /// Each line as JSON.
 fn lines(text: &str) -> Vec<Value> {
@@ -63,26 +100,49 @@ fn what_an_application_gets_and_sends_is_seen_decoded_from_either_node() {
 
 #[test]
 fn a_message_that_is_refused_is_seen_with_the_reason() {
-    // Given: somebody watches the knee
     let scenario = Scenario::new();
     let mut knee = scenario.start("knee", 2, &[]);
     let tid = knee.wait_for(&["started"]).split_once(' ').expect("it says its TID").1.to_owned();
-    let socket = scenario.socket("knee");
-    let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
-    command.arg("--socket").arg(&socket).args(["watch", "127.0.0.2/1fff", "--count", "1", "--json"]);
-    let mut watcher = command.stdout(Stdio::piped()).spawn().expect("the command starts");
-    let mut out = BufReader::new(watcher.stdout.take().expect("its output is a pipe"));
-    let mut first = String::new();
-    // When: it watches, somebody sends to an address that nobody has
-    while !first.contains("\"message\"") {
-        scenario.sinew("knee", &["send", "127.0.0.2/1fff", "test.any", "[1]", "--unconfirmed"]);
-        first.clear();
-        out.read_line(&mut first).expect("it lives");
-    }
+    // When: somebody sends to an address that nobody has, and somebody watches that
+    let mut watcher = Watcher::of(&scenario, "127.0.0.2/1fff");
+    let seen = watcher
+        .message(|| scenario.sinew("knee", &["send", "127.0.0.2/1fff", "test.any", "[1]", "--unconfirmed"]));
     // Then
-    let seen: Value = serde_json::from_str(&first).expect("JSON");
     assert_eq!((&seen["refused"], &seen["payload"]), (&"NoSuchApplication".into(), &serde_json::json!([1])));
     assert_eq!(seen["kind"], format!("{}", Kind::named("test.any")), "nobody has said what this is called");
-    assert_eq!(watcher.wait().expect("it ends").code(), Some(0));
     drop(tid);
+}
+
+#[test]
+fn a_name_is_followed_to_where_its_application_is_started_again() {
+    // Given: an application of another process, which is watched by its name
+    let scenario = Scenario::new();
+    let _knee = scenario.start("knee", 2, &[]);
+    let register = || {
+        let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
+        api.register_transport_address(Registration::new().name("sensor")).expect("it is registered")
+    };
+    let send = || scenario.sinew("knee", &["send", "sensor", "test.any", "1", "--unconfirmed"]);
+    let first = register();
+    let mut watcher = Watcher::of(&scenario, "sensor");
+    let seen = watcher.message(send);
+    assert_eq!(seen["target"], first.tid().to_string());
+    // When: it ends, somebody else takes its address, and it comes again at another
+    first.unregister().expect("it gives its address back");
+    let other = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
+    let other = other.register_transport_address(Registration::new()).expect("it is registered");
+    let second = register();
+    assert_ne!(second.tid(), other.tid());
+    // Then
+    let target = second.tid().to_string();
+    while watcher.message(send)["target"] != target {}
+    drop(other);
+}
+
+#[test]
+fn a_node_is_no_application_to_be_watched() {
+    let scenario = Scenario::new();
+    let _node = scenario.start("knee", 2, &["--requires", "ankle"]);
+    let answer = scenario.sinew("knee", &["watch", "127.0.0.2", "--for", "1"]);
+    assert!(answer.code == Some(1) && answer.err.contains("sinew apps"), "{}{}", answer.out, answer.err);
 }
