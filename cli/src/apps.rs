@@ -1,9 +1,9 @@
-//! `sinew apps` and `sinew barriers`: every application, and who waits for whom.
+//! `sinew apps` and `sinew barriers`: every application, and who waits for whom, at the start and at run time.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::{Value, json};
-use sinew::inspect::{AppReport, AppsReport, AskApps};
+use sinew::inspect::{AppReport, AppsReport, AskApps, BarrierReport};
 
 use crate::{
     Said,
@@ -44,15 +44,16 @@ pub(crate) fn barriers(system: &mut System) -> Result<Said, Fault> {
             reasons.entry(&missing.name).or_default().insert(&missing.why);
         }
     }
-    let is_fine = waiting.is_empty() && is_complete(&answers);
+    let meetings = meetings(&answers);
+    let is_fine = waiting.is_empty() && meetings.is_empty() && is_complete(&answers);
     let waiters = waiting.iter().map(|(node, app)| app_json(node, app)).collect::<Vec<_>>();
     let blockers = blocked
         .iter()
         .map(|(name, who)| json!({ "name": name, "why": reasons[name], "blocks": who }))
         .collect::<Vec<_>>();
-    let json = json!({ "waiting": waiters, "missing": blockers, "silent": silent_json(&answers) });
-    let text = if waiting.is_empty() {
-        "nobody waits\n".to_owned()
+    let json = json!({ "waiting": waiters, "missing": blockers, "barriers": meetings.iter().map(|(node, one)| meeting_json(node, one)).collect::<Vec<_>>(), "silent": silent_json(&answers) });
+    let mut text = if waiting.is_empty() {
+        if meetings.is_empty() { "nobody waits\n".to_owned() } else { String::new() }
     } else {
         let mut table = Table::new(["WAITS", "NODE", "SINCE", "FOR"]);
         for (node, app) in &waiting {
@@ -65,7 +66,34 @@ pub(crate) fn barriers(system: &mut System) -> Result<Said, Fault> {
         }
         format!("{}\n{}", table.text(), missing.text())
     };
+    if !meetings.is_empty() {
+        let mut table = Table::new(["BARRIER", "NODE", "OPENED", "WAITS", "MISSING"]);
+        meetings.iter().for_each(|(node, one)| table.row(meeting_cells(node, one)));
+        text += &(if text.is_empty() { table.text() } else { format!("\n{}", table.text()) });
+    }
     Ok(Said { text: text + &silent(&answers), json, is_fine })
+}
+
+/// The run-time barriers at which somebody waits, each as every node sees it that has somebody there.
+fn meetings(answers: &[Answer<AppsReport>]) -> Vec<(&str, &BarrierReport)> {
+    let said = answers.iter().filter_map(|answer| answer.said.as_ref().ok());
+    said.flat_map(|said| said.barriers.iter().map(|one| (said.name.as_str(), one))).collect()
+}
+
+fn meeting_cells(node: &str, one: &BarrierReport) -> [String; 5] {
+    let waits: Vec<_> =
+        one.waiting.iter().map(|who| format!("{} {}", who.name, time(who.waits_us))).collect();
+    let missing: Vec<_> = one.missing.iter().map(|who| format!("{} ({})", who.name, who.why)).collect();
+    [one.name.clone(), node.to_owned(), one.generation.to_string(), waits.join(", "), missing.join(", ")]
+}
+
+fn meeting_json(node: &str, one: &BarrierReport) -> Value {
+    let waiting = one.waiting.iter().map(|who| json!({ "name": who.name, "waits_us": who.waits_us }));
+    let missing = one.missing.iter().map(|who| json!({ "name": who.name, "why": who.why }));
+    json!({
+        "name": one.name, "node_name": node, "parties": one.parties, "generation": one.generation,
+        "waiting": waiting.collect::<Vec<_>>(), "missing": missing.collect::<Vec<_>>(),
+    })
 }
 
 fn ask(system: &mut System) -> Result<Vec<Answer<AppsReport>>, Fault> {

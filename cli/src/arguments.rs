@@ -65,7 +65,7 @@ pub(crate) enum Command {
     /// All nodes are asked that can be reached through any socket of this host, so that two nodes that do not know each other are asked
     /// both. Exit code 0 if the way is free.
     Why(why::Order),
-    /// Who waits for whom at start-up barriers, and who blocks them
+    /// Who waits for whom, at start-up barriers and at run-time ones, and who blocks them
     Barriers,
     /// Where every message is that was ever sent: what each mailbox, client and link took, and how each of these ended
     ///

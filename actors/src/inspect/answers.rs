@@ -16,9 +16,9 @@ use sinew_runtime::{
 };
 
 use super::reports::{
-    APPS_MAX, AppReport, AppsReport, AuditReport, DialReport, ForeignReport, LinkReport, LostReport, Missing,
-    NodeReport, PEERS_MAX, PeerReport, RefusalReport, SeenMessage, TOLD_MAX, TREE_MAX, TreeLine, TreeReport,
-    WatchReport,
+    APPS_MAX, AppReport, AppsReport, AuditReport, BarrierReport, DialReport, ForeignReport, LinkReport,
+    LostReport, MISSING_MAX, Missing, NodeReport, PEERS_MAX, PeerReport, RefusalReport, SeenMessage,
+    TOLD_MAX, TREE_MAX, TreeLine, TreeReport, WaitReport, WatchReport,
 };
 use super::watches::{Fetched, Sight};
 use crate::{
@@ -27,7 +27,7 @@ use crate::{
     ndl::{KnownNode, LossReason, LostNode, Source},
     node::{CommandError, NodeHandle, Supervised},
     stores::{Stores, lock},
-    sync::OwnApp,
+    sync::{BarrierStatus, OwnApp},
 };
 
 /// Time for the root's answer: one that hangs does not keep the other questions waiting for long.
@@ -84,9 +84,13 @@ impl Answers {
 
     #[expect(clippy::unnecessary_wraps, reason = "all answers have one form")]
     pub(super) fn apps(&self, stores: &Arc<Stores>) -> Result<AppsReport, Rejection> {
-        let (apps, more) = lock(&stores.sync).own_apps(Time::now(), APPS_MAX);
+        let (now, sync) = (Time::now(), lock(&stores.sync));
+        let (apps, more) = sync.own_apps(now, APPS_MAX);
+        let barriers = sync.barriers(now);
+        drop(sync);
         let apps = apps.into_iter().map(|app| app_report(stores.node, app)).collect();
-        Ok(AppsReport { name: stores.config.name.clone(), apps, left_out: more as u64 })
+        let barriers = barriers.into_iter().take(TOLD_MAX).map(barrier_report).collect();
+        Ok(AppsReport { name: stores.config.name.clone(), apps, left_out: more as u64, barriers })
     }
 
     pub(super) fn tree(&self, stores: &Arc<Stores>) -> Result<TreeReport, Rejection> {
@@ -259,6 +263,18 @@ fn links(peer: &Peer) -> Vec<LinkReport> {
         unconfirmed: way.outlet.unconfirmed() as u64,
     });
     links.collect()
+}
+
+fn barrier_report(status: BarrierStatus) -> BarrierReport {
+    let BarrierStatus { barrier, parties, generation, waiting, missing } = status;
+    let wait = |(name, waits)| WaitReport { name, waits_us: micros(waits) };
+    BarrierReport {
+        name: barrier,
+        parties: parties.into_iter().take(MISSING_MAX).collect(),
+        generation,
+        waiting: waiting.into_iter().take(MISSING_MAX).map(wait).collect(),
+        missing: missing.into_iter().take(MISSING_MAX).map(|(name, why)| Missing { name, why }).collect(),
+    }
 }
 
 fn seen_message(now: Time, sight: Sight, name: Option<String>) -> SeenMessage {

@@ -23,9 +23,10 @@ mod watches;
 
 pub(crate) use inspector::begin;
 pub use reports::{
-    APPS_MAX, AppReport, AppsReport, AskApps, AskAudit, AskNode, AskTree, AskWatch, AuditReport, DialReport,
-    ForeignReport, LinkReport, LostReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping, RefusalReport,
-    SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, TREE_MAX, TreeLine, TreeReport, WatchReport,
+    APPS_MAX, AppReport, AppsReport, AskApps, AskAudit, AskNode, AskTree, AskWatch, AuditReport,
+    BarrierReport, DialReport, ForeignReport, LinkReport, LostReport, Missing, NodeReport, PEERS_MAX,
+    PeerReport, Ping, RefusalReport, SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, TREE_MAX, TreeLine, TreeReport,
+    WaitReport, WatchReport,
 };
 
 #[cfg(doc)]

@@ -22,7 +22,7 @@ pub const TREE_MAX: usize = 1_024;
 /// Lost nodes, or causes of refusals, in one answer at most.
 pub(super) const TOLD_MAX: usize = 64;
 /// Names that one application lacks at most: as many as it may require.
-const MISSING_MAX: usize = 64;
+pub(super) const MISSING_MAX: usize = 64;
 /// Connections to one node at most, and ways in which it was found.
 const LINKS_MAX: usize = 8;
 
@@ -258,6 +258,9 @@ payload!("sinew.inspect.apps_report" =>
         pub apps: Vec<AppReport>,
         /// Further ones that had no room.
         pub left_out: u64,
+        /// The run-time barriers at which applications of this node wait, as far as there is room.
+        #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
+        pub barriers: Vec<BarrierReport>,
     }
 );
 
@@ -277,6 +280,33 @@ pub struct AppReport {
     pub missing: Vec<Missing>,
     /// How its former life ended, while this one is not ready.
     pub ended: Option<String>,
+}
+
+/// A run-time barrier at which somebody waits.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct BarrierReport {
+    /// The barrier's name.
+    pub name: String,
+    /// Who has to be there.
+    #[serde(deserialize_with = "at_most::<_, _, MISSING_MAX>")]
+    pub parties: Vec<String>,
+    /// How often it has opened, as far as the node knows.
+    pub generation: u64,
+    /// Applications of the node that wait there.
+    #[serde(deserialize_with = "at_most::<_, _, MISSING_MAX>")]
+    pub waiting: Vec<WaitReport>,
+    /// Who is missing.
+    #[serde(deserialize_with = "at_most::<_, _, MISSING_MAX>")]
+    pub missing: Vec<Missing>,
+}
+
+/// Who waits at a run-time barrier.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WaitReport {
+    /// Its name, or its address.
+    pub name: String,
+    /// For how long.
+    pub waits_us: u64,
 }
 
 /// A name that is required and not ready.

@@ -34,7 +34,12 @@ fn report(count: u32) -> AppsReport {
         missing: Vec::new(),
         ended: None,
     };
-    AppsReport { name: "knee".to_owned(), apps: (0..count).map(app).collect(), left_out: 0 }
+    AppsReport {
+        name: "knee".to_owned(),
+        apps: (0..count).map(app).collect(),
+        left_out: 0,
+        barriers: Vec::new(),
+    }
 }
 
 #[test]

@@ -9,7 +9,7 @@ use std::{path::Path, time::Duration};
 
 use rustix::process::Signal;
 use serde_json::Value;
-use sinew::{NodeApi, Registration};
+use sinew::{Barrier, NodeApi, Registration};
 use sinew_tests::{OwnDirectory, Program};
 
 use scenario::{Scenario, named, sinew};
@@ -71,6 +71,44 @@ fn who_waits_and_who_is_missing_is_seen_from_another_node() {
     );
     let table = scenario.sinew("knee", &["barriers"]).out;
     assert!(table.contains("ankle (never seen)") && table.contains("hip"), "{table}");
+}
+
+#[test]
+fn who_waits_at_a_run_time_barrier_and_who_is_missing_there_is_seen_from_another_node() {
+    // Given: one of two parties has arrived
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee"]);
+    let _knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["started"]);
+    let barrier = Barrier::new("calibrated", ["hip.imu", "knee.imu"]);
+    let party = |node: &str, name: &str| {
+        let api = NodeApi::connect(scenario.socket(node)).expect("its socket");
+        let mut imu =
+            api.register_transport_address(Registration::new().name(name)).expect("it is registered");
+        let barrier = barrier.clone();
+        std::thread::spawn(move || imu.meet(&barrier))
+    };
+    let first = party("knee", "knee.imu");
+    // When
+    let said = scenario
+        .until("it waits", "hip", &["barriers"], |said| named(&said["barriers"], "calibrated").is_some());
+    // Then
+    let seen = named(&said["barriers"], "calibrated").expect("it was there");
+    assert_eq!(
+        (&seen["node_name"], &seen["waiting"][0]["name"]),
+        (&"knee".into(), &"knee.imu".into()),
+        "{said}"
+    );
+    assert!(named(&seen["missing"], "hip.imu").is_some(), "{said}");
+    let table = scenario.sinew("hip", &["barriers"]);
+    assert!(table.code == Some(1) && table.out.contains("hip.imu ("), "{}", table.out);
+    // And: when both are there, nobody waits any more
+    let second = party("hip", "hip.imu");
+    for waiting in [first, second] {
+        waiting.join().expect("it does not panic").expect("it opens");
+    }
+    let table = scenario.sinew("hip", &["barriers"]);
+    assert!(table.code == Some(0) && table.out.contains("nobody waits"), "{}", table.out);
 }
 
 #[test]
