@@ -13,7 +13,7 @@
 //! | the same in a process of its own, started and restarted by the node | [`AppSpec::own_process`], [`Place::process`] |
 //! | an application in a process that the node did not start | [`NodeApi`], [`Endpoint`] for a thread, [`AsyncEndpoint`] for a task |
 //! | sending | [`Sender`]: `send`, `send_confirmed`, `ask`; [`Outcome`] |
-//! | events | [`NodeEvent`] (who is there), [`RequirementEvent`] (what is ready), [`Down`] (who ended, and why) |
+//! | events | [`NodeEvent`] (who is there), [`DirectoryEvent`] (which applications are, and what they handle), [`RequirementEvent`] (what is ready), [`Down`] (who ended, and why) |
 //!
 //! `docs/SEMANTICS.md` says on one page what is promised and what is not.
 //!
@@ -85,7 +85,8 @@ pub use sinew_runtime::{
 pub use sinew_shm::Spin;
 pub use stores::ClockOffset;
 pub use sync::{
-    ArriveAtBarrier, BarrierAnswer, BarrierStatus, DirectoryEntry, LeaveBarrier, OnPartyLoss, Waiting,
+    ArriveAtBarrier, BarrierAnswer, BarrierStatus, DirectoryEntry, DirectoryEvent, LeaveBarrier, OnPartyLoss,
+    Waiting,
 };
 
 /// Everything that an ordinary program needs, in one line: `use sinew::prelude::*;`

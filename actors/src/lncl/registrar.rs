@@ -52,9 +52,11 @@ pub(crate) fn register_local(stores: &Stores, app: LocalApp) -> Result<Tid, Regi
     let mut registry = lock(&stores.registry);
     let fact_requires = request.requires.clone();
     let app = registry.register(request, limits(stores))?;
+    let handled = events.to_vec();
     stores.router.set_local(app, LocalRoute { outlet, events });
     monitors::note(stores, monitors::Input::Began { app });
     tell_sync(stores, AppFact::Registered { app, name, requires: fact_requires });
+    tell_handled(stores, app, handled);
     Ok(Tid::new(stores.node, app))
 }
 
@@ -105,11 +107,19 @@ pub(crate) fn set_member(stores: &Stores, app: AppAddress, group: AppAddress, me
 /// Gives an application of another process its address. No message reaches it before [`open`].
 pub(super) fn register_client(stores: &Stores, request: Request) -> Result<AppAddress, RegisterError> {
     let (name, requires) = (request.name.clone(), request.requires.clone());
+    let handled = request.kinds.iter().map(|name| Kind::named(name)).collect();
     let mut registry = lock(&stores.registry);
     let app = registry.register(request, limits(stores))?;
     monitors::note(stores, monitors::Input::Began { app });
     tell_sync(stores, AppFact::Registered { app, name, requires });
+    tell_handled(stores, app, handled);
     Ok(app)
+}
+
+fn tell_handled(stores: &Stores, app: AppAddress, kinds: Vec<Kind>) {
+    if !kinds.is_empty() {
+        tell_sync(stores, AppFact::Handles { app, kinds });
+    }
 }
 
 /// Messages reach the application of another process from now on.

@@ -18,6 +18,7 @@ use sinew_runtime::{
 use super::{
     Event,
     core::{Core, Input, Output, Reason},
+    facts::DirectoryEvent,
     words::{ArriveAtBarrier, BarrierAnswer, LeaveBarrier},
 };
 use crate::{audit, lncl::AppFact, monitors, node::RootEvent, refusals::Refusals, stores::Stores, wills};
@@ -66,7 +67,13 @@ impl StreamHandler<Event> for SyncManager {
                 if groups_may_differ {
                     self.take_groups();
                 }
+                let ready = if let AppFact::Ready { app } = fact { Some(app) } else { None };
                 self.handle(Input::AppChanged(fact), ctx);
+                if let Some(app) =
+                    ready.filter(|app| self.stores.router.subscribes(*app, DirectoryEvent::KIND))
+                {
+                    self.handle(Input::DirectoryWanted { app }, ctx);
+                }
             }
             Event::Membership(fact) => {
                 monitors::feed(&self.stores, (&fact).into());
@@ -235,6 +242,7 @@ impl SyncManager {
                 }
             }
             Output::Tell { app, event, why } => self.tell(app, event, why),
+            Output::TellDirectory { app, event } => self.tell_of_directory(app, event),
             Output::Publish { to, list } => self.publish(to, list),
             Output::PublishArrivals { to, said } => self.publish_arrivals(to, said),
             Output::AnswerBarrier { app, correlation, answer } => self.answer(app, correlation, &answer),
@@ -291,6 +299,16 @@ impl SyncManager {
             Err(why) => {
                 self.refuse("application", &format_args!("{app} was not told of a requirement: {why}"))
             }
+        }
+    }
+
+    /// Tells an application what has changed in the directory.
+    fn tell_of_directory(&self, app: AppAddress, event: DirectoryEvent) {
+        let mut message = Message::typed(self.tid(), Tid::new(self.stores.node, app), &event);
+        self.stamp(&mut message.header);
+        // Any other refusal says that it is gone, and nobody has to hear of it.
+        if let Err(Rejection::QueueFull) = self.stores.router.send(message) {
+            self.core().handle(Time::now(), Input::DirectoryNotTaken { app, event });
         }
     }
 

@@ -2,7 +2,11 @@
 
 use std::{fmt, time::Duration};
 
-use sinew_runtime::tid::{AppAddress, Tid};
+use serde::{Deserialize, Serialize};
+use sinew_runtime::{
+    tid::{AppAddress, Tid},
+    wire::{Class, Kind, Payload},
+};
 
 /// An application that waits at the start-up barrier.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -28,7 +32,7 @@ impl fmt::Display for Waiting {
 }
 
 /// An application that has a name, on this node or on another.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DirectoryEntry {
     /// Its name.
     pub name: String,
@@ -36,6 +40,29 @@ pub struct DirectoryEntry {
     pub tid: Tid,
     /// Whether it has started, takes messages, and can be reached now.
     pub ready: bool,
+    /// The payloads that it handles, 64 at most; of an application in a process of its own, those that it named when it
+    /// registered.
+    pub kinds: Vec<Kind>,
+}
+
+/// The directory of names changed. An application that handles this payload hears, when it is ready, of every entry, then of each
+/// change; what its mailbox does not take comes later, in the form that is true then.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum DirectoryEvent {
+    /// An application is there, or something of what is said of it is new.
+    Is(DirectoryEntry),
+    /// It is not there any more: it has gone, or its node was lost.
+    Gone {
+        /// Its name.
+        name: String,
+        /// Its address.
+        tid: Tid,
+    },
+}
+
+impl Payload for DirectoryEvent {
+    const NAME: &'static str = "sinew.directory_event";
+    const CLASS: Class = Class::Control;
 }
 
 /// An application of this node, as a tool sees it.

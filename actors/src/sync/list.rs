@@ -12,6 +12,7 @@ use serde::{
 use sinew_runtime::{
     app::Requirement,
     tid::{AppAddress, Incarnation},
+    wire::Kind,
 };
 
 /// Applications in one list at most.
@@ -20,6 +21,8 @@ pub(crate) const ENTRIES_MAX: usize = 1_024;
 pub(crate) const GROUPS_MAX: usize = 1_024;
 /// Requirements of one application at most, as far as a list says.
 pub(crate) const REQUIRES_MAX: usize = 64;
+/// Kinds of payloads that one application handles at most, as far as a list says.
+pub(crate) const KINDS_MAX: usize = 64;
 /// Longest name in bytes.
 pub(crate) const NAME_BYTES_MAX: usize = 63;
 
@@ -50,6 +53,9 @@ pub(crate) struct Entry {
     /// What it requires, so that every node can see a cycle.
     #[serde(default, deserialize_with = "at_most::<_, _, REQUIRES_MAX>")]
     pub(crate) requires: Vec<Requirement>,
+    /// The payloads that it handles, as far as it tells.
+    #[serde(default, deserialize_with = "at_most::<_, _, KINDS_MAX>")]
+    pub(crate) kinds: Vec<Kind>,
 }
 
 /// A legal name: 1 to 63 bytes of UTF-8, no control characters (they would forge log lines).
@@ -204,7 +210,13 @@ mod tests {
     }
 
     fn entry(index: u32, text: &str) -> Entry {
-        Entry { name: name(text), app: AppAddress::fixed(index).unwrap(), ready: true, requires: Vec::new() }
+        Entry {
+            name: name(text),
+            app: AppAddress::fixed(index).unwrap(),
+            ready: true,
+            requires: Vec::new(),
+            kinds: Vec::new(),
+        }
     }
 
     fn list(entries: Vec<Entry>) -> List {
@@ -228,6 +240,7 @@ mod tests {
                     app: AppAddress::fixed(n).unwrap(),
                     ready,
                     requires: requires.iter().map(|text| text.parse().unwrap()).collect(),
+                    kinds: vec![Kind::named("demo.angle")],
                 })
                 .collect(),
             groups: Vec::new(),

@@ -19,6 +19,7 @@
 //! | SYNC-11 | What a node knows of barriers goes to each linked node when the link comes up, at each change (not sooner than 1 ms after the one before), and every 2 s. A node that has somebody waiting opens a barrier when all parties wait behind the generation that it knows as the last one; of other nodes that counts which can be heard. The opening is one generation more, and those who waited are its members. |
 //! | SYNC-12 | Who hears of a generation that is higher than the known one takes it over, with its members; of the same one the members are put together. Whoever waits behind an earlier one passes if it is a member, and waits for the next one if not. |
 //! | SYNC-13 | A named party that is missing and has failed, was stopped, or whose node is lost, for 50 ms, ends the wait of those who do not want to wait for it. |
+//! | SYNC-14 | An application that subscribed to it is told of every entry of the directory when it is ready, then of each change, until its life ends. What its mailbox does not take is told 10 ms later, as it is then. |
 
 mod actor;
 #[cfg(test)]
@@ -34,7 +35,7 @@ pub(crate) use core::Core;
 #[cfg(test)]
 pub(crate) use core::Input;
 pub(crate) use facts::OwnApp;
-pub use facts::{DirectoryEntry, Waiting};
+pub use facts::{DirectoryEntry, DirectoryEvent, Waiting};
 pub(crate) use list::{NAME_BYTES_MAX, Name, at_most};
 pub use words::{ArriveAtBarrier, BarrierAnswer, BarrierStatus, LeaveBarrier, OnPartyLoss};
 

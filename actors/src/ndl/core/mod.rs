@@ -361,7 +361,7 @@ impl Core {
             AppFact::Down { app } | AppFact::Stopped { app } | AppFact::Unregistered { app } => {
                 self.subscribers.remove(&app);
             }
-            AppFact::Registered { .. } | AppFact::GroupsChanged => {}
+            AppFact::Registered { .. } | AppFact::Handles { .. } | AppFact::GroupsChanged => {}
         }
     }
 

@@ -9,6 +9,7 @@ use sinew_runtime::{
     app::{Requirement, matches},
     tid::AppAddress,
     time::Time,
+    wire::Kind,
 };
 
 use super::reason::Reason;
@@ -26,6 +27,8 @@ pub(super) struct Apps {
 pub(super) struct App {
     pub(super) name: Option<Name>,
     pub(super) requires: Vec<Requirement>,
+    /// The payloads that it handles, as far as it tells.
+    pub(super) kinds: Vec<Kind>,
     pub(super) state: State,
     /// How its former life ended, while this one is not ready yet.
     pub(super) ended: Option<Reason>,
@@ -108,7 +111,8 @@ impl Apps {
         let (name, refused) = self.claim(app, name);
         let state = State::Waiting(wait);
         let (ended, lost, silent, patience) = (None, BTreeSet::new(), BTreeMap::new(), None);
-        self.apps.insert(app, App { name, requires, state, ended, lost, silent, patience });
+        self.apps
+            .insert(app, App { name, requires, kinds: Vec::new(), state, ended, lost, silent, patience });
         refused
     }
 
@@ -173,6 +177,7 @@ impl Apps {
                 app: address,
                 ready: app.state == State::Ready,
                 requires: app.requires.iter().take(REQUIRES_MAX).cloned().collect(),
+                kinds: app.kinds.clone(),
             })
             .collect()
     }

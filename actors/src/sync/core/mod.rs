@@ -7,6 +7,7 @@
 mod apps;
 mod barrier;
 mod cycles;
+mod directory;
 mod meet;
 mod peers;
 mod reason;
@@ -27,17 +28,19 @@ use sinew_runtime::{
     app::{Requirement, RequirementEvent},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
+    wire::Kind,
 };
 
 pub(crate) use self::reason::Reason;
 use self::{
     apps::{Apps, State, Wait},
+    directory::Watchers,
     peers::{Accepted, Peers},
     rendezvous::Rendezvous,
 };
 use super::{
-    facts::{DirectoryEntry, OwnApp, Waiting},
-    list::{ENTRIES_MAX, List},
+    facts::{DirectoryEntry, DirectoryEvent, OwnApp, Waiting},
+    list::{ENTRIES_MAX, KINDS_MAX, List},
     words::{ArriveAtBarrier, BarrierAnswer},
 };
 use crate::{
@@ -71,6 +74,10 @@ pub(crate) enum Input {
     ArrivalsReceived { from: NodeAddress, payload: Bytes },
     /// The queue to `to` did not take who waits at barriers.
     ArrivalsNotTaken { to: NodeAddress },
+    /// This application, which is ready, wants to hear of the directory.
+    DirectoryWanted { app: AppAddress },
+    /// It did not take this event.
+    DirectoryNotTaken { app: AppAddress, event: DirectoryEvent },
     /// The root did not take the release of this application.
     ReleaseNotTaken { app: AppAddress },
     /// This application did not take an event about the requirement `name`.
@@ -86,6 +93,8 @@ pub(crate) enum Output {
     Release { app: AppAddress },
     /// Tell a running application that a requirement changed; of one that is lost, why.
     Tell { app: AppAddress, event: RequirementEvent, why: Option<Reason> },
+    /// Tell an application that wants to hear of it what has changed in the directory.
+    TellDirectory { app: AppAddress, event: DirectoryEvent },
     /// Send this list to the sync manager of `to`.
     Publish { to: NodeAddress, list: Bytes },
     /// Tell the sync manager of `to` who waits at barriers.
@@ -115,6 +124,7 @@ pub(crate) struct Core {
     groups: Vec<AppAddress>,
     peers: Peers,
     rendezvous: Rendezvous,
+    watchers: Watchers,
     /// Of the names and patterns that are required here, those that somebody had at some time.
     seen: BTreeSet<String>,
     /// The cycles that stand, each without its closing name.
@@ -143,6 +153,7 @@ impl Core {
             groups: Vec::new(),
             peers: Peers::new(config.ndl.nodes_max),
             rendezvous: Rendezvous::new(node, incarnation),
+            watchers: Watchers::default(),
             seen: BTreeSet::new(),
             cycles: BTreeSet::new(),
             same_names: BTreeSet::new(),
@@ -167,6 +178,8 @@ impl Core {
             Input::ArrivalsNotTaken { to } => self.rendezvous.not_taken(now, to),
             Input::LinkChanged(fact) => self.link_changed(now, fact),
             Input::ListReceived { from, payload } => self.list_received(from, &payload),
+            Input::DirectoryWanted { app } => self.watchers.add(app),
+            Input::DirectoryNotTaken { app, event } => self.watchers.not_taken(now, app, event),
             Input::ReleaseNotTaken { app } => self.keep(now, app, None),
             Input::EventNotTaken { app, name } => self.keep(now, app, Some(name)),
             Input::TimePassed => {}
@@ -176,6 +189,7 @@ impl Core {
         self.report_overdue(now);
         self.publish(now);
         self.meet(now);
+        self.tell_watchers(now);
     }
 
     /// The next thing to be done; take until there is none.
@@ -188,10 +202,17 @@ impl Core {
         let overdue = self.apps.waiting().map(|(_, _, wait)| wait.overdue).min();
         let silent =
             self.apps.iter().flat_map(|(_, app)| app.silent.values().chain(&app.patience).copied()).min();
-        [self.peers.next_due(), overdue, self.retry, silent, self.rendezvous.next_wake()]
-            .into_iter()
-            .flatten()
-            .min()
+        [
+            self.peers.next_due(),
+            overdue,
+            self.retry,
+            silent,
+            self.rendezvous.next_wake(),
+            self.watchers.next_wake(),
+        ]
+        .into_iter()
+        .flatten()
+        .min()
     }
 
     /// The TIDs of the applications called `name`: of this node first, then of linked nodes, then of nodes whose link
@@ -205,11 +226,16 @@ impl Core {
     pub(crate) fn directory(&self) -> Vec<DirectoryEntry> {
         let here = self.apps.iter().filter_map(|(address, app)| {
             let tid = Tid::new(self.node, address);
-            Some((app.name.as_ref()?, tid, app.state == State::Ready))
+            Some((app.name.as_ref()?, tid, app.state == State::Ready, &app.kinds))
         });
         let mut entries: Vec<_> = here
             .chain(self.peers.directory())
-            .map(|(name, tid, ready)| DirectoryEntry { name: name.to_string(), tid, ready })
+            .map(|(name, tid, ready, kinds)| DirectoryEntry {
+                name: name.to_string(),
+                tid,
+                ready,
+                kinds: kinds.clone(),
+            })
             .collect();
         entries.sort_by(|a, b| (&a.name, a.tid).cmp(&(&b.name, b.tid)));
         entries
@@ -274,17 +300,18 @@ impl Core {
                     );
                 }
                 self.forget_not_taken(app);
-                self.rendezvous.ended(now, app);
+                self.life_ended(now, app);
                 self.note_same_name(name.as_deref().unwrap_or_default());
                 self.own_list_changed(now);
             }
+            AppFact::Handles { app, kinds } => self.app_handles(now, app, kinds),
             AppFact::Ready { app } => self.app_ready(now, app),
             AppFact::Down { app } => self.app_ended(now, app, Reason::Failed),
             AppFact::Stopped { app } => self.app_ended(now, app, Reason::Stopped),
             AppFact::Unregistered { app } => {
                 self.apps.remove(app);
                 self.forget_not_taken(app);
-                self.rendezvous.ended(now, app);
+                self.life_ended(now, app);
                 self.own_list_changed(now);
             }
             // The shell looks up which they are and says so by `Input::GroupsChanged`.
@@ -303,6 +330,16 @@ impl Core {
         texts.into_iter().map(read).collect()
     }
 
+    fn app_handles(&mut self, now: Time, address: AppAddress, mut kinds: Vec<Kind>) {
+        kinds.truncate(KINDS_MAX);
+        if let Some(app) = self.apps.get_mut(address)
+            && app.kinds != kinds
+        {
+            app.kinds = kinds;
+            self.own_list_changed(now);
+        }
+    }
+
     fn app_ready(&mut self, now: Time, address: AppAddress) {
         if let Some(app) = self.apps.get_mut(address)
             && app.state != State::Ready
@@ -314,7 +351,7 @@ impl Core {
 
     /// It waits again for all that it requires; one that waits already was not started yet and goes on waiting.
     fn app_ended(&mut self, now: Time, address: AppAddress, how: Reason) {
-        self.rendezvous.ended(now, address);
+        self.life_ended(now, address);
         let wait = Wait::begun(now, self.requirement_deadline);
         if let Some(app) = self.apps.get_mut(address)
             && app.wait().is_none()
@@ -325,6 +362,12 @@ impl Core {
             self.forget_not_taken(address);
             self.own_list_changed(now);
         }
+    }
+
+    /// What it waited for and wanted to hear it does not any more.
+    fn life_ended(&mut self, now: Time, app: AppAddress) {
+        self.rendezvous.ended(now, app);
+        self.watchers.remove(app);
     }
 
     fn groups_changed(&mut self, now: Time, mut groups: Vec<AppAddress>) {

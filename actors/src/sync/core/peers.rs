@@ -9,6 +9,7 @@ use sinew_runtime::{
     app::{Requirement, matches},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
+    wire::Kind,
 };
 
 use super::reason::Reason;
@@ -268,12 +269,15 @@ impl Peers {
         found.into_iter().map(|(_, tid)| tid).collect()
     }
 
-    /// Every application of every node that is not lost: name, address, whether it is ready.
-    pub(super) fn directory(&self) -> impl Iterator<Item = (&Name, Tid, bool)> {
+    /// Every application of every node that is not lost: name, address, whether it is ready, what it handles.
+    pub(super) fn directory(&self) -> impl Iterator<Item = (&Name, Tid, bool, &Vec<Kind>)> {
         let there = self.nodes.iter().filter(|(_, peer)| peer.lost.is_none() && !peer.stale);
         there.flat_map(|(node, peer)| {
             let entries = peer.list.iter().flat_map(|list| list.entries.values());
-            entries.map(|entry| (&entry.name, Tid::new(*node, entry.app), peer.why_not(entry).is_none()))
+            entries.map(|entry| {
+                let is_ready = peer.why_not(entry).is_none();
+                (&entry.name, Tid::new(*node, entry.app), is_ready, &entry.kinds)
+            })
         })
     }
 

@@ -10,6 +10,8 @@ use super::*;
 const NODES: usize = 3;
 /// Each node may have these applications; names are `node.app`.
 const APPS: usize = 3;
+/// An application of each node that watches the directory.
+const WATCHER: usize = 99;
 
 #[derive(Clone, Debug)]
 enum Step {
@@ -110,6 +112,10 @@ struct World {
     up: Vec<bool>,
     /// Lists on their way, by link and direction.
     flying: BTreeMap<(usize, bool), VecDeque<Bytes>>,
+    /// What an application of each node knows of the directory, by what it was told and took.
+    views: Vec<BTreeMap<(String, Tid), bool>>,
+    told: u64,
+    takes_all: bool,
 }
 
 /// The two ends of a link.
@@ -138,9 +144,35 @@ impl World {
             apps: vec![BTreeMap::new(); NODES],
             up: vec![false; NODES],
             flying: BTreeMap::new(),
+            views: vec![BTreeMap::new(); NODES],
+            told: 0,
+            takes_all: false,
         };
         world.cores = (0..NODES).map(|node| world.new_core(node)).collect();
+        (0..NODES).for_each(|node| world.watch(node));
         world
+    }
+
+    /// An application without a name wants to hear of the directory.
+    fn watch(&mut self, node: usize) {
+        self.views[node].clear();
+        let app = app_address(WATCHER);
+        self.tell(node, Input::AppChanged(AppFact::Registered { app, name: None, requires: Vec::new() }));
+        self.tell(node, Input::AppChanged(AppFact::Ready { app }));
+        self.tell(node, Input::DirectoryWanted { app });
+    }
+
+    /// It takes two of three events, and in the end all.
+    fn told_of_directory(&mut self, node: usize, event: DirectoryEvent) {
+        self.told += 1;
+        if self.told.is_multiple_of(3) && !self.takes_all {
+            return self.cores[node]
+                .handle(self.now, Input::DirectoryNotTaken { app: app_address(WATCHER), event });
+        }
+        match event {
+            DirectoryEvent::Is(entry) => drop(self.views[node].insert((entry.name, entry.tid), entry.ready)),
+            DirectoryEvent::Gone { name, tid } => drop(self.views[node].remove(&(name, tid))),
+        }
     }
 
     fn new_core(&self, node: usize) -> Core {
@@ -156,7 +188,9 @@ impl World {
 
     fn carry_out(&mut self, node: usize, output: Output) {
         match output {
+            Output::Release { app } if app == app_address(WATCHER) => {}
             Output::Release { app } => self.released(node, app),
+            Output::TellDirectory { event, .. } => self.told_of_directory(node, event),
             Output::Publish { to, list } => {
                 let to = (to.bits() - address(0).bits()) as usize;
                 let link = (0..NODES).find(|link| [(node, to), (to, node)].contains(&ends(*link))).unwrap();
@@ -294,6 +328,7 @@ impl World {
         self.incarnations[node] += 1;
         self.apps[node].clear();
         self.cores[node] = self.new_core(node);
+        self.watch(node);
     }
 
     fn deliver(&mut self, link: usize, forward: bool) -> bool {
@@ -316,8 +351,9 @@ impl World {
     /// Heals every link and lets everything happen that can.
     fn settle(&mut self) {
         (0..NODES).for_each(|link| self.restore(link));
+        self.takes_all = true;
         for _ in 0..NODES * APPS + 2 {
-            self.pass(peers::SPACING);
+            self.pass(barrier::RETRY);
             for link in 0..NODES {
                 while self.deliver(link, true) || self.deliver(link, false) {}
             }
@@ -356,6 +392,10 @@ proptest! {
         let directories: Vec<_> = world.cores.iter().map(Core::directory).collect();
         prop_assert_eq!(&directories[0], &directories[1]);
         prop_assert_eq!(&directories[0], &directories[2]);
+        for (core, view) in world.cores.iter().zip(&world.views) {
+            let known = core.directory().into_iter().map(|entry| ((entry.name, entry.tid), entry.ready));
+            prop_assert_eq!(&known.collect::<BTreeMap<_, _>>(), view);
+        }
         let registered: usize = world.apps.iter().map(BTreeMap::len).sum();
         prop_assert_eq!(directories[0].len(), registered);
         for entry in &directories[0] {

@@ -2,6 +2,8 @@
 
 use std::net::SocketAddr;
 
+#[path = "directory_tests.rs"]
+mod directory;
 #[path = "forms_tests.rs"]
 mod forms;
 
@@ -98,6 +100,7 @@ fn list(version: u64, entries: &[(&str, bool, &[&str])]) -> List {
         app: app(index),
         ready: *ready,
         requires: requires.iter().map(|text| text.parse().unwrap()).collect(),
+        kinds: Vec::new(),
     });
     List { incarnation: LIFE, version, entries: entries.collect(), groups: Vec::new() }
 }

@@ -177,6 +177,7 @@ impl World {
             }
             Output::Refused { cause, detail } => panic!("refused because of {cause}: {detail}"),
             Output::Release { .. }
+            | Output::TellDirectory { .. }
             | Output::Tell { .. }
             | Output::RouteGroups { .. }
             | Output::Cycle { .. }

@@ -1,0 +1,66 @@
+//! The directory, as those see it who want to hear of it.
+
+use super::*;
+
+fn is(name: &str, node: NodeAddress, index: u32, ready: bool) -> Output {
+    let entry =
+        DirectoryEntry { name: name.to_owned(), tid: Tid::new(node, app(index)), ready, kinds: Vec::new() };
+    Output::TellDirectory { app: app(9), event: DirectoryEvent::Is(entry) }
+}
+
+fn gone(name: &str, node: NodeAddress, index: u32) -> Output {
+    let event = DirectoryEvent::Gone { name: name.to_owned(), tid: Tid::new(node, app(index)) };
+    Output::TellDirectory { app: app(9), event }
+}
+
+fn watched() -> Bench {
+    let mut bench = Bench::new();
+    bench.registers(9, "", &[]);
+    bench.ready(9);
+    bench.registers(0, "hip", &[]);
+    bench
+}
+
+#[test]
+fn who_watches_hears_of_all_that_is_there_and_then_of_each_change_once() {
+    let mut bench = watched();
+    assert_eq!(bench.hears(Input::DirectoryWanted { app: app(9) }), [is("hip", HERE, 0, false)]);
+    assert_eq!(bench.ready(0), [is("hip", HERE, 0, true)]);
+    bench.links(KNEE, LIFE);
+    assert!(bench.list(KNEE, list(1, &[("knee", true, &[])])).contains(&is("knee", KNEE, 0, true)));
+    assert_eq!(bench.breaks(KNEE), [is("knee", KNEE, 0, false)]);
+    assert_eq!(bench.lost(KNEE, LossReason::Silent), [gone("knee", KNEE, 0)]);
+    assert_eq!(bench.down(9), [release(9)]);
+    assert_eq!(bench.hears(Input::AppChanged(AppFact::Unregistered { app: app(0) })), [], "it is over");
+}
+
+#[test]
+fn what_was_not_taken_is_told_later_as_it_is_then() {
+    let mut bench = watched();
+    bench.hears(Input::DirectoryWanted { app: app(9) });
+    let Output::TellDirectory { event, .. } = is("hip", HERE, 0, false) else { panic!("it is one") };
+    assert_eq!(bench.hears(Input::DirectoryNotTaken { app: app(9), event }), []);
+    assert_eq!(bench.ready(0), [], "it has no room yet");
+    assert_eq!(bench.core.next_wake(), Some(bench.now + RETRY));
+    assert_eq!(bench.passes(RETRY), [is("hip", HERE, 0, true)]);
+    let outputs = bench.hears(Input::AppChanged(AppFact::Unregistered { app: app(0) }));
+    assert_eq!(outputs, [gone("hip", HERE, 0)]);
+    let Output::TellDirectory { event, .. } = gone("hip", HERE, 0) else { panic!("it is one") };
+    bench.hears(Input::DirectoryNotTaken { app: app(9), event });
+    assert_eq!(bench.passes(RETRY), [gone("hip", HERE, 0)]);
+}
+
+#[test]
+fn what_an_application_handles_stands_in_the_directory_of_every_node() {
+    let mut bench = watched();
+    let kinds = vec![Kind::named("demo.angle")];
+    bench.links(KNEE, LIFE);
+    bench.passes(SPACING);
+    let outputs = bench.hears(Input::AppChanged(AppFact::Handles { app: app(0), kinds: kinds.clone() }));
+    assert_eq!(bench.core.directory()[0].kinds, kinds);
+    assert_eq!(published(&outputs)[0].entries[0].kinds, kinds);
+    let mut theirs = list(1, &[("knee", true, &[])]);
+    theirs.entries[0].kinds.clone_from(&kinds);
+    bench.list(KNEE, theirs);
+    assert_eq!(bench.core.directory()[1].kinds, kinds);
+}
