@@ -1,0 +1,61 @@
+//! The directory of names, as an application sees it that wants to hear of it.
+
+use std::sync::mpsc::{SyncSender, sync_channel};
+
+use sinew::{DirectoryEvent, prelude::*};
+use sinew_tests::{DEADLINE, Ground};
+
+payload!("scenario.angle" => struct Angle { degrees: f32 });
+
+struct Knee;
+
+impl Actor for Knee {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<Angle>> for Knee {
+    type Result = ();
+
+    fn handle(&mut self, angle: Delivery<Angle>, _: &mut Self::Context) {
+        assert!(angle.degrees < 360.0);
+    }
+}
+
+struct Watcher(SyncSender<DirectoryEvent>);
+
+impl Actor for Watcher {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<DirectoryEvent>> for Watcher {
+    type Result = ();
+
+    fn handle(&mut self, event: Delivery<DirectoryEvent>, _: &mut Self::Context) {
+        self.0.send(event.payload).expect("the test listens");
+    }
+}
+
+#[test]
+fn who_watches_hears_of_an_application_of_another_node_and_of_its_end() {
+    let ground = Ground::new();
+    let (say, heard) = sync_channel(64);
+    let watcher = AppSpec::new("watcher", move || Watcher(say.clone())).handles::<DirectoryEvent>();
+    let _hip = ground.node("hip").app(watcher).start().expect("it starts");
+    let knee =
+        ground.node("knee").app(AppSpec::new("knee", || Knee).handles::<Angle>()).start().expect("it starts");
+    let wait_for = |what: &str, is_it: &dyn Fn(&DirectoryEvent) -> bool| loop {
+        let event = heard.recv_timeout(DEADLINE).unwrap_or_else(|_| panic!("it does not hear that {what}"));
+        if is_it(&event) {
+            break;
+        }
+    };
+    wait_for(
+        "the knee is ready",
+        &|event| matches!(event, DirectoryEvent::Is(entry) if entry.name == "knee" && entry.ready && entry.kinds.contains(&Angle::KIND)),
+    );
+    drop(knee);
+    wait_for(
+        "the knee is gone",
+        &|event| matches!(event, DirectoryEvent::Gone { name, .. } if name == "knee"),
+    );
+}
