@@ -6,13 +6,16 @@ use std::{
     time::Duration,
 };
 
-use super::{ConfigFault, ConfigFaults, NodeConfig, faults::quoted};
+use super::{ConfigFault, ConfigFaults, NodeConfig, WatchGroup, faults::quoted};
 use crate::{ndl::FURTHER_MAX, sync::NAME_BYTES_MAX};
 
 /// Longest path of a unix socket in bytes: what every system takes, with the closing zero.
 const SOCKET_BYTES_MAX: usize = 100;
 /// Seeds at most.
 const SEEDS_MAX: usize = 256;
+/// Groups of nodes with a pace of their own at most, and names in one of them.
+const WATCH_MAX: usize = 16;
+const WATCHED_NAMES_MAX: usize = 64;
 
 /// A setting that is a number.
 #[derive(Clone, Copy, Debug)]
@@ -210,6 +213,7 @@ impl NodeConfig {
             faults.push(MDNS_PORT.fault("0".to_owned()));
         }
         check_seeds(faults, &ndl.seeds);
+        check_watch(faults, &ndl.watch);
         PERIOD.time(faults, ndl.period);
         MISSED_MAX.count(faults, ndl.missed_max as usize);
         NODES_MAX.count(faults, ndl.nodes_max);
@@ -247,5 +251,34 @@ fn check_seeds(faults: &mut Vec<ConfigFault>, seeds: &[SocketAddr]) {
     for seed in seeds.iter().take(SEEDS_MAX).filter(nowhere) {
         let remedy = "write the address of a node and its ndl.port";
         faults.push(fault("ndl.seeds", quoted(&seed.to_string()), legal.clone(), remedy));
+    }
+}
+
+/// What a group in `ndl.watch` may be.
+pub(super) const WATCH_LEGAL: &str = "at most 16 groups, each with `nodes` (1 to 64 names, `*` for any text), `period_ms` (10 to 60000) and \
+     `missed_max` (2 to 100)";
+
+fn check_watch(faults: &mut Vec<ConfigFault>, groups: &[WatchGroup]) {
+    let mut fault_in =
+        |found: String, remedy: &str| faults.push(fault("ndl.watch", found, WATCH_LEGAL, remedy));
+    if groups.len() > WATCH_MAX {
+        fault_in(format!("{} groups", groups.len()), "put nodes of one pace into one group");
+    }
+    for group in groups.iter().take(WATCH_MAX) {
+        if group.nodes.is_empty() || group.nodes.len() > WATCHED_NAMES_MAX {
+            fault_in(format!("a group of {} names", group.nodes.len()), "name its nodes, or write a `*`");
+        }
+        let is_unfit = |name: &&String| {
+            name.is_empty() || name.len() > NAME_BYTES_MAX || name.chars().any(char::is_control)
+        };
+        for name in group.nodes.iter().take(WATCHED_NAMES_MAX).filter(is_unfit) {
+            fault_in(quoted(name), "write a node's name, as in \"knee\" or \"leg.*\"");
+        }
+        let mut of_numbers = Vec::new();
+        PERIOD.time(&mut of_numbers, group.period);
+        MISSED_MAX.count(&mut of_numbers, group.missed_max as usize);
+        for fault in of_numbers {
+            fault_in(fault.found, "set `period_ms` and `missed_max` of this group within their ranges");
+        }
     }
 }

@@ -18,7 +18,7 @@ use toml::{
 };
 
 use super::{
-    ConfigFault, ConfigFaults, NodeConfig,
+    ConfigFault, ConfigFaults, NodeConfig, WatchGroup,
     check::{self, Range, fault},
     faults::quoted,
 };
@@ -29,7 +29,7 @@ const FILE_BYTES_MAX: u64 = 1 << 20;
 const SECTIONS: [&str; 6] = ["node", "lncl", "gncl", "ndl", "sync", "supervision"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 40] = [
+pub(super) const KEYS: [&str; 41] = [
     "node.name",
     "node.project",
     "node.address",
@@ -63,6 +63,7 @@ pub(super) const KEYS: [&str; 40] = [
     "ndl.seeds",
     "ndl.period_ms",
     "ndl.missed_max",
+    "ndl.watch",
     "ndl.nodes_max",
     "sync.layer_deadline_ms",
     "sync.requirement_deadline_ms",
@@ -375,7 +376,23 @@ impl Reader<'_> {
         self.read_list("ndl.seeds", "a list of addresses with their ports", remedy, &mut ndl.seeds);
         self.time(&check::PERIOD, &mut ndl.period);
         self.number(&check::MISSED_MAX, &mut ndl.missed_max);
+        self.read_watch(&mut ndl.watch);
         self.number(&check::NODES_MAX, &mut ndl.nodes_max);
+    }
+
+    fn read_watch(&mut self, groups: &mut Vec<WatchGroup>) {
+        let Some(value) = self.values.get("ndl.watch").copied() else { return };
+        let remedy =
+            "write [[ndl.watch]] and below it nodes = [\"leg.*\"], period_ms = 10 and missed_max = 3";
+        let Some(tables) = value.get_ref().as_array() else {
+            return self.reject("ndl.watch", value, check::WATCH_LEGAL, remedy);
+        };
+        for table in tables {
+            match table.get_ref().as_table().and_then(watch_group) {
+                Some(group) => groups.push(group),
+                None => self.reject("ndl.watch", table, check::WATCH_LEGAL, remedy),
+            }
+        }
     }
 
     fn read_supervision(&mut self, config: &mut NodeConfig) {
@@ -404,6 +421,19 @@ impl Reader<'_> {
             }
         }
     }
+}
+
+/// A group of nodes with a pace of their own, if `table` has what one has and nothing else.
+fn watch_group(table: &DeTable<'_>) -> Option<WatchGroup> {
+    let number = |key: &str| {
+        let number = table.get(key)?.get_ref().as_integer()?;
+        u64::from_str_radix(number.as_str(), number.radix()).ok()
+    };
+    let nodes = table.get("nodes")?.get_ref().as_array()?;
+    let nodes = nodes.iter().map(|name| name.get_ref().as_str().map(str::to_owned)).collect::<Option<_>>()?;
+    let (period, missed_max) = (number("period_ms")?, u32::try_from(number("missed_max")?).ok()?);
+    let is_all = table.len() == 3;
+    is_all.then(|| WatchGroup { nodes, period: Duration::from_millis(period), missed_max })
 }
 
 /// The known name that differs least from `name`. A name without a section is compared with keys without theirs.

@@ -134,8 +134,49 @@ pub struct NdlConfig {
     pub period: Duration,
     /// Answers missed in a row after which a node counts as lost. 2 to 100; default 3.
     pub missed_max: u32,
+    /// Nodes that are watched at a pace of their own, as [`period`](Self::period) and [`missed_max`](Self::missed_max) are that of all
+    /// others; of several groups that cover a node the first one counts. At most 16; default none.
+    pub watch: Vec<WatchGroup>,
     /// Nodes known at most. 1 to 65,536; default 1,024.
     pub nodes_max: usize,
+}
+
+/// Nodes whose loss is to be known sooner, or may be known later, than that of others. Each node decides for itself how it watches others;
+/// those answer whoever asks.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct WatchGroup {
+    /// Names of nodes; `*` stands for any text: `leg.*`. 1 to 64 names of 1 to 63 bytes.
+    pub nodes: Vec<String>,
+    /// Time between two queries to each of them. 10 ms to 60 s. Shorter costs a datagram each way for every node and period.
+    pub period: Duration,
+    /// Answers missed in a row after which one of them counts as lost. 2 to 100.
+    pub missed_max: u32,
+}
+
+impl WatchGroup {
+    /// Whether the node called `name` is in this group.
+    ///
+    /// ```
+    /// # use sinew::config::WatchGroup;
+    /// let legs = WatchGroup { nodes: vec!["leg.*".into(), "hip".into()], period: std::time::Duration::from_millis(10), missed_max: 3 };
+    /// assert!(legs.covers("leg.left") && legs.covers("hip") && !legs.covers("hip.left"));
+    /// ```
+    #[must_use]
+    pub fn covers(&self, name: &str) -> bool {
+        self.nodes.iter().any(|pattern| fits(pattern, name))
+    }
+}
+
+/// Whether `name` is what `pattern` says, in which each `*` stands for any text.
+fn fits(pattern: &str, name: &str) -> bool {
+    let mut parts: Vec<&str> = pattern.split('*').collect();
+    let Some(mut rest) = name.strip_prefix(parts.remove(0)) else { return false };
+    let Some(last) = parts.pop() else { return rest.is_empty() };
+    for part in parts {
+        let Some(at) = rest.find(part) else { return false };
+        rest = &rest[at + part.len()..];
+    }
+    rest.ends_with(last)
 }
 
 /// Sync manager: start-up barriers.
@@ -226,6 +267,7 @@ impl NodeConfig {
                 seeds: Vec::new(),
                 period: Duration::from_millis(500),
                 missed_max: 3,
+                watch: Vec::new(),
                 nodes_max: 1_024,
             },
             sync: SyncConfig {

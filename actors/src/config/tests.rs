@@ -169,6 +169,30 @@ fn texts_are_legal_at_both_ends_and_not_beyond() {
         ("ndl.seeds", "[7]".to_owned(), false),
         ("ndl.seeds", "'10.0.0.7:1'".to_owned(), false),
     ];
+    are_legal_or_not(cases);
+}
+
+#[test]
+fn groups_of_nodes_are_legal_at_both_ends_and_not_beyond() {
+    let cases = [
+        ("ndl.watch", watch("['leg.*', 'hip']", 10, 2), true),
+        ("ndl.watch", format!("[{}]", [watch_one("['*']", 10, 2); 16].join(",")), true),
+        ("ndl.watch", format!("[{}]", [watch_one("['*']", 10, 2); 17].join(",")), false),
+        ("ndl.watch", watch("[]", 10, 2), false),
+        ("ndl.watch", watch("['']", 10, 2), false),
+        ("ndl.watch", watch("[7]", 10, 2), false),
+        ("ndl.watch", watch("'hip'", 10, 2), false),
+        ("ndl.watch", watch("['hip']", 9, 2), false),
+        ("ndl.watch", watch("['hip']", 10, 1), false),
+        ("ndl.watch", "[{nodes = ['hip'], period_ms = 10}]".to_owned(), false),
+        ("ndl.watch", "[{nodes = ['hip'], period_ms = 10, missed_max = 2, speed = 1}]".to_owned(), false),
+        ("ndl.watch", "{}".to_owned(), false),
+    ];
+    are_legal_or_not(cases);
+}
+
+/// Keys, values, and whether they are legal.
+fn are_legal_or_not<const N: usize>(cases: [(&str, String, bool); N]) {
     for (key, value, legal) in cases {
         let read = NodeConfig::from_toml(&with(key, &value, ""));
         match read {
@@ -178,6 +202,31 @@ fn texts_are_legal_at_both_ends_and_not_beyond() {
                 assert!(!legal && one, "{key} = {value}: {faults}");
             }
         }
+    }
+}
+
+/// A group of nodes as one stands in a file.
+fn watch_one(nodes: &str, period_ms: u32, missed_max: u32) -> &'static str {
+    format!("{{nodes = {nodes}, period_ms = {period_ms}, missed_max = {missed_max}}}").leak()
+}
+
+fn watch(nodes: &str, period_ms: u32, missed_max: u32) -> String {
+    format!("[{}]", watch_one(nodes, period_ms, missed_max))
+}
+
+#[test]
+fn groups_of_nodes_are_read_in_the_order_of_the_file_and_the_first_that_covers_a_node_counts() {
+    let text = format!(
+        "{NAMED}[[ndl.watch]]\nnodes = ['leg.*']\nperiod_ms = 10\nmissed_max = 3\n\
+         [[ndl.watch]]\nnodes = ['*.left', 'l*g.*t']\nperiod_ms = 100\nmissed_max = 5\n"
+    );
+    let config = NodeConfig::from_toml(&text).unwrap();
+    let covering = |name: &str| config.ndl.watch.iter().position(|group| group.covers(name));
+    assert_eq!(config.ndl.watch.iter().map(|group| group.missed_max).collect::<Vec<_>>(), [3, 5]);
+    let expected =
+        [("leg.left", Some(0)), ("arm.left", Some(1)), ("ling.t", Some(1)), ("lg.", None), ("left", None)];
+    for (name, group) in expected {
+        assert_eq!(covering(name), group, "{name}");
     }
 }
 

@@ -46,6 +46,10 @@ pub enum NodeEvent {
         why: LossReason,
         /// Time since its last sign of life, in microseconds.
         silent_us: u64,
+        /// Time within which a node that falls silent is lost, with the settings that it was watched with, in microseconds. More only
+        /// where this node itself was starved (NDL-4.2), or its connection still stood (NDL-4.5).
+        #[serde(default)]
+        bound_us: u64,
     },
     /// A node is there in a new life: its process ended and was started again.
     NodeRestarted {

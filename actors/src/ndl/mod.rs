@@ -1,7 +1,7 @@
 //! NDL, the Node Discovery Layer: finds nodes and watches that they exist.
 //!
 //! Its promise: a node that can be reached is known within milliseconds of its start; a node that is gone is known to
-//! be gone within `period` times `missed_max` plus one period, and at once if it said so or if its connection broke
+//! be gone within `period` times `missed_max` plus one period (those of its group, if it is in one), and at once if it said so or if its connection broke
 //! and is refused; a node that is only slow is not lost; and nobody becomes a member by a forged source address.
 //!
 //! `docs/protocol/ndl.md` has the bytes. The rules:
@@ -15,6 +15,7 @@
 //! | NDL-2.1 | Each period, and at once at the start: a query to each member, each seed, each candidate, and one to the group. |
 //! | NDL-2.2 | Whoever is heard for the first time is asked at once. |
 //! | NDL-2.3 | So is whoever mDNS resolves. |
+//! | NDL-2.4 | Members of a group of `ndl.watch` are asked at that group's pace instead. |
 //! | NDL-3 | A query is answered at once, to where it came from; a member's query to the group is not. |
 //! | NDL-3.1 | An answer counts once, if it comes from the address that was asked and quotes the query's correlation id. |
 //! | NDL-3.2 | Such an answer, and nothing else, makes a member. |

@@ -7,6 +7,7 @@ use sinew_runtime::{tid::NodeAddress, time::Time};
 use super::{
     Core, Member, Output, Source,
     contact::{Contact, Question, Role},
+    pace::{Pace, REST},
 };
 use crate::ndl::LossReason;
 
@@ -31,35 +32,48 @@ impl Core {
         }
         for member in self.members.values_mut() {
             member.is_awaited = false;
-            member.missed = member.missed.min(self.missed_max - 1);
+            member.missed = member.missed.min(self.paces[member.pace].missed_max - 1);
         }
         self.contests.clear();
-        self.respite = None;
+        for (at, pace) in self.paces.iter_mut().enumerate() {
+            let is_used = at == REST || self.members.values().any(|member| member.pace == at);
+            (pace.due, pace.respite) = (is_used.then_some(now), None);
+        }
         // spec: NDL-5.5
         if self.settles.is_none() {
             self.settle(now);
         }
-        self.cycle_due = Some(now);
         self.time_passed(now);
     }
 
     pub(super) fn time_passed(&mut self, now: Time) {
         self.decide_contests(now);
-        self.end_respite(now);
         self.end_settling(now);
-        let Some(due) = self.cycle_due.filter(|due| *due <= now) else { return };
+        for at in 0..self.paces.len() {
+            self.end_respite(now, at);
+            self.pace_due(now, at);
+        }
+    }
+
+    fn pace_due(&mut self, now: Time, at: usize) {
+        let pace = &mut self.paces[at];
+        let Some(due) = pace.due.filter(|due| *due <= now) else { return };
         let late = now.since(due);
         // Lifeguard's rule: who was starved himself does not accuse others. The answers that came meanwhile are still
         // in the socket. spec: NDL-4.2
-        if late > self.period / 2 {
+        if late > pace.period / 2 {
+            pace.due = Some(now + pace.period);
             self.report_stall(now, late);
-            self.cycle_due = Some(now + self.period);
         } else {
-            self.count_missed();
-            self.lose_the_silent(now, late, Duration::ZERO);
-            self.cycle_due = Some(due + self.period);
+            pace.due = Some(due + pace.period);
+            self.count_missed(at);
+            self.lose_the_silent(now, at, late, Duration::ZERO);
         }
-        self.ask_everybody(now);
+        if at == REST {
+            self.ask_everybody(now);
+        } else {
+            self.ask_group(now, at);
+        }
     }
 
     fn report_stall(&mut self, now: Time, late: Duration) {
@@ -69,8 +83,8 @@ impl Core {
         }
     }
 
-    fn count_missed(&mut self) {
-        for member in self.members.values_mut().filter(|member| member.is_awaited) {
+    fn count_missed(&mut self, at: usize) {
+        for member in self.members.values_mut().filter(|member| member.pace == at && member.is_awaited) {
             member.missed += 1;
         }
     }
@@ -78,13 +92,14 @@ impl Core {
     /// Who missed too much is lost, unless our own timer was later than is `allowed`: then what waits in our socket is
     /// read first. Each respite allows twice what made it, so that a timer that is always late puts nothing off for ever.
     // spec: NDL-4.1, NDL-4.2
-    fn lose_the_silent(&mut self, now: Time, late: Duration, allowed: Duration) {
-        let is_silent = |member: &Member| member.is_silent(now, self.missed_max);
+    fn lose_the_silent(&mut self, now: Time, at: usize, late: Duration, allowed: Duration) {
+        let Pace { period, missed_max, .. } = self.paces[at];
+        let is_silent = |member: &Member| member.pace == at && member.is_silent(now, missed_max);
         let silent: Vec<NodeAddress> =
             self.members.iter().filter(|(_, member)| is_silent(member)).map(|(node, _)| *node).collect();
         if late > allowed && !silent.is_empty() {
-            let lasts = late.min(self.period / 2);
-            self.respite = Some(Respite { until: now + lasts, lasts });
+            let lasts = late.min(period / 2);
+            self.paces[at].respite = Some(Respite { until: now + lasts, lasts });
             return;
         }
         for node in silent {
@@ -92,9 +107,9 @@ impl Core {
         }
     }
 
-    fn end_respite(&mut self, now: Time) {
-        if let Some(respite) = self.respite.take_if(|respite| respite.until <= now) {
-            self.lose_the_silent(now, now.since(respite.until), respite.lasts * 2);
+    fn end_respite(&mut self, now: Time, at: usize) {
+        if let Some(respite) = self.paces[at].respite.take_if(|respite| respite.until <= now) {
+            self.lose_the_silent(now, at, now.since(respite.until), respite.lasts * 2);
         }
     }
 
@@ -111,18 +126,47 @@ impl Core {
         }
     }
 
+    /// The members of one group; a pace that has none any more rests.
+    fn ask_group(&mut self, now: Time, at: usize) {
+        let members = self.members.values_mut().filter(|member| member.pace == at);
+        let addresses: Vec<SocketAddr> = members
+            .map(|member| {
+                member.is_awaited = true;
+                member.address
+            })
+            .collect();
+        if addresses.is_empty() {
+            self.paces[at].due = None;
+        }
+        for address in addresses {
+            self.ask(now, address);
+        }
+    }
+
+    /// Which pace the node called `name` is asked at, from now on.
+    pub(super) fn pace_for(&mut self, now: Time, name: &str) -> usize {
+        let at = self.paces.iter().position(|pace| pace.covers(name)).unwrap_or(REST);
+        let pace = &mut self.paces[at];
+        pace.due.get_or_insert(now + pace.period);
+        at
+    }
+
     fn ask_in_cycle(&mut self, now: Time, address: SocketAddr) {
+        let missed_max = self.rest().missed_max;
         let Some(contact) = self.contacts.get_mut(&address) else { return };
         match &mut contact.role {
-            Role::Candidate { asked } if *asked >= self.missed_max && !contact.is_seed => {
+            Role::Candidate { asked } if *asked >= missed_max && !contact.is_seed => {
                 self.contacts.remove(&address);
                 return;
             }
             Role::Candidate { asked } => *asked = asked.saturating_add(1),
             Role::Member(node) => {
-                if let Some(member) = self.members.get_mut(node) {
-                    member.is_awaited = true;
+                let Some(member) = self.members.get_mut(node) else { return };
+                if member.pace != REST {
+                    // Its group is asked by itself.
+                    return;
                 }
+                member.is_awaited = true;
             }
             Role::Former { left, .. } if *left > 0 && !contact.is_seed => {
                 *left -= 1;
@@ -136,9 +180,9 @@ impl Core {
         self.ask(now, address);
     }
 
-    /// Time after its last sign of life within which a member is lost, if our own timer is on time.
+    /// Time within which a node is lost that is in no group.
     pub(super) fn loss_bound(&self) -> Duration {
-        self.period * (self.missed_max + 1)
+        self.rest().bound()
     }
 
     /// The node stops: it says so, and is silent from now on. // spec: NDL-4.4
@@ -146,8 +190,9 @@ impl Core {
         for (node, member) in &self.members {
             self.outputs.push_back(Output::SendLeave { to: member.address, node: *node });
         }
-        self.cycle_due = None;
-        self.respite = None;
+        for pace in &mut self.paces {
+            (pace.due, pace.respite) = (None, None);
+        }
         self.contests.clear();
     }
 }

@@ -83,7 +83,7 @@ impl Core {
             // Two that start together: the later life gives up at once, the earlier one only if the other stays.
             let is_later =
                 (theirs.incarnation, theirs.boot_nonce) < (self.me.incarnation, self.me.boot_nonce);
-            if is_later || now + self.period > settles {
+            if is_later || now + self.rest().period > settles {
                 return self.give_address_up(proof.from);
             }
         }
@@ -100,7 +100,7 @@ impl Core {
     fn try_other(&mut self, now: Time, other: SocketAddr) {
         let is_on = |trial: &Trial| now.since(trial.heard) <= self.loss_bound();
         let since = self.trial.filter(is_on).map_or(now, |trial| trial.since);
-        if now.since(since) >= self.period * self.missed_max {
+        if now.since(since) >= self.rest().period * self.rest().missed_max {
             return self.give_address_up(other);
         }
         self.trial = Some(Trial { since, heard: now });

@@ -157,7 +157,7 @@ impl Core {
             self.refusals.count(now, "NDL answer with false times", &what);
             return;
         }
-        if let Some(offset) = member.clock.offset(now, self.period) {
+        if let Some(offset) = member.clock.offset(now, self.paces[member.pace].period) {
             self.outputs.push_back(Output::ClockMeasured { node, offset });
         }
     }
@@ -208,10 +208,12 @@ impl Core {
             self.forget_former(gone.address, node);
         }
         self.contact_at(now, from).role = Role::Member(node);
+        let pace = self.pace_for(now, &name);
         let member = Member {
             announcement,
             address: from,
             heard: now,
+            pace,
             missed: 0,
             is_awaited: false,
             clock: PeerClock::default(),
@@ -256,7 +258,7 @@ impl Core {
     }
 
     fn challenge(&self) -> Duration {
-        self.period.min(CHALLENGE_MAX)
+        self.rest().period.min(CHALLENGE_MAX)
     }
 
     fn challenge_member(&mut self, now: Time, node: NodeAddress) {
@@ -333,9 +335,11 @@ impl Core {
             contact.questions.clear();
         }
         let Announcement { incarnation, name, .. } = member.announcement;
-        let silent_us = u64::try_from(now.since(member.heard).as_micros()).unwrap_or(u64::MAX);
+        let micros = |time: Duration| u64::try_from(time.as_micros()).unwrap_or(u64::MAX);
+        let (silent_us, bound_us) =
+            (micros(now.since(member.heard)), micros(self.paces[member.pace].bound()));
         self.outputs.push_back(Output::Fact(MembershipFact::NodeLost { node, incarnation, why }));
-        self.publish(NodeEvent::NodeLost { node, name, incarnation, why, silent_us });
+        self.publish(NodeEvent::NodeLost { node, name, incarnation, why, silent_us, bound_us });
         if why == LossReason::ConnectionRefused {
             // Perhaps only its GNCL restarts: then it answers this.
             self.ask(now, member.address);

@@ -11,6 +11,7 @@
 //! | `heard` | what a datagram means, and what it proves |
 //! | `lives` | who comes, goes, comes again |
 //! | `duplicates` | which of two processes has a node address |
+//! | `pace` | how often which members are asked |
 //! | `clock` | how far a peer's clock is from ours |
 //! | `recall` | what is told to whoever asks, and decides nothing |
 
@@ -21,6 +22,7 @@ mod cycle;
 mod duplicates;
 mod heard;
 mod lives;
+mod pace;
 mod recall;
 #[cfg(test)]
 mod simulation;
@@ -46,9 +48,9 @@ use self::{
     budget::Strangers,
     clock::PeerClock,
     contact::{Contact, Question, Questions},
-    cycle::Respite,
     duplicates::Trial,
     lives::{Contest, Gone},
+    pace::{Pace, REST},
     recall::Recall,
 };
 use super::{
@@ -169,6 +171,8 @@ struct Member {
     address: SocketAddr,
     /// Its last sign of life.
     heard: Time,
+    /// Which of the paces it is asked at.
+    pace: usize,
     /// Answers missed in a row.
     missed: u32,
     /// The last query of the cycle is not answered yet.
@@ -198,8 +202,8 @@ impl Member {
 pub(crate) struct Core {
     /// What this node says about itself.
     me: Announcement,
-    period: Duration,
-    missed_max: u32,
+    /// The first is that of who is in no group.
+    paces: Vec<Pace>,
     nodes_max: usize,
     seeds: Vec<SocketAddr>,
     asks_group: bool,
@@ -210,8 +214,6 @@ pub(crate) struct Core {
     epoch: u64,
     /// Our own UDP address; `None` before the first start.
     udp: Option<SocketAddr>,
-    /// When the next cycle is due; `None` while nothing runs.
-    cycle_due: Option<Time>,
     /// Until then, a living node with our address means that we are the newcomer.
     settles: Option<Time>,
     /// It had members and has none any more: others may have given its address to a later life.
@@ -219,7 +221,6 @@ pub(crate) struct Core {
     /// Another process is about to be believed that our address is its own.
     trial: Option<Trial>,
     stall_reported: Option<Time>,
-    respite: Option<Respite>,
 
     members: BTreeMap<NodeAddress, Member>,
     gone: BTreeMap<NodeAddress, Gone>,
@@ -261,8 +262,7 @@ impl Core {
         };
         Self {
             me,
-            period: ndl.period,
-            missed_max: ndl.missed_max,
+            paces: Pace::all_of(ndl),
             nodes_max: ndl.nodes_max,
             seeds: ndl.seeds.clone(),
             asks_group: ndl.multicast.is_some(),
@@ -270,12 +270,10 @@ impl Core {
             questions_asked: 0,
             epoch: 0,
             udp: None,
-            cycle_due: None,
             settles: None,
             is_lonely: false,
             trial: None,
             stall_reported: None,
-            respite: None,
             members: BTreeMap::new(),
             gone: BTreeMap::new(),
             contests: BTreeMap::new(),
@@ -318,7 +316,7 @@ impl Core {
             self.app_changed(&fact);
             return;
         }
-        let Some(due) = self.cycle_due else { return };
+        let Some(due) = self.rest().due else { return };
         if now.since(due) > self.loss_bound() {
             // We got no processor for so long that others may have lost us, and have found a later life.
             self.settle(now);
@@ -379,7 +377,8 @@ impl Core {
     /// When [`Input::TimePassed`] is due.
     pub(crate) fn next_wake(&self) -> Option<Time> {
         let contests = self.contests.values().map(|contest| contest.until);
-        contests.chain(self.respite.map(|respite| respite.until)).chain(self.cycle_due).min()
+        let paces = self.paces.iter().flat_map(|pace| [pace.respite.map(|respite| respite.until), pace.due]);
+        contests.chain(paces.flatten()).min()
     }
 
     /// What this node says about itself.
@@ -395,6 +394,11 @@ impl Core {
     /// What was refused.
     pub(crate) const fn refusals(&self) -> &Refusals {
         &self.refusals
+    }
+
+    /// The pace of who is in no group.
+    fn rest(&self) -> &Pace {
+        &self.paces[REST]
     }
 
     /// Asks `to`, whom there is a contact for.

@@ -2,6 +2,7 @@
 
 mod duplicates;
 mod lives;
+mod paces;
 mod properties;
 mod scenarios;
 mod several_addresses;

@@ -31,6 +31,11 @@ pub struct KnownNode {
     pub heard: Time,
     /// Answers that it missed in a row.
     pub missed: u32,
+    /// Time between two queries to it.
+    pub asked_every: Duration,
+    /// Time after its last sign of life within which its loss is known, our own stalls aside: `asked_every` times the answers that it may
+    /// miss and one more.
+    pub bound: Duration,
     /// Time of the last query and its answer on the network.
     pub round_trip: Option<Duration>,
     /// How far its clock is from ours.
@@ -50,6 +55,8 @@ impl Core {
             sources: self.contacts.get(&member.address).map(|c| c.sources.clone()).unwrap_or_default(),
             heard: member.heard,
             missed: member.missed,
+            asked_every: self.paces[member.pace].period,
+            bound: self.paces[member.pace].bound(),
             round_trip: member.clock.round_trip(),
             offset: member.clock.offset(now, Duration::ZERO),
         });

@@ -21,6 +21,7 @@ fn crowd(nodes: usize) -> Plan {
         nodes,
         period: Duration::from_millis(500),
         missed_max: 3,
+        watched: None,
         finding: Finding::Group,
         quality: Quality {
             lost_per_mille: 0,

@@ -66,19 +66,32 @@ struct Life {
 pub(super) struct Judge {
     period: Duration,
     missed_max: u32,
+    /// The node that is watched at another pace.
+    watched: Option<(NodeAddress, Duration, u32)>,
     lateness: Duration,
     lives: Vec<Life>,
     pub(super) violations: Vec<String>,
 }
 
 impl Judge {
-    pub(super) const fn new(plan: &Plan) -> Self {
+    pub(super) fn new(plan: &Plan) -> Self {
         Self {
             period: plan.period,
             missed_max: plan.missed_max,
+            watched: plan
+                .watched
+                .map(|(node, period, missed)| (super::world::node_address(node), period, missed)),
             lateness: plan.lateness,
             lives: Vec::new(),
             violations: Vec::new(),
+        }
+    }
+
+    /// How `other` is watched.
+    fn pace(&self, other: usize) -> (Duration, u32) {
+        match self.watched {
+            Some((node, period, missed_max)) if node == self.lives[other].node => (period, missed_max),
+            Some(_) | None => (self.period, self.missed_max),
         }
     }
 
@@ -147,7 +160,7 @@ impl Judge {
 
     /// An answer is in the asker's socket.
     pub(super) fn answered(&mut self, now: Time, process: usize, by: usize, correlation: u64) {
-        let from = self.lives[by].address;
+        let (from, (period, _)) = (self.lives[by].address, self.pace(by));
         let life = &mut self.lives[process];
         let questions = life.questions.entry(from).or_default();
         let Some(question) = questions
@@ -157,7 +170,7 @@ impl Judge {
             return;
         };
         question.is_answered = true;
-        question.is_answered_in_time = now.since(question.asked) <= self.period;
+        question.is_answered_in_time = now.since(question.asked) <= period;
         if question.is_answered_in_time
             && let Some(sight) = life.sights.get_mut(&by)
         {
@@ -246,7 +259,7 @@ impl Judge {
             | LossReason::Duplicate => {}
             LossReason::Silent => {
                 let unanswered = self.unanswered(now, process, other);
-                if unanswered < self.missed_max as usize && lives {
+                if unanswered < self.pace(other).1 as usize && lives {
                     let words =
                         format!("lives, did not answer {unanswered} questions, and is lost as silent");
                     self.violate(now, process, other, &words);
@@ -259,7 +272,7 @@ impl Judge {
     fn unanswered(&self, now: Time, process: usize, other: usize) -> usize {
         let (life, address) = (&self.lives[process], self.lives[other].address);
         let Some(sight) = life.sights.get(&other) else { return 0 };
-        let least = self.period * 49 / 100;
+        let least = self.pace(other).0 * 49 / 100;
         let is_missed = |question: &&Question| {
             question.asked >= sight.answered
                 && now.since(question.asked) >= least
@@ -270,17 +283,17 @@ impl Judge {
 
     /// A member was heard of within the bound.
     fn check_in_time(&mut self, now: Time, process: usize, other: usize) {
-        let life = &self.lives[process];
+        let (life, (period, missed_max)) = (&self.lives[process], self.pace(other));
         let Some(sight) = life.sights.get(&other) else { return };
         let own: Duration = life
             .stalls
             .iter()
             .filter(|(began, lasted)| *began + *lasted >= sight.read)
-            .map(|(_, lasted)| *lasted + self.period)
+            .map(|(_, lasted)| *lasted + period)
             .sum();
         let shells = life.shells.iter().filter(|at| **at >= sight.read).count();
-        let shells = self.period * u32::try_from(shells).expect("few restarts");
-        let periods = self.period * (self.missed_max + 1);
+        let shells = period * u32::try_from(shells).expect("few restarts");
+        let periods = period * (missed_max + 1);
         // Respites: each is more than twice as long as the one before, and none is longer than a timer was late.
         let respites = self.lateness * 5;
         let bound = periods + periods * DRIFT_PER_MILLE / 1_000 + respites + own + shells;

@@ -52,6 +52,8 @@ pub(super) struct Plan {
     pub(super) nodes: usize,
     pub(super) period: Duration,
     pub(super) missed_max: u32,
+    /// A node that all others watch at another pace, and that.
+    pub(super) watched: Option<(usize, Duration, u32)>,
     pub(super) finding: Finding,
     pub(super) quality: Quality,
     /// How late a timer wakes a node that is not stalled, at most.
@@ -74,6 +76,7 @@ impl Plan {
             nodes,
             period,
             missed_max,
+            watched: None,
             finding,
             quality: quality(&mut chance, period),
             lateness: chance.of(&[Duration::ZERO, period / 50, period / 4]),
@@ -81,6 +84,7 @@ impl Plan {
             happenings: Vec::new(),
             end: Duration::ZERO,
         };
+        plan.watch(&mut chance);
         let heals = period * (12 + u32::try_from(chance.below(12)).expect("below 12"));
         plan.starts(&mut chance);
         for _ in 0..chance.below(7) {
@@ -92,6 +96,16 @@ impl Plan {
         let found_again = if finding == Finding::Mdns { 18 } else { 3 };
         plan.end = heals + plan.quality.late_max + period * (missed_max + 2 + found_again);
         plan
+    }
+
+    /// One node has a pace of its own, in some plans: up to five times that of the others, or a third of it.
+    fn watch(&mut self, chance: &mut Chance) {
+        if !chance.happens(400) {
+            return;
+        }
+        let pace = chance.of(&[self.period / 5, self.period / 2, self.period * 3]);
+        self.watched = Some((chance.index(self.nodes), pace, chance.of(&[2, 3, 5])));
+        self.lateness = self.lateness.min(pace / 4);
     }
 
     fn starts(&mut self, chance: &mut Chance) {

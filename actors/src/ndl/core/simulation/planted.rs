@@ -32,6 +32,8 @@ pub(super) enum Fault {
     LosesEarly,
     /// One missed answer more than is allowed is none.
     LosesLate,
+    /// Groups of the configuration are watched like everybody.
+    HasOnePaceForAll,
     /// Who is lost is never asked again.
     ForgetsTheFormer,
     /// What the bound of a clock is, is said to be half of it.
@@ -41,7 +43,7 @@ pub(super) enum Fault {
 }
 
 impl Fault {
-    pub(super) const ALL: [Self; 11] = [
+    pub(super) const ALL: [Self; 12] = [
         Self::ForgetsAnAnswer,
         Self::CountsItsOwnStall,
         Self::IgnoresIncarnation,
@@ -50,6 +52,7 @@ impl Fault {
         Self::TakesLateAnswers,
         Self::LosesEarly,
         Self::LosesLate,
+        Self::HasOnePaceForAll,
         Self::ForgetsTheFormer,
         Self::BoastsOfItsClock,
         Self::KeepsALossToItself,
@@ -65,8 +68,9 @@ pub(super) struct Patient {
 impl Patient {
     pub(super) fn new(mut core: Core, fault: Option<Fault>) -> Self {
         match fault {
-            Some(Fault::LosesEarly) => core.missed_max -= 1,
-            Some(Fault::LosesLate) => core.missed_max += 1,
+            Some(Fault::LosesEarly) => core.paces.iter_mut().for_each(|pace| pace.missed_max -= 1),
+            Some(Fault::LosesLate) => core.paces.iter_mut().for_each(|pace| pace.missed_max += 1),
+            Some(Fault::HasOnePaceForAll) => core.paces.truncate(1),
             Some(_) | None => {}
         }
         Self { core, fault }

@@ -24,7 +24,7 @@ use super::{
     planted::{Fault, Patient},
 };
 use crate::{
-    config::NodeConfig,
+    config::{NodeConfig, WatchGroup},
     gncl::LinkFact,
     ndl::{
         MembershipFact,
@@ -127,7 +127,7 @@ pub(super) struct World {
     pub(super) in_cores: Duration,
 }
 
-fn node_address(node: usize) -> NodeAddress {
+pub(super) fn node_address(node: usize) -> NodeAddress {
     NodeAddress::new(0x0a00_0001 + u32::try_from(node).expect("few nodes"))
 }
 

@@ -12,7 +12,7 @@ use sinew_runtime::{
 };
 
 use crate::{
-    config::NodeConfig,
+    config::{NodeConfig, WatchGroup},
     gncl::LinkFact,
     lncl::AppFact,
     ndl::{
@@ -29,7 +29,7 @@ const APP: AppAddress = AppAddress::new(0x1000);
 pub(super) const PERIOD: Duration = Duration::from_millis(500);
 const FLIGHT: Duration = Duration::from_micros(100);
 
-pub(super) fn ms(millis: u64) -> Duration {
+pub(super) const fn ms(millis: u64) -> Duration {
     Duration::from_millis(millis)
 }
 
@@ -53,6 +53,8 @@ pub(super) struct Spec {
     pub(super) nodes_max: usize,
     /// Its clock minus the world's.
     pub(super) clock_ns: i64,
+    /// Whom it watches at another pace.
+    pub(super) watch: Vec<WatchGroup>,
     /// Where its GNCL listens besides.
     pub(super) further: Vec<SocketAddrV4>,
 }
@@ -67,6 +69,7 @@ impl Spec {
             multicast: true,
             nodes_max: 64,
             clock_ns: 0,
+            watch: Vec::new(),
             further: Vec::new(),
         }
     }
@@ -77,6 +80,7 @@ impl Spec {
         config.ndl.seeds.clone_from(&self.seeds);
         config.ndl.nodes_max = self.nodes_max;
         config.ndl.period = PERIOD;
+        config.ndl.watch.clone_from(&self.watch);
         if !self.multicast {
             config.ndl.multicast = None;
         }

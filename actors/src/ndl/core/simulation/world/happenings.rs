@@ -21,6 +21,10 @@ impl World {
         let mut config = NodeConfig::new(format!("node-{node}"));
         config.ndl.period = self.plan.period;
         config.ndl.missed_max = self.plan.missed_max;
+        if let Some((watched, period, missed_max)) = self.plan.watched {
+            let nodes = vec![format!("node-{watched}")];
+            config.ndl.watch = vec![WatchGroup { nodes, period, missed_max }];
+        }
         config.ndl.nodes_max = 64.max(self.plan.nodes + 16);
         if self.plan.finding != Finding::Group {
             config.ndl.multicast = None;

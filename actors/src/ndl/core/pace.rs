@@ -1,0 +1,43 @@
+//! How often members are asked: a pace for each group of the configuration, and one for all others.
+
+use std::time::Duration;
+
+use sinew_runtime::time::Time;
+
+use super::cycle::Respite;
+use crate::config::{NdlConfig, WatchGroup};
+
+/// The pace of whoever is in no group, and of seeds, candidates and the multicast group. It runs as long as the node does.
+pub(super) const REST: usize = 0;
+
+/// A pace at which members are asked.
+#[derive(Debug)]
+pub(super) struct Pace {
+    /// Who is watched at it; `None` for the rest.
+    group: Option<WatchGroup>,
+    pub(super) period: Duration,
+    pub(super) missed_max: u32,
+    /// When its members are asked next; `None` while nothing runs, and in a group while it has no members.
+    pub(super) due: Option<Time>,
+    pub(super) respite: Option<Respite>,
+}
+
+impl Pace {
+    /// That of the rest, then those of the groups.
+    pub(super) fn all_of(config: &NdlConfig) -> Vec<Self> {
+        let pace = |group, period, missed_max| Self { group, period, missed_max, due: None, respite: None };
+        let groups =
+            config.watch.iter().map(|group| pace(Some(group.clone()), group.period, group.missed_max));
+        std::iter::once(pace(None, config.period, config.missed_max)).chain(groups).collect()
+    }
+
+    /// Whether the node called `name` is in this pace's group.
+    pub(super) fn covers(&self, name: &str) -> bool {
+        self.group.as_ref().is_some_and(|group| group.covers(name))
+    }
+
+    /// Time after its last sign of life within which a member is lost, if our own timer is on time. // spec: NDL-4.1
+    pub(super) fn bound(&self) -> Duration {
+        self.period * (self.missed_max + 1)
+    }
+}

@@ -1,0 +1,87 @@
+//! Nodes that are watched at paces of their own.
+
+use std::time::Duration;
+
+use super::world::{PERIOD, Spec, World, ms, node};
+use crate::{
+    config::WatchGroup,
+    ndl::{NodeEvent, core::Output},
+};
+
+const FAST: Duration = ms(10);
+
+/// Node 1 watches node 2 every 10 ms, twice in vain at most, and node 3 like everybody.
+fn leg_and_console() -> World {
+    let mut world = World::new();
+    let watch = vec![WatchGroup { nodes: vec!["node-2".to_owned()], period: FAST, missed_max: 2 }];
+    world.start(1, &Spec { watch, ..Spec::of(1) });
+    world.start(2, &Spec::of(2));
+    world.start(3, &Spec::of(3));
+    world.run(ms(105));
+    assert!(world.knows(1, 2) && world.knows(1, 3));
+    world.forget_the_past();
+    world
+}
+
+/// Who was lost: how long it had been silent, and the bound, in microseconds.
+fn losses(world: &World) -> Vec<(u32, u64, u64)> {
+    let events = world.at(1).events.iter().filter_map(|event| match event {
+        NodeEvent::NodeLost { node, silent_us, bound_us, .. } => Some((node.bits(), *silent_us, *bound_us)),
+        NodeEvent::NodeFound { .. } | NodeEvent::NodeRestarted { .. } => None,
+    });
+    events.collect()
+}
+
+// spec: NDL-2.4
+#[test]
+fn a_leg_is_lost_within_its_bound_and_a_console_within_its_own() {
+    let mut world = leg_and_console();
+    world.kill(2);
+    world.kill(3);
+    world.run(ms(31));
+    let [(2, silent_us, 30_000)] = losses(&world)[..] else { panic!("{:?}", losses(&world)) };
+    assert!((20_000..=30_000).contains(&silent_us), "{silent_us}");
+    world.run(PERIOD * 4);
+    let [_, (3, silent_us, 2_000_000)] = losses(&world)[..] else { panic!("{:?}", losses(&world)) };
+    assert!((1_500_000..=2_000_000).contains(&silent_us), "{silent_us}");
+}
+
+#[test]
+fn only_the_leg_costs_what_its_pace_costs() {
+    let mut world = leg_and_console();
+    world.run(ms(5_000));
+    // 500 questions to it; for each period one to the console, three to the group, and answers to two.
+    assert!((500..=565).contains(&world.at(1).datagrams_sent), "{}", world.at(1).datagrams_sent);
+    let [leg, console] = &world.at(1).core.members(world.now)[..] else { panic!("two members") };
+    assert_eq!([leg.asked_every, console.asked_every], [FAST, PERIOD]);
+}
+
+// spec: NDL-4.2
+#[test]
+fn a_stall_that_is_long_for_the_leg_is_reported_and_costs_nobody() {
+    for stall in [6, 15, 40, 200] {
+        let mut world = leg_and_console();
+        world.stall(1, ms(stall));
+        world.run(ms(stall) + PERIOD * 5);
+        assert_eq!(losses(&world), [], "after {stall} ms");
+        let said = |output: &Output| matches!(output, Output::Stalled { .. });
+        let is_long = stall > 15;
+        assert!(!is_long || world.at(1).others.iter().any(said), "after {stall} ms");
+    }
+}
+
+#[test]
+fn a_leg_that_is_gone_is_asked_as_seldom_as_anybody_and_watched_again_when_it_is_back() {
+    let mut world = leg_and_console();
+    world.kill(2);
+    world.run(PERIOD * 40);
+    world.forget_the_past();
+    world.run(PERIOD * 32);
+    assert!(world.at(1).datagrams_sent < 32 * 6, "{}", world.at(1).datagrams_sent);
+    world.start(2, &Spec { incarnation: 2, ..Spec::of(2) });
+    world.run(ms(105));
+    world.forget_the_past();
+    world.kill(2);
+    world.run_until(ms(31), |world| !losses(world).is_empty());
+    assert_eq!(losses(&world)[0].0, node(2).bits());
+}
