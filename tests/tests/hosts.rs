@@ -62,9 +62,9 @@ fn four_hosts_find_each_other_wait_talk_and_notice_a_cut_link() {
     // Its link is cut: every other node says so, and it says so of every other.
     hosts.cut(3);
     for node in [&mut hip, &mut knee, &mut central] {
-        node.wait_for(&["NodeLost", "ankle", "Silent"]);
+        node.wait_for(&["NodeLost", "ankle", "LinkDown"]);
     }
-    ankle.wait_for(&["NodeLost", "central"]);
+    ankle.wait_for(&["NodeLost", "central", "LinkDown"]);
     central.wait_for(&["requirement", "Lost", "ankle"]);
 
     // And joined again: found, and talking where it stopped.

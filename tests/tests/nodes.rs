@@ -60,7 +60,7 @@ fn a_killed_node_is_lost_at_once_and_its_next_life_is_a_restart() {
     let knee = scenario.start("knee", 2, &[]);
     hip.wait_for(&["started"]);
     knee.signal(Signal::KILL);
-    hip.wait_for(&["NodeLost", "knee", "ConnectionRefused"]);
+    hip.wait_for(&["NodeLost", "knee", "Crashed"]);
     let mut knee = scenario.start("knee", 2, &[]);
     hip.wait_for(&["NodeRestarted", "knee"]);
     knee.wait_for(&["NodeFound", "hip"]);
@@ -89,7 +89,7 @@ fn a_frozen_node_is_lost_and_found_again_when_it_thaws() {
     hip.wait_for(&["NodeFound", "knee"]);
     knee.wait_for(&["NodeFound", "hip"]);
     knee.freeze();
-    hip.wait_for(&["NodeLost", "knee", "Silent"]);
+    hip.wait_for(&["NodeLost", "knee", "Hung"]);
     knee.signal(Signal::CONT);
     hip.wait_for(&["NodeFound", "knee"]);
 }

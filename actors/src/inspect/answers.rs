@@ -153,8 +153,9 @@ impl Discovery {
 fn lost_report(node: NodeAddress, lost: LostNode, now: Time) -> LostReport {
     let why = match lost.why {
         LossReason::Left => "left",
-        LossReason::Silent => "silent",
-        LossReason::ConnectionRefused => "connection refused",
+        LossReason::Crashed => "crashed",
+        LossReason::Hung => "hung",
+        LossReason::LinkDown => "link down",
         LossReason::Restarted => "restarted",
         LossReason::Duplicate => "duplicate",
     };

@@ -26,8 +26,9 @@ impl From<&MembershipFact> for Input {
             MembershipFact::NodeLost { node, incarnation, why } => {
                 let why = match why {
                     LossReason::Left => "its node left",
-                    LossReason::Silent => "its node was lost: it is silent",
-                    LossReason::ConnectionRefused => "its node was lost: its process ended",
+                    LossReason::Crashed => "its node was lost: its process ended",
+                    LossReason::Hung => "its node was lost: it hangs, while its host answers",
+                    LossReason::LinkDown => "its node was lost: neither it nor its host answers",
                     LossReason::Restarted => "its node was restarted",
                     LossReason::Duplicate => "its node is none: another process holds that node address",
                 };

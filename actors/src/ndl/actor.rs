@@ -1,6 +1,7 @@
 //! The thin shell around the membership core: sockets, timer, mDNS, and the ways to other layers.
 
 use std::{
+    cell::RefCell,
     hash::{BuildHasher, RandomState},
     io,
     net::{SocketAddr, SocketAddrV4},
@@ -10,6 +11,7 @@ use std::{
 };
 
 use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, WrapFuture};
+use futures_util::{StreamExt as _, stream::FuturesUnordered};
 use mdns_sd::{DaemonEvent, ServiceEvent};
 use sinew_runtime::{
     supervision::ReadyGate,
@@ -17,13 +19,14 @@ use sinew_runtime::{
     time::Time,
     wire::Message,
 };
-use tokio::sync::Notify;
+use tokio::sync::{Notify, mpsc};
 
 use super::{
     Event, MembershipFact, NodeEvent,
     core::{Core, Epoch, Input, Output, Way},
     datagram::{Answer, Body, DATAGRAM_MAX, Datagram, encode},
     mdns::{Mdns, MdnsError},
+    probe::{PROBES_MAX, Probe},
     socket,
 };
 use crate::{
@@ -80,6 +83,9 @@ impl Actor for NdlActor {
             ctx.spawn(watch_mdns(mdns.clone()).into_actor(self));
             ctx.spawn(browse(shell.clone(), mdns).into_actor(self));
         }
+        if let Some(probes) = shell.probes.borrow_mut().take() {
+            ctx.spawn(try_hosts(shell.clone(), probes).into_actor(self));
+        }
         ctx.spawn(keep_time(shell.clone()).into_actor(self));
         self.shell = Some(shell);
         if let Some(ready) = self.ready.take() {
@@ -130,6 +136,10 @@ struct Shell {
     /// The core's next wake is not the one that the timer sleeps for.
     rewind: Notify,
     refusals: Arc<Refusals>,
+    /// Hosts to be tried; one too many is not.
+    to_probe: mpsc::Sender<Probe>,
+    /// Until the task that tries them has it.
+    probes: RefCell<Option<mpsc::Receiver<Probe>>>,
 }
 
 impl Shell {
@@ -158,7 +168,9 @@ impl Shell {
         };
         crate::log::info!(%udp, %gncl, "NDL asks and answers");
         let (rewind, refusals) = (Notify::new(), stores.refusals.clone());
-        Ok((Self { stores, epoch, socket, rewind, refusals }, reader))
+        let (to_probe, probes) = mpsc::channel(PROBES_MAX);
+        let probes = RefCell::new(Some(probes));
+        Ok((Self { stores, epoch, socket, rewind, refusals, to_probe, probes }, reader))
     }
 
     fn join_group(&self) -> Option<tokio::net::UdpSocket> {
@@ -227,6 +239,10 @@ impl Shell {
                 self.send(to, node, correlation, Body::Answer(answer));
             }
             Output::SendLeave { to, node } => self.send(to, node, 0, Body::Leave(self.me())),
+            Output::Probe { node, incarnation, to, within } => {
+                // Where too many are silent at once it is not their hosts that are to be doubted.
+                let _ = self.to_probe.try_send(Probe { node, incarnation, to, within });
+            }
             Output::Fact(fact) => self.tell_layers(fact),
             Output::Event { to, event } => self.tell_applications(&to, &event),
             Output::ClockMeasured { node, offset } => self.stores.clocks.set(node, offset),
@@ -325,6 +341,23 @@ async fn receive(shell: Rc<Shell>, socket: tokio::net::UdpSocket, way: Way) {
                 shell.refusals.count(Time::now(), "NDL socket not readable", &error);
                 tokio::time::sleep(READ_FAILED_REST).await;
             }
+        }
+    }
+}
+
+/// Tries hosts, many at once.
+async fn try_hosts(shell: Rc<Shell>, mut asked: mpsc::Receiver<Probe>) {
+    let mut under_way = FuturesUnordered::new();
+    loop {
+        tokio::select! {
+            Some(probe) = asked.recv(), if under_way.len() < PROBES_MAX => under_way.push(probe.carry_out()),
+            Some((node, incarnation, host)) = under_way.next() => {
+                if !shell.feed(|core, now| core.handle(now, Input::Probed { node, incarnation, host })) {
+                    return;
+                }
+            }
+            // The shell, which is ours, has the other end.
+            else => return,
         }
     }
 }

@@ -72,10 +72,12 @@ impl Payload for NodeEvent {
 pub enum LossReason {
     /// It said goodbye.
     Left,
-    /// It missed as many answers in a row as the configuration allows.
-    Silent,
-    /// Its connection broke and was refused when dialled again: its process has ended.
-    ConnectionRefused,
+    /// Its process has ended: its host refuses connections to it.
+    Crashed,
+    /// It missed as many answers in a row as the configuration allows, and its host takes connections for it: its process does not run.
+    Hung,
+    /// It missed as many, and its host does not answer either, or this node cannot send there.
+    LinkDown,
     /// It is there in a new life.
     Restarted,
     /// Another process holds its node address, and held it before: nodes listen to that one.

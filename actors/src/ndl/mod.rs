@@ -20,10 +20,11 @@
 //! | NDL-3.1 | An answer counts once, if it comes from the address that was asked and quotes the query's correlation id. |
 //! | NDL-3.2 | Such an answer, and nothing else, makes a member. |
 //! | NDL-4 | A member is lost |
-//! | NDL-4.1 | when it missed `missed_max` answers in a row: `Silent`; |
+//! | NDL-4.1 | when it missed `missed_max` answers in a row; |
 //! | NDL-4.2 | but nobody is accused in a cycle to which our own timer came late by more than half a period; where it came late by less, as long again is given to read what was answered; |
-//! | NDL-4.3 | when its connection broke and is refused: `ConnectionRefused`, until it answers a later query; |
+//! | NDL-4.3 | when its connection broke and is refused: `Crashed`, until it answers a later query; |
 //! | NDL-4.4 | when it says so, from its own address, in its own life: `Left`. |
+//! | NDL-4.6 | whose host is tried from its first missed answer on: `Hung` if it accepts, `Crashed` if it refuses, else `LinkDown`. |
 //! | NDL-5 | A node has one life at a time. |
 //! | NDL-5.1 | A higher incarnation replaces a lower one: `NodeRestarted`. |
 //! | NDL-5.2 | A lower one is refused, also after the loss of the higher one. |
@@ -43,6 +44,7 @@ mod core;
 mod datagram;
 mod facts;
 mod mdns;
+mod probe;
 mod socket;
 #[cfg(test)]
 mod tests;

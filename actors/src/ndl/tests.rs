@@ -211,10 +211,32 @@ fn an_application_hears_who_comes_and_who_falls_silent() {
         // when: it ends without a word
         second.end_layer();
         // then
-        first.loses(&second, LossReason::Silent).await;
+        first.loses(&second, LossReason::Crashed).await;
         let lost: NodeEvent = first.event().await.decode().unwrap();
-        assert!(matches!(lost, NodeEvent::NodeLost { why: LossReason::Silent, .. }), "{lost:?}");
+        assert!(matches!(lost, NodeEvent::NodeLost { why: LossReason::Crashed, .. }), "{lost:?}");
         assert_eq!(first.stores.clocks.get(second.stores.node), None);
+    });
+}
+
+#[test]
+fn a_node_that_falls_silent_while_its_host_takes_connections_for_it_hangs() {
+    run(async {
+        // given: its GNCL listens, and takes nobody
+        let mut first = Node::start(1, |ndl| ndl.period = Duration::from_millis(50)).await;
+        let listener = std::net::TcpListener::bind((LOOPBACK, 0)).unwrap();
+        let seed = first.udp();
+        let mut second = Node::new(2, 1, |ndl| ndl.seeds = vec![seed]);
+        second.stores = {
+            let stores = Stores::for_test(second.stores.config.clone(), Incarnation(1));
+            stores.gncl_listen.set(listener.local_addr().unwrap()).unwrap();
+            stores
+        };
+        second.start_layer().await;
+        drop(first.fact("node 2 to be found").await);
+        // when
+        second.end_layer();
+        // then
+        first.loses(&second, LossReason::Hung).await;
     });
 }
 

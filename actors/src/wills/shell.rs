@@ -30,8 +30,9 @@ impl Input {
                 node,
                 incarnation,
                 why:
-                    LossReason::Silent
-                    | LossReason::ConnectionRefused
+                    LossReason::Crashed
+                    | LossReason::Hung
+                    | LossReason::LinkDown
                     | LossReason::Restarted
                     | LossReason::Duplicate,
             } => Some(Self::NodeLost { node, incarnation }),

@@ -275,13 +275,17 @@ pub(crate) fn lost_in_words(lost: &LostReport) -> (String, &'static str) {
     let ago = time(lost.lost_us);
     match lost.why.as_str() {
         "left" => (format!("lost {ago} ago: it stopped in order"), "start it again"),
-        "connection refused" => (
+        "crashed" => (
             format!("lost {ago} ago: its process has ended, nobody listens at its address"),
             "start it again; its log says why it ended",
         ),
-        "silent" => (
-            format!("lost {ago} ago: it had not answered for {}", time(lost.silent_us)),
-            "does its process run (a stopped one answers nobody)? Is the cable in, the interface up (`ip link`), the way free (`ping` its host)?",
+        "hung" => (
+            format!("lost {ago} ago: it had not answered for {}, while its host did", time(lost.silent_us)),
+            "its process does not run: is it stopped (`kill -CONT`), in a debugger, without a CPU? Its host lives",
+        ),
+        "link down" => (
+            format!("lost {ago} ago: it had not answered for {}, nor had its host", time(lost.silent_us)),
+            "is the cable in, the interface up (`ip link`), the way free (`ping` its host), its host on?",
         ),
         why => (format!("lost {ago} ago: {why}"), "its log says more"),
     }

@@ -173,7 +173,7 @@ impl Node {
     }
 
     pub(super) fn lose(&self, node: NodeAddress) {
-        let fact = MembershipFact::NodeLost { node, incarnation: Incarnation(1), why: LossReason::Silent };
+        let fact = MembershipFact::NodeLost { node, incarnation: Incarnation(1), why: LossReason::LinkDown };
         self.tell(Event::Membership(fact));
     }
 

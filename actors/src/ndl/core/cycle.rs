@@ -2,10 +2,13 @@
 
 use std::{net::SocketAddr, time::Duration};
 
-use sinew_runtime::{tid::NodeAddress, time::Time};
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
 
 use super::{
-    Core, Member, Output, Source,
+    Core, Host, Member, Output, Source,
     contact::{Contact, Question, Role},
     pace::{Pace, REST},
 };
@@ -68,6 +71,7 @@ impl Core {
             pace.due = Some(due + pace.period);
             self.count_missed(at);
             self.lose_the_silent(now, at, late, Duration::ZERO);
+            self.probe_the_suspected(at);
         }
         if at == REST {
             self.ask_everybody(now);
@@ -103,7 +107,39 @@ impl Core {
             return;
         }
         for node in silent {
-            self.lose(now, node, LossReason::Silent);
+            self.lose(now, node, self.class_of_silence(node));
+        }
+    }
+
+    /// Whoever missed an answer: why that is so is to be known by the time that it is lost. // spec: NDL-4.6
+    fn probe_the_suspected(&mut self, at: usize) {
+        // What is said later than the next look at the timer may be too late.
+        let within = self.paces[at].period * 3 / 4;
+        let suspected = self.members.iter().filter(|(_, member)| member.pace == at && member.missed > 0);
+        let probes = suspected.map(|(node, Member { announcement, .. })| Output::Probe {
+            node: *node,
+            incarnation: announcement.incarnation,
+            to: announcement.gncl_addresses(),
+            within,
+        });
+        self.outputs.extend(probes);
+    }
+
+    pub(super) fn probed(&mut self, node: NodeAddress, incarnation: Incarnation, host: Host) {
+        if let Some(member) = self.members.get_mut(&node)
+            && member.announcement.incarnation == incarnation
+            && member.missed > 0
+        {
+            member.host = Some(host);
+        }
+    }
+
+    /// What a member that is silent is lost as, by what its host said. // spec: NDL-4.6
+    fn class_of_silence(&self, node: NodeAddress) -> LossReason {
+        match self.members.get(&node).and_then(|member| member.host) {
+            Some(Host::Accepts) => LossReason::Hung,
+            Some(Host::Refuses) => LossReason::Crashed,
+            Some(Host::IsSilent) | None => LossReason::LinkDown,
         }
     }
 

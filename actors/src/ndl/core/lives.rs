@@ -102,7 +102,7 @@ impl Core {
         if let Some(Role::Member(other)) = role
             && other != node
         {
-            self.lose(now, other, LossReason::Silent);
+            self.lose(now, other, LossReason::Crashed);
         }
     }
 
@@ -127,7 +127,7 @@ impl Core {
         }
         let Some(member) = self.members.get_mut(&node) else { return };
         member.heard = now;
-        member.missed = 0;
+        (member.missed, member.host) = (0, None);
         member.is_awaited = false;
         self.measure(now, node, proof.exchange);
     }
@@ -215,6 +215,7 @@ impl Core {
             heard: now,
             pace,
             missed: 0,
+            host: None,
             is_awaited: false,
             clock: PeerClock::default(),
             is_link_broken: false,
@@ -306,7 +307,7 @@ impl Core {
                 (member.is_link_broken, member.link_until) = (true, now + LINK_GRACE);
             }
             LinkFact::DialRefused { .. } if member.is_link_broken => {
-                self.lose(now, node, LossReason::ConnectionRefused);
+                self.lose(now, node, LossReason::Crashed);
             }
             // Never connected: its GNCL may not listen yet.
             LinkFact::DialRefused { .. } => {}
@@ -321,7 +322,7 @@ impl Core {
         let sources =
             self.contacts.get(&member.address).map(|contact| contact.sources.keys().copied().collect());
         self.recall.lost(now, &member, sources.unwrap_or_default(), why);
-        self.is_lonely |= self.members.is_empty() && why == LossReason::Silent;
+        self.is_lonely |= self.members.is_empty() && matches!(why, LossReason::Hung | LossReason::LinkDown);
         if why == LossReason::Duplicate {
             // An elder life has its address: this one is no bar to that.
         } else {
@@ -340,7 +341,7 @@ impl Core {
             (micros(now.since(member.heard)), micros(self.paces[member.pace].bound()));
         self.outputs.push_back(Output::Fact(MembershipFact::NodeLost { node, incarnation, why }));
         self.publish(NodeEvent::NodeLost { node, name, incarnation, why, silent_us, bound_us });
-        if why == LossReason::ConnectionRefused {
+        if why == LossReason::Crashed {
             // Perhaps only its GNCL restarts: then it answers this.
             self.ask(now, member.address);
         }

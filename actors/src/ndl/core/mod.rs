@@ -72,6 +72,8 @@ pub(crate) enum Input {
     MdnsResolved { address: SocketAddr },
     /// A connection of GNCL changed.
     Link(LinkFact),
+    /// The host of a node that missed answers was tried, as [`Output::Probe`] asked.
+    Probed { node: NodeAddress, incarnation: Incarnation, host: Host },
     /// It is time for [`Core::next_wake`].
     TimePassed,
     /// The node stops in order.
@@ -100,6 +102,13 @@ pub(crate) enum Output {
     SendLeave {
         to: SocketAddr,
         node: NodeAddress,
+    },
+    /// Try to connect to the host of this node, at any of these addresses of its GNCL, and tell what it said within this time.
+    Probe {
+        node: NodeAddress,
+        incarnation: Incarnation,
+        to: Vec<SocketAddr>,
+        within: Duration,
     },
     /// For GNCL and the sync manager.
     Fact(MembershipFact),
@@ -147,6 +156,17 @@ pub(crate) enum Way {
     Multicast,
 }
 
+/// What a host says when a connection to a node on it is tried.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Host {
+    /// The connection is made: by the host, whether or not the node's process runs.
+    Accepts,
+    /// Nobody listens there: the process has ended.
+    Refuses,
+    /// Nothing, in the time that it had; or it cannot be sent to.
+    IsSilent,
+}
+
 /// How a node was found.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Source {
@@ -175,6 +195,8 @@ struct Member {
     pace: usize,
     /// Answers missed in a row.
     missed: u32,
+    /// What its host said since it missed the first of them.
+    host: Option<Host>,
     /// The last query of the cycle is not answered yet.
     is_awaited: bool,
     clock: PeerClock,
@@ -339,6 +361,7 @@ impl Core {
             }
             Input::MdnsResolved { address } => self.resolved(now, address),
             Input::Link(fact) => self.linked(now, fact),
+            Input::Probed { node, incarnation, host } => self.probed(node, incarnation, host),
             Input::TimePassed => self.time_passed(now),
             Input::Stopping => self.leave(),
             Input::AppChanged(_) => unreachable!("it was taken above, whether NDL runs or not"),

@@ -59,7 +59,7 @@ fn one_name_on_two_nodes_counts_twice_and_who_requires_never_for_itself() {
     bench.list(KNEE, list(1, &[("b.drive", true, &[])]));
     assert!(bench.list(ANKLE, list(1, &[("b.drive", true, &[])])).contains(&release(0)));
     bench.ready(0);
-    let outputs = bench.lost(ANKLE, LossReason::Silent);
+    let outputs = bench.lost(ANKLE, LossReason::LinkDown);
     assert!(
         outputs.contains(&lost(0, "2 of *.drive", Reason::NodeLost)),
         "its own readiness is not counted: {outputs:?}"

@@ -390,8 +390,9 @@ impl Core {
             MembershipFact::NodeLost { node, incarnation, why } => {
                 let reason = match why {
                     LossReason::Left => Reason::NodeLeft,
-                    LossReason::Silent
-                    | LossReason::ConnectionRefused
+                    LossReason::Crashed
+                    | LossReason::Hung
+                    | LossReason::LinkDown
                     | LossReason::Restarted
                     | LossReason::Duplicate => Reason::NodeLost,
                 };

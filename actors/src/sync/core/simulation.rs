@@ -256,7 +256,7 @@ impl World {
             Step::Restore { link } => self.restore(link),
             Step::Lose { link } => {
                 self.cut(link);
-                let why = LossReason::Silent;
+                let why = LossReason::LinkDown;
                 self.tell_ends(link, |node, incarnation| {
                     Input::MembershipChanged(MembershipFact::NodeLost { node, incarnation, why })
                 });

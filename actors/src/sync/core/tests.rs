@@ -168,7 +168,7 @@ fn a_running_application_hears_once_of_a_lost_node_and_once_of_its_return() {
     bench.list(KNEE, list(3, &[("knee.drive", true, &[])]));
     bench.registers(0, "gait", &["knee.drive"]);
     bench.ready(0);
-    assert_eq!(bench.lost(KNEE, LossReason::Silent), [lost(0, "knee.drive", Reason::NodeLost)]);
+    assert_eq!(bench.lost(KNEE, LossReason::LinkDown), [lost(0, "knee.drive", Reason::NodeLost)]);
     assert_eq!(bench.breaks(KNEE), []);
     let back = bench.links(KNEE, NEXT_LIFE);
     assert!(!back.contains(&met(0, "knee.drive")), "a link alone says nothing about the application");
@@ -210,7 +210,7 @@ fn a_link_that_stays_down_is_a_loss_and_so_is_at_once_what_is_known_of_the_appli
     assert_eq!(bench.passes(SILENCE), [lost(0, "knee.drive", Reason::LinkDown)]);
     let mut bench = where_gait_runs_with_a_drive_elsewhere();
     bench.breaks(KNEE);
-    assert_eq!(bench.lost(KNEE, LossReason::ConnectionRefused), [lost(0, "knee.drive", Reason::NodeLost)]);
+    assert_eq!(bench.lost(KNEE, LossReason::Crashed), [lost(0, "knee.drive", Reason::NodeLost)]);
     let mut bench = where_gait_runs_with_a_drive_elsewhere();
     bench.breaks(KNEE);
     bench.links(KNEE, LIFE);
@@ -303,11 +303,11 @@ fn the_last_known_reason_is_told_for_each_way_to_be_missing() {
     bench.list(KNEE, list(2, &[]));
     assert_eq!(reason(&bench), "unregistered");
     bench.list(KNEE, list(3, &[("drive", false, &[])]));
-    bench.lost(KNEE, LossReason::Silent);
+    bench.lost(KNEE, LossReason::LinkDown);
     assert_eq!(reason(&bench), "its node was lost");
     bench.links(KNEE, LIFE);
     bench.hears(Input::LinkChanged(LinkFact::PeerLeft { node: KNEE, incarnation: LIFE }));
-    bench.lost(KNEE, LossReason::Silent);
+    bench.lost(KNEE, LossReason::LinkDown);
     assert_eq!(reason(&bench), "its node left");
     bench.registers(1, "drive", &[]);
     assert_eq!(reason(&bench), "registered, not ready", "what this node knows comes first");
@@ -402,7 +402,7 @@ fn a_name_belongs_to_this_node_then_to_the_linked_then_to_the_lowest() {
     assert_eq!(bench.core.called("imu").first().copied(), Some(Tid::new(HERE, app(7))));
     assert_eq!(bench.core.called("nobody").first().copied(), None);
     bench.hears(Input::AppChanged(AppFact::Unregistered { app: app(7) }));
-    bench.lost(ANKLE, LossReason::Silent);
+    bench.lost(ANKLE, LossReason::LinkDown);
     assert_eq!(
         bench.core.called("imu").first().copied(),
         Some(Tid::new(KNEE, app(0))),
@@ -424,7 +424,7 @@ fn groups_of_a_node_are_routed_until_it_is_lost() {
     bench.links(KNEE, LIFE);
     assert_eq!(bench.list(KNEE, with_group(1)), [route(&groups)]);
     assert_eq!(bench.breaks(KNEE), []);
-    assert_eq!(bench.lost(KNEE, LossReason::Silent), [route(&[])]);
+    assert_eq!(bench.lost(KNEE, LossReason::LinkDown), [route(&[])]);
     assert_eq!(bench.hears(Input::MembershipChanged(found)), [route(&groups)]);
     let mine = bench.hears(Input::GroupsChanged(groups.clone()));
     assert_eq!(published(&mine), [], "not linked");
@@ -459,7 +459,7 @@ fn more_nodes_than_allowed_are_refused_until_one_is_lost() {
     bench.list(KNEE, list(1, &[("drive", true, &[])]));
     assert!(matches!(bench.links(ANKLE, LIFE)[..], [Output::Refused { cause: "nodes", .. }]));
     bench.breaks(KNEE);
-    bench.lost(KNEE, LossReason::Silent);
+    bench.lost(KNEE, LossReason::LinkDown);
     bench.links(ANKLE, LIFE);
     assert_eq!(bench.list(ANKLE, list(1, &[])), []);
     assert_eq!(bench.core.directory(), []);

@@ -176,14 +176,21 @@ const CASES: &[Case] = &[
     Case(
         |facts| {
             hip(facts).peers.clear();
-            hip(facts).lost.push(lost("silent"));
+            hip(facts).lost.push(lost("link down"));
         },
-        ["hip knows knee.drive", "had not answered for 1.5 s", "cable"],
+        ["hip knows knee.drive", "had not answered for 1.5 s, nor", "cable"],
     ),
     Case(
         |facts| {
             hip(facts).peers.clear();
-            hip(facts).lost.push(lost("connection refused"));
+            hip(facts).lost.push(lost("hung"));
+        },
+        ["hip knows knee.drive", "while its host did", "kill -CONT"],
+    ),
+    Case(
+        |facts| {
+            hip(facts).peers.clear();
+            hip(facts).lost.push(lost("crashed"));
         },
         ["hip knows knee.drive", "its process has ended", "start it again"],
     ),

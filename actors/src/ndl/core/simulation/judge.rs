@@ -8,7 +8,8 @@
 //! 5. Found and lost alternate. Refused, left and restarted are said of lives that ended.
 //! 6. A clock is as far from ours as is said, within the bound that is said.
 //! 7. A stall of one's own is reported.
-//! 8. When the network is well again, everybody knows exactly who is there.
+//! 8. A loss by silence is classed as what has been so for long: hung, crashed, or out of reach with its host.
+//! 9. When the network is well again, everybody knows exactly who is there.
 
 use std::{
     collections::{BTreeMap, BTreeSet, VecDeque},
@@ -22,7 +23,10 @@ use sinew_runtime::{
 };
 
 use super::plan::Plan;
-use crate::{ndl::LossReason, stores::ClockOffset};
+use crate::{
+    ndl::{LossReason, core::Host},
+    stores::ClockOffset,
+};
 
 /// Questions to one address of which the judge knows when they were asked.
 const QUESTIONS_KEPT: usize = 64;
@@ -250,14 +254,11 @@ impl Judge {
     fn check_reason(&mut self, now: Time, process: usize, other: usize, why: LossReason) {
         let lives = self.lives[other].ended.is_none();
         match why {
-            LossReason::Left | LossReason::ConnectionRefused | LossReason::Restarted if lives => {
+            LossReason::Left | LossReason::Crashed | LossReason::Restarted if lives => {
                 self.violate(now, process, other, &format!("lives, and is lost as {why:?}"));
             }
-            LossReason::Left
-            | LossReason::ConnectionRefused
-            | LossReason::Restarted
-            | LossReason::Duplicate => {}
-            LossReason::Silent => {
+            LossReason::Left | LossReason::Crashed | LossReason::Restarted | LossReason::Duplicate => {}
+            LossReason::Hung | LossReason::LinkDown => {
                 let unanswered = self.unanswered(now, process, other);
                 if unanswered < self.pace(other).1 as usize && lives {
                     let words =
@@ -265,6 +266,31 @@ impl Judge {
                     self.violate(now, process, other, &words);
                 }
             }
+        }
+    }
+
+    /// `host` is what the other's host has been saying for so long that it must be known.
+    pub(super) fn check_class(
+        &mut self,
+        now: Time,
+        process: usize,
+        (node, incarnation): (NodeAddress, Incarnation),
+        (why, host): (LossReason, Option<Host>),
+    ) {
+        let (Some(other), Some(host)) = (self.life(node, incarnation), host) else { return };
+        let is_right = match why {
+            LossReason::Left | LossReason::Restarted | LossReason::Duplicate => true,
+            LossReason::Crashed => host == Host::Refuses,
+            LossReason::Hung => host == Host::Accepts,
+            LossReason::LinkDown => host == Host::IsSilent,
+        };
+        if !is_right {
+            self.violate(
+                now,
+                process,
+                other,
+                &format!("is lost as {why:?}, and {host:?} is what its host says"),
+            );
         }
     }
 

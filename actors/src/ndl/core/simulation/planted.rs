@@ -32,6 +32,8 @@ pub(super) enum Fault {
     LosesEarly,
     /// One missed answer more than is allowed is none.
     LosesLate,
+    /// What a host says of a silent node is not heard.
+    IgnoresHosts,
     /// Groups of the configuration are watched like everybody.
     HasOnePaceForAll,
     /// Who is lost is never asked again.
@@ -43,7 +45,7 @@ pub(super) enum Fault {
 }
 
 impl Fault {
-    pub(super) const ALL: [Self; 12] = [
+    pub(super) const ALL: [Self; 13] = [
         Self::ForgetsAnAnswer,
         Self::CountsItsOwnStall,
         Self::IgnoresIncarnation,
@@ -53,6 +55,7 @@ impl Fault {
         Self::LosesEarly,
         Self::LosesLate,
         Self::HasOnePaceForAll,
+        Self::IgnoresHosts,
         Self::ForgetsTheFormer,
         Self::BoastsOfItsClock,
         Self::KeepsALossToItself,
@@ -90,6 +93,12 @@ impl Patient {
             for (node, member) in &mut self.core.members {
                 member.missed = missed.get(node).copied().unwrap_or(0);
             }
+        }
+    }
+
+    pub(super) fn told(&mut self, now: Time, input: Input) {
+        if self.fault != Some(Fault::IgnoresHosts) || !matches!(input, Input::Probed { .. }) {
+            self.core.handle(now, input);
         }
     }
 
@@ -154,5 +163,6 @@ impl Patient {
 }
 
 const fn is_silence(fact: &MembershipFact) -> bool {
-    matches!(fact, MembershipFact::NodeLost { why: LossReason::Silent, .. })
+    use LossReason::{Crashed, Hung, LinkDown};
+    matches!(fact, MembershipFact::NodeLost { why: Crashed | Hung | LinkDown, .. })
 }

@@ -28,7 +28,7 @@ use crate::{
     gncl::LinkFact,
     ndl::{
         MembershipFact,
-        core::{Core, Input, Output, Way},
+        core::{Core, Host, Input, Output, Way},
         datagram::{Answer, Body, Datagram, encode},
     },
 };
@@ -55,9 +55,10 @@ pub(super) struct Seen {
     pub(super) datagrams: u64,
     pub(super) dropped: u64,
     pub(super) found: u64,
-    pub(super) silent: u64,
+    pub(super) crashed: u64,
+    pub(super) hung: u64,
+    pub(super) link_down: u64,
     pub(super) left: u64,
-    pub(super) refused: u64,
     pub(super) restarted: u64,
     pub(super) stalls: u64,
 }
@@ -67,16 +68,18 @@ impl Seen {
         self.datagrams += other.datagrams;
         self.dropped += other.dropped;
         self.found += other.found;
-        self.silent += other.silent;
+        self.crashed += other.crashed;
+        self.hung += other.hung;
+        self.link_down += other.link_down;
         self.left += other.left;
-        self.refused += other.refused;
         self.restarted += other.restarted;
         self.stalls += other.stalls;
     }
 
     pub(super) fn must_cover_everything(&self, seeds: u64) {
-        let Self { datagrams, dropped, found, silent, left, refused, restarted, stalls } = *self;
-        let rarest = [datagrams, dropped, found, silent, left, refused, restarted, stalls].into_iter().min();
+        let Self { datagrams, dropped, found, crashed, hung, link_down, left, restarted, stalls } = *self;
+        let rarest =
+            [datagrams, dropped, found, crashed, hung, link_down, left, restarted, stalls].into_iter().min();
         assert!(rarest.is_some_and(|count| count >= seeds / 20), "something was hardly tried: {self:?}");
     }
 }
@@ -121,6 +124,10 @@ pub(super) struct World {
     /// The process of each node, and its number.
     current: BTreeMap<usize, usize>,
     at: BTreeMap<SocketAddr, usize>,
+    /// Hosts that went with their node: nobody answers there until it starts again.
+    dead_hosts: BTreeSet<usize>,
+    /// When what two nodes are to each other last changed: the way between them, and the life of either.
+    changed: BTreeMap<(usize, usize), Time>,
     seen: Seen,
     digest: DefaultHasher,
     /// Time of the host that cores have taken, reading of datagrams included.
@@ -149,6 +156,8 @@ impl World {
             processes: Vec::new(),
             current: BTreeMap::new(),
             at: BTreeMap::new(),
+            dead_hosts: BTreeSet::new(),
+            changed: BTreeMap::new(),
             seen: Seen::default(),
             digest: DefaultHasher::new(),
             in_cores: Duration::ZERO,
@@ -261,7 +270,7 @@ impl World {
             self.push(until, Event::Tell(process, input));
         } else if self.processes[process].is_alive {
             self.trace(|| format!("{process} is told {input:?}"));
-            self.with(process, |patient, now| patient.core.handle(now, input));
+            self.with(process, |patient, now| patient.told(now, input));
         }
     }
 

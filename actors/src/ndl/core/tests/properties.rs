@@ -86,7 +86,7 @@ proptest! {
                     }
                     Output::SendQuery { .. } | Output::SendMulticastQuery { .. } | Output::SendAnswer { .. }
                     | Output::SendLeave { .. } | Output::Event { .. } | Output::ClockMeasured { .. }
-                    | Output::Collision { .. } | Output::Stalled { .. } => {}
+                    | Output::Collision { .. } | Output::Stalled { .. } | Output::Probe { .. } => {}
                 }
             }
             prop_assert!(core.members.keys().eq(there.keys()));

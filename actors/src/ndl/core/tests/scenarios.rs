@@ -13,7 +13,7 @@ use crate::{
     lncl::AppFact,
     ndl::{
         LossReason, MembershipFact, NodeEvent,
-        core::{Input, Output, Source},
+        core::{Host, Input, Output, Source},
         datagram::{Announcement, Answer, Body, Claim, Datagram, encode},
     },
 };
@@ -103,9 +103,55 @@ fn a_node_is_lost_after_exactly_three_missed_answers() {
         world.run_until(PERIOD * 2, |world| missed(world) != Some(expected));
     }
     // then
-    assert_eq!(world.losses(1), [(2, LossReason::Silent)]);
+    assert_eq!(world.losses(1), [(2, LossReason::LinkDown)]);
     let [NodeEvent::NodeLost { silent_us, .. }] = world.at(1).events[..] else { panic!("one loss") };
     assert!((3 * 500_000..=4 * 500_000).contains(&silent_us), "{silent_us} us: within three to four periods");
+}
+
+// spec: NDL-4.6
+#[test]
+fn a_silent_node_is_lost_as_what_its_host_said_of_it_and_no_later_for_that() {
+    for (said, why) in [
+        (&[Host::Accepts][..], LossReason::Hung),
+        (&[Host::Refuses], LossReason::Crashed),
+        (&[Host::IsSilent], LossReason::LinkDown),
+        (&[], LossReason::LinkDown),
+        (&[Host::Accepts, Host::IsSilent], LossReason::LinkDown),
+    ] {
+        // given: nobody is tried who answers
+        let mut world = World::of_members(2);
+        world.run(PERIOD * 3);
+        assert_eq!(world.at(1).probes, []);
+        // when
+        world.kill(2);
+        world.run_until(PERIOD * 3, |world| !world.at(1).probes.is_empty());
+        assert!(world.knows(1, 2), "it is tried while it is suspected");
+        let (node, incarnation) = world.at(1).probes[0];
+        for host in said {
+            world.input(1, Input::Probed { node, incarnation, host: *host });
+        }
+        world.input(1, Input::Probed { node, incarnation: Incarnation(9), host: Host::Refuses });
+        let took = world.run_until(PERIOD * 4, |world| !world.knows(1, 2));
+        // then
+        assert_eq!(world.losses(1), [(2, why)]);
+        assert!(took <= PERIOD * 2, "{took:?} after the first missed answer");
+    }
+}
+
+// spec: NDL-4.6
+#[test]
+fn what_a_host_said_of_an_earlier_silence_does_not_count() {
+    let mut world = World::of_members(2);
+    world.cut(2, 1);
+    world.run_until(PERIOD * 3, |world| !world.at(1).probes.is_empty());
+    let (node, incarnation) = world.at(1).probes[0];
+    world.input(1, Input::Probed { node, incarnation, host: Host::Accepts });
+    world.mend();
+    world.run(PERIOD * 2);
+    world.input(1, Input::Probed { node, incarnation, host: Host::Accepts });
+    world.kill(2);
+    world.run(PERIOD * 5);
+    assert_eq!(world.losses(1), [(2, LossReason::LinkDown)]);
 }
 
 #[test]
@@ -203,7 +249,7 @@ fn a_broken_and_refused_connection_is_a_loss_at_once() {
     world.link(1, LinkFact::DialRefused { node, incarnation: Incarnation(0) });
     assert_eq!(world.losses(1), [], "a former life");
     world.link(1, LinkFact::DialRefused { node, incarnation });
-    assert_eq!(world.losses(1), [(2, LossReason::ConnectionRefused)]);
+    assert_eq!(world.losses(1), [(2, LossReason::Crashed)]);
 }
 
 #[test]

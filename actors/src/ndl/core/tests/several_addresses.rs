@@ -54,7 +54,7 @@ fn a_silent_node_with_another_address_is_there_as_long_as_its_link_stands_or_is_
     assert_eq!(world.losses(1), [], "it is back over the other address");
     world.link(1, broken());
     world.run(ms(1_000) + PERIOD);
-    assert_eq!(world.losses(1), [(2, LossReason::Silent)]);
+    assert_eq!(world.losses(1), [(2, LossReason::LinkDown)]);
 }
 
 #[test]
@@ -62,5 +62,5 @@ fn a_silent_node_with_another_address_and_no_link_is_lost_like_any_other() {
     let mut world = two();
     world.kill(2);
     world.run(PERIOD * 4);
-    assert_eq!(world.losses(1), [(2, LossReason::Silent)]);
+    assert_eq!(world.losses(1), [(2, LossReason::LinkDown)]);
 }

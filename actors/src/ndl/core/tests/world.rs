@@ -103,6 +103,8 @@ pub(super) struct Process {
     pub(super) others: Vec<Output>,
     pub(super) clocks: BTreeMap<NodeAddress, ClockOffset>,
     pub(super) datagrams_sent: usize,
+    /// Whose hosts are to be tried.
+    pub(super) probes: Vec<(NodeAddress, Incarnation)>,
 }
 
 struct Flying {
@@ -168,6 +170,7 @@ impl World {
             others: Vec::new(),
             clocks: BTreeMap::new(),
             datagrams_sent: 0,
+            probes: Vec::new(),
         };
         self.processes.insert(udp(index), process);
         self.restart_shell(index);
@@ -316,6 +319,7 @@ impl World {
             Output::SendLeave { to, .. } => {
                 self.send(from, to, Datagram { correlation: 0, sent: now, body: Body::Leave(me) });
             }
+            Output::Probe { node, incarnation, .. } => process.probes.push((node, incarnation)),
             Output::Fact(fact) => process.facts.push(fact),
             Output::Event { event, .. } => process.events.push(event),
             Output::ClockMeasured { node, offset } => drop(process.clocks.insert(node, offset)),

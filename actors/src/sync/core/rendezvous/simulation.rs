@@ -321,7 +321,7 @@ impl World {
         if is_lost {
             self.hear_of_break(b, a);
             for (node, peer) in [(a, b), (b, a)] {
-                let (incarnation, why) = (Incarnation(self.incarnations[peer]), LossReason::Silent);
+                let (incarnation, why) = (Incarnation(self.incarnations[peer]), LossReason::LinkDown);
                 let lost = MembershipFact::NodeLost { node: address(peer), incarnation, why };
                 self.tell(node, Input::MembershipChanged(lost));
             }

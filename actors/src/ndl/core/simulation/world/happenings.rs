@@ -11,10 +11,52 @@ impl World {
             Happening::Leave { node } => self.leave(node),
             Happening::RestartShell { node } => self.restart_shell(node),
             Happening::Stall { node, lasts } => self.stall(node, lasts),
-            Happening::Cut { from, to } => self.network.cut(from, to),
-            Happening::Mend { from, to } => self.network.mend(from, to),
+            Happening::Cut { from, to } => {
+                self.network.cut(from, to);
+                self.change(from, to);
+            }
+            Happening::Mend { from, to } => {
+                self.network.mend(from, to);
+                self.change(from, to);
+            }
             Happening::Heal => self.heal(),
         }
+    }
+
+    fn change(&mut self, one: usize, other: usize) {
+        self.changed.insert((one.min(other), one.max(other)), self.now);
+    }
+
+    fn change_node(&mut self, node: usize) {
+        (0..self.plan.nodes).for_each(|other| self.change(node, other));
+    }
+
+    /// What the host of `node` says to the node of `process`.
+    pub(super) fn host_of(&self, process: usize, node: usize) -> Host {
+        let here = self.processes[process].node;
+        let is_cut = self.network.is_cut(here, node) || self.network.is_cut(node, here);
+        if is_cut || self.dead_hosts.contains(&node) {
+            Host::IsSilent
+        } else if self.current.contains_key(&node) {
+            Host::Accepts
+        } else {
+            Host::Refuses
+        }
+    }
+
+    /// The same, if that has been so for long enough to be known.
+    pub(super) fn settled_host_of(&self, process: usize, node: usize) -> Option<Host> {
+        let Process { node: here, stalled_since, stalled_until, .. } = self.processes[process];
+        let (period, missed_max) = match self.plan.watched {
+            Some((watched, period, missed_max)) if watched == node => (period, missed_max),
+            Some(_) | None => (self.plan.period, self.plan.missed_max),
+        };
+        let bound = period * (missed_max + 1) + self.plan.lateness * 5;
+        let was_stalled = stalled_since != Time::ZERO && stalled_until + bound > self.now;
+        let changed = self.changed.get(&(here.min(node), here.max(node)));
+        let is_new =
+            changed.is_some_and(|at| *at + period * 2 + self.plan.lateness * 2 + WORD_MAX > self.now);
+        (!was_stalled && !is_new).then(|| self.host_of(process, node))
     }
 
     fn config(&self, node: usize) -> NodeConfig {
@@ -62,6 +104,8 @@ impl World {
             goodbyes: BTreeSet::new(),
         });
         self.current.insert(node, index);
+        self.dead_hosts.remove(&node);
+        self.change_node(node);
         self.at.insert(address, index);
         self.judge.started(node_address(node), incarnation, address);
         self.begin(index);
@@ -105,6 +149,7 @@ impl World {
     fn kill(&mut self, node: usize, refuses: bool) {
         let Some(process) = self.end(node) else { return };
         if !refuses {
+            self.dead_hosts.insert(node);
             return;
         }
         // Its host refuses connections from now on.
@@ -137,6 +182,8 @@ impl World {
         let index = self.current.remove(&node)?;
         let process = &mut self.processes[index];
         process.is_alive = false;
+        self.change_node(node);
+        let process = &mut self.processes[index];
         process.socket.clear();
         self.at.remove(&process.address);
         self.judge.ended(index, self.now);
@@ -158,6 +205,7 @@ impl World {
 
     fn heal(&mut self) {
         self.network.heal();
+        (0..self.plan.nodes).for_each(|node| self.change_node(node));
         if self.plan.finding != Finding::Mdns {
             return;
         }

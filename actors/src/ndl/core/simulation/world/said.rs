@@ -26,6 +26,15 @@ impl World {
                 self.processes[from].goodbyes.insert(to);
                 self.send(from, to, What::Leave, &datagram);
             }
+            Output::Probe { node, incarnation, within, .. } => {
+                let Some(index) = (0..self.plan.nodes).find(|index| node_address(*index) == node) else {
+                    return;
+                };
+                let host = self.host_of(from, index);
+                let takes = if host == Host::IsSilent { within } else { WORD_MAX.min(within / 2) };
+                let at = self.now + self.chance.between(Duration::ZERO, takes);
+                self.push(at, Event::Tell(from, Input::Probed { node, incarnation, host }));
+            }
             Output::Fact(fact) => self.told(from, fact),
             Output::ClockMeasured { node, offset } => {
                 let Some(peer) = self.current.values().find(|peer| self.is_of(**peer, node)).copied() else {
@@ -63,11 +72,12 @@ impl World {
                 self.judge.found(self.now, process, node, incarnation);
             }
             MembershipFact::NodeLost { node, incarnation, why } => {
-                use crate::ndl::LossReason::{ConnectionRefused, Duplicate, Left, Restarted, Silent};
+                use crate::ndl::LossReason::{Crashed, Duplicate, Hung, Left, LinkDown, Restarted};
                 match why {
                     Left => self.seen.left += 1,
-                    Silent => self.seen.silent += 1,
-                    ConnectionRefused => self.seen.refused += 1,
+                    Crashed => self.seen.crashed += 1,
+                    Hung => self.seen.hung += 1,
+                    LinkDown => self.seen.link_down += 1,
                     Restarted => self.seen.restarted += 1,
                     Duplicate => {
                         self.judge.violations.push(format!("{:?}: {process} says {fact:?}", self.now));
@@ -75,6 +85,9 @@ impl World {
                     }
                 }
                 self.judge.lost(self.now, process, (node, incarnation), why);
+                let index = (0..self.plan.nodes).find(|index| node_address(*index) == node);
+                let host = index.and_then(|index| self.settled_host_of(process, index));
+                self.judge.check_class(self.now, process, (node, incarnation), (why, host));
             }
         }
     }
