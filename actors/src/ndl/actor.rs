@@ -19,7 +19,7 @@ use sinew_runtime::{
     time::Time,
     wire::Message,
 };
-use tokio::sync::{Notify, mpsc};
+use tokio::sync::{Notify, mpsc, oneshot};
 
 use super::{
     Event, MembershipFact, NodeEvent,
@@ -31,7 +31,7 @@ use super::{
 };
 use crate::{
     config::NodeConfig,
-    gncl,
+    gncl, node,
     refusals::Refusals,
     stores::{self, Stores},
     sync,
@@ -39,6 +39,11 @@ use crate::{
 
 /// Rest after a failed read, so that a socket that fails for good does not take the whole thread.
 const READ_FAILED_REST: Duration = Duration::from_millis(10);
+/// Time between two questions to the root at least.
+const PROGRESS_PERIOD_MIN: Duration = Duration::from_millis(100);
+/// Datagrams that are read in a row; then there is a rest, so that a flood leaves a CPU to others, whatever this thread's priority is.
+const DATAGRAMS_IN_A_ROW: u32 = 128;
+const REST: Duration = Duration::from_millis(1);
 /// Time between two attempts to listen to mDNS again.
 const MDNS_REST: Duration = Duration::from_secs(1);
 
@@ -86,6 +91,7 @@ impl Actor for NdlActor {
         if let Some(probes) = shell.probes.borrow_mut().take() {
             ctx.spawn(try_hosts(shell.clone(), probes).into_actor(self));
         }
+        ctx.spawn(watch_progress(shell.clone()).into_actor(self));
         ctx.spawn(keep_time(shell.clone()).into_actor(self));
         self.shell = Some(shell);
         if let Some(ready) = self.ready.take() {
@@ -233,9 +239,12 @@ impl Shell {
                 }
             }
             Output::SendAnswer { to, node, correlation, query_sent, query_received } => {
-                let announcement = self.me();
+                let (announcement, progress) = {
+                    let core = lock(&self.stores);
+                    (core.announcement().clone(), core.progress().clone())
+                };
                 let (query_sent_ns, query_received_ns) = (query_sent.as_nanos(), query_received.as_nanos());
-                let answer = Answer { announcement, query_sent_ns, query_received_ns };
+                let answer = Answer { announcement, query_sent_ns, query_received_ns, progress };
                 self.send(to, node, correlation, Body::Answer(answer));
             }
             Output::SendLeave { to, node } => self.send(to, node, 0, Body::Leave(self.me())),
@@ -329,7 +338,15 @@ fn open_socket(stores: &Stores) -> io::Result<std::net::UdpSocket> {
 async fn receive(shell: Rc<Shell>, socket: tokio::net::UdpSocket, way: Way) {
     // One byte more than is taken: a longer datagram is noticed, not cut.
     let mut buffer = [0; DATAGRAM_MAX + 1];
+    let (mut in_a_row, mut began) = (0, Time::now());
     loop {
+        in_a_row += 1;
+        if in_a_row > DATAGRAMS_IN_A_ROW {
+            if Time::now().since(began) < REST {
+                tokio::time::sleep(REST).await;
+            }
+            (in_a_row, began) = (0, Time::now());
+        }
         match socket.recv_from(&mut buffer).await {
             Ok((length, from)) => {
                 let bytes = &buffer[..length];
@@ -341,6 +358,24 @@ async fn receive(shell: Rc<Shell>, socket: tokio::net::UdpSocket, way: Way) {
                 shell.refusals.count(Time::now(), "NDL socket not readable", &error);
                 tokio::time::sleep(READ_FAILED_REST).await;
             }
+        }
+    }
+}
+
+/// Asks the root, every period, what of this node does not get on. The root waits for nobody, and NDL not for the root.
+async fn watch_progress(shell: Rc<Shell>) {
+    let period = shell.stores.config.ndl.period.max(PROGRESS_PERIOD_MIN);
+    loop {
+        tokio::time::sleep(period).await;
+        let (answer, answered) = oneshot::channel();
+        if shell.stores.posts.root.post(node::RootEvent::TellProgress(answer)).is_err() {
+            // The root has much to do: it is asked again.
+            continue;
+        }
+        // A root that is gone, or is busy: what was known still holds.
+        let Ok(Ok(progress)) = tokio::time::timeout(period, answered).await else { continue };
+        if !shell.feed(|core, now| core.handle(now, Input::ProgressSeen(progress))) {
+            return;
         }
     }
 }

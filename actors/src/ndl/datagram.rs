@@ -10,6 +10,8 @@ use sinew_runtime::{
     wire::{Flags, Header, HeaderError, Kind, decode, decode_datagram, encode_frame},
 };
 
+use super::Progress;
+
 /// Longest datagram in bytes: it passes every network unfragmented. // spec: NDL-1
 pub(crate) const DATAGRAM_MAX: usize = 1_200;
 
@@ -141,6 +143,9 @@ pub(crate) struct Answer {
     pub(crate) query_sent_ns: u64,
     /// When the query arrived, in nanoseconds of the answering node's clock.
     pub(crate) query_received_ns: u64,
+    /// What of the node does not get on.
+    #[serde(default, skip_serializing_if = "Progress::is_nothing")]
+    pub(crate) progress: Progress,
 }
 
 /// A datagram that keeps the rules of its form.
@@ -221,6 +226,9 @@ pub(crate) fn parse(here: NodeAddress, bytes: &[u8]) -> Result<Datagram, Datagra
         Kind::NDL_QUERY => Body::Query(announcement(&message.payload)?),
         Kind::NDL_ANSWER => {
             let answer: Answer = decode(&message.payload)?;
+            if !answer.progress.is_fit() {
+                return Err(DatagramError::Announcement("what it says does not get on cannot be so"));
+            }
             Body::Answer(Answer { announcement: answer.announcement.check()?, ..answer })
         }
         Kind::NDL_LEAVE => Body::Leave(announcement(&message.payload)?),
@@ -270,6 +278,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::ndl::{Part, Told, Trouble};
 
     fn any_announcement() -> impl Strategy<Value = Announcement> {
         let names = ("[a-zäöü ]{1,30}", "[a-z.-]{1,63}");
@@ -301,13 +310,29 @@ mod tests {
         )
     }
 
+    /// As many parts as `number` says, with the longest names.
+    fn any_progress(number: u64) -> Progress {
+        let part = |at| Part {
+            app: AppAddress::new(0xffff_0000 + at),
+            name: "x".repeat(63),
+            trouble: Told(Trouble::GivenUp),
+            since_ms: u32::MAX,
+        };
+        Progress::of((0..(number % 7) as u32).map(part).collect())
+    }
+
     fn any_datagram() -> impl Strategy<Value = Datagram> {
         (any_announcement(), 0..3, any::<[u64; 4]>()).prop_map(
             |(announcement, kind, [correlation, sent, a, b])| {
                 let body = match kind {
                     0 => Body::Query(announcement),
                     1 => Body::Leave(announcement),
-                    _ => Body::Answer(Answer { announcement, query_sent_ns: a, query_received_ns: b }),
+                    _ => Body::Answer(Answer {
+                        announcement,
+                        query_sent_ns: a,
+                        query_received_ns: b,
+                        progress: any_progress(a),
+                    }),
                 };
                 Datagram { correlation, sent: Time::from_nanos(sent), body }
             },

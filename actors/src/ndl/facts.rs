@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 
 use serde::{Deserialize, Serialize};
 use sinew_runtime::{
-    tid::{Incarnation, NodeAddress},
+    tid::{Incarnation, NodeAddress, Tid},
     wire::{Class, Payload},
 };
 
@@ -51,6 +51,32 @@ pub enum NodeEvent {
         #[serde(default)]
         bound_us: u64,
     },
+    /// A layer or an application of a node that lives does not get on. It says so itself, in its answers.
+    AppStalled {
+        /// The node's address.
+        node: NodeAddress,
+        /// The node's name.
+        name: String,
+        /// What does not get on.
+        app: Tid,
+        /// Its name.
+        app_name: String,
+        /// What is wrong with it.
+        trouble: Trouble,
+        /// For how long that had been so when the node said it first, in microseconds.
+        since_us: u64,
+    },
+    /// It gets on again, or is not to be there any more.
+    AppResumed {
+        /// The node's address.
+        node: NodeAddress,
+        /// The node's name.
+        name: String,
+        /// What gets on.
+        app: Tid,
+        /// Its name.
+        app_name: String,
+    },
     /// A node is there in a new life: its process ended and was started again.
     NodeRestarted {
         /// Its address.
@@ -65,6 +91,17 @@ pub enum NodeEvent {
 impl Payload for NodeEvent {
     const NAME: &'static str = "sinew.node_event";
     const CLASS: Class = Class::Control;
+}
+
+/// Why a layer or an application does not get on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub enum Trouble {
+    /// One turn of it (a handler, a timer, a future) has lasted for 250 ms and more.
+    Stalled,
+    /// It has failed and is started again, or waits for that.
+    Away,
+    /// It has failed, and is not started again.
+    GivenUp,
 }
 
 /// How a loss was noticed.

@@ -34,6 +34,7 @@
 //! | NDL-5.6 | Of two that both live, who has settled goes before who has not, and then the elder life: whoever hears both takes that one. |
 //! | NDL-5.7 | Who goes second gives up `missed_max` periods after it hears of the first; who was frozen or alone settles anew. |
 //! | NDL-6 | Each answer measures the peer's clock; the smallest bound counts, grown by the drift since then. |
+//! | NDL-9 | Answers say what of the node does not get on; a change is told to applications. |
 //! | NDL-7 | All memory and all work is bounded. |
 //! | NDL-7.1 | `nodes_max` members, as many candidates, as many that are gone; the oldest candidate makes room. |
 //! | NDL-7.2 | 50 datagrams/s from a stranger's address, 1,000 from all of them, 500 from each member or seed. |
@@ -45,6 +46,7 @@ mod datagram;
 mod facts;
 mod mdns;
 mod probe;
+mod progress;
 mod socket;
 #[cfg(test)]
 mod tests;
@@ -52,10 +54,11 @@ mod tests;
 pub(crate) use actor::{NdlActor, new_core};
 pub(crate) use core::Core;
 pub(crate) use core::LostNode;
-pub use core::{KnownNode, Source};
+pub use core::{KnownNode, Source, TroubledApp};
 pub(crate) use datagram::FURTHER_MAX;
 pub(crate) use facts::MembershipFact;
-pub use facts::{LossReason, NodeEvent};
+pub use facts::{LossReason, NodeEvent, Trouble};
+pub(crate) use progress::{Part, Progress, Told};
 
 use crate::{gncl::LinkFact, lncl::AppFact};
 

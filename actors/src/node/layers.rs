@@ -10,6 +10,10 @@ use crate::{gncl, lncl, ndl, stores::Stores, sync};
 /// The layers' names, in the paper's order of start (section 6).
 pub(super) const LAYERS: [&str; 4] = ["LNCL", "sync manager", "GNCL", "NDL"];
 
+/// NDL's real-time priority, where there is one to be had: above ordinary threads, so that a busy node is not taken for a lost one, and
+/// below every control loop that asks for one.
+const NDL_PRIORITY: u8 = 1;
+
 /// The name of their supervisor.
 pub(super) const SUPERVISOR: &str = "layers";
 
@@ -33,7 +37,11 @@ pub(super) fn specs(stores: &Arc<Stores>, ids: &ChildIds, deadline: Duration) ->
         child(LAYERS[0], Place::io(), layer(stores, lncl::Lncl::new)),
         child(LAYERS[1], Place::layer("sync"), layer(stores, sync::SyncManager::new)),
         gncl,
-        child(LAYERS[3], Place::layer("ndl"), layer(stores, ndl::NdlActor::new)),
+        child(
+            LAYERS[3],
+            Place::layer("ndl").realtime_at_best(NDL_PRIORITY),
+            layer(stores, ndl::NdlActor::new),
+        ),
     ]
 }
 

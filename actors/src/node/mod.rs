@@ -21,6 +21,7 @@ mod directory;
 mod faults;
 mod layers;
 mod places;
+mod progress;
 mod root;
 mod supervisor_spec;
 mod tree;

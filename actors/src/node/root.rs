@@ -2,6 +2,7 @@
 
 use std::{
     cell::RefCell,
+    collections::BTreeMap,
     rc::Rc,
     sync::{Arc, atomic::Ordering, mpsc::SyncSender},
     time::Duration,
@@ -22,7 +23,10 @@ use sinew_runtime::{
     tid::AppAddress,
     time::Time,
 };
-use tokio::signal::unix::{SignalKind, signal};
+use tokio::{
+    signal::unix::{SignalKind, signal},
+    sync::oneshot,
+};
 
 use super::{
     NodeEnd, StartError,
@@ -36,7 +40,7 @@ use super::{
     tree::SupervisionTree,
     wind_up::{self, Branch, Heirs},
 };
-use crate::{lncl, process, stores::Stores};
+use crate::{lncl, ndl, process, stores::Stores};
 
 /// Confirmed messages and requests of one application under way at most.
 pub(crate) const WAITS_MAX: usize = 1_024;
@@ -61,6 +65,8 @@ pub(crate) enum RootEvent {
     Ordered(Ordered),
     /// By the owner: say who is supervised.
     TellTree(SyncSender<SupervisionTree>),
+    /// By NDL: say what does not get on.
+    TellProgress(oneshot::Sender<ndl::Progress>),
     /// By a test: panic.
     #[cfg(feature = "fault-points")]
     Fail,
@@ -92,7 +98,7 @@ const BURIED_WITHIN: Duration = Duration::from_secs(1);
 
 pub(super) struct Root {
     pub(super) stores: Arc<Stores>,
-    threads: Rc<RefCell<Threads>>,
+    pub(super) threads: Rc<RefCell<Threads>>,
     pub(super) burials: Burials,
     heirs: Heirs,
     pub(super) phase: Phase,
@@ -103,6 +109,8 @@ pub(super) struct Root {
     pub(super) apps: Apps,
     pub(super) absences: Absences,
     pub(super) answers: Answers,
+    /// Turns that lasted when they were looked at, and since when.
+    pub(super) turns: BTreeMap<String, (u64, Time)>,
     pub(super) layer_supervisor: Option<Roster>,
     pub(super) app_supervisor: Option<Roster>,
     last_layer_fault: Option<String>,
@@ -138,6 +146,7 @@ pub(super) fn run(
         apps: Apps::default(),
         absences: Absences::new(stores.clone()),
         answers: Answers::default(),
+        turns: BTreeMap::new(),
         layer_supervisor: None,
         app_supervisor: None,
         last_layer_fault: None,
@@ -208,6 +217,7 @@ impl StreamHandler<RootEvent> for Root {
             RootEvent::Ordered(ordered) => self.ordered(ordered),
             // Who asked may have stopped waiting.
             RootEvent::TellTree(answer) => _ = answer.try_send(self.tree()),
+            RootEvent::TellProgress(answer) => _ = answer.send(self.progress()),
             RootEvent::HeedSignals => self.heed_signals(context),
             RootEvent::StopOrdered => self.stop_apps(),
             #[cfg(feature = "fault-points")]

@@ -63,6 +63,6 @@ pub use self::{
     ready::{ReadyGate, ReadyPart},
     roster::{Listed, Roster},
     supervisor::{ChildSpec, Launch, PlannedChild, Supervisor, SupervisorFact, SupervisorPlan},
-    threads::Threads,
+    threads::{Threads, Turn},
     vitals::{at_fence, is_fenced},
 };

@@ -19,6 +19,8 @@ pub struct Place {
     pub owner: Owner,
     /// SCHED_FIFO priority, 1 to 99. Where the system refuses it, the node says so once and goes on without.
     pub realtime_priority: Option<u8>,
+    /// A priority for the node's own thread where the system grants one; nothing is said where it does not.
+    pub at_best: Option<u8>,
     /// The one CPU that the thread may run on.
     pub cpu: Option<usize>,
     /// The thread is in a process of its own, a child of the node's.
@@ -39,7 +41,7 @@ pub enum Owner {
 
 impl Place {
     const fn of(owner: Owner, thread: String) -> Self {
-        Self { thread, owner, realtime_priority: None, cpu: None, own_process: false }
+        Self { thread, owner, realtime_priority: None, at_best: None, cpu: None, own_process: false }
     }
 
     /// The thread called `name`, scheduled like any other, shared by all who name it. Those that name none share the one called
@@ -91,6 +93,13 @@ impl Place {
         self
     }
 
+    /// The same thread under SCHED_FIFO with this priority, 1 to 99, where the system allows it, and as any other where it does not.
+    #[must_use]
+    pub const fn realtime_at_best(mut self, priority: u8) -> Self {
+        self.at_best = Some(priority);
+        self
+    }
+
     /// The same thread on one CPU only.
     #[must_use]
     pub const fn on_cpu(mut self, cpu: usize) -> Self {
@@ -138,6 +147,15 @@ impl Place {
             && let Err(error) = system::keep_on(cpu)
         {
             crate::log::warn!(thread = self.thread, cpu, %error, "the thread stays on any CPU; does this one exist?");
+        }
+        if let Some(priority) = self.at_best {
+            let granted = make_realtime(priority).is_ok();
+            crate::log::debug!(
+                thread = self.thread,
+                priority,
+                granted,
+                "a real-time priority, where one is to be had"
+            );
         }
         if let Some(priority) = self.realtime_priority {
             self.make_realtime(priority);

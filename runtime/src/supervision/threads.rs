@@ -23,7 +23,7 @@ use super::{
     vitals::Neighbours,
     watchdog::{Reprieve, Watchdog},
 };
-use crate::post::lock;
+use crate::{post::lock, time::Time};
 
 /// One thread of a node, from its making to its end.
 #[derive(Debug)]
@@ -129,6 +129,19 @@ impl Drop for Occupied {
     }
 }
 
+/// What an actor did when somebody looked.
+#[derive(Clone, Debug)]
+pub struct Turn {
+    /// Its name.
+    pub actor: String,
+    /// Another number for each turn of one life.
+    pub number: u64,
+    /// Whether it is in the middle of that turn, or rests after it.
+    pub is_on: bool,
+    /// When the turn began, if the actor knew; else whoever looks twice knows since when it lasts at least.
+    pub begun: Option<Time>,
+}
+
 /// The threads of a node. Made when the first actor needs them; used on the node's root thread only.
 #[derive(Debug, Default)]
 pub struct Threads {
@@ -188,6 +201,25 @@ impl Threads {
         if let Some((arbiter, _)) = self.arbiters.remove(key) {
             arbiter.stop();
         }
+    }
+
+    /// What every actor on these threads does. Reads what their threads write, and waits for none of them.
+    #[must_use]
+    pub fn turns(&self) -> Vec<Turn> {
+        let seats = self.arbiters.values().map(|(_, seat)| seat);
+        let tenants = seats
+            .flat_map(|seat| lock(&seat.tenants).iter().filter_map(WeakTenant::living).collect::<Vec<_>>());
+        let turn = |tenant: Tenant| {
+            let vitals = tenant.vitals();
+            let sight = vitals.sight();
+            Turn {
+                actor: vitals.name().to_owned(),
+                number: sight.turn,
+                is_on: sight.is_busy(),
+                begun: sight.begun,
+            }
+        };
+        tenants.map(turn).collect()
     }
 
     /// A life moves in: its thread knows it, and the watchdog watches it.

@@ -100,6 +100,8 @@ impl Handler<Delivery<NodeEvent>> for Office {
     fn handle(&mut self, event: Delivery<NodeEvent>, _: &mut Self::Context) {
         match event.payload {
             NodeEvent::NodeFound { .. } => self.is_peer_there = true,
+            // The office tells what becomes of messages, and waits for nobody who is only slow.
+            NodeEvent::AppStalled { .. } | NodeEvent::AppResumed { .. } => {}
             NodeEvent::NodeLost { .. } => {
                 self.is_peer_there = false;
                 self.peer_lost();

@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
-use sinew::{NodeEnd, Sender, fault::Fault, prelude::*};
+use sinew::{NodeEnd, Sender, Trouble, fault::Fault, prelude::*};
 use sinew_tests::{
     DEADLINE, Ground, Log, all_run,
     load::LAYERS,
@@ -51,6 +51,37 @@ fn perform(
     let node = Ground::new().node("node").app(declare(puppet.progress_within(BUDGET))).app(desk);
     let node = node.start().expect("a node");
     (node, key.sender(), log)
+}
+
+/// NDL has a thread of its own: what blocks the node's IO thread makes the node not look lost, and is told by its name.
+#[test]
+fn an_application_that_stalls_its_nodes_io_thread_is_named_to_other_nodes_and_its_node_is_not_lost() {
+    let (gate, ground) = (Opener(Gate::default()), Ground::new());
+    let blocks = gate.0.clone();
+    let quick = |builder: NodeBuilder| {
+        builder
+            .configure(|config| (config.ndl.period, config.ndl.missed_max) = (Duration::from_millis(50), 4))
+    };
+    let (watcher, log) = Stage::new().app("watcher");
+    let here = quick(ground.node("here")).app(watcher.handles::<NodeEvent>()).start().expect("a node");
+    let (slow, _) = Stage::new().got(move |_, _| blocks.wait()).app("slow");
+    let slow = slow.place(Place::io()).progress_within(Duration::from_secs(60));
+    let (desk, key) = desk("desk");
+    let there = quick(ground.node("there")).app(slow).app(desk).start().expect("a node");
+    all_run(&[&here, &there]);
+    sees(&here.handle(), there.address());
+    // When
+    send_jobs(&key.sender(), "slow", [1]);
+    // Then: it has lasted for longer than a loss takes
+    let stalled = |seen: &Seen| matches!(seen, Seen::Node(NodeEvent::AppStalled { app_name, trouble: Trouble::Stalled, .. }) if app_name == "slow");
+    log.wait("the stall", |seen| seen.iter().any(stalled).then_some(()));
+    let known = here.handle().members();
+    assert!(known.iter().any(|node| node.troubles.iter().any(|app| app.name == "slow")), "{known:?}");
+    gate.0.open();
+    let resumed = |seen: &Seen| matches!(seen, Seen::Node(NodeEvent::AppResumed { app_name, .. }) if app_name == "slow");
+    log.wait("its end", |seen| seen.iter().any(resumed).then_some(()));
+    let lost = |seen: &Seen| matches!(seen, Seen::Node(NodeEvent::NodeLost { .. }));
+    assert!(!log.all().iter().any(lost), "{:?}", log.all());
 }
 
 #[test]

@@ -93,8 +93,8 @@ impl Core {
         let question = self.contacts.get_mut(&from).and_then(|contact| contact.questions.take(correlation));
         if let Some(question) = question {
             let exchange = self.exchange(now, question, answer_sent, &answer);
-            let announcement = answer.announcement;
-            self.confirmed(now, Proof { from, asked: question.asked, announcement, exchange });
+            let Answer { announcement, progress, .. } = answer;
+            self.confirmed(now, Proof { from, asked: question.asked, announcement, exchange, progress });
         } else if self.group_questions.has(correlation) {
             // Who answers the group's question is asked by himself: only that proves his address.
             self.heard(now, from, Source::Multicast, &answer.announcement);

@@ -14,7 +14,7 @@ use super::{
 };
 use crate::{
     gncl::LinkFact,
-    ndl::{LossReason, MembershipFact, NodeEvent, datagram::Announcement},
+    ndl::{LossReason, MembershipFact, NodeEvent, Progress, datagram::Announcement},
 };
 
 /// Longest time that a node has to show that it lives, when another process comes with its address.
@@ -30,6 +30,7 @@ pub(super) struct Proof {
     pub(super) asked: Time,
     pub(super) announcement: Announcement,
     pub(super) exchange: Option<Exchange>,
+    pub(super) progress: Progress,
 }
 
 impl Proof {
@@ -130,6 +131,7 @@ impl Core {
         (member.missed, member.host) = (0, None);
         member.is_awaited = false;
         self.measure(now, node, proof.exchange);
+        self.note_progress(node, proof.progress);
     }
 
     /// The member lives, and was asked after the newcomer came: there are two. The newcomer, if the address is its own.
@@ -198,7 +200,7 @@ impl Core {
     }
 
     fn join(&mut self, now: Time, proof: Proof, arrival: Arrival, fence: Option<Incarnation>) {
-        let Proof { from, announcement, exchange, .. } = proof;
+        let Proof { from, announcement, exchange, progress, .. } = proof;
         let Announcement { node, incarnation, ref name, .. } = announcement;
         let name = name.clone();
         let gncl = announcement.gncl_addresses();
@@ -216,6 +218,7 @@ impl Core {
             pace,
             missed: 0,
             host: None,
+            progress: Progress::default(),
             is_awaited: false,
             clock: PeerClock::default(),
             is_link_broken: false,
@@ -232,6 +235,7 @@ impl Core {
             Arrival::Found => NodeEvent::NodeFound { node, name, incarnation },
             Arrival::Restarted => NodeEvent::NodeRestarted { node, name, incarnation },
         });
+        self.note_progress(node, progress);
     }
 
     /// A member is there in a new life. // spec: NDL-5.1

@@ -12,6 +12,7 @@
 //! | `lives` | who comes, goes, comes again |
 //! | `duplicates` | which of two processes has a node address |
 //! | `pace` | how often which members are asked |
+//! | `troubles` | what of a member does not get on |
 //! | `clock` | how far a peer's clock is from ours |
 //! | `recall` | what is told to whoever asks, and decides nothing |
 
@@ -28,6 +29,7 @@ mod recall;
 mod simulation;
 #[cfg(test)]
 mod tests;
+mod troubles;
 mod view;
 
 use std::{
@@ -43,7 +45,7 @@ use sinew_runtime::{
 };
 
 pub(crate) use self::recall::{LostNode, Neighbour};
-pub use self::view::KnownNode;
+pub use self::view::{KnownNode, TroubledApp};
 use self::{
     budget::Strangers,
     clock::PeerClock,
@@ -54,7 +56,7 @@ use self::{
     recall::Recall,
 };
 use super::{
-    MembershipFact, NodeEvent,
+    MembershipFact, NodeEvent, Progress,
     datagram::{Announcement, Answer, Claim, FURTHER_MAX},
 };
 use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, refusals::Refusals, stores::ClockOffset};
@@ -80,6 +82,8 @@ pub(crate) enum Input {
     Stopping,
     /// An application that handles [`NodeEvent`] became ready, failed, went.
     AppChanged(AppFact),
+    /// The node's root says what of this node does not get on.
+    ProgressSeen(Progress),
 }
 
 /// What is to be done, or has become known.
@@ -197,6 +201,8 @@ struct Member {
     missed: u32,
     /// What its host said since it missed the first of them.
     host: Option<Host>,
+    /// What of it does not get on, as it said last.
+    progress: Progress,
     /// The last query of the cycle is not answered yet.
     is_awaited: bool,
     clock: PeerClock,
@@ -226,6 +232,8 @@ pub(crate) struct Core {
     me: Announcement,
     /// The first is that of who is in no group.
     paces: Vec<Pace>,
+    /// What of this node does not get on.
+    progress: Progress,
     nodes_max: usize,
     seeds: Vec<SocketAddr>,
     asks_group: bool,
@@ -285,6 +293,7 @@ impl Core {
         Self {
             me,
             paces: Pace::all_of(ndl),
+            progress: Progress::default(),
             nodes_max: ndl.nodes_max,
             seeds: ndl.seeds.clone(),
             asks_group: ndl.multicast.is_some(),
@@ -338,6 +347,10 @@ impl Core {
             self.app_changed(&fact);
             return;
         }
+        if let Input::ProgressSeen(progress) = input {
+            self.progress = progress;
+            return;
+        }
         let Some(due) = self.rest().due else { return };
         if now.since(due) > self.loss_bound() {
             // We got no processor for so long that others may have lost us, and have found a later life.
@@ -364,7 +377,9 @@ impl Core {
             Input::Probed { node, incarnation, host } => self.probed(node, incarnation, host),
             Input::TimePassed => self.time_passed(now),
             Input::Stopping => self.leave(),
-            Input::AppChanged(_) => unreachable!("it was taken above, whether NDL runs or not"),
+            Input::AppChanged(_) | Input::ProgressSeen(_) => {
+                unreachable!("it was taken above, whether NDL runs or not")
+            }
         }
     }
 
@@ -377,6 +392,10 @@ impl Core {
                     let Announcement { node, incarnation, ref name, .. } = member.announcement;
                     let event = NodeEvent::NodeFound { node, incarnation, name: name.clone() };
                     self.outputs.push_back(Output::Event { to: vec![app], event });
+                    for part in &member.progress.parts {
+                        let event = troubles::stalled(&member.announcement, part);
+                        self.outputs.push_back(Output::Event { to: vec![app], event });
+                    }
                 }
             }
             AppFact::Down { app } | AppFact::Stopped { app } | AppFact::Unregistered { app } => {
@@ -407,6 +426,11 @@ impl Core {
     /// What this node says about itself.
     pub(crate) const fn announcement(&self) -> &Announcement {
         &self.me
+    }
+
+    /// What of this node does not get on.
+    pub(crate) const fn progress(&self) -> &Progress {
+        &self.progress
     }
 
     /// Our own UDP address.

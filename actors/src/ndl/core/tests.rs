@@ -6,4 +6,5 @@ mod paces;
 mod properties;
 mod scenarios;
 mod several_addresses;
+mod troubles;
 mod world;

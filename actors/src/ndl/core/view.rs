@@ -3,12 +3,15 @@
 use std::{collections::BTreeMap, net::SocketAddr, time::Duration};
 
 use sinew_runtime::{
-    tid::{Incarnation, NodeAddress},
+    tid::{Incarnation, NodeAddress, Tid},
     time::Time,
 };
 
 use super::{Core, LostNode, Neighbour, Source};
-use crate::stores::ClockOffset;
+use crate::{
+    ndl::{Part, Trouble},
+    stores::ClockOffset,
+};
 
 /// A node that is there.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -36,10 +39,36 @@ pub struct KnownNode {
     /// Time after its last sign of life within which its loss is known, our own stalls aside: `asked_every` times the answers that it may
     /// miss and one more.
     pub bound: Duration,
+    /// How many of its layers and applications do not get on, as it says.
+    pub troubled: usize,
+    /// The first of them: layers, then applications by their addresses; four at most.
+    pub troubles: Vec<TroubledApp>,
     /// Time of the last query and its answer on the network.
     pub round_trip: Option<Duration>,
     /// How far its clock is from ours.
     pub offset: Option<ClockOffset>,
+}
+
+/// A layer or an application that does not get on.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TroubledApp {
+    /// Its address.
+    pub app: Tid,
+    /// Its name.
+    pub name: String,
+    /// What is wrong with it.
+    pub trouble: Trouble,
+    /// For how long that has been so, as its node said last.
+    pub since: Duration,
+}
+
+fn troubled(node: NodeAddress, part: &Part) -> TroubledApp {
+    TroubledApp {
+        app: Tid::new(node, part.app),
+        name: part.name.clone(),
+        trouble: part.trouble.0,
+        since: Duration::from_millis(part.since_ms.into()),
+    }
 }
 
 impl Core {
@@ -55,6 +84,8 @@ impl Core {
             sources: self.contacts.get(&member.address).map(|c| c.sources.clone()).unwrap_or_default(),
             heard: member.heard,
             missed: member.missed,
+            troubled: member.progress.troubled as usize,
+            troubles: member.progress.parts.iter().map(|part| troubled(*node, part)).collect(),
             asked_every: self.paces[member.pace].period,
             bound: self.paces[member.pace].bound(),
             round_trip: member.clock.round_trip(),

@@ -292,6 +292,8 @@ impl Handler<Delivery<NodeEvent>> for Gait {
                     self.learn(joint, |gone| gone.node = true);
                 }
             }
+            // Its drives' own watches, and the requirements, say sooner what that means for the gait.
+            NodeEvent::AppStalled { .. } | NodeEvent::AppResumed { .. } => {}
             NodeEvent::NodeFound { node, .. } | NodeEvent::NodeRestarted { node, .. } => {
                 if let Some(joint) = self.joint_at(node) {
                     self.learn(joint, |gone| gone.node = false);

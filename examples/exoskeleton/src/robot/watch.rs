@@ -55,6 +55,10 @@ impl Handler<Delivery<NodeEvent>> for Watch {
             NodeEvent::NodeRestarted { name, incarnation, .. } => {
                 ("node_restarted", name, incarnation.0.to_string())
             }
+            NodeEvent::AppStalled { name, app_name, trouble, .. } => {
+                ("app_stalled", name, format!("{app_name}: {trouble:?}"))
+            }
+            NodeEvent::AppResumed { name, app_name, .. } => ("app_resumed", name, app_name),
             NodeEvent::NodeLost { name, why, silent_us, .. } => {
                 ("node_lost", name, format!("{why:?}, silent for {silent_us} us"))
             }

@@ -27,7 +27,10 @@ fn leg_and_console() -> World {
 fn losses(world: &World) -> Vec<(u32, u64, u64)> {
     let events = world.at(1).events.iter().filter_map(|event| match event {
         NodeEvent::NodeLost { node, silent_us, bound_us, .. } => Some((node.bits(), *silent_us, *bound_us)),
-        NodeEvent::NodeFound { .. } | NodeEvent::NodeRestarted { .. } => None,
+        NodeEvent::NodeFound { .. }
+        | NodeEvent::NodeRestarted { .. }
+        | NodeEvent::AppStalled { .. }
+        | NodeEvent::AppResumed { .. } => None,
     });
     events.collect()
 }

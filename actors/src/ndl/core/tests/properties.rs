@@ -38,7 +38,12 @@ fn any_input() -> impl Strategy<Value = (u64, Input)> {
                     Input::QueryReceived(Query { from, way, correlation: 1, sent: Time::ZERO, announcement })
                 }
                 1 | 2 => {
-                    let answer = Answer { announcement, query_sent_ns: 0, query_received_ns: 0 };
+                    let answer = Answer {
+                        announcement,
+                        query_sent_ns: 0,
+                        query_received_ns: 0,
+                        progress: Default::default(),
+                    };
                     Input::AnswerReceived { from, correlation: 0, sent: Time::ZERO, answer }
                 }
                 3 => Input::LeaveReceived { from, announcement },

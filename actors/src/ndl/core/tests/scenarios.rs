@@ -302,7 +302,8 @@ fn what_a_node_answered_before_its_goodbye_does_not_bring_it_back_though_it_was_
     let announcement = world.at(2).core.announcement().clone();
     // when
     world.forge(udp(2), 1, &bytes(0, Body::Leave(announcement.clone())));
-    let answer = Answer { announcement, query_sent_ns: 0, query_received_ns: 0 };
+    let answer =
+        Answer { announcement, query_sent_ns: 0, query_received_ns: 0, progress: Default::default() };
     world.forge(udp(2), 1, &bytes(correlation, Body::Answer(answer)));
     // then
     assert!(!world.knows(1, 2));
@@ -333,7 +334,9 @@ fn an_answer_counts_only_from_the_address_that_was_asked_and_only_once() {
     world.forge(udp(9), 1, &bytes(1, Body::Query(stranger(9))));
     let question = world.at(1).core.contacts[&udp(9)].questions.newest().unwrap();
     let answer = |correlation| {
-        let answer = Answer { announcement: stranger(9), query_sent_ns: 0, query_received_ns: 0 };
+        let announcement = stranger(9);
+        let answer =
+            Answer { announcement, query_sent_ns: 0, query_received_ns: 0, progress: Default::default() };
         bytes(correlation, Body::Answer(answer))
     };
     // when: guessed, and from elsewhere

@@ -312,7 +312,8 @@ impl World {
             }
             Output::SendAnswer { to, correlation, query_sent, query_received, .. } => {
                 let (query_sent_ns, query_received_ns) = (query_sent.as_nanos(), query_received.as_nanos());
-                let answer = Answer { announcement: me, query_sent_ns, query_received_ns };
+                let progress = self.processes[&from].core.progress().clone();
+                let answer = Answer { announcement: me, query_sent_ns, query_received_ns, progress };
                 self.send(from, to, Datagram { correlation, sent: now, body: Body::Answer(answer) });
             }
             Output::SendLeave { .. } if self.loses_goodbyes => {}

@@ -17,7 +17,12 @@ impl World {
             }
             Output::SendAnswer { to, correlation, query_sent, query_received, .. } => {
                 let (query_sent_ns, query_received_ns) = (query_sent.as_nanos(), query_received.as_nanos());
-                let answer = Answer { announcement: me(), query_sent_ns, query_received_ns };
+                let answer = Answer {
+                    announcement: me(),
+                    query_sent_ns,
+                    query_received_ns,
+                    progress: Default::default(),
+                };
                 let datagram = Datagram { correlation, sent: now, body: Body::Answer(answer) };
                 self.send(from, to, What::Answer(correlation), &datagram);
             }

@@ -1,0 +1,69 @@
+//! A node that lives while something of it does not get on.
+
+use sinew_runtime::tid::{AppAddress, Tid};
+
+use super::world::{PERIOD, World, ms, node};
+use crate::ndl::{NodeEvent, Part, Progress, Told, Trouble, core::Input};
+
+fn part(app: u32, trouble: Trouble) -> Part {
+    Part { app: AppAddress::new(app), name: format!("app-{app:x}"), trouble: Told(trouble), since_ms: 300 }
+}
+
+/// What node 1 was told since it was told last, in few words.
+fn told(world: &mut World) -> Vec<(u32, Option<Trouble>)> {
+    let events = std::mem::take(&mut world.process(1).events);
+    let in_few_words = |event| match event {
+        NodeEvent::AppStalled { app, trouble, since_us: 300_000, .. } => (app.app.bits(), Some(trouble)),
+        NodeEvent::AppResumed { app, .. } => (app.app.bits(), None),
+        other @ (NodeEvent::AppStalled { .. }
+        | NodeEvent::NodeFound { .. }
+        | NodeEvent::NodeLost { .. }
+        | NodeEvent::NodeRestarted { .. }) => panic!("{other:?}"),
+    };
+    events.into_iter().map(in_few_words).collect()
+}
+
+fn says(world: &mut World, parts: Vec<Part>) {
+    world.input(2, Input::ProgressSeen(Progress::of(parts)));
+    world.run(PERIOD + ms(1));
+}
+
+// spec: NDL-9
+#[test]
+fn what_stalls_on_a_living_node_is_told_once_and_again_when_it_gets_on() {
+    let mut world = World::of_members(2);
+    let (stalled, away) = (Trouble::Stalled, Trouble::Away);
+    says(&mut world, vec![part(0x2000, stalled), part(3, stalled)]);
+    assert_eq!(told(&mut world), [(3, Some(stalled)), (0x2000, Some(stalled))], "layers first");
+    world.run(PERIOD * 5);
+    assert_eq!(told(&mut world), []);
+    let known = &world.at(1).core.members(world.now)[0];
+    assert_eq!((known.troubled, known.troubles[1].app), (2, Tid::new(node(2), AppAddress::new(0x2000))));
+    says(&mut world, vec![part(0x2000, away)]);
+    assert_eq!(told(&mut world), [(3, None), (0x2000, Some(away))]);
+    says(&mut world, vec![]);
+    assert_eq!(told(&mut world), [(0x2000, None)]);
+    assert!(world.knows(1, 2));
+}
+
+#[test]
+fn of_many_the_first_four_are_named_and_who_only_made_room_has_not_resumed() {
+    let mut world = World::of_members(2);
+    let many = |from: u32| (from..0x2006).map(|app| part(app, Trouble::GivenUp)).collect();
+    says(&mut world, many(0x2001));
+    assert_eq!(told(&mut world).len(), 4);
+    assert_eq!(world.at(1).core.members(world.now)[0].troubled, 5);
+    says(&mut world, many(0x2000));
+    assert_eq!(told(&mut world), [(0x2000, Some(Trouble::GivenUp))]);
+}
+
+#[test]
+fn an_application_that_comes_late_hears_what_does_not_get_on() {
+    let mut world = World::of_members(2);
+    says(&mut world, vec![part(0x2000, Trouble::Stalled)]);
+    told(&mut world);
+    let late = crate::lncl::AppFact::Ready { app: AppAddress::fixed(7).unwrap() };
+    world.input(1, Input::AppChanged(late));
+    let events = std::mem::take(&mut world.process(1).events);
+    assert!(matches!(events[..], [NodeEvent::NodeFound { .. }, NodeEvent::AppStalled { .. }]), "{events:?}");
+}

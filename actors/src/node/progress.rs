@@ -1,0 +1,103 @@
+//! What of this node does not get on, for the nodes that watch it: asked by NDL, answered by the root, which waits for nobody.
+
+use std::{collections::BTreeMap, time::Duration};
+
+use sinew_runtime::{
+    supervision::{BranchView, ChildState, ChildView, Roster, Turn},
+    tid::AppAddress,
+    time::Time,
+};
+
+use super::{layers::LAYERS, root::Root};
+use crate::ndl::{Part, Progress, Told, Trouble};
+
+/// A turn that lasts longer is told of. Below the watchdog's default of 1 s, after which the actor is replaced, and above what a
+/// loaded machine makes of a short one.
+const STALLED_AFTER: Duration = Duration::from_millis(250);
+/// The layers' addresses, in the order of their names.
+const ADDRESSES: [AppAddress; 4] = [AppAddress::LNCL, AppAddress::SYNC, AppAddress::GNCL, AppAddress::NDL];
+
+impl Root {
+    pub(super) fn progress(&mut self) -> Progress {
+        let now = Time::now();
+        let turns = self.threads.borrow().turns();
+        let stalled = stalled(now, turns, &mut self.turns);
+        let mut parts = Vec::new();
+        for roster in [&self.layer_supervisor, &self.app_supervisor].into_iter().flatten() {
+            collect(now, roster, roster.view(now), &stalled, &mut parts);
+        }
+        Progress::of(parts)
+    }
+}
+
+/// Whose turn lasts too long, and since when. What lasts is remembered until the next look.
+fn stalled(now: Time, turns: Vec<Turn>, seen: &mut BTreeMap<String, (u64, Time)>) -> BTreeMap<String, Time> {
+    let before = std::mem::take(seen);
+    for Turn { actor, number, begun, .. } in turns.into_iter().filter(|turn| turn.is_on) {
+        let lasted = before.get(&actor).filter(|(turn, _)| *turn == number).map(|(_, since)| *since);
+        seen.insert(actor, (number, begun.or(lasted).unwrap_or(now)));
+    }
+    let lasts = seen.iter().filter(|(_, (_, since))| now.since(*since) >= STALLED_AFTER);
+    lasts.map(|(actor, (_, since))| (actor.clone(), *since)).collect()
+}
+
+fn collect(
+    now: Time,
+    roster: &Roster,
+    view: BranchView,
+    stalled: &BTreeMap<String, Time>,
+    parts: &mut Vec<Part>,
+) {
+    for (id, child, below) in view.children {
+        if let Some(below) = below {
+            collect(now, roster, below, stalled, parts);
+        }
+        let Some(who) = roster.who(id) else { continue };
+        let layer = LAYERS.iter().position(|layer| *layer == who.name).map(|at| ADDRESSES[at]);
+        let Some(app) = who.tid.map(|tid| tid.app).or(layer) else { continue };
+        if let Some((trouble, since)) = trouble(&child, stalled.get(&who.name).copied()) {
+            let since_ms = u32::try_from(now.since(since).as_millis()).unwrap_or(u32::MAX);
+            parts.push(Part { app, name: who.name, trouble: Told(trouble), since_ms });
+        }
+    }
+}
+
+/// What is wrong with a child. Nothing, if it has not been ready yet, or is not to be there.
+fn trouble(child: &ChildView, stalled: Option<Time>) -> Option<(Trouble, Time)> {
+    let was_there = child.restarts > 0;
+    match child.state {
+        ChildState::Ready | ChildState::Stopping(_) => stalled.map(|since| (Trouble::Stalled, since)),
+        ChildState::BackingOff(_) => Some((Trouble::Away, child.since)),
+        ChildState::Starting(_) => was_there.then_some((Trouble::Away, child.since)),
+        ChildState::Down if child.wanted => was_there.then_some((Trouble::Away, child.since)),
+        ChildState::Down => {
+            let has_failed = child.last_reason.as_ref().is_some_and(|reason| reason.is_failure());
+            has_failed.then_some((Trouble::GivenUp, child.since))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn turn(number: u64, begun: Option<u64>) -> Turn {
+        let begun = begun.map(|ms| Time::from_nanos(ms * 1_000_000));
+        Turn { actor: "knee".to_owned(), number, is_on: number % 2 == 1, begun }
+    }
+
+    fn at(ms: u64) -> Time {
+        Time::from_nanos(ms * 1_000_000)
+    }
+
+    #[test]
+    fn a_turn_that_lasts_is_told_with_its_begin_or_since_it_was_seen_first() {
+        let mut seen = BTreeMap::new();
+        assert!(stalled(at(1_000), vec![turn(7, None)], &mut seen).is_empty(), "it may have begun just now");
+        assert_eq!(stalled(at(1_300), vec![turn(7, None)], &mut seen)["knee"], at(1_000));
+        assert!(stalled(at(1_600), vec![turn(9, None)], &mut seen).is_empty(), "another turn");
+        assert!(stalled(at(1_900), vec![turn(10, None)], &mut seen).is_empty(), "it rests");
+        assert_eq!(stalled(at(2_000), vec![turn(11, Some(1_700))], &mut seen)["knee"], at(1_700));
+        assert!(stalled(at(2_100), vec![], &mut seen).is_empty() && seen.is_empty());
+    }
+}
