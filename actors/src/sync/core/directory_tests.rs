@@ -29,7 +29,7 @@ fn who_watches_hears_of_all_that_is_there_and_then_of_each_change_once() {
     bench.links(KNEE, LIFE);
     assert!(bench.list(KNEE, list(1, &[("knee", true, &[])])).contains(&is("knee", KNEE, 0, true)));
     assert_eq!(bench.breaks(KNEE), [is("knee", KNEE, 0, false)]);
-    assert_eq!(bench.lost(KNEE, LossReason::Silent), [gone("knee", KNEE, 0)]);
+    assert_eq!(bench.lost(KNEE, LossReason::LinkDown), [gone("knee", KNEE, 0)]);
     assert_eq!(bench.down(9), [release(9)]);
     assert_eq!(bench.hears(Input::AppChanged(AppFact::Unregistered { app: app(0) })), [], "it is over");
 }
