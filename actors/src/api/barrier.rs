@@ -29,9 +29,9 @@ const WITHIN: Duration = Duration::from_secs(60);
 /// `docs/SEMANTICS.md`, "Barriers".
 ///
 /// ```no_run
-/// use sinew::{Barrier, prelude::*};
+/// use sinew::{Barrier, NodeApi, Registration, prelude::*};
 ///
-/// let node = NodeApi::connect("/run/sinew/hip.sock");
+/// let node = NodeApi::connect("/run/sinew/hip.sock")?;
 /// let mut calibration = node.register_transport_address(Registration::new().name("hip.calibration"))?;
 /// let calibrated = Barrier::new("calibrated", ["hip.calibration", "knee.calibration", "2 of *.imu"]);
 /// let generation = calibration.meet(&calibrated)?;

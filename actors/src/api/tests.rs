@@ -404,7 +404,8 @@ fn a_registration_waits_at_the_barrier_and_names_what_it_waits_for(under: Under)
     let mut node = TestNode::start();
     let api = Api::connect(under, &node);
     let wanted = on(under).requires(["knee.sensor", "central.gait"]);
-    let error = api.register(wanted.clone().deadline(Duration::from_millis(1))).unwrap_err();
+    // Long enough for the node to say what is missing.
+    let error = api.register(wanted.clone().deadline(Duration::from_secs(1))).unwrap_err();
     assert!(error.to_string().contains("knee.sensor, central.gait"), "{error}");
     let AppFact::Registered { app: given_up, .. } = node.fact() else { panic!("no registration") };
     assert_eq!(node.fact(), AppFact::Unregistered { app: given_up });

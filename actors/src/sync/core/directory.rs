@@ -18,7 +18,8 @@ pub(super) struct Watchers(BTreeMap<AppAddress, Watcher>);
 /// What one of them knows: what it was told and has taken.
 #[derive(Debug, Default)]
 struct Watcher {
-    told: BTreeMap<(String, Tid), (bool, Vec<Kind>)>,
+    /// `None`: of its last news it took nothing, so that it may know what was before, or nothing.
+    told: BTreeMap<(String, Tid), Option<(bool, Vec<Kind>)>>,
     /// It had no room: until then it is told nothing.
     rests: Option<Time>,
 }
@@ -37,10 +38,8 @@ impl Watchers {
     pub(super) fn not_taken(&mut self, now: Time, app: AppAddress, event: DirectoryEvent) {
         let Some(watcher) = self.0.get_mut(&app) else { return };
         watcher.rests.get_or_insert(now + RETRY);
-        match event {
-            DirectoryEvent::Is(entry) => drop(watcher.told.remove(&(entry.name, entry.tid))),
-            DirectoryEvent::Gone { name, tid } => drop(watcher.told.insert((name, tid), (false, Vec::new()))),
-        }
+        let (DirectoryEvent::Is(DirectoryEntry { name, tid, .. }) | DirectoryEvent::Gone { name, tid }) = event;
+        watcher.told.insert((name, tid), None);
     }
 
     pub(super) fn next_wake(&self) -> Option<Time> {
@@ -55,7 +54,7 @@ impl Watcher {
         let mut events = Vec::new();
         for entry in directory {
             let key = (entry.name.clone(), entry.tid);
-            let is = (entry.ready, entry.kinds.clone());
+            let is = Some((entry.ready, entry.kinds.clone()));
             if former.remove(&key).as_ref() != Some(&is) {
                 events.push(DirectoryEvent::Is(entry.clone()));
             }

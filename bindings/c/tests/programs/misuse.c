@@ -173,7 +173,7 @@ static void wrong_values(sinew_endpoint *endpoint)
     options.name = SINEW_TEXT("waits");
     options.required = &node;
     options.required_count = 1;
-    options.deadline_ns = 1000000;
+    options.deadline_ns = 1000000000;
     EXPECT_WORDS(sinew_register_transport_address(node, &options, &other), SINEW_ERROR_WAITING, "still waiting for");
     EXPECT_WORDS(sinew_create_message(endpoint, 1, kind, 3, 1, &message), SINEW_ERROR_INVALID_ARGUMENT, "`message_class`");
     EXPECT_WORDS(sinew_create_message(endpoint, 1, 7, 0, 1, &message), SINEW_ERROR_INVALID_ARGUMENT, "sinew_kind_named");
