@@ -1,6 +1,6 @@
 //! End-to-end protection of commands: from the application that sends to the output that it moves, whatever lies between.
 //!
-//! Marked on the payload's type ([`Payload::PROTECTION`](crate::wire::Payload::PROTECTION)): the sender's context puts each value
+//! Marked on the payload's type ([`Payload::PROTECTION`]): the sender's context puts each value
 //! into an envelope, the receiver's context lets nothing else through. Queues, rings, sockets, layers and networks between them
 //! are a black channel, of which nothing is believed.
 //!

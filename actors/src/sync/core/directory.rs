@@ -15,11 +15,14 @@ use crate::sync::facts::{DirectoryEntry, DirectoryEvent};
 #[derive(Debug, Default)]
 pub(super) struct Watchers(BTreeMap<AppAddress, Watcher>);
 
+/// Whether an application is ready, and what it handles. `None`: the last news of it was not taken, so that what was before is known,
+/// or nothing.
+type Known = Option<(bool, Vec<Kind>)>;
+
 /// What one of them knows: what it was told and has taken.
 #[derive(Debug, Default)]
 struct Watcher {
-    /// `None`: of its last news it took nothing, so that it may know what was before, or nothing.
-    told: BTreeMap<(String, Tid), Option<(bool, Vec<Kind>)>>,
+    told: BTreeMap<(String, Tid), Known>,
     /// It had no room: until then it is told nothing.
     rests: Option<Time>,
 }
@@ -38,7 +41,8 @@ impl Watchers {
     pub(super) fn not_taken(&mut self, now: Time, app: AppAddress, event: DirectoryEvent) {
         let Some(watcher) = self.0.get_mut(&app) else { return };
         watcher.rests.get_or_insert(now + RETRY);
-        let (DirectoryEvent::Is(DirectoryEntry { name, tid, .. }) | DirectoryEvent::Gone { name, tid }) = event;
+        let (DirectoryEvent::Is(DirectoryEntry { name, tid, .. }) | DirectoryEvent::Gone { name, tid }) =
+            event;
         watcher.told.insert((name, tid), None);
     }
 
