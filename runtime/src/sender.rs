@@ -366,6 +366,11 @@ impl Sender {
         Ok(Message::of_type::<P>(self.shared.tid, destination, payload))
     }
 
+    /// The TID with its node spelled out.
+    pub(crate) fn absolute(&self, tid: Tid) -> Tid {
+        self.shared.router.absolute(tid)
+    }
+
     /// A receiver of protected messages wants this time quoted.
     pub(crate) fn echoed(&self, from: Tid, echo: Echo) {
         self.flows.heard(from, echo);

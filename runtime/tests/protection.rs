@@ -18,7 +18,7 @@ use actix::{Actor, Handler};
 use serde::{Deserialize, Serialize};
 use sinew_runtime::{
     app::{AppContext, AppSpec, Delivery},
-    protection::{Cause, Guard, Protection},
+    protection::{ArmError, Cause, Guard, Protection},
     tid::Tid,
     wire::{Class, Payload},
 };
@@ -195,4 +195,32 @@ fn what_is_not_sealed_moves_nothing() {
         central.send_message(message).unwrap();
     }
     assert!(scene.seen.recv_timeout(PERIOD * 20).is_err(), "nothing moves it");
+}
+
+#[test]
+fn an_output_whose_making_safe_panics_is_made_safe_again_and_not_armed_before() {
+    let (safe, made_safe) = sync_channel(100);
+    let mut fails = 3;
+    let guard =
+        Guard::new::<Torque>(stage::tid(0), stage::tid(1), safe, move |safe: &mut SyncSender<()>, _| {
+            if fails > 0 {
+                fails -= 1;
+                panic!("a planted panic");
+            }
+            safe.send(()).unwrap();
+        })
+        .unwrap();
+    // By the thread of the watchdogs, of itself.
+    made_safe.recv_timeout(DEADLINE).expect("it is tried until it is done");
+    assert!(
+        matches!(guard.arm(), Err(ArmError::NotGood { .. })),
+        "now it is only that nothing good has come"
+    );
+}
+
+#[test]
+fn one_that_can_never_be_made_safe_is_never_armed() {
+    let guard =
+        Guard::new::<Torque>(stage::tid(0), stage::tid(1), (), |(), _| panic!("a planted panic")).unwrap();
+    assert_eq!(guard.arm(), Err(ArmError::SafeFails));
 }

@@ -319,7 +319,8 @@ impl<S: Socket> Half<S> {
             *older = message;
             return Ok(());
         }
-        if self.urgent.len() >= waiting_max {
+        // At most one of them waits.
+        if self.urgent.len() >= waiting_max && message.header.kind != Kind::GNCL_ACK {
             return Err(Refused::new(message, Rejection::QueueFull));
         }
         self.urgent.push_back(message);

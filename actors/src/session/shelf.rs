@@ -11,7 +11,8 @@
 //! A destination is held as long as the receiver has a line for it. The receiver says so before it acknowledges what it put there, and
 //! the sender keeps no more than its window unacknowledged: so a line is never longer than a window, and other destinations are
 //! sent to all the while. Where many destinations take nothing, the receiver says how much may come at all: half of the room that is left, so
-//! that each further one of them costs less, and one message always. Nobody who heeds this is refused, and others pass.
+//! that each further one of them costs less, and one message always. Who heeds this is refused nothing before the bytes of all lines are
+//! used up, and then only what is for one that takes nothing; others pass.
 //!
 //! | rule | what it says |
 //! | --- | --- |
@@ -19,7 +20,7 @@
 //! | CREDIT-2 | Each Ack names all that are held, with the number of the last change; of two the later change counts. |
 //! | CREDIT-3 | The sender gives no number to a message for one that is held; it waits in a line of its own, others pass. |
 //! | CREDIT-4 | Every line and all lines together are bounded; what comes then is refused as if the destination's queue were full. |
-//! | CREDIT-5 | Each Ack says how much may come: never more than there is room for in lines. Who heeds it is refused nothing. |
+//! | CREDIT-5 | Each Ack says how much may come: what there is room for in lines, and one message always. Who heeds it is refused nothing while there is room. |
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -97,14 +98,14 @@ impl<K: Copy + Ord, M> Shelf<K, M> {
     }
 
     /// How much may come, at most a `window`: of what has room in lines half, so that there is always some left for the next destination
-    /// that is full, and one message at least as long as there are bytes: a place for each line is kept for that. `longest` is the size
-    /// of the longest message. spec: CREDIT-5
+    /// that is full. One message may come in any case, one after the other: it may be for somebody who takes it, and else it is refused.
+    /// For that a place is kept for each line. `longest` is the size of the longest message. spec: CREDIT-5
     pub(crate) fn room(&self, window: Window, longest: usize) -> Window {
         let Self { limits, messages, bytes, .. } = self;
         let messages = limits.messages.saturating_sub(messages + IN_HAND + limits.lines) / 2;
         // One may reach beyond the room that it began in.
         let bytes = limits.bytes.saturating_sub(bytes + (IN_HAND + 1) * longest) / 2;
-        Window { messages: messages.clamp(1, window.messages), bytes: bytes.min(window.bytes) }
+        Window { messages: messages.clamp(1, window.messages), bytes: bytes.clamp(1, window.bytes) }
     }
 
     /// Messages that wait.

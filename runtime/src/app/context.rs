@@ -248,6 +248,8 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         output: O,
         safe: impl FnMut(&mut O, Cause) + Send + 'static,
     ) -> io::Result<Guard<O>> {
+        let source = self.sender.absolute(source);
+        self.guards.retain(|guard| !guard.is_orphan());
         if self.guard_of::<P>(source).is_some() {
             let words = format!(
                 "what {source} sends of '{}' is guarded already: keep that guard, or clone it",

@@ -4,17 +4,17 @@ use std::{
     io,
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{
-        Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError, TryLockError,
+        Arc, Mutex, MutexGuard, OnceLock, PoisonError, TryLockError, Weak,
         atomic::{AtomicBool, AtomicU64, Ordering},
     },
-    thread,
+    thread::{self, Thread},
     time::Duration,
 };
 
 use bytes::Bytes;
 
 use super::{
-    Cause, Codename, NotGood, Protection, State, Tally,
+    ArmError, Cause, Codename, Protection, State, Tally,
     receiver::{Receiver, Verdict},
 };
 use crate::{supervision::Place, tid::Tid, time::Time, wire::Payload};
@@ -23,6 +23,8 @@ use crate::{supervision::Place, tid::Tid, time::Time, wire::Payload};
 const PRIORITY: u8 = 90;
 /// Time after which an output is tried again that its application holds just then.
 const HELD: Duration = Duration::from_micros(100);
+/// Time after which what makes an output safe is called again, where it has panicked.
+const SAFE_RETRY: Duration = Duration::from_millis(1);
 /// Longest sleep of the thread; it is woken when it has something to do.
 const IDLE: Duration = Duration::from_secs(3_600);
 
@@ -30,25 +32,35 @@ const IDLE: Duration = Duration::from_secs(3_600);
 ///
 /// Clones have the same output. When the last one is dropped (its application has ended) the output is made safe.
 pub struct Guard<O: Send + 'static> {
-    shared: Arc<Shared<O>>,
-    /// Counts the clones, without the thread's own hold.
+    /// Counts the clones, without the hold that a context has.
     owners: Arc<Owners<O>>,
 }
 
 struct Owners<O: Send + 'static>(Arc<Shared<O>>);
 
 struct Shared<O> {
+    codename: Codename,
     inner: Mutex<Inner<O>>,
-    /// When the thread has to look, in nanoseconds; `u64::MAX` while the output is safe.
+    watch: Arc<Watch>,
+}
+
+/// What the thread knows of an output without touching it.
+struct Watch {
+    /// When it has to look, in nanoseconds; `u64::MAX` while the output is safe.
     deadline: AtomicU64,
+    /// Somebody trips the output who could not wait for it.
+    is_tripped: AtomicBool,
     /// Nobody has the guard any more.
     is_orphan: AtomicBool,
 }
 
 struct Inner<O> {
+    codename: Codename,
     receiver: Receiver,
     output: O,
     safe: MakeSafe<O>,
+    /// The output was to be made safe for this, and that has panicked.
+    owes: Option<Cause>,
 }
 
 type MakeSafe<O> = Box<dyn FnMut(&mut O, Cause) + Send>;
@@ -65,20 +77,40 @@ impl<O> Inner<O> {
     }
 
     fn make_safe(&mut self, cause: Cause) {
-        let Self { output, safe, receiver } = self;
-        let codename = receiver.codename();
-        if catch_unwind(AssertUnwindSafe(|| safe(output, cause))).is_err() {
-            crate::log::error!(source = %codename.source, of = codename.name, %cause, "what makes an output safe has panicked");
-        } else if cause != Cause::NotArmed && cause != Cause::Dropped {
-            crate::log::warn!(source = %codename.source, of = codename.name, %cause, "an output is safe");
+        let Self { output, safe, owes, codename: Codename { source, name, .. }, .. } = self;
+        let is_news = owes.is_none();
+        if catch_unwind(AssertUnwindSafe(|| safe(output, cause))).is_ok() {
+            *owes = None;
+            if cause != Cause::NotArmed && cause != Cause::Dropped {
+                crate::log::warn!(%source, of = *name, %cause, "an output is safe");
+            }
+            return;
         }
+        *owes = Some(cause);
+        if is_news {
+            crate::log::error!(%source, of = *name, %cause, "what makes an output safe has panicked; it is tried again each millisecond");
+        }
+    }
+
+    /// Calls again what has panicked.
+    fn pay(&mut self) {
+        if let Some(cause) = self.owes {
+            self.make_safe(cause);
+        }
+    }
+
+    /// When the thread has to look.
+    fn deadline(&self, now: Time) -> u64 {
+        let owed = self.owes.map(|_| now + SAFE_RETRY);
+        owed.or(self.receiver.deadline()).map_or(u64::MAX, Time::as_nanos)
     }
 }
 
 impl<O: Send + 'static> Guard<O> {
-    /// The output of what `receiver` does with the values of type `P` from `source`. `safe` is called with it now, and each time that
-    /// it is not live any more: on the thread `safe-output`, on that of a message, or of whoever trips or drops the guard. It must be
-    /// short, and wait for nobody.
+    /// The output of what `receiver` does with the values of type `P` from `source`, both absolute. `safe` is called with it now, and each
+    /// time that it is not live any more: on the thread `safe-output`, on that of a message, or of whoever trips or drops the guard. It
+    /// must be short and wait for nobody, as the outputs of all guards wait for it; of other guards it may [trip](Self::trip) any. One that
+    /// panics is called again.
     ///
     /// # Errors
     /// The thread cannot be started.
@@ -91,13 +123,22 @@ impl<O: Send + 'static> Guard<O> {
         const { assert!(P::PROTECTION.is_some(), "a guard is for a payload whose PROTECTION says what is borne") };
         let protection = P::PROTECTION.unwrap_or(Protection::of_period(Duration::ZERO));
         let codename = Codename::of::<P>(source, receiver);
-        let mut inner = Inner { receiver: Receiver::new(codename, protection), output, safe: Box::new(safe) };
+        let receiver = Receiver::new(codename, protection);
+        let mut inner = Inner { codename, receiver, output, safe: Box::new(safe), owes: None };
         inner.make_safe(Cause::NotArmed);
-        let deadline = AtomicU64::new(u64::MAX);
-        let shared =
-            Arc::new(Shared { inner: Mutex::new(inner), deadline, is_orphan: AtomicBool::new(false) });
-        keeper()?.keep(shared.clone());
-        Ok(Self { owners: Arc::new(Owners(shared.clone())), shared })
+        let watch = Watch {
+            deadline: AtomicU64::new(inner.deadline(Time::now())),
+            is_tripped: AtomicBool::new(false),
+            is_orphan: AtomicBool::new(false),
+        };
+        let shared = Arc::new(Shared { codename, inner: Mutex::new(inner), watch: Arc::new(watch) });
+        let output: Arc<dyn Watched> = shared.clone();
+        keeper()?.keep(Kept { watch: shared.watch.clone(), output: Arc::downgrade(&output) });
+        Ok(Self { owners: Arc::new(Owners(shared)) })
+    }
+
+    fn shared(&self) -> &Arc<Shared<O>> {
+        &self.owners.0
     }
 
     /// Moves the output, if it is live.
@@ -105,9 +146,8 @@ impl<O: Send + 'static> Guard<O> {
     /// # Errors
     /// It is not, since this; it was not moved.
     pub fn apply<R>(&self, command: impl FnOnce(&mut O) -> R) -> Result<R, Cause> {
-        let mut inner = self.shared.lock();
-        let now = Time::now();
-        inner.let_decide(|receiver| receiver.expire(now));
+        let mut inner = self.shared().lock();
+        self.shared().decide_locked(&mut inner, |receiver, now| receiver.expire(now));
         match inner.receiver.state() {
             State::Live => Ok(command(&mut inner.output)),
             State::Safe(cause) => Err(cause),
@@ -117,25 +157,33 @@ impl<O: Send + 'static> Guard<O> {
     /// Makes the output live: from now on commands pass. Somebody has seen that it is safe to; nothing does this by itself.
     ///
     /// # Errors
-    /// Too few good messages have come.
-    pub fn arm(&self) -> Result<(), NotGood> {
-        let armed = self.shared.decide(|receiver, now| receiver.arm(now));
-        if armed.is_ok() {
-            // The thread sleeps, as there was no deadline.
-            KEEPER.get().into_iter().for_each(Keeper::rouse);
+    /// Too few good messages have come, or the output could not be made safe.
+    pub fn arm(&self) -> Result<(), ArmError> {
+        {
+            let mut inner = self.shared().lock();
+            inner.pay();
+            if inner.owes.is_some() {
+                return Err(ArmError::SafeFails);
+            }
+            self.shared().decide_locked(&mut inner, |receiver, now| receiver.arm(now))?;
         }
-        armed
+        // The thread sleeps, as there was no deadline.
+        rouse();
+        Ok(())
     }
 
-    /// Makes the output safe.
+    /// Makes the output safe: at once, or, while its application or another thread has it in hand, as soon as it has not.
     pub fn trip(&self) {
-        self.shared.decide(|receiver, _| receiver.trip(Cause::Tripped));
+        self.shared().watch.is_tripped.store(true, Ordering::Release);
+        if !self.shared().try_expire() {
+            rouse();
+        }
     }
 
     /// Whether commands pass.
     #[must_use]
     pub fn state(&self) -> State {
-        self.shared.decide(|receiver, now| {
+        self.shared().decide(|receiver, now| {
             receiver.expire(now);
             receiver.state()
         })
@@ -144,33 +192,31 @@ impl<O: Send + 'static> Guard<O> {
     /// What has been counted.
     #[must_use]
     pub fn tally(&self) -> Tally {
-        self.shared.lock().receiver.tally()
+        self.shared().lock().receiver.tally()
     }
 
     /// What an application's context knows of it.
     pub(crate) fn guarded(&self) -> Arc<dyn Guarded> {
-        self.shared.clone()
+        self.shared().clone()
     }
 }
 
 impl<O: Send + 'static> Clone for Guard<O> {
     fn clone(&self) -> Self {
-        Self { shared: self.shared.clone(), owners: self.owners.clone() }
+        Self { owners: self.owners.clone() }
     }
 }
 
 impl<O: Send + 'static> std::fmt::Debug for Guard<O> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "Guard({:?})", self.shared.lock().receiver)
+        write!(f, "Guard({:?})", self.shared().codename)
     }
 }
 
 impl<O: Send + 'static> Drop for Owners<O> {
     fn drop(&mut self) {
-        let shared = &self.0;
-        shared.decide(|receiver, _| receiver.trip(Cause::Dropped));
-        shared.is_orphan.store(true, Ordering::Release);
-        KEEPER.get().into_iter().for_each(Keeper::rouse);
+        self.0.decide(|receiver, _| receiver.trip(Cause::Dropped));
+        self.0.watch.is_orphan.store(true, Ordering::Release);
     }
 }
 
@@ -184,15 +230,16 @@ impl<O> Shared<O> {
         self.decide_locked(&mut self.lock(), decide)
     }
 
-    fn decide_locked<R>(
-        &self,
-        inner: &mut MutexGuard<'_, Inner<O>>,
-        decide: impl FnOnce(&mut Receiver, Time) -> R,
-    ) -> R {
+    fn decide_locked<R>(&self, inner: &mut Inner<O>, decide: impl FnOnce(&mut Receiver, Time) -> R) -> R {
         let now = Time::now();
-        let decided = inner.let_decide(|receiver| decide(receiver, now));
-        let deadline = inner.receiver.deadline().map_or(u64::MAX, Time::as_nanos);
-        self.deadline.store(deadline, Ordering::Release);
+        let is_tripped = self.watch.is_tripped.swap(false, Ordering::AcqRel);
+        let decided = inner.let_decide(|receiver| {
+            if is_tripped {
+                receiver.trip(Cause::Tripped);
+            }
+            decide(receiver, now)
+        });
+        self.watch.deadline.store(inner.deadline(now), Ordering::Release);
         decided
     }
 }
@@ -201,6 +248,8 @@ impl<O> Shared<O> {
 pub(crate) trait Guarded: Send + Sync {
     /// Who sends what to whom.
     fn codename(&self) -> Codename;
+    /// Whether nobody has the guard any more.
+    fn is_orphan(&self) -> bool;
     /// Takes a message in.
     fn take(&self, bytes: &Bytes) -> Verdict;
     /// The time that the sender is to quote.
@@ -209,7 +258,11 @@ pub(crate) trait Guarded: Send + Sync {
 
 impl<O: Send + 'static> Guarded for Shared<O> {
     fn codename(&self) -> Codename {
-        *self.lock().receiver.codename()
+        self.codename
+    }
+
+    fn is_orphan(&self) -> bool {
+        self.watch.is_orphan.load(Ordering::Acquire)
     }
 
     fn take(&self, bytes: &Bytes) -> Verdict {
@@ -221,97 +274,106 @@ impl<O: Send + 'static> Guarded for Shared<O> {
     }
 }
 
-/// A guard, as the thread sees it.
+/// An output, as the thread sees it.
 trait Watched: Send + Sync {
-    fn deadline(&self) -> Time;
-    fn is_orphan(&self) -> bool;
-    /// Makes the output safe if its time is over. `false`: its application holds it just now.
+    /// Makes the output safe if its time is over. `false`: somebody has it in hand just now.
     fn try_expire(&self) -> bool;
 }
 
 impl<O: Send + 'static> Watched for Shared<O> {
-    fn deadline(&self) -> Time {
-        Time::from_nanos(self.deadline.load(Ordering::Acquire))
-    }
-
-    fn is_orphan(&self) -> bool {
-        self.is_orphan.load(Ordering::Acquire)
-    }
-
     fn try_expire(&self) -> bool {
         let mut inner = match self.inner.try_lock() {
             Ok(inner) => inner,
             Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
             Err(TryLockError::WouldBlock) => return false,
         };
+        inner.pay();
         self.decide_locked(&mut inner, |receiver, now| receiver.expire(now));
         true
     }
 }
 
+/// One output, which its owners keep: it is dropped where the last of them is.
+struct Kept {
+    watch: Arc<Watch>,
+    output: Weak<dyn Watched>,
+}
+
 /// Who keeps the watchdogs of this process.
+#[derive(Default)]
 struct Keeper {
-    watched: Mutex<Vec<Arc<dyn Watched>>>,
-    changed: Condvar,
+    kept: Mutex<Vec<Kept>>,
 }
 
 static KEEPER: OnceLock<Keeper> = OnceLock::new();
+static THREAD: OnceLock<Thread> = OnceLock::new();
 
 /// The keeper, whose thread runs.
 fn keeper() -> io::Result<&'static Keeper> {
-    static STARTED: Mutex<bool> = Mutex::new(false);
-    let keeper = KEEPER.get_or_init(|| Keeper { watched: Mutex::new(Vec::new()), changed: Condvar::new() });
-    let mut started = STARTED.lock().unwrap_or_else(PoisonError::into_inner);
-    if !*started {
-        thread::Builder::new().name("safe-output".to_owned()).spawn(|| {
+    static STARTING: Mutex<()> = Mutex::new(());
+    let keeper = KEEPER.get_or_init(Keeper::default);
+    let _one_at_a_time = STARTING.lock().unwrap_or_else(PoisonError::into_inner);
+    if THREAD.get().is_none() {
+        let thread = thread::Builder::new().name("safe-output".to_owned()).spawn(|| {
             Place::layer("safe-output").realtime(PRIORITY).prepare();
             keeper.run()
         })?;
-        *started = true;
+        THREAD.get_or_init(|| thread.thread().clone());
     }
     Ok(keeper)
 }
 
+/// A deadline is nearer than the thread knows. Takes no lock.
+fn rouse() {
+    if let Some(thread) = THREAD.get() {
+        thread.unpark();
+    }
+}
+
 impl Keeper {
-    fn lock(&self) -> MutexGuard<'_, Vec<Arc<dyn Watched>>> {
-        self.watched.lock().unwrap_or_else(PoisonError::into_inner)
+    fn lock(&self) -> MutexGuard<'_, Vec<Kept>> {
+        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn keep(&self, guard: Arc<dyn Watched>) {
-        self.lock().push(guard);
-    }
-
-    /// A deadline is nearer than the thread knows.
-    fn rouse(&self) {
-        // It reads the deadlines and begins to wait under this lock: it sees the new one, or this.
-        drop(self.lock());
-        self.changed.notify_one();
+    fn keep(&self, kept: Kept) {
+        self.lock().push(kept);
+        rouse();
     }
 
     fn run(&self) -> ! {
-        let mut watched = self.lock();
         loop {
-            let now = Time::now();
-            let mut sleeps = IDLE;
-            let mut buried = Vec::new();
-            watched.retain(|guard| {
-                if guard.is_orphan() {
-                    buried.push(guard.clone());
-                    return false;
-                }
-                let is_held = guard.deadline() <= now && !guard.try_expire();
-                sleeps = sleeps.min(if is_held { HELD } else { guard.deadline().since(now) });
-                true
-            });
-            if !buried.is_empty() {
-                // What an output does when it is dropped is its own affair, and nobody waits for it here.
-                drop(watched);
-                drop(buried);
-                watched = self.lock();
+            let (due, sleeps) = self.look(Time::now());
+            if due.is_empty() {
+                thread::park_timeout(sleeps);
                 continue;
             }
-            let waited = self.changed.wait_timeout(watched, sleeps);
-            watched = waited.unwrap_or_else(PoisonError::into_inner).0;
+            // Without the lock: what makes an output safe is the user's, and may make, arm or drop guards.
+            let mut are_held = true;
+            for output in due {
+                // A panic of what makes it safe is caught where that is called; here an output may panic whose last owner has just gone.
+                let tried = catch_unwind(AssertUnwindSafe(|| {
+                    output.upgrade().is_none_or(|output| output.try_expire())
+                }));
+                are_held &= !tried.unwrap_or(true);
+            }
+            if are_held {
+                thread::park_timeout(HELD.min(sleeps));
+            }
         }
+    }
+
+    /// Whose time is over, and the time until the next one's is.
+    fn look(&self, now: Time) -> (Vec<Weak<dyn Watched>>, Duration) {
+        let (mut due, mut sleeps) = (Vec::new(), IDLE);
+        self.lock().retain(|Kept { watch, output }| {
+            let left = Time::from_nanos(watch.deadline.load(Ordering::Acquire)).since(now);
+            if left.is_zero() || watch.is_tripped.load(Ordering::Acquire) {
+                due.push(output.clone());
+            } else {
+                sleeps = sleeps.min(left);
+            }
+            output.strong_count() > 0
+        });
+        (due, sleeps)
     }
 }

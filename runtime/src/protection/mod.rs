@@ -19,7 +19,7 @@
 //!
 //! The output belongs to a [`Guard`]. It is safe at first, live after [`Guard::arm`], and safe again, until it is armed again, once
 //! something is wrong that the type's [`Protection`] does not bear. The watchdog is kept by a thread of its own, `safe-output`,
-//! which needs no layer, no reactor and no other thread.
+//! which needs no layer and no reactor. All outputs of a process share it: what makes one of them safe must be short.
 //!
 //! | file | what it is |
 //! | --- | --- |
@@ -139,18 +139,24 @@ pub enum Fault {
     Gap,
 }
 
-/// An output cannot be armed.
+/// Why an output cannot be armed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "{good} good messages in a row have come, the last one {silent:?} ago; wait for {wanted}, and for the next one to be in time"
-)]
-pub struct NotGood {
-    /// Good messages in a row that have come.
-    pub good: u32,
-    /// How many must have come.
-    pub wanted: u32,
-    /// Time since the last one.
-    pub silent: Duration,
+pub enum ArmError {
+    /// Too few good messages have come, or the last one too long ago.
+    #[error(
+        "{good} good messages in a row have come, the last one {silent:?} ago; wait for {wanted}, and for the next one to be in time"
+    )]
+    NotGood {
+        /// Good messages in a row that have come.
+        good: u32,
+        /// How many must have come.
+        wanted: u32,
+        /// Time since the last one.
+        silent: Duration,
+    },
+    /// What makes the output safe has panicked, and goes on to: whether it is safe is not known.
+    #[error("what makes the output safe has panicked, and is tried again; see the log for its words")]
+    SafeFails,
 }
 
 /// What a receiver has counted.

@@ -2,7 +2,7 @@
 
 use bytes::Bytes;
 
-use super::{Cause, Fault, NotGood, Protection, State, Tally, envelope};
+use super::{ArmError, Cause, Fault, Protection, State, Tally, envelope};
 use crate::{protection::Codename, time::Time};
 
 /// Echoes that a sender may answer with. One is sent each quarter of the longest age, so that the oldest is twice too old.
@@ -50,10 +50,6 @@ impl Receiver {
             echoes: [Time::ZERO; ECHOES],
             tally: Tally::default(),
         }
-    }
-
-    pub(crate) const fn codename(&self) -> &Codename {
-        &self.codename
     }
 
     pub(crate) const fn state(&self) -> State {
@@ -142,7 +138,8 @@ impl Receiver {
         }
         self.last = Some((incarnation, stamp.counter));
         let lost = stamp.counter - counter - 1;
-        self.tally.lost += lost;
+        // It comes from outside.
+        self.tally.lost = self.tally.lost.saturating_add(lost);
         if lost > self.protection.lost_max {
             self.trip(Cause::TooMuchLost);
             return Err(Fault::Gap);
@@ -151,11 +148,15 @@ impl Receiver {
     }
 
     /// Makes the output live.
-    pub(crate) fn arm(&mut self, now: Time) -> Result<(), NotGood> {
+    pub(crate) fn arm(&mut self, now: Time) -> Result<(), ArmError> {
         self.expire(now);
         let wanted = self.protection.good_min;
         if self.good < wanted || now.since(self.heard) >= self.protection.within {
-            return Err(NotGood { good: self.good.min(wanted), wanted, silent: now.since(self.heard) });
+            return Err(ArmError::NotGood {
+                good: self.good.min(wanted),
+                wanted,
+                silent: now.since(self.heard),
+            });
         }
         self.state = State::Live;
         Ok(())

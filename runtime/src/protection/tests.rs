@@ -1,6 +1,9 @@
 //! Each class of error, injected between a sender and a receiver: none may be used, and the output has to be safe when it must.
 
-use std::time::Duration;
+use std::{
+    sync::{Arc, Mutex},
+    time::Duration,
+};
 
 use bytes::Bytes;
 use proptest::{prelude::*, test_runner::TestRng};
@@ -100,8 +103,11 @@ fn what_is_sealed_is_applied_once_armed_and_not_before() {
         let message = bench.next();
         assert_eq!(bench.take(&message), Verdict::Hold);
     }
-    let refused = bench.receiver.arm(bench.now).unwrap_err();
-    assert_eq!((refused.good, refused.wanted), (PROTECTION.good_min - 1, PROTECTION.good_min));
+    let (good, wanted) = (PROTECTION.good_min - 1, PROTECTION.good_min);
+    assert_eq!(
+        bench.receiver.arm(bench.now),
+        Err(ArmError::NotGood { good, wanted, silent: Duration::ZERO })
+    );
     let message = bench.next();
     assert_eq!(bench.take(&message), Verdict::Hold);
     bench.receiver.arm(bench.now).unwrap();
@@ -355,6 +361,56 @@ fn the_bytes_are_those_of_the_page() {
     let mut digest = crc64fast::Digest::new();
     digest.write(b"123456789");
     assert_eq!(digest.sum64(), 0x995d_c9bb_df19_39fa);
+}
+
+/// A live output, and whose `safe` is called with what is in its slot.
+fn live_guard(slot: &Arc<Mutex<Option<Guard<()>>>>) -> Guard<()> {
+    let peer = slot.clone();
+    let safe = move |(): &mut (), _| {
+        if let Some(peer) = peer.lock().expect("nobody panics with it").as_ref() {
+            peer.trip();
+        }
+    };
+    let guard = Guard::new::<Patient>(tid(CENTRAL), tid(DRIVE), (), safe).expect("a thread");
+    let (flows, guarded) = (Flows::new(Time::from_nanos(5)), guard.guarded());
+    let seal = || flows.seal(tid(CENTRAL), tid(DRIVE), &Patient).expect("one flow");
+    seal();
+    for _ in 0..8 {
+        flows.heard(tid(DRIVE), Echo::new(Patient::KIND, guarded.echo()));
+        assert_eq!(guarded.take(&seal()), Verdict::Hold);
+    }
+    guard.arm().expect("good ones have come");
+    guard
+}
+
+/// For whom no machine is too slow.
+#[derive(Serialize, Deserialize)]
+struct Patient;
+
+impl Payload for Patient {
+    const NAME: &'static str = "test.patient";
+    const PROTECTION: Option<Protection> = Some(Protection::of_period(Duration::from_secs(60)));
+}
+
+#[test]
+fn guards_that_trip_each_other_are_both_safe_and_wait_for_nobody() {
+    let (done, is_done) = std::sync::mpsc::sync_channel(1);
+    std::thread::spawn(move || {
+        for _ in 0..200 {
+            let slots: [Arc<Mutex<Option<Guard<()>>>>; 2] = Default::default();
+            let guards = [live_guard(&slots[0]), live_guard(&slots[1])];
+            *slots[0].lock().expect("it is new") = Some(guards[1].clone());
+            *slots[1].lock().expect("it is new") = Some(guards[0].clone());
+            std::thread::scope(|scope| guards.iter().for_each(|guard| drop(scope.spawn(|| guard.trip()))));
+            // Whom the other one had in hand the thread of the watchdogs trips.
+            while guards.iter().any(|guard| guard.state() == State::Live) {
+                std::thread::yield_now();
+            }
+            slots.iter().for_each(|slot| drop(slot.lock().expect("nobody panics with it").take()));
+        }
+        done.send(()).expect("the test waits");
+    });
+    is_done.recv_timeout(Duration::from_secs(60)).expect("nobody waits for somebody who waits for him");
 }
 
 proptest! {
