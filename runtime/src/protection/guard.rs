@@ -102,7 +102,7 @@ impl<O> Inner<O> {
     /// When the thread has to look.
     fn deadline(&self, now: Time) -> u64 {
         let owed = self.owes.map(|_| now + SAFE_RETRY);
-        owed.or(self.receiver.deadline()).map_or(u64::MAX, Time::as_nanos)
+        owed.or_else(|| self.receiver.deadline()).map_or(u64::MAX, Time::as_nanos)
     }
 }
 
