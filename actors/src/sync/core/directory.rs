@@ -8,7 +8,7 @@ use sinew_runtime::{
     wire::Kind,
 };
 
-use super::{Core, Output, barrier::RETRY};
+use super::{Core, Input, Output, barrier::RETRY};
 use crate::sync::facts::{DirectoryEntry, DirectoryEvent};
 
 /// Applications that want to hear of the directory.
@@ -23,6 +23,8 @@ type Known = Option<(bool, Vec<Kind>)>;
 #[derive(Debug, Default)]
 struct Watcher {
     told: BTreeMap<(String, Tid), Known>,
+    /// Whether the directory may have changed since it was told.
+    is_behind: bool,
     /// It had no room: until then it is told nothing.
     rests: Option<Time>,
 }
@@ -30,7 +32,14 @@ struct Watcher {
 impl Watchers {
     /// It knows nothing yet.
     pub(super) fn add(&mut self, app: AppAddress) {
-        self.0.insert(app, Watcher::default());
+        self.0.insert(app, Watcher { is_behind: true, ..Watcher::default() });
+    }
+
+    /// The directory may have changed.
+    pub(super) fn directory_changed(&mut self) {
+        for watcher in self.0.values_mut() {
+            watcher.is_behind = true;
+        }
     }
 
     pub(super) fn remove(&mut self, app: AppAddress) {
@@ -38,12 +47,20 @@ impl Watchers {
     }
 
     /// What it did not take it does not know: the difference is told again later.
-    pub(super) fn not_taken(&mut self, now: Time, app: AppAddress, event: DirectoryEvent) {
+    fn not_taken(&mut self, now: Time, app: AppAddress, events: Vec<DirectoryEvent>) {
         let Some(watcher) = self.0.get_mut(&app) else { return };
+        watcher.is_behind = true;
         watcher.rests.get_or_insert(now + RETRY);
-        let (DirectoryEvent::Is(DirectoryEntry { name, tid, .. }) | DirectoryEvent::Gone { name, tid }) =
-            event;
-        watcher.told.insert((name, tid), None);
+        for event in events {
+            let (DirectoryEvent::Is(DirectoryEntry { name, tid, .. }) | DirectoryEvent::Gone { name, tid }) =
+                event;
+            watcher.told.insert((name, tid), None);
+        }
+    }
+
+    /// Whether anybody can be told something now: the whole directory is read for it.
+    pub(super) fn are_due(&self, now: Time) -> bool {
+        self.0.values().any(|watcher| watcher.is_due(now))
     }
 
     pub(super) fn next_wake(&self) -> Option<Time> {
@@ -52,6 +69,10 @@ impl Watchers {
 }
 
 impl Watcher {
+    fn is_due(&self, now: Time) -> bool {
+        self.is_behind && self.rests.is_none_or(|until| until <= now)
+    }
+
     /// What it is told, so that it knows `directory`.
     fn catch_up(&mut self, directory: &[DirectoryEntry]) -> Vec<DirectoryEvent> {
         let mut former = std::mem::take(&mut self.told);
@@ -69,20 +90,54 @@ impl Watcher {
     }
 }
 
+impl Input {
+    /// Whether afterwards somebody may be in the directory who was not, or otherwise.
+    pub(super) const fn may_change_directory(&self) -> bool {
+        match self {
+            Self::AppChanged(_)
+            | Self::MembershipChanged(_)
+            | Self::LinkChanged(_)
+            | Self::ListReceived { .. } => true,
+            Self::GroupsChanged(_)
+            | Self::Arrived { .. }
+            | Self::Left { .. }
+            | Self::ArrivalsReceived { .. }
+            | Self::ArrivalsNotTaken { .. }
+            | Self::DirectoryWanted { .. }
+            | Self::DirectoryNotTaken { .. }
+            | Self::ReleaseNotTaken { .. }
+            | Self::EventNotTaken { .. }
+            | Self::TimePassed => false,
+        }
+    }
+}
+
 impl Core {
     /// Tells everybody who wants to hear of it what has changed in the directory. spec: SYNC-14
     pub(super) fn tell_watchers(&mut self, now: Time) {
-        if self.watchers.0.is_empty() {
+        if !self.watchers.are_due(now) {
             return;
         }
         let directory = self.directory();
-        for (app, watcher) in &mut self.watchers.0 {
-            if watcher.rests.is_some_and(|until| now < until) {
-                continue;
-            }
-            watcher.rests = None;
+        for (app, watcher) in self.watchers.0.iter_mut().filter(|(_, watcher)| watcher.is_due(now)) {
+            (watcher.is_behind, watcher.rests) = (false, None);
             let events = watcher.catch_up(&directory);
             self.outputs.extend(events.into_iter().map(|event| Output::TellDirectory { app: *app, event }));
         }
+    }
+
+    /// An application did not take this event, and has no room for those that are on their way to it either. It is told all of it
+    /// later. Nothing else is looked at: a directory may be much longer than a mailbox.
+    pub(super) fn directory_not_taken(&mut self, now: Time, app: AppAddress, event: DirectoryEvent) {
+        let mut not_taken = vec![event];
+        self.outputs.retain(|output| {
+            let Output::TellDirectory { app: to, event } = output else { return true };
+            let is_for_others = *to != app;
+            if !is_for_others {
+                not_taken.push(event.clone());
+            }
+            is_for_others
+        });
+        self.watchers.not_taken(now, app, not_taken);
     }
 }

@@ -50,6 +50,45 @@ fn what_was_not_taken_is_told_later_as_it_is_then() {
     assert_eq!(bench.passes(RETRY), [gone("hip", HERE, 0)]);
 }
 
+// spec: SYNC-14
+#[test]
+fn who_had_no_room_for_one_event_is_offered_no_other_before_it_had_time_to_read() {
+    let mut bench = watched();
+    bench.links(KNEE, LIFE);
+    for (index, name) in [(1, "knee"), (2, "ankle")] {
+        bench.registers(index, name, &[]);
+    }
+    let wanted = Input::DirectoryWanted { app: app(9) };
+    bench.core.handle(bench.now, wanted);
+    assert_eq!(bench.core.poll(), Some(is("ankle", HERE, 2, false)));
+    let Some(Output::TellDirectory { event, .. }) = bench.core.poll() else { panic!("of the hip") };
+    // Much is due, but an event that was not taken is no occasion for it.
+    bench.now = bench.now + REPEAT;
+    assert_eq!(bench.hears(Input::DirectoryNotTaken { app: app(9), event }), []);
+    assert_eq!(published(&bench.hears(Input::TimePassed)).len(), 1, "this is");
+    bench.ready(2);
+    let told: Vec<_> = bench.passes(RETRY);
+    let told: Vec<_> = told.into_iter().filter(|out| matches!(out, Output::TellDirectory { .. })).collect();
+    assert_eq!(told, [is("ankle", HERE, 2, true), is("hip", HERE, 0, false), is("knee", HERE, 1, false)]);
+}
+
+// spec: SYNC-14
+#[test]
+fn the_directory_is_read_only_when_somebody_can_be_told_of_a_change() {
+    let mut bench = watched();
+    bench.hears(Input::DirectoryWanted { app: app(9) });
+    assert!(!bench.core.watchers.are_due(bench.now), "it knows all");
+    let later = bench.now + REPEAT;
+    for input in [Input::TimePassed, Input::GroupsChanged(Vec::new())] {
+        assert!(!input.may_change_directory());
+    }
+    let Output::TellDirectory { event, .. } = is("hip", HERE, 0, false) else { panic!("it is one") };
+    bench.hears(Input::DirectoryNotTaken { app: app(9), event });
+    bench.core.watchers.directory_changed();
+    assert!(!bench.core.watchers.are_due(bench.now), "it rests");
+    assert!(bench.core.watchers.are_due(later), "it has rested");
+}
+
 #[test]
 fn what_an_application_handles_stands_in_the_directory_of_every_node() {
     let mut bench = watched();

@@ -168,6 +168,9 @@ impl Core {
 
     /// Takes in what has happened.
     pub(crate) fn handle(&mut self, now: Time, input: Input) {
+        if input.may_change_directory() {
+            self.watchers.directory_changed();
+        }
         match input {
             Input::AppChanged(fact) => self.app_changed(now, fact),
             Input::GroupsChanged(groups) => self.groups_changed(now, groups),
@@ -179,7 +182,7 @@ impl Core {
             Input::LinkChanged(fact) => self.link_changed(now, fact),
             Input::ListReceived { from, payload } => self.list_received(from, &payload),
             Input::DirectoryWanted { app } => self.watchers.add(app),
-            Input::DirectoryNotTaken { app, event } => self.watchers.not_taken(now, app, event),
+            Input::DirectoryNotTaken { app, event } => return self.directory_not_taken(now, app, event),
             Input::ReleaseNotTaken { app } => self.keep(now, app, None),
             Input::EventNotTaken { app, name } => self.keep(now, app, Some(name)),
             Input::TimePassed => {}
