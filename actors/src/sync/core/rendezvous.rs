@@ -264,8 +264,9 @@ impl Rendezvous {
     fn hear(&mut self, now: Time, said: &BarrierSaid) {
         let parties = said.parties.iter().map(ToString::to_string).collect();
         let key = Key { name: said.name.clone(), parties };
-        // One that nobody here has to do with is only said on, if there is room.
-        if self.make_room(&key).is_err() {
+        // One that nobody here has to do with is only said on, if there is room. None makes way for it: two nodes that know
+        // different ones would take turns for ever.
+        if self.known.len() >= BARRIERS_MAX && !self.known.contains_key(&key) {
             return;
         }
         let known = self.known.entry(key).or_insert_with(|| Known::new(said.parties.clone()));

@@ -2,6 +2,8 @@
 
 use std::net::SocketAddr;
 
+#[path = "barriers_tests.rs"]
+mod barriers;
 #[path = "directory_tests.rs"]
 mod directory;
 #[path = "forms_tests.rs"]
