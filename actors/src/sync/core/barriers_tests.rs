@@ -1,7 +1,10 @@
 //! Run-time barriers, as one node sees them: what it keeps in mind, whom it believes, whose wait is over.
 
 use super::*;
-use crate::sync::arrivals::{Arrivals, BARRIERS_MAX, BarrierSaid};
+use crate::sync::{
+    arrivals::{Arrival, Arrivals, BARRIERS_MAX, BarrierSaid},
+    words::OnPartyLoss,
+};
 
 fn name(text: &str) -> Name {
     Name::try_from(text.to_owned()).unwrap()
@@ -11,6 +14,16 @@ fn name(text: &str) -> Name {
 fn idle(text: &str, generation: u64) -> BarrierSaid {
     let parties = vec![Requirement::name("hip"), Requirement::name("knee")];
     BarrierSaid { name: name(text), parties, generation, members: Vec::new(), arrivals: Vec::new() }
+}
+
+/// One at which the knee waits behind this generation.
+fn awaited(text: &str, generation: u64) -> BarrierSaid {
+    let knee = Arrival { party: 1, app: app(0), name: Some(name("knee")), after: generation };
+    BarrierSaid { arrivals: vec![knee], ..idle(text, generation) }
+}
+
+fn answered(correlation: u64, answer: BarrierAnswer) -> Output {
+    Output::AnswerBarrier { app: app(0), correlation, answer }
 }
 
 impl Bench {
@@ -43,6 +56,17 @@ impl Bench {
         let payload = Arrivals { incarnation, version, barriers }.encode();
         self.hears(Input::ArrivalsReceived { from, payload })
     }
+
+    /// The hip arrives, and does not wait for a lost party's return.
+    fn arrives(&mut self, barrier: &str, correlation: u64) -> Vec<Output> {
+        let asked = ArriveAtBarrier {
+            barrier: barrier.to_owned(),
+            parties: ["hip", "knee"].map(str::to_owned).to_vec(),
+            within_ms: 60_000,
+            on_loss: OnPartyLoss::Fail,
+        };
+        self.hears(Input::Arrived { app: app(0), correlation, asked })
+    }
 }
 
 // spec: SYNC-10
@@ -51,4 +75,14 @@ fn nothing_is_forgotten_for_a_barrier_that_only_others_know() {
     let mut bench = Bench::that_has_no_room();
     let outputs = bench.is_told(ANKLE, LIFE, 1, vec![idle("other", 5)]);
     assert_eq!((outputs.len(), bench.passes(SPACING).len()), (0, 0), "nor is anything said on");
+}
+
+// spec: SYNC-12
+#[test]
+fn who_arrives_at_a_barrier_for_which_there_was_no_room_meets_those_who_wait_there() {
+    let mut bench = Bench::that_has_no_room();
+    bench.list(ANKLE, list(1, &[("knee", true, &[])]));
+    bench.is_told(ANKLE, LIFE, 1, vec![awaited("other", 5)]);
+    let outputs = bench.arrives("other", 7);
+    assert!(outputs.contains(&answered(7, BarrierAnswer::Opened { generation: 6 })), "{outputs:?}");
 }

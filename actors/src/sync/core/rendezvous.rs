@@ -154,6 +154,7 @@ impl Rendezvous {
             self.next_party += 1;
             self.next_party - 1
         });
+        self.recall(now, &key);
         let known = self.known.entry(key).or_insert_with(|| Known::new(parties));
         if known.waiting.len() >= ARRIVALS_MAX {
             return Err(format!("{ARRIVALS_MAX} applications of this node wait there already"));
@@ -184,6 +185,19 @@ impl Rendezvous {
         };
         self.known.remove(&idle);
         Ok(())
+    }
+
+    /// Hears again what others said last of a barrier that is not known here, or not any more: they do not say it anew. spec: SYNC-12
+    fn recall(&mut self, now: Time, key: &Key) {
+        if self.known.contains_key(key) {
+            return;
+        }
+        let said = self.peers.values().filter_map(|peer| peer.said.as_ref());
+        let of_it: Vec<BarrierSaid> =
+            said.flat_map(|said| &said.barriers).filter(|barrier| barrier.is_about(key)).cloned().collect();
+        for barrier in &of_it {
+            self.hear(now, barrier);
+        }
     }
 
     /// An application waits no more.
@@ -363,6 +377,12 @@ impl Rendezvous {
         let due = self.peers.values().filter_map(|peer| peer.due);
         let waits = self.known.values().flat_map(|known| known.waiting.values());
         due.chain(waits.map(Wait::next)).min()
+    }
+}
+
+impl BarrierSaid {
+    fn is_about(&self, key: &Key) -> bool {
+        self.name == key.name && self.parties.iter().map(Requirement::as_str).eq(&key.parties)
     }
 }
 

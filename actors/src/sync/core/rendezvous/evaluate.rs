@@ -72,10 +72,8 @@ impl Rendezvous {
             let Some(said) = peer.said.as_ref().filter(|said| linked(*node) == Some(said.incarnation)) else {
                 continue;
             };
-            let is_it = |barrier: &&BarrierSaid| {
-                barrier.name == key.name && barrier.parties.iter().map(Requirement::as_str).eq(&key.parties)
-            };
-            let arrivals = said.barriers.iter().find(is_it).into_iter().flat_map(|barrier| &barrier.arrivals);
+            let of_it = said.barriers.iter().find(|barrier| barrier.is_about(key));
+            let arrivals = of_it.into_iter().flat_map(|barrier| &barrier.arrivals);
             for arrival in arrivals.filter(|arrival| arrival.after == known.generation) {
                 let member = Member { node: *node, incarnation: said.incarnation, party: arrival.party };
                 present
