@@ -86,3 +86,18 @@ fn who_arrives_at_a_barrier_for_which_there_was_no_room_meets_those_who_wait_the
     let outputs = bench.arrives("other", 7);
     assert!(outputs.contains(&answered(7, BarrierAnswer::Opened { generation: 6 })), "{outputs:?}");
 }
+
+// spec: SYNC-11
+#[test]
+fn the_linked_life_of_a_node_is_heard_also_after_a_younger_double_of_it_has_spoken() {
+    const DOUBLE: Incarnation = Incarnation(9);
+    let mut bench = Bench::of_the_hip();
+    bench.links(KNEE, DOUBLE);
+    bench.is_told(KNEE, DOUBLE, 7, vec![idle("calibrated", 0)]);
+    bench.hears(Input::LinkChanged(LinkFact::LinkBroken { node: KNEE, incarnation: DOUBLE }));
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("knee", true, &[])]));
+    bench.is_told(KNEE, LIFE, 1, vec![awaited("calibrated", 0)]);
+    let outputs = bench.arrives("calibrated", 7);
+    assert!(outputs.contains(&answered(7, BarrierAnswer::Opened { generation: 1 })), "{outputs:?}");
+}

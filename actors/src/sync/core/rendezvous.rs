@@ -257,7 +257,10 @@ impl Rendezvous {
             return Err("this is about another life of its node than the one that is linked");
         }
         let peer = self.peers.entry(from).or_default();
-        let known = peer.said.as_ref().map(|known| (known.incarnation, known.version));
+        // Of two lives the linked one is right, be it the elder: the other one was a double of it.
+        let is_over = |known: &&Arrivals| linked.is_some() && known.incarnation != said.incarnation;
+        let known = peer.said.as_ref().filter(|known| !is_over(known));
+        let known = known.map(|known| (known.incarnation, known.version));
         if known.is_some_and(|known| (said.incarnation, said.version) < known) {
             return Ok(());
         }
