@@ -82,7 +82,7 @@ impl Bench {
     /// As GNCL hands over what the knee sent.
     fn knee_says(&self, version: u64, ready: bool) {
         let name = Name::try_from("knee.drive".to_owned()).unwrap();
-        let entry = Entry { name, app: GAIT, ready, requires: Vec::new(), kinds: Vec::new() };
+        let entry = Entry { name, app: GAIT, ready, ended: None, requires: Vec::new(), kinds: Vec::new() };
         let list = List { incarnation: LIFE, version, entries: vec![entry], groups: Vec::new() };
         let from = Tid::new(KNEE, AppAddress::SYNC);
         self.stores.router.deliver(directory(from, list.encode(usize::MAX).0)).unwrap();

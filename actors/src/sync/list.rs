@@ -50,12 +50,24 @@ pub(crate) struct Entry {
     pub(crate) app: AppAddress,
     /// Whether it has started and takes messages.
     pub(crate) ready: bool,
+    /// How its former life ended, while it is not ready again.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) ended: Option<Ended>,
     /// What it requires, so that every node can see a cycle.
     #[serde(default, deserialize_with = "at_most::<_, _, REQUIRES_MAX>")]
     pub(crate) requires: Vec<Requirement>,
     /// The payloads that it handles, as far as it tells.
     #[serde(default, deserialize_with = "at_most::<_, _, KINDS_MAX>")]
     pub(crate) kinds: Vec<Kind>,
+}
+
+/// How a life of an application ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) enum Ended {
+    /// By a fault.
+    Failed,
+    /// In order.
+    Stopped,
 }
 
 /// A legal name: 1 to 63 bytes of UTF-8, no control characters (they would forge log lines).
@@ -214,6 +226,7 @@ mod tests {
             name: name(text),
             app: AppAddress::fixed(index).unwrap(),
             ready: true,
+            ended: None,
             requires: Vec::new(),
             kinds: Vec::new(),
         }
@@ -239,6 +252,7 @@ mod tests {
                     name: name(&format!("{n}{}", &text[..text.len().min(60)])),
                     app: AppAddress::fixed(n).unwrap(),
                     ready,
+                    ended: (!ready).then_some(Ended::Failed),
                     requires: requires.iter().map(|text| text.parse().unwrap()).collect(),
                     kinds: vec![Kind::named("demo.angle")],
                 })

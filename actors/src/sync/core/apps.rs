@@ -13,7 +13,7 @@ use sinew_runtime::{
 };
 
 use super::reason::Reason;
-use crate::sync::list::{Entry, Name, REQUIRES_MAX};
+use crate::sync::list::{Ended, Entry, Name, REQUIRES_MAX};
 
 /// The applications of this node.
 #[derive(Debug, Default)]
@@ -31,7 +31,7 @@ pub(super) struct App {
     pub(super) kinds: Vec<Kind>,
     pub(super) state: State,
     /// How its former life ended, while this one is not ready yet.
-    pub(super) ended: Option<Reason>,
+    pub(super) ended: Option<Ended>,
     /// Of what it requires, what it was told is lost.
     pub(super) lost: BTreeSet<String>,
     /// Of what it requires, what nobody can hear of, and until when that is not told.
@@ -77,7 +77,7 @@ impl App {
     /// Why it is not ready; `None`: it is.
     pub(super) fn why_not(&self) -> Option<Reason> {
         match self.state {
-            State::Waiting(_) | State::Released => Some(self.ended.unwrap_or(Reason::NotReady)),
+            State::Waiting(_) | State::Released => Some(self.ended.map_or(Reason::NotReady, Reason::from)),
             State::Ready => None,
         }
     }
@@ -176,6 +176,7 @@ impl Apps {
                 name: name.clone(),
                 app: address,
                 ready: app.state == State::Ready,
+                ended: app.ended,
                 requires: app.requires.iter().take(REQUIRES_MAX).cloned().collect(),
                 kinds: app.kinds.clone(),
             })

@@ -3,6 +3,8 @@
 use super::*;
 use crate::sync::{
     arrivals::{Arrival, Arrivals, BARRIERS_MAX, BarrierSaid},
+    core::rendezvous::GRACE,
+    list::Ended,
     words::OnPartyLoss,
 };
 
@@ -100,4 +102,36 @@ fn the_linked_life_of_a_node_is_heard_also_after_a_younger_double_of_it_has_spok
     bench.is_told(KNEE, LIFE, 1, vec![awaited("calibrated", 0)]);
     let outputs = bench.arrives("calibrated", 7);
     assert!(outputs.contains(&answered(7, BarrierAnswer::Opened { generation: 1 })), "{outputs:?}");
+}
+
+// spec: SYNC-13
+#[test]
+fn who_does_not_wait_for_a_lost_party_hears_of_its_failure_and_stop_on_another_node() {
+    for (ended, why) in
+        [(Ended::Failed, "failed, not ready again"), (Ended::Stopped, "stopped in order, not ready again")]
+    {
+        let mut bench = Bench::of_the_hip();
+        bench.links(KNEE, LIFE);
+        bench.list(KNEE, list(1, &[("knee", true, &[])]));
+        bench.arrives("calibrated", 7);
+        let mut news = list(2, &[("knee", false, &[])]);
+        news.entries[0].ended = Some(ended);
+        bench.list(KNEE, news);
+        let outputs = bench.passes(GRACE);
+        let missing = vec![("knee".to_owned(), why.to_owned())];
+        assert!(outputs.contains(&answered(7, BarrierAnswer::Lost { missing })), "{outputs:?}");
+    }
+}
+
+#[test]
+fn a_node_says_how_an_application_ended_until_it_is_ready_again() {
+    let mut bench = Bench::of_the_hip();
+    bench.links(KNEE, LIFE);
+    let says = |bench: &mut Bench| published(&bench.passes(SPACING))[0].entries[0].ended;
+    bench.down(0);
+    assert_eq!(says(&mut bench), Some(Ended::Failed));
+    bench.hears(Input::AppChanged(AppFact::Stopped { app: app(0) }));
+    assert_eq!(says(&mut bench), Some(Ended::Stopped));
+    bench.ready(0);
+    assert_eq!(says(&mut bench), None);
 }

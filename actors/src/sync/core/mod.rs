@@ -40,7 +40,7 @@ use self::{
 };
 use super::{
     facts::{DirectoryEntry, DirectoryEvent, OwnApp, Waiting},
-    list::{ENTRIES_MAX, KINDS_MAX, List},
+    list::{ENTRIES_MAX, Ended, KINDS_MAX, List},
     words::{ArriveAtBarrier, BarrierAnswer},
 };
 use crate::{
@@ -257,7 +257,7 @@ impl Core {
             ready: app.state == State::Ready,
             missing: self.missing(now, address),
             waits: app.wait().map(|wait| now.since(wait.since)),
-            ended: app.ended.map(Reason::words),
+            ended: app.ended.map(|ended| Reason::from(ended).words()),
         };
         let apps: Vec<_> = self.apps.iter().take(max).map(view).collect();
         let more = self.apps.iter().count() - apps.len();
@@ -309,8 +309,8 @@ impl Core {
             }
             AppFact::Handles { app, kinds } => self.app_handles(now, app, kinds),
             AppFact::Ready { app } => self.app_ready(now, app),
-            AppFact::Down { app } => self.app_ended(now, app, Reason::Failed),
-            AppFact::Stopped { app } => self.app_ended(now, app, Reason::Stopped),
+            AppFact::Down { app } => self.app_ended(now, app, Ended::Failed),
+            AppFact::Stopped { app } => self.app_ended(now, app, Ended::Stopped),
             AppFact::Unregistered { app } => {
                 self.apps.remove(app);
                 self.forget_not_taken(app);
@@ -353,7 +353,7 @@ impl Core {
     }
 
     /// It waits again for all that it requires; one that waits already was not started yet and goes on waiting.
-    fn app_ended(&mut self, now: Time, address: AppAddress, how: Reason) {
+    fn app_ended(&mut self, now: Time, address: AppAddress, how: Ended) {
         self.life_ended(now, address);
         let wait = Wait::begun(now, self.requirement_deadline);
         if let Some(app) = self.apps.get_mut(address)

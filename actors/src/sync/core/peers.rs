@@ -79,7 +79,7 @@ impl Peer {
         } else if entry.ready {
             None
         } else {
-            Some(Reason::NotReady)
+            Some(entry.ended.map_or(Reason::NotReady, Reason::from))
         }
     }
 

@@ -1,5 +1,7 @@
 //! Why a required name is not ready.
 
+use crate::sync::list::Ended;
+
 /// The last that is known of a name that is not ready; the nearest to readiness comes first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Reason {
@@ -14,6 +16,15 @@ pub(crate) enum Reason {
     Unregistered,
     NeverSeen,
     Cycle,
+}
+
+impl From<Ended> for Reason {
+    fn from(ended: Ended) -> Self {
+        match ended {
+            Ended::Failed => Self::Failed,
+            Ended::Stopped => Self::Stopped,
+        }
+    }
 }
 
 impl Reason {

@@ -101,6 +101,7 @@ fn list(version: u64, entries: &[(&str, bool, &[&str])]) -> List {
         name: name(text),
         app: app(index),
         ready: *ready,
+        ended: None,
         requires: requires.iter().map(|text| text.parse().unwrap()).collect(),
         kinds: Vec::new(),
     });
