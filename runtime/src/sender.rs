@@ -514,6 +514,14 @@ pub struct Reply<R> {
     reply: PhantomData<fn() -> R>,
 }
 
+impl<R> Reply<R> {
+    /// The number of the request: the `correlation` in its header, by which its sender tells it from its others.
+    #[must_use]
+    pub const fn correlation(&self) -> u64 {
+        self.deadline.wait.correlation()
+    }
+}
+
 impl<R: Payload> Future for Reply<R> {
     type Output = Result<R, AskError>;
 

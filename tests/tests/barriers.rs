@@ -53,6 +53,25 @@ fn party(
     AppSpec::new(name, move || Party { barrier: barrier.clone(), rounds, said: said.clone() })
 }
 
+/// Arrives, arrives again, and gives the first wait up.
+struct Undecided {
+    barrier: Barrier,
+    said: SyncSender<Result<u64, String>>,
+}
+
+impl Actor for Undecided {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        let given_up = context.meet(&self.barrier);
+        let meeting = context.meet(&self.barrier).into_actor(self);
+        drop(given_up);
+        context.spawn(meeting.map(|passed, this, _| {
+            this.said.send(passed.map_err(|error| error.to_string())).expect("the test listens");
+        }));
+    }
+}
+
 /// A node with a door for other processes.
 fn with_door(ground: &Ground, directory: &OwnDirectory, name: &str) -> (NodeBuilder, PathBuf) {
     let socket = directory.join(&format!("{name}.sock"));
@@ -140,6 +159,23 @@ fn who_does_not_want_to_wait_for_a_lost_party_is_told_and_who_does_meets_its_nex
     until("a waits", || (!node.handle().barriers().is_empty()).then_some(()));
     assert_eq!(endpoint(&api, "b").meet(&barrier).expect("it opens"), 1);
     assert_eq!(waiting.join().expect("it ends").expect("it opens"), 1);
+}
+
+#[test]
+fn who_gives_a_wait_up_still_waits_by_a_later_one() {
+    let (ground, directory) = (Ground::new(), OwnDirectory::new());
+    let (say, heard) = sync_channel(1);
+    let barrier = Barrier::new("homed", ["a", "b"]).within(DEADLINE);
+    let (node, api) = with_door(&ground, &directory, "hip");
+    let spec = {
+        let barrier = barrier.clone();
+        AppSpec::new("a", move || Undecided { barrier: barrier.clone(), said: say.clone() })
+    };
+    let node = node.app(spec).start().expect("it starts");
+    all_run(&[&node]);
+    let mut b = endpoint(&api, "b");
+    assert_eq!(b.meet(&barrier).expect("it opens"), 1);
+    assert_eq!(heard.recv_timeout(DEADLINE).expect("a, too"), Ok(1));
 }
 
 #[test]

@@ -219,10 +219,12 @@ impl Future for Meeting {
 
 impl Drop for Meeting {
     fn drop(&mut self) {
-        if matches!(self.wait, Wait::For(_)) {
+        if let Wait::For(reply) = &self.wait {
             let to = Tid::new(self.sender.tid().node, AppAddress::SYNC);
+            let barrier = self.barrier.name.clone();
+            let leave = LeaveBarrier { barrier, correlation: Some(reply.correlation()) };
             // Where the node does not take it, the wait there ends with its deadline or with this life.
-            let _ = self.sender.send(to, &LeaveBarrier { barrier: self.barrier.name.clone() });
+            let _ = self.sender.send(to, &leave);
         }
     }
 }

@@ -190,7 +190,8 @@ impl SyncManager {
         let input = if is_arrival {
             message.decode().map(|asked| Input::Arrived { app, correlation, asked })
         } else {
-            message.decode().map(|LeaveBarrier { barrier }| Input::Left { app, barrier })
+            let left = |LeaveBarrier { barrier, correlation }| Input::Left { app, barrier, correlation };
+            message.decode().map(left)
         };
         match input {
             Ok(input) => {

@@ -27,6 +27,9 @@ payload!("sinew.barrier.leave" =>
     pub struct LeaveBarrier {
         /// The barrier's name.
         pub barrier: String,
+        /// The `correlation` of the request that is given up; a later one goes on waiting. Without it any wait there is over.
+        #[serde(default)]
+        pub correlation: Option<u64>,
     }
 );
 

@@ -69,6 +69,15 @@ impl Bench {
         };
         self.hears(Input::Arrived { app: app(0), correlation, asked })
     }
+
+    fn leaves(&mut self, correlation: Option<u64>) {
+        let barrier = "calibrated".to_owned();
+        self.hears(Input::Left { app: app(0), barrier, correlation });
+    }
+
+    fn barriers(&self) -> usize {
+        self.core.barriers(self.now).len()
+    }
 }
 
 // spec: SYNC-10
@@ -134,4 +143,19 @@ fn a_node_says_how_an_application_ended_until_it_is_ready_again() {
     assert_eq!(says(&mut bench), Some(Ended::Stopped));
     bench.ready(0);
     assert_eq!(says(&mut bench), None);
+}
+
+// spec: SYNC-10
+#[test]
+fn who_gives_a_request_up_still_waits_by_a_later_one() {
+    let mut bench = Bench::of_the_hip();
+    bench.arrives("calibrated", 7);
+    bench.arrives("calibrated", 8);
+    bench.leaves(Some(7));
+    assert_eq!(bench.barriers(), 1);
+    bench.leaves(Some(8));
+    assert_eq!(bench.barriers(), 0);
+    bench.arrives("calibrated", 9);
+    bench.leaves(None);
+    assert_eq!(bench.barriers(), 0, "whoever names no request means any");
 }

@@ -68,8 +68,8 @@ pub(crate) enum Input {
     ListReceived { from: NodeAddress, payload: Bytes },
     /// An application of this node has arrived at a barrier; the request has this correlation.
     Arrived { app: AppAddress, correlation: u64, asked: ArriveAtBarrier },
-    /// It waits there no more.
-    Left { app: AppAddress, barrier: String },
+    /// It waits there no more; where a correlation is given, only the wait by the request that has it is over.
+    Left { app: AppAddress, barrier: String, correlation: Option<u64> },
     /// The sync manager of `from` said who waits at barriers.
     ArrivalsReceived { from: NodeAddress, payload: Bytes },
     /// The queue to `to` did not take who waits at barriers.
@@ -176,7 +176,9 @@ impl Core {
             Input::GroupsChanged(groups) => self.groups_changed(now, groups),
             Input::MembershipChanged(fact) => self.membership_changed(fact),
             Input::Arrived { app, correlation, asked } => self.arrived(now, app, correlation, asked),
-            Input::Left { app, barrier } => self.rendezvous.leave(now, app, &barrier),
+            Input::Left { app, barrier, correlation } => {
+                self.rendezvous.leave(now, app, &barrier, correlation)
+            }
             Input::ArrivalsReceived { from, payload } => self.arrivals_received(now, from, &payload),
             Input::ArrivalsNotTaken { to } => self.rendezvous.not_taken(now, to),
             Input::LinkChanged(fact) => self.link_changed(now, fact),

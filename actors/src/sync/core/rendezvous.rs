@@ -200,11 +200,16 @@ impl Rendezvous {
         }
     }
 
-    /// An application waits no more.
-    pub(super) fn leave(&mut self, now: Time, app: AppAddress, barrier: &str) {
+    /// An application waits no more: by any request, or only by the one of this correlation, which a later one may have replaced.
+    pub(super) fn leave(&mut self, now: Time, app: AppAddress, barrier: &str, correlation: Option<u64>) {
         let mut has_left = false;
         for (_, known) in self.known.iter_mut().filter(|(key, _)| &*key.name == barrier) {
-            has_left |= known.waiting.remove(&app).is_some();
+            let wait = known.waiting.get(&app);
+            if wait.is_some_and(|wait| correlation.is_none_or(|correlation| correlation == wait.correlation))
+            {
+                known.waiting.remove(&app);
+                has_left = true;
+            }
         }
         if has_left {
             self.changed(now);

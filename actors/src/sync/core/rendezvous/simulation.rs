@@ -294,7 +294,7 @@ impl World {
         self.say(|| format!("{} leaves {}", name(node, app), BARRIERS[barrier].0));
         self.judge.gives_up((node, app), barrier, self.generation(node, barrier));
         let barrier = BARRIERS[barrier].0.to_owned();
-        self.tell(node, Input::Left { app: app_address(app), barrier });
+        self.tell(node, Input::Left { app: app_address(app), barrier, correlation: None });
     }
 
     fn die(&mut self, node: usize, app: usize) {
