@@ -246,7 +246,7 @@ impl SyncManager {
             Output::TellDirectory { app, event } => self.tell_of_directory(app, event),
             Output::Publish { to, list } => self.publish(to, list),
             Output::PublishArrivals { to, said } => self.publish_arrivals(to, said),
-            Output::AnswerBarrier { app, correlation, answer } => self.answer(app, correlation, &answer),
+            Output::AnswerBarrier { app, correlation, answer } => self.answer(app, correlation, answer),
             Output::RouteGroups { node, groups } => self.stores.router.set_remote_groups(node, &groups),
             Output::Cycle { names } => self.refuse_cycle(names),
             Output::Overdue(waiting) => crate::log::warn!(
@@ -332,13 +332,16 @@ impl SyncManager {
         }
     }
 
-    fn answer(&self, app: AppAddress, correlation: u64, answer: &BarrierAnswer) {
-        let mut message = Message::typed(self.tid(), Tid::new(self.stores.node, app), answer);
+    fn answer(&self, app: AppAddress, correlation: u64, answer: BarrierAnswer) {
+        let mut message = Message::typed(self.tid(), Tid::new(self.stores.node, app), &answer);
         self.stamp(&mut message.header);
         message.header.flags = Flags::REPLY;
         message.header.correlation = correlation;
-        if let Err(why) = self.stores.router.send(message) {
-            self.refuse("application", &format_args!("{app} was not told what became of its barrier: {why}"));
+        let Err(why) = self.stores.router.send(message) else { return };
+        self.refuse("application", &format_args!("{app} was not told what became of its barrier: {why}"));
+        // Any other refusal says that it is gone.
+        if why == Rejection::QueueFull {
+            self.core().handle(Time::now(), Input::AnswerNotTaken { app, correlation, answer });
         }
     }
 

@@ -16,12 +16,13 @@ use sinew_runtime::{
     router::{LocalRoute, Outlet, Refused},
     supervision::ReadyGate,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
-    wire::{Header, Kind, Message, Payload},
+    wire::{Flags, Header, Kind, Message, Payload},
 };
 
 use super::{
     Event, SyncManager,
     list::{Entry, List, Name},
+    words::{ArriveAtBarrier, BarrierAnswer, OnPartyLoss},
 };
 use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, node::RootEvent, stores::Stores};
 
@@ -160,6 +161,39 @@ fn an_event_that_a_full_mailbox_did_not_take_comes_when_there_is_room() {
         within("the message that was in the way", inbox.next()).await.unwrap();
         let event: RequirementEvent = within("the event", inbox.next()).await.unwrap().decode().unwrap();
         assert_eq!(event, RequirementEvent::Lost { name: "knee.drive".to_owned() });
+    });
+}
+
+#[test]
+fn an_answer_about_a_barrier_that_a_full_mailbox_did_not_take_comes_when_there_is_room() {
+    run(async {
+        let mut bench = Bench::new().await;
+        let mailbox = Post::new(1);
+        let outlet = Arc::new(Mailbox(mailbox.clone()));
+        bench.stores.router.set_local(GAIT, LocalRoute { outlet, events: Arc::new([]) });
+        bench.registers_gait();
+        mailbox.post(directory(Tid::NONE, Bytes::new())).unwrap();
+        let asked = ArriveAtBarrier {
+            barrier: "calibrated".to_owned(),
+            parties: vec!["gait".to_owned(), "knee".to_owned()],
+            within_ms: 0,
+            on_loss: OnPartyLoss::Wait,
+        };
+        let (gait, manager) = (Tid::new(HERE, GAIT), Tid::new(HERE, AppAddress::SYNC));
+        let mut arrival = Message::typed(gait, manager, &asked);
+        (arrival.header.flags, arrival.header.correlation) = (Flags::ASK, 7);
+        bench.stores.router.deliver(arrival).unwrap();
+        // The second application is released after the refused answer was dealt with: events are handled in order.
+        let second = AppAddress::new(0x1001);
+        bench.tells(Event::App(AppFact::Registered { app: second, name: None, requires: Vec::new() }));
+        assert_eq!(bench.released().await, second);
+        assert!(mailbox.refused() > 0);
+
+        let mut inbox = mailbox.attach();
+        within("the message that was in the way", inbox.next()).await.unwrap();
+        let message = within("the answer", inbox.next()).await.unwrap();
+        assert_eq!(message.header.correlation, 7);
+        assert!(matches!(message.decode().unwrap(), BarrierAnswer::TimedOut { .. }));
     });
 }
 

@@ -159,3 +159,27 @@ fn who_gives_a_request_up_still_waits_by_a_later_one() {
     bench.leaves(None);
     assert_eq!(bench.barriers(), 0, "whoever names no request means any");
 }
+
+// spec: SYNC-10
+#[test]
+fn an_answer_for_which_there_was_no_room_is_offered_again_as_long_as_its_application_lives() {
+    let mut bench = Bench::of_the_hip();
+    bench.arrives("calibrated", 7);
+    let missing = vec![("knee".to_owned(), "never seen".to_owned())];
+    let answer = BarrierAnswer::TimedOut { missing };
+    let not_taken = || Input::AnswerNotTaken { app: app(0), correlation: 7, answer: answer.clone() };
+    assert_eq!(bench.passes(Duration::from_secs(60)), [answered(7, answer.clone())]);
+    for _ in 0..3 {
+        assert_eq!(bench.hears(not_taken()), []);
+        assert_eq!(bench.core.next_wake(), Some(bench.now + RETRY));
+        assert_eq!(bench.passes(RETRY), [answered(7, answer.clone())]);
+    }
+    assert_eq!(bench.passes(RETRY), [], "it was taken");
+    bench.hears(not_taken());
+    bench.down(0);
+    assert_eq!(bench.passes(RETRY), [], "another life has not asked");
+    for _ in 0..16 {
+        assert_eq!(bench.hears(not_taken()), []);
+    }
+    assert!(matches!(bench.hears(not_taken())[..], [Output::Refused { cause: "barriers", .. }]));
+}

@@ -101,6 +101,7 @@ impl Input {
             Self::GroupsChanged(_)
             | Self::Arrived { .. }
             | Self::Left { .. }
+            | Self::AnswerNotTaken { .. }
             | Self::ArrivalsReceived { .. }
             | Self::ArrivalsNotTaken { .. }
             | Self::DirectoryWanted { .. }

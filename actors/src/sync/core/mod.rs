@@ -4,6 +4,7 @@
 //! [`Input::TimePassed`] at [`Core::next_wake`]. Outputs that were not taken stay here, so that an actor that fails
 //! between two of them loses none.
 
+mod answers;
 mod apps;
 mod barrier;
 mod cycles;
@@ -33,6 +34,7 @@ use sinew_runtime::{
 
 pub(crate) use self::reason::Reason;
 use self::{
+    answers::Untaken,
     apps::{Apps, State, Wait},
     directory::Watchers,
     peers::{Accepted, Peers},
@@ -70,6 +72,8 @@ pub(crate) enum Input {
     Arrived { app: AppAddress, correlation: u64, asked: ArriveAtBarrier },
     /// It waits there no more; where a correlation is given, only the wait by the request that has it is over.
     Left { app: AppAddress, barrier: String, correlation: Option<u64> },
+    /// It did not take this answer to its request.
+    AnswerNotTaken { app: AppAddress, correlation: u64, answer: BarrierAnswer },
     /// The sync manager of `from` said who waits at barriers.
     ArrivalsReceived { from: NodeAddress, payload: Bytes },
     /// The queue to `to` did not take who waits at barriers.
@@ -124,6 +128,7 @@ pub(crate) struct Core {
     groups: Vec<AppAddress>,
     peers: Peers,
     rendezvous: Rendezvous,
+    untaken: Untaken,
     watchers: Watchers,
     /// Of the names and patterns that are required here, those that somebody had at some time.
     seen: BTreeSet<String>,
@@ -153,6 +158,7 @@ impl Core {
             groups: Vec::new(),
             peers: Peers::new(config.ndl.nodes_max),
             rendezvous: Rendezvous::new(node, incarnation),
+            untaken: Untaken::default(),
             watchers: Watchers::default(),
             seen: BTreeSet::new(),
             cycles: BTreeSet::new(),
@@ -179,6 +185,9 @@ impl Core {
             Input::Left { app, barrier, correlation } => {
                 self.rendezvous.leave(now, app, &barrier, correlation)
             }
+            Input::AnswerNotTaken { app, correlation, answer } => {
+                return self.answer_not_taken(now, app, correlation, answer);
+            }
             Input::ArrivalsReceived { from, payload } => self.arrivals_received(now, from, &payload),
             Input::ArrivalsNotTaken { to } => self.rendezvous.not_taken(now, to),
             Input::LinkChanged(fact) => self.link_changed(now, fact),
@@ -190,6 +199,7 @@ impl Core {
             Input::TimePassed => {}
         }
         self.offer_again(now);
+        self.answer_again(now);
         self.evaluate(now);
         self.report_overdue(now);
         self.publish(now);
@@ -213,6 +223,7 @@ impl Core {
             self.retry,
             silent,
             self.rendezvous.next_wake(),
+            self.untaken.next_wake(),
             self.watchers.next_wake(),
         ]
         .into_iter()
@@ -372,6 +383,7 @@ impl Core {
     /// What it waited for and wanted to hear it does not any more.
     fn life_ended(&mut self, now: Time, app: AppAddress) {
         self.rendezvous.ended(now, app);
+        self.untaken.forget(app);
         self.watchers.remove(app);
     }
 
