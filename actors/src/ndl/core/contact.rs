@@ -9,9 +9,6 @@ use super::{
     budget::{Bucket, KNOWN},
 };
 
-/// Questions to one address that may still be answered: later ones make older ones void.
-const QUESTIONS_MAX: usize = 4;
-
 /// A query that was sent and may be answered.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Question {
@@ -19,13 +16,14 @@ pub(super) struct Question {
     pub(super) asked: Time,
 }
 
-/// The last few queries to one destination.
+/// The last queries to one destination that may still be answered: later ones make older ones void.
 #[derive(Debug, Default)]
 pub(super) struct Questions(VecDeque<Question>);
 
 impl Questions {
-    pub(super) fn push(&mut self, question: Question) {
-        if self.0.len() == QUESTIONS_MAX {
+    /// Keeps `question`, and of those before it as many that there are `most` at most.
+    pub(super) fn push(&mut self, question: Question, most: usize) {
+        while self.0.len() >= most {
             self.0.pop_front();
         }
         self.0.push_back(question);

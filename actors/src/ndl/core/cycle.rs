@@ -157,7 +157,8 @@ impl Core {
         }
         if self.asks_group {
             let correlation = self.next_correlation();
-            self.group_questions.push(Question { correlation, asked: now });
+            let most = self.rest().answerable();
+            self.group_questions.push(Question { correlation, asked: now }, most);
             self.outputs.push_back(Output::SendMulticastQuery { correlation });
         }
     }

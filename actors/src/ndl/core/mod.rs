@@ -49,7 +49,7 @@ pub use self::view::{KnownNode, TroubledApp};
 use self::{
     budget::Strangers,
     clock::PeerClock,
-    contact::{Contact, Question, Questions},
+    contact::{Contact, Question, Questions, Role},
     duplicates::Trial,
     lives::{Contest, Gone},
     pace::{Pace, REST},
@@ -452,7 +452,11 @@ impl Core {
     fn ask(&mut self, now: Time, to: SocketAddr) {
         let correlation = self.next_correlation();
         if let Some(contact) = self.contacts.get_mut(&to) {
-            contact.questions.push(Question { correlation, asked: now });
+            let pace = match contact.role {
+                Role::Member(node) => self.members.get(&node).map_or(REST, |member| member.pace),
+                Role::Candidate { .. } | Role::Former { .. } => REST,
+            };
+            contact.questions.push(Question { correlation, asked: now }, self.paces[pace].answerable());
             self.outputs.push_back(Output::SendQuery { to, correlation });
         }
     }

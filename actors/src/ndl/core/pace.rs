@@ -10,6 +10,9 @@ use crate::config::{NdlConfig, WatchGroup};
 /// The pace of whoever is in no group, and of seeds, candidates and the multicast group. It runs as long as the node does.
 pub(super) const REST: usize = 0;
 
+/// Queries to one address that may be answered, at least.
+const ANSWERABLE_MIN: usize = 4;
+
 /// A pace at which members are asked.
 #[derive(Debug)]
 pub(super) struct Pace {
@@ -34,6 +37,13 @@ impl Pace {
     /// Whether the node called `name` is in this pace's group.
     pub(super) fn covers(&self, name: &str) -> bool {
         self.group.as_ref().is_some_and(|group| group.covers(name))
+    }
+
+    /// Queries to one address that may be answered: as many as may be missed and one more, so that no answer that comes before the loss
+    /// comes too late. // spec: NDL-3.1
+    pub(super) fn answerable(&self) -> usize {
+        // `missed_max` is 100 at most.
+        ANSWERABLE_MIN.max(self.missed_max as usize + 1)
     }
 
     /// Time after its last sign of life within which a member is lost, if our own timer is on time. // spec: NDL-4.1

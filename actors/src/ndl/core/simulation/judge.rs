@@ -38,7 +38,7 @@ struct Question {
     correlation: u64,
     asked: Time,
     is_answered: bool,
-    /// Within a period; a later answer is none to a core that has asked four times since.
+    /// Within a period; a core that has asked often since takes a later answer for none.
     is_answered_in_time: bool,
 }
 

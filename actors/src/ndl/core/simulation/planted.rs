@@ -124,7 +124,7 @@ impl Patient {
             && let Some(contact) = self.core.contacts.get_mut(&flying.from)
             && !contact.questions.has(correlation)
         {
-            contact.questions.push(Question { correlation, asked: now });
+            contact.questions.push(Question { correlation, asked: now }, 4);
         }
     }
 

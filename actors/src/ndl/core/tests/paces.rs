@@ -59,6 +59,26 @@ fn only_the_leg_costs_what_its_pace_costs() {
     assert_eq!([leg.asked_every, console.asked_every], [FAST, PERIOD]);
 }
 
+// spec: NDL-3.1
+#[test]
+fn a_leg_behind_a_long_way_is_not_lost_while_its_answers_take_less_than_what_may_be_missed() {
+    let mut world = World::new();
+    world.flight = Duration::from_micros(22_500);
+    let watch = vec![WatchGroup { nodes: vec!["node-2".to_owned()], period: FAST, missed_max: 100 }];
+    world.start(1, &Spec { watch, ..Spec::of(1) });
+    world.start(2, &Spec::of(2));
+    world.run(ms(3_000));
+    assert!(world.knows(1, 2));
+    assert_eq!(losses(&world), []);
+    assert_eq!(world.at(1).core.refusals().of("NDL answer without a question"), 0);
+    // when: it is gone
+    world.kill(2);
+    world.run(ms(1_056));
+    // then: the last answer came 45 ms after it was killed at most
+    let [(2, silent_us, 1_010_000)] = losses(&world)[..] else { panic!("{:?}", losses(&world)) };
+    assert!((1_000_000..=1_010_000).contains(&silent_us), "{silent_us}");
+}
+
 // spec: NDL-4.2
 #[test]
 fn a_stall_that_is_long_for_the_leg_is_reported_and_costs_nobody() {

@@ -123,6 +123,8 @@ pub(super) struct World {
     cut: BTreeSet<(SocketAddr, SocketAddr)>,
     /// No goodbye arrives.
     pub(super) loses_goodbyes: bool,
+    /// Time that a datagram is under way.
+    pub(super) flight: Duration,
 }
 
 impl World {
@@ -135,6 +137,7 @@ impl World {
             sequence: 0,
             cut: BTreeSet::new(),
             loses_goodbyes: false,
+            flight: FLIGHT,
         }
     }
 
@@ -339,7 +342,7 @@ impl World {
         if !self.cut.contains(&(from, to)) {
             self.sequence += 1;
             let flying = Flying { from, to, way, bytes: bytes.to_vec() };
-            self.flying.insert((self.now + FLIGHT, self.sequence), flying);
+            self.flying.insert((self.now + self.flight, self.sequence), flying);
         }
     }
 }
