@@ -2,6 +2,7 @@
 
 use std::{
     cell::RefCell,
+    collections::BTreeSet,
     hash::{BuildHasher, RandomState},
     io,
     net::{SocketAddr, SocketAddrV4},
@@ -167,8 +168,11 @@ impl Shell {
         let socket = open_socket(&stores).map_err(unbound)?;
         let udp = socket.local_addr().map_err(unbound)?;
         let reader = socket.try_clone().map_err(unbound)?;
+        // Before the core is looked at: what GNCL changes from now on is in NDL's post.
+        let links = links(&stores);
         let epoch = {
             let mut core = lock(&stores);
+            core.look_at_links(Time::now(), |node, incarnation| links.contains(&(node, incarnation)));
             core.announce_further(stores.gncl_further.get().map_or(&[], Vec::as_slice));
             core.start(Time::now(), udp, gncl)
         };
@@ -316,6 +320,14 @@ impl Shell {
 
 pub(super) fn lock(stores: &Stores) -> MutexGuard<'_, Core> {
     stores.ndl.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// The lives of nodes to which there is a connection now.
+fn links(stores: &Stores) -> BTreeSet<(NodeAddress, Incarnation)> {
+    // The first way is that of Control, whose connection is the one that GNCL tells of.
+    let stands = |peer: &gncl::Peer| peer.ways().first().is_some_and(|way| way.outlet.is_connected());
+    let peers = stores.gncl.peers();
+    peers.iter().filter(|peer| stands(peer)).map(|peer| (peer.node, peer.incarnation)).collect()
 }
 
 /// The socket that is open already, if this layer was restarted: a former instance that hangs still has it, so that nobody

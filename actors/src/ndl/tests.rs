@@ -21,8 +21,13 @@ use sinew_runtime::{
     wire::{Message, Payload},
 };
 
-use super::{LossReason, MembershipFact, NdlActor, NodeEvent, Source, actor::lock};
-use crate::{config::NdlConfig, config::NodeConfig, gncl, lncl, stores::Stores};
+use super::{Event, LossReason, MembershipFact, NdlActor, NodeEvent, Source, actor::lock, core::Input};
+use crate::{
+    config::{NdlConfig, NodeConfig},
+    gncl::{self, LinkFact},
+    lncl,
+    stores::Stores,
+};
 
 const LOOPBACK: Ipv4Addr = Ipv4Addr::LOCALHOST;
 
@@ -285,6 +290,28 @@ fn nobody_notices_that_the_layer_of_a_node_is_restarted() {
         first.finds(&third).await;
         second.finds(&third).await;
         assert_eq!(lock(&second.stores).members(Time::now()).len(), 2);
+    });
+}
+
+#[test]
+fn a_refused_dial_after_gncl_and_ndl_were_restarted_is_a_crash_of_who_was_linked() {
+    run(async {
+        // given: a link stood, and no more is heard of it
+        let mut first = Node::start(1, |_| {}).await;
+        let seed = first.udp();
+        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
+        first.finds(&second).await;
+        let (node, incarnation) = (second.stores.node, Incarnation(1));
+        let up = Input::Link(LinkFact::LinkUp { node, incarnation });
+        lock(&first.stores).handle(Time::now(), up);
+        first.end_layer();
+        first.start_layer().await;
+        second.end_layer();
+        // when
+        let refused = Event::Link(LinkFact::DialRefused { node, incarnation });
+        first.stores.posts.ndl.post(refused).unwrap();
+        // then
+        first.loses(&second, LossReason::Crashed).await;
     });
 }
 

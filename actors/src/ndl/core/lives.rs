@@ -319,6 +319,16 @@ impl Core {
         }
     }
 
+    /// A shell starts, and `stands` says which connections there are: where GNCL was restarted, too, those that ended with it are told by
+    /// nobody. // spec: NDL-4.3, NDL-4.5
+    pub(crate) fn look_at_links(&mut self, now: Time, stands: impl Fn(NodeAddress, Incarnation) -> bool) {
+        for (node, member) in &mut self.members {
+            if member.link_until == Time::MAX && !stands(*node, member.announcement.incarnation) {
+                (member.is_link_broken, member.link_until) = (true, now + LINK_GRACE);
+            }
+        }
+    }
+
     /// A member is gone. Answers to earlier questions do not count any more.
     pub(super) fn lose(&mut self, now: Time, node: NodeAddress, why: LossReason) {
         let Some(member) = self.members.remove(&node) else { return };

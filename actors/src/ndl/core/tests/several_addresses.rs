@@ -4,7 +4,7 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 
 use sinew_runtime::tid::Incarnation;
 
-use super::world::{PERIOD, Spec, World, ms, node};
+use super::world::{PERIOD, Spec, World, ms, node, udp};
 use crate::{
     gncl::LinkFact,
     ndl::{LossReason, MembershipFact},
@@ -63,4 +63,41 @@ fn a_silent_node_with_another_address_and_no_link_is_lost_like_any_other() {
     world.kill(2);
     world.run(PERIOD * 4);
     assert_eq!(world.losses(1), [(2, LossReason::LinkDown)]);
+}
+
+#[test]
+fn a_link_that_ended_with_a_restart_of_gncl_keeps_nobody_and_one_that_outlived_ndl_alone_does() {
+    let mut world = two();
+    world.link(1, up());
+    world.kill(2);
+    world.run(PERIOD * 8);
+    // when: NDL alone is restarted
+    world.with(udp(1), |core, now| core.look_at_links(now, |_, _| true));
+    world.restart_shell(1);
+    world.run(PERIOD * 8);
+    assert_eq!(world.losses(1), []);
+    // when: GNCL, too, which links nobody again
+    world.with(udp(1), |core, now| core.look_at_links(now, |_, _| false));
+    world.restart_shell(1);
+    world.run(ms(900));
+    assert_eq!(world.losses(1), []);
+    world.run(ms(100) + PERIOD * 2);
+    assert_eq!(world.losses(1), [(2, LossReason::LinkDown)]);
+}
+
+// spec: NDL-4.3
+#[test]
+fn a_link_that_ended_with_a_restart_of_gncl_and_is_refused_is_a_crash_but_not_one_that_never_was() {
+    for was_linked in [true, false] {
+        let mut world = two();
+        if was_linked {
+            world.link(1, up());
+        }
+        world.with(udp(1), |core, now| core.look_at_links(now, |_, _| false));
+        world.restart_shell(1);
+        world.kill(2);
+        world.link(1, LinkFact::DialRefused { node: node(2), incarnation: Incarnation(1) });
+        let expected = if was_linked { vec![(2, LossReason::Crashed)] } else { vec![] };
+        assert_eq!(world.losses(1), expected);
+    }
 }
