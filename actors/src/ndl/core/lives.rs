@@ -11,6 +11,7 @@ use super::{
     Core, Member, Output, Source,
     clock::{Exchange, PeerClock},
     contact::{Contact, Role},
+    troubles::Troubles,
 };
 use crate::{
     gncl::LinkFact,
@@ -219,6 +220,7 @@ impl Core {
             missed: 0,
             host: None,
             progress: Progress::default(),
+            troubles: Troubles::default(),
             is_awaited: false,
             clock: PeerClock::default(),
             is_link_broken: false,

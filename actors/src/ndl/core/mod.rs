@@ -54,6 +54,7 @@ use self::{
     lives::{Contest, Gone},
     pace::{Pace, REST},
     recall::Recall,
+    troubles::Troubles,
 };
 use super::{
     MembershipFact, NodeEvent, Progress,
@@ -203,6 +204,8 @@ struct Member {
     host: Option<Host>,
     /// What of it does not get on, as it said last.
     progress: Progress,
+    /// What of that applications were told.
+    troubles: Troubles,
     /// The last query of the cycle is not answered yet.
     is_awaited: bool,
     clock: PeerClock,
@@ -392,7 +395,7 @@ impl Core {
                     let Announcement { node, incarnation, ref name, .. } = member.announcement;
                     let event = NodeEvent::NodeFound { node, incarnation, name: name.clone() };
                     self.outputs.push_back(Output::Event { to: vec![app], event });
-                    for part in &member.progress.parts {
+                    for part in member.troubles.parts() {
                         let event = troubles::stalled(&member.announcement, part);
                         self.outputs.push_back(Output::Event { to: vec![app], event });
                     }

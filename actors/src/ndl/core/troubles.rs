@@ -1,9 +1,14 @@
 //! What of a member does not get on, though the member lives.
 
-use sinew_runtime::tid::{NodeAddress, Tid};
+use std::collections::BTreeMap;
+
+use sinew_runtime::tid::{AppAddress, NodeAddress, Tid};
 
 use super::Core;
 use crate::ndl::{NodeEvent, Part, Progress, datagram::Announcement};
+
+/// Parts of one member that are told not to get on, at most.
+const TOLD_MAX: usize = 64;
 
 /// The event that a part of this node does not get on.
 pub(super) fn stalled(of: &Announcement, part: &Part) -> NodeEvent {
@@ -17,27 +22,57 @@ pub(super) fn stalled(of: &Announcement, part: &Part) -> NodeEvent {
     }
 }
 
+/// That this part of it gets on again.
+fn resumed(of: &Announcement, part: &Part) -> NodeEvent {
+    NodeEvent::AppResumed {
+        node: of.node,
+        name: of.name.clone(),
+        app: Tid::new(of.node, part.app),
+        app_name: part.name.clone(),
+    }
+}
+
+/// What of a member was told not to get on, and was not told to get on again since.
+#[derive(Debug, Default)]
+pub(super) struct Troubles(BTreeMap<AppAddress, Part>);
+
+impl Troubles {
+    /// In the order of their addresses.
+    pub(super) fn parts(&self) -> impl Iterator<Item = &Part> {
+        self.0.values()
+    }
+
+    /// What has changed with `said`, the member's last word.
+    fn changes(&mut self, of: &Announcement, said: &Progress) -> Vec<NodeEvent> {
+        let mut events = Vec::new();
+        // Who is not named any more where not all are may have made room for others only: it is kept until all are named again.
+        if said.is_whole() {
+            self.0.retain(|app, part| {
+                let is_named = said.part(*app).is_some();
+                if !is_named {
+                    events.push(resumed(of, part));
+                }
+                is_named
+            });
+        }
+        for part in &said.parts {
+            let known = self.0.get(&part.app);
+            let is_told = known.is_some_and(|known| known.trouble == part.trouble);
+            // One that finds no room is told when there is some, if it is named then.
+            if !is_told && (known.is_some() || self.0.len() < TOLD_MAX) {
+                events.push(stalled(of, part));
+                self.0.insert(part.app, part.clone());
+            }
+        }
+        events
+    }
+}
+
 impl Core {
     /// A member said how it gets on: what has changed is told, once. // spec: NDL-9
     pub(super) fn note_progress(&mut self, node: NodeAddress, progress: Progress) {
         let Some(member) = self.members.get_mut(&node) else { return };
-        let announcement = &member.announcement;
-        let is_same = |part: &Part, known: &Progress| {
-            known.part(part.app).is_some_and(|other| other.trouble == part.trouble)
-        };
-        let mut events = Vec::new();
-        // Who is not named any more where not all are may have made room for others only.
-        if progress.is_whole() {
-            let over = member.progress.parts.iter().filter(|part| progress.part(part.app).is_none());
-            events.extend(over.map(|part| NodeEvent::AppResumed {
-                node,
-                name: announcement.name.clone(),
-                app: Tid::new(node, part.app),
-                app_name: part.name.clone(),
-            }));
-        }
-        let new = progress.parts.iter().filter(|part| !is_same(part, &member.progress));
-        events.extend(new.map(|part| stalled(announcement, part)));
+        let events = member.troubles.changes(&member.announcement, &progress);
         member.progress = progress;
         for event in events {
             self.publish(event);

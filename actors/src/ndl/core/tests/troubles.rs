@@ -58,6 +58,38 @@ fn of_many_the_first_four_are_named_and_who_only_made_room_has_not_resumed() {
 }
 
 #[test]
+fn who_was_named_before_there_were_too_many_to_be_named_is_told_to_get_on_when_all_are_named_again() {
+    let mut world = World::of_members(2);
+    let stalled = Trouble::Stalled;
+    let many = |apps: &[u32]| apps.iter().map(|app| part(*app, stalled)).collect();
+    says(&mut world, many(&[0x2009]));
+    assert_eq!(told(&mut world), [(0x2009, Some(stalled))]);
+    says(&mut world, many(&[0x2001, 0x2002, 0x2003, 0x2004, 0x2009]));
+    assert_eq!(told(&mut world).len(), 4, "0x2009 is not named, and told already");
+    says(&mut world, many(&[0x2001]));
+    let over = [0x2002, 0x2003, 0x2004, 0x2009].map(|app| (app, None));
+    assert_eq!(told(&mut world), over);
+    says(&mut world, many(&[]));
+    assert_eq!(told(&mut world), [(0x2001, None)]);
+}
+
+#[test]
+fn of_more_than_are_kept_those_without_room_are_told_when_there_is_some() {
+    let mut world = World::of_members(2);
+    for first in (0..80).step_by(4) {
+        // The first four of many, each time others.
+        let mut parts: Vec<_> = (first..first + 5).map(|app| part(0x2000 + app, Trouble::Away)).collect();
+        parts.push(part(0x3000, Trouble::Away));
+        says(&mut world, parts);
+    }
+    assert_eq!(told(&mut world).len(), 64);
+    says(&mut world, vec![part(0x3000, Trouble::Away)]);
+    let events = told(&mut world);
+    assert_eq!(events.len(), 65);
+    assert_eq!(events.last(), Some(&(0x3000, Some(Trouble::Away))));
+}
+
+#[test]
 fn an_application_that_comes_late_hears_what_does_not_get_on() {
     let mut world = World::of_members(2);
     says(&mut world, vec![part(0x2000, Trouble::Stalled)]);
