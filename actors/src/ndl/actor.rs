@@ -15,6 +15,7 @@ use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, WrapFutur
 use futures_util::{StreamExt as _, stream::FuturesUnordered};
 use mdns_sd::{DaemonEvent, ServiceEvent};
 use sinew_runtime::{
+    outcome::Rejection,
     supervision::ReadyGate,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
@@ -257,7 +258,7 @@ impl Shell {
                 let _ = self.to_probe.try_send(Probe { node, incarnation, to, within });
             }
             Output::Fact(fact) => self.tell_layers(fact),
-            Output::Event { to, event } => self.tell_applications(&to, &event),
+            Output::Event { to, event } => self.tell_application(to, &event),
             Output::ClockMeasured { node, offset } => self.stores.clocks.set(node, offset),
             Output::Collision { node, holder, newcomer } => crate::log::error!(
                 "node address {node} is used twice: by {holder}, and by {newcomer}, which is not let in; give one of \
@@ -305,15 +306,18 @@ impl Shell {
         }
     }
 
-    fn tell_applications(&self, to: &[AppAddress], event: &NodeEvent) {
+    fn tell_application(&self, app: AppAddress, event: &NodeEvent) {
         let here = self.stores.node;
-        for app in to {
-            let mut message = Message::typed(Tid::new(here, AppAddress::NDL), Tid::new(here, *app), event);
-            message.header.sent = Time::now();
-            if let Err(why) = self.stores.router.send(message) {
-                let what = format_args!("{app} does not learn of {event:?}: {why}");
-                self.refusals.count(Time::now(), "event not taken by an application", &what);
-            }
+        let mut message = Message::typed(Tid::new(here, AppAddress::NDL), Tid::new(here, app), event);
+        message.header.sent = Time::now();
+        let Err(why) = self.stores.router.send(message) else { return };
+        let now = Time::now();
+        let what = format_args!("{app} does not learn of {event:?}: {why}");
+        self.refusals.count(now, "event not taken by an application", &what);
+        // Any other refusal says that it is gone, and nobody has to hear of it.
+        if why == Rejection::QueueFull {
+            lock(&self.stores).handle(now, Input::EventNotTaken { app });
+            self.rewind.notify_one();
         }
     }
 }

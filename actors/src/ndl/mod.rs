@@ -38,7 +38,7 @@
 //! | NDL-7 | All memory and all work is bounded. |
 //! | NDL-7.1 | `nodes_max` members, as many candidates, as many that are gone; the oldest candidate makes room. |
 //! | NDL-7.2 | 50 datagrams/s from a stranger's address, 1,000 from all of them, 500 from each member or seed. |
-//! | NDL-8 | An application that wants to know hears first of every member that is there, then of each change, once. |
+//! | NDL-8 | An application that wants to know hears first of every member that is there, then of each change, once; what it does not take is offered again every 10 ms, in its last form. |
 
 mod actor;
 mod core;

@@ -271,6 +271,35 @@ fn a_node_that_stops_says_goodbye_and_a_later_life_is_a_restart() {
 }
 
 #[test]
+fn an_event_that_finds_a_full_mailbox_is_told_when_there_is_room() {
+    run(async {
+        // given: room for one event
+        let mut first = Node::start(1, |_| {}).await;
+        let inbox = Post::new(1);
+        first.events = inbox.attach();
+        let route = LocalRoute { outlet: Arc::new(Inbox(inbox)), events: Arc::new([NodeEvent::KIND]) };
+        first.stores.router.set_local(AppAddress::new(0x1000), route);
+        let seed = first.udp();
+        let second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
+        first.finds(&second).await;
+        let third = Node::start(3, |ndl| ndl.seeds = vec![seed]).await;
+        first.finds(&third).await;
+        // when
+        within("the mailbox to refuse", async {
+            while first.stores.refusals.of("event not taken by an application") == 0 {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        // then
+        for node in [second.stores.node, third.stores.node] {
+            let event: NodeEvent = first.event().await.decode().unwrap();
+            assert!(matches!(event, NodeEvent::NodeFound { node: found, .. } if found == node), "{event:?}");
+        }
+    });
+}
+
+#[test]
 fn nobody_notices_that_the_layer_of_a_node_is_restarted() {
     run(async {
         // given

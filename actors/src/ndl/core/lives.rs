@@ -233,7 +233,7 @@ impl Core {
         // Before the fact, so that GNCL knows the clock of a peer when it connects.
         self.measure(now, node, exchange);
         self.outputs.push_back(Output::Fact(MembershipFact::NodeFound { node, incarnation, gncl }));
-        self.publish(match arrival {
+        self.publish(&match arrival {
             Arrival::Found => NodeEvent::NodeFound { node, name, incarnation },
             Arrival::Restarted => NodeEvent::NodeRestarted { node, name, incarnation },
         });
@@ -356,7 +356,7 @@ impl Core {
         let (silent_us, bound_us) =
             (micros(now.since(member.heard)), micros(self.paces[member.pace].bound()));
         self.outputs.push_back(Output::Fact(MembershipFact::NodeLost { node, incarnation, why }));
-        self.publish(NodeEvent::NodeLost { node, name, incarnation, why, silent_us, bound_us });
+        self.publish(&NodeEvent::NodeLost { node, name, incarnation, why, silent_us, bound_us });
         if why == LossReason::Crashed {
             // Perhaps only its GNCL restarts: then it answers this.
             self.ask(now, member.address);

@@ -13,9 +13,11 @@
 //! | `duplicates` | which of two processes has a node address |
 //! | `pace` | how often which members are asked |
 //! | `troubles` | what of a member does not get on |
+//! | `audience` | who is told, and what of it has not been taken |
 //! | `clock` | how far a peer's clock is from ours |
 //! | `recall` | what is told to whoever asks, and decides nothing |
 
+mod audience;
 mod budget;
 mod clock;
 mod contact;
@@ -33,7 +35,7 @@ mod troubles;
 mod view;
 
 use std::{
-    collections::{BTreeMap, BTreeSet, VecDeque},
+    collections::{BTreeMap, VecDeque},
     hash::{DefaultHasher, Hash, Hasher},
     net::{SocketAddr, SocketAddrV4},
     time::Duration,
@@ -47,6 +49,7 @@ use sinew_runtime::{
 pub(crate) use self::recall::{LostNode, Neighbour};
 pub use self::view::{KnownNode, TroubledApp};
 use self::{
+    audience::Audience,
     budget::Strangers,
     clock::PeerClock,
     contact::{Contact, Question, Questions, Role},
@@ -85,6 +88,8 @@ pub(crate) enum Input {
     AppChanged(AppFact),
     /// The node's root says what of this node does not get on.
     ProgressSeen(Progress),
+    /// An application had no room for the last [`Output::Event`], which was for it.
+    EventNotTaken { app: AppAddress },
 }
 
 /// What is to be done, or has become known.
@@ -117,9 +122,9 @@ pub(crate) enum Output {
     },
     /// For GNCL and the sync manager.
     Fact(MembershipFact),
-    /// For these applications.
+    /// For this application.
     Event {
-        to: Vec<AppAddress>,
+        to: AppAddress,
         event: NodeEvent,
     },
     ClockMeasured {
@@ -264,7 +269,7 @@ pub(crate) struct Core {
     collisions_reported: BTreeMap<NodeAddress, Time>,
 
     /// Applications that hear of changes.
-    subscribers: BTreeSet<AppAddress>,
+    audience: Audience,
     outputs: VecDeque<Output>,
     refusals: Refusals,
     recall: Recall,
@@ -315,7 +320,7 @@ impl Core {
             group_questions: Questions::default(),
             strangers: Strangers::new(Time::ZERO),
             collisions_reported: BTreeMap::new(),
-            subscribers: BTreeSet::new(),
+            audience: Audience::new(ndl.nodes_max),
             outputs: VecDeque::new(),
             refusals: Refusals::default(),
             recall: Recall::default(),
@@ -346,6 +351,11 @@ impl Core {
 
     /// Takes in what happened.
     pub(crate) fn handle(&mut self, now: Time, input: Input) {
+        self.offer_again(now);
+        if let Input::EventNotTaken { app } = input {
+            self.audience.not_taken(now, app);
+            return;
+        }
         if let Input::AppChanged(fact) = input {
             self.app_changed(&fact);
             return;
@@ -380,7 +390,7 @@ impl Core {
             Input::Probed { node, incarnation, host } => self.probed(node, incarnation, host),
             Input::TimePassed => self.time_passed(now),
             Input::Stopping => self.leave(),
-            Input::AppChanged(_) | Input::ProgressSeen(_) => {
+            Input::AppChanged(_) | Input::ProgressSeen(_) | Input::EventNotTaken { .. } => {
                 unreachable!("it was taken above, whether NDL runs or not")
             }
         }
@@ -390,40 +400,36 @@ impl Core {
     fn app_changed(&mut self, fact: &AppFact) {
         match *fact {
             AppFact::Ready { app } => {
-                self.subscribers.insert(app);
+                self.audience.add(app);
                 for member in self.members.values() {
                     let Announcement { node, incarnation, ref name, .. } = member.announcement;
                     let event = NodeEvent::NodeFound { node, incarnation, name: name.clone() };
-                    self.outputs.push_back(Output::Event { to: vec![app], event });
+                    self.audience.tell(app, event);
                     for part in member.troubles.parts() {
-                        let event = troubles::stalled(&member.announcement, part);
-                        self.outputs.push_back(Output::Event { to: vec![app], event });
+                        self.audience.tell(app, troubles::stalled(&member.announcement, part));
                     }
                 }
             }
             AppFact::Down { app } | AppFact::Stopped { app } | AppFact::Unregistered { app } => {
-                self.subscribers.remove(&app);
+                self.audience.remove(app);
             }
             AppFact::Registered { .. } | AppFact::Handles { .. } | AppFact::GroupsChanged => {}
         }
     }
 
-    /// Tells every application that subscribed.
-    fn publish(&mut self, event: NodeEvent) {
-        let to = self.subscribers.iter().copied().collect();
-        self.outputs.push_back(Output::Event { to, event });
-    }
-
-    /// The next order or fact.
+    /// The next order or fact; those for applications come after those for layers.
     pub(crate) fn poll(&mut self) -> Option<Output> {
-        self.outputs.pop_front()
+        self.outputs.pop_front().or_else(|| {
+            let (to, event) = self.audience.next()?;
+            Some(Output::Event { to, event })
+        })
     }
 
     /// When [`Input::TimePassed`] is due.
     pub(crate) fn next_wake(&self) -> Option<Time> {
         let contests = self.contests.values().map(|contest| contest.until);
         let paces = self.paces.iter().flat_map(|pace| [pace.respite.map(|respite| respite.until), pace.due]);
-        contests.chain(paces.flatten()).min()
+        contests.chain(paces.flatten()).chain(self.audience.next_wake()).min()
     }
 
     /// What this node says about itself.

@@ -74,8 +74,6 @@ impl Core {
         let Some(member) = self.members.get_mut(&node) else { return };
         let events = member.troubles.changes(&member.announcement, &progress);
         member.progress = progress;
-        for event in events {
-            self.publish(event);
-        }
+        events.iter().for_each(|event| self.publish(event));
     }
 }

@@ -450,3 +450,29 @@ fn thirty_nodes_are_quiet_when_all_know_each_other() {
         assert!(world.at(index).datagrams_sent <= 5 * (29 * 2 + 30), "{}", world.at(index).datagrams_sent);
     }
 }
+
+// spec: NDL-8
+#[test]
+fn an_application_whose_mailbox_is_full_hears_what_became_of_each_node_when_it_has_room_again() {
+    let mut world = World::of_members(3);
+    world.process(1).is_busy = true;
+    world.kill(2);
+    world.kill(3);
+    world.run(PERIOD * 5);
+    world.start(3, &Spec { incarnation: 2, ..Spec::of(3) });
+    world.run(PERIOD);
+    assert_eq!(world.at(1).events, []);
+    assert_eq!(world.losses(1).len(), 2, "layers were told");
+    // when
+    world.process(1).is_busy = false;
+    world.run(ms(10));
+    // then
+    let [NodeEvent::NodeLost { node: lost, .. }, NodeEvent::NodeRestarted { node: restarted, .. }] =
+        &world.at(1).events[..]
+    else {
+        panic!("{:?}", world.at(1).events)
+    };
+    assert_eq!([*lost, *restarted], [node(2), node(3)]);
+    world.run(PERIOD * 3);
+    assert_eq!(world.at(1).events.len(), 2, "each once");
+}

@@ -103,6 +103,8 @@ pub(super) struct Process {
     pub(super) others: Vec<Output>,
     pub(super) clocks: BTreeMap<NodeAddress, ClockOffset>,
     pub(super) datagrams_sent: usize,
+    /// Its application has no room.
+    pub(super) is_busy: bool,
     /// Whose hosts are to be tried.
     pub(super) probes: Vec<(NodeAddress, Incarnation)>,
 }
@@ -173,6 +175,7 @@ impl World {
             others: Vec::new(),
             clocks: BTreeMap::new(),
             datagrams_sent: 0,
+            is_busy: false,
             probes: Vec::new(),
         };
         self.processes.insert(udp(index), process);
@@ -325,6 +328,9 @@ impl World {
             }
             Output::Probe { node, incarnation, .. } => process.probes.push((node, incarnation)),
             Output::Fact(fact) => process.facts.push(fact),
+            Output::Event { to, .. } if process.is_busy => {
+                process.core.handle(now, Input::EventNotTaken { app: to });
+            }
             Output::Event { event, .. } => process.events.push(event),
             Output::ClockMeasured { node, offset } => drop(process.clocks.insert(node, offset)),
             other @ (Output::Collision { .. } | Output::AddressTaken { .. } | Output::Stalled { .. }) => {
