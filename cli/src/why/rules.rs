@@ -104,8 +104,13 @@ impl Steps {
         }
     }
 
-    /// No two processes have one address.
+    /// No two processes have the address of one of them.
     fn address(&mut self, a: &End, b: &End) {
+        let nodes: Vec<String> =
+            [a, b].iter().filter_map(|end| end.node).map(|node| node.to_string()).collect();
+        // The node that is used twice is the first word.
+        let is_ours =
+            |detail: &str| detail.split(' ').next().is_some_and(|word| nodes.iter().any(|node| node == word));
         for end in [a, b] {
             if let (Some(node), Some(double)) = (end.node, end.doubles.first()) {
                 self.blocked(
@@ -117,9 +122,11 @@ impl Steps {
             }
             let refusals = end.report.iter().flat_map(|report| &report.refusals);
             let mut twice = refusals.filter(|refusal| refusal.cause == "NDL node address used twice");
-            if let Some(refusal) = twice.find(|refusal| refusal.ago_us < RECENT_US) {
+            if let Some(refusal) =
+                twice.find(|refusal| refusal.ago_us < RECENT_US && is_ours(&refusal.detail))
+            {
                 self.blocked(
-                    format!("{} sees every address once", end.label()),
+                    format!("{} sees both addresses once", end.label()),
                     format!("{} ago: {}", time(refusal.ago_us), refusal.detail),
                     "give one of the two another `address` under [node]",
                 );

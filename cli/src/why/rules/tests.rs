@@ -22,6 +22,10 @@ fn peer(number: u8) -> PeerReport {
         found_by: vec!["multicast".to_owned()],
         silent_us: Some(120_000),
         missed: 0,
+        asked_every_us: Some(500_000),
+        bound_us: Some(2_000_000),
+        troubled: 0,
+        troubles: Vec::new(),
         round_trip_ns: None,
         offset_ns: None,
         offset_bound_ns: None,
@@ -164,7 +168,7 @@ const CASES: &[Case] = &[
             let detail = "10.0.0.2 is at 10.0.0.2:7000; the process at 10.0.0.9:7000 claims it".to_owned();
             hip(facts).refusals.push(RefusalReport { cause, count: 4, detail, ago_us: 1_000_000 });
         },
-        ["hip sees every address once", "10.0.0.9", "another `address`"],
+        ["hip sees both addresses once", "10.0.0.9", "another `address`"],
     ),
     Case(
         |facts| {
@@ -360,6 +364,17 @@ fn what_should_be_known_does_not_stand_in_the_way() {
         assert!(steps.iter().all(|step| step.state != State::Blocked), "{steps:#?}");
         assert!(steps.iter().any(|step| step.state == State::Note && step.seen.contains(seen)), "{steps:#?}");
     }
+}
+
+#[test]
+fn an_address_of_a_third_node_that_is_used_twice_does_not_stand_in_the_way() {
+    let mut facts = free();
+    let cause = "NDL node address used twice".to_owned();
+    // The elder one of the two is where the knee was once.
+    let detail =
+        "10.0.0.21 is at 10.0.0.2:7000; the process at 10.0.0.9:7000 claims the same node address".to_owned();
+    hip(&mut facts).refusals.push(RefusalReport { cause, count: 4, detail, ago_us: 1_000_000 });
+    assert!(judge(&facts).iter().all(|step| step.state == State::Fine));
 }
 
 #[test]
