@@ -3,7 +3,7 @@
 //! Each says how it stands to its address ([`Claim`]). Who has settled goes before who settles, and the elder life before the later
 //! one. Others listen to that one as soon as they know that both live; the other one gives the address up when it hears of it.
 
-use std::{net::SocketAddr, time::Duration};
+use std::{collections::btree_map::Entry, net::SocketAddr, time::Duration};
 
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
@@ -68,9 +68,9 @@ impl Core {
         let what =
             format_args!("{node} is at {holder}; the process at {newcomer} claims the same node address");
         self.refusals.count(now, "NDL node address used twice", &what);
-        let last = self.collisions_reported.get(&node);
-        if last.is_none_or(|last| now.since(*last) >= COLLISION_REPORT_PERIOD) {
-            self.collisions_reported.insert(node, now);
+        self.collisions_reported.retain(|_, last| now.since(*last) < COLLISION_REPORT_PERIOD);
+        if let Entry::Vacant(report) = self.collisions_reported.entry(node) {
+            report.insert(now);
             self.outputs.push_back(Output::Collision { node, holder, newcomer });
         }
     }

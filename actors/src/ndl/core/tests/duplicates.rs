@@ -110,6 +110,21 @@ fn who_was_frozen_for_so_long_that_a_later_life_took_over_gives_up_when_it_goes_
     assert_eq!((world.losses(1), world.losses(2)), (vec![], vec![]), "nobody doubted the later life");
 }
 
+#[test]
+fn reports_of_addresses_used_twice_are_remembered_for_as_long_as_they_hold_others_back() {
+    let mut world = World::of_members(2);
+    for nodes in [10..40, 40..41] {
+        let reported = nodes.clone().count();
+        for address in nodes.clone().chain(nodes) {
+            world.with(udp(1), |core, now| core.collide(now, node(address), udp(2), udp(3)));
+        }
+        assert_eq!(world.at(1).others.len(), reported, "each once");
+        assert_eq!(world.at(1).core.collisions_reported.len(), reported);
+        world.run(ms(10_000));
+        world.forget_the_past();
+    }
+}
+
 /// What is broken on purpose.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Fault {
