@@ -18,6 +18,7 @@ use std::{
 };
 
 use sinew_runtime::{
+    app::matches,
     supervision::{self, Flags, Intensity},
     tid::NodeAddress,
 };
@@ -163,20 +164,8 @@ impl WatchGroup {
     /// ```
     #[must_use]
     pub fn covers(&self, name: &str) -> bool {
-        self.nodes.iter().any(|pattern| fits(pattern, name))
+        self.nodes.iter().any(|pattern| matches(pattern, name))
     }
-}
-
-/// Whether `name` is what `pattern` says, in which each `*` stands for any text.
-fn fits(pattern: &str, name: &str) -> bool {
-    let mut parts: Vec<&str> = pattern.split('*').collect();
-    let Some(mut rest) = name.strip_prefix(parts.remove(0)) else { return false };
-    let Some(last) = parts.pop() else { return rest.is_empty() };
-    for part in parts {
-        let Some(at) = rest.find(part) else { return false };
-        rest = &rest[at + part.len()..];
-    }
-    rest.ends_with(last)
 }
 
 /// Sync manager: start-up barriers.
