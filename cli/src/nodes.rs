@@ -1,7 +1,7 @@
 //! `sinew nodes`: every node, its life, what connects it, its clock.
 
 use serde_json::{Value, json};
-use sinew::inspect::{AskNode, LinkReport, LostReport, NodeReport, PeerReport};
+use sinew::inspect::{AskNode, LinkReport, LostReport, NodeReport, PeerReport, TroubleReport};
 
 use crate::{
     Said,
@@ -9,6 +9,9 @@ use crate::{
     table::{Table, clean, or_dash, time},
     why::lost_in_words,
 };
+
+/// Columns of the table.
+const COLUMNS: usize = 11;
 
 /// Asks every node.
 pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
@@ -89,7 +92,7 @@ impl<'a> Row<'a> {
         or_dash(self.seen.map(|seen| seen.found_by.join(", ")).filter(|words| !words.is_empty()))
     }
 
-    fn cells(&self) -> [String; 9] {
+    fn cells(&self) -> [String; COLUMNS] {
         let said = self.answer.said.as_ref().ok();
         [
             self.answer.node.to_string(),
@@ -99,6 +102,8 @@ impl<'a> Row<'a> {
             self.state().to_owned(),
             self.found_by(),
             self.links(),
+            or_dash(self.seen.and_then(|seen| seen.asked_every_us).map(time)),
+            or_dash(self.seen.and_then(|seen| seen.bound_us).map(time)),
             or_dash(self.seen.and_then(|seen| seen.round_trip_ns).map(|ns| time(ns / 1_000))),
             self.clock(),
         ]
@@ -121,6 +126,10 @@ impl<'a> Row<'a> {
             "found_by": seen.map(|seen| &seen.found_by),
             "silent_us": seen.and_then(|seen| seen.silent_us),
             "missed": seen.map(|seen| seen.missed),
+            "asked_every_us": seen.and_then(|seen| seen.asked_every_us),
+            "bound_us": seen.and_then(|seen| seen.bound_us),
+            "troubled": seen.map(|seen| seen.troubled),
+            "troubles": seen.map(|seen| seen.troubles.iter().map(trouble_json).collect::<Vec<_>>()),
             "round_trip_ns": seen.and_then(|seen| seen.round_trip_ns),
             "clock_offset_ns": seen.and_then(|seen| seen.offset_ns),
             "clock_offset_bound_ns": seen.and_then(|seen| seen.offset_bound_ns),
@@ -134,7 +143,12 @@ fn link_json(link: &LinkReport) -> Value {
     json!({ "class": class, "up": is_up, "waiting": waiting, "unconfirmed": unconfirmed })
 }
 
-fn lost_cells(lost: &LostReport) -> [String; 9] {
+fn trouble_json(of: &TroubleReport) -> Value {
+    let TroubleReport { app, name, trouble, since_us } = of;
+    json!({ "app": app.to_string(), "name": name, "trouble": trouble, "since_us": since_us })
+}
+
+fn lost_cells(lost: &LostReport) -> [String; COLUMNS] {
     let dash = || "-".to_owned();
     let found_by = or_dash(Some(lost.found_by.join(", ")).filter(|words| !words.is_empty()));
     let life = lost.incarnation.to_string();
@@ -148,6 +162,8 @@ fn lost_cells(lost: &LostReport) -> [String; 9] {
         dash(),
         dash(),
         dash(),
+        dash(),
+        dash(),
     ]
 }
 
@@ -158,8 +174,40 @@ fn lost_json(lost: &LostReport) -> Value {
     })
 }
 
+/// What of a node does not get on, a line each.
+fn troubles(of: &PeerReport) -> String {
+    let name = clean(of.name.as_deref().unwrap_or_default());
+    let mut lines = String::new();
+    for TroubleReport { app, name: what, trouble, since_us } in &of.troubles {
+        lines += &format!(
+            "{} {name}: {} ({app}) does not get on: {} for {}\n",
+            of.node,
+            clean(what),
+            clean(trouble),
+            time(*since_us)
+        );
+    }
+    let unnamed = (of.troubled as usize).saturating_sub(of.troubles.len());
+    if unnamed > 0 {
+        lines += &format!("{} {name}: {unnamed} further ones do not get on\n", of.node);
+    }
+    lines
+}
+
 fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport]) -> String {
-    let heading = ["NODE", "NAME", "LIFE", "UP", "STATE", "FOUND BY", "LINKS", "ROUND TRIP", "CLOCK"];
+    let heading: [_; COLUMNS] = [
+        "NODE",
+        "NAME",
+        "LIFE",
+        "UP",
+        "STATE",
+        "FOUND BY",
+        "LINKS",
+        "ASKED EVERY",
+        "LOST WITHIN",
+        "ROUND TRIP",
+        "CLOCK",
+    ];
     let mut table = Table::new(heading);
     rows.iter().for_each(|row| table.row(row.cells()));
     lost.iter().for_each(|lost| table.row(lost_cells(lost)));
@@ -173,8 +221,49 @@ fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport]) -> String {
             text += &format!("{} {}: {}\n", row.answer.node, clean(row.name()), clean(why));
         }
     }
+    rows.iter().filter_map(|row| row.seen).for_each(|seen| text += &troubles(seen));
     if here.left_out > 0 {
         text += &format!("{} further nodes had no room in the answer of {}\n", here.left_out, here.node);
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew::{AppAddress, Incarnation, NodeAddress, Tid};
+
+    use super::*;
+
+    #[test]
+    fn what_of_a_node_does_not_get_on_has_a_line_each_and_the_rest_are_counted() {
+        let node = NodeAddress::from([10, 0, 0, 7]);
+        let app = Tid::new(node, AppAddress::new(0x1000));
+        let (name, trouble) = ("drive".to_owned(), "stalled".to_owned());
+        let seen = PeerReport {
+            node,
+            name: Some("knee".to_owned()),
+            incarnation: Incarnation(1),
+            is_there: true,
+            found_us: None,
+            found_by: Vec::new(),
+            silent_us: None,
+            missed: 0,
+            asked_every_us: Some(500_000),
+            bound_us: Some(2_000_000),
+            troubled: 3,
+            troubles: vec![TroubleReport { app, name, trouble, since_us: 2_500_000 }],
+            round_trip_ns: None,
+            offset_ns: None,
+            offset_bound_ns: None,
+            linked_us: None,
+            broken_us: None,
+            dial: None,
+            links: Vec::new(),
+        };
+        let lines = [
+            format!("10.0.0.7 knee: drive ({app}) does not get on: stalled for 2.5 s\n"),
+            "10.0.0.7 knee: 2 further ones do not get on\n".to_owned(),
+        ];
+        assert_eq!(troubles(&seen), lines.concat());
+    }
 }

@@ -18,13 +18,13 @@ use sinew_runtime::{
 use super::reports::{
     APPS_MAX, AppReport, AppsReport, AuditReport, BarrierReport, DialReport, ForeignReport, LinkReport,
     LostReport, MISSING_MAX, Missing, NodeReport, PEERS_MAX, PeerReport, RefusalReport, SeenMessage,
-    TOLD_MAX, TREE_MAX, TreeLine, TreeReport, WaitReport, WatchReport,
+    TOLD_MAX, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
 };
 use super::watches::{Fetched, Sight};
 use crate::{
     audit,
     gncl::Peer,
-    ndl::{KnownNode, LossReason, LostNode, Source},
+    ndl::{KnownNode, LossReason, LostNode, Source, Trouble, TroubledApp},
     node::{CommandError, NodeHandle, Supervised},
     stores::{Stores, lock},
     sync::{BarrierStatus, OwnApp},
@@ -58,6 +58,11 @@ impl Answers {
         let mut peers: Vec<_> = peers(stores, now).into_values().collect();
         let left_out = peers.len().saturating_sub(PEERS_MAX) as u64;
         peers.truncate(PEERS_MAX);
+        let mut room = TOLD_MAX;
+        for peer in &mut peers {
+            peer.troubles.truncate(room);
+            room -= peer.troubles.len();
+        }
         let ndl = Discovery::of(stores, now);
         Ok(NodeReport {
             node: stores.node,
@@ -225,6 +230,10 @@ fn peer_report(known: &KnownNode, now: Time) -> PeerReport {
         found_by: known.sources.keys().map(|source| word(*source).to_owned()).collect(),
         silent_us: Some(micros(now.since(known.heard))),
         missed: known.missed,
+        asked_every_us: Some(micros(known.asked_every)),
+        bound_us: Some(micros(known.bound)),
+        troubled: u32::try_from(known.troubled).unwrap_or(u32::MAX),
+        troubles: known.troubles.iter().map(trouble).collect(),
         round_trip_ns: known.round_trip.map(nanos),
         offset_ns: known.offset.map(|offset| offset.theirs_minus_ours_ns),
         offset_bound_ns: known.offset.map(|offset| nanos(offset.bound)),
@@ -233,6 +242,16 @@ fn peer_report(known: &KnownNode, now: Time) -> PeerReport {
         dial: None,
         links: Vec::new(),
     }
+}
+
+fn trouble(part: &TroubledApp) -> TroubleReport {
+    let word = match part.trouble {
+        Trouble::Stalled => "stalled",
+        Trouble::Away => "away",
+        Trouble::GivenUp => "given up",
+    };
+    let TroubledApp { app, ref name, since, .. } = *part;
+    TroubleReport { app, name: name.clone(), trouble: word.to_owned(), since_us: micros(since) }
 }
 
 fn lost(peer: &Peer) -> PeerReport {
@@ -245,6 +264,10 @@ fn lost(peer: &Peer) -> PeerReport {
         found_by: Vec::new(),
         silent_us: None,
         missed: 0,
+        asked_every_us: None,
+        bound_us: None,
+        troubled: 0,
+        troubles: Vec::new(),
         round_trip_ns: None,
         offset_ns: None,
         offset_bound_ns: None,
@@ -349,4 +372,40 @@ fn micros(time: Duration) -> u64 {
 
 fn nanos(time: Duration) -> u64 {
     u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew_runtime::tid::{AppAddress, Incarnation};
+
+    use super::*;
+
+    #[test]
+    fn a_peer_is_told_with_its_pace_its_bound_and_what_of_it_does_not_get_on() {
+        let now = Time::ZERO + Duration::from_secs(9);
+        let node = NodeAddress::new(7);
+        let app = Tid::new(node, AppAddress::new(0x1000));
+        let (trouble, since) = (Trouble::GivenUp, Duration::from_millis(3));
+        let known = KnownNode {
+            node,
+            name: "knee".to_owned(),
+            incarnation: Incarnation(1),
+            udp: ([10, 0, 0, 7], 1).into(),
+            gncl: Vec::new(),
+            period: Duration::from_secs(1),
+            sources: BTreeMap::new(),
+            heard: now,
+            missed: 0,
+            asked_every: Duration::from_millis(10),
+            bound: Duration::from_millis(40),
+            troubled: 5,
+            troubles: vec![TroubledApp { app, name: "drive".to_owned(), trouble, since }],
+            round_trip: None,
+            offset: None,
+        };
+        let said = peer_report(&known, now);
+        assert_eq!((said.asked_every_us, said.bound_us, said.troubled), (Some(10_000), Some(40_000), 5));
+        let (name, trouble) = ("drive".to_owned(), "given up".to_owned());
+        assert_eq!(said.troubles, [TroubleReport { app, name, trouble, since_us: 3_000 }]);
+    }
 }

@@ -26,7 +26,7 @@ pub use reports::{
     APPS_MAX, AppReport, AppsReport, AskApps, AskAudit, AskNode, AskTree, AskWatch, AuditReport,
     BarrierReport, DialReport, ForeignReport, LinkReport, LostReport, Missing, NodeReport, PEERS_MAX,
     PeerReport, Ping, RefusalReport, SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, TREE_MAX, TreeLine, TreeReport,
-    WaitReport, WatchReport,
+    TroubleReport, WaitReport, WatchReport,
 };
 
 #[cfg(doc)]

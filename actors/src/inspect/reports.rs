@@ -25,6 +25,8 @@ pub(super) const TOLD_MAX: usize = 64;
 pub(super) const MISSING_MAX: usize = 64;
 /// Connections to one node at most, and ways in which it was found.
 const LINKS_MAX: usize = 8;
+/// Layers and applications of a peer that do not get on and are named, at most.
+const TROUBLES_MAX: usize = 8;
 
 /// Messages of an application that is watched in one answer, at most.
 pub const SEEN_MAX: usize = 256;
@@ -194,6 +196,19 @@ pub struct DialReport {
     pub failed: u64,
 }
 
+/// A layer or an application of a node that does not get on, though the node lives.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TroubleReport {
+    /// Its address.
+    pub app: Tid,
+    /// Its name.
+    pub name: String,
+    /// `stalled` (one turn of it has lasted for 250 ms and more), `away` (it failed and is started again), `given up` (it failed and is not).
+    pub trouble: String,
+    /// For how long that has been so, as its node said last.
+    pub since_us: u64,
+}
+
 /// A node as another one sees it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PeerReport {
@@ -214,6 +229,18 @@ pub struct PeerReport {
     pub silent_us: Option<u64>,
     /// Answers that it missed in a row.
     pub missed: u32,
+    /// Time between two queries to it, if it is there.
+    #[serde(default)]
+    pub asked_every_us: Option<u64>,
+    /// Time after its last sign of life within which its loss is known, if it is there.
+    #[serde(default)]
+    pub bound_us: Option<u64>,
+    /// How many of its layers and applications do not get on, as it says.
+    #[serde(default)]
+    pub troubled: u32,
+    /// The first of them: four at most, and 64 of all peers.
+    #[serde(default, deserialize_with = "at_most::<_, _, TROUBLES_MAX>")]
+    pub troubles: Vec<TroubleReport>,
     /// Time of the last query and its answer on the network, in nanoseconds.
     pub round_trip_ns: Option<u64>,
     /// Its clock minus that of the node that answers, in nanoseconds.
