@@ -7,7 +7,7 @@
 //! | `table.rs` | handles: numbers that are looked up, never followed; one thread at a time |
 //! | `session.rs`, `hand.rs` | an endpoint with the messages that the program in C has in hand |
 //! | `fork.rs` | a child of `fork` is told apart |
-//! | `log.rs` | what the library says on the standard error |
+//! | `log.rs`, `log/` | what the library says on the standard error, and the thread that writes it |
 //! | `registration.rs`, `sending.rs`, `receiving.rs`, `naming.rs`, `words.rs` | the functions |
 //! | `options.rs`, `text.rs`, `message.rs`, `status.rs` | the types |
 //!

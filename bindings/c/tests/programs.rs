@@ -3,8 +3,10 @@
 #[path = "programs/ground.rs"]
 mod ground;
 
+use std::io::{PipeReader, PipeWriter, Write, pipe};
+
 use ground::{C, CPP, CPP20, Ground, WATCHDOG, is_there};
-use rustix::process::Signal;
+use rustix::{io::ioctl_fionbio, process::Signal};
 use serde::{Deserialize, Serialize};
 use sinew::{Endpoint, Kind, NodeApi, Outcome, Payload, Registration, RequirementEvent, Tid};
 
@@ -80,6 +82,32 @@ fn the_library_says_on_the_standard_error_what_sinew_log_asks_for() {
     let greeter = C.shared("examples/greeter.c", &ground);
     let mut greeter = ground.start_under(&["env", "SINEW_LOG=debug"], &greeter, &[]);
     greeter.wait_for(&["registered", "knee"]);
+}
+
+/// A pipe that takes nothing, with the end that nobody reads.
+fn full_pipe() -> (PipeReader, PipeWriter) {
+    let (unread, mut full) = pipe().expect("the system has a pipe");
+    ioctl_fionbio(&full, true).expect("it is ours");
+    while full.write(&[b'.'; 4_096]).is_ok() {}
+    ioctl_fionbio(&full, false).expect("it is ours");
+    (unread, full)
+}
+
+#[test]
+fn a_standard_error_that_nobody_reads_stops_no_call() {
+    if !is_there("gcc") {
+        return;
+    }
+    let ground = Ground::new();
+    let (_unread, full) = full_pipe();
+    let mut greeter = ground.start_logging_to(full, &C.shared("examples/greeter.c", &ground));
+    greeter.wait_for(&["the greeter is there"]);
+    let mut asking = endpoint(&ground, Registration::new());
+    let to = resolve(&mut asking, "greeter");
+    let mut name = asking.create_message(to, Kind::named("demo.name"), 5).unwrap();
+    name.copy_from_slice(b"Ankle");
+    assert_eq!(asking.ask_message(name, WATCHDOG).unwrap().bytes(), b"Hello, Ankle");
+    assert_eq!(greeter.wait_for_end(), Some(0));
 }
 
 #[test]

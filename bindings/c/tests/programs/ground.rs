@@ -2,7 +2,7 @@
 
 use std::{
     path::{Path, PathBuf},
-    process::Command,
+    process::{Command, Stdio},
 };
 
 use sinew_tests::{OwnDirectory, Program, own_group};
@@ -117,6 +117,14 @@ impl Ground {
         command.args(["-c", r#"exec "$@" 2>&1"#, "sh"]).args(over).arg(program);
         command.arg(self.socket()).args(arguments);
         // Cargo's own search path may lead to the library of an earlier build.
+        command.env_remove("LD_LIBRARY_PATH");
+        Program::start(&program.display().to_string(), command)
+    }
+
+    /// The same with all of the library's log on this standard error.
+    pub(crate) fn start_logging_to(&self, stderr: impl Into<Stdio>, program: &Path) -> Program {
+        let mut command = Command::new(program);
+        command.arg(self.socket()).env("SINEW_LOG", "debug").stderr(stderr);
         command.env_remove("LD_LIBRARY_PATH");
         Program::start(&program.display().to_string(), command)
     }
