@@ -77,7 +77,7 @@ impl Requirement {
     /// where several nodes have one of a name, each of them does; the one that requires it does not.
     #[must_use]
     pub fn at_least<N: Into<String>>(count: usize, names: impl IntoIterator<Item = N>) -> Self {
-        let of: Vec<String> = names.into_iter().map(Into::into).collect();
+        let of: Vec<String> = names.into_iter().map(|name| plain(&name.into())).collect();
         let choice = of.join(" | ");
         let text = if count == 1 { choice } else { format!("{count}{OF}{choice}") };
         Self { text, at_least: count, of, or_after: None }
@@ -184,14 +184,21 @@ fn parse(text: &str) -> Result<Requirement, &'static str> {
         if name.chars().any(char::is_control) {
             return Err("a name has no control characters");
         }
-        if !of.iter().any(|known| known == name) {
-            of.push(name.to_owned());
+        let name = plain(name);
+        if !of.contains(&name) {
+            of.push(name);
         }
     }
     if of.len() > ALTERNATIVES_MAX {
         return Err("it chooses between more than 16 names; use a pattern");
     }
     Ok(Requirement { text: text.to_owned(), at_least: usize::from(at_least), of, or_after })
+}
+
+/// A name or pattern, each run of `*` in it being one: they say the same, and cost more.
+fn plain(name: &str) -> String {
+    let mut before = None;
+    name.chars().filter(|letter| before.replace(*letter) != Some('*') || *letter != '*').collect()
 }
 
 /// `500ms`, `2s`.
@@ -240,6 +247,11 @@ mod tests {
         assert_eq!(read("a | b|c").alternatives(), ["a", "b", "c"]);
         let counted = read("2 of *.drive ?1500ms");
         assert_eq!((counted.count(), counted.wait_max()), (2, Some(Duration::from_millis(1_500))));
+        assert_eq!(
+            read("a** | a*|a|***b*").alternatives(),
+            ["a*", "a", "*b*"],
+            "no star twice, nothing twice"
+        );
         assert_eq!(read("camera ?2s").wait_max(), Some(Duration::from_secs(2)));
         assert_eq!(read("king of spain").only_name(), Some("king of spain"), "no number, no count");
         assert_eq!((read("*.drive").only_name(), read("a ?1s").only_name()), (None, None));
