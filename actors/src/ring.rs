@@ -41,7 +41,7 @@ pub(crate) enum ExchangeError {
     Missing,
     /// Our own fault.
     #[error(
-        "the thread that maps shared memory has panicked, which is a fault of this node's; connect again"
+        "the thread that maps shared memory has panicked or has too much to do, which is a fault of this node's; connect again"
     )]
     Fault,
     /// Other rings have all that there may be.

@@ -44,7 +44,8 @@ impl From<FrameError> for LinkError {
     }
 }
 
-/// Makes the node's half of the rings; `None` where the system has no memory for it, which is said once a link. The caller has a
+/// Makes the node's half of the rings; `None` where the system has no memory for it, which is said once a link, or where the thread `rings`
+/// has too much to do. The caller has a
 /// deadline.
 pub(super) async fn prepare(ring_bytes: usize, rings: &Rings) -> Option<(Capacity, Kept<Exchange>)> {
     let (capacity, keeper) = (ring::capacity(ring_bytes), rings.clone());
@@ -80,8 +81,10 @@ pub(super) async fn exchange(
         }
     };
     let keeper = rings.clone();
+    // What a hostile client has passed may take for ever to close.
+    let theirs = rings.keep(theirs);
     let map = move || {
-        let (producer, consumer) = exchange.into_inner().finish(theirs)?;
+        let (producer, consumer) = exchange.into_inner().finish(theirs.into_inner())?;
         Ok::<_, ExchangeError>((keeper.keep(producer), keeper.keep(consumer)))
     };
     let (producer, consumer) = rings.run(map).await.ok_or(ExchangeError::Fault)??;
