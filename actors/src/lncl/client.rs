@@ -7,9 +7,9 @@ mod notices;
 mod orders;
 mod outcomes;
 
-use std::{ops::ControlFlow, rc::Rc, sync::Arc, time::Duration};
+use std::{io::ErrorKind, ops::ControlFlow, rc::Rc, sync::Arc, time::Duration};
 
-use bytes::BytesMut;
+use bytes::{Buf, BytesMut};
 use rustix::net::Shutdown;
 use sinew_runtime::{
     monitor::DownClass,
@@ -275,7 +275,7 @@ impl Client {
             return Ok((ClientReader::Plain(reader), link));
         };
         // spec: LNCL-9
-        write_now(&self.peer.stream, &self.registered(Some(capacity.bytes())))?;
+        write_soon(&self.peer.stream, encoded(&self.registered(Some(capacity.bytes())))).await?;
         self.ring = Ring::Told;
         let exchange = link::exchange(exchange, &self.peer.stream, payload_max, self.server.rings());
         let (socket, reader) = match tokio::time::timeout(HANDSHAKE, exchange).await {
@@ -343,15 +343,43 @@ impl Client {
     }
 }
 
-/// Writes a frame that the socket has room for: the first one.
-fn write_now(stream: &UnixStream, message: &Message) -> Result<(), End> {
+fn encoded(message: &Message) -> BytesMut {
     let mut bytes = BytesMut::new();
     encode_frame(&message.header, &message.payload, &mut bytes);
-    match stream.try_write(&bytes) {
-        Ok(count) if count == bytes.len() => Ok(()),
-        Ok(_) => Err(End::HungUp(None)),
-        Err(cause) => Err(End::HungUp(Some(cause))),
+    bytes
+}
+
+/// Writes a frame that the socket has room for: the last one.
+fn write_now(stream: &UnixStream, message: &Message) -> Result<(), End> {
+    let mut bytes = encoded(message);
+    write_some(stream, &mut bytes)?;
+    if bytes.is_empty() { Ok(()) } else { Err(End::HungUp(None)) }
+}
+
+/// Writes what the socket has room for now; `bytes` are the rest.
+fn write_some(stream: &UnixStream, bytes: &mut BytesMut) -> Result<(), End> {
+    while !bytes.is_empty() {
+        match stream.try_write(bytes) {
+            Ok(count) => bytes.advance(count),
+            Err(cause) if cause.kind() == ErrorKind::WouldBlock => break,
+            Err(cause) => return Err(End::HungUp(Some(cause))),
+        }
     }
+    Ok(())
+}
+
+/// Writes all of it as the peer reads, which has [`HANDSHAKE`] for that.
+async fn write_soon(stream: &UnixStream, mut bytes: BytesMut) -> Result<(), End> {
+    let write = async {
+        loop {
+            write_some(stream, &mut bytes)?;
+            if bytes.is_empty() {
+                return Ok(());
+            }
+            stream.writable().await.map_err(|cause| End::HungUp(Some(cause)))?;
+        }
+    };
+    tokio::time::timeout(HANDSHAKE, write).await.unwrap_or(Err(End::HungUp(None)))
 }
 
 fn limits(stores: &Stores) -> OutletLimits {
@@ -361,5 +389,37 @@ fn limits(stores: &Stores) -> OutletLimits {
         queue_bytes: config.mailbox_bytes,
         unconfirmed_max: config.mailbox_capacity,
         payload_max: config.payload_max,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Read;
+
+    use super::*;
+
+    #[test]
+    fn a_frame_for_which_there_was_not_room_comes_whole_when_the_peer_reads() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+        runtime.block_on(async {
+            // Given: a peer that does not read, and more than its socket takes.
+            let (ours, mut theirs) = std::os::unix::net::UnixStream::pair().expect("a pair");
+            ours.set_nonblocking(true).expect("it is ours");
+            let ours = UnixStream::from_std(ours).expect("it is a socket");
+            let whole: Vec<u8> = (0..2_000_000_u32).map(|index| (index % 251) as u8).collect();
+            let mut rest = BytesMut::from(&whole[..]);
+            ours.writable().await.expect("it takes something");
+            assert!(write_some(&ours, &mut rest).is_ok());
+            assert!(!rest.is_empty() && rest.len() < whole.len(), "{} bytes are left", rest.len());
+            // When: it reads.
+            let reading = std::thread::spawn(move || {
+                let mut read = Vec::new();
+                theirs.read_to_end(&mut read).map(|_| read)
+            });
+            assert!(write_soon(&ours, rest).await.is_ok());
+            drop(ours);
+            // Then:
+            assert!(reading.join().expect("no panic").expect("it reads") == whole);
+        });
     }
 }

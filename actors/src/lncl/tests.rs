@@ -150,6 +150,25 @@ fn a_client_that_wants_to_know_what_it_waits_for_is_told_and_told_again_when_tha
     client.expect_registered();
 }
 
+// spec: LNCL-6
+#[test]
+fn a_client_that_waits_for_very_much_is_told_so_much_of_it_as_any_socket_has_room_for() {
+    let mut node = TestNode::start();
+    let mut client = RawClient::connect(&node);
+    let requires = (0..64).map(|index| format!("{index:0>60} | x ?9s")).collect();
+    client.ask_for_address(&Register { waits: true, requires, ..Register::default() });
+    assert!(payload::read::<Waiting>(&client.next().expect("a frame").payload).unwrap().missing.is_empty());
+    let fact = node.fact();
+    lock(&node.stores.sync).handle(Time::now(), sync::Input::AppChanged(fact));
+    let frame = client.next().expect("what it waits for");
+    let missing = payload::read::<Waiting>(&frame.payload).unwrap().missing;
+    assert!(
+        (1..=16).contains(&missing.len()) && frame.payload.len() < 2_048,
+        "{} bytes",
+        frame.payload.len()
+    );
+}
+
 #[test]
 fn one_connection_too_many_is_refused_in_words() {
     let node = TestNode::start_with(|config| config.lncl.clients_max = 1);

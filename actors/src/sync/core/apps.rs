@@ -162,6 +162,11 @@ impl Apps {
         self.iter().filter_map(|(address, app)| Some((address, app, app.wait()?)))
     }
 
+    /// All names.
+    pub(super) fn names(&self) -> impl Iterator<Item = &Name> {
+        self.names.keys()
+    }
+
     /// The applications whose names match `pattern`.
     pub(super) fn matching(&self, pattern: &str) -> impl Iterator<Item = (&Name, AppAddress, &App)> {
         let names = self.names.iter().filter(|(name, _)| matches(pattern, name));

@@ -108,3 +108,40 @@ fn a_circle_through_a_choice_is_refused_only_if_no_way_is_left() {
     bench.links(KNEE, LIFE);
     assert!(bench.list(KNEE, list(1, &[("c", true, &[])])).contains(&release(0)));
 }
+
+#[test]
+fn what_an_application_waits_for_is_said_in_brief_as_it_is() {
+    let mut bench = Bench::new();
+    bench.registers(0, "gait", &["2 of *.drive", "hip.imu | knee.imu", "camera"]);
+    bench.registers(1, "hip.drive", &[]);
+    bench.registers(2, "knee.imu", &[]);
+    bench.ready(1);
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("knee.drive", false, &[]), ("knee.eye", true, &[])]));
+    assert_eq!(bench.core.missing_in_brief(app(0)), bench.missing());
+    bench.list(KNEE, list(2, &[("knee.drive", true, &[]), ("hip.imu", true, &[])]));
+    assert_eq!(words(&bench.core.missing_in_brief(app(0))), ["camera: never seen"]);
+    assert_eq!(bench.core.missing_in_brief(app(1)), [], "it does not wait");
+}
+
+#[test]
+fn what_costs_too_much_to_look_at_is_not_looked_at_to_its_end() {
+    // Given: many names, and one who requires more of them than there are, by as many patterns as may be.
+    let mut bench = Bench::new();
+    (1..=200).for_each(|index| drop(bench.registers(index, &format!("name{index}"), &[])));
+    let all: Vec<String> = (0..16)
+        .map(|index| format!("*{}", ["n", "a", "m", "e"][index % 4].to_owned() + &"*".repeat(index / 4 + 1)))
+        .collect();
+    let patterns = all.join(" | ");
+    let requires: Vec<String> = (0..64).map(|index| format!("{} of {patterns}", 1_000 + index)).collect();
+    let requires: Vec<&str> = requires.iter().map(String::as_str).collect();
+    bench.registers(0, "gait", &requires);
+    // Then:
+    let [(what, why)] = &bench.core.missing_in_brief(app(0))[..] else { panic!("the first one is too much") };
+    assert!(what.starts_with("1000 of") && why.starts_with("not looked at"), "{what}: {why}");
+    // And: of many that are looked at, so many are said.
+    let many: Vec<String> = (0..64).map(|index| format!("none{index}")).collect();
+    let many: Vec<&str> = many.iter().map(String::as_str).collect();
+    bench.registers(201, "knee", &many);
+    assert_eq!(bench.core.missing_in_brief(app(201)).len(), 16);
+}

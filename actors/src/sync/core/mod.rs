@@ -7,6 +7,7 @@
 mod answers;
 mod apps;
 mod barrier;
+mod brief;
 mod cycles;
 mod directory;
 mod meet;

@@ -250,6 +250,11 @@ impl Peers {
         self.called(name).map(|(tid, peer, entry)| (tid, peer.why_not(entry)))
     }
 
+    /// All names.
+    pub(super) fn names(&self) -> impl Iterator<Item = &Name> {
+        self.names.keys()
+    }
+
     /// The names that match `pattern`.
     pub(super) fn names_like(&self, pattern: &str) -> impl Iterator<Item = &Name> {
         self.names.keys().filter(move |name| matches(pattern, name))

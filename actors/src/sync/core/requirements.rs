@@ -10,7 +10,7 @@ use sinew_runtime::{
 use super::{Core, Reason};
 
 /// Of those that a requirement with a pattern or a choice lacks, so many are named at most.
-const NAMED_MAX: usize = 8;
+pub(super) const NAMED_MAX: usize = 8;
 
 /// How one requirement of one application stands.
 #[derive(Debug, Default)]
@@ -21,6 +21,16 @@ pub(super) struct Standing {
     pub(super) unready: Vec<(String, Reason)>,
     /// Those of its names and patterns that somebody has, ready or not.
     pub(super) had: Vec<String>,
+}
+
+/// Why one is not met.
+pub(super) struct Lack<'found> {
+    /// How many are ready: too few.
+    pub(super) ready: usize,
+    /// As in [`Standing`].
+    pub(super) unready: &'found [(String, Reason)],
+    /// The nearest to readiness of the reasons.
+    pub(super) nearest: Reason,
 }
 
 impl Standing {
@@ -93,18 +103,31 @@ impl Core {
     ) -> Vec<(String, &'static str)> {
         let standing = self.standing(of, requirement);
         let Some(nearest) = standing.why_not(requirement) else { return Vec::new() };
-        let in_cycle = |name: &str| self.cycles.iter().any(|cycle| cycle.iter().any(|other| other == name));
+        let lack = Lack { ready: standing.ready.len(), unready: &standing.unready, nearest };
+        self.parts(requirement, lack, usize::MAX)
+    }
+
+    /// The parts of a requirement that is not met. That a name is part of a circle is seen within the first
+    /// `cycle_names_max` names of circles.
+    pub(super) fn parts(
+        &self,
+        requirement: &Requirement,
+        lack: Lack<'_>,
+        cycle_names_max: usize,
+    ) -> Vec<(String, &'static str)> {
+        let Lack { ready, unready, nearest } = lack;
+        let in_cycle =
+            |name: &str| self.cycles.iter().flatten().take(cycle_names_max).any(|other| other == name);
         let words = |name: &str, reason: Reason| {
             if in_cycle(name) { Reason::Cycle.words() } else { reason.words() }
         };
         if let Some(name) = requirement.only_name() {
             return vec![(name.to_owned(), words(name, nearest))];
         }
-        let ready = standing.ready.len();
-        if standing.unready.is_empty() {
+        if unready.is_empty() {
             return vec![(format!("{requirement} ({ready} ready)"), nearest.words())];
         }
-        let named = standing.unready.iter().take(NAMED_MAX);
+        let named = unready.iter().take(NAMED_MAX);
         named
             .map(|(name, reason)| (format!("{requirement} ({ready} ready): {name}"), words(name, *reason)))
             .collect()
