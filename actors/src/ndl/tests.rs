@@ -325,8 +325,8 @@ fn nobody_notices_that_the_layer_of_a_node_is_restarted() {
 #[test]
 fn a_refused_dial_after_gncl_and_ndl_were_restarted_is_a_crash_of_who_was_linked() {
     run(async {
-        // given: a link stood, and no more is heard of it
-        let mut first = Node::start(1, |_| {}).await;
+        // given: a link stood, of which no more is heard, and a period so long that only the refusal can tell
+        let mut first = Node::start(1, |ndl| ndl.period = Duration::from_secs(60)).await;
         let seed = first.udp();
         let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
         first.finds(&second).await;
