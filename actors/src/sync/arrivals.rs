@@ -134,6 +134,10 @@ pub(crate) fn fault_of_parties(parties: &[Requirement]) -> Option<&'static str> 
         Some("it has no parties; name who has to be there, or `3 of *` for any three")
     } else if parties.iter().any(|party| party.wait_max().is_some()) {
         Some("a party of a barrier has no wait limit: whoever waits has one for all")
+    } else if parties.iter().map(Requirement::count).sum::<usize>() > ARRIVALS_MAX {
+        Some(
+            "its parties are more than 1,024 applications together, which is the limit; use several barriers",
+        )
     } else {
         None
     }
@@ -164,10 +168,16 @@ mod tests {
     }
 
     #[test]
+    fn as_many_parties_as_can_pass_together_are_no_fault() {
+        assert!(fault_of_parties(&[Requirement::at_least(ARRIVALS_MAX, ["*"])]).is_none());
+    }
+
+    #[test]
     fn what_no_node_can_mean_is_refused() {
-        let wrong: [fn(&mut BarrierSaid); 6] = [
+        let wrong: [fn(&mut BarrierSaid); 7] = [
             |barrier| barrier.parties.clear(),
             |barrier| barrier.parties.push("camera ?1s".parse().unwrap()),
+            |barrier| barrier.parties.push(Requirement::at_least(ARRIVALS_MAX - 2, ["*"])),
             |barrier| barrier.generation = u64::MAX,
             |barrier| barrier.generation = 2,
             |barrier| barrier.arrivals.push(barrier.arrivals[0].clone()),
