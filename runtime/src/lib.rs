@@ -17,10 +17,12 @@
 //! | [`protection`] | end-to-end protection of commands, and outputs that are safe without them |
 //! | [`schedule`] | what an actor does when |
 //! | [`app`] | what an application is |
-//! | [`timer`] | the kernel's timer, exact to microseconds |
+//! | [`timer`], [`alarm`] | the kernel's timer, exact to microseconds; a task that it wakes |
 //! | [`supervision`] | who is started, when, and again after a fault |
 //! | [`log`] | what the runtime says of itself, without waiting for who reads it |
 
+#[cfg_attr(not(target_os = "linux"), path = "alarm_elsewhere.rs")]
+pub mod alarm;
 pub mod app;
 pub mod log;
 pub mod mailbox;

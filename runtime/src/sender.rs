@@ -1,24 +1,24 @@
 //! How an application sends: fire and forget, confirmed, or asking.
 
+mod awaiting;
 mod clock;
 
 use std::{
-    marker::PhantomData,
-    pin::Pin,
     sync::{
         Arc,
         atomic::{AtomicU64, Ordering},
     },
-    task::{Context, Poll, ready},
     time::Duration,
 };
 
 use bytes::Bytes;
 
+pub use self::awaiting::{Confirmation, Reply};
+use self::awaiting::{Deadline, Request};
 use crate::{
     monitor::{MonitorError, MonitorId},
     outcome::{Outcome, Receipt, Rejection, Ticket},
-    pending::{Awaited, Pending, Settlement, Wait},
+    pending::{Awaited, Pending, Wait},
     protection::{Echo, Flows},
     router::Router,
     supervision::vitals::Vitals,
@@ -261,7 +261,7 @@ impl Sender {
         }
         let wait = self.expect_answer(&mut message, Awaited::Outcome, within)?;
         let sent = self.dispatch(message)?;
-        Ok(Confirmation(Deadline::new(wait, sent + within)))
+        Ok(Confirmation::new(Deadline::new(wait, sent + within)))
     }
 
     /// Sends a request; the returned future ends with the reply, an error, or at the deadline.
@@ -282,8 +282,8 @@ impl Sender {
         let destination = self.shared.router.absolute(message.header.destination);
         let ticket = Ticket { source: self.shared.tid, destination, correlation: wait.correlation() };
         let sent = self.dispatch(message)?;
-        let request = Some(Request { router: self.shared.router.clone(), ticket });
-        Ok(Reply { deadline: Deadline::new(wait, sent + within), within, request, reply: PhantomData })
+        let request = Request { router: self.shared.router.clone(), ticket };
+        Ok(Reply::new(Deadline::new(wait, sent + within), within, request))
     }
 
     /// Whether whoever asked still waits for the reply, as far as is known here: its deadline is not over, and it has not given
@@ -433,115 +433,5 @@ impl ReplyTo {
     #[must_use]
     pub const fn deadline(&self) -> Time {
         self.until
-    }
-}
-
-/// A request whose reply is awaited.
-struct Request {
-    router: Arc<Router>,
-    ticket: Ticket,
-}
-
-impl std::fmt::Debug for Request {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "Request({:?})", self.ticket)
-    }
-}
-
-/// A wait with its deadline, which counts from the send. The timer is made at the first poll: by the runtime of the thread that polls, and where there is
-/// none by one that is kept for that.
-#[derive(Debug)]
-struct Deadline {
-    wait: Wait,
-    until: Time,
-    timer: Option<Pin<Box<tokio::time::Sleep>>>,
-}
-
-impl Deadline {
-    const fn new(wait: Wait, until: Time) -> Self {
-        Self { wait, until, timer: None }
-    }
-
-    /// What came, or `None` at the deadline.
-    fn poll(&mut self, cx: &mut Context<'_>) -> Poll<Option<Settlement>> {
-        if let Poll::Ready(settlement) = self.wait.poll_settled(cx) {
-            return Poll::Ready(Some(settlement));
-        }
-        if self.timer.is_none() {
-            let now = Time::now();
-            if self.until <= now {
-                return Poll::Ready(None);
-            }
-            self.timer = clock::sleep(self.until.since(now));
-        }
-        // Where there is no timer nobody can say when the deadline is: it is now.
-        if let Some(timer) = &mut self.timer {
-            ready!(timer.as_mut().poll(cx));
-        }
-        Poll::Ready(None)
-    }
-}
-
-/// The future outcome of a confirmed message. Any thread may poll it, with any executor; in a runtime of tokio's, one whose
-/// time is enabled.
-#[derive(Debug)]
-#[must_use = "an outcome that nobody reads is no better than an unconfirmed send"]
-pub struct Confirmation(Deadline);
-
-impl Future for Confirmation {
-    type Output = Outcome;
-
-    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Outcome> {
-        Poll::Ready(match ready!(self.0.poll(cx)) {
-            Some(Settlement::Outcome(outcome)) => outcome,
-            Some(Settlement::Reply(_)) | None => Outcome::Unknown,
-        })
-    }
-}
-
-/// The future reply to a request. Any thread may poll it, with any executor; in a runtime of tokio's, one whose time is
-/// enabled.
-///
-/// Dropping it before it has ended gives the request up: where it still waits for its handler it is taken back, on any node, and
-/// a handler that has begun can [see](Sender::is_wanted) it.
-#[derive(Debug)]
-#[must_use = "a reply that nobody reads need not be asked for"]
-pub struct Reply<R> {
-    deadline: Deadline,
-    within: Duration,
-    /// `None` once this has ended.
-    request: Option<Request>,
-    reply: PhantomData<fn() -> R>,
-}
-
-impl<R> Reply<R> {
-    /// The number of the request: the `correlation` in its header, by which its sender tells it from its others.
-    #[must_use]
-    pub const fn correlation(&self) -> u64 {
-        self.deadline.wait.correlation()
-    }
-}
-
-impl<R: Payload> Future for Reply<R> {
-    type Output = Result<R, AskError>;
-
-    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Self::Output> {
-        let settled = ready!(self.deadline.poll(cx));
-        // At its deadline it expires where it waits, by itself.
-        self.request = None;
-        Poll::Ready(match settled {
-            Some(Settlement::Reply(message)) => message.decode().map_err(AskError::from),
-            Some(Settlement::Outcome(outcome)) => Err(AskError::Ended(outcome)),
-            None => Err(AskError::Deadline(self.within)),
-        })
-    }
-}
-
-impl<R> Drop for Reply<R> {
-    fn drop(&mut self) {
-        let Some(Request { router, ticket }) = self.request.take() else { return };
-        if self.deadline.wait.is_open() {
-            router.cancel(ticket);
-        }
     }
 }

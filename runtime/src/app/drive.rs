@@ -15,9 +15,9 @@ use actix::{Actor, ActorContext, ActorFuture, ActorState, Handler};
 use bytes::Bytes;
 
 use crate::{
+    alarm::Alarm,
     app::{
         AppContext, Delivery, Raw, Silence, WatchId,
-        alarm::Alarm,
         context::Action,
         requirement::{Requirements, event_in},
     },

@@ -4,8 +4,6 @@
 //! has a `Handler<Delivery<P>>` for each. Everything that actix gives an actor (spawned futures, `run_later`, an
 //! `Addr`) works as usual.
 
-#[cfg_attr(not(target_os = "linux"), path = "alarm_elsewhere.rs")]
-mod alarm;
 mod away;
 mod context;
 mod delivery;
@@ -19,7 +17,7 @@ pub use away::{Absence, Away, Heir, LastWill, WILLS_MAX, Will};
 pub use context::{AppContext, Silence, WatchId};
 pub use delivery::{Delivery, Raw};
 pub use required::{
-    ALTERNATIVES_MAX, REQUIREMENT_BYTES_MAX, Requirement, RequirementError, is_pattern, matches,
+    ALTERNATIVES_MAX, REQUIREMENT_BYTES_MAX, Requirement, RequirementError, is_pattern, is_phase, matches,
 };
 pub use requirement::{RequirementEvent, RequirementPolicy};
 pub use spec::{AppSpec, AppWiring, DynApp};

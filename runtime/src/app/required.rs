@@ -9,6 +9,7 @@
 //! | `*.drive` | one whose name matches is: `*` stands for any characters, also for none |
 //! | `hip.imu \| knee.imu` | any of these is |
 //! | `2 of *.drive` | at least 2 applications are, each counted once, where several nodes have a name each of them |
+//! | `knee.drive at homed`, `2 of *.drive at homed` | it has reached the phase `homed` in its present life, ready or not |
 //! | `camera ?500ms`, `2 of *.drive ?2s` | it is, or the application has waited so long: then it starts without |
 
 use std::{fmt, str::FromStr, time::Duration};
@@ -23,6 +24,8 @@ pub const ALTERNATIVES_MAX: usize = 16;
 const NAME_BYTES_MAX: usize = 63;
 /// What ends the count of a requirement.
 const OF: &str = " of ";
+/// What begins the phase of a requirement.
+const AT: &str = " at ";
 
 /// One requirement of an application: its text, and what it says.
 ///
@@ -47,6 +50,7 @@ pub struct Requirement {
     text: String,
     at_least: usize,
     of: Vec<String>,
+    phase: Option<String>,
     or_after: Option<Duration>,
 }
 
@@ -74,21 +78,41 @@ impl Requirement {
     }
 
     /// At least `count` applications whose names are among these or match them are ready. Each application counts once, and
-    /// where several nodes have one of a name, each of them does; the one that requires it does not.
+    /// where several nodes have one of a name, each of them does; the one that requires it counts too: it does not wait for itself.
     #[must_use]
     pub fn at_least<N: Into<String>>(count: usize, names: impl IntoIterator<Item = N>) -> Self {
         let of: Vec<String> = names.into_iter().map(|name| plain(&name.into())).collect();
-        let choice = of.join(" | ");
-        let text = if count == 1 { choice } else { format!("{count}{OF}{choice}") };
-        Self { text, at_least: count, of, or_after: None }
+        Self { text: String::new(), at_least: count, of, phase: None, or_after: None }.spelled()
+    }
+
+    /// It is enough, and needed, that they have reached this phase in their present lives, be they ready or not. A phase is one word
+    /// ([`is_phase`]).
+    #[must_use]
+    pub fn at(mut self, phase: impl Into<String>) -> Self {
+        self.phase = Some(phase.into());
+        self.spelled()
     }
 
     /// After this time at the barrier the application starts without it, and is told so
     /// ([`RequirementEvent::Without`](crate::app::RequirementEvent::Without)). Whole milliseconds.
     #[must_use]
     pub fn or_after(mut self, wait: Duration) -> Self {
-        self.text = format!("{} ?{}ms", self.text, wait.as_millis());
         self.or_after = Some(wait);
+        self.spelled()
+    }
+
+    /// With the text that says it.
+    fn spelled(mut self) -> Self {
+        self.text = self.of.join(" | ");
+        if self.at_least != 1 {
+            self.text = format!("{}{OF}{}", self.at_least, self.text);
+        }
+        if let Some(phase) = &self.phase {
+            self.text = format!("{}{AT}{phase}", self.text);
+        }
+        if let Some(wait) = self.or_after {
+            self.text = format!("{} ?{}ms", self.text, wait.as_millis());
+        }
         self
     }
 
@@ -110,6 +134,12 @@ impl Requirement {
         &self.of
     }
 
+    /// The phase that they have to have reached; `None`: they have to be ready.
+    #[must_use]
+    pub fn phase(&self) -> Option<&str> {
+        self.phase.as_deref()
+    }
+
     /// For how long an application waits for it at most; `None`: it does not start without.
     #[must_use]
     pub const fn wait_max(&self) -> Option<Duration> {
@@ -119,8 +149,14 @@ impl Requirement {
     /// The one name that it asks for, if that is all that it asks for.
     #[must_use]
     pub fn only_name(&self) -> Option<&str> {
+        self.one_name().filter(|_| self.phase.is_none() && self.or_after.is_none())
+    }
+
+    /// The one name that it asks for, in whichever phase and for however long.
+    #[must_use]
+    pub fn one_name(&self) -> Option<&str> {
         match self.of.as_slice() {
-            [name] if self.at_least == 1 && self.or_after.is_none() && !is_pattern(name) => Some(name),
+            [name] if self.at_least == 1 && !is_pattern(name) => Some(name),
             _ => None,
         }
     }
@@ -130,6 +166,13 @@ impl Requirement {
     pub fn counts(&self, name: &str) -> bool {
         self.of.iter().any(|pattern| matches(pattern, name))
     }
+}
+
+/// Whether a text can be a phase: one word of 1 to 63 bytes, without `*`, `|` and `?`.
+#[must_use]
+pub fn is_phase(text: &str) -> bool {
+    let is_odd = |letter: char| letter.is_whitespace() || letter.is_control() || "*|?".contains(letter);
+    (1..=NAME_BYTES_MAX).contains(&text.len()) && !text.contains(is_odd)
 }
 
 /// Whether a text stands for more than the one name that it spells.
@@ -171,6 +214,10 @@ fn parse(text: &str) -> Result<Requirement, &'static str> {
         }
         None => (text, None),
     };
+    let (choice, phase) = match choice.rsplit_once(AT) {
+        Some((choice, phase)) if is_phase(phase) => (choice, Some(phase.to_owned())),
+        Some(_) | None => (choice, None),
+    };
     let counted = choice.split_once(OF).and_then(|(count, of)| Some((count.parse::<u16>().ok()?, of)));
     let (at_least, choice) = counted.unwrap_or((1, choice));
     if at_least == 0 {
@@ -192,7 +239,7 @@ fn parse(text: &str) -> Result<Requirement, &'static str> {
     if of.len() > ALTERNATIVES_MAX {
         return Err("it chooses between more than 16 names; use a pattern");
     }
-    Ok(Requirement { text: text.to_owned(), at_least: usize::from(at_least), of, or_after })
+    Ok(Requirement { text: text.to_owned(), at_least: usize::from(at_least), of, phase, or_after })
 }
 
 /// A name or pattern, each run of `*` in it being one: they say the same, and cost more.
@@ -255,6 +302,14 @@ mod tests {
         assert_eq!(read("camera ?2s").wait_max(), Some(Duration::from_secs(2)));
         assert_eq!(read("king of spain").only_name(), Some("king of spain"), "no number, no count");
         assert_eq!((read("*.drive").only_name(), read("a ?1s").only_name()), (None, None));
+        let phased = read("2 of *.drive at homed ?2s");
+        assert_eq!(
+            (phased.phase(), phased.count(), phased.alternatives()),
+            (Some("homed"), 2, &["*.drive".to_owned()][..])
+        );
+        assert_eq!((phased.wait_max(), phased.only_name()), (Some(Duration::from_secs(2)), None));
+        assert_eq!(read("a at homed").one_name(), Some("a"));
+        assert_eq!(read("king at the castle").only_name(), Some("king at the castle"), "no word, no phase");
     }
 
     #[test]
@@ -263,6 +318,7 @@ mod tests {
             Requirement::name("knee"),
             Requirement::any(["a", "b*"]),
             Requirement::at_least(3, ["*.drive"]).or_after(Duration::from_millis(20)),
+            Requirement::any(["a", "b"]).or_after(Duration::from_millis(20)).at("homed"),
         ];
         for requirement in built {
             assert_eq!(read(requirement.as_str()), requirement);

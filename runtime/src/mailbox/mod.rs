@@ -4,7 +4,9 @@
 //! them out. When the actor panics the message in its hand ends as `Failed`, the rest stays and goes to the next
 //! incarnation. Queue and waker stand under one mutex, see [`post`](crate::post).
 
+mod about;
 mod budget;
+mod ends;
 mod lender;
 mod queue;
 mod reader;
@@ -19,6 +21,7 @@ use std::{
     task::Waker,
 };
 
+pub use about::About;
 pub use budget::Budget;
 pub use lender::Lender;
 pub use queue::{Bounds, ClassQueue, is_same_stream};
@@ -46,7 +49,7 @@ pub struct Mailbox {
 #[derive(Debug)]
 struct Shared {
     queue: ClassQueue,
-    /// What this node's layers say: ahead of everything else.
+    /// What this node's layers say: ahead of everything else, but for what is [said of a node's end](About::End).
     events: VecDeque<Message>,
     events_max: usize,
     /// The reader takes nothing but events, and is not woken for anything else.
@@ -76,8 +79,9 @@ impl Shared {
 
     /// Takes out every event.
     fn take_events(&mut self) -> Vec<Message> {
-        let events = std::mem::take(&mut self.events);
-        self.rejected(events.into())
+        let mut events = Vec::from(std::mem::take(&mut self.events));
+        events.extend(self.queue.take_events());
+        self.rejected(events)
     }
 
     fn rejected(&mut self, waiting: Vec<Message>) -> Vec<Message> {
@@ -102,6 +106,11 @@ impl Shared {
             return Err(Refused::new(event, Rejection::QueueFull));
         }
         tally.taken += 1;
+        let Some(event) = self.queue.keep_behind(event) else {
+            // It waits with messages, which are not taken in a pause.
+            self.high_water = self.high_water.max(self.waiting());
+            return Ok(if self.paused { None } else { self.waker.take() });
+        };
         self.events.push_back(event);
         self.high_water = self.high_water.max(self.waiting());
         Ok(self.waker.take())

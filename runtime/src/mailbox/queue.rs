@@ -2,7 +2,7 @@
 
 use std::{collections::VecDeque, sync::Arc, task::Waker};
 
-use super::{Budget, room::Awaited};
+use super::{Budget, ends::Ends, room::Awaited};
 use crate::{
     outcome::{Rejection, Ticket},
     router::Refused,
@@ -42,16 +42,19 @@ impl From<usize> for Bounds {
 /// - Control and Bulk keep the order in which they came.
 /// - Stream keeps one message for each source and kind: a newer one takes the place of the older, and its turn.
 /// - A lane that was passed over 32 times has one turn.
+/// - What is left of a node whose end is told, and that, goes before all else.
 /// - A full lane refuses; it never drops. It is full when it holds as many messages, or as many bytes, as it may.
 #[derive(Debug)]
 pub struct ClassQueue {
-    lanes: [VecDeque<Message>; 3],
+    pub(super) lanes: [VecDeque<Message>; 3],
+    /// What is left of nodes that are gone, each with what is said of that behind it.
+    pub(super) ends: Ends,
     /// Bytes of the payloads in each lane.
-    bytes: [usize; 3],
+    pub(super) bytes: [usize; 3],
     passed_over: [u32; 3],
     bounds: Bounds,
     /// What it shares with others.
-    budget: Option<Arc<Budget>>,
+    pub(super) budget: Option<Arc<Budget>>,
     /// Nothing that waits expires before this.
     earliest_expiry: Time,
     /// Who waits for room.
@@ -64,6 +67,7 @@ impl ClassQueue {
     pub fn new(bounds: impl Into<Bounds>) -> Self {
         Self {
             lanes: [const { VecDeque::new() }; 3],
+            ends: Ends::default(),
             bytes: [0; 3],
             passed_over: [0; 3],
             bounds: bounds.into(),
@@ -108,9 +112,11 @@ impl ClassQueue {
         {
             return Err(Refused::new(message, Rejection::QueueFull));
         }
-        *held += length;
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
-        lane.push_back(message);
+        if let Some(message) = self.place_behind(message) {
+            self.bytes[class as usize] += length;
+            self.lanes[class as usize].push_back(message);
+        }
         Ok(None)
     }
 
@@ -188,6 +194,10 @@ impl ClassQueue {
 
     /// The next message to handle.
     pub fn pop(&mut self) -> Option<Message> {
+        if let Some(next) = self.ends.pop() {
+            self.give(next.payload.len());
+            return Some(next);
+        }
         let first = self.lanes.iter().position(|lane| !lane.is_empty())?;
         let overdue = (first + 1..3)
             .find(|lane| self.passed_over[*lane] >= PASSED_OVER_MAX && !self.lanes[*lane].is_empty());
@@ -225,7 +235,7 @@ impl ClassQueue {
         if now <= self.earliest_expiry {
             return expired;
         }
-        self.earliest_expiry = Time::MAX;
+        self.earliest_expiry = self.ends.take_expired(now, &mut expired);
         for (lane, bytes) in self.lanes.iter_mut().zip(&mut self.bytes) {
             for message in std::mem::take(lane) {
                 if message.header.is_expired(now) {
@@ -243,6 +253,10 @@ impl ClassQueue {
 
     /// Takes the request that `ticket` names out, if it waits.
     pub fn take_request(&mut self, ticket: Ticket) -> Option<Message> {
+        if let Some(request) = self.ends.take_request(ticket) {
+            self.give(request.payload.len());
+            return Some(request);
+        }
         // Who gives a request up has mostly just made it.
         let place = |lane: &VecDeque<Message>| lane.iter().rposition(|message| message.is_request(ticket));
         let (lane, at) = (0..3).find_map(|lane| Some((lane, place(&self.lanes[lane])?)))?;
@@ -254,38 +268,40 @@ impl ClassQueue {
 
     /// All that waits, most urgent class first.
     pub fn iter(&self) -> impl Iterator<Item = &Message> {
-        self.lanes.iter().flatten()
+        self.ends.iter().chain(self.lanes.iter().flatten())
     }
 
     /// Messages that wait.
     #[must_use]
     pub fn len(&self) -> usize {
-        self.lanes.iter().map(VecDeque::len).sum()
+        self.ends.iter().len() + self.lanes.iter().map(VecDeque::len).sum::<usize>()
     }
 
     /// Messages of `class` that wait.
     #[must_use]
     pub fn len_of(&self, class: Class) -> usize {
-        self.lanes[class as usize].len()
+        let at_ends = self.ends.iter().filter(|message| message.header.class == class).count();
+        at_ends + self.lanes[class as usize].len()
     }
 
     /// Bytes of the payloads that wait.
     #[must_use]
     pub fn bytes(&self) -> usize {
-        self.bytes.iter().sum()
+        self.ends.bytes() + self.bytes.iter().sum::<usize>()
     }
 
     /// Whether none waits.
     #[must_use]
     pub fn is_empty(&self) -> bool {
-        self.lanes.iter().all(VecDeque::is_empty)
+        self.ends.iter().len() == 0 && self.lanes.iter().all(VecDeque::is_empty)
     }
 
     /// Empties the queue, most urgent class first.
     pub fn drain_all(&mut self) -> impl Iterator<Item = Message> + use<> {
         self.give(self.bytes());
         self.bytes = [0; 3];
-        std::mem::take(&mut self.lanes).into_iter().flatten()
+        let ends = self.ends.take_all();
+        ends.into_iter().chain(std::mem::take(&mut self.lanes).into_iter().flatten())
     }
 }
 

@@ -47,6 +47,8 @@ impl Kind {
     pub const GNCL_VOID: Self = Self(0x17);
     /// Several outcomes of confirmed messages.
     pub const GNCL_OUTCOMES: Self = Self(0x18);
+    /// Where its sender reads datagrams.
+    pub const GNCL_DATAGRAMS: Self = Self(0x19);
     /// A node asks who is there, or whether a known node lives.
     pub const NDL_QUERY: Self = Self(0x20);
     /// The matched answer.

@@ -1,4 +1,4 @@
-//! Where there is no timerfd: wakes an actor's task by tokio's wheel, which has a tick of a millisecond.
+//! Where there is no timerfd: wakes a task by tokio's wheel, which has a tick of a millisecond.
 
 use std::{
     io,
@@ -12,21 +12,29 @@ use crate::time::Time;
 
 /// One timer of the reactor's.
 #[derive(Debug)]
-pub(super) struct Alarm {
+pub struct Alarm {
     sleep: Pin<Box<Sleep>>,
     set_for: Option<Time>,
 }
 
 impl Alarm {
     /// A timer that is not set, in the reactor of the calling thread.
+    ///
+    /// # Errors
+    ///
+    /// None here.
     #[allow(clippy::unnecessary_wraps, reason = "as in `alarm.rs`, where the system may give none")]
-    pub(super) fn new() -> io::Result<Self> {
+    pub fn new() -> io::Result<Self> {
         Ok(Self { sleep: Box::pin(sleep(std::time::Duration::ZERO)), set_for: None })
     }
 
     /// Wakes the task at `at`, or soon if that has passed; never if `at` is `None`.
+    ///
+    /// # Errors
+    ///
+    /// None here.
     #[allow(clippy::unnecessary_wraps, reason = "as in `alarm.rs`, where the system may refuse")]
-    pub(super) fn wake_at(&mut self, at: Option<Time>, cx: &mut Context<'_>) -> io::Result<()> {
+    pub fn wake_at(&mut self, at: Option<Time>, cx: &mut Context<'_>) -> io::Result<()> {
         if at != self.set_for {
             self.set_for = at;
             if let Some(at) = at {

@@ -1,4 +1,4 @@
-//! Wakes an actor's task at an exact time: a timerfd of its own, not a wheel of milliseconds.
+//! Wakes a task at an exact time: a timerfd of its own, not a wheel of milliseconds.
 
 use std::{
     io,
@@ -13,19 +13,27 @@ use crate::{time::Time, timer::kernel_timer};
 
 /// One timer of the kernel's, on the monotonic clock.
 #[derive(Debug)]
-pub(super) struct Alarm {
+pub struct Alarm {
     timer: AsyncFd<OwnedFd>,
     set_for: Option<Time>,
 }
 
 impl Alarm {
     /// A timer that is not set, in the reactor of the calling thread.
-    pub(super) fn new() -> io::Result<Self> {
+    ///
+    /// # Errors
+    ///
+    /// The process has no descriptor left, or the calling thread has no reactor.
+    pub fn new() -> io::Result<Self> {
         Ok(Self { timer: kernel_timer()?, set_for: None })
     }
 
     /// Wakes the task at `at`, or soon if that has passed; never if `at` is `None`.
-    pub(super) fn wake_at(&mut self, at: Option<Time>, cx: &mut Context<'_>) -> io::Result<()> {
+    ///
+    /// # Errors
+    ///
+    /// The kernel refuses the time.
+    pub fn wake_at(&mut self, at: Option<Time>, cx: &mut Context<'_>) -> io::Result<()> {
         if at != self.set_for {
             self.set(at)?;
         }

@@ -1,0 +1,138 @@
+//! What a sender waits for: the outcome of a confirmed message, or the reply to a request, each with its deadline.
+
+use std::{
+    marker::PhantomData,
+    pin::Pin,
+    sync::Arc,
+    task::{Context, Poll, ready},
+    time::Duration,
+};
+
+use super::{AskError, clock};
+use crate::{
+    outcome::{Outcome, Ticket},
+    pending::{Settlement, Wait},
+    router::Router,
+    time::Time,
+    wire::Payload,
+};
+
+/// A request whose reply is awaited.
+pub(super) struct Request {
+    pub(super) router: Arc<Router>,
+    pub(super) ticket: Ticket,
+}
+
+impl std::fmt::Debug for Request {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Request({:?})", self.ticket)
+    }
+}
+
+/// A wait with its deadline, which counts from the send. The timer is made at the first poll: by the runtime of the thread
+/// that polls, and where there is none by one that is kept for that.
+#[derive(Debug)]
+pub(super) struct Deadline {
+    wait: Wait,
+    until: Time,
+    timer: Option<Pin<Box<tokio::time::Sleep>>>,
+}
+
+impl Deadline {
+    pub(super) const fn new(wait: Wait, until: Time) -> Self {
+        Self { wait, until, timer: None }
+    }
+
+    /// What came, or `None` at the deadline.
+    fn poll(&mut self, cx: &mut Context<'_>) -> Poll<Option<Settlement>> {
+        if let Poll::Ready(settlement) = self.wait.poll_settled(cx) {
+            return Poll::Ready(Some(settlement));
+        }
+        if self.timer.is_none() {
+            let now = Time::now();
+            if self.until <= now {
+                return Poll::Ready(None);
+            }
+            self.timer = clock::sleep(self.until.since(now));
+        }
+        // Where there is no timer nobody can say when the deadline is: it is now.
+        if let Some(timer) = &mut self.timer {
+            ready!(timer.as_mut().poll(cx));
+        }
+        Poll::Ready(None)
+    }
+}
+
+/// The future outcome of a confirmed message. Any thread may poll it, with any executor; in a runtime of tokio's, one whose
+/// time is enabled.
+#[derive(Debug)]
+#[must_use = "an outcome that nobody reads is no better than an unconfirmed send"]
+pub struct Confirmation(Deadline);
+
+impl Confirmation {
+    pub(super) const fn new(deadline: Deadline) -> Self {
+        Self(deadline)
+    }
+}
+
+impl Future for Confirmation {
+    type Output = Outcome;
+
+    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Outcome> {
+        Poll::Ready(match ready!(self.0.poll(cx)) {
+            Some(Settlement::Outcome(outcome)) => outcome,
+            Some(Settlement::Reply(_)) | None => Outcome::Unknown,
+        })
+    }
+}
+
+/// The future reply to a request. Any thread may poll it, with any executor; in a runtime of tokio's, one whose time is
+/// enabled.
+///
+/// Dropping it before it has ended gives the request up: where it still waits for its handler it is taken back, on any node, and
+/// a handler that has begun can [see](super::Sender::is_wanted) it.
+#[derive(Debug)]
+#[must_use = "a reply that nobody reads need not be asked for"]
+pub struct Reply<R> {
+    deadline: Deadline,
+    within: Duration,
+    /// `None` once this has ended.
+    request: Option<Request>,
+    reply: PhantomData<fn() -> R>,
+}
+
+impl<R> Reply<R> {
+    pub(super) const fn new(deadline: Deadline, within: Duration, request: Request) -> Self {
+        Self { deadline, within, request: Some(request), reply: PhantomData }
+    }
+
+    /// The number of the request: the `correlation` in its header, by which its sender tells it from its others.
+    #[must_use]
+    pub const fn correlation(&self) -> u64 {
+        self.deadline.wait.correlation()
+    }
+}
+
+impl<R: Payload> Future for Reply<R> {
+    type Output = Result<R, AskError>;
+
+    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Self::Output> {
+        let settled = ready!(self.deadline.poll(cx));
+        // At its deadline it expires where it waits, by itself.
+        self.request = None;
+        Poll::Ready(match settled {
+            Some(Settlement::Reply(message)) => message.decode().map_err(AskError::from),
+            Some(Settlement::Outcome(outcome)) => Err(AskError::Ended(outcome)),
+            None => Err(AskError::Deadline(self.within)),
+        })
+    }
+}
+
+impl<R> Drop for Reply<R> {
+    fn drop(&mut self) {
+        let Some(Request { router, ticket }) = self.request.take() else { return };
+        if self.deadline.wait.is_open() {
+            router.cancel(ticket);
+        }
+    }
+}
