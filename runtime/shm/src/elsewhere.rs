@@ -13,7 +13,7 @@ use crate::{
     error::{CreateError, PassError, RefusedOffer},
     layout::{Capacity, Word},
     memory::{OwnHeader, OwnRing, Peer},
-    offer::Offer,
+    offer::{Descriptors, Offer, Received},
     wait::HangUp,
 };
 
@@ -21,8 +21,12 @@ pub(crate) fn send(_: &Offer, _: BorrowedFd<'_>) -> Result<(), PassError> {
     Err(PassError::System(io::ErrorKind::Unsupported.into()))
 }
 
-pub(crate) fn receive(_: BorrowedFd<'_>) -> Result<Result<Offer, RefusedOffer>, PassError> {
+pub(crate) fn receive(_: BorrowedFd<'_>) -> Result<Received, PassError> {
     Err(PassError::System(io::ErrorKind::Unsupported.into()))
+}
+
+pub(crate) fn set_descriptors(_: BorrowedFd<'_>, _: Descriptors) -> io::Result<()> {
+    Err(io::ErrorKind::Unsupported.into())
 }
 
 pub(crate) fn create(_: Capacity) -> Result<(OwnMemory, OwnedFd), CreateError> {

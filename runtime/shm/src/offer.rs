@@ -1,6 +1,9 @@
 //! What a side tells the other: its memory and its bells, as descriptors and a few plain bytes.
 
-use std::os::fd::{AsFd, OwnedFd};
+use std::{
+    io,
+    os::fd::{AsFd, OwnedFd},
+};
 
 use crate::{
     bell::BellKind,
@@ -73,7 +76,7 @@ impl Offer {
     /// # Errors
     /// The outer one when nothing whole came; the inner one when it is no offer.
     pub fn receive(socket: impl AsFd) -> Result<Result<Self, RefusedOffer>, PassError> {
-        platform::receive(socket.as_fd())
+        Received::receive(socket)?.into_offer()
     }
 
     /// An offer from what the peer sent. The descriptors are looked at when it is connected.
@@ -97,6 +100,67 @@ impl Offer {
         }
         Ok(Self { capacity, bell, descriptors })
     }
+}
+
+/// What came where an offer was expected, before any of it is judged or closed.
+#[derive(Debug)]
+pub struct Received {
+    pub(crate) bytes: [u8; OFFER_BYTES],
+    /// Bytes that came.
+    pub(crate) count: usize,
+    /// The system says that something did not fit.
+    pub(crate) cut: bool,
+    pub(crate) descriptors: Vec<OwnedFd>,
+}
+
+impl Received {
+    /// Takes what is there, with as many descriptors as one message can carry. Nothing is closed, unless this process
+    /// has no room for them all: then the system closes the rest, here, which can block.
+    ///
+    /// # Errors
+    /// [`PassError::Closed`], and [`PassError::System`]: also when a socket that does not block has nothing.
+    pub fn receive(socket: impl AsFd) -> Result<Self, PassError> {
+        platform::receive(socket.as_fd())
+    }
+
+    /// Further copies of the descriptors. While they live nothing that becomes of this is the last close of what the peer
+    /// has passed, the only one that can block.
+    ///
+    /// # Errors
+    /// This process has no descriptor left.
+    pub fn copies(&self) -> io::Result<Vec<OwnedFd>> {
+        self.descriptors.iter().map(OwnedFd::try_clone).collect()
+    }
+
+    /// The offer that it is. What does not belong to one is closed.
+    ///
+    /// # Errors
+    /// As [`Offer::receive`].
+    pub fn into_offer(self) -> Result<Result<Offer, RefusedOffer>, PassError> {
+        let Self { bytes, count, cut, descriptors } = self;
+        if count == OFFER_BYTES && !cut {
+            return Ok(Offer::from_parts(&bytes, descriptors));
+        }
+        Err(PassError::Broken { bytes: count, descriptors: descriptors.len(), cut })
+    }
+}
+
+/// Whether descriptors may come over a unix socket.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Descriptors {
+    /// The system refuses them to who sends them (`EPERM`).
+    Refused,
+    /// They come, as they do unless somebody has refused them.
+    Taken,
+}
+
+/// Says whether descriptors may come over `socket` from now on; what has come already stays. A connection inherits it from
+/// the socket that listens.
+///
+/// # Errors
+/// The system does not know how to refuse them: Linux before 6.16. Then they can come, and nothing else has changed.
+pub fn set_descriptors(socket: impl AsFd, which: Descriptors) -> io::Result<()> {
+    platform::set_descriptors(socket.as_fd(), which)
 }
 
 fn take<const N: usize>(bytes: &[u8; OFFER_BYTES], from: usize) -> [u8; N] {

@@ -21,10 +21,12 @@ use rustix::{
 use super::{
     mapping::Mapping,
     memfd::{adopt_page, create_page},
+    rights::set_descriptors,
 };
 use crate::{
     bell::{Bell, BellKind, Bells, CommonBell, Doorbell, Heard, Woken},
     error::{CreateError, RefusedOffer},
+    offer::Descriptors,
     wait::{HangUp, Waiting},
 };
 
@@ -81,6 +83,8 @@ fn event() -> Result<(EventBell, OwnedFd), Errno> {
 fn socket() -> Result<(SocketBell, OwnedFd), Errno> {
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
     let (ear, button) = socketpair(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
+    // Who drains the ear would close them. Where the system does not know it (Linux before 6.16) a hostile peer can still pass some.
+    let _ = set_descriptors(ear.as_fd(), Descriptors::Refused);
     Ok((SocketBell(ear), button))
 }
 
@@ -96,15 +100,21 @@ pub(crate) fn buttons(kind: BellKind, fds: Vec<OwnedFd>) -> Result<Both, Refused
         (BellKind::EventFd, Some(message), Some(room)) if is_eventfd(&message)? && is_eventfd(&room)? => {
             Ok((Box::new(EventBell(message)), Box::new(EventBell(room))))
         }
-        (BellKind::Socket, Some(message), Some(room)) if is_unix(&message) && is_unix(&room) => {
+        (BellKind::Socket, Some(message), Some(room)) if is_button(&message) && is_button(&room) => {
             Ok((Box::new(SocketBell(message)), Box::new(SocketBell(room))))
         }
         (BellKind::Futex | BellKind::EventFd | BellKind::Socket, _, _) => Err(RefusedOffer::NotABell(kind)),
     }
 }
 
-fn is_unix(fd: &OwnedFd) -> bool {
-    sockopt::socket_domain(fd) == Ok(AddressFamily::UNIX)
+/// Whether it is a unix socket into which nothing was written: what lies there, descriptors among it, would be closed with it. Nothing
+/// more comes, where the system knows that.
+fn is_button(fd: &OwnedFd) -> bool {
+    if sockopt::socket_domain(fd) != Ok(AddressFamily::UNIX) {
+        return false;
+    }
+    let _ = set_descriptors(fd.as_fd(), Descriptors::Refused);
+    !matches!(recv(fd, &mut [0; 1][..], RecvFlags::DONTWAIT | RecvFlags::PEEK), Ok((1.., _)))
 }
 
 fn is_eventfd(fd: &OwnedFd) -> Result<bool, RefusedOffer> {

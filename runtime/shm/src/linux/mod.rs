@@ -5,6 +5,7 @@ mod ears;
 mod mapping;
 mod memfd;
 mod passing;
+mod rights;
 #[cfg(test)]
 mod tests;
 
@@ -13,3 +14,4 @@ pub(crate) use ears::{Ears, sleep_at};
 pub(crate) use mapping::{OwnHeaderMemory, OwnMemory, OwnRingMemory, PeerMemory};
 pub(crate) use memfd::{adopt, create};
 pub(crate) use passing::{receive, send};
+pub(crate) use rights::set_descriptors;

@@ -15,8 +15,8 @@ use rustix::{
 };
 
 use crate::{
-    error::{PassError, RefusedOffer},
-    offer::{OFFER_BYTES, Offer},
+    error::PassError,
+    offer::{OFFER_BYTES, Offer, Received},
 };
 
 pub(crate) fn send(offer: &Offer, socket: BorrowedFd<'_>) -> Result<(), PassError> {
@@ -34,20 +34,22 @@ pub(crate) fn send(offer: &Offer, socket: BorrowedFd<'_>) -> Result<(), PassErro
     }
 }
 
-pub(crate) fn receive(socket: BorrowedFd<'_>) -> Result<Result<Offer, RefusedOffer>, PassError> {
+/// Descriptors that one message can carry: SCM_MAX_FD of the kernel.
+const MESSAGE_DESCRIPTORS_MAX: usize = 253;
+
+pub(crate) fn receive(socket: BorrowedFd<'_>) -> Result<Received, PassError> {
     let mut bytes = [0; OFFER_BYTES];
-    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(Offer::DESCRIPTORS_MAX))];
+    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(MESSAGE_DESCRIPTORS_MAX))];
     let mut control = RecvAncillaryBuffer::new(&mut space);
     let got = retried(|| {
         recvmsg(socket, &mut [IoSliceMut::new(&mut bytes)], &mut control, RecvFlags::CMSG_CLOEXEC)
     })?;
     let cut = got.flags.intersects(ReturnFlags::CTRUNC | ReturnFlags::TRUNC);
     let descriptors = taken(&mut control);
-    match got.bytes {
-        0 if descriptors.is_empty() => Err(PassError::Closed),
-        OFFER_BYTES if !cut => Ok(Offer::from_parts(&bytes, descriptors)),
-        bytes => Err(PassError::Broken { bytes, descriptors: descriptors.len(), cut }),
+    if got.bytes == 0 && descriptors.is_empty() {
+        return Err(PassError::Closed);
     }
+    Ok(Received { bytes, count: got.bytes, cut, descriptors })
 }
 
 fn taken(control: &mut RecvAncillaryBuffer<'_>) -> Vec<OwnedFd> {
