@@ -56,6 +56,18 @@
 #define SINEW_TID_TEXT 32
 
 /**
+ * For `flags` of `sinew_barrier`: does not wait for the return of a party that is asked for by its name and has failed, was
+ * stopped, or whose node is lost. Then `sinew_meet` returns `SINEW_ERROR_PARTY_LOST`.
+ */
+#define SINEW_FAIL_ON_LOSS 1
+
+/**
+ * For `flags` of `sinew_barrier`: a phase. Whoever has reached it counts until it is unregistered, also while it does something
+ * else: an application that is started again goes on at once if the others are there.
+ */
+#define SINEW_PHASE 2
+
+/**
  * For `events` of `sinew_options`: `sinew.node_event`, nodes that are found, lost, restarted.
  */
 #define SINEW_NODE_EVENTS 1
@@ -112,7 +124,7 @@ enum sinew_status
      */
     SINEW_ERROR_NO_NODE = -2,
     /**
-     * The node refused the registration, in words. Nothing is registered.
+     * The node refused the registration, or a wait at a barrier, in words. Nothing is registered.
      */
     SINEW_ERROR_REFUSED = -3,
     /**
@@ -186,6 +198,14 @@ enum sinew_status
      * was not sent.
      */
     SINEW_ERROR_AWAY = -20,
+    /**
+     * Not all parties were at the barrier in time. The sentence says who is missing; the others go on waiting.
+     */
+    SINEW_ERROR_NOT_MET = -21,
+    /**
+     * A party of the barrier was lost, and was not to be waited for. The sentence says which.
+     */
+    SINEW_ERROR_PARTY_LOST = -22,
 };
 #ifndef __cplusplus
 #if __STDC_VERSION__ >= 202311L
@@ -339,7 +359,7 @@ typedef struct sinew_options {
     struct sinew_text name;
     /**
      * What must be met, on this node or any, before this application is ready: `knee.drive`, `*.drive`, `hip.imu | knee.imu`,
-     * `2 of *.drive`, `camera ?2s`. At most 64. Default: none.
+     * `2 of *.drive`, `knee.drive at homed`, `camera ?2s`. At most 64. Default: none.
      */
     const struct sinew_text *required;
     /**
@@ -503,6 +523,38 @@ typedef struct sinew_untaken {
      */
     uint32_t reserved;
 } sinew_untaken;
+
+/**
+ * A barrier: where several applications, on any nodes, wait for each other. It need not be made, and can be used again and
+ * again. Set all of it to zero, then what is wanted. All that meet say the same name and the same parties.
+ */
+typedef struct sinew_barrier {
+    /**
+     * Its name, 1 to 63 bytes; of a phase one word.
+     */
+    struct sinew_text name;
+    /**
+     * Who has to be there: `knee.drive`, `*.drive`, `hip.imu | knee.imu`, `2 of *.drive`, `3 of *`. At most 64. Whoever waits must
+     * be one of them.
+     */
+    const struct sinew_text *parties;
+    /**
+     * How many.
+     */
+    size_t parties_count;
+    /**
+     * How long to wait, rounded up to milliseconds. Default: 60 s.
+     */
+    uint64_t within_ns;
+    /**
+     * `SINEW_FAIL_ON_LOSS`, `SINEW_PHASE`. Default: neither.
+     */
+    uint32_t flags;
+    /**
+     * Zero.
+     */
+    uint32_t reserved;
+} sinew_barrier;
 
 #ifdef __cplusplus
 extern "C" {
@@ -730,6 +782,17 @@ sinew_status sinew_next_untaken(struct sinew_endpoint *endpoint,
 sinew_status sinew_settle_message(struct sinew_endpoint *endpoint,
                                   struct sinew_received *received,
                                   int32_t outcome);
+
+/**
+ * Arrives at a barrier and waits until all parties have, `within_ns` of the barrier at most. `*generation` is how often the barrier
+ * has opened then, the same number for all that went on together (of a phase 1); `generation` may be NULL. What comes meanwhile waits
+ * to be received. `SINEW_ERROR_NOT_MET`: not all came in time; `SINEW_ERROR_PARTY_LOST`: one was lost and was not to be waited for;
+ * the sentence of both says who is missing, and why. `SINEW_ERROR_REFUSED`: this endpoint is none of the parties, or the barrier is
+ * none, in words. After any other error it counts as arrived until the barrier's time is over. The endpoint's thread.
+ */
+sinew_status sinew_meet(struct sinew_endpoint *endpoint,
+                        const struct sinew_barrier *barrier,
+                        uint64_t *generation);
 
 /**
  * A text for a status: what it means in general. Never NULL. Any thread.

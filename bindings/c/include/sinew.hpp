@@ -97,6 +97,14 @@ struct options {
     std::size_t direct_ring_bytes = 0;
 };
 
+/// A barrier, or with SINEW_PHASE a phase: where several applications wait for each other. Without a time: 60 s.
+struct barrier {
+    std::string name;
+    std::vector<std::string> parties;
+    duration within{};
+    std::uint32_t flags = 0;
+};
+
 /// A message that is being made: a container of writable bytes. One that is not sent is discarded at its end.
 class message {
 public:
@@ -331,6 +339,21 @@ public:
         if (detail::check(status) == SINEW_NOTHING)
             return std::nullopt;
         return found;
+    }
+
+    /// Arrives at a barrier and waits until all parties have; how often it has opened then. An error says who is missing.
+    std::uint64_t meet(const barrier &where)
+    {
+        const std::vector<sinew_text> parties = texts(where.parties);
+        sinew_barrier raw{};
+        raw.name = detail::text(where.name);
+        raw.parties = parties.data();
+        raw.parties_count = parties.size();
+        raw.within_ns = detail::nanoseconds(where.within);
+        raw.flags = where.flags;
+        std::uint64_t generation = 0;
+        detail::check(sinew_meet(raw_, &raw, &generation));
+        return generation;
     }
 
     void join(std::string_view name) { detail::check(sinew_join_group(raw_, detail::text(name))); }

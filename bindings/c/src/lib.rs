@@ -8,7 +8,7 @@
 //! | `session.rs`, `hand.rs` | an endpoint with the messages that the program in C has in hand |
 //! | `fork.rs` | a child of `fork` is told apart |
 //! | `log.rs`, `log/` | what the library says on the standard error, and the thread that writes it |
-//! | `registration.rs`, `sending.rs`, `receiving.rs`, `naming.rs`, `words.rs` | the functions |
+//! | `registration.rs`, `sending.rs`, `receiving.rs`, `meeting.rs`, `naming.rs`, `words.rs` | the functions |
 //! | `options.rs`, `text.rs`, `message.rs`, `status.rs` | the types |
 //!
 //! All modules are private: the functions are reached through C only, whose programs must keep what the header asks of
@@ -22,6 +22,8 @@ mod naming;
 mod sending;
 
 mod receiving;
+
+mod meeting;
 
 mod words;
 

@@ -14,7 +14,7 @@ use std::{
 use arc_swap::ArcSwapOption;
 use tracing_subscriber::EnvFilter;
 
-use self::writer::{Lines, is_taken, to_stderr};
+use self::writer::{Lines, is_taken, look_at_stderr, to_stderr};
 use crate::fork;
 
 /// The environment variable that says how much.
@@ -40,6 +40,7 @@ struct Own {
 pub(crate) fn begin() {
     static IS_OURS: OnceLock<bool> = OnceLock::new();
     let is_ours = *IS_OURS.get_or_init(|| {
+        look_at_stderr();
         let wanted = EnvFilter::try_from_env(WANTED).unwrap_or_else(|_| EnvFilter::new(USUAL));
         let log = tracing_subscriber::fmt().with_env_filter(wanted).with_writer(|| Pen);
         // An error means that there is one.

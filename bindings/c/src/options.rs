@@ -34,7 +34,7 @@ pub struct Options {
     /// The name, 1 to 63 bytes without control characters, unique on the node. Default: none.
     pub name: Text,
     /// What must be met, on this node or any, before this application is ready: `knee.drive`, `*.drive`, `hip.imu | knee.imu`,
-    /// `2 of *.drive`, `camera ?2s`. At most 64. Default: none.
+    /// `2 of *.drive`, `knee.drive at homed`, `camera ?2s`. At most 64. Default: none.
     pub required: *const Text,
     /// How many.
     pub required_count: usize,

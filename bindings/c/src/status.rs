@@ -23,7 +23,7 @@ pub enum Status {
     SinewErrorInvalidArgument = -1,
     /// No node listens at the path, or this user may not connect. Nothing was done.
     SinewErrorNoNode = -2,
-    /// The node refused the registration, in words. Nothing is registered.
+    /// The node refused the registration, or a wait at a barrier, in words. Nothing is registered.
     SinewErrorRefused = -3,
     /// What is required was not ready at the deadline. Nothing is registered.
     SinewErrorWaiting = -4,
@@ -62,10 +62,14 @@ pub enum Status {
     /// used: go on. Each send without a time tries, and `sinew_receive_message`, which says this once, waits for it. The message
     /// was not sent.
     SinewErrorAway = -20,
+    /// Not all parties were at the barrier in time. The sentence says who is missing; the others go on waiting.
+    SinewErrorNotMet = -21,
+    /// A party of the barrier was lost, and was not to be waited for. The sentence says which.
+    SinewErrorPartyLost = -22,
 }
 
 impl Status {
-    const ALL: [Self; 22] = [
+    const ALL: [Self; 24] = [
         Self::SinewOk,
         Self::SinewNothing,
         Self::SinewErrorInvalidArgument,
@@ -88,6 +92,8 @@ impl Status {
         Self::SinewErrorPanic,
         Self::SinewErrorLent,
         Self::SinewErrorAway,
+        Self::SinewErrorNotMet,
+        Self::SinewErrorPartyLost,
     ];
 
     /// The text for a number; for one that is no status it says so.
@@ -106,7 +112,7 @@ impl Status {
             Self::SinewErrorNoNode => {
                 c"no node can be reached at this path; does it run, with this path as its `lncl.socket`?"
             }
-            Self::SinewErrorRefused => c"the node refused the registration",
+            Self::SinewErrorRefused => c"the node refused the registration, or a wait at a barrier",
             Self::SinewErrorWaiting => c"what is required was not ready at the deadline",
             Self::SinewErrorNoAnswer => c"the node did not answer in time; does it hang?",
             Self::SinewErrorClosed => c"the connection to the node has ended; register again",
@@ -139,6 +145,8 @@ impl Status {
             Self::SinewErrorAway => {
                 c"the connection to the node has ended; the endpoint registers again by itself while it is used"
             }
+            Self::SinewErrorNotMet => c"not all were at the barrier in time",
+            Self::SinewErrorPartyLost => c"a party of the barrier was lost",
             Self::SinewErrorPanic => {
                 c"a fault of this library; the endpoint can only be unregistered; please report it"
             }

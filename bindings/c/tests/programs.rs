@@ -3,12 +3,15 @@
 #[path = "programs/ground.rs"]
 mod ground;
 
-use std::io::{PipeReader, PipeWriter, Write, pipe};
+use std::{
+    io::{PipeReader, PipeWriter, Write, pipe},
+    time::Duration,
+};
 
 use ground::{C, CPP, CPP20, Ground, WATCHDOG, is_there};
 use rustix::{io::ioctl_fionbio, process::Signal};
 use serde::{Deserialize, Serialize};
-use sinew::{Endpoint, Kind, NodeApi, Outcome, Payload, Registration, RequirementEvent, Tid};
+use sinew::{Barrier, Endpoint, Kind, NodeApi, Outcome, Payload, Registration, RequirementEvent, Tid};
 
 /// As in `programs/holder.c`: its map, written by hand there.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
@@ -103,10 +106,28 @@ fn a_standard_error_that_nobody_reads_stops_no_call() {
     let mut greeter = ground.start_logging_to(full, &C.shared("examples/greeter.c", &ground));
     greeter.wait_for(&["the greeter is there"]);
     let mut asking = endpoint(&ground, Registration::new());
-    let to = resolve(&mut asking, "greeter");
-    let mut name = asking.create_message(to, Kind::named("demo.name"), 5).unwrap();
+    assert_eq!(ask_for_a_greeting(&mut asking), b"Hello, Ankle");
+    assert_eq!(greeter.wait_for_end(), Some(0));
+}
+
+fn ask_for_a_greeting(asking: &mut Endpoint) -> Vec<u8> {
+    let to = resolve(asking, "greeter");
+    let mut name = asking.create_message(to, Kind::named("demo.name"), 5).expect("it is short");
     name.copy_from_slice(b"Ankle");
-    assert_eq!(asking.ask_message(name, WATCHDOG).unwrap().bytes(), b"Hello, Ankle");
+    asking.ask_message(name, WATCHDOG).expect("the greeter answers").bytes().to_vec()
+}
+
+#[test]
+fn a_standard_error_that_is_closed_is_not_mistaken_for_the_socket_that_has_its_number() {
+    if !is_there("gcc") {
+        return;
+    }
+    let ground = Ground::new();
+    let under = ["env", "SINEW_LOG=debug", "sh", "-c", r#"exec "$@" 2>&-"#, "sh"];
+    let mut greeter = ground.start_under(&under, &C.shared("examples/greeter.c", &ground), &[]);
+    greeter.wait_for(&["the greeter is there"]);
+    let mut asking = endpoint(&ground, Registration::new());
+    assert_eq!(ask_for_a_greeting(&mut asking), b"Hello, Ankle");
     assert_eq!(greeter.wait_for_end(), Some(0));
 }
 
@@ -306,4 +327,57 @@ fn a_send_in_c_waits_for_room_as_long_as_it_says_and_loses_nothing() {
         room.wait_for(&["all came"]);
         assert_eq!(room.wait_for_end(), Some(0));
     }
+}
+
+#[test]
+fn axes_in_c_come_up_and_step_with_one_in_rust() {
+    if !is_there("gcc") {
+        return;
+    }
+    let ground = Ground::new();
+    let axis = C.shared("examples/axis.c", &ground);
+    let start = |name| ground.start(&axis, &[name]);
+    let mut in_c = [start("knee.axis"), start("ankle.axis")];
+    let axes = ["hip.axis", "knee.axis", "ankle.axis"];
+    let mut hip = endpoint(&ground, Registration::new().name("hip.axis"));
+    assert_eq!(hip.meet(&Barrier::phase("homed", axes).within(WATCHDOG)).unwrap(), 1);
+    in_c.iter_mut().for_each(|axis| drop(axis.wait_for(&["all axes are homed"])));
+    for round in 1..=3 {
+        assert_eq!(hip.meet(&Barrier::new("step", axes).within(WATCHDOG)).unwrap(), round);
+        in_c.iter_mut().for_each(|axis| drop(axis.wait_for(&[&format!("step {round}")])));
+    }
+    in_c.iter_mut().for_each(|axis| assert_eq!(axis.wait_for_end(), Some(0)));
+}
+
+#[test]
+fn a_barrier_that_does_not_open_says_the_same_in_c_and_in_rust() {
+    if !is_there("gcc") {
+        return;
+    }
+    let ground = Ground::new();
+    let mut hip = endpoint(&ground, Registration::new().name("hip"));
+    let within = Duration::from_millis(20);
+    let mut says = |barrier: Barrier| hip.meet(&barrier.within(within)).unwrap_err().to_string();
+    let late = says(Barrier::new("ready", ["hip", "knee"]));
+    let late_phase = says(Barrier::phase("ready", ["hip", "knee"]));
+    let no_party = says(Barrier::new("ready", ["knee", "ankle"]));
+    assert!(late.contains("knee is missing (never seen)"), "{late}");
+    hip.unregister().unwrap();
+    let mut program = ground.start(&C.shared("tests/programs/barriers.c", &ground), &[]);
+    for line in [
+        format!("late -21 {late}"),
+        format!("late phase -21 {late_phase}"),
+        format!("no party -3 {no_party}"),
+        "alone 0 done".to_owned(),
+        "again 0 done".to_owned(),
+        "generation 2".to_owned(),
+        "no barrier -1 `barrier` is NULL".to_owned(),
+        "no endpoint -13".to_owned(),
+        "odd flags -1 `barrier.flags` is 0x40".to_owned(),
+        "reserved -1 `barrier.reserved` is 7".to_owned(),
+        "no texts -1 `barrier.parties` is NULL".to_owned(),
+    ] {
+        program.wait_for(&[&line]);
+    }
+    assert_eq!(program.wait_for_end(), Some(0));
 }

@@ -4,7 +4,7 @@ use std::{
     io::stderr,
     mem::MaybeUninit,
     sync::{
-        Arc,
+        Arc, OnceLock,
         atomic::{AtomicU64, AtomicUsize, Ordering},
         mpsc::{Receiver, SyncSender, sync_channel},
     },
@@ -14,6 +14,7 @@ use std::{
 
 use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
+    fs::{FileType, fstat},
     io::Errno,
 };
 
@@ -95,10 +96,35 @@ fn work(lines: &Receiver<Vec<u8>>, counts: &Counts, mut write: impl FnMut(&[u8])
     }
 }
 
+/// Which file the standard error is when the library looks first; `None`: it is closed, or not known.
+static FIRST: OnceLock<Option<(u64, u64)>> = OnceLock::new();
+
+/// Looks which file the standard error is. Before that the library opens none.
+pub(super) fn look_at_stderr() {
+    FIRST.get_or_init(|| fstat(stderr()).ok().map(|file| (file.st_dev, file.st_ino)));
+}
+
+/// Whether the standard error may be written to. Where the program has closed it, its number may be that of something else by now: of
+/// the library's own socket to the node, say, or of its memory. So only what the library has found there at first is written to, or what the
+/// program has put there since that is a terminal, a pipe or a file with a name.
+fn is_writable() -> bool {
+    let Some(first) = FIRST.get().copied().flatten() else { return false };
+    fstat(stderr()).is_ok_and(|file| match FileType::from_raw_mode(file.st_mode) {
+        _ if (file.st_dev, file.st_ino) == first => true,
+        FileType::CharacterDevice | FileType::Fifo => true,
+        FileType::RegularFile => file.st_nlink > 0,
+        FileType::Directory
+        | FileType::Symlink
+        | FileType::Socket
+        | FileType::BlockDevice
+        | FileType::Unknown => false,
+    })
+}
+
 /// Writes all of it, however long that takes, and without the lock that Rust's own writers to the standard error share.
 pub(super) fn to_stderr(line: &[u8]) {
     let mut rest = line;
-    while !rest.is_empty() {
+    while !rest.is_empty() && is_writable() {
         match rustix::io::write(stderr(), rest) {
             Ok(0) => return,
             Ok(count) => rest = &rest[count..],
