@@ -12,7 +12,7 @@ use sinew_figures::{
     process::{self, Process, say_there},
     stream,
 };
-use sinew_hosts::{Hosts, Queue};
+use sinew_hosts::{Host, Hosts, Queue};
 
 use crate::{beside, nodes::At};
 
@@ -35,13 +35,8 @@ pub(crate) fn measure(case: &str, queue: Queue) -> bool {
             return true;
         }
     };
-    let program = std::env::current_exe().expect("this program has a path");
     let [here, there] = [0, 1].map(|host| &hosts.all()[host]);
-    let on = |host: &sinew_hosts::Host, role: &str| {
-        let mut command = host.command(&program);
-        command.envs(process::command(role).get_envs().filter_map(|(name, value)| Some((name, value?))));
-        command
-    };
+    let on = |host: &Host, role: &str| host.moved(&process::command(role));
     let at = At::loopback();
     let both = [
         (

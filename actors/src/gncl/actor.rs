@@ -1,5 +1,6 @@
 //! The shell: sockets and timers for the core's orders, events for what they do.
 
+mod by_datagram;
 mod leaving;
 #[cfg(target_os = "linux")]
 mod lost_addresses;
@@ -27,9 +28,10 @@ use tokio::net::TcpStream;
 use super::{
     Event, LinkFact,
     core::{
-        Attach, CANCEL, CLASSES, ConnectionId, Core, Decline, GUARD, Input, Introduction, Lane, OUTCOMES,
-        Output, Refusal, Settings, read, write,
+        Attach, CANCEL, CLASSES, ConnectionId, Core, DATAGRAMS, Decline, GUARD, Input, Introduction, Lane,
+        OUTCOMES, Output, Refusal, Settings, read, write,
     },
+    datagrams,
     inbound::Inbound,
     link::{self, Mode, News, Reading, SharedMode, What},
     listener, marks,
@@ -85,13 +87,14 @@ impl Gncl {
             let further = listener::listen_at_further(&config.gncl, &self.stores.gncl.refusals);
             self.stores.gncl_further.get_or_init(|| listener::addresses_of(&further));
             *kept = std::iter::once(listener).chain(further).collect();
+            self.bind_datagrams(&kept);
             self.stores.gncl_listen.get_or_init(|| address);
         }
         kept.iter().map(|listener| tokio::net::TcpListener::from_std(listener.try_clone()?)).collect()
     }
 
     fn input(&mut self, input: Input, ctx: &mut Context<Self>) {
-        // News of life only ever puts the next alarm off.
+        // News of life puts the next alarm off, or is followed by a ping in a second at the earliest: the link's own is due by then.
         let may_wake_earlier = !matches!(input, Input::Heard(_));
         self.core.handle(Time::now(), input);
         while let Some(output) = self.core.poll() {
@@ -215,14 +218,18 @@ impl Gncl {
         let inbound = Inbound { stores, peer: peer_there, spin, lane, link, checksum, outcomes };
         wire.set_mode(Mode::Moves(inbound, Move { place: place.clone(), socket }));
         self.stores.router.set_peer(node, peer.clone());
+        let there = place.clone();
         let drainer = place.begin(async move {
             if let Some(way) = peer.way(lane) {
-                way.outlet.drain(link).await;
+                way.outlet.drain_by_turns(link, || there.end_turn()).await;
             }
         });
         let drainer = fut::wrap_future::<_, Self>(task::end_of(drainer));
         let drainer = ctx.spawn(drainer.map(move |_, actor, ctx| actor.ended(connection, ctx)));
         wire.link = Some((link, drainer));
+        if lane == Lane::Stream {
+            self.announce_datagrams(attach);
+        }
     }
 
     fn detach(
@@ -268,6 +275,9 @@ impl Gncl {
     fn tell(&self, fact: LinkFact) {
         crate::log::info!(?fact, "link");
         self.stores.gncl.notes.fact(Time::now(), &fact);
+        if let LinkFact::PeerLeft { node, incarnation } = fact {
+            self.stores.gncl.leaves(Time::now(), node, incarnation);
+        }
         self.post(&self.stores.posts.ndl, ndl::Event::Link(fact));
         self.post(&self.stores.posts.sync, sync::Event::Link(fact));
     }
@@ -282,8 +292,9 @@ impl Gncl {
     fn frame_came(&mut self, connection: ConnectionId, message: &Message, ctx: &mut Context<Self>) {
         let input =
             self.input_of(connection, message).unwrap_or_else(|decline| Input::Violated(connection, decline));
-        if !matches!(input, Input::Violated(..)) {
+        if !matches!(input, Input::Violated(..) | Input::PingReceived(_) | Input::PongReceived(_)) {
             self.input(Input::Heard(connection), ctx);
+            self.peer_speaks(message.header.source.node);
         }
         if matches!(input, Input::GoodbyeReceived(_)) {
             self.acknowledge_the_last(connection);
@@ -306,7 +317,7 @@ impl Gncl {
             Kind::GNCL_WELCOME => Ok(Input::WelcomeReceived(connection, introduction()?)),
             Kind::GNCL_REFUSAL => Ok(Input::RefusalReceived(connection, read(&message.payload)?)),
             Kind::GNCL_PING => Ok(Input::PingReceived(connection)),
-            Kind::GNCL_PONG => Ok(Input::Heard(connection)),
+            Kind::GNCL_PONG => Ok(Input::PongReceived(connection)),
             Kind::GNCL_GOODBYE => Ok(Input::GoodbyeReceived(connection)),
             kind => {
                 Err(Decline::Violation(format!("a frame of kind {kind} came before the handshake was over")))
@@ -331,6 +342,8 @@ enum AfterSpeaking {
 
 fn settings(stores: &Stores) -> Settings {
     let NodeConfig { name, project, payload_max, gncl, ndl, .. } = stores.config.clone();
+    let datagrams = gncl.datagrams.then_some(DATAGRAMS);
+    let features = [CLASSES, CANCEL, GUARD, OUTCOMES].into_iter().chain(datagrams);
     Settings {
         ours: Introduction {
             project,
@@ -340,7 +353,7 @@ fn settings(stores: &Stores) -> Settings {
             peer: NodeAddress::HERE,
             dial: 0,
             payload_max: payload_max as u64,
-            features: [CLASSES, CANCEL, GUARD, OUTCOMES].map(str::to_owned).to_vec(),
+            features: features.map(str::to_owned).collect(),
             lane: Lane::Control,
             link: 0,
         },
@@ -350,6 +363,7 @@ fn settings(stores: &Stores) -> Settings {
         strangers_max: gncl.strangers_max,
         peers_max: ndl.nodes_max,
         ping_period: Duration::from_secs(1),
+        side_rest: Duration::from_secs(10),
         pings_missed_max: 3,
         healthy: Duration::from_secs(5),
         orphan: Duration::from_secs(5),
@@ -386,6 +400,8 @@ impl Actor for Gncl {
         ctx.spawn(fut::wrap_future(Store::serve_those_held_up(self.stores.clone())));
         let spin = self.spin.clone();
         ctx.spawn(fut::wrap_future(async move { spin.keep_awake().await }));
+        ctx.spawn(fut::wrap_future(datagrams::read_all(self.stores.clone(), self.spin.clone())));
+        ctx.spawn(fut::wrap_future(datagrams::keep_time(self.stores.clone())));
         ctx.spawn(fut::wrap_future(Store::look_for_expired(self.stores.clone())));
         ctx.spawn(fut::wrap_future(Store::acknowledge_late(self.stores.clone())));
         if let Some(ready) = self.ready.take() {

@@ -14,6 +14,8 @@ pub(super) enum End {
     Refused,
     /// What handled it panicked.
     Failed,
+    /// A newer value had come before it, by datagram.
+    Superseded,
 }
 
 /// Counters of one session.
@@ -22,7 +24,7 @@ pub(super) struct Arrivals {
     taken: u64,
     /// Neither ended nor in a line.
     in_hand: u64,
-    ends: [u64; 6],
+    ends: [u64; 7],
 }
 
 impl Arrivals {

@@ -5,18 +5,13 @@
 
 use std::{io, net, os::fd::AsFd as _, thread};
 
-#[cfg(target_os = "linux")]
-use rustix::process::{getpriority_process, setpriority_process};
 use tokio::{
     net::TcpStream,
     runtime::{Builder, Handle},
     sync::oneshot,
 };
 
-/// How much nicer it is than who made it: on a full CPU it has a third of what they have. It need not be asked for, and lets those run on who
-/// have just written or read something: what waits meanwhile goes in one.
-#[cfg(target_os = "linux")]
-const NICER: i32 = 5;
+use crate::nicer::give_way;
 
 /// Such a thread. It ends with this, and what it does with it.
 pub(super) struct BulkThread {
@@ -32,7 +27,6 @@ impl BulkThread {
         let handle = runtime.handle().clone();
         let (is_wanted, is_to_end) = oneshot::channel();
         thread::Builder::new().name("bulk".to_owned()).spawn(move || {
-            #[cfg(target_os = "linux")]
             give_way();
             // Nothing is ever said but that nobody wants it any more.
             let _: Result<(), _> = runtime.block_on(is_to_end);
@@ -53,14 +47,5 @@ impl BulkThread {
         let socket = socket.as_fd().try_clone_to_owned()?;
         let _entered = self.runtime.enter();
         TcpStream::from_std(net::TcpStream::from(socket))
-    }
-}
-
-/// Makes the calling thread nicer.
-#[cfg(target_os = "linux")]
-fn give_way() {
-    // Both are about the calling thread, whatever their names say. It goes on as it is where the system refuses it.
-    if let Ok(nice) = getpriority_process(None) {
-        let _ = setpriority_process(None, nice + NICER);
     }
 }

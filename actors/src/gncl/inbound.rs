@@ -14,6 +14,7 @@ use sinew_runtime::{
 use super::{
     arrivals::End,
     core::{Decline, Lane, read},
+    datagrams::{Announcement, Freshness},
     peer::Peer,
     spin::Spin,
     way::{Taken, Way},
@@ -59,8 +60,9 @@ impl Drop for Batch<'_> {
 }
 
 impl Inbound {
-    /// Frames that came at once are [received](Self::receive) as long as this lives.
-    pub(super) fn batch(&self) -> Batch<'_> {
+    /// Frames that were read at once, at `now`, are [received](Self::receive) as long as this lives.
+    pub(super) fn batch(&self, now: Time) -> Batch<'_> {
+        self.peer.gives_a_sign(now);
         Batch { inbound: self, _wakes: wakes::Batch::begin() }
     }
 
@@ -70,11 +72,21 @@ impl Inbound {
     /// It is not the next one, or an acknowledgement that is none: the peer is at fault.
     pub(super) fn receive(&self, now: Time, message: Message) -> Result<(), Decline> {
         let Some(way) = self.peer.way(self.lane) else { return Ok(()) };
+        if let Some(channel) = self.peer.channel() {
+            channel.heard(now);
+        }
         if is_for_the_link(&message, Kind::GNCL_ACK) {
             let ack: Ack = read(&message.payload)?;
             way.heard(self.link, &ack, now);
             if !ack.held.is_empty() {
                 self.peer.holds_what_may_expire();
+            }
+            return Ok(());
+        }
+        if is_for_the_link(&message, Kind::GNCL_DATAGRAMS) {
+            let said: Announcement = read(&message.payload)?;
+            if let Some(channel) = self.peer.channel() {
+                channel.announced(now, said, way);
             }
             return Ok(());
         }
@@ -100,6 +112,17 @@ impl Inbound {
         Ok(())
     }
 
+    /// Takes a value that came by datagram at `now`, and is newer than all of its flow before.
+    pub(super) fn receive_datagram(&self, now: Time, message: Message) {
+        let Some(way) = self.peer.way(self.lane) else { return };
+        self.spin.heard(now);
+        let Some(hand) = way.take_datagram() else { return };
+        match self.take(now, message, way, Taken::Yes) {
+            Some(end) => hand.ends(end),
+            None => hand.empty(),
+        }
+    }
+
     /// Tells the peer what was taken, if it does not know.
     pub(super) fn acknowledge(&self) {
         if let Some(way) = self.peer.way(self.lane) {
@@ -114,6 +137,12 @@ impl Inbound {
             // No outcome is sent: the source that it names has not sent it.
             self.count(now, "forged source", &message);
             return Some(End::Refused);
+        }
+        if header.class == Class::Stream
+            && let Some(channel) = self.peer.channel()
+            && channel.came_by_connection(&mut message.header) == Freshness::Old
+        {
+            return Some(End::Superseded);
         }
         if header.flags.has(Flags::OUTCOME) {
             self.outcome(now, &message);

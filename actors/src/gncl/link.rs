@@ -22,7 +22,7 @@ use tokio_util::codec::Decoder;
 use super::{
     core::{ConnectionId, Decline, HANDSHAKE_PAYLOAD_MAX},
     inbound::Inbound,
-    task::{Move, ReadingTask},
+    task::{Move, Place, ReadingTask},
 };
 use crate::stores::lock;
 
@@ -187,6 +187,7 @@ pub(super) struct Reader {
     buffer: BytesMut,
     codec: FrameCodec,
     reading: Reading,
+    place: Place,
     /// Frames were delivered of which the shell does not know yet.
     heard: bool,
     /// The peer has said what it takes next.
@@ -214,6 +215,7 @@ impl Reader {
             buffer: BytesMut::new(),
             codec: FrameCodec::new(HANDSHAKE_PAYLOAD_MAX),
             reading,
+            place: Place::Here,
             heard: false,
             greeted: false,
             carried: false,
@@ -249,14 +251,16 @@ impl Reader {
             }
         };
         drop(mode);
-        Some(ReadingTask::begin(Self { socket: to.socket, ..self }, &to.place))
+        let Move { place, socket } = to;
+        Some(ReadingTask::begin(Self { socket, place: place.clone(), ..self }, &place))
     }
 
     fn look(&mut self) -> Look {
         let mode = lock(&self.reading.mode);
         let (payload_max, checksum) = match &*mode {
             Mode::Handshake => (HANDSHAKE_PAYLOAD_MAX, Checksum::Crc),
-            Mode::Linked(inbound) => (self.reading.payload_max, inbound.checksum),
+            // What GNCL itself says is never longer than in a handshake, and not bound by what messages may have.
+            Mode::Linked(inbound) => (self.reading.payload_max.max(HANDSHAKE_PAYLOAD_MAX), inbound.checksum),
             Mode::Moves(..) => return Look::Moves,
             Mode::Discard => {
                 self.buffer.clear();
@@ -268,17 +272,18 @@ impl Reader {
         }
         self.codec.set_payload_max(payload_max);
         self.codec.set_checksum(checksum);
-        let _batch = if let Mode::Linked(inbound) = &*mode { Some(inbound.batch()) } else { None };
         let now = Time::now();
+        let _batch = if let Mode::Linked(inbound) = &*mode { Some(inbound.batch(now)) } else { None };
         for _ in 0..FRAMES_PER_WAKE {
             match (self.codec.decode(&mut self.buffer), &*mode) {
                 (Ok(Some(message)), Mode::Linked(inbound)) if !is_for_the_shell(&message) => {
                     self.heard = true;
+                    let is_a_word = message.header.kind == Kind::GNCL_DATAGRAMS;
                     if let Err(decline) = inbound.receive(now, message) {
                         return Look::Tell(What::Violated(decline));
                     }
                     // The first frame is an ACK in any case. A later one says that our messages arrive.
-                    if !self.carried && std::mem::replace(&mut self.greeted, true) {
+                    if !is_a_word && !self.carried && std::mem::replace(&mut self.greeted, true) {
                         self.carried = true;
                         return Look::Tell(What::Carried);
                     }
@@ -291,9 +296,10 @@ impl Reader {
         Look::Again
     }
 
-    /// Lets the other connections of this thread have their turn, and what has come meanwhile be seen.
+    /// Lets others have their turn, and what has come meanwhile be seen.
     async fn give_way(&mut self) {
         self.turn = 0;
+        self.place.end_turn();
         tokio::task::yield_now().await;
     }
 

@@ -35,6 +35,18 @@ pub(super) fn mark(socket: &TcpStream, lane: Lane) {
     let _ = socket.set_priority(priority);
 }
 
+/// Marks a socket whose datagrams carry values of class Stream.
+#[cfg(target_os = "linux")]
+pub(super) fn mark_datagrams(socket: &socket2::Socket) {
+    let Mark { code_point, priority } = Mark::of(Lane::Stream);
+    let _ = socket.set_tos_v4(code_point << 2);
+    let _ = socket.set_priority(priority);
+}
+
+/// Marks nothing, likewise.
+#[cfg(not(target_os = "linux"))]
+pub(super) fn mark_datagrams(_: &socket2::Socket) {}
+
 /// Marks nothing: not every system has these options.
 #[cfg(not(target_os = "linux"))]
 pub(super) fn mark(_: &TcpStream, lane: Lane) {

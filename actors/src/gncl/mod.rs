@@ -1,4 +1,4 @@
-//! GNCL, the Global Node Communication Layer: moves messages between nodes over TCP, in order.
+//! GNCL, the Global Node Communication Layer: moves messages between nodes over TCP, in order, and values of class Stream by UDP.
 //!
 //! Its promise: a message to an application of another node arrives once, in the order in which its class was submitted,
 //! through any number of connections and restarts of this layer; and a confirmed message has exactly one outcome,
@@ -18,7 +18,7 @@
 //! | GNCL-10 | GOODBYE is the last frame of a node that leaves, behind all that waits; it is not dialled again until it is found again. |
 //! | GNCL-11 | A frame's source must be on the peer's node and its destination on this one; times are turned into our clock. |
 //! | GNCL-12 | CONFIRM is answered by OUTCOME on the peer's present connection. |
-//! | GNCL-14 | Where both know `classes`, whoever dialled a link dials a connection each for Stream and for Bulk as well. |
+//! | GNCL-14 | Where both know `classes`, whoever dialled a link dials a connection each for Stream and for Bulk as well. At rest they are pinged every 10 s. |
 //! | GNCL-15 | Who waits no more for a reply says CANCEL, to a peer that knows it: a request that still waits is taken out as `Expired`. |
 //! | GNCL-16 | All addresses that a peer announces are dialled, 20 ms apart; the first that is reached stays, the others are closed. |
 //! | GNCL-17 | Outcomes that wait go several in one frame, to a peer that knows `outcomes`. |
@@ -34,6 +34,7 @@
 //! | `bulk.rs` | the thread of those of Bulk |
 //! | `arrivals.rs` | what became of what came, counted |
 //! | `inbound.rs` | what is checked before a frame becomes a message of this node |
+//! | `datagrams/` | values of class Stream by UDP, where they get through |
 //! | `interfaces.rs` | which of this host's addresses are lost, as the kernel says |
 //! | `spin.rs` | how long the IO thread looks before it sleeps |
 //! | `ticks.rs` | looks at what has a time, only as long as there is something |
@@ -45,6 +46,7 @@ mod actor;
 mod arrivals;
 mod bulk;
 mod core;
+mod datagrams;
 mod facts;
 mod inbound;
 #[cfg(target_os = "linux")]

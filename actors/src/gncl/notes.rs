@@ -7,12 +7,20 @@ use sinew_runtime::{tid::NodeAddress, time::Time};
 use super::LinkFact;
 use crate::stores::lock;
 
-/// Nodes of which something is kept, at most; of a further one nothing is told.
+/// Nodes of which something is kept, at most. For a further one that is forgotten of which nothing new was heard for longest, of those
+/// without a connection if there is one: whoever can connect can say that it is any node, and one that is dialled is heard of each second.
 const NODES_MAX: usize = 1_024;
 
 /// Kept beside the layer, so that it is there when the layer hangs.
 #[derive(Debug, Default)]
-pub(crate) struct Notes(Mutex<BTreeMap<NodeAddress, Note>>);
+pub(crate) struct Notes(Mutex<BTreeMap<NodeAddress, Entry>>);
+
+/// A note, and when something was last written there.
+#[derive(Debug, Default)]
+struct Entry {
+    note: Note,
+    written: Time,
+}
 
 /// What is known of the connection to one node.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -38,11 +46,11 @@ pub(crate) struct FailedDial {
 impl Notes {
     /// What is known of `node`.
     pub(crate) fn of(&self, node: NodeAddress) -> Note {
-        lock(&self.0).get(&node).cloned().unwrap_or_default()
+        lock(&self.0).get(&node).map(|entry| entry.note.clone()).unwrap_or_default()
     }
 
     pub(super) fn dial_failed(&self, now: Time, node: NodeAddress, address: SocketAddr, error: String) {
-        self.change(node, |note| {
+        self.write(now, node, |note| {
             let count = note.dial.as_ref().map_or(0, |dial| dial.count) + 1;
             note.dial = Some(FailedDial { at: now, address, error, count });
         });
@@ -51,21 +59,27 @@ impl Notes {
     pub(super) fn fact(&self, now: Time, fact: &LinkFact) {
         match *fact {
             LinkFact::LinkUp { node, .. } => {
-                self.change(node, |note| *note = Note { linked: Some(now), ..Note::default() });
+                self.write(now, node, |note| *note = Note { linked: Some(now), ..Note::default() });
             }
             LinkFact::LinkBroken { node, .. } => {
-                self.change(node, |note| (note.linked, note.broken) = (None, Some(now)));
+                self.write(now, node, |note| (note.linked, note.broken) = (None, Some(now)));
             }
             LinkFact::PeerLeft { node, .. } => drop(lock(&self.0).remove(&node)),
             LinkFact::DialRefused { .. } => {}
         }
     }
 
-    fn change(&self, node: NodeAddress, change: impl FnOnce(&mut Note)) {
+    fn write(&self, now: Time, node: NodeAddress, write: impl FnOnce(&mut Note)) {
         let mut notes = lock(&self.0);
-        if notes.len() < NODES_MAX || notes.contains_key(&node) {
-            change(notes.entry(node).or_default());
+        if notes.len() >= NODES_MAX && !notes.contains_key(&node) {
+            let oldest =
+                notes.iter().min_by_key(|(_, Entry { note, written })| (note.linked.is_some(), *written));
+            let oldest = oldest.map(|(node, _)| *node);
+            oldest.and_then(|node| notes.remove(&node));
         }
+        let entry = notes.entry(node).or_default();
+        entry.written = now;
+        write(&mut entry.note);
     }
 }
 
@@ -96,12 +110,38 @@ mod tests {
     }
 
     #[test]
-    fn of_more_nodes_than_are_kept_nothing_is_told() {
+    fn for_one_more_node_that_one_is_forgotten_of_which_nothing_was_heard_for_longest() {
+        // Given: one with a connection, one that is dialled in vain, and strangers that came between and went
+        let notes = Notes::default();
+        let at = |seconds| Time::ZERO + Duration::from_secs(seconds);
+        let incarnation = Incarnation(1);
+        let node = |number| NodeAddress::new(number);
+        let (linked, dialled, first) = (node(1), node(2), 3);
+        notes.fact(at(1), &LinkFact::LinkUp { node: linked, incarnation });
+        notes.fact(at(1), &LinkFact::LinkBroken { node: dialled, incarnation });
+        let last = NODES_MAX as u32;
+        for number in first..=last {
+            notes.fact(at(2), &LinkFact::LinkBroken { node: node(number), incarnation });
+        }
+        notes.dial_failed(at(3), dialled, ([127, 0, 0, 2], 7).into(), "refused".to_owned());
+        // When
+        notes.fact(at(4), &LinkFact::LinkUp { node: node(last + 1), incarnation });
+        // Then
+        assert_eq!(lock(&notes.0).len(), NODES_MAX);
+        assert_eq!(notes.of(node(first)), Note::default(), "the oldest of those without a connection");
+        assert_eq!(notes.of(node(last + 1)).linked, Some(at(4)));
+        assert_eq!(notes.of(linked).linked, Some(at(1)));
+        assert_eq!(notes.of(dialled).dial.map(|dial| dial.count), Some(1));
+    }
+
+    #[test]
+    fn where_all_have_connections_the_oldest_one_makes_room() {
         let notes = Notes::default();
         for number in 0..=NODES_MAX as u32 {
-            let node = NodeAddress::new(number + 1);
-            notes.fact(Time::ZERO, &LinkFact::LinkBroken { node, incarnation: Incarnation(1) });
+            let (node, now) = (NodeAddress::new(number + 1), Time::from_nanos(u64::from(number)));
+            notes.fact(now, &LinkFact::LinkUp { node, incarnation: Incarnation(1) });
         }
         assert_eq!(lock(&notes.0).len(), NODES_MAX);
+        assert_eq!(notes.of(NodeAddress::new(1)), Note::default());
     }
 }

@@ -2,9 +2,13 @@
 
 use std::{
     collections::BTreeMap,
+    hash::{BuildHasher as _, RandomState},
     io,
     net::Shutdown,
-    sync::{Arc, Mutex, MutexGuard, PoisonError, Weak},
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError, Weak,
+        atomic::{AtomicBool, AtomicU64, Ordering},
+    },
     task::{Wake, Waker},
     time::Duration,
 };
@@ -23,6 +27,7 @@ use tokio::{net::TcpStream, sync::Notify};
 use super::{
     bulk::BulkThread,
     core::{Attach, Lane},
+    datagrams::{Alarm, Channel, Position, Sockets},
     notes::Notes,
     task::{Move, Place},
     ticks::Ticks,
@@ -30,7 +35,7 @@ use super::{
 };
 use crate::{
     audit::Account,
-    outlet::OutletCounts,
+    outlet::{OutletAccount, OutletCounts},
     refusals::Refusals,
     stores::{Stores, lock},
 };
@@ -53,6 +58,14 @@ pub(crate) struct Peer {
     ways: Vec<Way>,
     /// Whether it knows [`CANCEL`](Kind::CANCEL).
     takes_cancels: bool,
+    /// When something of it was read last, in nanoseconds of our clock; 0: never.
+    sign: AtomicU64,
+    /// When it said that it leaves, in nanoseconds of our clock, 0: it has not; what it still sends is taken.
+    has_left: AtomicU64,
+    /// It is over: nothing more is taken of it.
+    is_over: AtomicBool,
+    /// What goes by datagram, where both sides may have it so.
+    channel: Option<Channel>,
     buried: Arc<Mutex<Buried>>,
     expiring: Arc<Ticks>,
 }
@@ -84,9 +97,26 @@ impl Peer {
         let refusals = &stores.gncl.refusals;
         let acks = &stores.gncl.acks;
         let ways = (0..ways).map(|_| Way::new(now, ends, &stores.config, refusals, acks)).collect();
+        let channel = attach.takes_datagrams.then(|| {
+            // Nobody can guess it: this has its seed from the system.
+            let key = RandomState::new().hash_one(());
+            let ends = (stores.node, attach.node);
+            Channel::new(now, ends, key, (&stores.gncl.alarm, refusals))
+        });
         let (buried, expiring) = (stores.gncl.buried.clone(), stores.gncl.expiring.clone());
         let Attach { node, incarnation, takes_cancels, .. } = *attach;
-        Self { node, incarnation, ways, takes_cancels, buried, expiring }
+        Self {
+            node,
+            incarnation,
+            ways,
+            takes_cancels,
+            channel,
+            sign: AtomicU64::new(0),
+            has_left: AtomicU64::new(0),
+            is_over: AtomicBool::new(false),
+            buried,
+            expiring,
+        }
     }
 
     /// Its sessions.
@@ -99,9 +129,56 @@ impl Peer {
         self.ways.get(lane as usize)
     }
 
+    /// What goes by datagram, and the session of the values that do not.
+    pub(super) const fn channel(&self) -> Option<&Channel> {
+        self.channel.as_ref()
+    }
+
+    /// Nothing goes by datagram any more: what is under way goes by the connection.
+    pub(super) fn retire_datagrams(&self) {
+        if let Some(channel) = &self.channel {
+            channel.retire(self.way_of(Class::Stream));
+        }
+    }
+
+    /// Sends again what counts as lost, and acknowledges what came. Returns when to look again.
+    pub(super) fn look_at_the_time(&self, now: Time) -> Option<Time> {
+        self.channel.as_ref()?.tick(now, self.way_of(Class::Stream))
+    }
+
+    /// Nothing reaches it any more, and nothing that waits will.
+    fn end(&self, why: Rejection) {
+        self.channel.iter().for_each(Channel::end);
+        self.ways.iter().for_each(|way| way.outlet.close(why));
+    }
+
     /// The session of this class.
     fn way_of(&self, class: Class) -> &Way {
         self.ways.get(class as usize).unwrap_or(&self.ways[0])
+    }
+
+    /// Something of this life of it was read at `now`: NDL does not lose it for a while. Once for all that was read at once.
+    pub(super) fn gives_a_sign(&self, now: Time) {
+        // SYNC: Relaxed; nothing else becomes visible with it, and NDL reads it long after.
+        self.sign.store(now.as_nanos(), Ordering::Relaxed);
+    }
+
+    /// Nothing more is taken of this life of it.
+    fn fence(&self) {
+        self.ways.iter().for_each(Way::fence);
+        // SYNC: Release, with the Acquire in `owes`: who sees it sees the fences.
+        self.is_over.store(true, Ordering::Release);
+    }
+
+    /// Whether a message of this life, which has left or is over, may still come to the application at this address.
+    fn owes(&self, app: AppAddress) -> bool {
+        // SYNC: Acquire, see `fence`.
+        if self.is_over.load(Ordering::Acquire) {
+            self.ways.iter().any(|way| way.owes(app))
+        } else {
+            // SYNC: Relaxed; a flag by itself.
+            self.has_left.load(Ordering::Relaxed) != 0
+        }
     }
 
     /// Something waits here again that had gone out.
@@ -116,12 +193,13 @@ impl Peer {
 
     /// Messages for it that have not arrived, as far as is known here.
     pub(super) fn left(&self) -> usize {
-        self.ways.iter().map(|way| way.outlet.left()).sum()
+        let by_datagram = self.channel.as_ref().map_or(0, Channel::left);
+        by_datagram + self.ways.iter().map(|way| way.outlet.left()).sum::<usize>()
     }
 
     /// Nothing reaches it any more, because this node stops.
     pub(super) fn close(&self) {
-        self.ways.iter().for_each(|way| way.outlet.close(Rejection::Closed));
+        self.end(Rejection::Closed);
     }
 
     /// The peer says what became of these messages; those that nobody waits for any more are left.
@@ -132,17 +210,33 @@ impl Peer {
 
     /// Where every message to it and from it is, session by session.
     pub(crate) fn accounts(&self) -> Vec<WayAccount> {
-        self.ways.iter().map(Way::account).collect()
+        let mut accounts: Vec<_> = self.ways.iter().map(Way::account).collect();
+        if let Some(channel) = &self.channel
+            && let Some(account) = accounts.get_mut(Class::Stream as usize)
+        {
+            account.sent = with_datagrams(account.sent, &channel.position());
+        }
+        accounts
     }
 
     /// What became of the messages to it so far.
     pub(crate) fn counts(&self) -> OutletCounts {
-        self.ways.iter().fold(OutletCounts::default(), |sum, way| sum + way.outlet.counts())
+        let by_datagram = self.channel.as_ref().map(|channel| channel.position().counts);
+        let by_datagram = by_datagram.map(|counts| OutletCounts {
+            sent: counts.sent,
+            superseded: counts.superseded,
+            expired: counts.expired,
+            lost: counts.lost,
+            refused: 0,
+        });
+        let first = by_datagram.unwrap_or_default();
+        self.ways.iter().fold(first, |sum, way| sum + way.outlet.counts())
     }
 
     /// Messages that wait to be sent to it.
     pub(crate) fn waiting(&self) -> usize {
-        self.ways.iter().map(|way| way.outlet.waiting()).sum()
+        let by_datagram = self.channel.as_ref().map_or(0, |channel| channel.position().waiting as usize);
+        by_datagram + self.ways.iter().map(|way| way.outlet.waiting()).sum::<usize>()
     }
 
     /// Confirmed messages to it whose outcome is not known yet.
@@ -154,7 +248,11 @@ impl Peer {
 impl Outlet for Peer {
     fn submit(&self, message: Message) -> Result<(), Refused> {
         let has_a_time = message.header.time_to_live_us != 0 || message.receipt.is_some();
-        self.way_of(message.header.class).outlet.submit(message)?;
+        let way = self.way_of(message.header.class);
+        match &self.channel {
+            Some(channel) if message.header.class == Class::Stream => channel.submit(message, way)?,
+            Some(_) | None => way.outlet.submit(message)?,
+        }
         if has_a_time {
             self.expiring.want();
         }
@@ -180,6 +278,21 @@ impl ReceiptSink for Peer {
         let mut said = Message::outcome(ticket, outcome);
         said.header.sent = Time::now();
         self.way_of(said.header.class).send_outcome(said);
+    }
+}
+
+/// The account of a session with what went by datagram beside it.
+fn with_datagrams(session: OutletAccount, datagrams: &Position) -> OutletAccount {
+    OutletAccount {
+        taken: session.taken + datagrams.taken(),
+        arrived: session.arrived + datagrams.arrived,
+        superseded: session.superseded + datagrams.superseded(),
+        expired: session.expired + datagrams.expired(),
+        lost: session.lost + datagrams.counts.lost,
+        unknown: session.unknown + datagrams.unknown(),
+        waiting: session.waiting + datagrams.waiting,
+        unacknowledged: session.unacknowledged + datagrams.unacknowledged,
+        ..session
     }
 }
 
@@ -219,6 +332,9 @@ pub(crate) struct Store {
     /// Who looks for what has expired, and who for what was taken and not acknowledged.
     expiring: Arc<Ticks>,
     acks: Arc<Ticks>,
+    /// Where datagrams are read, and who looks at the time for them.
+    pub(super) datagrams: Sockets,
+    pub(super) alarm: Arc<Alarm>,
     /// What is told of connections to whoever asks.
     pub(crate) notes: Notes,
     /// What GNCL refused, and why.
@@ -244,6 +360,49 @@ impl Store {
     /// The peer at `node`.
     pub(crate) fn peer(&self, node: NodeAddress) -> Option<Arc<Peer>> {
         self.lock().get(&node).cloned()
+    }
+
+    /// This life of `node` has said goodbye: what it still sends is taken, and then it is over.
+    pub(crate) fn leaves(&self, now: Time, node: NodeAddress, incarnation: Incarnation) {
+        for peer in self.met().iter().filter(|peer| (peer.node, peer.incarnation) == (node, incarnation)) {
+            // SYNC: Relaxed; who is told of the goodbye is told behind this by the same thread, or through a post's lock.
+            let _ = peer.has_left.compare_exchange(0, now.as_nanos(), Ordering::Relaxed, Ordering::Relaxed);
+        }
+    }
+
+    /// This life of `node` is over: nothing more is taken of it.
+    pub(crate) fn fence(&self, node: NodeAddress, incarnation: Incarnation) {
+        let is_it = |peer: &&Arc<Peer>| (peer.node, peer.incarnation) == (node, incarnation);
+        self.met().iter().filter(is_it).for_each(|peer| peer.fence());
+    }
+
+    /// Who left so long ago, and still sends, is over. A later life of the node that leaves just now is not.
+    pub(crate) fn fence_who_left(&self, node: NodeAddress, now: Time, ago: Duration) {
+        let has_left = |peer: &&Arc<Peer>| {
+            let left = Some(peer.has_left.load(Ordering::Relaxed)).filter(|left| *left != 0);
+            peer.node == node && left.is_some_and(|left| now.since(Time::from_nanos(left)) >= ago)
+        };
+        self.met().iter().filter(has_left).for_each(|peer| peer.fence());
+    }
+
+    /// Whether a message of a life of `node` that has left or is over may still come to the application at this address.
+    pub(crate) fn owes(&self, node: NodeAddress, app: AppAddress) -> bool {
+        self.met().iter().any(|peer| peer.node == node && peer.owes(app))
+    }
+
+    /// When something of that life of `node` was read last.
+    pub(crate) fn sign_of(&self, node: NodeAddress, incarnation: Incarnation) -> Option<Time> {
+        let peer = self.peer(node).filter(|peer| peer.incarnation == incarnation)?;
+        // SYNC: see `gives_a_sign`.
+        Some(peer.sign.load(Ordering::Relaxed)).filter(|sign| *sign != 0).map(Time::from_nanos)
+    }
+
+    /// Has that life of `node` give a sign on each connection that stands: a PING, ahead of all that waits there. spec: NDL-4.7
+    pub(crate) fn ask_for_a_sign(&self, here: NodeAddress, node: NodeAddress, incarnation: Incarnation) {
+        let Some(peer) = self.peer(node).filter(|peer| peer.incarnation == incarnation) else { return };
+        for way in peer.ways.iter().filter(|way| way.outlet.is_connected()) {
+            way.say(frame(here, node, Kind::GNCL_PING, Bytes::new()));
+        }
     }
 
     /// The peer that a connection leads to, made if need be. An older life of it is closed.
@@ -273,7 +432,8 @@ impl Store {
         let peer = self.lock().remove(&node);
         // Closed without the lock: whoever is told of an outcome may ask for a peer.
         let Some(peer) = peer else { return };
-        peer.ways.iter().for_each(|way| way.outlet.close(Rejection::NoSuchNode));
+        peer.fence();
+        peer.end(Rejection::NoSuchNode);
         if peer.ways.iter().any(Way::is_held_up) {
             let mut gone = lock(&self.gone);
             // What the first one left has waited longest; it is dropped, and its receipts have nobody to tell.
@@ -359,6 +519,7 @@ impl Store {
 
     /// Nobody connects any more, and the ports are free, whoever still holds the sockets.
     pub(crate) fn close(&self) {
+        self.datagrams.close();
         for listener in lock(&self.listeners).drain(..) {
             // An error says that it does not listen any more.
             let _ = SockRef::from(&listener).shutdown(Shutdown::Both);

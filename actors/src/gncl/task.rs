@@ -1,7 +1,7 @@
 //! The tasks of a link: one reads and delivers, one writes what waits. They are no part of the actor, which hears of them only what
 //! it must know: a message costs the turn of one task, however many links there are.
 
-use std::{panic, sync::Arc, time::Duration};
+use std::{panic, sync::Arc, thread, time::Duration};
 
 use sinew_runtime::time::Time;
 use tokio::{net::TcpStream, runtime::Handle, sync::mpsc, task};
@@ -26,6 +26,17 @@ pub(super) enum Place {
 impl Place {
     pub(super) const fn is_here(&self) -> bool {
         matches!(self, Self::Here)
+    }
+
+    /// A task has had its turn, and goes on if nobody else wants to: with no lock in hand.
+    ///
+    /// The IO thread's turns are short enough. One of Bulk may have the next one ready for as long as the system lets it run, which is a
+    /// millisecond and more even where somebody has been woken for Control and waits for this CPU.
+    pub(super) fn end_turn(&self) {
+        match self {
+            Self::Here => {}
+            Self::There(_) => thread::yield_now(),
+        }
     }
 
     /// Begins a task, which ends when its handle is dropped.

@@ -5,6 +5,8 @@ mod bench;
 mod cancels;
 mod classes;
 mod credit;
+mod datagrams;
+mod ends;
 mod handshakes;
 mod leaving;
 mod links;

@@ -1,5 +1,7 @@
 //! One session with a peer: what is sent to it on the connections of a lane, and what was taken of its messages there.
 
+mod acks;
+
 use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
     task::Waker,
@@ -9,7 +11,7 @@ use bytes::Bytes;
 use sinew_runtime::{
     outcome::{Outcome, Rejection, Ticket},
     router::{Refused, Router},
-    tid::NodeAddress,
+    tid::{AppAddress, NodeAddress},
     time::Time,
     wire::{HEADER_LEN, Kind, Message},
 };
@@ -17,13 +19,15 @@ use tokio::net::TcpStream;
 
 use super::{
     arrivals::{Arrivals, End},
-    core::{Decline, write},
+    core::Decline,
     peer::frame,
     ticks::Ticks,
 };
 use crate::{
     config::NodeConfig,
-    outlet::{Gathering, LinkNumber, OutletAccount, OutletLimits, Session, StreamOutlet, line_of},
+    outlet::{
+        Gathering, LinkNumber, OutletAccount, OutletLimits, Session, StreamOutlet, destination_of, line_of,
+    },
     refusals::Refusals,
     session::{Ack, Arrival, Came, Receiving, Sent, Shelf, ShelfLimits, Window},
 };
@@ -38,12 +42,14 @@ const WINDOW_MESSAGES_MIN: usize = 64;
 const WORDS_MAX: usize = 32;
 
 /// Applications at most for which messages of one session wait because they take nothing. Of a further one that is full each message is
-/// refused at once.
-const LINES_MAX: usize = 64;
+/// refused at once. Each ACK names them all, in 9 bytes each: 2.4 KiB, which is less than what this layer's own frames may have (4,096).
+const LINES_MAX: usize = 256;
 /// Windows that may wait for applications, all together.
 const SHELF_WINDOWS: usize = 4;
 /// Messages of one line that are offered before others have their turn.
 const OFFERS_PER_TURN: usize = 256;
+/// Messages of all lines that are settled as expired before.
+const EXPIRED_PER_TURN: usize = 256;
 /// Times `gncl.queue_capacity`: so many outcomes may wait to be sent. They answer confirmed messages of the peer, of which it can
 /// have that many.
 const OUTCOMES_MAX: usize = 8;
@@ -74,13 +80,15 @@ struct Inbox {
     receiving: Receiving,
     shelf: Shelf<u64, Message>,
     arrivals: Arrivals,
-    /// Nothing in the lines expires before this.
-    next_expiry: Time,
     /// The peer is to be told what was taken, as soon as what came with it has been taken, too.
     ack_is_due: bool,
+    /// Acknowledgements that were made so far.
+    acks_made: u64,
+    /// The peer's life is over: nothing more is taken of it.
+    is_fenced: bool,
 }
 
-/// What became of the messages of a peer. `taken = handed_on + told + expired + refused + failed + waiting`.
+/// What became of the messages of a peer. `taken = handed_on + told + expired + refused + failed + superseded + waiting`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Arrived {
     pub(crate) taken: u64,
@@ -91,6 +99,8 @@ pub(crate) struct Arrived {
     pub(crate) expired: u64,
     pub(crate) refused: u64,
     pub(crate) failed: u64,
+    /// A newer value of class Stream had come before.
+    pub(crate) superseded: u64,
     /// For applications that take nothing now, or in the hand of a thread.
     pub(crate) waiting: u64,
 }
@@ -166,8 +176,9 @@ impl Way {
             receiving: Receiving::new(memory),
             shelf,
             arrivals: Arrivals::default(),
-            next_expiry: Time::MAX,
             ack_is_due: false,
+            acks_made: 0,
+            is_fenced: false,
         });
         let outcomes_max = OUTCOMES_MAX * config.gncl.queue_capacity;
         let (refusals, acks) = (refusals.clone(), acks.clone());
@@ -188,6 +199,9 @@ impl Way {
         let number = message.header.number;
         let (arrival, line) = {
             let mut inbox = self.inbox();
+            if inbox.is_fenced {
+                return Ok(Taken::No);
+            }
             let arrival = inbox.receiving.arrive(link.number(), number, message.size());
             if let Arrival::Take { ack_is_due } = arrival {
                 inbox.arrivals.take();
@@ -208,6 +222,17 @@ impl Way {
         }
     }
 
+    /// Takes nothing more: who has been told that this life of the peer is over gets no message of it afterwards.
+    pub(super) fn fence(&self) {
+        self.inbox().is_fenced = true;
+    }
+
+    /// Whether a message that was taken may still come to the application at this address.
+    pub(super) fn owes(&self, app: AppAddress) -> bool {
+        let Inbox { shelf, arrivals, .. } = &*self.inbox();
+        arrivals.in_hand() > 0 || shelf.held().into_iter().any(|line| destination_of(line) == app)
+    }
+
     /// The peer says what it has taken.
     pub(super) fn heard(&self, link: LinkNumber, ack: &Ack, now: Time) {
         let counts = self.inbox().receiving.heard(link.number(), ack.epoch);
@@ -224,54 +249,46 @@ impl Way {
         }
     }
 
-    /// All that came at once has been taken: tells the peer so, if there was much since it was told.
-    pub(super) fn acknowledge_if_due(&self) {
-        let is_due = self.inbox().ack_is_due;
-        if is_due {
-            self.acknowledge();
-        }
-    }
-
-    /// Tells the peer what was taken, if it does not know. Returns whether it did not.
-    pub(super) fn acknowledge_if_owed(&self) -> bool {
-        let owes = self.inbox().receiving.owes_ack();
-        if owes {
-            self.acknowledge();
-        }
-        owes
-    }
-
-    fn acknowledge(&self) {
-        let epoch = self.outlet.epoch();
-        let ack = {
-            let Inbox { receiving, shelf, ack_is_due, .. } = &mut *self.inbox();
-            *ack_is_due = false;
-            let room = shelf.room(self.window, self.longest);
-            Ack { change: shelf.change(), held: shelf.held(), ..receiving.ack(epoch, Some(room)) }
-        };
-        self.say(frame(self.ends.here, self.ends.node, Kind::GNCL_ACK, write(&ack)));
-    }
-
     /// Puts a message behind what waits for its destination; if that is held from now on, the peer is told so at once. Returns whether
     /// it is.
     ///
     /// # Errors
     /// The message: there is no room.
     pub(super) fn put_in_line(&self, key: u64, message: Message) -> Result<bool, Message> {
-        let (bytes, expiry) = (message.size(), message.header.expiry());
-        let is_news = {
-            let Inbox { shelf, arrivals, next_expiry, .. } = &mut *self.inbox();
-            let before = shelf.change();
-            shelf.put(key, message, bytes)?;
-            *next_expiry = expiry.min(*next_expiry);
-            arrivals.put_away();
-            shelf.change() != before
+        let bytes = message.size();
+        let put = {
+            let Inbox { shelf, arrivals, .. } = &mut *self.inbox();
+            let (before, has_no_line) = (shelf.change(), shelf.has_no_line_for(key));
+            let put = shelf.put(key, message, bytes);
+            if put.is_ok() {
+                arrivals.put_away();
+            }
+            put.map(|()| shelf.change() != before).map_err(|message| (message, has_no_line))
         };
-        if is_news {
-            // spec: CREDIT-2
-            self.acknowledge();
+        match put {
+            Ok(is_news) => {
+                if is_news {
+                    // spec: CREDIT-2
+                    self.acknowledge();
+                }
+                Ok(is_news)
+            }
+            Err((message, has_no_line)) => {
+                if has_no_line {
+                    self.count_too_many_lines();
+                }
+                Err(message)
+            }
         }
-        Ok(is_news)
+    }
+
+    fn count_too_many_lines(&self) {
+        let detail = format!(
+            "{LINES_MAX} applications here take nothing of what node {} sends, and one more is full: what comes for that one is refused \
+             (QueueFull) until one of them takes again; what they wait for says `sinew why`",
+            self.ends.node
+        );
+        self.refusals.count(Time::now(), "too many full applications", &detail);
     }
 
     /// Takes a request out of its line that nobody waits for any more; if its destination is held no more, the peer is told so.
@@ -293,14 +310,14 @@ impl Way {
 
     /// Offers what waits for applications here to them again; `room` is woken when one of them takes more. Returns how far that came.
     pub(super) fn offer_again(&self, now: Time, router: &Router, room: &Waker) -> Offered {
-        let has_fewer = self.expire_lines(now);
+        let (has_fewer, expired) = self.expire_lines(now);
         let held = self.inbox().shelf.held();
         let lines: Vec<_> = held.into_iter().map(|key| self.offer_line(now, key, router, room)).collect();
         if has_fewer || lines.contains(&Offered::All) || self.owes_room() {
             // spec: CREDIT-2
             self.acknowledge();
         }
-        lines.into_iter().max().unwrap_or(Offered::All)
+        lines.into_iter().fold(expired, Offered::max)
     }
 
     /// Whether there is much more room than the peer knows of.
@@ -309,34 +326,24 @@ impl Way {
         receiving.owes_room(shelf.room(self.window, self.longest))
     }
 
-    /// Settles what has expired in the lines, also behind a message that may wait longer. Returns whether somebody is held no more.
-    fn expire_lines(&self, now: Time) -> bool {
-        let (expired, has_fewer) = {
-            let Inbox { shelf, arrivals, next_expiry, .. } = &mut *self.inbox();
-            if now <= *next_expiry {
-                return false;
-            }
+    /// Settles what has expired in the lines, also behind a message that may wait longer. Returns whether somebody is held no more, and
+    /// how far that came.
+    fn expire_lines(&self, now: Time) -> (bool, Offered) {
+        let (expired, has_fewer, is_all) = {
+            let Inbox { shelf, arrivals, .. } = &mut *self.inbox();
             let before = shelf.change();
-            let mut next = Time::MAX;
-            let expired = shelf.take_useless(|message| {
-                let is_expired = message.header.is_expired(now);
-                if !is_expired {
-                    next = next.min(message.header.expiry());
-                }
-                is_expired
-            });
-            *next_expiry = next;
+            let expired = shelf.take_expired(now, EXPIRED_PER_TURN);
             for _ in &expired {
                 arrivals.take_again();
                 arrivals.end(End::Expired);
             }
-            (expired, shelf.change() != before)
+            (expired, shelf.change() != before, shelf.next_expiry() >= now)
         };
         // Nobody is told anything with the lock in hand.
         for mut message in expired {
             message.settle(Outcome::Expired);
         }
-        has_fewer
+        (has_fewer, if is_all { Offered::All } else { Offered::Turn })
     }
 
     /// Offers what waits in one line until its destination takes no more.
@@ -384,6 +391,7 @@ impl Way {
             expired: ended(End::Expired),
             refused: ended(End::Refused),
             failed: ended(End::Failed),
+            superseded: ended(End::Superseded),
             waiting: lines + arrivals.in_hand(),
         };
         WayAccount { sent, arrived, sending, receiving }
@@ -392,6 +400,16 @@ impl Way {
     /// The message that has just been taken.
     pub(super) const fn hand(&self) -> Hand<'_> {
         Hand(Some(self))
+    }
+
+    /// A value has come by datagram, and is in hand; `None` if nothing more is taken.
+    pub(super) fn take_datagram(&self) -> Option<Hand<'_>> {
+        let inbox = &mut *self.inbox();
+        if inbox.is_fenced {
+            return None;
+        }
+        inbox.arrivals.take();
+        Some(self.hand())
     }
 
     /// Whether messages wait for applications here.
@@ -464,7 +482,6 @@ impl Inbox {
 
     /// Puts what was in hand back.
     fn put_back(&mut self, key: u64, message: Message, bytes: usize) {
-        self.next_expiry = self.next_expiry.min(message.header.expiry());
         self.shelf.put_back(key, message, bytes);
         self.arrivals.put_away();
     }

@@ -24,7 +24,10 @@ const LINGER_LOOK: Duration = Duration::from_millis(1);
 impl Gncl {
     /// spec: GNCL-10
     pub(super) fn say_goodbye(&self, node: NodeAddress) {
-        for way in self.stores.gncl.peer(node).iter().flat_map(|peer| peer.ways()) {
+        let peer = self.stores.gncl.peer(node);
+        // Behind the last values, too.
+        peer.iter().for_each(|peer| peer.retire_datagrams());
+        for way in peer.iter().flat_map(|peer| peer.ways()) {
             way.outlet.finish(frame(self.stores.node, node, Kind::GNCL_GOODBYE, bytes::Bytes::new()));
         }
     }

@@ -55,6 +55,8 @@ pub(super) struct Pulse {
     pub(super) heard: Time,
     /// Pings since something was heard.
     pub(super) pings: u32,
+    /// What was heard says only that it lives, and it may be left alone for longer.
+    is_at_rest: bool,
 }
 
 impl Acquaintance {
@@ -142,12 +144,18 @@ impl Link {
 impl Pulse {
     /// Something was heard at `now`.
     pub(super) const fn beat(now: Time) -> Self {
-        Self { heard: now, pings: 0 }
+        Self { heard: now, pings: 0, is_at_rest: false }
+    }
+
+    /// A sign of life was heard at `now`, and nothing else goes on.
+    pub(super) const fn rest(now: Time) -> Self {
+        Self { heard: now, pings: 0, is_at_rest: true }
     }
 
     /// When the next ping is due, or the connection counts as broken.
     pub(super) fn ping_at(&self, settings: &Settings) -> Time {
-        self.heard + settings.ping_period * (self.pings + 1)
+        let silence = if self.is_at_rest { settings.side_rest } else { settings.ping_period };
+        self.heard + silence + settings.ping_period * self.pings
     }
 
     /// Whether one more ping is sent at `now`; `None` if none is due, `Some(false)` if enough were.

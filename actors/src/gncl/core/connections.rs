@@ -3,8 +3,8 @@
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
 use super::{
-    Attach, CANCEL, Connection, ConnectionId, Core, Decline, GUARD, Introduction, Lane, LinkFact, OUTCOMES,
-    Output, Refusal, Stage,
+    Attach, CANCEL, Connection, ConnectionId, Core, DATAGRAMS, Decline, GUARD, Introduction, Lane, LinkFact,
+    OUTCOMES, Output, Refusal, Stage,
     acquaintance::{Acquaintance, Link, Pulse},
     dials::Dial,
     handshake::check,
@@ -219,6 +219,7 @@ impl Core {
             by_class,
             takes_cancels: theirs.knows(CANCEL),
             takes_outcomes: theirs.knows(OUTCOMES),
+            takes_datagrams: by_class && theirs.knows(DATAGRAMS) && self.settings.ours.knows(DATAGRAMS),
             is_guarded: theirs.knows(GUARD) && self.settings.ours.knows(GUARD),
             payload_max: theirs.payload_max,
             welcome,

@@ -24,6 +24,9 @@ pub(crate) const CANCEL: &str = "cancel";
 /// The ability to take several outcomes in one frame.
 pub(crate) const OUTCOMES: &str = "outcomes";
 
+/// The ability to have values of class Stream by datagram.
+pub(crate) const DATAGRAMS: &str = "datagrams";
+
 /// Whose messages a connection carries: those of one class, where both nodes know [`CLASSES`]. Where one does not, the first
 /// carries all.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -64,7 +67,8 @@ pub(crate) struct Introduction {
     pub(crate) dial: u64,
     /// Longest payload that the sender takes, in bytes.
     pub(crate) payload_max: u64,
-    /// Optional abilities of the sender; what both have may be used: [`CLASSES`], [`CANCEL`], [`GUARD`], [`OUTCOMES`].
+    /// Optional abilities of the sender; what both have may be used: [`CLASSES`], [`CANCEL`], [`GUARD`], [`OUTCOMES`],
+    /// [`DATAGRAMS`].
     #[serde(default)]
     pub(crate) features: Vec<String>,
     /// What travels on this connection.

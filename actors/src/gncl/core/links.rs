@@ -127,6 +127,19 @@ impl Core {
         }
     }
 
+    /// The peer lives, as far as this connection tells; nothing else has come on it.
+    pub(super) fn lives(&mut self, now: Time, connection: ConnectionId) {
+        let Some((node, lane)) = self.linked(connection) else { return };
+        let Some(link) = self.peers.get_mut(&node).and_then(|peer| peer.link.as_mut()) else { return };
+        if let Some(pulse) = link.pulse_of(lane) {
+            *pulse = match lane {
+                // Whoever asks whether the peer lives asks here.
+                Lane::Control => Pulse::beat(now),
+                Lane::Stream | Lane::Bulk => Pulse::rest(now),
+            };
+        }
+    }
+
     /// A peer with which messages pass is dialled again soon, however short its links are. spec: GNCL-8
     pub(super) fn carried(&mut self, connection: ConnectionId) {
         let Some((node, lane)) = self.linked(connection) else { return };

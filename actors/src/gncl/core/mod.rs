@@ -33,8 +33,8 @@ use sinew_runtime::{
 use super::LinkFact;
 use acquaintance::Acquaintance;
 pub(super) use handshake::{
-    CANCEL, CLASSES, Decline, GUARD, HANDSHAKE_PAYLOAD_MAX, Introduction, Lane, OUTCOMES, Refusal, read,
-    write,
+    CANCEL, CLASSES, DATAGRAMS, Decline, GUARD, HANDSHAKE_PAYLOAD_MAX, Introduction, Lane, OUTCOMES, Refusal,
+    read, write,
 };
 
 /// What the core is set to.
@@ -54,6 +54,8 @@ pub(super) struct Settings {
     pub(super) peers_max: usize,
     /// Silence after which a link is pinged, and time between two pings.
     pub(super) ping_period: Duration,
+    /// Silence after which a connection for Stream or for Bulk is pinged that was pinged and answered since messages went over it.
+    pub(super) side_rest: Duration,
     /// Pings in a row without an answer after which a link is broken.
     pub(super) pings_missed_max: u32,
     /// Age of a link from which on its break counts as the first one.
@@ -93,12 +95,14 @@ pub(super) enum Input {
     RefusalReceived(ConnectionId, Refusal),
     /// The peer sent what cannot be used.
     Violated(ConnectionId, Decline),
-    /// Any frame came on a link.
+    /// Any frame came on a link but PING and PONG.
     Heard(ConnectionId),
     /// Messages pass on a link.
     Carried(ConnectionId),
     /// The peer asked for a sign of life.
     PingReceived(ConnectionId),
+    /// The peer gave one.
+    PongReceived(ConnectionId),
     /// The peer said goodbye.
     GoodbyeReceived(ConnectionId),
     /// The connection ended.
@@ -154,6 +158,8 @@ pub(super) struct Attach {
     pub(super) takes_cancels: bool,
     /// Whether the peer takes several outcomes in one frame.
     pub(super) takes_outcomes: bool,
+    /// Whether values of class Stream may go by datagram.
+    pub(super) takes_datagrams: bool,
     /// Whether the peer's frames have guards, and ours.
     pub(super) is_guarded: bool,
     /// Longest payload that the peer takes, in bytes.
@@ -242,7 +248,9 @@ impl Core {
             Input::Violated(connection, decline) => self.decline(now, connection, &decline),
             Input::Heard(connection) => self.heard(now, connection),
             Input::Carried(connection) => self.carried(connection),
+            Input::PongReceived(connection) => self.lives(now, connection),
             Input::PingReceived(connection) => {
+                self.lives(now, connection);
                 let pong = self.linked(connection).map(|(node, lane)| Output::SendPong(node, lane));
                 self.outputs.extend(pong);
             }

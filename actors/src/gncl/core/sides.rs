@@ -10,8 +10,8 @@ use std::time::Duration;
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
 use super::{
-    Attach, CANCEL, Connection, ConnectionId, Core, Decline, GUARD, Introduction, Lane, OUTCOMES, Output,
-    Settings, Stage,
+    Attach, CANCEL, Connection, ConnectionId, Core, DATAGRAMS, Decline, GUARD, Introduction, Lane, OUTCOMES,
+    Output, Settings, Stage,
     acquaintance::{Link, Pulse},
     handshake::check,
 };
@@ -203,6 +203,7 @@ impl Core {
             by_class: true,
             takes_cancels: theirs.knows(CANCEL),
             takes_outcomes: theirs.knows(OUTCOMES),
+            takes_datagrams: theirs.knows(DATAGRAMS) && self.settings.ours.knows(DATAGRAMS),
             is_guarded: theirs.knows(GUARD) && self.settings.ours.knows(GUARD),
             payload_max: theirs.payload_max,
             welcome,

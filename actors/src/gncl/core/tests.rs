@@ -85,6 +85,7 @@ fn settings(node: NodeAddress, incarnation: u64) -> Settings {
         strangers_max: 3,
         peers_max: 2,
         ping_period: Duration::from_secs(1),
+        side_rest: Duration::from_secs(10),
         pings_missed_max: 3,
         healthy: Duration::from_secs(5),
         orphan: Duration::from_secs(5),

@@ -11,7 +11,7 @@ use crate::gncl::{
     core::{CLASSES, Introduction, Lane},
 };
 
-fn of_class(class: Class, mut message: Message) -> Message {
+pub(super) fn of_class(class: Class, mut message: Message) -> Message {
     message.header.class = class;
     message
 }

@@ -15,17 +15,20 @@ use sinew_runtime::{
 
 use super::bench::{ByHand, NINE, Node, next, run, within};
 use crate::{
-    gncl::core::{Lane, read},
+    gncl::{
+        Arrived,
+        core::{Lane, read},
+    },
     session::Ack,
 };
 
 /// Messages that wait for a peer at most, in these tests: a window, too.
 const QUEUE: usize = 64;
 /// Messages that the slow application's mailbox holds.
-const MAILBOX: usize = 8;
+pub(super) const MAILBOX: usize = 8;
 
 /// Two nodes with small queues that have found each other, and an application of the second that is slow.
-async fn pair() -> (Node, Node, PostStream<Message>) {
+pub(super) async fn pair() -> (Node, Node, PostStream<Message>) {
     let small = |number| Node::start_with(number, |config| config.gncl.queue_capacity = QUEUE);
     let (mut a, mut b) = (small(1).await, small(2).await);
     a.find(b.address(), b.listens_at());
@@ -49,7 +52,7 @@ fn held_at(node: &Node, peer: &Node) -> usize {
 }
 
 /// Sends to the slow application until its line at the sender is full; returns how many were taken.
-async fn fill(a: &Node, b: &Node) -> u64 {
+pub(super) async fn fill(a: &Node, b: &Node) -> u64 {
     let mut taken = 0;
     within("the sender's line to be full", async {
         loop {
@@ -320,5 +323,79 @@ fn a_peer_that_sends_what_it_may_to_many_who_take_nothing_is_refused_nothing() {
                 next("a message for one of them", inbox).await;
             }
         }
+    });
+}
+
+/// Has so many applications of which each takes one message be sent two, and waits until all have come.
+async fn fill_many(node: &mut Node, apps: u32) -> Vec<PostStream<Message>> {
+    let mut peer = ByHand::linked_to(node).await;
+    let inboxes = (1..=apps).map(|number| node.app_of(number, 1)).collect();
+    for number in 1..=apps {
+        for _ in 0..2 {
+            let mut message = node.message(node.tid(number), b"");
+            message.header.source.node = NINE;
+            peer.say(&message).await;
+        }
+    }
+    within("all to have come", async {
+        while arrived(node).taken < u64::from(2 * apps) {
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+    inboxes
+}
+
+fn arrived(node: &Node) -> Arrived {
+    let peer = node.stores.gncl.peer(NINE).expect("it is linked");
+    peer.way(Lane::Control).expect("it has one").account().arrived
+}
+
+// spec: CREDIT-4
+#[test]
+fn many_applications_may_take_nothing_at_once_and_of_one_too_many_it_is_said() {
+    run(async {
+        const MOST: u32 = 256;
+        let mut node = Node::start(1).await;
+        let _inboxes = fill_many(&mut node, MOST + 1).await;
+        // The last one may still be in hand.
+        within("one too many to be refused", async {
+            while arrived(&node).refused == 0 {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        assert_eq!((arrived(&node).waiting, arrived(&node).refused), (u64::from(MOST), 1));
+        let refused = node.stores.gncl.refusals.by_cause();
+        assert!(refused.contains(&("too many full applications", 1)), "{refused:?}");
+    });
+}
+
+#[test]
+fn who_is_held_can_be_said_to_a_node_that_takes_only_short_messages() {
+    run(async {
+        const APPS: u32 = 60;
+        let short = |number| Node::start_with(number, |config| config.payload_max = 64);
+        let (mut a, mut b) = (short(1).await, short(2).await);
+        a.find(b.address(), b.listens_at());
+        b.find(a.address(), a.listens_at());
+        a.up().await;
+        b.up().await;
+        let _inboxes: Vec<_> = (1..=APPS).map(|number| b.app_of(number, 1)).collect();
+        for number in 1..=APPS {
+            for _ in 0..2 {
+                a.stores.router.send(a.message(b.tid(number), b"")).expect("there is room for it");
+            }
+        }
+        let way = a.stores.gncl.peer(b.address()).expect("it is linked");
+        within("the last of them to be held", async {
+            while way.way(Lane::Control).expect("it has one").outlet.in_lines() == 0 {
+                let _ = a.stores.router.send(a.message(b.tid(APPS), b""));
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        let refused = a.stores.gncl.refusals.by_cause();
+        assert!(refused.iter().all(|(cause, _)| *cause != "violation"), "{refused:?}");
     });
 }

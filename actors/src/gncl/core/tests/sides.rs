@@ -122,6 +122,46 @@ fn a_silent_side_is_broken_alone() {
     assert!(!out.contains(&Output::Close(link)), "{out:?}");
 }
 
+/// Seconds at which the side is pinged up to `end`, if the peer answers on its link and, as far as `answers` says, on the side.
+fn pinged(core: &mut Core, [link, bulk]: [ConnectionId; 2], end: u64, answers: bool) -> Vec<u64> {
+    let mut pinged = Vec::new();
+    while let Some(at) = core.next_wake().filter(|at| *at <= millis(end * 1_000)) {
+        core.handle(at, Input::TimePassed);
+        for output in outputs(core) {
+            if output == Output::Close(bulk) {
+                return pinged;
+            }
+            let Output::SendPing(_, lane) = output else { continue };
+            if lane == Lane::Control {
+                core.handle(at, Input::PongReceived(link));
+                continue;
+            }
+            pinged.push(at.as_nanos() / 1_000_000_000);
+            if answers {
+                core.handle(at, Input::PongReceived(bulk));
+            }
+        }
+    }
+    pinged
+}
+
+// spec: GNCL-14
+#[test]
+fn a_side_at_rest_is_pinged_seldom_and_one_that_falls_silent_soon() {
+    let mut core = core();
+    let (link, _) = greet(&mut core, millis(0), hello_from(HIGH, 1, 10));
+    let (bulk, _) = greet(&mut core, millis(0), side_of(10, Lane::Bulk, 12));
+    let both = [link, bulk];
+    assert_eq!(pinged(&mut core, both, 25, true), [1, 11, 21], "nothing goes over it");
+    core.handle(millis(25_000), Input::Heard(bulk));
+    assert_eq!(pinged(&mut core, both, 30, true), [26], "a message came, and then nothing");
+    core.handle(millis(30_000), Input::PingReceived(bulk));
+    outputs(&mut core);
+    assert_eq!(pinged(&mut core, both, 39, true), [0; 0], "the peer asks as well");
+    assert_eq!(pinged(&mut core, both, 60, false), [40, 41, 42], "and then it is broken");
+    assert_eq!(core.stage(bulk), None);
+}
+
 #[test]
 fn a_node_that_leaves_takes_the_connections_that_its_links_lack_and_no_others() {
     let mut core = core();

@@ -245,7 +245,7 @@ impl World {
             Parcel::Welcome(welcome) => Input::WelcomeReceived(connection, welcome),
             Parcel::Refusal(refusal) => Input::RefusalReceived(connection, refusal),
             Parcel::Ping => Input::PingReceived(connection),
-            Parcel::Pong => Input::Heard(connection),
+            Parcel::Pong => Input::PongReceived(connection),
             Parcel::End => {
                 self.drop_end(node, connection);
                 Input::Ended(connection)

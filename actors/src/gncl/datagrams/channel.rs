@@ -1,0 +1,357 @@
+//! What goes by datagram between this node and one peer: the core, its lock, and the socket that is written to.
+
+use std::{
+    net::SocketAddr,
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicU64, Ordering},
+    },
+};
+
+use sinew_runtime::{
+    router::{Outlet as _, Refused},
+    tid::{NodeAddress, Tid},
+    time::Time,
+    wire::{Checksum, Class, Flags, HEADER_LEN, Header, Kind, Message},
+};
+
+use super::{
+    core::{Core, Order, stamp},
+    outgoing::Position,
+    packet::{ACK_LEN, Content, DATAGRAM_MAX, PREFIX_LEN, Packet, Prefix, RANGE_LEN, RANGES_MAX},
+    reader::Alarm,
+    sockets::{Announcement, Door},
+};
+use crate::{gncl::way::Way, refusals::Refusals};
+
+/// Bytes of a payload at most that goes by datagram.
+pub(super) const PAYLOAD_MAX: usize = DATAGRAM_MAX - PREFIX_LEN - HEADER_LEN;
+
+/// What Stream conflates by.
+type Flow = (Tid, Tid, Kind);
+
+fn flow_of(header: &Header) -> Flow {
+    (header.source, header.destination, header.kind)
+}
+
+/// Where a peer reads datagrams.
+#[derive(Clone, Debug)]
+struct Target {
+    door: Door,
+    address: SocketAddr,
+    key: u64,
+}
+
+/// The two addresses of the connection for Stream.
+#[derive(Clone, Debug)]
+struct Connection {
+    door: Door,
+    remote: SocketAddr,
+}
+
+struct State {
+    core: Core<Flow, Message>,
+    connection: Option<Connection>,
+    target: Option<Target>,
+    /// Longest payload that the peer takes, in bytes.
+    payload_max: usize,
+    /// No value goes by datagram any more.
+    is_retired: bool,
+}
+
+impl State {
+    /// When something is to be sent or looked at.
+    fn next_wake(&self) -> Option<Time> {
+        // Nothing is said to a peer that has not said where.
+        self.target.as_ref().and_then(|_| self.core.next_wake())
+    }
+}
+
+/// Whether a value that came by the connection is to be handed on, and by datagram.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::gncl) enum Freshness {
+    New,
+    /// A newer one, or itself, was handed on.
+    Old,
+}
+
+/// The datagrams between this node and one life of another.
+pub(in crate::gncl) struct Channel {
+    here: NodeAddress,
+    node: NodeAddress,
+    /// What the peer's datagrams are to have.
+    key: u64,
+    /// Locked for a moment. The outlet of the connection may be locked with it in hand, never the other way round.
+    state: Mutex<State>,
+    /// When the peer spoke on a connection last.
+    heard: AtomicU64,
+    alarm: Arc<Alarm>,
+    refusals: Arc<Refusals>,
+}
+
+impl Channel {
+    /// `now` is the first number: a later channel with the same life of the peer goes on above it, as nobody sends a value each nanosecond.
+    pub(in crate::gncl) fn new(
+        now: Time,
+        (here, node): (NodeAddress, NodeAddress),
+        key: u64,
+        (alarm, refusals): (&Arc<Alarm>, &Arc<Refusals>),
+    ) -> Self {
+        let state = State {
+            core: Core::new(now.as_nanos()),
+            connection: None,
+            target: None,
+            payload_max: 0,
+            is_retired: false,
+        };
+        let (alarm, refusals) = (alarm.clone(), refusals.clone());
+        Self { here, node, key, state: Mutex::new(state), heard: AtomicU64::new(0), alarm, refusals }
+    }
+
+    /// There is a connection for Stream, between these two addresses, and `door` is beside it; the peer takes payloads of `payload_max`
+    /// bytes. Returns what the peer is to be told there. spec: DATAGRAM-2
+    pub(in crate::gncl) fn connected(
+        &self,
+        door: Door,
+        (local, remote): (SocketAddr, SocketAddr),
+        payload_max: usize,
+    ) -> Announcement {
+        let announcement = door.announcement(local, self.key);
+        let state = &mut *self.lock();
+        state.connection = Some(Connection { door, remote });
+        state.payload_max = payload_max.min(PAYLOAD_MAX);
+        announcement
+    }
+
+    /// The peer says on that connection where it reads datagrams.
+    pub(in crate::gncl) fn announced(&self, now: Time, said: Announcement, way: &Way) {
+        let wake = {
+            let state = &mut *self.lock();
+            let Some(Connection { door, remote }) = state.connection.clone() else { return };
+            let is_same_peer = state.target.as_ref().is_none_or(|target| target.key == said.key);
+            if !is_same_peer {
+                state.core.begin_anew();
+            }
+            let target = said.target(remote).map(|address| Target { door, address, key: said.key });
+            let is_same =
+                |former: &Target, new: &Target| (former.address, former.key) == (new.address, new.key);
+            let handed_over = match (&state.target, &target) {
+                _ if state.is_retired => return,
+                (Some(former), Some(new)) if is_same(former, new) => {
+                    state.core.reconnected(now);
+                    Vec::new()
+                }
+                (_, Some(_)) => state.core.announced(now),
+                (_, None) => state.core.retire(),
+            };
+            state.target = target;
+            self.hand_over(handed_over, way);
+            state.next_wake()
+        };
+        self.alarm.set(wake);
+    }
+
+    /// Takes a message of class Stream: by datagram, if it may, or by the connection.
+    ///
+    /// # Errors
+    /// The message: the connection's outlet does not take it.
+    pub(in crate::gncl) fn submit(&self, mut message: Message, way: &Way) -> Result<(), Refused> {
+        let flow = flow_of(&message.header);
+        let wake = {
+            let now = Time::now();
+            let state = &mut *self.lock();
+            let fits = message.payload.len() <= state.payload_max;
+            let may =
+                fits && !state.is_retired && message.receipt.is_none() && !message.header.is_expired(now);
+            let left = if may {
+                let bytes = PREFIX_LEN + message.size();
+                let expiry = message.header.expiry();
+                state.core.submit(flow, message, bytes, expiry).err()
+            } else {
+                Some(message)
+            };
+            match left {
+                None => {
+                    self.write(state, now);
+                    state.next_wake()
+                }
+                Some(left) => {
+                    message = left;
+                    message.header.correlation = state.core.outgoing.number_elsewhere(flow);
+                    // Below, without the lock: a long one is written in pieces.
+                    return self.by_connection(message, way);
+                }
+            }
+        };
+        self.alarm.set(wake);
+        Ok(())
+    }
+
+    fn by_connection(&self, message: Message, way: &Way) -> Result<(), Refused> {
+        way.outlet.submit(message).map_err(|mut refused| {
+            refused.message.header.correlation = 0;
+            refused
+        })
+    }
+
+    /// With the lock in hand, so that a newer value comes behind these.
+    fn hand_over(&self, values: Vec<(u64, Message)>, way: &Way) {
+        for (number, mut message) in values {
+            message.header.correlation = number;
+            if let Err(refused) = way.outlet.submit(message) {
+                let detail = format!("a value for node {}: {}", self.node, refused.why);
+                self.refusals.count(Time::now(), "value not sent", &detail);
+            }
+        }
+    }
+
+    /// Whether a datagram is from the peer. spec: DATAGRAM-1
+    pub(super) const fn knows(&self, prefix: Prefix) -> bool {
+        prefix.key == self.key
+    }
+
+    /// A datagram of the peer has come. Returns the value in it, if it is to be handed on. [`flush`](Self::flush) follows.
+    pub(super) fn came(
+        &self,
+        now: Time,
+        prefix: Prefix,
+        content: &Content<'_>,
+        value: Option<Message>,
+    ) -> Option<Message> {
+        let state = &mut *self.lock();
+        if let Some(said) = &content.acknowledgement
+            && state.core.acknowledged(now, said)
+        {
+            crate::log::debug!(node = %self.node, "values of class Stream go by datagram");
+        }
+        if content.is_probe {
+            state.core.asked(now, prefix.stamp);
+        }
+        let mut message = value?;
+        let number = std::mem::take(&mut message.header.correlation);
+        // spec: DATAGRAM-3
+        let is_new = state.core.incoming.came(now, prefix.stamp, flow_of(&message.header), number);
+        is_new.then_some(message)
+    }
+
+    /// A value has come by the connection. spec: DATAGRAM-3
+    pub(in crate::gncl) fn came_by_connection(&self, header: &mut Header) -> Freshness {
+        let number = std::mem::take(&mut header.correlation);
+        // 0: the peer numbers nothing.
+        let is_new = number == 0 || self.lock().core.incoming.came_by_connection(flow_of(header), number);
+        if is_new { Freshness::New } else { Freshness::Old }
+    }
+
+    /// The peer has spoken on a connection.
+    pub(in crate::gncl) fn heard(&self, now: Time) {
+        // SYNC: Relaxed; nothing else depends on it.
+        self.heard.store(now.as_nanos(), Ordering::Relaxed);
+    }
+
+    /// Sends what is to be sent now.
+    pub(super) fn flush(&self, now: Time) {
+        let wake = {
+            let state = &mut *self.lock();
+            self.write(state, now);
+            state.next_wake()
+        };
+        self.alarm.set(wake);
+    }
+
+    /// Time has passed. Returns when it is to be told again.
+    pub(in crate::gncl) fn tick(&self, now: Time, way: &Way) -> Option<Time> {
+        let (wake, blocked) = {
+            let state = &mut *self.lock();
+            let heard = Time::from_nanos(self.heard.load(Ordering::Relaxed));
+            let turn = state.core.tick(now, heard);
+            self.hand_over(turn.handed_over, way);
+            self.write(state, now);
+            let target = state.target.as_ref().map(|target| target.address);
+            (state.next_wake(), target.filter(|_| turn.is_blocked))
+        };
+        if let Some(to) = blocked {
+            crate::log::warn!(
+                node = %self.node, %to,
+                "datagrams (UDP) to this node, or its answers, do not get through, though its connection (TCP) lives: class Stream goes by \
+                 the connection, where one lost packet can hold it up for 200 ms. Let UDP through at this port in every firewall on the \
+                 way, or set `gncl.datagrams = false` to use the connection only"
+            );
+        }
+        wake
+    }
+
+    /// No value goes by datagram any more; what is under way goes by the connection.
+    pub(in crate::gncl) fn retire(&self, way: &Way) {
+        let state = &mut *self.lock();
+        state.is_retired = true;
+        let values = state.core.retire();
+        self.hand_over(values, way);
+    }
+
+    /// The peer is gone.
+    pub(in crate::gncl) fn end(&self) {
+        let state = &mut *self.lock();
+        (state.is_retired, state.target) = (true, None);
+        state.core.end();
+    }
+
+    /// Values that are not known to have arrived.
+    pub(in crate::gncl) fn left(&self) -> usize {
+        self.lock().core.outgoing.left()
+    }
+
+    /// Where each value is that went by datagram.
+    pub(in crate::gncl) fn position(&self) -> Position {
+        self.lock().core.position()
+    }
+
+    /// Whether values go by datagram now.
+    #[cfg(test)]
+    pub(in crate::gncl) fn is_open(&self) -> bool {
+        self.lock().core.is_open()
+    }
+
+    fn write(&self, state: &mut State, now: Time) {
+        let State { core, target, .. } = state;
+        let Some(target) = target else { return };
+        loop {
+            let mut packet = Packet::new(self.here, target.key, stamp(now));
+            match core.poll(now) {
+                None => return,
+                Some(Order::Probe) => packet.probe(),
+                Some(Order::Acknowledgement) => acknowledge(&mut packet, core, now, 0),
+                Some(Order::Value(number, message)) => {
+                    let mut header = message.header;
+                    header.correlation = number;
+                    header.flags = header.flags.without(Flags::CONFIRM);
+                    let payload = message.payload.clone();
+                    let head = Checksum::Crc.encode(&header, &payload);
+                    acknowledge(&mut packet, core, now, HEADER_LEN + payload.len());
+                    packet.value(&head, &payload);
+                }
+            }
+            // What the system does not take is a datagram that is lost, and sent again: the network does the same.
+            let _ = target.door.socket.send_to(packet.bytes(), target.address);
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Says with a datagram what has come, as far as there is room before `length` bytes.
+fn acknowledge(packet: &mut Packet, core: &mut Core<Flow, Message>, now: Time, length: usize) {
+    let Some(room) = packet.room().checked_sub(length + ACK_LEN + RANGE_LEN) else { return };
+    let ranges_max = (room / RANGE_LEN + 1).min(RANGES_MAX);
+    if let Some(said) = core.incoming.take(now, ranges_max) {
+        packet.acknowledge(&said);
+    }
+}
+
+/// The frame in a datagram, if it is a value.
+pub(super) fn value(bytes: &[u8]) -> Option<Message> {
+    let message = sinew_runtime::wire::decode_datagram(bytes).ok()?;
+    let Header { class, flags, .. } = message.header;
+    (class == Class::Stream && flags == Flags::NONE).then_some(message)
+}

@@ -1,0 +1,387 @@
+//! The sending half: numbers, the newest value of each flow until it is known to have arrived, and how much may be on its way.
+//!
+//! ```text
+//!  Idle ── submitted ──► Waiting ── sent ──► OnTheWay ── acknowledged ──► Idle
+//!             ▲ newer value takes its place │    ▲ └── time-out: again ─┘
+//! ```
+
+use std::{
+    collections::{BTreeMap, VecDeque},
+    time::Duration,
+};
+
+use sinew_runtime::time::Time;
+
+use super::{packet::Acknowledgement, round_trip::RoundTrip};
+
+/// What may be on its way to a peer without an acknowledgement.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Limits {
+    /// Datagrams.
+    pub(super) datagrams: usize,
+    /// Bytes of them; one datagram always may.
+    pub(super) bytes: usize,
+    /// Flows that are known.
+    pub(super) flows: usize,
+}
+
+/// A time-out of a value that was superseded says that it was lost or that its acknowledgement was: neither makes the window smaller. On a
+/// network that is slow, the window is what waits in its queues: 32 KiB are 26 ms of 10 Mbit/s. spec: DATAGRAM-6
+pub(super) const LIMITS: Limits = Limits { datagrams: 256, bytes: 32 << 10, flows: 1_024 };
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum State {
+    /// All that was sent has arrived, or went elsewhere.
+    Idle,
+    /// Its newest value has not been sent.
+    Waiting,
+    /// It has.
+    OnTheWay,
+}
+
+/// What one source sends to one destination of one kind.
+#[derive(Clone, Debug)]
+struct Flow<V> {
+    /// Number of the newest value.
+    number: u64,
+    /// As long as it is not known to have arrived.
+    value: Option<V>,
+    bytes: usize,
+    expiry: Time,
+    state: State,
+}
+
+/// A datagram on its way.
+#[derive(Clone, Debug)]
+struct Flight<K> {
+    number: u64,
+    key: K,
+    bytes: usize,
+    repeats: u32,
+    /// When it counts as lost.
+    due: Time,
+}
+
+/// What became of the values that were taken.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(in crate::gncl) struct Counts {
+    /// Sent at least once.
+    pub(in crate::gncl) sent: u64,
+    /// A newer value took their place before they were sent.
+    pub(in crate::gncl) superseded: u64,
+    /// Too old before they were sent.
+    pub(in crate::gncl) expired: u64,
+    /// Waited when all was over.
+    pub(in crate::gncl) lost: u64,
+    /// Sent, and given up because they were too old.
+    pub(in crate::gncl) expired_late: u64,
+    /// Sent, and nobody can say any more whether they arrived.
+    pub(in crate::gncl) unknown: u64,
+}
+
+/// Where each value is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(in crate::gncl) struct Position {
+    pub(in crate::gncl) counts: Counts,
+    /// Not sent yet.
+    pub(in crate::gncl) waiting: u64,
+    /// Sent, and neither acknowledged nor given up as lost.
+    pub(in crate::gncl) unacknowledged: u64,
+    /// Taken by the peer.
+    pub(in crate::gncl) arrived: u64,
+}
+
+/// What goes to a peer.
+#[derive(Clone, Debug)]
+pub(super) struct Outgoing<K, V> {
+    limits: Limits,
+    /// Number of the next value.
+    next: u64,
+    flows: BTreeMap<K, Flow<V>>,
+    /// Flows whose value waits, in their turn.
+    waiting: VecDeque<K>,
+    flight: Vec<Flight<K>>,
+    flight_bytes: usize,
+    /// Nothing on its way is due before this.
+    next_due: Time,
+    round_trip: RoundTrip,
+    counts: Counts,
+    /// Taken by the peer, as it said last, and by it before it forgot us.
+    taken: u64,
+    taken_before: u64,
+    #[cfg(test)]
+    pub(super) planted: super::simulation::Planted,
+}
+
+impl<K: Ord + Copy, V> Outgoing<K, V> {
+    /// Nothing was sent yet. `first` is above each number that ever went between the same two lives of nodes.
+    pub(super) fn new(first: u64, limits: Limits) -> Self {
+        Self {
+            limits,
+            next: first.max(1),
+            flows: BTreeMap::new(),
+            waiting: VecDeque::with_capacity(16),
+            flight: Vec::with_capacity(16),
+            flight_bytes: 0,
+            next_due: Time::MAX,
+            round_trip: RoundTrip::default(),
+            counts: Counts::default(),
+            taken: 0,
+            taken_before: 0,
+            #[cfg(test)]
+            planted: super::simulation::Planted::Nothing,
+        }
+    }
+
+    /// Takes the newest value of a flow, which has `bytes` in a datagram.
+    ///
+    /// # Errors
+    /// The value: too many flows have something under way.
+    pub(super) fn submit(&mut self, key: K, value: V, bytes: usize, expiry: Time) -> Result<(), V> {
+        if !self.flows.contains_key(&key) && self.flows.len() >= self.limits.flows && !self.forget_one() {
+            return Err(value);
+        }
+        let number = self.number();
+        let fresh = Flow { number, value: Some(value), bytes, expiry, state: State::Waiting };
+        let former = self.flows.insert(key, fresh).map(|flow| flow.state);
+        if former == Some(State::Waiting) {
+            self.counts.superseded += 1;
+        } else {
+            self.waiting.push_back(key);
+        }
+        Ok(())
+    }
+
+    /// The number of a value that goes by the connection: what goes by datagram of its flow is superseded.
+    pub(super) fn number_elsewhere(&mut self, key: K) -> u64 {
+        if let Some(flow) = self.flows.get_mut(&key) {
+            if flow.state == State::Waiting {
+                self.counts.superseded += 1;
+                self.waiting.retain(|waits| *waits != key);
+            }
+            (flow.value, flow.state) = (None, State::Idle);
+        }
+        self.number()
+    }
+
+    const fn number(&mut self) -> u64 {
+        let number = self.next;
+        self.next += 1;
+        number
+    }
+
+    /// Makes room for one more flow: one that has nothing under way is known by nothing but its key.
+    fn forget_one(&mut self) -> bool {
+        let idle = self.flows.iter().find(|(_, flow)| flow.state == State::Idle).map(|(key, _)| *key);
+        idle.is_some_and(|key| self.flows.remove(&key).is_some())
+    }
+
+    /// The next [value](Self::value) to be sent now: of which flow, and its number.
+    pub(super) fn transmit(&mut self, now: Time) -> Option<(K, u64)> {
+        self.repeat(now).or_else(|| self.begin(now))
+    }
+
+    /// The newest value of a flow, as long as it is not known to have arrived.
+    pub(super) fn value(&self, key: &K) -> Option<&V> {
+        self.flows.get(key)?.value.as_ref()
+    }
+
+    /// A value that was sent, is the newest of its flow, and counts as lost. spec: DATAGRAM-4
+    fn repeat(&mut self, now: Time) -> Option<(K, u64)> {
+        if now < self.next_due {
+            return None;
+        }
+        self.give_up(now);
+        #[cfg(test)]
+        if self.planted == super::simulation::Planted::NotRepeated {
+            return None;
+        }
+        let again = self.flight.iter_mut().find(|flight| flight.due <= now);
+        let sent = again.map(|flight| {
+            flight.repeats += 1;
+            flight.due = now + self.round_trip.time_out(flight.repeats);
+            (flight.key, flight.number)
+        });
+        self.next_due = self.flight.iter().map(|flight| flight.due).min().unwrap_or(Time::MAX);
+        sent
+    }
+
+    /// What counts as lost and has been superseded, or has expired, is on its way no more.
+    fn give_up(&mut self, now: Time) {
+        let Self { flight, flows, counts, flight_bytes, .. } = self;
+        flight.retain(|flight| {
+            if flight.due > now {
+                return true;
+            }
+            let newest = flows.get_mut(&flight.key).filter(|flow| flow.number == flight.number);
+            let keeps = match newest {
+                Some(flow) if flow.value.is_some() && flow.expiry >= now => true,
+                Some(flow) if flow.value.is_some() => {
+                    counts.expired_late += 1;
+                    (flow.value, flow.state) = (None, State::Idle);
+                    false
+                }
+                Some(_) | None => false,
+            };
+            *flight_bytes -= if keeps { 0 } else { flight.bytes };
+            keeps
+        });
+    }
+
+    /// A value that is sent for the first time.
+    fn begin(&mut self, now: Time) -> Option<(K, u64)> {
+        loop {
+            let key = *self.waiting.front()?;
+            let Some(flow) = self.flows.get_mut(&key).filter(|flow| flow.state == State::Waiting) else {
+                self.waiting.pop_front();
+                continue;
+            };
+            if flow.expiry < now {
+                (flow.value, flow.state) = (None, State::Idle);
+                self.counts.expired += 1;
+                self.waiting.pop_front();
+                continue;
+            }
+            let has_room = self.flight.len() < self.limits.datagrams
+                && self.flight_bytes + flow.bytes <= self.limits.bytes;
+            if !self.flight.is_empty() && !has_room {
+                return None;
+            }
+            flow.state = State::OnTheWay;
+            let (number, bytes) = (flow.number, flow.bytes);
+            self.waiting.pop_front();
+            self.counts.sent += 1;
+            let due = now + self.round_trip.time_out(0);
+            self.flight.push(Flight { number, key, bytes, repeats: 0, due });
+            self.flight_bytes += bytes;
+            self.next_due = self.next_due.min(due);
+            return Some((key, number));
+        }
+    }
+
+    /// The peer says what has come. `now_stamp` is the stamp of a datagram that would be sent now.
+    pub(super) fn acknowledged(&mut self, said: &Acknowledgement, now_stamp: u32) {
+        self.taken = self.taken.max(said.taken);
+        let took_us = now_stamp.wrapping_sub(said.echo).saturating_sub(said.held_us);
+        // A stamp that was never sent would look as old as the clock's turn.
+        if took_us < u32::MAX / 2 {
+            self.round_trip.measured(Duration::from_micros(took_us.into()));
+        }
+        let Self { flight, flows, flight_bytes, .. } = self;
+        flight.retain(|flight| {
+            if !said.ranges().iter().any(|range| range.has(flight.number)) {
+                return true;
+            }
+            if let Some(flow) = flows.get_mut(&flight.key).filter(|flow| flow.number == flight.number) {
+                (flow.value, flow.state) = (None, State::Idle);
+            }
+            *flight_bytes -= flight.bytes;
+            false
+        });
+        if flight.is_empty() {
+            self.next_due = Time::MAX;
+        }
+    }
+
+    /// The values that are not known to have arrived, oldest first, with their numbers: they go by the connection.
+    pub(super) fn hand_over(&mut self) -> Vec<(u64, V)> {
+        let mut values = Vec::new();
+        for flow in self.flows.values_mut() {
+            flow.state = State::Idle;
+            values.extend(flow.value.take().map(|value| (flow.number, value)));
+        }
+        values.sort_by_key(|(number, _)| *number);
+        self.clear();
+        values
+    }
+
+    /// Nothing that is under way is of use any more.
+    pub(super) fn end(&mut self) {
+        for flow in self.flows.values_mut() {
+            match flow.state {
+                State::Idle => {}
+                State::Waiting => self.counts.lost += 1,
+                State::OnTheWay => self.counts.unknown += 1,
+            }
+            (flow.value, flow.state) = (None, State::Idle);
+        }
+        self.clear();
+    }
+
+    /// The peer has forgotten us and counts anew: what is under way was for what it was before.
+    pub(super) fn begin_anew(&mut self) {
+        self.end();
+        self.taken_before = self.taken_before.saturating_add(std::mem::take(&mut self.taken));
+        self.round_trip = RoundTrip::default();
+    }
+
+    fn clear(&mut self) {
+        self.waiting.clear();
+        self.flight.clear();
+        self.flight_bytes = 0;
+        self.next_due = Time::MAX;
+    }
+
+    /// When something is due, if nothing happens before.
+    pub(super) fn next_wake(&self) -> Option<Time> {
+        Some(self.next_due).filter(|due| *due != Time::MAX)
+    }
+
+    /// Values that are not known to have arrived.
+    pub(super) fn left(&self) -> usize {
+        self.flows.values().filter(|flow| flow.state != State::Idle).count()
+    }
+
+    /// Where each value is.
+    pub(super) fn position(&self) -> Position {
+        let waiting = self.flows.values().filter(|flow| flow.state == State::Waiting).count() as u64;
+        // Of one that was superseded on its way it is not known yet whether it has arrived.
+        let unacknowledged = self.flight.len() as u64;
+        // What the peer says is believed as far as it can be so.
+        let arrived = self.taken_before.saturating_add(self.taken);
+        let arrived = arrived.min(self.counts.sent.saturating_sub(unacknowledged));
+        Position { counts: self.counts, waiting, unacknowledged, arrived }
+    }
+
+    #[cfg(test)]
+    pub(super) const fn on_the_way(&self) -> (usize, usize) {
+        (self.flight.len(), self.flight_bytes)
+    }
+
+    #[cfg(test)]
+    pub(super) const fn next_number(&self) -> u64 {
+        self.next
+    }
+}
+
+impl Position {
+    /// Values that were sent, superseded then, and have not arrived; with those that were never sent.
+    pub(in crate::gncl) fn superseded(&self) -> u64 {
+        self.counts.superseded + self.ended().0
+    }
+
+    /// Values that were too old, as far as they have not arrived after all.
+    pub(in crate::gncl) fn expired(&self) -> u64 {
+        self.counts.expired + self.ended().1
+    }
+
+    /// Of those that were sent and nobody can say whether they arrived.
+    pub(in crate::gncl) fn unknown(&self) -> u64 {
+        self.ended().2
+    }
+
+    /// All that were taken.
+    pub(in crate::gncl) const fn taken(&self) -> u64 {
+        let Counts { sent, superseded, expired, lost, .. } = self.counts;
+        sent + superseded + expired + lost + self.waiting
+    }
+
+    /// What was sent and has neither arrived nor is under way: superseded, expired, unknown. Where an acknowledgement was lost, fewer have
+    /// ended so than were counted when they did.
+    fn ended(&self) -> (u64, u64, u64) {
+        let rest = self.counts.sent - self.unacknowledged - self.arrived;
+        let expired = self.counts.expired_late.min(rest);
+        let unknown = self.counts.unknown.min(rest - expired);
+        (rest - expired - unknown, expired, unknown)
+    }
+}

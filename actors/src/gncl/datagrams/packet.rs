@@ -1,0 +1,315 @@
+//! The bytes of a datagram between two nodes. spec: DATAGRAM-1
+//!
+//! ```text
+//! offset size field
+//!      0    1 version: 1
+//!      1    1 what is in it: 1 an acknowledgement, 2 a value, 4 it is to be answered
+//!      2    2 length of the authentication tag at its end: 0 in this version
+//!      4    4 node of the sender
+//!      8    8 key, as the receiver has given it to the sender
+//!     16    4 stamp: the sender's clock in microseconds, lower 32 bits
+//!     20    4 CRC-32 (as in a frame) of what is before this, and of the acknowledgement
+//! an acknowledgement, 20 bytes and 12 for each range:
+//!      0    4 stamp of the last datagram that came
+//!      4    4 microseconds since it came
+//!      8    8 values that came by datagram and were handed on, so far
+//!     16    1 count of ranges, 0 to 32
+//!     17    3 0
+//!   then 12 first number that has come (8), and how many follow it without a gap (4)
+//! a value: one frame, to the end of the datagram
+//! ```
+
+use sinew_runtime::tid::NodeAddress;
+
+/// Bytes of a datagram at most. Every network that IPv6 goes over takes 1,280 with IP's and UDP's headers (RFC 8200, section 5), and QUIC
+/// sends 1,200 for that reason (RFC 9000, section 14): no fragment of it can get lost.
+pub(super) const DATAGRAM_MAX: usize = 1_200;
+/// Bytes before all else.
+pub(super) const PREFIX_LEN: usize = CRC_AT + 4;
+/// Where the checksum is.
+const CRC_AT: usize = 20;
+/// Bytes of an acknowledgement without ranges.
+pub(super) const ACK_LEN: usize = 20;
+/// Bytes of a range.
+pub(super) const RANGE_LEN: usize = 12;
+/// Ranges of an acknowledgement at most.
+pub(super) const RANGES_MAX: usize = 32;
+
+const VERSION: u8 = 1;
+const ACK: u8 = 1;
+const VALUE: u8 = 2;
+const PROBE: u8 = 4;
+
+/// Numbers without a gap.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Range {
+    pub(super) first: u64,
+    pub(super) more: u32,
+}
+
+impl Range {
+    pub(super) const fn of(number: u64) -> Self {
+        Self { first: number, more: 0 }
+    }
+
+    pub(super) const fn has(self, number: u64) -> bool {
+        matches!(number.checked_sub(self.first), Some(beyond) if beyond <= self.more as u64)
+    }
+
+    /// The same with this number, if it is in it or next to its end.
+    pub(super) fn with(self, number: u64) -> Option<Self> {
+        match number.checked_sub(self.first)? {
+            beyond if beyond <= self.more.into() => Some(self),
+            beyond if beyond == u64::from(self.more) + 1 => {
+                Some(Self { more: self.more.checked_add(1)?, ..self })
+            }
+            _ => None,
+        }
+    }
+}
+
+/// What a receiver says of what has come.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Acknowledgement {
+    /// Stamp of the last datagram that came.
+    pub(super) echo: u32,
+    /// Microseconds since then.
+    pub(super) held_us: u32,
+    pub(super) taken: u64,
+    pub(super) ranges: [Range; RANGES_MAX],
+    pub(super) count: usize,
+}
+
+impl Acknowledgement {
+    pub(super) fn ranges(&self) -> &[Range] {
+        &self.ranges[..self.count]
+    }
+
+    const fn len(&self) -> usize {
+        ACK_LEN + RANGE_LEN * self.count
+    }
+}
+
+/// What a datagram begins with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Prefix {
+    pub(super) node: NodeAddress,
+    pub(super) key: u64,
+    pub(super) stamp: u32,
+    what: u8,
+}
+
+/// What a datagram brings.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Content<'a> {
+    pub(super) acknowledgement: Option<Acknowledgement>,
+    /// Whether it is to be answered at once.
+    pub(super) is_probe: bool,
+    pub(super) value: Option<&'a [u8]>,
+}
+
+/// A datagram that is written.
+#[derive(Debug)]
+pub(super) struct Packet {
+    bytes: [u8; DATAGRAM_MAX],
+    length: usize,
+    /// Bytes before the value, which has a checksum of its own.
+    head: usize,
+}
+
+impl Packet {
+    pub(super) fn new(node: NodeAddress, key: u64, stamp: u32) -> Self {
+        let mut packet = Self { bytes: [0; DATAGRAM_MAX], length: 0, head: PREFIX_LEN };
+        packet.put(&[VERSION, 0, 0, 0]);
+        packet.put(&node.bits().to_le_bytes());
+        packet.put(&key.to_le_bytes());
+        packet.put(&stamp.to_le_bytes());
+        packet.put(&[0; 4]);
+        packet
+    }
+
+    /// Bytes that still have room.
+    pub(super) const fn room(&self) -> usize {
+        DATAGRAM_MAX - self.length
+    }
+
+    pub(super) fn probe(&mut self) {
+        self.bytes[1] |= PROBE;
+    }
+
+    /// Before a value.
+    pub(super) fn acknowledge(&mut self, acknowledgement: &Acknowledgement) {
+        debug_assert!(acknowledgement.len() <= self.room(), "it was made for the room that there is");
+        self.bytes[1] |= ACK;
+        self.put(&acknowledgement.echo.to_le_bytes());
+        self.put(&acknowledgement.held_us.to_le_bytes());
+        self.put(&acknowledgement.taken.to_le_bytes());
+        self.put(&[acknowledgement.count as u8, 0, 0, 0]);
+        for range in acknowledgement.ranges() {
+            self.put(&range.first.to_le_bytes());
+            self.put(&range.more.to_le_bytes());
+        }
+        self.head = self.length;
+    }
+
+    /// A frame in two parts, last of all.
+    pub(super) fn value(&mut self, header: &[u8], payload: &[u8]) {
+        self.bytes[1] |= VALUE;
+        self.put(header);
+        self.put(payload);
+    }
+
+    /// All of it, with its checksum.
+    pub(super) fn bytes(&mut self) -> &[u8] {
+        let sum = checksum(&self.bytes[..self.head]);
+        self.bytes[CRC_AT..PREFIX_LEN].copy_from_slice(&sum.to_le_bytes());
+        &self.bytes[..self.length]
+    }
+
+    fn put(&mut self, bytes: &[u8]) {
+        let end = self.length + bytes.len();
+        self.bytes[self.length..end].copy_from_slice(bytes);
+        self.length = end;
+    }
+}
+
+/// Of what is before a value, which has at least a prefix.
+fn checksum(head: &[u8]) -> u32 {
+    let mut hasher = crc32fast::Hasher::new();
+    hasher.update(&head[..CRC_AT]);
+    hasher.update(&head[PREFIX_LEN..]);
+    hasher.finalize()
+}
+
+fn u32_at(bytes: &[u8], at: usize) -> Option<u32> {
+    bytes.get(at..)?.first_chunk().copied().map(u32::from_le_bytes)
+}
+
+fn u64_at(bytes: &[u8], at: usize) -> Option<u64> {
+    bytes.get(at..)?.first_chunk().copied().map(u64::from_le_bytes)
+}
+
+impl Prefix {
+    /// `None`: this is none of ours, or of another version.
+    pub(super) fn read(bytes: &[u8]) -> Option<Self> {
+        let [VERSION, what, 0, 0, ..] = *bytes else { return None };
+        let node = NodeAddress::new(u32_at(bytes, 4)?);
+        Some(Self { node, key: u64_at(bytes, 8)?, stamp: u32_at(bytes, 16)?, what })
+    }
+
+    /// What comes behind it; `None`: it is not what it should be.
+    pub(super) fn content(self, bytes: &[u8]) -> Option<Content<'_>> {
+        let rest = bytes.get(PREFIX_LEN..)?;
+        let (acknowledgement, rest) = if self.what & ACK == 0 { (None, rest) } else { read_ack(rest)? };
+        let head = bytes.get(..bytes.len() - rest.len())?;
+        if u32_at(bytes, CRC_AT)? != checksum(head) {
+            return None;
+        }
+        let is_known = self.what & !(ACK | VALUE | PROBE) == 0;
+        let has_value = self.what & VALUE != 0;
+        (is_known && (has_value || rest.is_empty())).then_some(Content {
+            acknowledgement,
+            is_probe: self.what & PROBE != 0,
+            value: has_value.then_some(rest),
+        })
+    }
+}
+
+fn read_ack(bytes: &[u8]) -> Option<(Option<Acknowledgement>, &[u8])> {
+    let [count, 0, 0, 0] = *bytes.get(16..)?.first_chunk()? else { return None };
+    let count = usize::from(count);
+    let mut ranges = [Range::of(0); RANGES_MAX];
+    for (at, range) in ranges.get_mut(..count)?.iter_mut().enumerate() {
+        let at = ACK_LEN + RANGE_LEN * at;
+        *range = Range { first: u64_at(bytes, at)?, more: u32_at(bytes, at + 8)? };
+    }
+    let (echo, held_us, taken) = (u32_at(bytes, 0)?, u32_at(bytes, 4)?, u64_at(bytes, 8)?);
+    let rest = bytes.get(ACK_LEN + RANGE_LEN * count..)?;
+    Some((Some(Acknowledgement { echo, held_us, taken, ranges, count }), rest))
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn acknowledgement(numbers: &[(u64, u32)]) -> Acknowledgement {
+        let mut ranges = [Range::of(0); RANGES_MAX];
+        for (range, (first, more)) in ranges.iter_mut().zip(numbers) {
+            *range = Range { first: *first, more: *more };
+        }
+        Acknowledgement { echo: 5, held_us: 250, taken: 41, ranges, count: numbers.len() }
+    }
+
+    #[test]
+    fn the_documentation_shows_the_bytes_of_a_datagram() {
+        let mut packet = Packet::new(NodeAddress::new(0x0a00_0007), 0x0807_0605_0403_0201, 1_000);
+        packet.acknowledge(&acknowledgement(&[(7, 2)]));
+        packet.value(b"Sw", b"...");
+        let page = include_str!("../../../../docs/protocol/gncl.md");
+        let shown = page.split("```datagram").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
+        let shown: Vec<_> = shown
+            .lines()
+            .flat_map(|line| line.trim_start().split("  ").next().unwrap_or_default().split_whitespace())
+            .map(|byte| u8::from_str_radix(byte, 16).expect("two digits"))
+            .collect();
+        let (head, value) = packet.bytes().split_last_chunk::<5>().unwrap();
+        assert_eq!(shown, head);
+        assert_eq!(value, b"Sw...");
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_written_is_read(
+            ranges in proptest::option::of(proptest::collection::vec((any::<u64>(), any::<u32>()), 0..=RANGES_MAX)),
+            value in proptest::option::of(proptest::collection::vec(any::<u8>(), 0..500)),
+            is_probe: bool,
+        ) {
+            let mut packet = Packet::new(NodeAddress::new(3), 7, 9);
+            let acknowledgement = ranges.map(|ranges| acknowledgement(&ranges));
+            acknowledgement.iter().for_each(|acknowledgement| packet.acknowledge(acknowledgement));
+            if is_probe {
+                packet.probe();
+            }
+            value.iter().for_each(|value| packet.value(&value[..value.len() / 2], &value[value.len() / 2..]));
+            let bytes = packet.bytes();
+            let prefix = Prefix::read(bytes).unwrap();
+            prop_assert_eq!((prefix.node, prefix.key, prefix.stamp), (NodeAddress::new(3), 7, 9));
+            let content = Content { acknowledgement, is_probe, value: value.as_deref() };
+            prop_assert_eq!(prefix.content(bytes), Some(content));
+        }
+
+        #[test]
+        fn what_is_damaged_before_the_value_is_none(at in 0..PREFIX_LEN + ACK_LEN + RANGE_LEN, bit in 0..8) {
+            let mut packet = Packet::new(NodeAddress::new(3), 7, 9);
+            packet.acknowledge(&acknowledgement(&[(7, 2)]));
+            packet.value(b"a", b"value");
+            let mut bytes = packet.bytes().to_vec();
+            bytes[at] ^= 1_u8 << bit;
+            prop_assert_eq!(Prefix::read(&bytes).and_then(|prefix| prefix.content(&bytes)), None);
+        }
+
+        #[test]
+        fn any_bytes_are_a_datagram_or_none(mut bytes: Vec<u8>, as_ours: bool) {
+            if let Some(start) = bytes.first_chunk_mut::<4>().filter(|_| as_ours) {
+                *start = [VERSION, start[1] & 7, 0, 0];
+            }
+            if let Some(content) = Prefix::read(&bytes).and_then(|prefix| prefix.content(&bytes)) {
+                prop_assert!(content.acknowledgement.is_none_or(|said| said.ranges().len() <= RANGES_MAX));
+            }
+        }
+
+        #[test]
+        fn a_range_has_what_was_put_into_it(first in any::<u64>(), more in 0..3u32, number in any::<u64>()) {
+            let range = Range { first, more };
+            for number in [number, first, first.wrapping_add(u64::from(more)), first.wrapping_add(u64::from(more) + 1)] {
+                if let Some(wider) = range.with(number) {
+                    prop_assert!(wider.has(number) && wider.has(first));
+                } else {
+                    prop_assert!(!range.has(number));
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,214 @@
+//! What the two halves promise, one by one; the simulation has what they promise together.
+
+use std::time::Duration;
+
+use proptest::prelude::*;
+use sinew_runtime::time::Time;
+
+use super::{
+    incoming::Incoming,
+    outgoing::{Limits, Outgoing},
+    packet::{Acknowledgement, RANGES_MAX, Range},
+};
+
+const NOW: Time = Time::from_nanos(1_000_000_000);
+
+fn outgoing(datagrams: usize, bytes: usize, flows: usize) -> Outgoing<u32, u32> {
+    Outgoing::new(100, Limits { datagrams, bytes, flows })
+}
+
+fn said(numbers: &[u64], taken: u64) -> Acknowledgement {
+    let mut ranges = [Range::of(0); RANGES_MAX];
+    for (range, number) in ranges.iter_mut().zip(numbers) {
+        *range = Range::of(*number);
+    }
+    Acknowledgement { echo: 0, held_us: 0, taken, ranges, count: numbers.len() }
+}
+
+/// The numbers of all that is sent now.
+fn sent(outgoing: &mut Outgoing<u32, u32>, now: Time) -> Vec<u64> {
+    std::iter::from_fn(|| outgoing.transmit(now)).map(|(_, number)| number).collect()
+}
+
+#[test]
+fn what_is_beyond_the_window_waits_and_newer_values_take_its_place() {
+    let mut outgoing = outgoing(2, 1_000, 8);
+    for key in 0..3 {
+        outgoing.submit(key, 1, 100, Time::MAX).unwrap();
+    }
+    assert_eq!(sent(&mut outgoing, NOW), [100, 101]);
+    for value in 2..9 {
+        outgoing.submit(2, value, 100, Time::MAX).unwrap();
+    }
+    assert!(sent(&mut outgoing, NOW).is_empty());
+    outgoing.acknowledged(&said(&[100], 1), 500);
+    assert_eq!(sent(&mut outgoing, NOW), [109]);
+    assert_eq!(outgoing.value(&2), Some(&8));
+    let position = outgoing.position();
+    assert_eq!((position.superseded(), position.arrived, position.unacknowledged), (7, 1, 2));
+}
+
+#[test]
+fn bytes_have_a_bound_too_but_one_datagram_always_goes() {
+    let mut outgoing = outgoing(9, 1_000, 8);
+    outgoing.submit(1, 1, 1_200, Time::MAX).unwrap();
+    outgoing.submit(2, 1, 100, Time::MAX).unwrap();
+    assert_eq!(sent(&mut outgoing, NOW), [100]);
+    assert_eq!(outgoing.on_the_way(), (1, 1_200));
+    outgoing.acknowledged(&said(&[100], 1), 500);
+    assert_eq!(sent(&mut outgoing, NOW), [101]);
+}
+
+#[test]
+fn a_value_is_repeated_after_the_time_out_and_twice_as_long_after_that_until_it_is_acknowledged() {
+    let mut outgoing = outgoing(9, 1_000, 8);
+    outgoing.submit(1, 1, 100, Time::MAX).unwrap();
+    let mut times = Vec::new();
+    for millis in 0..200 {
+        if !sent(&mut outgoing, NOW + Duration::from_millis(millis)).is_empty() {
+            times.push(millis);
+        }
+    }
+    assert_eq!(times, [0, 20, 60, 140]);
+    assert_eq!(outgoing.on_the_way(), (1, 100), "it has one place however often it was sent");
+    outgoing.acknowledged(&said(&[100], 1), 500);
+    assert_eq!((outgoing.next_wake(), outgoing.left(), outgoing.on_the_way()), (None, 0, (0, 0)));
+}
+
+#[test]
+fn what_was_superseded_or_has_expired_is_not_repeated() {
+    let mut outgoing = outgoing(9, 1_000, 8);
+    let second = Duration::from_secs(1);
+    outgoing.submit(1, 1, 100, Time::MAX).unwrap();
+    outgoing.submit(2, 1, 100, NOW + Duration::from_millis(5)).unwrap();
+    assert_eq!(sent(&mut outgoing, NOW), [100, 101]);
+    outgoing.submit(1, 2, 100, Time::MAX).unwrap();
+    assert_eq!(sent(&mut outgoing, NOW), [102]);
+    assert_eq!(sent(&mut outgoing, NOW + second), [102]);
+    let position = outgoing.position();
+    assert_eq!((position.superseded(), position.expired(), position.unacknowledged), (1, 1, 1));
+    // What the peer had taken after all is not superseded.
+    outgoing.acknowledged(&said(&[102], 2), 500);
+    assert_eq!((outgoing.position().arrived, outgoing.position().superseded()), (2, 0));
+}
+
+#[test]
+fn a_value_that_goes_by_the_connection_supersedes_the_one_that_went_by_datagram() {
+    let mut outgoing = outgoing(9, 1_000, 8);
+    outgoing.submit(1, 1, 100, Time::MAX).unwrap();
+    assert_eq!(sent(&mut outgoing, NOW), [100]);
+    outgoing.submit(2, 1, 100, Time::MAX).unwrap();
+    assert_eq!((outgoing.number_elsewhere(1), outgoing.number_elsewhere(2)), (102, 103));
+    assert!(sent(&mut outgoing, NOW + Duration::from_secs(1)).is_empty());
+    assert_eq!((outgoing.left(), outgoing.position().superseded()), (0, 2));
+}
+
+#[test]
+fn a_table_that_is_full_forgets_a_flow_at_rest_and_else_sends_by_the_connection() {
+    let mut outgoing = outgoing(9, 1_000, 2);
+    outgoing.submit(1, 1, 100, Time::MAX).unwrap();
+    outgoing.submit(2, 1, 100, Time::MAX).unwrap();
+    assert_eq!(outgoing.submit(3, 7, 100, Time::MAX), Err(7));
+    assert_eq!(sent(&mut outgoing, NOW), [100, 101]);
+    assert_eq!(outgoing.submit(3, 7, 100, Time::MAX), Err(7));
+    outgoing.acknowledged(&said(&[100], 1), 500);
+    outgoing.submit(3, 7, 100, Time::MAX).unwrap();
+    assert_eq!(sent(&mut outgoing, NOW), [102]);
+}
+
+#[test]
+fn a_peer_that_says_more_than_can_be_is_believed_as_far_as_it_can_be() {
+    let mut outgoing = outgoing(9, 1_000, 8);
+    outgoing.submit(1, 1, 100, Time::MAX).unwrap();
+    sent(&mut outgoing, NOW);
+    outgoing.acknowledged(&said(&[99, 101, u64::MAX], u64::MAX), u32::MAX);
+    let position = outgoing.position();
+    assert_eq!((position.arrived, position.unacknowledged, position.superseded()), (0, 1, 0));
+    outgoing.begin_anew();
+    outgoing.acknowledged(&said(&[], u64::MAX), 1);
+    assert_eq!(outgoing.position().arrived, 1);
+}
+
+#[test]
+fn the_flow_that_is_given_up_when_the_table_is_full_never_goes_back_in_time() {
+    let mut incoming = Incoming::new(3);
+    for (key, number) in [(1, 10), (2, 20), (3, 30)] {
+        assert!(incoming.came(NOW, 0, key, number));
+    }
+    assert!(incoming.came(NOW, 0, 4, 40), "a further flow");
+    assert_eq!(incoming.flows(), 3);
+    assert!(!incoming.came(NOW, 0, 1, 10), "it comes a second time");
+    assert!(!incoming.came(NOW, 0, 1, 9));
+    assert!(incoming.came(NOW, 0, 1, 50), "a new value of it");
+}
+
+#[test]
+fn what_comes_is_acknowledged_at_once_but_no_more_than_once_a_millisecond_unless_it_is_much() {
+    let mut incoming = Incoming::new(3);
+    assert_eq!(incoming.due(), None);
+    incoming.came(NOW, 7, 1, 1);
+    assert!(incoming.is_due(NOW));
+    let first = incoming.take(NOW + Duration::from_micros(30), 32).unwrap();
+    assert_eq!((first.echo, first.held_us, first.taken, first.ranges()), (7, 30, 1, &[Range::of(1)][..]));
+    incoming.came(NOW, 8, 1, 2);
+    assert!(!incoming.is_due(NOW) && incoming.is_due(NOW + Duration::from_micros(1_030)));
+    for number in 3..34 {
+        incoming.came(NOW, 9, 1, number);
+    }
+    assert!(incoming.is_due(NOW));
+    assert_eq!(incoming.take(NOW, 32).unwrap().ranges(), [Range { first: 2, more: 31 }]);
+    assert_eq!((incoming.due(), incoming.take(NOW, 32)), (None, None));
+}
+
+proptest! {
+    #[test]
+    fn no_order_of_arrivals_is_handed_on_twice_or_out_of_order(
+        arrivals in proptest::collection::vec((0..6_u32, 1..60_u64, any::<bool>()), 1..200),
+        flows_max in 1..5_usize,
+    ) {
+        let mut incoming = Incoming::new(flows_max);
+        let mut last = std::collections::BTreeMap::new();
+        for (key, number, by_datagram) in arrivals {
+            // A number belongs to one flow.
+            let number = number * 6 + u64::from(key);
+            let is_new = if by_datagram {
+                incoming.came(NOW, 0, key, number)
+            } else {
+                incoming.came_by_connection(key, number)
+            };
+            if is_new {
+                prop_assert!(last.insert(key, number).is_none_or(|last| last < number));
+            }
+            prop_assert!(incoming.flows() <= flows_max);
+        }
+    }
+
+    #[test]
+    fn however_it_is_treated_every_message_is_explained_and_the_window_is_kept(
+        steps in proptest::collection::vec((0..12_u8, 0..6_u32, 1..1_200_usize), 1..300),
+    ) {
+        let mut outgoing = outgoing(8, 4_000, 4);
+        let (mut now, mut taken) = (NOW, 0);
+        for (step, key, bytes) in steps {
+            match step {
+                0..=4 => drop(outgoing.submit(key, 0, bytes, now + Duration::from_millis(30))),
+                5 => drop(outgoing.number_elsewhere(key)),
+                6..=7 => now = now + Duration::from_millis(bytes as u64 / 40),
+                8..=9 => {
+                    taken += 1;
+                    let newest = outgoing.next_number();
+                    outgoing.acknowledged(&said(&[newest.saturating_sub(key.into()), newest - 1], taken), key);
+                }
+                10 => drop(outgoing.hand_over()),
+                _ => outgoing.begin_anew(),
+            }
+            sent(&mut outgoing, now);
+            let (datagrams, on_the_way) = outgoing.on_the_way();
+            prop_assert!(datagrams <= 8 && (on_the_way <= 4_000 || datagrams == 1));
+            let position = outgoing.position();
+            let ends = position.arrived + position.superseded() + position.expired() + position.unknown();
+            let here = position.waiting + position.unacknowledged + position.counts.lost;
+            prop_assert_eq!(position.taken(), ends + here, "{:?}", position);
+        }
+    }
+}

@@ -1,0 +1,495 @@
+//! Values of class Stream by UDP: two real nodes, and a peer that is written by hand from `docs/protocol/gncl.md`.
+
+use std::{net::SocketAddr, time::Duration};
+
+use sinew_runtime::{
+    tid::{NodeAddress, Tid},
+    time::Time,
+    wire::{Class, Flags, Kind, Message, decode_datagram, encode_frame},
+};
+use tokio::net::UdpSocket;
+
+use super::{
+    bench::{ByHand, KIND, NINE, Node, introduction, next, pair, run, within},
+    classes::of_class,
+};
+use crate::gncl::{
+    core::{CLASSES, DATAGRAMS, Introduction, Lane, read, write},
+    datagrams::Announcement,
+    peer::frame,
+};
+
+const ACK: u8 = 1;
+const VALUE: u8 = 2;
+const PROBE: u8 = 4;
+/// What the node's datagrams to the peer by hand are to have.
+const KEY: u64 = 77;
+
+fn value(node: &Node, to: Tid, number: u64) -> Message {
+    of_class(Class::Stream, node.message(to, &number.to_le_bytes()))
+}
+
+fn send_value(node: &Node, to: Tid, number: u64) {
+    node.stores.router.send(value(node, to, number)).expect("the peer is known");
+}
+
+/// Waits until values to `peer` go by datagram.
+async fn opened(node: &Node, peer: NodeAddress) {
+    let is_open =
+        || node.stores.gncl.peer(peer).is_some_and(|peer| peer.channel().expect("both can").is_open());
+    within("datagrams to get through", async {
+        while !is_open() {
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+}
+
+/// A datagram as the peer by hand reads it.
+struct Heard {
+    what: u8,
+    stamp: u32,
+    value: Option<Message>,
+    numbers: Vec<(u64, u32)>,
+}
+
+/// A peer that is written by hand, with connections for Control and Stream, and a socket.
+struct Mate {
+    _first: ByHand,
+    stream: ByHand,
+    socket: UdpSocket,
+    /// Where the node reads, and with which key.
+    to: SocketAddr,
+    key: u64,
+}
+
+impl Mate {
+    async fn linked_to(node: &mut Node) -> Self {
+        Self::dialling(node, 1).await
+    }
+
+    /// The same, with this dial and the next one.
+    async fn dialling(node: &mut Node, dial: u64) -> Self {
+        let features = vec![CLASSES.to_owned(), DATAGRAMS.to_owned()];
+        let hello = Introduction { features, dial, ..introduction(node.address()) };
+        let first = ByHand::greeting(node, &hello).await;
+        node.up().await;
+        let hello = Introduction { lane: Lane::Stream, link: dial, dial: dial + 1, ..hello };
+        let mut stream = ByHand::greeting(node, &hello).await;
+        let said = stream.hear().await;
+        assert_eq!(said.header.kind, Kind::GNCL_DATAGRAMS);
+        let said: Announcement = read(&said.payload).expect("it says where");
+        let socket = UdpSocket::bind("127.0.0.1:0").await.expect("loopback has a port");
+        let to = SocketAddr::from(([127, 0, 0, 1], said.port));
+        assert_eq!((to, said.address), (node.listens_at(), 0), "the same port as for TCP");
+        let mut mate = Self { _first: first, stream, socket, to, key: said.key };
+        mate.announce(node, KEY).await;
+        mate
+    }
+
+    async fn announce(&mut self, node: &Node, key: u64) {
+        let port = self.socket.local_addr().expect("it is bound").port();
+        let said = Announcement { port, key, address: 0 };
+        self.stream.say(&frame(NINE, node.address(), Kind::GNCL_DATAGRAMS, write(&said))).await;
+    }
+
+    /// The same, and datagrams are used.
+    async fn open_to(node: &mut Node) -> Self {
+        Self::linked_to(node).await.open(node).await
+    }
+
+    async fn open(self, node: &Node) -> Self {
+        let probe = self.hear().await;
+        assert_eq!(probe.what, PROBE);
+        self.acknowledge(probe.stamp, &[]).await;
+        opened(node, NINE).await;
+        self
+    }
+
+    fn datagram(&self, key: u64, what: u8, rest: &[u8]) -> Vec<u8> {
+        let mut bytes = vec![1, what, 0, 0];
+        bytes.extend(NINE.bits().to_le_bytes());
+        bytes.extend(key.to_le_bytes());
+        bytes.extend(1_000_u32.to_le_bytes());
+        let head = if what & ACK == 0 { &[][..] } else { rest };
+        bytes.extend(crc32fast::hash(&[&bytes, head].concat()).to_le_bytes());
+        bytes.extend(rest);
+        bytes
+    }
+
+    async fn say(&self, what: u8, rest: &[u8]) {
+        self.say_bytes(&self.datagram(self.key, what, rest)).await;
+    }
+
+    async fn say_bytes(&self, bytes: &[u8]) {
+        self.socket.send_to(bytes, self.to).await.expect("loopback takes it");
+    }
+
+    async fn acknowledge(&self, echo: u32, numbers: &[u64]) {
+        let mut rest = Vec::from(echo.to_le_bytes());
+        rest.extend(0_u32.to_le_bytes());
+        rest.extend((numbers.len() as u64).to_le_bytes());
+        rest.extend((numbers.len() as u32).to_le_bytes());
+        for number in numbers {
+            rest.extend(number.to_le_bytes());
+            rest.extend(0_u32.to_le_bytes());
+        }
+        self.say(ACK, &rest).await;
+    }
+
+    fn value_bytes(&self, to: Tid, number: u64, source: Tid) -> Vec<u8> {
+        let mut header = sinew_runtime::wire::Header::new(KIND, source, to);
+        (header.class, header.correlation, header.sent) = (Class::Stream, number, Time::now());
+        let mut bytes = bytes::BytesMut::new();
+        encode_frame(&header, &number.to_le_bytes(), &mut bytes);
+        bytes.to_vec()
+    }
+
+    async fn send_value(&self, to: Tid, number: u64) {
+        self.say(VALUE, &self.value_bytes(to, number, nines_app())).await;
+    }
+
+    async fn hear(&self) -> Heard {
+        let mut buffer = vec![0; 2_000];
+        let length = within("a datagram", self.socket.recv(&mut buffer)).await.expect("it is read");
+        assert!(length <= 1_200);
+        let bytes = &buffer[..length];
+        let u32_at = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four"));
+        let u64_at = |at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().expect("eight"));
+        assert_eq!((bytes[0], bytes[2], bytes[3], u64_at(8)), (1, 0, 0, KEY));
+        let (what, mut at, mut numbers) = (bytes[1], 24, Vec::new());
+        if what & ACK != 0 {
+            let count = usize::from(bytes[40]);
+            numbers = (0..count).map(|n| (u64_at(44 + 12 * n), u32_at(52 + 12 * n))).collect();
+            at = 44 + 12 * count;
+        }
+        assert_eq!(u32_at(20), crc32fast::hash(&[&bytes[..20], &bytes[24..at]].concat()));
+        let value = (what & VALUE != 0).then(|| decode_datagram(&bytes[at..]).expect("it is a frame"));
+        Heard { what, stamp: u32_at(16), value, numbers }
+    }
+
+    /// The next value, with its number.
+    async fn hear_value(&self) -> (u64, Vec<u8>) {
+        loop {
+            if let Some(value) = self.hear().await.value {
+                assert_eq!((value.header.class, value.header.flags), (Class::Stream, Flags::NONE));
+                return (value.header.correlation, value.payload.to_vec());
+            }
+        }
+    }
+
+    /// The next value on the connection, with its number.
+    async fn hear_on_connection(&mut self) -> (u64, Vec<u8>) {
+        loop {
+            let message = self.stream.hear().await;
+            if message.header.class == Class::Stream {
+                return (message.header.correlation, message.payload.to_vec());
+            }
+        }
+    }
+}
+
+fn nines_app() -> Tid {
+    Tid::new(NINE, sinew_runtime::tid::AppAddress::new(0x1001))
+}
+
+#[test]
+fn values_go_by_datagram_once_it_was_seen_that_they_get_through_and_both_nodes_count_them() {
+    run(async {
+        let (a, b) = pair().await;
+        let mut inbox = b.app(1);
+        opened(&a, b.address()).await;
+        for number in 0..200 {
+            send_value(&a, b.tid(1), number);
+            let message = next("a value", &mut inbox).await;
+            assert_eq!(message.payload[..], number.to_le_bytes());
+            assert_eq!((message.header.correlation, message.header.class), (0, Class::Stream));
+        }
+        within("all to be acknowledged", async {
+            while a.stores.gncl.peer(b.address()).expect("it is there").left() > 0 {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        let position = a.stores.gncl.peer(b.address()).unwrap().channel().unwrap().position();
+        assert_eq!((position.taken(), position.arrived), (200, 200), "{position:?}");
+        within("all to be counted", async {
+            loop {
+                let arrived =
+                    b.stores.gncl.peer(a.address()).unwrap().accounts()[Class::Stream as usize].arrived;
+                assert_eq!(arrived.taken, 200);
+                if arrived.handed_on == 200 {
+                    break;
+                }
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+    });
+}
+
+#[test]
+fn values_stay_in_order_when_a_layer_is_restarted_at_either_side() {
+    run(async {
+        let (mut a, mut b) = pair().await;
+        let mut inbox = b.app(1);
+        opened(&a, b.address()).await;
+        let (mut sent, mut last) = (0, 0);
+        for round in 0..6 {
+            for _ in 0..50 {
+                sent += 1;
+                send_value(&a, b.tid(1), sent);
+            }
+            let layer = if round % 2 == 0 { &mut a } else { &mut b };
+            layer.stop_layer();
+            sent += 1;
+            send_value(&a, b.tid(1), sent);
+            let layer = if round % 2 == 0 { &mut a } else { &mut b };
+            layer.start_layer().await;
+            while last < sent {
+                let message = next("a value", &mut inbox).await;
+                let number = u64::from_le_bytes(message.payload[..].try_into().expect("a number"));
+                assert!(number > last, "{number} came after {last}");
+                last = number;
+            }
+        }
+    });
+}
+
+#[test]
+fn a_value_is_repeated_until_it_is_acknowledged_and_one_that_is_superseded_is_not() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mate = Mate::open_to(&mut node).await;
+        send_value(&node, nines_app(), 1);
+        let (first, payload) = mate.hear_value().await;
+        assert_eq!(payload, 1_u64.to_le_bytes());
+        assert_eq!(mate.hear_value().await, (first, payload), "again, with its number");
+        send_value(&node, nines_app(), 2);
+        let second = loop {
+            let (number, payload) = mate.hear_value().await;
+            if number != first {
+                assert_eq!(payload, 2_u64.to_le_bytes());
+                break number;
+            }
+        };
+        assert!(second > first);
+        assert_eq!(mate.hear_value().await.0, second, "the newest alone");
+        mate.acknowledge(1, &[second]).await;
+        within("the acknowledgement to be read", async {
+            while node.stores.gncl.peer(NINE).expect("it is there").left() > 0 {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+    });
+}
+
+#[test]
+fn where_nothing_is_answered_any_more_the_last_value_goes_by_the_connection_with_its_number() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut mate = Mate::open_to(&mut node).await;
+        send_value(&node, nines_app(), 1);
+        let by_datagram = mate.hear_value().await;
+        assert_eq!(mate.hear_on_connection().await, by_datagram);
+        send_value(&node, nines_app(), 2);
+        let (number, payload) = mate.hear_on_connection().await;
+        assert_eq!(payload, 2_u64.to_le_bytes());
+        assert!(number > by_datagram.0);
+    });
+}
+
+#[test]
+fn a_value_that_is_longer_than_a_datagram_goes_by_the_connection_and_so_does_all_before_an_answer() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut mate = Mate::linked_to(&mut node).await;
+        send_value(&node, nines_app(), 1);
+        let (first, _) = mate.hear_on_connection().await;
+        assert!(first > 0);
+        let probe = mate.hear().await;
+        assert_eq!(probe.what, PROBE);
+        mate.acknowledge(probe.stamp, &[]).await;
+        // One that fills a datagram, and one of a byte more.
+        let sized = |length: usize| of_class(Class::Stream, node.message(nines_app(), &vec![7; length]));
+        let (second, payload) = loop {
+            node.stores.router.send(sized(1_112)).expect("the peer is known");
+            if let Ok(heard) = tokio::time::timeout(Duration::from_millis(1), mate.hear_value()).await {
+                break heard;
+            }
+        };
+        assert_eq!(payload.len(), 1_112);
+        node.stores.router.send(sized(1_113)).expect("the peer is known");
+        let (third, payload) = loop {
+            let (number, payload) = mate.hear_on_connection().await;
+            if payload.len() == 1_113 {
+                break (number, payload);
+            }
+        };
+        assert!(first < second && second < third, "{first} {second} {third}: {}", payload.len());
+    });
+}
+
+#[test]
+fn of_what_comes_twice_late_or_by_both_ways_each_newest_value_is_handed_on_once() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut inbox = node.app(1);
+        let mut mate = Mate::open_to(&mut node).await;
+        let to = node.tid(1);
+        for number in [5, 5, 3, 9] {
+            mate.send_value(to, number).await;
+        }
+        let mut by_connection = Message::new(
+            sinew_runtime::wire::Header::new(KIND, nines_app(), to),
+            bytes::Bytes::copy_from_slice(&8_u64.to_le_bytes()),
+        );
+        for number in [8_u64, 10] {
+            (by_connection.header.class, by_connection.header.correlation) = (Class::Stream, number);
+            by_connection.header.sent = Time::now();
+            let payload = bytes::Bytes::copy_from_slice(&number.to_le_bytes());
+            let copy = Message::new(by_connection.header, payload);
+            if number == 8 {
+                // What came by datagram is read by now.
+                for expected in [5_u64, 9] {
+                    assert_eq!(next("a value", &mut inbox).await.payload[..], expected.to_le_bytes());
+                }
+            }
+            mate.stream.say(&copy).await;
+        }
+        assert_eq!(next("a value", &mut inbox).await.payload[..], 10_u64.to_le_bytes());
+        let acknowledged = loop {
+            let heard = mate.hear().await;
+            if heard.what & ACK != 0 && !heard.numbers.is_empty() {
+                break heard.numbers;
+            }
+        };
+        assert!(acknowledged.iter().any(|(first, _)| *first == 5), "{acknowledged:?}");
+        within("all to be counted", async {
+            loop {
+                let arrived = node.stores.gncl.peer(NINE).unwrap().accounts()[Class::Stream as usize].arrived;
+                assert!((arrived.taken, arrived.superseded) == (4, 1), "{arrived:?}");
+                if arrived.handed_on == 3 {
+                    break;
+                }
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+    });
+}
+
+#[test]
+fn bytes_of_strangers_and_what_is_malformed_are_dropped_and_counted_and_do_no_harm() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut inbox = node.app(1);
+        let mate = Mate::open_to(&mut node).await;
+        let good = mate.value_bytes(node.tid(1), 1, nines_app());
+        mate.say_bytes(b"hello").await;
+        node.counted("datagram of somebody else").await;
+        mate.say_bytes(&mate.datagram(mate.key ^ 1, VALUE, &good)).await;
+        node.counted("datagram with another key").await;
+        let mut of_nobody = mate.datagram(mate.key, VALUE, &good);
+        of_nobody[4..8].copy_from_slice(&12_u32.to_le_bytes());
+        mate.say_bytes(&of_nobody).await;
+        node.counted("datagram of a stranger").await;
+        for length in 0..good.len() {
+            mate.say(VALUE, &good[..length]).await;
+        }
+        let mut damaged = good.clone();
+        *damaged.last_mut().expect("it has a payload") ^= 1;
+        mate.say(VALUE, &damaged).await;
+        mate.say(0xff, &good).await;
+        mate.say(ACK, &[0xff; 100]).await;
+        mate.say(VALUE, &[0; 3_000]).await;
+        node.counted("datagram malformed").await;
+        // A source that is not the peer's, and a class that is none of a value.
+        let forged = mate.value_bytes(node.tid(1), 2, node.tid(7));
+        mate.say(VALUE, &forged).await;
+        node.counted("forged source").await;
+        mate.send_value(node.tid(1), 3).await;
+        assert_eq!(next("a value", &mut inbox).await.payload[..], 3_u64.to_le_bytes());
+        assert_eq!(node.stores.gncl.refusals.of("datagram with another key"), 1);
+    });
+}
+
+#[test]
+fn nothing_of_a_peer_that_is_lost_is_handed_on_and_nothing_with_its_former_key() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut inbox = node.app(1);
+        let mate = Mate::open_to(&mut node).await;
+        mate.send_value(node.tid(1), 1).await;
+        next("a value", &mut inbox).await;
+        // NDL tells of it, and that it is lost.
+        node.find(NINE, SocketAddr::from(([127, 0, 0, 1], 1)));
+        node.lose(NINE);
+        node.broken().await;
+        mate.send_value(node.tid(1), 2).await;
+        node.counted("datagram of a stranger").await;
+        drop(mate);
+        let next_life = Mate::dialling(&mut node, 5).await.open(&node).await;
+        let former = next_life.datagram(0, VALUE, &next_life.value_bytes(node.tid(1), 3, nines_app()));
+        next_life.say_bytes(&former).await;
+        node.counted("datagram with another key").await;
+        next_life.send_value(node.tid(1), 4).await;
+        assert_eq!(next("a value", &mut inbox).await.payload[..], 4_u64.to_le_bytes());
+    });
+}
+
+#[test]
+fn a_peer_that_has_forgotten_what_came_begins_anew_and_what_was_under_way_is_unknown() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut mate = Mate::open_to(&mut node).await;
+        send_value(&node, nines_app(), 1);
+        mate.hear_value().await;
+        mate.announce(&node, KEY + 1).await;
+        let account =
+            || node.stores.gncl.peer(NINE).expect("it is there").accounts()[Class::Stream as usize].sent;
+        within("its word to be read", async {
+            while account().unknown == 0 {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        let sent = account();
+        assert_eq!((sent.taken, sent.unknown, sent.unacknowledged), (1, 1, 0), "{sent:?}");
+    });
+}
+
+#[test]
+fn a_node_that_is_not_to_use_datagrams_says_nothing_of_them() {
+    run(async {
+        let (mut a, mut b) =
+            (Node::start_with(1, |config| config.gncl.datagrams = false).await, Node::start(2).await);
+        a.find(b.address(), b.listens_at());
+        a.up().await;
+        b.up().await;
+        let mut inbox = b.app(1);
+        send_value(&a, b.tid(1), 1);
+        assert_eq!(next("a value", &mut inbox).await.payload[..], 1_u64.to_le_bytes());
+        for (node, peer) in [(&a, &b), (&b, &a)] {
+            assert!(node.stores.gncl.peer(peer.address()).expect("linked").channel().is_none());
+        }
+    });
+}
+
+#[test]
+fn what_is_under_way_when_a_node_is_stopped_is_handed_over_before_its_goodbye() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut mate = Mate::open_to(&mut node).await;
+        send_value(&node, nines_app(), 1);
+        let by_datagram = mate.hear_value().await;
+        node.leave();
+        assert_eq!(mate.hear_on_connection().await, by_datagram);
+        loop {
+            if mate.stream.hear().await.header.kind == Kind::GNCL_GOODBYE {
+                break;
+            }
+        }
+    });
+}

@@ -1,0 +1,101 @@
+//! What is told of a peer's end comes behind its last message.
+
+use bytes::Bytes;
+use futures_util::{FutureExt as _, StreamExt as _};
+use sinew_runtime::{
+    mailbox::About,
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    time::Time,
+    wire::{Header, Kind, Message},
+};
+
+use super::{
+    bench::{ByHand, KIND, NINE, Node, next, run},
+    credit,
+};
+use crate::aftermath;
+
+/// The incarnation of a peer that is linked.
+fn life(node: &Node, peer: NodeAddress) -> Incarnation {
+    node.stores.gncl.peer(peer).expect("it is linked").incarnation
+}
+
+/// Tells the first application of `node` that `peer` is gone.
+fn tell_the_end(node: &Node, peer: NodeAddress) {
+    let header = Header::new(KIND, Tid::new(node.address(), AppAddress::NDL), node.tid(1));
+    let event = Message::new(header, Bytes::from_static(b"its end"));
+    aftermath::tell(&node.stores, About::End(peer), event).expect("there is room");
+}
+
+fn from_nine(node: &Node, payload: &[u8]) -> Message {
+    let mut message = node.message(node.tid(1), payload);
+    message.header.source.node = NINE;
+    message
+}
+
+/// The node has read all that the peer has said before.
+async fn has_read(peer: &mut ByHand, node: &Node) {
+    let gncl = |node| Tid::new(node, AppAddress::GNCL);
+    let ping = Header::new(Kind::GNCL_PING, gncl(NINE), gncl(node.address()));
+    peer.say(&Message::new(ping, Bytes::new())).await;
+    while peer.hear().await.header.kind != Kind::GNCL_PONG {}
+}
+
+#[test]
+fn of_a_life_that_is_over_nothing_more_is_taken() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut inbox = node.app(1);
+        let mut peer = ByHand::linked_to(&mut node).await;
+        peer.say(&from_nine(&node, b"the last one")).await;
+        assert_eq!(next("the last message", &mut inbox).await.payload[..], *b"the last one");
+        // Another life is none of its business.
+        node.stores.gncl.fence(NINE, Incarnation(life(&node, NINE).0 + 1));
+        peer.say(&from_nine(&node, b"still")).await;
+        assert_eq!(next("a message", &mut inbox).await.payload[..], *b"still");
+        node.stores.gncl.fence(NINE, life(&node, NINE));
+        peer.say(&from_nine(&node, b"too late")).await;
+        has_read(&mut peer, &node).await;
+        assert!(inbox.next().now_or_never().is_none());
+    });
+}
+
+#[test]
+fn what_is_told_of_a_node_that_leaves_waits_for_what_it_still_sends() {
+    run(async {
+        let mut node = Node::start(1).await;
+        actix::spawn(aftermath::carry_on(node.stores.clone()));
+        let mut inbox = node.app(1);
+        let mut peer = ByHand::linked_to(&mut node).await;
+        node.stores.gncl.leaves(Time::now(), NINE, life(&node, NINE));
+        tell_the_end(&node, NINE);
+        for said in [&b"one"[..], b"two"] {
+            peer.say(&from_nine(&node, said)).await;
+            assert_eq!(next("its message", &mut inbox).await.payload[..], *said);
+        }
+        node.lose(NINE);
+        assert_eq!(next("its end", &mut inbox).await.payload[..], *b"its end");
+    });
+}
+
+#[test]
+fn what_is_told_of_a_node_that_is_lost_comes_behind_what_waits_for_a_slow_application() {
+    run(async {
+        let (a, b, mut slow) = credit::pair().await;
+        actix::spawn(aftermath::carry_on(b.stores.clone()));
+        credit::fill(&a, &b).await;
+        b.stores.gncl.fence(a.address(), life(&b, a.address()));
+        tell_the_end(&b, a.address());
+        let mut came = 0_u64;
+        loop {
+            let message = next("what waited, and the end", &mut slow).await;
+            if message.payload[..] == *b"its end" {
+                break;
+            }
+            assert_eq!(message.payload[..], came.to_le_bytes());
+            came += 1;
+        }
+        assert!(came > credit::MAILBOX as u64, "{came}");
+        assert!(slow.next().now_or_never().is_none());
+    });
+}

@@ -1,0 +1,133 @@
+//! What a peer is told of what was taken of it.
+
+use sinew_runtime::wire::{Kind, Message};
+
+use super::{Inbox, Way};
+use crate::{
+    gncl::{core::write, peer::frame},
+    session::Ack,
+};
+
+/// One that is not said yet.
+struct Acknowledgement {
+    number: u64,
+    message: Message,
+}
+
+impl Way {
+    /// All that came at once has been taken: tells the peer so, if there was much since it was told.
+    pub(in crate::gncl) fn acknowledge_if_due(&self) {
+        let is_due = self.inbox().ack_is_due;
+        if is_due {
+            self.acknowledge();
+        }
+    }
+
+    /// Tells the peer what was taken, if it does not know. Returns whether it did not.
+    pub(in crate::gncl) fn acknowledge_if_owed(&self) -> bool {
+        let owes = self.inbox().receiving.owes_ack();
+        if owes {
+            self.acknowledge();
+        }
+        owes
+    }
+
+    pub(super) fn acknowledge(&self) {
+        self.say_ack(self.next_ack());
+    }
+
+    fn say_ack(&self, mut ack: Acknowledgement) {
+        loop {
+            self.say(ack.message);
+            // What another thread has made meanwhile may have been said before this one, which has taken its place then: in an outlet one waits.
+            if self.inbox().acks_made == ack.number {
+                return;
+            }
+            ack = self.next_ack();
+        }
+    }
+
+    fn next_ack(&self) -> Acknowledgement {
+        let epoch = self.outlet.epoch();
+        let (ack, number) = {
+            let Inbox { receiving, shelf, ack_is_due, acks_made, .. } = &mut *self.inbox();
+            *ack_is_due = false;
+            *acks_made += 1;
+            let room = shelf.room(self.window, self.longest);
+            let ack = receiving.ack(epoch, Some(room));
+            (Ack { change: shelf.change(), held: shelf.held(), ..ack }, *acks_made)
+        };
+        Acknowledgement {
+            number,
+            message: frame(self.ends.here, self.ends.node, Kind::GNCL_ACK, write(&ack)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use bytes::{Bytes, BytesMut};
+    use sinew_runtime::{
+        tid::NodeAddress,
+        time::Time,
+        wire::{Checksum, Class, FrameCodec},
+    };
+    use tokio::{
+        io::AsyncReadExt,
+        net::{TcpListener, TcpStream},
+    };
+    use tokio_util::codec::Decoder;
+
+    use super::{super::Ends, *};
+    use crate::{config::NodeConfig, gncl::core::read, outlet::Gathering};
+
+    // spec: CREDIT-2
+    #[tokio::test]
+    async fn of_two_that_are_made_at_once_the_older_one_does_not_have_the_last_word() {
+        // Given: a connection that takes nothing.
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+        let address = listener.local_addr().expect("it is bound");
+        let (ours, theirs) = tokio::join!(TcpStream::connect(address), listener.accept());
+        let (ours, mut theirs) = (Arc::new(ours.expect("it listens")), theirs.expect("it dials").0);
+        ours.writable().await.expect("it takes something");
+        let mut filled = 0;
+        while let Ok(count) = ours.try_write(&[0; 65_536]) {
+            filled += count;
+        }
+        let [here, node] = [1, 2].map(NodeAddress::new);
+        let ends = Ends { here, node, takes_outcomes: true };
+        let config = NodeConfig::new("hip");
+        let way = Way::new(Time::now(), ends, &config, &Arc::default(), &Arc::default());
+        let link = way.outlet.connect(Gathering::new(ours, Checksum::Crc), 1 << 16, None);
+        way.attach(link);
+        // When: one thread has made an acknowledgement, another one makes and says a newer one, and the first one goes on.
+        let older = way.next_ack();
+        let mut held = frame(node, here, Kind::named("held"), Bytes::new());
+        held.header.class = Class::Bulk;
+        way.inbox().shelf.put(7, held, 100).expect("there is room");
+        way.acknowledge();
+        way.say_ack(older);
+        // Then: what the peer reads last says what is held.
+        let reading = async {
+            let mut filler = vec![0; filled];
+            theirs.read_exact(&mut filler).await.expect("it is on its way");
+            let (mut codec, mut bytes, mut acks) = (FrameCodec::new(1 << 16), BytesMut::new(), Vec::new());
+            // The first one was made when the connection was there, and had begun to be written.
+            while acks.len() < 2 {
+                theirs.read_buf(&mut bytes).await.expect("it is on its way");
+                while let Some(message) = codec.decode(&mut bytes).expect("a frame") {
+                    assert_eq!(message.header.kind, Kind::GNCL_ACK);
+                    acks.push(read::<Ack>(&message.payload).expect("an acknowledgement"));
+                }
+            }
+            acks
+        };
+        let acks = tokio::select! {
+            acks = reading => acks,
+            cause = way.outlet.drain(link) => panic!("{cause}"),
+        };
+        assert_eq!(acks.last().map(|ack| ack.held.len()), Some(1), "{acks:?}");
+    }
+}
