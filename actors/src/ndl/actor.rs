@@ -1,13 +1,17 @@
 //! The thin shell around the membership core: sockets, timer, mDNS, and the ways to other layers.
 
+mod telling;
+
 use std::{
     cell::RefCell,
     collections::BTreeSet,
+    future::poll_fn,
     hash::{BuildHasher, RandomState},
     io,
     net::{SocketAddr, SocketAddrV4},
     rc::Rc,
     sync::{Arc, MutexGuard, PoisonError, atomic::Ordering},
+    task::Poll,
     time::Duration,
 };
 
@@ -15,16 +19,15 @@ use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, WrapFutur
 use futures_util::{StreamExt as _, stream::FuturesUnordered};
 use mdns_sd::{DaemonEvent, ServiceEvent};
 use sinew_runtime::{
-    outcome::Rejection,
+    alarm::Alarm,
     supervision::ReadyGate,
-    tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    tid::{Incarnation, NodeAddress},
     time::Time,
-    wire::Message,
 };
 use tokio::sync::{Notify, mpsc, oneshot};
 
 use super::{
-    Event, MembershipFact, NodeEvent,
+    Event,
     core::{Core, Epoch, Input, Output, Way},
     datagram::{Answer, Body, DATAGRAM_MAX, Datagram, encode},
     mdns::{Mdns, MdnsError},
@@ -32,11 +35,11 @@ use super::{
     socket,
 };
 use crate::{
+    aftermath,
     config::NodeConfig,
     gncl, node,
     refusals::Refusals,
     stores::{self, Stores},
-    sync,
 };
 
 /// Rest after a failed read, so that a socket that fails for good does not take the whole thread.
@@ -94,6 +97,7 @@ impl Actor for NdlActor {
             ctx.spawn(try_hosts(shell.clone(), probes).into_actor(self));
         }
         ctx.spawn(watch_progress(shell.clone()).into_actor(self));
+        ctx.spawn(aftermath::carry_on(self.stores.clone()).into_actor(self));
         ctx.spawn(keep_time(shell.clone()).into_actor(self));
         self.shell = Some(shell);
         if let Some(ready) = self.ready.take() {
@@ -254,6 +258,7 @@ impl Shell {
             }
             Output::SendLeave { to, node } => self.send(to, node, 0, Body::Leave(self.me())),
             Output::Probe { node, incarnation, to, within } => {
+                self.stores.gncl.ask_for_a_sign(self.stores.node, node, incarnation);
                 // Where too many are silent at once it is not their hosts that are to be doubted.
                 let _ = self.to_probe.try_send(Probe { node, incarnation, to, within });
             }
@@ -291,35 +296,6 @@ impl Shell {
             self.refusals.count(Time::now(), "NDL datagram not sent", &format_args!("to {to}: {error}"));
         }
     }
-
-    fn tell_layers(&self, fact: MembershipFact) {
-        if let MembershipFact::NodeLost { node, .. } = fact {
-            self.stores.clocks.forget(node);
-        }
-        crate::log::info!(?fact, "membership");
-        let posts = &self.stores.posts;
-        if let Err(event) = posts.gncl.post(gncl::Event::Membership(fact.clone())) {
-            crate::log::error!(?event, "GNCL's post is full: it does not learn this");
-        }
-        if let Err(event) = posts.sync.post(sync::Event::Membership(fact)) {
-            crate::log::error!(?event, "the sync manager's post is full: it does not learn this");
-        }
-    }
-
-    fn tell_application(&self, app: AppAddress, event: &NodeEvent) {
-        let here = self.stores.node;
-        let mut message = Message::typed(Tid::new(here, AppAddress::NDL), Tid::new(here, app), event);
-        message.header.sent = Time::now();
-        let Err(why) = self.stores.router.send(message) else { return };
-        let now = Time::now();
-        let what = format_args!("{app} does not learn of {event:?}: {why}");
-        self.refusals.count(now, "event not taken by an application", &what);
-        // Any other refusal says that it is gone, and nobody has to hear of it.
-        if why == Rejection::QueueFull {
-            lock(&self.stores).handle(now, Input::EventNotTaken { app });
-            self.rewind.notify_one();
-        }
-    }
 }
 
 pub(super) fn lock(stores: &Stores) -> MutexGuard<'_, Core> {
@@ -332,6 +308,16 @@ fn links(stores: &Stores) -> BTreeSet<(NodeAddress, Incarnation)> {
     let stands = |peer: &gncl::Peer| peer.ways().first().is_some_and(|way| way.outlet.is_connected());
     let peers = stores.gncl.peers();
     peers.iter().filter(|peer| stands(peer)).map(|peer| (peer.node, peer.incarnation)).collect()
+}
+
+/// What GNCL heard of those who are about to be lost. NDL's lock and GNCL's are never held together.
+fn signs(stores: &Stores) -> Vec<Input> {
+    let in_doubt = lock(stores).in_doubt();
+    let sign = |(node, incarnation)| {
+        let at = stores.gncl.sign_of(node, incarnation)?;
+        Some(Input::SignSeen { node, incarnation, at })
+    };
+    in_doubt.into_iter().filter_map(sign).collect()
 }
 
 /// The socket that is open already, if this layer was restarted: a former instance that hangs still has it, so that nobody
@@ -414,18 +400,38 @@ async fn try_hosts(shell: Rc<Shell>, mut asked: mpsc::Receiver<Probe>) {
 }
 
 async fn keep_time(shell: Rc<Shell>) {
+    // Not the reactor's own sleep, whose ticks of a millisecond made each look late by one to two, and each loss twice as much.
+    let mut alarm = Alarm::new().unwrap_or_else(|error| {
+        give_up(&format!("NDL gets no timer of the kernel's: {error}; raise `ulimit -n`"))
+    });
     loop {
         let wake = lock(&shell.stores).next_wake();
         let Some(wake) = wake else { return };
-        let sleep = tokio::time::sleep(wake.since(Time::now()));
         tokio::select! {
-            () = sleep => {}
+            () = reached(&mut alarm, wake) => {}
             () = shell.rewind.notified() => continue,
         }
-        if !shell.feed(|core, now| core.handle(now, Input::TimePassed)) {
+        let signs = signs(&shell.stores);
+        let time_passed = |core: &mut Core, now| {
+            signs.into_iter().for_each(|sign| core.handle(now, sign));
+            core.handle(now, Input::TimePassed);
+        };
+        if !shell.feed(time_passed) {
             return;
         }
     }
+}
+
+/// Until this time has come.
+async fn reached(alarm: &mut Alarm, at: Time) {
+    poll_fn(|context| {
+        if Time::now() >= at {
+            return Poll::Ready(());
+        }
+        alarm.wake_at(Some(at), context).expect("a timer that was made takes a time");
+        Poll::Pending
+    })
+    .await;
 }
 
 async fn browse(shell: Rc<Shell>, mdns: Rc<Mdns>) {

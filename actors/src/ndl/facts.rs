@@ -51,7 +51,7 @@ pub enum NodeEvent {
         #[serde(default)]
         bound_us: u64,
     },
-    /// A layer or an application of a node that lives does not get on. It says so itself, in its answers.
+    /// A layer or an application of a node that lives does not get on. It says so itself, in its answers; but for [`Trouble::Unheard`].
     AppStalled {
         /// The node's address.
         node: NodeAddress,
@@ -102,6 +102,8 @@ pub enum Trouble {
     Away,
     /// It has failed, and is not started again.
     GivenUp,
+    /// Only of NDL: it does not answer, while other connections of the node deliver. It hangs, or datagrams do not get through.
+    Unheard,
 }
 
 /// How a loss was noticed.

@@ -2,7 +2,7 @@
 //!
 //! Its promise: a node that can be reached is known within milliseconds of its start; a node that is gone is known to
 //! be gone within `period` times `missed_max` plus one period (those of its group, if it is in one), and at once if it said so or if its connection broke
-//! and is refused; a node that is only slow is not lost; and nobody becomes a member by a forged source address.
+//! and is refused; a node that is only slow is not lost, nor one of which any connection delivers; and nobody becomes a member by a forged source address.
 //!
 //! `docs/protocol/ndl.md` has the bytes. The rules:
 //!
@@ -25,6 +25,7 @@
 //! | NDL-4.3 | when its connection broke and is refused: `Crashed`, until it answers a later query; |
 //! | NDL-4.4 | when it says so, from its own address, in its own life: `Left`. |
 //! | NDL-4.6 | whose host is tried from its first missed answer on: `Hung` if it accepts, `Crashed` if it refuses, else `LinkDown`. |
+//! | NDL-4.7 | But not while GNCL reads of it: it lives, and is told to have an NDL that is not heard. |
 //! | NDL-5 | A node has one life at a time. |
 //! | NDL-5.1 | A higher incarnation replaces a lower one: `NodeRestarted`. |
 //! | NDL-5.2 | A lower one is refused, also after the loss of the higher one. |

@@ -44,6 +44,7 @@ impl From<u8> for Told {
         Self(match number {
             1 => Trouble::Away,
             2 => Trouble::GivenUp,
+            3 => Trouble::Unheard,
             _ => Trouble::Stalled,
         })
     }
@@ -55,6 +56,8 @@ impl From<Told> for u8 {
             Trouble::Stalled => 0,
             Trouble::Away => 1,
             Trouble::GivenUp => 2,
+            // Said by nobody of himself.
+            Trouble::Unheard => 3,
         }
     }
 }

@@ -10,7 +10,7 @@ use sinew_runtime::{
 use super::{
     Core, Host, Member, Output, Source,
     contact::{Contact, Question, Role},
-    pace::{Pace, REST},
+    pace::REST,
 };
 use crate::ndl::LossReason;
 
@@ -71,6 +71,7 @@ impl Core {
             pace.due = Some(due + pace.period);
             self.count_missed(at);
             self.lose_the_silent(now, at, late, Duration::ZERO);
+            self.tell_who_does_not_answer(at);
             self.probe_the_suspected(at);
         }
         if at == REST {
@@ -97,8 +98,9 @@ impl Core {
     /// read first. Each respite allows twice what made it, so that a timer that is always late puts nothing off for ever.
     // spec: NDL-4.1, NDL-4.2
     fn lose_the_silent(&mut self, now: Time, at: usize, late: Duration, allowed: Duration) {
-        let Pace { period, missed_max, .. } = self.paces[at];
-        let is_silent = |member: &Member| member.pace == at && member.is_silent(now, missed_max);
+        let pace = &self.paces[at];
+        let period = pace.period;
+        let is_silent = |member: &Member| member.pace == at && member.is_silent(now, pace);
         let silent: Vec<NodeAddress> =
             self.members.iter().filter(|(_, member)| is_silent(member)).map(|(node, _)| *node).collect();
         if late > allowed && !silent.is_empty() {

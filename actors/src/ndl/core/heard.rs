@@ -137,6 +137,10 @@ impl Core {
         }
         if let Some(member) = self.members.get_mut(&announcement.node) {
             member.heard = now;
+            if source == Source::Query {
+                // Who asks us lives, whatever becomes of our questions; he asks us as long as he hears our answers. spec: NDL-4.7
+                member.sign = now;
+            }
         }
         if let Some(contact) = self.contacts.get_mut(&from) {
             contact.sources.entry(source).or_insert(now);

@@ -11,6 +11,7 @@ use super::{
     Core, Member, Output, Source,
     clock::{Exchange, PeerClock},
     contact::{Contact, Role},
+    recall::Loss,
     troubles::Troubles,
 };
 use crate::{
@@ -132,6 +133,7 @@ impl Core {
         (member.missed, member.host) = (0, None);
         member.is_awaited = false;
         self.measure(now, node, proof.exchange);
+        self.answers_again(node);
         self.note_progress(node, proof.progress);
     }
 
@@ -216,6 +218,7 @@ impl Core {
             announcement,
             address: from,
             heard: now,
+            sign: now,
             pace,
             missed: 0,
             host: None,
@@ -337,7 +340,8 @@ impl Core {
         let contest = self.contests.remove(&node);
         let sources =
             self.contacts.get(&member.address).map(|contact| contact.sources.keys().copied().collect());
-        self.recall.lost(now, &member, sources.unwrap_or_default(), why);
+        let bound = self.paces[member.pace].bound();
+        self.recall.lost(now, &member, sources.unwrap_or_default(), Loss { why, bound });
         self.is_lonely |= self.members.is_empty() && matches!(why, LossReason::Hung | LossReason::LinkDown);
         if why == LossReason::Duplicate {
             // An elder life has its address: this one is no bar to that.
@@ -353,8 +357,7 @@ impl Core {
         }
         let Announcement { incarnation, name, .. } = member.announcement;
         let micros = |time: Duration| u64::try_from(time.as_micros()).unwrap_or(u64::MAX);
-        let (silent_us, bound_us) =
-            (micros(now.since(member.heard)), micros(self.paces[member.pace].bound()));
+        let (silent_us, bound_us) = (micros(now.since(member.heard)), micros(bound));
         self.outputs.push_back(Output::Fact(MembershipFact::NodeLost { node, incarnation, why }));
         self.publish(&NodeEvent::NodeLost { node, name, incarnation, why, silent_us, bound_us });
         if why == LossReason::Crashed {

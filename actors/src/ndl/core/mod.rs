@@ -12,6 +12,7 @@
 //! | `lives` | who comes, goes, comes again |
 //! | `duplicates` | which of two processes has a node address |
 //! | `pace` | how often which members are asked |
+//! | `signs` | what GNCL heard of a member that does not answer |
 //! | `troubles` | what of a member does not get on |
 //! | `audience` | who is told, and what of it has not been taken |
 //! | `clock` | how far a peer's clock is from ours |
@@ -27,6 +28,7 @@ mod heard;
 mod lives;
 mod pace;
 mod recall;
+mod signs;
 #[cfg(test)]
 mod simulation;
 #[cfg(test)]
@@ -80,6 +82,8 @@ pub(crate) enum Input {
     Link(LinkFact),
     /// The host of a node that missed answers was tried, as [`Output::Probe`] asked.
     Probed { node: NodeAddress, incarnation: Incarnation, host: Host },
+    /// GNCL read something of this life of a node at that time; of those [in doubt](Core::in_doubt).
+    SignSeen { node: NodeAddress, incarnation: Incarnation, at: Time },
     /// It is time for [`Core::next_wake`].
     TimePassed,
     /// The node stops in order.
@@ -113,7 +117,8 @@ pub(crate) enum Output {
         to: SocketAddr,
         node: NodeAddress,
     },
-    /// Try to connect to the host of this node, at any of these addresses of its GNCL, and tell what it said within this time.
+    /// Try to connect to the host of this node, at any of these addresses of its GNCL, and tell what it said within this time. Have its
+    /// GNCL give a sign on the connections that stand.
     Probe {
         node: NodeAddress,
         incarnation: Incarnation,
@@ -201,6 +206,8 @@ struct Member {
     address: SocketAddr,
     /// Its last sign of life.
     heard: Time,
+    /// When it asked us last, or GNCL heard of it last, as far as that was asked; or since when it has been a member.
+    sign: Time,
     /// Which of the paces it is asked at.
     pace: usize,
     /// Answers missed in a row.
@@ -226,10 +233,10 @@ struct Member {
 
 impl Member {
     /// Whether it is to be counted as lost for its silence. One with several addresses may only be out of reach at the one where it
-    /// is asked; as long as its connection stands, it is there. // spec: NDL-4.1, NDL-4.5
-    fn is_silent(&self, now: Time, missed_max: u32) -> bool {
+    /// is asked; as long as its connection stands, it is there. // spec: NDL-4.1, NDL-4.5, NDL-4.7
+    fn is_silent(&self, now: Time, pace: &Pace) -> bool {
         let has_another_way = !self.announcement.gncl_further.is_empty() && now < self.link_until;
-        self.missed >= missed_max && !has_another_way
+        self.missed >= pace.missed_max && !has_another_way && !self.has_given_a_sign(now, pace)
     }
 }
 
@@ -388,6 +395,7 @@ impl Core {
             Input::MdnsResolved { address } => self.resolved(now, address),
             Input::Link(fact) => self.linked(now, fact),
             Input::Probed { node, incarnation, host } => self.probed(node, incarnation, host),
+            Input::SignSeen { node, incarnation, at } => self.sign_seen(now, node, incarnation, at),
             Input::TimePassed => self.time_passed(now),
             Input::Stopping => self.leave(),
             Input::AppChanged(_) | Input::ProgressSeen(_) | Input::EventNotTaken { .. } => {

@@ -26,6 +26,16 @@ pub(crate) struct LostNode {
     pub(crate) why: LossReason,
     /// Time between its last sign of life and its loss.
     pub(crate) silent: Duration,
+    /// Within how much of that a loss is known.
+    pub(crate) bound: Duration,
+}
+
+/// What is told of a loss.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Loss {
+    pub(super) why: LossReason,
+    /// As in [`LostNode`].
+    pub(super) bound: Duration,
 }
 
 /// A node of another project.
@@ -47,11 +57,12 @@ pub(super) struct Recall {
 
 impl Recall {
     /// A member is gone.
-    pub(super) fn lost(&mut self, now: Time, member: &Member, sources: Vec<Source>, why: LossReason) {
+    pub(super) fn lost(&mut self, now: Time, member: &Member, sources: Vec<Source>, loss: Loss) {
         let Announcement { node, incarnation, ref name, .. } = member.announcement;
         make_room(&mut self.lost, LOST_MAX, &node, |lost| lost.lost);
         let (address, silent) = (member.address, now.since(member.heard));
-        let lost = LostNode { name: name.clone(), incarnation, address, sources, lost: now, why, silent };
+        let (name, Loss { why, bound }) = (name.clone(), loss);
+        let lost = LostNode { name, incarnation, address, sources, lost: now, why, silent, bound };
         self.lost.insert(node, lost);
     }
 

@@ -6,5 +6,6 @@ mod paces;
 mod properties;
 mod scenarios;
 mod several_addresses;
+mod signs;
 mod troubles;
 mod world;

@@ -1,11 +1,11 @@
 //! What of a member does not get on, though the member lives.
 
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, time::Duration};
 
 use sinew_runtime::tid::{AppAddress, NodeAddress, Tid};
 
 use super::Core;
-use crate::ndl::{NodeEvent, Part, Progress, datagram::Announcement};
+use crate::ndl::{NodeEvent, Part, Progress, Told, Trouble, datagram::Announcement};
 
 /// Parts of one member that are told not to get on, at most.
 const TOLD_MAX: usize = 64;
@@ -40,6 +40,33 @@ impl Troubles {
     /// In the order of their addresses.
     pub(super) fn parts(&self) -> impl Iterator<Item = &Part> {
         self.0.values()
+    }
+
+    /// Its NDL, if that is told not to be heard.
+    pub(super) fn unheard(&self) -> Option<&Part> {
+        self.0.get(&AppAddress::NDL).filter(|part| part.trouble.0 == Trouble::Unheard)
+    }
+
+    /// The member has not answered for this long, and lives. What is to be told of that, once.
+    pub(super) fn does_not_answer(&mut self, of: &Announcement, since: Duration) -> Option<NodeEvent> {
+        if self.unheard().is_some() {
+            return None;
+        }
+        let part = Part {
+            app: AppAddress::NDL,
+            name: "NDL".to_owned(),
+            trouble: Told(Trouble::Unheard),
+            since_ms: u32::try_from(since.as_millis()).unwrap_or(u32::MAX),
+        };
+        let event = stalled(of, &part);
+        self.0.insert(part.app, part);
+        Some(event)
+    }
+
+    /// The member answers. What is to be told of that.
+    pub(super) fn answers(&mut self, of: &Announcement) -> Option<NodeEvent> {
+        self.unheard()?;
+        self.0.remove(&AppAddress::NDL).map(|part| resumed(of, &part))
     }
 
     /// What has changed with `said`, the member's last word.

@@ -39,9 +39,9 @@ pub struct KnownNode {
     /// Time after its last sign of life within which its loss is known, our own stalls aside: `asked_every` times the answers that it may
     /// miss and one more.
     pub bound: Duration,
-    /// How many of its layers and applications do not get on, as it says.
+    /// How many of its layers and applications do not get on, as it says; and its NDL where that is not heard.
     pub troubled: usize,
-    /// The first of them: layers, then applications by their addresses; four at most.
+    /// The first of them: its NDL where that is not heard; then, as it says, layers, then applications by their addresses, four at most.
     pub troubles: Vec<TroubledApp>,
     /// Time of the last query and its answer on the network.
     pub round_trip: Option<Duration>,
@@ -84,8 +84,10 @@ impl Core {
             sources: self.contacts.get(&member.address).map(|c| c.sources.clone()).unwrap_or_default(),
             heard: member.heard,
             missed: member.missed,
-            troubled: member.progress.troubled as usize,
-            troubles: member.progress.parts.iter().map(|part| troubled(*node, part)).collect(),
+            troubled: member.progress.troubled as usize + usize::from(member.troubles.unheard().is_some()),
+            troubles: (member.troubles.unheard().into_iter().chain(&member.progress.parts))
+                .map(|part| troubled(*node, part))
+                .collect(),
             asked_every: self.paces[member.pace].period,
             bound: self.paces[member.pace].bound(),
             round_trip: member.clock.round_trip(),

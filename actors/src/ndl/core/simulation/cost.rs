@@ -23,6 +23,7 @@ fn crowd(nodes: usize) -> Plan {
         missed_max: 3,
         watched: None,
         finding: Finding::Group,
+        connections: false,
         quality: Quality {
             lost_per_mille: 0,
             twice_per_mille: 0,

@@ -9,7 +9,8 @@
 //! 6. A clock is as far from ours as is said, within the bound that is said.
 //! 7. A stall of one's own is reported.
 //! 8. A loss by silence is classed as what has been so for long: hung, crashed, or out of reach with its host.
-//! 9. When the network is well again, everybody knows exactly who is there.
+//! 9. No loss by silence while the connection delivers, nor for as long after that, or after a question of the other's, as answers may be missed.
+//! 10. When the network is well again, everybody knows exactly who is there.
 
 use std::{
     collections::{BTreeMap, BTreeSet, VecDeque},
@@ -51,6 +52,8 @@ struct Sight {
     answered: Time,
     /// The last sign of life that was read.
     read: Time,
+    /// The last one that was read on a connection.
+    sign: Option<Time>,
 }
 
 struct Life {
@@ -189,6 +192,13 @@ impl Judge {
         }
     }
 
+    /// Something was read on a connection, or a question to this process.
+    pub(super) fn read_a_sign(&mut self, now: Time, process: usize, of: usize) {
+        if let Some(sight) = self.lives[process].sights.get_mut(&of) {
+            (sight.read, sight.sign) = (now, Some(now));
+        }
+    }
+
     pub(super) fn heard_goodbye(&mut self, now: Time, process: usize, from: usize) {
         let Some(sight) = self.lives[process].sights.get_mut(&from) else { return };
         sight.is_over = true;
@@ -212,6 +222,7 @@ impl Judge {
             is_over: false,
             answered: now,
             read: now,
+            sign: None,
         });
         let was_member = std::mem::replace(&mut sight.is_member, true);
         let came_back = sight.is_over;
@@ -265,7 +276,19 @@ impl Judge {
                         format!("lives, did not answer {unanswered} questions, and is lost as silent");
                     self.violate(now, process, other, &words);
                 }
+                self.check_sign(now, process, other);
             }
+        }
+    }
+
+    fn check_sign(&mut self, now: Time, process: usize, other: usize) {
+        let (period, missed_max) = self.pace(other);
+        let counts = period * missed_max * (1_000 - DRIFT_PER_MILLE) / 1_000;
+        let sign = self.lives[process].sights.get(&other).and_then(|sight| sight.sign);
+        let age = sign.map(|sign| now.since(sign)).filter(|age| *age < counts);
+        if let Some(age) = age {
+            let words = format!("is lost as silent, and asked or was read of on its connection {age:?} ago");
+            self.violate(now, process, other, &words);
         }
     }
 

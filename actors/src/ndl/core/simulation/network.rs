@@ -39,11 +39,13 @@ pub(super) struct Network {
     quality: Quality,
     /// From which node to which nothing gets through.
     cut: BTreeSet<(usize, usize)>,
+    /// From which to which no datagram does.
+    muffled: BTreeSet<(usize, usize)>,
 }
 
 impl Network {
     pub(super) const fn new(quality: Quality) -> Self {
-        Self { quality, cut: BTreeSet::new() }
+        Self { quality, cut: BTreeSet::new(), muffled: BTreeSet::new() }
     }
 
     pub(super) fn cut(&mut self, from: usize, to: usize) {
@@ -54,8 +56,17 @@ impl Network {
         self.cut.remove(&(from, to));
     }
 
+    pub(super) fn muffle(&mut self, from: usize, to: usize) {
+        self.muffled.insert((from, to));
+    }
+
+    pub(super) fn unmuffle(&mut self, from: usize, to: usize) {
+        self.muffled.remove(&(from, to));
+    }
+
     pub(super) fn heal(&mut self) {
         self.cut.clear();
+        self.muffled.clear();
         self.quality = HEALED;
     }
 
@@ -66,7 +77,8 @@ impl Network {
     /// After which times a datagram arrives: not at all, once, or twice.
     pub(super) fn delays(&self, chance: &mut Chance, from: usize, to: usize) -> Vec<Duration> {
         let quality = self.quality;
-        if self.is_cut(from, to) || chance.happens(quality.lost_per_mille) {
+        let is_stopped = self.is_cut(from, to) || self.muffled.contains(&(from, to));
+        if is_stopped || chance.happens(quality.lost_per_mille) {
             return Vec::new();
         }
         let copies = if chance.happens(quality.twice_per_mille) { 2 } else { 1 };

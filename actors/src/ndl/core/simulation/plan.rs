@@ -35,13 +35,41 @@ pub(super) struct Clock {
 /// Something that happens; nodes are counted from 0.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Happening {
-    Start { node: usize, elsewhere: bool },
-    Kill { node: usize, refuses: bool },
-    Leave { node: usize },
-    RestartShell { node: usize },
-    Stall { node: usize, lasts: Duration },
-    Cut { from: usize, to: usize },
-    Mend { from: usize, to: usize },
+    Start {
+        node: usize,
+        elsewhere: bool,
+    },
+    Kill {
+        node: usize,
+        refuses: bool,
+    },
+    Leave {
+        node: usize,
+    },
+    RestartShell {
+        node: usize,
+    },
+    Stall {
+        node: usize,
+        lasts: Duration,
+    },
+    Cut {
+        from: usize,
+        to: usize,
+    },
+    Mend {
+        from: usize,
+        to: usize,
+    },
+    /// Datagrams are lost from one to the other, and nothing else.
+    Muffle {
+        from: usize,
+        to: usize,
+    },
+    Unmuffle {
+        from: usize,
+        to: usize,
+    },
     Heal,
 }
 
@@ -55,6 +83,8 @@ pub(super) struct Plan {
     /// A node that all others watch at another pace, and that.
     pub(super) watched: Option<(usize, Duration, u32)>,
     pub(super) finding: Finding,
+    /// Whether GNCL's connections deliver where the network is not cut.
+    pub(super) connections: bool,
     pub(super) quality: Quality,
     /// How late a timer wakes a node that is not stalled, at most.
     pub(super) lateness: Duration,
@@ -78,6 +108,7 @@ impl Plan {
             missed_max,
             watched: None,
             finding,
+            connections: false,
             quality: quality(&mut chance, period),
             lateness: chance.of(&[Duration::ZERO, period / 50, period / 4]),
             clocks: (0..nodes).map(|_| clock(&mut chance)).collect(),
@@ -90,6 +121,7 @@ impl Plan {
         for _ in 0..chance.below(7) {
             plan.fault(&mut chance, heals);
         }
+        plan.connect(&mut chance, heals);
         plan.happenings.push((heals, Happening::Heal));
         plan.happenings.sort_by_key(|(at, _)| *at);
         // An address where nobody answered is asked every 16 periods at last.
@@ -106,6 +138,24 @@ impl Plan {
         let pace = chance.of(&[self.period / 5, self.period / 2, self.period * 3]);
         self.watched = Some((chance.index(self.nodes), pace, chance.of(&[2, 3, 5])));
         self.lateness = self.lateness.min(pace / 4);
+    }
+
+    /// Connections deliver, in most plans; in some of these datagrams do not, between some nodes, one way or both.
+    fn connect(&mut self, chance: &mut Chance, heals: Duration) {
+        self.connections = chance.happens(700);
+        if !self.connections {
+            return;
+        }
+        for _ in 0..chance.below(3) {
+            let (from, to) = (chance.index(self.nodes), chance.index(self.nodes));
+            let begins = chance.between(self.period, heals);
+            let ends = (begins + chance.between(self.period * 3, self.period * 12)).min(heals);
+            let ways = if chance.happens(500) { &[(from, to)][..] } else { &[(from, to), (to, from)] };
+            for (from, to) in ways.iter().copied() {
+                self.happenings.push((begins, Happening::Muffle { from, to }));
+                self.happenings.push((ends, Happening::Unmuffle { from, to }));
+            }
+        }
     }
 
     fn starts(&mut self, chance: &mut Chance) {

@@ -34,6 +34,10 @@ pub(super) enum Fault {
     LosesLate,
     /// What a host says of a silent node is not heard.
     IgnoresHosts,
+    /// What GNCL hears is not heard.
+    IgnoresSigns,
+    /// What GNCL heard once counts for ever.
+    TakesOldSignsForNew,
     /// Groups of the configuration are watched like everybody.
     HasOnePaceForAll,
     /// Who is lost is never asked again.
@@ -45,7 +49,7 @@ pub(super) enum Fault {
 }
 
 impl Fault {
-    pub(super) const ALL: [Self; 13] = [
+    pub(super) const ALL: [Self; 15] = [
         Self::ForgetsAnAnswer,
         Self::CountsItsOwnStall,
         Self::IgnoresIncarnation,
@@ -56,6 +60,8 @@ impl Fault {
         Self::LosesLate,
         Self::HasOnePaceForAll,
         Self::IgnoresHosts,
+        Self::IgnoresSigns,
+        Self::TakesOldSignsForNew,
         Self::ForgetsTheFormer,
         Self::BoastsOfItsClock,
         Self::KeepsALossToItself,
@@ -86,10 +92,11 @@ impl Patient {
             Some(Fault::TakesLateAnswers) => self.ask_again(now, flying),
             Some(_) | None => {}
         }
-        let missed: BTreeMap<_, _> =
-            self.core.members.iter().map(|(node, member)| (*node, member.missed)).collect();
+        // Only then: the cost of a core is measured here, and must not grow with what a fault needs.
+        let missed: Option<BTreeMap<_, _>> = (self.fault == Some(Fault::ForgetsAnAnswer))
+            .then(|| self.core.members.iter().map(|(node, member)| (*node, member.missed)).collect());
         self.core.receive(now, flying.from, flying.way, &flying.bytes);
-        if self.fault == Some(Fault::ForgetsAnAnswer) {
+        if let Some(missed) = missed {
             for (node, member) in &mut self.core.members {
                 member.missed = missed.get(node).copied().unwrap_or(0);
             }
@@ -97,9 +104,15 @@ impl Patient {
     }
 
     pub(super) fn told(&mut self, now: Time, input: Input) {
-        if self.fault != Some(Fault::IgnoresHosts) || !matches!(input, Input::Probed { .. }) {
-            self.core.handle(now, input);
-        }
+        let input = match (self.fault, input) {
+            (Some(Fault::IgnoresHosts), Input::Probed { .. })
+            | (Some(Fault::IgnoresSigns), Input::SignSeen { .. }) => return,
+            (Some(Fault::TakesOldSignsForNew), Input::SignSeen { node, incarnation, .. }) => {
+                Input::SignSeen { node, incarnation, at: now }
+            }
+            (_, input) => input,
+        };
+        self.core.handle(now, input);
     }
 
     fn make_way_for_former_life(&mut self, now: Time, flying: &Flying) {

@@ -61,6 +61,7 @@ pub(super) struct Seen {
     pub(super) left: u64,
     pub(super) restarted: u64,
     pub(super) stalls: u64,
+    pub(super) signs: u64,
 }
 
 impl Seen {
@@ -74,13 +75,17 @@ impl Seen {
         self.left += other.left;
         self.restarted += other.restarted;
         self.stalls += other.stalls;
+        self.signs += other.signs;
     }
 
     pub(super) fn must_cover_everything(&self, seeds: u64) {
-        let Self { datagrams, dropped, found, crashed, hung, link_down, left, restarted, stalls } = *self;
-        let rarest =
-            [datagrams, dropped, found, crashed, hung, link_down, left, restarted, stalls].into_iter().min();
-        assert!(rarest.is_some_and(|count| count >= seeds / 20), "something was hardly tried: {self:?}");
+        let Self { datagrams, dropped, found, crashed, hung, link_down, left, restarted, stalls, signs } =
+            *self;
+        let all = [datagrams, dropped, found, crashed, hung, link_down, left, restarted, stalls, signs];
+        assert!(
+            all.into_iter().min().is_some_and(|count| count >= seeds / 20),
+            "something was hardly tried: {self:?}"
+        );
     }
 }
 
@@ -89,6 +94,8 @@ enum Event {
     Wake(usize),
     Resume(usize),
     Tell(usize, Input),
+    /// What GNCL reads of the second process is a sign of it for the first.
+    Sign(usize, usize),
     Happen(Happening),
 }
 
@@ -126,6 +133,8 @@ pub(super) struct World {
     at: BTreeMap<SocketAddr, usize>,
     /// Hosts that went with their node: nobody answers there until it starts again.
     dead_hosts: BTreeSet<usize>,
+    /// When a process's GNCL read of another one last, in that process's clock.
+    signs: BTreeMap<(usize, usize), Time>,
     /// When what two nodes are to each other last changed: the way between them, and the life of either.
     changed: BTreeMap<(usize, usize), Time>,
     seen: Seen,
@@ -157,6 +166,7 @@ impl World {
             current: BTreeMap::new(),
             at: BTreeMap::new(),
             dead_hosts: BTreeSet::new(),
+            signs: BTreeMap::new(),
             changed: BTreeMap::new(),
             seen: Seen::default(),
             digest: DefaultHasher::new(),
@@ -226,6 +236,7 @@ impl World {
             Event::Wake(process) => self.wake(process),
             Event::Resume(process) => self.resume(process),
             Event::Tell(process, input) => self.tell(process, input),
+            Event::Sign(process, of) => self.read_a_sign(process, of),
             Event::Happen(what) => self.strike(what),
         }
     }
@@ -243,7 +254,11 @@ impl World {
 
     fn look_at_timer(&mut self, process: usize) {
         self.processes[process].wake = None;
-        self.with(process, Patient::time_passed);
+        let signs = self.signs_in_doubt(process);
+        self.with(process, |patient, now| {
+            signs.into_iter().for_each(|sign| patient.told(now, sign));
+            patient.time_passed(now);
+        });
     }
 
     /// A process goes on after a stall: its timer and its socket are ready, and either may be first.
@@ -294,6 +309,9 @@ impl World {
     fn read(&mut self, process: usize, flying: &Flying) {
         if let What::Answer(_) = flying.what {
             self.judge.read(self.now, process, flying.sender);
+        }
+        if flying.what == What::Query && flying.way == Way::Unicast {
+            self.judge.read_a_sign(self.now, process, flying.sender);
         }
         self.with(process, |patient, now| patient.receive(now, flying));
         if flying.what == What::Leave {

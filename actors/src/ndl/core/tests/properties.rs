@@ -50,6 +50,7 @@ fn any_input() -> impl Strategy<Value = (u64, Input)> {
                 4 => Input::MdnsResolved { address: from },
                 5 if flag => Input::Link(LinkFact::LinkBroken { node, incarnation }),
                 5 => Input::Link(LinkFact::DialRefused { node, incarnation }),
+                6 if flag => Input::SignSeen { node, incarnation, at: Time::from_nanos(1) },
                 _ => Input::TimePassed,
             }
         });

@@ -19,6 +19,8 @@ impl World {
                 self.network.mend(from, to);
                 self.change(from, to);
             }
+            Happening::Muffle { from, to } => self.network.muffle(from, to),
+            Happening::Unmuffle { from, to } => self.network.unmuffle(from, to),
             Happening::Heal => self.heal(),
         }
     }
@@ -57,6 +59,62 @@ impl World {
         let is_new =
             changed.is_some_and(|at| *at + period * 2 + self.plan.lateness * 2 + WORD_MAX > self.now);
         (!was_stalled && !is_new).then(|| self.host_of(process, node))
+    }
+
+    /// Has the other's GNCL give a sign within this time, if the connection delivers.
+    pub(super) fn ask_for_a_sign(&mut self, process: usize, node: NodeAddress, within: Duration) {
+        let other = self.current.values().copied().find(|other| self.is_of(*other, node));
+        let Some(other) = other.filter(|other| !self.is_stalled(*other)) else { return };
+        let is_up =
+            self.plan.connections && self.host_of(process, self.processes[other].node) == Host::Accepts;
+        if is_up {
+            let at = self.now + self.chance.between(Duration::ZERO, within);
+            self.push(at, Event::Sign(process, other));
+        }
+    }
+
+    pub(super) fn read_a_sign(&mut self, process: usize, of: usize) {
+        if self.is_stalled(process) {
+            let until = self.processes[process].stalled_until;
+            self.push(until, Event::Sign(process, of));
+        } else if self.processes[process].is_alive {
+            self.trace(|| format!("{process} reads of {of} on their connection"));
+            self.signs.insert((process, of), self.local(process));
+            self.judge.read_a_sign(self.now, process, of);
+            self.seen.signs += 1;
+        }
+    }
+
+    /// What GNCL knows of those that a process is about to lose.
+    pub(super) fn signs_in_doubt(&self, process: usize) -> Vec<Input> {
+        let sign = |(node, incarnation)| {
+            let is_it = |of: &usize| {
+                let announcement = self.processes[*of].patient.core.announcement();
+                (announcement.node, announcement.incarnation) == (node, incarnation)
+            };
+            let of = (0..self.processes.len()).rev().find(is_it)?;
+            let at = *self.signs.get(&(process, of))?;
+            Some(Input::SignSeen { node, incarnation, at })
+        };
+        self.processes[process].patient.core.in_doubt().into_iter().filter_map(sign).collect()
+    }
+
+    /// Whether the connection with this life of a node has delivered for so long that a sign must be known.
+    pub(super) fn has_delivered(
+        &self,
+        process: usize,
+        (node, incarnation): (NodeAddress, Incarnation),
+    ) -> bool {
+        let Some(other) = self.current.values().copied().find(|other| self.is_of(*other, node)) else {
+            return false;
+        };
+        let Process { node: index, stalled_until, ref patient, .. } = self.processes[other];
+        let runs = stalled_until + (self.plan.period + self.plan.lateness) * 4 <= self.now;
+        let is_that_life = patient.core.announcement().incarnation == incarnation;
+        self.plan.connections
+            && is_that_life
+            && runs
+            && self.settled_host_of(process, index) == Some(Host::Accepts)
     }
 
     fn config(&self, node: usize) -> NodeConfig {

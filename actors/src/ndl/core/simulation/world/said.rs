@@ -37,6 +37,7 @@ impl World {
                 };
                 let host = self.host_of(from, index);
                 let takes = if host == Host::IsSilent { within } else { WORD_MAX.min(within / 2) };
+                self.ask_for_a_sign(from, node, WORD_MAX.min(within / 2));
                 let at = self.now + self.chance.between(Duration::ZERO, takes);
                 self.push(at, Event::Tell(from, Input::Probed { node, incarnation, host }));
             }
@@ -60,7 +61,7 @@ impl World {
         }
     }
 
-    fn is_of(&self, process: usize, node: NodeAddress) -> bool {
+    pub(super) fn is_of(&self, process: usize, node: NodeAddress) -> bool {
         node_address(self.processes[process].node) == node
     }
 
@@ -90,6 +91,12 @@ impl World {
                     }
                 }
                 self.judge.lost(self.now, process, (node, incarnation), why);
+                if matches!(why, Hung | LinkDown) && self.has_delivered(process, (node, incarnation)) {
+                    self.judge.violations.push(format!(
+                        "{:?}: {process} says {fact:?}, and the connection with it delivers",
+                        self.now
+                    ));
+                }
                 let index = (0..self.plan.nodes).find(|index| node_address(*index) == node);
                 let host = index.and_then(|index| self.settled_host_of(process, index));
                 self.judge.check_class(self.now, process, (node, incarnation), (why, host));

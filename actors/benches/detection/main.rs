@@ -1,0 +1,159 @@
+//! How soon a node learns that another one is gone, and why; and that it learns of none that is not.
+//!
+//! `cargo bench -p sinew --bench detection [-- [--short] [--seed=N] WORD...]` runs the cases whose name holds every WORD. Two hosts made of
+//! network namespaces (needs root and `ip`; says why and skips what is not possible), on each a node in a process of its own: one to which
+//! things happen, and one that watches it. JSON lines are on the standard output, a table on the standard error. Times are microseconds, from
+//! the act, as told by the process that does it, until the observer's application has the event. At which moment of the period an act comes is
+//! decided by the seed (1 if none is given). `--short` does a tenth of the 50 trials. Nothing here asserts a time.
+//!
+//! `WAY-SETTING`, where the settings are nodes that ask each other every 500 ms, every 50 ms, and every 500 ms but a group of `ndl.watch`
+//! every 10 ms (`leg_10ms`); and the ways to go are
+//!
+//! - `kill`: `kill -9`. `leave`: SIGTERM, on which the node stops in order.
+//! - `stop`: SIGSTOP.
+//! - `link_down`: the other end of its interface goes down. `silent_cut`: the network swallows its packets, and all interfaces stay up.
+//! - `stall_busy`, `stall_asleep`: its application's handler keeps its CPU, or sleeps, for longer than it takes to tell; the node lives.
+//! - `restart`: `kill -9`, and started again as soon as the process has ended; `restart_same_ports`: with UDP and TCP ports that are configured.
+//!   `act to new life` is the time to `NodeRestarted`.
+//!
+//! Beside the times stand how many of the trials told the right reason first (`right`; of a restart the end or the new life), the bound of the
+//! settings (`bound_us`: for a stall 250 ms, one look at the node's progress, and one period), in how many trials a loss says of itself that
+//! the silence was within its own bound (`held`), in how many the application had the event within it (`in_time`, from the end of the act:
+//! NDL may have a real-time priority, the application has none), by how much either was missed at worst (`over_us`), events that belong to
+//! no act (`surprises`), and how often the observer said of itself that it was starved (`own_stalls`). Each trial that told a wrong reason,
+//! and each that was later than all before it, is told in words.
+//!
+//! `spin-SETTING`, only where `spin` is asked for: four nodes, and eight processes for each CPU that spin at ordinary priority, for 10 minutes
+//! (`--short`: 20 s); and the same where the nodes have no right to real-time priority (`spin_plain`). `lost` are losses told, none of which is
+//! true: with one, the exit code is 1. The times are each second's longest silence of each node at each other one, as the watching node
+//! knows it; without privileges the nodes share this host's loopback interface.
+
+mod observer;
+mod setting;
+mod spin;
+mod starved;
+mod subject;
+mod trials;
+mod way;
+
+#[path = "../gncl/nodes.rs"]
+mod nodes;
+
+use std::process::ExitCode;
+
+use sinew_figures::process;
+
+use crate::{
+    nodes::At,
+    setting::Setting,
+    spin::Rights,
+    trials::Plan,
+    way::{Ports, Way},
+};
+
+/// What all chance comes from, unless another seed is given.
+const SEED: u64 = 1;
+/// Trials of each case.
+const TRIALS: u32 = 50;
+/// How long nodes are watched while others spin.
+const SPIN_SECONDS: u64 = 600;
+
+/// What is measured.
+#[derive(Clone, Copy, Debug)]
+enum Case {
+    Gone(Way, Setting),
+    Spin(Rights, Setting),
+}
+
+impl Case {
+    fn all() -> Vec<Self> {
+        let gone = Setting::ALL.iter().flat_map(|setting| Way::ALL.map(|way| Self::Gone(way, *setting)));
+        let spin = [Setting::Relaxed, Setting::Brisk]
+            .into_iter()
+            .flat_map(|setting| Rights::ALL.map(|rights| Self::Spin(rights, setting)));
+        gone.chain(spin).collect()
+    }
+
+    fn name(self) -> String {
+        match self {
+            Self::Gone(way, setting) => format!("{}-{}", way.name(), setting.name()),
+            Self::Spin(rights, setting) => format!("{}-{}", rights.name(), setting.name()),
+        }
+    }
+
+    fn is_wanted(self, words: &[String]) -> bool {
+        let name = self.name();
+        let is_named = match self {
+            Self::Gone(..) => true,
+            Self::Spin(..) => words.iter().any(|word| word.contains("spin")),
+        };
+        is_named && words.iter().all(|word| name.contains(word.as_str()))
+    }
+
+    /// Runs it in a process of its own. Returns whether that went well.
+    fn run(self, is_short: bool, seed: u64) -> bool {
+        let worked =
+            process::has_run(process::command(&format!("measure {is_short} {seed} {}", self.name())));
+        if !worked {
+            eprintln!("{}: failed", self.name());
+        }
+        worked
+    }
+
+    /// Returns whether that went well.
+    fn measure(self, is_short: bool, seed: u64) -> bool {
+        let (name, part) = (self.name(), if is_short { 10 } else { 1 });
+        match self {
+            Self::Gone(way, setting) => {
+                trials::measure(&name, Plan { way, setting, trials: TRIALS / part, seed })
+            }
+            Self::Spin(rights, setting) => {
+                let seconds = if is_short { 20 } else { SPIN_SECONDS };
+                spin::measure(&name, rights, setting, seconds)
+            }
+        }
+    }
+}
+
+fn main() -> ExitCode {
+    if let Some(role) = process::role() {
+        return play(&role);
+    }
+    sinew_figures::head();
+    let (options, words): (Vec<_>, Vec<_>) = std::env::args().skip(1).partition(|arg| arg.starts_with('-'));
+    let is_short = options.iter().any(|option| option == "--short");
+    let seed = options.iter().find_map(|option| option.strip_prefix("--seed=")?.parse().ok()).unwrap_or(SEED);
+    let wanted = Case::all().into_iter().filter(|case| case.is_wanted(&words));
+    let failed = wanted.filter(|case| !case.run(is_short, seed)).count();
+    if failed == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+}
+
+/// Plays the part that another process of this program gave this one.
+fn play(role: &str) -> ExitCode {
+    let words: Vec<&str> = role.split(' ').collect();
+    match words[..] {
+        ["measure", is_short, seed, name] => {
+            let case = Case::all().into_iter().find(|case| case.name() == name);
+            let case = case.expect("a name that this program wrote itself");
+            if !case.measure(is_short == "true", number(seed)) {
+                return ExitCode::FAILURE;
+            }
+        }
+        ["subject", ports, setting, at] => {
+            return subject::run(Ports::named(ports), Setting::named(setting), At::read(at));
+        }
+        ["member", rights, setting, seconds, at] => {
+            spin::member(Rights::named(rights), Setting::named(setting), number(seconds), At::read(at));
+        }
+        ["spinner"] => spin::spinner(),
+        _ => {
+            eprintln!("no such role: {role}");
+            return ExitCode::FAILURE;
+        }
+    }
+    ExitCode::SUCCESS
+}
+
+fn number(word: &str) -> u64 {
+    word.parse().expect("a number that this program wrote itself")
+}

@@ -1,0 +1,61 @@
+//! A member that does not answer, and of which GNCL hears: it lives, and either its NDL hangs or datagrams do not get through.
+
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
+
+use super::{Core, Host, Member, pace::Pace};
+
+/// Times the answers that a member may miss: after so many it is told that its NDL is not heard. Where one datagram in
+/// twenty is lost and the period is 30 ms, that is by chance twice a day; as many as may be missed would be twice a minute.
+const UNHEARD: u32 = 2;
+
+impl Member {
+    /// Whether GNCL heard of it as lately as a member has to be heard of. What is read of a process that has ended is what was under way,
+    /// and no sign. // spec: NDL-4.7
+    pub(super) fn has_given_a_sign(&self, now: Time, pace: &Pace) -> bool {
+        self.host != Some(Host::Refuses) && now.since(self.sign) < pace.period * pace.missed_max
+    }
+}
+
+impl Core {
+    /// Members that are lost when the next missed answer is counted, unless GNCL has heard of them: that is to be
+    /// [said](super::Input::SignSeen) before it is.
+    pub(crate) fn in_doubt(&self) -> Vec<(NodeAddress, Incarnation)> {
+        let is_in_doubt = |member: &&Member| {
+            member.missed + u32::from(member.is_awaited) >= self.paces[member.pace].missed_max
+        };
+        let members = self.members.values().filter(is_in_doubt);
+        members.map(|member| (member.announcement.node, member.announcement.incarnation)).collect()
+    }
+
+    pub(super) fn sign_seen(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation, at: Time) {
+        if let Some(member) = self.members.get_mut(&node)
+            && member.announcement.incarnation == incarnation
+        {
+            member.sign = member.sign.max(at.min(now));
+            member.heard = member.heard.max(member.sign);
+        }
+    }
+
+    /// Whoever lives and does not answer: applications are told that its NDL does not get on. // spec: NDL-4.7
+    pub(super) fn tell_who_does_not_answer(&mut self, at: usize) {
+        let Pace { period, missed_max, .. } = self.paces[at];
+        let is_unheard = |member: &&mut Member| member.pace == at && member.missed >= UNHEARD * missed_max;
+        let members = self.members.values_mut().filter(is_unheard);
+        let told = members.filter_map(|member| {
+            let since = period * member.missed;
+            member.troubles.does_not_answer(&member.announcement, since)
+        });
+        let told: Vec<_> = told.collect();
+        told.iter().for_each(|event| self.publish(event));
+    }
+
+    pub(super) fn answers_again(&mut self, node: NodeAddress) {
+        let Some(member) = self.members.get_mut(&node) else { return };
+        if let Some(event) = member.troubles.answers(&member.announcement) {
+            self.publish(&event);
+        }
+    }
+}
