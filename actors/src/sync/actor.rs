@@ -328,7 +328,10 @@ impl SyncManager {
         self.stamp(&mut header);
         if let Err(why) = self.stores.router.send(Message::new(header, said)) {
             self.refuse("peer", &format_args!("{to} was not told who waits at barriers, tried again: {why}"));
-            self.core().handle(Time::now(), Input::ArrivalsNotTaken { to });
+            // One that takes shorter words than this node writes is not helped by haste.
+            if why != Rejection::TooLong {
+                self.core().handle(Time::now(), Input::ArrivalsNotTaken { to });
+            }
         }
     }
 

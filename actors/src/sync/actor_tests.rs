@@ -22,7 +22,7 @@ use sinew_runtime::{
 use super::{
     Event, SyncManager,
     list::{Entry, List, Name},
-    words::{ArriveAtBarrier, BarrierAnswer, OnPartyLoss},
+    words::{ArriveAtBarrier, BarrierAnswer, BarrierKind, OnPartyLoss},
 };
 use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, node::RootEvent, stores::Stores};
 
@@ -83,7 +83,15 @@ impl Bench {
     /// As GNCL hands over what the knee sent.
     fn knee_says(&self, version: u64, ready: bool) {
         let name = Name::try_from("knee.drive".to_owned()).unwrap();
-        let entry = Entry { name, app: GAIT, ready, ended: None, requires: Vec::new(), kinds: Vec::new() };
+        let entry = Entry {
+            name,
+            app: GAIT,
+            ready,
+            ended: None,
+            phases: Vec::new(),
+            requires: Vec::new(),
+            kinds: Vec::new(),
+        };
         let list = List { incarnation: LIFE, version, entries: vec![entry], groups: Vec::new() };
         let from = Tid::new(KNEE, AppAddress::SYNC);
         self.stores.router.deliver(directory(from, list.encode(usize::MAX).0)).unwrap();
@@ -174,6 +182,7 @@ fn an_answer_about_a_barrier_that_a_full_mailbox_did_not_take_comes_when_there_i
         bench.registers_gait();
         mailbox.post(directory(Tid::NONE, Bytes::new())).unwrap();
         let asked = ArriveAtBarrier {
+            kind: BarrierKind::Meeting,
             barrier: "calibrated".to_owned(),
             parties: vec!["gait".to_owned(), "knee".to_owned()],
             within_ms: 0,

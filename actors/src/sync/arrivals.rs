@@ -47,6 +47,13 @@ pub(crate) struct BarrierSaid {
     /// Who passed it then.
     #[serde(default, deserialize_with = "at_most::<_, _, ARRIVALS_MAX>")]
     pub(crate) members: Vec<Member>,
+    /// Who passed an earlier one, and whose node may not know it yet.
+    #[serde(
+        default,
+        skip_serializing_if = "Vec::is_empty",
+        deserialize_with = "at_most::<_, _, ARRIVALS_MAX>"
+    )]
+    pub(crate) earlier: Vec<Passed>,
     /// Who waits there on this node.
     #[serde(default, deserialize_with = "at_most::<_, _, ARRIVALS_MAX>")]
     pub(crate) arrivals: Vec<Arrival>,
@@ -61,6 +68,26 @@ pub(crate) struct Member {
     pub(crate) incarnation: Incarnation,
     /// Which of the lives that have arrived somewhere in it.
     pub(crate) party: u64,
+}
+
+/// One life of an application has passed a barrier.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Passed {
+    node: NodeAddress,
+    incarnation: Incarnation,
+    party: u64,
+    /// Which generation, last.
+    pub(crate) generation: u64,
+}
+
+impl Passed {
+    pub(crate) const fn new(Member { node, incarnation, party }: Member, generation: u64) -> Self {
+        Self { node, incarnation, party, generation }
+    }
+
+    pub(crate) const fn member(&self) -> Member {
+        Member { node: self.node, incarnation: self.incarnation, party: self.party }
+    }
 }
 
 /// Somebody waits.
@@ -118,6 +145,8 @@ impl BarrierSaid {
             Some(why)
         } else if self.generation > GENERATION_MAX {
             Some("its generation is beyond 2^53")
+        } else if !self.earlier.iter().all(|passed| (1..self.generation).contains(&passed.generation)) {
+            Some("somebody has passed a generation earlier than the last that is none")
         } else if arrivals.clone().any(|arrival| arrival.after > self.generation) {
             Some("somebody waits behind a generation that its node does not know")
         } else if arrivals.any(|arrival| !parties.insert(arrival.party)) {
@@ -134,6 +163,8 @@ pub(crate) fn fault_of_parties(parties: &[Requirement]) -> Option<&'static str> 
         Some("it has no parties; name who has to be there, or `3 of *` for any three")
     } else if parties.iter().any(|party| party.wait_max().is_some()) {
         Some("a party of a barrier has no wait limit: whoever waits has one for all")
+    } else if parties.iter().any(|party| party.phase().is_some()) {
+        Some("a party of a barrier is in no phase: whoever arrives is there")
     } else if parties.iter().map(Requirement::count).sum::<usize>() > ARRIVALS_MAX {
         Some(
             "its parties are more than 1,024 applications together, which is the limit; use several barriers",
@@ -149,12 +180,17 @@ mod tests {
 
     use super::*;
 
+    fn passed(generation: u64) -> Passed {
+        Passed::new(Member { node: NodeAddress::new(1), incarnation: Incarnation(2), party: 4 }, generation)
+    }
+
     fn said(change: impl FnOnce(&mut BarrierSaid)) -> Vec<u8> {
         let mut barrier = BarrierSaid {
             name: Name::try_from("calibrated".to_owned()).unwrap(),
             parties: vec![Requirement::name("hip"), Requirement::at_least(2, ["*.drive"])],
             generation: 3,
             members: vec![Member { node: NodeAddress::new(1), incarnation: Incarnation(2), party: 3 }],
+            earlier: vec![passed(2)],
             arrivals: vec![Arrival { party: 1, app: AppAddress::new(0x1000), name: None, after: 3 }],
         };
         change(&mut barrier);
@@ -174,13 +210,17 @@ mod tests {
 
     #[test]
     fn what_no_node_can_mean_is_refused() {
-        let wrong: [fn(&mut BarrierSaid); 7] = [
+        let wrong: [fn(&mut BarrierSaid); 11] = [
             |barrier| barrier.parties.clear(),
             |barrier| barrier.parties.push("camera ?1s".parse().unwrap()),
             |barrier| barrier.parties.push(Requirement::at_least(ARRIVALS_MAX - 2, ["*"])),
+            |barrier| barrier.parties.push("camera at homed".parse().unwrap()),
             |barrier| barrier.generation = u64::MAX,
             |barrier| barrier.generation = 2,
             |barrier| barrier.arrivals.push(barrier.arrivals[0].clone()),
+            |barrier| barrier.earlier = vec![passed(0)],
+            |barrier| barrier.earlier = vec![passed(3)],
+            |barrier| barrier.earlier = vec![passed(1); ARRIVALS_MAX + 1],
             |barrier| barrier.members = vec![barrier.members[0]; ARRIVALS_MAX + 1],
         ];
         for change in wrong {

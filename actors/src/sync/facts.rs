@@ -75,7 +75,7 @@ pub(crate) struct OwnApp {
     pub(crate) ready: bool,
     /// What it lacks of what it requires, and why.
     pub(crate) missing: Vec<(String, &'static str)>,
-    /// How long it has waited at the barrier, if it waits there.
+    /// How long it has waited at the start-up barrier or at a phase, if it waits there.
     pub(crate) waits: Option<Duration>,
     /// How its former life ended, while this one is not ready.
     pub(crate) ended: Option<&'static str>,

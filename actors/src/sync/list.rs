@@ -21,8 +21,12 @@ pub(crate) const ENTRIES_MAX: usize = 1_024;
 pub(crate) const GROUPS_MAX: usize = 1_024;
 /// Requirements of one application at most, as far as a list says.
 pub(crate) const REQUIRES_MAX: usize = 64;
+/// Phases that one application has reached at most.
+pub(crate) const PHASES_MAX: usize = 16;
 /// Kinds of payloads that one application handles at most, as far as a list says.
 pub(crate) const KINDS_MAX: usize = 64;
+/// Bytes of a group in a list.
+const GROUP_BYTES: usize = 5;
 /// Longest name in bytes.
 pub(crate) const NAME_BYTES_MAX: usize = 63;
 
@@ -53,6 +57,13 @@ pub(crate) struct Entry {
     /// How its former life ended, while it is not ready again.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) ended: Option<Ended>,
+    /// The phases that it has reached in its present life.
+    #[serde(
+        default,
+        skip_serializing_if = "Vec::is_empty",
+        deserialize_with = "at_most::<_, _, PHASES_MAX>"
+    )]
+    pub(crate) phases: Vec<Name>,
     /// What it requires, so that every node can see a cycle.
     #[serde(default, deserialize_with = "at_most::<_, _, REQUIRES_MAX>")]
     pub(crate) requires: Vec<Requirement>,
@@ -151,18 +162,23 @@ impl List {
         Ok(list)
     }
 
-    /// The bytes of this list, at most `bytes_max`: entries that do not fit are left out, last ones first. Returns how
-    /// many were.
+    /// The bytes of this list, at most `bytes_max` (of an empty one 64): entries that do not fit are left out, last ones first, then
+    /// groups. Returns how many were.
     pub(crate) fn encode(mut self, bytes_max: usize) -> (Bytes, usize) {
-        let whole = self.entries.len();
+        let whole = self.entries.len() + self.groups.len();
         self.groups.truncate(GROUPS_MAX);
         self.entries.truncate(ENTRIES_MAX);
         loop {
             let bytes = encode(&self);
-            if bytes.len() <= bytes_max || self.entries.is_empty() {
-                return (bytes.into(), whole - self.entries.len());
+            if bytes.len() <= bytes_max || (self.entries.is_empty() && self.groups.is_empty()) {
+                return (bytes.into(), whole - self.entries.len() - self.groups.len());
             }
-            self.drop_entries_worth(bytes.len() - bytes_max);
+            let excess = bytes.len() - bytes_max;
+            if self.entries.is_empty() {
+                self.groups.truncate(self.groups.len().saturating_sub(excess.div_ceil(GROUP_BYTES)));
+            } else {
+                self.drop_entries_worth(excess);
+            }
         }
     }
 
@@ -227,6 +243,7 @@ mod tests {
             app: AppAddress::fixed(index).unwrap(),
             ready: true,
             ended: None,
+            phases: Vec::new(),
             requires: Vec::new(),
             kinds: Vec::new(),
         }
@@ -253,6 +270,7 @@ mod tests {
                     app: AppAddress::fixed(n).unwrap(),
                     ready,
                     ended: (!ready).then_some(Ended::Failed),
+                    phases: if ready { vec![name("homed")] } else { Vec::new() },
                     requires: requires.iter().map(|text| text.parse().unwrap()).collect(),
                     kinds: vec![Kind::named("demo.angle")],
                 })
@@ -344,5 +362,15 @@ mod tests {
         assert!(bytes.len() <= 1_000 && bytes.len() > 900, "{}", bytes.len());
         assert_eq!(read.entries.len() + left_out, 100);
         assert_eq!(list(many(2_000)).encode(usize::MAX).1, 2_000 - ENTRIES_MAX);
+    }
+
+    #[test]
+    fn groups_that_do_not_fit_are_left_out_too() {
+        let groups = (0..100).map(|n| AppAddress::group(&n.to_string())).collect();
+        let (bytes, left_out) = List { groups, ..list(many(10)) }.encode(200);
+        let read = List::parse(&bytes).unwrap();
+        assert!(bytes.len() <= 200 && bytes.len() > 190, "{}", bytes.len());
+        assert_eq!((read.entries.len(), read.groups.len() + left_out), (0, 110));
+        assert!(list(Vec::new()).encode(64).0.len() <= 64);
     }
 }

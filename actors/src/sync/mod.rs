@@ -20,6 +20,7 @@
 //! | SYNC-12 | Who hears of a generation that is higher than the known one takes it over, with its members; of the same one the members are put together. Whoever waits behind an earlier one passes if it is a member, and waits for the next one if not. |
 //! | SYNC-13 | A named party that is missing and has failed, was stopped, or whose node is lost, for 50 ms, ends the wait of those who do not want to wait for it. |
 //! | SYNC-14 | An application that subscribed to it is told of every entry of the directory when it is ready, then of each change, until its life ends. What its mailbox does not take is told 10 ms later, as it is then. |
+//! | SYNC-15 | What an application says it has reached, a phase, counts until its life ends, and goes to all nodes in its node's list. It waits there until all parties have reached the phase in their present lives, its deadline, its leave or its end; a lost party ends the wait as in SYNC-13. A requirement on a phase is met by whoever has reached it, ready or not. |
 
 mod actor;
 #[cfg(test)]
@@ -37,7 +38,7 @@ pub(crate) use core::Input;
 pub(crate) use facts::OwnApp;
 pub use facts::{DirectoryEntry, DirectoryEvent, Waiting};
 pub(crate) use list::{NAME_BYTES_MAX, Name, at_most};
-pub use words::{ArriveAtBarrier, BarrierAnswer, BarrierStatus, LeaveBarrier, OnPartyLoss};
+pub use words::{ArriveAtBarrier, BarrierAnswer, BarrierKind, BarrierStatus, LeaveBarrier, OnPartyLoss};
 
 use sinew_runtime::wire::Message;
 

@@ -18,8 +18,22 @@ payload!("sinew.barrier.arrive" =>
         pub within_ms: u32,
         /// What it does when a party is lost.
         pub on_loss: OnPartyLoss,
+        /// Whether they meet there, or come up in phases.
+        #[serde(default)]
+        pub kind: BarrierKind,
     }
 );
+
+/// When those who wait at a barrier go on.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub enum BarrierKind {
+    /// When all of them wait at the same time. It opens again for each round.
+    #[default]
+    Meeting,
+    /// When all of them have reached it in their present lives. Whoever has counts until its life ends, also while it does
+    /// something else: one that is started again does not bring the others back.
+    Phase,
+}
 
 payload!("sinew.barrier.leave" =>
     /// Its sender waits there no more. Nothing answers.
@@ -77,7 +91,9 @@ pub struct BarrierStatus {
     pub barrier: String,
     /// Who has to be there.
     pub parties: Vec<String>,
-    /// How often it has opened, as far as is known here.
+    /// When those who wait there go on.
+    pub kind: BarrierKind,
+    /// How often it has opened, as far as is known here; of a phase 0.
     pub generation: u64,
     /// Applications of this node that wait there: name or address, and for how long.
     pub waiting: Vec<(String, std::time::Duration)>,

@@ -27,6 +27,8 @@ pub(super) struct Apps {
 pub(super) struct App {
     pub(super) name: Option<Name>,
     pub(super) requires: Vec<Requirement>,
+    /// The phases that it has reached in its present life.
+    pub(super) phases: Vec<Name>,
     /// The payloads that it handles, as far as it tells.
     pub(super) kinds: Vec<Kind>,
     pub(super) state: State,
@@ -74,8 +76,12 @@ impl App {
         }
     }
 
-    /// Why it is not ready; `None`: it is.
-    pub(super) fn why_not(&self) -> Option<Reason> {
+    /// Why it is not ready, or has not reached a phase; `None`: it is, it has.
+    pub(super) fn why_not(&self, phase: Option<&str>) -> Option<Reason> {
+        if let Some(phase) = phase {
+            let has_reached = self.phases.iter().any(|reached| &**reached == phase);
+            return (!has_reached).then(|| self.ended.map_or(Reason::NotReached, Reason::from));
+        }
         match self.state {
             State::Waiting(_) | State::Released => Some(self.ended.map_or(Reason::NotReady, Reason::from)),
             State::Ready => None,
@@ -110,9 +116,9 @@ impl Apps {
         let wait = former.as_ref().and_then(App::wait).copied().unwrap_or(wait);
         let (name, refused) = self.claim(app, name);
         let state = State::Waiting(wait);
-        let (ended, lost, silent, patience) = (None, BTreeSet::new(), BTreeMap::new(), None);
-        self.apps
-            .insert(app, App { name, requires, kinds: Vec::new(), state, ended, lost, silent, patience });
+        let (phases, kinds, lost, silent) = (Vec::new(), Vec::new(), BTreeSet::new(), BTreeMap::new());
+        let (ended, patience) = (None, None);
+        self.apps.insert(app, App { name, requires, phases, kinds, state, ended, lost, silent, patience });
         refused
     }
 
@@ -182,6 +188,7 @@ impl Apps {
                 app: address,
                 ready: app.state == State::Ready,
                 ended: app.ended,
+                phases: app.phases.clone(),
                 requires: app.requires.iter().take(REQUIRES_MAX).cloned().collect(),
                 kinds: app.kinds.clone(),
             })

@@ -66,7 +66,7 @@ impl Core {
             }
             missing.insert(address, unmet);
         }
-        for party in self.rendezvous.awaited() {
+        for party in self.rendezvous.awaited().chain(self.phases.awaited()) {
             let remembered = party.alternatives().iter().filter(|name| self.seen.contains(*name));
             seen.extend(remembered.cloned().chain(self.standing(AppAddress::NONE, party).had));
         }

@@ -1,12 +1,17 @@
 //! Run-time barriers, as one node sees them: what it keeps in mind, whom it believes, whose wait is over.
 
+use sinew_runtime::app::Requirement;
+
 use super::*;
 use crate::sync::{
-    arrivals::{Arrival, Arrivals, BARRIERS_MAX, BarrierSaid},
+    arrivals::{Arrival, Arrivals, BARRIERS_MAX, BarrierSaid, Member, Passed},
     core::rendezvous::GRACE,
     list::Ended,
-    words::OnPartyLoss,
+    words::{BarrierKind, OnPartyLoss},
 };
+
+/// A younger life of a process with the same address.
+const DOUBLE: Incarnation = Incarnation(9);
 
 fn name(text: &str) -> Name {
     Name::try_from(text.to_owned()).unwrap()
@@ -15,7 +20,8 @@ fn name(text: &str) -> Name {
 /// A barrier of the hip and the knee at which nobody waits.
 fn idle(text: &str, generation: u64) -> BarrierSaid {
     let parties = vec![Requirement::name("hip"), Requirement::name("knee")];
-    BarrierSaid { name: name(text), parties, generation, members: Vec::new(), arrivals: Vec::new() }
+    let (members, earlier, arrivals) = (Vec::new(), Vec::new(), Vec::new());
+    BarrierSaid { name: name(text), parties, generation, members, earlier, arrivals }
 }
 
 /// One at which the knee waits behind this generation.
@@ -62,6 +68,7 @@ impl Bench {
     /// The hip arrives, and does not wait for a lost party's return.
     fn arrives(&mut self, barrier: &str, correlation: u64) -> Vec<Output> {
         let asked = ArriveAtBarrier {
+            kind: BarrierKind::Meeting,
             barrier: barrier.to_owned(),
             parties: ["hip", "knee"].map(str::to_owned).to_vec(),
             within_ms: 60_000,
@@ -101,7 +108,6 @@ fn who_arrives_at_a_barrier_for_which_there_was_no_room_meets_those_who_wait_the
 // spec: SYNC-11
 #[test]
 fn the_linked_life_of_a_node_is_heard_also_after_a_younger_double_of_it_has_spoken() {
-    const DOUBLE: Incarnation = Incarnation(9);
     let mut bench = Bench::of_the_hip();
     bench.links(KNEE, DOUBLE);
     bench.is_told(KNEE, DOUBLE, 7, vec![idle("calibrated", 0)]);
@@ -111,6 +117,19 @@ fn the_linked_life_of_a_node_is_heard_also_after_a_younger_double_of_it_has_spok
     bench.is_told(KNEE, LIFE, 1, vec![awaited("calibrated", 0)]);
     let outputs = bench.arrives("calibrated", 7);
     assert!(outputs.contains(&answered(7, BarrierAnswer::Opened { generation: 1 })), "{outputs:?}");
+}
+
+#[test]
+fn the_end_of_a_double_that_is_linked_with_nobody_any_more_is_no_loss_of_the_node() {
+    let mut bench = Bench::of_the_hip();
+    bench.links(KNEE, DOUBLE);
+    bench.hears(Input::LinkChanged(LinkFact::LinkBroken { node: KNEE, incarnation: DOUBLE }));
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("knee", true, &[])]));
+    let (node, incarnation, why) = (KNEE, DOUBLE, LossReason::Duplicate);
+    bench.hears(Input::MembershipChanged(MembershipFact::NodeLost { node, incarnation, why }));
+    let is_ready = |entry: &DirectoryEntry| entry.name == "knee" && entry.ready;
+    assert!(bench.core.directory().iter().any(is_ready), "{:?}", bench.core.directory());
 }
 
 // spec: SYNC-13
@@ -143,6 +162,75 @@ fn a_node_says_how_an_application_ended_until_it_is_ready_again() {
     assert_eq!(says(&mut bench), Some(Ended::Stopped));
     bench.ready(0);
     assert_eq!(says(&mut bench), None);
+}
+
+// spec: SYNC-12
+#[test]
+fn who_counted_passes_also_when_its_node_hears_of_a_later_generation_first() {
+    let mut bench = Bench::of_the_hip();
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("knee", true, &[])]));
+    bench.arrives("calibrated", 7);
+    let (node, incarnation) = (HERE, Incarnation(1));
+    let hip = Member { node, incarnation, party: 1 };
+    let later = BarrierSaid { earlier: vec![Passed::new(hip, 2)], ..idle("calibrated", 3) };
+    let outputs = bench.is_told(KNEE, LIFE, 1, vec![later]);
+    assert!(outputs.contains(&answered(7, BarrierAnswer::Opened { generation: 2 })), "{outputs:?}");
+    // Its next visit is behind the third, whoever repeats what it has passed.
+    bench.arrives("calibrated", 8);
+    let again = BarrierSaid { earlier: vec![Passed::new(hip, 2)], ..idle("calibrated", 4) };
+    let outputs = bench.is_told(KNEE, LIFE, 2, vec![again]);
+    assert!(!outputs.iter().any(|output| matches!(output, Output::AnswerBarrier { .. })), "{outputs:?}");
+}
+
+// spec: SYNC-12
+#[test]
+fn who_gave_a_visit_up_does_not_pass_in_its_next_one_by_a_late_word_about_that() {
+    let mut bench = Bench::of_the_hip();
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("knee", true, &[])]));
+    bench.arrives("calibrated", 7);
+    let is_over = |output: &Output| {
+        matches!(output, Output::AnswerBarrier { correlation: 7, answer: BarrierAnswer::TimedOut { .. }, .. })
+    };
+    assert!(bench.passes(Duration::from_secs(61)).iter().any(is_over));
+    bench.arrives("calibrated", 8);
+    // The knee's node had opened it for the first visit, and could not say so.
+    let hip = Member { node: HERE, incarnation: Incarnation(1), party: 1 };
+    let late = BarrierSaid { members: vec![hip], ..idle("calibrated", 1) };
+    let outputs = bench.is_told(KNEE, LIFE, 1, vec![late]);
+    assert!(!outputs.iter().any(|output| matches!(output, Output::AnswerBarrier { .. })), "{outputs:?}");
+}
+
+// spec: SYNC-11
+#[test]
+fn a_word_is_no_longer_than_it_may_be() {
+    let mut bench = Bench::of_the_hip();
+    bench.core.rendezvous = Rendezvous::new(HERE, Incarnation(1), 4_000);
+    bench.links(KNEE, LIFE);
+    let barriers = (0..100).map(|number| idle(&format!("round {number}"), 1)).collect();
+    bench.is_told(KNEE, LIFE, 1, barriers);
+    let outputs = [bench.arrives("calibrated", 7), bench.passes(SPACING)].concat();
+    let word = |output: &Output| {
+        let Output::PublishArrivals { said, .. } = output else { return None };
+        Some(said.clone())
+    };
+    let words = outputs.iter().filter_map(word);
+    let words: Vec<_> = words.collect();
+    assert!(words.iter().all(|word| word.len() <= 4_000) && !words.is_empty(), "{}", words.len());
+    let last = Arrivals::parse(&words[words.len() - 1]).unwrap();
+    assert!(last.barriers.iter().any(|said| &*said.name == "calibrated" && said.arrivals.len() == 1));
+    assert!(last.barriers.len() > 20, "{}", last.barriers.len());
+    let is_told = |output: &Output| matches!(output, Output::Refused { cause: "barriers", .. });
+    assert!(outputs.iter().any(is_told), "that some have no room");
+    // What the own applications wait for has room, or is refused.
+    let refusals = (0..40).filter(|number| {
+        let outputs = bench.arrives(&format!("own {number}"), 100 + number);
+        outputs.iter().any(|output| {
+            matches!(output, Output::AnswerBarrier { answer: BarrierAnswer::Refused { why }, .. } if why.contains("`node.payload_max`"))
+        })
+    });
+    assert!(refusals.count() > 0);
 }
 
 // spec: SYNC-10

@@ -90,7 +90,7 @@ impl Core {
                 for name in self.apps.names().chain(self.peers.names()) {
                     effort.spend(compare)?;
                     if matches(alternative, name) {
-                        is_had |= self.look_at(of, name, &mut found, effort)?;
+                        is_had |= self.look_at((of, requirement.phase()), name, &mut found, effort)?;
                     }
                     if found.ready.len() >= requirement.count() {
                         return Some(found);
@@ -98,7 +98,7 @@ impl Core {
                 }
             } else {
                 effort.spend(COMPARE)?;
-                is_had = self.look_at(of, alternative, &mut found, effort)?;
+                is_had = self.look_at((of, requirement.phase()), alternative, &mut found, effort)?;
             }
             if !is_had {
                 let is_known = self.seen.contains(alternative);
@@ -108,16 +108,22 @@ impl Core {
         Some(found)
     }
 
-    /// Looks at those that have `name`, but for the application at `of`. Returns whether anybody has it.
-    fn look_at(&self, of: AppAddress, name: &str, found: &mut Found, effort: &mut Effort) -> Option<bool> {
-        let here = self.apps.called(name).map(|(address, app)| (Tid::new(self.node, address), app.why_not()));
+    /// Looks at those that have `name`; the application at `of` counts in any case. Returns whether anybody has it.
+    fn look_at(
+        &self,
+        (of, phase): (AppAddress, Option<&str>),
+        name: &str,
+        found: &mut Found,
+        effort: &mut Effort,
+    ) -> Option<bool> {
+        let here = self.apps.called(name);
+        let here = here.map(|(address, app)| (Tid::new(self.node, address), app.why_not(phase)));
         let mut is_had = false;
-        for (tid, why_not) in here.into_iter().chain(self.peers.standing(name)) {
+        for (tid, why_not) in here.into_iter().chain(self.peers.standing(name, phase)) {
             effort.spend(APPLICATION)?;
             is_had = true;
             match why_not {
-                // It neither counts nor is missing.
-                _ if tid == Tid::new(self.node, of) => {}
+                _ if tid == Tid::new(self.node, of) => drop(found.ready.insert(tid)),
                 None => drop(found.ready.insert(tid)),
                 Some(reason) => found.lacks(name, reason),
             }

@@ -65,16 +65,18 @@ impl Graph {
         starts.filter_map(|start| self.walk(*start, &impossible, &mut walked)).collect()
     }
 
-    /// How many applications a requirement takes of those that are known; none if somebody who is not known yet may come and meet
-    /// it, or if it is done without in the end. spec: SYNC-7
-    fn takes(&self, requirement: &Requirement) -> usize {
+    /// How many other applications a requirement of one called `of` takes of those that are known; none if somebody who is not known
+    /// yet may come and meet it, or if it is done without in the end. spec: SYNC-7
+    fn takes(&self, of: &str, requirement: &Requirement) -> usize {
         let known = |name: &String| self.names.get(name).map_or(0, Vec::len);
         let each: Vec<usize> = requirement.alternatives().iter().map(known).collect();
         let is_open = requirement.wait_max().is_some()
             || requirement.alternatives().iter().any(|name| is_pattern(name))
             || each.contains(&0)
             || each.iter().sum::<usize>() < requirement.count();
-        if is_open { 0 } else { requirement.count() }
+        // It does not wait for itself.
+        let own = usize::from(requirement.alternatives().iter().any(|name| name == of));
+        if is_open { 0 } else { requirement.count() - own }
     }
 
     /// Starts in thought whoever can be started, until nobody is left who can.
@@ -82,7 +84,8 @@ impl Graph {
         let mut lacks: Vec<Vec<usize>> = Vec::new();
         let mut dependants: BTreeMap<&str, Vec<(usize, usize)>> = BTreeMap::new();
         for (at, application) in self.applications.iter().enumerate() {
-            lacks.push(application.requires.iter().map(|requirement| self.takes(requirement)).collect());
+            let takes = |requirement| self.takes(&application.name, requirement);
+            lacks.push(application.requires.iter().map(takes).collect());
             for (place, requirement) in application.requires.iter().enumerate() {
                 for name in names_of(requirement) {
                     dependants.entry(name).or_default().push((at, place));
@@ -139,13 +142,13 @@ impl Graph {
         &self.applications[at].name
     }
 
-    /// An impossible application behind the first requirement that an impossible one lacks. There is one: those that are known
+    /// Another impossible application behind the first requirement that an impossible one lacks. There is one: those that are known
     /// would be enough if all of them could start.
     fn next(&self, at: usize, impossible: &Impossible) -> Option<usize> {
         let lacked = impossible.lacks[at].iter().position(|lack| *lack > 0)?;
         let names = names_of(&self.applications[at].requires[lacked]);
         let mut behind = names.filter_map(|name| self.names.get(name)).flatten();
-        behind.find(|other| impossible.applications.contains(other)).copied()
+        behind.find(|other| **other != at && impossible.applications.contains(other)).copied()
     }
 }
 
@@ -186,13 +189,24 @@ mod tests {
     #[test]
     fn a_circle_is_spelled_from_its_smallest_name() {
         assert_eq!(cycles(&["c: a", "b: c", "a: b"]), ["a b c"]);
-        assert_eq!(cycles(&["a: a"]), ["a"]);
         assert_eq!(cycles(&["a: b", "b: a", "x: y", "y: x"]), ["a b", "x y"]);
     }
 
     #[test]
     fn who_only_waits_for_a_circle_is_not_part_of_it() {
         assert_eq!(cycles(&["before: a", "a: b", "b: a, after", "after:"]), ["a b"]);
+    }
+
+    #[test]
+    fn who_requires_itself_is_in_no_circle_by_that() {
+        assert_eq!(cycles(&["a: a"]), [""; 0]);
+        assert_eq!(cycles(&["a: 2 of a | b", "b:"]), [""; 0]);
+        assert_eq!(
+            cycles(&["a: 2 of a", "a:"]),
+            [""; 0],
+            "one on each of two nodes: one does not wait for itself"
+        );
+        assert_eq!(cycles(&["a: 2 of a | b", "b: a"]), ["a b"], "but for the other one");
     }
 
     #[test]
@@ -236,8 +250,10 @@ mod tests {
             let before = started.len();
             for (at, (_, requires)) in applications.iter().enumerate() {
                 let counting = |requirement: &Requirement| {
-                    let there = started.iter().filter(|other| requirement.counts(applications[**other].0));
-                    there.count() >= requirement.count()
+                    let is_there = |other: &usize| *other == at || started.contains(other);
+                    let there = (0..applications.len()).filter(is_there);
+                    there.filter(|other| requirement.counts(applications[*other].0)).count()
+                        >= requirement.count()
                 };
                 if requires.iter().all(counting) {
                     started.insert(at);

@@ -1,5 +1,7 @@
 //! The directory, as those see it who want to hear of it.
 
+use sinew_runtime::wire::Kind;
+
 use super::*;
 
 fn is(name: &str, node: NodeAddress, index: u32, ready: bool) -> Output {

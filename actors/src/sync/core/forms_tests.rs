@@ -51,24 +51,35 @@ fn so_many_that_match_are_enough_wherever_they_are() {
 }
 
 #[test]
-fn one_name_on_two_nodes_counts_twice_and_who_requires_never_for_itself() {
+fn one_name_on_two_nodes_counts_twice_and_who_requires_for_itself() {
     let mut bench = Bench::new();
-    bench.registers(0, "a.drive", &["2 of *.drive"]);
+    bench.registers(0, "a.drive", &["3 of *.drive"]);
     bench.links(KNEE, LIFE);
     bench.links(ANKLE, LIFE);
-    bench.list(KNEE, list(1, &[("b.drive", true, &[])]));
+    let outputs = bench.list(KNEE, list(1, &[("b.drive", true, &[])]));
+    assert!(!outputs.contains(&release(0)));
+    assert_eq!(words(&bench.missing()), ["3 of *.drive (2 ready): never seen"]);
+    assert_eq!(bench.core.missing_in_brief(app(0)), bench.missing());
     assert!(bench.list(ANKLE, list(1, &[("b.drive", true, &[])])).contains(&release(0)));
     bench.ready(0);
     let outputs = bench.lost(ANKLE, LossReason::LinkDown);
-    assert!(
-        outputs.contains(&lost(0, "2 of *.drive", Reason::NodeLost)),
-        "its own readiness is not counted: {outputs:?}"
-    );
-    bench.registers(1, "a", &["1 of a | b | c", "b"]);
-    bench.registers(2, "b", &[]);
-    bench.ready(2);
-    bench.ready(1);
-    assert!(bench.down(2).contains(&lost(1, "1 of a | b | c", Reason::Failed)), "nor is it by its own name");
+    assert!(outputs.contains(&lost(0, "3 of *.drive", Reason::NodeLost)), "{outputs:?}");
+}
+
+// spec: SYNC-7
+#[test]
+fn nobody_waits_for_itself() {
+    for requires in [&["a.drive"][..], &["*.drive"], &["a.drive | b.drive"], &["a.drive at homed", "a.drive"]]
+    {
+        let mut bench = Bench::new();
+        assert_eq!(bench.registers(0, "a.drive", requires), [release(0)], "{requires:?}");
+        bench.ready(0);
+        assert_eq!(bench.down(0), [release(0)], "{requires:?}");
+    }
+    let mut bench = Bench::new();
+    bench.registers(0, "a.drive", &["2 of *.drive"]);
+    bench.registers(1, "b.drive", &["*.drive"]);
+    assert_eq!(bench.ready(1), [release(0)], "but for others it does");
 }
 
 #[test]

@@ -15,17 +15,26 @@ use super::{
 use crate::sync::{
     arrivals::{Arrivals, PARTIES_MAX, fault_of_parties},
     list::Name,
-    words::{ArriveAtBarrier, BarrierAnswer, BarrierStatus},
+    words::{ArriveAtBarrier, BarrierAnswer, BarrierKind, BarrierStatus},
 };
 
 /// Bytes that the names of one barrier's parties have together, at most.
 const PARTIES_BYTES_MAX: usize = 4_096;
+/// Bytes of an answer beside who is missing, at most.
+const ANSWER: usize = 32;
+/// Bytes beside the two texts of each who is missing, at most.
+const MISSING: usize = 8;
 
 impl Core {
     /// An application of this node has arrived at a barrier.
     pub(super) fn arrived(&mut self, now: Time, app: AppAddress, correlation: u64, asked: ArriveAtBarrier) {
+        let kind = asked.kind;
         let arrived = self.read_arrival(app, correlation, asked);
-        if let Err(why) = arrived.and_then(|arrived| self.rendezvous.arrive(now, arrived)) {
+        let admitted = arrived.and_then(|arrived| match kind {
+            BarrierKind::Meeting => self.rendezvous.arrive(now, arrived),
+            BarrierKind::Phase => self.reach(now, arrived),
+        });
+        if let Err(why) = admitted {
             let answer = BarrierAnswer::Refused { why };
             self.outputs.push_back(Output::AnswerBarrier { app, correlation, answer });
         }
@@ -37,7 +46,7 @@ impl Core {
         correlation: u64,
         asked: ArriveAtBarrier,
     ) -> Result<Arrived, String> {
-        let ArriveAtBarrier { barrier, parties, within_ms, on_loss } = asked;
+        let ArriveAtBarrier { barrier, parties, within_ms, on_loss, kind: _ } = asked;
         let barrier = Name::try_from(barrier).map_err(|why| format!("the barrier's name: {why}"))?;
         let registered = self.apps.get(app).ok_or("only an application of this node can wait here")?;
         if parties.len() > PARTIES_MAX || parties.iter().map(String::len).sum::<usize>() > PARTIES_BYTES_MAX {
@@ -81,22 +90,25 @@ impl Core {
     /// Opens what can be opened, answers whose wait is over, and tells the other nodes.
     pub(super) fn meet(&mut self, now: Time) {
         // It is taken out while it asks about names.
-        let mut rendezvous =
-            std::mem::replace(&mut self.rendezvous, Rendezvous::new(self.node, self.incarnation));
+        let empty = Rendezvous::new(self.node, self.incarnation, self.list_bytes_max);
+        let mut rendezvous = std::mem::replace(&mut self.rendezvous, empty);
         rendezvous.retain(|node| self.peers.knows(node));
         rendezvous.evaluate(now, |node| self.peers.current(node), |name| self.why_not(name));
-        for (app, correlation, answer) in rendezvous.take_answers() {
+        let mut answers = rendezvous.take_answers();
+        answers.extend(self.pass_phases(now));
+        for (app, correlation, answer) in answers {
+            let answer = within(answer, self.list_bytes_max);
             self.outputs.push_back(Output::AnswerBarrier { app, correlation, answer });
         }
         for to in rendezvous.take_due(now, |node| self.peers.linked(node).is_some()) {
-            let said = rendezvous.encoded();
-            if said.len() > self.list_bytes_max {
+            let (said, left_out) = rendezvous.encoded();
+            if left_out > 0 {
                 let limit = self.list_bytes_max;
-                self.refuse(
-                    "barriers",
-                    format!("what waits at barriers takes {} of {limit} bytes: other nodes do not hear of it; raise `node.payload_max`", said.len()),
+                let detail = format!(
+                    "{left_out} barriers have no room in the {limit} bytes that this node says of them: others do not hear of these from it; \
+                     raise `node.payload_max`"
                 );
-                break;
+                self.refuse("barriers", detail);
             }
             self.outputs.push_back(Output::PublishArrivals { to, said });
         }
@@ -106,20 +118,41 @@ impl Core {
     /// The barriers at which somebody of this node waits, and who is missing at each.
     pub(crate) fn barriers(&self, now: Time) -> Vec<BarrierStatus> {
         let awaited = self.rendezvous.known.iter().filter(|(_, known)| !known.waiting.is_empty());
-        awaited.map(|(key, known)| self.status(now, key, known)).collect()
+        let meetings = awaited.map(|(key, known)| self.status(now, key, known));
+        meetings.chain(self.awaited_phases(now)).collect()
+    }
+
+    /// An application's name, or its address where it has none.
+    pub(super) fn title(&self, app: AppAddress) -> String {
+        self.apps.get(app).map_or_else(|| app.to_string(), |known| known.title(app))
     }
 
     fn status(&self, now: Time, key: &Key, known: &Known) -> BarrierStatus {
-        let title =
-            |app: AppAddress| self.apps.get(app).map_or_else(|| app.to_string(), |known| known.title(app));
-        let waiting = known.waiting.iter().map(|(app, wait)| (title(*app), now.since(wait.since)));
+        let waiting = known.waiting.iter().map(|(app, wait)| (self.title(*app), now.since(wait.since)));
         let current = |node| self.peers.current(node);
         BarrierStatus {
             barrier: key.name.to_string(),
             parties: key.parties.clone(),
+            kind: BarrierKind::Meeting,
             generation: known.generation,
             waiting: waiting.collect(),
             missing: self.rendezvous.missing(key, current, |name| self.why_not(name)),
         }
+    }
+}
+
+/// The answer with as much of who is missing as `bytes_max` has room for.
+fn within(answer: BarrierAnswer, bytes_max: usize) -> BarrierAnswer {
+    let cut = |missing: Vec<(String, String)>| {
+        let mut left = bytes_max.saturating_sub(ANSWER);
+        let has_room = |(who, why): &(String, String)| {
+            left.checked_sub(who.len() + why.len() + MISSING).inspect(|rest| left = *rest).is_some()
+        };
+        missing.into_iter().take_while(has_room).collect()
+    };
+    match answer {
+        BarrierAnswer::TimedOut { missing } => BarrierAnswer::TimedOut { missing: cut(missing) },
+        BarrierAnswer::Lost { missing } => BarrierAnswer::Lost { missing: cut(missing) },
+        BarrierAnswer::Opened { .. } | BarrierAnswer::Refused { .. } => answer,
     }
 }

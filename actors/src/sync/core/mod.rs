@@ -10,8 +10,12 @@ mod barrier;
 mod brief;
 mod cycles;
 mod directory;
+mod lives;
 mod meet;
+mod nodes;
 mod peers;
+mod phases;
+mod publish;
 mod reason;
 mod rendezvous;
 mod requirements;
@@ -27,34 +31,25 @@ use std::{
 
 use bytes::Bytes;
 use sinew_runtime::{
-    app::{Requirement, RequirementEvent},
+    app::RequirementEvent,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
-    wire::Kind,
 };
 
 pub(crate) use self::reason::Reason;
 use self::{
     answers::Untaken,
-    apps::{Apps, State, Wait},
+    apps::{Apps, State},
     directory::Watchers,
-    peers::{Accepted, Peers},
+    peers::Peers,
+    phases::Phases,
     rendezvous::Rendezvous,
 };
 use super::{
     facts::{DirectoryEntry, DirectoryEvent, OwnApp, Waiting},
-    list::{ENTRIES_MAX, Ended, KINDS_MAX, List},
     words::{ArriveAtBarrier, BarrierAnswer},
 };
-use crate::{
-    config::NodeConfig,
-    gncl::LinkFact,
-    lncl::AppFact,
-    ndl::{LossReason, MembershipFact},
-};
-
-/// Names that two nodes have, of which it was said, at most; of more it is not said.
-const SAME_NAMES_MAX: usize = 1_024;
+use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, ndl::MembershipFact};
 
 /// What has happened.
 #[derive(Debug)]
@@ -129,6 +124,7 @@ pub(crate) struct Core {
     groups: Vec<AppAddress>,
     peers: Peers,
     rendezvous: Rendezvous,
+    phases: Phases,
     untaken: Untaken,
     watchers: Watchers,
     /// Of the names and patterns that are required here, those that somebody had at some time.
@@ -158,7 +154,8 @@ impl Core {
             apps: Apps::default(),
             groups: Vec::new(),
             peers: Peers::new(config.ndl.nodes_max),
-            rendezvous: Rendezvous::new(node, incarnation),
+            rendezvous: Rendezvous::new(node, incarnation, config.payload_max),
+            phases: Phases::default(),
             untaken: Untaken::default(),
             watchers: Watchers::default(),
             seen: BTreeSet::new(),
@@ -184,7 +181,8 @@ impl Core {
             Input::MembershipChanged(fact) => self.membership_changed(fact),
             Input::Arrived { app, correlation, asked } => self.arrived(now, app, correlation, asked),
             Input::Left { app, barrier, correlation } => {
-                self.rendezvous.leave(now, app, &barrier, correlation)
+                self.rendezvous.leave(now, app, &barrier, correlation);
+                self.phases.leave(app, &barrier, correlation);
             }
             Input::AnswerNotTaken { app, correlation, answer } => {
                 return self.answer_not_taken(now, app, correlation, answer);
@@ -224,6 +222,7 @@ impl Core {
             self.retry,
             silent,
             self.rendezvous.next_wake(),
+            self.phases.next_wake(),
             self.untaken.next_wake(),
             self.watchers.next_wake(),
         ]
@@ -270,7 +269,10 @@ impl Core {
             name: app.name.as_ref().map(ToString::to_string),
             ready: app.state == State::Ready,
             missing: self.missing(now, address),
-            waits: app.wait().map(|wait| now.since(wait.since)),
+            waits: app
+                .wait()
+                .map(|wait| now.since(wait.since))
+                .or_else(|| Some(self.lacks_at_phases(now, address)?.0)),
             ended: app.ended.map(|ended| Reason::from(ended).words()),
         };
         let apps: Vec<_> = self.apps.iter().take(max).map(view).collect();
@@ -284,248 +286,19 @@ impl Core {
         self.sequence
     }
 
-    /// What this application lacks of what it requires, and why: what it waits for or, when it runs, what it was told is lost.
+    /// What this application lacks of what it requires, and why: what it waits for or, when it runs, what it was told is lost; and who
+    /// has not reached a phase at which it waits.
     pub(crate) fn missing(&self, now: Time, address: AppAddress) -> Vec<(String, &'static str)> {
         if let Some(waiting) = self.wait_of(now, address) {
             return waiting.missing;
         }
         let Some(app) = self.apps.get(address) else { return Vec::new() };
         let lost = app.requires.iter().filter(|requirement| app.lost.contains(requirement.as_str()));
-        lost.flat_map(|requirement| self.missing_parts(address, requirement)).collect()
+        let lost = lost.flat_map(|requirement| self.missing_parts(address, requirement));
+        lost.chain(self.lacks_at_phases(now, address).into_iter().flat_map(|(_, missing)| missing)).collect()
     }
 
     fn refuse(&mut self, cause: &'static str, detail: String) {
         self.outputs.push_back(Output::Refused { cause, detail });
-    }
-}
-
-/// The applications of this node.
-impl Core {
-    fn app_changed(&mut self, now: Time, fact: AppFact) {
-        match fact {
-            // Told again, as after a restart of LNCL: nothing has changed.
-            AppFact::Registered { app, name, requires }
-                if self.apps.knows(app, name.as_deref(), &requires) => {}
-            AppFact::Registered { app, name, requires } => {
-                let wait = Wait::begun(now, self.requirement_deadline);
-                let requires = self.read_requirements(app, requires);
-                let refused = self.apps.register(app, name.clone(), requires, wait);
-                if let Some(name) = refused {
-                    self.refuse(
-                        "name",
-                        format!("{app} cannot be called {name:?}: not 1 to 63 bytes, or taken"),
-                    );
-                }
-                self.forget_not_taken(app);
-                self.life_ended(now, app);
-                self.note_same_name(name.as_deref().unwrap_or_default());
-                self.own_list_changed(now);
-            }
-            AppFact::Handles { app, kinds } => self.app_handles(now, app, kinds),
-            AppFact::Ready { app } => self.app_ready(now, app),
-            AppFact::Down { app } => self.app_ended(now, app, Ended::Failed),
-            AppFact::Stopped { app } => self.app_ended(now, app, Ended::Stopped),
-            AppFact::Unregistered { app } => {
-                self.apps.remove(app);
-                self.forget_not_taken(app);
-                self.life_ended(now, app);
-                self.own_list_changed(now);
-            }
-            // The shell looks up which they are and says so by `Input::GroupsChanged`.
-            AppFact::GroupsChanged => {}
-        }
-    }
-
-    /// What its door has checked. A text that is none all the same is a name that nobody has: who asks for it does not start.
-    fn read_requirements(&mut self, app: AppAddress, texts: Vec<String>) -> Vec<Requirement> {
-        let read = |text: String| {
-            text.parse().unwrap_or_else(|fault| {
-                self.refuse("requirement", format!("of {app}: {fault}"));
-                Requirement::name(text)
-            })
-        };
-        texts.into_iter().map(read).collect()
-    }
-
-    fn app_handles(&mut self, now: Time, address: AppAddress, mut kinds: Vec<Kind>) {
-        kinds.truncate(KINDS_MAX);
-        if let Some(app) = self.apps.get_mut(address)
-            && app.kinds != kinds
-        {
-            app.kinds = kinds;
-            self.own_list_changed(now);
-        }
-    }
-
-    fn app_ready(&mut self, now: Time, address: AppAddress) {
-        if let Some(app) = self.apps.get_mut(address)
-            && app.state != State::Ready
-        {
-            (app.state, app.ended) = (State::Ready, None);
-            self.own_list_changed(now);
-        }
-    }
-
-    /// It waits again for all that it requires; one that waits already was not started yet and goes on waiting.
-    fn app_ended(&mut self, now: Time, address: AppAddress, how: Ended) {
-        self.life_ended(now, address);
-        let wait = Wait::begun(now, self.requirement_deadline);
-        if let Some(app) = self.apps.get_mut(address)
-            && app.wait().is_none()
-        {
-            // What it was told is lost stays so: an event may still be on its way, and its next life has to hear the end of it.
-            (app.state, app.ended) = (State::Waiting(wait), Some(how));
-            app.silent.clear();
-            self.forget_not_taken(address);
-            self.own_list_changed(now);
-        }
-    }
-
-    /// What it waited for and wanted to hear it does not any more.
-    fn life_ended(&mut self, now: Time, app: AppAddress) {
-        self.rendezvous.ended(now, app);
-        self.untaken.forget(app);
-        self.watchers.remove(app);
-    }
-
-    fn groups_changed(&mut self, now: Time, mut groups: Vec<AppAddress>) {
-        groups.retain(|group| group.is_group());
-        if self.groups != groups {
-            self.groups = groups;
-            self.own_list_changed(now);
-        }
-    }
-}
-
-/// The other nodes.
-impl Core {
-    fn membership_changed(&mut self, fact: MembershipFact) {
-        match fact {
-            MembershipFact::NodeFound { node, incarnation, .. } => {
-                self.peers.found(node, incarnation);
-                self.route_groups(node);
-            }
-            MembershipFact::NodeLost { node, incarnation, why } => {
-                let reason = match why {
-                    LossReason::Left => Reason::NodeLeft,
-                    LossReason::Crashed
-                    | LossReason::Hung
-                    | LossReason::LinkDown
-                    | LossReason::Restarted
-                    | LossReason::Duplicate => Reason::NodeLost,
-                };
-                self.peers.lost(node, incarnation, reason);
-                self.hear_no_more(node);
-                self.route_groups(node);
-            }
-        }
-    }
-
-    fn link_changed(&mut self, now: Time, fact: LinkFact) {
-        match fact {
-            LinkFact::LinkUp { node, incarnation } => {
-                if !self.peers.link_up(now, node, incarnation) {
-                    self.refuse(
-                        "nodes",
-                        format!("{node} is linked, but `ndl.nodes_max` nodes are known already"),
-                    );
-                }
-                self.rendezvous.link_up(now, node);
-                self.route_groups(node);
-            }
-            LinkFact::LinkBroken { node, incarnation } => {
-                self.peers.link_broken(node, incarnation);
-                self.hear_no_more(node);
-            }
-            // A link that was refused was down before. Whether its node is lost, NDL says.
-            LinkFact::DialRefused { .. } => {}
-            LinkFact::PeerLeft { node, incarnation } => {
-                self.peers.lost(node, incarnation, Reason::NodeLeft);
-                self.peers.link_broken(node, incarnation);
-                self.hear_no_more(node);
-                self.route_groups(node);
-            }
-        }
-    }
-
-    fn list_received(&mut self, from: NodeAddress, payload: &[u8]) {
-        if from == self.node || !from.is_single() {
-            return self.refuse("directory", format!("{from} is not another node"));
-        }
-        // A list that is longer than ours may be is not even looked at.
-        if payload.len() > self.list_bytes_max {
-            return self.refuse("directory", format!("{from} sent {} bytes", payload.len()));
-        }
-        match List::parse(payload) {
-            Err(fault) => self.refuse("directory", format!("from {from}: {fault}")),
-            Ok(list) => match self.peers.accept(from, list) {
-                Err(why) => self.refuse("directory", format!("from {from}: {why}")),
-                Ok(Accepted::New) => {
-                    self.route_groups(from);
-                    for name in self.peers.names_of(from) {
-                        self.note_same_name(&name);
-                    }
-                }
-                Ok(Accepted::Same | Accepted::Old) => {}
-            },
-        }
-    }
-
-    /// What `node` said of barriers does not count any more, unless news of a former life changed nothing.
-    fn hear_no_more(&mut self, node: NodeAddress) {
-        if self.peers.current(node).is_none() {
-            self.rendezvous.silent(node);
-        }
-    }
-
-    fn route_groups(&mut self, node: NodeAddress) {
-        if let Some(groups) = self.peers.changed_groups(node) {
-            self.outputs.push_back(Output::RouteGroups { node, groups });
-        }
-    }
-
-    fn note_same_name(&mut self, name: &str) {
-        let tids = self.called(name);
-        if tids.len() > 1 && self.same_names.len() < SAME_NAMES_MAX && self.same_names.insert(name.to_owned())
-        {
-            self.outputs.push_back(Output::SameName { name: name.to_owned(), tids });
-        }
-    }
-
-    fn own_list_changed(&mut self, now: Time) {
-        self.version += 1;
-        self.encoded = None;
-        self.peers.make_due(now);
-    }
-
-    /// Sends the list to whom it is due. spec: SYNC-2
-    fn publish(&mut self, now: Time) {
-        for to in self.peers.take_due(now) {
-            let list = self.encoded();
-            self.outputs.push_back(Output::Publish { to, list });
-        }
-    }
-
-    fn encoded(&mut self) -> Bytes {
-        if let Some(bytes) = &self.encoded {
-            return bytes.clone();
-        }
-        let list = List {
-            incarnation: self.incarnation,
-            version: self.version,
-            entries: self.apps.entries(),
-            groups: self.groups.clone(),
-        };
-        let (bytes, left_out) = list.encode(self.list_bytes_max);
-        if left_out > 0 {
-            let limit = self.list_bytes_max;
-            let detail = format!(
-                "{left_out} applications are not in this node's directory, which has at most {ENTRIES_MAX} entries \
-                 and {limit} bytes: other nodes cannot find them by name; raise `node.payload_max` or use more nodes"
-            );
-            self.refuse("directory full", detail);
-        }
-        self.encoded = Some(bytes.clone());
-        bytes
     }
 }

@@ -66,8 +66,8 @@ impl Peer {
         self.list.as_ref()?.entries.get(name)
     }
 
-    /// Why an application of it that stands in its list is not ready; `None`: it is.
-    fn why_not(&self, entry: &Entry) -> Option<Reason> {
+    /// Why an application of it that stands in its list is not ready, or has not reached a phase; `None`: it is, it has.
+    fn why_not(&self, entry: &Entry, phase: Option<&str>) -> Option<Reason> {
         if self.lost.is_some() {
             self.lost
         } else if self.stale {
@@ -76,6 +76,9 @@ impl Peer {
             Some(Reason::LinkDown)
         } else if !self.heard {
             Some(Reason::ListAwaited)
+        } else if let Some(phase) = phase {
+            let has_reached = entry.phases.iter().any(|reached| &**reached == phase);
+            (!has_reached).then(|| entry.ended.map_or(Reason::NotReached, Reason::from))
         } else if entry.ready {
             None
         } else {
@@ -245,9 +248,13 @@ impl Peers {
         })
     }
 
-    /// The applications called `name`, and why each is not ready.
-    pub(super) fn standing<'a>(&'a self, name: &'a str) -> impl Iterator<Item = (Tid, Option<Reason>)> {
-        self.called(name).map(|(tid, peer, entry)| (tid, peer.why_not(entry)))
+    /// The applications called `name`, and why each is not ready, or has not reached a phase.
+    pub(super) fn standing<'a>(
+        &'a self,
+        name: &'a str,
+        phase: Option<&'a str>,
+    ) -> impl Iterator<Item = (Tid, Option<Reason>)> {
+        self.called(name).map(move |(tid, peer, entry)| (tid, peer.why_not(entry, phase)))
     }
 
     /// All names.
@@ -280,7 +287,7 @@ impl Peers {
         there.flat_map(|(node, peer)| {
             let entries = peer.list.iter().flat_map(|list| list.entries.values());
             entries.map(|entry| {
-                let is_ready = peer.why_not(entry).is_none();
+                let is_ready = peer.why_not(entry, None).is_none();
                 (&entry.name, Tid::new(*node, entry.app), is_ready, &entry.kinds)
             })
         })

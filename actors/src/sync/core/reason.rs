@@ -5,6 +5,7 @@ use crate::sync::list::Ended;
 /// The last that is known of a name that is not ready; the nearest to readiness comes first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Reason {
+    NotReached,
     NotReady,
     Failed,
     Stopped,
@@ -31,6 +32,7 @@ impl Reason {
     /// The words of `Waiting::missing`.
     pub(crate) const fn words(self) -> &'static str {
         match self {
+            Self::NotReached => "has not reached this phase",
             Self::NotReady => "registered, not ready",
             Self::Failed => "failed, not ready again",
             Self::Stopped => "stopped in order, not ready again",
@@ -49,7 +51,8 @@ impl Reason {
     pub(crate) const fn is_orderly(self) -> bool {
         match self {
             Self::Stopped | Self::NodeLeft | Self::Unregistered => true,
-            Self::NotReady
+            Self::NotReached
+            | Self::NotReady
             | Self::Failed
             | Self::ListAwaited
             | Self::NodeRestarted
@@ -69,7 +72,12 @@ impl Reason {
             | Self::NodeLeft
             | Self::NodeLost
             | Self::Unregistered => true,
-            Self::NotReady | Self::ListAwaited | Self::LinkDown | Self::NeverSeen | Self::Cycle => false,
+            Self::NotReached
+            | Self::NotReady
+            | Self::ListAwaited
+            | Self::LinkDown
+            | Self::NeverSeen
+            | Self::Cycle => false,
         }
     }
 
@@ -77,7 +85,8 @@ impl Reason {
     pub(super) const fn is_silence(self) -> bool {
         match self {
             Self::ListAwaited | Self::LinkDown => true,
-            Self::NotReady
+            Self::NotReached
+            | Self::NotReady
             | Self::Failed
             | Self::Stopped
             | Self::NodeRestarted

@@ -6,10 +6,16 @@
 //!
 //! A generation is numbered one higher than that behind which its parties waited, so that the same parties get the same
 //! number wherever it is found out. Who waits and does not stand in a generation that others have opened waits for the next.
+//! Who stood in an earlier one than the last passes that: its node hears of it late, others have met again meanwhile.
 
+#[cfg(test)]
+mod cost;
 mod evaluate;
+mod known;
+mod room;
 #[cfg(test)]
 mod simulation;
+mod voices;
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -23,17 +29,15 @@ use sinew_runtime::{
     time::Time,
 };
 
+pub(super) use self::known::Known;
+use self::{known::Wait, voices::Voices};
 use super::Reason;
 use crate::sync::{
-    arrivals::{ARRIVALS_MAX, Arrival, Arrivals, BARRIERS_MAX, BarrierSaid, GENERATION_MAX, Member},
+    arrivals::{ARRIVALS_MAX, Arrival, Arrivals, BARRIERS_MAX, BarrierSaid, GENERATION_MAX, Member, Passed},
     list::Name,
     words::{BarrierAnswer, OnPartyLoss},
 };
 
-/// Time between two of our words to a peer when nothing changed.
-pub(super) const REPEAT: Duration = Duration::from_secs(2);
-/// Least time between two of them: who passes again and again costs a thousand frames a second, not one each.
-pub(super) const SPACING: Duration = Duration::from_millis(1);
 /// Time from a party's loss until who does not want to wait for its return is told: the word that others have passed with it
 /// is on its way no longer.
 pub(super) const GRACE: Duration = Duration::from_millis(50);
@@ -52,55 +56,17 @@ pub(super) struct Key {
 pub(super) struct Rendezvous {
     node: NodeAddress,
     incarnation: Incarnation,
+    bytes_max: usize,
+    barriers_max: usize,
     pub(super) known: BTreeMap<Key, Known>,
     /// Which life of an application is which party.
     parties: BTreeMap<AppAddress, u64>,
     next_party: u64,
-    peers: BTreeMap<NodeAddress, Peer>,
+    voices: Voices,
     version: u64,
     encoded: Option<Bytes>,
     /// Who is to be answered what.
     answers: Vec<(AppAddress, u64, BarrierAnswer)>,
-}
-
-/// One barrier.
-#[derive(Debug)]
-pub(super) struct Known {
-    parties: Vec<Requirement>,
-    /// How often it has opened, as far as is known here.
-    pub(super) generation: u64,
-    /// Who passed it then.
-    members: BTreeSet<Member>,
-    /// Who of this node waits there.
-    pub(super) waiting: BTreeMap<AppAddress, Wait>,
-    /// Applications of this node that were there in their present life. It is not forgotten before they end: one that came again
-    /// without it would pass with the word of its former visit.
-    visitors: BTreeSet<AppAddress>,
-}
-
-/// An application of this node waits at a barrier.
-#[derive(Debug)]
-pub(super) struct Wait {
-    party: u64,
-    name: Option<Name>,
-    /// The generation behind which it waits.
-    pub(super) after: u64,
-    pub(super) since: Time,
-    until: Time,
-    on_loss: OnPartyLoss,
-    /// Since when a party is known to be lost.
-    lost: Option<Time>,
-    /// Of its request.
-    correlation: u64,
-}
-
-#[derive(Debug, Default)]
-struct Peer {
-    said: Option<Arrivals>,
-    /// Whether it said so since the link came up.
-    heard: bool,
-    sent: Option<Time>,
-    due: Option<Time>,
 }
 
 /// An application has arrived.
@@ -116,14 +82,17 @@ pub(super) struct Arrived {
 }
 
 impl Rendezvous {
-    pub(super) const fn new(node: NodeAddress, incarnation: Incarnation) -> Self {
+    /// Knows no barrier; its word has at most `bytes_max`.
+    pub(super) const fn new(node: NodeAddress, incarnation: Incarnation, bytes_max: usize) -> Self {
         Self {
             node,
             incarnation,
+            bytes_max,
+            barriers_max: BARRIERS_MAX,
             known: BTreeMap::new(),
             parties: BTreeMap::new(),
             next_party: 1,
-            peers: BTreeMap::new(),
+            voices: Voices::new(),
             version: 1,
             encoded: None,
             answers: Vec::new(),
@@ -149,6 +118,7 @@ impl Rendezvous {
         if waits >= WAITS_PER_APP_MAX {
             return Err(format!("it waits at {WAITS_PER_APP_MAX} barriers already"));
         }
+        self.has_room(&key, &parties, called)?;
         self.make_room(&key)?;
         let party = *self.parties.entry(app).or_insert_with(|| {
             self.next_party += 1;
@@ -173,14 +143,15 @@ impl Rendezvous {
 
     /// Forgets a barrier that no living application of this node has to do with, if there is no room for one more.
     fn make_room(&mut self, key: &Key) -> Result<(), String> {
-        if self.known.len() < BARRIERS_MAX || self.known.contains_key(key) {
+        if self.known.len() < self.barriers_max || self.known.contains_key(key) {
             return Ok(());
         }
         let idle = self.known.iter().find(|(_, known)| known.visitors.is_empty()).map(|(key, _)| key.clone());
         let Some(idle) = idle else {
             return Err(format!(
-                "this node knows {BARRIERS_MAX} barriers, which is the limit; a barrier opens as often as one likes, so \
-                 that one name is enough for all rounds"
+                "this node knows {} barriers, which is the limit; a barrier opens as often as one likes, so that one name is \
+                 enough for all rounds",
+                self.barriers_max
             ));
         };
         self.known.remove(&idle);
@@ -192,9 +163,7 @@ impl Rendezvous {
         if self.known.contains_key(key) {
             return;
         }
-        let said = self.peers.values().filter_map(|peer| peer.said.as_ref());
-        let of_it: Vec<BarrierSaid> =
-            said.flat_map(|said| &said.barriers).filter(|barrier| barrier.is_about(key)).cloned().collect();
+        let of_it: Vec<BarrierSaid> = self.voices.about(key).cloned().collect();
         for barrier in &of_it {
             self.hear(now, barrier);
         }
@@ -212,7 +181,17 @@ impl Rendezvous {
             }
         }
         if has_left {
+            self.renumber(app);
             self.changed(now);
+        }
+    }
+
+    /// It has given a visit up without passing. It may have been counted all the same, where that is not known here yet: that word is not
+    /// about its next visit, which has a number of its own. spec: SYNC-12
+    fn renumber(&mut self, app: AppAddress) {
+        if let Some(party) = self.parties.get_mut(&app) {
+            *party = self.next_party;
+            self.next_party += 1;
         }
     }
 
@@ -230,21 +209,17 @@ impl Rendezvous {
 
     /// Messages can flow to `node`.
     pub(super) fn link_up(&mut self, now: Time, node: NodeAddress) {
-        let has_news = !self.known.is_empty();
-        let peer = self.peers.entry(node).or_default();
-        peer.due = has_news.then_some(now);
+        self.voices.link_up(now, node, !self.known.is_empty());
     }
 
     /// Nothing is heard of `node`, or it is lost: what it said does not count before it says it again.
     pub(super) fn silent(&mut self, node: NodeAddress) {
-        if let Some(peer) = self.peers.get_mut(&node) {
-            (peer.heard, peer.due) = (false, None);
-        }
+        self.voices.silent(node);
     }
 
     /// `node` is forgotten.
     pub(super) fn retain(&mut self, is_known: impl Fn(NodeAddress) -> bool) {
-        self.peers.retain(|node, _| is_known(*node));
+        self.voices.retain(is_known);
     }
 
     /// Takes what a node says, whose linked life is `linked`. spec: SYNC-11
@@ -258,56 +233,25 @@ impl Rendezvous {
         said: Arrivals,
         linked: Option<Incarnation>,
     ) -> Result<(), &'static str> {
-        if linked.is_some_and(|life| life != said.incarnation) {
-            return Err("this is about another life of its node than the one that is linked");
-        }
-        let peer = self.peers.entry(from).or_default();
-        // Of two lives the linked one is right, be it the elder: the other one was a double of it.
-        let is_over = |known: &&Arrivals| linked.is_some() && known.incarnation != said.incarnation;
-        let known = peer.said.as_ref().filter(|known| !is_over(known));
-        let known = known.map(|known| (known.incarnation, known.version));
-        if known.is_some_and(|known| (said.incarnation, said.version) < known) {
-            return Ok(());
-        }
-        peer.heard = true;
-        if known == Some((said.incarnation, said.version)) {
-            return Ok(());
-        }
-        for barrier in &said.barriers {
-            self.hear(now, barrier);
-        }
-        if let Some(peer) = self.peers.get_mut(&from) {
-            peer.said = Some(said);
+        for barrier in self.voices.hear(from, said, linked)? {
+            self.hear(now, &barrier);
         }
         Ok(())
     }
 
     /// Takes over which generation was opened, and who passed. spec: SYNC-12
     fn hear(&mut self, now: Time, said: &BarrierSaid) {
-        let parties = said.parties.iter().map(ToString::to_string).collect();
-        let key = Key { name: said.name.clone(), parties };
+        let key = said.key();
         // One that nobody here has to do with is only said on, if there is room. None makes way for it: two nodes that know
         // different ones would take turns for ever.
-        if self.known.len() >= BARRIERS_MAX && !self.known.contains_key(&key) {
+        if self.known.len() >= self.barriers_max && !self.known.contains_key(&key) {
             return;
         }
-        let known = self.known.entry(key).or_insert_with(|| Known::new(said.parties.clone()));
-        let before = known.members.len();
-        let is_news = match said.generation.cmp(&known.generation) {
-            std::cmp::Ordering::Less => false,
-            std::cmp::Ordering::Equal => {
-                let room = ARRIVALS_MAX.saturating_sub(before);
-                known.members.extend(said.members.iter().copied().take(room));
-                known.members.len() > before
-            }
-            std::cmp::Ordering::Greater => {
-                known.generation = said.generation;
-                known.members = said.members.iter().copied().collect();
-                true
-            }
-        };
-        if is_news {
-            let passed = known.pass(self.node, self.incarnation);
+        let (here, voices) = ((self.node, self.incarnation), &self.voices);
+        let known = self.known.entry(key.clone()).or_insert_with(|| Known::new(said.parties.clone()));
+        let before = known.generation;
+        if known.hear(said, |member| voices.knows(here, before, &key, member)) {
+            let passed = known.pass(here);
             self.answer_opened(passed);
             self.changed(now);
         }
@@ -329,17 +273,12 @@ impl Rendezvous {
     fn changed(&mut self, now: Time) {
         self.version += 1;
         self.encoded = None;
-        for peer in self.peers.values_mut() {
-            let earliest = peer.sent.map_or(now, |sent| now.max(sent + SPACING));
-            peer.due = Some(peer.due.map_or(earliest, |due| due.min(earliest)));
-        }
+        self.voices.make_due(now);
     }
 
     /// What our word did not reach is said again soon.
     pub(super) fn not_taken(&mut self, now: Time, node: NodeAddress) {
-        if let Some(peer) = self.peers.get_mut(&node) {
-            peer.due = Some(now + super::barrier::RETRY);
-        }
+        self.voices.not_taken(now, node);
     }
 
     /// The linked nodes to which our word goes now.
@@ -348,31 +287,17 @@ impl Rendezvous {
         now: Time,
         is_linked: impl Fn(NodeAddress) -> bool,
     ) -> Vec<NodeAddress> {
-        let mut due = Vec::new();
-        for (node, peer) in &mut self.peers {
-            if peer.due.is_none_or(|due| due > now) {
-                continue;
-            }
-            let goes = is_linked(*node) && !self.known.is_empty();
-            peer.due = goes.then(|| now + REPEAT);
-            if goes {
-                peer.sent = Some(now);
-                due.push(*node);
-            }
-        }
-        due
+        self.voices.take_due(now, !self.known.is_empty(), is_linked)
     }
 
-    /// Our word.
-    pub(super) fn encoded(&mut self) -> Bytes {
+    /// Our word; and, if it is new, how many barriers have no room in it.
+    pub(super) fn encoded(&mut self) -> (Bytes, usize) {
         if let Some(bytes) = &self.encoded {
-            return bytes.clone();
+            return (bytes.clone(), 0);
         }
-        let (incarnation, version) = (self.incarnation, self.version);
-        let barriers = self.known.iter().map(|(key, known)| known.said(key)).collect();
-        let bytes = Arrivals { incarnation, version, barriers }.encode();
+        let (bytes, left_out) = self.write();
         self.encoded = Some(bytes.clone());
-        bytes
+        (bytes, left_out)
     }
 
     /// The parties of the barriers at which somebody of this node waits.
@@ -382,60 +307,7 @@ impl Rendezvous {
 
     /// When there is something to do without news.
     pub(super) fn next_wake(&self) -> Option<Time> {
-        let due = self.peers.values().filter_map(|peer| peer.due);
         let waits = self.known.values().flat_map(|known| known.waiting.values());
-        due.chain(waits.map(Wait::next)).min()
-    }
-}
-
-impl BarrierSaid {
-    fn is_about(&self, key: &Key) -> bool {
-        self.name == key.name && self.parties.iter().map(Requirement::as_str).eq(&key.parties)
-    }
-}
-
-impl Wait {
-    fn next(&self) -> Time {
-        self.lost.map_or(self.until, |lost| self.until.min(lost + GRACE))
-    }
-}
-
-impl Known {
-    fn new(parties: Vec<Requirement>) -> Self {
-        let (members, waiting, visitors) = (BTreeSet::new(), BTreeMap::new(), BTreeSet::new());
-        Self { parties, generation: 0, members, waiting, visitors }
-    }
-
-    /// Lets those pass who stand in the last generation; who waits behind an earlier one waits for the next. Returns who passed,
-    /// with its request and the generation. spec: SYNC-12
-    fn pass(&mut self, node: NodeAddress, incarnation: Incarnation) -> Vec<(AppAddress, u64, u64)> {
-        let Self { generation, members, waiting, .. } = self;
-        let mut passed = Vec::new();
-        waiting.retain(|app, wait| {
-            let is_member = members.contains(&Member { node, incarnation, party: wait.party });
-            let passes = wait.after < *generation && is_member;
-            if passes {
-                passed.push((*app, wait.correlation, *generation));
-            }
-            wait.after = *generation;
-            !passes
-        });
-        passed
-    }
-
-    fn said(&self, key: &Key) -> BarrierSaid {
-        let arrival = |(app, wait): (&AppAddress, &Wait)| Arrival {
-            party: wait.party,
-            app: *app,
-            name: wait.name.clone(),
-            after: wait.after,
-        };
-        BarrierSaid {
-            name: key.name.clone(),
-            parties: self.parties.clone(),
-            generation: self.generation,
-            members: self.members.iter().copied().collect(),
-            arrivals: self.waiting.iter().map(arrival).collect(),
-        }
+        self.voices.next_due().into_iter().chain(waits.map(Wait::next)).min()
     }
 }

@@ -51,7 +51,7 @@ impl Core {
         self.standing(AppAddress::NONE, &requirement).why_not(&requirement)
     }
 
-    /// How a requirement of the application at `of` stands. It never counts for itself.
+    /// How a requirement of the application at `of` stands. It counts for its own: it does not wait for itself.
     pub(super) fn standing(&self, of: AppAddress, requirement: &Requirement) -> Standing {
         let mut standing = Standing::default();
         for alternative in requirement.alternatives() {
@@ -63,7 +63,7 @@ impl Core {
             };
             let before = standing.had.len();
             for name in names {
-                self.count(of, name, alternative, &mut standing);
+                self.count((of, requirement.phase()), name, alternative, &mut standing);
             }
             if standing.had.len() == before {
                 let is_known = self.seen.contains(alternative);
@@ -74,14 +74,20 @@ impl Core {
         standing
     }
 
-    /// Counts those that have `name`, but for the application at `of`.
-    fn count(&self, of: AppAddress, name: &str, alternative: &str, standing: &mut Standing) {
-        let here = self.apps.called(name).map(|(address, app)| (Tid::new(self.node, address), app.why_not()));
+    /// Counts those that have `name`, the application at `of` in any case.
+    fn count(
+        &self,
+        (of, phase): (AppAddress, Option<&str>),
+        name: &str,
+        alternative: &str,
+        standing: &mut Standing,
+    ) {
+        let here = self.apps.called(name);
+        let here = here.map(|(address, app)| (Tid::new(self.node, address), app.why_not(phase)));
         let mut reasons = Vec::new();
-        for (tid, why_not) in here.into_iter().chain(self.peers.standing(name)) {
+        for (tid, why_not) in here.into_iter().chain(self.peers.standing(name, phase)) {
             match why_not {
-                // It neither counts nor is missing.
-                _ if tid == Tid::new(self.node, of) => {}
+                _ if tid == Tid::new(self.node, of) => drop(standing.ready.insert(tid)),
                 None => drop(standing.ready.insert(tid)),
                 Some(reason) => reasons.push(reason),
             }
@@ -121,15 +127,17 @@ impl Core {
         let words = |name: &str, reason: Reason| {
             if in_cycle(name) { Reason::Cycle.words() } else { reason.words() }
         };
-        if let Some(name) = requirement.only_name() {
-            return vec![(name.to_owned(), words(name, nearest))];
+        if let Some(name) = requirement.one_name().filter(|_| requirement.wait_max().is_none()) {
+            let what = requirement.phase().map_or_else(|| name.to_owned(), |_| requirement.to_string());
+            return vec![(what, words(name, nearest))];
         }
+        let there = if requirement.phase().is_some() { "there" } else { "ready" };
         if unready.is_empty() {
-            return vec![(format!("{requirement} ({ready} ready)"), nearest.words())];
+            return vec![(format!("{requirement} ({ready} {there})"), nearest.words())];
         }
         let named = unready.iter().take(NAMED_MAX);
         named
-            .map(|(name, reason)| (format!("{requirement} ({ready} ready): {name}"), words(name, *reason)))
+            .map(|(name, reason)| (format!("{requirement} ({ready} {there}): {name}"), words(name, *reason)))
             .collect()
     }
 }

@@ -4,8 +4,10 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use proptest::prelude::*;
+use sinew_runtime::app::Requirement;
 
 use super::*;
+use crate::ndl::LossReason;
 
 const NODES: usize = 3;
 /// Each node may have these applications; names are `node.app`.

@@ -8,13 +8,18 @@ mod barriers;
 mod directory;
 #[path = "forms_tests.rs"]
 mod forms;
+#[path = "phases_tests.rs"]
+mod phases;
 
 use super::{
     barrier::{RETRY, SILENCE},
     peers::{REPEAT, SPACING},
     *,
 };
-use crate::sync::list::{Entry, Name};
+use crate::{
+    ndl::LossReason,
+    sync::list::{Entry, List, Name},
+};
 
 const HERE: NodeAddress = NodeAddress::new(0x7f00_0001);
 const KNEE: NodeAddress = NodeAddress::new(0x7f00_0002);
@@ -102,6 +107,7 @@ fn list(version: u64, entries: &[(&str, bool, &[&str])]) -> List {
         app: app(index),
         ready: *ready,
         ended: None,
+        phases: Vec::new(),
         requires: requires.iter().map(|text| text.parse().unwrap()).collect(),
         kinds: Vec::new(),
     });
@@ -385,6 +391,16 @@ fn the_whole_list_goes_out_at_link_up_at_each_change_and_every_two_seconds() {
     assert_eq!(bench.core.next_wake(), Some(bench.now + REPEAT));
     bench.breaks(KNEE);
     assert_eq!(published(&bench.passes(REPEAT)), []);
+}
+
+#[test]
+fn one_fixed_address_on_two_nodes_is_two_tids() {
+    let mut bench = Bench::new();
+    bench.registers(0, "hip.drive", &[]);
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("knee.drive", true, &[])]));
+    let tids = bench.core.directory().into_iter().map(|entry| entry.tid);
+    assert_eq!(tids.collect::<Vec<_>>(), [Tid::new(HERE, app(0)), Tid::new(KNEE, app(0))]);
 }
 
 // spec: SYNC-6

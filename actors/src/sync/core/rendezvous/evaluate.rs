@@ -3,9 +3,27 @@
 use super::*;
 
 /// Who waits at a barrier behind its last generation.
-struct Present {
+struct Present<'known> {
     member: Member,
-    name: String,
+    name: &'known str,
+}
+
+/// How a barrier stands.
+enum Standing {
+    /// All are there: these.
+    Complete(Vec<Member>),
+    /// Some are missing.
+    Lacks(Lack),
+}
+
+/// What a barrier lacks.
+struct Lack {
+    /// Who is missing, and the last that is known of each, where somebody is to be told.
+    missing: Vec<(String, String)>,
+    /// Whether a party is lost that somebody does not want to wait for.
+    has_lost: bool,
+    /// Those who wait whose time is over.
+    over: Vec<AppAddress>,
 }
 
 impl Rendezvous {
@@ -17,70 +35,84 @@ impl Rendezvous {
         linked: impl Fn(NodeAddress) -> Option<Incarnation>,
         why_not: impl Fn(&str) -> Option<Reason>,
     ) {
-        let keys: Vec<Key> = self
-            .known
-            .iter()
-            .filter(|(_, known)| !known.waiting.is_empty())
-            .map(|(key, _)| key.clone())
+        let awaited = self.known.iter().filter(|(_, known)| !known.waiting.is_empty());
+        let standings: Vec<(Key, Standing)> = awaited
+            .map(|(key, known)| (key.clone(), self.standing(now, (key, known), &linked, &why_not)))
             .collect();
-        for key in keys {
-            let present = self.present(&key, &linked);
-            let Some(known) = self.known.get_mut(&key) else { continue };
-            if is_complete(&known.parties, &present) && known.generation < GENERATION_MAX {
-                // spec: SYNC-11
-                known.generation += 1;
-                known.members =
-                    present.into_iter().map(|present| present.member).take(ARRIVALS_MAX).collect();
-                let passed = known.pass(self.node, self.incarnation);
-                self.answer_opened(passed);
-                self.changed(now);
-                continue;
+        for (key, standing) in standings {
+            match standing {
+                Standing::Complete(present) => self.open(now, &key, present),
+                Standing::Lacks(lack) => self.end_waits(now, &key, lack),
             }
-            let has_lost = known.parties.iter().any(|party| is_lost(party, &present, &why_not));
-            let over: Vec<AppAddress> = known
-                .waiting
-                .iter_mut()
-                .filter_map(|(app, wait)| wait.is_over(now, has_lost).then_some(*app))
-                .collect();
-            if over.is_empty() {
-                continue;
-            }
-            let missing = missing(&known.parties, &present, &why_not);
-            for app in over {
-                let Some(wait) = known.waiting.remove(&app) else { continue };
-                let missing = missing.clone();
-                let answer = if wait.until <= now {
-                    BarrierAnswer::TimedOut { missing }
-                } else {
-                    BarrierAnswer::Lost { missing }
-                };
-                self.answers.push((app, wait.correlation, answer));
-            }
-            self.changed(now);
         }
     }
 
-    /// Who waits at `key` behind the last generation that is known here, on this node and on all that can be heard.
-    fn present(&self, key: &Key, linked: &impl Fn(NodeAddress) -> Option<Incarnation>) -> Vec<Present> {
-        let Some(known) = self.known.get(key) else { return Vec::new() };
-        let mut present = Vec::new();
-        for wait in known.waiting.values().filter(|wait| wait.after == known.generation) {
-            let member = Member { node: self.node, incarnation: self.incarnation, party: wait.party };
-            present.push(Present { member, name: wait.name.as_deref().unwrap_or_default().to_owned() });
+    fn standing(
+        &self,
+        now: Time,
+        (key, known): (&Key, &Known),
+        linked: &impl Fn(NodeAddress) -> Option<Incarnation>,
+        why_not: &impl Fn(&str) -> Option<Reason>,
+    ) -> Standing {
+        let present = self.present(key, known, linked);
+        if is_complete(&known.parties, &present) && known.generation < GENERATION_MAX {
+            return Standing::Complete(chosen(&known.parties, present));
         }
-        for (node, peer) in self.peers.iter().filter(|(_, peer)| peer.heard) {
-            let Some(said) = peer.said.as_ref().filter(|said| linked(*node) == Some(said.incarnation)) else {
-                continue;
+        let asks = known.waiting.values().any(|wait| wait.on_loss == OnPartyLoss::Fail);
+        let has_lost = asks && known.parties.iter().any(|party| is_lost(party, &present, why_not));
+        let over = known.waiting.iter().filter(|(_, wait)| wait.is_over(now, has_lost));
+        let over: Vec<AppAddress> = over.map(|(app, _)| *app).collect();
+        let missing = if over.is_empty() { Vec::new() } else { missing(&known.parties, &present, why_not) };
+        Standing::Lacks(Lack { missing, has_lost, over })
+    }
+
+    // spec: SYNC-11
+    fn open(&mut self, now: Time, key: &Key, present: Vec<Member>) {
+        let (here, voices) = ((self.node, self.incarnation), &self.voices);
+        let Some(known) = self.known.get_mut(key) else { return };
+        let next = known.generation + 1;
+        known.open(present, |member| voices.knows(here, next, key, member));
+        let passed = known.pass(here);
+        self.answer_opened(passed);
+        self.changed(now);
+    }
+
+    fn end_waits(&mut self, now: Time, key: &Key, Lack { missing, has_lost, over }: Lack) {
+        let Some(known) = self.known.get_mut(key) else { return };
+        for wait in known.waiting.values_mut() {
+            wait.lost = wait.lost_since(now, has_lost);
+        }
+        if over.is_empty() {
+            return;
+        }
+        for app in &over {
+            let Some(wait) = known.waiting.remove(app) else { continue };
+            let missing = missing.clone();
+            let answer = if wait.until <= now {
+                BarrierAnswer::TimedOut { missing }
+            } else {
+                BarrierAnswer::Lost { missing }
             };
-            let of_it = said.barriers.iter().find(|barrier| barrier.is_about(key));
-            let arrivals = of_it.into_iter().flat_map(|barrier| &barrier.arrivals);
-            for arrival in arrivals.filter(|arrival| arrival.after == known.generation) {
-                let member = Member { node: *node, incarnation: said.incarnation, party: arrival.party };
-                present
-                    .push(Present { member, name: arrival.name.as_deref().unwrap_or_default().to_owned() });
-            }
+            self.answers.push((*app, wait.correlation, answer));
         }
-        present
+        over.into_iter().for_each(|app| self.renumber(app));
+        self.changed(now);
+    }
+
+    /// Who waits at a barrier behind the last generation that is known here, on this node and on all that can be heard.
+    fn present<'known>(
+        &'known self,
+        key: &Key,
+        known: &'known Known,
+        linked: impl Fn(NodeAddress) -> Option<Incarnation>,
+    ) -> Vec<Present<'known>> {
+        let (node, incarnation) = (self.node, self.incarnation);
+        let here = known.waiting.values().filter(|wait| wait.after == known.generation).map(|wait| Present {
+            member: Member { node, incarnation, party: wait.party },
+            name: wait.name.as_deref().unwrap_or_default(),
+        });
+        let there = self.voices.waiting(key, known.generation, linked);
+        here.chain(there.map(|(member, name)| Present { member, name })).collect()
     }
 
     /// Who is missing at `key`, and the last that is known of each.
@@ -90,35 +122,61 @@ impl Rendezvous {
         linked: impl Fn(NodeAddress) -> Option<Incarnation>,
         why_not: impl Fn(&str) -> Option<Reason>,
     ) -> Vec<(String, String)> {
-        let present = self.present(key, &linked);
-        self.known.get(key).map_or_else(Vec::new, |known| missing(&known.parties, &present, &why_not))
+        let Some(known) = self.known.get(key) else { return Vec::new() };
+        missing(&known.parties, &self.present(key, known, linked), &why_not)
     }
 }
 
 impl Wait {
-    /// Whether its time is over, or that of a lost party's return.
-    fn is_over(&mut self, now: Time, has_lost: bool) -> bool {
+    /// Since when a party is known to be lost, if one is and this application does not wait for its return.
+    fn lost_since(&self, now: Time, has_lost: bool) -> Option<Time> {
         match (self.on_loss, has_lost) {
-            (OnPartyLoss::Fail, true) => {
-                self.lost.get_or_insert(now);
-            }
-            (OnPartyLoss::Fail, false) | (OnPartyLoss::Wait, _) => self.lost = None,
+            (OnPartyLoss::Fail, true) => self.lost.or(Some(now)),
+            (OnPartyLoss::Fail, false) | (OnPartyLoss::Wait, _) => None,
         }
-        self.next() <= now
+    }
+
+    /// Whether its time is over, or that of a lost party's return.
+    fn is_over(&self, now: Time, has_lost: bool) -> bool {
+        let patience = self.lost_since(now, has_lost).map(|lost| lost + GRACE);
+        patience.map_or(self.until, |patience| self.until.min(patience)) <= now
     }
 }
 
-fn arrived(party: &Requirement, present: &[Present]) -> usize {
-    present.iter().filter(|present| party.counts(&present.name)).count()
+/// How many of a party's applications are there: as many as it takes at most.
+fn arrived(party: &Requirement, present: &[Present<'_>]) -> usize {
+    let there = present.iter().filter(|present| party.counts(present.name));
+    there.take(party.count()).count()
 }
 
 /// Whether all parties are there. spec: SYNC-11
-fn is_complete(parties: &[Requirement], present: &[Present]) -> bool {
-    parties.iter().all(|party| arrived(party, present) >= party.count())
+fn is_complete(parties: &[Requirement], present: &[Present<'_>]) -> bool {
+    // Where fewer are there than one party takes, nobody has to look at names.
+    let most = parties.iter().map(Requirement::count).max().unwrap_or_default();
+    present.len() >= most && parties.iter().all(|party| arrived(party, present) >= party.count())
+}
+
+/// Who passes together: those that the parties take come first, for more than `ARRIVALS_MAX` may be there.
+fn chosen(parties: &[Requirement], present: Vec<Present<'_>>) -> Vec<Member> {
+    if present.len() <= ARRIVALS_MAX {
+        return present.into_iter().map(|present| present.member).collect();
+    }
+    let mut chosen = BTreeSet::new();
+    for party in parties {
+        let of_it = present.iter().filter(|present| party.counts(present.name)).take(party.count());
+        chosen.extend(of_it.map(|present| present.member));
+    }
+    for other in present {
+        if chosen.len() >= ARRIVALS_MAX {
+            break;
+        }
+        chosen.insert(other.member);
+    }
+    chosen.into_iter().collect()
 }
 
 /// Whether a party that is asked for by its name is not there and has ended, as far as is known. spec: SYNC-13
-fn is_lost(party: &Requirement, present: &[Present], why_not: &impl Fn(&str) -> Option<Reason>) -> bool {
+fn is_lost(party: &Requirement, present: &[Present<'_>], why_not: &impl Fn(&str) -> Option<Reason>) -> bool {
     let is_missing = arrived(party, present) < party.count();
     let reason = party.only_name().filter(|_| is_missing).and_then(why_not);
     reason.is_some_and(Reason::is_end)
@@ -126,7 +184,7 @@ fn is_lost(party: &Requirement, present: &[Present], why_not: &impl Fn(&str) -> 
 
 fn missing(
     parties: &[Requirement],
-    present: &[Present],
+    present: &[Present<'_>],
     why_not: &impl Fn(&str) -> Option<Reason>,
 ) -> Vec<(String, String)> {
     let mut missing = Vec::new();

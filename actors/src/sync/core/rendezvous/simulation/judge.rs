@@ -7,10 +7,21 @@ use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
 };
 
-use super::{BARRIERS, BarrierAnswer, Member, name};
+use super::{BARRIERS, BarrierAnswer, Member};
 
-/// An application, by its node and number.
+/// The number of a request at a barrier that is not judged.
+pub(super) const ELSEWHERE: u64 = u64::MAX - 1;
+
+/// An application, by its process and number.
 type App = (usize, usize);
+
+/// An application that arrives.
+pub(super) struct Who {
+    pub(super) app: App,
+    pub(super) name: String,
+    pub(super) node: NodeAddress,
+    pub(super) incarnation: Incarnation,
+}
 
 /// One wait of one life at one barrier.
 #[derive(Debug)]
@@ -32,6 +43,9 @@ pub(super) struct Seen {
     deaths: u64,
     calm: u64,
     waits_at_the_end: u64,
+    counted: u64,
+    doubles: u64,
+    pub(super) crowded_out: u64,
 }
 
 impl Seen {
@@ -45,11 +59,15 @@ impl Seen {
         self.deaths += other.deaths;
         self.calm += other.calm;
         self.waits_at_the_end += other.waits_at_the_end;
+        self.counted += other.counted;
+        self.doubles += other.doubles;
+        self.crowded_out += other.crowded_out;
     }
 
     pub(super) fn must_cover_everything(self) {
-        let counts =
-            [self.timed_out, self.lost, self.given_up, self.deaths, self.calm, self.waits_at_the_end];
+        let ends = [self.timed_out, self.lost, self.given_up, self.deaths];
+        let rest = [self.calm, self.waits_at_the_end, self.counted, self.doubles, self.crowded_out];
+        let counts = [ends.as_slice(), &rest].concat();
         assert!(
             counts.iter().chain(&self.opened).all(|count| *count > 10),
             "hardly anything happens: {self:?}"
@@ -59,18 +77,30 @@ impl Seen {
 
 #[derive(Default)]
 pub(super) struct Judge {
-    /// The present life of each application that has arrived somewhere, and who it is.
-    parties: BTreeMap<App, Member>,
-    /// Lives that have arrived somewhere in this life of a node.
+    /// Who each application that has arrived somewhere in its present life is: another one from each visit on that it gave up. The last one is
+    /// who it is at its next visit.
+    parties: BTreeMap<App, Vec<Member>>,
+    /// How many there were in this life of a node.
     counts: BTreeMap<usize, u64>,
     /// Which application a life is one of.
     names: BTreeMap<Member, String>,
     visits: BTreeMap<(usize, Member), Vec<Visit>>,
+    /// By whom each generation of a barrier was opened, as each node saw it that opened it by its own sight.
+    openings: BTreeMap<(usize, u64), Vec<BTreeSet<Member>>>,
     correlation: u64,
+    /// The nodes that had a double: what was heard of one of the two may be forgotten for the other one.
+    doubled: BTreeSet<NodeAddress>,
     /// Nobody dies, gives up or is taken for lost.
     is_calm: bool,
     pub(super) violations: Vec<String>,
     pub(super) seen: Seen,
+}
+
+/// The next number of a process.
+fn next(counts: &mut BTreeMap<usize, u64>, process: usize) -> u64 {
+    let count = counts.entry(process).or_default();
+    *count += 1;
+    *count
 }
 
 fn is_met(barrier: usize, names: &[String]) -> bool {
@@ -86,9 +116,13 @@ impl Judge {
     }
 
     fn open_visit(&mut self, app: App, barrier: usize) -> Option<&mut Visit> {
-        let member = self.parties.get(&app)?;
-        let last = self.visits.get_mut(&(barrier, *member))?.last_mut()?;
-        (last.passed.is_none() && last.over.is_none()).then_some(last)
+        let visits = &self.visits;
+        let waits = |member: &&Member| {
+            let last = visits.get(&(barrier, **member)).and_then(|visits| visits.last());
+            last.is_some_and(|last| last.passed.is_none() && last.over.is_none())
+        };
+        let member = *self.parties.get(&app)?.iter().find(waits)?;
+        self.visits.get_mut(&(barrier, member))?.last_mut()
     }
 
     pub(super) fn waits(&mut self, app: App, barrier: usize) -> bool {
@@ -96,30 +130,40 @@ impl Judge {
     }
 
     /// An application arrives; the number of its request is returned.
-    pub(super) fn arrives(
-        &mut self,
-        app: App,
-        barrier: usize,
-        incarnation: Incarnation,
-        node: NodeAddress,
-    ) -> u64 {
+    pub(super) fn arrives(&mut self, who: Who, barrier: usize) -> u64 {
         self.correlation += 1;
-        let counts = &mut self.counts;
-        let member = *self.parties.entry(app).or_insert_with(|| {
-            let count = counts.entry(app.0).or_default();
-            *count += 1;
-            Member { node, incarnation, party: *count }
-        });
-        self.names.insert(member, name(app.0, app.1));
+        let member = self.is_somewhere(who);
         let visit = Visit { correlation: self.correlation, passed: None, over: None };
         self.visits.entry((barrier, member)).or_default().push(visit);
         self.correlation
     }
 
+    /// An application is at some barrier; which of its node's lives that is.
+    pub(super) fn is_somewhere(&mut self, Who { app, name, node, incarnation }: Who) -> Member {
+        let counts = &mut self.counts;
+        let members = self.parties.entry(app).or_insert_with(|| {
+            let party = next(counts, app.0);
+            vec![Member { node, incarnation, party }]
+        });
+        let member = members[members.len() - 1];
+        self.names.insert(member, name);
+        member
+    }
+
+    /// Two processes have this address.
+    pub(super) fn doubled(&mut self, node: NodeAddress) {
+        self.seen.doubles += 1;
+        self.doubled.insert(node);
+    }
+
     pub(super) fn gives_up(&mut self, app: App, barrier: usize, generation: u64) {
         self.seen.given_up += 1;
-        if let Some(visit) = self.open_visit(app, barrier) {
-            visit.over = Some(generation);
+        let Some(visit) = self.open_visit(app, barrier) else { return };
+        visit.over = Some(generation);
+        // What was said of this visit is not about the next one.
+        if let Some(members) = self.parties.get_mut(&app) {
+            let party = next(&mut self.counts, app.0);
+            members.push(Member { party, ..members[0] });
         }
     }
 
@@ -166,13 +210,12 @@ impl Judge {
 
     fn passes(&mut self, app: App, barrier: usize, generation: u64) {
         self.seen.opened[barrier] += 1;
-        let member = self.parties[&app];
-        let visits = self.visits.get_mut(&(barrier, member)).unwrap();
-        let before = visits.iter().filter_map(|visit| visit.passed).max();
+        let of_it = self.parties[&app].iter().filter_map(|member| self.visits.get(&(barrier, *member)));
+        let before = of_it.flatten().filter_map(|visit| visit.passed).max();
         if before.is_some_and(|before| before >= generation) {
             self.violations.push(format!("{app:?} passes generation {generation} after {before:?}"));
         }
-        visits.last_mut().unwrap().passed = Some(generation);
+        self.open_visit(app, barrier).unwrap().passed = Some(generation);
     }
 
     /// A node says that this generation was opened by these.
@@ -202,8 +245,49 @@ impl Judge {
         }
     }
 
+    /// A node has opened this generation, and has not heard of it from others.
+    pub(super) fn opened_by_own_sight(&mut self, barrier: usize, generation: u64, members: BTreeSet<Member>) {
+        self.openings.entry((barrier, generation)).or_default().push(members);
+    }
+
+    /// Whoever counted for a generation passed it, or waits no more. Where several nodes opened one apart, which more applications make
+    /// possible than take part, only who was seen by all of them: the others of one may have gone on to the next meanwhile. What only
+    /// those knew who died has not opened.
+    fn nobody_was_left_behind(&mut self, generations: &[Vec<u64>]) {
+        let last = |barrier: usize| generations[barrier].iter().copied().max().unwrap_or_default();
+        for ((barrier, generation), openings) in &self.openings {
+            if *generation > last(*barrier) {
+                continue;
+            }
+            let is_judged = |member: &&Member| {
+                !self.doubled.contains(&member.node) && openings.iter().all(|by| by.contains(*member))
+            };
+            let seen_by_all = openings[0].iter().filter(is_judged);
+            for member in seen_by_all {
+                let visits = self.visits.get(&(*barrier, *member)).into_iter().flatten();
+                let mut ways = visits.map(|visit| (visit.passed, visit.over));
+                let is_well = ways.any(|(passed, over)| {
+                    passed == Some(*generation) || over.is_some_and(|over| *generation <= over + 1)
+                });
+                self.seen.counted += 1;
+                if !is_well {
+                    let (barrier, who) = (BARRIERS[*barrier].0, &self.names[member]);
+                    self.violations
+                        .push(format!("{who} counted for {barrier} {generation} and has not passed it"));
+                }
+            }
+        }
+    }
+
     /// Every link is up and everything was heard.
-    pub(super) fn after_quiet(&mut self, barrier: usize, generations: &[u64]) {
+    pub(super) fn all_is_quiet(&mut self, generations: &[Vec<u64>]) {
+        for (barrier, of_barrier) in generations.iter().enumerate() {
+            self.after_quiet(barrier, of_barrier);
+        }
+        self.nobody_was_left_behind(generations);
+    }
+
+    fn after_quiet(&mut self, barrier: usize, generations: &[u64]) {
         let is_waiting =
             |visits: &Vec<Visit>| visits.iter().any(|visit| visit.passed.is_none() && visit.over.is_none());
         let of_barrier = self.visits.iter().filter(|((other, _), _)| *other == barrier);
@@ -222,7 +306,7 @@ impl Judge {
             self.violations.push(format!("after quiet {names} has generations {generations:?}"));
         }
         // Where nobody died or gave up, named parties go through every generation together.
-        if barrier == 0 && self.is_calm {
+        if barrier == 0 && self.is_calm && !generations.is_empty() {
             self.seen.calm += 1;
             let passed: BTreeSet<Vec<u64>> = of_barrier
                 .map(|(_, visits)| visits.iter().filter_map(|visit| visit.passed).collect())
