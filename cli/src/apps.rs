@@ -84,14 +84,15 @@ fn meeting_cells(node: &str, one: &BarrierReport) -> [String; 5] {
     let waits: Vec<_> =
         one.waiting.iter().map(|who| format!("{} {}", who.name, time(who.waits_us))).collect();
     let missing: Vec<_> = one.missing.iter().map(|who| format!("{} ({})", who.name, who.why)).collect();
-    [one.name.clone(), node.to_owned(), one.generation.to_string(), waits.join(", "), missing.join(", ")]
+    let opened = if one.is_phase { "phase".to_owned() } else { one.generation.to_string() };
+    [one.name.clone(), node.to_owned(), opened, waits.join(", "), missing.join(", ")]
 }
 
 fn meeting_json(node: &str, one: &BarrierReport) -> Value {
     let waiting = one.waiting.iter().map(|who| json!({ "name": who.name, "waits_us": who.waits_us }));
     let missing = one.missing.iter().map(|who| json!({ "name": who.name, "why": who.why }));
     json!({
-        "name": one.name, "node_name": node, "parties": one.parties, "generation": one.generation,
+        "name": one.name, "node_name": node, "parties": one.parties, "is_phase": one.is_phase, "generation": one.generation,
         "waiting": waiting.collect::<Vec<_>>(), "missing": missing.collect::<Vec<_>>(),
     })
 }

@@ -4,9 +4,9 @@ use std::{net::Ipv4Addr, path::PathBuf, time::Duration};
 
 use clap::{Parser, Subcommand};
 
-use crate::{send, watch, why};
+use crate::{keys, send, watch, why};
 
-/// Shows a running Sinew system, from any one node of it. It changes nothing, but for what `send` sends.
+/// Shows a running Sinew system, from any one node of it. It changes nothing, but for what `send` sends, and the files of `keys`.
 ///
 /// It comes in through the socket of a node on this machine (`lncl.socket` in the node's configuration) and asks that node, and through
 /// it all others.
@@ -79,6 +79,11 @@ pub(crate) enum Command {
         #[arg(long, value_name = "ADDRESS")]
         interface: Option<Ipv4Addr>,
     },
+    /// Makes the keys of a whole robot, and shows who has which: its authority, and a key and a certificate for each node
+    ///
+    /// It asks no node. Links between nodes cannot be secured with these keys yet: a node whose configuration names them refuses to start.
+    #[command(subcommand)]
+    Keys(keys::Order),
     /// Prints what makes the shell complete this command's words
     Completions {
         /// Which shell
@@ -96,7 +101,8 @@ impl Arguments {
 const AFTER: &str = "\
 Exit codes:
   0  all is fine
-  1  something was found: a node does not answer, an application is not ready, a message was not delivered, nobody is called so
+  1  something was found: a node does not answer, an application is not ready, a message was not delivered, nobody is called so;
+     keys cannot be made, or count for less than another 30 days
   2  the command line is wrong
   3  no node lets this command in, or that node does not answer
 
@@ -108,4 +114,5 @@ Examples:
   sinew why hip knee.drive
   sinew apps --json | jq '.apps[] | select(.ready | not)'
   sinew --socket /run/sinew/knee.sock barriers
+  sinew keys init walker hip=192.168.0.11 knee=192.168.0.12 && sinew keys show
   sinew completions bash > ~/.local/share/bash-completion/completions/sinew";

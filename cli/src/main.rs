@@ -1,13 +1,14 @@
 //! `sinew`: shows a running system, from any one node of it.
 //!
 //! It comes in through a node's socket like any other program, and asks each node's inspection (`sinew::inspect`) through ordinary
-//! messages. It changes nothing, but for what `send` sends.
+//! messages. It changes nothing, but for what `send` sends. `keys` asks no node: it makes the files by which nodes know each other.
 
 mod apps;
 mod arguments;
 mod audit;
 mod doctor;
 mod door;
+mod keys;
 mod messagepack;
 mod nodes;
 mod ping;
@@ -84,6 +85,7 @@ fn run(arguments: &Arguments) -> Result<Said, Fault> {
         Command::Doctor { interface } => {
             Ok(doctor::show(*interface, arguments.socket.as_deref(), arguments.within()))
         }
+        Command::Keys(order) => keys::show(order),
         Command::Completions { shell } => Ok(completions(*shell)),
     }
 }

@@ -161,7 +161,7 @@ fn lost_cells(lost: &LostReport) -> [String; COLUMNS] {
         found_by,
         dash(),
         dash(),
-        dash(),
+        or_dash(lost.bound_us.map(time)),
         dash(),
         dash(),
     ]
@@ -170,7 +170,7 @@ fn lost_cells(lost: &LostReport) -> [String; COLUMNS] {
 fn lost_json(lost: &LostReport) -> Value {
     json!({
         "node": lost.node.to_string(), "name": lost.name, "incarnation": lost.incarnation.0, "lost_us": lost.lost_us,
-        "why": lost.why, "silent_us": lost.silent_us, "found_by": lost.found_by,
+        "why": lost.why, "silent_us": lost.silent_us, "bound_us": lost.bound_us, "found_by": lost.found_by,
     })
 }
 

@@ -39,6 +39,9 @@ pub(crate) enum Fault {
     /// Nobody is called so.
     #[error("{0}")]
     Whom(String),
+    /// Keys cannot be made or read.
+    #[error("{0}")]
+    Keys(String),
     /// What was said on the command line cannot be meant.
     #[error("{0}")]
     Usage(String),
@@ -48,7 +51,7 @@ impl Fault {
     /// What the command ends with: see [`Arguments`](crate::arguments::Arguments).
     pub(crate) const fn code(&self) -> u8 {
         match self {
-            Self::Whom(_) => FINDING,
+            Self::Whom(_) | Self::Keys(_) => FINDING,
             Self::Usage(_) => USAGE,
             Self::NoDoor(_) | Self::NotTaken(..) | Self::NoAnswer(..) => NOBODY,
         }

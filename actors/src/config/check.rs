@@ -11,6 +11,8 @@ use crate::{ndl::FURTHER_MAX, sync::NAME_BYTES_MAX};
 
 /// Longest path of a unix socket in bytes: what every system takes, with the closing zero.
 const SOCKET_BYTES_MAX: usize = 100;
+/// Longest path of a directory in bytes: PATH_MAX of Linux.
+const DIRECTORY_BYTES_MAX: usize = 4_096;
 /// Seeds at most.
 const SEEDS_MAX: usize = 256;
 /// Groups of nodes with a pace of their own at most, and names in one of them.
@@ -122,6 +124,7 @@ impl NodeConfig {
         LAYER_WINDOW.time(&mut faults, self.supervision.layer_window);
         APP_RESTARTS_MAX.count(&mut faults, self.supervision.app_restarts_max);
         APP_WINDOW.time(&mut faults, self.supervision.app_window);
+        self.check_security(&mut faults);
         ConfigFaults::check(faults)
     }
 
@@ -152,6 +155,18 @@ impl NodeConfig {
         CLIENTS_BYTES.count(faults, self.lncl.clients_bytes);
         APPS_MAX.count(faults, self.lncl.apps_max);
         RING_BYTES.count(faults, self.lncl.ring_bytes);
+    }
+
+    fn check_security(&self, faults: &mut Vec<ConfigFault>) {
+        let is_path = |path: &&Path| {
+            let bytes = path.as_os_str().as_encoded_bytes();
+            (1..=DIRECTORY_BYTES_MAX).contains(&bytes.len()) && !bytes.contains(&0)
+        };
+        if let Some(keys) = self.security.keys.as_deref().filter(|keys| !is_path(keys)) {
+            let legal = format!("the path of a directory, 1 to {DIRECTORY_BYTES_MAX} bytes, or false");
+            let remedy = "name the directory that `sinew keys` made for this node, as in /etc/sinew/keys";
+            faults.push(fault("security.keys", quoted(&keys.to_string_lossy()), legal, remedy));
+        }
     }
 
     fn check_further(&self, faults: &mut Vec<ConfigFault>) {

@@ -26,10 +26,10 @@ use super::{
 /// Longest configuration file in bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
-const SECTIONS: [&str; 6] = ["node", "lncl", "gncl", "ndl", "sync", "supervision"];
+const SECTIONS: [&str; 7] = ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 41] = [
+pub(super) const KEYS: [&str; 44] = [
     "node.name",
     "node.project",
     "node.address",
@@ -55,6 +55,7 @@ pub(super) const KEYS: [&str; 41] = [
     "gncl.redial_max_ms",
     "gncl.give_up_ms",
     "gncl.marks",
+    "gncl.datagrams",
     "gncl.spin_ms",
     "ndl.interface",
     "ndl.port",
@@ -71,6 +72,8 @@ pub(super) const KEYS: [&str; 41] = [
     "supervision.layer_window_ms",
     "supervision.app_restarts_max",
     "supervision.app_window_ms",
+    "security.keys",
+    "security.times",
 ];
 
 impl NodeConfig {
@@ -101,6 +104,7 @@ impl NodeConfig {
         reader.time(&check::LAYER_DEADLINE, &mut config.sync.layer_deadline);
         reader.time(&check::REQUIREMENT_DEADLINE, &mut config.sync.requirement_deadline);
         reader.read_supervision(&mut config);
+        reader.read_security(&mut config);
         reader.finish(&config)?;
         Ok(config)
     }
@@ -358,6 +362,7 @@ impl Reader<'_> {
         self.time(&check::REDIAL_MAX, &mut gncl.redial_max);
         self.time(&check::GIVE_UP, &mut gncl.give_up);
         self.truth("gncl.marks", &mut gncl.marks);
+        self.truth("gncl.datagrams", &mut gncl.datagrams);
         self.time(&check::SPIN, &mut gncl.spin);
     }
 
@@ -401,6 +406,13 @@ impl Reader<'_> {
         self.time(&check::LAYER_WINDOW, &mut supervision.layer_window);
         self.number(&check::APP_RESTARTS_MAX, &mut supervision.app_restarts_max);
         self.time(&check::APP_WINDOW, &mut supervision.app_window);
+    }
+
+    fn read_security(&mut self, config: &mut NodeConfig) {
+        let security = &mut config.security;
+        self.text_or_off("security.keys", "\"/etc/sinew/keys\" or false", &mut security.keys);
+        let example = "\"until-set\", \"strict\" or \"ignored\"";
+        self.text("security.times", example, &mut security.times);
     }
 
     fn read_list<T: FromStr>(

@@ -23,6 +23,8 @@ use sinew_runtime::{
     tid::NodeAddress,
 };
 
+use crate::security::TimePolicy;
+
 /// Everything that can be set about a node.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NodeConfig {
@@ -52,6 +54,8 @@ pub struct NodeConfig {
     pub sync: SyncConfig,
     /// How many restarts are too many.
     pub supervision: SupervisionConfig,
+    /// Who other nodes are, proven.
+    pub security: SecurityConfig,
 }
 
 /// Local Node Communication Layer: the applications of this host.
@@ -109,6 +113,9 @@ pub struct GnclConfig {
     /// DSCP EF, AF41 and AF11 for Control, Stream and Bulk (RFC 4594), `SO_PRIORITY` 6, 0 and 2; CS6 and 6 for NDL's datagrams.
     /// Default `true`.
     pub marks: bool,
+    /// Whether values of class Stream go to other nodes by UDP where that gets through, so that a packet that is lost holds up nothing but
+    /// itself; else, and what is longer than 1,112 bytes, by TCP. Both nodes must have it so. Default `true`.
+    pub datagrams: bool,
     /// How long the IO thread stays awake after a message of a peer, so that the next one need not wake it: costs a core, and
     /// saves the wake of an idle one, 10 to 50 us, for applications on the IO thread. 0 to 10 ms; default 0, it sleeps at once.
     pub spin: Duration,
@@ -193,6 +200,17 @@ pub struct SupervisionConfig {
     pub app_window: Duration,
 }
 
+/// Security between nodes. **Not in use yet**: a node that has [`keys`](Self::keys) refuses to start
+/// ([`security::NOT_YET`](crate::security::NOT_YET)).
+#[derive(Clone, Debug, PartialEq)]
+pub struct SecurityConfig {
+    /// Directory of the node's keys, as `sinew keys` makes it ([`security::files`](crate::security::files)); 1 to 4,096 bytes. Default:
+    /// none, links between nodes are open to everybody on the network.
+    pub keys: Option<PathBuf>,
+    /// What the times of certificates are good for while the clock may be wrong. Default [`TimePolicy::UntilSet`].
+    pub times: TimePolicy,
+}
+
 impl SupervisionConfig {
     /// How the layers are supervised: each stands on those before it.
     pub(crate) fn layers(&self) -> Flags {
@@ -244,6 +262,7 @@ impl NodeConfig {
                 handshake: Duration::from_secs(2),
                 redial_min: Duration::from_millis(10),
                 marks: true,
+                datagrams: true,
                 spin: Duration::ZERO,
                 redial_max: Duration::from_secs(1),
                 give_up: Duration::from_secs(5),
@@ -269,6 +288,7 @@ impl NodeConfig {
                 app_restarts_max: 5,
                 app_window: Duration::from_secs(10),
             },
+            security: SecurityConfig { keys: None, times: TimePolicy::UntilSet },
         }
     }
 

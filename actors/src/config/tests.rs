@@ -149,6 +149,8 @@ fn texts_are_legal_at_both_ends_and_not_beyond() {
         ("gncl.further", "'10.0.0.7'".to_owned(), false),
         ("gncl.marks", "false".to_owned(), true),
         ("gncl.marks", "0".to_owned(), false),
+        ("gncl.datagrams", "false".to_owned(), true),
+        ("gncl.datagrams", "1".to_owned(), false),
         ("ndl.interface", "'127.0.0.1'".to_owned(), true),
         ("ndl.interface", "'0.0.0.0'".to_owned(), false),
         ("ndl.interface", "'224.0.0.1'".to_owned(), false),
@@ -189,6 +191,30 @@ fn groups_of_nodes_are_legal_at_both_ends_and_not_beyond() {
         ("ndl.watch", "{}".to_owned(), false),
     ];
     are_legal_or_not(cases);
+}
+
+#[test]
+fn security_is_a_directory_or_off_and_a_policy_that_exists() {
+    let path = |bytes| format!("{:?}", "k".repeat(bytes));
+    let cases = [
+        ("security.keys", "false".to_owned(), true),
+        ("security.keys", "true".to_owned(), false),
+        ("security.keys", "7".to_owned(), false),
+        ("security.keys", path(0), false),
+        ("security.keys", path(1), true),
+        ("security.keys", path(4_096), true),
+        ("security.keys", path(4_097), false),
+        ("security.keys", r#""a\u0000b""#.to_owned(), false),
+        ("security.times", "'strict'".to_owned(), true),
+        ("security.times", "'until-set'".to_owned(), true),
+        ("security.times", "'ignored'".to_owned(), true),
+        ("security.times", "'never'".to_owned(), false),
+        ("security.times", "false".to_owned(), false),
+    ];
+    are_legal_or_not(cases);
+    let config = NodeConfig::from_toml(&with("security.keys", "'/etc/keys'", "times = 'strict'")).unwrap();
+    let security = SecurityConfig { keys: Some("/etc/keys".into()), times: TimePolicy::Strict };
+    assert_eq!(config.security, security);
 }
 
 /// Keys, values, and whether they are legal.

@@ -1,5 +1,6 @@
 //! The command itself, against real node processes: what it says of two nodes from one of them, and how it fails.
 
+mod keys;
 mod scenario;
 mod send;
 mod watch;
@@ -280,10 +281,7 @@ fn the_tree_of_another_node_has_its_layers_and_its_application() {
 fn an_audit_explains_every_message_of_both_nodes_while_they_talk_and_names_who_does_not_answer() {
     // Given: the hip sends to the knee all the time
     let scenario = Scenario::new();
-    let mut hip = scenario.start("hip", 1, &["--requires", "knee", "--sends-to", "knee"]);
-    let mut knee = scenario.start("knee", 2, &[]);
-    hip.wait_for(&["started"]);
-    knee.wait_for(&["count 5 "]);
+    let (_hip, knee) = scenario.start_a_hip_that_sends_to_a_knee();
     for here in ["hip", "knee"] {
         // When
         let answer = scenario.sinew(here, &["audit", "--json"]);

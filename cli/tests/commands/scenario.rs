@@ -42,6 +42,15 @@ impl Scenario {
         self.start_changed(name, address, &[], more)
     }
 
+    /// The hip, which sends counts to the knee all the time, and the knee, which has the first of them.
+    pub(crate) fn start_a_hip_that_sends_to_a_knee(&self) -> (Program, Program) {
+        let mut hip = self.start("hip", 1, &["--requires", "knee", "--sends-to", "knee"]);
+        let mut knee = self.start("knee", 2, &[]);
+        hip.wait_for(&["started"]);
+        knee.wait_for(&["count 5 "]);
+        (hip, knee)
+    }
+
     /// As `start`, with these texts of its configuration replaced by others.
     pub(crate) fn start_changed(
         &self,

@@ -58,10 +58,7 @@ fn lines(text: &str) -> Vec<Value> {
 fn what_an_application_gets_and_sends_is_seen_decoded_from_either_node() {
     // Given: the hip sends counts to the knee
     let scenario = Scenario::new();
-    let mut hip = scenario.start("hip", 1, &["--requires", "knee", "--sends-to", "knee"]);
-    let mut knee = scenario.start("knee", 2, &[]);
-    hip.wait_for(&["started"]);
-    knee.wait_for(&["count 5 "]);
+    let (_hip, _knee) = scenario.start_a_hip_that_sends_to_a_knee();
     for here in ["hip", "knee"] {
         for (whom, is_sent) in [("hip", true), ("knee", false)] {
             // When

@@ -68,6 +68,7 @@ fn a_node_that_was_killed_is_shown_as_lost_with_how_it_was_found_and_why_says_wh
     // Then
     let lost = named(&said["lost"], "knee").expect("it was there");
     assert_eq!((&lost["node"], &lost["why"]), (&"127.0.0.2".into(), &"crashed".into()), "{lost}");
+    assert!(lost["silent_us"].as_u64() <= lost["bound_us"].as_u64(), "{lost}");
     assert!(lost["found_by"].as_array().is_some_and(|by| !by.is_empty()), "{lost}");
     let table = scenario.sinew("hip", &["nodes"]);
     assert!(table.code == Some(1) && table.out.contains("its process has ended"), "{}", table.out);

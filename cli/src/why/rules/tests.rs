@@ -125,6 +125,7 @@ fn lost(why: &str) -> LostReport {
         lost_us: 3_000_000,
         why: why.to_owned(),
         silent_us: 1_500_000,
+        bound_us: Some(2_000_000),
         found_by: Vec::new(),
     }
 }

@@ -1,0 +1,185 @@
+//! The files of a node: what they are called, and reading them with a look at who else may read or change them.
+//!
+//! ```text
+//! /etc/sinew/keys/      0700   security.keys names this directory
+//!   node.key            0600   the node's own key (PKCS #8, PEM); it never leaves the node
+//!   node.pem            0644   its certificate
+//!   ca.pem              0644   the certificate of the project's authority
+//!   discovery.key       0600   the project's key for datagrams of discovery: 64 hexadecimal digits
+//!   denied.txt          0644   the deny list
+//! ```
+
+use std::{
+    fs::OpenOptions,
+    io::{self, Read},
+    os::unix::fs::{MetadataExt, OpenOptionsExt},
+    path::{Path, PathBuf},
+};
+
+use zeroize::Zeroizing;
+
+/// The node's own key.
+pub const NODE_KEY: &str = "node.key";
+/// The node's certificate.
+pub const NODE_CERTIFICATE: &str = "node.pem";
+/// The certificate of the project's authority.
+pub const AUTHORITY: &str = "ca.pem";
+/// The project's key for datagrams of discovery.
+pub const DISCOVERY_KEY: &str = "discovery.key";
+/// The deny list.
+pub const DENIED: &str = "denied.txt";
+
+/// Longest file of a key or a certificate in bytes: those that `sinew keys` makes have less than 1 KiB.
+const KEY_BYTES_MAX: u64 = 16 << 10;
+/// Longest deny list in bytes: every number with a comment.
+const DENIED_BYTES_MAX: u64 = 8 << 20;
+
+/// Bits of a file's mode: others than its owner may write to it.
+const WRITABLE_BY_OTHERS: u32 = 0o022;
+/// Others than its owner may do anything with it.
+const OPEN_TO_OTHERS: u32 = 0o077;
+
+/// Why a file is not taken. The environment is at fault; nothing was changed.
+#[derive(Debug, thiserror::Error)]
+pub enum FileFault {
+    /// It cannot be read.
+    #[error(
+        "{path}: {cause}; copy the node's directory there as `sinew keys` says, and start the node as its owner"
+    )]
+    Unreadable {
+        /// Which.
+        path: PathBuf,
+        /// What the system says.
+        cause: io::Error,
+    },
+    /// It is something else.
+    #[error("{path} is no {wanted}; put the one there that `sinew keys` made")]
+    Other {
+        /// Which.
+        path: PathBuf,
+        /// What it is to be.
+        wanted: &'static str,
+    },
+    /// It belongs to somebody else, who can change it.
+    #[error("{path} belongs to user {owner}, this node runs as user {user}: `chown {user} {path}`")]
+    ForeignOwner {
+        /// Which.
+        path: PathBuf,
+        /// Its owner.
+        owner: u32,
+        /// The node's user.
+        user: u32,
+    },
+    /// Others can read a secret.
+    #[error(
+        "{path} is a secret, and others can get at it (mode {mode:04o}): `chmod 600 {path}`; if others use this machine, \
+         take it for stolen: `sinew keys revoke` and `issue`"
+    )]
+    Exposed {
+        /// Which.
+        path: PathBuf,
+        /// Its mode.
+        mode: u32,
+    },
+    /// Others can change what the node believes.
+    #[error(
+        "others can write to {path} (mode {mode:04o}), and so decide whom this node believes: `chmod go-w {path}`"
+    )]
+    Writable {
+        /// Which.
+        path: PathBuf,
+        /// Its mode.
+        mode: u32,
+    },
+    /// It is longer than any such file.
+    #[error(
+        "{path} has more than {bytes_max} bytes, which no such file has; put the one there that `sinew keys` made"
+    )]
+    TooLong {
+        /// Which.
+        path: PathBuf,
+        /// Longest in bytes.
+        bytes_max: u64,
+    },
+}
+
+/// Who may do what with a file.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Guarded {
+    /// Only its owner, anything.
+    Secret,
+    /// Only its owner, write.
+    Public,
+}
+
+/// Reads a secret of at most 16 KiB; only its owner may have any right to it.
+///
+/// # Errors
+/// It cannot be had, or somebody else can have it, too.
+pub fn secret(path: &Path) -> Result<Zeroizing<Vec<u8>>, FileFault> {
+    read(path, Guarded::Secret, KEY_BYTES_MAX)
+}
+
+/// Reads a certificate, as text.
+pub(super) fn certificate(path: &Path) -> Result<Zeroizing<Vec<u8>>, FileFault> {
+    read(path, Guarded::Public, KEY_BYTES_MAX)
+}
+
+/// Reads the deny list.
+pub(super) fn denied(path: &Path) -> Result<Zeroizing<Vec<u8>>, FileFault> {
+    read(path, Guarded::Public, DENIED_BYTES_MAX)
+}
+
+/// Whether `path` is a directory in which nobody else can put another file in the place of one.
+///
+/// # Errors
+/// It is none, or somebody else can.
+pub fn directory(path: &Path) -> Result<(), FileFault> {
+    let unreadable = |cause| FileFault::Unreadable { path: path.to_owned(), cause };
+    let about = std::fs::metadata(path).map_err(unreadable)?;
+    if !about.is_dir() {
+        return Err(FileFault::Other { path: path.to_owned(), wanted: "directory" });
+    }
+    check(path, about.uid(), about.mode(), Guarded::Public)
+}
+
+/// What is checked is what is read: the file is looked at after it is open.
+fn read(path: &Path, guarded: Guarded, bytes_max: u64) -> Result<Zeroizing<Vec<u8>>, FileFault> {
+    let unreadable = |cause| FileFault::Unreadable { path: path.to_owned(), cause };
+    // A pipe in its place would hold the node up for ever.
+    let no_wait = rustix::fs::OFlags::NONBLOCK.bits().cast_signed();
+    let file = OpenOptions::new().read(true).custom_flags(no_wait).open(path).map_err(unreadable)?;
+    let about = file.metadata().map_err(unreadable)?;
+    if !about.is_file() {
+        return Err(FileFault::Other { path: path.to_owned(), wanted: "file" });
+    }
+    check(path, about.uid(), about.mode(), guarded)?;
+    let too_long = || FileFault::TooLong { path: path.to_owned(), bytes_max };
+    if about.len() > bytes_max {
+        return Err(too_long());
+    }
+    // Room for all of it at once: a buffer that grows leaves copies of the secret behind.
+    let room = usize::try_from(about.len()).map_err(|_| too_long())? + 1;
+    let mut bytes = Zeroizing::new(Vec::with_capacity(room));
+    file.take(bytes_max + 1).read_to_end(&mut bytes).map_err(unreadable)?;
+    if bytes.len() as u64 > bytes_max {
+        return Err(too_long());
+    }
+    Ok(bytes)
+}
+
+fn check(path: &Path, owner: u32, mode: u32, guarded: Guarded) -> Result<(), FileFault> {
+    let (path, mode) = (path.to_owned(), mode & 0o7777);
+    let user = rustix::process::geteuid().as_raw();
+    // What root owns only root can change, who can change everything.
+    if owner != user && owner != 0 {
+        return Err(FileFault::ForeignOwner { path, owner, user });
+    }
+    if guarded == Guarded::Secret && mode & OPEN_TO_OTHERS != 0 {
+        return Err(FileFault::Exposed { path, mode });
+    }
+    if mode & WRITABLE_BY_OTHERS != 0 {
+        return Err(FileFault::Writable { path, mode });
+    }
+    Ok(())
+}

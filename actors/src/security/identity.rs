@@ -1,0 +1,168 @@
+//! What a certificate says of who shows it: project, address and name, as a URI in its alternative names.
+//!
+//! ```text
+//! sinew://walker/node/192.168.0.11/hip     a node
+//! sinew://walker                           the project's authority
+//! ```
+//!
+//! Project and name are percent-encoded (RFC 3986, section 2.1) but for letters, digits and `-._~`. There is one way to write each
+//! identity, and no other is read.
+
+use std::{
+    fmt::{self, Write as _},
+    net::Ipv4Addr,
+};
+
+use sinew_runtime::tid::NodeAddress;
+
+use crate::sync::NAME_BYTES_MAX;
+
+const SCHEME: &str = "sinew://";
+
+/// Which node of which project.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Identity {
+    /// The project, as in `node.project`.
+    pub project: String,
+    /// The node's address, as in `node.address`.
+    pub address: NodeAddress,
+    /// The node's name, as in `node.name`.
+    pub name: String,
+}
+
+impl Identity {
+    /// As it stands in a certificate.
+    ///
+    /// ```
+    /// use sinew::security::Identity;
+    /// let hip = Identity { project: "walker".into(), address: [192, 168, 0, 11].into(), name: "hip".into() };
+    /// assert_eq!(hip.uri(), "sinew://walker/node/192.168.0.11/hip");
+    /// assert_eq!(Identity::from_uri(&hip.uri()), Some(hip));
+    /// ```
+    #[must_use]
+    pub fn uri(&self) -> String {
+        let address = Ipv4Addr::from(self.address.bits());
+        format!("{}/node/{address}/{}", project_uri(&self.project), escaped(&self.name))
+    }
+
+    /// The identity that `uri` is; `None` if it is none, or written in another way than [`uri`](Self::uri) writes it.
+    #[must_use]
+    pub fn from_uri(uri: &str) -> Option<Self> {
+        let mut parts = uri.strip_prefix(SCHEME)?.split('/');
+        let project = unescaped(parts.next()?)?;
+        let is_node = parts.next()? == "node";
+        let address = NodeAddress::from(parts.next()?.parse::<Ipv4Addr>().ok()?);
+        let name = unescaped(parts.next()?)?;
+        let identity = Self { project, address, name };
+        let is_legal =
+            is_node && address.is_single() && is_name(&identity.project) && is_name(&identity.name);
+        (is_legal && identity.uri() == uri).then_some(identity)
+    }
+}
+
+impl fmt::Display for Identity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "node {:?} ({}) of project {:?}", self.name, self.address, self.project)
+    }
+}
+
+/// How the authority of `project` calls itself in its certificate.
+#[must_use]
+pub fn project_uri(project: &str) -> String {
+    format!("{SCHEME}{}", escaped(project))
+}
+
+/// The project whose authority `uri` is; `None` if it is none.
+#[must_use]
+pub fn project_of(uri: &str) -> Option<String> {
+    let project = unescaped(uri.strip_prefix(SCHEME)?)?;
+    (is_name(&project) && project_uri(&project) == uri).then_some(project)
+}
+
+/// The rule of `node.name` and `node.project`.
+fn is_name(text: &str) -> bool {
+    (1..=NAME_BYTES_MAX).contains(&text.len()) && !text.chars().any(char::is_control)
+}
+
+const fn is_plain(byte: u8) -> bool {
+    byte.is_ascii_alphanumeric() || matches!(byte, b'-' | b'.' | b'_' | b'~')
+}
+
+fn escaped(text: &str) -> String {
+    text.bytes().fold(String::new(), |mut out, byte| {
+        if is_plain(byte) {
+            out.push(byte.into());
+        } else {
+            write!(out, "%{byte:02X}").expect("a String takes all that is written");
+        }
+        out
+    })
+}
+
+fn unescaped(text: &str) -> Option<String> {
+    let mut bytes = Vec::new();
+    let mut rest = text.as_bytes();
+    while let [first, more @ ..] = rest {
+        if *first == b'%' {
+            let (digits, after) = more.split_at_checked(2)?;
+            bytes.push(u8::from_str_radix(str::from_utf8(digits).ok()?, 16).ok()?);
+            rest = after;
+        } else {
+            bytes.push(*first);
+            rest = more;
+        }
+    }
+    String::from_utf8(bytes).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn there_is_one_way_to_write_an_identity() {
+        for wrong in [
+            "",
+            "sinew://walker",
+            "sinew://walker/node/10.0.0.1",
+            "sinew://walker/node/10.0.0.1/hip/",
+            "sinew://walker/node/10.0.0.1/hip/x",
+            "sinew://walker/nodes/10.0.0.1/hip",
+            "sinew://walker/node/10.0.0.01/hip",
+            "sinew://walker/node/0.0.0.0/hip",
+            "sinew://walker/node/255.255.255.255/hip",
+            "sinew://walker/node/10.0.0.1/%68ip",
+            "sinew://walker/node/10.0.0.1/a%2fb",
+            "sinew://walker/node/10.0.0.1/a%2",
+            "sinew://walker/node/10.0.0.1/a%+1",
+            "sinew://walker/node/10.0.0.1/%FF",
+            "sinew://walker/node/10.0.0.1/%0A",
+            "sinew:///node/10.0.0.1/hip",
+            "SINEW://walker/node/10.0.0.1/hip",
+            "https://walker/node/10.0.0.1/hip",
+        ] {
+            assert_eq!(Identity::from_uri(wrong), None, "{wrong}");
+        }
+        assert_eq!(project_of("sinew://walker/"), None);
+        assert_eq!(project_of("sinew://my%20leg"), Some("my leg".to_owned()));
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_written_is_read(project in "\\PC{1,15}", name in "\\PC{1,15}", bits in 1..u32::MAX) {
+            let identity = Identity { project, address: NodeAddress::new(bits), name };
+            prop_assert!(identity.uri().is_ascii());
+            prop_assert_eq!(Identity::from_uri(&identity.uri()), Some(identity.clone()));
+            prop_assert_eq!(project_of(&project_uri(&identity.project)), Some(identity.project));
+        }
+
+        #[test]
+        fn any_text_is_an_identity_or_none(text in "(sinew://)?[a%/0-9.]{0,40}") {
+            if let Some(identity) = Identity::from_uri(&text) {
+                prop_assert_eq!(identity.uri(), text);
+            }
+        }
+    }
+}

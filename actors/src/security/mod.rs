@@ -1,0 +1,52 @@
+//! Security between nodes: who another node is, proven; and datagrams of discovery that nobody else can make.
+//!
+//! A project has a certificate authority, whose key stays off the robot. It signs a certificate for each node, which says the project,
+//! the node's address and its name. Two nodes connect by TLS 1.3, each shows its certificate, and each takes those of its own project's
+//! authority only, of nothing else that the host trusts. `sinew keys` makes all of it.
+//!
+//! ```text
+//! Credentials::load   the files of a node, checked against its configuration
+//!        |
+//!        v
+//!      Tls            configurations of rustls for both ends of a connection, whatever its class
+//!        |
+//!        v
+//!   Tls::peer         after the handshake: which node that is, or why it is not taken
+//! ```
+//!
+//! Datagrams of discovery have no handshake: [`Sealer`] and [`Checker`] are their tags, and what keeps an old one from being taken again.
+//!
+//! Everything here is pure but the reading of files ([`files`]): the time comes in as an argument, or from the
+//! [`TimeProvider`](rustls::time_provider::TimeProvider) that the caller gives.
+//!
+//! **Not in use yet**: GNCL and NDL do not know of it. See [`NOT_YET`].
+
+mod certificate;
+mod credentials;
+mod datagrams;
+mod denied;
+pub mod files;
+mod identity;
+mod peer;
+mod replay;
+#[cfg(test)]
+mod tests;
+mod times;
+mod tls;
+mod verifier;
+
+pub use certificate::{Certificate, Malformed, Serial};
+pub use credentials::{CredentialFault, CredentialFaults, Credentials};
+pub use datagrams::{Checker, DiscoveryKey, Sealer, Stamp, Tag, Verdict};
+pub use denied::{DenyList, DenyListFault};
+pub use identity::{Identity, project_of, project_uri};
+pub use peer::{Peer, PeerFault, words};
+pub use rustls::{self, pki_types::UnixTime};
+pub use times::{Judged, TimeFault, TimePolicy, Validity, date};
+pub use tls::{PROTOCOL, Tls};
+
+/// Why a node whose configuration turns security on refuses to start; `None` once it need not. This is the one place: whoever gives
+/// GNCL's connections to [`Tls`] and NDL's datagrams to [`Sealer`] and [`Checker`] sets it to `None`.
+pub const NOT_YET: Option<&str> = Some(
+    "this build cannot secure the links between nodes yet, and a node that went on would be open to everybody on its network",
+);

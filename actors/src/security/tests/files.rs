@@ -1,0 +1,208 @@
+//! A node's files: what each that is missing, exposed, of another node or of another time is called.
+
+use std::{
+    fs::{self, Permissions},
+    os::unix::fs::PermissionsExt,
+};
+
+use super::ground::{Authority, DAY, Directory, NOW, Wish, at, identity};
+use crate::security::{CredentialFaults, Credentials, TimePolicy, files as names};
+
+fn load(directory: &Directory, policy: TimePolicy, now: u64) -> Result<Credentials, CredentialFaults> {
+    Credentials::load(directory.path(), &identity("hip", 11), policy, at(now))
+}
+
+/// The faults of the hip's directory, changed so.
+fn faults(change: impl FnOnce(&Authority, &Directory)) -> Vec<String> {
+    let walker = Authority::new("walker");
+    let directory = walker.directory(&Wish::of(&identity("hip", 11)));
+    change(&walker, &directory);
+    let faults = load(&directory, TimePolicy::Strict, NOW).expect_err("it has a fault");
+    faults.faults().iter().map(ToString::to_string).collect()
+}
+
+/// The one fault that there is, which has these parts.
+#[track_caller]
+fn only(faults: &[String], parts: &[&str]) {
+    assert_eq!(faults.len(), 1, "{faults:?}");
+    for part in parts {
+        assert!(faults[0].contains(part), "{part}: {}", faults[0]);
+    }
+}
+
+#[test]
+fn good_files_are_taken_and_say_whose_they_are() {
+    let walker = Authority::new("walker");
+    let directory = walker.directory(&Wish::of(&identity("hip", 11)));
+    let credentials = load(&directory, TimePolicy::Strict, NOW).unwrap();
+    assert_eq!((credentials.identity(), credentials.warnings().len()), (&identity("hip", 11), 0));
+    assert_eq!(*credentials.discovery().text(), *walker.discovery.text());
+    assert_eq!(credentials.validity().until, at(NOW + 365 * DAY));
+    let shown = format!("{credentials:?}");
+    assert!(shown.contains("\"hip\"") && !shown.contains("PRIVATE"), "{shown}");
+}
+
+#[test]
+fn every_missing_file_is_named_at_once() {
+    let walker = Authority::new("walker");
+    let directory = walker.directory(&Wish::of(&identity("hip", 11)));
+    let all =
+        [names::NODE_CERTIFICATE, names::NODE_KEY, names::AUTHORITY, names::DISCOVERY_KEY, names::DENIED];
+    for name in all {
+        fs::remove_file(directory.path().join(name)).unwrap();
+    }
+    let said = load(&directory, TimePolicy::Strict, NOW).unwrap_err().to_string();
+    assert_eq!(said.lines().count(), 5, "{said}");
+    for name in all {
+        assert!(said.contains(name) && said.contains("sinew keys"), "{said}");
+    }
+    let nowhere = Credentials::load(
+        &directory.path().join("nowhere"),
+        &identity("hip", 11),
+        TimePolicy::Strict,
+        at(NOW),
+    );
+    assert!(nowhere.unwrap_err().to_string().contains("nowhere: No such file"));
+}
+
+#[test]
+fn a_secret_that_others_can_read_is_refused() {
+    for name in [names::NODE_KEY, names::DISCOVERY_KEY] {
+        for mode in [0o640, 0o604, 0o620, 0o601] {
+            let found = faults(|_, directory| {
+                fs::set_permissions(directory.path().join(name), Permissions::from_mode(mode)).unwrap();
+            });
+            only(&found, &[name, &format!("{mode:04o}"), "chmod 600"]);
+        }
+    }
+}
+
+#[test]
+fn what_others_can_change_is_refused() {
+    for name in [names::NODE_CERTIFICATE, names::AUTHORITY, names::DENIED, "."] {
+        for mode in [0o764, 0o746, 0o722] {
+            let found = faults(|_, directory| {
+                fs::set_permissions(directory.path().join(name), Permissions::from_mode(mode)).unwrap();
+            });
+            only(&found, &["others can write to", "chmod go-w"]);
+        }
+    }
+}
+
+#[test]
+fn what_is_no_file_holds_nobody_up() {
+    for name in [names::NODE_KEY, names::AUTHORITY] {
+        let found = faults(|_, directory| {
+            let path = directory.path().join(name);
+            fs::remove_file(&path).unwrap();
+            rustix::fs::mknodat(
+                rustix::fs::CWD,
+                &path,
+                rustix::fs::FileType::Fifo,
+                rustix::fs::Mode::from_raw_mode(0o600),
+                0,
+            )
+            .unwrap();
+        });
+        only(&found, &[name, "is no file"]);
+    }
+    let found = faults(|_, directory| directory.put(names::NODE_KEY, 0o600, &"k".repeat(17 << 10)));
+    only(&found, &[names::NODE_KEY, "more than 16384 bytes"]);
+}
+
+#[test]
+fn what_is_in_a_file_and_is_not_that_is_said() {
+    let cases: [(&str, u32, &str, &str); 7] = [
+        (names::NODE_CERTIFICATE, 0o644, "", "no certificate in PEM"),
+        (
+            names::NODE_CERTIFICATE,
+            0o644,
+            "-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n",
+            "no certificate",
+        ),
+        (names::NODE_KEY, 0o600, "hello", "no key"),
+        (names::NODE_KEY, 0o600, "-----BEGIN PRIVATE KEY-----\nAAAA\n-----END PRIVATE KEY-----\n", "no key"),
+        (names::DISCOVERY_KEY, 0o600, "00", "64 hexadecimal digits"),
+        (names::DENIED, 0o644, "# ok\nhip\n", "line 2 is \"hip\""),
+        (names::AUTHORITY, 0o644, "-----BEGIN CERTIFICATE-----\n", "PEM"),
+    ];
+    for (name, mode, text, part) in cases {
+        let found = faults(|_, directory| directory.put(name, mode, text));
+        only(&found, &[name, part]);
+    }
+    let twice = faults(|walker, directory| {
+        directory.put(names::AUTHORITY, 0o644, &[walker.pem.as_str(), &walker.pem].concat());
+    });
+    only(&twice, &["more than one certificate"]);
+}
+
+#[test]
+fn files_that_do_not_belong_together_are_told() {
+    let found = faults(|walker, directory| {
+        let other = walker.sign(&Wish::of(&identity("hip", 11)));
+        directory.put(names::NODE_KEY, 0o600, &other.key);
+    });
+    only(&found, &["is not the key of", names::NODE_CERTIFICATE]);
+    let found = faults(|_, directory| {
+        directory.put(names::AUTHORITY, 0o644, &Authority::new("walker").pem);
+    });
+    only(&found, &["is not from the authority", "another authority signed it"]);
+    let found = faults(|_, directory| {
+        directory.put(names::AUTHORITY, 0o644, &Authority::new("runner").pem);
+    });
+    only(&found, &["project \"runner\"", "node.project"]);
+    let found = faults(|walker, directory| {
+        let leaf = walker.sign(&Wish::of(&identity("hip", 11))).certificate;
+        directory.put(names::AUTHORITY, 0o644, &leaf);
+    });
+    only(&found, &["no certificate of a project's authority"]);
+}
+
+#[test]
+fn the_files_of_another_node_are_refused_with_both_names() {
+    let walker = Authority::new("walker");
+    for other in [identity("knee", 12), identity("hip", 12), identity("knee", 11)] {
+        let directory = walker.directory(&Wish::of(&other));
+        let found = load(&directory, TimePolicy::Strict, NOW).unwrap_err();
+        let said: Vec<_> = found.faults().iter().map(ToString::to_string).collect();
+        let (whose, here) = (other.to_string(), identity("hip", 11).to_string());
+        only(&said, &[&whose, &here, "sinew keys issue hip=192.168.0.11"]);
+    }
+}
+
+#[test]
+fn times_and_revocation_of_ones_own_certificate_are_told() {
+    let walker = Authority::new("walker");
+    let wish = Wish { from: NOW - 2 * DAY, until: NOW - DAY, ..Wish::of(&identity("hip", 11)) };
+    let directory = walker.directory(&wish);
+    let said = load(&directory, TimePolicy::UntilSet, NOW).unwrap_err().to_string();
+    assert!(said.contains("it ended on 2026-11-21") && said.contains("sinew keys issue"), "{said}");
+    // Ignored: it is taken, and that is said
+    let credentials = load(&directory, TimePolicy::Ignored, NOW).unwrap();
+    assert!(credentials.warnings()[0].contains("not looked at"));
+    let serial = credentials.serial().to_string();
+    let directory = walker.directory(&Wish::of(&identity("hip", 11)));
+    directory.put(names::DENIED, 0o644, &serial);
+    assert!(load(&directory, TimePolicy::Strict, NOW).is_ok(), "another one's");
+    let own = load(&directory, TimePolicy::Strict, NOW).unwrap().serial().to_string();
+    directory.put(names::DENIED, 0o644, &own);
+    let said = load(&directory, TimePolicy::Ignored, NOW).unwrap_err().to_string();
+    assert!(said.contains(&own) && said.contains("is revoked"), "{said}");
+}
+
+#[test]
+fn a_clock_in_1970_and_an_end_that_comes_are_warned_of() {
+    let walker = Authority::new("walker");
+    let directory = walker.directory(&Wish::of(&identity("hip", 11)));
+    let words =
+        |policy, now| load(&directory, policy, now).map(|credentials| credentials.warnings().to_vec());
+    let warned = words(TimePolicy::UntilSet, 12).unwrap();
+    assert!(
+        warned[0].contains("1970-01-01T00:00:12Z") && warned[0].contains("the clock is not set"),
+        "{warned:?}"
+    );
+    let refused = words(TimePolicy::Strict, 12).unwrap_err().to_string();
+    assert!(refused.contains("the clock is not set"), "{refused}");
+    let soon = words(TimePolicy::UntilSet, NOW + 340 * DAY).unwrap();
+    assert!(soon[0].contains("ends on 2027-11-22"), "{soon:?}");
+}

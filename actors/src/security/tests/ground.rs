@@ -1,0 +1,215 @@
+//! A project that exists for one test: an authority, certificates of any sort, a directory of files, a clock, and a wire in memory.
+
+use std::{
+    fs::{self, Permissions},
+    os::unix::fs::PermissionsExt,
+    path::{Path, PathBuf},
+    sync::{
+        Arc,
+        atomic::{AtomicU32, Ordering},
+    },
+    time::Duration,
+};
+
+use rcgen::{
+    BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, SanType,
+};
+use rustls::{ClientConfig, ClientConnection, CommonState, Error, ServerConfig, ServerConnection};
+use rustls::{pki_types::UnixTime, time_provider::TimeProvider};
+
+use crate::security::{Credentials, DiscoveryKey, Identity, TimePolicy, Tls, files as names, project_uri};
+
+/// The time of the tests: 2026-11-22T15:13:00Z.
+pub(super) const NOW: u64 = 1_795_360_380;
+pub(super) const DAY: u64 = 24 * 3_600;
+
+pub(super) const fn at(seconds: u64) -> UnixTime {
+    UnixTime::since_unix_epoch(Duration::from_secs(seconds))
+}
+
+/// A clock that stands.
+#[derive(Debug)]
+pub(super) struct Clock(pub(super) u64);
+
+impl TimeProvider for Clock {
+    fn current_time(&self) -> Option<UnixTime> {
+        Some(at(self.0))
+    }
+}
+
+pub(super) fn identity(name: &str, last: u8) -> Identity {
+    Identity { project: "walker".to_owned(), address: [192, 168, 0, last].into(), name: name.to_owned() }
+}
+
+/// An authority.
+pub(super) struct Authority {
+    params: CertificateParams,
+    key: KeyPair,
+    pub(super) pem: String,
+    pub(super) discovery: DiscoveryKey,
+}
+
+/// What a certificate is to say.
+pub(super) struct Wish {
+    pub(super) uris: Vec<String>,
+    pub(super) from: u64,
+    pub(super) until: u64,
+    pub(super) usages: Vec<ExtendedKeyUsagePurpose>,
+}
+
+impl Wish {
+    /// As `sinew keys` makes it.
+    pub(super) fn of(identity: &Identity) -> Self {
+        let usages = vec![ExtendedKeyUsagePurpose::ServerAuth, ExtendedKeyUsagePurpose::ClientAuth];
+        Self { uris: vec![identity.uri()], from: NOW - DAY, until: NOW + 365 * DAY, usages }
+    }
+}
+
+/// A key and a certificate, PEM.
+pub(super) struct Pair {
+    pub(super) key: String,
+    pub(super) certificate: String,
+}
+
+impl Authority {
+    pub(super) fn new(project: &str) -> Self {
+        let mut params = CertificateParams::default();
+        params.distinguished_name.push(DnType::CommonName, project);
+        params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
+        params.subject_alt_names = vec![SanType::URI(project_uri(project).try_into().unwrap())];
+        let origin = rcgen::date_time_ymd(1970, 1, 1);
+        params.not_before = origin + Duration::from_secs(NOW - DAY);
+        params.not_after = origin + Duration::from_secs(NOW + 7_300 * DAY);
+        let key = KeyPair::generate().unwrap();
+        let pem = params.self_signed(&key).unwrap().pem();
+        Self { params, key, pem, discovery: DiscoveryKey::generate().unwrap() }
+    }
+
+    pub(super) fn sign(&self, wish: &Wish) -> Pair {
+        let mut params = CertificateParams::default();
+        params.subject_alt_names =
+            wish.uris.iter().map(|uri| SanType::URI(uri.as_str().try_into().unwrap())).collect();
+        params.extended_key_usages = wish.usages.clone();
+        let origin = rcgen::date_time_ymd(1970, 1, 1);
+        params.not_before = origin + Duration::from_secs(wish.from);
+        params.not_after = origin + Duration::from_secs(wish.until);
+        let key = KeyPair::generate().unwrap();
+        let issuer = Issuer::from_params(&self.params, &self.key);
+        let certificate = params.signed_by(&key, &issuer).unwrap().pem();
+        Pair { key: key.serialize_pem(), certificate }
+    }
+
+    /// A node's directory with what `wish` asks for.
+    pub(super) fn directory(&self, wish: &Wish) -> Directory {
+        let Pair { key, certificate } = self.sign(wish);
+        let directory = Directory::new();
+        directory.put(names::NODE_KEY, 0o600, &key);
+        directory.put(names::NODE_CERTIFICATE, 0o644, &certificate);
+        directory.put(names::AUTHORITY, 0o644, &self.pem);
+        directory.put(names::DISCOVERY_KEY, 0o600, &self.discovery.text());
+        directory.put(names::DENIED, 0o644, "");
+        directory
+    }
+
+    pub(super) fn credentials(&self, name: &str, last: u8) -> Credentials {
+        let identity = identity(name, last);
+        load(&self.directory(&Wish::of(&identity)), &identity)
+    }
+
+    /// A node's two ends, at [`NOW`].
+    pub(super) fn tls(&self, name: &str, last: u8) -> Tls {
+        tls(&self.credentials(name, last))
+    }
+}
+
+pub(super) fn load(directory: &Directory, identity: &Identity) -> Credentials {
+    Credentials::load(directory.path(), identity, TimePolicy::Strict, at(NOW)).unwrap()
+}
+
+pub(super) fn tls(credentials: &Credentials) -> Tls {
+    Tls::new(credentials, Arc::new(Clock(NOW))).unwrap()
+}
+
+/// A directory of a test's own, removed with it.
+pub(super) struct Directory(PathBuf);
+
+impl Directory {
+    pub(super) fn new() -> Self {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let number = COUNT.fetch_add(1, Ordering::Relaxed);
+        let path = std::env::temp_dir().join(format!("sinew-keys-{}-{number}", std::process::id()));
+        fs::create_dir(&path).unwrap();
+        fs::set_permissions(&path, Permissions::from_mode(0o700)).unwrap();
+        Self(path)
+    }
+
+    pub(super) fn path(&self) -> &Path {
+        &self.0
+    }
+
+    pub(super) fn put(&self, name: &str, mode: u32, text: &str) {
+        let path = self.0.join(name);
+        fs::write(&path, text).unwrap();
+        fs::set_permissions(&path, Permissions::from_mode(mode)).unwrap();
+    }
+}
+
+impl Drop for Directory {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+/// Both ends of a connection, with a wire in memory between them.
+pub(super) struct Wire {
+    pub(super) client: ClientConnection,
+    pub(super) server: ServerConnection,
+}
+
+impl Wire {
+    pub(super) fn new(client: Arc<ClientConfig>, server: Arc<ServerConfig>) -> Self {
+        Self {
+            client: ClientConnection::new(client, Tls::server_name()).unwrap(),
+            server: ServerConnection::new(server).unwrap(),
+        }
+    }
+
+    /// Carries what either end has to say until both are silent; each end's error, if it has one.
+    pub(super) fn run(&mut self) -> (Result<(), Error>, Result<(), Error>) {
+        let (mut at_client, mut at_server) = (Ok(()), Ok(()));
+        loop {
+            let to_server = written(&mut self.client);
+            let to_client = written(&mut self.server);
+            if to_server.is_empty() && to_client.is_empty() {
+                return (at_client, at_server);
+            }
+            at_server = at_server.and_then(|()| heard(&mut self.server, &to_server));
+            at_client = at_client.and_then(|()| heard(&mut self.client, &to_client));
+        }
+    }
+}
+
+/// What a connection has to say.
+pub(super) fn written<D>(connection: &mut rustls::ConnectionCommon<D>) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    while connection.wants_write() {
+        connection.write_tls(&mut bytes).unwrap();
+    }
+    bytes
+}
+
+/// Tells a connection `bytes`.
+pub(super) fn heard<D>(connection: &mut rustls::ConnectionCommon<D>, mut bytes: &[u8]) -> Result<(), Error> {
+    while !bytes.is_empty() {
+        // It reads no more where its buffer is full of what it does not understand.
+        if connection.read_tls(&mut bytes).unwrap_or(0) == 0 {
+            break;
+        }
+        connection.process_new_packets()?;
+    }
+    Ok(())
+}
+
+pub(super) fn is_open(connection: &CommonState) -> bool {
+    !connection.is_handshaking()
+}

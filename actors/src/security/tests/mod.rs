@@ -1,0 +1,7 @@
+//! Nodes of a project of the tests' own, their handshakes in memory, and what is refused in them.
+
+mod ground;
+
+mod files;
+mod handshakes;
+mod strangers;

@@ -1,0 +1,108 @@
+//! The authority's own key and certificate, and what it signs.
+
+use std::time::Duration;
+
+use rcgen::{
+    BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer,
+    KeyPair, KeyUsagePurpose, SanType,
+};
+use sinew::security::{Identity, UnixTime, date, project_uri};
+
+use crate::system::Fault;
+
+/// For how long the authority's own certificate counts: 20 years, the life of a robot and more.
+const AUTHORITY_DAYS: u64 = 20 * 365;
+/// Certificates count from a little before they are made: the robot's clock may be behind this machine's.
+const BEFORE: Duration = Duration::from_secs(3_600);
+/// When `sinew keys` came into being, in seconds since 1970 (2026-01-01): a clock that shows an earlier time is wrong.
+const EARLIEST: u64 = 1_767_225_600;
+const DAY: Duration = Duration::from_secs(24 * 3_600);
+
+/// From when until when certificates count that are made now.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Clock {
+    pub(super) now: UnixTime,
+    days: u32,
+}
+
+/// A project's authority.
+pub(super) struct Authority {
+    project: String,
+    key: KeyPair,
+}
+
+/// A key and a certificate, as PEM.
+pub(super) struct Pair {
+    pub(super) key: String,
+    pub(super) certificate: String,
+}
+
+impl Clock {
+    /// Refuses a clock that is not set: the certificates would count at another time than was meant.
+    pub(super) fn new(now: UnixTime, days: u32) -> Result<Self, Fault> {
+        if now.as_secs() < EARLIEST {
+            return Err(Fault::Keys(format!(
+                "the clock of this machine says {}, and certificates are made with dates; set it first",
+                date(&now)
+            )));
+        }
+        Ok(Self { now, days })
+    }
+
+    fn set(self, params: &mut CertificateParams, days: u64) {
+        let since_1970 = Duration::from_secs(self.now.as_secs());
+        let days = DAY * u32::try_from(days).unwrap_or(u32::MAX);
+        let origin = rcgen::date_time_ymd(1970, 1, 1);
+        params.not_before = origin + since_1970.saturating_sub(BEFORE);
+        params.not_after = origin + since_1970 + days;
+    }
+}
+
+impl Authority {
+    /// A new one, and its certificate as PEM.
+    pub(super) fn make(project: &str, clock: Clock) -> Result<(Self, Pair), rcgen::Error> {
+        let key = KeyPair::generate()?;
+        let mut params = params_of(project)?;
+        clock.set(&mut params, AUTHORITY_DAYS);
+        let pair = Pair { key: key.serialize_pem(), certificate: params.self_signed(&key)?.pem() };
+        Ok((Self { project: project.to_owned(), key }, pair))
+    }
+
+    /// The one of `project` whose key is in `pem`.
+    pub(super) fn read(project: &str, pem: &str) -> Result<Self, rcgen::Error> {
+        Ok(Self { project: project.to_owned(), key: KeyPair::from_pem(pem)? })
+    }
+
+    /// A key and a certificate for the node `identity`, at both ends of connections.
+    pub(super) fn sign(&self, identity: &Identity, clock: Clock) -> Result<Pair, rcgen::Error> {
+        let own = params_of(&self.project)?;
+        let issuer = Issuer::from_params(&own, &self.key);
+        let key = KeyPair::generate()?;
+        let mut params = CertificateParams::default();
+        params.distinguished_name = named(&identity.name);
+        params.subject_alt_names = vec![SanType::URI(identity.uri().try_into()?)];
+        params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
+        params.extended_key_usages =
+            vec![ExtendedKeyUsagePurpose::ServerAuth, ExtendedKeyUsagePurpose::ClientAuth];
+        params.use_authority_key_identifier_extension = true;
+        clock.set(&mut params, clock.days.into());
+        let certificate = params.signed_by(&key, &issuer)?.pem();
+        Ok(Pair { key: key.serialize_pem(), certificate })
+    }
+}
+
+/// What an authority says of itself: it signs nodes, and no other authority.
+fn params_of(project: &str) -> Result<CertificateParams, rcgen::Error> {
+    let mut params = CertificateParams::default();
+    params.distinguished_name = named(&format!("{project} (Sinew)"));
+    params.subject_alt_names = vec![SanType::URI(project_uri(project).try_into()?)];
+    params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
+    params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
+    Ok(params)
+}
+
+fn named(name: &str) -> DistinguishedName {
+    let mut names = DistinguishedName::new();
+    names.push(DnType::CommonName, name);
+    names
+}

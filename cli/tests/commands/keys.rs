@@ -1,0 +1,343 @@
+//! `sinew keys` as a process: what it makes, for whom it can be read, what it never replaces, and that nodes take it.
+
+use std::{
+    fs,
+    os::unix::fs::PermissionsExt,
+    path::{Path, PathBuf},
+    process::{Command, Output},
+    sync::Arc,
+};
+
+use serde_json::Value;
+use sinew::security::{
+    Credentials, Identity, TimePolicy, Tls, UnixTime,
+    rustls::{ClientConnection, ServerConnection, time_provider::DefaultTimeProvider},
+};
+use sinew_tests::OwnDirectory;
+
+use crate::scenario::{Answer, named};
+
+/// Runs `sinew keys` in `directory`.
+fn keys(directory: &OwnDirectory, words: &[&str]) -> Answer {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
+    command.arg("keys").args(words).current_dir(directory.join("."));
+    let Output { status, stdout, stderr } = command.output().expect("the command starts");
+    let text = |bytes| String::from_utf8(bytes).expect("it writes text");
+    Answer { code: status.code(), out: text(stdout), err: text(stderr) }
+}
+
+/// What it says, which is good.
+#[track_caller]
+fn good(directory: &OwnDirectory, words: &[&str]) -> Value {
+    let answer = keys(directory, &[words, &["--json"]].concat());
+    assert_eq!(answer.code, Some(0), "{words:?}: {}{}", answer.out, answer.err);
+    answer.json()
+}
+
+/// What it says, which is a refusal with these parts.
+#[track_caller]
+fn refused(directory: &OwnDirectory, words: &[&str], code: i32, parts: &[&str]) {
+    let answer = keys(directory, words);
+    assert_eq!(answer.code, Some(code), "{words:?}: {}{}", answer.out, answer.err);
+    for part in parts {
+        assert!(answer.err.contains(part), "{part}: {}", answer.err);
+    }
+}
+
+fn mode(path: &Path) -> u32 {
+    fs::metadata(path).unwrap_or_else(|why| panic!("{}: {why}", path.display())).permissions().mode() & 0o7777
+}
+
+/// Every file and directory below `path`, with its mode and content.
+fn everything(path: &Path) -> Vec<(PathBuf, u32, Vec<u8>)> {
+    let mut all = Vec::new();
+    for entry in fs::read_dir(path).expect("a directory") {
+        let path = entry.expect("an entry").path();
+        let content = fs::read(&path).unwrap_or_default();
+        if path.is_dir() {
+            all.extend(everything(&path));
+        }
+        all.push((path.clone(), mode(&path), content));
+    }
+    all.sort();
+    all
+}
+
+fn credentials(directory: &OwnDirectory, name: &str, address: [u8; 4]) -> Credentials {
+    let identity = Identity { project: "walker".to_owned(), address: address.into(), name: name.to_owned() };
+    let path = directory.join("keys").join("nodes").join(name);
+    Credentials::load(&path, &identity, TimePolicy::Strict, UnixTime::now()).expect("nodes take it")
+}
+
+#[test]
+fn four_names_make_a_robot_whose_nodes_know_each_other() {
+    // Given: nothing
+    let directory = OwnDirectory::new();
+    // When
+    let said = good(&directory, &["init", "walker", "hip", "knee", "ankle", "central"]);
+    // Then: the nodes share this machine, in order
+    let addresses: Vec<_> =
+        said["nodes"].as_array().expect("nodes").iter().map(|node| &node["address"]).collect();
+    assert_eq!(addresses, ["127.0.0.1", "127.0.0.2", "127.0.0.3", "127.0.0.4"]);
+    let hip = named(&said["nodes"], "hip").expect("it");
+    assert_eq!(hip["copy"], "keys/nodes/hip");
+    // And: two of them connect
+    let tls = |name: &str, last| {
+        let credentials = credentials(&directory, name, [127, 0, 0, last]);
+        Tls::new(&credentials, Arc::new(DefaultTimeProvider)).expect("a good key")
+    };
+    let (hip, central) = (tls("hip", 1), tls("central", 4));
+    let mut client = ClientConnection::new(hip.client(), Tls::server_name()).expect("a client");
+    let mut server = ServerConnection::new(central.server()).expect("a server");
+    while client.is_handshaking() || server.is_handshaking() {
+        let mut bytes = Vec::new();
+        client.write_tls(&mut bytes).expect("memory");
+        server.read_tls(&mut &bytes[..]).expect("memory");
+        server.process_new_packets().expect("a good client");
+        bytes.clear();
+        server.write_tls(&mut bytes).expect("memory");
+        client.read_tls(&mut &bytes[..]).expect("memory");
+        client.process_new_packets().expect("a good server");
+    }
+    let peer = hip.peer(&client, Some([127, 0, 0, 4].into()), UnixTime::now()).expect("the central node");
+    assert_eq!(peer.identity.name, "central");
+}
+
+#[test]
+fn files_are_for_whom_they_are_meant_and_nothing_else_is_left() {
+    let directory = OwnDirectory::new();
+    good(&directory, &["init", "walker", "hip=10.0.0.2", "--out", "mine"]);
+    let keys = directory.join("mine");
+    assert_eq!(mode(&keys), 0o700);
+    let all = everything(&keys);
+    let names: Vec<_> = all
+        .iter()
+        .map(|(path, mode, _)| format!("{} {mode:o}", path.strip_prefix(&keys).expect("inside").display()))
+        .map(|name| if name.starts_with("issued/") { "issued/.pem 644".to_owned() } else { name })
+        .collect();
+    let expected = [
+        "ca.key 600",
+        "ca.pem 644",
+        "denied.txt 644",
+        "discovery.key 600",
+        "issued 700",
+        "issued/.pem 644",
+        "nodes 700",
+        "nodes/hip 700",
+        "nodes/hip/ca.pem 644",
+        "nodes/hip/denied.txt 644",
+        "nodes/hip/discovery.key 600",
+        "nodes/hip/node.key 600",
+        "nodes/hip/node.pem 644",
+    ];
+    assert_eq!(names, expected);
+    assert_eq!(fs::read_dir(directory.join(".")).expect("it").count(), 1, "nothing beside it");
+    // The authority's key goes to no node.
+    let authority = fs::read(keys.join("ca.key")).expect("it");
+    assert_eq!(all.iter().filter(|(_, _, content)| *content == authority).count(), 1);
+}
+
+#[test]
+fn nothing_that_exists_is_replaced_without_a_word() {
+    let directory = OwnDirectory::new();
+    good(&directory, &["init", "walker", "hip"]);
+    let before = everything(&directory.join("keys"));
+    refused(&directory, &["init", "walker", "hip"], 1, &["keys of a project", "sinew keys issue", "--out"]);
+    fs::create_dir(directory.join("full")).expect("it");
+    fs::write(directory.join("full").join("notes.txt"), "mine").expect("it");
+    refused(&directory, &["init", "walker", "hip", "--out", "full"], 1, &["no empty directory", "--out"]);
+    fs::write(directory.join("file"), "mine").expect("it");
+    refused(&directory, &["init", "walker", "hip", "--out", "file"], 1, &["no empty directory"]);
+    refused(&directory, &["init", "walker", "hip", "--out", "no/where"], 1, &["No such file"]);
+    assert_eq!(everything(&directory.join("keys")), before);
+    assert_eq!(fs::read_dir(directory.join("full")).expect("it").count(), 1);
+    // An empty one is as good as none.
+    fs::create_dir(directory.join("empty")).expect("it");
+    good(&directory, &["init", "walker", "hip", "--out", "empty"]);
+    assert_eq!(mode(&directory.join("empty")), 0o700);
+}
+
+#[test]
+fn names_and_addresses_that_cannot_be_are_refused_before_anything_is_made() {
+    let directory = OwnDirectory::new();
+    for (nodes, parts) in [
+        (&["hip=10.0.0.2", "knee=10.0.0.2"][..], &["'hip' and 'knee' have the same address, 10.0.0.2"][..]),
+        (&["hip", "hip"], &["'hip' is named twice"]),
+        (&["hip=10.0.0.2", "hip=10.0.0.2"], &["'hip' is named twice"]),
+        (&["hip=10.0.0"], &["'10.0.0' is no address", "hip=192.168.0.11"]),
+        (&["hip=0.0.0.0"], &["node.address"]),
+        (&["../hip"], &["cannot be the name of a directory"]),
+        (&[".hip"], &["cannot be the name of a directory"]),
+        (&["a/b=10.0.0.2"], &["cannot be the name of a directory"]),
+        (&[""], &["node.name"]),
+        (&["nowhere.toml"], &["nowhere.toml is no configuration"]),
+    ] {
+        refused(&directory, &[&["init", "walker"], nodes].concat(), 2, parts);
+    }
+    refused(&directory, &["init", "", "hip"], 2, &["node.project"]);
+    assert_eq!(fs::read_dir(directory.join(".")).expect("it").count(), 0, "nothing was made");
+}
+
+#[test]
+fn an_address_comes_from_the_nodes_configuration_where_there_is_one() {
+    let directory = OwnDirectory::new();
+    let config = |name: &str, text: &str| fs::write(directory.join(name), text).expect("it");
+    config("knee.toml", "[node]\nname = 'knee'\nproject = 'walker'\naddress = '10.0.0.3'\n");
+    config("left.toml", "[node]\nname = 'ankle'\nproject = 'walker'\n[ndl]\ninterface = '192.168.0.14'\n");
+    config("other.toml", "[node]\nname = 'other'\nproject = 'runner'\n");
+    config("wrong.toml", "[node]\nname = 'right'\nproject = 'walker'\n");
+    let said = good(&directory, &["init", "walker", "knee", "left.toml", "hip"]);
+    for (name, address, from) in [
+        ("knee", "10.0.0.3", "from knee.toml"),
+        ("ankle", "192.168.0.14", "from left.toml"),
+        ("hip", "127.0.0.1", "next free here"),
+    ] {
+        let node = named(&said["nodes"], name).expect("it");
+        assert_eq!((&node["address"], &node["address_from"]), (&address.into(), &from.into()), "{node}");
+    }
+    refused(
+        &directory,
+        &["init", "walker", "other.toml", "--out", "o"],
+        2,
+        &["of project 'runner'", "'walker'"],
+    );
+    refused(&directory, &["init", "walker", "wrong", "--out", "o"], 2, &["called 'right'"]);
+}
+
+#[test]
+fn what_is_said_turns_a_node_on_which_refuses_to_pretend() {
+    let directory = OwnDirectory::new();
+    let answer = keys(&directory, &["init", "walker", "hip=10.0.0.9", "knee"]);
+    for part in [
+        "keep it off the robot",
+        "tar -C keys/nodes/hip -c . | ssh root@10.0.0.9",
+        "keys = \"/etc/sinew/keys\"",
+        "NOT YET",
+        "refuses to start",
+    ] {
+        assert!(answer.out.contains(part), "{part}: {}", answer.out);
+    }
+    assert!(!answer.out.contains("tar -C keys/nodes/knee"), "what stays here is not copied: {}", answer.out);
+    // A node of this machine takes its keys from where they are.
+    let lines =
+        good(&directory, &["issue", "knee"])["nodes"][0]["configuration"].as_str().expect("lines").to_owned();
+    let config = sinew::NodeConfig::from_toml(&lines).expect("legal");
+    let path = config.security.keys.clone().expect("keys");
+    assert!(path.is_absolute() && path.ends_with("keys/nodes/knee"), "{}", path.display());
+    let identity = Identity {
+        project: config.project.clone(),
+        address: config.node_address(),
+        name: config.name.clone(),
+    };
+    let loaded = Credentials::load(&path, &identity, config.security.times, UnixTime::now());
+    assert_eq!(loaded.expect("they are its own").warnings(), [""; 0]);
+    // Then: the node says that it cannot be secured yet
+    let refused = sinew::Node::builder("knee").configure(|own| *own = config).start();
+    let words = refused.expect_err("it cannot be secured yet").to_string();
+    assert!(words.contains("cannot secure the links"), "{words}");
+}
+
+#[test]
+fn issue_adds_nodes_and_renews_them_and_says_what_still_counts() {
+    let directory = OwnDirectory::new();
+    good(&directory, &["init", "walker", "hip", "knee=10.0.0.3"]);
+    let first = credentials(&directory, "knee", [10, 0, 0, 3]).serial().to_string();
+    // When: one more, and the knee again
+    let said = good(&directory, &["issue", "ankle", "knee", "--days", "30"]);
+    // Then
+    assert_eq!(named(&said["nodes"], "ankle").expect("it")["address"], "127.0.0.2");
+    let knee = named(&said["nodes"], "knee").expect("it");
+    assert_eq!((&knee["address"], &knee["address_from"]), (&"10.0.0.3".into(), &"as before".into()));
+    assert_eq!(said["older"][0]["number"], first.as_str());
+    assert_ne!(credentials(&directory, "knee", [10, 0, 0, 3]).serial().to_string(), first);
+    assert_eq!(mode(&directory.join("keys/nodes/knee")), 0o700);
+    assert_eq!(fs::read_dir(directory.join("keys/nodes")).expect("it").count(), 3, "nothing is left over");
+    // And: an address that another one has is refused
+    refused(&directory, &["issue", "hip=10.0.0.3"], 2, &["'knee' and 'hip' have the same address"]);
+    refused(&directory, &["issue", "wrist", "--keys", "elsewhere"], 1, &["elsewhere", "--keys DIR"]);
+}
+
+#[test]
+fn who_is_revoked_is_on_every_list_and_seen() {
+    let directory = OwnDirectory::new();
+    good(&directory, &["init", "walker", "hip", "knee"]);
+    let other = credentials(&directory, "knee", [127, 0, 0, 2]);
+    let serial = credentials(&directory, "hip", [127, 0, 0, 1]).serial().to_string();
+    refused(
+        &directory,
+        &["revoke", "hip", "wrist"],
+        1,
+        &["no certificate of 'wrist'", "Nothing was revoked"],
+    );
+    assert!(credentials(&directory, "hip", [127, 0, 0, 1]).validity().until > UnixTime::now());
+    // When
+    let said = good(&directory, &["revoke", "hip"]);
+    // Then: on every list
+    assert_eq!(said["revoked"][0]["number"], serial.as_str());
+    for list in ["keys/denied.txt", "keys/nodes/hip/denied.txt", "keys/nodes/knee/denied.txt"] {
+        let text = fs::read_to_string(directory.join(list)).expect("it");
+        assert!(text.contains(&serial) && text.contains("hip 127.0.0.1, revoked 20"), "{list}: {text}");
+    }
+    // And: seen
+    let shown = keys(&directory, &["show", "--json"]);
+    assert_eq!(shown.code, Some(1), "a node without a certificate that counts is a finding");
+    let hip = named(&shown.json()["certificates"], "hip").expect("it").clone();
+    assert_eq!((&hip["state"], &hip["revoked"]), (&"revoked".into(), &true.into()));
+    // And: once is enough
+    let again = good(&directory, &["revoke", &serial]);
+    assert_eq!(
+        (again["revoked"].as_array().map(Vec::len), &again["revoked_before"][0]["name"]),
+        (Some(0), &"hip".into())
+    );
+    // And: a new one counts beside it
+    good(&directory, &["issue", "hip"]);
+    assert_eq!(good(&directory, &["show"])["denied"], 1);
+    assert!(credentials(&directory, "hip", [127, 0, 0, 1]).serial().to_string() != serial);
+    drop(other);
+}
+
+#[test]
+fn show_tells_who_has_what_until_when_also_on_the_robot() {
+    let directory = OwnDirectory::new();
+    good(&directory, &["init", "walker", "hip=10.0.0.2"]);
+    let answer = keys(&directory, &["show"]);
+    let lines: Vec<_> = answer.out.lines().collect();
+    assert!(
+        answer.code == Some(0) && lines[0].contains("Project walker, authority until 20"),
+        "{}",
+        answer.out
+    );
+    assert!(
+        lines[3].starts_with("hip") && lines[3].contains("10.0.0.2") && lines[3].ends_with("good"),
+        "{}",
+        answer.out
+    );
+    // On the robot: the directory of the node alone
+    let said = good(&directory, &["show", "--keys", "keys/nodes/hip"]);
+    assert_eq!(said["certificates"].as_array().map(Vec::len), Some(1));
+    // And: what ends soon is a finding
+    good(&directory, &["issue", "hip", "--days", "3"]);
+    let soon = keys(&directory, &["show"]);
+    assert!(soon.code == Some(1) && soon.out.contains("good, ends soon"), "{}", soon.out);
+    refused(&directory, &["show", "--keys", "nowhere"], 1, &["nowhere/ca.pem", "No such file"]);
+}
+
+#[test]
+fn a_directory_that_others_can_get_at_is_not_worked_with() {
+    let directory = OwnDirectory::new();
+    good(&directory, &["init", "walker", "hip"]);
+    let key = directory.join("keys/ca.key");
+    fs::set_permissions(&key, fs::Permissions::from_mode(0o644)).expect("it");
+    refused(&directory, &["issue", "knee"], 1, &["ca.key", "0644", "chmod 600"]);
+    fs::set_permissions(&key, fs::Permissions::from_mode(0o600)).expect("it");
+    let own = directory.join("keys");
+    fs::set_permissions(&own, fs::Permissions::from_mode(0o770)).expect("it");
+    refused(&directory, &["revoke", "hip"], 1, &["others can write to keys", "0770", "chmod go-w"]);
+    fs::set_permissions(&own, fs::Permissions::from_mode(0o700)).expect("it");
+    // And: two at once do not mix
+    let opened = fs::File::open(directory.join("keys")).expect("it");
+    rustix::fs::flock(&opened, rustix::fs::FlockOperation::LockExclusive).expect("it");
+    refused(&directory, &["issue", "knee"], 1, &["another `sinew keys` is at work"]);
+    drop(opened);
+    good(&directory, &["issue", "knee"]);
+}
