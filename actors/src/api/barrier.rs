@@ -15,7 +15,7 @@ use sinew_runtime::{
 };
 
 use super::{ApiError, AsyncEndpoint, Endpoint};
-use crate::sync::{ArriveAtBarrier, BarrierAnswer, LeaveBarrier, OnPartyLoss};
+use crate::sync::{ArriveAtBarrier, BarrierAnswer, BarrierKind, LeaveBarrier, OnPartyLoss};
 
 /// How much later than the barrier's own deadline its answer may come: the node says who is missing.
 const SAYING: Duration = Duration::from_secs(2);
@@ -44,6 +44,7 @@ pub struct Barrier {
     parties: Vec<String>,
     within: Duration,
     on_loss: OnPartyLoss,
+    kind: BarrierKind,
 }
 
 impl Barrier {
@@ -53,7 +54,27 @@ impl Barrier {
     #[must_use]
     pub fn new<N: Into<String>>(name: impl Into<String>, parties: impl IntoIterator<Item = N>) -> Self {
         let parties = parties.into_iter().map(Into::into).collect();
-        Self { name: name.into(), parties, within: WITHIN, on_loss: OnPartyLoss::default() }
+        let (within, on_loss, kind) = (WITHIN, OnPartyLoss::default(), BarrierKind::default());
+        Self { name: name.into(), parties, within, on_loss, kind }
+    }
+
+    /// The phase of this name, one word, that these parties come up in: to `meet` there says that one has reached it, and waits until all
+    /// parties have. Who has reached it counts until its life ends. So who is started again goes on at once if the others are there, and
+    /// nobody else is brought back. Whoever is no party can require it: `2 of *.drive at homed`.
+    ///
+    /// ```no_run
+    /// # use sinew::{Barrier, Meet, Sender};
+    /// # async fn come_up(sender: Sender) -> Result<(), Box<dyn std::error::Error>> {
+    /// # fn home() {}
+    /// home();
+    /// sender.meet(&Barrier::phase("homed", ["hip.drive", "knee.drive", "ankle.drive"])).await?;
+    /// // All drives are homed: this one may arm its output.
+    /// # Ok(())
+    /// # }
+    /// ```
+    #[must_use]
+    pub fn phase<N: Into<String>>(name: impl Into<String>, parties: impl IntoIterator<Item = N>) -> Self {
+        Self { kind: BarrierKind::Phase, ..Self::new(name, parties) }
     }
 
     /// The barrier at which any `count` applications meet. Exactly so many should take part: with more, those that the others
@@ -89,6 +110,7 @@ impl Barrier {
             parties: self.parties.clone(),
             within_ms: u32::try_from(self.within.as_millis()).unwrap_or(u32::MAX),
             on_loss: self.on_loss,
+            kind: self.kind,
         }
     }
 

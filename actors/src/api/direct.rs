@@ -5,6 +5,7 @@
 mod budget;
 mod descriptors;
 mod early;
+mod foreign;
 mod meeting;
 mod room;
 mod standing;
@@ -25,7 +26,7 @@ use sinew_runtime::{
     time::Time,
     wire::{Flags, Kind, Message},
 };
-use sinew_shm::{Any, AnyError, Offer, Spin, Waiter};
+use sinew_shm::{Any, AnyError, Spin, Waiter};
 
 use super::{
     ApiError,

@@ -405,11 +405,15 @@ impl Registration {
         let deadline = Time::now() + self.deadline;
         let mut greeting = Greeting::begin(path, &self.register, self.link.clone(), deadline)?;
         while is_wanted() {
-            if let Some(link) = greeting.wait(deadline.min(Time::now() + look))? {
-                return Ok(link);
-            }
-            if Time::now() >= deadline {
-                break;
+            match greeting.wait(deadline.min(Time::now() + look)) {
+                Ok(Some(link)) => return Ok(link),
+                Ok(None) if Time::now() >= deadline => break,
+                Ok(None) => {}
+                // The node had waited for this side for its 2 s: that is the pace of it.
+                Err(_) if greeting.may_begin_anew() && Time::now() < deadline => {
+                    greeting = Greeting::begin(path, &self.register, self.link.clone(), deadline)?;
+                }
+                Err(why) => return Err(why),
             }
         }
         Err(match greeting.missing() {

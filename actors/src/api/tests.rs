@@ -132,6 +132,12 @@ fn addresses_are_fixed_or_dynamic_and_names_have_one_holder(under: Under) {
     assert!(why.contains("is taken by 'knee'"), "{why}");
     let why = refusal(under, &node, on(under).fixed(AppAddress::NDL));
     assert!(why.contains("fixed addresses are"), "{why}");
+    // The life after the one that had it has it again.
+    first.unregister().unwrap();
+    assert_eq!(
+        register(under, &node, on(under).name("knee").fixed(fixed)).tid(),
+        Tid::new(node.address(), fixed)
+    );
 }
 
 #[test]

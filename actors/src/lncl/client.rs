@@ -36,7 +36,7 @@ use super::{
     reader::Reader,
     registrar,
     rings::Kept,
-    server::{Server, refuse},
+    server::{Server, refuse, say_why},
     session::{Order, Session},
     strangers::Place,
 };
@@ -78,10 +78,16 @@ pub(super) async fn serve(
             return refuse(&server, &stream, "silent stranger", &why);
         }
     };
-    let peer = Peer { stream: stream.clone(), id, pid: credentials.pid().unwrap_or_default() };
+    let pid = credentials.pid().unwrap_or_default();
+    let peer = Peer { stream: stream.clone(), id, pid };
     let mut client = match Client::register(server.clone(), peer, register) {
         Ok(client) => client,
-        Err(why) => return refuse(&server, &stream, "registration", &why),
+        Err(why) => {
+            // Who is refused knows who it is; whoever reads the log does not.
+            let both = format!("of process {pid}: {why}");
+            server.refusals.count(Time::now(), "registration", &both);
+            return say_why(&server, &stream, &why);
+        }
     };
     session.registered(client.tid);
     let end = client.live(reader, &mut session).await;
@@ -283,7 +289,9 @@ impl Client {
             Ok(Err(ExchangeError::Pass(PassError::Closed))) => return Err(End::HungUp(None)),
             Ok(Err(why)) => return Err(End::Refused(why.to_string())),
             Err(_) => {
-                return Err(End::Refused(format!("no offer of shared memory came within {HANDSHAKE:?}")));
+                return Err(End::Late(format!(
+                    "its rings were not there within {HANDSHAKE:?}: it was stopped or slow to offer its half, or this node was slow to map it"
+                )));
             }
         };
         let link = self.outlet.connect(socket, payload_max, None);
@@ -293,7 +301,7 @@ impl Client {
 
     /// The node's half of its rings; `None` if it is to have none.
     async fn prepare(&self, ring_bytes: usize) -> Option<(Capacity, Kept<Exchange>)> {
-        let prepare = link::prepare(ring_bytes, self.server.rings());
+        let prepare = link::prepare(ring_bytes, &self.peer.stream, self.server.rings());
         tokio::time::timeout(HANDSHAKE, prepare).await.unwrap_or_else(|_| {
             let tid = self.tid;
             crate::log::warn!(%tid, "no rings were made within {HANDSHAKE:?}; this client gets a plain socket");

@@ -1,7 +1,7 @@
 //! Introductions: LNCL makes a socket between two clients, gives each an end, and is not on the path of what follows.
 //!
-//! No client ever passes a descriptor to the node: it makes the sockets itself, so that nobody gets a descriptor from it that
-//! is not one. Its own copies are closed as soon as they are on their way: a hang-up of one end is the end of its holder. The asker's
+//! No client passes a descriptor to the node for it: it makes the sockets itself, so that nobody gets a descriptor from it that
+//! is not one. (What clients do pass are offers of rings, and what nobody has asked for: `rings`, `reader`.) Its own copies are closed as soon as they are on their way: a hang-up of one end is the end of its holder. The asker's
 //! end waits here for the answer, within bounds of number and time.
 
 mod coming;

@@ -8,14 +8,14 @@ use std::{
 };
 
 use sinew_runtime::wire::{Checksum, FrameError, Message};
-use sinew_shm::{Armed, BellKind, Capacity, Consumer, LoanError, PassError, Producer};
+use sinew_shm::{Armed, BellKind, Capacity, Consumer, Descriptors, LoanError, PassError, Producer};
 use tokio::{
     io::{Interest, unix::AsyncFd},
     net::UnixStream,
 };
 
 use super::{
-    reader::Reader,
+    reader::{self, Reader, Seen},
     rings::{Kept, Rings},
 };
 use crate::{
@@ -47,11 +47,21 @@ impl From<FrameError> for LinkError {
 /// Makes the node's half of the rings; `None` where the system has no memory for it, which is said once a link, or where the thread `rings`
 /// has too much to do. The caller has a
 /// deadline.
-pub(super) async fn prepare(ring_bytes: usize, rings: &Rings) -> Option<(Capacity, Kept<Exchange>)> {
+///
+/// Where it is made, descriptors may come over `stream`, until the exchange is over.
+pub(super) async fn prepare(
+    ring_bytes: usize,
+    stream: &UnixStream,
+    rings: &Rings,
+) -> Option<(Capacity, Kept<Exchange>)> {
     let (capacity, keeper) = (ring::capacity(ring_bytes), rings.clone());
     let make = move || Exchange::prepare(capacity, BellKind::Socket).map(|exchange| keeper.keep(exchange));
     match rings.run(make).await? {
-        Ok(exchange) => Some((capacity, exchange)),
+        Ok(exchange) => {
+            // Before the client hears that it may offer its half. Where the system does not know it they come anyway.
+            let _ = sinew_shm::set_descriptors(stream, Descriptors::Taken);
+            Some((capacity, exchange))
+        }
         Err(why) => {
             crate::log::warn!(%why, "a client that asked for rings gets a plain socket");
             None
@@ -62,29 +72,21 @@ pub(super) async fn prepare(ring_bytes: usize, rings: &Rings) -> Option<(Capacit
 /// Exchanges offers with the client. Ends with its offer, or never; the caller has a deadline.
 pub(super) async fn exchange(
     exchange: Kept<Exchange>,
-    stream: &UnixStream,
+    stream: &Arc<UnixStream>,
     payload_max: usize,
     rings: &Rings,
 ) -> Result<(ClientSocket, ClientReader), ExchangeError> {
     exchange.offer(stream)?;
-    let theirs = loop {
-        stream.readable().await.map_err(PassError::System)?;
-        let took = stream.try_io(Interest::READABLE, || match Exchange::receive(stream) {
-            Ok(Some(offer)) => Ok(Ok(offer)),
-            Ok(None) => Err(io::ErrorKind::WouldBlock.into()),
-            Err(error) => Ok(Err(error)),
-        });
-        match took {
-            Ok(offer) => break offer?,
-            Err(cause) if cause.kind() == io::ErrorKind::WouldBlock => {}
-            Err(cause) => return Err(PassError::System(cause).into()),
-        }
-    };
-    let keeper = rings.clone();
-    // What a hostile client has passed may take for ever to close.
-    let theirs = rings.keep(theirs);
+    something_is_there(stream).await?;
+    let (keeper, stream) = (rings.clone(), stream.clone());
     let map = move || {
-        let (producer, consumer) = exchange.into_inner().finish(theirs.into_inner())?;
+        let theirs = Exchange::take(&*stream);
+        let _ = sinew_shm::set_descriptors(&*stream, Descriptors::Refused);
+        // What a hostile client has passed may take for ever to close. Whatever becomes of it here, that is not its last close.
+        let theirs = keeper.keep(theirs?);
+        let _copies = keeper.keep(theirs.copies().map_err(PassError::System)?);
+        let theirs = theirs.into_inner().into_offer()??;
+        let (producer, consumer) = exchange.into_inner().finish(theirs)?;
         Ok::<_, ExchangeError>((keeper.keep(producer), keeper.keep(consumer)))
     };
     let (producer, consumer) = rings.run(map).await.ok_or(ExchangeError::Fault)??;
@@ -92,6 +94,18 @@ pub(super) async fn exchange(
     let consumer = watch(In(consumer))?;
     let reader = RingReader { consumer, frames: RingFrames::new(payload_max), looks: 0, has_hung_up: false };
     Ok((ClientSocket::Ring(socket), ClientReader::Ring(reader)))
+}
+
+/// Resolves when the client has sent something, or has closed. Takes nothing of it: what is beside it is for another thread to close.
+async fn something_is_there(stream: &UnixStream) -> Result<(), ExchangeError> {
+    loop {
+        stream.readable().await.map_err(PassError::System)?;
+        match stream.try_io(Interest::READABLE, || reader::look(stream, &mut [0])) {
+            Ok(_) => return Ok(()),
+            Err(cause) if cause.kind() == io::ErrorKind::WouldBlock => {}
+            Err(cause) => return Err(PassError::System(cause).into()),
+        }
+    }
 }
 
 /// Has the reactor of the calling thread listen to a bell.
@@ -295,8 +309,9 @@ async fn hear(stream: &UnixStream) -> Result<(), LinkError> {
         if stream.readable().await.is_err() {
             return Ok(());
         }
-        match stream.try_read(&mut [0]) {
-            Ok(0) => return Ok(()),
+        // What has come is not taken: a descriptor may be beside it, and goes with the socket.
+        match stream.try_io(Interest::READABLE, || reader::look(stream, &mut [0])) {
+            Ok(Seen { count: 0, .. }) => return Ok(()),
             Ok(_) => return Err(LinkError::StrayBytes),
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
             Err(_) => return Ok(()),

@@ -16,6 +16,7 @@ use std::{
 };
 
 use rustix::fs::FlockOperation;
+use sinew_shm::Descriptors;
 use socket2::{Domain, SockAddr, Socket, Type};
 
 /// Longest path in bytes; the system's limit is 107, and another platform's less.
@@ -140,6 +141,8 @@ fn bind(path: &Path) -> Result<UnixListener, ListenError> {
     let socket = Socket::new(Domain::UNIX, Type::STREAM, None).map_err(system("make a socket for", path))?;
     let address = SockAddr::unix(path).map_err(system("bind", path))?;
     socket.bind(&address).map_err(system("bind", path))?;
+    // A connection inherits it. Where the system does not know it (Linux before 6.16), whoever reads looks first.
+    let _ = sinew_shm::set_descriptors(&socket, Descriptors::Refused);
     // Before it listens, so that nobody connects under wider permissions.
     fs::set_permissions(path, Permissions::from_mode(SOCKET_MODE))
         .map_err(system("set permissions of", path))?;

@@ -44,6 +44,7 @@ pub(crate) mod testing;
 #[cfg(test)]
 mod tests;
 mod untaken;
+mod worker;
 
 pub(crate) use actor::Lncl;
 pub use core::RegisterError;

@@ -1,14 +1,18 @@
 //! The reading half of a unix connection: frames out of bytes.
 
-use std::io;
+use std::{
+    io::{self, IoSliceMut},
+    os::fd::AsFd,
+};
 
 use bytes::BytesMut;
 use rustix::{
     io::Errno,
-    net::{RecvFlags, recv},
+    net::{RecvAncillaryBuffer, RecvFlags, ReturnFlags, recv, recvmsg},
 };
 use sinew_runtime::wire::{FrameCodec, FrameError, Message};
-use tokio::net::UnixStream;
+use sinew_shm::Descriptors;
+use tokio::{io::Interest, net::UnixStream};
 use tokio_util::codec::Decoder;
 
 /// Bytes that are read at once.
@@ -18,12 +22,26 @@ const READ_CHUNK: usize = 16 * 1024;
 pub(crate) struct Reader {
     buffer: BytesMut,
     codec: FrameCodec,
+    guard: Guard,
+}
+
+/// Who sees to it that no descriptor is taken from the socket: the one who reads closes it, for as long as that takes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Guard {
+    /// Nothing was read yet.
+    Unknown,
+    /// The system lets none come any more; what has come before is looked at.
+    Soon,
+    /// The system: what has come before is read.
+    System,
+    /// Whoever reads looks first: the system does not know how to let none come.
+    Look,
 }
 
 impl Reader {
     /// Takes payloads of at most `payload_max` bytes.
     pub(crate) fn new(payload_max: usize) -> Self {
-        Self { buffer: BytesMut::new(), codec: FrameCodec::new(payload_max) }
+        Self { buffer: BytesMut::new(), codec: FrameCodec::new(payload_max), guard: Guard::Unknown }
     }
 
     /// Takes payloads of at most `payload_max` bytes from now on.
@@ -34,17 +52,20 @@ impl Reader {
     /// The next frame that is there already; `None` if there is none and none will come, the process at the other end
     /// being dead.
     pub(crate) fn next_of_the_dead(&mut self, stream: &UnixStream) -> Result<Option<Message>, FrameError> {
-        let mut chunk = [0; READ_CHUNK];
         loop {
             if let Some(message) = self.codec.decode(&mut self.buffer)? {
                 return Ok(Some(message));
             }
-            match recv(stream, &mut chunk[..], RecvFlags::DONTWAIT) {
+            match self.read_guarded(stream) {
+                Ok(0) => return Ok(None),
+                Ok(_) => {}
                 // A reset says that it died with words of ours unread. It comes after its last words.
-                Ok((_, 0)) | Err(Errno::AGAIN | Errno::CONNRESET) => return Ok(None),
-                Ok((_, count)) => self.buffer.extend_from_slice(&chunk[..count]),
-                Err(Errno::INTR) => {}
-                Err(error) => return Err(io::Error::from(error).into()),
+                Err(error)
+                    if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::ConnectionReset) =>
+                {
+                    return Ok(None);
+                }
+                Err(error) => return Err(error.into()),
             }
         }
     }
@@ -62,12 +83,77 @@ impl Reader {
             {
                 self.buffer.reserve(READ_CHUNK);
             }
-            match stream.try_read_buf(&mut self.buffer) {
+            let read = match self.guard(stream) {
+                Guard::System => stream.try_read_buf(&mut self.buffer),
+                Guard::Unknown | Guard::Soon | Guard::Look => {
+                    stream.try_io(Interest::READABLE, || self.read_guarded(stream))
+                }
+            };
+            match read {
                 Ok(0) => return Ok(None),
                 Ok(_) => {}
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                    if self.guard == Guard::Soon {
+                        self.guard = Guard::System;
+                    }
+                }
                 Err(error) => return Err(error.into()),
             }
+        }
+    }
+
+    fn guard(&mut self, stream: &UnixStream) -> Guard {
+        if self.guard == Guard::Unknown {
+            let refused = sinew_shm::set_descriptors(stream, Descriptors::Refused);
+            self.guard = if refused.is_ok() { Guard::Soon } else { Guard::Look };
+        }
+        self.guard
+    }
+
+    /// Reads what is there, unless a descriptor is beside it: that stays where it is.
+    fn read_guarded(&mut self, stream: &UnixStream) -> io::Result<usize> {
+        let mut chunk = [0; READ_CHUNK];
+        let Seen { count, beside } = look(stream, &mut chunk)?;
+        // spec: LNCL-18
+        if beside {
+            return Err(io::Error::new(io::ErrorKind::InvalidData, STRAY_DESCRIPTORS));
+        }
+        // Nobody else reads, so these are the bytes that were looked at.
+        let (_, count) = retried(|| recv(stream, &mut chunk[..count], RecvFlags::DONTWAIT))?;
+        self.buffer.extend_from_slice(&chunk[..count]);
+        Ok(count)
+    }
+}
+
+/// What is said to who passes them.
+const STRAY_DESCRIPTORS: &str = "descriptors came beside its bytes, and nobody has asked for any; pass them with the offer of shared memory only";
+
+/// What comes next on a socket.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Seen {
+    /// Bytes; 0 when the peer has closed.
+    pub(super) count: usize,
+    /// Descriptors are beside them.
+    pub(super) beside: bool,
+}
+
+/// Looks at what comes next, which all stays where it is. Does not wait.
+pub(super) fn look(stream: impl AsFd, bytes: &mut [u8]) -> io::Result<Seen> {
+    let flags = RecvFlags::DONTWAIT | RecvFlags::PEEK;
+    let got = retried(|| {
+        // Without room for descriptors: that they are there is said, and none is made ours.
+        let mut none = RecvAncillaryBuffer::default();
+        recvmsg(&stream, &mut [IoSliceMut::new(bytes)], &mut none, flags)
+    })?;
+    Ok(Seen { count: got.bytes, beside: got.flags.contains(ReturnFlags::CTRUNC) })
+}
+
+/// A signal is no reason to give up.
+fn retried<T>(mut call: impl FnMut() -> Result<T, Errno>) -> io::Result<T> {
+    loop {
+        match call() {
+            Err(Errno::INTR) => {}
+            other => return other.map_err(io::Error::from),
         }
     }
 }

@@ -1,134 +1,102 @@
-//! The thread `rings`: makes and maps the memory of clients' rings, and gives it back. Each of these takes the kernel a tenth of a
-//! millisecond, and the thread that carries everybody's messages does not wait for it.
+//! Two threads beside the one that carries everybody's messages, which waits for neither.
 //!
-//! It takes what it is given in that order, each thing for as long as it takes: what a hostile process has passed may take for ever to
-//! close. Where more waits than may, nothing more is made: the client gets a plain socket. Where there is no such thread, who asks does it
-//! himself.
+//! `rings` makes and maps the memory of clients' rings: a tenth of a millisecond each. Where more waits than may, nothing more is made: the client
+//! gets a plain socket.
+//!
+//! `closing` gives back what clients have left: memory, bells, sockets. What a client has passed may take for ever to close, even where nobody
+//! has asked for it and nobody has looked at it: it lies in a socket's queue, and goes with the socket, or is a socket with such a queue. Where more
+//! waits than may, no connections are taken until there is room.
+//!
+//! Where there is no such thread, who asks does it himself.
 
 use std::{
     ops::{Deref, DerefMut},
-    sync::{
-        Arc, Mutex,
-        atomic::{AtomicUsize, Ordering},
-        mpsc::{Receiver, SyncSender, TrySendError, sync_channel},
-    },
-    thread,
-    time::{Duration, Instant},
+    sync::Arc,
 };
 
-#[cfg(target_os = "linux")]
-use rustix::process::{getpriority_process, setpriority_process};
-use sinew_runtime::supervision::make_ordinary;
-use tokio::sync::oneshot;
+use rustix::net::{RecvFlags, Shutdown, recv};
+use tokio::{net::UnixStream, sync::oneshot};
 
-use crate::stores::lock;
+use super::worker::{SLOW, Worker};
 
-/// Things that wait for the thread when something is to be made, at most: four for each of 64 addresses that come or go at once.
-const WAITING_MAX: usize = 256;
-/// Things that wait for it in all, with those that are to be given back: three for each of 1,280 clients. What is more is given back by who
-/// has it.
-const GIVEN_MAX: usize = 1_280 * 3 + WAITING_MAX;
-/// What takes longer is said.
-const SLOW: Duration = Duration::from_secs(1);
-/// How much nicer it is than others: newcomers wait, not the messages of those who are there.
-#[cfg(target_os = "linux")]
-const NICER: i32 = 5;
+/// Bytes that are read at once from a socket that is given back.
+const CHUNK: usize = 4 * 1024;
 
-type Task = Box<dyn FnOnce() + Send>;
-
-/// Clones are the same thread. It ends when there are none any more, after what it was given.
+/// Clones are the same threads. They end when there are none any more, after what they were given.
 #[derive(Clone)]
-pub(super) struct Rings(Arc<Hold>);
+pub(super) struct Rings(Arc<Threads>);
 
-/// What keeps the thread.
-struct Hold {
-    /// `None`: there is no thread.
-    tasks: Option<SyncSender<Task>>,
-    queue: Arc<Queue>,
-}
-
-/// What is known of the thread.
-#[derive(Default)]
-struct Queue {
-    waiting: AtomicUsize,
-    /// Since when the task at hand is done, unless that was said to be long.
-    since: Mutex<Option<Instant>>,
+struct Threads {
+    making: Worker,
+    closing: Worker,
 }
 
 impl Rings {
-    /// Begins the thread.
+    /// Begins the threads.
     pub(super) fn begin() -> Self {
-        let (sender, tasks) = sync_channel(GIVEN_MAX);
-        let queue = Arc::new(Queue::default());
-        let its_queue = queue.clone();
-        match thread::Builder::new().name("rings".to_owned()).spawn(move || work(tasks, &its_queue)) {
-            Ok(_) => Self(Arc::new(Hold { tasks: Some(sender), queue })),
-            Err(cause) => {
-                crate::log::warn!(%cause, "no thread makes the rings of clients: each newcomer holds up others; raise `ulimit -u`");
-                Self(Arc::new(Hold { tasks: None, queue }))
-            }
-        }
+        let making = Worker::begin(
+            "rings",
+            "who registers meanwhile gets a plain socket",
+            "each newcomer holds up others",
+        );
+        let closing = Worker::begin(
+            "closing",
+            "what other clients leave waits behind it",
+            "who passes a descriptor that does not close holds up others",
+        );
+        Self(Arc::new(Threads { making, closing }))
     }
 
-    /// Runs `work` there. `None` if it panicked, or if too much waits: then `work` is dropped here, and what of it may take long to
-    /// drop must be kept. Dropped, it is run all the same, and what it gives is dropped there.
+    /// Runs `work` on the thread that makes. `None` if it panicked, or if too much waits: then `work` is dropped here, and what of it may
+    /// take long to drop must be kept. Dropped, it is run all the same, and what it gives is dropped there.
     pub(super) async fn run<R: Send + 'static>(
         &self,
         work: impl FnOnce() -> R + Send + 'static,
     ) -> Option<R> {
-        if self.0.tasks.is_some() && self.0.queue.waiting.load(Ordering::Relaxed) >= WAITING_MAX {
-            self.0.queue.say_if_slow();
+        let making = &self.0.making;
+        if !making.has_room() {
             return None;
         }
         let (sender, mut done) = oneshot::channel();
         // Who has asked may have gone: then it is dropped here.
-        self.give(Box::new(move || drop(sender.send(work()))));
+        making.give(Box::new(move || drop(sender.send(work()))));
         if let Ok(done) = tokio::time::timeout(SLOW, &mut done).await {
             return done.ok();
         }
-        self.0.queue.say_if_slow();
+        making.queue.say_if_slow();
         done.await.ok()
     }
 
-    /// `what`, which is dropped there.
+    /// `what`, which is dropped on the thread that gives back.
     pub(super) fn keep<T: Send + 'static>(&self, what: T) -> Kept<T> {
         Kept { what: Some(what), rings: self.clone() }
     }
 
-    fn give(&self, task: Task) {
-        let Hold { tasks: Some(tasks), queue } = &*self.0 else { return task() };
-        queue.waiting.fetch_add(1, Ordering::Relaxed);
-        // It is there as long as its sender, unless a task has panicked.
-        if let Err(TrySendError::Full(task) | TrySendError::Disconnected(task)) = tasks.try_send(task) {
-            queue.waiting.fetch_sub(1, Ordering::Relaxed);
-            task();
-        }
+    /// Whether no more waits to be given back than may.
+    pub(super) fn has_room(&self) -> bool {
+        self.0.closing.has_room()
+    }
+
+    /// Ends a connection, and takes what is unread in it out where that may take long. Whoever still holds it may drop it anywhere then.
+    pub(super) fn empty(&self, stream: Arc<UnixStream>) {
+        self.0.closing.give(Box::new(move || {
+            let mut chunk = [0; CHUNK];
+            // Without room for descriptors: the system closes them here. It ends, since nothing more can come.
+            while recv(&*stream, &mut chunk[..], RecvFlags::DONTWAIT).is_ok_and(|(_, count)| count > 0) {}
+        }));
     }
 }
 
-impl Queue {
-    /// Says once of the task at hand that it takes long.
-    fn say_if_slow(&self) -> bool {
-        let is_slow = lock(&self.since).take_if(|since| since.elapsed() >= SLOW).is_some();
-        if is_slow {
-            let waiting = self.waiting.load(Ordering::Relaxed);
-            crate::log::warn!(
-                waiting,
-                "the thread that makes rings has been at one thing for over {SLOW:?}: a client has passed a descriptor that does not close, or the machine is short of memory; who registers meanwhile gets a plain socket"
-            );
-        }
-        is_slow
-    }
-
-    fn run(&self, task: Task) {
-        self.waiting.fetch_sub(1, Ordering::Relaxed);
-        *lock(&self.since) = Some(Instant::now());
-        task();
-        *lock(&self.since) = None;
-    }
+/// Ends a connection. Returns whether something is unread in it, which must then be taken out by [`Rings::empty`] before the last one who holds it
+/// drops it.
+pub(super) fn shut(stream: &UnixStream) -> bool {
+    // An error says that it is closed already.
+    let _ = rustix::net::shutdown(stream, Shutdown::Both);
+    // Looked at, not taken: what is beside the byte stays where it is.
+    recv(stream, &mut [0; 1][..], RecvFlags::DONTWAIT | RecvFlags::PEEK).is_ok_and(|(_, count)| count > 0)
 }
 
-/// Something that its thread drops, whoever has it.
+/// Something that the thread which gives back drops, whoever has it.
 pub(super) struct Kept<T: Send + 'static> {
     /// There until the drop.
     what: Option<T>,
@@ -159,37 +127,24 @@ impl<T: Send + 'static> DerefMut for Kept<T> {
 impl<T: Send + 'static> Drop for Kept<T> {
     fn drop(&mut self) {
         if let Some(what) = self.what.take() {
-            self.rings.give(Box::new(move || drop(what)));
+            self.rings.0.closing.give(Box::new(move || drop(what)));
         }
-    }
-}
-
-fn work(tasks: Receiver<Task>, queue: &Queue) {
-    give_way();
-    tasks.into_iter().for_each(|task| queue.run(task));
-}
-
-/// Makes the calling thread nicer than who made it, who may have a real-time priority besides.
-fn give_way() {
-    // Both are about the calling thread, whatever their names say. It goes on as it is where the system refuses it.
-    #[cfg(target_os = "linux")]
-    let nice = getpriority_process(None);
-    make_ordinary();
-    #[cfg(target_os = "linux")]
-    if let Ok(nice) = nice {
-        let _ = setpriority_process(None, nice + NICER);
     }
 }
 
 #[cfg(test)]
 mod tests {
     use std::{
-        sync::mpsc::{RecvTimeoutError, SyncSender, sync_channel},
+        sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel},
         thread::{Thread, ThreadId, current},
+        time::Instant,
     };
 
     use super::*;
-    use crate::lncl::testing::WATCHDOG;
+    use crate::{
+        lncl::{testing::WATCHDOG, worker::WAITING_MAX},
+        stores::lock,
+    };
 
     /// Tells on which thread it is dropped.
     struct Remains(SyncSender<ThreadId>);
@@ -210,11 +165,11 @@ mod tests {
         runtime.block_on(future)
     }
 
-    /// Holds the thread until the sender is dropped.
-    fn hold(rings: &Rings) -> SyncSender<()> {
+    /// Holds a thread until the sender is dropped.
+    fn hold(worker: &Worker) -> SyncSender<()> {
         let (release, released) = sync_channel::<()>(0);
         let (begins, begun) = sync_channel(1);
-        rings.give(Box::new(move || {
+        worker.give(Box::new(move || {
             begins.send(()).expect("the test listens");
             assert_eq!(released.recv_timeout(WATCHDOG), Err(RecvTimeoutError::Disconnected));
         }));
@@ -222,71 +177,82 @@ mod tests {
         release
     }
 
+    /// The thread that gives back.
+    fn closing(rings: &Rings) -> ThreadId {
+        let (what, dropped) = remains();
+        drop(rings.keep(what));
+        dropped.recv_timeout(WATCHDOG).expect("it is dropped")
+    }
+
     #[test]
-    fn what_is_made_is_made_and_dropped_on_a_thread_of_its_own() {
+    fn what_is_made_is_made_on_a_thread_of_its_own_and_given_back_on_another() {
         let rings = Rings::begin();
         let thread: Thread = block_on(rings.run(current)).expect("no panic");
         assert_eq!(thread.name(), Some("rings"));
-        let (what, dropped) = remains();
-        drop(rings.keep(what));
-        assert_eq!(dropped.recv_timeout(WATCHDOG), Ok(thread.id()));
+        assert!(![thread.id(), current().id()].contains(&closing(&rings)));
     }
 
     #[test]
     fn who_has_gone_meanwhile_leaves_nothing() {
         // Given: somebody whose thing is not made yet.
         let rings = Rings::begin();
-        let thread = block_on(rings.run(current)).expect("no panic");
-        let held = hold(&rings);
+        let held = hold(&rings.0.making);
         let (what, dropped) = remains();
+        let what = rings.keep(what);
         let mut asked = Box::pin(rings.run(move || what));
         assert!(block_on(async { futures_util::poll!(&mut asked) }).is_pending());
         // When:
         drop(asked);
         drop(held);
         // Then:
-        assert_eq!(dropped.recv_timeout(WATCHDOG), Ok(thread.id()));
+        assert_eq!(dropped.recv_timeout(WATCHDOG), Ok(closing(&rings)));
     }
 
     #[test]
     fn so_much_waits_and_nothing_more_is_made_nor_done_by_who_asks() {
-        // Given: a thread that hangs, and as much as may wait for it.
+        // Given: threads that hang, and as much as may wait for them.
         let rings = Rings::begin();
-        let thread = block_on(rings.run(current)).expect("no panic");
-        let held = hold(&rings);
-        (0..WAITING_MAX).for_each(|_| rings.give(Box::new(|| ())));
-        // When: more is to be made, and something is given back.
+        let closing = closing(&rings);
+        let held = [&rings.0.making, &rings.0.closing].map(hold);
+        (0..WAITING_MAX).for_each(|_| rings.0.making.give(Box::new(|| ())));
+        (1..WAITING_MAX).for_each(|_| rings.0.closing.give(Box::new(|| ())));
+        assert!(rings.has_room());
+        // When: more is to be made, and is given back.
         let (asked, dropped) = remains();
         let asked = rings.keep(asked);
         assert!(block_on(rings.run(move || asked)).is_none());
-        let (what, given_back) = remains();
-        drop(rings.keep(what));
-        // Then: both wait for the thread.
-        assert!(dropped.try_recv().is_err() && given_back.try_recv().is_err());
+        // Then: it waits for the thread.
+        assert!(dropped.try_recv().is_err() && !rings.has_room());
         drop(held);
-        assert_eq!(dropped.recv_timeout(WATCHDOG), Ok(thread.id()));
-        assert_eq!(given_back.recv_timeout(WATCHDOG), Ok(thread.id()));
-        assert!(block_on(rings.run(current)).is_some(), "there is room again");
+        assert_eq!(dropped.recv_timeout(WATCHDOG), Ok(closing));
+        assert!(rings.has_room(), "there is room again");
+    }
+
+    #[test]
+    fn who_makes_the_thread_hang_that_gives_back_costs_newcomers_no_rings() {
+        let rings = Rings::begin();
+        let _held = hold(&rings.0.closing);
+        drop(rings.keep(()));
+        assert!(block_on(rings.run(current)).is_some());
     }
 
     #[test]
     fn what_takes_long_is_said_once() {
         let rings = Rings::begin();
-        let _held = hold(&rings);
-        assert!(!rings.0.queue.say_if_slow(), "it has just begun");
-        *lock(&rings.0.queue.since) = Instant::now().checked_sub(SLOW);
-        assert!(rings.0.queue.say_if_slow());
-        assert!(!rings.0.queue.say_if_slow());
+        let _held = hold(&rings.0.making);
+        assert!(!rings.0.making.queue.say_if_slow(), "it has just begun");
+        *lock(&rings.0.making.queue.since) = Instant::now().checked_sub(SLOW);
+        assert!(rings.0.making.queue.say_if_slow());
+        assert!(!rings.0.making.queue.say_if_slow());
     }
 
     #[test]
-    fn where_there_is_no_such_thread_any_more_nothing_is_lost() {
+    fn a_fault_in_one_thing_is_told_and_the_thread_does_the_next_one() {
         let rings = Rings::begin();
+        let thread = block_on(rings.run(current)).expect("no panic");
         let fault = || -> u8 { std::panic::panic_any("planted") };
         assert_eq!(block_on(rings.run(fault)), None);
-        // Its end is not told: what is given in that moment is dropped with its queue.
-        let (what, dropped) = remains();
-        drop(rings.keep(what));
-        dropped.recv_timeout(WATCHDOG).expect("it is dropped");
+        assert_eq!(block_on(rings.run(current)).map(|thread| thread.id()), Some(thread.id()));
+        assert!(rings.has_room());
     }
 }

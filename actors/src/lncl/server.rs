@@ -26,7 +26,7 @@ use super::{
     core::ClientId,
     introductions::Introductions,
     payload::{self, Refusal},
-    rings::Rings,
+    rings::{self, Rings},
     strangers::{Bounds, NoPlace, Place, Strangers},
 };
 use crate::{
@@ -94,6 +94,13 @@ impl Server {
         self.rings.get_or_init(Rings::begin)
     }
 
+    /// Resolves when there is room for what one connection more may leave.
+    async fn may_accept(&self) {
+        while self.rings.get().is_some_and(|rings| !rings.has_room()) {
+            tokio::time::sleep(ACCEPT_BACKOFF.1).await;
+        }
+    }
+
     /// Resolves when the barrier opens for `app`.
     pub(super) fn wait_for_release(&self, app: AppAddress) -> oneshot::Receiver<()> {
         let (sender, receiver) = oneshot::channel();
@@ -140,9 +147,13 @@ pub(super) async fn accept(server: Rc<Server>, listener: UnixListener) {
     let mut clients = JoinSet::new();
     let mut backoff = ACCEPT_BACKOFF.0;
     loop {
+        let accept = async {
+            server.may_accept().await;
+            listener.accept().await
+        };
         tokio::select! {
             Some(ended) = clients.join_next() => report(ended),
-            accepted = listener.accept() => match accepted {
+            accepted = accept => match accepted {
                 Ok((stream, _)) => {
                     backoff = ACCEPT_BACKOFF.0;
                     admit(&server, stream, &mut clients);
@@ -173,6 +184,8 @@ fn report(ended: Result<(), JoinError>) {
 /// Serves a connection from now on, or refuses it. Those that are served are bounded: as strangers here, as clients by the
 /// registry.
 fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) {
+    let connected = Connected { server: server.clone(), stream: Arc::new(stream) };
+    let stream = connected.stream.clone();
     let credentials = match check_credentials(&stream) {
         Ok(credentials) => credentials,
         Err(why) => return refuse(server, &stream, "credentials", &why),
@@ -181,14 +194,28 @@ fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) {
         Ok(place) => place,
         Err(why) => return refuse(server, &stream, "too many strangers", &why),
     };
-    let server = server.clone();
     let id = lock(&server.stores.registry).new_client();
-    let stream = Arc::new(stream);
     server.stores.door.admit(id, &stream);
     clients.spawn_local(async move {
-        client::serve(server.clone(), stream, credentials, id, place).await;
-        server.stores.door.dismiss(id);
+        client::serve(connected.server.clone(), stream, credentials, id, place).await;
+        connected.server.stores.door.dismiss(id);
     });
+}
+
+/// A connection that was taken. Dropping it ends it, and has what the peer left unread in it taken out by a thread that may wait: a
+/// descriptor may be beside it, which can take for ever to close.
+struct Connected {
+    server: Rc<Server>,
+    stream: Arc<UnixStream>,
+}
+
+impl Drop for Connected {
+    fn drop(&mut self) {
+        // spec: LNCL-18
+        if rings::shut(&self.stream) {
+            self.server.rings().empty(self.stream.clone());
+        }
+    }
 }
 
 /// spec: LNCL-13
@@ -219,6 +246,11 @@ const fn admits(own: u32, theirs: u32) -> bool {
 /// dropping it.
 pub(super) fn refuse(server: &Server, stream: &UnixStream, cause: &'static str, why: &dyn std::fmt::Display) {
     server.refusals.count(Time::now(), cause, why);
+    say_why(server, stream, why);
+}
+
+/// Says to a client why it is refused.
+pub(super) fn say_why(server: &Server, stream: &UnixStream, why: &dyn std::fmt::Display) {
     let refusal = Refusal { sentence: why.to_string(), again: false };
     let lncl = payload::lncl_of(server.stores.node);
     let message = payload::frame(Kind::LNCL_REFUSAL, lncl, Tid::NONE, &refusal);

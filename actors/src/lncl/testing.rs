@@ -2,8 +2,9 @@
 
 use std::{
     fs,
-    io::{Read, Write},
-    os::unix::net::UnixStream,
+    io::{self, IoSlice, Read, Write},
+    mem::MaybeUninit,
+    os::{fd::BorrowedFd, unix::net::UnixStream},
     path::{Path, PathBuf},
     sync::{
         Arc, Mutex,
@@ -17,6 +18,7 @@ use std::{
 use actix::Actor;
 use bytes::BytesMut;
 use futures_util::StreamExt;
+use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
 use sinew_runtime::{
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     post::PostStream,
@@ -268,12 +270,28 @@ impl RawClient {
         let _ = self.socket.write_all(bytes);
     }
 
+    /// Passes the bytes with a descriptor beside them.
+    pub(crate) fn pass(&mut self, bytes: &[u8], descriptors: &[BorrowedFd<'_>]) -> io::Result<()> {
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(2))];
+        let mut control = SendAncillaryBuffer::new(&mut space);
+        assert!(control.push(SendAncillaryMessage::ScmRights(descriptors)), "the space is for two");
+        let sent = sendmsg(&self.socket, &[IoSlice::new(bytes)], &mut control, SendFlags::NOSIGNAL)?;
+        assert_eq!(sent, bytes.len());
+        Ok(())
+    }
+
     /// Sends if the node goes on taking what is sent. If not, part of it may be sent: this is the last thing that is.
     pub(crate) fn takes_at_once(&mut self, message: &Message) -> bool {
         let mut bytes = BytesMut::new();
         encode_frame(&message.header, &message.payload, &mut bytes);
         self.socket.set_write_timeout(Some(Duration::from_millis(500))).unwrap();
         self.socket.write_all(&bytes).is_ok()
+    }
+
+    /// Reads until the node has closed.
+    pub(crate) fn skip_until_closed(&mut self) {
+        let mut chunk = [0; 4_096];
+        while matches!(self.socket.read(&mut chunk), Ok(count) if count > 0) {}
     }
 
     /// The next frame; `None` when the node has closed.
@@ -287,7 +305,7 @@ impl RawClient {
                 Ok(0) => return None,
                 Ok(count) => self.buffer.extend_from_slice(&chunk[..count]),
                 // Closed with bytes of ours unread.
-                Err(error) if error.kind() == std::io::ErrorKind::ConnectionReset => return None,
+                Err(error) if error.kind() == io::ErrorKind::ConnectionReset => return None,
                 Err(error) => panic!("waiting for a frame: {error}"),
             }
         }

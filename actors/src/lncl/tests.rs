@@ -1,8 +1,11 @@
 //! A real door, with clients spoken by hand: what a client in another language meets.
 
+mod documented;
 mod forks;
+mod lingering;
 mod owed;
 mod unread;
+mod waiting;
 
 use std::{sync::Arc, time::Duration};
 
@@ -19,16 +22,11 @@ use sinew_runtime::{
 
 use super::{
     AppFact,
-    payload::{self, Group, Register, Resolve, Resolved, Untaken, Waiting},
+    payload::{self, Group, Register, Resolve, Resolved, Untaken},
     registrar,
     testing::{RawClient, TestNode, WATCHDOG},
 };
-use crate::{
-    documentation::{block, python},
-    ndl::{self, NodeEvent},
-    stores::lock,
-    sync,
-};
+use crate::ndl::{self, NodeEvent};
 
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Angle {
@@ -41,10 +39,6 @@ impl Payload for Angle {
 
 fn named(name: &str) -> Register {
     Register { name: Some(name.to_owned()), ..Register::default() }
-}
-
-fn requiring(name: &str) -> Register {
-    Register { requires: vec![name.to_owned()], ..Register::default() }
 }
 
 fn confirmed(source: Tid, destination: Tid, correlation: u64) -> Message {
@@ -121,52 +115,6 @@ fn a_silent_stranger_is_sent_away() {
     let node = TestNode::start();
     let refusal = RawClient::connect(&node).expect_refusal();
     assert!(refusal.contains("LNCL_REGISTER"), "{refusal}");
-}
-
-// spec: LNCL-6
-#[test]
-fn a_client_that_wants_to_know_what_it_waits_for_is_told_and_told_again_when_that_changes() {
-    // Given: a client that requires what is not there.
-    let mut node = TestNode::start();
-    let mut client = RawClient::connect(&node);
-    client.ask_for_address(&Register { waits: true, ..requiring("hip") });
-    let mut next = || {
-        let frame = client.next().expect("what it waits for");
-        assert_eq!(frame.header.kind, Kind::LNCL_WAITING, "{frame:?}");
-        payload::read::<Waiting>(&frame.payload).unwrap().missing
-    };
-    assert_eq!(next(), [], "nobody knows yet");
-
-    // When: the sync manager hears of it.
-    let fact = node.fact();
-    let AppFact::Registered { app, .. } = fact else { panic!("{fact:?} is no registration") };
-    lock(&node.stores.sync).handle(Time::now(), sync::Input::AppChanged(fact));
-
-    // Then:
-    let [missing] = &next()[..] else { panic!("one thing is missing") };
-    assert_eq!(missing.what, "hip");
-    assert!(!missing.why.is_empty());
-    node.release(app);
-    client.expect_registered();
-}
-
-// spec: LNCL-6
-#[test]
-fn a_client_that_waits_for_very_much_is_told_so_much_of_it_as_any_socket_has_room_for() {
-    let mut node = TestNode::start();
-    let mut client = RawClient::connect(&node);
-    let requires = (0..64).map(|index| format!("{index:0>60} | x ?9s")).collect();
-    client.ask_for_address(&Register { waits: true, requires, ..Register::default() });
-    assert!(payload::read::<Waiting>(&client.next().expect("a frame").payload).unwrap().missing.is_empty());
-    let fact = node.fact();
-    lock(&node.stores.sync).handle(Time::now(), sync::Input::AppChanged(fact));
-    let frame = client.next().expect("what it waits for");
-    let missing = payload::read::<Waiting>(&frame.payload).unwrap().missing;
-    assert!(
-        (1..=16).contains(&missing.len()) && frame.payload.len() < 2_048,
-        "{} bytes",
-        frame.payload.len()
-    );
 }
 
 #[test]
@@ -364,39 +312,6 @@ fn an_outcome_comes_back_from_a_client() {
 }
 
 #[test]
-fn a_client_is_held_until_all_that_it_requires_is_ready() {
-    let mut node = TestNode::start();
-    let app = node.local(1);
-    let mut client = RawClient::connect(&node);
-    client.ask_for_address(&requiring("knee.sensor"));
-    let AppFact::Registered { app: address, requires, .. } = node.fact() else { panic!("no registration") };
-    assert_eq!(requires, ["knee.sensor"]);
-    let early = node.send_confirmed(app.tid, Tid::new(node.address(), address), &Angle { degrees: 0.0 });
-    assert_eq!(early.recv_timeout(WATCHDOG), Ok(Outcome::Rejected(Rejection::NoSuchApplication)));
-    node.release(address);
-    assert_eq!(client.expect_registered().app, address);
-    assert_eq!(node.fact(), AppFact::Ready { app: address });
-}
-
-#[test]
-fn a_client_may_leave_while_it_waits_at_the_barrier() {
-    let mut node = TestNode::start();
-    for say_goodbye in [true, false] {
-        let mut client = RawClient::connect(&node);
-        client.ask_for_address(&requiring("knee.sensor"));
-        let AppFact::Registered { app, .. } = node.fact() else { panic!("no registration") };
-        if say_goodbye {
-            client
-                .send(&Message::new(Header::new(Kind::LNCL_UNREGISTER, Tid::NONE, Tid::NONE), Bytes::new()));
-            assert!(client.next().is_none());
-        } else {
-            drop(client);
-        }
-        assert_eq!(node.fact(), AppFact::Unregistered { app });
-    }
-}
-
-#[test]
 fn who_subscribes_to_node_events_is_told_to_ndl_and_others_are_not() {
     let mut node = TestNode::start();
     let mut heard = node.stores.posts.ndl.attach();
@@ -482,42 +397,6 @@ fn filler(source: Tid, destination: Tid) -> Message {
     let mut header = Header::new(Kind::named("blob"), source, destination);
     header.class = Class::Bulk;
     Message::new(header, vec![0; 8_192 - HEADER_LEN].into())
-}
-
-const DOCUMENTATION: &str = include_str!("../../../docs/protocol/lncl.md");
-
-#[test]
-fn the_bytes_in_the_documentation_are_a_registration() {
-    let node = TestNode::start();
-    let text = block(DOCUMENTATION, "## The bytes of a registration", "```text");
-    let bytes: Vec<_> = text.split_whitespace().map(|byte| u8::from_str_radix(byte, 16).unwrap()).collect();
-    let mut client = RawClient::connect(&node);
-    client.send_bytes(&bytes);
-    let tid = client.expect_registered();
-    assert_eq!(registrar::resolve(&node.stores, "hip"), Some(tid));
-}
-
-#[test]
-fn the_client_in_the_documentation_answers_and_confirms() {
-    let Some(mut python) = python(DOCUMENTATION, "## A whole client") else { return };
-    let mut node = TestNode::start();
-    let mut python = python.arg(node.path()).spawn().expect("it was there a moment ago");
-    let AppFact::Registered { app, name, .. } = node.fact() else { panic!("no registration") };
-    assert_eq!(name.as_deref(), Some("echo"));
-    assert_eq!(node.fact(), AppFact::Ready { app });
-    let (mut asking, tid) = RawClient::register(&node, &Register::default());
-    node.fact();
-    node.fact();
-    let mut request = confirmed(tid, Tid::new(node.address(), app), 4);
-    request.header.flags = Flags::CONFIRM.with(Flags::ASK);
-    asking.send(&request);
-    let reply = asking.next().unwrap();
-    assert_eq!((reply.header.flags, reply.header.correlation), (Flags::REPLY, 4));
-    assert_eq!(reply.decode::<Angle>().unwrap(), Angle { degrees: 1.0 });
-    assert_eq!(outcome_of(&asking.next().unwrap()), (4, Outcome::Delivered));
-    python.kill().unwrap();
-    python.wait().unwrap();
-    assert_eq!(node.fact(), AppFact::Unregistered { app }, "a killed process is noticed");
 }
 
 #[test]

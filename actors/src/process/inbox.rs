@@ -18,7 +18,7 @@ use super::words::{Fate, Turn, WINDOW};
 #[derive(Debug)]
 pub(super) struct Inbox {
     queue: ClassQueue,
-    /// What the node's layers say: ahead of everything else. The node's window bounds them.
+    /// What the node's layers say: ahead of everything else, but for what is said of a node's end. The node's window bounds them.
     events: VecDeque<Message>,
     /// Number of the last message that came.
     last: u64,
@@ -62,7 +62,9 @@ impl Inbox {
         let is_event = is_event(header);
         message.receipt = Some(Receipt::new(self.mute.clone(), ticket));
         if is_event {
-            self.events.push_back(message);
+            if let Some(event) = self.queue.keep_behind(message) {
+                self.events.push_back(event);
+            }
             return (None, self.reader.take());
         }
         let gone = match self.queue.push(message) {
@@ -168,7 +170,8 @@ mod tests {
     use bytes::Bytes;
     use futures_util::task::noop_waker;
     use sinew_runtime::{
-        tid::Tid,
+        mailbox::About,
+        tid::{AppAddress, NodeAddress, Tid},
         wire::{Class, Header, Kind},
     };
 
@@ -195,6 +198,32 @@ mod tests {
         inbox.finish(Outcome::Delivered);
         let done = Some((2, Fate::Ended(Outcome::Delivered)));
         assert_eq!(inbox.claim(), Some(Turn { done, taken: Some(1) }));
+    }
+
+    #[test]
+    fn what_is_said_of_a_nodes_end_is_claimed_behind_what_came_of_it_and_other_events_before() {
+        let (here, gone) = (NodeAddress::new(1), NodeAddress::new(2));
+        let app = AppAddress::new(0x1000);
+        let of = |source: Tid, sequence: u64| {
+            let mut message = message(Class::Bulk, sequence);
+            (message.header.source, message.header.destination) = (source, Tid::new(here, app));
+            message
+        };
+        let event = |about: About, sequence: u64| {
+            let mut event = of(Tid::new(here, AppAddress::NDL), sequence);
+            about.write(&mut event.header);
+            event
+        };
+        let mut inbox = Inbox::new();
+        inbox.push(of(Tid::new(gone, app), 1));
+        inbox.push(event(About::End(gone), 2));
+        inbox.push(event(About::End(here), 3));
+        let (waker, mut order) = (noop_waker(), Vec::new());
+        while inbox.claim().is_some() {
+            let Poll::Ready(message) = inbox.poll_claimed(true, &Context::from_waker(&waker)) else { break };
+            order.push(message.header.sequence);
+        }
+        assert_eq!(order, [3, 1, 2]);
     }
 
     #[test]

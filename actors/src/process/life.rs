@@ -169,6 +169,7 @@ impl Child {
         let (tid, node) = (hosted.tid, payload::lncl_of(hosted.tid.node));
         // Before the names are looked up: a change in between is told twice and not never.
         let directory = hosted.stores.directory_changes.subscribe();
+        let told = *directory.borrow();
         let mut names = KnownNames::default();
         let known = names.changes(&hosted.stores).unwrap_or_default();
         let welcome = Welcome {
@@ -179,7 +180,7 @@ impl Child {
             names: known,
         };
         let welcome = words::frame(Kind::HOST_WELCOME, node, tid, &welcome);
-        let number = hosted.link.connect(stream.clone(), welcome, directory);
+        let number = hosted.link.connect(stream.clone(), welcome, (directory, told));
         let mut session = Session::new();
         session.released(tid);
         let reader = Reader::new(hosted.stores.config.payload_max.max(WORDS_BYTES_MAX));
@@ -374,10 +375,11 @@ impl Child {
     }
 
     fn tell_names(&mut self) {
-        self.hosted.link.directory_is_told();
+        let seen = *self.hosted.stores.directory_changes.borrow();
         if let Some(changes) = self.names.changes(&self.hosted.stores) {
             self.tell(&changes);
         }
+        self.hosted.link.directory_is_told(seen);
     }
 
     fn tell(&self, names: &Names) {

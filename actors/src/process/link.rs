@@ -72,10 +72,19 @@ struct Present {
     number: LinkNumber,
     lender: Lender,
     window: Window,
-    /// Tells of changes of the directory that the child has not been told of.
+    /// Counts the changes of the directory.
     directory: watch::Receiver<u64>,
-    /// A message that came after such a change: its sender may know of it, so the child must.
+    /// So many of them the child has been told of, ahead of all that is handed over from then on.
+    told: u64,
+    /// A message that came after a further one: its sender may know of it, so the child must.
     held: Option<Message>,
+}
+
+impl Present {
+    /// Whether the child has been told of every change that a sender may know of by now.
+    fn knows_directory(&self) -> bool {
+        *self.directory.borrow() == self.told
+    }
 }
 
 impl Link {
@@ -134,20 +143,21 @@ impl Link {
         self.sender.get().map_or(0, Sender::last_sequence)
     }
 
-    /// Messages go to the process behind `socket` from now on, `welcome` first.
+    /// Messages go to the process behind `socket` from now on, `welcome` first, which tells of the `told` first changes of the
+    /// `directory`.
     pub(super) fn connect(
         &self,
         socket: Arc<UnixStream>,
         welcome: Message,
-        directory: watch::Receiver<u64>,
+        (directory, told): (watch::Receiver<u64>, u64),
     ) -> LinkNumber {
         // A former process whose supervisor did not wait for its end.
         let former = lock(&self.present).take();
         // Without the lock, because whoever is told may send to this very TID.
         self.end(former, LastWords::Unheard);
         let number = self.outlet.connect(socket, self.payload_max, Some(welcome));
-        let (window, held) = (Window::default(), None);
-        *lock(&self.present) = Some(Present { number, lender: self.mailbox.lend(), window, directory, held });
+        let (lender, window, held) = (self.mailbox.lend(), Window::default(), None);
+        *lock(&self.present) = Some(Present { number, lender, window, directory, told, held });
         self.pump();
         number
     }
@@ -195,10 +205,11 @@ impl Link {
         self.nudge.notified().await;
     }
 
-    /// The child is about to be told of all changes up to now.
-    pub(super) fn directory_is_told(&self) {
+    /// The child has been told of so many changes, counted before it was looked what has changed. Said when the words are on their
+    /// way and not before: what another thread sends meanwhile would overtake them.
+    pub(super) fn directory_is_told(&self, changes: u64) {
         if let Some(present) = &mut *lock(&self.present) {
-            present.directory.mark_unchanged();
+            present.told = changes;
         }
     }
 
@@ -208,11 +219,11 @@ impl Link {
         if let Some(present) = &mut *lock(&self.present)
             && let Some(message) = present.held.take()
         {
-            if present.directory.has_changed().unwrap_or(false) {
+            if present.knows_directory() {
+                self.hand_over(present, message);
+            } else {
                 present.held = Some(message);
                 self.nudge.notify_one();
-            } else {
-                self.hand_over(present, message);
             }
         }
         self.pump();
@@ -268,12 +279,11 @@ impl Link {
                 Room::Nothing => None,
             };
             let Some(message) = next else { return };
-            // It has not changed either where nobody can tell any more.
-            if present.directory.has_changed().unwrap_or(false) {
+            if present.knows_directory() {
+                self.hand_over(present, message);
+            } else {
                 present.held = Some(message);
                 self.nudge.notify_one();
-            } else {
-                self.hand_over(present, message);
             }
         }
     }
@@ -405,7 +415,7 @@ mod tests {
         let _entered = runtime.enter();
         let (socket, mut process) = UnixStream::pair().expect("a pair of sockets");
         let welcome = words::bare(Kind::HOST_WELCOME, Tid::NONE, tid);
-        let number = link.connect(Arc::new(socket), welcome, stores.directory_changes.subscribe());
+        let number = link.connect(Arc::new(socket), welcome, (stores.directory_changes.subscribe(), 0));
         let mut frame = [0; HEADER_LEN];
         runtime.block_on(async {
             tokio::select! {
@@ -414,19 +424,25 @@ mod tests {
             }
         });
         let waits = || lock(&link.present).as_ref().expect("it is connected").held.is_some();
-        // Given: the child is being told of one change when another one and a message come
+        let send = || {
+            link.submit(Message::new(Header::new(Kind::named("event"), tid, tid), Bytes::new()))
+                .expect("there is room");
+        };
+        // Given: the child is being told of one change when a message comes
         stores.directory_has_changed();
-        link.directory_is_told();
+        send();
+        assert!(waits(), "the words are not on their way");
+        // When: it has been told, and meanwhile there was another one
         stores.directory_has_changed();
-        link.submit(Message::new(Header::new(Kind::named("event"), tid, tid), Bytes::new()))
-            .expect("there is room");
-        // When: the child has been told of the first
+        link.directory_is_told(1);
         link.hand_over_held();
         // Then
         assert!(waits(), "it does not know of the second");
-        link.directory_is_told();
+        link.directory_is_told(2);
         link.hand_over_held();
         assert!(!waits());
+        send();
+        assert!(!waits(), "it knows all");
     }
 
     #[test]
@@ -444,7 +460,7 @@ mod tests {
             let (second, _other) = UnixStream::pair().expect("another");
             let connect = |socket| {
                 let welcome = words::bare(Kind::HOST_WELCOME, Tid::NONE, tid);
-                link.connect(Arc::new(socket), welcome, stores.directory_changes.subscribe())
+                link.connect(Arc::new(socket), welcome, (stores.directory_changes.subscribe(), 0))
             };
             let number = connect(first);
             let mut message = Message::new(Header::new(Kind::named("first"), tid, tid), Bytes::new());

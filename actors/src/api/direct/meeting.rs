@@ -1,6 +1,33 @@
 //! How a link is made: LNCL's introductions, the offers of both sides, and the marks by which they switch to it.
 
-use super::*;
+use std::io;
+
+use sinew_shm::{Descriptors, PassError, Received, set_descriptors};
+
+use super::{foreign::Foreign, *};
+
+/// What a peer has passed for its half, of which nothing is judged.
+struct Theirs {
+    received: Received,
+    copies: Foreign,
+}
+
+impl Theirs {
+    /// Takes it. Nothing more may be passed over `socket` from then on, where the system knows that.
+    fn take(socket: &Arc<UnixStream>) -> Result<Self, ExchangeError> {
+        let received = Exchange::take(socket).map_err(|error| {
+            let is_there = !matches!(
+                &error,
+                ExchangeError::Pass(PassError::System(cause)) if cause.kind() == io::ErrorKind::WouldBlock
+            );
+            if is_there { error } else { ExchangeError::Missing }
+        })?;
+        let _ = set_descriptors(socket, Descriptors::Refused);
+        let copies = Foreign::of(&received, socket);
+        let theirs = Self { received, copies: copies.map_err(PassError::System)? };
+        if descriptors::holds_something(socket) { Err(ExchangeError::Stray) } else { Ok(theirs) }
+    }
+}
 
 impl Direct {
     /// Does what a frame of the node asks for. Hands it back if it is not about links.
@@ -69,7 +96,7 @@ impl Direct {
             return;
         }
         let connected = socket.ok_or(ExchangeError::Missing).and_then(|socket| {
-            let theirs = Exchange::receive(&socket)?.ok_or(ExchangeError::Missing)?;
+            let theirs = Theirs::take(&socket)?;
             let (exchange, share) = self.prepare(&socket)?;
             self.connect(Offered { peer, number, socket, exchange, share }, theirs)
         });
@@ -86,9 +113,12 @@ impl Direct {
         }
     }
 
-    fn connect(&self, offered: Offered, theirs: Offer) -> Result<Standing, ExchangeError> {
+    fn connect(&self, offered: Offered, theirs: Theirs) -> Result<Standing, ExchangeError> {
+        // Dropped in the other order: the copies last.
+        let Theirs { received, copies } = theirs;
         let Offered { peer, number, socket, exchange, share } = offered;
-        let (producer, consumer) = exchange.finish(theirs)?;
+        let (producer, consumer) = exchange.finish(received.into_offer()??)?;
+        copies.are_good();
         let writer = ring::Writer::new(socket.clone(), producer, &self.terms.options);
         let pair = Pair { own: self.terms.own, peer, number, socket };
         Ok(Standing::new(pair, writer, consumer, share, self.terms.payload_max))
@@ -132,7 +162,7 @@ impl Direct {
     fn connect_offered(&mut self, peer: Tid, number: LinkNumber, now: Time, node: &mut ToNode<'_>) -> bool {
         let Some(index) = self.offered.iter().position(|link| link.number == number) else { return false };
         let offered = self.offered.swap_remove(index);
-        let theirs = Exchange::receive(&offered.socket).and_then(|offer| offer.ok_or(ExchangeError::Missing));
+        let theirs = Theirs::take(&offered.socket);
         match theirs.and_then(|theirs| self.connect(offered, theirs)) {
             Ok(link) => {
                 self.open.push(link);
@@ -171,5 +201,45 @@ impl Direct {
             Answered::End(peer, number) => self.end(peer, number, now),
         }
         None
+    }
+}
+
+#[cfg(all(test, target_os = "linux"))]
+mod tests {
+    use std::{io::IoSlice, mem::MaybeUninit, os::fd::AsFd, sync::mpsc::sync_channel};
+
+    use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
+    use sinew_shm::OFFER_BYTES;
+
+    use super::*;
+    use crate::{lingering::Lingering, lncl::testing::WATCHDOG};
+
+    #[test]
+    fn what_a_peer_passes_in_place_of_its_offer_is_not_closed_by_who_takes_it() {
+        // Given: a peer that passes what does not close, and keeps no copy.
+        let (ours, theirs) = UnixStream::pair().unwrap();
+        ours.set_nonblocking(true).unwrap();
+        let mut lingering = Lingering::new();
+        let passed = lingering.ours.take().expect("it is passed once");
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
+        let mut control = SendAncillaryBuffer::new(&mut space);
+        let descriptors = [passed.as_fd()];
+        assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)));
+        let bytes = [IoSlice::new(&[0; OFFER_BYTES])];
+        sendmsg(&theirs, &bytes, &mut control, SendFlags::empty()).unwrap();
+        drop(passed);
+        // When: it is taken and refused.
+        let (say, said) = sync_channel(1);
+        std::thread::spawn(move || {
+            let ours = Arc::new(ours);
+            let Theirs { received, copies } = Theirs::take(&ours).map_err(|why| why.to_string()).unwrap();
+            let is_refused = matches!(received.into_offer(), Ok(Err(_)));
+            drop(copies);
+            // The test has ended, where this comes too late.
+            let _ = say.send(is_refused);
+        });
+        // Then:
+        assert_eq!(said.recv_timeout(WATCHDOG), Ok(true));
+        lingering.let_go();
     }
 }

@@ -20,7 +20,7 @@ use sinew_runtime::{
 };
 use tokio_util::codec::Decoder;
 
-use super::{Link, LinkOptions, Reader, Writer, asked, connect, ring, socket};
+use super::{Ended, Link, LinkOptions, Reader, Writer, asked, connect, ring, socket};
 use crate::{
     api::ApiError,
     lncl::payload::{self, Missing, Refusal, Register, Registered, Waiting},
@@ -43,6 +43,8 @@ pub(in crate::api) struct Greeting {
     missing: Option<Vec<String>>,
     /// The address is given; the node's half of the rings has not come yet.
     offered: Option<Offered>,
+    /// The node has given it up, and says that another one may succeed.
+    may_begin_anew: bool,
 }
 
 /// This side's half of the rings, which the node knows.
@@ -68,7 +70,8 @@ impl Greeting {
         let frame = payload::frame(Kind::LNCL_REGISTER, Tid::NONE, lncl, &asked);
         let written = socket::Writer::new(socket.clone(), &options).write(&frame);
         let frame = BytesMut::zeroed(HEADER_LEN);
-        let mut greeting = Self { socket, options, frame, filled: 0, missing: None, offered: None };
+        let (filled, missing, offered, may_begin_anew) = (0, None, None, false);
+        let mut greeting = Self { socket, options, frame, filled, missing, offered, may_begin_anew };
         match written {
             Ok(()) => Ok(greeting),
             Err(error) => Err(greeting.explain(error)),
@@ -89,9 +92,24 @@ impl Greeting {
         if self.offered.is_none() {
             let Some(registered) = self.hear(deadline)? else { return Ok(None) };
             let Some(ring_bytes) = registered.ring else { return Ok(Some(self.plain(registered))) };
-            self.offered = Some(self.offer(registered, ring_bytes)?);
+            let offered = self.offer(registered, ring_bytes);
+            self.offered = Some(offered.map_err(|seen| self.told_in_place_of(seen))?);
         }
         self.exchange(deadline)
+    }
+
+    /// Whether the node has ended it for what is nobody's fault: it waited for the rings of a process that was stopped, say.
+    pub(in crate::api) const fn may_begin_anew(&self) -> bool {
+        self.may_begin_anew
+    }
+
+    /// What the node took leave with, if it did, in place of what was seen of that.
+    fn told_in_place_of(&mut self, seen: ApiError) -> ApiError {
+        // Before its words lies its offer. If that is broken, so are they.
+        let words = Exchange::receive(&self.socket).ok().and_then(|_| ring::farewell(&self.socket));
+        let Some(Ended { why, again }) = words else { return seen };
+        self.may_begin_anew = again;
+        ApiError::Refused(why)
     }
 
     /// What the node says that the registration waits for: nothing, if that is not known yet. `None` if it has said nothing at all.
@@ -214,7 +232,12 @@ fn read_greeting(message: &Message) -> Result<Registered, ApiError> {
 #[cfg(test)]
 #[cfg(target_os = "linux")]
 mod tests {
-    use std::{io::Write, os::unix::net::UnixListener};
+    use std::{
+        cell::{OnceCell, RefCell},
+        io::Write,
+        net::Shutdown,
+        os::unix::net::UnixListener,
+    };
 
     use rustix::net::{AddressFamily, SocketAddrUnix, SocketType, bind, listen, socket};
     use sinew_runtime::{tid::AppAddress, wire::encode_frame};
@@ -236,10 +259,14 @@ mod tests {
         let registered = Registered { node, app, node_name, payload_max: 4_096, ring: Some(4_096) };
         let tid = Tid::new(node, app);
         let frame = payload::frame(Kind::LNCL_REGISTERED, payload::lncl_of(node), tid, &registered);
+        client.write_all(&bytes_of(&frame)).unwrap();
+        client
+    }
+
+    fn bytes_of(frame: &Message) -> BytesMut {
         let mut bytes = BytesMut::new();
         encode_frame(&frame.header, &frame.payload, &mut bytes);
-        client.write_all(&bytes).unwrap();
-        client
+        bytes
     }
 
     #[test]
@@ -249,12 +276,12 @@ mod tests {
         let path = directory.path().join("node.sock");
         let listener = UnixListener::bind(&path).unwrap();
         let registration = Registration::new();
-        let until = || Time::now() + SHORT;
-        let begun = Greeting::begin(&path, &registration.register, registration.link.clone(), until());
+        let long = Time::now() + WATCHDOG;
+        let begun = Greeting::begin(&path, &registration.register, registration.link.clone(), long);
         let mut greeting = begun.unwrap();
         assert!(greeting.wait(Time::now()).unwrap().is_none(), "it has said nothing");
         let node = answer(&listener);
-        assert!(greeting.wait(until()).unwrap().is_none(), "it has offered nothing");
+        assert!(greeting.wait(Time::now() + SHORT).unwrap().is_none(), "it has offered nothing");
         // when
         Exchange::prepare(rings::capacity(4_096), BellKind::Socket).unwrap().offer(&node).unwrap();
         // then
@@ -267,11 +294,47 @@ mod tests {
         let directory = TestDirectory::new();
         let path = directory.path().join("node.sock");
         let listener = UnixListener::bind(&path).unwrap();
-        let api = NodeApi { path };
-        let node = std::thread::spawn(move || answer(&listener));
-        let error = api.register_transport_address(Registration::new().deadline(SHORT)).unwrap_err();
-        assert!(matches!(error, ApiError::NoAnswer(SHORT)), "{error}");
-        drop(node.join().unwrap());
+        let node = OnceCell::new();
+        let answers = || {
+            node.get_or_init(|| answer(&listener));
+            true
+        };
+        let error = Registration::new().deadline(SHORT).greet(&path, WATCHDOG, answers).err();
+        assert!(matches!(error, Some(ApiError::NoAnswer(SHORT))), "{error:?}");
+    }
+
+    #[test]
+    fn a_registration_that_the_node_gave_up_while_its_process_was_stopped_begins_anew() {
+        for again in [true, false] {
+            // Given: a node that has waited in vain for this side's offer, and then one that does not wait any more.
+            let directory = TestDirectory::new();
+            let path = directory.path().join("node.sock");
+            let listener = UnixListener::bind(&path).unwrap();
+            let exchange = || Exchange::prepare(rings::capacity(4_096), BellKind::Socket).unwrap();
+            let nodes = RefCell::new(Vec::new());
+            let plays = || {
+                let mut node = answer(&listener);
+                exchange().offer(&node).unwrap();
+                let is_first = nodes.borrow().is_empty();
+                if is_first {
+                    let refusal = Refusal { sentence: "too late".to_owned(), again };
+                    let lncl = payload::lncl_of(NodeAddress::new(1));
+                    let words = payload::frame(Kind::LNCL_REFUSAL, lncl, Tid::NONE, &refusal);
+                    node.write_all(&bytes_of(&words)).unwrap();
+                    node.shutdown(Shutdown::Both).unwrap();
+                }
+                nodes.borrow_mut().push(node);
+                true
+            };
+            // When: it goes on.
+            let link = Registration::new().deadline(WATCHDOG).greet(&path, WATCHDOG, plays);
+            // Then:
+            match link {
+                Ok(link) => assert!(again && link.registered.node_name == "played"),
+                Err(why) => assert!(!again && why.to_string() == "the node refused: too late", "{why}"),
+            }
+            assert_eq!(nodes.borrow().len(), if again { 2 } else { 1 });
+        }
     }
 
     #[test]
@@ -300,30 +363,29 @@ mod tests {
             let directory = TestDirectory::new();
             let path = directory.path().join("node.sock");
             let listener = UnixListener::bind(&path).unwrap();
-            let node = std::thread::spawn(move || {
-                let (mut client, _) = listener.accept().unwrap();
-                let frames = said.map(|missing| {
+            let node = OnceCell::new();
+            // When: it has said so before the first look, and nobody wants to look a second time.
+            let says = || {
+                let looks_first = node.get().is_none();
+                node.get_or_init(|| {
+                    let (mut client, _) = listener.accept().unwrap();
+                    let Some(missing) = said.clone() else { return client };
                     let (kind, waiting) = (Kind::LNCL_WAITING, Waiting { missing });
-                    payload::frame(kind, payload::lncl_of(NodeAddress::new(1)), Tid::NONE, &waiting)
+                    let lncl = payload::lncl_of(NodeAddress::new(1));
+                    client.write_all(&bytes_of(&payload::frame(kind, lncl, Tid::NONE, &waiting))).unwrap();
+                    client
                 });
-                let mut bytes = BytesMut::new();
-                if let Some(frame) = frames {
-                    encode_frame(&frame.header, &frame.payload, &mut bytes);
-                }
-                client.write_all(&bytes).unwrap();
-                client
-            });
-            // When: the deadline passes.
-            let registration = Registration::new().requires(["hip", "knee"]).deadline(SHORT);
-            let error = NodeApi { path }.register_transport_address(registration).unwrap_err();
+                looks_first
+            };
+            let registration = Registration::new().requires(["hip", "knee"]).deadline(WATCHDOG);
+            let error = registration.greet(&path, SHORT, says).err();
             // Then:
             let is_said = if told.is_empty() {
-                matches!(error, ApiError::NoAnswer(SHORT))
+                matches!(error, Some(ApiError::NoAnswer(WATCHDOG)))
             } else {
-                matches!(&error, ApiError::Waiting { missing, .. } if *missing == told)
+                matches!(&error, Some(ApiError::Waiting { missing, .. }) if *missing == told)
             };
-            assert!(is_said, "{error}");
-            drop(node.join().unwrap());
+            assert!(is_said, "{error:?}");
         }
     }
 

@@ -253,15 +253,19 @@ impl ReceiptSink for Writer {
     }
 }
 
-/// Why the node has closed the socket: its words are the only bytes that a ring's socket ever carries.
+/// Why the node has closed the socket.
 fn last_words(socket: &UnixStream) -> Ended {
+    farewell(socket).unwrap_or_else(Ended::silently)
+}
+
+/// The words with which the node takes leave, if there are any: the only bytes that a ring's socket ever carries.
+pub(super) fn farewell(socket: &UnixStream) -> Option<Ended> {
     let mut buffer = BytesMut::zeroed(LAST_WORDS_BYTES_MAX);
     let count = recv(socket, &mut buffer[..], RecvFlags::DONTWAIT).map_or(0, |(count, _)| count);
     buffer.truncate(count);
     let refusal = FrameCodec::new(LAST_WORDS_BYTES_MAX).decode(&mut buffer).ok().flatten();
     let refusal = refusal.filter(|message| message.header.kind == Kind::LNCL_REFUSAL);
-    let sentence = refusal.and_then(|message| payload::read::<Refusal>(&message.payload).ok());
-    sentence.map_or_else(Ended::silently, Ended::from)
+    refusal.and_then(|message| payload::read::<Refusal>(&message.payload).ok()).map(Ended::from)
 }
 
 /// The reading half.

@@ -32,6 +32,8 @@ pub(super) enum End {
     HungUp(Option<io::Error>),
     /// It was refused.
     Refused(String),
+    /// Its rings were not there in time, which is nobody's fault: it may register again.
+    Late(String),
 }
 
 impl End {
@@ -42,7 +44,7 @@ impl End {
             Self::HungUp(_) => {
                 Cause::new(DownClass::ProcessEnded, "its process ended, or closed its connection")
             }
-            Self::Refused(sentence) => {
+            Self::Refused(sentence) | Self::Late(sentence) => {
                 Cause::new(DownClass::Killed, format!("its connection was ended: {sentence}"))
             }
         }
@@ -72,6 +74,9 @@ impl From<LinkError> for End {
 impl From<FrameError> for End {
     fn from(error: FrameError) -> Self {
         match error {
+            FrameError::Io(cause) if cause.kind() == io::ErrorKind::InvalidData => {
+                Self::Refused(cause.to_string())
+            }
             FrameError::Io(cause) => Self::HungUp(Some(cause)),
             FrameError::Header(_) | FrameError::TooLong { .. } => Self::Refused(error.to_string()),
         }
@@ -89,11 +94,20 @@ impl Client {
             End::HungUp(Some(cause)) => self.log(&format!("has gone: {cause}")),
             // spec: LNCL-4
             End::Refused(sentence) => {
-                let detail = format!("{} ({}): {sentence}", self.name, self.tid);
-                self.server.refusals.count(Time::now(), "protocol violation", &detail);
+                self.count("protocol violation", &sentence);
                 self.say_farewell(sentence).await;
             }
+            // spec: LNCL-9
+            End::Late(sentence) => {
+                self.count("rings too late", &sentence);
+                self.say_last(sentence, true);
+            }
         }
+    }
+
+    fn count(&self, cause: &'static str, sentence: &str) {
+        let detail = format!("{} ({}): {sentence}", self.name, self.tid);
+        self.server.refusals.count(Time::now(), cause, &detail);
     }
 
     async fn say_farewell(&self, sentence: String) {

@@ -1,0 +1,42 @@
+//! Descriptors that take for ever to close, for tests of who closes them.
+
+use std::{
+    io::{ErrorKind, Write},
+    net::{TcpListener, TcpStream},
+    time::Duration,
+};
+
+use rustix::net::sockopt::{set_socket_linger, set_socket_recv_buffer_size};
+
+/// A connection whose last close waits until its peer has taken what is written, or has gone.
+pub(crate) struct Lingering {
+    pub(crate) ours: Option<TcpStream>,
+    peer: TcpStream,
+}
+
+impl Lingering {
+    pub(crate) fn new() -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("a connection on loopback");
+        set_socket_recv_buffer_size(&listener, 4_096).expect("a connection on loopback");
+        let mut ours = TcpStream::connect(listener.local_addr().expect("a connection on loopback"))
+            .expect("a connection on loopback");
+        let (peer, _) = listener.accept().expect("a connection on loopback");
+        ours.set_nonblocking(true).expect("a connection on loopback");
+        // So much that it is not all taken, however fast the system moves it from one buffer to the other.
+        let chunk = vec![0; 1 << 16];
+        loop {
+            match ours.write(&chunk) {
+                Ok(_) => {}
+                Err(error) if error.kind() == ErrorKind::WouldBlock => break,
+                Err(error) => panic!("filling a connection: {error}"),
+            }
+        }
+        set_socket_linger(&ours, Some(Duration::from_secs(3_600))).expect("a connection on loopback");
+        Self { ours: Some(ours), peer }
+    }
+
+    /// Ends its close, wherever somebody waits for it.
+    pub(crate) fn let_go(self) {
+        drop(self.peer);
+    }
+}
