@@ -13,6 +13,7 @@
 //! | the same in a process of its own, started and restarted by the node | [`AppSpec::own_process`], [`Place::process`] |
 //! | an application in a process that the node did not start | [`NodeApi`], [`Endpoint`] for a thread, [`AsyncEndpoint`] for a task |
 //! | sending | [`Sender`]: `send`, `send_confirmed`, `ask`; [`Outcome`] |
+//! | who another node is, proven | [`security`] |
 //! | events | [`NodeEvent`] (who is there), [`DirectoryEvent`] (which applications are, and what they handle), [`RequirementEvent`] (what is ready), [`Down`] (who ended, and why) |
 //!
 //! `docs/SEMANTICS.md` says on one page what is promised and what is not.
@@ -29,6 +30,7 @@ extern crate self as sinew;
 // What the layers log stops nobody.
 use sinew_runtime::log;
 
+mod aftermath;
 pub mod api;
 pub mod audit;
 pub mod config;
@@ -37,15 +39,19 @@ pub mod config;
 mod documentation;
 mod gncl;
 pub mod inspect;
+#[cfg(all(test, target_os = "linux"))]
+mod lingering;
 mod lncl;
 mod monitors;
 mod ndl;
+mod nicer;
 mod node;
 mod outlet;
 mod payload;
 mod process;
 mod refusals;
 mod ring;
+pub mod security;
 mod session;
 mod stores;
 mod sync;
@@ -85,8 +91,8 @@ pub use sinew_runtime::{
 pub use sinew_shm::Spin;
 pub use stores::ClockOffset;
 pub use sync::{
-    ArriveAtBarrier, BarrierAnswer, BarrierStatus, DirectoryEntry, DirectoryEvent, LeaveBarrier, OnPartyLoss,
-    Waiting,
+    ArriveAtBarrier, BarrierAnswer, BarrierKind, BarrierStatus, DirectoryEntry, DirectoryEvent, LeaveBarrier,
+    OnPartyLoss, Waiting,
 };
 
 /// Everything that an ordinary program needs, in one line: `use sinew::prelude::*;`

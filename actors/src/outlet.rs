@@ -51,7 +51,7 @@ pub(crate) use account::OutletAccount;
 pub(crate) use batch::Gathering;
 use draining::Drained;
 use half::{After, Bound, Half, Step};
-pub(crate) use held::line_of;
+pub(crate) use held::{destination_of, line_of};
 pub(crate) use outcomes::{OUTCOMES_MAX, read as read_outcomes};
 pub(crate) use resume::Session;
 
@@ -194,7 +194,7 @@ impl std::ops::Add for OutletCounts {
 }
 
 /// Which of an outlet's connections, one after the other, something is about.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct LinkNumber(u64);
 
 impl LinkNumber {
@@ -277,11 +277,19 @@ impl<S: Socket> StreamOutlet<S> {
     /// Writes what waits whenever the socket takes it. Resolves when this connection cannot be written to any more,
     /// with the reason. To be run by one task, on the thread whose reactor the socket belongs to.
     pub(crate) async fn drain(&self, link: LinkNumber) -> io::Error {
+        self.drain_by_turns(link, || ()).await
+    }
+
+    /// The same; calls `end_turn` before it goes on with what it could write at once, without a lock in hand.
+    pub(crate) async fn drain_by_turns(&self, link: LinkNumber, end_turn: impl Fn()) -> io::Error {
         loop {
             match poll_fn(|cx| self.with(|half, after| half.poll_drain(link, cx, after))).await {
                 Drained::Over(error) => return error,
                 // Others of this thread have their turn, and what has come meanwhile is looked at.
-                Drained::Enough => tokio::task::yield_now().await,
+                Drained::Enough => {
+                    end_turn();
+                    tokio::task::yield_now().await;
+                }
             }
         }
     }

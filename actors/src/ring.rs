@@ -12,8 +12,8 @@ use std::{
 use bytes::BytesMut;
 use sinew_runtime::wire::{FrameCodec, FrameError, HEADER_LEN, Header, Message};
 use sinew_shm::{
-    Bell, Capacity, Consumer, Corrupt, CreateError, LoanError, Offer, PassError, Producer, RefusedOffer,
-    Region, Terms,
+    Bell, Capacity, Consumer, Corrupt, CreateError, LoanError, Offer, PassError, Producer, Received,
+    RefusedOffer, Region, Terms,
 };
 use tokio_util::codec::Decoder;
 
@@ -39,6 +39,9 @@ pub(crate) enum ExchangeError {
     /// The peer's fault: it says that it has offered something.
     #[error("the peer has offered no shared memory")]
     Missing,
+    /// The peer's fault.
+    #[error("the peer has sent more than its offer")]
+    Stray,
     /// Our own fault.
     #[error(
         "the thread that maps shared memory has panicked or has too much to do, which is a fault of this node's; connect again"
@@ -85,6 +88,11 @@ impl Exchange {
             Err(PassError::System(cause)) if cause.kind() == io::ErrorKind::WouldBlock => Ok(None),
             Err(error) => Err(error.into()),
         }
+    }
+
+    /// Takes what is there, of which nothing is closed or judged yet.
+    pub(crate) fn take(socket: impl AsFd) -> Result<Received, ExchangeError> {
+        Ok(Received::receive(socket)?)
     }
 
     /// Maps what the peer has offered.

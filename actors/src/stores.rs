@@ -15,7 +15,10 @@ use sinew_runtime::{
 };
 use tokio::sync::watch;
 
-use crate::{audit, config::NodeConfig, gncl, lncl, monitors, ndl, node, refusals::Refusals, sync, wills};
+use crate::{
+    aftermath::Aftermath, audit, config::NodeConfig, gncl, lncl, monitors, ndl, node, refusals::Refusals,
+    sync, wills,
+};
 
 /// What the layers of one node share.
 pub(crate) struct Stores {
@@ -44,6 +47,8 @@ pub(crate) struct Stores {
     pub(crate) gncl: gncl::Store,
     /// NDL's socket for queries and answers. It stays open while this layer is restarted: whoever knows it still finds us.
     pub(crate) ndl_socket: Mutex<Option<UdpSocket>>,
+    /// What is to be told of nodes' ends behind their last messages.
+    pub(crate) aftermath: Aftermath,
     /// Which nodes are there; a restarted NDL goes on with them.
     pub(crate) ndl: Mutex<ndl::Core>,
     /// Where other processes come in.
@@ -92,6 +97,7 @@ impl Stores {
             refusals: Arc::default(),
             gncl: gncl::Store::default(),
             ndl_socket: Mutex::default(),
+            aftermath: Aftermath::default(),
             ndl: Mutex::new(ndl::new_core(&config, node, incarnation)),
             door: lncl::Door::default(),
             registry: Mutex::new(lncl::Registry::counting_links_from(RandomState::new().hash_one(()))),
@@ -99,8 +105,13 @@ impl Stores {
             sync: Mutex::new(sync::Core::new(&config, node, incarnation)),
             book: audit::Book::default(),
             questions: audit::Questions::default(),
-            monitors: Mutex::new(monitors::Core::new(node, incarnation, config.ndl.nodes_max)),
-            wills: Mutex::new(wills::Core::new(incarnation, config.ndl.nodes_max)),
+            monitors: Mutex::new(monitors::Core::new(
+                node,
+                incarnation,
+                config.ndl.nodes_max,
+                config.payload_max,
+            )),
+            wills: Mutex::new(wills::Core::new(incarnation, config.ndl.nodes_max, config.payload_max)),
             config,
             #[cfg(feature = "fault-points")]
             faults: sinew_runtime::supervision::fault::FaultPoints::default(),

@@ -169,7 +169,7 @@ impl Account {
             own: 0,
             delivered: arrived.handed_on + arrived.told,
             handed_on: arrived.handed_on,
-            superseded: 0,
+            superseded: arrived.superseded,
             rejected: arrived.refused,
             expired: arrived.expired,
             failed: arrived.failed,

@@ -3,7 +3,7 @@
 use std::{
     collections::{BTreeMap, BTreeSet},
     sync::{
-        Mutex,
+        Arc, Mutex,
         mpsc::{Receiver, SyncSender, sync_channel},
     },
     time::Duration,
@@ -18,6 +18,7 @@ use sinew_runtime::{
 };
 
 use super::{
+    answering::{self, Waiting},
     reading::{self, NodeAudit},
     system::Audit,
     words,
@@ -28,7 +29,7 @@ use crate::stores::{Stores, lock};
 const OPEN_MAX: usize = 16;
 /// A node is answered so often at most in [`PERIOD`], which an audit asks twice; further questions are refused, and counted.
 const ANSWERS_MAX: u32 = 16;
-/// All of them together so often: the thread that answers has Control to carry.
+/// All of them together so often: an answer of a node with many applications takes a CPU for milliseconds.
 const ANSWERS_ALL_MAX: u32 = 64;
 const PERIOD: Duration = Duration::from_secs(1);
 /// Of a node whose longest payload is shorter than an answer: it is tried with half so many bytes, down to this.
@@ -36,7 +37,11 @@ const ANSWER_BYTES_MIN: usize = 1 << 10;
 
 /// Which questions are open, and who was answered. It outlives the sync manager.
 #[derive(Default)]
-pub(crate) struct Questions(Mutex<Open>);
+pub(crate) struct Questions {
+    open: Mutex<Open>,
+    /// Those of other nodes.
+    pub(super) waiting: Mutex<Waiting>,
+}
 
 #[derive(Default)]
 struct Open {
@@ -50,16 +55,19 @@ struct Open {
 struct Question {
     /// Who has not answered.
     awaited: BTreeSet<NodeAddress>,
-    answers: SyncSender<NodeAudit>,
+    answers: SyncSender<Answer>,
 }
+
+/// Who answers, and the bytes; whoever has asked reads them, on his own thread.
+type Answer = (NodeAddress, Bytes);
 
 /// Too many questions are open.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct TooManyQuestions;
 
 impl Questions {
-    fn open(&self, awaited: BTreeSet<NodeAddress>) -> Result<(u64, Receiver<NodeAudit>), TooManyQuestions> {
-        let mut questions = lock(&self.0);
+    fn open(&self, awaited: BTreeSet<NodeAddress>) -> Result<(u64, Receiver<Answer>), TooManyQuestions> {
+        let mut questions = lock(&self.open);
         if questions.open.len() >= OPEN_MAX {
             return Err(TooManyQuestions);
         }
@@ -72,22 +80,22 @@ impl Questions {
     }
 
     fn close(&self, number: u64) {
-        lock(&self.0).open.remove(&number);
+        lock(&self.open).open.remove(&number);
     }
 
     /// Takes an answer, if it is awaited; a late one is nobody's.
-    fn answered(&self, number: u64, answer: NodeAudit) {
-        if let Some(question) = lock(&self.0).open.get_mut(&number)
-            && question.awaited.remove(&answer.node)
+    fn answered(&self, number: u64, from: NodeAddress, answer: Bytes) {
+        if let Some(question) = lock(&self.open).open.get_mut(&number)
+            && question.awaited.remove(&from)
         {
             // Whoever asked may wait no more.
-            let _ = question.answers.try_send(answer);
+            let _ = question.answers.try_send((from, answer));
         }
     }
 
     /// Whether `asker` is answered at `now`.
     fn admits(&self, asker: NodeAddress, now: Time) -> bool {
-        let askers = &mut lock(&self.0).askers;
+        let askers = &mut lock(&self.open).askers;
         askers.retain(|_, (since, _)| now.since(*since) < PERIOD);
         let answered: u32 = askers.values().map(|(_, answered)| answered).sum();
         let (_, theirs) = askers.entry(asker).or_insert((now, 0));
@@ -129,10 +137,14 @@ fn ask(
         |other: &&NodeAddress| say(stores, **other, (Kind::SYNC_AUDIT_ASK, number), Bytes::new()).is_ok();
     let asked = others.iter().filter(sent).count();
     let mut answers = Vec::new();
-    while answers.len() < asked {
+    for _ in 0..asked {
         let left = within.saturating_sub(Time::now().since(began));
-        let Ok(answer) = answered.recv_timeout(left) else { break };
-        answers.push(answer);
+        let Ok((from, answer)) = answered.recv_timeout(left) else { break };
+        match read(from, &answer) {
+            Ok(answer) => answers.push(answer),
+            // Who answers so counts as silent.
+            Err(fault) => stores.refusals.count(Time::now(), "audit", &fault),
+        }
     }
     stores.questions.close(number);
     Ok(answers)
@@ -142,25 +154,31 @@ fn ask(
 ///
 /// # Errors
 /// What is wrong with it, in words.
-pub(crate) fn receive(stores: &Stores, from: NodeAddress, message: &Message) -> Result<(), String> {
+pub(crate) fn receive(stores: &Arc<Stores>, from: NodeAddress, message: &Message) -> Result<(), String> {
     let number = message.header.correlation;
-    if message.header.kind == Kind::SYNC_AUDIT_ASK {
-        return answer(stores, from, number);
+    if message.header.kind != Kind::SYNC_AUDIT_ASK {
+        stores.questions.answered(number, from, message.payload.clone());
+        return Ok(());
     }
-    let said = words::read(&message.payload).map_err(|error| format!("from {from}, {error}"))?;
-    if said.node != from {
-        return Err(format!("from {from}, an audit of {}", said.node));
-    }
-    stores.questions.answered(number, said);
-    Ok(())
-}
-
-fn answer(stores: &Stores, to: NodeAddress, number: u64) -> Result<(), String> {
-    if !stores.questions.admits(to, Time::now()) {
+    if !stores.questions.admits(from, Time::now()) {
         return Err(format!(
-            "from {to}, more than {ANSWERS_MAX} questions for an audit in {PERIOD:?}, or of all more than {ANSWERS_ALL_MAX}"
+            "from {from}, more than {ANSWERS_MAX} questions for an audit in {PERIOD:?}, or of all more than {ANSWERS_ALL_MAX}"
         ));
     }
+    answering::have_answered(stores, from, number)
+}
+
+/// What `from` says of itself.
+fn read(from: NodeAddress, answer: &Bytes) -> Result<NodeAudit, String> {
+    let said = words::read(answer).map_err(|error| format!("from {from}, {error}"))?;
+    if said.node == from { Ok(said) } else { Err(format!("from {from}, an audit of {}", said.node)) }
+}
+
+/// Answers a question of another node, which takes the longer the more places there are.
+///
+/// # Errors
+/// It was not answered; why, in words.
+pub(super) fn answer(stores: &Stores, to: NodeAddress, number: u64) -> Result<(), String> {
     let (audit, mut bytes_max) = (reading::read(stores), stores.config.payload_max);
     loop {
         let bytes = words::write(&audit, bytes_max).ok_or("an audit has no room in an answer")?;
@@ -198,7 +216,7 @@ mod tests {
 
     const OTHER: NodeAddress = NodeAddress::new(2);
 
-    fn stores() -> std::sync::Arc<Stores> {
+    fn stores() -> Arc<Stores> {
         Stores::for_test(NodeConfig::new("test"), Incarnation(1))
     }
 
@@ -223,14 +241,14 @@ mod tests {
 
     #[test]
     fn questions_are_bounded_and_an_answer_counts_once_and_from_whom_was_asked() {
-        let (questions, said) = (Questions::default(), NodeAudit { node: OTHER, ..reading::read(&stores()) });
+        let (questions, said) = (Questions::default(), Bytes::from_static(b"said"));
         let (number, answered) = questions.open(BTreeSet::from([OTHER])).unwrap();
-        questions.answered(number, NodeAudit { node: NodeAddress::new(3), ..said.clone() });
-        questions.answered(number + 1, said.clone());
+        questions.answered(number, NodeAddress::new(3), said.clone());
+        questions.answered(number + 1, OTHER, said.clone());
         assert!(answered.try_recv().is_err());
-        questions.answered(number, said.clone());
-        questions.answered(number, said.clone());
-        assert_eq!(answered.try_recv(), Ok(said));
+        questions.answered(number, OTHER, said.clone());
+        questions.answered(number, OTHER, said.clone());
+        assert_eq!(answered.try_recv(), Ok((OTHER, said)));
         assert!(answered.try_recv().is_err());
         for _ in 1..OPEN_MAX {
             questions.open(BTreeSet::new()).unwrap();

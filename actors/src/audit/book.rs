@@ -35,7 +35,7 @@ pub(crate) struct Book(Mutex<Places>);
 
 #[derive(Default)]
 struct Places {
-    mailboxes: BTreeMap<AppAddress, (String, Arc<Mailbox>)>,
+    mailboxes: BTreeMap<AppAddress, (Arc<str>, Arc<Mailbox>)>,
     /// Mailboxes that are gone, of which a message is in hand.
     closing: Vec<Arc<Mailbox>>,
     clients: BTreeMap<ClientId, Client>,
@@ -43,16 +43,17 @@ struct Places {
     former_clients: Account,
 }
 
+#[derive(Clone)]
 struct Client {
     app: AppAddress,
-    name: String,
+    name: Arc<str>,
     outlet: Arc<dyn Accounted>,
 }
 
 impl Book {
     /// The mailbox of the application at `app`.
     pub(crate) fn add_mailbox(&self, app: AppAddress, name: &str, mailbox: &Arc<Mailbox>) {
-        lock(&self.0).mailboxes.insert(app, (name.to_owned(), mailbox.clone()));
+        lock(&self.0).mailboxes.insert(app, (name.into(), mailbox.clone()));
     }
 
     /// The application at `app` is gone for good, and its mailbox closed.
@@ -67,7 +68,7 @@ impl Book {
 
     /// What waits for a client.
     pub(crate) fn add_client(&self, id: ClientId, app: AppAddress, name: &str, outlet: Arc<dyn Accounted>) {
-        lock(&self.0).clients.insert(id, Client { app, name: name.to_owned(), outlet });
+        lock(&self.0).clients.insert(id, Client { app, name: name.into(), outlet });
     }
 
     /// The client is gone, and its outlet has ended.
@@ -80,23 +81,33 @@ impl Book {
 
     /// The accounts of all places, now.
     pub(super) fn read(&self) -> Vec<(Place, Account)> {
-        let mut places = lock(&self.0);
-        places.write_off(0);
-        let mut read = Vec::new();
-        for (app, (name, mailbox)) in &places.mailboxes {
+        let (mailboxes, clients, mut read) = self.list();
+        for (app, (name, mailbox)) in mailboxes {
             read.extend(Class::ALL.map(|class| {
-                let place = Place::Mailbox { app: *app, name: name.clone(), class };
+                let place = Place::Mailbox { app, name: name.to_string(), class };
                 (place, Account::of_mailbox(mailbox.account(class)))
             }));
         }
-        for Client { app, name, outlet } in places.clients.values() {
-            let place = Place::Client { app: *app, name: name.clone() };
+        for Client { app, name, outlet } in clients {
+            let place = Place::Client { app, name: name.to_string() };
             read.push((place, Account::of_outlet(&outlet.account())));
         }
-        let closing: Account = places.closing.iter().map(|mailbox| whole(mailbox)).sum();
-        read.push((Place::OtherMailboxes, places.former_mailboxes + closing));
-        read.push((Place::OtherClients, places.former_clients));
         read
+    }
+
+    /// Which places there are, and the accounts of those that are gone: each is in one of them, also where it goes before it is read. Whoever
+    /// comes or goes waits for this, and not for the reading of all accounts.
+    #[expect(clippy::type_complexity, reason = "three lists of one moment, for the function above alone")]
+    fn list(&self) -> (Vec<(AppAddress, (Arc<str>, Arc<Mailbox>))>, Vec<Client>, Vec<(Place, Account)>) {
+        let mut places = lock(&self.0);
+        places.write_off(0);
+        let closing: Account = places.closing.iter().map(|mailbox| whole(mailbox)).sum();
+        let gone = vec![
+            (Place::OtherMailboxes, places.former_mailboxes + closing),
+            (Place::OtherClients, places.former_clients),
+        ];
+        let mailboxes = places.mailboxes.iter().map(|(app, mailbox)| (*app, mailbox.clone())).collect();
+        (mailboxes, places.clients.values().cloned().collect(), gone)
     }
 }
 

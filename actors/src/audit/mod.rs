@@ -11,10 +11,12 @@
 //! | `book.rs` | which places there are, and the accounts of those that are gone |
 //! | `reading.rs` | what a node says of itself |
 //! | `asking.rs`, `words.rs` | what nodes say to each other |
+//! | `answering.rs` | the thread that answers |
 //! | `compare.rs` | two readings of all nodes, and what cannot be explained in them |
 //! | `system.rs`, `table.rs` | the result, and how it is shown |
 
 mod account;
+mod answering;
 mod asking;
 mod book;
 mod compare;

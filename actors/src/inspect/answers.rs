@@ -27,7 +27,7 @@ use crate::{
     ndl::{KnownNode, LossReason, LostNode, Source, Trouble, TroubledApp},
     node::{CommandError, NodeHandle, Supervised},
     stores::{Stores, lock},
-    sync::{BarrierStatus, OwnApp},
+    sync::{BarrierKind, BarrierStatus, OwnApp},
 };
 
 /// Time for the root's answer: one that hangs does not keep the other questions waiting for long.
@@ -172,6 +172,7 @@ fn lost_report(node: NodeAddress, lost: LostNode, now: Time) -> LostReport {
         lost_us: micros(now.since(lost.lost)),
         why: why.to_owned(),
         silent_us: micros(lost.silent),
+        bound_us: Some(micros(lost.bound)),
         found_by: lost.sources.iter().map(|source| word(*source).to_owned()).collect(),
     }
 }
@@ -249,6 +250,7 @@ fn trouble(part: &TroubledApp) -> TroubleReport {
         Trouble::Stalled => "stalled",
         Trouble::Away => "away",
         Trouble::GivenUp => "given up",
+        Trouble::Unheard => "not heard",
     };
     let TroubledApp { app, ref name, since, .. } = *part;
     TroubleReport { app, name: name.clone(), trouble: word.to_owned(), since_us: micros(since) }
@@ -290,11 +292,12 @@ fn links(peer: &Peer) -> Vec<LinkReport> {
 }
 
 fn barrier_report(status: BarrierStatus) -> BarrierReport {
-    let BarrierStatus { barrier, parties, generation, waiting, missing } = status;
+    let BarrierStatus { barrier, parties, kind, generation, waiting, missing } = status;
     let wait = |(name, waits)| WaitReport { name, waits_us: micros(waits) };
     BarrierReport {
         name: barrier,
         parties: parties.into_iter().take(MISSING_MAX).collect(),
+        is_phase: kind == BarrierKind::Phase,
         generation,
         waiting: waiting.into_iter().take(MISSING_MAX).map(wait).collect(),
         missing: missing.into_iter().take(MISSING_MAX).map(|(name, why)| Missing { name, why }).collect(),

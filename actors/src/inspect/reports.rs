@@ -150,6 +150,9 @@ pub struct LostReport {
     pub why: String,
     /// How long it had been silent then.
     pub silent_us: u64,
+    /// Time after its last sign of life within which its loss was to be known.
+    #[serde(default)]
+    pub bound_us: Option<u64>,
     /// How it had been found: `seed`, `multicast`, `mdns`, `query`.
     #[serde(deserialize_with = "at_most::<_, _, LINKS_MAX>")]
     pub found_by: Vec<String>,
@@ -300,7 +303,7 @@ pub struct AppReport {
     pub name: Option<String>,
     /// Whether it has started and takes messages.
     pub ready: bool,
-    /// How long it has waited at the start-up barrier, if it waits there.
+    /// How long it has waited at the start-up barrier or at a phase, if it waits there.
     pub waits_us: Option<u64>,
     /// What it lacks of what it requires: before its start what it waits for, later what it lost.
     #[serde(deserialize_with = "at_most::<_, _, MISSING_MAX>")]
@@ -317,7 +320,10 @@ pub struct BarrierReport {
     /// Who has to be there.
     #[serde(deserialize_with = "at_most::<_, _, MISSING_MAX>")]
     pub parties: Vec<String>,
-    /// How often it has opened, as far as the node knows.
+    /// Whether it is a phase.
+    #[serde(default)]
+    pub is_phase: bool,
+    /// How often it has opened, as far as the node knows; of a phase 0.
     pub generation: u64,
     /// Applications of the node that wait there.
     #[serde(deserialize_with = "at_most::<_, _, MISSING_MAX>")]

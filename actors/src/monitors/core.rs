@@ -16,7 +16,7 @@ use sinew_runtime::{
 };
 
 use self::{pace::Pace, watched::Watched, watching::Watching};
-use super::words::{Cause, LifeState, Lives, WATCHED_MAX, Watch};
+use super::words::{Cause, LifeState, Lives, Watch, watched_max};
 
 /// Time until a `Down` that was not taken is offered again.
 pub(super) const RETRY: Duration = Duration::from_millis(10);
@@ -82,6 +82,7 @@ struct Waiting {
 pub(crate) struct Core {
     node: NodeAddress,
     incarnation: Incarnation,
+    watched_max: usize,
     watched: Watched,
     watching: Watching,
     pace: Pace,
@@ -91,11 +92,17 @@ pub(crate) struct Core {
 }
 
 impl Core {
-    /// The monitors of `node`, none yet. It knows at most `nodes_max` others.
-    pub(crate) fn new(node: NodeAddress, incarnation: Incarnation, nodes_max: usize) -> Self {
+    /// The monitors of `node`, none yet. It knows at most `nodes_max` others; its words have at most `words_bytes_max`.
+    pub(crate) fn new(
+        node: NodeAddress,
+        incarnation: Incarnation,
+        nodes_max: usize,
+        words_bytes_max: usize,
+    ) -> Self {
         Self {
             node,
             incarnation,
+            watched_max: watched_max(words_bytes_max),
             watched: Watched::new(nodes_max),
             watching: Watching::new(nodes_max),
             pace: Pace::default(),
@@ -128,8 +135,8 @@ impl Core {
             }
             return Ok(id);
         }
-        if self.watching.targets_on(target.node) >= WATCHED_MAX && !self.watching.is_watched(target) {
-            return Err(MonitorError::PeerFull(WATCHED_MAX));
+        if self.watching.targets_on(target.node) >= self.watched_max && !self.watching.is_watched(target) {
+            return Err(MonitorError::PeerFull(self.watched_max));
         }
         let id = self.watching.add(watcher, target, now);
         if !self.watching.make_due(target.node, now) {

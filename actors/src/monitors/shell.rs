@@ -1,7 +1,8 @@
 //! Carries the core's orders out, on whatever thread has news for it.
 
 use sinew_runtime::{
-    monitor::Down,
+    mailbox::About,
+    monitor::{Down, DownClass},
     outcome::Rejection,
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
@@ -13,6 +14,7 @@ use super::{
     words::write,
 };
 use crate::{
+    aftermath,
     gncl::LinkFact,
     ndl::{LossReason, MembershipFact},
     stores::{Stores, lock},
@@ -105,7 +107,11 @@ pub(crate) fn drain(stores: &Stores) {
         match output {
             Output::Tell { watcher, down } => tell(stores, watcher, down),
             Output::Watch { to, watch } => say(stores, to, Kind::SYNC_WATCH, write(&watch)),
-            Output::Lives { to, lives } => say(stores, to, Kind::SYNC_LIVES, write(&lives)),
+            Output::Lives { to, lives } => {
+                for part in lives.in_parts(stores.config.payload_max) {
+                    say(stores, to, Kind::SYNC_LIVES, write(&part));
+                }
+            }
         }
     }
 }
@@ -140,7 +146,12 @@ fn tell(stores: &Stores, watcher: AppAddress, down: Down) {
     let mut message =
         Message::new(header(stores, Down::KIND, stores.node, watcher), sinew_runtime::wire::encode(&down));
     message.header.class = Down::CLASS;
-    if let Err(Rejection::QueueFull) = stores.router.send(message) {
+    let told = if down.class == DownClass::NodeLost {
+        aftermath::tell(stores, About::End(down.tid.node), message)
+    } else {
+        stores.router.send(message)
+    };
+    if let Err(Rejection::QueueFull) = told {
         // Any other refusal says that the watcher is gone, and its monitors go with it.
         // What follows is carried out by whoever drains now, not within this: a thousand of these are no deep stack.
         note_undrained(stores, Input::NotTaken { watcher, down });
@@ -167,7 +178,6 @@ mod tests {
     };
 
     use sinew_runtime::{
-        monitor::DownClass,
         router::{LocalRoute, Outlet, Refused},
         tid::Incarnation,
     };

@@ -12,6 +12,12 @@ use crate::sync::at_most;
 
 /// Applications of one node that another one watches at most.
 pub(crate) const WATCHED_MAX: usize = 1_024;
+/// Bytes of one of these words beside its entries, at most.
+const WORD: usize = 64;
+/// Bytes of a watched application in a `Watch`.
+const WATCHED: usize = 5;
+/// Bytes of an application in `Lives`, at most.
+const LIFE: usize = 360;
 /// Longest reason in bytes.
 const WHY_BYTES_MAX: usize = 256;
 
@@ -37,6 +43,20 @@ pub(crate) struct Lives {
     /// One entry each.
     #[serde(deserialize_with = "at_most::<_, _, WATCHED_MAX>")]
     pub(crate) lives: Vec<LifeState>,
+}
+
+/// How many applications of one node can be watched, if who watches them stand in one word of `bytes_max`.
+pub(super) fn watched_max(bytes_max: usize) -> usize {
+    (bytes_max.saturating_sub(WORD) / WATCHED).min(WATCHED_MAX)
+}
+
+impl Lives {
+    /// The same in words of at most `bytes_max`, each about one application at least.
+    pub(super) fn in_parts(self, bytes_max: usize) -> Vec<Self> {
+        let Self { incarnation, version, lives } = self;
+        let each = (bytes_max.saturating_sub(WORD) / LIFE).max(1);
+        lives.chunks(each).map(|lives| Self { incarnation, version, lives: lives.to_vec() }).collect()
+    }
 }
 
 /// The life of one application.
@@ -92,4 +112,38 @@ impl From<&Reason> for Cause {
 /// The bytes of a frame's payload.
 pub(crate) fn write<P: Serialize>(words: &P) -> Bytes {
     rmp_serde::to_vec_named(words).expect("these types have no map with equal keys").into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn life(app: u32) -> LifeState {
+        let cause = Cause::new(DownClass::NoSuchAddress, "x".repeat(WHY_BYTES_MAX));
+        let ended = Some(Ended { life: u64::MAX, cause });
+        LifeState { app: AppAddress::fixed(app).unwrap(), life: u64::MAX, age_us: u64::MAX, ended }
+    }
+
+    #[test]
+    fn what_does_not_fit_into_one_word_about_lives_is_said_in_several() {
+        let lives: Vec<_> = (0..1_024).map(life).collect();
+        let whole = Lives { incarnation: Incarnation(u64::MAX), version: u64::MAX, lives: lives.clone() };
+        assert_eq!(whole.clone().in_parts(1 << 20).len(), 1);
+        for bytes_max in [500, 10_000] {
+            let parts = whole.clone().in_parts(bytes_max);
+            assert!(parts.iter().all(|part| write(part).len() <= bytes_max), "{bytes_max}");
+            assert_eq!(parts.into_iter().flat_map(|part| part.lives).collect::<Vec<_>>(), lives);
+        }
+    }
+
+    #[test]
+    fn as_many_applications_are_watched_as_one_word_names() {
+        for bytes_max in [64, 1_000, 5_000] {
+            let apps =
+                (0..watched_max(bytes_max) as u32).map(|app| AppAddress::fixed(app).unwrap()).collect();
+            let watch = Watch { incarnation: Incarnation(u64::MAX), version: u64::MAX, apps };
+            assert!(write(&watch).len() <= bytes_max, "{bytes_max}");
+        }
+        assert_eq!(watched_max(1 << 20), WATCHED_MAX);
+    }
 }

@@ -19,7 +19,7 @@ use super::{
 };
 use crate::{
     config::{ConfigFaults, NodeConfig},
-    inspect, log, process,
+    inspect, log, process, security,
     stores::Stores,
     sync::Waiting,
 };
@@ -61,6 +61,12 @@ pub enum StartError {
     /// `lncl.socket` cannot be had: another node has it, or the place cannot be written to. No layer was started.
     #[error("the door for applications of other processes cannot be opened: {0}")]
     Door(String),
+    /// The configuration turns security on, and this build has none between nodes. Nothing was started.
+    #[error(
+        "security.keys is set, and {0}: take [security] out of the configuration to run open, on a network of your own, or run \
+         a version that has it"
+    )]
+    NotSecured(&'static str),
     /// A layer did not become ready.
     #[error("the layers did not start: {0}")]
     Layers(String),
@@ -219,12 +225,13 @@ impl NodeBuilder {
     /// keep it short there, and do not read the standard input.
     ///
     /// # Errors
-    /// The configuration has faults, `lncl.socket` cannot be had, an application cannot be registered, or a layer did not
+    /// The configuration has faults, or turns security on, which this build has not yet; `lncl.socket` cannot be had, an application cannot be registered, or a layer did not
     /// become ready.
     pub fn start(mut self) -> Result<Node, StartError> {
         // Here, on a thread like any other.
         log::begin();
         self.config.validate()?;
+        check_security(&self.config, security::NOT_YET)?;
         check_panics(UNWINDS, self.accept_abort_on_panic)?;
         #[cfg(feature = "fault-points")]
         let planned = super::faults::read(&self.faults, &mut self.tree)?;
@@ -280,6 +287,14 @@ fn wall_clock() -> Incarnation {
     Incarnation(u64::try_from(since_1970.as_micros()).unwrap_or(u64::MAX))
 }
 
+/// Refuses to pretend: links that are to be secured are, or there are none.
+fn check_security(config: &NodeConfig, not_yet: Option<&'static str>) -> Result<(), StartError> {
+    match not_yet.filter(|_| config.security.keys.is_some()) {
+        Some(why) => Err(StartError::NotSecured(why)),
+        None => Ok(()),
+    }
+}
+
 /// Refuses a program that no supervisor can help, unless its owner wants it so.
 fn check_panics(unwinds: bool, accepted: bool) -> Result<(), StartError> {
     if unwinds {
@@ -300,6 +315,21 @@ mod tests {
     fn a_program_that_aborts_on_panic_has_no_node_unless_that_is_accepted() {
         assert!(matches!(check_panics(false, false), Err(StartError::AbortsOnPanic)));
         assert!(check_panics(false, true).is_ok() && check_panics(true, false).is_ok());
+    }
+
+    #[test]
+    fn a_node_that_is_to_be_secured_and_cannot_be_does_not_start() {
+        // Given: keys, good or not: nothing looks at them yet
+        let secured = |config: &mut NodeConfig| config.security.keys = Some("/etc/sinew/keys".into());
+        // When
+        let refused = Node::builder("hip").configure(secured).start();
+        // Then: words, and no node that pretends
+        let words = refused.expect_err("this build secures nothing").to_string();
+        assert!(words.contains("security.keys") && words.contains("cannot secure the links"), "{words}");
+        // And: it is this one constant that is in the way
+        let mut config = NodeConfig::new("hip");
+        secured(&mut config);
+        assert!(check_security(&config, None).is_ok());
     }
 
     #[test]

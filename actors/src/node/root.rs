@@ -1,5 +1,7 @@
 //! The root actor: carries events between the supervisors, the sync manager and the node's owner.
 
+mod events;
+
 use std::{
     cell::RefCell,
     collections::BTreeMap,
@@ -23,59 +25,24 @@ use sinew_runtime::{
     tid::AppAddress,
     time::Time,
 };
-use tokio::{
-    signal::unix::{SignalKind, signal},
-    sync::oneshot,
-};
+use tokio::signal::unix::{SignalKind, signal};
 
+pub(crate) use self::events::RootEvent;
 use super::{
     NodeEnd, StartError,
     absences::Absences,
     apps::Apps,
     asker::Asker,
-    commands::{Answers, Ordered},
+    commands::Answers,
     directory::NodeDirectory,
     layers,
     supervisor_spec::{Member, SupervisorSpec},
-    tree::SupervisionTree,
     wind_up::{self, Branch, Heirs},
 };
-use crate::{lncl, ndl, process, stores::Stores};
+use crate::{lncl, process, stores::Stores};
 
 /// Confirmed messages and requests of one application under way at most.
 pub(crate) const WAITS_MAX: usize = 1_024;
-
-/// What the root is told.
-#[derive(Debug)]
-pub(crate) enum RootEvent {
-    /// By the sync manager: all that this application requires is ready.
-    Release { app: AppAddress },
-    /// By the sync manager: these names require each other in a circle, the first one again at the end. None of these
-    /// applications is released.
-    RequirementCycle { names: Vec<String> },
-    /// By the layers' supervisor.
-    Layers(SupervisorFact),
-    /// By the applications' supervisor.
-    Apps(SupervisorFact),
-    /// By the owner: stop on SIGINT and SIGTERM.
-    HeedSignals,
-    /// By the owner or a signal.
-    StopOrdered,
-    /// By the owner: add, stop, start again or remove a child.
-    Ordered(Ordered),
-    /// By the owner: say who is supervised.
-    TellTree(SyncSender<SupervisionTree>),
-    /// By NDL: say what does not get on.
-    TellProgress(oneshot::Sender<ndl::Progress>),
-    /// By a test: panic.
-    #[cfg(feature = "fault-points")]
-    Fail,
-    /// By a test: let the applications' supervisor panic.
-    #[cfg(feature = "fault-points")]
-    FailSupervisor,
-    /// By the owner: say when every application runs.
-    TellWhenRunning(Asker),
-}
 
 /// How far the node is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -309,7 +309,8 @@ impl<'a> Edges<'a> {
 /// The names without which an application is not started, whatever else comes.
 fn required_names(requires: &[String]) -> Vec<String> {
     let read = requires.iter().filter_map(|text| text.parse::<Requirement>().ok());
-    read.filter_map(|requirement| requirement.only_name().map(str::to_owned)).collect()
+    let read = read.filter(|requirement| requirement.wait_max().is_none());
+    read.filter_map(|requirement| requirement.one_name().map(str::to_owned)).collect()
 }
 
 #[cfg(test)]

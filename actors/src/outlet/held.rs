@@ -3,6 +3,7 @@
 use sinew_runtime::{
     outcome::{Rejection, Ticket},
     router::Refused,
+    tid::AppAddress,
     time::Time,
     wire::{Class, Flags, Header, Kind, Message},
 };
@@ -13,9 +14,10 @@ use super::{
 };
 use crate::session::{ShelfLimits, Turn};
 
-/// What waits in lines at the sender. In messages the bound of a session's queue holds, and a quarter of it for each line.
+/// What waits in lines at the sender: as many lines as a receiver has. In messages the bound of a session's queue holds, and a quarter of it
+/// for each line.
 pub(super) const LIMITS_OF_LINES: ShelfLimits =
-    ShelfLimits { lines: 64, line_messages: 0, line_bytes: 1 << 20, messages: 0, bytes: 4 << 20 };
+    ShelfLimits { lines: 256, line_messages: 0, line_bytes: 1 << 20, messages: 0, bytes: 4 << 20 };
 
 /// The name of a destination that may be held, by class: an application's mailbox, and not where the newest value is all that
 /// waits.
@@ -33,6 +35,12 @@ pub(crate) fn line_of(header: &Header) -> Option<u64> {
         }
         Class::Control | Class::Bulk | Class::Stream => None,
     }
+}
+
+/// The application that a line is for.
+pub(crate) const fn destination_of(line: u64) -> AppAddress {
+    // Its address is the lower half.
+    AppAddress::new(line as u32)
 }
 
 impl<S: Socket> Half<S> {
@@ -88,15 +96,8 @@ impl<S: Socket> Half<S> {
     /// Takes out of the lines what has expired; `next_expiry` takes what is left into account.
     pub(super) fn expire_lines(&mut self, now: Time, after: &mut After) {
         let Some(session) = &mut self.session else { return };
-        let mut next = self.next_expiry;
-        let expired = session.held.take_useless(|message| {
-            if message.header.is_expired(now) {
-                return true;
-            }
-            next = next.min(message.header.expiry());
-            false
-        });
-        self.next_expiry = next;
+        let expired = session.held.take_expired(now);
+        self.next_expiry = self.next_expiry.min(session.held.next_expiry());
         for message in expired {
             self.waiting_receipts -= usize::from(message.receipt.is_some());
             self.expired(message, after);

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 use stateright::{Checker, Model, Property};
 
-use super::{Ack, Arrival, Heard, Held, Receiving, Sending, Shelf, ShelfLimits, Turn, Window};
+use super::{Ack, Arrival, Heard, Held, Receiving, Sending, Shelf, ShelfLimits, Turn, Waits, Window};
 
 const WINDOW: Window = Window { messages: 2, bytes: 1_000 };
 const LIMITS: ShelfLimits =
@@ -17,6 +17,9 @@ const QUICK: u64 = 2;
 
 /// A message: its destination, and its number there.
 type Value = (u64, u8);
+
+/// None loses its use.
+impl Waits for Value {}
 
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 struct Sender {

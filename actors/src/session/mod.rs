@@ -32,15 +32,24 @@ mod room_tests;
 mod sending;
 mod shelf;
 #[cfg(test)]
+mod shelf_tests;
+#[cfg(test)]
 mod table;
 #[cfg(test)]
 mod tests;
 
 pub(crate) use receiving::{Arrival, Receiving};
 pub(crate) use sending::{Heard, Sending, Window};
-pub(crate) use shelf::{Held, Shelf, ShelfLimits, Turn};
+pub(crate) use shelf::{Held, Shelf, ShelfLimits, Turn, Waits};
 
 use serde::{Deserialize, Serialize};
+use sinew_runtime::{time::Time, wire::Message};
+
+impl Waits for Message {
+    fn expiry(&self) -> Time {
+        self.header.expiry()
+    }
+}
 
 /// The number of an epoch's first message.
 const FIRST: u64 = 1;

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use proptest::prelude::*;
 
-use super::{Ack, Arrival, Held, Receiving, Sending, Shelf, ShelfLimits, Window};
+use super::{Ack, Arrival, Held, Receiving, Sending, Shelf, ShelfLimits, Waits, Window};
 
 const WINDOW: Window = Window { messages: 8, bytes: 200 };
 const LONGEST: usize = 60;
@@ -21,6 +21,9 @@ const LIMITS: ShelfLimits = ShelfLimits {
 
 /// For whom, which one of its, how many bytes.
 type Value = (u64, u32, usize);
+
+/// None loses its use.
+impl Waits for Value {}
 
 struct World {
     sending: Sending<Value>,

@@ -22,12 +22,27 @@
 //! | CREDIT-4 | Every line and all lines together are bounded; what comes then is refused as if the destination's queue were full. |
 //! | CREDIT-5 | Each Ack says how much may come: what there is room for in lines, and one message always. Who heeds it is refused nothing while there is room. |
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    hash::{Hash, Hasher},
+};
+
+use sinew_runtime::time::Time;
 
 use super::Window;
 
 /// Messages of a session that no line counts though they may come into one: one that is just taken, and one that is just offered.
 const IN_HAND: usize = 2;
+/// The number of the first message of a line: as many can be put back before it as come behind it.
+const MIDDLE: u64 = 1 << 63;
+
+/// What may wait in a line.
+pub(crate) trait Waits {
+    /// When it loses its use; [`Time::MAX`]: never.
+    fn expiry(&self) -> Time {
+        Time::MAX
+    }
+}
 
 /// How much waits in lines.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -44,10 +59,10 @@ pub(crate) struct ShelfLimits {
     pub(crate) bytes: usize,
 }
 
-/// One destination's messages, oldest first, each with its bytes.
-#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+/// One destination's messages by numbers that rise, oldest first, each with its bytes.
+#[derive(Clone, Debug)]
 struct Line<M> {
-    messages: VecDeque<(M, usize)>,
+    messages: BTreeMap<u64, (M, usize)>,
     bytes: usize,
     /// The first message is with somebody who offers it; the line stands meanwhile, even an empty one.
     is_offered: bool,
@@ -55,7 +70,24 @@ struct Line<M> {
 
 impl<M> Default for Line<M> {
     fn default() -> Self {
-        Self { messages: VecDeque::new(), bytes: 0, is_offered: false }
+        Self { messages: BTreeMap::new(), bytes: 0, is_offered: false }
+    }
+}
+
+/// The numbers say nothing but the order.
+impl<M: PartialEq> PartialEq for Line<M> {
+    fn eq(&self, other: &Self) -> bool {
+        self.is_offered == other.is_offered && self.messages.values().eq(other.messages.values())
+    }
+}
+
+impl<M: Eq> Eq for Line<M> {}
+
+impl<M: Hash> Hash for Line<M> {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        self.is_offered.hash(state);
+        self.messages.len().hash(state);
+        self.messages.values().for_each(|message| message.hash(state));
     }
 }
 
@@ -64,16 +96,18 @@ impl<M> Default for Line<M> {
 pub(crate) struct Shelf<K, M> {
     limits: ShelfLimits,
     lines: BTreeMap<K, Line<M>>,
+    /// What loses its use one day, the first of it first: its line, and its number there.
+    expiries: BTreeSet<(Time, K, u64)>,
     messages: usize,
     bytes: usize,
     /// Counts how often it changed who is held.
     change: u64,
 }
 
-impl<K: Copy + Ord, M> Shelf<K, M> {
+impl<K: Copy + Ord, M: Waits> Shelf<K, M> {
     /// Nothing waits.
     pub(crate) const fn new(limits: ShelfLimits) -> Self {
-        Self { limits, lines: BTreeMap::new(), messages: 0, bytes: 0, change: 0 }
+        Self { limits, lines: BTreeMap::new(), expiries: BTreeSet::new(), messages: 0, bytes: 0, change: 0 }
     }
 
     /// Whether nothing waits and nobody is held.
@@ -85,6 +119,11 @@ impl<K: Copy + Ord, M> Shelf<K, M> {
     pub(crate) fn holds(&self, key: K) -> bool {
         // Nearly always there is none.
         !self.lines.is_empty() && self.lines.contains_key(&key)
+    }
+
+    /// Whether as many destinations as may be are held, and this one is another.
+    pub(crate) fn has_no_line_for(&self, key: K) -> bool {
+        self.lines.len() >= self.limits.lines && !self.lines.contains_key(&key)
     }
 
     /// Who is held, in order.
@@ -141,23 +180,41 @@ impl<K: Copy + Ord, M> Shelf<K, M> {
         if !self.lines.contains_key(&key) {
             self.change += 1;
         }
+        let number = self.lines.get(&key).and_then(|line| line.messages.last_key_value());
+        let number = number.map_or(MIDDLE, |(last, _)| last + 1);
+        self.insert((key, number), message, bytes);
+    }
+
+    fn insert(&mut self, (key, number): (K, u64), message: M, bytes: usize) {
+        let expiry = message.expiry();
+        if expiry != Time::MAX {
+            self.expiries.insert((expiry, key, number));
+        }
         let line = self.lines.entry(key).or_default();
-        line.messages.push_back((message, bytes));
+        line.messages.insert(number, (message, bytes));
         line.bytes += bytes;
         self.messages += 1;
         self.bytes += bytes;
+    }
+
+    /// Takes one out; its line stands, even an empty one.
+    fn remove(&mut self, (key, number): (K, u64)) -> Option<(M, usize)> {
+        let line = self.lines.get_mut(&key)?;
+        let (message, bytes) = line.messages.remove(&number)?;
+        line.bytes -= bytes;
+        self.messages -= 1;
+        self.bytes -= bytes;
+        self.expiries.remove(&(message.expiry(), key, number));
+        Some((message, bytes))
     }
 
     /// Takes the first message of a line out, to be offered to its destination; then say what came of it:
     /// [`taken`](Self::taken) or [`put_back`](Self::put_back). `None` while another one is offered.
     pub(crate) fn offer(&mut self, key: K) -> Option<(M, usize)> {
         let line = self.lines.get_mut(&key).filter(|line| !line.is_offered)?;
-        let (message, bytes) = line.messages.pop_front()?;
+        let number = *line.messages.first_key_value()?.0;
         line.is_offered = true;
-        line.bytes -= bytes;
-        self.messages -= 1;
-        self.bytes -= bytes;
-        Some((message, bytes))
+        self.remove((key, number))
     }
 
     /// What was offered was taken, or is refused for good. Returns whether its destination is held no more.
@@ -176,32 +233,29 @@ impl<K: Copy + Ord, M> Shelf<K, M> {
     pub(crate) fn put_back(&mut self, key: K, message: M, bytes: usize) {
         let line = self.lines.entry(key).or_default();
         line.is_offered = false;
-        line.messages.push_front((message, bytes));
-        line.bytes += bytes;
-        self.messages += 1;
-        self.bytes += bytes;
+        let number = line.messages.first_key_value().map_or(MIDDLE, |(first, _)| first - 1);
+        self.insert((key, number), message, bytes);
     }
 
     /// Takes out of a line, the newest first, the one message that `is_it`, unless it is offered.
-    pub(crate) fn take_back(&mut self, key: K, is_it: impl FnMut(&M) -> bool) -> Option<M> {
-        let line = self.lines.get_mut(&key)?;
-        let mut is_it = is_it;
-        let at = line.messages.iter().rposition(|(message, _)| is_it(message))?;
-        let (message, bytes) = line.messages.remove(at)?;
-        line.bytes -= bytes;
-        (self.messages, self.bytes) = (self.messages - 1, self.bytes - bytes);
-        if line.messages.is_empty() && !line.is_offered {
-            self.lines.remove(&key);
-            self.change += 1;
-        }
+    pub(crate) fn take_back(&mut self, key: K, mut is_it: impl FnMut(&M) -> bool) -> Option<M> {
+        let mut messages = self.lines.get(&key)?.messages.iter().rev();
+        let number = *messages.find(|(_, (message, _))| is_it(message))?.0;
+        let (message, _) = self.remove((key, number))?;
+        self.end_empty_lines();
         Some(message)
     }
 
     /// Whoever was offering has ended; what it had in its hand is gone.
     pub(crate) fn forget_offers(&mut self) {
         self.lines.values_mut().for_each(|line| line.is_offered = false);
+        self.end_empty_lines();
+    }
+
+    /// A line in which nothing is left is over, but for one of which a message is offered.
+    fn end_empty_lines(&mut self) {
         let lines = self.lines.len();
-        self.lines.retain(|_, line| !line.messages.is_empty());
+        self.lines.retain(|_, line| line.is_offered || !line.messages.is_empty());
         self.change += u64::from(self.lines.len() < lines);
     }
 
@@ -210,28 +264,44 @@ impl<K: Copy + Ord, M> Shelf<K, M> {
         let line = self.lines.remove(&key).unwrap_or_default();
         self.messages -= line.messages.len();
         self.bytes -= line.bytes;
-        line.messages.into_iter().map(|(message, _)| message)
+        for (number, (message, _)) in &line.messages {
+            self.expiries.remove(&(message.expiry(), key, *number));
+        }
+        line.messages.into_values().map(|(message, _)| message)
+    }
+
+    /// When something here loses its use next; [`Time::MAX`] if nothing does.
+    pub(crate) fn next_expiry(&self) -> Time {
+        self.expiries.first().map_or(Time::MAX, |(expiry, ..)| *expiry)
+    }
+
+    /// Takes out what has lost its use by `now`, `at_most` so many, the one that lost it first first: nothing else is looked at. A line
+    /// in which nothing is left is over, but for one of which a message is offered.
+    pub(crate) fn take_expired(&mut self, now: Time, at_most: usize) -> Vec<M> {
+        let over = self.expiries.iter().take_while(|(expiry, ..)| *expiry < now).take(at_most);
+        let over: Vec<_> = over.map(|(_, key, number)| (*key, *number)).collect();
+        self.take_out(over)
     }
 
     /// Takes everything out that `has_no_use`, oldest first in each line. A line in which nothing is left is over, but for one of which
     /// a message is offered.
     pub(crate) fn take_useless(&mut self, mut has_no_use: impl FnMut(&M) -> bool) -> Vec<M> {
-        let mut useless = Vec::new();
-        for line in self.lines.values_mut() {
-            for (message, bytes) in std::mem::take(&mut line.messages) {
-                if has_no_use(&message) {
-                    line.bytes -= bytes;
-                    (self.messages, self.bytes) = (self.messages - 1, self.bytes - bytes);
-                    useless.push(message);
-                } else {
-                    line.messages.push_back((message, bytes));
-                }
-            }
+        let lines = self.lines.iter();
+        let all =
+            lines.flat_map(|(key, line)| line.messages.iter().map(|(number, kept)| (*key, *number, kept)));
+        let useless = all.filter(|(_, _, (message, _))| has_no_use(message));
+        let useless: Vec<_> = useless.map(|(key, number, _)| (key, number)).collect();
+        self.take_out(useless)
+    }
+
+    fn take_out(&mut self, these: Vec<(K, u64)>) -> Vec<M> {
+        if these.is_empty() {
+            return Vec::new();
         }
-        let lines = self.lines.len();
-        self.lines.retain(|_, line| line.is_offered || !line.messages.is_empty());
-        self.change += u64::from(self.lines.len() < lines);
-        useless
+        let taken =
+            these.into_iter().filter_map(|this| self.remove(this)).map(|(message, _)| message).collect();
+        self.end_empty_lines();
+        taken
     }
 }
 
@@ -253,7 +323,7 @@ pub(crate) struct Turn<M> {
     pub(crate) released: Vec<M>,
 }
 
-impl<K: Copy + Ord, M> Held<K, M> {
+impl<K: Copy + Ord, M: Waits> Held<K, M> {
     /// Nobody is held.
     pub(crate) const fn new(limits: ShelfLimits) -> Self {
         Self { keys: BTreeSet::new(), change: None, shelf: Shelf::new(limits) }
@@ -306,6 +376,16 @@ impl<K: Copy + Ord, M> Held<K, M> {
     /// As [`put`](Self::put), whatever the bounds: it was taken before its destination was held.
     pub(crate) fn put_beyond(&mut self, key: K, message: M, bytes: usize) {
         self.shelf.append(key, message, bytes);
+    }
+
+    /// When something in a line loses its use next; [`Time::MAX`] if nothing does.
+    pub(crate) fn next_expiry(&self) -> Time {
+        self.shelf.next_expiry()
+    }
+
+    /// Takes out of the lines what has lost its use by `now`.
+    pub(crate) fn take_expired(&mut self, now: Time) -> Vec<M> {
+        self.shelf.take_expired(now, usize::MAX)
     }
 
     /// Takes out of the lines what `has_no_use`.

@@ -16,6 +16,8 @@ use super::words::{HeldWill, Testament, WILLS_MAX};
 
 /// Time between two lists to a node when nothing changes.
 pub(super) const REPEAT: Duration = Duration::from_secs(2);
+/// Bytes of a list beside its wills, at most.
+const WORD: usize = 64;
 /// Least time between two of them.
 const SPACING: Duration = Duration::from_millis(5);
 
@@ -43,8 +45,8 @@ pub(crate) enum Input {
 /// What is to be done.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Output {
-    /// Tell a node our wills.
-    Tell { to: NodeAddress, testament: Testament },
+    /// Tell a node our wills; so many more stay at home.
+    Tell { to: NodeAddress, testament: Testament, left_out: usize },
     /// Execute a will of an application of a lost node, towards our own applications.
     Execute { node: NodeAddress, will: HeldWill },
 }
@@ -53,6 +55,7 @@ pub(super) enum Output {
 #[derive(Debug)]
 pub(crate) struct Core {
     incarnation: Incarnation,
+    bytes_max: usize,
     own: BTreeMap<AppAddress, Vec<HeldWill>>,
     peers: BTreeMap<NodeAddress, Peer>,
     nodes_max: usize,
@@ -71,10 +74,11 @@ struct Peer {
 }
 
 impl Core {
-    /// No wills yet; it holds those of at most `nodes_max` nodes.
-    pub(crate) const fn new(incarnation: Incarnation, nodes_max: usize) -> Self {
+    /// No wills yet; it holds those of at most `nodes_max` nodes, and tells its own in at most `bytes_max`.
+    pub(crate) const fn new(incarnation: Incarnation, nodes_max: usize, bytes_max: usize) -> Self {
         Self {
             incarnation,
+            bytes_max,
             own: BTreeMap::new(),
             peers: BTreeMap::new(),
             nodes_max,
@@ -176,7 +180,12 @@ impl Core {
 
     /// spec: WILL-1
     fn publish(&mut self, now: Time) {
-        let wills: Vec<_> = self.own.values().flatten().take(WILLS_MAX).cloned().collect();
+        let mut left = self.bytes_max.saturating_sub(WORD);
+        let has_room =
+            |will: &&HeldWill| left.checked_sub(will.bytes_max()).inspect(|rest| left = *rest).is_some();
+        let own = self.own.values().flatten();
+        let wills: Vec<_> = own.clone().filter(has_room).take(WILLS_MAX).cloned().collect();
+        let left_out = own.count() - wills.len();
         for (to, peer) in &mut self.peers {
             if peer.due.is_none_or(|due| due > now) {
                 continue;
@@ -186,7 +195,7 @@ impl Core {
             peer.due = (!wills.is_empty()).then(|| now + REPEAT);
             let (incarnation, version) = (self.incarnation, self.version);
             let testament = Testament { incarnation, version, wills: wills.clone() };
-            self.outputs.push_back(Output::Tell { to: *to, testament });
+            self.outputs.push_back(Output::Tell { to: *to, testament, left_out });
         }
     }
 }

@@ -61,7 +61,16 @@ pub(crate) fn feed(stores: &Stores, input: Input) {
     loop {
         let Some(output) = lock(&stores.wills).poll() else { break };
         match output {
-            Output::Tell { to, testament } => tell(stores, to, &testament),
+            Output::Tell { to, testament, left_out } => {
+                if left_out > 0 {
+                    let detail = format!(
+                        "{left_out} last wills of this node's applications are not held by other nodes: there are more than 256, or \
+                         they are longer than `node.payload_max` together; raise it, or write shorter ones"
+                    );
+                    stores.refusals.count(Time::now(), "wills", &detail);
+                }
+                tell(stores, to, &testament);
+            }
             Output::Execute { node, will } => execute(stores, node, &will),
         }
     }

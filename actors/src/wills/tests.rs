@@ -51,7 +51,7 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
-        Self { core: Core::new(LIFE, 4), now: Time::from_nanos(1_000_000_000) }
+        Self { core: Core::new(LIFE, 4, 1 << 20), now: Time::from_nanos(1_000_000_000) }
     }
 
     fn hears(&mut self, input: Input) -> Vec<Output> {
@@ -113,7 +113,7 @@ fn the_wills_of_those_who_live_are_told_at_each_change_and_again_within_bounds()
     let wills: Arc<[Will]> = Arc::new([will(3), will(PAYLOAD_MAX + 1)]);
     let lives = bench.hears(Input::Lives { app: app(0), wills: wills.clone() });
     let list = |version, wills| {
-        [Output::Tell { to: THERE, testament: Testament { incarnation: LIFE, version, wills } }]
+        [Output::Tell { to: THERE, testament: Testament { incarnation: LIFE, version, wills }, left_out: 0 }]
     };
     assert_eq!(lives, list(1, vec![held()]));
     bench.now = bench.now + REPEAT;
@@ -128,4 +128,17 @@ fn the_wills_of_those_who_live_are_told_at_each_change_and_again_within_bounds()
     bench.now = bench.now + REPEAT;
     let Some(Output::Tell { testament, .. }) = bench.hears(Input::TimePassed).pop() else { panic!("a list") };
     assert_eq!(testament.wills.len(), WILLS_MAX);
+}
+
+// spec: WILL-4
+#[test]
+fn wills_that_are_too_long_together_for_one_word_stay_at_home_but_for_those_that_fit() {
+    let mut core = Core::new(LIFE, 4, 3_000);
+    let now = Time::from_nanos(1_000_000_000);
+    core.handle(now, UP);
+    let wills: Arc<[Will]> = (0..5).map(|_| will(PAYLOAD_MAX)).chain([will(3)]).collect();
+    core.handle(now, Input::Lives { app: app(0), wills });
+    let Some(Output::Tell { testament, left_out, .. }) = core.poll() else { panic!("it is told") };
+    assert_eq!((testament.wills.len(), left_out), (3, 3));
+    assert!(rmp_serde::to_vec_named(&testament).unwrap().len() <= 3_000);
 }

@@ -66,6 +66,13 @@ impl HeldWill {
         }
     }
 
+    /// Bytes of it in a list, at most: a map of six fields, four numbers, two texts.
+    pub(super) fn bytes_max(&self) -> usize {
+        /// All of it but name and payload.
+        const FRAME: usize = 72;
+        FRAME + self.name.as_ref().map_or(0, |name| name.len()) + self.payload.len()
+    }
+
     pub(super) fn class(&self) -> Option<Class> {
         Class::ALL.get(usize::from(self.class)).copied()
     }
