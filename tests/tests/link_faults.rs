@@ -44,7 +44,8 @@ fn cuts_and_panics_of_gncl_on_both_sides_lose_double_and_reorder_nothing() {
 #[track_caller]
 fn agrees(report: &Report) {
     let total = report.audit.total();
-    assert_eq!(total.superseded, report.verdict.superseded, "{report}");
+    // A value that goes by the connection after all, as no word came that it had arrived by datagram, counts as two, of which one is superseded.
+    assert!(total.superseded >= report.verdict.superseded, "{report}");
     assert_eq!((total.expired, total.failed, total.lost, total.unknown), (0, 0, 0, 0), "{report}");
     for link in &report.audit.links {
         // The audit's own question and answer may lie between the readings.

@@ -6,6 +6,8 @@ use std::{
     process::{Child, ChildStdout, Command, Stdio},
 };
 
+use rustix::process::{Pid, Signal, kill_process};
+
 /// The environment variable that gives a bench's program a role.
 const ROLE: &str = "SINEW_BENCH_ROLE";
 const THERE: &str = "there";
@@ -75,6 +77,15 @@ impl Process {
         let mut process = Self { child, output };
         assert_eq!(process.line(), THERE, "the process with the role `{role}` failed");
         process
+    }
+
+    /// Sends it a signal.
+    ///
+    /// # Panics
+    /// If it is no process any more.
+    pub fn signal(&self, signal: Signal) {
+        let id = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw).expect("a process id");
+        kill_process(id, signal).expect("a child that nobody has collected takes signals");
     }
 
     /// How often its threads have gone to sleep so far.

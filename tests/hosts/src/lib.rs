@@ -100,6 +100,14 @@ impl Hosts {
         radio.carried()
     }
 
+    /// Their network carries no multicast from now on.
+    ///
+    /// # Panics
+    /// If these hosts are not on a radio.
+    pub fn drop_multicast(&self) {
+        self.radio.as_ref().expect("hosts that `on_radio` has made").drop_multicast();
+    }
+
     /// The hosts.
     #[must_use]
     pub fn all(&self) -> &[Host] {
@@ -120,6 +128,24 @@ impl Hosts {
     /// If the kernel refuses.
     pub fn join(&self, host: usize) {
         self.set_port(host, "up");
+    }
+
+    /// From now on the first network swallows what a host sends and what is for it; every interface stays up, so nobody's kernel
+    /// knows.
+    ///
+    /// # Panics
+    /// If the kernel refuses.
+    pub fn swallow(&self, host: usize) {
+        // The port is up, and belongs to no bridge.
+        self.set_port(host, "nomaster");
+    }
+
+    /// Carries a host's packets again.
+    ///
+    /// # Panics
+    /// If the kernel refuses.
+    pub fn carry(&self, host: usize) {
+        self.set_port(host, "master bridge0");
     }
 
     /// Takes a host's own interface in a network down.
@@ -196,6 +222,15 @@ impl Host {
         let mut command = Command::new("ip");
         command.args(["netns", "exec", &self.namespace.0]).arg(program);
         command
+    }
+
+    /// The same command on this host: its program, its arguments, and what it sets in the environment.
+    #[must_use]
+    pub fn moved(&self, command: &Command) -> Command {
+        let mut moved = self.command(Path::new(command.get_program()));
+        moved.args(command.get_args());
+        moved.envs(command.get_envs().filter_map(|(name, value)| Some((name, value?))));
+        moved
     }
 }
 

@@ -32,6 +32,8 @@ const UNDER_WAY_MAX: usize = 16_384;
 const LOOK: Duration = Duration::from_millis(20);
 /// Bytes of a hardware address.
 const MAC: usize = 6;
+/// How the hardware addresses of IPv4 multicast begin (RFC 1112), and of IPv6 multicast (RFC 2464).
+const MULTICAST: [&[u8]; 2] = [&[0x01, 0x00, 0x5e], &[0x33, 0x33]];
 
 /// What happens to each frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -66,6 +68,7 @@ pub struct Radio {
 struct Shared {
     weather: Mutex<Weather>,
     ends: AtomicBool,
+    drops_multicast: AtomicBool,
     arrived: AtomicU64,
     lost: AtomicU64,
     dropped: AtomicU64,
@@ -97,6 +100,11 @@ impl Radio {
     /// From now on this happens to each frame.
     pub fn set(&self, weather: Weather) {
         *self.shared.weather.lock().unwrap_or_else(PoisonError::into_inner) = weather;
+    }
+
+    /// Carries no multicast from now on, as many an access point does not. ARP, which is broadcast, it carries. What it drops counts as lost.
+    pub fn drop_multicast(&self) {
+        self.shared.drops_multicast.store(true, Ordering::Relaxed);
     }
 
     /// What became of the frames so far.
@@ -180,6 +188,11 @@ impl Carrier {
             let Some((to, rest)) = frame[..length].split_first_chunk::<MAC>() else { continue };
             let Some(source) = rest.first_chunk::<MAC>() else { continue };
             self.homes.insert(*source, from);
+            let is_multicast = MULTICAST.iter().any(|begin| to.starts_with(begin));
+            if is_multicast && self.shared.drops_multicast.load(Ordering::Relaxed) {
+                self.shared.lost.fetch_add(1, Ordering::Relaxed);
+                continue;
+            }
             match self.homes.get(to).copied() {
                 Some(home) if home != from => self.send(home, &frame[..length], weather),
                 Some(_) => {}

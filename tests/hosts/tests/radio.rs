@@ -62,6 +62,26 @@ fn a_clear_network_carries_everything_in_order() {
 }
 
 #[test]
+fn one_without_multicast_carries_everything_else() {
+    let Some(hosts) = hosts() else { return };
+    introduce(&hosts);
+    let [from, to] = hosts.all() else { panic!("there are two") };
+    let group = Ipv4Addr::new(239, 255, 1, 9);
+    let listener = to.run(|| UdpSocket::bind((group, 0)).unwrap());
+    listener.join_multicast_v4(&group, &to.address).unwrap();
+    listener.set_read_timeout(Some(PATIENCE)).unwrap();
+    let port = listener.local_addr().unwrap().port();
+    let sender = from.run(|| UdpSocket::bind((from.address, 0)).unwrap());
+    sender.send_to(b"carried", (group, port)).unwrap();
+    assert_eq!(listener.recv(&mut [0; 9]).unwrap(), 7);
+    hosts.drop_multicast();
+    sender.send_to(b"not", (group, port)).unwrap();
+    assert_eq!(carry(&hosts, PATIENCE).0, (0..SENT).collect::<Vec<_>>());
+    listener.set_read_timeout(Some(SILENCE)).unwrap();
+    listener.recv(&mut [0; 9]).unwrap_err();
+}
+
+#[test]
 fn a_rough_one_loses_its_share_and_takes_its_time() {
     let Some(hosts) = hosts() else { return };
     introduce(&hosts);

@@ -1,8 +1,8 @@
 //! A node for the scenarios: one application that sends, and says what it sees, one line each.
 //!
-//! `node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--will NAME]... [--logs]`
+//! `node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--floods NAME]... [--will NAME]... [--logs]`
 //!
-//! A will is a count of 1,000,000. What it logs goes to its standard error, with `--logs` to its output.
+//! Whom it floods it sends as many counts as are taken, to each the same. A will is a count of 1,000,000. What it logs goes to its standard error, with `--logs` to its output.
 
 use std::process::ExitCode;
 
@@ -10,8 +10,12 @@ use sinew::prelude::*;
 
 payload!("scenario.count", Bulk => struct Count { number: u64 });
 
+/// Counts in each millisecond to whom it floods.
+const AT_ONCE: u32 = 100;
+
 struct Probe {
     sends_to: Option<String>,
+    floods: Vec<String>,
     sent: u64,
     last: u64,
 }
@@ -21,6 +25,14 @@ impl Actor for Probe {
 
     fn started(&mut self, context: &mut Self::Context) {
         println!("started {}", context.tid());
+        for to in self.floods.clone() {
+            let mut sent = 0;
+            context.every(Duration::from_millis(1), move |_, _, context| {
+                for _ in 0..AT_ONCE {
+                    sent += u64::from(context.send(&*to, &Count { number: sent + 1 }).is_ok());
+                }
+            });
+        }
         let Some(to) = self.sends_to.clone() else { return };
         context.every(Duration::from_millis(20), move |this, _, context| {
             // What nobody takes while the network is cut is not counted as sent.
@@ -83,14 +95,15 @@ fn main() -> ExitCode {
         }
     };
     let sends_to = after("--sends-to").into_iter().next();
+    let floods = after("--floods");
     let name = config.name.clone();
-    let mut probe =
-        AppSpec::new(name.as_str(), move || Probe { sends_to: sends_to.clone(), sent: 0, last: 0 })
-            .handles::<Count>()
-            .handles::<NodeEvent>()
-            .handles::<RequirementEvent>()
-            .requires(after("--requires"))
-            .own_thread();
+    let make = move || Probe { sends_to: sends_to.clone(), floods: floods.clone(), sent: 0, last: 0 };
+    let mut probe = AppSpec::new(name.as_str(), make)
+        .handles::<Count>()
+        .handles::<NodeEvent>()
+        .handles::<RequirementEvent>()
+        .requires(after("--requires"))
+        .own_thread();
     for heir in after("--will") {
         probe = probe.last_will(heir.as_str(), &Count { number: 1_000_000 });
     }

@@ -32,10 +32,14 @@ const FIRST: Station = 1;
 /// The other.
 const SECOND: Station = 2;
 
-/// The doors: to the second node's GNCL, to the first's, to the second's NDL.
+/// The doors: to the second node's GNCL, to the first's, to the second's NDL, and to both GNCLs' datagrams at the places of the first two.
 const TO_SECOND: usize = 0;
 const TO_FIRST: usize = 1;
 const TO_SECOND_UDP: usize = 2;
+const TO_SECOND_STREAM: usize = 3;
+const TO_FIRST_STREAM: usize = 4;
+/// Where GNCL is reached, at an address that only this has.
+const PORT: u16 = 6_912;
 
 type Shared = Arc<Mutex<History>>;
 
@@ -68,8 +72,15 @@ impl Pair {
     /// Starts the nodes, and lets messages flow.
     pub(super) fn start(plan: &Plan) -> Self {
         let listen = SocketAddr::from(([127, 0, 0, 1], 0));
-        let door = |side, datagrams| Door { side, listen, datagrams };
-        let doors = [door(Side::Right, false), door(Side::Left, false), door(Side::Right, true)];
+        let [second, first] = [(); 2].map(|()| SocketAddr::from((own_interface(), PORT)));
+        let door = |side, listen, datagrams| Door { side, listen, datagrams };
+        let doors = [
+            door(Side::Right, second, false),
+            door(Side::Left, first, false),
+            door(Side::Right, listen, true),
+            door(Side::Right, second, true),
+            door(Side::Left, first, true),
+        ];
         let proxy = Proxy::start(&doors, plan.seed).expect("ports on loopback");
         for side in [Side::Left, Side::Right] {
             proxy.change(side, |faults| {
@@ -287,8 +298,11 @@ fn start(
         places.split_whitespace().map(|place| place.parse().expect("an address")).collect();
     if station == FIRST {
         proxy.lead(TO_FIRST, places[0]);
+        // The same port, as nobody else has this address.
+        proxy.lead(TO_FIRST_STREAM, places[0]);
     } else {
         proxy.lead(TO_SECOND, places[0]);
+        proxy.lead(TO_SECOND_STREAM, places[0]);
         proxy.lead(TO_SECOND_UDP, places[1]);
     }
     member

@@ -59,8 +59,8 @@ impl Handler<Delivery<NodeEvent>> for Watch {
                 ("app_stalled", name, format!("{app_name}: {trouble:?}"))
             }
             NodeEvent::AppResumed { name, app_name, .. } => ("app_resumed", name, app_name),
-            NodeEvent::NodeLost { name, why, silent_us, .. } => {
-                ("node_lost", name, format!("{why:?}, silent for {silent_us} us"))
+            NodeEvent::NodeLost { name, why, silent_us, bound_us, .. } => {
+                ("node_lost", name, format!("{why:?}, silent for {silent_us} us of {bound_us} us"))
             }
         };
         tracing::info!(what, whom, how, "a change in who is there");

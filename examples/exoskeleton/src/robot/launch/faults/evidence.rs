@@ -51,6 +51,25 @@ pub(super) const fn span(from: Time, to: Time) -> Span {
     from.as_nanos()..to.as_nanos()
 }
 
+/// A loss, as a node's discovery told it.
+pub(super) struct Loss<'a> {
+    /// Milliseconds from the beginning of the span that was looked at.
+    pub(super) after_ms: f64,
+    pub(super) why: &'a str,
+    /// Milliseconds within which a silence is to be noticed.
+    pub(super) bound_ms: Option<f64>,
+}
+
+impl<'a> Loss<'a> {
+    /// From what the watch wrote down: `LinkDown, silent for 97000 us of 120000 us`.
+    fn read(after_ms: f64, how: &'a str) -> Self {
+        let (why, words) = how.split_once(", ").unwrap_or((how, ""));
+        let bound_us = words.rsplit_once(" of ").and_then(|(_, bound)| bound.strip_suffix(" us"));
+        let bound_ms = bound_us.and_then(|us| us.parse::<f64>().ok()).map(|us| us * 1e-3);
+        Self { after_ms, why, bound_ms }
+    }
+}
+
 /// Some values in their order.
 pub(super) struct Quantiles(Vec<u32>);
 
@@ -149,12 +168,12 @@ impl Evidence {
         first.map(|row| ms_after(from, row.t_ns))
     }
 
-    /// Milliseconds from `from` until the discovery of `part` says that `lost` is lost.
-    pub(super) fn node_lost_after_ms(&self, part: Part, lost: Part, span: Span) -> Option<f64> {
+    /// What the discovery of `part` says first of the loss of `lost`.
+    pub(super) fn node_lost(&self, part: Part, lost: Part, span: Span) -> Option<Loss<'_>> {
         let from = Time::from_nanos(span.start);
         let mut events = self.events(part, span);
-        let first = events.find(|event| event.what == "node_lost" && event.whom == lost.name());
-        first.map(|event| ms_after(from, event.t_ns))
+        let first = events.find(|event| event.what == "node_lost" && event.whom == lost.name())?;
+        Some(Loss::read(ms_after(from, first.t_ns), &first.how))
     }
 
     /// Times that a drive left `Walk` for `Safe` though the host did not stand still.
@@ -349,4 +368,17 @@ fn cut<R>(rows: &[R], span: Span, t_ns: impl Fn(&R) -> u64) -> &[R] {
     let from = rows.partition_point(|row| t_ns(row) < span.start);
     let to = rows.partition_point(|row| t_ns(row) < span.end);
     &rows[from..to.max(from)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_loss_is_read_as_the_watch_writes_it_and_one_in_other_words_has_no_bound() {
+        let loss = Loss::read(101.0, "LinkDown, silent for 97000 us of 120000 us");
+        assert_eq!((loss.after_ms, loss.why, loss.bound_ms), (101.0, "LinkDown", Some(120.0)));
+        let loss = Loss::read(3.0, "Crashed, silent for 97000 us");
+        assert_eq!((loss.why, loss.bound_ms), ("Crashed", None));
+    }
 }

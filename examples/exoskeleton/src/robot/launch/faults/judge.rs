@@ -1,9 +1,9 @@
 //! What was injected against what was seen: the claims of each step.
 
-use sinew::Time;
+use sinew::{LossReason, Time};
 
 use super::claim::{Claim, Claims, REPORTED};
-use super::evidence::{Evidence, SAFE_AT_LATEST_NS, Span, ms_after, span};
+use super::evidence::{Evidence, Loss, SAFE_AT_LATEST_NS, Span, ms_after, span};
 use super::script::{Injection, Mark, Seen};
 use super::step::Step;
 use crate::central::bit;
@@ -177,21 +177,37 @@ fn pull_node(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection
     let knee = Part::Joint(Joint::Knee);
     let away = span(injection.at, injection.until);
     let others = [Joint::Hip, Joint::Ankle];
-    loss_of(claims, evidence, knee, &others, &away);
+    loss_of(claims, evidence, (knee, LossReason::Crashed), &others, &away);
     let damped = evidence.watchdog_after_ms(Joint::Knee, away.clone());
     claims.timing("the knee's device damps by itself after, ms", LOST_MS, damped);
     stay_safe(claims, evidence, &others, &away);
     claims.exactly("samples with more than that, knee", 0, evidence.undamped_device(Joint::Knee, away));
 }
 
-/// A node is gone: who notices, and who damps.
-fn loss_of(claims: &mut Claims<'_>, evidence: &Evidence, lost: Part, drives: &[Joint], away: &Span) {
+/// A node is gone: who notices and why they say it is so, and who damps.
+fn loss_of(
+    claims: &mut Claims<'_>,
+    evidence: &Evidence,
+    (lost, why): (Part, LossReason),
+    drives: &[Joint],
+    away: &Span,
+) {
     let peers = Part::ALL.into_iter().filter(|part| *part != lost);
-    let noticed = all(peers.map(|part| evidence.node_lost_after_ms(part, lost, away.clone())));
-    claims.timing("NODE_LOST at every other node after, ms", LOST_MS, noticed);
+    let losses: Vec<_> = peers.map(|part| evidence.node_lost(part, lost, away.clone())).collect();
+    noticed(claims, "NODE_LOST at every other node after, ms", why, &losses);
     let from = Time::from_nanos(away.start);
     let safe = all(drives.iter().map(|joint| evidence.safe_after_ms(*joint, from)));
     claims.timing("their drives SAFE after, ms", SAFE_MS, safe);
+}
+
+/// When and how each of these nodes noticed the loss of another one.
+fn noticed(claims: &mut Claims<'_>, name: &str, why: LossReason, losses: &[Option<Loss<'_>>]) {
+    claims.timing(name, LOST_MS, all(losses.iter().map(|loss| Some(loss.as_ref()?.after_ms))));
+    let bound = all(losses.iter().map(|loss| loss.as_ref()?.bound_ms));
+    claims.told("its bound, by the settings of discovery, ms", bound);
+    let why = format!("{why:?}");
+    let others = losses.iter().flatten().filter(|loss| loss.why != why).count();
+    claims.exactly(&format!("nodes that give another reason than {why}"), 0, others);
 }
 
 fn return_node(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection) {
@@ -216,12 +232,12 @@ fn epochs_of_the_knee(evidence: &Evidence, injection: &Injection) -> [Option<u64
 fn cut_link(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection) {
     let knee = Part::Joint(Joint::Knee);
     let away = span(injection.at, injection.until);
-    loss_of(claims, evidence, knee, &[Joint::Hip, Joint::Ankle], &away);
+    loss_of(claims, evidence, (knee, LossReason::LinkDown), &[Joint::Hip, Joint::Ankle], &away);
     let alone = evidence.safe_after_ms(Joint::Knee, injection.at);
     claims.timing("the isolated knee SAFE by its own timer after, ms", LOST_MS, alone);
     let others = Part::ALL.into_iter().filter(|part| *part != knee);
-    let noticed = all(others.map(|part| evidence.node_lost_after_ms(knee, part, away.clone())));
-    claims.timing("NODE_LOST of every other at the knee after, ms", LOST_MS, noticed);
+    let losses: Vec<_> = others.map(|part| evidence.node_lost(knee, part, away.clone())).collect();
+    noticed(claims, "NODE_LOST of every other at the knee after, ms", LossReason::LinkDown, &losses);
     stay_safe(claims, evidence, &Joint::ALL, &away);
     claims.exactly("drives that were started anew", 0, evidence.lives_begun(&away));
 }
@@ -378,7 +394,7 @@ fn rough_network(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injec
 fn kill_central(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection) {
     let started = injection.when(Mark::Started).unwrap_or(injection.until);
     let (at, away) = (injection.at, span(injection.at, started));
-    loss_of(claims, evidence, Part::Central, &Joint::ALL, &away);
+    loss_of(claims, evidence, (Part::Central, LossReason::Crashed), &Joint::ALL, &away);
     stay_safe(claims, evidence, &Joint::ALL, &away);
     claims.exactly("drives that were started anew", 0, evidence.lives_begun(&span(at, injection.until)));
     let held = injection.when(Mark::Held).map(|held| held.since(started).as_secs_f64());

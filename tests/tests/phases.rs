@@ -1,0 +1,74 @@
+//! Phases on real nodes: applications that come up in steps, before they are ready, and one that is started again.
+
+use std::sync::mpsc::{SyncSender, sync_channel};
+
+use sinew::{Barrier, BarrierKind, Meet, ReadyGate, prelude::*};
+use sinew_tests::{DEADLINE, Ground, until};
+
+const DRIVES: [&str; 2] = ["hip.drive", "knee.drive"];
+
+/// Homes, is ready when all drives are homed, and says so.
+struct Drive {
+    held: Option<ReadyGate>,
+    said: SyncSender<Result<u64, String>>,
+}
+
+impl Actor for Drive {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        self.held = context.hold_ready();
+        let homed = Barrier::phase("homed", DRIVES).within(DEADLINE);
+        let meeting = context.meet(&homed).into_actor(self);
+        context.spawn(meeting.map(|passed, this, _| {
+            this.said.send(passed.map_err(|error| error.to_string())).expect("the test listens");
+            this.held.take().expect("it was held").reached();
+        }));
+    }
+}
+
+fn drive(name: &str, said: &SyncSender<Result<u64, String>>) -> AppSpec<Drive> {
+    let said = said.clone();
+    AppSpec::new(name, move || Drive { held: None, said: said.clone() }).start_within(DEADLINE)
+}
+
+/// Needs homed drives, ready or not.
+struct Gait(SyncSender<()>);
+
+impl Actor for Gait {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, _: &mut Self::Context) {
+        self.0.send(()).expect("the test listens");
+    }
+}
+
+#[test]
+fn drives_of_two_nodes_come_up_together_and_one_that_is_started_again_brings_nobody_back() {
+    let ground = Ground::new();
+    let (say, heard) = sync_channel(16);
+    let (start, started) = sync_channel(16);
+    let gait = AppSpec::new("gait", move || Gait(start.clone())).requires(["2 of *.drive at homed"]);
+    let hip = ground.node("hip").app(drive("hip.drive", &say)).app(gait).start().expect("it starts");
+    // Given: one drive is homed, and is seen to wait for the other.
+    let status = until("the hip's drive waits", || hip.handle().barriers().pop());
+    assert_eq!((status.barrier.as_str(), status.kind), ("homed", BarrierKind::Phase));
+    assert_eq!(status.missing, [("knee.drive at homed".to_owned(), "never seen".to_owned())]);
+    let waits = until("the gait waits", || hip.handle().waiting().pop());
+    assert_eq!(waits.missing, [("2 of *.drive at homed (1 there)".to_owned(), "never seen")]);
+    assert!(heard.try_recv().is_err() && started.try_recv().is_err(), "nobody has gone on");
+    // When the other one comes, then both go on, and so does who needs them.
+    let knee = ground.node("knee").app(drive("knee.drive", &say)).start().expect("it starts");
+    for _ in DRIVES {
+        assert_eq!(heard.recv_timeout(DEADLINE).expect("both go on"), Ok(1));
+    }
+    started.recv_timeout(DEADLINE).expect("the gait starts");
+    // When one is started again, then it goes through its phase alone.
+    until("the knee's drive is ready", || {
+        knee.handle().directory().iter().any(|entry| entry.name == "knee.drive" && entry.ready).then_some(())
+    });
+    knee.handle().stop_app("knee.drive").expect("it stops");
+    knee.handle().restart_app("knee.drive").expect("it is started again");
+    assert_eq!(heard.recv_timeout(DEADLINE).expect("it goes on"), Ok(1));
+    assert!(heard.try_recv().is_err(), "the hip's is not brought back");
+}
