@@ -1,5 +1,7 @@
 //! What another node is to the senders of this one: its sessions, which outlive connections and restarts of this layer.
 
+mod lives;
+
 use std::{
     collections::BTreeMap,
     hash::{BuildHasher as _, RandomState},
@@ -47,8 +49,6 @@ const OFFER_PERIOD: Duration = Duration::from_millis(50);
 const EXPIRY_PERIOD: Duration = Duration::from_millis(50);
 /// After so long at most a peer is told what was taken of it. It keeps that so long and needs no more: where more comes, it is told before.
 const ACK_PERIOD: Duration = Duration::from_secs(1);
-/// Peers at most that are gone and have left messages for applications that take nothing.
-const GONE_MAX: usize = 16;
 
 /// One life of another node, from its first link until it is forgotten.
 pub(crate) struct Peer {
@@ -347,11 +347,6 @@ impl Store {
         self.lock().values().cloned().collect()
     }
 
-    /// Every life of a peer that is known, or that messages still wait of.
-    pub(crate) fn met(&self) -> Vec<Arc<Peer>> {
-        lock(&self.met).iter().filter_map(Weak::upgrade).collect()
-    }
-
     /// The accounts of those that are gone, all together.
     pub(crate) fn buried(&self) -> Buried {
         *lock(&self.buried)
@@ -360,89 +355,6 @@ impl Store {
     /// The peer at `node`.
     pub(crate) fn peer(&self, node: NodeAddress) -> Option<Arc<Peer>> {
         self.lock().get(&node).cloned()
-    }
-
-    /// This life of `node` has said goodbye: what it still sends is taken, and then it is over.
-    pub(crate) fn leaves(&self, now: Time, node: NodeAddress, incarnation: Incarnation) {
-        for peer in self.met().iter().filter(|peer| (peer.node, peer.incarnation) == (node, incarnation)) {
-            // SYNC: Relaxed; who is told of the goodbye is told behind this by the same thread, or through a post's lock.
-            let _ = peer.has_left.compare_exchange(0, now.as_nanos(), Ordering::Relaxed, Ordering::Relaxed);
-        }
-    }
-
-    /// This life of `node` is over: nothing more is taken of it.
-    pub(crate) fn fence(&self, node: NodeAddress, incarnation: Incarnation) {
-        let is_it = |peer: &&Arc<Peer>| (peer.node, peer.incarnation) == (node, incarnation);
-        self.met().iter().filter(is_it).for_each(|peer| peer.fence());
-    }
-
-    /// Who left so long ago, and still sends, is over. A later life of the node that leaves just now is not.
-    pub(crate) fn fence_who_left(&self, node: NodeAddress, now: Time, ago: Duration) {
-        let has_left = |peer: &&Arc<Peer>| {
-            let left = Some(peer.has_left.load(Ordering::Relaxed)).filter(|left| *left != 0);
-            peer.node == node && left.is_some_and(|left| now.since(Time::from_nanos(left)) >= ago)
-        };
-        self.met().iter().filter(has_left).for_each(|peer| peer.fence());
-    }
-
-    /// Whether a message of a life of `node` that has left or is over may still come to the application at this address.
-    pub(crate) fn owes(&self, node: NodeAddress, app: AppAddress) -> bool {
-        self.met().iter().any(|peer| peer.node == node && peer.owes(app))
-    }
-
-    /// When something of that life of `node` was read last.
-    pub(crate) fn sign_of(&self, node: NodeAddress, incarnation: Incarnation) -> Option<Time> {
-        let peer = self.peer(node).filter(|peer| peer.incarnation == incarnation)?;
-        // SYNC: see `gives_a_sign`.
-        Some(peer.sign.load(Ordering::Relaxed)).filter(|sign| *sign != 0).map(Time::from_nanos)
-    }
-
-    /// Has that life of `node` give a sign on each connection that stands: a PING, ahead of all that waits there. spec: NDL-4.7
-    pub(crate) fn ask_for_a_sign(&self, here: NodeAddress, node: NodeAddress, incarnation: Incarnation) {
-        let Some(peer) = self.peer(node).filter(|peer| peer.incarnation == incarnation) else { return };
-        for way in peer.ways.iter().filter(|way| way.outlet.is_connected()) {
-            way.say(frame(here, node, Kind::GNCL_PING, Bytes::new()));
-        }
-    }
-
-    /// The peer that a connection leads to, made if need be. An older life of it is closed.
-    pub(super) fn meet(&self, now: Time, attach: &Attach, stores: &Stores) -> Arc<Peer> {
-        let node = attach.node;
-        match self.peer(node) {
-            Some(peer)
-                if peer.incarnation == attach.incarnation && (peer.ways.len() > 1) == attach.by_class =>
-            {
-                return peer;
-            }
-            Some(_) => self.forget(node),
-            None => {}
-        }
-        let peer = Arc::new(Peer::new(now, attach, stores));
-        {
-            let mut met = lock(&self.met);
-            met.retain(|former| former.strong_count() > 0);
-            met.push(Arc::downgrade(&peer));
-        }
-        self.lock().insert(node, peer.clone());
-        peer
-    }
-
-    /// Nothing reaches `node` any more: what waits for it is lost, and says so.
-    pub(super) fn forget(&self, node: NodeAddress) {
-        let peer = self.lock().remove(&node);
-        // Closed without the lock: whoever is told of an outcome may ask for a peer.
-        let Some(peer) = peer else { return };
-        peer.fence();
-        peer.end(Rejection::NoSuchNode);
-        if peer.ways.iter().any(Way::is_held_up) {
-            let mut gone = lock(&self.gone);
-            // What the first one left has waited longest; it is dropped, and its receipts have nobody to tell.
-            let surplus = (gone.len() + 1).saturating_sub(GONE_MAX);
-            let dropped: Vec<_> = gone.drain(..surplus).collect();
-            gone.push(peer);
-            drop(gone);
-            drop(dropped);
-        }
     }
 
     /// Offers what waits for applications here to them, whenever one of them takes more.
