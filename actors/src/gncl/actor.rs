@@ -4,6 +4,7 @@ mod by_datagram;
 mod leaving;
 #[cfg(target_os = "linux")]
 mod lost_addresses;
+mod membership;
 mod wire;
 
 use std::{
@@ -26,7 +27,7 @@ use sinew_runtime::{
 use tokio::net::TcpStream;
 
 use super::{
-    Event, LinkFact,
+    LinkFact,
     core::{
         Attach, CANCEL, CLASSES, ConnectionId, Core, DATAGRAMS, Decline, GUARD, Input, Introduction, Lane,
         OUTCOMES, Output, Refusal, Settings, read, write,
@@ -42,7 +43,6 @@ use super::{
 use crate::{
     config::NodeConfig,
     ndl,
-    ndl::{KnownNode, LossReason, MembershipFact},
     outlet::Gathering,
     stores::{Stores, lock},
     sync,
@@ -383,14 +383,7 @@ impl Actor for Gncl {
             )
         });
         self.cut_all();
-        for peer in self.stores.gncl.peers() {
-            self.input(Input::Restored { node: peer.node, incarnation: peer.incarnation }, ctx);
-        }
-        // NDL tells each change once, and a former instance may have had the last one in its hand.
-        let members = lock(&self.stores.ndl).members(Time::now());
-        for KnownNode { node, incarnation, gncl: addresses, .. } in members {
-            self.input(Input::NodeFound { node, incarnation, addresses }, ctx);
-        }
+        self.catch_up(ctx);
         for listener in listeners {
             ctx.add_stream(listener::accepted(listener, self.stores.config.gncl.give_up));
         }
@@ -429,26 +422,6 @@ impl Drop for Gncl {
     /// Senders must not go on writing to the sockets of an actor that is gone.
     fn drop(&mut self) {
         self.cut_all();
-    }
-}
-
-impl StreamHandler<Event> for Gncl {
-    fn handle(&mut self, event: Event, ctx: &mut Context<Self>) {
-        let input = match event {
-            Event::Membership(MembershipFact::NodeFound { node, incarnation, gncl }) => {
-                Input::NodeFound { node, incarnation, addresses: gncl }
-            }
-            Event::Membership(MembershipFact::NodeLost { node, incarnation, why: LossReason::Left }) => {
-                Input::NodeLeaves { node, incarnation }
-            }
-            Event::Membership(MembershipFact::NodeLost { node, incarnation, why: LossReason::Duplicate }) => {
-                Input::NodeDisowned { node, incarnation }
-            }
-            Event::Membership(MembershipFact::NodeLost { node, incarnation, .. }) => {
-                Input::NodeLost { node, incarnation }
-            }
-        };
-        self.input(input, ctx);
     }
 }
 

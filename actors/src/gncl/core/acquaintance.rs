@@ -31,6 +31,15 @@ pub(super) struct Acquaintance {
     pub(super) back_off: Duration,
     /// When it is forgotten, having said hello without NDL ever telling of it.
     pub(super) orphan_at: Option<Time>,
+    /// The life of it that NDL lost, until NDL finds one: neither it nor an earlier one is linked.
+    pub(super) lost: Option<Lost>,
+}
+
+/// A life that NDL has lost.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Lost {
+    pub(super) incarnation: Incarnation,
+    pub(super) at: Time,
 }
 
 /// A connection on which messages flow, and those for Stream and Bulk that go with it.
@@ -73,12 +82,18 @@ impl Acquaintance {
             redial_at: None,
             back_off: settings.redial_min,
             orphan_at: None,
+            lost: None,
         }
     }
 
     /// The life of it that is there, as long as NDL says so.
     pub(super) fn vouched(&self) -> Option<Incarnation> {
         self.found.filter(|_| self.wanted.is_some())
+    }
+
+    /// Whether NDL has lost this life of it, or a later one, and has found none since.
+    pub(super) fn is_lost(&self, incarnation: Incarnation) -> bool {
+        self.lost.is_some_and(|lost| incarnation <= lost.incarnation)
     }
 
     /// Whether only its own hello tells of it, and something is kept for it.

@@ -1,6 +1,9 @@
 //! What happens to one connection until it is a link or gone.
 
-use sinew_runtime::{tid::NodeAddress, time::Time};
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
 
 use super::{
     Attach, CANCEL, Connection, ConnectionId, Core, DATAGRAMS, Decline, GUARD, Introduction, Lane, LinkFact,
@@ -106,15 +109,9 @@ impl Core {
             return Err(Decline::Leaving);
         }
         check(hello, &self.settings.ours)?;
+        self.judge_life(hello.node, hello.incarnation)?;
         self.room_for_claim(hello.node)?;
         let Some(peer) = self.peers.get(&hello.node) else { return self.room() };
-        // spec: GNCL-7
-        if hello.incarnation < peer.incarnation {
-            return Err(Decline::Stale { theirs: hello.incarnation, known: peer.incarnation });
-        }
-        if peer.vouched().is_some_and(|present| hello.incarnation > present) {
-            return Err(Decline::Contested { node: hello.node });
-        }
         // spec: GNCL-6
         let is_void = hello.incarnation == peer.incarnation && hello.dial <= peer.void_dial;
         // A dial that has not said hello yet loses against one that has. spec: GNCL-4
@@ -172,14 +169,20 @@ impl Core {
         if welcome.node != dialled {
             return Err(Decline::WrongNode { wanted: dialled, ours: welcome.node });
         }
-        match self.peers.get(&dialled) {
-            Some(peer) if welcome.incarnation < peer.incarnation => {
-                Err(Decline::Stale { theirs: welcome.incarnation, known: peer.incarnation })
-            }
-            Some(peer) if peer.vouched().is_some_and(|present| welcome.incarnation > present) => {
-                Err(Decline::Contested { node: dialled })
-            }
-            Some(_) | None => Ok(()),
+        self.judge_life(dialled, welcome.incarnation)
+    }
+
+    /// Whether this life of `node` may be linked: which one is there, and whether one is, says NDL. spec: GNCL-7
+    fn judge_life(&self, node: NodeAddress, incarnation: Incarnation) -> Result<(), Decline> {
+        let Some(peer) = self.peers.get(&node) else { return Ok(()) };
+        if incarnation < peer.incarnation {
+            Err(Decline::Stale { theirs: incarnation, known: peer.incarnation })
+        } else if peer.vouched().is_some_and(|present| incarnation > present) {
+            Err(Decline::Contested { node })
+        } else if peer.is_lost(incarnation) {
+            Err(Decline::Lost { node })
+        } else {
+            Ok(())
         }
     }
 

@@ -131,6 +131,10 @@ pub(crate) enum Decline {
     Contested {
         node: NodeAddress,
     },
+    /// NDL has lost this life, and not found it again.
+    Lost {
+        node: NodeAddress,
+    },
     Duplicate,
     TooManyPeers {
         peers_max: usize,
@@ -152,7 +156,7 @@ impl Decline {
             Self::OwnAddress { .. } => "own address",
             Self::WrongNode { .. } => "wrong node",
             Self::Stale { .. } => "stale incarnation",
-            Self::Contested { .. } => "contested",
+            Self::Contested { .. } | Self::Lost { .. } => "contested",
             Self::Duplicate => "duplicate",
             Self::TooManyPeers { .. } | Self::TooManyClaims { .. } => "too many peers",
             Self::TooLate => "too late",
@@ -192,6 +196,11 @@ impl fmt::Display for Decline {
                 f,
                 "an earlier process still answers as node {node}; wait until it is found to be gone, or give each its own \
                  address"
+            ),
+            Self::Lost { node } => write!(
+                f,
+                "I have lost node {node} and not found it again; what waits for me goes on when I do, so see that its NDL answers \
+                 mine (UDP)"
             ),
             Self::Duplicate => {
                 f.write_str("another connection between us is made or being made; keep that one")

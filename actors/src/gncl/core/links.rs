@@ -9,7 +9,7 @@ use sinew_runtime::{
 
 use super::{
     ConnectionId, Core, Lane, LinkFact, Output, Stage,
-    acquaintance::{Acquaintance, Pulse},
+    acquaintance::{Acquaintance, Lost, Pulse},
 };
 
 impl Core {
@@ -42,6 +42,7 @@ impl Core {
             return;
         };
         peer.orphan_at = None;
+        peer.lost = None;
         peer.found = Some(incarnation);
         peer.wanted = Some(addresses);
         if peer.link.is_none() && peer.dial.is_none() {
@@ -50,7 +51,21 @@ impl Core {
         }
     }
 
+    /// NDL lost this life: whoever was told of that gets nothing of it until NDL finds it again, whatever it dials. spec: GNCL-7
     pub(super) fn lost(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
+        self.over(now, node, incarnation);
+        if !self.peers.contains_key(&node) && self.peers.len() < self.settings.peers_max {
+            self.peers.insert(node, Acquaintance::new(incarnation, &self.settings));
+        }
+        if let Some(peer) = self.peers.get_mut(&node)
+            && incarnation >= peer.incarnation
+        {
+            peer.lost = Some(Lost { incarnation, at: now });
+        }
+    }
+
+    /// This life of `node` is over: all that there is with it ends.
+    fn over(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
         let Some(peer) = self.peers.get_mut(&node) else { return };
         if incarnation < peer.incarnation {
             // The news is about a life that is over anyway.
@@ -62,7 +77,7 @@ impl Core {
 
     /// What was known of `node` was about another process than the one that has its address. spec: GNCL-7
     pub(super) fn disowned(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
-        self.lost(now, node, incarnation);
+        self.over(now, node, incarnation);
         if self.peers.get(&node).is_some_and(Acquaintance::is_idle) {
             self.peers.remove(&node);
         }
@@ -72,7 +87,8 @@ impl Core {
     pub(super) fn leaves(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
         match self.peers.get_mut(&node) {
             Some(peer) if peer.link.is_some() && peer.incarnation == incarnation => peer.wanted = None,
-            Some(_) | None => self.lost(now, node, incarnation),
+            // It may dial for what it has for us still.
+            Some(_) | None => self.over(now, node, incarnation),
         }
     }
 
@@ -107,12 +123,14 @@ impl Core {
         }
     }
 
-    /// A full table gives up somebody of whom only a past life is known.
+    /// A full table gives up somebody of whom only a past life is known: of those that NDL lost the one that was lost first, and that after
+    /// all others.
     fn make_room(&mut self) {
         if self.peers.len() < self.settings.peers_max {
             return;
         }
-        let idle = self.peers.iter().find(|(_, peer)| peer.is_idle()).map(|(node, _)| *node);
+        let idle = self.peers.iter().filter(|(_, peer)| peer.is_idle());
+        let idle = idle.min_by_key(|(_, peer)| peer.lost.map(|lost| lost.at)).map(|(node, _)| *node);
         if let Some(node) = idle {
             self.peers.remove(&node);
             self.outputs.push_back(Output::Forget(node));

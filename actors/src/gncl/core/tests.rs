@@ -5,6 +5,7 @@ use proptest::prelude::*;
 use super::*;
 
 mod dials;
+mod lost;
 mod sides;
 mod virtual_wire;
 

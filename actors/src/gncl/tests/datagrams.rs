@@ -14,6 +14,7 @@ use super::{
     classes::of_class,
 };
 use crate::gncl::{
+    LinkFact,
     core::{CLASSES, DATAGRAMS, Introduction, Lane, read, write},
     datagrams::Announcement,
     peer::frame,
@@ -430,6 +431,15 @@ fn nothing_of_a_peer_that_is_lost_is_handed_on_and_nothing_with_its_former_key()
         mate.send_value(node.tid(1), 2).await;
         node.counted("datagram of a stranger").await;
         drop(mate);
+        // It has not lost us, and dials again: nothing of it comes between its loss and its finding. spec: GNCL-7
+        let mut again = ByHand::dial(&node).await;
+        let hello = Introduction { dial: 4, ..introduction(node.address()) };
+        again.say(&frame(NINE, node.address(), Kind::GNCL_HELLO, write(&hello))).await;
+        let refusal = again.refusal().await;
+        assert_eq!(refusal.cause, "contested", "{}", refusal.sentence);
+        assert!(node.stores.gncl.peer(NINE).is_none());
+        node.find(NINE, SocketAddr::from(([127, 0, 0, 1], 1)));
+        node.fact_that(|fact| matches!(fact, LinkFact::DialRefused { .. })).await;
         let next_life = Mate::dialling(&mut node, 5).await.open(&node).await;
         let former = next_life.datagram(0, VALUE, &next_life.value_bytes(node.tid(1), 3, nines_app()));
         next_life.say_bytes(&former).await;

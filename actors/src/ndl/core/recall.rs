@@ -1,4 +1,4 @@
-//! What is remembered for whoever asks, and decides nothing: nodes that were lost, and those of other projects that are heard.
+//! What is remembered for whoever asks, and decides nothing in NDL: nodes that were lost, and those of other projects that are heard.
 
 use std::{collections::BTreeMap, net::SocketAddr, time::Duration};
 

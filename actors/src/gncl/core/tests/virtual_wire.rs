@@ -31,6 +31,8 @@ pub(super) struct Node {
     ends: BTreeMap<ConnectionId, usize>,
     /// Which life of the core this is: what was on its way to a former one is void.
     life: u64,
+    /// The life of the other one that NDL here has lost and not found again.
+    lost: Option<Incarnation>,
 }
 
 struct Pipe {
@@ -91,6 +93,7 @@ impl World {
             facts: Vec::new(),
             ends: BTreeMap::new(),
             life: 0,
+            lost: None,
         };
         Self {
             nodes: [node(0), node(1)],
@@ -148,6 +151,7 @@ impl World {
     fn restart_node(&mut self, node: usize) {
         let (other, old) = (1 - node, self.nodes[node].incarnation);
         self.nodes[node].incarnation += 1;
+        self.nodes[node].lost = None;
         self.restart(node);
         // The other's NDL may learn of it before or after the first hello.
         let (life, at) = (self.nodes[other].life, self.now + self.delay() * 3);
@@ -168,6 +172,9 @@ impl World {
         lives.core = Core::new(settings(ADDRESSES[node], lives.incarnation), seed);
         // Connections of a former life have other names.
         lives.core.opened = lives.life << 32;
+        if let Some(incarnation) = lives.lost {
+            self.input(node, Input::NodeLost { node: ADDRESSES[1 - node], incarnation });
+        }
         let at = self.now + self.delay() * 3;
         self.told_found(node, at);
     }
@@ -256,10 +263,23 @@ impl World {
 
     fn input(&mut self, node: usize, input: Input) {
         let _ = writeln!(self.story, "{:?} {node} <- {input:?}", self.now);
+        self.note_what_ndl_says(node, &input);
         self.nodes[node].core.handle(self.now, input);
         while let Some(output) = self.nodes[node].core.poll() {
             let _ = writeln!(self.story, "{:?} {node} -> {output:?}", self.now);
             self.obey(node, output);
+        }
+    }
+
+    fn note_what_ndl_says(&mut self, node: usize, input: &Input) {
+        let lost = &mut self.nodes[node].lost;
+        if let Input::NodeLost { incarnation, .. } = input {
+            *lost = Some(*incarnation).max(*lost);
+        }
+        if let Input::NodeFound { incarnation, .. } = input
+            && lost.is_some_and(|lost| *incarnation >= lost)
+        {
+            *lost = None;
         }
     }
 
@@ -270,6 +290,9 @@ impl World {
             Output::Dial { .. } => {}
             Output::SendHello(connection, hello) => self.send(node, connection, Parcel::Hello(hello)),
             Output::Attach(attach) => {
+                // spec: GNCL-7
+                let is_lost = self.nodes[node].lost.is_some_and(|lost| attach.incarnation <= lost);
+                assert!(!is_lost, "nothing is linked between a life's loss and its finding: {}", self.story);
                 if let Some(welcome) = attach.welcome {
                     self.send(node, attach.connection, Parcel::Welcome(welcome));
                 }

@@ -1,0 +1,65 @@
+//! Who is there and who is lost, as NDL tells it.
+
+use actix::{Context, StreamHandler};
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
+
+use super::{
+    super::{Event, core::Input},
+    Gncl,
+};
+use crate::{
+    ndl::{KnownNode, LossReason, LostNode, MembershipFact},
+    stores::lock,
+};
+
+impl Gncl {
+    /// What a former instance of this layer left behind, and what NDL has told so far: it tells each change once, and that instance may
+    /// have had the last one in its hand. spec: GNCL-7
+    pub(super) fn catch_up(&mut self, ctx: &mut Context<Self>) {
+        for peer in self.stores.gncl.peers() {
+            self.input(Input::Restored { node: peer.node, incarnation: peer.incarnation }, ctx);
+        }
+        let (lost, members) = {
+            let ndl = lock(&self.stores.ndl);
+            (ndl.lost_nodes(), ndl.members(Time::now()))
+        };
+        for (node, LostNode { incarnation, why, .. }) in lost {
+            match why {
+                // One that leaves may still have something to say, and of a process that was none nothing is known.
+                LossReason::Left | LossReason::Duplicate => {}
+                LossReason::Crashed | LossReason::Hung | LossReason::LinkDown | LossReason::Restarted => {
+                    self.input(lost_as(why, node, incarnation), ctx);
+                }
+            }
+        }
+        for KnownNode { node, incarnation, gncl: addresses, .. } in members {
+            self.input(Input::NodeFound { node, incarnation, addresses }, ctx);
+        }
+    }
+}
+
+const fn lost_as(why: LossReason, node: NodeAddress, incarnation: Incarnation) -> Input {
+    match why {
+        LossReason::Left => Input::NodeLeaves { node, incarnation },
+        LossReason::Duplicate => Input::NodeDisowned { node, incarnation },
+        LossReason::Crashed | LossReason::Hung | LossReason::LinkDown | LossReason::Restarted => {
+            Input::NodeLost { node, incarnation }
+        }
+    }
+}
+
+impl StreamHandler<Event> for Gncl {
+    fn handle(&mut self, event: Event, ctx: &mut Context<Self>) {
+        let Event::Membership(fact) = event;
+        let input = match fact {
+            MembershipFact::NodeFound { node, incarnation, gncl } => {
+                Input::NodeFound { node, incarnation, addresses: gncl }
+            }
+            MembershipFact::NodeLost { node, incarnation, why } => lost_as(why, node, incarnation),
+        };
+        self.input(input, ctx);
+    }
+}
