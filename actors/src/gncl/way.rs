@@ -1,6 +1,7 @@
 //! One session with a peer: what is sent to it on the connections of a lane, and what was taken of its messages there.
 
 mod acks;
+mod hand;
 
 use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
@@ -31,6 +32,7 @@ use crate::{
     refusals::Refusals,
     session::{Ack, Arrival, Came, Receiving, Sent, Shelf, ShelfLimits, Window},
 };
+pub(super) use hand::Hand;
 
 /// Bytes of frames for one peer that are kept unacknowledged, from which on further messages wait.
 const WINDOW_BYTES: usize = 4 << 20;
@@ -399,7 +401,7 @@ impl Way {
 
     /// The message that has just been taken.
     pub(super) const fn hand(&self) -> Hand<'_> {
-        Hand(Some(self))
+        Hand::of(self)
     }
 
     /// A value has come by datagram, and is in hand; `None` if nothing more is taken.
@@ -443,31 +445,6 @@ impl Way {
             let kind = refused.message.header.kind;
             let detail = format!("a frame of kind {kind} for node {}: {}", self.ends.node, refused.why);
             self.refusals.count(Time::now(), "own frame not sent", &detail);
-        }
-    }
-}
-
-/// A message in hand. If nobody says how it ended, it has failed.
-pub(super) struct Hand<'a>(Option<&'a Way>);
-
-impl Hand<'_> {
-    /// The message has ended so.
-    pub(super) fn ends(mut self, end: End) {
-        if let Some(way) = self.0.take() {
-            way.inbox().arrivals.end(end);
-        }
-    }
-
-    /// The message waits in a line.
-    pub(super) fn empty(mut self) {
-        self.0 = None;
-    }
-}
-
-impl Drop for Hand<'_> {
-    fn drop(&mut self) {
-        if let Some(way) = self.0 {
-            way.inbox().arrivals.end(End::Failed);
         }
     }
 }

@@ -1,0 +1,32 @@
+//! A message that has come and is being handled: it is counted once, whatever panics.
+
+use super::{super::arrivals::End, Way};
+
+/// A message in hand. If nobody says how it ended, it has failed.
+pub(in crate::gncl) struct Hand<'a>(Option<&'a Way>);
+
+impl<'a> Hand<'a> {
+    pub(super) const fn of(way: &'a Way) -> Self {
+        Self(Some(way))
+    }
+
+    /// The message has ended so.
+    pub(in crate::gncl) fn ends(mut self, end: End) {
+        if let Some(way) = self.0.take() {
+            way.inbox().arrivals.end(end);
+        }
+    }
+
+    /// The message waits in a line.
+    pub(in crate::gncl) fn empty(mut self) {
+        self.0 = None;
+    }
+}
+
+impl Drop for Hand<'_> {
+    fn drop(&mut self) {
+        if let Some(way) = self.0 {
+            way.inbox().arrivals.end(End::Failed);
+        }
+    }
+}
