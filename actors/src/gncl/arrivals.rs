@@ -34,6 +34,12 @@ impl Arrivals {
         self.in_hand += 1;
     }
 
+    /// What was counted as one more had come before.
+    pub(super) const fn take_none(&mut self) {
+        self.taken = self.taken.saturating_sub(1);
+        self.put_away();
+    }
+
     /// One that has waited for its application is in hand again.
     pub(super) const fn take_again(&mut self) {
         self.in_hand += 1;

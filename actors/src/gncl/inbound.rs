@@ -17,7 +17,7 @@ use super::{
     datagrams::{Announcement, Freshness},
     peer::Peer,
     spin::Spin,
-    way::{Taken, Way},
+    way::{Hand, Taken, Way},
 };
 use crate::{
     outlet::{LinkNumber, OUTCOMES_MAX, line_of, read_outcomes},
@@ -84,11 +84,7 @@ impl Inbound {
             return Ok(());
         }
         if is_for_the_link(&message, Kind::GNCL_DATAGRAMS) {
-            let said: Announcement = read(&message.payload)?;
-            if let Some(channel) = self.peer.channel() {
-                channel.announced(now, said, way);
-            }
-            return Ok(());
+            return self.datagrams_announced(now, &message, way);
         }
         // Counted first: what panics from here on must not come again.
         let taken = way.arrive(self.link, &message)?;
@@ -112,11 +108,23 @@ impl Inbound {
         Ok(())
     }
 
-    /// Takes a value that came by datagram at `now`, and is newer than all of its flow before.
-    pub(super) fn receive_datagram(&self, now: Time, message: Message) {
-        let Some(way) = self.peer.way(self.lane) else { return };
+    /// Of a connection that is not the present one it is old news, and about another address. spec: DATAGRAM-2
+    fn datagrams_announced(&self, now: Time, message: &Message, way: &Way) -> Result<(), Decline> {
+        if self.lane != Lane::Stream {
+            return Err(Decline::Violation("DATAGRAMS came where none belongs".to_owned()));
+        }
+        let said: Announcement = read(&message.payload)?;
+        if let Some(channel) = self.peer.channel()
+            && way.comes_on(self.link)
+        {
+            channel.announced(now, said, way);
+        }
+        Ok(())
+    }
+
+    /// Takes a value that came by datagram at `now`, is newer than all of its flow before, and is in `hand`.
+    pub(super) fn receive_datagram(&self, now: Time, message: Message, way: &Way, hand: Hand<'_>) {
         self.spin.heard(now);
-        let Some(hand) = way.take_datagram() else { return };
         match self.take(now, message, way, Taken::Yes) {
             Some(end) => hand.ends(end),
             None => hand.empty(),

@@ -3,7 +3,7 @@
 mod lives;
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, VecDeque},
     hash::{BuildHasher as _, RandomState},
     io,
     net::Shutdown,
@@ -29,7 +29,7 @@ use tokio::{net::TcpStream, sync::Notify};
 use super::{
     bulk::BulkThread,
     core::{Attach, Lane},
-    datagrams::{Alarm, Channel, Position, Sockets},
+    datagrams::{Alarm, Channel, HandedOn, Position, Sockets},
     notes::Notes,
     task::{Move, Place},
     ticks::Ticks,
@@ -101,7 +101,8 @@ impl Peer {
             // Nobody can guess it: this has its seed from the system.
             let key = RandomState::new().hash_one(());
             let ends = (stores.node, attach.node);
-            Channel::new(now, ends, key, (&stores.gncl.alarm, refusals))
+            let former = stores.gncl.handed_on(attach.node, attach.incarnation);
+            Channel::new(now, ends, key, former, (&stores.gncl.alarm, refusals))
         });
         let (buried, expiring) = (stores.gncl.buried.clone(), stores.gncl.expiring.clone());
         let Attach { node, incarnation, takes_cancels, .. } = *attach;
@@ -318,6 +319,8 @@ pub(crate) struct Store {
     peers: Mutex<BTreeMap<NodeAddress, Arc<Peer>>>,
     /// Peers that are gone, as long as messages of theirs wait for applications here.
     gone: Mutex<Vec<Arc<Peer>>>,
+    /// What was handed on by datagram of lives that are forgotten and may come back, oldest first.
+    handed_on: Mutex<VecDeque<(NodeAddress, Incarnation, HandedOn)>>,
     /// Every life of a peer that somebody still holds, for an audit; those that are gone are in `buried`.
     met: Mutex<Vec<Weak<Peer>>>,
     /// The accounts of those that nobody holds any more, both ways, all together.

@@ -224,6 +224,12 @@ impl Way {
         }
     }
 
+    /// Whether what its messages come on is this connection, and not a later one.
+    pub(super) fn comes_on(&self, link: LinkNumber) -> bool {
+        let inbox = self.inbox();
+        !inbox.is_fenced && inbox.receiving.is_present(link.number())
+    }
+
     /// Takes nothing more: who has been told that this life of the peer is over gets no message of it afterwards.
     pub(super) fn fence(&self) {
         self.inbox().is_fenced = true;
@@ -404,7 +410,7 @@ impl Way {
         Hand::of(self)
     }
 
-    /// A value has come by datagram, and is in hand; `None` if nothing more is taken.
+    /// A value comes by datagram, and is in hand; `None` if nothing more is taken.
     pub(super) fn take_datagram(&self) -> Option<Hand<'_>> {
         let inbox = &mut *self.inbox();
         if inbox.is_fenced {

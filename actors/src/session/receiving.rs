@@ -49,6 +49,11 @@ impl Receiving {
         self.knows_epoch = false;
     }
 
+    /// Whether this is the latest connection.
+    pub(crate) const fn is_present(&self, link: u64) -> bool {
+        link == self.link
+    }
+
     /// The peer counts in `epoch`. Returns whether this came on the latest connection, and so counts.
     pub(crate) const fn heard(&mut self, link: u64, epoch: u64) -> bool {
         if link != self.link || epoch < self.epoch {

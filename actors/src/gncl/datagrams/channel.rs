@@ -9,6 +9,7 @@ use std::{
 };
 
 use sinew_runtime::{
+    outcome::Rejection,
     router::{Outlet as _, Refused},
     tid::{NodeAddress, Tid},
     time::Time,
@@ -17,7 +18,8 @@ use sinew_runtime::{
 
 use super::{
     core::{Core, Order, stamp},
-    outgoing::Position,
+    incoming::Incoming,
+    outgoing::{Offered, Position},
     packet::{ACK_LEN, Content, DATAGRAM_MAX, PREFIX_LEN, Packet, Prefix, RANGE_LEN, RANGES_MAX},
     reader::Alarm,
     sockets::{Announcement, Door},
@@ -33,6 +35,11 @@ type Flow = (Tid, Tid, Kind);
 fn flow_of(header: &Header) -> Flow {
     (header.source, header.destination, header.kind)
 }
+
+/// The numbers that were handed on of one life of a peer: they outlive what else is known of it, as those of later values are larger
+/// still. spec: DATAGRAM-3
+#[derive(Clone, Debug)]
+pub(in crate::gncl) struct HandedOn(Incoming<Flow>);
 
 /// Where a peer reads datagrams.
 #[derive(Clone, Debug)]
@@ -62,8 +69,11 @@ struct State {
 impl State {
     /// When something is to be sent or looked at.
     fn next_wake(&self) -> Option<Time> {
-        // Nothing is said to a peer that has not said where.
-        self.target.as_ref().and_then(|_| self.core.next_wake())
+        match self.target {
+            Some(_) => self.core.next_wake(),
+            // Nothing is said to a peer that has not said where.
+            None => self.core.outgoing.offer_at(),
+        }
     }
 }
 
@@ -91,19 +101,19 @@ pub(in crate::gncl) struct Channel {
 
 impl Channel {
     /// `now` is the first number: a later channel with the same life of the peer goes on above it, as nobody sends a value each nanosecond.
+    /// `former` is what an earlier one with the same life handed on.
     pub(in crate::gncl) fn new(
         now: Time,
         (here, node): (NodeAddress, NodeAddress),
         key: u64,
+        former: Option<HandedOn>,
         (alarm, refusals): (&Arc<Alarm>, &Arc<Refusals>),
     ) -> Self {
-        let state = State {
-            core: Core::new(now.as_nanos()),
-            connection: None,
-            target: None,
-            payload_max: 0,
-            is_retired: false,
-        };
+        let mut core = Core::new(now.as_nanos());
+        if let Some(HandedOn(incoming)) = former {
+            core.incoming = incoming;
+        }
+        let state = State { core, connection: None, target: None, payload_max: 0, is_retired: false };
         let (alarm, refusals) = (alarm.clone(), refusals.clone());
         Self { here, node, key, state: Mutex::new(state), heard: AtomicU64::new(0), alarm, refusals }
     }
@@ -128,24 +138,22 @@ impl Channel {
         let wake = {
             let state = &mut *self.lock();
             let Some(Connection { door, remote }) = state.connection.clone() else { return };
-            let is_same_peer = state.target.as_ref().is_none_or(|target| target.key == said.key);
-            if !is_same_peer {
+            if state.is_retired {
+                return;
+            }
+            if state.target.as_ref().is_some_and(|target| target.key != said.key) {
                 state.core.begin_anew();
             }
             let target = said.target(remote).map(|address| Target { door, address, key: said.key });
             let is_same =
                 |former: &Target, new: &Target| (former.address, former.key) == (new.address, new.key);
-            let handed_over = match (&state.target, &target) {
-                _ if state.is_retired => return,
-                (Some(former), Some(new)) if is_same(former, new) => {
-                    state.core.reconnected(now);
-                    Vec::new()
-                }
+            match (&state.target, &target) {
+                (Some(former), Some(new)) if is_same(former, new) => state.core.reconnected(now),
                 (_, Some(_)) => state.core.announced(now),
                 (_, None) => state.core.retire(),
-            };
+            }
             state.target = target;
-            self.hand_over(handed_over, way);
+            self.hand_over(now, state, way);
             state.next_wake()
         };
         self.alarm.set(wake);
@@ -155,7 +163,16 @@ impl Channel {
     ///
     /// # Errors
     /// The message: the connection's outlet does not take it.
-    pub(in crate::gncl) fn submit(&self, mut message: Message, way: &Way) -> Result<(), Refused> {
+    pub(in crate::gncl) fn submit(&self, message: Message, way: &Way) -> Result<(), Refused> {
+        match self.by_datagram(message) {
+            None => Ok(()),
+            // Without the lock: a long one is written in pieces.
+            Some(message) => self.by_connection(message, way),
+        }
+    }
+
+    /// Returns what goes by the connection, with its number.
+    fn by_datagram(&self, message: Message) -> Option<Message> {
         let flow = flow_of(&message.header);
         let wake = {
             let now = Time::now();
@@ -170,39 +187,56 @@ impl Channel {
             } else {
                 Some(message)
             };
-            match left {
-                None => {
-                    self.write(state, now);
-                    state.next_wake()
-                }
-                Some(left) => {
-                    message = left;
-                    message.header.correlation = state.core.outgoing.number_elsewhere(flow);
-                    // Below, without the lock: a long one is written in pieces.
-                    return self.by_connection(message, way);
-                }
+            if let Some(mut message) = left {
+                message.header.correlation = state.core.outgoing.given_elsewhere(flow);
+                return Some(message);
             }
+            self.write(state, now);
+            state.next_wake()
         };
         self.alarm.set(wake);
-        Ok(())
+        None
     }
 
+    /// What goes by datagram of this flow stays as long as the connection has not taken what is newer.
     fn by_connection(&self, message: Message, way: &Way) -> Result<(), Refused> {
-        way.outlet.submit(message).map_err(|mut refused| {
-            refused.message.header.correlation = 0;
-            refused
-        })
-    }
-
-    /// With the lock in hand, so that a newer value comes behind these.
-    fn hand_over(&self, values: Vec<(u64, Message)>, way: &Way) {
-        for (number, mut message) in values {
-            message.header.correlation = number;
-            if let Err(refused) = way.outlet.submit(message) {
-                let detail = format!("a value for node {}: {}", self.node, refused.why);
-                self.refusals.count(Time::now(), "value not sent", &detail);
+        let (flow, number) = (flow_of(&message.header), message.header.correlation);
+        let taken = way.outlet.submit(message);
+        let outgoing = &mut self.lock().core.outgoing;
+        match taken {
+            Ok(()) => {
+                outgoing.taken_elsewhere(flow, number);
+                Ok(())
+            }
+            Err(mut refused) => {
+                outgoing.refused_elsewhere(flow);
+                refused.message.header.correlation = 0;
+                Err(refused)
             }
         }
+    }
+
+    /// Offers the connection what is for it. With the lock in hand, so that a newer value comes behind these.
+    fn hand_over(&self, now: Time, state: &mut State, way: &Way) {
+        let is_retired = state.is_retired;
+        state.core.outgoing.hand_over(now, |number, mut message| {
+            message.header.correlation = number;
+            let offered = if is_retired {
+                // The last ones, of so many flows at most: no other time comes.
+                way.outlet.submit_beyond(message)
+            } else {
+                way.outlet.offer(message, None)
+            };
+            match offered {
+                Ok(()) => Offered::Taken,
+                Err(Refused { message, why: Rejection::QueueFull }) => Offered::Full(message),
+                Err(refused) => {
+                    let detail = format!("a value for node {}: {}", self.node, refused.why);
+                    self.refusals.count(now, "value not sent", &detail);
+                    Offered::Refused
+                }
+            }
+        });
     }
 
     /// Whether a datagram is from the peer. spec: DATAGRAM-1
@@ -263,11 +297,11 @@ impl Channel {
         let (wake, blocked) = {
             let state = &mut *self.lock();
             let heard = Time::from_nanos(self.heard.load(Ordering::Relaxed));
-            let turn = state.core.tick(now, heard);
-            self.hand_over(turn.handed_over, way);
+            let is_blocked = state.core.tick(now, heard);
+            self.hand_over(now, state, way);
             self.write(state, now);
             let target = state.target.as_ref().map(|target| target.address);
-            (state.next_wake(), target.filter(|_| turn.is_blocked))
+            (state.next_wake(), target.filter(|_| is_blocked))
         };
         if let Some(to) = blocked {
             crate::log::warn!(
@@ -284,8 +318,8 @@ impl Channel {
     pub(in crate::gncl) fn retire(&self, way: &Way) {
         let state = &mut *self.lock();
         state.is_retired = true;
-        let values = state.core.retire();
-        self.hand_over(values, way);
+        state.core.retire();
+        self.hand_over(Time::now(), state, way);
     }
 
     /// The peer is gone.
@@ -293,6 +327,13 @@ impl Channel {
         let state = &mut *self.lock();
         (state.is_retired, state.target) = (true, None);
         state.core.end();
+    }
+
+    /// What of the peer's was handed on.
+    pub(in crate::gncl) fn handed_on(&self) -> HandedOn {
+        let mut incoming = self.lock().core.incoming.clone();
+        incoming.begin_anew();
+        HandedOn(incoming)
     }
 
     /// Values that are not known to have arrived.

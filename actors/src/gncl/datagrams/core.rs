@@ -22,21 +22,14 @@ pub(super) enum Order<'a, V> {
     Acknowledgement,
 }
 
-/// What a look at the time has found.
-#[derive(Debug)]
-pub(super) struct Turn<V> {
-    /// The peer lives, and datagrams do not get through: to be said.
-    pub(super) is_blocked: bool,
-    /// What is to go by the connection instead, oldest first, with its numbers.
-    pub(super) handed_over: Vec<(u64, V)>,
-}
-
 /// Both directions between this node and a peer.
 #[derive(Clone, Debug)]
 pub(super) struct Core<K, V> {
     pub(super) outgoing: Outgoing<K, V>,
     pub(super) incoming: Incoming<K>,
     path: Path,
+    /// Since when datagrams go where they do: what answers an earlier one says nothing of the way there.
+    there_since: Time,
     is_to_probe: bool,
 }
 
@@ -47,14 +40,17 @@ impl<K: Ord + Copy, V> Core<K, V> {
             outgoing: Outgoing::new(first, LIMITS),
             incoming: Incoming::new(incoming::FLOWS_MAX),
             path: Path::new(),
+            there_since: Time::ZERO,
             is_to_probe: false,
         }
     }
 
-    /// The peer reads datagrams somewhere else than was known. What is under way goes by the connection, oldest first.
-    pub(super) fn announced(&mut self, now: Time) -> Vec<(u64, V)> {
+    /// The peer reads datagrams somewhere else than was known. What is under way goes by the connection:
+    /// [`hand_over`](Outgoing::hand_over) follows.
+    pub(super) fn announced(&mut self, now: Time) {
         self.path.announced(now);
-        self.outgoing.hand_over()
+        self.there_since = now;
+        self.outgoing.turn_to_connection();
     }
 
     /// There is a new connection, and the peer reads datagrams where it did.
@@ -62,17 +58,17 @@ impl<K: Ord + Copy, V> Core<K, V> {
         self.path.reconnected(now);
     }
 
-    /// The peer has forgotten what came from here.
+    /// The peer has forgotten what came from here. [`announced`](Self::announced) follows.
     pub(super) fn begin_anew(&mut self) {
         self.outgoing.begin_anew();
         self.incoming.begin_anew();
     }
 
-    /// No datagrams are sent any more. What is under way goes by the connection, oldest first.
-    pub(super) fn retire(&mut self) -> Vec<(u64, V)> {
+    /// No datagrams are sent any more. What is under way goes by the connection: [`hand_over`](Outgoing::hand_over) follows.
+    pub(super) fn retire(&mut self) {
         self.path.over();
         self.is_to_probe = false;
-        self.outgoing.hand_over()
+        self.outgoing.turn_to_connection();
     }
 
     /// The peer is gone, with all that was for it.
@@ -104,22 +100,25 @@ impl<K: Ord + Copy, V> Core<K, V> {
     /// The peer says what has come. Returns whether values go by datagram from now on, and did not before.
     pub(super) fn acknowledged(&mut self, now: Time, said: &Acknowledgement) -> bool {
         self.outgoing.acknowledged(said, stamp(now));
-        self.path.answered()
+        let age_us = stamp(now).wrapping_sub(said.echo);
+        // spec: DATAGRAM-5
+        let is_from_there = u128::from(age_us) <= now.since(self.there_since).as_micros();
+        is_from_there && self.path.answered()
     }
 
-    /// Time has passed. `heard` is when the peer spoke on a connection last.
-    pub(super) fn tick(&mut self, now: Time, heard: Time) -> Turn<V> {
+    /// Time has passed; [`hand_over`](Outgoing::hand_over) follows. `heard` is when the peer spoke on a connection last. Returns whether
+    /// it is to be said that the peer lives and datagrams do not get through.
+    pub(super) fn tick(&mut self, now: Time, heard: Time) -> bool {
         let is_blocked = self.path.is_to_warn(now, heard);
-        let mut handed_over = Vec::new();
         match self.path.tick(now) {
             Step::Nothing => {}
             Step::Probe => self.is_to_probe = true,
             Step::GoBack => {
                 self.is_to_probe = self.path.tick(now) == Step::Probe;
-                handed_over = self.outgoing.hand_over();
+                self.outgoing.turn_to_connection();
             }
         }
-        Turn { is_blocked, handed_over }
+        is_blocked
     }
 
     /// The next thing to send.

@@ -9,9 +9,9 @@
 //! | rule | what it says |
 //! | --- | --- |
 //! | DATAGRAM-1 | A datagram has the key that its receiver has given to its sender; what has not is dropped before all else. |
-//! | DATAGRAM-2 | Each side says on each connection for Stream where it reads datagrams, and with which key. |
+//! | DATAGRAM-2 | Each side says on each connection for Stream where it reads datagrams, and with which key; another key has the newest values go by the connection. |
 //! | DATAGRAM-3 | Values of both ways are numbered together; who has one of a flow hands on none with the same number or a smaller one. |
-//! | DATAGRAM-4 | The newest value of a flow is repeated until it is acknowledged, superseded, too old, or goes by the connection. |
+//! | DATAGRAM-4 | The newest value of a flow is repeated until it is acknowledged, superseded, too old, or the connection has taken it. |
 //! | DATAGRAM-5 | No value goes by datagram before a datagram was answered; after 500 ms without any answer none does, and it is tried now and then. |
 //! | DATAGRAM-6 | 256 datagrams and 32 KiB are on the way to a peer at most. |
 //!
@@ -41,7 +41,7 @@ mod sockets;
 #[cfg(test)]
 mod tests;
 
-pub(super) use channel::{Channel, Freshness};
+pub(super) use channel::{Channel, Freshness, HandedOn};
 pub(super) use outgoing::Position;
 pub(super) use reader::{Alarm, keep_time, read_all};
 pub(super) use sockets::{Announcement, Sockets};

@@ -3,6 +3,7 @@
 //! ```text
 //!  Idle ── submitted ──► Waiting ── sent ──► OnTheWay ── acknowledged ──► Idle
 //!             ▲ newer value takes its place │    ▲ └── time-out: again ─┘
+//!  Waiting, OnTheWay ── datagrams do not get through ──► ForConnection ── the connection has taken it ──► Idle
 //! ```
 
 use std::{
@@ -37,7 +38,22 @@ enum State {
     Waiting,
     /// It has.
     OnTheWay,
+    /// It goes by the connection, which has not taken it yet.
+    ForConnection { was_sent: bool },
 }
+
+/// What the connection says of a value that it is offered.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Offered<V> {
+    Taken,
+    /// It has no room now.
+    Full(V),
+    /// It never takes this one.
+    Refused,
+}
+
+/// How often the connection is offered what it had no room for.
+const OFFER_PERIOD: Duration = Duration::from_millis(10);
 
 /// What one source sends to one destination of one kind.
 #[derive(Clone, Debug)]
@@ -49,6 +65,8 @@ struct Flow<V> {
     bytes: usize,
     expiry: Time,
     state: State,
+    /// Newer values of it that the connection is being given at this moment: what is older stays here until they are taken.
+    elsewhere: u32,
 }
 
 /// A datagram on its way.
@@ -104,6 +122,8 @@ pub(super) struct Outgoing<K, V> {
     flight_bytes: usize,
     /// Nothing on its way is due before this.
     next_due: Time,
+    /// When the connection is offered what is for it.
+    offer_at: Time,
     round_trip: RoundTrip,
     counts: Counts,
     /// Taken by the peer, as it said last, and by it before it forgot us.
@@ -124,6 +144,7 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
             flight: Vec::with_capacity(16),
             flight_bytes: 0,
             next_due: Time::MAX,
+            offer_at: Time::MAX,
             round_trip: RoundTrip::default(),
             counts: Counts::default(),
             taken: 0,
@@ -142,26 +163,42 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
             return Err(value);
         }
         let number = self.number();
-        let fresh = Flow { number, value: Some(value), bytes, expiry, state: State::Waiting };
-        let former = self.flows.insert(key, fresh).map(|flow| flow.state);
-        if former == Some(State::Waiting) {
-            self.counts.superseded += 1;
-        } else {
+        let former = self.flows.get(&key).map(|flow| (flow.state, flow.elsewhere));
+        let (former, elsewhere) = former.unwrap_or((State::Idle, 0));
+        let fresh = Flow { number, value: Some(value), bytes, expiry, state: State::Waiting, elsewhere };
+        self.flows.insert(key, fresh);
+        self.counts.superseded += u64::from(former.was_never_sent());
+        if former != State::Waiting {
             self.waiting.push_back(key);
         }
         Ok(())
     }
 
-    /// The number of a value that goes by the connection: what goes by datagram of its flow is superseded.
-    pub(super) fn number_elsewhere(&mut self, key: K) -> u64 {
+    /// The number of a value that the connection is given now. What goes by datagram of its flow stays until that one
+    /// [is taken](Self::taken_elsewhere): it is the last one if it is not.
+    pub(super) fn given_elsewhere(&mut self, key: K) -> u64 {
         if let Some(flow) = self.flows.get_mut(&key) {
-            if flow.state == State::Waiting {
-                self.counts.superseded += 1;
-                self.waiting.retain(|waits| *waits != key);
-            }
-            (flow.value, flow.state) = (None, State::Idle);
+            flow.elsewhere += 1;
         }
         self.number()
+    }
+
+    /// The connection has taken the value with this number: an older one is superseded.
+    pub(super) fn taken_elsewhere(&mut self, key: K, number: u64) {
+        self.refused_elsewhere(key);
+        let Some(flow) = self.flows.get_mut(&key).filter(|flow| flow.number < number) else { return };
+        self.counts.superseded += u64::from(flow.state.was_never_sent());
+        if flow.state == State::Waiting {
+            self.waiting.retain(|waits| *waits != key);
+        }
+        (flow.value, flow.state) = (None, State::Idle);
+    }
+
+    /// The connection has not taken it.
+    pub(super) fn refused_elsewhere(&mut self, key: K) {
+        if let Some(flow) = self.flows.get_mut(&key) {
+            flow.elsewhere = flow.elsewhere.saturating_sub(1);
+        }
     }
 
     const fn number(&mut self) -> u64 {
@@ -283,16 +320,60 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
         }
     }
 
-    /// The values that are not known to have arrived, oldest first, with their numbers: they go by the connection.
-    pub(super) fn hand_over(&mut self) -> Vec<(u64, V)> {
-        let mut values = Vec::new();
+    /// What is not known to have arrived goes by the connection: [`hand_over`](Self::hand_over) follows.
+    pub(super) fn turn_to_connection(&mut self) {
         for flow in self.flows.values_mut() {
-            flow.state = State::Idle;
-            values.extend(flow.value.take().map(|value| (flow.number, value)));
+            flow.state = match flow.state {
+                State::Waiting => State::ForConnection { was_sent: false },
+                State::OnTheWay => State::ForConnection { was_sent: true },
+                stays @ (State::Idle | State::ForConnection { .. }) => stays,
+            };
         }
-        values.sort_by_key(|(number, _)| *number);
         self.clear();
-        values
+        self.offer_at = Time::ZERO;
+    }
+
+    /// Offers the connection what is for it, if that is due: oldest first, with the numbers. What finds no room is kept, and offered again.
+    pub(super) fn hand_over(&mut self, now: Time, mut offer: impl FnMut(u64, V) -> Offered<V>) {
+        if now < self.offer_at {
+            return;
+        }
+        self.offer_at = Time::MAX;
+        for key in self.for_connection() {
+            let Some(flow) = self.flows.get_mut(&key) else { continue };
+            if flow.elsewhere > 0 {
+                // Behind the newer one it would take its place there.
+                self.offer_at = now + OFFER_PERIOD;
+                continue;
+            }
+            let Some(value) = flow.value.take() else { continue };
+            match offer(flow.number, value) {
+                Offered::Taken => flow.state = State::Idle,
+                Offered::Refused => {
+                    self.counts.lost += u64::from(flow.state.was_never_sent());
+                    flow.state = State::Idle;
+                }
+                Offered::Full(value) => {
+                    flow.value = Some(value);
+                    self.offer_at = now + OFFER_PERIOD;
+                    return;
+                }
+            }
+        }
+    }
+
+    /// Flows whose value is for the connection, in the order of their numbers.
+    fn for_connection(&self) -> Vec<K> {
+        let is_for_it = |flow: &Flow<V>| matches!(flow.state, State::ForConnection { .. });
+        let flows = self.flows.iter().filter(|(_, flow)| is_for_it(flow));
+        let mut flows: Vec<_> = flows.map(|(key, flow)| (flow.number, *key)).collect();
+        flows.sort_unstable();
+        flows.into_iter().map(|(_, key)| key).collect()
+    }
+
+    /// When the connection is to be offered what is for it.
+    pub(super) fn offer_at(&self) -> Option<Time> {
+        Some(self.offer_at).filter(|at| *at != Time::MAX)
     }
 
     /// Nothing that is under way is of use any more.
@@ -300,17 +381,21 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
         for flow in self.flows.values_mut() {
             match flow.state {
                 State::Idle => {}
-                State::Waiting => self.counts.lost += 1,
-                State::OnTheWay => self.counts.unknown += 1,
+                State::Waiting | State::ForConnection { was_sent: false } => self.counts.lost += 1,
+                State::OnTheWay | State::ForConnection { was_sent: true } => self.counts.unknown += 1,
             }
             (flow.value, flow.state) = (None, State::Idle);
         }
         self.clear();
+        self.offer_at = Time::MAX;
     }
 
-    /// The peer has forgotten us and counts anew: what is under way was for what it was before.
+    /// The peer has forgotten us and counts anew. What was sent by datagram it may have taken before or never: that is not known, and
+    /// the newest value of each flow goes by the connection, as it may be the last one.
     pub(super) fn begin_anew(&mut self) {
-        self.end();
+        let on_the_way = self.flows.values().filter(|flow| flow.state == State::OnTheWay);
+        self.counts.unknown += on_the_way.count() as u64;
+        self.turn_to_connection();
         self.taken_before = self.taken_before.saturating_add(std::mem::take(&mut self.taken));
         self.round_trip = RoundTrip::default();
     }
@@ -324,7 +409,7 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
 
     /// When something is due, if nothing happens before.
     pub(super) fn next_wake(&self) -> Option<Time> {
-        Some(self.next_due).filter(|due| *due != Time::MAX)
+        Some(self.next_due.min(self.offer_at)).filter(|due| *due != Time::MAX)
     }
 
     /// Values that are not known to have arrived.
@@ -334,13 +419,18 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
 
     /// Where each value is.
     pub(super) fn position(&self) -> Position {
-        let waiting = self.flows.values().filter(|flow| flow.state == State::Waiting).count() as u64;
+        let waiting = self.flows.values().filter(|flow| flow.state.was_never_sent()).count() as u64;
         // Of one that was superseded on its way it is not known yet whether it has arrived.
         let unacknowledged = self.flight.len() as u64;
         // What the peer says is believed as far as it can be so.
         let arrived = self.taken_before.saturating_add(self.taken);
         let arrived = arrived.min(self.counts.sent.saturating_sub(unacknowledged));
         Position { counts: self.counts, waiting, unacknowledged, arrived }
+    }
+
+    #[cfg(test)]
+    pub(super) const fn counts(&self) -> Counts {
+        self.counts
     }
 
     #[cfg(test)]
@@ -351,6 +441,13 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
     #[cfg(test)]
     pub(super) const fn next_number(&self) -> u64 {
         self.next
+    }
+}
+
+impl State {
+    /// Whether there is a value that has gone out neither way.
+    const fn was_never_sent(self) -> bool {
+        matches!(self, Self::Waiting | Self::ForConnection { was_sent: false })
     }
 }
 

@@ -159,12 +159,26 @@ impl Reader {
             Some(value) => value,
             None => None,
         };
+        let Some(way) = peer.way(Lane::Stream) else { return };
+        let hand = value.as_ref().map(|_| way.take_datagram());
+        if matches!(hand, Some(None)) {
+            // It is not acknowledged: nobody gets it. spec: DATAGRAM-4
+            return self.count(now, "datagram of a life that is over");
+        }
         if !self.met.iter().any(|met| Arc::ptr_eq(met, peer)) {
             peer.gives_a_sign(now);
             self.met.push(peer.clone());
         }
-        let Some(message) = channel.came(now, prefix, &content, value) else { return };
-        let inbound = Inbound {
+        let message = channel.came(now, prefix, &content, value);
+        match (message, hand.flatten()) {
+            (Some(message), Some(hand)) => self.inbound(peer).receive_datagram(now, message, way, hand),
+            (None, Some(hand)) => hand.had_come(),
+            (_, None) => {}
+        }
+    }
+
+    fn inbound(&self, peer: &Arc<Peer>) -> Inbound {
+        Inbound {
             stores: self.stores.clone(),
             peer: peer.clone(),
             spin: self.spin.clone(),
@@ -172,8 +186,7 @@ impl Reader {
             link: LinkNumber::default(),
             checksum: Checksum::Crc,
             outcomes: RefCell::default(),
-        };
-        inbound.receive_datagram(now, message);
+        }
     }
 
     fn count(&self, now: Time, cause: &'static str) {

@@ -6,8 +6,9 @@ use proptest::prelude::*;
 use sinew_runtime::time::Time;
 
 use super::{
+    core::{Core, Order, stamp},
     incoming::Incoming,
-    outgoing::{Limits, Outgoing},
+    outgoing::{Limits, Offered, Outgoing},
     packet::{Acknowledgement, RANGES_MAX, Range},
 };
 
@@ -98,9 +99,106 @@ fn a_value_that_goes_by_the_connection_supersedes_the_one_that_went_by_datagram(
     outgoing.submit(1, 1, 100, Time::MAX).unwrap();
     assert_eq!(sent(&mut outgoing, NOW), [100]);
     outgoing.submit(2, 1, 100, Time::MAX).unwrap();
-    assert_eq!((outgoing.number_elsewhere(1), outgoing.number_elsewhere(2)), (102, 103));
+    assert_eq!((outgoing.given_elsewhere(1), outgoing.given_elsewhere(2)), (102, 103));
+    outgoing.taken_elsewhere(1, 102);
+    outgoing.taken_elsewhere(2, 103);
     assert!(sent(&mut outgoing, NOW + Duration::from_secs(1)).is_empty());
     assert_eq!((outgoing.left(), outgoing.position().superseded()), (0, 2));
+}
+
+#[test]
+fn the_last_value_that_was_taken_stays_until_the_connection_has_taken_a_newer_one() {
+    let mut outgoing = outgoing(9, 1_000, 8);
+    outgoing.submit(1, 1, 100, Time::MAX).unwrap();
+    assert_eq!(sent(&mut outgoing, NOW), [100]);
+    outgoing.given_elsewhere(1);
+    outgoing.refused_elsewhere(1);
+    assert_eq!((outgoing.left(), sent(&mut outgoing, NOW + Duration::from_secs(1))), (1, vec![100]));
+}
+
+/// What the connection is offered at `now`, as long as it has `room`.
+fn handed_over(outgoing: &mut Outgoing<u32, u32>, now: Time, mut room: usize) -> Vec<(u64, u32)> {
+    let mut taken = Vec::new();
+    outgoing.hand_over(now, |number, value| {
+        if room == 0 {
+            return Offered::Full(value);
+        }
+        room -= 1;
+        taken.push((number, value));
+        Offered::Taken
+    });
+    taken
+}
+
+#[test]
+fn what_the_connection_has_no_room_for_is_offered_again_unless_something_newer_takes_its_place() {
+    let mut outgoing = outgoing(1, 1_000, 8);
+    for key in 1..=3 {
+        outgoing.submit(key, key, 100, Time::MAX).unwrap();
+    }
+    assert_eq!(sent(&mut outgoing, NOW), [100], "the others wait");
+    outgoing.turn_to_connection();
+    assert_eq!(handed_over(&mut outgoing, NOW, 1), [(100, 1)]);
+    assert_eq!((outgoing.left(), outgoing.position().waiting), (2, 2));
+    let again = outgoing.next_wake().unwrap();
+    assert!(again > NOW);
+    assert_eq!(handed_over(&mut outgoing, NOW, 9), [], "it is not due");
+    outgoing.submit(2, 7, 100, Time::MAX).unwrap();
+    assert_eq!(handed_over(&mut outgoing, again, 9), [(102, 3)]);
+    assert_eq!((outgoing.left(), outgoing.next_wake(), outgoing.counts().superseded), (1, None, 1));
+}
+
+#[test]
+fn what_is_for_the_connection_does_not_get_there_behind_a_newer_one_that_is_being_given_to_it() {
+    let mut outgoing = outgoing(9, 1_000, 8);
+    outgoing.submit(1, 1, 100, Time::MAX).unwrap();
+    let newer = outgoing.given_elsewhere(1);
+    outgoing.turn_to_connection();
+    assert_eq!(handed_over(&mut outgoing, NOW, 9), []);
+    outgoing.taken_elsewhere(1, newer);
+    let again = outgoing.next_wake().unwrap();
+    assert_eq!((handed_over(&mut outgoing, again, 9), outgoing.left()), (vec![], 0));
+    outgoing.submit(1, 2, 100, Time::MAX).unwrap();
+    outgoing.given_elsewhere(1);
+    outgoing.turn_to_connection();
+    outgoing.refused_elsewhere(1);
+    assert_eq!(handed_over(&mut outgoing, again, 9), [(102, 2)]);
+}
+
+#[test]
+fn the_last_value_for_a_peer_that_has_forgotten_us_goes_by_the_connection() {
+    let mut outgoing = outgoing(1, 1_000, 8);
+    outgoing.submit(1, 1, 100, Time::MAX).unwrap();
+    outgoing.submit(2, 1, 100, Time::MAX).unwrap();
+    assert_eq!(sent(&mut outgoing, NOW), [100], "the other one waits");
+    outgoing.begin_anew();
+    assert_eq!(handed_over(&mut outgoing, NOW, 9), [(100, 1), (101, 1)]);
+    assert_eq!((outgoing.left(), outgoing.position().unknown()), (0, 1));
+}
+
+// spec: DATAGRAM-5
+#[test]
+fn what_answers_a_datagram_to_a_former_address_says_nothing_of_the_present_one() {
+    let at = |millis| NOW + Duration::from_millis(millis);
+    let mut core = Core::<u32, u32>::new(100);
+    let probe = |core: &mut Core<u32, u32>, now| {
+        core.tick(now, now);
+        assert_eq!(core.poll(now), Some(Order::Probe));
+    };
+    let answered = |core: &mut Core<u32, u32>, now, echo| {
+        let said = Acknowledgement { echo: stamp(echo), ..said(&[], 0) };
+        core.acknowledged(now, &said)
+    };
+    core.announced(at(0));
+    probe(&mut core, at(1));
+    core.announced(at(10));
+    probe(&mut core, at(11));
+    assert!(!answered(&mut core, at(12), at(1)) && !core.is_open());
+    assert!(answered(&mut core, at(13), at(11)) && core.is_open());
+    // The clock of stamps turns in 72 minutes: an answer is one however long that takes.
+    let later = at(100 * 60 * 1_000);
+    core.announced(at(20));
+    assert!(answered(&mut core, later, at(100 * 60 * 1_000 - 1)));
 }
 
 #[test]
@@ -185,21 +283,28 @@ proptest! {
 
     #[test]
     fn however_it_is_treated_every_message_is_explained_and_the_window_is_kept(
-        steps in proptest::collection::vec((0..12_u8, 0..6_u32, 1..1_200_usize), 1..300),
+        steps in proptest::collection::vec((0..13_u8, 0..6_u32, 1..1_200_usize), 1..300),
     ) {
         let mut outgoing = outgoing(8, 4_000, 4);
         let (mut now, mut taken) = (NOW, 0);
         for (step, key, bytes) in steps {
             match step {
                 0..=4 => drop(outgoing.submit(key, 0, bytes, now + Duration::from_millis(30))),
-                5 => drop(outgoing.number_elsewhere(key)),
+                5 => {
+                    let number = outgoing.given_elsewhere(key);
+                    match number % 2 {
+                        0 => outgoing.taken_elsewhere(key, number),
+                        _ => outgoing.refused_elsewhere(key),
+                    }
+                }
                 6..=7 => now = now + Duration::from_millis(bytes as u64 / 40),
                 8..=9 => {
                     taken += 1;
                     let newest = outgoing.next_number();
                     outgoing.acknowledged(&said(&[newest.saturating_sub(key.into()), newest - 1], taken), key);
                 }
-                10 => drop(outgoing.hand_over()),
+                10 => outgoing.turn_to_connection(),
+                11 => drop(handed_over(&mut outgoing, now, key as usize)),
                 _ => outgoing.begin_anew(),
             }
             sent(&mut outgoing, now);

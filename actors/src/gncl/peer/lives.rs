@@ -14,13 +14,16 @@ use sinew_runtime::{
 };
 
 use super::{
-    super::{core::Attach, way::Way},
+    super::{core::Attach, datagrams::HandedOn, way::Way},
     Peer, Store, frame,
 };
 use crate::stores::{Stores, lock};
 
 /// Peers at most that are gone and have left messages for applications that take nothing.
 const GONE_MAX: usize = 16;
+/// Forgotten lives of peers of which it is known what came by datagram: in an error of NDL they come back, and send again what was not
+/// acknowledged. The one that was forgotten first makes room.
+const HANDED_ON_MAX: usize = 16;
 
 impl Store {
     /// Every life of a peer that is known, or that messages still wait of.
@@ -100,6 +103,12 @@ impl Store {
         let Some(peer) = peer else { return };
         peer.fence();
         peer.end(Rejection::NoSuchNode);
+        if let Some(channel) = peer.channel() {
+            let mut handed_on = lock(&self.handed_on);
+            let surplus = (handed_on.len() + 1).saturating_sub(HANDED_ON_MAX);
+            handed_on.drain(..surplus);
+            handed_on.push_back((peer.node, peer.incarnation, channel.handed_on()));
+        }
         if peer.ways.iter().any(Way::is_held_up) {
             let mut gone = lock(&self.gone);
             // What the first one left has waited longest; it is dropped, and its receipts have nobody to tell.
@@ -109,5 +118,12 @@ impl Store {
             drop(gone);
             drop(dropped);
         }
+    }
+
+    /// What was handed on by datagram of that life of `node`, if it was here before.
+    pub(super) fn handed_on(&self, node: NodeAddress, incarnation: Incarnation) -> Option<HandedOn> {
+        let mut all = lock(&self.handed_on);
+        let place = all.iter().position(|(of, life, _)| (*of, *life) == (node, incarnation))?;
+        all.remove(place).map(|(.., handed_on)| handed_on)
     }
 }

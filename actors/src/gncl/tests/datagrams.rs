@@ -1,11 +1,11 @@
 //! Values of class Stream by UDP: two real nodes, and a peer that is written by hand from `docs/protocol/gncl.md`.
 
-use std::{net::SocketAddr, time::Duration};
+use std::{cell::RefCell, net::SocketAddr, sync::Arc, time::Duration};
 
 use sinew_runtime::{
     tid::{NodeAddress, Tid},
     time::Time,
-    wire::{Class, Flags, Kind, Message, decode_datagram, encode_frame},
+    wire::{Checksum, Class, Flags, Kind, Message, decode_datagram, encode_frame},
 };
 use tokio::net::UdpSocket;
 
@@ -17,8 +17,10 @@ use crate::gncl::{
     LinkFact,
     core::{CLASSES, DATAGRAMS, Introduction, Lane, read, write},
     datagrams::Announcement,
+    inbound::Inbound,
     peer::frame,
 };
+use crate::outlet::LinkNumber;
 
 const ACK: u8 = 1;
 const VALUE: u8 = 2;
@@ -444,29 +446,66 @@ fn nothing_of_a_peer_that_is_lost_is_handed_on_and_nothing_with_its_former_key()
         let former = next_life.datagram(0, VALUE, &next_life.value_bytes(node.tid(1), 3, nines_app()));
         next_life.say_bytes(&former).await;
         node.counted("datagram with another key").await;
+        // It has no acknowledgement, perhaps, and sends again what came before: that comes once.
+        next_life.send_value(node.tid(1), 1).await;
         next_life.send_value(node.tid(1), 4).await;
         assert_eq!(next("a value", &mut inbox).await.payload[..], 4_u64.to_le_bytes());
     });
 }
 
+// spec: DATAGRAM-2
 #[test]
-fn a_peer_that_has_forgotten_what_came_begins_anew_and_what_was_under_way_is_unknown() {
+fn a_peer_that_has_forgotten_what_came_gets_the_last_value_and_what_was_under_way_is_unknown() {
     run(async {
         let mut node = Node::start(1).await;
         let mut mate = Mate::open_to(&mut node).await;
         send_value(&node, nines_app(), 1);
-        mate.hear_value().await;
+        let last = mate.hear_value().await;
         mate.announce(&node, KEY + 1).await;
-        let account =
-            || node.stores.gncl.peer(NINE).expect("it is there").accounts()[Class::Stream as usize].sent;
-        within("its word to be read", async {
-            while account().unknown == 0 {
-                tokio::task::yield_now().await;
+        assert_eq!(mate.hear_on_connection().await, last);
+        let sent = node.stores.gncl.peer(NINE).expect("it is there").accounts()[Class::Stream as usize].sent;
+        assert_eq!((sent.taken, sent.unknown), (2, 1), "{sent:?}");
+    });
+}
+
+#[test]
+fn what_a_former_connection_says_of_datagrams_is_old_news() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let _mate = Mate::open_to(&mut node).await;
+        let peer = node.stores.gncl.peer(NINE).expect("it is linked");
+        let say_on = |lane, link| {
+            let (stores, peer) = (node.stores.clone(), peer.clone());
+            let (spin, checksum, outcomes) = (Arc::default(), Checksum::Crc, RefCell::default());
+            let inbound = Inbound { stores, peer, spin, lane, link, checksum, outcomes };
+            let said = Announcement { port: 1, key: KEY, address: 0 };
+            inbound.receive(Time::now(), frame(NINE, node.address(), Kind::GNCL_DATAGRAMS, write(&said)))
+        };
+        assert_eq!(say_on(Lane::Stream, LinkNumber::default()), Ok(()));
+        assert!(peer.channel().expect("both can").is_open(), "nothing goes elsewhere");
+        assert!(say_on(Lane::Control, LinkNumber::default()).is_err());
+    });
+}
+
+#[test]
+fn a_value_of_a_life_that_is_over_is_neither_acknowledged_nor_counted_as_taken() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mate = Mate::open_to(&mut node).await;
+        let peer = node.stores.gncl.peer(NINE).expect("it is linked");
+        node.stores.gncl.fence(NINE, peer.incarnation);
+        mate.send_value(node.tid(1), 5).await;
+        node.counted("datagram of a life that is over").await;
+        mate.say(PROBE, &[]).await;
+        let answer = loop {
+            let heard = mate.hear().await;
+            if heard.what & ACK != 0 {
+                break heard;
             }
-        })
-        .await;
-        let sent = account();
-        assert_eq!((sent.taken, sent.unknown, sent.unacknowledged), (1, 1, 0), "{sent:?}");
+        };
+        assert_eq!(answer.numbers, []);
+        let arrived = peer.accounts()[Class::Stream as usize].arrived;
+        assert_eq!((arrived.taken, arrived.waiting), (0, 0), "{arrived:?}");
     });
 }
 

@@ -17,6 +17,13 @@ impl<'a> Hand<'a> {
         }
     }
 
+    /// It had come before: nothing is in hand, and nothing came.
+    pub(in crate::gncl) fn had_come(mut self) {
+        if let Some(way) = self.0.take() {
+            way.inbox().arrivals.take_none();
+        }
+    }
+
     /// The message waits in a line.
     pub(in crate::gncl) fn empty(mut self) {
         self.0 = None;
