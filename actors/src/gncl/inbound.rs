@@ -185,6 +185,9 @@ impl Inbound {
         }
         match (taken, line_of(&message.header)) {
             (Taken::InLine(line), _) => self.put_in_line(way, line, message),
+            (_, Some(line)) if self.stores.gncl.waits_before(&self.peer, line) => {
+                self.put_in_line(way, line, message)
+            }
             (_, Some(line)) => self.offer(way, line, message),
             (_, None) => Some(self.deliver(message)),
         }

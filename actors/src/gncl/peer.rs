@@ -9,7 +9,7 @@ use std::{
     net::Shutdown,
     sync::{
         Arc, Mutex, MutexGuard, PoisonError, Weak,
-        atomic::{AtomicBool, AtomicU64, Ordering},
+        atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering},
     },
     task::{Wake, Waker},
     time::Duration,
@@ -317,8 +317,10 @@ impl Wake for Room {
 #[derive(Default)]
 pub(crate) struct Store {
     peers: Mutex<BTreeMap<NodeAddress, Arc<Peer>>>,
-    /// Peers that are gone, as long as messages of theirs wait for applications here.
+    /// Peers that are gone, as long as messages of theirs wait for applications here, oldest first.
     gone: Mutex<Vec<Arc<Peer>>>,
+    /// How many they are.
+    gone_count: AtomicUsize,
     /// What was handed on by datagram of lives that are forgotten and may come back, oldest first.
     handed_on: Mutex<VecDeque<(NodeAddress, Incarnation, HandedOn)>>,
     /// Every life of a peer that somebody still holds, for an audit; those that are gone are in `buried`.
@@ -364,14 +366,17 @@ impl Store {
     pub(super) async fn serve_those_held_up(stores: Arc<Stores>) {
         let store = &stores.gncl;
         let room = Waker::from(Arc::new(Room(store.held_up.clone())));
-        let all = || store.peers().into_iter().chain(lock(&store.gone).clone()).collect::<Vec<_>>();
+        // What is over first: a later life of the same node comes behind it.
+        let all = || lock(&store.gone).clone().into_iter().chain(store.peers()).collect::<Vec<_>>();
         all().iter().flat_map(|peer| &peer.ways).for_each(Way::forget_offers);
         loop {
-            let ways = all();
             let now = Time::now();
-            let offer = |way: &Way| way.offer_again(now, &stores.router, &room);
-            let offered = ways.iter().flat_map(|peer| &peer.ways).map(offer).max();
-            lock(&store.gone).retain(|peer| peer.ways.iter().any(Way::is_held_up));
+            let offer = |peer: &Arc<Peer>| {
+                let is_early = |line| store.waits_before(peer, line);
+                peer.ways.iter().map(|way| way.offer_again(now, &stores.router, &room, is_early)).max()
+            };
+            let offered = all().iter().filter_map(offer).max();
+            store.drop_those_served();
             match offered.unwrap_or(Offered::All) {
                 Offered::All => store.held_up.notified().await,
                 // Whether somebody was told or the time is over: it is tried again.

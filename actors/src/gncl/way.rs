@@ -316,11 +316,18 @@ impl Way {
         Some(request)
     }
 
-    /// Offers what waits for applications here to them again; `room` is woken when one of them takes more. Returns how far that came.
-    pub(super) fn offer_again(&self, now: Time, router: &Router, room: &Waker) -> Offered {
+    /// Offers what waits for applications here to them again, but for lines that are `is_early`; `room` is woken when one of them takes
+    /// more. Returns how far that came.
+    pub(super) fn offer_again(
+        &self,
+        now: Time,
+        router: &Router,
+        room: &Waker,
+        is_early: impl Fn(u64) -> bool,
+    ) -> Offered {
         let (has_fewer, expired) = self.expire_lines(now);
-        let held = self.inbox().shelf.held();
-        let lines: Vec<_> = held.into_iter().map(|key| self.offer_line(now, key, router, room)).collect();
+        let held = self.inbox().shelf.held().into_iter().filter(|key| !is_early(*key));
+        let lines: Vec<_> = held.map(|key| self.offer_line(now, key, router, room)).collect();
         if has_fewer || lines.contains(&Offered::All) || self.owes_room() {
             // spec: CREDIT-2
             self.acknowledge();
@@ -418,6 +425,11 @@ impl Way {
         }
         inbox.arrivals.take();
         Some(self.hand())
+    }
+
+    /// Whether messages wait for the application of this line.
+    pub(super) fn has_line(&self, line: u64) -> bool {
+        self.inbox().shelf.holds(line)
     }
 
     /// Whether messages wait for applications here.

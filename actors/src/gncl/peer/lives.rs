@@ -115,6 +115,7 @@ impl Store {
             let surplus = (gone.len() + 1).saturating_sub(GONE_MAX);
             let dropped: Vec<_> = gone.drain(..surplus).collect();
             gone.push(peer);
+            self.count_gone(&gone);
             drop(gone);
             drop(dropped);
         }
@@ -125,5 +126,34 @@ impl Store {
         let mut all = lock(&self.handed_on);
         let place = all.iter().position(|(of, life, _)| (*of, *life) == (node, incarnation))?;
         all.remove(place).map(|(.., handed_on)| handed_on)
+    }
+
+    /// Whether messages of an earlier life of this peer still wait for the application of this line: its own wait behind them.
+    pub(in crate::gncl) fn waits_before(&self, peer: &Arc<Peer>, line: u64) -> bool {
+        // SYNC: Relaxed; what is in there is seen under its lock, and nearly always there is nothing. A later life is met on the thread
+        // that has counted the earlier one.
+        if self.gone_count.load(Ordering::Relaxed) == 0 {
+            return false;
+        }
+        let gone = lock(&self.gone);
+        let before = gone.iter().take_while(|former| !Arc::ptr_eq(former, peer));
+        before.filter(|former| former.node == peer.node).any(|former| former.has_line(line))
+    }
+
+    /// Those of which nothing waits any more.
+    pub(super) fn drop_those_served(&self) {
+        let mut gone = lock(&self.gone);
+        gone.retain(|peer| peer.ways.iter().any(Way::is_held_up));
+        self.count_gone(&gone);
+    }
+
+    fn count_gone(&self, gone: &[Arc<Peer>]) {
+        self.gone_count.store(gone.len(), Ordering::Relaxed);
+    }
+}
+
+impl Peer {
+    fn has_line(&self, line: u64) -> bool {
+        self.ways.iter().any(|way| way.has_line(line))
     }
 }

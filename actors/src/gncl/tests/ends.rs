@@ -10,10 +10,10 @@ use sinew_runtime::{
 };
 
 use super::{
-    bench::{ByHand, KIND, NINE, Node, next, run},
+    bench::{ByHand, KIND, NINE, Node, introduction, next, run},
     credit,
 };
-use crate::aftermath;
+use crate::{aftermath, gncl::core::Introduction};
 
 /// The incarnation of a peer that is linked.
 fn life(node: &Node, peer: NodeAddress) -> Incarnation {
@@ -96,6 +96,30 @@ fn what_is_told_of_a_node_that_is_lost_comes_behind_what_waits_for_a_slow_applic
             came += 1;
         }
         assert!(came > credit::MAILBOX as u64, "{came}");
+        assert!(slow.next().now_or_never().is_none());
+    });
+}
+
+#[test]
+fn what_comes_of_a_later_life_comes_behind_what_waits_of_the_earlier_one() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut slow = node.app_of(1, 2);
+        let mut earlier = ByHand::linked_to(&mut node).await;
+        for said in 0..5_u8 {
+            earlier.say(&from_nine(&node, &[said])).await;
+        }
+        has_read(&mut earlier, &node).await;
+        let incarnation = Incarnation(life(&node, NINE).0 + 1);
+        let hello = Introduction { incarnation, ..introduction(node.address()) };
+        let mut later = ByHand::greeting(&node, &hello).await;
+        for said in 5..8_u8 {
+            later.say(&from_nine(&node, &[said])).await;
+        }
+        has_read(&mut later, &node).await;
+        for expected in 0..8_u8 {
+            assert_eq!(next("a message of either life", &mut slow).await.payload[..], [expected]);
+        }
         assert!(slow.next().now_or_never().is_none());
     });
 }
