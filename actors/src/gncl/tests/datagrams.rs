@@ -1,32 +1,30 @@
-//! Values of class Stream by UDP: two real nodes, and a peer that is written by hand from `docs/protocol/gncl.md`.
+//! Values of class Stream by UDP: two real nodes, and a peer that is written by hand.
+
+mod mate;
 
 use std::{cell::RefCell, net::SocketAddr, sync::Arc, time::Duration};
 
 use sinew_runtime::{
-    tid::{NodeAddress, Tid},
+    tid::Tid,
     time::Time,
-    wire::{Checksum, Class, Flags, Kind, Message, decode_datagram, encode_frame},
+    wire::{Checksum, Class, Kind, Message},
 };
-use tokio::net::UdpSocket;
 
 use super::{
     bench::{ByHand, KIND, NINE, Node, introduction, next, pair, run, within},
     classes::of_class,
 };
-use crate::gncl::{
-    LinkFact,
-    core::{CLASSES, DATAGRAMS, Introduction, Lane, read, write},
-    datagrams::Announcement,
-    inbound::Inbound,
-    peer::frame,
+use crate::{
+    gncl::{
+        LinkFact,
+        core::{Introduction, Lane, write},
+        datagrams::Announcement,
+        inbound::Inbound,
+        peer::frame,
+    },
+    outlet::LinkNumber,
 };
-use crate::outlet::LinkNumber;
-
-const ACK: u8 = 1;
-const VALUE: u8 = 2;
-const PROBE: u8 = 4;
-/// What the node's datagrams to the peer by hand are to have.
-const KEY: u64 = 77;
+use mate::{ACK, KEY, Mate, PROBE, VALUE, nines_app, opened};
 
 fn value(node: &Node, to: Tid, number: u64) -> Message {
     of_class(Class::Stream, node.message(to, &number.to_le_bytes()))
@@ -34,166 +32,6 @@ fn value(node: &Node, to: Tid, number: u64) -> Message {
 
 fn send_value(node: &Node, to: Tid, number: u64) {
     node.stores.router.send(value(node, to, number)).expect("the peer is known");
-}
-
-/// Waits until values to `peer` go by datagram.
-async fn opened(node: &Node, peer: NodeAddress) {
-    let is_open =
-        || node.stores.gncl.peer(peer).is_some_and(|peer| peer.channel().expect("both can").is_open());
-    within("datagrams to get through", async {
-        while !is_open() {
-            tokio::task::yield_now().await;
-        }
-    })
-    .await;
-}
-
-/// A datagram as the peer by hand reads it.
-struct Heard {
-    what: u8,
-    stamp: u32,
-    value: Option<Message>,
-    numbers: Vec<(u64, u32)>,
-}
-
-/// A peer that is written by hand, with connections for Control and Stream, and a socket.
-struct Mate {
-    _first: ByHand,
-    stream: ByHand,
-    socket: UdpSocket,
-    /// Where the node reads, and with which key.
-    to: SocketAddr,
-    key: u64,
-}
-
-impl Mate {
-    async fn linked_to(node: &mut Node) -> Self {
-        Self::dialling(node, 1).await
-    }
-
-    /// The same, with this dial and the next one.
-    async fn dialling(node: &mut Node, dial: u64) -> Self {
-        let features = vec![CLASSES.to_owned(), DATAGRAMS.to_owned()];
-        let hello = Introduction { features, dial, ..introduction(node.address()) };
-        let first = ByHand::greeting(node, &hello).await;
-        node.up().await;
-        let hello = Introduction { lane: Lane::Stream, link: dial, dial: dial + 1, ..hello };
-        let mut stream = ByHand::greeting(node, &hello).await;
-        let said = stream.hear().await;
-        assert_eq!(said.header.kind, Kind::GNCL_DATAGRAMS);
-        let said: Announcement = read(&said.payload).expect("it says where");
-        let socket = UdpSocket::bind("127.0.0.1:0").await.expect("loopback has a port");
-        let to = SocketAddr::from(([127, 0, 0, 1], said.port));
-        assert_eq!((to, said.address), (node.listens_at(), 0), "the same port as for TCP");
-        let mut mate = Self { _first: first, stream, socket, to, key: said.key };
-        mate.announce(node, KEY).await;
-        mate
-    }
-
-    async fn announce(&mut self, node: &Node, key: u64) {
-        let port = self.socket.local_addr().expect("it is bound").port();
-        let said = Announcement { port, key, address: 0 };
-        self.stream.say(&frame(NINE, node.address(), Kind::GNCL_DATAGRAMS, write(&said))).await;
-    }
-
-    /// The same, and datagrams are used.
-    async fn open_to(node: &mut Node) -> Self {
-        Self::linked_to(node).await.open(node).await
-    }
-
-    async fn open(self, node: &Node) -> Self {
-        let probe = self.hear().await;
-        assert_eq!(probe.what, PROBE);
-        self.acknowledge(probe.stamp, &[]).await;
-        opened(node, NINE).await;
-        self
-    }
-
-    fn datagram(&self, key: u64, what: u8, rest: &[u8]) -> Vec<u8> {
-        let mut bytes = vec![1, what, 0, 0];
-        bytes.extend(NINE.bits().to_le_bytes());
-        bytes.extend(key.to_le_bytes());
-        bytes.extend(1_000_u32.to_le_bytes());
-        let head = if what & ACK == 0 { &[][..] } else { rest };
-        bytes.extend(crc32fast::hash(&[&bytes, head].concat()).to_le_bytes());
-        bytes.extend(rest);
-        bytes
-    }
-
-    async fn say(&self, what: u8, rest: &[u8]) {
-        self.say_bytes(&self.datagram(self.key, what, rest)).await;
-    }
-
-    async fn say_bytes(&self, bytes: &[u8]) {
-        self.socket.send_to(bytes, self.to).await.expect("loopback takes it");
-    }
-
-    async fn acknowledge(&self, echo: u32, numbers: &[u64]) {
-        let mut rest = Vec::from(echo.to_le_bytes());
-        rest.extend(0_u32.to_le_bytes());
-        rest.extend((numbers.len() as u64).to_le_bytes());
-        rest.extend((numbers.len() as u32).to_le_bytes());
-        for number in numbers {
-            rest.extend(number.to_le_bytes());
-            rest.extend(0_u32.to_le_bytes());
-        }
-        self.say(ACK, &rest).await;
-    }
-
-    fn value_bytes(&self, to: Tid, number: u64, source: Tid) -> Vec<u8> {
-        let mut header = sinew_runtime::wire::Header::new(KIND, source, to);
-        (header.class, header.correlation, header.sent) = (Class::Stream, number, Time::now());
-        let mut bytes = bytes::BytesMut::new();
-        encode_frame(&header, &number.to_le_bytes(), &mut bytes);
-        bytes.to_vec()
-    }
-
-    async fn send_value(&self, to: Tid, number: u64) {
-        self.say(VALUE, &self.value_bytes(to, number, nines_app())).await;
-    }
-
-    async fn hear(&self) -> Heard {
-        let mut buffer = vec![0; 2_000];
-        let length = within("a datagram", self.socket.recv(&mut buffer)).await.expect("it is read");
-        assert!(length <= 1_200);
-        let bytes = &buffer[..length];
-        let u32_at = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four"));
-        let u64_at = |at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().expect("eight"));
-        assert_eq!((bytes[0], bytes[2], bytes[3], u64_at(8)), (1, 0, 0, KEY));
-        let (what, mut at, mut numbers) = (bytes[1], 24, Vec::new());
-        if what & ACK != 0 {
-            let count = usize::from(bytes[40]);
-            numbers = (0..count).map(|n| (u64_at(44 + 12 * n), u32_at(52 + 12 * n))).collect();
-            at = 44 + 12 * count;
-        }
-        assert_eq!(u32_at(20), crc32fast::hash(&[&bytes[..20], &bytes[24..at]].concat()));
-        let value = (what & VALUE != 0).then(|| decode_datagram(&bytes[at..]).expect("it is a frame"));
-        Heard { what, stamp: u32_at(16), value, numbers }
-    }
-
-    /// The next value, with its number.
-    async fn hear_value(&self) -> (u64, Vec<u8>) {
-        loop {
-            if let Some(value) = self.hear().await.value {
-                assert_eq!((value.header.class, value.header.flags), (Class::Stream, Flags::NONE));
-                return (value.header.correlation, value.payload.to_vec());
-            }
-        }
-    }
-
-    /// The next value on the connection, with its number.
-    async fn hear_on_connection(&mut self) -> (u64, Vec<u8>) {
-        loop {
-            let message = self.stream.hear().await;
-            if message.header.class == Class::Stream {
-                return (message.header.correlation, message.payload.to_vec());
-            }
-        }
-    }
-}
-
-fn nines_app() -> Tid {
-    Tid::new(NINE, sinew_runtime::tid::AppAddress::new(0x1001))
 }
 
 #[test]
