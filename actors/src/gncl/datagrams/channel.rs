@@ -316,10 +316,15 @@ impl Channel {
 
     /// No value goes by datagram any more; what is under way goes by the connection.
     pub(in crate::gncl) fn retire(&self, way: &Way) {
-        let state = &mut *self.lock();
-        state.is_retired = true;
-        state.core.retire();
-        self.hand_over(Time::now(), state, way);
+        let wake = {
+            let state = &mut *self.lock();
+            state.is_retired = true;
+            state.core.retire();
+            self.hand_over(Time::now(), state, way);
+            state.next_wake()
+        };
+        // A newer one may be on its way to the connection at this moment.
+        self.alarm.set(wake);
     }
 
     /// The peer is gone.
