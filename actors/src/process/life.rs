@@ -126,6 +126,8 @@ struct Child {
     reader: Reader,
     session: Session,
     names: KnownNames,
+    /// Changes of the directory since the names in the welcome were looked up.
+    changes: watch::Receiver<u64>,
     number: LinkNumber,
     said: Option<Reason>,
     heard: Option<Instant>,
@@ -168,7 +170,8 @@ impl Child {
         let stream = Arc::new(UnixStream::from_std(socket)?);
         let (tid, node) = (hosted.tid, payload::lncl_of(hosted.tid.node));
         // Before the names are looked up: a change in between is told twice and not never.
-        let directory = hosted.stores.directory_changes.subscribe();
+        let changes = hosted.stores.directory_changes.subscribe();
+        let directory = changes.clone();
         let told = *directory.borrow();
         let mut names = KnownNames::default();
         let known = names.changes(&hosted.stores).unwrap_or_default();
@@ -194,6 +197,7 @@ impl Child {
             reader,
             session,
             names,
+            changes,
             number,
             said: None,
             heard: None,
@@ -228,7 +232,7 @@ impl Child {
         let ended = process.ended();
         tokio::pin!(drain, ended);
         let mut drained = false;
-        let mut changes = self.hosted.stores.directory_changes.subscribe();
+        let mut changes = self.changes.clone();
         let mut watch = Watch::new(self.hosted.progress_within);
         loop {
             tokio::select! {
@@ -455,3 +459,6 @@ impl Watch {
 fn in_micros(time: Duration) -> u64 {
     u64::try_from(time.as_micros()).unwrap_or(u64::MAX)
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,73 @@
+//! What a child hears of the directory.
+
+use std::{os::unix::process::CommandExt, process::Command};
+
+use rustix::process::{Pid, PidfdFlags, pidfd_open};
+use sinew_runtime::{
+    mailbox::Mailbox,
+    pending::{AppOutlet, Pending},
+    tid::{AppAddress, Incarnation, NodeAddress},
+};
+
+use super::*;
+use crate::{
+    NodeConfig,
+    lncl::{LocalApp, register_local},
+    process::group::Group,
+};
+
+/// Nothing takes longer, on a busy machine either.
+const WITHIN: Duration = Duration::from_secs(60);
+
+/// A process that does nothing.
+#[expect(clippy::zombie_processes, reason = "whoever has the group reaps it")]
+fn sleeper() -> Rc<Process> {
+    let child = Command::new("sleep").arg("600").process_group(0).spawn().unwrap();
+    let pid = Pid::from_child(&child);
+    Rc::new(Process::new(Arc::new(Group::new(pid, pidfd_open(pid, PidfdFlags::empty()).unwrap()))).unwrap())
+}
+
+fn registers(stores: &Stores, name: &str) {
+    let outlet = Arc::new(AppOutlet { pending: Pending::new(1), inbox: Mailbox::new(1) });
+    let (name, events) = (Some(name.to_owned()), Arc::new([]));
+    let app = LocalApp { name, address: None, requires: vec![], kinds: vec![], outlet, events };
+    register_local(stores, app).unwrap();
+}
+
+#[test]
+fn a_name_that_comes_between_the_welcome_and_the_listening_is_told() {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        // Given: a child that was welcomed
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let hosted = Hosted {
+            stores: stores.clone(),
+            link: Link::new(&stores, Mailbox::new(8)),
+            tid: Tid::new(NodeAddress::HERE, AppAddress::fixed(1).unwrap()),
+            name: "child".to_owned(),
+            progress_within: None,
+        };
+        let (ours, theirs) = std::os::unix::net::UnixStream::pair().unwrap();
+        theirs.set_nonblocking(true).unwrap();
+        let mut child = Child::new(Arc::new(hosted), sleeper(), ReadyGate::new(|| {}), ours).unwrap();
+        // When
+        registers(&stores, "late");
+        // Then
+        let hears = async {
+            let (mut reader, theirs) = (Reader::new(WORDS_BYTES_MAX), UnixStream::from_std(theirs).unwrap());
+            loop {
+                let frame = reader.next(&theirs).await.unwrap().unwrap();
+                if frame.header.kind == Kind::HOST_NAMES {
+                    return payload::read::<Names>(&frame.payload).unwrap();
+                }
+            }
+        };
+        let stop = Notify::new();
+        tokio::select! {
+            ended = child.accompany(&stop) => panic!("it lives: {ended:?}"),
+            names = tokio::time::timeout(WITHIN, hears) => {
+                assert!(names.unwrap().names.iter().any(|name| name.name == "late"));
+            }
+        }
+    });
+}
