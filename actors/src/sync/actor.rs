@@ -116,8 +116,12 @@ impl SyncManager {
     }
 
     fn handle(&mut self, input: Input, ctx: &mut Context<Self>) {
-        self.core().handle(Time::now(), input);
-        self.stores.directory_has_changed();
+        {
+            let mut core = self.core();
+            core.handle(Time::now(), input);
+            // Counted before anybody can see it: who is told of a name by whoever saw it first must find that it has changed.
+            self.stores.directory_has_changed();
+        }
         // One at a time, and never with the lock in hand: an order may lead to a question to the directory.
         loop {
             let Some(output) = self.core().poll() else { break };

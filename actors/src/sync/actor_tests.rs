@@ -3,6 +3,7 @@
 use std::{
     future::Future,
     sync::{Arc, Mutex, PoisonError},
+    task::{Context, Wake, Waker},
     time::Duration,
 };
 
@@ -278,5 +279,36 @@ fn a_cycle_is_told_to_the_root() {
             Some(RootEvent::RequirementCycle { names }) => assert_eq!(names, ["a", "b", "a"]),
             other => panic!("{other:?}"),
         }
+    });
+}
+
+/// Woken when the directory changes, by whoever changes it: sees whether anybody can read it at that moment.
+struct Looker(Arc<Stores>, Mutex<Vec<bool>>);
+
+impl Wake for Looker {
+    fn wake(self: Arc<Self>) {
+        let can_be_read = self.0.sync.try_lock().is_ok();
+        self.1.lock().unwrap_or_else(PoisonError::into_inner).push(can_be_read);
+    }
+}
+
+#[test]
+fn a_change_of_the_directory_is_counted_before_anybody_can_see_it() {
+    run(async {
+        let mut bench = Bench::new().await;
+        let _sent = bench.links_knee();
+        bench.registers_gait();
+        // When: the next change is looked for
+        let looker = Arc::new(Looker(bench.stores.clone(), Mutex::default()));
+        let waker = Waker::from(looker.clone());
+        let mut changes = bench.stores.directory_changes.subscribe();
+        {
+            let mut changed = std::pin::pin!(changes.changed());
+            assert!(changed.as_mut().poll(&mut Context::from_waker(&waker)).is_pending());
+            bench.knee_says(1, true);
+            assert_eq!(bench.released().await, GAIT);
+        }
+        // Then
+        assert_eq!(*looker.1.lock().unwrap_or_else(PoisonError::into_inner), [false]);
     });
 }
