@@ -259,7 +259,7 @@ impl Reader {
         let mode = lock(&self.reading.mode);
         let (payload_max, checksum) = match &*mode {
             Mode::Handshake => (HANDSHAKE_PAYLOAD_MAX, Checksum::Crc),
-            // What GNCL itself says is never longer than in a handshake, and not bound by what messages may have.
+            // What GNCL itself says is never longer than in a handshake, and not bound by what messages may have: see `is_too_long`.
             Mode::Linked(inbound) => (self.reading.payload_max.max(HANDSHAKE_PAYLOAD_MAX), inbound.checksum),
             Mode::Moves(..) => return Look::Moves,
             Mode::Discard => {
@@ -276,6 +276,10 @@ impl Reader {
         let _batch = if let Mode::Linked(inbound) = &*mode { Some(inbound.batch(now)) } else { None };
         for _ in 0..FRAMES_PER_WAKE {
             match (self.codec.decode(&mut self.buffer), &*mode) {
+                (Ok(Some(message)), Mode::Linked(_)) if is_too_long(&message, self.reading.payload_max) => {
+                    let (said, limit) = (message.payload.len(), self.reading.payload_max);
+                    return Look::Tell(What::Violated(decline(&FrameError::TooLong { said, limit })));
+                }
                 (Ok(Some(message)), Mode::Linked(inbound)) if !is_for_the_shell(&message) => {
                     self.heard = true;
                     let is_a_word = message.header.kind == Kind::GNCL_DATAGRAMS;
@@ -345,6 +349,11 @@ impl Reader {
 fn expect_more(socket: &TcpStream) {
     // What is refused here is the very attempt.
     let _ = socket.try_io(Interest::READABLE, || Err::<(), _>(io::ErrorKind::WouldBlock.into()));
+}
+
+/// Whether this is no word of GNCL itself, and longer than this node takes.
+fn is_too_long(message: &Message, payload_max: usize) -> bool {
+    message.header.destination.app != AppAddress::GNCL && message.payload.len() > payload_max
 }
 
 /// Whether this is about the link itself.

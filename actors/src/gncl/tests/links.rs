@@ -166,6 +166,25 @@ fn a_peer_that_skips_or_repeats_a_number_is_told_so_and_its_connection_ends() {
 }
 
 #[test]
+fn a_message_that_is_longer_than_this_node_takes_is_refused_also_where_gncls_own_words_may_be_longer() {
+    run(async {
+        let mut node = Node::start_with(1, |config| config.payload_max = 256).await;
+        let mut inbox = node.app(1);
+        let mut peer = ByHand::linked_to(&mut node).await;
+        let message = |length| {
+            let mut message = node.message(node.tid(1), &vec![7; length]);
+            message.header.source = Tid::new(NINE, node.tid(1).app);
+            message
+        };
+        peer.say(&message(256)).await;
+        next("the one that is short enough", &mut inbox).await;
+        peer.say(&message(257)).await;
+        let refusal = peer.refusal().await;
+        assert!(refusal.sentence.contains("257 bytes"), "{}", refusal.sentence);
+    });
+}
+
+#[test]
 fn a_lost_node_loses_what_waits_for_it_and_takes_nothing_more() {
     run(async {
         let mut node = Node::start(1).await;
