@@ -4,6 +4,7 @@ use std::{
     collections::{BTreeMap, BTreeSet},
     sync::{
         Arc, Mutex,
+        atomic::{AtomicUsize, Ordering},
         mpsc::{Receiver, SyncSender, sync_channel},
     },
     time::Duration,
@@ -21,7 +22,7 @@ use super::{
     answering::{self, Waiting},
     reading::{self, NodeAudit},
     system::Audit,
-    words,
+    words::{self, ANSWER_BYTES_MAX},
 };
 use crate::stores::{Stores, lock};
 
@@ -32,6 +33,8 @@ const ANSWERS_MAX: u32 = 16;
 /// All of them together so often: an answer of a node with many applications takes a CPU for milliseconds.
 const ANSWERS_ALL_MAX: u32 = 64;
 const PERIOD: Duration = Duration::from_secs(1);
+/// Bytes at most of answers that nobody has read yet, to all questions together. What finds no room is not kept, and its node counts as silent.
+const UNREAD_BYTES_MAX: usize = 16 << 20;
 /// Of a node whose longest payload is shorter than an answer: it is tried with half so many bytes, down to this.
 const ANSWER_BYTES_MIN: usize = 1 << 10;
 
@@ -39,6 +42,8 @@ const ANSWER_BYTES_MIN: usize = 1 << 10;
 #[derive(Default)]
 pub(crate) struct Questions {
     open: Mutex<Open>,
+    /// Bytes of answers that nobody has read yet.
+    unread: Arc<AtomicUsize>,
     /// Those of other nodes.
     pub(super) waiting: Mutex<Waiting>,
 }
@@ -59,7 +64,35 @@ struct Question {
 }
 
 /// Who answers, and the bytes; whoever has asked reads them, on his own thread.
-type Answer = (NodeAddress, Bytes);
+#[derive(Debug)]
+struct Answer {
+    from: NodeAddress,
+    bytes: Bytes,
+    _share: Share,
+}
+
+/// What an answer takes of [`UNREAD_BYTES_MAX`], until it is dropped.
+#[derive(Debug)]
+struct Share {
+    unread: Arc<AtomicUsize>,
+    bytes: usize,
+}
+
+impl Share {
+    fn of(unread: &Arc<AtomicUsize>, bytes: usize) -> Option<Self> {
+        let grown = |unread: usize| unread.checked_add(bytes).filter(|sum| *sum <= UNREAD_BYTES_MAX);
+        // SYNC: Relaxed; nothing else depends on it.
+        unread.fetch_update(Ordering::Relaxed, Ordering::Relaxed, grown).ok()?;
+        Some(Self { unread: unread.clone(), bytes })
+    }
+}
+
+impl Drop for Share {
+    fn drop(&mut self) {
+        // SYNC: see `of`.
+        self.unread.fetch_sub(self.bytes, Ordering::Relaxed);
+    }
+}
 
 /// Too many questions are open.
 #[derive(Debug, PartialEq, Eq)]
@@ -84,13 +117,28 @@ impl Questions {
     }
 
     /// Takes an answer, if it is awaited; a late one is nobody's.
-    fn answered(&self, number: u64, from: NodeAddress, answer: Bytes) {
-        if let Some(question) = lock(&self.open).open.get_mut(&number)
-            && question.awaited.remove(&from)
-        {
-            // Whoever asked may wait no more.
-            let _ = question.answers.try_send((from, answer));
+    ///
+    /// # Errors
+    /// It is awaited and not kept, and its node counts as silent; why, in words.
+    fn answered(&self, number: u64, from: NodeAddress, answer: &Bytes) -> Result<(), String> {
+        let mut questions = lock(&self.open);
+        let question = questions.open.get_mut(&number).filter(|question| question.awaited.contains(&from));
+        let Some(question) = question else { return Ok(()) };
+        if answer.len() > ANSWER_BYTES_MAX {
+            return Err(format!(
+                "from {from}, an audit of {} bytes; {ANSWER_BYTES_MAX} are read at most",
+                answer.len()
+            ));
         }
+        let share = Share::of(&self.unread, answer.len());
+        let share = share
+            .ok_or_else(|| format!("from {from}, an audit behind {UNREAD_BYTES_MAX} bytes that wait"))?;
+        question.awaited.remove(&from);
+        // A copy, so that it holds no longer buffer.
+        let answer = Answer { from, bytes: Bytes::copy_from_slice(answer), _share: share };
+        // Whoever asked may wait no more.
+        let _ = question.answers.try_send(answer);
+        Ok(())
     }
 
     /// Whether `asker` is answered at `now`.
@@ -139,8 +187,8 @@ fn ask(
     let mut answers = Vec::new();
     for _ in 0..asked {
         let left = within.saturating_sub(Time::now().since(began));
-        let Ok((from, answer)) = answered.recv_timeout(left) else { break };
-        match read(from, &answer) {
+        let Ok(Answer { from, bytes, .. }) = answered.recv_timeout(left) else { break };
+        match read(from, &bytes) {
             Ok(answer) => answers.push(answer),
             // Who answers so counts as silent.
             Err(fault) => stores.refusals.count(Time::now(), "audit", &fault),
@@ -157,8 +205,7 @@ fn ask(
 pub(crate) fn receive(stores: &Arc<Stores>, from: NodeAddress, message: &Message) -> Result<(), String> {
     let number = message.header.correlation;
     if message.header.kind != Kind::SYNC_AUDIT_ASK {
-        stores.questions.answered(number, from, message.payload.clone());
-        return Ok(());
+        return stores.questions.answered(number, from, &message.payload);
     }
     if !stores.questions.admits(from, Time::now()) {
         return Err(format!(
@@ -243,12 +290,13 @@ mod tests {
     fn questions_are_bounded_and_an_answer_counts_once_and_from_whom_was_asked() {
         let (questions, said) = (Questions::default(), Bytes::from_static(b"said"));
         let (number, answered) = questions.open(BTreeSet::from([OTHER])).unwrap();
-        questions.answered(number, NodeAddress::new(3), said.clone());
-        questions.answered(number + 1, OTHER, said.clone());
+        questions.answered(number, NodeAddress::new(3), &said).unwrap();
+        questions.answered(number + 1, OTHER, &said).unwrap();
         assert!(answered.try_recv().is_err());
-        questions.answered(number, OTHER, said.clone());
-        questions.answered(number, OTHER, said.clone());
-        assert_eq!(answered.try_recv(), Ok((OTHER, said)));
+        questions.answered(number, OTHER, &said).unwrap();
+        questions.answered(number, OTHER, &said).unwrap();
+        let answer = answered.try_recv().unwrap();
+        assert_eq!((answer.from, answer.bytes), (OTHER, said));
         assert!(answered.try_recv().is_err());
         for _ in 1..OPEN_MAX {
             questions.open(BTreeSet::new()).unwrap();
@@ -256,6 +304,23 @@ mod tests {
         assert_eq!(questions.open(BTreeSet::new()).err(), Some(TooManyQuestions));
         questions.close(number);
         assert!(questions.open(BTreeSet::new()).is_ok());
+    }
+
+    #[test]
+    fn an_answer_is_kept_up_to_its_longest_and_all_that_nobody_has_read_up_to_a_bound() {
+        let questions = Questions::default();
+        let nodes: Vec<_> = (0..100).map(NodeAddress::new).collect();
+        let (number, answered) = questions.open(nodes.iter().copied().collect()).unwrap();
+        let (longest, longer) = (vec![0; ANSWER_BYTES_MAX].into(), vec![0; ANSWER_BYTES_MAX + 1].into());
+        assert!(questions.answered(number, nodes[0], &longer).is_err());
+        let room = UNREAD_BYTES_MAX / ANSWER_BYTES_MAX;
+        let kept = nodes.iter().filter(|node| questions.answered(number, **node, &longest).is_ok());
+        assert_eq!(kept.count(), room);
+        drop(answered.recv().unwrap());
+        assert!(questions.answered(number, nodes[room], &longest).is_ok(), "one was read");
+        questions.close(number);
+        drop(answered);
+        assert_eq!(questions.unread.load(Ordering::Relaxed), 0);
     }
 
     #[test]

@@ -53,7 +53,7 @@ impl<S: Socket> Half<S> {
         let (counts, tally) = (self.counts, self.tally);
         let begun = self.partial.as_ref().is_some_and(is_a_message) && self.session.is_none();
         let waiting = self.waits_for_its_number() + usize::from(begun);
-        let (unacknowledged, sent) = self.kept(tally.void_expired + tally.void_superseded > 0);
+        let (unacknowledged, sent) = self.kept();
         let ended = tally.void_expired + tally.void_superseded + tally.unknown + unacknowledged;
         let arrived = if self.session.is_some() { tally.numbered.saturating_sub(ended) } else { counts.sent };
         let account = OutletAccount {

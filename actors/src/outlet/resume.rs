@@ -66,11 +66,9 @@ impl<S: Socket> Half<S> {
     }
 
     /// Messages that have a number and have not arrived, as far as is known here, and how far the session is.
-    pub(super) fn kept(&self, has_voids: bool) -> (u64, Option<Sent>) {
+    pub(super) fn kept(&self) -> (u64, Option<Sent>) {
         let Some(Session { sending, .. }) = &self.session else { return (0, None) };
-        // Looked through only where some may be voids.
-        let kept = if has_voids { sending.kept_with_a_use() } else { sending.kept() };
-        (kept as u64, Some(sending.position()))
+        (sending.kept_with_a_use() as u64, Some(sending.position()))
     }
 
     pub(super) fn epoch(&self) -> u64 {

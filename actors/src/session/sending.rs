@@ -40,6 +40,8 @@ pub(crate) struct Sending<M> {
     /// Number of the oldest message that is kept.
     base: u64,
     kept: VecDeque<Kept<M>>,
+    /// Those of them that have lost their use.
+    voids: usize,
     bytes: usize,
     /// Number of what is written next on the present connection; `None` until the peer has said where to go on.
     cursor: Option<u64>,
@@ -54,8 +56,18 @@ pub(crate) struct Sending<M> {
 impl<M> Sending<M> {
     /// Nothing was sent yet. `epoch` is larger than any before it between the same two lives of nodes, and not 0.
     pub(crate) const fn new(epoch: u64, window: Window) -> Self {
-        let kept = VecDeque::new();
-        Self { window, epoch, base: FIRST, kept, bytes: 0, cursor: None, peer: None, arrived: 0, until: None }
+        Self {
+            window,
+            epoch,
+            base: FIRST,
+            kept: VecDeque::new(),
+            voids: 0,
+            bytes: 0,
+            cursor: None,
+            peer: None,
+            arrived: 0,
+            until: None,
+        }
     }
 
     /// The epoch that the peer is told.
@@ -91,7 +103,7 @@ impl<M> Sending<M> {
 
     /// Those of them that have not become voids.
     pub(crate) fn kept_with_a_use(&self) -> usize {
-        self.kept.iter().filter(|kept| kept.message.is_some()).count()
+        self.kept.len() - self.voids
     }
 
     /// How far the peer is, as far as is known here, for an audit.
@@ -121,6 +133,7 @@ impl<M> Sending<M> {
     pub(crate) fn take_back(&mut self) {
         if let Some(kept) = self.kept.pop_back() {
             self.bytes -= kept.bytes;
+            self.voids -= usize::from(kept.message.is_none());
             self.cursor = self.cursor.map(|cursor| cursor.min(self.end()));
         }
     }
@@ -142,6 +155,7 @@ impl<M> Sending<M> {
                 self.bytes -= std::mem::take(&mut kept.bytes);
             }
         }
+        self.voids += void.len();
         void
     }
 
@@ -186,6 +200,7 @@ impl<M> Sending<M> {
         while self.base < next {
             let kept = self.kept.pop_front().expect("a number between base and end is kept");
             self.bytes -= kept.bytes;
+            self.voids -= usize::from(kept.message.is_none());
             self.arrived += kept.bytes as u64;
             self.base += 1;
         }
@@ -213,7 +228,7 @@ impl<M> Sending<M> {
 
     /// Gives up all that is kept, oldest first.
     pub(crate) fn drain(&mut self) -> Vec<M> {
-        self.bytes = 0;
+        (self.bytes, self.voids) = (0, 0);
         // There is nothing that the connection could go on with.
         self.cursor = None;
         self.kept.drain(..).filter_map(|kept| kept.message).collect()
