@@ -40,7 +40,8 @@ impl<A> DatagramWay<A> {
 
     /// Takes one that came.
     pub(super) fn take(&mut self, now: Time, to: A, mut datagram: Vec<u8>) {
-        if self.faults.parted || self.held.len() >= HELD_MAX {
+        let is_unlucky = self.faults.one_loss_in.is_some_and(|one_in| self.dice.once_in(one_in.get()));
+        if self.faults.parted || is_unlucky || self.held.len() >= HELD_MAX {
             self.lost += 1;
             return;
         }

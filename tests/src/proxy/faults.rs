@@ -45,6 +45,8 @@ pub struct Faults {
     pub segment_max: Option<NonZeroUsize>,
     /// One bit of about so many bytes is flipped.
     pub one_flip_in: Option<NonZeroU32>,
+    /// One of about so many datagrams is lost, each by itself.
+    pub one_loss_in: Option<NonZeroU32>,
     /// What passes at most.
     pub bytes_per_second: Option<NonZeroU64>,
 }
@@ -93,6 +95,8 @@ pub enum Change {
     Chop(Option<NonZeroUsize>),
     /// [`Faults::one_flip_in`].
     Corrupt(Option<NonZeroU32>),
+    /// [`Faults::one_loss_in`].
+    Lose(Option<NonZeroU32>),
     /// [`Faults::bytes_per_second`].
     Throttle(Option<NonZeroU64>),
     /// All faults of the way end.
@@ -109,6 +113,7 @@ impl Change {
             Self::Jitter(jitter) => faults.jitter = jitter,
             Self::Chop(segment_max) => faults.segment_max = segment_max,
             Self::Corrupt(one_flip_in) => faults.one_flip_in = one_flip_in,
+            Self::Lose(one_loss_in) => faults.one_loss_in = one_loss_in,
             Self::Throttle(rate) => faults.bytes_per_second = rate,
             Self::Heal => *faults = Faults::default(),
         }
@@ -117,7 +122,7 @@ impl Change {
 
 /// The words that [`Word`] is read from.
 pub const WORDS: &str = "cut [fin] | refuse | accept | heal | [left|right] WHAT, where WHAT is \
-    stall | part | delay MS | jitter MS | chop BYTES | corrupt ONE-FLIP-IN-BYTES | throttle BYTES-PER-SECOND | heal; \
+    stall | part | delay MS | jitter MS | chop BYTES | corrupt ONE-FLIP-IN-BYTES | lose ONE-IN-DATAGRAMS | throttle BYTES-PER-SECOND | heal; \
     a number 0 ends what it stands for; without left or right both ways are meant, else the one that leads there";
 
 impl FromStr for Word {
@@ -151,6 +156,7 @@ fn read_change(words: &[&str]) -> Option<Change> {
         ["jitter", text] => Change::Jitter(ms(text)?),
         ["chop", text] => Change::Chop(NonZeroUsize::new(text.parse().ok()?)),
         ["corrupt", text] => Change::Corrupt(NonZeroU32::new(text.parse().ok()?)),
+        ["lose", text] => Change::Lose(NonZeroU32::new(text.parse().ok()?)),
         ["throttle", text] => Change::Throttle(NonZeroU64::new(text.parse().ok()?)),
         ["heal"] => Change::Heal,
         _ => return None,

@@ -36,6 +36,7 @@ fn faults() -> impl Strategy<Value = Faults> {
             jitter,
             segment_max: segment.and_then(NonZeroUsize::new),
             one_flip_in: None,
+            one_loss_in: None,
             bytes_per_second: rate.and_then(NonZeroU64::new),
         }
     })
@@ -223,6 +224,7 @@ fn every_word_is_read_and_nonsense_is_not() {
         ("left stall", Word::Change(Some(Side::Left), Change::Stall)),
         ("right part", Word::Change(Some(Side::Right), Change::Part)),
         ("right delay 1000", Word::Change(Some(Side::Right), second)),
+        ("lose 20", Word::Change(None, Change::Lose(NonZeroU32::new(20)))),
         ("jitter 5", Word::Change(None, Change::Jitter(Duration::from_millis(5)))),
         ("chop 1", Word::Change(None, Change::Chop(NonZeroUsize::new(1)))),
         ("corrupt 0", Word::Change(None, Change::Corrupt(None))),
