@@ -259,6 +259,7 @@ mod tests {
             broken_us: None,
             dial: None,
             links: Vec::new(),
+            stream: None,
         };
         let lines = [
             format!("10.0.0.7 knee: drive ({app}) does not get on: stalled for 2.5 s\n"),

@@ -34,6 +34,7 @@
 //! | `bulk.rs` | the thread of those of Bulk |
 //! | `arrivals.rs` | what became of what came, counted |
 //! | `inbound.rs` | what is checked before a frame becomes a message of this node |
+//! | `stream_way.rs` | how much of class Stream goes by datagram, for whoever asks |
 //! | `datagrams/` | values of class Stream by UDP, where they get through |
 //! | `interfaces.rs` | which of this host's addresses are lost, as the kernel says |
 //! | `spin.rs` | how long the IO thread looks before it sleeps |
@@ -57,6 +58,7 @@ mod marks;
 mod notes;
 mod peer;
 mod spin;
+mod stream_way;
 mod task;
 #[cfg(test)]
 mod tests;
@@ -66,6 +68,7 @@ mod way;
 pub(crate) use actor::{Gncl, LINGER};
 pub(crate) use facts::LinkFact;
 pub(crate) use peer::{Peer, Store};
+pub(crate) use stream_way::{ByDatagram, by_datagram};
 pub(crate) use way::{Arrived, WayAccount};
 
 use crate::ndl::MembershipFact;

@@ -18,12 +18,12 @@ use sinew_runtime::{
 use super::reports::{
     APPS_MAX, AppReport, AppsReport, AuditReport, BarrierReport, DialReport, ForeignReport, LinkReport,
     LostReport, MISSING_MAX, Missing, NodeReport, PEERS_MAX, PeerReport, RefusalReport, SeenMessage,
-    TOLD_MAX, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
+    StreamReport, TOLD_MAX, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
 };
 use super::watches::{Fetched, Sight};
 use crate::{
     audit,
-    gncl::Peer,
+    gncl::{self, ByDatagram, Peer},
     ndl::{KnownNode, LossReason, LostNode, Source, Trouble, TroubledApp},
     node::{CommandError, NodeHandle, Supervised},
     stores::{Stores, lock},
@@ -205,7 +205,8 @@ fn peers(stores: &Stores, now: Time) -> BTreeMap<NodeAddress, PeerReport> {
     let known = lock(&stores.ndl).members(now);
     let mut peers: BTreeMap<_, _> = known.iter().map(|known| (known.node, peer_report(known, now))).collect();
     for peer in stores.gncl.peers() {
-        peers.entry(peer.node).or_insert_with(|| lost(&peer)).links = links(&peer);
+        let report = peers.entry(peer.node).or_insert_with(|| lost(&peer));
+        (report.links, report.stream) = (links(&peer), stream(stores, &peer));
     }
     for (node, peer) in &mut peers {
         let note = stores.gncl.notes.of(*node);
@@ -242,6 +243,7 @@ fn peer_report(known: &KnownNode, now: Time) -> PeerReport {
         broken_us: None,
         dial: None,
         links: Vec::new(),
+        stream: None,
     }
 }
 
@@ -277,6 +279,7 @@ fn lost(peer: &Peer) -> PeerReport {
         broken_us: None,
         dial: None,
         links: Vec::new(),
+        stream: None,
     }
 }
 
@@ -289,6 +292,16 @@ fn links(peer: &Peer) -> Vec<LinkReport> {
         unconfirmed: way.outlet.unconfirmed() as u64,
     });
     links.collect()
+}
+
+fn stream(stores: &Stores, peer: &Peer) -> Option<StreamReport> {
+    let has_a_connection = peer.ways().len() > 1;
+    has_a_connection.then(|| {
+        let by_datagram = gncl::by_datagram(peer);
+        let ByDatagram { sent, arrived } = by_datagram.unwrap_or_default();
+        let is_on = stores.config.gncl.datagrams;
+        StreamReport { is_on, is_agreed: by_datagram.is_some(), sent, arrived }
+    })
 }
 
 fn barrier_report(status: BarrierStatus) -> BarrierReport {

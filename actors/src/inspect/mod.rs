@@ -25,8 +25,8 @@ pub(crate) use inspector::begin;
 pub use reports::{
     APPS_MAX, AppReport, AppsReport, AskApps, AskAudit, AskNode, AskTree, AskWatch, AuditReport,
     BarrierReport, DialReport, ForeignReport, LinkReport, LostReport, Missing, NodeReport, PEERS_MAX,
-    PeerReport, Ping, RefusalReport, SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, TREE_MAX, TreeLine, TreeReport,
-    TroubleReport, WaitReport, WatchReport,
+    PeerReport, Ping, RefusalReport, SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, StreamReport, TREE_MAX, TreeLine,
+    TreeReport, TroubleReport, WaitReport, WatchReport,
 };
 
 #[cfg(doc)]

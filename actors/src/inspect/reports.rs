@@ -262,6 +262,22 @@ pub struct PeerReport {
     /// The connections to it.
     #[serde(deserialize_with = "at_most::<_, _, LINKS_MAX>")]
     pub links: Vec<LinkReport>,
+    /// How values of class Stream go to it; `None` where one connection carries all classes.
+    #[serde(default)]
+    pub stream: Option<StreamReport>,
+}
+
+/// How values of class Stream go to a node: each in a datagram of its own (UDP), or by the connection (TCP).
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct StreamReport {
+    /// Whether the node that answers may send datagrams: `gncl.datagrams`.
+    pub is_on: bool,
+    /// Whether both have agreed on them. If not, all goes by the connection.
+    pub is_agreed: bool,
+    /// Values that went by datagram so far.
+    pub sent: u64,
+    /// Those of them that the other node has acknowledged.
+    pub arrived: u64,
 }
 
 /// What carries the messages of a class to a node.

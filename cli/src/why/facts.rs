@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use sinew::{
     NodeAddress,
-    inspect::{AppReport, NodeReport, PeerReport, TreeLine},
+    inspect::{AppReport, NodeReport, PeerReport, StreamReport, TreeLine},
 };
 
 /// All that the rules look at.
@@ -13,6 +13,9 @@ pub(super) struct Facts {
     pub(super) ends: [End; 2],
     /// From the node of the first to the second, and back: microseconds until it was confirmed, or why not. `None`: not tried.
     pub(super) pings: [Option<Result<u64, String>>; 2],
+    /// What the node of the first has counted for that of the second when a value of class Stream had been sent to it, and back. `None`: none
+    /// was sent.
+    pub(super) streams: [Option<StreamReport>; 2],
     /// Sockets of this host that let nobody in, with the reason.
     pub(super) shut: Vec<String>,
     /// Who waits at a start-up barrier, and for whom, on all nodes that were asked.

@@ -1,13 +1,15 @@
 //! What all nodes say that can be asked, through every socket of this host that lets us in.
 
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, time::Duration};
 
 use sinew::{
     AppAddress, NodeAddress, Tid, Time,
     audit::Place,
     inspect::{
-        AppReport, AppsReport, AskApps, AskAudit, AskNode, AskTree, AuditReport, NodeReport, Ping, TreeReport,
+        AppReport, AppsReport, AskApps, AskAudit, AskNode, AskTree, AuditReport, NodeReport, Ping,
+        StreamReport, TreeReport,
     },
+    payload,
 };
 
 use super::facts::{App, End, Facts};
@@ -131,7 +133,8 @@ impl<'a> Gathered<'a> {
                 Some((app.name.clone()?, app.missing.iter().map(|missing| missing.name.clone()).collect()))
             })
             .collect();
-        Facts { ends, pings, waits, shut: Vec::new() }
+        let streams = [self.stream(found[0].at, found[1].node), self.stream(found[1].at, found[0].node)];
+        Facts { ends, pings, streams, waits, shut: Vec::new() }
     }
 
     /// An application's TID, a node's address, an application's name, a node's name: the first that it is.
@@ -221,6 +224,41 @@ impl<'a> Gathered<'a> {
             .map_err(|error| error.to_string())
             .and_then(|outcome| ping::judged(outcome, system.within));
         Some(judged.map(|()| took))
+    }
+}
+
+payload!("sinew.ping", Stream =>
+    /// A sign of life that goes as a value of class Stream does.
+    struct Value {}
+);
+
+/// Time between two looks whether a value has arrived.
+const LOOK: Duration = Duration::from_millis(10);
+/// Time for its acknowledgement: it comes a millisecond and a round trip after it, and is asked for again where it was lost.
+const VALUE_WITHIN: Duration = Duration::from_millis(500);
+
+impl Gathered<'_> {
+    /// Sends a value of class Stream from the very node, if it has a door here, and gives what it has counted when it has arrived, or when
+    /// it should have.
+    fn stream(&mut self, from: Option<usize>, to: Option<NodeAddress>) -> Option<StreamReport> {
+        let (asked, to) = (&self.nodes[from?], to?);
+        let of = |said: &NodeReport| said.peers.iter().find(|peer| peer.node == to)?.stream.clone();
+        let before = of(asked.said.as_ref().ok()?).filter(|stream| stream.is_agreed)?;
+        if !asked.is_own_door || asked.node == to {
+            return None;
+        }
+        let (through, whom) = (asked.through, (asked.node, asked.name.clone()));
+        let system = self.system(through);
+        let until = Time::now() + VALUE_WITHIN.min(system.within);
+        system.endpoint.send(Tid::new(to, AppAddress::INSPECT), &Value {}).ok()?;
+        loop {
+            let answer = system.ask_these::<AskNode, NodeReport>(vec![whom.clone()]).pop()?;
+            let after = of(&answer.said.ok()?)?;
+            if after.arrived > before.arrived || Time::now() >= until {
+                return Some(after);
+            }
+            std::thread::sleep(LOOK);
+        }
     }
 }
 

@@ -1,5 +1,7 @@
 //! From what two ends say to what stands in the way between them: facts in, steps out, nothing asked and nothing waited for.
 
+mod stream;
+
 use std::collections::BTreeSet;
 
 use sinew::inspect::{LostReport, NodeReport, PeerReport};
@@ -43,9 +45,10 @@ pub(super) fn judge(facts: &Facts) -> Vec<Step> {
     steps.address(a, b);
     if a.node.is_some() && a.node != b.node {
         steps.project(a, b);
-        for (from, to) in [(a, b), (b, a)] {
+        for ((from, to), value) in [(a, b), (b, a)].into_iter().zip(&facts.streams) {
             steps.known(from, to);
             steps.linked(from, to);
+            steps.streamed(from, to, value.as_ref());
         }
     }
     for end in [a, b] {

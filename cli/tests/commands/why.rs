@@ -100,3 +100,34 @@ fn applications_that_wait_for_each_other_in_a_circle_are_told_the_circle() {
     let answer = scenario.sinew("hip", &["why", "hip", "ankle"]);
     assert!(answer.code == Some(1) && answer.out.contains("'ankle'"), "{}", answer.out);
 }
+
+#[test]
+fn which_way_values_of_class_stream_go_is_said_from_both_ends() {
+    // Given: two nodes that have datagrams, and one that has switched them off
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee", "--requires", "ankle"]);
+    let _knee = scenario.start("knee", 2, &[]);
+    let off = [("[lncl]", "[gncl]\ndatagrams = false\n[lncl]")];
+    let _ankle = scenario.start_changed("ankle", 3, &off, &[]);
+    hip.wait_for(&["started"]);
+    let seen = |said: &Value, what: &str| {
+        let steps = said["steps"].as_array().cloned().unwrap_or_default();
+        let step = steps.into_iter().find(|step| step["step"] == what);
+        step.map_or_else(String::new, |step| format!("{} {}", step["seen"], step["mend"]))
+    };
+    // Then: a value of each goes by datagram, as soon as one was answered
+    scenario.until("datagrams get through", "hip", &["why", "hip", "knee"], |said| {
+        ["class Stream from hip to knee", "class Stream from knee to hip"]
+            .iter()
+            .all(|what| seen(said, what).contains("by datagram (UDP)") && said["free"] == true)
+    });
+    // And: both say why none does, and it stands in nobody's way
+    scenario.until("all links are up", "hip", &["why", "hip", "ankle"], |said| {
+        let (there, back) =
+            (seen(said, "class Stream from hip to ankle"), seen(said, "class Stream from ankle to hip"));
+        said["free"] == true
+            && there.contains("the other end takes no datagrams")
+            && back.contains("switched off here")
+            && back.contains("`datagrams = true` under [gncl] of ankle")
+    });
+}

@@ -2,7 +2,9 @@
 
 use sinew::{
     AppAddress, Incarnation, NodeAddress, Tid,
-    inspect::{AppReport, DialReport, ForeignReport, LinkReport, Missing, RefusalReport, TreeLine},
+    inspect::{
+        AppReport, DialReport, ForeignReport, LinkReport, Missing, RefusalReport, StreamReport, TreeLine,
+    },
 };
 
 use super::*;
@@ -33,7 +35,13 @@ fn peer(number: u8) -> PeerReport {
         broken_us: None,
         dial: None,
         links: ["control", "stream", "bulk"].map(link).to_vec(),
+        stream: Some(values(7)),
     }
+}
+
+/// Datagrams are agreed on, and so many values have arrived by one.
+fn values(arrived: u64) -> StreamReport {
+    StreamReport { is_on: true, is_agreed: true, sent: arrived, arrived }
 }
 
 fn report(number: u8, name: &str, other: u8) -> NodeReport {
@@ -98,6 +106,7 @@ fn free() -> Facts {
     let mut facts = Facts {
         ends: [end("hip", report(1, "hip", 2)), end("knee.drive", report(2, "knee", 1))],
         pings: [Some(Ok(300)), Some(Ok(400))],
+        streams: [Some(values(8)), None],
         ..Facts::default()
     };
     facts.ends[1].app = Some(app("knee.drive"));
@@ -322,8 +331,8 @@ fn a_free_way_has_nothing_to_mend() {
     let not_fine: Vec<_> =
         steps.iter().filter(|step| step.state != State::Fine || step.mend.is_some()).collect();
     assert!(not_fine.is_empty(), "{not_fine:?}");
-    // Each end, one project, both ways known, linked and pinged, and the application.
-    assert_eq!(steps.len(), 10, "{steps:?}");
+    // Each end, one project, both ways known, linked, for Stream and pinged, and the application.
+    assert_eq!(steps.len(), 12, "{steps:?}");
 }
 
 #[test]
@@ -364,6 +373,46 @@ fn what_should_be_known_does_not_stand_in_the_way() {
         let steps = judge(&facts);
         assert!(steps.iter().all(|step| step.state != State::Blocked), "{steps:#?}");
         assert!(steps.iter().any(|step| step.state == State::Note && step.seen.contains(seen)), "{steps:#?}");
+    }
+}
+
+fn of_stream(facts: &mut Facts) -> &mut StreamReport {
+    hip(facts).peers[0].stream.as_mut().expect("it has a connection of its own")
+}
+
+#[test]
+fn which_way_stream_goes_is_said_at_both_ends_with_what_lets_datagrams_through() {
+    let steps = judge(&free());
+    let said =
+        |what: &str| steps.iter().find(|step| step.what == what).expect("it is looked at").seen.clone();
+    assert_eq!(said("class Stream from hip to knee.drive"), "by datagram (UDP)");
+    // Nobody could send one from there.
+    assert!(said("class Stream from knee.drive to hip").starts_with("7 values by datagram (UDP) so far"));
+    let notes: [(fn(&mut Facts), _, _); 3] = [
+        (
+            |facts| facts.streams[0] = Some(values(7)),
+            "no datagram is answered",
+            "UDP through at 10.0.0.2:7001 of knee",
+        ),
+        (
+            |facts| of_stream(facts).is_on = false,
+            "switched off here",
+            "`datagrams = true` under [gncl] of hip",
+        ),
+        (
+            |facts| of_stream(facts).is_agreed = false,
+            "takes no datagrams",
+            "`datagrams = true` under [gncl] of knee",
+        ),
+    ];
+    for (change, seen, mend) in notes {
+        let mut facts = free();
+        change(&mut facts);
+        let steps = judge(&facts);
+        assert!(steps.iter().all(|step| step.state != State::Blocked), "{steps:#?}");
+        let is_it = |step: &&Step| step.state == State::Note && step.seen.contains(seen);
+        let note = steps.iter().find(is_it).expect("it is a note");
+        assert!(note.mend.as_ref().expect("it can be mended").contains(mend), "{note:?}");
     }
 }
 

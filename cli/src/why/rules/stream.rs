@@ -1,0 +1,56 @@
+//! Which way values of class Stream go: by UDP, or by the connection, and why.
+
+use sinew::inspect::StreamReport;
+
+use super::{End, Steps};
+
+impl Steps {
+    /// Which way they go from `from` to `to`. `after` is what was counted when one had just been sent.
+    pub(super) fn streamed(&mut self, from: &End, to: &End, after: Option<&StreamReport>) {
+        let peer = to.node.and_then(|node| from.peer(node));
+        // Where there is no connection nothing goes any way.
+        let Some(peer) =
+            peer.filter(|peer| !peer.links.is_empty() && peer.links.iter().all(|link| link.is_up))
+        else {
+            return;
+        };
+        let what = format!("class Stream from {} to {}", from.label(), to.label());
+        let Some(before) = &peer.stream else { return };
+        if !before.is_on {
+            let mend =
+                format!("`datagrams = true` under [gncl] of {}, where UDP gets through", from.node_label());
+            return self.note(what, "by the connection (TCP): datagrams are switched off here", mend);
+        }
+        if !before.is_agreed {
+            let mend = format!(
+                "`datagrams = true` under [gncl] of {}; if it is so, its version knows none",
+                to.node_label()
+            );
+            return self.note(what, "by the connection (TCP): the other end takes no datagrams", mend);
+        }
+        let Some(after) = after else {
+            let StreamReport { sent, arrived, .. } = before;
+            return self
+                .fine(what, format!("{sent} values by datagram (UDP) so far, {arrived} acknowledged"));
+        };
+        if after.arrived > before.arrived {
+            return self.fine(what, "by datagram (UDP)");
+        }
+        self.note(what, "by the connection (TCP): no datagram is answered", blocked(from, to));
+    }
+}
+
+/// What lets datagrams through.
+fn blocked(from: &End, to: &End) -> String {
+    // A node reads them at the port of its connections, if that is free.
+    let port = |end: &End| {
+        let gncl = end.report.as_ref().and_then(|report| report.gncl.clone());
+        format!("{} of {}", gncl.unwrap_or_else(|| "the port".to_owned()), end.node_label())
+    };
+    format!(
+        "let UDP through at {} and {} in every firewall on the way (`sudo nft list ruleset`), as TCP is; or `datagrams = false` under [gncl]: then \
+         one lost packet can hold values up for 200 ms",
+        port(to),
+        port(from)
+    )
+}
