@@ -17,6 +17,9 @@
 //!   flood of Bulk messages of N bytes to another application of the other node, as fast as they are taken. What counts is the
 //!   p99 beside the flood by the p99 alone (`p99_ratio_percent`).
 //! - `control_beside_slow_consumer`: the same, and the application that is flooded takes a millisecond for each of its messages.
+//! - `stream_by_WAY-CHANNELS`: values of class Stream one way, one every millisecond on each of 1, 16 and 64 channels, by datagrams and by the connection
+//!   (`gncl.datagrams`): how old they are when they are handled. `cpu_ns_each_value` is what both processes needed, `acks_per_s` what this host sent of datagrams beside the
+//!   values that were handled (acknowledgements, repetitions, a few of NDL's). `--bench stream_allocations` counts what memory is asked for.
 //! - `slow_link`: the same as `control_beside_bulk_1000`, and bare TCP, on two hosts with a link of 10 Mbit/s between them
 //!   (network namespaces: needs root, `ip` and `tc`); `slow_link_priorities`: the hosts send by priority what waits.
 
@@ -29,6 +32,8 @@ mod nodes;
 mod ping;
 mod rounds;
 mod slow_link;
+mod stream_ends;
+mod stream_ways;
 
 use std::{process::ExitCode, time::Duration};
 
@@ -40,6 +45,7 @@ use crate::{
     flood::Carrier,
     nodes::At,
     rounds::Thread,
+    stream_ends::{By as Way, Plan},
 };
 
 /// What is measured.
@@ -69,6 +75,8 @@ enum Case {
         pause_us: u64,
         rounds: u64,
     },
+    /// Values of class Stream.
+    Stream(Plan),
     SlowLink(Queue),
 }
 
@@ -111,6 +119,10 @@ impl Case {
             pause_us,
             rounds,
         }));
+        let values = 10_000 / part as u64;
+        for channels in stream_ways::CHANNELS {
+            cases.extend(Way::ALL.map(|by| Self::Stream(Plan { by, channels, values })));
+        }
         cases.extend([Queue::OneLine, Queue::Priorities].map(Self::SlowLink));
         cases
     }
@@ -125,6 +137,7 @@ impl Case {
             Self::Crowd { by: By::Nodes, nodes, .. } => format!("table_2-{nodes}"),
             Self::Crowd { by: By::Tcp, nodes, .. } => format!("table_2_raw_tcp-{nodes}"),
             Self::Beside { name, .. } => name.to_owned(),
+            Self::Stream(Plan { by, channels, .. }) => format!("stream_by_{}-{channels}", by.name()),
             Self::SlowLink(Queue::OneLine) => "slow_link".to_owned(),
             Self::SlowLink(Queue::Priorities) => "slow_link_priorities".to_owned(),
         }
@@ -158,6 +171,7 @@ impl Case {
                 let _other = process::Process::start(&format!("beside_echo {pause_us} {}", at.host(2)));
                 beside::measure(name, at, bulk_bytes, rounds);
             }
+            Self::Stream(plan) => stream_ways::measure(&self.name(), plan),
             Self::SlowLink(queue) => return slow_link::measure(&self.name(), queue),
         }
         true
@@ -218,6 +232,12 @@ fn play(role: &str) -> ExitCode {
         }
         ["beside_echo", pause_us, at] => {
             beside::echo(At::read(at), Duration::from_micros(number(pause_us) as u64));
+        }
+        ["stream_take", by, channels, values, at] => {
+            let by = Way::ALL.into_iter().find(|way| way.name() == by);
+            let by = by.expect("a name that this program wrote itself");
+            let plan = Plan { by, channels: number(channels), values: number(values) as u64 };
+            stream_ways::take(plan, At::read(at));
         }
         ["slow_nodes", case, at] => slow_link::nodes(case, At::read(at)),
         ["slow_raw_echo", address] => slow_link::raw_echo(address.parse().expect("an address of ours")),

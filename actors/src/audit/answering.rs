@@ -2,8 +2,8 @@
 //! applications takes longer than the sync manager may stand still, who says that a requirement is lost or that a barrier is open.
 //!
 //! It is nicer than the threads that it takes locks from, and stays so while it has one: to be less nice again needs a privilege. So it holds each
-//! for a copy of bounded length only: the counters of one place, or the pointers of a list, and never for a walk through messages. The one exception is
-//! the outlet for Bulk of who has asked, for as long as its answer of 256 KiB at most is written.
+//! for a copy of bounded length only: the counters of one place, or the pointers of a list, and never for a walk through messages, but the few of layers'
+//! events that wait in one mailbox. The one exception is the outlet for Bulk of who has asked, for as long as its answer of 256 KiB at most is written.
 
 use std::{collections::VecDeque, sync::Arc, thread};
 

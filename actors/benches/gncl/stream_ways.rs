@@ -1,0 +1,78 @@
+//! What values of class Stream cost, by datagrams and by the connection: a node gives them, another one takes them.
+
+use std::time::Duration;
+
+use rustix::time::{ClockId, clock_gettime};
+use sinew_figures::{
+    Alone, Figures,
+    process::{self, Process, say_there},
+};
+
+use crate::{
+    nodes::At,
+    ping::DEADLINE,
+    stream_ends::{By, PERIOD, Plan, Seen, giver, taker},
+};
+
+/// Channels, each with a value a millisecond.
+pub(crate) const CHANNELS: [usize; 3] = [1, 16, 64];
+
+/// Nanoseconds that this process had a CPU, how often its threads went to sleep, and datagrams that this host has sent.
+fn meter() -> [u64; 3] {
+    let cpu = clock_gettime(ClockId::ProcessCPUTime);
+    let cpu = Duration::new(cpu.tv_sec as u64, cpu.tv_nsec as u32);
+    [u64::try_from(cpu.as_nanos()).unwrap_or(u64::MAX), process::sleeps(), datagrams()]
+}
+
+/// Datagrams that this host has sent so far; 0 where it does not say.
+fn datagrams() -> u64 {
+    let snmp = std::fs::read_to_string("/proc/net/snmp").unwrap_or_default();
+    let mut lines = snmp.lines().filter(|line| line.starts_with("Udp:"));
+    let (Some(names), Some(counts)) = (lines.next(), lines.next()) else { return 0 };
+    let mut pairs = names.split(' ').zip(counts.split(' '));
+    pairs.find(|(name, _)| *name == "OutDatagrams").and_then(|(_, count)| count.parse().ok()).unwrap_or(0)
+}
+
+/// The node that takes them, in a process of its own: hands over what it has seen.
+pub(crate) fn take(plan: Plan, at: At) {
+    let (node, seen) = taker(plan, at.node("there"), meter);
+    say_there();
+    let Seen { ages, counted: [cpu_ns, sleeps, _] } =
+        seen.recv_timeout(DEADLINE).expect("the last ones come");
+    println!("{cpu_ns} {sleeps}");
+    ages.hand_over();
+    node.stop();
+}
+
+/// Gives them, and prints the line.
+pub(crate) fn measure(case: &str, plan: Plan) {
+    let at = At::loopback();
+    let role = format!("stream_take {} {} {} {}", plan.by.name(), plan.channels, plan.values, at.host(2));
+    let other = Process::start(&role);
+    let (node, given) = giver(plan, at.node("here"), meter);
+    let [cpu_ns, sleeps, datagrams] = given.recv_timeout(DEADLINE).expect("all are given").counted;
+    let said = other.wait();
+    node.stop();
+    let (first, ages) = said.split_once('\n').expect("it says what it has counted");
+    let (their_cpu_ns, their_sleeps) = first.split_once(' ').expect("two numbers");
+    let ages = Figures::taken(ages).expect("it hands over its times");
+    let values = plan.channels as u64 * (plan.values + 1);
+    let each = |count: u64, of: u64| count / of.max(1);
+    let others = match plan.by {
+        By::Datagrams => datagrams.saturating_sub(ages.rounds()),
+        By::Connection => datagrams,
+    };
+    let seconds = PERIOD.as_secs_f64() * plan.values as f64;
+    let counts = [
+        ("values", values),
+        ("superseded", values.saturating_sub(ages.rounds())),
+        ("cpu_ns_each_value", each(cpu_ns + number(their_cpu_ns), values)),
+        ("sleeps_each_1000_values", each(1_000 * (sleeps + number(their_sleeps)), values)),
+        ("acks_per_s", (others as f64 / seconds) as u64),
+    ];
+    Alone { bench: "gncl", case, figure: "age of a value", seen: &ages, counts: &counts }.report();
+}
+
+fn number(word: &str) -> u64 {
+    word.parse().expect("a number that this program wrote itself")
+}
