@@ -1,0 +1,138 @@
+//! What a hosted application gets, and when.
+
+use std::{sync::mpsc::sync_channel, time::Duration};
+
+use bytes::Bytes;
+use sinew_runtime::{
+    pending::Pending,
+    sender::Directory,
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    wire::HEADER_LEN,
+};
+use tokio::io::AsyncReadExt;
+
+use super::*;
+use crate::{config::NodeConfig, process::words};
+
+struct Nobody;
+
+impl Directory for Nobody {
+    fn resolve(&self, _: &str) -> Option<Tid> {
+        None
+    }
+
+    fn set_member(&self, _: AppAddress, _: AppAddress, _: bool) {}
+}
+
+/// Sends to the TID whose message has ended, from within.
+struct SendsAgain(Arc<Link>);
+
+impl ReceiptSink for SendsAgain {
+    fn settle(&self, ticket: Ticket, outcome: Outcome) {
+        assert_eq!(outcome, Outcome::Failed);
+        let again =
+            Message::new(Header::new(Kind::named("again"), ticket.source, ticket.destination), Bytes::new());
+        self.0.submit(again).expect("there is room");
+    }
+}
+
+#[test]
+fn a_process_cannot_count_beyond_its_reach_step_by_step_either() {
+    let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+    let link = Link::new(&stores, Mailbox::new(8));
+    let tid = Tid::new(NodeAddress::HERE, AppAddress::fixed(1).expect("a fixed one"));
+    let sender = Sender::new(tid, stores.router.clone(), Arc::new(Nobody), Pending::new(1), 1_024);
+    assert!(link.sender.set(sender).is_ok());
+    let says = |sequence| {
+        let mut header = Header::new(Kind::named("first"), tid, tid);
+        header.sequence = sequence;
+        link.note(&header)
+    };
+    link.begin_life();
+    assert!(says(1) && says(1 << 40) && !says((1 << 40) + 1) && !says(u64::MAX));
+    link.begin_life();
+    assert!(says((1 << 40) + 1), "the next one counts on from there");
+    assert_eq!(link.sequence(), (1 << 40) + 1);
+}
+
+#[test]
+fn a_message_does_not_overtake_the_change_of_the_directory_behind_which_it_came() {
+    let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+    let link = Link::new(&stores, Mailbox::new(8));
+    let tid = Tid::new(NodeAddress::HERE, AppAddress::fixed(1).expect("a fixed one"));
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().expect("a reactor");
+    let _entered = runtime.enter();
+    let (socket, mut process) = UnixStream::pair().expect("a pair of sockets");
+    let welcome = words::bare(Kind::HOST_WELCOME, Tid::NONE, tid);
+    let number = link.connect(Arc::new(socket), welcome, (stores.directory_changes.subscribe(), 0));
+    let mut frame = [0; HEADER_LEN];
+    runtime.block_on(async {
+        tokio::select! {
+            error = link.drain(number) => panic!("the process reads: {error}"),
+            read = process.read_exact(&mut frame) => read.expect("the welcome"),
+        }
+    });
+    let waits = || lock(&link.present).as_ref().expect("it is connected").held.is_some();
+    let send = || {
+        link.submit(Message::new(Header::new(Kind::named("event"), tid, tid), Bytes::new()))
+            .expect("there is room");
+    };
+    // Given: a message has come behind two changes
+    stores.directory_has_changed();
+    stores.directory_has_changed();
+    send();
+    assert!(waits(), "the words are not on their way");
+    // When: the child has been told of one
+    link.directory_is_told(1);
+    link.hand_over_held();
+    // Then
+    assert!(waits(), "it does not know of the second");
+    // When: it has been told of the second, and meanwhile there was another one
+    stores.directory_has_changed();
+    link.directory_is_told(2);
+    link.hand_over_held();
+    // Then
+    assert!(
+        !waits(),
+        "nobody who sent it can know of the third: names that change all the time hold nothing up for good"
+    );
+    link.directory_is_told(3);
+    send();
+    assert!(!waits(), "it knows all");
+}
+
+#[test]
+fn whoever_is_told_that_a_former_process_failed_may_send_to_it_at_once() {
+    let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+    let mailbox = Mailbox::new(8);
+    let link = Link::new(&stores, mailbox.clone());
+    let tid = Tid::new(NodeAddress::HERE, AppAddress::fixed(1).expect("a fixed one"));
+    let (say, said) = sync_channel(1);
+    std::thread::spawn(move || {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().expect("a reactor");
+        let _entered = runtime.enter();
+        let (first, process) = UnixStream::pair().expect("a pair of sockets");
+        let (second, _other) = UnixStream::pair().expect("another");
+        let connect = |socket| {
+            let welcome = words::bare(Kind::HOST_WELCOME, Tid::NONE, tid);
+            link.connect(Arc::new(socket), welcome, (stores.directory_changes.subscribe(), 0))
+        };
+        let number = connect(first);
+        let mut message = Message::new(Header::new(Kind::named("first"), tid, tid), Bytes::new());
+        let ticket = Ticket { source: tid, destination: tid, correlation: 1 };
+        message.receipt = Some(Receipt::new(Arc::new(SendsAgain(link.clone())), ticket));
+        link.submit(message).expect("there is room");
+        let (mut process, mut frames) = (process, [0; 2 * HEADER_LEN]);
+        let taken = async {
+            tokio::select! {
+                error = link.drain(number) => panic!("the process reads: {error}"),
+                read = process.read_exact(&mut frames) => read.expect("the welcome and the message"),
+            }
+        };
+        runtime.block_on(taken);
+        // Its supervisor has not waited for the end of the first one.
+        connect(second);
+        say.send(()).expect("it is waited for");
+    });
+    said.recv_timeout(Duration::from_secs(10)).expect("whoever is told is told without a lock");
+}
