@@ -47,6 +47,7 @@ use crate::{
 use budget::{Budget, PROCESS, Share};
 use early::Early;
 pub(super) use early::InTurn;
+use foreign::LinkEnd;
 pub(super) use room::Room;
 use standing::{Alone, Pair, Put};
 pub(super) use standing::{Came, Everything, Standing};
@@ -75,7 +76,7 @@ pub(super) struct Terms {
 struct Offered {
     peer: Tid,
     number: LinkNumber,
-    socket: Arc<UnixStream>,
+    socket: LinkEnd,
     exchange: Exchange,
     share: Share,
 }
@@ -390,7 +391,7 @@ impl Direct {
         if links.is_empty() {
             return;
         }
-        let gone: Vec<_> = socket::which_hung_up(links.iter().map(|(_, _, socket)| &***socket))
+        let gone: Vec<_> = socket::which_hung_up(links.iter().map(|(_, _, socket)| &****socket))
             .into_iter()
             .map(|index| (links[index].0, links[index].1))
             .chain(self.early.iter().map(|(peer, early)| (*peer, early.after)))

@@ -11,6 +11,7 @@ use rustix::{
     net::{RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, recv, recvmsg},
 };
 
+use super::foreign::LinkEnd;
 use crate::api::routes::LinkNumber;
 
 /// Ends that one look takes at most: so many are on their way to a client, and as many for links that it has asked for.
@@ -18,11 +19,11 @@ const ENDS_A_LOOK: usize = 128;
 
 /// The end of the link `number`, if it is there. Ends that come before it were for links that nobody wants any more; they are
 /// closed.
-pub(super) fn take(socket: &UnixStream, number: LinkNumber) -> Option<UnixStream> {
+pub(super) fn take(socket: &UnixStream, number: LinkNumber) -> Option<LinkEnd> {
     for _ in 0..ENDS_A_LOOK {
         let (found, end) = receive(socket).ok()?;
         if found == number {
-            return end.map(UnixStream::from);
+            return end;
         }
     }
     None
@@ -33,7 +34,7 @@ pub(super) fn holds_something(socket: &UnixStream) -> bool {
     recv(socket, &mut [0; 1][..], RecvFlags::DONTWAIT | RecvFlags::PEEK).is_ok_and(|(count, _)| count > 0)
 }
 
-fn receive(socket: &UnixStream) -> Result<(LinkNumber, Option<OwnedFd>), Errno> {
+fn receive(socket: &UnixStream) -> Result<(LinkNumber, Option<LinkEnd>), Errno> {
     let mut number = [0; 8];
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
     let mut control = RecvAncillaryBuffer::new(&mut space);
@@ -46,9 +47,10 @@ fn receive(socket: &UnixStream) -> Result<(LinkNumber, Option<OwnedFd>), Errno> 
         }
     };
     // What is not taken out here is closed.
-    let end = control.drain().find_map(|message| {
+    let end: Option<OwnedFd> = control.drain().find_map(|message| {
         if let RecvAncillaryMessage::ScmRights(mut ends) = message { ends.next() } else { None }
     });
+    let end = end.map(|end| LinkEnd::new(end.into()));
     if got.bytes != number.len() {
         // The node writes the number as a whole; it has gone, perhaps with a last word that is for others to read.
         return Err(Errno::CONNRESET);

@@ -4,7 +4,10 @@ use std::io;
 
 use sinew_shm::{Descriptors, PassError, Received, set_descriptors};
 
-use super::{foreign::Foreign, *};
+use super::{
+    foreign::{Foreign, LinkEnd},
+    *,
+};
 
 /// What a peer has passed for its half, of which nothing is judged.
 struct Theirs {
@@ -82,8 +85,8 @@ impl Direct {
         Ok((exchange, share))
     }
 
-    fn take_end(&self, number: LinkNumber) -> Option<Arc<UnixStream>> {
-        descriptors::take(self.control.as_ref()?, number).map(Arc::new)
+    fn take_end(&self, number: LinkNumber) -> Option<LinkEnd> {
+        descriptors::take(self.control.as_ref()?, number)
     }
 
     /// The other one has agreed to a link: it stands, and is switched to.
@@ -119,7 +122,7 @@ impl Direct {
         let Offered { peer, number, socket, exchange, share } = offered;
         let (producer, consumer) = exchange.finish(received.into_offer()??)?;
         copies.are_good();
-        let writer = ring::Writer::new(socket.clone(), producer, &self.terms.options);
+        let writer = ring::Writer::new(Arc::clone(&socket), producer, &self.terms.options);
         let pair = Pair { own: self.terms.own, peer, number, socket };
         Ok(Standing::new(pair, writer, consumer, share, self.terms.payload_max))
     }
@@ -208,8 +211,11 @@ impl Direct {
 mod tests {
     use std::{io::IoSlice, mem::MaybeUninit, os::fd::AsFd, sync::mpsc::sync_channel};
 
-    use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
-    use sinew_shm::OFFER_BYTES;
+    use rustix::{
+        io::Errno,
+        net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg},
+    };
+    use sinew_shm::{BellKind, OFFER_BYTES};
 
     use super::*;
     use crate::{lingering::Lingering, lncl::testing::WATCHDOG};
@@ -241,5 +247,36 @@ mod tests {
         // Then:
         assert_eq!(said.recv_timeout(WATCHDOG), Ok(true));
         lingering.let_go();
+    }
+
+    /// The offer of a ring, with what else is passed beside it.
+    fn offer_to(socket: &UnixStream) {
+        let exchange = Exchange::prepare(rings::capacity(4_096), BellKind::Futex).unwrap();
+        exchange.offer(socket).unwrap();
+    }
+
+    fn pass(socket: &UnixStream, descriptor: impl AsFd) -> Result<usize, Errno> {
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
+        let mut control = SendAncillaryBuffer::new(&mut space);
+        let descriptors = [descriptor.as_fd()];
+        assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)));
+        sendmsg(socket, &[IoSlice::new(&[1])], &mut control, SendFlags::empty())
+    }
+
+    // spec: LNCL-18
+    #[test]
+    fn behind_its_offer_a_peer_passes_nothing() {
+        // Given: two that offer, of whom one passes more.
+        let [(ours, theirs), (stray_ours, stray_theirs)] = [(); 2].map(|()| UnixStream::pair().unwrap());
+        for socket in [&theirs, &stray_theirs] {
+            offer_to(socket);
+        }
+        pass(&stray_theirs, &ours).unwrap();
+        // Then: what is there already ends the meeting, and what comes later is refused where the system knows that.
+        assert!(matches!(Theirs::take(&Arc::new(stray_ours)), Err(ExchangeError::Stray)));
+        let knows = set_descriptors(&ours, Descriptors::Taken).is_ok();
+        let ours = Arc::new(ours);
+        Theirs::take(&ours).map_err(|why| why.to_string()).unwrap().copies.are_good();
+        assert_eq!(pass(&theirs, &theirs).err(), knows.then_some(Errno::PERM));
     }
 }

@@ -16,7 +16,11 @@ use sinew_runtime::{
 };
 use sinew_shm::{Armed, Consumer, Ends, HangUp};
 
-use super::{budget::Share, hang_up};
+use super::{
+    budget::Share,
+    foreign::{self, LinkEnd},
+    hang_up,
+};
 use crate::{
     api::{
         ApiError,
@@ -35,7 +39,7 @@ pub(in crate::api) struct Standing {
     own: Tid,
     pub(in crate::api) peer: Tid,
     pub(in crate::api) number: LinkNumber,
-    pub(super) socket: Arc<UnixStream>,
+    pub(super) socket: LinkEnd,
     pub(super) writer: Arc<ring::Writer>,
     /// What comes on this link is settled on it.
     pub(in crate::api) sink: Arc<dyn ReceiptSink>,
@@ -58,7 +62,7 @@ pub(super) struct Pair {
     pub(super) peer: Tid,
     pub(super) number: LinkNumber,
     /// Hangs up with the peer.
-    pub(super) socket: Arc<UnixStream>,
+    pub(super) socket: LinkEnd,
 }
 
 /// What became of a message that was to be written.
@@ -334,6 +338,8 @@ impl Drop for Standing {
     fn drop(&mut self) {
         // A message in some thread's hand may hold the writer, and the socket with it, a little longer.
         hang_up(&self.socket);
+        foreign::empty_bell(self.consumer.fd());
+        self.writer.with_bell(foreign::empty_bell);
         match &self.rest {
             Some(rest) => rest.wake_peer(),
             None => self.writer.wake_peer(),

@@ -14,7 +14,10 @@ use rustix::{
     event::{EventfdFlags, PollFd, PollFlags, eventfd, poll},
     fs::{Timespec, readlink},
     io::{Errno, ReadWriteFlags, preadv2},
-    net::{AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, recv, send, socketpair, sockopt},
+    net::{
+        AddressFamily, RecvAncillaryBuffer, RecvFlags, ReturnFlags, SendFlags, Shutdown, SocketFlags,
+        SocketType, recv, recvmsg, send, shutdown, socketpair, sockopt,
+    },
     thread::futex,
 };
 
@@ -83,9 +86,9 @@ fn event() -> Result<(EventBell, OwnedFd), Errno> {
 fn socket() -> Result<(SocketBell, OwnedFd), Errno> {
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
     let (ear, button) = socketpair(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
-    // Who drains the ear would close them. Where the system does not know it (Linux before 6.16) a hostile peer can still pass some.
-    let _ = set_descriptors(ear.as_fd(), Descriptors::Refused);
-    Ok((SocketBell(ear), button))
+    // Who drains the ear would close them. Where the system does not know it (Linux before 6.16) it is looked at first.
+    let looks = set_descriptors(ear.as_fd(), Descriptors::Refused).is_err();
+    Ok((SocketBell { socket: ear, looks }, button))
 }
 
 /// The peer's bells, to be rung by this side, if the descriptors are such.
@@ -101,19 +104,20 @@ pub(crate) fn buttons(kind: BellKind, fds: Vec<OwnedFd>) -> Result<Both, Refused
             Ok((Box::new(EventBell(message)), Box::new(EventBell(room))))
         }
         (BellKind::Socket, Some(message), Some(room)) if is_button(&message) && is_button(&room) => {
-            Ok((Box::new(SocketBell(message)), Box::new(SocketBell(room))))
+            Ok((Box::new(button(message)), Box::new(button(room))))
         }
         (BellKind::Futex | BellKind::EventFd | BellKind::Socket, _, _) => Err(RefusedOffer::NotABell(kind)),
     }
 }
 
 /// Whether it is a unix socket into which nothing was written: what lies there, descriptors among it, would be closed with it. Nothing
-/// more comes, where the system knows that.
+/// more comes: a button is rung, not read, and no copy of it that the peer has kept takes this back.
 fn is_button(fd: &OwnedFd) -> bool {
     if sockopt::socket_domain(fd) != Ok(AddressFamily::UNIX) {
         return false;
     }
-    let _ = set_descriptors(fd.as_fd(), Descriptors::Refused);
+    // It fails where there is no other end, from which nothing comes either.
+    let _ = shutdown(fd, Shutdown::Read);
     !matches!(recv(fd, &mut [0; 1][..], RecvFlags::DONTWAIT | RecvFlags::PEEK), Ok((1.., _)))
 }
 
@@ -234,12 +238,21 @@ impl Doorbell for EventBell {
     }
 }
 
-struct SocketBell(OwnedFd);
+struct SocketBell {
+    socket: OwnedFd,
+    /// Descriptors may come with what is heard.
+    looks: bool,
+}
+
+/// A bell of the peer's, of which nothing is heard.
+const fn button(socket: OwnedFd) -> SocketBell {
+    SocketBell { socket, looks: false }
+}
 
 impl Doorbell for SocketBell {
     fn ring(&self) {
         // Full means that it is rung already; closed means that nobody waits.
-        let _ = send(&self.0, &[1], SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
+        let _ = send(&self.socket, &[1], SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
     }
 
     fn listen(&self) -> Heard {
@@ -247,17 +260,39 @@ impl Doorbell for SocketBell {
     }
 
     fn sleep(&self, _: Heard, waiting: &Waiting<'_>) -> io::Result<Woken> {
+        if self.looks && undescribed(&self.socket, &mut [0; RINGS_MAX]).is_none() {
+            // It would end every sleep, and can be taken out by nobody who may not wait.
+            return Ok(Woken::HungUp);
+        }
         poll_for(self, waiting)
     }
 
     fn fd(&self) -> Option<BorrowedFd<'_>> {
-        Some(self.0.as_fd())
+        Some(self.socket.as_fd())
     }
 
     fn drain(&self) {
-        // More than this was rung only by a peer that rings for fun; then the next sleep ends early.
-        let mut rings = [0; 64];
-        let _ = recv(&self.0, &mut rings, RecvFlags::DONTWAIT);
+        let mut rings = [0; RINGS_MAX];
+        let count = if self.looks { undescribed(&self.socket, &mut rings) } else { Some(RINGS_MAX) };
+        if let Some(count) = count {
+            let _ = recv(&self.socket, &mut rings[..count], RecvFlags::DONTWAIT);
+        }
+    }
+}
+
+/// Bytes that are drained at once. More was rung only by a peer that rings for fun; then the next sleep ends early.
+const RINGS_MAX: usize = 64;
+
+/// So many bytes can be taken without a descriptor beside them; `None` if there is one. All stays where it is.
+fn undescribed(socket: &OwnedFd, rings: &mut [u8]) -> Option<usize> {
+    let flags = RecvFlags::DONTWAIT | RecvFlags::PEEK;
+    // Without room for descriptors: that they are there is said, and none is made ours.
+    let mut none = RecvAncillaryBuffer::default();
+    match recvmsg(socket, &mut [IoSliceMut::new(rings)], &mut none, flags) {
+        Ok(got) if got.flags.contains(ReturnFlags::CTRUNC) => None,
+        Ok(got) => Some(got.bytes),
+        // There is nothing, or will be nothing.
+        Err(_) => Some(0),
     }
 }
 
@@ -319,3 +354,6 @@ pub(super) fn timespec(time: Duration) -> Timespec {
         tv_nsec: i64::from(time.subsec_nanos()),
     }
 }
+
+#[cfg(test)]
+mod tests;

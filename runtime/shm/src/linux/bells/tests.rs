@@ -1,0 +1,81 @@
+//! What a hostile peer does to bells that are sockets, besides ringing them.
+
+use std::{io::IoSlice, mem::MaybeUninit};
+
+use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, sendmsg};
+
+use super::*;
+use crate::wait::Wait;
+
+fn pair() -> (OwnedFd, OwnedFd) {
+    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+    socketpair(AddressFamily::UNIX, SocketType::STREAM, flags, None).expect("two sockets")
+}
+
+/// Rings with a descriptor beside it.
+fn pass(through: &OwnedFd, descriptor: &OwnedFd) -> Result<usize, Errno> {
+    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
+    let mut control = SendAncillaryBuffer::new(&mut space);
+    let descriptors = [descriptor.as_fd()];
+    assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)));
+    sendmsg(through, &[IoSlice::new(&[1])], &mut control, SendFlags::NOSIGNAL)
+}
+
+/// A descriptor, and the other end that hangs up when nobody has it any more.
+fn witnessed() -> (OwnedFd, OwnedFd) {
+    pair()
+}
+
+fn nobody_has_the_other_end_of(witness: &OwnedFd) -> bool {
+    matches!(recv(witness, &mut [0; 1][..], RecvFlags::DONTWAIT), Ok((_, 0)))
+}
+
+#[test]
+fn an_ear_lets_no_descriptors_come_where_the_system_knows_that() {
+    let (ear, button) = socket().expect("a bell");
+    if ear.looks {
+        return;
+    }
+    let (given, _witness) = witnessed();
+    assert_eq!(pass(&button, &given), Err(Errno::PERM));
+    assert_eq!(send(&button, &[1], SendFlags::NOSIGNAL), Ok(1), "it is rung all the same");
+}
+
+#[test]
+fn an_ear_at_which_they_can_come_is_not_drained_of_them_and_is_an_end_to_who_sleeps_there() {
+    // Given: a system that cannot refuse them.
+    let (socket, button) = pair();
+    let ear = SocketBell { socket, looks: true };
+    assert_eq!(send(&button, &[1], SendFlags::NOSIGNAL), Ok(1));
+    ear.drain();
+    assert_eq!(undescribed(&ear.socket, &mut [0; 1]), Some(0), "what is rung is drained");
+
+    // When:
+    let (given, witness) = witnessed();
+    assert_eq!(pass(&button, &given), Ok(1));
+    drop(given);
+    ear.drain();
+
+    // Then:
+    assert!(!nobody_has_the_other_end_of(&witness), "it was not closed");
+    let waiting = Wait::within(Duration::from_secs(10)).begin(Instant::now());
+    assert_eq!(ear.sleep(ear.listen(), &waiting).expect("it sleeps"), Woken::HungUp);
+}
+
+#[test]
+fn a_button_in_which_something_lies_is_refused_and_nothing_comes_into_one_that_is_not() {
+    // Given: two that a peer offers, and keeps copies of.
+    let ((full, full_ear), (empty, empty_ear)) = (pair(), pair());
+    let (given, _witness) = witnessed();
+    assert_eq!(pass(&full_ear, &given), Ok(1));
+    let copy = empty.try_clone().expect("a descriptor");
+
+    // Then:
+    assert!(!is_button(&full));
+    assert!(is_button(&empty));
+    // Whatever it does to its copy.
+    let _ = set_descriptors(copy.as_fd(), Descriptors::Taken);
+    assert_eq!(pass(&empty_ear, &given), Err(Errno::PIPE));
+    assert_eq!(send(&empty, &[1], SendFlags::NOSIGNAL), Ok(1), "it can be rung");
+    assert_eq!(recv(&empty_ear, &mut [0; 2][..], RecvFlags::DONTWAIT).map(|(_, count)| count), Ok(1));
+}
