@@ -7,6 +7,7 @@ mod classes;
 mod credit;
 mod datagrams;
 mod ends;
+mod former_lives;
 mod handshakes;
 mod leaving;
 mod links;
