@@ -45,7 +45,7 @@ use std::process::ExitCode;
 pub use self::{
     held::Held,
     performer::Performer,
-    stage::{Stage, StageLimits},
+    stage::{Kernel, Stage, StageLimits},
     steady::Window,
 };
 

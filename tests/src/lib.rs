@@ -10,6 +10,7 @@ pub mod load;
 mod log;
 pub mod meetings;
 mod numbers;
+mod preload;
 mod program;
 
 pub mod orders;

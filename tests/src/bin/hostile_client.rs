@@ -8,6 +8,7 @@ use std::{process::ExitCode, time::Duration};
 
 use clap::Parser;
 use sinew_tests::clients::{
+    Kernel,
     hostile::{Plan, run},
     play,
 };
@@ -26,18 +27,22 @@ struct Arguments {
     /// What all chance comes from; another one each time if it is not given.
     #[arg(long, default_value_t = u64::from(std::process::id()))]
     seed: u64,
+    /// As on Linux before 6.16: the system cannot be told to let no descriptors come.
+    #[arg(long)]
+    old_kernel: bool,
 }
 
 fn main() -> ExitCode {
     if let Some(code) = play() {
         return code;
     }
-    let Arguments { minutes, seconds, seed } = Arguments::parse();
+    let Arguments { minutes, seconds, seed, old_kernel } = Arguments::parse();
     println!("seed {seed}");
     let report = run(Plan {
         program: std::env::current_exe().expect("a program has a path"),
         lasts: Duration::from_secs((minutes * 60 + seconds).max(5)),
         seed,
+        kernel: if old_kernel { Kernel::WithoutPassRights } else { Kernel::Present },
     });
     println!("{report}");
     if report.holds() { ExitCode::SUCCESS } else { ExitCode::FAILURE }

@@ -4,9 +4,11 @@
 //! | file | what it is |
 //! | --- | --- |
 //! | `stranger` | a connection by hand |
+//! | `lingering` | what takes for ever to close, and who keeps it from closing |
 //! | `ring` | the hostile end of rings |
 //! | `tricks` | what a hostile client does |
 
+mod lingering;
 mod ring;
 mod stranger;
 mod tricks;
@@ -27,11 +29,12 @@ use rustix::process::{Signal, getpid, kill_process};
 use sinew::{Kind, NodeApi, Registration};
 
 use self::{
+    lingering::Keeper,
     stranger::{Frame, Stranger},
     tricks::{Attacker, Tally},
 };
 use super::{
-    Performer, Stage, StageLimits,
+    Kernel, Performer, Stage, StageLimits,
     held::Held,
     host::HOSTS,
     say,
@@ -46,6 +49,9 @@ const ATTACKERS: u64 = 2;
 const LIFE: Duration = Duration::from_secs(2);
 /// Sentences that are kept of those that newcomers are told.
 const TOLD_MAX: usize = 8;
+/// Nobody else's round trip takes longer. Whoever waits for what does not close waits for [`lingering::KEPT`]; an application with the
+/// patience that is usual, [`Registration::patience`], is told sooner that its node stands still.
+const HELD_UP_MAX: Duration = Duration::from_secs(1);
 /// How often the node's memory is looked at.
 const LOOK: Duration = Duration::from_millis(50);
 const LIMITS: StageLimits = StageLimits { mailbox_capacity: 32, payload_max: 16 * 1024, clients_max: 64 };
@@ -59,12 +65,15 @@ pub struct Plan {
     pub lasts: Duration,
     /// Decides what is tried.
     pub seed: u64,
+    /// What the node and the hosts run on.
+    pub kernel: Kernel,
 }
 
 /// What was seen.
 #[derive(Debug)]
 pub struct Report {
     seconds: f64,
+    kernel: Kernel,
     tally: Tally,
     /// What the node refused.
     pub refused: u64,
@@ -114,6 +123,12 @@ impl Report {
         LINKS * (1_024 + 64 + 64) + 16 * 1_024
     }
 
+    /// The longest round trip of the others under attack, through the node and with the hosts.
+    fn longest(&self) -> Duration {
+        let hosts = self.hosts.iter().map(|host| host.windows[1].max_us);
+        Duration::from_micros(hosts.chain([self.windows[1].max_us]).max().unwrap_or_default())
+    }
+
     /// The node lived within its bound, served the others, counted every refusal that it told, and gave all back.
     #[must_use]
     pub fn holds(&self) -> bool {
@@ -122,8 +137,11 @@ impl Report {
             && self.grown_kib <= Self::bound_kib()
             && is_given_back(&self.held)
             && self.windows.iter().all(|window| window.failed == 0)
+            && self.longest() <= HELD_UP_MAX
             && self.hosts.iter().all(Host::holds)
-            && [self.tally.links, self.tally.rings, self.tally.lies].iter().all(|tried| *tried > 0)
+            && [self.tally.links, self.tally.rings, self.tally.lies, self.tally.lingering]
+                .iter()
+                .all(|tried| *tried > 0)
             && self.newcomers.served > 0
             && self.newcomers.turned_away.is_empty()
     }
@@ -158,10 +176,24 @@ impl fmt::Display for Host {
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { seconds, tally, refused, grown_kib, held, windows, hosts, newcomers } = self;
-        let Tally { tricks, connections, bytes, refused: told, rings, lies, links } = tally;
+        let Self { seconds, kernel, tally, refused, grown_kib, held, windows, hosts, newcomers } = self;
+        let Tally {
+            tricks,
+            connections,
+            bytes,
+            refused: told,
+            rings,
+            lies,
+            links,
+            lingering,
+            lingering_came,
+        } = tally;
         writeln!(f, "{seconds:.1} s, {tricks} tricks on {connections} connections, {bytes} bytes taken")?;
         writeln!(f, "{rings} links with rings, {links} direct links, {lies} lies written into their memory")?;
+        writeln!(
+            f,
+            "{lingering} descriptors that do not close were passed, on {kernel}: {lingering_came} came, the others were refused by the system"
+        )?;
         writeln!(f, "refusals: {told} told to the hostile ones, {refused} counted by the node")?;
         let Newcomers { served, turned_away } = newcomers;
         writeln!(f, "newcomers: {served} served, {} turned away {turned_away:?}", turned_away.len())?;
@@ -169,24 +201,32 @@ impl fmt::Display for Report {
         writeln!(f, "node grown by {grown_kib} KiB at most; its bound is {} KiB", Self::bound_kib())?;
         writeln!(f, "others, alone        {}\nothers, under attack {}", windows[0], windows[1])?;
         hosts.iter().try_for_each(|host| write!(f, "{host}"))?;
+        writeln!(
+            f,
+            "longest round trip of the others under attack: {:?}; at most {HELD_UP_MAX:?}",
+            self.longest()
+        )?;
         write!(
             f,
-            "expected: the node and the hosts live, within their bounds, all given back, no round trip failed, no newcomer turned away, every refusal counted; seen: {}",
+            "expected: the node and the hosts live, within their bounds, all given back, no round trip failed or too long, newcomers served and none turned away, every refusal counted; seen: {}",
             if self.holds() { "so" } else { "NOT SO" }
         )
     }
 }
 
-/// The role of an attacker, `SOCKET SEED MILLISECONDS`: tells what it did at its end.
+/// The role of an attacker, `SOCKET SEED MILLISECONDS KEEPER`: tells what it did at its end.
 pub(super) fn play_attacker(arguments: &[String]) {
     let number = |index: usize| arguments[index].parse::<u64>().expect("a number");
     let end = Instant::now() + Duration::from_millis(number(2));
-    let mut attacker = Attacker::new(Path::new(&arguments[0]), Dice::new(number(1)));
+    let mut attacker = Attacker::new(Path::new(&arguments[0]), Dice::new(number(1)), number(3) as u16);
     while Instant::now() < end {
         attacker.play_one();
     }
-    let Tally { tricks, connections, bytes, refused, rings, lies, links } = attacker.tally;
-    say(&format!("{tricks} {connections} {bytes} {refused} {rings} {lies} {links}"));
+    let Tally { tricks, connections, bytes, refused, rings, lies, links, lingering, lingering_came } =
+        attacker.tally;
+    say(&format!(
+        "{tricks} {connections} {bytes} {refused} {rings} {lies} {links} {lingering} {lingering_came}"
+    ));
 }
 
 /// The role of one that stops in mid-frame, `SOCKET`: stops itself, and goes on where it was if it is let.
@@ -215,12 +255,13 @@ struct Cast {
     pingers: Vec<Performer>,
     answers: Receiver<String>,
     tally: Arc<Mutex<Tally>>,
+    keeper: Arc<Keeper>,
     dice: Dice,
 }
 
 impl Cast {
     fn new(plan: Plan) -> Self {
-        let stage = Stage::new(&plan.program, LIMITS);
+        let stage = Stage::on(plan.kernel, &plan.program, LIMITS);
         let (say, answers) = sync_channel(64);
         let start = |role: &str, arguments: &[String]| {
             let say = say.clone();
@@ -235,7 +276,17 @@ impl Cast {
         let of_hosts = names.iter().map(|name| start("pinger", std::slice::from_ref(name)));
         let pingers = std::iter::once(start("pinger", &[])).chain(of_hosts).collect();
         let dice = Dice::new(plan.seed);
-        Self { plan, stage, echo, hosts, pingers, answers, tally: Arc::default(), dice }
+        Self {
+            plan,
+            stage,
+            echo,
+            hosts,
+            pingers,
+            answers,
+            tally: Arc::default(),
+            keeper: Arc::new(Keeper::new()),
+            dice,
+        }
     }
 
     /// What each of the others measured since the last one; at least one round trip.
@@ -271,7 +322,8 @@ impl Cast {
 
     fn start_attacker(&mut self) -> Performer {
         let tally = self.tally.clone();
-        let arguments = [self.dice.roll().to_string(), LIFE.as_millis().to_string()];
+        let keeper = self.keeper.port().to_string();
+        let arguments = [self.dice.roll().to_string(), LIFE.as_millis().to_string(), keeper];
         self.stage.start("attacker", &arguments, move |line| {
             let numbers: Vec<u64> =
                 line.split_whitespace().map(|word| word.parse().expect("a number")).collect();
@@ -283,6 +335,8 @@ impl Cast {
             tally.rings += numbers[4];
             tally.lies += numbers[5];
             tally.links += numbers[6];
+            tally.lingering += numbers[7];
+            tally.lingering_came += numbers[8];
         })
     }
 
@@ -353,15 +407,17 @@ fn come(socket: &Path, over: &AtomicBool) -> Newcomers {
 /// If the node or one of the others ends.
 #[must_use]
 pub fn run(plan: Plan) -> Report {
+    let kernel = plan.kernel;
     let mut cast = Cast::new(plan);
     cast.windows();
     thread::sleep(cast.plan.lasts / 8);
     let alone = cast.windows();
     let (before, over, began) = (cast.held(), AtomicBool::new(false), Instant::now());
-    let (socket, processes) = (cast.stage.socket(), cast.processes());
+    let (socket, processes, keeper) = (cast.stage.socket(), cast.processes(), cast.keeper.clone());
     let (most, newcomers) = thread::scope(|scope| {
         let watching = scope.spawn(|| watch(&processes, &over));
         let coming = scope.spawn(|| come(&socket, &over));
+        scope.spawn(|| keeper.keep(&over));
         let ends = EndsIt(&over);
         cast.attack();
         drop(ends);
@@ -384,5 +440,5 @@ pub fn run(plan: Plan) -> Report {
     let hosts = (1..=HOSTS.len()).map(seen).collect();
     let tally = *cast.tally.lock().unwrap_or_else(PoisonError::into_inner);
     cast.end();
-    Report { seconds, tally, refused, grown_kib, held, windows, hosts, newcomers }
+    Report { seconds, kernel, tally, refused, grown_kib, held, windows, hosts, newcomers }
 }

@@ -1,6 +1,7 @@
 //! A node in a process of its own, a directory that belongs to nobody else, and a cast that is started in it.
 
 use std::{
+    fmt,
     path::{Path, PathBuf},
     sync::mpsc::{Receiver, sync_channel},
 };
@@ -8,7 +9,7 @@ use std::{
 use sinew::Audit;
 
 use super::Performer;
-use crate::{DEADLINE, OwnDirectory};
+use crate::{DEADLINE, OwnDirectory, preload::Preload};
 
 /// What the node may hold.
 #[derive(Clone, Copy, Debug)]
@@ -21,10 +22,31 @@ pub struct StageLimits {
     pub clients_max: usize,
 }
 
+/// What the processes of a stage run on.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Kernel {
+    /// The kernel that is there.
+    #[default]
+    Present,
+    /// As one before Linux 6.16: it cannot be told to let no descriptors come over a socket.
+    WithoutPassRights,
+}
+
+impl fmt::Display for Kernel {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Present => "the kernel that is there",
+            Self::WithoutPassRights => "a kernel without SO_PASSRIGHTS",
+        })
+    }
+}
+
 /// Where a proof takes place.
 #[derive(Debug)]
 pub struct Stage {
     program: PathBuf,
+    /// What makes the kernel another one.
+    preload: Option<Preload>,
     residents: Vec<String>,
     /// Ends before its directory does.
     node: Performer,
@@ -39,11 +61,26 @@ impl Stage {
     /// If it does not start.
     #[must_use]
     pub fn new(program: &Path, limits: StageLimits) -> Self {
-        Self::with_residents(program, limits, &[], |_| {})
+        Self::on(Kernel::Present, program, limits)
+    }
+
+    /// The same on this kernel.
+    pub(super) fn on(kernel: Kernel, program: &Path, limits: StageLimits) -> Self {
+        Self::begin(kernel, program, limits, &[], |_| {})
     }
 
     /// The same, with posters in the node's own process: these arguments, and whoever hears what they tell.
     pub(super) fn with_residents(
+        program: &Path,
+        limits: StageLimits,
+        residents: &[String],
+        hear: impl FnMut(&str) + Send + 'static,
+    ) -> Self {
+        Self::begin(Kernel::Present, program, limits, residents, hear)
+    }
+
+    fn begin(
+        kernel: Kernel,
         program: &Path,
         limits: StageLimits,
         residents: &[String],
@@ -62,9 +99,11 @@ impl Stage {
              [lncl]\nsocket = {socket:?}\nclients_max = {clients_max}\nclients_per_process_max = {share}\n[ndl]\nmulticast = false\nmdns_port = false\n"
         );
         std::fs::write(&config, text).expect("the test's own directory");
-        let (node, answers) = open(program, &directory, residents, hear);
+        let preload = (kernel == Kernel::WithoutPassRights)
+            .then(|| Preload::build(&directory.join(""), "old_kernel", include_str!("old_kernel.c")));
+        let (node, answers) = open((program, preload.as_ref()), &directory, residents, hear);
         let (program, residents) = (program.to_owned(), residents.to_owned());
-        let stage = Self { program, residents, node, answers, directory };
+        let stage = Self { program, preload, residents, node, answers, directory };
         stage.wait_for("open");
         stage
     }
@@ -75,7 +114,8 @@ impl Stage {
     /// If it does not start.
     pub fn replace_node(&mut self) {
         self.node.kill_now();
-        (self.node, self.answers) = open(&self.program, &self.directory, &self.residents, |_| {});
+        (self.node, self.answers) =
+            open((&self.program, self.preload.as_ref()), &self.directory, &self.residents, |_| {});
         self.wait_for("open");
     }
 
@@ -102,7 +142,8 @@ impl Stage {
     ) -> Performer {
         let socket = self.socket().display().to_string();
         let arguments: Vec<String> = [socket].into_iter().chain(arguments.iter().cloned()).collect();
-        Performer::start(&self.program, role, &arguments, &self.directory.join("tmp"), hear)
+        let program = (&*self.program, self.preload.as_ref());
+        start(program, role, &arguments, &self.directory, hear)
     }
 
     /// The path of the node's socket.
@@ -164,9 +205,25 @@ impl Stage {
     }
 }
 
+/// A program, and what it loads before its C library.
+type Loaded<'a> = (&'a Path, Option<&'a Preload>);
+
+fn start(
+    (program, preload): Loaded<'_>,
+    role: &str,
+    arguments: &[String],
+    directory: &OwnDirectory,
+    hear: impl FnMut(&str) + Send + 'static,
+) -> Performer {
+    let temporary = directory.join("tmp");
+    let preload = preload.map(|library| (Preload::VARIABLE, library.path()));
+    let environment: Vec<_> = [("TMPDIR", &*temporary)].into_iter().chain(preload).collect();
+    Performer::start_with(program, role, arguments, &environment, hear)
+}
+
 /// Starts a node with the stage's configuration: its process, and what it says to its director.
 fn open(
-    program: &Path,
+    program: Loaded<'_>,
     directory: &OwnDirectory,
     residents: &[String],
     mut hear: impl FnMut(&str) + Send + 'static,
@@ -174,7 +231,7 @@ fn open(
     let (say, answers) = sync_channel(64);
     let config = directory.join("node.toml").display().to_string();
     let arguments: Vec<_> = [config].into_iter().chain(residents.iter().cloned()).collect();
-    let node = Performer::start(program, "door", &arguments, &directory.join("tmp"), move |line| {
+    let node = start(program, "door", &arguments, directory, move |line| {
         if line.starts_with(|first: char| first.is_ascii_digit()) {
             return hear(line);
         }

@@ -17,12 +17,13 @@ use super::{
     Plan,
     node::wall_seconds,
     trouble::Trouble,
-    wall_clock::{JUMP, Library, WallClock},
+    wall_clock::{self, JUMP, WallClock},
 };
 use crate::{
     DEADLINE, OwnDirectory,
     clients::Performer,
     history::{Fault, History, Party, Station, Verdict},
+    preload::Preload,
     proxy::{Counts, Cut, Door, Proxy, Side},
     unique, until,
 };
@@ -69,7 +70,7 @@ pub(super) struct Pair {
     members: [Member; 2],
     directory: OwnDirectory,
     /// Where wall clocks are to be set.
-    clocks: Option<Library>,
+    clocks: Option<Preload>,
 }
 
 impl Pair {
@@ -94,7 +95,7 @@ impl Pair {
         let (history, directory) = (Shared::default(), OwnDirectory::new());
         let sets_clocks =
             plan.troubles.iter().any(|one| matches!(one, Trouble::ClockOn | Trouble::ClockBack));
-        let clocks = sets_clocks.then(|| Library::build(&directory.join("")));
+        let clocks = sets_clocks.then(|| wall_clock::library(&directory.join("")));
         let members = [FIRST, SECOND].map(|station| {
             let interface = own_interface();
             start((station, 1), interface, (plan, &proxy), (&history, &directory, clocks.as_ref()))
@@ -290,7 +291,7 @@ fn start(
     (station, life): (Station, u32),
     interface: Ipv4Addr,
     (plan, proxy): (&Plan, &Proxy),
-    (history, directory, clocks): (&Shared, &OwnDirectory, Option<&Library>),
+    (history, directory, clocks): (&Shared, &OwnDirectory, Option<&Preload>),
 ) -> Member {
     let (announce, seeds) = if station == FIRST {
         (proxy.address(TO_FIRST), format!("[\"{}\"]", proxy.address(TO_SECOND_UDP)))

@@ -3,14 +3,27 @@
 use std::time::Duration;
 
 use sinew_tests::{
-    clients::hostile::{Plan, run},
+    clients::{
+        Kernel,
+        hostile::{Plan, run},
+    },
     program,
 };
 
+fn attack(kernel: Kernel) {
+    let seed = u64::from(std::process::id());
+    let lasts = Duration::from_secs(5);
+    let report = run(Plan { program: program("hostile_client"), lasts, seed, kernel });
+    println!("{report}");
+    assert!(report.holds(), "replay with `--bin hostile_client -- --seed {seed}`, on {kernel}:\n{report}");
+}
+
 #[test]
 fn a_node_lives_within_its_bounds_and_serves_the_others_whatever_a_client_does() {
-    let seed = u64::from(std::process::id());
-    let report = run(Plan { program: program("hostile_client"), lasts: Duration::from_secs(5), seed });
-    println!("{report}");
-    assert!(report.holds(), "replay with `--bin hostile_client -- --seed {seed}`:\n{report}");
+    attack(Kernel::Present);
+}
+
+#[test]
+fn so_it_does_where_the_kernel_cannot_refuse_descriptors() {
+    attack(Kernel::WithoutPassRights);
 }

@@ -4,7 +4,10 @@
 use std::{
     io,
     ops::{Deref, DerefMut},
-    os::fd::{AsFd, OwnedFd},
+    os::{
+        fd::{AsFd, OwnedFd},
+        unix::net::UnixStream,
+    },
     path::Path,
 };
 
@@ -164,6 +167,16 @@ impl RingEnd {
         let head = self.read_word(TAIL)?;
         self.region.scribble(HEAD, head);
         self.press(2)
+    }
+
+    /// Whether the other's bells are sockets.
+    pub(super) fn has_bells(&self) -> bool {
+        self.victim.bell() == BellKind::Socket
+    }
+
+    /// The socket of the other's bell number `bell`, from 1 on.
+    pub(super) fn bell(&self, bell: usize) -> io::Result<UnixStream> {
+        Ok(self.victim.descriptors()[bell].try_clone()?.into())
     }
 
     /// Rings one of the other's bells.

@@ -1,5 +1,6 @@
 //! What a hostile client does to a node, one trick after the other.
 
+mod lingering;
 mod links;
 mod meetings;
 
@@ -50,12 +51,18 @@ pub(super) struct Tally {
     pub(super) lies: u64,
     /// Direct links with other processes.
     pub(super) links: u64,
+    /// Descriptors that take for ever to close which were passed to somebody.
+    pub(super) lingering: u64,
+    /// Those of them that the system did not refuse.
+    pub(super) lingering_came: u64,
 }
 
 /// A hostile client of the node at a socket.
 pub(super) struct Attacker {
     socket: PathBuf,
     dice: Dice,
+    /// The port of the one who keeps the other ends of what does not close.
+    keeper: u16,
     /// Connections that stay silent, in mid-frame or before the first one.
     silent: Vec<Stranger>,
     pub(super) tally: Tally,
@@ -69,13 +76,13 @@ const TRICK: Duration = Duration::from_millis(500);
 const SILENT_MAX: usize = 16;
 
 impl Attacker {
-    pub(super) fn new(socket: &Path, dice: Dice) -> Self {
-        Self { socket: socket.to_owned(), dice, silent: Vec::new(), tally: Tally::default() }
+    pub(super) fn new(socket: &Path, dice: Dice, keeper: u16) -> Self {
+        Self { socket: socket.to_owned(), dice, keeper, silent: Vec::new(), tally: Tally::default() }
     }
 
     /// Plays one trick. What the node answers to it, or that it closes, is no error.
     pub(super) fn play_one(&mut self) {
-        const TRICKS: [Trick; 18] = [
+        const TRICKS: [Trick; 23] = [
             Attacker::garbage,
             Attacker::mutants,
             Attacker::forged_sources,
@@ -94,6 +101,11 @@ impl Attacker {
             Attacker::deaf_link,
             Attacker::odd_link,
             Attacker::lure,
+            Attacker::lingering_stranger,
+            Attacker::lingering_frame,
+            Attacker::lingering_bell,
+            Attacker::lingering_link,
+            Attacker::lingering_offer,
         ];
         self.tally.tricks += 1;
         let trick = TRICKS[self.dice.below(TRICKS.len() as u32) as usize];

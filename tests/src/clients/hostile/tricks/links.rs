@@ -30,18 +30,18 @@ payload!("hostile.switching" => struct Switch { peer: u64, number: u64 });
 const OFFER: Duration = Duration::from_millis(300);
 
 /// A hostile client whose victim has agreed to a link.
-struct Met {
+pub(super) struct Met {
     node: HostileRing,
     /// The end of the link's socket, and its number.
-    socket: UnixStream,
+    pub(super) socket: UnixStream,
     number: u64,
     victim: Tid,
 }
 
 /// A link whose both sides have offered their memory.
-struct Link {
-    met: Met,
-    end: RingEnd,
+pub(super) struct Link {
+    pub(super) met: Met,
+    pub(super) end: RingEnd,
 }
 
 impl Met {
@@ -156,7 +156,7 @@ impl Attacker {
     }
 
     /// A link as an honest client makes it.
-    fn join_link(&mut self) -> io::Result<Link> {
+    pub(super) fn join_link(&mut self) -> io::Result<Link> {
         let mut met = self.meet()?;
         let theirs = met.offer()?;
         let (capacity, bell) = self.odd_ring();

@@ -1,0 +1,123 @@
+//! Descriptors that take for ever to close, passed where the node or a host may find them: before a registration, beside a frame, on a
+//! bell, where an offer is due. Who closes one waits until its other end is closed, and that is in the hands of the director.
+//!
+//! Where the kernel refuses them (Linux from 6.16 on) they only come where an offer is due.
+
+use std::{
+    collections::VecDeque,
+    io::{self, ErrorKind, Write},
+    net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream},
+    os::{fd::OwnedFd, unix::net::UnixStream},
+    sync::atomic::{AtomicBool, Ordering},
+    thread,
+    time::{Duration, Instant},
+};
+
+use rustix::net::{
+    AddressFamily, SocketFlags, SocketType, socketpair,
+    sockopt::{set_socket_linger, set_socket_recv_buffer_size, set_socket_send_buffer_size},
+};
+use sinew_shm::Offer;
+
+use super::stranger::pass;
+
+/// So long the other end is kept: longer than anybody may be held up.
+pub(super) const KEPT: Duration = Duration::from_secs(3);
+/// Time between two looks for new ones and old ones.
+const LOOK: Duration = Duration::from_millis(20);
+/// Ends that are kept at once. The oldest goes before its time where there are more.
+const KEPT_MAX: usize = 1_024;
+
+/// The director's: keeps the other ends.
+pub(super) struct Keeper(TcpListener);
+
+impl Keeper {
+    /// Listens on loopback.
+    pub(super) fn new() -> Self {
+        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a port on loopback");
+        listener.set_nonblocking(true).expect("a port on loopback");
+        // So little is taken, though nobody reads.
+        set_socket_recv_buffer_size(&listener, 4_096).expect("a port on loopback");
+        Self(listener)
+    }
+
+    pub(super) fn port(&self) -> u16 {
+        self.0.local_addr().expect("a port on loopback").port()
+    }
+
+    /// Keeps each end for its time, until it is told not to.
+    pub(super) fn keep(&self, over: &AtomicBool) {
+        let mut kept = VecDeque::new();
+        while !over.load(Ordering::Relaxed) {
+            while let Ok((end, _)) = self.0.accept() {
+                kept.push_back((Instant::now(), end));
+            }
+            while kept.front().is_some_and(|(since, _)| since.elapsed() >= KEPT) || kept.len() > KEPT_MAX {
+                kept.pop_front();
+            }
+            thread::sleep(LOOK);
+        }
+    }
+}
+
+/// What became of one that was passed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Passed {
+    /// It is on its way.
+    Came,
+    /// The system has refused it.
+    Refused,
+}
+
+/// A connection whose last close waits for the keeper.
+struct Lingering(TcpStream);
+
+impl Lingering {
+    fn connect(keeper: u16) -> io::Result<Self> {
+        let mut stream = TcpStream::connect(SocketAddr::from((Ipv4Addr::LOCALHOST, keeper)))?;
+        set_socket_send_buffer_size(&stream, 16 * 1_024)?;
+        stream.set_nonblocking(true)?;
+        let chunk = [0; 4 * 1_024];
+        loop {
+            match stream.write(&chunk) {
+                Ok(_) => {}
+                Err(error) if error.kind() == ErrorKind::WouldBlock => break,
+                Err(error) => return Err(error),
+            }
+        }
+        set_socket_linger(&stream, Some(Duration::from_secs(3_600)))?;
+        Ok(Self(stream))
+    }
+}
+
+/// Passes one with `bytes`, and keeps no copy.
+pub(super) fn pass_lingering(keeper: u16, socket: &UnixStream, bytes: &[u8]) -> io::Result<Passed> {
+    let lingering = Lingering::connect(keeper)?.0;
+    let copies = [lingering.try_clone()?.into()];
+    let passed = pass(socket, bytes, &copies);
+    let is_refused = |error: &io::Error| error.raw_os_error() == Some(rustix::io::Errno::PERM.raw_os_error());
+    let became = match passed {
+        Ok(()) => Ok(Passed::Came),
+        Err(error) if is_refused(&error) => Ok(Passed::Refused),
+        Err(error) => Err(error),
+    };
+    if !matches!(became, Ok(Passed::Came)) {
+        set_socket_linger(&lingering, None)?;
+    }
+    // The victim may have closed its copy, so that this is the last one: then the hostile one does not wait either.
+    thread::spawn(move || drop((copies, lingering)));
+    became
+}
+
+/// An offer like `model` whose bell for messages has one in it already.
+pub(super) fn offer_with_full_bells(keeper: u16, model: &Offer) -> io::Result<(Offer, Vec<OwnedFd>)> {
+    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+    let pair = || socketpair(AddressFamily::UNIX, SocketType::STREAM, flags, None);
+    let ((message, message_ear), (room, room_ear)) = (pair()?, pair()?);
+    let ear = UnixStream::from(message_ear);
+    pass_lingering(keeper, &ear, b"1")?;
+    let memory = model.descriptors()[0].try_clone()?;
+    let offer =
+        Offer::from_parts(&model.to_bytes(), vec![memory, message, room]).map_err(io::Error::other)?;
+    Ok((offer, vec![ear.into(), room_ear]))
+}
