@@ -1,4 +1,4 @@
-//! Whether descriptors may come over a unix socket. The only unsafe code beside that about memory: one block.
+//! Whether descriptors may come over a unix socket. The only unsafe code of this package beside that about memory (`mapping`): one block.
 
 use std::{
     io,
