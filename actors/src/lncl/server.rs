@@ -262,7 +262,46 @@ pub(super) fn say_why(server: &Server, stream: &UnixStream, why: &dyn std::fmt::
 
 #[cfg(test)]
 mod tests {
+    use std::{
+        io::IoSlice, mem::MaybeUninit, os::fd::AsFd, os::unix::net::UnixStream as Plain,
+        sync::mpsc::sync_channel,
+    };
+
+    use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
+    use sinew_runtime::tid::Incarnation;
+
     use super::*;
+    use crate::{config::NodeConfig, lingering::Lingering, lncl::testing::WATCHDOG};
+
+    // spec: LNCL-18
+    #[test]
+    fn who_ends_a_connection_does_not_wait_for_what_is_unread_in_it() {
+        // Given: a connection in which lies what does not close, and of which nobody has a copy.
+        let (ours, theirs) = Plain::pair().unwrap();
+        ours.set_nonblocking(true).unwrap();
+        let mut lingering = Lingering::new();
+        let passed = lingering.ours.take().expect("it is passed once");
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
+        let mut control = SendAncillaryBuffer::new(&mut space);
+        let descriptors = [passed.as_fd()];
+        assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)));
+        sendmsg(&theirs, &[IoSlice::new(b"S")], &mut control, SendFlags::empty()).unwrap();
+        drop(passed);
+        // When:
+        let (say, said) = sync_channel(1);
+        std::thread::spawn(move || {
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+            let _inside = runtime.enter();
+            let server = Server::new(Stores::for_test(NodeConfig::new("hip"), Incarnation(1)));
+            let stream = Arc::new(UnixStream::from_std(ours).unwrap());
+            drop(Connected { server, stream });
+            // The test has ended, where this comes too late.
+            let _ = say.send(());
+        });
+        // Then:
+        assert_eq!(said.recv_timeout(WATCHDOG), Ok(()));
+        lingering.let_go();
+    }
 
     #[test]
     fn only_the_nodes_own_user_and_root_are_admitted() {

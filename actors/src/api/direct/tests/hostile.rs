@@ -99,6 +99,21 @@ fn a_descriptor_for_the_node_ends_its_senders_connection_in_words_and_is_closed(
     assert!(third.receive(WATCHDOG).unwrap().is_some());
 }
 
+// spec: LNCL-18
+#[test]
+fn once_the_rings_are_made_the_system_lets_no_descriptor_come_to_the_node() {
+    let node = TestNode::start();
+    let (mut one, mut other) = (endpoint(&node), endpoint(&node));
+    link(&mut one, &mut other);
+    let (given, _kept) = UnixStream::pair().unwrap();
+    if sinew_shm::set_descriptors(&given, sinew_shm::Descriptors::Refused).is_err() {
+        // A kernel before 6.16: the test before this one says what becomes of it.
+        return;
+    }
+    let control = one.direct.control.clone().expect("the socket to the node");
+    assert_eq!(try_to_pass(&control, &given), Err(Errno::PERM));
+}
+
 #[test]
 fn what_the_node_says_of_links_that_are_none_changes_nothing() {
     let node = TestNode::start();
@@ -144,12 +159,16 @@ fn who_only_sends_hears_of_the_end_of_a_peer_that_takes_nothing_and_whose_link_d
 
 /// Sends a descriptor where the protocol has none; bytes alone, if the system lets none come (from Linux 6.16 on).
 fn pass(socket: &UnixStream, descriptor: &UnixStream) {
+    match try_to_pass(socket, descriptor) {
+        Err(Errno::PERM) => assert_eq!(send(socket, &[0; 8], SendFlags::empty()), Ok(8)),
+        sent => assert_eq!(sent, Ok(8)),
+    }
+}
+
+fn try_to_pass(socket: &UnixStream, descriptor: &UnixStream) -> Result<usize, Errno> {
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
     let mut control = SendAncillaryBuffer::new(&mut space);
     let descriptors = [descriptor.as_fd()];
     assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)));
-    match sendmsg(socket, &[IoSlice::new(&[0; 8])], &mut control, SendFlags::empty()) {
-        Err(Errno::PERM) => assert_eq!(send(socket, &[0; 8], SendFlags::empty()), Ok(8)),
-        sent => assert_eq!(sent, Ok(8)),
-    }
+    sendmsg(socket, &[IoSlice::new(&[0; 8])], &mut control, SendFlags::empty())
 }
