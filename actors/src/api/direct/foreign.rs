@@ -152,7 +152,7 @@ mod tests {
         let mut control = SendAncillaryBuffer::new(&mut space);
         let descriptors = [passed.as_fd()];
         assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)));
-        sendmsg(socket, &[IoSlice::new(&[1])], &mut control, SendFlags::empty()).unwrap();
+        sendmsg(socket, &[IoSlice::new(&[1])], &mut control, SendFlags::empty()).expect("it comes");
     }
 
     /// Whether a thread is done with it before the one who has passed it lets go.

@@ -251,8 +251,8 @@ mod tests {
 
     /// The offer of a ring, with what else is passed beside it.
     fn offer_to(socket: &UnixStream) {
-        let exchange = Exchange::prepare(rings::capacity(4_096), BellKind::Futex).unwrap();
-        exchange.offer(socket).unwrap();
+        let exchange = Exchange::prepare(rings::capacity(4_096), BellKind::Futex).expect("a ring");
+        exchange.offer(socket).expect("it comes");
     }
 
     fn pass(socket: &UnixStream, descriptor: impl AsFd) -> Result<usize, Errno> {
