@@ -11,8 +11,8 @@ use sinew_runtime::{
 /// Why an operation of NodeAPI failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ApiError {
-    /// Nobody listens at the path. The environment is at fault; nothing changed.
-    #[error("no node can be reached at {path:?}: {cause}; does it run, with this path as its `lncl.socket`?")]
+    /// Nobody listens at the path, or this process may not connect to who does. The environment is at fault; nothing changed.
+    #[error("no node can be reached at {path:?}: {cause}; {}", way_to_a_node(cause))]
     NoNode {
         /// The path.
         path: PathBuf,
@@ -130,6 +130,16 @@ fn not_handled(outcome: Outcome) -> String {
     format!("no reply, {outcome:?}: {why}")
 }
 
+/// What to do about a node that cannot be reached. spec: LNCL-2
+fn way_to_a_node(cause: &io::Error) -> &'static str {
+    if cause.kind() == io::ErrorKind::PermissionDenied {
+        "this process's user may not open that socket: a node serves the user that it runs as, and root; run the application \
+         as that user, and see that it may enter the socket's directories"
+    } else {
+        "does it run, with this path as its `lncl.socket`?"
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use sinew_runtime::outcome::Rejection;
@@ -141,6 +151,7 @@ mod tests {
         let second = Duration::from_secs(1);
         let mut all = vec![
             ApiError::NoNode { path: "/run/knee.sock".into(), cause: io::ErrorKind::NotFound.into() },
+            ApiError::NoNode { path: "/run/knee.sock".into(), cause: io::ErrorKind::PermissionDenied.into() },
             ApiError::NotAPath { path: PathBuf::new(), why: "it is empty" },
             ApiError::Waiting { missing: vec!["hip".to_owned()], waited: second },
             ApiError::NoAnswer(second),
@@ -170,6 +181,9 @@ mod tests {
             // The brackets of `Debug` and the names of our types are no words of a control engineer's.
             assert!(!text.contains("ApiError") && !text.contains('{'), "{text}");
         }
+        let forbidden =
+            ApiError::NoNode { path: PathBuf::new(), cause: io::ErrorKind::PermissionDenied.into() };
+        assert!(forbidden.to_string().contains("the user that it runs as, and root"), "{forbidden}");
         let no_room = ApiError::Ended(Outcome::Rejected(Rejection::QueueFull)).to_string();
         assert!(no_room.contains("more slowly than they come"), "{no_room}");
     }

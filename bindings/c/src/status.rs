@@ -140,7 +140,7 @@ impl Status {
                 c"this endpoint belongs to the process that this one was forked from; register an own one"
             }
             Self::SinewErrorLent => {
-                c"a message of this endpoint is lent; send or discard it first"
+                c"a message of this endpoint is lent; hand it to sinew_send_message or sinew_discard_message first"
             }
             Self::SinewErrorAway => {
                 c"the connection to the node has ended; the endpoint registers again by itself while it is used"
@@ -223,6 +223,11 @@ fn in_c(error: &ApiError) -> String {
         ApiError::NotYours(kind) => {
             format!("the kind {kind} belongs to Sinew's layers; take one from sinew_kind_named")
         }
+        ApiError::Lent => {
+            "a message of this endpoint is lent, before which nothing else goes out; hand it to \
+                           sinew_send_message or sinew_discard_message first"
+                .to_owned()
+        }
         ApiError::Ended(outcome) => text_of(*outcome).to_string_lossy().into_owned(),
         ApiError::Away(why) => format!(
             "the connection to the node has ended: {why}; the endpoint registers again by itself, go on with \
@@ -235,7 +240,6 @@ fn in_c(error: &ApiError) -> String {
         | ApiError::NoAnswer(_)
         | ApiError::Closed(_)
         | ApiError::Stalled(_)
-        | ApiError::Lent
         | ApiError::TooLong { .. }
         | ApiError::TooManyGroups
         | ApiError::NoReply(_)
