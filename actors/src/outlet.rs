@@ -43,7 +43,7 @@ use sinew_runtime::{
     time::Time,
     wire::{Checksum, Message},
 };
-use tokio::net::{TcpStream, UnixStream};
+use tokio::net::UnixStream;
 
 use crate::session::{Ack, Sent};
 
@@ -122,21 +122,6 @@ pub(crate) trait Socket: Send + 'static {
 pub(crate) struct Account {
     pub(crate) written: u64,
     pub(crate) taken: u64,
-}
-
-impl Socket for Arc<TcpStream> {
-    fn piece_max(&self) -> usize {
-        // About 20 us of copying.
-        64 << 10
-    }
-
-    fn try_write_vectored(&mut self, parts: &[IoSlice<'_>]) -> io::Result<usize> {
-        TcpStream::try_write_vectored(self, parts)
-    }
-
-    fn poll_writable(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        self.poll_write_ready(cx)
-    }
 }
 
 impl Socket for Arc<UnixStream> {

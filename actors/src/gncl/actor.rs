@@ -5,6 +5,7 @@ mod leaving;
 #[cfg(target_os = "linux")]
 mod lost_addresses;
 mod membership;
+mod proven;
 mod wire;
 
 use std::{
@@ -37,8 +38,10 @@ use super::{
     link::{self, Mode, News, Reading, SharedMode, What},
     listener, marks,
     peer::{Store, frame},
+    secure::Secure,
     spin::Spin,
     task::{self, Move},
+    transport::Transport,
 };
 use crate::{
     config::NodeConfig,
@@ -48,7 +51,8 @@ use crate::{
     sync,
 };
 pub(crate) use leaving::LINGER;
-use wire::{Wire, shut};
+use proven::NOT_PROVEN;
+use wire::Wire;
 
 /// GNCL's actor.
 pub(crate) struct Gncl {
@@ -57,6 +61,8 @@ pub(crate) struct Gncl {
     core: Core,
     wires: BTreeMap<ConnectionId, Wire>,
     spin: Arc<Spin>,
+    /// How peers prove who they are; `None`: they do not.
+    secure: Option<Arc<Secure>>,
     alarm: Option<(Time, SpawnHandle)>,
     /// When it goes, whoever has not hung up; set once the node is being stopped.
     goes_at: Option<Time>,
@@ -68,7 +74,8 @@ impl Gncl {
         let seed = Time::now().as_nanos() ^ u64::from(stores.node.bits());
         let core = Core::new(settings(&stores), seed);
         let spin = Arc::new(Spin::new(stores.config.gncl.spin));
-        Self { stores, ready: Some(ready), core, wires: BTreeMap::new(), spin, alarm: None, goes_at: None }
+        let wires = BTreeMap::new();
+        Self { stores, ready: Some(ready), core, wires, spin, secure: None, alarm: None, goes_at: None }
     }
 
     /// Whether the node is being stopped.
@@ -148,15 +155,16 @@ impl Gncl {
 
     fn reading(&self, mode: &SharedMode) -> Reading {
         let NodeConfig { payload_max, gncl, .. } = &self.stores.config;
-        Reading { mode: mode.clone(), payload_max: *payload_max, give_up: gncl.give_up }
+        let (payload_max, give_up) = (*payload_max, gncl.give_up);
+        Reading { mode: mode.clone(), payload_max, give_up, secure: self.secure.clone() }
     }
 
     fn accepted(&mut self, socket: TcpStream, ctx: &mut Context<Self>) {
-        let (connection, socket) = (self.core.open(), Arc::new(socket));
+        let (connection, transport) = (self.core.open(), Transport::open(socket));
         let mode = Arc::new(Mutex::new(Mode::Handshake));
         let reading = self.reading(&mode);
-        let reader = ctx.add_stream(link::read(connection, socket.clone(), reading));
-        self.wires.insert(connection, Wire::new(Some(socket), mode, reader));
+        let reader = ctx.add_stream(link::read(connection, transport.clone(), reading));
+        self.wires.insert(connection, Wire::new(Some(transport), mode, reader));
         self.input(Input::Accepted(connection), ctx);
     }
 
@@ -182,14 +190,14 @@ impl Gncl {
         ctx: &mut Context<Self>,
     ) {
         let Some(wire) = self.wires.get_mut(&connection) else { return };
-        let (Some(socket), may_speak) = (wire.socket.clone(), wire.may_speak) else { return };
+        let (Some(transport), may_speak) = (wire.transport.clone(), wire.may_speak) else { return };
         let task = async move {
-            if may_speak && link::write_frame(&socket, &words).await.is_err() {
+            if may_speak && link::write_frame(transport.clone(), &words).await.is_err() {
                 // The reader meets the same error, and tells the core.
                 return;
             }
             if then == AfterSpeaking::Hush {
-                shut(&socket, Shutdown::Write);
+                transport.shut(Shutdown::Write);
             }
         };
         wire.tasks.push(ctx.spawn(fut::wrap_future(task)));
@@ -198,25 +206,25 @@ impl Gncl {
     fn attach(&mut self, attach: &Attach, ctx: &mut Context<Self>) {
         let Attach { connection, node, lane, .. } = *attach;
         let Some(wire) = self.wires.get_mut(&connection) else { return };
-        let Some(socket) = wire.socket.clone() else { return };
+        let Some(transport) = wire.transport.clone() else { return };
         let peer = self.stores.gncl.meet(Time::now(), attach, &self.stores);
         let Some(way) = peer.way(lane) else { return };
         let words = attach.welcome.as_ref();
         let welcome = words.map(|words| frame(self.stores.node, node, Kind::GNCL_WELCOME, write(words)));
         if attach.by_class && self.stores.config.gncl.marks {
-            marks::mark(&socket, lane);
+            marks::mark(transport.socket(), lane);
         }
         let payload_max = usize::try_from(attach.payload_max).unwrap_or(usize::MAX);
-        let Move { place, socket } = self.stores.gncl.place(lane, socket);
-        wire.socket = Some(socket.clone());
+        let Move { place, transport } = self.stores.gncl.place(lane, transport);
+        wire.transport = Some(transport.clone());
         let checksum = attach.checksum();
-        let link = way.outlet.connect(Gathering::new(socket.clone(), checksum), payload_max, welcome);
+        let link = way.outlet.connect(Gathering::new(transport.clone(), checksum), payload_max, welcome);
         way.attach(link);
         let spin = if place.is_here() { self.spin.clone() } else { Arc::default() };
         let (stores, peer_there) = (self.stores.clone(), peer.clone());
         let outcomes = RefCell::default();
         let inbound = Inbound { stores, peer: peer_there, spin, lane, link, checksum, outcomes };
-        wire.set_mode(Mode::Moves(inbound, Move { place: place.clone(), socket }));
+        wire.set_mode(Mode::Moves(inbound, Move { place: place.clone(), transport }));
         self.stores.router.set_peer(node, peer.clone());
         let there = place.clone();
         let drainer = place.begin(async move {
@@ -255,8 +263,8 @@ impl Gncl {
         for task in wire.tasks.into_iter().chain(drainer) {
             ctx.cancel_future(task);
         }
-        if let Some(socket) = wire.socket {
-            shut(&socket, Shutdown::Both);
+        if let Some(transport) = wire.transport {
+            transport.shut(Shutdown::Both);
         }
     }
 
@@ -305,12 +313,12 @@ impl Gncl {
     fn input_of(&self, connection: ConnectionId, message: &Message) -> Result<Input, Decline> {
         let introduction = || -> Result<Introduction, Decline> {
             let introduction: Introduction = read(&message.payload)?;
-            if introduction.node == message.header.source.node {
-                return Ok(introduction);
+            if introduction.node != message.header.source.node {
+                let what = "the source of this frame is another node than its sender says";
+                return Err(Decline::Violation(what.to_owned()));
             }
-            Err(Decline::Violation(
-                "the source of this frame is another node than its sender says".to_owned(),
-            ))
+            self.is_who_was_proven(connection, &introduction)?;
+            Ok(introduction)
         };
         match message.header.kind {
             Kind::GNCL_HELLO => Ok(Input::HelloReceived(connection, introduction()?)),
@@ -342,7 +350,8 @@ enum AfterSpeaking {
 
 fn settings(stores: &Stores) -> Settings {
     let NodeConfig { name, project, payload_max, gncl, ndl, .. } = stores.config.clone();
-    let datagrams = gncl.datagrams.then_some(DATAGRAMS);
+    // What is sealed is a connection: a datagram would go as it is.
+    let datagrams = (gncl.datagrams && stores.tls.get().is_none()).then_some(DATAGRAMS);
     let features = [CLASSES, CANCEL, GUARD, OUTCOMES].into_iter().chain(datagrams);
     Settings {
         ours: Introduction {
@@ -374,6 +383,7 @@ impl Actor for Gncl {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Context<Self>) {
+        self.begin_to_prove();
         let listeners = self.listen().unwrap_or_else(|error| {
             let config = &self.stores.config;
             let (interface, port) = (config.ndl.interface, config.gncl.port);
@@ -443,10 +453,12 @@ impl StreamHandler<News> for Gncl {
     fn handle(&mut self, news: News, ctx: &mut Context<Self>) {
         let connection = news.connection;
         match news.what {
-            What::Connected(socket) => {
-                self.wires.entry(connection).and_modify(|wire| wire.socket = Some(socket));
+            What::Connected(transport, peer) => {
+                self.proven(connection, transport, peer.as_deref());
                 self.input(Input::Connected(connection), ctx);
             }
+            What::Proven(transport, peer) => self.proven(connection, transport, Some(&*peer)),
+            What::Unproven(why) => self.unproven(connection, &why, ctx),
             What::DialFailed(error) => {
                 crate::log::debug!(%error, "dial failed");
                 if listener::is_starved(&error) {
@@ -454,6 +466,9 @@ impl StreamHandler<News> for Gncl {
                 }
                 if let Some((node, address)) = self.core.dialled(connection) {
                     self.stores.gncl.notes.dial_failed(Time::now(), node, address, error.to_string());
+                }
+                if error.kind() == io::ErrorKind::InvalidData {
+                    self.stores.gncl.refusals.count(Time::now(), NOT_PROVEN, &error);
                 }
                 let refused = error.kind() == io::ErrorKind::ConnectionRefused;
                 self.input(Input::DialFailed { connection, refused }, ctx);

@@ -22,11 +22,11 @@ pub(super) struct BulkThread {
 impl BulkThread {
     /// # Errors
     /// The system gives no thread, or no descriptors for its reactor.
-    pub(super) fn begin() -> io::Result<Self> {
+    pub(super) fn begin(name: &str) -> io::Result<Self> {
         let runtime = Builder::new_current_thread().enable_io().build()?;
         let handle = runtime.handle().clone();
         let (is_wanted, is_to_end) = oneshot::channel();
-        thread::Builder::new().name("bulk".to_owned()).spawn(move || {
+        thread::Builder::new().name(name.to_owned()).spawn(move || {
             give_way();
             // Nothing is ever said but that nobody wants it any more.
             let _: Result<(), _> = runtime.block_on(is_to_end);

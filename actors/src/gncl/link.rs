@@ -7,7 +7,7 @@ use std::{
     time::Duration,
 };
 
-use bytes::{BufMut, BytesMut};
+use bytes::{BufMut as _, BytesMut};
 use futures_util::{Stream, stream};
 use sinew_runtime::{
     tid::AppAddress,
@@ -16,15 +16,17 @@ use sinew_runtime::{
 };
 #[cfg(target_os = "linux")]
 use socket2::SockRef;
-use tokio::{io::Interest, net::TcpStream};
+use tokio::net::TcpStream;
 use tokio_util::codec::Decoder;
 
 use super::{
     core::{ConnectionId, Decline, HANDSHAKE_PAYLOAD_MAX},
     inbound::Inbound,
+    secure::{self, End, Secure, Unproven},
     task::{Move, Place, ReadingTask},
+    transport::Transport,
 };
-use crate::stores::lock;
+use crate::{security::Peer, stores::lock};
 
 /// Frames that are handled before other tasks of the thread have their turn.
 const FRAMES_PER_WAKE: usize = 64;
@@ -47,8 +49,12 @@ pub(super) struct News {
 
 #[derive(Debug)]
 pub(super) enum What {
-    /// The dial succeeded.
-    Connected(Arc<TcpStream>),
+    /// The dial succeeded; who is there, where that is proven.
+    Connected(Transport, Option<Box<Peer>>),
+    /// Who dialled has proven who it is.
+    Proven(Transport, Box<Peer>),
+    /// Who dialled has not.
+    Unproven(Unproven),
     /// The dial failed.
     DialFailed(io::Error),
     /// A frame of GNCL itself.
@@ -90,10 +96,14 @@ pub(super) fn dial(
 /// Reads from a socket that was accepted.
 pub(super) fn read(
     connection: ConnectionId,
-    socket: Arc<TcpStream>,
+    transport: Transport,
     reading: Reading,
 ) -> impl Stream<Item = News> {
-    news(connection, State::Reading(Reader::new(socket, reading)))
+    let state = match reading.secure {
+        Some(_) => State::Accepted(transport, reading),
+        None => State::Reading(Reader::new(transport, reading)),
+    };
+    news(connection, state)
 }
 
 /// How a connection is read.
@@ -103,10 +113,13 @@ pub(super) struct Reading {
     pub(super) payload_max: usize,
     /// See [`tune`].
     pub(super) give_up: Duration,
+    /// How both sides prove who they are; `None`: they do not.
+    pub(super) secure: Option<Arc<Secure>>,
 }
 
 enum State {
     Dialling(SocketAddr, Reading),
+    Accepted(Transport, Reading),
     Reading(Reader),
     Linked(ReadingTask),
     Over,
@@ -115,13 +128,13 @@ enum State {
 fn news(connection: ConnectionId, state: State) -> impl Stream<Item = News> {
     stream::unfold(state, move |state| async move {
         let (what, state) = match state {
-            State::Dialling(address, reading) => match connect(address, reading.give_up).await {
-                Ok(socket) => {
-                    let socket = Arc::new(socket);
-                    (What::Connected(socket.clone()), State::Reading(Reader::new(socket, reading)))
+            State::Dialling(address, reading) => match reach(address, &reading).await {
+                Ok((transport, peer)) => {
+                    (What::Connected(transport.clone(), peer), State::Reading(Reader::new(transport, reading)))
                 }
                 Err(error) => (What::DialFailed(error), State::Over),
             },
+            State::Accepted(transport, reading) => greeted(transport, reading).await,
             State::Reading(mut reader) => match reader.next().await {
                 Some(what) => (what, State::Reading(reader)),
                 None => match reader.moves() {
@@ -140,6 +153,24 @@ async fn linked(task: ReadingTask) -> (What, State) {
     match task.next().await {
         Some((what, task)) => (what, State::Linked(task)),
         None => (What::Ended, State::Over),
+    }
+}
+
+/// Connects, and has both sides prove who they are.
+async fn reach(address: SocketAddr, reading: &Reading) -> io::Result<(Transport, Option<Box<Peer>>)> {
+    let transport = Transport::open(connect(address, reading.give_up).await?);
+    let Some(secure) = &reading.secure else { return Ok((transport, None)) };
+    let (transport, peer) = secure.greet(transport, End::Dials).await?;
+    Ok((transport, Some(peer)))
+}
+
+async fn greeted(transport: Transport, reading: Reading) -> (What, State) {
+    let Some(secure) = &reading.secure else { return (What::Ended, State::Over) };
+    match secure.greet(transport, End::IsDialled).await {
+        Ok((transport, peer)) => {
+            (What::Proven(transport.clone(), peer), State::Reading(Reader::new(transport, reading)))
+        }
+        Err(unproven) => (What::Unproven(unproven), State::Over),
     }
 }
 
@@ -165,25 +196,16 @@ pub(super) fn tune(socket: &TcpStream, give_up: Duration) -> io::Result<()> {
 }
 
 /// Writes one frame to a connection that is not a link.
-pub(super) async fn write_frame(socket: &TcpStream, message: &Message) -> io::Result<()> {
+pub(super) async fn write_frame(mut transport: Transport, message: &Message) -> io::Result<()> {
     let mut bytes = BytesMut::with_capacity(message.size());
     // Whoever knows no guard reads it, too: nobody looks at its sequence. spec: FRAME-3.1
     bytes.put_slice(&Checksum::Guarded.encode(&message.header, &message.payload));
     bytes.put_slice(&message.payload);
-    let mut rest = &bytes[..];
-    while !rest.is_empty() {
-        socket.writable().await?;
-        match socket.try_write(rest) {
-            Ok(written) => rest = &rest[written..],
-            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
-            Err(error) => return Err(error),
-        }
-    }
-    Ok(())
+    transport.write_all(&bytes).await
 }
 
 pub(super) struct Reader {
-    socket: Arc<TcpStream>,
+    transport: Transport,
     buffer: BytesMut,
     codec: FrameCodec,
     reading: Reading,
@@ -198,6 +220,8 @@ pub(super) struct Reader {
     turn: usize,
     /// Bytes that are asked for next, on a link: more where the last ones came all at once.
     asked: usize,
+    /// Why it is over was said.
+    is_over: bool,
 }
 
 /// How a look at the buffer ended.
@@ -209,9 +233,9 @@ enum Look {
 }
 
 impl Reader {
-    fn new(socket: Arc<TcpStream>, reading: Reading) -> Self {
+    fn new(transport: Transport, reading: Reading) -> Self {
         Self {
-            socket,
+            transport,
             buffer: BytesMut::new(),
             codec: FrameCodec::new(HANDSHAKE_PAYLOAD_MAX),
             reading,
@@ -221,6 +245,7 @@ impl Reader {
             carried: false,
             turn: 0,
             asked: READ_LEN,
+            is_over: false,
         }
     }
 
@@ -232,7 +257,15 @@ impl Reader {
                 Look::Again => self.give_way().await,
                 Look::Moves => return None,
                 Look::Empty if std::mem::take(&mut self.heard) => return Some(What::Heard),
-                Look::Empty => self.fill().await.ok()?,
+                Look::Empty => match self.fill().await {
+                    Ok(()) => {}
+                    // What came was not sealed by the peer, or says that it does not take this node.
+                    Err(error) if error.kind() == io::ErrorKind::InvalidData => {
+                        let why = Unproven::NotTaken(error.to_string());
+                        return (!std::mem::replace(&mut self.is_over, true)).then_some(What::Unproven(why));
+                    }
+                    Err(_) => return None,
+                },
             }
         }
     }
@@ -251,8 +284,8 @@ impl Reader {
             }
         };
         drop(mode);
-        let Move { place, socket } = to;
-        Some(ReadingTask::begin(Self { socket, place: place.clone(), ..self }, &place))
+        let Move { place, transport } = to;
+        Some(ReadingTask::begin(Self { transport, place: place.clone(), ..self }, &place))
     }
 
     fn look(&mut self) -> Look {
@@ -269,6 +302,9 @@ impl Reader {
         };
         if self.buffer.is_empty() {
             return Look::Empty;
+        }
+        if matches!(&*mode, Mode::Handshake) && secure::is_sealed(&self.buffer) {
+            return Look::Tell(What::Violated(Decline::Security(secure::SEALED_WORDS.to_owned())));
         }
         self.codec.set_payload_max(payload_max);
         self.codec.set_checksum(checksum);
@@ -321,34 +357,16 @@ impl Reader {
         if self.turn >= BYTES_PER_TURN {
             self.give_way().await;
         }
-        loop {
-            self.socket.readable().await?;
-            let room = (self.buffer.capacity() - self.buffer.len()).min(BYTES_PER_TURN);
-            match self.socket.try_read_buf(&mut (&mut self.buffer).limit(room)) {
-                Ok(0) => return Err(io::ErrorKind::UnexpectedEof.into()),
-                Ok(count) => {
-                    self.turn += count;
-                    if count < room {
-                        self.asked = READ_LEN;
-                        expect_more(&self.socket);
-                    } else {
-                        self.asked = BYTES_PER_TURN.min(2 * self.asked);
-                    }
-                    return Ok(());
-                }
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
-                Err(error) => return Err(error),
+        let room = (self.buffer.capacity() - self.buffer.len()).min(BYTES_PER_TURN);
+        match self.transport.read(&mut self.buffer, room).await? {
+            0 => Err(io::ErrorKind::UnexpectedEof.into()),
+            count => {
+                self.turn += count;
+                self.asked = if count < room { READ_LEN } else { BYTES_PER_TURN.min(2 * self.asked) };
+                Ok(())
             }
         }
     }
-}
-
-/// Says that a socket has been read empty, so that the next read waits for the kernel's word instead of asking in vain: a read
-/// that fills its room only in part has left nothing, and what comes afterwards is told anew. A system call less for each
-/// message.
-fn expect_more(socket: &TcpStream) {
-    // What is refused here is the very attempt.
-    let _ = socket.try_io(Interest::READABLE, || Err::<(), _>(io::ErrorKind::WouldBlock.into()));
 }
 
 /// Whether this is no word of GNCL itself, and longer than this node takes.

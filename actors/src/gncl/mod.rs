@@ -57,12 +57,14 @@ mod listener;
 mod marks;
 mod notes;
 mod peer;
+mod secure;
 mod spin;
 mod stream_way;
 mod task;
 #[cfg(test)]
 mod tests;
 mod ticks;
+mod transport;
 mod way;
 
 pub(crate) use actor::{Gncl, LINGER};

@@ -24,7 +24,7 @@ use sinew_runtime::{
     wire::{Class, Header, Kind, Message},
 };
 use socket2::SockRef;
-use tokio::{net::TcpStream, sync::Notify};
+use tokio::sync::Notify;
 
 use super::{
     bulk::BulkThread,
@@ -33,6 +33,7 @@ use super::{
     notes::Notes,
     task::{Move, Place},
     ticks::Ticks,
+    transport::Transport,
     way::{Ends, Offered, Way, WayAccount},
 };
 use crate::{
@@ -388,26 +389,26 @@ impl Store {
         }
     }
 
-    /// Where the connections of a lane are read and written from now on, and this one, `socket`, as it is to be used there.
-    pub(super) fn place(&self, lane: Lane, socket: Arc<TcpStream>) -> Move {
+    /// Where the connections of a lane are read and written from now on, and this one, `transport`, as it is to be used there.
+    pub(super) fn place(&self, lane: Lane, transport: Transport) -> Move {
         match lane {
-            Lane::Control | Lane::Stream => Move { place: Place::Here, socket },
-            Lane::Bulk => self.bulk_place(&socket).unwrap_or_else(|error| {
+            Lane::Control | Lane::Stream => Move { place: Place::Here, transport },
+            Lane::Bulk => self.bulk_place(&transport).unwrap_or_else(|error| {
                 // It works there, too; only that Control may wait for Bulk.
                 self.refusals.count(Time::now(), "Bulk stays on the IO thread", &error);
-                Move { place: Place::Here, socket }
+                Move { place: Place::Here, transport }
             }),
         }
     }
 
-    fn bulk_place(&self, socket: &TcpStream) -> io::Result<Move> {
+    fn bulk_place(&self, transport: &Transport) -> io::Result<Move> {
         let mut bulk = lock(&self.bulk);
         if bulk.is_none() {
-            *bulk = Some(BulkThread::begin()?);
+            *bulk = Some(BulkThread::begin("bulk")?);
         }
         let thread = bulk.as_ref().expect("it was made if there was none");
         let place = Place::There(thread.runtime().clone());
-        Ok(Move { place, socket: Arc::new(thread.adopt(socket)?) })
+        Ok(Move { place, transport: transport.with_socket(thread.adopt(transport.socket())?) })
     }
 
     /// Settles what has expired while it waited, and outcomes that do not come any more.

@@ -1,13 +1,16 @@
 //! The tasks of a link: one reads and delivers, one writes what waits. They are no part of the actor, which hears of them only what
 //! it must know: a message costs the turn of one task, however many links there are.
 
-use std::{panic, sync::Arc, thread, time::Duration};
+use std::{panic, thread, time::Duration};
 
 use sinew_runtime::time::Time;
-use tokio::{net::TcpStream, runtime::Handle, sync::mpsc, task};
+use tokio::{runtime::Handle, sync::mpsc, task};
 use tokio_util::task::AbortOnDropHandle;
 
-use super::link::{Reader, What};
+use super::{
+    link::{Reader, What},
+    transport::Transport,
+};
 
 /// News of a link that wait for the shell at most. While there are so many, nothing is read.
 const NEWS_MAX: usize = 8;
@@ -65,7 +68,7 @@ pub(super) async fn end_of<T>(task: AbortOnDropHandle<T>) -> Option<T> {
 pub(super) struct Move {
     pub(super) place: Place,
     /// The same connection, for the tasks of that place.
-    pub(super) socket: Arc<TcpStream>,
+    pub(super) transport: Transport,
 }
 
 /// The reading task of a link, as its shell sees it.

@@ -13,5 +13,6 @@ mod leaving;
 mod links;
 mod messages;
 mod outcomes;
+mod secured;
 mod threads;
 mod ticks;

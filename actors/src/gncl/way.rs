@@ -16,13 +16,13 @@ use sinew_runtime::{
     time::Time,
     wire::{HEADER_LEN, Kind, Message},
 };
-use tokio::net::TcpStream;
 
 use super::{
     arrivals::{Arrivals, End},
     core::Decline,
     peer::frame,
     ticks::Ticks,
+    transport::Transport,
 };
 use crate::{
     config::NodeConfig,
@@ -127,7 +127,7 @@ pub(super) struct Ends {
 
 /// A session with a peer.
 pub(crate) struct Way {
-    pub(crate) outlet: StreamOutlet<Gathering<Arc<TcpStream>>>,
+    pub(crate) outlet: StreamOutlet<Gathering<Transport>>,
     /// Locked for a moment, never with another lock in hand.
     inbox: Mutex<Inbox>,
     /// What the peer may have on its way, where applications take what comes.

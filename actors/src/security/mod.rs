@@ -30,7 +30,7 @@ mod identity;
 mod peer;
 mod replay;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod times;
 mod tls;
 mod verifier;

@@ -21,7 +21,7 @@ impl Gncl {
     /// Connections that are bound to this address.
     fn connections_at(&self, AddressLost(lost): AddressLost) -> Vec<ConnectionId> {
         let is_there = |wire: &super::Wire| {
-            let local = wire.socket.as_ref().and_then(|socket| socket.local_addr().ok());
+            let local = wire.transport.as_ref().and_then(|transport| transport.socket().local_addr().ok());
             local.is_some_and(|local| local.ip() == lost)
         };
         self.wires.iter().filter(|(_, wire)| is_there(wire)).map(|(connection, _)| *connection).collect()

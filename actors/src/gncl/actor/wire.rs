@@ -1,17 +1,19 @@
 //! A connection as the shell has it.
 
-use std::{net::Shutdown, sync::Arc};
-
 use actix::SpawnHandle;
-use socket2::SockRef;
-use tokio::net::TcpStream;
+use sinew_runtime::tid::NodeAddress;
 
-use super::super::link::{Mode, SharedMode};
+use super::super::{
+    link::{Mode, SharedMode},
+    transport::Transport,
+};
 use crate::{outlet::LinkNumber, stores::lock};
 
 /// One connection and what runs for it.
 pub(super) struct Wire {
-    pub(super) socket: Option<Arc<TcpStream>>,
+    pub(super) transport: Option<Transport>,
+    /// Who is at the other end, if its keys have proven it.
+    pub(super) proven: Option<NodeAddress>,
     pub(super) mode: SharedMode,
     /// Which of its peer's connections it is, and what writes there, as long as it is a link.
     pub(super) link: Option<(LinkNumber, SpawnHandle)>,
@@ -21,17 +23,11 @@ pub(super) struct Wire {
 }
 
 impl Wire {
-    pub(super) fn new(socket: Option<Arc<TcpStream>>, mode: SharedMode, reader: SpawnHandle) -> Self {
-        Self { socket, mode, link: None, may_speak: true, tasks: vec![reader] }
+    pub(super) fn new(transport: Option<Transport>, mode: SharedMode, reader: SpawnHandle) -> Self {
+        Self { transport, proven: None, mode, link: None, may_speak: true, tasks: vec![reader] }
     }
 
     pub(super) fn set_mode(&self, mode: Mode) {
         *lock(&self.mode) = mode;
     }
-}
-
-/// Shuts a socket that others may still hold.
-pub(super) fn shut(socket: &TcpStream, how: Shutdown) {
-    // It fails if the peer was faster, and then there is nothing left to shut.
-    let _ = SockRef::from(socket).shutdown(how);
 }

@@ -144,6 +144,8 @@ pub(crate) enum Decline {
     },
     TooLate,
     Leaving,
+    /// It has not proven who it is, or has proven to be another one.
+    Security(String),
 }
 
 impl Decline {
@@ -161,6 +163,7 @@ impl Decline {
             Self::TooManyPeers { .. } | Self::TooManyClaims { .. } => "too many peers",
             Self::TooLate => "too late",
             Self::Leaving => "leaving",
+            Self::Security(_) => "security",
         }
     }
 
@@ -173,7 +176,7 @@ impl Decline {
 impl fmt::Display for Decline {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Violation(what) | Self::Version(what) => f.write_str(what),
+            Self::Violation(what) | Self::Version(what) | Self::Security(what) => f.write_str(what),
             Self::OtherProject { theirs, ours } => write!(
                 f,
                 "you belong to the project '{theirs}' and I to '{ours}'; give both the same project, or keep them on \

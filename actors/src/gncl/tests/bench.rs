@@ -32,6 +32,10 @@ use crate::{
         peer::frame,
     },
     ndl::{self, LossReason, MembershipFact},
+    security::{
+        Identity,
+        tests::ground::{self, Authority},
+    },
     session::Ack,
     stores::Stores,
 };
@@ -92,7 +96,21 @@ impl Node {
         let mut config = NodeConfig::new(format!("node-{number}"));
         config.address = Some(NodeAddress::new(number));
         set(&mut config);
+        Self::begin(Stores::for_test(config, Incarnation(1))).await
+    }
+
+    /// One that has keys of this project, made for a node of this number.
+    pub(super) async fn start_secured(number: u32, keys: &Authority, made_for: u32) -> Self {
+        let mut config = NodeConfig::new(format!("node-{number}"));
+        config.address = Some(NodeAddress::new(number));
+        let (project, name) = (config.project.clone(), format!("node-{made_for}"));
+        let made_for = Identity { project, address: NodeAddress::new(made_for), name };
         let stores = Stores::for_test(config, Incarnation(1));
+        stores.tls.set(ground::tls(&keys.credentials_of(&made_for))).expect("it is set once");
+        Self::begin(stores).await
+    }
+
+    async fn begin(stores: Arc<Stores>) -> Self {
         let outcomes = Post::new(10_000);
         let settled = outcomes.attach();
         let facts = stores.posts.ndl.attach();

@@ -81,7 +81,7 @@ mod tests {
     use tokio_util::codec::Decoder;
 
     use super::{super::Ends, *};
-    use crate::{config::NodeConfig, gncl::core::read, outlet::Gathering};
+    use crate::{config::NodeConfig, gncl::{core::read, transport::Transport}, outlet::Gathering};
 
     // spec: CREDIT-2
     #[tokio::test]
@@ -90,7 +90,7 @@ mod tests {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = listener.local_addr().expect("it is bound");
         let (ours, theirs) = tokio::join!(TcpStream::connect(address), listener.accept());
-        let (ours, mut theirs) = (Arc::new(ours.expect("it listens")), theirs.expect("it dials").0);
+        let (ours, mut theirs) = (ours.expect("it listens"), theirs.expect("it dials").0);
         ours.writable().await.expect("it takes something");
         let mut filled = 0;
         while let Ok(count) = ours.try_write(&[0; 65_536]) {
@@ -100,7 +100,7 @@ mod tests {
         let ends = Ends { here, node, takes_outcomes: true };
         let config = NodeConfig::new("hip");
         let way = Way::new(Time::now(), ends, &config, &Arc::default(), &Arc::default());
-        let link = way.outlet.connect(Gathering::new(ours, Checksum::Crc), 1 << 16, None);
+        let link = way.outlet.connect(Gathering::new(Transport::open(ours), Checksum::Crc), 1 << 16, None);
         way.attach(link);
         // When: one thread has made an acknowledgement, another one makes and says a newer one, and the first one goes on.
         let older = way.next_ack();

@@ -20,16 +20,16 @@ use rustls::{pki_types::UnixTime, time_provider::TimeProvider};
 use crate::security::{Credentials, DiscoveryKey, Identity, TimePolicy, Tls, files as names, project_uri};
 
 /// The time of the tests: 2026-11-22T15:13:00Z.
-pub(super) const NOW: u64 = 1_795_360_380;
-pub(super) const DAY: u64 = 24 * 3_600;
+pub(crate) const NOW: u64 = 1_795_360_380;
+pub(crate) const DAY: u64 = 24 * 3_600;
 
-pub(super) const fn at(seconds: u64) -> UnixTime {
+pub(crate) const fn at(seconds: u64) -> UnixTime {
     UnixTime::since_unix_epoch(Duration::from_secs(seconds))
 }
 
 /// A clock that stands.
 #[derive(Debug)]
-pub(super) struct Clock(pub(super) u64);
+pub(crate) struct Clock(pub(crate) u64);
 
 impl TimeProvider for Clock {
     fn current_time(&self) -> Option<UnixTime> {
@@ -37,42 +37,42 @@ impl TimeProvider for Clock {
     }
 }
 
-pub(super) fn identity(name: &str, last: u8) -> Identity {
+pub(crate) fn identity(name: &str, last: u8) -> Identity {
     Identity { project: "walker".to_owned(), address: [192, 168, 0, last].into(), name: name.to_owned() }
 }
 
 /// An authority.
-pub(super) struct Authority {
+pub(crate) struct Authority {
     params: CertificateParams,
     key: KeyPair,
-    pub(super) pem: String,
-    pub(super) discovery: DiscoveryKey,
+    pub(crate) pem: String,
+    pub(crate) discovery: DiscoveryKey,
 }
 
 /// What a certificate is to say.
-pub(super) struct Wish {
-    pub(super) uris: Vec<String>,
-    pub(super) from: u64,
-    pub(super) until: u64,
-    pub(super) usages: Vec<ExtendedKeyUsagePurpose>,
+pub(crate) struct Wish {
+    pub(crate) uris: Vec<String>,
+    pub(crate) from: u64,
+    pub(crate) until: u64,
+    pub(crate) usages: Vec<ExtendedKeyUsagePurpose>,
 }
 
 impl Wish {
     /// As `sinew keys` makes it.
-    pub(super) fn of(identity: &Identity) -> Self {
+    pub(crate) fn of(identity: &Identity) -> Self {
         let usages = vec![ExtendedKeyUsagePurpose::ServerAuth, ExtendedKeyUsagePurpose::ClientAuth];
         Self { uris: vec![identity.uri()], from: NOW - DAY, until: NOW + 365 * DAY, usages }
     }
 }
 
 /// A key and a certificate, PEM.
-pub(super) struct Pair {
-    pub(super) key: String,
-    pub(super) certificate: String,
+pub(crate) struct Pair {
+    pub(crate) key: String,
+    pub(crate) certificate: String,
 }
 
 impl Authority {
-    pub(super) fn new(project: &str) -> Self {
+    pub(crate) fn new(project: &str) -> Self {
         let mut params = CertificateParams::default();
         params.distinguished_name.push(DnType::CommonName, project);
         params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
@@ -85,7 +85,7 @@ impl Authority {
         Self { params, key, pem, discovery: DiscoveryKey::generate().unwrap() }
     }
 
-    pub(super) fn sign(&self, wish: &Wish) -> Pair {
+    pub(crate) fn sign(&self, wish: &Wish) -> Pair {
         let mut params = CertificateParams::default();
         params.subject_alt_names =
             wish.uris.iter().map(|uri| SanType::URI(uri.as_str().try_into().unwrap())).collect();
@@ -100,7 +100,7 @@ impl Authority {
     }
 
     /// A node's directory with what `wish` asks for.
-    pub(super) fn directory(&self, wish: &Wish) -> Directory {
+    pub(crate) fn directory(&self, wish: &Wish) -> Directory {
         let Pair { key, certificate } = self.sign(wish);
         let directory = Directory::new();
         directory.put(names::NODE_KEY, 0o600, &key);
@@ -111,30 +111,33 @@ impl Authority {
         directory
     }
 
-    pub(super) fn credentials(&self, name: &str, last: u8) -> Credentials {
-        let identity = identity(name, last);
-        load(&self.directory(&Wish::of(&identity)), &identity)
+    pub(crate) fn credentials(&self, name: &str, last: u8) -> Credentials {
+        self.credentials_of(&identity(name, last))
+    }
+
+    pub(crate) fn credentials_of(&self, identity: &Identity) -> Credentials {
+        load(&self.directory(&Wish::of(identity)), identity)
     }
 
     /// A node's two ends, at [`NOW`].
-    pub(super) fn tls(&self, name: &str, last: u8) -> Tls {
+    pub(crate) fn tls(&self, name: &str, last: u8) -> Tls {
         tls(&self.credentials(name, last))
     }
 }
 
-pub(super) fn load(directory: &Directory, identity: &Identity) -> Credentials {
+pub(crate) fn load(directory: &Directory, identity: &Identity) -> Credentials {
     Credentials::load(directory.path(), identity, TimePolicy::Strict, at(NOW)).unwrap()
 }
 
-pub(super) fn tls(credentials: &Credentials) -> Tls {
+pub(crate) fn tls(credentials: &Credentials) -> Tls {
     Tls::new(credentials, Arc::new(Clock(NOW))).unwrap()
 }
 
 /// A directory of a test's own, removed with it.
-pub(super) struct Directory(PathBuf);
+pub(crate) struct Directory(PathBuf);
 
 impl Directory {
-    pub(super) fn new() -> Self {
+    pub(crate) fn new() -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let number = COUNT.fetch_add(1, Ordering::Relaxed);
         let path = std::env::temp_dir().join(format!("sinew-keys-{}-{number}", std::process::id()));
@@ -143,11 +146,11 @@ impl Directory {
         Self(path)
     }
 
-    pub(super) fn path(&self) -> &Path {
+    pub(crate) fn path(&self) -> &Path {
         &self.0
     }
 
-    pub(super) fn put(&self, name: &str, mode: u32, text: &str) {
+    pub(crate) fn put(&self, name: &str, mode: u32, text: &str) {
         let path = self.0.join(name);
         fs::write(&path, text).unwrap();
         fs::set_permissions(&path, Permissions::from_mode(mode)).unwrap();
@@ -161,13 +164,13 @@ impl Drop for Directory {
 }
 
 /// Both ends of a connection, with a wire in memory between them.
-pub(super) struct Wire {
-    pub(super) client: ClientConnection,
-    pub(super) server: ServerConnection,
+pub(crate) struct Wire {
+    pub(crate) client: ClientConnection,
+    pub(crate) server: ServerConnection,
 }
 
 impl Wire {
-    pub(super) fn new(client: Arc<ClientConfig>, server: Arc<ServerConfig>) -> Self {
+    pub(crate) fn new(client: Arc<ClientConfig>, server: Arc<ServerConfig>) -> Self {
         Self {
             client: ClientConnection::new(client, Tls::server_name()).unwrap(),
             server: ServerConnection::new(server).unwrap(),
@@ -175,7 +178,7 @@ impl Wire {
     }
 
     /// Carries what either end has to say until both are silent; each end's error, if it has one.
-    pub(super) fn run(&mut self) -> (Result<(), Error>, Result<(), Error>) {
+    pub(crate) fn run(&mut self) -> (Result<(), Error>, Result<(), Error>) {
         let (mut at_client, mut at_server) = (Ok(()), Ok(()));
         loop {
             let to_server = written(&mut self.client);
@@ -190,7 +193,7 @@ impl Wire {
 }
 
 /// What a connection has to say.
-pub(super) fn written<D>(connection: &mut rustls::ConnectionCommon<D>) -> Vec<u8> {
+pub(crate) fn written<D>(connection: &mut rustls::ConnectionCommon<D>) -> Vec<u8> {
     let mut bytes = Vec::new();
     while connection.wants_write() {
         connection.write_tls(&mut bytes).unwrap();
@@ -199,7 +202,7 @@ pub(super) fn written<D>(connection: &mut rustls::ConnectionCommon<D>) -> Vec<u8
 }
 
 /// Tells a connection `bytes`.
-pub(super) fn heard<D>(connection: &mut rustls::ConnectionCommon<D>, mut bytes: &[u8]) -> Result<(), Error> {
+pub(crate) fn heard<D>(connection: &mut rustls::ConnectionCommon<D>, mut bytes: &[u8]) -> Result<(), Error> {
     while !bytes.is_empty() {
         // It reads no more where its buffer is full of what it does not understand.
         if connection.read_tls(&mut bytes).unwrap_or(0) == 0 {
@@ -210,6 +213,6 @@ pub(super) fn heard<D>(connection: &mut rustls::ConnectionCommon<D>, mut bytes: 
     Ok(())
 }
 
-pub(super) fn is_open(connection: &CommonState) -> bool {
+pub(crate) fn is_open(connection: &CommonState) -> bool {
     !connection.is_handshaking()
 }

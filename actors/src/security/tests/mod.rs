@@ -1,6 +1,6 @@
 //! Nodes of a project of the tests' own, their handshakes in memory, and what is refused in them.
 
-mod ground;
+pub(crate) mod ground;
 
 mod files;
 mod handshakes;

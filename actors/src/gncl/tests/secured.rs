@@ -1,0 +1,165 @@
+//! Nodes that prove who they are, and what those are told that do not.
+
+use sinew_runtime::{outcome::Outcome, wire::Class};
+use tokio::net::TcpListener;
+
+use super::bench::{ByHand, Cable, NINE, Node, introduction, next, run, within};
+use crate::{
+    gncl::{
+        core::write,
+        peer::frame,
+        secure::is_sealed,
+    },
+    security::tests::ground::Authority,
+};
+use sinew_runtime::wire::Kind;
+
+/// As the name of its test nodes' project.
+fn keys() -> Authority {
+    Authority::new("sinew")
+}
+
+/// Two nodes with keys of one project, the second of which is reached over a cable.
+async fn two(keys: &Authority) -> (Node, Node, Cable) {
+    let mut a = Node::start_secured(1, keys, 1).await;
+    let b = Node::start_secured(2, keys, 2).await;
+    let cable = Cable::to(b.listens_at()).await;
+    a.find(b.address(), cable.address);
+    a.up().await;
+    (a, b, cable)
+}
+
+#[test]
+fn messages_of_each_class_and_length_pass_both_ways_between_nodes_that_have_proven_who_they_are() {
+    run(async {
+        let (mut a, b, _cable) = two(&keys()).await;
+        let (mut at_a, mut at_b) = (a.app(1), b.app(1));
+        for class in [Class::Control, Class::Stream, Class::Bulk] {
+            for length in [0, 8, 1_000, 16_384, 16_385, 65_536, 1_000_000] {
+                let payload: Vec<u8> = (0..length).map(|at| (at % 251) as u8).collect();
+                for (from, to, inbox) in [(&a, b.tid(1), &mut at_b), (&b, a.tid(1), &mut at_a)] {
+                    let mut message = from.message(to, &payload);
+                    message.header.class = class;
+                    from.stores.router.send(message).expect("somebody takes it");
+                    assert_eq!(next("a message", inbox).await.payload, payload, "{class:?}");
+                }
+            }
+        }
+        a.stores.router.send(a.confirmed(b.tid(1), 7)).expect("there is room for it");
+        next("a message", &mut at_b).await.receipt.expect("it is to be confirmed").settle(Outcome::Delivered);
+        assert_eq!(next("an outcome", &mut a.settled).await, (7, Outcome::Delivered));
+    });
+}
+
+#[test]
+fn a_flood_that_fills_the_socket_arrives_whole_and_in_order() {
+    run(async {
+        let (a, b, _cable) = two(&keys()).await;
+        let mut at_b = b.app(1);
+        for number in 0..500_u32 {
+            let mut payload = vec![0; 20_000 + number as usize];
+            payload[..4].copy_from_slice(&number.to_le_bytes());
+            let mut message = a.message(b.tid(1), &payload);
+            message.header.class = Class::Bulk;
+            a.stores.router.send(message).expect("there is room for it");
+        }
+        for number in 0..500_u32 {
+            let message = next("a message", &mut at_b).await;
+            assert_eq!(message.payload[..4], number.to_le_bytes());
+            assert_eq!(message.payload.len(), 20_000 + number as usize);
+        }
+    });
+}
+
+#[test]
+fn cuts_in_full_flow_lose_double_and_reorder_nothing() {
+    run(async {
+        let (a, b, cable) = two(&keys()).await;
+        let mut at_b = b.app(1);
+        let mut there = 0u64;
+        for round in 1..=20u64 {
+            for _ in 0..50 {
+                there += 1;
+                a.send(b.tid(1), &there.to_le_bytes());
+            }
+            if round % 2 == 0 {
+                cable.cut();
+            }
+            for number in there - 49..=there {
+                assert_eq!(next("a message", &mut at_b).await.payload[..], number.to_le_bytes());
+            }
+        }
+    });
+}
+
+#[test]
+fn nodes_with_keys_of_two_projects_refuse_each_other_and_both_know_why() {
+    run(async {
+        let a = Node::start_secured(1, &keys(), 1).await;
+        let b = Node::start_secured(2, &keys(), 2).await;
+        a.find(b.address(), b.listens_at());
+        b.counted("peer not proven").await;
+        a.counted("peer not proven").await;
+    });
+}
+
+#[test]
+fn who_has_another_nodes_keys_is_not_taken_for_that_node_nor_for_itself() {
+    run(async {
+        let keys = keys();
+        let a = Node::start_secured(1, &keys, 1).await;
+        let thief = Node::start_secured(3, &keys, 2).await;
+        thief.find(a.address(), a.listens_at());
+        a.counted("security").await;
+        thief.counted("refused by the peer").await;
+        a.find(thief.address(), thief.listens_at());
+        within("the thief's WELCOME to be refused", async {
+            while a.stores.gncl.refusals.of("security") < 2 {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+    });
+}
+
+#[test]
+fn a_node_without_keys_is_told_so_whoever_dials() {
+    run(async {
+        let secured = Node::start_secured(1, &keys(), 1).await;
+        let open = Node::start(2).await;
+        open.find(secured.address(), secured.listens_at());
+        secured.counted("security").await;
+        open.counted("refused by the peer").await;
+        let dials = Node::start_secured(3, &keys(), 3).await;
+        dials.find(open.address(), open.listens_at());
+        open.counted("security").await;
+        dials.counted("peer not proven").await;
+    });
+}
+
+#[test]
+fn a_stranger_reads_in_plain_words_that_it_must_prove_who_it_is() {
+    run(async {
+        let secured = Node::start_secured(1, &keys(), 1).await;
+        let mut stranger = ByHand::dial(&secured).await;
+        let hello = introduction(secured.address());
+        stranger.say(&frame(NINE, secured.address(), Kind::GNCL_HELLO, write(&hello))).await;
+        let refusal = stranger.refusal().await;
+        assert_eq!(refusal.cause, "security");
+        assert!(refusal.sentence.contains("sinew keys issue"), "{}", refusal.sentence);
+    });
+}
+
+#[test]
+fn a_secured_node_says_nothing_to_whom_it_dials_before_that_one_has_proven_who_it_is() {
+    run(async {
+        let secured = Node::start_secured(1, &keys(), 1).await;
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        secured.find(NINE, listener.local_addr().unwrap());
+        let (mut socket, _) = within("the node's dial", listener.accept()).await.unwrap();
+        let mut said = [0; 4_096];
+        let reading = tokio::io::AsyncReadExt::read(&mut socket, &mut said);
+        let length = within("what it says first", reading).await.unwrap();
+        assert!(is_sealed(&said[..length]) && !said[..length].windows(6).any(|bytes| bytes == b"node-1"));
+    });
+}
