@@ -51,6 +51,7 @@ mod payload;
 mod process;
 mod refusals;
 mod ring;
+mod secured;
 pub mod security;
 mod session;
 mod stores;

@@ -17,7 +17,7 @@ use tokio::sync::watch;
 
 use crate::{
     aftermath::Aftermath, audit, config::NodeConfig, gncl, lncl, monitors, ndl, node, refusals::Refusals,
-    security::Tls, sync, wills,
+    secured::Secured, sync, wills,
 };
 
 /// What the layers of one node share.
@@ -38,7 +38,7 @@ pub(crate) struct Stores {
     /// How far each peer's clock is from ours; written by NDL, read by GNCL.
     pub(crate) clocks: ClockOffsets,
     /// How peers prove who they are, and this node to them; not set: it is open. Set before any layer starts.
-    pub(crate) tls: OnceLock<Tls>,
+    pub(crate) secured: OnceLock<Secured>,
     /// Address of GNCL's listener, known once it listens; announced by NDL. A restarted GNCL binds it again.
     pub(crate) gncl_listen: OnceLock<SocketAddr>,
     /// Where GNCL listens besides; set with it.
@@ -94,7 +94,7 @@ impl Stores {
                 ndl: Post::new(POST_CAPACITY),
             },
             clocks: ClockOffsets::default(),
-            tls: OnceLock::new(),
+            secured: OnceLock::new(),
             gncl_listen: OnceLock::new(),
             gncl_further: OnceLock::new(),
             refusals: Arc::default(),

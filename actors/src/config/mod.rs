@@ -200,8 +200,7 @@ pub struct SupervisionConfig {
     pub app_window: Duration,
 }
 
-/// Security between nodes. **Not in use yet**: a node that has [`keys`](Self::keys) refuses to start
-/// ([`security::NOT_YET`](crate::security::NOT_YET)).
+/// Security between nodes: see [`security`](crate::security).
 #[derive(Clone, Debug, PartialEq)]
 pub struct SecurityConfig {
     /// Directory of the node's keys, as `sinew keys` makes it ([`security::files`](crate::security::files)); 1 to 4,096 bytes. Default:

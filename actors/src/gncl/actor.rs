@@ -169,7 +169,8 @@ impl Gncl {
     }
 
     fn send_hello(&mut self, connection: ConnectionId, hello: &Introduction, ctx: &mut Context<Self>) {
-        let message = frame(self.stores.node, hello.peer, Kind::GNCL_HELLO, write(hello));
+        let hello = Introduction { datagrams_made: self.datagrams_made(), ..hello.clone() };
+        let message = frame(self.stores.node, hello.peer, Kind::GNCL_HELLO, write(&hello));
         self.speak(connection, message, AfterSpeaking::Listen, ctx);
     }
 
@@ -205,12 +206,15 @@ impl Gncl {
 
     fn attach(&mut self, attach: &Attach, ctx: &mut Context<Self>) {
         let Attach { connection, node, lane, .. } = *attach;
+        self.confirm(attach);
+        let welcome = attach.welcome.clone().map(|words| {
+            let words = Introduction { datagrams_made: self.datagrams_made(), ..words };
+            frame(self.stores.node, node, Kind::GNCL_WELCOME, write(&words))
+        });
         let Some(wire) = self.wires.get_mut(&connection) else { return };
         let Some(transport) = wire.transport.clone() else { return };
         let peer = self.stores.gncl.meet(Time::now(), attach, &self.stores);
         let Some(way) = peer.way(lane) else { return };
-        let words = attach.welcome.as_ref();
-        let welcome = words.map(|words| frame(self.stores.node, node, Kind::GNCL_WELCOME, write(words)));
         if attach.by_class && self.stores.config.gncl.marks {
             marks::mark(transport.socket(), lane);
         }
@@ -310,14 +314,14 @@ impl Gncl {
         self.input(input, ctx);
     }
 
-    fn input_of(&self, connection: ConnectionId, message: &Message) -> Result<Input, Decline> {
-        let introduction = || -> Result<Introduction, Decline> {
+    fn input_of(&mut self, connection: ConnectionId, message: &Message) -> Result<Input, Decline> {
+        let mut introduction = || -> Result<Introduction, Decline> {
             let introduction: Introduction = read(&message.payload)?;
             if introduction.node != message.header.source.node {
                 let what = "the source of this frame is another node than its sender says";
                 return Err(Decline::Violation(what.to_owned()));
             }
-            self.is_who_was_proven(connection, &introduction)?;
+            self.introduces_itself(connection, &introduction)?;
             Ok(introduction)
         };
         match message.header.kind {
@@ -351,7 +355,7 @@ enum AfterSpeaking {
 fn settings(stores: &Stores) -> Settings {
     let NodeConfig { name, project, payload_max, gncl, ndl, .. } = stores.config.clone();
     // What is sealed is a connection: a datagram would go as it is.
-    let datagrams = (gncl.datagrams && stores.tls.get().is_none()).then_some(DATAGRAMS);
+    let datagrams = (gncl.datagrams && stores.secured.get().is_none()).then_some(DATAGRAMS);
     let features = [CLASSES, CANCEL, GUARD, OUTCOMES].into_iter().chain(datagrams);
     Settings {
         ours: Introduction {
@@ -365,6 +369,7 @@ fn settings(stores: &Stores) -> Settings {
             features: features.map(str::to_owned).collect(),
             lane: Lane::Control,
             link: 0,
+            datagrams_made: 0,
         },
         handshake: gncl.handshake,
         redial_min: gncl.redial_min,

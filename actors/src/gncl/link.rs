@@ -129,9 +129,10 @@ fn news(connection: ConnectionId, state: State) -> impl Stream<Item = News> {
     stream::unfold(state, move |state| async move {
         let (what, state) = match state {
             State::Dialling(address, reading) => match reach(address, &reading).await {
-                Ok((transport, peer)) => {
-                    (What::Connected(transport.clone(), peer), State::Reading(Reader::new(transport, reading)))
-                }
+                Ok((transport, peer)) => (
+                    What::Connected(transport.clone(), peer),
+                    State::Reading(Reader::new(transport, reading)),
+                ),
                 Err(error) => (What::DialFailed(error), State::Over),
             },
             State::Accepted(transport, reading) => greeted(transport, reading).await,

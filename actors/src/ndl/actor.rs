@@ -29,7 +29,7 @@ use tokio::sync::{Notify, mpsc, oneshot};
 use super::{
     Event,
     core::{Core, Epoch, Input, Output, Way},
-    datagram::{Answer, Body, DATAGRAM_MAX, Datagram, encode},
+    datagram::{Answer, Body, DATAGRAM_MAX, Datagram, encode, maker_of},
     mdns::{Mdns, MdnsError},
     probe::{PROBES_MAX, Probe},
     socket,
@@ -39,6 +39,7 @@ use crate::{
     config::NodeConfig,
     gncl, node,
     refusals::Refusals,
+    secured::SEAL_LEN,
     stores::{self, Stores},
 };
 
@@ -285,13 +286,30 @@ impl Shell {
         lock(&self.stores).announcement().clone()
     }
 
+    /// What came from `from`, if this node has no keys, or a node of its project made it. spec: NDL-1.3
+    fn unsealed<'a>(&self, from: SocketAddr, bytes: &'a [u8]) -> Option<&'a [u8]> {
+        let Some(secured) = self.stores.secured.get() else { return Some(bytes) };
+        let now = Time::now();
+        let refused = |why: &&str| {
+            self.refusals.count(
+                now,
+                "NDL datagram not of this project's keys",
+                &format_args!("{from}: {why}"),
+            );
+        };
+        secured.unseal(now, bytes, maker_of).inspect_err(refused).ok()
+    }
+
     fn send_query(&self, to: SocketAddr, correlation: u64) {
         self.send(to, NodeAddress::ALL, correlation, Body::Query(self.me()));
     }
 
     fn send(&self, to: SocketAddr, node: NodeAddress, correlation: u64, body: Body) {
         // The send time is taken last: what is between it and the network counts as network.
-        let bytes = encode(&Datagram { correlation, sent: Time::now(), body }, node);
+        let mut bytes = encode(&Datagram { correlation, sent: Time::now(), body }, node);
+        if let Some(secured) = self.stores.secured.get() {
+            secured.seal(&mut bytes);
+        }
         if let Err(error) = socket::send(&self.socket, &bytes, to) {
             self.refusals.count(Time::now(), "NDL datagram not sent", &format_args!("to {to}: {error}"));
         }
@@ -339,7 +357,7 @@ fn open_socket(stores: &Stores) -> io::Result<std::net::UdpSocket> {
 /// Reads datagrams for as long as this instance is the current one. Answers leave from here.
 async fn receive(shell: Rc<Shell>, socket: tokio::net::UdpSocket, way: Way) {
     // One byte more than is taken: a longer datagram is noticed, not cut.
-    let mut buffer = [0; DATAGRAM_MAX + 1];
+    let mut buffer = [0; DATAGRAM_MAX + SEAL_LEN + 1];
     let (mut in_a_row, mut began) = (0, Time::now());
     loop {
         in_a_row += 1;
@@ -351,7 +369,7 @@ async fn receive(shell: Rc<Shell>, socket: tokio::net::UdpSocket, way: Way) {
         }
         match socket.recv_from(&mut buffer).await {
             Ok((length, from)) => {
-                let bytes = &buffer[..length];
+                let Some(bytes) = shell.unsealed(from, &buffer[..length]) else { continue };
                 if !shell.feed(|core, now| core.receive(now, from, way, bytes)) {
                     return;
                 }

@@ -273,6 +273,13 @@ pub(crate) fn encode(datagram: &Datagram, to: NodeAddress) -> BytesMut {
     bytes
 }
 
+/// Which node says that it made a datagram, of which nothing else is believed yet.
+pub(crate) fn maker_of(bytes: &[u8]) -> Option<NodeAddress> {
+    const SOURCE_AT: usize = 16;
+    let source = bytes.get(SOURCE_AT..)?.first_chunk()?;
+    Some(Tid::from_bits(u64::from_le_bytes(*source)).node)
+}
+
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;

@@ -19,7 +19,8 @@ use super::{
 };
 use crate::{
     config::{ConfigFaults, NodeConfig},
-    inspect, log, process, security,
+    inspect, log, process,
+    secured::{KeyFault, Secured},
     stores::Stores,
     sync::Waiting,
 };
@@ -61,12 +62,9 @@ pub enum StartError {
     /// `lncl.socket` cannot be had: another node has it, or the place cannot be written to. No layer was started.
     #[error("the door for applications of other processes cannot be opened: {0}")]
     Door(String),
-    /// The configuration turns security on, and this build has none between nodes. Nothing was started.
-    #[error(
-        "security.keys is set, and {0}: take [security] out of the configuration to run open, on a network of your own, or run \
-         a version that has it"
-    )]
-    NotSecured(&'static str),
+    /// The configuration turns security on, and the node's keys cannot be used. Nothing was started.
+    #[error("security.keys is set, and the node does not start without them:\n{0}")]
+    Keys(#[from] KeyFault),
     /// A layer did not become ready.
     #[error("the layers did not start: {0}")]
     Layers(String),
@@ -225,13 +223,12 @@ impl NodeBuilder {
     /// keep it short there, and do not read the standard input.
     ///
     /// # Errors
-    /// The configuration has faults, or turns security on, which this build has not yet; `lncl.socket` cannot be had, an application cannot be registered, or a layer did not
+    /// The configuration has faults, or turns security on and the keys cannot be used; `lncl.socket` cannot be had, an application cannot be registered, or a layer did not
     /// become ready.
     pub fn start(mut self) -> Result<Node, StartError> {
         // Here, on a thread like any other.
         log::begin();
         self.config.validate()?;
-        check_security(&self.config, security::NOT_YET)?;
         check_panics(UNWINDS, self.accept_abort_on_panic)?;
         #[cfg(feature = "fault-points")]
         let planned = super::faults::read(&self.faults, &mut self.tree)?;
@@ -241,7 +238,9 @@ impl NodeBuilder {
         self.tree.check()?;
         let patience = self.config.sync.layer_deadline * 4;
         let incarnation = self.incarnation.unwrap_or_else(wall_clock);
+        let secured = Secured::load(&self.config, incarnation)?;
         let stores = Stores::new(self.config, incarnation);
+        secure(&stores, secured);
         #[cfg(feature = "fault-points")]
         super::faults::keep(&stores, &planned)?;
         #[cfg(not(feature = "fault-points"))]
@@ -287,11 +286,16 @@ fn wall_clock() -> Incarnation {
     Incarnation(u64::try_from(since_1970.as_micros()).unwrap_or(u64::MAX))
 }
 
-/// Refuses to pretend: links that are to be secured are, or there are none.
-fn check_security(config: &NodeConfig, not_yet: Option<&'static str>) -> Result<(), StartError> {
-    match not_yet.filter(|_| config.security.keys.is_some()) {
-        Some(why) => Err(StartError::NotSecured(why)),
-        None => Ok(()),
+/// Gives the stores what the node proves itself with. One that has nothing, and is on a network, says so.
+fn secure(stores: &Stores, secured: Option<Secured>) {
+    match secured {
+        Some(secured) => drop(stores.secured.set(secured)),
+        None if stores.config.ndl.interface.is_loopback() => {}
+        None => log::warn!(
+            interface = %stores.config.ndl.interface,
+            "this node is OPEN: whoever is on its network can send to its applications, and pose as any node. Make keys with \
+             `sinew keys init`, and set security.keys on all nodes"
+        ),
     }
 }
 
@@ -318,18 +322,11 @@ mod tests {
     }
 
     #[test]
-    fn a_node_that_is_to_be_secured_and_cannot_be_does_not_start() {
-        // Given: keys, good or not: nothing looks at them yet
-        let secured = |config: &mut NodeConfig| config.security.keys = Some("/etc/sinew/keys".into());
-        // When
+    fn a_node_that_is_to_be_secured_and_has_no_keys_does_not_start() {
+        let secured = |config: &mut NodeConfig| config.security.keys = Some("/there/are/no/keys".into());
         let refused = Node::builder("hip").configure(secured).start();
-        // Then: words, and no node that pretends
-        let words = refused.expect_err("this build secures nothing").to_string();
-        assert!(words.contains("security.keys") && words.contains("cannot secure the links"), "{words}");
-        // And: it is this one constant that is in the way
-        let mut config = NodeConfig::new("hip");
-        secured(&mut config);
-        assert!(check_security(&config, None).is_ok());
+        let words = refused.expect_err("there are no keys").to_string();
+        assert!(words.contains("security.keys") && words.contains("/there/are/no/keys"), "{words}");
     }
 
     #[test]

@@ -18,8 +18,6 @@
 //!
 //! Everything here is pure but the reading of files ([`files`]): the time comes in as an argument, or from the
 //! [`TimeProvider`](rustls::time_provider::TimeProvider) that the caller gives.
-//!
-//! **Not in use yet**: GNCL and NDL do not know of it. See [`NOT_YET`].
 
 mod certificate;
 mod credentials;
@@ -44,9 +42,3 @@ pub use peer::{Peer, PeerFault, words};
 pub use rustls::{self, pki_types::UnixTime};
 pub use times::{Judged, TimeFault, TimePolicy, Validity, date};
 pub use tls::{PROTOCOL, Tls};
-
-/// Why a node whose configuration turns security on refuses to start; `None` once it need not. This is the one place: whoever gives
-/// GNCL's connections to [`Tls`] and NDL's datagrams to [`Sealer`] and [`Checker`] sets it to `None`.
-pub const NOT_YET: Option<&str> = Some(
-    "this build cannot secure the links between nodes yet, and a node that went on would be open to everybody on its network",
-);

@@ -3,7 +3,7 @@
 use std::{fmt::Write as _, net::Ipv4Addr, path::Path};
 
 use serde_json::{Value, json};
-use sinew::security::{NOT_YET, UnixTime, date};
+use sinew::security::{UnixTime, date};
 
 use super::{
     project::{Issued, Look, Made, Revoked},
@@ -69,9 +69,6 @@ pub(super) fn made(made: &Made, wanted: &[Wanted]) -> Said {
             older.serial()
         );
     }
-    if let Some(why) = NOT_YET {
-        let _ = write!(text, "\nNOT YET: {why}. A node with [security] refuses to start.\n");
-    }
     Said { text, json: made_json(made, wanted), is_fine: true }
 }
 
@@ -97,7 +94,6 @@ fn made_json(made: &Made, wanted: &[Wanted]) -> Value {
         "authority_until": made.authority_until.as_ref().map(date),
         "nodes": nodes,
         "older": older,
-        "not_yet": NOT_YET,
     })
 }
 

@@ -26,12 +26,16 @@ impl Gncl {
 
     /// Says on a connection for Stream where this node reads datagrams. spec: DATAGRAM-2
     pub(super) fn announce_datagrams(&self, attach: &Attach) {
-        let Some(transport) = self.wires.get(&attach.connection).and_then(|wire| wire.transport.as_ref()) else {
+        let Some(transport) = self.wires.get(&attach.connection).and_then(|wire| wire.transport.as_ref())
+        else {
             return;
         };
         let Some(peer) = self.stores.gncl.peer(attach.node) else { return };
         let (Some(channel), Some(way)) = (peer.channel(), peer.way(attach.lane)) else { return };
-        let (Ok(local), Ok(remote)) = (transport.socket().local_addr(), transport.socket().peer_addr()) else { return };
+        let (Ok(local), Ok(remote)) = (transport.socket().local_addr(), transport.socket().peer_addr())
+        else {
+            return;
+        };
         let Some(door) = self.stores.gncl.datagrams.beside(local) else { return };
         let payload_max = usize::try_from(attach.payload_max).unwrap_or(usize::MAX);
         let payload_max = payload_max.min(self.stores.config.payload_max);

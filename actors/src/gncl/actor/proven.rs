@@ -7,13 +7,16 @@ use sinew_runtime::time::Time;
 
 use super::{
     super::{
-        core::{ConnectionId, Decline, Input, Introduction},
+        core::{Attach, ConnectionId, Decline, Input, Introduction},
         secure::{Secure, Unproven},
         transport::Transport,
     },
     Gncl,
 };
-use crate::security::Peer;
+use crate::{
+    secured::Secured,
+    security::{Peer, Stamp},
+};
 
 /// Under which it is counted that a peer is not taken, or does not take this node.
 pub(super) const NOT_PROVEN: &str = "peer not proven";
@@ -21,8 +24,8 @@ pub(super) const NOT_PROVEN: &str = "peer not proven";
 impl Gncl {
     /// The start fails if it cannot: a node that has keys is never open.
     pub(super) fn begin_to_prove(&mut self) {
-        let Some(tls) = self.stores.tls.get() else { return };
-        let secure = Secure::begin(tls.clone()).unwrap_or_else(|error| {
+        let Some(secured) = self.stores.secured.get() else { return };
+        let secure = Secure::begin(secured.tls.clone()).unwrap_or_else(|error| {
             panic!("GNCL gets no thread for handshakes: {error}; raise `ulimit -n` or `ulimit -u`")
         });
         self.secure = Some(Arc::new(secure));
@@ -50,13 +53,32 @@ impl Gncl {
         self.ended(connection, ctx);
     }
 
+    /// What a node says in its handshakes of the datagrams of discovery that it has made.
+    pub(super) fn datagrams_made(&self) -> u64 {
+        self.stores.secured.get().map_or(0, Secured::made)
+    }
+
+    /// A life that has proven itself is at the other end of a link: its datagrams count once from now on.
+    pub(super) fn confirm(&self, attach: &Attach) {
+        let Attach { connection, node, incarnation, .. } = *attach;
+        if let Some(secured) = self.stores.secured.get()
+            && let Some(wire) = self.wires.get(&connection)
+        {
+            secured.confirm(Time::now(), Stamp { node, incarnation, number: wire.datagrams_made });
+        }
+    }
+
     /// A node speaks for itself alone, whatever keys of the project it has.
-    pub(super) fn is_who_was_proven(
-        &self,
+    pub(super) fn introduces_itself(
+        &mut self,
         connection: ConnectionId,
         says: &Introduction,
     ) -> Result<(), Decline> {
-        match self.wires.get(&connection).and_then(|wire| wire.proven) {
+        let mut wire = self.wires.get_mut(&connection);
+        if let Some(wire) = &mut wire {
+            wire.datagrams_made = says.datagrams_made;
+        }
+        match wire.and_then(|wire| wire.proven) {
             Some(proven) if proven != says.node => Err(Decline::Security(format!(
                 "you say that you are node {}, and your certificate is of node {proven}; give each node its own keys",
                 says.node

@@ -14,6 +14,8 @@ pub(super) struct Wire {
     pub(super) transport: Option<Transport>,
     /// Who is at the other end, if its keys have proven it.
     pub(super) proven: Option<NodeAddress>,
+    /// Datagrams of discovery that the other end had made when it introduced itself.
+    pub(super) datagrams_made: u64,
     pub(super) mode: SharedMode,
     /// Which of its peer's connections it is, and what writes there, as long as it is a link.
     pub(super) link: Option<(LinkNumber, SpawnHandle)>,
@@ -24,7 +26,15 @@ pub(super) struct Wire {
 
 impl Wire {
     pub(super) fn new(transport: Option<Transport>, mode: SharedMode, reader: SpawnHandle) -> Self {
-        Self { transport, proven: None, mode, link: None, may_speak: true, tasks: vec![reader] }
+        Self {
+            transport,
+            proven: None,
+            datagrams_made: 0,
+            mode,
+            link: None,
+            may_speak: true,
+            tasks: vec![reader],
+        }
     }
 
     pub(super) fn set_mode(&self, mode: Mode) {

@@ -77,6 +77,9 @@ pub(crate) struct Introduction {
     /// Of a further connection: number of the dial that made the first one.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub(crate) link: u64,
+    /// Where it has keys: how many datagrams of discovery its life has made. None of them counts any more.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub(crate) datagrams_made: u64,
 }
 
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde calls it with a reference")]
@@ -271,6 +274,7 @@ mod tests {
             features: Vec::new(),
             lane: Lane::Control,
             link: 0,
+            datagrams_made: 0,
         }
     }
 
@@ -307,6 +311,7 @@ mod tests {
             features: Vec::new(),
             lane: Lane::Control,
             link: 0,
+            datagrams_made: 0,
         };
         let page = include_str!("../../../../docs/protocol/gncl.md");
         let shown = page.split("```text").nth(1).and_then(|rest| rest.split("```").next()).unwrap();

@@ -79,6 +79,7 @@ fn settings(node: NodeAddress, incarnation: u64) -> Settings {
             features: vec![CLASSES.to_owned()],
             lane: Lane::Control,
             link: 0,
+            datagrams_made: 0,
         },
         handshake: Duration::from_secs(2),
         redial_min: Duration::from_millis(10),

@@ -32,6 +32,7 @@ use crate::{
         peer::frame,
     },
     ndl::{self, LossReason, MembershipFact},
+    secured::Secured,
     security::{
         Identity,
         tests::ground::{self, Authority},
@@ -106,7 +107,9 @@ impl Node {
         let (project, name) = (config.project.clone(), format!("node-{made_for}"));
         let made_for = Identity { project, address: NodeAddress::new(made_for), name };
         let stores = Stores::for_test(config, Incarnation(1));
-        stores.tls.set(ground::tls(&keys.credentials_of(&made_for))).expect("it is set once");
+        let credentials = keys.credentials_of(&made_for);
+        let secured = Secured::new(ground::tls(&credentials), &credentials, 8, Incarnation(1));
+        assert!(stores.secured.set(secured).is_ok(), "it is set once");
         Self::begin(stores).await
     }
 
@@ -420,6 +423,7 @@ pub(super) fn introduction(to: NodeAddress) -> Introduction {
         features: Vec::new(),
         lane: Lane::Control,
         link: 0,
+        datagrams_made: 0,
     }
 }
 

@@ -5,11 +5,7 @@ use tokio::net::TcpListener;
 
 use super::bench::{ByHand, Cable, NINE, Node, introduction, next, run, within};
 use crate::{
-    gncl::{
-        core::write,
-        peer::frame,
-        secure::is_sealed,
-    },
+    gncl::{core::write, peer::frame, secure::is_sealed},
     security::tests::ground::Authority,
 };
 use sinew_runtime::wire::Kind;

@@ -81,7 +81,11 @@ mod tests {
     use tokio_util::codec::Decoder;
 
     use super::{super::Ends, *};
-    use crate::{config::NodeConfig, gncl::{core::read, transport::Transport}, outlet::Gathering};
+    use crate::{
+        config::NodeConfig,
+        gncl::{core::read, transport::Transport},
+        outlet::Gathering,
+    };
 
     // spec: CREDIT-2
     #[tokio::test]

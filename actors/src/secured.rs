@@ -1,0 +1,171 @@
+//! What a node with keys proves itself and its datagrams with. Not there: it is open to everybody on its network.
+
+use std::{
+    num::NonZeroUsize,
+    sync::{Arc, Mutex},
+};
+
+use bytes::BytesMut;
+use rustls::{pki_types::UnixTime, time_provider::DefaultTimeProvider};
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
+
+use crate::{
+    config::NodeConfig,
+    security::{Checker, CredentialFaults, Credentials, Identity, Sealer, Stamp, Tag, Tls, Verdict},
+    stores::lock,
+};
+
+/// Bytes of a seal behind a datagram: the life of its maker, the datagram's number in that life, and the tag, little-endian.
+pub(crate) const SEAL_LEN: usize = 8 + 8 + Tag::BYTES;
+
+/// Of one life of a node; it outlives the layers that use it.
+pub(crate) struct Secured {
+    pub(crate) tls: Tls,
+    seals: Mutex<(Sealer, Checker)>,
+}
+
+impl Secured {
+    /// From the files that the configuration names, if it does.
+    ///
+    /// # Errors
+    /// All that is wrong with them; rustls does not take the key.
+    pub(crate) fn load(config: &NodeConfig, incarnation: Incarnation) -> Result<Option<Self>, KeyFault> {
+        let Some(keys) = &config.security.keys else { return Ok(None) };
+        let (project, name) = (config.project.clone(), config.name.clone());
+        let identity = Identity { project, address: config.node_address(), name };
+        let credentials = Credentials::load(keys, &identity, config.security.times, UnixTime::now())?;
+        for warning in credentials.warnings() {
+            crate::log::warn!("{warning}");
+        }
+        let tls = Tls::new(&credentials, Arc::new(DefaultTimeProvider))?;
+        Ok(Some(Self::new(tls, &credentials, config.ndl.nodes_max, incarnation)))
+    }
+
+    pub(crate) fn new(
+        tls: Tls,
+        credentials: &Credentials,
+        nodes_max: usize,
+        incarnation: Incarnation,
+    ) -> Self {
+        let (key, identity) = (credentials.discovery(), credentials.identity());
+        let nodes_max = NonZeroUsize::new(nodes_max).unwrap_or(NonZeroUsize::MIN);
+        let sealer = Sealer::new(key, &identity.project, identity.address, incarnation);
+        let checker = Checker::new(key, &identity.project, nodes_max);
+        Self { tls, seals: Mutex::new((sealer, checker)) }
+    }
+
+    /// Puts a seal behind a datagram of this node.
+    pub(crate) fn seal(&self, datagram: &mut BytesMut) {
+        let (stamp, tag) = lock(&self.seals).0.seal(datagram);
+        datagram.extend_from_slice(&stamp.incarnation.0.to_le_bytes());
+        datagram.extend_from_slice(&stamp.number.to_le_bytes());
+        datagram.extend_from_slice(&tag.0);
+    }
+
+    /// The datagram in front of a seal, as `maker` says who made it.
+    ///
+    /// # Errors
+    /// Nobody of the project made it so, or it was taken before; in words.
+    pub(crate) fn unseal<'a>(
+        &self,
+        now: Time,
+        sealed: &'a [u8],
+        maker: impl FnOnce(&[u8]) -> Option<NodeAddress>,
+    ) -> Result<&'a [u8], &'static str> {
+        const FORGED: &str = "it was not made with this project's keys: somebody pretends, or a node there has no keys, or older ones";
+        let (datagram, seal) = sealed.split_last_chunk::<SEAL_LEN>().ok_or(FORGED)?;
+        let (incarnation, seal) = seal.split_first_chunk::<8>().ok_or(FORGED)?;
+        let (number, tag) = seal.split_first_chunk::<8>().ok_or(FORGED)?;
+        let tag = Tag(tag.try_into().map_err(|_| FORGED)?);
+        let stamp = Stamp {
+            node: maker(datagram).ok_or(FORGED)?,
+            incarnation: Incarnation(u64::from_le_bytes(*incarnation)),
+            number: u64::from_le_bytes(*number),
+        };
+        match lock(&self.seals).1.check(now, stamp, tag, datagram) {
+            // Of a life that has not proven itself it is a hint, and what follows from a hint has its bounds.
+            Verdict::Fresh | Verdict::OtherLife => Ok(datagram),
+            Verdict::Replayed => Err("it was taken before: somebody sends again what was recorded"),
+            Verdict::Forged => Err(FORGED),
+        }
+    }
+
+    /// How many datagrams this life has made: what it says in its handshakes.
+    pub(crate) fn made(&self) -> u64 {
+        lock(&self.seals).0.made()
+    }
+
+    /// That life of that node has proven itself, and said how many datagrams it had made.
+    pub(crate) fn confirm(&self, now: Time, said: Stamp) {
+        lock(&self.seals).1.confirm(now, said);
+    }
+}
+
+/// Why a node has no keys that it is to have.
+#[derive(Debug, thiserror::Error)]
+pub enum KeyFault {
+    /// Something is wrong with its files.
+    #[error(transparent)]
+    Files(#[from] CredentialFaults),
+    /// rustls does not take its key.
+    #[error("the key cannot be used ({0}); make a new one with `sinew keys issue`")]
+    Key(#[from] rustls::Error),
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::security::tests::ground::{self, Authority};
+
+    const NODE: NodeAddress = NodeAddress::new(7);
+
+    fn secured(keys: &Authority, incarnation: u64) -> Secured {
+        let identity = Identity { project: "walker".to_owned(), address: NODE, name: "hip".to_owned() };
+        let credentials = keys.credentials_of(&identity);
+        Secured::new(ground::tls(&credentials), &credentials, 8, Incarnation(incarnation))
+    }
+
+    fn sealed(by: &Secured, datagram: &[u8]) -> Vec<u8> {
+        let mut bytes = BytesMut::from(datagram);
+        by.seal(&mut bytes);
+        bytes.to_vec()
+    }
+
+    fn opened<'a>(by: &Secured, bytes: &'a [u8]) -> Result<&'a [u8], &'static str> {
+        by.unseal(Time::ZERO, bytes, |_| Some(NODE))
+    }
+
+    #[test]
+    fn a_datagram_of_the_project_is_taken_and_what_anybody_else_made_is_not() {
+        let keys = Authority::new("walker");
+        let (here, there) = (secured(&keys, 1), secured(&keys, 2));
+        let right = sealed(&there, b"who is there?");
+        assert_eq!(opened(&here, &right), Ok(&b"who is there?"[..]));
+        for at in 0..right.len() {
+            let mut changed = right.clone();
+            changed[at] ^= 1;
+            assert!(opened(&here, &changed).is_err(), "byte {at}");
+        }
+        assert!(opened(&here, &sealed(&secured(&Authority::new("walker"), 2), b"who is there?")).is_err());
+        for short in [&b""[..], b"who", &right[..SEAL_LEN]] {
+            assert!(opened(&here, short).is_err());
+        }
+        assert!(here.unseal(Time::ZERO, &right, |_| None).is_err(), "who says not who it is");
+    }
+
+    #[test]
+    fn a_datagram_of_a_life_that_has_proven_itself_is_taken_once_and_one_from_before_never() {
+        let keys = Authority::new("walker");
+        let (here, there) = (secured(&keys, 1), secured(&keys, 2));
+        let before = sealed(&there, b"before");
+        let said = Stamp { node: NODE, incarnation: Incarnation(2), number: there.made() };
+        here.confirm(Time::ZERO, said);
+        let after = sealed(&there, b"after");
+        assert!(opened(&here, &before).is_err());
+        assert_eq!(opened(&here, &after), Ok(&b"after"[..]));
+        assert!(opened(&here, &after).is_err());
+    }
+}
