@@ -2,6 +2,7 @@
 
 mod keys;
 mod scenario;
+mod secured;
 mod send;
 mod watch;
 mod why;

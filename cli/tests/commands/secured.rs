@@ -1,0 +1,68 @@
+//! Nodes whose keys `sinew keys` made, and those beside them that have none, or others.
+
+use std::path::Path;
+
+use serde_json::Value;
+use sinew_tests::Program;
+
+use crate::scenario::{Scenario, named, sinew};
+
+/// Keys of a project of their own, in this directory of the test's.
+fn make_keys(scenario: &Scenario, directory: &str, nodes: &[&str]) {
+    let out = scenario.directory.join(directory);
+    let out = out.to_str().expect("a path of the test's own");
+    let answer = sinew(&[&["keys", "init", "cli", "--out", out], nodes].concat(), Path::new("/"));
+    assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
+}
+
+/// A node with its keys in `directory`.
+fn secured(scenario: &Scenario, directory: &str, name: &str, address: u8, more: &[&str]) -> Program {
+    let keys = scenario.directory.join(&format!("{directory}/nodes/{name}"));
+    let section = format!("[security]\nkeys = \"{}\"\n[lncl]", keys.display());
+    scenario.start_changed(name, address, &[("[lncl]", &section)], more)
+}
+
+fn names(said: &Value) -> Vec<&str> {
+    let nodes = said["nodes"].as_array().expect("a list");
+    nodes.iter().filter_map(|node| node["name"].as_str()).collect()
+}
+
+#[test]
+fn nodes_with_keys_of_one_project_find_each_other_and_nobody_else() {
+    // Given: beside them, in their group and under their project's name, two nodes without keys, and one with keys of its own
+    let scenario = Scenario::new();
+    make_keys(&scenario, "keys", &["hip=127.0.0.1", "knee=127.0.0.2"]);
+    make_keys(&scenario, "others", &["thief=127.0.0.5"]);
+    let _spies = [
+        scenario.start("spy", 3, &[]),
+        scenario.start("spy2", 4, &[]),
+        secured(&scenario, "others", "thief", 5, &[]),
+    ];
+    scenario.until("nodes without keys find each other", "spy", &["nodes"], |said| names(said).len() == 2);
+    // When
+    let mut hip = secured(&scenario, "keys", "hip", 1, &["--requires", "knee", "--sends-to", "knee"]);
+    let mut knee = secured(&scenario, "keys", "knee", 2, &[]);
+    // Then
+    hip.wait_for(&["started"]);
+    knee.wait_for(&["count 50 "]);
+    let said = scenario.until("all connections are up", "hip", &["nodes"], |said| {
+        let links = named(&said["nodes"], "knee").and_then(|node| node["links"].as_array());
+        links.is_some_and(|links| links.len() == 3 && links.iter().all(|link| link["up"] == true))
+    });
+    assert_eq!(names(&said), ["hip", "knee"], "{said}");
+    for (outside, knows) in [("spy", 2), ("thief", 1)] {
+        let said = scenario.sinew(outside, &["nodes", "--json"]).json();
+        assert_eq!(names(&said).len(), knows, "{outside}: {said}");
+    }
+}
+
+#[test]
+fn a_node_that_is_killed_is_found_again_in_its_next_life() {
+    let scenario = Scenario::new();
+    make_keys(&scenario, "keys", &["hip=127.0.0.1", "knee=127.0.0.2"]);
+    let _hip = secured(&scenario, "keys", "hip", 1, &["--requires", "knee", "--sends-to", "knee"]);
+    for _ in 0..3 {
+        let mut knee = secured(&scenario, "keys", "knee", 2, &[]);
+        knee.wait_for(&["count"]);
+    }
+}
