@@ -16,7 +16,7 @@ use sinew_figures::{
     stream,
 };
 
-use crate::{nodes::At, ping::DEADLINE};
+use crate::{keys::Keys, nodes::At, ping::DEADLINE};
 
 /// Bytes of a packet.
 const PACKET: usize = 1000;
@@ -79,15 +79,19 @@ impl Payload for Last {
 }
 
 /// Measures, and prints the line.
-pub(crate) fn measure(carrier: Carrier, packets: usize, pinning: Pinning) {
+pub(crate) fn measure(carrier: Carrier, packets: usize, pinning: Pinning, is_secured: bool) {
     let at = At::loopback();
+    let keys = is_secured.then(|| Keys::make(&[("flooder", at.ip()), ("sink", at.host(2).ip())]));
+    let at = if is_secured { at.secured() } else { at };
     let role = format!("sink {} {packets} {} {}", carrier.name(), pinning.name(), at.host(2));
     let took = run(carrier, packets, at, &role);
+    drop(keys);
     let mut seen = Figures::new();
     seen.record(took / u32::try_from(packets).expect("no flood has so many"));
     let rate = packets as u128 * 1_000_000_000 / took.as_nanos().max(1);
     let counts = [("messages_per_s", u64::try_from(rate).unwrap_or(u64::MAX)), ("packets", packets as u64)];
-    let case = format!("flood_{}_{}", carrier.name(), pinning.name());
+    let secured = if is_secured { "_secured" } else { "" };
+    let case = format!("flood{secured}_{}_{}", carrier.name(), pinning.name());
     Alone { bench: "gncl", case: &case, figure: "time for each packet", seen: &seen, counts: &counts }
         .report();
 }

@@ -9,6 +9,8 @@
 //!   `sleeps` is how often a thread of either process went to sleep for each message, which another one had to end.
 //! - `flood-CARRIER-CPUS`: packets of 1000 bytes in class Bulk one way, as fast as they go, confirmed or not, and through bare
 //!   TCP, with a write for each and with one for 32.
+//! - `secured-rounds-..`, `secured-flood-..`: the same between nodes with keys (TLS 1.3), beside nodes without; `secured-handshake`: how long it takes until
+//!   both ends of a connection know who is there.
 //! - `table_2-N`: the paper's test, every node to every other one, 1000 bytes with a full echo, 3, 8 and 16 nodes at 2,000 round
 //!   trips a second together; `cpu_ns_each_message` is what all processes needed by what arrived, `sleeps_each_1000_messages` how often a thread of theirs
 //!   went to sleep. `table_2_raw_tcp-N`: the same by bare TCP, one thread a process.
@@ -27,6 +29,7 @@ mod beside;
 mod crowd;
 mod crowd_raw;
 mod flood;
+mod keys;
 mod nodes;
 #[path = "../ping/mod.rs"]
 mod ping;
@@ -78,6 +81,15 @@ enum Case {
     /// Values of class Stream.
     Stream(Plan),
     SlowLink(Queue),
+    /// Between nodes with keys, beside nodes without.
+    Secured(Secured),
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Secured {
+    Rounds { thread: Thread, rounds: Rounds, pinning: Pinning },
+    Flood { carrier: Carrier, packets: usize, pinning: Pinning },
+    Handshakes(usize),
 }
 
 impl Case {
@@ -124,6 +136,7 @@ impl Case {
             cases.extend(Way::ALL.map(|by| Self::Stream(Plan { by, channels, values })));
         }
         cases.extend([Queue::OneLine, Queue::Priorities].map(Self::SlowLink));
+        cases.extend(Secured::all(is_short).into_iter().map(Self::Secured));
         cases
     }
 
@@ -140,6 +153,13 @@ impl Case {
             Self::Stream(Plan { by, channels, .. }) => format!("stream_by_{}-{channels}", by.name()),
             Self::SlowLink(Queue::OneLine) => "slow_link".to_owned(),
             Self::SlowLink(Queue::Priorities) => "slow_link_priorities".to_owned(),
+            Self::Secured(Secured::Rounds { thread, rounds, pinning }) => {
+                format!("secured-{}", Self::Rounds { thread, rounds, pinning }.name())
+            }
+            Self::Secured(Secured::Flood { carrier, packets, pinning }) => {
+                format!("secured-{}", Self::Flood { carrier, packets, pinning }.name())
+            }
+            Self::Secured(Secured::Handshakes(_)) => "secured-handshake".to_owned(),
         }
     }
 
@@ -161,7 +181,7 @@ impl Case {
             }
             Self::Flood { carrier, packets, pinning } => {
                 pinning.pin(End::Measuring);
-                flood::measure(carrier, packets, pinning);
+                flood::measure(carrier, packets, pinning, false);
             }
             Self::Crowd { by, nodes: count, seconds, rate } => {
                 crowd::measure(&self.name(), by, Share { index: 0, count, seconds, rate });
@@ -173,8 +193,47 @@ impl Case {
             }
             Self::Stream(plan) => stream_ways::measure(&self.name(), plan),
             Self::SlowLink(queue) => return slow_link::measure(&self.name(), queue),
+            Self::Secured(secured) => secured.measure(),
         }
         true
+    }
+}
+
+impl Secured {
+    fn all(is_short: bool) -> Vec<Self> {
+        let part = if is_short { 10 } else { 1 };
+        let mut cases = Vec::new();
+        for pinning in [Pinning::OneCpu, Pinning::OneCpuEach] {
+            for (bytes, pace) in payloads(is_short) {
+                let rounds = Rounds::of(bytes, pace, is_short);
+                cases.extend([Thread::Io, Thread::Own].map(|thread| Self::Rounds {
+                    thread,
+                    rounds,
+                    pinning,
+                }));
+            }
+        }
+        let (packets, pinning) = (1_000_000 / part, Pinning::OneCpuEach);
+        let carriers = [Carrier::Confirmed, Carrier::Unconfirmed];
+        cases.extend(carriers.map(|carrier| Self::Flood { carrier, packets, pinning }));
+        cases.push(Self::Handshakes(2_000 / part));
+        cases
+    }
+
+    fn measure(self) {
+        match self {
+            Self::Rounds { thread, rounds, pinning } => {
+                pinning.pin(End::Measuring);
+                rounds::measure_secured(thread, rounds, pinning);
+            }
+            Self::Flood { carrier, packets, pinning } => {
+                pinning.pin(End::Measuring);
+                for is_secured in [true, false] {
+                    flood::measure(carrier, packets, pinning, is_secured);
+                }
+            }
+            Self::Handshakes(count) => keys::measure_handshakes(count),
+        }
     }
 }
 

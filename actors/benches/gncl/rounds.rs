@@ -10,6 +10,7 @@ use sinew_figures::{
 };
 
 use crate::{
+    keys::Keys,
     nodes::At,
     ping::{self, DEADLINE},
 };
@@ -67,9 +68,29 @@ impl Thread {
     }
 }
 
+/// Measures nodes with keys beside nodes without, and prints the line.
+pub(crate) fn measure_secured(thread: Thread, rounds: Rounds, pinning: Pinning) {
+    let at = At::loopback();
+    let _keys = Keys::make(&[("ping", at.ip()), ("echo", at.host(2).ip())]);
+    let (seen, sleeps) = between_nodes(at.secured(), thread, rounds, pinning);
+    let (open, open_sleeps) = between_nodes(at, thread, rounds, pinning);
+    Beside {
+        bench: "gncl",
+        case: &format!("secured_{}", thread.name()),
+        payload_bytes: rounds.bytes,
+        pinning: pinning.name(),
+        pace: rounds.pace.name(),
+        seen: &seen,
+        reference: "open",
+        raw: &open,
+        counts: &[("sleeps", sleeps), ("reference_sleeps", open_sleeps)],
+    }
+    .report();
+}
+
 /// Measures both, and prints the line.
 pub(crate) fn measure(thread: Thread, rounds: Rounds, pinning: Pinning) {
-    let (seen, sleeps) = between_nodes(thread, rounds, pinning);
+    let (seen, sleeps) = between_nodes(At::loopback(), thread, rounds, pinning);
     let (raw, raw_sleeps) = raw(rounds, pinning);
     Beside {
         bench: "gncl",
@@ -94,8 +115,7 @@ fn counting_sleeps(other: &Process, rounds: Rounds, measure: impl FnOnce() -> Fi
     (figures, (sleeps() - before) as f64 / f64::from(messages))
 }
 
-fn between_nodes(thread: Thread, rounds: Rounds, pinning: Pinning) -> (Figures, f64) {
-    let at = At::loopback();
+fn between_nodes(at: At, thread: Thread, rounds: Rounds, pinning: Pinning) -> (Figures, f64) {
     let role = format!("echo {} {} {}", thread.name(), pinning.name(), at.host(2));
     let echo = Process::start(&role);
     let (ping, figures) = ping::ping(rounds);
