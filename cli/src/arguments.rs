@@ -81,7 +81,7 @@ pub(crate) enum Command {
     },
     /// Makes the keys of a whole robot, and shows who has which: its authority, and a key and a certificate for each node
     ///
-    /// It asks no node. Links between nodes cannot be secured with these keys yet: a node whose configuration names them refuses to start.
+    /// It asks no node. A node whose configuration names its keys takes only nodes with keys of the same project.
     #[command(subcommand)]
     Keys(keys::Order),
     /// Prints what makes the shell complete this command's words

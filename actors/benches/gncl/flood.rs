@@ -16,7 +16,11 @@ use sinew_figures::{
     stream,
 };
 
-use crate::{keys::Keys, nodes::At, ping::DEADLINE};
+use crate::{
+    keys::{self, FIRST, Keys, SECOND},
+    nodes::At,
+    ping::DEADLINE,
+};
 
 /// Bytes of a packet.
 const PACKET: usize = 1000;
@@ -81,8 +85,7 @@ impl Payload for Last {
 /// Measures, and prints the line.
 pub(crate) fn measure(carrier: Carrier, packets: usize, pinning: Pinning, is_secured: bool) {
     let at = At::loopback();
-    let keys = is_secured.then(|| Keys::make(&[("flooder", at.ip()), ("sink", at.host(2).ip())]));
-    let at = if is_secured { at.secured() } else { at };
+    let keys = is_secured.then(|| Keys::make(at, &[("flooder", FIRST), ("sink", SECOND)]));
     let role = format!("sink {} {packets} {} {}", carrier.name(), pinning.name(), at.host(2));
     let took = run(carrier, packets, at, &role);
     drop(keys);
@@ -111,7 +114,7 @@ pub(crate) fn sink(carrier: Carrier, packets: usize, at: At) {
         return raw_sink(packets);
     }
     let app = AppSpec::new("sink", move || Sink { left: packets }).handles::<Packet>().own_thread();
-    let _node = at.node("sink").app(app).start().expect("a node");
+    let _node = keys::node(at, "sink").app(app).start().expect("a node");
     say_there();
     await_end();
 }
@@ -204,7 +207,7 @@ fn between_nodes(carrier: Carrier, packets: usize, at: At, role: &str) -> Durati
     let (done, took) = sync_channel(1);
     let make = move || Flooder { carrier, packets, start: Instant::now(), done: done.clone() };
     let app = AppSpec::new("flooder", make).handles::<Last>().requires(["sink"]).own_thread();
-    let node = at.node("flooder").app(app).start().expect("a node");
+    let node = keys::node(at, "flooder").app(app).start().expect("a node");
     let took = took.recv_timeout(DEADLINE).expect("the flood ends");
     node.stop();
     took

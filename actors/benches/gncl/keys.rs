@@ -13,7 +13,7 @@ use std::{
 
 use rcgen::{BasicConstraints, CertificateParams, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, SanType};
 use sinew::{
-    NodeConfig,
+    NodeBuilder, NodeConfig,
     security::{
         Credentials, DiscoveryKey, Identity, TimePolicy, Tls, UnixTime, files, project_uri,
         rustls::{self, ClientConnection, ServerConnection, time_provider::DefaultTimeProvider},
@@ -21,14 +21,21 @@ use sinew::{
 };
 use sinew_figures::{Alone, Figures};
 
-/// Where the keys of the run are that this process has begun.
-fn directory_of(process: u32) -> PathBuf {
-    std::env::temp_dir().join(format!("sinew-bench-keys-{process}"))
+use crate::nodes::At;
+
+/// The addresses of the two nodes of a run.
+pub(crate) const FIRST: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 1);
+pub(crate) const SECOND: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 2);
+
+/// Where the keys of the run at this place are, if its nodes have any: the place is this run's own.
+fn directory_of(at: At) -> PathBuf {
+    std::env::temp_dir().join(format!("sinew-bench-keys-{}", at.port()))
 }
 
-/// Where those of one of its nodes are.
-pub(crate) fn of_node(process: u32, name: &str) -> PathBuf {
-    directory_of(process).join(name)
+/// A node there that finds nobody else, with its keys, if they were made.
+pub(crate) fn node(at: At, name: &str) -> NodeBuilder {
+    let directory = directory_of(at).join(name);
+    at.node(name).configure(|config| config.security.keys = directory.exists().then_some(directory))
 }
 
 fn identity(name: &str, address: Ipv4Addr) -> Identity {
@@ -42,12 +49,12 @@ pub(crate) struct Keys {
 }
 
 impl Keys {
-    pub(crate) fn make(nodes: &[(&str, Ipv4Addr)]) -> Self {
-        Self::try_make(nodes).expect("the system's directory for temporary files can be written to")
+    pub(crate) fn make(at: At, nodes: &[(&str, Ipv4Addr)]) -> Self {
+        Self::try_make(at, nodes).expect("the system's directory for temporary files can be written to")
     }
 
-    fn try_make(nodes: &[(&str, Ipv4Addr)]) -> io::Result<Self> {
-        let keys = Self { directory: directory_of(std::process::id()) };
+    fn try_make(at: At, nodes: &[(&str, Ipv4Addr)]) -> io::Result<Self> {
+        let keys = Self { directory: directory_of(at) };
         fs::create_dir_all(&keys.directory)?;
         let project = NodeConfig::new("any").project;
         let mut params = CertificateParams::default();
@@ -105,7 +112,7 @@ fn put(directory: &Path, name: &str, mode: u32, text: &str) -> io::Result<()> {
 /// How long both ends of a TCP connection over loopback take to prove who they are, each on a thread of its own.
 pub(crate) fn measure_handshakes(count: usize) {
     let at = Ipv4Addr::LOCALHOST;
-    let keys = Keys::make(&[("hip", at), ("knee", at)]);
+    let keys = Keys::make(At::loopback(), &[("hip", at), ("knee", at)]);
     let (hip, knee) = (keys.tls("hip", at), keys.tls("knee", at));
     let listener = TcpListener::bind((at, 0)).expect("a port on loopback");
     let address = listener.local_addr().expect("it is bound");

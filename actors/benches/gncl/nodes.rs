@@ -7,15 +7,11 @@ use std::{
 
 use sinew::prelude::*;
 
-use crate::keys;
-
 /// An address of a node of this run, and the group where it finds the others.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct At {
     address: Ipv4Addr,
     group: SocketAddrV4,
-    /// The process that has made keys for the nodes of this run; 0: they have none.
-    keys: u32,
 }
 
 impl At {
@@ -23,18 +19,12 @@ impl At {
     pub(crate) fn loopback() -> Self {
         let id = std::process::id();
         let group = Ipv4Addr::new(239, 255, 84, (id % 200 + 1) as u8);
-        let group = SocketAddrV4::new(group, 20_000 + (id % 20_000) as u16);
-        Self { address: Ipv4Addr::LOCALHOST, group, keys: 0 }
+        Self { address: Ipv4Addr::LOCALHOST, group: SocketAddrV4::new(group, 20_000 + (id % 20_000) as u16) }
     }
 
     /// The port of the group, which is this run's own.
     pub(crate) fn port(self) -> u16 {
         self.group.port()
-    }
-
-    /// The address.
-    pub(crate) fn ip(self) -> Ipv4Addr {
-        self.address
     }
 
     /// Another address, the same group.
@@ -48,38 +38,26 @@ impl At {
         self.on(Ipv4Addr::new(a, b, c, number))
     }
 
-    /// The same, for nodes that have the keys that this process has made.
-    pub(crate) fn secured(self) -> Self {
-        Self { keys: std::process::id(), ..self }
-    }
-
     /// A node there that finds nobody else.
     pub(crate) fn node(self, name: &str) -> NodeBuilder {
         Node::builder(name).address(self.address).configure(|config| {
             config.ndl.interface = self.address;
             config.ndl.multicast = Some(self.group);
             config.ndl.mdns_port = None;
-            config.security.keys = (self.keys != 0).then(|| keys::of_node(self.keys, name));
         })
     }
 
     /// What [`Display`] wrote.
     pub(crate) fn read(words: &str) -> Self {
-        let at = |words: &str| {
-            let mut parts = words.split('@');
-            let (address, group, keys) = (parts.next()?, parts.next()?, parts.next()?);
-            Some(Self {
-                address: address.parse().ok()?,
-                group: group.parse().ok()?,
-                keys: keys.parse().ok()?,
-            })
-        };
-        at(words).expect("an address that this program wrote itself")
+        let parts = words.split_once('@').and_then(|(address, group)| {
+            Some(Self { address: address.parse().ok()?, group: group.parse().ok()? })
+        });
+        parts.expect("an address that this program wrote itself")
     }
 }
 
 impl Display for At {
     fn fmt(&self, f: &mut Formatter<'_>) -> Result {
-        write!(f, "{}@{}@{}", self.address, self.group, self.keys)
+        write!(f, "{}@{}", self.address, self.group)
     }
 }

@@ -10,7 +10,7 @@ use sinew_figures::{
 };
 
 use crate::{
-    keys::Keys,
+    keys::{self, FIRST, Keys, SECOND},
     nodes::At,
     ping::{self, DEADLINE},
 };
@@ -54,7 +54,7 @@ impl Thread {
 
     fn node(self, name: &str, at: At) -> NodeBuilder {
         let spin = if self.spins() { SPIN } else { Duration::ZERO };
-        at.node(name).configure(|config| config.gncl.spin = spin)
+        keys::node(at, name).configure(|config| config.gncl.spin = spin)
     }
 
     fn place<A>(self, app: AppSpec<A>) -> AppSpec<A>
@@ -71,8 +71,9 @@ impl Thread {
 /// Measures nodes with keys beside nodes without, and prints the line.
 pub(crate) fn measure_secured(thread: Thread, rounds: Rounds, pinning: Pinning) {
     let at = At::loopback();
-    let _keys = Keys::make(&[("ping", at.ip()), ("echo", at.host(2).ip())]);
-    let (seen, sleeps) = between_nodes(at.secured(), thread, rounds, pinning);
+    let keys = Keys::make(at, &[("ping", FIRST), ("echo", SECOND)]);
+    let (seen, sleeps) = between_nodes(at, thread, rounds, pinning);
+    drop(keys);
     let (open, open_sleeps) = between_nodes(at, thread, rounds, pinning);
     Beside {
         bench: "gncl",

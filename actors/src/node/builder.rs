@@ -238,9 +238,11 @@ impl NodeBuilder {
         self.tree.check()?;
         let patience = self.config.sync.layer_deadline * 4;
         let incarnation = self.incarnation.unwrap_or_else(wall_clock);
-        let secured = Secured::load(&self.config, incarnation)?;
+        let secured = if is_bystander { None } else { Secured::load(&self.config, incarnation)? };
         let stores = Stores::new(self.config, incarnation);
-        secure(&stores, secured);
+        if !is_bystander {
+            secure(&stores, secured);
+        }
         #[cfg(feature = "fault-points")]
         super::faults::keep(&stores, &planned)?;
         #[cfg(not(feature = "fault-points"))]

@@ -51,6 +51,9 @@ pub(crate) struct Arguments {
     /// `SCHED_FIFO` priority of the control loops, 1 to 99; wants `--control-thread own`. Real time only.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=99))]
     pub(crate) realtime_priority: Option<u8>,
+    /// Secure the links between nodes with the keys in this directory, made by `sinew keys init exoskeleton central hip knee ankle`. Real time only.
+    #[arg(long, value_name = "DIR")]
+    pub(crate) keys: Option<PathBuf>,
     /// Folder for the run folders.
     #[arg(long, value_name = "DIR", default_value = "runs")]
     pub(crate) runs: PathBuf,

@@ -55,6 +55,7 @@ fn options(arguments: &Arguments) -> Result<LaunchOptions, RunError> {
             realtime_priority: arguments.realtime_priority,
             release: ReleaseBy::Itself,
         },
+        keys: arguments.keys.clone(),
         runs: arguments.runs.clone(),
     })
 }

@@ -61,6 +61,8 @@ pub struct LaunchOptions {
     pub device_watchdog: Option<Duration>,
     /// How the control loops run.
     pub control: Control,
+    /// Directory of the robot's keys, made for the project [`PROJECT_WITH_KEYS`]; `None`: links between nodes are open.
+    pub keys: Option<PathBuf>,
     /// Folder for the run folders.
     pub runs: PathBuf,
 }
@@ -152,10 +154,17 @@ pub fn run(options: &LaunchOptions) -> Result<Walk, LaunchError> {
     Ok(Walk { report, real_time: collected.figures, folder })
 }
 
+/// The project of a robot with keys: they say whose they are. Its multicast group keeps each run apart.
+pub const PROJECT_WITH_KEYS: &str = "exoskeleton";
+
 fn topology(options: &LaunchOptions) -> Result<Topology, LaunchError> {
     let mut topology = topology::for_this_host(options.seed)?;
     topology.control = options.control;
     topology.plant.device_watchdog = options.device_watchdog;
+    if let Some(keys) = &options.keys {
+        PROJECT_WITH_KEYS.clone_into(&mut topology.project);
+        topology.keys = Some(std::path::absolute(keys)?);
+    }
     topology.plant.trial = match &options.trial {
         Some(path) => Some(std::path::absolute(path)?),
         None => None,

@@ -32,6 +32,8 @@ pub struct Topology {
     pub central: NodePlace,
     /// The joint nodes.
     pub joints: PerJoint<NodePlace>,
+    /// Directory of the robot's keys, as `sinew keys init` makes it; `None`: links between nodes are open.
+    pub keys: Option<PathBuf>,
     /// Path of central's socket for the status screen; `None`: no such door.
     pub console: Option<PathBuf>,
     /// The plant.
@@ -184,6 +186,7 @@ impl Topology {
         config.ndl.mdns_port = self.discovery.mdns.then_some(MDNS_PORT);
         config.ndl.period = self.discovery.period;
         config.ndl.missed_max = self.discovery.missed_max;
+        config.security.keys = self.keys.as_ref().map(|keys| keys.join("nodes").join(part.name()));
         if part == Part::Central {
             config.lncl.socket.clone_from(&self.console);
         }

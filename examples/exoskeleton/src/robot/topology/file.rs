@@ -25,6 +25,8 @@ const SEEDS_MAX: usize = 256;
 #[serde(deny_unknown_fields)]
 struct File {
     project: String,
+    /// Directory of the robot's keys.
+    keys: Option<PathBuf>,
     #[serde(default)]
     discovery: DiscoveryTable,
     #[serde(default)]
@@ -123,7 +125,7 @@ pub(super) fn parse(text: &str) -> Result<Topology, TopologyFaults> {
     match (places, discovery, plant) {
         (Some([central, hip, knee, ankle]), Some(discovery), Some(plant)) if faults.0.is_empty() => {
             let (joints, console) = ([hip, knee, ankle], file.central.console);
-            Ok(Topology { project, discovery, control, central, joints, console, plant })
+            Ok(Topology { project, keys: file.keys, discovery, control, central, joints, console, plant })
         }
         (Some(_) | None, Some(_) | None, Some(_) | None) => Err(TopologyFaults(faults.0)),
     }
@@ -296,6 +298,7 @@ pub(super) fn write(topology: &Topology) -> String {
     };
     let file = File {
         project: topology.project.clone(),
+        keys: topology.keys.clone(),
         discovery: DiscoveryTable {
             multicast: discovery.multicast.map_or_else(|| OFF.to_owned(), |group| group.to_string()),
             mdns: discovery.mdns,

@@ -28,6 +28,7 @@ pub fn for_this_host(seed: u64) -> io::Result<Topology> {
     };
     Ok(Topology {
         project: format!("exoskeleton-{id}"),
+        keys: None,
         discovery: Discovery {
             multicast: Some(SocketAddrV4::new(group, query.local_addr()?.port())),
             mdns: false,
