@@ -1,0 +1,125 @@
+//! Mailboxes and their readers: what outlives whom, and what becomes of each message.
+
+use std::task::{Context, Poll};
+
+use bytes::Bytes;
+use futures_util::task::noop_waker;
+
+use super::*;
+use crate::{
+    tid::Tid,
+    wire::{Header, Kind},
+};
+
+fn message() -> Message {
+    Message::new(Header::new(Kind::named("test"), Tid::NONE, Tid::NONE), Bytes::new())
+}
+
+fn take(reader: &mut MailboxReader) -> Poll<Option<Message>> {
+    reader.poll_take(&mut Context::from_waker(&noop_waker()))
+}
+
+#[test]
+fn messages_behind_a_panic_reach_the_next_incarnation() {
+    let mailbox = Mailbox::new(8);
+    mailbox.submit(message()).unwrap();
+    mailbox.submit(message()).unwrap();
+    let mut first = mailbox.attach();
+    assert!(matches!(take(&mut first), Poll::Ready(Some(_))));
+    drop(first); // as the guard does after a panic
+    let mut second = mailbox.attach();
+    assert!(matches!(take(&mut second), Poll::Ready(Some(_))));
+    second.finish(Outcome::Delivered);
+    assert!(take(&mut second).is_pending());
+    let tally = mailbox.tally(Class::Control);
+    assert_eq!((tally.taken, tally.failed, tally.delivered, tally.open()), (2, 1, 1, 0));
+}
+
+#[test]
+fn a_fenced_reader_gets_nothing() {
+    let mailbox = Mailbox::new(8);
+    let mut zombie = mailbox.attach();
+    let _present = mailbox.attach();
+    mailbox.submit(message()).unwrap();
+    assert!(matches!(take(&mut zombie), Poll::Ready(None)));
+}
+
+#[test]
+fn what_a_reader_has_in_its_hand_when_it_is_fenced_off_has_failed_whatever_it_says_later() {
+    let mailbox = Mailbox::new(8);
+    mailbox.submit(message()).unwrap();
+    mailbox.submit(message()).unwrap();
+    let mut zombie = mailbox.attach();
+    assert!(matches!(take(&mut zombie), Poll::Ready(Some(_))));
+    zombie.finish(Outcome::Delivered);
+    assert!(matches!(take(&mut zombie), Poll::Ready(Some(_))));
+    mailbox.detach(zombie.epoch());
+    let told = |mailbox: &Mailbox| {
+        let tally = mailbox.tally(Class::Control);
+        (tally.delivered, tally.failed, tally.open())
+    };
+    assert_eq!(told(&mailbox), (1, 1, 0));
+    zombie.finish(Outcome::Delivered);
+    drop(zombie);
+    assert_eq!(told(&mailbox), (1, 1, 0));
+}
+
+#[test]
+fn a_reader_that_is_not_the_present_one_cannot_be_fenced_off() {
+    let mailbox = Mailbox::new(8);
+    let former = mailbox.attach().epoch();
+    let mut present = mailbox.attach();
+    mailbox.detach(former);
+    mailbox.submit(message()).unwrap();
+    assert!(matches!(take(&mut present), Poll::Ready(Some(_))));
+}
+
+#[test]
+fn what_has_expired_makes_room_in_a_full_mailbox_that_nobody_reads() {
+    let mailbox = Mailbox::new(1);
+    let mut old = message();
+    (old.header.sent, old.header.time_to_live_us) = (Time::from_nanos(1), 1);
+    mailbox.submit(old).unwrap();
+    mailbox.submit(message()).unwrap();
+    assert_eq!(mailbox.submit(message()).unwrap_err().why, Rejection::QueueFull);
+    let tally = mailbox.tally(Class::Control);
+    assert_eq!((tally.taken, tally.expired, tally.refused, tally.open()), (2, 1, 1, 1));
+}
+
+#[test]
+fn the_layers_events_go_ahead_of_everything_and_alone_in_a_pause() {
+    let mailbox = Mailbox::new(8);
+    let mut event = message();
+    event.header.source = Tid::new(Tid::NONE.node, crate::tid::AppAddress::SYNC);
+    let (kind, source) = (event.header.kind, event.header.source);
+    mailbox.submit(message()).unwrap();
+    mailbox.submit(event).unwrap();
+    let mut reader = mailbox.attach();
+    let mut poll_event = || reader.poll_event(&mut Context::from_waker(&noop_waker()));
+    let Poll::Ready(Some(first)) = poll_event() else { panic!("the event") };
+    assert_eq!((first.header.kind, first.header.source), (kind, source));
+    assert!(poll_event().is_pending());
+    assert!(matches!(take(&mut reader), Poll::Ready(Some(_))));
+}
+
+#[test]
+fn a_mailbox_whose_application_is_away_and_keeps_nothing_refuses_until_it_is_back() {
+    let mailbox = Mailbox::new(8);
+    mailbox.submit(message()).unwrap();
+    mailbox.refuse_while_away();
+    assert_eq!(mailbox.submit(message()).unwrap_err().why, Rejection::Away);
+    mailbox.is_back();
+    mailbox.submit(message()).unwrap();
+    let tally = mailbox.tally(Class::Control);
+    assert_eq!((tally.taken, tally.rejected, tally.refused, tally.open()), (2, 1, 1, 1));
+}
+
+#[test]
+fn a_closed_mailbox_refuses_what_waits_and_what_comes() {
+    let mailbox = Mailbox::new(8);
+    mailbox.submit(message()).unwrap();
+    mailbox.close();
+    assert_eq!(mailbox.submit(message()).unwrap_err().why, Rejection::Closed);
+    let tally = mailbox.tally(Class::Control);
+    assert_eq!((tally.taken, tally.rejected, tally.refused, tally.open()), (1, 1, 1, 0));
+}
