@@ -73,11 +73,11 @@ macro_rules! on_every_transport {
 
 mod awaiting;
 mod loans;
+mod registration;
 mod returns;
 mod room;
 
 on_every_transport! {
-    addresses_are_fixed_or_dynamic_and_names_have_one_holder
     messages_go_to_and_fro_between_processes
     raw_memory_is_lent_filled_and_sent
     what_is_handled_while_memory_is_lent_is_told_when_it_is_given_back
@@ -94,10 +94,7 @@ on_every_transport! {
     what_waited_in_a_dropped_endpoint_was_not_handled
     of_a_stream_only_the_newest_value_is_received
     a_member_gets_what_is_sent_to_its_group_until_it_leaves
-    names_resolve_and_are_free_when_unregister_returns
-    a_registration_waits_at_the_barrier_and_names_what_it_waits_for
     the_end_of_the_node_is_an_error_with_its_reason
-    every_thread_may_have_an_address_of_its_own
     what_nobody_takes_is_said_with_its_number_and_once
 }
 
@@ -107,44 +104,6 @@ fn on(under: Under) -> Registration {
 
 fn register(under: Under, node: &TestNode, registration: Registration) -> Client {
     Api::connect(under, node).register(registration).unwrap()
-}
-
-fn refusal(under: Under, node: &TestNode, registration: Registration) -> String {
-    match Api::connect(under, node).register(registration) {
-        Err(ApiError::Refused(sentence)) => sentence,
-        other => panic!("{other:?} instead of a refusal"),
-    }
-}
-
-fn addresses_are_fixed_or_dynamic_and_names_have_one_holder(under: Under) {
-    let node = TestNode::start();
-    let fixed = AppAddress::fixed(7).unwrap();
-    let first = register(under, &node, on(under).name("knee").fixed(fixed));
-    assert_eq!(first.transport(), under.transport);
-    assert_eq!(first.tid(), Tid::new(node.address(), fixed));
-    assert_eq!((first.node_name(), first.payload_max()), ("test", 1 << 20));
-    let second = register(under, &node, on(under));
-    assert!(second.tid().app.is_dynamic());
-    let pid = std::process::id();
-    let why = refusal(under, &node, on(under).name("knee"));
-    assert!(why.contains(&format!("'knee' is taken by application {fixed} of process {pid}")), "{why}");
-    let why = refusal(under, &node, on(under).fixed(fixed));
-    assert!(why.contains("is taken by 'knee'"), "{why}");
-    let why = refusal(under, &node, on(under).fixed(AppAddress::NDL));
-    assert!(why.contains("fixed addresses are"), "{why}");
-    // The life after the one that had it has it again.
-    first.unregister().unwrap();
-    assert_eq!(
-        register(under, &node, on(under).name("knee").fixed(fixed)).tid(),
-        Tid::new(node.address(), fixed)
-    );
-}
-
-#[test]
-fn without_a_node_the_error_says_where_it_was_looked_for() {
-    let directory = TestDirectory::new();
-    let error = NodeApi::connect(directory.path().join("nobody.sock")).unwrap_err();
-    assert!(error.to_string().contains("nobody.sock"), "{error}");
 }
 
 fn messages_go_to_and_fro_between_processes(under: Under) {
@@ -395,32 +354,6 @@ fn a_member_gets_what_is_sent_to_its_group_until_it_leaves(under: Under) {
     assert_eq!(member.receive(WATCHDOG).unwrap().expect("a message").destination(), member.tid());
 }
 
-fn names_resolve_and_are_free_when_unregister_returns(under: Under) {
-    let node = TestNode::start();
-    let mut endpoint = register(under, &node, on(under));
-    assert_eq!(endpoint.resolve("hip", WATCHDOG).unwrap(), None);
-    let hip = register(under, &node, on(under).name("hip"));
-    assert_eq!(endpoint.resolve("hip", WATCHDOG).unwrap(), Some(hip.tid()));
-    hip.unregister().unwrap();
-    assert_eq!(endpoint.resolve("hip", WATCHDOG).unwrap(), None);
-    register(under, &node, on(under).name("hip"));
-}
-
-fn a_registration_waits_at_the_barrier_and_names_what_it_waits_for(under: Under) {
-    let mut node = TestNode::start();
-    let api = Api::connect(under, &node);
-    let wanted = on(under).requires(["knee.sensor", "central.gait"]);
-    // Long enough for the node to say what is missing.
-    let error = api.register(wanted.clone().deadline(Duration::from_secs(1))).unwrap_err();
-    assert!(error.to_string().contains("knee.sensor, central.gait"), "{error}");
-    let AppFact::Registered { app: given_up, .. } = node.fact() else { panic!("no registration") };
-    assert_eq!(node.fact(), AppFact::Unregistered { app: given_up });
-    let waiting = thread::spawn(move || api.register(wanted.deadline(WATCHDOG)));
-    let AppFact::Registered { app, .. } = node.fact() else { panic!("no registration") };
-    node.release(app);
-    assert_eq!(waiting.join().unwrap().unwrap().tid().app, app);
-}
-
 fn the_end_of_the_node_is_an_error_with_its_reason(under: Under) {
     let mut node = TestNode::start();
     let mut endpoint = register(under, &node, on(under));
@@ -429,34 +362,6 @@ fn the_end_of_the_node_is_an_error_with_its_reason(under: Under) {
     assert!(error.to_string().contains("LNCL has ended"), "{error}");
     let error = endpoint.send(Tid::NONE, &TORQUE).unwrap_err();
     assert!(error.to_string().contains("LNCL has ended"), "{error}");
-}
-
-fn every_thread_may_have_an_address_of_its_own(under: Under) {
-    let node = TestNode::start();
-    let api = Api::connect(under, &node);
-    let app = node.local(1);
-    thread::scope(|scope| {
-        for _ in 0..8 {
-            scope.spawn(|| {
-                let mut endpoint = api.register(on(under)).unwrap();
-                let kind = Kind::named("test.raw");
-                for number in 0..100_u64 {
-                    let mut buffer = endpoint.create_message(app.tid, kind, 8).unwrap();
-                    buffer.copy_from_slice(&number.to_le_bytes());
-                    endpoint.send_message(buffer).unwrap();
-                }
-            });
-        }
-        let mut next = std::collections::BTreeMap::<Tid, u64>::new();
-        for _ in 0..800 {
-            let message = app.next();
-            let expected = next.entry(message.header.source).or_default();
-            assert_eq!(message.payload[..], expected.to_le_bytes(), "in order for each source");
-            *expected += 1;
-            assert!(!message.header.flags.has(Flags::CONFIRM));
-        }
-        assert_eq!(next.len(), 8);
-    });
 }
 
 fn what_nobody_takes_is_said_with_its_number_and_once(under: Under) {
@@ -487,20 +392,4 @@ fn what_nobody_takes_is_said_with_its_number_and_once(under: Under) {
         }
     }
     assert_eq!((full, gone, endpoint.untaken()), (MORE, 1, None));
-}
-
-/// Who is refused at the door has its words closed in behind it, and not only a broken pipe.
-#[test]
-fn who_is_refused_before_it_has_said_a_word_is_told_why() {
-    let node = TestNode::start_with(|config| config.lncl.strangers_per_process_max = 1);
-    for _ in 0..20 {
-        // Whoever is silent has its place for two seconds, or for less where this thread stands still.
-        let _silent = RawClient::connect(&node);
-        match NodeApi::connect(node.path()).unwrap().register_transport_address(Registration::new()) {
-            Err(ApiError::Refused(why)) => assert!(why.contains("strangers_per_process_max"), "{why}"),
-            Ok(_) => {}
-            Err(other) => panic!("{other:?} instead of a refusal"),
-        }
-    }
-    assert!(node.refused("too many strangers") > 0);
 }
