@@ -1,0 +1,158 @@
+//! What a node says of others: those that it knows, those that it lost, those of other projects.
+
+use serde::{Deserialize, Serialize};
+use sinew_runtime::tid::{Incarnation, NodeAddress, Tid};
+
+use crate::sync::at_most;
+
+/// Connections to one node at most, and ways in which it was found.
+const LINKS_MAX: usize = 8;
+/// Layers and applications of a peer that do not get on and are named, at most.
+const TROUBLES_MAX: usize = 8;
+
+/// A node that was there.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LostReport {
+    /// Its address.
+    pub node: NodeAddress,
+    /// Its name.
+    pub name: String,
+    /// Which life of it that was.
+    pub incarnation: Incarnation,
+    /// Where its NDL answered.
+    pub udp: String,
+    /// Time since it was lost.
+    pub lost_us: u64,
+    /// How that was noticed: `left`, `crashed`, `hung`, `link down`, `restarted`, `duplicate`.
+    pub why: String,
+    /// How long it had been silent then.
+    pub silent_us: u64,
+    /// Time after its last sign of life within which its loss was to be known.
+    #[serde(default)]
+    pub bound_us: Option<u64>,
+    /// How it had been found: `seed`, `multicast`, `mdns`, `query`.
+    #[serde(deserialize_with = "at_most::<_, _, LINKS_MAX>")]
+    pub found_by: Vec<String>,
+}
+
+/// A node of another project that is heard.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ForeignReport {
+    /// Its address.
+    pub node: NodeAddress,
+    /// Its name.
+    pub name: String,
+    /// Its project.
+    pub project: String,
+    /// Where it speaks.
+    pub udp: String,
+    /// Time since it was heard.
+    pub ago_us: u64,
+}
+
+/// The last dial to a node, if it failed and none has led to a connection since.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DialReport {
+    /// Where to.
+    pub address: String,
+    /// What the system said.
+    pub error: String,
+    /// Time since then.
+    pub ago_us: u64,
+    /// How many have failed since there was a connection.
+    pub failed: u64,
+}
+
+/// A layer or an application of a node that does not get on, though the node lives.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TroubleReport {
+    /// Its address.
+    pub app: Tid,
+    /// Its name.
+    pub name: String,
+    /// `stalled` (one turn of it has lasted for 250 ms and more), `away` (it failed and is started again), `given up` (it failed and is not).
+    pub trouble: String,
+    /// For how long that has been so, as its node said last.
+    pub since_us: u64,
+}
+
+/// A node as another one sees it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PeerReport {
+    /// Its address.
+    pub node: NodeAddress,
+    /// Its name, if it is there.
+    pub name: Option<String>,
+    /// Which life of it this is.
+    pub incarnation: Incarnation,
+    /// Whether it answers; else it is lost, and there is still something for it or from it.
+    pub is_there: bool,
+    /// Time since it was found.
+    pub found_us: Option<u64>,
+    /// How it was found: `seed`, `multicast`, `mdns`, `query`.
+    #[serde(deserialize_with = "at_most::<_, _, LINKS_MAX>")]
+    pub found_by: Vec<String>,
+    /// Time since its last sign of life.
+    pub silent_us: Option<u64>,
+    /// Answers that it missed in a row.
+    pub missed: u32,
+    /// Time between two queries to it, if it is there.
+    #[serde(default)]
+    pub asked_every_us: Option<u64>,
+    /// Time after its last sign of life within which its loss is known, if it is there.
+    #[serde(default)]
+    pub bound_us: Option<u64>,
+    /// How many of its layers and applications do not get on, as it says.
+    #[serde(default)]
+    pub troubled: u32,
+    /// The first of them: four at most, and 64 of all peers.
+    #[serde(default, deserialize_with = "at_most::<_, _, TROUBLES_MAX>")]
+    pub troubles: Vec<TroubleReport>,
+    /// Time of the last query and its answer on the network, in nanoseconds.
+    pub round_trip_ns: Option<u64>,
+    /// Its clock minus that of the node that answers, in nanoseconds.
+    pub offset_ns: Option<i64>,
+    /// The error of that at most, in nanoseconds.
+    pub offset_bound_ns: Option<u64>,
+    /// Since when there is a connection to it.
+    #[serde(default)]
+    pub linked_us: Option<u64>,
+    /// When the last one broke, if there is none.
+    #[serde(default)]
+    pub broken_us: Option<u64>,
+    /// The last dial, if it failed.
+    #[serde(default)]
+    pub dial: Option<DialReport>,
+    /// The connections to it.
+    #[serde(deserialize_with = "at_most::<_, _, LINKS_MAX>")]
+    pub links: Vec<LinkReport>,
+    /// How values of class Stream go to it; `None` where one connection carries all classes.
+    #[serde(default)]
+    pub stream: Option<StreamReport>,
+}
+
+/// How values of class Stream go to a node: each in a datagram of its own (UDP), or by the connection (TCP).
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct StreamReport {
+    /// Whether the node that answers may send datagrams: `gncl.datagrams`.
+    pub is_on: bool,
+    /// Whether both have agreed on them. If not, all goes by the connection.
+    pub is_agreed: bool,
+    /// Values that went by datagram so far.
+    pub sent: u64,
+    /// Those of them that the other node has acknowledged.
+    pub arrived: u64,
+}
+
+/// What carries the messages of a class to a node.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LinkReport {
+    /// `control`, `stream`, `bulk`; `all` where one connection carries all.
+    pub class: String,
+    /// Whether it is connected now.
+    pub is_up: bool,
+    /// Messages that wait to be sent.
+    pub waiting: u64,
+    /// Confirmed ones whose outcome is not known yet.
+    pub unconfirmed: u64,
+}
