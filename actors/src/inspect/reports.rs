@@ -2,7 +2,7 @@
 
 mod peers;
 
-pub use peers::{DialReport, ForeignReport, LinkReport, LostReport, PeerReport, TroubleReport};
+pub use peers::{DialReport, ForeignReport, LinkReport, LostReport, PeerReport, StreamReport, TroubleReport};
 
 use serde::{Deserialize, Serialize};
 use sinew_runtime::{

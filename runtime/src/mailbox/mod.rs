@@ -101,9 +101,17 @@ impl Shared {
         self.events.len() + self.queue.len()
     }
 
+    /// Half of the places are not for events that wait behind messages: what ends a pause is an event itself, and those wait as long as
+    /// the pause lasts.
+    fn has_room_for_event(&self, event: &Header) -> bool {
+        let kept = self.queue.kept_events();
+        self.events.len() + kept < self.events_max && (kept < self.events_max / 2 || !self.queue.keeps(event))
+    }
+
     fn submit_event(&mut self, event: Message) -> Result<Option<Waker>, Refused> {
+        let has_room = self.has_room_for_event(&event.header);
         let tally = &mut self.tallies[event.header.class as usize];
-        if self.events.len() >= self.events_max {
+        if !has_room {
             tally.refused += 1;
             return Err(Refused::new(event, Rejection::QueueFull));
         }

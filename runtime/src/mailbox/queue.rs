@@ -5,7 +5,11 @@ mod tests;
 
 use std::{collections::VecDeque, sync::Arc, task::Waker};
 
-use super::{Budget, ends::Ends, room::Awaited};
+use super::{
+    Budget,
+    ends::{Ends, Held, Place},
+    room::Awaited,
+};
 use crate::{
     outcome::{Rejection, Ticket},
     router::Refused,
@@ -31,6 +35,11 @@ impl Bounds {
     const fn has_bytes_for(self, length: usize, held: usize) -> bool {
         held == 0 || length <= self.bytes.saturating_sub(held)
     }
+
+    /// Whether one message more of this `length` has room beside what is `held`.
+    const fn has_room_for(self, length: usize, held: Held) -> bool {
+        held.messages < self.messages && self.has_bytes_for(length, held.bytes)
+    }
 }
 
 impl From<usize> for Bounds {
@@ -45,7 +54,7 @@ impl From<usize> for Bounds {
 /// - Control and Bulk keep the order in which they came.
 /// - Stream keeps one message for each source and kind: a newer one takes the place of the older, and its turn.
 /// - A lane that was passed over 32 times has one turn.
-/// - What is left of a node whose end is told, and that, goes before all else.
+/// - What is left of a node whose end is told, and that, goes before all else. It holds its lane's places until it is taken.
 /// - A full lane refuses; it never drops. It is full when it holds as many messages, or as many bytes, as it may.
 #[derive(Debug)]
 pub struct ClassQueue {
@@ -94,29 +103,26 @@ impl ClassQueue {
     /// The message itself, if the lane of its class is full. An older value that waits stays there then.
     pub fn push(&mut self, message: Message) -> Result<Option<Message>, Refused> {
         let (class, length) = (message.header.class, message.payload.len());
-        let lane = &mut self.lanes[class as usize];
-        let held = &mut self.bytes[class as usize];
+        let held = self.held(class as usize);
         if class == Class::Stream
-            && let Some(older) = older_value(lane, &message.header)
+            && let Some(older) = older_value(&mut self.lanes[class as usize], &message.header)
         {
-            let others = *held - older.payload.len();
-            if !self.bounds.has_bytes_for(length, others)
-                || !takes_instead(self.budget.as_deref(), length, older.payload.len())
+            let former = older.payload.len();
+            if !self.bounds.has_bytes_for(length, held.bytes - former)
+                || !takes_instead(self.budget.as_deref(), length, former)
             {
                 return Err(Refused::new(message, Rejection::QueueFull));
             }
-            *held = others + length;
+            let in_lane = &mut self.bytes[class as usize];
+            *in_lane = *in_lane - former + length;
             self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
             return Ok(Some(std::mem::replace(older, message)));
         }
-        if lane.len() >= self.bounds.messages
-            || !self.bounds.has_bytes_for(length, *held)
-            || !takes_instead(self.budget.as_deref(), length, 0)
-        {
+        if !self.bounds.has_room_for(length, held) || !takes_instead(self.budget.as_deref(), length, 0) {
             return Err(Refused::new(message, Rejection::QueueFull));
         }
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
-        if let Some(message) = self.place_behind(message) {
+        if let Some(message) = self.place_behind(message, Place::Lane) {
             self.bytes[class as usize] += length;
             self.lanes[class as usize].push_back(message);
         }
@@ -127,25 +133,25 @@ impl ClassQueue {
     /// order counts; who uses it bounds how many there are.
     pub fn push_beyond(&mut self, message: Message) {
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
-        self.hold(&message);
-        self.lanes[message.header.class as usize].push_back(message);
-    }
-
-    /// Counts a message in, whatever the bounds.
-    fn hold(&mut self, message: &Message) {
-        let length = message.payload.len();
-        self.bytes[message.header.class as usize] += length;
-        if let Some(budget) = &self.budget {
-            budget.add(length);
-        }
+        let (class, length) = (message.header.class as usize, message.payload.len());
+        self.add(length);
+        self.bytes[class] += length;
+        self.lanes[class].push_back(message);
     }
 
     /// Whether there is room for this message beside all that waits.
     #[must_use]
     pub fn has_room_for(&self, message: &Message) -> bool {
-        let class = message.header.class as usize;
-        self.lanes[class].len() < self.bounds.messages
-            && self.bounds.has_bytes_for(message.payload.len(), self.bytes[class])
+        self.bounds.has_room_for(message.payload.len(), self.held(message.header.class as usize))
+    }
+
+    /// What holds places of a lane: what waits in it, and what was brought forward from it.
+    pub(super) fn held(&self, class: usize) -> Held {
+        let at_ends = self.ends.of_lane(class);
+        Held {
+            messages: self.lanes[class].len() + at_ends.messages,
+            bytes: self.bytes[class] + at_ends.bytes,
+        }
     }
 
     /// Somebody keeps this message, which found no room, and waits for some: [`room_made`](Self::room_made) says when. Returns the waker if
@@ -161,9 +167,9 @@ impl ClassQueue {
     pub fn room_made(&mut self) -> Option<Waker> {
         let awaited = self.awaited.as_ref()?;
         let has_room = awaited.any(|class, length| {
-            let (waits, held) = (self.lanes[class].len(), self.bytes[class]);
-            waits <= self.bounds.messages / 2
-                && self.bounds.has_bytes_for(length.max(self.bounds.bytes / 2), held)
+            let held = self.held(class);
+            held.messages <= self.bounds.messages / 2
+                && self.bounds.has_bytes_for(length.max(self.bounds.bytes / 2), held.bytes)
                 && self.budget.as_ref().is_none_or(|budget| budget.has_room_for(length))
         });
         if has_room { self.awaited_no_more() } else { None }
@@ -178,20 +184,24 @@ impl ClassQueue {
     #[must_use]
     pub fn supersedes(&self, older: &Header) -> bool {
         let lane = &self.lanes[Class::Stream as usize];
-        older.class == Class::Stream && lane.iter().any(|newer| is_same_stream(&newer.header, older))
+        older.class == Class::Stream
+            && (self.ends.has_value_of(older)
+                || lane.iter().any(|newer| is_same_stream(&newer.header, older)))
     }
 
     /// Puts a message back that was popped, before all others of its class, whatever the bound. Hands it back if it is
     /// of a Stream whose newer value waits here.
     pub fn put_back(&mut self, message: Message) -> Option<Message> {
-        let lane = &self.lanes[message.header.class as usize];
-        let header = &message.header;
-        if header.class == Class::Stream && lane.iter().any(|newer| is_same_stream(&newer.header, header)) {
+        if self.supersedes(&message.header) {
             return Some(message);
         }
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
-        self.hold(&message);
-        self.lanes[message.header.class as usize].push_front(message);
+        let (class, length) = (message.header.class as usize, message.payload.len());
+        self.add(length);
+        if let Some(message) = self.put_back_before_end(message) {
+            self.bytes[class] += length;
+            self.lanes[class].push_front(message);
+        }
         None
     }
 
@@ -225,8 +235,15 @@ impl ClassQueue {
         Some(next)
     }
 
+    /// So many bytes are held more, whatever the bounds.
+    pub(super) fn add(&self, bytes: usize) {
+        if let Some(budget) = &self.budget {
+            budget.add(bytes);
+        }
+    }
+
     /// So many bytes are held no more.
-    fn give(&self, bytes: usize) {
+    pub(super) fn give(&self, bytes: usize) {
         if let Some(budget) = &self.budget {
             budget.give(bytes);
         }
@@ -252,6 +269,12 @@ impl ClassQueue {
         }
         self.give(expired.iter().map(|message| message.payload.len()).sum());
         expired
+    }
+
+    /// Nothing that waits expires before this.
+    #[must_use]
+    pub const fn next_expiry(&self) -> Time {
+        self.earliest_expiry
     }
 
     /// Takes the request that `ticket` names out, if it waits.
@@ -303,8 +326,7 @@ impl ClassQueue {
     pub fn drain_all(&mut self) -> impl Iterator<Item = Message> + use<> {
         self.give(self.bytes());
         self.bytes = [0; 3];
-        let ends = self.ends.take_all();
-        ends.into_iter().chain(std::mem::take(&mut self.lanes).into_iter().flatten())
+        self.ends.take_all().chain(std::mem::take(&mut self.lanes).into_iter().flatten())
     }
 }
 

@@ -1,10 +1,18 @@
 //! What is said of a node's end, and where it stands in a queue.
 
+use std::{
+    collections::BTreeMap,
+    task::{Context, Poll, Waker},
+};
+
 use bytes::Bytes;
-use proptest::prelude::*;
+use proptest::{prelude::*, test_runner::TestCaseError};
 
 use super::*;
 use crate::{
+    mailbox::{Bounds, Mailbox},
+    outcome::Outcome,
+    router::Outlet,
     tid::{AppAddress, NodeAddress, Tid},
     wire::{Class, Header, Kind},
 };
@@ -68,7 +76,191 @@ fn events_that_wait_behind_messages_are_forgotten_like_others_and_the_messages_s
     assert_eq!(all(&mut queue), [1]);
 }
 
+#[test]
+fn what_goes_before_all_others_holds_its_classs_places_until_it_is_taken() {
+    let mut queue = ClassQueue::new(Bounds { messages: 2, bytes: 8 });
+    for round in 0..3 {
+        queue.push(of(GONE, Class::Bulk, round)).unwrap();
+        queue.push(of(GONE, Class::Bulk, round)).unwrap();
+        assert!(queue.keep_behind(event(About::End(GONE), 9)).is_none());
+        let refused = queue.push(of(GONE, Class::Bulk, round)).unwrap_err();
+        assert!(!queue.has_room_for(&refused.message) && queue.kept_events() == 1);
+        assert_eq!(all(&mut queue), [round, round, 9]);
+    }
+}
+
+#[test]
+fn who_waits_for_room_is_not_woken_by_what_is_only_brought_forward() {
+    let mut queue = ClassQueue::new(2);
+    queue.push(of(GONE, Class::Bulk, 1)).unwrap();
+    queue.push(of(GONE, Class::Bulk, 2)).unwrap();
+    assert!(queue.offered(&of(OTHER, Class::Bulk, 3), Waker::noop()).is_none());
+    assert!(queue.keep_behind(event(About::End(GONE), 4)).is_none());
+    assert!(queue.room_made().is_none());
+    queue.pop();
+    assert!(queue.room_made().is_some());
+}
+
+#[test]
+fn what_is_put_back_comes_before_what_was_said_of_its_nodes_end_meanwhile() {
+    for rest in [0, 1] {
+        let mut queue = ClassQueue::new(8);
+        queue.push(of(GONE, Class::Bulk, 1)).unwrap();
+        let popped = queue.pop().unwrap();
+        (0..rest).for_each(|_| drop(queue.push(of(GONE, Class::Control, 2)).unwrap()));
+        queue.push(event(About::End(GONE), 3)).unwrap();
+        assert!(queue.put_back(popped).is_none());
+        assert_eq!(all(&mut queue), if rest == 0 { vec![1, 3] } else { vec![1, 2, 3] });
+    }
+}
+
+#[test]
+fn of_a_stream_the_newer_value_wins_also_where_it_was_brought_forward() {
+    let mut queue = ClassQueue::new(8);
+    queue.push(of(GONE, Class::Stream, 1)).unwrap();
+    let older = queue.pop().unwrap();
+    queue.push(of(GONE, Class::Stream, 2)).unwrap();
+    queue.push(event(About::End(GONE), 3)).unwrap();
+    assert!(queue.supersedes(&older.header));
+    assert!(queue.put_back(older).is_some());
+    // What the next life says takes nobody's place.
+    assert!(queue.push(of(GONE, Class::Stream, 4)).unwrap().is_none());
+    assert_eq!(all(&mut queue), [2, 3, 4]);
+}
+
+/// Looks at the order in which messages are taken: of each node nothing comes behind its end that came before it.
+#[derive(Default)]
+struct Order {
+    ends: BTreeMap<NodeAddress, u64>,
+    last: BTreeMap<(NodeAddress, Class), u64>,
+}
+
+impl Order {
+    fn taken(&mut self, header: &Header) -> Result<(), TestCaseError> {
+        let (node, sequence) = (node_of(header), header.sequence);
+        if let Some(about) = About::of(header) {
+            if matches!(about, About::End(_)) {
+                self.ends.insert(node, sequence);
+            }
+            return Ok(());
+        }
+        prop_assert!(
+            self.ends.get(&node).is_none_or(|end| *end < sequence),
+            "{sequence} comes after the end"
+        );
+        let before = self.last.insert((node, header.class), sequence);
+        prop_assert!(before.is_none_or(|before| before < sequence), "{sequence} after {before:?}");
+        Ok(())
+    }
+}
+
+const BOUNDS: Bounds = Bounds { messages: 6, bytes: 20 };
+
 proptest! {
+    /// As on the way to a client: events are messages of class Control like any others.
+    #[test]
+    fn a_queue_holds_no_more_than_its_bounds_however_often_nodes_end(
+        steps in proptest::collection::vec((0u8..12, 0usize..3, any::<bool>()), 1..200),
+    ) {
+        let mut queue = ClassQueue::new(BOUNDS);
+        let (mut order, mut hand) = (Order::default(), None::<Message>);
+        for (sequence, (what, class, is_gone)) in (1..).zip(steps) {
+            let node = if is_gone { GONE } else { OTHER };
+            match what {
+                0..6 => {
+                    let mut message = of(node, Class::ALL[class], sequence);
+                    message.header.sent = Time::from_nanos(sequence * 1_000);
+                    message.header.time_to_live_us = if what == 0 { 5 } else { 0 };
+                    let _ = queue.push(message);
+                }
+                6 | 7 => drop(queue.push(event(About::End(node), sequence))),
+                8 => drop(queue.push(event(About::Node(node), sequence))),
+                9 => drop(queue.take_expired(Time::from_nanos(sequence * 1_000))),
+                10 => {
+                    if let Some(message) = hand.take() {
+                        order.taken(&message.header)?;
+                    }
+                    hand = queue.pop();
+                }
+                _ => if let Some(message) = hand.take() { drop(queue.put_back(message)) },
+            }
+            for class in 0..3 {
+                // What is put back has room beyond the bound.
+                prop_assert!(queue.held(class).messages <= BOUNDS.messages + 1);
+                prop_assert!(queue.held(class).bytes <= BOUNDS.bytes + 4);
+                prop_assert_eq!(queue.len_of(Class::ALL[class]), queue.held(class).messages);
+            }
+            prop_assert_eq!(queue.iter().map(|message| message.payload.len()).sum::<usize>(), queue.bytes());
+        }
+        for message in hand.into_iter().chain(std::iter::from_fn(|| queue.pop())) {
+            order.taken(&message.header)?;
+        }
+        prop_assert_eq!((queue.bytes(), queue.held(0), queue.held(1), queue.held(2)),
+            (0, Held::default(), Held::default(), Held::default()));
+    }
+
+    /// As in an application's mailbox, also while it is paused: then nothing is taken but events that go ahead.
+    #[test]
+    fn a_mailbox_holds_no_more_than_its_bounds_however_often_nodes_end(
+        steps in proptest::collection::vec((0u8..10, 0usize..3, any::<bool>()), 1..200),
+    ) {
+        let mailbox = Mailbox::new(BOUNDS);
+        let mut reader = mailbox.attach();
+        let mut cx = Context::from_waker(Waker::noop());
+        let (mut order, mut is_paused) = (Order::default(), true);
+        for (sequence, (what, class, is_gone)) in (1..).zip(steps) {
+            let node = if is_gone { GONE } else { OTHER };
+            let submitted = match what {
+                0..4 => mailbox.submit(of(node, Class::ALL[class], sequence)),
+                4 | 5 => mailbox.submit(event(About::End(node), sequence)),
+                6 => mailbox.submit(event(About::Node(node), sequence)),
+                7 => {
+                    is_paused = !is_paused;
+                    Ok(())
+                }
+                _ => {
+                    let taken = if is_paused { reader.poll_event(&mut cx) } else { reader.poll_take(&mut cx) };
+                    if let Poll::Ready(Some(message)) = taken {
+                        reader.finish(Outcome::Delivered);
+                        order.taken(&message.header)?;
+                    }
+                    Ok(())
+                }
+            };
+            prop_assert!(submitted.is_ok() || mailbox.depth() > 0, "an empty one refuses nothing");
+            prop_assert!(mailbox.depth() <= 4 * BOUNDS.messages, "three classes, and events");
+            for class in Class::ALL {
+                // One may be in hand; events are of class Control.
+                let events_max = if class == Class::Control { BOUNDS.messages } else { 0 };
+                let (tally, held) = mailbox.account(class);
+                prop_assert!(held <= (BOUNDS.messages + events_max + 1) as u64);
+                prop_assert_eq!(tally.open(), held);
+            }
+        }
+        while let Poll::Ready(Some(message)) = reader.poll_take(&mut cx) {
+            reader.finish(Outcome::Delivered);
+            order.taken(&message.header)?;
+        }
+    }
+
+    /// What ends a pause is told in it, whatever waits for the end of it.
+    #[test]
+    fn an_event_that_need_not_wait_has_room_in_a_pause_whatever_is_kept(capacity in 1usize..9, ends in 0u64..40) {
+        let mailbox = Mailbox::new(capacity);
+        let mut reader = mailbox.attach();
+        let mut cx = Context::from_waker(Waker::noop());
+        prop_assert!(reader.poll_event(&mut cx).is_pending());
+        mailbox.submit(of(GONE, Class::Bulk, 1)).unwrap();
+        for sequence in 0..ends {
+            let _ = mailbox.submit(event(About::End(GONE), sequence));
+        }
+        let mut met = of(HERE, Class::Control, 2);
+        met.header.source.app = AppAddress::SYNC;
+        prop_assert!(mailbox.submit(met).is_ok());
+        prop_assert!(reader.poll_event(&mut cx).is_ready());
+        prop_assert!(mailbox.depth() <= capacity + 1);
+    }
+
     /// However they come: of each node nothing comes behind its end that came before it, and each class stays in order.
     #[test]
     fn ends_are_ends(steps in proptest::collection::vec((0u8..5, 0usize..3), 1..100)) {
@@ -86,7 +278,7 @@ proptest! {
             queue.push(message).unwrap();
         }
         let mut said = Vec::new();
-        let mut last = std::collections::BTreeMap::new();
+        let mut last = BTreeMap::new();
         while let Some(Message { header, .. }) = queue.pop() {
             if let Some(about) = About::of(&header) {
                 said.push((about.node(), header.sequence));
