@@ -55,13 +55,11 @@ impl<S: Socket> Half<S> {
         if let Some(message) = self.interrupted.take() {
             self.interrupted = self.keep_or_expire(message, now, after);
         }
-        let waiting: Vec<_> = self.queue.drain_all().collect();
-        for message in waiting {
-            if let Some(message) = self.keep_or_expire(message, now, after) {
-                // What was in the queue has room in it.
-                self.queue.push_beyond(message);
-            }
+        for message in self.queue.take_expired(now) {
+            self.waiting_receipts -= usize::from(message.receipt.is_some());
+            self.expired(message, after);
         }
+        self.next_expiry = self.next_expiry.min(self.queue.next_expiry());
     }
 
     fn keep_or_expire(&mut self, message: Message, now: Time, after: &mut After) -> Option<Message> {

@@ -12,6 +12,7 @@ use std::{
 use bytes::{Bytes, BytesMut};
 use futures_util::FutureExt;
 use sinew_runtime::{
+    mailbox::About,
     outcome::{Receipt, ReceiptSink},
     tid::{AppAddress, NodeAddress, Tid},
     wire::{Class, Flags, FrameCodec, Header, Kind},
@@ -331,6 +332,25 @@ fn what_expires_while_it_waits_says_so_and_is_not_sent() {
     bench.reconnect(PLENTY);
     assert_eq!(bench.seen(), [3]);
     assert_eq!(bench.outlet.counts(), OutletCounts { sent: 1, expired: 2, ..OutletCounts::default() });
+}
+
+#[test]
+fn what_is_said_of_a_nodes_end_stays_behind_its_messages_when_something_else_expires() {
+    let mut bench = Bench::new(0);
+    bench.outlet.disconnect(bench.link);
+    let (here, gone) = (NodeAddress::new(1), NodeAddress::new(2));
+    let mut last = message(Class::Bulk, 1);
+    last.header.source.node = gone;
+    let mut end = message(Class::Control, 2);
+    end.header.source = Tid::new(here, AppAddress::NDL);
+    end.header.destination.node = here;
+    About::End(gone).write(&mut end.header);
+    bench.submit(last);
+    bench.submit(end);
+    bench.submit(expiring(Class::Stream, 3));
+    bench.outlet.expire(Time::now() + Duration::from_secs(61));
+    bench.reconnect(PLENTY);
+    assert_eq!(bench.seen(), [1, 2]);
 }
 
 #[test]
