@@ -9,7 +9,7 @@
 //! A node that leaves in order is heard to its end first: until its connections are through, and for [`LEAVE_MAX`] at most.
 
 use std::{
-    collections::{BTreeSet, VecDeque},
+    collections::{BTreeMap, BTreeSet, VecDeque},
     sync::{Arc, Mutex},
     time::Duration,
 };
@@ -21,24 +21,24 @@ use sinew_runtime::{
     time::Time,
     wire::Message,
 };
-use tokio::sync::Notify;
 
 use crate::stores::{Stores, lock};
 
 /// Time that a node which said goodbye has for its last messages: it gives them 3 s itself (GNCL-10).
-const LEAVE_MAX: Duration = Duration::from_secs(5);
+pub(crate) const LEAVE_MAX: Duration = Duration::from_secs(5);
 /// Events that are kept back at most; one more is offered again by whoever tells it.
 const WAITING_MAX: usize = 4_096;
-/// How often it is looked whether the last message has come: at first, and of what has waited for longer than [`SOON`].
-const LOOK: Duration = Duration::from_millis(1);
-const LOOK_LATER: Duration = Duration::from_millis(10);
-const SOON: Duration = Duration::from_millis(100);
+/// So long it is not looked again: messages end one after the other, and a look is for all that ended meanwhile.
+const REST: Duration = Duration::from_millis(1);
+/// How often an event is offered again to an application that has no room for it.
+const OFFER_PERIOD: Duration = Duration::from_millis(10);
+/// After so long it is looked whatever is heard.
+pub(crate) const LOOK_PERIOD: Duration = Duration::from_secs(1);
 
 /// Events that are kept back, in the order in which they were told.
 #[derive(Debug, Default)]
 pub(crate) struct Aftermath {
     waiting: Mutex<VecDeque<Waiting>>,
-    news: Notify,
 }
 
 #[derive(Debug)]
@@ -63,7 +63,7 @@ pub(crate) fn tell(stores: &Stores, about: About, mut event: Message) -> Result<
     let waiting = Waiting { event, node: about.node(), since: Time::now() };
     let key = waiting.key();
     // Without a lock in hand: GNCL's are asked.
-    let is_early = matches!(about, About::End(_)) && stores.gncl.owes(key.1, key.0);
+    let is_early = matches!(about, About::End(_)) && stores.gncl.owed(key.1).has(key.0);
     let mut all = lock(&stores.aftermath.waiting);
     if !is_early && all.iter().all(|other| other.key() != key) {
         drop(all);
@@ -74,38 +74,55 @@ pub(crate) fn tell(stores: &Stores, about: About, mut event: Message) -> Result<
     }
     all.push_back(waiting);
     drop(all);
-    stores.aftermath.news.notify_one();
+    stores.gncl.fewer_owed.notify_one();
     Ok(())
 }
 
-/// Tells what is kept back, each when its turn has come.
+/// Tells what is kept back, each when its turn has come. GNCL says when that may be: while nothing ends, nothing is looked at but what is
+/// offered to a full application.
+///
+/// A look costs a search among those to whom something is owed for each event that is kept, and a moment of the locks of the sessions of
+/// each node that these are about. There is one a millisecond at most.
 pub(crate) async fn carry_on(stores: Arc<Stores>) {
     loop {
-        let oldest = lock(&stores.aftermath.waiting).front().map(|waiting| waiting.since);
-        match oldest {
-            None => stores.aftermath.news.notified().await,
-            Some(since) if Time::now().since(since) < SOON => tokio::time::sleep(LOOK).await,
-            Some(_) => tokio::time::sleep(LOOK_LATER).await,
+        let news = stores.gncl.fewer_owed.notified();
+        match tell_whose_turn_has_come(&stores, Time::now()) {
+            None => news.await,
+            Some(pause) => {
+                drop(tokio::time::timeout(pause, news).await);
+                tokio::time::sleep(REST).await;
+            }
         }
-        tell_whose_turn_has_come(&stores, Time::now());
     }
 }
 
-fn tell_whose_turn_has_come(stores: &Stores, now: Time) {
+/// Returns for how long it need not be looked again if nothing is heard; `None` if nothing is kept back.
+pub(crate) fn tell_whose_turn_has_come(stores: &Stores, now: Time) -> Option<Duration> {
     // Whoever is told meanwhile comes behind these, for they are looked at under the lock.
     let mut all = lock(&stores.aftermath.waiting);
-    let mut stay = BTreeSet::new();
-    let waiting = std::mem::take(&mut *all);
-    for waiting in waiting {
+    let (mut owed, mut stay, mut pause) = (BTreeMap::new(), BTreeSet::new(), LOOK_PERIOD);
+    for waiting in std::mem::take(&mut *all) {
         let key = waiting.key();
-        if now.since(waiting.since) >= LEAVE_MAX {
-            stores.gncl.fence_who_left(key.1, now, LEAVE_MAX);
+        let left = LEAVE_MAX.saturating_sub(now.since(waiting.since));
+        // The first one of a node is the oldest.
+        let owed = owed.entry(key.1).or_insert_with(|| {
+            if left.is_zero() {
+                stores.gncl.fence_who_left(key.1, now, LEAVE_MAX);
+            } else {
+                pause = pause.min(left);
+            }
+            stores.gncl.owed(key.1)
+        });
+        if !stay.contains(&key) && !owed.has(key.0) {
+            if is_taken(stores, &waiting.event) {
+                continue;
+            }
+            pause = pause.min(OFFER_PERIOD);
         }
-        if stay.contains(&key) || stores.gncl.owes(key.1, key.0) || !is_taken(stores, &waiting.event) {
-            stay.insert(key);
-            all.push_back(waiting);
-        }
+        stay.insert(key);
+        all.push_back(waiting);
     }
+    (!all.is_empty()).then_some(pause)
 }
 
 /// Whether it need not be told again: any other refusal says that the application is gone.

@@ -56,6 +56,7 @@ mod link;
 mod listener;
 mod marks;
 mod notes;
+mod owed;
 mod peer;
 mod secure;
 mod spin;

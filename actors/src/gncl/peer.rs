@@ -31,10 +31,11 @@ use super::{
     core::{Attach, Lane},
     datagrams::{Alarm, Channel, HandedOn, Position, Sockets},
     notes::Notes,
+    owed::Owed,
     task::{Move, Place},
     ticks::Ticks,
     transport::Transport,
-    way::{Ends, Offered, Way, WayAccount},
+    way::{Ends, Offered, Told, Way, WayAccount},
 };
 use crate::{
     audit::Account,
@@ -69,6 +70,7 @@ pub(crate) struct Peer {
     channel: Option<Channel>,
     buried: Arc<Mutex<Buried>>,
     expiring: Arc<Ticks>,
+    fewer_owed: Arc<Notify>,
 }
 
 /// What became of the messages to and from lives of peers that are gone, all together.
@@ -87,6 +89,7 @@ impl Drop for Peer {
             // What still waited for applications is gone with it, and its receipts say so.
             buried.arrived = buried.arrived + Account::of_arrivals(&arrived).over();
         }
+        self.fewer_owed.notify_one();
     }
 }
 
@@ -95,9 +98,9 @@ impl Peer {
     fn new(now: Time, attach: &Attach, stores: &Stores) -> Self {
         let ends = Ends { here: stores.node, node: attach.node, takes_outcomes: attach.takes_outcomes };
         let ways = if attach.by_class { Lane::ALL.len() } else { 1 };
-        let refusals = &stores.gncl.refusals;
-        let acks = &stores.gncl.acks;
-        let ways = (0..ways).map(|_| Way::new(now, ends, &stores.config, refusals, acks)).collect();
+        let Store { refusals, acks, fewer_owed, .. } = &stores.gncl;
+        let told = Told { refusals: refusals.clone(), acks: acks.clone(), fewer_owed: fewer_owed.clone() };
+        let ways = (0..ways).map(|_| Way::new(now, ends, &stores.config, &told)).collect();
         let channel = attach.takes_datagrams.then(|| {
             // Nobody can guess it: this has its seed from the system.
             let key = RandomState::new().hash_one(());
@@ -106,6 +109,7 @@ impl Peer {
             Channel::new(now, ends, key, former, (&stores.gncl.alarm, refusals))
         });
         let (buried, expiring) = (stores.gncl.buried.clone(), stores.gncl.expiring.clone());
+        let fewer_owed = fewer_owed.clone();
         let Attach { node, incarnation, takes_cancels, .. } = *attach;
         Self {
             node,
@@ -118,6 +122,7 @@ impl Peer {
             is_over: AtomicBool::new(false),
             buried,
             expiring,
+            fewer_owed,
         }
     }
 
@@ -168,19 +173,20 @@ impl Peer {
     /// Nothing more is taken of this life of it.
     fn fence(&self) {
         self.ways.iter().for_each(Way::fence);
-        // SYNC: Release, with the Acquire in `owes`: who sees it sees the fences.
-        self.is_over.store(true, Ordering::Release);
+        // SYNC: Release, with the Acquire in `owed`: who sees it sees the fences.
+        if !self.is_over.swap(true, Ordering::Release) {
+            self.fewer_owed.notify_one();
+        }
     }
 
-    /// Whether a message of this life, which has left or is over, may still come to the application at this address.
-    fn owes(&self, app: AppAddress) -> bool {
+    /// To whom a message of this life, if it has left or is over, may still come.
+    fn owed(&self) -> Owed {
         // SYNC: Acquire, see `fence`.
         if self.is_over.load(Ordering::Acquire) {
-            self.ways.iter().any(|way| way.owes(app))
-        } else {
-            // SYNC: Relaxed; a flag by itself.
-            self.has_left.load(Ordering::Relaxed) != 0
+            return self.ways.iter().map(Way::owed).fold(Owed::NOBODY, Owed::and);
         }
+        // SYNC: Relaxed; a flag by itself.
+        if self.has_left.load(Ordering::Relaxed) != 0 { Owed::Anyone } else { Owed::NOBODY }
     }
 
     /// Something waits here again that had gone out.
@@ -338,6 +344,8 @@ pub(crate) struct Store {
     /// Who looks for what has expired, and who for what was taken and not acknowledged.
     expiring: Arc<Ticks>,
     acks: Arc<Ticks>,
+    /// Told when messages that were [owed](Self::owed) came or will not come. For one who waits.
+    pub(crate) fewer_owed: Arc<Notify>,
     /// Where datagrams are read, and who looks at the time for them.
     pub(super) datagrams: Sockets,
     pub(super) alarm: Arc<Alarm>,

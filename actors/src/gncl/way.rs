@@ -12,14 +12,16 @@ use bytes::Bytes;
 use sinew_runtime::{
     outcome::{Outcome, Rejection, Ticket},
     router::{Refused, Router},
-    tid::{AppAddress, NodeAddress},
+    tid::NodeAddress,
     time::Time,
     wire::{HEADER_LEN, Kind, Message},
 };
+use tokio::sync::Notify;
 
 use super::{
     arrivals::{Arrivals, End},
     core::Decline,
+    owed::Owed,
     peer::frame,
     ticks::Ticks,
     transport::Transport,
@@ -125,6 +127,16 @@ pub(super) struct Ends {
     pub(super) takes_outcomes: bool,
 }
 
+/// What a session tells others of.
+#[derive(Clone, Default)]
+pub(super) struct Told {
+    pub(super) refusals: Arc<Refusals>,
+    /// Something was taken that the peer does not know of.
+    pub(super) acks: Arc<Ticks>,
+    /// The peer's life is over, and fewer of its messages may still come to an application.
+    pub(super) fewer_owed: Arc<Notify>,
+}
+
 /// A session with a peer.
 pub(crate) struct Way {
     pub(crate) outlet: StreamOutlet<Gathering<Transport>>,
@@ -136,20 +148,12 @@ pub(crate) struct Way {
     longest: usize,
     outcomes_max: usize,
     ends: Ends,
-    refusals: Arc<Refusals>,
-    /// Told when something was taken that the peer does not know of.
-    acks: Arc<Ticks>,
+    told: Told,
 }
 
 impl Way {
     /// `now` numbers what is remembered: a later session with the same life of the peer has a larger number.
-    pub(super) fn new(
-        now: Time,
-        ends: Ends,
-        config: &NodeConfig,
-        refusals: &Arc<Refusals>,
-        acks: &Arc<Ticks>,
-    ) -> Self {
+    pub(super) fn new(now: Time, ends: Ends, config: &NodeConfig, told: &Told) -> Self {
         let limits = OutletLimits {
             queue_capacity: config.gncl.queue_capacity,
             queue_bytes: config.gncl.queue_bytes,
@@ -183,8 +187,7 @@ impl Way {
             is_fenced: false,
         });
         let outcomes_max = OUTCOMES_MAX * config.gncl.queue_capacity;
-        let (refusals, acks) = (refusals.clone(), acks.clone());
-        Self { outlet, inbox, window, longest, outcomes_max, ends, refusals, acks }
+        Self { outlet, inbox, window, longest, outcomes_max, ends, told: told.clone() }
     }
 
     /// Its messages come on `link` from now on, and are taken from no other.
@@ -213,7 +216,7 @@ impl Way {
         };
         match arrival {
             Arrival::Take { .. } => {
-                self.acks.want();
+                self.told.acks.want();
                 Ok(line.map_or(Taken::Yes, Taken::InLine))
             }
             Arrival::Fenced => Ok(Taken::No),
@@ -235,17 +238,40 @@ impl Way {
         self.inbox().is_fenced = true;
     }
 
-    /// Whether a message that was taken may still come to the application at this address.
-    pub(super) fn owes(&self, app: AppAddress) -> bool {
+    /// To whom a message that was taken may still come.
+    pub(super) fn owed(&self) -> Owed {
         let Inbox { shelf, arrivals, .. } = &*self.inbox();
-        arrivals.in_hand() > 0 || shelf.held().into_iter().any(|line| destination_of(line) == app)
+        if arrivals.in_hand() > 0 {
+            return Owed::Anyone;
+        }
+        Owed::These(shelf.held().into_iter().map(destination_of).collect())
+    }
+
+    /// Fewer messages may still come to applications here: whoever waits for that of a peer whose life is over looks.
+    fn owes_less(&self) {
+        let is_fenced = self.inbox().is_fenced;
+        if is_fenced {
+            self.told.fewer_owed.notify_one();
+        }
+    }
+
+    /// A message that was in hand has ended so.
+    fn end(&self, end: End) {
+        let is_fenced = {
+            let mut inbox = self.inbox();
+            inbox.arrivals.end(end);
+            inbox.is_fenced
+        };
+        if is_fenced {
+            self.told.fewer_owed.notify_one();
+        }
     }
 
     /// The peer says what it has taken.
     pub(super) fn heard(&self, link: LinkNumber, ack: &Ack, now: Time) {
         let counts = self.inbox().receiving.heard(link.number(), ack.epoch);
         if counts && self.outlet.heard(link, ack, now) {
-            self.refusals.count(
+            self.told.refusals.count(
                 now,
                 "session begun anew",
                 &format!(
@@ -275,6 +301,7 @@ impl Way {
         };
         match put {
             Ok(is_news) => {
+                self.owes_less();
                 if is_news {
                     // spec: CREDIT-2
                     self.acknowledge();
@@ -296,7 +323,7 @@ impl Way {
              (QueueFull) until one of them takes again; what they wait for says `sinew why`",
             self.ends.node
         );
-        self.refusals.count(Time::now(), "too many full applications", &detail);
+        self.told.refusals.count(Time::now(), "too many full applications", &detail);
     }
 
     /// Takes a request out of its line that nobody waits for any more; if its destination is held no more, the peer is told so.
@@ -309,6 +336,7 @@ impl Way {
             arrivals.end(End::Expired);
             (request, shelf.change() != before)
         };
+        self.owes_less();
         if is_news || self.owes_room() {
             // spec: CREDIT-2
             self.acknowledge();
@@ -328,6 +356,9 @@ impl Way {
         let (has_fewer, expired) = self.expire_lines(now);
         let held = self.inbox().shelf.held().into_iter().filter(|key| !is_early(*key));
         let lines: Vec<_> = held.map(|key| self.offer_line(now, key, router, room)).collect();
+        if has_fewer || !lines.is_empty() {
+            self.owes_less();
+        }
         if has_fewer || lines.contains(&Offered::All) || self.owes_room() {
             // spec: CREDIT-2
             self.acknowledge();
@@ -453,7 +484,7 @@ impl Way {
         {
             let detail =
                 format!("a frame of kind {} for node {}", refused.message.header.kind, self.ends.node);
-            self.refusals.count(Time::now(), "own frame not sent", &detail);
+            self.told.refusals.count(Time::now(), "own frame not sent", &detail);
         }
     }
 
@@ -462,7 +493,7 @@ impl Way {
         if let Err(refused) = self.outlet.submit_beyond_up_to(self.outcomes_max, message) {
             let kind = refused.message.header.kind;
             let detail = format!("a frame of kind {kind} for node {}: {}", self.ends.node, refused.why);
-            self.refusals.count(Time::now(), "own frame not sent", &detail);
+            self.told.refusals.count(Time::now(), "own frame not sent", &detail);
         }
     }
 }

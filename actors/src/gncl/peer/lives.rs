@@ -8,13 +8,13 @@ use std::{
 use bytes::Bytes;
 use sinew_runtime::{
     outcome::Rejection,
-    tid::{AppAddress, Incarnation, NodeAddress},
+    tid::{Incarnation, NodeAddress},
     time::Time,
     wire::Kind,
 };
 
 use super::{
-    super::{core::Attach, datagrams::HandedOn, way::Way},
+    super::{core::Attach, datagrams::HandedOn, owed::Owed, way::Way},
     Peer, Store, frame,
 };
 use crate::stores::{Stores, lock};
@@ -54,9 +54,11 @@ impl Store {
         self.met().iter().filter(has_left).for_each(|peer| peer.fence());
     }
 
-    /// Whether a message of a life of `node` that has left or is over may still come to the application at this address.
-    pub(crate) fn owes(&self, node: NodeAddress, app: AppAddress) -> bool {
-        self.met().iter().any(|peer| peer.node == node && peer.owes(app))
+    /// To whom a message of a life of `node` that has left or is over may still come.
+    pub(crate) fn owed(&self, node: NodeAddress) -> Owed {
+        let met = self.met();
+        let of_node = met.iter().filter(|peer| peer.node == node);
+        of_node.map(|peer| peer.owed()).fold(Owed::NOBODY, Owed::and)
     }
 
     /// When something of that life of `node` was read last.

@@ -10,10 +10,13 @@ use sinew_runtime::{
 };
 
 use super::{
-    bench::{ByHand, KIND, NINE, Node, introduction, next, run},
+    bench::{ByHand, KIND, NINE, Node, introduction, next, run, within},
     credit,
 };
-use crate::{aftermath, gncl::core::Introduction};
+use crate::{
+    aftermath,
+    gncl::{core::Introduction, owed::Owed},
+};
 
 /// The incarnation of a peer that is linked.
 fn life(node: &Node, peer: NodeAddress) -> Incarnation {
@@ -121,5 +124,69 @@ fn what_comes_of_a_later_life_comes_behind_what_waits_of_the_earlier_one() {
             assert_eq!(next("a message of either life", &mut slow).await.payload[..], [expected]);
         }
         assert!(slow.next().now_or_never().is_none());
+    });
+}
+
+/// Nothing of `peer` may still come to an application of `node`: whoever is told of each change, and looks at nothing else, knows.
+async fn owes_nothing(node: &Node, peer: NodeAddress) {
+    let gncl = &node.stores.gncl;
+    within("the last message", async {
+        while gncl.owed(peer) != Owed::NOBODY {
+            gncl.fewer_owed.notified().await;
+        }
+    })
+    .await;
+}
+
+#[test]
+fn who_waits_for_the_end_of_a_life_that_leaves_is_told_of_it_and_looks_at_nothing_meanwhile() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut inbox = node.app(1);
+        let _peer = ByHand::linked_to(&mut node).await;
+        node.stores.gncl.leaves(Time::now(), NINE, life(&node, NINE));
+        tell_the_end(&node, NINE);
+        let pause = aftermath::tell_whose_turn_has_come(&node.stores, Time::now());
+        assert_eq!(pause, Some(aftermath::LOOK_PERIOD));
+        let news = &node.stores.gncl.fewer_owed;
+        assert!(news.notified().now_or_never().is_some(), "it was told something");
+        assert!(news.notified().now_or_never().is_none(), "nothing has come");
+        assert!(inbox.next().now_or_never().is_none());
+        node.stores.gncl.fence(NINE, life(&node, NINE));
+        assert!(news.notified().now_or_never().is_some(), "its end");
+        assert_eq!(node.stores.gncl.owed(NINE), Owed::NOBODY);
+        assert_eq!(aftermath::tell_whose_turn_has_come(&node.stores, Time::now()), None);
+        assert_eq!(next("its end", &mut inbox).await.payload[..], *b"its end");
+    });
+}
+
+#[test]
+fn who_waits_for_the_last_message_to_a_slow_application_is_told_when_it_has_come() {
+    run(async {
+        let (a, b, mut slow) = credit::pair().await;
+        credit::fill(&a, &b).await;
+        b.stores.gncl.fence(a.address(), life(&b, a.address()));
+        assert!(b.stores.gncl.owed(a.address()).has(b.tid(1).app));
+        assert!(!b.stores.gncl.owed(a.address()).has(b.tid(2).app));
+        let takes = async { while slow.next().await.is_some() {} };
+        tokio::select! {
+            () = owes_nothing(&b, a.address()) => {}
+            () = takes => panic!("its mailbox ended"),
+        }
+    });
+}
+
+#[test]
+fn who_left_and_still_sends_is_over_when_his_time_is() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut inbox = node.app(1);
+        let _peer = ByHand::linked_to(&mut node).await;
+        let now = Time::now();
+        node.stores.gncl.leaves(now, NINE, life(&node, NINE));
+        tell_the_end(&node, NINE);
+        let later = Time::now() + aftermath::LEAVE_MAX;
+        assert_eq!(aftermath::tell_whose_turn_has_come(&node.stores, later), None);
+        assert_eq!(next("its end", &mut inbox).await.payload[..], *b"its end");
     });
 }

@@ -80,7 +80,10 @@ mod tests {
     };
     use tokio_util::codec::Decoder;
 
-    use super::{super::Ends, *};
+    use super::{
+        super::{Ends, Told},
+        *,
+    };
     use crate::{
         config::NodeConfig,
         gncl::{core::read, transport::Transport},
@@ -103,7 +106,7 @@ mod tests {
         let [here, node] = [1, 2].map(NodeAddress::new);
         let ends = Ends { here, node, takes_outcomes: true };
         let config = NodeConfig::new("hip");
-        let way = Way::new(Time::now(), ends, &config, &Arc::default(), &Arc::default());
+        let way = Way::new(Time::now(), ends, &config, &Told::default());
         let link = way.outlet.connect(Gathering::new(Transport::open(ours), Checksum::Crc), 1 << 16, None);
         way.attach(link);
         // When: one thread has made an acknowledgement, another one makes and says a newer one, and the first one goes on.

@@ -13,7 +13,7 @@ impl<'a> Hand<'a> {
     /// The message has ended so.
     pub(in crate::gncl) fn ends(mut self, end: End) {
         if let Some(way) = self.0.take() {
-            way.inbox().arrivals.end(end);
+            way.end(end);
         }
     }
 
@@ -21,6 +21,7 @@ impl<'a> Hand<'a> {
     pub(in crate::gncl) fn had_come(mut self) {
         if let Some(way) = self.0.take() {
             way.inbox().arrivals.take_none();
+            way.owes_less();
         }
     }
 
@@ -33,7 +34,7 @@ impl<'a> Hand<'a> {
 impl Drop for Hand<'_> {
     fn drop(&mut self) {
         if let Some(way) = self.0 {
-            way.inbox().arrivals.end(End::Failed);
+            way.end(End::Failed);
         }
     }
 }
