@@ -66,8 +66,6 @@ impl Way {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
-
     use bytes::{Bytes, BytesMut};
     use sinew_runtime::{
         tid::NodeAddress,
