@@ -240,26 +240,13 @@ mod tests {
         let app = Tid::new(node, AppAddress::new(0x1000));
         let (name, trouble) = ("drive".to_owned(), "stalled".to_owned());
         let seen = PeerReport {
-            node,
             name: Some("knee".to_owned()),
-            incarnation: Incarnation(1),
             is_there: true,
-            found_us: None,
-            found_by: Vec::new(),
-            silent_us: None,
-            missed: 0,
             asked_every_us: Some(500_000),
             bound_us: Some(2_000_000),
             troubled: 3,
             troubles: vec![TroubleReport { app, name, trouble, since_us: 2_500_000 }],
-            round_trip_ns: None,
-            offset_ns: None,
-            offset_bound_ns: None,
-            linked_us: None,
-            broken_us: None,
-            dial: None,
-            links: Vec::new(),
-            stream: None,
+            ..PeerReport::lost(node, Incarnation(1))
         };
         let lines = [
             format!("10.0.0.7 knee: drive ({app}) does not get on: stalled for 2.5 s\n"),

@@ -205,7 +205,8 @@ fn peers(stores: &Stores, now: Time) -> BTreeMap<NodeAddress, PeerReport> {
     let known = lock(&stores.ndl).members(now);
     let mut peers: BTreeMap<_, _> = known.iter().map(|known| (known.node, peer_report(known, now))).collect();
     for peer in stores.gncl.peers() {
-        let report = peers.entry(peer.node).or_insert_with(|| lost(&peer));
+        let lost = || PeerReport::lost(peer.node, peer.incarnation);
+        let report = peers.entry(peer.node).or_insert_with(lost);
         (report.links, report.stream) = (links(&peer), stream(stores, &peer));
     }
     for (node, peer) in &mut peers {
@@ -224,9 +225,7 @@ fn peers(stores: &Stores, now: Time) -> BTreeMap<NodeAddress, PeerReport> {
 
 fn peer_report(known: &KnownNode, now: Time) -> PeerReport {
     PeerReport {
-        node: known.node,
         name: Some(known.name.clone()),
-        incarnation: known.incarnation,
         is_there: true,
         found_us: known.sources.values().min().map(|found| micros(now.since(*found))),
         found_by: known.sources.keys().map(|source| word(*source).to_owned()).collect(),
@@ -239,11 +238,7 @@ fn peer_report(known: &KnownNode, now: Time) -> PeerReport {
         round_trip_ns: known.round_trip.map(nanos),
         offset_ns: known.offset.map(|offset| offset.theirs_minus_ours_ns),
         offset_bound_ns: known.offset.map(|offset| nanos(offset.bound)),
-        linked_us: None,
-        broken_us: None,
-        dial: None,
-        links: Vec::new(),
-        stream: None,
+        ..PeerReport::lost(known.node, known.incarnation)
     }
 }
 
@@ -256,31 +251,6 @@ fn trouble(part: &TroubledApp) -> TroubleReport {
     };
     let TroubledApp { app, ref name, since, .. } = *part;
     TroubleReport { app, name: name.clone(), trouble: word.to_owned(), since_us: micros(since) }
-}
-
-fn lost(peer: &Peer) -> PeerReport {
-    PeerReport {
-        node: peer.node,
-        name: None,
-        incarnation: peer.incarnation,
-        is_there: false,
-        found_us: None,
-        found_by: Vec::new(),
-        silent_us: None,
-        missed: 0,
-        asked_every_us: None,
-        bound_us: None,
-        troubled: 0,
-        troubles: Vec::new(),
-        round_trip_ns: None,
-        offset_ns: None,
-        offset_bound_ns: None,
-        linked_us: None,
-        broken_us: None,
-        dial: None,
-        links: Vec::new(),
-        stream: None,
-    }
 }
 
 fn links(peer: &Peer) -> Vec<LinkReport> {

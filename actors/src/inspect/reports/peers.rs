@@ -144,6 +144,35 @@ pub struct StreamReport {
     pub arrived: u64,
 }
 
+impl PeerReport {
+    /// That of a node that is not there and of which nothing else is known.
+    #[must_use]
+    pub const fn lost(node: NodeAddress, incarnation: Incarnation) -> Self {
+        Self {
+            node,
+            name: None,
+            incarnation,
+            is_there: false,
+            found_us: None,
+            found_by: Vec::new(),
+            silent_us: None,
+            missed: 0,
+            asked_every_us: None,
+            bound_us: None,
+            troubled: 0,
+            troubles: Vec::new(),
+            round_trip_ns: None,
+            offset_ns: None,
+            offset_bound_ns: None,
+            linked_us: None,
+            broken_us: None,
+            dial: None,
+            links: Vec::new(),
+            stream: None,
+        }
+    }
+}
+
 /// What carries the messages of a class to a node.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LinkReport {
