@@ -2,16 +2,13 @@
 
 mod acks;
 mod hand;
+mod lines;
 
-use std::{
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
-    task::Waker,
-};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use bytes::Bytes;
 use sinew_runtime::{
-    outcome::{Outcome, Rejection, Ticket},
-    router::{Refused, Router},
+    outcome::Rejection,
     tid::NodeAddress,
     time::Time,
     wire::{HEADER_LEN, Kind, Message},
@@ -50,10 +47,6 @@ const WORDS_MAX: usize = 32;
 const LINES_MAX: usize = 256;
 /// Windows that may wait for applications, all together.
 const SHELF_WINDOWS: usize = 4;
-/// Messages of one line that are offered before others have their turn.
-const OFFERS_PER_TURN: usize = 256;
-/// Messages of all lines that are settled as expired before.
-const EXPIRED_PER_TURN: usize = 256;
 /// Times `gncl.queue_capacity`: so many outcomes may wait to be sent. They answer confirmed messages of the peer, of which it can
 /// have that many.
 const OUTCOMES_MAX: usize = 8;
@@ -281,145 +274,6 @@ impl Way {
             );
             self.acknowledge();
         }
-    }
-
-    /// Puts a message behind what waits for its destination; if that is held from now on, the peer is told so at once. Returns whether
-    /// it is.
-    ///
-    /// # Errors
-    /// The message: there is no room.
-    pub(super) fn put_in_line(&self, key: u64, message: Message) -> Result<bool, Message> {
-        let bytes = message.size();
-        let put = {
-            let Inbox { shelf, arrivals, .. } = &mut *self.inbox();
-            let (before, has_no_line) = (shelf.change(), shelf.has_no_line_for(key));
-            let put = shelf.put(key, message, bytes);
-            if put.is_ok() {
-                arrivals.put_away();
-            }
-            put.map(|()| shelf.change() != before).map_err(|message| (message, has_no_line))
-        };
-        match put {
-            Ok(is_news) => {
-                self.owes_less();
-                if is_news {
-                    // spec: CREDIT-2
-                    self.acknowledge();
-                }
-                Ok(is_news)
-            }
-            Err((message, has_no_line)) => {
-                if has_no_line {
-                    self.count_too_many_lines();
-                }
-                Err(message)
-            }
-        }
-    }
-
-    fn count_too_many_lines(&self) {
-        let detail = format!(
-            "{LINES_MAX} applications here take nothing of what node {} sends, and one more is full: what comes for that one is refused \
-             (QueueFull) until one of them takes again; what they wait for says `sinew why`",
-            self.ends.node
-        );
-        self.told.refusals.count(Time::now(), "too many full applications", &detail);
-    }
-
-    /// Takes a request out of its line that nobody waits for any more; if its destination is held no more, the peer is told so.
-    pub(super) fn take_back(&self, line: u64, ticket: Ticket) -> Option<Message> {
-        let (request, is_news) = {
-            let Inbox { shelf, arrivals, .. } = &mut *self.inbox();
-            let before = shelf.change();
-            let request = shelf.take_back(line, |message| message.is_request(ticket))?;
-            arrivals.take_again();
-            arrivals.end(End::Expired);
-            (request, shelf.change() != before)
-        };
-        self.owes_less();
-        if is_news || self.owes_room() {
-            // spec: CREDIT-2
-            self.acknowledge();
-        }
-        Some(request)
-    }
-
-    /// Offers what waits for applications here to them again, but for lines that are `is_early`; `room` is woken when one of them takes
-    /// more. Returns how far that came.
-    pub(super) fn offer_again(
-        &self,
-        now: Time,
-        router: &Router,
-        room: &Waker,
-        is_early: impl Fn(u64) -> bool,
-    ) -> Offered {
-        let (has_fewer, expired) = self.expire_lines(now);
-        let held = self.inbox().shelf.held().into_iter().filter(|key| !is_early(*key));
-        let lines: Vec<_> = held.map(|key| self.offer_line(now, key, router, room)).collect();
-        if has_fewer || !lines.is_empty() {
-            self.owes_less();
-        }
-        if has_fewer || lines.contains(&Offered::All) || self.owes_room() {
-            // spec: CREDIT-2
-            self.acknowledge();
-        }
-        lines.into_iter().fold(expired, Offered::max)
-    }
-
-    /// Whether there is much more room than the peer knows of.
-    fn owes_room(&self) -> bool {
-        let Inbox { receiving, shelf, .. } = &*self.inbox();
-        receiving.owes_room(shelf.room(self.window, self.longest))
-    }
-
-    /// Settles what has expired in the lines, also behind a message that may wait longer. Returns whether somebody is held no more, and
-    /// how far that came.
-    fn expire_lines(&self, now: Time) -> (bool, Offered) {
-        let (expired, has_fewer, is_all) = {
-            let Inbox { shelf, arrivals, .. } = &mut *self.inbox();
-            let before = shelf.change();
-            let expired = shelf.take_expired(now, EXPIRED_PER_TURN);
-            for _ in &expired {
-                arrivals.take_again();
-                arrivals.end(End::Expired);
-            }
-            (expired, shelf.change() != before, shelf.next_expiry() >= now)
-        };
-        // Nobody is told anything with the lock in hand.
-        for mut message in expired {
-            message.settle(Outcome::Expired);
-        }
-        (has_fewer, if is_all { Offered::All } else { Offered::Turn })
-    }
-
-    /// Offers what waits in one line until its destination takes no more.
-    fn offer_line(&self, now: Time, key: u64, router: &Router, room: &Waker) -> Offered {
-        for _ in 0..OFFERS_PER_TURN {
-            let Some((mut message, bytes)) = self.inbox().offer(key) else { return Offered::Full };
-            let hand = self.hand();
-            // Nobody is told anything with the lock in hand.
-            if message.header.is_expired(now) {
-                message.settle(Outcome::Expired);
-                hand.ends(End::Expired);
-            } else {
-                match router.offer(message, Some(room)) {
-                    Ok(()) => hand.ends(End::HandedOn),
-                    Err(Refused { message, why: Rejection::QueueFull }) => {
-                        self.inbox().put_back(key, message, bytes);
-                        hand.empty();
-                        return Offered::Full;
-                    }
-                    Err(refused) => {
-                        router.refuse(refused);
-                        hand.ends(End::Refused);
-                    }
-                }
-            }
-            if self.inbox().shelf.taken(key) {
-                return Offered::All;
-            }
-        }
-        Offered::Turn
     }
 
     /// Where every message of this session is, both ways.
