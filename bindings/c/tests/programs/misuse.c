@@ -262,7 +262,7 @@ static void one_at_a_time(const char *way, uint32_t links)
     for (size_t length = 5; length <= 50000; length += 49995) {
         first = new_message(endpoint, to, length);
         memcpy(first.bytes, "first", 5);
-        EXPECT_WORDS(sinew_create_message(endpoint, to, kind, 0, 1, &second), SINEW_ERROR_LENT, "send that message or drop it first");
+        EXPECT_WORDS(sinew_create_message(endpoint, to, kind, 0, 1, &second), SINEW_ERROR_LENT, "hand it to sinew_send_message or sinew_discard_message first");
         EXPECT_WORDS(sinew_send_bytes(endpoint, to, kind, SINEW_CONTROL, NULL, 0), SINEW_ERROR_LENT, "lent");
         EXPECT_WORDS(sinew_send_bytes_within(endpoint, to, kind, SINEW_CONTROL, NULL, 0, 0), SINEW_ERROR_LENT, "lent");
         EXPECT(sinew_resolve(endpoint, SINEW_TEXT("nobody"), SECOND, &tid), SINEW_ERROR_LENT);
