@@ -150,7 +150,7 @@ impl Gncl {
         let mode = Arc::new(Mutex::new(Mode::Handshake));
         let reading = self.reading(&mode);
         let reader = ctx.add_stream(link::dial(connection, address, reading));
-        self.wires.insert(connection, Wire::new(None, mode, reader));
+        self.wires.insert(connection, Wire::new(None, mode, reader, self.secure.is_none()));
     }
 
     fn reading(&self, mode: &SharedMode) -> Reading {
@@ -164,7 +164,7 @@ impl Gncl {
         let mode = Arc::new(Mutex::new(Mode::Handshake));
         let reading = self.reading(&mode);
         let reader = ctx.add_stream(link::read(connection, transport.clone(), reading));
-        self.wires.insert(connection, Wire::new(Some(transport), mode, reader));
+        self.wires.insert(connection, Wire::new(Some(transport), mode, reader, self.secure.is_none()));
         self.input(Input::Accepted(connection), ctx);
     }
 

@@ -167,9 +167,13 @@ async fn reach(address: SocketAddr, reading: &Reading) -> io::Result<(Transport,
 
 async fn greeted(transport: Transport, reading: Reading) -> (What, State) {
     let Some(secure) = &reading.secure else { return (What::Ended, State::Over) };
-    match secure.greet(transport, End::IsDialled).await {
+    match secure.greet(transport.clone(), End::IsDialled).await {
         Ok((transport, peer)) => {
             (What::Proven(transport.clone(), peer), State::Reading(Reader::new(transport, reading)))
+        }
+        // It is told so, and until it hangs up what it says is thrown away.
+        Err(Unproven::IsOpen) => {
+            (What::Unproven(Unproven::IsOpen), State::Reading(Reader::new(transport, reading)))
         }
         Err(unproven) => (What::Unproven(unproven), State::Over),
     }

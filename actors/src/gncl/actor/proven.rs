@@ -8,6 +8,7 @@ use sinew_runtime::time::Time;
 use super::{
     super::{
         core::{Attach, ConnectionId, Decline, Input, Introduction},
+        listener,
         secure::{Secure, Unproven},
         transport::Transport,
     },
@@ -38,6 +39,7 @@ impl Gncl {
         }
         if let Some(wire) = self.wires.get_mut(&connection) {
             wire.transport = Some(transport);
+            wire.may_speak = true;
             wire.proven = peer.map(|peer| peer.identity.address);
         }
     }
@@ -46,10 +48,16 @@ impl Gncl {
     pub(super) fn unproven(&mut self, connection: ConnectionId, why: &Unproven, ctx: &mut Context<Self>) {
         if let Unproven::IsOpen = why {
             // It reads what it is told.
+            self.wires.entry(connection).and_modify(|wire| wire.may_speak = true);
             let decline = Decline::Security(why.to_string());
             return self.input(Input::Violated(connection, decline), ctx);
         }
-        self.stores.gncl.refusals.count(Time::now(), NOT_PROVEN, why);
+        match why {
+            Unproven::NotTaken(_) => self.stores.gncl.refusals.count(Time::now(), NOT_PROVEN, why),
+            Unproven::Ended(error) if listener::is_starved(error) => self.input(Input::Starved, ctx),
+            // Whoever looks whether this host lives comes and goes without a word.
+            Unproven::Ended(_) | Unproven::IsOpen => {}
+        }
         self.ended(connection, ctx);
     }
 

@@ -19,22 +19,19 @@ pub(super) struct Wire {
     pub(super) mode: SharedMode,
     /// Which of its peer's connections it is, and what writes there, as long as it is a link.
     pub(super) link: Option<(LinkNumber, SpawnHandle)>,
-    /// Whether what was written so far ends with a whole frame, so that words can follow.
+    /// Whether what was written so far ends with a whole frame, so that words can follow; where peers prove who they are, not before that.
     pub(super) may_speak: bool,
     pub(super) tasks: Vec<SpawnHandle>,
 }
 
 impl Wire {
-    pub(super) fn new(transport: Option<Transport>, mode: SharedMode, reader: SpawnHandle) -> Self {
-        Self {
-            transport,
-            proven: None,
-            datagrams_made: 0,
-            mode,
-            link: None,
-            may_speak: true,
-            tasks: vec![reader],
-        }
+    pub(super) fn new(
+        transport: Option<Transport>,
+        mode: SharedMode,
+        reader: SpawnHandle,
+        may_speak: bool,
+    ) -> Self {
+        Self { transport, proven: None, datagrams_made: 0, mode, link: None, may_speak, tasks: vec![reader] }
     }
 
     pub(super) fn set_mode(&self, mode: Mode) {

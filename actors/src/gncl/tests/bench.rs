@@ -102,8 +102,18 @@ impl Node {
 
     /// One that has keys of this project, made for a node of this number.
     pub(super) async fn start_secured(number: u32, keys: &Authority, made_for: u32) -> Self {
+        Self::start_secured_with(number, keys, made_for, |_| {}).await
+    }
+
+    pub(super) async fn start_secured_with(
+        number: u32,
+        keys: &Authority,
+        made_for: u32,
+        set: impl FnOnce(&mut NodeConfig),
+    ) -> Self {
         let mut config = NodeConfig::new(format!("node-{number}"));
         config.address = Some(NodeAddress::new(number));
+        set(&mut config);
         let (project, name) = (config.project.clone(), format!("node-{made_for}"));
         let made_for = Identity { project, address: NodeAddress::new(made_for), name };
         let stores = Stores::for_test(config, Incarnation(1));

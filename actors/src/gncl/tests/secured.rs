@@ -1,5 +1,7 @@
 //! Nodes that prove who they are, and what those are told that do not.
 
+use std::time::Duration;
+
 use sinew_runtime::{outcome::Outcome, wire::Class};
 use tokio::net::TcpListener;
 
@@ -157,5 +159,23 @@ fn a_secured_node_says_nothing_to_whom_it_dials_before_that_one_has_proven_who_i
         let reading = tokio::io::AsyncReadExt::read(&mut socket, &mut said);
         let length = within("what it says first", reading).await.unwrap();
         assert!(is_sealed(&said[..length]) && !said[..length].windows(6).any(|bytes| bytes == b"node-1"));
+    });
+}
+
+#[test]
+fn who_does_not_end_its_handshake_is_hung_up_on_without_a_word_that_is_no_record() {
+    run(async {
+        let secured = Node::start_secured_with(1, &keys(), 1, |config| {
+            config.gncl.handshake = Duration::from_millis(50);
+        })
+        .await;
+        let mut stranger = ByHand::dial(&secured).await;
+        // The beginning of a record that never ends.
+        stranger.say_bytes(&[0x16, 3, 1, 0x40, 0]).await;
+        let mut said = Vec::new();
+        let reading = tokio::io::AsyncReadExt::read_to_end(&mut stranger.socket, &mut said);
+        within("the end of the connection", reading).await.unwrap();
+        assert_eq!(said, [0; 0]);
+        secured.counted("too late").await;
     });
 }
