@@ -21,7 +21,7 @@ use socket2::{Domain, SockAddr, Socket, Type};
 
 /// Longest path in bytes; the system's limit is 107, and another platform's less.
 const PATH_MAX: usize = 100;
-/// The owner and the group may connect.
+/// The owner and the group may open it. Of those who do, the node's own user and root are served, nobody else. spec: LNCL-2
 const SOCKET_MODE: u32 = 0o660;
 const DIRECTORY_MODE: u32 = 0o750;
 /// Connections that wait to be accepted; one that comes after that waits in its `connect`.
