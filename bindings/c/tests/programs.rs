@@ -196,6 +196,32 @@ fn c_is_driven_by_rust() {
     assert_eq!(sensor.wait_for_end(), Some(0));
 }
 
+fn echoed(asking: &mut Endpoint, to: Tid, kind: Kind) -> Vec<u8> {
+    let mut packet = asking.create_message(to, kind, 16).expect("it is short");
+    packet.fill(0xa5);
+    asking.send_message(packet).expect("the node takes it");
+    let back = asking.receive(WATCHDOG).expect("the node lives").expect("what was sent");
+    assert_eq!(back.kind(), kind);
+    back.bytes().to_vec()
+}
+
+#[test]
+fn the_receiver_in_cpp_of_the_bench_sends_back_what_it_gets_with_its_age_where_that_is_asked_for() {
+    if !is_there("g++") {
+        return;
+    }
+    let ground = Ground::new();
+    let mut echo = ground.start(&CPP.shared("../../actors/benches/lncl/echo.cpp", &ground), &[]);
+    echo.wait_for(&["there"]);
+    let mut asking = endpoint(&ground, Registration::new());
+    let to = resolve(&mut asking, "echo");
+    assert_eq!(echoed(&mut asking, to, Kind::named("test.packet")), [0xa5; 16]);
+    let aged = echoed(&mut asking, to, Kind::named("lncl.aged"));
+    let (age, rest) = aged.split_first_chunk::<8>().expect("it is as long as what was sent");
+    assert_eq!(rest, [0xa5; 8]);
+    assert!(i64::from_ne_bytes(*age) >= 0, "{age:?}");
+}
+
 #[test]
 fn a_type_of_rust_is_read_and_written_by_c() {
     if !is_there("gcc") {
