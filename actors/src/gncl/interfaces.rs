@@ -170,7 +170,7 @@ impl Watch {
         send(&socket, &request(), SendFlags::empty())?;
         #[expect(
             deprecated,
-            reason = "sound for an OwnedFd, which keeps its descriptor; its successor is an unsafe fn, and unsafe code lives in sinew-shm alone"
+            reason = "sound for an OwnedFd, which keeps its descriptor; its successor is an unsafe fn, and unsafe code lives in sinew-shm and the C binding alone"
         )]
         let socket = AsyncFd::new(socket)?;
         Ok(Self { socket, interfaces: Interfaces::default(), buffer: vec![0; BUFFER_LEN] })

@@ -112,7 +112,7 @@ async fn something_is_there(stream: &UnixStream) -> Result<(), ExchangeError> {
 fn watch<B: AsRawFd>(bell: B) -> Result<AsyncFd<B>, ExchangeError> {
     #[expect(
         deprecated,
-        reason = "sound for the two types below, whose bell keeps its descriptor; its successor is an unsafe fn, and unsafe code lives in sinew-shm alone"
+        reason = "sound for the two types below, whose bell keeps its descriptor; its successor is an unsafe fn, and unsafe code lives in sinew-shm and the C binding alone"
     )]
     let watched = AsyncFd::with_interest(bell, Interest::READABLE);
     watched.map_err(|cause| PassError::System(cause).into())

@@ -28,7 +28,7 @@ impl Process {
         });
         #[expect(
             deprecated,
-            reason = "sound for an OwnedFd, whose descriptor never changes; its successor is an unsafe fn, and unsafe code lives in sinew-shm alone"
+            reason = "sound for an OwnedFd, whose descriptor never changes; its successor is an unsafe fn, and unsafe code lives in sinew-shm and the C binding alone"
         )]
         AsyncFd::new(group.pidfd().clone()).map(|pidfd| Self { group, pidfd }).inspect_err(|_| {
             doomed.kill();
@@ -86,7 +86,7 @@ impl Drop for Process {
 pub(super) async fn is_dead(pidfd: Arc<OwnedFd>, within: Duration) -> bool {
     #[expect(
         deprecated,
-        reason = "sound for an OwnedFd, whose descriptor never changes; its successor is an unsafe fn, and unsafe code lives in sinew-shm alone"
+        reason = "sound for an OwnedFd, whose descriptor never changes; its successor is an unsafe fn, and unsafe code lives in sinew-shm and the C binding alone"
     )]
     let Ok(pidfd) = AsyncFd::new(pidfd) else { return false };
     // Readable from its end on, whoever reaps it.

@@ -35,7 +35,7 @@ impl Life {
         };
         #[expect(
             deprecated,
-            reason = "sound for an OwnedFd, whose descriptor never changes; its successor is an unsafe fn, and unsafe code lives in sinew-shm alone"
+            reason = "sound for an OwnedFd, whose descriptor never changes; its successor is an unsafe fn, and unsafe code lives in sinew-shm and the C binding alone"
         )]
         AsyncFd::with_interest(pidfd, Interest::READABLE).map(Self::Watched)
     }
