@@ -15,7 +15,7 @@ pub struct Waiting {
     pub application: String,
     /// The names that are not ready, and the last that is known of each: `registered, not ready`, `failed, not ready
     /// again`, `stopped in order, not ready again`, `its node has restarted, its directory has not come yet`, `its node is linked again, its directory has not come yet`, `its link is down`, `its node left`, `its
-    /// node was lost`, `unregistered`, `never seen`, `part of a cycle of requirements`.
+    /// node was lost`, `unregistered`, `not there`, `part of a cycle of requirements`.
     pub missing: Vec<(String, &'static str)>,
     /// How long it has waited.
     pub since: Duration,

@@ -61,7 +61,7 @@ fn who_waits_and_who_is_missing_is_seen_from_another_node() {
     // Then
     let hip = named(&said["apps"], "hip").expect("it was there");
     assert_eq!((&hip["node"], &hip["ready"]), (&"127.0.0.1".into(), &false.into()), "{said}");
-    assert_eq!(hip["missing"], serde_json::json!([{ "name": "ankle", "why": "never seen" }]));
+    assert_eq!(hip["missing"], serde_json::json!([{ "name": "ankle", "why": "not there" }]));
     assert_eq!(said["apps"].as_array().map(Vec::len), Some(2), "the command shows nothing of itself: {said}");
     let barriers = scenario.sinew("knee", &["barriers", "--json"]);
     let said = barriers.json();
@@ -72,7 +72,7 @@ fn who_waits_and_who_is_missing_is_seen_from_another_node() {
         "{said}"
     );
     let table = scenario.sinew("knee", &["barriers"]).out;
-    assert!(table.contains("ankle (never seen)") && table.contains("hip"), "{table}");
+    assert!(table.contains("ankle (not there)") && table.contains("hip"), "{table}");
 }
 
 #[test]
@@ -219,7 +219,7 @@ fn who_does_not_answer_a_ping_is_a_finding_with_a_reason() {
     });
     let answer = scenario.sinew("hip", &["ping", "knee", "--deadline-ms", "50"]);
     assert!(
-        answer.code == Some(1) && answer.out.contains("ankle (never seen)"),
+        answer.code == Some(1) && answer.out.contains("ankle (not there)"),
         "{}{}",
         answer.out,
         answer.err

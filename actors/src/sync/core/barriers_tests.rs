@@ -253,7 +253,7 @@ fn who_gives_a_request_up_still_waits_by_a_later_one() {
 fn an_answer_for_which_there_was_no_room_is_offered_again_as_long_as_its_application_lives() {
     let mut bench = Bench::of_the_hip();
     bench.arrives("calibrated", 7);
-    let missing = vec![("knee".to_owned(), "never seen".to_owned())];
+    let missing = vec![("knee".to_owned(), "not there".to_owned())];
     let answer = BarrierAnswer::TimedOut { missing };
     let not_taken = || Input::AnswerNotTaken { app: app(0), correlation: 7, answer: answer.clone() };
     assert_eq!(bench.passes(Duration::from_secs(60)), [answered(7, answer.clone())]);

@@ -68,7 +68,7 @@ impl Core {
                 break;
             };
             if found.ready.len() < requirement.count() {
-                let nearest = found.nearest.unwrap_or(Reason::NeverSeen);
+                let nearest = found.nearest.unwrap_or(Reason::NotThere);
                 let lack = Lack { ready: found.ready.len(), unready: &found.unready, nearest };
                 parts.extend(self.parts(requirement, lack, CYCLE_NAMES_MAX));
             }
@@ -102,7 +102,7 @@ impl Core {
             }
             if !is_had {
                 let is_known = self.seen.contains(alternative);
-                found.lacks(alternative, if is_known { Reason::Unregistered } else { Reason::NeverSeen });
+                found.lacks(alternative, if is_known { Reason::Unregistered } else { Reason::NotThere });
             }
         }
         Some(found)

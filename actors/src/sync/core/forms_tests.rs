@@ -40,7 +40,7 @@ fn so_many_that_match_are_enough_wherever_they_are() {
     assert_eq!(bench.ready(1), []);
     assert_eq!(
         words(&bench.missing()),
-        ["2 of *.drive (1 ready): never seen"],
+        ["2 of *.drive (1 ready): not there"],
         "of a second one nothing is known"
     );
     bench.links(KNEE, LIFE);
@@ -58,7 +58,7 @@ fn one_name_on_two_nodes_counts_twice_and_who_requires_for_itself() {
     bench.links(ANKLE, LIFE);
     let outputs = bench.list(KNEE, list(1, &[("b.drive", true, &[])]));
     assert!(!outputs.contains(&release(0)));
-    assert_eq!(words(&bench.missing()), ["3 of *.drive (2 ready): never seen"]);
+    assert_eq!(words(&bench.missing()), ["3 of *.drive (2 ready): not there"]);
     assert_eq!(bench.core.missing_in_brief(app(0)), bench.missing());
     assert!(bench.list(ANKLE, list(1, &[("b.drive", true, &[])])).contains(&release(0)));
     bench.ready(0);
@@ -93,7 +93,7 @@ fn what_can_be_done_without_is_waited_for_only_so_long() {
     assert_eq!(bench.ready(1), [release(0)]);
     let event = RequirementEvent::Without { name: "camera ?500ms".to_owned() };
     let without = |why| Output::Tell { app: app(0), event: event.clone(), why: Some(why) };
-    assert_eq!(bench.ready(0), [without(Reason::NeverSeen)]);
+    assert_eq!(bench.ready(0), [without(Reason::NotThere)]);
     bench.registers(2, "camera", &[]);
     assert_eq!(bench.ready(2), [met(0, "camera ?500ms")]);
     assert_eq!(bench.down(2), [without(Reason::Failed), release(2)]);
@@ -131,7 +131,7 @@ fn what_an_application_waits_for_is_said_in_brief_as_it_is() {
     bench.list(KNEE, list(1, &[("knee.drive", false, &[]), ("knee.eye", true, &[])]));
     assert_eq!(bench.core.missing_in_brief(app(0)), bench.missing());
     bench.list(KNEE, list(2, &[("knee.drive", true, &[]), ("hip.imu", true, &[])]));
-    assert_eq!(words(&bench.core.missing_in_brief(app(0))), ["camera: never seen"]);
+    assert_eq!(words(&bench.core.missing_in_brief(app(0))), ["camera: not there"]);
     assert_eq!(bench.core.missing_in_brief(app(1)), [], "it does not wait");
 }
 

@@ -15,7 +15,8 @@ pub(crate) enum Reason {
     NodeLeft,
     NodeLost,
     Unregistered,
-    NeverSeen,
+    /// Nobody has the name. Somebody may have had it before: that is remembered of names only while somebody asks for them.
+    NotThere,
     Cycle,
 }
 
@@ -42,7 +43,7 @@ impl Reason {
             Self::NodeLeft => "its node left",
             Self::NodeLost => "its node was lost",
             Self::Unregistered => "unregistered",
-            Self::NeverSeen => "never seen",
+            Self::NotThere => "not there",
             Self::Cycle => "part of a cycle of requirements",
         }
     }
@@ -58,7 +59,7 @@ impl Reason {
             | Self::NodeRestarted
             | Self::LinkDown
             | Self::NodeLost
-            | Self::NeverSeen
+            | Self::NotThere
             | Self::Cycle => false,
         }
     }
@@ -76,7 +77,7 @@ impl Reason {
             | Self::NotReady
             | Self::ListAwaited
             | Self::LinkDown
-            | Self::NeverSeen
+            | Self::NotThere
             | Self::Cycle => false,
         }
     }
@@ -93,7 +94,7 @@ impl Reason {
             | Self::NodeLeft
             | Self::NodeLost
             | Self::Unregistered
-            | Self::NeverSeen
+            | Self::NotThere
             | Self::Cycle => false,
         }
     }

@@ -40,7 +40,7 @@ impl Standing {
             return None;
         }
         // Every application that counts is ready, and they are too few: of the others nobody has been seen.
-        Some(self.unready.iter().map(|(_, reason)| *reason).min().unwrap_or(Reason::NeverSeen))
+        Some(self.unready.iter().map(|(_, reason)| *reason).min().unwrap_or(Reason::NotThere))
     }
 }
 
@@ -67,7 +67,7 @@ impl Core {
             }
             if standing.had.len() == before {
                 let is_known = self.seen.contains(alternative);
-                let reason = if is_known { Reason::Unregistered } else { Reason::NeverSeen };
+                let reason = if is_known { Reason::Unregistered } else { Reason::NotThere };
                 standing.unready.push((alternative.clone(), reason));
             }
         }

@@ -282,7 +282,7 @@ fn every_deadline_that_passes_reports_what_is_missing_since_when_and_why() {
     assert_eq!(deadline, bench.now + Duration::from_secs(60));
     let waited = |seconds| {
         let missing =
-            vec![("sensor".to_owned(), "registered, not ready"), ("knee.drive".to_owned(), "never seen")];
+            vec![("sensor".to_owned(), "registered, not ready"), ("knee.drive".to_owned(), "not there")];
         Output::Overdue(Waiting {
             application: "gait".to_owned(),
             missing,
@@ -301,7 +301,7 @@ fn the_last_known_reason_is_told_for_each_way_to_be_missing() {
     let mut bench = Bench::new();
     bench.registers(0, "gait", &["drive"]);
     let reason = |bench: &Bench| bench.missing().remove(0).1;
-    assert_eq!(reason(&bench), "never seen");
+    assert_eq!(reason(&bench), "not there");
     bench.links(KNEE, LIFE);
     bench.list(KNEE, list(1, &[("drive", false, &[])]));
     assert_eq!(reason(&bench), "registered, not ready");

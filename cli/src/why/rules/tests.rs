@@ -154,7 +154,7 @@ fn waits(facts: &mut Facts, missing: &str) {
     let report = drive(facts).report.as_mut().expect("it is there");
     report.ready = false;
     report.waits_us = Some(2_000_000);
-    report.missing = vec![Missing { name: missing.to_owned(), why: "never seen".to_owned() }];
+    report.missing = vec![Missing { name: missing.to_owned(), why: "not there".to_owned() }];
     facts.waits.insert("knee.drive".to_owned(), vec![missing.to_owned()]);
 }
 
@@ -299,7 +299,7 @@ const CASES: &[Case] = &[
     ),
     Case(
         |facts| waits(facts, "ankle"),
-        ["knee.drive takes messages", "ankle (never seen)", "start what it waits for: ankle"],
+        ["knee.drive takes messages", "ankle (not there)", "start what it waits for: ankle"],
     ),
     Case(
         |facts| {

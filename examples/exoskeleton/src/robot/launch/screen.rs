@@ -162,8 +162,8 @@ mod tests {
 
     #[test]
     fn waiting_is_told_without_its_time() {
-        let words = "knee.drive has waited 1.3 s for hip.sensor (never seen)";
-        assert_eq!(untimed(words), "knee.drive waits for hip.sensor (never seen)");
+        let words = "knee.drive has waited 1.3 s for hip.sensor (not there)";
+        assert_eq!(untimed(words), "knee.drive waits for hip.sensor (not there)");
         assert_eq!(untimed("something else"), "something else");
     }
 }
