@@ -134,6 +134,11 @@ fn node_of(header: &Header) -> NodeAddress {
     About::of(header).map_or(header.source.node, About::node)
 }
 
+/// Whether this is said of a node's end.
+pub(super) fn is_end(header: &Header) -> bool {
+    matches!(About::of(header), Some(About::End(_)))
+}
+
 fn is_of(node: NodeAddress, header: &Header) -> bool {
     node_of(header) == node
 }
@@ -191,6 +196,7 @@ impl ClassQueue {
             for message in std::mem::take(lane) {
                 if is_of(node, &message.header) {
                     *bytes -= message.payload.len();
+                    self.ends_in_lanes -= usize::from(is_end(&message.header));
                     self.ends.push(Place::Lane, message);
                 } else {
                     lane.push_back(message);
@@ -203,9 +209,12 @@ impl ClassQueue {
     /// nothing is.
     pub(super) fn put_back_before_end(&mut self, message: Message) -> Option<Message> {
         let node = node_of(&message.header);
-        let is_end = |other: &Message| About::of(&other.header) == Some(About::End(node));
-        if self.lanes.iter().flatten().any(is_end) {
-            self.bring_forward(node);
+        // Nearly always there is none: then nothing is looked at, however much waits.
+        if self.ends_in_lanes > 0 {
+            let is_its_end = |other: &Message| About::of(&other.header) == Some(About::End(node));
+            if self.lanes.iter().flatten().any(is_its_end) {
+                self.bring_forward(node);
+            }
         }
         if !self.ends.has_any_of(node) {
             return Some(message);

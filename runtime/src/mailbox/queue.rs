@@ -7,7 +7,7 @@ use std::{collections::VecDeque, sync::Arc, task::Waker};
 
 use super::{
     Budget,
-    ends::{Ends, Held, Place},
+    ends::{Ends, Held, Place, is_end},
     room::Awaited,
 };
 use crate::{
@@ -61,6 +61,8 @@ pub struct ClassQueue {
     pub(super) lanes: [VecDeque<Message>; 3],
     /// What is left of nodes that are gone, each with what is said of that behind it.
     pub(super) ends: Ends,
+    /// Of what waits in the lanes, how much is said of a node's end.
+    pub(super) ends_in_lanes: usize,
     /// Bytes of the payloads in each lane.
     pub(super) bytes: [usize; 3],
     passed_over: [u32; 3],
@@ -80,6 +82,7 @@ impl ClassQueue {
         Self {
             lanes: [const { VecDeque::new() }; 3],
             ends: Ends::default(),
+            ends_in_lanes: 0,
             bytes: [0; 3],
             passed_over: [0; 3],
             bounds: bounds.into(),
@@ -116,6 +119,8 @@ impl ClassQueue {
             let in_lane = &mut self.bytes[class as usize];
             *in_lane = *in_lane - former + length;
             self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
+            self.ends_in_lanes += usize::from(is_end(&message.header));
+            self.ends_in_lanes -= usize::from(is_end(&older.header));
             return Ok(Some(std::mem::replace(older, message)));
         }
         if !self.bounds.has_room_for(length, held) || !takes_instead(self.budget.as_deref(), length, 0) {
@@ -123,7 +128,7 @@ impl ClassQueue {
         }
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
         if let Some(message) = self.place_behind(message, Place::Lane) {
-            self.bytes[class as usize] += length;
+            self.enters_lane(&message);
             self.lanes[class as usize].push_back(message);
         }
         Ok(None)
@@ -133,10 +138,9 @@ impl ClassQueue {
     /// order counts; who uses it bounds how many there are.
     pub fn push_beyond(&mut self, message: Message) {
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
-        let (class, length) = (message.header.class as usize, message.payload.len());
-        self.add(length);
-        self.bytes[class] += length;
-        self.lanes[class].push_back(message);
+        self.add(message.payload.len());
+        self.enters_lane(&message);
+        self.lanes[message.header.class as usize].push_back(message);
     }
 
     /// Whether there is room for this message beside all that waits.
@@ -196,11 +200,10 @@ impl ClassQueue {
             return Some(message);
         }
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
-        let (class, length) = (message.header.class as usize, message.payload.len());
-        self.add(length);
+        self.add(message.payload.len());
         if let Some(message) = self.put_back_before_end(message) {
-            self.bytes[class] += length;
-            self.lanes[class].push_front(message);
+            self.enters_lane(&message);
+            self.lanes[message.header.class as usize].push_front(message);
         }
         None
     }
@@ -222,17 +225,28 @@ impl ClassQueue {
             }
         }
         let next = self.lanes[chosen].pop_front()?;
-        self.bytes[chosen] -= next.payload.len();
-        self.give(next.payload.len());
+        self.left_lane(&next);
         Some(next)
     }
 
     /// The next message of a class, if it is of the sort that goes with one that was [popped](Self::pop).
     pub fn pop_if(&mut self, class: Class, is_it: impl FnOnce(&Message) -> bool) -> Option<Message> {
         let next = self.lanes[class as usize].pop_front_if(|message| is_it(message))?;
-        self.bytes[class as usize] -= next.payload.len();
-        self.give(next.payload.len());
+        self.left_lane(&next);
         Some(next)
+    }
+
+    /// A message comes to wait in the lane of its class.
+    fn enters_lane(&mut self, message: &Message) {
+        self.bytes[message.header.class as usize] += message.payload.len();
+        self.ends_in_lanes += usize::from(is_end(&message.header));
+    }
+
+    /// A message was taken out of the lane of its class, and of the queue.
+    fn left_lane(&mut self, message: &Message) {
+        self.bytes[message.header.class as usize] -= message.payload.len();
+        self.ends_in_lanes -= usize::from(is_end(&message.header));
+        self.give(message.payload.len());
     }
 
     /// So many bytes are held more, whatever the bounds.
@@ -260,6 +274,7 @@ impl ClassQueue {
             for message in std::mem::take(lane) {
                 if message.header.is_expired(now) {
                     *bytes -= message.payload.len();
+                    self.ends_in_lanes -= usize::from(is_end(&message.header));
                     expired.push(message);
                 } else {
                     self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
@@ -287,8 +302,7 @@ impl ClassQueue {
         let place = |lane: &VecDeque<Message>| lane.iter().rposition(|message| message.is_request(ticket));
         let (lane, at) = (0..3).find_map(|lane| Some((lane, place(&self.lanes[lane])?)))?;
         let request = self.lanes[lane].remove(at)?;
-        self.bytes[lane] -= request.payload.len();
-        self.give(request.payload.len());
+        self.left_lane(&request);
         Some(request)
     }
 
@@ -325,7 +339,7 @@ impl ClassQueue {
     /// Empties the queue, most urgent class first.
     pub fn drain_all(&mut self) -> impl Iterator<Item = Message> + use<> {
         self.give(self.bytes());
-        self.bytes = [0; 3];
+        (self.bytes, self.ends_in_lanes) = ([0; 3], 0);
         self.ends.take_all().chain(std::mem::take(&mut self.lanes).into_iter().flatten())
     }
 }

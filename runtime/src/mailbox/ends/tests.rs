@@ -128,6 +128,44 @@ fn of_a_stream_the_newer_value_wins_also_where_it_was_brought_forward() {
     assert_eq!(all(&mut queue), [2, 3, 4]);
 }
 
+#[test]
+fn what_is_said_of_ends_in_the_lanes_is_counted_on_every_way_in_and_out() {
+    let said_of = |class, sequence| {
+        let mut event = event(About::End(GONE), sequence);
+        event.header.class = class;
+        event
+    };
+    let mut queue = ClassQueue::new(8);
+    let counts = |queue: &ClassQueue, expected| {
+        assert_eq!((queue.ends_in_lanes, ends_in_lanes(queue)), (expected, expected));
+    };
+    // Of class Stream one takes the other's place.
+    queue.push(said_of(Class::Stream, 1)).unwrap();
+    assert!(queue.push(said_of(Class::Stream, 2)).unwrap().is_some());
+    counts(&queue, 1);
+    queue.pop().unwrap();
+    counts(&queue, 0);
+    queue.push_beyond(said_of(Class::Bulk, 3));
+    queue.push_beyond(said_of(Class::Bulk, 4));
+    counts(&queue, 2);
+    let popped = queue.pop_if(Class::Bulk, |_| true).unwrap();
+    counts(&queue, 1);
+    assert!(queue.put_back(popped).is_none());
+    counts(&queue, 0);
+    assert_eq!(all(&mut queue), [3, 4], "they were brought forward");
+    queue.push_beyond(said_of(Class::Control, 5));
+    let popped = queue.pop().unwrap();
+    assert!(queue.put_back(popped).is_none());
+    counts(&queue, 1);
+    let mut old = said_of(Class::Bulk, 6);
+    old.header.time_to_live_us = 1;
+    queue.push_beyond(old);
+    assert_eq!(queue.take_expired(Time::from_nanos(1_000_000)).len(), 1);
+    counts(&queue, 1);
+    assert_eq!(queue.drain_all().count(), 1);
+    counts(&queue, 0);
+}
+
 /// Looks at the order in which messages are taken: of each node nothing comes behind its end that came before it.
 #[derive(Default)]
 struct Order {
@@ -152,6 +190,11 @@ impl Order {
         prop_assert!(before.is_none_or(|before| before < sequence), "{sequence} after {before:?}");
         Ok(())
     }
+}
+
+/// How much is said of ends in the lanes, found by looking.
+fn ends_in_lanes(queue: &ClassQueue) -> usize {
+    queue.lanes.iter().flatten().filter(|message| is_end(&message.header)).count()
 }
 
 const BOUNDS: Bounds = Bounds { messages: 6, bytes: 20 };
@@ -191,6 +234,7 @@ proptest! {
                 prop_assert_eq!(queue.len_of(Class::ALL[class]), queue.held(class).messages);
             }
             prop_assert_eq!(queue.iter().map(|message| message.payload.len()).sum::<usize>(), queue.bytes());
+            prop_assert_eq!(queue.ends_in_lanes, ends_in_lanes(&queue));
         }
         for message in hand.into_iter().chain(std::iter::from_fn(|| queue.pop())) {
             order.taken(&message.header)?;
