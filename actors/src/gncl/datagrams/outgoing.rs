@@ -207,9 +207,10 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
         number
     }
 
-    /// Makes room for one more flow: one that has nothing under way is known by nothing but its key.
+    /// Makes room for one more flow: one that has nothing under way, either way, is known by nothing but its key.
     fn forget_one(&mut self) -> bool {
-        let idle = self.flows.iter().find(|(_, flow)| flow.state == State::Idle).map(|(key, _)| *key);
+        let is_idle = |flow: &Flow<V>| flow.state == State::Idle && flow.elsewhere == 0;
+        let idle = self.flows.iter().find(|(_, flow)| is_idle(flow)).map(|(key, _)| *key);
         idle.is_some_and(|key| self.flows.remove(&key).is_some())
     }
 
@@ -350,7 +351,9 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
             match offer(flow.number, value) {
                 Offered::Taken => flow.state = State::Idle,
                 Offered::Refused => {
-                    self.counts.lost += u64::from(flow.state.was_never_sent());
+                    let was_never_sent = flow.state.was_never_sent();
+                    self.counts.lost += u64::from(was_never_sent);
+                    self.counts.unknown += u64::from(!was_never_sent);
                     flow.state = State::Idle;
                 }
                 Offered::Full(value) => {

@@ -166,6 +166,31 @@ fn what_is_for_the_connection_does_not_get_there_behind_a_newer_one_that_is_bein
 }
 
 #[test]
+fn of_what_the_connection_refuses_nobody_knows_whether_it_arrived_if_it_was_sent_and_else_it_is_lost() {
+    let mut outgoing = outgoing(1, 1_000, 8);
+    outgoing.submit(1, 1, 100, Time::MAX).unwrap();
+    outgoing.submit(2, 1, 100, Time::MAX).unwrap();
+    assert_eq!(sent(&mut outgoing, NOW), [100], "the other one waits");
+    outgoing.turn_to_connection();
+    outgoing.hand_over(NOW, |_, _| Offered::Refused);
+    let position = outgoing.position();
+    assert_eq!((position.unknown(), position.counts.lost, position.superseded()), (1, 1, 0));
+    assert_eq!((outgoing.left(), position.taken()), (0, 2));
+}
+
+#[test]
+fn a_flow_of_which_a_newer_value_is_being_given_to_the_connection_does_not_make_room() {
+    let mut outgoing = outgoing(9, 1_000, 1);
+    outgoing.submit(1, 1, 100, Time::MAX).unwrap();
+    assert_eq!(sent(&mut outgoing, NOW), [100]);
+    outgoing.acknowledged(&said(&[100], 1), 500);
+    let newer = outgoing.given_elsewhere(1);
+    assert_eq!(outgoing.submit(2, 7, 100, Time::MAX), Err(7));
+    outgoing.taken_elsewhere(1, newer);
+    outgoing.submit(2, 7, 100, Time::MAX).unwrap();
+}
+
+#[test]
 fn the_last_value_for_a_peer_that_has_forgotten_us_goes_by_the_connection() {
     let mut outgoing = outgoing(1, 1_000, 8);
     outgoing.submit(1, 1, 100, Time::MAX).unwrap();
