@@ -98,8 +98,13 @@ impl Peer {
     fn new(now: Time, attach: &Attach, stores: &Stores) -> Self {
         let ends = Ends { here: stores.node, node: attach.node, takes_outcomes: attach.takes_outcomes };
         let ways = if attach.by_class { Lane::ALL.len() } else { 1 };
-        let Store { refusals, acks, fewer_owed, .. } = &stores.gncl;
-        let told = Told { refusals: refusals.clone(), acks: acks.clone(), fewer_owed: fewer_owed.clone() };
+        let Store { refusals, acks, fewer_owed, held_up, .. } = &stores.gncl;
+        let told = Told {
+            refusals: refusals.clone(),
+            acks: acks.clone(),
+            fewer_owed: fewer_owed.clone(),
+            held_up: held_up.clone(),
+        };
         let ways = (0..ways).map(|_| Way::new(now, ends, &stores.config, &told)).collect();
         let channel = attach.takes_datagrams.then(|| {
             // Nobody can guess it: this has its seed from the system.
@@ -324,7 +329,7 @@ impl Wake for Room {
 #[derive(Default)]
 pub(crate) struct Store {
     peers: Mutex<BTreeMap<NodeAddress, Arc<Peer>>>,
-    /// Peers that are gone, as long as messages of theirs wait for applications here, oldest first.
+    /// Peers that are gone, as long as messages of theirs wait for applications here or are in hand, oldest first.
     gone: Mutex<Vec<Arc<Peer>>>,
     /// How many they are.
     gone_count: AtomicUsize,
@@ -334,7 +339,8 @@ pub(crate) struct Store {
     met: Mutex<Vec<Weak<Peer>>>,
     /// The accounts of those that nobody holds any more, both ways, all together.
     buried: Arc<Mutex<Buried>>,
-    /// Told when messages begin to wait for an application here, and when one for which they wait takes more.
+    /// Told when messages begin to wait for an application here, when one for which they wait takes more, and when a message of a peer that
+    /// is over has ended.
     pub(super) held_up: Arc<Notify>,
     /// The thread of Bulk, from its first connection until the node ends.
     bulk: Mutex<Option<BulkThread>>,

@@ -8,6 +8,7 @@ mod credit;
 mod datagrams;
 mod ends;
 mod former_lives;
+mod gone;
 mod handshakes;
 mod leaving;
 mod links;

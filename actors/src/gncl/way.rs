@@ -83,6 +83,8 @@ struct Inbox {
     acks_made: u64,
     /// The peer's life is over: nothing more is taken of it.
     is_fenced: bool,
+    /// What waited was given up: nothing more waits here.
+    is_abandoned: bool,
 }
 
 /// What became of the messages of a peer. `taken = handed_on + told + expired + refused + failed + superseded + waiting`.
@@ -128,6 +130,8 @@ pub(super) struct Told {
     pub(super) acks: Arc<Ticks>,
     /// The peer's life is over, and fewer of its messages may still come to an application.
     pub(super) fewer_owed: Arc<Notify>,
+    /// The same, for whoever keeps that peer as long as there are any.
+    pub(super) held_up: Arc<Notify>,
 }
 
 /// A session with a peer.
@@ -178,6 +182,7 @@ impl Way {
             ack_is_due: false,
             acks_made: 0,
             is_fenced: false,
+            is_abandoned: false,
         });
         let outcomes_max = OUTCOMES_MAX * config.gncl.queue_capacity;
         Self { outlet, inbox, window, longest, outcomes_max, ends, told: told.clone() }
@@ -248,16 +253,22 @@ impl Way {
         }
     }
 
-    /// A message that was in hand has ended so.
-    fn end(&self, end: End) {
+    /// A message that was in hand is there no more, in this way.
+    fn leaves_the_hand(&self, how: impl FnOnce(&mut Arrivals)) {
         let is_fenced = {
             let mut inbox = self.inbox();
-            inbox.arrivals.end(end);
+            how(&mut inbox.arrivals);
             inbox.is_fenced
         };
         if is_fenced {
             self.told.fewer_owed.notify_one();
+            self.told.held_up.notify_one();
         }
+    }
+
+    /// A message that was in hand has ended so.
+    fn end(&self, end: End) {
+        self.leaves_the_hand(|arrivals| arrivals.end(end));
     }
 
     /// The peer says what it has taken.
@@ -317,9 +328,11 @@ impl Way {
         self.inbox().shelf.holds(line)
     }
 
-    /// Whether messages wait for applications here.
-    pub(super) fn is_held_up(&self) -> bool {
-        !self.inbox().shelf.is_empty()
+    /// Whether a message that was taken may still come to an application here: one waits, or is in the hand of a thread, which may put it
+    /// into a line.
+    pub(super) fn owes(&self) -> bool {
+        let Inbox { shelf, arrivals, .. } = &*self.inbox();
+        arrivals.in_hand() > 0 || !shelf.is_empty()
     }
 
     /// Whoever offered what waits has ended.
@@ -360,10 +373,15 @@ impl Inbox {
         Some(offered)
     }
 
-    /// Puts what was in hand back.
-    fn put_back(&mut self, key: u64, message: Message, bytes: usize) {
+    /// Puts what was in hand back. Hands it over where nothing waits any more.
+    fn put_back(&mut self, key: u64, message: Message, bytes: usize) -> Option<Message> {
+        if self.is_abandoned {
+            self.shelf.taken(key);
+            return Some(message);
+        }
         self.shelf.put_back(key, message, bytes);
         self.arrivals.put_away();
+        None
     }
 
     /// The line of a message whose destination is held.

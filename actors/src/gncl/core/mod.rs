@@ -66,7 +66,7 @@ pub(super) struct Settings {
 
 /// One TCP connection, made or accepted. Never used twice.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct ConnectionId(u64);
+pub(super) struct ConnectionId(pub(super) u64);
 
 /// What has happened.
 #[derive(Clone, Debug)]

@@ -111,16 +111,25 @@ impl Store {
             handed_on.drain(..surplus);
             handed_on.push_back((peer.node, peer.incarnation, channel.handed_on()));
         }
-        if peer.ways.iter().any(Way::is_held_up) {
+        if peer.owes() {
+            self.keep_gone(peer);
+        }
+    }
+
+    /// Keeps a peer that is gone, as messages of it may still come to applications here. What the first one left has waited longest, and
+    /// is given up when they are too many.
+    fn keep_gone(&self, peer: Arc<Peer>) {
+        let given_up: Vec<_> = {
             let mut gone = lock(&self.gone);
-            // What the first one left has waited longest; it is dropped, and its receipts have nobody to tell.
             let surplus = (gone.len() + 1).saturating_sub(GONE_MAX);
-            let dropped: Vec<_> = gone.drain(..surplus).collect();
+            let given_up = gone.drain(..surplus).collect();
             gone.push(peer);
             self.count_gone(&gone);
-            drop(gone);
-            drop(dropped);
-        }
+            given_up
+        };
+        // A receipt in a line holds the peer whose line it is: nothing of that goes by itself.
+        given_up.iter().flat_map(|peer| &peer.ways).for_each(Way::abandon_lines);
+        self.held_up.notify_one();
     }
 
     /// What was handed on by datagram of that life of `node`, if it was here before.
@@ -142,10 +151,10 @@ impl Store {
         before.filter(|former| former.node == peer.node).any(|former| former.has_line(line))
     }
 
-    /// Those of which nothing waits any more.
+    /// Those of which nothing may come any more.
     pub(super) fn drop_those_served(&self) {
         let mut gone = lock(&self.gone);
-        gone.retain(|peer| peer.ways.iter().any(Way::is_held_up));
+        gone.retain(|peer| peer.owes());
         self.count_gone(&gone);
     }
 
@@ -155,6 +164,11 @@ impl Store {
 }
 
 impl Peer {
+    /// Whether a message of it that was taken may still come to an application here.
+    fn owes(&self) -> bool {
+        self.ways.iter().any(Way::owes)
+    }
+
     fn has_line(&self, line: u64) -> bool {
         self.ways.iter().any(|way| way.has_line(line))
     }

@@ -1,6 +1,9 @@
 //! A message that has come and is being handled: it is counted once, whatever panics.
 
-use super::{super::arrivals::End, Way};
+use super::{
+    super::arrivals::{Arrivals, End},
+    Way,
+};
 
 /// A message in hand. If nobody says how it ended, it has failed.
 pub(in crate::gncl) struct Hand<'a>(Option<&'a Way>);
@@ -20,8 +23,7 @@ impl<'a> Hand<'a> {
     /// It had come before: nothing is in hand, and nothing came.
     pub(in crate::gncl) fn had_come(mut self) {
         if let Some(way) = self.0.take() {
-            way.inbox().arrivals.take_none();
-            way.owes_less();
+            way.leaves_the_hand(Arrivals::take_none);
         }
     }
 

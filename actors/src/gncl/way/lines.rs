@@ -21,11 +21,14 @@ impl Way {
     /// it is.
     ///
     /// # Errors
-    /// The message: there is no room.
+    /// The message: there is no room, or the lines were [abandoned](Self::abandon_lines).
     pub(in crate::gncl) fn put_in_line(&self, key: u64, message: Message) -> Result<bool, Message> {
         let bytes = message.size();
         let put = {
-            let Inbox { shelf, arrivals, .. } = &mut *self.inbox();
+            let Inbox { shelf, arrivals, is_abandoned, .. } = &mut *self.inbox();
+            if *is_abandoned {
+                return Err(message);
+            }
             let (before, has_no_line) = (shelf.change(), shelf.has_no_line_for(key));
             let put = shelf.put(key, message, bytes);
             if put.is_ok() {
@@ -49,6 +52,25 @@ impl Way {
                 Err(message)
             }
         }
+    }
+
+    /// Gives up what waits here of a life that is over: it has failed, and nothing more waits.
+    pub(in crate::gncl) fn abandon_lines(&self) {
+        let abandoned = {
+            let Inbox { shelf, arrivals, is_abandoned, .. } = &mut *self.inbox();
+            *is_abandoned = true;
+            let abandoned = shelf.take_useless(|_| true);
+            for _ in &abandoned {
+                arrivals.take_again();
+                arrivals.end(End::Failed);
+            }
+            abandoned
+        };
+        // Nobody is told anything with the lock in hand.
+        for mut message in abandoned {
+            message.settle(Outcome::Failed);
+        }
+        self.owes_less();
     }
 
     fn count_too_many_lines(&self) {
@@ -139,9 +161,13 @@ impl Way {
                 match router.offer(message, Some(room)) {
                     Ok(()) => hand.ends(End::HandedOn),
                     Err(Refused { message, why: Rejection::QueueFull }) => {
-                        self.inbox().put_back(key, message, bytes);
-                        hand.empty();
-                        return Offered::Full;
+                        let Some(message) = self.inbox().put_back(key, message, bytes) else {
+                            hand.empty();
+                            return Offered::Full;
+                        };
+                        router.refuse(Refused::new(message, Rejection::QueueFull));
+                        hand.ends(End::Refused);
+                        return Offered::All;
                     }
                     Err(refused) => {
                         router.refuse(refused);
