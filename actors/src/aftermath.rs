@@ -22,7 +22,10 @@ use sinew_runtime::{
     wire::Message,
 };
 
-use crate::stores::{Stores, lock};
+use crate::{
+    stores::{Stores, lock},
+    takeover::take_over,
+};
 
 /// Time that a node which said goodbye has for its last messages: it gives them 3 s itself (GNCL-10).
 pub(crate) const LEAVE_MAX: Duration = Duration::from_secs(5);
@@ -79,19 +82,19 @@ pub(crate) fn tell(stores: &Stores, about: About, mut event: Message) -> Result<
 }
 
 /// Tells what is kept back, each when its turn has come. GNCL says when that may be: while nothing ends, nothing is looked at but what is
-/// offered to a full application.
+/// offered to a full application. Once in [`LOOK_PERIOD`] it is looked also where nothing was kept back: what GNCL says may have been
+/// heard by somebody else.
 ///
 /// A look costs a search among those to whom something is owed for each event that is kept, and a moment of the locks of the sessions of
 /// each node that these are about. There is one a millisecond at most.
 pub(crate) async fn carry_on(stores: Arc<Stores>) {
+    take_over(&stores.gncl.fewer_owed);
     loop {
         let news = stores.gncl.fewer_owed.notified();
-        match tell_whose_turn_has_come(&stores, Time::now()) {
-            None => news.await,
-            Some(pause) => {
-                drop(tokio::time::timeout(pause, news).await);
-                tokio::time::sleep(REST).await;
-            }
+        let pause = tell_whose_turn_has_come(&stores, Time::now());
+        drop(tokio::time::timeout(pause.unwrap_or(LOOK_PERIOD), news).await);
+        if pause.is_some() {
+            tokio::time::sleep(REST).await;
         }
     }
 }

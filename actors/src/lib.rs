@@ -56,6 +56,7 @@ pub mod security;
 mod session;
 mod stores;
 mod sync;
+mod takeover;
 mod wills;
 
 #[cfg(feature = "fault-points")]

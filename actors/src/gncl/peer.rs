@@ -42,6 +42,7 @@ use crate::{
     outlet::{OutletAccount, OutletCounts},
     refusals::Refusals,
     stores::{Stores, lock},
+    takeover::take_over,
 };
 
 /// How often what waits for an application that is full is offered to it, if it does not say itself that it takes more; so late at most
@@ -380,6 +381,7 @@ impl Store {
     /// Offers what waits for applications here to them, whenever one of them takes more.
     pub(super) async fn serve_those_held_up(stores: Arc<Stores>) {
         let store = &stores.gncl;
+        take_over(&store.held_up);
         let room = Waker::from(Arc::new(Room(store.held_up.clone())));
         // What is over first: a later life of the same node comes behind it.
         let all = || lock(&store.gone).clone().into_iter().chain(store.peers()).collect::<Vec<_>>();

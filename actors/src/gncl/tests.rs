@@ -15,5 +15,6 @@ mod links;
 mod messages;
 mod outcomes;
 mod secured;
+mod takeovers;
 mod threads;
 mod ticks;

@@ -7,6 +7,8 @@ use std::{
 
 use tokio::{sync::Notify, time::sleep};
 
+use crate::takeover::take_over;
+
 /// Whether somebody looks, and how to have him look.
 #[derive(Debug, Default)]
 pub(super) struct Ticks {
@@ -26,6 +28,7 @@ impl Ticks {
 
     /// Looks every `period` as long as `look` says that there is something, at once again when there is.
     pub(super) async fn run(&self, period: Duration, mut look: impl FnMut() -> bool) {
+        take_over(&self.wanted);
         // A former life of the layer may have been about to look.
         self.run.store(true, Ordering::Release);
         loop {

@@ -22,6 +22,7 @@ use crate::{
     gncl::{core::Lane, inbound::Inbound, peer::Peer, spin::Spin},
     outlet::LinkNumber,
     stores::Stores,
+    takeover::take_over,
 };
 
 /// Datagrams that are read before other tasks of the thread have their turn.
@@ -51,6 +52,7 @@ impl Alarm {
 /// Looks at the time for all peers, whenever something is due.
 pub(in crate::gncl) async fn keep_time(stores: Arc<Stores>) {
     let (store, alarm) = (&stores.gncl, &stores.gncl.alarm);
+    take_over(&alarm.earlier);
     loop {
         alarm.set.store(u64::MAX, Ordering::Release);
         let now = Time::now();
@@ -191,5 +193,26 @@ impl Reader {
 
     fn count(&self, now: Time, cause: &'static str) {
         self.stores.gncl.refusals.count(now, cause, &"it was dropped");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::pin::pin;
+
+    use sinew_runtime::tid::Incarnation;
+
+    use super::*;
+    use crate::{config::NodeConfig, takeover::tests::waits};
+
+    #[test]
+    fn who_looks_at_the_time_is_told_what_is_due_earlier_whoever_looked_before() {
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let mut former = pin!(keep_time(stores.clone()));
+        waits(former.as_mut());
+        let mut present = pin!(keep_time(stores.clone()));
+        let woken = waits(present.as_mut());
+        stores.gncl.alarm.set(Some(Time::now()));
+        assert!(woken.is());
     }
 }

@@ -19,12 +19,12 @@ use crate::{
 };
 
 /// The incarnation of a peer that is linked.
-fn life(node: &Node, peer: NodeAddress) -> Incarnation {
+pub(super) fn life(node: &Node, peer: NodeAddress) -> Incarnation {
     node.stores.gncl.peer(peer).expect("it is linked").incarnation
 }
 
 /// Tells the first application of `node` that `peer` is gone.
-fn tell_the_end(node: &Node, peer: NodeAddress) {
+pub(super) fn tell_the_end(node: &Node, peer: NodeAddress) {
     let header = Header::new(KIND, Tid::new(node.address(), AppAddress::NDL), node.tid(1));
     let event = Message::new(header, Bytes::from_static(b"its end"));
     aftermath::tell(&node.stores, About::End(peer), event).expect("there is room");
