@@ -289,6 +289,7 @@ impl Link {
             let next = match present.window.room() {
                 Room::Any => present.lender.take(),
                 Room::Events => present.lender.take_event(),
+                Room::EventsAboutNobody => present.lender.take_event_about_nobody(),
                 Room::Nothing => None,
             };
             let Some(message) = next else { return };

@@ -6,13 +6,16 @@
 
 use std::collections::VecDeque;
 
-use sinew_runtime::wire::Message;
+use sinew_runtime::{mailbox::About, wire::Message};
 
 use super::words::{EVENTS_MAX, Fate, Turn, WINDOW};
 
 /// Bytes of the payloads that a child has, from which on it gets no further message.
 const BYTES_ENOUGH: usize = 1 << 20;
 const WINDOW_AND_EVENTS: usize = WINDOW + EVENTS_MAX;
+/// Events about nodes that it has, from which on it gets only such as are about none: in a pause those about a node may wait there behind
+/// messages of it, as long as the pause lasts.
+const ABOUT_NODES_ENOUGH: usize = EVENTS_MAX / 2;
 
 /// A message that the child has.
 struct Lent {
@@ -26,6 +29,8 @@ pub(super) struct Window {
     lent: VecDeque<Lent>,
     /// Bytes of their payloads.
     bytes: usize,
+    /// Those that are events about nodes.
+    about_nodes: usize,
     last: u64,
     in_hand: Option<u64>,
 }
@@ -36,6 +41,8 @@ pub(super) enum Room {
     Any,
     /// The layers' events.
     Events,
+    /// Those of them that are about no node: what ends a pause is one.
+    EventsAboutNobody,
     Nothing,
 }
 
@@ -58,8 +65,9 @@ impl Window {
     pub(super) fn room(&self) -> Room {
         match self.lent.len() {
             0..WINDOW if self.bytes < BYTES_ENOUGH => Room::Any,
-            0..WINDOW_AND_EVENTS => Room::Events,
-            _ => Room::Nothing,
+            WINDOW_AND_EVENTS.. => Room::Nothing,
+            _ if self.about_nodes < ABOUT_NODES_ENOUGH => Room::Events,
+            _ => Room::EventsAboutNobody,
         }
     }
 
@@ -67,6 +75,7 @@ impl Window {
     pub(super) fn lend(&mut self, message: Message) {
         self.last += 1;
         self.bytes += message.payload.len();
+        self.about_nodes += usize::from(is_about_a_node(&message));
         self.lent.push_back(Lent { number: self.last, message });
     }
 
@@ -82,6 +91,7 @@ impl Window {
                     return Err(NoSuchMessage(number));
                 };
                 self.bytes -= message.payload.len();
+                self.about_nodes -= usize::from(is_about_a_node(&message));
                 Some((message, fate))
             }
             None => None,
@@ -110,6 +120,10 @@ impl Window {
     fn find(&self, number: u64) -> Result<usize, NoSuchMessage> {
         self.lent.iter().position(|lent| lent.number == number).ok_or(NoSuchMessage(number))
     }
+}
+
+fn is_about_a_node(message: &Message) -> bool {
+    About::of(&message.header).is_some()
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@
 
 use std::{sync::Arc, task::Waker};
 
-use super::{Mailbox, Shared, is_event};
+use super::{About, Mailbox, Shared, is_event};
 use crate::{
     outcome::{Outcome, Rejection},
     post::lock,
@@ -37,7 +37,9 @@ impl Mailbox {
     /// Takes over the reading end for a borrower in another process; the former reader is fenced off.
     #[must_use]
     pub fn lend(self: &Arc<Self>) -> Lender {
-        Lender { epoch: self.attach().epoch(), mailbox: self.clone() }
+        let epoch = self.attach().epoch();
+        lock(&self.shared).is_lent = true;
+        Lender { epoch, mailbox: self.clone() }
     }
 }
 
@@ -59,6 +61,17 @@ impl Lender {
     pub fn take_event(&self) -> Option<Message> {
         let mut shared = lock(&self.mailbox.shared);
         let event = if shared.epoch == self.epoch { shared.events.pop_front() } else { None };
+        shared.lends(event.as_ref());
+        event
+    }
+
+    /// The next of them that is [about](About) no node, if one waits. It passes those that are, whose order stays.
+    #[must_use]
+    pub fn take_event_about_nobody(&self) -> Option<Message> {
+        let mut shared = lock(&self.mailbox.shared);
+        let is_next = |event: &Message| About::of(&event.header).is_none();
+        let at = shared.events.iter().position(is_next).filter(|_| shared.epoch == self.epoch)?;
+        let event = shared.events.remove(at);
         shared.lends(event.as_ref());
         event
     }
@@ -175,5 +188,24 @@ mod tests {
             assert_eq!((tally.taken, tally.rejected, tally.open()), (1, 1, 0));
             assert_eq!(mailbox.account(Class::Control), (tally, 0));
         }
+    }
+    #[test]
+    fn events_about_nodes_leave_room_for_others_which_pass_them_and_keep_their_order() {
+        let event = |sequence, about: Option<About>| {
+            let mut event = message(Class::Control, sequence);
+            event.header.source.app = crate::tid::AppAddress::SYNC;
+            about.iter().for_each(|about| about.write(&mut event.header));
+            event
+        };
+        let node = crate::tid::NodeAddress::new(9);
+        let mailbox = Mailbox::new(4);
+        let lender = mailbox.lend();
+        let submit = |sequence, about| mailbox.submit(event(sequence, about)).is_ok();
+        assert!(submit(1, Some(About::End(node))) && submit(2, Some(About::Node(node))));
+        assert!(!submit(3, Some(About::End(node))), "half of the places are not for these");
+        assert!(submit(4, None) && submit(5, None) && !submit(6, None));
+        let next = || lender.take_event_about_nobody().map(|event| event.header.sequence);
+        assert_eq!([next(), next(), next()], [Some(4), Some(5), None]);
+        assert_eq!(sequences(&lender), [1, 2]);
     }
 }

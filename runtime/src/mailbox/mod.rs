@@ -65,6 +65,8 @@ struct Shared {
     taken_out: u64,
     /// Messages of each class that are out with a [`Lender`].
     lent: [u64; 3],
+    /// The present reader is a [`Lender`].
+    is_lent: bool,
     closed: bool,
     /// The application is away and wants nothing kept for it.
     refuses: bool,
@@ -105,7 +107,17 @@ impl Shared {
     /// the pause lasts.
     fn has_room_for_event(&self, event: &Header) -> bool {
         let kept = self.queue.kept_events();
-        self.events.len() + kept < self.events_max && (kept < self.events_max / 2 || !self.queue.keeps(event))
+        if self.events.len() + kept >= self.events_max {
+            return false;
+        }
+        // Behind which messages a borrower keeps an event about a node is not known here.
+        let (stay, stays) = if self.is_lent {
+            let about_nodes = self.events.iter().filter(|event| About::of(&event.header).is_some()).count();
+            (kept + about_nodes, About::of(event).is_some())
+        } else {
+            (kept, self.queue.keeps(event))
+        };
+        !stays || stay < self.events_max / 2
     }
 
     fn submit_event(&mut self, event: Message) -> Result<Option<Waker>, Refused> {
@@ -188,6 +200,7 @@ impl Mailbox {
             in_hand: None,
             taken_out: 0,
             lent: [0; 3],
+            is_lent: false,
             closed: false,
             refuses: false,
             tallies: [Tally::default(); 3],
@@ -202,7 +215,7 @@ impl Mailbox {
         let (epoch, former) = {
             let mut shared = lock(&self.shared);
             shared.next_reader();
-            shared.paused = false;
+            (shared.paused, shared.is_lent) = (false, false);
             (shared.epoch, shared.waker.take())
         };
         if let Some(waker) = former {

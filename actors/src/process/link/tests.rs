@@ -4,6 +4,7 @@ use std::{sync::mpsc::sync_channel, time::Duration};
 
 use bytes::Bytes;
 use sinew_runtime::{
+    mailbox::About,
     pending::Pending,
     sender::Directory,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
@@ -12,7 +13,11 @@ use sinew_runtime::{
 use tokio::io::AsyncReadExt;
 
 use super::*;
-use crate::{config::NodeConfig, process::words};
+use crate::{
+    config::NodeConfig,
+    lncl::Reader,
+    process::words::{self, EVENTS_MAX, WINDOW},
+};
 
 struct Nobody;
 
@@ -34,6 +39,19 @@ impl ReceiptSink for SendsAgain {
             Message::new(Header::new(Kind::named("again"), ticket.source, ticket.destination), Bytes::new());
         self.0.submit(again).expect("there is room");
     }
+}
+
+/// The end of the connection of a process behind `link`, which has read the welcome.
+async fn connected(stores: &Stores, link: &Link) -> UnixStream {
+    let (socket, mut process) = UnixStream::pair().expect("a pair of sockets");
+    let welcome = words::bare(Kind::HOST_WELCOME, Tid::NONE, Tid::NONE);
+    let number = link.connect(Arc::new(socket), welcome, (stores.directory_changes.subscribe(), 0));
+    let mut frame = [0; HEADER_LEN];
+    tokio::select! {
+        error = link.drain(number) => panic!("the process reads: {error}"),
+        read = process.read_exact(&mut frame) => drop(read.expect("the welcome")),
+    }
+    process
 }
 
 #[test]
@@ -135,4 +153,42 @@ fn whoever_is_told_that_a_former_process_failed_may_send_to_it_at_once() {
         say.send(()).expect("it is waited for");
     });
     said.recv_timeout(Duration::from_secs(10)).expect("whoever is told is told without a lock");
+}
+
+#[test]
+fn what_ends_a_pause_is_handed_over_however_many_events_wait_behind_messages_of_a_node() {
+    const MET: Kind = Kind::named("met");
+    // Given: messages of a node fill the window
+    let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+    let link = Link::new(&stores, Mailbox::new(2 * (WINDOW + EVENTS_MAX)));
+    let tid = Tid::new(NodeAddress::HERE, AppAddress::fixed(1).expect("a fixed one"));
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().expect("a reactor");
+    let _entered = runtime.enter();
+    let process = runtime.block_on(connected(&stores, &link));
+    let gone = NodeAddress::new(9);
+    let send = |source, kind, about: Option<About>| {
+        let mut header = Header::new(kind, source, tid);
+        about.iter().for_each(|about| about.write(&mut header));
+        link.submit(Message::new(header, Bytes::new()))
+    };
+    for _ in 0..WINDOW {
+        send(Tid::new(gone, tid.app), Kind::named("test"), None).expect("there is room");
+    }
+    // When: more is told of it than the child may have, which takes nothing else, and then what it waits for
+    let ndl = Tid::new(tid.node, AppAddress::NDL);
+    for _ in 0..2 * EVENTS_MAX {
+        for about in [About::End(gone), About::Node(gone)] {
+            // One that is refused is offered again.
+            let _ = send(ndl, Kind::named("event"), Some(about));
+        }
+    }
+    send(Tid::new(tid.node, AppAddress::SYNC), MET, None).expect("there is room");
+    // Then
+    let mut kinds = Vec::new();
+    let mut reader = Reader::new(1_024);
+    runtime.block_on(process.readable()).expect("a connection");
+    while let Ok(Some(message)) = reader.next_of_the_dead(&process) {
+        kinds.push(message.header.kind);
+    }
+    assert_eq!((kinds.len(), kinds.last()), (WINDOW + EVENTS_MAX / 2 + 1, Some(&MET)));
 }
