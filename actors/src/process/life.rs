@@ -252,7 +252,7 @@ impl Child {
                 _ = &mut drain, if !drained => drained = true,
                 words = &mut ended => return Silence::Ended(words),
                 () = stop.notified() => self.say(words::bare(Kind::HOST_STOP, Tid::NONE, self.hosted.tid)),
-                () = link.nudged() => {
+                () = link.nudged(self.number) => {
                     self.tell_names();
                     link.hand_over_held();
                 }

@@ -52,8 +52,6 @@ pub(crate) struct Link {
     former: Mutex<Option<Arc<OwnedFd>>>,
     /// Sequence of the last message that came from the TID before that one.
     began: AtomicU64,
-    /// A message waits until the child knows which names have changed.
-    nudge: Notify,
     /// The node's own sending side of the TID.
     sender: OnceLock<Sender>,
 }
@@ -77,6 +75,9 @@ struct Present {
     /// So many of them the child has been told of, ahead of all that is handed over from then on.
     told: u64,
     held: Option<Held>,
+    /// A message waits until the child knows which names have changed. Of this child alone: who waits for a former one may not be polled
+    /// any more, and would be told first.
+    nudge: Arc<Notify>,
 }
 
 /// A message that came behind changes that the child has not been told of: its sender may know of them, so the child must. It waits for one
@@ -118,7 +119,6 @@ impl Link {
             lives: AtomicU64::new(0),
             former: Mutex::new(None),
             began: AtomicU64::new(0),
-            nudge: Notify::new(),
             sender: OnceLock::new(),
         })
     }
@@ -169,8 +169,8 @@ impl Link {
         // Without the lock, because whoever is told may send to this very TID.
         self.end(former, LastWords::Unheard);
         let number = self.outlet.connect(socket, self.payload_max, Some(welcome));
-        let (lender, window, held) = (self.mailbox.lend(), Window::default(), None);
-        *lock(&self.present) = Some(Present { number, lender, window, directory, told, held });
+        let (lender, window, nudge) = (self.mailbox.lend(), Window::default(), Arc::default());
+        *lock(&self.present) = Some(Present { number, lender, window, directory, told, held: None, nudge });
         self.pump();
         number
     }
@@ -213,9 +213,14 @@ impl Link {
         .await
     }
 
-    /// Resolves when a message waits for [`hand_over_held`](Self::hand_over_held).
-    pub(super) async fn nudged(&self) {
-        self.nudge.notified().await;
+    /// Resolves when a message for this child waits for [`hand_over_held`](Self::hand_over_held); never for a former one.
+    pub(super) async fn nudged(&self, number: LinkNumber) {
+        let is_it = |present: &&Present| present.number == number;
+        let nudge = lock(&self.present).as_ref().filter(is_it).map(|present| present.nudge.clone());
+        match nudge {
+            Some(nudge) => nudge.notified().await,
+            None => std::future::pending().await,
+        }
     }
 
     /// The child has been told of so many changes, counted before it was looked what has changed. Said when the words are on their
@@ -236,7 +241,7 @@ impl Link {
                 self.hand_over(present, held.message);
             } else {
                 present.held = Some(held);
-                self.nudge.notify_one();
+                present.nudge.notify_one();
             }
         }
         self.pump();
@@ -297,7 +302,7 @@ impl Link {
                 self.hand_over(present, message);
             } else {
                 present.hold(message);
-                self.nudge.notify_one();
+                present.nudge.notify_one();
             }
         }
     }

@@ -1,6 +1,6 @@
 //! What a hosted application gets, and when.
 
-use std::{sync::mpsc::sync_channel, time::Duration};
+use std::{pin::pin, sync::mpsc::sync_channel, time::Duration};
 
 use bytes::Bytes;
 use sinew_runtime::{
@@ -17,6 +17,7 @@ use crate::{
     config::NodeConfig,
     lncl::Reader,
     process::words::{self, EVENTS_MAX, WINDOW},
+    takeover::tests::waits,
 };
 
 struct Nobody;
@@ -41,8 +42,8 @@ impl ReceiptSink for SendsAgain {
     }
 }
 
-/// The end of the connection of a process behind `link`, which has read the welcome.
-async fn connected(stores: &Stores, link: &Link) -> UnixStream {
+/// A process behind `link`, and its end of the connection; it has read the welcome.
+async fn connected(stores: &Stores, link: &Link) -> (LinkNumber, UnixStream) {
     let (socket, mut process) = UnixStream::pair().expect("a pair of sockets");
     let welcome = words::bare(Kind::HOST_WELCOME, Tid::NONE, Tid::NONE);
     let number = link.connect(Arc::new(socket), welcome, (stores.directory_changes.subscribe(), 0));
@@ -51,7 +52,7 @@ async fn connected(stores: &Stores, link: &Link) -> UnixStream {
         error = link.drain(number) => panic!("the process reads: {error}"),
         read = process.read_exact(&mut frame) => drop(read.expect("the welcome")),
     }
-    process
+    (number, process)
 }
 
 #[test]
@@ -164,7 +165,7 @@ fn what_ends_a_pause_is_handed_over_however_many_events_wait_behind_messages_of_
     let tid = Tid::new(NodeAddress::HERE, AppAddress::fixed(1).expect("a fixed one"));
     let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().expect("a reactor");
     let _entered = runtime.enter();
-    let process = runtime.block_on(connected(&stores, &link));
+    let (_, process) = runtime.block_on(connected(&stores, &link));
     let gone = NodeAddress::new(9);
     let send = |source, kind, about: Option<About>| {
         let mut header = Header::new(kind, source, tid);
@@ -191,4 +192,23 @@ fn what_ends_a_pause_is_handed_over_however_many_events_wait_behind_messages_of_
         kinds.push(message.header.kind);
     }
     assert_eq!((kinds.len(), kinds.last()), (WINDOW + EVENTS_MAX / 2 + 1, Some(&MET)));
+}
+
+#[test]
+fn a_message_that_waits_for_names_is_told_to_who_waits_for_this_child_whoever_waited_for_the_former() {
+    let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+    let link = Link::new(&stores, Mailbox::new(8));
+    let tid = Tid::new(NodeAddress::HERE, AppAddress::fixed(1).expect("a fixed one"));
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().expect("a reactor");
+    let _entered = runtime.enter();
+    let (former, _process) = runtime.block_on(connected(&stores, &link));
+    let mut of_former = pin!(link.nudged(former));
+    waits(of_former.as_mut());
+    let (present, _other) = runtime.block_on(connected(&stores, &link));
+    let mut of_present = pin!(link.nudged(present));
+    let woken = waits(of_present.as_mut());
+    stores.directory_has_changed();
+    link.submit(Message::new(Header::new(Kind::named("event"), tid, tid), Bytes::new()))
+        .expect("there is room");
+    assert!(woken.is());
 }
