@@ -1,5 +1,6 @@
 //! The thin shell around the membership core: sockets, timer, mDNS, and the ways to other layers.
 
+mod receiving;
 mod telling;
 
 use std::{
@@ -29,7 +30,7 @@ use tokio::sync::{Notify, mpsc, oneshot};
 use super::{
     Event,
     core::{Core, Epoch, Input, Output, Way},
-    datagram::{Answer, Body, DATAGRAM_MAX, Datagram, encode, maker_of},
+    datagram::{Answer, Body, Datagram, encode},
     mdns::{Mdns, MdnsError},
     probe::{PROBES_MAX, Probe},
     socket,
@@ -39,17 +40,11 @@ use crate::{
     config::NodeConfig,
     gncl, node,
     refusals::Refusals,
-    secured::SEAL_LEN,
     stores::{self, Stores},
 };
 
-/// Rest after a failed read, so that a socket that fails for good does not take the whole thread.
-const READ_FAILED_REST: Duration = Duration::from_millis(10);
 /// Time between two questions to the root at least.
 const PROGRESS_PERIOD_MIN: Duration = Duration::from_millis(100);
-/// Datagrams that are read in a row; then there is a rest, so that a flood leaves a CPU to others, whatever this thread's priority is.
-const DATAGRAMS_IN_A_ROW: u32 = 128;
-const REST: Duration = Duration::from_millis(1);
 /// Time between two attempts to listen to mDNS again.
 const MDNS_REST: Duration = Duration::from_secs(1);
 
@@ -84,9 +79,9 @@ impl Actor for NdlActor {
         let shell = Rc::new(shell);
         let unicast = tokio::net::UdpSocket::from_std(unicast)
             .unwrap_or_else(|error| give_up(&format!("NDL's socket cannot be watched: {error}")));
-        ctx.spawn(receive(shell.clone(), unicast, Way::Unicast).into_actor(self));
+        ctx.spawn(receiving::receive(shell.clone(), unicast, Way::Unicast).into_actor(self));
         if let Some(group) = shell.join_group() {
-            ctx.spawn(receive(shell.clone(), group, Way::Multicast).into_actor(self));
+            ctx.spawn(receiving::receive(shell.clone(), group, Way::Multicast).into_actor(self));
         }
         // The first queries leave here.
         shell.carry_out();
@@ -286,20 +281,6 @@ impl Shell {
         lock(&self.stores).announcement().clone()
     }
 
-    /// What came from `from`, if this node has no keys, or a node of its project made it. spec: NDL-1.3
-    fn unsealed<'a>(&self, from: SocketAddr, bytes: &'a [u8]) -> Option<&'a [u8]> {
-        let Some(secured) = self.stores.secured.get() else { return Some(bytes) };
-        let now = Time::now();
-        let refused = |why: &&str| {
-            self.refusals.count(
-                now,
-                "NDL datagram not of this project's keys",
-                &format_args!("{from}: {why}"),
-            );
-        };
-        secured.unseal(now, bytes, maker_of).inspect_err(refused).ok()
-    }
-
     fn send_query(&self, to: SocketAddr, correlation: u64) {
         self.send(to, NodeAddress::ALL, correlation, Body::Query(self.me()));
     }
@@ -352,34 +333,6 @@ fn open_socket(stores: &Stores) -> io::Result<std::net::UdpSocket> {
     }
     *kept = Some(socket.try_clone()?);
     Ok(socket)
-}
-
-/// Reads datagrams for as long as this instance is the current one. Answers leave from here.
-async fn receive(shell: Rc<Shell>, socket: tokio::net::UdpSocket, way: Way) {
-    // One byte more than is taken: a longer datagram is noticed, not cut.
-    let mut buffer = [0; DATAGRAM_MAX + SEAL_LEN + 1];
-    let (mut in_a_row, mut began) = (0, Time::now());
-    loop {
-        in_a_row += 1;
-        if in_a_row > DATAGRAMS_IN_A_ROW {
-            if Time::now().since(began) < REST {
-                tokio::time::sleep(REST).await;
-            }
-            (in_a_row, began) = (0, Time::now());
-        }
-        match socket.recv_from(&mut buffer).await {
-            Ok((length, from)) => {
-                let Some(bytes) = shell.unsealed(from, &buffer[..length]) else { continue };
-                if !shell.feed(|core, now| core.receive(now, from, way, bytes)) {
-                    return;
-                }
-            }
-            Err(error) => {
-                shell.refusals.count(Time::now(), "NDL socket not readable", &error);
-                tokio::time::sleep(READ_FAILED_REST).await;
-            }
-        }
-    }
 }
 
 /// Asks the root, every period, what of this node does not get on. The root waits for nobody, and NDL not for the root.

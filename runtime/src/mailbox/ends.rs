@@ -10,7 +10,7 @@ use crate::{
     outcome::Ticket,
     tid::NodeAddress,
     time::Time,
-    wire::{Header, Message},
+    wire::{Class, Header, Message},
 };
 
 /// Messages, and the bytes of their payloads.
@@ -125,7 +125,8 @@ impl Ends {
 
     /// Whether a value of this stream is here. One that comes now does not take its place: an end is between them.
     pub(super) fn has_value_of(&self, stream: &Header) -> bool {
-        self.iter().any(|message| is_same_stream(&message.header, stream))
+        let is_one = |header: &Header| header.class == Class::Stream && is_same_stream(header, stream);
+        self.iter().any(|message| is_one(&message.header))
     }
 }
 
