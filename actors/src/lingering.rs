@@ -1,12 +1,29 @@
 //! Descriptors that take for ever to close, for tests of who closes them.
 
 use std::{
-    io::{ErrorKind, Write},
+    io::{ErrorKind, IoSlice, Write},
+    mem::MaybeUninit,
     net::{TcpListener, TcpStream},
+    os::fd::AsFd,
     time::Duration,
 };
 
-use rustix::net::sockopt::{set_socket_linger, set_socket_recv_buffer_size};
+use rustix::{
+    io::Errno,
+    net::{
+        SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg,
+        sockopt::{set_socket_linger, set_socket_recv_buffer_size},
+    },
+};
+
+/// Passes a descriptor beside these bytes.
+pub(crate) fn pass(socket: impl AsFd, bytes: &[u8], descriptor: impl AsFd) -> Result<usize, Errno> {
+    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
+    let mut control = SendAncillaryBuffer::new(&mut space);
+    let descriptors = [descriptor.as_fd()];
+    assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)));
+    sendmsg(socket, &[IoSlice::new(bytes)], &mut control, SendFlags::empty())
+}
 
 /// A connection whose last close waits until its peer has taken what is written, or has gone.
 pub(crate) struct Lingering {

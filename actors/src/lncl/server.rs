@@ -262,16 +262,16 @@ pub(super) fn say_why(server: &Server, stream: &UnixStream, why: &dyn std::fmt::
 
 #[cfg(test)]
 mod tests {
-    use std::{
-        io::IoSlice, mem::MaybeUninit, os::fd::AsFd, os::unix::net::UnixStream as Plain,
-        sync::mpsc::sync_channel,
-    };
+    use std::{os::unix::net::UnixStream as Plain, sync::mpsc::sync_channel};
 
-    use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
     use sinew_runtime::tid::Incarnation;
 
     use super::*;
-    use crate::{config::NodeConfig, lingering::Lingering, lncl::testing::WATCHDOG};
+    use crate::{
+        config::NodeConfig,
+        lingering::{self, Lingering},
+        lncl::testing::WATCHDOG,
+    };
 
     // spec: LNCL-18
     #[test]
@@ -281,12 +281,7 @@ mod tests {
         ours.set_nonblocking(true).unwrap();
         let mut lingering = Lingering::new();
         let passed = lingering.ours.take().expect("it is passed once");
-        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
-        let mut control = SendAncillaryBuffer::new(&mut space);
-        let descriptors = [passed.as_fd()];
-        assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)));
-        sendmsg(&theirs, &[IoSlice::new(b"S")], &mut control, SendFlags::empty()).unwrap();
-        drop(passed);
+        lingering::pass(&theirs, b"S", passed).unwrap();
         // When:
         let (say, said) = sync_channel(1);
         std::thread::spawn(move || {

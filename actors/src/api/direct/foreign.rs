@@ -138,21 +138,18 @@ fn close(left: Left) {
 
 #[cfg(all(test, target_os = "linux"))]
 mod tests {
-    use std::{io::IoSlice, mem::MaybeUninit, sync::mpsc::sync_channel};
-
-    use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
+    use std::sync::mpsc::sync_channel;
 
     use super::*;
-    use crate::{lingering::Lingering, lncl::testing::WATCHDOG};
+    use crate::{
+        lingering::{self, Lingering},
+        lncl::testing::WATCHDOG,
+    };
 
     /// Passes it, with one byte, and keeps no copy.
     fn pass(lingering: &mut Lingering, socket: &UnixStream) {
         let passed = lingering.ours.take().expect("it is passed once");
-        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
-        let mut control = SendAncillaryBuffer::new(&mut space);
-        let descriptors = [passed.as_fd()];
-        assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)));
-        sendmsg(socket, &[IoSlice::new(&[1])], &mut control, SendFlags::empty()).expect("it comes");
+        lingering::pass(socket, &[1], passed).expect("it comes");
     }
 
     /// Whether a thread is done with it before the one who has passed it lets go.

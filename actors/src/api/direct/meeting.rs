@@ -209,16 +209,16 @@ impl Direct {
 
 #[cfg(all(test, target_os = "linux"))]
 mod tests {
-    use std::{io::IoSlice, mem::MaybeUninit, os::fd::AsFd, sync::mpsc::sync_channel};
+    use std::{os::fd::AsFd, sync::mpsc::sync_channel};
 
-    use rustix::{
-        io::Errno,
-        net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg},
-    };
+    use rustix::io::Errno;
     use sinew_shm::{BellKind, OFFER_BYTES};
 
     use super::*;
-    use crate::{lingering::Lingering, lncl::testing::WATCHDOG};
+    use crate::{
+        lingering::{self, Lingering},
+        lncl::testing::WATCHDOG,
+    };
 
     #[test]
     fn what_a_peer_passes_in_place_of_its_offer_is_not_closed_by_who_takes_it() {
@@ -227,13 +227,7 @@ mod tests {
         ours.set_nonblocking(true).unwrap();
         let mut lingering = Lingering::new();
         let passed = lingering.ours.take().expect("it is passed once");
-        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
-        let mut control = SendAncillaryBuffer::new(&mut space);
-        let descriptors = [passed.as_fd()];
-        assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)));
-        let bytes = [IoSlice::new(&[0; OFFER_BYTES])];
-        sendmsg(&theirs, &bytes, &mut control, SendFlags::empty()).unwrap();
-        drop(passed);
+        lingering::pass(&theirs, &[0; OFFER_BYTES], passed).unwrap();
         // When: it is taken and refused.
         let (say, said) = sync_channel(1);
         std::thread::spawn(move || {
@@ -256,11 +250,7 @@ mod tests {
     }
 
     fn pass(socket: &UnixStream, descriptor: impl AsFd) -> Result<usize, Errno> {
-        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
-        let mut control = SendAncillaryBuffer::new(&mut space);
-        let descriptors = [descriptor.as_fd()];
-        assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)));
-        sendmsg(socket, &[IoSlice::new(&[1])], &mut control, SendFlags::empty())
+        lingering::pass(socket, &[1], descriptor)
     }
 
     // spec: LNCL-18
