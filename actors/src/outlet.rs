@@ -219,7 +219,7 @@ impl<S: Socket> StreamOutlet<S> {
     }
 
     /// The peer has said on `link` what it takes next; with a session, nothing goes out on a connection before this.
-    /// Returns whether the peer must be told at once in which [`epoch`](Self::epoch) that is.
+    /// Returns whether an epoch has begun with it: then nothing goes out before the peer is told so, by [`acknowledge`](Self::acknowledge).
     pub(crate) fn heard(&self, link: LinkNumber, ack: &Ack, now: Time) -> bool {
         self.with(|half, after| half.heard(link, ack, now, after))
     }
@@ -314,6 +314,12 @@ impl<S: Socket> StreamOutlet<S> {
     /// The frame: there is no connection, or too many wait.
     pub(crate) fn submit_urgent(&self, message: Message, waiting_max: usize) -> Result<(), Refused> {
         self.with(|half, after| half.submit_urgent(message, waiting_max, after))
+    }
+
+    /// Says what was taken, ahead of all that waits: `ack` names `epoch` as that in which this outlet counts. Returns whether it does; if a
+    /// later one has begun since, `ack` is not said.
+    pub(crate) fn acknowledge(&self, ack: Message, epoch: u64) -> bool {
+        self.with(|half, after| half.acknowledge(ack, epoch, after))
     }
 
     /// Urgent frames that the socket has not taken to their last byte. They end with the connection.

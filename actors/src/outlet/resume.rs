@@ -148,6 +148,22 @@ impl<S: Socket> Half<S> {
         }
     }
 
+    /// An ACK that names `epoch` goes ahead of all that waits; what was held back until the peer knows of that epoch follows it. Returns
+    /// whether that is the present one: if not, the frame is dropped, and another one is to be made.
+    pub(super) fn acknowledge(&mut self, ack: Message, epoch: u64, after: &mut After) -> bool {
+        if epoch != self.epoch() {
+            return false;
+        }
+        // Without a connection nobody needs it, and the next one begins with another.
+        if self.submit_urgent(ack, usize::MAX, after).is_ok()
+            && let Some(session) = &mut self.session
+        {
+            session.sending.told(epoch);
+            self.hand_to_drainer(after);
+        }
+        true
+    }
+
     /// What has expired, or has a newer value behind it, is not sent again. It has not arrived, so the outcome is true.
     fn void(&mut self, now: Time, after: &mut After) {
         let Some(session) = &mut self.session else { return };

@@ -22,6 +22,7 @@ use tokio_util::codec::Decoder;
 use super::*;
 
 mod accounts;
+mod anew;
 mod audits;
 mod floods;
 mod holding;

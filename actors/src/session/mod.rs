@@ -5,7 +5,8 @@
 //! it takes next ([`Ack`]), and the other goes on from there. Both halves outlive connections and restarts of GNCL.
 //!
 //! ```text
-//!  Sending     Paused ── Ack ──► Flowing ── link ended ──► Paused        Ack of another epoch: Reset, all kept are reported
+//!  Sending     Paused ── Ack ──► Flowing ── link ended ──► Paused
+//!                        Ack of another epoch ──► Untold, all kept are reported ── our Ack goes out ──► Flowing
 //!  Receiving   Fenced ── attached, epoch known ──► Taking ── next link ──► Fenced
 //! ```
 //!
@@ -15,7 +16,7 @@
 //! | SESSION-2 | The sender keeps it until it is acknowledged; what it keeps is bounded in messages and bytes. |
 //! | SESSION-3 | On a new connection nothing is sent before the receiver's Ack; then all from the number in it. |
 //! | SESSION-4 | The receiver takes the next number only, on the latest connection only, and counts it before it hands it on. |
-//! | SESSION-5 | An epoch is one counting. An Ack of a peer that has forgotten what it took ends the epoch: what is kept is reported, not sent again. |
+//! | SESSION-5 | An epoch is one counting. An Ack of a peer that has forgotten what it took ends the epoch: what is kept is reported, not sent again, and nothing of the next one goes out before the Ack that names it. |
 //! | SESSION-6 | What has lost its use while it was kept (expired, superseded) is sent as a void of the same number. |
 //!
 //! Who cannot be sent to at present is in `shelf.rs`, with its rules (CREDIT-1 to CREDIT-4).

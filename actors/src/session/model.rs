@@ -25,6 +25,8 @@ struct Side {
     taken: Vec<u8>,
     lost: Vec<u8>,
     memories: u64,
+    /// An epoch has begun, and nobody has said so yet: another thread may write before this one does.
+    owes_word: bool,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
@@ -45,6 +47,8 @@ enum Action {
     /// A side turns to the present connection.
     Attach(usize),
     Write(usize),
+    /// A side tells of its epoch.
+    Tell(usize),
     Read {
         side: usize,
         link: u64,
@@ -69,6 +73,8 @@ enum Planted {
     DeafSender,
     /// What a side keeps when it gives the other up is not reported.
     SilentLoss,
+    /// Messages of a new epoch do not wait until the peer was told of it.
+    Hasty,
 }
 
 struct Pair {
@@ -89,6 +95,7 @@ impl Side {
             taken: Vec::new(),
             lost: Vec::new(),
             memories: 1,
+            owes_word: false,
         }
     }
 
@@ -97,6 +104,8 @@ impl Side {
         if planted == Planted::NamelessMemory {
             ack.memory = 0;
         }
+        self.sending.told(ack.epoch);
+        self.owes_word = false;
         Frame::Ack(ack)
     }
 
@@ -110,7 +119,8 @@ impl Side {
             | Planted::NoFence
             | Planted::NamelessMemory
             | Planted::DeafSender
-            | Planted::SilentLoss => {}
+            | Planted::SilentLoss
+            | Planted::Hasty => {}
         }
         self.receiving.attach(link);
         self.ack(planted)
@@ -125,7 +135,7 @@ impl Side {
         // A reset on the way may have come as far as the next epoch already.
         self.sending = Sending::new(self.memories * 100, WINDOW);
         self.receiving = Receiving::new(self.memories);
-        self.link = 0;
+        (self.link, self.owes_word) = (0, false);
     }
 
     fn write(&mut self) -> Option<Frame> {
@@ -155,7 +165,11 @@ impl Side {
                     Heard::Known | Heard::Resumed => Ok(None),
                     Heard::Reset(lost) => {
                         self.lost.extend(lost);
-                        Ok(Some(self.ack(planted)))
+                        self.owes_word = true;
+                        if planted == Planted::Hasty {
+                            self.sending.told(self.sending.epoch());
+                        }
+                        Ok(None)
                     }
                 }
             }
@@ -228,6 +242,9 @@ impl Model for Pair {
                 actions.push(Action::Forget(side));
             }
             actions.push(Action::Write(side));
+            if state.sides[side].owes_word {
+                actions.push(Action::Tell(side));
+            }
             let readable = state
                 .wires
                 .iter()
@@ -252,6 +269,11 @@ impl Model for Pair {
                 let frame = state.sides[side].write()?;
                 let link = state.sides[side].link;
                 state.put(side, link, frame);
+            }
+            Action::Tell(side) => {
+                let ack = state.sides[side].ack(self.planted);
+                let link = state.sides[side].link;
+                state.put(side, link, ack);
             }
             Action::Read { side, link } => {
                 let frame = state.wires.get_mut(&link)?[1 - side].pop_front()?;
@@ -321,6 +343,7 @@ fn each_planted_fault_is_found() {
         Planted::NamelessMemory,
         Planted::DeafSender,
         Planted::SilentLoss,
+        Planted::Hasty,
     ] {
         let checker = check(Pair { planted, values: [2, 0], cuts: 1, forgets: 1 });
         let broken =

@@ -27,8 +27,8 @@ pub(crate) enum Heard<M> {
     Known,
     /// The connection can be used: what was kept and has not arrived is sent again now.
     Resumed,
-    /// The peer does not know what it took in this epoch. A new one has begun, which the peer must be told before all else; whether these
-    /// messages, oldest first, have arrived nobody can say.
+    /// The peer does not know what it took in this epoch. A new one has begun, of which nothing goes out before the peer is
+    /// [told](Sending::told); whether these messages, oldest first, have arrived nobody can say.
     Reset(Vec<M>),
 }
 
@@ -47,6 +47,8 @@ pub(crate) struct Sending<M> {
     cursor: Option<u64>,
     /// The memory of the peer that this epoch's messages were for.
     peer: Option<u64>,
+    /// This epoch began on the present connection, and the peer has not been told: nothing of it goes out.
+    is_untold: bool,
     /// Bytes of this epoch's messages that have arrived.
     arrived: u64,
     /// How far the peer has said that it has room: before this number, and for messages that begin before so many bytes. spec: CREDIT-5
@@ -65,6 +67,7 @@ impl<M> Sending<M> {
             bytes: 0,
             cursor: None,
             peer: None,
+            is_untold: false,
             arrived: 0,
             until: None,
         }
@@ -162,6 +165,16 @@ impl<M> Sending<M> {
     /// The connection has ended.
     pub(crate) const fn link_ended(&mut self) {
         self.cursor = None;
+        self.is_untold = false;
+    }
+
+    /// An [`Ack`] that names `epoch` goes out on the present connection, ahead of all that is sent from now on: if that is the epoch that began
+    /// there, its messages may follow. spec: SESSION-5
+    pub(crate) const fn told(&mut self, epoch: u64) {
+        if self.is_untold && epoch == self.epoch {
+            self.is_untold = false;
+            self.cursor = Some(FIRST);
+        }
     }
 
     /// The peer has said what it takes next.
@@ -209,6 +222,8 @@ impl<M> Sending<M> {
                 self.cursor = Some(cursor.max(next));
                 Heard::Known
             }
+            // The peer's word is about an epoch that is over.
+            None if self.is_untold => Heard::Known,
             None => {
                 self.cursor = Some(next);
                 Heard::Resumed
@@ -222,7 +237,7 @@ impl<M> Sending<M> {
         self.epoch += 1;
         self.base = FIRST;
         (self.arrived, self.until) = (0, None);
-        self.cursor = Some(FIRST);
+        self.is_untold = true;
         Heard::Reset(lost)
     }
 

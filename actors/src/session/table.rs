@@ -76,6 +76,8 @@ fn sending() -> String {
     // Its first message has arrived: what is below its base can be told from what is not.
     let mut later = full.clone();
     later.heard(&ack(MEMORY, EPOCH, 2));
+    let mut anew = paused.clone();
+    anew.heard(&ack(MEMORY + 1, 0, 1));
     let states = [
         ("fresh", fresh),
         ("flowing", flowing),
@@ -84,6 +86,7 @@ fn sending() -> String {
         ("flowing, 1 arrived, 1 kept", later),
         ("paused, 2 kept", paused),
         ("resuming, 2 kept", resuming),
+        ("begun anew, untold", anew),
     ];
     rows(
         "Sending: state + input -> epoch, kept, to be written again, room: answer",
@@ -96,6 +99,14 @@ fn sending() -> String {
             ("Ack, knows no epoch", |half| format!("{:?}", half.heard(&ack(MEMORY, 0, 1)))),
             ("Ack, knows another epoch", |half| format!("{:?}", half.heard(&ack(MEMORY, EPOCH - 1, 5)))),
             ("Ack of another memory", |half| format!("{:?}", half.heard(&ack(MEMORY + 1, EPOCH, 1)))),
+            ("told of epoch 7", |half| {
+                half.told(EPOCH);
+                String::new()
+            }),
+            ("told of epoch 8", |half| {
+                half.told(EPOCH + 1);
+                String::new()
+            }),
             ("again", |half| format!("{:?}", half.again())),
             ("take_back", |half| {
                 half.take_back();

@@ -11,6 +11,8 @@ use crate::{
 /// One that is not said yet.
 struct Acknowledgement {
     number: u64,
+    /// That in which the peer's messages from here are counted.
+    epoch: u64,
     message: Message,
 }
 
@@ -38,9 +40,9 @@ impl Way {
 
     fn say_ack(&self, mut ack: Acknowledgement) {
         loop {
-            self.say(ack.message);
+            let is_of_now = self.outlet.acknowledge(ack.message, ack.epoch);
             // What another thread has made meanwhile may have been said before this one, which has taken its place then: in an outlet one waits.
-            if self.inbox().acks_made == ack.number {
+            if is_of_now && self.inbox().acks_made == ack.number {
                 return;
             }
             ack = self.next_ack();
@@ -59,6 +61,7 @@ impl Way {
         };
         Acknowledgement {
             number,
+            epoch,
             message: frame(self.ends.here, self.ends.node, Kind::GNCL_ACK, write(&ack)),
         }
     }
