@@ -2,32 +2,29 @@
 
 use std::time::Duration;
 
-/// A row of numbers: xorshift64*.
+/// A row of numbers.
 #[derive(Clone, Debug)]
-pub struct Dice(u64);
+pub struct Dice(fastrand::Rng);
 
 impl Dice {
     /// The row of this seed.
     #[must_use]
-    pub const fn new(seed: u64) -> Self {
-        Self(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1)
+    pub fn new(seed: u64) -> Self {
+        Self(fastrand::Rng::with_seed(seed))
     }
 
     /// The next number.
-    pub const fn roll(&mut self) -> u64 {
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        self.0.wrapping_mul(0x2545_F491_4F6C_DD1D)
+    pub fn roll(&mut self) -> u64 {
+        self.0.u64(..)
     }
 
     /// A number below `limit`, which is not zero.
-    pub const fn below(&mut self, limit: u32) -> u32 {
-        (self.roll() >> 32) as u32 % limit
+    pub fn below(&mut self, limit: u32) -> u32 {
+        self.0.u32(..limit)
     }
 
     /// Whether the one case of `cases` came.
-    pub const fn once_in(&mut self, cases: u32) -> bool {
+    pub fn once_in(&mut self, cases: u32) -> bool {
         self.below(cases) == 0
     }
 

@@ -85,7 +85,7 @@ impl Shared {
     }
 
     /// The chance of one way of a connection or a door.
-    pub(super) const fn dice(&self, number: u64, side: Side) -> Dice {
+    pub(super) fn dice(&self, number: u64, side: Side) -> Dice {
         Dice::new(self.seed ^ (number << 1 | side.index() as u64).wrapping_mul(0xD6E8_FEB8_6659_FD93))
     }
 }

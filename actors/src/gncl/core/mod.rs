@@ -205,7 +205,7 @@ pub(super) struct Core {
     peers: BTreeMap<NodeAddress, Acquaintance>,
     outputs: VecDeque<Output>,
     opened: u64,
-    chance: u64,
+    chance: fastrand::Rng,
     leaving: bool,
 }
 
@@ -218,7 +218,7 @@ impl Core {
             peers: BTreeMap::new(),
             outputs: VecDeque::new(),
             opened: 0,
-            chance: seed,
+            chance: fastrand::Rng::with_seed(seed),
             leaving: false,
         }
     }
@@ -319,12 +319,8 @@ impl Core {
         }
     }
 
-    /// The next number of a seeded sequence in `0.0..1.0` (SplitMix64; Steele, Lea, Flood 2014).
-    const fn chance(&mut self) -> f64 {
-        self.chance = self.chance.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.chance;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
+    /// The next number of a seeded sequence in `0.0..1.0`.
+    fn chance(&mut self) -> f64 {
+        self.chance.f64()
     }
 }

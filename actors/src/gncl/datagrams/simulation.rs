@@ -59,23 +59,19 @@ struct Network {
     jitter_us: u64,
 }
 
-struct Dice(u64);
+struct Dice(fastrand::Rng);
 
 impl Dice {
-    fn next(&mut self) -> u64 {
-        // SplitMix64 (Steele, Lea, Flood 2014).
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
+    fn new(seed: u64) -> Self {
+        Self(fastrand::Rng::with_seed(seed))
     }
 
     fn below(&mut self, bound: u64) -> u64 {
-        self.next() % bound.max(1)
+        self.0.u64(..bound.max(1))
     }
 
     fn happens(&mut self, chance: f64) -> bool {
-        (self.next() >> 11) as f64 / ((1u64 << 53) as f64) < chance
+        self.0.f64() < chance
     }
 }
 
@@ -119,7 +115,7 @@ impl World {
         sender.outgoing.planted = planted;
         receiver.incoming.planted = planted;
         Self {
-            dice: Dice(seed),
+            dice: Dice::new(seed),
             now,
             planted,
             network,
@@ -361,7 +357,7 @@ fn due(on_the_way: &mut Vec<(Time, Datagram)>, now: Time) -> Vec<Datagram> {
 
 /// Two seconds of up to six flows with everything that a seed thinks of, then quiet.
 fn play(seed: u64, planted: Planted) -> Result<World, String> {
-    let mut dice = Dice(seed ^ 0x5eed);
+    let mut dice = Dice::new(seed ^ 0x5eed);
     let network = Network {
         lost: [0.0, 0.01, 0.05, 0.3][dice.below(4) as usize],
         doubled: [0.0, 0.1][dice.below(2) as usize],

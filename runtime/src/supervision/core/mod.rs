@@ -81,7 +81,7 @@ impl Core {
     pub fn new(flags: Flags, seed: u64, children: Vec<(ChildId, Policy)>) -> Self {
         let mut core = Self {
             flags,
-            chance: Chance(seed),
+            chance: Chance::new(seed),
             children: Vec::new(),
             restarts: Window::default(),
             losses: Window::default(),
@@ -101,7 +101,7 @@ impl Core {
     /// before, which of those have not let go, and who was released since.
     #[must_use]
     pub fn renewed(&self, children: Vec<(ChildId, Policy)>) -> Self {
-        let mut core = Self::new(self.flags, self.chance.0, Vec::new());
+        let mut core = Self::new(self.flags, self.chance.seed(), Vec::new());
         core.last_generation = self.last_generation;
         core.abandoned.clone_from(&self.abandoned);
         core.take_in(children);

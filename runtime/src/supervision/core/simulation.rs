@@ -107,7 +107,7 @@ struct History {
 
 impl History {
     fn new(seed: u64) -> Self {
-        let mut chance = Chance(seed.wrapping_mul(0x2545_f491_4f6c_dd1d));
+        let mut chance = Chance::new(seed.wrapping_mul(0x2545_f491_4f6c_dd1d));
         let flags = any_flags(&mut chance);
         let count = chance.below(6);
         let children: Vec<_> = (0..count).map(|id| (ChildId(id), any_policy(&mut chance))).collect();

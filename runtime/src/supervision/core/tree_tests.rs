@@ -228,7 +228,7 @@ fn any_plan(chance: &mut Chance, next: &mut u64, floors: u64) -> Plan {
 #[test]
 fn any_history_of_any_tree_keeps_one_life_of_each_child_and_comes_to_an_end() {
     for seed in 0..20_000 {
-        let mut chance = Chance(seed);
+        let mut chance = Chance::new(seed);
         let mut next = 0;
         let mut tree = Tree::new(any_plan(&mut chance, &mut next, 2), seed);
         let mut world = World::default();

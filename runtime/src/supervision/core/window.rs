@@ -24,23 +24,29 @@ impl Window {
     }
 }
 
-/// Chance from a seed (splitmix64): the same seed gives the same numbers.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Chance(pub(super) u64);
+/// Chance from a seed: the same seed gives the same numbers.
+#[derive(Clone, Debug)]
+pub(super) struct Chance(fastrand::Rng);
 
 impl Chance {
-    pub(super) const fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut mixed = self.0;
-        mixed = (mixed ^ (mixed >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        mixed ^ (mixed >> 31)
+    pub(super) fn new(seed: u64) -> Self {
+        Self(fastrand::Rng::with_seed(seed))
+    }
+
+    /// From which the same numbers come as from here on.
+    pub(super) fn seed(&self) -> u64 {
+        self.0.get_seed()
+    }
+
+    #[cfg(test)]
+    pub(super) fn next(&mut self) -> u64 {
+        self.0.u64(..)
     }
 
     /// `wait`, shortened by up to a quarter of it: children that failed together do not come back together. Never
     /// lengthened, so that the longest wait stays what the policy says.
     pub(super) fn jitter(&mut self, wait: Duration) -> Duration {
-        let shorter_permille = u32::try_from(self.next() % 251).expect("a remainder below 251 fits");
+        let shorter_permille = self.0.u32(..=250);
         wait - wait * shorter_permille / 1_000
     }
 }

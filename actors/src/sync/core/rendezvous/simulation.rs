@@ -28,7 +28,7 @@ const SEEDS_VARIABLE: &str = "SINEW_SYNC_SEEDS";
 /// The one seed that is to be replayed.
 const SEED_VARIABLE: &str = "SINEW_SYNC_SEED";
 /// Seeds within which each planted fault must be found.
-const SEEDS_FOR_A_FAULT: u64 = 400;
+const SEEDS_FOR_A_FAULT: u64 = 1_000;
 /// Steps of one seed.
 const STEPS: u64 = 150;
 const APPS: usize = 2;
@@ -62,16 +62,16 @@ enum Fault {
     VisitsForgotten,
 }
 
-/// Chance from a seed (splitmix64).
-struct Chance(u64);
+/// Chance from a seed.
+struct Chance(fastrand::Rng);
 
 impl Chance {
+    fn new(seed: u64) -> Self {
+        Self(fastrand::Rng::with_seed(seed))
+    }
+
     fn below(&mut self, limit: usize) -> usize {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut mixed = self.0;
-        mixed = (mixed ^ (mixed >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((mixed ^ (mixed >> 31)) % limit as u64) as usize
+        self.0.usize(..limit)
     }
 
     fn once_in(&mut self, cases: usize) -> bool {
@@ -145,7 +145,7 @@ fn heard_generations(input: &Input) -> Vec<u64> {
 
 impl World {
     fn new(seed: u64, fault: Option<Fault>, trace: bool) -> Self {
-        let mut chance = Chance(seed);
+        let mut chance = Chance::new(seed);
         let nodes = 3 + chance.below(2);
         let mut world = Self {
             seed,
