@@ -52,11 +52,13 @@ pub enum Rejection {
     Unsupported,
     /// The destination's application has ended, is not ready again, and wants no message kept for it meanwhile.
     Away,
+    /// The access list of the destination's node does not let this source send this to it.
+    NotAllowed,
 }
 
 impl Rejection {
     /// All of them, in the order in which they are declared.
-    pub(crate) const ALL: [Self; 11] = [
+    pub(crate) const ALL: [Self; 12] = [
         Self::NoSuchApplication,
         Self::NoSuchNode,
         Self::UnknownKind,
@@ -68,6 +70,7 @@ impl Rejection {
         Self::ByHandler,
         Self::Unsupported,
         Self::Away,
+        Self::NotAllowed,
     ];
 }
 
@@ -89,6 +92,9 @@ impl fmt::Display for Rejection {
             Self::ByHandler => "the destination's handler refused it",
             Self::Unsupported => "this cannot be asked of this destination",
             Self::Away => "the destination's application is away: it ended and is not ready again",
+            Self::NotAllowed => {
+                "the access list of the destination's node does not allow it; `sinew why` names the rule"
+            }
         })
     }
 }

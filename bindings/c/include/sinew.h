@@ -287,6 +287,10 @@ enum sinew_outcome
      * Not handled: the application has ended and is not ready again.
      */
     SINEW_REJECTED_AWAY = 26,
+    /**
+     * Not handled: the access list of the destination's node does not allow it.
+     */
+    SINEW_REJECTED_NOT_ALLOWED = 27,
 };
 #ifndef __cplusplus
 #if __STDC_VERSION__ >= 202311L

@@ -43,6 +43,8 @@ pub enum Outcome {
     SinewRejectedUnsupported = 25,
     /// Not handled: the application has ended and is not ready again.
     SinewRejectedAway = 26,
+    /// Not handled: the access list of the destination's node does not allow it.
+    SinewRejectedNotAllowed = 27,
 }
 
 /// A text for a status: what it means in general. Never NULL. Any thread.
@@ -87,6 +89,7 @@ pub(crate) const fn code_of(outcome: sinew::Outcome) -> Outcome {
             Rejection::ByHandler => Outcome::SinewRejectedByHandler,
             Rejection::Unsupported => Outcome::SinewRejectedUnsupported,
             Rejection::Away => Outcome::SinewRejectedAway,
+            Rejection::NotAllowed => Outcome::SinewRejectedNotAllowed,
         },
     }
 }
@@ -117,6 +120,9 @@ pub(crate) const fn text_of(outcome: sinew::Outcome) -> &'static CStr {
         Outcome::SinewRejectedAway => {
             c"not handled: the destination's application has ended and is not ready again"
         }
+        Outcome::SinewRejectedNotAllowed => {
+            c"not handled: the access list of the destination's node does not allow it"
+        }
     }
 }
 
@@ -127,7 +133,7 @@ mod tests {
     #[test]
     fn every_outcome_has_the_number_that_it_has_on_the_wire() {
         let outcomes: Vec<_> = (0..=i32::from(u8::MAX)).filter_map(outcome_of).collect();
-        assert_eq!(outcomes.len(), 16);
+        assert_eq!(outcomes.len(), 17);
         for outcome in outcomes {
             assert_eq!(code_of(outcome) as i32, i32::from(outcome.code()), "{outcome:?}");
         }
