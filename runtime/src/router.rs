@@ -1,5 +1,6 @@
 //! Where messages go: the routing table of a node, read by senders without a lock.
 
+pub mod guard;
 pub mod tap;
 
 use std::{
@@ -13,12 +14,12 @@ use std::{
 
 use arc_swap::ArcSwap;
 
-use self::tap::Tap;
+use self::{guard::Guard, tap::Tap};
 use crate::{
     outcome::{Rejection, Ticket},
     post::lock,
     tid::{AppAddress, NodeAddress, Tid},
-    wire::{Flags, Kind, Message},
+    wire::{Flags, Header, Kind, Message},
 };
 
 /// A place that takes messages: a mailbox, a client's socket, the connection to a node.
@@ -78,10 +79,20 @@ pub struct LocalRoute {
 struct Table {
     /// Who watches; nobody, as a rule.
     tap: Option<Arc<dyn Tap>>,
+    /// Who decides what may reach this node's applications; nobody where everything may.
+    guard: Option<Arc<dyn Guard>>,
     local: BTreeMap<AppAddress, LocalRoute>,
     groups: BTreeMap<AppAddress, Vec<AppAddress>>,
     peers: BTreeMap<NodeAddress, Arc<dyn Outlet>>,
     remote_groups: BTreeMap<AppAddress, Vec<NodeAddress>>,
+}
+
+impl Table {
+    /// Whether what this header says may not reach the application of this node at `target`.
+    #[inline]
+    fn refuses(&self, target: AppAddress, header: &Header) -> bool {
+        guard::refuses(self.guard.as_ref(), target, header)
+    }
 }
 
 /// The routing table of a node. It is owned by the node, so that it outlives every layer.
@@ -163,8 +174,7 @@ impl Router {
         let table = self.table.load();
         let app = message.header.destination.app;
         let result = if message.header.destination.is_single() {
-            let outlet = table.local.get(&app).map(|route| &route.outlet);
-            submit_to(&table, outlet, message, Rejection::NoSuchApplication)
+            submit_here(&table, message)
         } else {
             self.fan_out(&table, app, &message);
             Ok(())
@@ -181,9 +191,12 @@ impl Router {
     pub fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
         let table = self.table.load();
         match table.local.get(&message.header.destination.app) {
-            Some(route) => {
-                tap::hand_over(table.tap.as_ref(), message, true, |message| route.outlet.offer(message, room))
-            }
+            Some(route) => tap::hand_over(table.tap.as_ref(), message, true, |message| {
+                if table.refuses(message.header.destination.app, &message.header) {
+                    return Err(Refused::new(message, Rejection::NotAllowed));
+                }
+                route.outlet.offer(message, room)
+            }),
             None => Err(Refused::new(message, Rejection::NoSuchApplication)),
         }
     }
@@ -246,12 +259,14 @@ impl Router {
     }
 
     fn send_to_one(table: &Table, here: NodeAddress, message: Message) -> Result<(), Refused> {
-        let Tid { node, app } = message.header.destination;
+        let Tid { node, .. } = message.header.destination;
         if node == here {
-            let route = table.local.get(&app).map(|route| &route.outlet);
-            submit_to(table, route, message, Rejection::NoSuchApplication)
+            submit_here(table, message)
         } else {
-            submit_to(table, table.peers.get(&node), message, Rejection::NoSuchNode)
+            tap::hand_over(table.tap.as_ref(), message, false, |message| match table.peers.get(&node) {
+                Some(peer) => peer.submit(message),
+                None => Err(Refused::new(message, Rejection::NoSuchNode)),
+            })
         }
     }
 
@@ -283,7 +298,11 @@ impl Router {
             if is_sender {
                 return false;
             }
-            let refused = outlet.submit(copy_of(message)).err().map(|refused| refused.why);
+            let refused = if table.refuses(member, &message.header) {
+                Some(Rejection::NotAllowed)
+            } else {
+                outlet.submit(copy_of(message)).err().map(|refused| refused.why)
+            };
             tap::saw_one_of_many(table.tap.as_ref(), Tid::new(here, member), message, refused);
             refused.is_none()
         };
@@ -347,6 +366,11 @@ impl Router {
         self.change(|table| table.tap = tap);
     }
 
+    /// Asks `guard` from now on what may reach the applications of this node.
+    pub fn set_guard(&self, guard: Arc<dyn Guard>) {
+        self.change(|table| table.guard = Some(guard));
+    }
+
     /// Groups that have a member on this node.
     #[must_use]
     pub fn groups(&self) -> Vec<AppAddress> {
@@ -382,15 +406,17 @@ impl Router {
     }
 }
 
-fn submit_to(
-    table: &Table,
-    outlet: Option<&Arc<dyn Outlet>>,
-    message: Message,
-    otherwise: Rejection,
-) -> Result<(), Refused> {
-    tap::hand_over(table.tap.as_ref(), message, false, |message| match outlet {
-        Some(outlet) => outlet.submit(message),
-        None => Err(Refused::new(message, otherwise)),
+/// Hands a message to the one application of this node that it is for, if it may reach it.
+fn submit_here(table: &Table, message: Message) -> Result<(), Refused> {
+    tap::hand_over(table.tap.as_ref(), message, false, |message| {
+        let target = message.header.destination.app;
+        match table.local.get(&target) {
+            Some(_) if table.refuses(target, &message.header) => {
+                Err(Refused::new(message, Rejection::NotAllowed))
+            }
+            Some(route) => route.outlet.submit(message),
+            None => Err(Refused::new(message, Rejection::NoSuchApplication)),
+        }
     })
 }
 
