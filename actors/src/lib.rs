@@ -30,6 +30,7 @@ extern crate self as sinew;
 // What the layers log stops nobody.
 use sinew_runtime::log;
 
+mod access;
 mod aftermath;
 pub mod api;
 pub mod audit;
@@ -62,6 +63,7 @@ mod wills;
 #[cfg(feature = "fault-points")]
 pub use sinew_runtime::supervision::fault;
 
+pub use access::{AccessError, AccessSummary};
 pub use api::{
     ApiError, AsyncEndpoint, Barrier, BarrierError, Endpoint, LentMessage, Meet, Meeting, NodeApi, Received,
     Registration, Transport, Untaken,

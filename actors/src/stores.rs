@@ -4,6 +4,8 @@ use std::{
     collections::BTreeMap,
     hash::{BuildHasher, RandomState},
     net::{SocketAddr, SocketAddrV4, UdpSocket},
+    os::unix::net::UnixListener,
+    path::Path,
     sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, atomic::AtomicBool},
     time::Duration,
 };
@@ -16,8 +18,8 @@ use sinew_runtime::{
 use tokio::sync::watch;
 
 use crate::{
-    aftermath::Aftermath, audit, config::NodeConfig, gncl, lncl, monitors, ndl, node, refusals::Refusals,
-    secured::Secured, sync, wills,
+    access::Access, aftermath::Aftermath, audit, config::NodeConfig, gncl, lncl, monitors, ndl, node,
+    refusals::Refusals, secured::Secured, sync, wills,
 };
 
 /// What the layers of one node share.
@@ -39,6 +41,8 @@ pub(crate) struct Stores {
     pub(crate) clocks: ClockOffsets,
     /// How peers prove who they are, and this node to them; not set: it is open. Set before any layer starts.
     pub(crate) secured: OnceLock<Secured>,
+    /// Who may send what to whom; not set: everybody everything. Set before any layer starts.
+    pub(crate) access: OnceLock<Arc<Access>>,
     /// Address of GNCL's listener, known once it listens; announced by NDL. A restarted GNCL binds it again.
     pub(crate) gncl_listen: OnceLock<SocketAddr>,
     /// Where GNCL listens besides; set with it.
@@ -95,6 +99,7 @@ impl Stores {
             },
             clocks: ClockOffsets::default(),
             secured: OnceLock::new(),
+            access: OnceLock::new(),
             gncl_listen: OnceLock::new(),
             gncl_further: OnceLock::new(),
             refusals: Arc::default(),
@@ -134,6 +139,22 @@ impl Stores {
     /// whoever caused it hears that it is done.
     pub(crate) fn directory_has_changed(&self) {
         self.directory_changes.send_modify(|count| *count += 1);
+    }
+
+    /// Opens the door for other processes at `path`, if it is not open already.
+    ///
+    /// # Errors
+    /// Why not, with what to do about it.
+    pub(crate) fn open_door(&self, path: &Path) -> Result<UnixListener, lncl::ListenError> {
+        let has_clients = self.access.get().is_some_and(|access| access.has_clients());
+        self.door.open(path, if has_clients { lncl::Openers::Everybody } else { lncl::Openers::Own })
+    }
+
+    /// Puts an access list in force, for all that is sent from now on.
+    pub(crate) fn guard(&self, access: Arc<Access>) {
+        self.router.set_guard(access.clone());
+        // There is one for each node, set once: whoever sets a second one keeps it for itself.
+        let _ = self.access.set(access);
     }
 
     /// The stores of a node that has only the layers that a test starts.

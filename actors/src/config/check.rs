@@ -71,7 +71,7 @@ pub(super) const APP_WINDOW: Range = range("supervision.app_window_ms", 1, 3_600
 
 impl Range {
     /// The fault that `found` is, where it is outside of this range.
-    pub(super) fn fault(&self, found: String) -> ConfigFault {
+    pub(crate) fn fault(&self, found: String) -> ConfigFault {
         let Self { key, low, high, unit } = self;
         let remedy = format!("set {key} to a number from {low} to {high}");
         fault(key, found, format!("{low} to {high} {unit}"), remedy)
@@ -90,7 +90,7 @@ impl Range {
     }
 }
 
-pub(super) fn fault(
+pub(crate) fn fault(
     key: &str,
     found: String,
     legal: impl Into<String>,
@@ -166,6 +166,11 @@ impl NodeConfig {
             let legal = format!("the path of a directory, 1 to {DIRECTORY_BYTES_MAX} bytes, or false");
             let remedy = "name the directory that `sinew keys` made for this node, as in /etc/sinew/keys";
             faults.push(fault("security.keys", quoted(&keys.to_string_lossy()), legal, remedy));
+        }
+        if let Some(access) = self.security.access.as_deref().filter(|access| !is_path(access)) {
+            let legal = format!("the path of a file, 1 to {DIRECTORY_BYTES_MAX} bytes, or false");
+            let remedy = "name the file that has the access list, as in /etc/sinew/access.toml";
+            faults.push(fault("security.access", quoted(&access.to_string_lossy()), legal, remedy));
         }
     }
 

@@ -31,12 +31,12 @@ impl ConfigFaults {
     }
 
     /// Good if there are no `faults`.
-    pub(super) fn check(faults: Vec<ConfigFault>) -> Result<(), Self> {
+    pub(crate) fn check(faults: Vec<ConfigFault>) -> Result<(), Self> {
         if faults.is_empty() { Ok(()) } else { Err(Self(faults)) }
     }
 
     /// A single fault.
-    pub(super) fn one(fault: ConfigFault) -> Self {
+    pub(crate) fn one(fault: ConfigFault) -> Self {
         Self(vec![fault])
     }
 
@@ -69,7 +69,7 @@ impl fmt::Display for ConfigFault {
 }
 
 /// `text` in quotes, without control characters and not longer than a line.
-pub(super) fn quoted(text: &str) -> String {
+pub(crate) fn quoted(text: &str) -> String {
     const SHOWN_MAX: usize = 80;
     let shown: String = text.chars().take(SHOWN_MAX).collect();
     let more = if shown.len() < text.len() { "..." } else { "" };

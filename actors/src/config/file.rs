@@ -29,7 +29,7 @@ const FILE_BYTES_MAX: u64 = 1 << 20;
 const SECTIONS: [&str; 7] = ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 44] = [
+pub(super) const KEYS: [&str; 45] = [
     "node.name",
     "node.project",
     "node.address",
@@ -74,6 +74,7 @@ pub(super) const KEYS: [&str; 44] = [
     "supervision.app_window_ms",
     "security.keys",
     "security.times",
+    "security.access",
 ];
 
 impl NodeConfig {
@@ -124,7 +125,7 @@ impl NodeConfig {
     }
 }
 
-fn read_bounded(path: &Path) -> Result<String, String> {
+pub(crate) fn read_bounded(path: &Path) -> Result<String, String> {
     let file = File::open(path).map_err(|error| error.to_string())?;
     let mut text = String::new();
     file.take(FILE_BYTES_MAX + 1).read_to_string(&mut text).map_err(|error| error.to_string())?;
@@ -134,20 +135,20 @@ fn read_bounded(path: &Path) -> Result<String, String> {
     Ok(text)
 }
 
-fn syntax_fault(text: &str, error: &toml::de::Error) -> ConfigFault {
+pub(crate) fn syntax_fault(text: &str, error: &toml::de::Error) -> ConfigFault {
     let line = error.span().map(|span| line_of(text, &span));
     let remedy = "correct this line; docs/CONFIGURATION.md has a complete file";
     ConfigFault { line, ..fault("syntax", error.message().to_owned(), "TOML (https://toml.io)", remedy) }
 }
 
 /// The line of `text` on which `span` begins, from 1.
-fn line_of(text: &str, span: &Span<usize>) -> usize {
+pub(crate) fn line_of(text: &str, span: &Span<usize>) -> usize {
     let before = text.as_bytes().get(..span.start).unwrap_or_default();
     1 + before.iter().filter(|byte| **byte == b'\n').count()
 }
 
 /// What stands at `span`, on one line and not longer than that.
-fn shown(text: &str, span: Span<usize>) -> String {
+pub(crate) fn shown(text: &str, span: Span<usize>) -> String {
     const SHOWN_MAX: usize = 80;
     let raw = text.get(span).unwrap_or_default();
     let line: String = raw.chars().map(|c| if c.is_control() { ' ' } else { c }).take(SHOWN_MAX).collect();
@@ -413,6 +414,7 @@ impl Reader<'_> {
         self.text_or_off("security.keys", "\"/etc/sinew/keys\" or false", &mut security.keys);
         let example = "\"until-set\", \"strict\" or \"ignored\"";
         self.text("security.times", example, &mut security.times);
+        self.text_or_off("security.access", "\"/etc/sinew/access.toml\" or false", &mut security.access);
     }
 
     fn read_list<T: FromStr>(

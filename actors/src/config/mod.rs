@@ -9,7 +9,10 @@ mod file;
 #[cfg(test)]
 mod tests;
 
+pub(crate) use check::fault;
+pub(crate) use faults::quoted;
 pub use faults::{ConfigFault, ConfigFaults};
+pub(crate) use file::{line_of, read_bounded, shown, syntax_fault};
 
 use std::{
     net::{Ipv4Addr, SocketAddr, SocketAddrV4},
@@ -200,7 +203,7 @@ pub struct SupervisionConfig {
     pub app_window: Duration,
 }
 
-/// Security between nodes: see [`security`](crate::security).
+/// Security: who other nodes are ([`security`](crate::security)), and who may send what to whom.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SecurityConfig {
     /// Directory of the node's keys, as `sinew keys` makes it ([`security::files`](crate::security::files)); 1 to 4,096 bytes. Default:
@@ -208,6 +211,9 @@ pub struct SecurityConfig {
     pub keys: Option<PathBuf>,
     /// What the times of certificates are good for while the clock may be wrong. Default [`TimePolicy::UntilSet`].
     pub times: TimePolicy,
+    /// File with the access list of the node: who may send what to whom; 1 to 4,096 bytes. It can be read again while the node runs; whether
+    /// there is one cannot be changed then. Default: none, everybody may send everything.
+    pub access: Option<PathBuf>,
 }
 
 impl SupervisionConfig {
@@ -287,7 +293,7 @@ impl NodeConfig {
                 app_restarts_max: 5,
                 app_window: Duration::from_secs(10),
             },
-            security: SecurityConfig { keys: None, times: TimePolicy::UntilSet },
+            security: SecurityConfig { keys: None, times: TimePolicy::UntilSet, access: None },
         }
     }
 

@@ -210,10 +210,15 @@ fn security_is_a_directory_or_off_and_a_policy_that_exists() {
         ("security.times", "'ignored'".to_owned(), true),
         ("security.times", "'never'".to_owned(), false),
         ("security.times", "false".to_owned(), false),
+        ("security.access", "false".to_owned(), true),
+        ("security.access", "true".to_owned(), false),
+        ("security.access", path(0), false),
+        ("security.access", path(4_096), true),
+        ("security.access", path(4_097), false),
     ];
     are_legal_or_not(cases);
     let config = NodeConfig::from_toml(&with("security.keys", "'/etc/keys'", "times = 'strict'")).unwrap();
-    let security = SecurityConfig { keys: Some("/etc/keys".into()), times: TimePolicy::Strict };
+    let security = SecurityConfig { keys: Some("/etc/keys".into()), times: TimePolicy::Strict, access: None };
     assert_eq!(config.security, security);
 }
 

@@ -1,5 +1,6 @@
 //! Real GNCL actors over loopback, and peers that are written by hand, as another language's would be.
 
+mod access;
 mod audits;
 mod bench;
 mod cancels;

@@ -41,7 +41,7 @@ impl Lncl {
         let Some(path) = self.server.stores.config.lncl.socket.clone() else { return };
         descriptors::make_room(&self.server.stores.config.lncl);
         let in_words = |cause| ListenError::System { doing: "watch", path: path.clone(), cause };
-        let opened = self.server.stores.door.open(&path);
+        let opened = self.server.stores.open_door(&path);
         let opened = opened.and_then(|listener| UnixListener::from_std(listener).map_err(in_words));
         let listener = opened.unwrap_or_else(|error| panic!("LNCL cannot start: {error}"));
         ctx.spawn(accept(self.server.clone(), listener).into_actor(self));

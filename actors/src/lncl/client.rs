@@ -41,6 +41,7 @@ use super::{
     strangers::Place,
 };
 use crate::{
+    access::Applicant,
     monitors::Cause,
     outlet::{LinkNumber, OutletLimits, StreamOutlet},
     ring::{Exchange, ExchangeError},
@@ -79,7 +80,8 @@ pub(super) async fn serve(
         }
     };
     let pid = credentials.pid().unwrap_or_default();
-    let peer = Peer { stream: stream.clone(), id, pid };
+    let who = Applicant { uid: credentials.uid(), gid: credentials.gid() };
+    let peer = Peer { stream: stream.clone(), id, pid, who };
     let mut client = match Client::register(server.clone(), peer, register) {
         Ok(client) => client,
         Err(why) => {
@@ -124,6 +126,8 @@ struct Peer {
     id: ClientId,
     /// As the kernel says; 0 where it does not.
     pid: i32,
+    /// As the kernel says.
+    who: Applicant,
 }
 
 impl Peer {
@@ -174,6 +178,11 @@ impl Client {
     fn register(server: Rc<Server>, peer: Peer, asked: Register) -> Result<Self, super::RegisterError> {
         let Register { name, address, requires, events, kinds, pid: _, direct, ring, former, waits } = asked;
         let any = former.map_or(Address::Dynamic, Address::Former);
+        if let Some(access) = server.stores.access.get() {
+            let own = rustix::process::geteuid().as_raw();
+            let allowed = access.may_register(own, peer.who, name.as_deref(), address);
+            allowed.map_err(|why| super::RegisterError::NotAllowed(why.to_string()))?;
+        }
         let address = address.map_or(any, Address::Fixed);
         let request = Request { address, name, requires: requires.clone(), kinds, owner: peer.owner() };
         let app = registrar::register_client(&server.stores, request)?;

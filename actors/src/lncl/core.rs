@@ -96,6 +96,9 @@ pub enum RegisterError {
     /// The address is not one that users may choose.
     #[error("address {0} is not one to choose: fixed addresses are 1000 to 7fffffff, hexadecimal")]
     NotFixed(AppAddress),
+    /// The node's access list does not let this user register so.
+    #[error("{0}")]
+    NotAllowed(String),
     /// Another application of the node has this address.
     #[error(
         "address {address} is taken by {holder} of {owner}; choose another address or end that one first"

@@ -17,7 +17,7 @@ use tokio::net::UnixStream;
 use super::{
     client::ClientOutlet,
     core::ClientId,
-    listener::{self, ListenError, SocketFile},
+    listener::{self, ListenError, Openers, SocketFile},
 };
 use crate::stores::lock;
 
@@ -36,16 +36,16 @@ struct Connection {
 }
 
 impl Door {
-    /// The socket that listens at `path`: the one that is open already, as it is when LNCL starts, if the path is still ours.
+    /// The socket that listens at `path`, for these users: the one that is open already, as it is when LNCL starts, if the path is still ours.
     ///
     /// # Errors
     /// Why not, with what to do about it.
-    pub(crate) fn open(&self, path: &Path) -> Result<UnixListener, ListenError> {
+    pub(crate) fn open(&self, path: &Path, openers: Openers) -> Result<UnixListener, ListenError> {
         let mut open = lock(&self.open);
         if open.as_ref().is_none_or(|(_, file)| !file.is_there()) {
             // A former life may have what somebody took the file of.
             open.take().iter().for_each(|(listener, _)| shut(listener));
-            *open = Some(listener::listen(path)?);
+            *open = Some(listener::listen(path, openers)?);
         }
         let (listener, _) = open.as_ref().expect("it was opened just now, if it was not");
         listener.try_clone().map_err(|cause| ListenError::System {

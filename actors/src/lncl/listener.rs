@@ -21,8 +21,24 @@ use socket2::{Domain, SockAddr, Socket, Type};
 
 /// Longest path in bytes; the system's limit is 107, and another platform's less.
 const PATH_MAX: usize = 100;
-/// The owner and the group may open it. Of those who do, the node's own user and root are served, nobody else. spec: LNCL-2
-const SOCKET_MODE: u32 = 0o660;
+/// Who may open the socket. Of those who do, only whom the node admits is served. spec: LNCL-2
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Openers {
+    /// The node's user and its group.
+    Own,
+    /// Every user of the host: the access list admits some of them.
+    Everybody,
+}
+
+impl Openers {
+    const fn mode(self) -> u32 {
+        match self {
+            Self::Own => 0o660,
+            Self::Everybody => 0o666,
+        }
+    }
+}
+
 const DIRECTORY_MODE: u32 = 0o750;
 /// Connections that wait to be accepted; one that comes after that waits in its `connect`.
 const BACKLOG: i32 = 1_024;
@@ -77,7 +93,7 @@ impl Drop for SocketFile {
 ///
 /// # Errors
 /// Why not, with what to do about it.
-pub(crate) fn listen(path: &Path) -> Result<(UnixListener, SocketFile), ListenError> {
+pub(crate) fn listen(path: &Path, openers: Openers) -> Result<(UnixListener, SocketFile), ListenError> {
     if path.as_os_str().len() > PATH_MAX {
         return Err(ListenError::TooLong(path.to_owned()));
     }
@@ -91,7 +107,7 @@ pub(crate) fn listen(path: &Path) -> Result<(UnixListener, SocketFile), ListenEr
     // Held while we look and bind: two nodes that start at once must not both find a dead file and replace it.
     let _turn = take_turn(directory, path)?;
     remove_if_dead(path)?;
-    let listener = bind(path)?;
+    let listener = bind(path, openers)?;
     let identity = identity_of(path).map_err(system("look at", path))?;
     Ok((listener, SocketFile { path: path.to_owned(), identity }))
 }
@@ -137,14 +153,14 @@ fn probe(path: &Path) -> io::Result<()> {
     socket.connect(&SockAddr::unix(path)?)
 }
 
-fn bind(path: &Path) -> Result<UnixListener, ListenError> {
+fn bind(path: &Path, openers: Openers) -> Result<UnixListener, ListenError> {
     let socket = Socket::new(Domain::UNIX, Type::STREAM, None).map_err(system("make a socket for", path))?;
     let address = SockAddr::unix(path).map_err(system("bind", path))?;
     socket.bind(&address).map_err(system("bind", path))?;
     // A connection inherits it. Where the system does not know it (Linux before 6.16), whoever reads looks first.
     let _ = sinew_shm::set_descriptors(&socket, Descriptors::Refused);
     // Before it listens, so that nobody connects under wider permissions.
-    fs::set_permissions(path, Permissions::from_mode(SOCKET_MODE))
+    fs::set_permissions(path, Permissions::from_mode(openers.mode()))
         .map_err(system("set permissions of", path))?;
     socket.listen(BACKLOG).map_err(system("listen at", path))?;
     socket.set_nonblocking(true).map_err(system("listen at", path))?;
@@ -168,9 +184,9 @@ mod tests {
     fn a_socket_file_has_narrow_permissions_and_goes_with_its_owner() {
         let directory = TestDirectory::new();
         let path = directory.path().join("made/node.sock");
-        let (_listener, file) = listen(&path).unwrap();
+        let (_listener, file) = listen(&path, Openers::Own).unwrap();
         let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode() & 0o777;
-        assert_eq!(mode(&path), SOCKET_MODE);
+        assert_eq!(mode(&path), 0o660);
         assert_eq!(mode(path.parent().unwrap()) & !DIRECTORY_MODE, 0);
         drop(file);
         assert!(!path.exists());
@@ -180,19 +196,19 @@ mod tests {
     fn a_file_that_a_killed_node_left_is_replaced() {
         let directory = TestDirectory::new();
         let path = directory.path().join("node.sock");
-        let (listener, file) = listen(&path).unwrap();
+        let (listener, file) = listen(&path, Openers::Own).unwrap();
         std::mem::forget(file);
         drop(listener);
         assert!(path.exists());
-        listen(&path).unwrap();
+        listen(&path, Openers::Own).unwrap();
     }
 
     #[test]
     fn the_place_of_a_living_node_is_not_taken() {
         let directory = TestDirectory::new();
         let path = directory.path().join("node.sock");
-        let (_listener, _file) = listen(&path).unwrap();
-        let refusal = listen(&path).unwrap_err();
+        let (_listener, _file) = listen(&path, Openers::Own).unwrap();
+        let refusal = listen(&path, Openers::Own).unwrap_err();
         assert!(refusal.to_string().contains("another node listens"), "{refusal}");
         assert!(path.exists(), "the living node keeps its file");
     }
@@ -205,7 +221,7 @@ mod tests {
         thread::scope(|scope| {
             let nodes: Vec<_> = (0..4)
                 .map(|node| directory.path().join(format!("{node}.sock")))
-                .map(|path| scope.spawn(move || listen(&path).map(|(_, file)| file.is_there())))
+                .map(|path| scope.spawn(move || listen(&path, Openers::Own).map(|(_, file)| file.is_there())))
                 .collect();
             thread::sleep(20 * TURN_LOOK);
             drop(turn);
@@ -220,7 +236,7 @@ mod tests {
         let directory = TestDirectory::new();
         let path = directory.path().join("notes.txt");
         fs::write(&path, "precious").unwrap();
-        assert!(matches!(listen(&path), Err(ListenError::NotASocket(_))));
+        assert!(matches!(listen(&path, Openers::Own), Err(ListenError::NotASocket(_))));
         assert_eq!(fs::read_to_string(&path).unwrap(), "precious");
     }
 
@@ -228,16 +244,16 @@ mod tests {
     fn a_successors_file_is_not_removed() {
         let directory = TestDirectory::new();
         let path = directory.path().join("node.sock");
-        let (_first_listener, first) = listen(&path).unwrap();
+        let (_first_listener, first) = listen(&path, Openers::Own).unwrap();
         fs::remove_file(&path).unwrap();
-        let (_second_listener, _second) = listen(&path).unwrap();
+        let (_second_listener, _second) = listen(&path, Openers::Own).unwrap();
         drop(first);
         assert!(path.exists());
     }
 
     #[test]
     fn a_path_that_is_too_long_is_refused_in_words() {
-        let refusal = listen(Path::new(&format!("/tmp/{}", "x".repeat(200)))).unwrap_err();
+        let refusal = listen(Path::new(&format!("/tmp/{}", "x".repeat(200))), Openers::Own).unwrap_err();
         assert!(refusal.to_string().contains("lncl.socket"));
     }
 }

@@ -51,6 +51,7 @@ pub use core::RegisterError;
 pub(crate) use core::{ClientId, Registry};
 pub(crate) use door::Door;
 pub(crate) use facts::AppFact;
+pub(crate) use listener::{ListenError, Openers};
 pub(crate) use reader::Reader;
 pub(crate) use registrar::{
     LocalApp, app_down, app_ready, app_stopped, register_local, resolve, set_member, unregister_local,

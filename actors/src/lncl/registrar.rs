@@ -52,6 +52,7 @@ pub(crate) fn register_local(stores: &Stores, app: LocalApp) -> Result<Tid, Regi
     let mut registry = lock(&stores.registry);
     let fact_requires = request.requires.clone();
     let app = registry.register(request, limits(stores))?;
+    named(stores, app, name.as_deref());
     let handled = events.to_vec();
     stores.router.set_local(app, LocalRoute { outlet, events });
     monitors::note(stores, monitors::Input::Began { app });
@@ -110,10 +111,18 @@ pub(super) fn register_client(stores: &Stores, request: Request) -> Result<AppAd
     let handled = request.kinds.iter().map(|name| Kind::named(name)).collect();
     let mut registry = lock(&stores.registry);
     let app = registry.register(request, limits(stores))?;
+    named(stores, app, name.as_deref());
     monitors::note(stores, monitors::Input::Began { app });
     tell_sync(stores, AppFact::Registered { app, name, requires });
     tell_handled(stores, app, handled);
     Ok(app)
+}
+
+/// The access list has rules about names: it knows one before whoever has it can send or get anything.
+fn named(stores: &Stores, app: AppAddress, name: Option<&str>) {
+    if let Some(access) = stores.access.get() {
+        access.named(app, name);
+    }
 }
 
 fn tell_handled(stores: &Stores, app: AppAddress, kinds: Vec<Kind>) {
@@ -151,6 +160,9 @@ fn forget(stores: &Stores, app: AppAddress, cause: Cause) {
     // Told first: afterwards nobody knows any more what it subscribed to.
     tell(stores, AppFact::Unregistered { app });
     stores.router.remove_local(app);
+    if let Some(access) = stores.access.get() {
+        access.gone(app);
+    }
 }
 
 /// Tells the sync manager, and NDL where the application wants to know who is there.

@@ -30,6 +30,7 @@ use super::{
     strangers::{Bounds, NoPlace, Place, Strangers},
 };
 use crate::{
+    access::Applicant,
     refusals::Refusals,
     stores::{Stores, lock},
 };
@@ -186,7 +187,7 @@ fn report(ended: Result<(), JoinError>) {
 fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) {
     let connected = Connected { server: server.clone(), stream: Arc::new(stream) };
     let stream = connected.stream.clone();
-    let credentials = match check_credentials(&stream) {
+    let credentials = match check_credentials(&server.stores, &stream) {
         Ok(credentials) => credentials,
         Err(why) => return refuse(server, &stream, "credentials", &why),
     };
@@ -225,9 +226,13 @@ fn place_for(server: &Server, credentials: UCred) -> Result<Place, NoPlace> {
     server.strangers.admit(credentials.pid().unwrap_or_default(), bounds)
 }
 
-fn check_credentials(stream: &UnixStream) -> Result<UCred, String> {
+fn check_credentials(stores: &Stores, stream: &UnixStream) -> Result<UCred, String> {
     let credentials = stream.peer_cred().map_err(|cause: io::Error| format!("who are you? {cause}"))?;
     let own = rustix::process::geteuid().as_raw();
+    if let Some(access) = stores.access.get() {
+        let who = Applicant { uid: credentials.uid(), gid: credentials.gid() };
+        return access.admit(own, who).map(|()| credentials).map_err(|why| why.to_string());
+    }
     if admits(own, credentials.uid()) {
         return Ok(credentials);
     }
@@ -237,7 +242,7 @@ fn check_credentials(stream: &UnixStream) -> Result<UCred, String> {
     ))
 }
 
-/// spec: LNCL-2: the user that the node runs as, and root.
+/// spec: LNCL-2: the user that the node runs as, and root, where no access list says more.
 const fn admits(own: u32, theirs: u32) -> bool {
     theirs == own || theirs == 0
 }

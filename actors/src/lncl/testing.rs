@@ -34,7 +34,7 @@ use super::{
     AppFact, Event, Lncl,
     payload::{self, Refusal, Register, Registered},
 };
-use crate::{NodeConfig, stores::Stores, sync};
+use crate::{NodeConfig, access::Access, stores::Stores, sync};
 
 /// How long a test waits for what must come; it fails then with what it waited for.
 pub(crate) const WATCHDOG: Duration = Duration::from_secs(10);
@@ -97,7 +97,20 @@ impl TestNode {
         let mut config = NodeConfig::new("test");
         config.lncl.socket = Some(directory.path().join("node.sock"));
         change(&mut config);
+        Self::begin(Stores::for_test(config, Incarnation(1)), directory)
+    }
+
+    /// One with this access list.
+    pub(crate) fn start_guarded(access: &str) -> Self {
+        let directory = TestDirectory::new();
+        let mut config = NodeConfig::new("test");
+        config.lncl.socket = Some(directory.path().join("node.sock"));
         let stores = Stores::for_test(config, Incarnation(1));
+        Access::in_test(&stores, access);
+        Self::begin(stores, directory)
+    }
+
+    fn begin(stores: Arc<Stores>, directory: TestDirectory) -> Self {
         let facts = stores.posts.sync.attach();
         let (stop, thread) = live(&stores);
         Self { stores, facts, stop: Some(stop), thread: Some(thread), directory }

@@ -1,5 +1,6 @@
 //! A real door, with clients spoken by hand: what a client in another language meets.
 
+mod access;
 mod documented;
 mod forks;
 mod lingering;

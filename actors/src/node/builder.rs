@@ -1,8 +1,9 @@
 //! Declares a node and starts it.
 
 use std::{
+    path::PathBuf,
     process::ExitCode,
-    sync::mpsc::sync_channel,
+    sync::{Arc, mpsc::sync_channel},
     time::{Duration, SystemTime},
 };
 
@@ -18,6 +19,7 @@ use super::{
     supervisor_spec::SupervisorSpec,
 };
 use crate::{
+    access::{self, Access, AccessSummary, List},
     config::{ConfigFaults, NodeConfig},
     inspect, log, process,
     secured::{KeyFault, Secured},
@@ -65,6 +67,14 @@ pub enum StartError {
     /// The configuration turns security on, and the node's keys cannot be used. Nothing was started.
     #[error("security.keys is set, and the node does not start without them:\n{0}")]
     Keys(#[from] KeyFault),
+    /// The configuration names an access list, and it cannot be used. Nothing was started.
+    #[error("security.access is set, and the node does not start without the list in {path:?}:\n{faults}")]
+    Access {
+        /// The file.
+        path: PathBuf,
+        /// All that is wrong with it.
+        faults: ConfigFaults,
+    },
     /// A layer did not become ready.
     #[error("the layers did not start: {0}")]
     Layers(String),
@@ -239,9 +249,11 @@ impl NodeBuilder {
         let patience = self.config.sync.layer_deadline * 4;
         let incarnation = self.incarnation.unwrap_or_else(wall_clock);
         let secured = if is_bystander { None } else { Secured::load(&self.config, incarnation)? };
+        let list = if is_bystander { None } else { access_list(&self.config)? };
         let stores = Stores::new(self.config, incarnation);
         if !is_bystander {
             secure(&stores, secured);
+            guard(&stores, list);
         }
         #[cfg(feature = "fault-points")]
         super::faults::keep(&stores, &planned)?;
@@ -278,7 +290,7 @@ impl NodeBuilder {
 /// Opens the door for other processes, if there is to be one. LNCL serves it later.
 fn open_door(stores: &Stores) -> Result<(), StartError> {
     let Some(path) = &stores.config.lncl.socket else { return Ok(()) };
-    stores.door.open(path).map(drop).map_err(|why| StartError::Door(why.to_string()))
+    stores.open_door(path).map(drop).map_err(|why| StartError::Door(why.to_string()))
 }
 
 /// A number that grows from one start of a host's node to the next, as long as the host's clock does not go back.
@@ -299,6 +311,30 @@ fn secure(stores: &Stores, secured: Option<Secured>) {
              `sinew keys init`, and set security.keys on all nodes"
         ),
     }
+}
+
+fn access_list(config: &NodeConfig) -> Result<Option<(PathBuf, List)>, StartError> {
+    let Some(path) = config.security.access.clone() else { return Ok(None) };
+    match access::read(&path) {
+        Ok(list) => Ok(Some((path, list))),
+        Err(faults) => Err(StartError::Access { path, faults }),
+    }
+}
+
+/// Puts the access list in force. One that believes what anybody on the network says of himself is told of loudly.
+fn guard(stores: &Stores, list: Option<(PathBuf, List)>) {
+    let Some((path, list)) = list else { return };
+    let access = Access::new(stores.node, path.clone(), list, stores.refusals.clone());
+    let AccessSummary { rules, clients } = access.summary();
+    log::info!(?path, rules, clients, "an access list is in force: what no rule allows is refused");
+    if stores.secured.get().is_none() {
+        log::warn!(
+            ?path,
+            "the access list keeps out MISTAKES ONLY: without keys anybody who reaches this node can pose as any node and any application \
+             of it. Make keys with `sinew keys init`, and set security.keys on all nodes"
+        );
+    }
+    stores.guard(Arc::new(access));
 }
 
 /// Refuses a program that no supervisor can help, unless its owner wants it so.

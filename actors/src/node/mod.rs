@@ -55,6 +55,7 @@ use sinew_runtime::{
 };
 
 use crate::{
+    access::{AccessError, AccessSummary},
     gncl::Peer,
     log,
     ndl::KnownNode,
@@ -281,6 +282,23 @@ impl NodeHandle {
     pub fn refused(&self) -> u64 {
         let Stores { refusals, gncl, router, ndl, .. } = &*self.stores;
         refusals.total() + gncl.refusals.total() + lock(ndl).refusals().total() + router.refused()
+    }
+
+    /// Reads the node's access list again and puts it in force: for every message that is delivered from now on, for every application of
+    /// another process that registers from now on. What has reached an application's mailbox, and who is registered, stays.
+    ///
+    /// # Errors
+    /// The node was started without a list, or the file cannot be used: the list in force stays, which is logged too.
+    pub fn reload_access(&self) -> Result<AccessSummary, AccessError> {
+        let access = self.stores.access.get().ok_or(AccessError::None)?;
+        let read = access.reload();
+        match &read {
+            Ok(AccessSummary { rules, clients }) => {
+                log::info!(rules, clients, "another access list is in force")
+            }
+            Err(why) => log::error!(%why, "the access list was not replaced"),
+        }
+        read
     }
 
     /// Tells the node to stop; returns at once.

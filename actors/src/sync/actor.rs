@@ -17,7 +17,7 @@ use sinew_runtime::{
 
 use super::{
     Event,
-    core::{Core, Input, Output, Reason},
+    core::{Core, Input, Named, Output, Reason},
     facts::DirectoryEvent,
     words::{ArriveAtBarrier, BarrierAnswer, LeaveBarrier},
 };
@@ -118,7 +118,9 @@ impl SyncManager {
     fn handle(&mut self, input: Input, ctx: &mut Context<Self>) {
         {
             let mut core = self.core();
+            let named = input.may_name();
             core.handle(Time::now(), input);
+            self.tell_access(&core, named);
             // Counted before anybody can see it: who is told of a name by whoever saw it first must find that it has changed.
             self.stores.directory_has_changed();
         }
@@ -128,6 +130,16 @@ impl SyncManager {
             self.carry_out(output);
         }
         self.set_alarm(ctx);
+    }
+
+    /// Has the access list know who is called how elsewhere, before anybody is told of them: what they send is judged by these names.
+    fn tell_access(&self, core: &Core, named: Named) {
+        let Some(access) = self.stores.access.get() else { return };
+        match named {
+            Named::Nobody => {}
+            Named::By(node) => access.named_elsewhere(Some(node), core.names_elsewhere(Some(node))),
+            Named::Anybody => access.named_elsewhere(None, core.names_elsewhere(None)),
+        }
     }
 
     /// Takes a peer's list; anything else that is sent here is refused.

@@ -15,6 +15,7 @@ use super::{
     classes::of_class,
 };
 use crate::{
+    access::Access,
     gncl::{
         LinkFact,
         core::{Introduction, Lane, write},
@@ -253,6 +254,27 @@ fn bytes_of_strangers_and_what_is_malformed_are_dropped_and_counted_and_do_no_ha
         mate.send_value(node.tid(1), 3).await;
         assert_eq!(next("a value", &mut inbox).await.payload[..], 3_u64.to_le_bytes());
         assert_eq!(node.stores.gncl.refusals.of("datagram with another key"), 1);
+    });
+}
+
+#[test]
+fn a_value_that_the_access_list_does_not_allow_is_refused_whichever_way_it_comes() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let rules = "[[rule]]\nfrom = ['*']\nto = ['*']\nclasses = ['control']\n";
+        let access = Access::in_test(&node.stores, rules);
+        let mate = Mate::open_to(&mut node).await;
+        let mut inbox = node.app(1);
+        mate.send_value(node.tid(1), 1).await;
+        within("it to be refused", async {
+            while node.stores.refusals.of("access list") == 0 {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        access.replace_in_test("[[rule]]\nfrom = ['0.0.0.9']\nto = ['*']\nclasses = ['stream']\n");
+        mate.send_value(node.tid(1), 2).await;
+        assert_eq!(next("what is allowed", &mut inbox).await.payload[..], 2_u64.to_le_bytes());
     });
 }
 

@@ -87,6 +87,11 @@ impl Client {
     }
 
     fn introduce(&self, to: Tid, correlation: u64) {
+        // What goes over a direct link nobody can check, nor stop when the list changes. spec: LNCL-10
+        if self.server.stores.access.get().is_some() {
+            let to = self.server.stores.router.absolute(to);
+            return self.tell(to, correlation, Outcome::Rejected(Rejection::Unsupported));
+        }
         let number = lock(&self.server.stores.registry).new_link();
         let to = self.server.stores.router.absolute(to);
         let introductions = &self.server.introductions;

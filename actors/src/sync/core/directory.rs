@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use sinew_runtime::{
-    tid::{AppAddress, Tid},
+    tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     wire::Kind,
 };
@@ -113,7 +113,46 @@ impl Input {
     }
 }
 
+/// Whose names an input may change.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::sync) enum Named {
+    Nobody,
+    By(NodeAddress),
+    Anybody,
+}
+
+impl Input {
+    /// Whose names elsewhere this may change.
+    pub(in crate::sync) const fn may_name(&self) -> Named {
+        match self {
+            Self::ListReceived { from, .. } => Named::By(*from),
+            // One may be forgotten for another.
+            Self::LinkChanged(_) | Self::MembershipChanged(_) => Named::Anybody,
+            Self::AppChanged(_)
+            | Self::GroupsChanged(_)
+            | Self::Arrived { .. }
+            | Self::Left { .. }
+            | Self::AnswerNotTaken { .. }
+            | Self::ArrivalsReceived { .. }
+            | Self::ArrivalsNotTaken { .. }
+            | Self::DirectoryWanted { .. }
+            | Self::DirectoryNotTaken { .. }
+            | Self::ReleaseNotTaken { .. }
+            | Self::EventNotTaken { .. }
+            | Self::TimePassed => Named::Nobody,
+        }
+    }
+}
+
 impl Core {
+    /// Who is called how on other nodes, or on this one of them, as they have said last.
+    pub(in crate::sync) fn names_elsewhere(
+        &self,
+        node: Option<NodeAddress>,
+    ) -> impl Iterator<Item = (Tid, &str)> {
+        self.peers.said_names(node)
+    }
+
     /// Tells everybody who wants to hear of it what has changed in the directory. spec: SYNC-14
     pub(super) fn tell_watchers(&mut self, now: Time) {
         if !self.watchers.are_due(now) {

@@ -36,6 +36,7 @@ use sinew_runtime::{
     time::Time,
 };
 
+pub(in crate::sync) use self::directory::Named;
 pub(crate) use self::reason::Reason;
 use self::{
     answers::Untaken,

@@ -293,6 +293,16 @@ impl Peers {
         })
     }
 
+    /// Every name that a node, or this one, has given itself, also of those that are lost or have not said yet who is in their new life: what they sent
+    /// before still comes, their last wills among it.
+    pub(super) fn said_names(&self, of: Option<NodeAddress>) -> impl Iterator<Item = (Tid, &str)> {
+        let range = of.map_or(NodeAddress::HERE..=NodeAddress::ALL, |node| node..=node);
+        let lists = self.nodes.range(range).filter_map(|(node, peer)| Some((*node, peer.list.as_ref()?)));
+        lists.flat_map(|(node, list)| {
+            list.entries.values().map(move |entry| (Tid::new(node, entry.app), &*entry.name))
+        })
+    }
+
     /// The names in the list of `node`.
     pub(super) fn names_of(&self, node: NodeAddress) -> Vec<Name> {
         let list = self.nodes.get(&node).and_then(|peer| peer.list.as_ref());

@@ -1,0 +1,248 @@
+//! Reads a list from TOML: every fault at once, each with its line, what is legal and what to do.
+
+use std::path::Path;
+
+use sinew_runtime::{tid::AppAddress, wire::Class};
+use toml::{
+    Spanned,
+    de::{DeTable, DeValue},
+};
+
+use super::{
+    client::{CLIENTS_MAX, ClientRule},
+    rule::{Action, Classes, List, RULES_MAX, Rule, TEXTS_MAX},
+    who::{self, Who},
+};
+use crate::config::{ConfigFault, ConfigFaults, fault, line_of, quoted, read_bounded, shown, syntax_fault};
+
+/// Keys of a `[[rule]]` and of a `[[client]]`.
+const RULE_KEYS: [&str; 6] = ["name", "from", "to", "groups", "classes", "action"];
+const CLIENT_KEYS: [&str; 4] = ["uid", "gid", "names", "addresses"];
+/// Longest name of a rule in bytes.
+const RULE_NAME_MAX: usize = 63;
+
+/// The list in the file at `path`, of at most 1 MiB.
+///
+/// # Errors
+/// All that is wrong with it. A file that cannot be read is one fault.
+pub(crate) fn read(path: &Path) -> Result<List, ConfigFaults> {
+    let text = read_bounded(path).map_err(|found| {
+        let legal = "a text file of at most 1 MiB that this user may read";
+        let remedy = "check security.access, the path and its permissions";
+        ConfigFaults::one(fault(&path.display().to_string(), found, legal, remedy))
+    })?;
+    parse(&text)
+}
+
+/// The list that `text` is.
+///
+/// # Errors
+/// All that is wrong with it.
+pub(super) fn parse(text: &str) -> Result<List, ConfigFaults> {
+    let table = DeTable::parse(text).map_err(|error| ConfigFaults::one(syntax_fault(text, &error)))?;
+    let mut reader = Reader { text, faults: Vec::new() };
+    let mut list = List::default();
+    for (name, value) in table.get_ref() {
+        match &**name.get_ref() {
+            "rule" => list.rules = reader.tables(value, ("rule", RULES_MAX), Reader::rule),
+            "client" => list.clients = reader.tables(value, ("client", CLIENTS_MAX), Reader::client),
+            other => {
+                let found = "a key that does not exist".to_owned();
+                let remedy = "write [[rule]] or [[client]] and their keys below";
+                reader.add(other, name, Some(found), "[[rule]] and [[client]]", remedy);
+            }
+        }
+    }
+    reader.faults.sort_by_key(|fault| fault.line);
+    ConfigFaults::check(reader.faults)?;
+    Ok(list)
+}
+
+/// A text, and what is wrong with it so far.
+struct Reader<'t> {
+    text: &'t str,
+    faults: Vec<ConfigFault>,
+}
+
+type Value<'t> = Spanned<DeValue<'t>>;
+type Table<'t> = DeTable<'t>;
+
+impl<'t> Reader<'t> {
+    fn add<S>(&mut self, key: &str, place: &Spanned<S>, found: Option<String>, legal: &str, remedy: &str) {
+        let found = found.unwrap_or_else(|| shown(self.text, place.span()));
+        let line = Some(line_of(self.text, &place.span()));
+        let key = quoted(key).trim_matches('"').to_owned();
+        self.faults.push(ConfigFault { line, ..fault(&key, found, legal, remedy) });
+    }
+
+    /// The tables of an array, each read by `one`, which says itself what is wrong with it.
+    fn tables<T>(
+        &mut self,
+        value: &Value<'t>,
+        (key, max): (&'static str, usize),
+        one: fn(&mut Self, &Value<'t>, &Table<'t>) -> Option<T>,
+    ) -> Vec<T> {
+        let legal = format!("at most {max} tables, each with [[{key}]] above it");
+        let remedy = format!("write [[{key}]] on a line of its own and its keys below");
+        let Some(tables) = value.get_ref().as_array() else {
+            self.add(key, value, None, &legal, &remedy);
+            return Vec::new();
+        };
+        if tables.len() > max {
+            self.add(key, value, Some(format!("{} of them", tables.len())), &legal, "put several into one");
+        }
+        let mut read = Vec::new();
+        for table in tables.iter().take(max) {
+            match table.get_ref().as_table() {
+                Some(keys) => read.extend(one(self, table, keys)),
+                None => self.add(key, table, None, &legal, &remedy),
+            }
+        }
+        read
+    }
+
+    fn rule(&mut self, place: &Value<'t>, table: &Table<'t>) -> Option<Rule> {
+        self.know_all(table, "rule", &RULE_KEYS);
+        let name = self.optional(table, "rule.name", |value| {
+            let name = value.as_str().filter(|name| (1..=RULE_NAME_MAX).contains(&name.len()))?;
+            (!name.contains(char::is_control)).then(|| name.to_owned())
+        });
+        let action = self.optional(table, "rule.action", |value| match value.as_str()? {
+            "allow" => Some(Action::Allow),
+            "refuse" => Some(Action::Refuse),
+            _ => None,
+        });
+        let from = self.texts(table, "rule.from", who::LEGAL, Who::parse);
+        let to = self.texts(table, "rule.to", who::LEGAL, Who::parse);
+        let groups = self.texts(table, "rule.groups", GROUP_LEGAL, group);
+        let classes = self.texts(table, "rule.classes", CLASS_LEGAL, class);
+        if from.is_none() {
+            let remedy = "say from whom, or from = [\"*\"] for everybody";
+            self.add("rule.from", place, Some("nothing".to_owned()), who::LEGAL, remedy);
+        }
+        if to.is_none() && groups.is_none() {
+            let remedy = "say to whom: to = [\"*\"] for every application, or groups";
+            self.add("rule.to", place, Some("nothing".to_owned()), who::LEGAL, remedy);
+        }
+        Some(Rule {
+            name,
+            line: line_of(self.text, &place.span()),
+            action: action.unwrap_or(Action::Allow),
+            from: from?,
+            to: to.unwrap_or_default(),
+            groups: groups.unwrap_or_default(),
+            classes: classes.map_or(Classes::ALL, Classes::of),
+        })
+    }
+
+    fn client(&mut self, place: &Value<'t>, table: &Table<'t>) -> Option<ClientRule> {
+        self.know_all(table, "client", &CLIENT_KEYS);
+        let number = |value: &DeValue<'t>| {
+            let number = value.as_integer()?;
+            u32::from_str_radix(number.as_str(), number.radix()).ok()
+        };
+        let uid = self.optional(table, "client.uid", number);
+        let gid = self.optional(table, "client.gid", number);
+        if !table.contains_key("uid") && !table.contains_key("gid") {
+            let legal = "the number of a user (uid) or of a group (gid), or both";
+            self.add(
+                "client.uid",
+                place,
+                Some("neither".to_owned()),
+                legal,
+                "say whom it is about (see `id`)",
+            );
+        }
+        let legal = "names of 1 to 63 bytes; `*` stands for any text";
+        let names = self.texts(table, "client.names", legal, who::name_pattern).unwrap_or_default();
+        let legal = "addresses as in \"1001\" or \"1000-10ff\", or \"*\"";
+        let addresses = self.texts(table, "client.addresses", legal, who::range).unwrap_or_default();
+        Some(ClientRule { line: line_of(self.text, &place.span()), uid, gid, names, addresses })
+    }
+
+    fn know_all(&mut self, table: &Table<'t>, of: &str, keys: &[&str]) {
+        for (name, _) in table.iter().filter(|(name, _)| !keys.contains(&&**name.get_ref())) {
+            let key = format!("{of}.{}", name.get_ref());
+            let legal = format!("one of {}", keys.join(", "));
+            let found = "a key that does not exist".to_owned();
+            self.add(&key, name, Some(found), &legal, "is it spelled right? Else remove it");
+        }
+    }
+
+    /// A value that may be left out.
+    fn optional<T>(
+        &mut self,
+        table: &Table<'t>,
+        key: &'static str,
+        read: impl Fn(&DeValue<'t>) -> Option<T>,
+    ) -> Option<T> {
+        let value = table.get(leaf(key))?;
+        let found = read(value.get_ref());
+        if found.is_none() {
+            let legal = match key {
+                "rule.action" => "\"allow\" or \"refuse\"",
+                "rule.name" => "a text of 1 to 63 bytes without control characters",
+                _ => "a number from 0 to 4294967295",
+            };
+            self.add(
+                key,
+                value,
+                None,
+                legal,
+                &format!("set {} to what is legal, or leave it out", leaf(key)),
+            );
+        }
+        found
+    }
+
+    /// A list of texts that may be left out, each read by `read`. `None` if it is not there; an empty one is a fault.
+    fn texts<T>(
+        &mut self,
+        table: &Table<'t>,
+        key: &'static str,
+        legal: &str,
+        read: impl Fn(&str) -> Result<T, &'static str>,
+    ) -> Option<Vec<T>> {
+        let value = table.get(leaf(key))?;
+        let legal = format!("a list of 1 to {TEXTS_MAX} texts: {legal}");
+        let texts = value.get_ref().as_array().filter(|texts| (1..=TEXTS_MAX).contains(&texts.len()));
+        let Some(texts) = texts else {
+            self.add(key, value, None, &legal, &format!("write {} = [\"...\"]", leaf(key)));
+            return Some(Vec::new());
+        };
+        let mut all = Vec::new();
+        for text in texts {
+            match text.get_ref().as_str().map_or(Err("write it as a text, in quotes"), &read) {
+                Ok(one) => all.push(one),
+                Err(remedy) => self.add(key, text, None, &legal, remedy),
+            }
+        }
+        Some(all)
+    }
+}
+
+const GROUP_LEGAL: &str = "names of groups";
+const CLASS_LEGAL: &str = "\"control\", \"stream\" or \"bulk\"";
+
+fn leaf(key: &str) -> &str {
+    key.split_once('.').map_or(key, |(_, leaf)| leaf)
+}
+
+fn group(text: &str) -> Result<AppAddress, &'static str> {
+    if text.is_empty() || text.contains('*') {
+        // What travels is a number made of the name.
+        return Err(
+            "name each group: a pattern cannot be compared with what travels, which is a number made of the name",
+        );
+    }
+    Ok(AppAddress::group(text))
+}
+
+fn class(text: &str) -> Result<Class, &'static str> {
+    match text {
+        "control" => Ok(Class::Control),
+        "stream" => Ok(Class::Stream),
+        "bulk" => Ok(Class::Bulk),
+        _ => Err("write control, stream or bulk"),
+    }
+}

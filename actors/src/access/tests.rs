@@ -1,0 +1,325 @@
+//! What a list says of any message, whichever way it is looked up, and what is said of one that cannot be read.
+
+use std::{collections::BTreeMap, sync::Arc};
+
+use proptest::prelude::*;
+use sinew_runtime::{
+    router::guard::Guard as _,
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    wire::{Class, Header, Kind},
+};
+
+use super::{
+    Access, Applicant, Question,
+    client::ClientRefusal,
+    file::parse,
+    guard::CAUSE,
+    index::Index,
+    rule::{List, Names, Verdict},
+};
+use crate::{config::NodeConfig, stores::Stores};
+
+const HERE: NodeAddress = NodeAddress::new(0x0a00_0002);
+const THERE: NodeAddress = NodeAddress::new(0x0a00_0004);
+
+impl Access {
+    /// A list that stands in no file, in force on these stores.
+    pub(crate) fn in_test(stores: &Stores, text: &str) -> Arc<Self> {
+        let list = parse(text).unwrap_or_else(|faults| panic!("{faults}"));
+        let access = Self::new(stores.node, "nowhere".into(), list, stores.refusals.clone());
+        let access = Arc::new(access);
+        stores.guard(access.clone());
+        access
+    }
+
+    /// Another list, as if its file had been read again.
+    pub(crate) fn replace_in_test(&self, text: &str) {
+        self.put_in_force(parse(text).unwrap_or_else(|faults| panic!("{faults}")));
+    }
+}
+
+fn app(node: NodeAddress, number: u32) -> Tid {
+    Tid::new(node, AppAddress::new(number))
+}
+
+fn asked(source: Tid, target: Tid) -> Question {
+    Question { source, target, group: None, class: Class::Control }
+}
+
+fn named<'a>(source: &'a str, target: &'a str) -> Names<'a> {
+    Names { source: Some(source), target: Some(target) }
+}
+
+fn verdict(text: &str, asked: Question, names: Names<'_>) -> Verdict {
+    parse(text).unwrap_or_else(|faults| panic!("{faults}")).decide(HERE, asked, names)
+}
+
+#[test]
+fn what_no_rule_covers_is_refused() {
+    let message = asked(app(THERE, 0x1001), app(HERE, 0x1002));
+    assert_eq!(verdict("", message, Names::default()), Verdict::Refused(None));
+    let others = "[[rule]]\nfrom = ['gait']\nto = ['drive']\n";
+    assert_eq!(verdict(others, message, named("gait", "log")), Verdict::Refused(None));
+    assert_eq!(verdict(others, message, named("gait", "drive")), Verdict::Allowed(0));
+    assert_eq!(
+        verdict(others, message, Names::default()),
+        Verdict::Refused(None),
+        "nobody knows their names"
+    );
+}
+
+#[test]
+fn the_first_rule_that_covers_a_message_decides() {
+    let text =
+        "[[rule]]\nfrom = ['guest.*']\nto = ['*']\naction = 'refuse'\n[[rule]]\nfrom = ['*']\nto = ['*']\n";
+    let message = asked(app(THERE, 0x1001), app(HERE, 0x1002));
+    assert_eq!(verdict(text, message, named("guest.1", "drive")), Verdict::Refused(Some(0)));
+    assert_eq!(verdict(text, message, named("gait", "drive")), Verdict::Allowed(1));
+}
+
+#[test]
+fn applications_are_named_by_node_address_range_and_pattern() {
+    let covers = |from: &str, source: Tid, name: Option<&str>| {
+        let text = format!("[[rule]]\nfrom = ['{from}']\nto = ['*']\n");
+        let names = Names { source: name, target: None };
+        verdict(&text, asked(source, app(HERE, 0x1002)), names) == Verdict::Allowed(0)
+    };
+    let (there, here) = (app(THERE, 0x1001), app(HERE, 0x1001));
+    let cases = [
+        ("*", true, true),
+        ("10.0.0.4", true, false),
+        ("here", false, true),
+        ("10.0.0.4/1001", true, false),
+        ("10.0.0.4/1002", false, false),
+        ("*/1001", true, true),
+        ("here/1000-1001", false, true),
+        ("*/1002-7fffffff", false, false),
+        ("10.0.0.4/*", true, false),
+        ("leg.*", true, true),
+        ("leg.*@10.0.0.4", true, false),
+        ("leg.*@here", false, true),
+        ("arm.*", false, false),
+    ];
+    for (from, is_there, is_here) in cases {
+        let found = (covers(from, there, Some("leg.left")), covers(from, here, Some("leg.left")));
+        assert_eq!(found, (is_there, is_here), "{from}");
+    }
+    assert!(covers("a@b", there, Some("a@b")), "what is no node is part of the name");
+    assert!(!covers("*@10.0.0.4", there, None), "a pattern is about names");
+}
+
+#[test]
+fn a_group_and_a_class_are_let_through_by_themselves() {
+    let text = "[[rule]]\nfrom = ['*']\ngroups = ['drives']\nclasses = ['stream', 'bulk']\n";
+    let to = |group, class| {
+        let message = asked(app(THERE, 0x1001), app(HERE, 0x1002));
+        verdict(text, Question { group, class, ..message }, Names::default())
+    };
+    let drives = Some(AppAddress::group("drives"));
+    assert_eq!(to(drives, Class::Stream), Verdict::Allowed(0));
+    assert_eq!(to(drives, Class::Bulk), Verdict::Allowed(0));
+    assert_eq!(to(drives, Class::Control), Verdict::Refused(None));
+    assert_eq!(to(Some(AppAddress::group("others")), Class::Stream), Verdict::Refused(None));
+    assert_eq!(to(None, Class::Stream), Verdict::Refused(None), "a member itself is not its group");
+}
+
+#[test]
+fn all_that_is_wrong_with_a_list_is_told_with_its_line_and_what_to_do() {
+    let text = "[[rule]]\nfrom = ['10.0.0.4/3']\nto = ['*/80000001']\n[[rule]]\nto = []\nclass = ['fast']\naction = 'deny'\n\
+                [[rule]]\nfrom = ['*']\ngroups = ['d*']\nclasses = ['fast']\n[[client]]\nnames = [7]\n[[clients]]\nuid = 1\n";
+    let faults = parse(text).expect_err("nothing of it is right").to_string();
+    let expected = [
+        ("rule.from (line 2)", "layers are not subject"),
+        ("rule.to (line 3)", "given out anew"),
+        ("rule.from (line 4)", "from whom"),
+        ("rule.to (line 5)", "to = "),
+        ("rule.class (line 6)", "does not exist"),
+        ("rule.action (line 7)", "\"allow\" or \"refuse\""),
+        ("rule.groups (line 10)", "name each group"),
+        ("rule.classes (line 11)", "control, stream or bulk"),
+        ("client.uid (line 12)", "whom it is about"),
+        ("client.names (line 13)", "in quotes"),
+        ("clients (line 14)", "[[client]]"),
+    ];
+    let lines: Vec<_> = faults.lines().collect();
+    assert_eq!(lines.len(), expected.len(), "{faults}");
+    for (line, (place, remedy)) in lines.iter().zip(expected) {
+        assert!(line.starts_with(place) && line.contains(remedy), "{line}");
+    }
+    let many = "[[rule]]\nfrom = ['*']\nto = ['*']\n";
+    assert!(parse(&many.repeat(256)).is_ok() && parse(&many.repeat(257)).is_err());
+}
+
+const POLICY: &str = "[[client]]\nuid = 1001\nnames = ['guest.*']\naddresses = ['2000-20ff']\n[[client]]\ngid = 50\n\
+                      [[client]]\nuid = 0\nnames = ['*']\naddresses = ['*']\n";
+
+#[test]
+fn a_user_has_what_its_rule_says_and_nobody_else_comes_in() {
+    let list = parse(POLICY).unwrap();
+    let may = |uid, gid, name, address: Option<u32>| {
+        list.may_register(1000, Applicant { uid, gid }, name, address.map(AppAddress::new))
+    };
+    assert_eq!(
+        may(1000, 1000, Some("gait"), Some(0x1000)),
+        Ok(()),
+        "the node's own user, of whom nothing is said"
+    );
+    assert_eq!(may(0, 0, Some("gait"), Some(0x1000)), Ok(()));
+    assert_eq!(may(1001, 9, Some("guest.1"), Some(0x2001)), Ok(()));
+    assert_eq!(may(1001, 9, None, None), Ok(()));
+    let name = may(1001, 9, Some("gait"), None).expect_err("not its name");
+    assert!(matches!(name, ClientRefusal::Name { .. }) && name.to_string().contains("line 1 "), "{name}");
+    let address = may(1001, 9, Some("guest.1"), Some(0x1001)).expect_err("not its address");
+    assert!(matches!(address, ClientRefusal::Address { .. }), "{address}");
+    assert_eq!(may(1002, 50, None, None), Ok(()), "of the group");
+    assert!(may(1002, 50, Some("guest.1"), None).is_err(), "the group has no names");
+    assert_eq!(may(1002, 9, None, None), Err(ClientRefusal::NotAdmitted(1002, 1000)));
+    // The names of one rule and the addresses of another are not for anybody.
+    assert!(may(1001, 50, None, Some(0x2001)).is_ok());
+}
+
+#[test]
+fn without_rules_for_users_the_nodes_own_and_root_come_in() {
+    let list = parse("").unwrap();
+    let admits = |uid| list.admit(1000, Applicant { uid, gid: 1 }).is_ok();
+    assert!(admits(1000) && admits(0) && !admits(1001));
+}
+
+fn header(source: Tid, target: Tid) -> Header {
+    Header::new(Kind::named("test"), source, target)
+}
+
+#[test]
+fn refusals_are_counted_and_name_the_rule_and_both_ends() {
+    let mut config = NodeConfig::new("knee");
+    config.address = Some(HERE);
+    let stores = Stores::for_test(config, Incarnation(1));
+    let access = Access::in_test(
+        &stores,
+        "[[rule]]\nname = 'no guests'\nfrom = ['*']\nto = ['*']\naction = 'refuse'\n",
+    );
+    access.named(AppAddress::new(0x1002), Some("drive"));
+    let (source, target) = (app(THERE, 0x1001), app(HERE, 0x1002));
+    (0..3).for_each(|_| assert!(!access.allows(&header(source, target), target.app)));
+    assert_eq!(stores.refusals.of(CAUSE), 3);
+    let detail = &stores.refusals.told()[0].detail;
+    for word in ["rule 1 'no guests' (line 1)", "10.0.0.4/1001", "'drive'", "Control"] {
+        assert!(detail.contains(word), "{detail}");
+    }
+    // What this node's layers tell its applications is not theirs to refuse; another node's layers are nobody here.
+    assert!(access.allows(&header(Tid::new(HERE, AppAddress::SYNC), target), target.app));
+    assert!(!access.allows(&header(Tid::new(THERE, AppAddress::SYNC), target), target.app));
+}
+
+#[test]
+fn a_name_counts_from_when_it_is_known_until_it_is_gone_wherever_it_is() {
+    let mut config = NodeConfig::new("knee");
+    config.address = Some(HERE);
+    let stores = Stores::for_test(config, Incarnation(1));
+    let access = Access::in_test(&stores, "[[rule]]\nfrom = ['gait']\nto = ['drive']\n");
+    let (source, target) = (app(THERE, 0x1001), app(HERE, 0x1002));
+    let is_open = || access.allows(&header(source, target), target.app);
+    assert!(!is_open());
+    access.named(target.app, Some("drive"));
+    assert!(!is_open());
+    access.named_elsewhere(Some(THERE), [(source, "gait")].into_iter());
+    assert!(is_open());
+    // Nobody gives a name to what is another node's, nor to what is ours.
+    let other = NodeAddress::new(9);
+    access.named_elsewhere(Some(other), [(source, "log"), (target, "log")].into_iter());
+    assert!(is_open());
+    access.named_elsewhere(None, [].into_iter());
+    assert!(!is_open());
+    access.named_elsewhere(None, [(source, "gait")].into_iter());
+    assert!(is_open());
+    access.gone(target.app);
+    assert!(!is_open());
+}
+
+fn who() -> impl Strategy<Value = String> {
+    prop::sample::select(vec![
+        "*",
+        "10.0.0.4",
+        "here",
+        "*/1000",
+        "*/1000-1001",
+        "here/1001",
+        "10.0.0.4/1000",
+        "a",
+        "a*",
+        "b@here",
+        "*@10.0.0.4",
+        "*b",
+    ])
+    .prop_map(|text| format!("'{text}'"))
+}
+
+fn rule() -> impl Strategy<Value = String> {
+    let list = |each| prop::collection::vec(each, 1..3).prop_map(|texts| texts.join(", "));
+    let classes = prop::sample::select(vec!["'control'", "'stream', 'bulk'", "'control', 'stream', 'bulk'"]);
+    let group = prop::sample::select(vec!["", "groups = ['g']\n", "groups = ['g', 'h']\n"]);
+    let action = prop::sample::select(vec!["allow", "refuse"]);
+    (list(who().boxed()), list(who().boxed()), classes, group, action).prop_map(
+        |(from, to, classes, group, action)| {
+            format!(
+                "[[rule]]\nfrom = [{from}]\nto = [{to}]\n{group}classes = [{classes}]\naction = '{action}'\n"
+            )
+        },
+    )
+}
+
+fn tid() -> impl Strategy<Value = Tid> {
+    let apps = [0x1000, 0x1001, 0x1002, 0x8000_0000];
+    (prop::sample::select(vec![HERE, THERE, NodeAddress::new(9)]), prop::sample::select(apps.to_vec()))
+        .prop_map(|(node, number)| app(node, number))
+}
+
+fn names() -> impl Strategy<Value = BTreeMap<Tid, Arc<str>>> {
+    let name = prop::sample::select(vec!["a", "b", "ab"]).prop_map(Arc::from);
+    prop::collection::btree_map(tid(), name, 0..6)
+}
+
+fn question() -> impl Strategy<Value = Question> {
+    let group = prop::option::of(prop::sample::select(vec!["g", "h", "i"]).prop_map(AppAddress::group));
+    let target = prop::sample::select(vec![0x1000, 0x1001, 0x1002]).prop_map(|number| app(HERE, number));
+    (tid(), target, group, prop::sample::select(Class::ALL.to_vec()))
+        .prop_map(|(source, target, group, class)| Question { source, target, group, class })
+}
+
+proptest! {
+    #[test]
+    fn looked_up_or_searched_a_list_says_the_same_whatever_names_were_known_before(
+        rules in prop::collection::vec(rule(), 0..80), before in names(), now in names(),
+        questions in prop::collection::vec(question(), 1..20),
+    ) {
+        let list: Arc<List> = Arc::new(parse(&rules.concat()).expect("it is written as lists are"));
+        let index = Index::new(list.clone(), HERE, &before).with_names(&now);
+        for asked in questions {
+            let name = |tid| now.get(&tid).map(|name| &**name);
+            let names = Names { source: name(asked.source), target: name(asked.target) };
+            prop_assert_eq!(index.decide(asked), list.decide(HERE, asked, names), "{:?}", asked);
+        }
+    }
+
+    #[test]
+    fn a_rule_more_at_the_end_allows_nothing_that_one_before_it_refuses(
+        rules in prop::collection::vec(rule(), 0..6), last in rule(), names in names(), asked in question(),
+    ) {
+        let decide = |text: &str| Index::new(Arc::new(parse(text).unwrap()), HERE, &names).decide(asked);
+        let (before, after) = (decide(&rules.concat()), decide(&(rules.concat() + &last)));
+        prop_assert!(before == after || before == Verdict::Refused(None), "{:?} {:?}", before, after);
+    }
+
+    #[test]
+    fn any_text_is_a_list_or_faults(text in ".{0,200}") {
+        let _ = parse(&text);
+    }
+
+    #[test]
+    fn a_damaged_list_is_a_list_or_faults(rules in prop::collection::vec(rule(), 1..4), at: prop::sample::Index, with: char) {
+        let mut text: Vec<char> = (rules.concat() + POLICY).chars().collect();
+        let at = at.index(text.len());
+        text[at] = with;
+        let _ = parse(&text.into_iter().collect::<String>());
+    }
+}

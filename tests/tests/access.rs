@@ -1,0 +1,82 @@
+//! An access list between whole nodes: default deny, and another list without a restart.
+
+use std::path::Path;
+
+use sinew::{AccessError, AccessSummary, Endpoint, NodeApi, Registration, Rejection, prelude::*};
+use sinew_tests::{DEADLINE, Ground, OwnDirectory, until};
+
+payload!("access.torque", Control => struct Torque { newton_metres: f64 });
+
+/// Takes every torque.
+struct Drive;
+
+impl Actor for Drive {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<Torque>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, _: Delivery<Torque>, _: &mut Self::Context) {}
+}
+
+const OPEN: &str = "[[rule]]\nfrom = ['gait@127.0.0.1']\nto = ['drive']\nclasses = ['control']\n";
+const SHUT: &str = "[[rule]]\nname = 'nobody'\nfrom = ['*']\nto = ['*']\naction = 'refuse'\n";
+
+fn write(path: &Path, list: &str) {
+    std::fs::write(path, list).expect("the test's own directory");
+}
+
+fn send(gait: &mut Endpoint, to: Tid) -> Outcome {
+    let torque = Torque { newton_metres: 1.0 };
+    gait.send_confirmed(to, &torque, DEADLINE).expect("it is sent")
+}
+
+#[test]
+fn only_who_is_on_the_list_reaches_a_drive_and_another_list_counts_at_once() {
+    // Given: a drive behind a list, and two applications of another node, of which one is on it
+    let (ground, directory) = (Ground::new(), OwnDirectory::new());
+    let (list, socket) = (directory.join("access.toml"), directory.join("hip.sock"));
+    write(&list, OPEN);
+    let hip = ground.node("hip").configure(|config| config.lncl.socket = Some(socket.clone()));
+    let hip = hip.start().expect("a node");
+    let knee = ground.node("knee").configure(|config| config.security.access = Some(list.clone()));
+    let knee = knee.app(AppSpec::new("drive", || Drive).handles::<Torque>()).start().expect("a node");
+    let api = NodeApi::connect(&socket).expect("its door");
+    let register = |name| {
+        let registration = Registration::new().name(name).requires(["drive"]).deadline(DEADLINE);
+        api.register_transport_address(registration).expect("it is registered")
+    };
+    let (mut gait, mut log) = (register("gait"), register("log"));
+    let drive = gait.resolve("drive", DEADLINE).expect("an answer").expect("it is there");
+    // Then: as soon as the knee knows who is called so, and never for the other one
+    until("the knee knows the name", || (send(&mut gait, drive) == Outcome::Delivered).then_some(()));
+    let not_allowed = Outcome::Rejected(Rejection::NotAllowed);
+    assert_eq!(send(&mut log, drive), not_allowed);
+    assert!(knee.handle().refused() > 0, "it is counted");
+    // When: another list
+    write(&list, SHUT);
+    assert_eq!(knee.handle().reload_access().expect("it is good"), AccessSummary { rules: 1, clients: 0 });
+    assert_eq!(send(&mut gait, drive), not_allowed);
+    // When: one with a fault, which changes nothing
+    write(&list, "[[rule]]\nfrom = ['*']\nto = ['*']\nclasses = ['fast']\n");
+    let faults = knee.handle().reload_access().expect_err("there is no such class").to_string();
+    assert!(faults.contains("line 4") && faults.contains("access.toml"), "{faults}");
+    assert_eq!(send(&mut gait, drive), not_allowed);
+    write(&list, OPEN);
+    knee.handle().reload_access().expect("it is good");
+    assert_eq!(send(&mut gait, drive), Outcome::Delivered);
+    drop((gait, log, hip));
+}
+
+#[test]
+fn a_node_whose_list_cannot_be_used_does_not_start_and_one_without_has_none_to_read() {
+    let (ground, directory) = (Ground::new(), OwnDirectory::new());
+    let list = directory.join("access.toml");
+    write(&list, "[[rule]]\nfrom = ['*']\n");
+    let node = ground.node("knee").configure(|config| config.security.access = Some(list.clone()));
+    let why = node.start().expect_err("nobody is meant").to_string();
+    assert!(why.contains("access.toml") && why.contains("rule.to (line 1)"), "{why}");
+    let open = ground.node("knee").start().expect("a node");
+    assert!(matches!(open.handle().reload_access(), Err(AccessError::None)));
+}
