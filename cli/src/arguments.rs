@@ -71,6 +71,10 @@ pub(crate) enum Command {
     ///
     /// Each node is read twice, and both ends of each link are compared. What nobody can explain is named, with its place or link.
     Audit,
+    /// Has the node that lets this command in read its access list again, without a restart
+    ///
+    /// A list with faults changes nothing: each is named with its line, and the list in force stays.
+    Reload,
     /// Whether this machine gives a node what it needs: interfaces, multicast, limits, real-time rights, CPU governor, clock, shared memory,
     /// sockets; each finding with the command that mends it
     Doctor {
@@ -102,7 +106,7 @@ const AFTER: &str = "\
 Exit codes:
   0  all is fine
   1  something was found: a node does not answer, an application is not ready, a message was not delivered, nobody is called so;
-     keys cannot be made, or count for less than another 30 days
+     a list cannot be used; keys cannot be made, or count for less than another 30 days
   2  the command line is wrong
   3  no node lets this command in, or that node does not answer
 
@@ -112,6 +116,7 @@ Examples:
   sinew send knee.drive demo.angle '{\"degrees\": 5}'
   sinew watch knee.drive --received
   sinew why hip knee.drive
+  sinew reload
   sinew apps --json | jq '.apps[] | select(.ready | not)'
   sinew --socket /run/sinew/knee.sock barriers
   sinew keys init walker hip=192.168.0.11 knee=192.168.0.12 && sinew keys show

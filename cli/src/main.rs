@@ -1,7 +1,8 @@
 //! `sinew`: shows a running system, from any one node of it.
 //!
 //! It comes in through a node's socket like any other program, and asks each node's inspection (`sinew::inspect`) through ordinary
-//! messages. It changes nothing, but for what `send` sends. `keys` asks no node: it makes the files by which nodes know each other.
+//! messages. It changes nothing, but for what `send` sends and the access
+//! list that `reload` has a node read again. `keys` asks no node: it makes the files by which nodes know each other.
 
 mod apps;
 mod arguments;
@@ -12,6 +13,7 @@ mod keys;
 mod messagepack;
 mod nodes;
 mod ping;
+mod reload;
 mod send;
 mod system;
 mod table;
@@ -82,6 +84,7 @@ fn run(arguments: &Arguments) -> Result<Said, Fault> {
         Command::Why(order) => inside(&|system| why::show(system, order)),
         Command::Barriers => inside(&apps::barriers),
         Command::Audit => inside(&audit::show),
+        Command::Reload => inside(&reload::show),
         Command::Doctor { interface } => {
             Ok(doctor::show(*interface, arguments.socket.as_deref(), arguments.within()))
         }

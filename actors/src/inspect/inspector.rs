@@ -19,8 +19,9 @@ use sinew_runtime::{
 };
 
 use super::{
+    access,
     answers::Answers,
-    reports::{AskApps, AskAudit, AskNode, AskTree, AskWatch, Report, WatchReport},
+    reports::{AskAccess, AskApps, AskAudit, AskNode, AskReload, AskTree, AskWatch, Report, WatchReport},
     watches::{NewTap, WATCHES_MAX, Watches, Ways},
 };
 use crate::{log, stores::Stores};
@@ -110,6 +111,10 @@ fn answer(answers: &Answers, number: u64, watches: &mut Watches, mut question: M
         AskWatch::KIND => {
             reply(answers, number, &question, |answers, stores| watch(answers, stores, watches, &question))
         }
+        AskAccess::KIND => {
+            reply(answers, number, &question, |_, stores| access::explained(stores, &question))
+        }
+        AskReload::KIND => reply(answers, number, &question, |_, stores| access::reloaded(stores, &question)),
         // spec: INSPECT-4
         _ => Err(Rejection::UnknownKind),
     };

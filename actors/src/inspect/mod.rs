@@ -1,7 +1,7 @@
 //! Inspection: every node answers questions about itself, for tools like `sinew`.
 //!
 //! Whoever can send a message can ask, from any node: the questions go to `node/inspect` ([`AppAddress::INSPECT`]) by
-//! [`ask`](crate::Endpoint::ask), as to any application. It only reads.
+//! [`ask`](crate::Endpoint::ask), as to any application. It only reads, but for the access list, which it has read again.
 //!
 //! | rule | |
 //! | --- | --- |
@@ -11,9 +11,11 @@
 //! | INSPECT-4 | A kind that is no question is refused as `UnknownKind`. `sinew.ping`, confirmed, ends as `Delivered`. |
 //! | INSPECT-5 | A panic in an answer costs that answer, which ends as `Failed`, and nothing else. |
 //! | INSPECT-6 | A watch sees what the routing table hands over: all that an application of this node sends and gets, but for direct links between processes. At most 8 watches; each keeps 2,048 messages and 1 MiB of payloads until it is asked, further ones are counted as dropped. Nobody who sends waits for it. It is over 3 s after the last question, and without one it costs a sender one look at a pointer. Its answers travel as Bulk. |
+//! | INSPECT-7 | The node's access list does not apply to questions. Its file is read again on the word of a program on the node's own host only; one with faults changes nothing. |
 //!
 //! `docs/protocol/inspect.md` has the fields.
 
+mod access;
 mod answers;
 mod inspector;
 mod reports;
@@ -23,10 +25,11 @@ mod watches;
 
 pub(crate) use inspector::begin;
 pub use reports::{
-    APPS_MAX, AppReport, AppsReport, AskApps, AskAudit, AskNode, AskTree, AskWatch, AuditReport,
-    BarrierReport, DialReport, ForeignReport, LinkReport, LostReport, Missing, NodeReport, PEERS_MAX,
-    PeerReport, Ping, RefusalReport, SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, StreamReport, TREE_MAX, TreeLine,
-    TreeReport, TroubleReport, WaitReport, WatchReport,
+    APPS_MAX, AccessReport, AccessVerdict, AppReport, AppsReport, AskAccess, AskApps, AskAudit, AskNode,
+    AskReload, AskTree, AskWatch, AuditReport, BarrierReport, DialReport, ForeignReport, LinkReport,
+    LostReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping, RefusalReport, ReloadReport,
+    SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, StreamReport, TREE_MAX, TreeLine, TreeReport, TroubleReport,
+    WaitReport, WatchReport,
 };
 
 #[cfg(doc)]

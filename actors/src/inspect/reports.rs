@@ -1,7 +1,9 @@
 //! The questions and what answers them. Times are microseconds before the answer was made, unless a name says otherwise.
 
+mod access;
 mod peers;
 
+pub use access::{AccessReport, AccessVerdict, AskAccess, AskReload, ReloadReport};
 pub use peers::{DialReport, ForeignReport, LinkReport, LostReport, PeerReport, StreamReport, TroubleReport};
 
 use serde::{Deserialize, Serialize};

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use sinew::{
     NodeAddress,
-    inspect::{AppReport, NodeReport, PeerReport, StreamReport, TreeLine},
+    inspect::{AccessReport, AppReport, NodeReport, PeerReport, StreamReport, TreeLine},
 };
 
 /// All that the rules look at.
@@ -16,6 +16,8 @@ pub(super) struct Facts {
     /// What the node of the first has counted for that of the second when a value of class Stream had been sent to it, and back. `None`: none
     /// was sent.
     pub(super) streams: [Option<StreamReport>; 2],
+    /// What the node of the second says of messages to it from the first, and back. `None`: not two applications, or it cannot be asked.
+    pub(super) access: [Option<AccessReport>; 2],
     /// Sockets of this host that let nobody in, with the reason.
     pub(super) shut: Vec<String>,
     /// Who waits at a start-up barrier, and for whom, on all nodes that were asked.

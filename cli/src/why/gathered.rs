@@ -6,8 +6,8 @@ use sinew::{
     AppAddress, NodeAddress, Tid, Time,
     audit::Place,
     inspect::{
-        AppReport, AppsReport, AskApps, AskAudit, AskNode, AskTree, AuditReport, NodeReport, Ping,
-        StreamReport, TreeReport,
+        AccessReport, AppReport, AppsReport, AskAccess, AskApps, AskAudit, AskNode, AskTree, AuditReport,
+        NodeReport, Ping, StreamReport, TreeReport,
     },
     payload,
 };
@@ -127,6 +127,7 @@ impl<'a> Gathered<'a> {
             Some(Tid::new(node, found.app.map_or(AppAddress::INSPECT, |tid| tid.app)))
         });
         let pings = [self.ping(found[0].at, targets[1]), self.ping(found[1].at, targets[0])];
+        let access = [self.access(found[0], found[1]), self.access(found[1], found[0])];
         let waits = self.nodes.iter().flat_map(|asked| &asked.apps).filter(|app| !app.ready);
         let waits: BTreeMap<_, _> = waits
             .filter_map(|app| {
@@ -134,7 +135,7 @@ impl<'a> Gathered<'a> {
             })
             .collect();
         let streams = [self.stream(found[0].at, found[1].node), self.stream(found[1].at, found[0].node)];
-        Facts { ends, pings, streams, waits, shut: Vec::new() }
+        Facts { ends, pings, streams, access, waits, shut: Vec::new() }
     }
 
     /// An application's TID, a node's address, an application's name, a node's name: the first that it is.
@@ -207,6 +208,20 @@ impl<'a> Gathered<'a> {
         let refused =
             entries.iter().filter(|entry| is_its(&entry.place)).map(|entry| entry.account.refused).sum();
         App { report, line: lines.into_iter().find(|line| line.tid == Some(tid)), refused }
+    }
+
+    /// Whether the access list of the target's node lets the source send to it, where both are applications.
+    fn access(&mut self, source: Found, target: Found) -> Option<AccessReport> {
+        let asked = AskAccess { source: source.app?, target: target.app? };
+        let there = &self.nodes[target.at?];
+        if there.said.is_err() {
+            return None;
+        }
+        let through = there.through;
+        let system = self.system(through);
+        let inspection = Tid::new(asked.target.node, AppAddress::INSPECT);
+        // A node of an older version does not know the question, and has no list.
+        system.endpoint.ask(inspection, &asked, system.within).ok()
     }
 
     /// A ping from the very node, if it has a door here.

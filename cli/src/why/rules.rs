@@ -1,10 +1,14 @@
 //! From what two ends say to what stands in the way between them: facts in, steps out, nothing asked and nothing waited for.
 
+mod access;
 mod stream;
 
 use std::collections::BTreeSet;
 
-use sinew::inspect::{LostReport, NodeReport, PeerReport};
+use sinew::{
+    Rejection,
+    inspect::{LostReport, NodeReport, PeerReport},
+};
 
 use super::facts::{App, End, Facts};
 use crate::table::time;
@@ -54,6 +58,7 @@ pub(super) fn judge(facts: &Facts) -> Vec<Step> {
     for end in [a, b] {
         steps.application(end, facts);
     }
+    steps.access(a, b, facts);
     for (ping, (from, to)) in facts.pings.iter().zip([(a, b), (b, a)]) {
         steps.ping(ping.as_ref(), from, to);
     }
@@ -258,6 +263,12 @@ impl Steps {
         let what = format!("a message goes from {} to {}", from.node_label(), to.label());
         match ping {
             Some(Ok(micros)) => self.fine(what, format!("confirmed after {}", time(*micros))),
+            // The list was looked at for the two applications; this command is a third one.
+            Some(Err(why)) if *why == Rejection::NotAllowed.to_string() => self.note(
+                what,
+                "not tried: the access list there does not let this command send",
+                "a [[rule]] for this command, if it is to; what the list says of the two is told above",
+            ),
             Some(Err(why)) => {
                 // What was found before explains it.
                 let is_explained = self.0.iter().any(|step| step.state == State::Blocked);

@@ -1,5 +1,6 @@
 //! The command itself, against real node processes: what it says of two nodes from one of them, and how it fails.
 
+mod access;
 mod keys;
 mod scenario;
 mod secured;

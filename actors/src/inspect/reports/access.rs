@@ -1,0 +1,80 @@
+//! The questions about the access list and what answers them.
+
+use serde::{Deserialize, Serialize};
+use sinew_runtime::{tid::Tid, wire::Class};
+
+use super::Report;
+use crate::{payload, sync::at_most};
+
+/// Classes that there are.
+const CLASSES: usize = Class::ALL.len();
+
+payload!("sinew.inspect.access" =>
+    /// May this application send to that one of yours? [`AccessReport`] answers.
+    #[derive(Clone, Copy, Debug)]
+    pub struct AskAccess {
+        /// Who would send.
+        pub source: Tid,
+        /// The application of the node that is asked, which would get it.
+        pub target: Tid,
+    }
+);
+
+payload!("sinew.inspect.access_report" =>
+    /// What the access list of a node says of messages from one application to another.
+    #[derive(Clone, Debug, PartialEq, Eq)]
+    pub struct AccessReport {
+        /// Whether the node has a list; without one everything is allowed.
+        pub is_given: bool,
+        /// For each class, if there is a list.
+        #[serde(deserialize_with = "at_most::<_, _, CLASSES>")]
+        pub verdicts: Vec<AccessVerdict>,
+    }
+);
+
+/// What becomes of messages of one class.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct AccessVerdict {
+    /// The class.
+    pub class: Class,
+    /// Whether they are let through.
+    pub is_allowed: bool,
+    /// Which rule says so, or that there is none, and for which names it was looked up.
+    pub why: String,
+}
+
+payload!("sinew.inspect.reload" =>
+    /// Read your access list again. Only a program on the node's own host is obeyed. [`ReloadReport`] answers.
+    #[derive(Clone, Copy, Debug, Default)]
+    pub struct AskReload {}
+);
+
+payload!("sinew.inspect.reload_report" =>
+    /// The access list that is in force now.
+    #[derive(Clone, Debug, PartialEq, Eq)]
+    pub struct ReloadReport {
+        /// Its rules for messages.
+        pub rules: u64,
+        /// Its rules for users of the node's host.
+        pub clients: u64,
+        /// Why it is the one that was in force before, or that there is none; in words.
+        pub refused: Option<String>,
+    }
+);
+
+/// It has no list of unknown length.
+impl Report for AccessReport {
+    fn halve(&mut self) -> bool {
+        false
+    }
+}
+
+impl Report for ReloadReport {
+    fn halve(&mut self) -> bool {
+        let Some(words) = &mut self.refused else { return false };
+        let kept: String = words.chars().take(words.chars().count() / 2).collect();
+        let had_any = kept.len() < words.len();
+        *words = kept;
+        had_any
+    }
+}

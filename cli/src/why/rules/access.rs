@@ -1,0 +1,51 @@
+//! Whether an access list stands in the way.
+
+use sinew::inspect::{AccessReport, AccessVerdict};
+
+use super::{
+    super::facts::{End, Facts},
+    Steps,
+};
+
+const MEND: &str = "have a [[rule]] of that list allow it, then `sinew reload` on its host";
+
+impl Steps {
+    /// What the list at each end says. Who asks is in the way of what is to go from the first to the second; that nothing may go back is often
+    /// meant so, and replies need no leave.
+    pub(super) fn access(&mut self, a: &End, b: &End, facts: &Facts) {
+        let [there, back] = &facts.access;
+        for (said, from, to, is_asked_for) in [(there, a, b, true), (back, b, a, false)] {
+            let Some(said) = said else { continue };
+            let what = format!("{} may send to {}", from.label(), to.label());
+            if !said.is_given {
+                self.fine(what, format!("node {} has no access list", to.node_label()));
+                continue;
+            }
+            let seen = in_words(said);
+            let refused = said.verdicts.iter().filter(|verdict| !verdict.is_allowed).count();
+            if refused == 0 {
+                self.fine(what, seen);
+            } else if is_asked_for && refused == said.verdicts.len() {
+                self.blocked(what, seen, MEND);
+            } else {
+                self.note(what, seen, MEND);
+            }
+        }
+    }
+}
+
+/// What counts for each class, or for all at once where it is the same.
+fn in_words(said: &AccessReport) -> String {
+    let judged = |verdict: &AccessVerdict| {
+        format!("{}: {}", if verdict.is_allowed { "allowed" } else { "refused" }, verdict.why)
+    };
+    match said.verdicts.split_first() {
+        Some((first, others)) if others.iter().all(|other| judged(other) == judged(first)) => {
+            format!("access list of its node: {}", judged(first))
+        }
+        _ => {
+            let each = said.verdicts.iter().map(|one| format!("{:?} {}", one.class, judged(one)));
+            format!("access list of its node: {}", each.collect::<Vec<_>>().join("; "))
+        }
+    }
+}
