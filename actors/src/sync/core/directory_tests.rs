@@ -105,3 +105,24 @@ fn what_an_application_handles_stands_in_the_directory_of_every_node() {
     bench.list(KNEE, theirs);
     assert_eq!(bench.core.directory()[1].kinds, kinds);
 }
+
+#[test]
+fn what_a_node_has_called_its_applications_counts_for_the_access_list_until_it_says_otherwise() {
+    let mut bench = watched();
+    bench.links(KNEE, LIFE);
+    let names = |bench: &Bench, of| {
+        bench.core.names_elsewhere(of).map(|(tid, name)| (tid, name.to_owned())).collect::<Vec<_>>()
+    };
+    bench.list(KNEE, list(1, &[("knee", true, &[])]));
+    let knee = (Tid::new(KNEE, app(0)), "knee".to_owned());
+    assert_eq!(names(&bench, None), [knee.clone()], "those of this node are known before");
+    assert_eq!((names(&bench, Some(KNEE)), names(&bench, Some(HERE))), (vec![knee.clone()], vec![]));
+    // What it sent before it was lost still comes, its last wills too.
+    bench.breaks(KNEE);
+    bench.lost(KNEE, LossReason::Crashed);
+    assert_eq!((bench.core.directory().len(), names(&bench, None)), (1, vec![knee]));
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(2, &[("drive", true, &[])]));
+    assert_eq!(names(&bench, Some(KNEE)), [(Tid::new(KNEE, app(0)), "drive".to_owned())]);
+    assert_eq!(Input::TimePassed.may_name(), Named::Nobody);
+}
