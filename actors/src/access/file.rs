@@ -49,7 +49,7 @@ pub(super) fn parse(text: &str) -> Result<List, ConfigFaults> {
             other => {
                 let found = "a key that does not exist".to_owned();
                 let remedy = "write [[rule]] or [[client]] and their keys below";
-                reader.add(other, name, Some(found), "[[rule]] and [[client]]", remedy);
+                reader.add(other, name, Some(found), ("[[rule]] and [[client]]", remedy));
             }
         }
     }
@@ -68,7 +68,13 @@ type Value<'t> = Spanned<DeValue<'t>>;
 type Table<'t> = DeTable<'t>;
 
 impl<'t> Reader<'t> {
-    fn add<S>(&mut self, key: &str, place: &Spanned<S>, found: Option<String>, legal: &str, remedy: &str) {
+    fn add<S>(
+        &mut self,
+        key: &str,
+        place: &Spanned<S>,
+        found: Option<String>,
+        (legal, remedy): (&str, &str),
+    ) {
         let found = found.unwrap_or_else(|| shown(self.text, place.span()));
         let line = Some(line_of(self.text, &place.span()));
         let key = quoted(key).trim_matches('"').to_owned();
@@ -85,17 +91,17 @@ impl<'t> Reader<'t> {
         let legal = format!("at most {max} tables, each with [[{key}]] above it");
         let remedy = format!("write [[{key}]] on a line of its own and its keys below");
         let Some(tables) = value.get_ref().as_array() else {
-            self.add(key, value, None, &legal, &remedy);
+            self.add(key, value, None, (&legal, &remedy));
             return Vec::new();
         };
         if tables.len() > max {
-            self.add(key, value, Some(format!("{} of them", tables.len())), &legal, "put several into one");
+            self.add(key, value, Some(format!("{} of them", tables.len())), (&legal, "put several into one"));
         }
         let mut read = Vec::new();
         for table in tables.iter().take(max) {
             match table.get_ref().as_table() {
                 Some(keys) => read.extend(one(self, table, keys)),
-                None => self.add(key, table, None, &legal, &remedy),
+                None => self.add(key, table, None, (&legal, &remedy)),
             }
         }
         read
@@ -118,11 +124,11 @@ impl<'t> Reader<'t> {
         let classes = self.texts(table, "rule.classes", CLASS_LEGAL, class);
         if from.is_none() {
             let remedy = "say from whom, or from = [\"*\"] for everybody";
-            self.add("rule.from", place, Some("nothing".to_owned()), who::LEGAL, remedy);
+            self.add("rule.from", place, Some("nothing".to_owned()), (who::LEGAL, remedy));
         }
         if to.is_none() && groups.is_none() {
             let remedy = "say to whom: to = [\"*\"] for every application, or groups";
-            self.add("rule.to", place, Some("nothing".to_owned()), who::LEGAL, remedy);
+            self.add("rule.to", place, Some("nothing".to_owned()), (who::LEGAL, remedy));
         }
         Some(Rule {
             name,
@@ -149,8 +155,7 @@ impl<'t> Reader<'t> {
                 "client.uid",
                 place,
                 Some("neither".to_owned()),
-                legal,
-                "say whom it is about (see `id`)",
+                (legal, "say whom it is about (see `id`)"),
             );
         }
         let legal = "names of 1 to 63 bytes; `*` stands for any text";
@@ -165,7 +170,7 @@ impl<'t> Reader<'t> {
             let key = format!("{of}.{}", name.get_ref());
             let legal = format!("one of {}", keys.join(", "));
             let found = "a key that does not exist".to_owned();
-            self.add(&key, name, Some(found), &legal, "is it spelled right? Else remove it");
+            self.add(&key, name, Some(found), (&legal, "is it spelled right? Else remove it"));
         }
     }
 
@@ -188,8 +193,7 @@ impl<'t> Reader<'t> {
                 key,
                 value,
                 None,
-                legal,
-                &format!("set {} to what is legal, or leave it out", leaf(key)),
+                (legal, &format!("set {} to what is legal, or leave it out", leaf(key))),
             );
         }
         found
@@ -207,14 +211,14 @@ impl<'t> Reader<'t> {
         let legal = format!("a list of 1 to {TEXTS_MAX} texts: {legal}");
         let texts = value.get_ref().as_array().filter(|texts| (1..=TEXTS_MAX).contains(&texts.len()));
         let Some(texts) = texts else {
-            self.add(key, value, None, &legal, &format!("write {} = [\"...\"]", leaf(key)));
+            self.add(key, value, None, (&legal, &format!("write {} = [\"...\"]", leaf(key))));
             return Some(Vec::new());
         };
         let mut all = Vec::new();
         for text in texts {
             match text.get_ref().as_str().map_or(Err("write it as a text, in quotes"), &read) {
                 Ok(one) => all.push(one),
-                Err(remedy) => self.add(key, text, None, &legal, remedy),
+                Err(remedy) => self.add(key, text, None, (&legal, remedy)),
             }
         }
         Some(all)
