@@ -160,12 +160,14 @@ impl Gncl {
     }
 
     fn accepted(&mut self, socket: TcpStream, ctx: &mut Context<Self>) {
+        // It has gone again already where the system does not know.
+        let Ok(from) = socket.peer_addr() else { return };
         let (connection, transport) = (self.core.open(), Transport::open(socket));
         let mode = Arc::new(Mutex::new(Mode::Handshake));
         let reading = self.reading(&mode);
         let reader = ctx.add_stream(link::read(connection, transport.clone(), reading));
         self.wires.insert(connection, Wire::new(Some(transport), mode, reader, self.secure.is_none()));
-        self.input(Input::Accepted(connection), ctx);
+        self.input(Input::Accepted(connection, from.ip()), ctx);
     }
 
     fn send_hello(&mut self, connection: ConnectionId, hello: &Introduction, ctx: &mut Context<Self>) {

@@ -1,5 +1,11 @@
 //! What happens to one connection until it is a link or gone.
 
+use std::{
+    cmp::Reverse,
+    collections::{BTreeMap, BTreeSet},
+    net::IpAddr,
+};
+
 use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
     time::Time,
@@ -15,18 +21,20 @@ use super::{
 };
 
 impl Core {
-    pub(super) fn accepted(&mut self, now: Time, connection: ConnectionId) {
+    pub(super) fn accepted(&mut self, now: Time, connection: ConnectionId, from: IpAddr) {
         if self.leaving && !self.expects_sides() {
             self.count("leaving", "a connection was closed at once".to_owned());
             self.outputs.push_back(Output::Close(connection));
             return;
         }
         if self.strangers().count() >= self.settings.strangers_max {
-            let what = "the one that had said nothing for longest was closed; see `gncl.strangers_max`";
+            let what = "the oldest one from where most come was closed; see `gncl.strangers_max`";
             self.count("too many strangers", what.to_owned());
             self.close_strangers(1);
         }
-        self.stage_for_handshake(now, connection, Stage::Stranger);
+        let deadline = now + self.settings.handshake;
+        self.connections
+            .insert(connection, Connection { stage: Stage::Stranger, from: Some(from), deadline });
     }
 
     /// There are no descriptors left, or no memory: what strangers hold is needed for peers. spec: GNCL-2
@@ -35,16 +43,31 @@ impl Core {
         self.close_strangers(half);
     }
 
-    /// Connections whose peer is not known, or was refused and has not closed: oldest first.
-    fn strangers(&self) -> impl Iterator<Item = ConnectionId> {
+    /// Connections whose peer is not known, or was refused and has not closed, and from where they were made: oldest first.
+    fn strangers(&self) -> impl DoubleEndedIterator<Item = (ConnectionId, Option<IpAddr>)> {
         let is_stranger = |stage| matches!(stage, Stage::Stranger | Stage::Leaving);
-        self.connections.iter().filter(move |(_, c)| is_stranger(c.stage)).map(|(id, _)| *id)
+        self.connections.iter().filter(move |(_, c)| is_stranger(c.stage)).map(|(id, c)| (*id, c.from))
     }
 
-    /// Who is a peer says hello at once, so those that have not for longest are none.
+    /// Strangers in the order in which they go. Who is a peer says hello at once, so those that have not for longest are none; but who
+    /// connects thousands of times a second lets nobody say anything, unless it is his own that go: first those from where most come,
+    /// and only behind all others those from where NDL has found a node.
+    fn least_wanted(&self) -> Vec<ConnectionId> {
+        let found: BTreeSet<IpAddr> =
+            self.peers.values().filter_map(|peer| peer.wanted.as_ref()).flatten().map(|at| at.ip()).collect();
+        let mut newer: BTreeMap<Option<IpAddr>, usize> = BTreeMap::new();
+        let ranked = self.strangers().rev().map(|(connection, from)| {
+            let newer = newer.entry(from).or_default();
+            *newer += 1;
+            (from.is_some_and(|from| found.contains(&from)), Reverse(*newer), connection)
+        });
+        let mut ranked: Vec<_> = ranked.collect();
+        ranked.sort_unstable();
+        ranked.into_iter().map(|(_, _, connection)| connection).collect()
+    }
+
     fn close_strangers(&mut self, count: usize) {
-        let oldest: Vec<_> = self.strangers().take(count).collect();
-        for connection in oldest {
+        for connection in self.least_wanted().into_iter().take(count) {
             self.connections.remove(&connection);
             self.outputs.push_back(Output::Close(connection));
         }
@@ -213,7 +236,7 @@ impl Core {
             has_left: false,
         });
         let stage = Stage::Linked(node, Lane::Control);
-        self.connections.insert(connection, Connection { stage, deadline: Time::MAX });
+        self.connections.insert(connection, Connection { stage, from: None, deadline: Time::MAX });
         self.outputs.push_back(Output::Attach(Attach {
             connection,
             node,
@@ -312,7 +335,9 @@ impl Core {
     /// Enters a stage that does not last. spec: GNCL-2
     pub(super) fn stage_for_handshake(&mut self, now: Time, connection: ConnectionId, stage: Stage) {
         let deadline = now + self.settings.handshake;
-        self.connections.insert(connection, Connection { stage, deadline });
+        // Who is refused stays from where it came.
+        let from = self.connections.get(&connection).and_then(|known| known.from);
+        self.connections.insert(connection, Connection { stage, from, deadline });
     }
 }
 

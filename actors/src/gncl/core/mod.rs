@@ -20,7 +20,7 @@ mod tests;
 
 use std::{
     collections::{BTreeMap, VecDeque},
-    net::SocketAddr,
+    net::{IpAddr, SocketAddr},
     time::Duration,
 };
 
@@ -48,7 +48,7 @@ pub(super) struct Settings {
     pub(super) redial_min: Duration,
     /// Longest wait before dialling again, before jitter.
     pub(super) redial_max: Duration,
-    /// Connections at most that are not links, of those that we accepted. For a further one the oldest is closed.
+    /// Connections at most that are not links, of those that we accepted. For a further one one is closed: see `least_wanted`.
     pub(super) strangers_max: usize,
     /// Peers known at most. Further ones are refused.
     pub(super) peers_max: usize,
@@ -81,8 +81,8 @@ pub(super) enum Input {
     NodeDisowned { node: NodeAddress, incarnation: Incarnation },
     /// NDL heard a node say that it leaves. What it had sent before may still be on its way, and its GOODBYE behind that.
     NodeLeaves { node: NodeAddress, incarnation: Incarnation },
-    /// The listener accepted a connection; `connection` is from [`Core::open`].
-    Accepted(ConnectionId),
+    /// The listener accepted a connection from this address; `connection` is from [`Core::open`].
+    Accepted(ConnectionId, IpAddr),
     /// A dial reached the peer's host.
     Connected(ConnectionId),
     /// A dial did not.
@@ -193,6 +193,8 @@ enum Stage {
 #[derive(Clone, Copy, Debug)]
 struct Connection {
     stage: Stage,
+    /// From where it was made, if it was accepted.
+    from: Option<IpAddr>,
     /// When it is given up; never for a link.
     deadline: Time,
 }
@@ -239,7 +241,7 @@ impl Core {
             Input::NodeLost { node, incarnation } => self.lost(now, node, incarnation),
             Input::NodeDisowned { node, incarnation } => self.disowned(now, node, incarnation),
             Input::NodeLeaves { node, incarnation } => self.leaves(now, node, incarnation),
-            Input::Accepted(connection) => self.accepted(now, connection),
+            Input::Accepted(connection, from) => self.accepted(now, connection, from),
             Input::Connected(connection) => self.connected(now, connection),
             Input::DialFailed { connection, refused } => self.dial_failed(now, connection, refused),
             Input::HelloReceived(connection, hello) => self.hello(now, connection, &hello),

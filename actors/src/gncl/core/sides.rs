@@ -194,7 +194,7 @@ impl Core {
         let Some(side) = peer.link.as_mut().and_then(|link| link.side(lane)) else { return };
         side.state = SideState::Up(connection, Pulse::beat(now));
         let stage = Stage::Linked(node, lane);
-        self.connections.insert(connection, Connection { stage, deadline: Time::MAX });
+        self.connections.insert(connection, Connection { stage, from: None, deadline: Time::MAX });
         self.outputs.push_back(Output::Attach(Attach {
             connection,
             node,

@@ -63,6 +63,8 @@ proptest! {
     }
 }
 
+/// From where connections are accepted where it does not matter.
+const SOMEWHERE: IpAddr = IpAddr::V4(std::net::Ipv4Addr::new(10, 9, 9, 9));
 const LOW: NodeAddress = NodeAddress::new(1);
 const HIGH: NodeAddress = NodeAddress::new(2);
 
@@ -109,7 +111,7 @@ fn hello_from(node: NodeAddress, incarnation: u64, dial: u64) -> Introduction {
 /// Has `core` accept a connection on which `hello` comes.
 fn greet(core: &mut Core, now: Time, hello: Introduction) -> (ConnectionId, Vec<Output>) {
     let connection = core.open();
-    core.handle(now, Input::Accepted(connection));
+    core.handle(now, Input::Accepted(connection, SOMEWHERE));
     core.handle(now, Input::HelloReceived(connection, hello));
     (connection, outputs(core))
 }
@@ -250,7 +252,7 @@ fn strangers_are_limited_in_number_and_in_time() {
     let mut core = core();
     let strangers: Vec<_> = (0..4).map(|_| core.open()).collect();
     for stranger in &strangers {
-        core.handle(millis(0), Input::Accepted(*stranger));
+        core.handle(millis(0), Input::Accepted(*stranger, SOMEWHERE));
     }
     assert!(outputs(&mut core).contains(&Output::Close(strangers[0])), "with the fourth the oldest goes");
     core.handle(millis(2_000), Input::TimePassed);
@@ -261,13 +263,47 @@ fn strangers_are_limited_in_number_and_in_time() {
     assert_eq!(core.next_wake(), None);
 }
 
+/// Accepts one from there, and says who was closed for it.
+fn accept_from(core: &mut Core, from: impl Into<IpAddr>) -> (ConnectionId, Vec<Output>) {
+    let stranger = core.open();
+    core.handle(millis(0), Input::Accepted(stranger, from.into()));
+    let closed = outputs(core).into_iter().filter(|output| matches!(output, Output::Close(_)));
+    (stranger, closed.collect())
+}
+
+#[test]
+fn who_connects_again_and_again_has_his_own_connections_closed_and_nobody_elses() {
+    let mut core = core();
+    let (other, _) = accept_from(&mut core, [10, 0, 0, 7]);
+    let mut his: Vec<_> = (0..2).map(|_| accept_from(&mut core, [10, 0, 0, 8]).0).collect();
+    for _ in 0..100 {
+        let (one_more, closed) = accept_from(&mut core, [10, 0, 0, 8]);
+        his.push(one_more);
+        assert_eq!(closed, [Output::Close(his.remove(0))], "his oldest");
+    }
+    core.handle(millis(1), Input::HelloReceived(other, hello_from(HIGH, 1, 1)));
+    assert!(core.linked(other).is_some(), "the other one comes in, however long it took");
+}
+
+#[test]
+fn strangers_from_where_a_node_was_found_are_closed_behind_all_others() {
+    let mut core = core();
+    core.handle(millis(0), found(1));
+    outputs(&mut core);
+    let (peer, _) = accept_from(&mut core, address().ip());
+    for last in 1..100 {
+        let (_, closed) = accept_from(&mut core, [10, 1, 0, last]);
+        assert!(!closed.contains(&Output::Close(peer)), "as many addresses as there may be say nothing");
+    }
+}
+
 #[test]
 fn half_of_the_strangers_give_their_descriptors_back_when_there_are_none_left() {
     let mut core = core();
     let (link, _) = greet(&mut core, millis(0), hello_from(HIGH, 1, 1));
     let strangers: Vec<_> = (0..3).map(|_| core.open()).collect();
     for stranger in &strangers {
-        core.handle(millis(0), Input::Accepted(*stranger));
+        core.handle(millis(0), Input::Accepted(*stranger, SOMEWHERE));
     }
     for gone in [&strangers[..2], &strangers[2..], &[]] {
         core.handle(millis(1), Input::Starved);
@@ -329,7 +365,7 @@ fn a_node_that_leaves_says_goodbye_and_takes_nobody_any_more() {
     core.handle(millis(1), Input::LeaveRequested { owed: Vec::new() });
     assert!(outputs(&mut core).contains(&Output::SendGoodbye(HIGH)));
     let connection = core.open();
-    core.handle(millis(2), Input::Accepted(connection));
+    core.handle(millis(2), Input::Accepted(connection, SOMEWHERE));
     assert!(outputs(&mut core).contains(&Output::Close(connection)));
 }
 

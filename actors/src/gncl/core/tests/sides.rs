@@ -174,6 +174,6 @@ fn a_node_that_leaves_takes_the_connections_that_its_links_lack_and_no_others() 
         assert!(taken.iter().any(|output| matches!(output, Output::Attach(_))), "{taken:?}");
     }
     let last = core.open();
-    core.handle(millis(3), Input::Accepted(last));
+    core.handle(millis(3), Input::Accepted(last, SOMEWHERE));
     assert!(outputs(&mut core).contains(&Output::Close(last)), "no link lacks one any more");
 }

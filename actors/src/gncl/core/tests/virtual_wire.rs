@@ -239,7 +239,7 @@ impl World {
             let connection = self.nodes[node].core.open();
             self.pipes[pipe].ends[node] = Some(connection);
             self.nodes[node].ends.insert(connection, pipe);
-            return self.input(node, Input::Accepted(connection));
+            return self.input(node, Input::Accepted(connection, SOMEWHERE));
         }
         let Some(connection) = self.pipes[pipe].ends[node] else { return };
         if !self.pipes[pipe].carries && !matches!(what, Parcel::End) {
