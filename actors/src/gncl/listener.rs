@@ -1,6 +1,7 @@
 //! The accepting socket: waits when the system has no more to give, and never spins.
 
 use std::{
+    future::poll_fn,
     io,
     net::{Ipv4Addr, SocketAddr, SocketAddrV4},
     time::Duration,
@@ -16,6 +17,11 @@ use crate::{config::GnclConfig, refusals::Refusals};
 
 /// Connections that wait to be accepted at most; the kernel refuses further ones.
 const BACKLOG: i32 = 1_024;
+/// Connections that are accepted without a pause: each takes some 50 us of the thread, so that no message waits longer for them than for
+/// another one of 64 KiB.
+const AT_ONCE_MAX: u32 = 4;
+/// The pause: 300 nodes that dial all their connections at once are accepted within a third of a second.
+const REST: Duration = Duration::from_millis(1);
 const BACK_OFF_MIN: Duration = Duration::from_millis(10);
 const BACK_OFF_MAX: Duration = Duration::from_millis(100);
 
@@ -70,16 +76,25 @@ fn begin_to_listen(socket: &Socket, address: SocketAddr) -> io::Result<std::net:
     Ok(socket.try_clone()?.into())
 }
 
-/// Each connection that is made to `listener`, and each error that made it wait. See [`tune`](super::link::tune).
+/// Each connection that is made to `listener`, and each error that made it wait. See [`tune`](super::link::tune). Links that stand share
+/// the thread: after [`AT_ONCE_MAX`] connections without a pause it [rests](REST), and whoever floods the port waits in the kernel.
 pub(super) fn accepted(
     listener: TcpListener,
     give_up: Duration,
 ) -> impl Stream<Item = io::Result<TcpStream>> {
-    stream::unfold((listener, Duration::ZERO), move |(listener, wait)| async move {
+    stream::unfold((listener, Duration::ZERO, 0), move |(listener, wait, mut at_once)| async move {
         if wait > Duration::ZERO {
             tokio::time::sleep(wait).await;
+        } else if at_once >= AT_ONCE_MAX {
+            tokio::time::sleep(REST).await;
+            at_once = 0;
         }
-        let accepted = listener.accept().await.and_then(|(socket, _)| {
+        let accepted = poll_fn(|cx| {
+            let accepted = listener.poll_accept(cx);
+            at_once = if accepted.is_pending() { 0 } else { at_once + 1 };
+            accepted
+        });
+        let accepted = accepted.await.and_then(|(socket, _)| {
             super::link::tune(&socket, give_up)?;
             Ok(socket)
         });
@@ -88,7 +103,7 @@ pub(super) fn accepted(
             std::future::pending::<()>().await;
         }
         let wait = accepted.as_ref().err().map_or(Duration::ZERO, |error| wait_after(error, wait));
-        Some((accepted, (listener, wait)))
+        Some((accepted, (listener, wait, at_once)))
     })
 }
 
@@ -144,6 +159,27 @@ mod tests {
         SockRef::from(&listener).shutdown(std::net::Shutdown::Both).unwrap();
         let told = tokio::time::timeout(Duration::from_millis(100), accepted.next()).await;
         assert!(told.is_err(), "{told:?}");
+    }
+
+    #[tokio::test]
+    async fn after_some_connections_without_a_pause_the_thread_is_left_to_others_and_all_are_accepted() {
+        const DIALLED: u32 = 5 * AT_ONCE_MAX;
+        let listener = listen(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
+        let address = listener.local_addr().unwrap();
+        let _dialled: Vec<_> = (0..DIALLED).map(|_| std::net::TcpStream::connect(address).unwrap()).collect();
+        let mut accepted = pin!(accepted(TcpListener::from_std(listener).unwrap(), Duration::from_secs(1)));
+        let (mut all, mut longest) = (0, 0);
+        while all < DIALLED {
+            accepted.next().await.expect("it listens").unwrap();
+            let mut at_once = 1;
+            while let Some(next) = accepted.next().now_or_never() {
+                next.expect("it listens").unwrap();
+                at_once += 1;
+            }
+            longest = at_once.max(longest);
+            all += at_once;
+        }
+        assert!(longest <= AT_ONCE_MAX, "{longest} without a pause");
     }
 
     #[test]
