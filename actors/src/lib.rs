@@ -38,6 +38,9 @@ pub mod config;
 
 #[cfg(test)]
 mod documentation;
+#[cfg(feature = "fuzzing")]
+#[doc(hidden)]
+pub mod fuzzing;
 mod gncl;
 pub mod inspect;
 #[cfg(all(test, target_os = "linux"))]

@@ -18,6 +18,8 @@ mod account;
 mod batch;
 mod draining;
 mod expiry;
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 mod half;
 mod held;
 mod outcomes;

@@ -1,7 +1,10 @@
-//! A hostile peer in shared memory whose every act the fuzzer chooses, and when this side acts between them.
+//! The format `ring` of `sinew-formats`, with bytes that libFuzzer chooses by what they reach.
 
 #![no_main]
 
-libfuzzer_sys::fuzz_target!(|script: &[u8]| {
-    let _ = sinew_shm::hostile::play(script);
+use sinew_formats::Format;
+
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
+    let format = Format::named("ring").expect("it has this name");
+    (format.play)(bytes);
 });

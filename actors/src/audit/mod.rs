@@ -20,6 +20,8 @@ mod answering;
 mod asking;
 mod book;
 mod compare;
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 mod reading;
 mod system;
 mod table;

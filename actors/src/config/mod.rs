@@ -101,7 +101,8 @@ pub struct GnclConfig {
     /// Bytes of their payloads at most, each class by itself; one message waits however long it is. 4 KiB to 1 GiB;
     /// default 16 MiB.
     pub queue_bytes: usize,
-    /// Connections whose peer has not said who it is, at most; for a further one the oldest is closed. 1 to 1,024; default 64.
+    /// Connections whose peer has not said who it is, at most; for a further one one of them is closed, first from where most
+    /// come. 1 to 1,024; default 64.
     pub strangers_max: usize,
     /// Time for a handshake. 10 ms to 60 s; default 2 s.
     pub handshake: Duration,

@@ -49,6 +49,8 @@ mod bulk;
 mod core;
 mod datagrams;
 mod facts;
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 mod inbound;
 #[cfg(target_os = "linux")]
 mod interfaces;

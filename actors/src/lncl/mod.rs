@@ -29,6 +29,8 @@ mod core;
 mod descriptors;
 mod door;
 mod facts;
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 mod introductions;
 mod link;
 mod listener;

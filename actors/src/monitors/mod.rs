@@ -17,6 +17,8 @@
 //! | MON-8 | That nobody is there, or no such node is known, is told to one watcher 256 times at once and then once every 10 ms; what waits for its time counts as a monitor. |
 
 mod core;
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 mod shell;
 #[cfg(test)]
 mod tests;

@@ -45,6 +45,8 @@ mod actor;
 mod core;
 mod datagram;
 mod facts;
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 mod mdns;
 mod probe;
 mod progress;

@@ -26,6 +26,8 @@
 //! | `inbox` | child | where the application's messages come from |
 //! | `wire` | child | reads what the node says |
 
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 mod group;
 mod held;
 mod host;

@@ -25,6 +25,8 @@
 
 #[cfg(test)]
 mod credit_model;
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 #[cfg(test)]
 mod model;
 mod receiving;

@@ -28,6 +28,8 @@ mod actor_tests;
 mod arrivals;
 mod core;
 mod facts;
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 mod list;
 mod words;
 

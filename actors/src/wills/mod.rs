@@ -13,6 +13,8 @@
 //! | WILL-4 | A will of more than 1,024 bytes, and what is more than 256 wills of a node or than `payload_max` has room for, stays at home. One list is held of each of `ndl.nodes_max` nodes. |
 
 mod core;
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 mod shell;
 #[cfg(test)]
 mod tests;

@@ -12,6 +12,8 @@
 mod acquaintance;
 mod connections;
 mod dials;
+#[cfg(feature = "fuzzing")]
+pub(super) mod fuzzing;
 mod handshake;
 mod links;
 mod sides;

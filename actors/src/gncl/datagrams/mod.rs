@@ -29,6 +29,8 @@
 
 mod channel;
 mod core;
+#[cfg(feature = "fuzzing")]
+pub(super) mod fuzzing;
 mod incoming;
 mod outgoing;
 mod packet;

@@ -1,0 +1,42 @@
+//! Any list of a directory, and any word of barriers, against what is promised.
+
+use sinew_runtime::wire::decode;
+
+use super::{ArriveAtBarrier, LeaveBarrier, arrivals::Arrivals, list::List};
+use crate::fuzzing::is_read_as_written;
+
+/// Of a list nothing may be left out here.
+const ROOM: usize = 1 << 20;
+
+pub(crate) fn said() -> Vec<Vec<u8>> {
+    use sinew_runtime::tid::{AppAddress, Incarnation};
+    let name = |name: &str| name.to_owned().try_into().expect("it is short");
+    let entry = super::list::Entry {
+        name: name("knee.drive"),
+        app: AppAddress::new(0x8000_0001),
+        ready: true,
+        ended: None,
+        phases: vec![name("calibrated")],
+        requires: Vec::new(),
+        kinds: Vec::new(),
+    };
+    let list = List { incarnation: Incarnation(1), version: 2, entries: vec![entry], groups: Vec::new() };
+    let arrivals = Arrivals { incarnation: Incarnation(1), version: 2, barriers: Vec::new() };
+    vec![list.encode(ROOM).0.to_vec(), arrivals.encode().to_vec()]
+}
+
+pub(crate) fn words(bytes: &[u8]) -> bool {
+    let list = List::parse(bytes);
+    if let Ok(list) = &list {
+        let (written, left_out) = list.clone().encode(ROOM);
+        assert_eq!(left_out, 0);
+        assert_eq!(&List::parse(&written).expect("what was written can be read"), list);
+    }
+    let arrivals = Arrivals::parse(bytes);
+    if let Ok(arrivals) = &arrivals {
+        assert_eq!(&Arrivals::parse(&arrivals.encode()).expect("what was written can be read"), arrivals);
+    }
+    // These come from applications, and are checked when they are carried out.
+    let asked = decode::<ArriveAtBarrier>(bytes).is_ok() || decode::<LeaveBarrier>(bytes).is_ok();
+    is_read_as_written::<List>(bytes) || arrivals.is_ok() || asked
+}

@@ -1,0 +1,148 @@
+//! What people and their tools write: configurations, keys, recorded trials, topologies.
+
+use exoskeleton::{
+    gait::trial::Trial,
+    joint::Joint,
+    robot::{
+        datagram::{Reading, Word},
+        topology::Topology,
+    },
+};
+use sinew::{
+    AppAddress, NodeAddress, NodeConfig, Requirement, Tid,
+    fault::Fault,
+    security::{Certificate, DenyList, DiscoveryKey, Serial, rustls::pki_types::CertificateDer},
+};
+
+/// Longer texts are the same again and again.
+const TEXT_MAX: usize = 16 * 1024;
+
+pub(crate) fn some_configurations() -> Vec<Vec<u8>> {
+    let texts = [
+        "[node]\nname = 'knee'\naddress = '10.0.0.7'\nproject = 'exo'\npayload_max = 65536\n[lncl]\n[gncl]\nport = 7000\n\
+         strangers_max = 16\nhandshake_ms = 100\nfurther = ['10.1.0.7']\n[ndl]\nmulticast = '239.255.1.2:7001'\nperiod_ms = 100\n\
+         seeds = ['10.0.0.8:7001']\nmdns_port = false\n[sync]\n[supervision]\n[security]\n",
+        "2d6f  # hip\n\nab\n",
+        "10.0.0.7/0x80000001",
+        "knee.drive within 3s",
+        "3 of leg.*",
+        "knee.drive:panic@1000, GNCL:hang(200ms)@5, hip.drive:slow(3ms)@100..200, sync:panic@every(500)",
+        "00112233445566778899aabbccddeeff00112233445566778899aabbccddeeff\n",
+    ];
+    texts.map(|text| text.as_bytes().to_vec()).into()
+}
+
+/// A configuration file, a deny list, a key, a list of faults, and every address and requirement that stands in one.
+pub(crate) fn configuration(bytes: &[u8]) -> bool {
+    let is_key = DiscoveryKey::read(bytes).is_some_and(|key| {
+        let again = DiscoveryKey::read(key.text().as_bytes()).expect("what was written can be read");
+        assert_eq!(*again.text(), *key.text());
+        true
+    });
+    let Some(text) = std::str::from_utf8(bytes).ok().filter(|text| text.len() <= TEXT_MAX) else {
+        return is_key;
+    };
+    let config = NodeConfig::from_toml(text);
+    if let Err(faults) = &config {
+        assert!(!faults.to_string().is_empty(), "a refusal has words");
+    }
+    let denied = DenyList::read(text);
+    if let Ok(tid) = text.parse::<Tid>() {
+        assert_eq!(tid.to_string().parse::<Tid>().ok(), Some(tid));
+    }
+    if let Ok(node) = text.parse::<NodeAddress>() {
+        assert_eq!(node.to_string().parse::<NodeAddress>().ok(), Some(node));
+    }
+    let is_serial = text.parse::<Serial>().is_ok_and(|serial| {
+        assert_eq!(serial.to_string().parse::<Serial>().as_ref(), Ok(&serial));
+        true
+    });
+    let others = [
+        config.is_ok(),
+        denied.is_ok(),
+        is_serial,
+        text.parse::<AppAddress>().is_ok(),
+        text.parse::<Requirement>().is_ok(),
+        text.parse::<Fault>().is_ok(),
+    ];
+    is_key || others.contains(&true)
+}
+
+/// What a stranger shows in the handshake of TLS, before anything of it is proven.
+pub(crate) fn certificate(der: &[u8]) -> bool {
+    let Ok(read) = Certificate::read(CertificateDer::from(der.to_vec())) else { return false };
+    let _ = (read.identity(), read.project(), read.validity());
+    assert_eq!(read.serial().to_string().parse::<Serial>().as_ref(), Ok(read.serial()));
+    true
+}
+
+pub(crate) fn some_trials() -> Vec<Vec<u8>> {
+    let mut text = "time_s,hip_r_deg,knee_r_deg,ankle_r_deg,grf_v_r,stance_r\n".to_owned();
+    // As short as a trial may be: eight strides of half a second, 50 rows each second.
+    for row in 0..208 {
+        let time = f64::from(row) * 0.02;
+        let stance = u8::from(row % 25 < 15);
+        let phase = 2.0 * time * std::f64::consts::TAU;
+        text += &format!(
+            "{time:.2},{:.0},{:.0},1,{stance},{stance}\n",
+            20.0 * phase.cos(),
+            30.0 + 30.0 * phase.sin()
+        );
+    }
+    vec![text.into_bytes()]
+}
+
+/// A recorded trial, and the datagrams of devices that a robot's nodes exchange with a plant.
+pub(crate) fn trial(bytes: &[u8]) -> bool {
+    if let Ok(word) = Word::decode(bytes) {
+        assert!(Word::decode(&word.encode()).is_ok());
+    }
+    if let Ok(reading) = Reading::decode(bytes) {
+        assert!(Reading::decode(&reading.encode()).is_ok());
+    }
+    let Some(text) = std::str::from_utf8(bytes).ok().filter(|text| text.len() <= 4 * TEXT_MAX) else {
+        return false;
+    };
+    let trial = match Trial::parse(text) {
+        Ok(trial) => trial,
+        Err(error) => {
+            assert!(!error.to_string().is_empty(), "a refusal has words");
+            return false;
+        }
+    };
+    let strikes = trial.heel_strikes_s();
+    assert!(strikes.len() >= 2 && strikes.is_sorted());
+    for time in [strikes[0], strikes[strikes.len() - 1], -1e300, 1e300] {
+        let (at, duration) = trial.strides_at(time);
+        assert!(at.is_finite() && duration.is_finite() && duration > 0.0, "{at} {duration} at {time}");
+        let load = trial.vertical_load_bw(time);
+        assert!(load.is_finite() && trial.hip_raw_deg(time).is_finite(), "{load} at {time}");
+    }
+    for joint in Joint::ALL {
+        let _ = trial.angle_rad(joint, strikes[0]);
+    }
+    true
+}
+
+pub(crate) fn some_topologies() -> Vec<Vec<u8>> {
+    let files = [include_str!("../../../examples/exoskeleton/topology.toml")];
+    files.map(|file| file.as_bytes().to_vec()).into()
+}
+
+/// Which node of a robot is where.
+pub(crate) fn topology(bytes: &[u8]) -> bool {
+    let Some(text) = std::str::from_utf8(bytes).ok().filter(|text| text.len() <= TEXT_MAX) else {
+        return false;
+    };
+    match Topology::parse(text) {
+        Ok(read) => {
+            let written = read.to_toml();
+            assert_eq!(Topology::parse(&written).expect("what was written can be read").to_toml(), written);
+            true
+        }
+        Err(faults) => {
+            assert!(!faults.to_string().is_empty(), "a refusal has words");
+            false
+        }
+    }
+}
