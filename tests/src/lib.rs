@@ -1,6 +1,7 @@
 //! What the scenarios stand on: puppets that do as they are told and write down what they saw, programs that are watched
 //! line by line, and hosts made of network namespaces.
 
+pub mod attacks;
 pub mod clients;
 pub mod dice;
 mod ground;

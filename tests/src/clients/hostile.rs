@@ -28,8 +28,8 @@ use std::{
 use rustix::process::{Signal, getpid, kill_process};
 use sinew::{Kind, NodeApi, Registration};
 
+pub(crate) use self::lingering::Keeper;
 use self::{
-    lingering::Keeper,
     stranger::{Frame, Stranger},
     tricks::{Attacker, Tally},
 };

@@ -44,10 +44,22 @@ impl Performer {
         role: &str,
         arguments: &[String],
         environment: &[(&str, &Path)],
-        mut hear: impl FnMut(&str) + Send + 'static,
+        hear: impl FnMut(&str) + Send + 'static,
     ) -> Self {
         let mut command = Command::new(program);
         command.arg("--role").arg(role).args(arguments).envs(environment.iter().copied());
+        Self::start_command(command, role, hear)
+    }
+
+    /// The same with a command that starts a program in this role, such as one on another host.
+    ///
+    /// # Panics
+    /// If it cannot be started.
+    pub(crate) fn start_command(
+        mut command: Command,
+        role: &str,
+        mut hear: impl FnMut(&str) + Send + 'static,
+    ) -> Self {
         let spawned = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
         let mut child = spawned.unwrap_or_else(|error| panic!("{role} does not start: {error}"));
         let (input, output) = (child.stdin.take(), child.stdout.take().expect("its output is a pipe"));

@@ -29,11 +29,11 @@ const LOOK: Duration = Duration::from_millis(20);
 const KEPT_MAX: usize = 1_024;
 
 /// The director's: keeps the other ends.
-pub(super) struct Keeper(TcpListener);
+pub(crate) struct Keeper(TcpListener);
 
 impl Keeper {
     /// Listens on loopback.
-    pub(super) fn new() -> Self {
+    pub(crate) fn new() -> Self {
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a port on loopback");
         listener.set_nonblocking(true).expect("a port on loopback");
         // So little is taken, though nobody reads.
@@ -41,12 +41,12 @@ impl Keeper {
         Self(listener)
     }
 
-    pub(super) fn port(&self) -> u16 {
+    pub(crate) fn port(&self) -> u16 {
         self.0.local_addr().expect("a port on loopback").port()
     }
 
     /// Keeps each end for its time, until it is told not to.
-    pub(super) fn keep(&self, over: &AtomicBool) {
+    pub(crate) fn keep(&self, over: &AtomicBool) {
         let mut kept = VecDeque::new();
         while !over.load(Ordering::Relaxed) {
             while let Ok((end, _)) = self.0.accept() {

@@ -1,0 +1,263 @@
+//! The claim: whatever somebody on a secured robot's network does, nobody gets in, nobody is lost, those who talk feel little of it, and
+//! the node's memory stays within its bounds.
+//!
+//! Two nodes with keys on hosts of their own, each a process: `hip` asks `knee` a thousand times a second. An attacker on a third host does one
+//! thing to `knee`. Meanwhile, where that is the question, an honest peer that `knee` does not know comes from a fourth host, and a node `ankle`
+//! is started there. Hosts are network namespaces joined by veth pairs, which the program makes and removes.
+//!
+//! | file | what it is |
+//! | --- | --- |
+//! | `keys` | the robot's authority, and another one |
+//! | `node` | the role of each node |
+//! | `robot` | the nodes, as the director sees them |
+//! | `stranger` | a peer by hand: TLS, HELLO, a session |
+//! | `tried/` | what is done, one file each |
+//! | `report` | what was seen |
+
+mod keys;
+mod node;
+mod report;
+mod robot;
+mod stranger;
+mod tried;
+
+use std::{
+    path::PathBuf,
+    process::ExitCode,
+    sync::atomic::{AtomicBool, Ordering},
+    thread,
+    time::{Duration, Instant},
+};
+
+use rustix::process::{Resource, Rlimit, getrlimit, setpriority_process, setrlimit};
+
+pub use self::report::{Report, Row};
+use self::{
+    keys::{Keys, Who},
+    robot::Robot,
+    stranger::Stranger,
+};
+use crate::{Host, Hosts};
+
+/// Which of the hosts is whose.
+const HIP: usize = 0;
+const KNEE: usize = 1;
+const ATTACKER: usize = 2;
+const NEWCOMER: usize = 3;
+/// Memory that a node may grow by under attack, in bytes.
+pub const GROWTH_MAX: u64 = 64 << 20;
+/// How much slower live traffic may be at its 99th percentile.
+pub const SLOWER_MAX: f64 = 2.0;
+/// Below this the 99th percentile says more of the machine than of the node.
+const P99_FLOOR: Duration = Duration::from_micros(200);
+/// Nodes settle for so long before they are measured.
+const SETTLING: Duration = Duration::from_secs(1);
+/// Time between two looks at memory, and between two honest peers by hand.
+const LOOK: Duration = Duration::from_millis(100);
+/// Descriptors that the director needs for an attacker's connections.
+const DESCRIPTORS: u64 = 16_384;
+
+/// What is to be done.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    /// A program whose `main` calls [`play`] first.
+    pub program: PathBuf,
+    /// How long each attack lasts, and the time before that is compared with it.
+    pub lasts: Duration,
+    /// The names of those that are tried; none: all.
+    pub only: Vec<String>,
+}
+
+/// Something that is done to a node.
+struct Attack {
+    /// Its name, for `--only`.
+    name: &'static str,
+    /// What is tried, in words.
+    tried: &'static str,
+    /// Descriptors of the attacked node; `None`: as many as the system allows.
+    descriptors: Option<u32>,
+    /// Others want to come in meanwhile.
+    others_come: bool,
+    /// In whose name he may speak: his own.
+    own: Who,
+    /// Does it until the scene is over.
+    run: fn(&Scene<'_>) -> Happened,
+}
+
+/// What came of it, as far as the attacker knows.
+struct Happened {
+    /// In words.
+    what: String,
+    /// What must not have been.
+    broken: Vec<String>,
+}
+
+/// Where an attack takes place.
+struct Scene<'a> {
+    robot: &'a Robot,
+    keys: &'a Keys,
+    hosts: &'a [Host],
+    program: &'a PathBuf,
+    lasts: Duration,
+    over: &'a AtomicBool,
+}
+
+impl Scene<'_> {
+    fn is_over(&self) -> bool {
+        self.over.load(Ordering::Relaxed)
+    }
+
+    /// Waits, but not longer than the scene.
+    fn rest(&self, time: Duration) {
+        let until = Instant::now() + time;
+        while !self.is_over() && Instant::now() < until {
+            thread::sleep(time.min(Duration::from_millis(10)));
+        }
+    }
+
+    /// Does this on the attacker's host until the scene is over, on so many threads, which are nicer than all nodes: the CPUs are shared.
+    fn on_threads<R: Send>(&self, threads: usize, work: impl Fn(usize) -> R + Sync) -> Vec<R> {
+        self.hosts[ATTACKER].run(|| {
+            give_way();
+            thread::scope(|scope| {
+                let work = &work;
+                let running: Vec<_> = (0..threads).map(|number| scope.spawn(move || work(number))).collect();
+                running
+                    .into_iter()
+                    .map(|thread| thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+                    .collect()
+            })
+        })
+    }
+}
+
+/// On a machine whose CPUs the attacker shares with the nodes, he has what they leave.
+fn give_way() {
+    const NICEST: i32 = 19;
+    // It goes on as it is where the system refuses it.
+    let _ = setpriority_process(None, NICEST);
+}
+
+/// Plays the role that this process was started for; `None` if it is the director.
+#[must_use]
+pub fn play() -> Option<ExitCode> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    match &arguments[..] {
+        [flag, role, rest @ ..] if flag == "--role" && role == "robot-node" => node::play(rest),
+        // That of a client at the door.
+        _ => return crate::clients::play(),
+    }
+    Some(ExitCode::SUCCESS)
+}
+
+/// The names of all attacks, and what each tries.
+#[must_use]
+pub fn known() -> Vec<(&'static str, &'static str)> {
+    tried::ATTACKS.iter().map(|attack| (attack.name, attack.tried)).collect()
+}
+
+/// Attacks a robot in all ways of the plan, one after the other, each a new robot.
+///
+/// # Errors
+/// A sentence: why no hosts can be made here, or which attack is not known.
+///
+/// # Panics
+/// If a node does not start, or does not answer.
+pub fn run(plan: &Plan) -> Result<Report, String> {
+    if let Some(name) = plan.only.iter().find(|name| known().iter().all(|(known, _)| known != name)) {
+        let names: Vec<_> = known().iter().map(|(name, _)| *name).collect();
+        return Err(format!("there is no attack {name}; there are: {}", names.join(", ")));
+    }
+    let hosts = Hosts::new(4)?;
+    allow_descriptors();
+    let is_meant =
+        |attack: &&Attack| plan.only.is_empty() || plan.only.iter().any(|name| name == attack.name);
+    let rows = tried::ATTACKS.iter().filter(is_meant).map(|attack| one(attack, plan, &hosts)).collect();
+    Ok(Report { rows })
+}
+
+/// For connections that are held by thousands.
+fn allow_descriptors() {
+    let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
+    let wanted = maximum.map_or(DESCRIPTORS, |maximum| maximum.min(DESCRIPTORS));
+    if current.is_some_and(|current| current < wanted) {
+        // With fewer, fewer are held, and the report says how many.
+        let _ = setrlimit(Resource::Nofile, Rlimit { current: Some(wanted), maximum });
+    }
+}
+
+/// One attack on a robot of its own.
+fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
+    let hosts = hosts.all();
+    let keys = Keys::make();
+    let mut robot = Robot::start(&plan.program, hosts, &keys, attack.descriptors);
+    thread::sleep(SETTLING);
+    robot.window();
+    thread::sleep(plan.lasts);
+    let before = robot.window();
+    let (held_before, over) = (robot.held_bytes(), AtomicBool::new(false));
+    let (mut held_most, mut came) = (held_before, None);
+    let scene =
+        Scene { robot: &robot, keys: &keys, hosts, program: &plan.program, lasts: plan.lasts, over: &over };
+    let (happened, by_hand) = thread::scope(|scope| {
+        let _ends = EndsIt(&over);
+        let attacking = scope.spawn(|| (attack.run)(&scene));
+        let knocking = attack.others_come.then(|| scope.spawn(|| knock(&scene)));
+        let until = Instant::now() + plan.lasts;
+        let ankle = attack.others_come.then(|| {
+            // In the middle of it.
+            thread::sleep(plan.lasts / 4);
+            let began = Instant::now();
+            let ankle = robot.start_newcomer(&hosts[NEWCOMER]);
+            came = Some(began.elapsed());
+            ankle
+        });
+        while Instant::now() < until {
+            held_most = held_most.max(robot.held_bytes());
+            thread::sleep(LOOK);
+        }
+        drop(ankle);
+        over.store(true, Ordering::Relaxed);
+        let happened = attacking.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+        let by_hand =
+            knocking.map(|knocking| knocking.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
+        (happened, by_hand)
+    });
+    let during = robot.window();
+    held_most = held_most.max(robot.held_bytes());
+    let seen = robot.seen();
+    robot.end();
+    Row::of(attack, before, during, held_most.saturating_sub(held_before), (happened, seen), (came, by_hand))
+}
+
+/// Ends the scene also when something panics: else nobody would hear of it.
+struct EndsIt<'a>(&'a AtomicBool);
+
+impl Drop for EndsIt<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+/// How many honest peers that the node does not know came in, of how many that wanted to.
+#[derive(Clone, Copy, Debug, Default)]
+struct Knocked {
+    tried: u64,
+    came_in: u64,
+}
+
+/// An honest peer that the node has not heard of, with keys of the project: it dials, says hello, and goes, again and again.
+fn knock(scene: &Scene<'_>) -> Knocked {
+    let tls = scene.keys.tls(keys::SPARE);
+    let mut knocked = Knocked::default();
+    scene.hosts[NEWCOMER].run(|| {
+        while !scene.is_over() {
+            knocked.tried += 1;
+            let greeted = Stranger::dial(scene.robot.knee(), Some(&tls))
+                .and_then(|mut stranger| stranger.hello(keys::SPARE, scene.robot.knee_address()));
+            knocked.came_in += u64::from(matches!(greeted, Ok(stranger::Answer::Welcome)));
+            scene.rest(LOOK);
+        }
+    });
+    knocked
+}

@@ -1,0 +1,223 @@
+//! The nodes of a robot on their hosts, as the director sees them.
+
+use std::{
+    collections::BTreeMap,
+    net::SocketAddr,
+    path::{Path, PathBuf},
+    process::Command,
+    sync::{
+        Mutex, PoisonError,
+        mpsc::{Receiver, sync_channel},
+    },
+    time::Duration,
+};
+
+use sinew::{NodeAddress, Tid};
+
+use super::keys::{self, Keys, PROJECT, Who};
+use crate::{
+    DEADLINE, Host,
+    clients::{Held, Performer},
+    own_group,
+};
+
+/// Ports that the attacked nodes listen at: each has a host of its own.
+const GNCL_PORT: u16 = 7_700;
+pub(super) const NDL_PORT: u16 = 7_701;
+
+/// How long answers took.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Window {
+    /// Answers.
+    pub count: u64,
+    /// Questions without one.
+    pub failed: u64,
+    /// Half of the answers took no longer.
+    pub p50: Duration,
+    /// 99 of 100.
+    pub p99: Duration,
+    /// The longest.
+    pub max: Duration,
+}
+
+/// What a node has seen of others in its life.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Seen {
+    pub(super) lost: u64,
+    pub(super) found: u64,
+    /// Messages that nobody of the robot sends, by the last byte of the node that they say they are from.
+    pub(super) sent: BTreeMap<u8, u64>,
+}
+
+/// A node in its process.
+struct Member {
+    performer: Performer,
+    /// Nobody but the director reads them; attackers look at the rest of the robot.
+    answers: Mutex<Receiver<String>>,
+}
+
+impl Member {
+    fn start(command: Command) -> Self {
+        let (say, answers) = sync_channel(16);
+        let hear = move |line: &str| {
+            // Nobody waits for its answers any more when the director is done.
+            let _ = say.send(line.to_owned());
+        };
+        Self {
+            performer: Performer::start_command(command, "robot-node", hear),
+            answers: Mutex::new(answers),
+        }
+    }
+
+    fn answer(&self, to: &str) -> String {
+        let answer = self.answers.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(DEADLINE);
+        answer.unwrap_or_else(|_| panic!("a node did not answer `{to}` within {DEADLINE:?}"))
+    }
+
+    fn ask(&mut self, question: &str) -> String {
+        self.performer.tell(question);
+        self.answer(question)
+    }
+
+    fn seen(&mut self) -> Seen {
+        let [lost, found, ref sent @ ..] = numbers(&self.ask("seen"))[..] else {
+            panic!("two numbers and more")
+        };
+        let sent = sent.chunks_exact(2).map(|pair| (pair[0] as u8, pair[1])).collect();
+        Seen { lost, found, sent }
+    }
+}
+
+fn numbers(line: &str) -> Vec<u64> {
+    line.split_whitespace().map(|word| word.parse().expect("a number")).collect()
+}
+
+/// The two nodes that talk, of which one is attacked.
+pub(super) struct Robot {
+    program: PathBuf,
+    directory: PathBuf,
+    group: std::net::SocketAddrV4,
+    hip: Member,
+    knee: Member,
+    newcomer_keys: PathBuf,
+    echo: Tid,
+}
+
+impl Robot {
+    /// Starts both, and returns when they talk. The attacked one may have so many descriptors only.
+    pub(super) fn start(program: &Path, hosts: &[Host], keys: &Keys, descriptors: Option<u32>) -> Self {
+        let (group, directory) = (own_group(), keys.path(""));
+        let config = |who: Who| configuration(&directory, group, who, Some(&keys.of(who)));
+        let knee = as_role(program, &config(keys::KNEE), &[]);
+        let knee = match descriptors {
+            Some(descriptors) => limited(&knee, descriptors),
+            None => knee,
+        };
+        let mut knee = Member::start(hosts[super::KNEE].moved(&knee));
+        knee.answer("up");
+        let echo = Tid::from_bits(numbers(&knee.ask("tid"))[0]);
+        let hip = Member::start(hosts[super::HIP].moved(&as_role(program, &config(keys::HIP), &["asks"])));
+        hip.answer("up");
+        let newcomer_keys = keys.of(keys::ANKLE);
+        Self { program: program.to_owned(), directory, group, hip, knee, newcomer_keys, echo }
+    }
+
+    /// A node of the robot's that was not there; returns when it has an answer of the attacked one.
+    pub(super) fn start_newcomer(&self, host: &Host) -> impl Sized + use<> {
+        let config = configuration(&self.directory, self.group, keys::ANKLE, Some(&self.newcomer_keys));
+        let ankle = Member::start(host.moved(&as_role(&self.program, &config, &["asks"])));
+        ankle.answer("up");
+        ankle
+    }
+
+    /// A command that starts a whole node there, with keys that it should not have, or none.
+    pub(super) fn foreign_node(&self, host: &Host, keys: Option<&Path>) -> Command {
+        let config = configuration(&self.directory, self.group, keys::MALLORY, keys);
+        host.moved(&as_role(&self.program, &config, &["asks"]))
+    }
+
+    /// Where the attacked node takes connections.
+    #[expect(clippy::unused_self, reason = "it is the robot's, whichever is attacked")]
+    pub(super) fn knee(&self) -> SocketAddr {
+        (keys::KNEE.address(), GNCL_PORT).into()
+    }
+
+    #[expect(clippy::unused_self, reason = "it is the robot's, whichever is attacked")]
+    pub(super) fn knee_address(&self) -> NodeAddress {
+        keys::KNEE.node()
+    }
+
+    /// Where it takes datagrams of discovery.
+    #[expect(clippy::unused_self, reason = "it is the robot's, whichever is attacked")]
+    pub(super) fn discovery(&self) -> SocketAddr {
+        (keys::KNEE.address(), NDL_PORT).into()
+    }
+
+    pub(super) const fn group(&self) -> std::net::SocketAddrV4 {
+        self.group
+    }
+
+    /// The socket of the attacked node's door.
+    pub(super) fn door(&self) -> PathBuf {
+        self.directory.join(format!("{}.sock", keys::KNEE.name))
+    }
+
+    /// The TID of the application that is asked: everybody who has been a member knows it.
+    pub(super) const fn echo(&self) -> Tid {
+        self.echo
+    }
+
+    /// What the asking node measured since the last one.
+    pub(super) fn window(&mut self) -> Window {
+        let [count, failed, p50, p99, max] = numbers(&self.hip.ask("window"))[..] else {
+            panic!("five numbers")
+        };
+        let [p50, p99, max] = [p50, p99, max].map(Duration::from_nanos);
+        Window { count, failed, p50, p99, max }
+    }
+
+    /// What both have seen.
+    pub(super) fn seen(&mut self) -> [Seen; 2] {
+        [self.hip.seen(), self.knee.seen()]
+    }
+
+    /// Memory of the attacked node, in bytes.
+    pub(super) fn held_bytes(&self) -> u64 {
+        Held::of(self.knee.performer.id()).own_kib << 10
+    }
+
+    /// Ends both in order.
+    pub(super) fn end(self) {
+        for member in [self.hip, self.knee] {
+            let status = member.performer.end();
+            assert!(status.success(), "a node ended with {status}");
+        }
+    }
+}
+
+fn as_role(program: &Path, config: &Path, more: &[&str]) -> Command {
+    let mut command = Command::new(program);
+    command.args(["--role", "robot-node"]).arg(config).args(more);
+    command
+}
+
+/// The same command with so many descriptors.
+fn limited(command: &Command, descriptors: u32) -> Command {
+    let mut limited = Command::new("sh");
+    limited.args(["-c", r#"ulimit -n $0 && exec "$@""#, &descriptors.to_string()]);
+    limited.arg(command.get_program()).args(command.get_args());
+    limited
+}
+
+fn configuration(directory: &Path, group: std::net::SocketAddrV4, who: Who, keys: Option<&Path>) -> PathBuf {
+    let path = directory.join(format!("{}.toml", who.name));
+    let (name, address, socket) = (who.name, who.address(), directory.join(format!("{}.sock", who.name)));
+    let keys = keys.map_or("false".to_owned(), |keys| format!("{keys:?}"));
+    let text = format!(
+        "[node]\nname = \"{name}\"\naddress = \"{address}\"\nproject = \"{PROJECT}\"\n[lncl]\nsocket = {socket:?}\n\
+         [gncl]\nport = {GNCL_PORT}\n[ndl]\ninterface = \"{address}\"\nport = {NDL_PORT}\nmulticast = \"{group}\"\n\
+         mdns_port = false\nperiod_ms = 100\n[security]\nkeys = {keys}\n"
+    );
+    std::fs::write(&path, text).expect("the scene's own directory");
+    path
+}

@@ -1,0 +1,49 @@
+//! Who connects, and says nothing.
+
+use std::{
+    collections::VecDeque,
+    net::TcpStream,
+    time::{Duration, Instant},
+};
+
+use super::{Happened, Scene};
+
+const THREADS: usize = 4;
+/// Connections that are held at once, of all threads together.
+const HELD: usize = 10_000;
+/// What the system may take to make one: beyond that it has no room for now.
+const PATIENCE: Duration = Duration::from_millis(200);
+
+pub(super) fn ten_thousand(scene: &Scene<'_>) -> Happened {
+    let seen = scene.on_threads(THREADS, |_| {
+        let (mut made, mut held, mut most, mut longest) = (0_u64, VecDeque::new(), 0, Duration::ZERO);
+        while !scene.is_over() {
+            let began = Instant::now();
+            if let Ok(silent) = TcpStream::connect_timeout(&scene.robot.knee(), PATIENCE) {
+                made += 1;
+                held.push_back(silent);
+                longest = longest.max(began.elapsed());
+            } else {
+                // There are no ports or descriptors left, or the node's system has no room.
+                std::thread::sleep(Duration::from_millis(1));
+                held.pop_front();
+            }
+            most = held.len().max(most);
+            if held.len() >= HELD / THREADS {
+                held.pop_front();
+            }
+        }
+        (made, most, longest)
+    });
+    let (made, most): (u64, usize) =
+        seen.iter().fold((0, 0), |(made, most), one| (made + one.0, most + one.1));
+    let longest = seen.iter().map(|one| one.2).max().unwrap_or_default();
+    let mut broken = Vec::new();
+    if made == 0 {
+        broken.push("no connection was made".to_owned());
+    }
+    Happened {
+        what: format!("{made} made, {most} open at this end at once; the longest took {longest:.0?}"),
+        broken,
+    }
+}

@@ -1,0 +1,66 @@
+//! Who is in, and speaks for others.
+
+use std::{io, time::Duration};
+
+use sinew::{AppAddress, Payload as _, Tid};
+use sinew_runtime::wire::{Header, Kind};
+
+use super::{
+    super::{
+        keys::{self, SPARE, Who},
+        stranger::{Answer, Stranger, words},
+    },
+    Happened, Scene,
+};
+use crate::puppet::Order;
+
+/// Messages in each millisecond.
+const AT_ONCE: u64 = 5;
+/// An application of the one that speaks.
+const OWN: AppAddress = AppAddress::new(0x8000_0001);
+
+pub(super) fn forged(scene: &Scene<'_>) -> Happened {
+    let sent = scene.on_threads(1, |_| speak(scene)).pop().unwrap_or_else(|| Ok([0; 2]));
+    match sent {
+        Ok([own, forged]) => {
+            let mut broken = Vec::new();
+            if own == 0 || forged == 0 {
+                broken.push("nothing was sent".to_owned());
+            }
+            Happened {
+                what: format!("{own} messages in its own name, {forged} in that of hip and of knee"),
+                broken,
+            }
+        }
+        Err(error) => Happened {
+            what: format!("its link broke: {error}"),
+            broken: vec!["no link to try it on".to_owned()],
+        },
+    }
+}
+
+/// Returns how many were sent in its own name, and in others'.
+fn speak(scene: &Scene<'_>) -> io::Result<[u64; 2]> {
+    let (peer, echo) = (scene.robot.knee_address(), scene.robot.echo());
+    let mut stranger = Stranger::dial(scene.robot.knee(), Some(&scene.keys.tls(SPARE)))?;
+    if let Answer::Refused(why) = stranger.hello(SPARE, peer)? {
+        return Err(io::Error::other(why));
+    }
+    stranger.begin_session(SPARE, peer)?;
+    let (mut sent, mut number) = ([0; 2], 0_u64);
+    while !scene.is_over() {
+        for says in [SPARE, keys::HIP, keys::KNEE, keys::HIP, keys::KNEE].into_iter().take(AT_ONCE as usize) {
+            number += 1;
+            stranger.send(&header(says, echo, number), &words(&Order { number }))?;
+            sent[usize::from(says.host != SPARE.host)] += 1;
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    Ok(sent)
+}
+
+fn header(says: Who, to: Tid, number: u64) -> Header {
+    let mut header = Header::new(Kind::named(Order::NAME), Tid::new(says.node(), OWN), to);
+    (header.number, header.sequence) = (number as u16, number);
+    header
+}

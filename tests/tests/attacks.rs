@@ -1,0 +1,20 @@
+//! Attacks on a secured robot, in short: the long form is the program `attacks`, which looks at times, too.
+
+use std::time::Duration;
+
+use sinew_tests::{
+    attacks::{Plan, run},
+    program,
+};
+
+#[test]
+fn nobody_gets_in_is_lost_or_fills_memory_whatever_somebody_on_the_network_does() {
+    let report = run(&Plan { program: program("attacks"), lasts: Duration::from_secs(2), only: Vec::new() });
+    match report {
+        Ok(report) => {
+            println!("{report}");
+            assert!(report.has_held(), "an attack was not held off:\n{report}");
+        }
+        Err(why) => println!("skipped: no hosts can be made here: {why}"),
+    }
+}
