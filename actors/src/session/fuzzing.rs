@@ -154,6 +154,7 @@ impl Play<'_> {
             // The peer is told of the new epoch before all else, on this connection.
             self.wire.clear();
             self.receiving.heard(self.link, self.sending.epoch());
+            self.sending.told(self.sending.epoch());
         }
     }
 
