@@ -227,7 +227,8 @@ fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
     held_most = held_most.max(robot.held_bytes());
     let seen = robot.seen();
     robot.end();
-    Row::of(attack, before, during, held_most.saturating_sub(held_before), (happened, seen), (came, by_hand))
+    let growth = held_most.saturating_sub(held_before);
+    Row::of(attack, [before, during], growth, (happened, seen), (came, by_hand))
 }
 
 /// Ends the scene also when something panics: else nobody would hear of it.

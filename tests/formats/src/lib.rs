@@ -136,5 +136,5 @@ fn ring(script: &[u8]) -> bool {
 }
 
 fn some_scripts() -> Vec<Vec<u8>> {
-    vec![(0..=255).collect(), vec![7; 64]]
+    vec![(0..=255).collect(), (0..=255).rev().collect()]
 }

@@ -57,7 +57,9 @@ impl Handler<Delivery<NodeEvent>> for Echo {
         match &event.payload {
             NodeEvent::NodeFound { .. } => self.0.found.fetch_add(1, Ordering::Relaxed),
             NodeEvent::NodeLost { .. } => self.0.lost.fetch_add(1, Ordering::Relaxed),
-            _ => 0,
+            NodeEvent::AppStalled { .. } | NodeEvent::AppResumed { .. } | NodeEvent::NodeRestarted { .. } => {
+                0
+            }
         };
     }
 }

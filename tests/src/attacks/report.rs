@@ -38,8 +38,7 @@ pub struct Row {
 impl Row {
     pub(super) fn of(
         attack: &Attack,
-        before: Window,
-        during: Window,
+        [before, during]: [Window; 2],
         growth: u64,
         (happened, seen): (Happened, [Seen; 2]),
         (came, by_hand): (Option<Duration>, Option<Knocked>),

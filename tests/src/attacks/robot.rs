@@ -212,7 +212,7 @@ fn limited(command: &Command, descriptors: u32) -> Command {
 fn configuration(directory: &Path, group: std::net::SocketAddrV4, who: Who, keys: Option<&Path>) -> PathBuf {
     let path = directory.join(format!("{}.toml", who.name));
     let (name, address, socket) = (who.name, who.address(), directory.join(format!("{}.sock", who.name)));
-    let keys = keys.map_or("false".to_owned(), |keys| format!("{keys:?}"));
+    let keys = keys.map_or_else(|| "false".to_owned(), |keys| format!("{keys:?}"));
     let text = format!(
         "[node]\nname = \"{name}\"\naddress = \"{address}\"\nproject = \"{PROJECT}\"\n[lncl]\nsocket = {socket:?}\n\
          [gncl]\nport = {GNCL_PORT}\n[ndl]\ninterface = \"{address}\"\nport = {NDL_PORT}\nmulticast = \"{group}\"\n\

@@ -20,7 +20,7 @@ const AT_ONCE: u64 = 5;
 const OWN: AppAddress = AppAddress::new(0x8000_0001);
 
 pub(super) fn forged(scene: &Scene<'_>) -> Happened {
-    let sent = scene.on_threads(1, |_| speak(scene)).pop().unwrap_or_else(|| Ok([0; 2]));
+    let sent = scene.on_threads(1, |_| speak(scene)).pop().unwrap_or(Ok([0; 2]));
     match sent {
         Ok([own, forged]) => {
             let mut broken = Vec::new();
