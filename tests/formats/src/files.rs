@@ -26,13 +26,15 @@ pub(crate) fn some_configurations() -> Vec<Vec<u8>> {
         "10.0.0.7/0x80000001",
         "knee.drive within 3s",
         "3 of leg.*",
-        "knee.drive:panic@1000, GNCL:hang(200ms)@5, hip.drive:slow(3ms)@100..200, sync:panic@every(500)",
+        "hang(200ms)@5",
+        "slow(3ms)@100..200",
+        "panic@every(500)",
         "00112233445566778899aabbccddeeff00112233445566778899aabbccddeeff\n",
     ];
     texts.map(|text| text.as_bytes().to_vec()).into()
 }
 
-/// A configuration file, a deny list, a key, a list of faults, and every address and requirement that stands in one.
+/// A configuration file, a deny list, a key, a fault of `SINEW_FAULTS`, and every address and requirement that stands in one.
 pub(crate) fn configuration(bytes: &[u8]) -> bool {
     let is_key = DiscoveryKey::read(bytes).is_some_and(|key| {
         let again = DiscoveryKey::read(key.text().as_bytes()).expect("what was written can be read");
