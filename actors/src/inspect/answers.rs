@@ -139,7 +139,7 @@ impl Discovery {
     fn of(stores: &Stores, now: Time) -> Self {
         let (udp, me, lost, foreign) = {
             let core = lock(&stores.ndl);
-            (core.udp(), core.announcement().clone(), core.lost_nodes(), core.neighbours())
+            (core.paths().first().copied(), core.announcement().clone(), core.lost_nodes(), core.neighbours())
         };
         let mut lost: Vec<_> = lost.into_iter().map(|(node, lost)| lost_report(node, lost, now)).collect();
         lost.sort_by_key(|lost| lost.lost_us);
@@ -377,6 +377,7 @@ mod tests {
             name: "knee".to_owned(),
             incarnation: Incarnation(1),
             udp: ([10, 0, 0, 7], 1).into(),
+            routes: Vec::new(),
             gncl: Vec::new(),
             period: Duration::from_secs(1),
             sources: BTreeMap::new(),

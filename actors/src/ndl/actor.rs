@@ -79,9 +79,10 @@ impl Actor for NdlActor {
         let shell = Rc::new(shell);
         let unicast = tokio::net::UdpSocket::from_std(unicast)
             .unwrap_or_else(|error| give_up(&format!("NDL's socket cannot be watched: {error}")));
-        ctx.spawn(receiving::receive(shell.clone(), unicast, Way::Unicast).into_actor(self));
+        let here = shell.here;
+        ctx.spawn(receiving::receive(shell.clone(), unicast, (here, Way::Unicast)).into_actor(self));
         if let Some(group) = shell.join_group() {
-            ctx.spawn(receiving::receive(shell.clone(), group, Way::Multicast).into_actor(self));
+            ctx.spawn(receiving::receive(shell.clone(), group, (here, Way::Multicast)).into_actor(self));
         }
         // The first queries leave here.
         shell.carry_out();
@@ -139,6 +140,8 @@ fn give_up(words: &str) -> ! {
 struct Shell {
     stores: Arc<Stores>,
     epoch: Epoch,
+    /// Our address for queries.
+    here: SocketAddr,
     /// Sends at once, whatever the runtime knows of the socket.
     socket: std::net::UdpSocket,
     /// The core's next wake is not the one that the timer sleeps for.
@@ -175,13 +178,13 @@ impl Shell {
             let mut core = lock(&stores);
             core.look_at_links(Time::now(), |node, incarnation| links.contains(&(node, incarnation)));
             core.announce_further(stores.gncl_further.get().map_or(&[], Vec::as_slice));
-            core.start(Time::now(), udp, gncl)
+            core.start(Time::now(), &[udp], gncl)
         };
         crate::log::info!(%udp, %gncl, "NDL asks and answers");
         let (rewind, refusals) = (Notify::new(), stores.refusals.clone());
         let (to_probe, probes) = mpsc::channel(PROBES_MAX);
         let probes = RefCell::new(Some(probes));
-        Ok((Self { stores, epoch, socket, rewind, refusals, to_probe, probes }, reader))
+        Ok((Self { stores, epoch, here: udp, socket, rewind, refusals, to_probe, probes }, reader))
     }
 
     fn join_group(&self) -> Option<tokio::net::UdpSocket> {
@@ -203,7 +206,7 @@ impl Shell {
         let port = self.stores.config.ndl.mdns_port?;
         let (udp, me) = {
             let core = lock(&self.stores);
-            (core.udp()?, core.announcement().clone())
+            (*core.paths().first()?, core.announcement().clone())
         };
         Mdns::start(port, udp, &me).inspect_err(|error| warn_of_mdns(port, error)).ok().map(Rc::new)
     }
@@ -237,8 +240,8 @@ impl Shell {
 
     fn obey(&self, output: Output) {
         match output {
-            Output::SendQuery { to, correlation } => self.send_query(to, correlation),
-            Output::SendMulticastQuery { correlation } => {
+            Output::SendQuery { to, correlation } => self.send_query(to.there, correlation),
+            Output::SendMulticastQuery { correlation, .. } => {
                 if let Some(group) = self.stores.config.ndl.multicast {
                     self.send_query(group.into(), correlation);
                 }
@@ -250,9 +253,9 @@ impl Shell {
                 };
                 let (query_sent_ns, query_received_ns) = (query_sent.as_nanos(), query_received.as_nanos());
                 let answer = Answer { announcement, query_sent_ns, query_received_ns, progress };
-                self.send(to, node, correlation, Body::Answer(answer));
+                self.send(to.there, node, correlation, Body::Answer(answer));
             }
-            Output::SendLeave { to, node } => self.send(to, node, 0, Body::Leave(self.me())),
+            Output::SendLeave { to, node } => self.send(to.there, node, 0, Body::Leave(self.me())),
             Output::Probe { node, incarnation, to, within } => {
                 self.stores.gncl.ask_for_a_sign(self.stores.node, node, incarnation);
                 // Where too many are silent at once it is not their hosts that are to be doubted.

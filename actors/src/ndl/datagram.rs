@@ -21,6 +21,9 @@ const NAME_MAX: usize = 63;
 /// Addresses of a node's GNCL at most, beside the first: with the longest names an answer has 400 bytes.
 pub(crate) const FURTHER_MAX: usize = 7;
 
+/// Addresses of a node's NDL at most, each on a path of its own.
+pub(crate) const PATHS_MAX: usize = 8;
+
 /// How a node stands to its address, in the datagram as a number: 1, 2, or not there at all.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "u8", into = "u8")]
@@ -82,6 +85,9 @@ pub(crate) struct Announcement {
     /// Further addresses and ports of the listener, [`FURTHER_MAX`] at most: those of other interfaces.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(crate) gncl_further: Vec<(u32, u16)>,
+    /// All IPv4 addresses and ports where its NDL answers, if there are several; [`PATHS_MAX`] at most. // spec: NDL-3.3
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(crate) ndl: Vec<(u32, u16)>,
     /// Whether the address is its own already, and still.
     #[serde(default, skip_serializing_if = "Claim::is_held")]
     pub(crate) claim: Claim,
@@ -99,6 +105,20 @@ impl Announcement {
         std::iter::once(self.gncl().into()).chain(further).collect()
     }
 
+    /// All addresses where its NDL answers, if there are several.
+    pub(crate) fn ndl_addresses(&self) -> impl Iterator<Item = SocketAddr> {
+        self.ndl.iter().map(|(ip, port)| (Ipv4Addr::from(*ip), *port).into())
+    }
+
+    /// Its NDL answers there. Where there is one address alone, whoever asks it knows it.
+    pub(crate) fn announce_ndl(&mut self, paths: &[SocketAddr]) {
+        let number = |path: &SocketAddr| match path {
+            SocketAddr::V4(path) => Some((path.ip().to_bits(), path.port())),
+            SocketAddr::V6(_) => None,
+        };
+        self.ndl = if paths.len() > 1 { paths.iter().filter_map(number).collect() } else { Vec::new() };
+    }
+
     /// Whether both are from one process.
     pub(crate) fn is_same_life(&self, other: &Self) -> bool {
         self.incarnation == other.incarnation && self.boot_nonce == other.boot_nonce
@@ -114,10 +134,10 @@ impl Announcement {
     fn check(self) -> Result<Self, DatagramError> {
         let name_is_fit =
             |name: &str| (1..=NAME_MAX).contains(&name.len()) && !name.contains(char::is_control);
-        let leads_nowhere = |gncl: SocketAddr| {
-            let SocketAddr::V4(gncl) = gncl else { return true };
-            let ip = gncl.ip();
-            gncl.port() == 0 || ip.is_unspecified() || ip.is_multicast() || ip.is_broadcast()
+        let leads_nowhere = |address: SocketAddr| {
+            let SocketAddr::V4(address) = address else { return true };
+            let ip = address.ip();
+            address.port() == 0 || ip.is_unspecified() || ip.is_multicast() || ip.is_broadcast()
         };
         let fault = if !name_is_fit(&self.project) || !name_is_fit(&self.name) {
             "a name is empty, longer than 63 bytes, or has control characters"
@@ -125,6 +145,10 @@ impl Announcement {
             "its node address names no single node"
         } else if self.gncl_further.len() > FURTHER_MAX {
             "its GNCL has too many addresses"
+        } else if self.ndl.len() > PATHS_MAX {
+            "its NDL has too many addresses"
+        } else if self.ndl_addresses().any(leads_nowhere) {
+            "nobody can be asked at an address of its NDL"
         } else if self.gncl_addresses().into_iter().any(leads_nowhere) {
             "nobody can be reached at an address of its GNCL"
         } else {
@@ -291,13 +315,15 @@ mod tests {
         let names = ("[a-zäöü ]{1,30}", "[a-z.-]{1,63}");
         let place = || (1..0xe000_0000_u32, 1..u16::MAX);
         let further = proptest::collection::vec(place(), 0..=FURTHER_MAX);
-        (names, 1..u32::MAX, any::<[u64; 2]>(), place(), further, any::<u32>(), 0..3u8).prop_map(
+        let ndl = proptest::collection::vec(place(), 0..=PATHS_MAX);
+        (names, 1..u32::MAX, any::<[u64; 2]>(), place(), further, ndl, any::<u32>(), 0..3u8).prop_map(
             |(
                 (name, project),
                 node,
                 [incarnation, boot_nonce],
                 (gncl_ip, gncl_port),
                 gncl_further,
+                ndl,
                 period_us,
                 claim,
             )| {
@@ -311,6 +337,7 @@ mod tests {
                     gncl_port,
                     period_us,
                     gncl_further,
+                    ndl,
                     claim: Claim::from(claim),
                 }
             },
@@ -404,6 +431,7 @@ mod tests {
             gncl_port: 4,
             period_us: 5,
             gncl_further: Vec::new(),
+            ndl: Vec::new(),
             claim: Claim::Held,
         }
     }
@@ -425,6 +453,9 @@ mod tests {
             Announcement { gncl_further: vec![(0x7f00_0002, 4), (0x7f00_0003, 0)], ..sound() },
             Announcement { gncl_further: vec![(0, 4)], ..sound() },
             Announcement { gncl_further: vec![(0x7f00_0002, 4); FURTHER_MAX + 1], ..sound() },
+            Announcement { ndl: vec![(0x7f00_0002, 4); PATHS_MAX + 1], ..sound() },
+            Announcement { ndl: vec![(0x7f00_0002, 0)], ..sound() },
+            Announcement { ndl: vec![(0xe000_0001, 4)], ..sound() },
         ];
         for announcement in unfit {
             assert!(matches!(refusal(&announcement), DatagramError::Announcement(_)), "{announcement:?}");

@@ -120,6 +120,7 @@ mod tests {
             gncl_port: 0,
             period_us: 0,
             gncl_further: Vec::new(),
+            ndl: Vec::new(),
             claim: crate::ndl::datagram::Claim::Held,
         };
         let mdns = Mdns::start(port, "127.0.0.1:9".parse().unwrap(), &me).unwrap();

@@ -19,8 +19,9 @@
 //! | NDL-3 | A query is answered at once, to where it came from; a member's query to the group is not. |
 //! | NDL-3.1 | An answer counts once, if it comes from the address that was asked and quotes the query's correlation id. |
 //! | NDL-3.2 | Such an answer, and nothing else, makes a member. |
+//! | NDL-3.3 | A member is asked on each route to it: where it says itself that it is, and answers; elsewhere only when no route answers. |
 //! | NDL-4 | A member is lost |
-//! | NDL-4.1 | when it missed `missed_max` answers in a row; |
+//! | NDL-4.1 | when it missed `missed_max` answers in a row on all routes; |
 //! | NDL-4.2 | but nobody is accused in a cycle to which our own timer came late by more than half a period; where it came late by less, as long again is given to read what was answered; |
 //! | NDL-4.3 | when its connection broke and is refused: `Crashed`, until it answers a later query; |
 //! | NDL-4.4 | when it says so, from its own address, in its own life: `Left`. |
@@ -29,7 +30,7 @@
 //! | NDL-5 | A node has one life at a time. |
 //! | NDL-5.1 | A higher incarnation replaces a lower one: `NodeRestarted`. |
 //! | NDL-5.2 | A lower one is refused, also after the loss of the higher one. |
-//! | NDL-5.3 | From another address, the newcomer waits up to 100 ms for the former life to show that it lives. |
+//! | NDL-5.3 | From another address than its own, the newcomer waits up to 100 ms for the former life to show that it lives. |
 //! | NDL-5.4 | If it does, there are two processes with one address: the newcomer is refused, both addresses are logged. |
 //! | NDL-5.5 | A node that finds its own address in use while it settles, `missed_max` plus one periods from its start, gives up: at once if its life is the later one, else at the end of that time if the other is still there. |
 //! | NDL-5.6 | Of two that both live, who has settled goes before who has not, and then the elder life: whoever hears both takes that one. |
@@ -57,7 +58,7 @@ mod tests;
 pub(crate) use actor::{NdlActor, new_core};
 pub(crate) use core::Core;
 pub(crate) use core::LostNode;
-pub use core::{KnownNode, Source, TroubledApp};
+pub use core::{KnownNode, KnownRoute, Source, TroubledApp};
 pub(crate) use datagram::FURTHER_MAX;
 pub(crate) use facts::MembershipFact;
 pub use facts::{LossReason, NodeEvent, Trouble};

@@ -114,7 +114,7 @@ impl Node {
     }
 
     fn udp(&self) -> SocketAddr {
-        lock(&self.stores).udp().expect("NDL has bound its socket")
+        lock(&self.stores).paths().first().copied().expect("NDL has bound its socket")
     }
 
     async fn fact(&mut self, what: &str) -> MembershipFact {

@@ -274,7 +274,7 @@ impl NodeHandle {
     /// Where NDL takes queries and answers, once it does.
     #[must_use]
     pub fn ndl_address(&self) -> Option<SocketAddr> {
-        lock(&self.stores.ndl).udp()
+        lock(&self.stores.ndl).paths().first().copied()
     }
 
     /// How often something that came from outside was refused, or a message was taken by nobody.

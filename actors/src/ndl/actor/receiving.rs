@@ -7,7 +7,7 @@ use sinew_runtime::time::Time;
 use super::Shell;
 use crate::{
     ndl::{
-        core::Way,
+        core::{Place, Way},
         datagram::{DATAGRAM_MAX, maker_of},
     },
     secured::SEAL_LEN,
@@ -21,7 +21,7 @@ const DATAGRAMS_IN_A_ROW: u32 = 128;
 const REST: Duration = Duration::from_millis(1);
 
 /// Reads datagrams for as long as this instance is the current one. Answers leave from here.
-pub(super) async fn receive(shell: Rc<Shell>, socket: tokio::net::UdpSocket, way: Way) {
+pub(super) async fn receive(shell: Rc<Shell>, socket: tokio::net::UdpSocket, (here, way): (SocketAddr, Way)) {
     // One byte more than is taken: a longer datagram is noticed, not cut.
     let mut buffer = [0; DATAGRAM_MAX + SEAL_LEN + 1];
     let mut in_a_row = 0;
@@ -39,9 +39,9 @@ pub(super) async fn receive(shell: Rc<Shell>, socket: tokio::net::UdpSocket, way
         };
         in_a_row += 1;
         match received {
-            Ok((length, from)) => {
-                let Some(bytes) = shell.unsealed(from, &buffer[..length]) else { continue };
-                if !shell.feed(|core, now| core.receive(now, from, way, bytes)) {
+            Ok((length, there)) => {
+                let Some(bytes) = shell.unsealed(there, &buffer[..length]) else { continue };
+                if !shell.feed(|core, now| core.receive(now, Place { there, here }, way, bytes)) {
                     return;
                 }
             }

@@ -26,6 +26,13 @@ pub(super) struct Exchange {
     pub(super) answer_received: Time,
 }
 
+impl Exchange {
+    /// Time on the network, the peer's thinking time not counted; `None` if the times contradict each other.
+    pub(super) fn round_trip(self) -> Option<Duration> {
+        sample(self).map(|sample| Duration::from_nanos(sample.bound_ns * 2))
+    }
+}
+
 #[derive(Clone, Copy, Debug)]
 struct Sample {
     at: Time,

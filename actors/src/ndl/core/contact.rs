@@ -79,13 +79,29 @@ impl Contact {
     pub(super) fn new(now: Time, source: Source) -> Self {
         Self {
             role: Role::Candidate { asked: 0 },
-            is_seed: source == Source::Seed,
+            is_seed: false,
             since: now,
             sources: BTreeMap::from([(source, now)]),
             questions: Questions::default(),
             budget: Bucket::full(KNOWN, now),
             answers: Bucket::full(KNOWN, now),
         }
+    }
+
+    /// One that the configuration lists.
+    pub(super) fn seed(now: Time) -> Self {
+        Self { is_seed: true, ..Self::new(now, Source::Seed) }
+    }
+
+    /// One of which only a member says that it is its own. A stranger may have said so in its name: that is no source.
+    pub(super) fn announced(now: Time) -> Self {
+        Self { sources: BTreeMap::new(), ..Self::new(now, Source::Query) }
+    }
+
+    /// Where a node may be that was lost.
+    pub(super) fn former(now: Time, node: NodeAddress) -> Self {
+        let role = Role::Former { node, wait: 1, left: 0 };
+        Self { role, ..Self::announced(now) }
     }
 
     pub(super) const fn is_candidate(&self) -> bool {

@@ -1,6 +1,6 @@
 //! The cycle: who is asked when, and who missed too much.
 
-use std::{net::SocketAddr, time::Duration};
+use std::time::Duration;
 
 use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
@@ -8,8 +8,8 @@ use sinew_runtime::{
 };
 
 use super::{
-    Core, Host, Member, Output, Source,
-    contact::{Contact, Question, Role},
+    Core, Host, Member, Output, Place,
+    contact::{Question, Role},
     pace::REST,
 };
 use crate::ndl::LossReason;
@@ -29,12 +29,10 @@ pub(super) struct Respite {
 impl Core {
     /// A shell starts, the first one or one after it: what came while there was none is its own fault, not the peers'.
     pub(super) fn begin(&mut self, now: Time) {
-        let udp = self.udp;
-        for seed in self.seeds.iter().copied().filter(|seed| Some(*seed) != udp) {
-            self.contacts.entry(seed).or_insert_with(|| Contact::new(now, Source::Seed));
-        }
+        self.meet_seeds(now);
         for member in self.members.values_mut() {
             member.is_awaited = false;
+            member.routes.forgive();
             member.missed = member.missed.min(self.paces[member.pace].missed_max - 1);
         }
         self.contests.clear();
@@ -70,6 +68,7 @@ impl Core {
         } else {
             pace.due = Some(due + pace.period);
             self.count_missed(at);
+            self.drop_former_routes(now, at);
             self.lose_the_silent(now, at, late, Duration::ZERO);
             self.tell_who_does_not_answer(at);
             self.probe_the_suspected(at);
@@ -89,8 +88,9 @@ impl Core {
     }
 
     fn count_missed(&mut self, at: usize) {
-        for member in self.members.values_mut().filter(|member| member.pace == at && member.is_awaited) {
-            member.missed += 1;
+        for member in self.members.values_mut().filter(|member| member.pace == at) {
+            member.routes.count_missed();
+            member.missed += u32::from(member.is_awaited);
         }
     }
 
@@ -153,32 +153,43 @@ impl Core {
 
     // spec: NDL-2.1
     fn ask_everybody(&mut self, now: Time) {
-        let addresses: Vec<SocketAddr> = self.contacts.keys().copied().collect();
-        for address in addresses {
-            self.ask_in_cycle(now, address);
+        self.seek_all(now);
+        // Also who cannot be asked at all: none of our addresses leads there any more.
+        let members = self.members.values_mut().filter(|member| member.pace == REST);
+        members.for_each(|member| member.is_awaited = true);
+        let places: Vec<Place> = self.contacts.keys().copied().collect();
+        for place in places {
+            self.ask_in_cycle(now, place);
         }
+        self.ask_the_group(now);
+    }
+
+    /// Everybody who hears the group from any of our addresses.
+    pub(super) fn ask_the_group(&mut self, now: Time) {
         if self.asks_group {
-            let correlation = self.next_correlation();
+            let (correlation, from) = (self.next_correlation(), self.paths.clone());
             let most = self.rest().answerable();
             self.group_questions.push(Question { correlation, asked: now }, most);
-            self.outputs.push_back(Output::SendMulticastQuery { correlation });
+            self.outputs.push_back(Output::SendMulticastQuery { from, correlation });
         }
     }
 
     /// The members of one group; a pace that has none any more rests.
     fn ask_group(&mut self, now: Time, at: usize) {
         let members = self.members.values_mut().filter(|member| member.pace == at);
-        let addresses: Vec<SocketAddr> = members
-            .map(|member| {
-                member.is_awaited = true;
-                member.address
-            })
-            .collect();
-        if addresses.is_empty() {
+        let (mut is_empty, mut places) = (true, Vec::new());
+        for member in members {
+            (is_empty, member.is_awaited) = (false, true);
+            for place in Self::places_in_round(member) {
+                member.routes.asked(place);
+                places.push(place);
+            }
+        }
+        if is_empty {
             self.paces[at].due = None;
         }
-        for address in addresses {
-            self.ask(now, address);
+        for place in places {
+            self.ask(now, place);
         }
     }
 
@@ -190,22 +201,22 @@ impl Core {
         at
     }
 
-    fn ask_in_cycle(&mut self, now: Time, address: SocketAddr) {
+    fn ask_in_cycle(&mut self, now: Time, place: Place) {
         let missed_max = self.rest().missed_max;
-        let Some(contact) = self.contacts.get_mut(&address) else { return };
+        let Some(contact) = self.contacts.get_mut(&place) else { return };
         match &mut contact.role {
             Role::Candidate { asked } if *asked >= missed_max && !contact.is_seed => {
-                self.contacts.remove(&address);
+                self.contacts.remove(&place);
                 return;
             }
             Role::Candidate { asked } => *asked = asked.saturating_add(1),
             Role::Member(node) => {
                 let Some(member) = self.members.get_mut(node) else { return };
-                if member.pace != REST {
+                if member.pace != REST && Self::places_in_round(member).contains(&place) {
                     // Its group is asked by itself.
                     return;
                 }
-                member.is_awaited = true;
+                member.routes.asked(place);
             }
             Role::Former { left, .. } if *left > 0 && !contact.is_seed => {
                 *left -= 1;
@@ -216,7 +227,7 @@ impl Core {
                 *wait = (*wait * 2).min(FORMER_WAIT_MAX);
             }
         }
-        self.ask(now, address);
+        self.ask(now, place);
     }
 
     /// Time within which a node is lost that is in no group.
@@ -227,7 +238,8 @@ impl Core {
     /// The node stops: it says so, and is silent from now on. // spec: NDL-4.4
     pub(super) fn leave(&mut self) {
         for (node, member) in &self.members {
-            self.outputs.push_back(Output::SendLeave { to: member.address, node: *node });
+            let leaves = member.routes.places().map(|to| Output::SendLeave { to, node: *node });
+            self.outputs.extend(leaves);
         }
         for pace in &mut self.paces {
             (pace.due, pace.respite) = (None, None);

@@ -56,8 +56,8 @@ impl Core {
         if proof.asked < member.since {
             return;
         }
-        let newcomer = member.address;
-        self.collide(now, node, proof.from, newcomer);
+        let newcomer = member.routes.best().there;
+        self.collide(now, node, proof.from.there, newcomer);
         self.contests.remove(&node);
         self.lose(now, node, LossReason::Duplicate);
         self.arrive(now, proof);
@@ -77,22 +77,23 @@ impl Core {
 
     /// A living process has our own node address. // spec: NDL-5.5
     pub(super) fn own_address_used(&mut self, now: Time, proof: &Proof) {
-        let (Some(settles), Some(own)) = (self.settles, self.udp) else { return };
+        let Some(settles) = self.settles else { return };
+        let (own, other) = (proof.from.here, proof.from.there);
         let theirs = &proof.announcement;
         if now < settles {
             // Two that start together: the later life gives up at once, the earlier one only if the other stays.
             let is_later =
                 (theirs.incarnation, theirs.boot_nonce) < (self.me.incarnation, self.me.boot_nonce);
             if is_later || now + self.rest().period > settles {
-                return self.give_address_up(proof.from);
+                return self.give_address_up(other);
             }
         }
         if !theirs.precedes(&self.me) {
-            return self.collide(now, self.me.node, own, proof.from);
+            return self.collide(now, self.me.node, own, other);
         }
-        self.collide(now, self.me.node, proof.from, own);
+        self.collide(now, self.me.node, other, own);
         if now >= settles {
-            self.try_other(now, proof.from);
+            self.try_other(now, other);
         }
     }
 

@@ -8,9 +8,9 @@ use std::net::SocketAddr;
 use sinew_runtime::time::Time;
 
 use super::{
-    Core, Input, Output, Query, Source, Way,
+    Core, Input, Member, Output, Place, Query, Source, Way,
     clock::Exchange,
-    contact::{Contact, Question},
+    contact::{Contact, Question, Role},
     lives::Proof,
 };
 use crate::ndl::{
@@ -23,15 +23,19 @@ const ASK_GAP_MS: u64 = 10;
 
 impl Core {
     /// Takes in a datagram, if its sender's budget allows. // spec: NDL-7.2
-    pub(crate) fn receive(&mut self, now: Time, from: SocketAddr, way: Way, bytes: &[u8]) {
+    pub(crate) fn receive(&mut self, now: Time, from: Place, way: Way, bytes: &[u8]) {
         if !self.admits(now, from, bytes) {
-            self.refusals.count(now, "NDL datagrams above the budget of their source", &from);
+            self.refusals.count(now, "NDL datagrams above the budget of their source", &from.there);
             return;
         }
         let datagram = match parse(self.me.node, bytes) {
             Ok(datagram) => datagram,
             Err(error) => {
-                self.refusals.count(now, error.cause(), &format_args!("datagram from {from}: {error}"));
+                self.refusals.count(
+                    now,
+                    error.cause(),
+                    &format_args!("datagram from {}: {error}", from.there),
+                );
                 return;
             }
         };
@@ -46,7 +50,7 @@ impl Core {
         self.handle(now, input);
     }
 
-    fn admits(&mut self, now: Time, from: SocketAddr, bytes: &[u8]) -> bool {
+    fn admits(&mut self, now: Time, from: Place, bytes: &[u8]) -> bool {
         if let Some(contact) = self.contacts.get_mut(&from) {
             let is_expected = peek_answer(bytes).is_some_and(|id| contact.questions.has(id));
             // What we asked for has a budget apart, so that noise with a member's address on it does not make its
@@ -58,7 +62,7 @@ impl Core {
                 return contact.budget.take(now);
             }
         }
-        self.strangers.admit(now, from.ip())
+        self.strangers.admit(now, from.there.ip())
     }
 
     // spec: NDL-3
@@ -86,7 +90,7 @@ impl Core {
     pub(super) fn answered(
         &mut self,
         now: Time,
-        from: SocketAddr,
+        from: Place,
         (correlation, answer_sent): (u64, Time),
         answer: Answer,
     ) {
@@ -99,7 +103,7 @@ impl Core {
             // Who answers the group's question is asked by himself: only that proves his address.
             self.heard(now, from, Source::Multicast, &answer.announcement);
         } else {
-            let what = format_args!("{from} answers what it was not asked, or twice, or too late");
+            let what = format_args!("{} answers what it was not asked, or twice, or too late", from.there);
             self.refusals.count(now, "NDL answer without a question", &what);
         }
     }
@@ -123,16 +127,27 @@ impl Core {
         Some(Exchange { query_sent, query_received, answer_sent, answer_received: now })
     }
 
-    fn is_member_at(&self, from: SocketAddr, announcement: &Announcement) -> bool {
+    fn is_member_at(&self, from: Place, announcement: &Announcement) -> bool {
         self.members
             .get(&announcement.node)
-            .is_some_and(|member| member.address == from && member.announcement.is_same_life(announcement))
+            .is_some_and(|member| member.routes.has(from) && member.announcement.is_same_life(announcement))
+    }
+
+    /// The same, or at an address where the member says that it is: it may hear us on fewer routes than we hear it on.
+    fn is_said_by_member(&self, from: Place, announcement: &Announcement) -> bool {
+        let is_it = |member: &Member| {
+            member.announcement.is_same_life(announcement)
+                && (member.routes.has(from) || member.announces(from))
+        };
+        self.members.get(&announcement.node).is_some_and(is_it)
     }
 
     /// Somebody spoke who may be a node. // spec: NDL-2.2
-    fn heard(&mut self, now: Time, from: SocketAddr, source: Source, announcement: &Announcement) {
+    fn heard(&mut self, now: Time, from: Place, source: Source, announcement: &Announcement) {
         if !self.is_member_at(from, announcement) {
             self.look_at(now, from, source);
+        }
+        if !self.is_said_by_member(from, announcement) {
             return;
         }
         if let Some(member) = self.members.get_mut(&announcement.node) {
@@ -149,55 +164,75 @@ impl Core {
 
     // spec: NDL-2.3
     pub(super) fn resolved(&mut self, now: Time, address: SocketAddr) {
-        if Some(address) == self.udp {
+        if self.paths.contains(&address) {
             return;
         }
-        if !self.contacts.contains_key(&address) && !self.strangers.admit_any(now) {
+        let places = self.places_of(address);
+        let is_known = places.iter().all(|place| self.contacts.contains_key(place));
+        if !is_known && !self.strangers.admit_any(now) {
             self.refusals.count(now, "more addresses from mDNS than can be asked", &address);
             return;
         }
-        self.look_at(now, address, Source::Mdns);
+        places.into_iter().for_each(|place| self.look_at(now, place, Source::Mdns));
     }
 
-    /// Asks `address` at once, unless it was asked just now.
-    fn look_at(&mut self, now: Time, address: SocketAddr, source: Source) {
-        if !self.contacts.contains_key(&address) {
+    /// Asks at `place` at once, unless it was asked just now.
+    fn look_at(&mut self, now: Time, place: Place, source: Source) {
+        if !self.contacts.contains_key(&place) {
             self.make_room_for_a_candidate(now);
         }
-        let contact = self.contacts.entry(address).or_insert_with(|| Contact::new(now, source));
+        let contact = self.contacts.entry(place).or_insert_with(|| Contact::new(now, source));
         contact.sources.entry(source).or_insert(now);
-        let asked = contact.questions.newest().map(|question| question.asked);
+        if let Role::Candidate { asked } = &mut contact.role {
+            // Heard of anew, also while it was about to be forgotten.
+            *asked = 0;
+        }
+        self.ask_unless_just_asked(now, place);
+    }
+
+    pub(super) fn ask_unless_just_asked(&mut self, now: Time, place: Place) {
+        let newest = self.contacts.get(&place).and_then(|contact| contact.questions.newest());
+        let asked = newest.map(|question| question.asked);
         if asked.is_none_or(|asked| now.since(asked).as_millis() >= u128::from(ASK_GAP_MS)) {
-            self.ask(now, address);
+            self.ask(now, place);
         }
     }
 
     /// The oldest candidate makes room: one that answers does so within milliseconds. // spec: NDL-7.1
     fn make_room_for_a_candidate(&mut self, now: Time) {
-        let candidates = || self.contacts.iter().filter(|(_, contact)| contact.is_candidate());
-        if candidates().count() < self.nodes_max {
+        if self.has_room_for_a_candidate() {
             return;
         }
-        if let Some(oldest) =
-            candidates().min_by_key(|(_, contact)| contact.since).map(|(address, _)| *address)
-        {
-            self.refusals.count(now, "more addresses than can be asked", &oldest);
+        let candidates = self.contacts.iter().filter(|(_, contact)| contact.is_candidate());
+        if let Some(oldest) = candidates.min_by_key(|(_, contact)| contact.since).map(|(place, _)| *place) {
+            self.refusals.count(now, "more addresses than can be asked", &oldest.there);
             self.contacts.remove(&oldest);
         }
     }
 
+    pub(super) fn has_room_for_a_candidate(&self) -> bool {
+        self.contacts.values().filter(|contact| contact.is_candidate()).count() < self.nodes_max
+    }
+
     // spec: NDL-4.4
-    pub(super) fn taken_leave_of(&mut self, now: Time, from: SocketAddr, announcement: &Announcement) {
-        if self.is_member_at(from, announcement) {
+    pub(super) fn taken_leave_of(&mut self, now: Time, from: Place, announcement: &Announcement) {
+        if self.is_said_by_member(from, announcement) {
             let yields = announcement.claim == Claim::Yielded;
             let why = if yields { LossReason::Duplicate } else { LossReason::Left };
             self.lose(now, announcement.node, why);
         } else if self.is_former_at(from, announcement) {
             // It was silent, and has been asked since: what it answered before it left is no sign of life any more.
-            self.drop_contact(now, from);
+            // Another node may be there by now.
+            let is_others = |contact: &Contact| matches!(contact.role, Role::Member(_));
+            if !self.contacts.get(&from).is_some_and(is_others) {
+                self.drop_contact(now, from);
+            }
+            self.void_questions(now, announcement);
         } else {
-            let what =
-                format_args!("{from} says that {} leaves, which is no member there", announcement.node);
+            let what = format_args!(
+                "{} says that {} leaves, which is no member there",
+                from.there, announcement.node
+            );
             self.refusals.count(now, "NDL leave of a stranger", &what);
         }
     }

@@ -1,6 +1,6 @@
 //! Who comes, goes, and comes again in a new life.
 
-use std::{net::SocketAddr, time::Duration};
+use std::time::Duration;
 
 use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
@@ -8,10 +8,11 @@ use sinew_runtime::{
 };
 
 use super::{
-    Core, Member, Output, Source,
+    Core, Member, Output, Place, Source,
     clock::{Exchange, PeerClock},
     contact::{Contact, Role},
     recall::Loss,
+    routes::Routes,
     troubles::Troubles,
 };
 use crate::{
@@ -27,7 +28,7 @@ const LINK_GRACE: Duration = Duration::from_secs(1);
 /// An answer to a question that was asked at one address: somebody is there and says this.
 #[derive(Clone, Debug)]
 pub(super) struct Proof {
-    pub(super) from: SocketAddr,
+    pub(super) from: Place,
     /// When the question was asked.
     pub(super) asked: Time,
     pub(super) announcement: Announcement,
@@ -46,14 +47,15 @@ impl Proof {
 pub(super) struct Contest {
     since: Time,
     pub(super) until: Time,
-    newcomer: Proof,
+    pub(super) newcomer: Proof,
 }
 
 /// The last life of a node that is gone.
 #[derive(Debug)]
 pub(super) struct Gone {
     since: Time,
-    address: SocketAddr,
+    /// Where it was asked.
+    pub(super) places: Vec<Place>,
     incarnation: Incarnation,
     boot_nonce: u64,
 }
@@ -90,9 +92,8 @@ impl Core {
         } else if claimed.incarnation < known.incarnation {
             self.refuse_stale(now, &proof, known.incarnation);
         } else if claimed.incarnation == known.incarnation {
-            self.collide(now, claimed.node, member.address, proof.from);
-        } else if member.address == proof.from {
-            // No two processes have one socket address: the former one is gone.
+            self.collide(now, claimed.node, member.routes.best().there, proof.from.there);
+        } else if member.is_followed_at(proof.from) {
             self.replace(now, proof);
         } else {
             self.contest(now, proof);
@@ -100,17 +101,24 @@ impl Core {
     }
 
     /// Another node is where a member was: the member is not.
-    fn release_address(&mut self, now: Time, address: SocketAddr, node: NodeAddress) {
-        let role = self.contacts.get(&address).map(|contact| contact.role);
-        if let Some(Role::Member(other)) = role
-            && other != node
-        {
+    fn release_address(&mut self, now: Time, place: Place, node: NodeAddress) {
+        let role = self.contacts.get(&place).map(|contact| contact.role);
+        let Some(Role::Member(other)) = role.filter(|role| *role != Role::Member(node)) else { return };
+        let Some(member) = self.members.get_mut(&other) else { return };
+        if member.routes.is_only(place) {
             self.lose(now, other, LossReason::Crashed);
+            return;
         }
+        member.routes.keep(|route| route.place != place);
+        self.drop_contact(now, place);
     }
 
     fn alive(&mut self, now: Time, proof: Proof) {
         let node = proof.announcement.node;
+        if !self.is_routed(now, node, proof.from) {
+            // Anybody may answer there in its name.
+            return;
+        }
         if let Some(member) = self.members.get_mut(&node) {
             member.announcement.claim = proof.announcement.claim;
         }
@@ -119,19 +127,11 @@ impl Core {
             return;
         }
         let Some(member) = self.members.get_mut(&node) else { return };
-        if member.address != proof.from {
-            // One life at two addresses: it has moved if it does not answer at the first any more.
-            if member.missed == 0 {
-                return;
-            }
-            let former = std::mem::replace(&mut member.address, proof.from);
-            self.drop_contact(now, former);
-            self.contact_at(now, proof.from).role = Role::Member(node);
-        }
-        let Some(member) = self.members.get_mut(&node) else { return };
         member.heard = now;
         (member.missed, member.host) = (0, None);
         member.is_awaited = false;
+        member.routes.answered(proof.from, proof.exchange.and_then(|exchange| exchange.round_trip()));
+        self.note_addresses(now, node, &proof.announcement);
         self.measure(now, node, proof.exchange);
         self.answers_again(node);
         self.note_progress(node, proof.progress);
@@ -140,17 +140,17 @@ impl Core {
     /// The member lives, and was asked after the newcomer came: there are two. The newcomer, if the address is its own.
     fn settle_contest(&mut self, now: Time, proof: &Proof) -> Option<Proof> {
         let node = proof.announcement.node;
-        if self.members.get(&node).map(|member| member.address) != Some(proof.from)
-            || self.contests.get(&node).is_none_or(|contest| proof.asked < contest.since)
-        {
+        let is_later =
+            |contest: &Contest| proof.asked >= contest.since && proof.from != contest.newcomer.from;
+        if !self.contests.get(&node).is_some_and(is_later) {
             return None;
         }
         let newcomer = self.contests.remove(&node)?.newcomer;
         if newcomer.announcement.precedes(&proof.announcement) {
-            self.collide(now, node, newcomer.from, proof.from);
+            self.collide(now, node, newcomer.from.there, proof.from.there);
             return Some(newcomer);
         }
-        self.collide(now, node, proof.from, newcomer.from);
+        self.collide(now, node, proof.from.there, newcomer.from.there);
         None
     }
 
@@ -188,7 +188,7 @@ impl Core {
             }
         };
         if self.members.len() >= self.nodes_max {
-            self.refusals.count(now, "more nodes than `ndl.nodes_max`", &proof.from);
+            self.refusals.count(now, "more nodes than `ndl.nodes_max`", &proof.from.there);
             return;
         }
         self.join(now, proof, arrival, fence);
@@ -197,8 +197,10 @@ impl Core {
     // spec: NDL-5.2
     pub(super) fn refuse_stale(&self, now: Time, proof: &Proof, known: Incarnation) {
         let Announcement { node, incarnation, .. } = proof.announcement;
-        let what =
-            format_args!("{node} at {} is in life {incarnation}, and life {known} was seen", proof.from);
+        let what = format_args!(
+            "{node} at {} is in life {incarnation}, and life {known} was seen",
+            proof.from.there
+        );
         self.refusals.count(now, "NDL answer of a former life", &what);
     }
 
@@ -207,16 +209,15 @@ impl Core {
         let Announcement { node, incarnation, ref name, .. } = announcement;
         let name = name.clone();
         let gncl = announcement.gncl_addresses();
-        if let Some(gone) = self.gone.remove(&node)
-            && gone.address != from
-        {
-            self.forget_former(gone.address, node);
+        if let Some(gone) = self.gone.remove(&node) {
+            let others = gone.places.into_iter().filter(|place| *place != from);
+            others.for_each(|place| self.forget_former(place, node));
         }
         self.contact_at(now, from).role = Role::Member(node);
         let pace = self.pace_for(now, &name);
         let member = Member {
             announcement,
-            address: from,
+            routes: Routes::new(from),
             heard: now,
             sign: now,
             pace,
@@ -234,6 +235,9 @@ impl Core {
         self.members.insert(node, member);
         self.recall.found(node);
         // Before the fact, so that GNCL knows the clock of a peer when it connects.
+        if let Some(member) = self.members.get_mut(&node) {
+            member.routes.answered(from, exchange.and_then(|exchange| exchange.round_trip()));
+        }
         self.measure(now, node, exchange);
         self.outputs.push_back(Output::Fact(MembershipFact::NodeFound { node, incarnation, gncl }));
         self.publish(&match arrival {
@@ -241,6 +245,7 @@ impl Core {
             Arrival::Restarted => NodeEvent::NodeRestarted { node, name, incarnation },
         });
         self.note_progress(node, progress);
+        self.seek(now, node);
     }
 
     /// A member is there in a new life. // spec: NDL-5.1
@@ -248,9 +253,8 @@ impl Core {
         let node = proof.announcement.node;
         let Some(former) = self.members.remove(&node) else { return };
         self.contests.remove(&node);
-        if former.address != proof.from {
-            self.drop_contact(now, former.address);
-        }
+        let others = former.routes.places().filter(|place| *place != proof.from);
+        others.for_each(|place| self.drop_contact(now, place));
         let incarnation = former.announcement.incarnation;
         let why = LossReason::Restarted;
         self.outputs.push_back(Output::Fact(MembershipFact::NodeLost { node, incarnation, why }));
@@ -272,9 +276,11 @@ impl Core {
     }
 
     fn challenge_member(&mut self, now: Time, node: NodeAddress) {
-        if let Some(address) = self.members.get(&node).map(|member| member.address) {
-            self.ask(now, address);
-        }
+        // An answer of the member from where the newcomer is proves nothing.
+        let newcomer = self.contests.get(&node).map(|contest| contest.newcomer.from);
+        let routes = self.members.get(&node).into_iter().flat_map(|member| member.routes.places());
+        let asked: Vec<_> = routes.filter(|place| Some(*place) != newcomer).collect();
+        asked.into_iter().for_each(|place| self.ask(now, place));
     }
 
     pub(super) fn decide_contests(&mut self, now: Time) {
@@ -338,20 +344,23 @@ impl Core {
     pub(super) fn lose(&mut self, now: Time, node: NodeAddress, why: LossReason) {
         let Some(member) = self.members.remove(&node) else { return };
         let contest = self.contests.remove(&node);
-        let sources =
-            self.contacts.get(&member.address).map(|contact| contact.sources.keys().copied().collect());
+        let sources = self.sources(&member).into_keys().collect();
         let bound = self.paces[member.pace].bound();
-        self.recall.lost(now, &member, sources.unwrap_or_default(), Loss { why, bound });
+        self.recall.lost(now, &member, sources, Loss { why, bound });
         self.is_lonely |= self.members.is_empty() && matches!(why, LossReason::Hung | LossReason::LinkDown);
         if why == LossReason::Duplicate {
             // An elder life has its address: this one is no bar to that.
         } else {
             self.remember(now, &member);
         }
-        if why == LossReason::Left {
-            self.drop_contact(now, member.address);
-        } else {
-            let contact = self.contact_at(now, member.address);
+        self.void_questions(now, &member.announcement);
+        let places: Vec<_> = member.routes.places().collect();
+        for place in places.iter().copied() {
+            if why == LossReason::Left {
+                self.drop_contact(now, place);
+                continue;
+            }
+            let contact = self.contact_at(now, place);
             contact.role = Role::Former { node, wait: 1, left: 0 };
             contact.questions.clear();
         }
@@ -362,7 +371,7 @@ impl Core {
         self.publish(&NodeEvent::NodeLost { node, name, incarnation, why, silent_us, bound_us });
         if why == LossReason::Crashed {
             // Perhaps only its GNCL restarts: then it answers this.
-            self.ask(now, member.address);
+            places.into_iter().for_each(|place| self.ask(now, place));
         }
         if let Some(contest) = contest {
             self.arrive(now, contest.newcomer);
@@ -372,44 +381,65 @@ impl Core {
     /// Keeps the last life of a lost node, so that a former one never comes back. // spec: NDL-7.1
     fn remember(&mut self, now: Time, member: &Member) {
         if self.gone.len() >= self.nodes_max
-            && let Some((node, address)) =
-                self.gone.iter().min_by_key(|(_, gone)| gone.since).map(|(node, gone)| (*node, gone.address))
+            && let Some(node) = self.gone.iter().min_by_key(|(_, gone)| gone.since).map(|(node, _)| *node)
+            && let Some(oldest) = self.gone.remove(&node)
         {
-            self.gone.remove(&node);
-            self.forget_former(address, node);
+            oldest.places.into_iter().for_each(|place| self.forget_former(place, node));
         }
         let Announcement { node, incarnation, boot_nonce, .. } = member.announcement;
-        self.gone.insert(node, Gone { since: now, address: member.address, incarnation, boot_nonce });
+        let mut places: Vec<_> = member.routes.places().collect();
+        if places.is_empty() {
+            places.push(member.routes.best());
+        }
+        self.gone.insert(node, Gone { since: now, places, incarnation, boot_nonce });
     }
 
-    fn contact_at(&mut self, now: Time, address: SocketAddr) -> &mut Contact {
-        self.contacts.entry(address).or_insert_with(|| Contact::new(now, Source::Query))
+    pub(super) fn contact_at(&mut self, now: Time, place: Place) -> &mut Contact {
+        self.contacts.entry(place).or_insert_with(|| Contact::new(now, Source::Query))
+    }
+
+    /// A node is not there any more: what was asked at addresses that it announced is answered too late.
+    pub(super) fn void_questions(&mut self, now: Time, of: &Announcement) {
+        let there: Vec<_> = of.ndl_addresses().collect();
+        let is_its = |contact: &Contact| match contact.role {
+            Role::Candidate { .. } => true,
+            Role::Former { node, .. } => node == of.node,
+            Role::Member(_) => false,
+        };
+        let places =
+            self.contacts.iter().filter(|(place, contact)| there.contains(&place.there) && is_its(contact));
+        let places: Vec<_> = places.map(|(place, _)| *place).collect();
+        places.into_iter().for_each(|place| self.drop_contact(now, place));
     }
 
     /// Whether this is the last life of a lost node, which is still asked where it was.
-    pub(super) fn is_former_at(&self, address: SocketAddr, announcement: &Announcement) -> bool {
+    pub(super) fn is_former_at(&self, place: Place, announcement: &Announcement) -> bool {
         let Announcement { node, incarnation, boot_nonce, .. } = *announcement;
-        let is_asked = self.contacts.get(&address).is_some_and(
+        let is_asked = self.contacts.get(&place).is_some_and(
             |contact| matches!(contact.role, Role::Former { node: former, .. } if former == node),
         );
-        let is_it = |gone: &Gone| (gone.incarnation, gone.boot_nonce) == (incarnation, boot_nonce);
-        is_asked && self.gone.get(&node).is_some_and(is_it)
+        let Some(gone) = self.gone.get(&node) else { return false };
+        let is_it = (gone.incarnation, gone.boot_nonce) == (incarnation, boot_nonce);
+        // It says goodbye on each of its routes, and may have had one that this node did not.
+        let is_announced = announcement.ndl_addresses().any(|there| there == place.there)
+            && announcement.ndl_addresses().any(|there| gone.places.iter().any(|known| known.there == there));
+        is_it && (is_asked || is_announced)
     }
 
-    /// Nobody that we know is at `address` any more; a seed is still asked.
-    pub(super) fn drop_contact(&mut self, now: Time, address: SocketAddr) {
-        let Some(contact) = self.contacts.remove(&address) else { return };
+    /// Nobody that we know is at `place` any more; a seed is still asked.
+    pub(super) fn drop_contact(&mut self, now: Time, place: Place) {
+        let Some(contact) = self.contacts.remove(&place) else { return };
         if contact.is_seed {
-            self.contacts.insert(address, Contact::new(now, Source::Seed));
+            self.contacts.insert(place, Contact::seed(now));
         }
     }
 
-    fn forget_former(&mut self, address: SocketAddr, node: NodeAddress) {
-        if let Some(contact) = self.contacts.get(&address)
+    fn forget_former(&mut self, place: Place, node: NodeAddress) {
+        if let Some(contact) = self.contacts.get(&place)
             && matches!(contact.role, Role::Former { node: former, .. } if former == node)
             && !contact.is_seed
         {
-            self.contacts.remove(&address);
+            self.contacts.remove(&place);
         }
     }
 }

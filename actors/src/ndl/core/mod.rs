@@ -9,8 +9,10 @@
 //! | `contact` | an address that is talked to |
 //! | `cycle` | who is asked when, and who missed too much |
 //! | `heard` | what a datagram means, and what it proves |
+//! | `member` | what is known of a node that answers |
 //! | `lives` | who comes, goes, comes again |
 //! | `duplicates` | which of two processes has a node address |
+//! | `routes` | from where to where a member is asked |
 //! | `pace` | how often which members are asked |
 //! | `signs` | what GNCL heard of a member that does not answer |
 //! | `troubles` | what of a member does not get on |
@@ -26,8 +28,10 @@ mod cycle;
 mod duplicates;
 mod heard;
 mod lives;
+mod member;
 mod pace;
 mod recall;
+mod routes;
 mod signs;
 #[cfg(test)]
 mod simulation;
@@ -49,17 +53,17 @@ use sinew_runtime::{
 };
 
 pub(crate) use self::recall::{LostNode, Neighbour};
-pub use self::view::{KnownNode, TroubledApp};
+pub(crate) use self::routes::Place;
+pub use self::view::{KnownNode, KnownRoute, TroubledApp};
 use self::{
     audience::Audience,
     budget::Strangers,
-    clock::PeerClock,
     contact::{Contact, Question, Questions, Role},
     duplicates::Trial,
     lives::{Contest, Gone},
+    member::Member,
     pace::{Pace, REST},
     recall::Recall,
-    troubles::Troubles,
 };
 use super::{
     MembershipFact, NodeEvent, Progress,
@@ -73,9 +77,9 @@ pub(crate) enum Input {
     /// Somebody asked.
     QueryReceived(Query),
     /// Somebody answered; `sent` is in its clock.
-    AnswerReceived { from: SocketAddr, correlation: u64, sent: Time, answer: Answer },
+    AnswerReceived { from: Place, correlation: u64, sent: Time, answer: Answer },
     /// Somebody said goodbye.
-    LeaveReceived { from: SocketAddr, announcement: Announcement },
+    LeaveReceived { from: Place, announcement: Announcement },
     /// Multicast DNS knows a node of this project at this address.
     MdnsResolved { address: SocketAddr },
     /// A connection of GNCL changed.
@@ -100,21 +104,23 @@ pub(crate) enum Input {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Output {
     SendQuery {
-        to: SocketAddr,
+        to: Place,
         correlation: u64,
     },
+    /// From each of these addresses of ours.
     SendMulticastQuery {
+        from: Vec<SocketAddr>,
         correlation: u64,
     },
     SendAnswer {
-        to: SocketAddr,
+        to: Place,
         node: NodeAddress,
         correlation: u64,
         query_sent: Time,
         query_received: Time,
     },
     SendLeave {
-        to: SocketAddr,
+        to: Place,
         node: NodeAddress,
     },
     /// Try to connect to the host of this node, at any of these addresses of its GNCL, and tell what it said within this time. Have its
@@ -155,7 +161,7 @@ pub(crate) enum Output {
 /// A query that somebody sent; `sent` is in its clock.
 #[derive(Clone, Debug)]
 pub(crate) struct Query {
-    pub(crate) from: SocketAddr,
+    pub(crate) from: Place,
     pub(crate) way: Way,
     pub(crate) correlation: u64,
     pub(crate) sent: Time,
@@ -199,47 +205,6 @@ pub enum Source {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Epoch(u64);
 
-/// A node that answers.
-#[derive(Debug)]
-struct Member {
-    announcement: Announcement,
-    address: SocketAddr,
-    /// Its last sign of life.
-    heard: Time,
-    /// When it asked us last, or GNCL heard of it last, as far as that was asked; or since when it has been a member.
-    sign: Time,
-    /// Which of the paces it is asked at.
-    pace: usize,
-    /// Answers missed in a row.
-    missed: u32,
-    /// What its host said since it missed the first of them.
-    host: Option<Host>,
-    /// What of it does not get on, as it said last.
-    progress: Progress,
-    /// What of that applications were told.
-    troubles: Troubles,
-    /// The last query of the cycle is not answered yet.
-    is_awaited: bool,
-    clock: PeerClock,
-    /// Its connection ended and did not come back yet.
-    is_link_broken: bool,
-    /// Until then its connection stands, or is being made again.
-    link_until: Time,
-    /// Since when it has been a member.
-    since: Time,
-    /// The life before this one whose end is known: neither that one nor one before it comes back.
-    fence: Option<Incarnation>,
-}
-
-impl Member {
-    /// Whether it is to be counted as lost for its silence. One with several addresses may only be out of reach at the one where it
-    /// is asked; as long as its connection stands, it is there. // spec: NDL-4.1, NDL-4.5, NDL-4.7
-    fn is_silent(&self, now: Time, pace: &Pace) -> bool {
-        let has_another_way = !self.announcement.gncl_further.is_empty() && now < self.link_until;
-        self.missed >= pace.missed_max && !has_another_way && !self.has_given_a_sign(now, pace)
-    }
-}
-
 /// Who is there.
 #[derive(Debug)]
 pub(crate) struct Core {
@@ -257,8 +222,8 @@ pub(crate) struct Core {
     questions_asked: u64,
 
     epoch: u64,
-    /// Our own UDP address; `None` before the first start.
-    udp: Option<SocketAddr>,
+    /// Our own UDP addresses, one for each path; none before the first start.
+    paths: Vec<SocketAddr>,
     /// Until then, a living node with our address means that we are the newcomer.
     settles: Option<Time>,
     /// It had members and has none any more: others may have given its address to a later life.
@@ -270,7 +235,7 @@ pub(crate) struct Core {
     members: BTreeMap<NodeAddress, Member>,
     gone: BTreeMap<NodeAddress, Gone>,
     contests: BTreeMap<NodeAddress, Contest>,
-    contacts: BTreeMap<SocketAddr, Contact>,
+    contacts: BTreeMap<Place, Contact>,
     group_questions: Questions,
     strangers: Strangers,
     collisions_reported: BTreeMap<NodeAddress, Time>,
@@ -303,6 +268,7 @@ impl Core {
             gncl_port: 0,
             period_us: u32::try_from(ndl.period.as_micros()).unwrap_or(u32::MAX),
             gncl_further: Vec::new(),
+            ndl: Vec::new(),
             claim: Claim::Settling,
         };
         Self {
@@ -315,7 +281,7 @@ impl Core {
             secret,
             questions_asked: 0,
             epoch: 0,
-            udp: None,
+            paths: Vec::new(),
             settles: None,
             is_lonely: false,
             trial: None,
@@ -340,11 +306,11 @@ impl Core {
         self.me.gncl_further = further.map(|gncl| (gncl.ip().to_bits(), gncl.port())).collect();
     }
 
-    /// A shell has bound its sockets: `udp` is our address for queries, `gncl` that of GNCL's listener. The first
+    /// A shell has bound its sockets: `paths` are our addresses for queries, `gncl` is that of GNCL's listener. The first
     /// queries are due at once.
-    pub(crate) fn start(&mut self, now: Time, udp: SocketAddr, gncl: SocketAddrV4) -> Epoch {
+    pub(crate) fn start(&mut self, now: Time, paths: &[SocketAddr], gncl: SocketAddrV4) -> Epoch {
         self.epoch += 1;
-        self.udp = Some(udp);
+        self.use_paths(now, paths);
         self.me.gncl_ip = gncl.ip().to_bits();
         self.me.gncl_port = gncl.port();
         self.begin(now);
@@ -450,9 +416,9 @@ impl Core {
         &self.progress
     }
 
-    /// Our own UDP address.
-    pub(crate) const fn udp(&self) -> Option<SocketAddr> {
-        self.udp
+    /// Our own UDP addresses.
+    pub(crate) fn paths(&self) -> &[SocketAddr] {
+        &self.paths
     }
 
     /// What was refused.
@@ -466,7 +432,7 @@ impl Core {
     }
 
     /// Asks `to`, whom there is a contact for.
-    fn ask(&mut self, now: Time, to: SocketAddr) {
+    fn ask(&mut self, now: Time, to: Place) {
         let correlation = self.next_correlation();
         if let Some(contact) = self.contacts.get_mut(&to) {
             let pace = match contact.role {
@@ -487,11 +453,12 @@ impl Core {
     }
 
     /// Other projects and our own echo are none of our business. // spec: NDL-1.2
-    fn concerns_us(&mut self, now: Time, from: SocketAddr, announcement: &Announcement) -> bool {
+    fn concerns_us(&mut self, now: Time, from: Place, announcement: &Announcement) -> bool {
         if announcement.project != self.me.project {
-            self.recall.heard(now, from, announcement);
+            self.recall.heard(now, from.there, announcement);
             return false;
         }
-        announcement.boot_nonce != self.me.boot_nonce
+        // What was read just before its socket was closed came too late.
+        announcement.boot_nonce != self.me.boot_nonce && self.paths.contains(&from.here)
     }
 }

@@ -60,7 +60,7 @@ impl Recall {
     pub(super) fn lost(&mut self, now: Time, member: &Member, sources: Vec<Source>, loss: Loss) {
         let Announcement { node, incarnation, ref name, .. } = member.announcement;
         make_room(&mut self.lost, LOST_MAX, &node, |lost| lost.lost);
-        let (address, silent) = (member.address, now.since(member.heard));
+        let (address, silent) = (member.routes.best().there, now.since(member.heard));
         let (name, Loss { why, bound }) = (name.clone(), loss);
         let lost = LostNode { name, incarnation, address, sources, lost: now, why, silent, bound };
         self.lost.insert(node, lost);

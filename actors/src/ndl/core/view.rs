@@ -7,7 +7,7 @@ use sinew_runtime::{
     time::Time,
 };
 
-use super::{Core, LostNode, Neighbour, Source};
+use super::{Core, LostNode, Member, Neighbour, Place, Source, routes::Route};
 use crate::{
     ndl::{Part, Trouble},
     stores::ClockOffset,
@@ -22,8 +22,10 @@ pub struct KnownNode {
     pub name: String,
     /// Which life of it this is.
     pub incarnation: Incarnation,
-    /// Where its NDL answers.
+    /// Where its NDL answers, and is asked first.
     pub udp: SocketAddr,
+    /// All ways to it that are known, that one first. None: this node has none of the addresses any more that it was asked from.
+    pub routes: Vec<KnownRoute>,
     /// Where its GNCL listens: the address that it prefers first.
     pub gncl: Vec<SocketAddr>,
     /// Time between two of its queries.
@@ -47,6 +49,26 @@ pub struct KnownNode {
     pub round_trip: Option<Duration>,
     /// How far its clock is from ours.
     pub offset: Option<ClockOffset>,
+}
+
+/// A way to a node: an address of this node, and one of the other where it answers.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct KnownRoute {
+    /// This node's.
+    pub here: SocketAddr,
+    /// The other one's.
+    pub there: SocketAddr,
+    /// Rounds of questions in a row that were not answered there.
+    pub missed: u32,
+    /// Time of a query and its answer on the network there, of the last ones.
+    pub round_trip: Option<Duration>,
+}
+
+impl KnownRoute {
+    const fn of(route: &Route) -> Self {
+        let Route { place: Place { here, there }, missed, round_trip, .. } = *route;
+        Self { here, there, missed, round_trip }
+    }
 }
 
 /// A layer or an application that does not get on.
@@ -78,10 +100,11 @@ impl Core {
             node: *node,
             name: member.announcement.name.clone(),
             incarnation: member.announcement.incarnation,
-            udp: member.address,
+            udp: member.routes.best().there,
+            routes: member.routes.iter().map(KnownRoute::of).collect(),
             gncl: member.announcement.gncl_addresses(),
             period: Duration::from_micros(member.announcement.period_us.into()),
-            sources: self.contacts.get(&member.address).map(|c| c.sources.clone()).unwrap_or_default(),
+            sources: self.sources(member),
             heard: member.heard,
             missed: member.missed,
             troubled: member.progress.troubled as usize + usize::from(member.troubles.unheard().is_some()),
@@ -94,6 +117,17 @@ impl Core {
             offset: member.clock.offset(now, Duration::ZERO),
         });
         views.collect()
+    }
+
+    /// How a member was found, wherever it is asked, and when first.
+    pub(super) fn sources(&self, member: &Member) -> BTreeMap<Source, Time> {
+        let mut sources = BTreeMap::new();
+        let contacts = member.routes.places().filter_map(|place| self.contacts.get(&place));
+        for (source, at) in contacts.flat_map(|contact| &contact.sources) {
+            let first = sources.entry(*source).or_insert(*at);
+            *first = (*at).min(*first);
+        }
+        sources
     }
 
     /// Who was there and has not come back, as far as is remembered.

@@ -24,6 +24,7 @@ fn crowd(nodes: usize) -> Plan {
         watched: None,
         finding: Finding::Group,
         connections: false,
+        networks: 1,
         quality: Quality {
             lost_per_mille: 0,
             twice_per_mille: 0,

@@ -1,7 +1,8 @@
 //! What must hold, whatever the scenario. The judge knows the truth and the network, and of a core what it sends and says.
 //!
 //! 1. No false loss: who is called silent did not answer `missed_max` questions in a row, each of which had half a
-//!    period. An answer counts from when it is in the asker's socket: that it was not read yet is the asker's own stall.
+//!    period, at each address where it has answered since it was found (of an address that was asked as a second one at a pace of its
+//!    own, one fewer). An answer counts from when it is in the asker's socket: that it was not read yet is the asker's own stall.
 //! 2. A loss is seen within `missed_max` plus one periods of the last sign, and the asker's own stalls.
 //! 3. A goodbye counts when it is heard, and is said to everybody who is known.
 //! 4. A life that ended never comes back after its loss or its goodbye, a former life never after a later one.
@@ -10,7 +11,7 @@
 //! 7. A stall of one's own is reported.
 //! 8. A loss by silence is classed as what has been so for long: hung, crashed, or out of reach with its host.
 //! 9. No loss by silence while the connection delivers, nor for as long after that, or after a question of the other's, as answers may be missed.
-//! 10. When the network is well again, everybody knows exactly who is there.
+//! 10. When the network is well again, everybody knows exactly who is there, and a way there in each network.
 
 use std::{
     collections::{BTreeMap, BTreeSet, VecDeque},
@@ -50,6 +51,8 @@ struct Sight {
     is_over: bool,
     /// The last answer within a period of its question: when it was in the socket.
     answered: Time,
+    /// Where it answered so since it was found.
+    places: BTreeSet<SocketAddr>,
     /// The last sign of life that was read.
     read: Time,
     /// The last one that was read on a connection.
@@ -59,7 +62,8 @@ struct Sight {
 struct Life {
     node: NodeAddress,
     incarnation: Incarnation,
-    address: SocketAddr,
+    /// One in each network.
+    addresses: Vec<SocketAddr>,
     ended: Option<Time>,
     sights: BTreeMap<usize, Sight>,
     questions: BTreeMap<SocketAddr, VecDeque<Question>>,
@@ -103,11 +107,16 @@ impl Judge {
     }
 
     /// A process starts; they are counted from 0.
-    pub(super) fn started(&mut self, node: NodeAddress, incarnation: Incarnation, address: SocketAddr) {
+    pub(super) fn started(
+        &mut self,
+        node: NodeAddress,
+        incarnation: Incarnation,
+        addresses: Vec<SocketAddr>,
+    ) {
         self.lives.push(Life {
             node,
             incarnation,
-            address,
+            addresses,
             ended: None,
             sights: BTreeMap::new(),
             questions: BTreeMap::new(),
@@ -126,7 +135,9 @@ impl Judge {
         let sights = &self.lives[process].sights;
         let forgotten: Vec<usize> = sights
             .iter()
-            .filter(|(other, sight)| sight.is_member && !to.contains(&self.lives[**other].address))
+            .filter(|(other, sight)| {
+                sight.is_member && !self.lives[**other].addresses.iter().any(|address| to.contains(address))
+            })
             .map(|(other, _)| *other)
             .collect();
         for other in forgotten {
@@ -166,8 +177,14 @@ impl Judge {
     }
 
     /// An answer is in the asker's socket.
-    pub(super) fn answered(&mut self, now: Time, process: usize, by: usize, correlation: u64) {
-        let (from, (period, _)) = (self.lives[by].address, self.pace(by));
+    pub(super) fn answered(
+        &mut self,
+        now: Time,
+        process: usize,
+        (by, from): (usize, SocketAddr),
+        correlation: u64,
+    ) {
+        let (period, _) = self.pace(by);
         let life = &mut self.lives[process];
         let questions = life.questions.entry(from).or_default();
         let Some(question) = questions
@@ -182,6 +199,7 @@ impl Judge {
             && let Some(sight) = life.sights.get_mut(&by)
         {
             sight.answered = now;
+            sight.places.insert(from);
         }
     }
 
@@ -221,11 +239,13 @@ impl Judge {
             is_member: false,
             is_over: false,
             answered: now,
+            places: BTreeSet::new(),
             read: now,
             sign: None,
         });
         let was_member = std::mem::replace(&mut sight.is_member, true);
         let came_back = sight.is_over;
+        sight.places.clear();
         (sight.answered, sight.read) = (now, now);
         if was_member {
             self.violate(now, process, other, "is found, and was a member already");
@@ -270,10 +290,15 @@ impl Judge {
             }
             LossReason::Left | LossReason::Crashed | LossReason::Restarted | LossReason::Duplicate => {}
             LossReason::Hung | LossReason::LinkDown => {
-                let unanswered = self.unanswered(now, process, other);
-                if unanswered < self.pace(other).1 as usize && lives {
-                    let words =
-                        format!("lives, did not answer {unanswered} questions, and is lost as silent");
+                let (most, least) = self.unanswered(now, process, other);
+                let missed_max = self.pace(other).1 as usize;
+                let is_watched = self.watched.is_some_and(|(node, ..)| node == self.lives[other].node);
+                let of_second = missed_max - usize::from(is_watched);
+                if lives && (most < missed_max || least.is_some_and(|least| least < of_second)) {
+                    let words = format!(
+                        "lives, did not answer {most} questions at one address and {least:?} at each where it has answered, and is \
+                         lost as silent"
+                    );
                     self.violate(now, process, other, &words);
                 }
                 self.check_sign(now, process, other);
@@ -317,17 +342,22 @@ impl Judge {
         }
     }
 
-    /// Questions since the last answer that had half a period to be answered.
-    fn unanswered(&self, now: Time, process: usize, other: usize) -> usize {
-        let (life, address) = (&self.lives[process], self.lives[other].address);
-        let Some(sight) = life.sights.get(&other) else { return 0 };
+    /// Questions since the last answer that had half a period to be answered: at the address where there were the most, and of those
+    /// where it has answered before at the one where there were the fewest.
+    fn unanswered(&self, now: Time, process: usize, other: usize) -> (usize, Option<usize>) {
+        let life = &self.lives[process];
+        let Some(sight) = life.sights.get(&other) else { return (0, None) };
         let least = self.pace(other).0 * 49 / 100;
         let is_missed = |question: &&Question| {
             question.asked >= sight.answered
                 && now.since(question.asked) >= least
                 && !question.is_answered_in_time
         };
-        life.questions.get(&address).map_or(0, |questions| questions.iter().filter(is_missed).count())
+        let count = |address: &SocketAddr| {
+            life.questions.get(address).map_or(0, |questions| questions.iter().filter(is_missed).count())
+        };
+        let most = self.lives[other].addresses.iter().map(count).max();
+        (most.unwrap_or(0), sight.places.iter().map(count).min())
     }
 
     /// A member was heard of within the bound.

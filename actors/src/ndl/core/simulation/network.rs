@@ -1,6 +1,6 @@
 //! What becomes of a datagram: lost, late, twice, out of order, cut off.
 
-use std::{collections::BTreeSet, net::SocketAddr, rc::Rc, time::Duration};
+use std::{collections::BTreeSet, net::SocketAddr, ops::Range, rc::Rc, time::Duration};
 
 use super::{chance::Chance, plan::Quality};
 use crate::ndl::core::Way;
@@ -37,23 +37,32 @@ pub(super) struct Flying {
 
 pub(super) struct Network {
     quality: Quality,
-    /// From which node to which nothing gets through.
-    cut: BTreeSet<(usize, usize)>,
+    networks: usize,
+    /// From which node to which nothing gets through, in which network.
+    cut: BTreeSet<(usize, usize, usize)>,
     /// From which to which no datagram does.
     muffled: BTreeSet<(usize, usize)>,
 }
 
 impl Network {
-    pub(super) const fn new(quality: Quality) -> Self {
-        Self { quality, cut: BTreeSet::new(), muffled: BTreeSet::new() }
+    pub(super) const fn new(quality: Quality, networks: usize) -> Self {
+        Self { quality, networks, cut: BTreeSet::new(), muffled: BTreeSet::new() }
     }
 
-    pub(super) fn cut(&mut self, from: usize, to: usize) {
-        self.cut.insert((from, to));
+    /// In one network, or in all.
+    pub(super) fn cut(&mut self, from: usize, to: usize, network: Option<usize>) {
+        let networks = self.those(network);
+        self.cut.extend(networks.map(|network| (from, to, network)));
     }
 
-    pub(super) fn mend(&mut self, from: usize, to: usize) {
-        self.cut.remove(&(from, to));
+    pub(super) fn mend(&mut self, from: usize, to: usize, network: Option<usize>) {
+        for network in self.those(network) {
+            self.cut.remove(&(from, to, network));
+        }
+    }
+
+    fn those(&self, network: Option<usize>) -> Range<usize> {
+        network.map_or(0..self.networks, |network| network..network + 1)
     }
 
     pub(super) fn muffle(&mut self, from: usize, to: usize) {
@@ -70,14 +79,22 @@ impl Network {
         self.quality = HEALED;
     }
 
-    pub(super) fn is_cut(&self, from: usize, to: usize) -> bool {
-        self.cut.contains(&(from, to))
+    /// Whether in no network packets go both ways.
+    pub(super) fn is_apart(&self, one: usize, other: usize) -> bool {
+        let is_apart =
+            |network| self.cut.contains(&(one, other, network)) || self.cut.contains(&(other, one, network));
+        (0..self.networks).all(is_apart)
     }
 
     /// After which times a datagram arrives: not at all, once, or twice.
-    pub(super) fn delays(&self, chance: &mut Chance, from: usize, to: usize) -> Vec<Duration> {
+    pub(super) fn delays(
+        &self,
+        chance: &mut Chance,
+        (from, to): (usize, usize),
+        network: usize,
+    ) -> Vec<Duration> {
         let quality = self.quality;
-        let is_stopped = self.is_cut(from, to) || self.muffled.contains(&(from, to));
+        let is_stopped = self.cut.contains(&(from, to, network)) || self.muffled.contains(&(from, to));
         if is_stopped || chance.happens(quality.lost_per_mille) {
             return Vec::new();
         }

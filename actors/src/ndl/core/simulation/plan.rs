@@ -53,13 +53,16 @@ pub(super) enum Happening {
         node: usize,
         lasts: Duration,
     },
+    /// In one network, or in all.
     Cut {
         from: usize,
         to: usize,
+        network: Option<usize>,
     },
     Mend {
         from: usize,
         to: usize,
+        network: Option<usize>,
     },
     /// Datagrams are lost from one to the other, and nothing else.
     Muffle {
@@ -85,6 +88,8 @@ pub(super) struct Plan {
     pub(super) finding: Finding,
     /// Whether GNCL's connections deliver where the network is not cut.
     pub(super) connections: bool,
+    /// Networks in which each node has an address.
+    pub(super) networks: usize,
     pub(super) quality: Quality,
     /// How late a timer wakes a node that is not stalled, at most.
     pub(super) lateness: Duration,
@@ -109,6 +114,7 @@ impl Plan {
             watched: None,
             finding,
             connections: false,
+            networks: 1,
             quality: quality(&mut chance, period),
             lateness: chance.of(&[Duration::ZERO, period / 50, period / 4]),
             clocks: (0..nodes).map(|_| clock(&mut chance)).collect(),
@@ -122,11 +128,16 @@ impl Plan {
             plan.fault(&mut chance, heals);
         }
         plan.connect(&mut chance, heals);
+        plan.multiply(&mut chance, heals);
         plan.happenings.push((heals, Happening::Heal));
         plan.happenings.sort_by_key(|(at, _)| *at);
         // An address where nobody answered is asked every 16 periods at last.
         let found_again = if finding == Finding::Mdns { 18 } else { 3 };
-        plan.end = heals + plan.quality.late_max + period * (missed_max + 2 + found_again);
+        // A loss takes longer of a node that is watched more slowly.
+        let watched =
+            plan.watched.map_or(Duration::ZERO, |(_, period, missed_max)| period * (missed_max + 2));
+        let loss = watched.max(period * (missed_max + 2));
+        plan.end = heals + plan.quality.late_max + loss + period * found_again;
         plan
     }
 
@@ -156,6 +167,45 @@ impl Plan {
                 self.happenings.push((ends, Happening::Unmuffle { from, to }));
             }
         }
+    }
+
+    /// Several networks, in some plans: each node has an address in each, and networks fail one by one, between two nodes or around one,
+    /// one way or both, for good or again and again.
+    fn multiply(&mut self, chance: &mut Chance, heals: Duration) {
+        if !chance.happens(300) {
+            return;
+        }
+        self.networks = 2 + chance.index(2);
+        for _ in 0..1 + chance.below(4) {
+            let network = Some(chance.index(self.networks));
+            let (one, both_ways) = (chance.index(self.nodes), chance.happens(600));
+            let others = if chance.happens(500) { 0..self.nodes } else { one..one + 1 };
+            let others: Vec<_> =
+                others.map(|other| (other + 1) % self.nodes).filter(|other| *other != one).collect();
+            let mut at = chance.between(self.period, heals);
+            let (down, up) = (self.period / 2 + self.period * chance.of(&[0, 3, 8]), self.period / 3);
+            for _ in 0..chance.of(&[1, 1, 4]) {
+                let end = (at + down).min(heals);
+                for other in others.iter().copied() {
+                    self.cut_between(at, end, (one, other), network);
+                    if both_ways {
+                        self.cut_between(at, end, (other, one), network);
+                    }
+                }
+                at = (end + up).min(heals);
+            }
+        }
+    }
+
+    fn cut_between(
+        &mut self,
+        begins: Duration,
+        ends: Duration,
+        (from, to): (usize, usize),
+        network: Option<usize>,
+    ) {
+        self.happenings.push((begins, Happening::Cut { from, to, network }));
+        self.happenings.push((ends, Happening::Mend { from, to, network }));
     }
 
     fn starts(&mut self, chance: &mut Chance) {
@@ -200,8 +250,7 @@ impl Plan {
     }
 
     fn one_way(&mut self, from: usize, to: usize, begins: Duration, ends: Duration) {
-        self.happenings.push((begins, Happening::Cut { from, to }));
-        self.happenings.push((ends, Happening::Mend { from, to }));
+        self.cut_between(begins, ends, (from, to), None);
     }
 
     /// Some cannot hear the others for a time, or neither side the other.

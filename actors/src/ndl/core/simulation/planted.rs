@@ -8,7 +8,7 @@ use super::network::{Flying, What};
 use crate::ndl::{
     LossReason, MembershipFact,
     core::{
-        Core, Input, Output,
+        Core, Input, Output, Place,
         contact::{Question, Role},
     },
     datagram::{Announcement, Body, Datagram, parse},
@@ -46,10 +46,12 @@ pub(super) enum Fault {
     BoastsOfItsClock,
     /// Nobody is told of a loss by silence.
     KeepsALossToItself,
+    /// A member that does not answer at one of its addresses is silent.
+    JudgesByOneRoute,
 }
 
 impl Fault {
-    pub(super) const ALL: [Self; 15] = [
+    pub(super) const ALL: [Self; 16] = [
         Self::ForgetsAnAnswer,
         Self::CountsItsOwnStall,
         Self::IgnoresIncarnation,
@@ -65,6 +67,7 @@ impl Fault {
         Self::ForgetsTheFormer,
         Self::BoastsOfItsClock,
         Self::KeepsALossToItself,
+        Self::JudgesByOneRoute,
     ];
 }
 
@@ -95,7 +98,7 @@ impl Patient {
         // Only then: the cost of a core is measured here, and must not grow with what a fault needs.
         let missed: Option<BTreeMap<_, _>> = (self.fault == Some(Fault::ForgetsAnAnswer))
             .then(|| self.core.members.iter().map(|(node, member)| (*node, member.missed)).collect());
-        self.core.receive(now, flying.from, flying.way, &flying.bytes);
+        self.core.receive(now, place(flying), flying.way, &flying.bytes);
         if let Some(missed) = missed {
             for (node, member) in &mut self.core.members {
                 member.missed = missed.get(node).copied().unwrap_or(0);
@@ -124,7 +127,7 @@ impl Patient {
         let Announcement { node, incarnation, .. } = answer.announcement;
         let member = self.core.members.get(&node).map(|member| member.announcement.incarnation);
         let is_taken =
-            self.core.contacts.get(&flying.from).is_some_and(|contact| contact.questions.has(correlation));
+            self.core.contacts.get(&place(flying)).is_some_and(|contact| contact.questions.has(correlation));
         if is_taken && member.is_some_and(|known| incarnation < known) {
             self.core.lose(now, node, LossReason::Restarted);
             self.core.gone.remove(&node);
@@ -134,7 +137,7 @@ impl Patient {
 
     fn ask_again(&mut self, now: Time, flying: &Flying) {
         if let What::Answer(correlation) = flying.what
-            && let Some(contact) = self.core.contacts.get_mut(&flying.from)
+            && let Some(contact) = self.core.contacts.get_mut(&place(flying))
             && !contact.questions.has(correlation)
         {
             contact.questions.push(Question { correlation, asked: now }, 4);
@@ -146,6 +149,12 @@ impl Patient {
             && let Some(due) = self.core.next_wake().filter(|due| *due < now)
         {
             self.core.handle(due, Input::TimePassed);
+        }
+        if self.fault == Some(Fault::JudgesByOneRoute) {
+            for member in self.core.members.values_mut() {
+                let missed = member.routes.iter().map(|route| route.missed).max();
+                member.missed = member.missed.max(missed.unwrap_or(0));
+            }
         }
         self.core.handle(now, Input::TimePassed);
     }
@@ -173,6 +182,10 @@ impl Patient {
         let contacts = &mut self.core.contacts;
         contacts.retain(|_, contact| !matches!(contact.role, Role::Former { .. }));
     }
+}
+
+const fn place(flying: &Flying) -> Place {
+    Place { there: flying.from, here: flying.to }
 }
 
 const fn is_silence(fact: &MembershipFact) -> bool {

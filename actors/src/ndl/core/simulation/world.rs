@@ -28,7 +28,7 @@ use crate::{
     gncl::LinkFact,
     ndl::{
         MembershipFact,
-        core::{Core, Host, Input, Output, Way},
+        core::{Core, Host, Input, Output, Place, Way},
         datagram::{Answer, Body, Datagram, encode},
     },
 };
@@ -102,7 +102,8 @@ enum Event {
 struct Process {
     node: usize,
     patient: Patient,
-    address: SocketAddr,
+    /// One in each network.
+    addresses: Vec<SocketAddr>,
     clock: Clock,
     is_alive: bool,
     stalled_until: Time,
@@ -147,8 +148,17 @@ pub(super) fn node_address(node: usize) -> NodeAddress {
     NodeAddress::new(0x0a00_0001 + u32::try_from(node).expect("few nodes"))
 }
 
-fn ip(node: usize) -> Ipv4Addr {
-    Ipv4Addr::from(node_address(node).bits())
+/// The address of a node in a network.
+fn ip(node: usize, network: usize) -> Ipv4Addr {
+    Ipv4Addr::from(node_address(node).bits() + (u32::try_from(network).expect("few networks") << 16))
+}
+
+/// The network that an address is in.
+fn network_of(address: SocketAddr) -> usize {
+    match address {
+        SocketAddr::V4(address) => usize::from(address.ip().octets()[1]),
+        SocketAddr::V6(_) => unreachable!("all are IPv4"),
+    }
 }
 
 impl World {
@@ -160,7 +170,7 @@ impl World {
             now: BEGIN,
             events: BTreeMap::new(),
             sequence: 0,
-            network: Network::new(plan.quality),
+            network: Network::new(plan.quality, plan.networks),
             judge: Judge::new(&plan),
             processes: Vec::new(),
             current: BTreeMap::new(),
@@ -198,6 +208,7 @@ impl World {
         let views: Vec<_> = self.current.values().map(|process| (*process, self.view(*process))).collect();
         if self.judge.violations.is_empty() {
             self.judge.at_rest(self.now, &views);
+            self.judge_routes();
         }
         let Self { judge, seen, digest, .. } = self;
         Outcome { violations: judge.violations, seen, digest: digest.finish() }
@@ -219,6 +230,23 @@ impl World {
         let now = self.local(process);
         let members = self.processes[process].patient.core.members(now);
         members.into_iter().map(|member| (member.node, member.incarnation)).collect()
+    }
+
+    /// All has been well for long: everybody answers everybody in each network.
+    fn judge_routes(&mut self) {
+        for process in self.current.values().copied() {
+            for member in self.processes[process].patient.core.members(self.local(process)) {
+                let routes = member.routes.iter().filter(|route| route.missed == 0);
+                let networks: BTreeSet<_> = routes.map(|route| network_of(route.there)).collect();
+                if networks.len() < self.plan.networks {
+                    let words = format!(
+                        "{:?}: at rest, {process} reaches {} in the networks {networks:?} of {}",
+                        self.now, member.node, self.plan.networks
+                    );
+                    self.judge.violations.push(words);
+                }
+            }
+        }
     }
 
     pub(super) const fn seen(&self) -> &Seen {
@@ -297,7 +325,7 @@ impl World {
             return;
         }
         if let What::Answer(correlation) = flying.what {
-            self.judge.answered(self.now, process, flying.sender, correlation);
+            self.judge.answered(self.now, process, (flying.sender, flying.from), correlation);
         }
         if is_stalled {
             self.processes[process].socket.push_back(flying);

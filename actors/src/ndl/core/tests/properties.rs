@@ -2,7 +2,7 @@
 
 use std::{
     collections::BTreeMap,
-    net::{Ipv4Addr, SocketAddrV4},
+    net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4},
 };
 
 use proptest::prelude::*;
@@ -16,44 +16,58 @@ use crate::{
     gncl::LinkFact,
     ndl::{
         MembershipFact,
-        core::{Core, Input, Output, Query, Way, contact::Role},
+        core::{Core, Input, Output, Place, Query, Way, contact::Role},
         datagram::{Announcement, Answer},
     },
 };
 
 const GNCL: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 1), 5);
 
+/// This node's addresses.
+const PATHS: [SocketAddr; 2] = [path(0), path(1)];
+
+const fn path(network: u8) -> SocketAddr {
+    SocketAddr::new(IpAddr::V4(Ipv4Addr::new(10, network, 0, 9)), 1_000)
+}
+
 /// Anything that can reach a core, in any order.
 fn any_input() -> impl Strategy<Value = (u64, Input)> {
-    let addresses = (1u16..6).prop_map(udp);
-    let announcement = (1u32..6, 0u64..4, 0u64..4).prop_map(|(address, incarnation, boot_nonce)| {
-        Announcement { incarnation: Incarnation(incarnation), boot_nonce, ..stranger(address) }
-    });
-    let input =
-        (addresses, announcement, 0..7, any::<bool>()).prop_map(|(from, announcement, what, flag)| {
-            let Announcement { node, incarnation, .. } = announcement;
-            match what {
-                0 => {
-                    let way = if flag { Way::Unicast } else { Way::Multicast };
-                    Input::QueryReceived(Query { from, way, correlation: 1, sent: Time::ZERO, announcement })
-                }
-                1 | 2 => {
-                    let answer = Answer {
-                        announcement,
-                        query_sent_ns: 0,
-                        query_received_ns: 0,
-                        progress: Default::default(),
-                    };
-                    Input::AnswerReceived { from, correlation: 0, sent: Time::ZERO, answer }
-                }
-                3 => Input::LeaveReceived { from, announcement },
-                4 => Input::MdnsResolved { address: from },
-                5 if flag => Input::Link(LinkFact::LinkBroken { node, incarnation }),
-                5 => Input::Link(LinkFact::DialRefused { node, incarnation }),
-                6 if flag => Input::SignSeen { node, incarnation, at: Time::from_nanos(1) },
-                _ => Input::TimePassed,
-            }
+    let place = || {
+        (1u16..6, 0..2u16)
+            .prop_map(|(there, here)| Place { there: udp(there), here: PATHS[usize::from(here)] })
+    };
+    let ndl = proptest::collection::vec((Just(0x0a00_0001), 1_001..1_006_u16), 0..4);
+    let announcement =
+        (1u32..6, 0u64..4, 0u64..4, ndl).prop_map(|(address, incarnation, boot_nonce, ndl)| Announcement {
+            incarnation: Incarnation(incarnation),
+            boot_nonce,
+            ndl,
+            ..stranger(address)
         });
+    let input = (place(), announcement, 0..7, any::<bool>()).prop_map(|(from, announcement, what, flag)| {
+        let Announcement { node, incarnation, .. } = announcement;
+        match what {
+            0 => {
+                let way = if flag { Way::Unicast } else { Way::Multicast };
+                Input::QueryReceived(Query { from, way, correlation: 1, sent: Time::ZERO, announcement })
+            }
+            1 | 2 => {
+                let answer = Answer {
+                    announcement,
+                    query_sent_ns: 0,
+                    query_received_ns: 0,
+                    progress: Default::default(),
+                };
+                Input::AnswerReceived { from, correlation: 0, sent: Time::ZERO, answer }
+            }
+            3 => Input::LeaveReceived { from, announcement },
+            4 => Input::MdnsResolved { address: from.there },
+            5 if flag => Input::Link(LinkFact::LinkBroken { node, incarnation }),
+            5 => Input::Link(LinkFact::DialRefused { node, incarnation }),
+            6 if flag => Input::SignSeen { node, incarnation, at: Time::from_nanos(1) },
+            _ => Input::TimePassed,
+        }
+    });
     (0u64..700, input)
 }
 
@@ -73,11 +87,15 @@ proptest! {
     fn facts_alternate_and_tables_agree(inputs in proptest::collection::vec(any_input(), 1..200)) {
         let mut core = Spec { nodes_max: 3, ..Spec::of(1) }.core(99);
         let mut now = Time::from_nanos(1_000_000_000);
-        core.start(now, udp(0), GNCL);
+        core.start(now, &PATHS, GNCL);
         let mut there = BTreeMap::new();
         for (gap, input) in inputs {
             now = now + ms(gap);
             let input = to_a_question(&core, input);
+            if gap < 20 {
+                // An address goes, and is back.
+                core.use_paths(now, &PATHS[..gap as usize % 3]);
+            }
             core.handle(now, input);
             while let Some(output) = core.poll() {
                 match output {
@@ -88,7 +106,7 @@ proptest! {
                         prop_assert_eq!(there.remove(&node), Some(incarnation));
                     }
                     Output::AddressTaken { .. } => {
-                        core.start(now, udp(0), GNCL);
+                        core.start(now, &PATHS, GNCL);
                     }
                     Output::SendQuery { .. } | Output::SendMulticastQuery { .. } | Output::SendAnswer { .. }
                     | Output::SendLeave { .. } | Output::Event { .. } | Output::ClockMeasured { .. }
@@ -96,12 +114,15 @@ proptest! {
                 }
             }
             prop_assert!(core.members.keys().eq(there.keys()));
-            prop_assert!(core.members.len() <= 3 && core.gone.len() <= 3 && core.contacts.len() <= 9);
+            prop_assert!(core.members.len() <= 3 && core.gone.len() <= 3 && core.contacts.len() <= 3 + 3 * 2 * 8 * 2);
+            prop_assert!(core.contacts.keys().all(|place| core.paths().contains(&place.here)));
             prop_assert!(core.contests.keys().all(|node| core.members.contains_key(node)));
             prop_assert!(core.members.keys().all(|node| !core.gone.contains_key(node)));
             for (node, member) in &core.members {
-                let role = core.contacts.get(&member.address).map(|contact| contact.role);
-                prop_assert_eq!(role, Some(Role::Member(*node)));
+                for place in member.routes.places() {
+                    let role = core.contacts.get(&place).map(|contact| contact.role);
+                    prop_assert_eq!(role, Some(Role::Member(*node)));
+                }
             }
             prop_assert!(core.next_wake().is_some());
         }

@@ -7,7 +7,7 @@ use sinew_runtime::{
     time::Time,
 };
 
-use super::world::{PERIOD, Spec, World, ms, node, udp};
+use super::world::{PERIOD, Spec, World, ms, node, place, udp};
 use crate::{
     gncl::LinkFact,
     lncl::AppFact,
@@ -33,6 +33,7 @@ pub(super) fn stranger(address: u32) -> Announcement {
         gncl_port: 1,
         period_us: 500_000,
         gncl_further: Vec::new(),
+        ndl: Vec::new(),
         claim: Claim::Held,
     }
 }
@@ -297,7 +298,7 @@ fn what_a_node_answered_before_its_goodbye_does_not_bring_it_back_though_it_was_
     let mut world = World::of_members(2);
     world.cut(2, 1);
     world.run_until(PERIOD * 5, |world| !world.knows(1, 2));
-    let contact = &world.at(1).core.contacts[&udp(2)];
+    let contact = &world.at(1).core.contacts[&place(1, udp(2))];
     let correlation = contact.questions.newest().expect("it is asked again at once").correlation;
     let announcement = world.at(2).core.announcement().clone();
     // when
@@ -332,7 +333,7 @@ fn an_answer_counts_only_from_the_address_that_was_asked_and_only_once() {
     // given: the address of a stranger has been asked
     let mut world = World::of_members(1);
     world.forge(udp(9), 1, &bytes(1, Body::Query(stranger(9))));
-    let question = world.at(1).core.contacts[&udp(9)].questions.newest().unwrap();
+    let question = world.at(1).core.contacts[&place(1, udp(9))].questions.newest().unwrap();
     let answer = |correlation| {
         let announcement = stranger(9);
         let answer =

@@ -17,7 +17,7 @@ use crate::{
     lncl::AppFact,
     ndl::{
         LossReason, MembershipFact, NodeEvent,
-        core::{Core, Input, Output, Way},
+        core::{Core, Input, Output, Place, Way},
         datagram::{Answer, Body, Datagram, encode},
     },
     stores::ClockOffset,
@@ -36,6 +36,11 @@ pub(super) const fn ms(millis: u64) -> Duration {
 /// The UDP address of the `index`-th process.
 pub(super) fn udp(index: u16) -> SocketAddr {
     SocketAddr::from(([10, 0, 0, 1], 1_000 + index))
+}
+
+/// Where the `index`-th process meets who is at `there`.
+pub(super) fn place(index: u16, there: SocketAddr) -> Place {
+    Place { there, here: udp(index) }
 }
 
 pub(super) fn node(address: u32) -> NodeAddress {
@@ -186,7 +191,7 @@ impl World {
     pub(super) fn restart_shell(&mut self, index: u16) {
         let gncl = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 1), 5_000 + index);
         self.with(udp(index), |core, now| {
-            core.start(now, udp(index), gncl);
+            core.start(now, &[udp(index)], gncl);
         });
     }
 
@@ -218,7 +223,7 @@ impl World {
 
     /// A datagram that somebody wrote by hand, with whatever source address.
     pub(super) fn forge(&mut self, from: SocketAddr, to: u16, bytes: &[u8]) {
-        self.with(udp(to), |core, now| core.receive(now, from, Way::Unicast, bytes));
+        self.with(udp(to), |core, now| core.receive(now, place(to, from), Way::Unicast, bytes));
     }
 
     pub(super) fn at(&self, index: u16) -> &Process {
@@ -291,7 +296,8 @@ impl World {
             self.flying.insert((process.stalled_until, self.sequence), flying);
             return;
         }
-        self.with(flying.to, |core, now| core.receive(now, flying.from, flying.way, &flying.bytes));
+        let place = Place { there: flying.from, here: flying.to };
+        self.with(flying.to, |core, now| core.receive(now, place, flying.way, &flying.bytes));
     }
 
     pub(super) fn with(&mut self, address: SocketAddr, act: impl FnOnce(&mut Core, Time)) {
@@ -308,9 +314,9 @@ impl World {
         let me = process.core.announcement().clone();
         match output {
             Output::SendQuery { to, correlation } => {
-                self.send(from, to, Datagram { correlation, sent: now, body: Body::Query(me) });
+                self.send(from, to.there, Datagram { correlation, sent: now, body: Body::Query(me) });
             }
-            Output::SendMulticastQuery { correlation } => {
+            Output::SendMulticastQuery { correlation, .. } => {
                 let bytes =
                     encode(&Datagram { correlation, sent: now, body: Body::Query(me) }, NodeAddress::ALL);
                 let all: Vec<SocketAddr> = self.processes.keys().copied().collect();
@@ -320,11 +326,11 @@ impl World {
                 let (query_sent_ns, query_received_ns) = (query_sent.as_nanos(), query_received.as_nanos());
                 let progress = self.processes[&from].core.progress().clone();
                 let answer = Answer { announcement: me, query_sent_ns, query_received_ns, progress };
-                self.send(from, to, Datagram { correlation, sent: now, body: Body::Answer(answer) });
+                self.send(from, to.there, Datagram { correlation, sent: now, body: Body::Answer(answer) });
             }
             Output::SendLeave { .. } if self.loses_goodbyes => {}
             Output::SendLeave { to, .. } => {
-                self.send(from, to, Datagram { correlation: 0, sent: now, body: Body::Leave(me) });
+                self.send(from, to.there, Datagram { correlation: 0, sent: now, body: Body::Leave(me) });
             }
             Output::Probe { node, incarnation, .. } => process.probes.push((node, incarnation)),
             Output::Fact(fact) => process.facts.push(fact),

@@ -11,12 +11,12 @@ impl World {
             Happening::Leave { node } => self.leave(node),
             Happening::RestartShell { node } => self.restart_shell(node),
             Happening::Stall { node, lasts } => self.stall(node, lasts),
-            Happening::Cut { from, to } => {
-                self.network.cut(from, to);
+            Happening::Cut { from, to, network } => {
+                self.network.cut(from, to, network);
                 self.change(from, to);
             }
-            Happening::Mend { from, to } => {
-                self.network.mend(from, to);
+            Happening::Mend { from, to, network } => {
+                self.network.mend(from, to, network);
                 self.change(from, to);
             }
             Happening::Muffle { from, to } => self.network.muffle(from, to),
@@ -36,8 +36,7 @@ impl World {
     /// What the host of `node` says to the node of `process`.
     pub(super) fn host_of(&self, process: usize, node: usize) -> Host {
         let here = self.processes[process].node;
-        let is_cut = self.network.is_cut(here, node) || self.network.is_cut(node, here);
-        if is_cut || self.dead_hosts.contains(&node) {
+        if self.network.is_apart(here, node) || self.dead_hosts.contains(&node) {
             Host::IsSilent
         } else if self.current.contains_key(&node) {
             Host::Accepts
@@ -132,7 +131,7 @@ impl World {
         if self.plan.finding == Finding::Seeds {
             config.ndl.seeds = (0..self.plan.nodes)
                 .filter(|other| *other != node)
-                .map(|other| SocketAddr::from((ip(other), PORT)))
+                .map(|other| SocketAddr::from((ip(other, 0), PORT)))
                 .collect();
         }
         config
@@ -145,13 +144,14 @@ impl World {
         let index = self.processes.len();
         let incarnation = Incarnation(index as u64 + 1);
         let port = if elsewhere { PORT + 1 + u16::try_from(index).expect("few lives") } else { PORT };
-        let address = SocketAddr::from((ip(node), port));
+        let addresses: Vec<_> =
+            (0..self.plan.networks).map(|network| SocketAddr::from((ip(node, network), port))).collect();
         let (nonce, secret) = (self.chance.draw(), u128::from(self.chance.draw()));
         let core = Core::new(&self.config(node), node_address(node), incarnation, nonce, secret);
         self.processes.push(Process {
             node,
             patient: Patient::new(core, self.fault),
-            address,
+            addresses: addresses.clone(),
             clock: self.plan.clocks[node],
             is_alive: true,
             stalled_until: Time::ZERO,
@@ -164,17 +164,17 @@ impl World {
         self.current.insert(node, index);
         self.dead_hosts.remove(&node);
         self.change_node(node);
-        self.at.insert(address, index);
-        self.judge.started(node_address(node), incarnation, address);
+        self.at.extend(addresses.iter().map(|address| (*address, index)));
+        self.judge.started(node_address(node), incarnation, addresses);
         self.begin(index);
         self.tell_through_mdns(index);
     }
 
     fn begin(&mut self, process: usize) {
-        let Process { address, node, .. } = self.processes[process];
-        let gncl = SocketAddrV4::new(ip(node), 5_000);
+        let Process { ref addresses, node, .. } = self.processes[process];
+        let (paths, gncl) = (addresses.clone(), SocketAddrV4::new(ip(node, 0), 5_000));
         self.with(process, |patient, now| {
-            patient.core.start(now, address, gncl);
+            patient.core.start(now, &paths, gncl);
         });
     }
 
@@ -200,7 +200,7 @@ impl World {
 
     fn resolve(&mut self, process: usize, other: usize) {
         let at = self.now + self.chance.between(Duration::ZERO, WORD_MAX);
-        let address = self.processes[other].address;
+        let address = self.processes[other].addresses[0];
         self.push(at, Event::Tell(process, Input::MdnsResolved { address }));
     }
 
@@ -214,7 +214,7 @@ impl World {
         let incarnation = self.processes[process].patient.core.announcement().incarnation;
         let (node_address, others) = (node_address(node), self.current.clone());
         for (other, index) in others {
-            if self.network.is_cut(other, node) || self.network.is_cut(node, other) {
+            if self.network.is_apart(other, node) {
                 continue;
             }
             let at = self.now + self.chance.between(Duration::ZERO, WORD_MAX);
@@ -243,7 +243,7 @@ impl World {
         self.change_node(node);
         let process = &mut self.processes[index];
         process.socket.clear();
-        self.at.remove(&process.address);
+        self.at.retain(|_, at| *at != index);
         self.judge.ended(index, self.now);
         Some(index)
     }
@@ -271,7 +271,7 @@ impl World {
         let living: Vec<usize> = self.current.values().copied().collect();
         for process in &living {
             for other in living.iter().filter(|other| *other != process) {
-                if !self.processes[*process].met.contains(&self.processes[*other].address) {
+                if !self.processes[*process].met.contains(&self.processes[*other].addresses[0]) {
                     self.resolve(*process, *other);
                 }
             }

@@ -7,11 +7,13 @@ impl World {
         let me = || self.processes[from].patient.core.announcement().clone();
         match output {
             Output::SendQuery { to, correlation } => {
-                self.judge.asked(self.now, from, to, correlation);
+                if network_of(to.here) == network_of(to.there) {
+                    self.judge.asked(self.now, from, to.there, correlation);
+                }
                 let datagram = Datagram { correlation, sent: now, body: Body::Query(me()) };
                 self.send(from, to, What::Query, &datagram);
             }
-            Output::SendMulticastQuery { correlation } => {
+            Output::SendMulticastQuery { correlation, .. } => {
                 let datagram = Datagram { correlation, sent: now, body: Body::Query(me()) };
                 self.send_to_all(from, &datagram);
             }
@@ -28,7 +30,7 @@ impl World {
             }
             Output::SendLeave { to, .. } => {
                 let datagram = Datagram { correlation: 0, sent: now, body: Body::Leave(me()) };
-                self.processes[from].goodbyes.insert(to);
+                self.processes[from].goodbyes.insert(to.there);
                 self.send(from, to, What::Leave, &datagram);
             }
             Output::Probe { node, incarnation, within, .. } => {
@@ -72,7 +74,7 @@ impl World {
             MembershipFact::NodeFound { node, incarnation, .. } => {
                 self.seen.found += 1;
                 if let Some(other) = self.current.values().copied().find(|other| self.is_of(*other, node)) {
-                    let address = self.processes[other].address;
+                    let address = self.processes[other].addresses[0];
                     self.processes[process].met.insert(address);
                 }
                 self.judge.found(self.now, process, node, incarnation);
@@ -105,30 +107,38 @@ impl World {
     }
 
     fn send_to_all(&mut self, sender: usize, datagram: &Datagram) {
-        let from = self.processes[sender].address;
         let bytes: Rc<[u8]> = encode(datagram, NodeAddress::ALL).as_ref().into();
         let all: Vec<SocketAddr> = self.at.keys().copied().collect();
-        for to in all {
-            let (way, what, bytes) = (Way::Multicast, What::Query, bytes.clone());
-            self.fly(&Flying { sender, from, to, way, what, bytes });
+        for from in self.processes[sender].addresses.clone() {
+            for to in all.iter().copied().filter(|to| network_of(*to) == network_of(from)) {
+                let (way, what, bytes) = (Way::Multicast, What::Query, bytes.clone());
+                self.fly(&Flying { sender, from, to, way, what, bytes });
+            }
         }
     }
 
-    fn send(&mut self, sender: usize, to: SocketAddr, what: What, datagram: &Datagram) {
-        let from = self.processes[sender].address;
+    fn send(&mut self, sender: usize, to: Place, what: What, datagram: &Datagram) {
+        let Place { here: from, there: to } = to;
+        assert!(self.processes[sender].addresses.contains(&from), "it is sent from an address that is ours");
+        if network_of(from) != network_of(to) {
+            self.seen.datagrams += 1;
+            self.trace(|| format!("{sender} sends {what:?} from {from} to {to}, which nothing joins"));
+            return;
+        }
         let bytes = encode(datagram, NodeAddress::ALL).as_ref().into();
         self.fly(&Flying { sender, from, to, way: Way::Unicast, what, bytes });
     }
 
     fn fly(&mut self, flying: &Flying) {
-        let Flying { sender, to, what, .. } = *flying;
+        let Flying { sender, from, to, what, .. } = *flying;
         self.seen.datagrams += 1;
         let Some(receiver) = self.at.get(&to).map(|process| self.processes[*process].node) else {
             self.trace(|| format!("{sender} sends {what:?} to {to}, where nobody is"));
             return;
         };
-        let delays = self.network.delays(&mut self.chance, self.processes[sender].node, receiver);
-        self.trace(|| format!("{sender} sends {what:?} to {to}, there after {delays:?}"));
+        let nodes = (self.processes[sender].node, receiver);
+        let delays = self.network.delays(&mut self.chance, nodes, network_of(from));
+        self.trace(|| format!("{sender} sends {what:?} from {from} to {to}, there after {delays:?}"));
         self.seen.dropped += u64::from(delays.is_empty());
         for delay in delays {
             self.push(self.now + delay, Event::Land(flying.clone()));

@@ -1,0 +1,49 @@
+//! What is known of a node that answers.
+
+use sinew_runtime::{tid::Incarnation, time::Time};
+
+use super::{Host, clock::PeerClock, pace::Pace, routes::Routes, troubles::Troubles};
+use crate::ndl::{Progress, datagram::Announcement};
+
+/// A node that answers.
+#[derive(Debug)]
+pub(super) struct Member {
+    pub(super) announcement: Announcement,
+    /// Where it answers.
+    pub(super) routes: Routes,
+    /// Its last sign of life.
+    pub(super) heard: Time,
+    /// When it asked us last, or GNCL heard of it last, as far as that was asked; or since when it has been a member.
+    pub(super) sign: Time,
+    /// Which of the paces it is asked at.
+    pub(super) pace: usize,
+    /// Answers missed in a row.
+    pub(super) missed: u32,
+    /// What its host said since it missed the first of them.
+    pub(super) host: Option<Host>,
+    /// What of it does not get on, as it said last.
+    pub(super) progress: Progress,
+    /// What of that applications were told.
+    pub(super) troubles: Troubles,
+    /// The last query of the cycle is not answered yet.
+    pub(super) is_awaited: bool,
+    pub(super) clock: PeerClock,
+    /// Its connection ended and did not come back yet.
+    pub(super) is_link_broken: bool,
+    /// Until then its connection stands, or is being made again.
+    pub(super) link_until: Time,
+    /// Since when it has been a member.
+    pub(super) since: Time,
+    /// The life before this one whose end is known: neither that one nor one before it comes back.
+    pub(super) fence: Option<Incarnation>,
+}
+
+impl Member {
+    /// Whether it is to be counted as lost for its silence. One with several addresses that is asked at one of them alone may only be out
+    /// of reach there; as long as its connection stands, it is there. // spec: NDL-4.1, NDL-4.5, NDL-4.7
+    pub(super) fn is_silent(&self, now: Time, pace: &Pace) -> bool {
+        let Announcement { gncl_further, ndl, .. } = &self.announcement;
+        let has_another_way = !gncl_further.is_empty() && ndl.is_empty() && now < self.link_until;
+        self.missed >= pace.missed_max && !has_another_way && !self.has_given_a_sign(now, pace)
+    }
+}

@@ -1,0 +1,317 @@
+//! The ways to one member: from which of this node's addresses to which of the member's, and which of them works best.
+//!
+//! A member is lost when none of its routes answers; one that fails is replaced by one that is known to work. Who answers somewhere
+//! else in a member's name has no route for that: a new one is taken where the member itself says that it is, on a route that there is
+//! already, or where no route answers any more.
+
+use std::{net::SocketAddr, time::Duration};
+
+use sinew_runtime::{tid::NodeAddress, time::Time};
+
+use super::{
+    Core, Member,
+    contact::{Contact, Role},
+    pace::REST,
+};
+use crate::ndl::datagram::{Announcement, PATHS_MAX};
+
+/// Routes to one member that are asked, at most.
+const ROUTES_MAX: usize = PATHS_MAX;
+/// How many times shorter the round trip of another route is that goes before one that answers: less is chance.
+const MUCH_SHORTER: u32 = 2;
+/// Weight of what was known of a round trip, against one of the newest.
+const SMOOTHING: u32 = 7;
+
+/// From where to where: an address of this node and one of somebody else.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct Place {
+    /// Theirs.
+    pub(crate) there: SocketAddr,
+    /// Ours: of the socket that hears what they send there.
+    pub(crate) here: SocketAddr,
+}
+
+impl Place {
+    /// Whether packets can go there at all: what has a loopback address stays on its host.
+    pub(super) fn is_a_way(&self) -> bool {
+        self.here.is_ipv4() == self.there.is_ipv4()
+            && self.here.ip().is_loopback() == self.there.ip().is_loopback()
+    }
+}
+
+/// A place where a member answers, or did.
+#[derive(Clone, Debug)]
+pub(super) struct Route {
+    pub(super) place: Place,
+    /// Rounds of questions in a row that it did not answer.
+    pub(super) missed: u32,
+    is_awaited: bool,
+    /// Of the last answers, each weighed against those before it.
+    pub(super) round_trip: Option<Duration>,
+}
+
+/// All routes to one member.
+#[derive(Debug)]
+pub(super) struct Routes {
+    /// The first is the one that is used. None: each of them began at an address that this node does not have any more.
+    all: Vec<Route>,
+    /// The one that was used last.
+    last: Place,
+}
+
+impl Routes {
+    pub(super) fn new(place: Place) -> Self {
+        Self { all: vec![Route::new(place)], last: place }
+    }
+
+    /// The one that is used, or was used last.
+    pub(super) fn best(&self) -> Place {
+        self.all.first().map_or(self.last, |route| route.place)
+    }
+
+    pub(super) fn iter(&self) -> impl Iterator<Item = &Route> {
+        self.all.iter()
+    }
+
+    pub(super) fn places(&self) -> impl Iterator<Item = Place> {
+        self.all.iter().map(|route| route.place)
+    }
+
+    pub(super) fn has(&self, place: Place) -> bool {
+        self.places().any(|known| known == place)
+    }
+
+    pub(super) fn is_only(&self, place: Place) -> bool {
+        self.has(place) && self.all.len() == 1
+    }
+
+    /// Whether each of them failed to answer the last question there.
+    pub(super) fn have_all_missed(&self) -> bool {
+        self.all.iter().all(|route| route.missed > 0)
+    }
+
+    pub(super) const fn is_full(&self) -> bool {
+        self.all.len() >= ROUTES_MAX
+    }
+
+    /// One more, which is used if none else answers.
+    pub(super) fn add(&mut self, place: Place) {
+        if !self.has(place) && !self.is_full() {
+            self.all.push(Route::new(place));
+        }
+    }
+
+    /// Keeps those that are `wanted`; returns the others.
+    pub(super) fn keep(&mut self, wanted: impl Fn(&Route) -> bool) -> Vec<Place> {
+        self.last = self.best();
+        let (kept, gone): (Vec<_>, Vec<_>) = self.all.drain(..).partition(wanted);
+        self.all = kept;
+        gone.into_iter().map(|route| route.place).collect()
+    }
+
+    /// A question of the cycle goes there.
+    pub(super) fn asked(&mut self, place: Place) {
+        if let Some(route) = self.all.iter_mut().find(|route| route.place == place) {
+            route.is_awaited = true;
+        }
+    }
+
+    pub(super) fn count_missed(&mut self) {
+        for route in self.all.iter_mut().filter(|route| route.is_awaited) {
+            route.missed = route.missed.saturating_add(1);
+        }
+    }
+
+    /// What came while nobody listened was missed by nobody.
+    pub(super) fn forgive(&mut self) {
+        self.all.iter_mut().for_each(|route| route.is_awaited = false);
+    }
+
+    /// Somebody answered there.
+    pub(super) fn answered(&mut self, place: Place, round_trip: Option<Duration>) {
+        let Some(at) = self.all.iter().position(|route| route.place == place) else { return };
+        let route = &mut self.all[at];
+        (route.missed, route.is_awaited) = (0, false);
+        route.round_trip = match (route.round_trip, round_trip) {
+            (Some(known), Some(new)) => Some((known * SMOOTHING + new) / (SMOOTHING + 1)),
+            (known, new) => new.or(known),
+        };
+        let (used, other) = (&self.all[0], &self.all[at]);
+        let is_better = at != 0 && (used.missed > 0 || other.is_much_shorter_than(used));
+        if is_better {
+            self.all.swap(0, at);
+            self.last = place;
+        }
+    }
+}
+
+impl Route {
+    const fn new(place: Place) -> Self {
+        Self { place, missed: 0, is_awaited: false, round_trip: None }
+    }
+
+    fn is_much_shorter_than(&self, other: &Self) -> bool {
+        self.round_trip.zip(other.round_trip).is_some_and(|(own, other)| own * MUCH_SHORTER < other)
+    }
+}
+
+impl Member {
+    /// Whether this life of it says itself that it answers there.
+    pub(super) fn announces(&self, place: Place) -> bool {
+        self.announcement.ndl_addresses().any(|address| address == place.there)
+    }
+
+    /// Whether a later life that answers there has followed this one: no two processes have one socket address. Where the member did
+    /// not say itself that it is there, and is asked elsewhere too, somebody else may be. // spec: NDL-5.3
+    pub(super) fn is_followed_at(&self, place: Place) -> bool {
+        self.routes.is_only(place) || self.routes.has(place) && self.announces(place)
+    }
+
+    /// Whether a place where its life answers becomes a route to it. // spec: NDL-3.3
+    fn is_led_to(&self, place: Place) -> bool {
+        self.announces(place) && !self.routes.is_full() || self.routes.have_all_missed()
+    }
+}
+
+impl Core {
+    /// This node has these addresses for queries now, from the first one of which it is known by other means; nothing that was asked
+    /// from another one can be answered.
+    pub(crate) fn use_paths(&mut self, now: Time, paths: &[SocketAddr]) {
+        let paths = &paths[..paths.len().min(PATHS_MAX)];
+        let new: Vec<_> = paths.iter().copied().filter(|path| !self.paths.contains(path)).collect();
+        self.paths = paths.to_vec();
+        self.me.announce_ndl(paths);
+        self.contacts.retain(|place, _| paths.contains(&place.here));
+        for member in self.members.values_mut() {
+            member.routes.keep(|route| paths.contains(&route.place.here));
+        }
+        self.contests.retain(|_, contest| paths.contains(&contest.newcomer.from.here));
+        if new.is_empty() || self.rest().due.is_none() {
+            return;
+        }
+        self.meet_seeds(now);
+        self.look_for_the_gone(now, &new);
+        let members: Vec<_> = self.members.keys().copied().collect();
+        members.into_iter().for_each(|node| self.seek(now, node));
+        let asked: Vec<_> = self.contacts.keys().copied().filter(|place| new.contains(&place.here)).collect();
+        asked.into_iter().for_each(|place| self.ask_unless_just_asked(now, place));
+        self.ask_the_group(now);
+    }
+
+    /// Seeds are asked from every address of ours.
+    pub(super) fn meet_seeds(&mut self, now: Time) {
+        for seed in self.seeds.clone().into_iter().filter(|seed| !self.paths.contains(seed)) {
+            for place in self.places_of(seed) {
+                let contact = self.contacts.entry(place).or_insert_with(|| Contact::seed(now));
+                contact.is_seed = true;
+            }
+        }
+    }
+
+    /// From where to ask at an address: wherever packets can go from, and if they can from nowhere, at least so that the system says so.
+    pub(super) fn places_of(&self, there: SocketAddr) -> Vec<Place> {
+        let places = || self.paths.iter().map(|here| Place { there, here: *here });
+        let ways: Vec<_> = places().filter(Place::is_a_way).collect();
+        if ways.is_empty() { places().collect() } else { ways }
+    }
+
+    /// Who was lost may be in reach from an address that we did not have.
+    fn look_for_the_gone(&mut self, now: Time, new: &[SocketAddr]) {
+        let gone: Vec<_> = self.gone.iter().map(|(node, gone)| (*node, gone.places.clone())).collect();
+        for (node, places) in gone {
+            let there = places.iter().map(|place| place.there);
+            let at = there.flat_map(|there| new.iter().map(move |here| Place { there, here: *here }));
+            for place in at.filter(Place::is_a_way) {
+                self.contacts.entry(place).or_insert_with(|| Contact::former(now, node));
+            }
+        }
+    }
+
+    /// Asks a member wherever it says that it is and has not answered.
+    pub(super) fn seek(&mut self, now: Time, node: NodeAddress) {
+        for place in self.unknown_places_of(node) {
+            if !self.has_room_for_a_candidate() {
+                return;
+            }
+            self.contacts.insert(place, Contact::announced(now));
+            self.ask(now, place);
+        }
+    }
+
+    /// The same of all members: who was not in reach may be now. They are asked with all others in this round.
+    pub(super) fn seek_all(&mut self, now: Time) {
+        let members: Vec<_> = self.members.keys().copied().collect();
+        for node in members {
+            for place in self.unknown_places_of(node) {
+                if self.has_room_for_a_candidate() {
+                    self.contacts.insert(place, Contact::announced(now));
+                }
+            }
+        }
+    }
+
+    fn unknown_places_of(&self, node: NodeAddress) -> Vec<Place> {
+        let Some(member) = self.members.get(&node) else { return Vec::new() };
+        let pairs = member.announcement.ndl_addresses().flat_map(|there| {
+            let place = move |here: &SocketAddr| Place { there, here: *here };
+            self.paths.iter().map(place)
+        });
+        pairs.filter(|place| place.is_a_way() && !self.contacts.contains_key(place)).collect()
+    }
+
+    /// Whether the member's life, which answered there, has a route there, or is given one now.
+    pub(super) fn is_routed(&mut self, now: Time, node: NodeAddress, place: Place) -> bool {
+        let Some(member) = self.members.get_mut(&node) else { return false };
+        if member.routes.has(place) {
+            return true;
+        }
+        if !member.is_led_to(place) {
+            return false;
+        }
+        if !member.announces(place) {
+            // It has moved: where it does not say that it is, it is not any more.
+            let announced: Vec<_> = member.announcement.ndl_addresses().collect();
+            let most = ROUTES_MAX - 1;
+            let former = member.routes.keep(|route| announced.contains(&route.place.there));
+            let crowded: Vec<_> = member.routes.places().skip(most).collect();
+            member.routes.keep(|route| !crowded.contains(&route.place));
+            former.into_iter().chain(crowded).for_each(|place| self.drop_contact(now, place));
+        }
+        if let Some(member) = self.members.get_mut(&node) {
+            member.routes.add(place);
+        }
+        self.contact_at(now, place).role = Role::Member(node);
+        true
+    }
+
+    /// What a member says of its addresses, on a route to it. // spec: NDL-3.3
+    pub(super) fn note_addresses(&mut self, now: Time, node: NodeAddress, said: &Announcement) {
+        let Some(member) = self.members.get_mut(&node) else { return };
+        if member.announcement.ndl != said.ndl {
+            member.announcement.ndl.clone_from(&said.ndl);
+            self.seek(now, node);
+        }
+    }
+
+    /// Routes that the member does not speak of any more, and does not answer on either, are no routes.
+    pub(super) fn drop_former_routes(&mut self, now: Time, at: usize) {
+        let missed_max = self.paces[at].missed_max;
+        let mut dropped = Vec::new();
+        for member in self.members.values_mut().filter(|member| member.pace == at && member.missed == 0) {
+            let announced: Vec<_> = member.announcement.ndl_addresses().collect();
+            let is_wanted =
+                |route: &Route| route.missed < missed_max || announced.contains(&route.place.there);
+            dropped.extend(member.routes.keep(is_wanted));
+        }
+        dropped.into_iter().for_each(|place| self.drop_contact(now, place));
+    }
+
+    /// Where a member is asked in a round of its own pace: where it answered last, as long as it does; then everywhere.
+    pub(super) fn places_in_round(member: &Member) -> Vec<Place> {
+        if member.pace == REST || member.missed > 0 {
+            member.routes.places().collect()
+        } else {
+            member.routes.places().take(1).collect()
+        }
+    }
+}

@@ -1,0 +1,310 @@
+//! Several ways to one member: which of them are believed, which is used, and when none is left. One core, answered by hand.
+
+use std::{
+    net::{Ipv4Addr, SocketAddr, SocketAddrV4},
+    time::Duration,
+};
+
+use sinew_runtime::{tid::Incarnation, time::Time};
+
+use super::{
+    scenarios::stranger,
+    world::{PERIOD, Spec, ms, node},
+};
+use crate::ndl::{
+    LossReason, MembershipFact,
+    core::{Core, Input, Output, Place, Query, Way},
+    datagram::{Announcement, Answer, Claim},
+};
+
+const GNCL: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 1), 5);
+/// The networks that both nodes are in; a third one is of whoever means no good.
+const NETWORKS: [u8; 2] = [0, 1];
+
+/// An address of this node, and one of the member, in one network.
+fn way(network: u8) -> Place {
+    Place { here: at(network, 1), there: at(network, 2) }
+}
+
+/// Somebody else in the first network.
+fn elsewhere() -> Place {
+    Place { there: at(0, 66), ..way(0) }
+}
+
+fn at(network: u8, host: u8) -> SocketAddr {
+    ([10, network, 0, host], 7_400).into()
+}
+
+/// A node with an address in each network, and what it has said.
+struct Bench {
+    core: Core,
+    now: Time,
+    facts: Vec<MembershipFact>,
+    asked: Vec<Place>,
+    collisions: usize,
+}
+
+impl Bench {
+    fn new() -> Self {
+        let core = Spec { multicast: false, seeds: vec![way(0).there], ..Spec::of(1) }.core(9);
+        let now = Time::from_nanos(1_000_000_000);
+        let mut bench = Self { core, now, facts: Vec::new(), asked: Vec::new(), collisions: 0 };
+        bench.core.start(now, &NETWORKS.map(|network| at(network, 1)), GNCL);
+        bench.drain();
+        bench
+    }
+
+    /// One that knows the member on both ways.
+    fn of_two_ways() -> Self {
+        let mut bench = Self::new();
+        bench.answer(way(0), member());
+        bench.answer(way(1), member());
+        assert_eq!(bench.routes(), [way(0), way(1)]);
+        bench.facts.clear();
+        bench
+    }
+
+    fn drain(&mut self) {
+        while let Some(output) = self.core.poll() {
+            match output {
+                Output::SendQuery { to, .. } => self.asked.push(to),
+                Output::Fact(fact) => self.facts.push(fact),
+                Output::Collision { .. } => self.collisions += 1,
+                Output::SendMulticastQuery { .. }
+                | Output::SendAnswer { .. }
+                | Output::SendLeave { .. }
+                | Output::Probe { .. }
+                | Output::Event { .. }
+                | Output::ClockMeasured { .. }
+                | Output::AddressTaken { .. }
+                | Output::Stalled { .. } => {}
+            }
+        }
+    }
+
+    /// The last question that was asked there is answered so; whether there was one.
+    fn answer(&mut self, from: Place, announcement: Announcement) -> bool {
+        let question = self.core.contacts.get(&from).and_then(|contact| contact.questions.newest());
+        let Some(question) = question else { return false };
+        let answer = Answer {
+            announcement,
+            query_sent_ns: question.asked.as_nanos(),
+            query_received_ns: 0,
+            progress: Default::default(),
+        };
+        let (correlation, sent) = (question.correlation, Time::ZERO);
+        self.core.handle(self.now, Input::AnswerReceived { from, correlation, sent, answer });
+        self.drain();
+        true
+    }
+
+    /// Has `from` asked, as if somebody had spoken there, and answered so.
+    fn speak(&mut self, from: Place, announcement: Announcement) {
+        let query = Query {
+            from,
+            way: Way::Unicast,
+            correlation: 1,
+            sent: Time::ZERO,
+            announcement: announcement.clone(),
+        };
+        self.now = self.now + ms(11);
+        self.core.handle(self.now, Input::QueryReceived(query));
+        self.drain();
+        assert!(self.answer(from, announcement), "who is heard is asked");
+    }
+
+    fn pass(&mut self, time: Duration) {
+        let end = self.now + time;
+        while let Some(wake) = self.core.next_wake().filter(|wake| *wake <= end) {
+            self.now = wake;
+            self.core.handle(wake, Input::TimePassed);
+            self.drain();
+        }
+        self.now = end;
+    }
+
+    /// The member answers on these ways for so many periods.
+    fn live(&mut self, periods: u32, ways: &[Place]) {
+        for _ in 0..periods {
+            self.pass(PERIOD);
+            for way in ways {
+                self.answer(*way, member());
+            }
+        }
+    }
+
+    fn routes(&self) -> Vec<Place> {
+        self.core.members[&node(2)].routes.places().collect()
+    }
+
+    fn life(&self) -> Option<Incarnation> {
+        self.core.members.get(&node(2)).map(|member| member.announcement.incarnation)
+    }
+}
+
+/// What the member says of itself.
+fn member() -> Announcement {
+    let ndl = NETWORKS.map(|network| ([10, network, 0, 2], 7_400));
+    let ndl = ndl.map(|(ip, port)| (u32::from_be_bytes(ip), port)).to_vec();
+    Announcement { ndl, incarnation: Incarnation(5), ..stranger(2) }
+}
+
+fn later_life() -> Announcement {
+    Announcement { incarnation: Incarnation(6), boot_nonce: 0x600d, claim: Claim::Settling, ..member() }
+}
+
+// spec: NDL-3.3
+#[test]
+fn who_says_where_it_is_is_asked_there_from_each_address_at_once() {
+    let mut bench = Bench::new();
+    bench.asked.clear();
+    bench.answer(way(0), member());
+    assert!(bench.asked.contains(&way(1)), "{:?}", bench.asked);
+    assert_eq!(bench.routes(), [way(0)], "what it says makes no route");
+    bench.answer(way(1), member());
+    assert_eq!(bench.routes(), [way(0), way(1)]);
+    // In each round both are asked.
+    bench.asked.clear();
+    bench.live(1, &[way(0), way(1)]);
+    assert!([way(0), way(1)].iter().all(|way| bench.asked.contains(way)), "{:?}", bench.asked);
+}
+
+// spec: NDL-4.1
+#[test]
+fn a_member_is_there_while_one_way_answers_and_lost_in_time_when_none_does() {
+    for dies in [0, 1] {
+        let mut bench = Bench::of_two_ways();
+        let lives = way(1 - dies);
+        bench.live(20, &[lives]);
+        assert_eq!(bench.facts, [], "way {dies} is cut");
+        assert_eq!(bench.routes()[0], lives, "it is the one that is used");
+        bench.pass(PERIOD * 4);
+        let [MembershipFact::NodeLost { why: LossReason::LinkDown, .. }] = bench.facts[..] else {
+            panic!("lost once: {:?}", bench.facts)
+        };
+    }
+}
+
+// spec: NDL-4.1
+#[test]
+fn ways_that_answer_by_turns_keep_the_member() {
+    let mut bench = Bench::of_two_ways();
+    for round in 0..30 {
+        bench.live(1, &[way(round % 2)]);
+    }
+    assert_eq!(bench.facts, []);
+    bench.live(2, &[way(0), way(1)]);
+    assert_eq!(bench.routes().len(), 2);
+}
+
+// spec: NDL-3.3
+#[test]
+fn a_life_that_answers_where_the_member_does_not_say_that_it_is_has_no_route_there() {
+    let mut bench = Bench::of_two_ways();
+    // Who repeats what the member says, from an address of his own, also with that address in it.
+    bench.speak(elsewhere(), member());
+    let with_his = Announcement { ndl: vec![(0x0a00_0042, 7_400)], ..member() };
+    bench.speak(elsewhere(), with_his.clone());
+    bench.speak(elsewhere(), with_his);
+    assert_eq!(bench.routes(), [way(0), way(1)]);
+    // Nor while one of the ways alone answers.
+    bench.live(2, &[way(0)]);
+    bench.speak(elsewhere(), member());
+    assert_eq!(bench.routes().len(), 2);
+}
+
+// spec: NDL-3.3
+#[test]
+fn a_member_that_has_moved_is_believed_when_it_answers_nowhere_else() {
+    let mut bench = Bench::of_two_ways();
+    bench.pass(PERIOD * 2);
+    bench.speak(elsewhere(), member());
+    assert_eq!(bench.routes()[0], elsewhere());
+    assert!([way(0), way(1)].iter().all(|way| bench.routes().contains(way)), "it is asked there further");
+    bench.live(10, &[elsewhere()]);
+    assert_eq!(bench.facts, []);
+}
+
+// spec: NDL-5.3
+#[test]
+fn a_later_life_elsewhere_is_no_successor_while_the_member_answers_anywhere() {
+    let mut bench = Bench::of_two_ways();
+    bench.speak(elsewhere(), later_life());
+    assert_eq!(bench.life(), Some(Incarnation(5)), "it is contested");
+    bench.now = bench.now + ms(11);
+    assert!(bench.answer(way(1), member()), "each way is asked");
+    bench.pass(ms(200));
+    assert_eq!((bench.life(), bench.collisions), (Some(Incarnation(5)), 1));
+    assert_eq!(bench.facts, []);
+    // It does follow where the former life itself was, or when that answers nowhere any more.
+    for place in [way(1), elsewhere()] {
+        let mut bench = Bench::of_two_ways();
+        bench.speak(place, later_life());
+        bench.pass(ms(200));
+        assert_eq!(bench.life(), Some(Incarnation(6)), "{place:?}");
+    }
+}
+
+// spec: NDL-5.3
+#[test]
+fn a_later_life_is_contested_also_at_a_place_that_was_taken_for_the_members_while_it_was_silent() {
+    let mut bench = Bench::of_two_ways();
+    bench.pass(PERIOD * 2);
+    bench.speak(elsewhere(), member());
+    bench.speak(elsewhere(), later_life());
+    assert_eq!(bench.life(), Some(Incarnation(5)));
+    bench.answer(way(0), member());
+    bench.pass(ms(200));
+    assert_eq!(bench.life(), Some(Incarnation(5)), "it answers where it says that it is");
+}
+
+#[test]
+fn what_was_asked_from_an_address_that_is_gone_is_forgotten_and_the_member_is_not() {
+    let mut bench = Bench::of_two_ways();
+    bench.pass(PERIOD);
+    // when: one address goes
+    bench.core.use_paths(bench.now, &[way(1).here]);
+    assert!(!bench.answer(way(0), member()), "no question is left");
+    assert_eq!(bench.routes(), [way(1)]);
+    // when: the other one goes too
+    bench.core.use_paths(bench.now, &[]);
+    assert_eq!(bench.routes(), []);
+    assert_eq!(bench.core.members(bench.now)[0].udp, way(1).there, "where it was last");
+    bench.pass(PERIOD);
+    assert_eq!(bench.facts, []);
+    // then: it is back in time, and is asked at once
+    bench.asked.clear();
+    bench.core.use_paths(bench.now, &NETWORKS.map(|network| at(network, 1)));
+    bench.drain();
+    assert!(NETWORKS.iter().all(|network| bench.asked.contains(&way(*network))), "{:?}", bench.asked);
+    bench.answer(way(1), member());
+    assert_eq!(bench.routes(), [way(1)]);
+    // and lost if not
+    bench.core.use_paths(bench.now, &[]);
+    bench.pass(PERIOD * 4);
+    assert!(matches!(bench.facts[..], [MembershipFact::NodeLost { .. }]), "{:?}", bench.facts);
+    // and found when there is a way again
+    bench.core.use_paths(bench.now, &[way(1).here]);
+    bench.drain();
+    assert!(bench.answer(way(1), member()), "who was lost is asked at once");
+    assert!(bench.life().is_some());
+}
+
+#[test]
+fn a_member_has_no_more_routes_than_there_are_paths_however_much_it_says() {
+    let mut bench = Bench::new();
+    let all = |host: u32| Announcement {
+        ndl: (0..8).map(|n| (0x0a00_0100 + host + n, 7_400)).chain(member().ndl).take(8).collect(),
+        ..member()
+    };
+    bench.answer(way(0), all(0));
+    for round in 0..10_u32 {
+        let places: Vec<_> = bench.core.contacts.keys().copied().collect();
+        for place in places {
+            bench.answer(place, all(round * 8));
+        }
+        bench.pass(PERIOD);
+        assert!(bench.routes().len() <= 8, "{:?}", bench.routes());
+        assert!(bench.core.contacts.len() <= 8 + 64 + 2, "{}", bench.core.contacts.len());
+    }
+}
