@@ -3,7 +3,7 @@
 use std::{
     collections::BTreeMap,
     hash::{BuildHasher, RandomState},
-    net::{SocketAddr, SocketAddrV4, UdpSocket},
+    net::{SocketAddr, SocketAddrV4},
     os::unix::net::UnixListener,
     path::Path,
     sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, atomic::AtomicBool},
@@ -51,8 +51,8 @@ pub(crate) struct Stores {
     pub(crate) refusals: Arc<Refusals>,
     /// GNCL's peers with the messages that wait for them, and what GNCL refused.
     pub(crate) gncl: gncl::Store,
-    /// NDL's socket for queries and answers. It stays open while this layer is restarted: whoever knows it still finds us.
-    pub(crate) ndl_socket: Mutex<Option<UdpSocket>>,
+    /// NDL's sockets for queries and answers. They stay open while this layer is restarted.
+    pub(crate) ndl_sockets: Mutex<ndl::Sockets>,
     /// What is to be told of nodes' ends behind their last messages.
     pub(crate) aftermath: Aftermath,
     /// Which nodes are there; a restarted NDL goes on with them.
@@ -104,7 +104,7 @@ impl Stores {
             gncl_further: OnceLock::new(),
             refusals: Arc::default(),
             gncl: gncl::Store::default(),
-            ndl_socket: Mutex::default(),
+            ndl_sockets: Mutex::default(),
             aftermath: Aftermath::default(),
             ndl: Mutex::new(ndl::new_core(&config, node, incarnation)),
             door: lncl::Door::default(),
@@ -132,7 +132,7 @@ impl Stores {
         self.router.remove_local(AppAddress::INSPECT);
         self.gncl.close();
         self.gncl.end_bulk();
-        lock(&self.ndl_socket).take();
+        lock(&self.ndl_sockets).close_all();
     }
 
     /// Somebody has a name that he had not, or has it no more, on this node or another. Said after the change and before

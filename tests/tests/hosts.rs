@@ -128,3 +128,91 @@ fn a_link_whose_interface_is_taken_down_is_back_over_the_other_one_and_nothing_i
         assert!(node.said().iter().all(is_as_it_should_be), "{:?}", node.said());
     }
 }
+
+/// A node that uses these interfaces, and finds others by multicast on each.
+fn start_on(
+    hosts: &Hosts,
+    directory: &OwnDirectory,
+    (index, interfaces): (usize, &str),
+    group: SocketAddrV4,
+    more: &[&str],
+) -> Program {
+    let (name, address) = (NAMES[index], index + 1);
+    let path = directory.join(&format!("{name}.toml"));
+    let text = format!(
+        "[node]\nname = \"{name}\"\nproject = \"hosts\"\naddress = \"10.77.0.{address}\"\n\
+         [ndl]\ninterface = {interfaces}\nmulticast = \"{group}\"\nmdns_port = false\nperiod_ms = 100\n"
+    );
+    std::fs::write(&path, text).expect("the test's own directory");
+    node_under_test(Some(&hosts.all()[index]), &path, more)
+}
+
+fn counts_in_order(node: &Program) {
+    let counts: Vec<_> = node.said().iter().filter_map(|line| count_in(line)).collect();
+    assert!(counts.iter().all(|(number, last)| *number == last + 1), "{counts:?}");
+}
+
+fn has_lost_nobody(nodes: [&Program; 2]) {
+    for node in nodes {
+        assert!(node.said().iter().all(|line| !line.contains("NodeLost")), "{:?}", node.said());
+    }
+}
+
+#[test]
+fn a_node_with_two_links_is_there_while_one_of_them_carries_and_lost_when_none_does() {
+    let hosts = match Hosts::in_networks(2, 2) {
+        Ok(hosts) => hosts,
+        Err(why) => {
+            println!("skipped: no hosts can be made here: {why}");
+            return;
+        }
+    };
+    let (directory, group) = (OwnDirectory::new(), own_group());
+    let sends = ["--requires", "hip", "--sends-to", "hip", "--logs"];
+    let on = |index| (index, ["[\"10.77.0.1\", \"10.78.0.1\"]", "[\"10.77.0.2\", \"10.78.0.2\"]"][index]);
+    let mut central = start_on(&hosts, &directory, on(0), group, &sends);
+    let mut hip = start_on(&hosts, &directory, on(1), group, &["--logs"]);
+    central.wait_for(&["started"]);
+    hip.wait_for(&["count 50 from 10.77.0.1"]);
+    // One link is cut: what is sent arrives over the other, and nobody is lost.
+    hosts.cut(0);
+    hip.wait_for(&["count 350 from 10.77.0.1"]);
+    counts_in_order(&hip);
+    has_lost_nobody([&central, &hip]);
+    // Both are.
+    hosts.cut_in(0, 1);
+    for (node, other) in [(&mut central, "hip"), (&mut hip, "central")] {
+        node.wait_for(&["NodeLost", other, "LinkDown"]);
+    }
+    // The first one is there again, at the same address and port.
+    hosts.join(0);
+    hip.wait_for(&["NodeFound", "central"]);
+    central.wait_for(&["NodeFound", "hip"]);
+}
+
+#[test]
+fn an_interface_that_is_chosen_by_its_name_is_used_from_when_it_is_there() {
+    let hosts = match Hosts::in_networks(2, 2) {
+        Ok(hosts) => hosts,
+        Err(why) => {
+            println!("skipped: no hosts can be made here: {why}");
+            return;
+        }
+    };
+    let (directory, group) = (OwnDirectory::new(), own_group());
+    hosts.take_down(0, 1);
+    let sends = ["--requires", "hip", "--sends-to", "hip", "--logs-info"];
+    let mut central = start_on(&hosts, &directory, (0, "[\"eth0\", \"eth1\"]"), group, &sends);
+    let mut hip = start_on(&hosts, &directory, (1, "\"all\""), group, &["--logs-info"]);
+    central.wait_for(&["started"]);
+    hip.wait_for(&["count 50 from 10.77.0.1"]);
+    // The second one comes up: the other node learns where this one listens besides.
+    hosts.bring_up(0, 1);
+    central.wait_for(&["NDL asks and answers", "10.78.0.1"]);
+    hip.wait_for(&["listens there now", "10.78.0.1"]);
+    // Now the first one may go.
+    hosts.take_down(0, 0);
+    hip.wait_for(&["count 350 from 10.77.0.1"]);
+    counts_in_order(&hip);
+    has_lost_nobody([&central, &hip]);
+}

@@ -41,7 +41,7 @@ impl At {
     /// A node there that finds nobody else.
     pub(crate) fn node(self, name: &str) -> NodeBuilder {
         Node::builder(name).address(self.address).configure(|config| {
-            config.ndl.interface = self.address;
+            config.ndl.interface = self.address.into();
             config.ndl.multicast = Some(self.group);
             config.ndl.mdns_port = None;
         })

@@ -6,13 +6,19 @@ use std::{
     time::Duration,
 };
 
-use super::{ConfigFault, ConfigFaults, NodeConfig, WatchGroup, faults::quoted};
-use crate::{ndl::FURTHER_MAX, sync::NAME_BYTES_MAX};
+use super::{ConfigFault, ConfigFaults, Interface, NodeConfig, WatchGroup, faults::quoted};
+use crate::{
+    ndl::{FURTHER_MAX, PATHS_MAX},
+    sync::NAME_BYTES_MAX,
+};
 
 /// Longest path of a unix socket in bytes: what every system takes, with the closing zero.
 const SOCKET_BYTES_MAX: usize = 100;
 /// Longest path of a directory in bytes: PATH_MAX of Linux.
 const DIRECTORY_BYTES_MAX: usize = 4_096;
+/// What chooses an interface.
+pub(super) const INTERFACE_LEGAL: &str =
+    "each an IPv4 address of this host, as in 192.168.1.7, a name of 1 to 15 bytes, as in eth0, or all";
 /// Seeds at most.
 const SEEDS_MAX: usize = 256;
 /// Groups of nodes with a pace of their own at most, and names in one of them.
@@ -137,6 +143,13 @@ impl NodeConfig {
                 "choose one that no other node of the project has, or leave it out for the interface's";
             faults.push(fault("node.address", quoted(&address.to_string()), legal, remedy));
         }
+        let is_nameless =
+            self.ndl.interface.first_address().is_none() && self.ndl.interface.iter().next().is_some();
+        if self.address.is_none() && is_nameless {
+            let legal = "an address of one node, as in 10.0.0.7, where ndl.interface names no address first";
+            let remedy = "give the node an address of its own: an interface that is chosen by its name may have none, or another one tomorrow";
+            faults.push(fault("node.address", "nothing".to_owned(), legal, remedy));
+        }
         MAILBOX_CAPACITY.count(faults, self.mailbox_capacity);
         MAILBOX_BYTES.count(faults, self.mailbox_bytes);
         PAYLOAD_MAX.count(faults, self.payload_max);
@@ -176,14 +189,21 @@ impl NodeConfig {
 
     fn check_further(&self, faults: &mut Vec<ConfigFault>) {
         let further = &self.gncl.further;
-        let legal =
-            format!("at most {FURTHER_MAX} addresses of this host, each another one than ndl.interface");
-        if further.len() > FURTHER_MAX {
+        let interfaces: Vec<_> = self.ndl.interface.addresses().collect();
+        let legal = format!(
+            "at most {FURTHER_MAX} addresses of this host, with those of ndl.interface but the first, each another one than there"
+        );
+        if !further.is_empty() && !self.ndl.interface.are_addresses() {
+            let remedy =
+                "leave it out: where ndl.interface chooses by name, GNCL listens at all that it chooses";
+            faults.push(fault("gncl.further", format!("{} addresses", further.len()), legal.clone(), remedy));
+        }
+        if !further.is_empty() && self.gncl_further().len() > FURTHER_MAX {
             let remedy = "list one address for each further interface";
             faults.push(fault("gncl.further", format!("{} addresses", further.len()), legal.clone(), remedy));
         }
         let is_unfit = |(at, ip): &(usize, &Ipv4Addr)| {
-            !is_host_address(**ip) || **ip == self.ndl.interface || further[..*at].contains(ip)
+            !is_host_address(**ip) || interfaces.contains(ip) || further[..*at].contains(ip)
         };
         for (_, ip) in further.iter().enumerate().take(FURTHER_MAX).filter(is_unfit) {
             let remedy = "write another interface's address, or leave it out";
@@ -217,13 +237,34 @@ impl NodeConfig {
         SPIN.time(faults, gncl.spin);
     }
 
+    fn check_interfaces(&self, faults: &mut Vec<ConfigFault>) {
+        let chosen: Vec<_> = self.ndl.interface.iter().collect();
+        let legal = format!("1 to {PATHS_MAX} interfaces, {INTERFACE_LEGAL}, each once");
+        let remedy = "name the interfaces over which the other nodes are reached (see `ip address`)";
+        if !(1..=PATHS_MAX).contains(&chosen.len()) {
+            faults.push(fault(
+                "ndl.interface",
+                format!("{} interfaces", chosen.len()),
+                legal.clone(),
+                remedy,
+            ));
+        }
+        for (at, interface) in chosen.iter().enumerate() {
+            let is_fit = match interface {
+                Interface::Address(address) => is_host_address(*address),
+                Interface::Name(_) | Interface::All => {
+                    interface.to_string().parse().as_ref() == Ok(*interface)
+                }
+            };
+            if !is_fit || chosen[..at].contains(interface) {
+                faults.push(fault("ndl.interface", quoted(&interface.to_string()), legal.clone(), remedy));
+            }
+        }
+    }
+
     fn check_ndl(&self, faults: &mut Vec<ConfigFault>) {
         let ndl = &self.ndl;
-        if !is_host_address(ndl.interface) {
-            let legal = "one address of this host, as in 127.0.0.1 or 192.168.1.7";
-            let remedy = "name the interface that the other nodes reach (see `ip address`)";
-            faults.push(fault("ndl.interface", quoted(&ndl.interface.to_string()), legal, remedy));
-        }
+        self.check_interfaces(faults);
         if let Some(group) = ndl.multicast.filter(|group| !is_multicast(group)) {
             let legal = "a multicast address and a port, as in 239.255.83.119:6910, or false";
             let remedy = "choose an address from 239.0.0.0 to 239.255.255.255, the same on every node";

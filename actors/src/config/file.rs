@@ -1,14 +1,8 @@
 //! Reads a configuration from TOML: knows the keys and their types. What is legal, the check decides.
 
 use std::{
-    collections::BTreeMap,
-    fs::File,
-    io::Read,
-    net::{Ipv4Addr, SocketAddrV4},
-    ops::Range as Span,
-    path::Path,
-    str::FromStr,
-    time::Duration,
+    collections::BTreeMap, fs::File, io::Read, net::SocketAddrV4, ops::Range as Span, path::Path,
+    str::FromStr, time::Duration,
 };
 
 use sinew_runtime::tid::NodeAddress;
@@ -18,7 +12,7 @@ use toml::{
 };
 
 use super::{
-    ConfigFault, ConfigFaults, NodeConfig, WatchGroup,
+    ConfigFault, ConfigFaults, Interface, Interfaces, NodeConfig, WatchGroup,
     check::{self, Range, fault},
     faults::quoted,
 };
@@ -369,7 +363,7 @@ impl Reader<'_> {
 
     fn read_ndl(&mut self, config: &mut NodeConfig) {
         let ndl = &mut config.ndl;
-        self.text::<Ipv4Addr>("ndl.interface", "\"192.168.1.7\"", &mut ndl.interface);
+        self.read_interfaces(&mut ndl.interface);
         self.number(&check::NDL_PORT, &mut ndl.port);
         let example = "\"239.255.83.119:6910\" or false";
         self.text_or_off::<SocketAddrV4>("ndl.multicast", example, &mut ndl.multicast);
@@ -384,6 +378,22 @@ impl Reader<'_> {
         self.number(&check::MISSED_MAX, &mut ndl.missed_max);
         self.read_watch(&mut ndl.watch);
         self.number(&check::NODES_MAX, &mut ndl.nodes_max);
+    }
+
+    /// One interface, or a list of them.
+    fn read_interfaces(&mut self, interfaces: &mut Interfaces) {
+        const KEY: &str = "ndl.interface";
+        let Some(value) = self.values.get(KEY).copied() else { return };
+        let remedy = "set ndl.interface as in \"192.168.1.7\" or [\"eth0\", \"wlan0\"]";
+        let mut read: Vec<Interface> = Vec::new();
+        match value.get_ref().as_str().map(str::parse) {
+            Some(Ok(interface)) => read.push(interface),
+            Some(Err(_)) => return self.reject(KEY, value, check::INTERFACE_LEGAL, remedy),
+            None => self.read_list(KEY, check::INTERFACE_LEGAL, remedy, &mut read),
+        }
+        if !read.is_empty() || value.get_ref().as_array().is_some_and(|list| list.is_empty()) {
+            *interfaces = read.into();
+        }
     }
 
     fn read_watch(&mut self, groups: &mut Vec<WatchGroup>) {

@@ -6,6 +6,7 @@
 mod check;
 mod faults;
 mod file;
+mod interfaces;
 #[cfg(test)]
 mod tests;
 
@@ -13,6 +14,7 @@ pub(crate) use check::fault;
 pub(crate) use faults::quoted;
 pub use faults::{ConfigFault, ConfigFaults};
 pub(crate) use file::{line_of, read_bounded, shown, syntax_fault};
+pub use interfaces::{Interface, Interfaces, NoInterface};
 
 use std::{
     net::{Ipv4Addr, SocketAddr, SocketAddrV4},
@@ -37,7 +39,8 @@ pub struct NodeConfig {
     /// Default `sinew`.
     pub project: String,
     /// Address of the node, unique in the project: not 0.0.0.0 (here) and not 255.255.255.255 (every node). Default: the
-    /// address of [`NdlConfig::interface`]; set it by hand where several nodes share a host.
+    /// address of [`NdlConfig::interface`], the first one's; set it by hand where several nodes share a host, or where that one is
+    /// chosen by its name.
     pub address: Option<NodeAddress>,
     /// Messages that an application's mailbox holds at most, each class by itself. 1 to 65,536; default 256.
     pub mailbox_capacity: usize,
@@ -88,7 +91,7 @@ pub struct LnclConfig {
 /// Global Node Communication Layer: connections between nodes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GnclConfig {
-    /// TCP port to listen on, at [`NdlConfig::interface`]. Default 0: any free one; NDL tells the others which.
+    /// TCP port to listen on, at [`NdlConfig::interface`], where that is several at each. Default 0: any free one; NDL tells the others which.
     pub port: u16,
     /// Where the others reach the listener, if not where it listens: the outer side of a forwarded port. Default: none, where it
     /// listens.
@@ -128,9 +131,10 @@ pub struct GnclConfig {
 /// Node Discovery Layer: who is there, who is gone.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NdlConfig {
-    /// Address of the network interface that the node uses: one address of this host, not 0.0.0.0. Default: loopback,
-    /// so that nothing leaves the host.
-    pub interface: Ipv4Addr,
+    /// Network interfaces that the node uses, at most 8, the one that it prefers first: by addresses of this host (not 0.0.0.0), by
+    /// names, or all. Other nodes are asked over each, and are there as long as they answer over any. Default: loopback, so that
+    /// nothing leaves the host; beside others, loopback is used where it is listed.
+    pub interface: Interfaces,
     /// UDP port for queries and answers. Default 0: any free one; set it where other nodes list this one as a seed.
     pub port: u16,
     /// Multicast group (224.0.0.0 to 239.255.255.255) and port of the cyclic query; `None` switches it off. Default
@@ -274,7 +278,7 @@ impl NodeConfig {
                 give_up: Duration::from_secs(5),
             },
             ndl: NdlConfig {
-                interface: Ipv4Addr::LOCALHOST,
+                interface: Ipv4Addr::LOCALHOST.into(),
                 port: 0,
                 multicast: Some(SocketAddrV4::new(Ipv4Addr::new(239, 255, 83, 119), 6910)),
                 mdns_port: Some(5353),
@@ -298,9 +302,17 @@ impl NodeConfig {
         }
     }
 
-    /// The node's address: as set, or that of its interface.
+    /// The node's address: as set, or that of its first interface. One that is chosen by its name has none to give: 0.0.0.0.
     #[must_use]
     pub fn node_address(&self) -> NodeAddress {
-        self.address.unwrap_or_else(|| NodeAddress::from(self.ndl.interface))
+        let interface = || self.ndl.interface.first_address().unwrap_or(Ipv4Addr::UNSPECIFIED);
+        self.address.unwrap_or_else(|| NodeAddress::from(interface()))
+    }
+
+    /// Where GNCL listens besides: at the other interfaces that are chosen by their addresses, and where it is told to.
+    pub(crate) fn gncl_further(&self) -> Vec<Ipv4Addr> {
+        let mut further: Vec<_> = self.ndl.interface.addresses().skip(1).collect();
+        further.extend(&self.gncl.further);
+        further
     }
 }

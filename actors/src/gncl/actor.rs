@@ -89,9 +89,9 @@ impl Gncl {
         let mut kept = lock(&self.stores.gncl.listeners);
         if kept.is_empty() {
             let config = &self.stores.config;
-            let listener = listener::listen((config.ndl.interface, config.gncl.port).into())?;
+            let listener = listener::listen_first(config)?;
             let address = listener.local_addr()?;
-            let further = listener::listen_at_further(&config.gncl, &self.stores.gncl.refusals);
+            let further = listener::listen_at_further(config, &self.stores.gncl.refusals);
             self.stores.gncl_further.get_or_init(|| listener::addresses_of(&further));
             *kept = std::iter::once(listener).chain(further).collect();
             self.bind_datagrams(&kept);
@@ -157,6 +157,19 @@ impl Gncl {
         let NodeConfig { payload_max, gncl, .. } = &self.stores.config;
         let (payload_max, give_up) = (*payload_max, gncl.give_up);
         Reading { mode: mode.clone(), payload_max, give_up, secure: self.secure.clone() }
+    }
+
+    /// Whether a connection came to an address of an interface that this node uses: where those are chosen by their names, it listens at
+    /// all that the host has.
+    fn listens_at(&self, socket: &TcpStream) -> bool {
+        if self.stores.config.ndl.interface.are_addresses() {
+            return true;
+        }
+        let local = socket.local_addr().map(|local| local.ip());
+        lock(&self.stores.ndl)
+            .paths()
+            .iter()
+            .any(|path| local.as_ref().is_ok_and(|local| *local == path.ip()))
     }
 
     fn accepted(&mut self, socket: TcpStream, ctx: &mut Context<Self>) {
@@ -393,7 +406,7 @@ impl Actor for Gncl {
         self.begin_to_prove();
         let listeners = self.listen().unwrap_or_else(|error| {
             let config = &self.stores.config;
-            let (interface, port) = (config.ndl.interface, config.gncl.port);
+            let (interface, port) = (&config.ndl.interface, config.gncl.port);
             panic!(
                 "GNCL cannot listen at {interface}:{port}: {error}; is another node using this port? Set `gncl.port` \
                  to a free one (0 takes any), and `ndl.interface` to an address of this host"
@@ -445,6 +458,10 @@ impl Drop for Gncl {
 impl StreamHandler<io::Result<TcpStream>> for Gncl {
     fn handle(&mut self, accepted: io::Result<TcpStream>, ctx: &mut Context<Self>) {
         match accepted {
+            Ok(socket) if !self.listens_at(&socket) => {
+                let detail = format_args!("a connection to {:?}", socket.local_addr());
+                self.stores.gncl.refusals.count(Time::now(), "connection over another interface", &detail);
+            }
             Ok(socket) => self.accepted(socket, ctx),
             Err(error) => {
                 self.stores.gncl.refusals.count(Time::now(), "not accepted", &error);

@@ -13,7 +13,7 @@ use sinew_runtime::time::Time;
 use socket2::{Domain, SockRef, Socket, Type};
 use tokio::net::{TcpListener, TcpStream};
 
-use crate::{config::GnclConfig, refusals::Refusals};
+use crate::{config::NodeConfig, refusals::Refusals};
 
 /// Connections that wait to be accepted at most; the kernel refuses further ones.
 const BACKLOG: i32 = 1_024;
@@ -33,17 +33,33 @@ pub(super) fn listen(address: SocketAddr) -> io::Result<std::net::TcpListener> {
     begin_to_listen(&new_socket(address)?, address)
 }
 
+/// Listens at the first interface; where one is chosen by its name, at all addresses that this host has or will have.
+///
+/// # Errors
+/// What the system says.
+pub(super) fn listen_first(config: &NodeConfig) -> io::Result<std::net::TcpListener> {
+    let (chosen, port) = (&config.ndl.interface, config.gncl.port);
+    let first = chosen.first_address().filter(|_| chosen.are_addresses());
+    let address = (first.unwrap_or(Ipv4Addr::UNSPECIFIED), port).into();
+    if chosen.iter().count() > 1 { listen_also_without(address) } else { listen(address) }
+}
+
+/// Listens at an address that this host may not have yet.
+fn listen_also_without(address: SocketAddr) -> io::Result<std::net::TcpListener> {
+    let socket = new_socket(address)?;
+    #[cfg(target_os = "linux")]
+    socket.set_freebind_v4(true)?;
+    begin_to_listen(&socket, address)
+}
+
 /// Listens at the further addresses of this node. One that this host does not have now it may have later: an interface that is
 /// down, or has no address yet, keeps no node from its start. What cannot be listened at in any case is counted, and not announced.
-pub(super) fn listen_at_further(gncl: &GnclConfig, refusals: &Refusals) -> Vec<std::net::TcpListener> {
-    let listen = |address: SocketAddr| {
-        let socket = new_socket(address)?;
-        #[cfg(target_os = "linux")]
-        socket.set_freebind_v4(true)?;
-        begin_to_listen(&socket, address)
-    };
-    let listen = |ip: &Ipv4Addr| {
-        let address = (*ip, gncl.port).into();
+pub(super) fn listen_at_further(config: &NodeConfig, refusals: &Refusals) -> Vec<std::net::TcpListener> {
+    if !config.ndl.interface.are_addresses() {
+        return Vec::new();
+    }
+    let listen = |ip: Ipv4Addr| {
+        let address = (ip, config.gncl.port).into();
         let noted = |error: &io::Error| {
             refusals.count(
                 Time::now(),
@@ -51,9 +67,9 @@ pub(super) fn listen_at_further(gncl: &GnclConfig, refusals: &Refusals) -> Vec<s
                 &format_args!("{address}: {error}"),
             );
         };
-        listen(address).inspect_err(noted).ok()
+        listen_also_without(address).inspect_err(noted).ok()
     };
-    gncl.further.iter().filter_map(listen).collect()
+    config.gncl_further().into_iter().filter_map(listen).collect()
 }
 
 /// Where these listen.

@@ -76,6 +76,10 @@ pub(crate) use peer::{Peer, Store};
 pub(crate) use stream_way::{ByDatagram, by_datagram};
 pub(crate) use way::{Arrived, WayAccount};
 
+use std::net::SocketAddr;
+
+use sinew_runtime::tid::{Incarnation, NodeAddress};
+
 use crate::ndl::MembershipFact;
 
 /// What GNCL is told.
@@ -83,4 +87,6 @@ use crate::ndl::MembershipFact;
 pub(crate) enum Event {
     /// By NDL: who is there.
     Membership(MembershipFact),
+    /// By NDL: this life of a node listens at these addresses now.
+    Moved { node: NodeAddress, incarnation: Incarnation, gncl: Vec<SocketAddr> },
 }

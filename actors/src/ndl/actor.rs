@@ -1,5 +1,6 @@
 //! The thin shell around the membership core: sockets, timer, mDNS, and the ways to other layers.
 
+mod paths;
 mod receiving;
 mod telling;
 
@@ -8,8 +9,7 @@ use std::{
     collections::BTreeSet,
     future::poll_fn,
     hash::{BuildHasher, RandomState},
-    io,
-    net::{SocketAddr, SocketAddrV4},
+    net::{Ipv4Addr, SocketAddr, SocketAddrV4},
     rc::Rc,
     sync::{Arc, MutexGuard, PoisonError, atomic::Ordering},
     task::Poll,
@@ -27,13 +27,14 @@ use sinew_runtime::{
 };
 use tokio::sync::{Notify, mpsc, oneshot};
 
+use self::paths::{Paths, Reader};
 use super::{
     Event,
-    core::{Core, Epoch, Input, Output, Way},
+    core::{Core, Epoch, Input, Output, Place},
     datagram::{Answer, Body, Datagram, encode},
+    interfaces,
     mdns::{Mdns, MdnsError},
     probe::{PROBES_MAX, Probe},
-    socket,
 };
 use crate::{
     aftermath,
@@ -75,20 +76,29 @@ impl Actor for NdlActor {
 
     fn started(&mut self, ctx: &mut Self::Context) {
         ctx.add_stream(self.stores.posts.ndl.attach_keeping(Clone::clone));
-        let (shell, unicast) = Shell::bind(self.stores.clone()).unwrap_or_else(|words| give_up(&words));
+        let (shell, readers) = Shell::bind(self.stores.clone()).unwrap_or_else(|words| give_up(&words));
         let shell = Rc::new(shell);
-        let unicast = tokio::net::UdpSocket::from_std(unicast)
-            .unwrap_or_else(|error| give_up(&format!("NDL's socket cannot be watched: {error}")));
-        let here = shell.here;
-        ctx.spawn(receiving::receive(shell.clone(), unicast, (here, Way::Unicast)).into_actor(self));
-        if let Some(group) = shell.join_group() {
-            ctx.spawn(receiving::receive(shell.clone(), group, (here, Way::Multicast)).into_actor(self));
+        for reader in readers {
+            let reading = shell.reading(reader);
+            let reading =
+                reading.unwrap_or_else(|error| give_up(&format!("NDL's socket cannot be watched: {error}")));
+            ctx.spawn(reading.into_actor(self));
         }
         // The first queries leave here.
         shell.carry_out();
-        if let Some(mdns) = shell.start_mdns() {
-            ctx.spawn(watch_mdns(mdns.clone()).into_actor(self));
-            ctx.spawn(browse(shell.clone(), mdns).into_actor(self));
+        let chosen = &self.stores.config.ndl.interface;
+        if chosen.are_addresses() && chosen.iter().count() == 1 {
+            // Nothing comes and goes.
+            if let Some(mdns) = shell.start_mdns() {
+                ctx.spawn(watch_mdns(mdns.clone()).into_actor(self));
+                ctx.spawn(browse(shell.clone(), mdns).into_actor(self));
+            }
+        } else {
+            let news = (!chosen.are_addresses()).then(|| interfaces::watch(chosen.clone()));
+            let news = news.transpose().unwrap_or_else(|error| {
+                give_up(&format!("NDL has no thread to see interfaces with: {error}; raise `ulimit -u`"))
+            });
+            ctx.spawn(paths::keep_paths(shell.clone(), news).into_actor(self));
         }
         if let Some(probes) = shell.probes.borrow_mut().take() {
             ctx.spawn(try_hosts(shell.clone(), probes).into_actor(self));
@@ -108,7 +118,7 @@ impl Actor for NdlActor {
             && self.stores.stopping.load(Ordering::Acquire)
         {
             shell.feed(|core, now| core.handle(now, Input::Stopping));
-            stores::lock(&self.stores.ndl_socket).take();
+            stores::lock(&self.stores.ndl_sockets).close_all();
         }
     }
 }
@@ -140,10 +150,7 @@ fn give_up(words: &str) -> ! {
 struct Shell {
     stores: Arc<Stores>,
     epoch: Epoch,
-    /// Our address for queries.
-    here: SocketAddr,
-    /// Sends at once, whatever the runtime knows of the socket.
-    socket: std::net::UdpSocket,
+    paths: Paths,
     /// The core's next wake is not the one that the timer sleeps for.
     rewind: Notify,
     refusals: Arc<Refusals>,
@@ -154,52 +161,33 @@ struct Shell {
 }
 
 impl Shell {
-    /// Binds the socket for queries and answers, and starts the core; the socket is returned for reading.
-    fn bind(stores: Arc<Stores>) -> Result<(Self, std::net::UdpSocket), String> {
-        let Some(SocketAddr::V4(gncl)) = stores.gncl_listen.get().copied() else {
+    /// Binds the sockets, and starts the core; what is to be read is returned.
+    fn bind(stores: Arc<Stores>) -> Result<(Self, Vec<Reader>), String> {
+        if !matches!(stores.gncl_listen.get(), Some(SocketAddr::V4(_))) {
             return Err("NDL has no GNCL to announce: start GNCL, on an IPv4 address, before NDL".to_owned());
-        };
-        let interface = stores.config.ndl.interface;
-        let gncl = if gncl.ip().is_unspecified() { SocketAddrV4::new(interface, gncl.port()) } else { gncl };
-        let gncl = stores.config.gncl.announce.unwrap_or(gncl);
-        let unbound = |error: io::Error| {
-            let port = stores.config.ndl.port;
-            format!(
-                "NDL cannot use UDP {interface}:{port}: {error}; set `ndl.interface` to an IPv4 address of this host \
+        }
+        let (chosen, port, paths) = (&stores.config.ndl.interface, stores.config.ndl.port, Paths::default());
+        let addresses: Vec<_> = chosen.addresses().collect();
+        let (readers, error) = paths.open(&stores, &addresses);
+        // Of several each may come later.
+        if let Some(error) = error.filter(|_| chosen.iter().count() == 1) {
+            return Err(format!(
+                "NDL cannot use UDP {chosen}:{port}: {error}; set `ndl.interface` to an IPv4 address of this host \
                  and `ndl.port` to a free port, or to 0 for any"
-            )
-        };
-        let socket = open_socket(&stores).map_err(unbound)?;
-        let udp = socket.local_addr().map_err(unbound)?;
-        let reader = socket.try_clone().map_err(unbound)?;
+            ));
+        }
         // Before the core is looked at: what GNCL changes from now on is in NDL's post.
         let links = links(&stores);
         let epoch = {
             let mut core = lock(&stores);
             core.look_at_links(Time::now(), |node, incarnation| links.contains(&(node, incarnation)));
-            core.announce_further(stores.gncl_further.get().map_or(&[], Vec::as_slice));
-            core.start(Time::now(), &[udp], gncl)
+            core.announce_gncl(announced(&stores, &addresses));
+            core.start(Time::now(), &paths.here())
         };
-        crate::log::info!(%udp, %gncl, "NDL asks and answers");
         let (rewind, refusals) = (Notify::new(), stores.refusals.clone());
         let (to_probe, probes) = mpsc::channel(PROBES_MAX);
         let probes = RefCell::new(Some(probes));
-        Ok((Self { stores, epoch, here: udp, socket, rewind, refusals, to_probe, probes }, reader))
-    }
-
-    fn join_group(&self) -> Option<tokio::net::UdpSocket> {
-        let ndl = &self.stores.config.ndl;
-        let group = ndl.multicast?;
-        let joined = socket::join_group(group, ndl.interface).and_then(tokio::net::UdpSocket::from_std);
-        joined
-            .inspect_err(|error| {
-                crate::log::warn!(
-                    "NDL does not hear multicast {group} on {}: {error}; nodes are found through mDNS and seeds only. \
-                     Set `ndl.interface` to an interface that is up and `ndl.multicast` to a group, or list `ndl.seeds`",
-                    ndl.interface,
-                );
-            })
-            .ok()
+        Ok((Self { stores, epoch, paths, rewind, refusals, to_probe, probes }, readers))
     }
 
     fn start_mdns(&self) -> Option<Rc<Mdns>> {
@@ -240,10 +228,11 @@ impl Shell {
 
     fn obey(&self, output: Output) {
         match output {
-            Output::SendQuery { to, correlation } => self.send_query(to.there, correlation),
-            Output::SendMulticastQuery { correlation, .. } => {
-                if let Some(group) = self.stores.config.ndl.multicast {
-                    self.send_query(group.into(), correlation);
+            Output::SendQuery { to, correlation } => self.send_query(to, correlation),
+            Output::SendMulticastQuery { from, correlation } => {
+                let group = self.stores.config.ndl.multicast;
+                for (here, group) in from.into_iter().zip(group.into_iter().cycle()) {
+                    self.send_query(Place { there: group.into(), here }, correlation);
                 }
             }
             Output::SendAnswer { to, node, correlation, query_sent, query_received } => {
@@ -253,15 +242,19 @@ impl Shell {
                 };
                 let (query_sent_ns, query_received_ns) = (query_sent.as_nanos(), query_received.as_nanos());
                 let answer = Answer { announcement, query_sent_ns, query_received_ns, progress };
-                self.send(to.there, node, correlation, Body::Answer(answer));
+                self.send(to, node, correlation, Body::Answer(answer));
             }
-            Output::SendLeave { to, node } => self.send(to.there, node, 0, Body::Leave(self.me())),
+            Output::SendLeave { to, node } => self.send(to, node, 0, Body::Leave(self.me())),
             Output::Probe { node, incarnation, to, within } => {
                 self.stores.gncl.ask_for_a_sign(self.stores.node, node, incarnation);
                 // Where too many are silent at once it is not their hosts that are to be doubted.
                 let _ = self.to_probe.try_send(Probe { node, incarnation, to, within });
             }
             Output::Fact(fact) => self.tell_layers(fact),
+            Output::Moved { node, incarnation, gncl } => {
+                crate::log::info!(%node, ?gncl, "the node listens there now");
+                self.tell_gncl(gncl::Event::Moved { node, incarnation, gncl });
+            }
             Output::Event { to, event } => self.tell_application(to, &event),
             Output::ClockMeasured { node, offset } => self.stores.clocks.set(node, offset),
             Output::Collision { node, holder, newcomer } => crate::log::error!(
@@ -284,18 +277,19 @@ impl Shell {
         lock(&self.stores).announcement().clone()
     }
 
-    fn send_query(&self, to: SocketAddr, correlation: u64) {
+    fn send_query(&self, to: Place, correlation: u64) {
         self.send(to, NodeAddress::ALL, correlation, Body::Query(self.me()));
     }
 
-    fn send(&self, to: SocketAddr, node: NodeAddress, correlation: u64, body: Body) {
+    fn send(&self, to: Place, node: NodeAddress, correlation: u64, body: Body) {
         // The send time is taken last: what is between it and the network counts as network.
         let mut bytes = encode(&Datagram { correlation, sent: Time::now(), body }, node);
         if let Some(secured) = self.stores.secured.get() {
             secured.seal(&mut bytes);
         }
-        if let Err(error) = socket::send(&self.socket, &bytes, to) {
-            self.refusals.count(Time::now(), "NDL datagram not sent", &format_args!("to {to}: {error}"));
+        if let Err(error) = self.paths.send(to.here, &bytes, to.there) {
+            let what = format_args!("from {} to {}: {error}", to.here, to.there);
+            self.refusals.count(Time::now(), "NDL datagram not sent", &what);
         }
     }
 }
@@ -322,20 +316,21 @@ fn signs(stores: &Stores) -> Vec<Input> {
     in_doubt.into_iter().filter_map(sign).collect()
 }
 
-/// The socket that is open already, if this layer was restarted: a former instance that hangs still has it, so that nobody
-/// could bind its port again.
-fn open_socket(stores: &Stores) -> io::Result<std::net::UdpSocket> {
-    let mut kept = stores::lock(&stores.ndl_socket);
-    if let Some(socket) = &*kept {
-        return socket.try_clone();
+/// Where the others reach GNCL of a node that has these addresses: at all at which it listens, the one that is preferred first.
+fn announced(stores: &Stores, ips: &[Ipv4Addr]) -> Vec<SocketAddrV4> {
+    let Some(SocketAddr::V4(listens)) = stores.gncl_listen.get().copied() else { return Vec::new() };
+    let mut all: Vec<_> = if listens.ip().is_unspecified() {
+        // Other hosts would find themselves at a loopback address.
+        let is_told = |ip: &&Ipv4Addr| !ip.is_loopback() || ips.iter().all(Ipv4Addr::is_loopback);
+        ips.iter().filter(is_told).map(|ip| SocketAddrV4::new(*ip, listens.port())).collect()
+    } else {
+        let further = stores.gncl_further.get().into_iter().flatten();
+        std::iter::once(&listens).chain(further).copied().collect()
+    };
+    if let Some(outer) = stores.config.gncl.announce {
+        all.splice(..all.len().min(1), [outer]);
     }
-    let ndl = &stores.config.ndl;
-    let socket = socket::bind_unicast(ndl.interface, ndl.port)?;
-    if stores.config.gncl.marks {
-        socket::mark(&socket);
-    }
-    *kept = Some(socket.try_clone()?);
-    Ok(socket)
+    all
 }
 
 /// Asks the root, every period, what of this node does not get on. The root waits for nobody, and NDL not for the root.

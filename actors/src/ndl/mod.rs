@@ -48,6 +48,7 @@ mod datagram;
 mod facts;
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing;
+mod interfaces;
 mod mdns;
 mod probe;
 mod progress;
@@ -59,10 +60,11 @@ pub(crate) use actor::{NdlActor, new_core};
 pub(crate) use core::Core;
 pub(crate) use core::LostNode;
 pub use core::{KnownNode, KnownRoute, Source, TroubledApp};
-pub(crate) use datagram::FURTHER_MAX;
+pub(crate) use datagram::{FURTHER_MAX, PATHS_MAX};
 pub(crate) use facts::MembershipFact;
 pub use facts::{LossReason, NodeEvent, Trouble};
 pub(crate) use progress::{Part, Progress, Told};
+pub(crate) use socket::Sockets;
 
 use crate::{gncl::LinkFact, lncl::AppFact};
 

@@ -1,6 +1,7 @@
-//! NDL's two UDP sockets: one of its own for queries and answers, one in the multicast group.
+//! NDL's UDP sockets, two for each of its addresses: one of its own for queries and answers, one in the multicast group.
 
 use std::{
+    collections::BTreeMap,
     io,
     net::{Ipv4Addr, SocketAddr, SocketAddrV4, UdpSocket},
 };
@@ -20,6 +21,72 @@ pub(super) fn bind_unicast(interface: Ipv4Addr, port: u16) -> io::Result<UdpSock
     socket.set_multicast_ttl_v4(1)?;
     socket.set_multicast_loop_v4(true)?;
     Ok(socket.into())
+}
+
+/// The sockets for queries and answers, one for each address. They stay open while this layer is restarted: whoever knows them still
+/// finds us.
+#[derive(Debug, Default)]
+pub(crate) struct Sockets(BTreeMap<Ipv4Addr, Kept>);
+
+#[derive(Debug)]
+struct Kept {
+    port: u16,
+    /// `None`: the address was taken away. If it is back, so is the port.
+    socket: Option<UdpSocket>,
+}
+
+/// Addresses whose ports are remembered, at most.
+const KEPT_MAX: usize = 64;
+
+impl Sockets {
+    /// The socket at this address: that which is open already, if this layer was restarted, for a former instance that hangs still has it;
+    /// else a new one, at `port` or, if that is 0, at the one of before.
+    ///
+    /// # Errors
+    /// What the system says.
+    pub(super) fn open(&mut self, ip: Ipv4Addr, port: u16, is_marked: bool) -> io::Result<UdpSocket> {
+        let former = match self.0.get(&ip) {
+            Some(Kept { socket: Some(socket), .. }) => return socket.try_clone(),
+            Some(Kept { port, socket: None }) => Some(*port),
+            None => None,
+        };
+        let again = former.filter(|_| port == 0).and_then(|port| bind_unicast(ip, port).ok());
+        let socket = again.map_or_else(|| bind_unicast(ip, port), Ok)?;
+        if is_marked {
+            mark(&socket);
+        }
+        let port = socket.local_addr()?.port();
+        let kept = socket.try_clone()?;
+        if self.0.len() >= KEPT_MAX {
+            self.0.retain(|_, kept| kept.socket.is_some());
+        }
+        self.0.insert(ip, Kept { port, socket: Some(kept) });
+        Ok(socket)
+    }
+
+    pub(super) fn close(&mut self, ip: Ipv4Addr) {
+        if let Some(kept) = self.0.get_mut(&ip) {
+            kept.socket = None;
+        }
+    }
+
+    pub(crate) fn close_all(&mut self) {
+        self.0.clear();
+    }
+
+    #[cfg(test)]
+    pub(super) fn all(&self) -> impl Iterator<Item = &UdpSocket> {
+        self.0.values().filter_map(|kept| kept.socket.as_ref())
+    }
+}
+
+/// Has the sockets of a path go by the interface that has this address now: it may be another one than at first.
+pub(super) fn renew(unicast: &UdpSocket, group: Option<(&UdpSocket, SocketAddrV4)>, interface: Ipv4Addr) {
+    // What fails here fails because the interface is away; it is tried again.
+    let _ = socket2::SockRef::from(unicast).set_multicast_if_v4(&interface);
+    if let Some((socket, group)) = group {
+        let _ = socket2::SockRef::from(socket).join_multicast_v4(group.ip(), &interface);
+    }
 }
 
 /// Marks what leaves this socket as what keeps a network up, so that no queue has a node lost while its link is full of Bulk: code

@@ -119,7 +119,7 @@ impl Node {
 
     async fn fact(&mut self, what: &str) -> MembershipFact {
         let event = within(what, self.facts.next()).await.expect("nobody else reads this post");
-        let gncl::Event::Membership(fact) = event;
+        let gncl::Event::Membership(fact) = event else { panic!("no node moves: {event:?}") };
         fact
     }
 
@@ -405,7 +405,7 @@ fn what_cannot_be_had_is_named_with_its_place_and_remedy() {
     let said = words(&Node::new(1, 1, |ndl| ndl.port = port));
     assert!(said.contains(&format!("127.0.0.1:{port}")) && said.contains("`ndl.port`"), "{said}");
     // An interface that is not there: 192.0.2.0/24 is for documentation.
-    let said = words(&Node::new(1, 1, |ndl| ndl.interface = Ipv4Addr::new(192, 0, 2, 1)));
+    let said = words(&Node::new(1, 1, |ndl| ndl.interface = [192, 0, 2, 1].into()));
     assert!(said.contains("192.0.2.1:0") && said.contains("`ndl.interface`"), "{said}");
 }
 
@@ -418,8 +418,8 @@ fn its_datagrams_are_marked_as_what_keeps_the_network_up_unless_marks_are_off() 
         let stores = Stores::for_test(config, Incarnation(1));
         stores.gncl_listen.get_or_init(|| (LOOPBACK, 1).into());
         super::actor::start_words(stores.clone()).expect("any free port");
-        let kept = crate::stores::lock(&stores.ndl_socket);
-        let socket = socket2::SockRef::from(kept.as_ref().expect("it is kept for the next instance"));
+        let kept = crate::stores::lock(&stores.ndl_sockets);
+        let socket = socket2::SockRef::from(kept.all().next().expect("it is kept for the next instance"));
         let seen = (socket.tos_v4().expect("Linux tells") >> 2, socket.priority().expect("Linux tells"));
         assert_eq!(seen, expected, "with gncl.marks = {marks}");
     }

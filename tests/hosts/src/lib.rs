@@ -119,7 +119,15 @@ impl Hosts {
     /// # Panics
     /// If the kernel refuses.
     pub fn cut(&self, host: usize) {
-        self.set_port(host, "down");
+        self.cut_in(host, 0);
+    }
+
+    /// Cuts a host's link to a network.
+    ///
+    /// # Panics
+    /// If the kernel refuses.
+    pub fn cut_in(&self, host: usize, network: u8) {
+        self.set_port(host, network, "down");
     }
 
     /// Joins a cut host again.
@@ -127,7 +135,7 @@ impl Hosts {
     /// # Panics
     /// If the kernel refuses.
     pub fn join(&self, host: usize) {
-        self.set_port(host, "up");
+        self.set_port(host, 0, "up");
     }
 
     /// From now on the first network swallows what a host sends and what is for it; every interface stays up, so nobody's kernel
@@ -137,7 +145,7 @@ impl Hosts {
     /// If the kernel refuses.
     pub fn swallow(&self, host: usize) {
         // The port is up, and belongs to no bridge.
-        self.set_port(host, "nomaster");
+        self.set_port(host, 0, "nomaster");
     }
 
     /// Carries a host's packets again.
@@ -145,7 +153,7 @@ impl Hosts {
     /// # Panics
     /// If the kernel refuses.
     pub fn carry(&self, host: usize) {
-        self.set_port(host, "master bridge0");
+        self.set_port(host, 0, "master bridge0");
     }
 
     /// Takes a host's own interface in a network down.
@@ -153,8 +161,20 @@ impl Hosts {
     /// # Panics
     /// If the kernel refuses.
     pub fn take_down(&self, host: usize, network: u8) {
-        let taken = self.hosts[host].namespace.ip(&format!("link set eth{network} down"));
-        taken.unwrap_or_else(|error| panic!("eth{network} down: {error}"));
+        self.set_interface(host, network, "down");
+    }
+
+    /// Brings it up again.
+    ///
+    /// # Panics
+    /// If the kernel refuses.
+    pub fn bring_up(&self, host: usize, network: u8) {
+        self.set_interface(host, network, "up");
+    }
+
+    fn set_interface(&self, host: usize, network: u8, state: &str) {
+        let set = self.hosts[host].namespace.ip(&format!("link set eth{network} {state}"));
+        set.unwrap_or_else(|error| panic!("eth{network} {state}: {error}"));
     }
 
     /// Lets so many kilobits a second out of each host. A host keeps 50 ms of what its programs send faster, and loses the rest.
@@ -173,8 +193,8 @@ impl Hosts {
         Ok(())
     }
 
-    fn set_port(&self, host: usize, state: &str) {
-        let port = port(self.hosts[host].index, 0);
+    fn set_port(&self, host: usize, network: u8, state: &str) {
+        let port = port(self.hosts[host].index, network);
         self.bridge
             .ip(&format!("link set {port} {state}"))
             .unwrap_or_else(|error| panic!("{port} {state}: {error}"));

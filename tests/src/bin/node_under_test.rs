@@ -1,8 +1,8 @@
 //! A node for the scenarios: one application that sends, and says what it sees, one line each.
 //!
-//! `node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--floods NAME]... [--will NAME]... [--logs]`
+//! `node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--floods NAME]... [--will NAME]... [--logs | --logs-info]`
 //!
-//! Whom it floods it sends as many counts as are taken, to each the same. A will is a count of 1,000,000. What it logs goes to its standard error, with `--logs` to its output.
+//! Whom it floods it sends as many counts as are taken, to each the same. A will is a count of 1,000,000. What it logs goes to its standard error, with `--logs` warnings and with `--logs-info` more go to its output.
 
 use std::process::ExitCode;
 
@@ -75,8 +75,10 @@ impl Handler<Delivery<RequirementEvent>> for Probe {
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    if arguments.iter().any(|argument| argument == "--logs") {
-        tracing_subscriber::fmt().with_max_level(tracing::Level::WARN).init();
+    let has = |flag: &str| arguments.iter().any(|argument| argument == flag);
+    if has("--logs") || has("--logs-info") {
+        let level = if has("--logs-info") { tracing::Level::INFO } else { tracing::Level::WARN };
+        tracing_subscriber::fmt().with_max_level(level).init();
     } else {
         tracing_subscriber::fmt()
             .with_env_filter(tracing_subscriber::EnvFilter::from_default_env())

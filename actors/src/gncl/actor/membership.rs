@@ -53,12 +53,11 @@ const fn lost_as(why: LossReason, node: NodeAddress, incarnation: Incarnation) -
 
 impl StreamHandler<Event> for Gncl {
     fn handle(&mut self, event: Event, ctx: &mut Context<Self>) {
-        let Event::Membership(fact) = event;
-        let input = match fact {
-            MembershipFact::NodeFound { node, incarnation, gncl } => {
-                Input::NodeFound { node, incarnation, addresses: gncl }
-            }
-            MembershipFact::NodeLost { node, incarnation, why } => lost_as(why, node, incarnation),
+        let input = match event {
+            Event::Membership(MembershipFact::NodeFound { node, incarnation, gncl })
+            // It is dialled there from the next time on; a link that stands is left alone.
+            | Event::Moved { node, incarnation, gncl } => Input::NodeFound { node, incarnation, addresses: gncl },
+            Event::Membership(MembershipFact::NodeLost { node, incarnation, why }) => lost_as(why, node, incarnation),
         };
         self.input(input, ctx);
     }

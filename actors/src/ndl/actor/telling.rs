@@ -31,11 +31,15 @@ impl Shell {
         }
         crate::log::info!(?fact, "membership");
         let posts = &self.stores.posts;
-        if let Err(event) = posts.gncl.post(gncl::Event::Membership(fact.clone())) {
-            crate::log::error!(?event, "GNCL's post is full: it does not learn this");
-        }
+        self.tell_gncl(gncl::Event::Membership(fact.clone()));
         if let Err(event) = posts.sync.post(sync::Event::Membership(fact)) {
             crate::log::error!(?event, "the sync manager's post is full: it does not learn this");
+        }
+    }
+
+    pub(super) fn tell_gncl(&self, event: gncl::Event) {
+        if let Err(event) = self.stores.posts.gncl.post(event) {
+            crate::log::error!(?event, "GNCL's post is full: it does not learn this");
         }
     }
 

@@ -154,6 +154,7 @@ impl Core {
     // spec: NDL-2.1
     fn ask_everybody(&mut self, now: Time) {
         self.seek_all(now);
+        self.tell_moves(now);
         // Also who cannot be asked at all: none of our addresses leads there any more.
         let members = self.members.values_mut().filter(|member| member.pace == REST);
         members.for_each(|member| member.is_awaited = true);

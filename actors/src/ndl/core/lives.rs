@@ -218,6 +218,7 @@ impl Core {
         let member = Member {
             announcement,
             routes: Routes::new(from),
+            gncl_told: (gncl.clone(), now),
             heard: now,
             sign: now,
             pace,

@@ -1,5 +1,7 @@
 //! What is known of a node that answers.
 
+use std::net::SocketAddr;
+
 use sinew_runtime::{tid::Incarnation, time::Time};
 
 use super::{Host, clock::PeerClock, pace::Pace, routes::Routes, troubles::Troubles};
@@ -11,6 +13,8 @@ pub(super) struct Member {
     pub(super) announcement: Announcement,
     /// Where it answers.
     pub(super) routes: Routes,
+    /// Where GNCL was told that its listener is, and when.
+    pub(super) gncl_told: (Vec<SocketAddr>, Time),
     /// Its last sign of life.
     pub(super) heard: Time,
     /// When it asked us last, or GNCL heard of it last, as far as that was asked; or since when it has been a member.

@@ -133,6 +133,12 @@ pub(crate) enum Output {
     },
     /// For GNCL and the sync manager.
     Fact(MembershipFact),
+    /// For GNCL: a member listens elsewhere now, the address that it prefers first.
+    Moved {
+        node: NodeAddress,
+        incarnation: Incarnation,
+        gncl: Vec<SocketAddr>,
+    },
     /// For this application.
     Event {
         to: AppAddress,
@@ -300,19 +306,17 @@ impl Core {
         }
     }
 
-    /// GNCL listens at these addresses, too.
-    pub(crate) fn announce_further(&mut self, further: &[SocketAddrV4]) {
-        let further = further.iter().take(FURTHER_MAX);
-        self.me.gncl_further = further.map(|gncl| (gncl.ip().to_bits(), gncl.port())).collect();
+    /// GNCL listens at these addresses, the one that it prefers first; at none for now, if there is none.
+    pub(crate) fn announce_gncl(&mut self, addresses: Vec<SocketAddrV4>) {
+        let mut all = addresses.into_iter().map(|gncl| (gncl.ip().to_bits(), gncl.port()));
+        (self.me.gncl_ip, self.me.gncl_port) = all.next().unwrap_or_default();
+        self.me.gncl_further = all.take(FURTHER_MAX).collect();
     }
 
-    /// A shell has bound its sockets: `paths` are our addresses for queries, `gncl` is that of GNCL's listener. The first
-    /// queries are due at once.
-    pub(crate) fn start(&mut self, now: Time, paths: &[SocketAddr], gncl: SocketAddrV4) -> Epoch {
+    /// A shell has bound its sockets: `paths` are our addresses for queries. The first queries are due at once.
+    pub(crate) fn start(&mut self, now: Time, paths: &[SocketAddr]) -> Epoch {
         self.epoch += 1;
         self.use_paths(now, paths);
-        self.me.gncl_ip = gncl.ip().to_bits();
-        self.me.gncl_port = gncl.port();
         self.begin(now);
         Epoch(self.epoch)
     }

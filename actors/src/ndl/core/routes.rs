@@ -9,7 +9,7 @@ use std::{net::SocketAddr, time::Duration};
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
 use super::{
-    Core, Member,
+    Core, Member, Output,
     contact::{Contact, Role},
     pace::REST,
 };
@@ -17,6 +17,8 @@ use crate::ndl::datagram::{Announcement, PATHS_MAX};
 
 /// Routes to one member that are asked, at most.
 const ROUTES_MAX: usize = PATHS_MAX;
+/// Time between two words to GNCL that a member listens elsewhere.
+const MOVE_GAP: Duration = Duration::from_secs(1);
 /// How many times shorter the round trip of another route is that goes before one that answers: less is chance.
 const MUCH_SHORTER: u32 = 2;
 /// Weight of what was known of a round trip, against one of the newest.
@@ -287,9 +289,25 @@ impl Core {
     /// What a member says of its addresses, on a route to it. // spec: NDL-3.3
     pub(super) fn note_addresses(&mut self, now: Time, node: NodeAddress, said: &Announcement) {
         let Some(member) = self.members.get_mut(&node) else { return };
-        if member.announcement.ndl != said.ndl {
-            member.announcement.ndl.clone_from(&said.ndl);
+        let known = &mut member.announcement;
+        (known.gncl_ip, known.gncl_port) = (said.gncl_ip, said.gncl_port);
+        known.gncl_further.clone_from(&said.gncl_further);
+        if known.ndl != said.ndl {
+            known.ndl.clone_from(&said.ndl);
             self.seek(now, node);
+        }
+    }
+
+    /// Tells GNCL where members listen now that said something else before; of one member once a second at most, whatever it says.
+    pub(super) fn tell_moves(&mut self, now: Time) {
+        for (node, member) in &mut self.members {
+            let (told, at) = &member.gncl_told;
+            let gncl = member.announcement.gncl_addresses();
+            if *told != gncl && now.since(*at) >= MOVE_GAP {
+                member.gncl_told = (gncl.clone(), now);
+                let incarnation = member.announcement.incarnation;
+                self.outputs.push_back(Output::Moved { node: *node, incarnation, gncl });
+            }
         }
     }
 

@@ -179,7 +179,7 @@ impl Topology {
         let mut config = NodeConfig::new(part.name());
         config.project.clone_from(&self.project);
         config.address = Some(place.address);
-        config.ndl.interface = place.interface;
+        config.ndl.interface = place.interface.into();
         config.ndl.port = place.port;
         config.ndl.seeds.clone_from(&place.seeds);
         config.ndl.multicast = self.discovery.multicast;

@@ -2,7 +2,7 @@
 
 use std::{
     collections::BTreeMap,
-    net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4},
+    net::{IpAddr, Ipv4Addr, SocketAddr},
 };
 
 use proptest::prelude::*;
@@ -20,8 +20,6 @@ use crate::{
         datagram::{Announcement, Answer},
     },
 };
-
-const GNCL: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 1), 5);
 
 /// This node's addresses.
 const PATHS: [SocketAddr; 2] = [path(0), path(1)];
@@ -87,7 +85,7 @@ proptest! {
     fn facts_alternate_and_tables_agree(inputs in proptest::collection::vec(any_input(), 1..200)) {
         let mut core = Spec { nodes_max: 3, ..Spec::of(1) }.core(99);
         let mut now = Time::from_nanos(1_000_000_000);
-        core.start(now, &PATHS, GNCL);
+        core.start(now, &PATHS);
         let mut there = BTreeMap::new();
         for (gap, input) in inputs {
             now = now + ms(gap);
@@ -106,11 +104,11 @@ proptest! {
                         prop_assert_eq!(there.remove(&node), Some(incarnation));
                     }
                     Output::AddressTaken { .. } => {
-                        core.start(now, &PATHS, GNCL);
+                        core.start(now, &PATHS);
                     }
                     Output::SendQuery { .. } | Output::SendMulticastQuery { .. } | Output::SendAnswer { .. }
                     | Output::SendLeave { .. } | Output::Event { .. } | Output::ClockMeasured { .. }
-                    | Output::Collision { .. } | Output::Stalled { .. } | Output::Probe { .. } => {}
+                    | Output::Moved { .. } | Output::Collision { .. } | Output::Stalled { .. } | Output::Probe { .. } => {}
                 }
             }
             prop_assert!(core.members.keys().eq(there.keys()));

@@ -1,9 +1,6 @@
 //! Several ways to one member: which of them are believed, which is used, and when none is left. One core, answered by hand.
 
-use std::{
-    net::{Ipv4Addr, SocketAddr, SocketAddrV4},
-    time::Duration,
-};
+use std::{net::SocketAddr, time::Duration};
 
 use sinew_runtime::{tid::Incarnation, time::Time};
 
@@ -17,7 +14,6 @@ use crate::ndl::{
     datagram::{Announcement, Answer, Claim},
 };
 
-const GNCL: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 1), 5);
 /// The networks that both nodes are in; a third one is of whoever means no good.
 const NETWORKS: [u8; 2] = [0, 1];
 
@@ -42,14 +38,16 @@ struct Bench {
     facts: Vec<MembershipFact>,
     asked: Vec<Place>,
     collisions: usize,
+    moves: Vec<Vec<SocketAddr>>,
 }
 
 impl Bench {
     fn new() -> Self {
         let core = Spec { multicast: false, seeds: vec![way(0).there], ..Spec::of(1) }.core(9);
         let now = Time::from_nanos(1_000_000_000);
-        let mut bench = Self { core, now, facts: Vec::new(), asked: Vec::new(), collisions: 0 };
-        bench.core.start(now, &NETWORKS.map(|network| at(network, 1)), GNCL);
+        let mut bench =
+            Self { core, now, facts: Vec::new(), asked: Vec::new(), collisions: 0, moves: Vec::new() };
+        bench.core.start(now, &NETWORKS.map(|network| at(network, 1)));
         bench.drain();
         bench
     }
@@ -70,6 +68,7 @@ impl Bench {
                 Output::SendQuery { to, .. } => self.asked.push(to),
                 Output::Fact(fact) => self.facts.push(fact),
                 Output::Collision { .. } => self.collisions += 1,
+                Output::Moved { gncl, .. } => self.moves.push(gncl),
                 Output::SendMulticastQuery { .. }
                 | Output::SendAnswer { .. }
                 | Output::SendLeave { .. }
@@ -288,6 +287,26 @@ fn what_was_asked_from_an_address_that_is_gone_is_forgotten_and_the_member_is_no
     bench.drain();
     assert!(bench.answer(way(1), member()), "who was lost is asked at once");
     assert!(bench.life().is_some());
+}
+
+// spec: NDL-3.3
+#[test]
+fn where_a_member_listens_now_is_told_once_a_second_at_most_and_only_what_it_says_on_a_route() {
+    let mut bench = Bench::of_two_ways();
+    let listens_at = |port| Announcement { gncl_port: port, ..member() };
+    bench.speak(elsewhere(), listens_at(66));
+    for round in 0..20_u16 {
+        bench.pass(PERIOD);
+        assert!(bench.answer(way(1), listens_at(1_000 + round)));
+    }
+    let ports: Vec<_> = bench.moves.iter().map(|gncl| gncl[0].port()).collect();
+    assert!((5..=10).contains(&ports.len()) && !ports.contains(&66), "in 10 s: {ports:?}");
+    bench.live(4, &[way(0)]);
+    assert_eq!(
+        bench.moves.last().map(|gncl| gncl[0].port()),
+        Some(member().gncl_port),
+        "the last word is told"
+    );
 }
 
 #[test]

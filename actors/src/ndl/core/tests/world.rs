@@ -90,15 +90,14 @@ impl Spec {
             config.ndl.multicast = None;
         }
         let secret = u128::from(boot_nonce) << 3;
-        let mut core = Core::new(&config, node(self.node), Incarnation(self.incarnation), boot_nonce, secret);
-        core.announce_further(&self.further);
-        core
+        Core::new(&config, node(self.node), Incarnation(self.incarnation), boot_nonce, secret)
     }
 }
 
 /// One process.
 pub(super) struct Process {
     pub(super) core: Core,
+    further: Vec<SocketAddrV4>,
     clock_ns: i64,
     is_alive: bool,
     /// Until then it gets no processor.
@@ -172,6 +171,7 @@ impl World {
         let core = spec.core(nonce);
         let process = Process {
             core,
+            further: spec.further.clone(),
             clock_ns: spec.clock_ns,
             is_alive: true,
             stalled_until: Time::ZERO,
@@ -190,8 +190,10 @@ impl World {
 
     pub(super) fn restart_shell(&mut self, index: u16) {
         let gncl = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 1), 5_000 + index);
+        let further = self.process(index).further.clone();
         self.with(udp(index), |core, now| {
-            core.start(now, &[udp(index)], gncl);
+            core.announce_gncl(std::iter::once(gncl).chain(further).collect());
+            core.start(now, &[udp(index)]);
         });
     }
 
@@ -339,7 +341,10 @@ impl World {
             }
             Output::Event { event, .. } => process.events.push(event),
             Output::ClockMeasured { node, offset } => drop(process.clocks.insert(node, offset)),
-            other @ (Output::Collision { .. } | Output::AddressTaken { .. } | Output::Stalled { .. }) => {
+            other @ (Output::Moved { .. }
+            | Output::Collision { .. }
+            | Output::AddressTaken { .. }
+            | Output::Stalled { .. }) => {
                 process.others.push(other);
             }
         }

@@ -174,7 +174,8 @@ impl World {
         let Process { ref addresses, node, .. } = self.processes[process];
         let (paths, gncl) = (addresses.clone(), SocketAddrV4::new(ip(node, 0), 5_000));
         self.with(process, |patient, now| {
-            patient.core.start(now, &paths, gncl);
+            patient.core.announce_gncl(vec![gncl]);
+            patient.core.start(now, &paths);
         });
     }
 
