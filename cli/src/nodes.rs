@@ -1,7 +1,7 @@
 //! `sinew nodes`: every node, its life, what connects it, its clock.
 
 use serde_json::{Value, json};
-use sinew::inspect::{AskNode, LinkReport, LostReport, NodeReport, PeerReport, TroubleReport};
+use sinew::inspect::{AskNode, LinkReport, LostReport, NodeReport, PeerReport, RouteReport, TroubleReport};
 
 use crate::{
     Said,
@@ -11,7 +11,7 @@ use crate::{
 };
 
 /// Columns of the table.
-const COLUMNS: usize = 11;
+const COLUMNS: usize = 12;
 
 /// Asks every node.
 pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
@@ -102,6 +102,7 @@ impl<'a> Row<'a> {
             self.state().to_owned(),
             self.found_by(),
             self.links(),
+            or_dash(self.seen.filter(|seen| seen.is_there).map(routes)),
             or_dash(self.seen.and_then(|seen| seen.asked_every_us).map(time)),
             or_dash(self.seen.and_then(|seen| seen.bound_us).map(time)),
             or_dash(self.seen.and_then(|seen| seen.round_trip_ns).map(|ns| time(ns / 1_000))),
@@ -130,6 +131,7 @@ impl<'a> Row<'a> {
             "bound_us": seen.and_then(|seen| seen.bound_us),
             "troubled": seen.map(|seen| seen.troubled),
             "troubles": seen.map(|seen| seen.troubles.iter().map(trouble_json).collect::<Vec<_>>()),
+            "routes": seen.map(|seen| seen.routes.iter().map(route_json).collect::<Vec<_>>()),
             "round_trip_ns": seen.and_then(|seen| seen.round_trip_ns),
             "clock_offset_ns": seen.and_then(|seen| seen.offset_ns),
             "clock_offset_bound_ns": seen.and_then(|seen| seen.offset_bound_ns),
@@ -141,6 +143,17 @@ impl<'a> Row<'a> {
 fn link_json(link: &LinkReport) -> Value {
     let LinkReport { class, is_up, waiting, unconfirmed } = link;
     json!({ "class": class, "up": is_up, "waiting": waiting, "unconfirmed": unconfirmed })
+}
+
+/// On how many ways NDL asks it, and how many of them answer, if not all do.
+fn routes(seen: &PeerReport) -> String {
+    let (all, answer) = (seen.routes.len(), seen.routes.iter().filter(|route| route.missed == 0).count());
+    if all == answer { all.to_string() } else { format!("{answer} of {all}") }
+}
+
+fn route_json(of: &RouteReport) -> Value {
+    let RouteReport { here, there, missed, round_trip_ns } = of;
+    json!({ "here": here, "there": there, "missed": missed, "round_trip_ns": round_trip_ns })
 }
 
 fn trouble_json(of: &TroubleReport) -> Value {
@@ -159,6 +172,7 @@ fn lost_cells(lost: &LostReport) -> [String; COLUMNS] {
         dash(),
         "lost".to_owned(),
         found_by,
+        dash(),
         dash(),
         dash(),
         or_dash(lost.bound_us.map(time)),
@@ -203,6 +217,7 @@ fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport]) -> String {
         "STATE",
         "FOUND BY",
         "LINKS",
+        "ROUTES",
         "ASKED EVERY",
         "LOST WITHIN",
         "ROUND TRIP",
@@ -253,5 +268,27 @@ mod tests {
             "10.0.0.7 knee: 2 further ones do not get on\n".to_owned(),
         ];
         assert_eq!(troubles(&seen), lines.concat());
+    }
+
+    #[test]
+    fn routes_are_counted_and_those_that_answer_where_not_all_do() {
+        let route = |missed| RouteReport {
+            here: "10.0.0.1:1".to_owned(),
+            there: "10.0.0.7:1".to_owned(),
+            missed,
+            round_trip_ns: None,
+        };
+        let of = |missed: &[u32]| {
+            let routes = missed.iter().map(|missed| route(*missed)).collect();
+            routes_of(routes)
+        };
+        assert_eq!([of(&[]), of(&[0]), of(&[0, 0]), of(&[0, 3])], ["0", "1", "2", "1 of 2"]);
+    }
+
+    fn routes_of(routes: Vec<RouteReport>) -> String {
+        super::routes(&PeerReport {
+            routes,
+            ..PeerReport::lost(NodeAddress::from([10, 0, 0, 7]), Incarnation(1))
+        })
     }
 }

@@ -17,14 +17,15 @@ use sinew_runtime::{
 
 use super::reports::{
     APPS_MAX, AppReport, AppsReport, AuditReport, BarrierReport, DialReport, ForeignReport, LinkReport,
-    LostReport, MISSING_MAX, Missing, NodeReport, PEERS_MAX, PeerReport, RefusalReport, SeenMessage,
-    StreamReport, TOLD_MAX, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
+    LostReport, MISSING_MAX, Missing, NodeReport, PEERS_MAX, PeerReport, RefusalReport, RouteReport,
+    SeenMessage, StreamReport, TOLD_MAX, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport,
+    WatchReport,
 };
 use super::watches::{Fetched, Sight};
 use crate::{
     audit,
     gncl::{self, ByDatagram, Peer},
-    ndl::{KnownNode, LossReason, LostNode, Source, Trouble, TroubledApp},
+    ndl::{KnownNode, KnownRoute, LossReason, LostNode, Source, Trouble, TroubledApp},
     node::{CommandError, NodeHandle, Supervised},
     stores::{Stores, lock},
     sync::{BarrierKind, BarrierStatus, OwnApp},
@@ -235,10 +236,21 @@ fn peer_report(known: &KnownNode, now: Time) -> PeerReport {
         bound_us: Some(micros(known.bound)),
         troubled: u32::try_from(known.troubled).unwrap_or(u32::MAX),
         troubles: known.troubles.iter().map(trouble).collect(),
+        routes: known.routes.iter().map(route).collect(),
         round_trip_ns: known.round_trip.map(nanos),
         offset_ns: known.offset.map(|offset| offset.theirs_minus_ours_ns),
         offset_bound_ns: known.offset.map(|offset| nanos(offset.bound)),
         ..PeerReport::lost(known.node, known.incarnation)
+    }
+}
+
+fn route(of: &KnownRoute) -> RouteReport {
+    let KnownRoute { here, there, missed, round_trip } = of;
+    RouteReport {
+        here: here.to_string(),
+        there: there.to_string(),
+        missed: *missed,
+        round_trip_ns: round_trip.map(nanos),
     }
 }
 

@@ -4,7 +4,9 @@ mod access;
 mod peers;
 
 pub use access::{AccessReport, AccessVerdict, AskAccess, AskReload, ReloadReport};
-pub use peers::{DialReport, ForeignReport, LinkReport, LostReport, PeerReport, StreamReport, TroubleReport};
+pub use peers::{
+    DialReport, ForeignReport, LinkReport, LostReport, PeerReport, RouteReport, StreamReport, TroubleReport,
+};
 
 use serde::{Deserialize, Serialize};
 use sinew_runtime::{

@@ -108,6 +108,9 @@ pub struct PeerReport {
     /// The first of them: four at most, and 64 of all peers.
     #[serde(default, deserialize_with = "at_most::<_, _, TROUBLES_MAX>")]
     pub troubles: Vec<TroubleReport>,
+    /// The ways on which NDL asks it, the one that is used first.
+    #[serde(default, deserialize_with = "at_most::<_, _, LINKS_MAX>")]
+    pub routes: Vec<RouteReport>,
     /// Time of the last query and its answer on the network, in nanoseconds.
     pub round_trip_ns: Option<u64>,
     /// Its clock minus that of the node that answers, in nanoseconds.
@@ -129,6 +132,19 @@ pub struct PeerReport {
     /// How values of class Stream go to it; `None` where one connection carries all classes.
     #[serde(default)]
     pub stream: Option<StreamReport>,
+}
+
+/// A way to a node.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RouteReport {
+    /// The UDP address of the node that answers this.
+    pub here: String,
+    /// That of the other one.
+    pub there: String,
+    /// Rounds of questions in a row that were not answered there.
+    pub missed: u32,
+    /// Time of a query and its answer on the network there, in nanoseconds, of the last ones.
+    pub round_trip_ns: Option<u64>,
 }
 
 /// How values of class Stream go to a node: each in a datagram of its own (UDP), or by the connection (TCP).
@@ -161,6 +177,7 @@ impl PeerReport {
             bound_us: None,
             troubled: 0,
             troubles: Vec::new(),
+            routes: Vec::new(),
             round_trip_ns: None,
             offset_ns: None,
             offset_bound_ns: None,

@@ -29,6 +29,7 @@ fn peer(number: u8) -> PeerReport {
         bound_us: Some(2_000_000),
         troubled: 0,
         troubles: Vec::new(),
+        routes: Vec::new(),
         round_trip_ns: None,
         offset_ns: None,
         offset_bound_ns: None,
