@@ -104,8 +104,13 @@ impl Contact {
         Self { role, ..Self::announced(now) }
     }
 
-    pub(super) const fn is_candidate(&self) -> bool {
-        matches!(self.role, Role::Candidate { .. }) && !self.is_seed
+    pub(super) fn is_candidate(&self) -> bool {
+        matches!(self.role, Role::Candidate { .. }) && !self.is_seed && !self.is_announced_only()
+    }
+
+    /// Nobody was heard there: only a member says that it is its own. These have room of their own.
+    pub(super) fn is_announced_only(&self) -> bool {
+        matches!(self.role, Role::Candidate { .. }) && !self.is_seed && self.sources.is_empty()
     }
 
     /// Whether its datagrams are counted against its own budget, not the strangers'.

@@ -17,6 +17,8 @@ use crate::ndl::datagram::{Announcement, PATHS_MAX};
 
 /// Routes to one member that are asked, at most.
 const ROUTES_MAX: usize = PATHS_MAX;
+/// Places of one member that are asked at once and have not answered, at most.
+const SOUGHT_MAX: usize = 2 * PATHS_MAX;
 /// Time between two words to GNCL that a member listens elsewhere.
 const MOVE_GAP: Duration = Duration::from_secs(1);
 /// How many times shorter the round trip of another route is that goes before one that answers: less is chance.
@@ -232,9 +234,6 @@ impl Core {
     /// Asks a member wherever it says that it is and has not answered.
     pub(super) fn seek(&mut self, now: Time, node: NodeAddress) {
         for place in self.unknown_places_of(node) {
-            if !self.has_room_for_a_candidate() {
-                return;
-            }
             self.contacts.insert(place, Contact::announced(now));
             self.ask(now, place);
         }
@@ -243,22 +242,28 @@ impl Core {
     /// The same of all members: who was not in reach may be now. They are asked with all others in this round.
     pub(super) fn seek_all(&mut self, now: Time) {
         let members: Vec<_> = self.members.keys().copied().collect();
-        for node in members {
-            for place in self.unknown_places_of(node) {
-                if self.has_room_for_a_candidate() {
-                    self.contacts.insert(place, Contact::announced(now));
-                }
-            }
+        for place in members.into_iter().flat_map(|node| self.unknown_places_of(node)).collect::<Vec<_>>() {
+            self.contacts.entry(place).or_insert_with(|| Contact::announced(now));
         }
     }
 
+    /// Where else to look for a member: not everywhere at once, if it says much, but everywhere in turn.
     fn unknown_places_of(&self, node: NodeAddress) -> Vec<Place> {
         let Some(member) = self.members.get(&node) else { return Vec::new() };
         let pairs = member.announcement.ndl_addresses().flat_map(|there| {
             let place = move |here: &SocketAddr| Place { there, here: *here };
             self.paths.iter().map(place)
         });
-        pairs.filter(|place| place.is_a_way() && !self.contacts.contains_key(place)).collect()
+        let (known, mut unknown): (Vec<_>, Vec<_>) =
+            pairs.filter(Place::is_a_way).partition(|place| self.contacts.contains_key(place));
+        let is_sought = |place: &&Place| self.contacts.get(place).is_some_and(Contact::is_announced_only);
+        let room = SOUGHT_MAX.saturating_sub(known.iter().filter(is_sought).count());
+        if unknown.len() > room {
+            let turn = self.questions_asked % unknown.len() as u64;
+            unknown.rotate_left(usize::try_from(turn).unwrap_or(0));
+            unknown.truncate(room);
+        }
+        unknown
     }
 
     /// Whether the member's life, which answered there, has a route there, or is given one now.
