@@ -67,7 +67,7 @@ impl Core {
             self.report_stall(now, late);
         } else {
             pace.due = Some(due + pace.period);
-            self.count_missed(at);
+            self.count_missed(now, at);
             self.drop_former_routes(now, at);
             self.lose_the_silent(now, at, late, Duration::ZERO);
             self.tell_who_does_not_answer(at);
@@ -87,9 +87,10 @@ impl Core {
         }
     }
 
-    fn count_missed(&mut self, at: usize) {
+    fn count_missed(&mut self, now: Time, at: usize) {
+        let period = self.paces[at].period;
         for member in self.members.values_mut().filter(|member| member.pace == at) {
-            member.routes.count_missed();
+            member.routes.count_missed(now, period);
             member.missed += u32::from(member.is_awaited);
         }
     }
@@ -182,7 +183,7 @@ impl Core {
         for member in members {
             (is_empty, member.is_awaited) = (false, true);
             for place in Self::places_in_round(member) {
-                member.routes.asked(place);
+                member.routes.asked(now, place);
                 places.push(place);
             }
         }
@@ -217,7 +218,7 @@ impl Core {
                     // Its group is asked by itself.
                     return;
                 }
-                member.routes.asked(place);
+                member.routes.asked(now, place);
             }
             Role::Former { left, .. } if *left > 0 && !contact.is_seed => {
                 *left -= 1;

@@ -49,7 +49,8 @@ pub(super) struct Route {
     pub(super) place: Place,
     /// Rounds of questions in a row that it did not answer.
     pub(super) missed: u32,
-    is_awaited: bool,
+    /// When the question was asked there that is neither answered nor counted as missed.
+    awaited: Option<Time>,
     /// Of the last answers, each weighed against those before it.
     pub(super) round_trip: Option<Duration>,
 }
@@ -114,28 +115,32 @@ impl Routes {
     }
 
     /// A question of the cycle goes there.
-    pub(super) fn asked(&mut self, place: Place) {
+    pub(super) fn asked(&mut self, now: Time, place: Place) {
         if let Some(route) = self.all.iter_mut().find(|route| route.place == place) {
-            route.is_awaited = true;
+            route.awaited = Some(now);
         }
     }
 
-    pub(super) fn count_missed(&mut self) {
-        for route in self.all.iter_mut().filter(|route| route.is_awaited) {
-            route.missed = route.missed.saturating_add(1);
+    /// Each question counts once, when it had half a `period` to be answered: the rounds in which it is asked may not be those that are
+    /// counted.
+    pub(super) fn count_missed(&mut self, now: Time, period: Duration) {
+        for route in &mut self.all {
+            if route.awaited.take_if(|asked| now.since(*asked) >= period / 2).is_some() {
+                route.missed = route.missed.saturating_add(1);
+            }
         }
     }
 
     /// What came while nobody listened was missed by nobody.
     pub(super) fn forgive(&mut self) {
-        self.all.iter_mut().for_each(|route| route.is_awaited = false);
+        self.all.iter_mut().for_each(|route| route.awaited = None);
     }
 
     /// Somebody answered there.
     pub(super) fn answered(&mut self, place: Place, round_trip: Option<Duration>) {
         let Some(at) = self.all.iter().position(|route| route.place == place) else { return };
         let route = &mut self.all[at];
-        (route.missed, route.is_awaited) = (0, false);
+        (route.missed, route.awaited) = (0, None);
         route.round_trip = match (route.round_trip, round_trip) {
             (Some(known), Some(new)) => Some((known * SMOOTHING + new) / (SMOOTHING + 1)),
             (known, new) => new.or(known),
@@ -151,7 +156,7 @@ impl Routes {
 
 impl Route {
     const fn new(place: Place) -> Self {
-        Self { place, missed: 0, is_awaited: false, round_trip: None }
+        Self { place, missed: 0, awaited: None, round_trip: None }
     }
 
     fn is_much_shorter_than(&self, other: &Self) -> bool {
