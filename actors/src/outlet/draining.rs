@@ -106,7 +106,7 @@ impl<S: Socket> Half<S> {
         {
             return;
         }
-        after.wake = self.drainer.take();
+        self.wake_drainer(after);
     }
 
     /// Why the connection `link` cannot be written to, if it cannot.
@@ -233,10 +233,15 @@ impl<S: Socket> Half<S> {
         Step::Done
     }
 
+    /// The drainer is woken, and whoever calls this twice wakes it still.
+    pub(super) fn wake_drainer(&mut self, after: &mut After) {
+        after.wake = after.wake.take().or_else(|| self.drainer.take());
+    }
+
     /// The drainer writes on, if there is anything to write.
     pub(super) fn hand_to_drainer(&mut self, after: &mut After) {
         if self.waiting() > 0 {
-            after.wake = self.drainer.take();
+            self.wake_drainer(after);
         }
     }
 

@@ -161,7 +161,7 @@ impl<S: Socket> Half<S> {
         let has_gathered = self.gathered() > 0;
         self.link = Link::Down;
         self.urgent.clear();
-        after.wake = self.drainer.take();
+        self.wake_drainer(after);
         let partial = self.partial.take();
         let was_whole = !has_gathered && partial.as_ref().is_none_or(|partial| partial.written == 0);
         if self.session.is_some() {
@@ -293,7 +293,7 @@ impl<S: Socket> Half<S> {
             }
             Written::InPart if frame.written > 0 => {
                 self.partial = Some(frame);
-                after.wake = self.drainer.take();
+                self.wake_drainer(after);
             }
             Written::InPart | Written::Broken => {
                 return self.requeue(frame, bound, after).map(|()| Step::Done);
@@ -328,7 +328,7 @@ impl<S: Socket> Half<S> {
             self.write_next(after);
         }
         if self.urgent_left() > 0 {
-            after.wake = self.drainer.take();
+            self.wake_drainer(after);
         }
         Ok(())
     }
@@ -345,7 +345,7 @@ impl<S: Socket> Half<S> {
         if self.waiting() == 1 && self.has_frame() && matches!(self.link, Link::Up(_)) {
             self.write_next(after);
         }
-        after.wake = self.drainer.take();
+        self.wake_drainer(after);
     }
 
     /// Where there is a session, a destination may have as many as the bound says, and all together a few times that: one that

@@ -132,7 +132,7 @@ impl<S: Socket> Half<S> {
         let heard = session.sending.heard(ack);
         let turn = session.held.heard(ack.change, ack.held.iter().copied());
         self.turn(turn);
-        after.wake = self.drainer.take();
+        self.wake_drainer(after);
         match heard {
             Heard::Known => false,
             Heard::Resumed => {
@@ -157,8 +157,8 @@ impl<S: Socket> Half<S> {
         // Without a connection nobody needs it, and the next one begins with another.
         if self.submit_urgent(ack, usize::MAX, after).is_ok()
             && let Some(session) = &mut self.session
+            && session.sending.told(epoch)
         {
-            session.sending.told(epoch);
             self.hand_to_drainer(after);
         }
         true

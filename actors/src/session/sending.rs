@@ -169,12 +169,14 @@ impl<M> Sending<M> {
     }
 
     /// An [`Ack`] that names `epoch` goes out on the present connection, ahead of all that is sent from now on: if that is the epoch that began
-    /// there, its messages may follow. spec: SESSION-5
-    pub(crate) const fn told(&mut self, epoch: u64) {
-        if self.is_untold && epoch == self.epoch {
+    /// there, its messages may follow now. Returns whether it is. spec: SESSION-5
+    pub(crate) fn told(&mut self, epoch: u64) -> bool {
+        let follows = self.is_untold && epoch == self.epoch;
+        if follows {
             self.is_untold = false;
             self.cursor = Some(FIRST);
         }
+        follows
     }
 
     /// The peer has said what it takes next.

@@ -1,5 +1,7 @@
 //! A session begun anew: nothing of it goes out before the peer was told.
 
+use std::future::Future;
+
 use super::*;
 use crate::session::Window;
 
@@ -40,6 +42,34 @@ fn forgotten() -> Bench {
     bench.reconnect(PLENTY);
     assert!(bench.hears(2), "it knows nothing of that message");
     bench
+}
+
+/// Counts how often it was woken.
+#[derive(Default)]
+struct Woken(AtomicUsize);
+
+impl std::task::Wake for Woken {
+    fn wake(self: Arc<Self>) {
+        self.0.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+/// An acknowledgement that finds the socket full goes out when it takes something again, in the drainer's hand.
+#[test]
+fn an_acknowledgement_that_the_socket_does_not_take_wakes_the_drainer() {
+    let bench = bench(1);
+    let woken = Arc::new(Woken::default());
+    let waker = Waker::from(woken.clone());
+    let mut drained = std::pin::pin!(bench.outlet.drain(bench.link));
+    assert!(drained.as_mut().poll(&mut Context::from_waker(&waker)).is_pending());
+    bench.wire.room.store(0, Ordering::Relaxed);
+    assert!(bench.tells(EPOCH));
+    assert_eq!(woken.0.load(Ordering::Relaxed), 1);
+    bench.wire.room.store(PLENTY, Ordering::Relaxed);
+    for _ in 0..2 {
+        assert!(drained.as_mut().poll(&mut Context::from_waker(&waker)).is_pending());
+    }
+    assert_eq!(bench.seen(), [EPOCH as u8]);
 }
 
 // spec: SESSION-5
