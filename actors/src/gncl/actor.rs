@@ -1,5 +1,6 @@
 //! The shell: sockets and timers for the core's orders, events for what they do.
 
+mod accepting;
 mod by_datagram;
 mod leaving;
 #[cfg(target_os = "linux")]
@@ -25,7 +26,6 @@ use sinew_runtime::{
     time::Time,
     wire::{Kind, Message},
 };
-use tokio::net::TcpStream;
 
 use super::{
     LinkFact,
@@ -41,15 +41,8 @@ use super::{
     secure::Secure,
     spin::Spin,
     task::{self, Move},
-    transport::Transport,
 };
-use crate::{
-    config::NodeConfig,
-    ndl,
-    outlet::Gathering,
-    stores::{Stores, lock},
-    sync,
-};
+use crate::{config::NodeConfig, ndl, outlet::Gathering, stores::Stores, sync};
 pub(crate) use leaving::LINGER;
 use proven::NOT_PROVEN;
 use wire::Wire;
@@ -82,22 +75,6 @@ impl Gncl {
     pub(super) fn is_to_stop(&self) -> bool {
         // SYNC: Relaxed; the order to stop came through the supervisor's lock, after the flag was set.
         self.stores.stopping.load(Ordering::Relaxed)
-    }
-
-    /// The listeners, one for each address: those that are open already, if this layer was restarted.
-    fn listen(&self) -> io::Result<Vec<tokio::net::TcpListener>> {
-        let mut kept = lock(&self.stores.gncl.listeners);
-        if kept.is_empty() {
-            let config = &self.stores.config;
-            let listener = listener::listen_first(config)?;
-            let address = listener.local_addr()?;
-            let further = listener::listen_at_further(config, &self.stores.gncl.refusals);
-            self.stores.gncl_further.get_or_init(|| listener::addresses_of(&further));
-            *kept = std::iter::once(listener).chain(further).collect();
-            self.bind_datagrams(&kept);
-            self.stores.gncl_listen.get_or_init(|| address);
-        }
-        kept.iter().map(|listener| tokio::net::TcpListener::from_std(listener.try_clone()?)).collect()
     }
 
     fn input(&mut self, input: Input, ctx: &mut Context<Self>) {
@@ -157,30 +134,6 @@ impl Gncl {
         let NodeConfig { payload_max, gncl, .. } = &self.stores.config;
         let (payload_max, give_up) = (*payload_max, gncl.give_up);
         Reading { mode: mode.clone(), payload_max, give_up, secure: self.secure.clone() }
-    }
-
-    /// Whether a connection came to an address of an interface that this node uses: where those are chosen by their names, it listens at
-    /// all that the host has.
-    fn listens_at(&self, socket: &TcpStream) -> bool {
-        if self.stores.config.ndl.interface.are_addresses() {
-            return true;
-        }
-        let local = socket.local_addr().map(|local| local.ip());
-        lock(&self.stores.ndl)
-            .paths()
-            .iter()
-            .any(|path| local.as_ref().is_ok_and(|local| *local == path.ip()))
-    }
-
-    fn accepted(&mut self, socket: TcpStream, ctx: &mut Context<Self>) {
-        // It has gone again already where the system does not know.
-        let Ok(from) = socket.peer_addr() else { return };
-        let (connection, transport) = (self.core.open(), Transport::open(socket));
-        let mode = Arc::new(Mutex::new(Mode::Handshake));
-        let reading = self.reading(&mode);
-        let reader = ctx.add_stream(link::read(connection, transport.clone(), reading));
-        self.wires.insert(connection, Wire::new(Some(transport), mode, reader, self.secure.is_none()));
-        self.input(Input::Accepted(connection, from.ip()), ctx);
     }
 
     fn send_hello(&mut self, connection: ConnectionId, hello: &Introduction, ctx: &mut Context<Self>) {
@@ -452,24 +405,6 @@ impl Drop for Gncl {
     /// Senders must not go on writing to the sockets of an actor that is gone.
     fn drop(&mut self) {
         self.cut_all();
-    }
-}
-
-impl StreamHandler<io::Result<TcpStream>> for Gncl {
-    fn handle(&mut self, accepted: io::Result<TcpStream>, ctx: &mut Context<Self>) {
-        match accepted {
-            Ok(socket) if !self.listens_at(&socket) => {
-                let detail = format_args!("a connection to {:?}", socket.local_addr());
-                self.stores.gncl.refusals.count(Time::now(), "connection over another interface", &detail);
-            }
-            Ok(socket) => self.accepted(socket, ctx),
-            Err(error) => {
-                self.stores.gncl.refusals.count(Time::now(), "not accepted", &error);
-                if listener::is_starved(&error) {
-                    self.input(Input::Starved, ctx);
-                }
-            }
-        }
     }
 }
 

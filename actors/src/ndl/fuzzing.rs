@@ -24,6 +24,7 @@ pub(crate) fn some_datagrams() -> Vec<Vec<u8>> {
         gncl_port: 7_777,
         period_us: 500_000,
         gncl_further: vec![(0x0a00_0102, 7_777)],
+        ndl: vec![(0x0a00_0002, 6_910), (0x0a00_0102, 6_910)],
         claim: Claim::Held,
     };
     let answer = Answer {
