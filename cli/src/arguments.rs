@@ -1,6 +1,6 @@
 //! What can be said on the command line.
 
-use std::{net::Ipv4Addr, path::PathBuf, time::Duration};
+use std::{path::PathBuf, time::Duration};
 
 use clap::{Parser, Subcommand};
 
@@ -78,10 +78,10 @@ pub(crate) enum Command {
     /// Whether this machine gives a node what it needs: interfaces, multicast, limits, real-time rights, CPU governor, clock, shared memory,
     /// sockets; each finding with the command that mends it
     Doctor {
-        /// Address of the interface that multicast is tried on. Without it: the `ndl.interface` of the node that lets us in, else 127.0.0.1.
-        /// What is sent does not leave this machine
-        #[arg(long, value_name = "ADDRESS")]
-        interface: Option<Ipv4Addr>,
+        /// Interfaces that multicast is tried on, by address or by name, or `all`, with commas between them. Without it: the
+        /// `ndl.interface` of the node that lets us in, else 127.0.0.1. What is sent does not leave this machine
+        #[arg(long, value_name = "INTERFACE", value_delimiter = ',')]
+        interface: Vec<sinew::config::Interface>,
     },
     /// Makes the keys of a whole robot, and shows who has which: its authority, and a key and a certificate for each node
     ///

@@ -10,6 +10,7 @@ mod sockets;
 use std::{net::Ipv4Addr, path::Path, time::Duration};
 
 use serde_json::{Value, json};
+use sinew::config::{Interface, Interfaces};
 
 use crate::{
     Said,
@@ -36,13 +37,14 @@ impl Check {
     }
 }
 
-/// Tries everything; multicast at the interface that has this address, without one where the node looks that lets us in.
-pub(crate) fn show(interface: Option<Ipv4Addr>, socket: Option<&Path>, within: Duration) -> Said {
+/// Tries everything; multicast at these interfaces, without any where the node looks that lets us in.
+pub(crate) fn show(chosen: Vec<Interface>, socket: Option<&Path>, within: Duration) -> Said {
     let interfaces = network::found();
-    let interface = interface.or_else(|| of_node(socket, within)).unwrap_or(Ipv4Addr::LOCALHOST);
-    let checks = [
-        network::interfaces(&interfaces),
-        network::multicast(interface, &interfaces),
+    let chosen = Some(chosen).filter(|chosen| !chosen.is_empty()).map(Interfaces::from);
+    let chosen = chosen.or_else(|| of_node(socket, within)).unwrap_or_else(|| Ipv4Addr::LOCALHOST.into());
+    let mut checks = vec![network::interfaces(&interfaces)];
+    checks.extend(network::multicast(&chosen, &interfaces));
+    checks.extend([
         rights::open_files(),
         rights::locked_memory(),
         rights::real_time(),
@@ -52,7 +54,7 @@ pub(crate) fn show(interface: Option<Ipv4Addr>, socket: Option<&Path>, within: D
         sockets::directory(),
         sockets::leftover(),
         sockets::node(socket),
-    ];
+    ]);
     let is_fine = checks.iter().all(|check| check.mend.is_none());
     let json = json!({ "checks": checks.iter().map(check_json).collect::<Vec<_>>() });
     let mut table = Table::new(["CHECK", "", "WHAT IS SO"]);
@@ -66,12 +68,13 @@ pub(crate) fn show(interface: Option<Ipv4Addr>, socket: Option<&Path>, within: D
     Said { text, json, is_fine }
 }
 
-/// The interface at which a node of this machine looks for others.
-fn of_node(socket: Option<&Path>, within: Duration) -> Option<Ipv4Addr> {
+/// The interfaces at which a node of this machine looks for others.
+fn of_node(socket: Option<&Path>, within: Duration) -> Option<Interfaces> {
     let mut system = System::enter(socket, within).ok()?;
     let here = system.here();
     system.leave();
-    here.ok()?.interface.parse().ok()
+    let chosen: Vec<_> = here.ok()?.interface.split(", ").filter_map(|one| one.parse().ok()).collect();
+    (!chosen.is_empty()).then(|| chosen.into())
 }
 
 fn check_json(check: &Check) -> Value {

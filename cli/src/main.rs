@@ -86,7 +86,7 @@ fn run(arguments: &Arguments) -> Result<Said, Fault> {
         Command::Audit => inside(&audit::show),
         Command::Reload => inside(&reload::show),
         Command::Doctor { interface } => {
-            Ok(doctor::show(*interface, arguments.socket.as_deref(), arguments.within()))
+            Ok(doctor::show(interface.clone(), arguments.socket.as_deref(), arguments.within()))
         }
         Command::Keys(order) => keys::show(order),
         Command::Completions { shell } => Ok(completions(*shell)),

@@ -7,6 +7,7 @@ use std::{
     time::Duration,
 };
 
+use sinew::config::{Interface as Choice, Interfaces};
 use socket2::{Domain, Protocol, SockAddr, Socket, Type};
 
 use super::Check;
@@ -120,9 +121,45 @@ pub(super) fn found() -> Vec<Interface> {
     found
 }
 
+const MULTICAST_NAME: &str = "multicast";
+
+/// Whether a datagram to a group comes back at each address of these interfaces.
+pub(super) fn multicast(chosen: &Interfaces, all: &[Interface]) -> Vec<Check> {
+    chosen.iter().flat_map(|choice| multicast_at(choice, all)).collect()
+}
+
+fn multicast_at(choice: &Choice, all: &[Interface]) -> Vec<Check> {
+    let usable = |interface: &&Interface| !interface.is_loopback() && interface.lacks().is_none();
+    let (at, none): (Vec<&Interface>, String) = match choice {
+        Choice::Address(address) => return vec![hears_at(*address, all)],
+        Choice::Name(name) => (
+            all.iter().filter(|interface| interface.name == *name).collect(),
+            format!("no interface of this host is called {name}, or it has no address"),
+        ),
+        Choice::All => (
+            all.iter().filter(usable).collect(),
+            "no interface leads to other hosts, and `all` is chosen".to_owned(),
+        ),
+    };
+    let checks: Vec<_> = at
+        .into_iter()
+        .flat_map(|interface| &interface.addresses)
+        .map(|address| hears_at(*address, all))
+        .collect();
+    if !checks.is_empty() {
+        return checks;
+    }
+    let names: Vec<_> = all.iter().map(Interface::in_words).collect();
+    let mend = format!(
+        "the node waits until there is one; or set `ndl.interface` to one of this host: {}",
+        names.join(", ")
+    );
+    vec![Check::finding(MULTICAST_NAME, none, mend)]
+}
+
 /// Whether a datagram to a group comes back at the interface that has this address.
-pub(super) fn multicast(address: Ipv4Addr, all: &[Interface]) -> Check {
-    const NAME: &str = "multicast";
+fn hears_at(address: Ipv4Addr, all: &[Interface]) -> Check {
+    const NAME: &str = MULTICAST_NAME;
     let Some(interface) = all.iter().find(|interface| {
         interface.addresses.contains(&address) || (address.is_loopback() && interface.is_loopback())
     }) else {
@@ -208,7 +245,27 @@ mod tests {
     #[test]
     fn an_address_that_nobody_has_is_told_with_those_that_there_are() {
         let all = [interface("lo", Some([127, 0, 0, 1]), UP, true)];
-        let check = multicast(Ipv4Addr::new(192, 0, 2, 1), &all);
+        let check = hears_at(Ipv4Addr::new(192, 0, 2, 1), &all);
         assert!(check.mend.is_some_and(|mend| mend.contains("127.0.0.1")));
+    }
+
+    #[test]
+    fn a_name_that_no_interface_has_and_all_where_there_is_none_are_findings() {
+        let all =
+            [interface("lo", Some([127, 0, 0, 1]), UP, true), interface("eth0", None, MULTICAST, false)];
+        for (choice, word) in [(Choice::Name("eth1".to_owned()), "eth1"), (Choice::All, "`all`")] {
+            let checks = multicast(&vec![choice].into(), &all);
+            assert_eq!(checks.len(), 1);
+            assert!(checks[0].seen.contains(word), "{}", checks[0].seen);
+            assert!(checks[0].mend.as_ref().is_some_and(|mend| mend.contains("eth0")));
+        }
+    }
+
+    #[test]
+    fn each_address_of_an_interface_is_tried() {
+        let mut lo = interface("lo", Some([127, 0, 0, 1]), UP, true);
+        lo.addresses.push(Ipv4Addr::new(127, 0, 0, 2));
+        let checks = multicast(&vec![Choice::Name("lo".to_owned())].into(), &[lo]);
+        assert_eq!(checks.len(), 2);
     }
 }
