@@ -1,10 +1,6 @@
 //! What happens to one connection until it is a link or gone.
 
-use std::{
-    cmp::Reverse,
-    collections::{BTreeMap, BTreeSet},
-    net::IpAddr,
-};
+use std::{cmp::Reverse, collections::BTreeMap, net::IpAddr, time::Duration};
 
 use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
@@ -20,6 +16,18 @@ use super::{
     sides::Side,
 };
 
+/// Connections that a node makes at once: one for each class.
+const OF_A_NODE: usize = 3;
+/// How old may be what is known of where nodes were found, as a look through all their addresses takes a millisecond where there are a thousand.
+const FOUND_FOR: Duration = Duration::from_millis(100);
+
+/// How many nodes NDL has found at each address.
+#[derive(Debug, Default)]
+pub(super) struct FoundAt {
+    as_of: Option<Time>,
+    nodes: BTreeMap<IpAddr, usize>,
+}
+
 impl Core {
     pub(super) fn accepted(&mut self, now: Time, connection: ConnectionId, from: IpAddr) {
         if self.leaving && !self.expects_sides() {
@@ -30,7 +38,7 @@ impl Core {
         if self.strangers().count() >= self.settings.strangers_max {
             let what = "the oldest one from where most come was closed; see `gncl.strangers_max`";
             self.count("too many strangers", what.to_owned());
-            self.close_strangers(1);
+            self.close_strangers(now, 1);
         }
         let deadline = now + self.settings.handshake;
         self.connections
@@ -38,9 +46,9 @@ impl Core {
     }
 
     /// There are no descriptors left, or no memory: what strangers hold is needed for peers. spec: GNCL-2
-    pub(super) fn starved(&mut self) {
+    pub(super) fn starved(&mut self, now: Time) {
         let half = self.strangers().count().div_ceil(2);
-        self.close_strangers(half);
+        self.close_strangers(now, half);
     }
 
     /// Connections whose peer is not known, or was refused and has not closed, and from where they were made: oldest first.
@@ -51,23 +59,42 @@ impl Core {
 
     /// Strangers in the order in which they go. Who is a peer says hello at once, so those that have not for longest are none; but who
     /// connects thousands of times a second lets nobody say anything, unless it is his own that go: first those from where most come,
-    /// and only behind all others those from where NDL has found a node.
-    fn least_wanted(&self) -> Vec<ConnectionId> {
-        let found: BTreeSet<IpAddr> =
-            self.peers.values().filter_map(|peer| peer.wanted.as_ref()).flatten().map(|at| at.ip()).collect();
+    /// and only behind all others those from where NDL has found a node, as many of the newest as that makes; half of the places at most
+    /// are for these.
+    fn least_wanted(&mut self, now: Time) -> Vec<ConnectionId> {
+        self.look_where_nodes_are(now);
+        let places = self.settings.strangers_max / 2;
         let mut newer: BTreeMap<Option<IpAddr>, usize> = BTreeMap::new();
         let ranked = self.strangers().rev().map(|(connection, from)| {
             let newer = newer.entry(from).or_default();
             *newer += 1;
-            (from.is_some_and(|from| found.contains(&from)), Reverse(*newer), connection)
+            let nodes = from.and_then(|from| self.found_at.nodes.get(&from)).copied().unwrap_or(0);
+            let is_expected = *newer <= (nodes * OF_A_NODE).min(places);
+            (is_expected, Reverse(*newer), connection)
         });
         let mut ranked: Vec<_> = ranked.collect();
         ranked.sort_unstable();
         ranked.into_iter().map(|(_, _, connection)| connection).collect()
     }
 
-    fn close_strangers(&mut self, count: usize) {
-        for connection in self.least_wanted().into_iter().take(count) {
+    fn look_where_nodes_are(&mut self, now: Time) {
+        if self.found_at.as_of.is_some_and(|as_of| now.since(as_of) < FOUND_FOR) {
+            return;
+        }
+        let mut nodes = BTreeMap::<_, usize>::new();
+        for addresses in self.peers.values().filter_map(|peer| peer.wanted.as_ref()) {
+            let mut addresses: Vec<_> = addresses.iter().map(|at| at.ip()).collect();
+            addresses.sort_unstable();
+            addresses.dedup();
+            for address in addresses {
+                *nodes.entry(address).or_default() += 1;
+            }
+        }
+        self.found_at = FoundAt { as_of: Some(now), nodes };
+    }
+
+    fn close_strangers(&mut self, now: Time, count: usize) {
+        for connection in self.least_wanted(now).into_iter().take(count) {
             self.connections.remove(&connection);
             self.outputs.push_back(Output::Close(connection));
         }
@@ -279,8 +306,11 @@ impl Core {
             return;
         }
         self.count(decline.cause(), decline.to_string());
+        // Who is refused stays from where it came.
+        let from = self.connections.get(&connection).and_then(|known| known.from);
         self.leave_stage(now, connection, stage);
-        self.stage_for_handshake(now, connection, Stage::Leaving);
+        let deadline = now + self.settings.handshake;
+        self.connections.insert(connection, Connection { stage: Stage::Leaving, from, deadline });
         self.outputs.push_back(Output::Refuse(connection, decline.to_refusal()));
     }
 
@@ -332,12 +362,10 @@ impl Core {
         }
     }
 
-    /// Enters a stage that does not last. spec: GNCL-2
+    /// A connection that was dialled enters a stage that does not last. spec: GNCL-2
     pub(super) fn stage_for_handshake(&mut self, now: Time, connection: ConnectionId, stage: Stage) {
         let deadline = now + self.settings.handshake;
-        // Who is refused stays from where it came.
-        let from = self.connections.get(&connection).and_then(|known| known.from);
-        self.connections.insert(connection, Connection { stage, from, deadline });
+        self.connections.insert(connection, Connection { stage, from: None, deadline });
     }
 }
 

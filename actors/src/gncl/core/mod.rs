@@ -34,6 +34,7 @@ use sinew_runtime::{
 
 use super::LinkFact;
 use acquaintance::Acquaintance;
+use connections::FoundAt;
 pub(super) use handshake::{
     CANCEL, CLASSES, DATAGRAMS, Decline, GUARD, HANDSHAKE_PAYLOAD_MAX, Introduction, Lane, OUTCOMES, Refusal,
     read, write,
@@ -208,6 +209,8 @@ pub(super) struct Core {
     connections: BTreeMap<ConnectionId, Connection>,
     peers: BTreeMap<NodeAddress, Acquaintance>,
     outputs: VecDeque<Output>,
+    /// Where connections of strangers may be those of nodes that were found.
+    found_at: FoundAt,
     opened: u64,
     chance: fastrand::Rng,
     leaving: bool,
@@ -215,12 +218,13 @@ pub(super) struct Core {
 
 impl Core {
     /// A core that knows nobody; `seed` decides its jitter.
-    pub(super) const fn new(settings: Settings, seed: u64) -> Self {
+    pub(super) fn new(settings: Settings, seed: u64) -> Self {
         Self {
             settings,
             connections: BTreeMap::new(),
             peers: BTreeMap::new(),
             outputs: VecDeque::new(),
+            found_at: FoundAt::default(),
             opened: 0,
             chance: fastrand::Rng::with_seed(seed),
             leaving: false,
@@ -260,7 +264,7 @@ impl Core {
             }
             Input::GoodbyeReceived(connection) => self.goodbye(now, connection),
             Input::Ended(connection) => self.ended(now, connection),
-            Input::Starved => self.starved(),
+            Input::Starved => self.starved(now),
             Input::TimePassed => self.time_passed(now),
             Input::LeaveRequested { owed } => self.leave(now, &owed),
         }

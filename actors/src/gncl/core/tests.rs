@@ -298,6 +298,40 @@ fn strangers_from_where_a_node_was_found_are_closed_behind_all_others() {
 }
 
 #[test]
+fn not_even_where_a_node_was_found_can_anybody_take_all_places() {
+    let mut core = core();
+    core.handle(millis(0), found(1));
+    outputs(&mut core);
+    for _ in 0..3 {
+        accept_from(&mut core, address().ip());
+    }
+    let (newcomer, closed) = accept_from(&mut core, [10, 1, 0, 1]);
+    assert_eq!(closed.len(), 1, "one of the many");
+    for _ in 0..100 {
+        let (_, closed) = accept_from(&mut core, address().ip());
+        assert!(!closed.contains(&Output::Close(newcomer)));
+    }
+}
+
+#[test]
+fn who_is_refused_counts_where_it_came_from() {
+    let mut core = core();
+    let from = [10, 0, 0, 8];
+    let (refused, _) = accept_from(&mut core, from);
+    let strange = Introduction { project: "another".to_owned(), ..hello_from(HIGH, 1, 1) };
+    core.handle(millis(1), Input::HelloReceived(refused, strange));
+    assert!(refusal(&outputs(&mut core)).is_some());
+    let (other, _) = accept_from(&mut core, [10, 0, 0, 7]);
+    accept_from(&mut core, from);
+    let (_, closed) = accept_from(&mut core, from);
+    assert_eq!(
+        closed,
+        [Output::Close(refused)],
+        "two came from there, and it is the older one, not {other:?}"
+    );
+}
+
+#[test]
 fn half_of_the_strangers_give_their_descriptors_back_when_there_are_none_left() {
     let mut core = core();
     let (link, _) = greet(&mut core, millis(0), hello_from(HIGH, 1, 1));
