@@ -182,7 +182,7 @@ impl Core {
         let (mut is_empty, mut places) = (true, Vec::new());
         for member in members {
             (is_empty, member.is_awaited) = (false, true);
-            for place in Self::places_in_round(member) {
+            for place in member.routes.places().collect::<Vec<_>>() {
                 member.routes.asked(now, place);
                 places.push(place);
             }
@@ -214,7 +214,7 @@ impl Core {
             Role::Candidate { asked } => *asked = asked.saturating_add(1),
             Role::Member(node) => {
                 let Some(member) = self.members.get_mut(node) else { return };
-                if member.pace != REST && Self::places_in_round(member).contains(&place) {
+                if member.pace != REST && member.routes.has(place) {
                     // Its group is asked by itself.
                     return;
                 }

@@ -131,7 +131,8 @@ impl Core {
         (member.missed, member.host) = (0, None);
         member.is_awaited = false;
         member.routes.answered(proof.from, proof.exchange.and_then(|exchange| exchange.round_trip()));
-        self.note_addresses(now, node, &proof.announcement);
+        self.note_addresses(now, node, proof.from, &proof.announcement);
+        self.drop_unannounced_routes(now, node, proof.from);
         self.measure(now, node, proof.exchange);
         self.answers_again(node);
         self.note_progress(node, proof.progress);

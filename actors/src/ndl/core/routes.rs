@@ -4,14 +4,17 @@
 //! else in a member's name has no route for that: a new one is taken where the member itself says that it is, on a route that there is
 //! already, or where no route answers any more.
 
-use std::{net::SocketAddr, time::Duration};
+use std::{
+    cmp::Reverse,
+    net::{IpAddr, SocketAddr},
+    time::Duration,
+};
 
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
 use super::{
     Core, Member, Output,
     contact::{Contact, Role},
-    pace::REST,
 };
 use crate::ndl::datagram::{Announcement, PATHS_MAX};
 
@@ -40,6 +43,15 @@ impl Place {
     pub(super) fn is_a_way(&self) -> bool {
         self.here.is_ipv4() == self.there.is_ipv4()
             && self.here.ip().is_loopback() == self.there.ip().is_loopback()
+    }
+
+    /// How many leading bits both addresses share: the more, the likelier they are in one network, with no router between them.
+    fn kinship(&self) -> u32 {
+        match (self.here.ip(), self.there.ip()) {
+            (IpAddr::V4(here), IpAddr::V4(there)) => (here.to_bits() ^ there.to_bits()).leading_zeros(),
+            (IpAddr::V6(here), IpAddr::V6(there)) => (here.to_bits() ^ there.to_bits()).leading_zeros(),
+            (IpAddr::V4(_), IpAddr::V6(_)) | (IpAddr::V6(_), IpAddr::V4(_)) => 0,
+        }
     }
 }
 
@@ -106,6 +118,22 @@ impl Routes {
         }
     }
 
+    /// Which route makes way for one more: none while there is room; else one that does not answer, or that leads through more networks
+    /// than the new one does, so that what is left leads through as many different ones as there are.
+    pub(super) fn makes_way(&self, place: Place) -> MakesWay {
+        if !self.is_full() {
+            return MakesWay::Nobody;
+        }
+        let worst = self.all.iter().max_by_key(|route| (route.missed, Reverse(route.place.kinship())));
+        let worst = worst.filter(|worst| worst.missed > 0 || worst.place.kinship() < place.kinship());
+        worst.map_or(MakesWay::Not, |worst| MakesWay::Route(worst.place))
+    }
+
+    /// Whether none but this one has answered of late: each other one has missed so many questions in a row.
+    pub(super) fn answers_alone_at(&self, place: Place, missed_max: u32) -> bool {
+        self.all.iter().all(|route| route.place == place || route.missed >= missed_max)
+    }
+
     /// Keeps those that are `wanted`; returns the others.
     pub(super) fn keep(&mut self, wanted: impl Fn(&Route) -> bool) -> Vec<Place> {
         self.last = self.best();
@@ -154,6 +182,17 @@ impl Routes {
     }
 }
 
+/// What happens when there is one more route.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum MakesWay {
+    /// There is room.
+    Nobody,
+    /// This one goes.
+    Route(Place),
+    /// All others are better: there is no further one.
+    Not,
+}
+
 impl Route {
     const fn new(place: Place) -> Self {
         Self { place, missed: 0, awaited: None, round_trip: None }
@@ -178,7 +217,14 @@ impl Member {
 
     /// Whether a place where its life answers becomes a route to it. // spec: NDL-3.3
     fn is_led_to(&self, place: Place) -> bool {
-        self.announces(place) && !self.routes.is_full() || self.routes.have_all_missed()
+        self.announces(place) && self.routes.makes_way(place) != MakesWay::Not
+            || self.routes.have_all_missed()
+    }
+
+    /// Whether what is said there of its addresses is its own word: it said before that it is there, or is nowhere else any more, or has
+    /// one place alone. Somebody else may have taken a place in a moment in which it answered nowhere. // spec: NDL-3.3
+    fn is_believed_at(&self, place: Place, missed_max: u32) -> bool {
+        self.announces(place) || self.routes.answers_alone_at(place, missed_max)
     }
 }
 
@@ -255,7 +301,9 @@ impl Core {
     /// Where else to look for a member: not everywhere at once, if it says much, but everywhere in turn.
     fn unknown_places_of(&self, node: NodeAddress) -> Vec<Place> {
         let Some(member) = self.members.get(&node) else { return Vec::new() };
-        let pairs = member.announcement.ndl_addresses().flat_map(|there| {
+        // One that says nothing of its addresses was somewhere, before our own address went.
+        let last = Some(member.routes.best().there).filter(|_| member.routes.iter().next().is_none());
+        let pairs = member.announcement.ndl_addresses().chain(last).flat_map(|there| {
             let place = move |here: &SocketAddr| Place { there, here: *here };
             self.paths.iter().map(place)
         });
@@ -289,6 +337,15 @@ impl Core {
             member.routes.keep(|route| !crowded.contains(&route.place));
             former.into_iter().chain(crowded).for_each(|place| self.drop_contact(now, place));
         }
+        let Some(member) = self.members.get_mut(&node) else { return false };
+        match member.routes.makes_way(place) {
+            MakesWay::Nobody => {}
+            MakesWay::Route(former) => {
+                member.routes.keep(|route| route.place != former);
+                self.drop_contact(now, former);
+            }
+            MakesWay::Not => return false,
+        }
         if let Some(member) = self.members.get_mut(&node) {
             member.routes.add(place);
         }
@@ -296,9 +353,23 @@ impl Core {
         true
     }
 
-    /// What a member says of its addresses, on a route to it. // spec: NDL-3.3
-    pub(super) fn note_addresses(&mut self, now: Time, node: NodeAddress, said: &Announcement) {
+    /// A member answers where it says that it is: where it does not, it was taken to be for want of anything better.
+    pub(super) fn drop_unannounced_routes(&mut self, now: Time, node: NodeAddress, place: Place) {
         let Some(member) = self.members.get_mut(&node) else { return };
+        if !member.announces(place) {
+            return;
+        }
+        let announced: Vec<_> = member.announcement.ndl_addresses().collect();
+        let dropped = member.routes.keep(|route| announced.contains(&route.place.there));
+        dropped.into_iter().for_each(|place| self.drop_contact(now, place));
+    }
+
+    /// What a member says of its addresses, on a route to it. // spec: NDL-3.3
+    pub(super) fn note_addresses(&mut self, now: Time, node: NodeAddress, place: Place, said: &Announcement) {
+        let Some(member) = self.members.get_mut(&node) else { return };
+        if !member.is_believed_at(place, self.paces[member.pace].missed_max) {
+            return;
+        }
         let known = &mut member.announcement;
         (known.gncl_ip, known.gncl_port) = (said.gncl_ip, said.gncl_port);
         known.gncl_further.clone_from(&said.gncl_further);
@@ -332,14 +403,5 @@ impl Core {
             dropped.extend(member.routes.keep(is_wanted));
         }
         dropped.into_iter().for_each(|place| self.drop_contact(now, place));
-    }
-
-    /// Where a member is asked in a round of its own pace: where it answered last, as long as it does; then everywhere.
-    pub(super) fn places_in_round(member: &Member) -> Vec<Place> {
-        if member.pace == REST || member.missed > 0 {
-            member.routes.places().collect()
-        } else {
-            member.routes.places().take(1).collect()
-        }
     }
 }

@@ -1,8 +1,8 @@
 //! What must hold, whatever the scenario. The judge knows the truth and the network, and of a core what it sends and says.
 //!
 //! 1. No false loss: who is called silent did not answer `missed_max` questions in a row, each of which had half a
-//!    period, at each address where it has answered since it was found (of an address that was asked as a second one at a pace of its
-//!    own, one fewer). An answer counts from when it is in the asker's socket: that it was not read yet is the asker's own stall.
+//!    period, at each address where it has answered since it was found. An answer counts from when it is in the asker's socket: that it
+//!    was not read yet is the asker's own stall.
 //! 2. A loss is seen within `missed_max` plus one periods of the last sign, and the asker's own stalls.
 //! 3. A goodbye counts when it is heard, and is said to everybody who is known.
 //! 4. A life that ended never comes back after its loss or its goodbye, a former life never after a later one.
@@ -292,9 +292,7 @@ impl Judge {
             LossReason::Hung | LossReason::LinkDown => {
                 let (most, least) = self.unanswered(now, process, other);
                 let missed_max = self.pace(other).1 as usize;
-                let is_watched = self.watched.is_some_and(|(node, ..)| node == self.lives[other].node);
-                let of_second = missed_max - usize::from(is_watched);
-                if lives && (most < missed_max || least.is_some_and(|least| least < of_second)) {
+                if lives && (most < missed_max || least.is_some_and(|least| least < missed_max)) {
                     let words = format!(
                         "lives, did not answer {most} questions at one address and {least:?} at each where it has answered, and is \
                          lost as silent"

@@ -327,3 +327,5 @@ fn a_member_has_no_more_routes_than_there_are_paths_however_much_it_says() {
         assert!(bench.core.contacts.len() <= 8 + 64 + 2, "{}", bench.core.contacts.len());
     }
 }
+
+mod redundancy;

@@ -1,0 +1,198 @@
+//! What is written is what is read, and nothing else is.
+
+use proptest::prelude::*;
+
+use super::*;
+use crate::ndl::{Part, Told, Trouble};
+
+fn any_announcement() -> impl Strategy<Value = Announcement> {
+    let names = ("[a-zäöü ]{1,30}", "[a-z.-]{1,63}");
+    let place = || (1..0xe000_0000_u32, 1..u16::MAX);
+    let further = proptest::collection::vec(place(), 0..=FURTHER_MAX);
+    let ndl = proptest::collection::vec(place(), 0..=PATHS_MAX);
+    (names, 1..u32::MAX, any::<[u64; 2]>(), place(), further, ndl, any::<u32>(), 0..3u8).prop_map(
+        |(
+            (name, project),
+            node,
+            [incarnation, boot_nonce],
+            (gncl_ip, gncl_port),
+            gncl_further,
+            ndl,
+            period_us,
+            claim,
+        )| {
+            Announcement {
+                project,
+                node: NodeAddress::new(node),
+                name,
+                incarnation: Incarnation(incarnation),
+                boot_nonce,
+                gncl_ip,
+                gncl_port,
+                period_us,
+                gncl_further,
+                ndl,
+                claim: Claim::from(claim),
+            }
+        },
+    )
+}
+
+/// As many parts as `number` says, with the longest names.
+fn any_progress(number: u64) -> Progress {
+    let part = |at| Part {
+        app: AppAddress::new(0xffff_0000 + at),
+        name: "x".repeat(63),
+        trouble: Told(Trouble::GivenUp),
+        since_ms: u32::MAX,
+    };
+    Progress::of((0..(number % 7) as u32).map(part).collect())
+}
+
+fn any_datagram() -> impl Strategy<Value = Datagram> {
+    (any_announcement(), 0..3, any::<[u64; 4]>()).prop_map(
+        |(announcement, kind, [correlation, sent, a, b])| {
+            let body = match kind {
+                0 => Body::Query(announcement),
+                1 => Body::Leave(announcement),
+                _ => Body::Answer(Answer {
+                    announcement,
+                    query_sent_ns: a,
+                    query_received_ns: b,
+                    progress: any_progress(a),
+                }),
+            };
+            Datagram { correlation, sent: Time::from_nanos(sent), body }
+        },
+    )
+}
+
+const HERE: NodeAddress = NodeAddress::new(7);
+
+proptest! {
+    #[test]
+    fn what_is_written_is_read_back_and_fits(datagram in any_datagram(), to_all: bool) {
+        let bytes = encode(&datagram, if to_all { NodeAddress::ALL } else { HERE });
+        prop_assert!(bytes.len() <= DATAGRAM_MAX);
+        prop_assert_eq!(parse(HERE, &bytes).unwrap(), datagram);
+    }
+
+    #[test]
+    fn any_bytes_are_a_datagram_or_an_error(bytes in proptest::collection::vec(any::<u8>(), 0..1_400)) {
+        prop_assert!(parse(HERE, &bytes).is_err());
+        let _ = peek_answer(&bytes);
+    }
+
+    #[test]
+    fn any_payload_behind_a_good_header_is_a_datagram_or_an_error(
+        payload in proptest::collection::vec(any::<u8>(), 0..1_100),
+        kind in 0x20u32..0x24,
+    ) {
+        let _ = parse(HERE, &frame(Kind::from_bits(kind), &payload));
+    }
+
+    #[test]
+    fn a_cut_or_flipped_datagram_is_refused(datagram in any_datagram(), keep in 0.0f64..1.0, bit in 0usize..800) {
+        let whole = encode(&datagram, HERE);
+        prop_assert!(parse(HERE, &whole[..(whole.len() as f64 * keep) as usize]).is_err());
+        let mut flipped = whole.clone();
+        flipped[bit / 8] ^= 1 << (bit % 8);
+        prop_assert!(parse(HERE, &flipped).is_err());
+    }
+
+    #[test]
+    fn a_datagram_for_another_node_is_refused(datagram in any_datagram(), other in 8..u32::MAX) {
+        let error = parse(HERE, &encode(&datagram, NodeAddress::new(other))).unwrap_err();
+        prop_assert!(matches!(error, DatagramError::Misdirected(_)));
+    }
+}
+
+fn frame(kind: Kind, payload: &[u8]) -> BytesMut {
+    let mut bytes = BytesMut::new();
+    let ndl = |node| Tid::new(NodeAddress::new(node), AppAddress::NDL);
+    encode_frame(&Header::new(kind, ndl(9), ndl(7)), payload, &mut bytes);
+    bytes
+}
+
+fn sound() -> Announcement {
+    Announcement {
+        project: "p".to_owned(),
+        node: NodeAddress::new(9),
+        name: "knee".to_owned(),
+        incarnation: Incarnation(1),
+        boot_nonce: 2,
+        gncl_ip: 0x7f00_0001,
+        gncl_port: 4,
+        period_us: 5,
+        gncl_further: Vec::new(),
+        ndl: Vec::new(),
+        claim: Claim::Held,
+    }
+}
+
+fn refusal(announcement: &Announcement) -> DatagramError {
+    let payload = rmp_serde::to_vec_named(announcement).unwrap();
+    parse(HERE, &frame(Kind::NDL_QUERY, &payload)).unwrap_err()
+}
+
+#[test]
+fn an_announcement_that_cannot_be_used_is_refused() {
+    let unfit = [
+        Announcement { name: String::new(), ..sound() },
+        Announcement { name: "x".repeat(64), ..sound() },
+        Announcement { project: "two\nlines".to_owned(), ..sound() },
+        Announcement { node: NodeAddress::ALL, ..sound() },
+        Announcement { gncl_port: 0, ..sound() },
+        Announcement { gncl_ip: 0xe000_0001, ..sound() },
+        Announcement { gncl_further: vec![(0x7f00_0002, 4), (0x7f00_0003, 0)], ..sound() },
+        Announcement { gncl_further: vec![(0, 4)], ..sound() },
+        Announcement { gncl_further: vec![(0x7f00_0002, 4); FURTHER_MAX + 1], ..sound() },
+        Announcement { ndl: vec![(0x7f00_0002, 4); PATHS_MAX + 1], ..sound() },
+        Announcement { ndl: vec![(0x7f00_0002, 0)], ..sound() },
+        Announcement { ndl: vec![(0xe000_0001, 4)], ..sound() },
+    ];
+    for announcement in unfit {
+        assert!(matches!(refusal(&announcement), DatagramError::Announcement(_)), "{announcement:?}");
+    }
+}
+
+#[test]
+fn a_source_that_is_not_the_announced_node_is_refused() {
+    let forged = refusal(&Announcement { node: NodeAddress::new(10), ..sound() });
+    assert!(matches!(forged, DatagramError::Forged { .. }));
+}
+
+#[test]
+fn deep_nesting_ends_in_an_error_and_not_in_the_stack() {
+    let nested = [0x91; 1_100];
+    assert!(matches!(parse(HERE, &frame(Kind::NDL_QUERY, &nested)), Err(DatagramError::Payload(_))));
+    // A field that nobody knows is skipped, however deep it goes.
+    let mut unknown = vec![0x81, 0xa1, b'x'];
+    unknown.extend([0x91; 1_090]);
+    assert!(matches!(parse(HERE, &frame(Kind::NDL_QUERY, &unknown)), Err(DatagramError::Payload(_))));
+}
+
+#[test]
+fn another_version_is_refused_in_words() {
+    let mut bytes = frame(Kind::NDL_QUERY, &[]);
+    bytes[2] = 2;
+    let error = parse(HERE, &bytes).unwrap_err();
+    assert_eq!(error.cause(), "NDL datagram of another protocol version");
+    assert!(error.to_string().contains("speaks version 2"), "{error}");
+}
+
+/// The example of `docs/protocol/ndl.md`.
+#[test]
+fn the_documented_example_is_what_is_sent() {
+    let query = Datagram { correlation: 0x1122, sent: Time::from_nanos(0x3344), body: Body::Query(sound()) };
+    let bytes = encode(&query, NodeAddress::ALL);
+    let hex: Vec<String> = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
+    let example: Vec<&str> = include_str!("../../../../docs/protocol/ndl.md")
+        .split("```hex")
+        .nth(1)
+        .and_then(|rest| rest.split("```").next())
+        .unwrap()
+        .split_whitespace()
+        .collect();
+    assert_eq!(hex, example);
+}
