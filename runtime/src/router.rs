@@ -154,6 +154,7 @@ impl Router {
             return self.account(Self::send_up(&**uplink, message));
         }
         let table = self.table.load();
+        guard::note(table.guard.as_ref(), &message.header);
         let result = if destination.is_single() {
             Self::send_to_one(&table, self.node, message)
         } else if destination.app == AppAddress::NONE {

@@ -12,10 +12,11 @@ use sinew_runtime::{
     router::guard::Guard,
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
-    wire::Header,
+    wire::{Flags, Header},
 };
 
 use super::{
+    asked::Asked,
     client::{Applicant, ClientRefusal},
     file,
     index::Index,
@@ -38,6 +39,8 @@ pub(crate) struct Access {
     reloading: Mutex<()>,
     /// Who has which name, here and elsewhere. Writers take turns at it.
     names: Mutex<BTreeMap<Tid, Arc<str>>>,
+    /// What the applications of this node may be told in reply.
+    asked: Asked,
 }
 
 /// An access list that was read.
@@ -78,7 +81,8 @@ impl Access {
     pub(crate) fn new(here: NodeAddress, path: PathBuf, list: List, refusals: Arc<Refusals>) -> Self {
         let names = BTreeMap::new();
         let index = ArcSwap::from_pointee(Index::new(Arc::new(list), here, &names));
-        Self { here, path, refusals, index, reloading: Mutex::default(), names: Mutex::new(names) }
+        let (reloading, names) = (Mutex::default(), Mutex::new(names));
+        Self { here, path, refusals, index, reloading, names, asked: Asked::default() }
     }
 
     /// Reads the file again and puts its list in force, for every message from now on.
@@ -118,6 +122,7 @@ impl Access {
 
     /// An application of this node has gone for good.
     pub(crate) fn gone(&self, app: AppAddress) {
+        self.asked.forget(app);
         let mut names = lock(&self.names);
         if names.remove(&Tid::new(self.here, app)).is_some() {
             self.index.store(Arc::new(self.index.load().with_names(&names)));
@@ -178,6 +183,12 @@ impl Guard for Access {
         if header.source.node == self.here && header.source.app.is_layer() {
             return true;
         }
+        if header.flags.has(Flags::REPLY)
+            && header.destination.is_single()
+            && self.asked.take(Time::now(), header, app)
+        {
+            return true;
+        }
         let destination = header.destination.app;
         let asked = Question {
             source: header.source,
@@ -190,6 +201,13 @@ impl Guard for Access {
             self.refuse(asked);
         }
         is_allowed
+    }
+
+    fn asks(&self, header: &Header) {
+        // What the node's own layers reply needs no leave.
+        if header.destination.node != self.here || !header.destination.app.is_layer() {
+            self.asked.note(Time::now(), header);
+        }
     }
 }
 

@@ -6,8 +6,9 @@
 //!
 //! - `who`: how a rule names applications; `rule`: a rule, and which of several counts; `index`: the same answer without a search
 //!   through names; `client`: users of this host. Pure.
-//! - `file`: reads a list. `guard`: the list in force, as senders read it, and what is told of it.
+//! - `asked`: questions that may be replied to. `file`: reads a list. `guard`: the list in force, as senders read it, and what is told of it.
 
+mod asked;
 mod client;
 mod file;
 mod guard;

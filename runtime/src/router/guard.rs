@@ -10,18 +10,20 @@ use crate::{
     wire::{Flags, Header},
 };
 
-/// Whoever decides. It is called on the thread of whoever sends, for every message, so it neither waits nor takes a lock.
+/// Whoever decides. It is called on the thread of whoever sends, for every message, so it neither waits nor holds a lock for long.
 pub trait Guard: Send + Sync {
     /// Whether what this header says may reach the application of this node at `target`; its destination may be a group that the
     /// application is a member of, or every application. It is told of each message once for each target, and of one that found a full
     /// queue each time that it is offered again.
     fn allows(&self, header: &Header, target: AppAddress) -> bool;
+
+    /// An application of this node sends this question to one application; said before anybody can answer it.
+    fn asks(&self, header: &Header);
 }
 
 /// Whether what this header says may not reach `target`.
 ///
-/// What layers say, and what is said to them, is their protocols' business; a reply needs no leave, because only an application that has
-/// asked takes one, and only from whom it has asked.
+/// What layers say, and what is said to them, is their protocols' business.
 #[inline]
 pub(super) fn refuses(guard: Option<&Arc<dyn Guard>>, target: AppAddress, header: &Header) -> bool {
     guard.is_some_and(|guard| is_guarded(header, target) && !guard.allows(header, target))
@@ -29,5 +31,17 @@ pub(super) fn refuses(guard: Option<&Arc<dyn Guard>>, target: AppAddress, header
 
 /// Whether a guard is asked at all.
 const fn is_guarded(header: &Header, target: AppAddress) -> bool {
-    header.kind.is_user() && !target.is_layer() && !header.flags.has(Flags::REPLY)
+    header.kind.is_user() && !target.is_layer()
+}
+
+/// Tells the guard of a question, if it is one.
+#[inline]
+pub(super) fn note(guard: Option<&Arc<dyn Guard>>, header: &Header) {
+    if let Some(guard) = guard
+        && header.flags.has(Flags::ASK)
+        && header.kind.is_user()
+        && header.destination.is_single()
+    {
+        guard.asks(header);
+    }
 }

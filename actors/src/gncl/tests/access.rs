@@ -98,16 +98,40 @@ fn each_class_is_let_through_by_itself_and_another_list_counts_from_the_next_mes
 }
 
 #[test]
-fn a_reply_needs_no_leave_and_an_application_of_the_node_itself_does() {
+fn a_reply_that_was_asked_for_needs_no_leave_and_any_other_one_and_an_application_of_the_node_itself_do() {
     run(async {
+        // Given: an application that has asked one of the peer for something
         let mut node = Node::start(1).await;
         Access::in_test(&node.stores, "");
         let mut peer = ByHand::linked_to(&mut node).await;
-        let mut inbox = node.app(2);
-        let mut reply = from_nine(&node, node.tid(2), b"reply");
-        reply.header.flags = Flags::REPLY;
-        peer.say(&reply).await;
+        let (mut inbox, mut other) = (node.app(2), node.app(3));
+        let reply = |to, correlation, word: &'static [u8]| {
+            let mut reply = from_nine(&node, to, word);
+            (reply.header.flags, reply.header.correlation) = (Flags::REPLY, correlation);
+            reply
+        };
+        let asked = reply(node.tid(2), 7, b"reply");
+        let mut question = node.message(asked.header.source, b"question");
+        (question.header.source, question.header.correlation) = (node.tid(2), 7);
+        question.header.flags = Flags::ASK;
+        node.stores.router.send(question).expect("the peer takes it");
+        assert_eq!(&peer.hear().await.payload[..], b"question");
+        // When: replies come that nobody asked for, to one and to all, and then the one that was
+        peer.say(&reply(node.tid(2), 8, b"unasked")).await;
+        peer.say(&reply(node.tid(3), 7, b"not its own")).await;
+        node.stores.router.set_member(Tid::group("drives").app, node.tid(3).app, true);
+        peer.say(&reply(Tid::group("drives"), 7, b"to a group")).await;
+        peer.say(&reply(Tid::BROADCAST, 7, b"to all")).await;
+        peer.say(&asked).await;
+        peer.say(&reply(node.tid(2), 7, b"a second time")).await;
+        peer.say(&confirmed(from_nine(&node, node.tid(2), b"closed"), 5)).await;
+        // Then: that one came, and nothing else
         assert_eq!(&next("the reply", &mut inbox).await.payload[..], b"reply");
+        assert_eq!(peer.hear().await.header.correlation, 5);
+        for inbox in [&mut inbox, &mut other] {
+            let more = futures_util::FutureExt::now_or_never(futures_util::StreamExt::next(inbox));
+            assert!(more.is_none(), "{more:?}");
+        }
         let own = node.message(node.tid(2), b"mine");
         assert_eq!(node.stores.router.send(own), Err(Rejection::NotAllowed));
     });

@@ -11,7 +11,7 @@ const MEND: &str = "have a [[rule]] of that list allow it, then `sinew reload` o
 
 impl Steps {
     /// What the list at each end says. Who asks is in the way of what is to go from the first to the second; that nothing may go back is often
-    /// meant so, and replies need no leave.
+    /// meant so, and replies that were asked for need no leave.
     pub(super) fn access(&mut self, a: &End, b: &End, facts: &Facts) {
         let [there, back] = &facts.access;
         for (said, from, to, is_asked_for) in [(there, a, b, true), (back, b, a, false)] {
