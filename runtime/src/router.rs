@@ -172,12 +172,24 @@ impl Router {
     /// # Errors
     /// Why nobody took the message.
     pub fn deliver(&self, message: Message) -> Result<(), Rejection> {
-        let table = self.table.load();
+        self.deliver_by(&self.table.load(), message)
+    }
+
+    /// The same, by what another guard than the table's own says of it.
+    ///
+    /// # Errors
+    /// Why nobody took the message.
+    pub fn deliver_judged_by(&self, message: Message, guard: Arc<dyn Guard>) -> Result<(), Rejection> {
+        let table = Table { guard: Some(guard), ..Table::clone(&self.table.load()) };
+        self.deliver_by(&table, message)
+    }
+
+    fn deliver_by(&self, table: &Table, message: Message) -> Result<(), Rejection> {
         let app = message.header.destination.app;
         let result = if message.header.destination.is_single() {
-            submit_here(&table, message)
+            submit_here(table, message)
         } else {
-            self.fan_out(&table, app, &message);
+            self.fan_out(table, app, &message);
             Ok(())
         };
         self.account(result)

@@ -1,7 +1,7 @@
 //! The list in force, as every sender reads it; read again on request, and told who has which name.
 
 use std::{
-    collections::BTreeMap,
+    collections::VecDeque,
     fmt,
     path::PathBuf,
     sync::{Arc, Mutex},
@@ -10,7 +10,7 @@ use std::{
 use arc_swap::ArcSwap;
 use sinew_runtime::{
     router::guard::Guard,
-    tid::{AppAddress, NodeAddress, Tid},
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
     wire::{Flags, Header},
 };
@@ -19,7 +19,7 @@ use super::{
     asked::Asked,
     client::{Applicant, ClientRefusal},
     file,
-    index::Index,
+    index::{Index, Names},
     rule::{List, Question, Verdict},
 };
 use crate::{config::ConfigFaults, refusals::Refusals, stores::lock};
@@ -33,14 +33,38 @@ pub(crate) struct Access {
     /// Where it is read from.
     path: PathBuf,
     refusals: Arc<Refusals>,
-    /// SYNC: senders load it without a lock; whoever replaces it holds `names`.
+    /// SYNC: senders load it without a lock; whoever replaces it holds `writing`.
     index: ArcSwap<Index>,
     /// Of two who have the file read again, the later one reads later.
     reloading: Mutex<()>,
-    /// Who has which name, here and elsewhere. Writers take turns at it.
-    names: Mutex<BTreeMap<Tid, Arc<str>>>,
+    /// Writers of `index` take turns.
+    writing: Mutex<()>,
+    /// Which process of another program had which address that the node chose; of more than [`HOLDERS_MAX`] the one that came first is
+    /// forgotten.
+    holders: Mutex<VecDeque<Holder>>,
     /// What the applications of this node may be told in reply.
     asked: Asked,
+}
+
+/// Nodes of which names are known at most, beyond those that the directory has.
+const NODES_MAX: usize = 1_024;
+/// Former holders of addresses that are known at most.
+const HOLDERS_MAX: usize = 4_096;
+
+/// An application of another process that has, or had, an address that the node chose.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Holder {
+    app: AppAddress,
+    uid: u32,
+    name: Option<String>,
+}
+
+/// What a life of a node has said of who is called how in it.
+#[derive(Clone, Debug)]
+pub(crate) struct Said<'a> {
+    pub(crate) node: NodeAddress,
+    pub(crate) life: Incarnation,
+    pub(crate) names: Vec<(AppAddress, &'a str)>,
 }
 
 /// An access list that was read.
@@ -79,10 +103,9 @@ pub(crate) struct Explanation {
 impl Access {
     /// The `list` that was read from `path`, in force on the node at `here`.
     pub(crate) fn new(here: NodeAddress, path: PathBuf, list: List, refusals: Arc<Refusals>) -> Self {
-        let names = BTreeMap::new();
-        let index = ArcSwap::from_pointee(Index::new(Arc::new(list), here, &names));
-        let (reloading, names) = (Mutex::default(), Mutex::new(names));
-        Self { here, path, refusals, index, reloading, names, asked: Asked::default() }
+        let index = ArcSwap::from_pointee(Index::new(Arc::new(list), here));
+        let (reloading, writing, holders) = (Mutex::default(), Mutex::default(), Mutex::default());
+        Self { here, path, refusals, index, reloading, writing, holders, asked: Asked::default() }
     }
 
     /// Reads the file again and puts its list in force, for every message from now on.
@@ -98,8 +121,8 @@ impl Access {
     }
 
     pub(super) fn put_in_force(&self, list: List) {
-        let names = lock(&self.names);
-        self.index.store(Arc::new(Index::new(Arc::new(list), self.here, &names)));
+        let _turn = lock(&self.writing);
+        self.index.store(Arc::new(self.index.load().with_list(Arc::new(list))));
     }
 
     pub(crate) fn summary(&self) -> AccessSummary {
@@ -115,36 +138,109 @@ impl Access {
     /// An application of this node has come; said before it can send or get anything.
     pub(crate) fn named(&self, app: AppAddress, name: Option<&str>) {
         let Some(name) = name else { return };
-        let mut names = lock(&self.names);
-        names.insert(Tid::new(self.here, app), name.into());
-        self.index.store(Arc::new(self.index.load().with_names(&names)));
+        self.change(self.here, |index, names| {
+            let known = index.look(Tid::new(self.here, app), name);
+            Arc::make_mut(&mut names.apps).insert(app, known);
+        });
     }
 
     /// An application of this node has gone for good.
     pub(crate) fn gone(&self, app: AppAddress) {
         self.asked.forget(app);
-        let mut names = lock(&self.names);
-        if names.remove(&Tid::new(self.here, app)).is_some() {
-            self.index.store(Arc::new(self.index.load().with_names(&names)));
+        if self.index.load().name_of(Tid::new(self.here, app)).is_some() {
+            self.change(self.here, |_, names| drop(Arc::make_mut(&mut names.apps).remove(&app)));
         }
     }
 
-    /// These have names on other nodes, or on the one that is given, as those have said; nobody else there has one.
+    fn change(&self, node: NodeAddress, edit: impl FnOnce(&Index, &mut Names)) {
+        let _turn = lock(&self.writing);
+        let index = self.index.load();
+        let mut names = index.names_on(node);
+        edit(&index, &mut names);
+        self.index.store(Arc::new(index.with_names(node, names)));
+    }
+
+    /// A connection to this life of `node` begins; said before anything of it is taken. What a life before has called its applications is
+    /// not what this one does: its addresses are given out anew.
+    pub(crate) fn meets(&self, node: NodeAddress, life: Incarnation) {
+        if self.index.load().nodes.get(&node).is_some_and(|names| names.life == Some(life)) {
+            return;
+        }
+        self.change(node, |_, names| {
+            let apps = std::mem::take(&mut names.apps);
+            let former = names.life.filter(|_| names.is_told).map(|life| (life, apps));
+            *names = Names { life: Some(life), former, ..Names::default() };
+        });
+        self.make_room(node);
+    }
+
+    /// Forgets nodes that have said nothing, where they are many; but not `met`.
+    fn make_room(&self, met: NodeAddress) {
+        let _turn = lock(&self.writing);
+        let index = self.index.load();
+        if index.nodes.len() > NODES_MAX {
+            let mut index = Index::clone(&index);
+            index.nodes.retain(|node, names| names.is_told || [self.here, met].contains(node));
+            self.index.store(Arc::new(index));
+        }
+    }
+
+    /// These have names on other nodes, or on the one that is given, as those have said; nobody else there has one. What a life has said
+    /// that is not the one that was met counts for nobody.
     pub(crate) fn named_elsewhere<'a>(
         &self,
         node: Option<NodeAddress>,
-        told: impl Iterator<Item = (Tid, &'a str)>,
+        told: impl Iterator<Item = Said<'a>>,
     ) {
-        let is_meant = |tid: &Tid| tid.node != self.here && node.is_none_or(|node| tid.node == node);
-        let told: BTreeMap<_, _> = told.filter(|(tid, _)| is_meant(tid)).collect();
-        let mut names = lock(&self.names);
-        let known = names.iter().filter(|(tid, _)| is_meant(tid)).map(|(tid, name)| (*tid, &**name));
-        if known.eq(told.iter().map(|(tid, name)| (*tid, *name))) {
-            return;
+        let is_meant = |of: NodeAddress| of != self.here && node.is_none_or(|node| of == node);
+        let _turn = lock(&self.writing);
+        let former = self.index.load();
+        let mut index = Index::clone(&former);
+        let mut silent: Vec<_> = index.nodes.iter().filter(|(of, names)| is_meant(**of) && names.is_told).map(|(of, _)| *of).collect();
+        for Said { node, life, names } in told.filter(|said| is_meant(said.node)) {
+            let before = former.names_on(node);
+            if before.life.is_some_and(|met| met != life) {
+                continue;
+            }
+            silent.retain(|of| *of != node);
+            let apps = former.look_all(node, names.into_iter(), &before.apps);
+            index.nodes.insert(node, Arc::new(Names { life: Some(life), is_told: true, apps, ..before }));
         }
-        names.retain(|tid, _| !is_meant(tid));
-        names.extend(told.into_iter().map(|(tid, name)| (tid, name.into())));
-        self.index.store(Arc::new(self.index.load().with_names(&names)));
+        for node in silent {
+            let before = former.names_on(node);
+            let names = Names { is_told: false, apps: Arc::default(), ..before };
+            index.nodes.insert(node, Arc::new(names));
+        }
+        self.index.store(Arc::new(index));
+    }
+
+    /// By what a last will is judged that an application of this life of `node` has left; `None`: as any message.
+    pub(crate) fn of_life(&self, node: NodeAddress, life: Incarnation) -> Option<Arc<dyn Guard>> {
+        let index = self.index.load();
+        let known = index.names_on(node);
+        if known.life.is_none_or(|known| known == life) {
+            return None;
+        }
+        let former = known.former.filter(|(former, _)| *former == life);
+        let names = Names { life: Some(life), is_told: former.is_some(), ..Names::default() };
+        let names = Names { apps: former.map(|(_, apps)| apps).unwrap_or_default(), ..names };
+        let (index, refusals) = (index.with_names(node, names), self.refusals.clone());
+        Some(Arc::new(OfLife { here: self.here, index, refusals }))
+    }
+
+    /// A process of `uid` has this address, which the node chose.
+    pub(crate) fn holds(&self, app: AppAddress, uid: u32, name: Option<&str>) {
+        let mut holders = lock(&self.holders);
+        holders.retain(|holder| holder.app != app);
+        let surplus = (holders.len() + 1).saturating_sub(HOLDERS_MAX);
+        holders.drain(..surplus);
+        holders.push_back(Holder { app, uid, name: name.map(str::to_owned) });
+    }
+
+    /// Whether the last one that had this address was the same user under the same name: other nodes may still call it so.
+    pub(crate) fn has_held(&self, app: AppAddress, uid: u32, name: Option<&str>) -> bool {
+        let is_it = |holder: &Holder| (holder.app, holder.uid, holder.name.as_deref()) == (app, uid, name);
+        lock(&self.holders).iter().any(is_it)
     }
 
     /// Whether a process of this host may come in.
@@ -165,16 +261,54 @@ impl Access {
 
     /// What becomes of such a message, and why.
     pub(crate) fn explain(&self, asked: Question) -> Explanation {
-        let index = self.index.load();
-        let (is_allowed, rule) = match index.decide(asked) {
-            Verdict::Allowed(rule) => (true, Some(rule)),
-            Verdict::Refused(rule) => (false, rule),
-        };
-        let label = |tid: Tid| Label(tid, index.name_of(tid).map(str::to_owned));
-        let (source, target) = (label(asked.source), label(asked.target));
-        let rule = index.list.in_words(rule);
-        Explanation { is_allowed, why: format!("{rule}, for {source} to {target}") }
+        explained(&self.index.load(), asked)
     }
+}
+
+fn explained(index: &Index, asked: Question) -> Explanation {
+    let (is_allowed, rule) = match index.decide(asked) {
+        Verdict::Allowed(rule) => (true, Some(rule)),
+        Verdict::Refused(rule) => (false, rule),
+    };
+    let label = |tid: Tid| Label(tid, index.name_of(tid).map(str::to_owned));
+    let (source, target) = (label(asked.source), label(asked.target));
+    let rule = index.list.in_words(rule);
+    Explanation { is_allowed, why: format!("{rule}, for {source} to {target}") }
+}
+
+fn judge(index: &Index, refusals: &Refusals, asked: Question) -> bool {
+    let is_allowed = matches!(index.decide(asked), Verdict::Allowed(_));
+    if !is_allowed {
+        refuse(index, refusals, asked);
+    }
+    is_allowed
+}
+
+/// What is asked of the list for a message to the application of the node at `here`.
+fn question(here: NodeAddress, header: &Header, app: AppAddress) -> Question {
+    let destination = header.destination.app;
+    Question {
+        source: header.source,
+        target: Tid::new(here, app),
+        group: destination.is_group().then_some(destination),
+        class: header.class,
+    }
+}
+
+/// The list with the names of another life of a node.
+struct OfLife {
+    here: NodeAddress,
+    index: Index,
+    refusals: Arc<Refusals>,
+}
+
+impl Guard for OfLife {
+    fn allows(&self, header: &Header, app: AppAddress) -> bool {
+        judge(&self.index, &self.refusals, question(self.here, header, app))
+    }
+
+    /// What it judges was sent by another node.
+    fn asks(&self, _: &Header) {}
 }
 
 impl Guard for Access {
@@ -189,18 +323,7 @@ impl Guard for Access {
         {
             return true;
         }
-        let destination = header.destination.app;
-        let asked = Question {
-            source: header.source,
-            target: Tid::new(self.here, app),
-            group: destination.is_group().then_some(destination),
-            class: header.class,
-        };
-        let is_allowed = matches!(self.index.load().decide(asked), Verdict::Allowed(_));
-        if !is_allowed {
-            self.refuse(asked);
-        }
-        is_allowed
+        judge(&self.index.load(), &self.refusals, question(self.here, header, app))
     }
 
     fn asks(&self, header: &Header) {
@@ -211,20 +334,18 @@ impl Guard for Access {
     }
 }
 
-impl Access {
-    #[cold]
-    fn refuse(&self, asked: Question) {
-        self.refusals.count(Time::now(), CAUSE, &Refused(self, asked));
-    }
+#[cold]
+fn refuse(index: &Index, refusals: &Refusals, asked: Question) {
+    refusals.count(Time::now(), CAUSE, &Refused(index, asked));
 }
 
 /// Put into words only where it is logged.
-struct Refused<'a>(&'a Access, Question);
+struct Refused<'a>(&'a Index, Question);
 
 impl fmt::Display for Refused<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self(access, asked) = self;
-        write!(f, "{} in class {:?}", access.explain(*asked).why, asked.class)
+        let Self(index, asked) = self;
+        write!(f, "{} in class {:?}", explained(index, *asked).why, asked.class)
     }
 }
 

@@ -7,7 +7,7 @@
 use std::{collections::BTreeMap, sync::Arc};
 
 use sinew_runtime::{
-    tid::{NodeAddress, Tid},
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
     wire::Class,
 };
 
@@ -15,7 +15,7 @@ use super::rule::{List, Question, RULES_MAX, Rule, Verdict};
 
 /// Some of a list's rules.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-struct Rules([u64; RULES_MAX / 64]);
+pub(super) struct Rules([u64; RULES_MAX / 64]);
 
 impl Rules {
     fn of(rules: &[Rule], is_one: impl Fn(&Rule) -> bool) -> Self {
@@ -43,12 +43,27 @@ impl Rules {
 
 /// An application that has a name.
 #[derive(Clone, Debug)]
-struct Known {
+pub(super) struct Known {
     name: Arc<str>,
     /// The rules that it is a source of.
     from: Rules,
     /// The rules that it is a target of.
     to: Rules,
+}
+
+/// Those of one life of a node that have a name.
+pub(super) type Named = Arc<BTreeMap<AppAddress, Known>>;
+
+/// What is known of the names on one node.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Names {
+    /// Which life of the node these are of, as far as that is known.
+    pub(super) life: Option<Incarnation>,
+    /// Whether this life has said who is called how.
+    pub(super) is_told: bool,
+    pub(super) apps: Named,
+    /// The life before, and its names: its last wills are judged by them.
+    pub(super) former: Option<(Incarnation, Named)>,
 }
 
 /// A list and the names that are known.
@@ -58,51 +73,84 @@ pub(super) struct Index {
     here: NodeAddress,
     /// For each class in the order of their numbers.
     classes: [Rules; 3],
-    known: BTreeMap<Tid, Known>,
+    /// Node by node, so that a name more on one copies those of that one alone.
+    pub(super) nodes: BTreeMap<NodeAddress, Arc<Names>>,
 }
 
 impl Index {
-    /// `list` on the node at `here`, which knows these names.
-    pub(super) fn new(list: Arc<List>, here: NodeAddress, names: &BTreeMap<Tid, Arc<str>>) -> Self {
+    /// `list` on the node at `here`, which knows no names.
+    pub(super) fn new(list: Arc<List>, here: NodeAddress) -> Self {
         let classes = [Class::Control, Class::Stream, Class::Bulk]
             .map(|class| Rules::of(&list.rules, |rule| rule.classes.has(class)));
-        let mut index = Self { list, here, classes, known: BTreeMap::new() };
-        for (tid, name) in names {
-            let known = index.look(*tid, name.clone());
-            index.known.insert(*tid, known);
+        Self { list, here, classes, nodes: BTreeMap::new() }
+    }
+
+    /// Another list, and the same names.
+    pub(super) fn with_list(&self, list: Arc<List>) -> Self {
+        let mut index = Self::new(list, self.here);
+        for (node, names) in &self.nodes {
+            let look = |apps: &Named| {
+                let all = apps.iter().map(|(app, known)| (*app, &*known.name));
+                index.look_all(*node, all, &Named::default())
+            };
+            let former = names.former.as_ref().map(|(life, apps)| (*life, look(apps)));
+            let names = Names { apps: look(&names.apps), former, ..**names };
+            index.nodes.insert(*node, Arc::new(names));
         }
         index
     }
 
-    /// The same list, and other names. Only those that are new are compared with the rules.
-    pub(super) fn with_names(&self, names: &BTreeMap<Tid, Arc<str>>) -> Self {
-        let known = names.iter().map(|(tid, name)| {
-            let same = self.known.get(tid).filter(|known| known.name == *name);
-            (*tid, same.cloned().unwrap_or_else(|| self.look(*tid, name.clone())))
-        });
-        Self { known: known.collect(), list: self.list.clone(), ..*self }
+    /// The same list, and these names on `node`.
+    pub(super) fn with_names(&self, node: NodeAddress, names: Names) -> Self {
+        let mut index = self.clone();
+        index.nodes.insert(node, Arc::new(names));
+        index
     }
 
-    fn look(&self, tid: Tid, name: Arc<str>) -> Known {
-        let from = Rules::of(&self.list.rules, |rule| rule.is_from(self.here, tid, Some(&name)));
-        let to = Rules::of(&self.list.rules, |rule| rule.is_to(self.here, tid, Some(&name)));
-        Known { name, from, to }
+    /// What is known of the names on `node`.
+    pub(super) fn names_on(&self, node: NodeAddress) -> Names {
+        self.nodes.get(&node).map(|names| Names::clone(names)).unwrap_or_default()
+    }
+
+    /// These applications on `node`. Only those that are called otherwise than `before` are compared with the rules.
+    pub(super) fn look_all<'a>(
+        &self,
+        node: NodeAddress,
+        apps: impl Iterator<Item = (AppAddress, &'a str)>,
+        before: &Named,
+    ) -> Named {
+        let known = apps.map(|(app, name)| {
+            let same = before.get(&app).filter(|known| &*known.name == name);
+            (app, same.cloned().unwrap_or_else(|| self.look(Tid::new(node, app), name)))
+        });
+        Arc::new(known.collect())
+    }
+
+    /// An application and the rules about it.
+    pub(super) fn look(&self, tid: Tid, name: &str) -> Known {
+        let from = Rules::of(&self.list.rules, |rule| rule.is_from(self.here, tid, Some(name)));
+        let to = Rules::of(&self.list.rules, |rule| rule.is_to(self.here, tid, Some(name)));
+        Known { name: name.into(), from, to }
+    }
+
+    fn known(&self, tid: Tid) -> Option<&Known> {
+        self.nodes.get(&tid.node)?.apps.get(&tid.app)
     }
 
     /// What the directory calls the application at `tid`.
     pub(super) fn name_of(&self, tid: Tid) -> Option<&str> {
-        self.known.get(&tid).map(|known| &*known.name)
+        self.known(tid).map(|known| &*known.name)
     }
 
     /// What becomes of a message.
     pub(super) fn decide(&self, asked: Question) -> Verdict {
         let Question { source, target, group, class } = asked;
         let rules = &self.list.rules;
-        let from = match self.known.get(&source) {
+        let from = match self.known(source) {
             Some(known) => known.from,
             None => Rules::of(rules, |rule| rule.is_from(self.here, source, None)),
         };
-        let mut to = match self.known.get(&target) {
+        let mut to = match self.known(target) {
             Some(known) => known.to,
             None => Rules::of(rules, |rule| rule.is_to(self.here, target, None)),
         };

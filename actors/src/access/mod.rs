@@ -20,6 +20,6 @@ mod who;
 
 pub(crate) use client::Applicant;
 pub(crate) use file::read;
-pub(crate) use guard::{Access, Explanation};
+pub(crate) use guard::{Access, Explanation, Said};
 pub use guard::{AccessError, AccessSummary};
 pub(crate) use rule::{List, Question};

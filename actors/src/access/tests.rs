@@ -10,7 +10,7 @@ use sinew_runtime::{
 };
 
 use super::{
-    Access, Applicant, Question,
+    Access, Applicant, Question, Said,
     client::ClientRefusal,
     file::parse,
     guard::CAUSE,
@@ -185,6 +185,30 @@ fn without_rules_for_users_the_nodes_own_and_root_come_in() {
     assert!(admits(1000) && admits(0) && !admits(1001));
 }
 
+const LIFE: Incarnation = Incarnation(7);
+
+/// What the nodes of these applications say of them in one life.
+fn said<'a>(names: &[(Tid, &'a str)]) -> impl Iterator<Item = Said<'a>> {
+    said_in(LIFE, names)
+}
+
+fn said_in<'a>(life: Incarnation, names: &[(Tid, &'a str)]) -> impl Iterator<Item = Said<'a>> {
+    let mut nodes = BTreeMap::<_, Vec<_>>::new();
+    for (tid, name) in names {
+        nodes.entry(tid.node).or_default().push((tid.app, *name));
+    }
+    nodes.into_iter().map(move |(node, names)| Said { node, life, names })
+}
+
+fn indexed(index: &Index, names: &BTreeMap<Tid, Arc<str>>) -> Index {
+    [HERE, THERE, NodeAddress::new(9)].into_iter().fold(index.clone(), |index, node| {
+        let on_it = names.iter().filter(|(tid, _)| tid.node == node);
+        let before = index.names_on(node);
+        let apps = index.look_all(node, on_it.map(|(tid, name)| (tid.app, &**name)), &before.apps);
+        index.with_names(node, super::index::Names { is_told: true, apps, ..before })
+    })
+}
+
 fn header(source: Tid, target: Tid) -> Header {
     Header::new(Kind::named("test"), source, target)
 }
@@ -222,18 +246,44 @@ fn a_name_counts_from_when_it_is_known_until_it_is_gone_wherever_it_is() {
     assert!(!is_open());
     access.named(target.app, Some("drive"));
     assert!(!is_open());
-    access.named_elsewhere(Some(THERE), [(source, "gait")].into_iter());
+    access.named_elsewhere(Some(THERE), said(&[(source, "gait")]));
     assert!(is_open());
     // Nobody gives a name to what is another node's, nor to what is ours.
     let other = NodeAddress::new(9);
-    access.named_elsewhere(Some(other), [(source, "log"), (target, "log")].into_iter());
+    access.named_elsewhere(Some(other), said(&[(source, "log"), (target, "log")]));
     assert!(is_open());
     access.named_elsewhere(None, [].into_iter());
     assert!(!is_open());
-    access.named_elsewhere(None, [(source, "gait")].into_iter());
+    access.named_elsewhere(None, said(&[(source, "gait")]));
     assert!(is_open());
     access.gone(target.app);
     assert!(!is_open());
+}
+
+#[test]
+fn names_of_a_life_of_a_node_count_for_no_later_one_but_for_what_it_left_behind() {
+    // Given: a node of which an application that may send has the first address that is given out
+    let stores = Stores::for_test(NodeConfig::new("knee"), Incarnation(1));
+    let access = Access::in_test(&stores, "[[rule]]\nfrom = ['gait']\nto = ['*']\n");
+    let (source, target) = (app(THERE, 0x8000_0000), app(stores.node, 0x1002));
+    let is_open = || access.allows(&header(source, target), target.app);
+    let next = Incarnation(8);
+    access.meets(THERE, LIFE);
+    access.named_elsewhere(Some(THERE), said(&[(source, "gait")]));
+    access.meets(THERE, LIFE);
+    assert!(is_open(), "another connection to the same life");
+    assert!(access.of_life(THERE, LIFE).is_none());
+    // When: a new life of that node is met
+    access.meets(THERE, next);
+    // Then: nobody is called so there, whoever repeats what the former one has said
+    assert!(!is_open());
+    access.named_elsewhere(None, said(&[(source, "gait")]));
+    assert!(!is_open());
+    let allows = |life| access.of_life(THERE, life).unwrap().allows(&header(source, target), target.app);
+    assert!(allows(LIFE), "its last wills are its own");
+    assert!(!allows(Incarnation(6)), "of that one nothing is known");
+    access.named_elsewhere(None, said_in(next, &[(source, "gait")]));
+    assert!(is_open());
 }
 
 fn who() -> impl Strategy<Value = String> {
@@ -293,7 +343,7 @@ proptest! {
         questions in prop::collection::vec(question(), 1..20),
     ) {
         let list: Arc<List> = Arc::new(parse(&rules.concat()).expect("it is written as lists are"));
-        let index = Index::new(list.clone(), HERE, &before).with_names(&now);
+        let index = indexed(&indexed(&Index::new(list.clone(), HERE), &before), &now);
         for asked in questions {
             let name = |tid| now.get(&tid).map(|name| &**name);
             let names = Names { source: name(asked.source), target: name(asked.target) };
@@ -305,7 +355,7 @@ proptest! {
     fn a_rule_more_at_the_end_allows_nothing_that_one_before_it_refuses(
         rules in prop::collection::vec(rule(), 0..6), last in rule(), names in names(), asked in question(),
     ) {
-        let decide = |text: &str| Index::new(Arc::new(parse(text).unwrap()), HERE, &names).decide(asked);
+        let decide = |text: &str| indexed(&Index::new(Arc::new(parse(text).unwrap()), HERE), &names).decide(asked);
         let (before, after) = (decide(&rules.concat()), decide(&(rules.concat() + &last)));
         prop_assert!(before == after || before == Verdict::Refused(None), "{:?} {:?}", before, after);
     }

@@ -47,8 +47,8 @@ pub(crate) enum Input {
 pub(super) enum Output {
     /// Tell a node our wills; so many more stay at home.
     Tell { to: NodeAddress, testament: Testament, left_out: usize },
-    /// Execute a will of an application of a lost node, towards our own applications.
-    Execute { node: NodeAddress, will: HeldWill },
+    /// Execute a will of an application of this lost life of a node, towards our own applications.
+    Execute { node: NodeAddress, life: Incarnation, will: HeldWill },
 }
 
 /// The wills of this node's applications, and those of other nodes.
@@ -174,8 +174,8 @@ impl Core {
 
     fn execute(&mut self, node: NodeAddress, is_over: impl Fn(Incarnation) -> bool) {
         let held = self.take_held(node, is_over);
-        let wills = held.into_iter().flat_map(|testament| testament.wills);
-        self.outputs.extend(wills.map(|will| Output::Execute { node, will }));
+        let Some(Testament { incarnation: life, wills, .. }) = held else { return };
+        self.outputs.extend(wills.into_iter().map(|will| Output::Execute { node, life, will }));
     }
 
     /// spec: WILL-1

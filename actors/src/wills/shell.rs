@@ -2,7 +2,7 @@
 
 use sinew_runtime::{
     app::Heir,
-    tid::{AppAddress, NodeAddress, Tid},
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
     wire::{Header, Kind, Message, decode},
 };
@@ -71,7 +71,7 @@ pub(crate) fn feed(stores: &Stores, input: Input) {
                 }
                 tell(stores, to, &testament);
             }
-            Output::Execute { node, will } => execute(stores, node, &will),
+            Output::Execute { node, life, will } => execute(stores, (node, life), &will),
         }
     }
     if is_earlier && stores.posts.sync.post(sync::Event::Monitors).is_err() {
@@ -109,7 +109,7 @@ fn tell(stores: &Stores, to: NodeAddress, testament: &Testament) {
 }
 
 /// Hands the will to those of our own applications that it is for.
-fn execute(stores: &Stores, node: NodeAddress, will: &HeldWill) {
+fn execute(stores: &Stores, (node, life): (NodeAddress, Incarnation), will: &HeldWill) {
     let (Some(heir), Some(class)) = (will.heir(), will.class()) else { return };
     let destination = match &heir {
         Heir::Name(name) => {
@@ -125,7 +125,13 @@ fn execute(stores: &Stores, node: NodeAddress, will: &HeldWill) {
     header.class = class;
     header.sent = Time::now();
     crate::log::warn!(source = %header.source, %destination, "the last will of an application of a lost node");
-    if let Err(why) = stores.router.deliver(Message::new(header, will.payload())) {
+    let message = Message::new(header, will.payload());
+    // The next life of the node may be here already, and call others so.
+    let delivered = match stores.access.get().and_then(|access| access.of_life(node, life)) {
+        Some(guard) => stores.router.deliver_judged_by(message, guard),
+        None => stores.router.deliver(message),
+    };
+    if let Err(why) = delivered {
         crate::log::error!(source = %header.source, %destination, %why, "a last will was not taken");
     }
 }

@@ -88,6 +88,9 @@ impl Store {
             Some(_) => self.forget(node),
             None => {}
         }
+        if let Some(access) = stores.access.get() {
+            access.meets(node, attach.incarnation);
+        }
         let peer = Arc::new(Peer::new(now, attach, stores));
         {
             let mut met = lock(&self.met);

@@ -14,6 +14,7 @@ use super::{Angle, confirmed, named, outcome_of};
 use crate::{
     api::{NodeApi, Registration},
     lncl::{
+        AppFact,
         payload::Register,
         testing::{RawClient, TestNode, WATCHDOG},
     },
@@ -63,6 +64,22 @@ fn what_two_processes_say_to_each_other_stays_where_the_list_sees_it() {
         assert_eq!(said, vec![Outcome::Delivered; ENOUGH]);
         assert_eq!(after, Outcome::Rejected(Rejection::NotAllowed));
     });
+}
+
+#[test]
+fn nobody_gets_the_address_of_somebody_elses_that_other_nodes_may_still_call_by_its_name() {
+    let mut node = TestNode::start_guarded("[[rule]]\nfrom = ['*']\nto = ['*']\n");
+    let (gait, tid) = RawClient::register(&node, &named("gait"));
+    let again = |node: &TestNode, name| {
+        RawClient::register(node, &Register { former: Some(tid.app), ..named(name) })
+    };
+    drop(gait);
+    while !matches!(node.fact(), AppFact::Unregistered { app } if app == tid.app) {}
+    let (guest, its) = again(&node, "guest");
+    assert_ne!(its, tid);
+    let (_gait, its) = again(&node, "gait");
+    assert_eq!(its, tid);
+    drop(guest);
 }
 
 /// Messages after which two that may are introduced.

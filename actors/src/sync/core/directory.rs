@@ -9,7 +9,10 @@ use sinew_runtime::{
 };
 
 use super::{Core, Input, Output, barrier::RETRY};
-use crate::sync::facts::{DirectoryEntry, DirectoryEvent};
+use crate::{
+    access::Said,
+    sync::facts::{DirectoryEntry, DirectoryEvent},
+};
 
 /// Applications that want to hear of the directory.
 #[derive(Debug, Default)]
@@ -149,7 +152,7 @@ impl Core {
     pub(in crate::sync) fn names_elsewhere(
         &self,
         node: Option<NodeAddress>,
-    ) -> impl Iterator<Item = (Tid, &str)> {
+    ) -> impl Iterator<Item = Said<'_>> {
         self.peers.said_names(node)
     }
 

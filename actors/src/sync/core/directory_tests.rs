@@ -111,7 +111,11 @@ fn what_a_node_has_called_its_applications_counts_for_the_access_list_until_it_s
     let mut bench = watched();
     bench.links(KNEE, LIFE);
     let names = |bench: &Bench, of| {
-        bench.core.names_elsewhere(of).map(|(tid, name)| (tid, name.to_owned())).collect::<Vec<_>>()
+        let all = bench.core.names_elsewhere(of).flat_map(|said| {
+            assert_eq!(said.life, LIFE);
+            said.names.into_iter().map(move |(app, name)| (Tid::new(said.node, app), name.to_owned()))
+        });
+        all.collect::<Vec<_>>()
     };
     bench.list(KNEE, list(1, &[("knee", true, &[])]));
     let knee = (Tid::new(KNEE, app(0)), "knee".to_owned());

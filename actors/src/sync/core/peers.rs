@@ -13,7 +13,10 @@ use sinew_runtime::{
 };
 
 use super::reason::Reason;
-use crate::sync::list::{Entry, List, Name};
+use crate::{
+    access::Said,
+    sync::list::{Entry, List, Name},
+};
 
 /// Time between two lists to a peer when nothing changed: the net beneath a list that a full queue refused.
 pub(super) const REPEAT: Duration = Duration::from_secs(2);
@@ -294,12 +297,13 @@ impl Peers {
     }
 
     /// Every name that a node, or this one, has given itself, also of those that are lost or have not said yet who is in their new life: what they sent
-    /// before still comes, their last wills among it.
-    pub(super) fn said_names(&self, of: Option<NodeAddress>) -> impl Iterator<Item = (Tid, &str)> {
+    /// before still comes, their last wills among it. The access list takes what is of the life that it has met.
+    pub(super) fn said_names(&self, of: Option<NodeAddress>) -> impl Iterator<Item = Said<'_>> {
         let range = of.map_or(NodeAddress::HERE..=NodeAddress::ALL, |node| node..=node);
         let lists = self.nodes.range(range).filter_map(|(node, peer)| Some((*node, peer.list.as_ref()?)));
-        lists.flat_map(|(node, list)| {
-            list.entries.values().map(move |entry| (Tid::new(node, entry.app), &*entry.name))
+        lists.map(|(node, list)| {
+            let names = list.entries.values().map(|entry| (entry.app, &*entry.name)).collect();
+            Said { node, life: list.incarnation, names }
         })
     }
 
