@@ -106,6 +106,10 @@ impl Client {
         let to = self.server.stores.router.absolute(to);
         let ticket = Ticket { source: self.tid, destination: to, correlation };
         let Some(receipt) = self.outcomes.receipt(ticket) else { return };
+        // Marks are put into the queues of the other side, past the list. Who was never introduced has no link to turn to.
+        if self.server.stores.access.get().is_some() {
+            return receipt.settle(Outcome::Rejected(Rejection::Unsupported));
+        }
         if let Err((receipt, why)) = self.server.introductions.pass_marks(self.tid, to, number, receipt) {
             receipt.settle(Outcome::Rejected(why));
         }

@@ -8,6 +8,7 @@ use std::{
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
     tid::AppAddress,
+    wire::Kind,
 };
 
 use super::{Angle, confirmed, named, outcome_of};
@@ -15,7 +16,7 @@ use crate::{
     api::{NodeApi, Registration},
     lncl::{
         AppFact,
-        payload::Register,
+        payload::{self, Register, Switch},
         testing::{RawClient, TestNode, WATCHDOG},
     },
 };
@@ -70,9 +71,8 @@ fn what_two_processes_say_to_each_other_stays_where_the_list_sees_it() {
 fn nobody_gets_the_address_of_somebody_elses_that_other_nodes_may_still_call_by_its_name() {
     let mut node = TestNode::start_guarded("[[rule]]\nfrom = ['*']\nto = ['*']\n");
     let (gait, tid) = RawClient::register(&node, &named("gait"));
-    let again = |node: &TestNode, name| {
-        RawClient::register(node, &Register { former: Some(tid.app), ..named(name) })
-    };
+    let again =
+        |node: &TestNode, name| RawClient::register(node, &Register { former: Some(tid.app), ..named(name) });
     drop(gait);
     while !matches!(node.fact(), AppFact::Unregistered { app } if app == tid.app) {}
     let (guest, its) = again(&node, "guest");
@@ -80,6 +80,22 @@ fn nobody_gets_the_address_of_somebody_elses_that_other_nodes_may_still_call_by_
     let (_gait, its) = again(&node, "gait");
     assert_eq!(its, tid);
     drop(guest);
+}
+
+#[test]
+fn nobody_turns_to_a_direct_link_where_there_is_a_list() {
+    let node = TestNode::start_guarded("");
+    let (_other, to) = RawClient::register(&node, &named("gait"));
+    let (mut guest, tid) = RawClient::register(&node, &named("guest"));
+    let mut switch = payload::frame(
+        Kind::LNCL_SWITCH,
+        tid,
+        payload::lncl_of(tid.node),
+        &Switch { peer: to.bits(), number: 1 },
+    );
+    switch.header.correlation = 3;
+    guest.send(&switch);
+    assert_eq!(outcome_of(&guest.next().unwrap()), (3, Outcome::Rejected(Rejection::Unsupported)));
 }
 
 /// Messages after which two that may are introduced.
