@@ -95,6 +95,14 @@ impl Table {
     }
 }
 
+/// What became of the copies of a message to many.
+#[derive(Clone, Copy, Debug, Default)]
+struct Copies {
+    taken: usize,
+    /// The guard did not let so many through.
+    not_allowed: usize,
+}
+
 /// The routing table of a node. It is owned by the node, so that it outlives every layer.
 pub struct Router {
     node: NodeAddress,
@@ -287,9 +295,12 @@ impl Router {
     fn multicast(&self, table: &Table, message: Message) -> Result<(), Refused> {
         let Tid { node, app } = message.header.destination;
         let mut taken = 0;
+        let mut not_allowed = false;
         tap::saw_sent_to_many(table.tap.as_ref(), &message);
         if node == self.node || node == NodeAddress::ALL {
-            taken += self.fan_out(table, app, &message);
+            let here = self.fan_out(table, app, &message);
+            taken += here.taken;
+            not_allowed = here.not_allowed > 0;
         }
         if node == NodeAddress::ALL && app.is_group() {
             let members = table.remote_groups.get(&app).map_or(&[][..], Vec::as_slice);
@@ -300,16 +311,21 @@ impl Router {
         } else if let Some(peer) = table.peers.get(&node) {
             taken += usize::from(peer.submit(copy_of(&message)).is_ok());
         }
-        if taken == 0 { Err(Refused::new(message, Rejection::NoSuchApplication)) } else { Ok(()) }
+        if taken > 0 {
+            return Ok(());
+        }
+        let why = if not_allowed { Rejection::NotAllowed } else { Rejection::NoSuchApplication };
+        Err(Refused::new(message, why))
     }
 
-    /// Copies for the members on this node, except the sender itself; returns how many took theirs.
-    fn fan_out(&self, table: &Table, app: AppAddress, message: &Message) -> usize {
+    /// Copies for the members on this node, except the sender itself.
+    fn fan_out(&self, table: &Table, app: AppAddress, message: &Message) -> Copies {
         let here = self.node;
-        let submit = |(member, outlet): (AppAddress, &Arc<dyn Outlet>)| {
+        let mut copies = Copies::default();
+        let mut submit = |(member, outlet): (AppAddress, &Arc<dyn Outlet>)| {
             let is_sender = here == message.header.source.node && member == message.header.source.app;
             if is_sender {
-                return false;
+                return;
             }
             let refused = if table.refuses(member, &message.header) {
                 Some(Rejection::NotAllowed)
@@ -317,19 +333,21 @@ impl Router {
                 outlet.submit(copy_of(message)).err().map(|refused| refused.why)
             };
             tap::saw_one_of_many(table.tap.as_ref(), Tid::new(here, member), message, refused);
-            refused.is_none()
+            copies.taken += usize::from(refused.is_none());
+            copies.not_allowed += usize::from(refused == Some(Rejection::NotAllowed));
         };
         if app.is_group() {
             let members = table.groups.get(&app).map_or(&[][..], Vec::as_slice);
             let routes = members.iter().filter_map(|m| table.local.get(m).map(|route| (*m, &route.outlet)));
-            routes.filter(|route| submit(*route)).count()
+            routes.for_each(submit);
         } else if app == AppAddress::ALL {
             let apps = table.local.iter().filter(|(app, _)| !app.is_layer());
-            apps.filter(|(app, route)| submit((**app, &route.outlet))).count()
+            apps.for_each(|(app, route)| submit((*app, &route.outlet)));
         } else {
             // A broadcast to the application that has this address on every node.
-            table.local.get(&app).map_or(0, |route| usize::from(submit((app, &route.outlet))))
+            table.local.get(&app).into_iter().for_each(|route| submit((app, &route.outlet)));
         }
+        copies
     }
 
     fn change(&self, edit: impl FnOnce(&mut Table)) {

@@ -132,6 +132,8 @@ fn a_reply_that_was_asked_for_needs_no_leave_and_any_other_one_and_an_applicatio
             let more = futures_util::FutureExt::now_or_never(futures_util::StreamExt::next(inbox));
             assert!(more.is_none(), "{more:?}");
         }
+        let to_many = node.message(Tid::group("drives"), b"mine");
+        assert_eq!(node.stores.router.send(to_many), Err(Rejection::NotAllowed));
         let own = node.message(node.tid(2), b"mine");
         assert_eq!(node.stores.router.send(own), Err(Rejection::NotAllowed));
     });
