@@ -3,7 +3,10 @@
 use std::{
     collections::BTreeMap,
     fmt::Display,
-    sync::{Mutex, MutexGuard, PoisonError},
+    sync::{
+        Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicU64, Ordering},
+    },
     time::Duration,
 };
 
@@ -16,7 +19,16 @@ const DETAIL_MAX: usize = 256;
 
 /// Counters of refusals. The causes are literals of this program, so their number is bounded.
 #[derive(Debug, Default)]
-pub(crate) struct Refusals(Mutex<BTreeMap<&'static str, Cause>>);
+pub(crate) struct Refusals {
+    causes: Mutex<BTreeMap<&'static str, Cause>>,
+    /// What the access list has refused: senders count that, of whom many may be in a hurry.
+    by_list: AtomicU64,
+    /// When that is logged next at the earliest, in nanoseconds.
+    by_list_next: AtomicU64,
+}
+
+/// The cause under which messages are counted that the access list refuses.
+pub(crate) const BY_LIST: &str = "access list";
 
 #[derive(Debug, Default)]
 struct Cause {
@@ -57,6 +69,24 @@ impl Refusals {
         crate::log::warn!(cause, suppressed, "refused: {detail}");
     }
 
+    /// Counts a message that the access list refuses, without a lock.
+    pub(crate) fn count_by_list(&self) {
+        // SYNC: Relaxed; a count, which nothing hangs on.
+        self.by_list.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Whether one of those is to be logged at `now`: to one of all that ask in a second.
+    pub(crate) fn logs_by_list(&self, now: Time) -> bool {
+        let next = self.by_list_next.load(Ordering::Relaxed);
+        let then = now + LOG_PERIOD;
+        // SYNC: Relaxed; of several one changes it, whoever sees what else.
+        now.as_nanos() >= next
+            && self
+                .by_list_next
+                .compare_exchange(next, then.as_nanos(), Ordering::Relaxed, Ordering::Relaxed)
+                .is_ok()
+    }
+
     /// How much was refused.
     pub(crate) fn total(&self) -> u64 {
         self.causes().values().map(|cause| cause.count).sum()
@@ -84,7 +114,13 @@ impl Refusals {
     }
 
     fn causes(&self) -> MutexGuard<'_, BTreeMap<&'static str, Cause>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        let mut causes = self.causes.lock().unwrap_or_else(PoisonError::into_inner);
+        let by_list = self.by_list.swap(0, Ordering::Relaxed);
+        if by_list > 0 {
+            let cause = causes.entry(BY_LIST).or_default();
+            (cause.count, cause.suppressed) = (cause.count + by_list, cause.suppressed + by_list);
+        }
+        causes
     }
 }
 

@@ -1,6 +1,6 @@
 //! An access list between whole nodes: default deny, and another list without a restart.
 
-use std::path::Path;
+use std::{os::unix::fs::PermissionsExt, path::Path};
 
 use sinew::{AccessError, AccessSummary, Endpoint, NodeApi, Registration, Rejection, prelude::*};
 use sinew_tests::{DEADLINE, Ground, OwnDirectory, until};
@@ -52,8 +52,9 @@ fn only_who_is_on_the_list_reaches_a_drive_and_another_list_counts_at_once() {
     // Then: as soon as the knee knows who is called so, and never for the other one
     until("the knee knows the name", || (send(&mut gait, drive) == Outcome::Delivered).then_some(()));
     let not_allowed = Outcome::Rejected(Rejection::NotAllowed);
+    let before = knee.handle().refused();
     assert_eq!(send(&mut log, drive), not_allowed);
-    assert!(knee.handle().refused() > 0, "it is counted");
+    assert!(knee.handle().refused() > before, "it is counted");
     // When: another list
     write(&list, SHUT);
     assert_eq!(knee.handle().reload_access().expect("it is good"), AccessSummary { rules: 1, clients: 0 });
@@ -77,6 +78,17 @@ fn a_node_whose_list_cannot_be_used_does_not_start_and_one_without_has_none_to_r
     let node = ground.node("knee").configure(|config| config.security.access = Some(list.clone()));
     let why = node.start().expect_err("nobody is meant").to_string();
     assert!(why.contains("access.toml") && why.contains("rule.to (line 1)"), "{why}");
+    // One that others can write to, and one that is no file, which would hold the start up for ever.
+    write(&list, OPEN);
+    std::fs::set_permissions(&list, std::fs::Permissions::from_mode(0o666)).expect("the test's own file");
+    for wrong in ["chmod go-w", "no file"] {
+        let node = ground.node("knee").configure(|config| config.security.access = Some(list.clone()));
+        let why = node.start().expect_err("it is not taken").to_string();
+        assert!(why.contains("access.toml") && why.contains(wrong), "{why}");
+        std::fs::remove_file(&list).expect("the test's own file");
+        let mode = rustix::fs::Mode::from_raw_mode(0o600);
+        rustix::fs::mknodat(rustix::fs::CWD, &list, rustix::fs::FileType::Fifo, mode, 0).expect("a pipe");
+    }
     let open = ground.node("knee").start().expect("a node");
     assert!(matches!(open.handle().reload_access(), Err(AccessError::None)));
 }

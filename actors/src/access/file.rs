@@ -10,14 +10,17 @@ use toml::{
 
 use super::{
     client::{CLIENTS_MAX, ClientRule},
-    rule::{Action, Classes, List, RULES_MAX, Rule, TEXTS_MAX},
+    rule::{Action, Classes, List, PATTERNS_MAX, RULES_MAX, Rule, TEXTS_MAX},
     who::{self, Who},
 };
-use crate::config::{ConfigFault, ConfigFaults, fault, line_of, quoted, read_bounded, shown, syntax_fault};
+use crate::config::{ConfigFault, ConfigFaults, fault, line_of, quoted, shown, syntax_fault};
+use crate::security::files::{self, FileFault};
 
 /// Keys of a `[[rule]]` and of a `[[client]]`.
 const RULE_KEYS: [&str; 6] = ["name", "from", "to", "groups", "classes", "action"];
 const CLIENT_KEYS: [&str; 4] = ["uid", "gid", "names", "addresses"];
+/// Longest file in bytes.
+const FILE_BYTES_MAX: u64 = 1 << 20;
 /// Longest name of a rule in bytes.
 const RULE_NAME_MAX: usize = 63;
 
@@ -26,8 +29,18 @@ const RULE_NAME_MAX: usize = 63;
 /// # Errors
 /// All that is wrong with it. A file that cannot be read is one fault.
 pub(crate) fn read(path: &Path) -> Result<List, ConfigFaults> {
-    let text = read_bounded(path).map_err(|found| {
-        let legal = "a text file of at most 1 MiB that this user may read";
+    let read = files::access_list(path, FILE_BYTES_MAX).map_err(|why| match why {
+        FileFault::Unreadable { cause, .. } => cause.to_string(),
+        FileFault::Other { .. } => "no file".to_owned(),
+        FileFault::TooLong { .. } => "a longer file".to_owned(),
+        why @ (FileFault::ForeignOwner { .. } | FileFault::Exposed { .. } | FileFault::Writable { .. }) => {
+            why.to_string()
+        }
+    });
+    let text = read.and_then(|bytes| String::from_utf8(bytes.to_vec()).map_err(|error| error.to_string()));
+    let text = text.map_err(|found| {
+        let legal =
+            "a text file of at most 1 MiB that this user may read, and that only it or root may write to";
         let remedy = "check security.access, the path and its permissions";
         ConfigFaults::one(fault(&path.display().to_string(), found, legal, remedy))
     })?;
@@ -52,6 +65,12 @@ pub(super) fn parse(text: &str) -> Result<List, ConfigFaults> {
                 reader.add(other, name, Some(found), ("[[rule]] and [[client]]", remedy));
             }
         }
+    }
+    let patterns: usize = list.rules.iter().map(|rule| rule.from.len() + rule.to.len()).sum();
+    if patterns > PATTERNS_MAX {
+        let legal = format!("at most {PATTERNS_MAX} texts in `from` and `to` of all rules together");
+        let remedy = "put several into a pattern or a range";
+        reader.faults.push(fault("rule", format!("{patterns} of them"), &legal, remedy));
     }
     reader.faults.sort_by_key(|fault| fault.line);
     ConfigFaults::check(reader.faults)?;

@@ -5,6 +5,7 @@ use std::{
     fmt,
     path::PathBuf,
     sync::{Arc, Mutex},
+    time::Duration,
 };
 
 use arc_swap::ArcSwap;
@@ -22,10 +23,11 @@ use super::{
     index::{Index, Names},
     rule::{List, Question, Verdict},
 };
-use crate::{config::ConfigFaults, refusals::Refusals, stores::lock};
-
-/// The cause under which refused messages are counted.
-pub(super) const CAUSE: &str = "access list";
+use crate::{
+    config::ConfigFaults,
+    refusals::{BY_LIST, Refusals},
+    stores::lock,
+};
 
 /// The access list of one node. It outlives the layers.
 pub(crate) struct Access {
@@ -37,10 +39,11 @@ pub(crate) struct Access {
     index: ArcSwap<Index>,
     /// Of two who have the file read again, the later one reads later.
     reloading: Mutex<()>,
+    /// When the list may be read again [`ASKED_AT_ONCE`] times on the word of tools.
+    asked_to_read: Mutex<Time>,
     /// Writers of `index` take turns.
     writing: Mutex<()>,
-    /// Which process of another program had which address that the node chose; of more than [`HOLDERS_MAX`] the one that came first is
-    /// forgotten.
+    /// Which user's process had which address last; of more than [`HOLDERS_MAX`] the one that came first is forgotten.
     holders: Mutex<VecDeque<Holder>>,
     /// What the applications of this node may be told in reply.
     asked: Asked,
@@ -48,10 +51,13 @@ pub(crate) struct Access {
 
 /// Nodes of which names are known at most, beyond those that the directory has.
 const NODES_MAX: usize = 1_024;
+/// How often tools may have the list read again, and how often at once.
+const READ_PERIOD: Duration = Duration::from_secs(1);
+const ASKED_AT_ONCE: u32 = 4;
 /// Former holders of addresses that are known at most.
 const HOLDERS_MAX: usize = 4_096;
 
-/// An application of another process that has, or had, an address that the node chose.
+/// An application of another process that has, or had, this address.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Holder {
     app: AppAddress,
@@ -105,7 +111,8 @@ impl Access {
     pub(crate) fn new(here: NodeAddress, path: PathBuf, list: List, refusals: Arc<Refusals>) -> Self {
         let index = ArcSwap::from_pointee(Index::new(Arc::new(list), here));
         let (reloading, writing, holders) = (Mutex::default(), Mutex::default(), Mutex::default());
-        Self { here, path, refusals, index, reloading, writing, holders, asked: Asked::default() }
+        let (asked, asked_to_read) = (Asked::default(), Mutex::new(Time::ZERO));
+        Self { here, path, refusals, index, reloading, asked_to_read, writing, holders, asked }
     }
 
     /// Reads the file again and puts its list in force, for every message from now on.
@@ -196,7 +203,12 @@ impl Access {
         let _turn = lock(&self.writing);
         let former = self.index.load();
         let mut index = Index::clone(&former);
-        let mut silent: Vec<_> = index.nodes.iter().filter(|(of, names)| is_meant(**of) && names.is_told).map(|(of, _)| *of).collect();
+        let mut silent: Vec<_> = index
+            .nodes
+            .iter()
+            .filter(|(of, names)| is_meant(**of) && names.is_told)
+            .map(|(of, _)| *of)
+            .collect();
         for Said { node, life, names } in told.filter(|said| is_meant(said.node)) {
             let before = former.names_on(node);
             if before.life.is_some_and(|met| met != life) {
@@ -228,7 +240,7 @@ impl Access {
         Some(Arc::new(OfLife { here: self.here, index, refusals }))
     }
 
-    /// A process of `uid` has this address, which the node chose.
+    /// A process of `uid` has this address.
     pub(crate) fn holds(&self, app: AppAddress, uid: u32, name: Option<&str>) {
         let mut holders = lock(&self.holders);
         holders.retain(|holder| holder.app != app);
@@ -259,6 +271,22 @@ impl Access {
         self.index.load().list.may_register(own, who, name, address)
     }
 
+    /// Whether the process that has this address now is one of the user `own`, or of root; not, if that is not known any more.
+    pub(crate) fn is_of(&self, app: AppAddress, own: u32) -> bool {
+        lock(&self.holders).iter().any(|holder| holder.app == app && [own, 0].contains(&holder.uid))
+    }
+
+    /// Whether the list may be read again on the word of a tool at `now`: [`ASKED_AT_ONCE`] times, and once a second.
+    pub(crate) fn may_be_read(&self, now: Time) -> bool {
+        let mut full = lock(&self.asked_to_read);
+        let next = (*full).max(now) + READ_PERIOD;
+        let may = next.since(now) <= READ_PERIOD * ASKED_AT_ONCE;
+        if may {
+            *full = next;
+        }
+        may
+    }
+
     /// What becomes of such a message, and why.
     pub(crate) fn explain(&self, asked: Question) -> Explanation {
         explained(&self.index.load(), asked)
@@ -276,12 +304,15 @@ fn explained(index: &Index, asked: Question) -> Explanation {
     Explanation { is_allowed, why: format!("{rule}, for {source} to {target}") }
 }
 
-fn judge(index: &Index, refusals: &Refusals, asked: Question) -> bool {
-    let is_allowed = matches!(index.decide(asked), Verdict::Allowed(_));
-    if !is_allowed {
-        refuse(index, refusals, asked);
+fn judge(index: &Index, refusals: &Refusals, asked: Question, is_for_one: bool) -> bool {
+    let Verdict::Refused(rule) = index.decide(asked) else { return true };
+    // That no rule is about one of many to whom something goes is how a list is meant to be: nothing to be told of.
+    if (is_for_one || rule.is_some()) && refusals.logs_by_list(Time::now()) {
+        refusals.count(Time::now(), BY_LIST, &Refused(index, asked));
+    } else {
+        refusals.count_by_list();
     }
-    is_allowed
+    false
 }
 
 /// What is asked of the list for a message to the application of the node at `here`.
@@ -304,7 +335,7 @@ struct OfLife {
 
 impl Guard for OfLife {
     fn allows(&self, header: &Header, app: AppAddress) -> bool {
-        judge(&self.index, &self.refusals, question(self.here, header, app))
+        judge(&self.index, &self.refusals, question(self.here, header, app), header.destination.is_single())
     }
 
     /// What it judges was sent by another node.
@@ -323,7 +354,12 @@ impl Guard for Access {
         {
             return true;
         }
-        judge(&self.index.load(), &self.refusals, question(self.here, header, app))
+        judge(
+            &self.index.load(),
+            &self.refusals,
+            question(self.here, header, app),
+            header.destination.is_single(),
+        )
     }
 
     fn asks(&self, header: &Header) {
@@ -332,11 +368,6 @@ impl Guard for Access {
             self.asked.note(Time::now(), header);
         }
     }
-}
-
-#[cold]
-fn refuse(index: &Index, refusals: &Refusals, asked: Question) {
-    refusals.count(Time::now(), CAUSE, &Refused(index, asked));
 }
 
 /// Put into words only where it is logged.

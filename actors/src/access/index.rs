@@ -142,12 +142,21 @@ impl Index {
         self.known(tid).map(|known| &*known.name)
     }
 
+    /// Whether this node does not know yet who is called how on `node`.
+    fn is_untold(&self, node: NodeAddress) -> bool {
+        node != self.here && self.nodes.get(&node).is_none_or(|names| !names.is_told)
+    }
+
     /// What becomes of a message.
     pub(super) fn decide(&self, asked: Question) -> Verdict {
         let Question { source, target, group, class } = asked;
         let rules = &self.list.rules;
         let from = match self.known(source) {
             Some(known) => known.from,
+            // It may be called anything: what is refused to some name is refused to it, until its node has said who it is.
+            None if self.is_untold(source.node) => Rules::of(rules, |rule| {
+                rule.is_from(self.here, source, None) || rule.may_refuse(self.here, source.node)
+            }),
             None => Rules::of(rules, |rule| rule.is_from(self.here, source, None)),
         };
         let mut to = match self.known(target) {

@@ -11,6 +11,8 @@ use super::{client::ClientRule, who::Who};
 
 /// Rules of one list at most.
 pub(super) const RULES_MAX: usize = 256;
+/// Texts in `from` and `to` of all rules of one list at most: so much each new name is compared with.
+pub(super) const PATTERNS_MAX: usize = 2_048;
 /// Texts in one `from`, `to`, `groups`, `names` or `addresses` at most.
 pub(super) const TEXTS_MAX: usize = 64;
 
@@ -125,6 +127,11 @@ impl Rule {
 
     pub(super) fn is_from(&self, here: NodeAddress, source: Tid, name: Option<&str>) -> bool {
         self.from.iter().any(|who| who.covers(here, source, name))
+    }
+
+    /// Whether it refuses something to applications on `node` that have some name.
+    pub(super) fn may_refuse(&self, here: NodeAddress, node: NodeAddress) -> bool {
+        self.action == Action::Refuse && self.from.iter().any(|who| who.names_some(here, node))
     }
 
     pub(super) fn is_to(&self, here: NodeAddress, target: Tid, name: Option<&str>) -> bool {

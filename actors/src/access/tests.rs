@@ -1,11 +1,12 @@
 //! What a list says of any message, whichever way it is looked up, and what is said of one that cannot be read.
 
-use std::{collections::BTreeMap, sync::Arc};
+use std::{collections::BTreeMap, sync::Arc, time::Duration};
 
 use proptest::prelude::*;
 use sinew_runtime::{
     router::guard::Guard as _,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    time::Time,
     wire::{Class, Header, Kind},
 };
 
@@ -13,11 +14,10 @@ use super::{
     Access, Applicant, Question, Said,
     client::ClientRefusal,
     file::parse,
-    guard::CAUSE,
     index::Index,
     rule::{List, Names, Verdict},
 };
-use crate::{config::NodeConfig, stores::Stores};
+use crate::{config::NodeConfig, refusals::BY_LIST, stores::Stores};
 
 const HERE: NodeAddress = NodeAddress::new(0x0a00_0002);
 const THERE: NodeAddress = NodeAddress::new(0x0a00_0004);
@@ -104,7 +104,8 @@ fn applications_are_named_by_node_address_range_and_pattern() {
         let found = (covers(from, there, Some("leg.left")), covers(from, here, Some("leg.left")));
         assert_eq!(found, (is_there, is_here), "{from}");
     }
-    assert!(covers("a@b", there, Some("a@b")), "what is no node is part of the name");
+    assert!(covers("a@b@*", there, Some("a@b")), "a name with an @ in it");
+    assert!(covers("7@*", there, Some("7")), "a name of digits");
     assert!(!covers("*@10.0.0.4", there, None), "a pattern is about names");
 }
 
@@ -148,6 +149,40 @@ fn all_that_is_wrong_with_a_list_is_told_with_its_line_and_what_to_do() {
     }
     let many = "[[rule]]\nfrom = ['*']\nto = ['*']\n";
     assert!(parse(&many.repeat(256)).is_ok() && parse(&many.repeat(257)).is_err());
+    let wide = format!("[[rule]]\nfrom = [{}]\nto = ['*']\n", "'a', ".repeat(63));
+    assert!(parse(&wide.repeat(32)).is_ok());
+    let why = parse(&wide.repeat(33)).expect_err("too many").to_string();
+    assert!(why.contains("2112 of them") && why.contains("at most 2048"), "{why}");
+}
+
+#[test]
+fn an_address_with_a_slip_in_it_is_not_taken_for_a_name() {
+    let is_legal = |who: &str| {
+        let (from, to) = (
+            format!("[[rule]]\nfrom = ['{who}']\nto = ['*']\n"),
+            format!("[[rule]]\nfrom = ['*']\nto = ['{who}']\n"),
+        );
+        assert_eq!(parse(&from).is_ok(), parse(&to).is_ok(), "{who}");
+        parse(&from).is_ok()
+    };
+    for who in [
+        "10.0.0.400",
+        "10.0.0.*",
+        "gait@10.0.0.400",
+        "10.0.0.4:1001",
+        "gait@knee",
+        " gait",
+        "10.0.0.4 ",
+        "gait ",
+        "7",
+        "gait@",
+    ] {
+        assert!(!is_legal(who), "{who}");
+    }
+    for who in ["gait", "leg.*", "gait@10.0.0.4", "leg 2", "*.7", "7@*", "gait@here", "v1.2:a"] {
+        assert_eq!(is_legal(who), who != "*.7", "{who}");
+    }
+    assert!(parse("[[client]]\nuid = 1\nnames = ['guest ']\n").is_err());
 }
 
 const POLICY: &str = "[[client]]\nuid = 1001\nnames = ['guest.*']\naddresses = ['2000-20ff']\n[[client]]\ngid = 50\n\
@@ -209,6 +244,23 @@ fn indexed(index: &Index, names: &BTreeMap<Tid, Arc<str>>) -> Index {
     })
 }
 
+#[test]
+fn a_list_is_read_again_at_the_word_of_the_nodes_user_a_few_times_at_once_and_then_once_a_second() {
+    let stores = Stores::for_test(NodeConfig::new("knee"), Incarnation(1));
+    let access = Access::in_test(&stores, "");
+    let [own, guest, root] = [0x1001, 0x1002, 0x1003].map(AppAddress::new);
+    for (app, uid) in [(own, 1_000), (guest, 1_001), (root, 0)] {
+        access.holds(app, uid, None);
+    }
+    assert!(access.is_of(own, 1_000) && access.is_of(root, 1_000));
+    assert!(!access.is_of(guest, 1_000) && !access.is_of(AppAddress::new(0x1004), 1_000));
+    let begin = Time::from_nanos(1);
+    let may = |at| (0..9).filter(|_| access.may_be_read(at)).count();
+    assert_eq!(may(begin), 4);
+    assert_eq!(may(begin + Duration::from_secs(1)), 1);
+    assert_eq!(may(begin + Duration::from_secs(60)), 4);
+}
+
 fn header(source: Tid, target: Tid) -> Header {
     Header::new(Kind::named("test"), source, target)
 }
@@ -225,7 +277,7 @@ fn refusals_are_counted_and_name_the_rule_and_both_ends() {
     access.named(AppAddress::new(0x1002), Some("drive"));
     let (source, target) = (app(THERE, 0x1001), app(HERE, 0x1002));
     (0..3).for_each(|_| assert!(!access.allows(&header(source, target), target.app)));
-    assert_eq!(stores.refusals.of(CAUSE), 3);
+    assert_eq!(stores.refusals.of(BY_LIST), 3);
     let detail = &stores.refusals.told()[0].detail;
     for word in ["rule 1 'no guests' (line 1)", "10.0.0.4/1001", "'drive'", "Control"] {
         assert!(detail.contains(word), "{detail}");
@@ -284,6 +336,24 @@ fn names_of_a_life_of_a_node_count_for_no_later_one_but_for_what_it_left_behind(
     assert!(!allows(Incarnation(6)), "of that one nothing is known");
     access.named_elsewhere(None, said_in(next, &[(source, "gait")]));
     assert!(is_open());
+}
+
+#[test]
+fn a_rule_that_refuses_a_name_refuses_those_of_whom_nothing_is_known_yet() {
+    let stores = Stores::for_test(NodeConfig::new("knee"), Incarnation(1));
+    let rules = "[[rule]]\nfrom = ['guest.*', 'log@10.0.0.9']\nto = ['*']\naction = 'refuse'\n[[rule]]\nfrom = ['*']\nto = ['*']\n";
+    let access = Access::in_test(&stores, rules);
+    let (source, target) = (app(THERE, 0x8000_0000), app(stores.node, 0x1002));
+    let is_open = |from| access.allows(&header(from, target), target.app);
+    assert!(is_open(app(stores.node, 0x8000_0000)), "those of this node are known");
+    assert!(!is_open(source));
+    access.meets(THERE, LIFE);
+    assert!(!is_open(source));
+    access.named_elsewhere(Some(THERE), said(&[(source, "gait")]));
+    assert!(is_open(source) && is_open(app(THERE, 0x1001)), "one that has no name");
+    access.replace_in_test(&rules.replace("'guest.*', ", ""));
+    assert!(is_open(source) && is_open(app(NodeAddress::new(8), 0x1001)), "it is about another node");
+    assert!(!is_open(app(NodeAddress::new(0x0a00_0009), 0x1001)));
 }
 
 fn who() -> impl Strategy<Value = String> {

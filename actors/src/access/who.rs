@@ -55,6 +55,11 @@ impl Who {
         }
     }
 
+    /// Whether it is by name, and some on `node` may have it.
+    pub(super) fn names_some(&self, here: NodeAddress, node: NodeAddress) -> bool {
+        matches!(self, Self::Named(nodes, _) if nodes.cover(node, here))
+    }
+
     /// What `text` means.
     ///
     /// # Errors
@@ -72,9 +77,16 @@ impl Who {
         if let Some(node) = nodes(text) {
             return Ok(Self::Addresses(node, 0..=u32::MAX));
         }
-        // A name may have an `@` in it: only what is a node behind the last one is one.
+        // An address with a slip in it would be the name of nobody, and a rule that refuses would refuse nobody.
+        if text.chars().all(|c| c.is_ascii_digit() || ".*:-".contains(c)) {
+            return Err("this is no node; if it is a name, write it with the node, or with @* behind it");
+        }
         let (name, node) = match text.rsplit_once('@') {
-            Some((name, node)) => nodes(node).map_or((text, Nodes::All), |node| (name, node)),
+            Some((name, node)) => (
+                name,
+                nodes(node)
+                    .ok_or("the part behind the @ is no node; if it is part of a name, write @* behind it")?,
+            ),
             None => (text, Nodes::All),
         };
         name_pattern(name).map(|name| Self::Named(node, name))
@@ -88,6 +100,9 @@ impl Who {
 pub(super) fn name_pattern(text: &str) -> Result<String, &'static str> {
     if text.is_empty() || text.len() > NAME_MAX || text.chars().any(char::is_control) {
         return Err("a name has 1 to 63 bytes without control characters");
+    }
+    if text.trim() != text {
+        return Err("there is white space before or behind it: leave that out");
     }
     Ok(text.to_owned())
 }

@@ -13,7 +13,7 @@ mod tests;
 pub(crate) use check::fault;
 pub(crate) use faults::quoted;
 pub use faults::{ConfigFault, ConfigFaults};
-pub(crate) use file::{line_of, read_bounded, shown, syntax_fault};
+pub(crate) use file::{line_of, shown, syntax_fault};
 pub use interfaces::{Interface, Interfaces, NoInterface};
 
 use std::{

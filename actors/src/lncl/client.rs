@@ -180,7 +180,8 @@ impl Client {
         let uid = peer.who.uid;
         // Other nodes may still call whoever has it by the name of whoever had it. spec: LNCL-5
         let access = server.stores.access.get();
-        let former = former.filter(|app| access.is_none_or(|access| access.has_held(*app, uid, name.as_deref())));
+        let former =
+            former.filter(|app| access.is_none_or(|access| access.has_held(*app, uid, name.as_deref())));
         let any = former.map_or(Address::Dynamic, Address::Former);
         if let Some(access) = server.stores.access.get() {
             let own = rustix::process::geteuid().as_raw();
@@ -189,9 +190,9 @@ impl Client {
         }
         let address = address.map_or(any, Address::Fixed);
         let request = Request { address, name, requires: requires.clone(), kinds, owner: peer.owner() };
-        let (has_chosen, called) = (matches!(request.address, Address::Fixed(_)), request.name.clone());
+        let called = request.name.clone();
         let app = registrar::register_client(&server.stores, request)?;
-        if let Some(access) = server.stores.access.get().filter(|_| !has_chosen) {
+        if let Some(access) = server.stores.access.get() {
             access.holds(app, uid, called.as_deref());
         }
         let tid = Tid::new(server.stores.node, app);

@@ -253,6 +253,11 @@ impl Registry {
         self.names.keys().cloned()
     }
 
+    /// Whom the registration of `app` belongs to, if it has one.
+    pub(crate) fn owner_of(&self, app: AppAddress) -> Option<Owner> {
+        self.apps.get(&app).map(|entry| entry.owner)
+    }
+
     /// The name of `app`, or its address where it has none.
     pub(crate) fn name_of(&self, app: AppAddress) -> String {
         let name = self.apps.get(&app).and_then(|entry| entry.name.clone());

@@ -50,7 +50,7 @@ mod worker;
 
 pub(crate) use actor::Lncl;
 pub use core::RegisterError;
-pub(crate) use core::{ClientId, Registry};
+pub(crate) use core::{ClientId, Owner, Registry};
 pub(crate) use door::Door;
 pub(crate) use facts::AppFact;
 pub(crate) use listener::{ListenError, Openers};

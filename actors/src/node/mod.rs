@@ -48,6 +48,7 @@ use std::{
 };
 
 use sinew_runtime::{
+    outcome::Rejection,
     post::Post,
     sender::Directory,
     tid::{Incarnation, NodeAddress, Tid},
@@ -64,6 +65,8 @@ use crate::{
     sync::{BarrierStatus, DirectoryEntry, Waiting},
 };
 
+/// What is logged of the faults of an access list, in characters: whoever asks for it to be read gets all of them.
+const LOGGED_MAX: usize = 1_024;
 /// Time at its end for what the node has logged to be written.
 const LAST_WORDS: Duration = Duration::from_millis(500);
 
@@ -281,7 +284,10 @@ impl NodeHandle {
     #[must_use]
     pub fn refused(&self) -> u64 {
         let Stores { refusals, gncl, router, ndl, .. } = &*self.stores;
-        refusals.total() + gncl.refusals.total() + lock(ndl).refusals().total() + router.refused()
+        // What the access list refuses stands among the refusals already, also what the router has no reason for: one of many.
+        let not_taken = router.refused_because().into_iter().filter(|(why, _)| *why != Rejection::NotAllowed);
+        let not_taken: u64 = not_taken.map(|(_, count)| count).sum();
+        refusals.total() + gncl.refusals.total() + lock(ndl).refusals().total() + not_taken
     }
 
     /// Reads the node's access list again and puts it in force: for every message that is delivered from now on, for every application of
@@ -296,7 +302,10 @@ impl NodeHandle {
             Ok(AccessSummary { rules, clients }) => {
                 log::info!(rules, clients, "another access list is in force")
             }
-            Err(why) => log::error!(%why, "the access list was not replaced"),
+            Err(why) => {
+                let why: String = why.to_string().chars().take(LOGGED_MAX).collect();
+                log::error!(why, "the access list was not replaced");
+            }
         }
         read
     }

@@ -125,6 +125,11 @@ pub(super) fn certificate(path: &Path) -> Result<Zeroizing<Vec<u8>>, FileFault> 
     read(path, Guarded::Public, KEY_BYTES_MAX)
 }
 
+/// Reads an access list of at most `bytes_max` bytes.
+pub(crate) fn access_list(path: &Path, bytes_max: u64) -> Result<Zeroizing<Vec<u8>>, FileFault> {
+    read(path, Guarded::Public, bytes_max)
+}
+
 /// Reads the deny list.
 pub(super) fn denied(path: &Path) -> Result<Zeroizing<Vec<u8>>, FileFault> {
     read(path, Guarded::Public, DENIED_BYTES_MAX)
