@@ -37,7 +37,7 @@ use self::{
     robot::Robot,
     stranger::Stranger,
 };
-use crate::{Host, Hosts};
+use crate::{DEADLINE, Host, Hosts};
 
 /// Which of the hosts is whose.
 const HIP: usize = 0;
@@ -48,6 +48,8 @@ const NEWCOMER: usize = 3;
 pub const GROWTH_MAX: u64 = 64 << 20;
 /// How much slower live traffic may be at its 99th percentile.
 pub const SLOWER_MAX: f64 = 2.0;
+/// Of the answers in each second before an attack, so many are still given while it lasts: fewer is no service, on any machine.
+pub const ANSWERED_MIN: f64 = 0.02;
 /// Below this the 99th percentile says more of the machine than of the node.
 const P99_FLOOR: Duration = Duration::from_micros(200);
 /// Nodes settle for so long before they are measured.
@@ -76,6 +78,8 @@ struct Attack {
     tried: &'static str,
     /// Descriptors of the attacked node; `None`: as many as the system allows.
     descriptors: Option<u32>,
+    /// The attacker hears the robot's datagrams before it begins.
+    records: bool,
     /// Others want to come in meanwhile.
     others_come: bool,
     /// In whose name he may speak: his own.
@@ -85,11 +89,22 @@ struct Attack {
 }
 
 /// What came of it, as far as the attacker knows.
+#[derive(Default)]
 struct Happened {
     /// In words.
     what: String,
     /// What must not have been.
     broken: Vec<String>,
+    /// What the node must have refused meanwhile, by cause, and how often at least: an attack that never reached it shows nothing.
+    refused: Vec<(&'static str, u64)>,
+    /// Messages that were sent in the sender's own name, and are to arrive.
+    own_sent: u64,
+}
+
+impl Happened {
+    fn new(what: String, broken: Vec<String>) -> Self {
+        Self { what, broken, ..Self::default() }
+    }
 }
 
 /// Where an attack takes place.
@@ -99,6 +114,8 @@ struct Scene<'a> {
     hosts: &'a [Host],
     program: &'a PathBuf,
     lasts: Duration,
+    /// Datagrams of the robot that the attacker has heard before.
+    recorded: Vec<Vec<u8>>,
     over: &'a AtomicBool,
 }
 
@@ -192,13 +209,22 @@ fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
     let keys = Keys::make();
     let mut robot = Robot::start(&plan.program, hosts, &keys, attack.descriptors);
     thread::sleep(SETTLING);
+    let recorded = if attack.records { hosts[ATTACKER].run(|| tried::record(&robot)) } else { Vec::new() };
+    let refused_before = robot.refused();
     robot.window();
     thread::sleep(plan.lasts);
     let before = robot.window();
     let (held_before, over) = (robot.held_bytes(), AtomicBool::new(false));
     let (mut held_most, mut came) = (held_before, None);
-    let scene =
-        Scene { robot: &robot, keys: &keys, hosts, program: &plan.program, lasts: plan.lasts, over: &over };
+    let scene = Scene {
+        robot: &robot,
+        keys: &keys,
+        hosts,
+        program: &plan.program,
+        lasts: plan.lasts,
+        recorded,
+        over: &over,
+    };
     let (happened, by_hand) = thread::scope(|scope| {
         let _ends = EndsIt(&over);
         let attacking = scope.spawn(|| (attack.run)(&scene));
@@ -225,10 +251,27 @@ fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
     });
     let during = robot.window();
     held_most = held_most.max(robot.held_bytes());
-    let seen = robot.seen();
+    let outcome = report::Outcome {
+        happened,
+        before,
+        during,
+        answers_again: robot.answers_again(),
+        growth: held_most.saturating_sub(held_before),
+        refused: since(&refused_before, robot.refused()),
+        seen: robot.seen(),
+        came,
+        by_hand,
+    };
     robot.end();
-    let growth = held_most.saturating_sub(held_before);
-    Row::of(attack, [before, during], growth, (happened, seen), (came, by_hand))
+    Row::of(attack, outcome)
+}
+
+/// How much was refused since then.
+fn since(before: &robot::Refused, mut now: robot::Refused) -> robot::Refused {
+    for (cause, count) in &mut now {
+        *count -= before.get(cause).copied().unwrap_or_default().min(*count);
+    }
+    now
 }
 
 /// Ends the scene also when something panics: else nobody would hear of it.
@@ -240,23 +283,40 @@ impl Drop for EndsIt<'_> {
     }
 }
 
-/// How many honest peers that the node does not know came in, of how many that wanted to.
-#[derive(Clone, Copy, Debug, Default)]
+/// What honest peers that the node does not know had to do to come in.
+#[derive(Clone, Debug, Default)]
 struct Knocked {
-    tried: u64,
     came_in: u64,
+    attempts: u64,
+    /// The longest time until one was in.
+    longest: Duration,
+    /// Why the last attempt of one failed that never came in.
+    never: Option<String>,
 }
 
-/// An honest peer that the node has not heard of, with keys of the project: it dials, says hello, and goes, again and again.
+/// Honest peers that the node has not heard of, with keys of the project, one after the other: each dials and says hello until it is in, as
+/// a node does, and goes. The last one may need longer than the scene.
 fn knock(scene: &Scene<'_>) -> Knocked {
     let tls = scene.keys.tls(keys::SPARE);
     let mut knocked = Knocked::default();
     scene.hosts[NEWCOMER].run(|| {
         while !scene.is_over() {
-            knocked.tried += 1;
-            let greeted = Stranger::dial(scene.robot.knee(), Some(&tls))
-                .and_then(|mut stranger| stranger.hello(keys::SPARE, scene.robot.knee_address()));
-            knocked.came_in += u64::from(matches!(greeted, Ok(stranger::Answer::Welcome)));
+            let began = Instant::now();
+            loop {
+                knocked.attempts += 1;
+                let greeted = Stranger::dial(scene.robot.knee(), Some(&tls))
+                    .and_then(|mut stranger| stranger.hello(keys::SPARE, scene.robot.knee_address()));
+                if matches!(greeted, Ok(stranger::Answer::Welcome)) {
+                    break;
+                }
+                if began.elapsed() > DEADLINE {
+                    knocked.never = Some(format!("{greeted:?}"));
+                    return;
+                }
+                thread::sleep(LOOK);
+            }
+            knocked.came_in += 1;
+            knocked.longest = knocked.longest.max(began.elapsed());
             scene.rest(LOOK);
         }
     });

@@ -1,15 +1,16 @@
 //! The role of each node of the robot: an application that answers, one that looks who is there, and one that asks.
 
 use std::{
+    collections::BTreeMap,
     io::BufRead,
     sync::{
-        Arc, Mutex, PoisonError,
-        atomic::{AtomicBool, AtomicU64, Ordering},
+        Arc, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, Ordering},
     },
     time::Instant,
 };
 
-use sinew::{Sender, prelude::*};
+use sinew::{NodeAddress, Sender, prelude::*};
 
 use crate::{
     DEADLINE,
@@ -23,17 +24,55 @@ pub(super) const ECHO: &str = "echo";
 /// Time between two questions.
 const PACE: Duration = Duration::from_millis(1);
 
+/// How long another answer may take when the attack is over, on a machine that is shared.
+const AGAIN: Duration = Duration::from_secs(30);
+
+/// All by the last byte of a node's address.
 #[derive(Default)]
 struct Counts {
-    /// Nodes that were lost.
-    lost: AtomicU64,
-    /// Nodes that were found.
-    found: AtomicU64,
-    /// Messages that nobody asks with: nobody of the robot sends any. By the last byte of the node that they say they are from.
-    sent: Mutex<std::collections::BTreeMap<u8, u64>>,
+    /// How often it was lost.
+    lost: BTreeMap<u8, u64>,
+    /// How often it was found.
+    found: BTreeMap<u8, u64>,
+    /// Messages that nobody asks with, which say that they are from there: nobody of the robot sends any.
+    sent: BTreeMap<u8, u64>,
 }
 
-struct Echo(Arc<Counts>);
+struct Echo(Arc<Mutex<Counts>>);
+
+impl Echo {
+    fn note(&self, which: impl FnOnce(&mut Counts) -> &mut BTreeMap<u8, u64>, node: NodeAddress) {
+        let mut counts = lock(&self.0);
+        *which(&mut counts).entry(node.bits() as u8).or_default() += 1;
+    }
+}
+
+/// What was measured since the last time that somebody asked for it.
+struct Measured {
+    since: Instant,
+    times: Times,
+    failed: u64,
+    /// When the question was asked that has no answer yet.
+    open: Option<Instant>,
+    /// Answers in all.
+    answers: u64,
+}
+
+impl Measured {
+    fn new() -> Self {
+        Self { since: Instant::now(), times: Times::default(), failed: 0, open: None, answers: 0 }
+    }
+
+    /// `COUNT FAILED P50 P99 MAX LASTED`, times in nanoseconds. A question that waits for its answer is among the longest: else silence
+    /// would look like no traffic at all.
+    fn window(&mut self) -> String {
+        let (times, failed) = (std::mem::take(&mut self.times), std::mem::take(&mut self.failed));
+        let lasted = std::mem::replace(&mut self.since, Instant::now()).elapsed().as_nanos();
+        let [p50, p99, max] = [0.5, 0.99, 1.0].map(|share| times.percentile(share).as_nanos());
+        let max = self.open.map_or(max, |asked| max.max(asked.elapsed().as_nanos()));
+        format!("{} {failed} {p50} {p99} {max} {lasted}", times.count())
+    }
+}
 
 impl Actor for Echo {
     type Context = AppContext<Self>;
@@ -44,8 +83,7 @@ impl Handler<Delivery<Order>> for Echo {
 
     fn handle(&mut self, order: Delivery<Order>, context: &mut Self::Context) {
         if context.reply(&order, &Order { number: order.number }).is_err() {
-            let mut sent = self.0.sent.lock().unwrap_or_else(PoisonError::into_inner);
-            *sent.entry(order.source.node.bits() as u8).or_default() += 1;
+            self.note(|counts| &mut counts.sent, order.source.node);
         }
     }
 }
@@ -55,21 +93,22 @@ impl Handler<Delivery<NodeEvent>> for Echo {
 
     fn handle(&mut self, event: Delivery<NodeEvent>, _: &mut Self::Context) {
         match &event.payload {
-            NodeEvent::NodeFound { .. } => self.0.found.fetch_add(1, Ordering::Relaxed),
-            NodeEvent::NodeLost { .. } => self.0.lost.fetch_add(1, Ordering::Relaxed),
+            NodeEvent::NodeFound { node, .. } => self.note(|counts| &mut counts.found, *node),
+            NodeEvent::NodeLost { node, .. } => self.note(|counts| &mut counts.lost, *node),
+            // Neither comes nor goes.
             NodeEvent::AppStalled { .. } | NodeEvent::AppResumed { .. } | NodeEvent::NodeRestarted { .. } => {
-                0
             }
-        };
+        }
     }
 }
 
-/// `CONFIGURATION [ASKS]`: says `up` when all runs. `window`: what was measured since the last one; `seen`: who was lost, who was found, and
-/// what came unasked; `tid`: that of the application that answers.
+/// `CONFIGURATION [ASKS]`: says `up` when all runs. `window`: what was measured since the last one; `again`: whether questions are answered
+/// from now on; `seen`: who was lost, who was found, and what came unasked; `refused`: what the node refused, for each cause; `tid`: that of
+/// the application that answers.
 pub(super) fn play(arguments: &[String]) {
     let config = NodeConfig::from_file(&arguments[0]).expect("the director's configuration");
     let asks = arguments.get(1).is_some_and(|asks| asks == "asks");
-    let counts = Arc::new(Counts::default());
+    let counts: Arc<Mutex<Counts>> = Arc::default();
     let counted = counts.clone();
     let name = if asks { "idle" } else { ECHO };
     let echo = AppSpec::new(name, move || Echo(counted.clone()))
@@ -83,31 +122,32 @@ pub(super) fn play(arguments: &[String]) {
     let sender = key.sender();
     let echo = until("the echo is there", || sender.resolve(ECHO));
     let over = Arc::new(AtomicBool::new(false));
-    let measured: Arc<Mutex<(Times, u64)>> = Arc::default();
+    let measured = Arc::new(Mutex::new(Measured::new()));
     let asking = asks.then(|| {
         let (over, measured) = (over.clone(), measured.clone());
         std::thread::spawn(move || question(&sender, &over, &measured))
     });
     if asks {
         // It is up when it has an answer.
-        until("the first answer", || {
-            (measured.lock().unwrap_or_else(PoisonError::into_inner).0.count() > 0).then_some(())
-        });
+        until("the first answer", || (lock(&measured).answers > 0).then_some(()));
     }
     println!("up");
     for line in std::io::stdin().lock().lines().map_while(Result::ok) {
         match &*line {
-            "window" => {
-                let (times, failed) =
-                    std::mem::take(&mut *measured.lock().unwrap_or_else(PoisonError::into_inner));
-                let [p50, p99, max] = [0.5, 0.99, 1.0].map(|share| times.percentile(share).as_nanos());
-                println!("{} {failed} {p50} {p99} {max}", times.count());
-            }
+            "window" => println!("{}", lock(&measured).window()),
+            "again" => println!("{}", u8::from(is_answered(&measured))),
             "seen" => {
-                let of = |count: &AtomicU64| count.load(Ordering::Relaxed);
-                let sent = counts.sent.lock().unwrap_or_else(PoisonError::into_inner).clone();
-                let sent: String = sent.iter().map(|(node, count)| format!(" {node} {count}")).collect();
-                println!("{} {}{sent}", of(&counts.lost), of(&counts.found));
+                let counts = lock(&counts);
+                let words = |kind: &str, of: &BTreeMap<u8, u64>| {
+                    of.iter().map(|(node, count)| format!(" {kind} {node} {count}")).collect::<String>()
+                };
+                let Counts { lost, found, sent } = &*counts;
+                println!("seen{}{}{}", words("lost", lost), words("found", found), words("sent", sent));
+            }
+            "refused" => {
+                let refused = node.handle().audit_here().refused;
+                let words = refused.iter().map(|(cause, count)| format!("\t{cause}\t{count}"));
+                println!("refused{}", words.collect::<String>());
             }
             "tid" => println!("{}", echo.bits()),
             _ => panic!("{line:?} is nothing that a node is told"),
@@ -118,7 +158,23 @@ pub(super) fn play(arguments: &[String]) {
     node.stop();
 }
 
-fn question(sender: &Sender, over: &AtomicBool, measured: &Mutex<(Times, u64)>) {
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Waits for the answer to a question that is asked from now on: the first one that comes may be to an older one.
+fn is_answered(measured: &Mutex<Measured>) -> bool {
+    let (before, deadline) = (lock(measured).answers, Instant::now() + AGAIN);
+    while lock(measured).answers < before + 2 {
+        if Instant::now() > deadline {
+            return false;
+        }
+        std::thread::sleep(PACE);
+    }
+    true
+}
+
+fn question(sender: &Sender, over: &AtomicBool, measured: &Mutex<Measured>) {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build();
     let runtime = runtime.expect("a reactor with nothing but a timer");
     for number in 0.. {
@@ -126,17 +182,20 @@ fn question(sender: &Sender, over: &AtomicBool, measured: &Mutex<(Times, u64)>) 
             return;
         }
         let asked = Instant::now();
+        lock(measured).open = Some(asked);
         let answer = runtime.block_on(async {
             sender.ask::<Order, Order>(ECHO, &Order { number }, DEADLINE).ok()?.await.ok()
         });
         let took = asked.elapsed();
-        let mut measured = measured.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut measured = lock(measured);
+        measured.open = None;
         match answer {
             Some(answer) => {
                 assert_eq!(answer.number, number, "the answer to another question");
-                measured.0.note(took);
+                measured.times.note(took);
+                measured.answers += 1;
             }
-            None => measured.1 += 1,
+            None => measured.failed += 1,
         }
         drop(measured);
         std::thread::sleep(PACE.saturating_sub(asked.elapsed()));

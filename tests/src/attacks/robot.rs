@@ -36,18 +36,33 @@ pub struct Window {
     pub p50: Duration,
     /// 99 of 100.
     pub p99: Duration,
-    /// The longest.
+    /// The longest, of a question that still has none as long as it has waited.
     pub max: Duration,
+    /// How long all that was measured.
+    pub lasted: Duration,
 }
 
-/// What a node has seen of others in its life.
+impl Window {
+    /// Answers in a second.
+    #[must_use]
+    pub fn rate(&self) -> f64 {
+        self.count as f64 / self.lasted.as_secs_f64().max(f64::MIN_POSITIVE)
+    }
+}
+
+/// What a node has seen of others in its life, by the last byte of their addresses.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Seen {
-    pub(super) lost: u64,
-    pub(super) found: u64,
-    /// Messages that nobody of the robot sends, by the last byte of the node that they say they are from.
+    /// How often each was lost.
+    pub(super) lost: BTreeMap<u8, u64>,
+    /// How often each was found.
+    pub(super) found: BTreeMap<u8, u64>,
+    /// Messages that nobody of the robot sends and that say that they are from there.
     pub(super) sent: BTreeMap<u8, u64>,
 }
+
+/// What a node refused, for each cause.
+pub(super) type Refused = BTreeMap<String, u64>;
 
 /// A node in its process.
 struct Member {
@@ -80,11 +95,25 @@ impl Member {
     }
 
     fn seen(&mut self) -> Seen {
-        let [lost, found, ref sent @ ..] = numbers(&self.ask("seen"))[..] else {
-            panic!("two numbers and more")
-        };
-        let sent = sent.chunks_exact(2).map(|pair| (pair[0] as u8, pair[1])).collect();
-        Seen { lost, found, sent }
+        let (line, mut seen) = (self.ask("seen"), Seen::default());
+        let words: Vec<&str> = line.split_whitespace().skip(1).collect();
+        for entry in words.chunks_exact(3) {
+            let which = match entry[0] {
+                "lost" => &mut seen.lost,
+                "found" => &mut seen.found,
+                "sent" => &mut seen.sent,
+                other => panic!("{other} is nothing that a node has seen"),
+            };
+            which.insert(entry[1].parse().expect("a node"), entry[2].parse().expect("a number"));
+        }
+        seen
+    }
+
+    fn refused(&mut self) -> Refused {
+        let line = self.ask("refused");
+        let words: Vec<&str> = line.split('\t').skip(1).collect();
+        let entry = |entry: &[&str]| (entry[0].to_owned(), entry[1].parse().expect("a number"));
+        words.chunks_exact(2).map(entry).collect()
     }
 }
 
@@ -107,8 +136,10 @@ impl Robot {
     /// Starts both, and returns when they talk. The attacked one may have so many descriptors only.
     pub(super) fn start(program: &Path, hosts: &[Host], keys: &Keys, descriptors: Option<u32>) -> Self {
         let (group, directory) = (own_group(), keys.path(""));
-        let config = |who: Who| configuration(&directory, group, who, Some(&keys.of(who)));
-        let knee = as_role(program, &config(keys::KNEE), &[]);
+        let config = |who: Who, gncl| configuration(&directory, group, (who, Some(&keys.of(who))), gncl);
+        // With as many strangers as are allowed by default, descriptors would never run out.
+        let knee_gncl = if descriptors.is_some() { "strangers_max = 1024\n" } else { "" };
+        let knee = as_role(program, &config(keys::KNEE, knee_gncl), &[]);
         let knee = match descriptors {
             Some(descriptors) => limited(&knee, descriptors),
             None => knee,
@@ -116,7 +147,8 @@ impl Robot {
         let mut knee = Member::start(hosts[super::KNEE].moved(&knee));
         knee.answer("up");
         let echo = Tid::from_bits(numbers(&knee.ask("tid"))[0]);
-        let hip = Member::start(hosts[super::HIP].moved(&as_role(program, &config(keys::HIP), &["asks"])));
+        let hip =
+            Member::start(hosts[super::HIP].moved(&as_role(program, &config(keys::HIP, ""), &["asks"])));
         hip.answer("up");
         let newcomer_keys = keys.of(keys::ANKLE);
         Self { program: program.to_owned(), directory, group, hip, knee, newcomer_keys, echo }
@@ -124,7 +156,7 @@ impl Robot {
 
     /// A node of the robot's that was not there; returns when it has an answer of the attacked one.
     pub(super) fn start_newcomer(&self, host: &Host) -> impl Sized + use<> {
-        let config = configuration(&self.directory, self.group, keys::ANKLE, Some(&self.newcomer_keys));
+        let config = configuration(&self.directory, self.group, (keys::ANKLE, Some(&self.newcomer_keys)), "");
         let ankle = Member::start(host.moved(&as_role(&self.program, &config, &["asks"])));
         ankle.answer("up");
         ankle
@@ -132,7 +164,7 @@ impl Robot {
 
     /// A command that starts a whole node there, with keys that it should not have, or none.
     pub(super) fn foreign_node(&self, host: &Host, keys: Option<&Path>) -> Command {
-        let config = configuration(&self.directory, self.group, keys::MALLORY, keys);
+        let config = configuration(&self.directory, self.group, (keys::MALLORY, keys), "");
         host.moved(&as_role(&self.program, &config, &["asks"]))
     }
 
@@ -169,11 +201,21 @@ impl Robot {
 
     /// What the asking node measured since the last one.
     pub(super) fn window(&mut self) -> Window {
-        let [count, failed, p50, p99, max] = numbers(&self.hip.ask("window"))[..] else {
-            panic!("five numbers")
+        let [count, failed, p50, p99, max, lasted] = numbers(&self.hip.ask("window"))[..] else {
+            panic!("six numbers")
         };
-        let [p50, p99, max] = [p50, p99, max].map(Duration::from_nanos);
-        Window { count, failed, p50, p99, max }
+        let [p50, p99, max, lasted] = [p50, p99, max, lasted].map(Duration::from_nanos);
+        Window { count, failed, p50, p99, max, lasted }
+    }
+
+    /// Whether a question that is asked from now on is answered in time.
+    pub(super) fn answers_again(&mut self) -> bool {
+        self.hip.ask("again") == "1"
+    }
+
+    /// What the attacked node refused in its life.
+    pub(super) fn refused(&mut self) -> Refused {
+        self.knee.refused()
     }
 
     /// What both have seen.
@@ -209,13 +251,19 @@ fn limited(command: &Command, descriptors: u32) -> Command {
     limited
 }
 
-fn configuration(directory: &Path, group: std::net::SocketAddrV4, who: Who, keys: Option<&Path>) -> PathBuf {
+/// Writes one, with these further lines of its table `gncl`.
+fn configuration(
+    directory: &Path,
+    group: std::net::SocketAddrV4,
+    (who, keys): (Who, Option<&Path>),
+    gncl: &str,
+) -> PathBuf {
     let path = directory.join(format!("{}.toml", who.name));
     let (name, address, socket) = (who.name, who.address(), directory.join(format!("{}.sock", who.name)));
     let keys = keys.map_or_else(|| "false".to_owned(), |keys| format!("{keys:?}"));
     let text = format!(
         "[node]\nname = \"{name}\"\naddress = \"{address}\"\nproject = \"{PROJECT}\"\n[lncl]\nsocket = {socket:?}\n\
-         [gncl]\nport = {GNCL_PORT}\n[ndl]\ninterface = \"{address}\"\nport = {NDL_PORT}\nmulticast = \"{group}\"\n\
+         [gncl]\nport = {GNCL_PORT}\n{gncl}[ndl]\ninterface = \"{address}\"\nport = {NDL_PORT}\nmulticast = \"{group}\"\n\
          mdns_port = false\nperiod_ms = 100\n[security]\nkeys = {keys}\n"
     );
     std::fs::write(&path, text).expect("the scene's own directory");

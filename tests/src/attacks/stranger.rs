@@ -7,7 +7,7 @@ use std::{
         Arc,
         atomic::{AtomicU64, Ordering},
     },
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use bytes::BytesMut;
@@ -205,6 +205,24 @@ impl Stranger {
         self.send(&Header::new(Kind::GNCL_ACK, gncl(own.node()), gncl(peer)), &words(&ack))?;
         while self.receive()?.header.kind != Kind::GNCL_ACK {}
         Ok(())
+    }
+
+    /// Waits until the node says that it has taken all messages up to this one: who goes before loses what is under way.
+    pub(super) fn wait_for_taken(&mut self, last: u64) -> io::Result<()> {
+        let until = Instant::now() + PATIENCE;
+        while Instant::now() < until {
+            let message = self.receive()?;
+            if message.header.kind != Kind::GNCL_ACK {
+                continue;
+            }
+            let ack: Ack = decode(&message.payload).map_err(io::Error::other)?;
+            if ack.next > last {
+                return Ok(());
+            }
+        }
+        Err(io::Error::other(format!(
+            "the node did not say within {PATIENCE:?} that it has taken message {last}"
+        )))
     }
 
     /// Sends one frame.

@@ -42,8 +42,13 @@ pub(super) fn ten_thousand(scene: &Scene<'_>) -> Happened {
     if made == 0 {
         broken.push("no connection was made".to_owned());
     }
-    Happened {
-        what: format!("{made} made, {most} open at this end at once; the longest took {longest:.0?}"),
+    Happened::new(
+        format!("{made} made, {most} of {HELD} open at this end at once; the longest took {longest:.0?}"),
         broken,
-    }
+    )
+}
+
+/// The same to a node that has no descriptors for them: it has run out of them, else this shows nothing.
+pub(super) fn until_none_are_left(scene: &Scene<'_>) -> Happened {
+    Happened { refused: vec![("not accepted", 1)], ..ten_thousand(scene) }
 }

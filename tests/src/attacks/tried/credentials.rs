@@ -1,6 +1,14 @@
 //! Who shows what is not his, or nothing.
 
-use std::{sync::Arc, time::Duration};
+use std::{
+    collections::BTreeMap,
+    io,
+    path::Path,
+    sync::{Arc, mpsc::sync_channel},
+    time::{Duration, Instant},
+};
+
+use sinew::security::rustls::{AlertDescription, Error};
 
 use super::{
     super::{
@@ -9,88 +17,208 @@ use super::{
         stranger::{Answer, Client, Stranger, client},
     },
     Happened, Scene,
+    datagrams::NOT_OURS,
 };
 use crate::clients::Performer;
 
 /// Time between two handshakes.
 const PACE: Duration = Duration::from_millis(20);
 
+/// The node's words for who has not proven who he is, and for who has proven to be another one.
+const NOT_PROVEN: &str = "peer not proven";
+const SECURITY: &str = "security";
+
+/// What a node says of every certificate that it reads and does not take: why is for its own log.
+const NOT_TAKEN: AlertDescription = AlertDescription::CertificateUnknown;
+
+/// How an attempt is to end.
+#[derive(Clone, Copy)]
+enum Expected {
+    /// By an alert of TLS. Where the node has closed before this end has read it, the system says that the connection was cut.
+    Alert(AlertDescription),
+    /// By a REFUSAL whose sentence has these words.
+    Refusal(&'static str),
+}
+
+impl Expected {
+    /// The cause under which the node counts such an end.
+    const fn cause(self) -> &'static str {
+        match self {
+            Self::Alert(_) => NOT_PROVEN,
+            Self::Refusal(_) => SECURITY,
+        }
+    }
+}
+
 /// What became of handshakes.
 #[derive(Default)]
 struct Tally {
     tried: u64,
     came_in: u64,
+    /// Ended as they are to.
+    as_expected: u64,
+    /// Ended without a word that this end could read.
+    cut: u64,
+    /// Of one that ended as it is to.
     words: Option<String>,
+    /// Of one that ended otherwise.
+    otherwise: Option<String>,
 }
 
 impl Tally {
-    fn happened(self, who: &str) -> Happened {
-        let Self { tried, came_in, words } = self;
-        let words = words.unwrap_or_else(|| "nothing".to_owned());
+    fn note(&mut self, answer: io::Result<Answer>, expected: Expected) {
+        self.tried += 1;
+        let words = match (answer, expected) {
+            (Ok(Answer::Welcome), _) => {
+                self.came_in += 1;
+                return;
+            }
+            (Ok(Answer::Refused(words)), Expected::Refusal(part)) if words.contains(part) => words,
+            (Ok(Answer::Refused(words)), _) => return self.otherwise = Some(words),
+            (Err(error), Expected::Alert(alert)) if alert_of(&error) == Some(alert) => error.to_string(),
+            (Err(error), Expected::Alert(_)) if is_cut(&error) => return self.cut += 1,
+            (Err(error), _) => return self.otherwise = Some(error.to_string()),
+        };
+        self.as_expected += 1;
+        self.words = Some(words);
+    }
+
+    fn happened(self, who: &str, expected: Expected) -> Happened {
+        let Self { tried, came_in, as_expected, cut, words, otherwise } = self;
         let mut broken = Vec::new();
         if came_in > 0 {
             broken.push(format!("{who}: {came_in} of {tried} came in"));
         }
-        if tried == 0 {
-            broken.push(format!("{who}: nothing was tried"));
+        if as_expected == 0 {
+            broken.push(format!("{who}: none of {tried} was refused as it is to be, {cut} were cut"));
         }
-        Happened { what: format!("{who}: {tried} tried, {came_in} came in; told: {words}"), broken }
+        broken.extend(otherwise.map(|words| format!("{who}: one ended otherwise: {words}")));
+        let words = words.unwrap_or_else(|| "nothing".to_owned());
+        let what = format!("{who}: {tried} tried, {came_in} came in, {cut} cut; told: {words}");
+        Happened { refused: vec![(expected.cause(), tried)], ..Happened::new(what, broken) }
     }
 }
 
-/// Shows this, and says that it is `says`, again and again for so long.
-fn shake(scene: &Scene<'_>, lasts: Duration, shows: Option<&Arc<Client>>, says: Who) -> Tally {
-    let until = std::time::Instant::now() + lasts;
+fn alert_of(error: &io::Error) -> Option<AlertDescription> {
+    match error.get_ref()?.downcast_ref::<Error>()? {
+        Error::AlertReceived(alert) => Some(*alert),
+        _ => None,
+    }
+}
+
+fn is_cut(error: &io::Error) -> bool {
+    use io::ErrorKind::{BrokenPipe, ConnectionAborted, ConnectionReset, UnexpectedEof};
+    matches!(error.kind(), BrokenPipe | ConnectionAborted | ConnectionReset | UnexpectedEof)
+}
+
+/// Who tries, what he shows, and how that is to end.
+struct Attempt<'a> {
+    who: &'static str,
+    shows: Option<&'a Arc<Client>>,
+    says: Who,
+    expected: Expected,
+}
+
+/// Tries it again and again for so long.
+fn shake(scene: &Scene<'_>, lasts: Duration, attempt: &Attempt<'_>) -> Happened {
+    let &Attempt { who, shows, says, expected } = attempt;
+    let until = Instant::now() + lasts;
     let mut tallies = scene.on_threads(1, |_| {
         let mut tally = Tally::default();
-        while !scene.is_over() && std::time::Instant::now() < until {
-            tally.tried += 1;
+        while !scene.is_over() && Instant::now() < until {
             let answer = Stranger::dial(scene.robot.knee(), shows)
                 .and_then(|mut stranger| stranger.hello(says, scene.robot.knee_address()));
-            match answer {
-                Ok(Answer::Welcome) => tally.came_in += 1,
-                Ok(Answer::Refused(words)) => tally.words = Some(words),
-                Err(error) => tally.words = tally.words.or_else(|| Some(error.to_string())),
-            }
+            tally.note(answer, expected);
             scene.rest(PACE);
         }
         tally
     });
-    tallies.pop().unwrap_or_default()
+    tallies.pop().unwrap_or_default().happened(who, expected)
 }
 
 fn together(parts: Vec<Happened>) -> Happened {
-    let what = parts.iter().map(|part| &*part.what).collect::<Vec<_>>().join("; ");
-    Happened { what, broken: parts.into_iter().flat_map(|part| part.broken).collect() }
+    let mut all = Happened::default();
+    let mut refused: BTreeMap<&'static str, u64> = BTreeMap::new();
+    let mut what = Vec::new();
+    for part in parts {
+        what.push(part.what);
+        all.broken.extend(part.broken);
+        for (cause, count) in part.refused {
+            *refused.entry(cause).or_default() += count;
+        }
+    }
+    Happened { what: what.join("; "), refused: refused.into_iter().collect(), ..all }
+}
+
+/// Starts a whole node with these keys, or none, does this meanwhile, and looks whether the node has got in. It says `up` when it has an
+/// answer.
+fn beside_a_node(scene: &Scene<'_>, keys: Option<&Path>, tries: impl FnOnce() -> Vec<Happened>) -> Happened {
+    let command = scene.robot.foreign_node(&scene.hosts[ATTACKER], keys);
+    let (say, said) = sync_channel(16);
+    let node = Performer::start_command(command, "robot-node", move |line| {
+        // What it says beyond that is not needed: one word is enough.
+        let _ = say.try_send(line.to_owned());
+    });
+    let mut parts = tries();
+    drop(node);
+    let broken = said.iter().map(|line| format!("a foreign node has got in, and says {line:?}")).collect();
+    // Only a whole node speaks discovery: it has truly tried if that was refused.
+    let whole = Happened::new("a whole node was started".to_owned(), broken);
+    parts.push(Happened { refused: vec![(NOT_OURS, 1)], ..whole });
+    together(parts)
 }
 
 pub(super) fn wrong_authority(scene: &Scene<'_>) -> Happened {
     let theirs = scene.keys.of_others(keys::MALLORY);
-    // It never gets an answer, and so never comes up.
-    let command = scene.robot.foreign_node(&scene.hosts[ATTACKER], Some(&theirs));
-    let node =
-        Performer::start_command(command, "robot-node", |line| assert_ne!(line, "up", "it has got in"));
-    let by = scene.keys.tls_of_others(keys::MALLORY);
-    let half = scene.lasts / 2;
-    let own = shake(scene, half, Some(&by), keys::MALLORY).happened("as itself");
-    let by = scene.keys.tls_of_others(keys::HIP);
-    let hip = shake(scene, half, Some(&by), keys::HIP).happened("as hip, with a certificate that says so");
-    drop(node);
-    together(vec![own, hip])
+    let [own, hip] = [keys::MALLORY, keys::HIP].map(|who| scene.keys.tls_of_others(who));
+    let expected = Expected::Alert(NOT_TAKEN);
+    beside_a_node(scene, Some(&theirs), || {
+        let attempts = [
+            Attempt { who: "as itself", shows: Some(&own), says: keys::MALLORY, expected },
+            Attempt {
+                who: "as hip, with a certificate that says so",
+                shows: Some(&hip),
+                says: keys::HIP,
+                expected,
+            },
+        ];
+        attempts.iter().map(|attempt| shake(scene, scene.lasts / 2, attempt)).collect()
+    })
 }
 
 pub(super) fn none(scene: &Scene<'_>) -> Happened {
-    let half = scene.lasts / 2;
-    let tls = shake(scene, half, Some(&client(None)), keys::MALLORY).happened("TLS");
-    let open = shake(scene, half, None, keys::MALLORY).happened("without TLS");
-    together(vec![tls, open])
+    let nothing = client(None);
+    beside_a_node(scene, None, || {
+        let attempts = [
+            Attempt {
+                who: "TLS",
+                shows: Some(&nothing),
+                says: keys::MALLORY,
+                expected: Expected::Alert(AlertDescription::CertificateRequired),
+            },
+            Attempt {
+                who: "without TLS",
+                shows: None,
+                says: keys::MALLORY,
+                expected: Expected::Refusal("you do not speak TLS"),
+            },
+        ];
+        attempts.iter().map(|attempt| shake(scene, scene.lasts / 2, attempt)).collect()
+    })
 }
 
 pub(super) fn stolen(scene: &Scene<'_>) -> Happened {
-    let (third, spare) = (scene.lasts / 3, scene.keys.tls(keys::SPARE));
-    let hip = shake(scene, third, Some(&spare), keys::HIP).happened("as hip");
-    let knee = shake(scene, third, Some(&spare), keys::KNEE).happened("as knee itself");
-    let revoked = scene.keys.tls(keys::REVOKED);
-    let revoked = shake(scene, third, Some(&revoked), keys::REVOKED).happened("revoked");
-    together(vec![hip, knee, revoked])
+    let (spare, revoked) = (scene.keys.tls(keys::SPARE), scene.keys.tls(keys::REVOKED));
+    let another = Expected::Refusal("your certificate is of node");
+    let attempts = [
+        Attempt { who: "as hip", shows: Some(&spare), says: keys::HIP, expected: another },
+        Attempt { who: "as knee itself", shows: Some(&spare), says: keys::KNEE, expected: another },
+        Attempt {
+            who: "revoked",
+            shows: Some(&revoked),
+            says: keys::REVOKED,
+            expected: Expected::Alert(NOT_TAKEN),
+        },
+    ];
+    together(attempts.iter().map(|attempt| shake(scene, scene.lasts / 3, attempt)).collect())
 }

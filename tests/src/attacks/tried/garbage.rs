@@ -6,7 +6,7 @@ use std::{
     time::Duration,
 };
 
-use super::{Happened, Scene};
+use super::{Happened, Scene, datagrams::NOT_OURS};
 use crate::dice::Dice;
 
 const THREADS: usize = 3;
@@ -25,8 +25,11 @@ pub(super) fn pour(scene: &Scene<'_>) -> Happened {
     let broken =
         if datagrams == 0 || bytes == 0 { vec!["nothing was poured".to_owned()] } else { Vec::new() };
     Happened {
-        what: format!("{} MiB by TCP, {datagrams} datagrams of {DATAGRAM} bytes", bytes >> 20),
-        broken,
+        refused: vec![(NOT_OURS, 1)],
+        ..Happened::new(
+            format!("{} MiB by TCP, {datagrams} datagrams of {DATAGRAM} bytes", bytes >> 20),
+            broken,
+        )
     }
 }
 

@@ -1,6 +1,12 @@
 //! Who begins handshakes of TLS, which cost the node more than himself, and ends none.
 
-use std::{collections::VecDeque, io::Write as _, net::TcpStream, sync::Arc, time::Duration};
+use std::{
+    collections::VecDeque,
+    io::{Read as _, Write as _},
+    net::TcpStream,
+    sync::Arc,
+    time::Duration,
+};
 
 use sinew::security::{Tls, rustls::ClientConnection};
 
@@ -25,7 +31,7 @@ pub(super) fn beginning(client: &Arc<Client>) -> Vec<u8> {
 pub(super) fn begun(scene: &Scene<'_>) -> Happened {
     let beginning = beginning(&client(None));
     let begun = scene.on_threads(THREADS, |_| {
-        let (mut begun, mut held) = (0_u64, VecDeque::new());
+        let (mut begun, mut answered, mut held) = (0_u64, 0_u64, VecDeque::new());
         while !scene.is_over() {
             let connected = TcpStream::connect_timeout(&scene.robot.knee(), PATIENCE);
             if let Ok(mut socket) = connected {
@@ -34,12 +40,24 @@ pub(super) fn begun(scene: &Scene<'_>) -> Happened {
                 held.push_back(socket);
             }
             if held.len() > HELD {
-                held.pop_front();
+                answered += u64::from(held.pop_front().is_some_and(|socket| is_answered(&socket)));
             }
         }
-        begun
+        (begun, answered + held.iter().filter(|socket| is_answered(socket)).count() as u64)
     });
-    let begun: u64 = begun.iter().sum();
-    let broken = if begun == 0 { vec!["no handshake was begun".to_owned()] } else { Vec::new() };
-    Happened { what: format!("{begun} begun"), broken }
+    let (begun, answered) = begun.iter().fold((0, 0), |sum, one| (sum.0 + one.0, sum.1 + one.1));
+    let mut broken = Vec::new();
+    if begun == 0 || answered == 0 {
+        broken.push(format!("{begun} handshakes were begun, and {answered} answered: the node had no work"));
+    }
+    Happened::new(format!("{begun} begun, {answered} answered with the node's own beginning"), broken)
+}
+
+/// Whether the node has done its part, and has sent its ServerHello.
+fn is_answered(mut socket: &TcpStream) -> bool {
+    const HANDSHAKE_RECORD: u8 = 0x16;
+    let mut first = [0];
+    socket.set_nonblocking(true).is_ok()
+        && socket.read(&mut first).is_ok_and(|count| count == 1)
+        && first == [HANDSHAKE_RECORD]
 }

@@ -27,15 +27,16 @@ pub(super) fn forged(scene: &Scene<'_>) -> Happened {
             if own == 0 || forged == 0 {
                 broken.push("nothing was sent".to_owned());
             }
+            let what = format!("{own} messages in its own name, {forged} in that of hip and of knee");
             Happened {
-                what: format!("{own} messages in its own name, {forged} in that of hip and of knee"),
-                broken,
+                own_sent: own,
+                refused: vec![("forged source", forged)],
+                ..Happened::new(what, broken)
             }
         }
-        Err(error) => Happened {
-            what: format!("its link broke: {error}"),
-            broken: vec!["no link to try it on".to_owned()],
-        },
+        Err(error) => {
+            Happened::new(format!("its link broke: {error}"), vec!["no link to try it on".to_owned()])
+        }
     }
 }
 
@@ -56,6 +57,7 @@ fn speak(scene: &Scene<'_>) -> io::Result<[u64; 2]> {
         }
         std::thread::sleep(Duration::from_millis(1));
     }
+    stranger.wait_for_taken(number)?;
     Ok(sent)
 }
 
