@@ -100,10 +100,8 @@ impl Tally {
 }
 
 fn alert_of(error: &io::Error) -> Option<AlertDescription> {
-    match error.get_ref()?.downcast_ref::<Error>()? {
-        Error::AlertReceived(alert) => Some(*alert),
-        _ => None,
-    }
+    let Error::AlertReceived(alert) = error.get_ref()?.downcast_ref::<Error>()? else { return None };
+    Some(*alert)
 }
 
 fn is_cut(error: &io::Error) -> bool {
