@@ -70,6 +70,11 @@ pub(crate) fn configuration(bytes: &[u8]) -> bool {
     is_key || others.contains(&true)
 }
 
+/// One that `sinew keys issue` made for a node: what is kept of it is the same.
+pub(crate) fn some_certificates() -> Vec<Vec<u8>> {
+    vec![include_bytes!("../../../fuzz/corpus/certificate/seed-node").to_vec()]
+}
+
 /// What a stranger shows in the handshake of TLS, before anything of it is proven.
 pub(crate) fn certificate(der: &[u8]) -> bool {
     let Ok(read) = Certificate::read(CertificateDer::from(der.to_vec())) else { return false };

@@ -86,7 +86,7 @@ pub const FORMATS: [Format; 14] = [
         name: "certificate",
         from: "a stranger, in the handshake of TLS",
         play: files::certificate,
-        seeds: Vec::new,
+        seeds: files::some_certificates,
     },
     Format { name: "trial", from: "a person, in a file", play: files::trial, seeds: files::some_trials },
     Format {
@@ -104,21 +104,28 @@ impl Format {
         FORMATS.into_iter().find(|format| format.name == name)
     }
 
-    /// Inputs to begin with: what the other side of the format writes, and what is kept in `corpus`, if that directory is there.
+    /// Inputs to begin with: what the other side of the format writes, and what is kept in its directory of `corpus`.
     ///
     /// # Errors
-    /// The directory is there and cannot be read.
+    /// That directory cannot be read, or is not there.
     pub fn inputs(&self, corpus: &Path) -> io::Result<Vec<Vec<u8>>> {
         let mut inputs = (self.seeds)();
         let kept = corpus.join(self.name);
-        if kept.is_dir() {
-            let mut paths =
-                std::fs::read_dir(kept)?.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>()?;
-            // The same seed means the same run, whatever order the system has.
-            paths.sort();
-            for path in paths {
-                inputs.push(std::fs::read(path)?);
-            }
+        let read = std::fs::read_dir(&kept);
+        // Without what is kept a run tries less, and would look the same.
+        let read = read.map_err(|error| {
+            let what = format!(
+                "no inputs of {} in {}: {error}; name the directory with --corpus",
+                self.name,
+                kept.display()
+            );
+            io::Error::new(error.kind(), what)
+        })?;
+        let mut paths = read.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>()?;
+        // The same seed means the same run, whatever order the system has.
+        paths.sort();
+        for path in paths {
+            inputs.push(std::fs::read(path)?);
         }
         Ok(inputs)
     }

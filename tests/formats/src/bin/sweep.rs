@@ -2,7 +2,7 @@
 //!
 //! `cargo run --release -p sinew-formats --bin sweep -- --executions 100000`; `--help` names the options.
 //!
-//! Exit code 101: a promise is broken. The input lies where the last lines say, and `--replay` plays it again.
+//! Exit code 1: a format has no directory of inputs, or none of its inputs was understood, which tries nothing. 101: a promise is broken. The input lies where the last lines say, and `--replay` plays it again.
 
 use std::{
     collections::VecDeque,
@@ -102,6 +102,12 @@ fn sweep(format: Format, arguments: &Arguments) -> std::io::Result<u64> {
         "{:<14} {count:>10} executions, {understood:>10} understood, {seconds:>7.1} s  ({})",
         format.name, format.from
     );
+    if understood == 0 {
+        return Err(std::io::Error::other(format!(
+            "{}: none of {count} inputs was understood: it tried nothing; see that its seeds are of today's format",
+            format.name
+        )));
+    }
     Ok(count)
 }
 
