@@ -77,6 +77,11 @@ impl List {
         self.clients.iter().filter(move |rule| rule.is_about(who))
     }
 
+    /// Whether a rule is about `who`.
+    pub(crate) fn is_about(&self, who: Applicant) -> bool {
+        self.about(who).next().is_some()
+    }
+
     /// Whether `who` may come in on a node that runs as the user `own`: that user and root may, and whoever a rule is about.
     ///
     /// # Errors

@@ -276,6 +276,16 @@ impl Access {
         lock(&self.holders).iter().any(|holder| holder.app == app && [own, 0].contains(&holder.uid))
     }
 
+    /// How many of these addresses processes of `uid` have, that was let in by a rule.
+    pub(crate) fn held_by(&self, uid: u32, is_held: impl Fn(AppAddress) -> bool) -> usize {
+        lock(&self.holders).iter().filter(|holder| holder.uid == uid && is_held(holder.app)).count()
+    }
+
+    /// Whether a rule is about processes of the user `own` in its group, of whom most are meant to do anything.
+    pub(crate) fn narrows(&self, own: Applicant) -> bool {
+        self.index.load().list.is_about(own)
+    }
+
     /// Whether the list may be read again on the word of a tool at `now`: [`ASKED_AT_ONCE`] times, and once a second.
     pub(crate) fn may_be_read(&self, now: Time) -> bool {
         let mut full = lock(&self.asked_to_read);

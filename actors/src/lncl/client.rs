@@ -41,7 +41,7 @@ use super::{
     strangers::Place,
 };
 use crate::{
-    access::Applicant,
+    access::{Access, Applicant},
     monitors::Cause,
     outlet::{LinkNumber, OutletLimits, StreamOutlet},
     ring::{Exchange, ExchangeError},
@@ -187,6 +187,7 @@ impl Client {
             let own = rustix::process::geteuid().as_raw();
             let allowed = access.may_register(own, peer.who, name.as_deref(), address);
             allowed.map_err(|why| super::RegisterError::NotAllowed(why.to_string()))?;
+            check_share(&server.stores, access, own, uid)?;
         }
         let address = address.map_or(any, Address::Fixed);
         let request = Request { address, name, requires: requires.clone(), kinds, owner: peer.owner() };
@@ -367,6 +368,19 @@ impl Client {
         let registered = Registered { node, app, node_name: config.name.clone(), payload_max, ring };
         payload::frame(Kind::LNCL_REGISTERED, payload::lncl_of(node), self.tid, &registered)
     }
+}
+
+/// Users whom the access list lets in leave room for the robot's own: each has half of the places at most.
+fn check_share(stores: &Stores, access: &Access, own: u32, uid: u32) -> Result<(), super::RegisterError> {
+    let limit = (stores.config.lncl.clients_max / 2).max(1);
+    let registry = lock(&stores.registry);
+    let is_held = |app| matches!(registry.owner_of(app), Some(Owner::Client { .. }));
+    if uid == own || uid == 0 || access.held_by(uid, is_held) < limit {
+        return Ok(());
+    }
+    Err(super::RegisterError::NotAllowed(format!(
+        "user {uid} has {limit} applications here, half of `lncl.clients_max`, and may not have more: end one, or raise it"
+    )))
 }
 
 fn encoded(message: &Message) -> BytesMut {

@@ -102,8 +102,14 @@ impl TestNode {
 
     /// One with this access list.
     pub(crate) fn start_guarded(access: &str) -> Self {
+        Self::start_guarded_with(access, |_| {})
+    }
+
+    /// The same, with a configuration of its own.
+    pub(crate) fn start_guarded_with(access: &str, change: impl FnOnce(&mut NodeConfig)) -> Self {
         let directory = TestDirectory::new();
         let mut config = NodeConfig::new("test");
+        change(&mut config);
         config.lncl.socket = Some(directory.path().join("node.sock"));
         let stores = Stores::for_test(config, Incarnation(1));
         Access::in_test(&stores, access);

@@ -19,7 +19,7 @@ use super::{
     supervisor_spec::SupervisorSpec,
 };
 use crate::{
-    access::{self, Access, AccessSummary, List},
+    access::{self, Access, AccessSummary, Applicant, List},
     config::{ConfigFaults, NodeConfig},
     inspect, log, process,
     secured::{KeyFault, Secured},
@@ -332,6 +332,15 @@ fn guard(stores: &Stores, list: Option<(PathBuf, List)>) {
             ?path,
             "the access list keeps out MISTAKES ONLY: without keys anybody who reaches this node can pose as any node and any application \
              of it. Make keys with `sinew keys init`, and set security.keys on all nodes"
+        );
+    }
+    let own =
+        Applicant { uid: rustix::process::geteuid().as_raw(), gid: rustix::process::getegid().as_raw() };
+    if access.narrows(own) {
+        log::warn!(
+            ?path,
+            "a [[client]] of the access list is about the node's own {own}: the robot's own processes have only the names and addresses that it \
+             lets them have. If it is meant for others, say their uid"
         );
     }
     stores.guard(Arc::new(access));

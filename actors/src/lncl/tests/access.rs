@@ -156,3 +156,18 @@ fn another_user_of_whom_no_rule_speaks_is_not_let_in() {
         assert!(why.contains("54321") && why.contains("[[client]]"), "{why}");
     }
 }
+
+#[test]
+fn another_user_has_half_of_the_places_at_most() {
+    let list = format!("[[client]]\nuid = {STRANGER}\n");
+    let node = TestNode::start_guarded_with(&list, |config| config.lncl.clients_max = 4);
+    let why = as_stranger(|| {
+        let _two = [(); 2].map(|()| RawClient::register(&node, &Register::default()));
+        let mut third = RawClient::connect(&node);
+        third.ask_for_address(&Register::default());
+        third.expect_refusal()
+    });
+    assert!(why.is_none_or(|why| why.contains("54321") && why.contains("`lncl.clients_max`")));
+    // The node's own user is not bound so.
+    (0..2).for_each(|_| drop(RawClient::register(&node, &Register::default())));
+}
