@@ -120,7 +120,8 @@ fn an_application_in_another_process_waits_for_one_in_the_nodes() {
     let api = NodeApi::connect(&socket).unwrap();
     // Given: what it requires waits itself, for a sensor that is not there.
     let hip = Registration::new().name("hip").requires(["drive"]);
-    let early = api.register_transport_address(hip.clone().deadline(Duration::from_millis(50)));
+    // Long enough for the node to say what is waited for.
+    let early = api.register_transport_address(hip.clone().deadline(Duration::from_secs(1)));
     assert!(early.unwrap_err().to_string().contains("drive"));
     // When: the sensor comes.
     let _sensor = api.register_transport_address(Registration::new().name("sensor")).unwrap();
