@@ -210,9 +210,13 @@ impl Core {
         let Announcement { node, incarnation, ref name, .. } = announcement;
         let name = name.clone();
         let gncl = announcement.gncl_addresses();
+        let mut sought = Vec::new();
         if let Some(gone) = self.gone.remove(&node) {
             let others = gone.places.into_iter().filter(|place| *place != from);
-            others.for_each(|place| self.forget_former(place, node));
+            let (announced, former): (Vec<_>, Vec<_>) =
+                others.partition(|place| announcement.ndl_addresses().any(|there| there == place.there));
+            former.into_iter().for_each(|place| self.forget_former(place, node));
+            sought.extend(announced.into_iter().filter(|place| self.seeks_former(*place, node)));
         }
         self.contact_at(now, from).role = Role::Member(node);
         let pace = self.pace_for(now, &name);
@@ -248,6 +252,7 @@ impl Core {
         });
         self.note_progress(node, progress);
         self.seek(now, node);
+        sought.into_iter().for_each(|place| self.ask_unless_just_asked(now, place));
     }
 
     /// A member is there in a new life. // spec: NDL-5.1
@@ -434,6 +439,18 @@ impl Core {
         if contact.is_seed {
             self.contacts.insert(place, Contact::seed(now));
         }
+    }
+
+    /// A node that is back says that it is also where it was asked last: what it is asked there already may make a route. Returns whether
+    /// it is asked there.
+    fn seeks_former(&mut self, place: Place, node: NodeAddress) -> bool {
+        let Some(contact) = self.contacts.get_mut(&place) else { return false };
+        let is_its = matches!(contact.role, Role::Former { node: former, .. } if former == node);
+        if is_its {
+            contact.role = Role::Candidate { asked: 0 };
+            contact.sources.clear();
+        }
+        is_its
     }
 
     fn forget_former(&mut self, place: Place, node: NodeAddress) {
