@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! ours    t1 --query-->            t4        offset = ((t2 - t1) + (t3 - t4)) / 2
-//! theirs         t2 --answer--> t3           bound  = ((t4 - t1) - (t3 - t2)) / 2
+//! theirs         t2 --answer--> t3           bound  = ((t4 - t1) - (t3 - t2)) / 2, and what the clocks drift apart from t1 to t4
 //! ```
 
 use std::{collections::VecDeque, time::Duration};
@@ -29,7 +29,7 @@ pub(super) struct Exchange {
 impl Exchange {
     /// Time on the network, the peer's thinking time not counted; `None` if the times contradict each other.
     pub(super) fn round_trip(self) -> Option<Duration> {
-        sample(self).map(|sample| Duration::from_nanos(sample.bound_ns * 2))
+        sample(self).map(|sample| sample.round_trip)
     }
 }
 
@@ -38,13 +38,13 @@ struct Sample {
     at: Time,
     offset_ns: i64,
     bound_ns: u64,
+    round_trip: Duration,
 }
 
 impl Sample {
     /// The bound now: the clocks drift on since the sample was taken.
     fn bound_at(&self, now: Time) -> u64 {
-        let age_us = u64::try_from(now.since(self.at).as_micros()).unwrap_or(u64::MAX);
-        self.bound_ns.saturating_add(age_us.saturating_mul(DRIFT_PPM) / 1_000)
+        self.bound_ns.saturating_add(drift_ns(now.since(self.at)))
     }
 }
 
@@ -59,7 +59,7 @@ impl PeerClock {
     /// Takes in an exchange; `false` if its times contradict each other. // spec: NDL-6
     pub(super) fn measure(&mut self, exchange: Exchange) -> bool {
         let Some(sample) = sample(exchange) else { return false };
-        self.round_trip = Some(Duration::from_nanos(sample.bound_ns * 2));
+        self.round_trip = Some(sample.round_trip);
         if self.samples.len() == SAMPLES_MAX {
             self.samples.pop_front();
         }
@@ -80,6 +80,12 @@ impl PeerClock {
     }
 }
 
+/// Nanoseconds by which two clocks drift apart in this time at most, rounded up.
+fn drift_ns(time: Duration) -> u64 {
+    let micros = u64::try_from(time.as_micros()).unwrap_or(u64::MAX).saturating_add(1);
+    micros.saturating_mul(DRIFT_PPM).div_ceil(1_000)
+}
+
 fn sample(exchange: Exchange) -> Option<Sample> {
     let [t1, t2, t3, t4] =
         [exchange.query_sent, exchange.query_received, exchange.answer_sent, exchange.answer_received]
@@ -90,8 +96,10 @@ fn sample(exchange: Exchange) -> Option<Sample> {
     }
     let offset_ns = i64::try_from(((t2 - t1) + (t3 - t4)) / 2).ok()?;
     // Rounded up: a bound errs on the safe side.
-    let bound_ns = u64::try_from((away - there + 1) / 2).ok()?;
-    Some(Sample { at: exchange.answer_received, offset_ns, bound_ns })
+    let half_ns = u64::try_from((away - there + 1) / 2).ok()?;
+    let drift_ns = drift_ns(exchange.answer_received.since(exchange.query_sent));
+    let (at, bound_ns) = (exchange.answer_received, half_ns.saturating_add(drift_ns));
+    Some(Sample { at, offset_ns, bound_ns, round_trip: Duration::from_nanos(half_ns.saturating_mul(2)) })
 }
 
 #[cfg(test)]
