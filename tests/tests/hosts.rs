@@ -31,15 +31,14 @@ fn start(
     node_under_test(Some(&hosts.all()[index]), &configuration(directory, index, group), more)
 }
 
+/// The hosts; where none can be made here, it says so, and the test that asks is skipped.
+fn or_say(hosts: Result<Hosts, String>) -> Option<Hosts> {
+    hosts.inspect_err(|why| println!("skipped: no hosts can be made here: {why}")).ok()
+}
+
 #[test]
 fn four_hosts_find_each_other_wait_talk_and_notice_a_cut_link() {
-    let hosts = match Hosts::new(4) {
-        Ok(hosts) => hosts,
-        Err(why) => {
-            println!("skipped: no hosts can be made here: {why}");
-            return;
-        }
-    };
+    let Some(hosts) = or_say(Hosts::new(4)) else { return };
     let (directory, group) = (OwnDirectory::new(), own_group());
 
     // Three are there, and wait for the fourth.
@@ -103,13 +102,7 @@ fn count_in(line: &str) -> Option<(u64, u64)> {
 
 #[test]
 fn a_link_whose_interface_is_taken_down_is_back_over_the_other_one_and_nothing_is_lost_or_comes_twice() {
-    let hosts = match Hosts::in_networks(2, 2) {
-        Ok(hosts) => hosts,
-        Err(why) => {
-            println!("skipped: no hosts can be made here: {why}");
-            return;
-        }
-    };
+    let Some(hosts) = or_say(Hosts::in_networks(2, 2)) else { return };
     let directory = OwnDirectory::new();
     let mut central =
         start_in_both(&hosts, &directory, 0, &["--requires", "hip", "--sends-to", "hip", "--logs"]);
@@ -160,13 +153,7 @@ fn has_lost_nobody(nodes: [&Program; 2]) {
 
 #[test]
 fn a_node_with_two_links_is_there_while_one_of_them_carries_and_lost_when_none_does() {
-    let hosts = match Hosts::in_networks(2, 2) {
-        Ok(hosts) => hosts,
-        Err(why) => {
-            println!("skipped: no hosts can be made here: {why}");
-            return;
-        }
-    };
+    let Some(hosts) = or_say(Hosts::in_networks(2, 2)) else { return };
     let (directory, group) = (OwnDirectory::new(), own_group());
     let sends = ["--requires", "hip", "--sends-to", "hip", "--logs"];
     let on = |index| (index, ["[\"10.77.0.1\", \"10.78.0.1\"]", "[\"10.77.0.2\", \"10.78.0.2\"]"][index]);
@@ -192,13 +179,7 @@ fn a_node_with_two_links_is_there_while_one_of_them_carries_and_lost_when_none_d
 
 #[test]
 fn an_interface_that_is_chosen_by_its_name_is_used_from_when_it_is_there() {
-    let hosts = match Hosts::in_networks(2, 2) {
-        Ok(hosts) => hosts,
-        Err(why) => {
-            println!("skipped: no hosts can be made here: {why}");
-            return;
-        }
-    };
+    let Some(hosts) = or_say(Hosts::in_networks(2, 2)) else { return };
     let (directory, group) = (OwnDirectory::new(), own_group());
     hosts.take_down(0, 1);
     let sends = ["--requires", "hip", "--sends-to", "hip", "--logs-info"];
