@@ -37,6 +37,8 @@ pub mod sender;
 pub mod supervision;
 pub mod tid;
 pub mod time;
+// A timerfd; `alarm` stands in for it elsewhere.
+#[cfg(target_os = "linux")]
 pub mod timer;
 pub mod wakes;
 pub mod wire;

@@ -7,7 +7,7 @@ mod stage;
 
 use std::{
     sync::{
-        Arc,
+        Arc, OnceLock,
         atomic::{AtomicBool, Ordering},
         mpsc::{Receiver, SyncSender, sync_channel},
     },
@@ -18,12 +18,13 @@ use actix::{Actor, Handler};
 use serde::{Deserialize, Serialize};
 use sinew_runtime::{
     app::{AppContext, AppSpec, Delivery},
+    mailbox::Mailbox,
     protection::{ArmError, Cause, Guard, Protection},
     tid::Tid,
     wire::{Class, Payload},
 };
 
-use self::stage::{DEADLINE, Stage};
+use self::stage::{DEADLINE, Number, Stage};
 
 const PERIOD: Duration = Duration::from_millis(20);
 
@@ -162,6 +163,183 @@ fn a_sender_that_falls_silent_leaves_the_output_safe() {
     assert!(scene.seen.recv_timeout(PERIOD * 20).is_err(), "nothing moves it");
     scene.sends.store(true, Ordering::Relaxed);
     scene.wait_for(|seen| *seen == Seen::Moved(12.5));
+}
+
+/// Guards what comes from each of some senders in turn, at each torque that is no torque of theirs.
+struct Turncoat {
+    senders: std::vec::IntoIter<Tid>,
+    guard: Option<Guard<()>>,
+}
+
+impl Turncoat {
+    fn turn(&mut self, context: &mut AppContext<Self>) {
+        let Some(sender) = self.senders.next() else { return };
+        self.guard = None;
+        self.guard = Some(context.guard::<Torque, _>(sender, (), |(), _| ()).unwrap());
+    }
+}
+
+impl Actor for Turncoat {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        self.turn(context);
+    }
+}
+
+impl Handler<Delivery<Number>> for Turncoat {
+    type Result = ();
+
+    fn handle(&mut self, _: Delivery<Number>, context: &mut Self::Context) {
+        self.turn(context);
+    }
+}
+
+/// Does nothing.
+struct Idle;
+
+impl Actor for Idle {
+    type Context = AppContext<Self>;
+}
+
+#[test]
+fn who_is_guarded_no_more_is_sent_no_echoes() {
+    let [old, new] = [0, 1].map(stage::tid);
+    let idle = |name| AppSpec::new(name, || Idle).own_thread().into();
+    let turncoat =
+        AppSpec::new("drive", move || Turncoat { senders: vec![old, new].into_iter(), guard: None });
+    let drive = turncoat.handles::<Number>().own_thread().into();
+    let stage = Stage::start(vec![idle("old"), idle("new"), drive]);
+    let echoes = |of: usize| stage.mailboxes[of].tally(Class::Stream).taken;
+    let wait_for = |of: usize, at_least: u64| {
+        let deadline = std::time::Instant::now() + DEADLINE;
+        while echoes(of) < at_least {
+            assert!(std::time::Instant::now() < deadline, "{at_least} echoes come");
+            std::thread::sleep(PERIOD);
+        }
+    };
+    wait_for(0, 2);
+    stage.send(2, 0);
+    wait_for(1, 1);
+    let so_far = echoes(0);
+    wait_for(1, 5);
+    assert_eq!(echoes(0), so_far, "the guard that asked for them is gone");
+}
+
+/// Protected, too, and from the same sender.
+#[derive(Debug, Serialize, Deserialize)]
+struct Stiffness {
+    nm_per_rad: f64,
+}
+
+/// As slow as a test may be on a busy machine.
+const UNHURRIED: Protection = Protection {
+    within: DEADLINE,
+    age_max: Duration::from_millis(400),
+    lost_max: 0,
+    bad_max: 1,
+    good_min: 4,
+};
+
+impl Payload for Stiffness {
+    const NAME: &'static str = "test.stiffness";
+    const CLASS: Class = Class::Stream;
+    const PROTECTION: Option<Protection> = Some(UNHURRIED);
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+struct Damping {
+    nms_per_rad: f64,
+}
+
+impl Payload for Damping {
+    const NAME: &'static str = "test.damping";
+    const CLASS: Class = Class::Stream;
+    const PROTECTION: Option<Protection> = Some(UNHURRIED);
+}
+
+/// Sends a stiffness and a damping for each number, and then looks at nothing until its drive has sent two more echoes.
+struct Busy {
+    drive: Tid,
+    mailbox: Arc<OnceLock<Arc<Mailbox>>>,
+}
+
+impl Actor for Busy {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<Number>> for Busy {
+    type Result = ();
+
+    fn handle(&mut self, _: Delivery<Number>, context: &mut Self::Context) {
+        context.send(self.drive, &Stiffness { nm_per_rad: 80.0 }).unwrap();
+        context.send(self.drive, &Damping { nms_per_rad: 1.0 }).unwrap();
+        let taken = || self.mailbox.wait().tally(Class::Stream).taken;
+        let (before, deadline) = (taken(), std::time::Instant::now() + DEADLINE);
+        while taken() < before + 2 && std::time::Instant::now() < deadline {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+}
+
+/// Guards both.
+struct Compliant {
+    central: Tid,
+    live: Arc<[AtomicBool; 2]>,
+    guards: Option<[Guard<()>; 2]>,
+}
+
+impl Actor for Compliant {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        let stiffness = context.guard::<Stiffness, _>(self.central, (), |(), _| ()).unwrap();
+        let damping = context.guard::<Damping, _>(self.central, (), |(), _| ()).unwrap();
+        self.guards = Some([stiffness, damping]);
+        context.every(PERIOD, |drive, _, _| {
+            for (guard, live) in drive.guards.iter().flatten().zip(&*drive.live) {
+                live.fetch_or(guard.arm().is_ok(), Ordering::Relaxed);
+            }
+        });
+    }
+}
+
+impl Handler<Delivery<Stiffness>> for Compliant {
+    type Result = ();
+
+    fn handle(&mut self, _: Delivery<Stiffness>, _: &mut Self::Context) {}
+}
+
+impl Handler<Delivery<Damping>> for Compliant {
+    type Result = ();
+
+    fn handle(&mut self, _: Delivery<Damping>, _: &mut Self::Context) {}
+}
+
+#[test]
+fn of_two_types_from_one_sender_neither_takes_the_others_echoes_away() {
+    let [central, drive] = [0, 1].map(stage::tid);
+    let (mailbox, live) = (Arc::new(OnceLock::new()), Arc::new([const { AtomicBool::new(false) }; 2]));
+    let (its_mailbox, its_live) = (mailbox.clone(), live.clone());
+    let busy = AppSpec::new("central", move || Busy { drive, mailbox: its_mailbox.clone() });
+    let compliant =
+        AppSpec::new("drive", move || Compliant { central, live: its_live.clone(), guards: None });
+    let compliant = compliant.handles::<Stiffness>().handles::<Damping>();
+    let stage =
+        Stage::start(vec![busy.handles::<Number>().own_thread().into(), compliant.own_thread().into()]);
+    mailbox.set(stage.mailboxes[0].clone()).ok().unwrap();
+    let deadline = std::time::Instant::now() + DEADLINE;
+    for number in 0.. {
+        let are_live = live.each_ref().map(|live| live.load(Ordering::Relaxed));
+        if are_live == [true; 2] {
+            break;
+        }
+        assert!(std::time::Instant::now() < deadline, "both can be armed: {are_live:?}");
+        stage.send(0, number);
+        while stage.mailboxes[0].tally(Class::Bulk).open() > 0 && std::time::Instant::now() < deadline {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
 }
 
 #[test]

@@ -254,6 +254,8 @@ pub(crate) trait Guarded: Send + Sync {
     fn take(&self, bytes: &Bytes) -> Verdict;
     /// The time that the sender is to quote.
     fn echo(&self) -> Time;
+    /// The one that it was told last.
+    fn last_echo(&self) -> Time;
 }
 
 impl<O: Send + 'static> Guarded for Shared<O> {
@@ -271,6 +273,10 @@ impl<O: Send + 'static> Guarded for Shared<O> {
 
     fn echo(&self) -> Time {
         self.decide(|receiver, now| receiver.echo(now))
+    }
+
+    fn last_echo(&self) -> Time {
+        self.lock().receiver.last_echo()
     }
 }
 

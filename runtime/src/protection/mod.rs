@@ -197,12 +197,16 @@ impl Tally {
 }
 
 /// From a receiver of protected messages to their sender: to be quoted in the next one.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Echo {
     /// The type that is protected.
     pub(crate) kind: Kind,
     /// Nanoseconds of the receiver's clock.
     pub(crate) at_ns: u64,
+    /// The same of the other types that it guards of this sender, as they were said last: of class Stream only the newest message may
+    /// arrive, whichever type it is for.
+    #[serde(default)]
+    pub(crate) others: Vec<(Kind, u64)>,
 }
 
 impl Payload for Echo {
@@ -212,6 +216,6 @@ impl Payload for Echo {
 
 impl Echo {
     pub(crate) const fn new(kind: Kind, at: Time) -> Self {
-        Self { kind, at_ns: at.as_nanos() }
+        Self { kind, at_ns: at.as_nanos(), others: Vec::new() }
     }
 }

@@ -72,6 +72,11 @@ impl Receiver {
         now
     }
 
+    /// The last of them; zero before there was one.
+    pub(crate) const fn last_echo(&self) -> Time {
+        self.echoes[0]
+    }
+
     /// The output is safe if the watchdog's time is over.
     pub(crate) fn expire(&mut self, now: Time) {
         if self.deadline().is_some_and(|deadline| now >= deadline) {

@@ -54,11 +54,15 @@ impl Flows {
         Some(seal(&Codename::of::<P>(source, destination), stamp, &encode(value)))
     }
 
-    /// `from` is to find this time in the next message that is sent to it.
+    /// `from` is to find these times in the next messages that are sent to it.
     pub(crate) fn heard(&self, from: Tid, echo: Echo) {
         let mut flows = self.flows.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(flow) = flows.get_mut(&(from, echo.kind)) {
-            flow.echo = Time::from_nanos(echo.at_ns);
+        let echoes = std::iter::once((echo.kind, echo.at_ns)).chain(echo.others);
+        // It comes from outside.
+        for (kind, at_ns) in echoes.take(FLOWS_MAX) {
+            if let Some(flow) = flows.get_mut(&(from, kind)) {
+                flow.echo = Time::from_nanos(at_ns);
+            }
         }
     }
 }

@@ -41,7 +41,7 @@ pub struct Word {
     pub t_ns: u64,
     /// Torque to give, Nm; `None`: no command, only a wish for readings.
     pub torque_nm: Option<f64>,
-    /// Whether walking is released.
+    /// Whether walking is released, by a word of central's that counts: not while the drive believes none.
     pub released: bool,
     /// Whether the torque law met its limit.
     pub saturated: bool,

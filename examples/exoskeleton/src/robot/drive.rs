@@ -5,17 +5,20 @@
 //! when all three sensors do; until then, and until walking is released, the torque is zero. Inputs carry
 //! the time at which they were sent, in this host's clock ([`Delivery::sent`]). Silence of an input is noticed twice,
 //! independently: by the core, which refuses what is older than 10 ms in the tick in which it would use it, and by the
-//! runtime's input watchdogs, which write it down. When it is told to stop, the torque ramps to zero first.
+//! runtime's input watchdogs, which write it down. What central says is protected from end to end, by `PROTECTION` of
+//! [`GaitState`]: a guard lets through what is central's, whole, in order and young; else it is shut, until the drive
+//! opens it, in a state in which no torque comes of central's word. When it is told to stop, the torque ramps to zero first.
 
 use std::path::{Path, PathBuf};
 
 use sinew::ReadyGate;
 use sinew::prelude::*;
+use sinew::protection::{Guard, State};
 
 use super::PERIOD;
 use super::device::{DriveCommand, JointDevice};
 use super::edges::{
-    AS_LONG_AS_IT_TAKES, Addressee, DRIVES, EmergencyStop, GAIT, Reset, STATUS, STOP, drive_name, sensor_name,
+    AS_LONG_AS_IT_TAKES, Addressee, EmergencyStop, GAIT, Reset, STATUS, STOP, drive_name, sensor_name,
 };
 use super::figures::LoopFigures;
 use super::sensor::DeviceMaker;
@@ -50,7 +53,12 @@ pub struct Drive {
     core: DriveCore,
     device: Box<dyn JointDevice>,
     sample: Option<JointSample>,
-    gait: Option<GaitState>,
+    /// Central's newest word, for as long as all that comes from there is good.
+    word: Option<Word>,
+    /// Whether it was said that central's word cannot be guarded.
+    unguarded: bool,
+    /// Whether central was heard in this life.
+    central_heard: bool,
     ticked_at: Option<Time>,
     figures: LoopFigures,
     stopping: bool,
@@ -59,6 +67,14 @@ pub struct Drive {
     central: Addressee,
     /// Reached when all inputs are there for the first time.
     ready: Option<ReadyGate>,
+}
+
+/// What central says, behind the guard that lets nothing else through.
+struct Word {
+    /// Whose word it is.
+    central: Tid,
+    /// Empties it as soon as it is not to be used.
+    guard: Guard<Option<GaitState>>,
 }
 
 /// Declares the drive of a joint.
@@ -86,7 +102,9 @@ impl Drive {
             ready: None,
             parts,
             sample: None,
-            gait: None,
+            word: None,
+            unguarded: false,
+            central_heard: false,
             ticked_at: None,
             figures: LoopFigures::default(),
             stopping: false,
@@ -95,10 +113,11 @@ impl Drive {
 
     fn tick(&mut self, tick: Tick, context: &mut AppContext<Self>) {
         let now = Time::now();
-        let output = self.core.tick(now.as_nanos(), self.sample.as_ref(), self.gait.as_ref());
+        let gait = self.word(now, context);
+        let output = self.core.tick(now.as_nanos(), self.sample.as_ref(), gait.as_ref());
+        self.arm();
         if let Some(torque_nm) = output.command_nm {
-            let released =
-                self.gait.is_some_and(|gait| !matches!(gait.mode, GaitMode::Hold | GaitMode::Stop));
+            let released = gait.is_some_and(|gait| !matches!(gait.mode, GaitMode::Hold | GaitMode::Stop));
             let (saturated, state) = (output.saturated, output.state);
             self.device.command(now, &DriveCommand { torque_nm, released, saturated, state });
         }
@@ -125,6 +144,39 @@ impl Drive {
                     .command(now, &DriveCommand { torque_nm: 0.0, released: false, saturated: false, state });
             }
             context.stop();
+        }
+    }
+
+    /// What central says, if that is good. Guarded from the moment on at which it is there.
+    fn word(&mut self, now: Time, context: &mut AppContext<Self>) -> Option<GaitState> {
+        let central = self.central.at(now, context)?;
+        if self.word.as_ref().is_none_or(|word| word.central != central) {
+            // What another life of central has said is worth nothing any more.
+            self.word = None;
+            let guard =
+                context.guard::<GaitState, _>(central, None, |word: &mut Option<GaitState>, _| *word = None);
+            match guard {
+                Ok(guard) => self.word = Some(Word { central, guard }),
+                // Tried again in the next tick, and said once.
+                Err(error) if !std::mem::replace(&mut self.unguarded, true) => {
+                    let joint = self.parts.joint;
+                    tracing::error!(%joint, %error, "central's word cannot be guarded: no torque comes of it");
+                }
+                Err(_) => {}
+            }
+        }
+        self.word.as_ref()?.guard.apply(|word| *word).ok().flatten()
+    }
+
+    /// Lets central's word count from now on, where no torque comes of it: that somebody has to say before there is any is
+    /// the release's matter.
+    fn arm(&self) {
+        if let Some(Word { guard, .. }) = &self.word
+            && self.core.state() != DriveState::Walk
+            && guard.state() != State::Live
+        {
+            // Refused until eight good ones have come in a row.
+            let _ = guard.arm();
         }
     }
 
@@ -205,7 +257,6 @@ impl Actor for Drive {
 
     fn started(&mut self, context: &mut Self::Context) {
         self.ready = context.hold_ready();
-        context.join(DRIVES);
         context.join(STOP);
         context.every(PERIOD, Self::tick);
     }
@@ -247,16 +298,21 @@ impl Handler<Delivery<GaitState>> for Drive {
     type Result = ();
 
     fn handle(&mut self, gait: Delivery<GaitState>, context: &mut Self::Context) {
-        if self.central.at(Time::now(), context) != Some(gait.source) {
+        // What is not central's, damaged, old, repeated or out of order does not come here.
+        let Some(word) = self.word.as_ref().filter(|word| word.central == gait.source) else {
+            context.reject();
+            return;
+        };
+        let gait = GaitState { t_ns: gait.sent.as_nanos(), ..gait.payload };
+        if word.guard.apply(|word| *word = Some(gait)).is_err() {
             context.reject();
             return;
         }
-        if self.gait.is_none() {
+        if !std::mem::replace(&mut self.central_heard, true) {
             context.expect::<GaitState>(None, SILENCE_MAX, |this, silence, _| {
                 this.note_silence("gait state", silence);
             });
         }
-        self.gait = Some(GaitState { t_ns: gait.sent.as_nanos(), ..gait.payload });
     }
 }
 

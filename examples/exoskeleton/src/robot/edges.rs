@@ -1,6 +1,7 @@
 //! What crosses an edge between applications: classes and names of the messages, names of applications and groups.
 
 use sinew::prelude::{Actor, AppContext, Class, Duration, Payload, Tid, Time, payload};
+use sinew::protection::Protection;
 
 use crate::joint::Joint;
 use crate::message::{DriveStatus, FootLoad, GaitMode, GaitState, JointSample, TorqueSet};
@@ -10,8 +11,6 @@ pub(super) const AS_LONG_AS_IT_TAKES: Duration = Duration::from_secs(7 * 24 * 36
 
 /// Name of the application that estimates the phase.
 pub const GAIT: &str = "central.gait";
-/// Group of the drives: central's word to all three.
-pub const DRIVES: &str = "exo.drives";
 /// Group of those who stop when the e-stop is pressed: the drives and central's gait.
 pub const STOP: &str = "exo.stop";
 /// Group of those who want to know how things stand.
@@ -33,6 +32,16 @@ impl Payload for FootLoad {
 impl Payload for GaitState {
     const NAME: &'static str = "exo.gait_state";
     const CLASS: Class = Class::Stream;
+    /// Torque comes of it, so it is protected from central's gait to each drive. A drive uses a word for 10 ms, as the one
+    /// that replaces it may be late or lost; central quotes a drive's clock that is at most an echo's period, the way and
+    /// its own millisecond old.
+    const PROTECTION: Option<Protection> = Some(Protection {
+        within: Duration::from_millis(10),
+        age_max: Duration::from_millis(60),
+        lost_max: 9,
+        bad_max: 1,
+        good_min: 8,
+    });
 }
 
 impl Payload for TorqueSet {

@@ -12,8 +12,8 @@ use sinew::{Down, NodeAddress, ReadyGate};
 use super::PERIOD;
 use super::drive::micros;
 use super::edges::{
-    AS_LONG_AS_IT_TAKES, DRIVES, EmergencyStop, GAIT, GaitStatus, Release, Reset, STATUS, STOP,
-    joint_of_sensor, sensor_name,
+    AS_LONG_AS_IT_TAKES, Addressee, EmergencyStop, GAIT, GaitStatus, Release, Reset, STATUS, STOP,
+    drive_name, joint_of_sensor, sensor_name,
 };
 use super::trace::{EventRow, GaitRow, Trace};
 use crate::central::{CentralConfig, CentralCore, CentralInput, Resume, bit};
@@ -50,6 +50,8 @@ struct Gone {
 pub struct Gait {
     parts: GaitParts,
     core: CentralCore,
+    /// Whom the gait is told, one by one: what moves a joint is protected from here to its drive.
+    drives: PerJoint<Addressee>,
     samples: PerJoint<Option<JointSample>>,
     load: Option<FootLoad>,
     gone: PerJoint<Gone>,
@@ -87,6 +89,7 @@ impl Gait {
         Self {
             parts,
             core: CentralCore::new(CentralConfig { epoch, resume, ..CentralConfig::default() }),
+            drives: Joint::ALL.map(|joint| Addressee::new(drive_name(joint))),
             samples: [None; 3],
             load: None,
             gone: [Gone::default(); 3],
@@ -103,8 +106,12 @@ impl Gait {
             CentralInput { samples: self.samples.each_ref().map(Option::as_ref), load: self.load.as_ref() };
         let state = self.core.tick(now.as_nanos(), &input);
         if let Some(state) = &state {
-            // Before a drive has joined there is nobody to hear it.
-            let _ = context.send(Tid::group(DRIVES), state);
+            for drive in &mut self.drives {
+                if let Some(drive) = drive.at(now, context) {
+                    // One that cannot be reached hears nothing, and lets go by itself.
+                    let _ = context.send(drive, state);
+                }
+            }
             if let Some(gate) = self.ready.take() {
                 gate.reached();
             }

@@ -9,7 +9,7 @@
 //!   |                             |                  |      | JointSample              |
 //!   |                             |   GaitState      |      v                          |
 //!   |                             | ---------------> | X.drive   1 kHz                 |
-//!   |                             |  exo.drives      |   requires the three sensors    |
+//!   |                             |  protected       |   requires the three sensors    |
 //!   | central.coordinator         |                  |   and central.gait              |
 //!   |   requires the drives,      | <--------------- |                                 |
 //!   |   then releases             |  DriveStatus     |                                 |

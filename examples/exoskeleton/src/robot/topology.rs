@@ -181,7 +181,7 @@ impl Topology {
         config.address = Some(place.address);
         config.ndl.interface = place.interface.into();
         config.ndl.port = place.port;
-        config.ndl.seeds.clone_from(&place.seeds);
+        config.ndl.seeds = place.seeds.iter().copied().map(Into::into).collect();
         config.ndl.multicast = self.discovery.multicast;
         config.ndl.mdns_port = self.discovery.mdns.then_some(MDNS_PORT);
         config.ndl.period = self.discovery.period;
