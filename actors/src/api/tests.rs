@@ -49,17 +49,21 @@ impl Payload for Setpoint {
 
 pub(super) const TORQUE: Torque = Torque { newton_metres: 2.5 };
 
-/// Every claim of NodeAPI holds whatever carries the messages, and whoever waits.
+/// Every claim of NodeAPI holds whatever carries the messages, and in every form. `; in_rust:` are those of which `forms/in_c.rs`
+/// says why C has them not.
 macro_rules! on_every_transport {
-    ($($claim:ident)*) => {
-        on_every_transport!(ring Ring Thread false, $($claim)*);
-        on_every_transport!(direct Ring Thread true, $($claim)*);
-        on_every_transport!(socket Socket Thread false, $($claim)*);
-        on_every_transport!(async_ring Ring Task false, $($claim)*);
-        on_every_transport!(async_direct Ring Task true, $($claim)*);
-        on_every_transport!(async_socket Socket Task false, $($claim)*);
+    ($($claim:ident)* $(; in_rust: $($rust:ident)*)?) => {
+        on_every_transport!(@ring Ring Thread false, $($claim)* $($($rust)*)?);
+        on_every_transport!(@direct Ring Thread true, $($claim)* $($($rust)*)?);
+        on_every_transport!(@socket Socket Thread false, $($claim)* $($($rust)*)?);
+        on_every_transport!(@async_ring Ring Task false, $($claim)* $($($rust)*)?);
+        on_every_transport!(@async_direct Ring Task true, $($claim)* $($($rust)*)?);
+        on_every_transport!(@async_socket Socket Task false, $($claim)* $($($rust)*)?);
+        on_every_transport!(@c_ring Ring C false, $($claim)*);
+        on_every_transport!(@c_direct Ring C true, $($claim)*);
+        on_every_transport!(@c_socket Socket C false, $($claim)*);
     };
-    ($module:ident $transport:ident $form:ident $direct:literal, $($claim:ident)*) => {
+    (@$module:ident $transport:ident $form:ident $direct:literal, $($claim:ident)*) => {
         mod $module {
             use super::{Transport, forms::{Form, Under}};
 
@@ -91,11 +95,12 @@ on_every_transport! {
     another_endpoint_cannot_reply_to_what_this_one_was_asked
     a_received_message_counts_as_handled_when_it_is_dropped
     a_message_that_is_in_hand_at_a_panic_has_failed
-    what_waited_in_a_dropped_endpoint_was_not_handled
     of_a_stream_only_the_newest_value_is_received
     a_member_gets_what_is_sent_to_its_group_until_it_leaves
     the_end_of_the_node_is_an_error_with_its_reason
     what_nobody_takes_is_said_with_its_number_and_once
+    ; in_rust:
+    what_waited_in_a_dropped_endpoint_was_not_handled
 }
 
 fn on(under: Under) -> Registration {

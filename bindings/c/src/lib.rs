@@ -10,8 +10,9 @@
 //! | `log.rs`, `log/` | what the library says on the standard error, and the thread that writes it |
 //! | `registration.rs`, `sending.rs`, `receiving.rs`, `meeting.rs`, `naming.rs`, `words.rs` | the functions |
 //! | `options.rs`, `text.rs`, `message.rs`, `status.rs` | the types |
+//! | `conformance.rs` | for the suite that holds all forms of NodeAPI to the same claims; with the feature `conformance` alone |
 //!
-//! All modules are private: the functions are reached through C only, whose programs must keep what the header asks of
+//! All other modules are private: the functions are reached through C only, whose programs must keep what the header asks of
 //! every pointer. That is the one thing that the unsafe blocks here stand on; what can be checked is checked.
 
 // In this order the functions stand in the header.
@@ -36,6 +37,8 @@ mod text;
 mod status;
 
 mod border;
+#[cfg(feature = "conformance")]
+pub mod conformance;
 mod fork;
 mod hand;
 mod log;

@@ -3,10 +3,18 @@
 //! A handle looks like a pointer to C, but is a place in a table and a serial number. So one that was unregistered, or was
 //! never registered, is refused; nothing is read through it. On 64 bits a serial number does not come again; on 32 bits it
 //! does after 16 million registrations.
+//!
+//! A place goes round: free, claimed, held by a handle, free. Each step is one store or exchange of its `holder`, and one
+//! thread makes it: the exchange that claims has one winner, only that winner fills or gives back, and of those that take a handle
+//! one finds the value. The value itself is under the lock, which orders what its users do. So what the atomics have to order
+//! is little: that who sees a handle sees the fork count beside it, and that who sees the place free finds it empty.
 
-use std::sync::{
-    Mutex, MutexGuard, PoisonError, TryLockError,
-    atomic::{AtomicU32, AtomicUsize, Ordering},
+use std::{
+    mem,
+    sync::{
+        Mutex, MutexGuard, PoisonError, TryLockError,
+        atomic::{AtomicU32, AtomicUsize, Ordering},
+    },
 };
 
 use crate::{
@@ -59,6 +67,8 @@ impl<T> Table<T> {
     /// Keeps a place.
     pub(crate) fn claim(&self) -> Result<Claim<'_, T>, Fault> {
         let is_claimed = |place: &Place<T>| {
+            // SYNC: Acquire, with the Release of `take` and of a claim that was dropped: who had the place before has emptied it
+            // and cleared its poison. Relaxed where it fails: nothing is read of a place that is not had.
             let result = place.holder.compare_exchange(FREE, CLAIMED, Ordering::Acquire, Ordering::Relaxed);
             result.is_ok()
         };
@@ -87,12 +97,15 @@ impl<T> Table<T> {
             Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
             Err(TryLockError::WouldBlock) => return Err(Fault::plain(Status::SinewErrorBusy)),
         };
-        if place.holder.load(Ordering::Acquire) != handle {
+        // SYNC: as in `lock`.
+        if place.holder.load(Ordering::Relaxed) != handle {
             return Err(Fault::plain(Status::SinewErrorNoSuchEndpoint));
         }
         let taken = value.take().ok_or_else(|| Fault::plain(Status::SinewErrorNoSuchEndpoint))?;
         drop(value);
+        // Who has the lock between finds this handle, and nothing behind it.
         place.value.clear_poison();
+        // SYNC: Release, for the exchange in `claim`, which then has a place that is empty and not poisoned.
         place.holder.store(FREE, Ordering::Release);
         Ok(taken)
     }
@@ -106,7 +119,9 @@ impl<T> Table<T> {
             })
         })?;
         // It may have been taken out, and the place given to another, since it was looked at.
-        if place.holder.load(Ordering::Acquire) != handle {
+        // SYNC: Relaxed, since the lock orders it: who put another value in had claimed the place before it had the lock, and that
+        // was before this one. Where nobody has, a value that was taken out is not there.
+        if place.holder.load(Ordering::Relaxed) != handle {
             return Err(Fault::plain(Status::SinewErrorNoSuchEndpoint));
         }
         Ok(value)
@@ -114,9 +129,11 @@ impl<T> Table<T> {
 
     fn place(&self, handle: usize) -> Result<&Place<T>, Fault> {
         let place = &self.places[handle % ENDPOINTS_MAX];
+        // SYNC: Acquire, with the Release in `fill`, behind which `born` is this handle's.
         if handle == FREE || handle == CLAIMED || place.holder.load(Ordering::Acquire) != handle {
             return Err(Fault::plain(Status::SinewErrorNoSuchEndpoint));
         }
+        // Should the place be another's by now, so may the number be: then the look under the lock refuses it, or this does.
         if place.born.load(Ordering::Relaxed) != fork::generation() {
             return Err(Fault::plain(Status::SinewErrorForked));
         }
@@ -131,7 +148,11 @@ impl<T> Claim<'_, T> {
         *place.value.lock().unwrap_or_else(PoisonError::into_inner) = Some(value);
         place.born.store(fork::generation(), Ordering::Relaxed);
         let handle = self.table.next_serial() * ENDPOINTS_MAX + self.place;
+        // SYNC: Release, for the Acquire in `place`: who finds the handle finds `born`. The value is found by the lock.
         place.holder.store(handle, Ordering::Release);
+        // From here on the place is the handle's. A program that had guessed that one may have freed the place already, and
+        // another thread have claimed it: nothing is given back here.
+        mem::forget(self);
         handle
     }
 }
@@ -140,21 +161,25 @@ impl<T> Table<T> {
     /// Of a handle's bits the lowest eight are the place; the rest is this, never zero and never all ones.
     fn next_serial(&self) -> usize {
         const SERIALS: usize = usize::MAX / ENDPOINTS_MAX - 1;
+        // SYNC: Relaxed, since nothing goes with the number: that no two are the same is all.
         self.serials.fetch_add(1, Ordering::Relaxed) % SERIALS + 1
     }
 }
 
 impl<T> Drop for Claim<'_, T> {
     fn drop(&mut self) {
-        let holder = &self.table.places[self.place].holder;
-        // If it was filled there is nothing to give back.
-        let _ = holder.compare_exchange(CLAIMED, FREE, Ordering::Release, Ordering::Relaxed);
+        // SYNC: Release, for the next exchange in `claim`: hands on what this claim's own has acquired. A store will do, since
+        // nobody but who has claimed a place changes it.
+        self.table.places[self.place].holder.store(FREE, Ordering::Release);
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::panic::{AssertUnwindSafe, catch_unwind};
+    use std::{
+        panic::{AssertUnwindSafe, catch_unwind},
+        thread,
+    };
 
     use super::*;
 
@@ -207,5 +232,69 @@ mod tests {
         drop(table.claim().unwrap());
         table.claim().unwrap().fill(7);
         assert_eq!(status(table.claim()), Status::SinewErrorTooMany);
+    }
+
+    const THREADS: usize = 4;
+    /// Endpoints that each thread has, one after the other.
+    const LIVES: usize = 100_000;
+
+    /// What is behind a handle in the test below, and what every thread may find out about it.
+    #[derive(Clone, Copy, Debug, Default, PartialEq)]
+    struct Life {
+        owner: usize,
+        number: usize,
+    }
+
+    /// The last handle of each thread, good or not, and whose it is.
+    type Known = [Mutex<(usize, Life)>; THREADS];
+
+    /// Calls until the place's lock is free. A thread that tries an old handle of the place has it for a moment.
+    fn unless_busy<R>(mut call: impl FnMut() -> Result<R, Fault>) -> Option<R> {
+        loop {
+            match call() {
+                Ok(done) => return Some(done),
+                Err(fault) if fault.status == Status::SinewErrorNoSuchEndpoint => return None,
+                Err(fault) => assert_eq!(fault.status, Status::SinewErrorBusy),
+            }
+        }
+    }
+
+    /// Has one endpoint after the other, uses them, and uses and ends those of others, who do the same. How many it has ended.
+    fn live_and_trespass(table: &Table<Life>, owner: usize, known: &Known) -> usize {
+        let mut ended = 0;
+        for number in 0..LIVES {
+            let own = Life { owner, number };
+            let handle = table.claim().unwrap().fill(own);
+            *known[owner].lock().unwrap() = (handle, own);
+            let others = known.iter().map(|last| *last.lock().unwrap());
+            let tried: [(usize, Life); THREADS] = others.collect::<Vec<_>>().try_into().unwrap();
+            for (handle, life) in tried {
+                // Whatever has become of the place since: this endpoint is there, or none.
+                let found = unless_busy(|| table.with(handle, |found| Ok(*found)));
+                assert!(found.is_none_or(|found| found == life), "{found:?} instead of {life:?}");
+            }
+            for (handle, life) in [tried[(owner + number) % THREADS], (handle, own)] {
+                let taken = unless_busy(|| table.take(handle));
+                assert!(taken.is_none_or(|taken| taken == life), "{taken:?} instead of {life:?}");
+                ended += usize::from(taken.is_some());
+            }
+        }
+        ended
+    }
+
+    #[test]
+    fn threads_that_use_end_and_reuse_places_at_once_find_their_own_endpoint_or_none() {
+        let (table, known) = (Table::new(), Known::default());
+        let ended = thread::scope(|scope| {
+            let threads = [0, 1, 2, 3].map(|owner| {
+                let (table, known) = (&table, &known);
+                scope.spawn(move || live_and_trespass(table, owner, known))
+            });
+            threads.map(|thread| thread.join().unwrap()).iter().sum::<usize>()
+        });
+        assert_eq!(ended, THREADS * LIVES, "each was ended once");
+        let again: Vec<_> =
+            (0..ENDPOINTS_MAX).map(|_| table.claim().unwrap().fill(Life::default())).collect();
+        assert_eq!(again.len(), ENDPOINTS_MAX, "all places are free");
     }
 }

@@ -15,10 +15,11 @@ const LENGTHS: [usize; 2] = [100, 200_000];
 on_every_transport! {
     while_a_message_is_lent_nothing_else_goes_out_and_the_refusal_says_what_to_do
     a_message_that_is_dropped_was_never_there
+    what_was_lent_before_a_link_was_made_goes_out_on_it
+    ; in_rust:
     another_endpoint_may_send_what_this_one_has_lent_if_it_has_lent_nothing_itself
     who_unregisters_while_a_message_is_lent_is_told_and_gives_the_address_back
     what_was_lent_before_the_node_was_restarted_goes_to_its_next_life
-    what_was_lent_before_a_link_was_made_goes_out_on_it
 }
 
 fn lent<T>(refused: Result<T, ApiError>) {

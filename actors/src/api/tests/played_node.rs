@@ -11,7 +11,10 @@ use std::{
 };
 
 use bytes::BytesMut;
-use rustix::event::PollFlags;
+use rustix::{
+    event::PollFlags,
+    net::{RecvFlags, recv},
+};
 use sinew_runtime::{
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
@@ -55,7 +58,7 @@ impl PlayedNode {
         let (orders, heard) = sync_channel(65_536);
         let (say, came) = sync_channel(65_536);
         let thread = thread::spawn(move || {
-            let (socket, _) = listener.accept().unwrap();
+            let socket = caller(&listener);
             let (ends, frames) = (greet(&socket), RingFrames::new(PAYLOAD_MAX));
             Played {
                 socket,
@@ -127,6 +130,16 @@ fn socket_in(directory: &Path) -> PathBuf {
     directory.join("played.sock")
 }
 
+/// The first that connects and says something. C looks whether anybody listens before it registers, on a connection of its own.
+fn caller(listener: &UnixListener) -> UnixStream {
+    loop {
+        let (socket, _) = listener.accept().unwrap();
+        if recv(&socket, &mut [0; 1][..], RecvFlags::PEEK).unwrap().0 > 0 {
+            return socket;
+        }
+    }
+}
+
 /// Registers whoever has connected.
 fn greet(socket: &UnixStream) -> Option<(Producer, Consumer)> {
     let mut codec = FrameCodec::new(PAYLOAD_MAX);
@@ -134,6 +147,7 @@ fn greet(socket: &UnixStream) -> Option<(Producer, Consumer)> {
     let asked = loop {
         let mut chunk = [0; 4_096];
         let count = { socket }.read(&mut chunk).unwrap();
+        assert!(count > 0, "it has gone before it was registered");
         buffer.extend_from_slice(&chunk[..count]);
         if let Some(message) = codec.decode(&mut buffer).unwrap() {
             break message;

@@ -33,7 +33,7 @@ fn register(under: Under, node: &PlayedNode, patience: Duration) -> Client {
     forms::Api::at(under, &node.path()).register(registration).unwrap()
 }
 
-fn message(from: &mut Client, number: u64, length: usize) -> crate::LentMessage {
+fn message(from: &mut Client, number: u64, length: usize) -> forms::Lent {
     let mut message = from.create_message(PlayedNode::somebody(), RAW, length).unwrap();
     message[..8].copy_from_slice(&number.to_le_bytes());
     message

@@ -1,0 +1,439 @@
+//! The functions of C behind a face that safe Rust may call, so that NodeAPI's suite of claims (`actors/src/api/tests/`)
+//! holds C to them, too. There with the feature `conformance` alone.
+//!
+//! Each call here is one call of C's, with the structs that C hands over; what it returns is handed on as it is, with its
+//! sentence. Payloads are copied where a program in C would read or write them, since what C promises of memory (not after the
+//! message is gone, not after its endpoint is) is nothing that Rust's borrows could say of a number.
+
+use std::{
+    ffi::{CStr, c_char},
+    fmt,
+    mem::{self, MaybeUninit},
+    ops::{Deref, DerefMut},
+    os::unix::ffi::OsStrExt,
+    path::Path,
+    ptr, slice, thread,
+};
+
+pub use crate::{
+    message::Untaken,
+    options::{SINEW_DIRECT, SINEW_ONE_CONNECTION, SINEW_SOCKET_ONLY},
+    status::Status,
+    words::Outcome,
+};
+use crate::{
+    message::{self, Message},
+    naming::{sinew_join_group, sinew_leave_group, sinew_resolve},
+    options::Options,
+    receiving::{sinew_next_untaken, sinew_receive_message, sinew_settle_message},
+    registration::{
+        sinew_endpoint_tid, sinew_node_name, sinew_payload_max, sinew_register_transport_address,
+        sinew_unregister,
+    },
+    sending::{
+        sinew_ask, sinew_create_message, sinew_discard_message, sinew_reply, sinew_reply_within,
+        sinew_send_bytes, sinew_send_bytes_within, sinew_send_message, sinew_send_message_confirmed,
+        sinew_send_message_within,
+    },
+    text::Text,
+    words::sinew_last_error,
+};
+
+/// What a function of C said that was not `SINEW_OK`.
+#[derive(Clone, Debug)]
+pub struct Told {
+    /// What it returned.
+    pub status: Status,
+    /// What `sinew_last_error` says of it.
+    pub sentence: String,
+    /// What became of a request that was not handled.
+    pub ended: Option<Outcome>,
+}
+
+/// What `sinew_options` asks for; zero and empty are the defaults.
+#[derive(Clone, Debug, Default)]
+#[expect(missing_docs, reason = "each is the field of sinew_options that has its name")]
+pub struct Asked {
+    pub name: String,
+    pub required: Vec<String>,
+    pub handled: Vec<String>,
+    pub fixed_address: u32,
+    pub deadline_ns: u64,
+    pub patience_ns: u64,
+    pub inbox_capacity: usize,
+    pub links: u32,
+}
+
+/// An endpoint; unregistered when it is dropped.
+#[derive(Debug)]
+pub struct Endpoint {
+    handle: usize,
+}
+
+/// A message that is being made; discarded when it is dropped.
+#[derive(Debug)]
+pub struct Made {
+    owner: usize,
+    message: Given<Message>,
+    payload: Vec<u8>,
+}
+
+/// A message in hand; settled when it is dropped, as Failed by a thread that panics and else as Delivered.
+#[derive(Debug)]
+pub struct InHand {
+    owner: usize,
+    message: Given<message::Received>,
+    payload: Vec<u8>,
+}
+
+/// A struct that C has given, with a pointer in it.
+struct Given<T>(T);
+
+// SAFETY: what C gives may be handed to another thread, its `bytes` too: the header says so; here nobody but the calls of the
+// endpoint follows them.
+unsafe impl<T> Send for Given<T> {}
+
+impl<T> fmt::Debug for Given<T> {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str("of C")
+    }
+}
+
+/// `Ok` if it was done, and what was said instead if not.
+fn done(status: Status) -> Result<(), Told> {
+    if status == Status::SinewOk { Ok(()) } else { Err(told(status)) }
+}
+
+fn told(status: Status) -> Told {
+    // SAFETY: it is a C string that stays until this thread's next error.
+    let sentence = unsafe { CStr::from_ptr(sinew_last_error()) };
+    Told { status, sentence: sentence.to_string_lossy().into_owned(), ended: None }
+}
+
+fn text(text: &[u8]) -> Text {
+    Text { bytes: text.as_ptr().cast::<c_char>(), length: text.len() }
+}
+
+fn texts(names: &[String]) -> Vec<Text> {
+    names.iter().map(|name| text(name.as_bytes())).collect()
+}
+
+impl Endpoint {
+    /// `sinew_register_transport_address`.
+    ///
+    /// # Errors
+    /// What it says.
+    pub fn register(socket: &Path, asked: &Asked) -> Result<Self, Told> {
+        let (required, handled) = (texts(&asked.required), texts(&asked.handled));
+        let options = Options {
+            size: size_of::<Options>(),
+            name: text(asked.name.as_bytes()),
+            required: required.as_ptr(),
+            required_count: required.len(),
+            handled: handled.as_ptr(),
+            handled_count: handled.len(),
+            fixed_address: asked.fixed_address,
+            events: 0,
+            deadline_ns: asked.deadline_ns,
+            patience_ns: asked.patience_ns,
+            inbox_capacity: asked.inbox_capacity,
+            spin_ns: 0,
+            links: asked.links,
+            reserved: 0,
+            direct_ring_bytes: 0,
+        };
+        let mut endpoint = MaybeUninit::new(ptr::null_mut());
+        let path = text(socket.as_os_str().as_bytes());
+        done(sinew_register_transport_address(path, &raw const options, Some(&mut endpoint)))?;
+        // SAFETY: it was made with a value.
+        let endpoint = unsafe { endpoint.assume_init() };
+        Ok(Self { handle: endpoint.addr() })
+    }
+
+    const fn pointer(&self) -> *mut message::Endpoint {
+        ptr::without_provenance_mut(self.handle)
+    }
+
+    /// `sinew_endpoint_tid`.
+    #[must_use]
+    pub fn tid(&self) -> u64 {
+        sinew_endpoint_tid(self.pointer())
+    }
+
+    /// `sinew_payload_max`.
+    #[must_use]
+    pub fn payload_max(&self) -> usize {
+        sinew_payload_max(self.pointer())
+    }
+
+    /// `sinew_node_name`.
+    #[must_use]
+    pub fn node_name(&self) -> &str {
+        let name = sinew_node_name(self.pointer());
+        assert!(!name.is_null(), "it is registered, and no other thread is in a call");
+        // SAFETY: it is not NULL, and a C string that stays until the endpoint is unregistered, for which this borrow must be over.
+        unsafe { CStr::from_ptr(name) }.to_str().expect("a node's name is UTF-8")
+    }
+
+    /// `sinew_create_message`.
+    ///
+    /// # Errors
+    /// What it says.
+    pub fn create(
+        &mut self,
+        destination: u64,
+        kind: u32,
+        message_class: i32,
+        length: usize,
+    ) -> Result<Made, Told> {
+        let mut message = MaybeUninit::new(Message::GONE);
+        done(sinew_create_message(
+            self.pointer(),
+            destination,
+            kind,
+            message_class,
+            length,
+            Some(&mut message),
+        ))?;
+        // SAFETY: it was made with a value.
+        let message = unsafe { message.assume_init() };
+        assert_eq!(message.length, length);
+        // SAFETY: so many bytes are there until the message is sent or discarded, and nobody else has it.
+        let payload = unsafe { slice::from_raw_parts(message.bytes, length) }.to_vec();
+        Ok(Made { owner: self.handle, message: Given(message), payload })
+    }
+
+    /// Writes a message where it lies, as a program in C would have done; another endpoint's is left as it is.
+    fn fill(&self, made: &mut Made) {
+        if made.owner == self.handle {
+            let message = made.message.0;
+            // SAFETY: so many bytes are there: the message was neither sent nor discarded, since it is here, and its endpoint is
+            // this one, which is registered. They are nobody else's.
+            unsafe { ptr::copy_nonoverlapping(made.payload.as_ptr(), message.bytes, message.length) };
+        }
+    }
+
+    /// `sinew_send_message`, or with a time `sinew_send_message_within`.
+    ///
+    /// # Errors
+    /// What it says.
+    pub fn send(&mut self, mut made: Made, within_ns: Option<u64>) -> Result<(), Told> {
+        self.fill(&mut made);
+        let message = Some(&mut made.message.0);
+        done(match within_ns {
+            None => sinew_send_message(self.pointer(), message),
+            Some(within_ns) => sinew_send_message_within(self.pointer(), message, within_ns),
+        })
+    }
+
+    /// `sinew_send_bytes`, or with a time `sinew_send_bytes_within`.
+    ///
+    /// # Errors
+    /// What it says.
+    pub fn send_bytes(
+        &mut self,
+        destination: u64,
+        (kind, message_class): (u32, i32),
+        bytes: &[u8],
+        within_ns: Option<u64>,
+    ) -> Result<(), Told> {
+        let (endpoint, first, length) = (self.pointer(), bytes.as_ptr().cast(), bytes.len());
+        done(match within_ns {
+            None => sinew_send_bytes(endpoint, destination, kind, message_class, first, length),
+            Some(time) => {
+                sinew_send_bytes_within(endpoint, destination, kind, message_class, first, length, time)
+            }
+        })
+    }
+
+    /// `sinew_send_message_confirmed`.
+    ///
+    /// # Errors
+    /// What it says.
+    pub fn send_confirmed(&mut self, mut made: Made, within_ns: u64) -> Result<Outcome, Told> {
+        self.fill(&mut made);
+        let mut outcome = MaybeUninit::new(Outcome::SinewUnknown);
+        let message = Some(&mut made.message.0);
+        done(sinew_send_message_confirmed(self.pointer(), message, within_ns, Some(&mut outcome)))?;
+        // SAFETY: it was made with a value.
+        Ok(unsafe { outcome.assume_init() })
+    }
+
+    /// `sinew_ask`.
+    ///
+    /// # Errors
+    /// What it says.
+    pub fn ask(&mut self, mut made: Made, within_ns: u64) -> Result<InHand, Told> {
+        self.fill(&mut made);
+        let mut reply = MaybeUninit::new(message::Received::GONE);
+        let mut ended = MaybeUninit::new(Outcome::SinewUnknown);
+        let message = Some(&mut made.message.0);
+        let status = sinew_ask(self.pointer(), message, within_ns, Some(&mut reply), Some(&mut ended));
+        // SAFETY: it was made with a value.
+        let ended = unsafe { ended.assume_init() };
+        done(status).map_err(|told| Told {
+            ended: (status == Status::SinewErrorNotHandled).then_some(ended),
+            ..told
+        })?;
+        Ok(self.in_hand(reply))
+    }
+
+    /// `sinew_reply`, or with a time `sinew_reply_within`.
+    ///
+    /// # Errors
+    /// What it says.
+    pub fn reply(&mut self, request: &InHand, mut made: Made, within_ns: Option<u64>) -> Result<(), Told> {
+        self.fill(&mut made);
+        let (request, message) = (Some(&request.message.0), Some(&mut made.message.0));
+        done(match within_ns {
+            None => sinew_reply(self.pointer(), request, message),
+            Some(within_ns) => sinew_reply_within(self.pointer(), request, message, within_ns),
+        })
+    }
+
+    /// `sinew_receive_message`.
+    ///
+    /// # Errors
+    /// What it says.
+    pub fn receive(&mut self, within_ns: u64) -> Result<Option<InHand>, Told> {
+        let mut received = MaybeUninit::new(message::Received::GONE);
+        let status = sinew_receive_message(self.pointer(), within_ns, Some(&mut received));
+        if status == Status::SinewNothing {
+            return Ok(None);
+        }
+        done(status).map(|()| Some(self.in_hand(received)))
+    }
+
+    fn in_hand(&self, received: MaybeUninit<message::Received>) -> InHand {
+        // SAFETY: both that call this have made it with a value.
+        let received = unsafe { received.assume_init() };
+        // SAFETY: so many bytes are there until it is settled, and nobody writes them.
+        let payload = unsafe { slice::from_raw_parts(received.bytes, received.length) }.to_vec();
+        InHand { owner: self.handle, message: Given(received), payload }
+    }
+
+    /// `sinew_next_untaken`.
+    ///
+    /// # Errors
+    /// What it says.
+    pub fn next_untaken(&mut self) -> Result<Option<Untaken>, Told> {
+        let nothing = Untaken { destination: 0, count: 0, since_ns: 0, outcome: 0, reserved: 0 };
+        let mut untaken = MaybeUninit::new(nothing);
+        let status = sinew_next_untaken(self.pointer(), Some(&mut untaken));
+        if status == Status::SinewNothing {
+            return Ok(None);
+        }
+        // SAFETY: it was made with a value.
+        done(status).map(|()| Some(unsafe { untaken.assume_init() }))
+    }
+
+    /// `sinew_resolve`.
+    ///
+    /// # Errors
+    /// What it says.
+    pub fn resolve(&mut self, name: &str, within_ns: u64) -> Result<Option<u64>, Told> {
+        let mut tid = MaybeUninit::new(u64::MAX);
+        let status = sinew_resolve(self.pointer(), text(name.as_bytes()), within_ns, Some(&mut tid));
+        // SAFETY: it was made with a value.
+        let tid = unsafe { tid.assume_init() };
+        if status == Status::SinewNothing {
+            assert_eq!(tid, 0, "nobody has the name");
+            return Ok(None);
+        }
+        done(status).map(|()| Some(tid))
+    }
+
+    /// `sinew_join_group`.
+    ///
+    /// # Errors
+    /// What it says.
+    pub fn join(&mut self, name: &str) -> Result<(), Told> {
+        done(sinew_join_group(self.pointer(), text(name.as_bytes())))
+    }
+
+    /// `sinew_leave_group`.
+    ///
+    /// # Errors
+    /// What it says.
+    pub fn leave(&mut self, name: &str) -> Result<(), Told> {
+        done(sinew_leave_group(self.pointer(), text(name.as_bytes())))
+    }
+
+    /// `sinew_unregister`.
+    ///
+    /// # Errors
+    /// What it says.
+    pub fn unregister(self) -> Result<(), Told> {
+        let mut endpoint = self.pointer();
+        mem::forget(self);
+        done(sinew_unregister(Some(&mut endpoint)))
+    }
+}
+
+impl Drop for Endpoint {
+    fn drop(&mut self) {
+        // Whatever it says, nobody is here to be told.
+        let _ = sinew_unregister(Some(&mut self.pointer()));
+    }
+}
+
+impl Deref for Made {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        &self.payload
+    }
+}
+
+impl DerefMut for Made {
+    fn deref_mut(&mut self) -> &mut [u8] {
+        &mut self.payload
+    }
+}
+
+impl Drop for Made {
+    fn drop(&mut self) {
+        if self.message.0.token != 0 {
+            let owner = ptr::without_provenance_mut(self.owner);
+            // Its endpoint may be gone, and the message with it.
+            let _ = sinew_discard_message(owner, Some(&mut self.message.0));
+        }
+    }
+}
+
+impl InHand {
+    /// The struct that C has; its `bytes` are not to be followed.
+    #[must_use]
+    pub const fn fields(&self) -> &message::Received {
+        &self.message.0
+    }
+
+    /// Its payload.
+    #[must_use]
+    pub fn payload(&self) -> &[u8] {
+        &self.payload
+    }
+
+    /// `sinew_settle_message`.
+    ///
+    /// # Errors
+    /// What it says.
+    pub fn settle(mut self, outcome: i32) -> Result<(), Told> {
+        self.settle_as(outcome)
+    }
+
+    fn settle_as(&mut self, outcome: i32) -> Result<(), Told> {
+        let owner = ptr::without_provenance_mut(self.owner);
+        done(sinew_settle_message(owner, Some(&mut self.message.0), outcome))
+    }
+}
+
+impl Drop for InHand {
+    fn drop(&mut self) {
+        if self.message.0.token != 0 {
+            let outcome = if thread::panicking() { Outcome::SinewFailed } else { Outcome::SinewDelivered };
+            // Its endpoint may be gone, which has said Failed of it.
+            let _ = self.settle_as(outcome as i32);
+        }
+    }
+}
