@@ -15,6 +15,7 @@
 //! is told may submit to this very outlet.
 
 mod account;
+mod after;
 mod batch;
 mod draining;
 mod expiry;
@@ -50,9 +51,10 @@ use tokio::net::UnixStream;
 use crate::session::{Ack, Sent};
 
 pub(crate) use account::OutletAccount;
+use after::After;
 pub(crate) use batch::Gathering;
 use draining::Drained;
-use half::{After, Bound, Half, Step};
+use half::{Bound, Half, Step};
 pub(crate) use held::{destination_of, line_of};
 pub(crate) use outcomes::{OUTCOMES_MAX, read as read_outcomes};
 pub(crate) use resume::Session;
@@ -316,6 +318,26 @@ impl<S: Socket> StreamOutlet<S> {
     /// The frame: there is no connection, or too many wait.
     pub(crate) fn submit_urgent(&self, message: Message, waiting_max: usize) -> Result<(), Refused> {
         self.with(|half, after| half.submit_urgent(message, waiting_max, after))
+    }
+
+    /// As [`submit_urgent`](Self::submit_urgent), for whoever is behind this connection and nobody after it.
+    ///
+    /// # Errors
+    /// The frame: that connection has ended, or too many wait.
+    pub(crate) fn submit_urgent_on(
+        &self,
+        link: LinkNumber,
+        message: Message,
+        waiting_max: usize,
+    ) -> Result<(), Refused> {
+        self.with(|half, after| {
+            // Under the lock, so that no other connection takes its place in between.
+            if half.is_present(link) {
+                half.submit_urgent(message, waiting_max, after)
+            } else {
+                Err(Refused::new(message, Rejection::Closed))
+            }
+        })
     }
 
     /// Says what was taken, ahead of all that waits: `ack` names `epoch` as that in which this outlet counts. Returns whether it does; if a

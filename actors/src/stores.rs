@@ -47,6 +47,8 @@ pub(crate) struct Stores {
     pub(crate) gncl_listen: OnceLock<SocketAddr>,
     /// Where GNCL listens besides; set with it.
     pub(crate) gncl_further: OnceLock<Vec<SocketAddrV4>>,
+    /// TCP port at which GNCL listens at this host's IPv6 addresses, if it does; set with it.
+    pub(crate) gncl_port6: OnceLock<u16>,
     /// What LNCL, the sync manager and NDL's sockets refused.
     pub(crate) refusals: Arc<Refusals>,
     /// GNCL's peers with the messages that wait for them, and what GNCL refused.
@@ -102,6 +104,7 @@ impl Stores {
             access: OnceLock::new(),
             gncl_listen: OnceLock::new(),
             gncl_further: OnceLock::new(),
+            gncl_port6: OnceLock::new(),
             refusals: Arc::default(),
             gncl: gncl::Store::default(),
             ndl_sockets: Mutex::default(),

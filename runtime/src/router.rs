@@ -19,7 +19,7 @@ use crate::{
     outcome::{Rejection, Ticket},
     post::lock,
     tid::{AppAddress, NodeAddress, Tid},
-    wire::{Flags, Header, Kind, Message},
+    wire::{Flags, Kind, Message},
 };
 
 /// A place that takes messages: a mailbox, a client's socket, the connection to a node.
@@ -87,13 +87,8 @@ struct Table {
     remote_groups: BTreeMap<AppAddress, Vec<NodeAddress>>,
 }
 
-impl Table {
-    /// Whether what this header says may not reach the application of this node at `target`.
-    #[inline]
-    fn refuses(&self, target: AppAddress, header: &Header) -> bool {
-        guard::refuses(self.guard.as_ref(), target, header)
-    }
-}
+/// Who decides about one message; nobody: it may go anywhere.
+type Judge<'a> = Option<&'a Arc<dyn Guard>>;
 
 /// What became of the copies of a message to many.
 #[derive(Clone, Copy, Debug, Default)]
@@ -180,24 +175,24 @@ impl Router {
     /// # Errors
     /// Why nobody took the message.
     pub fn deliver(&self, message: Message) -> Result<(), Rejection> {
-        self.deliver_by(&self.table.load(), message)
+        let table = self.table.load();
+        self.deliver_by(&table, table.guard.as_ref(), message)
     }
 
-    /// The same, by what another guard than the table's own says of it.
+    /// The same, by what another guard than the table's own says of it. It copies no table, however many applications there are.
     ///
     /// # Errors
     /// Why nobody took the message.
-    pub fn deliver_judged_by(&self, message: Message, guard: Arc<dyn Guard>) -> Result<(), Rejection> {
-        let table = Table { guard: Some(guard), ..Table::clone(&self.table.load()) };
-        self.deliver_by(&table, message)
+    pub fn deliver_judged_by(&self, message: Message, guard: &Arc<dyn Guard>) -> Result<(), Rejection> {
+        self.deliver_by(&self.table.load(), Some(guard), message)
     }
 
-    fn deliver_by(&self, table: &Table, message: Message) -> Result<(), Rejection> {
+    fn deliver_by(&self, table: &Table, guard: Judge<'_>, message: Message) -> Result<(), Rejection> {
         let app = message.header.destination.app;
         let result = if message.header.destination.is_single() {
-            submit_here(table, message)
+            submit_here(table, guard, message)
         } else {
-            self.fan_out(table, app, &message);
+            self.fan_out(table, guard, app, &message);
             Ok(())
         };
         self.account(result)
@@ -213,7 +208,7 @@ impl Router {
         let table = self.table.load();
         match table.local.get(&message.header.destination.app) {
             Some(route) => tap::hand_over(table.tap.as_ref(), message, true, |message| {
-                if table.refuses(message.header.destination.app, &message.header) {
+                if guard::refuses(table.guard.as_ref(), message.header.destination.app, &message.header) {
                     return Err(Refused::new(message, Rejection::NotAllowed));
                 }
                 route.outlet.offer(message, room)
@@ -282,7 +277,7 @@ impl Router {
     fn send_to_one(table: &Table, here: NodeAddress, message: Message) -> Result<(), Refused> {
         let Tid { node, .. } = message.header.destination;
         if node == here {
-            submit_here(table, message)
+            submit_here(table, table.guard.as_ref(), message)
         } else {
             tap::hand_over(table.tap.as_ref(), message, false, |message| match table.peers.get(&node) {
                 Some(peer) => peer.submit(message),
@@ -298,7 +293,7 @@ impl Router {
         let mut not_allowed = false;
         tap::saw_sent_to_many(table.tap.as_ref(), &message);
         if node == self.node || node == NodeAddress::ALL {
-            let here = self.fan_out(table, app, &message);
+            let here = self.fan_out(table, table.guard.as_ref(), app, &message);
             taken += here.taken;
             not_allowed = here.not_allowed > 0;
         }
@@ -319,7 +314,7 @@ impl Router {
     }
 
     /// Copies for the members on this node, except the sender itself.
-    fn fan_out(&self, table: &Table, app: AppAddress, message: &Message) -> Copies {
+    fn fan_out(&self, table: &Table, guard: Judge<'_>, app: AppAddress, message: &Message) -> Copies {
         let here = self.node;
         let mut copies = Copies::default();
         let mut submit = |(member, outlet): (AppAddress, &Arc<dyn Outlet>)| {
@@ -327,7 +322,7 @@ impl Router {
             if is_sender {
                 return;
             }
-            let refused = if table.refuses(member, &message.header) {
+            let refused = if guard::refuses(guard, member, &message.header) {
                 Some(Rejection::NotAllowed)
             } else {
                 outlet.submit(copy_of(message)).err().map(|refused| refused.why)
@@ -438,11 +433,11 @@ impl Router {
 }
 
 /// Hands a message to the one application of this node that it is for, if it may reach it.
-fn submit_here(table: &Table, message: Message) -> Result<(), Refused> {
+fn submit_here(table: &Table, guard: Judge<'_>, message: Message) -> Result<(), Refused> {
     tap::hand_over(table.tap.as_ref(), message, false, |message| {
         let target = message.header.destination.app;
         match table.local.get(&target) {
-            Some(_) if table.refuses(target, &message.header) => {
+            Some(_) if guard::refuses(guard, target, &message.header) => {
                 Err(Refused::new(message, Rejection::NotAllowed))
             }
             Some(route) => route.outlet.submit(message),

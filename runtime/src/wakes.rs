@@ -38,12 +38,11 @@ impl Drop for Batch {
         let wakers = PUT_OFF.try_with(|put_off| {
             let put_off = &mut *put_off.borrow_mut();
             put_off.batches = put_off.batches.saturating_sub(1);
-            if put_off.batches == 0 { std::mem::take(&mut put_off.wakers) } else { Vec::new() }
+            // Where nobody is to be woken the memory stays for the next batch.
+            let is_due = put_off.batches == 0 && !put_off.wakers.is_empty();
+            is_due.then(|| std::mem::take(&mut put_off.wakers))
         });
-        let Ok(wakers) = wakers else { return };
-        if wakers.is_empty() {
-            return;
-        }
+        let Ok(Some(wakers)) = wakers else { return };
         let mut rest = Rest(wakers);
         rest.wake();
         // Its memory is used again, unless one that was woken has begun anew already.
@@ -187,6 +186,17 @@ mod tests {
         assert_eq!(all.iter().filter(|(woken, _)| woken.times() == 1).count(), 9);
         drop(batch);
         assert!(all.iter().all(|(woken, _)| woken.times() == 1));
+    }
+
+    #[test]
+    fn memory_for_wakers_is_used_again_though_a_batch_in_between_wakes_nobody() {
+        let memory = || PUT_OFF.with(|put_off| put_off.borrow().wakers.as_ptr());
+        let batch = Batch::begin();
+        wake(woken().1);
+        let first = memory();
+        drop(batch);
+        drop(Batch::begin());
+        assert_eq!(memory(), first);
     }
 
     #[test]

@@ -3,7 +3,8 @@
 //!
 //! It is nicer than the threads that it takes locks from, and stays so while it has one: to be less nice again needs a privilege. So it holds each
 //! for a copy of bounded length only: the counters of one place, or the pointers of a list, and never for a walk through messages, but the few of layers'
-//! events that wait in one mailbox. The one exception is the outlet for Bulk of who has asked, for as long as its answer of 256 KiB at most is written.
+//! events that wait in one mailbox. Its answer of 256 KiB at most is put into the queue of who has asked, and written by whoever writes what waits there: so
+//! nobody who has an outcome to settle in that outlet, or on a link of one connection Control to send, waits for a nice thread that writes.
 
 use std::{collections::VecDeque, sync::Arc, thread};
 

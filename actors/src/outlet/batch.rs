@@ -14,7 +14,7 @@ use std::{
 
 use sinew_runtime::{
     time::Time,
-    wire::{Checksum, Class, Flags, Message},
+    wire::{Checksum, Class, Flags, Kind, Message},
 };
 
 use super::{
@@ -94,6 +94,12 @@ impl<S: Socket> Half<S> {
 pub(super) fn is_patient(message: &Message) -> bool {
     let header = &message.header;
     message.size() <= SHORT && (header.class == Class::Bulk || header.flags.has(Flags::OUTCOME))
+}
+
+/// Whether who submits a message does not write it itself, though nothing waits before it: the thread that answers an audit is nicer than
+/// those who need this lock, so that it has the lock for as long as a queue takes, and not while it computes a long checksum or writes.
+pub(super) fn is_left_to_the_drainer(message: &Message) -> bool {
+    message.header.kind == Kind::SYNC_AUDIT
 }
 
 /// A socket that gathers frames.

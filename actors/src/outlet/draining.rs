@@ -9,8 +9,9 @@ use sinew_runtime::{time::Time, wire::HEADER_LEN};
 
 use super::{
     LinkNumber, Socket,
+    after::After,
     batch::SHORT,
-    half::{After, Half, Link, Step},
+    half::{Half, Link, Step},
     partial::{Partial, Written},
 };
 

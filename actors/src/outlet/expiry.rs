@@ -8,10 +8,7 @@ use sinew_runtime::{
     wire::Message,
 };
 
-use super::{
-    Socket,
-    half::{After, Half},
-};
+use super::{Socket, after::After, half::Half};
 
 /// Time after a sent message's time to live in which its outcome may still come.
 const OUTCOME_GRACE: Duration = Duration::from_secs(1);
@@ -19,14 +16,14 @@ const OUTCOME_GRACE: Duration = Duration::from_secs(1);
 impl<S: Socket> Half<S> {
     pub(super) fn expired(&mut self, message: Message, after: &mut After) {
         self.counts.expired += 1;
-        after.settle.extend(message.receipt.map(|receipt| (receipt, Outcome::Expired)));
+        after.settle(message.receipt.map(|receipt| (receipt, Outcome::Expired)));
     }
 
     /// Outcomes that are long overdue do not come any more; their places are needed. By then the senders have stopped
     /// waiting.
     fn give_up_overdue(&mut self, now: Time, after: &mut After) {
         let overdue = self.sent_receipts.take_overdue(now, OUTCOME_GRACE);
-        after.settle.extend(overdue.into_iter().map(|receipt| (receipt, Outcome::Unknown)));
+        after.settle(overdue.into_iter().map(|receipt| (receipt, Outcome::Unknown)));
     }
 
     /// Nobody waits any more for the reply to this request: its time is over, if it has not been begun. Returns whether it waited here.

@@ -4,18 +4,18 @@ use std::{collections::VecDeque, io, sync::Arc, task::Waker};
 
 use sinew_runtime::{
     mailbox::{Bounds, Budget, ClassQueue},
-    outcome::{Outcome, Receipt, Rejection},
+    outcome::{Outcome, Rejection},
     router::Refused,
     tid::Tid,
     time::Time,
-    wakes,
     wire::{Checksum, Class, Flags, Kind, Message},
 };
 
 use super::{
     LinkNumber, OutletCounts, OutletLimits, Socket,
     account::Tally,
-    batch::{Pace, is_patient},
+    after::After,
+    batch::{Pace, is_left_to_the_drainer, is_patient},
     outcomes::messages_in,
     outstanding::{Outstanding, Sent},
     partial::{Partial, Sort, Written},
@@ -24,24 +24,6 @@ use super::{
 
 /// Of a session: times the bound for one destination, so many messages may be unconfirmed for all.
 const UNCONFIRMED_DESTINATIONS: usize = 8;
-
-/// What is done when the lock is free again.
-#[derive(Default)]
-pub(super) struct After {
-    pub(super) settle: Vec<(Receipt, Outcome)>,
-    pub(super) wake: Option<Waker>,
-    /// Those who waited for room.
-    pub(super) room: Vec<Waker>,
-}
-
-impl After {
-    pub(super) fn run(self) {
-        for (receipt, outcome) in self.settle {
-            receipt.settle(outcome);
-        }
-        self.wake.into_iter().chain(self.room).for_each(wakes::wake);
-    }
-}
 
 pub(super) enum Link<S> {
     Down,
@@ -129,6 +111,11 @@ impl<S: Socket> Half<S> {
         self.queue = ClassQueue::sharing(bounds(self.limits), budget);
     }
 
+    /// Whether this is the latest connection.
+    pub(super) const fn is_present(&self, link: LinkNumber) -> bool {
+        link.0 == self.number
+    }
+
     pub(super) const fn is_connected(&self) -> bool {
         matches!(self.link, Link::Up(_))
     }
@@ -175,7 +162,7 @@ impl<S: Socket> Half<S> {
 
     /// What was sent and not confirmed may have been handled or not.
     pub(super) fn unknown(&mut self, after: &mut After) {
-        after.settle.extend(self.sent_receipts.take_all().map(|sent| (sent.receipt, Outcome::Unknown)));
+        after.settle(self.sent_receipts.take_all().map(|sent| (sent.receipt, Outcome::Unknown)));
         after.room.extend(self.outcomes_awaited.take());
     }
 
@@ -221,7 +208,7 @@ impl<S: Socket> Half<S> {
         let waiting = self.take_waiting();
         for message in waiting {
             self.counts.lost += 1;
-            after.settle.extend(message.receipt.map(|receipt| (receipt, Outcome::PeerLost)));
+            after.settle(message.receipt.map(|receipt| (receipt, Outcome::PeerLost)));
         }
         self.waiting_receipts = 0;
         self.next_expiry = Time::MAX;
@@ -229,7 +216,7 @@ impl<S: Socket> Half<S> {
 
     pub(super) fn end(&mut self, in_hand: Outcome, why: Rejection, after: &mut After) {
         let taken = if let Link::Up(socket) = &mut self.link { socket.account().taken } else { u64::MAX };
-        after.settle.extend(self.sent_receipts.take_all().map(|Sent { receipt, written, .. }| {
+        after.settle(self.sent_receipts.take_all().map(|Sent { receipt, written, .. }| {
             // What lay in its memory untaken was not handled.
             (receipt, if written > taken { Outcome::Rejected(why) } else { in_hand })
         }));
@@ -237,7 +224,7 @@ impl<S: Socket> Half<S> {
         let waiting = self.take_waiting();
         for message in waiting {
             self.counts.lost += 1;
-            after.settle.extend(message.receipt.map(|receipt| (receipt, Outcome::Rejected(why))));
+            after.settle(message.receipt.map(|receipt| (receipt, Outcome::Rejected(why))));
         }
         self.close(why, after);
     }
@@ -272,11 +259,14 @@ impl<S: Socket> Half<S> {
             return self.put_in_line(key, message).map(|()| Step::Done);
         }
         // Asked in any case: what comes while others wait counts, too.
-        let is_one_of_a_flood = self.is_one_of_a_flood(&message);
-        if self.waiting() > 0 || !self.takes_new() || is_one_of_a_flood {
+        let (is_one_of_a_flood, is_left) =
+            (self.is_one_of_a_flood(&message), is_left_to_the_drainer(&message));
+        if self.waiting() > 0 || !self.takes_new() || is_one_of_a_flood || is_left {
             let is_patient = is_patient(&message);
             self.enqueue(message, bound)?;
-            self.help(after);
+            if !is_left {
+                self.help(after);
+            }
             self.rouse(is_patient, after);
             return Ok(Step::Done);
         }

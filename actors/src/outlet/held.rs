@@ -8,10 +8,7 @@ use sinew_runtime::{
     wire::{Class, Flags, Header, Kind, Message},
 };
 
-use super::{
-    Socket,
-    half::{After, Half},
-};
+use super::{Socket, after::After, half::Half};
 use crate::session::{ShelfLimits, Turn};
 
 /// What waits in lines at the sender: as many lines as a receiver has. In messages the bound of a session's queue holds, and a quarter of it

@@ -11,10 +11,7 @@ use sinew_runtime::{
     time::Time,
 };
 
-use super::{
-    Socket,
-    half::{After, Half},
-};
+use super::{Socket, after::After, half::Half};
 
 /// Lines that are kept though nothing is in them: most destinations are sent to again.
 const EMPTY_LINES_MAX: usize = 64;
@@ -93,7 +90,7 @@ impl<S: Socket> Half<S> {
 
     pub(super) fn confirm(&mut self, ticket: Ticket, outcome: Outcome, after: &mut After) -> bool {
         let Some(receipt) = self.sent_receipts.take(ticket) else { return false };
-        after.settle.push((receipt, outcome));
+        after.settle([(receipt, outcome)]);
         if self.unconfirmed() <= self.limits.unconfirmed_max / 2 {
             after.room.extend(self.outcomes_awaited.take());
         }

@@ -11,7 +11,8 @@ use sinew_runtime::{
 
 use super::{
     LinkNumber, Socket,
-    half::{After, Half},
+    after::After,
+    half::Half,
     held::LIMITS_OF_LINES,
     partial::{Partial, Sort},
 };

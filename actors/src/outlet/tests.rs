@@ -163,6 +163,17 @@ fn a_message_is_on_the_wire_before_submit_returns_when_nothing_waits() {
 }
 
 #[test]
+fn who_answers_an_audit_leaves_the_writing_to_the_drainer() {
+    let bench = Bench::new(PLENTY);
+    let mut answer = message(Class::Bulk, 7);
+    answer.header.kind = Kind::SYNC_AUDIT;
+    bench.submit(answer);
+    assert!(bench.seen().is_empty(), "a nice thread would hold the lock while it writes");
+    bench.drain();
+    assert_eq!(bench.seen(), [7]);
+}
+
+#[test]
 fn control_overtakes_waiting_stream_and_both_overtake_waiting_bulk() {
     let bench = Bench::new(0);
     for (class, value) in [(Class::Bulk, 1), (Class::Bulk, 2), (Class::Stream, 3), (Class::Control, 4)] {

@@ -34,6 +34,8 @@ pub(crate) enum Input {
     LinkBroken { node: NodeAddress, incarnation: Incarnation },
     /// A node is lost.
     NodeLost { node: NodeAddress, incarnation: Incarnation },
+    /// This life was another process than the one that has the node's address.
+    WasNobody { node: NodeAddress, incarnation: Incarnation },
     /// A node has left in order.
     NodeLeft { node: NodeAddress, incarnation: Incarnation },
     /// A node has told its wills.
@@ -111,6 +113,8 @@ impl Core {
                 }
             }
             Input::NodeLost { node, incarnation } => self.execute(node, |life| life <= incarnation),
+            // The node itself, in whatever life, may be alive. spec: WILL-2
+            Input::WasNobody { node, incarnation } => self.execute(node, |life| life == incarnation),
             Input::NodeLeft { node, incarnation } => {
                 // spec: WILL-2
                 drop(self.take_held(node, |life| life <= incarnation));

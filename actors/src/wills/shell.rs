@@ -29,13 +29,11 @@ impl Input {
             MembershipFact::NodeLost {
                 node,
                 incarnation,
-                why:
-                    LossReason::Crashed
-                    | LossReason::Hung
-                    | LossReason::LinkDown
-                    | LossReason::Restarted
-                    | LossReason::Duplicate,
+                why: LossReason::Crashed | LossReason::Hung | LossReason::LinkDown | LossReason::Restarted,
             } => Some(Self::NodeLost { node, incarnation }),
+            MembershipFact::NodeLost { node, incarnation, why: LossReason::Duplicate } => {
+                Some(Self::WasNobody { node, incarnation })
+            }
         }
     }
 
@@ -128,7 +126,7 @@ fn execute(stores: &Stores, (node, life): (NodeAddress, Incarnation), will: &Hel
     let message = Message::new(header, will.payload());
     // The next life of the node may be here already, and call others so.
     let delivered = match stores.access.get().and_then(|access| access.of_life(node, life)) {
-        Some(guard) => stores.router.deliver_judged_by(message, guard),
+        Some(guard) => stores.router.deliver_judged_by(message, &guard),
         None => stores.router.deliver(message),
     };
     if let Err(why) = delivered {

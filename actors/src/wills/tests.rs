@@ -82,6 +82,17 @@ fn a_lost_nodes_wills_are_executed_once_for_each_loss_and_those_of_one_that_left
     assert_eq!(executed(&bench.hears(LOST)), 0);
 }
 
+// spec: WILL-2
+#[test]
+fn that_a_double_of_a_node_is_gone_executes_the_wills_of_no_other_life_of_it() {
+    let mut bench = Bench::new();
+    bench.hears(UP);
+    bench.hears(told(LIFE, 1));
+    let double = |incarnation| Input::WasNobody { node: THERE, incarnation };
+    assert_eq!(executed(&bench.hears(double(NEXT_LIFE))), 0, "it lives");
+    assert_eq!(executed(&bench.hears(double(LIFE))), 1);
+}
+
 // spec: WILL-3
 #[test]
 fn a_new_life_of_a_node_executes_the_wills_of_the_old_one_once_whoever_says_so_first() {

@@ -33,7 +33,16 @@ pub struct AppContext<A: Actor<Context = Self>> {
     /// What the handler says of the message in hand, if it does not take it.
     pub(super) verdict: Option<Outcome>,
     /// The outputs that protected messages move.
-    guards: Vec<Arc<dyn Guarded>>,
+    guards: Vec<HeldGuard>,
+}
+
+/// What is guarded.
+struct HeldGuard {
+    guard: Arc<dyn Guarded>,
+    /// The type that it is moved by.
+    kind: Kind,
+    /// The timer of its echoes.
+    echoes: TimerId,
 }
 
 pub(super) type Timer<A> = Box<dyn FnMut(&mut A, Tick, &mut <A as Actor>::Context)>;
@@ -249,7 +258,14 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         safe: impl FnMut(&mut O, Cause) + Send + 'static,
     ) -> io::Result<Guard<O>> {
         let source = self.sender.absolute(source);
-        self.guards.retain(|guard| !guard.is_orphan());
+        let schedule = &mut self.schedule;
+        self.guards.retain(|held| {
+            let is_held = !held.guard.is_orphan();
+            if !is_held {
+                schedule.cancel(held.echoes);
+            }
+            is_held
+        });
         if self.guard_of::<P>(source).is_some() {
             let words = format!(
                 "what {source} sends of '{}' is guarded already: keep that guard, or clone it",
@@ -259,22 +275,36 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         }
         let guard = Guard::new::<P>(source, self.tid(), output, safe)?;
         let guarded = guard.guarded();
-        self.guards.push(guarded.clone());
         let protection =
             P::PROTECTION.expect("a guard is for a protected type: that was asserted when this was compiled");
+        let echoed = guarded.clone();
         let echo = move |context: &Self| {
-            // Whoever cannot be reached does not answer either: the watchdog knows.
-            let _ = context.send(source, &Echo::new(P::KIND, guarded.echo()));
+            if !echoed.is_orphan() {
+                // Whoever cannot be reached does not answer either: the watchdog knows.
+                let echo = Echo {
+                    others: context.last_echoes(source, P::KIND),
+                    ..Echo::new(P::KIND, echoed.echo())
+                };
+                let _ = context.send(source, &echo);
+            }
         };
         echo(self);
-        self.every(protection.echo_period(), move |_, _, context| echo(context));
+        let echoes = self.every(protection.echo_period(), move |_, _, context| echo(context));
+        self.guards.push(HeldGuard { guard: guarded, kind: P::KIND, echoes });
         Ok(guard)
     }
 
     /// The guard of what `source` sends of type `P`.
     pub(super) fn guard_of<P: Payload>(&self, source: Tid) -> Option<&Arc<dyn Guarded>> {
         let codename = Codename::of::<P>(source, self.tid());
-        self.guards.iter().find(|guard| guard.codename() == codename)
+        self.guards.iter().map(|held| &held.guard).find(|guard| guard.codename() == codename)
+    }
+
+    /// What was sent last to `source` for each type but `kind`. All echoes are one Stream, of which only the newest message may arrive.
+    fn last_echoes(&self, source: Tid, kind: Kind) -> Vec<(Kind, u64)> {
+        let others =
+            self.guards.iter().filter(|held| held.kind != kind && held.guard.codename().source == source);
+        others.map(|held| (held.kind, held.guard.last_echo().as_nanos())).collect()
     }
 
     /// The sender's side hears an echo.

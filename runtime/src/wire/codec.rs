@@ -3,7 +3,7 @@
 use bytes::{Buf, BufMut, Bytes, BytesMut};
 use tokio_util::codec::{Decoder, Encoder};
 
-use crate::wire::{HEADER_LEN, Header, HeaderError, Message, long};
+use crate::wire::{HEADER_LEN, Header, HeaderError, Message, long, memory};
 
 /// Why a stream of frames cannot go on. The connection is of no use after it.
 #[derive(Debug, thiserror::Error)]
@@ -32,7 +32,8 @@ const COPIED_BELOW: usize = 8 * 1024;
 /// Cuts a byte stream into messages and writes messages to one.
 ///
 /// The length in a header is checked before memory is reserved for it. A payload holds its own bytes in memory and little
-/// more: no message that waits long keeps the buffer that it came in.
+/// more: no message that waits long keeps the buffer that it came in. A short one is in one of the few buffers that the
+/// reading thread uses again, as if it had been written there.
 #[derive(Clone, Copy, Debug)]
 pub struct FrameCodec {
     payload_max: usize,
@@ -164,7 +165,7 @@ impl FrameCodec {
             self.tidy(source);
             return frame;
         }
-        let payload = Bytes::copy_from_slice(&source[HEADER_LEN..whole]);
+        let payload = memory::copied(&source[HEADER_LEN..whole]);
         source.advance(whole);
         self.tidy(source);
         payload

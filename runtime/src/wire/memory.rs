@@ -35,6 +35,16 @@ pub(super) fn written<E>(write: impl FnOnce(&mut Writer) -> Result<(), E>) -> Re
     Ok(writer.0.cut().freeze())
 }
 
+/// A payload that is these bytes.
+pub(super) fn copied(bytes: &[u8]) -> Bytes {
+    if bytes.is_empty() || bytes.len() > BUFFER_BYTES {
+        return Bytes::copy_from_slice(bytes);
+    }
+    let Some(mut buffer) = Buffer::of_thread() else { return Bytes::copy_from_slice(bytes) };
+    buffer.memory.extend_from_slice(bytes);
+    buffer.cut().freeze()
+}
+
 /// Zeroed memory of `length` bytes.
 pub(super) fn zeroed(length: usize) -> BytesMut {
     if length > BUFFER_BYTES {
@@ -78,9 +88,13 @@ struct Buffer {
 
 impl Buffer {
     fn take() -> Self {
+        Self::of_thread().unwrap_or_else(|| Self { memory: BytesMut::with_capacity(SHORT), place: None })
+    }
+
+    /// One of the thread's, if one is free.
+    fn of_thread() -> Option<Self> {
         // A thread that ends has none any more.
-        let taken = BUFFERS.try_with(|buffers| buffers.borrow_mut().take()).ok().flatten();
-        taken.unwrap_or_else(|| Self { memory: BytesMut::with_capacity(SHORT), place: None })
+        BUFFERS.try_with(|buffers| buffers.borrow_mut().take()).ok().flatten()
     }
 
     /// Other memory with what was written so far, and room for `length` bytes in all.
@@ -166,6 +180,7 @@ mod tests {
         drop(first);
         assert_eq!(payload(2, 4096).as_ptr(), place);
         assert_eq!(zeroed(8).as_ptr(), place);
+        assert_eq!(copied(&[1; 4096]).as_ptr(), place);
     }
 
     #[test]
@@ -174,6 +189,7 @@ mod tests {
         for round in 0..3 {
             kept.extend((0..BUFFERS_MAX + 9).map(|n| payload(n as u8, 1 + n * 67)));
             kept.extend((0..9).map(|n| payload(n as u8, 2 * BUFFER_BYTES)));
+            kept.extend((0..9).map(|n| copied(&[n as u8; 100])));
             for (n, payload) in kept.iter().enumerate() {
                 assert!(payload.iter().all(|byte| *byte == payload[0]), "payload {n} in round {round}");
             }
@@ -204,6 +220,7 @@ mod tests {
             let payload = written(|writer| writer.write_all(head).and_then(|()| writer.write_all(tail)));
             assert_eq!(payload.unwrap(), bytes);
             assert_eq!(zeroed(length), vec![0; length]);
+            assert_eq!(copied(&bytes), bytes);
         }
         assert_eq!(buffers(), 1);
     }

@@ -156,7 +156,7 @@ fn code_of(outcome: Outcome) -> Bytes {
 ///
 /// # Panics
 /// If the type's `Serialize` refuses its own value: a fault of the program, found by its first send.
-pub fn encode<P: Payload>(value: &P) -> Bytes {
+pub fn encode<T: Serialize>(value: &T) -> Bytes {
     memory::written(|writer| rmp_serde::encode::write_named(writer, value))
         .expect("a payload type can be written as MessagePack")
 }

@@ -1,0 +1,308 @@
+//! Messages between nodes cost no memory: once their number under way no longer grows, nothing is allocated for one, at either end.
+
+#![expect(clippy::unwrap_used, reason = "a test says what failed by failing")]
+
+use std::{
+    alloc::System,
+    collections::VecDeque,
+    marker::PhantomData,
+    net::SocketAddrV4,
+    pin::pin,
+    sync::{
+        Mutex, PoisonError,
+        mpsc::{SyncSender, sync_channel},
+    },
+    task::{Context, Poll, Waker},
+    time::Duration,
+};
+
+use actix::fut::wrap_future;
+use serde::{Deserialize, Serialize};
+use serde_bytes::ByteArray;
+use sinew::{Confirmation, Sender, prelude::*};
+use stats_alloc::{INSTRUMENTED_SYSTEM, StatsAlloc};
+
+/// Counts what all threads allocate, so that both ends are counted.
+#[global_allocator]
+static MEMORY: &StatsAlloc<System> = &INSTRUMENTED_SYSTEM;
+
+/// The count is the process's: one test at a time.
+static TURN: Mutex<()> = Mutex::new(());
+
+/// No wait is longer.
+const DEADLINE: Duration = Duration::from_secs(120);
+/// Windows after which queues and buffers have grown as far as they will.
+const WARM_UP: usize = 20;
+/// Messages that are looked at together: more than are acknowledged at once. The count is the whole process's, whose layers have their
+/// own work now and then: in most of the windows they have none.
+const WINDOW: usize = 200;
+/// Windows that are counted.
+const WINDOWS: usize = 100;
+
+/// A payload of `N` bytes in class Control.
+#[derive(Serialize, Deserialize)]
+struct Order<const N: usize>(ByteArray<N>);
+
+impl<const N: usize> Payload for Order<N> {
+    const NAME: &'static str = "test.order";
+}
+
+/// A payload of `N` bytes in class Bulk.
+#[derive(Serialize, Deserialize)]
+struct Load<const N: usize>(ByteArray<N>);
+
+impl<const N: usize> Payload for Load<N> {
+    const NAME: &'static str = "test.load";
+    const CLASS: Class = Class::Bulk;
+}
+
+/// Made of bytes.
+trait Filled: Payload {
+    fn filled() -> Self;
+}
+
+impl<const N: usize> Filled for Order<N> {
+    fn filled() -> Self {
+        Self(ByteArray::new([7; N]))
+    }
+}
+
+impl<const N: usize> Filled for Load<N> {
+    fn filled() -> Self {
+        Self(ByteArray::new([7; N]))
+    }
+}
+
+/// Says that something was handled; sent back, that whatever went before it the same way has come.
+#[derive(Serialize, Deserialize)]
+struct Word;
+
+impl Payload for Word {
+    const NAME: &'static str = "test.word";
+}
+
+/// How messages go.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum How {
+    /// As many as this are under way, each sent back by whoever gets it.
+    ThereAndBack(usize),
+    /// As many as this are sent, and their outcomes looked at when they are all there.
+    ConfirmedAndLookedAt(usize),
+    /// As many as this are under way, and the outcome of each is awaited in turn.
+    ConfirmedAndAwaited(usize),
+}
+
+fn allocated() -> usize {
+    let stats = MEMORY.stats();
+    stats.allocations + stats.reallocations
+}
+
+/// What was allocated in each window, but for those of the warm-up.
+struct Windows {
+    messages: usize,
+    before: usize,
+    each: Vec<usize>,
+    done: SyncSender<Vec<usize>>,
+}
+
+impl Windows {
+    fn new(done: SyncSender<Vec<usize>>) -> Self {
+        Self { messages: 0, before: 0, each: Vec::with_capacity(WARM_UP + WINDOWS), done }
+    }
+
+    /// Counts a message. Returns whether more are needed.
+    fn count(&mut self) -> bool {
+        self.messages += 1;
+        if self.messages.is_multiple_of(WINDOW) && self.each.len() < WARM_UP + WINDOWS {
+            let now = allocated();
+            self.each.push(now - self.before);
+            if self.each.len() == WARM_UP + WINDOWS {
+                self.done.send(self.each[WARM_UP..].to_vec()).unwrap();
+            }
+            self.before = allocated();
+        }
+        self.each.len() < WARM_UP + WINDOWS
+    }
+}
+
+/// Sends from one node, and counts.
+struct Here<P> {
+    how: How,
+    windows: Windows,
+    /// What was sent and not looked at.
+    under_way: Vec<Confirmation>,
+    /// Words that have come since.
+    words: usize,
+    payload: PhantomData<fn() -> P>,
+}
+
+impl<P: Filled> Here<P> {
+    fn new(how: How, done: SyncSender<Vec<usize>>) -> Self {
+        Self { how, windows: Windows::new(done), under_way: Vec::new(), words: 0, payload: PhantomData }
+    }
+
+    /// Sends `count`, of which each is followed by a word when it is handled.
+    fn send_confirmed(&mut self, there: Tid, count: usize, sender: &Sender) {
+        self.words = 0;
+        let sent = (0..count).map(|_| sender.send_confirmed(there, &P::filled(), DEADLINE).unwrap());
+        self.under_way.extend(sent);
+    }
+
+    /// Sends, and awaits the outcome of the oldest one, with `count` under way.
+    async fn send_and_await(sender: Sender, there: Tid, count: usize, mut windows: Windows) {
+        let send = || sender.send_confirmed(there, &P::filled(), DEADLINE).unwrap();
+        let mut under_way: VecDeque<_> = (0..count).map(|_| send()).collect();
+        while let Some(first) = under_way.pop_front() {
+            assert_eq!(first.await, Outcome::Delivered);
+            if windows.count() {
+                under_way.push_back(send());
+            }
+        }
+    }
+}
+
+impl<P: Filled> Actor for Here<P> {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        let (there, sender) = (context.resolve("there").unwrap(), context.sender());
+        match self.how {
+            How::ThereAndBack(count) => (0..count).for_each(|_| sender.send(there, &P::filled()).unwrap()),
+            How::ConfirmedAndLookedAt(count) => self.send_confirmed(there, count, &sender),
+            How::ConfirmedAndAwaited(count) => {
+                let nobody = Windows::new(sync_channel(1).0);
+                let windows = std::mem::replace(&mut self.windows, nobody);
+                context.spawn(wrap_future(Self::send_and_await(sender, there, count, windows)));
+            }
+        }
+    }
+}
+
+impl<P: Filled> Handler<Delivery<P>> for Here<P> {
+    type Result = ();
+
+    fn handle(&mut self, message: Delivery<P>, context: &mut Self::Context) {
+        // There and back are two.
+        self.windows.count();
+        if self.windows.count() {
+            context.send(message.source, &P::filled()).unwrap();
+        }
+    }
+}
+
+impl<P: Filled> Handler<Delivery<Word>> for Here<P> {
+    type Result = ();
+
+    fn handle(&mut self, word: Delivery<Word>, context: &mut Self::Context) {
+        self.windows.count();
+        self.words += 1;
+        let count = self.under_way.len();
+        if self.words < count {
+            return;
+        }
+        // An outcome is told at the end of all that was read with it: what is asked for after that comes behind it.
+        if self.words < count + 2 {
+            return context.send(word.source, &Word).unwrap();
+        }
+        let task = &mut Context::from_waker(Waker::noop());
+        for confirmation in self.under_way.drain(..) {
+            assert_eq!(pin!(confirmation).poll(task), Poll::Ready(Outcome::Delivered));
+        }
+        // What was confirmed is counted, too.
+        if (0..count).all(|_| self.windows.count()) {
+            self.send_confirmed(word.source, count, &context.sender());
+        }
+    }
+}
+
+/// Takes what comes at the other node, and says what is to be said to it.
+struct There {
+    how: How,
+}
+
+impl Actor for There {
+    type Context = AppContext<Self>;
+}
+
+impl<P: Filled> Handler<Delivery<P>> for There {
+    type Result = ();
+
+    fn handle(&mut self, message: Delivery<P>, context: &mut Self::Context) {
+        // Once all is counted the other node stops, and takes nothing more.
+        let _ = match self.how {
+            How::ThereAndBack(_) => context.send(message.source, &P::filled()),
+            How::ConfirmedAndLookedAt(_) => context.send(message.source, &Word),
+            How::ConfirmedAndAwaited(_) => Ok(()),
+        };
+    }
+}
+
+impl Handler<Delivery<Word>> for There {
+    type Result = ();
+
+    fn handle(&mut self, word: Delivery<Word>, context: &mut Self::Context) {
+        context.send(word.source, &Word).unwrap();
+    }
+}
+
+/// A node on the loopback interface, in a group that only this process has.
+fn node(name: &str, host: u8) -> NodeBuilder {
+    let id = std::process::id();
+    let group = SocketAddrV4::new([239, 255, 86, (id % 200 + 1) as u8].into(), 20_000 + (id % 20_000) as u16);
+    Node::builder(name).address([127, 0, 0, host]).configure(|config| {
+        config.ndl.multicast = Some(group);
+        config.ndl.mdns_port = None;
+    })
+}
+
+/// What was allocated in each window of messages between two nodes, least first.
+fn windows<P: Filled>(how: How) -> Vec<usize> {
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let (done, windows) = sync_channel(1);
+    let there = AppSpec::new("there", move || There { how }).handles::<P>().handles::<Word>().own_thread();
+    let here = AppSpec::new("here", move || Here::<P>::new(how, done.clone()));
+    let here = here.handles::<P>().handles::<Word>().requires(["there"]).own_thread();
+    let there = node("there", 2).app(there).start().unwrap();
+    let here = node("here", 1).app(here).start().unwrap();
+    let mut windows = windows.recv_timeout(DEADLINE).expect("all windows are counted");
+    here.stop();
+    there.stop();
+    windows.sort_unstable();
+    windows
+}
+
+/// The least that is allocated in a window, at most `bound`. With `--nocapture` the rest is shown, layers' own work in it.
+fn assert_at_most<P: Filled>(bound: usize, length: usize, how: How) {
+    let windows = windows::<P>(how);
+    let [least, median, most] = [0, WINDOWS / 2, WINDOWS - 1].map(|at| windows[at]);
+    let class = P::CLASS;
+    println!("{class:?}, {length} bytes, {how:?}: in {WINDOW} messages {least}, {median} (median), {most}");
+    assert!(least <= bound, "{class:?}, {length} bytes, {how:?}: {windows:?}");
+}
+
+/// The same for each class and each length.
+fn assert_all_at_most(bound: usize, how: How) {
+    assert_at_most::<Order<64>>(bound, 64, how);
+    assert_at_most::<Order<1000>>(bound, 1000, how);
+    assert_at_most::<Order<4096>>(bound, 4096, how);
+    assert_at_most::<Load<64>>(bound, 64, how);
+    assert_at_most::<Load<1000>>(bound, 1000, how);
+    assert_at_most::<Load<4096>>(bound, 4096, how);
+}
+
+#[test]
+fn an_unconfirmed_message_between_nodes_costs_no_memory() {
+    assert_all_at_most(0, How::ThereAndBack(1));
+    assert_all_at_most(0, How::ThereAndBack(16));
+}
+
+#[test]
+fn a_confirmed_message_between_nodes_and_its_outcome_cost_no_memory() {
+    assert_all_at_most(0, How::ConfirmedAndLookedAt(1));
+    assert_all_at_most(0, How::ConfirmedAndLookedAt(16));
+}
+
+#[test]
+fn an_outcome_that_is_awaited_costs_the_timer_of_its_deadline_and_nothing_else() {
+    assert_all_at_most(WINDOW, How::ConfirmedAndAwaited(1));
+}
