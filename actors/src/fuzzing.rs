@@ -33,6 +33,18 @@ pub fn discovery(bytes: &[u8]) -> bool {
     crate::ndl::fuzzing::discovery(bytes)
 }
 
+/// A script of sealed datagrams of discovery, honest, forged, damaged and sent again, played to a live checker of seals.
+#[must_use]
+pub fn seals(script: &[u8]) -> bool {
+    crate::secured::fuzzing::seals(script)
+}
+
+/// The file of an access list.
+#[must_use]
+pub fn access(bytes: &[u8]) -> bool {
+    crate::access::fuzzing::access(bytes)
+}
+
 /// Frames of a client at the node's door, in any state of its connection.
 #[must_use]
 pub fn control(bytes: &[u8]) -> bool {
@@ -63,6 +75,8 @@ pub fn seeds(format: &str) -> Vec<Vec<u8>> {
         "session" => vec![crate::session::fuzzing::A_SESSION.to_vec()],
         "datagrams" => crate::gncl::fuzzing::some_datagrams(),
         "discovery" => crate::ndl::fuzzing::some_datagrams(),
+        "seals" => vec![crate::secured::fuzzing::SOME_SEALS.to_vec()],
+        "access" => crate::access::fuzzing::some_lists(),
         "control" => crate::lncl::fuzzing::some_frames(),
         "words" => {
             let said = [

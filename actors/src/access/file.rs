@@ -40,8 +40,8 @@ pub(crate) fn read(path: &Path) -> Result<List, ConfigFaults> {
     let text = read.and_then(|bytes| String::from_utf8(bytes.to_vec()).map_err(|error| error.to_string()));
     let text = text.map_err(|found| {
         let legal =
-            "a text file of at most 1 MiB that this user may read, and that only it or root may write to";
-        let remedy = "check security.access, the path and its permissions";
+            "a text file of at most 1 MiB that this user may read, and that only it or root may write to, in a directory of which the same is so";
+        let remedy = "check security.access, the path and its permissions, and those of its directory";
         ConfigFaults::one(fault(&path.display().to_string(), found, legal, remedy))
     })?;
     parse(&text)

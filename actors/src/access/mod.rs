@@ -11,6 +11,8 @@
 mod asked;
 mod client;
 mod file;
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 mod guard;
 mod index;
 mod rule;

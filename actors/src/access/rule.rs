@@ -77,7 +77,7 @@ pub(crate) struct Question {
 }
 
 /// The names of source and target, as far as the directory has them.
-#[cfg(test)]
+#[cfg(any(test, feature = "fuzzing"))]
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Names<'a> {
     pub(super) source: Option<&'a str>,
@@ -95,7 +95,7 @@ pub(crate) enum Verdict {
 
 impl List {
     /// What becomes of a message on the node at `here`. What no rule covers is refused.
-    #[cfg(test)]
+    #[cfg(any(test, feature = "fuzzing"))]
     pub(super) fn decide(&self, here: NodeAddress, asked: Question, names: Names<'_>) -> Verdict {
         self.verdict(self.rules.iter().position(|rule| rule.covers(here, asked, names)))
     }
@@ -117,7 +117,7 @@ impl List {
 }
 
 impl Rule {
-    #[cfg(test)]
+    #[cfg(any(test, feature = "fuzzing"))]
     fn covers(&self, here: NodeAddress, asked: Question, names: Names<'_>) -> bool {
         self.classes.has(asked.class)
             && self.is_from(here, asked.source, names.source)

@@ -396,7 +396,9 @@ impl Attacker {
         let record = crate::layout::record_bytes(length).expect("it is small");
         let rest = capacity.rest(self.tail);
         let skip = if record > rest { rest } else { 0 };
-        if self.tail.wrapping_sub(self.victim.load(Word::Head)) + skip + record > capacity.bytes() {
+        // What it has lied before may make any number of these.
+        let used = self.tail.wrapping_sub(self.victim.load(Word::Head));
+        if u64::from(used) + u64::from(skip) + u64::from(record) > u64::from(capacity.bytes()) {
             return;
         }
         // Nor does anything keep it from writing there before the victim has read, but this.

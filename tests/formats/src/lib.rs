@@ -25,7 +25,7 @@ pub struct Format {
 }
 
 /// All of them.
-pub const FORMATS: [Format; 14] = [
+pub const FORMATS: [Format; 16] = [
     Format {
         name: "header",
         from: "a peer, by TCP or UDP",
@@ -64,6 +64,12 @@ pub const FORMATS: [Format; 14] = [
         seeds: || sinew::fuzzing::seeds("discovery"),
     },
     Format {
+        name: "seals",
+        from: "anybody, by UDP, in a project with keys",
+        play: sinew::fuzzing::seals,
+        seeds: || sinew::fuzzing::seeds("seals"),
+    },
+    Format {
         name: "control",
         from: "a client, at the node's door",
         play: sinew::fuzzing::control,
@@ -81,6 +87,12 @@ pub const FORMATS: [Format; 14] = [
         from: "a person, in files and variables",
         play: files::configuration,
         seeds: files::some_configurations,
+    },
+    Format {
+        name: "access",
+        from: "a person, in the access list's file",
+        play: sinew::fuzzing::access,
+        seeds: || sinew::fuzzing::seeds("access"),
     },
     Format {
         name: "certificate",
