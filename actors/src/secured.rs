@@ -1,5 +1,8 @@
 //! What a node with keys proves itself and its datagrams with. Not there: it is open to everybody on its network.
 
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
+
 use std::{
     num::NonZeroUsize,
     sync::{Arc, Mutex},
@@ -14,7 +17,9 @@ use sinew_runtime::{
 
 use crate::{
     config::NodeConfig,
-    security::{Checker, CredentialFaults, Credentials, Identity, Sealer, Stamp, Tag, Tls, Verdict},
+    security::{
+        Checker, CredentialFaults, Credentials, DiscoveryKey, Identity, Sealer, Stamp, Tag, Tls, Verdict,
+    },
     stores::lock,
 };
 
@@ -24,7 +29,13 @@ pub(crate) const SEAL_LEN: usize = 8 + 8 + Tag::BYTES;
 /// Of one life of a node; it outlives the layers that use it.
 pub(crate) struct Secured {
     pub(crate) tls: Tls,
-    seals: Mutex<(Sealer, Checker)>,
+    seals: Mutex<Seals>,
+}
+
+/// Puts seals behind datagrams, and looks at those of others.
+struct Seals {
+    sealer: Sealer,
+    checker: Checker,
 }
 
 impl Secured {
@@ -52,17 +63,13 @@ impl Secured {
     ) -> Self {
         let (key, identity) = (credentials.discovery(), credentials.identity());
         let nodes_max = NonZeroUsize::new(nodes_max).unwrap_or(NonZeroUsize::MIN);
-        let sealer = Sealer::new(key, &identity.project, identity.address, incarnation);
-        let checker = Checker::new(key, &identity.project, nodes_max);
-        Self { tls, seals: Mutex::new((sealer, checker)) }
+        let seals = Seals::new(key, &identity.project, identity.address, incarnation, nodes_max);
+        Self { tls, seals: Mutex::new(seals) }
     }
 
     /// Puts a seal behind a datagram of this node.
     pub(crate) fn seal(&self, datagram: &mut BytesMut) {
-        let (stamp, tag) = lock(&self.seals).0.seal(datagram);
-        datagram.extend_from_slice(&stamp.incarnation.0.to_le_bytes());
-        datagram.extend_from_slice(&stamp.number.to_le_bytes());
-        datagram.extend_from_slice(&tag.0);
+        lock(&self.seals).seal(datagram);
     }
 
     /// The datagram in front of a seal, as `maker` says who made it.
@@ -71,6 +78,47 @@ impl Secured {
     /// Nobody of the project made it so, or it was taken before; in words.
     pub(crate) fn unseal<'a>(
         &self,
+        now: Time,
+        sealed: &'a [u8],
+        maker: impl FnOnce(&[u8]) -> Option<NodeAddress>,
+    ) -> Result<&'a [u8], &'static str> {
+        lock(&self.seals).unseal(now, sealed, maker)
+    }
+
+    /// How many datagrams this life has made: what it says in its handshakes.
+    pub(crate) fn made(&self) -> u64 {
+        lock(&self.seals).made()
+    }
+
+    /// That life of that node has proven itself, and said how many datagrams it had made.
+    pub(crate) fn confirm(&self, now: Time, said: Stamp) {
+        lock(&self.seals).confirm(now, said);
+    }
+}
+
+impl Seals {
+    /// For this life of `node`; it keeps so many nodes in mind.
+    fn new(
+        key: &DiscoveryKey,
+        project: &str,
+        node: NodeAddress,
+        incarnation: Incarnation,
+        nodes_max: NonZeroUsize,
+    ) -> Self {
+        let sealer = Sealer::new(key, project, node, incarnation);
+        Self { sealer, checker: Checker::new(key, project, nodes_max) }
+    }
+
+    fn seal(&mut self, datagram: &mut BytesMut) {
+        let (stamp, tag) = self.sealer.seal(datagram);
+        datagram.extend_from_slice(&stamp.incarnation.0.to_le_bytes());
+        datagram.extend_from_slice(&stamp.number.to_le_bytes());
+        datagram.extend_from_slice(&tag.0);
+    }
+
+    /// As [`Secured::unseal`].
+    fn unseal<'a>(
+        &mut self,
         now: Time,
         sealed: &'a [u8],
         maker: impl FnOnce(&[u8]) -> Option<NodeAddress>,
@@ -85,7 +133,7 @@ impl Secured {
             incarnation: Incarnation(u64::from_le_bytes(*incarnation)),
             number: u64::from_le_bytes(*number),
         };
-        match lock(&self.seals).1.check(now, stamp, tag, datagram) {
+        match self.checker.check(now, stamp, tag, datagram) {
             // Of a life that has not proven itself it is a hint, and what follows from a hint has its bounds.
             Verdict::Fresh | Verdict::OtherLife => Ok(datagram),
             Verdict::Replayed => Err("it was taken before: somebody sends again what was recorded"),
@@ -93,14 +141,12 @@ impl Secured {
         }
     }
 
-    /// How many datagrams this life has made: what it says in its handshakes.
-    pub(crate) fn made(&self) -> u64 {
-        lock(&self.seals).0.made()
+    const fn made(&self) -> u64 {
+        self.sealer.made()
     }
 
-    /// That life of that node has proven itself, and said how many datagrams it had made.
-    pub(crate) fn confirm(&self, now: Time, said: Stamp) {
-        lock(&self.seals).1.confirm(now, said);
+    fn confirm(&mut self, now: Time, said: Stamp) {
+        self.checker.confirm(now, said);
     }
 }
 

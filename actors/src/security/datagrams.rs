@@ -15,7 +15,7 @@
 //! | --- | --- | --- |
 //! | whose tag is wrong | [`Verdict::Forged`] | a count |
 //! | of a confirmed life, with a new number | [`Verdict::Fresh`] | what discovery does with it |
-//! | of a confirmed life, with a number that was taken, or is older by 64 and more | [`Verdict::Replayed`] | a count |
+//! | of a confirmed life, with a number that was taken, or is older by 1,984 and more | [`Verdict::Replayed`] | a count |
 //! | of another life, or of a node that is not confirmed | [`Verdict::OtherLife`] | one dial, whose rate the caller limits |
 //!
 //! Whether another life is later or earlier is not asked: a robot without a battery for its clock may come back with a smaller number.
@@ -34,6 +34,10 @@ use subtle::ConstantTimeEq;
 use zeroize::Zeroizing;
 
 use super::replay::Window;
+
+/// So many numbers up to the highest one that was taken of a life may still be taken.
+#[cfg(feature = "fuzzing")]
+pub(crate) const SPAN: u64 = Window::SPAN;
 
 /// The project's key for datagrams, the same on all nodes.
 #[derive(Clone)]
@@ -184,7 +188,7 @@ impl Sealer {
 }
 
 impl Checker {
-    /// One that keeps `nodes_max` nodes in mind: 48 bytes and a place in a tree for each.
+    /// One that keeps `nodes_max` nodes in mind: 290 bytes and a place in a tree for each.
     #[must_use]
     pub fn new(key: &DiscoveryKey, project: &str, nodes_max: NonZeroUsize) -> Self {
         Self { key: key.of_tags(project), nodes_max, confirmed: BTreeMap::new() }
@@ -211,7 +215,8 @@ impl Checker {
     }
 
     /// A handshake has proven that this life of this node is there, and it has said in it how many datagrams it had made (`said.number`): of
-    /// these none counts any more, whoever recorded them. Of a life that was confirmed already nothing is forgotten. Where there is no room,
+    /// these none counts any more, whoever recorded them. Of a life that was confirmed already nothing is forgotten, unless a number was taken
+    /// that it has not come near to: somebody else made that one, to have it taken for repeating itself. Where there is no room,
     /// the node that was silent longest is no longer confirmed, which costs it a dial.
     pub fn confirm(&mut self, now: Time, said: Stamp) {
         let Stamp { node, incarnation, number } = said;
@@ -219,6 +224,9 @@ impl Checker {
             && life.incarnation == incarnation
         {
             life.heard = now;
+            if life.window.is_beyond(number) {
+                life.window = Window::after(number);
+            }
             return;
         }
         self.confirmed.remove(&node);

@@ -83,7 +83,7 @@ pub enum FileFault {
     },
     /// Others can change what the node believes.
     #[error(
-        "others can write to {path} (mode {mode:04o}), and so decide whom this node believes: `chmod go-w {path}`"
+        "others can write to {path} (mode {mode:04o}), and so decide whom this node believes: `chmod go-w {path}`, or, where others are to write there (as in `/tmp`), move the file to a directory of its own"
     )]
     Writable {
         /// Which.
@@ -125,8 +125,15 @@ pub(super) fn certificate(path: &Path) -> Result<Zeroizing<Vec<u8>>, FileFault> 
     read(path, Guarded::Public, KEY_BYTES_MAX)
 }
 
-/// Reads an access list of at most `bytes_max` bytes.
+/// Reads an access list of at most `bytes_max` bytes, which stands where nobody else can put another file in its place: neither in the
+/// directory of `path` nor, if that is a link, in the one where the file itself is. Who can rename those directories is not looked at.
 pub(crate) fn access_list(path: &Path, bytes_max: u64) -> Result<Zeroizing<Vec<u8>>, FileFault> {
+    let unreadable = |cause| FileFault::Unreadable { path: path.to_owned(), cause };
+    let target = path.canonicalize().map_err(unreadable)?;
+    for place in [path, &target] {
+        let parent = place.parent().filter(|parent| !parent.as_os_str().is_empty());
+        directory(parent.unwrap_or_else(|| Path::new(".")))?;
+    }
     read(path, Guarded::Public, bytes_max)
 }
 

@@ -35,6 +35,8 @@ mod verifier;
 
 pub use certificate::{Certificate, Malformed, Serial};
 pub use credentials::{CredentialFault, CredentialFaults, Credentials};
+#[cfg(feature = "fuzzing")]
+pub(crate) use datagrams::SPAN;
 pub use datagrams::{Checker, DiscoveryKey, Sealer, Stamp, Tag, Verdict};
 pub use denied::{DenyList, DenyListFault};
 pub use identity::{Identity, project_of, project_uri};

@@ -11,6 +11,10 @@ use super::{ConnectionId, Settings, dials::Dial, sides::Side};
 pub(super) struct Acquaintance {
     /// The newest life of it that was seen.
     pub(super) incarnation: Incarnation,
+    /// Since when that life is known.
+    pub(super) met: Time,
+    /// That life has been linked; else it is known by what others told of it.
+    pub(super) was_linked: bool,
     /// The life of it that NDL told of last.
     pub(super) found: Option<Incarnation>,
     /// Where to dial it, as long as NDL says that it is there.
@@ -69,9 +73,11 @@ pub(super) struct Pulse {
 }
 
 impl Acquaintance {
-    pub(super) const fn new(incarnation: Incarnation, settings: &Settings) -> Self {
+    pub(super) const fn new(now: Time, incarnation: Incarnation, settings: &Settings) -> Self {
         Self {
             incarnation,
+            met: now,
+            was_linked: false,
             found: None,
             wanted: None,
             link: None,
@@ -94,6 +100,24 @@ impl Acquaintance {
     /// Whether NDL has lost this life of it, or a later one, and has found none since.
     pub(super) fn is_lost(&self, incarnation: Incarnation) -> bool {
         self.lost.is_some_and(|lost| incarnation <= lost.incarnation)
+    }
+
+    /// Whether the life of it that is known has proven nothing, where a connection proves who is at its end, though it had the time to connect:
+    /// then datagrams alone told of it, which every node of the project can make.
+    pub(super) fn is_hearsay(&self, now: Time, settings: &Settings) -> bool {
+        settings.connections_prove && !self.was_linked && now.since(self.met) >= settings.orphan
+    }
+
+    /// Whether NDL can no longer find this life, as it has found a later one. Where a connection proves who is at its end, one that was never
+    /// linked bars no other, as in NDL (NDL-5.2).
+    pub(super) fn bars_finding(&self, incarnation: Incarnation, settings: &Settings) -> bool {
+        let is_proven = !settings.connections_prove || self.was_linked;
+        is_proven && self.found.is_some_and(|found| incarnation < found)
+    }
+
+    /// Whether news about this life contradict a link that has proven to be another life's.
+    pub(super) fn disproves(&self, incarnation: Incarnation, settings: &Settings) -> bool {
+        settings.connections_prove && self.link.is_some() && self.incarnation != incarnation
     }
 
     /// Whether only its own hello tells of it, and something is kept for it.
@@ -122,6 +146,7 @@ impl Acquaintance {
     /// A link is there: nothing is planned.
     pub(super) fn linked(&mut self, link: Link) {
         self.link = Some(link);
+        self.was_linked = true;
         self.redial_at = None;
         self.orphan_at = None;
     }

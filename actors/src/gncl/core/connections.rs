@@ -138,7 +138,7 @@ impl Core {
         if hello.lane != Lane::Control {
             return self.side_hello(now, connection, hello);
         }
-        if let Err(decline) = self.judge(hello) {
+        if let Err(decline) = self.judge(now, hello) {
             return self.decline(now, connection, &decline);
         }
         let node = hello.node;
@@ -154,12 +154,12 @@ impl Core {
     }
 
     /// Whether a hello can be taken.
-    fn judge(&self, hello: &Introduction) -> Result<(), Decline> {
+    fn judge(&self, now: Time, hello: &Introduction) -> Result<(), Decline> {
         if self.leaving {
             return Err(Decline::Leaving);
         }
         check(hello, &self.settings.ours)?;
-        self.judge_life(hello.node, hello.incarnation)?;
+        self.judge_life(now, hello.node, hello.incarnation)?;
         self.room_for_claim(hello.node)?;
         let Some(peer) = self.peers.get(&hello.node) else { return self.room() };
         // spec: GNCL-6
@@ -205,7 +205,7 @@ impl Core {
                 return self.decline(now, connection, &Decline::Violation(what));
             }
         };
-        if let Err(decline) = self.judge_welcome(node, welcome) {
+        if let Err(decline) = self.judge_welcome(now, node, welcome) {
             return self.decline(now, connection, &decline);
         }
         self.meet(now, node, welcome.incarnation);
@@ -214,18 +214,21 @@ impl Core {
         self.link(now, connection, welcome, None);
     }
 
-    fn judge_welcome(&self, dialled: NodeAddress, welcome: &Introduction) -> Result<(), Decline> {
+    fn judge_welcome(&self, now: Time, dialled: NodeAddress, welcome: &Introduction) -> Result<(), Decline> {
         check(welcome, &self.settings.ours)?;
         if welcome.node != dialled {
             return Err(Decline::WrongNode { wanted: dialled, ours: welcome.node });
         }
-        self.judge_life(dialled, welcome.incarnation)
+        self.judge_life(now, dialled, welcome.incarnation)
     }
 
     /// Whether this life of `node` may be linked: which one is there, and whether one is, says NDL. spec: GNCL-7
-    fn judge_life(&self, node: NodeAddress, incarnation: Incarnation) -> Result<(), Decline> {
+    fn judge_life(&self, now: Time, node: NodeAddress, incarnation: Incarnation) -> Result<(), Decline> {
         let Some(peer) = self.peers.get(&node) else { return Ok(()) };
-        if incarnation < peer.incarnation {
+        if incarnation != peer.incarnation && peer.is_hearsay(now, &self.settings) {
+            // Who connects has proven more than the one of whom NDL tells. spec: GNCL-7
+            Ok(())
+        } else if incarnation < peer.incarnation {
             Err(Decline::Stale { theirs: incarnation, known: peer.incarnation })
         } else if peer.vouched().is_some_and(|present| incarnation > present) {
             Err(Decline::Contested { node })
@@ -249,6 +252,10 @@ impl Core {
         let Some(peer) = self.peers.get_mut(&node) else { return };
         let ours = peer.dial.take().and_then(|dial| dial.address_of(connection));
         let (dial, dialled) = if welcome.is_some() { (theirs.dial, None) } else { (peer.dial_number, ours) };
+        if self.settings.connections_prove && peer.found.is_some_and(|found| found != incarnation) {
+            // NDL was told of a life that never connected; it will tell of this one.
+            (peer.found, peer.wanted) = (None, None);
+        }
         if self.leaving {
             // What waited goes out on it, and it is the last one.
             peer.wanted = None;

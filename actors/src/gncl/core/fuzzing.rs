@@ -73,6 +73,7 @@ fn settings() -> Settings {
         pings_missed_max: 3,
         healthy: Duration::from_secs(1),
         orphan: Duration::from_secs(1),
+        connections_prove: false,
     }
 }
 
@@ -237,9 +238,11 @@ impl Play<'_> {
         assert!(orders <= 16 * connections_max, "{orders} orders for one input");
         assert!(self.core.peers.len() <= PEERS_MAX, "{} peers", self.core.peers.len());
         let strange = |stage| matches!(stage, Stage::Stranger | Stage::Leaving);
-        let strangers = self.core.connections.values().filter(|held| strange(held.stage)).count();
-        // Who is refused may be a peer's, whose number is bounded by itself.
-        assert!(strangers <= connections_max, "{strangers} strangers");
+        // Their number has no bound of its own, as who is refused may be a peer's that was dialled again and again: their time has.
+        let latest = self.now + settings().handshake;
+        for stranger in self.core.connections.values().filter(|held| strange(held.stage)) {
+            assert!(stranger.deadline <= latest, "a stranger may stay until {:?}", stranger.deadline);
+        }
         assert!(
             self.core.connections.len() <= 2 * connections_max,
             "{} connections",

@@ -245,9 +245,9 @@ pub(crate) fn check(theirs: &Introduction, ours: &Introduction) -> Result<(), De
 
 /// The MessagePack form of a payload of this layer.
 pub(crate) fn write<T: Serialize>(value: &T) -> Bytes {
-    rmp_serde::to_vec_named(value)
-        .expect("structs of strings and numbers can be written as MessagePack")
-        .into()
+    // Structs of strings and numbers, which can be written. An acknowledgement is one, and each 32 messages at most have one: in memory that
+    // is used again.
+    sinew_runtime::wire::encode(value)
 }
 
 /// Reads a payload of this layer.

@@ -24,8 +24,15 @@ impl Core {
             return;
         }
         // A life that only said hello is no proof: another process may use the node's address. spec: GNCL-7
-        if self.peers.get(&node).is_some_and(|peer| peer.found.is_some_and(|found| incarnation < found)) {
+        if self.peers.get(&node).is_some_and(|peer| peer.bars_finding(incarnation, &self.settings)) {
             self.count("stale incarnation", format!("NDL found node {node} in a life that is over"));
+            return;
+        }
+        if self.peers.get(&node).is_some_and(|peer| peer.disproves(incarnation, &self.settings)) {
+            self.count(
+                "life not proven",
+                format!("NDL found node {node} in another life than the one that is linked"),
+            );
             return;
         }
         if self.peers.get(&node).is_some_and(|peer| peer.incarnation != incarnation) {
@@ -55,10 +62,14 @@ impl Core {
     pub(super) fn lost(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
         self.over(now, node, incarnation);
         if !self.peers.contains_key(&node) && self.peers.len() < self.settings.peers_max {
-            self.peers.insert(node, Acquaintance::new(incarnation, &self.settings));
+            let mut lost = Acquaintance::new(now, incarnation, &self.settings);
+            // As a former instance of this layer may have linked it.
+            lost.was_linked = true;
+            self.peers.insert(node, lost);
         }
         if let Some(peer) = self.peers.get_mut(&node)
             && incarnation >= peer.incarnation
+            && !peer.disproves(incarnation, &self.settings)
         {
             peer.lost = Some(Lost { incarnation, at: now });
         }
@@ -67,8 +78,8 @@ impl Core {
     /// This life of `node` is over: all that there is with it ends.
     fn over(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
         let Some(peer) = self.peers.get_mut(&node) else { return };
-        if incarnation < peer.incarnation {
-            // The news is about a life that is over anyway.
+        if incarnation < peer.incarnation || peer.disproves(incarnation, &self.settings) {
+            // The news is about a life that is over anyway, or never was.
             return;
         }
         peer.wanted = None;
@@ -97,7 +108,12 @@ impl Core {
         self.meet(now, node, incarnation);
         let chance = self.chance();
         if let Some(peer) = self.peers.get_mut(&node) {
-            peer.plan(now, &self.settings, chance);
+            // That instance had a link with it: what is restored is what was left of one.
+            peer.was_linked = true;
+            // Where a link or a dial of this instance's is there already, what follows from its end plans.
+            if peer.link.is_none() && peer.dial.is_none() {
+                peer.plan(now, &self.settings, chance);
+            }
         }
     }
 
@@ -116,10 +132,15 @@ impl Core {
         }
         if let Some(peer) = self.peers.get_mut(&node) {
             peer.incarnation = incarnation;
+            (peer.met, peer.was_linked) = (now, false);
+            if peer.is_lost(incarnation) {
+                // What was lost was never linked, and is no bar to a life that is there.
+                peer.lost = None;
+            }
             peer.void_dial = 0;
             peer.back_off = self.settings.redial_min;
         } else if self.peers.len() < self.settings.peers_max {
-            self.peers.insert(node, Acquaintance::new(incarnation, &self.settings));
+            self.peers.insert(node, Acquaintance::new(now, incarnation, &self.settings));
         }
     }
 

@@ -65,6 +65,8 @@ pub(super) struct Settings {
     pub(super) healthy: Duration,
     /// Time that a peer's messages are kept without a link, if NDL never told of it.
     pub(super) orphan: Duration,
+    /// Whether who says hello on a connection has proven there to be that node, by its keys.
+    pub(super) connections_prove: bool,
 }
 
 /// One TCP connection, made or accepted. Never used twice.

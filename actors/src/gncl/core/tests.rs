@@ -6,6 +6,7 @@ use super::*;
 
 mod dials;
 mod lost;
+mod proven;
 mod sides;
 mod virtual_wire;
 
@@ -93,6 +94,7 @@ fn settings(node: NodeAddress, incarnation: u64) -> Settings {
         pings_missed_max: 3,
         healthy: Duration::from_secs(5),
         orphan: Duration::from_secs(5),
+        connections_prove: false,
     }
 }
 

@@ -119,10 +119,10 @@ impl Core {
         // What is said later than the next look at the timer may be too late.
         let within = self.paces[at].period * 3 / 4;
         let suspected = self.members.iter().filter(|(_, member)| member.pace == at && member.missed > 0);
-        let probes = suspected.map(|(node, Member { announcement, .. })| Output::Probe {
+        let probes = suspected.map(|(node, member)| Output::Probe {
             node: *node,
-            incarnation: announcement.incarnation,
-            to: announcement.gncl_addresses(),
+            incarnation: member.announcement.incarnation,
+            to: member.gncl_addresses(),
             within,
         });
         self.outputs.extend(probes);

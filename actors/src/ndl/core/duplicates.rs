@@ -92,7 +92,8 @@ impl Core {
             return self.collide(now, self.me.node, own, other);
         }
         self.collide(now, self.me.node, other, own);
-        if now >= settles {
+        // Whose connections stand, and prove something, is what it says; the other one cannot connect. spec: NDL-5.8
+        if now >= settles && !self.proven.is_anybody() {
             self.try_other(now, other);
         }
     }

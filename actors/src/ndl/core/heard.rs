@@ -24,6 +24,10 @@ const ASK_GAP_MS: u64 = 10;
 impl Core {
     /// Takes in a datagram, if its sender's budget allows. // spec: NDL-7.2
     pub(crate) fn receive(&mut self, now: Time, from: Place, way: Way, bytes: &[u8]) {
+        // A group of IPv6 is heard once for each address of an interface: what a link-local address sent there concerns the link-local one, and so on.
+        if way == Way::Multicast && from.there.is_ipv6() && !from.is_a_way() {
+            return;
+        }
         if !self.admits(now, from, bytes) {
             self.refusals.count(now, "NDL datagrams above the budget of their source", &from.there);
             return;
@@ -216,8 +220,12 @@ impl Core {
 
     // spec: NDL-4.4
     pub(super) fn taken_leave_of(&mut self, now: Time, from: Place, announcement: &Announcement) {
-        if self.is_said_by_member(from, announcement) {
-            let yields = announcement.claim == Claim::Yielded;
+        let yields = announcement.claim == Claim::Yielded;
+        if yields && self.is_proven(announcement.node) {
+            // Who gives its address up ends, and its connections with it. spec: NDL-5.8
+            let what = format_args!("{} says that {} gives its address up", from.there, announcement.node);
+            self.refusals.count(now, "NDL leave of a node that is connected", &what);
+        } else if self.is_said_by_member(from, announcement) {
             let why = if yields { LossReason::Duplicate } else { LossReason::Left };
             self.lose(now, announcement.node, why);
         } else if self.is_former_at(from, announcement) {

@@ -79,6 +79,9 @@ impl Core {
             self.own_address_used(now, &proof);
             return;
         }
+        if self.contradicts_a_proof(now, &proof) {
+            return;
+        }
         self.release_address(now, proof.from, claimed.node);
         let Some(member) = self.members.get(&claimed.node) else {
             self.arrive(now, proof);
@@ -183,6 +186,12 @@ impl Core {
             {
                 Arrival::Found
             }
+            Some(gone) if self.earlier_may_come(now, gone.since) => {
+                // GNCL knows nothing of that address any more, so that the earlier life may connect.
+                let (node, incarnation) = (claimed.node, gone.incarnation);
+                self.outputs.push_back(Output::Forgotten { node, incarnation });
+                Arrival::Restarted
+            }
             Some(gone) => {
                 self.refuse_stale(now, &proof, gone.incarnation);
                 return;
@@ -199,7 +208,8 @@ impl Core {
     pub(super) fn refuse_stale(&self, now: Time, proof: &Proof, known: Incarnation) {
         let Announcement { node, incarnation, .. } = proof.announcement;
         let what = format_args!(
-            "{node} at {} is in life {incarnation}, and life {known} was seen",
+            "{node} at {} is in life {incarnation}, and the later life {known} was seen; if no other process has that address, its \
+             clock went back, and it is taken 15 s after the later life was lost",
             proof.from.there
         );
         self.refusals.count(now, "NDL answer of a former life", &what);
@@ -209,12 +219,12 @@ impl Core {
         let Proof { from, announcement, exchange, progress, .. } = proof;
         let Announcement { node, incarnation, ref name, .. } = announcement;
         let name = name.clone();
-        let gncl = announcement.gncl_addresses();
+        let gncl = announcement.gncl_addresses([(from.here, from.there)]);
         let mut sought = Vec::new();
         if let Some(gone) = self.gone.remove(&node) {
             let others = gone.places.into_iter().filter(|place| *place != from);
             let (announced, former): (Vec<_>, Vec<_>) =
-                others.partition(|place| announcement.ndl_addresses().any(|there| there == place.there));
+                others.partition(|place| announcement.has_ndl_at(place.there));
             former.into_iter().for_each(|place| self.forget_former(place, node));
             sought.extend(announced.into_iter().filter(|place| self.seeks_former(*place, node)));
         }
@@ -307,7 +317,9 @@ impl Core {
             self.challenge_member(now, node);
             return;
         }
-        if let Some(contest) = self.contests.remove(&node) {
+        if let Some(contest) = self.contests.remove(&node)
+            && !self.contradicts_a_proof(now, &contest.newcomer)
+        {
             self.replace(now, contest.newcomer);
         }
     }
@@ -318,6 +330,7 @@ impl Core {
         | LinkFact::LinkBroken { node, incarnation }
         | LinkFact::DialRefused { node, incarnation }
         | LinkFact::PeerLeft { node, incarnation }) = fact;
+        self.note_proof(now, fact);
         let Some(member) = self.members.get_mut(&node).filter(|m| m.announcement.incarnation == incarnation)
         else {
             // About a life that is over for NDL already.
@@ -340,6 +353,7 @@ impl Core {
     /// A shell starts, and `stands` says which connections there are: where GNCL was restarted, too, those that ended with it are told by
     /// nobody. // spec: NDL-4.3, NDL-4.5
     pub(crate) fn look_at_links(&mut self, now: Time, stands: impl Fn(NodeAddress, Incarnation) -> bool) {
+        self.proven.look_at_links(&stands);
         for (node, member) in &mut self.members {
             if member.link_until == Time::MAX && !stands(*node, member.announcement.incarnation) {
                 (member.is_link_broken, member.link_until) = (true, now + LINK_GRACE);
@@ -352,11 +366,15 @@ impl Core {
         let Some(member) = self.members.remove(&node) else { return };
         let contest = self.contests.remove(&node);
         let sources = self.sources(&member).into_keys().collect();
+        // GNCL ends the connection of a life that is over.
+        self.proven.lost(node, member.announcement.incarnation);
         let bound = self.paces[member.pace].bound();
         self.recall.lost(now, &member, sources, Loss { why, bound });
         self.is_lonely |= self.members.is_empty() && matches!(why, LossReason::Hung | LossReason::LinkDown);
         if why == LossReason::Duplicate {
             // An elder life has its address: this one is no bar to that.
+        } else if !self.bars_earlier(&member) {
+            // It may never have been there.
         } else {
             self.remember(now, &member);
         }
@@ -407,14 +425,13 @@ impl Core {
 
     /// A node is not there any more: what was asked at addresses that it announced is answered too late.
     pub(super) fn void_questions(&mut self, now: Time, of: &Announcement) {
-        let there: Vec<_> = of.ndl_addresses().collect();
         let is_its = |contact: &Contact| match contact.role {
             Role::Candidate { .. } => true,
             Role::Former { node, .. } => node == of.node,
             Role::Member(_) => false,
         };
         let places =
-            self.contacts.iter().filter(|(place, contact)| there.contains(&place.there) && is_its(contact));
+            self.contacts.iter().filter(|(place, contact)| of.has_ndl_at(place.there) && is_its(contact));
         let places: Vec<_> = places.map(|(place, _)| *place).collect();
         places.into_iter().for_each(|place| self.drop_contact(now, place));
     }
@@ -428,8 +445,8 @@ impl Core {
         let Some(gone) = self.gone.get(&node) else { return false };
         let is_it = (gone.incarnation, gone.boot_nonce) == (incarnation, boot_nonce);
         // It says goodbye on each of its routes, and may have had one that this node did not.
-        let is_announced = announcement.ndl_addresses().any(|there| there == place.there)
-            && announcement.ndl_addresses().any(|there| gone.places.iter().any(|known| known.there == there));
+        let is_announced = announcement.has_ndl_at(place.there)
+            && gone.places.iter().any(|known| announcement.has_ndl_at(known.there));
         is_it && (is_asked || is_announced)
     }
 

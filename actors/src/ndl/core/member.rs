@@ -43,11 +43,17 @@ pub(super) struct Member {
 }
 
 impl Member {
+    /// Where its GNCL can be reached, the address that it prefers first.
+    pub(super) fn gncl_addresses(&self) -> Vec<SocketAddr> {
+        self.announcement.gncl_addresses(self.routes.places().map(|place| (place.here, place.there)))
+    }
+
     /// Whether it is to be counted as lost for its silence. One with several addresses that is asked at one of them alone may only be out
     /// of reach there; as long as its connection stands, it is there. // spec: NDL-4.1, NDL-4.5, NDL-4.7
     pub(super) fn is_silent(&self, now: Time, pace: &Pace) -> bool {
-        let Announcement { gncl_further, ndl, .. } = &self.announcement;
-        let has_another_way = !gncl_further.is_empty() && ndl.is_empty() && now < self.link_until;
+        let Announcement { gncl_further, ndl, ndl6, .. } = &self.announcement;
+        let has_another_way =
+            !gncl_further.is_empty() && ndl.is_empty() && ndl6.is_empty() && now < self.link_until;
         self.missed >= pace.missed_max && !has_another_way && !self.has_given_a_sign(now, pace)
     }
 }

@@ -12,6 +12,7 @@
 //! | `member` | what is known of a node that answers |
 //! | `lives` | who comes, goes, comes again |
 //! | `duplicates` | which of two processes has a node address |
+//! | `proven` | whom no datagram ends, where nodes have keys |
 //! | `routes` | from where to where a member is asked |
 //! | `pace` | how often which members are asked |
 //! | `signs` | what GNCL heard of a member that does not answer |
@@ -30,6 +31,7 @@ mod heard;
 mod lives;
 mod member;
 mod pace;
+mod proven;
 mod recall;
 mod routes;
 mod signs;
@@ -63,6 +65,7 @@ use self::{
     lives::{Contest, Gone},
     member::Member,
     pace::{Pace, REST},
+    proven::Proven,
     recall::Recall,
 };
 use super::{
@@ -138,6 +141,11 @@ pub(crate) enum Output {
         node: NodeAddress,
         incarnation: Incarnation,
         gncl: Vec<SocketAddr>,
+    },
+    /// For GNCL: an earlier life than this one is about to be found, and nothing bars it any more.
+    Forgotten {
+        node: NodeAddress,
+        incarnation: Incarnation,
     },
     /// For this application.
     Event {
@@ -240,6 +248,7 @@ pub(crate) struct Core {
 
     members: BTreeMap<NodeAddress, Member>,
     gone: BTreeMap<NodeAddress, Gone>,
+    proven: Proven,
     contests: BTreeMap<NodeAddress, Contest>,
     contacts: BTreeMap<Place, Contact>,
     group_questions: Questions,
@@ -275,6 +284,8 @@ impl Core {
             period_us: u32::try_from(ndl.period.as_micros()).unwrap_or(u32::MAX),
             gncl_further: Vec::new(),
             ndl: Vec::new(),
+            ndl6: Vec::new(),
+            gncl_port6: 0,
             claim: Claim::Settling,
         };
         Self {
@@ -282,7 +293,7 @@ impl Core {
             paces: Pace::all_of(ndl),
             progress: Progress::default(),
             nodes_max: ndl.nodes_max,
-            seeds: ndl.seeds.clone(),
+            seeds: ndl.seeds.iter().map(|seed| seed.address).collect(),
             asks_group: ndl.multicast.is_some(),
             secret,
             questions_asked: 0,
@@ -294,6 +305,7 @@ impl Core {
             stall_reported: None,
             members: BTreeMap::new(),
             gone: BTreeMap::new(),
+            proven: Proven::new(config),
             contests: BTreeMap::new(),
             contacts: BTreeMap::new(),
             group_questions: Questions::default(),
@@ -306,11 +318,13 @@ impl Core {
         }
     }
 
-    /// GNCL listens at these addresses, the one that it prefers first; at none for now, if there is none.
-    pub(crate) fn announce_gncl(&mut self, addresses: Vec<SocketAddrV4>) {
+    /// GNCL listens at these addresses, the one that it prefers first; at none for now, if there is none. And at this port where this node has
+    /// IPv6 addresses.
+    pub(crate) fn announce_gncl(&mut self, (addresses, port6): (Vec<SocketAddrV4>, Option<u16>)) {
         let mut all = addresses.into_iter().map(|gncl| (gncl.ip().to_bits(), gncl.port()));
         (self.me.gncl_ip, self.me.gncl_port) = all.next().unwrap_or_default();
         self.me.gncl_further = all.take(FURTHER_MAX).collect();
+        self.me.gncl_port6 = port6.unwrap_or(0);
     }
 
     /// A shell has bound its sockets: `paths` are our addresses for queries. The first queries are due at once.

@@ -16,7 +16,10 @@ use super::{
     Core, Member, Output,
     contact::{Contact, Role},
 };
-use crate::ndl::datagram::{Announcement, PATHS_MAX};
+use crate::ndl::{
+    address::{is_link_local, seen_from},
+    datagram::{Announcement, PATHS_MAX},
+};
 
 /// Routes to one member that are asked, at most.
 const ROUTES_MAX: usize = PATHS_MAX;
@@ -40,16 +43,29 @@ pub(crate) struct Place {
 
 impl Place {
     /// Whether packets can go there at all: what has a loopback address stays on its host.
+    /// What belongs to a link stays on it, and is no way between it and another address: that of the same host is another way.
     pub(super) fn is_a_way(&self) -> bool {
         self.here.is_ipv4() == self.there.is_ipv4()
             && self.here.ip().is_loopback() == self.there.ip().is_loopback()
+            && is_link_local(self.here.ip()) == is_link_local(self.there.ip())
+            && seen_from(self.here, self.there) == self.there
+    }
+
+    /// From an address of ours to one that somebody said, as it is reached from there.
+    pub(super) fn between(here: SocketAddr, said: SocketAddr) -> Self {
+        Self { there: seen_from(here, said), here }
     }
 
     /// How many leading bits both addresses share: the more, the likelier they are in one network, with no router between them.
-    fn kinship(&self) -> u32 {
+    pub(super) fn kinship(&self) -> u32 {
         match (self.here.ip(), self.there.ip()) {
             (IpAddr::V4(here), IpAddr::V4(there)) => (here.to_bits() ^ there.to_bits()).leading_zeros(),
-            (IpAddr::V6(here), IpAddr::V6(there)) => (here.to_bits() ^ there.to_bits()).leading_zeros(),
+            // The lower half is the host's own: two with one upper half are on one link, as close as two of IPv4 can be; all others are
+            // less so than two of IPv4 in a network of 65,534 hosts, as the networks of a site differ in the last bits of that half.
+            (IpAddr::V6(here), IpAddr::V6(there)) => {
+                let shared = (here.to_bits() ^ there.to_bits()).leading_zeros();
+                if shared >= 64 { 32 } else { shared / 4 }
+            }
             (IpAddr::V4(_), IpAddr::V6(_)) | (IpAddr::V6(_), IpAddr::V4(_)) => 0,
         }
     }
@@ -206,7 +222,7 @@ impl Route {
 impl Member {
     /// Whether this life of it says itself that it answers there.
     pub(super) fn announces(&self, place: Place) -> bool {
-        self.announcement.ndl_addresses().any(|address| address == place.there)
+        self.announcement.has_ndl_at(place.there)
     }
 
     /// Whether a later life that answers there has followed this one: no two processes have one socket address. Where the member did
@@ -244,6 +260,11 @@ impl Core {
         if new.is_empty() || self.rest().due.is_none() {
             return;
         }
+        // Where nothing could lead to a seed of IPv6, something may now.
+        let is_vain = |place: &Place, contact: &Contact| {
+            place.there.is_ipv6() && !place.is_a_way() && matches!(contact.role, Role::Candidate { .. })
+        };
+        self.contacts.retain(|place, contact| !is_vain(place, contact));
         self.meet_seeds(now);
         self.look_for_the_gone(now, &new);
         let members: Vec<_> = self.members.keys().copied().collect();
@@ -253,9 +274,28 @@ impl Core {
         self.ask_the_group(now);
     }
 
+    /// These are asked in any case; what was asked only for being one of those before is not.
+    pub(crate) fn use_seeds(&mut self, now: Time, seeds: Vec<SocketAddr>) {
+        if self.has_seeds(&seeds) {
+            return;
+        }
+        self.seeds = seeds;
+        self.contacts.values_mut().for_each(|contact| contact.is_seed = false);
+        if self.rest().due.is_some() {
+            self.meet_seeds(now);
+        }
+    }
+
+    /// Whether these are the seeds already.
+    pub(crate) fn has_seeds(&self, seeds: &[SocketAddr]) -> bool {
+        self.seeds == seeds
+    }
+
     /// Seeds are asked from every address of ours.
     pub(super) fn meet_seeds(&mut self, now: Time) {
-        for seed in self.seeds.clone().into_iter().filter(|seed| !self.paths.contains(seed)) {
+        let is_own = |seed: &SocketAddr| self.paths.iter().any(|path| path == &seen_from(*path, *seed));
+        let seeds: Vec<_> = self.seeds.iter().copied().filter(|seed| !is_own(seed)).collect();
+        for seed in seeds {
             for place in self.places_of(seed) {
                 let contact = self.contacts.entry(place).or_insert_with(|| Contact::seed(now));
                 contact.is_seed = true;
@@ -265,7 +305,12 @@ impl Core {
 
     /// From where to ask at an address: wherever packets can go from, and if they can from nowhere, at least so that the system says so.
     pub(super) fn places_of(&self, there: SocketAddr) -> Vec<Place> {
-        let places = || self.paths.iter().map(|here| Place { there, here: *here });
+        // Of a link-local one whose link is known only what leads to that link.
+        let is_meant = |here: &&SocketAddr| match there {
+            SocketAddr::V6(there) if there.scope_id() != 0 => seen_from(**here, there.into()) == there.into(),
+            SocketAddr::V4(_) | SocketAddr::V6(_) => true,
+        };
+        let places = || self.paths.iter().filter(is_meant).map(|here| Place::between(*here, there));
         let ways: Vec<_> = places().filter(Place::is_a_way).collect();
         if ways.is_empty() { places().collect() } else { ways }
     }
@@ -275,7 +320,7 @@ impl Core {
         let gone: Vec<_> = self.gone.iter().map(|(node, gone)| (*node, gone.places.clone())).collect();
         for (node, places) in gone {
             let there = places.iter().map(|place| place.there);
-            let at = there.flat_map(|there| new.iter().map(move |here| Place { there, here: *here }));
+            let at = there.flat_map(|there| new.iter().map(move |here| Place::between(*here, there)));
             for place in at.filter(Place::is_a_way) {
                 self.contacts.entry(place).or_insert_with(|| Contact::former(now, node));
             }
@@ -304,7 +349,7 @@ impl Core {
         // One that says nothing of its addresses was somewhere, before our own address went.
         let last = Some(member.routes.best().there).filter(|_| member.routes.iter().next().is_none());
         let pairs = member.announcement.ndl_addresses().chain(last).flat_map(|there| {
-            let place = move |here: &SocketAddr| Place { there, here: *here };
+            let place = move |here: &SocketAddr| Place::between(*here, there);
             self.paths.iter().map(place)
         });
         let (known, mut unknown): (Vec<_>, Vec<_>) =
@@ -330,9 +375,8 @@ impl Core {
         }
         if !member.announces(place) {
             // It has moved: where it does not say that it is, it is not any more.
-            let announced: Vec<_> = member.announcement.ndl_addresses().collect();
-            let most = ROUTES_MAX - 1;
-            let former = member.routes.keep(|route| announced.contains(&route.place.there));
+            let (announcement, most) = (&member.announcement, ROUTES_MAX - 1);
+            let former = member.routes.keep(|route| announcement.has_ndl_at(route.place.there));
             let crowded: Vec<_> = member.routes.places().skip(most).collect();
             member.routes.keep(|route| !crowded.contains(&route.place));
             former.into_iter().chain(crowded).for_each(|place| self.drop_contact(now, place));
@@ -359,8 +403,8 @@ impl Core {
         if !member.announces(place) {
             return;
         }
-        let announced: Vec<_> = member.announcement.ndl_addresses().collect();
-        let dropped = member.routes.keep(|route| announced.contains(&route.place.there));
+        let announcement = &member.announcement;
+        let dropped = member.routes.keep(|route| announcement.has_ndl_at(route.place.there));
         dropped.into_iter().for_each(|place| self.drop_contact(now, place));
     }
 
@@ -370,11 +414,7 @@ impl Core {
         if !member.is_believed_at(place, self.paces[member.pace].missed_max) {
             return;
         }
-        let known = &mut member.announcement;
-        (known.gncl_ip, known.gncl_port) = (said.gncl_ip, said.gncl_port);
-        known.gncl_further.clone_from(&said.gncl_further);
-        if known.ndl != said.ndl {
-            known.ndl.clone_from(&said.ndl);
+        if member.announcement.note_addresses(said) {
             self.seek(now, node);
         }
     }
@@ -383,8 +423,9 @@ impl Core {
     pub(super) fn tell_moves(&mut self, now: Time) {
         for (node, member) in &mut self.members {
             let (told, at) = &member.gncl_told;
-            let gncl = member.announcement.gncl_addresses();
-            if *told != gncl && now.since(*at) >= MOVE_GAP {
+            let gncl = member.gncl_addresses();
+            // Where nothing of it is known at all, what was known last may still hold.
+            if *told != gncl && !gncl.is_empty() && now.since(*at) >= MOVE_GAP {
                 member.gncl_told = (gncl.clone(), now);
                 let incarnation = member.announcement.incarnation;
                 self.outputs.push_back(Output::Moved { node: *node, incarnation, gncl });
@@ -397,9 +438,9 @@ impl Core {
         let missed_max = self.paces[at].missed_max;
         let mut dropped = Vec::new();
         for member in self.members.values_mut().filter(|member| member.pace == at && member.missed == 0) {
-            let announced: Vec<_> = member.announcement.ndl_addresses().collect();
+            let announcement = &member.announcement;
             let is_wanted =
-                |route: &Route| route.missed < missed_max || announced.contains(&route.place.there);
+                |route: &Route| route.missed < missed_max || announcement.has_ndl_at(route.place.there);
             dropped.extend(member.routes.keep(is_wanted));
         }
         dropped.into_iter().for_each(|place| self.drop_contact(now, place));

@@ -4,6 +4,7 @@ mod duplicates;
 mod lives;
 mod paces;
 mod properties;
+mod proven;
 mod routes;
 mod scenarios;
 mod several_addresses;

@@ -55,6 +55,19 @@ fn a_datagram_counts_once() {
     assert_eq!(checker.check(at(3), stamp, tag, b"here"), Verdict::Fresh);
 }
 
+/// One row of numbers is for everybody to whom a node speaks: what it asks and answers its other members meanwhile makes no datagram a
+/// replay that another route, or a radio that sends again, holds up for a moment.
+#[test]
+fn an_honest_datagram_that_comes_late_counts_though_its_maker_spoke_to_hundreds_meanwhile() {
+    let (mut sealer, mut checker) = (sealer(), acquainted());
+    let late = sealer.seal(b"by radio");
+    let to_others = 2 * 500;
+    let newer = (0..to_others).map(|_| sealer.seal(b"by wire")).last().unwrap();
+    assert_eq!(checker.check(at(1), newer.0, newer.1, b"by wire"), Verdict::Fresh);
+    assert_eq!(checker.check(at(2), late.0, late.1, b"by radio"), Verdict::Fresh);
+    assert_eq!(checker.check(at(3), late.0, late.1, b"by radio"), Verdict::Replayed, "and once");
+}
+
 #[test]
 fn nodes_of_another_project_or_key_are_forgers() {
     for mut other in [
@@ -109,6 +122,27 @@ fn to_confirm_a_life_again_forgets_nothing_of_it() {
     assert_eq!(checker.check(at(1), stamp, tag, b"here"), Verdict::Fresh);
     checker.confirm(at(2), Stamp { number: 0, ..stamp });
     assert_eq!(checker.check(at(3), stamp, tag, b"here"), Verdict::Replayed);
+}
+
+#[test]
+fn a_number_that_its_node_cannot_have_made_bars_it_until_the_next_handshake_and_no_longer() {
+    for forged in [u64::MAX, 2_000] {
+        // Given: who has the project's key used up the numbers of another node
+        let (mut sealer, mut checker) = (sealer(), acquainted());
+        let (recorded, recorded_tag) = sealer.seal(b"here");
+        assert_eq!(checker.check(at(1), recorded, recorded_tag, b"here"), Verdict::Fresh);
+        let stamp = Stamp { number: forged, ..recorded };
+        let tag = Tag::of(&key(0).of_tags("walker"), stamp, b"gone");
+        assert_eq!(checker.check(at(2), stamp, tag, b"gone"), Verdict::Fresh);
+        let (stamp, tag) = sealer.seal(b"here");
+        assert_eq!(checker.check(at(3), stamp, tag, b"here"), Verdict::Replayed);
+        // When: it says in a handshake how many it has made
+        checker.confirm(at(4), Stamp { number: sealer.made(), ..stamp });
+        // Then
+        let (stamp, tag) = sealer.seal(b"here");
+        assert_eq!(checker.check(at(5), stamp, tag, b"here"), Verdict::Fresh);
+        assert_eq!(checker.check(at(6), recorded, recorded_tag, b"here"), Verdict::Replayed);
+    }
 }
 
 #[test]

@@ -90,6 +90,28 @@ fn what_others_can_change_is_refused() {
 }
 
 #[test]
+fn an_access_list_is_taken_only_from_where_others_can_put_no_other_one() {
+    let directory = Directory::new();
+    let (common, link) = (directory.path().join("common"), directory.path().join("link.toml"));
+    fs::create_dir(&common).unwrap();
+    let list = common.join("access.toml");
+    fs::write(&list, "").unwrap();
+    fs::set_permissions(&list, Permissions::from_mode(0o644)).unwrap();
+    std::os::unix::fs::symlink(&list, &link).unwrap();
+    for (mode, is_taken) in [(0o755, true), (0o775, false), (0o1777, false)] {
+        fs::set_permissions(&common, Permissions::from_mode(mode)).unwrap();
+        // By its own name, and by a link in a directory that is the node's own.
+        for path in [&list, &link] {
+            let read = names::access_list(path, 1 << 20);
+            assert_eq!(read.is_ok(), is_taken, "{mode:o} {}: {read:?}", path.display());
+            if let Err(why) = read {
+                only(&[why.to_string()], &["others can write to", "common"]);
+            }
+        }
+    }
+}
+
+#[test]
 fn what_is_no_file_holds_nobody_up() {
     for name in [names::NODE_KEY, names::AUTHORITY] {
         let found = faults(|_, directory| {

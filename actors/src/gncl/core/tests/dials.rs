@@ -146,3 +146,17 @@ fn a_node_that_is_lost_has_none_of_its_addresses_dialled_any_more() {
     assert!(out.contains(&Output::Close(first)) && out.contains(&Output::Close(second)), "{out:?}");
     assert_eq!(core.next_wake(), None);
 }
+
+#[test]
+fn a_peer_that_is_restored_while_it_is_dialled_is_not_dialled_twice() {
+    let mut core = core();
+    core.handle(millis(0), found(5));
+    core.handle(millis(1), Input::Restored { node: HIGH, incarnation: Incarnation(4) });
+    let dials =
+        |outputs: &[Output]| outputs.iter().filter(|output| matches!(output, Output::Dial { .. })).count();
+    assert_eq!(dials(&outputs(&mut core)), 1);
+    for at in [50, 1_900] {
+        core.handle(millis(at), Input::TimePassed);
+        assert_eq!(dials(&outputs(&mut core)), 0, "its dial is on its way");
+    }
+}

@@ -63,6 +63,33 @@ fn a_former_life_is_refused_also_after_the_later_one_is_lost() {
     assert!(!world.knows(1, 2));
 }
 
+// spec: NDL-5.2
+#[test]
+fn a_node_whose_clock_began_anew_is_refused_for_a_time_after_its_loss_and_then_found() {
+    // Given: a node that was lost
+    let mut world = World::new();
+    world.start(1, &Spec::of(1));
+    world.start(2, &Spec { incarnation: 1_000_000, ..Spec::of(2) });
+    world.run(ms(100));
+    world.kill(2);
+    world.run_until(PERIOD * 5, |world| !world.knows(1, 2));
+    world.forget_the_past();
+    // When: it is back, and its clock shows 1970
+    world.start(2, &Spec { incarnation: 3, ..Spec::of(2) });
+    world.run(ms(14_900));
+    assert_eq!(world.at(1).facts, []);
+    assert!(world.at(1).core.refusals().of("NDL answer of a former life") > 0);
+    world.run(PERIOD * 2);
+    // Then: what others knew of the later life bars it no more
+    let [found] = &world.at(1).facts[..] else { panic!("{:?}", world.at(1).facts) };
+    let forgotten = Output::Forgotten { node: node(2), incarnation: Incarnation(1_000_000) };
+    assert_eq!(world.at(1).others, [forgotten], "GNCL, too, is told");
+    assert!(matches!(found, MembershipFact::NodeFound { incarnation: Incarnation(3), .. }));
+    let restarted =
+        NodeEvent::NodeRestarted { node: node(2), name: "node-2".into(), incarnation: Incarnation(3) };
+    assert_eq!(world.at(1).events, [restarted]);
+}
+
 // spec: NDL-5.4
 #[test]
 fn of_two_living_processes_with_one_address_the_newcomer_is_refused() {

@@ -70,6 +70,7 @@ impl Bench {
                 Output::Collision { .. } => self.collisions += 1,
                 Output::Moved { gncl, .. } => self.moves.push(gncl),
                 Output::SendMulticastQuery { .. }
+                | Output::Forgotten { .. }
                 | Output::SendAnswer { .. }
                 | Output::SendLeave { .. }
                 | Output::Probe { .. }
@@ -328,4 +329,5 @@ fn a_member_has_no_more_routes_than_there_are_paths_however_much_it_says() {
     }
 }
 
+mod ipv6;
 mod redundancy;

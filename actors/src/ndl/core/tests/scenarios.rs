@@ -34,6 +34,8 @@ pub(super) fn stranger(address: u32) -> Announcement {
         period_us: 500_000,
         gncl_further: Vec::new(),
         ndl: Vec::new(),
+        ndl6: Vec::new(),
+        gncl_port6: 0,
         claim: Claim::Held,
     }
 }

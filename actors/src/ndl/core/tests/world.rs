@@ -62,6 +62,8 @@ pub(super) struct Spec {
     pub(super) watch: Vec<WatchGroup>,
     /// Where its GNCL listens besides.
     pub(super) further: Vec<SocketAddrV4>,
+    /// Its connections prove who is at their other end.
+    pub(super) has_keys: bool,
 }
 
 impl Spec {
@@ -76,19 +78,21 @@ impl Spec {
             clock_ns: 0,
             watch: Vec::new(),
             further: Vec::new(),
+            has_keys: false,
         }
     }
 
     pub(super) fn core(&self, boot_nonce: u64) -> Core {
         let mut config = NodeConfig::new(format!("node-{}", self.node));
         config.project = self.project.to_owned();
-        config.ndl.seeds.clone_from(&self.seeds);
+        config.ndl.seeds = self.seeds.iter().copied().map(Into::into).collect();
         config.ndl.nodes_max = self.nodes_max;
         config.ndl.period = PERIOD;
         config.ndl.watch.clone_from(&self.watch);
         if !self.multicast {
             config.ndl.multicast = None;
         }
+        config.security.keys = self.has_keys.then(|| "keys".into());
         let secret = u128::from(boot_nonce) << 3;
         Core::new(&config, node(self.node), Incarnation(self.incarnation), boot_nonce, secret)
     }
@@ -192,7 +196,7 @@ impl World {
         let gncl = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 1), 5_000 + index);
         let further = self.process(index).further.clone();
         self.with(udp(index), |core, now| {
-            core.announce_gncl(std::iter::once(gncl).chain(further).collect());
+            core.announce_gncl((std::iter::once(gncl).chain(further).collect(), None));
             core.start(now, &[udp(index)]);
         });
     }
@@ -342,6 +346,7 @@ impl World {
             Output::Event { event, .. } => process.events.push(event),
             Output::ClockMeasured { node, offset } => drop(process.clocks.insert(node, offset)),
             other @ (Output::Moved { .. }
+            | Output::Forgotten { .. }
             | Output::Collision { .. }
             | Output::AddressTaken { .. }
             | Output::Stalled { .. }) => {

@@ -131,7 +131,7 @@ impl World {
         if self.plan.finding == Finding::Seeds {
             config.ndl.seeds = (0..self.plan.nodes)
                 .filter(|other| *other != node)
-                .map(|other| SocketAddr::from((ip(other, 0), PORT)))
+                .map(|other| SocketAddr::from((ip(other, 0), PORT)).into())
                 .collect();
         }
         config
@@ -174,7 +174,7 @@ impl World {
         let Process { ref addresses, node, .. } = self.processes[process];
         let (paths, gncl) = (addresses.clone(), SocketAddrV4::new(ip(node, 0), 5_000));
         self.with(process, |patient, now| {
-            patient.core.announce_gncl(vec![gncl]);
+            patient.core.announce_gncl((vec![gncl], None));
             patient.core.start(now, &paths);
         });
     }

@@ -56,7 +56,10 @@ impl World {
                 self.trace(|| format!("{from} was late by {late:?}"));
                 self.judge.reported_a_stall(from);
             }
-            Output::Moved { .. } | Output::Collision { .. } | Output::AddressTaken { .. } => {
+            Output::Moved { .. }
+            | Output::Forgotten { .. }
+            | Output::Collision { .. }
+            | Output::AddressTaken { .. } => {
                 self.judge.violations.push(format!("{:?}: {from} says {output:?}", self.now));
             }
             Output::Event { .. } => {}
