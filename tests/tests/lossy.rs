@@ -67,7 +67,8 @@ impl Pair {
             Node::builder(name).address([127, 0, 0, number]).configure(|config| {
                 config.project = "lossy".to_owned();
                 config.gncl.announce = Some(v4(network.address(announce)));
-                (config.ndl.multicast, config.ndl.mdns_port, config.ndl.seeds) = (None, None, seeds);
+                (config.ndl.multicast, config.ndl.mdns_port) = (None, None);
+                config.ndl.seeds = seeds.into_iter().map(Into::into).collect();
             })
         };
         let listener = |name| Stage::new().app(name);

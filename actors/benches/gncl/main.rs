@@ -21,7 +21,8 @@
 //! - `control_beside_slow_consumer`: the same, and the application that is flooded takes a millisecond for each of its messages.
 //! - `stream_by_WAY-CHANNELS`: values of class Stream one way, one every millisecond on each of 1, 16 and 64 channels, by datagrams and by the connection
 //!   (`gncl.datagrams`): how old they are when they are handled. `cpu_ns_each_value` is what both processes needed, `acks_per_s` what this host sent of datagrams beside the
-//!   values that were handled (acknowledgements, repetitions, a few of NDL's). `--bench stream_allocations` counts what memory is asked for.
+//!   values that were handled (acknowledgements, repetitions, a few of NDL's). `superseded` are counted values that did not come; `superseded_on_the_way_with_warm_up` and
+//!   `superseded_in_mailboxes_with_warm_up` say where newer ones took their place, of all that were sent. `--bench stream_allocations` counts what memory is asked for.
 //! - `slow_link`: the same as `control_beside_bulk_1000`, and bare TCP, on two hosts with a link of 10 Mbit/s between them
 //!   (network namespaces: needs root, `ip` and `tc`); `slow_link_priorities`: the hosts send by priority what waits.
 

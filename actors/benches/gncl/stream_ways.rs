@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use rustix::time::{ClockId, clock_gettime};
+use sinew::{Node, audit::Place};
 use sinew_figures::{
     Alone, Figures,
     process::{self, Process, say_there},
@@ -33,13 +34,32 @@ fn datagrams() -> u64 {
     pairs.find(|(name, _)| *name == "OutDatagrams").and_then(|(_, count)| count.parse().ok()).unwrap_or(0)
 }
 
+/// Values that newer ones took the place of at a node, from its start on: on the way to the other node, and in mailboxes.
+fn superseded(node: &Node) -> [u64; 2] {
+    let mut superseded = [0; 2];
+    for entry in node.handle().audit_here().entries {
+        match entry.place {
+            // The other node may have left by then.
+            Place::ToNode { .. } | Place::ToFormerNodes => superseded[0] += entry.account.superseded,
+            Place::Mailbox { .. } => superseded[1] += entry.account.superseded,
+            Place::Client { .. }
+            | Place::FromNode { .. }
+            | Place::OtherMailboxes
+            | Place::OtherClients
+            | Place::FromFormerNodes => {}
+        }
+    }
+    superseded
+}
+
 /// The node that takes them, in a process of its own: hands over what it has seen.
 pub(crate) fn take(plan: Plan, at: At) {
     let (node, seen) = taker(plan, at.node("there"), meter);
     say_there();
     let Seen { ages, counted: [cpu_ns, sleeps, _] } =
         seen.recv_timeout(DEADLINE).expect("the last ones come");
-    println!("{cpu_ns} {sleeps}");
+    let [_, in_mailboxes] = superseded(&node);
+    println!("{cpu_ns} {sleeps} {in_mailboxes}");
     ages.hand_over();
     node.stop();
 }
@@ -52,9 +72,11 @@ pub(crate) fn measure(case: &str, plan: Plan) {
     let (node, given) = giver(plan, at.node("here"), meter);
     let [cpu_ns, sleeps, datagrams] = given.recv_timeout(DEADLINE).expect("all are given").counted;
     let said = other.wait();
+    let [on_the_way, _] = superseded(&node);
     node.stop();
     let (first, ages) = said.split_once('\n').expect("it says what it has counted");
-    let (their_cpu_ns, their_sleeps) = first.split_once(' ').expect("two numbers");
+    let theirs: Vec<u64> = first.split(' ').map(number).collect();
+    let [their_cpu_ns, their_sleeps, in_mailboxes] = theirs[..] else { panic!("three numbers: {first:?}") };
     let ages = Figures::taken(ages).expect("it hands over its times");
     let values = plan.channels as u64 * (plan.values + 1);
     let each = |count: u64, of: u64| count / of.max(1);
@@ -66,8 +88,11 @@ pub(crate) fn measure(case: &str, plan: Plan) {
     let counts = [
         ("values", values),
         ("superseded", values.saturating_sub(ages.rounds())),
-        ("cpu_ns_each_value", each(cpu_ns + number(their_cpu_ns), values)),
-        ("sleeps_each_1000_values", each(1_000 * (sleeps + number(their_sleeps)), values)),
+        ("superseded_on_the_way_with_warm_up", on_the_way),
+        ("superseded_in_mailboxes_with_warm_up", in_mailboxes),
+        ("cpu_ns_each_value_there", each(their_cpu_ns, values)),
+        ("cpu_ns_each_value", each(cpu_ns + their_cpu_ns, values)),
+        ("sleeps_each_1000_values", each(1_000 * (sleeps + their_sleeps), values)),
         ("acks_per_s", (others as f64 / seconds) as u64),
     ];
     Alone { bench: "gncl", case, figure: "age of a value", seen: &ages, counts: &counts }.report();

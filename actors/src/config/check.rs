@@ -1,12 +1,12 @@
 //! The legal range of every setting, checked at once for a configuration from code or from TOML.
 
 use std::{
-    net::{Ipv4Addr, SocketAddr, SocketAddrV4},
+    net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddrV4, SocketAddrV6},
     path::Path,
     time::Duration,
 };
 
-use super::{ConfigFault, ConfigFaults, Interface, NodeConfig, WatchGroup, faults::quoted};
+use super::{ConfigFault, ConfigFaults, Interface, NodeConfig, Seed, WatchGroup, faults::quoted};
 use crate::{
     ndl::{FURTHER_MAX, PATHS_MAX},
     sync::NAME_BYTES_MAX,
@@ -17,8 +17,8 @@ const SOCKET_BYTES_MAX: usize = 100;
 /// Longest path of a directory in bytes: PATH_MAX of Linux.
 const DIRECTORY_BYTES_MAX: usize = 4_096;
 /// What chooses an interface.
-pub(super) const INTERFACE_LEGAL: &str =
-    "each an IPv4 address of this host, as in 192.168.1.7, a name of 1 to 15 bytes, as in eth0, or all";
+pub(super) const INTERFACE_LEGAL: &str = "each an address of this host, as in 192.168.1.7, fd00::7 or fe80::7%eth0, a name of 1 to 15 bytes, as in eth0, or all, the last two with /ipv4 \
+     or /ipv6 behind them for one family alone";
 /// Seeds at most.
 const SEEDS_MAX: usize = 256;
 /// Groups of nodes with a pace of their own at most, and names in one of them.
@@ -146,8 +146,9 @@ impl NodeConfig {
         let is_nameless =
             self.ndl.interface.first_address().is_none() && self.ndl.interface.iter().next().is_some();
         if self.address.is_none() && is_nameless {
-            let legal = "an address of one node, as in 10.0.0.7, where ndl.interface names no address first";
-            let remedy = "give the node an address of its own: an interface that is chosen by its name may have none, or another one tomorrow";
+            let legal =
+                "an address of one node, as in 10.0.0.7, where ndl.interface names no IPv4 address first";
+            let remedy = "give the node an address of its own: an IPv6 address is too long for one, and an interface that is chosen by its name may have none, or another one tomorrow";
             faults.push(fault("node.address", "nothing".to_owned(), legal, remedy));
         }
         MAILBOX_CAPACITY.count(faults, self.mailbox_capacity);
@@ -193,9 +194,8 @@ impl NodeConfig {
         let legal = format!(
             "at most {FURTHER_MAX} addresses of this host, with those of ndl.interface but the first, each another one than there"
         );
-        if !further.is_empty() && !self.ndl.interface.are_addresses() {
-            let remedy =
-                "leave it out: where ndl.interface chooses by name, GNCL listens at all that it chooses";
+        if !further.is_empty() && !self.ndl.interface.are_ipv4_addresses() {
+            let remedy = "leave it out: where ndl.interface chooses by name, or an IPv6 address, GNCL listens at all that it chooses";
             faults.push(fault("gncl.further", format!("{} addresses", further.len()), legal.clone(), remedy));
         }
         if !further.is_empty() && self.gncl_further().len() > FURTHER_MAX {
@@ -249,12 +249,12 @@ impl NodeConfig {
                 remedy,
             ));
         }
+        let is_read_again = |interface: &Interface| interface.to_string().parse().as_ref() == Ok(interface);
         for (at, interface) in chosen.iter().enumerate() {
             let is_fit = match interface {
                 Interface::Address(address) => is_host_address(*address),
-                Interface::Name(_) | Interface::All => {
-                    interface.to_string().parse().as_ref() == Ok(*interface)
-                }
+                Interface::Address6 { address, .. } => is_host_address6(*address) && is_read_again(interface),
+                Interface::Name(..) | Interface::All(_) => is_read_again(interface),
             };
             if !is_fit || chosen[..at].contains(interface) {
                 faults.push(fault("ndl.interface", quoted(&interface.to_string()), legal.clone(), remedy));
@@ -269,6 +269,11 @@ impl NodeConfig {
             let legal = "a multicast address and a port, as in 239.255.83.119:6910, or false";
             let remedy = "choose an address from 239.0.0.0 to 239.255.255.255, the same on every node";
             faults.push(fault("ndl.multicast", quoted(&group.to_string()), legal, remedy));
+        }
+        if let Some(group) = ndl.multicast6.filter(|group| !is_multicast6(group)) {
+            let legal = "a multicast address that stays on its link, and a port, as in [ff12::8000:5377]:6910, or false";
+            let remedy = "choose an address from ff12::8000:0 to ff12::ffff:ffff, the same on every node";
+            faults.push(fault("ndl.multicast6", quoted(&group.to_string()), legal, remedy));
         }
         if ndl.mdns_port == Some(0) {
             faults.push(MDNS_PORT.fault("0".to_owned()));
@@ -302,13 +307,32 @@ fn is_multicast(group: &SocketAddrV4) -> bool {
     group.ip().is_multicast() && group.port() != 0
 }
 
-fn check_seeds(faults: &mut Vec<ConfigFault>, seeds: &[SocketAddr]) {
-    let legal = format!("at most {SEEDS_MAX} addresses with their ports, as in 192.168.1.7:6911");
+/// One that a host has by itself: no address of IPv4 in the guise of one of IPv6, of which no socket of IPv6 alone knows.
+const fn is_host_address6(address: Ipv6Addr) -> bool {
+    !address.is_unspecified() && !address.is_multicast() && address.to_ipv4_mapped().is_none()
+}
+
+/// Of link-local scope, whatever its flags: nodes of another link are asked by seeds.
+const fn is_multicast6(group: &SocketAddrV6) -> bool {
+    let is_of_link = group.ip().segments()[0] & 0xff0f == 0xff02;
+    is_of_link && group.port() != 0 && group.scope_id() == 0
+}
+
+fn check_seeds(faults: &mut Vec<ConfigFault>, seeds: &[Seed]) {
+    let legal = format!(
+        "at most {SEEDS_MAX} addresses with their ports, as in 192.168.1.7:6911, [fd00::7]:6911 or [fe80::7%eth0]:6911"
+    );
     if seeds.len() > SEEDS_MAX {
         let remedy = "list a few nodes only: they tell of the others";
         faults.push(fault("ndl.seeds", format!("{} addresses", seeds.len()), legal.clone(), remedy));
     }
-    let nowhere = |seed: &&SocketAddr| seed.port() == 0 || seed.ip().is_unspecified();
+    let nowhere = |seed: &&Seed| {
+        let is_of_a_host = match seed.address.ip() {
+            IpAddr::V4(ip) => !ip.is_unspecified() && seed.zone.is_none(),
+            IpAddr::V6(ip) => is_host_address6(ip) && seed.to_string().parse().as_ref() == Ok(*seed),
+        };
+        seed.address.port() == 0 || !is_of_a_host
+    };
     for seed in seeds.iter().take(SEEDS_MAX).filter(nowhere) {
         let remedy = "write the address of a node and its ndl.port";
         faults.push(fault("ndl.seeds", quoted(&seed.to_string()), legal.clone(), remedy));

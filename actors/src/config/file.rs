@@ -1,8 +1,14 @@
 //! Reads a configuration from TOML: knows the keys and their types. What is legal, the check decides.
 
 use std::{
-    collections::BTreeMap, fs::File, io::Read, net::SocketAddrV4, ops::Range as Span, path::Path,
-    str::FromStr, time::Duration,
+    collections::BTreeMap,
+    fs::File,
+    io::Read,
+    net::{SocketAddrV4, SocketAddrV6},
+    ops::Range as Span,
+    path::Path,
+    str::FromStr,
+    time::Duration,
 };
 
 use sinew_runtime::tid::NodeAddress;
@@ -23,7 +29,7 @@ const FILE_BYTES_MAX: u64 = 1 << 20;
 const SECTIONS: [&str; 7] = ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 45] = [
+pub(super) const KEYS: [&str; 46] = [
     "node.name",
     "node.project",
     "node.address",
@@ -54,6 +60,7 @@ pub(super) const KEYS: [&str; 45] = [
     "ndl.interface",
     "ndl.port",
     "ndl.multicast",
+    "ndl.multicast6",
     "ndl.mdns_port",
     "ndl.seeds",
     "ndl.period_ms",
@@ -367,12 +374,14 @@ impl Reader<'_> {
         self.number(&check::NDL_PORT, &mut ndl.port);
         let example = "\"239.255.83.119:6910\" or false";
         self.text_or_off::<SocketAddrV4>("ndl.multicast", example, &mut ndl.multicast);
+        let example = "\"[ff12::8000:5377]:6910\" or false";
+        self.text_or_off::<SocketAddrV6>("ndl.multicast6", example, &mut ndl.multicast6);
         if self.is_off("ndl.mdns_port") {
             ndl.mdns_port = None;
         } else if let Some(port) = &mut ndl.mdns_port {
             self.number(&check::MDNS_PORT, port);
         }
-        let remedy = "set ndl.seeds as in [\"192.168.1.7:6911\"]";
+        let remedy = "set ndl.seeds as in [\"192.168.1.7:6911\", \"[fe80::7%eth0]:6911\"]";
         self.read_list("ndl.seeds", "a list of addresses with their ports", remedy, &mut ndl.seeds);
         self.time(&check::PERIOD, &mut ndl.period);
         self.number(&check::MISSED_MAX, &mut ndl.missed_max);
@@ -384,7 +393,8 @@ impl Reader<'_> {
     fn read_interfaces(&mut self, interfaces: &mut Interfaces) {
         const KEY: &str = "ndl.interface";
         let Some(value) = self.values.get(KEY).copied() else { return };
-        let remedy = "set ndl.interface as in \"192.168.1.7\" or [\"eth0\", \"wlan0\"]";
+        let remedy =
+            "set ndl.interface as in \"192.168.1.7\" or [\"eth0\", \"wlan0/ipv4\", \"fe80::7%eth1\"]";
         let mut read: Vec<Interface> = Vec::new();
         match value.get_ref().as_str().map(str::parse) {
             Some(Ok(interface)) => read.push(interface),

@@ -7,6 +7,7 @@ mod check;
 mod faults;
 mod file;
 mod interfaces;
+mod seeds;
 #[cfg(test)]
 mod tests;
 
@@ -14,10 +15,11 @@ pub(crate) use check::fault;
 pub(crate) use faults::quoted;
 pub use faults::{ConfigFault, ConfigFaults};
 pub(crate) use file::{line_of, shown, syntax_fault};
-pub use interfaces::{Interface, Interfaces, NoInterface};
+pub use interfaces::{Families, Interface, Interfaces, NoInterface};
+pub use seeds::{NoSeed, Seed};
 
 use std::{
-    net::{Ipv4Addr, SocketAddr, SocketAddrV4},
+    net::{Ipv4Addr, Ipv6Addr, SocketAddrV4, SocketAddrV6},
     path::PathBuf,
     time::Duration,
 };
@@ -131,8 +133,8 @@ pub struct GnclConfig {
 /// Node Discovery Layer: who is there, who is gone.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NdlConfig {
-    /// Network interfaces that the node uses, at most 8, the one that it prefers first: by addresses of this host (not 0.0.0.0), by
-    /// names, or all. Other nodes are asked over each, and are there as long as they answer over any. Default: loopback, so that
+    /// Network interfaces that the node uses, at most 8, the one that it prefers first: by addresses of this host (not 0.0.0.0 nor ::), by
+    /// names, or all, each of these two with its addresses of IPv4, of IPv6, or both. Other nodes are asked over each, and are there as long as they answer over any. Default: loopback, so that
     /// nothing leaves the host; beside others, loopback is used where it is listed.
     pub interface: Interfaces,
     /// UDP port for queries and answers. Default 0: any free one; set it where other nodes list this one as a seed.
@@ -140,11 +142,14 @@ pub struct NdlConfig {
     /// Multicast group (224.0.0.0 to 239.255.255.255) and port of the cyclic query; `None` switches it off. Default
     /// 239.255.83.119:6910, never routed (time to live 1).
     pub multicast: Option<SocketAddrV4>,
+    /// Multicast group (ff02::/16 or ff12::/16) and port of the same query where an interface has IPv6 addresses; `None` switches it off, and so
+    /// does `None` above. Default `[ff12::8000:5377]:6910`, which stays on its link.
+    pub multicast6: Option<SocketAddrV6>,
     /// Port of multicast DNS; `None` switches it off. Default 5353, the port of RFC 6762.
     pub mdns_port: Option<u16>,
     /// UDP addresses of nodes to ask in any case, for networks without multicast. At most 256, each with a port;
     /// default none.
-    pub seeds: Vec<SocketAddr>,
+    pub seeds: Vec<Seed>,
     /// Time between two queries. 10 ms to 60 s; default 500 ms, the paper's. Detection takes `period` times
     /// `missed_max`, and up to one period more.
     pub period: Duration,
@@ -281,6 +286,13 @@ impl NodeConfig {
                 interface: Ipv4Addr::LOCALHOST.into(),
                 port: 0,
                 multicast: Some(SocketAddrV4::new(Ipv4Addr::new(239, 255, 83, 119), 6910)),
+                // Link-local and transient (RFC 4291, section 2.7), with a number that is free to choose (RFC 3307, section 4.3).
+                multicast6: Some(SocketAddrV6::new(
+                    Ipv6Addr::new(0xff12, 0, 0, 0, 0, 0, 0x8000, 0x5377),
+                    6910,
+                    0,
+                    0,
+                )),
                 mdns_port: Some(5353),
                 seeds: Vec::new(),
                 period: Duration::from_millis(500),

@@ -184,6 +184,32 @@ fn texts_are_legal_at_both_ends_and_not_beyond() {
 }
 
 #[test]
+fn texts_of_ipv6_are_legal_at_both_ends_and_not_beyond() {
+    let cases = [
+        ("ndl.seeds", "['[fd00::7]:1', '[fe80::7]:1', '[fe80::7%eth0]:1']".to_owned(), true),
+        ("ndl.seeds", "['[fe80::7%eth0]:0']".to_owned(), false),
+        ("ndl.seeds", "['[::]:1']".to_owned(), false),
+        ("ndl.seeds", "['[ff02::1]:1']".to_owned(), false),
+        ("ndl.seeds", "['[::ffff:10.0.0.7]:1']".to_owned(), false),
+        ("ndl.interface", "['10.0.0.7', 'fd00::7', 'fe80::7%eth0', 'eth0/ipv6']".to_owned(), true),
+        ("ndl.interface", "['10.0.0.7', '::1']".to_owned(), true),
+        ("ndl.interface", "['10.0.0.7', '::']".to_owned(), false),
+        ("ndl.interface", "['10.0.0.7', 'ff02::1']".to_owned(), false),
+        ("ndl.interface", "['10.0.0.7', '::ffff:10.0.0.7']".to_owned(), false),
+        ("ndl.interface", "'eth0/ipv5'".to_owned(), false),
+        ("ndl.multicast6", "'[ff02::5377]:1'".to_owned(), true),
+        ("ndl.multicast6", "'[ff12::8000:1]:65535'".to_owned(), true),
+        ("ndl.multicast6", "'[ff05::1]:1'".to_owned(), false),
+        ("ndl.multicast6", "'[ff12::8000:1]:0'".to_owned(), false),
+        ("ndl.multicast6", "'[fe80::1]:1'".to_owned(), false),
+        ("ndl.multicast6", "'239.0.0.1:1'".to_owned(), false),
+        ("ndl.multicast6", "false".to_owned(), true),
+        ("ndl.multicast6", "true".to_owned(), false),
+    ];
+    are_legal_or_not(cases);
+}
+
+#[test]
 fn groups_of_nodes_are_legal_at_both_ends_and_not_beyond() {
     let cases = [
         ("ndl.watch", watch("['leg.*', 'hip']", 10, 2), true),
@@ -276,7 +302,7 @@ fn code_is_checked_like_a_file_and_more_finely() {
     config.gncl.redial_min = Duration::from_micros(999);
     config.ndl.period = Duration::from_millis(60_000) + Duration::from_nanos(1);
     config.ndl.mdns_port = Some(0);
-    config.ndl.seeds = vec![SocketAddr::from(([0, 0, 0, 0], 5))];
+    config.ndl.seeds = vec![Seed::from(SocketAddr::from(([0, 0, 0, 0], 5)))];
     config.lncl.socket = Some("\0".into());
     let faults = config.validate().unwrap_err();
     let keys: Vec<&str> = faults.faults().iter().map(|fault| fault.key.as_str()).collect();

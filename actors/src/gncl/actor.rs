@@ -349,6 +349,7 @@ fn settings(stores: &Stores) -> Settings {
         pings_missed_max: 3,
         healthy: Duration::from_secs(5),
         orphan: Duration::from_secs(5),
+        connections_prove: stores.secured.get().is_some(),
     }
 }
 

@@ -3,7 +3,7 @@
 //! Where all CPUs are busy, whoever is busy himself waits for his turn like everybody else, and whoever sleeps has a CPU soon after he
 //! is woken.
 
-use std::{io, net, os::fd::AsFd as _, thread};
+use std::{io, net, os::fd::AsFd as _, sync::Arc, thread};
 
 use tokio::{
     net::TcpStream,
@@ -11,11 +11,13 @@ use tokio::{
     sync::oneshot,
 };
 
+use super::{courtesy::Courtesy, task::Place};
 use crate::nicer::give_way;
 
 /// Such a thread. It ends with this, and what it does with it.
 pub(super) struct BulkThread {
     runtime: Handle,
+    courtesy: Arc<Courtesy>,
     _is_wanted: oneshot::Sender<()>,
 }
 
@@ -31,12 +33,17 @@ impl BulkThread {
             // Nothing is ever said but that nobody wants it any more.
             let _: Result<(), _> = runtime.block_on(is_to_end);
         })?;
-        Ok(Self { runtime: handle, _is_wanted: is_wanted })
+        Ok(Self { runtime: handle, courtesy: Arc::default(), _is_wanted: is_wanted })
     }
 
     /// Where its tasks are.
     pub(super) const fn runtime(&self) -> &Handle {
         &self.runtime
+    }
+
+    /// The same for those that may have a next turn at once.
+    pub(super) fn place(&self) -> Place {
+        Place::There(self.runtime.clone(), self.courtesy.clone())
     }
 
     /// The same connection, for tasks of this thread.

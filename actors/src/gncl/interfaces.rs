@@ -4,8 +4,8 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet},
-    io,
-    net::Ipv4Addr,
+    fmt, io,
+    net::{IpAddr, SocketAddr, SocketAddrV6},
     os::fd::OwnedFd,
 };
 
@@ -18,7 +18,13 @@ use tokio::io::unix::AsyncFd;
 
 /// An address that is of no use any more to those that are bound to it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct AddressLost(pub(super) Ipv4Addr);
+pub(super) struct AddressLost(pub(super) SocketAddr);
+
+impl fmt::Display for AddressLost {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.ip().fmt(f)
+    }
+}
 
 /// Addresses that are known at most. One more is found to be lost by what is not answered, as everywhere but on Linux.
 const ADDRESSES_MAX: usize = 1_024;
@@ -42,18 +48,19 @@ const UP: u32 = 0x41;
 const LOCAL: u16 = 2;
 const ADDRESS: u16 = 1;
 const IPV4: u8 = 2;
-/// `RTMGRP_LINK | RTMGRP_IPV4_IFADDR`.
-const GROUPS: u32 = 0x11;
+const IPV6: u8 = 10;
+/// `RTMGRP_LINK | RTMGRP_IPV4_IFADDR | RTMGRP_IPV6_IFADDR`.
+const GROUPS: u32 = 0x111;
 /// `NLM_F_REQUEST | NLM_F_DUMP`.
 const DUMP: u16 = 0x301;
 
 /// The addresses of this host, by the index of their interface.
 #[derive(Debug, Default)]
-struct Interfaces(BTreeMap<u32, BTreeSet<Ipv4Addr>>);
+struct Interfaces(BTreeMap<u32, BTreeSet<IpAddr>>);
 
 impl Interfaces {
     /// Takes in what the kernel says; returns the addresses that are lost with it.
-    fn hear(&mut self, mut said: &[u8]) -> Vec<Ipv4Addr> {
+    fn hear(&mut self, mut said: &[u8]) -> Vec<SocketAddr> {
         let mut lost = Vec::new();
         while let Some((message, rest)) = first_of(said) {
             lost.extend(self.hear_one(message).unwrap_or_default());
@@ -63,15 +70,15 @@ impl Interfaces {
     }
 
     /// `None`: it is about something else, or too short.
-    fn hear_one(&mut self, message: &[u8]) -> Option<Vec<Ipv4Addr>> {
+    fn hear_one(&mut self, message: &[u8]) -> Option<Vec<SocketAddr>> {
         let kind = u16::from_ne_bytes(field(message, 4)?);
         let index = u32::from_ne_bytes(field(message, INDEX_AT)?);
         match kind {
             NEW_LINK if u32::from_ne_bytes(field(message, FLAGS_AT)?) & UP != UP => {
                 // It may have them again as soon as it is up: they are not forgotten.
-                Some(self.0.get(&index)?.iter().copied().collect())
+                Some(self.0.get(&index)?.iter().map(|ip| at(index, *ip)).collect())
             }
-            GONE_LINK => Some(self.0.remove(&index)?.into_iter().collect()),
+            GONE_LINK => Some(self.0.remove(&index)?.into_iter().map(|ip| at(index, ip)).collect()),
             NEW_ADDRESS => {
                 let address = address_in(message)?;
                 if self.0.values().map(BTreeSet::len).sum::<usize>() < ADDRESSES_MAX {
@@ -86,7 +93,7 @@ impl Interfaces {
                 if addresses.is_empty() {
                     self.0.remove(&index);
                 }
-                Some(vec![address])
+                Some(vec![at(index, address)])
             }
             _ => None,
         }
@@ -103,14 +110,26 @@ fn first_of(said: &[u8]) -> Option<(&[u8], &[u8])> {
     Some((message, said.get(length.next_multiple_of(4)..).unwrap_or_default()))
 }
 
-fn address_in(message: &[u8]) -> Option<Ipv4Addr> {
-    if *message.get(HEADER_LEN)? != IPV4 {
+/// An address of this interface, as a socket of it has it, but for the port.
+fn at(index: u32, ip: IpAddr) -> SocketAddr {
+    match ip {
+        IpAddr::V4(_) => (ip, 0).into(),
+        IpAddr::V6(ip) => SocketAddrV6::new(ip, 0, 0, index).into(),
+    }
+}
+
+fn address_in(message: &[u8]) -> Option<IpAddr> {
+    let family = *message.get(HEADER_LEN)?;
+    if ![IPV4, IPV6].contains(&family) {
         return None;
     }
     let mut attributes = message.get(ATTRIBUTES_AT..)?;
     let (mut local, mut address) = (None, None);
     while let Some(length) = field(attributes, 0).map(u16::from_ne_bytes).filter(|length| *length >= 4) {
-        let value = field(attributes, 4).map(Ipv4Addr::from);
+        let value = match family {
+            IPV4 => field::<4>(attributes, 4).map(IpAddr::from),
+            _ => field::<16>(attributes, 4).map(IpAddr::from),
+        };
         match u16::from_ne_bytes(field(attributes, 2)?) {
             LOCAL => local = value,
             ADDRESS => address = value,
@@ -131,7 +150,7 @@ fn request() -> [u8; 24] {
     bytes[..4].copy_from_slice(&24_u32.to_ne_bytes());
     bytes[4..6].copy_from_slice(&GET_ADDRESSES.to_ne_bytes());
     bytes[6..8].copy_from_slice(&DUMP.to_ne_bytes());
-    bytes[HEADER_LEN] = IPV4;
+    // The family of the body stays 0: those of all.
     bytes
 }
 
@@ -177,7 +196,7 @@ impl Watch {
     }
 
     /// Waits for the kernel's next words; returns what is lost with them.
-    async fn hear(&mut self) -> io::Result<Vec<Ipv4Addr>> {
+    async fn hear(&mut self) -> io::Result<Vec<SocketAddr>> {
         loop {
             let mut ready = self.socket.readable().await?;
             let buffer = &mut self.buffer;
@@ -199,7 +218,10 @@ impl Watch {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
+    use std::{
+        net::{Ipv4Addr, Ipv6Addr},
+        time::Duration,
+    };
 
     use proptest::prelude::*;
 
@@ -222,6 +244,20 @@ mod tests {
         message(kind, words.as_flattened())
     }
 
+    fn lost(address: Ipv4Addr) -> Vec<SocketAddr> {
+        vec![(address, 0).into()]
+    }
+
+    /// As the kernel says it of an address of IPv6.
+    fn address6(kind: u16, index: u32, address: Ipv6Addr) -> Vec<u8> {
+        let mut body = vec![IPV6, 64, 0, 0];
+        body.extend(index.to_ne_bytes());
+        body.extend(20_u16.to_ne_bytes());
+        body.extend(ADDRESS.to_ne_bytes());
+        body.extend(address.octets());
+        message(kind, &body)
+    }
+
     /// As the kernel says it of an address with a peer: the peer's first.
     fn address(kind: u16, index: u32, address: Ipv4Addr) -> Vec<u8> {
         let mut body = vec![IPV4, 24, 0, 0];
@@ -241,9 +277,9 @@ mod tests {
         assert!(interfaces.hear(&said).is_empty());
         for _ in 0..2 {
             assert!(interfaces.hear(&link(NEW_LINK, ETH0, UP | 0x1000)).is_empty());
-            assert_eq!(interfaces.hear(&link(NEW_LINK, ETH0, 0x1001)), [OURS], "it cannot carry packets");
+            assert_eq!(interfaces.hear(&link(NEW_LINK, ETH0, 0x1001)), lost(OURS), "it cannot carry packets");
         }
-        assert_eq!(interfaces.hear(&link(GONE_LINK, ETH0, UP)), [OURS]);
+        assert_eq!(interfaces.hear(&link(GONE_LINK, ETH0, UP)), lost(OURS));
         assert!(interfaces.hear(&link(GONE_LINK, ETH0, UP)).is_empty());
     }
 
@@ -251,8 +287,19 @@ mod tests {
     fn an_address_that_is_taken_away_is_lost() {
         let mut interfaces = Interfaces::default();
         interfaces.hear(&address(NEW_ADDRESS, ETH0, OURS));
-        assert_eq!(interfaces.hear(&address(GONE_ADDRESS, ETH0, OURS)), [OURS]);
+        assert_eq!(interfaces.hear(&address(GONE_ADDRESS, ETH0, OURS)), lost(OURS));
         assert!(interfaces.hear(&link(NEW_LINK, ETH0, 0)).is_empty());
+    }
+
+    #[test]
+    fn a_link_local_address_that_two_interfaces_have_is_lost_on_one_of_them() {
+        let mut interfaces = Interfaces::default();
+        let ours: Ipv6Addr = "fe80::1".parse().unwrap();
+        let said = [ETH0, 3].map(|index| address6(NEW_ADDRESS, index, ours)).concat();
+        assert!(interfaces.hear(&said).is_empty());
+        let of = |index: u32| vec![SocketAddr::from(SocketAddrV6::new(ours, 0, 0, index))];
+        assert_eq!(interfaces.hear(&link(NEW_LINK, 3, 0)), of(3));
+        assert_eq!(interfaces.hear(&address6(GONE_ADDRESS, ETH0, ours)), of(ETH0));
     }
 
     #[test]
@@ -269,7 +316,11 @@ mod tests {
         fn any_bytes_are_survived(bytes: Vec<u8>, cut in 0usize..60, word in 0usize..60, value: u8) {
             let mut interfaces = Interfaces::default();
             interfaces.hear(&bytes);
-            let mut said = address(NEW_ADDRESS, ETH0, OURS);
+            let mut said = if value % 2 == 0 {
+                address(NEW_ADDRESS, ETH0, OURS)
+            } else {
+                address6(NEW_ADDRESS, ETH0, Ipv6Addr::LOCALHOST)
+            };
             said.truncate(cut);
             if let Some(byte) = said.get_mut(word) {
                 *byte = value;
@@ -282,7 +333,7 @@ mod tests {
     async fn the_kernel_says_which_addresses_there_are() {
         let mut watch = Watch::begin().expect("any process may listen");
         let known = async {
-            while !watch.interfaces.0.values().flatten().any(|address| *address == Ipv4Addr::LOCALHOST) {
+            while !watch.interfaces.0.values().flatten().any(|address| address.is_loopback()) {
                 watch.hear().await.expect("the kernel speaks");
             }
         };

@@ -3,7 +3,7 @@
 use std::{
     future::poll_fn,
     io,
-    net::{Ipv4Addr, SocketAddr, SocketAddrV4},
+    net::{Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4},
     time::Duration,
 };
 
@@ -33,15 +33,29 @@ pub(super) fn listen(address: SocketAddr) -> io::Result<std::net::TcpListener> {
     begin_to_listen(&new_socket(address)?, address)
 }
 
-/// Listens at the first interface; where one is chosen by its name, at all addresses that this host has or will have.
+/// Listens at the first interface; where one is chosen by its name, at all addresses that this host has or will have: of IPv4, and of IPv6
+/// only where no interface can have one of IPv4. Where all are of loopback, nowhere else.
 ///
 /// # Errors
 /// What the system says.
 pub(super) fn listen_first(config: &NodeConfig) -> io::Result<std::net::TcpListener> {
     let (chosen, port) = (&config.ndl.interface, config.gncl.port);
-    let first = chosen.first_address().filter(|_| chosen.are_addresses());
+    if !chosen.have_ipv4() {
+        return listen((all_of_ipv6(config), port).into());
+    }
+    let first = if chosen.are_loopback() {
+        chosen.addresses().next()
+    } else {
+        chosen.first_address().filter(|_| chosen.are_ipv4_addresses())
+    };
     let address = (first.unwrap_or(Ipv4Addr::UNSPECIFIED), port).into();
     if chosen.iter().count() > 1 { listen_also_without(address) } else { listen(address) }
+}
+
+/// Where a node listens by IPv6: at all addresses, as those of its interfaces come and go; but at none that other hosts reach where it is to
+/// be seen by its own host alone.
+fn all_of_ipv6(config: &NodeConfig) -> Ipv6Addr {
+    if config.ndl.interface.are_loopback() { Ipv6Addr::LOCALHOST } else { Ipv6Addr::UNSPECIFIED }
 }
 
 /// Listens at an address that this host may not have yet.
@@ -55,7 +69,7 @@ fn listen_also_without(address: SocketAddr) -> io::Result<std::net::TcpListener>
 /// Listens at the further addresses of this node. One that this host does not have now it may have later: an interface that is
 /// down, or has no address yet, keeps no node from its start. What cannot be listened at in any case is counted, and not announced.
 pub(super) fn listen_at_further(config: &NodeConfig, refusals: &Refusals) -> Vec<std::net::TcpListener> {
-    if !config.ndl.interface.are_addresses() {
+    if !config.ndl.interface.are_ipv4_addresses() {
         return Vec::new();
     }
     let listen = |ip: Ipv4Addr| {
@@ -72,7 +86,28 @@ pub(super) fn listen_at_further(config: &NodeConfig, refusals: &Refusals) -> Vec
     config.gncl_further().into_iter().filter_map(listen).collect()
 }
 
-/// Where these listen.
+/// Listens at all IPv6 addresses, too, where interfaces may have some beside those of IPv4: at the same port, if that is free or was asked for.
+/// A host without IPv6 goes on with what it has.
+pub(super) fn listen_at_ipv6(config: &NodeConfig, first: SocketAddr) -> Option<std::net::TcpListener> {
+    if first.is_ipv6() || !config.ndl.interface.have_ipv6() {
+        return None;
+    }
+    let listen_at = |port| listen((all_of_ipv6(config), port).into());
+    let listened = match listen_at(first.port()) {
+        Err(error) if config.gncl.port == 0 && error.kind() == io::ErrorKind::AddrInUse => listen_at(0),
+        listened => listened,
+    };
+    let say = |error: &io::Error| {
+        crate::log::warn!(
+            %error,
+            "GNCL does not listen at IPv6 addresses: the other nodes reach this one by IPv4 alone. Where IPv6 is wanted, free the port in `gncl.port`, \
+             and see that the kernel has IPv6; where it is not, add /ipv4 to names in `ndl.interface`"
+        );
+    };
+    listened.inspect_err(say).ok()
+}
+
+/// Where these listen by IPv4.
 pub(super) fn addresses_of(listeners: &[std::net::TcpListener]) -> Vec<SocketAddrV4> {
     let addresses = listeners.iter().filter_map(|listener| match listener.local_addr() {
         Ok(SocketAddr::V4(address)) => Some(address),
@@ -87,6 +122,10 @@ fn new_socket(address: SocketAddr) -> io::Result<Socket> {
 
 fn begin_to_listen(socket: &Socket, address: SocketAddr) -> io::Result<std::net::TcpListener> {
     socket.set_reuse_address(true)?;
+    if address.is_ipv6() {
+        // Beside one of IPv4 at the same port.
+        socket.set_only_v6(true)?;
+    }
     socket.bind(&address.into())?;
     socket.listen(BACKLOG)?;
     Ok(socket.try_clone()?.into())
@@ -151,6 +190,26 @@ mod tests {
     use futures_util::{FutureExt, StreamExt};
 
     use super::*;
+
+    #[test]
+    fn a_node_that_is_on_loopback_alone_listens_nowhere_else() {
+        for (choices, ipv6_too) in
+            [(&["::1"][..], false), (&["127.0.0.1", "::1"], true), (&["127.0.0.1"], false)]
+        {
+            let mut config = NodeConfig::new("test");
+            let chosen: Vec<_> = choices.iter().map(|choice| choice.parse().unwrap()).collect();
+            config.ndl.interface = chosen.into();
+            let Ok(first) = listen_first(&config) else {
+                println!("skipped: this host has no IPv6");
+                return;
+            };
+            let at = first.local_addr().unwrap();
+            let beside = listen_at_ipv6(&config, at).map(|listener| listener.local_addr().unwrap());
+            assert!(at.ip().is_loopback(), "{choices:?}: {at}");
+            assert!(beside.is_none_or(|at| at.ip().is_loopback()), "{choices:?}: {beside:?}");
+            assert_eq!(beside.is_some(), ipv6_too, "{choices:?}");
+        }
+    }
 
     #[test]
     fn a_lack_of_descriptors_or_memory_waits_longer_each_time_and_never_spins() {

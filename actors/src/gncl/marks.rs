@@ -1,5 +1,7 @@
 //! What the network is told about a class, so that Control does not wait behind Bulk in somebody's queue.
 
+use std::net::SocketAddr;
+
 use tokio::net::TcpStream;
 
 use super::core::Lane;
@@ -29,23 +31,29 @@ impl Mark {
 /// Marks a connection that carries one class. Where the system refuses, it goes unmarked, as everything else does.
 #[cfg(target_os = "linux")]
 pub(super) fn mark(socket: &TcpStream, lane: Lane) {
-    let (socket, Mark { code_point, priority }) = (socket2::SockRef::from(socket), Mark::of(lane));
+    let is_ipv6 = socket.local_addr().is_ok_and(|at| at.is_ipv6());
+    let (socket, Mark { code_point, priority }) = (&socket2::SockRef::from(socket), Mark::of(lane));
     // The two low bits are for congestion (RFC 3168). The system derives a priority from this: ours comes after it.
-    let _ = socket.set_tos_v4(code_point << 2);
+    set_code_point(socket, is_ipv6, code_point);
     let _ = socket.set_priority(priority);
 }
 
-/// Marks a socket whose datagrams carry values of class Stream.
+/// Marks a socket at this address whose datagrams carry values of class Stream.
 #[cfg(target_os = "linux")]
-pub(super) fn mark_datagrams(socket: &socket2::Socket) {
+pub(super) fn mark_datagrams(socket: &socket2::Socket, at: SocketAddr) {
     let Mark { code_point, priority } = Mark::of(Lane::Stream);
-    let _ = socket.set_tos_v4(code_point << 2);
+    set_code_point(socket, at.is_ipv6(), code_point);
     let _ = socket.set_priority(priority);
+}
+
+#[cfg(target_os = "linux")]
+fn set_code_point(socket: &socket2::Socket, is_ipv6: bool, code_point: u32) {
+    let _ = if is_ipv6 { socket.set_tclass_v6(code_point << 2) } else { socket.set_tos_v4(code_point << 2) };
 }
 
 /// Marks nothing, likewise.
 #[cfg(not(target_os = "linux"))]
-pub(super) fn mark_datagrams(_: &socket2::Socket) {}
+pub(super) fn mark_datagrams(_: &socket2::Socket, _: SocketAddr) {}
 
 /// Marks nothing: not every system has these options.
 #[cfg(not(target_os = "linux"))]

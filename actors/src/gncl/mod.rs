@@ -12,7 +12,7 @@
 //! | GNCL-4 | A HELLO that meets an own HELLO on its way is refused by the lower node address and taken by the higher, which drops its own. |
 //! | GNCL-5 | A HELLO from a linked peer replaces the link: the peer knows better that the old one is dead. |
 //! | GNCL-6 | Dials are numbered; a WELCOME voids its sender's dials so far, and a void HELLO is refused. |
-//! | GNCL-7 | A newer incarnation ends all that belongs to the older; an older one is refused. |
+//! | GNCL-7 | A newer incarnation ends all that belongs to the older; an older one is refused. Where nodes have keys, a life that only datagrams tell of gives way to one that connects. |
 //! | GNCL-8 | After a break both dial again: waits double from `redial_min` to `redial_max`, 20 % jitter, until NodeLost; from the least again once messages pass. |
 //! | GNCL-9 | A link on which nothing comes is pinged every second; after 3 unanswered pings it is broken. One whose own address is lost is so at once. |
 //! | GNCL-10 | GOODBYE is the last frame of a node that leaves, behind all that waits; it is not dialled again until it is found again. |
@@ -32,6 +32,7 @@
 //! | `link.rs` | the reading half of a connection |
 //! | `task.rs` | the tasks that read and write a link, one each |
 //! | `bulk.rs` | the thread of those of Bulk |
+//! | `courtesy.rs` | when that thread gives its CPU away |
 //! | `arrivals.rs` | what became of what came, counted |
 //! | `inbound.rs` | what is checked before a frame becomes a message of this node |
 //! | `stream_way.rs` | how much of class Stream goes by datagram, for whoever asks |
@@ -47,6 +48,7 @@ mod actor;
 mod arrivals;
 mod bulk;
 mod core;
+mod courtesy;
 mod datagrams;
 mod facts;
 #[cfg(feature = "fuzzing")]
@@ -89,4 +91,6 @@ pub(crate) enum Event {
     Membership(MembershipFact),
     /// By NDL: this life of a node listens at these addresses now.
     Moved { node: NodeAddress, incarnation: Incarnation, gncl: Vec<SocketAddr> },
+    /// By NDL: that this life of a node was there bars no other.
+    Forgotten { node: NodeAddress, incarnation: Incarnation },
 }

@@ -423,8 +423,10 @@ impl Store {
             *bulk = Some(BulkThread::begin("bulk")?);
         }
         let thread = bulk.as_ref().expect("it was made if there was none");
-        let place = Place::There(thread.runtime().clone());
-        Ok(Move { place, transport: transport.with_socket(thread.adopt(transport.socket())?) })
+        Ok(Move {
+            place: thread.place(),
+            transport: transport.with_socket(thread.adopt(transport.socket())?),
+        })
     }
 
     /// Settles what has expired while it waited, and outcomes that do not come any more.

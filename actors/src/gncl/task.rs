@@ -1,13 +1,14 @@
 //! The tasks of a link: one reads and delivers, one writes what waits. They are no part of the actor, which hears of them only what
 //! it must know: a message costs the turn of one task, however many links there are.
 
-use std::{panic, thread, time::Duration};
+use std::{panic, sync::Arc, thread, time::Duration};
 
 use sinew_runtime::time::Time;
 use tokio::{runtime::Handle, sync::mpsc, task};
 use tokio_util::task::AbortOnDropHandle;
 
 use super::{
+    courtesy::Courtesy,
     link::{Reader, What},
     transport::Transport,
 };
@@ -22,8 +23,8 @@ const HEARD_PERIOD: Duration = Duration::from_millis(250);
 pub(super) enum Place {
     /// On the calling thread, which is the IO thread.
     Here,
-    /// On another one.
-    There(Handle),
+    /// On another one, which gives way to others.
+    There(Handle, Arc<Courtesy>),
 }
 
 impl Place {
@@ -34,11 +35,17 @@ impl Place {
     /// A task has had its turn, and goes on if nobody else wants to: with no lock in hand.
     ///
     /// The IO thread's turns are short enough. One of Bulk may have the next one ready for as long as the system lets it run, which is a
-    /// millisecond and more even where somebody has been woken for Control and waits for this CPU.
+    /// millisecond and more even where somebody has been woken for Control and waits for this CPU. See [`Courtesy`].
     pub(super) fn end_turn(&self) {
         match self {
             Self::Here => {}
-            Self::There(_) => thread::yield_now(),
+            Self::There(_, courtesy) => {
+                let now = Time::now();
+                if courtesy.gives_way(now) {
+                    thread::yield_now();
+                    courtesy.was_away(now, Time::now());
+                }
+            }
         }
     }
 
@@ -49,7 +56,7 @@ impl Place {
     ) -> AbortOnDropHandle<T> {
         AbortOnDropHandle::new(match self {
             Self::Here => task::spawn_local(task),
-            Self::There(runtime) => runtime.spawn(task),
+            Self::There(runtime, _) => runtime.spawn(task),
         })
     }
 }

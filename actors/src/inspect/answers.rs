@@ -24,6 +24,7 @@ use super::reports::{
 use super::watches::{Fetched, Sight};
 use crate::{
     audit,
+    config::NdlConfig,
     gncl::{self, ByDatagram, Peer},
     ndl::{KnownNode, KnownRoute, LossReason, LostNode, Source, Trouble, TroubledApp},
     node::{CommandError, NodeHandle, Supervised},
@@ -78,7 +79,7 @@ impl Answers {
             interface: stores.config.ndl.interface.to_string(),
             udp: ndl.udp,
             gncl: ndl.gncl,
-            group: stores.config.ndl.multicast.map(|group| group.to_string()),
+            group: group(&stores.config.ndl),
             seeds: stores.config.ndl.seeds.iter().take(TOLD_MAX).map(ToString::to_string).collect(),
             lost: ndl.lost,
             foreign: ndl.foreign,
@@ -136,6 +137,16 @@ struct Discovery {
     foreign: Vec<ForeignReport>,
 }
 
+/// The group that is asked: that of IPv6 where there is nothing else.
+fn group(ndl: &NdlConfig) -> Option<String> {
+    let ipv4 = ndl.multicast?;
+    if ndl.interface.have_ipv4() {
+        Some(ipv4.to_string())
+    } else {
+        ndl.multicast6.map(|group| group.to_string())
+    }
+}
+
 impl Discovery {
     fn of(stores: &Stores, now: Time) -> Self {
         let (udp, me, lost, foreign) = {
@@ -151,7 +162,7 @@ impl Discovery {
             udp: from.to_string(),
             ago_us: micros(now.since(other.heard)),
         });
-        let gncl = udp.map(|_| me.gncl().to_string());
+        let gncl = udp.and_then(|udp| me.gncl_addresses([(udp, udp)]).first().map(ToString::to_string));
         Self { udp: udp.map(|udp| udp.to_string()), gncl, lost, foreign: foreign.collect() }
     }
 }

@@ -9,7 +9,7 @@ use std::{
     collections::BTreeSet,
     future::poll_fn,
     hash::{BuildHasher, RandomState},
-    net::{Ipv4Addr, SocketAddr, SocketAddrV4},
+    net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4, SocketAddrV6},
     rc::Rc,
     sync::{Arc, MutexGuard, PoisonError, atomic::Ordering},
     task::Poll,
@@ -30,9 +30,10 @@ use tokio::sync::{Notify, mpsc, oneshot};
 use self::paths::{Paths, Reader};
 use super::{
     Event,
+    address::LocalAddress,
     core::{Core, Epoch, Input, Output, Place},
     datagram::{Answer, Body, Datagram, encode},
-    interfaces,
+    interfaces::{self, Usable},
     mdns::{Mdns, MdnsError},
     probe::{PROBES_MAX, Probe},
 };
@@ -87,14 +88,14 @@ impl Actor for NdlActor {
         // The first queries leave here.
         shell.carry_out();
         let chosen = &self.stores.config.ndl.interface;
-        if chosen.are_addresses() && chosen.iter().count() == 1 {
+        if chosen.are_ipv4_addresses() && chosen.iter().count() == 1 {
             // Nothing comes and goes.
             if let Some(mdns) = shell.start_mdns() {
                 ctx.spawn(watch_mdns(mdns.clone()).into_actor(self));
                 ctx.spawn(browse(shell.clone(), mdns).into_actor(self));
             }
         } else {
-            let news = (!chosen.are_addresses()).then(|| interfaces::watch(chosen.clone()));
+            let news = (!chosen.are_ipv4_addresses()).then(|| interfaces::watch(chosen.clone()));
             let news = news.transpose().unwrap_or_else(|error| {
                 give_up(&format!("NDL has no thread to see interfaces with: {error}; raise `ulimit -u`"))
             });
@@ -163,11 +164,11 @@ struct Shell {
 impl Shell {
     /// Binds the sockets, and starts the core; what is to be read is returned.
     fn bind(stores: Arc<Stores>) -> Result<(Self, Vec<Reader>), String> {
-        if !matches!(stores.gncl_listen.get(), Some(SocketAddr::V4(_))) {
-            return Err("NDL has no GNCL to announce: start GNCL, on an IPv4 address, before NDL".to_owned());
+        if stores.gncl_listen.get().is_none() {
+            return Err("NDL has no GNCL to announce: start GNCL before NDL".to_owned());
         }
         let (chosen, port, paths) = (&stores.config.ndl.interface, stores.config.ndl.port, Paths::default());
-        let addresses: Vec<_> = chosen.addresses().collect();
+        let addresses: Vec<_> = chosen.addresses().map(LocalAddress::from).collect();
         let (readers, error) = paths.open(&stores, &addresses);
         // Of several each may come later.
         if let Some(error) = error.filter(|_| chosen.iter().count() == 1) {
@@ -181,7 +182,9 @@ impl Shell {
         let epoch = {
             let mut core = lock(&stores);
             core.look_at_links(Time::now(), |node, incarnation| links.contains(&(node, incarnation)));
-            core.announce_gncl(announced(&stores, &addresses));
+            let expected: Vec<_> = addresses.iter().map(|local| local.at(0)).collect();
+            core.announce_gncl(announced(&stores, &expected));
+            core.use_seeds(Time::now(), seeds(&stores, None));
             core.start(Time::now(), &paths.here())
         };
         let (rewind, refusals) = (Notify::new(), stores.refusals.clone());
@@ -230,9 +233,11 @@ impl Shell {
         match output {
             Output::SendQuery { to, correlation } => self.send_query(to, correlation),
             Output::SendMulticastQuery { from, correlation } => {
-                let group = self.stores.config.ndl.multicast;
-                for (here, group) in from.into_iter().zip(group.into_iter().cycle()) {
-                    self.send_query(Place { there: group.into(), here }, correlation);
+                let groups = self.stores.config.ndl.groups();
+                for here in from {
+                    if let Some(there) = groups.of(here.ip()) {
+                        self.send_query(Place { there, here }, correlation);
+                    }
                 }
             }
             Output::SendAnswer { to, node, correlation, query_sent, query_received } => {
@@ -254,6 +259,10 @@ impl Shell {
             Output::Moved { node, incarnation, gncl } => {
                 crate::log::info!(%node, ?gncl, "the node listens there now");
                 self.tell_gncl(gncl::Event::Moved { node, incarnation, gncl });
+            }
+            Output::Forgotten { node, incarnation } => {
+                crate::log::warn!(%node, life = %incarnation, "the node is there in an earlier life than this one: its clock went back");
+                self.tell_gncl(gncl::Event::Forgotten { node, incarnation });
             }
             Output::Event { to, event } => self.tell_application(to, &event),
             Output::ClockMeasured { node, offset } => self.stores.clocks.set(node, offset),
@@ -316,12 +325,19 @@ fn signs(stores: &Stores) -> Vec<Input> {
     in_doubt.into_iter().filter_map(sign).collect()
 }
 
-/// Where the others reach GNCL of a node that has these addresses: at all at which it listens, the one that is preferred first.
-fn announced(stores: &Stores, ips: &[Ipv4Addr]) -> Vec<SocketAddrV4> {
-    let Some(SocketAddr::V4(listens)) = stores.gncl_listen.get().copied() else { return Vec::new() };
+/// Where the others reach GNCL of a node that has these addresses: at all of IPv4 at which it listens, the one that is preferred first; and at
+/// which port at those of IPv6, which NDL announces as its own.
+fn announced(stores: &Stores, here: &[SocketAddr]) -> (Vec<SocketAddrV4>, Option<u16>) {
+    let port6 = stores.gncl_port6.get().copied();
+    let Some(SocketAddr::V4(listens)) = stores.gncl_listen.get().copied() else { return (Vec::new(), port6) };
     let mut all: Vec<_> = if listens.ip().is_unspecified() {
         // Other hosts would find themselves at a loopback address.
-        let is_told = |ip: &&Ipv4Addr| !ip.is_loopback() || ips.iter().all(Ipv4Addr::is_loopback);
+        let ips = here.iter().filter_map(|here| match here.ip() {
+            IpAddr::V4(ip) => Some(ip),
+            IpAddr::V6(_) => None,
+        });
+        let ips: Vec<_> = ips.collect();
+        let is_told = |ip: &&Ipv4Addr| !ip.is_loopback() || here.iter().all(|here| here.ip().is_loopback());
         ips.iter().filter(is_told).map(|ip| SocketAddrV4::new(*ip, listens.port())).collect()
     } else {
         let further = stores.gncl_further.get().into_iter().flatten();
@@ -330,7 +346,23 @@ fn announced(stores: &Stores, ips: &[Ipv4Addr]) -> Vec<SocketAddrV4> {
     if let Some(outer) = stores.config.gncl.announce {
         all.splice(..all.len().min(1), [outer]);
     }
-    all
+    (all, port6)
+}
+
+/// Whom to ask in any case. A seed on the link of an interface that is not there waits for it; where nobody looks for interfaces, or the
+/// name of one is of no account, it is asked from everywhere.
+fn seeds(stores: &Stores, usable: Option<&Usable>) -> Vec<SocketAddr> {
+    let seeds = stores.config.ndl.seeds.iter().filter_map(|seed| {
+        let (SocketAddr::V6(at), Some(zone)) = (seed.address, &seed.zone) else { return Some(seed.address) };
+        if !at.ip().is_unicast_link_local() || stores.config.ndl.interface.are_ipv4_addresses() {
+            return Some(seed.address);
+        }
+        let numbers = &usable?.numbers;
+        let is_number = |number: &u32| numbers.values().any(|known| known == number);
+        let number = numbers.get(zone).copied().or_else(|| zone.parse().ok().filter(is_number))?;
+        Some(SocketAddrV6::new(*at.ip(), at.port(), 0, number).into())
+    });
+    seeds.collect()
 }
 
 /// Asks the root, every period, what of this node does not get on. The root waits for nobody, and NDL not for the root.

@@ -1,6 +1,6 @@
 //! NDL's datagrams: one frame each, at most 1,200 bytes, their payloads MessagePack maps.
 
-use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
 use bytes::BytesMut;
 use serde::{Deserialize, Serialize};
@@ -10,7 +10,10 @@ use sinew_runtime::{
     wire::{Flags, Header, HeaderError, Kind, decode, decode_datagram, encode_frame},
 };
 
-use super::Progress;
+use super::{
+    Progress,
+    address::{is_link_local, seen_from, unscoped},
+};
 
 /// Longest datagram in bytes: it passes every network unfragmented. // spec: NDL-1
 pub(crate) const DATAGRAM_MAX: usize = 1_200;
@@ -76,9 +79,9 @@ pub(crate) struct Announcement {
     pub(crate) incarnation: Incarnation,
     /// Drawn at random by each process: two processes with one address are told apart by it.
     pub(crate) boot_nonce: u64,
-    /// IPv4 address of the node's GNCL listener, as a number: 10.0.0.7 is 0x0a000007.
+    /// IPv4 address of the node's GNCL listener, as a number: 10.0.0.7 is 0x0a000007; 0: it has none.
     pub(crate) gncl_ip: u32,
-    /// TCP port of the node's GNCL listener.
+    /// TCP port of the node's GNCL listener; 0: there is none at IPv4.
     pub(crate) gncl_port: u16,
     /// Time between two queries of the node, in microseconds.
     pub(crate) period_us: u32,
@@ -88,35 +91,97 @@ pub(crate) struct Announcement {
     /// All IPv4 addresses and ports where its NDL answers, if there are several; [`PATHS_MAX`] at most. // spec: NDL-3.3
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(crate) ndl: Vec<(u32, u16)>,
+    /// All IPv6 addresses and ports where its NDL answers, [`PATHS_MAX`] at most with those of IPv4: each as its upper and its lower 64 bits. A
+    /// link-local one is meant on the link on which this is heard. // spec: NDL-3.5
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(crate) ndl6: Vec<(u64, u64, u16)>,
+    /// TCP port of its GNCL listener at those addresses; 0: there is none.
+    #[serde(default, skip_serializing_if = "is_nothing")]
+    pub(crate) gncl_port6: u16,
     /// Whether the address is its own already, and still.
     #[serde(default, skip_serializing_if = "Claim::is_held")]
     pub(crate) claim: Claim,
 }
 
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a field so")]
+const fn is_nothing(port: &u16) -> bool {
+    *port == 0
+}
+
 impl Announcement {
-    /// Where the node's GNCL listens.
-    pub(crate) fn gncl(&self) -> SocketAddrV4 {
-        SocketAddrV4::new(Ipv4Addr::from(self.gncl_ip), self.gncl_port)
+    /// All addresses where its GNCL listens, the one that it prefers first; those of IPv4 before those of IPv6. Of the link-local ones that at
+    /// which its NDL is seen from each of `routes`: from one of our addresses to one of its. // spec: NDL-3.5
+    pub(crate) fn gncl_addresses(
+        &self,
+        routes: impl IntoIterator<Item = (SocketAddr, SocketAddr)>,
+    ) -> Vec<SocketAddr> {
+        let first = Some((self.gncl_ip, self.gncl_port)).filter(|(_, port)| *port != 0);
+        let further = first.iter().chain(&self.gncl_further);
+        let mut all: Vec<SocketAddr> =
+            further.map(|(ip, port)| (Ipv4Addr::from(*ip), *port).into()).collect();
+        if self.gncl_port6 == 0 {
+            return all;
+        }
+        let is_on_hosts = |at: &SocketAddr| !at.ip().is_loopback();
+        let elsewhere = self.ndl6_addresses().filter(|at| !is_link_local(at.ip()));
+        let by_link =
+            routes.into_iter().filter(|(_, there)| is_link_local(there.ip()) && self.has_ndl_at(*there));
+        let by_link = by_link.map(|(here, there)| seen_from(here, there));
+        let mut ipv6: Vec<_> = by_link.chain(elsewhere).collect();
+        ipv6.iter_mut().for_each(|at| at.set_port(self.gncl_port6));
+        // Other hosts would find themselves at a loopback address.
+        if all.iter().chain(&ipv6).any(is_on_hosts) {
+            ipv6.retain(is_on_hosts);
+        }
+        for at in ipv6 {
+            if !all.contains(&at) {
+                all.push(at);
+            }
+        }
+        all
     }
 
-    /// All addresses where it listens, the one that it prefers first.
-    pub(crate) fn gncl_addresses(&self) -> Vec<SocketAddr> {
-        let further = self.gncl_further.iter().map(|(ip, port)| (Ipv4Addr::from(*ip), *port).into());
-        std::iter::once(self.gncl().into()).chain(further).collect()
-    }
-
-    /// All addresses where its NDL answers, if there are several.
+    /// All addresses where its NDL answers, if it says them.
     pub(crate) fn ndl_addresses(&self) -> impl Iterator<Item = SocketAddr> {
-        self.ndl.iter().map(|(ip, port)| (Ipv4Addr::from(*ip), *port).into())
+        let ipv4 = self.ndl.iter().map(|(ip, port)| (Ipv4Addr::from(*ip), *port).into());
+        ipv4.chain(self.ndl6_addresses())
     }
 
-    /// Its NDL answers there. Where there is one address alone, whoever asks it knows it.
+    fn ndl6_addresses(&self) -> impl Iterator<Item = SocketAddr> {
+        let ip = |upper: u64, lower: u64| Ipv6Addr::from_bits(u128::from(upper) << 64 | u128::from(lower));
+        self.ndl6.iter().map(move |(upper, lower, port)| (ip(*upper, *lower), *port).into())
+    }
+
+    /// Whether it says that its NDL answers there, on whichever of our links that is.
+    pub(crate) fn has_ndl_at(&self, there: SocketAddr) -> bool {
+        self.ndl_addresses().any(|address| address == unscoped(there))
+    }
+
+    /// Its NDL answers there. Where there is one address alone, whoever asks it knows it; of IPv6 it says where its GNCL is, too.
     pub(crate) fn announce_ndl(&mut self, paths: &[SocketAddr]) {
-        let number = |path: &SocketAddr| match path {
-            SocketAddr::V4(path) => Some((path.ip().to_bits(), path.port())),
-            SocketAddr::V6(_) => None,
-        };
-        self.ndl = if paths.len() > 1 { paths.iter().filter_map(number).collect() } else { Vec::new() };
+        (self.ndl, self.ndl6) = (Vec::new(), Vec::new());
+        for path in paths {
+            match path {
+                SocketAddr::V4(path) if paths.len() > 1 => self.ndl.push((path.ip().to_bits(), path.port())),
+                // Its only path.
+                SocketAddr::V4(_) => {}
+                SocketAddr::V6(path) => {
+                    let (bits, low) = (path.ip().to_bits(), u128::from(u64::MAX));
+                    let half = |bits: u128| u64::try_from(bits & low).unwrap_or(u64::MAX);
+                    self.ndl6.push((half(bits >> 64), half(bits), path.port()));
+                }
+            }
+        }
+    }
+
+    /// Takes over from what the same life says later where it is; returns whether its NDL is elsewhere than before.
+    pub(crate) fn note_addresses(&mut self, said: &Self) -> bool {
+        let is_elsewhere = self.ndl != said.ndl || self.ndl6 != said.ndl6;
+        (self.gncl_ip, self.gncl_port, self.gncl_port6) = (said.gncl_ip, said.gncl_port, said.gncl_port6);
+        self.gncl_further.clone_from(&said.gncl_further);
+        self.ndl.clone_from(&said.ndl);
+        self.ndl6.clone_from(&said.ndl6);
+        is_elsewhere
     }
 
     /// Whether both are from one process.
@@ -135,21 +200,31 @@ impl Announcement {
         let name_is_fit =
             |name: &str| (1..=NAME_MAX).contains(&name.len()) && !name.contains(char::is_control);
         let leads_nowhere = |address: SocketAddr| {
-            let SocketAddr::V4(address) = address else { return true };
-            let ip = address.ip();
-            address.port() == 0 || ip.is_unspecified() || ip.is_multicast() || ip.is_broadcast()
+            let is_a_host = match address.ip() {
+                IpAddr::V4(ip) => !(ip.is_unspecified() || ip.is_multicast() || ip.is_broadcast()),
+                // One of IPv4 in the guise of one of IPv6 would be asked past what is said of it elsewhere.
+                IpAddr::V6(ip) => {
+                    !(ip.is_unspecified() || ip.is_multicast()) && ip.to_ipv4_mapped().is_none()
+                }
+            };
+            address.port() == 0 || !is_a_host
         };
+        let has_gncl4 = self.gncl_ip != 0 || self.gncl_port != 0;
+        let gncl4 =
+            self.gncl_further.iter().copied().chain(has_gncl4.then_some((self.gncl_ip, self.gncl_port)));
+        let mut gncl4 = gncl4.map(|(ip, port)| SocketAddr::from((Ipv4Addr::from(ip), port)));
+        let has_gncl6 = self.gncl_port6 != 0 && !self.ndl6.is_empty();
         let fault = if !name_is_fit(&self.project) || !name_is_fit(&self.name) {
             "a name is empty, longer than 63 bytes, or has control characters"
         } else if !self.node.is_single() {
             "its node address names no single node"
         } else if self.gncl_further.len() > FURTHER_MAX {
             "its GNCL has too many addresses"
-        } else if self.ndl.len() > PATHS_MAX {
+        } else if self.ndl.len() + self.ndl6.len() > PATHS_MAX {
             "its NDL has too many addresses"
         } else if self.ndl_addresses().any(leads_nowhere) {
             "nobody can be asked at an address of its NDL"
-        } else if self.gncl_addresses().into_iter().any(leads_nowhere) {
+        } else if !(has_gncl4 || has_gncl6) || gncl4.any(leads_nowhere) {
             "nobody can be reached at an address of its GNCL"
         } else {
             return Ok(self);

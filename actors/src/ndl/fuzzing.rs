@@ -25,6 +25,8 @@ pub(crate) fn some_datagrams() -> Vec<Vec<u8>> {
         period_us: 500_000,
         gncl_further: vec![(0x0a00_0102, 7_777)],
         ndl: vec![(0x0a00_0002, 6_910), (0x0a00_0102, 6_910)],
+        ndl6: Vec::new(),
+        gncl_port6: 0,
         claim: Claim::Held,
     };
     let answer = Answer {
@@ -52,7 +54,7 @@ fn read(bytes: &[u8]) -> bool {
     let Ok(read) = parse(HERE, bytes) else { return false };
     assert!(bytes.len() <= DATAGRAM_MAX);
     let announcement = read.body.announcement();
-    assert!(announcement.node.is_single() && announcement.gncl_addresses().len() <= 8, "{announcement:?}");
+    assert!(announcement.node.is_single() && announcement.gncl_addresses([]).len() <= 16, "{announcement:?}");
     assert_eq!(maker_of(bytes), Some(announcement.node));
     let again = encode(&read, HERE);
     if again.len() <= DATAGRAM_MAX {

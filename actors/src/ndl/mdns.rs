@@ -8,10 +8,12 @@ use std::{
     net::{IpAddr, SocketAddr},
 };
 
-use mdns_sd::{DaemonEvent, IfKind, Receiver, ResolvedService, ServiceDaemon, ServiceEvent, ServiceInfo};
+use mdns_sd::{
+    DaemonEvent, IfKind, Receiver, ResolvedService, ScopedIp, ServiceDaemon, ServiceEvent, ServiceInfo,
+};
 use sinew_runtime::wire::fnv1a;
 
-use super::datagram::Announcement;
+use super::{address::seen_from, datagram::Announcement};
 
 /// The type of Sinew's service.
 const SERVICE: &str = "_sinew._udp.local.";
@@ -25,6 +27,8 @@ pub(super) struct Mdns {
     daemon: ServiceDaemon,
     fullname: String,
     project: String,
+    /// Our address, where the service is published.
+    here: SocketAddr,
 }
 
 /// Why multicast DNS did not start.
@@ -35,7 +39,8 @@ impl Mdns {
     pub(super) fn start(port: u16, udp: SocketAddr, me: &Announcement) -> Result<Self, MdnsError> {
         let service = service(udp, me)?;
         let daemon = ServiceDaemon::new_with_port(port)?;
-        let mdns = Self { daemon, fullname: service.get_fullname().to_owned(), project: me.project.clone() };
+        let (fullname, project) = (service.get_fullname().to_owned(), me.project.clone());
+        let mdns = Self { daemon, fullname, project, here: udp };
         // Commands are obeyed in order: nothing leaves by another interface.
         mdns.daemon.disable_interface(IfKind::All)?;
         mdns.daemon.enable_interface(interface(udp.ip()))?;
@@ -53,17 +58,20 @@ impl Mdns {
         self.daemon.monitor()
     }
 
-    /// Where the node of a resolved service can be asked; nothing if it is our own or of another project.
+    /// Where the node of a resolved service can be asked, by the family in which it was looked for; nothing if it is our own or of another
+    /// project.
     pub(super) fn addresses(&self, service: &ResolvedService) -> Vec<SocketAddr> {
         let is_own = service.get_fullname().eq_ignore_ascii_case(&self.fullname);
         if is_own || service.get_property_val_str("project") != Some(self.project.as_str()) {
             return Vec::new();
         }
-        let mut addresses: Vec<_> = service.get_addresses_v4().into_iter().collect();
+        let mut addresses: Vec<IpAddr> = service.get_addresses().iter().map(ScopedIp::to_ip_addr).collect();
+        addresses.retain(|ip| ip.is_ipv4() == self.here.is_ipv4());
         // From a hash set: in an order that a failure can be repeated with.
         addresses.sort_unstable();
         addresses.truncate(ADDRESSES_MAX);
-        addresses.into_iter().map(|ip| SocketAddr::from((ip, service.get_port()))).collect()
+        let at = |ip| seen_from(self.here, (ip, service.get_port()).into());
+        addresses.into_iter().map(at).collect()
     }
 }
 
@@ -77,7 +85,11 @@ impl Drop for Mdns {
 
 /// 127.0.0.0/8 is one interface with one address, whichever of its addresses the node has.
 fn interface(ip: IpAddr) -> IfKind {
-    if ip.is_loopback() { IfKind::LoopbackV4 } else { IfKind::Addr(ip) }
+    match ip {
+        IpAddr::V4(ip) if ip.is_loopback() => IfKind::LoopbackV4,
+        IpAddr::V6(ip) if ip.is_loopback() => IfKind::LoopbackV6,
+        ip @ (IpAddr::V4(_) | IpAddr::V6(_)) => IfKind::Addr(ip),
+    }
 }
 
 fn service(udp: SocketAddr, me: &Announcement) -> Result<ServiceInfo, MdnsError> {
@@ -121,6 +133,8 @@ mod tests {
             period_us: 0,
             gncl_further: Vec::new(),
             ndl: Vec::new(),
+            ndl6: Vec::new(),
+            gncl_port6: 0,
             claim: crate::ndl::datagram::Claim::Held,
         };
         let mdns = Mdns::start(port, "127.0.0.1:9".parse().unwrap(), &me).unwrap();

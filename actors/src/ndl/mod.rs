@@ -29,12 +29,13 @@
 //! | NDL-4.7 | But not while GNCL reads of it: it lives, and is told to have an NDL that is not heard. |
 //! | NDL-5 | A node has one life at a time. |
 //! | NDL-5.1 | A higher incarnation replaces a lower one: `NodeRestarted`. |
-//! | NDL-5.2 | A lower one is refused, also after the loss of the higher one. |
+//! | NDL-5.2 | A lower one is refused, also after the loss of the higher one, for 15 s. |
 //! | NDL-5.3 | From another address than its own, the newcomer waits up to 100 ms for the former life to show that it lives. |
 //! | NDL-5.4 | If it does, there are two processes with one address: the newcomer is refused, both addresses are logged. |
 //! | NDL-5.5 | A node that finds its own address in use while it settles, `missed_max` plus one periods from its start, gives up: at once if its life is the later one, else at the end of that time if the other is still there. |
 //! | NDL-5.6 | Of two that both live, who has settled goes before who has not, and then the elder life: whoever hears both takes that one. |
 //! | NDL-5.7 | Who goes second gives up `missed_max` periods after it hears of the first; who was frozen or alone settles anew. |
+//! | NDL-5.8 | Where nodes have keys, no datagram ends a life that has proven itself on a connection which stands. |
 //! | NDL-6 | Each answer measures the peer's clock; the smallest bound counts, grown by the drift since then. |
 //! | NDL-9 | Answers say what of the node does not get on; a change is told to applications. |
 //! | NDL-7 | All memory and all work is bounded. |
@@ -43,6 +44,7 @@
 //! | NDL-8 | An application that wants to know hears first of every member that is there, then of each change, once; what it does not take is offered again every 10 ms, in its last form. |
 
 mod actor;
+mod address;
 mod core;
 mod datagram;
 mod facts;
@@ -57,6 +59,7 @@ mod socket;
 mod tests;
 
 pub(crate) use actor::{NdlActor, new_core};
+pub(crate) use address::is_same_host;
 pub(crate) use core::Core;
 pub(crate) use core::LostNode;
 pub use core::{KnownNode, KnownRoute, Source, TroubledApp};

@@ -3,30 +3,49 @@
 use std::{
     collections::BTreeMap,
     io,
-    net::{Ipv4Addr, SocketAddr, SocketAddrV4, UdpSocket},
+    net::{IpAddr, SocketAddr, SocketAddrV4, SocketAddrV6, UdpSocket},
 };
 
-use socket2::{Domain, Protocol, Socket, Type};
+use socket2::{Domain, Protocol, SockRef, Socket, Type};
+
+use super::address::LocalAddress;
+use crate::config::NdlConfig;
 
 /// Room for the answers of a thousand members, where the system grants it (`net.core.rmem_max`).
 const RECEIVE_BUFFER: usize = 1 << 20;
 
 /// Binds the socket for queries and answers. Multicast leaves by the same interface, for this network only and for
 /// this host, too.
-pub(super) fn bind_unicast(interface: Ipv4Addr, port: u16) -> io::Result<UdpSocket> {
+pub(super) fn bind_unicast(local: LocalAddress, port: u16) -> io::Result<UdpSocket> {
     // Without address reuse: a port that another process has must be noticed.
-    let socket = udp()?;
-    socket.bind(&SocketAddrV4::new(interface, port).into())?;
-    socket.set_multicast_if_v4(&interface)?;
-    socket.set_multicast_ttl_v4(1)?;
-    socket.set_multicast_loop_v4(true)?;
+    let at = local.at(port);
+    let socket = udp(Domain::for_address(at))?;
+    socket.bind(&at.into())?;
+    send_multicast_by(SockRef::from(&socket), local)?;
+    match local.ip {
+        IpAddr::V4(_) => {
+            socket.set_multicast_ttl_v4(1)?;
+            socket.set_multicast_loop_v4(true)?;
+        }
+        IpAddr::V6(_) => {
+            socket.set_multicast_hops_v6(1)?;
+            socket.set_multicast_loop_v6(true)?;
+        }
+    }
     Ok(socket.into())
+}
+
+fn send_multicast_by(socket: SockRef<'_>, local: LocalAddress) -> io::Result<()> {
+    match local.ip {
+        IpAddr::V4(ip) => socket.set_multicast_if_v4(&ip),
+        IpAddr::V6(_) => socket.set_multicast_if_v6(local.interface),
+    }
 }
 
 /// The sockets for queries and answers, one for each address. They stay open while this layer is restarted: whoever knows them still
 /// finds us.
 #[derive(Debug, Default)]
-pub(crate) struct Sockets(BTreeMap<Ipv4Addr, Kept>);
+pub(crate) struct Sockets(BTreeMap<LocalAddress, Kept>);
 
 #[derive(Debug)]
 struct Kept {
@@ -44,14 +63,14 @@ impl Sockets {
     ///
     /// # Errors
     /// What the system says.
-    pub(super) fn open(&mut self, ip: Ipv4Addr, port: u16, is_marked: bool) -> io::Result<UdpSocket> {
-        let former = match self.0.get(&ip) {
+    pub(super) fn open(&mut self, local: LocalAddress, port: u16, is_marked: bool) -> io::Result<UdpSocket> {
+        let former = match self.0.get(&local) {
             Some(Kept { socket: Some(socket), .. }) => return socket.try_clone(),
             Some(Kept { port, socket: None }) => Some(*port),
             None => None,
         };
-        let again = former.filter(|_| port == 0).and_then(|port| bind_unicast(ip, port).ok());
-        let socket = again.map_or_else(|| bind_unicast(ip, port), Ok)?;
+        let again = former.filter(|_| port == 0).and_then(|port| bind_unicast(local, port).ok());
+        let socket = again.map_or_else(|| bind_unicast(local, port), Ok)?;
         if is_marked {
             mark(&socket);
         }
@@ -60,12 +79,12 @@ impl Sockets {
         if self.0.len() >= KEPT_MAX {
             self.0.retain(|_, kept| kept.socket.is_some());
         }
-        self.0.insert(ip, Kept { port, socket: Some(kept) });
+        self.0.insert(local, Kept { port, socket: Some(kept) });
         Ok(socket)
     }
 
-    pub(super) fn close(&mut self, ip: Ipv4Addr) {
-        if let Some(kept) = self.0.get_mut(&ip) {
+    pub(super) fn close(&mut self, local: LocalAddress) {
+        if let Some(kept) = self.0.get_mut(&local) {
             kept.socket = None;
         }
     }
@@ -80,12 +99,46 @@ impl Sockets {
     }
 }
 
+/// The groups in which nodes ask who is there, one for each family.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Groups {
+    pub(super) ipv4: Option<SocketAddrV4>,
+    pub(super) ipv6: Option<SocketAddrV6>,
+}
+
+impl NdlConfig {
+    /// Where this node asks who is there. Who switches multicast off wants none of either family.
+    pub(super) fn groups(&self) -> Groups {
+        Groups { ipv4: self.multicast, ipv6: self.multicast6.filter(|_| self.multicast.is_some()) }
+    }
+}
+
+impl Groups {
+    /// The one that is asked from an address of ours. None from loopback of IPv6: Linux has no route for groups there.
+    pub(super) fn of(self, ip: IpAddr) -> Option<SocketAddr> {
+        match ip {
+            IpAddr::V4(_) => self.ipv4.map(SocketAddr::from),
+            IpAddr::V6(ip) => self.ipv6.filter(|_| !ip.is_loopback()).map(SocketAddr::from),
+        }
+    }
+}
+
 /// Has the sockets of a path go by the interface that has this address now: it may be another one than at first.
-pub(super) fn renew(unicast: &UdpSocket, group: Option<(&UdpSocket, SocketAddrV4)>, interface: Ipv4Addr) {
+pub(super) fn renew(unicast: &UdpSocket, group: Option<(&UdpSocket, SocketAddr)>, local: LocalAddress) {
     // What fails here fails because the interface is away; it is tried again.
-    let _ = socket2::SockRef::from(unicast).set_multicast_if_v4(&interface);
+    let _ = send_multicast_by(SockRef::from(unicast), local);
     if let Some((socket, group)) = group {
-        let _ = socket2::SockRef::from(socket).join_multicast_v4(group.ip(), &interface);
+        let _ = join(SockRef::from(socket), group, local);
+    }
+}
+
+fn join(socket: SockRef<'_>, group: SocketAddr, local: LocalAddress) -> io::Result<()> {
+    match (group.ip(), local.ip) {
+        (IpAddr::V4(group), IpAddr::V4(ip)) => socket.join_multicast_v4(&group, &ip),
+        (IpAddr::V6(group), IpAddr::V6(_)) => socket.join_multicast_v6(&group, local.interface),
+        (IpAddr::V4(_), IpAddr::V6(_)) | (IpAddr::V6(_), IpAddr::V4(_)) => {
+            Err(io::ErrorKind::Unsupported.into())
+        }
     }
 }
 
@@ -96,9 +149,10 @@ pub(super) fn renew(unicast: &UdpSocket, group: Option<(&UdpSocket, SocketAddrV4
 pub(super) fn mark(socket: &UdpSocket) {
     const CODE_POINT: u32 = 48;
     const PRIORITY: u32 = 6;
-    let socket = socket2::SockRef::from(socket);
+    let is_ipv6 = socket.local_addr().is_ok_and(|at| at.is_ipv6());
+    let socket = SockRef::from(socket);
     // The two low bits are for congestion (RFC 3168). The system derives a priority from this: ours comes after it.
-    let _ = socket.set_tos_v4(CODE_POINT << 2);
+    let _ = if is_ipv6 { socket.set_tclass_v6(CODE_POINT << 2) } else { socket.set_tos_v4(CODE_POINT << 2) };
     let _ = socket.set_priority(PRIORITY);
 }
 
@@ -106,22 +160,34 @@ pub(super) fn mark(socket: &UdpSocket) {
 #[cfg(not(target_os = "linux"))]
 pub(super) const fn mark(_: &UdpSocket) {}
 
-/// Binds a socket that hears the multicast group on one interface.
-pub(super) fn join_group(group: SocketAddrV4, interface: Ipv4Addr) -> io::Result<UdpSocket> {
-    let socket = udp()?;
+/// Binds a socket that hears the multicast group on the interface that has this address.
+pub(super) fn join_group(group: SocketAddr, local: LocalAddress) -> io::Result<UdpSocket> {
+    let socket = udp(Domain::for_address(group))?;
     // Every node of the host hears the group.
     socket.set_reuse_address(true)?;
-    // Bound to the group's address and deaf to other interfaces, this hears nothing but the group.
-    socket.bind(&group.into())?;
+    // Bound to the group's address and deaf to other interfaces, this hears nothing but the group. To bind a group of IPv6 that
+    // belongs to a link takes the interface that leads there.
+    let at = match group {
+        SocketAddr::V4(_) => group,
+        SocketAddr::V6(group) => SocketAddrV6::new(*group.ip(), group.port(), 0, local.interface).into(),
+    };
+    socket.bind(&at.into())?;
     #[cfg(target_os = "linux")]
-    socket.set_multicast_all_v4(false)?;
-    socket.join_multicast_v4(group.ip(), &interface)?;
+    match group {
+        SocketAddr::V4(_) => socket.set_multicast_all_v4(false)?,
+        SocketAddr::V6(_) => socket.set_multicast_all_v6(false)?,
+    }
+    join(SockRef::from(&socket), group, local)?;
     Ok(socket.into())
 }
 
-fn udp() -> io::Result<Socket> {
-    let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
+fn udp(family: Domain) -> io::Result<Socket> {
+    let socket = Socket::new(family, Type::DGRAM, Some(Protocol::UDP))?;
     socket.set_nonblocking(true)?;
+    if family == Domain::IPV6 {
+        // Beside one of IPv4 at the same port.
+        socket.set_only_v6(true)?;
+    }
     // The system may grant less; then a burst loses datagrams, which NDL can bear.
     let _ = socket.set_recv_buffer_size(RECEIVE_BUFFER);
     Ok(socket)
@@ -134,7 +200,7 @@ pub(super) fn send(socket: &UdpSocket, bytes: &[u8], to: SocketAddr) -> io::Resu
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
+    use std::{net::Ipv4Addr, time::Duration};
 
     use super::*;
 
@@ -144,12 +210,12 @@ mod tests {
     #[test]
     fn multicast_on_loopback_reaches_every_socket_of_the_group_and_not_another_group() {
         // given: two listeners of a group, and one of another group at the same port
-        let sender = bind_unicast(Ipv4Addr::LOCALHOST, 0).unwrap();
+        let sender = bind_unicast(Ipv4Addr::LOCALHOST.into(), 0).unwrap();
         let port = sender.local_addr().unwrap().port();
         let group = SocketAddrV4::new(Ipv4Addr::new(239, 255, 1, 1), port);
         let other = SocketAddrV4::new(Ipv4Addr::new(239, 255, 1, 2), port);
         let listeners = [group, group, other].map(|group| {
-            let socket = join_group(group, Ipv4Addr::LOCALHOST).unwrap();
+            let socket = join_group(group.into(), Ipv4Addr::LOCALHOST.into()).unwrap();
             socket.set_nonblocking(false).unwrap();
             socket.set_read_timeout(Some(DEADLINE)).unwrap();
             socket
@@ -170,8 +236,11 @@ mod tests {
 
     #[test]
     fn a_port_that_is_in_use_is_noticed() {
-        let first = bind_unicast(Ipv4Addr::LOCALHOST, 0).unwrap();
+        let first = bind_unicast(Ipv4Addr::LOCALHOST.into(), 0).unwrap();
         let port = first.local_addr().unwrap().port();
-        assert_eq!(bind_unicast(Ipv4Addr::LOCALHOST, port).unwrap_err().kind(), io::ErrorKind::AddrInUse);
+        assert_eq!(
+            bind_unicast(Ipv4Addr::LOCALHOST.into(), port).unwrap_err().kind(),
+            io::ErrorKind::AddrInUse
+        );
     }
 }

@@ -179,7 +179,7 @@ fn two_nodes_find_each_other_by_one_seed_alone() {
     run(async {
         let mut first = Node::start(1, |_| {}).await;
         let seed = first.udp();
-        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
+        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed.into()]).await;
         first.finds(&second).await;
         second.finds(&first).await;
         assert_eq!(first.sources(), [Source::Query]);
@@ -206,7 +206,7 @@ fn an_application_hears_who_comes_and_who_falls_silent() {
         // given
         let mut first = Node::start(1, |ndl| ndl.period = Duration::from_millis(50)).await;
         let seed = first.udp();
-        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
+        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed.into()]).await;
         first.finds(&second).await;
         let found = first.event().await;
         assert_eq!(found.header.source, Tid::new(first.stores.node, AppAddress::NDL));
@@ -230,7 +230,7 @@ fn a_node_that_falls_silent_while_its_host_takes_connections_for_it_hangs() {
         let mut first = Node::start(1, |ndl| ndl.period = Duration::from_millis(50)).await;
         let listener = std::net::TcpListener::bind((LOOPBACK, 0)).unwrap();
         let seed = first.udp();
-        let mut second = Node::new(2, 1, |ndl| ndl.seeds = vec![seed]);
+        let mut second = Node::new(2, 1, |ndl| ndl.seeds = vec![seed.into()]);
         second.stores = {
             let stores = Stores::for_test(second.stores.config.clone(), Incarnation(1));
             stores.gncl_listen.set(listener.local_addr().unwrap()).unwrap();
@@ -251,7 +251,7 @@ fn a_node_that_stops_says_goodbye_and_a_later_life_is_a_restart() {
         // given: a period so long that only the goodbye can tell
         let mut first = Node::start(1, |ndl| ndl.period = Duration::from_secs(60)).await;
         let seed = first.udp();
-        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
+        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed.into()]).await;
         first.finds(&second).await;
         drop(first.event().await);
         second.finds(&first).await;
@@ -262,7 +262,7 @@ fn a_node_that_stops_says_goodbye_and_a_later_life_is_a_restart() {
         first.loses(&second, LossReason::Left).await;
         drop(first.event().await);
         // when
-        let third = Node::start_life(2, 2, |ndl| ndl.seeds = vec![seed]).await;
+        let third = Node::start_life(2, 2, |ndl| ndl.seeds = vec![seed.into()]).await;
         // then
         first.finds(&third).await;
         let event: NodeEvent = first.event().await.decode().unwrap();
@@ -280,9 +280,9 @@ fn an_event_that_finds_a_full_mailbox_is_told_when_there_is_room() {
         let route = LocalRoute { outlet: Arc::new(Inbox(inbox)), events: Arc::new([NodeEvent::KIND]) };
         first.stores.router.set_local(AppAddress::new(0x1000), route);
         let seed = first.udp();
-        let second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
+        let second = Node::start(2, |ndl| ndl.seeds = vec![seed.into()]).await;
         first.finds(&second).await;
-        let third = Node::start(3, |ndl| ndl.seeds = vec![seed]).await;
+        let third = Node::start(3, |ndl| ndl.seeds = vec![seed.into()]).await;
         first.finds(&third).await;
         // when
         within("the mailbox to refuse", async {
@@ -305,7 +305,7 @@ fn nobody_notices_that_the_layer_of_a_node_is_restarted() {
         // given
         let mut first = Node::start(1, |_| {}).await;
         let seed = first.udp();
-        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
+        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed.into()]).await;
         first.finds(&second).await;
         second.finds(&first).await;
         // when
@@ -314,7 +314,7 @@ fn nobody_notices_that_the_layer_of_a_node_is_restarted() {
         second.start_layer().await;
         // then: the next thing that either hears of is a third node
         assert_eq!(second.udp(), before);
-        let seeds = vec![seed, before];
+        let seeds = vec![seed.into(), before.into()];
         let third = Node::start(3, |ndl| ndl.seeds = seeds).await;
         first.finds(&third).await;
         second.finds(&third).await;
@@ -328,7 +328,7 @@ fn a_refused_dial_after_gncl_and_ndl_were_restarted_is_a_crash_of_who_was_linked
         // given: a link stood, of which no more is heard, and a period so long that only the refusal can tell
         let mut first = Node::start(1, |ndl| ndl.period = Duration::from_secs(60)).await;
         let seed = first.udp();
-        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
+        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed.into()]).await;
         first.finds(&second).await;
         let (node, incarnation) = (second.stores.node, Incarnation(1));
         let up = Input::Link(LinkFact::LinkUp { node, incarnation });
@@ -352,7 +352,7 @@ fn a_later_instance_ends_the_former_one_and_takes_over() {
         first.start_layer().await;
         // The former one still holds the port; the later one has another, and is the one that is found.
         let seed = first.udp();
-        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
+        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed.into()]).await;
         second.finds(&first).await;
         first.finds(&second).await;
         if let Some(former) = former {
@@ -376,7 +376,7 @@ fn a_flood_of_rubbish_is_refused_and_keeps_nobody_out() {
                 let _ = socket.send_to(&vec![b'S'; length], target);
             }
         });
-        let mut second = Node::start(2, |ndl| ndl.seeds = vec![target]).await;
+        let mut second = Node::start(2, |ndl| ndl.seeds = vec![target.into()]).await;
         // then
         second.finds(&first).await;
         first.finds(&second).await;
@@ -391,7 +391,7 @@ fn a_group_that_cannot_be_joined_leaves_the_other_sources() {
         let no_group = SocketAddrV4::new(Ipv4Addr::new(203, 0, 113, 1), 9);
         let mut first = Node::start(1, |ndl| ndl.multicast = Some(no_group)).await;
         let seed = first.udp();
-        let second = Node::start(2, |ndl| ndl.seeds = vec![seed]).await;
+        let second = Node::start(2, |ndl| ndl.seeds = vec![seed.into()]).await;
         first.finds(&second).await;
     });
 }

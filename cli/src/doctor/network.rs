@@ -3,19 +3,20 @@
 use std::{
     collections::BTreeMap,
     fs, io,
-    net::{IpAddr, Ipv4Addr, SocketAddrV4, UdpSocket},
+    net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4, SocketAddrV6, UdpSocket},
     time::Duration,
 };
 
-use sinew::config::{Interface as Choice, Interfaces};
+use sinew::config::{Families, Interface as Choice, Interfaces};
 use socket2::{Domain, Protocol, SockAddr, Socket, Type};
 
 use super::Check;
 
 /// Time for a datagram to come back from this machine's own interface.
 const HEARD_WITHIN: Duration = Duration::from_millis(500);
-/// The group of the trial; nothing of Sinew's is there.
+/// The groups of the trial; nothing of Sinew's is there.
 const GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 255, 77);
+const GROUP6: Ipv6Addr = Ipv6Addr::new(0xff12, 0, 0, 0, 0, 0, 0x8000, 0xff4d);
 /// Flags of an interface (`linux/if.h`).
 const UP: u32 = 0x1;
 const MULTICAST: u32 = 0x1000;
@@ -24,7 +25,9 @@ const MULTICAST: u32 = 0x1000;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Interface {
     pub(super) name: String,
-    pub(super) addresses: Vec<Ipv4Addr>,
+    pub(super) addresses: Vec<IpAddr>,
+    /// The kernel's number of it, where it has an address.
+    pub(super) number: Option<u32>,
     pub(super) flags: u32,
     /// Whether there is a carrier: a cable, a radio link.
     pub(super) has_carrier: bool,
@@ -32,7 +35,7 @@ pub(super) struct Interface {
 
 impl Interface {
     fn is_loopback(&self) -> bool {
-        self.addresses.iter().any(Ipv4Addr::is_loopback)
+        self.addresses.iter().any(IpAddr::is_loopback)
     }
 
     /// What it lacks to carry nodes' words to other hosts, and what mends that.
@@ -46,7 +49,7 @@ impl Interface {
         }
         if self.addresses.is_empty() {
             return Some((
-                "no IPv4 address",
+                "no address",
                 format!("sudo ip address add 10.0.0.1/24 dev {name} (an address of your network)"),
             ));
         }
@@ -60,7 +63,7 @@ impl Interface {
     }
 
     fn in_words(&self) -> String {
-        let addresses: Vec<_> = self.addresses.iter().map(Ipv4Addr::to_string).collect();
+        let addresses: Vec<_> = self.addresses.iter().map(IpAddr::to_string).collect();
         let state = match self.lacks() {
             // Linux carries multicast there without the flag.
             _ if self.is_loopback() => "this host only",
@@ -94,11 +97,12 @@ pub(super) fn interfaces(all: &[Interface]) -> Check {
 
 /// All interfaces, with what the kernel says of them.
 pub(super) fn found() -> Vec<Interface> {
-    let mut addresses: BTreeMap<String, Vec<Ipv4Addr>> = BTreeMap::new();
+    let mut addresses: BTreeMap<String, (Vec<IpAddr>, Option<u32>)> = BTreeMap::new();
     for interface in if_addrs::get_if_addrs().unwrap_or_default() {
-        if let IpAddr::V4(address) = interface.ip() {
-            addresses.entry(interface.name).or_default().push(address);
-        }
+        let (ip, index) = (interface.ip(), interface.index);
+        let (all, number) = addresses.entry(interface.name).or_default();
+        all.push(ip);
+        *number = number.or(index);
     }
     let entries = fs::read_dir("/sys/class/net").into_iter().flatten().flatten();
     let names: Vec<_> = entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();
@@ -109,12 +113,12 @@ pub(super) fn found() -> Vec<Interface> {
                 |what: &str| fs::read_to_string(format!("/sys/class/net/{name}/{what}")).unwrap_or_default();
             let flags = u32::from_str_radix(read("flags").trim().trim_start_matches("0x"), 16).ok()?;
             let has_carrier = read("carrier").trim() == "1";
-            let addresses = addresses.remove(&name).unwrap_or_default();
+            let (addresses, number) = addresses.remove(&name).unwrap_or_default();
             // What has never had an address and is down is no way that anybody means (tunnels, shapers).
             let is_meant = flags & UP != 0
                 || !addresses.is_empty()
                 || fs::exists(format!("/sys/class/net/{name}/device")).unwrap_or(false);
-            is_meant.then_some(Interface { name, addresses, flags, has_carrier })
+            is_meant.then_some(Interface { name, addresses, number, flags, has_carrier })
         })
         .collect();
     found.sort_by(|one, other| one.name.cmp(&other.name));
@@ -130,21 +134,25 @@ pub(super) fn multicast(chosen: &Interfaces, all: &[Interface]) -> Vec<Check> {
 
 fn multicast_at(choice: &Choice, all: &[Interface]) -> Vec<Check> {
     let usable = |interface: &&Interface| !interface.is_loopback() && interface.lacks().is_none();
-    let (at, none): (Vec<&Interface>, String) = match choice {
-        Choice::Address(address) => return vec![hears_at(*address, all)],
-        Choice::Name(name) => (
+    let (at, families, none): (Vec<&Interface>, Families, String) = match choice {
+        Choice::Address(address) => return vec![hears_at((*address).into(), None, all)],
+        Choice::Address6 { address, zone } => {
+            return vec![hears_at((*address).into(), zone.as_deref(), all)];
+        }
+        Choice::Name(name, families) => (
             all.iter().filter(|interface| interface.name == *name).collect(),
+            *families,
             format!("no interface of this host is called {name}, or it has no address"),
         ),
-        Choice::All => (
+        Choice::All(families) => (
             all.iter().filter(usable).collect(),
+            *families,
             "no interface leads to other hosts, and `all` is chosen".to_owned(),
         ),
     };
     let checks: Vec<_> = at
         .into_iter()
-        .flat_map(|interface| &interface.addresses)
-        .map(|address| hears_at(*address, all))
+        .flat_map(|interface| tried(interface, families).map(|address| heard_at(address, interface)))
         .collect();
     if !checks.is_empty() {
         return checks;
@@ -157,28 +165,52 @@ fn multicast_at(choice: &Choice, all: &[Interface]) -> Vec<Check> {
     vec![Check::finding(MULTICAST_NAME, none, mend)]
 }
 
+/// Addresses of an interface at which groups are tried: each of IPv4, and of IPv6 one, as the group belongs to the link.
+fn tried(interface: &Interface, families: Families) -> impl Iterator<Item = IpAddr> {
+    let of_ipv6 = interface.addresses.iter().copied().filter(|_| families.has_ipv6()).find(IpAddr::is_ipv6);
+    let of_ipv4 = interface.addresses.iter().copied().filter(move |ip| families.has_ipv4() && ip.is_ipv4());
+    of_ipv4.chain(of_ipv6)
+}
+
 /// Whether a datagram to a group comes back at the interface that has this address.
-fn hears_at(address: Ipv4Addr, all: &[Interface]) -> Check {
-    const NAME: &str = MULTICAST_NAME;
-    let Some(interface) = all.iter().find(|interface| {
-        interface.addresses.contains(&address) || (address.is_loopback() && interface.is_loopback())
-    }) else {
-        let others: Vec<_> =
-            all.iter().flat_map(|interface| &interface.addresses).map(Ipv4Addr::to_string).collect();
-        let mend = format!(
-            "set `ndl.interface`, and --interface here, to an address of this host: {}",
-            others.join(", ")
-        );
-        return Check::finding(NAME, format!("no interface of this host has the address {address}"), mend);
+fn hears_at(address: IpAddr, zone: Option<&str>, all: &[Interface]) -> Check {
+    let is_it = |interface: &&Interface| {
+        let has_it = interface.addresses.contains(&address)
+            || (address.is_ipv4() && address.is_loopback() && interface.is_loopback());
+        let is_called = |zone: &str| interface.name == zone || zone.parse().ok() == interface.number;
+        has_it && zone.is_none_or(is_called)
     };
+    if let Some(interface) = all.iter().find(is_it) {
+        return heard_at(address, interface);
+    }
+    let others: Vec<_> =
+        all.iter().flat_map(|interface| &interface.addresses).map(IpAddr::to_string).collect();
+    let mend = format!(
+        "set `ndl.interface`, and --interface here, to an address of this host: {}",
+        others.join(", ")
+    );
+    Check::finding(MULTICAST_NAME, format!("no interface of this host has the address {address}"), mend)
+}
+
+fn heard_at(address: IpAddr, interface: &Interface) -> Check {
+    const NAME: &str = MULTICAST_NAME;
     let device = &interface.name;
+    if address.is_ipv6() && address.is_loopback() {
+        let seen =
+            format!("{address} ({device}) has no groups: nodes of this host find each other there by seeds");
+        return Check::fine(NAME, seen);
+    }
     let mend = || {
+        let (route, key) = match address {
+            IpAddr::V4(_) => ("ip route add 239.0.0.0/8", "multicast"),
+            IpAddr::V6(_) => ("ip -6 route add multicast ff00::/8 table local", "multicast6"),
+        };
         format!(
-            "sudo ip link set dev {device} multicast on && sudo ip route add 239.0.0.0/8 dev {device}; or do without it: [ndl] multicast = \
+            "sudo ip link set dev {device} multicast on && sudo {route} dev {device}; or do without it: [ndl] {key} = \
              false, seeds = [..]"
         )
     };
-    match hears_itself(address) {
+    match hears_itself(address, interface.number) {
         Ok(true) => Check::fine(NAME, format!("a datagram to a group came back at {address} ({device})")),
         Ok(false) => {
             let seen = format!(
@@ -192,19 +224,33 @@ fn hears_at(address: Ipv4Addr, all: &[Interface]) -> Check {
     }
 }
 
-/// Whether what is sent to a group at this interface comes back, never farther than this link.
-fn hears_itself(interface: Ipv4Addr) -> io::Result<bool> {
-    let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
-    socket.bind(&SockAddr::from(SocketAddrV4::new(Ipv4Addr::UNSPECIFIED, 0)))?;
-    socket.set_multicast_if_v4(&interface)?;
-    // Not even beyond this machine.
-    socket.set_multicast_ttl_v4(0)?;
-    socket.set_multicast_loop_v4(true)?;
-    socket.join_multicast_v4(&GROUP, &interface)?;
+/// Whether what is sent to a group at this interface comes back, never farther than this machine.
+fn hears_itself(address: IpAddr, number: Option<u32>) -> io::Result<bool> {
+    let family = if address.is_ipv4() { Domain::IPV4 } else { Domain::IPV6 };
+    let socket = Socket::new(family, Type::DGRAM, Some(Protocol::UDP))?;
+    match address {
+        IpAddr::V4(interface) => {
+            socket.bind(&SockAddr::from(SocketAddrV4::new(Ipv4Addr::UNSPECIFIED, 0)))?;
+            socket.set_multicast_if_v4(&interface)?;
+            socket.set_multicast_ttl_v4(0)?;
+            socket.set_multicast_loop_v4(true)?;
+            socket.join_multicast_v4(&GROUP, &interface)?;
+        }
+        IpAddr::V6(_) => {
+            let number = number.ok_or(io::ErrorKind::AddrNotAvailable)?;
+            socket.set_only_v6(true)?;
+            socket.bind(&SockAddr::from(SocketAddrV6::new(Ipv6Addr::UNSPECIFIED, 0, 0, 0)))?;
+            socket.set_multicast_if_v6(number)?;
+            socket.set_multicast_hops_v6(0)?;
+            socket.set_multicast_loop_v6(true)?;
+            socket.join_multicast_v6(&GROUP6, number)?;
+        }
+    }
     let socket = UdpSocket::from(socket);
     socket.set_read_timeout(Some(HEARD_WITHIN))?;
     let said = std::process::id().to_le_bytes();
-    socket.send_to(&said, SocketAddrV4::new(GROUP, socket.local_addr()?.port()))?;
+    let group = if address.is_ipv4() { IpAddr::V4(GROUP) } else { IpAddr::V6(GROUP6) };
+    socket.send_to(&said, SocketAddr::new(group, socket.local_addr()?.port()))?;
     let mut heard = [0; 8];
     match socket.recv_from(&mut heard) {
         Ok((length, _)) => Ok(heard[..length] == said),
@@ -220,8 +266,8 @@ mod tests {
     use super::*;
 
     fn interface(name: &str, address: Option<[u8; 4]>, flags: u32, has_carrier: bool) -> Interface {
-        let addresses = address.into_iter().map(Ipv4Addr::from).collect();
-        Interface { name: name.to_owned(), addresses, flags, has_carrier }
+        let addresses = address.into_iter().map(IpAddr::from).collect();
+        Interface { name: name.to_owned(), addresses, number: Some(1), flags, has_carrier }
     }
 
     #[test]
@@ -245,7 +291,7 @@ mod tests {
     #[test]
     fn an_address_that_nobody_has_is_told_with_those_that_there_are() {
         let all = [interface("lo", Some([127, 0, 0, 1]), UP, true)];
-        let check = hears_at(Ipv4Addr::new(192, 0, 2, 1), &all);
+        let check = hears_at(Ipv4Addr::new(192, 0, 2, 1).into(), None, &all);
         assert!(check.mend.is_some_and(|mend| mend.contains("127.0.0.1")));
     }
 
@@ -253,19 +299,22 @@ mod tests {
     fn a_name_that_no_interface_has_and_all_where_there_is_none_are_findings() {
         let all =
             [interface("lo", Some([127, 0, 0, 1]), UP, true), interface("eth0", None, MULTICAST, false)];
-        for (choice, word) in [(Choice::Name("eth1".to_owned()), "eth1"), (Choice::All, "`all`")] {
+        for (choice, word) in [("eth1", "eth1"), ("all", "`all`"), ("fe80::1%eth1", "fe80::1")] {
+            let choice: Choice = choice.parse().unwrap();
             let checks = multicast(&vec![choice].into(), &all);
             assert_eq!(checks.len(), 1);
             assert!(checks[0].seen.contains(word), "{}", checks[0].seen);
-            assert!(checks[0].mend.as_ref().is_some_and(|mend| mend.contains("eth0")));
+            assert!(checks[0].mend.as_ref().is_some_and(|mend| mend.contains("eth0") || word == "fe80::1"));
         }
     }
 
     #[test]
     fn each_address_of_an_interface_is_tried() {
         let mut lo = interface("lo", Some([127, 0, 0, 1]), UP, true);
-        lo.addresses.push(Ipv4Addr::new(127, 0, 0, 2));
-        let checks = multicast(&vec![Choice::Name("lo".to_owned())].into(), &[lo]);
-        assert_eq!(checks.len(), 2);
+        lo.addresses.extend(["127.0.0.2", "::1"].map(|ip| ip.parse::<IpAddr>().unwrap()));
+        let count = |choice: &str| {
+            multicast(&vec![choice.parse::<Choice>().unwrap()].into(), std::slice::from_ref(&lo)).len()
+        };
+        assert_eq!((count("lo"), count("lo/ipv4"), count("lo/ipv6"), count("::1%lo")), (3, 2, 1, 1));
     }
 }

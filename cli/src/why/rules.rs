@@ -3,7 +3,7 @@
 mod access;
 mod stream;
 
-use std::collections::BTreeSet;
+use std::{collections::BTreeSet, net::IpAddr};
 
 use sinew::{
     Rejection,
@@ -358,8 +358,7 @@ fn why_unknown(from: &NodeReport, to: &End) -> Vec<(String, String)> {
         let seen = format!("it asks in the group {one}, the other in {other}");
         return vec![(seen, format!("set the same `multicast` under [ndl] in both; or {seed}"))];
     }
-    let is_loopback = |report: &NodeReport| report.interface.starts_with("127.");
-    if is_loopback(from) != is_loopback(theirs) {
+    if is_on_loopback(from) != is_on_loopback(theirs) {
         let seen = format!(
             "it asks at {}, the other at {}: one of them on its own host only",
             from.interface, theirs.interface
@@ -376,6 +375,15 @@ fn why_unknown(from: &NodeReport, to: &End) -> Vec<(String, String)> {
         from.interface, theirs.interface
     );
     vec![(format!("both ask in the group {one}, and it has not heard the other"), mend)]
+}
+
+/// Whether a node looks for others on its own host only: none of its interfaces leads out of it.
+fn is_on_loopback(report: &NodeReport) -> bool {
+    let is_loopback = |interface: &str| {
+        let interface = interface.trim_end_matches("/ipv4").trim_end_matches("/ipv6");
+        interface == "lo" || interface.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
+    };
+    report.interface.split(", ").all(is_loopback)
 }
 
 fn dial_in_words(peer: &PeerReport) -> (String, String) {

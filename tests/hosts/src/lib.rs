@@ -39,6 +39,17 @@ pub struct Host {
     index: u8,
 }
 
+/// Which addresses the interfaces of hosts have from the start.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Addresses {
+    /// Of IPv4, as 10.77.0.1, and that of IPv6 which the kernel makes by itself, some seconds later.
+    Ipv4,
+    /// Link-local ones of IPv6 alone: fe80::1 for the first host, the same in each network.
+    LinkLocal,
+    /// Both of these, and no further one.
+    Both,
+}
+
 /// In what order a throttled host sends what waits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Queue {
@@ -62,13 +73,21 @@ impl Hosts {
     /// # Errors
     /// As `new`.
     pub fn in_networks(count: u8, networks: u8) -> Result<Self, String> {
+        Self::with_addresses(count, networks, Addresses::Ipv4)
+    }
+
+    /// The same with these addresses. Those of IPv6 can be used at once: the kernel does not ask first whether another host has them.
+    ///
+    /// # Errors
+    /// As `new`; and a kernel without IPv6.
+    pub fn with_addresses(count: u8, networks: u8, addresses: Addresses) -> Result<Self, String> {
         let number = format!("{}-{}-", std::process::id(), NETWORKS.fetch_add(1, Ordering::Relaxed));
         let bridge = Namespace::new(format!("sw{number}br"))?;
         for network in 0..networks {
             bridge.ip(&format!("link add bridge{network} type bridge"))?;
             bridge.ip(&format!("link set bridge{network} up"))?;
         }
-        let host = |index| Host::new(&number, index, &bridge, networks);
+        let host = |index| Host::new(&number, index, &bridge, (networks, addresses));
         let hosts = (1..=count).map(host).collect::<Result<_, _>>()?;
         Ok(Self { bridge, hosts, radio: None })
     }
@@ -207,7 +226,12 @@ fn port(host: u8, network: u8) -> String {
 }
 
 impl Host {
-    fn new(number: &str, index: u8, bridge: &Namespace, networks: u8) -> Result<Self, String> {
+    fn new(
+        number: &str,
+        index: u8,
+        bridge: &Namespace,
+        (networks, addresses): (u8, Addresses),
+    ) -> Result<Self, String> {
         let namespace = Namespace::new(format!("sw{number}h{index}"))?;
         namespace.ip("link set lo up")?;
         for network in 0..networks {
@@ -215,10 +239,26 @@ impl Host {
             bridge.ip(&format!("link add {port} type veth peer name {name} netns {}", namespace.0))?;
             bridge.ip(&format!("link set {port} master bridge{network}"))?;
             bridge.ip(&format!("link set {port} up"))?;
-            namespace.ip(&format!("address add {}/24 dev {name}", address(index, network)))?;
+            if addresses != Addresses::LinkLocal {
+                namespace.ip(&format!("address add {}/24 dev {name}", address(index, network)))?;
+            }
+            if addresses != Addresses::Ipv4 {
+                namespace.ip(&format!("link set {name} addrgenmode none"))?;
+            }
             namespace.ip(&format!("link set {name} up"))?;
+            if addresses != Addresses::Ipv4 {
+                namespace.ip(&format!("address add fe80::{index}/64 dev {name} nodad"))?;
+            }
         }
         Ok(Self { namespace, address: address(index, 0), index })
+    }
+
+    /// Runs `ip` with these arguments on this host: `address add fd00::1/64 dev eth0 nodad`.
+    ///
+    /// # Errors
+    /// What `ip` says.
+    pub fn ip(&self, arguments: &str) -> Result<(), String> {
+        self.namespace.ip(arguments)
     }
 
     /// Runs `work` on this host, on a thread of its own.

@@ -2,6 +2,7 @@
 
 use std::{
     io,
+    net::SocketAddr,
     sync::{Arc, Mutex},
 };
 
@@ -19,7 +20,7 @@ use super::{
     Gncl,
     wire::Wire,
 };
-use crate::stores::lock;
+use crate::{ndl, stores::lock};
 
 impl Gncl {
     /// The listeners, one for each address: those that are open already, if this layer was restarted.
@@ -31,7 +32,14 @@ impl Gncl {
             let address = listener.local_addr()?;
             let further = listener::listen_at_further(config, &self.stores.gncl.refusals);
             self.stores.gncl_further.get_or_init(|| listener::addresses_of(&further));
-            *kept = std::iter::once(listener).chain(further).collect();
+            let ipv6 = listener::listen_at_ipv6(config, address);
+            let all = std::iter::once(listener).chain(further).chain(ipv6);
+            *kept = all.collect();
+            for at in
+                kept.iter().filter_map(|listener| listener.local_addr().ok()).filter(SocketAddr::is_ipv6)
+            {
+                self.stores.gncl_port6.get_or_init(|| at.port());
+            }
             self.bind_datagrams(&kept);
             self.stores.gncl_listen.get_or_init(|| address);
         }
@@ -41,14 +49,11 @@ impl Gncl {
     /// Whether a connection came to an address of an interface that this node uses: where those are chosen by their names, it listens at
     /// all that the host has.
     fn listens_at(&self, socket: &TcpStream) -> bool {
-        if self.stores.config.ndl.interface.are_addresses() {
+        if self.stores.config.ndl.interface.are_ipv4_addresses() {
             return true;
         }
-        let local = socket.local_addr().map(|local| local.ip());
-        lock(&self.stores.ndl)
-            .paths()
-            .iter()
-            .any(|path| local.as_ref().is_ok_and(|local| *local == path.ip()))
+        let Ok(local) = socket.local_addr() else { return false };
+        lock(&self.stores.ndl).paths().iter().any(|path| ndl::is_same_host(*path, local))
     }
 
     fn accepted(&mut self, socket: TcpStream, ctx: &mut Context<Self>) {

@@ -4,9 +4,12 @@ use actix::{AsyncContext, Context, StreamHandler};
 use sinew_runtime::time::Time;
 
 use super::Gncl;
-use crate::gncl::{
-    core::ConnectionId,
-    interfaces::{self, AddressLost},
+use crate::{
+    gncl::{
+        core::ConnectionId,
+        interfaces::{self, AddressLost},
+    },
+    ndl,
 };
 
 impl Gncl {
@@ -22,7 +25,7 @@ impl Gncl {
     fn connections_at(&self, AddressLost(lost): AddressLost) -> Vec<ConnectionId> {
         let is_there = |wire: &super::Wire| {
             let local = wire.transport.as_ref().and_then(|transport| transport.socket().local_addr().ok());
-            local.is_some_and(|local| local.ip() == lost)
+            local.is_some_and(|local| ndl::is_same_host(local, lost))
         };
         self.wires.iter().filter(|(_, wire)| is_there(wire)).map(|(connection, _)| *connection).collect()
     }
@@ -33,7 +36,7 @@ impl StreamHandler<AddressLost> for Gncl {
     fn handle(&mut self, lost: AddressLost, ctx: &mut Context<Self>) {
         for connection in self.connections_at(lost) {
             let detail =
-                format!("{} is gone, or its interface is down; what went over it goes another way", lost.0);
+                format!("{lost} is gone, or its interface is down; what went over it goes another way");
             self.stores.gncl.refusals.count(Time::now(), "address lost", &detail);
             self.ended(connection, ctx);
         }

@@ -58,6 +58,7 @@ impl StreamHandler<Event> for Gncl {
             // It is dialled there from the next time on; a link that stands is left alone.
             | Event::Moved { node, incarnation, gncl } => Input::NodeFound { node, incarnation, addresses: gncl },
             Event::Membership(MembershipFact::NodeLost { node, incarnation, why }) => lost_as(why, node, incarnation),
+            Event::Forgotten { node, incarnation } => Input::NodeDisowned { node, incarnation },
         };
         self.input(input, ctx);
     }

@@ -66,11 +66,13 @@ impl Sockets {
         lock(&self.0).clone()
     }
 
-    /// The one that belongs to a connection: that of its own address, or of the node's interface.
+    /// The one that belongs to a connection: that of its own address, or of the node's interface; none of the other family, from which nothing
+    /// gets there.
     pub(in crate::gncl) fn beside(&self, connection: SocketAddr) -> Option<Door> {
         let doors = lock(&self.0);
         let own = doors.iter().find(|door| connection.ip() == door.at.ip());
-        own.or_else(|| doors.first()).cloned()
+        let of_family = || doors.iter().find(|door| connection.is_ipv4() == door.at.is_ipv4());
+        own.or_else(of_family).cloned()
     }
 
     pub(in crate::gncl) fn close(&self) {
@@ -96,12 +98,17 @@ impl Door {
 impl Announcement {
     /// Where the peer reads datagrams, whose connection comes from `remote`.
     pub(super) fn target(self, remote: SocketAddr) -> Option<SocketAddr> {
-        let ip = if self.address == 0 { remote.ip() } else { Ipv4Addr::from_bits(self.address).into() };
-        let is_a_host = match ip {
+        // That of the connection as it is: a link-local one with the interface that leads there.
+        let mut at = remote;
+        if self.address != 0 {
+            at = (Ipv4Addr::from_bits(self.address), 0).into();
+        }
+        at.set_port(self.port);
+        let is_a_host = match at.ip() {
             IpAddr::V4(ip) => !(ip.is_unspecified() || ip.is_broadcast() || ip.is_multicast()),
             IpAddr::V6(ip) => !(ip.is_unspecified() || ip.is_multicast()),
         };
-        (self.port != 0 && is_a_host).then(|| SocketAddr::new(ip, self.port))
+        (self.port != 0 && is_a_host && at.is_ipv4() == remote.is_ipv4()).then_some(at)
     }
 }
 
@@ -114,7 +121,13 @@ fn door(listener: SocketAddr, is_marked: bool) -> io::Result<Door> {
         )?;
         // An interface that is down may come up, as for the listener.
         #[cfg(target_os = "linux")]
-        socket.set_freebind_v4(true)?;
+        if listener.is_ipv4() {
+            socket.set_freebind_v4(true)?;
+        }
+        if listener.is_ipv6() {
+            // Beside one of IPv4 at the same port.
+            socket.set_only_v6(true)?;
+        }
         socket.bind(&SocketAddr::new(listener.ip(), port).into())?;
         Ok(socket)
     };
@@ -123,8 +136,45 @@ fn door(listener: SocketAddr, is_marked: bool) -> io::Result<Door> {
     // The system may grant less; then a burst loses datagrams, which are sent again.
     let _ = socket.set_recv_buffer_size(RECEIVE_BUFFER);
     if is_marked {
-        marks::mark_datagrams(&socket);
+        marks::mark_datagrams(&socket, listener);
     }
     let socket = UdpSocket::from(socket);
     Ok(Door { at: socket.local_addr()?, socket: Arc::new(socket), outer: None })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn said(address: u32) -> Announcement {
+        Announcement { port: 9, key: 1, address }
+    }
+
+    #[test]
+    fn a_peer_on_a_link_reads_datagrams_there_and_one_of_ipv6_at_no_address_of_ipv4() {
+        let remote: SocketAddr = "[fe80::2%3]:5".parse().unwrap();
+        assert_eq!(said(0).target(remote), Some("[fe80::2%3]:9".parse().unwrap()));
+        assert_eq!(
+            said(0x0a00_0001).target(remote),
+            None,
+            "our socket there sends nothing of the other family"
+        );
+        assert_eq!(
+            said(0x0a00_0001).target("10.0.0.2:5".parse().unwrap()),
+            Some("10.0.0.1:9".parse().unwrap())
+        );
+        assert_eq!(Announcement { port: 0, ..said(0) }.target(remote), None);
+    }
+
+    #[test]
+    fn beside_a_connection_is_the_socket_of_its_address_or_one_of_its_family() {
+        let sockets = Sockets::default();
+        let config = crate::config::NodeConfig::new("test").gncl;
+        let listeners = ["127.0.0.1:0", "0.0.0.0:0"].map(|at| at.parse().unwrap());
+        sockets.bind(&listeners, &config, &Refusals::default());
+        let beside = |at: &str| sockets.beside(at.parse().unwrap()).map(|door| door.at.ip().to_string());
+        assert_eq!(beside("127.0.0.1:5").as_deref(), Some("127.0.0.1"));
+        assert_eq!(beside("127.0.0.2:5").as_deref(), Some("127.0.0.1"));
+        assert_eq!(beside("[fe80::1%3]:5"), None, "none of this node's gets there");
+    }
 }

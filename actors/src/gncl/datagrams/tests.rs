@@ -8,7 +8,7 @@ use sinew_runtime::time::Time;
 use super::{
     core::{Core, Order, stamp},
     incoming::Incoming,
-    outgoing::{Limits, Offered, Outgoing},
+    outgoing::{LIMITS, Limits, Offered, Outgoing},
     packet::{Acknowledgement, RANGES_MAX, Range},
 };
 
@@ -47,6 +47,35 @@ fn what_is_beyond_the_window_waits_and_newer_values_take_its_place() {
     assert_eq!(outgoing.value(&2), Some(&8));
     let position = outgoing.position();
     assert_eq!((position.superseded(), position.arrived, position.unacknowledged), (7, 1, 2));
+}
+
+// spec: DATAGRAM-6
+#[test]
+fn no_value_is_superseded_before_it_goes_while_acknowledgements_come_within_what_the_window_holds() {
+    // Given: 64 flows with a value of 170 bytes each millisecond: 192 of them fit in 32 KiB, which is 3 ms.
+    let superseded = |late: usize| {
+        let mut outgoing = Outgoing::<u32, u32>::new(100, LIMITS);
+        let mut went: Vec<(Time, Vec<u64>)> = Vec::new();
+        for millis in 0..100 {
+            let now = NOW + Duration::from_millis(millis);
+            if let Some((then, numbers)) = went.len().checked_sub(late).map(|at| &went[at]) {
+                for numbers in numbers.chunks(RANGES_MAX) {
+                    let said = Acknowledgement { echo: stamp(*then), ..said(numbers, 0) };
+                    outgoing.acknowledged(&said, stamp(now));
+                }
+            }
+            for key in 0..64 {
+                outgoing.submit(key, 1, 170, Time::MAX).unwrap();
+            }
+            let numbers = sent(&mut outgoing, now);
+            went.push((now, numbers));
+        }
+        outgoing.counts().superseded
+    };
+    // When, then: it is the window and nothing else that makes a value wait.
+    assert_eq!(superseded(1), 0);
+    assert_eq!(superseded(3), 0);
+    assert!(superseded(4) > 0);
 }
 
 #[test]

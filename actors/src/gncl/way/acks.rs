@@ -8,6 +8,10 @@ use crate::{
     session::Ack,
 };
 
+/// Rounds in which one thread at most makes another acknowledgement because a newer one was made while it said its own. Each round takes
+/// another thread that made one at that very moment: more than two hardly follow each other.
+const ROUNDS_MAX: u32 = 8;
+
 /// One that is not said yet.
 struct Acknowledgement {
     number: u64,
@@ -27,7 +31,10 @@ impl Way {
 
     /// Tells the peer what was taken, if it does not know. Returns whether it did not.
     pub(in crate::gncl) fn acknowledge_if_owed(&self) -> bool {
-        let owes = self.inbox().receiving.owes_ack();
+        let owes = {
+            let inbox = self.inbox();
+            inbox.ack_is_due || inbox.receiving.owes_ack()
+        };
         if owes {
             self.acknowledge();
         }
@@ -38,15 +45,27 @@ impl Way {
         self.say_ack(self.next_ack());
     }
 
-    fn say_ack(&self, mut ack: Acknowledgement) {
-        loop {
+    fn say_ack(&self, ack: Acknowledgement) {
+        self.say_acks(ack, || self.next_ack());
+    }
+
+    /// Says `ack`, and what is made `next` as long as that was not the last one, up to a bound.
+    ///
+    /// The bound is enough: whoever made the newer one says it, or one that is newer still. Only if that came before this one, which has taken its
+    /// place then, the peer does not know the rest; so it is owed, and said within a period (1 s) of [`Ticks`](super::super::ticks::Ticks) by who looks for
+    /// what is owed, who is one thread.
+    fn say_acks(&self, mut ack: Acknowledgement, mut next: impl FnMut() -> Acknowledgement) {
+        for _ in 0..ROUNDS_MAX {
             let is_of_now = self.outlet.acknowledge(ack.message, ack.epoch);
             // What another thread has made meanwhile may have been said before this one, which has taken its place then: in an outlet one waits.
             if is_of_now && self.inbox().acks_made == ack.number {
                 return;
             }
-            ack = self.next_ack();
+            ack = next();
         }
+        // Not the one in hand, which may be older than what was said meanwhile.
+        self.inbox().ack_is_due = true;
+        self.told.acks.want();
     }
 
     fn next_ack(&self) -> Acknowledgement {
@@ -90,6 +109,28 @@ mod tests {
         gncl::{core::read, transport::Transport},
         outlet::Gathering,
     };
+
+    #[test]
+    fn who_is_always_outrun_by_another_thread_leaves_it_to_who_looks_for_what_is_owed() {
+        // Given: each time that one is said, another thread has made a newer one.
+        let [here, node] = [1, 2].map(NodeAddress::new);
+        let ends = Ends { here, node, takes_outcomes: true };
+        let way = Way::new(Time::now(), ends, &NodeConfig::new("hip"), &Told::default());
+        let mut rounds = 0;
+        let mut outrun = || {
+            rounds += 1;
+            assert!(rounds <= 1_000, "it goes on for ever");
+            let ack = way.next_ack();
+            way.next_ack();
+            ack
+        };
+        // When
+        let first = outrun();
+        way.say_acks(first, &mut outrun);
+        // Then
+        assert!(way.acknowledge_if_owed(), "the last word is still to be said");
+        assert!(!way.acknowledge_if_owed(), "it is");
+    }
 
     // spec: CREDIT-2
     #[tokio::test]

@@ -4,11 +4,11 @@
 //! interface's name, as long as the interface has the address. Nothing here waits.
 
 use std::{
-    cell::RefCell,
+    cell::{Cell, RefCell},
     collections::BTreeSet,
     future::pending,
     io,
-    net::{Ipv4Addr, SocketAddr, SocketAddrV4, UdpSocket},
+    net::{SocketAddr, UdpSocket},
     rc::Rc,
     time::Duration,
 };
@@ -23,7 +23,14 @@ use tokio::sync::watch;
 use super::{Shell, browse, lock, receiving::receive, watch_mdns};
 use crate::{
     config::Interfaces,
-    ndl::{PATHS_MAX, core::Way, interfaces::Usable, mdns::Mdns, socket},
+    ndl::{
+        PATHS_MAX,
+        address::LocalAddress,
+        core::Way,
+        interfaces::{Flags, Usable},
+        mdns::Mdns,
+        socket,
+    },
     stores::{self, Stores},
 };
 
@@ -35,7 +42,7 @@ type Task = LocalBoxFuture<'static, ()>;
 
 /// One path.
 struct Path {
-    ip: Ipv4Addr,
+    local: LocalAddress,
     here: SocketAddr,
     /// Sends at once, whatever the runtime knows of the socket.
     socket: UdpSocket,
@@ -48,14 +55,16 @@ struct Path {
 #[derive(Default)]
 pub(super) struct Paths {
     open: RefCell<Vec<Path>>,
-    said: RefCell<BTreeSet<(Ipv4Addr, &'static str)>>,
+    said: RefCell<BTreeSet<(LocalAddress, &'static str)>>,
+    has_said_no_ipv6: Cell<bool>,
+    has_said_none: Cell<bool>,
 }
 
 /// A socket that is to be read.
 pub(super) struct Reader {
     socket: UdpSocket,
     from: (SocketAddr, Way),
-    ip: Ipv4Addr,
+    local: LocalAddress,
 }
 
 impl Paths {
@@ -64,8 +73,8 @@ impl Paths {
         self.open.borrow().iter().map(|path| path.here).collect()
     }
 
-    fn ips(&self) -> Vec<Ipv4Addr> {
-        self.open.borrow().iter().map(|path| path.ip).collect()
+    fn locals(&self) -> Vec<LocalAddress> {
+        self.open.borrow().iter().map(|path| path.local).collect()
     }
 
     /// Sends from one of our addresses.
@@ -79,64 +88,64 @@ impl Paths {
     }
 
     /// Opens what is `wanted` and is not open, closes what is not wanted. What is to be read from now on; and the first error.
-    pub(super) fn open(&self, stores: &Stores, wanted: &[Ipv4Addr]) -> (Vec<Reader>, Option<io::Error>) {
+    pub(super) fn open(&self, stores: &Stores, wanted: &[LocalAddress]) -> (Vec<Reader>, Option<io::Error>) {
         let (mut readers, mut first_error) = (Vec::new(), None);
         self.close_all_but(stores, wanted);
-        for ip in wanted.iter().copied() {
-            if !self.ips().contains(&ip) {
-                match open(stores, ip) {
+        for local in wanted.iter().copied() {
+            if !self.locals().contains(&local) {
+                match open(stores, local) {
                     Ok(path) => {
                         let from = (path.here, Way::Unicast);
                         match path.socket.try_clone() {
-                            Ok(socket) => readers.push(Reader { socket, from, ip }),
+                            Ok(socket) => readers.push(Reader { socket, from, local }),
                             Err(error) => {
                                 first_error.get_or_insert(error);
                                 continue;
                             }
                         }
                         self.open.borrow_mut().push(path);
-                        self.said.borrow_mut().remove(&(ip, UNOPENED));
+                        self.said.borrow_mut().remove(&(local, UNOPENED));
                     }
                     Err(error) => {
                         first_error.get_or_insert(error);
                     }
                 }
             }
-            readers.extend(self.join(stores, ip));
+            readers.extend(self.join(stores, local));
         }
-        let place = |path: &Path| wanted.iter().position(|ip| *ip == path.ip);
+        let place = |path: &Path| wanted.iter().position(|local| *local == path.local);
         self.open.borrow_mut().sort_by_key(place);
         (readers, first_error)
     }
 
-    fn close_all_but(&self, stores: &Stores, wanted: &[Ipv4Addr]) {
+    fn close_all_but(&self, stores: &Stores, wanted: &[LocalAddress]) {
         self.open.borrow_mut().retain(|path| {
-            let is_wanted = wanted.contains(&path.ip);
+            let is_wanted = wanted.contains(&path.local);
             if !is_wanted {
                 path.readers.iter().for_each(AbortHandle::abort);
-                stores::lock(&stores.ndl_sockets).close(path.ip);
+                stores::lock(&stores.ndl_sockets).close(path.local);
                 crate::log::info!(udp = %path.here, "NDL does not ask there any more: the address is gone");
             }
             is_wanted
         });
-        self.said.borrow_mut().retain(|(ip, _)| wanted.contains(ip));
+        self.said.borrow_mut().retain(|(local, what)| *what == IN_DOUBT || wanted.contains(local));
     }
 
     /// Joins the group on a path that has not joined it yet.
-    fn join(&self, stores: &Stores, ip: Ipv4Addr) -> Option<Reader> {
-        let group = stores.config.ndl.multicast?;
+    fn join(&self, stores: &Stores, local: LocalAddress) -> Option<Reader> {
+        let group = stores.config.ndl.groups().of(local.ip)?;
         let mut open = self.open.borrow_mut();
-        let path = open.iter_mut().find(|path| path.ip == ip && path.group.is_none())?;
-        let joined = socket::join_group(group, ip).and_then(|socket| Ok((socket.try_clone()?, socket)));
+        let path = open.iter_mut().find(|path| path.local == local && path.group.is_none())?;
+        let joined = socket::join_group(group, local).and_then(|socket| Ok((socket.try_clone()?, socket)));
         match joined {
             Ok((socket, kept)) => {
                 path.group = Some(kept);
-                self.said.borrow_mut().remove(&(ip, UNJOINED));
-                Some(Reader { socket, from: (path.here, Way::Multicast), ip })
+                self.said.borrow_mut().remove(&(local, UNJOINED));
+                Some(Reader { socket, from: (path.here, Way::Multicast), local })
             }
             Err(error) => {
-                if self.said.borrow_mut().insert((ip, UNJOINED)) {
-                    say_unjoined(group, ip, &error);
+                if self.said.borrow_mut().insert((local, UNJOINED)) {
+                    say_unjoined(group, local, &error);
                 }
                 None
             }
@@ -144,12 +153,13 @@ impl Paths {
     }
 
     /// What is not open, and why, once.
-    fn say_unopened(&self, stores: &Stores, wanted: &[Ipv4Addr], error: &io::Error) {
+    fn say_unopened(&self, stores: &Stores, wanted: &[LocalAddress], error: &io::Error) {
         let port = stores.config.ndl.port;
-        for ip in wanted.iter().filter(|ip| !self.ips().contains(ip)) {
-            if self.said.borrow_mut().insert((*ip, UNOPENED)) {
+        for local in wanted.iter().filter(|local| !self.locals().contains(local)) {
+            if self.said.borrow_mut().insert((*local, UNOPENED)) {
+                let at = local.at(port);
                 crate::log::warn!(
-                    "NDL cannot use UDP {ip}:{port} yet: {error}; it tries again each second. Give this host the address \
+                    "NDL cannot use UDP {at} yet: {error}; it tries again each second. Give this host the address \
                      (`ip address`), leave it out of `ndl.interface`, or set `ndl.port` to a port that is free there"
                 );
             }
@@ -158,43 +168,103 @@ impl Paths {
 
     /// Sockets whose interface was gone for a while, and has the address again, send and hear by it.
     fn renew(&self, stores: &Stores) {
-        for path in self.open.borrow().iter().filter(|path| !path.ip.is_loopback()) {
-            socket::renew(&path.socket, path.group.as_ref().zip(stores.config.ndl.multicast), path.ip);
+        for path in self.open.borrow().iter().filter(|path| !path.local.ip.is_loopback()) {
+            let group = stores.config.ndl.groups().of(path.local.ip);
+            socket::renew(&path.socket, path.group.as_ref().zip(group), path.local);
         }
     }
 
-    fn keep(&self, ip: Ipv4Addr, reader: AbortHandle) {
-        if let Some(path) = self.open.borrow_mut().iter_mut().find(|path| path.ip == ip) {
+    fn keep(&self, local: LocalAddress, reader: AbortHandle) {
+        if let Some(path) = self.open.borrow_mut().iter_mut().find(|path| path.local == local) {
             path.readers.push(reader);
+        }
+    }
+
+    /// Why an IPv6 address that was chosen is not used, and that there are none at all; each once.
+    fn say_what_is_missing(&self, stores: &Stores, usable: &Usable) {
+        for (local, flags) in &usable.in_doubt {
+            let is_open = self.locals().contains(local);
+            // Whoever was told that an address is asked for is told again if another host has it.
+            let what = if flags.is_duplicate { TAKEN } else { IN_DOUBT };
+            if !is_open && self.said.borrow_mut().insert((*local, what)) {
+                say_in_doubt(*local, *flags);
+            }
+        }
+        self.said.borrow_mut().retain(|(local, what)| {
+            ![IN_DOUBT, TAKEN].contains(what) || usable.in_doubt.iter().any(|(known, _)| known == local)
+        });
+        let interfaces = &stores.config.ndl.interface;
+        if usable.is_known && wanted_later(interfaces, usable) && !self.has_said_none.replace(true) {
+            crate::log::warn!(
+                %interfaces,
+                "NDL has no address yet: no interface of this host that is up has what `ndl.interface` chooses. It begins when there is one: give \
+                 the host the address (`ip address`), or choose another interface"
+            );
+        }
+        if usable.is_known
+            && !usable.has_ipv6
+            && interfaces.have_ipv6()
+            && !self.has_said_no_ipv6.replace(true)
+        {
+            crate::log::warn!(
+                %interfaces,
+                "this host has no IPv6: NDL goes on with IPv4, and takes IPv6 addresses when there are any. Where they are wanted, look at \
+                 `sysctl net.ipv6.conf.all.disable_ipv6` and at `ipv6.disable` of the kernel's command line; where they are not, add /ipv4 \
+                 to names in `ndl.interface`"
+            );
         }
     }
 }
 
 const UNOPENED: &str = "it cannot be opened";
+const IN_DOUBT: &str = "another host may have it";
+const TAKEN: &str = "another host has it";
 const UNJOINED: &str = "the group cannot be joined";
 
-fn open(stores: &Stores, ip: Ipv4Addr) -> io::Result<Path> {
+fn open(stores: &Stores, local: LocalAddress) -> io::Result<Path> {
     let (ndl, marks) = (&stores.config.ndl, stores.config.gncl.marks);
-    let socket = stores::lock(&stores.ndl_sockets).open(ip, ndl.port, marks)?;
+    let socket = stores::lock(&stores.ndl_sockets).open(local, ndl.port, marks)?;
     let here = socket.local_addr()?;
     crate::log::info!(udp = %here, "NDL asks and answers");
-    Ok(Path { ip, here, socket, group: None, readers: Vec::new() })
+    Ok(Path { local, here, socket, group: None, readers: Vec::new() })
 }
 
-fn say_unjoined(group: SocketAddrV4, interface: Ipv4Addr, error: &io::Error) {
+fn say_in_doubt(local: LocalAddress, flags: Flags) {
+    if flags.is_duplicate {
+        crate::log::error!(
+            %local,
+            "NDL does not use this address: another host on the link has it (duplicate address detection). Take it away from one of the two \
+             (`sudo ip -6 address del`), and give it another one"
+        );
+    } else {
+        crate::log::info!(%local, "NDL uses this address as soon as the kernel knows that no other host on the link has it");
+    }
+}
+
+fn say_unjoined(group: SocketAddr, interface: LocalAddress, error: &io::Error) {
     crate::log::warn!(
         "NDL does not hear multicast {group} on {interface}: {error}; nodes are found through mDNS and seeds only. \
-         Set `ndl.interface` to an interface that is up and `ndl.multicast` to a group, or list `ndl.seeds`",
+         Set `ndl.interface` to an interface that is up and `{}` to a group, or list `ndl.seeds`",
+        if group.is_ipv4() { "ndl.multicast" } else { "ndl.multicast6" },
     );
 }
 
+/// Whether there is nothing that could be used, now or as soon as it is known to be this host's alone.
+fn wanted_later(chosen: &Interfaces, usable: &Usable) -> bool {
+    usable.running.is_empty() && usable.in_doubt.is_empty() && chosen.addresses().next().is_none()
+}
+
 /// Which addresses are used: those that were chosen, and of the other interfaces those that packets get out at, or that are open.
-fn wanted(chosen: &Interfaces, usable: &Usable, open: &[Ipv4Addr]) -> Vec<Ipv4Addr> {
-    let mut wanted: Vec<_> = chosen.addresses().collect();
-    let is_used = |ip: &Ipv4Addr| usable.running.contains(ip) || open.contains(ip);
-    for ip in usable.there.iter().copied().filter(is_used) {
-        if !wanted.contains(&ip) {
-            wanted.push(ip);
+fn wanted(chosen: &Interfaces, usable: &Usable, open: &[LocalAddress]) -> Vec<LocalAddress> {
+    let mut wanted: Vec<_> = chosen.addresses().map(LocalAddress::from).collect();
+    let is_used = |local: &LocalAddress| usable.running.contains(local) || open.contains(local);
+    // An interface that comes back may ask once more whether it alone has an address: what is open there stays open.
+    let asked_again =
+        usable.in_doubt.iter().filter(|(_, flags)| !flags.is_duplicate).map(|(local, _)| *local);
+    let asked_again = asked_again.filter(|local| open.contains(local));
+    for local in usable.there.iter().copied().filter(is_used).chain(asked_again) {
+        if !wanted.contains(&local) {
+            wanted.push(local);
         }
     }
     wanted.truncate(PATHS_MAX);
@@ -204,17 +274,17 @@ fn wanted(chosen: &Interfaces, usable: &Usable, open: &[Ipv4Addr]) -> Vec<Ipv4Ad
 impl Shell {
     /// Reads a socket, until this instance or its path ends.
     pub(super) fn reading(self: &Rc<Self>, reader: Reader) -> io::Result<Task> {
-        let Reader { socket, from, ip } = reader;
+        let Reader { socket, from, local } = reader;
         let socket = tokio::net::UdpSocket::from_std(socket)?;
         let (task, handle) = abortable(receive(self.clone(), socket, from));
-        self.paths.keep(ip, handle);
+        self.paths.keep(local, handle);
         Ok(task.map(drop).boxed_local())
     }
 
     /// Opens and closes paths as they come and go; `false` when a later instance has taken over.
     fn look_at_paths(self: &Rc<Self>, usable: &Usable, tasks: &FuturesUnordered<Task>) -> bool {
         let (stores, before) = (&self.stores, self.paths.here());
-        let wanted = wanted(&stores.config.ndl.interface, usable, &self.paths.ips());
+        let wanted = wanted(&stores.config.ndl.interface, usable, &self.paths.locals());
         let (readers, error) = self.paths.open(stores, &wanted);
         if let Some(error) = error {
             self.paths.say_unopened(stores, &wanted, &error);
@@ -226,16 +296,20 @@ impl Shell {
             }
         }
         self.paths.renew(stores);
+        self.paths.say_what_is_missing(stores, usable);
         let here = self.paths.here();
-        here == before
+        let seeds = super::seeds(stores, Some(usable));
+        let has_seeds = lock(stores).has_seeds(&seeds);
+        (here == before && has_seeds)
             || self.feed(|core, now| {
-                core.announce_gncl(super::announced(stores, &self.paths.ips()));
+                core.announce_gncl(super::announced(stores, &here));
+                core.use_seeds(now, seeds);
                 core.use_paths(now, &here);
             })
     }
 }
 
-/// mDNS speaks at the first path, for as long as there is that.
+/// mDNS speaks at the first path, for as long as there is that, or until one of IPv4 goes before one of IPv6.
 #[derive(Default)]
 pub(super) struct MdnsAt(Option<(SocketAddr, Vec<AbortHandle>)>);
 
@@ -243,7 +317,7 @@ impl MdnsAt {
     /// Begins, if there is a path and it has not begun there.
     fn look(&mut self, shell: &Rc<Shell>, tasks: &FuturesUnordered<Task>) {
         let here = shell.paths.here();
-        if self.0.as_ref().is_some_and(|(at, _)| here.contains(at)) {
+        if self.0.as_ref().is_some_and(|(at, _)| stays_at(*at, &here)) {
             return;
         }
         for task in self.0.take().into_iter().flat_map(|(_, tasks)| tasks) {
@@ -255,6 +329,12 @@ impl MdnsAt {
         // Where it does not start, that is said, and tried again only elsewhere.
         self.0 = Some((at, handles));
     }
+}
+
+/// Whether mDNS goes on where it is, now that these are our addresses. A link-local address is there before a lease of IPv4 is: who is
+/// published at that alone is not found by those that look by IPv4, so it goes over as soon as IPv4 is what is preferred.
+fn stays_at(at: SocketAddr, here: &[SocketAddr]) -> bool {
+    here.contains(&at) && (at.is_ipv4() || here.first().is_some_and(SocketAddr::is_ipv6))
 }
 
 fn begin_mdns(shell: &Rc<Shell>, mdns: &Rc<Mdns>, tasks: &FuturesUnordered<Task>) -> [AbortHandle; 2] {
@@ -297,24 +377,59 @@ pub(super) async fn keep_paths(shell: Rc<Shell>, mut news: Option<watch::Receive
 
 #[cfg(test)]
 mod tests {
+    use std::net::Ipv4Addr;
+
     use super::*;
 
-    const CHOSEN: Ipv4Addr = Ipv4Addr::new(10, 9, 0, 1);
-    const NAMED: Ipv4Addr = Ipv4Addr::new(10, 8, 0, 1);
+    fn v4(address: [u8; 4]) -> LocalAddress {
+        Ipv4Addr::from(address).into()
+    }
 
     #[test]
     fn what_is_chosen_by_address_is_always_wanted_and_what_is_open_as_long_as_the_address_is_there() {
+        let (by_address, named) = (v4([10, 9, 0, 1]), v4([10, 8, 0, 1]));
         let chosen: Interfaces = vec!["10.9.0.1".parse().unwrap(), "eth0".parse().unwrap()].into();
-        let usable = |running: &[Ipv4Addr], there: &[Ipv4Addr]| Usable {
+        let usable = |running: &[LocalAddress], there: &[LocalAddress]| Usable {
             running: running.into(),
             there: there.into(),
+            ..Usable::default()
         };
-        assert_eq!(wanted(&chosen, &usable(&[], &[]), &[]), [CHOSEN], "also where the host has not got it");
-        assert_eq!(wanted(&chosen, &usable(&[NAMED], &[NAMED, CHOSEN]), &[]), [CHOSEN, NAMED]);
-        assert_eq!(wanted(&chosen, &usable(&[], &[NAMED]), &[]), [CHOSEN], "no carrier yet");
-        assert_eq!(wanted(&chosen, &usable(&[], &[NAMED]), &[NAMED]), [CHOSEN, NAMED], "no carrier any more");
-        assert_eq!(wanted(&chosen, &usable(&[], &[]), &[NAMED]), [CHOSEN], "the address is gone");
-        let many: Vec<_> = (0..20).map(|last| Ipv4Addr::new(10, 8, 1, last)).collect();
+        assert_eq!(
+            wanted(&chosen, &usable(&[], &[]), &[]),
+            [by_address],
+            "also where the host has not got it"
+        );
+        assert_eq!(wanted(&chosen, &usable(&[named], &[named, by_address]), &[]), [by_address, named]);
+        assert_eq!(wanted(&chosen, &usable(&[], &[named]), &[]), [by_address], "no carrier yet");
+        assert_eq!(
+            wanted(&chosen, &usable(&[], &[named]), &[named]),
+            [by_address, named],
+            "no carrier any more"
+        );
+        assert_eq!(wanted(&chosen, &usable(&[], &[]), &[named]), [by_address], "the address is gone");
+        let many: Vec<_> = (0..20).map(|last| v4([10, 8, 1, last])).collect();
         assert_eq!(wanted(&chosen, &usable(&many, &many), &[]).len(), PATHS_MAX);
+    }
+
+    #[test]
+    fn mdns_goes_over_to_ipv4_when_that_comes_after_ipv6_and_stays_where_it_is_otherwise() {
+        let [ipv4, link, other] =
+            ["10.0.0.1:7", "[fe80::1%2]:7", "[fe80::1%3]:7"].map(|at| at.parse().unwrap());
+        assert!(stays_at(link, &[link]) && stays_at(link, &[other, link]));
+        assert!(!stays_at(link, &[ipv4, link]), "a lease comes later than a link-local address");
+        assert!(stays_at(ipv4, &[ipv4, link]) && stays_at(ipv4, &[link, ipv4]));
+        assert!(!stays_at(ipv4, &[link]) && !stays_at(link, &[]));
+    }
+
+    #[test]
+    fn an_open_address_stays_open_while_the_kernel_asks_for_it_again_and_not_when_another_host_has_it() {
+        let chosen: Interfaces = vec!["eth0".parse().unwrap()].into();
+        let local = LocalAddress { ip: "fe80::1".parse().unwrap(), interface: 2 };
+        let usable = |flags| Usable { in_doubt: vec![(local, flags)], ..Usable::default() };
+        let asked = Flags { is_tentative: true, ..Flags::default() };
+        let taken = Flags { is_duplicate: true, ..Flags::default() };
+        assert!(wanted(&chosen, &usable(asked), &[]).is_empty());
+        assert_eq!(wanted(&chosen, &usable(asked), &[local]), [local]);
+        assert!(wanted(&chosen, &usable(taken), &[local]).is_empty());
     }
 }

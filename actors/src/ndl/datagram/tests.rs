@@ -10,32 +10,47 @@ fn any_announcement() -> impl Strategy<Value = Announcement> {
     let place = || (1..0xe000_0000_u32, 1..u16::MAX);
     let further = proptest::collection::vec(place(), 0..=FURTHER_MAX);
     let ndl = proptest::collection::vec(place(), 0..=PATHS_MAX);
-    (names, 1..u32::MAX, any::<[u64; 2]>(), place(), further, ndl, any::<u32>(), 0..3u8).prop_map(
-        |(
-            (name, project),
-            node,
-            [incarnation, boot_nonce],
-            (gncl_ip, gncl_port),
-            gncl_further,
-            ndl,
-            period_us,
-            claim,
-        )| {
-            Announcement {
-                project,
-                node: NodeAddress::new(node),
-                name,
-                incarnation: Incarnation(incarnation),
-                boot_nonce,
-                gncl_ip,
-                gncl_port,
-                period_us,
+    // Global addresses, link-local ones, and that of loopback.
+    let place6 =
+        (prop_oneof![0x2000_u64 << 48..0x4000 << 48, Just(0xfe80_u64 << 48)], 1..u64::MAX, 1..u16::MAX);
+    let place6 = prop_oneof![place6, (Just(0_u64), Just(1_u64), 1..u16::MAX)];
+    let ndl6 = proptest::collection::vec(place6, 0..=PATHS_MAX);
+    let ports6 = (any::<bool>(), 1..u16::MAX);
+    (names, 1..u32::MAX, any::<[u64; 2]>(), place(), further, (ndl, ndl6, ports6), any::<u32>(), 0..3u8)
+        .prop_map(
+            |(
+                (name, project),
+                node,
+                [incarnation, boot_nonce],
+                (gncl_ip, gncl_port),
                 gncl_further,
-                ndl,
-                claim: Claim::from(claim),
-            }
-        },
-    )
+                (mut ndl, mut ndl6, (is_ipv6_alone, port6)),
+                period_us,
+                claim,
+            )| {
+                ndl6.truncate(PATHS_MAX);
+                ndl.truncate(PATHS_MAX - ndl6.len());
+                let gncl_port6 = if ndl6.is_empty() { 0 } else { port6 };
+                let is_ipv6_alone = is_ipv6_alone && gncl_port6 != 0;
+                let (gncl_ip, gncl_port) = if is_ipv6_alone { (0, 0) } else { (gncl_ip, gncl_port) };
+                let gncl_further = if is_ipv6_alone { Vec::new() } else { gncl_further };
+                Announcement {
+                    project,
+                    node: NodeAddress::new(node),
+                    name,
+                    incarnation: Incarnation(incarnation),
+                    boot_nonce,
+                    gncl_ip,
+                    gncl_port,
+                    period_us,
+                    gncl_further,
+                    ndl,
+                    ndl6,
+                    gncl_port6,
+                    claim: Claim::from(claim),
+                }
+            },
+        )
 }
 
 /// As many parts as `number` says, with the longest names.
@@ -126,6 +141,8 @@ fn sound() -> Announcement {
         period_us: 5,
         gncl_further: Vec::new(),
         ndl: Vec::new(),
+        ndl6: Vec::new(),
+        gncl_port6: 0,
         claim: Claim::Held,
     }
 }
@@ -150,6 +167,17 @@ fn an_announcement_that_cannot_be_used_is_refused() {
         Announcement { ndl: vec![(0x7f00_0002, 4); PATHS_MAX + 1], ..sound() },
         Announcement { ndl: vec![(0x7f00_0002, 0)], ..sound() },
         Announcement { ndl: vec![(0xe000_0001, 4)], ..sound() },
+        Announcement { ndl6: vec![(0xfe80 << 48, 1, 0)], ..sound() },
+        Announcement { ndl6: vec![(0, 0, 4)], ..sound() },
+        Announcement { ndl6: vec![(0xff02 << 48, 1, 4)], ..sound() },
+        // ::ffff:10.0.0.7
+        Announcement { ndl6: vec![(0, 0xffff_0a00_0007, 4)], ..sound() },
+        Announcement { ndl6: vec![(0xfd00 << 48, 1, 4); PATHS_MAX + 1], ..sound() },
+        Announcement { ndl6: vec![(0xfd00 << 48, 1, 4)], ndl: vec![(0x7f00_0001, 4); PATHS_MAX], ..sound() },
+        Announcement { gncl_ip: 0, gncl_port: 0, ..sound() },
+        Announcement { gncl_ip: 0, gncl_port: 0, gncl_port6: 4, ..sound() },
+        Announcement { gncl_ip: 0, gncl_port: 0, ndl6: vec![(0xfd00 << 48, 1, 4)], ..sound() },
+        Announcement { gncl_ip: 0, gncl_port6: 4, ndl6: vec![(0xfd00 << 48, 1, 4)], ..sound() },
     ];
     for announcement in unfit {
         assert!(matches!(refusal(&announcement), DatagramError::Announcement(_)), "{announcement:?}");
@@ -195,4 +223,47 @@ fn the_documented_example_is_what_is_sent() {
         .split_whitespace()
         .collect();
     assert_eq!(hex, example);
+}
+
+/// A node at these addresses, whose GNCL listens at one of IPv4 and at those of IPv6.
+fn at(paths: &[&str]) -> Announcement {
+    let mut announcement = Announcement { gncl_ip: 0x0a00_0001, gncl_port6: 5, ..sound() };
+    announcement.announce_ndl(&paths.iter().map(|path| path.parse().unwrap()).collect::<Vec<_>>());
+    announcement
+}
+
+// spec: NDL-3.5
+#[test]
+fn a_listener_at_ipv6_is_where_ndl_is_and_on_a_link_where_it_was_met() {
+    let gncl = |announcement: &Announcement, routes: &[(&str, &str)]| {
+        let routes: Vec<(SocketAddr, SocketAddr)> =
+            routes.iter().map(|(here, there)| (here.parse().unwrap(), there.parse().unwrap())).collect();
+        let all = announcement.gncl_addresses(routes);
+        all.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ")
+    };
+    let all = at(&["10.0.0.1:7", "[fe80::1%3]:7", "[fd00::1]:8", "[::1]:9"]);
+    assert_eq!(gncl(&all, &[]), "10.0.0.1:4 [fd00::1]:5");
+    let met = [
+        ("[fe80::9%2]:1", "[fe80::1%2]:7"),
+        ("[fe80::8%6]:1", "[fe80::1%6]:7"),
+        ("10.0.0.2:1", "10.0.0.1:7"),
+    ];
+    assert_eq!(gncl(&all, &met), "10.0.0.1:4 [fe80::1%2]:5 [fe80::1%6]:5 [fd00::1]:5");
+    let elsewhere = [("[fe80::9%2]:1", "[fe80::66%2]:7")];
+    assert_eq!(gncl(&all, &elsewhere), "10.0.0.1:4 [fd00::1]:5", "where it does not say that it is");
+    let alone = Announcement { gncl_ip: 0, gncl_port: 0, ..at(&["[::1]:9"]) };
+    assert_eq!(gncl(&alone, &[]), "[::1]:5");
+    assert_eq!(gncl(&Announcement { gncl_port6: 0, ..all }, &met), "10.0.0.1:4");
+}
+
+#[test]
+fn a_node_without_ipv6_says_no_more_than_one_of_which_nobody_knew_that_there_is_any() {
+    let bytes =
+        encode(&Datagram { correlation: 1, sent: Time::ZERO, body: Body::Query(sound()) }, NodeAddress::ALL);
+    let says = |what: &[u8]| bytes.windows(what.len()).any(|part| part == what);
+    assert!(says(b"gncl_port") && !says(b"ndl6") && !says(b"gncl_port6"));
+    let one = at(&["10.0.0.1:7"]);
+    assert!(one.ndl.is_empty() && one.ndl6.is_empty(), "who asks there knows it");
+    let alone = at(&["[fd00::1]:7"]);
+    assert_eq!((alone.ndl.len(), &alone.ndl6[..]), (0, &[(0xfd00 << 48, 1, 7)][..]));
 }

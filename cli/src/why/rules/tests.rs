@@ -257,6 +257,20 @@ const CASES: &[Case] = &[
     Case(
         |facts| {
             strangers(facts);
+            knee(facts).interface = "lo, ::1".to_owned();
+        },
+        ["hip knows knee.drive", "its own host only", "`interface`"],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            knee(facts).interface = "lo, eth0".to_owned();
+        },
+        ["hip knows knee.drive", "has not heard the other", "IGMP"],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
             hip(facts).seeds.push("10.0.0.2:7000".to_owned());
         },
         ["hip knows knee.drive", "a seed names it", "firewalls"],
