@@ -9,6 +9,7 @@
 //! | `pacer` | the thread that sends, and keeps what became of each confirmed message |
 //! | `clerk` | writes down what was sent and got, in rows |
 //! | `pair` | both nodes with the faulty network between them, as their director sees them |
+//! | `progress` | what is said while it goes on |
 //! | `trouble` | what can happen to a link, and how it is healed |
 //! | `wall_clock` | a wall clock of each node's own, which can be set |
 //! | `report` | what was seen, as a table and as JSON |
@@ -17,6 +18,7 @@ mod clerk;
 mod node;
 mod pacer;
 mod pair;
+mod progress;
 mod report;
 mod trouble;
 mod wall_clock;
@@ -66,7 +68,7 @@ pub fn play() -> Option<std::process::ExitCode> {
     Some(std::process::ExitCode::SUCCESS)
 }
 
-/// Lets things happen to the link and says what became of the messages.
+/// Lets things happen to the link and says what became of the messages. While it waits it says on standard error each 10 s how far it is.
 ///
 /// # Panics
 /// If a node does not start, or messages do not flow again after a fault has ended.
@@ -79,6 +81,7 @@ pub fn run(plan: &Plan) -> Report {
     for fault in 0..plan.faults {
         let trouble = plan.troubles[fault as usize % plan.troubles.len()];
         let _ = pair.gap();
+        pair.strikes(trouble);
         let struck = Instant::now();
         pair.suffer(trouble, plan.hold);
         pair.wait_for_flow();

@@ -89,6 +89,20 @@ fn a_node_whose_list_cannot_be_used_does_not_start_and_one_without_has_none_to_r
         let mode = rustix::fs::Mode::from_raw_mode(0o600);
         rustix::fs::mknodat(rustix::fs::CWD, &list, rustix::fs::FileType::Fifo, mode, 0).expect("a pipe");
     }
+    // One that others could put another one in the place of.
+    std::fs::remove_file(&list).expect("the test's own file");
+    write(&list, OPEN);
+    let common = directory.join("common");
+    std::fs::create_dir(&common).expect("the test's own directory");
+    std::fs::set_permissions(&common, std::fs::Permissions::from_mode(0o1777)).expect("the test's own");
+    let (there, link) = (common.join("access.toml"), directory.join("link.toml"));
+    write(&there, OPEN);
+    std::os::unix::fs::symlink(&there, &link).expect("the test's own directory");
+    for list in [there, link] {
+        let node = ground.node("knee").configure(|config| config.security.access = Some(list.clone()));
+        let why = node.start().expect_err("it is not taken").to_string();
+        assert!(why.contains("others can write to") && why.contains("common"), "{why}");
+    }
     let open = ground.node("knee").start().expect("a node");
     assert!(matches!(open.handle().reload_access(), Err(AccessError::None)));
 }

@@ -300,7 +300,7 @@ impl Child {
             Kind::HOST_BEAT => {}
             Kind::HOST_TURN => {
                 let turn = Turn::read(&message).ok_or_else(|| fault(&"it sent a turn that is none"))?;
-                self.hosted.link.turn(turn).map_err(|error| fault(&error))?;
+                self.hosted.link.turn(self.number, turn).map_err(|error| fault(&error))?;
             }
             Kind::HOST_READY => {
                 if let Some(ready) = self.ready.take() {
@@ -383,7 +383,7 @@ impl Child {
         if let Some(changes) = self.names.changes(&self.hosted.stores) {
             self.tell(&changes);
         }
-        self.hosted.link.directory_is_told(seen);
+        self.hosted.link.directory_is_told(self.number, seen);
     }
 
     fn tell(&self, names: &Names) {
@@ -392,7 +392,7 @@ impl Child {
     }
 
     fn say(&self, message: Message) {
-        match self.hosted.link.say(message) {
+        match self.hosted.link.say_to(self.number, message) {
             // Closed: it is about to end.
             Ok(()) | Err(sinew_runtime::router::Refused { why: Rejection::Closed, .. }) => {}
             Err(refused) => {

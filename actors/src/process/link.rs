@@ -225,8 +225,9 @@ impl Link {
 
     /// The child has been told of so many changes, counted before it was looked what has changed. Said when the words are on their
     /// way and not before: what another thread sends meanwhile would overtake them.
-    pub(super) fn directory_is_told(&self, changes: u64) {
-        if let Some(present) = &mut *lock(&self.present) {
+    /// What a former child was told counts for nothing.
+    pub(super) fn directory_is_told(&self, number: LinkNumber, changes: u64) {
+        if let Some(present) = lock(&self.present).as_mut().filter(|present| present.number == number) {
             present.told = changes;
         }
     }
@@ -247,9 +248,9 @@ impl Link {
         self.pump();
     }
 
-    /// The child has made a step.
-    pub(super) fn turn(&self, turn: Turn) -> Result<(), NoSuchMessage> {
-        let ended = match &mut *lock(&self.present) {
+    /// The child has made a step. One of a former child, whose messages have ended with it, counts for nothing.
+    pub(super) fn turn(&self, number: LinkNumber, turn: Turn) -> Result<(), NoSuchMessage> {
+        let ended = match lock(&self.present).as_mut().filter(|present| present.number == number) {
             Some(present) => {
                 let ended = present.window.turn(turn)?;
                 if let Some((message, fate)) = &ended {
@@ -270,8 +271,17 @@ impl Link {
         Ok(())
     }
 
-    /// Says something to the child ahead of all messages.
-    pub(super) fn say(&self, message: Message) -> Result<(), Refused> {
+    /// Says something to this child, and to none after it, ahead of all messages: its supervisor's thread may have hung, and come back when
+    /// another one has started the next.
+    ///
+    /// # Errors
+    /// The message: the child is gone, or does not read.
+    pub(super) fn say_to(&self, number: LinkNumber, message: Message) -> Result<(), Refused> {
+        self.outlet.submit_urgent_on(number, message, EXPRESS_MAX)
+    }
+
+    /// Says something to whichever child there is ahead of all messages.
+    fn say(&self, message: Message) -> Result<(), Refused> {
         self.outlet.submit_urgent(message, EXPRESS_MAX)
     }
 

@@ -165,6 +165,7 @@ fn serve(node: &Node, pacer: Pacer, lull: &Lull) {
             ["gap"] => println!("gap {}", lull.longest_ns.swap(0, Ordering::Relaxed)),
             ["say"] => clerk.say(),
             ["wall"] => println!("wall {}", wall_seconds()),
+            ["queues"] => println!("queues {}", queues(&handle)),
             ["audit"] => {
                 let audit = handle.audit(DEADLINE).expect("it runs, and nobody else asks");
                 println!("audit {}", serde_json::to_string(&audit).expect("every field can be written"));
@@ -179,6 +180,19 @@ fn serve(node: &Node, pacer: Pacer, lull: &Lull) {
         }
     }
     clerk.say();
+}
+
+/// What stands in which queue of the node now, in words.
+fn queues(node: &NodeHandle) -> String {
+    let queues = node.audit_here().entries.into_iter().filter_map(|entry| {
+        let (place, waiting, under_way) = (entry.place, entry.account.waiting, entry.account.unacknowledged);
+        (waiting + under_way > 0).then(|| match under_way {
+            0 => format!("{place}: {waiting} wait"),
+            _ => format!("{place}: {waiting} wait, {under_way} are under way"),
+        })
+    });
+    let queues: Vec<_> = queues.collect();
+    if queues.is_empty() { "nothing waits".to_owned() } else { queues.join("; ") }
 }
 
 /// Seconds since 1970, as the wall clock says.

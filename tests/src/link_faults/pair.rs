@@ -16,6 +16,7 @@ use sinew::{Audit, Class};
 use super::{
     Plan,
     node::wall_seconds,
+    progress::{self, Progress},
     trouble::Trouble,
     wall_clock::{self, JUMP, WallClock},
 };
@@ -71,6 +72,7 @@ pub(super) struct Pair {
     directory: OwnDirectory,
     /// Where wall clocks are to be set.
     clocks: Option<Preload>,
+    progress: Progress,
 }
 
 impl Pair {
@@ -100,7 +102,8 @@ impl Pair {
             let interface = own_interface();
             start((station, 1), interface, (plan, &proxy), (&history, &directory, clocks.as_ref()))
         });
-        let mut pair = Self { plan: plan.clone(), proxy, history, members, directory, clocks };
+        let progress = Progress::begin(plan.faults);
+        let mut pair = Self { plan: plan.clone(), proxy, history, members, directory, clocks, progress };
         [FIRST, SECOND].into_iter().for_each(|station| pair.begin(station));
         pair.wait_for_flow();
         pair
@@ -128,7 +131,7 @@ impl Pair {
     /// Waits until messages that are sent after this come, both ways.
     ///
     /// What is sent is written down a little later: what was under way then is less than what this waits for.
-    pub(super) fn wait_for_flow(&self) {
+    pub(super) fn wait_for_flow(&mut self) {
         let ways = [(FIRST, SECOND, self.plan.rate), (SECOND, FIRST, self.plan.back_rate)];
         for (from, to, rate) in ways.into_iter().filter(|(.., rate)| *rate > 0) {
             let party = self.party(from);
@@ -139,7 +142,7 @@ impl Pair {
 
     /// Waits until this number has come, for as long as any come: where connections end faster than they carry what is sent, as with many
     /// flipped bits on a busy host, a full queue lies before it.
-    fn wait_to_get(&self, upto: u64, (from, to): (Station, Station)) {
+    fn wait_to_get(&mut self, upto: u64, (from, to): (Station, Station)) {
         let began = Instant::now();
         let (mut got, mut since, mut network) = (self.last_got(from, to), began, self.proxy.counts());
         while got < upto {
@@ -154,8 +157,29 @@ impl Pair {
                 began.elapsed(),
                 self.proxy.counts()
             );
+            if self.progress.is_due(Instant::now()) {
+                self.say_progress(&format!("number {upto} from {from} to {to}, since {:?}", began.elapsed()));
+            }
             std::thread::sleep(LOOK);
         }
+    }
+
+    /// The next fault strikes.
+    pub(super) fn strikes(&mut self, trouble: Trouble) {
+        self.progress.strikes(trouble);
+    }
+
+    /// Says how far the run is. Both nodes are asked, so nothing else may be that they have not answered.
+    fn say_progress(&mut self, waits_for: &str) {
+        let way = |from, to, rate| {
+            let (history, party) = (lock(&self.history), self.party(from));
+            let class = Class::Bulk;
+            let (sent, got) = (history.last_sent(party, to, class), history.last_got(party, to, class));
+            progress::Way { sent, got, rate }
+        };
+        let ways = [way(FIRST, SECOND, self.plan.rate), way(SECOND, FIRST, self.plan.back_rate)];
+        let queues = [FIRST, SECOND].map(|station| (station, self.member(station).ask("queues")));
+        eprintln!("{}", self.progress.say(Instant::now(), ways, waits_for, &queues));
     }
 
     /// The longest time without a message at the second node since this was asked last, or since it was started.

@@ -71,3 +71,46 @@ fn a_name_that_comes_between_the_welcome_and_the_listening_is_told() {
         }
     });
 }
+
+#[test]
+fn names_that_were_looked_up_for_a_former_child_do_not_reach_the_next_one() {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        // Given: two lives of a child, the former with a supervisor that was held up
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let hosted = Arc::new(Hosted {
+            stores: stores.clone(),
+            link: Link::new(&stores, Mailbox::new(8)),
+            tid: Tid::new(NodeAddress::HERE, AppAddress::fixed(1).unwrap()),
+            name: "child".to_owned(),
+            progress_within: None,
+        });
+        let begin = || {
+            let (ours, theirs) = std::os::unix::net::UnixStream::pair().unwrap();
+            theirs.set_nonblocking(true).unwrap();
+            let child = Child::new(hosted.clone(), sleeper(), ReadyGate::new(|| {}), ours).unwrap();
+            (child, UnixStream::from_std(theirs).unwrap())
+        };
+        let (mut former, _theirs) = begin();
+        let (present, theirs) = begin();
+        registers(&stores, "late");
+        // When: it goes on
+        former.tell_names();
+        present.say(words::bare(Kind::HOST_STOP, Tid::NONE, hosted.tid));
+        // Then: the next one hears its own supervisor alone
+        let mut reader = Reader::new(WORDS_BYTES_MAX);
+        let hears = async {
+            let mut kinds = Vec::new();
+            while !kinds.contains(&Kind::HOST_STOP) {
+                kinds.push(reader.next(&theirs).await.unwrap().unwrap().header.kind);
+            }
+            kinds
+        };
+        let writes = hosted.link.drain(present.number);
+        let kinds = tokio::select! {
+            error = writes => panic!("it reads: {error}"),
+            kinds = tokio::time::timeout(WITHIN, hears) => kinds.unwrap(),
+        };
+        assert_eq!(kinds, [Kind::HOST_WELCOME, Kind::HOST_STOP]);
+    });
+}

@@ -102,20 +102,20 @@ fn a_message_does_not_overtake_the_change_of_the_directory_behind_which_it_came(
     send();
     assert!(waits(), "the words are not on their way");
     // When: the child has been told of one
-    link.directory_is_told(1);
+    link.directory_is_told(number, 1);
     link.hand_over_held();
     // Then
     assert!(waits(), "it does not know of the second");
     // When: it has been told of the second, and meanwhile there was another one
     stores.directory_has_changed();
-    link.directory_is_told(2);
+    link.directory_is_told(number, 2);
     link.hand_over_held();
     // Then
     assert!(
         !waits(),
         "nobody who sent it can know of the third: names that change all the time hold nothing up for good"
     );
-    link.directory_is_told(3);
+    link.directory_is_told(number, 3);
     send();
     assert!(!waits(), "it knows all");
 }
@@ -211,4 +211,33 @@ fn a_message_that_waits_for_names_is_told_to_who_waits_for_this_child_whoever_wa
     link.submit(Message::new(Header::new(Kind::named("event"), tid, tid), Bytes::new()))
         .expect("there is room");
     assert!(woken.is());
+}
+
+#[test]
+fn what_is_said_for_a_former_child_neither_reaches_the_next_one_nor_counts_as_said_to_it() {
+    // Given: a child that has followed another one, and names that have changed
+    let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+    let link = Link::new(&stores, Mailbox::new(8));
+    let tid = Tid::new(NodeAddress::HERE, AppAddress::fixed(1).expect("a fixed one"));
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().expect("a reactor");
+    let _entered = runtime.enter();
+    let (former, _process) = runtime.block_on(connected(&stores, &link));
+    let (present, _other) = runtime.block_on(connected(&stores, &link));
+    stores.directory_has_changed();
+    // When: the former one's supervisor, which was held up, tells it
+    let refused = link.say_to(former, words::bare(Kind::HOST_NAMES, Tid::NONE, tid));
+    link.directory_is_told(former, 1);
+    // Then
+    assert_eq!(refused.expect_err("it is over").why, Rejection::Closed);
+    link.submit(Message::new(Header::new(Kind::named("event"), tid, tid), Bytes::new()))
+        .expect("there is room");
+    let waits = || lock(&link.present).as_ref().expect("it is connected").held.is_some();
+    assert!(waits(), "this child has not been told");
+    link.directory_is_told(present, 1);
+    link.hand_over_held();
+    assert!(!waits());
+    // And: what the former one says that it did says nothing of what this one has in its hand
+    let ended = || Turn { done: Some((1, Fate::Ended(Outcome::Delivered))), taken: None };
+    link.turn(former, ended()).expect("it counts for nothing");
+    link.turn(present, ended()).expect("it has the message still");
 }
