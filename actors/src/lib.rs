@@ -88,6 +88,7 @@ pub use sinew_runtime::{
     },
     monitor::{Down, DownClass, MonitorError, MonitorId},
     outcome::{Outcome, Rejection},
+    protection,
     schedule::{Tick, TimerId},
     sender::{AskError, Confirmation, Destination, Reply, SendError, Sender},
     supervision::{AutoShutdown, Place, ReadyGate, Reason, Refusal, Restart, Strategy},
