@@ -33,6 +33,7 @@ pub use builder::{NodeBuilder, StartError};
 pub use commands::CommandError;
 #[cfg(feature = "fault-points")]
 pub(crate) use faults::arm_alone;
+pub(crate) use progress::Stalls;
 pub(crate) use root::{RootEvent, WAITS_MAX};
 pub use supervisor_spec::SupervisorSpec;
 pub use tree::{LifeState, MailboxState, Supervised, Supervises, SupervisionTree};

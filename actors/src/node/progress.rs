@@ -1,4 +1,5 @@
 //! What of this node does not get on, for the nodes that watch it: asked by NDL, answered by the root, which waits for nobody.
+//! What an application in a process of its own does its process sees, and says.
 
 use std::{collections::BTreeMap, time::Duration};
 
@@ -21,7 +22,10 @@ impl Root {
     pub(super) fn progress(&mut self) -> Progress {
         let now = Time::now();
         let turns = self.threads.borrow().turns();
-        let stalled = stalled(now, turns, &mut self.turns);
+        let mut stalled = self.turns.look(now, turns);
+        self.hosted.retain(|_, link| link.strong_count() > 0);
+        let links = self.hosted.iter().filter_map(|(name, link)| Some((name, link.upgrade()?)));
+        stalled.extend(links.filter_map(|(name, link)| Some((name.clone(), link.stalled_since()?))));
         let mut parts = Vec::new();
         for roster in [&self.layer_supervisor, &self.app_supervisor].into_iter().flatten() {
             collect(now, roster, roster.view(now), &stalled, &mut parts);
@@ -30,15 +34,25 @@ impl Root {
     }
 }
 
-/// Whose turn lasts too long, and since when. What lasts is remembered until the next look.
-fn stalled(now: Time, turns: Vec<Turn>, seen: &mut BTreeMap<String, (u64, Time)>) -> BTreeMap<String, Time> {
-    let before = std::mem::take(seen);
-    for Turn { actor, number, begun, .. } in turns.into_iter().filter(|turn| turn.is_on) {
-        let lasted = before.get(&actor).filter(|(turn, _)| *turn == number).map(|(_, since)| *since);
-        seen.insert(actor, (number, begun.or(lasted).unwrap_or(now)));
+/// Turns that lasted when they were looked at: the number of each, and since when it lasts at least.
+#[derive(Default)]
+pub(crate) struct Stalls(BTreeMap<String, (u64, Time)>);
+
+impl Stalls {
+    /// Whose turn lasts too long, and since when. What lasts is remembered until the next look.
+    pub(crate) fn look(
+        &mut self,
+        now: Time,
+        turns: impl IntoIterator<Item = Turn>,
+    ) -> BTreeMap<String, Time> {
+        let before = std::mem::take(&mut self.0);
+        for Turn { actor, number, begun, .. } in turns.into_iter().filter(|turn| turn.is_on) {
+            let lasted = before.get(&actor).filter(|(turn, _)| *turn == number).map(|(_, since)| *since);
+            self.0.insert(actor, (number, begun.or(lasted).unwrap_or(now)));
+        }
+        let lasts = self.0.iter().filter(|(_, (_, since))| now.since(*since) >= STALLED_AFTER);
+        lasts.map(|(actor, (_, since))| (actor.clone(), *since)).collect()
     }
-    let lasts = seen.iter().filter(|(_, (_, since))| now.since(*since) >= STALLED_AFTER);
-    lasts.map(|(actor, (_, since))| (actor.clone(), *since)).collect()
 }
 
 fn collect(
@@ -92,12 +106,12 @@ mod tests {
 
     #[test]
     fn a_turn_that_lasts_is_told_with_its_begin_or_since_it_was_seen_first() {
-        let mut seen = BTreeMap::new();
-        assert!(stalled(at(1_000), vec![turn(7, None)], &mut seen).is_empty(), "it may have begun just now");
-        assert_eq!(stalled(at(1_300), vec![turn(7, None)], &mut seen)["knee"], at(1_000));
-        assert!(stalled(at(1_600), vec![turn(9, None)], &mut seen).is_empty(), "another turn");
-        assert!(stalled(at(1_900), vec![turn(10, None)], &mut seen).is_empty(), "it rests");
-        assert_eq!(stalled(at(2_000), vec![turn(11, Some(1_700))], &mut seen)["knee"], at(1_700));
-        assert!(stalled(at(2_100), vec![], &mut seen).is_empty() && seen.is_empty());
+        let mut stalls = Stalls::default();
+        assert!(stalls.look(at(1_000), vec![turn(7, None)]).is_empty(), "it may have begun just now");
+        assert_eq!(stalls.look(at(1_300), vec![turn(7, None)])["knee"], at(1_000));
+        assert!(stalls.look(at(1_600), vec![turn(9, None)]).is_empty(), "another turn");
+        assert!(stalls.look(at(1_900), vec![turn(10, None)]).is_empty(), "it rests");
+        assert_eq!(stalls.look(at(2_000), vec![turn(11, Some(1_700))])["knee"], at(1_700));
+        assert!(stalls.look(at(2_100), vec![]).is_empty() && stalls.0.is_empty());
     }
 }

@@ -6,7 +6,7 @@ use std::{
     cell::RefCell,
     collections::BTreeMap,
     rc::Rc,
-    sync::{Arc, atomic::Ordering, mpsc::SyncSender},
+    sync::{Arc, Weak, atomic::Ordering, mpsc::SyncSender},
     time::Duration,
 };
 
@@ -36,6 +36,7 @@ use super::{
     commands::Answers,
     directory::NodeDirectory,
     layers,
+    progress::Stalls,
     supervisor_spec::{Member, SupervisorSpec},
     wind_up::{self, Branch, Heirs},
 };
@@ -76,8 +77,9 @@ pub(super) struct Root {
     pub(super) apps: Apps,
     pub(super) absences: Absences,
     pub(super) answers: Answers,
-    /// Turns that lasted when they were looked at, and since when.
-    pub(super) turns: BTreeMap<String, (u64, Time)>,
+    pub(super) turns: Stalls,
+    /// The applications in processes of their own, which say themselves whether they stall.
+    pub(super) hosted: BTreeMap<String, Weak<process::Link>>,
     pub(super) layer_supervisor: Option<Roster>,
     pub(super) app_supervisor: Option<Roster>,
     last_layer_fault: Option<String>,
@@ -113,7 +115,8 @@ pub(super) fn run(
         apps: Apps::default(),
         absences: Absences::new(stores.clone()),
         answers: Answers::default(),
-        turns: BTreeMap::new(),
+        turns: Stalls::default(),
+        hosted: BTreeMap::new(),
         layer_supervisor: None,
         app_supervisor: None,
         last_layer_fault: None,
@@ -355,6 +358,9 @@ impl Root {
         self.apps.add(id, app, tid, mailbox.clone());
         let wiring = AppWiring { sender, mailbox };
         self.absences.keep(id, app.absence(wiring.clone()));
+        if let Some(link) = &hosted {
+            self.hosted.insert(app.name().to_owned(), Arc::downgrade(link));
+        }
         let mut policy = app.policy().clone();
         if hosted.is_some() && policy.progress_within.is_some() {
             // Its process is held to it. The link shares a thread with the node's layers, and is judged as they are.

@@ -7,7 +7,7 @@ use sinew_runtime::{
     wire::{Header, Kind, Message, decode},
 };
 
-use super::words::{Ending, Look, Names, TEXT_BYTES_MAX, Turn, Welcome};
+use super::words::{Beat, Ending, Look, Names, TEXT_BYTES_MAX, Turn, Welcome};
 use crate::fuzzing::is_read_as_written;
 
 pub(crate) fn said() -> Vec<Vec<u8>> {
@@ -15,6 +15,7 @@ pub(crate) fn said() -> Vec<Vec<u8>> {
     let written = [
         rmp_serde::to_vec_named(&welcome),
         rmp_serde::to_vec_named(&Look { name: "hip".to_owned() }),
+        rmp_serde::to_vec_named(&Beat { stalled_since: 5 }),
         rmp_serde::to_vec_named(&Ending::Panic("it broke".to_owned())),
     ];
     written
@@ -38,6 +39,7 @@ pub(crate) fn words(bytes: &[u8]) -> bool {
     let known = [
         is_read_as_written::<Welcome>(bytes),
         is_read_as_written::<Names>(bytes),
+        is_read_as_written::<Beat>(bytes),
         is_read_as_written::<Look>(bytes),
         is_read_as_written::<Ending>(bytes),
     ];

@@ -4,14 +4,14 @@ use std::{
     future::poll_fn,
     io::{self, Read},
     os::unix::net::UnixStream as StdStream,
-    sync::Arc,
+    sync::{Arc, OnceLock},
     time::Duration,
 };
 
 use sinew_runtime::{
     app::{AppWiring, DynApp},
     mailbox::Mailbox,
-    supervision::{Alone, Place, ReadyGate, Reason, alone, tell_of_a_stop},
+    supervision::{Alone, AloneHandle, Place, ReadyGate, Reason, alone, tell_of_a_stop},
     tid::Tid,
     time::Time,
     wire::{FrameCodec, HEADER_LEN, Header, Kind},
@@ -26,9 +26,9 @@ use tokio_util::codec::Decoder;
 use super::{
     role::{Hosting, die},
     wire::Wire,
-    words::{self, Ending, WORDS_BYTES_MAX, Welcome},
+    words::{self, Beat, Ending, WORDS_BYTES_MAX, Welcome},
 };
-use crate::{config::NodeConfig, lncl::payload, log};
+use crate::{config::NodeConfig, lncl::payload, log, node::Stalls};
 
 /// Time that the node has for its first words.
 const WELCOME: Duration = Duration::from_secs(10);
@@ -38,6 +38,8 @@ const LAST_WORDS: Duration = Duration::from_millis(100);
 const LOG_WRITTEN: Duration = Duration::from_millis(500);
 /// Longest time between two looks at what has expired.
 const EXPIRING: Duration = Duration::from_millis(250);
+/// Longest time between two looks at whether the application stalls.
+const STALLS_LOOKED_FOR: Duration = Duration::from_millis(125);
 
 /// Hosts the application, then ends this process.
 pub(super) fn host(config: &NodeConfig, apps: Vec<DynApp>, hosting: Hosting) -> ! {
@@ -114,11 +116,10 @@ async fn live(config: &NodeConfig, app: &DynApp, socket: StdStream, welcome: Wel
     socket.writable().await?;
     let (sequence, beat_us, tid) = (welcome.sequence, welcome.beat_us, Tid::from_bits(welcome.tid));
     let wire = Wire::new(config, socket, welcome);
-    wire.say_kind(Kind::HOST_BEAT);
+    say_beat(&wire, None);
     serve(&wire);
-    if beat_us > 0 {
-        beat_apart(&wire, Duration::from_micros(beat_us))?;
-    }
+    let hosted = Arc::new(OnceLock::new());
+    beat_apart(&wire, (beat_us > 0).then(|| Duration::from_micros(beat_us)), hosted.clone())?;
     let sender = wire.sender(sequence, config.payload_max);
     let wiring = AppWiring { sender, mailbox: Mailbox::fed_by(wire.clone()) };
     let saying = wire.clone();
@@ -127,6 +128,8 @@ async fn live(config: &NodeConfig, app: &DynApp, socket: StdStream, welcome: Wel
     #[cfg(feature = "fault-points")]
     let launch = crate::node::arm_alone(app, launch);
     let (handle, ended) = alone(&launch, ready, watched(app, &wire, tid));
+    // Set once.
+    let _ = hosted.set(handle.clone());
     let stopping = wire.clone();
     actix_rt::spawn(async move {
         loop {
@@ -158,19 +161,32 @@ fn serve(wire: &Arc<Wire>) {
     });
 }
 
-/// Gives signs of life of the process, on a thread of its own: whether the application comes back in its time is judged by
-/// the watchdog here, which knows in what it is, and whether it was given a CPU.
-fn beat_apart(wire: &Arc<Wire>, period: Duration) -> io::Result<()> {
-    let wire = wire.clone();
-    let beat = move || {
+/// Gives signs of life of the process, on a thread of its own, each `beat` at least if any are wanted: whether the application comes back in
+/// its time is judged by the watchdog here, which knows in what it is, and whether it was given a CPU. With them it says whether the
+/// application, which is there from the time on at which its factory has returned, stalls: the node tells the nodes that watch it.
+fn beat_apart(
+    wire: &Arc<Wire>,
+    beat: Option<Duration>,
+    hosted: Arc<OnceLock<AloneHandle>>,
+) -> io::Result<()> {
+    let (wire, mut stalls, mut has_stalled) = (wire.clone(), Stalls::default(), false);
+    let beat_on = move || {
         loop {
-            std::thread::sleep(period);
-            if wire.has_said_all() {
-                wire.say_kind(Kind::HOST_BEAT);
+            std::thread::sleep(beat.map_or(STALLS_LOOKED_FOR, |beat| beat.min(STALLS_LOOKED_FOR)));
+            let turns = hosted.get().map(AloneHandle::turn).into_iter();
+            let since = stalls.look(Time::now(), turns).into_values().next();
+            if wire.has_said_all() && (beat.is_some() || since.is_some() || has_stalled) {
+                say_beat(&wire, since);
+                has_stalled = since.is_some();
             }
         }
     };
-    std::thread::Builder::new().name("beat".to_owned()).spawn(beat).map(drop)
+    std::thread::Builder::new().name("beat".to_owned()).spawn(beat_on).map(drop)
+}
+
+fn say_beat(wire: &Wire, stalled: Option<Time>) {
+    let (tid, beat) = (wire.tid(), Beat { stalled_since: stalled.map_or(0, Time::as_nanos) });
+    wire.say(words::frame(Kind::HOST_BEAT, tid, payload::lncl_of(tid.node), &beat));
 }
 
 /// How the application is watched: the node kills its process when it hangs.

@@ -27,7 +27,7 @@ use super::{
     link::{LastWords, Link},
     names::KnownNames,
     spawn::{self, Started},
-    words::{self, Ending, Look, Names, Turn, WORDS_BYTES_MAX, Welcome},
+    words::{self, Beat, Ending, Look, Names, Turn, WORDS_BYTES_MAX, Welcome},
 };
 use crate::{
     lncl::{
@@ -297,7 +297,11 @@ impl Child {
         self.heard = Some(Instant::now());
         let fault = |what: &dyn std::fmt::Display| Reason::ProcessEnded(format!("it was killed: {what}"));
         match message.header.kind {
-            Kind::HOST_BEAT => {}
+            Kind::HOST_BEAT => {
+                let Beat { stalled_since } =
+                    payload::read(&message.payload).map_err(|error| fault(&error))?;
+                self.hosted.link.set_stalled(self.number, stalled_since);
+            }
             Kind::HOST_TURN => {
                 let turn = Turn::read(&message).ok_or_else(|| fault(&"it sent a turn that is none"))?;
                 self.hosted.link.turn(self.number, turn).map_err(|error| fault(&error))?;

@@ -19,6 +19,7 @@ use sinew_runtime::{
     router::{Outlet, Refused},
     sender::Sender,
     supervision::Launch,
+    time::Time,
     wire::{Flags, Header, Kind, Message},
 };
 use tokio::{
@@ -52,6 +53,8 @@ pub(crate) struct Link {
     former: Mutex<Option<Arc<OwnedFd>>>,
     /// Sequence of the last message that came from the TID before that one.
     began: AtomicU64,
+    /// Since when the present process's application is in one turn that lasts too long, in nanoseconds; 0: it is in none.
+    stalled: AtomicU64,
     /// The node's own sending side of the TID.
     sender: OnceLock<Sender>,
 }
@@ -119,6 +122,7 @@ impl Link {
             lives: AtomicU64::new(0),
             former: Mutex::new(None),
             began: AtomicU64::new(0),
+            stalled: AtomicU64::new(0),
             sender: OnceLock::new(),
         })
     }
@@ -149,6 +153,19 @@ impl Link {
     /// The process whose end nobody has seen, for the next one to wait for.
     pub(super) fn take_former(&self) -> Option<Arc<OwnedFd>> {
         lock(&self.former).take()
+    }
+
+    /// What this child says of its application's turn. What a former one says counts for nothing.
+    pub(super) fn set_stalled(&self, number: LinkNumber, since: u64) {
+        if lock(&self.present).as_ref().is_some_and(|present| present.number == number) {
+            self.stalled.store(since, Ordering::Relaxed);
+        }
+    }
+
+    /// Since when the application is in one turn that lasts too long, as its process has said last.
+    pub(crate) fn stalled_since(&self) -> Option<Time> {
+        let since = self.stalled.load(Ordering::Relaxed);
+        (since != 0).then(|| Time::from_nanos(since))
     }
 
     /// Sequence of the last message that came from the TID.
@@ -183,6 +200,7 @@ impl Link {
 
     fn end(&self, gone: Option<Present>, last_words: LastWords) {
         let Some(Present { number, lender, mut window, held, .. }) = gone else { return };
+        self.stalled.store(0, Ordering::Relaxed);
         self.outlet.disconnect(number);
         let Left { in_hand, mut untouched } = window.end();
         let touched = match last_words {

@@ -194,6 +194,11 @@ impl Wire {
         self.stop.notified().await;
     }
 
+    /// Whose connection it is.
+    pub(super) const fn tid(&self) -> Tid {
+        self.tid
+    }
+
     /// A frame without a payload, for the node.
     pub(super) fn say_kind(&self, kind: Kind) {
         self.say(words::bare(kind, self.tid, payload::lncl_of(self.tid.node)));

@@ -61,6 +61,13 @@ pub(super) const WORDS_BYTES_MAX: usize = 256 * 1024;
 /// Longest text in them, in bytes; longer ones are cut.
 pub(super) const TEXT_BYTES_MAX: usize = 4 * 1024;
 
+/// A sign of life.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Beat {
+    /// The application's turn lasts too long, since then: the host's clock, in nanoseconds; 0: it does not.
+    pub(super) stalled_since: u64,
+}
+
 /// Asks who has a name.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Look {

@@ -15,7 +15,7 @@ use super::{
     panics::{install_hook, is_the_runtimes},
     place::Place,
     tenant::{Fate, Report, Tenant},
-    threads::Seat,
+    threads::{Seat, Turn},
     vitals::Vitals,
     watchdog::Watchdog,
 };
@@ -57,6 +57,12 @@ impl AloneHandle {
     /// Asks the actor to stop; its `stopping` may say that it goes on for a while.
     pub fn stop(&self) {
         self.tenant.stop();
+    }
+
+    /// What the actor does now. Reads what its thread writes, and does not wait for it.
+    #[must_use]
+    pub fn turn(&self) -> Turn {
+        Turn::of(&self.tenant)
     }
 }
 

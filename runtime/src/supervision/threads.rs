@@ -142,6 +142,20 @@ pub struct Turn {
     pub begun: Option<Time>,
 }
 
+impl Turn {
+    /// What this one does now.
+    pub(super) fn of(tenant: &Tenant) -> Self {
+        let vitals = tenant.vitals();
+        let sight = vitals.sight();
+        Self {
+            actor: vitals.name().to_owned(),
+            number: sight.turn,
+            is_on: sight.is_busy(),
+            begun: sight.begun,
+        }
+    }
+}
+
 /// The threads of a node. Made when the first actor needs them; used on the node's root thread only.
 #[derive(Debug, Default)]
 pub struct Threads {
@@ -209,17 +223,7 @@ impl Threads {
         let seats = self.arbiters.values().map(|(_, seat)| seat);
         let tenants = seats
             .flat_map(|seat| lock(&seat.tenants).iter().filter_map(WeakTenant::living).collect::<Vec<_>>());
-        let turn = |tenant: Tenant| {
-            let vitals = tenant.vitals();
-            let sight = vitals.sight();
-            Turn {
-                actor: vitals.name().to_owned(),
-                number: sight.turn,
-                is_on: sight.is_busy(),
-                begun: sight.begun,
-            }
-        };
-        tenants.map(turn).collect()
+        tenants.map(|tenant| Turn::of(&tenant)).collect()
     }
 
     /// A life moves in: its thread knows it, and the watchdog watches it.

@@ -387,6 +387,9 @@ fn main() -> ExitCode {
     if swells.is_some() || starts_in.is_some() {
         drive = drive.start_within(time("--starts-within").unwrap_or(Duration::from_secs(1)));
     }
+    if let Some(time) = time("--turns-within") {
+        drive = drive.progress_within(time);
+    }
     drive = match after("--on-lost").as_deref() {
         None => drive,
         Some("pause") => drive.on_requirement_lost(RequirementPolicy::Pause),

@@ -1,12 +1,12 @@
 //! A host that stands still for a while: nobody's fault, and no reason to kill a process that is healthy.
 
-use std::time::Duration;
+use std::{net::UdpSocket, time::Duration};
 
 use rustix::process::Signal;
 use sinew::{NodeApi, Registration};
 use sinew_tests::{
     DEADLINE, OwnDirectory, Program,
-    orders::{Me, Who},
+    orders::{Me, Order, Who},
     process_under_test, wait_until_frozen,
 };
 
@@ -105,4 +105,32 @@ fn a_process_that_starts_for_longer_than_a_turn_may_last_is_not_killed_as_long_a
     // Its turns have a second each.
     let mut scenario = Scenario::start(&["--starts-in", "2500", "--starts-within", "60000"]);
     assert_eq!(scenario.who().pid, started(&mut scenario.node));
+}
+
+#[test]
+fn an_application_that_stalls_in_its_process_is_named_to_other_nodes_until_its_next_life() {
+    // Given: a node with an application in a process, and another node, whose application says what it hears.
+    let free = UdpSocket::bind("127.0.0.1:0").expect("a port on loopback").local_addr().expect("it is bound");
+    let more = format!("period_ms = 50\nport = {}\n", free.port());
+    let mut scenario = Scenario::start_with(&more, &["--turns-within", "600000"]);
+    let directory = OwnDirectory::new();
+    let path = directory.join("watcher.toml");
+    let text = format!(
+        "[node]\nname = \"watcher\"\naddress = \"127.0.0.2\"\nproject = \"processes\"\n\
+         [ndl]\nmulticast = false\nmdns_port = false\nperiod_ms = 50\nseeds = [\"{free}\"]\n"
+    );
+    std::fs::write(&path, text).expect("the test's own directory");
+    let mut watcher = process_under_test(&path, &["--place", "thread"]);
+    watcher.wait_for(&["event NodeFound", "robot"]);
+    let pid = scenario.who().pid;
+    // When
+    scenario.order(Order::Hang);
+    // Then
+    watcher.wait_for(&["event AppStalled", "robot", "drive", "Stalled"]);
+    // When: its next life is well
+    signal(pid, Signal::KILL);
+    // Then
+    watcher.wait_for(&["event AppResumed", "robot", "drive"]);
+    assert_ne!(scenario.who().pid, pid);
+    assert!(watcher.said().iter().all(|line| !line.contains("NodeLost")), "{:?}", watcher.said());
 }
