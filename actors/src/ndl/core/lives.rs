@@ -150,7 +150,8 @@ impl Core {
             return None;
         }
         let newcomer = self.contests.remove(&node)?.newcomer;
-        if newcomer.announcement.precedes(&proof.announcement) {
+        // The member may have proven itself since the newcomer came.
+        if newcomer.announcement.precedes(&proof.announcement) && !self.contradicts_a_proof(now, &newcomer) {
             self.collide(now, node, newcomer.from.there, proof.from.there);
             return Some(newcomer);
         }
@@ -398,7 +399,10 @@ impl Core {
             // Perhaps only its GNCL restarts: then it answers this.
             places.into_iter().for_each(|place| self.ask(now, place));
         }
-        if let Some(contest) = contest {
+        // Who proved himself just now, and is why this one is lost, comes by an answer of his own.
+        if let Some(contest) = contest
+            && !self.contradicts_a_proof(now, &contest.newcomer)
+        {
             self.arrive(now, contest.newcomer);
         }
     }

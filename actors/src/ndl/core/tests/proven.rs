@@ -146,3 +146,51 @@ fn who_proves_himself_on_a_connection_takes_the_place_of_who_only_answers() {
         MembershipFact::NodeLost { node: node(2), incarnation: Incarnation(9), why: LossReason::Duplicate };
     assert!(world.at(1).facts.contains(&lost));
 }
+
+// spec: NDL-5.8
+#[test]
+fn a_newcomer_that_only_answers_does_not_come_in_when_somebody_else_proves_himself() {
+    // Given: a member that only answers, and another process that claims its address
+    let mut world = World::new();
+    world.start(1, &with_keys(1));
+    world.start(3, &Spec { incarnation: 9, ..with_keys(2) });
+    world.run(ms(100));
+    world.kill(3);
+    world.start(4, &Spec { incarnation: 12, ..with_keys(2) });
+    world.run_until(ms(600), |world| world.at(1).core.contests.contains_key(&node(2)));
+    world.forget_the_past();
+    // When
+    world.link(1, up(5));
+    world.run(PERIOD * 2);
+    // Then
+    let lost =
+        MembershipFact::NodeLost { node: node(2), incarnation: Incarnation(9), why: LossReason::Duplicate };
+    assert_eq!(world.at(1).facts, [lost]);
+    assert!(!world.knows(1, 2));
+}
+
+// spec: NDL-5.8
+#[test]
+fn a_member_that_proves_itself_while_a_newcomer_is_tried_stays() {
+    // Given: a process that has settled, and a member in an earlier life that has not
+    let mut world = World::new();
+    world.start(3, &Spec { incarnation: 9, ..with_keys(2) });
+    world.run(PERIOD * 6);
+    for (from, to) in [(1, 3), (3, 1), (2, 3), (3, 2)] {
+        world.cut(from, to);
+    }
+    world.start(1, &with_keys(1));
+    world.start(2, &Spec { incarnation: 5, ..with_keys(2) });
+    world.run(ms(100));
+    world.mend();
+    world.cut(2, 3);
+    world.cut(3, 2);
+    world.run_until(ms(600), |world| world.at(1).core.contests.contains_key(&node(2)));
+    world.forget_the_past();
+    // When: it connects, and answers
+    world.link(1, up(5));
+    world.run(PERIOD * 2);
+    // Then
+    assert_eq!(world.at(1).facts, []);
+    assert_eq!(world.at(1).core.members[&node(2)].announcement.incarnation, Incarnation(5));
+}
