@@ -96,9 +96,11 @@ impl Peer {
         }
     }
 
-    /// Which life of it is known, by its link or else by its list.
+    /// Which life of it is known, by its link or else by its list, unless another life was linked after that: it may be an earlier one, of a
+    /// host whose clock began anew.
     fn life(&self) -> Option<Incarnation> {
-        self.linked.or_else(|| self.list.as_ref().map(|list| list.incarnation))
+        let listed = self.list.as_ref().filter(|_| !self.stale).map(|list| list.incarnation);
+        self.linked.or(listed)
     }
 
     /// Whether news about `incarnation` are about a life before the known one.

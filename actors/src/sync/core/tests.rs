@@ -324,6 +324,24 @@ fn the_last_known_reason_is_told_for_each_way_to_be_missing() {
     assert_eq!(reason(&bench), "failed, not ready again");
 }
 
+#[test]
+fn a_node_that_was_back_in_an_earlier_life_and_is_lost_before_it_said_anything_is_told_as_lost() {
+    // Given: its list in a later life; its host's clock began anew
+    let mut bench = Bench::new();
+    bench.registers(0, "gait", &["drive"]);
+    bench.links(KNEE, NEXT_LIFE);
+    let mut later = list(1, &[("drive", true, &[])]);
+    later.incarnation = NEXT_LIFE;
+    bench.list(KNEE, later);
+    bench.links(KNEE, LIFE);
+    // When
+    bench.breaks(KNEE);
+    bench.lost(KNEE, LossReason::Crashed);
+    // Then
+    bench.down(0);
+    assert_eq!(bench.missing(), [("drive".to_owned(), "its node was lost")]);
+}
+
 // spec: SYNC-7
 #[test]
 fn a_cycle_is_refused_with_its_names_whoever_came_first() {
