@@ -10,12 +10,23 @@
 //! ```
 
 use std::{
-    fs::OpenOptions,
+    ffi::{OsStr, OsString},
+    fs::{File, OpenOptions},
     io::{self, Read},
-    os::unix::fs::{MetadataExt, OpenOptionsExt},
+    os::{
+        fd::{AsFd, OwnedFd},
+        unix::{
+            ffi::OsStringExt,
+            fs::{MetadataExt, OpenOptionsExt},
+        },
+    },
     path::{Path, PathBuf},
 };
 
+use rustix::{
+    fs::{CWD, Mode, OFlags, openat, readlinkat},
+    io::Errno,
+};
 use zeroize::Zeroizing;
 
 /// The node's own key.
@@ -33,6 +44,17 @@ pub const DENIED: &str = "denied.txt";
 const KEY_BYTES_MAX: u64 = 16 << 10;
 /// Longest deny list in bytes: every number with a comment.
 const DENIED_BYTES_MAX: u64 = 8 << 20;
+
+/// Links from one to the next behind the path of an access list: more than any that was made on purpose.
+const LINKS_MAX: usize = 8;
+
+/// A directory, only to look at it and to open what is in it.
+#[cfg(target_os = "linux")]
+const DIRECTORY: OFlags = OFlags::PATH.union(OFlags::DIRECTORY).union(OFlags::CLOEXEC);
+#[cfg(not(target_os = "linux"))]
+const DIRECTORY: OFlags = OFlags::DIRECTORY.union(OFlags::CLOEXEC);
+/// A file: a pipe in its place would hold the node up for ever, and a link is another place.
+const FILE: OFlags = OFlags::NOFOLLOW.union(OFlags::NONBLOCK).union(OFlags::CLOEXEC);
 
 /// Bits of a file's mode: others than its owner may write to it.
 const WRITABLE_BY_OTHERS: u32 = 0o022;
@@ -126,15 +148,43 @@ pub(super) fn certificate(path: &Path) -> Result<Zeroizing<Vec<u8>>, FileFault> 
 }
 
 /// Reads an access list of at most `bytes_max` bytes, which stands where nobody else can put another file in its place: neither in the
-/// directory of `path` nor, if that is a link, in the one where the file itself is. Who can rename those directories is not looked at.
+/// directory of `path` nor, if that is a link, in the one where that leads to, and so on. Each of these directories is looked at after it is
+/// open, and the next thing opened in it: what is checked is what is read. Who can rename those directories is not looked at.
 pub(crate) fn access_list(path: &Path, bytes_max: u64) -> Result<Zeroizing<Vec<u8>>, FileFault> {
-    let unreadable = |cause| FileFault::Unreadable { path: path.to_owned(), cause };
-    let target = path.canonicalize().map_err(unreadable)?;
-    for place in [path, &target] {
-        let parent = place.parent().filter(|parent| !parent.as_os_str().is_empty());
-        directory(parent.unwrap_or_else(|| Path::new(".")))?;
+    let unreadable = |cause: io::Error| FileFault::Unreadable { path: path.to_owned(), cause };
+    let mut base: Option<OwnedFd> = None;
+    // As it is opened, which may be from a directory that is open, and as it is shown.
+    let (mut here, mut shown) = (path.to_owned(), path.to_owned());
+    for _ in 0..=LINKS_MAX {
+        let Some(name) = here.file_name().map(OsStr::to_owned) else {
+            return Err(FileFault::Other { path: shown, wanted: "file" });
+        };
+        let from = base.as_ref().map_or(CWD, |base| base.as_fd());
+        let parent = openat(from, parent_of(&here), DIRECTORY, Mode::empty());
+        let parent = File::from(parent.map_err(|error| unreadable(error.into()))?);
+        let about = parent.metadata().map_err(unreadable)?;
+        check(parent_of(&shown), about.uid(), about.mode(), Guarded::Public)?;
+        match readlinkat(&parent, &name, Vec::new()) {
+            Ok(link) => {
+                here = PathBuf::from(OsString::from_vec(link.into_bytes()));
+                shown = parent_of(&shown).join(&here);
+                base = Some(parent.into());
+            }
+            // It is no link.
+            Err(Errno::INVAL) => {
+                let file = openat(&parent, &name, FILE, Mode::empty());
+                let file = File::from(file.map_err(|error| unreadable(error.into()))?);
+                return read_open(file, &shown, Guarded::Public, bytes_max);
+            }
+            Err(error) => return Err(unreadable(error.into())),
+        }
     }
-    read(path, Guarded::Public, bytes_max)
+    Err(unreadable(Errno::LOOP.into()))
+}
+
+/// The directory of what is at `path`.
+fn parent_of(path: &Path) -> &Path {
+    path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."))
 }
 
 /// Reads the deny list.
@@ -159,8 +209,19 @@ pub fn directory(path: &Path) -> Result<(), FileFault> {
 fn read(path: &Path, guarded: Guarded, bytes_max: u64) -> Result<Zeroizing<Vec<u8>>, FileFault> {
     let unreadable = |cause| FileFault::Unreadable { path: path.to_owned(), cause };
     // A pipe in its place would hold the node up for ever.
-    let no_wait = rustix::fs::OFlags::NONBLOCK.bits().cast_signed();
+    let no_wait = OFlags::NONBLOCK.bits().cast_signed();
     let file = OpenOptions::new().read(true).custom_flags(no_wait).open(path).map_err(unreadable)?;
+    read_open(file, path, guarded, bytes_max)
+}
+
+/// Reads what is open as `file`, and called `path`.
+fn read_open(
+    file: File,
+    path: &Path,
+    guarded: Guarded,
+    bytes_max: u64,
+) -> Result<Zeroizing<Vec<u8>>, FileFault> {
+    let unreadable = |cause| FileFault::Unreadable { path: path.to_owned(), cause };
     let about = file.metadata().map_err(unreadable)?;
     if !about.is_file() {
         return Err(FileFault::Other { path: path.to_owned(), wanted: "file" });

@@ -3,6 +3,7 @@
 use std::{
     fs::{self, Permissions},
     os::unix::fs::PermissionsExt,
+    path::Path,
 };
 
 use super::ground::{Authority, DAY, Directory, NOW, Wish, at, identity};
@@ -108,6 +109,47 @@ fn an_access_list_is_taken_only_from_where_others_can_put_no_other_one() {
                 only(&[why.to_string()], &["others can write to", "common"]);
             }
         }
+    }
+}
+
+#[test]
+fn an_access_list_behind_several_links_is_taken_only_if_nobody_else_can_change_any_of_them() {
+    // Given: `link.toml`, which leads to `middle/link.toml`, and that to `list/access.toml`
+    let directory = Directory::new();
+    let [link, middle, list] = ["link.toml", "middle", "list"].map(|name| directory.path().join(name));
+    for made in [&middle, &list] {
+        fs::create_dir(made).unwrap();
+        fs::set_permissions(made, Permissions::from_mode(0o755)).unwrap();
+    }
+    fs::write(list.join("access.toml"), "text").unwrap();
+    fs::set_permissions(list.join("access.toml"), Permissions::from_mode(0o644)).unwrap();
+    std::os::unix::fs::symlink("middle/link.toml", &link).unwrap();
+    std::os::unix::fs::symlink("../list/access.toml", middle.join("link.toml")).unwrap();
+    assert_eq!(names::access_list(&link, 1 << 20).unwrap().as_slice(), b"text");
+    for weak in [&middle, &list] {
+        // When
+        fs::set_permissions(weak, Permissions::from_mode(0o777)).unwrap();
+        // Then
+        let read = names::access_list(&link, 1 << 20);
+        let name = weak.file_name().unwrap().to_str().unwrap();
+        only(&[read.unwrap_err().to_string()], &["others can write to", name]);
+        fs::set_permissions(weak, Permissions::from_mode(0o755)).unwrap();
+    }
+    // A ring of links has an end.
+    fs::remove_file(middle.join("link.toml")).unwrap();
+    std::os::unix::fs::symlink(&link, middle.join("link.toml")).unwrap();
+    only(&[names::access_list(&link, 1 << 20).unwrap_err().to_string()], &["link.toml", "symbolic links"]);
+}
+
+#[test]
+fn an_access_list_that_is_no_file_holds_nobody_up() {
+    let directory = Directory::new();
+    let pipe = directory.path().join("access.toml");
+    let mode = rustix::fs::Mode::from_raw_mode(0o600);
+    rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, mode, 0).unwrap();
+    only(&[names::access_list(&pipe, 1 << 20).unwrap_err().to_string()], &["is no file"]);
+    for path in [directory.path(), Path::new("/"), Path::new("..")] {
+        assert!(names::access_list(path, 1 << 20).is_err(), "{}", path.display());
     }
 }
 
