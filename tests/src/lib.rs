@@ -6,6 +6,7 @@ pub mod clients;
 pub mod dice;
 mod ground;
 pub mod history;
+pub mod keys;
 pub mod link_faults;
 pub mod load;
 mod log;

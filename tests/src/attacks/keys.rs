@@ -1,25 +1,22 @@
 //! Keys of the robot that is attacked, as `sinew keys` makes them, and of a project of the same name whose authority is another one.
 
 use std::{
-    fs::{self, Permissions},
-    io,
+    fs, io,
     net::Ipv4Addr,
-    os::unix::fs::PermissionsExt as _,
     path::{Path, PathBuf},
     sync::Arc,
 };
 
-use rcgen::{BasicConstraints, CertificateParams, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, SanType};
 use sinew::{
     NodeAddress,
     security::{
-        Certificate, DiscoveryKey, Identity, files, project_uri,
+        Certificate, Identity, files,
         rustls::pki_types::{CertificateDer, PrivateKeyDer, PrivatePkcs8KeyDer},
     },
 };
 
 use super::stranger::Client;
-use crate::OwnDirectory;
+use crate::{OwnDirectory, keys::put};
 
 /// The project of the robot.
 pub(super) const PROJECT: &str = "attacked";
@@ -106,47 +103,13 @@ impl Keys {
 fn client(directory: &Path) -> Arc<Client> {
     let certificate =
         Certificate::from_file(&directory.join(files::NODE_CERTIFICATE)).expect("it was just made");
-    let key = fs::read(directory.join("node.der")).expect("it was just made");
+    let key = fs::read(directory.join(crate::keys::NODE_KEY_DER)).expect("it was just made");
     let key = PrivateKeyDer::from(PrivatePkcs8KeyDer::from(key));
     let chain: Vec<CertificateDer<'static>> = vec![certificate.der().clone()];
     super::stranger::client(Some((chain, key)))
 }
 
 fn make(directory: &Path, nodes: &[Who]) -> io::Result<()> {
-    let mut params = CertificateParams::default();
-    params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
-    params.subject_alt_names = vec![uri(&project_uri(PROJECT))];
-    let key = KeyPair::generate().map_err(io::Error::other)?;
-    let authority = params.self_signed(&key).map_err(io::Error::other)?.pem();
-    let issuer = Issuer::from_params(&params, &key);
-    let discovery = DiscoveryKey::generate()?;
-    for who in nodes {
-        let mut params = CertificateParams::default();
-        params.subject_alt_names = vec![uri(&who.identity().uri())];
-        params.extended_key_usages =
-            vec![ExtendedKeyUsagePurpose::ServerAuth, ExtendedKeyUsagePurpose::ClientAuth];
-        let key = KeyPair::generate().map_err(io::Error::other)?;
-        let certificate = params.signed_by(&key, &issuer).map_err(io::Error::other)?.pem();
-        let directory = directory.join(who.name);
-        fs::create_dir_all(&directory)?;
-        fs::set_permissions(&directory, Permissions::from_mode(0o700))?;
-        put(&directory, files::NODE_KEY, 0o600, &key.serialize_pem())?;
-        put(&directory, files::NODE_CERTIFICATE, 0o644, &certificate)?;
-        put(&directory, files::AUTHORITY, 0o644, &authority)?;
-        put(&directory, files::DISCOVERY_KEY, 0o600, &discovery.text())?;
-        put(&directory, files::DENIED, 0o644, "")?;
-        // The same key for peers by hand.
-        fs::write(directory.join("node.der"), key.serialize_der())?;
-    }
-    Ok(())
-}
-
-fn uri(text: &str) -> SanType {
-    SanType::URI(text.try_into().expect("it is ASCII"))
-}
-
-fn put(directory: &Path, name: &str, mode: u32, text: &str) -> io::Result<()> {
-    let path = directory.join(name);
-    fs::write(&path, text)?;
-    fs::set_permissions(&path, Permissions::from_mode(mode))
+    let identities: Vec<Identity> = nodes.iter().map(|who| who.identity()).collect();
+    crate::keys::make(directory, &identities)
 }

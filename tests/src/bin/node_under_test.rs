@@ -1,8 +1,9 @@
 //! A node for the scenarios: one application that sends, and says what it sees, one line each.
 //!
-//! `node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--floods NAME]... [--will NAME]... [--logs | --logs-info]`
+//! `node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--floods NAME]... [--will NAME]... [--incarnation NUMBER] [--logs | --logs-info]`
 //!
-//! Whom it floods it sends as many counts as are taken, to each the same. A will is a count of 1,000,000. What it logs goes to its standard error, with `--logs` warnings and with `--logs-info` more go to its output.
+//! Whom it floods it sends as many counts as are taken, to each the same. A will is a count of 1,000,000. The
+//! incarnation is the clock's of its host, if none is given. What it logs goes to its standard error, with `--logs` warnings and with `--logs-info` more go to its output.
 
 use std::process::ExitCode;
 
@@ -109,7 +110,15 @@ fn main() -> ExitCode {
     for heir in after("--will") {
         probe = probe.last_will(heir.as_str(), &Count { number: 1_000_000 });
     }
-    match Node::builder(name).config(config).app(probe).heed_signals().start() {
+    let mut builder = Node::builder(name).config(config).app(probe).heed_signals();
+    for life in after("--incarnation") {
+        let Ok(life) = life.parse() else {
+            println!("refused --incarnation {life}: it is no number");
+            return ExitCode::FAILURE;
+        };
+        builder = builder.incarnation(sinew::Incarnation(life));
+    }
+    match builder.start() {
         Ok(node) => {
             println!("up");
             node.run()
