@@ -1,6 +1,6 @@
 //! A run in real time from the command line.
 
-use std::time::Duration;
+use std::{path::Path, time::Duration};
 
 use exoskeleton::report;
 use exoskeleton::robot::launch::{self, LaunchOptions, RealTimeFigures, Walk};
@@ -22,6 +22,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Verdict, RunError> {
     let walk = launch::run(&options(arguments)?)?;
     print!("{}", report::table(&walk.report));
     print!("{}", words(&walk.real_time));
+    println!("{}", links(arguments.keys.as_deref()));
     let json = json(&walk)?;
     std::fs::write(walk.folder.join("report.json"), &json)?;
     if let Some(path) = &arguments.report {
@@ -58,6 +59,19 @@ fn options(arguments: &Arguments) -> Result<LaunchOptions, RunError> {
         keys: arguments.keys.clone(),
         runs: arguments.runs.clone(),
     })
+}
+
+/// Who could speak to whom.
+fn links(keys: Option<&Path>) -> String {
+    keys.map_or_else(
+        || "links between nodes: open to every program of this host; `--keys DIR` closes them".to_owned(),
+        |keys| {
+            format!(
+                "links between nodes: TLS 1.3, each node proven by its key in {}; those to the plant's devices are open",
+                keys.join("nodes").display()
+            )
+        },
+    )
 }
 
 /// The report, with what only a real-time run can say.
