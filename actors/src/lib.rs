@@ -80,6 +80,7 @@ pub use node::{
     Supervised, Supervises, SupervisionTree, SupervisorSpec, Traffic,
 };
 pub use outlet::OutletCounts;
+pub use secured::DenyListError;
 pub use serde;
 pub use sinew_runtime::{
     app::{

@@ -5,6 +5,7 @@ pub(crate) mod fuzzing;
 
 use std::{
     num::NonZeroUsize,
+    path::PathBuf,
     sync::{Arc, Mutex},
 };
 
@@ -18,7 +19,8 @@ use sinew_runtime::{
 use crate::{
     config::NodeConfig,
     security::{
-        Checker, CredentialFaults, Credentials, DiscoveryKey, Identity, Sealer, Stamp, Tag, Tls, Verdict,
+        Checker, CredentialFaults, Credentials, DiscoveryKey, Identity, Sealer, Serial, Stamp, Tag, Tls,
+        Verdict,
     },
     stores::lock,
 };
@@ -30,6 +32,46 @@ pub(crate) const SEAL_LEN: usize = 8 + 8 + Tag::BYTES;
 pub(crate) struct Secured {
     pub(crate) tls: Tls,
     seals: Mutex<Seals>,
+    /// Where its files are.
+    directory: PathBuf,
+    /// The number of its own certificate.
+    pub(crate) serial: Serial,
+    /// Of two who have the deny list read again, the later one reads later.
+    reading: Mutex<()>,
+}
+
+/// Why a node's deny list was not read again, or what else is to be done. Each says what is in force.
+#[derive(Debug, thiserror::Error)]
+pub enum DenyListError {
+    /// The node was started without keys. Nothing changed.
+    #[error("this node has no keys, and so no deny list: set security.keys, and start it again")]
+    None,
+    /// The file cannot be used; all that is wrong with it is listed. The list that was in force still is.
+    #[error("the deny list cannot be used, and the one in force stays:\n{0}")]
+    Faults(#[from] CredentialFaults),
+    /// The list is in force for connections from now on, but those that stand were not looked at: the node is stopping, or a layer hangs.
+    #[error(
+        "the deny list is in force for connections from now on, but those that stand were not looked at, as GNCL does not read its \
+         events: ask again, and if that does not help start the node again"
+    )]
+    NotTold,
+    /// The list is in force, and this node's own certificate is on it.
+    #[error(
+        "the deny list is in force, and this node's own certificate, number {serial}, is on it: nodes with that list do not take it, and it \
+         does not start again. Make a new one with `sinew keys issue`"
+    )]
+    Own {
+        /// Its number.
+        serial: Serial,
+    },
+}
+
+/// A deny list that was read and put in force.
+pub(crate) struct Denied {
+    /// Certificates that are on it.
+    pub(crate) count: usize,
+    /// The number of this node's own certificate, if it is among them.
+    pub(crate) own: Option<Serial>,
 }
 
 /// Puts seals behind datagrams, and looks at those of others.
@@ -64,7 +106,22 @@ impl Secured {
         let (key, identity) = (credentials.discovery(), credentials.identity());
         let nodes_max = NonZeroUsize::new(nodes_max).unwrap_or(NonZeroUsize::MIN);
         let seals = Seals::new(key, &identity.project, identity.address, incarnation, nodes_max);
-        Self { tls, seals: Mutex::new(seals) }
+        let (directory, serial) = (credentials.directory().to_owned(), credentials.serial().clone());
+        Self { tls, seals: Mutex::new(seals), directory, serial, reading: Mutex::default() }
+    }
+
+    /// Reads the deny list again and puts it in force, for every handshake and every HELLO from now on. Connections that stand end when
+    /// GNCL is told.
+    ///
+    /// # Errors
+    /// It cannot be used; the list in force stays.
+    pub(crate) fn reload_deny_list(&self) -> Result<Denied, CredentialFaults> {
+        let _turn = lock(&self.reading);
+        let list = Credentials::deny_list(&self.directory)?;
+        let own = list.has(&self.serial).then(|| self.serial.clone());
+        let count = list.len();
+        self.tls.deny(list);
+        Ok(Denied { count, own })
     }
 
     /// Puts a seal behind a datagram of this node.

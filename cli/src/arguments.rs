@@ -71,9 +71,10 @@ pub(crate) enum Command {
     ///
     /// Each node is read twice, and both ends of each link are compared. What nobody can explain is named, with its place or link.
     Audit,
-    /// Has the node that lets this command in read its access list again, without a restart
+    /// Has the node that lets this command in read its access list and its deny list again, without a restart
     ///
-    /// A list with faults changes nothing: each is named with its line, and the list in force stays.
+    /// A list with faults changes nothing: each is named with its line, and the list in force stays. Connections with nodes whose
+    /// certificates are on the deny list end.
     Reload,
     /// Whether this machine gives a node what it needs: interfaces, multicast, limits, real-time rights, CPU governor, clock, shared memory,
     /// sockets; each finding with the command that mends it

@@ -7,8 +7,27 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew::security::Identity;
-use sinew_tests::{OwnDirectory, Program, keys, node_under_test, own_group};
+use sinew::{
+    DenyListError, Endpoint, NodeApi, NodeBuilder, Registration,
+    prelude::*,
+    security::{Certificate, Identity, files},
+};
+use sinew_tests::{DEADLINE, OwnDirectory, Program, keys, node_under_test, own_group, until};
+
+payload!("keys.torque", Control => struct Torque { newton_metres: f64 });
+
+/// Takes every torque.
+struct Drive;
+
+impl Actor for Drive {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<Torque>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, _: Delivery<Torque>, _: &mut Self::Context) {}
+}
 
 const PROJECT: &str = "keys";
 const NAMES: [&str; 2] = ["hip", "knee"];
@@ -56,6 +75,29 @@ impl Robot {
     }
 }
 
+impl Robot {
+    /// The same in this process.
+    fn builder(&self, index: usize) -> NodeBuilder {
+        Node::builder(NAMES[index]).address(address(index)).configure(|config| {
+            config.project = PROJECT.to_owned();
+            config.ndl.multicast = Some(self.group);
+            config.ndl.mdns_port = None;
+            config.security.keys = Some(self.keys(index));
+            config.lncl.socket = Some(self.door(index));
+        })
+    }
+
+    fn door(&self, index: usize) -> PathBuf {
+        self.directory.join(&format!("{}.sock", NAMES[index]))
+    }
+
+    fn revoke(&self, index: usize, at: usize) {
+        let certificate = Certificate::from_file(&self.keys(index).join(files::NODE_CERTIFICATE));
+        let serial = certificate.expect("it was just made").serial().to_string();
+        keys::put(&self.keys(at), files::DENIED, 0o644, &serial).expect("the test's own directory");
+    }
+}
+
 fn address(index: usize) -> Ipv4Addr {
     Ipv4Addr::new(127, 0, 0, index as u8 + 1)
 }
@@ -81,4 +123,45 @@ fn a_node_whose_clock_began_anew_is_there_again_15_s_after_its_loss() {
     assert!(took < BARRED + FOUND, "found {took:?} after its loss");
     knee.wait_for(&["count", "from 127.0.0.1"]);
     hip.wait_for(&["requirement", "Met", "knee"]);
+}
+
+fn send(gait: &mut Endpoint, to: Tid, within: Duration) -> Outcome {
+    gait.send_confirmed(to, &Torque { newton_metres: 1.0 }, within).expect("it is sent")
+}
+
+// spec: GNCL-18
+#[test]
+fn who_is_revoked_reaches_nobody_from_when_the_deny_list_is_read_again() {
+    // Given: the hip sends to a drive of the knee
+    let robot = Robot::new();
+    let drive = AppSpec::new("drive", || Drive).handles::<Torque>();
+    let (hip, knee) = (robot.builder(0).start(), robot.builder(1).app(drive).start());
+    let (_hip, knee) = (hip.expect("a node"), knee.expect("a node"));
+    let api = NodeApi::connect(robot.door(0)).expect("its door");
+    let registration = Registration::new().name("gait").requires(["drive"]).deadline(DEADLINE);
+    let mut gait = api.register_transport_address(registration).expect("it is registered");
+    let drive = gait.resolve("drive", DEADLINE).expect("an answer").expect("it is there");
+    assert_eq!(send(&mut gait, drive, DEADLINE), Outcome::Delivered);
+    // When: a list with a fault, which changes nothing
+    keys::put(&robot.keys(1), files::DENIED, 0o644, "hip\n").expect("the test's own directory");
+    let faults = knee.handle().reload_deny_list().expect_err("that is no number").to_string();
+    assert!(faults.contains("line 1") && faults.contains("stays"), "{faults}");
+    assert_eq!(send(&mut gait, drive, DEADLINE), Outcome::Delivered);
+    // When: the hip is revoked
+    robot.revoke(0, 1);
+    assert_eq!(knee.handle().reload_deny_list().expect("it is good"), 1);
+    // Then: the link ends, and there is no other one
+    let soon = Duration::from_millis(500);
+    until("it reaches nobody", || (send(&mut gait, drive, soon) != Outcome::Delivered).then_some(()));
+    assert_ne!(send(&mut gait, drive, soon), Outcome::Delivered);
+    // When: the knee itself
+    robot.revoke(1, 1);
+    let own = knee.handle().reload_deny_list();
+    assert!(matches!(own, Err(DenyListError::Own { .. })), "{own:?}");
+}
+
+#[test]
+fn a_node_without_keys_has_no_deny_list_to_read() {
+    let node = sinew_tests::Ground::new().node("hip").start().expect("a node");
+    assert!(matches!(node.handle().reload_deny_list(), Err(DenyListError::None)));
 }

@@ -5,7 +5,6 @@ use std::{
     fmt,
     path::PathBuf,
     sync::{Arc, Mutex},
-    time::Duration,
 };
 
 use arc_swap::ArcSwap;
@@ -39,8 +38,6 @@ pub(crate) struct Access {
     index: ArcSwap<Index>,
     /// Of two who have the file read again, the later one reads later.
     reloading: Mutex<()>,
-    /// When the list may be read again [`ASKED_AT_ONCE`] times on the word of tools.
-    asked_to_read: Mutex<Time>,
     /// Writers of `index` take turns.
     writing: Mutex<()>,
     /// Which user's process had which address last; of more than [`HOLDERS_MAX`] the one that came first is forgotten.
@@ -51,9 +48,6 @@ pub(crate) struct Access {
 
 /// Nodes of which names are known at most, beyond those that the directory has.
 const NODES_MAX: usize = 1_024;
-/// How often tools may have the list read again, and how often at once.
-const READ_PERIOD: Duration = Duration::from_secs(1);
-const ASKED_AT_ONCE: u32 = 4;
 /// Former holders of addresses that are known at most.
 const HOLDERS_MAX: usize = 4_096;
 
@@ -111,8 +105,8 @@ impl Access {
     pub(crate) fn new(here: NodeAddress, path: PathBuf, list: List, refusals: Arc<Refusals>) -> Self {
         let index = ArcSwap::from_pointee(Index::new(Arc::new(list), here));
         let (reloading, writing, holders) = (Mutex::default(), Mutex::default(), Mutex::default());
-        let (asked, asked_to_read) = (Asked::default(), Mutex::new(Time::ZERO));
-        Self { here, path, refusals, index, reloading, asked_to_read, writing, holders, asked }
+        let asked = Asked::default();
+        Self { here, path, refusals, index, reloading, writing, holders, asked }
     }
 
     /// Reads the file again and puts its list in force, for every message from now on.
@@ -284,17 +278,6 @@ impl Access {
     /// Whether a rule is about processes of the user `own` in its group, of whom most are meant to do anything.
     pub(crate) fn narrows(&self, own: Applicant) -> bool {
         self.index.load().list.is_about(own)
-    }
-
-    /// Whether the list may be read again on the word of a tool at `now`: [`ASKED_AT_ONCE`] times, and once a second.
-    pub(crate) fn may_be_read(&self, now: Time) -> bool {
-        let mut full = lock(&self.asked_to_read);
-        let next = (*full).max(now) + READ_PERIOD;
-        let may = next.since(now) <= READ_PERIOD * ASKED_AT_ONCE;
-        if may {
-            *full = next;
-        }
-        may
     }
 
     /// What becomes of such a message, and why.

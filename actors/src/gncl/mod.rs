@@ -93,4 +93,6 @@ pub(crate) enum Event {
     Moved { node: NodeAddress, incarnation: Incarnation, gncl: Vec<SocketAddr> },
     /// By NDL: that this life of a node was there bars no other.
     Forgotten { node: NodeAddress, incarnation: Incarnation },
+    /// By whoever had the deny list read again: another one is in force.
+    DenyListChanged,
 }

@@ -1,6 +1,6 @@
 //! What a node says of its access list, and has done with it.
 
-use std::sync::Arc;
+use std::{sync::Arc, time::Duration};
 
 use sinew_runtime::{
     outcome::Rejection,
@@ -17,6 +17,9 @@ use crate::{
     stores::{Stores, lock},
 };
 
+/// How often tools may have files read again, and how often at once.
+const READ_PERIOD: Duration = Duration::from_secs(1);
+const ASKED_AT_ONCE: u32 = 4;
 /// Longest account of what is wrong with a list, in characters.
 const FAULTS_MAX: usize = 16 * 1024;
 
@@ -48,30 +51,76 @@ fn is_of_the_nodes_user(stores: &Stores, app: AppAddress) -> bool {
     }
 }
 
-/// Has the list read again, if somebody of the node's own user on this host wants it. spec: INSPECT-7
-#[expect(clippy::unnecessary_wraps, reason = "all answers have one form")]
-pub(super) fn reloaded(stores: &Arc<Stores>, question: &Message) -> Result<ReloadReport, Rejection> {
-    let refused = |words: String| {
-        let now = stores.access.get().map(|access| access.summary());
-        ReloadReport {
-            rules: now.map_or(0, |now| now.rules as u64),
-            clients: now.map_or(0, |now| now.clients as u64),
-            refused: Some(words.chars().take(FAULTS_MAX).collect()),
+/// How often files were read again of late on the word of tools.
+#[derive(Debug, Default)]
+pub(super) struct Readings {
+    /// When they may be read [`ASKED_AT_ONCE`] times again.
+    full: Time,
+}
+
+impl Readings {
+    /// Whether they may be read at `now`: so often at once, and once a second.
+    fn admit(&mut self, now: Time) -> bool {
+        let next = self.full.max(now) + READ_PERIOD;
+        let may = next.since(now) <= READ_PERIOD * ASKED_AT_ONCE;
+        if may {
+            self.full = next;
         }
-    };
+        may
+    }
+}
+
+/// Has the lists read again, if somebody of the node's own user on this host wants it. spec: INSPECT-7
+#[expect(clippy::unnecessary_wraps, reason = "all answers have one form")]
+pub(super) fn reloaded(
+    stores: &Arc<Stores>,
+    readings: &mut Readings,
+    question: &Message,
+) -> Result<ReloadReport, Rejection> {
     if question.header.source.node != stores.node {
-        let why = "an access list is read again for a program of its node's own host only: run `sinew reload` there";
-        return Ok(refused(why.to_owned()));
+        let why =
+            "lists are read again for a program of their node's own host only: run `sinew reload` there";
+        return Ok(report(stores, None, why));
     }
     if !is_of_the_nodes_user(stores, question.header.source.app) {
-        let why = "an access list is read again for programs of its node's own user and of root only: run `sinew reload` as that user";
-        return Ok(refused(why.to_owned()));
+        let why = "lists are read again for programs of their node's own user and of root only: run `sinew reload` as that user";
+        return Ok(report(stores, None, why));
     }
-    if stores.access.get().is_some_and(|access| !access.may_be_read(Time::now())) {
-        return Ok(refused("the access list was read a moment ago: ask again in a second".to_owned()));
+    if !readings.admit(Time::now()) {
+        return Ok(report(stores, None, "the lists were read a moment ago: ask again in a second"));
     }
-    Ok(match NodeHandle::of(stores.clone()).reload_access() {
-        Ok(now) => ReloadReport { rules: now.rules as u64, clients: now.clients as u64, refused: None },
-        Err(why) => refused(why.to_string()),
-    })
+    let (node, mut faults) = (NodeHandle::of(stores.clone()), Vec::new());
+    let is_secured = stores.secured.get().is_some();
+    if stores.access.get().is_some() || !is_secured {
+        faults.extend(node.reload_access().err().map(|why| why.to_string()));
+    }
+    let denied = is_secured.then(|| node.reload_deny_list());
+    let denied = denied.and_then(|read| read.map_err(|why| faults.push(why.to_string())).ok());
+    Ok(report(stores, denied, &faults.join("\n")))
+}
+
+/// What is in force, and what is wrong, if anything is.
+fn report(stores: &Stores, denied: Option<usize>, faults: &str) -> ReloadReport {
+    let now = stores.access.get().map(|access| access.summary());
+    ReloadReport {
+        rules: now.map_or(0, |now| now.rules as u64),
+        clients: now.map_or(0, |now| now.clients as u64),
+        has_list: now.is_some(),
+        denied: denied.map(|count| count as u64),
+        refused: (!faults.is_empty()).then(|| faults.chars().take(FAULTS_MAX).collect()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lists_are_read_again_a_few_times_at_once_and_then_once_a_second() {
+        let (mut readings, begin) = (Readings::default(), Time::from_nanos(1));
+        let mut may = |at| (0..9).filter(|_| readings.admit(at)).count();
+        assert_eq!(may(begin), 4);
+        assert_eq!(may(begin + Duration::from_secs(1)), 1);
+        assert_eq!(may(begin + Duration::from_secs(60)), 4);
+    }
 }

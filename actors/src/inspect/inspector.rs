@@ -19,7 +19,7 @@ use sinew_runtime::{
 };
 
 use super::{
-    access,
+    access::{self, Readings},
     answers::Answers,
     reports::{AskAccess, AskApps, AskAudit, AskNode, AskReload, AskTree, AskWatch, Report, WatchReport},
     watches::{NewTap, WATCHES_MAX, Watches, Ways},
@@ -61,13 +61,13 @@ pub(crate) fn begin(stores: &Arc<Stores>) -> io::Result<()> {
 }
 
 fn serve(questions: &Receiver<Message>, answers: &Answers) {
-    let mut watches = Watches::default();
+    let (mut watches, mut readings) = (Watches::default(), Readings::default());
     let mut number = 0;
     while let Some(question) = next(questions, answers, &mut watches) {
         number += 1;
         // spec: INSPECT-5. The question is dropped with the panic, and its receipt says `Failed`.
         let is_ping = question.header.kind == Kind::PING;
-        let answer = AssertUnwindSafe(|| answer(answers, number, &mut watches, question));
+        let answer = AssertUnwindSafe(|| answer(answers, number, &mut watches, &mut readings, question));
         if catch_unwind(answer).is_err() {
             log::error!("an answer of the inspection panicked; the next question is answered");
         }
@@ -98,7 +98,13 @@ fn put_up(stores: &Stores, tap: NewTap) {
     }
 }
 
-fn answer(answers: &Answers, number: u64, watches: &mut Watches, mut question: Message) {
+fn answer(
+    answers: &Answers,
+    number: u64,
+    watches: &mut Watches,
+    readings: &mut Readings,
+    mut question: Message,
+) {
     if question.header.is_expired(Time::now()) {
         return question.settle(Outcome::Expired);
     }
@@ -114,7 +120,9 @@ fn answer(answers: &Answers, number: u64, watches: &mut Watches, mut question: M
         AskAccess::KIND => {
             reply(answers, number, &question, |_, stores| access::explained(stores, &question))
         }
-        AskReload::KIND => reply(answers, number, &question, |_, stores| access::reloaded(stores, &question)),
+        AskReload::KIND => {
+            reply(answers, number, &question, |_, stores| access::reloaded(stores, readings, &question))
+        }
         // spec: INSPECT-4
         _ => Err(Rejection::UnknownKind),
     };

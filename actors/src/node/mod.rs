@@ -58,15 +58,16 @@ use sinew_runtime::{
 
 use crate::{
     access::{AccessError, AccessSummary},
-    gncl::Peer,
+    gncl::{self, Peer},
     log,
     ndl::KnownNode,
     outlet::OutletCounts,
+    secured::{Denied, DenyListError},
     stores::{Stores, lock},
     sync::{BarrierStatus, DirectoryEntry, Waiting},
 };
 
-/// What is logged of the faults of an access list, in characters: whoever asks for it to be read gets all of them.
+/// What is logged of the faults of a list, in characters: whoever asks for it to be read gets all of them.
 const LOGGED_MAX: usize = 1_024;
 /// Time at its end for what the node has logged to be written.
 const LAST_WORDS: Duration = Duration::from_millis(500);
@@ -306,6 +307,30 @@ impl NodeHandle {
             Err(why) => {
                 let why: String = why.to_string().chars().take(LOGGED_MAX).collect();
                 log::error!(why, "the access list was not replaced");
+            }
+        }
+        read
+    }
+
+    /// Reads the node's deny list again and puts it in force: connections that stand with nodes whose certificates are on it end, in words,
+    /// and none is made. How many certificates are on it. Such a node is lost when it is silent; what is sent to it waits, and expires.
+    ///
+    /// # Errors
+    /// The node was started without keys, the file cannot be used, or there is more to do: each says what is in force. It is logged too.
+    pub fn reload_deny_list(&self) -> Result<usize, DenyListError> {
+        let secured = self.stores.secured.get().ok_or(DenyListError::None)?;
+        let read =
+            secured.reload_deny_list().map_err(DenyListError::from).and_then(|Denied { count, own }| {
+                // After the list is in force: who comes meanwhile is judged by it.
+                let told = self.stores.posts.gncl.post(gncl::Event::DenyListChanged);
+                told.map_err(|_| DenyListError::NotTold)?;
+                own.map_or(Ok(count), |serial| Err(DenyListError::Own { serial }))
+            });
+        match &read {
+            Ok(count) => log::info!(count, "another deny list is in force"),
+            Err(why) => {
+                let why: String = why.to_string().chars().take(LOGGED_MAX).collect();
+                log::error!(why, "the deny list was read again");
             }
         }
         read

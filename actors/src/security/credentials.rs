@@ -3,8 +3,10 @@
 use std::{
     fmt,
     path::{Path, PathBuf},
+    sync::Arc,
 };
 
+use arc_swap::ArcSwap;
 use rustls::pki_types::{
     CertificateDer, PrivateKeyDer, TrustAnchor, UnixTime,
     pem::{Error as PemError, PemObject},
@@ -26,6 +28,7 @@ pub struct Credentials {
     pub(super) key: PrivateKeyDer<'static>,
     pub(super) believed: Believed,
     discovery: DiscoveryKey,
+    directory: PathBuf,
     warnings: Vec<String>,
 }
 
@@ -153,6 +156,7 @@ impl Credentials {
             return Err(CredentialFaults(faults));
         };
         let floor = certificate.validity().from;
+        let denied = Arc::new(ArcSwap::from_pointee(denied));
         let believed = Believed { anchor, project: configured.project.clone(), denied, policy, floor };
         let mut credentials = Self {
             identity: configured.clone(),
@@ -160,6 +164,7 @@ impl Credentials {
             key,
             believed,
             discovery,
+            directory: directory.to_owned(),
             warnings: Vec::new(),
         };
         credentials.check(directory, now, &mut faults);
@@ -196,7 +201,7 @@ impl Credentials {
             }
         }
         let serial = self.certificate.serial();
-        if self.believed.denied.has(serial) {
+        if self.believed.denied.load().has(serial) {
             faults.push(CredentialFault::Denied { path: path.clone(), serial: serial.clone() });
         }
         if let Err(why) = self.believed.judge(self.certificate.validity(), now) {
@@ -227,6 +232,28 @@ impl Credentials {
             ));
         }
         warnings
+    }
+
+    /// Reads the deny list in `directory` again, as [`load`](Self::load) does.
+    ///
+    /// # Errors
+    /// It is not there, cannot be read, or others can change it.
+    pub fn deny_list(directory: &Path) -> Result<DenyList, CredentialFaults> {
+        let mut faults = Vec::new();
+        let parts = (
+            keep(&mut faults, files::directory(directory).map_err(CredentialFault::from)),
+            keep(&mut faults, read_denied(&directory.join(files::DENIED))),
+        );
+        match parts {
+            (Some(()), Some(denied)) => Ok(denied),
+            (None, _) | (_, None) => Err(CredentialFaults(faults)),
+        }
+    }
+
+    /// Where they were read from.
+    #[must_use]
+    pub fn directory(&self) -> &Path {
+        &self.directory
     }
 
     /// Which node these are of.

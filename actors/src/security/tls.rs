@@ -27,7 +27,7 @@ use sinew_runtime::tid::NodeAddress;
 use webpki::KeyUsage;
 
 use super::{
-    Certificate, Credentials, Identity, Peer, PeerFault,
+    Certificate, Credentials, DenyList, Identity, Peer, PeerFault,
     verifier::{Believed, Verifier},
 };
 
@@ -135,6 +135,20 @@ impl Tls {
             Some(expected) => Err(PeerFault::SomebodyElse { identity: peer.identity, expected }),
             None => Ok(peer),
         }
+    }
+
+    /// Puts another deny list in force, for every handshake from now on, of each [`Tls`] from the same credentials. Connections that stand
+    /// are asked for with [`denies`](Self::denies).
+    pub fn deny(&self, denied: DenyList) {
+        self.believed.denied.store(Arc::new(denied));
+    }
+
+    /// Why `peer`, who was taken before, would not be taken any more: its certificate is on the deny list.
+    #[must_use]
+    pub fn denies(&self, peer: &Peer) -> Option<PeerFault> {
+        let Peer { identity, serial, .. } = peer;
+        let is_denied = self.believed.denied.load().has(serial);
+        is_denied.then(|| PeerFault::Denied { identity: identity.clone(), serial: serial.clone() })
     }
 }
 

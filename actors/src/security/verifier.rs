@@ -5,6 +5,7 @@
 
 use std::sync::Arc;
 
+use arc_swap::ArcSwap;
 use rustls::{
     CertificateError, DigitallySignedStruct, DistinguishedName, Error, OtherError, SignatureScheme,
     client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier},
@@ -23,7 +24,8 @@ use super::{
 pub(super) struct Believed {
     pub(super) anchor: TrustAnchor<'static>,
     pub(super) project: String,
-    pub(super) denied: DenyList,
+    /// Read again while connections stand: all that believe the same have the same one.
+    pub(super) denied: Arc<ArcSwap<DenyList>>,
     pub(super) policy: TimePolicy,
     /// A time that is certainly past: when this node's own certificate was made.
     pub(super) floor: UnixTime,
@@ -50,7 +52,7 @@ impl Believed {
             return Err(PeerFault::OtherProject { identity, project: self.project.clone() });
         }
         let serial = certificate.serial().clone();
-        if self.denied.has(&serial) {
+        if self.denied.load().has(&serial) {
             return Err(PeerFault::Denied { identity, serial });
         }
         let validity = certificate.validity();

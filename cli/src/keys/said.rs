@@ -165,8 +165,8 @@ pub(super) fn revoked(revoked: &Revoked, directory: &Path) -> Said {
     let list = directory.join("denied.txt");
     let _ = write!(
         text,
-        "\nIt counts on a node when {} has been copied beside its keys, as to {INSTALLED}/denied.txt, and the node has been\n\
-         started again; it is in each directory of {} already. Who has a revoked node's files still has the discovery key of the project, with which\n\
+        "\nIt counts on a node when {} has been copied beside its keys, as to {INSTALLED}/denied.txt, and `sinew reload` was\n\
+         run there, which ends its links with those; it is in each directory of {} already. Who has a revoked node's files still has the discovery key of the project, with which\n\
          datagrams can be made that pass for any node's: `sinew keys init` a new project where that matters. `sinew keys issue` gives the node a new certificate.\n",
         list.display(),
         directory.join("nodes").display()

@@ -59,6 +59,7 @@ impl StreamHandler<Event> for Gncl {
             | Event::Moved { node, incarnation, gncl } => Input::NodeFound { node, incarnation, addresses: gncl },
             Event::Membership(MembershipFact::NodeLost { node, incarnation, why }) => lost_as(why, node, incarnation),
             Event::Forgotten { node, incarnation } => Input::NodeDisowned { node, incarnation },
+            Event::DenyListChanged => return self.end_the_denied(ctx),
         };
         self.input(input, ctx);
     }

@@ -40,7 +40,7 @@ impl Gncl {
         if let Some(wire) = self.wires.get_mut(&connection) {
             wire.transport = Some(transport);
             wire.may_speak = true;
-            wire.proven = peer.map(|peer| peer.identity.address);
+            wire.proven = peer.cloned();
         }
     }
 
@@ -82,19 +82,38 @@ impl Gncl {
         connection: ConnectionId,
         says: &Introduction,
     ) -> Result<(), Decline> {
-        let mut wire = self.wires.get_mut(&connection);
-        if let Some(wire) = &mut wire {
+        if let Some(wire) = self.wires.get_mut(&connection) {
             wire.datagrams_made = says.datagrams_made;
         }
-        match wire.and_then(|wire| wire.proven) {
-            Some(proven) if proven != says.node => Err(Decline::Security(format!(
-                "you say that you are node {}, and your certificate is of node {proven}; give each node its own keys",
-                says.node
+        match self.wires.get(&connection).and_then(|wire| wire.proven.as_ref()) {
+            Some(peer) if peer.identity.address != says.node => Err(Decline::Security(format!(
+                "you say that you are node {}, and your certificate is of node {}; give each node its own keys",
+                says.node, peer.identity.address
             ))),
+            // Another list may have come in force since it proved who it is.
+            Some(peer) => self.denied(peer).map_or(Ok(()), Err),
             None if self.secure.is_some() => {
                 Err(Decline::Security("nothing is proven on this connection".to_owned()))
             }
-            Some(_) | None => Ok(()),
+            None => Ok(()),
+        }
+    }
+
+    fn denied(&self, peer: &Peer) -> Option<Decline> {
+        let why = self.stores.secured.get()?.tls.denies(peer)?;
+        Some(Decline::Security(why.to_string()))
+    }
+
+    /// Another deny list is in force: whose certificate is on it is refused on each connection that it has, in whatever stage that is.
+    // spec: GNCL-18
+    pub(super) fn end_the_denied(&mut self, ctx: &mut Context<Self>) {
+        let denied = self.wires.iter().filter_map(|(connection, wire)| {
+            let decline = self.denied(wire.proven.as_ref()?)?;
+            Some((*connection, decline))
+        });
+        let denied: Vec<_> = denied.collect();
+        for (connection, decline) in denied {
+            self.input(Input::Disproven(connection, decline), ctx);
         }
     }
 }

@@ -1,19 +1,18 @@
 //! A connection as the shell has it.
 
 use actix::SpawnHandle;
-use sinew_runtime::tid::NodeAddress;
 
 use super::super::{
     link::{Mode, SharedMode},
     transport::Transport,
 };
-use crate::{outlet::LinkNumber, stores::lock};
+use crate::{outlet::LinkNumber, security::Peer, stores::lock};
 
 /// One connection and what runs for it.
 pub(super) struct Wire {
     pub(super) transport: Option<Transport>,
     /// Who is at the other end, if its keys have proven it.
-    pub(super) proven: Option<NodeAddress>,
+    pub(super) proven: Option<Peer>,
     /// Datagrams of discovery that the other end had made when it introduced itself.
     pub(super) datagrams_made: u64,
     pub(super) mode: SharedMode,

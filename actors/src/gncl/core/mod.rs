@@ -100,6 +100,8 @@ pub(super) enum Input {
     RefusalReceived(ConnectionId, Refusal),
     /// The peer sent what cannot be used.
     Violated(ConnectionId, Decline),
+    /// What the peer proved who it is with counts no more.
+    Disproven(ConnectionId, Decline),
     /// Any frame came on a link but PING and PONG.
     Heard(ConnectionId),
     /// Messages pass on a link.
@@ -256,6 +258,7 @@ impl Core {
             Input::WelcomeReceived(connection, welcome) => self.welcome(now, connection, &welcome),
             Input::RefusalReceived(connection, refusal) => self.refused(now, connection, &refusal),
             Input::Violated(connection, decline) => self.decline(now, connection, &decline),
+            Input::Disproven(connection, decline) => self.disproven(now, connection, &decline),
             Input::Heard(connection) => self.heard(now, connection),
             Input::Carried(connection) => self.carried(connection),
             Input::PongReceived(connection) => self.lives(now, connection),

@@ -7,8 +7,8 @@ use tokio::net::TcpListener;
 
 use super::bench::{ByHand, Cable, NINE, Node, introduction, next, run, within};
 use crate::{
-    gncl::{core::write, peer::frame, secure::is_sealed},
-    security::tests::ground::Authority,
+    gncl::{Event, core::write, peer::frame, secure::is_sealed},
+    security::{DenyList, tests::ground::Authority},
 };
 use sinew_runtime::wire::Kind;
 
@@ -117,6 +117,28 @@ fn who_has_another_nodes_keys_is_not_taken_for_that_node_nor_for_itself() {
             }
         })
         .await;
+    });
+}
+
+// spec: GNCL-18
+#[test]
+fn a_node_whose_certificate_is_revoked_is_refused_on_the_link_that_stands_and_on_the_next_one() {
+    run(async {
+        let (mut a, b, _cable) = two(&keys()).await;
+        let mut at_a = a.app(1);
+        b.send(a.tid(1), b"before");
+        next("a message", &mut at_a).await;
+        // When
+        let revoked = &b.stores.secured.get().expect("it has keys").serial;
+        let list = DenyList::read(&revoked.to_string()).expect("it is a number");
+        a.stores.secured.get().expect("it has keys").tls.deny(list);
+        a.tell(Event::DenyListChanged);
+        // Then: it ends with words
+        a.broken().await;
+        a.counted("security").await;
+        b.counted("refused by the peer").await;
+        // And as NDL still holds it for present it is dialled, and not taken.
+        a.counted("peer not proven").await;
     });
 }
 

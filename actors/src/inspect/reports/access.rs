@@ -44,23 +44,34 @@ pub struct AccessVerdict {
 }
 
 payload!("sinew.inspect.reload" =>
-    /// Read your access list again. Only a program on the node's own host is obeyed. [`ReloadReport`] answers.
+    /// Read your access list and your deny list again. Only a program on the node's own host is obeyed. [`ReloadReport`] answers.
     #[derive(Clone, Copy, Debug, Default)]
     pub struct AskReload {}
 );
 
 payload!("sinew.inspect.reload_report" =>
-    /// The access list that is in force now.
+    /// The lists that are in force now.
     #[derive(Clone, Debug, PartialEq, Eq)]
     pub struct ReloadReport {
-        /// Its rules for messages.
+        /// Rules of the access list for messages.
         pub rules: u64,
-        /// Its rules for users of the node's host.
+        /// Rules of the access list for users of the node's host.
         pub clients: u64,
-        /// Why it is the one that was in force before, or that there is none; in words.
+        /// Whether the node has an access list: without one everything is allowed.
+        #[serde(default = "has_list")]
+        pub has_list: bool,
+        /// How many certificates are on the deny list, if that was read again; `None` of a node without keys, too.
+        #[serde(default)]
+        pub denied: Option<u64>,
+        /// Why a list is the one that was in force before, or that there is none; in words.
         pub refused: Option<String>,
     }
 );
+
+/// Nodes from before there was that field answer so only where they have a list.
+const fn has_list() -> bool {
+    true
+}
 
 /// It has no list of unknown length.
 impl Report for AccessReport {

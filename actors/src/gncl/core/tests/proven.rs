@@ -83,3 +83,22 @@ fn a_life_that_was_linked_bars_earlier_ones_as_ever() {
     let (_, earlier) = greet(&mut core, millis(60_000), hello_from(HIGH, 4, 9));
     assert_eq!(refusal(&earlier), Some("stale incarnation"));
 }
+
+// spec: GNCL-7
+#[test]
+fn a_thief_whose_certificate_is_revoked_while_it_is_linked_bars_the_node_itself_for_five_seconds_only() {
+    // Given: the last of all lives is linked, with keys that were stolen, and NDL goes on to hear it
+    let mut core = core();
+    core.handle(millis(0), found(u64::MAX));
+    let (link, up) = greet(&mut core, millis(1), hello_from(HIGH, u64::MAX, 1));
+    assert!(is_up(&up, u64::MAX));
+    // When
+    core.handle(millis(100), Input::Disproven(link, Decline::Security("it is revoked".to_owned())));
+    let then = outputs(&mut core);
+    assert!(is_down(&then) && refusal(&then) == Some("security"), "{then:?}");
+    // Then
+    let (_, at_once) = greet(&mut core, millis(5_099), hello_from(HIGH, 5, 1));
+    assert_eq!(refusal(&at_once), Some("stale incarnation"));
+    let (_, later) = greet(&mut core, millis(5_100), hello_from(HIGH, 5, 2));
+    assert!(is_up(&later, 5), "{later:?}");
+}
