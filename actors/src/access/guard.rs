@@ -40,7 +40,7 @@ pub(crate) struct Access {
     reloading: Mutex<()>,
     /// Writers of `index` take turns.
     writing: Mutex<()>,
-    /// Which user's process had which address last; of more than [`HOLDERS_MAX`] the one that came first is forgotten.
+    /// Which user's process had which address last; of more than [`HOLDERS_MAX`] the one that came first and has gone is forgotten.
     holders: Mutex<VecDeque<Holder>>,
     /// What the applications of this node may be told in reply.
     asked: Asked,
@@ -57,6 +57,7 @@ struct Holder {
     app: AppAddress,
     uid: u32,
     name: Option<String>,
+    is_here: bool,
 }
 
 /// What a life of a node has said of who is called how in it.
@@ -148,6 +149,10 @@ impl Access {
     /// An application of this node has gone for good.
     pub(crate) fn gone(&self, app: AppAddress) {
         self.asked.forget(app);
+        lock(&self.holders)
+            .iter_mut()
+            .filter(|holder| holder.app == app)
+            .for_each(|holder| holder.is_here = false);
         if self.index.load().name_of(Tid::new(self.here, app)).is_some() {
             self.change(self.here, |_, names| drop(Arc::make_mut(&mut names.apps).remove(&app)));
         }
@@ -238,9 +243,12 @@ impl Access {
     pub(crate) fn holds(&self, app: AppAddress, uid: u32, name: Option<&str>) {
         let mut holders = lock(&self.holders);
         holders.retain(|holder| holder.app != app);
-        let surplus = (holders.len() + 1).saturating_sub(HOLDERS_MAX);
-        holders.drain(..surplus);
-        holders.push_back(Holder { app, uid, name: name.map(str::to_owned) });
+        if holders.len() >= HOLDERS_MAX {
+            // Who is here stays: of these there are `lncl.clients_max`, which is no more than this, and by them a user's places are counted.
+            let first = holders.iter().position(|holder| !holder.is_here).unwrap_or(0);
+            holders.remove(first);
+        }
+        holders.push_back(Holder { app, uid, name: name.map(str::to_owned), is_here: true });
     }
 
     /// Whether the last one that had this address was the same user under the same name: other nodes may still call it so.

@@ -255,6 +255,20 @@ fn a_list_is_read_again_at_the_word_of_the_nodes_user_and_of_root() {
     assert!(!access.is_of(guest, 1_000) && !access.is_of(AppAddress::new(0x1004), 1_000));
 }
 
+#[test]
+fn a_user_who_comes_and_goes_without_end_hides_none_of_the_places_that_he_has() {
+    let stores = Stores::for_test(NodeConfig::new("knee"), Incarnation(1));
+    let access = Access::in_test(&stores, "");
+    let held = AppAddress::new(0x1001);
+    access.holds(held, 1_001, None);
+    for number in 0..5_000 {
+        let app = AppAddress::new(0x8000_0000 + number);
+        access.holds(app, 1_001, None);
+        access.gone(app);
+    }
+    assert_eq!(access.held_by(1_001, |app| app == held), 1);
+}
+
 fn header(source: Tid, target: Tid) -> Header {
     Header::new(Kind::named("test"), source, target)
 }
