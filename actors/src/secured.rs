@@ -20,7 +20,7 @@ use crate::{
     config::NodeConfig,
     security::{
         Checker, CredentialFaults, Credentials, DiscoveryKey, Identity, Sealer, Serial, Stamp, Tag, Tls,
-        Verdict,
+        Validity, Verdict,
     },
     stores::lock,
 };
@@ -31,6 +31,8 @@ pub(crate) const SEAL_LEN: usize = 8 + 8 + Tag::BYTES;
 /// Of one life of a node; it outlives the layers that use it.
 pub(crate) struct Secured {
     pub(crate) tls: Tls,
+    /// From when until when the node's own certificate counts.
+    pub(crate) validity: Validity,
     seals: Mutex<Seals>,
     /// Where its files are.
     directory: PathBuf,
@@ -107,7 +109,8 @@ impl Secured {
         let nodes_max = NonZeroUsize::new(nodes_max).unwrap_or(NonZeroUsize::MIN);
         let seals = Seals::new(key, &identity.project, identity.address, incarnation, nodes_max);
         let (directory, serial) = (credentials.directory().to_owned(), credentials.serial().clone());
-        Self { tls, seals: Mutex::new(seals), directory, serial, reading: Mutex::default() }
+        let (validity, seals) = (credentials.validity(), Mutex::new(seals));
+        Self { tls, validity, seals, directory, serial, reading: Mutex::default() }
     }
 
     /// Reads the deny list again and puts it in force, for every handshake and every HELLO from now on. Connections that stand end when

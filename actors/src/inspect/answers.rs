@@ -16,10 +16,10 @@ use sinew_runtime::{
 };
 
 use super::reports::{
-    APPS_MAX, AppReport, AppsReport, AuditReport, BarrierReport, DialReport, ForeignReport, LinkReport,
-    LostReport, MISSING_MAX, Missing, NodeReport, PEERS_MAX, PeerReport, RefusalReport, RouteReport,
-    SeenMessage, StreamReport, TOLD_MAX, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport,
-    WatchReport,
+    APPS_MAX, AppReport, AppsReport, AuditReport, BarrierReport, CertificateReport, DialReport,
+    ForeignReport, LinkReport, LostReport, MISSING_MAX, Missing, NodeReport, PEERS_MAX, PeerReport,
+    RefusalReport, RouteReport, SecurityReport, SeenMessage, StreamReport, TOLD_MAX, TREE_MAX, TreeLine,
+    TreeReport, TroubleReport, WaitReport, WatchReport,
 };
 use super::watches::{Fetched, Sight};
 use crate::{
@@ -28,6 +28,7 @@ use crate::{
     gncl::{self, ByDatagram, Peer},
     ndl::{KnownNode, KnownRoute, LossReason, LostNode, Source, Trouble, TroubledApp},
     node::{CommandError, NodeHandle, Supervised},
+    security::UnixTime,
     stores::{Stores, lock},
     sync::{BarrierKind, BarrierStatus, OwnApp},
 };
@@ -76,6 +77,7 @@ impl Answers {
             stopping: stores.stopping.load(Ordering::Relaxed),
             refused: NodeHandle::of(stores.clone()).refused(),
             project: stores.config.project.clone(),
+            security: Some(security(stores, UnixTime::now())),
             interface: stores.config.ndl.interface.to_string(),
             udp: ndl.udp,
             gncl: ndl.gncl,
@@ -127,6 +129,16 @@ impl Answers {
     pub(super) fn audit(&self, stores: &Arc<Stores>) -> Result<AuditReport, Rejection> {
         Ok(AuditReport { audit: audit::read(stores) })
     }
+}
+
+fn security(stores: &Stores, clock: UnixTime) -> SecurityReport {
+    let certificate = stores.secured.get().map(|secured| CertificateReport {
+        from_s: secured.validity.from.as_secs(),
+        until_s: secured.validity.until.as_secs(),
+        clock_s: clock.as_secs(),
+        times: stores.config.security.times.word().to_owned(),
+    });
+    SecurityReport { is_beyond_host: !stores.config.ndl.interface.are_loopback(), certificate }
 }
 
 /// What NDL says of itself, and of those that are no members.

@@ -26,10 +26,10 @@ mod watches;
 pub(crate) use inspector::begin;
 pub use reports::{
     APPS_MAX, AccessReport, AccessVerdict, AppReport, AppsReport, AskAccess, AskApps, AskAudit, AskNode,
-    AskReload, AskTree, AskWatch, AuditReport, BarrierReport, DialReport, ForeignReport, LinkReport,
-    LostReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping, RefusalReport, ReloadReport, RouteReport,
-    SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, StreamReport, TREE_MAX, TreeLine, TreeReport, TroubleReport,
-    WaitReport, WatchReport,
+    AskReload, AskTree, AskWatch, AuditReport, BarrierReport, CertificateReport, DialReport, ForeignReport,
+    LinkReport, LostReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping, RefusalReport, ReloadReport,
+    RouteReport, SEEN_BYTES_MAX, SEEN_MAX, SecurityReport, SeenMessage, StreamReport, TREE_MAX, TreeLine,
+    TreeReport, TroubleReport, WaitReport, WatchReport,
 };
 
 #[cfg(doc)]

@@ -2,11 +2,13 @@
 
 mod access;
 mod peers;
+mod security;
 
 pub use access::{AccessReport, AccessVerdict, AskAccess, AskReload, ReloadReport};
 pub use peers::{
     DialReport, ForeignReport, LinkReport, LostReport, PeerReport, RouteReport, StreamReport, TroubleReport,
 };
+pub use security::{CertificateReport, SecurityReport};
 
 use serde::{Deserialize, Serialize};
 use sinew_runtime::{
@@ -104,6 +106,9 @@ payload!("sinew.inspect.node_report" =>
         /// The project that it is of.
         #[serde(default)]
         pub project: String,
+        /// How it proves itself to other nodes, or that it does not; `None`: it is of a version that does not say.
+        #[serde(default)]
+        pub security: Option<SecurityReport>,
         /// Address of the interface where it looks for others.
         #[serde(default)]
         pub interface: String,

@@ -1,6 +1,7 @@
 //! What becomes of questions: answered within bounds, refused, or too many.
 
 use std::{
+    net::Ipv4Addr,
     sync::{
         Arc,
         mpsc::{Receiver, SyncSender, sync_channel},
@@ -17,9 +18,17 @@ use sinew_runtime::{
 
 use super::{
     inspector::{Inbox, WAITING_MAX},
-    reports::{AppReport, AppsReport, AskApps, AskNode, AskTree, NodeReport, Report as _},
+    reports::{AppReport, AppsReport, AskApps, AskNode, AskTree, NodeReport, Report as _, SecurityReport},
 };
-use crate::{config::NodeConfig, stores::Stores};
+use crate::{
+    config::NodeConfig,
+    secured::Secured,
+    security::{
+        TimePolicy,
+        tests::ground::{self, Authority},
+    },
+    stores::Stores,
+};
 
 fn question() -> Message {
     Message::new(Header::new(Kind::PING, Tid::NONE, Tid::NONE), bytes::Bytes::new())
@@ -141,6 +150,39 @@ fn a_question_is_answered_and_what_is_none_is_refused() {
     drop(bench.stores.posts.root.close());
     assert_eq!(bench.outcome(AskTree::KIND, Flags::ASK), refused(Rejection::Closed));
     assert_eq!(bench.outcome(AskApps::KIND, Flags::ASK), Outcome::Delivered);
+}
+
+#[test]
+fn a_node_says_whether_it_is_open_to_whom_and_until_when_its_certificate_counts() {
+    let said = |bench: &Bench| -> NodeReport {
+        assert_eq!(bench.outcome(AskNode::KIND, Flags::ASK), Outcome::Delivered);
+        bench.reply().decode().expect("a report")
+    };
+    // Given: one that others cannot reach, one that they can, and one with keys
+    let alone = Bench::new(NodeConfig::new("knee"));
+    let mut config = NodeConfig::new("knee");
+    config.ndl.interface = Ipv4Addr::new(192, 0, 2, 7).into();
+    config.security.times = TimePolicy::Strict;
+    let (open, secured) = (Bench::new(config.clone()), Bench::new(config));
+    let credentials = Authority::new("walker").credentials("knee", 7);
+    let own = Secured::new(ground::tls(&credentials), &credentials, 8, Incarnation(1));
+    assert!(secured.stores.secured.set(own).is_ok(), "it had none");
+    // Then
+    let of = |bench: &Bench| said(bench).security.expect("it says so");
+    assert_eq!(of(&alone), SecurityReport { is_beyond_host: false, certificate: None });
+    assert_eq!(of(&open), SecurityReport { is_beyond_host: true, certificate: None });
+    let certificate = of(&secured).certificate.expect("it has one");
+    let (from, until) = (ground::NOW - ground::DAY, ground::NOW + 365 * ground::DAY);
+    assert_eq!((certificate.from_s, certificate.until_s), (from, until));
+    assert_eq!(certificate.times, "strict");
+    assert!(certificate.clock_s > 0, "by its own clock");
+    // And: who says nothing of it is of an older version, which is not the same as open
+    let mut bytes = encode(&said(&open)).to_vec();
+    let key = b"security";
+    let at = bytes.windows(key.len()).position(|window| window == key).expect("a field of the map");
+    bytes[at] = b'x';
+    let older: NodeReport = decode(&bytes).expect("unknown fields are skipped");
+    assert_eq!(older.security, None);
 }
 
 #[test]

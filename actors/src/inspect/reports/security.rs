@@ -1,0 +1,25 @@
+//! How a node proves itself to others.
+
+use serde::{Deserialize, Serialize};
+
+/// Whether a node is secured or open, and who can reach it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SecurityReport {
+    /// Whether it looks for nodes beyond its own host (`ndl.interface`): if it is open, anybody there can pose as any node.
+    pub is_beyond_host: bool,
+    /// What it proves itself with (`security.keys`); `None`: it is open.
+    pub certificate: Option<CertificateReport>,
+}
+
+/// When a node's own certificate counts. Seconds since 1970-01-01, UTC.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct CertificateReport {
+    /// Its first second.
+    pub from_s: u64,
+    /// Its last one.
+    pub until_s: u64,
+    /// The node's own clock. It is not set where it says an earlier time than `from_s`.
+    pub clock_s: u64,
+    /// What the times of certificates are good for there (`security.times`): `strict`, `until-set` or `ignored`.
+    pub times: String,
+}
