@@ -360,7 +360,10 @@ fn check_panics(unwinds: bool, accepted: bool) -> Result<(), StartError> {
 
 #[cfg(test)]
 mod tests {
+    use std::{net::Ipv4Addr, sync::Mutex, time::Duration};
+
     use super::*;
+    use crate::security::tests::ground::{self, Authority};
 
     #[test]
     fn a_program_that_aborts_on_panic_has_no_node_unless_that_is_accepted() {
@@ -374,6 +377,53 @@ mod tests {
         let refused = Node::builder("hip").configure(secured).start();
         let words = refused.expect_err("there are no keys").to_string();
         assert!(words.contains("security.keys") && words.contains("/there/are/no/keys"), "{words}");
+    }
+
+    #[test]
+    fn a_node_that_is_open_beyond_its_host_says_so_loudly_and_one_that_is_not_says_nothing() {
+        let said = |interface: Ipv4Addr, secured: Option<Secured>| {
+            let mut config = NodeConfig::new("knee");
+            config.ndl.interface = interface.into();
+            let stores = Stores::for_test(config, Incarnation(1));
+            logged(|| secure(&stores, secured))
+        };
+        let network = Ipv4Addr::new(192, 0, 2, 7);
+        let words = said(network, None);
+        assert!(
+            ["WARN", "this node is OPEN", "192.0.2.7", "sinew keys init", "security.keys"]
+                .iter()
+                .all(|word| words.contains(word)),
+            "{words:?}"
+        );
+        assert_eq!(said(Ipv4Addr::LOCALHOST, None), "");
+        let credentials = Authority::new("walker").credentials("knee", 7);
+        let own = Secured::new(ground::tls(&credentials), &credentials, 8, Incarnation(1));
+        assert_eq!(said(network, Some(own)), "");
+    }
+
+    /// What this says in the log.
+    fn logged(say: impl FnOnce()) -> String {
+        let written = Written::default();
+        let to = written.clone();
+        let reader = tracing_subscriber::fmt().with_writer(move || to.clone()).with_ansi(false).finish();
+        tracing::subscriber::with_default(reader, say);
+        log::flush(Duration::from_secs(20));
+        String::from_utf8(written.0.lock().expect("nobody panics with it").clone()).expect("text")
+    }
+
+    /// Where a log is written to.
+    #[derive(Clone, Default)]
+    struct Written(Arc<Mutex<Vec<u8>>>);
+
+    impl std::io::Write for Written {
+        fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+            self.0.lock().expect("nobody panics with it").extend(bytes);
+            Ok(bytes.len())
+        }
+
+        fn flush(&mut self) -> std::io::Result<()> {
+            Ok(())
+        }
     }
 
     #[test]
