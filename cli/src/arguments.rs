@@ -31,7 +31,7 @@ pub(crate) struct Arguments {
 /// What to show.
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Every node: address, name, life, since when, what connects it, round trip and clock
+    /// Every node: address, name, life, since when, for how many days its keys still count (or OPEN), what connects it, round trip and clock
     Nodes,
     /// Every application: address, name, node, ready or why not
     Apps,
@@ -77,7 +77,7 @@ pub(crate) enum Command {
     /// certificates are on the deny list end.
     Reload,
     /// Whether this machine gives a node what it needs: interfaces, multicast, limits, real-time rights, CPU governor, clock, shared memory,
-    /// sockets; each finding with the command that mends it
+    /// sockets; whether nodes are open to others, and when their certificates end; each finding with the command that mends it
     Doctor {
         /// Interfaces that multicast is tried on, by address or by name, or `all`, with commas between them. Without it: the
         /// `ndl.interface` of the node that lets us in, else 127.0.0.1. What is sent does not leave this machine

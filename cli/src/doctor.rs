@@ -1,16 +1,21 @@
-//! `sinew doctor`: whether this machine gives a node what it needs; each finding with the command that mends it.
+//! `sinew doctor`: whether this machine gives a node what it needs, and whether its nodes are closed to others; each finding with the command
+//! that mends it.
 //!
 //! Every check tries the thing itself where it can, and undoes it.
 
 mod clock;
 mod network;
 mod rights;
+mod security;
 mod sockets;
 
 use std::{net::Ipv4Addr, path::Path, time::Duration};
 
 use serde_json::{Value, json};
-use sinew::config::{Interface, Interfaces};
+use sinew::{
+    config::{Interface, Interfaces},
+    inspect::{AskNode, NodeReport},
+};
 
 use crate::{
     Said,
@@ -41,7 +46,8 @@ impl Check {
 pub(crate) fn show(chosen: Vec<Interface>, socket: Option<&Path>, within: Duration) -> Said {
     let interfaces = network::found();
     let chosen = Some(chosen).filter(|chosen| !chosen.is_empty()).map(Interfaces::from);
-    let chosen = chosen.or_else(|| of_node(socket, within)).unwrap_or_else(|| Ipv4Addr::LOCALHOST.into());
+    let nodes = nodes(socket, within).unwrap_or_default();
+    let chosen = chosen.or_else(|| of_node(nodes.first()?)).unwrap_or_else(|| Ipv4Addr::LOCALHOST.into());
     let mut checks = vec![network::interfaces(&interfaces)];
     checks.extend(network::multicast(&chosen, &interfaces));
     checks.extend([
@@ -55,6 +61,7 @@ pub(crate) fn show(chosen: Vec<Interface>, socket: Option<&Path>, within: Durati
         sockets::leftover(),
         sockets::node(socket),
     ]);
+    checks.extend(security::checks(&nodes));
     let is_fine = checks.iter().all(|check| check.mend.is_none());
     let json = json!({ "checks": checks.iter().map(check_json).collect::<Vec<_>>() });
     let mut table = Table::new(["CHECK", "", "WHAT IS SO"]);
@@ -68,12 +75,22 @@ pub(crate) fn show(chosen: Vec<Interface>, socket: Option<&Path>, within: Durati
     Said { text, json, is_fine }
 }
 
-/// The interfaces at which a node of this machine looks for others.
-fn of_node(socket: Option<&Path>, within: Duration) -> Option<Interfaces> {
+/// What the node that lets us in says, and then every other one of its system that answers; `None` where none lets us in.
+fn nodes(socket: Option<&Path>, within: Duration) -> Option<Vec<NodeReport>> {
     let mut system = System::enter(socket, within).ok()?;
-    let here = system.here();
+    let nodes = system.here().map(|here| {
+        let others = system.ask_all::<AskNode, NodeReport>(&here);
+        let others = others.into_iter().filter(|other| other.node != here.node);
+        let others: Vec<_> = others.filter_map(|other| other.said.ok()).collect();
+        std::iter::once(here).chain(others).collect()
+    });
     system.leave();
-    let chosen: Vec<_> = here.ok()?.interface.split(", ").filter_map(|one| one.parse().ok()).collect();
+    nodes.ok()
+}
+
+/// The interfaces at which this node of this machine looks for others.
+fn of_node(node: &NodeReport) -> Option<Interfaces> {
+    let chosen: Vec<_> = node.interface.split(", ").filter_map(|one| one.parse().ok()).collect();
     (!chosen.is_empty()).then(|| chosen.into())
 }
 

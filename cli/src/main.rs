@@ -14,6 +14,7 @@ mod messagepack;
 mod nodes;
 mod ping;
 mod reload;
+mod security;
 mod send;
 mod system;
 mod table;

@@ -4,14 +4,14 @@ use serde_json::{Value, json};
 use sinew::inspect::{AskNode, LinkReport, LostReport, NodeReport, PeerReport, RouteReport, TroubleReport};
 
 use crate::{
-    Said,
+    Said, security,
     system::{Answer, Fault, System},
     table::{Table, clean, or_dash, time},
     why::lost_in_words,
 };
 
 /// Columns of the table.
-const COLUMNS: usize = 12;
+const COLUMNS: usize = 13;
 
 /// Asks every node.
 pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
@@ -100,6 +100,7 @@ impl<'a> Row<'a> {
             or_dash(self.life().map(|life| life.to_string())),
             or_dash(said.map(|said| time(said.up_us))),
             self.state().to_owned(),
+            or_dash(said.map(security::cell)),
             self.found_by(),
             self.links(),
             or_dash(self.seen.filter(|seen| seen.is_there).map(routes)),
@@ -121,6 +122,7 @@ impl<'a> Row<'a> {
             "fault": said.err(),
             "up_us": said.ok().map(|said| said.up_us),
             "pid": said.ok().map(|said| said.pid),
+            "security": said.ok().map(security::json),
             "version": said.ok().map(|said| &said.version),
             "refused": said.ok().map(|said| said.refused),
             "found_us": seen.and_then(|seen| seen.found_us),
@@ -171,6 +173,7 @@ fn lost_cells(lost: &LostReport) -> [String; COLUMNS] {
         life,
         dash(),
         "lost".to_owned(),
+        dash(),
         found_by,
         dash(),
         dash(),
@@ -215,6 +218,7 @@ fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport]) -> String {
         "LIFE",
         "UP",
         "STATE",
+        "KEYS",
         "FOUND BY",
         "LINKS",
         "ROUTES",

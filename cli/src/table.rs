@@ -35,6 +35,12 @@ pub(crate) fn clean(text: &str) -> String {
     text.chars().map(|sign| if sign.is_control() { '?' } else { sign }).collect()
 }
 
+/// One word for the shell.
+pub(crate) fn quoted(word: &str) -> String {
+    let is_plain = |sign: char| sign.is_ascii_alphanumeric() || "/._-".contains(sign);
+    if word.chars().all(is_plain) { word.to_owned() } else { format!("'{}'", word.replace('\'', r"'\''")) }
+}
+
 /// A time in the unit that suits it, from microseconds.
 pub(crate) fn time(micros: u64) -> String {
     let seconds = micros / 1_000_000;

@@ -11,13 +11,12 @@ use super::{
 };
 use crate::{
     Said,
-    table::{Table, clean},
+    security::SOON_S,
+    table::{Table, clean, quoted},
 };
 
 /// Where a node's directory is on its machine, unless somebody decides otherwise.
 const INSTALLED: &str = "/etc/sinew/keys";
-/// A node without a certificate for at least this time is a finding: 30 days.
-const SOON: u64 = 30 * 24 * 3_600;
 
 /// Of `init` and `issue`.
 pub(super) fn made(made: &Made, wanted: &[Wanted]) -> Said {
@@ -147,12 +146,6 @@ fn configuration(made: &Made, issued: &Issued) -> String {
     )
 }
 
-/// One word for the shell.
-fn quoted(word: &str) -> String {
-    let is_plain = |sign: char| sign.is_ascii_alphanumeric() || "/._-".contains(sign);
-    if word.chars().all(is_plain) { word.to_owned() } else { format!("'{}'", word.replace('\'', r"'\''")) }
-}
-
 /// Of `revoke`.
 pub(super) fn revoked(revoked: &Revoked, directory: &Path) -> Said {
     let mut text = String::new();
@@ -223,7 +216,7 @@ impl State {
             Self::NotYet
         } else if !issued.is_current {
             Self::Older
-        } else if validity.until.as_secs() - now.as_secs() < SOON {
+        } else if validity.until.as_secs() - now.as_secs() < SOON_S {
             Self::EndsSoon
         } else {
             Self::Good

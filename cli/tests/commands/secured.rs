@@ -9,9 +9,15 @@ use crate::scenario::{Scenario, named, sinew};
 
 /// Keys of a project of their own, in this directory of the test's.
 fn make_keys(scenario: &Scenario, directory: &str, nodes: &[&str]) {
+    make_keys_for(scenario, directory, "365", nodes);
+}
+
+/// For so many days.
+fn make_keys_for(scenario: &Scenario, directory: &str, days: &str, nodes: &[&str]) {
     let out = scenario.directory.join(directory);
     let out = out.to_str().expect("a path of the test's own");
-    let answer = sinew(&[&["keys", "init", "cli", "--out", out], nodes].concat(), Path::new("/"));
+    let init = ["keys", "init", "cli", "--days", days, "--out", out];
+    let answer = sinew(&[&init, nodes].concat(), Path::new("/"));
     assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
 }
 
@@ -65,4 +71,52 @@ fn a_node_that_is_killed_is_found_again_in_its_next_life() {
         let mut knee = secured(&scenario, "keys", "knee", 2, &[]);
         knee.wait_for(&["count"]);
     }
+}
+
+#[test]
+fn the_doctor_and_the_list_of_nodes_say_who_is_open_and_when_a_certificate_ends() {
+    // Given: a node without keys, one with keys for a year, and one with keys for ten days
+    let scenario = Scenario::new();
+    make_keys(&scenario, "keys", &["hip=127.0.0.1"]);
+    make_keys_for(&scenario, "short", "10", &["knee=127.0.0.2"]);
+    let _nodes = [
+        secured(&scenario, "keys", "hip", 1, &[]),
+        secured(&scenario, "short", "knee", 2, &[]),
+        scenario.start("spy", 3, &[]),
+    ];
+    // When
+    let security = |name: &str| {
+        let said = scenario.sinew(name, &["doctor", "--json"]).json();
+        let checks = said["checks"].as_array().expect("a list");
+        checks.iter().find(|check| check["check"] == "security").expect("it is there").clone()
+    };
+    let listed = |name: &str| {
+        let said = scenario.sinew(name, &["nodes", "--json"]).json();
+        named(&said["nodes"], name).expect("itself")["security"].clone()
+    };
+    // Then: whole days, of which the first has begun
+    let (hip, knee, spy) = (security("hip"), security("knee"), security("spy"));
+    assert!(
+        hip["fine"] == true && hip["seen"].as_str().is_some_and(|seen| seen.contains("(364 days)")),
+        "{hip}"
+    );
+    assert!(
+        knee["fine"] == false && knee["seen"].as_str().is_some_and(|seen| seen.contains("(9 days)")),
+        "{knee}"
+    );
+    assert!(knee["mend"].as_str().is_some_and(|mend| mend.contains("sinew keys issue knee")), "{knee}");
+    assert!(
+        spy["fine"] == true && spy["seen"].as_str().is_some_and(|seen| seen.starts_with("open")),
+        "{spy}"
+    );
+    let (hip, knee, spy) = (listed("hip"), listed("knee"), listed("spy"));
+    assert_eq!((&hip["state"], &hip["certificate"]["days_left"]), (&"secured".into(), &364.into()), "{hip}");
+    assert_eq!(
+        (&knee["state"], &knee["certificate"]["days_left"]),
+        (&"ends soon".into(), &9.into()),
+        "{knee}"
+    );
+    assert_eq!((&spy["secured"], &spy["beyond_host"]), (&false.into(), &false.into()), "{spy}");
+    let table = scenario.sinew("hip", &["nodes"]).out;
+    assert!(table.contains("KEYS") && table.contains("364 d"), "{table}");
 }

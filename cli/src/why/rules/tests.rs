@@ -56,6 +56,7 @@ fn report(number: u8, name: &str, other: u8) -> NodeReport {
         version: "0".to_owned(),
         stopping: false,
         refused: 0,
+        security: None,
         project: "leg".to_owned(),
         interface: node(number).to_string(),
         udp: Some(format!("{}:7000", node(number))),
