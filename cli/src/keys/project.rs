@@ -70,6 +70,8 @@ pub(super) struct Made {
 pub(super) struct Revoked {
     pub(super) now: Vec<Issued>,
     pub(super) before: Vec<Issued>,
+    /// What those nodes have that are left: the list has to come to them.
+    pub(super) left: Vec<Issued>,
 }
 
 /// What is in a directory of keys.
@@ -237,12 +239,14 @@ impl Project {
         let added: String = new.iter().map(line).collect();
         let end = if text.is_empty() || text.ends_with('\n') { "" } else { "\n" };
         let text = format!("{text}{end}{added}");
-        DenyList::read(&text).map_err(|why| fault(&self.directory.join(DENIED), why, "correct it"))?;
+        let list =
+            DenyList::read(&text).map_err(|why| fault(&self.directory.join(DENIED), why, "correct it"))?;
         put(&self.directory, DENIED, Readers::All, text.as_bytes())?;
         for node in inside(&self.directory.join(NODES))?.iter().filter(|path| path.is_dir()) {
             put(node, DENIED, Readers::All, text.as_bytes())?;
         }
-        Ok(Revoked { now: new, before })
+        let left = all.into_iter().filter(|one| one.is_current && !list.has(one.serial())).collect();
+        Ok(Revoked { now: new, before, left })
     }
 
     /// What is in a project's directory, or in a node's.

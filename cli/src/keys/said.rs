@@ -126,11 +126,14 @@ fn is_here(issued: &Issued) -> bool {
 
 /// What copies a node's directory to its machine, over one that is there, for root whoever made it; `None` where it stays.
 fn copy(made: &Made, issued: &Issued) -> Option<String> {
-    let from = quoted(&directory_of(made, issued));
-    let host = issued.identity.address;
     let unpack = format!("mkdir -p {INSTALLED} && tar -C {INSTALLED} -xp --no-same-owner");
-    let line = format!("  tar -C {from} -c . | ssh root@{host} '{unpack}'\n");
-    (!is_here(issued)).then_some(line)
+    sent(&directory_of(made, issued), ".", issued, &unpack)
+}
+
+/// What has `what` of this directory unpacked on the node's machine; `None` where that is this one.
+fn sent(directory: &str, what: &str, issued: &Issued, unpack: &str) -> Option<String> {
+    let (from, host) = (quoted(directory), issued.identity.address);
+    (!is_here(issued)).then(|| format!("  tar -C {from} -c {what} | ssh root@{host} '{unpack}'\n"))
 }
 
 /// What the node's configuration needs. Texts of JSON are texts of TOML.
@@ -164,11 +167,19 @@ pub(super) fn revoked(revoked: &Revoked, directory: &Path) -> Said {
         list.display(),
         directory.join("nodes").display()
     );
+    let unpack = format!("tar -C {INSTALLED} -xp --no-same-owner");
+    let shown = directory.display().to_string();
+    let copies = revoked.left.iter().filter_map(|issued| sent(&shown, "denied.txt", issued, &unpack));
+    let copies: Vec<_> = copies.collect();
+    if !copies.is_empty() {
+        let _ = write!(text, "\nTo the nodes that are left, for example:\n{}", copies.concat());
+    }
     let json = json!({
         "revoked": revoked.now.iter().map(issued_json).collect::<Vec<_>>(),
         "revoked_before": revoked.before.iter().map(issued_json).collect::<Vec<_>>(),
         "copy": list,
         "to": format!("{INSTALLED}/denied.txt"),
+        "nodes": revoked.left.iter().map(issued_json).collect::<Vec<_>>(),
     });
     Said { text, json, is_fine: true }
 }

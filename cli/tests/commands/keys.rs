@@ -296,6 +296,22 @@ fn who_is_revoked_is_on_every_list_and_seen() {
 }
 
 #[test]
+fn revoke_says_how_the_list_comes_to_each_node_that_is_left() {
+    let directory = OwnDirectory::new();
+    good(&directory, &["init", "walker", "hip=10.0.0.2", "knee=10.0.0.3", "ankle=127.0.0.4"]);
+    let answer = keys(&directory, &["revoke", "hip"]);
+    let line = "  tar -C keys -c denied.txt | ssh root@10.0.0.3 'tar -C /etc/sinew/keys -xp --no-same-owner'";
+    let copies: Vec<_> = answer.out.lines().filter(|line| line.contains("ssh")).collect();
+    // Not to the one that was revoked, and not to one of this machine, which has its directory here.
+    assert_eq!(copies, [line], "{}", answer.out);
+    // And: a node that has a new certificate is left, too
+    good(&directory, &["issue", "hip=10.0.0.2"]);
+    let answer = keys(&directory, &["revoke", "knee"]);
+    let copies: Vec<_> = answer.out.lines().filter(|line| line.contains("ssh")).collect();
+    assert!(copies.len() == 1 && copies[0].contains("root@10.0.0.2"), "{}", answer.out);
+}
+
+#[test]
 fn show_tells_who_has_what_until_when_also_on_the_robot() {
     let directory = OwnDirectory::new();
     good(&directory, &["init", "walker", "hip=10.0.0.2"]);
