@@ -36,6 +36,7 @@ use self::{
     keys::{Keys, Who},
     robot::Robot,
     stranger::Stranger,
+    tried::Recording,
 };
 use crate::{DEADLINE, Host, Hosts};
 
@@ -48,10 +49,13 @@ const NEWCOMER: usize = 3;
 pub const GROWTH_MAX: u64 = 64 << 20;
 /// How much slower live traffic may be at its 99th percentile.
 pub const SLOWER_MAX: f64 = 2.0;
-/// Of the answers in each second before an attack, so many are still given while it lasts: fewer is no service, on any machine.
-pub const ANSWERED_MIN: f64 = 0.02;
-/// Below this the 99th percentile says more of the machine than of the node.
-const P99_FLOOR: Duration = Duration::from_micros(200);
+/// Of the answers in each second before an attack, so many are still given while it lasts: fewer is no service, on any machine, however many
+/// others share it. How much live traffic feels is said by the 99th percentile, which counts on a machine at rest.
+pub const ANSWERED_MIN: f64 = 0.1;
+/// Share of the questions that may be late before an attack, on a machine at rest: with more of them the ratio of times says nothing.
+pub const LATE_AT_REST: f64 = 0.01;
+/// Connections that a node begins to one that comes: a dial, one that crosses the other's (GNCL-4), and two side connections (GNCL-14).
+const DIALS_OF_A_NEWCOMER: u64 = 4;
 /// Nodes settle for so long before they are measured.
 const SETTLING: Duration = Duration::from_secs(1);
 /// Time between two looks at memory, and between two honest peers by hand.
@@ -78,10 +82,12 @@ struct Attack {
     tried: &'static str,
     /// Descriptors of the attacked node; `None`: as many as the system allows.
     descriptors: Option<u32>,
-    /// The attacker hears the robot's datagrams before it begins.
+    /// The attacker hears the robot's datagrams before it begins; meanwhile `ankle` comes and goes, and the attacked node is started again.
     records: bool,
     /// Others want to come in meanwhile.
     others_come: bool,
+    /// He is a process of the attacked node's host: what that one dials is his doing, too.
+    inside: bool,
     /// In whose name he may speak: his own.
     own: Who,
     /// Does it until the scene is over.
@@ -115,7 +121,7 @@ struct Scene<'a> {
     program: &'a PathBuf,
     lasts: Duration,
     /// Datagrams of the robot that the attacker has heard before.
-    recorded: Vec<Vec<u8>>,
+    recorded: Recording,
     over: &'a AtomicBool,
 }
 
@@ -209,13 +215,18 @@ fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
     let keys = Keys::make();
     let mut robot = Robot::start(&plan.program, hosts, &keys, attack.descriptors);
     thread::sleep(SETTLING);
-    let recorded = if attack.records { hosts[ATTACKER].run(|| tried::record(&robot)) } else { Vec::new() };
-    let refused_before = robot.refused();
+    let mut recorded = Recording::default();
+    if attack.records {
+        (robot, recorded) = record(robot, hosts);
+        thread::sleep(SETTLING);
+    }
+    let (refused_before, seen_before) = (robot.refused(), robot.seen());
     robot.window();
     thread::sleep(plan.lasts);
     let before = robot.window();
+    let dials_before = robot.dials();
     let (held_before, over) = (robot.held_bytes(), AtomicBool::new(false));
-    let (mut held_most, mut came) = (held_before, None);
+    let (mut held_most, mut came, mut dials) = (held_before, None, dials_before);
     let scene = Scene {
         robot: &robot,
         keys: &keys,
@@ -242,6 +253,8 @@ fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
             held_most = held_most.max(robot.held_bytes());
             thread::sleep(LOOK);
         }
+        // Who goes is dialled again until it is lost: that is no attacker's doing.
+        dials = robot.dials();
         drop(ankle);
         over.store(true, Ordering::Relaxed);
         let happened = attacking.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
@@ -258,12 +271,31 @@ fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
         answers_again: robot.answers_again(),
         growth: held_most.saturating_sub(held_before),
         refused: since(&refused_before, robot.refused()),
-        seen: robot.seen(),
+        seen: robot.seen_since(&seen_before),
+        dials: [0, 1].map(|node| dials[node] - dials_before[node]),
+        lasted: plan.lasts,
         came,
         by_hand,
     };
     robot.end();
     Row::of(attack, outcome)
+}
+
+/// What the robot says of discovery while `ankle` comes and goes, and the attacked node goes and comes again.
+fn record(robot: Robot, hosts: &[Host]) -> (Robot, Recording) {
+    let over = AtomicBool::new(false);
+    thread::scope(|scope| {
+        let _ends = EndsIt(&over);
+        let (group, over) = (robot.group(), &over);
+        let hearing = scope.spawn(move || hosts[KNEE].run(|| tried::listen(group, over)));
+        let ankle = robot.start_newcomer(&hosts[NEWCOMER]);
+        thread::sleep(SETTLING);
+        ankle.end();
+        let robot = robot.with_knee_anew(&hosts[KNEE]);
+        over.store(true, Ordering::Relaxed);
+        let recorded = hearing.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+        (robot, recorded)
+    })
 }
 
 /// How much was refused since then.

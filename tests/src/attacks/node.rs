@@ -7,7 +7,7 @@ use std::{
         Arc, Mutex, MutexGuard, PoisonError,
         atomic::{AtomicBool, Ordering},
     },
-    time::Instant,
+    time::{Duration, Instant},
 };
 
 use sinew::{NodeAddress, Sender, prelude::*};
@@ -21,7 +21,7 @@ use crate::{
 
 /// The name of the application that answers.
 pub(super) const ECHO: &str = "echo";
-/// Time between two questions.
+/// Time between the moments at which two questions are due.
 const PACE: Duration = Duration::from_millis(1);
 
 /// How long another answer may take when the attack is over, on a machine that is shared.
@@ -48,29 +48,56 @@ impl Echo {
 }
 
 /// What was measured since the last time that somebody asked for it.
+///
+/// A question is due each [`PACE`], whether the one before has its answer or not, and its answer is timed from then on: what waits behind a
+/// silence has waited, too.
 struct Measured {
     since: Instant,
     times: Times,
     failed: u64,
-    /// When the question was asked that has no answer yet.
-    open: Option<Instant>,
+    /// Questions that were asked more than a pace after they were due, because the one before had no answer.
+    late: u64,
+    /// When the oldest question was due that has no answer yet.
+    due: Instant,
     /// Answers in all.
     answers: u64,
 }
 
 impl Measured {
-    fn new() -> Self {
-        Self { since: Instant::now(), times: Times::default(), failed: 0, open: None, answers: 0 }
+    fn new(now: Instant) -> Self {
+        Self { since: now, times: Times::default(), failed: 0, late: 0, due: now, answers: 0 }
     }
 
-    /// `COUNT FAILED P50 P99 MAX LASTED`, times in nanoseconds. A question that waits for its answer is among the longest: else silence
-    /// would look like no traffic at all.
-    fn window(&mut self) -> String {
-        let (times, failed) = (std::mem::take(&mut self.times), std::mem::take(&mut self.failed));
-        let lasted = std::mem::replace(&mut self.since, Instant::now()).elapsed().as_nanos();
+    /// The question that was due has been asked.
+    fn asked(&mut self, now: Instant) {
+        self.late += u64::from(now.saturating_duration_since(self.due) > PACE);
+    }
+
+    /// It has its answer, or will never have one. Of those that were due before this window began none is asked any more: they were counted there.
+    fn ended(&mut self, now: Instant, is_answered: bool) {
+        if is_answered {
+            self.times.note(now.saturating_duration_since(self.due));
+            self.answers += 1;
+        } else {
+            self.failed += 1;
+        }
+        self.due = (self.due + PACE).max(self.since);
+    }
+
+    /// `COUNT FAILED LATE WAITING P50 P99 MAX LASTED`, times in nanoseconds. Questions that were due and have no answer count with the time
+    /// that they have waited: else silence would look like no traffic at all.
+    fn window(&mut self, now: Instant) -> String {
+        let mut times = std::mem::take(&mut self.times);
+        let (count, mut due) = (times.count(), self.due);
+        while due < now {
+            times.note(now - due);
+            due += PACE;
+        }
+        let waiting = times.count() - count;
+        let (failed, late) = (std::mem::take(&mut self.failed), std::mem::take(&mut self.late));
+        let lasted = (now - std::mem::replace(&mut self.since, now)).as_nanos();
         let [p50, p99, max] = [0.5, 0.99, 1.0].map(|share| times.percentile(share).as_nanos());
-        let max = self.open.map_or(max, |asked| max.max(asked.elapsed().as_nanos()));
-        format!("{} {failed} {p50} {p99} {max} {lasted}", times.count())
+        format!("{count} {failed} {late} {waiting} {p50} {p99} {max} {lasted}")
     }
 }
 
@@ -122,7 +149,7 @@ pub(super) fn play(arguments: &[String]) {
     let sender = key.sender();
     let echo = until("the echo is there", || sender.resolve(ECHO));
     let over = Arc::new(AtomicBool::new(false));
-    let measured = Arc::new(Mutex::new(Measured::new()));
+    let measured = Arc::new(Mutex::new(Measured::new(Instant::now())));
     let asking = asks.then(|| {
         let (over, measured) = (over.clone(), measured.clone());
         std::thread::spawn(move || question(&sender, &over, &measured))
@@ -134,7 +161,7 @@ pub(super) fn play(arguments: &[String]) {
     println!("up");
     for line in std::io::stdin().lock().lines().map_while(Result::ok) {
         match &*line {
-            "window" => println!("{}", lock(&measured).window()),
+            "window" => println!("{}", lock(&measured).window(Instant::now())),
             "again" => println!("{}", u8::from(is_answered(&measured))),
             "seen" => {
                 let counts = lock(&counts);
@@ -181,23 +208,65 @@ fn question(sender: &Sender, over: &AtomicBool, measured: &Mutex<Measured>) {
         if over.load(Ordering::Relaxed) {
             return;
         }
-        let asked = Instant::now();
-        lock(measured).open = Some(asked);
+        let due = lock(measured).due;
+        std::thread::sleep(due.saturating_duration_since(Instant::now()));
+        lock(measured).asked(Instant::now());
         let answer = runtime.block_on(async {
             sender.ask::<Order, Order>(ECHO, &Order { number }, DEADLINE).ok()?.await.ok()
         });
-        let took = asked.elapsed();
-        let mut measured = lock(measured);
-        measured.open = None;
-        match answer {
-            Some(answer) => {
-                assert_eq!(answer.number, number, "the answer to another question");
-                measured.times.note(took);
-                measured.answers += 1;
-            }
-            None => measured.failed += 1,
+        assert!(
+            answer.as_ref().is_none_or(|answer| answer.number == number),
+            "the answer to another question"
+        );
+        lock(measured).ended(Instant::now(), answer.is_some());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn window(measured: &mut Measured, at: Instant) -> Vec<u128> {
+        measured.window(at).split(' ').map(|word| word.parse().expect("a number")).collect()
+    }
+
+    #[test]
+    fn what_waits_behind_a_silence_is_late_and_as_slow_as_it_was_for_who_waited() {
+        // Given: 100 questions, each answered in 100 us, but for the tenth, which takes 50 ms
+        let (begin, quick) = (Instant::now(), Duration::from_micros(100));
+        let mut measured = Measured::new(begin);
+        let mut now = begin;
+        for number in 0..100 {
+            now = now.max(measured.due);
+            measured.asked(now);
+            now += if number == 9 { Duration::from_millis(50) } else { quick };
+            measured.ended(now, true);
         }
-        drop(measured);
-        std::thread::sleep(PACE.saturating_sub(asked.elapsed()));
+        // Then: half of those that it held up waited for 25 ms and more, not one of a hundred
+        let seen = window(&mut measured, now);
+        let [count, failed, late, waiting, _, p99, max, _] = seen[..] else { panic!("{seen:?}") };
+        assert_eq!((count, failed, waiting), (100, 0, 0));
+        assert!((50..60).contains(&late), "{late}");
+        assert_eq!(max, 50_000_000);
+        assert!((45_000_000..50_000_000).contains(&p99), "{p99}");
+    }
+
+    #[test]
+    fn a_silence_that_does_not_end_is_all_that_is_due_in_it_and_the_next_window_begins_anew() {
+        let begin = Instant::now();
+        let mut measured = Measured::new(begin);
+        measured.asked(begin);
+        // When: nothing comes for 20 ms, and the answer 5 ms later
+        let seen = window(&mut measured, begin + PACE * 20);
+        measured.ended(begin + PACE * 25, true);
+        // Then
+        assert_eq!(seen[..4], [0, 0, 0, 20]);
+        assert_eq!((seen[5], seen[6]), (20_000_000, 20_000_000));
+        assert_eq!(measured.due, begin + PACE * 20, "those before were counted");
+        measured.asked(begin + PACE * 25);
+        measured.ended(begin + PACE * 25, false);
+        let seen = window(&mut measured, begin + PACE * 26);
+        // The one that came late, one that failed, and of six that are due one and four that have no answer.
+        assert_eq!(seen[..4], [1, 1, 1, 5]);
     }
 }

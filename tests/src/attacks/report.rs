@@ -5,7 +5,7 @@ use std::{fmt, time::Duration};
 use serde_json::{Value, json};
 
 use super::{
-    ANSWERED_MIN, Attack, GROWTH_MAX, Happened, Knocked, P99_FLOOR, SLOWER_MAX,
+    ANSWERED_MIN, Attack, DIALS_OF_A_NEWCOMER, GROWTH_MAX, Happened, Knocked, LATE_AT_REST, SLOWER_MAX,
     keys::{self, ANKLE},
     robot::{Refused, Seen, Window},
 };
@@ -54,6 +54,7 @@ impl Row {
         outcome.messages(attack.own.host, &mut said, &mut broken);
         outcome.service(&mut broken);
         outcome.refusals(&mut said, &mut broken);
+        outcome.dials(attack.inside, &mut said, &mut broken);
         let Outcome { before, during, growth, .. } = outcome;
         if growth > GROWTH_MAX {
             broken.push(format!("memory grew by {} MiB", growth >> 20));
@@ -62,10 +63,10 @@ impl Row {
         Self { name, tried, happened, before, during, growth, broken }
     }
 
-    /// How much longer 99 of 100 answers took.
+    /// How much longer 99 of 100 answers took, whatever they took before.
     #[must_use]
     pub fn ratio(&self) -> f64 {
-        self.during.p99.as_secs_f64() / self.before.p99.max(P99_FLOOR).as_secs_f64()
+        self.during.p99.as_secs_f64() / self.before.p99.as_secs_f64().max(f64::MIN_POSITIVE)
     }
 
     /// All that has to hold on every machine holds: nobody got in, nobody was lost, memory is bounded.
@@ -74,24 +75,31 @@ impl Row {
         self.broken.is_empty()
     }
 
-    /// Live traffic did not feel it.
+    /// The machine was at rest before it: else times say nothing.
+    #[must_use]
+    pub fn was_at_rest(&self) -> bool {
+        self.before.missed() as f64 <= LATE_AT_REST * self.before.asked() as f64
+    }
+
+    /// Live traffic did not feel it, on a machine that would have shown it.
     #[must_use]
     pub fn is_unfelt(&self) -> bool {
-        self.ratio() <= SLOWER_MAX
+        self.was_at_rest() && self.ratio() <= SLOWER_MAX
     }
 
     fn json(&self) -> Value {
         let window = |window: &Window| {
             let us = |time: Duration| time.as_micros() as u64;
             json!({
-                "answers": window.count, "failed": window.failed, "answers_per_s": window.rate() as u64,
+                "answers": window.count, "failed": window.failed, "late": window.late, "waiting": window.waiting,
+                "answers_per_s": window.rate() as u64,
                 "p50_us": us(window.p50), "p99_us": us(window.p99), "max_us": us(window.max),
             })
         };
         json!({
             "attack": self.name, "tried": self.tried, "happened": self.happened,
             "before": window(&self.before), "during": window(&self.during), "p99_ratio": self.ratio(),
-            "growth_kib": self.growth >> 10, "held": self.has_held(), "unfelt": self.is_unfelt(), "broken": self.broken,
+            "growth_kib": self.growth >> 10, "held": self.has_held(), "at_rest": self.was_at_rest(), "unfelt": self.is_unfelt(), "broken": self.broken,
         })
     }
 }
@@ -114,6 +122,10 @@ pub(super) struct Outcome {
     /// The node that was started in the middle of it, after so long.
     pub(super) came: Option<Duration>,
     pub(super) by_hand: Option<Knocked>,
+    /// Connections that both nodes have begun meanwhile.
+    pub(super) dials: [u64; 2],
+    /// How long it lasted.
+    pub(super) lasted: Duration,
 }
 
 impl Outcome {
@@ -170,6 +182,20 @@ impl Outcome {
         }
     }
 
+    /// Nobody has a node dial whom it would not: one that comes is dialled, and again as seldom as GNCL-8 says.
+    fn dials(&self, inside: bool, said: &mut Vec<String>, broken: &mut Vec<String>) {
+        let most = if self.came.is_some() { DIALS_OF_A_NEWCOMER + dials_again(self.lasted) } else { 0 };
+        let hosts = if inside { 1 } else { 2 };
+        for (dials, name) in self.dials.iter().zip(["hip", "knee"]).take(hosts) {
+            said.push(format!("{name} dialled {dials} times"));
+            if *dials > most {
+                broken.push(format!(
+                    "{name} dialled {dials} times, and {most} is the most that it had reason to"
+                ));
+            }
+        }
+    }
+
     /// The attack reached the node: it counted what it refused.
     fn refusals(&self, said: &mut Vec<String>, broken: &mut Vec<String>) {
         let counted = |cause: &str| self.refused.get(cause).copied().unwrap_or_default();
@@ -206,38 +232,72 @@ impl Report {
     }
 }
 
+/// How often a node dials one again within this time: after 10 ms, then twice that, up to 1 s, each a fifth less by chance (GNCL-8, by default).
+fn dials_again(within: Duration) -> u64 {
+    let (mut wait, mut all, mut dials) = (Duration::from_millis(10), Duration::ZERO, 0);
+    loop {
+        all += wait.mul_f64(0.8);
+        if all > within {
+            return dials;
+        }
+        dials += 1;
+        wait = (wait * 2).min(Duration::from_secs(1));
+    }
+}
+
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
             f,
-            "{:<20} {:>10} {:>10} {:>6} {:>10}  held",
-            "attack", "p99 before", "during", "ratio", "grown"
+            "{:<20} {:>10} {:>10} {:>6} {:>10} {:>14} {:>10}  held",
+            "attack", "p99 before", "during", "ratio", "longest", "missed", "grown"
         )?;
         for row in &self.rows {
             let Row { name, tried, happened, before, during, growth, broken } = row;
             let us = |time: Duration| format!("{} us", time.as_micros());
-            let (before, during, kib) = (us(before.p99), us(during.p99), growth >> 10);
+            let missed = format!("{} of {}", during.missed(), during.asked());
+            let (longest, kib) = (format!("{} ms", during.max.as_millis()), growth >> 10);
             let held = match (row.has_held(), row.is_unfelt()) {
                 (true, true) => "yes",
+                (true, false) if !row.was_at_rest() => "yes, not at rest",
                 (true, false) => "yes, and felt",
                 (false, _) => "NO",
             };
-            writeln!(f, "{name:<20} {before:>10} {during:>10} {:>6.2} {kib:>6} KiB  {held}", row.ratio())?;
             writeln!(
                 f,
-                "    answers in a second: {:.0} before, {:.0} during it, the longest after {} ms",
-                row.before.rate(),
-                row.during.rate(),
-                row.during.max.as_millis()
+                "{name:<20} {:>10} {:>10} {:>6.2} {longest:>10} {missed:>14} {kib:>6} KiB  {held}",
+                us(before.p99),
+                us(during.p99),
+                row.ratio()
+            )?;
+            let [was, is] = [before.rate(), during.rate()];
+            writeln!(
+                f,
+                "    answers in a second: {was:.0} before, {is:.0} during it; before it the longest took {} ms, {} were missed",
+                before.max.as_millis(),
+                before.missed()
             )?;
             writeln!(f, "    tried: {tried}\n    happened: {happened}")?;
             broken.iter().try_for_each(|what| writeln!(f, "    BROKEN: {what}"))?;
         }
         write!(
             f,
-            "limits: p99 {SLOWER_MAX} times that before ({} us at least), memory {} MiB",
-            P99_FLOOR.as_micros(),
+            "A question is due each millisecond, and its answer timed from then on. Missed: asked late, or without an answer at the end.\n\
+             limits: p99 {SLOWER_MAX} times that before, where at most {} % were missed then (at rest), memory {} MiB",
+            LATE_AT_REST * 100.0,
             GROWTH_MAX >> 20
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_node_has_no_reason_to_dial_more_often_than_its_waits_let_it() {
+        // 10, 20, 40 ... 640 ms are 1.27 s, and then one a second, all a fifth less.
+        let [second, ten] = [1, 10].map(|seconds| dials_again(Duration::from_secs(seconds)));
+        assert_eq!((dials_again(Duration::from_millis(7)), second, ten), (0, 6, 18));
     }
 }

@@ -32,11 +32,16 @@ pub struct Window {
     pub count: u64,
     /// Questions without one.
     pub failed: u64,
-    /// Half of the answers took no longer.
+    /// Questions that were asked late, because the one before had no answer.
+    pub late: u64,
+    /// Questions that were due and had no answer at the end.
+    pub waiting: u64,
+    /// Half of the answers took no longer, from the moment on at which their question was due. A question that still has none
+    /// counts as long as it has waited.
     pub p50: Duration,
     /// 99 of 100.
     pub p99: Duration,
-    /// The longest, of a question that still has none as long as it has waited.
+    /// The longest.
     pub max: Duration,
     /// How long all that was measured.
     pub lasted: Duration,
@@ -48,9 +53,21 @@ impl Window {
     pub fn rate(&self) -> f64 {
         self.count as f64 / self.lasted.as_secs_f64().max(f64::MIN_POSITIVE)
     }
+
+    /// Questions that were due.
+    #[must_use]
+    pub const fn asked(&self) -> u64 {
+        self.count + self.waiting + self.failed
+    }
+
+    /// Questions that were not asked in time, or had no answer.
+    #[must_use]
+    pub const fn missed(&self) -> u64 {
+        self.late + self.waiting + self.failed
+    }
 }
 
-/// What a node has seen of others in its life, by the last byte of their addresses.
+/// What a node has seen of others, by the last byte of their addresses.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Seen {
     /// How often each was lost.
@@ -61,11 +78,23 @@ pub(super) struct Seen {
     pub(super) sent: BTreeMap<u8, u64>,
 }
 
+impl Seen {
+    /// What of it was not there before.
+    pub(super) fn since(mut self, before: &Self) -> Self {
+        for (now, before) in
+            [(&mut self.lost, &before.lost), (&mut self.found, &before.found), (&mut self.sent, &before.sent)]
+        {
+            now.iter_mut().for_each(|(node, count)| *count -= before.get(node).copied().unwrap_or_default());
+        }
+        self
+    }
+}
+
 /// What a node refused, for each cause.
 pub(super) type Refused = BTreeMap<String, u64>;
 
 /// A node in its process.
-struct Member {
+pub(super) struct Member {
     performer: Performer,
     /// Nobody but the director reads them; attackers look at the rest of the robot.
     answers: Mutex<Receiver<String>>,
@@ -87,6 +116,23 @@ impl Member {
     fn answer(&self, to: &str) -> String {
         let answer = self.answers.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(DEADLINE);
         answer.unwrap_or_else(|_| panic!("a node did not answer `{to}` within {DEADLINE:?}"))
+    }
+
+    /// Ends it in order.
+    pub(super) fn end(self) {
+        let status = self.performer.end();
+        assert!(status.success(), "a node ended with {status}");
+    }
+
+    /// How often its host has begun a connection since there is one.
+    fn dials(&self) -> u64 {
+        let path = format!("/proc/{}/net/snmp", self.performer.id());
+        let text = std::fs::read_to_string(path).expect("the kernel counts what hosts do");
+        let mut lines = text.lines().filter(|line| line.starts_with("Tcp:"));
+        let [names, counts] = [lines.next(), lines.next()].map(|line| line.unwrap_or_default().split(' '));
+        let (_, count) =
+            names.zip(counts).find(|(name, _)| *name == "ActiveOpens").expect("it counts connections");
+        count.parse().expect("a number")
     }
 
     fn ask(&mut self, question: &str) -> String {
@@ -128,6 +174,7 @@ pub(super) struct Robot {
     group: std::net::SocketAddrV4,
     hip: Member,
     knee: Member,
+    knee_config: PathBuf,
     newcomer_keys: PathBuf,
     echo: Tid,
 }
@@ -139,23 +186,26 @@ impl Robot {
         let config = |who: Who, gncl| configuration(&directory, group, (who, Some(&keys.of(who))), gncl);
         // With as many strangers as are allowed by default, descriptors would never run out.
         let knee_gncl = if descriptors.is_some() { "strangers_max = 1024\n" } else { "" };
-        let knee = as_role(program, &config(keys::KNEE, knee_gncl), &[]);
-        let knee = match descriptors {
-            Some(descriptors) => limited(&knee, descriptors),
-            None => knee,
-        };
-        let mut knee = Member::start(hosts[super::KNEE].moved(&knee));
-        knee.answer("up");
-        let echo = Tid::from_bits(numbers(&knee.ask("tid"))[0]);
+        let knee_config = config(keys::KNEE, knee_gncl);
+        let (knee, echo) = start_knee(program, &hosts[super::KNEE], &knee_config, descriptors);
         let hip =
             Member::start(hosts[super::HIP].moved(&as_role(program, &config(keys::HIP, ""), &["asks"])));
         hip.answer("up");
         let newcomer_keys = keys.of(keys::ANKLE);
-        Self { program: program.to_owned(), directory, group, hip, knee, newcomer_keys, echo }
+        Self { program: program.to_owned(), directory, group, hip, knee, knee_config, newcomer_keys, echo }
+    }
+
+    /// Ends the attacked node in order, and starts its next life; returns when both talk again.
+    pub(super) fn with_knee_anew(self, host: &Host) -> Self {
+        self.knee.end();
+        let (knee, echo) = start_knee(&self.program, host, &self.knee_config, None);
+        let mut robot = Self { knee, echo, ..self };
+        assert!(robot.answers_again(), "the next life of the attacked node gives no answer");
+        robot
     }
 
     /// A node of the robot's that was not there; returns when it has an answer of the attacked one.
-    pub(super) fn start_newcomer(&self, host: &Host) -> impl Sized + use<> {
+    pub(super) fn start_newcomer(&self, host: &Host) -> Member {
         let config = configuration(&self.directory, self.group, (keys::ANKLE, Some(&self.newcomer_keys)), "");
         let ankle = Member::start(host.moved(&as_role(&self.program, &config, &["asks"])));
         ankle.answer("up");
@@ -185,6 +235,17 @@ impl Robot {
         (keys::KNEE.address(), NDL_PORT).into()
     }
 
+    /// Where the other node does.
+    #[expect(clippy::unused_self, reason = "it is the robot's")]
+    pub(super) fn discovery_beside(&self) -> SocketAddr {
+        (keys::HIP.address(), NDL_PORT).into()
+    }
+
+    /// How often each of both has begun a connection, since there is its host.
+    pub(super) fn dials(&self) -> [u64; 2] {
+        [self.hip.dials(), self.knee.dials()]
+    }
+
     pub(super) const fn group(&self) -> std::net::SocketAddrV4 {
         self.group
     }
@@ -201,11 +262,12 @@ impl Robot {
 
     /// What the asking node measured since the last one.
     pub(super) fn window(&mut self) -> Window {
-        let [count, failed, p50, p99, max, lasted] = numbers(&self.hip.ask("window"))[..] else {
-            panic!("six numbers")
+        let [count, failed, late, waiting, p50, p99, max, lasted] = numbers(&self.hip.ask("window"))[..]
+        else {
+            panic!("eight numbers")
         };
         let [p50, p99, max, lasted] = [p50, p99, max, lasted].map(Duration::from_nanos);
-        Window { count, failed, p50, p99, max, lasted }
+        Window { count, failed, late, waiting, p50, p99, max, lasted }
     }
 
     /// Whether a question that is asked from now on is answered in time.
@@ -216,6 +278,12 @@ impl Robot {
     /// What the attacked node refused in its life.
     pub(super) fn refused(&mut self) -> Refused {
         self.knee.refused()
+    }
+
+    /// What both have seen since then.
+    pub(super) fn seen_since(&mut self, before: &[Seen; 2]) -> [Seen; 2] {
+        let [hip, knee] = self.seen();
+        [hip.since(&before[0]), knee.since(&before[1])]
     }
 
     /// What both have seen.
@@ -230,11 +298,21 @@ impl Robot {
 
     /// Ends both in order.
     pub(super) fn end(self) {
-        for member in [self.hip, self.knee] {
-            let status = member.performer.end();
-            assert!(status.success(), "a node ended with {status}");
-        }
+        [self.hip, self.knee].into_iter().for_each(Member::end);
     }
+}
+
+/// The attacked node with so many descriptors, and its application that answers.
+fn start_knee(program: &Path, host: &Host, config: &Path, descriptors: Option<u32>) -> (Member, Tid) {
+    let knee = as_role(program, config, &[]);
+    let knee = match descriptors {
+        Some(descriptors) => limited(&knee, descriptors),
+        None => knee,
+    };
+    let mut knee = Member::start(host.moved(&knee));
+    knee.answer("up");
+    let echo = Tid::from_bits(numbers(&knee.ask("tid"))[0]);
+    (knee, echo)
 }
 
 fn as_role(program: &Path, config: &Path, more: &[&str]) -> Command {

@@ -9,7 +9,7 @@ mod handshakes;
 mod slow_loris;
 mod sources;
 
-pub(super) use datagrams::record;
+pub(super) use datagrams::{Recording, listen};
 
 use super::{
     Attack, Happened, Scene,
@@ -26,6 +26,7 @@ const COMMON: Attack = Attack {
     descriptors: None,
     records: false,
     others_come: false,
+    inside: false,
     own: SPARE,
     run: |_| Happened { what: String::new(), broken: Vec::new(), refused: Vec::new(), own_sent: 0 },
 };
@@ -52,7 +53,8 @@ pub(super) const ATTACKS: &[Attack] = &[
     },
     Attack {
         name: "datagrams",
-        tried: "recorded datagrams of discovery sent again, and with a bit changed, and made up",
+        tried: "all that three nodes said in discovery, to the group and to each other, sent again: of lives that are over, of those that last; \
+                with a bit changed; and made up",
         records: true,
         others_come: true,
         run: datagrams::replayed_and_forged,
@@ -95,6 +97,7 @@ pub(super) const ATTACKS: &[Attack] = &[
     Attack {
         name: "local-client",
         tried: "hostile clients at the node's own door, in all ways that there are (`hostile_client`)",
+        inside: true,
         own: KNEE,
         run: client::at_the_door,
         ..COMMON

@@ -2,7 +2,7 @@
 //!
 //! `cargo run --release -p sinew-tests --bin attacks [-- --only NAME --seconds N --json]`; `--help` names the options. As root.
 //!
-//! Exit code 1: an attack was not held off. 3: all were, and live traffic felt one. 2: no hosts can be made here.
+//! Exit code 1: an attack was not held off. 3: all were, and live traffic felt one, or the machine was not at rest, so that nobody knows. 2: no hosts can be made here.
 
 use std::{process::ExitCode, time::Duration};
 

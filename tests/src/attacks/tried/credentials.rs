@@ -25,8 +25,8 @@ use crate::clients::Performer;
 const PACE: Duration = Duration::from_millis(20);
 
 /// The node's words for who has not proven who he is, and for who has proven to be another one.
-const NOT_PROVEN: &str = "peer not proven";
-const SECURITY: &str = "security";
+pub(super) const NOT_PROVEN: &str = "peer not proven";
+pub(super) const SECURITY: &str = "security";
 
 /// What a node says of every certificate that it reads and does not take: why is for its own log.
 const NOT_TAKEN: AlertDescription = AlertDescription::CertificateUnknown;

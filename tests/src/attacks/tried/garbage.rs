@@ -6,10 +6,17 @@ use std::{
     time::Duration,
 };
 
-use super::{Happened, Scene, datagrams::NOT_OURS};
+use super::{
+    Happened, Scene,
+    credentials::{NOT_PROVEN, SECURITY},
+    datagrams::NOT_OURS,
+};
 use crate::dice::Dice;
 
 const THREADS: usize = 3;
+/// The first bytes of a connection by TLS, and of one that is none.
+const LIKE_TLS: [u8; 3] = [0x16, 3, 1];
+const UNLIKE_TLS: [u8; 1] = [0];
 const PATIENCE: Duration = Duration::from_millis(200);
 /// Bytes of a datagram.
 const DATAGRAM: usize = 1_200;
@@ -18,14 +25,19 @@ pub(super) fn pour(scene: &Scene<'_>) -> Happened {
     let poured = scene.on_threads(THREADS, |number| {
         let mut dice = Dice::new(number as u64 + 1);
         let garbage: Vec<u8> = (0..64 << 10).map(|_| dice.roll() as u8).collect();
-        if number == 0 { by_udp(scene, &garbage) } else { by_tcp(scene, &garbage, &mut dice) }
+        match number {
+            0 => by_udp(scene, &garbage),
+            1 => by_tcp(scene, &LIKE_TLS, &garbage, &mut dice),
+            _ => by_tcp(scene, &UNLIKE_TLS, &garbage, &mut dice),
+        }
     });
     let datagrams = poured[0];
     let bytes: u64 = poured[1..].iter().sum();
     let broken =
         if datagrams == 0 || bytes == 0 { vec!["nothing was poured".to_owned()] } else { Vec::new() };
     Happened {
-        refused: vec![(NOT_OURS, 1)],
+        // What is no TLS; what looked like it and was none; what is no datagram of the project.
+        refused: vec![(SECURITY, 1), (NOT_PROVEN, 1), (NOT_OURS, 1)],
         ..Happened::new(
             format!("{} MiB by TCP, {datagrams} datagrams of {DATAGRAM} bytes", bytes >> 20),
             broken,
@@ -44,8 +56,8 @@ fn by_udp(scene: &Scene<'_>, garbage: &[u8]) -> u64 {
     sent
 }
 
-/// Returns the bytes.
-fn by_tcp(scene: &Scene<'_>, garbage: &[u8], dice: &mut Dice) -> u64 {
+/// Begins each connection so. Returns the bytes.
+fn by_tcp(scene: &Scene<'_>, first: &[u8], garbage: &[u8], dice: &mut Dice) -> u64 {
     let mut bytes = 0;
     while !scene.is_over() {
         let Ok(mut socket) = TcpStream::connect_timeout(&scene.robot.knee(), PATIENCE) else { continue };
@@ -53,9 +65,8 @@ fn by_tcp(scene: &Scene<'_>, garbage: &[u8], dice: &mut Dice) -> u64 {
         if socket.set_write_timeout(Some(PATIENCE)).is_err() {
             continue;
         }
-        // Half of them look as TLS does at first.
         let at = dice.roll() as usize % 1_024;
-        if dice.once_in(2) && socket.write_all(&[0x16, 3, 1]).is_err() {
+        if socket.write_all(first).is_err() {
             continue;
         }
         while !scene.is_over() && socket.write_all(&garbage[at..]).is_ok() {
