@@ -2,8 +2,9 @@
 
 mod faults;
 mod real_time;
+mod secured;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::mpsc::sync_channel;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -29,8 +30,14 @@ fn folder(name: &str) -> PathBuf {
 /// Starts the program. A leg at 1 kHz does not walk where compilers come first, so it comes before them, as on a robot:
 /// by the priority of the thread that starts it, where that is granted.
 fn start(arguments: &[&str]) -> Child {
+    start_in(Path::new("."), arguments)
+}
+
+/// The same in this directory.
+fn start_in(directory: &Path, arguments: &[&str]) -> Child {
     let mut command = Command::new(PROGRAM);
-    command.args(arguments).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    command.args(arguments).current_dir(directory);
+    command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
     let started = std::thread::spawn(move || {
         let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::RoundRobin);
         let priority = ThreadPriority::Crossplatform(1.try_into().expect("1 is one of 0 to 99"));

@@ -1,0 +1,54 @@
+//! The secured robot, by the README's own words: keys for all nodes, and the robot that takes nobody without them.
+
+use std::{path::Path, process::Command};
+
+use crate::{alone, end, folder, start_in};
+
+const README: &str = include_str!("../../../../README.md");
+
+/// What stands behind this on a line of the README.
+fn words_behind(command: &str) -> Vec<&'static str> {
+    let mut found = README.lines().filter_map(|line| line.trim().strip_prefix(command));
+    let words = found.next().unwrap_or_else(|| panic!("the README has no line with `{command}`"));
+    words.split_whitespace().collect()
+}
+
+/// `sinew`, which another package builds into the same directory.
+fn sinew(directory: &Path, words: &[&str]) -> std::process::Output {
+    let test = std::env::current_exe().expect("a test has a path");
+    let program =
+        test.parent().and_then(Path::parent).expect("it lies in deps/ of the profile's").join("sinew");
+    assert!(program.exists(), "there is no {}; build it: cargo build -p sinew-cli", program.display());
+    Command::new(program).args(words).current_dir(directory).output().expect("the command starts")
+}
+
+#[test]
+fn robot_with_the_keys_that_the_readme_makes_walks_and_without_them_it_does_not_start() {
+    let _alone = alone();
+    let folder = folder("secured");
+    let init = words_behind("cargo run --release -p sinew-cli -- keys init ");
+    let robot = words_behind("cargo run --release -p exoskeleton -- --keys ");
+    let robot = [&["--strides", "8", "--keys"], &robot[..]].concat();
+
+    // Given: no keys yet
+    let refused = end(start_in(&folder, &robot), "the robot is refused");
+    let words = String::from_utf8_lossy(&refused.stderr);
+    assert!(
+        !matches!(refused.status.code(), Some(0 | 3)),
+        "it walked without the keys that it was to have: {words}"
+    );
+    assert!(words.contains("keys"), "{words}");
+
+    // When
+    let made = sinew(&folder, &[&["keys", "init"], &init[..]].concat());
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let output = end(start_in(&folder, &robot), "the walk ends");
+
+    // Then
+    let told = String::from_utf8_lossy(&output.stdout);
+    let failed = String::from_utf8_lossy(&output.stderr);
+    assert!(told.contains("stride 8 of 8"), "{told}\n{failed}");
+    // Whether limits hold depends on the machine; that it walked does not.
+    assert!(matches!(output.status.code(), Some(0 | 3)), "{:?}\n{told}\n{failed}", output.status);
+    std::fs::remove_dir_all(&folder).expect("the folder of this test");
+}
