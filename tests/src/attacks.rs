@@ -220,11 +220,10 @@ fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
         (robot, recorded) = record(robot, hosts);
         thread::sleep(SETTLING);
     }
-    let (refused_before, seen_before) = (robot.refused(), robot.seen());
     robot.window();
     thread::sleep(plan.lasts);
     let before = robot.window();
-    let dials_before = robot.dials();
+    let (refused_before, seen_before, dials_before) = (robot.refused(), robot.seen(), robot.dials());
     let (held_before, over) = (robot.held_bytes(), AtomicBool::new(false));
     let (mut held_most, mut came, mut dials) = (held_before, None, dials_before);
     let scene = Scene {
