@@ -272,7 +272,6 @@ fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
         refused: since(&refused_before, robot.refused()),
         seen: robot.seen_since(&seen_before),
         dials: [0, 1].map(|node| dials[node] - dials_before[node]),
-        lasted: plan.lasts,
         came,
         by_hand,
     };

@@ -124,8 +124,6 @@ pub(super) struct Outcome {
     pub(super) by_hand: Option<Knocked>,
     /// Connections that both nodes have begun meanwhile.
     pub(super) dials: [u64; 2],
-    /// How long it lasted.
-    pub(super) lasted: Duration,
 }
 
 impl Outcome {
@@ -184,7 +182,8 @@ impl Outcome {
 
     /// Nobody has a node dial whom it would not: one that comes is dialled, and again as seldom as GNCL-8 says.
     fn dials(&self, inside: bool, said: &mut Vec<String>, broken: &mut Vec<String>) {
-        let most = if self.came.is_some() { DIALS_OF_A_NEWCOMER + dials_again(self.lasted) } else { 0 };
+        let most =
+            if self.came.is_some() { DIALS_OF_A_NEWCOMER + dials_again(self.during.lasted) } else { 0 };
         let hosts = if inside { 1 } else { 2 };
         for (dials, name) in self.dials.iter().zip(["hip", "knee"]).take(hosts) {
             said.push(format!("{name} dialled {dials} times"));
