@@ -1,0 +1,343 @@
+//! Each class of error of IEC 61784-3's table, injected between a sender and a receiver that are in order: every one is found, none is
+//! applied. `--nocapture` shows a line for each class.
+
+use proptest::{
+    prelude::{Rng, RngExt},
+    test_runner::{RngAlgorithm, TestRng},
+};
+
+use super::*;
+
+/// Trials of each class of error; 100,000 in a release build.
+const TRIALS: u32 = if cfg!(debug_assertions) { 10_000 } else { 100_000 };
+
+/// What has to be true behind an error.
+#[derive(Clone, Copy)]
+enum Aftermath {
+    /// It was borne: the next command is applied.
+    Live,
+    /// The output is safe for this: the next command is not applied, and is after eight good ones and a hand that arms.
+    Safe(Cause),
+}
+
+/// What came of one class of errors.
+#[derive(Debug, Default, PartialEq, Eq)]
+struct Figures {
+    /// Commands that were applied just before an error: so nothing but the error kept it from being applied.
+    good_before: u32,
+    injected: u32,
+    detected: u32,
+    applied: u32,
+    /// Trials that ended as their [`Aftermath`] says.
+    good_after: u32,
+}
+
+/// One error, in a bench whose output is live.
+struct Trial<'a> {
+    bench: Bench,
+    figures: &'a mut Figures,
+}
+
+impl Trial<'_> {
+    /// The error, by the way of all messages.
+    fn inject(&mut self, bytes: &Bytes, expected: Fault) {
+        let before = self.bench.applied.len();
+        let verdict = self.bench.take(bytes);
+        let applied = self.bench.applied.len() - before;
+        self.count(verdict == Verdict::Refused(expected), applied);
+    }
+
+    fn count(&mut self, is_detected: bool, applied: usize) {
+        self.figures.injected += 1;
+        self.figures.detected += u32::from(is_detected);
+        self.figures.applied += u32::try_from(applied).expect("one message was taken");
+    }
+
+    fn ends_as(&mut self, aftermath: Aftermath) -> bool {
+        let is_right = match aftermath {
+            Aftermath::Live => self.bench.applies_the_next(),
+            Aftermath::Safe(cause) => {
+                let is_safe = self.bench.receiver.state() == State::Safe(cause);
+                let message = self.bench.next();
+                let is_held = self.bench.take(&message) == Verdict::Hold;
+                let is_shut = self.bench.receiver.arm(self.bench.now).is_err();
+                is_safe && is_held && is_shut && {
+                    self.bench.come_alive();
+                    self.bench.applies_the_next()
+                }
+            }
+        };
+        // What is applied is what was sent, once, in order.
+        is_right && self.bench.applied.windows(2).all(|two| two[0] < two[1])
+    }
+}
+
+/// Runs all trials of a class.
+fn inject(
+    class: &str,
+    protection: Protection,
+    aftermath: Aftermath,
+    error: impl Fn(&mut Trial<'_>, &mut TestRng),
+) {
+    let mut rng = TestRng::deterministic_rng(RngAlgorithm::ChaCha);
+    let mut figures = Figures::default();
+    for _ in 0..TRIALS {
+        let mut trial = Trial { bench: Bench::live_of(protection), figures: &mut figures };
+        let are_applied = (0..rng.random_range(1..=8)).all(|_| trial.bench.applies_the_next());
+        trial.figures.good_before += u32::from(are_applied);
+        error(&mut trial, &mut rng);
+        let is_good = trial.ends_as(aftermath);
+        figures.good_after += u32::from(is_good);
+    }
+    let Figures { injected, detected, applied, .. } = figures;
+    println!("{class}: {injected} injected, {detected} detected, {applied} applied");
+    let all =
+        Figures { good_before: TRIALS, injected: TRIALS, detected: TRIALS, applied: 0, good_after: TRIALS };
+    assert_eq!(figures, all, "{class}");
+}
+
+/// `message` as somebody else would have sealed it: right in all but what `change` changes.
+fn forged(message: &Bytes, change: impl FnOnce(&mut Codename, &mut Stamp)) -> Bytes {
+    let (mut stamp, payload) = open(&codename(), message).expect("it is the sender's own");
+    let mut codename = codename();
+    change(&mut codename, &mut stamp);
+    seal(&codename, stamp, &payload)
+}
+
+fn any_tid(rng: &mut TestRng) -> Tid {
+    Tid::new(NodeAddress::new(rng.random()), AppAddress::new(rng.random()))
+}
+
+/// Another than `tid`: any, or one that differs from it in one bit.
+fn another(tid: Tid, rng: &mut TestRng) -> Tid {
+    let other = match rng.random() {
+        true => any_tid(rng),
+        false => Tid::from_bits(tid.bits() ^ 1 << rng.random_range(0..64)),
+    };
+    if other == tid { another(tid, rng) } else { other }
+}
+
+fn damaged(whole: &Bytes, rng: &mut TestRng) -> Bytes {
+    let mut bytes = whole.to_vec();
+    match rng.random_range(0..4) {
+        // One to eight bits, anywhere.
+        0 | 1 => {
+            for _ in 0..rng.random_range(1..=8) {
+                let at = rng.random_range(0..bytes.len());
+                bytes[at] ^= 1 << rng.random_range(0..8);
+            }
+        }
+        // A burst.
+        2 => {
+            let from = rng.random_range(0..bytes.len());
+            let to = (from + rng.random_range(1..=64)).min(bytes.len());
+            rng.fill_bytes(&mut bytes[from..to]);
+        }
+        // Cut, or longer than it was.
+        _ if rng.random() => bytes.truncate(rng.random_range(0..bytes.len())),
+        _ => bytes.extend([0; 8]),
+    }
+    // The same bit may have been turned twice.
+    if bytes == *whole { damaged(whole, rng) } else { bytes.into() }
+}
+
+#[test]
+fn corruption_is_detected() {
+    inject("corruption", PROTECTION, Aftermath::Live, |trial, rng| {
+        let whole = trial.bench.next();
+        trial.inject(&damaged(&whole, rng), Fault::Corrupt);
+    });
+}
+
+#[test]
+fn unintended_repetition_is_detected() {
+    inject("unintended repetition", PROTECTION, Aftermath::Live, |trial, rng| {
+        // All of them young enough: nothing but their numbers says that they have come before.
+        let sent: Vec<Bytes> = (0..8)
+            .map(|_| {
+                let message = trial.bench.next();
+                trial.bench.take(&message);
+                message
+            })
+            .collect();
+        let at = rng.random_range(0..sent.len());
+        let expected = if at + 1 == sent.len() { Fault::Repeated } else { Fault::Backwards };
+        trial.inject(&sent[at], expected);
+    });
+}
+
+#[test]
+fn incorrect_sequence_is_detected() {
+    inject("incorrect sequence", PROTECTION, Aftermath::Live, |trial, rng| {
+        // No more than may be missing, so that the one that overtakes them is applied.
+        let mut overtaken = vec![trial.bench.next()];
+        if rng.random() {
+            overtaken.push(trial.bench.seal());
+        }
+        assert!(trial.bench.applies_the_next(), "the one that comes too early is a good one");
+        trial.inject(&overtaken[rng.random_range(0..overtaken.len())], Fault::Backwards);
+    });
+}
+
+#[test]
+fn loss_of_more_than_is_borne_is_detected() {
+    inject("loss", PROTECTION, Aftermath::Safe(Cause::TooMuchLost), |trial, rng| {
+        let lost = rng.random_range(PROTECTION.lost_max + 1..=10);
+        // In the same moment, so that no watchdog says anything.
+        for _ in 0..lost {
+            trial.bench.seal();
+        }
+        let message = trial.bench.next();
+        trial.inject(&message, Fault::Gap);
+    });
+}
+
+#[test]
+fn loss_that_is_borne_is_counted() {
+    inject("loss that is borne", PROTECTION, Aftermath::Live, |trial, rng| {
+        let before = trial.bench.receiver.tally().lost;
+        let lost = rng.random_range(1..=PROTECTION.lost_max);
+        for _ in 0..lost {
+            trial.bench.seal();
+        }
+        assert!(trial.bench.applies_the_next(), "so many may be missing: {lost}");
+        let is_counted = trial.bench.receiver.tally().lost == before + lost;
+        trial.count(is_counted, 0);
+    });
+}
+
+#[test]
+fn loss_of_all_is_detected_at_the_limit_even_if_nobody_looked() {
+    inject("loss of all", PROTECTION, Aftermath::Safe(Cause::Silent), |trial, rng| {
+        let bench = &mut trial.bench;
+        let deadline = bench.receiver.deadline().expect("it is live");
+        assert_eq!(deadline, bench.now + PROTECTION.within);
+        bench.receiver.expire(Time::from_nanos(deadline.as_nanos() - 1));
+        assert_eq!(bench.receiver.state(), State::Live);
+        // The watchdog at its time; or late; or never, and a message comes too late.
+        let is_kept = rng.random();
+        bench.now = deadline;
+        if is_kept {
+            let late = if rng.random() { 0 } else { rng.random_range(1..5_000_000) };
+            bench.now = bench.now + Duration::from_nanos(late);
+            bench.receiver.expire(bench.now);
+        }
+        let is_noticed = bench.receiver.state() == State::Safe(Cause::Silent);
+        let before = bench.applied.len();
+        let late = bench.next();
+        bench.take(&late);
+        let applied = bench.applied.len() - before;
+        let is_safe = bench.receiver.state() == State::Safe(Cause::Silent);
+        trial.count(is_noticed == is_kept && is_safe, applied);
+    });
+}
+
+#[test]
+fn unacceptable_delay_is_detected_although_it_is_the_next_message_and_no_watchdog_has_spoken() {
+    let patient = Protection { within: Duration::from_secs(10), ..PROTECTION };
+    inject("unacceptable delay", patient, Aftermath::Live, |trial, rng| {
+        let held_up = trial.bench.next();
+        let until =
+            trial.bench.now + patient.age_max + Duration::from_nanos(rng.random_range(1..100_000_000));
+        // The receiver goes on sending echoes; or its own thread was held up as well.
+        while rng.random() && trial.bench.now + patient.echo_period() < until {
+            trial.bench.now = trial.bench.now + patient.echo_period();
+            trial.bench.receiver.echo(trial.bench.now);
+        }
+        trial.bench.now = until;
+        trial.inject(&held_up, Fault::TooOld);
+    });
+}
+
+#[test]
+fn an_age_that_nobody_measured_is_detected_however_young_it_looks() {
+    inject("echo that was never sent", PROTECTION, Aftermath::Live, |trial, rng| {
+        let message = trial.bench.next();
+        // Echoes are sent at whole milliseconds.
+        let ago = Duration::from_nanos(rng.random_range(0..8) * 1_000_000 + rng.random_range(1..1_000_000));
+        let at = Time::from_nanos(trial.bench.now.as_nanos() + 1_000_000 - ago.as_nanos() as u64);
+        trial.inject(&forged(&message, |_, stamp| stamp.echo = at), Fault::TooOld);
+    });
+}
+
+#[test]
+fn insertion_of_what_another_has_sealed_is_detected() {
+    inject("insertion", PROTECTION, Aftermath::Live, |trial, rng| {
+        let message = trial.bench.next();
+        let forged = forged(&message, |codename, _| codename.source = another(codename.source, rng));
+        trial.inject(&forged, Fault::Corrupt);
+    });
+}
+
+#[test]
+fn masquerade_of_what_is_no_protected_command_is_detected() {
+    inject("masquerade", PROTECTION, Aftermath::Live, |trial, rng| {
+        let message = trial.bench.next();
+        let (_, payload) = open(&codename(), &message).expect("it is the sender's own");
+        let forged = match rng.random_range(0..3) {
+            // By the right one to the right one, of another type.
+            0 => forged(&message, |codename, _| {
+                codename.name = ["test.torquo", "test.torqu", ""][rng.random_range(0..3)]
+            }),
+            // The value without protection.
+            1 => payload,
+            // All but the codename, by somebody who knows the format.
+            _ => {
+                let mut digest = crc64fast::Digest::new();
+                let sealed = &message[..message.len() - 8];
+                digest.write(sealed);
+                [sealed, &digest.sum64().to_le_bytes()].concat().into()
+            }
+        };
+        trial.inject(&forged, Fault::Corrupt);
+    });
+}
+
+#[test]
+fn wrong_addressing_is_detected() {
+    inject("addressing", PROTECTION, Aftermath::Live, |trial, rng| {
+        let message = trial.bench.next();
+        let forged = forged(&message, |codename, _| {
+            if rng.random_range(0..8) == 0 {
+                // What the receiver itself has sent comes back to it.
+                std::mem::swap(&mut codename.source, &mut codename.destination);
+            } else {
+                codename.destination = another(codename.destination, rng);
+            }
+        });
+        trial.inject(&forged, Fault::Corrupt);
+    });
+}
+
+#[test]
+fn restart_of_the_sender_is_detected_whatever_number_it_begins_with() {
+    inject("restart of the sender", PROTECTION, Aftermath::Safe(Cause::Restarted), |trial, rng| {
+        let life = loop {
+            let life = Time::from_nanos(rng.random());
+            if life != LIFE {
+                break life;
+            }
+        };
+        let count = trial.bench.sent;
+        trial.bench.flows = Flows::new(life);
+        // Half of them have just the number that the life before would have had.
+        for _ in 0..if rng.random() { count } else { rng.random_range(1..=2 * count) } {
+            trial.bench.flows.seal(tid(CENTRAL), tid(DRIVE), &Torque { nm: 0 }).expect("one flow");
+        }
+        let message = trial.bench.next();
+        trial.inject(&message, Fault::Restarted);
+    });
+}
+
+#[test]
+fn restart_of_the_receiver_is_detected_by_what_was_under_way() {
+    inject("restart of the receiver", PROTECTION, Aftermath::Safe(Cause::NotArmed), |trial, rng| {
+        let under_way = trial.bench.next();
+        trial.bench.receiver = Receiver::new(codename(), PROTECTION);
+        for _ in 0..rng.random_range(0..4) {
+            trial.bench.now = trial.bench.now + MS;
+            trial.bench.receiver.echo(trial.bench.now);
+        }
+        trial.inject(&under_way, Fault::TooOld);
+    });
+}
