@@ -5,7 +5,7 @@
 
 use crate::chance::Chance;
 use crate::intention::{Intended, Intention};
-use crate::joint::PerJoint;
+use crate::joint::{Joint, PerJoint};
 use crate::leg::{BODY_MASS_KG, GRAVITY_M_S2, Leg, LegState};
 
 /// The person in the device.
@@ -164,6 +164,13 @@ impl PlantCore {
         self.state = LegState { angle_rad: intended.angle_rad, velocity_rad_s: intended.velocity_rad_s };
     }
 
+    /// Has a device damp by itself until its next command, whether or not it has a watchdog.
+    pub const fn damp(&mut self, joint: Joint) {
+        let device = &mut self.devices[joint.index()];
+        device.damps = true;
+        device.silent_ns = Some(0);
+    }
+
     /// Moves on by `dt_ns` under the commands that arrived (Nm; `None` from a silent drive), then reads.
     pub fn step(&mut self, dt_ns: u64, commands_nm: &PerJoint<Option<f64>>) -> PlantReadings {
         let dt_s = dt_ns as f64 * 1e-9;
@@ -245,6 +252,8 @@ struct Device {
     applied_nm: f64,
     /// Silence since the last command, ns; `None` before the first.
     silent_ns: Option<u64>,
+    /// Told to damp by itself.
+    damps: bool,
 }
 
 impl Device {
@@ -254,6 +263,7 @@ impl Device {
                 let step = config.torque_step_nm;
                 self.command_nm = if step > 0.0 { (command_nm / step).round() * step } else { command_nm };
                 self.silent_ns = Some(0);
+                self.damps = false;
             }
             None => self.silent_ns = self.silent_ns.map(|s| s.saturating_add(dt_ns)),
         }
@@ -267,7 +277,7 @@ impl Device {
     }
 
     fn act(&mut self, dt_s: f64, velocity_rad_s: f64, config: &PlantConfig) {
-        if self.watchdog_active(config) {
+        if self.damps || self.watchdog_active(config) {
             let wanted = -DEVICE_DAMPING_NMS_RAD * velocity_rad_s;
             let step = DEVICE_RATE_NM_S * dt_s;
             self.command_nm += (wanted - self.command_nm).clamp(-step, step);
@@ -323,6 +333,26 @@ mod tests {
         let truth = plant.truth();
         assert!((truth.applied_nm[0] + truth.leg.velocity_rad_s[0]).abs() < 0.1);
         assert!(plant.read().joints[0].watchdog_active);
+    }
+
+    #[test]
+    fn device_that_is_told_to_damp_does_so_without_a_watchdog_until_its_next_command() {
+        let mut plant = plant(PlantConfig::as_reference());
+        plant.step(MS, &[Some(40.0), None, None]);
+        plant.damp(Joint::Hip);
+        let mut before = 40.0;
+        for _ in 0..1000 {
+            plant.step(MS, &[None; 3]);
+            let now = plant.truth().applied_nm[0];
+            assert!(f64::abs(now - before) < 2.0 + 1e-9, "no quicker than it may: {before} to {now}");
+            before = now;
+        }
+        let truth = plant.truth();
+        assert!((truth.applied_nm[0] + truth.leg.velocity_rad_s[0]).abs() < 0.1);
+        assert!(!plant.read().joints[0].watchdog_active, "it was told to");
+        plant.step(MS, &[Some(3.0), None, None]);
+        plant.step(MS, &[None; 3]);
+        assert_eq!(plant.truth().applied_nm[0], 3.0);
     }
 
     #[test]

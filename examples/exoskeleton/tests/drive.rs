@@ -76,6 +76,28 @@ fn drive_that_never_heard_its_device_stays_silent() {
 }
 
 #[test]
+fn word_that_is_not_believed_any_more_makes_the_drive_safe_in_the_same_tick_however_young_it_is() {
+    let mut drive = walking();
+    drive.disbelieve_gait();
+    let last = gait(999, GaitMode::Walk);
+    let output = drive.tick(1000 * MS, Some(&sample(1000)), Some(&last));
+    assert_eq!(output.state, DriveState::Safe, "what was heard before does not count again");
+    let output = drive.tick(1001 * MS, Some(&sample(1001)), Some(&gait(1001, GaitMode::Walk)));
+    assert_eq!(output.state, DriveState::Walk, "a new one does");
+}
+
+#[test]
+fn drive_whose_device_was_left_to_damp_goes_on_from_what_that_gives() {
+    let mut drive = walking();
+    drive.disbelieve_gait();
+    drive.let_device_damp();
+    assert_eq!(drive.tick(1000 * MS, None, None).command_nm, None, "it is not known yet");
+    let damping = JointSample { torque_nm: -1.5, ..sample(1001) };
+    let torque_nm = drive.tick(1001 * MS, Some(&damping), None).command_nm.expect("it is known");
+    assert!((torque_nm + 1.5).abs() <= 2.0, "{torque_nm} after what was -1.5");
+}
+
+#[test]
 fn gait_state_over_ten_ms_old_makes_the_drive_safe_in_the_same_tick() {
     let mut drive = walking();
     for ms in 1000..1009 {

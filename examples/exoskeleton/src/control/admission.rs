@@ -48,6 +48,7 @@ enum Refusal {
 pub struct Admission<T> {
     age_max_ns: u64,
     newest: Option<T>,
+    is_believed: bool,
     refused: RefusedCount,
 }
 
@@ -63,7 +64,7 @@ impl<T: Stamped> Admission<T> {
             from_future: 0,
             opposed: 0,
         };
-        Self { age_max_ns, newest: None, refused }
+        Self { age_max_ns, newest: None, is_believed: true, refused }
     }
 
     /// Judges an input. The one already held may be offered again and again; that is no refusal.
@@ -75,6 +76,7 @@ impl<T: Stamped> Admission<T> {
         match self.judge(now_ns, input) {
             Ok(()) => {
                 self.newest = Some(*input);
+                self.is_believed = true;
                 true
             }
             Err(refusal) => {
@@ -89,10 +91,16 @@ impl<T: Stamped> Admission<T> {
         self.refused.opposed = self.refused.opposed.saturating_add(1);
     }
 
-    /// The newest admitted input if it is not older than the limit now.
+    /// Uses nothing that was admitted before: its way here is not trusted any more. What is older than it stays refused.
+    pub const fn disbelieve(&mut self) {
+        self.is_believed = false;
+    }
+
+    /// The newest admitted input if it is not older than the limit now, and still believed.
     #[must_use]
     pub fn fresh(&self, now_ns: u64) -> Option<&T> {
-        self.newest.as_ref().filter(|input| now_ns.saturating_sub(input.stamp().t_ns) <= self.age_max_ns)
+        let newest = self.newest.as_ref().filter(|_| self.is_believed);
+        newest.filter(|input| now_ns.saturating_sub(input.stamp().t_ns) <= self.age_max_ns)
     }
 
     /// The newest admitted input, however old.

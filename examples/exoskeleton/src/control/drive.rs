@@ -214,6 +214,16 @@ impl DriveCore {
         Ok(())
     }
 
+    /// Central's word counts no more: what was heard of it is not used either, from this tick on, until a new word is given.
+    pub const fn disbelieve_gait(&mut self) {
+        self.gait.disbelieve();
+    }
+
+    /// The device was left to damp by itself: what it gives is asked anew, and until it is known nothing is commanded.
+    pub const fn let_device_damp(&mut self) {
+        self.device_heard = false;
+    }
+
     /// Takes a moment to feed forward in place of its own for the next 10 ms; returns whether it is believed.
     ///
     /// It has to be finite, within limits, newer than the last, young, and near to what this drive would do itself at

@@ -6,13 +6,14 @@
 //! offset  0        3     4        5      6      7      8        12        20
 //!         "SXD"    kind  version  joint  flags  state  seq u32  t_ns u64  numbers f64 ...  crc u32
 //!
-//! word     32 bytes  'W'  to the device    flags: 1 torque given, 2 released, 4 at its limit
+//! word     32 bytes  'W'  to the device    flags: 1 torque given, 2 released, 4 at its limit, 8 damp
 //!                         state: of the drive; numbers: torque Nm
 //! reading  64 bytes  'R'  from the device  flags: 1 the device's watchdog has taken over, 2 a sole is attached
 //!                         numbers: angle rad, velocity rad/s, torque Nm, heel N, toe N
 //! ```
 //!
-//! A word without torque asks for readings and commands nothing.
+//! A word with neither torque nor damp asks for readings and commands nothing. One that says damp has the device do by itself what its
+//! watchdog would, until the next torque: it goes to soft damping, no quicker than it may.
 
 use thiserror::Error;
 
@@ -26,7 +27,7 @@ pub const WORD_BYTES: usize = 32;
 pub const READING_BYTES: usize = 64;
 
 const MAGIC: [u8; 3] = *b"SXD";
-const VERSION: u8 = 1;
+const VERSION: u8 = 2;
 const NUMBERS_AT: usize = 20;
 const CRC_BYTES: usize = 4;
 
@@ -39,14 +40,23 @@ pub struct Word {
     pub seq: u32,
     /// When it was sent, ns of the sender's clock.
     pub t_ns: u64,
-    /// Torque to give, Nm; `None`: no command, only a wish for readings.
-    pub torque_nm: Option<f64>,
+    /// What the device is to do; `None`: no command, only a wish for readings.
+    pub order: Option<Order>,
     /// Whether walking is released, by a word of central's that counts: not while the drive believes none.
     pub released: bool,
     /// Whether the torque law met its limit.
     pub saturated: bool,
     /// State of the drive.
     pub state: DriveState,
+}
+
+/// What a device is to do, until it is told otherwise.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Order {
+    /// Give this torque, Nm.
+    Torque(f64),
+    /// Damp softly by itself: its safe state, which needs nobody.
+    Damp,
 }
 
 /// What a device tells.
@@ -82,6 +92,9 @@ pub enum DatagramFault {
     /// Names no joint.
     #[error("there is no joint {0}")]
     Joint(u8),
+    /// Says both torque and damp.
+    #[error("it says both torque and damp")]
+    Orders,
     /// Names no state.
     #[error("there is no drive state {0}")]
     State(u8),
@@ -105,16 +118,20 @@ impl Word {
     const TORQUE: u8 = 1;
     const RELEASED: u8 = 1 << 1;
     const SATURATED: u8 = 1 << 2;
+    const DAMP: u8 = 1 << 3;
 
     /// Its bytes.
     #[must_use]
     pub fn encode(&self) -> [u8; WORD_BYTES] {
-        let flags = flag(self.torque_nm.is_some(), Self::TORQUE)
-            | flag(self.released, Self::RELEASED)
-            | flag(self.saturated, Self::SATURATED);
+        let (order, torque_nm) = match self.order {
+            None => (0, 0.0),
+            Some(Order::Torque(torque_nm)) => (Self::TORQUE, torque_nm),
+            Some(Order::Damp) => (Self::DAMP, 0.0),
+        };
+        let flags = order | flag(self.released, Self::RELEASED) | flag(self.saturated, Self::SATURATED);
         let state = self.state.into();
         let head = Head { kind: Self::KIND, joint: self.joint, flags, state, seq: self.seq, t_ns: self.t_ns };
-        write(&head, &[self.torque_nm.unwrap_or(0.0)])
+        write(&head, &[torque_nm])
     }
 
     /// Reads bytes.
@@ -123,11 +140,17 @@ impl Word {
     /// They are no word.
     pub fn decode(bytes: &[u8]) -> Result<Self, DatagramFault> {
         let (head, [torque_nm]) = read::<WORD_BYTES, 1>(bytes, Self::KIND)?;
+        let order = match (head.flags & Self::TORQUE != 0, head.flags & Self::DAMP != 0) {
+            (false, false) => None,
+            (true, false) => Some(Order::Torque(torque_nm)),
+            (false, true) => Some(Order::Damp),
+            (true, true) => return Err(DatagramFault::Orders),
+        };
         Ok(Self {
             joint: head.joint,
             seq: head.seq,
             t_ns: head.t_ns,
-            torque_nm: (head.flags & Self::TORQUE != 0).then_some(torque_nm),
+            order,
             released: head.flags & Self::RELEASED != 0,
             saturated: head.flags & Self::SATURATED != 0,
             state: DriveState::try_from(head.state).map_err(|_| DatagramFault::State(head.state))?,
@@ -228,13 +251,13 @@ mod tests {
 
     use super::*;
 
-    fn word(seq: u32, t_ns: u64, torque_nm: Option<f64>, state: u8) -> Word {
+    fn word(seq: u32, t_ns: u64, order: Option<Order>, state: u8) -> Word {
         let state = DriveState::try_from(state).unwrap();
         Word {
             joint: Joint::Knee,
             seq,
             t_ns,
-            torque_nm,
+            order,
             released: seq.is_multiple_of(2),
             saturated: seq.is_multiple_of(3),
             state,
@@ -255,19 +278,20 @@ mod tests {
             let crc = crc32fast::hash(&bytes[..WORD_BYTES - CRC_BYTES]);
             bytes[WORD_BYTES - CRC_BYTES..].copy_from_slice(&crc.to_le_bytes());
             if let Ok(word) = Word::decode(&bytes) {
-                prop_assert!(word.torque_nm.is_none_or(f64::is_finite));
+                prop_assert!(!matches!(word.order, Some(Order::Torque(torque_nm)) if !torque_nm.is_finite()));
             }
         }
 
         #[test]
-        fn word_reads_back(seq: u32, t_ns: u64, torque_nm in prop::option::of(-500.0..500.0), state in 0u8..5) {
-            let word = word(seq, t_ns, torque_nm, state);
+        fn word_reads_back(seq: u32, t_ns: u64, torque_nm in -500.0..500.0, order in 0..3, state in 0u8..5) {
+            let order = [None, Some(Order::Damp), Some(Order::Torque(torque_nm))][order as usize];
+            let word = word(seq, t_ns, order, state);
             prop_assert_eq!(Word::decode(&word.encode()), Ok(word));
         }
 
         #[test]
         fn one_damaged_byte_is_noticed(at in 0..WORD_BYTES, by in 1u8..=255) {
-            let mut bytes = word(1, 2, Some(3.0), 2).encode();
+            let mut bytes = word(1, 2, Some(Order::Torque(3.0)), 2).encode();
             bytes[at] ^= by;
             prop_assert!(Word::decode(&bytes).is_err());
         }
@@ -285,7 +309,7 @@ mod tests {
 
     #[test]
     fn torque_that_is_not_a_number_is_refused() {
-        let bytes = Word { torque_nm: Some(f64::NAN), ..word(1, 2, None, 1) }.encode();
+        let bytes = word(1, 2, Some(Order::Torque(f64::NAN)), 1).encode();
         assert_eq!(Word::decode(&bytes), Err(DatagramFault::NotFinite));
     }
 

@@ -6,19 +6,23 @@
 //! the time at which they were sent, in this host's clock ([`Delivery::sent`]). Silence of an input is noticed twice,
 //! independently: by the core, which refuses what is older than 10 ms in the tick in which it would use it, and by the
 //! runtime's input watchdogs, which write it down. What central says is protected from end to end, by `PROTECTION` of
-//! [`GaitState`]: a guard lets through what is central's, whole, in order and young; else it is shut, until the drive
-//! opens it, in a state in which no torque comes of central's word. When it is told to stop, the torque ramps to zero first.
+//! [`GaitState`]: a guard lets through what is central's, whole, in order and young; else it is shut. When it shuts, the
+//! device is told at once to damp by itself, by a thread that is there for that: also when this application hangs, or the
+//! thread on which it runs. Torque goes to the device through the open guard, or is on its way to zero. A shut guard stays
+//! so until central's gait asks for it ([`Arm`]), in a state in which no torque comes of central's word. When the drive is told
+//! to stop, the torque ramps to zero first.
 
 use std::path::{Path, PathBuf};
 
 use sinew::ReadyGate;
 use sinew::prelude::*;
-use sinew::protection::{Guard, State};
+use sinew::protection::{Cause, Guard, State};
 
 use super::PERIOD;
-use super::device::{DriveCommand, JointDevice};
+use super::device::{Damper, DriveCommand, JointDevice};
 use super::edges::{
-    AS_LONG_AS_IT_TAKES, Addressee, EmergencyStop, GAIT, Reset, STATUS, STOP, drive_name, sensor_name,
+    AS_LONG_AS_IT_TAKES, Addressee, Arm, EmergencyStop, GAIT, Reset, STATUS, STOP, Shut, drive_name,
+    sensor_name,
 };
 use super::figures::LoopFigures;
 use super::sensor::DeviceMaker;
@@ -52,6 +56,7 @@ pub struct Drive {
     parts: DriveParts,
     core: DriveCore,
     device: Box<dyn JointDevice>,
+    damper: Box<dyn Damper>,
     sample: Option<JointSample>,
     /// Central's newest word, for as long as all that comes from there is good.
     word: Option<Word>,
@@ -73,8 +78,26 @@ pub struct Drive {
 struct Word {
     /// Whose word it is.
     central: Tid,
-    /// Empties it as soon as it is not to be used.
-    guard: Guard<Option<GaitState>>,
+    guard: Guard<Output>,
+    /// Words that were damaged or not central's, until it counted last.
+    corrupt: u64,
+}
+
+/// What is taken away as soon as central's word does not count: by whoever notices first.
+struct Output {
+    word: Option<GaitState>,
+    device: Box<dyn Damper>,
+    /// Whether the device was told to give a torque: one that gives nothing on purpose is left as it is.
+    gives: bool,
+}
+
+impl Output {
+    fn make_safe(&mut self) {
+        self.word = None;
+        if std::mem::take(&mut self.gives) {
+            self.device.damp(Time::now(), DriveState::Safe);
+        }
+    }
 }
 
 /// Declares the drive of a joint.
@@ -85,6 +108,7 @@ pub fn spec(parts: DriveParts, place: Place) -> AppSpec<Drive> {
         .handles::<JointSample>()
         .handles::<GaitState>()
         .handles::<TorqueSet>()
+        .handles::<Arm>()
         .handles::<EmergencyStop>()
         .handles::<Reset>()
         .requires([sensor])
@@ -94,9 +118,11 @@ pub fn spec(parts: DriveParts, place: Place) -> AppSpec<Drive> {
 
 impl Drive {
     fn new(parts: DriveParts) -> Self {
+        let device = (parts.device)();
         Self {
             core: DriveCore::new(DriveConfig::standard(parts.joint)),
-            device: (parts.device)(),
+            damper: device.damper(),
+            device,
             sensor: Addressee::new(sensor_name(parts.joint)),
             central: Addressee::new(GAIT.to_owned()),
             ready: None,
@@ -114,13 +140,11 @@ impl Drive {
     fn tick(&mut self, tick: Tick, context: &mut AppContext<Self>) {
         let now = Time::now();
         let gait = self.word(now, context);
-        let output = self.core.tick(now.as_nanos(), self.sample.as_ref(), gait.as_ref());
-        self.arm();
-        if let Some(torque_nm) = output.command_nm {
-            let released = gait.is_some_and(|gait| !matches!(gait.mode, GaitMode::Hold | GaitMode::Stop));
-            let (saturated, state) = (output.saturated, output.state);
-            self.device.command(now, &DriveCommand { torque_nm, released, saturated, state });
+        if self.is_shut() {
+            self.core.disbelieve_gait();
         }
+        let mut output = self.core.tick(now.as_nanos(), self.sample.as_ref(), gait.as_ref());
+        output.command_nm = self.command(now, &output, gait.as_ref());
         if output.state != DriveState::Init
             && let Some(gate) = self.ready.take()
         {
@@ -135,13 +159,12 @@ impl Drive {
             if let Some(central) = self.central.at(now, context) {
                 let _ = context.send(central, &status);
             }
+            self.ask_to_be_armed(context);
         }
         if self.stopping && self.at_rest(&output) {
             if output.command_nm.is_none() {
-                // Never heard: it may hold a torque all the same, from an earlier life of this drive.
-                let state = output.state;
-                self.device
-                    .command(now, &DriveCommand { torque_nm: 0.0, released: false, saturated: false, state });
+                // Not heard: it may hold a torque all the same, from an earlier life of this drive.
+                self.damper.damp(now, output.state);
             }
             context.stop();
         }
@@ -153,10 +176,10 @@ impl Drive {
         if self.word.as_ref().is_none_or(|word| word.central != central) {
             // What another life of central has said is worth nothing any more.
             self.word = None;
-            let guard =
-                context.guard::<GaitState, _>(central, None, |word: &mut Option<GaitState>, _| *word = None);
+            let output = Output { word: None, device: self.device.damper(), gives: false };
+            let guard = context.guard::<GaitState, _>(central, output, |output, _| output.make_safe());
             match guard {
-                Ok(guard) => self.word = Some(Word { central, guard }),
+                Ok(guard) => self.word = Some(Word { central, guard, corrupt: 0 }),
                 // Tried again in the next tick, and said once.
                 Err(error) if !std::mem::replace(&mut self.unguarded, true) => {
                     let joint = self.parts.joint;
@@ -165,19 +188,56 @@ impl Drive {
                 Err(_) => {}
             }
         }
-        self.word.as_ref()?.guard.apply(|word| *word).ok().flatten()
+        self.word.as_ref()?.guard.apply(|output| output.word).ok().flatten()
     }
 
-    /// Lets central's word count from now on, where no torque comes of it: that somebody has to say before there is any is
-    /// the release's matter.
-    fn arm(&self) {
-        if let Some(Word { guard, .. }) = &self.word
-            && self.core.state() != DriveState::Walk
-            && guard.state() != State::Live
-        {
-            // Refused until eight good ones have come in a row.
-            let _ = guard.arm();
+    /// Whether central's word does not count, though it is known whose it is.
+    fn is_shut(&self) -> bool {
+        self.word.as_ref().is_some_and(|word| word.guard.state() != State::Live)
+    }
+
+    /// Gives the device its command, and returns what it is to give, Nm; `None` when it is told nothing, or to damp by itself.
+    ///
+    /// What may assist goes through the open guard, so that none follows the order to damp, however long this thread was held up
+    /// before it came here. With a shut one the device is left to damp by itself; what is on its way to zero goes on.
+    fn command(&mut self, now: Time, output: &DriveOutput, gait: Option<&GaitState>) -> Option<f64> {
+        let released = gait.is_some_and(|gait| !matches!(gait.mode, GaitMode::Hold | GaitMode::Stop));
+        let (saturated, state) = (output.saturated, output.state);
+        let command = |torque_nm| DriveCommand { torque_nm, released, saturated, state };
+        let Self { word, device, .. } = self;
+        let through = word.as_ref().map(|word| {
+            word.guard.apply(|to| {
+                let torque_nm = output.command_nm?;
+                to.gives = torque_nm != 0.0;
+                device.command(now, &command(torque_nm));
+                Some(torque_nm)
+            })
+        });
+        match (through, state) {
+            (Some(Ok(given)), _) => given,
+            // Again and again, as one may be lost.
+            (_, DriveState::Walk | DriveState::Safe) => {
+                self.damper.damp(now, state);
+                self.core.let_device_damp();
+                None
+            }
+            (_, DriveState::Init | DriveState::Ready | DriveState::EStop) => {
+                let torque_nm = output.command_nm?;
+                device.command(now, &command(torque_nm));
+                Some(torque_nm)
+            }
         }
+    }
+
+    /// Tells central that its word does not count, though it comes; what becomes of that is central's to say.
+    fn ask_to_be_armed(&self, context: &AppContext<Self>) {
+        let Some(Word { central, guard, corrupt }) = self.word.as_ref().filter(|_| self.is_shut()) else {
+            return;
+        };
+        let is_meddled_with =
+            guard.state() == State::Safe(Cause::TooManyBad) && guard.tally().corrupt > *corrupt;
+        // It is asked again.
+        let _ = context.send(*central, &Shut { suspect: is_meddled_with });
     }
 
     fn at_rest(&self, output: &DriveOutput) -> bool {
@@ -304,7 +364,7 @@ impl Handler<Delivery<GaitState>> for Drive {
             return;
         };
         let gait = GaitState { t_ns: gait.sent.as_nanos(), ..gait.payload };
-        if word.guard.apply(|word| *word = Some(gait)).is_err() {
+        if word.guard.apply(|output| output.word = Some(gait)).is_err() {
             context.reject();
             return;
         }
@@ -330,6 +390,31 @@ impl Handler<Delivery<TorqueSet>> for Drive {
         if !self.core.command(now.as_nanos(), &set) {
             context.reject();
         }
+    }
+}
+
+impl Handler<Delivery<Arm>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, arm: Delivery<Arm>, context: &mut Self::Context) {
+        let state = self.core.state();
+        let Some(word) = self.word.as_mut().filter(|word| word.central == arm.source) else {
+            context.reject();
+            return;
+        };
+        if word.guard.state() == State::Live {
+            return;
+        }
+        // In WALK the tick is still to come that makes the drive safe, and what central meant long ago may not be so any more. Refused, too,
+        // until eight good words have come in a row.
+        if state == DriveState::Walk || arm.age > SILENCE_MAX || word.guard.arm().is_err() {
+            context.reject();
+            return;
+        }
+        word.corrupt = word.guard.tally().corrupt;
+        // A ramp to zero may be under way.
+        let _ = word.guard.apply(|output| output.gives = true);
+        self.note_event("armed", &arm.source.to_string(), String::new());
     }
 }
 

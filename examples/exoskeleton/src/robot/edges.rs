@@ -44,6 +44,8 @@ impl Payload for GaitState {
     });
 }
 
+/// Not protected from end to end: whoever is on central's node may send it, and it moves a joint only as far as the drive would by
+/// itself, give or take 10 Nm, and while a word of central's counts that is protected. See README.md, "Safety states".
 impl Payload for TorqueSet {
     const NAME: &'static str = "exo.torque_set";
     const CLASS: Class = Class::Stream;
@@ -71,6 +73,21 @@ payload!("exo.reset" =>
     /// torque is not zero and while central says stop.
     #[derive(Debug, Clone, Copy)]
     pub struct Reset {}
+);
+
+payload!("exo.shut", Stream =>
+    /// From a drive to central's gait, 200 times a second while it is so: your word does not count here, though it comes.
+    #[derive(Debug, Clone, Copy)]
+    pub struct Shut {
+        /// Whether words came that were damaged, or not central's at all.
+        pub suspect: bool,
+    }
+);
+
+payload!("exo.arm", Stream =>
+    /// From central's gait to a drive, as an answer to [`Shut`]: let my word count again. A drive never does that by itself.
+    #[derive(Debug, Clone, Copy)]
+    pub struct Arm {}
 );
 
 payload!("exo.gait_status", Stream =>

@@ -12,13 +12,13 @@ use sinew::{Down, NodeAddress, ReadyGate};
 use super::PERIOD;
 use super::drive::micros;
 use super::edges::{
-    AS_LONG_AS_IT_TAKES, Addressee, EmergencyStop, GAIT, GaitStatus, Release, Reset, STATUS, STOP,
+    AS_LONG_AS_IT_TAKES, Addressee, Arm, EmergencyStop, GAIT, GaitStatus, Release, Reset, STATUS, STOP, Shut,
     drive_name, joint_of_sensor, sensor_name,
 };
 use super::trace::{EventRow, GaitRow, Trace};
 use crate::central::{CentralConfig, CentralCore, CentralInput, Resume, bit};
 use crate::joint::{Joint, PerJoint};
-use crate::message::{DriveStatus, FootLoad, GaitState, JointSample};
+use crate::message::{DriveStatus, FootLoad, GaitMode, GaitState, JointSample};
 
 /// Ticks between two statuses: 20 a second.
 const STATUS_TICKS: u64 = 50;
@@ -52,6 +52,8 @@ pub struct Gait {
     core: CentralCore,
     /// Whom the gait is told, one by one: what moves a joint is protected from here to its drive.
     drives: PerJoint<Addressee>,
+    /// What they were told last to do.
+    mode: Option<GaitMode>,
     samples: PerJoint<Option<JointSample>>,
     load: Option<FootLoad>,
     gone: PerJoint<Gone>,
@@ -70,6 +72,7 @@ pub fn spec(parts: GaitParts, place: Place) -> AppSpec<Gait> {
         .handles::<JointSample>()
         .handles::<FootLoad>()
         .handles::<DriveStatus>()
+        .handles::<Shut>()
         .handles::<Down>()
         .handles::<Release>()
         .handles::<EmergencyStop>()
@@ -90,6 +93,7 @@ impl Gait {
             parts,
             core: CentralCore::new(CentralConfig { epoch, resume, ..CentralConfig::default() }),
             drives: Joint::ALL.map(|joint| Addressee::new(drive_name(joint))),
+            mode: None,
             samples: [None; 3],
             load: None,
             gone: [Gone::default(); 3],
@@ -105,6 +109,7 @@ impl Gait {
         let input =
             CentralInput { samples: self.samples.each_ref().map(Option::as_ref), load: self.load.as_ref() };
         let state = self.core.tick(now.as_nanos(), &input);
+        self.mode = state.map(|state| state.mode);
         if let Some(state) = &state {
             for drive in &mut self.drives {
                 if let Some(drive) = drive.at(now, context) {
@@ -277,6 +282,35 @@ impl Handler<Delivery<DriveStatus>> for Gait {
     }
 }
 
+/// Whether a drive may let central's word count again. While a part is missing it waits for what comes of that. One in whose words
+/// somebody has meddled waits until the leg is held, after which walking is released anew.
+const fn may_arm(mode: Option<GaitMode>, suspect: bool) -> bool {
+    match mode {
+        // No torque comes of these.
+        Some(GaitMode::Hold | GaitMode::Stop) => true,
+        // Walking is released: words were late or lost, or the drive is a new one.
+        Some(GaitMode::Sync | GaitMode::Walk) => !suspect,
+        Some(GaitMode::Safe) | None => false,
+    }
+}
+
+impl Handler<Delivery<Shut>> for Gait {
+    type Result = ();
+
+    fn handle(&mut self, shut: Delivery<Shut>, context: &mut Self::Context) {
+        let Some(joint) = self.joint_at(shut.source.node) else {
+            context.reject();
+            return;
+        };
+        if self.drives[joint.index()].at(Time::now(), context) != Some(shut.source) {
+            context.reject();
+        } else if may_arm(self.mode, shut.suspect) {
+            // One that cannot be reached asks again.
+            let _ = context.send(shut.source, &Arm {});
+        }
+    }
+}
+
 impl Handler<Delivery<Down>> for Gait {
     type Result = ();
 
@@ -321,5 +355,19 @@ impl Handler<Delivery<RequirementEvent>> for Gait {
             }
             RequirementEvent::Met { .. } => self.learn(joint, |gone| gone.sensor = false),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn word_counts_again_where_no_torque_comes_of_it_or_walking_is_released_and_nobody_has_meddled() {
+        let modes = [GaitMode::Hold, GaitMode::Sync, GaitMode::Walk, GaitMode::Safe, GaitMode::Stop];
+        let may = |suspect| modes.map(|mode| may_arm(Some(mode), suspect));
+        assert_eq!(may(false), [true, true, true, false, true]);
+        assert_eq!(may(true), [true, false, false, false, true]);
+        assert!(!may_arm(None, false), "nobody is told anything yet");
     }
 }

@@ -9,10 +9,10 @@
 //!   |                             |                  |      | JointSample              |
 //!   |                             |   GaitState      |      v                          |
 //!   |                             | ---------------> | X.drive   1 kHz                 |
-//!   |                             |  protected       |   requires the three sensors    |
+//!   |                             |  protected; Arm  |   requires the three sensors    |
 //!   | central.coordinator         |                  |   and central.gait              |
 //!   |   requires the drives,      | <--------------- |                                 |
-//!   |   then releases             |  DriveStatus     |                                 |
+//!   |   then releases             | DriveStatus, Shut|                                 |
 //!   +-----------------------------+  exo.status      +---------------------------------+
 //!             | NodeAPI                                   ^ readings   | torque   (UDP)
 //!             v                                           |            v

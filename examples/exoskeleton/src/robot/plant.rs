@@ -15,7 +15,7 @@ use sinew::Time;
 use thiserror::Error;
 
 use super::PERIOD;
-use super::datagram::{Reading, WORD_BYTES, Word};
+use super::datagram::{Order, Reading, WORD_BYTES, Word};
 use super::topology::PlantPlace;
 use super::trace::{PlantRow, Recording, Trace};
 use crate::gait::trial::{Trial, TrialError};
@@ -134,7 +134,14 @@ impl Plant {
     }
 
     fn step(&mut self, due: Time, now: Time) {
-        let commands_nm = self.devices.take_commands();
+        let mut commands_nm = [None; 3];
+        for (joint, order) in Joint::ALL.into_iter().zip(self.devices.take_orders()) {
+            match order {
+                Some(Order::Torque(torque_nm)) => commands_nm[joint.index()] = Some(torque_nm),
+                Some(Order::Damp) => self.core.damp(joint),
+                None => {}
+            }
+        }
         let readings = self.core.step(PERIOD_NS, &commands_nm);
         self.note(due, now);
         self.seq = self.seq.wrapping_add(1);
@@ -163,7 +170,7 @@ impl Plant {
             velocity_rad_s: truth.leg.velocity_rad_s,
             intended_rad: truth.intended.angle_rad,
             applied_nm: truth.applied_nm,
-            commanded_nm: heard.map(|heard| heard.map(|heard| heard.torque_nm)),
+            commanded_nm: heard.map(|heard| heard?.torque_nm()),
             state: heard.map(|heard| heard.map(|heard| heard.word.state)),
             saturated: heard.map(|heard| heard.is_some_and(|heard| heard.word.saturated)),
             watchdog: truth.watchdog_active,
@@ -209,13 +216,21 @@ fn sleep_until(due: Time) -> Result<(), PlantError> {
 #[derive(Debug, Clone, Copy)]
 struct Heard {
     word: Word,
-    torque_nm: f64,
+    order: Order,
     at: Time,
     /// Not yet given to the device.
     is_new: bool,
 }
 
 impl Heard {
+    /// What it is to give, Nm; `None` when that is the device's own matter.
+    const fn torque_nm(&self) -> Option<f64> {
+        match self.order {
+            Order::Torque(torque_nm) => Some(torque_nm),
+            Order::Damp => None,
+        }
+    }
+
     fn is_silent(&self, now: Time, after_ns: u64) -> bool {
         now.since(self.at).as_nanos() > u128::from(after_ns)
     }
@@ -252,7 +267,7 @@ impl Devices {
 
     fn take(&mut self, word: Word, source: SocketAddr, now: Time) {
         let joint = word.joint.index();
-        let Some(torque_nm) = word.torque_nm else {
+        let Some(order) = word.order else {
             self.listeners[joint] = Some(source);
             return;
         };
@@ -261,18 +276,18 @@ impl Devices {
             ahead > 0 || last.is_silent(now, NEW_SENDER_AFTER_NS)
         });
         if follows {
-            self.words[joint] = Some(Heard { word, torque_nm, at: now, is_new: true });
+            self.words[joint] = Some(Heard { word, order, at: now, is_new: true });
         } else {
             self.refused += 1;
         }
     }
 
     /// What the devices are told in this step; `None` for a drive that said nothing since the last.
-    fn take_commands(&mut self) -> PerJoint<Option<f64>> {
+    fn take_orders(&mut self) -> PerJoint<Option<Order>> {
         self.words.each_mut().map(|heard| {
             let heard = heard.as_mut().filter(|heard| heard.is_new)?;
             heard.is_new = false;
-            Some(heard.torque_nm)
+            Some(heard.order)
         })
     }
 
