@@ -1,0 +1,402 @@
+//! Protected commands through a black channel that is one: a relay that holds their bytes stands between a sender and a guard, on
+//! real nodes, and repeats, reorders, delays, loses, changes and misdirects what it holds. All is found, nothing of it is applied, and
+//! the output is safe at once.
+//!
+//! ```text
+//!   network one                                  network two
+//!   central 127.0.0.1 <---> node 127.0.0.2       node 127.0.0.1 <---> drive 127.0.0.2
+//!                              relay: the drive, to central | central, to the drive
+//! ```
+//!
+//! Neither end can tell: each knows the other by the address that the relay has in its place.
+
+use std::{
+    sync::{
+        Mutex,
+        mpsc::{Receiver, Sender, channel},
+    },
+    time::Instant,
+};
+
+use sinew::{
+    Endpoint, Kind, NodeApi, Outcome, Registration, Rejection,
+    prelude::*,
+    protection::{Cause, Codename, Guard, Protection, State, Tally, open, seal},
+};
+use sinew_tests::{DEADLINE, Ground, OwnDirectory};
+
+/// Trials of each error; those of a delay take its time.
+const TRIALS: u32 = 50;
+const DELAYS: u32 = 5;
+/// The first bad one makes the output safe; for the rest as patient as a busy machine needs.
+const PROTECTION: Protection =
+    Protection { within: DEADLINE, age_max: Duration::from_secs(1), lost_max: 1, bad_max: 0, good_min: 4 };
+/// By its name: the type is the runtime's own.
+const ECHO: Kind = Kind::named("sinew.echo");
+
+#[derive(Debug, sinew::serde::Serialize, sinew::serde::Deserialize)]
+#[serde(crate = "sinew::serde")]
+struct Torque {
+    number: u64,
+}
+
+impl Payload for Torque {
+    const NAME: &'static str = "black_channel.torque";
+    const CLASS: Class = Class::Control;
+    const PROTECTION: Option<Protection> = Some(PROTECTION);
+}
+
+payload!("black_channel.go", Control =>
+    /// The next torque is to be sent to who asks.
+    struct Go;
+);
+
+fn tid(host: u8, app: u32) -> Tid {
+    Tid::new(NodeAddress::from([127, 0, 0, host]), AppAddress::fixed(app).expect("a fixed one"))
+}
+
+fn central() -> Tid {
+    tid(1, 1)
+}
+
+/// Sends torques, too, and none of them to the drive's guard.
+fn stranger() -> Tid {
+    tid(1, 2)
+}
+
+fn drive() -> Tid {
+    tid(2, 1)
+}
+
+/// Is sent torques, too, by central.
+fn other_drive() -> Tid {
+    tid(2, 2)
+}
+
+#[derive(Default)]
+struct Central {
+    number: u64,
+}
+
+impl Actor for Central {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<Go>> for Central {
+    type Result = ();
+
+    fn handle(&mut self, go: Delivery<Go>, context: &mut Self::Context) {
+        self.number += 1;
+        context.send(go.source, &Torque { number: self.number }).expect("the relay is there");
+    }
+}
+
+/// What happened to the motor.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Seen {
+    Moved(u64),
+    Safe(Cause),
+}
+
+struct Drive {
+    motor: Sender<Seen>,
+    guards: Sender<Guard<Sender<Seen>>>,
+    guard: Option<Guard<Sender<Seen>>>,
+}
+
+impl Actor for Drive {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        let safe = |motor: &mut Sender<Seen>, cause| motor.send(Seen::Safe(cause)).expect("the test looks");
+        let guard = context.guard::<Torque, _>(central(), self.motor.clone(), safe).expect("a thread");
+        self.guards.send(guard.clone()).expect("the test waits");
+        self.guard = Some(guard);
+    }
+}
+
+impl Handler<Delivery<Torque>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, torque: Delivery<Torque>, _: &mut Self::Context) {
+        let guard = self.guard.as_ref().expect("it was made first");
+        let moved = guard.apply(|motor| motor.send(Seen::Moved(torque.number)));
+        moved.expect("it was live when the torque was let through").expect("the test looks");
+    }
+}
+
+/// All four nodes, and what the relay does between them.
+struct Scene {
+    to_central: Endpoint,
+    to_central_as_another: Endpoint,
+    to_drive: Endpoint,
+    // In the order in which they end: the motor hears of all that ends before it.
+    _nodes: [Node; 4],
+    _directory: OwnDirectory,
+    guard: Guard<Sender<Seen>>,
+    motor: Receiver<Seen>,
+    /// What was passed on last.
+    number: u64,
+}
+
+/// A node at 127.0.0.`host` with a door for endpoints.
+fn node(ground: &Ground, host: u8, name: &str, directory: &OwnDirectory) -> NodeBuilder {
+    let socket = directory.join(&format!("{name}.sock"));
+    ground.node(name).address([127, 0, 0, host]).configure(|config| config.lncl.socket = Some(socket))
+}
+
+fn relay(name: &str, own: Tid, directory: &OwnDirectory) -> Endpoint {
+    let api = NodeApi::connect(directory.join(&format!("{name}.sock"))).expect("its door");
+    let registration = Registration::new().fixed(own.app).deadline(DEADLINE);
+    api.register_transport_address(registration).expect("the address is free")
+}
+
+impl Scene {
+    fn start() -> Self {
+        let directory = OwnDirectory::new();
+        let (one, two) = (Ground::new(), Ground::new());
+        let ((motor, seen), (guards, guard)) = (channel(), channel());
+        let ends = Mutex::new(Some((motor, guards)));
+        let drive_app = AppSpec::new("drive", move || {
+            let (motor, guards) = ends.lock().expect("nobody panics with it").take().expect("one life");
+            Drive { motor, guards, guard: None }
+        });
+        let central_app =
+            |name, tid: Tid| AppSpec::new(name, Central::default).address(tid.app).handles::<Go>();
+        let centrals = [central_app("central", central()), central_app("stranger", stranger())];
+        let [first, second] = centrals;
+        let nodes = [
+            node(&one, 1, "one.central", &directory).app(first).app(second),
+            node(&one, 2, "one.relay", &directory),
+            node(&two, 1, "two.relay", &directory),
+            node(&two, 2, "two.drive", &directory).app(drive_app.address(drive().app).handles::<Torque>()),
+        ];
+        let nodes = nodes.map(|node| node.start().expect("a node"));
+        sinew_tests::all_run(&[&nodes[0], &nodes[3]]);
+        sinew_tests::sees(&nodes[1].handle(), nodes[0].address());
+        sinew_tests::sees(&nodes[2].handle(), nodes[3].address());
+        let guard = guard.recv_timeout(DEADLINE).expect("the drive has a guard");
+        Self {
+            to_central: relay("one.relay", drive(), &directory),
+            to_central_as_another: relay("one.relay", other_drive(), &directory),
+            to_drive: relay("two.relay", central(), &directory),
+            guard,
+            motor: seen,
+            number: 0,
+            _nodes: nodes,
+            _directory: directory,
+        }
+    }
+
+    /// The bytes of central's next torque, which quotes an echo of just now.
+    fn next(&mut self) -> Vec<u8> {
+        self.pass_echoes();
+        next_of(&mut self.to_central, central())
+    }
+
+    /// What the drive says passes as it is.
+    fn pass_echoes(&mut self) {
+        while let Some(echo) = self.to_drive.receive(Duration::ZERO).expect("it is connected") {
+            assert_eq!(echo.kind(), ECHO);
+            let passed = pass(&mut self.to_central, central(), ECHO, echo.bytes());
+            assert_eq!(passed, Outcome::Delivered);
+        }
+    }
+
+    /// The way of all bytes to the drive.
+    fn pass(&mut self, bytes: &[u8]) -> Outcome {
+        pass(&mut self.to_drive, drive(), Torque::KIND, bytes)
+    }
+
+    /// Good ones until the output is armed and has been moved by one, whatever the machine is busy with.
+    fn come_alive(&mut self) {
+        let deadline = Instant::now() + DEADLINE;
+        loop {
+            assert!(Instant::now() < deadline, "it can be armed: {:?}", self.guard.tally());
+            let torque = self.next();
+            let is_live = self.pass(&torque) == Outcome::Delivered;
+            let seen: Vec<Seen> = self.motor.try_iter().collect();
+            if let ([Seen::Moved(number)], true) = (&seen[..], is_live) {
+                assert!(*number > self.number, "{number} after {}", self.number);
+                self.number = *number;
+                return;
+            }
+            let _ = self.guard.arm(); // refused until enough have come
+        }
+    }
+
+    /// An error in a channel whose commands are applied: found, not applied, and the output is safe.
+    fn inject(&mut self, figures: &mut Figures, error: &Error) {
+        let deadline = Instant::now() + DEADLINE;
+        let bytes = loop {
+            assert!(Instant::now() < deadline, "good ones are applied before: {:?}", self.guard.tally());
+            self.come_alive();
+            let bytes = (error.make)(self);
+            let is_live = self.guard.state() == State::Live;
+            if let (Some(bytes), true) = (bytes, is_live) {
+                break bytes;
+            }
+        };
+        // The good ones that it took to make it.
+        for seen in self.motor.try_iter() {
+            assert!(matches!(seen, Seen::Moved(_)), "{seen:?} before the error");
+        }
+        let before = self.guard.tally();
+        figures.injected += 1;
+        let outcome = self.pass(&bytes);
+        let after = self.guard.tally();
+        let is_counted = (error.counted)(&after) == (error.counted)(&before) + 1 && after.good == before.good;
+        figures.detected += u32::from(is_counted && outcome == Outcome::Rejected(error.rejection));
+        for seen in self.motor.try_iter() {
+            match seen {
+                Seen::Moved(_) => figures.applied += 1,
+                Seen::Safe(cause) => figures.made_safe += u32::from(cause == error.cause),
+            }
+        }
+    }
+}
+
+/// Sends bytes as they are, and waits for what becomes of them.
+fn pass(by: &mut Endpoint, to: Tid, kind: Kind, bytes: &[u8]) -> Outcome {
+    let mut message = by.create_message(to, kind, bytes.len()).expect("there is room");
+    message.copy_from_slice(bytes);
+    by.send_message_confirmed(message, DEADLINE).expect("it is sent")
+}
+
+/// The bytes of the next torque of `source` for who asks.
+fn next_of(asks: &mut Endpoint, source: Tid) -> Vec<u8> {
+    assert_eq!(asks.send_confirmed(source, &Go, DEADLINE).expect("it is sent"), Outcome::Delivered);
+    let torque = asks.receive(DEADLINE).expect("it is connected").expect("it sends one");
+    assert_eq!((torque.source(), torque.kind()), (source, Torque::KIND));
+    torque.bytes().to_vec()
+}
+
+#[derive(Debug, Default, PartialEq, Eq)]
+struct Figures {
+    injected: u32,
+    detected: u32,
+    applied: u32,
+    made_safe: u32,
+}
+
+/// One class of errors.
+struct Error {
+    class: &'static str,
+    trials: u32,
+    /// Makes the bytes that are passed on then; `None`: a good one before them came too late, as the machine is busy.
+    make: fn(&mut Scene) -> Option<Vec<u8>>,
+    rejection: Rejection,
+    counted: fn(&Tally) -> u64,
+    cause: Cause,
+}
+
+const CORRUPT: Error = Error {
+    class: "corruption",
+    trials: TRIALS,
+    make: |scene| {
+        let mut bytes = scene.next();
+        for _ in 0..fastrand::usize(1..=8) {
+            let at = fastrand::usize(0..bytes.len());
+            // Another value in any case, however often it is changed: only upwards, and by less than a round in all.
+            bytes[at] = bytes[at].wrapping_add(fastrand::u8(1..=31));
+        }
+        Some(bytes)
+    },
+    rejection: Rejection::Malformed,
+    counted: |tally| tally.corrupt,
+    cause: Cause::TooManyBad,
+};
+
+const ERRORS: [Error; 9] = [
+    CORRUPT,
+    Error {
+        class: "unintended repetition",
+        make: |scene| {
+            let bytes = scene.next();
+            // The first time it is good.
+            (scene.pass(&bytes) == Outcome::Delivered).then_some(bytes)
+        },
+        rejection: Rejection::ByHandler,
+        counted: |tally| tally.repeated,
+        ..CORRUPT
+    },
+    Error {
+        class: "incorrect sequence",
+        make: |scene| {
+            let (overtaken, bytes) = (scene.next(), scene.next());
+            // One may be missing.
+            (scene.pass(&bytes) == Outcome::Delivered).then_some(overtaken)
+        },
+        rejection: Rejection::ByHandler,
+        counted: |tally| tally.backwards,
+        ..CORRUPT
+    },
+    Error {
+        class: "loss",
+        make: |scene| {
+            for _ in 0..fastrand::u64(2..=5) {
+                scene.next();
+            }
+            Some(scene.next())
+        },
+        rejection: Rejection::ByHandler,
+        counted: |tally| tally.gaps,
+        cause: Cause::TooMuchLost,
+        ..CORRUPT
+    },
+    Error {
+        class: "unacceptable delay",
+        trials: DELAYS,
+        make: |scene| {
+            let bytes = scene.next();
+            // Only time makes it old.
+            std::thread::sleep(PROTECTION.age_max);
+            Some(bytes)
+        },
+        rejection: Rejection::ByHandler,
+        counted: |tally| tally.too_old,
+        ..CORRUPT
+    },
+    Error { class: "insertion", make: |scene| Some(next_of(&mut scene.to_central, stranger())), ..CORRUPT },
+    Error {
+        class: "masquerade as the command of another type",
+        make: |scene| {
+            let bytes = scene.next();
+            let own = Codename::of::<Torque>(central(), drive());
+            let (stamp, payload) = open(&own, &bytes.into()).expect("it is central's");
+            Some(seal(&Codename { name: "black_channel.speed", ..own }, stamp, &payload).to_vec())
+        },
+        ..CORRUPT
+    },
+    Error {
+        class: "masquerade as a command without protection",
+        make: |scene| {
+            let own = Codename::of::<Torque>(central(), drive());
+            Some(open(&own, &scene.next().into()).expect("it is central's").1.to_vec())
+        },
+        ..CORRUPT
+    },
+    Error {
+        class: "addressing",
+        make: |scene| Some(next_of(&mut scene.to_central_as_another, central())),
+        ..CORRUPT
+    },
+];
+
+#[test]
+fn whatever_a_relay_does_to_commands_is_found_and_makes_the_output_safe() {
+    let mut scene = Scene::start();
+    assert_eq!(scene.motor.recv_timeout(DEADLINE), Ok(Seen::Safe(Cause::NotArmed)), "before anything else");
+    for error in &ERRORS {
+        let mut figures = Figures::default();
+        for _ in 0..error.trials {
+            scene.inject(&mut figures, error);
+        }
+        let (class, trials) = (error.class, error.trials);
+        println!("{class}: {figures:?}");
+        let all = Figures { injected: trials, detected: trials, applied: 0, made_safe: trials };
+        assert_eq!(figures, all, "{class}");
+    }
+    // Behind all of them commands are applied as before, once somebody arms.
+    scene.come_alive();
+}
