@@ -39,6 +39,12 @@ pub fn seals(script: &[u8]) -> bool {
     crate::secured::fuzzing::seals(script)
 }
 
+/// A script of protected messages and echoes, honest, lost, held up, damaged and forged, played to a live receiver.
+#[must_use]
+pub fn protected(script: &[u8]) -> bool {
+    sinew_runtime::protection::fuzzing::protected(script)
+}
+
 /// The file of an access list.
 #[must_use]
 pub fn access(bytes: &[u8]) -> bool {
@@ -76,6 +82,7 @@ pub fn seeds(format: &str) -> Vec<Vec<u8>> {
         "datagrams" => crate::gncl::fuzzing::some_datagrams(),
         "discovery" => crate::ndl::fuzzing::some_datagrams(),
         "seals" => vec![crate::secured::fuzzing::SOME_SEALS.to_vec()],
+        "protected" => vec![sinew_runtime::protection::fuzzing::SOME_MESSAGES.to_vec()],
         "access" => crate::access::fuzzing::some_lists(),
         "control" => crate::lncl::fuzzing::some_frames(),
         "words" => {

@@ -29,6 +29,9 @@
 //! | `guard` | the output, and its thread |
 
 mod envelope;
+#[cfg(any(test, feature = "fuzzing"))]
+#[doc(hidden)]
+pub mod fuzzing;
 mod guard;
 mod receiver;
 mod sender;

@@ -25,7 +25,7 @@ pub struct Format {
 }
 
 /// All of them.
-pub const FORMATS: [Format; 16] = [
+pub const FORMATS: [Format; 17] = [
     Format {
         name: "header",
         from: "a peer, by TCP or UDP",
@@ -68,6 +68,12 @@ pub const FORMATS: [Format; 16] = [
         from: "anybody, by UDP, in a project with keys",
         play: sinew::fuzzing::seals,
         seeds: || sinew::fuzzing::seeds("seals"),
+    },
+    Format {
+        name: "protected",
+        from: "whatever lies between a sender and an output",
+        play: sinew::fuzzing::protected,
+        seeds: || sinew::fuzzing::seeds("protected"),
     },
     Format {
         name: "control",
