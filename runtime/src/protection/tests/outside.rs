@@ -71,7 +71,7 @@ proptest! {
         // Near in periods, or in nanoseconds.
         let echo = match head[4] {
             Word::Near(off) if is_echo_near => now.wrapping_add_signed(i64::from(off) * 1_000_000),
-            other => other.around(now),
+            Word::Near(_) | Word::Any(_) => head[4].around(now),
         };
         let mut bytes = [version.to_le_bytes(), length.to_le_bytes()].concat();
         for word in [counter, incarnation, echo] {
