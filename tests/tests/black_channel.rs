@@ -13,7 +13,7 @@
 use std::{
     sync::{
         Mutex,
-        mpsc::{Receiver, Sender, channel},
+        mpsc::{Receiver, SyncSender, sync_channel},
     },
     time::Instant,
 };
@@ -99,16 +99,17 @@ enum Seen {
 }
 
 struct Drive {
-    motor: Sender<Seen>,
-    guards: Sender<Guard<Sender<Seen>>>,
-    guard: Option<Guard<Sender<Seen>>>,
+    motor: SyncSender<Seen>,
+    guards: SyncSender<Guard<SyncSender<Seen>>>,
+    guard: Option<Guard<SyncSender<Seen>>>,
 }
 
 impl Actor for Drive {
     type Context = AppContext<Self>;
 
     fn started(&mut self, context: &mut Self::Context) {
-        let safe = |motor: &mut Sender<Seen>, cause| motor.send(Seen::Safe(cause)).expect("the test looks");
+        let safe =
+            |motor: &mut SyncSender<Seen>, cause| motor.send(Seen::Safe(cause)).expect("the test looks");
         let guard = context.guard::<Torque, _>(central(), self.motor.clone(), safe).expect("a thread");
         self.guards.send(guard.clone()).expect("the test waits");
         self.guard = Some(guard);
@@ -133,7 +134,7 @@ struct Scene {
     // In the order in which they end: the motor hears of all that ends before it.
     _nodes: [Node; 4],
     _directory: OwnDirectory,
-    guard: Guard<Sender<Seen>>,
+    guard: Guard<SyncSender<Seen>>,
     motor: Receiver<Seen>,
     /// What was passed on last.
     number: u64,
@@ -155,7 +156,7 @@ impl Scene {
     fn start() -> Self {
         let directory = OwnDirectory::new();
         let (one, two) = (Ground::new(), Ground::new());
-        let ((motor, seen), (guards, guard)) = (channel(), channel());
+        let ((motor, seen), (guards, guard)) = (sync_channel(1_000), sync_channel(1));
         let ends = Mutex::new(Some((motor, guards)));
         let drive_app = AppSpec::new("drive", move || {
             let (motor, guards) = ends.lock().expect("nobody panics with it").take().expect("one life");
