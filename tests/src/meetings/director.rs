@@ -1,4 +1,4 @@
-//! Starts the processes, kills them, and waits until they meet.
+//! Starts the processes one after the other or all at once, keeps one back, kills them, and waits until they meet.
 
 use std::{
     io::{BufRead, BufReader, Write},
@@ -8,9 +8,12 @@ use std::{
     sync::{Arc, Mutex, PoisonError},
 };
 
-use sinew::Time;
+use sinew::{Requirement, Time};
 
-use super::verdict::{Event, Life, Verdict};
+use super::{
+    node::{COME, DIRECTORY, KEPT_BACK, STAY_AWAY, UP},
+    verdict::{Event, HEARSAY, Life, Verdict},
+};
 use crate::{own_group, until};
 
 /// The parties, and what each requires before it starts: a name, any of two, so many of a pattern and a name.
@@ -35,6 +38,8 @@ pub struct Cast {
     group: SocketAddrV4,
     present: [Option<Process>; PARTIES.len()],
     former: Vec<Vec<Life>>,
+    /// What was seen to be wrong before the judge reads everything.
+    violations: Vec<String>,
 }
 
 /// Every order of four.
@@ -54,7 +59,43 @@ impl Cast {
     /// Nobody yet, on a network of its own.
     #[must_use]
     pub fn new() -> Self {
-        Self { group: own_group(), present: [const { None }; 4], former: vec![Vec::new(); PARTIES.len()] }
+        Self {
+            group: own_group(),
+            present: [const { None }; PARTIES.len()],
+            former: vec![Vec::new(); PARTIES.len()],
+            violations: Vec::new(),
+        }
+    }
+
+    /// All four, each started when those before it are up, know each other, and have started where they may; they have met once.
+    ///
+    /// # Panics
+    /// If somebody is not there in time.
+    #[must_use]
+    pub fn one_by_one(program: &Path, order: [usize; PARTIES.len()]) -> Self {
+        let mut cast = Self::new();
+        for present in 1..=order.len() {
+            let newcomer = order[present - 1];
+            cast.start(program, newcomer);
+            cast.wait_until_up(newcomer);
+            cast.wait_for_one_directory();
+            cast.check_who_waits(&order[..present]);
+        }
+        cast.wait_until_passed(0);
+        cast
+    }
+
+    /// All four, started without a wait between; they have met once.
+    ///
+    /// # Panics
+    /// If somebody is not there in time.
+    #[must_use]
+    pub fn at_once(program: &Path) -> Self {
+        let mut cast = Self::new();
+        (0..PARTIES.len()).for_each(|index| cast.start(program, index));
+        cast.wait_until_passed(0);
+        cast.wait_for_one_directory();
+        cast
     }
 
     /// Starts a party's process: `program` with a role.
@@ -91,6 +132,39 @@ impl Cast {
         self.former[index].push(life);
     }
 
+    /// A party that waits is killed while another one keeps away; that one comes when everybody knows of the loss. Nobody may go on
+    /// before the next life of the killed one, which the judge is to see. All four live afterwards, and meet.
+    ///
+    /// # Panics
+    /// If somebody does not do in time what is waited for.
+    pub fn kill_who_waits(&mut self, program: &Path, killed: usize, away: usize) {
+        if let Some(process) = &self.present[away] {
+            // What it said when it was told so before is no answer.
+            process.said().1.clear();
+        }
+        self.tell(away, STAY_AWAY);
+        self.wait_for_word(away, KEPT_BACK);
+        let generation = self.generation();
+        let waits = |process: &Process| {
+            let life = &process.said().0;
+            matches!(life.events.last(), Some(Event::Arrived(_)))
+                && passed(life).unwrap_or_default() >= generation
+        };
+        until(&format!("{} waits for generation {}", PARTIES[killed].0, generation + 1), || {
+            self.present[killed].as_ref().is_some_and(waits).then_some(())
+        });
+        self.kill(killed);
+        // From then on it must not count.
+        std::thread::sleep(HEARSAY);
+        self.tell(away, COME);
+        let arrived = |process: &Process| matches!(process.said().0.events.last(), Some(Event::Arrived(_)));
+        until(&format!("{} has come", PARTIES[away].0), || {
+            self.present[away].as_ref().is_some_and(arrived).then_some(())
+        });
+        self.start(program, killed);
+        self.wait_until_passed(generation);
+    }
+
     /// The highest generation that anybody has passed.
     #[must_use]
     pub fn generation(&self) -> u64 {
@@ -115,21 +189,71 @@ impl Cast {
         }
     }
 
-    /// Waits until all four say the same of who is there, and that all are ready.
+    /// Waits until all who live say the same of who is there, and that those are ready whose requirements are met.
     ///
     /// # Panics
     /// If they do not in time.
     pub fn wait_for_one_directory(&mut self) {
-        let mut names = PARTIES.map(|(name, _)| name);
-        names.sort_unstable();
-        let expected = names.map(|name| format!("{name}=true")).join(" ");
-        for process in self.present.iter_mut().flatten() {
-            until(&format!("the directory is {expected}"), || {
-                process.child.stdin.as_mut().and_then(|input| writeln!(input, "directory").ok())?;
-                let said = process.said();
-                let last = said.1.iter().rev().find_map(|line| line.strip_prefix("directory "))?;
-                (last == expected).then_some(())
+        let present: Vec<usize> = (0..PARTIES.len()).filter(|index| self.present[*index].is_some()).collect();
+        let ready = who_may_start(&present);
+        let mut entries: Vec<String> =
+            present.iter().map(|index| format!("{}={}", PARTIES[*index].0, ready.contains(index))).collect();
+        entries.sort_unstable();
+        let expected = entries.join(" ");
+        for index in present {
+            until(&format!("the directory of {} is {expected}", PARTIES[index].0), || {
+                (self.directory_of(index) == expected).then_some(())
             });
+        }
+    }
+
+    /// What a party's node has of all, as it says when it is asked now.
+    fn directory_of(&mut self, index: usize) -> String {
+        let answers = |process: &Process| -> Vec<String> {
+            let lines = &process.said().1;
+            lines.iter().filter_map(|line| line.strip_prefix("directory ")).map(str::to_owned).collect()
+        };
+        let process = self.present[index].as_ref().expect("it lives");
+        let before = answers(process).len();
+        self.tell(index, DIRECTORY);
+        let process = self.present[index].as_ref().expect("it lives");
+        until(&format!("{} says its directory", PARTIES[index].0), || {
+            answers(process).into_iter().nth(before)
+        })
+    }
+
+    fn wait_until_up(&self, index: usize) {
+        self.wait_for_word(index, UP);
+    }
+
+    /// Waits until a party has said this.
+    fn wait_for_word(&self, index: usize, word: &str) {
+        until(&format!("{} says that it is {word}", PARTIES[index].0), || {
+            self.present[index].as_ref()?.said().1.iter().any(|line| line == word).then_some(())
+        });
+    }
+
+    fn tell(&mut self, index: usize, word: &str) {
+        let process = self.present[index].as_mut().expect("it lives");
+        let told = process.child.stdin.as_mut().map(|input| writeln!(input, "{word}"));
+        assert!(matches!(told, Some(Ok(()))), "{} cannot be told {word}: {told:?}", PARTIES[index].0);
+    }
+
+    /// Nobody has started whose requirements are not met yet, and as long as one of the four is missing nobody has gone on.
+    fn check_who_waits(&mut self, present: &[usize]) {
+        let may_start = who_may_start(present);
+        let there: Vec<&str> = present.iter().map(|index| PARTIES[*index].0).collect();
+        for index in present {
+            let Some(process) = &self.present[*index] else { continue };
+            let life = process.said().0.clone();
+            let name = PARTIES[*index].0;
+            if life.started().is_some() != may_start.contains(index) {
+                let has = if life.started().is_some() { "has started" } else { "has not started" };
+                self.violations.push(format!("{name} {has} when {there:?} are there"));
+            }
+            if passed(&life).is_some() && present.len() < PARTIES.len() {
+                self.violations.push(format!("{name} has gone on when {there:?} are there"));
+            }
         }
     }
 
@@ -142,8 +266,29 @@ impl Cast {
             let life = process.said().0.clone();
             self.former[index].push(life);
         }
-        Verdict::of(&self.former)
+        let mut verdict = Verdict::of(&self.former);
+        verdict.violations.splice(0..0, self.violations);
+        verdict
     }
+}
+
+/// Those of these whose requirements are met by others of these that start.
+fn who_may_start(present: &[usize]) -> Vec<usize> {
+    let mut start: Vec<usize> = Vec::new();
+    let is_met = |start: &[usize], text: &&str| {
+        let requirement: Requirement = text.parse().expect("they are written by us");
+        start.iter().filter(|other| requirement.counts(PARTIES[**other].0)).count() >= requirement.count()
+    };
+    // Each round lets at least one more start, or was the last.
+    for _ in present {
+        let next: Vec<usize> = present
+            .iter()
+            .copied()
+            .filter(|index| PARTIES[*index].1.iter().all(|text| is_met(&start, text)))
+            .collect();
+        start = next;
+    }
+    start
 }
 
 fn passed(life: &Life) -> Option<u64> {

@@ -1,11 +1,27 @@
 //! One node with one application, as a process: it starts when what it requires is ready, and meets the others for ever.
 
-use std::io::BufRead;
+use std::{
+    io::BufRead,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+};
 
 use sinew::{Barrier, Meet, NodeBuilder, prelude::*};
 
 use super::{Event, PARTIES};
 
+/// Said when the node's layers run.
+pub(super) const UP: &str = "up";
+/// Told: the directory is to be said.
+pub(super) const DIRECTORY: &str = "directory";
+/// Told: the party is not to arrive any more.
+pub(super) const STAY_AWAY: &str = "stay away";
+/// Said when it has gone on and does not arrive, because it was told so.
+pub(super) const KEPT_BACK: &str = "kept back";
+/// Told: it is to arrive again.
+pub(super) const COME: &str = "come";
 /// From one round to the next arrival.
 const PAUSE: Duration = Duration::from_millis(5);
 /// How long a party waits; longer than any scenario lets it.
@@ -13,6 +29,8 @@ const WITHIN: Duration = Duration::from_secs(600);
 
 struct Party {
     barrier: Barrier,
+    stays_away: Arc<AtomicBool>,
+    is_kept_back: bool,
 }
 
 impl Actor for Party {
@@ -26,6 +44,14 @@ impl Actor for Party {
 
 impl Party {
     fn arrive(&mut self, context: &mut AppContext<Self>) {
+        if self.stays_away.load(Ordering::Relaxed) {
+            if !std::mem::replace(&mut self.is_kept_back, true) {
+                println!("{KEPT_BACK}");
+            }
+            context.run_later(PAUSE, Self::arrive);
+            return;
+        }
+        self.is_kept_back = false;
         Event::Arrived(Time::now().as_nanos()).tell();
         let meeting = context.meet(&self.barrier).into_actor(self);
         context.spawn(meeting.map(|passed, _, context| {
@@ -47,26 +73,39 @@ pub fn play() -> Option<std::process::ExitCode> {
         return None;
     }
     let index: usize = index.parse().expect("the director counts");
-    let node = node(index, group.parse().expect("the director's group")).start();
+    let stays_away = Arc::new(AtomicBool::new(false));
+    let node = node(index, group.parse().expect("the director's group"), &stays_away).start();
     let node = node.unwrap_or_else(|error| panic!("{error}"));
-    for line in std::io::stdin().lock().lines() {
-        if line.is_err() {
-            break;
+    println!("{UP}");
+    for line in std::io::stdin().lock().lines().map_while(Result::ok) {
+        match line.as_str() {
+            STAY_AWAY => stays_away.store(true, Ordering::Relaxed),
+            COME => stays_away.store(false, Ordering::Relaxed),
+            DIRECTORY => say_the_directory(&node),
+            other => panic!("the director says {other:?}, which is nothing known"),
         }
-        let directory = node.handle().directory();
-        let ready: Vec<String> =
-            directory.iter().map(|entry| format!("{}={}", entry.name, entry.ready)).collect();
-        println!("directory {}", ready.join(" "));
     }
     Some(std::process::ExitCode::SUCCESS)
 }
 
-fn node(index: usize, group: std::net::SocketAddrV4) -> NodeBuilder {
+fn say_the_directory(node: &Node) {
+    let directory = node.handle().directory();
+    let ready: Vec<String> =
+        directory.iter().map(|entry| format!("{}={}", entry.name, entry.ready)).collect();
+    println!("{DIRECTORY} {}", ready.join(" "));
+}
+
+fn node(index: usize, group: std::net::SocketAddrV4, stays_away: &Arc<AtomicBool>) -> NodeBuilder {
     let (name, requires) = PARTIES[index];
     let barrier = Barrier::new("step", PARTIES.map(|(name, _)| name)).within(WITHIN);
-    let party = AppSpec::new(name, move || Party { barrier: barrier.clone() })
-        .requires(requires.iter().copied())
-        .address(AppAddress::fixed(0).expect("the first fixed address"));
+    let stays_away = stays_away.clone();
+    let party = AppSpec::new(name, move || Party {
+        barrier: barrier.clone(),
+        stays_away: stays_away.clone(),
+        is_kept_back: false,
+    })
+    .requires(requires.iter().copied())
+    .address(AppAddress::fixed(0).expect("the first fixed address"));
     let address = u8::try_from(index + 1).expect("four of them");
     Node::builder(name)
         .address([127, 0, 0, address])
