@@ -56,7 +56,11 @@ mod process;
 mod refusals;
 mod ring;
 mod secured;
+// One file for both packages, which share nothing else in tests.
 pub mod security;
+#[cfg(test)]
+#[path = "../../runtime/src/seeded.rs"]
+mod seeded;
 mod session;
 mod stores;
 mod sync;

@@ -33,6 +33,8 @@ pub mod post;
 pub mod protection;
 pub mod router;
 pub mod schedule;
+#[cfg(test)]
+mod seeded;
 pub mod sender;
 pub mod supervision;
 pub mod tid;

@@ -3,23 +3,29 @@
 use std::{collections::BTreeMap, time::Duration};
 
 use super::{model::Model, window::Chance, *};
+use crate::seeded::{Seed, number};
 
 /// Histories in an ordinary run.
 const HISTORIES: u64 = 50_000;
 /// How many instead; `docs/TESTING.md` has the command.
 const HISTORIES_VARIABLE: &str = "SINEW_HISTORIES";
+/// The one history that is to be replayed.
+pub(super) const SEED_VARIABLE: &str = "SINEW_HISTORY";
 const STEPS_MAX: u64 = 80;
 
 #[test]
 fn any_history_gives_the_orders_that_the_rules_of_otp_give() {
-    let asked_for = std::env::var(HISTORIES_VARIABLE).ok();
-    let histories = asked_for.map_or(HISTORIES, |text| text.parse().expect("a number of histories"));
+    let (histories, only) = (number(HISTORIES_VARIABLE).unwrap_or(HISTORIES), number(SEED_VARIABLE));
     let mut seen = Seen::default();
-    for seed in 0..histories {
-        History::new(seed).run(&mut seen);
+    for number in only.map_or(0..histories, |only| only..only + 1) {
+        let test = "supervision::core::simulation::any_history";
+        let seed = Seed { number, variable: SEED_VARIABLE, package: "sinew-runtime", test };
+        seed.run(|| History::new(number).run(&mut seen));
     }
     println!("{histories} histories: {seen:?}");
-    seen.must_cover_everything();
+    if only.is_none() {
+        seen.must_cover_everything();
+    }
 }
 
 /// What came up, so that a generator that tries nothing is noticed.
@@ -95,7 +101,6 @@ impl World {
 }
 
 struct History {
-    seed: u64,
     chance: Chance,
     now: Time,
     next_id: u64,
@@ -112,7 +117,6 @@ impl History {
         let count = chance.below(6);
         let children: Vec<_> = (0..count).map(|id| (ChildId(id), any_policy(&mut chance))).collect();
         Self {
-            seed,
             chance,
             now: Time::from_nanos(1_000_000),
             next_id: count,
@@ -175,7 +179,7 @@ impl History {
     fn story(&self) -> String {
         let told: String =
             self.told.iter().map(|(at, input)| format!("\n  {:?} {input:?}", at.since(Time::ZERO))).collect();
-        format!("{told}\nwith {:?}, seed {}", self.core.flags(), self.seed)
+        format!("{told}\nwith {:?}", self.core.flags())
     }
 
     fn any_input(&mut self) -> Input {

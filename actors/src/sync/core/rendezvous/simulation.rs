@@ -13,6 +13,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use super::{super::*, Key, Known};
 use crate::{
     ndl::LossReason,
+    seeded::{Seed, number},
     sync::{
         arrivals::{Arrivals, Member},
         list::Name,
@@ -81,7 +82,6 @@ impl Chance {
 
 /// Nodes are the first processes; a double of one is a process behind them.
 struct World {
-    seed: u64,
     chance: Chance,
     now: Time,
     cores: Vec<Core>,
@@ -148,7 +148,6 @@ impl World {
         let mut chance = Chance::new(seed);
         let nodes = 3 + chance.below(2);
         let mut world = Self {
-            seed,
             chance,
             now: Time::from_nanos(1),
             cores: Vec::new(),
@@ -430,27 +429,26 @@ impl World {
             .map(|barrier| of_barrier(barrier).map(|node| self.generation(node, barrier)).collect())
             .collect();
         self.judge.all_is_quiet(&generations);
-        let replay = format!(
-            "seed {}; replay it with a trace: {SEED_VARIABLE}={} cargo test -p sinew --lib \
-             sync::core::rendezvous::simulation::a_seed_is_replayed -- --nocapture",
-            self.seed, self.seed
-        );
-        let violations = self.judge.violations.into_iter().map(|violation| format!("{violation}\n{replay}"));
-        (violations.collect(), self.judge.seen)
+        (self.judge.violations, self.judge.seen)
     }
 }
 
-fn number(variable: &str) -> Option<u64> {
-    std::env::var(variable).ok().map(|text| text.parse().expect("a number"))
+fn seed(number: u64) -> Seed {
+    let test = "sync::core::rendezvous::simulation::a_seed_is_replayed";
+    Seed { number, variable: SEED_VARIABLE, package: "sinew", test }
+}
+
+fn run(number: u64, fault: Option<Fault>, trace: bool) -> (Vec<String>, judge::Seen) {
+    seed(number).run(|| World::new(number, fault, trace).run())
 }
 
 #[test]
 fn a_barrier_never_opens_early_and_nobody_waits_where_all_are_there() {
     let seeds = number(SEEDS_VARIABLE).unwrap_or(SEEDS);
     let mut seen = judge::Seen::default();
-    for seed in 0..seeds {
-        let (violations, of_seed) = World::new(seed, None, false).run();
-        assert!(violations.is_empty(), "{}", violations.join("\n"));
+    for number in 0..seeds {
+        let (violations, of_seed) = run(number, None, false);
+        assert!(violations.is_empty(), "{}\n{}", violations.join("\n"), seed(number));
         seen.add(of_seed);
     }
     println!("{seeds} seeds: {seen:?}");
@@ -459,10 +457,11 @@ fn a_barrier_never_opens_early_and_nobody_waits_where_all_are_there() {
 
 #[test]
 fn a_seed_is_replayed() {
-    let seed = number(SEED_VARIABLE);
-    let (violations, seen) = World::new(seed.unwrap_or(7), None, seed.is_some()).run();
-    assert!(violations.is_empty(), "{}", violations.join("\n"));
-    assert_eq!(World::new(seed.unwrap_or(7), None, false).run().1, seen);
+    let asked_for = number(SEED_VARIABLE);
+    let replayed = asked_for.unwrap_or(7);
+    let (violations, seen) = run(replayed, None, asked_for.is_some());
+    assert!(violations.is_empty(), "{}\n{}", violations.join("\n"), seed(replayed));
+    assert_eq!(run(replayed, None, false).1, seen);
 }
 
 #[test]
@@ -473,8 +472,7 @@ fn each_planted_fault_is_found() {
     };
     let in_words = [GenerationsConfused, MembersLeftOut, EarlierLeftOut, DeparturesHidden];
     for fault in in_words.into_iter().chain([YoungerBelieved, VisitsForgotten]) {
-        let found =
-            (0..SEEDS_FOR_A_FAULT).find(|seed| !World::new(*seed, Some(fault), false).run().0.is_empty());
+        let found = (0..SEEDS_FOR_A_FAULT).find(|number| !run(*number, Some(fault), false).0.is_empty());
         println!("{fault:?} is found by seed {found:?}");
         assert!(found.is_some(), "{fault:?} is not found");
     }
