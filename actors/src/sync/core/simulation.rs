@@ -1,9 +1,16 @@
 //! Several cores that exchange lists over links that break, nodes that restart, applications that come and go in any
-//! order: after quiet, everybody whose requirements can be met runs, and all nodes say the same.
+//! order: nobody starts before what it requires has run; after quiet, everybody whose requirements can be met runs, who waits is told why, and
+//! all nodes say the same. Faults that are planted into what cores are told, and what becomes of their orders, must be found.
+
+mod judge;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
-use proptest::prelude::*;
+use proptest::{
+    prelude::*,
+    strategy::ValueTree,
+    test_runner::{RngAlgorithm, TestRng, TestRunner},
+};
 use sinew_runtime::app::Requirement;
 
 use super::*;
@@ -14,6 +21,43 @@ const NODES: usize = 3;
 const APPS: usize = 3;
 /// An application of each node that watches the directory.
 const WATCHER: usize = 99;
+
+/// Tries within which each planted fault must be found.
+const TRIES_FOR_A_FAULT: u32 = 1_000;
+
+/// A fault in what a core is told, or in what becomes of what it orders.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Fault {
+    /// An application is told to be ready when it is registered.
+    ReadyTooEarly,
+    /// That an application failed is not told.
+    FailureNotTold,
+    /// That an application is not to be there any more is not told.
+    EndNotTold,
+    /// One list in three is lost on a link that stands.
+    ListLost,
+    /// One release in three is not carried out.
+    ReleaseLost,
+    /// An application is released as soon as it is registered.
+    ReleasedAtOnce,
+    /// Watchers of the directory are not told who has gone.
+    GoneNotTold,
+    /// Who waits is given no reason.
+    ReasonsKept,
+}
+
+impl Fault {
+    const ALL: [Self; 8] = [
+        Self::ReadyTooEarly,
+        Self::FailureNotTold,
+        Self::EndNotTold,
+        Self::ListLost,
+        Self::ReleaseLost,
+        Self::ReleasedAtOnce,
+        Self::GoneNotTold,
+        Self::ReasonsKept,
+    ];
+}
 
 #[derive(Clone, Debug)]
 enum Step {
@@ -118,6 +162,12 @@ struct World {
     views: Vec<BTreeMap<(String, Tid), bool>>,
     told: u64,
     takes_all: bool,
+    /// Applications that have run in any life.
+    has_run: BTreeSet<usize>,
+    fault: Option<Fault>,
+    /// Orders that a fault may strike.
+    struck: u64,
+    violations: Vec<String>,
 }
 
 /// The two ends of a link.
@@ -138,7 +188,7 @@ fn app_address(app: usize) -> AppAddress {
 }
 
 impl World {
-    fn new() -> Self {
+    fn new(fault: Option<Fault>) -> Self {
         let mut world = Self {
             now: Time::from_nanos(1),
             cores: Vec::new(),
@@ -149,6 +199,10 @@ impl World {
             views: vec![BTreeMap::new(); NODES],
             told: 0,
             takes_all: false,
+            has_run: BTreeSet::new(),
+            fault,
+            struck: 0,
+            violations: Vec::new(),
         };
         world.cores = (0..NODES).map(|node| world.new_core(node)).collect();
         (0..NODES).for_each(|node| world.watch(node));
@@ -173,6 +227,7 @@ impl World {
         }
         match event {
             DirectoryEvent::Is(entry) => drop(self.views[node].insert((entry.name, entry.tid), entry.ready)),
+            DirectoryEvent::Gone { .. } if self.fault == Some(Fault::GoneNotTold) => {}
             DirectoryEvent::Gone { name, tid } => drop(self.views[node].remove(&(name, tid))),
         }
     }
@@ -188,9 +243,21 @@ impl World {
         }
     }
 
+    /// Whether a fault strikes now: one time in three.
+    fn strikes(&mut self, fault: Fault) -> bool {
+        self.struck += u64::from(self.fault == Some(fault));
+        self.fault == Some(fault) && self.struck.is_multiple_of(3)
+    }
+
+    fn violate(&mut self, is_so: bool, words: impl FnOnce() -> String) {
+        self.violations.extend(judge::require(is_so, words).err());
+    }
+
     fn carry_out(&mut self, node: usize, output: Output) {
         match output {
             Output::Release { app } if app == app_address(WATCHER) => {}
+            Output::Release { .. } if self.strikes(Fault::ReleaseLost) => {}
+            Output::Publish { .. } if self.strikes(Fault::ListLost) => {}
             Output::Release { app } => self.released(node, app),
             Output::TellDirectory { event, .. } => self.told_of_directory(node, event),
             Output::Publish { to, list } => {
@@ -200,8 +267,8 @@ impl World {
                 self.flying.entry((link, ends(link).0 == node)).or_default().push_back(list);
             }
             Output::Tell { app, event, .. } => {
-                let (index, _) = self.life(node, app);
-                assert!(self.apps[node][&index].released == 1, "told before it was released: {event:?}");
+                let released = self.life(node, app).1.released;
+                self.violate(released == 1, || format!("told before it was released: {event:?}"));
             }
             Output::Refused { cause, detail } => panic!("refused because of {cause}: {detail}"),
             Output::PublishArrivals { .. }
@@ -226,14 +293,19 @@ impl World {
             .filter(|entry| entry.ready)
             .map(|entry| entry.name)
             .collect();
-        let (_, life) = self.life(node, app);
+        let (index, life) = self.life(node, app);
         life.released += 1;
-        assert_eq!(life.released, 1, "released twice in one life");
-        for wanted in &life.requires {
-            assert!(
-                wanted.is_met_by(|index| ready.contains(&name(index))),
-                "too early: {wanted:?} is not met"
-            );
+        let (released, requires) = (life.released, life.requires.clone());
+        let who = name(node * APPS + index);
+        self.violate(released == 1, || format!("{who} is released twice in one life"));
+        for wanted in requires {
+            let is_met = wanted.is_met_by(|index| ready.contains(&name(index)));
+            self.violate(is_met, || {
+                format!("{who} is released early: {wanted:?} is not met, as its node sees it")
+            });
+            // What was heard last may be out of date, and was so once.
+            let has_been = wanted.is_met_by(|index| self.has_run.contains(&index));
+            self.violate(has_been, || format!("{who} is released early: {wanted:?} has never run"));
         }
     }
 
@@ -247,11 +319,16 @@ impl World {
                     if life.released == 1 {
                         (life.released, life.running) = (0, false);
                     }
-                    self.tell(node, Input::AppChanged(AppFact::Down { app: app_address(app) }));
+                    if self.fault != Some(Fault::FailureNotTold) {
+                        self.tell(node, Input::AppChanged(AppFact::Down { app: app_address(app) }));
+                    }
                 }
             }
             Step::Unregister { node, app } => {
                 self.apps[node].remove(&app);
+                if self.fault == Some(Fault::EndNotTold) {
+                    return;
+                }
                 self.tell(node, Input::AppChanged(AppFact::Unregistered { app: app_address(app) }));
             }
             Step::Cut { link } => self.cut(link),
@@ -285,8 +362,15 @@ impl World {
             self.apps[node].insert(app, life);
         }
         let requires = requires.iter().map(|wanted| wanted.requirement().to_string()).collect();
-        let fact = AppFact::Registered { app: app_address(app), name: Some(name(index)), requires };
+        let address = app_address(app);
+        let fact = AppFact::Registered { app: address, name: Some(name(index)), requires };
         self.tell(node, Input::AppChanged(fact));
+        if self.fault == Some(Fault::ReadyTooEarly) {
+            self.tell(node, Input::AppChanged(AppFact::Ready { app: address }));
+        }
+        if self.fault == Some(Fault::ReleasedAtOnce) && self.apps[node][&app].released == 0 {
+            self.released(node, address);
+        }
     }
 
     fn start(&mut self, node: usize, app: usize) {
@@ -295,6 +379,7 @@ impl World {
             && !life.running
         {
             life.running = true;
+            self.has_run.insert(node * APPS + app);
             self.tell(node, Input::AppChanged(AppFact::Ready { app: app_address(app) }));
         }
     }
@@ -364,46 +449,43 @@ impl World {
             }
         }
     }
+}
 
-    /// The applications that can run: all that they require can.
-    fn possible(&self) -> BTreeSet<usize> {
-        let mut possible = BTreeSet::new();
-        for index in 0..NODES * APPS {
-            let life = self.apps[index / APPS].get(&(index % APPS));
-            if life.is_some_and(|life| {
-                life.requires.iter().all(|wanted| wanted.is_met_by(|index| possible.contains(&index)))
-            }) {
-                possible.insert(index);
-            }
-        }
-        possible
+/// What happens; what is found to be wrong.
+fn play(steps: Vec<Step>, fault: Option<Fault>) -> Result<(), String> {
+    let mut world = World::new(fault);
+    steps.into_iter().for_each(|step| world.step(step));
+    world.settle();
+    match world.violations.first() {
+        Some(violation) => Err(violation.clone()),
+        None => world.verdict(),
     }
+}
+
+fn any_steps() -> impl Strategy<Value = Vec<Step>> {
+    proptest::collection::vec(any_step(), 0..80)
 }
 
 proptest! {
     #[test]
-    fn after_quiet_all_who_can_run_do_and_all_nodes_agree(steps in proptest::collection::vec(any_step(), 0..80)) {
-        let mut world = World::new();
-        steps.into_iter().for_each(|step| world.step(step));
-        world.settle();
-        // Who was released and lost a requirement since is not stopped, so it may run without being possible.
-        for index in world.possible() {
-            let life = &world.apps[index / APPS][&(index % APPS)];
-            prop_assert_eq!((life.released, life.running), (1, true), "{} does not run", name(index));
-        }
-        let directories: Vec<_> = world.cores.iter().map(Core::directory).collect();
-        prop_assert_eq!(&directories[0], &directories[1]);
-        prop_assert_eq!(&directories[0], &directories[2]);
-        for (core, view) in world.cores.iter().zip(&world.views) {
-            let known = core.directory().into_iter().map(|entry| ((entry.name, entry.tid), entry.ready));
-            prop_assert_eq!(&known.collect::<BTreeMap<_, _>>(), view);
-        }
-        let registered: usize = world.apps.iter().map(BTreeMap::len).sum();
-        prop_assert_eq!(directories[0].len(), registered);
-        for entry in &directories[0] {
-            for core in &world.cores {
-                prop_assert_eq!(core.called(&entry.name).first().copied(), Some(entry.tid));
-            }
-        }
+    fn after_quiet_all_who_can_run_do_and_all_nodes_agree(steps in any_steps()) {
+        prop_assert_eq!(play(steps, None), Ok(()));
+    }
+}
+
+#[test]
+fn each_planted_fault_is_found() {
+    for fault in Fault::ALL {
+        let random = TestRng::deterministic_rng(RngAlgorithm::ChaCha);
+        let mut runner = TestRunner::new_with_rng(ProptestConfig::default(), random);
+        let mut tries = 0..TRIES_FOR_A_FAULT;
+        let found = tries.find_map(|number| {
+            let steps = any_steps().new_tree(&mut runner).expect("nothing is filtered").current();
+            Some((number, play(steps, Some(fault)).err()?))
+        });
+        let Some((number, words)) = found else {
+            panic!("{fault:?} is not found in {TRIES_FOR_A_FAULT} tries");
+        };
+        println!("{fault:?}: try {number}: {words}");
     }
 }
