@@ -3,14 +3,14 @@
 use std::time::{Duration, Instant};
 
 use super::{
+    CROWD_VARIABLE,
     plan::{Clock, Finding, Happening, Plan, Quality},
     world::World,
 };
+use crate::seeded::number;
 
 /// How many nodes there are in an ordinary run; `docs/TESTING.md` has the command for more.
 const CROWD: usize = 10;
-/// The most nodes that are looked at, a power of ten.
-const CROWD_VARIABLE: &str = "SINEW_NDL_CROWD";
 /// Periods that are measured, when all know each other.
 const PERIODS: u32 = 4;
 
@@ -42,8 +42,7 @@ fn crowd(nodes: usize) -> Plan {
 /// All start at the same moment, and know each other; then they are quiet.
 #[test]
 fn a_crowd_that_starts_at_once_knows_each_other_and_its_cost_is_told() {
-    let most =
-        super::number(CROWD_VARIABLE).map_or(CROWD, |most| usize::try_from(most).expect("a small number"));
+    let most = number(CROWD_VARIABLE).map_or(CROWD, |most| usize::try_from(most).expect("a small number"));
     let mut nodes = 10;
     while nodes <= most {
         measure(nodes);
@@ -58,12 +57,15 @@ fn measure(nodes: usize) {
     let begin = world.now;
     let known_after = (1..=100_u32).find(|tenths| {
         world.run_until(begin + period * *tenths / 10);
+        // It stands still at the first of them: what is measured then would be nothing.
+        assert_eq!(world.violations(), [""; 0], "{nodes} nodes");
         (0..nodes).all(|node| world.view(node).len() == nodes - 1)
     });
     let known_after = known_after.expect("all know each other within ten periods") * period / 10;
     let (sent, began) = (world.seen().datagrams, (world.in_cores, Instant::now()));
     let measured = period * PERIODS;
     world.run_until(world.now + measured);
+    assert_eq!(world.violations(), [""; 0], "{nodes} nodes");
     let seconds = measured.as_secs_f64();
     let per_node = |total: f64| total / seconds / f64::from(u32::try_from(nodes).expect("few nodes"));
     let in_cores = (world.in_cores - began.0).as_secs_f64() * 1e3;

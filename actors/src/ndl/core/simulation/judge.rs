@@ -55,6 +55,8 @@ struct Sight {
     places: BTreeSet<SocketAddr>,
     /// The last sign of life that was read.
     read: Time,
+    /// The last time that anything of it was read, a question to all too.
+    heard: Time,
     /// The last one that was read on a connection.
     sign: Option<Time>,
 }
@@ -213,7 +215,14 @@ impl Judge {
     /// Something was read on a connection, or a question to this process.
     pub(super) fn read_a_sign(&mut self, now: Time, process: usize, of: usize) {
         if let Some(sight) = self.lives[process].sights.get_mut(&of) {
-            (sight.read, sight.sign) = (now, Some(now));
+            (sight.read, sight.heard, sight.sign) = (now, now, Some(now));
+        }
+    }
+
+    /// A question or an answer was read.
+    pub(super) fn heard(&mut self, now: Time, process: usize, of: usize) {
+        if let Some(sight) = self.lives[process].sights.get_mut(&of) {
+            sight.heard = now;
         }
     }
 
@@ -241,12 +250,13 @@ impl Judge {
             answered: now,
             places: BTreeSet::new(),
             read: now,
+            heard: now,
             sign: None,
         });
         let was_member = std::mem::replace(&mut sight.is_member, true);
         let came_back = sight.is_over;
         sight.places.clear();
-        (sight.answered, sight.read) = (now, now);
+        (sight.answered, sight.read, sight.heard) = (now, now, now);
         if was_member {
             self.violate(now, process, other, "is found, and was a member already");
         }
@@ -279,6 +289,27 @@ impl Judge {
         });
         if !was_member {
             self.violate(now, process, other, "is lost, and was no member");
+        }
+    }
+
+    /// An application is told for how long it was silent, and within which time that is a loss.
+    pub(super) fn told_of_a_loss(
+        &mut self,
+        now: Time,
+        process: usize,
+        (node, incarnation): (NodeAddress, Incarnation),
+        [silent, bound]: [Duration; 2],
+    ) {
+        let Some(other) = self.life(node, incarnation) else { return };
+        let (period, missed_max) = self.pace(other);
+        if bound != period * (missed_max + 1) {
+            self.violate(now, process, other, &format!("is told to be lost within {bound:?}"));
+        }
+        let Some(heard) = self.lives[process].sights.get(&other).map(|sight| sight.heard) else { return };
+        let least = now.since(heard) * (1_000 - DRIFT_PER_MILLE) / 1_000;
+        if silent + Duration::from_micros(2) < least {
+            let words = format!("is told to have been silent for {silent:?}, and was for {least:?} and more");
+            self.violate(now, process, other, &words);
         }
     }
 

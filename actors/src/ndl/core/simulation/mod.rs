@@ -11,12 +11,14 @@
 //! | `world` | virtual time, one queue of events, processes |
 //! | `network` | what becomes of a datagram |
 //! | `judge` | what must hold, apart from all scenarios |
+//! | `listeners` | what applications are told |
 //! | `planted` | faults in the core's behaviour that the judge must find |
 //! | `cost` | what a node costs among 10, 100 and 1,000 |
 
 mod chance;
 mod cost;
 mod judge;
+mod listeners;
 mod network;
 mod plan;
 mod planted;
@@ -28,30 +30,34 @@ use self::{
     planted::Fault,
     world::{Outcome, World},
 };
+use crate::seeded::{Seed, number};
 
 /// Seeds in an ordinary run.
 const SEEDS: u64 = 300;
 /// How many instead; `docs/TESTING.md` has the command.
 const SEEDS_VARIABLE: &str = "SINEW_NDL_SEEDS";
+/// The most nodes that are looked at: what they cost at 10, 100 and so on, how they get over faults if there are more than 100.
+const CROWD_VARIABLE: &str = "SINEW_NDL_CROWD";
+/// The one crowd that is to be replayed.
+const CROWD_SEED_VARIABLE: &str = "SINEW_NDL_CROWD_SEED";
+/// Crowds of 100 in an ordinary run, and of more where they are asked for. Without optimization one takes as long as all other seeds.
+const CROWDS: u64 = if cfg!(debug_assertions) { 1 } else { 3 };
 /// The one seed that is to be replayed.
-const SEED_VARIABLE: &str = "SINEW_NDL_SEED";
+pub(super) const SEED_VARIABLE: &str = "SINEW_NDL_SEED";
 /// Seeds within which each planted fault must be found.
 const SEEDS_FOR_A_FAULT: u64 = 300;
 
-fn number(variable: &str) -> Option<u64> {
-    std::env::var(variable).ok().map(|text| text.parse().expect("a number"))
+fn seed(number: u64) -> Seed {
+    let test = "ndl::core::simulation::a_seed_is_replayed";
+    Seed { number, variable: SEED_VARIABLE, package: "sinew", test }
 }
 
-fn run(seed: u64, fault: Option<Fault>) -> Outcome {
-    World::new(Plan::of(seed), fault).run()
+fn run(number: u64, fault: Option<Fault>) -> Outcome {
+    seed(number).run(|| World::new(Plan::of(number), fault).run())
 }
 
-fn words(seed: u64, outcome: &Outcome) -> String {
-    format!(
-        "seed {seed}: {}\nreplay it with a trace: {SEED_VARIABLE}={seed} cargo test -p sinew --lib \
-         ndl::core::simulation::a_seed_is_replayed -- --nocapture",
-        outcome.violations.join("\n")
-    )
+fn words(number: u64, outcome: &Outcome) -> String {
+    format!("{}\n{}", outcome.violations.join("\n"), seed(number))
 }
 
 #[test]
@@ -69,13 +75,41 @@ fn whatever_happens_the_judge_finds_nothing() {
 
 #[test]
 fn a_seed_is_replayed_the_same_each_time() {
-    let seed = number(SEED_VARIABLE);
-    let trace = seed.is_some();
-    let replay = || World::new(Plan::of(seed.unwrap_or(7)), None).traced(trace).run();
-    let outcome = replay();
-    assert!(outcome.violations.is_empty(), "{}", words(seed.unwrap_or(7), &outcome));
-    let again = World::new(Plan::of(seed.unwrap_or(7)), None).run();
+    let asked_for = number(SEED_VARIABLE);
+    let replayed = asked_for.unwrap_or(7);
+    let traced = || World::new(Plan::of(replayed), None).traced(asked_for.is_some()).run();
+    let outcome = seed(replayed).run(traced);
+    assert!(outcome.violations.is_empty(), "{}", words(replayed, &outcome));
+    let again = run(replayed, None);
     assert_eq!((outcome.seen, outcome.digest), (again.seen, again.digest));
+}
+
+/// Plays crowds, or the one that is asked for; `test` replays one, with `variable`.
+fn crowds_get_over_faults(nodes: usize, variable: &'static str, test: &'static str) {
+    let only = number(CROWD_SEED_VARIABLE);
+    let mut seen = world::Seen::default();
+    for number in only.map_or(0..CROWDS, |only| only..only + 1) {
+        let seed = Seed { number, variable, package: "sinew", test };
+        let outcome = seed.run(|| World::new(Plan::crowd(number, nodes), None).run());
+        assert!(outcome.violations.is_empty(), "{nodes} nodes: {}\n{seed}", outcome.violations.join("\n"));
+        seen.add(&outcome.seen);
+    }
+    println!("{nodes} nodes: {seen:?}");
+}
+
+#[test]
+fn a_hundred_nodes_get_over_faults() {
+    crowds_get_over_faults(100, CROWD_SEED_VARIABLE, "ndl::core::simulation::a_hundred_nodes");
+}
+
+/// A thousand take minutes.
+#[test]
+fn more_nodes_get_over_faults_where_they_are_asked_for() {
+    if let Some(nodes) = number(CROWD_VARIABLE).filter(|nodes| *nodes > 100) {
+        let variable = format!("{CROWD_VARIABLE}={nodes} {CROWD_SEED_VARIABLE}").leak();
+        let nodes = usize::try_from(nodes).expect("a small number");
+        crowds_get_over_faults(nodes, variable, "ndl::core::simulation::more_nodes");
+    }
 }
 
 #[test]

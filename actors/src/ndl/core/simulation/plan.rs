@@ -3,6 +3,10 @@
 use std::time::Duration;
 
 use super::chance::Chance;
+use crate::ndl::Trouble;
+
+/// Faults of a crowd; one that parts it is a million cuts among 1,000.
+const FAULTS_OF_A_CROWD: usize = 20;
 
 /// How nodes find each other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -73,6 +77,11 @@ pub(super) enum Happening {
         from: usize,
         to: usize,
     },
+    /// An application of it does not get on, or does again.
+    Trouble {
+        node: usize,
+        trouble: Option<Trouble>,
+    },
     Heal,
 }
 
@@ -129,6 +138,7 @@ impl Plan {
         }
         plan.connect(&mut chance, heals);
         plan.multiply(&mut chance, heals);
+        plan.troubles(&mut chance, heals);
         plan.happenings.push((heals, Happening::Heal));
         plan.happenings.sort_by_key(|(at, _)| *at);
         // An address where nobody answered is asked every 16 periods at last.
@@ -138,6 +148,41 @@ impl Plan {
             plan.watched.map_or(Duration::ZERO, |(_, period, missed_max)| period * (missed_max + 2));
         let loss = watched.max(period * (missed_max + 2));
         plan.end = heals + plan.quality.late_max + loss + period * found_again;
+        plan
+    }
+
+    /// Many nodes that find each other through the group, and so many faults that several happen at a time.
+    pub(super) fn crowd(seed: u64, nodes: usize) -> Self {
+        let mut chance = Chance::new(seed);
+        let period = Duration::from_millis(500);
+        let mut quality = quality(&mut chance, period);
+        // More than this, and everybody loses many others all the time, rightly.
+        quality.lost_per_mille = quality.lost_per_mille.min(100);
+        quality.late_max = period;
+        let mut plan = Self {
+            seed,
+            nodes,
+            period,
+            missed_max: 3,
+            watched: None,
+            finding: Finding::Group,
+            connections: chance.happens(700),
+            networks: 1,
+            quality,
+            lateness: chance.of(&[Duration::ZERO, period / 50]),
+            clocks: (0..nodes).map(|_| clock(&mut chance)).collect(),
+            happenings: Vec::new(),
+            end: Duration::ZERO,
+        };
+        let heals = period * 8;
+        plan.starts(&mut chance);
+        for _ in 0..FAULTS_OF_A_CROWD {
+            plan.fault(&mut chance, heals);
+        }
+        plan.troubles(&mut chance, heals);
+        plan.happenings.push((heals, Happening::Heal));
+        plan.happenings.sort_by_key(|(at, _)| *at);
+        plan.end = heals + plan.quality.late_max + period * (plan.missed_max + 2 + 3);
         plan
     }
 
@@ -193,6 +238,21 @@ impl Plan {
                     }
                 }
                 at = (end + up).min(heals);
+            }
+        }
+    }
+
+    /// Applications do not get on for a time, or for good, in some plans.
+    fn troubles(&mut self, chance: &mut Chance, heals: Duration) {
+        for _ in 0..chance.below(4) {
+            let node = chance.index(self.nodes);
+            let mut at = chance.between(self.period, heals);
+            for trouble in [Trouble::Stalled, Trouble::Away] {
+                self.happenings.push((at, Happening::Trouble { node, trouble: Some(trouble) }));
+                at = chance.between(at, heals);
+            }
+            if chance.happens(700) {
+                self.happenings.push((at, Happening::Trouble { node, trouble: None }));
             }
         }
     }
@@ -256,7 +316,7 @@ impl Plan {
     /// Some cannot hear the others for a time, or neither side the other.
     fn part(&mut self, chance: &mut Chance, begins: Duration, ends: Duration) {
         let (side, both_ways) = (chance.draw(), chance.happens(500));
-        let is_there = |node: usize| side >> node & 1 == 1;
+        let is_there = |node: usize| side >> (node % 64) & 1 == 1;
         for from in 0..self.nodes {
             for to in 0..self.nodes {
                 if is_there(from) && !is_there(to) || both_ways && !is_there(from) && is_there(to) {

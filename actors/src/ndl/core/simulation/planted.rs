@@ -6,7 +6,7 @@ use sinew_runtime::time::Time;
 
 use super::network::{Flying, What};
 use crate::ndl::{
-    LossReason, MembershipFact,
+    LossReason, MembershipFact, NodeEvent,
     core::{
         Core, Input, Output, Place,
         contact::{Question, Role},
@@ -48,10 +48,22 @@ pub(super) enum Fault {
     KeepsALossToItself,
     /// A member that does not answer at one of its addresses is silent.
     JudgesByOneRoute,
+    /// Applications are not told of a loss.
+    KeepsALossFromApplications,
+    /// Applications are told of a loss twice.
+    TellsALossTwice,
+    /// Applications are told that a node that crashed hangs.
+    TellsAnotherClass,
+    /// Applications are told that a node was heard just before it was lost.
+    TellsThatItWasJustHeard,
+    /// Applications are not told what does not get on.
+    KeepsATroubleToItself,
+    /// Applications are not told what gets on again.
+    NeverTellsThatItGetsOn,
 }
 
 impl Fault {
-    pub(super) const ALL: [Self; 16] = [
+    pub(super) const ALL: [Self; 22] = [
         Self::ForgetsAnAnswer,
         Self::CountsItsOwnStall,
         Self::IgnoresIncarnation,
@@ -68,13 +80,28 @@ impl Fault {
         Self::BoastsOfItsClock,
         Self::KeepsALossToItself,
         Self::JudgesByOneRoute,
+        Self::KeepsALossFromApplications,
+        Self::TellsALossTwice,
+        Self::TellsAnotherClass,
+        Self::TellsThatItWasJustHeard,
+        Self::KeepsATroubleToItself,
+        Self::NeverTellsThatItGetsOn,
     ];
+}
+
+/// How often an application is told something.
+enum Telling {
+    Never,
+    Once,
+    Twice,
 }
 
 /// A core, and the fault of it.
 pub(super) struct Patient {
     pub(super) core: Core,
     fault: Option<Fault>,
+    /// What is told once more.
+    again: Option<Output>,
 }
 
 impl Patient {
@@ -85,7 +112,7 @@ impl Patient {
             Some(Fault::HasOnePaceForAll) => core.paces.truncate(1),
             Some(_) | None => {}
         }
-        Self { core, fault }
+        Self { core, fault, again: None }
     }
 
     pub(super) fn receive(&mut self, now: Time, flying: &Flying) {
@@ -160,8 +187,18 @@ impl Patient {
     }
 
     pub(super) fn poll(&mut self) -> Option<Output> {
+        if let Some(output) = self.again.take() {
+            return Some(output);
+        }
         loop {
             let mut output = self.core.poll()?;
+            if let Output::Event { event, .. } = &mut output {
+                match self.tell(event) {
+                    Telling::Once => {}
+                    Telling::Twice => self.again = Some(output.clone()),
+                    Telling::Never => continue,
+                }
+            }
             match (self.fault, &mut output) {
                 (Some(Fault::SaysNoGoodbye), Output::SendLeave { .. }) => {}
                 (Some(Fault::BoastsOfItsClock), Output::ClockMeasured { offset, .. }) => {
@@ -175,6 +212,27 @@ impl Patient {
                 }
                 _ => return Some(output),
             }
+        }
+    }
+
+    /// What becomes of an event for applications.
+    const fn tell(&self, event: &mut NodeEvent) -> Telling {
+        match (self.fault, event) {
+            (Some(Fault::KeepsALossFromApplications), NodeEvent::NodeLost { .. })
+            | (Some(Fault::KeepsATroubleToItself), NodeEvent::AppStalled { .. })
+            | (Some(Fault::NeverTellsThatItGetsOn), NodeEvent::AppResumed { .. }) => Telling::Never,
+            (Some(Fault::TellsALossTwice), NodeEvent::NodeLost { .. }) => Telling::Twice,
+            (Some(Fault::TellsAnotherClass), NodeEvent::NodeLost { why, .. }) => {
+                if matches!(why, LossReason::Crashed) {
+                    *why = LossReason::Hung;
+                }
+                Telling::Once
+            }
+            (Some(Fault::TellsThatItWasJustHeard), NodeEvent::NodeLost { silent_us, .. }) => {
+                *silent_us = 0;
+                Telling::Once
+            }
+            _ => Telling::Once,
         }
     }
 

@@ -12,13 +12,14 @@ use std::{
 };
 
 use sinew_runtime::{
-    tid::{Incarnation, NodeAddress},
+    tid::{AppAddress, Incarnation, NodeAddress},
     time::Time,
 };
 
 use super::{
     chance::Chance,
     judge::Judge,
+    listeners::{Listeners, Truth},
     network::{Flying, Network, What},
     plan::{Clock, Finding, Happening, Plan},
     planted::{Fault, Patient},
@@ -26,8 +27,9 @@ use super::{
 use crate::{
     config::{NodeConfig, WatchGroup},
     gncl::LinkFact,
+    lncl::AppFact,
     ndl::{
-        MembershipFact,
+        MembershipFact, Part, Progress, Told, Trouble,
         core::{Core, Host, Input, Output, Place, Way},
         datagram::{Answer, Body, Datagram, encode},
     },
@@ -40,6 +42,9 @@ const PORT: u16 = 7_400;
 const SOCKET_MAX: usize = 256;
 /// Longest time until mDNS tells of a node, or a peer's host refuses a connection.
 const WORD_MAX: Duration = Duration::from_millis(5);
+/// The application of each process that listens, and one that has trouble now and then.
+const LISTENER: AppAddress = AppAddress::new(0x1000);
+const TROUBLED: AppAddress = AppAddress::new(0x2000);
 
 /// What a run was like.
 pub(super) struct Outcome {
@@ -62,6 +67,9 @@ pub(super) struct Seen {
     pub(super) restarted: u64,
     pub(super) stalls: u64,
     pub(super) signs: u64,
+    pub(super) restarts_told: u64,
+    pub(super) stalls_told: u64,
+    pub(super) unheard_told: u64,
 }
 
 impl Seen {
@@ -76,16 +84,20 @@ impl Seen {
         self.restarted += other.restarted;
         self.stalls += other.stalls;
         self.signs += other.signs;
+        self.restarts_told += other.restarts_told;
+        self.stalls_told += other.stalls_told;
+        self.unheard_told += other.unheard_told;
     }
 
     pub(super) fn must_cover_everything(&self, seeds: u64) {
-        let Self { datagrams, dropped, found, crashed, hung, link_down, left, restarted, stalls, signs } =
-            *self;
-        let all = [datagrams, dropped, found, crashed, hung, link_down, left, restarted, stalls, signs];
-        assert!(
-            all.into_iter().min().is_some_and(|count| count >= seeds / 20),
-            "something was hardly tried: {self:?}"
-        );
+        let Self {
+            datagrams, dropped, found, crashed, hung, link_down, left, restarted, stalls, signs, ..
+        } = *self;
+        let Self { restarts_told, stalls_told, unheard_told, .. } = *self;
+        let happened = [datagrams, dropped, found, crashed, hung, link_down, left, restarted, stalls, signs];
+        // Datagrams alone are stopped for that long now and then only.
+        let all = happened.into_iter().chain([restarts_told, stalls_told, unheard_told * 5]);
+        assert!(all.min().is_some_and(|count| count >= seeds / 20), "something was hardly tried: {self:?}");
     }
 }
 
@@ -116,6 +128,8 @@ struct Process {
     met: BTreeSet<SocketAddr>,
     /// Whom it said goodbye to.
     goodbyes: BTreeSet<SocketAddr>,
+    /// What of it does not get on, and did not.
+    troubles: Truth,
 }
 
 pub(super) struct World {
@@ -128,6 +142,7 @@ pub(super) struct World {
     sequence: u64,
     network: Network,
     judge: Judge,
+    listeners: Listeners,
     processes: Vec<Process>,
     /// The process of each node, and its number.
     current: BTreeMap<usize, usize>,
@@ -172,6 +187,7 @@ impl World {
             sequence: 0,
             network: Network::new(plan.quality, plan.networks),
             judge: Judge::new(&plan),
+            listeners: Listeners::default(),
             processes: Vec::new(),
             current: BTreeMap::new(),
             at: BTreeMap::new(),
@@ -209,6 +225,7 @@ impl World {
         if self.judge.violations.is_empty() {
             self.judge.at_rest(self.now, &views);
             self.judge_routes();
+            self.judge_listeners();
         }
         let Self { judge, seen, digest, .. } = self;
         Outcome { violations: judge.violations, seen, digest: digest.finish() }
@@ -247,6 +264,23 @@ impl World {
                 }
             }
         }
+    }
+
+    /// All has been well for long: everybody's application knows who has trouble.
+    fn judge_listeners(&mut self) {
+        for process in self.current.values().copied() {
+            for other in self.current.values().copied().filter(|other| *other != process) {
+                let Process { node, ref troubles, .. } = self.processes[other];
+                if let Err(words) = self.listeners.at_rest(process, node_address(node), troubles) {
+                    self.judge.violations.push(format!("{:?}: at rest, to {process}: {words}", self.now));
+                }
+            }
+        }
+    }
+
+    /// What must not have happened, in words.
+    pub(super) fn violations(&self) -> &[String] {
+        &self.judge.violations
     }
 
     pub(super) const fn seen(&self) -> &Seen {
@@ -335,6 +369,9 @@ impl World {
     }
 
     fn read(&mut self, process: usize, flying: &Flying) {
+        if flying.what != What::Leave {
+            self.judge.heard(self.now, process, flying.sender);
+        }
         if let What::Answer(_) = flying.what {
             self.judge.read(self.now, process, flying.sender);
         }
@@ -370,6 +407,9 @@ impl World {
         self.in_cores += began.elapsed();
         while let Some(output) = self.processes[process].patient.poll() {
             self.obey(process, now, output);
+        }
+        if let Err(words) = self.listeners.all_is_told(process) {
+            self.judge.violations.push(format!("{:?}: to {process}: {words}", self.now));
         }
         self.set_timer(process);
     }

@@ -21,8 +21,26 @@ impl World {
             }
             Happening::Muffle { from, to } => self.network.muffle(from, to),
             Happening::Unmuffle { from, to } => self.network.unmuffle(from, to),
+            Happening::Trouble { node, trouble } => self.trouble(node, trouble),
             Happening::Heal => self.heal(),
         }
+    }
+
+    /// An application of the node does not get on, or gets on again.
+    fn trouble(&mut self, node: usize, trouble: Option<Trouble>) {
+        let Some(process) = self.current.get(&node).copied().filter(|process| !self.is_stalled(*process))
+        else {
+            return;
+        };
+        let troubles = &mut self.processes[process].troubles;
+        troubles.now.clear();
+        let part = trouble.map(|trouble| {
+            troubles.now.insert(TROUBLED, trouble);
+            troubles.ever.push((TROUBLED, trouble));
+            Part { app: TROUBLED, name: "troubled".to_owned(), trouble: Told(trouble), since_ms: 300 }
+        });
+        let progress = Progress::of(part.into_iter().collect());
+        self.with(process, |patient, now| patient.core.handle(now, Input::ProgressSeen(progress)));
     }
 
     fn change(&mut self, one: usize, other: usize) {
@@ -160,12 +178,16 @@ impl World {
             wake: None,
             met: BTreeSet::new(),
             goodbyes: BTreeSet::new(),
+            troubles: Truth::default(),
         });
         self.current.insert(node, index);
         self.dead_hosts.remove(&node);
         self.change_node(node);
         self.at.extend(addresses.iter().map(|address| (*address, index)));
         self.judge.started(node_address(node), incarnation, addresses);
+        self.listeners.started();
+        let listens = AppFact::Ready { app: LISTENER };
+        self.with(index, |patient, now| patient.core.handle(now, Input::AppChanged(listens)));
         self.begin(index);
         self.tell_through_mdns(index);
     }

@@ -1,6 +1,7 @@
 //! What cores say: datagrams go to the network, facts to the judge.
 
 use super::*;
+use crate::ndl::NodeEvent;
 
 impl World {
     pub(super) fn obey(&mut self, from: usize, now: Time, output: Output) {
@@ -23,7 +24,7 @@ impl World {
                     announcement: me(),
                     query_sent_ns,
                     query_received_ns,
-                    progress: Default::default(),
+                    progress: self.processes[from].patient.core.progress().clone(),
                 };
                 let datagram = Datagram { correlation, sent: now, body: Body::Answer(answer) };
                 self.send(from, to, What::Answer(correlation), &datagram);
@@ -62,7 +63,7 @@ impl World {
             | Output::AddressTaken { .. } => {
                 self.judge.violations.push(format!("{:?}: {from} says {output:?}", self.now));
             }
-            Output::Event { .. } => {}
+            Output::Event { event, .. } => self.told_to_application(from, &event),
         }
     }
 
@@ -70,7 +71,33 @@ impl World {
         node_address(self.processes[process].node) == node
     }
 
+    fn told_to_application(&mut self, process: usize, event: &NodeEvent) {
+        self.trace(|| format!("{process} tells its application {event:?}"));
+        match *event {
+            NodeEvent::NodeLost { node, incarnation, silent_us, bound_us, .. } => {
+                let said = [silent_us, bound_us].map(Duration::from_micros);
+                self.judge.told_of_a_loss(self.now, process, (node, incarnation), said);
+            }
+            NodeEvent::AppStalled { trouble: Trouble::Unheard, .. } => self.seen.unheard_told += 1,
+            NodeEvent::AppStalled { .. } => self.seen.stalls_told += 1,
+            NodeEvent::NodeRestarted { .. } => self.seen.restarts_told += 1,
+            NodeEvent::NodeFound { .. } | NodeEvent::AppResumed { .. } => {}
+        }
+        let truth = |node: NodeAddress, incarnation: Incarnation| {
+            let life = self.processes.iter().find(|process| {
+                let announcement = process.patient.core.announcement();
+                (announcement.node, announcement.incarnation) == (node, incarnation)
+            });
+            life.map(|process| process.troubles.clone()).unwrap_or_default()
+        };
+        if let Err(words) = self.listeners.told(process, event, truth) {
+            let words = format!("{:?}: to the application of {process}, {event:?}: {words}", self.now);
+            self.judge.violations.push(words);
+        }
+    }
+
     fn told(&mut self, process: usize, fact: MembershipFact) {
+        self.listeners.owes(process, &fact);
         self.trace(|| format!("{process} says {fact:?}"));
         format!("{:?} {process} {fact:?}", self.now).hash(&mut self.digest);
         match fact {
