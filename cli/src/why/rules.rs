@@ -276,7 +276,20 @@ impl Steps {
                 let mend = (!is_explained).then(|| mend.to_owned());
                 self.0.push(Step { what, state: State::Blocked, seen: why.clone(), mend });
             }
-            None => {}
+            // It cannot be asked, or nobody knows where to: that stands in the way, and was told.
+            None if from.report.is_none() || to.node.is_none() => {}
+            None => {
+                let node = from.node_label();
+                self.note(
+                    what,
+                    format!("not tried from there: this command has no socket of {node}, which other nodes told of"),
+                    format!(
+                        "`sinew why {} {}` on the host of {node}; if its socket is on this one: --other-socket PATH",
+                        from.label(),
+                        to.label()
+                    ),
+                );
+            }
         }
     }
 }

@@ -405,8 +405,9 @@ type Note = (fn(&mut Facts), &'static str);
 
 #[test]
 fn what_should_be_known_does_not_stand_in_the_way() {
-    let notes: [Note; 3] = [
+    let notes: [Note; 4] = [
         (|facts| hip(facts).peers[0].missed = 2, "missed its last 2 answers"),
+        (|facts| facts.pings[1] = None, "not tried from there: this command has no socket of knee"),
         (|facts| drive(facts).refused = 9, "9 messages were refused"),
         (
             |facts| {
@@ -423,6 +424,22 @@ fn what_should_be_known_does_not_stand_in_the_way() {
         assert!(steps.iter().all(|step| step.state != State::Blocked), "{steps:#?}");
         assert!(steps.iter().any(|step| step.state == State::Note && step.seen.contains(seen)), "{steps:#?}");
     }
+}
+
+#[test]
+fn a_way_back_that_was_not_tried_is_told_with_where_to_try_it() {
+    let mut facts = free();
+    facts.pings[1] = None;
+    let steps = judge(&facts);
+    let back = steps.iter().find(|step| step.what == "a message goes from knee to hip").expect("it is told");
+    let mend = back.mend.as_deref().expect("it can be tried");
+    assert!(
+        mend.contains("`sinew why knee.drive hip` on the host of knee") && mend.contains("--other-socket"),
+        "{mend}"
+    );
+    // What cannot be asked at all stands in the way, and that is told once.
+    facts.ends[1].report = None;
+    assert!(judge(&facts).iter().all(|step| step.what != "a message goes from knee.drive to hip"));
 }
 
 fn of_stream(facts: &mut Facts) -> &mut StreamReport {
