@@ -1,6 +1,7 @@
 //! How soon a node learns that another one is gone, and why; and that it learns of none that is not.
 //!
-//! `cargo bench -p sinew --bench detection [-- [--short] [--seed=N] WORD...]` runs the cases whose name holds every WORD. Two hosts made of
+//! `cargo bench -p sinew --bench detection [-- [--short] [--seed=N] WORD...]` runs the cases whose name holds every WORD; exit code 2 if
+//! there is none. Two hosts made of
 //! network namespaces (needs root and `ip`; says why and skips what is not possible), on each a node in a process of its own: one to which
 //! things happen, and one that watches it. JSON lines are on the standard output, a table on the standard error. Times are microseconds, from
 //! the act, as told by the process that does it, until the observer's application has the event. At which moment of the period an act comes is
@@ -16,6 +17,15 @@
 //! - `restart`: `kill -9`, and started again as soon as the process has ended; `restart_same_ports`: with UDP and TCP ports that are configured.
 //!   `act to new life` is the time to `NodeRestarted`.
 //!
+//! `new-SETTING`: a node starts, and the applications of three others are told; from its first announcement, as a socket on one of the other hosts
+//! reads it, and from the call that starts it, until the last of the three has the event. `new_unheard-SETTING`: the network swallows all that it
+//! says until it is up; from when packets are carried, within one period.
+//!
+//! `app_kill`: `kill -9` of an application in a process of its own, until another application of its node, which monitors it, has `Down`. It
+//! needs no root.
+//!
+//! The table has p50, p99, p99.9 and the maximum in columns of their own; of 50 trials the 99th percentile is the maximum.
+//!
 //! Beside the times stand how many of the trials told the right reason first (`right`; of a restart the end or the new life), the bound of the
 //! settings (`bound_us`: for a stall 250 ms, one look at the node's progress, and one period), in how many trials a loss says of itself that
 //! the silence was within its own bound (`held`), in how many the application had the event within it (`in_time`, from the end of the act:
@@ -28,6 +38,8 @@
 //! true: with one, the exit code is 1. The times are each second's longest silence of each node at each other one, as the watching node
 //! knows it; without privileges the nodes share this host's loopback interface.
 
+mod application;
+mod newcomer;
 mod observer;
 mod setting;
 mod spin;
@@ -44,6 +56,7 @@ use std::process::ExitCode;
 use sinew_figures::process;
 
 use crate::{
+    newcomer::First,
     nodes::At,
     setting::Setting,
     spin::Rights,
@@ -62,6 +75,8 @@ const SPIN_SECONDS: u64 = 600;
 #[derive(Clone, Copy, Debug)]
 enum Case {
     Gone(Way, Setting),
+    New(First, Setting),
+    AppKill,
     Spin(Rights, Setting),
 }
 
@@ -71,12 +86,17 @@ impl Case {
         let spin = [Setting::Relaxed, Setting::Brisk]
             .into_iter()
             .flat_map(|setting| Rights::ALL.map(|rights| Self::Spin(rights, setting)));
-        gone.chain(spin).collect()
+        let new = [Setting::Relaxed, Setting::Brisk]
+            .into_iter()
+            .flat_map(|setting| First::ALL.map(|first| Self::New(first, setting)));
+        gone.chain(new).chain([Self::AppKill]).chain(spin).collect()
     }
 
     fn name(self) -> String {
         match self {
             Self::Gone(way, setting) => format!("{}-{}", way.name(), setting.name()),
+            Self::New(first, setting) => format!("{}-{}", first.name(), setting.name()),
+            Self::AppKill => "app_kill".to_owned(),
             Self::Spin(rights, setting) => format!("{}-{}", rights.name(), setting.name()),
         }
     }
@@ -84,7 +104,7 @@ impl Case {
     fn is_wanted(self, words: &[String]) -> bool {
         let name = self.name();
         let is_named = match self {
-            Self::Gone(..) => true,
+            Self::Gone(..) | Self::New(..) | Self::AppKill => true,
             Self::Spin(..) => words.iter().any(|word| word.contains("spin")),
         };
         is_named && words.iter().all(|word| name.contains(word.as_str()))
@@ -107,6 +127,8 @@ impl Case {
             Self::Gone(way, setting) => {
                 trials::measure(&name, Plan { way, setting, trials: TRIALS / part, seed })
             }
+            Self::New(first, setting) => newcomer::measure(&name, (first, setting), TRIALS / part, seed),
+            Self::AppKill => application::measure(&name, TRIALS / part, seed),
             Self::Spin(rights, setting) => {
                 let seconds = if is_short { 20 } else { SPIN_SECONDS };
                 spin::measure(&name, rights, setting, seconds)
@@ -119,12 +141,17 @@ fn main() -> ExitCode {
     if let Some(role) = process::role() {
         return play(&role);
     }
-    sinew_figures::head();
     let (options, words): (Vec<_>, Vec<_>) = std::env::args().skip(1).partition(|arg| arg.starts_with('-'));
     let is_short = options.iter().any(|option| option == "--short");
     let seed = options.iter().find_map(|option| option.strip_prefix("--seed=")?.parse().ok()).unwrap_or(SEED);
-    let wanted = Case::all().into_iter().filter(|case| case.is_wanted(&words));
-    let failed = wanted.filter(|case| !case.run(is_short, seed)).count();
+    let wanted: Vec<_> = Case::all().into_iter().filter(|case| case.is_wanted(&words)).collect();
+    if wanted.is_empty() {
+        let names: Vec<_> = Case::all().into_iter().map(Case::name).collect();
+        eprintln!("no case has {} in its name; there are {}", words.join(" and "), names.join(", "));
+        return ExitCode::from(2);
+    }
+    sinew_figures::head();
+    let failed = wanted.into_iter().filter(|case| !case.run(is_short, seed)).count();
     if failed == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 

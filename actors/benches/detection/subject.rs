@@ -61,8 +61,10 @@ pub(crate) fn run(ports: Ports, setting: Setting, at: At) -> ExitCode {
             (config.gncl.port, config.ndl.port) = (at.port() / 2, at.port() / 2);
         }
     });
+    let began = Time::now();
     let node = node.start().expect("a node");
     say_there();
+    println!("{}", began.as_nanos());
     thread::spawn(|| {
         await_end();
         std::process::exit(0);

@@ -23,7 +23,7 @@ use crate::{
 const OBSERVER: usize = 0;
 const SUBJECT: usize = 1;
 /// Two nodes that have just met do not know each other well: clocks are measured, names told.
-const SETTLED: Duration = Duration::from_millis(200);
+pub(crate) const SETTLED: Duration = Duration::from_millis(200);
 /// How much longer a turn lasts than it may take until it is told.
 const HELD_LONGER: Duration = Duration::from_millis(300);
 
