@@ -433,10 +433,7 @@ fn a_way_back_that_was_not_tried_is_told_with_where_to_try_it() {
     let steps = judge(&facts);
     let back = steps.iter().find(|step| step.what == "a message goes from knee to hip").expect("it is told");
     let mend = back.mend.as_deref().expect("it can be tried");
-    assert!(
-        mend.contains("`sinew why knee.drive hip` on the host of knee") && mend.contains("--other-socket"),
-        "{mend}"
-    );
+    assert!(mend.starts_with("`sinew why knee.drive hip` on the host of knee"), "{mend}");
     // What cannot be asked at all stands in the way, and that is told once.
     facts.ends[1].report = None;
     assert!(judge(&facts).iter().all(|step| step.what != "a message goes from knee.drive to hip"));
