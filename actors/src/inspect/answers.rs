@@ -174,7 +174,7 @@ impl Discovery {
             udp: from.to_string(),
             ago_us: micros(now.since(other.heard)),
         });
-        let gncl = udp.and_then(|udp| me.gncl_addresses([(udp, udp)]).first().map(ToString::to_string));
+        let gncl = udp.and_then(|udp| me.gncl_addresses(None, [(udp, udp)]).first().map(ToString::to_string));
         Self { udp: udp.map(|udp| udp.to_string()), gncl, lost, foreign: foreign.collect() }
     }
 }

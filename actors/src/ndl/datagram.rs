@@ -12,7 +12,7 @@ use sinew_runtime::{
 
 use super::{
     Progress,
-    address::{is_link_local, seen_from, unscoped},
+    address::{is_link_local, is_same_host, seen_from, unscoped},
 };
 
 /// Longest datagram in bytes: it passes every network unfragmented. // spec: NDL-1
@@ -26,6 +26,9 @@ pub(crate) const FURTHER_MAX: usize = 7;
 
 /// Addresses of a node's NDL at most, each on a path of its own.
 pub(crate) const PATHS_MAX: usize = 8;
+
+/// Addresses of a node's GNCL at most: those of IPv4, and of IPv6 one on each path and one link-local one on each route.
+pub(crate) const GNCL_ADDRESSES_MAX: usize = 1 + FURTHER_MAX + 2 * PATHS_MAX;
 
 /// How a node stands to its address, in the datagram as a number: 1, 2, or not there at all.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -109,10 +112,12 @@ const fn is_nothing(port: &u16) -> bool {
 }
 
 impl Announcement {
-    /// All addresses where its GNCL listens, the one that it prefers first; those of IPv4 before those of IPv6. Of the link-local ones that at
-    /// which its NDL is seen from each of `routes`: from one of our addresses to one of its. // spec: NDL-3.5
+    /// All addresses where its GNCL listens, [`GNCL_ADDRESSES_MAX`] at most: the one that it prefers first, then the one at which it was
+    /// `met`, then the families by turns. Of the link-local ones that at which its NDL is seen from each of `routes`, [`PATHS_MAX`] at most:
+    /// from one of our addresses to one of its. // spec: NDL-3.5
     pub(crate) fn gncl_addresses(
         &self,
+        met: Option<SocketAddr>,
         routes: impl IntoIterator<Item = (SocketAddr, SocketAddr)>,
     ) -> Vec<SocketAddr> {
         let first = Some((self.gncl_ip, self.gncl_port)).filter(|(_, port)| *port != 0);
@@ -126,7 +131,7 @@ impl Announcement {
         let elsewhere = self.ndl6_addresses().filter(|at| !is_link_local(at.ip()));
         let by_link =
             routes.into_iter().filter(|(_, there)| is_link_local(there.ip()) && self.has_ndl_at(*there));
-        let by_link = by_link.map(|(here, there)| seen_from(here, there));
+        let by_link = by_link.map(|(here, there)| seen_from(here, there)).take(PATHS_MAX);
         let mut ipv6: Vec<_> = by_link.chain(elsewhere).collect();
         ipv6.iter_mut().for_each(|at| at.set_port(self.gncl_port6));
         // Other hosts would find themselves at a loopback address.
@@ -138,7 +143,11 @@ impl Announcement {
                 all.push(at);
             }
         }
-        all
+        debug_assert!(
+            all.len() <= GNCL_ADDRESSES_MAX,
+            "an announcement is checked before it is believed: {self:?}"
+        );
+        by_turns(all, met)
     }
 
     /// All addresses where its NDL answers, if it says them.
@@ -231,6 +240,27 @@ impl Announcement {
         };
         Err(DatagramError::Announcement(fault))
     }
+}
+
+/// The first stays first. Behind it is the address at which somebody was `met`, as that one is known to be in reach; then the families take
+/// turns (RFC 8305, section 4), so that one that leads nowhere holds the other one up by one address at a time.
+fn by_turns(mut all: Vec<SocketAddr>, met: Option<SocketAddr>) -> Vec<SocketAddr> {
+    if all.is_empty() {
+        return all;
+    }
+    let mut last = all.remove(0);
+    let mut ordered = vec![last];
+    if let Some(at) = met.and_then(|met| all.iter().position(|at| is_same_host(*at, met))) {
+        last = all.remove(at);
+        ordered.push(last);
+    }
+    let (same, other): (Vec<_>, Vec<_>) = all.into_iter().partition(|at| at.is_ipv4() == last.is_ipv4());
+    let (mut next, mut then) = (other.into_iter(), same.into_iter());
+    while let Some(at) = next.next().or_else(|| then.next()) {
+        ordered.push(at);
+        std::mem::swap(&mut next, &mut then);
+    }
+    ordered
 }
 
 /// The payload of an answer.

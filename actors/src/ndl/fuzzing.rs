@@ -54,7 +54,10 @@ fn read(bytes: &[u8]) -> bool {
     let Ok(read) = parse(HERE, bytes) else { return false };
     assert!(bytes.len() <= DATAGRAM_MAX);
     let announcement = read.body.announcement();
-    assert!(announcement.node.is_single() && announcement.gncl_addresses([]).len() <= 16, "{announcement:?}");
+    assert!(
+        announcement.node.is_single() && announcement.gncl_addresses(None, []).len() <= 16,
+        "{announcement:?}"
+    );
     assert_eq!(maker_of(bytes), Some(announcement.node));
     let again = encode(&read, HERE);
     if again.len() <= DATAGRAM_MAX {

@@ -3,9 +3,13 @@
 //! A kernel accepts connections for a process that is stopped or hangs, refuses those to one that has ended, and says nothing where the
 //! way is cut. No word is sent: the other side sees a connection that ends again.
 
-use std::{io::ErrorKind, net::SocketAddr, time::Duration};
+use std::{
+    io::{self, ErrorKind},
+    net::SocketAddr,
+    time::Duration,
+};
 
-use futures_util::{StreamExt as _, stream::FuturesUnordered};
+use futures_util::{StreamExt as _, stream};
 use sinew_runtime::tid::{Incarnation, NodeAddress};
 use tokio::{net::TcpStream, time::timeout};
 
@@ -14,6 +18,8 @@ use super::core::Host;
 /// Hosts that are tried at once, at most, so that a cut network costs few descriptors. Whose host is not tried counts as out of reach with
 /// it, as all the others are then.
 pub(super) const PROBES_MAX: usize = 64;
+/// Addresses of one host that are tried at once, at most: 256 descriptors for all hosts. Where as many say nothing, others are not tried.
+const AT_ONCE_MAX: usize = 4;
 
 /// Whose host is to be tried.
 #[derive(Debug)]
@@ -25,9 +31,16 @@ pub(super) struct Probe {
 }
 
 impl Probe {
-    /// Tries all addresses at once; what the host said is known in time, whatever it is.
+    /// Tries the addresses, the first ones at once; what the host said is known in time, whatever it is.
     pub(super) async fn carry_out(self) -> (NodeAddress, Incarnation, Host) {
-        let mut tries: FuturesUnordered<_> = self.to.iter().map(TcpStream::connect).collect();
+        self.carry_out_with(TcpStream::connect).await
+    }
+
+    async fn carry_out_with<T>(self, connect: impl Fn(SocketAddr) -> T) -> (NodeAddress, Incarnation, Host)
+    where
+        T: Future<Output = io::Result<TcpStream>>,
+    {
+        let mut tries = stream::iter(&self.to).map(|to| connect(*to)).buffer_unordered(AT_ONCE_MAX);
         let mut host = Host::IsSilent;
         let all = async {
             while let Some(tried) = tries.next().await {
@@ -47,19 +60,38 @@ impl Probe {
 
 #[cfg(test)]
 mod tests {
-    use std::net::{Ipv4Addr, TcpListener};
+    use std::{
+        cell::RefCell,
+        net::{Ipv4Addr, TcpListener},
+    };
 
     use super::*;
 
+    fn of(to: Vec<SocketAddr>, within: Duration) -> Probe {
+        Probe { node: NodeAddress::new(1), incarnation: Incarnation(1), to, within }
+    }
+
     fn probe(to: Vec<SocketAddr>) -> Host {
-        let probe = Probe {
-            node: NodeAddress::new(1),
-            incarnation: Incarnation(1),
-            to,
-            within: Duration::from_secs(5),
-        };
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-        runtime.block_on(probe.carry_out()).2
+        runtime.block_on(of(to, Duration::from_secs(5)).carry_out()).2
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn of_addresses_that_say_nothing_a_few_are_tried_and_one_that_refuses_makes_room_for_the_next() {
+        let to: Vec<SocketAddr> = (1..=20).map(|port| ([127, 0, 0, 1], port).into()).collect();
+        let tried = RefCell::new(Vec::new());
+        let connect = |at: SocketAddr| {
+            tried.borrow_mut().push(at.port());
+            async move {
+                if at.port() == 2 {
+                    return Err(ErrorKind::ConnectionRefused.into());
+                }
+                std::future::pending().await
+            }
+        };
+        let host = of(to, Duration::from_secs(1)).carry_out_with(connect).await.2;
+        assert_eq!(host, Host::Refuses);
+        assert_eq!(tried.into_inner(), [1, 2, 3, 4, 5]);
     }
 
     #[test]

@@ -10,6 +10,9 @@ use super::{ConnectionId, Core, Lane, LinkFact, Output, Stage};
 /// before a dial short enough that no requirement is lost over it (50 ms). RFC 8305 has no less than 10 ms.
 pub(super) const STAGGER: Duration = Duration::from_millis(20);
 
+/// Addresses of a peer that are dialled at once, at most; a further one when one of them has failed.
+pub(super) const AT_ONCE_MAX: usize = 8;
+
 /// A dial on its way.
 #[derive(Debug)]
 pub(super) struct Dial {
@@ -58,7 +61,8 @@ impl Core {
         let Some(dial) = self.peers.get_mut(&node).and_then(|peer| peer.dial.as_mut()) else { return };
         let Some(address) = dial.untried.pop_front() else { return };
         dial.attempts.push((connection, address));
-        dial.next_at = if dial.untried.is_empty() { Time::MAX } else { now + STAGGER };
+        let is_to_wait = dial.untried.is_empty() || dial.attempts.len() >= AT_ONCE_MAX;
+        dial.next_at = if is_to_wait { Time::MAX } else { now + STAGGER };
         self.stage_for_handshake(now, connection, Stage::Dialling(node, Lane::Control));
         self.outputs.push_back(Output::Dial { connection, address });
     }

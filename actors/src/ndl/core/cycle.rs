@@ -122,7 +122,7 @@ impl Core {
         let probes = suspected.map(|(node, member)| Output::Probe {
             node: *node,
             incarnation: member.announcement.incarnation,
-            to: member.gncl_addresses(),
+            to: member.probed_addresses(),
             within,
         });
         self.outputs.extend(probes);

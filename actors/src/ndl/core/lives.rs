@@ -220,7 +220,7 @@ impl Core {
         let Proof { from, announcement, exchange, progress, .. } = proof;
         let Announcement { node, incarnation, ref name, .. } = announcement;
         let name = name.clone();
-        let gncl = announcement.gncl_addresses([(from.here, from.there)]);
+        let gncl = announcement.gncl_addresses(Some(from.there), [(from.here, from.there)]);
         let mut sought = Vec::new();
         if let Some(gone) = self.gone.remove(&node) {
             let others = gone.places.into_iter().filter(|place| *place != from);
@@ -233,6 +233,7 @@ impl Core {
         let pace = self.pace_for(now, &name);
         let member = Member {
             announcement,
+            met: from.there,
             routes: Routes::new(from),
             gncl_told: (gncl.clone(), now),
             heard: now,

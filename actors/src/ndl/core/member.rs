@@ -5,12 +5,21 @@ use std::net::SocketAddr;
 use sinew_runtime::{tid::Incarnation, time::Time};
 
 use super::{Host, clock::PeerClock, pace::Pace, routes::Routes, troubles::Troubles};
-use crate::ndl::{Progress, datagram::Announcement};
+use crate::ndl::{
+    Progress,
+    address::is_same_host,
+    datagram::{Announcement, PATHS_MAX},
+};
+
+/// Addresses at which a silent member's host is tried, at most: as many as it has routes.
+const PROBED_MAX: usize = PATHS_MAX;
 
 /// A node that answers.
 #[derive(Debug)]
 pub(super) struct Member {
     pub(super) announcement: Announcement,
+    /// Where it answered first.
+    pub(super) met: SocketAddr,
     /// Where it answers.
     pub(super) routes: Routes,
     /// Where GNCL was told that its listener is, and when.
@@ -45,7 +54,16 @@ pub(super) struct Member {
 impl Member {
     /// Where its GNCL can be reached, the address that it prefers first.
     pub(super) fn gncl_addresses(&self) -> Vec<SocketAddr> {
-        self.announcement.gncl_addresses(self.routes.places().map(|place| (place.here, place.there)))
+        let routes = self.routes.places().map(|place| (place.here, place.there));
+        self.announcement.gncl_addresses(Some(self.met), routes)
+    }
+
+    /// Where its host is tried when it is silent: first where its NDL answered, as its host was in reach there. // spec: NDL-4.6
+    pub(super) fn probed_addresses(&self) -> Vec<SocketAddr> {
+        let mut all = self.gncl_addresses();
+        all.sort_by_key(|at| !self.routes.places().any(|place| is_same_host(place.there, *at)));
+        all.truncate(PROBED_MAX);
+        all
     }
 
     /// Whether it is to be counted as lost for its silence. One with several addresses that is asked at one of them alone may only be out

@@ -238,7 +238,7 @@ fn a_listener_at_ipv6_is_where_ndl_is_and_on_a_link_where_it_was_met() {
     let gncl = |announcement: &Announcement, routes: &[(&str, &str)]| {
         let routes: Vec<(SocketAddr, SocketAddr)> =
             routes.iter().map(|(here, there)| (here.parse().unwrap(), there.parse().unwrap())).collect();
-        let all = announcement.gncl_addresses(routes);
+        let all = announcement.gncl_addresses(None, routes);
         all.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ")
     };
     let all = at(&["10.0.0.1:7", "[fe80::1%3]:7", "[fd00::1]:8", "[::1]:9"]);
@@ -254,6 +254,44 @@ fn a_listener_at_ipv6_is_where_ndl_is_and_on_a_link_where_it_was_met() {
     let alone = Announcement { gncl_ip: 0, gncl_port: 0, ..at(&["[::1]:9"]) };
     assert_eq!(gncl(&alone, &[]), "[::1]:5");
     assert_eq!(gncl(&Announcement { gncl_port6: 0, ..all }, &met), "10.0.0.1:4");
+}
+
+// spec: NDL-3.5
+#[test]
+fn the_families_take_turns_behind_the_preferred_address_and_the_one_where_the_node_was_met() {
+    let further = vec![(0x0a00_0002, 4), (0x0a00_0003, 4)];
+    let mut all = at(&["10.0.0.1:7", "[fd00::1]:7", "[fd00::2]:7", "[fd00::3]:7"]);
+    all.gncl_further = further;
+    let ordered = |met: Option<&str>| {
+        let met = met.map(|met| met.parse().unwrap());
+        let all = all.gncl_addresses(met, []);
+        all.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ")
+    };
+    let v6_first = "10.0.0.1:4 [fd00::1]:5 10.0.0.2:4 [fd00::2]:5 10.0.0.3:4 [fd00::3]:5";
+    assert_eq!(ordered(None), v6_first);
+    assert_eq!(ordered(Some("10.0.0.1:7")), v6_first, "it prefers that one");
+    assert_eq!(
+        ordered(Some("10.0.0.3:7")),
+        "10.0.0.1:4 10.0.0.3:4 [fd00::1]:5 10.0.0.2:4 [fd00::2]:5 [fd00::3]:5"
+    );
+    assert_eq!(
+        ordered(Some("[fd00::2]:7")),
+        "10.0.0.1:4 [fd00::2]:5 10.0.0.2:4 [fd00::1]:5 10.0.0.3:4 [fd00::3]:5"
+    );
+    assert_eq!(ordered(Some("10.9.9.9:7")), v6_first, "its GNCL is not where it was met");
+}
+
+#[test]
+fn however_many_routes_there_are_a_node_has_a_bounded_number_of_addresses() {
+    let paths: Vec<_> = (1..=PATHS_MAX).map(|path| format!("[fe80::{path}]:7")).collect();
+    let mut all = at(&paths.iter().map(String::as_str).collect::<Vec<_>>());
+    all.gncl_further = (1..=FURTHER_MAX as u32).map(|further| (0x0a00_0100 + further, 4)).collect();
+    let routes = (1..100_u32).map(|link| {
+        let scoped = |ip: &str| format!("[{ip}%{link}]:7").parse::<SocketAddr>().unwrap();
+        (scoped("fe80::99"), scoped("fe80::1"))
+    });
+    let all = all.gncl_addresses(None, routes).len();
+    assert!((1 + FURTHER_MAX + PATHS_MAX..=GNCL_ADDRESSES_MAX).contains(&all), "{all}");
 }
 
 #[test]

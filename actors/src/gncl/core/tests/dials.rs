@@ -1,7 +1,7 @@
 //! Peers that announce several addresses.
 
 use super::*;
-use crate::gncl::core::dials::STAGGER;
+use crate::gncl::core::dials::{AT_ONCE_MAX, STAGGER};
 
 /// The n-th address of the peer.
 fn at(number: u16) -> SocketAddr {
@@ -103,6 +103,37 @@ fn an_address_that_fails_has_the_next_one_dialled_at_once_and_a_refusal_is_told_
         assert!(again >= millis(9) && again < millis(14), "{again:?}");
         assert_eq!(next_dial(&mut core).1, at(0), "the preferred one comes first again");
     }
+}
+
+// spec: GNCL-16
+#[test]
+fn of_many_addresses_that_say_nothing_a_few_are_dialled_at_once_and_the_others_in_their_turn() {
+    // Given
+    let many = 2 * AT_ONCE_MAX as u16 + 3;
+    let mut core = finding(many);
+    let (mut first, mut under_way) = (Vec::new(), AT_ONCE_MAX);
+    for number in 0..AT_ONCE_MAX as u16 {
+        let (connection, to) = next_dial(&mut core);
+        assert_eq!(to, at(number));
+        first.push(connection);
+        if usize::from(number) + 1 < AT_ONCE_MAX {
+            wait(&mut core);
+        }
+    }
+    // When one fails, then the next one is dialled in its place.
+    core.handle(millis(500), Input::DialFailed { connection: first[3], refused: false });
+    assert_eq!(next_dial(&mut core).1, at(AT_ONCE_MAX as u16));
+    // When the others have had their time, then as many others have theirs.
+    let mut dialled_in_all = AT_ONCE_MAX + 1;
+    while core.next_wake().is_some() && dialled_in_all < usize::from(many) {
+        wait(&mut core);
+        let out = outputs(&mut core);
+        let closed = out.iter().filter(|output| matches!(output, Output::Close(_))).count();
+        dialled_in_all += dialled(&out).len();
+        under_way = under_way + dialled(&out).len() - closed;
+        assert!(under_way <= AT_ONCE_MAX, "{out:?}");
+    }
+    assert_eq!(dialled_in_all, usize::from(many));
 }
 
 #[test]

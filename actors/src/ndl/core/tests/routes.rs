@@ -149,6 +149,37 @@ fn member() -> Announcement {
     Announcement { ndl, incarnation: Incarnation(5), ..stranger(2) }
 }
 
+/// Where its GNCL listens in one network.
+fn gncl(network: u8) -> SocketAddr {
+    ([10, network, 0, 2], 5_002).into()
+}
+
+// spec: NDL-4.6
+#[test]
+fn the_host_of_a_silent_member_is_tried_at_a_few_of_its_addresses_first_where_it_was_heard() {
+    let mut bench = Bench::new();
+    let gncl_further = (10..17).map(|host| (u32::from_be_bytes([10, 9, 0, host]), 5_002));
+    let last = (u32::from_be_bytes([10, 0, 0, 2]), 5_002);
+    let gncl_further = gncl_further.skip(1).chain([last]).collect();
+    let ndl6 = (1..=4).map(|host| (0xfd00 << 48, host, 7_400)).collect();
+    let paths = vec![(u32::from_be_bytes([10, 0, 0, 2]), 7_400)];
+    let gncl_ip = u32::from_be_bytes([10, 9, 0, 10]);
+    let announcement = Announcement {
+        gncl_ip,
+        gncl_port: 5_002,
+        gncl_further,
+        ndl: paths,
+        ndl6,
+        gncl_port6: 5_002,
+        ..member()
+    };
+    bench.answer(way(0), announcement);
+    let probed = bench.core.members[&node(2)].probed_addresses();
+    assert_eq!((probed.len(), probed[0]), (8, gncl(0)), "{probed:?}");
+    let of_ipv6 = probed.iter().filter(|at| at.is_ipv6()).count();
+    assert!((3..=4).contains(&of_ipv6), "both families: {probed:?}");
+}
+
 fn later_life() -> Announcement {
     Announcement { incarnation: Incarnation(6), boot_nonce: 0x600d, claim: Claim::Settling, ..member() }
 }
