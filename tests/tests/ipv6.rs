@@ -3,6 +3,7 @@
 
 use std::net::SocketAddrV4;
 
+use rustix::process::Signal;
 use sinew_hosts::Addresses;
 use sinew_tests::{Hosts, OwnDirectory, Program, node_under_test, own_group};
 
@@ -15,6 +16,7 @@ struct Scenario {
     hosts: Hosts,
     directory: OwnDirectory,
     group: SocketAddrV4,
+    period_ms: u32,
     /// Both nodes are on the first one.
     is_one_host: bool,
 }
@@ -25,7 +27,13 @@ impl Scenario {
         let hosts = Hosts::with_addresses(2, networks, addresses);
         let hosts =
             hosts.inspect_err(|why| println!("skipped: no hosts with IPv6 can be made here: {why}")).ok()?;
-        Some(Self { hosts, directory: OwnDirectory::new(), group: own_group(), is_one_host: false })
+        Some(Self {
+            hosts,
+            directory: OwnDirectory::new(),
+            group: own_group(),
+            period_ms: 100,
+            is_one_host: false,
+        })
     }
 
     fn ip(&self, host: usize, arguments: &str) {
@@ -39,11 +47,11 @@ impl Scenario {
 
     /// The same with this port of multicast DNS.
     fn start_with(&self, index: usize, ndl: &str, mdns_port: &str) -> Program {
-        let (name, address) = (NAMES[index], index + 1);
+        let (name, address, period_ms) = (NAMES[index], index + 1, self.period_ms);
         let path = self.directory.join(&format!("{name}.toml"));
         let text = format!(
             "[node]\nname = \"{name}\"\nproject = \"ipv6\"\naddress = \"10.77.0.{address}\"\n\
-             [ndl]\nmdns_port = {mdns_port}\nperiod_ms = 100\n{ndl}\n"
+             [ndl]\nmdns_port = {mdns_port}\nperiod_ms = {period_ms}\n{ndl}\n"
         );
         std::fs::write(&path, text).expect("the test's own directory");
         let more: &[&str] = if index == 0 { &SENDS } else { &LOGS };
@@ -128,6 +136,26 @@ fn nobody_is_lost_while_one_of_two_families_carries() {
     hip.wait_for(&["listens there now", "10.77.0.1"]);
     scenario.ip(1, "address del fe80::2/64 dev eth0");
     all_came(&central, &mut hip, 700);
+}
+
+#[test]
+fn a_crash_is_noticed_at_once_where_a_firewall_swallows_one_family() {
+    let Some(mut scenario) = Scenario::new(1, Addresses::Both) else { return };
+    // So seldom that silence would tell nothing before this test gives up.
+    scenario.period_ms = 20_000;
+    for (host, other) in [(0, 2), (1, 1)] {
+        scenario.ip(host, &format!("address add fd77::{}/64 dev eth0 nodad", host + 1));
+        // What is sent to the other one's IPv6 addresses goes where nobody is, and no kernel says so.
+        for of_other in ["fd77", "fe80"] {
+            let entry = format!("{of_other}::{other} lladdr 02:00:00:00:00:99 dev eth0 nud permanent");
+            scenario.ip(host, &format!("-6 neighbour replace {entry}"));
+        }
+    }
+    let [mut central, mut hip] = scenario.start_both("\"eth0\"");
+    central.wait_for(&["started"]);
+    hip.wait_for(&["count 5 from 10.77.0.1"]);
+    hip.signal(Signal::KILL);
+    central.wait_for(&["NodeLost", "hip", "Crashed"]);
 }
 
 #[test]

@@ -4,7 +4,11 @@ use std::{net::SocketAddr, time::Duration};
 
 use sinew_runtime::{tid::Incarnation, time::Time};
 
-use super::{ConnectionId, Settings, dials::Dial, sides::Side};
+use super::{
+    ConnectionId, Settings,
+    dials::{Dial, Reached},
+    sides::Side,
+};
 
 /// What is known of one peer.
 #[derive(Debug)]
@@ -23,6 +27,8 @@ pub(super) struct Acquaintance {
     pub(super) link: Option<Link>,
     /// Our dial on its way, if there is one.
     pub(super) dial: Option<Dial>,
+    /// Where that life was linked.
+    pub(super) reached: Reached,
     /// Which of its addresses is dialled first, modulo their number.
     pub(super) first: usize,
     /// Number of our last dial.
@@ -73,7 +79,7 @@ pub(super) struct Pulse {
 }
 
 impl Acquaintance {
-    pub(super) const fn new(now: Time, incarnation: Incarnation, settings: &Settings) -> Self {
+    pub(super) fn new(now: Time, incarnation: Incarnation, settings: &Settings) -> Self {
         Self {
             incarnation,
             met: now,
@@ -82,6 +88,7 @@ impl Acquaintance {
             wanted: None,
             link: None,
             dial: None,
+            reached: Reached::default(),
             first: 0,
             dial_number: 0,
             void_dial: 0,

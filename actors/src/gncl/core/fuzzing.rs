@@ -230,6 +230,7 @@ impl Play<'_> {
                 | Output::SendGoodbye(_)
                 | Output::Forget(_)
                 | Output::Fact(_)
+                | Output::RefusedWhereLinked { .. }
                 | Output::Count { .. } => {}
             }
         }

@@ -231,6 +231,16 @@ impl Member {
         self.routes.is_only(place) || self.routes.has(place) && self.announces(place)
     }
 
+    /// Whether each way on which its NDL may be heard was tried, and each one on which it was is a route: there are not more than are asked
+    /// at once, nor than are kept.
+    pub(super) fn is_known_on_all_ways(&self, paths: &[SocketAddr]) -> bool {
+        let ways = self.announcement.ndl_addresses().flat_map(|there| {
+            let place = move |here: &SocketAddr| Place::between(*here, there);
+            paths.iter().map(place).filter(Place::is_a_way)
+        });
+        ways.count() <= SOUGHT_MAX && !self.routes.is_full() && self.routes.iter().next().is_some()
+    }
+
     /// Whether a place where its life answers becomes a route to it. // spec: NDL-3.3
     fn is_led_to(&self, place: Place) -> bool {
         self.announces(place) && self.routes.makes_way(place) != MakesWay::Not
