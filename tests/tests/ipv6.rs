@@ -1,11 +1,11 @@
 //! Nodes on hosts that have IPv6, alone or beside IPv4: found over a link that nobody gave addresses to, talking, cut off, and there as long as
 //! either family carries.
 
-use std::net::SocketAddrV4;
+use std::net::{Ipv6Addr, SocketAddrV4};
 
 use rustix::process::Signal;
 use sinew_hosts::Addresses;
-use sinew_tests::{Hosts, OwnDirectory, Program, node_under_test, own_group};
+use sinew_tests::{Host, Hosts, OwnDirectory, Program, node_under_test, own_group};
 
 const NAMES: [&str; 2] = ["central", "hip"];
 const SENDS: [&str; 5] = ["--requires", "hip", "--sends-to", "hip", "--logs-info"];
@@ -156,6 +156,44 @@ fn a_crash_is_noticed_at_once_where_a_firewall_swallows_one_family() {
     hip.wait_for(&["count 5 from 10.77.0.1"]);
     hip.signal(Signal::KILL);
     central.wait_for(&["NodeLost", "hip", "Crashed"]);
+}
+
+/// Both ends of each TCP connection of IPv6 that a host has, but for their ports.
+fn connections(host: &Host) -> Vec<[Ipv6Addr; 2]> {
+    let table =
+        host.run(|| std::fs::read_to_string("/proc/thread-self/net/tcp6")).expect("the kernel's table");
+    // Each 32 bits of an address are in this host's byte order.
+    let address = |text: &str| {
+        let words =
+            (0..4).map(|at| u32::from_str_radix(&text[8 * at..8 * at + 8], 16).expect("hexadecimal digits"));
+        let bytes: Vec<u8> = words.flat_map(u32::to_ne_bytes).collect();
+        Ipv6Addr::from(<[u8; 16]>::try_from(bytes).expect("four words"))
+    };
+    let ends = |line: &str| {
+        let fields: Vec<_> = line.split_whitespace().collect();
+        (fields[3] == "01").then(|| [address(fields[1]), address(fields[2])])
+    };
+    table.lines().skip(1).filter_map(ends).collect()
+}
+
+#[test]
+fn connections_go_from_announced_address_to_announced_address_though_the_kernel_prefers_another_one() {
+    let Some(scenario) = Scenario::new(1, Addresses::LinkLocal) else { return };
+    for host in 0..2 {
+        // As with temporary addresses, what the kernel takes by itself is not what the node is known by.
+        let number = host + 1;
+        scenario.ip(host, &format!("address add fd77::{number}/64 dev eth0 nodad preferred_lft 0"));
+        scenario.ip(host, &format!("address add fd77::6{number}/64 dev eth0 nodad"));
+    }
+    let alone = "multicast = false\nport = 6911";
+    let mut hip = scenario.start(1, &format!("interface = \"fd77::2\"\n{alone}"));
+    let mut central =
+        scenario.start(0, &format!("interface = \"fd77::1\"\n{alone}\nseeds = [\"[fd77::2]:6911\"]"));
+    central.wait_for(&["started"]);
+    all_came(&central, &mut hip, 50);
+    let all = connections(&scenario.hosts.all()[0]);
+    let [ours, theirs] = ["fd77::1", "fd77::2"].map(|ip| ip.parse::<Ipv6Addr>().expect("an address"));
+    assert!(!all.is_empty() && all.iter().all(|ends| *ends == [ours, theirs]), "{all:?}");
 }
 
 #[test]

@@ -35,14 +35,20 @@ use super::{
     },
     datagrams,
     inbound::Inbound,
-    link::{self, Mode, News, Reading, SharedMode, What},
+    link::{self, Ends, Mode, News, Reading, SharedMode, What},
     listener, marks,
     peer::{Store, frame},
     secure::Secure,
     spin::Spin,
     task::{self, Move},
 };
-use crate::{config::NodeConfig, ndl, outlet::Gathering, stores::Stores, sync};
+use crate::{
+    config::NodeConfig,
+    ndl,
+    outlet::Gathering,
+    stores::{Stores, lock},
+    sync,
+};
 pub(crate) use leaving::LINGER;
 use proven::NOT_PROVEN;
 use wire::Wire;
@@ -130,7 +136,8 @@ impl Gncl {
     fn dial(&mut self, connection: ConnectionId, address: SocketAddr, ctx: &mut Context<Self>) {
         let mode = Arc::new(Mutex::new(Mode::Handshake));
         let reading = self.reading(&mode);
-        let reader = ctx.add_stream(link::dial(connection, address, reading));
+        let ends = Ends::of(address, lock(&self.stores.ndl).paths());
+        let reader = ctx.add_stream(link::dial(connection, ends, reading));
         self.wires.insert(connection, Wire::new(None, mode, reader, self.secure.is_none()));
     }
 

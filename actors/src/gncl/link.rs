@@ -2,7 +2,7 @@
 
 use std::{
     io,
-    net::SocketAddr,
+    net::{IpAddr, Ipv6Addr, SocketAddr},
     sync::{Arc, Mutex},
     time::Duration,
 };
@@ -16,7 +16,7 @@ use sinew_runtime::{
 };
 #[cfg(target_os = "linux")]
 use socket2::SockRef;
-use tokio::net::TcpStream;
+use tokio::net::{TcpSocket, TcpStream};
 use tokio_util::codec::Decoder;
 
 use super::{
@@ -84,13 +84,36 @@ pub(super) enum Mode {
 /// Set by the shell while it handles the news of the connection, before the next frame is looked at.
 pub(super) type SharedMode = Arc<Mutex<Mode>>;
 
-/// Dials `address`, then reads.
-pub(super) fn dial(
-    connection: ConnectionId,
-    address: SocketAddr,
-    reading: Reading,
-) -> impl Stream<Item = News> {
-    news(connection, State::Dialling(address, reading))
+/// Where a dial goes, and from which address of this host; `None`: the system chooses.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Ends {
+    pub(super) to: SocketAddr,
+    pub(super) from: Option<IpAddr>,
+}
+
+impl Ends {
+    /// To an address, from that one of `paths`, the addresses that this node announces, which is in its network. The system would take an
+    /// IPv6 address that it makes for a day (RFC 8981), and the peer see a connection from where it never heard of anybody. Where no path
+    /// is in that network the system knows better which one leads there; of IPv4 it takes no other.
+    pub(super) fn of(to: SocketAddr, paths: &[SocketAddr]) -> Self {
+        let from = match to {
+            SocketAddr::V6(to) if !to.ip().is_unicast_link_local() && !to.ip().is_loopback() => {
+                let network = |ip: &Ipv6Addr| ip.to_bits() >> 64;
+                let is_there = |ip: &Ipv6Addr| network(ip) == network(to.ip());
+                paths.iter().find_map(|path| match path {
+                    SocketAddr::V6(path) if is_there(path.ip()) => Some(IpAddr::from(*path.ip())),
+                    SocketAddr::V6(_) | SocketAddr::V4(_) => None,
+                })
+            }
+            SocketAddr::V6(_) | SocketAddr::V4(_) => None,
+        };
+        Self { to, from }
+    }
+}
+
+/// Dials, then reads.
+pub(super) fn dial(connection: ConnectionId, ends: Ends, reading: Reading) -> impl Stream<Item = News> {
+    news(connection, State::Dialling(ends, reading))
 }
 
 /// Reads from a socket that was accepted.
@@ -118,7 +141,7 @@ pub(super) struct Reading {
 }
 
 enum State {
-    Dialling(SocketAddr, Reading),
+    Dialling(Ends, Reading),
     Accepted(Transport, Reading),
     Reading(Reader),
     Linked(ReadingTask),
@@ -128,7 +151,7 @@ enum State {
 fn news(connection: ConnectionId, state: State) -> impl Stream<Item = News> {
     stream::unfold(state, move |state| async move {
         let (what, state) = match state {
-            State::Dialling(address, reading) => match reach(address, &reading).await {
+            State::Dialling(ends, reading) => match reach(ends, &reading).await {
                 Ok((transport, peer)) => (
                     What::Connected(transport.clone(), peer),
                     State::Reading(Reader::new(transport, reading)),
@@ -158,8 +181,8 @@ async fn linked(task: ReadingTask) -> (What, State) {
 }
 
 /// Connects, and has both sides prove who they are.
-async fn reach(address: SocketAddr, reading: &Reading) -> io::Result<(Transport, Option<Box<Peer>>)> {
-    let transport = Transport::open(connect(address, reading.give_up).await?);
+async fn reach(ends: Ends, reading: &Reading) -> io::Result<(Transport, Option<Box<Peer>>)> {
+    let transport = Transport::open(connect(ends, reading.give_up).await?);
     let Some(secure) = &reading.secure else { return Ok((transport, None)) };
     let (transport, peer) = secure.greet(transport, End::Dials).await?;
     Ok((transport, Some(peer)))
@@ -179,8 +202,13 @@ async fn greeted(transport: Transport, reading: Reading) -> (What, State) {
     }
 }
 
-pub(super) async fn connect(address: SocketAddr, give_up: Duration) -> io::Result<TcpStream> {
-    let socket = TcpStream::connect(address).await?;
+pub(super) async fn connect(ends: Ends, give_up: Duration) -> io::Result<TcpStream> {
+    let socket = if ends.to.is_ipv6() { TcpSocket::new_v6() } else { TcpSocket::new_v4() }?;
+    if let Some(from) = ends.from {
+        // An address that was taken away since leaves the choice to the system.
+        let _ = socket.bind((from, 0).into());
+    }
+    let socket = socket.connect(ends.to).await?;
     tune(&socket, give_up)?;
     Ok(socket)
 }
@@ -397,6 +425,24 @@ fn decline(error: &FrameError) -> Decline {
         FrameError::Header(HeaderError::Version { .. }) => Decline::Version(error.to_string()),
         FrameError::Header(_) | FrameError::TooLong { .. } | FrameError::Io(_) => {
             Decline::Violation(error.to_string())
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_dial_goes_out_from_the_announced_address_that_is_in_the_same_network_and_else_from_where_the_system_says()
+     {
+        let paths = ["10.0.0.1:7", "[fe80::1%3]:7", "[fd00::1]:7", "[2001:db8:0:1::1]:7"];
+        let paths: Vec<SocketAddr> = paths.iter().map(|path| path.parse().unwrap()).collect();
+        let from = |to: &str| Ends::of(to.parse().unwrap(), &paths).from.map(|ip| ip.to_string());
+        assert_eq!(from("[fd00::2]:9").as_deref(), Some("fd00::1"));
+        assert_eq!(from("[2001:db8:0:1::2]:9").as_deref(), Some("2001:db8:0:1::1"));
+        for elsewhere in ["[2001:db8:0:2::2]:9", "[fe80::2%3]:9", "10.0.0.2:9", "[::1]:9"] {
+            assert_eq!(from(elsewhere), None, "{elsewhere}");
         }
     }
 }

@@ -262,7 +262,8 @@ fn both_ends_of_a_connection_give_it_up_when_nothing_is_taken_any_more() {
         let address = listener.local_addr().expect("it is bound");
         let listener = tokio::net::TcpListener::from_std(listener).expect("it does not block");
         let mut accepted = Box::pin(listener::accepted(listener, give_up));
-        let dialled = link::connect(address, give_up).await.expect("it listens");
+        let dialled =
+            link::connect(link::Ends { to: address, from: None }, give_up).await.expect("it listens");
         let accepted = next("a connection", &mut accepted).await.expect("it is accepted");
         for end in [&dialled, &accepted] {
             assert_eq!(SockRef::from(end).tcp_user_timeout().expect("the system says it"), Some(give_up));
