@@ -369,14 +369,9 @@ impl Actor for Gncl {
 
     fn started(&mut self, ctx: &mut Context<Self>) {
         self.begin_to_prove();
-        let listeners = self.listen().unwrap_or_else(|error| {
-            let config = &self.stores.config;
-            let (interface, port) = (&config.ndl.interface, config.gncl.port);
-            panic!(
-                "GNCL cannot listen at {interface}:{port}: {error}; is another node using this port? Set `gncl.port` \
-                 to a free one (0 takes any), and `ndl.interface` to an address of this host"
-            )
-        });
+        let listeners = self
+            .listen()
+            .unwrap_or_else(|error| panic!("{}", listener::why_not(&self.stores.config, &error)));
         self.cut_all();
         self.catch_up(ctx);
         for listener in listeners {

@@ -39,17 +39,35 @@ pub(super) fn listen(address: SocketAddr) -> io::Result<std::net::TcpListener> {
 /// # Errors
 /// What the system says.
 pub(super) fn listen_first(config: &NodeConfig) -> io::Result<std::net::TcpListener> {
+    let (address, chosen) = (first_of(config), &config.ndl.interface);
+    let is_one_of_many = chosen.have_ipv4() && chosen.iter().count() > 1;
+    if is_one_of_many { listen_also_without(address) } else { listen(address) }
+}
+
+fn first_of(config: &NodeConfig) -> SocketAddr {
     let (chosen, port) = (&config.ndl.interface, config.gncl.port);
     if !chosen.have_ipv4() {
-        return listen((all_of_ipv6(config), port).into());
+        return (all_of_ipv6(config), port).into();
     }
     let first = if chosen.are_loopback() {
         chosen.addresses().next()
     } else {
         chosen.first_address().filter(|_| chosen.are_ipv4_addresses())
     };
-    let address = (first.unwrap_or(Ipv4Addr::UNSPECIFIED), port).into();
-    if chosen.iter().count() > 1 { listen_also_without(address) } else { listen(address) }
+    (first.unwrap_or(Ipv4Addr::UNSPECIFIED), port).into()
+}
+
+/// Why this node cannot [listen](listen_first), and what to do.
+pub(super) fn why_not(config: &NodeConfig, error: &io::Error) -> String {
+    let address = first_of(config);
+    let remedy = if error.kind() == io::ErrorKind::AddrInUse && address.ip().is_unspecified() {
+        "another node or program of this host has this port. Where `ndl.interface` chooses by name, or an IPv6 address, GNCL listens at all \
+         addresses of the host, so that each node of one host needs a port of its own, though their addresses differ: set `gncl.port` to a free \
+         one (0 takes any), or choose by IPv4 addresses alone"
+    } else {
+        "is another node using this port? Set `gncl.port` to a free one (0 takes any), and `ndl.interface` to an address of this host"
+    };
+    format!("GNCL cannot listen at {address}: {error}; {remedy}")
 }
 
 /// Where a node listens by IPv6: at all addresses, as those of its interfaces come and go; but at none that other hosts reach where it is to
@@ -98,13 +116,24 @@ pub(super) fn listen_at_ipv6(config: &NodeConfig, first: SocketAddr) -> Option<s
         listened => listened,
     };
     let say = |error: &io::Error| {
+        if has_no_ipv6(error) {
+            // NDL says so, with what can be done.
+            return crate::log::debug!(%error, "GNCL does not listen at IPv6 addresses: this host has none");
+        }
         crate::log::warn!(
             %error,
-            "GNCL does not listen at IPv6 addresses: the other nodes reach this one by IPv4 alone. Where IPv6 is wanted, free the port in `gncl.port`, \
-             and see that the kernel has IPv6; where it is not, add /ipv4 to names in `ndl.interface`"
+            port = first.port(),
+            "GNCL does not listen at IPv6 addresses: the other nodes reach this one by IPv4 alone. Is another node or program of this host using the \
+             port there? Where IPv6 is wanted, set `gncl.port` to one that is free in both families (0 takes any); where it is not, add /ipv4 to \
+             names in `ndl.interface`"
         );
     };
     listened.inspect_err(say).ok()
+}
+
+/// Whether the kernel knows no IPv6, as with `ipv6.disable=1`.
+fn has_no_ipv6(error: &io::Error) -> bool {
+    matches!(Errno::from_io_error(error), Some(Errno::AFNOSUPPORT | Errno::PROTONOSUPPORT))
 }
 
 /// Where these listen by IPv4.
@@ -209,6 +238,47 @@ mod tests {
             assert!(beside.is_none_or(|at| at.ip().is_loopback()), "{choices:?}: {beside:?}");
             assert_eq!(beside.is_some(), ipv6_too, "{choices:?}");
         }
+    }
+
+    #[test]
+    fn who_cannot_listen_is_told_where_and_that_nodes_at_all_addresses_need_a_port_each() {
+        let words = |interface: &str, error: io::ErrorKind| {
+            let mut config = NodeConfig::new("test");
+            config.ndl.interface = vec![interface.parse().unwrap()].into();
+            config.gncl.port = 7_000;
+            why_not(&config, &error.into())
+        };
+        for (interface, at) in [("eth0", "0.0.0.0:7000"), ("fd00::7", "[::]:7000")] {
+            let said = words(interface, io::ErrorKind::AddrInUse);
+            assert!(said.contains(&format!("listen at {at}: ")), "{said}");
+            assert!(said.contains("needs a port of its own") && said.contains("`gncl.port`"), "{said}");
+        }
+        let said = words("10.0.0.7", io::ErrorKind::AddrInUse);
+        assert!(said.contains("listen at 10.0.0.7:7000") && !said.contains("of its own"), "{said}");
+        assert!(words("::1", io::ErrorKind::AddrNotAvailable).contains("listen at [::1]:7000"));
+    }
+
+    #[test]
+    fn of_two_nodes_of_one_host_with_one_port_the_second_has_no_ipv6_or_does_not_start() {
+        let config = |choices: &[&str], port: u16| {
+            let mut config = NodeConfig::new("test");
+            let chosen: Vec<_> = choices.iter().map(|choice| choice.parse().unwrap()).collect();
+            config.ndl.interface = chosen.into();
+            config.gncl.port = port;
+            config
+        };
+        let Ok(first) = listen_first(&config(&["::1"], 0)) else {
+            println!("skipped: this host has no IPv6");
+            return;
+        };
+        let port = first.local_addr().unwrap().port();
+        let alone = listen_first(&config(&["::1"], port));
+        assert_eq!(alone.unwrap_err().kind(), io::ErrorKind::AddrInUse);
+        let both = config(&["127.0.0.1", "::1"], port);
+        let ipv4 = listen_first(&both).unwrap();
+        assert!(listen_at_ipv6(&both, ipv4.local_addr().unwrap()).is_none());
+        assert!(!has_no_ipv6(&io::ErrorKind::AddrInUse.into()));
+        assert!(has_no_ipv6(&Errno::AFNOSUPPORT.into()));
     }
 
     #[test]
