@@ -1,6 +1,11 @@
 //! What happens to one connection until it is a link or gone.
 
-use std::{cmp::Reverse, collections::BTreeMap, net::IpAddr, time::Duration};
+use std::{
+    cmp::Reverse,
+    collections::BTreeMap,
+    net::{IpAddr, Ipv6Addr},
+    time::Duration,
+};
 
 use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
@@ -60,17 +65,26 @@ impl Core {
     /// Strangers in the order in which they go. Who is a peer says hello at once, so those that have not for longest are none; but who
     /// connects thousands of times a second lets nobody say anything, unless it is his own that go: first those from where most come,
     /// and only behind all others those from where NDL has found a node, as many of the newest as that makes; half of the places at most
-    /// are for these.
+    /// are for these. Most come from one network of IPv6 where a host takes a new address for each: in it, first those of the address from
+    /// where most come.
     fn least_wanted(&mut self, now: Time) -> Vec<ConnectionId> {
         self.look_where_nodes_are(now);
         let places = self.settings.strangers_max / 2;
         let mut newer: BTreeMap<Option<IpAddr>, usize> = BTreeMap::new();
-        let ranked = self.strangers().rev().map(|(connection, from)| {
+        let of_addresses = self.strangers().rev().map(|(connection, from)| {
             let newer = newer.entry(from).or_default();
             *newer += 1;
             let nodes = from.and_then(|from| self.found_at.nodes.get(&from)).copied().unwrap_or(0);
             let is_expected = *newer <= (nodes * OF_A_NODE).min(places);
-            (is_expected, Reverse(*newer), connection)
+            (*newer, Reverse(connection), from, is_expected)
+        });
+        let mut of_addresses: Vec<_> = of_addresses.collect();
+        of_addresses.sort_unstable();
+        let mut before: BTreeMap<Option<IpAddr>, usize> = BTreeMap::new();
+        let ranked = of_addresses.into_iter().map(|(_, Reverse(connection), from, is_expected)| {
+            let before = before.entry(from.map(network_of)).or_default();
+            *before += 1;
+            (is_expected, Reverse(*before), connection)
         });
         let mut ranked: Vec<_> = ranked.collect();
         ranked.sort_unstable();
@@ -391,6 +405,14 @@ impl Core {
     pub(super) fn stage_for_handshake(&mut self, now: Time, connection: ConnectionId, stage: Stage) {
         let deadline = now + self.settings.handshake;
         self.connections.insert(connection, Connection { stage, from: None, deadline });
+    }
+}
+
+/// Where whoever has this address may have others as well: of IPv6 a network of 2^64 of them is the least that a host is given.
+fn network_of(ip: IpAddr) -> IpAddr {
+    match ip {
+        IpAddr::V4(_) => ip,
+        IpAddr::V6(ip) => Ipv6Addr::from_bits(ip.to_bits() >> 64 << 64).into(),
     }
 }
 

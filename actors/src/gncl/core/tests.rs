@@ -316,6 +316,26 @@ fn not_even_where_a_node_was_found_can_anybody_take_all_places() {
 }
 
 #[test]
+fn a_host_that_takes_a_new_address_of_its_ipv6_network_for_each_connection_closes_its_own() {
+    let mut core = core();
+    let from = |ip: &str| ip.parse::<IpAddr>().unwrap();
+    let (honest, _) = accept_from(&mut core, from("fd00:0:0:1::7"));
+    let (first, _) = accept_from(&mut core, from("fd00:0:0:2::1"));
+    let (second, _) = accept_from(&mut core, from("fd00:0:0:2::2"));
+    let (_, closed) = accept_from(&mut core, from("fd00:0:0:2::3"));
+    assert_eq!(closed, [Output::Close(first)], "not {honest:?}, though that is older");
+    // In one network it is the address from where most come.
+    let (_, closed) = accept_from(&mut core, from("fd00:0:0:2::3"));
+    assert_eq!(closed, [Output::Close(second)], "two are as old as each other's addresses");
+    let (other, _) = accept_from(&mut core, from("fd00:0:0:2::4"));
+    let (_, closed) = accept_from(&mut core, from("fd00:0:0:2::3"));
+    assert!(
+        !closed.contains(&Output::Close(other)) && !closed.contains(&Output::Close(honest)),
+        "{closed:?}"
+    );
+}
+
+#[test]
 fn who_is_refused_counts_where_it_came_from() {
     let mut core = core();
     let from = [10, 0, 0, 8];
