@@ -138,6 +138,7 @@ fn texts_are_legal_at_both_ends_and_not_beyond() {
         ("gncl.announce", "'0.0.0.0:6912'".to_owned(), false),
         ("gncl.announce", "'224.0.0.1:6912'".to_owned(), false),
         ("gncl.announce", "'10.0.0.7'".to_owned(), false),
+        ("gncl.announce", "'[fd00::7]:6912'".to_owned(), false),
         ("gncl.further", "[]".to_owned(), true),
         ("gncl.further", "['10.0.0.7', '10.1.0.7']".to_owned(), true),
         ("gncl.further", format!("{:?}", (1..8).map(|n| format!("10.0.0.{n}")).collect::<Vec<_>>()), true),
@@ -147,6 +148,7 @@ fn texts_are_legal_at_both_ends_and_not_beyond() {
         ("gncl.further", "['0.0.0.0']".to_owned(), false),
         ("gncl.further", "['10.0.0.7:5']".to_owned(), false),
         ("gncl.further", "'10.0.0.7'".to_owned(), false),
+        ("gncl.further", "['fd00::7']".to_owned(), false),
         ("gncl.marks", "false".to_owned(), true),
         ("gncl.marks", "0".to_owned(), false),
         ("gncl.datagrams", "false".to_owned(), true),
@@ -341,6 +343,17 @@ fn an_unknown_key_is_told_its_nearest_one() {
         assert!(found.remedy.starts_with(nearest), "{found}");
     }
     assert!(faults("name = 'knee'").iter().any(|fault| fault.remedy.starts_with("write node.name,")));
+}
+
+#[test]
+fn where_addresses_of_ipv6_have_no_place_it_is_said_where_they_have_one() {
+    for (line, key) in
+        [("announce = '[fd00::7]:6912'", "gncl.announce"), ("further = ['fd00::7']", "gncl.further")]
+    {
+        let found = only_fault(&format!("[node]\nname = 'knee'\n[gncl]\n{line}\n"));
+        assert_eq!((found.key.as_str(), found.line), (key, Some(4)));
+        assert!(found.legal.contains("IPv4") && found.remedy.contains("ndl.interface"), "{found}");
+    }
 }
 
 #[test]

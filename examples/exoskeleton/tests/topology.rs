@@ -63,6 +63,22 @@ fn nodes_that_could_never_meet_are_refused() {
 }
 
 #[test]
+fn a_node_may_be_where_ipv6_is_and_what_is_written_is_read_again() {
+    let text = EXAMPLE
+        .replacen("interface = \"10.0.0.1\"", "interface = \"eth0/ipv6\"", 1)
+        .replacen("address = \"10.0.0.2\"", "address = \"10.0.0.2\"\ninterface = \"fe80::2%eth0\"", 1)
+        .replacen("10.0.0.1:6911", "[fe80::1%eth0]:6911", 1);
+    let topology = Topology::parse(&text).unwrap();
+    assert_eq!(topology.central.interface.to_string(), "eth0/ipv6");
+    assert_eq!(topology.joints[0].interface.to_string(), "fe80::2%eth0");
+    assert_eq!(topology.joints[2].seeds[0].to_string(), "[fe80::1%eth0]:6911");
+    let written = topology.to_toml();
+    assert_eq!(Topology::parse(&written).unwrap(), topology, "{written}");
+    let slip = EXAMPLE.replacen("interface = \"10.0.0.1\"", "interface = \"fe80::zz\"", 1);
+    assert!(faults(&slip)[0].contains("central.interface"));
+}
+
+#[test]
 fn priority_of_the_network_thread_is_refused() {
     let text = with("# realtime_priority = 50 ", "realtime_priority = 50 #");
     assert!(faults(&text)[0].contains("control.thread = \"own\""));

@@ -4,10 +4,11 @@ mod file;
 mod free;
 
 use std::fmt;
-use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
+use std::net::{SocketAddr, SocketAddrV4};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use sinew::config::{Interfaces, Seed};
 use sinew::{NodeAddress, NodeConfig};
 use thiserror::Error;
 
@@ -88,12 +89,12 @@ pub enum ReleaseBy {
 pub struct NodePlace {
     /// Its address in the project.
     pub address: NodeAddress,
-    /// Address of the network interface that it uses.
-    pub interface: Ipv4Addr,
+    /// The network interface that it uses, by address or by name.
+    pub interface: Interfaces,
     /// UDP port of its discovery; 0: any free one. Set it where others list this node as a seed.
     pub port: u16,
     /// UDP addresses of nodes to ask in any case.
-    pub seeds: Vec<SocketAddr>,
+    pub seeds: Vec<Seed>,
     /// Where the drive of a joint runs; of no meaning at central.
     pub drive: DrivePlace,
 }
@@ -179,9 +180,9 @@ impl Topology {
         let mut config = NodeConfig::new(part.name());
         config.project.clone_from(&self.project);
         config.address = Some(place.address);
-        config.ndl.interface = place.interface.into();
+        config.ndl.interface = place.interface.clone();
         config.ndl.port = place.port;
-        config.ndl.seeds = place.seeds.iter().copied().map(Into::into).collect();
+        config.ndl.seeds.clone_from(&place.seeds);
         config.ndl.multicast = self.discovery.multicast;
         config.ndl.mdns_port = self.discovery.mdns.then_some(MDNS_PORT);
         config.ndl.period = self.discovery.period;

@@ -255,7 +255,7 @@ fn topology_on_hosts(options: &FaultOptions) -> io::Result<Topology> {
             Part::Central => &mut topology.central,
             Part::Joint(joint) => &mut topology.joints[joint.index()],
         };
-        (place.address, place.interface) = (NodeAddress::from(address), address);
+        (place.address, place.interface) = (NodeAddress::from(address), address.into());
     }
     topology.plant.address.set_ip(IpAddr::V4(Hosts::device_address_of(Role::Plant)));
     Ok(topology)

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use sinew::NodeAddress;
+use sinew::config::{Interface, Interfaces, Seed};
 
 use super::{
     Control, ControlThread, Discovery, DrivePlace, NodePlace, PlantPlace, ReleaseBy, Topology, TopologyFaults,
@@ -134,9 +135,14 @@ pub(super) fn parse(text: &str) -> Result<Topology, TopologyFaults> {
 fn node(faults: &mut Faults, part: Part, table: &NodeTable) -> Option<NodePlace> {
     let form = "write an IPv4 address, as in 10.0.0.7";
     let address: Option<Ipv4Addr> = faults.parsed(&format!("{part}.address"), &table.address, form);
-    let interface: Option<Ipv4Addr> = match &table.interface {
-        Some(text) => faults.parsed(&format!("{part}.interface"), text, form),
-        None => address,
+    let interface: Option<Interfaces> = match &table.interface {
+        Some(text) => {
+            let form =
+                "write an address of its host, as in 10.0.0.7 or fd00::7, or an interface's name, as in eth0";
+            let one: Option<Interface> = faults.parsed(&format!("{part}.interface"), text, form);
+            one.map(|one| vec![one].into())
+        }
+        None => address.map(Into::into),
     };
     if let Some(address) = address {
         let single = !address.is_unspecified() && !address.is_broadcast() && !address.is_multicast();
@@ -163,11 +169,11 @@ fn drive_place(faults: &mut Faults, part: Part, text: Option<&str>) -> DrivePlac
     }
 }
 
-fn seeds(faults: &mut Faults, place: &str, texts: &[String]) -> Vec<SocketAddr> {
+fn seeds(faults: &mut Faults, place: &str, texts: &[String]) -> Vec<Seed> {
     faults.note(texts.len() <= SEEDS_MAX, || format!("{place} has more than {SEEDS_MAX} entries"));
-    let form = "write address:port, as in 10.0.0.7:6911";
-    let seeds: Vec<SocketAddr> = texts.iter().filter_map(|text| faults.parsed(place, text, form)).collect();
-    faults.note(seeds.iter().all(|seed| seed.port() != 0), || {
+    let form = "write address:port, as in 10.0.0.7:6911 or [fd00::7]:6911";
+    let seeds: Vec<Seed> = texts.iter().filter_map(|text| faults.parsed(place, text, form)).collect();
+    faults.note(seeds.iter().all(|seed| seed.address.port() != 0), || {
         format!("{place}: port 0 cannot be asked; set `port` at that node and write it here")
     });
     seeds
@@ -258,7 +264,7 @@ fn check_together(faults: &mut Faults, places: &[Option<NodePlace>], discovery: 
             format!("{part}.address = \"{}\" is another node's already; each needs its own", place.address)
         });
     }
-    let on_loopback = known.iter().filter(|(_, place)| place.interface.is_loopback()).count();
+    let on_loopback = known.iter().filter(|(_, place)| place.interface.are_loopback()).count();
     faults.note(on_loopback == 0 || on_loopback == known.len(), || {
         "some nodes are on a loopback interface and others are not; they would never meet".to_owned()
     });

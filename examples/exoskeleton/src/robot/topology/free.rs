@@ -21,7 +21,7 @@ pub fn for_this_host(seed: u64) -> io::Result<Topology> {
     let group = Ipv4Addr::new(239, 255, (id >> 8) as u8, id as u8);
     let node = |last| NodePlace {
         address: NodeAddress::from([127, 0, 0, last]),
-        interface: Ipv4Addr::LOCALHOST,
+        interface: Ipv4Addr::LOCALHOST.into(),
         port: 0,
         seeds: Vec::new(),
         drive: DrivePlace::Node,
