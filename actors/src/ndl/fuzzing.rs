@@ -35,7 +35,19 @@ pub(crate) fn some_datagrams() -> Vec<Vec<u8>> {
         query_received_ns: 2,
         progress: Progress::default(),
     };
-    let bodies = [Body::Query(announcement.clone()), Body::Answer(answer), Body::Leave(announcement)];
+    // Of both families, and of IPv6 alone.
+    let ndl6 = vec![(0xfe80 << 48, 2, 6_910), (0xfd00 << 48, 2, 6_910)];
+    let both = Announcement { ndl6: ndl6.clone(), gncl_port6: 7_777, ..announcement.clone() };
+    let (ndl, gncl_further) = (Vec::new(), Vec::new());
+    let alone = Announcement { gncl_ip: 0, gncl_port: 0, gncl_further, ndl, ..both.clone() };
+    let answer_of_both = Answer { announcement: both, ..answer.clone() };
+    let bodies = [
+        Body::Query(announcement.clone()),
+        Body::Answer(answer),
+        Body::Leave(announcement),
+        Body::Answer(answer_of_both),
+        Body::Query(alone),
+    ];
     let written =
         bodies.map(|body| encode(&Datagram { correlation: 3, sent: Time::from_nanos(4), body }, HERE));
     written.map(|bytes| bytes.to_vec()).into()

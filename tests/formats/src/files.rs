@@ -22,6 +22,8 @@ pub(crate) fn some_configurations() -> Vec<Vec<u8>> {
         "[node]\nname = 'knee'\naddress = '10.0.0.7'\nproject = 'exo'\npayload_max = 65536\n[lncl]\n[gncl]\nport = 7000\n\
          strangers_max = 16\nhandshake_ms = 100\nfurther = ['10.1.0.7']\n[ndl]\nmulticast = '239.255.1.2:7001'\nperiod_ms = 100\n\
          seeds = ['10.0.0.8:7001']\nmdns_port = false\n[sync]\n[supervision]\n[security]\n",
+        "[node]\nname = 'knee'\naddress = '10.0.0.7'\n[ndl]\ninterface = ['eth0/ipv6', 'fe80::7%eth0', 'fd00::7']\nseeds = ['[fe80::8%eth0]:6911', \
+         '[fd00::8]:6911']\nmulticast6 = '[ff12::8000:1]:6910'\n",
         "2d6f  # hip\n\nab\n",
         "10.0.0.7/0x80000001",
         "knee.drive within 3s",
