@@ -151,11 +151,12 @@ fn multicast_at(choice: &Choice, all: &[Interface]) -> Vec<Check> {
         ),
     };
     let checks: Vec<_> = at
-        .into_iter()
+        .iter()
+        .copied()
         .flat_map(|interface| tried(interface, families).map(|address| heard_at(address, interface)))
         .collect();
     if !checks.is_empty() {
-        return checks;
+        return checks.into_iter().chain(without_ipv4(choice, families, &at)).collect();
     }
     let names: Vec<_> = all.iter().map(Interface::in_words).collect();
     let mend = format!(
@@ -163,6 +164,20 @@ fn multicast_at(choice: &Choice, all: &[Interface]) -> Vec<Check> {
         names.join(", ")
     );
     vec![Check::finding(MULTICAST_NAME, none, mend)]
+}
+
+/// That what is chosen has no IPv4 address, where it may have one: nodes without IPv6 do not see that node. A lease may have ended.
+fn without_ipv4(choice: &Choice, families: Families, at: &[&Interface]) -> Option<Check> {
+    let has_ipv4 = at.iter().flat_map(|interface| &interface.addresses).any(IpAddr::is_ipv4);
+    if has_ipv4 || !families.has_ipv4() {
+        return None;
+    }
+    let device = at.first().map_or("eth0", |interface| interface.name.as_str());
+    let mend = format!(
+        "sudo ip address add 10.0.0.1/24 dev {device} (an address of your network); or, where IPv6 alone is meant, `ndl.interface` = \"{choice}/ipv6\""
+    );
+    let seen = format!("{choice} has no IPv4 address: the node is seen by IPv6 alone");
+    Some(Check::finding(MULTICAST_NAME, seen, mend))
 }
 
 /// Addresses of an interface at which groups are tried: each of IPv4, and of IPv6 one, as the group belongs to the link.
@@ -306,6 +321,22 @@ mod tests {
             assert!(checks[0].seen.contains(word), "{}", checks[0].seen);
             assert!(checks[0].mend.as_ref().is_some_and(|mend| mend.contains("eth0") || word == "fe80::1"));
         }
+    }
+
+    #[test]
+    fn that_an_interface_has_no_ipv4_is_a_finding_unless_ipv6_alone_is_chosen() {
+        let of = |addresses: &[&str], choice: &str| {
+            let addresses = addresses.iter().map(|ip| ip.parse().unwrap()).collect();
+            let all = [Interface { addresses, ..interface("eth0", None, UP | MULTICAST, true) }];
+            let checks = multicast(&vec![choice.parse::<Choice>().unwrap()].into(), &all);
+            checks.into_iter().find(|check| check.seen.contains("no IPv4 address"))
+        };
+        for choice in ["eth0", "all"] {
+            let missing = of(&["fe80::1"], choice).expect("a finding");
+            assert!(missing.mend.is_some_and(|mend| mend.contains(&format!("{choice}/ipv6"))));
+            assert!(of(&["fe80::1", "127.0.0.9"], choice).is_none());
+        }
+        assert!(of(&["fe80::1"], "eth0/ipv6").is_none());
     }
 
     #[test]

@@ -3,10 +3,11 @@
 mod access;
 mod stream;
 
-use std::{collections::BTreeSet, net::IpAddr};
+use std::collections::BTreeSet;
 
 use sinew::{
     Rejection,
+    config::{Interface, Seed},
     inspect::{LostReport, NodeReport, PeerReport},
 };
 
@@ -354,8 +355,9 @@ fn why_unknown(from: &NodeReport, to: &End) -> Vec<(String, String)> {
         // It was said already, and is reason enough.
         return vec![("not found, as it is of another project".to_owned(), "as above".to_owned())];
     }
-    let seeded =
-        |of: &NodeReport, other: &NodeReport| other.udp.as_ref().is_some_and(|udp| of.seeds.contains(udp));
+    let seeded = |of: &NodeReport, other: &NodeReport| {
+        other.udp.as_ref().is_some_and(|udp| of.seeds.iter().any(|seed| names(seed, udp)))
+    };
     if seeded(from, theirs) || seeded(theirs, from) {
         let mend = "is UDP let through by the firewalls of both hosts (`sudo nft list ruleset`), and is `ndl.port` the one that the seed names?";
         return vec![("a seed names it, and no answer has come".to_owned(), mend.to_owned())];
@@ -394,9 +396,21 @@ fn why_unknown(from: &NodeReport, to: &End) -> Vec<(String, String)> {
 fn is_on_loopback(report: &NodeReport) -> bool {
     let is_loopback = |interface: &str| {
         let interface = interface.trim_end_matches("/ipv4").trim_end_matches("/ipv6");
-        interface == "lo" || interface.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
+        let is_loopback = |choice| match choice {
+            Interface::Address(address) => address.is_loopback(),
+            Interface::Address6 { address, .. } => address.is_loopback(),
+            Interface::Name(..) | Interface::All(_) => false,
+        };
+        interface == "lo" || interface.parse().is_ok_and(is_loopback)
     };
     report.interface.split(", ").all(is_loopback)
+}
+
+/// Whether a seed is where a node says that it is. The interface behind a link-local address is each host's own: one calls it by its name,
+/// another by its number, and it may be another one.
+fn names(seed: &str, udp: &str) -> bool {
+    let at = |text: &str| text.parse::<Seed>().ok().map(|seed| seed.address);
+    seed == udp || at(seed).is_some_and(|seed| at(udp) == Some(seed))
 }
 
 fn dial_in_words(peer: &PeerReport) -> (String, String) {
