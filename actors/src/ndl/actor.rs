@@ -172,9 +172,9 @@ impl Shell {
         }
         let (chosen, port, paths) = (&stores.config.ndl.interface, stores.config.ndl.port, Paths::default());
         let addresses: Vec<_> = chosen.addresses().map(LocalAddress::from).collect();
-        let (readers, error) = paths.open(&stores, &addresses);
+        let (readers, unopened) = paths.open(&stores, &addresses);
         // Of several each may come later.
-        if let Some(error) = error.filter(|_| chosen.iter().count() == 1) {
+        if let Some((_, error)) = unopened.first().filter(|_| chosen.iter().count() == 1) {
             return Err(format!(
                 "NDL cannot use UDP {chosen}:{port}: {error}; set `ndl.interface` to an IPv4 address of this host \
                  and `ndl.port` to a free port, or to 0 for any"

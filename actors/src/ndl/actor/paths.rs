@@ -87,9 +87,13 @@ impl Paths {
         socket::send(&path.socket, bytes, to)
     }
 
-    /// Opens what is `wanted` and is not open, closes what is not wanted. What is to be read from now on; and the first error.
-    pub(super) fn open(&self, stores: &Stores, wanted: &[LocalAddress]) -> (Vec<Reader>, Option<io::Error>) {
-        let (mut readers, mut first_error) = (Vec::new(), None);
+    /// Opens what is `wanted` and is not open, closes what is not wanted. What is to be read from now on; and what is not open, and why.
+    pub(super) fn open(
+        &self,
+        stores: &Stores,
+        wanted: &[LocalAddress],
+    ) -> (Vec<Reader>, Vec<(LocalAddress, io::Error)>) {
+        let (mut readers, mut unopened) = (Vec::new(), Vec::new());
         self.close_all_but(stores, wanted);
         for local in wanted.iter().copied() {
             if !self.locals().contains(&local) {
@@ -99,23 +103,21 @@ impl Paths {
                         match path.socket.try_clone() {
                             Ok(socket) => readers.push(Reader { socket, from, local }),
                             Err(error) => {
-                                first_error.get_or_insert(error);
+                                unopened.push((local, error));
                                 continue;
                             }
                         }
                         self.open.borrow_mut().push(path);
                         self.said.borrow_mut().remove(&(local, UNOPENED));
                     }
-                    Err(error) => {
-                        first_error.get_or_insert(error);
-                    }
+                    Err(error) => unopened.push((local, error)),
                 }
             }
             readers.extend(self.join(stores, local));
         }
         let place = |path: &Path| wanted.iter().position(|local| *local == path.local);
         self.open.borrow_mut().sort_by_key(place);
-        (readers, first_error)
+        (readers, unopened)
     }
 
     fn close_all_but(&self, stores: &Stores, wanted: &[LocalAddress]) {
@@ -153,9 +155,8 @@ impl Paths {
     }
 
     /// What is not open, and why, once.
-    fn say_unopened(&self, stores: &Stores, wanted: &[LocalAddress], error: &io::Error) {
-        let port = stores.config.ndl.port;
-        for local in wanted.iter().filter(|local| !self.locals().contains(local)) {
+    fn say_unopened(&self, port: u16, unopened: &[(LocalAddress, io::Error)]) {
+        for (local, error) in unopened {
             if self.said.borrow_mut().insert((*local, UNOPENED)) {
                 let at = local.at(port);
                 crate::log::warn!(
@@ -285,10 +286,8 @@ impl Shell {
     fn look_at_paths(self: &Rc<Self>, usable: &Usable, tasks: &FuturesUnordered<Task>) -> bool {
         let (stores, before) = (&self.stores, self.paths.here());
         let wanted = wanted(&stores.config.ndl.interface, usable, &self.paths.locals());
-        let (readers, error) = self.paths.open(stores, &wanted);
-        if let Some(error) = error {
-            self.paths.say_unopened(stores, &wanted, &error);
-        }
+        let (readers, unopened) = self.paths.open(stores, &wanted);
+        self.paths.say_unopened(stores.config.ndl.port, &unopened);
         for reader in readers {
             match self.reading(reader) {
                 Ok(task) => tasks.push(task),
