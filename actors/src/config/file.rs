@@ -286,16 +286,6 @@ impl<'t> Reader<'t> {
         }
     }
 
-    fn is_text(&self, key: &str, is_it: impl Fn(&str) -> bool) -> bool {
-        self.values.get(key).and_then(|value| value.get_ref().as_str()).is_some_and(is_it)
-    }
-
-    fn reject_key(&mut self, key: &str, legal: &str, remedy: &str) {
-        if let Some(value) = self.values.get(key).copied() {
-            self.reject(key, value, legal, remedy);
-        }
-    }
-
     fn truth(&mut self, key: &str, target: &mut bool) {
         let Some(value) = self.values.get(key).copied() else { return };
         match value.get_ref().as_bool() {
@@ -362,13 +352,8 @@ impl Reader<'_> {
     fn read_gncl(&mut self, config: &mut NodeConfig) {
         let gncl = &mut config.gncl;
         self.number(&check::GNCL_PORT, &mut gncl.port);
-        let example = "\"192.168.1.7:6912\" or false";
-        if self.is_text("gncl.announce", |text| text.parse::<SocketAddrV6>().is_ok()) {
-            let remedy = "leave it out: IPv6 addresses are announced as `ndl.interface` chooses them, and nothing forwards them";
-            self.reject_key("gncl.announce", "an address of IPv4 and a port, or false", remedy);
-        } else {
-            self.text_or_off::<SocketAddrV4>("gncl.announce", example, &mut gncl.announce);
-        }
+        let example = "\"192.168.1.7:6912\" (of IPv4: those of IPv6 are announced as ndl.interface chooses them) or false";
+        self.text_or_off::<SocketAddrV4>("gncl.announce", example, &mut gncl.announce);
         let remedy =
             "set gncl.further as in [\"192.168.2.7\"]; further IPv6 addresses are listed in `ndl.interface`";
         self.read_list("gncl.further", "a list of IPv4 addresses of this host", remedy, &mut gncl.further);

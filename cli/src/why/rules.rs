@@ -1,16 +1,17 @@
 //! From what two ends say to what stands in the way between them: facts in, steps out, nothing asked and nothing waited for.
 
 mod access;
+mod places;
 mod stream;
 
 use std::collections::BTreeSet;
 
 use sinew::{
     Rejection,
-    config::{Interface, Seed},
     inspect::{LostReport, NodeReport, PeerReport},
 };
 
+use self::places::{is_on_loopback, names};
 use super::facts::{App, End, Facts};
 use crate::table::time;
 
@@ -373,7 +374,7 @@ fn why_unknown(from: &NodeReport, to: &End) -> Vec<(String, String)> {
         let seen = format!("it asks in the group {one}, the other in {other}");
         return vec![(seen, format!("set the same `multicast` under [ndl] in both; or {seed}"))];
     }
-    if is_on_loopback(from) != is_on_loopback(theirs) {
+    if is_on_loopback(&from.interface) != is_on_loopback(&theirs.interface) {
         let seen = format!(
             "it asks at {}, the other at {}: one of them on its own host only",
             from.interface, theirs.interface
@@ -390,27 +391,6 @@ fn why_unknown(from: &NodeReport, to: &End) -> Vec<(String, String)> {
         from.interface, theirs.interface
     );
     vec![(format!("both ask in the group {one}, and it has not heard the other"), mend)]
-}
-
-/// Whether a node looks for others on its own host only: none of its interfaces leads out of it.
-fn is_on_loopback(report: &NodeReport) -> bool {
-    let is_loopback = |interface: &str| {
-        let interface = interface.trim_end_matches("/ipv4").trim_end_matches("/ipv6");
-        let is_loopback = |choice| match choice {
-            Interface::Address(address) => address.is_loopback(),
-            Interface::Address6 { address, .. } => address.is_loopback(),
-            Interface::Name(..) | Interface::All(_) => false,
-        };
-        interface == "lo" || interface.parse().is_ok_and(is_loopback)
-    };
-    report.interface.split(", ").all(is_loopback)
-}
-
-/// Whether a seed is where a node says that it is. The interface behind a link-local address is each host's own: one calls it by its name,
-/// another by its number, and it may be another one.
-fn names(seed: &str, udp: &str) -> bool {
-    let at = |text: &str| text.parse::<Seed>().ok().map(|seed| seed.address);
-    seed == udp || at(seed).is_some_and(|seed| at(udp) == Some(seed))
 }
 
 fn dial_in_words(peer: &PeerReport) -> (String, String) {

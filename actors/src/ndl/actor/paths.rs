@@ -378,7 +378,10 @@ pub(super) async fn keep_paths(shell: Rc<Shell>, mut news: Option<watch::Receive
 mod tests {
     use std::net::Ipv4Addr;
 
+    use sinew_runtime::tid::Incarnation;
+
     use super::*;
+    use crate::config::NodeConfig;
 
     fn v4(address: [u8; 4]) -> LocalAddress {
         Ipv4Addr::from(address).into()
@@ -408,6 +411,20 @@ mod tests {
         assert_eq!(wanted(&chosen, &usable(&[], &[]), &[named]), [by_address], "the address is gone");
         let many: Vec<_> = (0..20).map(|last| v4([10, 8, 1, last])).collect();
         assert_eq!(wanted(&chosen, &usable(&many, &many), &[]).len(), PATHS_MAX);
+    }
+
+    #[test]
+    fn each_address_that_cannot_be_opened_has_its_own_reason() {
+        let taken = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+        let mut config = NodeConfig::new("test");
+        config.ndl.port = taken.local_addr().unwrap().port();
+        let stores = Stores::for_test(config, Incarnation(1));
+        // TEST-NET-1: no host has it.
+        let wanted = [v4([127, 0, 0, 1]), v4([192, 0, 2, 1])];
+        let (_, unopened) = Paths::default().open(&stores, &wanted);
+        let reasons: Vec<_> = unopened.iter().map(|(local, error)| (*local, error.kind())).collect();
+        let expected = [io::ErrorKind::AddrInUse, io::ErrorKind::AddrNotAvailable];
+        assert_eq!(reasons, wanted.into_iter().zip(expected).collect::<Vec<_>>());
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Who comes, goes, and comes again in a new life.
 
-use std::{net::SocketAddr, time::Duration};
+use std::time::Duration;
 
 use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
@@ -17,7 +17,7 @@ use super::{
 };
 use crate::{
     gncl::LinkFact,
-    ndl::{LossReason, MembershipFact, NodeEvent, Progress, address::is_same_host, datagram::Announcement},
+    ndl::{LossReason, MembershipFact, NodeEvent, Progress, datagram::Announcement},
 };
 
 /// Longest time that a node has to show that it lives, when another process comes with its address.
@@ -349,27 +349,6 @@ impl Core {
             // Never connected: its GNCL may not listen yet.
             LinkFact::DialRefused { .. } => {}
             LinkFact::PeerLeft { .. } => self.lose(now, node, LossReason::Left),
-        }
-    }
-
-    /// Its host refuses connections where it was linked, and nothing is known of its other addresses but that they do not answer: it is lost
-    /// as if they refused, unless its NDL was heard at one of them or may be. Where it was heard it may live. // spec: NDL-4.3
-    pub(super) fn refused(
-        &mut self,
-        now: Time,
-        node: NodeAddress,
-        incarnation: Incarnation,
-        at: &[SocketAddr],
-    ) {
-        let paths = &self.paths;
-        let is_gone = self.members.get(&node).is_some_and(|member| {
-            member.announcement.incarnation == incarnation
-                && member.is_link_broken
-                && member.is_known_on_all_ways(paths)
-                && member.routes.places().all(|place| at.iter().any(|at| is_same_host(*at, place.there)))
-        });
-        if is_gone {
-            self.lose(now, node, LossReason::Crashed);
         }
     }
 

@@ -10,14 +10,18 @@ use std::{
     time::Duration,
 };
 
-use sinew_runtime::{tid::NodeAddress, time::Time};
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
 
 use super::{
     Core, Member, Output,
     contact::{Contact, Role},
 };
 use crate::ndl::{
-    address::{is_link_local, seen_from},
+    LossReason,
+    address::{is_link_local, is_same_host, seen_from},
     datagram::{Announcement, PATHS_MAX},
 };
 
@@ -310,6 +314,27 @@ impl Core {
                 let contact = self.contacts.entry(place).or_insert_with(|| Contact::seed(now));
                 contact.is_seed = true;
             }
+        }
+    }
+
+    /// Its host refuses connections where it was linked, and nothing is known of its other addresses but that they do not answer: it is lost
+    /// as if they refused, unless its NDL was heard at one of them or may be. Where it was heard it may live. // spec: NDL-4.3
+    pub(super) fn refused(
+        &mut self,
+        now: Time,
+        node: NodeAddress,
+        incarnation: Incarnation,
+        at: &[SocketAddr],
+    ) {
+        let paths = &self.paths;
+        let is_gone = self.members.get(&node).is_some_and(|member| {
+            member.announcement.incarnation == incarnation
+                && member.is_link_broken
+                && member.is_known_on_all_ways(paths)
+                && member.routes.places().all(|place| at.iter().any(|at| is_same_host(*at, place.there)))
+        });
+        if is_gone {
+            self.lose(now, node, LossReason::Crashed);
         }
     }
 

@@ -71,35 +71,6 @@ fn report(number: u8, name: &str, other: u8) -> NodeReport {
     }
 }
 
-#[test]
-fn a_seed_names_a_node_whatever_the_interface_is_called_on_either_host() {
-    for (seed, udp, is_it) in [
-        ("[fe80::2%eth0]:6911", "[fe80::2%2]:6911", true),
-        ("[fe80::2]:6911", "[fe80::2%2]:6911", true),
-        ("[::1%lo]:6911", "[::1]:6911", true),
-        ("[fd00::2]:6911", "[fd00:0::2]:6911", true),
-        ("[fe80::2%eth0]:6911", "[fe80::2%2]:6912", false),
-        ("[fe80::2%eth0]:6911", "[fe80::3%2]:6911", false),
-        ("10.0.0.2:7000", "10.0.0.2:7000", true),
-        ("10.0.0.2:7000", "10.0.0.3:7000", false),
-    ] {
-        assert_eq!(names(seed, udp), is_it, "{seed} {udp}");
-    }
-}
-
-#[test]
-fn a_node_on_loopback_is_so_by_each_name_of_it() {
-    let on = |interface: &str| {
-        is_on_loopback(&NodeReport { interface: interface.to_owned(), ..report(1, "hip", 2) })
-    };
-    for interface in ["127.0.0.1", "::1", "::1%lo", "lo/ipv6", "127.0.0.1, ::1%lo"] {
-        assert!(on(interface), "{interface}");
-    }
-    for interface in ["eth0", "all", "fe80::1%eth0", "127.0.0.1, eth0"] {
-        assert!(!on(interface), "{interface}");
-    }
-}
-
 fn app(name: &str) -> App {
     let tid = Tid::new(node(2), AppAddress::new(0x1001));
     let report = AppReport {
