@@ -125,10 +125,6 @@ impl Gncl {
                 self.stores.gncl.forget(node);
             }
             Output::Fact(fact) => self.tell(fact),
-            Output::RefusedWhereLinked { node, incarnation, at } => {
-                crate::log::info!(%node, ?at, "link refused wherever it was");
-                self.post(&self.stores.posts.ndl, ndl::Event::RefusedWhereLinked { node, incarnation, at });
-            }
             Output::Count { cause, detail } => self.stores.gncl.refusals.count(Time::now(), cause, &detail),
         }
     }

@@ -1,6 +1,7 @@
 //! The reading half of a connection: bytes become frames, a bounded number at a time.
 
 use std::{
+    cmp::Reverse,
     io,
     net::{IpAddr, Ipv6Addr, SocketAddr},
     sync::{Arc, Mutex},
@@ -98,12 +99,20 @@ impl Ends {
     pub(super) fn of(to: SocketAddr, paths: &[SocketAddr]) -> Self {
         let from = match to {
             SocketAddr::V6(to) if !to.ip().is_unicast_link_local() && !to.ip().is_loopback() => {
-                let network = |ip: &Ipv6Addr| ip.to_bits() >> 64;
-                let is_there = |ip: &Ipv6Addr| network(ip) == network(to.ip());
-                paths.iter().find_map(|path| match path {
-                    SocketAddr::V6(path) if is_there(path.ip()) => Some(IpAddr::from(*path.ip())),
-                    SocketAddr::V6(_) | SocketAddr::V4(_) => None,
-                })
+                // Bits at the beginning that both have. A network may be smaller than its first 64: one for each link, say.
+                let shared = |ip: &Ipv6Addr| (ip.to_bits() ^ to.ip().to_bits()).leading_zeros();
+                let nearest = paths.iter().filter_map(|path| match path {
+                    SocketAddr::V6(path) => Some((shared(path.ip()), *path.ip())),
+                    SocketAddr::V4(_) => None,
+                });
+                let mut nearest: Vec<_> = nearest.filter(|(shared, _)| *shared >= 64).collect();
+                nearest.sort_unstable_by_key(|(shared, _)| Reverse(*shared));
+                match nearest[..] {
+                    [(_, ip)] => Some(IpAddr::from(ip)),
+                    [(first, ip), (second, _), ..] if first > second => Some(IpAddr::from(ip)),
+                    // Of two that are as near the system knows which one leads there.
+                    _ => None,
+                }
             }
             SocketAddr::V6(_) | SocketAddr::V4(_) => None,
         };

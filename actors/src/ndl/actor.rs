@@ -128,9 +128,6 @@ impl StreamHandler<Event> for NdlActor {
     fn handle(&mut self, event: Event, _: &mut Self::Context) {
         let input = match event {
             Event::Link(fact) => Input::Link(fact),
-            Event::RefusedWhereLinked { node, incarnation, at } => {
-                Input::RefusedWhereLinked { node, incarnation, at }
-            }
             Event::App(fact) => Input::AppChanged(fact),
         };
         if let Some(shell) = &self.shell {

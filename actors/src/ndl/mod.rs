@@ -69,10 +69,6 @@ pub use facts::{LossReason, NodeEvent, Trouble};
 pub(crate) use progress::{Part, Progress, Told};
 pub(crate) use socket::Sockets;
 
-use std::net::SocketAddr;
-
-use sinew_runtime::tid::{Incarnation, NodeAddress};
-
 use crate::{gncl::LinkFact, lncl::AppFact};
 
 /// What NDL is told.
@@ -80,8 +76,6 @@ use crate::{gncl::LinkFact, lncl::AppFact};
 pub(crate) enum Event {
     /// By GNCL: a connection came, broke, or cannot be made again.
     Link(LinkFact),
-    /// By GNCL: the host of this node refuses connections at these addresses, among which is each one where GNCL had one with this life of it.
-    RefusedWhereLinked { node: NodeAddress, incarnation: Incarnation, at: Vec<SocketAddr> },
     /// By LNCL: an application that handles [`NodeEvent`] became ready, failed, went.
     App(AppFact),
 }

@@ -4,7 +4,10 @@ use std::{
     future::poll_fn,
     io::{self, Read},
     os::unix::net::UnixStream as StdStream,
-    sync::{Arc, OnceLock},
+    sync::{
+        Arc, OnceLock,
+        mpsc::{SyncSender, sync_channel},
+    },
     time::Duration,
 };
 
@@ -75,12 +78,14 @@ pub(super) fn host(config: &NodeConfig, apps: Vec<DynApp>, hosting: Hosting) -> 
 fn run(config: &NodeConfig, app: &DynApp, mut socket: StdStream) -> io::Result<()> {
     let welcome = read_welcome(&mut socket)?;
     socket.set_nonblocking(true)?;
+    // Before the application's priority and CPU are this thread's: who hangs there keeps no sign of life from being given.
+    let beats = Beats::begin((welcome.beat_us > 0).then(|| Duration::from_micros(welcome.beat_us)))?;
     place(app).prepare();
     let system = actix::System::new();
     let stop = system.stop_future();
     system.block_on(async {
         actix_rt::spawn(tell_of_a_stop(stop));
-        live(config, app, socket, welcome).await
+        live(config, app, socket, welcome, beats).await
     })
 }
 
@@ -109,17 +114,22 @@ fn read_welcome(socket: &mut StdStream) -> io::Result<Welcome> {
     }
 }
 
-async fn live(config: &NodeConfig, app: &DynApp, socket: StdStream, welcome: Welcome) -> io::Result<()> {
+async fn live(
+    config: &NodeConfig,
+    app: &DynApp,
+    socket: StdStream,
+    welcome: Welcome,
+    beats: Beats,
+) -> io::Result<()> {
     let socket = Arc::new(UnixStream::from_std(socket)?);
     // Other threads can write to it from now on: the reactor has seen it once. It has no turn while the application's
     // factory or its `started` keeps this thread, and a hang there must be told all the same.
     socket.writable().await?;
-    let (sequence, beat_us, tid) = (welcome.sequence, welcome.beat_us, Tid::from_bits(welcome.tid));
+    let (sequence, tid) = (welcome.sequence, Tid::from_bits(welcome.tid));
     let wire = Wire::new(config, socket, welcome);
     say_beat(&wire, None);
     serve(&wire);
-    let hosted = Arc::new(OnceLock::new());
-    beat_apart(&wire, (beat_us > 0).then(|| Duration::from_micros(beat_us)), hosted.clone())?;
+    beats.over(wire.clone());
     let sender = wire.sender(sequence, config.payload_max);
     let wiring = AppWiring { sender, mailbox: Mailbox::fed_by(wire.clone()) };
     let saying = wire.clone();
@@ -128,8 +138,7 @@ async fn live(config: &NodeConfig, app: &DynApp, socket: StdStream, welcome: Wel
     #[cfg(feature = "fault-points")]
     let launch = crate::node::arm_alone(app, launch);
     let (handle, ended) = alone(&launch, ready, watched(app, &wire, tid));
-    // Set once.
-    let _ = hosted.set(handle.clone());
+    beats.of(handle.clone());
     let stopping = wire.clone();
     actix_rt::spawn(async move {
         loop {
@@ -161,27 +170,67 @@ fn serve(wire: &Arc<Wire>) {
     });
 }
 
-/// Gives signs of life of the process, on a thread of its own, each `beat` at least if any are wanted: whether the application comes back in
-/// its time is judged by the watchdog here, which knows in what it is, and whether it was given a CPU. With them it says whether the
-/// application, which is there from the time on at which its factory has returned, stalls: the node tells the nodes that watch it.
-fn beat_apart(
-    wire: &Arc<Wire>,
-    beat: Option<Duration>,
+/// Signs of life of the process, from a thread of their own: whether the application comes back in its time is judged by the watchdog here,
+/// which knows in what it is, and whether it was given a CPU. With them it says whether the application stalls: the node tells the nodes that
+/// watch it.
+struct Beats {
+    wire: SyncSender<Arc<Wire>>,
     hosted: Arc<OnceLock<AloneHandle>>,
-) -> io::Result<()> {
-    let (wire, mut stalls, mut has_stalled) = (wire.clone(), Stalls::default(), false);
-    let beat_on = move || {
-        loop {
-            std::thread::sleep(beat.map_or(STALLS_LOOKED_FOR, |beat| beat.min(STALLS_LOOKED_FOR)));
-            let turns = hosted.get().map(AloneHandle::turn).into_iter();
-            let since = stalls.look(Time::now(), turns).into_values().next();
-            if wire.has_said_all() && (beat.is_some() || since.is_some() || has_stalled) {
-                say_beat(&wire, since);
-                has_stalled = since.is_some();
+}
+
+impl Beats {
+    /// One each `beat` at least, if any are wanted, once there is a connection.
+    ///
+    /// # Errors
+    /// There is no thread, and they are wanted.
+    fn begin(beat: Option<Duration>) -> io::Result<Self> {
+        let hosted = Arc::new(OnceLock::new());
+        let (wire, connected) = sync_channel::<Arc<Wire>>(1);
+        let whose = hosted.clone();
+        let thread = std::thread::Builder::new().name("beat".to_owned());
+        // Nobody connects: this process is about to end.
+        let beats = move || {
+            if let Ok(wire) = connected.recv() {
+                beat_on(&wire, beat, &whose);
+            }
+        };
+        match thread.spawn(beats) {
+            Ok(_) => {}
+            Err(error) if beat.is_none() => {
+                log::warn!(%error, "no thread says whether this application stalls; raise `ulimit -u`");
+            }
+            Err(error) => {
+                let why = format!("no thread gives its signs of life: {error}; raise `ulimit -u`");
+                return Err(io::Error::new(error.kind(), why));
             }
         }
-    };
-    std::thread::Builder::new().name("beat".to_owned()).spawn(beat_on).map(drop)
+        Ok(Self { wire, hosted })
+    }
+
+    /// The connection is there.
+    fn over(&self, wire: Arc<Wire>) {
+        // Not taken: there is no such thread.
+        let _ = self.wire.send(wire);
+    }
+
+    /// The application is there, as its factory has returned.
+    fn of(&self, app: AloneHandle) {
+        // Said once.
+        let _ = self.hosted.set(app);
+    }
+}
+
+fn beat_on(wire: &Wire, beat: Option<Duration>, hosted: &OnceLock<AloneHandle>) {
+    let (mut stalls, mut has_stalled) = (Stalls::default(), false);
+    loop {
+        std::thread::sleep(beat.map_or(STALLS_LOOKED_FOR, |beat| beat.min(STALLS_LOOKED_FOR)));
+        let turns = hosted.get().map(AloneHandle::turn).into_iter();
+        let since = stalls.look(Time::now(), turns).into_values().next();
+        if wire.has_said_all() && (beat.is_some() || since.is_some() || has_stalled) {
+            say_beat(wire, since);
+            has_stalled = since.is_some();
+        }
+    }
 }
 
 fn say_beat(wire: &Wire, stalled: Option<Time>) {

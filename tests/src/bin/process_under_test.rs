@@ -387,9 +387,7 @@ fn main() -> ExitCode {
     if swells.is_some() || starts_in.is_some() {
         drive = drive.start_within(time("--starts-within").unwrap_or(Duration::from_secs(1)));
     }
-    if let Some(time) = time("--turns-within") {
-        drive = drive.progress_within(time);
-    }
+    drive = time("--turns-within").into_iter().fold(drive, AppSpec::progress_within);
     drive = match after("--on-lost").as_deref() {
         None => drive,
         Some("pause") => drive.on_requirement_lost(RequirementPolicy::Pause),

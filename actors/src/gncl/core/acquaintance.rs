@@ -4,11 +4,7 @@ use std::{net::SocketAddr, time::Duration};
 
 use sinew_runtime::{tid::Incarnation, time::Time};
 
-use super::{
-    ConnectionId, Settings,
-    dials::{Dial, Reached},
-    sides::Side,
-};
+use super::{ConnectionId, Settings, dials::Dial, sides::Side};
 
 /// What is known of one peer.
 #[derive(Debug)]
@@ -27,8 +23,6 @@ pub(super) struct Acquaintance {
     pub(super) link: Option<Link>,
     /// Our dial on its way, if there is one.
     pub(super) dial: Option<Dial>,
-    /// Where that life was linked.
-    pub(super) reached: Reached,
     /// Which of its addresses is dialled first, modulo their number.
     pub(super) first: usize,
     /// Number of our last dial.
@@ -79,7 +73,7 @@ pub(super) struct Pulse {
 }
 
 impl Acquaintance {
-    pub(super) fn new(now: Time, incarnation: Incarnation, settings: &Settings) -> Self {
+    pub(super) const fn new(now: Time, incarnation: Incarnation, settings: &Settings) -> Self {
         Self {
             incarnation,
             met: now,
@@ -88,7 +82,6 @@ impl Acquaintance {
             wanted: None,
             link: None,
             dial: None,
-            reached: Reached::default(),
             first: 0,
             dial_number: 0,
             void_dial: 0,

@@ -80,9 +80,9 @@ impl Core {
         });
         let mut of_addresses: Vec<_> = of_addresses.collect();
         of_addresses.sort_unstable();
-        let mut before: BTreeMap<Option<IpAddr>, usize> = BTreeMap::new();
+        let mut before: BTreeMap<(bool, Option<IpAddr>), usize> = BTreeMap::new();
         let ranked = of_addresses.into_iter().map(|(_, Reverse(connection), from, is_expected)| {
-            let before = before.entry(from.map(network_of)).or_default();
+            let before = before.entry((is_expected, from.map(network_of))).or_default();
             *before += 1;
             (is_expected, Reverse(*before), connection)
         });
@@ -263,15 +263,9 @@ impl Core {
         let (node, incarnation) = (theirs.node, theirs.incarnation);
         let by_class = theirs.knows_classes() && self.settings.ours.knows_classes();
         let redial_min = self.settings.redial_min;
-        let from = self.connections.get(&connection).and_then(|known| known.from);
         let Some(peer) = self.peers.get_mut(&node) else { return };
         let ours = peer.dial.take().and_then(|dial| dial.address_of(connection));
         let (dial, dialled) = if welcome.is_some() { (theirs.dial, None) } else { (peer.dial_number, ours) };
-        match (dialled, from) {
-            (Some(at), _) => peer.reached.dialled(at),
-            (None, Some(ip)) => peer.reached.came_from(ip),
-            (None, None) => {}
-        }
         if self.settings.connections_prove && peer.found.is_some_and(|found| found != incarnation) {
             // NDL was told of a life that never connected; it will tell of this one.
             (peer.found, peer.wanted) = (None, None);

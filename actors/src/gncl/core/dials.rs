@@ -1,10 +1,6 @@
 //! A dial of ours to a peer: all addresses that it announced, one shortly after the other, until one is reached. spec: GNCL-16
 
-use std::{
-    collections::VecDeque,
-    net::{IpAddr, SocketAddr},
-    time::Duration,
-};
+use std::{collections::VecDeque, net::SocketAddr, time::Duration};
 
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
@@ -14,8 +10,10 @@ use super::{ConnectionId, Core, Lane, LinkFact, Output, Stage};
 /// before a dial short enough that no requirement is lost over it (50 ms). RFC 8305 has no less than 10 ms.
 pub(super) const STAGGER: Duration = Duration::from_millis(20);
 
-/// Addresses of a peer that are dialled at once, at most; a further one when one of them has failed.
-pub(super) const AT_ONCE_MAX: usize = 8;
+/// The same where so many say nothing that a further one hardly will: the last one of as many as a node can announce (23, NDL-3.5) is dialled
+/// 0.9 s after the first, before the time is over in which a link may be made again (NDL-4.3).
+pub(super) const LATER: Duration = Duration::from_millis(50);
+pub(super) const SILENT: usize = 8;
 
 /// A dial on its way.
 #[derive(Debug)]
@@ -24,51 +22,10 @@ pub(super) struct Dial {
     attempts: Vec<(ConnectionId, SocketAddr)>,
     /// Addresses that were not dialled yet, the next one first.
     untried: VecDeque<SocketAddr>,
-    /// When the next one is dialled, if nobody answers before, or behind the last one what the others have not answered is told;
-    /// [`Time::MAX`] if neither.
+    /// When the next one is dialled, if nobody answers before; [`Time::MAX`] if there is none.
     pub(super) next_at: Time,
-    /// Where the peer's host has said that nobody listens.
-    refused: Vec<SocketAddr>,
-    /// It said so at each address so far.
+    /// At each address so far the peer's host has said that nobody listens there.
     is_refused: bool,
-}
-
-/// Where one life of a peer was linked, since this instance of the layer knows it.
-#[derive(Debug, Default)]
-pub(super) struct Reached(Vec<SocketAddr>);
-
-/// Where more were reached, nothing is concluded from them.
-const REACHED_MAX: usize = 32;
-
-impl Reached {
-    /// Our dial led to it at this address.
-    pub(super) fn dialled(&mut self, at: SocketAddr) {
-        if self.0.len() < REACHED_MAX && !self.0.contains(&at) {
-            self.0.push(at);
-        }
-    }
-
-    /// Its own dial came from there; where it listens there it did not say.
-    pub(super) fn came_from(&mut self, ip: IpAddr) {
-        self.dialled((ip, 0).into());
-    }
-
-    /// Whether it was linked, and nowhere else than where its host refuses now. One that came from a link-local address may have done so on
-    /// any link.
-    fn is_refused(&self, refused: &[SocketAddr]) -> bool {
-        let is_refused = |at: &SocketAddr| {
-            let came_from = |by: &SocketAddr| at.port() == 0 && by.ip() == at.ip() && !is_link_local(at.ip());
-            refused.iter().any(|by| by == at || came_from(by))
-        };
-        !self.0.is_empty() && self.0.len() < REACHED_MAX && self.0.iter().all(is_refused)
-    }
-}
-
-const fn is_link_local(ip: IpAddr) -> bool {
-    match ip {
-        IpAddr::V4(_) => false,
-        IpAddr::V6(ip) => ip.is_unicast_link_local(),
-    }
 }
 
 impl Dial {
@@ -76,7 +33,7 @@ impl Dial {
     fn to(addresses: &[SocketAddr], first: usize) -> Self {
         let mut untried: VecDeque<_> = addresses.iter().copied().collect();
         untried.rotate_left(first % addresses.len().max(1));
-        Self { attempts: Vec::new(), untried, next_at: Time::MAX, refused: Vec::new(), is_refused: true }
+        Self { attempts: Vec::new(), untried, next_at: Time::MAX, is_refused: true }
     }
 
     /// The address at which this connection was made.
@@ -104,14 +61,10 @@ impl Core {
     pub(super) fn attempt(&mut self, now: Time, node: NodeAddress) {
         let connection = self.open();
         let Some(dial) = self.peers.get_mut(&node).and_then(|peer| peer.dial.as_mut()) else { return };
-        let Some(address) = dial.untried.pop_front() else {
-            dial.next_at = Time::MAX;
-            return self.tell_who_refused(node);
-        };
+        let Some(address) = dial.untried.pop_front() else { return };
         dial.attempts.push((connection, address));
-        let is_full = !dial.untried.is_empty() && dial.attempts.len() >= AT_ONCE_MAX;
-        let is_alone = dial.untried.is_empty() && dial.attempts.len() == 1 && dial.refused.is_empty();
-        dial.next_at = if is_full || is_alone { Time::MAX } else { now + STAGGER };
+        let stagger = if dial.attempts.len() < SILENT { STAGGER } else { LATER };
+        dial.next_at = if dial.untried.is_empty() { Time::MAX } else { now + stagger };
         self.stage_for_handshake(now, connection, Stage::Dialling(node, Lane::Control));
         self.outputs.push_back(Output::Dial { connection, address });
     }
@@ -131,32 +84,16 @@ impl Core {
         let Some(peer) = self.peers.get_mut(&node) else { return };
         let incarnation = peer.incarnation;
         let Some(dial) = peer.dial.as_mut() else { return };
-        dial.refused.extend(dial.address_of(failed).filter(|_| refused));
         dial.attempts.retain(|(attempt, _)| *attempt != failed);
         dial.is_refused &= refused;
         if !dial.untried.is_empty() {
             return self.attempt(now, node);
         }
-        let is_over = dial.attempts.is_empty();
-        if is_over && dial.is_refused {
-            self.fact(LinkFact::DialRefused { node, incarnation });
-        } else if is_over || dial.next_at == Time::MAX {
-            self.tell_who_refused(node);
-        }
-        if is_over {
+        if dial.attempts.is_empty() {
+            if dial.is_refused {
+                self.fact(LinkFact::DialRefused { node, incarnation });
+            }
             self.dial_over(now, node);
-        }
-    }
-
-    /// All addresses were dialled, and had their time: where the host refuses wherever this life of the peer was ever linked, what is said
-    /// elsewhere, or is not said because packets are thrown away there, is no reason to wait. Whether it is lost by that says NDL, which
-    /// knows where else it is heard. spec: GNCL-16
-    fn tell_who_refused(&mut self, node: NodeAddress) {
-        let Some(peer) = self.peers.get(&node) else { return };
-        let Some(dial) = &peer.dial else { return };
-        if peer.reached.is_refused(&dial.refused) {
-            let (incarnation, at) = (peer.incarnation, dial.refused.clone());
-            self.outputs.push_back(Output::RefusedWhereLinked { node, incarnation, at });
         }
     }
 

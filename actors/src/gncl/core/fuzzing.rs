@@ -230,7 +230,6 @@ impl Play<'_> {
                 | Output::SendGoodbye(_)
                 | Output::Forget(_)
                 | Output::Fact(_)
-                | Output::RefusedWhereLinked { .. }
                 | Output::Count { .. } => {}
             }
         }

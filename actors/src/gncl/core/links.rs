@@ -10,7 +10,6 @@ use sinew_runtime::{
 use super::{
     ConnectionId, Core, Lane, LinkFact, Output, Stage,
     acquaintance::{Acquaintance, Lost, Pulse},
-    dials::Reached,
 };
 
 impl Core {
@@ -133,7 +132,7 @@ impl Core {
         }
         if let Some(peer) = self.peers.get_mut(&node) {
             peer.incarnation = incarnation;
-            (peer.met, peer.was_linked, peer.reached) = (now, false, Reached::default());
+            (peer.met, peer.was_linked) = (now, false);
             if peer.is_lost(incarnation) {
                 // What was lost was never linked, and is no bar to a life that is there.
                 peer.lost = None;

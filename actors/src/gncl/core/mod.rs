@@ -148,8 +148,6 @@ pub(super) enum Output {
     Forget(NodeAddress),
     /// Tell the other layers.
     Fact(LinkFact),
-    /// Tell NDL: the peer's host refuses our dial at these addresses, among which is each one where this life of it was linked.
-    RefusedWhereLinked { node: NodeAddress, incarnation: Incarnation, at: Vec<SocketAddr> },
     /// Count a refusal, ours or the peer's.
     Count { cause: &'static str, detail: String },
 }

@@ -211,7 +211,7 @@ impl Node {
     pub(super) async fn fact(&mut self) -> LinkFact {
         match next("a fact about a link", &mut self.facts).await {
             ndl::Event::Link(fact) => fact,
-            other @ (ndl::Event::RefusedWhereLinked { .. } | ndl::Event::App(_)) => panic!("{other:?}"),
+            ndl::Event::App(fact) => panic!("GNCL told NDL of an application: {fact:?}"),
         }
     }
 

@@ -87,8 +87,6 @@ pub(crate) enum Input {
     MdnsResolved { address: SocketAddr },
     /// A connection of GNCL changed.
     Link(LinkFact),
-    /// The host of a node refuses connections at these addresses, among which is each one where GNCL had one with this life of it.
-    RefusedWhereLinked { node: NodeAddress, incarnation: Incarnation, at: Vec<SocketAddr> },
     /// The host of a node that missed answers was tried, as [`Output::Probe`] asked.
     Probed { node: NodeAddress, incarnation: Incarnation, host: Host },
     /// GNCL read something of this life of a node at that time; of those [in doubt](Core::in_doubt).
@@ -380,9 +378,6 @@ impl Core {
             }
             Input::MdnsResolved { address } => self.resolved(now, address),
             Input::Link(fact) => self.linked(now, fact),
-            Input::RefusedWhereLinked { node, incarnation, at } => {
-                self.refused(now, node, incarnation, &at);
-            }
             Input::Probed { node, incarnation, host } => self.probed(node, incarnation, host),
             Input::SignSeen { node, incarnation, at } => self.sign_seen(now, node, incarnation, at),
             Input::TimePassed => self.time_passed(now),

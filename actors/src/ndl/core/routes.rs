@@ -10,18 +10,14 @@ use std::{
     time::Duration,
 };
 
-use sinew_runtime::{
-    tid::{Incarnation, NodeAddress},
-    time::Time,
-};
+use sinew_runtime::{tid::NodeAddress, time::Time};
 
 use super::{
     Core, Member, Output,
     contact::{Contact, Role},
 };
 use crate::ndl::{
-    LossReason,
-    address::{is_link_local, is_same_host, seen_from},
+    address::{is_link_local, seen_from},
     datagram::{Announcement, PATHS_MAX},
 };
 
@@ -235,16 +231,6 @@ impl Member {
         self.routes.is_only(place) || self.routes.has(place) && self.announces(place)
     }
 
-    /// Whether each way on which its NDL may be heard was tried, and each one on which it was is a route: there are not more than are asked
-    /// at once, nor than are kept.
-    pub(super) fn is_known_on_all_ways(&self, paths: &[SocketAddr]) -> bool {
-        let ways = self.announcement.ndl_addresses().flat_map(|there| {
-            let place = move |here: &SocketAddr| Place::between(*here, there);
-            paths.iter().map(place).filter(Place::is_a_way)
-        });
-        ways.count() <= SOUGHT_MAX && !self.routes.is_full() && self.routes.iter().next().is_some()
-    }
-
     /// Whether a place where its life answers becomes a route to it. // spec: NDL-3.3
     fn is_led_to(&self, place: Place) -> bool {
         self.announces(place) && self.routes.makes_way(place) != MakesWay::Not
@@ -314,27 +300,6 @@ impl Core {
                 let contact = self.contacts.entry(place).or_insert_with(|| Contact::seed(now));
                 contact.is_seed = true;
             }
-        }
-    }
-
-    /// Its host refuses connections where it was linked, and nothing is known of its other addresses but that they do not answer: it is lost
-    /// as if they refused, unless its NDL was heard at one of them or may be. Where it was heard it may live. // spec: NDL-4.3
-    pub(super) fn refused(
-        &mut self,
-        now: Time,
-        node: NodeAddress,
-        incarnation: Incarnation,
-        at: &[SocketAddr],
-    ) {
-        let paths = &self.paths;
-        let is_gone = self.members.get(&node).is_some_and(|member| {
-            member.announcement.incarnation == incarnation
-                && member.is_link_broken
-                && member.is_known_on_all_ways(paths)
-                && member.routes.places().all(|place| at.iter().any(|at| is_same_host(*at, place.there)))
-        });
-        if is_gone {
-            self.lose(now, node, LossReason::Crashed);
         }
     }
 

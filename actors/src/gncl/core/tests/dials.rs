@@ -1,7 +1,7 @@
 //! Peers that announce several addresses.
 
 use super::*;
-use crate::gncl::core::dials::{AT_ONCE_MAX, STAGGER};
+use crate::gncl::core::dials::{LATER, SILENT, STAGGER};
 
 /// The n-th address of the peer.
 fn at(number: u16) -> SocketAddr {
@@ -105,140 +105,26 @@ fn an_address_that_fails_has_the_next_one_dialled_at_once_and_a_refusal_is_told_
     }
 }
 
-/// Where the host refuses, as NDL is told before all addresses have said something.
-fn refused_in(outputs: &[Output]) -> Option<Vec<SocketAddr>> {
-    outputs.iter().find_map(|output| {
-        let Output::RefusedWhereLinked { node: HIGH, incarnation: Incarnation(1), at } = output else {
-            return None;
-        };
-        Some(at.clone())
-    })
-}
-
-/// A core whose link to a peer with so many addresses, dialled at the n-th one, has just broken.
-fn broken_at(number: u16, count: u16) -> Core {
-    let mut core = finding(count);
-    for _ in 0..number {
-        next_dial(&mut core);
-        wait(&mut core);
-    }
-    let (connection, to) = next_dial(&mut core);
-    assert_eq!(to, at(number));
-    core.handle(millis(90), Input::Connected(connection));
-    let (_, hello) = hello_in(&outputs(&mut core));
-    core.handle(millis(90), Input::WelcomeReceived(connection, welcome_for(&hello)));
-    core.handle(millis(91), Input::Ended(connection));
-    outputs(&mut core);
-    wait(&mut core);
-    core
-}
-
 // spec: GNCL-16
 #[test]
-fn a_refusal_where_the_peer_was_linked_is_told_when_the_other_addresses_say_nothing() {
-    // Given a peer that was linked at its first address
-    let mut core = broken_at(0, 3);
-    let (first, _) = next_dial(&mut core);
-    // When that one refuses, and the others say nothing
-    core.handle(millis(120), Input::DialFailed { connection: first, refused: true });
-    next_dial(&mut core);
-    wait(&mut core);
-    let out = outputs(&mut core);
-    assert_eq!((dialled(&out).len(), refused_in(&out)), (1, None), "the last one has its time, too");
-    wait(&mut core);
+fn of_many_addresses_that_say_nothing_the_last_is_dialled_within_a_second() {
+    // Given: as many as a node can announce.
+    let mut core = finding(23);
+    let (_, to) = next_dial(&mut core);
+    assert_eq!(to, at(0));
+    // When
+    let mut gaps = Vec::new();
+    let mut before = millis(0);
+    for number in 1..23 {
+        let now = wait(&mut core);
+        assert_eq!(next_dial(&mut core).1, at(number));
+        gaps.push(now.since(before));
+        before = now;
+    }
     // Then
-    let out = outputs(&mut core);
-    assert_eq!(refused_in(&out), Some(vec![at(0)]));
-    assert!(!has_refusal(&out), "nobody says that all of them refuse");
-}
-
-#[test]
-fn a_refusal_somewhere_is_not_told_while_an_address_where_the_peer_was_linked_has_not_refused() {
-    // Given a peer that was linked at its second address
-    let mut core = broken_at(1, 3);
-    let (first, _) = next_dial(&mut core);
-    core.handle(millis(120), Input::DialFailed { connection: first, refused: true });
-    let (second, _) = next_dial(&mut core);
-    // When that one says nothing
-    wait(&mut core);
-    let (third, _) = next_dial(&mut core);
-    wait(&mut core);
-    assert_eq!(refused_in(&outputs(&mut core)), None);
-    // When another one cannot be reached at all
-    core.handle(millis(170), Input::DialFailed { connection: third, refused: false });
-    assert_eq!(refused_in(&outputs(&mut core)), None);
-    // When it refuses too
-    core.handle(millis(180), Input::DialFailed { connection: second, refused: true });
-    let out = outputs(&mut core);
-    assert_eq!((refused_in(&out), has_refusal(&out)), (Some(vec![at(0), at(1)]), false));
-}
-
-#[test]
-fn a_peer_that_dialled_itself_was_where_it_came_from_and_another_life_of_it_was_nowhere() {
-    // By `from` the peer was linked when it broke; then its first address refuses, and its second one cannot be reached.
-    let refused_after = |from: &[[u8; 4]], life: u64| {
-        let mut core = finding(2);
-        let mut dials = dialled(&outputs(&mut core));
-        for (number, from) in from.iter().enumerate() {
-            let connection = core.open();
-            core.handle(millis(1), Input::Accepted(connection, (*from).into()));
-            let hello = hello_from(HIGH, 1, number as u64 + 1);
-            core.handle(millis(1), Input::HelloReceived(connection, hello));
-            core.handle(millis(2), Input::Ended(connection));
-        }
-        if life > 1 {
-            let addresses = vec![at(0), at(1)];
-            let incarnation = Incarnation(life);
-            core.handle(millis(3), Input::NodeFound { node: HIGH, incarnation, addresses });
-        }
-        if !from.is_empty() {
-            // Its own dial took the place of that one.
-            dials = dialled(&outputs(&mut core));
-        }
-        while dials.is_empty() {
-            wait(&mut core);
-            dials = dialled(&outputs(&mut core));
-        }
-        core.handle(millis(20), Input::DialFailed { connection: dials[0].0, refused: true });
-        let (second, _) = next_dial(&mut core);
-        core.handle(millis(21), Input::DialFailed { connection: second, refused: false });
-        outputs(&mut core).iter().any(|output| matches!(output, Output::RefusedWhereLinked { .. }))
-    };
-    assert!(refused_after(&[[127, 0, 0, 1]], 1));
-    assert!(!refused_after(&[[127, 0, 0, 1], [10, 0, 0, 9]], 1), "where it was, too, and may listen");
-    assert!(!refused_after(&[], 1), "it was never linked");
-    assert!(!refused_after(&[[127, 0, 0, 1]], 2), "that was the former life");
-}
-
-// spec: GNCL-16
-#[test]
-fn of_many_addresses_that_say_nothing_a_few_are_dialled_at_once_and_the_others_in_their_turn() {
-    // Given
-    let many = 2 * AT_ONCE_MAX as u16 + 3;
-    let mut core = finding(many);
-    let (mut first, mut under_way) = (Vec::new(), AT_ONCE_MAX);
-    for number in 0..AT_ONCE_MAX as u16 {
-        let (connection, to) = next_dial(&mut core);
-        assert_eq!(to, at(number));
-        first.push(connection);
-        if usize::from(number) + 1 < AT_ONCE_MAX {
-            wait(&mut core);
-        }
-    }
-    // When one fails, then the next one is dialled in its place.
-    core.handle(millis(500), Input::DialFailed { connection: first[3], refused: false });
-    assert_eq!(next_dial(&mut core).1, at(AT_ONCE_MAX as u16));
-    // When the others have had their time, then as many others have theirs.
-    let mut dialled_in_all = AT_ONCE_MAX + 1;
-    while core.next_wake().is_some() && dialled_in_all < usize::from(many) {
-        wait(&mut core);
-        let out = outputs(&mut core);
-        let closed = out.iter().filter(|output| matches!(output, Output::Close(_))).count();
-        dialled_in_all += dialled(&out).len();
-        under_way = under_way + dialled(&out).len() - closed;
-        assert!(under_way <= AT_ONCE_MAX, "{out:?}");
-    }
-    assert_eq!(dialled_in_all, usize::from(many));
+    let (quick, later) = gaps.split_at(SILENT - 1);
+    assert!(quick.iter().all(|gap| *gap == STAGGER) && later.iter().all(|gap| *gap == LATER), "{gaps:?}");
+    assert!(before.since(millis(0)) < Duration::from_secs(1));
 }
 
 #[test]

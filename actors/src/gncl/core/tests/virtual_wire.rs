@@ -308,11 +308,7 @@ impl World {
             Output::SendPing(_, lane) => self.send_on_link(node, lane, Parcel::Ping),
             Output::SendPong(_, lane) => self.send_on_link(node, lane, Parcel::Pong),
             Output::Fact(fact) => self.nodes[node].facts.push(fact),
-            Output::Detach { .. }
-            | Output::RefusedWhereLinked { .. }
-            | Output::SendGoodbye(_)
-            | Output::Forget(_)
-            | Output::Count { .. } => {}
+            Output::Detach { .. } | Output::SendGoodbye(_) | Output::Forget(_) | Output::Count { .. } => {}
         }
     }
 

@@ -42,7 +42,7 @@ fn any_input() -> impl Strategy<Value = (u64, Input)> {
             ndl,
             ..stranger(address)
         });
-    let input = (place(), announcement, 0..9, any::<bool>()).prop_map(|(from, announcement, what, flag)| {
+    let input = (place(), announcement, 0..7, any::<bool>()).prop_map(|(from, announcement, what, flag)| {
         let Announcement { node, incarnation, .. } = announcement;
         match what {
             0 => {
@@ -62,7 +62,6 @@ fn any_input() -> impl Strategy<Value = (u64, Input)> {
             4 => Input::MdnsResolved { address: from.there },
             5 if flag => Input::Link(LinkFact::LinkBroken { node, incarnation }),
             5 => Input::Link(LinkFact::DialRefused { node, incarnation }),
-            7 => Input::RefusedWhereLinked { node, incarnation, at: vec![from.there] },
             6 if flag => Input::SignSeen { node, incarnation, at: Time::from_nanos(1) },
             _ => Input::TimePassed,
         }

@@ -8,13 +8,10 @@ use super::{
     scenarios::stranger,
     world::{PERIOD, Spec, ms, node},
 };
-use crate::{
-    gncl::LinkFact,
-    ndl::{
-        LossReason, MembershipFact,
-        core::{Core, Input, Output, Place, Query, Way},
-        datagram::{Announcement, Answer, Claim},
-    },
+use crate::ndl::{
+    LossReason, MembershipFact,
+    core::{Core, Input, Output, Place, Query, Way},
+    datagram::{Announcement, Answer, Claim},
 };
 
 /// The networks that both nodes are in; a third one is of whoever means no good.
@@ -152,19 +149,6 @@ fn member() -> Announcement {
     Announcement { ndl, incarnation: Incarnation(5), ..stranger(2) }
 }
 
-/// The member's host refuses connections at these addresses of its GNCL; the link broke before.
-fn refuse(bench: &mut Bench, at: &[SocketAddr]) -> bool {
-    let (node, incarnation) = (node(2), Incarnation(5));
-    let at = at.to_vec();
-    bench.core.handle(bench.now, Input::RefusedWhereLinked { node, incarnation, at });
-    bench.drain();
-    bench.life().is_none()
-}
-
-fn broken() -> Input {
-    Input::Link(LinkFact::LinkBroken { node: node(2), incarnation: Incarnation(5) })
-}
-
 /// Where its GNCL listens in one network.
 fn gncl(network: u8) -> SocketAddr {
     ([10, network, 0, 2], 5_002).into()
@@ -194,57 +178,6 @@ fn the_host_of_a_silent_member_is_tried_at_a_few_of_its_addresses_first_where_it
     assert_eq!((probed.len(), probed[0]), (8, gncl(0)), "{probed:?}");
     let of_ipv6 = probed.iter().filter(|at| at.is_ipv6()).count();
     assert!((3..=4).contains(&of_ipv6), "both families: {probed:?}");
-}
-
-// spec: NDL-4.3
-#[test]
-fn a_member_whose_host_refuses_wherever_it_was_heard_has_crashed_whatever_it_says_elsewhere() {
-    // Given a member that was heard in one network, and announces an address in another one as well
-    let mut bench = Bench::new();
-    bench.answer(way(0), member());
-    bench.facts.clear();
-    // Then what is refused before its link broke is nothing new, and neither is what is of another life.
-    assert!(!refuse(&mut bench, &[gncl(0)]));
-    bench.core.handle(bench.now, broken());
-    let (node, at) = (node(2), vec![gncl(0)]);
-    bench.core.handle(bench.now, Input::RefusedWhereLinked { node, incarnation: Incarnation(4), at });
-    assert!(bench.life().is_some());
-    assert!(!refuse(&mut bench, &[gncl(1)]), "it was heard elsewhere");
-    assert!(refuse(&mut bench, &[gncl(0)]));
-    let lost = MembershipFact::NodeLost { node, incarnation: Incarnation(5), why: LossReason::Crashed };
-    assert_eq!(bench.facts, [lost]);
-}
-
-// spec: NDL-4.3
-#[test]
-fn a_member_that_was_heard_where_its_host_has_not_refused_is_not_lost_by_a_refusal() {
-    let mut bench = Bench::of_two_ways();
-    bench.core.handle(bench.now, broken());
-    for network in NETWORKS {
-        assert!(!refuse(&mut bench, &[gncl(network)]), "it may live at the other one");
-    }
-    // Though it has missed an answer there.
-    bench.pass(PERIOD + PERIOD / 2);
-    bench.answer(way(0), member());
-    assert!(!refuse(&mut bench, &[gncl(0)]));
-    assert!(refuse(&mut bench, &NETWORKS.map(gncl)));
-}
-
-// spec: NDL-4.3
-#[test]
-fn a_member_that_may_be_heard_in_more_ways_than_are_asked_at_once_is_not_lost_by_a_refusal() {
-    let mut bench = Bench::new();
-    let ndl = (0..8).map(|host| (u32::from_be_bytes([10, 0, 0, 2 + host]), 7_400)).collect();
-    let announcement = Announcement { ndl, ..member() };
-    bench.answer(way(0), announcement);
-    let paths: Vec<_> = (1..=3).map(|host| at(0, host + 100)).chain([way(0).here]).collect();
-    bench.core.use_paths(bench.now, &paths);
-    bench.drain();
-    bench.core.handle(bench.now, broken());
-    assert_eq!(bench.routes(), [way(0)]);
-    assert!(!refuse(&mut bench, &[gncl(0)]));
-    bench.core.use_paths(bench.now, &paths[2..]);
-    assert!(refuse(&mut bench, &[gncl(0)]), "now there are sixteen");
 }
 
 fn later_life() -> Announcement {
