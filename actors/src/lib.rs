@@ -34,6 +34,7 @@ mod access;
 mod aftermath;
 pub mod api;
 pub mod audit;
+mod clocks;
 pub mod config;
 
 #[cfg(test)]
@@ -76,6 +77,7 @@ pub use api::{
     Registration, Transport, Untaken,
 };
 pub use audit::{Audit, NodeAudit};
+pub use clocks::{ClockDrift, ClockOffset};
 pub use config::{ConfigFaults, NodeConfig};
 pub use lncl::RegisterError;
 pub use ndl::{KnownNode, KnownRoute, LossReason, NodeEvent, Source, Trouble, TroubledApp};
@@ -102,7 +104,6 @@ pub use sinew_runtime::{
     wire::{Class, Kind, MessageBuffer, Payload},
 };
 pub use sinew_shm::Spin;
-pub use stores::ClockOffset;
 pub use sync::{
     ArriveAtBarrier, BarrierAnswer, BarrierKind, BarrierStatus, DirectoryEntry, DirectoryEvent, LeaveBarrier,
     OnPartyLoss, Waiting,

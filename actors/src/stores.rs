@@ -1,13 +1,11 @@
 //! State that outlives every layer: owned by the node's root, lent to each new instance of a layer.
 
 use std::{
-    collections::BTreeMap,
     hash::{BuildHasher, RandomState},
     net::{SocketAddr, SocketAddrV4},
     os::unix::net::UnixListener,
     path::Path,
     sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, atomic::AtomicBool},
-    time::Duration,
 };
 
 use sinew_runtime::{
@@ -18,8 +16,8 @@ use sinew_runtime::{
 use tokio::sync::watch;
 
 use crate::{
-    access::Access, aftermath::Aftermath, audit, config::NodeConfig, gncl, lncl, monitors, ndl, node,
-    refusals::Refusals, secured::Secured, sync, wills,
+    access::Access, aftermath::Aftermath, audit, clocks::ClockOffsets, config::NodeConfig, gncl, lncl,
+    monitors, ndl, node, refusals::Refusals, secured::Secured, sync, wills,
 };
 
 /// What the layers of one node share.
@@ -179,34 +177,4 @@ pub(crate) struct Posts {
     pub(crate) sync: Post<sync::Event>,
     pub(crate) gncl: Post<gncl::Event>,
     pub(crate) ndl: Post<ndl::Event>,
-}
-
-/// The offsets of the peers' clocks against ours.
-#[derive(Debug, Default)]
-pub(crate) struct ClockOffsets(Mutex<BTreeMap<NodeAddress, ClockOffset>>);
-
-/// How far a peer's monotonic clock is from ours.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct ClockOffset {
-    /// Their clock minus ours, in nanoseconds.
-    pub theirs_minus_ours_ns: i64,
-    /// The error is at most this: half the round trip of the best sample.
-    pub bound: Duration,
-}
-
-impl ClockOffsets {
-    /// The offset of `node`, if it was ever measured.
-    pub(crate) fn get(&self, node: NodeAddress) -> Option<ClockOffset> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).get(&node).copied()
-    }
-
-    /// Replaces the offset of `node`.
-    pub(crate) fn set(&self, node: NodeAddress, offset: ClockOffset) {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).insert(node, offset);
-    }
-
-    /// Forgets `node`.
-    pub(crate) fn forget(&self, node: NodeAddress) {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).remove(&node);
-    }
 }

@@ -88,6 +88,15 @@ impl<'a> Row<'a> {
         format!("{:+.1} us +- {:.1} us", offset as f64 / 1e3, bound as f64 / 1e3)
     }
 
+    /// How fast its clock leaves that of the node through which we came.
+    fn drift(&self) -> String {
+        let drift = self.seen.and_then(|seen| seen.drift_ppb.zip(seen.drift_bound_ppb));
+        or_dash(
+            drift
+                .map(|(ppb, bound)| format!("{:+.1} ppm +- {:.1} ppm", ppb as f64 / 1e3, bound as f64 / 1e3)),
+        )
+    }
+
     fn found_by(&self) -> String {
         or_dash(self.seen.map(|seen| seen.found_by.join(", ")).filter(|words| !words.is_empty()))
     }
@@ -108,6 +117,7 @@ impl<'a> Row<'a> {
             or_dash(self.seen.and_then(|seen| seen.bound_us).map(time)),
             or_dash(self.seen.and_then(|seen| seen.round_trip_ns).map(|ns| time(ns / 1_000))),
             self.clock(),
+            self.drift(),
         ]
     }
 
@@ -137,6 +147,8 @@ impl<'a> Row<'a> {
             "round_trip_ns": seen.and_then(|seen| seen.round_trip_ns),
             "clock_offset_ns": seen.and_then(|seen| seen.offset_ns),
             "clock_offset_bound_ns": seen.and_then(|seen| seen.offset_bound_ns),
+            "clock_drift_ppb": seen.and_then(|seen| seen.drift_ppb),
+            "clock_drift_bound_ppb": seen.and_then(|seen| seen.drift_bound_ppb),
             "links": seen.map(|seen| seen.links.iter().map(link_json).collect::<Vec<_>>()),
         })
     }
@@ -179,6 +191,7 @@ fn lost_cells(lost: &LostReport) -> [String; COLUMNS] {
         dash(),
         dash(),
         or_dash(lost.bound_us.map(time)),
+        dash(),
         dash(),
         dash(),
     ]
@@ -226,6 +239,7 @@ fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport]) -> String {
         "LOST WITHIN",
         "ROUND TRIP",
         "CLOCK",
+        "DRIFT",
     ];
     let mut table = Table::new(heading);
     rows.iter().for_each(|row| table.row(row.cells()));

@@ -178,7 +178,7 @@ impl Screen {
             kind(message),
             format!("{:?}{wants}", message.class),
             self.names.get(&other).cloned().unwrap_or_else(|| other.to_string()),
-            time(message.age_ns / 1_000),
+            age(message),
             payload(message),
         );
         say(&clean(&line))
@@ -190,7 +190,7 @@ impl Screen {
             "class": format!("{:?}", message.class).to_lowercase(), "wants": message.wants,
             "source": message.source.to_string(), "source_name": self.names.get(&message.source),
             "target": message.target.to_string(), "target_name": self.names.get(&message.target),
-            "sequence": message.sequence, "age_ns": message.age_ns, "bytes": message.length,
+            "sequence": message.sequence, "age_ns": message.age_error_ns.map(|_| message.age_ns), "age_error_ns": message.age_error_ns, "bytes": message.length,
             "refused": message.refused.map(|refused| format!("{refused:?}")),
             "payload": is_whole(message).then(|| messagepack::shown_or_raw(&message.payload)),
         })
@@ -203,6 +203,11 @@ impl Screen {
 
 fn kind(message: &SeenMessage) -> String {
     message.name.clone().unwrap_or_else(|| message.kind.to_string())
+}
+
+/// How old a message was; nothing is said of what came from a node whose clock nobody has measured.
+fn age(message: &SeenMessage) -> String {
+    message.age_error_ns.map_or_else(|| "?".to_owned(), |_| time(message.age_ns / 1_000))
 }
 
 const fn is_whole(message: &SeenMessage) -> bool {

@@ -49,7 +49,8 @@ impl Handler<Delivery<Word>> for Oracle {
     type Result = ();
 
     fn handle(&mut self, word: Delivery<Word>, _: &mut Self::Context) {
-        assert!(word.age < DEADLINE, "{:?}", word.age);
+        // The first one may come before anybody here has measured the other's clock.
+        assert!(word.age_error().is_none() || word.age < DEADLINE, "{:?}", word.age);
         self.0.send(word.payload.text).expect("the test listens");
     }
 }

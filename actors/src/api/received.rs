@@ -56,16 +56,24 @@ impl Received {
         self.message.header.sequence
     }
 
-    /// When it was sent, in this host's clock.
+    /// When it was sent, in this host's clock; [`Time::ZERO`] where that is not known ([`age_error`](Self::age_error)).
     #[must_use]
     pub const fn sent(&self) -> Time {
-        self.message.header.sent
+        self.message.header.known_sent()
     }
 
-    /// Time from sending to `now`.
+    /// Time from sending to `now`, as wrong as [`age_error`](Self::age_error) says. Where it is not known it is 584 years, so that no limit
+    /// takes what may be old for fresh.
     #[must_use]
     pub const fn age(&self, now: Time) -> Duration {
-        now.since(self.message.header.sent)
+        self.message.header.known_age(now)
+    }
+
+    /// The error of the age at most: zero for what was sent on this host; `None` where the age is not known, because the clock of the
+    /// sender's host was not measured yet, or not for so long that it may be wrong by more than 32 s.
+    #[must_use]
+    pub const fn age_error(&self) -> Option<Duration> {
+        self.message.header.sent_error()
     }
 
     /// Whether the sender waits for a [`reply`](super::Endpoint::reply).

@@ -8,7 +8,7 @@ use sinew_runtime::{
     tid::{AppAddress, NodeAddress},
     time::Time,
     wakes,
-    wire::{Checksum, Class, Flags, Kind, Message},
+    wire::{Checksum, Class, Flags, Header, Kind, Message},
 };
 
 use super::{
@@ -178,7 +178,7 @@ impl Inbound {
             message.reject(Rejection::Unsupported);
             return Some(End::Refused);
         }
-        message.header.sent = self.in_our_clock(now, header.sent);
+        self.into_our_clock(now, &mut message.header);
         if message.header.is_expired(now) {
             message.settle(Outcome::Expired);
             return Some(End::Expired);
@@ -234,12 +234,16 @@ impl Inbound {
         }
     }
 
-    /// The peer's time in our clock; never later than `now`.
+    /// The time at which the peer sent it, in our clock; never later than `now`. And how wrong that may be: more, the longer NDL has not heard
+    /// of the peer.
     ///
-    /// As long as nobody has measured the peer's clock, a message counts as sent when it came.
-    fn in_our_clock(&self, now: Time, sent: Time) -> Time {
-        let offset = self.stores.clocks.get(self.peer.node);
-        offset.map_or(now, |offset| sent.shifted(offset.theirs_minus_ours_ns.saturating_neg()).min(now))
+    /// As long as nobody has measured the peer's clock, its time to live counts from `now`, and whoever gets it is told that its age is not
+    /// known.
+    fn into_our_clock(&self, now: Time, header: &mut Header) {
+        let measured = self.stores.clocks.get(self.peer.node);
+        let times = measured.map(|clock| clock.in_our_clock(now, header.sent));
+        header.sent = times.map_or(now, |(sent, _)| sent);
+        header.set_sent_error(times.map(|(_, error)| error));
     }
 
     /// spec: GNCL-12

@@ -263,6 +263,8 @@ fn peer_report(known: &KnownNode, now: Time) -> PeerReport {
         round_trip_ns: known.round_trip.map(nanos),
         offset_ns: known.offset.map(|offset| offset.theirs_minus_ours_ns),
         offset_bound_ns: known.offset.map(|offset| nanos(offset.bound)),
+        drift_ppb: known.offset.map(|offset| offset.drift.ppb),
+        drift_bound_ppb: known.offset.map(|offset| offset.drift.bound_ppb),
         ..PeerReport::lost(known.node, known.incarnation)
     }
 }
@@ -328,7 +330,8 @@ fn seen_message(now: Time, sight: Sight, name: Option<String>) -> SeenMessage {
     let wants = wants.into_iter().find(|(flag, _)| header.flags.has(*flag));
     SeenMessage {
         seen_us: micros(now.since(at)),
-        age_ns: nanos(at.since(header.sent)),
+        age_ns: nanos(header.known_age(at)),
+        age_error_ns: header.sent_error().map(nanos),
         is_sent: way == Way::Out,
         source: header.source,
         target: header.destination,

@@ -37,6 +37,7 @@
 //! | NDL-5.7 | Who goes second gives up `missed_max` periods after it hears of the first; who was frozen or alone settles anew. |
 //! | NDL-5.8 | Where nodes have keys, no datagram ends a life that has proven itself on a connection which stands. |
 //! | NDL-6 | Each answer measures the peer's clock; the smallest bound counts, grown by the drift since then. |
+//! | NDL-6.1 | Answers some time apart measure how fast that clock drifts; an offset moves on with it, ever less exactly, while nobody answers. |
 //! | NDL-9 | Answers say what of the node does not get on; a change is told to applications. |
 //! | NDL-7 | All memory and all work is bounded. |
 //! | NDL-7.1 | `nodes_max` members, as many candidates, as many that are gone; the oldest candidate makes room. |

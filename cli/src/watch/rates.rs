@@ -21,6 +21,8 @@ pub(super) struct Rates {
 struct Kind {
     count: u64,
     bytes: u64,
+    /// Those of them whose age is known.
+    aged: u64,
     age_sum_ns: u128,
     age_max_ns: u64,
     refused: u64,
@@ -42,8 +44,11 @@ impl Rates {
         let kind = self.kinds.entry(key).or_default();
         kind.count += 1;
         kind.bytes += message.length;
-        kind.age_sum_ns += u128::from(message.age_ns);
-        kind.age_max_ns = kind.age_max_ns.max(message.age_ns);
+        if message.age_error_ns.is_some() {
+            kind.aged += 1;
+            kind.age_sum_ns += u128::from(message.age_ns);
+            kind.age_max_ns = kind.age_max_ns.max(message.age_ns);
+        }
         kind.refused += u64::from(message.refused.is_some());
     }
 
@@ -102,7 +107,7 @@ impl Rated {
 
 impl Kind {
     fn age_mean_ns(&self) -> u64 {
-        u64::try_from(self.age_sum_ns / u128::from(self.count.max(1))).unwrap_or(u64::MAX)
+        u64::try_from(self.age_sum_ns / u128::from(self.aged.max(1))).unwrap_or(u64::MAX)
     }
 }
 
@@ -117,6 +122,7 @@ mod tests {
         SeenMessage {
             seen_us: 0,
             age_ns,
+            age_error_ns: (age_ns < u64::MAX).then_some(0),
             is_sent: false,
             source: tid,
             target: tid,
@@ -135,13 +141,15 @@ mod tests {
     fn each_type_has_a_line_and_what_was_dropped_has_one() {
         let mut rates = Rates::default();
         (0..10).for_each(|number| rates.add(&message("a", number * 2_000, None)));
+        // Of unknown age: it makes no mean.
+        rates.add(&message("a", u64::MAX, None));
         rates.add(&message("b", 0, Some(Rejection::QueueFull)));
         rates.drop(7);
         let said = rates.end(Duration::from_secs(2));
         assert_eq!(
             said.text().lines().take(2).collect::<Vec<_>>(),
             [
-                "   --- -> a: 5.0/s, 500 B/s, age mean 9 us max 18 us",
+                "   --- -> a: 5.5/s, 550 B/s, age mean 9 us max 18 us",
                 "   --- -> b: 0.5/s, 50 B/s, age mean 0 us max 0 us, 1 REFUSED"
             ]
         );

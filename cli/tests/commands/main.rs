@@ -30,7 +30,10 @@ fn both_nodes_are_seen_from_either_of_them_with_their_links_and_lives() {
             named(&said["nodes"], other).is_some_and(|node| {
                 let links = node["links"].as_array().map_or(&[][..], Vec::as_slice);
                 let all_up = links.len() == 3 && links.iter().all(|link| link["up"] == true);
-                all_up && node["round_trip_ns"].is_u64() && node["clock_offset_ns"].is_i64()
+                all_up
+                    && node["round_trip_ns"].is_u64()
+                    && node["clock_offset_ns"].is_i64()
+                    && node["clock_drift_bound_ppb"].is_u64()
             })
         });
         // Then

@@ -22,12 +22,14 @@ pub struct Delivery<P> {
     pub destination: Tid,
     /// The source's n-th message.
     pub sequence: u64,
-    /// When it was sent, in this host's clock.
+    /// When it was sent, in this host's clock; [`Time::ZERO`] where that is not known ([`age_error`](Self::age_error)).
     pub sent: Time,
-    /// Time from sending to handling.
+    /// Time from sending to handling, as wrong as [`age_error`](Self::age_error) says. Where it is not known it is 584 years, so that no limit
+    /// takes what may be old for fresh.
     pub age: Duration,
     /// Type of the payload.
     pub kind: Kind,
+    age_error: Option<Duration>,
     reply_to: Option<ReplyTo>,
 }
 
@@ -40,11 +42,21 @@ impl<P> Delivery<P> {
             source: header.source,
             destination: header.destination,
             sequence: header.sequence,
-            sent: header.sent,
-            age: now.since(header.sent),
+            sent: header.known_sent(),
+            age: header.known_age(now),
             kind: header.kind,
+            age_error: header.sent_error(),
             reply_to: header.flags.has(Flags::ASK).then_some(reply_to),
         }
+    }
+
+    /// The error of `age`, and of `sent`, at most: zero for what was sent on this host; `None` where the age is not known, because the clock
+    /// of the sender's host was not measured yet, or not for so long that it may be wrong by more than 32 s.
+    ///
+    /// It holds as long as the hosts' clocks drift apart as clocks do (`docs/protocol/ndl.md`, NDL-6.1).
+    #[must_use]
+    pub const fn age_error(&self) -> Option<Duration> {
+        self.age_error
     }
 
     /// Where the sender waits for a reply; `None` if it does not.

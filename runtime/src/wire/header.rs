@@ -9,7 +9,8 @@
 //!      8    4 kind of the payload
 //!     12    1 class: 0 Control, 1 Stream, 2 Bulk
 //!     13    1 flags
-//!     14    2 between two nodes: the lower 16 bits of its number in their session; else zero
+//!     14    2 between two nodes: the lower 16 bits of its number in their session; from a node to its applications: how wrong the send
+//!             time may be; else zero
 //!     16    8 source TID
 //!     24    8 destination TID
 //!     32    8 sequence: the source's n-th message
@@ -118,13 +119,15 @@ pub struct Header {
     pub source: Tid,
     /// Whom it is for.
     pub destination: Tid,
-    /// Between two nodes: the lower 16 bits of its number in their session. Zero elsewhere, and not looked at.
+    /// Between two nodes: the lower 16 bits of its number in their session. From a node to its applications: how wrong `sent` may be
+    /// ([`sent_error`](Self::sent_error)). Else zero.
     pub number: u16,
     /// The source's n-th message, from 1.
     pub sequence: u64,
     /// Ties a reply or an outcome to its message; 0 where there is none.
     pub correlation: u64,
-    /// When it was sent. On the wire in the sender's clock; a receiving layer turns it into its own.
+    /// When it was sent. On the wire in the sender's clock; a receiving layer turns it into its own. Where that is not known it is when it
+    /// arrived, and [`sent_error`](Self::sent_error) says so.
     pub sent: Time,
     /// How long after `sent` it is still worth handling, in microseconds; 0 = for ever.
     pub time_to_live_us: u32,

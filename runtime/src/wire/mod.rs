@@ -3,6 +3,7 @@
 //! The same frame (header, then payload) is used on unix sockets, on TCP and in datagrams; `docs/protocol/frame.md`
 //! specifies it byte by byte. Nothing here allocates on the word of a peer: lengths are checked first.
 
+mod age;
 mod codec;
 mod header;
 mod kind;

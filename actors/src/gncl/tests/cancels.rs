@@ -15,13 +15,14 @@ use sinew_runtime::{
     router::LocalRoute,
     sender::{Directory, Reply, Sender},
     tid::{AppAddress, Tid},
+    time::Time,
     wire::{Class, Flags, Kind, Message, Payload},
 };
 
 use super::bench::{ByHand, NINE, Node, introduction, pair, run, within};
 use crate::{
+    clocks::{ClockDrift, ClockOffset},
     gncl::core::{Introduction, Lane},
-    stores::ClockOffset,
 };
 
 /// Longer than any test.
@@ -146,7 +147,15 @@ fn a_request_whose_time_is_over_is_not_handled_though_nobody_takes_it_back() {
     run(async {
         let (a, b) = pair().await;
         // Else it would count as sent when it came.
-        b.stores.clocks.set(a.address(), ClockOffset { theirs_minus_ours_ns: 0, bound: Duration::ZERO });
+        b.stores.clocks.set(
+            a.address(),
+            ClockOffset {
+                theirs_minus_ours_ns: 0,
+                bound: Duration::ZERO,
+                at: Time::now(),
+                drift: ClockDrift { ppb: 0, bound_ppb: 0 },
+            },
+        );
         let (asker, mut asked) = (App::of(&a, 1, 8), App::of(&b, 1, 8));
         let mut within = Duration::from_millis(30);
         loop {
@@ -168,7 +177,7 @@ fn a_request_whose_time_is_over_is_not_handled_though_nobody_takes_it_back() {
             none @ (Poll::Ready(None) | Poll::Pending) => panic!("the first request waits there: {none:?}"),
         };
         // As an application's drive does with what it takes out.
-        assert!(first.header.is_expired(sinew_runtime::time::Time::now()));
+        assert!(first.header.is_expired(Time::now()));
     });
 }
 

@@ -11,9 +11,9 @@ use sinew_runtime::{
 
 use super::bench::{ByHand, KIND, LONGEST, NINE, Node, introduction, next, pair, run, within};
 use crate::{
+    clocks::{ClockDrift, ClockOffset},
     gncl::core::{Introduction, read},
     session::Ack,
-    stores::ClockOffset,
 };
 
 /// A message as the peer that is written by hand sends it.
@@ -99,7 +99,8 @@ fn times_are_in_our_clock_and_what_is_too_old_on_arrival_has_expired() {
         let mut peer = ByHand::linked_to(&mut node).await;
         let mut inbox = node.app(1);
         let hour = 3_600_000_000_000;
-        let offset = ClockOffset { theirs_minus_ours_ns: hour, bound: Duration::ZERO };
+        let (at, drift) = (Time::now(), ClockDrift { ppb: 0, bound_ppb: 0 });
+        let offset = ClockOffset { theirs_minus_ours_ns: hour, bound: Duration::from_millis(1), at, drift };
         node.stores.clocks.set(NINE, offset);
         let sent = Time::now() - Duration::from_secs(1);
 
@@ -107,7 +108,10 @@ fn times_are_in_our_clock_and_what_is_too_old_on_arrival_has_expired() {
         fresh.header.sent = sent.shifted(hour);
         fresh.header.time_to_live_us = 60_000_000;
         peer.say(&fresh).await;
-        assert_eq!(next("the fresh message", &mut inbox).await.header.sent, sent);
+        let fresh = next("the fresh message", &mut inbox).await.header;
+        assert_eq!(fresh.sent, sent);
+        // The clock's error, and by how much two clocks may have drifted apart in the second for which it was on its way.
+        assert!(fresh.sent_error().is_some_and(|error| error >= Duration::from_micros(1_200)), "{fresh:?}");
 
         let mut old = from_nine(&node, b"old");
         old.header.sent = sent.shifted(hour);
@@ -119,7 +123,33 @@ fn times_are_in_our_clock_and_what_is_too_old_on_arrival_has_expired() {
 }
 
 #[test]
-fn without_a_measured_clock_a_message_counts_as_sent_when_it_came() {
+fn of_a_peer_whose_clock_nobody_measures_any_more_ages_are_known_ever_less_exactly() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut peer = ByHand::linked_to(&mut node).await;
+        let mut inbox = node.app(1);
+        let drift = ClockDrift { ppb: 50_000, bound_ppb: 5_000 };
+        let at = Time::now() - Duration::from_secs(60);
+        let measured = ClockOffset { theirs_minus_ours_ns: 0, bound: Duration::from_micros(50), at, drift };
+        node.stores.clocks.set(NINE, measured);
+
+        // Its clock is 3 ms ahead by now.
+        let sent = Time::now() - Duration::from_secs(1);
+        let mut message = from_nine(&node, b"");
+        message.header.sent = sent.shifted(3_000_000);
+        peer.say(&message).await;
+        let came = next("the message", &mut inbox).await.header;
+        assert!(came.sent.since(sent).max(sent.since(came.sent)) < Duration::from_micros(500), "{came:?}");
+        let error = came.sent_error().expect("its clock was measured");
+        assert!(
+            error > Duration::from_micros(500),
+            "half a round trip, and what it may have wandered in a minute: {came:?}"
+        );
+    });
+}
+
+#[test]
+fn without_a_measured_clock_a_message_lives_from_when_it_came_and_is_of_unknown_age() {
     run(async {
         let mut node = Node::start(1).await;
         let mut peer = ByHand::linked_to(&mut node).await;
@@ -129,8 +159,9 @@ fn without_a_measured_clock_a_message_counts_as_sent_when_it_came() {
         message.header.sent = Time::from_nanos(1);
         message.header.time_to_live_us = 1_000_000;
         peer.say(&message).await;
-        let came = next("the message", &mut inbox).await.header.sent;
-        assert!(before <= came && came <= Time::now());
+        let came = next("the message", &mut inbox).await.header;
+        assert!(before <= came.sent && came.sent <= Time::now());
+        assert_eq!((came.sent_error(), came.known_sent()), (None, Time::ZERO));
     });
 }
 

@@ -117,6 +117,12 @@ pub struct PeerReport {
     pub offset_ns: Option<i64>,
     /// The error of that at most, in nanoseconds.
     pub offset_bound_ns: Option<u64>,
+    /// By how much faster its clock runs than that of the node that answers, in billionths: 1,000 are 1 ppm.
+    #[serde(default)]
+    pub drift_ppb: Option<i64>,
+    /// The error of that at most; 200,000 as long as nothing is known of it.
+    #[serde(default)]
+    pub drift_bound_ppb: Option<u64>,
     /// Since when there is a connection to it.
     #[serde(default)]
     pub linked_us: Option<u64>,
@@ -181,6 +187,8 @@ impl PeerReport {
             round_trip_ns: None,
             offset_ns: None,
             offset_bound_ns: None,
+            drift_ppb: None,
+            drift_bound_ppb: None,
             linked_us: None,
             broken_us: None,
             dial: None,

@@ -1,21 +1,25 @@
-//! How far a peer's clock is from ours, from the four times of a query and its answer.
+//! How far a peer's clock is from ours, and how fast that changes, from the four times of each query and its answer.
 //!
 //! ```text
 //! ours    t1 --query-->            t4        offset = ((t2 - t1) + (t3 - t4)) / 2
 //! theirs         t2 --answer--> t3           bound  = ((t4 - t1) - (t3 - t2)) / 2, and what the clocks drift apart from t1 to t4
 //! ```
+//!
+//! Two offsets some time apart say how much the clocks drifted in that time: the best of each 8 s are kept for some minutes, and each two of
+//! them bound the drift. What all of them allow, and nothing else, is the drift. // spec: NDL-6.1
 
 use std::{collections::VecDeque, time::Duration};
 
 use sinew_runtime::time::Time;
 
-use crate::stores::ClockOffset;
+use crate::clocks::{ClockDrift, ClockOffset, DRIFT_PPB_MAX, WANDER_PPB_PER_S, drift_ns_max};
 
 /// Samples of which the best one counts.
 const SAMPLES_MAX: usize = 8;
-
-/// Two quartz clocks drift apart by at most this; datasheets say +-50 for each, cold and old ones do worse.
-const DRIFT_PPM: u64 = 200;
+/// Time of which the best sample is kept for the drift, in nanoseconds.
+const SPAN_NS: u64 = 8_000_000_000;
+/// As many are kept: what a drift was longer ago says less of what it is than what it was since.
+const SPANS_MAX: usize = 32;
 
 /// The four times of one exchange.
 #[derive(Clone, Copy, Debug)]
@@ -33,6 +37,17 @@ impl Exchange {
     }
 }
 
+/// What an exchange said of a clock.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Measured {
+    /// How far it is from ours.
+    Offset,
+    /// Nothing: the times contradict each other.
+    Nothing,
+    /// That it is where no clock could have run since the exchanges before. It was set, or stood still: these count no more.
+    Leap,
+}
+
 #[derive(Clone, Copy, Debug)]
 struct Sample {
     at: Time,
@@ -41,49 +56,134 @@ struct Sample {
     round_trip: Duration,
 }
 
-impl Sample {
-    /// The bound now: the clocks drift on since the sample was taken.
-    fn bound_at(&self, now: Time) -> u64 {
-        self.bound_ns.saturating_add(drift_ns(now.since(self.at)))
-    }
-}
-
 /// The last exchanges with one peer.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct PeerClock {
     samples: VecDeque<Sample>,
     round_trip: Option<Duration>,
+    /// The best of each span, but for the present one.
+    spans: VecDeque<Sample>,
+    /// When the present span began, and the best of it so far.
+    span: Option<(Time, Sample)>,
+    /// As it was at that time.
+    drift: (Time, ClockDrift),
+}
+
+impl Default for PeerClock {
+    fn default() -> Self {
+        Self {
+            samples: VecDeque::new(),
+            round_trip: None,
+            spans: VecDeque::new(),
+            span: None,
+            drift: (Time::ZERO, ClockDrift::UNKNOWN),
+        }
+    }
 }
 
 impl PeerClock {
-    /// Takes in an exchange; `false` if its times contradict each other. // spec: NDL-6
-    pub(super) fn measure(&mut self, exchange: Exchange) -> bool {
-        let Some(sample) = sample(exchange) else { return false };
+    /// Takes in an exchange. // spec: NDL-6
+    pub(super) fn measure(&mut self, exchange: Exchange) -> Measured {
+        let Some(sample) = sample(exchange) else { return Measured::Nothing };
+        let is_possible = self.allows(sample) && self.note_drift(sample);
+        if !is_possible {
+            *self = Self { span: Some((sample.at, sample)), ..Self::default() };
+        }
         self.round_trip = Some(sample.round_trip);
         if self.samples.len() == SAMPLES_MAX {
             self.samples.pop_front();
         }
         self.samples.push_back(sample);
-        true
+        if is_possible { Measured::Offset } else { Measured::Leap }
     }
 
-    /// The offset with the smallest bound, the bound as it will be `horizon` from now.
-    pub(super) fn offset(&self, now: Time, horizon: Duration) -> Option<ClockOffset> {
-        let best = self.samples.iter().min_by_key(|sample| sample.bound_at(now))?;
-        let bound = Duration::from_nanos(best.bound_at(now + horizon));
-        Some(ClockOffset { theirs_minus_ours_ns: best.offset_ns, bound })
+    /// Where the peer's clock is at `now`, by the sample that says it most exactly.
+    pub(super) fn offset(&self, now: Time) -> Option<ClockOffset> {
+        let (at, drift) = self.drift;
+        let offset = |sample: &Sample| {
+            let drift = drift.apart(sample.at.as_nanos().abs_diff(at.as_nanos()));
+            let (theirs_minus_ours_ns, bound) = (sample.offset_ns, Duration::from_nanos(sample.bound_ns));
+            ClockOffset { theirs_minus_ours_ns, bound, at: sample.at, drift }.at(now)
+        };
+        self.samples.iter().map(offset).min_by_key(|offset| offset.bound)
     }
 
     /// Time of the last query and answer on the network, the peer's thinking time not counted.
     pub(super) const fn round_trip(&self) -> Option<Duration> {
         self.round_trip
     }
+
+    /// Whether a clock that was where those before this sample say can be where it says.
+    fn allows(&self, sample: Sample) -> bool {
+        self.offset(sample.at).is_none_or(|expected| {
+            let error = expected.theirs_minus_ours_ns.abs_diff(sample.offset_ns);
+            u128::from(error) <= expected.bound.as_nanos() + u128::from(sample.bound_ns)
+        })
+    }
+
+    /// Keeps the best of each span, and at the end of each sees what drift it leaves; `false`: none.
+    fn note_drift(&mut self, sample: Sample) -> bool {
+        match &mut self.span {
+            Some((began, best)) if sample.at.as_nanos().saturating_sub(began.as_nanos()) < SPAN_NS => {
+                if sample.bound_ns < best.bound_ns {
+                    *best = sample;
+                }
+                return true;
+            }
+            Some(_) | None => {}
+        }
+        let Some((_, over)) = self.span.replace((sample.at, sample)) else { return true };
+        let (at, drift) = self.drift;
+        let present = drift.apart(over.at.as_nanos().abs_diff(at.as_nanos()));
+        let most = Range { least: -i128::from(DRIFT_PPB_MAX), most: i128::from(DRIFT_PPB_MAX) };
+        let allowed = (self.spans.iter())
+            .fold(most.and(present.into()), |allowed, former| allowed.and(Range::between(former, &over)));
+        if self.spans.len() == SPANS_MAX {
+            self.spans.pop_front();
+        }
+        self.spans.push_back(over);
+        let drift = allowed.drift();
+        self.drift = (over.at, drift.unwrap_or(ClockDrift::UNKNOWN));
+        drift.is_some()
+    }
 }
 
-/// Nanoseconds by which two clocks drift apart in this time at most, rounded up.
-fn drift_ns(time: Duration) -> u64 {
-    let micros = u64::try_from(time.as_micros()).unwrap_or(u64::MAX).saturating_add(1);
-    micros.saturating_mul(DRIFT_PPM).div_ceil(1_000)
+/// What a drift can be, in billionths.
+#[derive(Clone, Copy, Debug)]
+struct Range {
+    least: i128,
+    most: i128,
+}
+
+impl From<ClockDrift> for Range {
+    fn from(drift: ClockDrift) -> Self {
+        let (ppb, bound) = (i128::from(drift.ppb), i128::from(drift.bound_ppb));
+        Self { least: ppb - bound, most: ppb + bound }
+    }
+}
+
+impl Range {
+    /// At the later of two samples: the mean drift between them, as wrong as both offsets may be, and what it may have wandered since the middle.
+    fn between(former: &Sample, later: &Sample) -> Self {
+        let nanos = i128::from(later.at.as_nanos().saturating_sub(former.at.as_nanos())).max(1);
+        let moved = i128::from(later.offset_ns) - i128::from(former.offset_ns);
+        let error = i128::from(former.bound_ns) + i128::from(later.bound_ns);
+        let wandered = nanos * i128::from(WANDER_PPB_PER_S) / 2_000_000_000 + 1;
+        let ppb = |moved: i128| moved * 1_000_000_000 / nanos;
+        Self { least: ppb(moved - error) - wandered - 1, most: ppb(moved + error) + wandered + 1 }
+    }
+
+    fn and(self, other: Self) -> Self {
+        Self { least: self.least.max(other.least), most: self.most.min(other.most) }
+    }
+
+    /// Its middle; `None` if nothing is in it.
+    fn drift(self) -> Option<ClockDrift> {
+        let width = u64::try_from(self.most - self.least).ok()?;
+        let bound_ppb = width.div_ceil(2);
+        let ppb = i64::try_from(self.least + i128::from(bound_ppb)).ok()?;
+        Some(ClockDrift { ppb, bound_ppb })
+    }
 }
 
 fn sample(exchange: Exchange) -> Option<Sample> {
@@ -97,8 +197,8 @@ fn sample(exchange: Exchange) -> Option<Sample> {
     let offset_ns = i64::try_from(((t2 - t1) + (t3 - t4)) / 2).ok()?;
     // Rounded up: a bound errs on the safe side.
     let half_ns = u64::try_from((away - there + 1) / 2).ok()?;
-    let drift_ns = drift_ns(exchange.answer_received.since(exchange.query_sent));
-    let (at, bound_ns) = (exchange.answer_received, half_ns.saturating_add(drift_ns));
+    let drifted_ns = drift_ns_max(u64::try_from(away).ok()?);
+    let (at, bound_ns) = (exchange.answer_received, half_ns.saturating_add(drifted_ns));
     Some(Sample { at, offset_ns, bound_ns, round_trip: Duration::from_nanos(half_ns.saturating_mul(2)) })
 }
 
@@ -108,50 +208,170 @@ mod tests {
 
     use super::*;
 
-    const SECOND: i64 = 1_000_000_000;
+    const SECOND: u64 = 1_000_000_000;
+    /// When the exchanges of a test begin.
+    const BEGIN: u64 = 2_000_000 * SECOND;
 
-    /// An exchange at `at` with a peer whose clock is `offset` ahead.
-    fn exchange(at: u64, offset: i64, [there, thinking, back]: [u64; 3]) -> Exchange {
-        let theirs = |nanos: u64| Time::from_nanos(nanos).shifted(offset);
-        Exchange {
-            query_sent: Time::from_nanos(at),
-            query_received: theirs(at + there),
-            answer_sent: theirs(at + there + thinking),
-            answer_received: Time::from_nanos(at + there + thinking + back),
+    /// A peer's clock, whose drift wanders.
+    struct Truth {
+        ahead_ns: i64,
+        /// The drift at the beginning of each second, in billionths; between two of these it changes evenly.
+        ppb: Vec<i64>,
+        /// What the clocks have drifted apart by then, in nanoseconds.
+        drifted_ns: Vec<f64>,
+    }
+
+    impl Truth {
+        /// The drift begins with `ppb` and has changed by each of `steps` a second later, for ever in turn.
+        fn new(ahead_ns: i64, ppb: i64, steps: &[i64]) -> Self {
+            const SECONDS: usize = 40_000;
+            let most = DRIFT_PPB_MAX.cast_signed();
+            let (mut all, mut drifted_ns) = (vec![ppb.clamp(-most, most)], vec![0.0]);
+            for at in 0..SECONDS {
+                let next = (all[at] + steps[at % steps.len()]).clamp(-most, most);
+                drifted_ns.push(drifted_ns[at] + (all[at] + next) as f64 / 2.0);
+                all.push(next);
+            }
+            Self { ahead_ns, ppb: all, drifted_ns }
+        }
+
+        /// The offset and the drift at `at`, in our clock.
+        fn at(&self, at: Time) -> (i64, f64) {
+            let nanos = at.as_nanos() - BEGIN;
+            let (second, part) = ((nanos / SECOND) as usize, (nanos % SECOND) as f64 / SECOND as f64);
+            let (ppb, next) = (self.ppb[second] as f64, self.ppb[second + 1] as f64);
+            let present = ppb + (next - ppb) * part;
+            let drifted = self.drifted_ns[second] + (ppb + present) / 2.0 * part;
+            (self.ahead_ns + drifted.round() as i64, present)
+        }
+
+        fn exchange(&self, at: u64, [there, thinking, back]: [u64; 3]) -> Exchange {
+            let theirs = |nanos: u64| {
+                let ours = Time::from_nanos(nanos);
+                ours.shifted(self.at(ours).0)
+            };
+            Exchange {
+                query_sent: Time::from_nanos(at),
+                query_received: theirs(at + there),
+                answer_sent: theirs(at + there + thinking),
+                answer_received: Time::from_nanos(at + there + thinking + back),
+            }
+        }
+
+        /// Whether what is said of the clock is true, but for what the test itself rounds.
+        fn bears_out(&self, said: ClockOffset) -> bool {
+            let (offset, ppb) = self.at(said.at);
+            let error = u128::from(said.theirs_minus_ours_ns.abs_diff(offset));
+            error <= said.bound.as_nanos() + 2
+                && (said.drift.ppb as f64 - ppb).abs() <= said.drift.bound_ppb as f64 + 1.0
         }
     }
 
+    /// An exchange with a peer whose clock runs as fast as ours.
+    fn exchange(at: u64, offset: i64, legs: [u64; 3]) -> Exchange {
+        Truth::new(offset, 0, &[0]).exchange(BEGIN + at, legs)
+    }
+
+    fn steps() -> impl Strategy<Value = Vec<i64>> {
+        let wander = WANDER_PPB_PER_S.cast_signed();
+        prop_oneof![
+            Just(vec![0]),
+            Just(vec![wander]),
+            Just(vec![-wander]),
+            proptest::collection::vec(-wander..=wander, 1..300)
+        ]
+    }
+
+    fn legs() -> impl Strategy<Value = [u64; 3]> {
+        prop_oneof![
+            [0..50_000u64, 0..50_000u64, 0..50_000u64],
+            [0..30_000_000u64, 0..1_000_000u64, 0..30_000_000u64]
+        ]
+    }
+
     proptest! {
+        // spec: NDL-6, NDL-6.1
         #[test]
-        fn the_true_offset_is_within_the_bound(
-            offset in -1_000_000 * SECOND..1_000_000 * SECOND,
-            legs in proptest::collection::vec(any::<[u32; 3]>(), 1..20),
+        fn the_true_offset_and_the_true_drift_are_within_their_bounds_also_long_after_the_last_answer(
+            ahead in -1_000_000_000_000_000i64..1_000_000_000_000_000,
+            ppb in -200_000i64..=200_000,
+            steps in steps(),
+            exchanges in proptest::collection::vec((10_000_000u64..10_000_000_000, legs()), 1..200),
+            silences in proptest::collection::vec(0..36_000 * SECOND, 3),
         ) {
-            let (mut clock, mut now) = (PeerClock::default(), 2_000_000 * SECOND as u64);
-            for legs in legs {
-                let exchange = exchange(now, offset, legs.map(u64::from));
+            let (truth, mut clock, mut now) = (Truth::new(ahead, ppb, &steps), PeerClock::default(), BEGIN);
+            for (rest, legs) in exchanges {
+                let exchange = truth.exchange(now + rest, legs);
                 now = exchange.answer_received.as_nanos();
-                prop_assert!(clock.measure(exchange));
-                let said = clock.offset(exchange.answer_received, Duration::ZERO).unwrap();
-                let error = u128::from(said.theirs_minus_ours_ns.abs_diff(offset));
-                prop_assert!(error <= said.bound.as_nanos() + 1, "{said:?}");
+                prop_assert_eq!(clock.measure(exchange), Measured::Offset);
+                let said = clock.offset(exchange.answer_received).unwrap();
+                prop_assert!(truth.bears_out(said), "{said:?}, and it is {:?}", truth.at(said.at));
+            }
+            let last = clock.offset(Time::from_nanos(now)).unwrap();
+            for silence in silences {
+                let said = last.at(Time::from_nanos(now + silence));
+                prop_assert!(truth.bears_out(said), "{said:?}, and it is {:?}", truth.at(said.at));
             }
         }
 
         #[test]
-        fn any_times_are_a_sample_or_refused(times: [u64; 4]) {
-            let [a, b, c, d] = times.map(Time::from_nanos);
-            let exchange = Exchange { query_sent: a, query_received: b, answer_sent: c, answer_received: d };
-            PeerClock::default().measure(exchange);
+        fn any_times_are_a_sample_or_refused(times: [[u64; 4]; 20]) {
+            let mut clock = PeerClock::default();
+            for times in times {
+                let [a, b, c, d] = times.map(Time::from_nanos);
+                clock.measure(Exchange { query_sent: a, query_received: b, answer_sent: c, answer_received: d });
+                clock.offset(a);
+            }
         }
+    }
+
+    /// Who is asked every half second for so long.
+    fn watched(truth: &Truth, seconds: u64) -> ClockOffset {
+        let mut clock = PeerClock::default();
+        let exchanges =
+            (0..2 * seconds).map(|at| truth.exchange(BEGIN + at * SECOND / 2, [60_000, 20_000, 40_000]));
+        exchanges.for_each(|exchange| assert_eq!(clock.measure(exchange), Measured::Offset));
+        clock.offset(Time::from_nanos(BEGIN + seconds * SECOND)).unwrap()
+    }
+
+    #[test]
+    fn a_drift_is_known_to_a_few_millionths_after_a_minute() {
+        let truth = Truth::new(-7_000_000_000, 50_000, &[0]);
+        let said = watched(&truth, 5);
+        assert_eq!(said.drift, ClockDrift::UNKNOWN, "nothing is known before there are two spans");
+        let said = watched(&truth, 60);
+        assert!(said.drift.ppb.abs_diff(50_000) < 3_000 && said.drift.bound_ppb < 10_000, "{said:?}");
+    }
+
+    #[test]
+    fn a_clock_that_nobody_hears_of_for_an_hour_is_still_followed() {
+        let truth = Truth::new(0, 50_000, &[0]);
+        let said = watched(&truth, 300);
+        let later = said.at(said.at + Duration::from_secs(3_600));
+        // It is 180 ms further on by then, and is known to be.
+        let error = later.theirs_minus_ours_ns.abs_diff(truth.at(later.at).0);
+        assert!(error < 10_000_000, "{later:?}");
+        assert!(later.bound > Duration::from_millis(100), "nobody knows that it drifts as before: {later:?}");
+    }
+
+    #[test]
+    fn a_clock_that_leaps_is_believed_at_once_and_its_former_drift_is_not() {
+        let (before, after) = (Truth::new(0, 20_000, &[0]), Truth::new(1_000_000_000, 20_000, &[0]));
+        let mut clock = PeerClock::default();
+        let legs = [60_000, 20_000, 40_000];
+        (0..60).for_each(|at| drop(clock.measure(before.exchange(BEGIN + at * SECOND, legs))));
+        assert_eq!(clock.measure(after.exchange(BEGIN + 60 * SECOND, legs)), Measured::Leap);
+        let said = clock.offset(Time::from_nanos(BEGIN + 60 * SECOND + 120_000)).unwrap();
+        assert!(after.bears_out(said) && said.drift == ClockDrift::UNKNOWN, "{said:?}");
+        assert_eq!(clock.measure(after.exchange(BEGIN + 61 * SECOND, legs)), Measured::Offset);
     }
 
     #[test]
     fn a_quick_exchange_counts_more_than_a_later_slow_one() {
         let mut clock = PeerClock::default();
         clock.measure(exchange(0, 500, [10_000, 0, 10_000]));
-        clock.measure(exchange(SECOND as u64, 500, [9_000_000, 0, 1_000]));
-        let offset = clock.offset(Time::from_nanos(SECOND as u64), Duration::ZERO).unwrap();
+        clock.measure(exchange(SECOND, 500, [9_000_000, 0, 1_000]));
+        let offset = clock.offset(Time::from_nanos(BEGIN + SECOND)).unwrap();
         assert_eq!(offset.theirs_minus_ours_ns, 500);
         assert!(offset.bound < Duration::from_millis(1), "{offset:?}");
     }
@@ -160,6 +380,6 @@ mod tests {
     fn an_answer_that_left_before_its_query_came_is_refused() {
         let mut contradictory = exchange(0, 0, [10, 10, 10]);
         contradictory.answer_sent = Time::ZERO;
-        assert!(!PeerClock::default().measure(contradictory));
+        assert_eq!(PeerClock::default().measure(contradictory), Measured::Nothing);
     }
 }

@@ -9,7 +9,7 @@ use sinew_runtime::{
 
 use super::{
     Core, Member, Output, Place, Source,
-    clock::{Exchange, PeerClock},
+    clock::{Exchange, Measured, PeerClock},
     contact::{Contact, Role},
     recall::Loss,
     routes::Routes,
@@ -162,12 +162,19 @@ impl Core {
     fn measure(&mut self, now: Time, node: NodeAddress, exchange: Option<Exchange>) {
         let Some(member) = self.members.get_mut(&node) else { return };
         let Some(exchange) = exchange else { return };
-        if !member.clock.measure(exchange) {
-            let what = format_args!("the times of {node} contradict each other");
-            self.refusals.count(now, "NDL answer with false times", &what);
-            return;
+        match member.clock.measure(exchange) {
+            Measured::Offset => {}
+            Measured::Nothing => {
+                let what = format_args!("the times of {node} contradict each other");
+                self.refusals.count(now, "NDL answer with false times", &what);
+                return;
+            }
+            Measured::Leap => {
+                let what = format_args!("{node} or this node: its host slept, or something set the clock");
+                self.refusals.count(now, "a monotonic clock leapt", &what);
+            }
         }
-        if let Some(offset) = member.clock.offset(now, self.paces[member.pace].period) {
+        if let Some(offset) = member.clock.offset(now) {
             self.outputs.push_back(Output::ClockMeasured { node, offset });
         }
     }

@@ -72,7 +72,7 @@ use super::{
     MembershipFact, NodeEvent, Progress,
     datagram::{Announcement, Answer, Claim, FURTHER_MAX},
 };
-use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, refusals::Refusals, stores::ClockOffset};
+use crate::{clocks::ClockOffset, config::NodeConfig, gncl::LinkFact, lncl::AppFact, refusals::Refusals};
 
 /// What happened.
 #[derive(Clone, Debug)]

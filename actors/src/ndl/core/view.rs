@@ -9,8 +9,8 @@ use sinew_runtime::{
 
 use super::{Core, LostNode, Member, Neighbour, Place, Source, routes::Route};
 use crate::{
+    clocks::ClockOffset,
     ndl::{Part, Trouble},
-    stores::ClockOffset,
 };
 
 /// A node that is there.
@@ -47,7 +47,7 @@ pub struct KnownNode {
     pub troubles: Vec<TroubledApp>,
     /// Time of the last query and its answer on the network.
     pub round_trip: Option<Duration>,
-    /// How far its clock is from ours.
+    /// How far its clock is from ours, now, and how fast that changes.
     pub offset: Option<ClockOffset>,
 }
 
@@ -114,7 +114,7 @@ impl Core {
             asked_every: self.paces[member.pace].period,
             bound: self.paces[member.pace].bound(),
             round_trip: member.clock.round_trip(),
-            offset: member.clock.offset(now, Duration::ZERO),
+            offset: member.clock.offset(now),
         });
         views.collect()
     }

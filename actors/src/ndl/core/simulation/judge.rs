@@ -26,8 +26,8 @@ use sinew_runtime::{
 
 use super::plan::Plan;
 use crate::{
+    clocks::ClockOffset,
     ndl::{LossReason, core::Host},
-    stores::ClockOffset,
 };
 
 /// Questions to one address of which the judge knows when they were asked.

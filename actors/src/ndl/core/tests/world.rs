@@ -12,6 +12,7 @@ use sinew_runtime::{
 };
 
 use crate::{
+    clocks::ClockOffset,
     config::{NodeConfig, WatchGroup},
     gncl::LinkFact,
     lncl::AppFact,
@@ -20,7 +21,6 @@ use crate::{
         core::{Core, Input, Output, Place, Way},
         datagram::{Answer, Body, Datagram, encode},
     },
-    stores::ClockOffset,
 };
 
 /// The application of each process that hears of changes.
