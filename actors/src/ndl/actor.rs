@@ -271,7 +271,7 @@ impl Shell {
                  them another `address`"
             ),
             Output::AddressTaken { holder } => give_up(&format!(
-                "node address {} is used already, by the node that answers at {holder}; set `address` of this node to \
+                "node address {} is used already, by {holder}; set `address` of this node to \
                  a free one",
                 self.stores.node
             )),

@@ -3,11 +3,11 @@
 //! Each says how it stands to its address ([`Claim`]). Who has settled goes before who settles, and the elder life before the later
 //! one. Others listen to that one as soon as they know that both live; the other one gives the address up when it hears of it.
 
-use std::{collections::btree_map::Entry, net::SocketAddr, time::Duration};
+use std::{collections::btree_map::Entry, fmt, net::SocketAddr, time::Duration};
 
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
-use super::{Core, Output, lives::Proof};
+use super::{Core, Member, Output, lives::Proof};
 use crate::ndl::{LossReason, datagram::Claim};
 
 /// Time between two reports that a node address is used twice.
@@ -20,6 +20,33 @@ const YIELDS: usize = 3;
 pub(super) struct Trial {
     since: Time,
     heard: Time,
+}
+
+/// A process that has a node address, or wants it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Claimant {
+    /// The node's name.
+    pub(crate) name: String,
+    /// Where it answers.
+    pub(crate) at: SocketAddr,
+}
+
+impl From<&Proof> for Claimant {
+    fn from(proof: &Proof) -> Self {
+        Self { name: proof.announcement.name.clone(), at: proof.from.there }
+    }
+}
+
+impl From<&Member> for Claimant {
+    fn from(member: &Member) -> Self {
+        Self { name: member.announcement.name.clone(), at: member.routes.best().there }
+    }
+}
+
+impl fmt::Display for Claimant {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "the node '{}' at {}", self.name, self.at)
+    }
 }
 
 impl Core {
@@ -56,17 +83,16 @@ impl Core {
         if proof.asked < member.since {
             return;
         }
-        let newcomer = member.routes.best().there;
-        self.collide(now, node, proof.from.there, newcomer);
+        let newcomer = member.into();
+        self.collide(now, node, (&proof).into(), newcomer);
         self.contests.remove(&node);
         self.lose(now, node, LossReason::Duplicate);
         self.arrive(now, proof);
     }
 
     // spec: NDL-5.4
-    pub(super) fn collide(&mut self, now: Time, node: NodeAddress, holder: SocketAddr, newcomer: SocketAddr) {
-        let what =
-            format_args!("{node} is at {holder}; the process at {newcomer} claims the same node address");
+    pub(super) fn collide(&mut self, now: Time, node: NodeAddress, holder: Claimant, newcomer: Claimant) {
+        let what = format_args!("{node} is that of {holder}; {newcomer} claims the same node address");
         self.refusals.count(now, "NDL node address used twice", &what);
         self.collisions_reported.retain(|_, last| now.since(*last) < COLLISION_REPORT_PERIOD);
         if let Entry::Vacant(report) = self.collisions_reported.entry(node) {
@@ -78,7 +104,8 @@ impl Core {
     /// A living process has our own node address. // spec: NDL-5.5
     pub(super) fn own_address_used(&mut self, now: Time, proof: &Proof) {
         let Some(settles) = self.settles else { return };
-        let (own, other) = (proof.from.here, proof.from.there);
+        let own = Claimant { name: self.me.name.clone(), at: proof.from.here };
+        let other = Claimant::from(proof);
         let theirs = &proof.announcement;
         if now < settles {
             // Two that start together: the later life gives up at once, the earlier one only if the other stays.
@@ -91,7 +118,7 @@ impl Core {
         if !theirs.precedes(&self.me) {
             return self.collide(now, self.me.node, own, other);
         }
-        self.collide(now, self.me.node, other, own);
+        self.collide(now, self.me.node, other.clone(), own);
         // Whose connections stand, and prove something, is what it says; the other one cannot connect. spec: NDL-5.8
         if now >= settles && !self.proven.is_anybody() {
             self.try_other(now, other);
@@ -99,7 +126,7 @@ impl Core {
     }
 
     /// Both have settled, apart from each other: who goes before us is given the time that a newcomer has. // spec: NDL-5.7
-    fn try_other(&mut self, now: Time, other: SocketAddr) {
+    fn try_other(&mut self, now: Time, other: Claimant) {
         let is_on = |trial: &Trial| now.since(trial.heard) <= self.loss_bound();
         let since = self.trial.filter(is_on).map_or(now, |trial| trial.since);
         if now.since(since) >= self.rest().period * self.rest().missed_max {
@@ -108,7 +135,7 @@ impl Core {
         self.trial = Some(Trial { since, heard: now });
     }
 
-    fn give_address_up(&mut self, holder: SocketAddr) {
+    fn give_address_up(&mut self, holder: Claimant) {
         // The next start begins anew: the other may be gone by then.
         (self.settles, self.trial) = (None, None);
         self.me.claim = Claim::Yielded;

@@ -95,7 +95,7 @@ impl Core {
         } else if claimed.incarnation < known.incarnation {
             self.refuse_stale(now, &proof, known.incarnation);
         } else if claimed.incarnation == known.incarnation {
-            self.collide(now, claimed.node, member.routes.best().there, proof.from.there);
+            self.collide(now, claimed.node, member.into(), (&proof).into());
         } else if member.is_followed_at(proof.from) {
             self.replace(now, proof);
         } else {
@@ -152,10 +152,10 @@ impl Core {
         let newcomer = self.contests.remove(&node)?.newcomer;
         // The member may have proven itself since the newcomer came.
         if newcomer.announcement.precedes(&proof.announcement) && !self.contradicts_a_proof(now, &newcomer) {
-            self.collide(now, node, newcomer.from.there, proof.from.there);
+            self.collide(now, node, (&newcomer).into(), proof.into());
             return Some(newcomer);
         }
-        self.collide(now, node, proof.from.there, newcomer.from.there);
+        self.collide(now, node, proof.into(), (&newcomer).into());
         None
     }
 

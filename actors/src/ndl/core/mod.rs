@@ -61,7 +61,7 @@ use self::{
     audience::Audience,
     budget::Strangers,
     contact::{Contact, Question, Questions, Role},
-    duplicates::Trial,
+    duplicates::{Claimant, Trial},
     lives::{Contest, Gone},
     member::Member,
     pace::{Pace, REST},
@@ -159,12 +159,12 @@ pub(crate) enum Output {
     /// Two living processes have one node address; the newcomer is no member, or not any more.
     Collision {
         node: NodeAddress,
-        holder: SocketAddr,
-        newcomer: SocketAddr,
+        holder: Claimant,
+        newcomer: Claimant,
     },
     /// This node's own address is another's already: it must not go on.
     AddressTaken {
-        holder: SocketAddr,
+        holder: Claimant,
     },
     /// Our own timer was this late: nobody was counted as silent.
     Stalled {

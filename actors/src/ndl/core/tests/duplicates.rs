@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use sinew_runtime::{tid::Incarnation, time::Time};
 
-use super::world::{PERIOD, Spec, World, ms, node, udp};
+use super::world::{PERIOD, Spec, World, claimant, ms, node, udp};
 use crate::{
     ndl::{
         LossReason,
@@ -65,7 +65,8 @@ fn a_newcomer_that_meets_the_impostor_first_ends_with_the_elder_life_and_names_b
     // then
     assert_eq!(has(&world, 1), Some(Incarnation(1)));
     assert_eq!(world.losses(1), [(BOTH, LossReason::Duplicate)]);
-    let both = Output::Collision { node: node(BOTH), holder: udp(ELDER), newcomer: udp(LATER) };
+    let (holder, newcomer) = (claimant(BOTH, ELDER), claimant(BOTH, LATER));
+    let both = Output::Collision { node: node(BOTH), holder, newcomer };
     assert_eq!(world.at(1).others, [both]);
     assert!(!gave_up(&world, LATER), "it has not heard of the elder");
 }
@@ -122,7 +123,7 @@ fn reports_of_addresses_used_twice_are_remembered_for_as_long_as_they_hold_other
     for nodes in [10..40, 40..41] {
         let reported = nodes.clone().count();
         for address in nodes.clone().chain(nodes) {
-            world.with(udp(1), |core, now| core.collide(now, node(address), udp(2), udp(3)));
+            world.with(udp(1), |core, now| core.collide(now, node(address), claimant(2, 2), claimant(3, 3)));
         }
         assert_eq!(world.at(1).others.len(), reported, "each once");
         assert_eq!(world.at(1).core.collisions_reported.len(), reported);

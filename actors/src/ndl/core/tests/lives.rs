@@ -2,7 +2,7 @@
 
 use sinew_runtime::tid::Incarnation;
 
-use super::world::{PERIOD, Spec, World, ms, node, udp};
+use super::world::{PERIOD, Spec, World, claimant, ms, node};
 use crate::ndl::{LossReason, MembershipFact, NodeEvent, core::Output};
 
 // spec: NDL-5.1
@@ -103,7 +103,7 @@ fn of_two_living_processes_with_one_address_the_newcomer_is_refused() {
         world.run(PERIOD * 6);
         // then
         assert_eq!(world.at(1).facts, [], "life {incarnation}");
-        let collision = Output::Collision { node: node(2), holder: udp(2), newcomer: udp(3) };
+        let collision = Output::Collision { node: node(2), holder: claimant(2, 2), newcomer: claimant(2, 3) };
         assert_eq!(world.at(1).others, [collision], "reported once in 10 s");
         assert!(world.at(1).core.refusals().of("NDL node address used twice") > 1);
         // when: the holder goes
@@ -133,9 +133,10 @@ fn a_newcomer_that_finds_its_own_address_in_use_gives_up_and_the_holder_does_not
     world.run(PERIOD * 5);
     world.start(3, &Spec::of(2));
     world.run(ms(10));
-    assert_eq!(world.at(3).others, [Output::AddressTaken { holder: udp(2) }]);
+    assert_eq!(world.at(3).others, [Output::AddressTaken { holder: claimant(2, 2) }]);
     assert_eq!(world.at(3).core.next_wake(), None, "it is silent from now on");
-    assert_eq!(world.at(2).others, [Output::Collision { node: node(2), holder: udp(2), newcomer: udp(3) }]);
+    let both = Output::Collision { node: node(2), holder: claimant(2, 2), newcomer: claimant(2, 3) };
+    assert_eq!(world.at(2).others, [both]);
     assert_eq!(world.at(1).facts, []);
 }
 

@@ -18,7 +18,7 @@ use crate::{
     lncl::AppFact,
     ndl::{
         LossReason, MembershipFact, NodeEvent,
-        core::{Core, Input, Output, Place, Way},
+        core::{Core, Input, Output, Place, Way, duplicates::Claimant},
         datagram::{Answer, Body, Datagram, encode},
     },
 };
@@ -45,6 +45,11 @@ pub(super) fn place(index: u16, there: SocketAddr) -> Place {
 
 pub(super) fn node(address: u32) -> NodeAddress {
     NodeAddress::new(address)
+}
+
+/// The `index`-th process, as one that has this node address.
+pub(super) fn claimant(address: u32, index: u16) -> Claimant {
+    Claimant { name: format!("node-{address}"), at: udp(index) }
 }
 
 /// What a process is like.
