@@ -1,7 +1,11 @@
 //! `sinew nodes`: every node, its life, what connects it, its clock.
 
+use std::fmt::Display;
+
 use serde_json::{Value, json};
-use sinew::inspect::{AskNode, LinkReport, LostReport, NodeReport, PeerReport, RouteReport, TroubleReport};
+use sinew::inspect::{
+    AskNode, LinkReport, LostReport, NodeReport, PeerReport, RouteReport, StallReport, TroubleReport,
+};
 
 use crate::{
     Said, security,
@@ -135,6 +139,7 @@ impl<'a> Row<'a> {
             "security": said.ok().map(security::json),
             "version": said.ok().map(|said| &said.version),
             "refused": said.ok().map(|said| said.refused),
+            "own_stalls": said.ok().and_then(|said| said.own_stalls).map(|stalls| stalls_json(&stalls)),
             "found_us": seen.and_then(|seen| seen.found_us),
             "found_by": seen.map(|seen| &seen.found_by),
             "silent_us": seen.and_then(|seen| seen.silent_us),
@@ -204,6 +209,26 @@ fn lost_json(lost: &LostReport) -> Value {
     })
 }
 
+fn stalls_json(of: &StallReport) -> Value {
+    let StallReport { count, longest_us, last_us } = of;
+    json!({ "count": count, "longest_us": longest_us, "last_us": last_us })
+}
+
+/// That a node was starved itself, if it was.
+fn own_stalls(said: &NodeReport) -> Option<String> {
+    stalls_in_words(said.own_stalls, &format_args!("{} {}", said.node, clean(&said.name)))
+}
+
+fn stalls_in_words(stalls: Option<StallReport>, node: &dyn Display) -> Option<String> {
+    let StallReport { count, longest_us, last_us } = stalls?;
+    let times = if count == 1 { "once".to_owned() } else { format!("{count} times") };
+    let (longest, last) = (time(longest_us), time(last_us?));
+    Some(format!(
+        "{node}: it got no processor {times}, for {longest} at most, last {last} ago; it told of losses later by that. `sinew doctor` on its host \
+         looks for the cause\n"
+    ))
+}
+
 /// What of a node does not get on, a line each.
 fn troubles(of: &PeerReport) -> String {
     let name = clean(of.name.as_deref().unwrap_or_default());
@@ -255,6 +280,8 @@ fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport]) -> String {
         }
     }
     rows.iter().filter_map(|row| row.seen).for_each(|seen| text += &troubles(seen));
+    let said = rows.iter().filter_map(|row| row.answer.said.as_ref().ok());
+    text.extend(said.filter_map(own_stalls));
     if here.left_out > 0 {
         text += &format!("{} further nodes had no room in the answer of {}\n", here.left_out, here.node);
     }
@@ -286,6 +313,22 @@ mod tests {
             "10.0.0.7 knee: 2 further ones do not get on\n".to_owned(),
         ];
         assert_eq!(troubles(&seen), lines.concat());
+    }
+
+    #[test]
+    fn a_node_that_was_starved_itself_says_so_and_another_one_does_not() {
+        let said = |stalls: Option<(u64, u64)>| {
+            let report = |(count, longest_us)| StallReport { count, longest_us, last_us: Some(5_000_000) };
+            stalls_in_words(stalls.map(report), &"10.0.0.7 knee")
+        };
+        assert_eq!((said(None), stalls_in_words(Some(StallReport::default()), &"it")), (None, None));
+        let words = said(Some((3, 1_200_000))).expect("it was starved");
+        assert!(
+            words
+                .starts_with("10.0.0.7 knee: it got no processor 3 times, for 1.2 s at most, last 5.0 s ago"),
+            "{words}"
+        );
+        assert!(said(Some((1, 1_200_000))).expect("it was starved").contains("no processor once, for"));
     }
 
     #[test]

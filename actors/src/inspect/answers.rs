@@ -18,8 +18,8 @@ use sinew_runtime::{
 use super::reports::{
     APPS_MAX, AppReport, AppsReport, AuditReport, BarrierReport, CertificateReport, DialReport,
     ForeignReport, LinkReport, LostReport, MISSING_MAX, Missing, NodeReport, PEERS_MAX, PeerReport,
-    RefusalReport, RouteReport, SecurityReport, SeenMessage, StreamReport, TOLD_MAX, TREE_MAX, TreeLine,
-    TreeReport, TroubleReport, WaitReport, WatchReport,
+    RefusalReport, RouteReport, SecurityReport, SeenMessage, StallReport, StreamReport, TOLD_MAX, TREE_MAX,
+    TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
 };
 use super::watches::{Fetched, Sight};
 use crate::{
@@ -84,6 +84,7 @@ impl Answers {
             group: group(&stores.config.ndl),
             seeds: stores.config.ndl.seeds.iter().take(TOLD_MAX).map(ToString::to_string).collect(),
             lost: ndl.lost,
+            own_stalls: Some(ndl.stalls),
             foreign: ndl.foreign,
             refusals: refusals(stores, now),
             peers,
@@ -147,6 +148,7 @@ struct Discovery {
     gncl: Option<String>,
     lost: Vec<LostReport>,
     foreign: Vec<ForeignReport>,
+    stalls: StallReport,
 }
 
 /// The group that is asked: that of IPv6 where there is nothing else.
@@ -161,9 +163,15 @@ fn group(ndl: &NdlConfig) -> Option<String> {
 
 impl Discovery {
     fn of(stores: &Stores, now: Time) -> Self {
-        let (udp, me, lost, foreign) = {
+        let (udp, me, lost, foreign, stalls) = {
             let core = lock(&stores.ndl);
-            (core.paths().first().copied(), core.announcement().clone(), core.lost_nodes(), core.neighbours())
+            let (udp, me) = (core.paths().first().copied(), core.announcement().clone());
+            (udp, me, core.lost_nodes(), core.neighbours(), core.own_stalls())
+        };
+        let stalls = StallReport {
+            count: stalls.count,
+            longest_us: micros(stalls.longest),
+            last_us: stalls.last.map(|last| micros(now.since(last))),
         };
         let mut lost: Vec<_> = lost.into_iter().map(|(node, lost)| lost_report(node, lost, now)).collect();
         lost.sort_by_key(|lost| lost.lost_us);
@@ -175,7 +183,7 @@ impl Discovery {
             ago_us: micros(now.since(other.heard)),
         });
         let gncl = udp.and_then(|udp| me.gncl_addresses(None, [(udp, udp)]).first().map(ToString::to_string));
-        Self { udp: udp.map(|udp| udp.to_string()), gncl, lost, foreign: foreign.collect() }
+        Self { udp: udp.map(|udp| udp.to_string()), gncl, lost, foreign: foreign.collect(), stalls }
     }
 }
 

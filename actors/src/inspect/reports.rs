@@ -6,7 +6,8 @@ mod security;
 
 pub use access::{AccessReport, AccessVerdict, AskAccess, AskReload, ReloadReport};
 pub use peers::{
-    DialReport, ForeignReport, LinkReport, LostReport, PeerReport, RouteReport, StreamReport, TroubleReport,
+    DialReport, ForeignReport, LinkReport, LostReport, PeerReport, RouteReport, StallReport, StreamReport,
+    TroubleReport,
 };
 pub use security::{CertificateReport, SecurityReport};
 
@@ -127,6 +128,9 @@ payload!("sinew.inspect.node_report" =>
         /// Nodes that it knew and that have not come back, as far as it remembers.
         #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
         pub lost: Vec<LostReport>,
+        /// How often its own NDL was starved, so that it counted nobody as silent.
+        #[serde(default)]
+        pub own_stalls: Option<StallReport>,
         /// Nodes of other projects that it hears.
         #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
         pub foreign: Vec<ForeignReport>,

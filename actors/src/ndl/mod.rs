@@ -63,7 +63,7 @@ pub(crate) use actor::{NdlActor, new_core};
 pub(crate) use address::is_same_host;
 pub(crate) use core::Core;
 pub(crate) use core::LostNode;
-pub use core::{KnownNode, KnownRoute, Source, TroubledApp};
+pub use core::{KnownNode, KnownRoute, OwnStalls, Source, TroubledApp};
 pub(crate) use datagram::{FURTHER_MAX, PATHS_MAX};
 pub(crate) use facts::MembershipFact;
 pub use facts::{LossReason, NodeEvent, Trouble};

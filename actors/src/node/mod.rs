@@ -60,7 +60,7 @@ use crate::{
     access::{AccessError, AccessSummary},
     gncl::{self, Peer},
     log,
-    ndl::KnownNode,
+    ndl::{KnownNode, OwnStalls},
     outlet::OutletCounts,
     secured::{Denied, DenyListError},
     stores::{Stores, lock},
@@ -250,6 +250,12 @@ impl NodeHandle {
     #[must_use]
     pub fn members(&self) -> Vec<KnownNode> {
         lock(&self.stores.ndl).members(Time::now())
+    }
+
+    /// How often this node's own NDL got no processor, so that it counted nobody as silent and told losses later.
+    #[must_use]
+    pub fn own_stalls(&self) -> OwnStalls {
+        lock(&self.stores.ndl).own_stalls()
     }
 
     /// Every application that has a name, on any node that is known.

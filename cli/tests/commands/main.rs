@@ -47,7 +47,9 @@ fn both_nodes_are_seen_from_either_of_them_with_their_links_and_lives() {
         .until("the knee is there", "hip", &["nodes"], |said| named(&said["nodes"], "knee").is_some());
     assert_eq!(named(&said["nodes"], "knee").expect("it")["pid"], knee.id(), "it has answered itself");
     let table = scenario.sinew("hip", &["nodes"]);
-    assert_eq!((table.code, table.out.lines().count()), (Some(0), 3), "{}{}", table.out, table.err);
+    // On a machine that has no time for it a node says below the table that it was starved.
+    let lines = table.out.lines().filter(|line| !line.contains("got no processor")).count();
+    assert_eq!((table.code, lines), (Some(0), 3), "{}{}", table.out, table.err);
     assert!(table.out.contains("127.0.0.2") && table.out.contains("3 up"), "{}", table.out);
 }
 

@@ -35,6 +35,18 @@ pub struct LostReport {
     pub found_by: Vec<String>,
 }
 
+/// How often the timer of a node's NDL came so late that it counted nobody as silent: it got no processor, or its host slept. Each of these puts
+/// a loss off by as much and one period.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct StallReport {
+    /// How often since the node started.
+    pub count: u64,
+    /// How late it was at worst.
+    pub longest_us: u64,
+    /// Time since the last one, if there was any.
+    pub last_us: Option<u64>,
+}
+
 /// A node of another project that is heard.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ForeignReport {

@@ -81,6 +81,7 @@ impl Core {
     }
 
     fn report_stall(&mut self, now: Time, late: Duration) {
+        self.recall.stalled(now, late);
         if self.stall_reported.is_none_or(|last| now.since(last) >= STALL_REPORT_PERIOD) {
             self.stall_reported = Some(now);
             self.outputs.push_back(Output::Stalled { late });

@@ -54,6 +54,7 @@ use sinew_runtime::{
     time::Time,
 };
 
+pub use self::recall::OwnStalls;
 pub(crate) use self::recall::{LostNode, Neighbour};
 pub(crate) use self::routes::Place;
 pub use self::view::{KnownNode, KnownRoute, TroubledApp};

@@ -38,6 +38,18 @@ pub(super) struct Loss {
     pub(super) bound: Duration,
 }
 
+/// How often this node's own timer came so late that nobody was counted as silent: it got no processor, or its host slept. Each of these puts
+/// the losses of that moment off by as much and one period.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct OwnStalls {
+    /// How often since the node started.
+    pub count: u64,
+    /// How late the timer was at worst.
+    pub longest: Duration,
+    /// When it was late last.
+    pub last: Option<Time>,
+}
+
 /// A node of another project.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Neighbour {
@@ -53,6 +65,7 @@ pub(crate) struct Neighbour {
 pub(super) struct Recall {
     lost: BTreeMap<NodeAddress, LostNode>,
     neighbours: BTreeMap<SocketAddr, Neighbour>,
+    stalls: OwnStalls,
 }
 
 impl Recall {
@@ -77,6 +90,17 @@ impl Recall {
         let Announcement { project, node, name, .. } = announcement;
         let neighbour = Neighbour { project: project.clone(), node: *node, name: name.clone(), heard: now };
         self.neighbours.insert(from, neighbour);
+    }
+
+    /// Our own timer was so late. What made the cycles of several groups late at once was one stall.
+    pub(super) fn stalled(&mut self, now: Time, late: Duration) {
+        let OwnStalls { count, longest, last } = &mut self.stalls;
+        *count += u64::from(*last != Some(now));
+        (*longest, *last) = (late.max(*longest), Some(now));
+    }
+
+    pub(super) const fn stalls(&self) -> OwnStalls {
+        self.stalls
     }
 
     pub(super) fn lost_nodes(&self) -> Vec<(NodeAddress, LostNode)> {

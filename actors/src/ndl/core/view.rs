@@ -7,7 +7,7 @@ use sinew_runtime::{
     time::Time,
 };
 
-use super::{Core, LostNode, Member, Neighbour, Place, Source, routes::Route};
+use super::{Core, LostNode, Member, Neighbour, OwnStalls, Place, Source, routes::Route};
 use crate::{
     clocks::ClockOffset,
     ndl::{Part, Trouble},
@@ -133,6 +133,11 @@ impl Core {
     /// Who was there and has not come back, as far as is remembered.
     pub(crate) fn lost_nodes(&self) -> Vec<(NodeAddress, LostNode)> {
         self.recall.lost_nodes()
+    }
+
+    /// How often this node's own timer came so late that nobody was counted as silent.
+    pub(crate) const fn own_stalls(&self) -> OwnStalls {
+        self.recall.stalls()
     }
 
     /// Nodes of other projects that are heard, and where.

@@ -64,6 +64,7 @@ fn report(number: u8, name: &str, other: u8) -> NodeReport {
         group: Some("239.0.0.1:7000".to_owned()),
         seeds: Vec::new(),
         lost: Vec::new(),
+        own_stalls: None,
         foreign: Vec::new(),
         refusals: Vec::new(),
         peers: vec![peer(other)],

@@ -90,6 +90,7 @@ fn a_stall_that_is_long_for_the_leg_is_reported_and_costs_nobody() {
         let said = |output: &Output| matches!(output, Output::Stalled { .. });
         let is_long = stall > 15;
         assert!(!is_long || world.at(1).others.iter().any(said), "after {stall} ms");
+        assert!(world.at(1).core.own_stalls().count <= 1, "one stall, whoever's cycle it made late");
     }
 }
 

@@ -13,7 +13,7 @@ use crate::{
     lncl::AppFact,
     ndl::{
         LossReason, MembershipFact, NodeEvent,
-        core::{Host, Input, Output, Source},
+        core::{Host, Input, Output, OwnStalls, Source},
         datagram::{Announcement, Answer, Body, Claim, Datagram, encode},
     },
 };
@@ -183,6 +183,9 @@ fn a_starved_node_accuses_nobody() {
         assert_eq!(world.losses(1), [], "after {late_ms} ms");
         let said = world.at(1).others.clone();
         assert_eq!(said, if late_ms > 250 { vec![Output::Stalled { late: ms(late_ms) }] } else { vec![] });
+        let OwnStalls { count, longest, last } = world.at(1).core.own_stalls();
+        let counted = if late_ms > 250 { (1, ms(late_ms), true) } else { (0, ms(0), false) };
+        assert_eq!((count, longest, last.is_some()), counted, "after {late_ms} ms");
     }
 }
 
