@@ -105,8 +105,8 @@ pub use sinew_runtime::{
 };
 pub use sinew_shm::Spin;
 pub use sync::{
-    ArriveAtBarrier, BarrierAnswer, BarrierKind, BarrierStatus, DirectoryEntry, DirectoryEvent, LeaveBarrier,
-    OnPartyLoss, Waiting,
+    Absence, ArriveAtBarrier, BarrierAnswer, BarrierKind, BarrierStatus, DirectoryEntry, DirectoryEvent,
+    LeaveBarrier, OnPartyLoss, Waiting,
 };
 
 /// Everything that an ordinary program needs, in one line: `use sinew::prelude::*;`

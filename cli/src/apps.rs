@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::{Value, json};
-use sinew::inspect::{AppReport, AppsReport, AskApps, BarrierReport};
+use sinew::inspect::{AppReport, AppsReport, AskApps, BarrierReport, Missing};
 
 use crate::{
     Said,
@@ -37,11 +37,14 @@ pub(crate) fn barriers(system: &mut System) -> Result<Said, Fault> {
     let waiting: Vec<_> = all(&answers).filter(|(_, app)| !app.missing.is_empty()).collect();
     let mut blocked: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
     let mut reasons: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+    let mut since: BTreeMap<&str, Option<u64>> = BTreeMap::new();
     for (_, app) in &waiting {
         for missing in &app.missing {
             let name = app.name.as_deref().unwrap_or("without a name");
             blocked.entry(&missing.name).or_default().insert(name);
             reasons.entry(&missing.name).or_default().insert(&missing.why);
+            let longest = since.entry(&missing.name).or_default();
+            *longest = missing.since_us.max(*longest);
         }
     }
     let meetings = meetings(&answers);
@@ -49,7 +52,7 @@ pub(crate) fn barriers(system: &mut System) -> Result<Said, Fault> {
     let waiters = waiting.iter().map(|(node, app)| app_json(node, app)).collect::<Vec<_>>();
     let blockers = blocked
         .iter()
-        .map(|(name, who)| json!({ "name": name, "why": reasons[name], "blocks": who }))
+        .map(|(name, who)| json!({ "name": name, "since_us": since[name], "why": reasons[name], "blocks": who }))
         .collect::<Vec<_>>();
     let json = json!({ "waiting": waiters, "missing": blockers, "barriers": meetings.iter().map(|(node, one)| meeting_json(node, one)).collect::<Vec<_>>(), "silent": silent_json(&answers) });
     let mut text = if waiting.is_empty() {
@@ -60,9 +63,14 @@ pub(crate) fn barriers(system: &mut System) -> Result<Said, Fault> {
             let since = app.waits_us.map_or_else(|| "lost it".to_owned(), time);
             table.row([or_dash(app.name.clone()), (*node).to_owned(), since, lacks(app)]);
         }
-        let mut missing = Table::new(["MISSING", "WHY", "BLOCKS"]);
+        let mut missing = Table::new(["MISSING", "SINCE", "WHY", "BLOCKS"]);
         for (name, who) in &blocked {
-            missing.row([(*name).to_owned(), joined(&reasons[name]), joined(who)]);
+            missing.row([
+                (*name).to_owned(),
+                or_dash(since[name].map(time)),
+                joined(&reasons[name]),
+                joined(who),
+            ]);
         }
         format!("{}\n{}", table.text(), missing.text())
     };
@@ -83,18 +91,28 @@ fn meetings(answers: &[Answer<AppsReport>]) -> Vec<(&str, &BarrierReport)> {
 fn meeting_cells(node: &str, one: &BarrierReport) -> [String; 5] {
     let waits: Vec<_> =
         one.waiting.iter().map(|who| format!("{} {}", who.name, time(who.waits_us))).collect();
-    let missing: Vec<_> = one.missing.iter().map(|who| format!("{} ({})", who.name, who.why)).collect();
+    let missing: Vec<_> = one.missing.iter().map(meeting_lacks).collect();
     let opened = if one.is_phase { "phase".to_owned() } else { one.generation.to_string() };
     [one.name.clone(), node.to_owned(), opened, waits.join(", "), missing.join(", ")]
 }
 
+fn meeting_lacks(who: &Missing) -> String {
+    let since = who.since_us.map_or_else(String::new, |since| format!("; {}", time(since)));
+    format!("{} ({}{since})", who.name, who.why)
+}
+
 fn meeting_json(node: &str, one: &BarrierReport) -> Value {
     let waiting = one.waiting.iter().map(|who| json!({ "name": who.name, "waits_us": who.waits_us }));
-    let missing = one.missing.iter().map(|who| json!({ "name": who.name, "why": who.why }));
+    let missing = one.missing.iter().map(missing_json);
     json!({
         "name": one.name, "node_name": node, "parties": one.parties, "is_phase": one.is_phase, "generation": one.generation,
         "waiting": waiting.collect::<Vec<_>>(), "missing": missing.collect::<Vec<_>>(),
     })
+}
+
+fn missing_json(of: &Missing) -> Value {
+    let Missing { name, why, since_us } = of;
+    json!({ "name": name, "why": why, "since_us": since_us })
 }
 
 fn ask(system: &mut System) -> Result<Vec<Answer<AppsReport>>, Fault> {
@@ -145,7 +163,7 @@ pub(crate) fn why(app: &AppReport) -> String {
 }
 
 pub(crate) fn lacks(app: &AppReport) -> String {
-    let one = |missing: &sinew::inspect::Missing| format!("{} ({})", missing.name, missing.why);
+    let one = |missing: &Missing| format!("{} ({})", missing.name, missing.why);
     app.missing.iter().map(one).collect::<Vec<_>>().join(", ")
 }
 
@@ -154,7 +172,7 @@ fn joined(words: &BTreeSet<&str>) -> String {
 }
 
 fn app_json(node: &str, app: &AppReport) -> Value {
-    let missing = app.missing.iter().map(|missing| json!({ "name": missing.name, "why": missing.why }));
+    let missing = app.missing.iter().map(missing_json);
     json!({
         "tid": app.tid.to_string(),
         "name": app.name,

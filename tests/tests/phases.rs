@@ -53,7 +53,8 @@ fn drives_of_two_nodes_come_up_together_and_one_that_is_started_again_brings_nob
     // Given: one drive is homed, and is seen to wait for the other.
     let status = until("the hip's drive waits", || hip.handle().barriers().pop());
     assert_eq!((status.barrier.as_str(), status.kind), ("homed", BarrierKind::Phase));
-    assert_eq!(status.missing, [("knee.drive at homed".to_owned(), "not there".to_owned())]);
+    let missing: Vec<_> = status.missing.iter().map(|absence| (&*absence.name, &*absence.why)).collect();
+    assert_eq!(missing, [("knee.drive at homed", "not there")]);
     let waits = until("the gait waits", || hip.handle().waiting().pop());
     assert_eq!(waits.missing, [("2 of *.drive at homed (1 there)".to_owned(), "not there")]);
     assert!(heard.try_recv().is_err() && started.try_recv().is_err(), "nobody has gone on");

@@ -30,7 +30,7 @@ use crate::{
     node::{CommandError, NodeHandle, Supervised},
     security::UnixTime,
     stores::{Stores, lock},
-    sync::{BarrierKind, BarrierStatus, OwnApp},
+    sync::{Absence, BarrierKind, BarrierStatus, OwnApp},
 };
 
 /// Time for the root's answer: one that hangs does not keep the other questions waiting for long.
@@ -328,8 +328,13 @@ fn barrier_report(status: BarrierStatus) -> BarrierReport {
         is_phase: kind == BarrierKind::Phase,
         generation,
         waiting: waiting.into_iter().take(MISSING_MAX).map(wait).collect(),
-        missing: missing.into_iter().take(MISSING_MAX).map(|(name, why)| Missing { name, why }).collect(),
+        missing: missing.into_iter().take(MISSING_MAX).map(missing_report).collect(),
     }
+}
+
+fn missing_report(absence: Absence) -> Missing {
+    let Absence { name, why, since } = absence;
+    Missing { name, why: why.into_owned(), since_us: Some(micros(since)) }
 }
 
 fn seen_message(now: Time, sight: Sight, name: Option<String>) -> SeenMessage {
@@ -355,7 +360,7 @@ fn seen_message(now: Time, sight: Sight, name: Option<String>) -> SeenMessage {
 }
 
 fn app_report(node: NodeAddress, app: OwnApp) -> AppReport {
-    let missing = app.missing.into_iter().map(|(name, why)| Missing { name, why: why.to_owned() });
+    let missing = app.missing.into_iter().map(missing_report);
     AppReport {
         tid: Tid::new(node, app.app),
         name: app.name,

@@ -230,6 +230,9 @@ pub struct Missing {
     pub name: String,
     /// The last that is known of it.
     pub why: String,
+    /// For how long the node has known that it is missing; not longer than somebody there has waited for it, or lacks it.
+    #[serde(default)]
+    pub since_us: Option<u64>,
 }
 
 payload!("sinew.inspect.tree_report" =>

@@ -12,7 +12,7 @@ use super::{
     CommandError, NodeHandle, Told,
     root::{Root, RootEvent},
 };
-use crate::stores::lock;
+use crate::{stores::lock, sync::Absence};
 
 /// Time for the root's answer. It waits for nobody, so that this is over only if the root itself hangs.
 const WITHIN: Duration = Duration::from_secs(10);
@@ -48,9 +48,9 @@ pub struct Supervised {
     pub place: Option<String>,
     /// What waits for it; `None` where there is no mailbox.
     pub mailbox: Option<MailboxState>,
-    /// The names that it lacks of those that it requires, and why each is not ready: before its start what it waits for, later
+    /// The names that it lacks of those that it requires, since when, and why each is not ready: before its start what it waits for, later
     /// what it lost.
-    pub missing: Vec<(String, &'static str)>,
+    pub missing: Vec<Absence>,
     /// Former lives of it that were taken, because they hung or did not stop, and have not let go of their threads.
     pub abandoned: usize,
     /// Whom it supervises, if it is a supervisor.
@@ -280,7 +280,7 @@ impl fmt::Display for Supervised {
         if let Some(MailboxState { depth, high_water }) = self.mailbox {
             write!(f, ", mailbox {depth} (at most {high_water})")?;
         }
-        for (name, why) in &self.missing {
+        for Absence { name, why, .. } in &self.missing {
             write!(f, ", without {name} ({why})")?;
         }
         if self.abandoned > 0 {

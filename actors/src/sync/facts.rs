@@ -1,6 +1,6 @@
 //! What the sync manager says to applications and to the node's root.
 
-use std::{fmt, time::Duration};
+use std::{borrow::Cow, fmt, time::Duration};
 
 use serde::{Deserialize, Serialize};
 use sinew_runtime::{
@@ -13,10 +13,10 @@ use sinew_runtime::{
 pub struct Waiting {
     /// The application's name, or its address where it has none.
     pub application: String,
-    /// The names that are not ready, and the last that is known of each: `registered, not ready`, `failed, not ready
+    /// The names that are not ready, since when, and the last that is known of each: `registered, not ready`, `failed, not ready
     /// again`, `stopped in order, not ready again`, `its node has restarted, its directory has not come yet`, `its node is linked again, its directory has not come yet`, `its link is down`, `its node left`, `its
     /// node was lost`, `unregistered`, `not there`, `part of a cycle of requirements`.
-    pub missing: Vec<(String, &'static str)>,
+    pub missing: Vec<Absence>,
     /// How long it has waited.
     pub since: Duration,
 }
@@ -24,10 +24,27 @@ pub struct Waiting {
 impl fmt::Display for Waiting {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} has waited {:.1} s for", self.application, self.since.as_secs_f64())?;
-        for (place, (name, why)) in self.missing.iter().enumerate() {
-            write!(f, "{} {name} ({why})", if place == 0 { "" } else { "," })?;
+        for (place, absence) in self.missing.iter().enumerate() {
+            write!(f, "{} {absence}", if place == 0 { "" } else { "," })?;
         }
         Ok(())
+    }
+}
+
+/// Who is waited for and not there.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Absence {
+    /// The name; of a pattern, or so many of several, what was asked for, and who of it.
+    pub name: String,
+    /// The last that is known of it.
+    pub why: Cow<'static, str>,
+    /// For how long this node has known that it is missing; not longer than somebody here has waited for it, or lacks it.
+    pub since: Duration,
+}
+
+impl fmt::Display for Absence {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} ({}; missing for {:.1} s)", self.name, self.why, self.since.as_secs_f64())
     }
 }
 
@@ -73,8 +90,8 @@ pub(crate) struct OwnApp {
     pub(crate) name: Option<String>,
     /// Whether it has started and takes messages.
     pub(crate) ready: bool,
-    /// What it lacks of what it requires, and why.
-    pub(crate) missing: Vec<(String, &'static str)>,
+    /// What it lacks of what it requires, since when and why.
+    pub(crate) missing: Vec<Absence>,
     /// How long it has waited at the start-up barrier or at a phase, if it waits there.
     pub(crate) waits: Option<Duration>,
     /// How its former life ended, while this one is not ready.

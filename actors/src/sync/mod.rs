@@ -38,7 +38,7 @@ pub(crate) use core::Core;
 #[cfg(test)]
 pub(crate) use core::Input;
 pub(crate) use facts::OwnApp;
-pub use facts::{DirectoryEntry, DirectoryEvent, Waiting};
+pub use facts::{Absence, DirectoryEntry, DirectoryEvent, Waiting};
 pub(crate) use list::{NAME_BYTES_MAX, Name, at_most};
 pub use words::{ArriveAtBarrier, BarrierAnswer, BarrierKind, BarrierStatus, LeaveBarrier, OnPartyLoss};
 

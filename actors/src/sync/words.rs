@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::facts::Absence;
 use crate::payload;
 
 payload!("sinew.barrier.arrive" =>
@@ -97,6 +98,6 @@ pub struct BarrierStatus {
     pub generation: u64,
     /// Applications of this node that wait there: name or address, and for how long.
     pub waiting: Vec<(String, std::time::Duration)>,
-    /// Who is missing, and the last that is known of each.
-    pub missing: Vec<(String, String)>,
+    /// Who is missing, since when, and the last that is known of each; of one that waits at another barrier for somebody who waits here, that.
+    pub missing: Vec<Absence>,
 }

@@ -36,6 +36,8 @@ pub(super) struct App {
     pub(super) ended: Option<Ended>,
     /// Of what it requires, what it was told is lost.
     pub(super) lost: BTreeSet<String>,
+    /// Of what it requires, what is not met, and since when.
+    pub(super) absent: BTreeMap<String, Time>,
     /// Of what it requires, what nobody can hear of, and until when that is not told.
     pub(super) silent: BTreeMap<String, Time>,
     /// When the next time ends for which it waits for what it can do without.
@@ -88,6 +90,16 @@ impl App {
         }
     }
 
+    /// Keeps since when each requirement is not met.
+    pub(super) fn note_absent(&mut self, now: Time, unmet: &[(String, Reason)]) {
+        self.absent.retain(|text, _| unmet.iter().any(|(other, _)| other == text));
+        for (text, _) in unmet {
+            if !self.absent.contains_key(text) {
+                self.absent.insert(text.clone(), now);
+            }
+        }
+    }
+
     /// The application's name, or its address where it has none.
     pub(super) fn title(&self, app: AppAddress) -> String {
         self.name.as_ref().map_or_else(|| app.to_string(), |name| name.to_string())
@@ -118,7 +130,10 @@ impl Apps {
         let state = State::Waiting(wait);
         let (phases, kinds, lost, silent) = (Vec::new(), Vec::new(), BTreeSet::new(), BTreeMap::new());
         let (ended, patience) = (None, None);
-        self.apps.insert(app, App { name, requires, phases, kinds, state, ended, lost, silent, patience });
+        // One that waits already has waited for that, too.
+        let absent = former.map(|former| former.absent).unwrap_or_default();
+        let life = App { name, requires, phases, kinds, state, ended, lost, absent, silent, patience };
+        self.apps.insert(app, life);
         refused
     }
 

@@ -33,6 +33,7 @@ impl Core {
         let mut released = Vec::new();
         for (address, app) in self.apps.iter_mut() {
             let unready = missing.remove(&address).unwrap_or_default();
+            app.note_absent(now, &unready);
             if app.wait().is_none() {
                 for (event, why) in changes(now, app, &unready) {
                     // What it did not take about this name before is out of date.
@@ -96,7 +97,7 @@ impl Core {
     pub(super) fn wait_of(&self, now: Time, address: AppAddress) -> Option<Waiting> {
         let app = self.apps.get(address)?;
         let since = app.wait()?.since;
-        let missing = app.requires.iter().flat_map(|requirement| self.missing_parts(address, requirement));
+        let missing = app.requires.iter().flat_map(|requirement| self.absences(now, address, requirement));
         Some(Waiting { application: app.title(address), missing: missing.collect(), since: now.since(since) })
     }
 

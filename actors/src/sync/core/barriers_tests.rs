@@ -248,6 +248,63 @@ fn who_gives_a_request_up_still_waits_by_a_later_one() {
     assert_eq!(bench.barriers(), 0, "whoever names no request means any");
 }
 
+/// Who is missing where the hip waits, since how many seconds, and why.
+fn missing(bench: &Bench) -> Vec<(String, u64, String)> {
+    let missing = bench.core.barriers(bench.now).remove(0).missing.into_iter();
+    missing.map(|absence| (absence.name, absence.since.as_secs(), absence.why.into_owned())).collect()
+}
+
+#[test]
+fn since_when_a_party_is_missing_is_since_it_went_not_since_others_wait() {
+    // given: the knee waits with the hip for the ankle
+    let mut bench = Bench::of_the_hip();
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("knee", true, &[])]));
+    let parties: Vec<_> = ["ankle", "hip", "knee"].map(Requirement::name).to_vec();
+    let of_three = |said: BarrierSaid| BarrierSaid { parties: parties.clone(), ..said };
+    bench.is_told(KNEE, LIFE, 1, vec![of_three(awaited("calibrated", 0))]);
+    let (kind, on_loss) = (BarrierKind::Meeting, OnPartyLoss::Wait);
+    let (barrier, texts) = ("calibrated".to_owned(), parties.iter().map(ToString::to_string).collect());
+    let asked = ArriveAtBarrier { kind, barrier, parties: texts, within_ms: 60_000, on_loss };
+    bench.hears(Input::Arrived { app: app(0), correlation: 7, asked });
+    bench.passes(Duration::from_secs(10));
+    let ankle = |seconds| ("ankle".to_owned(), seconds, "not there".to_owned());
+    assert_eq!(missing(&bench), [ankle(10)]);
+    // when: the knee gives up
+    bench.is_told(KNEE, LIFE, 2, vec![of_three(idle("calibrated", 0))]);
+    bench.passes(Duration::from_secs(5));
+    // then
+    let knee = ("knee".to_owned(), 5, "ready, has not arrived".to_owned());
+    assert_eq!(missing(&bench), [ankle(15), knee]);
+}
+
+#[test]
+fn who_waits_for_one_that_waits_for_him_at_another_barrier_is_told_so() {
+    let mut bench = Bench::of_the_hip();
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("knee", true, &[])]));
+    bench.arrives("calibrated", 7);
+    let why = |bench: &Bench| missing(bench).remove(0).2;
+    assert_eq!(why(&bench), "ready, has not arrived");
+    bench.is_told(KNEE, LIFE, 1, vec![awaited("homed", 0)]);
+    assert_eq!(why(&bench), "waits at 'homed' for hip, which waits here for it: neither opens");
+    // An application may wait at several: at both, it keeps nobody.
+    let asked = ArriveAtBarrier {
+        kind: BarrierKind::Meeting,
+        barrier: "homed".to_owned(),
+        parties: ["hip", "knee", "toe"].map(str::to_owned).to_vec(),
+        within_ms: 60_000,
+        on_loss: OnPartyLoss::Wait,
+    };
+    let toes = |said: BarrierSaid| {
+        let parties = ["hip", "knee", "toe"].map(Requirement::name).to_vec();
+        BarrierSaid { parties, ..said }
+    };
+    bench.is_told(KNEE, LIFE, 2, vec![idle("homed", 0), toes(awaited("homed", 0))]);
+    bench.hears(Input::Arrived { app: app(0), correlation: 8, asked });
+    assert_eq!(why(&bench), "ready, has not arrived");
+}
+
 // spec: SYNC-10
 #[test]
 fn an_answer_for_which_there_was_no_room_is_offered_again_as_long_as_its_application_lives() {

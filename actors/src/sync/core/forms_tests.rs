@@ -1,6 +1,17 @@
 //! Requirements of every form: any of several, so many, patterns, what can be done without.
 
+use std::borrow::Cow;
+
 use super::*;
+
+/// Who is missing and why, not since when.
+pub(super) fn in_words(absences: Vec<Absence>) -> Vec<(String, &'static str)> {
+    let words = |absence: Absence| match absence.why {
+        Cow::Borrowed(why) => (absence.name, why),
+        Cow::Owned(why) => panic!("of the start-up barrier there are fixed words: {why}"),
+    };
+    absences.into_iter().map(words).collect()
+}
 
 fn words(missing: &[(String, &'static str)]) -> Vec<String> {
     missing.iter().map(|(part, why)| format!("{part}: {why}")).collect()
@@ -155,4 +166,24 @@ fn what_costs_too_much_to_look_at_is_not_looked_at_to_its_end() {
     let many: Vec<&str> = many.iter().map(String::as_str).collect();
     bench.registers(201, "knee", &many);
     assert_eq!(bench.core.missing_in_brief(app(201)).len(), 16);
+}
+
+#[test]
+fn since_when_something_is_missing_is_since_it_went_not_since_somebody_waits() {
+    let mut bench = Bench::new();
+    bench.registers(1, "sensor", &[]);
+    bench.ready(1);
+    bench.registers(0, "gait", &["sensor", "drive"]);
+    bench.passes(Duration::from_secs(10));
+    bench.down(1);
+    bench.passes(Duration::from_secs(2));
+    let since = |bench: &Bench| -> Vec<(String, u64)> {
+        let missing = bench.core.waiting(bench.now).remove(0).missing;
+        missing.into_iter().map(|absence| (absence.name, absence.since.as_secs())).collect()
+    };
+    assert_eq!(since(&bench), [("sensor".to_owned(), 2), ("drive".to_owned(), 12)]);
+    // It registers anew and waits on, and what it lacked it still lacks.
+    bench.registers(0, "gait", &["drive"]);
+    bench.ready(1);
+    assert_eq!(since(&bench), [("drive".to_owned(), 12)]);
 }

@@ -136,7 +136,7 @@ impl Core {
             kind: BarrierKind::Meeting,
             generation: known.generation,
             waiting: waiting.collect(),
-            missing: self.rendezvous.missing(key, current, |name| self.why_not(name)),
+            missing: self.rendezvous.missing(now, key, current, |name| self.why_not(name)),
         }
     }
 }

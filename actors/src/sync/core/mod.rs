@@ -47,7 +47,7 @@ use self::{
     rendezvous::Rendezvous,
 };
 use super::{
-    facts::{DirectoryEntry, DirectoryEvent, OwnApp, Waiting},
+    facts::{Absence, DirectoryEntry, DirectoryEvent, OwnApp, Waiting},
     words::{ArriveAtBarrier, BarrierAnswer},
 };
 use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, ndl::MembershipFact};
@@ -287,15 +287,15 @@ impl Core {
         self.sequence
     }
 
-    /// What this application lacks of what it requires, and why: what it waits for or, when it runs, what it was told is lost; and who
+    /// What this application lacks of what it requires, since when and why: what it waits for or, when it runs, what it was told is lost; and who
     /// has not reached a phase at which it waits.
-    pub(crate) fn missing(&self, now: Time, address: AppAddress) -> Vec<(String, &'static str)> {
+    pub(crate) fn missing(&self, now: Time, address: AppAddress) -> Vec<Absence> {
         if let Some(waiting) = self.wait_of(now, address) {
             return waiting.missing;
         }
         let Some(app) = self.apps.get(address) else { return Vec::new() };
         let lost = app.requires.iter().filter(|requirement| app.lost.contains(requirement.as_str()));
-        let lost = lost.flat_map(|requirement| self.missing_parts(address, requirement));
+        let lost = lost.flat_map(|requirement| self.absences(now, address, requirement));
         lost.chain(self.lacks_at_phases(now, address).into_iter().flat_map(|(_, missing)| missing)).collect()
     }
 

@@ -17,6 +17,7 @@ use super::{
     rendezvous::{Arrived, GRACE},
 };
 use crate::sync::{
+    facts::Absence,
     list::{Name, PHASES_MAX},
     words::{BarrierAnswer, BarrierKind, BarrierStatus, OnPartyLoss},
 };
@@ -42,12 +43,14 @@ struct Wait {
     lost: Option<Time>,
     /// Of its request.
     correlation: u64,
+    /// Of each party, since when it is missing, if it is.
+    absent: Vec<Option<Time>>,
 }
 
 /// How a wait stands.
 struct Standing {
-    /// Who has not reached the phase, and the last that is known of each.
-    missing: Vec<(String, String)>,
+    /// Who has not reached the phase, of which party, and the last that is known of each.
+    missing: Vec<(usize, String, &'static str)>,
     /// Whether one that is asked for by its name has ended.
     has_lost: bool,
 }
@@ -85,6 +88,11 @@ impl Wait {
     /// Its answer, if its time has come.
     fn judge(&mut self, now: Time, standing: Standing) -> Option<BarrierAnswer> {
         let Standing { missing, has_lost } = standing;
+        for (party, absent) in self.absent.iter_mut().enumerate() {
+            let is_missing = missing.iter().any(|(other, ..)| *other == party);
+            *absent = is_missing.then(|| absent.unwrap_or(now));
+        }
+        let missing: Vec<_> = missing.into_iter().map(|(_, part, why)| (part, why.to_owned())).collect();
         if missing.is_empty() {
             return Some(BarrierAnswer::Opened { generation: ONCE });
         }
@@ -126,9 +134,10 @@ impl Core {
             self.own_list_changed(now);
         }
         let texts = parties.iter().map(ToString::to_string).collect();
-        let parties = parties.into_iter().map(|party| party.at(&*phase)).collect();
+        let parties: Vec<Requirement> = parties.into_iter().map(|party| party.at(&*phase)).collect();
         let until = now + within;
-        let wait = Wait { texts, parties, since: now, until, on_loss, lost: None, correlation };
+        let absent = vec![None; parties.len()];
+        let wait = Wait { texts, parties, since: now, until, on_loss, lost: None, correlation, absent };
         if let Some(former) = self.phases.0.insert((app, phase), wait) {
             let why = "this application has arrived there again; the later request stands".to_owned();
             let answer = BarrierAnswer::Refused { why };
@@ -154,26 +163,29 @@ impl Core {
 
     fn standing_at_phase(&self, wait: &Wait) -> Standing {
         let (mut missing, mut has_lost) = (Vec::new(), false);
-        for party in &wait.parties {
+        for (at, party) in wait.parties.iter().enumerate() {
             let Some(why) = self.standing(AppAddress::NONE, party).why_not(party) else { continue };
             has_lost |= party.one_name().is_some() && why.is_end();
             let parts = self.missing_parts(AppAddress::NONE, party);
-            missing.extend(parts.into_iter().map(|(part, why)| (part, why.to_owned())));
+            missing.extend(parts.into_iter().map(|(part, why)| (at, part, why)));
         }
         Standing { missing, has_lost }
     }
 
+    fn absent_at_phase(&self, now: Time, wait: &Wait) -> Vec<Absence> {
+        let absence = |(party, name, why): (usize, String, &'static str)| {
+            let since = wait.absent[party].map_or(Duration::ZERO, |absent| now.since(absent));
+            Absence { name, why: why.into(), since }
+        };
+        self.standing_at_phase(wait).missing.into_iter().map(absence).collect()
+    }
+
     /// For how long an application has waited at phases, and for whom.
-    pub(super) fn lacks_at_phases(
-        &self,
-        now: Time,
-        app: AppAddress,
-    ) -> Option<(Duration, Vec<(String, &'static str)>)> {
+    pub(super) fn lacks_at_phases(&self, now: Time, app: AppAddress) -> Option<(Duration, Vec<Absence>)> {
         let waits: Vec<&Wait> =
             self.phases.0.iter().filter(|((other, _), _)| *other == app).map(|(_, wait)| wait).collect();
         let since = waits.iter().map(|wait| wait.since).min()?;
-        let parties = waits.iter().flat_map(|wait| &wait.parties);
-        let missing = parties.flat_map(|party| self.missing_parts(AppAddress::NONE, party)).collect();
+        let missing = waits.iter().flat_map(|wait| self.absent_at_phase(now, wait)).collect();
         Some((now.since(since), missing))
     }
 
@@ -189,7 +201,7 @@ impl Core {
                 continue;
             }
             let (barrier, parties) = (phase.to_string(), wait.texts.clone());
-            let (kind, missing) = (BarrierKind::Phase, self.standing_at_phase(wait).missing);
+            let (kind, missing) = (BarrierKind::Phase, self.absent_at_phase(now, wait));
             statuses.push(BarrierStatus {
                 barrier,
                 parties,

@@ -7,6 +7,7 @@ use crate::sync::{
     words::{BarrierKind, OnPartyLoss},
 };
 
+const SECOND: Duration = Duration::from_secs(1);
 const MINUTE: Duration = Duration::from_secs(60);
 
 fn answered(index: u32, correlation: u64, answer: BarrierAnswer) -> Output {
@@ -71,7 +72,7 @@ fn who_requires_a_phase_is_released_when_it_is_reached_and_told_when_it_is_lost(
     assert_eq!(bench.registers(1, "gait", &["2 of *.drive at homed"]), []);
     bench.reaches(0, "homed", 7);
     let missing = [("2 of *.drive at homed (1 there): knee.drive".to_owned(), "has not reached this phase")];
-    assert_eq!(bench.core.wait_of(bench.now, app(1)).unwrap().missing, missing);
+    assert_eq!(in_words(bench.core.wait_of(bench.now, app(1)).unwrap().missing), missing);
     assert_eq!(bench.core.missing_in_brief(app(1)), missing);
     // Neither drive is ready.
     let mut homed = reached(2, &["homed"]);
@@ -92,12 +93,15 @@ fn who_waits_at_a_phase_and_for_whom_is_to_be_seen_and_said_at_the_deadline() {
     let missing = vec![("knee.drive at homed".to_owned(), "has not reached this phase".to_owned())];
     let status = bench.core.barriers(bench.now).remove(0);
     assert_eq!(
-        (status.barrier.as_str(), status.kind, &status.missing),
-        ("homed", BarrierKind::Phase, &missing)
+        (status.barrier.as_str(), status.kind, in_words(status.missing)),
+        ("homed", BarrierKind::Phase, vec![("knee.drive at homed".to_owned(), "has not reached this phase")])
     );
     assert_eq!(status.waiting, [("hip.drive".to_owned(), Duration::ZERO)]);
+    bench.passes(SECOND);
+    let [absence] = &bench.core.barriers(bench.now).remove(0).missing[..] else { panic!("one is missing") };
+    assert_eq!(absence.since, SECOND, "since somebody waits for it");
     let (apps, _) = bench.core.own_apps(bench.now, 1);
-    assert_eq!((apps[0].missing.len(), apps[0].waits), (1, Some(Duration::ZERO)));
+    assert_eq!((apps[0].missing.len(), apps[0].waits), (1, Some(SECOND)));
     let timed_out = answered(0, 7, BarrierAnswer::TimedOut { missing });
     assert!(bench.passes(MINUTE).contains(&timed_out));
     assert_eq!(bench.core.barriers(bench.now), []);

@@ -34,6 +34,7 @@ use self::{known::Wait, voices::Voices};
 use super::Reason;
 use crate::sync::{
     arrivals::{ARRIVALS_MAX, Arrival, Arrivals, BARRIERS_MAX, BarrierSaid, GENERATION_MAX, Member, Passed},
+    facts::Absence,
     list::Name,
     words::{BarrierAnswer, OnPartyLoss},
 };

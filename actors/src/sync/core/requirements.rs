@@ -1,13 +1,15 @@
 //! How a requirement stands: who counts for it, how many of them are ready, and why the others are not.
 
-use std::collections::BTreeSet;
+use std::{collections::BTreeSet, time::Duration};
 
 use sinew_runtime::{
     app::{Requirement, is_pattern},
     tid::{AppAddress, Tid},
+    time::Time,
 };
 
 use super::{Core, Reason};
+use crate::sync::facts::Absence;
 
 /// Of those that a requirement with a pattern or a choice lacks, so many are named at most.
 pub(super) const NAMED_MAX: usize = 8;
@@ -111,6 +113,14 @@ impl Core {
         let Some(nearest) = standing.why_not(requirement) else { return Vec::new() };
         let lack = Lack { ready: standing.ready.len(), unready: &standing.unready, nearest };
         self.parts(requirement, lack, usize::MAX)
+    }
+
+    /// The same with since when it lacks them.
+    pub(super) fn absences(&self, now: Time, of: AppAddress, requirement: &Requirement) -> Vec<Absence> {
+        let absent = self.apps.get(of).and_then(|app| app.absent.get(requirement.as_str()));
+        let since = absent.map_or(Duration::ZERO, |absent| now.since(*absent));
+        let parts = self.missing_parts(of, requirement).into_iter();
+        parts.map(|(name, why)| Absence { name, why: why.into(), since }).collect()
     }
 
     /// The parts of a requirement that is not met. That a name is part of a circle is seen within the first

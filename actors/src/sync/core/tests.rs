@@ -11,6 +11,7 @@ mod forms;
 #[path = "phases_tests.rs"]
 mod phases;
 
+use self::forms::in_words;
 use super::{
     barrier::{RETRY, SILENCE},
     peers::{REPEAT, SPACING},
@@ -92,7 +93,7 @@ impl Bench {
 
     /// The words about what keeps the first waiting application.
     fn missing(&self) -> Vec<(String, &'static str)> {
-        self.core.waiting(self.now).remove(0).missing
+        in_words(self.core.waiting(self.now).remove(0).missing)
     }
 }
 
@@ -240,7 +241,7 @@ fn one_that_was_stopped_in_order_is_not_said_to_have_failed() {
     assert_eq!(stopped, [lost(0, "sensor", Reason::Stopped), release(1)]);
     assert!(Reason::Stopped.is_orderly() && !Reason::Failed.is_orderly());
     assert_eq!(
-        bench.core.missing(bench.now, app(0)),
+        in_words(bench.core.missing(bench.now, app(0))),
         [("sensor".to_owned(), "stopped in order, not ready again")]
     );
 }
@@ -281,13 +282,11 @@ fn every_deadline_that_passes_reports_what_is_missing_since_when_and_why() {
     let deadline = bench.core.next_wake().unwrap();
     assert_eq!(deadline, bench.now + Duration::from_secs(60));
     let waited = |seconds| {
-        let missing =
-            vec![("sensor".to_owned(), "registered, not ready"), ("knee.drive".to_owned(), "not there")];
-        Output::Overdue(Waiting {
-            application: "gait".to_owned(),
-            missing,
-            since: Duration::from_secs(seconds),
-        })
+        let since = Duration::from_secs(seconds);
+        let absent =
+            |(name, why): (&str, &'static str)| Absence { name: name.to_owned(), why: why.into(), since };
+        let missing = [("sensor", "registered, not ready"), ("knee.drive", "not there")].map(absent).to_vec();
+        Output::Overdue(Waiting { application: "gait".to_owned(), missing, since })
     };
     assert_eq!(bench.passes(Duration::from_secs(59)), []);
     assert_eq!(bench.passes(Duration::from_secs(1)), [waited(60)]);

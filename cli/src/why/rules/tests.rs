@@ -158,7 +158,7 @@ fn waits(facts: &mut Facts, missing: &str) {
     let report = drive(facts).report.as_mut().expect("it is there");
     report.ready = false;
     report.waits_us = Some(2_000_000);
-    report.missing = vec![Missing { name: missing.to_owned(), why: "not there".to_owned() }];
+    report.missing = vec![Missing { name: missing.to_owned(), why: "not there".to_owned(), since_us: None }];
     facts.waits.insert("knee.drive".to_owned(), vec![missing.to_owned()]);
 }
 
@@ -412,7 +412,8 @@ fn what_should_be_known_does_not_stand_in_the_way() {
         (|facts| drive(facts).refused = 9, "9 messages were refused"),
         (
             |facts| {
-                let missing = Missing { name: "ankle".to_owned(), why: "its node is lost".to_owned() };
+                let missing =
+                    Missing { name: "ankle".to_owned(), why: "its node is lost".to_owned(), since_us: None };
                 drive(facts).report.as_mut().expect("it is there").missing.push(missing);
             },
             "it lost ankle",

@@ -24,7 +24,12 @@ struct Lack {
     has_lost: bool,
     /// Those who wait whose time is over.
     over: Vec<AppAddress>,
+    /// Of each party whether it is there, unless so many are that this is not looked at.
+    there: Vec<bool>,
 }
+
+/// Parties times those who are there, up to which it is looked at each time who is missing.
+const LOOKED_AT_MAX: usize = 1_024;
 
 impl Rendezvous {
     /// Opens what can be opened, then tells those whose time is over or who do not want to wait for a lost party. `linked` gives the
@@ -63,7 +68,11 @@ impl Rendezvous {
         let over = known.waiting.iter().filter(|(_, wait)| wait.is_over(now, has_lost));
         let over: Vec<AppAddress> = over.map(|(app, _)| *app).collect();
         let missing = if over.is_empty() { Vec::new() } else { missing(&known.parties, &present, why_not) };
-        Standing::Lacks(Lack { missing, has_lost, over })
+        let missing = missing.into_iter().map(|(_, name, why)| (name, why)).collect();
+        let is_little = known.parties.len() * present.len() <= LOOKED_AT_MAX;
+        let parties = known.parties.iter().filter(|_| is_little);
+        let there = parties.map(|party| arrived(party, &present) >= party.count()).collect();
+        Standing::Lacks(Lack { missing, has_lost, over, there })
     }
 
     // spec: SYNC-11
@@ -77,8 +86,9 @@ impl Rendezvous {
         self.changed(now);
     }
 
-    fn end_waits(&mut self, now: Time, key: &Key, Lack { missing, has_lost, over }: Lack) {
+    fn end_waits(&mut self, now: Time, key: &Key, Lack { missing, has_lost, over, there }: Lack) {
         let Some(known) = self.known.get_mut(key) else { return };
+        known.note_absent(now, &there);
         for wait in known.waiting.values_mut() {
             wait.lost = wait.lost_since(now, has_lost);
         }
@@ -115,15 +125,47 @@ impl Rendezvous {
         here.chain(there.map(|(member, name)| Present { member, name })).collect()
     }
 
-    /// Who is missing at `key`, and the last that is known of each.
+    /// Who is missing at `key`, since when, and the last that is known of each.
     pub(in crate::sync::core) fn missing(
         &self,
+        now: Time,
         key: &Key,
         linked: impl Fn(NodeAddress) -> Option<Incarnation>,
         why_not: impl Fn(&str) -> Option<Reason>,
-    ) -> Vec<(String, String)> {
+    ) -> Vec<Absence> {
         let Some(known) = self.known.get(key) else { return Vec::new() };
-        missing(&known.parties, &self.present(key, known, linked), &why_not)
+        let present = self.present(key, known, &linked);
+        let absence = |(party, name, why): (usize, String, String)| {
+            let since = known.absent_since(party).map_or(Duration::ZERO, |absent| now.since(absent));
+            let elsewhere = self.waits_elsewhere(key, &present, &name, &linked);
+            Absence { name, why: elsewhere.unwrap_or(why).into(), since }
+        };
+        missing(&known.parties, &present, &why_not).into_iter().map(absence).collect()
+    }
+
+    /// Whether who is missing at `key` waits at another barrier, of which this node knows, for somebody who waits at this one: as long as both
+    /// stay, neither opens.
+    fn waits_elsewhere(
+        &self,
+        key: &Key,
+        here: &[Present<'_>],
+        name: &str,
+        linked: &impl Fn(NodeAddress) -> Option<Incarnation>,
+    ) -> Option<String> {
+        self.known.iter().filter(|(other, _)| *other != key).find_map(|(other, known)| {
+            let there = self.present(other, known, linked);
+            let waits = |name: &str| there.iter().any(|present| present.name == name);
+            let lacks = |party: &Requirement| arrived(party, &there) < party.count();
+            if !waits(name) {
+                return None;
+            }
+            let is_awaited = |present: &&Present<'_>| {
+                !waits(present.name)
+                    && known.parties.iter().any(|party| party.counts(present.name) && lacks(party))
+            };
+            let awaited = here.iter().find(is_awaited)?.name;
+            Some(format!("waits at '{}' for {awaited}, which waits here for it: neither opens", &*other.name))
+        })
     }
 }
 
@@ -182,13 +224,14 @@ fn is_lost(party: &Requirement, present: &[Present<'_>], why_not: &impl Fn(&str)
     reason.is_some_and(Reason::is_end)
 }
 
+/// Which parties are missing, and the last that is known of each.
 fn missing(
     parties: &[Requirement],
     present: &[Present<'_>],
     why_not: &impl Fn(&str) -> Option<Reason>,
-) -> Vec<(String, String)> {
+) -> Vec<(usize, String, String)> {
     let mut missing = Vec::new();
-    for party in parties {
+    for (at, party) in parties.iter().enumerate() {
         let there = arrived(party, present);
         if there >= party.count() {
             continue;
@@ -196,11 +239,11 @@ fn missing(
         match party.only_name() {
             Some(name) => {
                 let why = why_not(name).map_or("ready, has not arrived", Reason::words);
-                missing.push((name.to_owned(), why.to_owned()));
+                missing.push((at, name.to_owned(), why.to_owned()));
             }
             None => {
                 let why = format!("{there} of {} have arrived", party.count());
-                missing.push((party.to_string(), why));
+                missing.push((at, party.to_string(), why));
             }
         }
     }

@@ -16,6 +16,8 @@ pub(in crate::sync::core) struct Known {
     /// Applications of this node that were there in their present life. It is not forgotten before they end: one that came again
     /// without it would pass with the word of its former visit.
     pub(super) visitors: BTreeSet<AppAddress>,
+    /// Of each party, since when it is known not to wait there, as long as somebody of this node does.
+    pub(super) absent: Vec<Option<Time>>,
 }
 
 /// An application of this node waits at a barrier.
@@ -49,12 +51,14 @@ impl Known {
             members: BTreeMap::new(),
             waiting: BTreeMap::new(),
             visitors: BTreeSet::new(),
+            absent: Vec::new(),
         }
     }
 
     /// Opens it for those who are there. `knows` gives the generation that a member's node is known to know. spec: SYNC-11
     pub(super) fn open(&mut self, present: Vec<Member>, knows: impl Fn(&Member) -> u64) {
         self.generation += 1;
+        self.absent.clear();
         for member in present {
             self.note(member, self.generation);
         }
@@ -76,9 +80,24 @@ impl Known {
             }
         }
         if is_later {
+            self.absent.clear();
             self.forget(knows);
         }
         is_news
+    }
+
+    /// Of a party that is missing: since when that is known, while somebody of this node waits.
+    pub(super) fn absent_since(&self, party: usize) -> Option<Time> {
+        let waits = self.waiting.values().map(|wait| wait.since).min();
+        self.absent.get(party).copied().flatten().max(waits)
+    }
+
+    /// Notes which parties are there.
+    pub(super) fn note_absent(&mut self, now: Time, there: &[bool]) {
+        self.absent.resize(there.len(), None);
+        for (absent, is_there) in self.absent.iter_mut().zip(there) {
+            *absent = (!is_there).then(|| absent.unwrap_or(now));
+        }
     }
 
     /// Notes who has passed which generation, and returns whether that is news. Where there is no room the smallest, by generation
