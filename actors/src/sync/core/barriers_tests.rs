@@ -287,7 +287,7 @@ fn who_waits_for_one_that_waits_for_him_at_another_barrier_is_told_so() {
     let why = |bench: &Bench| missing(bench).remove(0).2;
     assert_eq!(why(&bench), "ready, has not arrived");
     bench.is_told(KNEE, LIFE, 1, vec![awaited("homed", 0)]);
-    assert_eq!(why(&bench), "waits at 'homed' for hip, which waits here for it: neither opens");
+    assert_eq!(why(&bench), "waits at 'homed' for hip, which waits here for it");
     // An application may wait at several: at both, it keeps nobody.
     let asked = ArriveAtBarrier {
         kind: BarrierKind::Meeting,

@@ -10,7 +10,7 @@ use sinew_runtime::{
 
 use super::{
     Core, Output,
-    rendezvous::{Arrived, Key, Known, Rendezvous},
+    rendezvous::{Arrived, Key, Known, Rendezvous, WhoWaits},
 };
 use crate::sync::{
     arrivals::{Arrivals, PARTIES_MAX, fault_of_parties},
@@ -118,7 +118,8 @@ impl Core {
     /// The barriers at which somebody of this node waits, and who is missing at each.
     pub(crate) fn barriers(&self, now: Time) -> Vec<BarrierStatus> {
         let awaited = self.rendezvous.known.iter().filter(|(_, known)| !known.waiting.is_empty());
-        let meetings = awaited.map(|(key, known)| self.status(now, key, known));
+        let who_waits = self.rendezvous.who_waits(|node| self.peers.current(node));
+        let meetings = awaited.map(|(key, known)| self.status(now, (key, known), &who_waits));
         meetings.chain(self.awaited_phases(now)).collect()
     }
 
@@ -127,16 +128,15 @@ impl Core {
         self.apps.get(app).map_or_else(|| app.to_string(), |known| known.title(app))
     }
 
-    fn status(&self, now: Time, key: &Key, known: &Known) -> BarrierStatus {
+    fn status(&self, now: Time, (key, known): (&Key, &Known), who_waits: &WhoWaits<'_>) -> BarrierStatus {
         let waiting = known.waiting.iter().map(|(app, wait)| (self.title(*app), now.since(wait.since)));
-        let current = |node| self.peers.current(node);
         BarrierStatus {
             barrier: key.name.to_string(),
             parties: key.parties.clone(),
             kind: BarrierKind::Meeting,
             generation: known.generation,
             waiting: waiting.collect(),
-            missing: self.rendezvous.missing(now, key, current, |name| self.why_not(name)),
+            missing: who_waits.missing(now, key, |name| self.why_not(name)),
         }
     }
 }

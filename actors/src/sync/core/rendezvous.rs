@@ -16,6 +16,7 @@ mod room;
 #[cfg(test)]
 mod simulation;
 mod voices;
+mod who_waits;
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -29,7 +30,7 @@ use sinew_runtime::{
     time::Time,
 };
 
-pub(super) use self::known::Known;
+pub(super) use self::{known::Known, who_waits::WhoWaits};
 use self::{known::Wait, voices::Voices};
 use super::Reason;
 use crate::sync::{

@@ -3,9 +3,10 @@
 use super::*;
 
 /// Who waits at a barrier behind its last generation.
-struct Present<'known> {
+pub(super) struct Present<'known> {
     member: Member,
-    name: &'known str,
+    /// Empty where it has none.
+    pub(super) name: &'known str,
 }
 
 /// How a barrier stands.
@@ -110,7 +111,7 @@ impl Rendezvous {
     }
 
     /// Who waits at a barrier behind the last generation that is known here, on this node and on all that can be heard.
-    fn present<'known>(
+    pub(super) fn present<'known>(
         &'known self,
         key: &Key,
         known: &'known Known,
@@ -123,49 +124,6 @@ impl Rendezvous {
         });
         let there = self.voices.waiting(key, known.generation, linked);
         here.chain(there.map(|(member, name)| Present { member, name })).collect()
-    }
-
-    /// Who is missing at `key`, since when, and the last that is known of each.
-    pub(in crate::sync::core) fn missing(
-        &self,
-        now: Time,
-        key: &Key,
-        linked: impl Fn(NodeAddress) -> Option<Incarnation>,
-        why_not: impl Fn(&str) -> Option<Reason>,
-    ) -> Vec<Absence> {
-        let Some(known) = self.known.get(key) else { return Vec::new() };
-        let present = self.present(key, known, &linked);
-        let absence = |(party, name, why): (usize, String, String)| {
-            let since = known.absent_since(party).map_or(Duration::ZERO, |absent| now.since(absent));
-            let elsewhere = self.waits_elsewhere(key, &present, &name, &linked);
-            Absence { name, why: elsewhere.unwrap_or(why).into(), since }
-        };
-        missing(&known.parties, &present, &why_not).into_iter().map(absence).collect()
-    }
-
-    /// Whether who is missing at `key` waits at another barrier, of which this node knows, for somebody who waits at this one: as long as both
-    /// stay, neither opens.
-    fn waits_elsewhere(
-        &self,
-        key: &Key,
-        here: &[Present<'_>],
-        name: &str,
-        linked: &impl Fn(NodeAddress) -> Option<Incarnation>,
-    ) -> Option<String> {
-        self.known.iter().filter(|(other, _)| *other != key).find_map(|(other, known)| {
-            let there = self.present(other, known, linked);
-            let waits = |name: &str| there.iter().any(|present| present.name == name);
-            let lacks = |party: &Requirement| arrived(party, &there) < party.count();
-            if !waits(name) {
-                return None;
-            }
-            let is_awaited = |present: &&Present<'_>| {
-                !waits(present.name)
-                    && known.parties.iter().any(|party| party.counts(present.name) && lacks(party))
-            };
-            let awaited = here.iter().find(is_awaited)?.name;
-            Some(format!("waits at '{}' for {awaited}, which waits here for it: neither opens", &*other.name))
-        })
     }
 }
 
@@ -186,7 +144,7 @@ impl Wait {
 }
 
 /// How many of a party's applications are there: as many as it takes at most.
-fn arrived(party: &Requirement, present: &[Present<'_>]) -> usize {
+pub(super) fn arrived(party: &Requirement, present: &[Present<'_>]) -> usize {
     let there = present.iter().filter(|present| party.counts(present.name));
     there.take(party.count()).count()
 }
@@ -225,7 +183,7 @@ fn is_lost(party: &Requirement, present: &[Present<'_>], why_not: &impl Fn(&str)
 }
 
 /// Which parties are missing, and the last that is known of each.
-fn missing(
+pub(super) fn missing(
     parties: &[Requirement],
     present: &[Present<'_>],
     why_not: &impl Fn(&str) -> Option<Reason>,
