@@ -178,7 +178,7 @@ impl Inbound {
             message.reject(Rejection::Unsupported);
             return Some(End::Refused);
         }
-        self.into_our_clock(now, &mut message.header);
+        self.turn_to_our_clock(now, &mut message.header);
         if message.header.is_expired(now) {
             message.settle(Outcome::Expired);
             return Some(End::Expired);
@@ -239,7 +239,7 @@ impl Inbound {
     ///
     /// As long as nobody has measured the peer's clock, its time to live counts from `now`, and whoever gets it is told that its age is not
     /// known.
-    fn into_our_clock(&self, now: Time, header: &mut Header) {
+    fn turn_to_our_clock(&self, now: Time, header: &mut Header) {
         let measured = self.stores.clocks.get(self.peer.node);
         let times = measured.map(|clock| clock.in_our_clock(now, header.sent));
         header.sent = times.map_or(now, |(sent, _)| sent);

@@ -359,7 +359,9 @@ mod tests {
         let (before, after) = (Truth::new(0, 20_000, &[0]), Truth::new(1_000_000_000, 20_000, &[0]));
         let mut clock = PeerClock::default();
         let legs = [60_000, 20_000, 40_000];
-        (0..60).for_each(|at| drop(clock.measure(before.exchange(BEGIN + at * SECOND, legs))));
+        for at in 0..60 {
+            assert_eq!(clock.measure(before.exchange(BEGIN + at * SECOND, legs)), Measured::Offset);
+        }
         assert_eq!(clock.measure(after.exchange(BEGIN + 60 * SECOND, legs)), Measured::Leap);
         let said = clock.offset(Time::from_nanos(BEGIN + 60 * SECOND + 120_000)).unwrap();
         assert!(after.bears_out(said) && said.drift == ClockDrift::UNKNOWN, "{said:?}");

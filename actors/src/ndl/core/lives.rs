@@ -170,7 +170,9 @@ impl Core {
                 return;
             }
             Measured::Leap => {
-                let what = format_args!("{node} or this node: its host slept, or something set the clock");
+                let what = format_args!(
+                    "that of {node}, or this node's: the host slept, or something slews the clock"
+                );
                 self.refusals.count(now, "a monotonic clock leapt", &what);
             }
         }
