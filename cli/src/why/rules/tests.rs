@@ -33,6 +33,8 @@ fn peer(number: u8) -> PeerReport {
         round_trip_ns: None,
         offset_ns: None,
         offset_bound_ns: None,
+        drift_ppb: None,
+        drift_bound_ppb: None,
         linked_us: Some(4_000_000),
         broken_us: None,
         dial: None,
