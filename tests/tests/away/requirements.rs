@@ -103,12 +103,16 @@ fn the_tree_shows_who_is_paused_and_why_and_who_was_stopped_is_not_said_to_have_
     all_run(&[&node]);
     log.wait_for(Seen::Started(1));
     let walker = || node.handle().tree().ok()?.find("walker").cloned();
-    let is = |state, missing: &[(String, &str)]| {
-        walker().filter(|walker| walker.state == state && walker.missing == missing)
+    let is = |state, missing: &[(&str, &str)]| {
+        let lacks = |walker: &sinew::Supervised| {
+            let lacks = walker.missing.iter().map(|absence| (&*absence.name, &*absence.why));
+            lacks.eq(missing.iter().copied())
+        };
+        walker().filter(|walker| walker.state == state && lacks(walker))
     };
     until("it runs and lacks nothing", || is(LifeState::Ready, &[]));
     node.handle().stop_app("anchor").expect("it is there");
-    let why = ("anchor".to_owned(), "stopped in order, not ready again");
+    let why = ("anchor", "stopped in order, not ready again");
     let shown = until("it is paused", || is(LifeState::Paused, std::slice::from_ref(&why))).to_string();
     assert!(shown.starts_with("walker: paused for "), "{shown}");
     assert!(shown.contains(", without anchor (stopped in order, not ready again)"), "{shown}");
