@@ -15,7 +15,7 @@ use crate::{
 };
 
 /// Columns of the table.
-const COLUMNS: usize = 13;
+const COLUMNS: usize = 14;
 
 /// Asks every node.
 pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {

@@ -137,6 +137,7 @@ pub(crate) mod tests {
             foreign: Vec::new(),
             refusals: Vec::new(),
             peers: Vec::new(),
+            own_stalls: None,
             left_out: 0,
         }
     }

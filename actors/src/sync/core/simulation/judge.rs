@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::{super::reason::Reason, APPS, Core, Fault, Life, NODES, Wanted, World, app_address, name};
+use crate::sync::facts::Absence;
 
 impl World {
     /// The applications that can run: all that they require can.
@@ -36,15 +37,17 @@ impl World {
     fn check_reasons(&self, index: usize) -> Result<(), String> {
         let Some(life) = self.life_of(index).filter(|life| life.released == 0) else { return Ok(()) };
         let (core, who) = (&self.cores[index / APPS], name(index));
-        let missing: Vec<(String, &str)> = if self.fault == Some(Fault::ReasonsKept) {
+        let missing: Vec<Absence> = if self.fault == Some(Fault::ReasonsKept) {
             Vec::new()
         } else {
             core.missing(self.now, app_address(index % APPS))
         };
         require(!missing.is_empty(), || format!("{who} waits, and no reason is given"))?;
         // Of a requirement with several names each that is not ready is told behind it.
-        let named: BTreeMap<&str, &str> =
-            missing.iter().map(|(what, why)| (what.rsplit(": ").next().unwrap_or(what), *why)).collect();
+        let named: BTreeMap<&str, &str> = missing
+            .iter()
+            .map(|Absence { name, why, .. }| (name.rsplit(": ").next().unwrap_or(name), &**why))
+            .collect();
         for other in 0..NODES * APPS {
             let other_name = name(other);
             let life = self.life_of(other);
