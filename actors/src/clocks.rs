@@ -100,13 +100,18 @@ impl ClockOffset {
         }
     }
 
-    /// A time of theirs that is past at `now`, in our clock, and how wrong that may be.
-    pub(crate) fn in_our_clock(self, now: Time, theirs: Time) -> (Time, Duration) {
+    /// A time of theirs that is past at `now`, in our clock, and how wrong that may be; `None` if by this offset it is still to come: then
+    /// the offset is another one by now, as this host has slept, say.
+    pub(crate) fn in_our_clock(self, now: Time, theirs: Time) -> Option<(Time, Duration)> {
         let present = self.at(now);
-        let ours = theirs.shifted(present.theirs_minus_ours_ns.saturating_neg()).min(now);
+        let ours = theirs.shifted(present.theirs_minus_ours_ns.saturating_neg());
+        if ours > now + present.bound {
+            return None;
+        }
+        let ours = ours.min(now);
         // It was another offset then, if only by a little.
         let drifted = drift_ns_max(now.as_nanos() - ours.as_nanos());
-        (ours, present.bound.saturating_add(Duration::from_nanos(drifted)))
+        Some((ours, present.bound.saturating_add(Duration::from_nanos(drifted))))
     }
 }
 
@@ -175,9 +180,25 @@ mod tests {
         let far = ClockOffset { theirs_minus_ours_ns: i64::MAX, ..offset(i64::MIN, u64::MAX) };
         for at in [Time::ZERO, Time::MAX] {
             for theirs in [Time::ZERO, Time::MAX] {
-                let (ours, _) = far.in_our_clock(at, theirs);
-                assert!(ours <= at);
+                let times = far.in_our_clock(at, theirs);
+                assert!(times.is_none_or(|(ours, _)| ours <= at), "{times:?}");
             }
         }
+    }
+
+    #[test]
+    fn a_send_time_that_is_still_to_come_is_not_known() {
+        // Given: an offset that is exact to 100 us; this host has slept for three seconds since.
+        let (clock, now) = (offset(0, 0), Time::from_nanos(3_600 * SECOND));
+        let theirs = |ours: u64| Time::from_nanos(ours + 7 * SECOND);
+        let sent = 3_600 * SECOND;
+        assert!(clock.in_our_clock(now, theirs(sent - SECOND)).is_some());
+        assert_eq!(
+            clock.in_our_clock(now, theirs(sent + 50_000)).map(|(at, _)| at),
+            Some(now),
+            "by its error"
+        );
+        assert_eq!(clock.in_our_clock(now, theirs(sent + 3 * SECOND)), None);
+        assert_eq!(clock.in_our_clock(now, Time::MAX), None);
     }
 }

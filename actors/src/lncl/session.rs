@@ -1,6 +1,6 @@
 //! What a client's frame means, and whether it may say so. Pure: frames in, orders out.
 
-use std::collections::BTreeSet;
+use std::{collections::BTreeSet, time::Duration};
 
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
@@ -170,7 +170,7 @@ fn read_early(message: &Message) -> Result<Order, Violation> {
     }
 }
 
-fn read_data(message: Message) -> Order {
+fn read_data(mut message: Message) -> Order {
     // The flag belongs to frames of kind OUTCOME alone; a message with it could be taken for one further on.
     // Of a Stream the newest wins, so an older one has no outcome of its own.
     let is_confirmed_stream =
@@ -178,6 +178,8 @@ fn read_data(message: Message) -> Order {
     if message.header.flags.has(Flags::OUTCOME) || is_confirmed_stream {
         return Order::RefuseMessage { message, why: Rejection::Unsupported };
     }
+    // It was sent on this host.
+    message.header.set_sent_error(Some(Duration::ZERO));
     Order::Route(message)
 }
 

@@ -477,7 +477,7 @@ typedef struct sinew_received {
      */
     uint64_t sequence;
     /**
-     * When it was sent, on the clock of `sinew_now_ns`; 0: nobody has measured the clock of the sender's host yet.
+     * When it was sent, on the clock of `sinew_now_ns`; 0: nobody has measured the clock of the sender's host yet, or not well enough (32 s).
      */
     uint64_t sent_ns;
     /**

@@ -166,9 +166,11 @@ public:
     sinew::kind kind() const noexcept { return raw_.kind; }
     std::uint64_t sequence() const noexcept { return raw_.sequence; }
     bool wants_reply() const noexcept { return raw_.wants_reply; }
-    /// Time since it was sent.
+    /// Time since it was sent; `duration::max()` while nobody has measured the clock of the sender's host, or it is known too badly.
     duration age() const noexcept
     {
+        if (raw_.sent_ns == 0)
+            return duration::max();
         const std::uint64_t now = sinew_now_ns();
         return duration(now > raw_.sent_ns ? static_cast<std::int64_t>(now - raw_.sent_ns) : 0);
     }

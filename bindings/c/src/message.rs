@@ -59,7 +59,7 @@ pub struct Received {
     pub destination: TidBits,
     /// The source's n-th message, from 1.
     pub sequence: u64,
-    /// When it was sent, on the clock of `sinew_now_ns`; 0: nobody has measured the clock of the sender's host yet.
+    /// When it was sent, on the clock of `sinew_now_ns`; 0: nobody has measured the clock of the sender's host yet, or not well enough (32 s).
     pub sent_ns: u64,
     /// For the library: by this it knows the message again.
     pub token: u64,

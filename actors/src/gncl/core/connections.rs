@@ -80,9 +80,9 @@ impl Core {
         });
         let mut of_addresses: Vec<_> = of_addresses.collect();
         of_addresses.sort_unstable();
-        let mut before: BTreeMap<(bool, Option<IpAddr>), usize> = BTreeMap::new();
+        let mut before: BTreeMap<Option<IpAddr>, usize> = BTreeMap::new();
         let ranked = of_addresses.into_iter().map(|(_, Reverse(connection), from, is_expected)| {
-            let before = before.entry((is_expected, from.map(network_of))).or_default();
+            let before = before.entry(from.map(network_of)).or_default();
             *before += 1;
             (is_expected, Reverse(*before), connection)
         });

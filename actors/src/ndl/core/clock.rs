@@ -85,8 +85,15 @@ impl PeerClock {
     /// Takes in an exchange. // spec: NDL-6
     pub(super) fn measure(&mut self, exchange: Exchange) -> Measured {
         let Some(sample) = sample(exchange) else { return Measured::Nothing };
-        let is_possible = self.allows(sample) && self.note_drift(sample);
-        if !is_possible {
+        if !self.allows(sample) {
+            // Something steers one of the clocks, as NTP does: what is left is what holds of every clock.
+            (self.drift, self.span) = ((sample.at, ClockDrift::UNKNOWN), None);
+            self.spans.clear();
+        }
+        let is_possible = self.allows(sample);
+        if is_possible {
+            self.note_drift(sample);
+        } else {
             *self = Self { span: Some((sample.at, sample)), ..Self::default() };
         }
         self.round_trip = Some(sample.round_trip);
@@ -121,30 +128,32 @@ impl PeerClock {
         })
     }
 
-    /// Keeps the best of each span, and at the end of each sees what drift it leaves; `false`: none.
-    fn note_drift(&mut self, sample: Sample) -> bool {
+    /// Keeps the best of each span, and at the end of each sees what drift it leaves. If none, something steers one of the clocks.
+    fn note_drift(&mut self, sample: Sample) {
         match &mut self.span {
             Some((began, best)) if sample.at.as_nanos().saturating_sub(began.as_nanos()) < SPAN_NS => {
                 if sample.bound_ns < best.bound_ns {
                     *best = sample;
                 }
-                return true;
+                return;
             }
             Some(_) | None => {}
         }
-        let Some((_, over)) = self.span.replace((sample.at, sample)) else { return true };
+        let Some((_, over)) = self.span.replace((sample.at, sample)) else { return };
         let (at, drift) = self.drift;
         let present = drift.apart(over.at.as_nanos().abs_diff(at.as_nanos()));
         let most = Range { least: -i128::from(DRIFT_PPB_MAX), most: i128::from(DRIFT_PPB_MAX) };
         let allowed = (self.spans.iter())
             .fold(most.and(present.into()), |allowed, former| allowed.and(Range::between(former, &over)));
+        let drift = allowed.drift();
+        if drift.is_none() {
+            self.spans.clear();
+        }
         if self.spans.len() == SPANS_MAX {
             self.spans.pop_front();
         }
         self.spans.push_back(over);
-        let drift = allowed.drift();
         self.drift = (over.at, drift.unwrap_or(ClockDrift::UNKNOWN));
-        drift.is_some()
     }
 }
 
@@ -366,6 +375,23 @@ mod tests {
         let said = clock.offset(Time::from_nanos(BEGIN + 60 * SECOND + 120_000)).unwrap();
         assert!(after.bears_out(said) && said.drift == ClockDrift::UNKNOWN, "{said:?}");
         assert_eq!(clock.measure(after.exchange(BEGIN + 61 * SECOND, legs)), Measured::Offset);
+    }
+
+    #[test]
+    fn a_clock_that_is_steered_has_not_leapt_and_only_its_former_drift_is_forgotten() {
+        for ppb in [4_000, 12_000, 40_000, 150_000] {
+            // Given: from a minute on it runs at another rate.
+            let before = Truth::new(0, 0, &[0]);
+            let after = Truth::new(-60 * i64::from(ppb), ppb.into(), &[0]);
+            let (mut clock, legs) = (PeerClock::default(), [60_000, 20_000, 40_000]);
+            for at in 0..180 {
+                let truth = if at < 60 { &before } else { &after };
+                let measured = clock.measure(truth.exchange(BEGIN + at * SECOND, legs));
+                assert_eq!(measured, Measured::Offset, "{ppb} at {at} s");
+            }
+            let said = clock.offset(Time::from_nanos(BEGIN + 179 * SECOND + 120_000)).unwrap();
+            assert!(after.bears_out(said), "{ppb}: {said:?}");
+        }
     }
 
     #[test]

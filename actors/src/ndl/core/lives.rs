@@ -171,7 +171,7 @@ impl Core {
             }
             Measured::Leap => {
                 let what = format_args!(
-                    "that of {node}, or this node's: the host slept, or something slews the clock"
+                    "that of {node}, or this node's: the host slept, or the clock is set or slewed by much"
                 );
                 self.refusals.count(now, "a monotonic clock leapt", &what);
             }

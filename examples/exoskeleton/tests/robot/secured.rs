@@ -6,11 +6,11 @@ use crate::{alone, end, folder, start_in};
 
 const README: &str = include_str!("../../../../README.md");
 
-/// What stands behind this on a line of the README.
+/// What stands behind this on a line of the README, but for what the shell takes for a comment.
 fn words_behind(command: &str) -> Vec<&'static str> {
     let mut found = README.lines().filter_map(|line| line.trim().strip_prefix(command));
     let words = found.next().unwrap_or_else(|| panic!("the README has no line with `{command}`"));
-    words.split_whitespace().collect()
+    words.split_whitespace().take_while(|word| *word != "#").collect()
 }
 
 /// `sinew`, which another package builds into the same directory.
