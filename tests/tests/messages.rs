@@ -296,7 +296,7 @@ fn who_waits_for_whom_can_be_asked() {
     let node = node("alone", 1, own_group()).app(spec.requires(["never"])).start().expect("the layers start");
     let error = node.handle().wait_until_running(Duration::from_millis(50)).expect_err("it waits");
     let words = error.to_string();
-    assert!(words.contains("oracle") && words.contains("never (not there)"), "{words}");
+    assert!(words.contains("oracle") && words.contains("never (not there; missing for "), "{words}");
 }
 
 #[test]
