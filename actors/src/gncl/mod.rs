@@ -35,6 +35,7 @@
 //! | `courtesy.rs` | when that thread gives its CPU away |
 //! | `arrivals.rs` | what became of what came, counted |
 //! | `inbound.rs` | what is checked before a frame becomes a message of this node |
+//! | `proofs.rs` | with which certificate each node was linked last |
 //! | `stream_way.rs` | how much of class Stream goes by datagram, for whoever asks |
 //! | `datagrams/` | values of class Stream by UDP, where they get through |
 //! | `interfaces.rs` | which of this host's addresses are lost, as the kernel says |
@@ -62,6 +63,7 @@ mod marks;
 mod notes;
 mod owed;
 mod peer;
+mod proofs;
 mod secure;
 mod spin;
 mod stream_way;

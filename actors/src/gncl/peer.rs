@@ -32,6 +32,7 @@ use super::{
     datagrams::{Alarm, Channel, HandedOn, Position, Sockets},
     notes::Notes,
     owed::Owed,
+    proofs::Proofs,
     task::{Move, Place},
     ticks::Ticks,
     transport::Transport,
@@ -336,6 +337,8 @@ pub(crate) struct Store {
     gone_count: AtomicUsize,
     /// What was handed on by datagram of lives that are forgotten and may come back, oldest first.
     handed_on: Mutex<VecDeque<(NodeAddress, Incarnation, HandedOn)>>,
+    /// How nodes proved who they are when they were linked last.
+    pub(super) proofs: Proofs,
     /// Every life of a peer that somebody still holds, for an audit; those that are gone are in `buried`.
     met: Mutex<Vec<Weak<Peer>>>,
     /// The accounts of those that nobody holds any more, both ways, all together.

@@ -72,6 +72,11 @@ impl Gncl {
         if let Some(secured) = self.stores.secured.get()
             && let Some(wire) = self.wires.get(&connection)
         {
+            if let Some(peer) = &wire.proven {
+                let nodes_max = self.stores.config.ndl.nodes_max;
+                let known = |node| self.core.knows(node);
+                self.stores.gncl.proofs.note((node, incarnation), peer.clone(), nodes_max, known);
+            }
             secured.confirm(Time::now(), Stamp { node, incarnation, number: wire.datagrams_made });
         }
     }
@@ -104,7 +109,8 @@ impl Gncl {
         Some(Decline::Security(why.to_string()))
     }
 
-    /// Another deny list is in force: whose certificate is on it is refused on each connection that it has, in whatever stage that is.
+    /// Another deny list is in force: whose certificate is on it is refused on each connection that it has, in whatever stage that is, and
+    /// was not linked.
     // spec: GNCL-18
     pub(super) fn end_the_denied(&mut self, ctx: &mut Context<Self>) {
         let denied = self.wires.iter().filter_map(|(connection, wire)| {
@@ -113,7 +119,16 @@ impl Gncl {
         });
         let denied: Vec<_> = denied.collect();
         for (connection, decline) in denied {
-            self.input(Input::Disproven(connection, decline), ctx);
+            self.input(Input::Violated(connection, decline), ctx);
+        }
+        self.disprove_the_denied(ctx);
+    }
+
+    /// Whose link ended before its certificate was revoked is asked for as well: it may go on to answer NDL. spec: GNCL-7
+    fn disprove_the_denied(&mut self, ctx: &mut Context<Self>) {
+        let denied = self.stores.gncl.proofs.of_those(|peer| self.denied(peer).is_some());
+        for (node, incarnation) in denied {
+            self.input(Input::Disproven { node, incarnation }, ctx);
         }
     }
 }

@@ -335,18 +335,6 @@ impl Core {
         self.outputs.push_back(Output::Refuse(connection, decline.to_refusal()));
     }
 
-    /// Whoever is there has not proven who it is, as is known by now: the life that was linked so bars no other, or a thief could keep the
-    /// node itself out by what it says in datagrams. spec: GNCL-7
-    pub(super) fn disproven(&mut self, now: Time, connection: ConnectionId, decline: &Decline) {
-        let stage = self.stage(connection);
-        self.decline(now, connection, decline);
-        if let Some(Stage::Linked(node, Lane::Control)) = stage
-            && let Some(peer) = self.peers.get_mut(&node)
-        {
-            (peer.met, peer.was_linked) = (now, false);
-        }
-    }
-
     pub(super) fn ended(&mut self, now: Time, connection: ConnectionId) {
         if let Some(stage) = self.stage(connection) {
             self.leave_stage(now, connection, stage);

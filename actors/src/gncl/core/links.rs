@@ -94,6 +94,17 @@ impl Core {
         }
     }
 
+    /// This life has not proven who it is, as is known by now, whether its link stands or not: it bars no other, or a thief could keep the
+    /// node itself out by what it says in datagrams. Told again it begins no new time. spec: GNCL-7
+    pub(super) fn disproven(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
+        if let Some(peer) = self.peers.get_mut(&node)
+            && peer.incarnation == incarnation
+            && peer.was_linked
+        {
+            (peer.met, peer.was_linked) = (now, false);
+        }
+    }
+
     /// A link outlives the word of its node that it leaves: GOODBYE, or its break, ends it. spec: GNCL-10
     pub(super) fn leaves(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) {
         match self.peers.get_mut(&node) {

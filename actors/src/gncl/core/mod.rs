@@ -100,8 +100,8 @@ pub(super) enum Input {
     RefusalReceived(ConnectionId, Refusal),
     /// The peer sent what cannot be used.
     Violated(ConnectionId, Decline),
-    /// What the peer proved who it is with counts no more.
-    Disproven(ConnectionId, Decline),
+    /// What this life of a node proved who it is with, when it was linked last, counts no more.
+    Disproven { node: NodeAddress, incarnation: Incarnation },
     /// Any frame came on a link but PING and PONG.
     Heard(ConnectionId),
     /// Messages pass on a link.
@@ -241,6 +241,11 @@ impl Core {
         ConnectionId(self.opened)
     }
 
+    /// Whether anything is known of `node`: of so many nodes at most as peers are known at most.
+    pub(super) fn knows(&self, node: NodeAddress) -> bool {
+        self.peers.contains_key(&node)
+    }
+
     /// Takes note of what happened at `now`.
     pub(super) fn handle(&mut self, now: Time, input: Input) {
         match input {
@@ -258,7 +263,7 @@ impl Core {
             Input::WelcomeReceived(connection, welcome) => self.welcome(now, connection, &welcome),
             Input::RefusalReceived(connection, refusal) => self.refused(now, connection, &refusal),
             Input::Violated(connection, decline) => self.decline(now, connection, &decline),
-            Input::Disproven(connection, decline) => self.disproven(now, connection, &decline),
+            Input::Disproven { node, incarnation } => self.disproven(now, node, incarnation),
             Input::Heard(connection) => self.heard(now, connection),
             Input::Carried(connection) => self.carried(connection),
             Input::PongReceived(connection) => self.lives(now, connection),

@@ -111,14 +111,24 @@ impl Node {
         made_for: u32,
         set: impl FnOnce(&mut NodeConfig),
     ) -> Self {
+        Self::start_secured_in(Incarnation(1), number, (keys, made_for), set).await
+    }
+
+    /// The same in that life.
+    pub(super) async fn start_secured_in(
+        life: Incarnation,
+        number: u32,
+        (keys, made_for): (&Authority, u32),
+        set: impl FnOnce(&mut NodeConfig),
+    ) -> Self {
         let mut config = NodeConfig::new(format!("node-{number}"));
         config.address = Some(NodeAddress::new(number));
         set(&mut config);
         let (project, name) = (config.project.clone(), format!("node-{made_for}"));
         let made_for = Identity { project, address: NodeAddress::new(made_for), name };
-        let stores = Stores::for_test(config, Incarnation(1));
+        let stores = Stores::for_test(config, life);
         let credentials = keys.credentials_of(&made_for);
-        let secured = Secured::new(ground::tls(&credentials), &credentials, 8, Incarnation(1));
+        let secured = Secured::new(ground::tls(&credentials), &credentials, 8, life);
         assert!(stores.secured.set(secured).is_ok(), "it is set once");
         Self::begin(stores).await
     }

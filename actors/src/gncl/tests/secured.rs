@@ -2,12 +2,12 @@
 
 use std::time::Duration;
 
-use sinew_runtime::{outcome::Outcome, wire::Class};
+use sinew_runtime::{outcome::Outcome, tid::Incarnation, wire::Class};
 use tokio::net::TcpListener;
 
 use super::bench::{ByHand, Cable, NINE, Node, introduction, next, run, within};
 use crate::{
-    gncl::{Event, core::write, peer::frame, secure::is_sealed},
+    gncl::{Event, LinkFact, core::write, peer::frame, secure::is_sealed},
     security::{DenyList, tests::ground::Authority},
 };
 use sinew_runtime::wire::Kind;
@@ -129,9 +129,7 @@ fn a_node_whose_certificate_is_revoked_is_refused_on_the_link_that_stands_and_on
         b.send(a.tid(1), b"before");
         next("a message", &mut at_a).await;
         // When
-        let revoked = &b.stores.secured.get().expect("it has keys").serial;
-        let list = DenyList::read(&revoked.to_string()).expect("it is a number");
-        a.stores.secured.get().expect("it has keys").tls.deny(list);
+        revoke(&a, &b);
         a.tell(Event::DenyListChanged);
         // Then: it ends with words
         a.broken().await;
@@ -139,6 +137,45 @@ fn a_node_whose_certificate_is_revoked_is_refused_on_the_link_that_stands_and_on
         b.counted("refused by the peer").await;
         // And as NDL still holds it for present it is dialled, and not taken.
         a.counted("peer not proven").await;
+    });
+}
+
+/// Nothing looks at what there is until GNCL is told.
+fn revoke(at: &Node, whose: &Node) {
+    let revoked = &whose.stores.secured.get().expect("it has keys").serial;
+    let list = DenyList::read(&revoked.to_string()).expect("it is a number");
+    at.stores.secured.get().expect("it has keys").tls.deny(list);
+}
+
+/// A node that a thief was linked with, as node 2 in the last of all lives; its keys are on that node's deny list, which GNCL does not know.
+async fn left_by_a_thief(keys: &Authority) -> Node {
+    let mut a = Node::start_secured(1, keys, 1).await;
+    let thief = Node::start_secured_in(Incarnation(u64::MAX), 2, (keys, 2), |_| {}).await;
+    thief.find(a.address(), a.listens_at());
+    a.up().await;
+    revoke(&a, &thief);
+    drop(thief);
+    a.broken().await;
+    a
+}
+
+/// Node 2 itself, with new keys and in an earlier life, is linked with `a`: after 5 s.
+async fn itself_comes(mut a: Node, keys: &Authority) {
+    let b = Node::start_secured(2, keys, 2).await;
+    b.find(a.address(), a.listens_at());
+    a.counted("stale incarnation").await;
+    let LinkFact::LinkUp { incarnation, .. } = a.fact().await else { panic!("no other fact") };
+    assert_eq!(incarnation, Incarnation(1));
+}
+
+// spec: GNCL-7
+#[test]
+fn a_thief_who_hangs_up_before_its_certificate_is_revoked_does_not_keep_the_node_itself_out() {
+    run(async {
+        let keys = keys();
+        let a = left_by_a_thief(&keys).await;
+        a.tell(Event::DenyListChanged);
+        itself_comes(a, &keys).await;
     });
 }
 

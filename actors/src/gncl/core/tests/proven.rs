@@ -86,19 +86,41 @@ fn a_life_that_was_linked_bars_earlier_ones_as_ever() {
 
 // spec: GNCL-7
 #[test]
-fn a_thief_whose_certificate_is_revoked_while_it_is_linked_bars_the_node_itself_for_five_seconds_only() {
-    // Given: the last of all lives is linked, with keys that were stolen, and NDL goes on to hear it
+fn a_thief_whose_certificate_is_revoked_bars_the_node_itself_for_five_seconds_only() {
+    let disproven = Input::Disproven { node: HIGH, incarnation: Incarnation(u64::MAX) };
+    for hangs_up_first in [false, true] {
+        // Given: the last of all lives is linked, with keys that were stolen, and NDL goes on to hear it
+        let mut core = core();
+        core.handle(millis(0), found(u64::MAX));
+        let (link, up) = greet(&mut core, millis(1), hello_from(HIGH, u64::MAX, 1));
+        assert!(is_up(&up, u64::MAX));
+        // When
+        let end = if hangs_up_first {
+            Input::Ended(link)
+        } else {
+            Input::Violated(link, Decline::Security("it is revoked".to_owned()))
+        };
+        core.handle(millis(99), end);
+        let then = outputs(&mut core);
+        assert!(is_down(&then), "{then:?}");
+        core.handle(millis(100), disproven.clone());
+        // Then, also where the list is read once more
+        let (_, at_once) = greet(&mut core, millis(5_099), hello_from(HIGH, 5, 1));
+        assert_eq!(refusal(&at_once), Some("stale incarnation"));
+        core.handle(millis(5_099), disproven.clone());
+        core.handle(millis(5_099), found(u64::MAX));
+        let (_, later) = greet(&mut core, millis(5_100), hello_from(HIGH, 5, 2));
+        assert!(is_up(&later, 5), "{later:?}");
+    }
+}
+
+// spec: GNCL-7
+#[test]
+fn a_life_bars_earlier_ones_though_the_certificate_of_another_one_of_its_node_is_revoked() {
     let mut core = core();
-    core.handle(millis(0), found(u64::MAX));
-    let (link, up) = greet(&mut core, millis(1), hello_from(HIGH, u64::MAX, 1));
-    assert!(is_up(&up, u64::MAX));
-    // When
-    core.handle(millis(100), Input::Disproven(link, Decline::Security("it is revoked".to_owned())));
-    let then = outputs(&mut core);
-    assert!(is_down(&then) && refusal(&then) == Some("security"), "{then:?}");
-    // Then
-    let (_, at_once) = greet(&mut core, millis(5_099), hello_from(HIGH, 5, 1));
-    assert_eq!(refusal(&at_once), Some("stale incarnation"));
-    let (_, later) = greet(&mut core, millis(5_100), hello_from(HIGH, 5, 2));
-    assert!(is_up(&later, 5), "{later:?}");
+    core.handle(millis(0), found(5));
+    greet(&mut core, millis(1), hello_from(HIGH, 5, 1));
+    core.handle(millis(2), Input::Disproven { node: HIGH, incarnation: Incarnation(9) });
+    let (_, earlier) = greet(&mut core, millis(60_000), hello_from(HIGH, 4, 9));
+    assert_eq!(refusal(&earlier), Some("stale incarnation"));
 }
