@@ -35,6 +35,7 @@ impl Gncl {
                 }
             }
         }
+        self.disprove_the_denied(ctx);
         for KnownNode { node, incarnation, gncl: addresses, .. } in members {
             self.input(Input::NodeFound { node, incarnation, addresses }, ctx);
         }
@@ -61,6 +62,11 @@ impl StreamHandler<Event> for Gncl {
             Event::Forgotten { node, incarnation } => Input::NodeDisowned { node, incarnation },
             Event::DenyListChanged => return self.end_the_denied(ctx),
         };
+        // Of a node that is not known the core takes it that a former instance may have linked it.
+        let is_as_linked = matches!(input, Input::NodeLost { node, .. } if !self.core.knows(node));
         self.input(input, ctx);
+        if is_as_linked {
+            self.disprove_the_denied(ctx);
+        }
     }
 }

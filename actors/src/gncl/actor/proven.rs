@@ -124,8 +124,9 @@ impl Gncl {
         self.disprove_the_denied(ctx);
     }
 
-    /// Whose link ended before its certificate was revoked is asked for as well: it may go on to answer NDL. spec: GNCL-7
-    fn disprove_the_denied(&mut self, ctx: &mut Context<Self>) {
+    /// Whose link ended before its certificate was revoked is asked for as well: it may go on to answer NDL. So are those that a former
+    /// instance of this layer linked. spec: GNCL-7
+    pub(super) fn disprove_the_denied(&mut self, ctx: &mut Context<Self>) {
         let denied = self.stores.gncl.proofs.of_those(|peer| self.denied(peer).is_some());
         for (node, incarnation) in denied {
             self.input(Input::Disproven { node, incarnation }, ctx);

@@ -2,12 +2,17 @@
 
 use std::time::Duration;
 
-use sinew_runtime::{outcome::Outcome, tid::Incarnation, wire::Class};
+use sinew_runtime::{
+    outcome::Outcome,
+    tid::{Incarnation, NodeAddress},
+    wire::Class,
+};
 use tokio::net::TcpListener;
 
 use super::bench::{ByHand, Cable, NINE, Node, introduction, next, run, within};
 use crate::{
     gncl::{Event, LinkFact, core::write, peer::frame, secure::is_sealed},
+    ndl::{LossReason, MembershipFact},
     security::{DenyList, tests::ground::Authority},
 };
 use sinew_runtime::wire::Kind;
@@ -175,6 +180,35 @@ fn a_thief_who_hangs_up_before_its_certificate_is_revoked_does_not_keep_the_node
         let keys = keys();
         let a = left_by_a_thief(&keys).await;
         a.tell(Event::DenyListChanged);
+        itself_comes(a, &keys).await;
+    });
+}
+
+// spec: GNCL-7
+#[test]
+fn a_thief_whose_certificate_is_revoked_does_not_keep_the_node_itself_out_when_gncl_is_restarted() {
+    run(async {
+        let keys = keys();
+        let mut a = left_by_a_thief(&keys).await;
+        a.stop_layer();
+        a.start_layer().await;
+        itself_comes(a, &keys).await;
+    });
+}
+
+// spec: GNCL-7
+#[test]
+fn a_thief_that_was_lost_before_gncl_was_restarted_does_not_keep_the_node_itself_out_either() {
+    run(async {
+        let keys = keys();
+        let mut a = left_by_a_thief(&keys).await;
+        a.stop_layer();
+        // What that instance knew is gone.
+        a.stores.gncl.forget(NodeAddress::new(2));
+        a.start_layer().await;
+        let (node, incarnation) = (NodeAddress::new(2), Incarnation(u64::MAX));
+        let lost = MembershipFact::NodeLost { node, incarnation, why: LossReason::Crashed };
+        a.tell(Event::Membership(lost));
         itself_comes(a, &keys).await;
     });
 }
