@@ -86,7 +86,7 @@ pub use node::{
     Supervised, Supervises, SupervisionTree, SupervisorSpec, Traffic,
 };
 pub use outlet::OutletCounts;
-pub use secured::DenyListError;
+pub use secured::{DenyListError, DenyListSummary};
 pub use serde;
 pub use sinew_runtime::{
     app::{

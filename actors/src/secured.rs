@@ -52,11 +52,15 @@ pub enum DenyListError {
     #[error("the deny list cannot be used, and the one in force stays:\n{0}")]
     Faults(#[from] CredentialFaults),
     /// The list is in force for connections from now on, but those that stand were not looked at: the node is stopping, or a layer hangs.
+    /// Ask again.
     #[error(
         "the deny list is in force for connections from now on, but those that stand were not looked at, as GNCL does not read its \
          events: ask again, and if that does not help start the node again"
     )]
-    NotTold,
+    NotTold {
+        /// The list.
+        summary: DenyListSummary,
+    },
     /// The list is in force, and this node's own certificate is on it.
     #[error(
         "the deny list is in force, and this node's own certificate, number {serial}, is on it: nodes with that list do not take it, and it \
@@ -65,13 +69,24 @@ pub enum DenyListError {
     Own {
         /// Its number.
         serial: Serial,
+        /// The list.
+        summary: DenyListSummary,
     },
 }
 
 /// A deny list that was read and put in force.
-pub(crate) struct Denied {
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct DenyListSummary {
     /// Certificates that are on it.
-    pub(crate) count: usize,
+    pub denied: usize,
+    /// Those that were on the list before and are not on this one: they count again. If nobody took them out, only a part of the file was
+    /// there when it was read.
+    pub readmitted: usize,
+}
+
+/// The same, for the node itself.
+pub(crate) struct Denied {
+    pub(crate) summary: DenyListSummary,
     /// The number of this node's own certificate, if it is among them.
     pub(crate) own: Option<Serial>,
 }
@@ -114,7 +129,7 @@ impl Secured {
     }
 
     /// Reads the deny list again and puts it in force, for every handshake and every HELLO from now on. Connections that stand end when
-    /// GNCL is told.
+    /// GNCL is told. Of certificates that were on the list and are not any more it is logged how many.
     ///
     /// # Errors
     /// It cannot be used; the list in force stays.
@@ -122,9 +137,16 @@ impl Secured {
         let _turn = lock(&self.reading);
         let list = Credentials::deny_list(&self.directory)?;
         let own = list.has(&self.serial).then(|| self.serial.clone());
-        let count = list.len();
+        let (denied, before) = (list.len(), self.tls.denied());
+        let readmitted = before.not_on(&list);
         self.tls.deny(list);
-        Ok(Denied { count, own })
+        if readmitted > 0 {
+            crate::log::warn!(
+                readmitted,
+                "certificates that were on the deny list are not any more, and count again; if nobody took them out the file was read before                  all of it was there: copy it under another name, rename it, and have it read again"
+            );
+        }
+        Ok(Denied { summary: DenyListSummary { denied, readmitted }, own })
     }
 
     /// Puts a seal behind a datagram of this node.

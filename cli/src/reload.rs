@@ -1,7 +1,10 @@
 //! `sinew reload`: has the node on this host read its access list and its deny list again.
 
 use serde_json::json;
-use sinew::inspect::{AskReload, ReloadReport};
+use sinew::{
+    NodeAddress,
+    inspect::{AskReload, ReloadReport},
+};
 
 use crate::{
     Said,
@@ -15,16 +18,26 @@ pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
     let answer = system.ask_these::<AskReload, ReloadReport>(vec![(node, String::new())]).pop();
     let said = answer.map_or_else(|| Err("no answer".to_owned()), |answer| answer.said);
     let said = said.map_err(|why| Fault::NoAnswer(system.path.clone(), why))?;
-    let ReloadReport { rules, clients, has_list, denied, ref refused } = said;
+    let ReloadReport { rules, clients, has_list, denied, readmitted, ref refused } = said;
     let json = json!({
-        "rules": rules, "clients": clients, "has_list": has_list, "denied": denied, "refused": refused
+        "rules": rules, "clients": clients, "has_list": has_list, "denied": denied, "readmitted": readmitted,
+        "refused": refused
     });
-    let text = match refused {
-        None => format!("In force at {node}: {}.\n", in_force(&said)),
-        // One fault a line.
-        Some(why) => why.lines().map(|line| clean(line) + "\n").collect(),
+    Ok(Said { text: text(node, &said), json, is_fine: refused.is_none() })
+}
+
+/// What is wrong, one fault a line, and what is in force whether anything is or not.
+fn text(node: NodeAddress, said: &ReloadReport) -> String {
+    let faults: String =
+        said.refused.iter().flat_map(|why| why.lines()).map(|line| clean(line) + "\n").collect();
+    let readmitted = match said.readmitted {
+        0 => String::new(),
+        count => format!(
+            "Certificates that were revoked and are not on the deny list any more: {count}. They count again. If nobody took them out, the \
+             file was read before all of it was there: copy it under another name, rename it, and reload.\n"
+        ),
     };
-    Ok(Said { text, json, is_fine: refused.is_none() })
+    format!("{faults}In force at {node}: {}.\n{readmitted}", in_force(said))
 }
 
 fn in_force(said: &ReloadReport) -> String {
@@ -35,5 +48,33 @@ fn in_force(said: &ReloadReport) -> String {
         Some(1) => format!("{access}; 1 certificate is revoked"),
         Some(count) => format!("{access}; {count} certificates are revoked"),
         None => access,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn report(denied: u64, readmitted: u64, refused: Option<&str>) -> ReloadReport {
+        let (denied, refused) = (Some(denied), refused.map(str::to_owned));
+        ReloadReport { rules: 2, clients: 0, has_list: true, denied, readmitted, refused }
+    }
+
+    #[test]
+    fn what_is_in_force_is_said_also_where_something_is_wrong() {
+        let node = NodeAddress::new(0x0a00_0002);
+        let good = text(node, &report(1, 0, None));
+        assert_eq!(
+            good,
+            "In force at 10.0.0.2: 2 rules for messages, 0 for users of this host; 1 certificate is revoked.\n"
+        );
+        assert_eq!(text(node, &report(1, 0, Some("a fault\nanother"))), format!("a fault\nanother\n{good}"));
+    }
+
+    #[test]
+    fn who_is_let_in_again_is_said() {
+        let said = text(NodeAddress::new(1), &report(0, 3, None));
+        assert!(said.contains("0 certificates are revoked") && said.contains("3 "), "{said}");
+        assert!(said.contains("count again") && said.contains("rename"), "{said}");
     }
 }

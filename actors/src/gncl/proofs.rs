@@ -40,3 +40,36 @@ impl Proofs {
         those.map(|(node, proof)| (*node, proof.incarnation)).collect()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::security::{Judged, Validity, tests::ground};
+
+    fn peer(serial: &str) -> Peer {
+        Peer {
+            identity: ground::identity("hip", 1),
+            serial: serial.parse().expect("a number"),
+            validity: Validity { from: ground::at(0), until: ground::at(1) },
+            times: Judged::Valid,
+        }
+    }
+
+    #[test]
+    fn the_last_certificate_of_each_node_counts_and_nodes_that_are_not_known_make_room() {
+        let (proofs, [hip, knee, ankle]) = (Proofs::default(), [1, 2, 3].map(NodeAddress::new));
+        let note = |node, life, serial| {
+            proofs.note((node, Incarnation(life)), peer(serial), 2, |node| node != hip);
+        };
+        let of = |serial: &str| proofs.of_those(|shown| shown.serial == peer(serial).serial);
+        note(hip, 1, "aa");
+        note(knee, 1, "bb");
+        assert_eq!(of("aa"), [(hip, Incarnation(1))], "there is room for both");
+        note(knee, 2, "bc");
+        assert!(of("bb").is_empty());
+        assert_eq!(of("bc"), [(knee, Incarnation(2))]);
+        note(ankle, 1, "cc");
+        assert!(of("aa").is_empty(), "it made room");
+        assert_eq!((of("bc").len(), of("cc").len()), (1, 1));
+    }
+}

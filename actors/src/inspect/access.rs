@@ -14,6 +14,7 @@ use crate::{
     access::{Explanation, Question},
     lncl::Owner,
     node::NodeHandle,
+    secured::DenyListError,
     stores::{Stores, lock},
 };
 
@@ -80,40 +81,139 @@ pub(super) fn reloaded(
     if question.header.source.node != stores.node {
         let why =
             "lists are read again for a program of their node's own host only: run `sinew reload` there";
-        return Ok(report(stores, None, why));
+        return Ok(report(stores, why));
     }
     if !is_of_the_nodes_user(stores, question.header.source.app) {
         let why = "lists are read again for programs of their node's own user and of root only: run `sinew reload` as that user";
-        return Ok(report(stores, None, why));
+        return Ok(report(stores, why));
     }
     if !readings.admit(Time::now()) {
-        return Ok(report(stores, None, "the lists were read a moment ago: ask again in a second"));
+        return Ok(report(stores, "the lists were read a moment ago: ask again in a second"));
     }
+    Ok(read_again(stores))
+}
+
+/// Has the lists read again, and says what is in force then.
+fn read_again(stores: &Arc<Stores>) -> ReloadReport {
     let (node, mut faults) = (NodeHandle::of(stores.clone()), Vec::new());
+    let mut readmitted = 0;
     let is_secured = stores.secured.get().is_some();
+    // First: where there are many faults, those of the access list are cut.
+    if is_secured {
+        let read = node.reload_deny_list();
+        readmitted = match &read {
+            Ok(summary) | Err(DenyListError::Own { summary, .. } | DenyListError::NotTold { summary }) => {
+                summary.readmitted
+            }
+            Err(DenyListError::Faults(_) | DenyListError::None) => 0,
+        };
+        faults.extend(read.err().map(|why| why.to_string()));
+    }
     if stores.access.get().is_some() || !is_secured {
         faults.extend(node.reload_access().err().map(|why| why.to_string()));
     }
-    let denied = is_secured.then(|| node.reload_deny_list());
-    let denied = denied.and_then(|read| read.map_err(|why| faults.push(why.to_string())).ok());
-    Ok(report(stores, denied, &faults.join("\n")))
+    ReloadReport { readmitted: readmitted as u64, ..report(stores, &faults.join("\n")) }
 }
 
 /// What is in force, and what is wrong, if anything is.
-fn report(stores: &Stores, denied: Option<usize>, faults: &str) -> ReloadReport {
+fn report(stores: &Stores, faults: &str) -> ReloadReport {
     let now = stores.access.get().map(|access| access.summary());
     ReloadReport {
         rules: now.map_or(0, |now| now.rules as u64),
         clients: now.map_or(0, |now| now.clients as u64),
         has_list: now.is_some(),
-        denied: denied.map(|count| count as u64),
+        denied: stores.secured.get().map(|secured| secured.tls.denied().len() as u64),
+        readmitted: 0,
         refused: (!faults.is_empty()).then(|| faults.chars().take(FAULTS_MAX).collect()),
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use sinew_runtime::tid::{Incarnation, NodeAddress};
+
     use super::*;
+    use crate::{
+        access::Access,
+        config::NodeConfig,
+        secured::Secured,
+        security::{
+            Identity, files,
+            tests::ground::{self, Authority, Directory, Wish},
+        },
+    };
+
+    const LIST: &str = "access.toml";
+    const GOOD: &str = "[[rule]]\nfrom = ['hip']\nto = ['knee']\n";
+
+    /// A node with an access list of one rule, and keys; both lists are in this directory.
+    fn node() -> (Arc<Stores>, Directory) {
+        let mut config = NodeConfig::new("knee");
+        config.address = Some(NodeAddress::new(2));
+        let stores = Stores::for_test(config, Incarnation(1));
+        let identity =
+            Identity { project: "sinew".to_owned(), address: stores.node, name: "knee".to_owned() };
+        let directory = Authority::new("sinew").directory(&Wish::of(&identity));
+        let credentials = ground::load(&directory, &identity);
+        let secured = Secured::new(ground::tls(&credentials), &credentials, 8, Incarnation(1));
+        assert!(stores.secured.set(secured).is_ok(), "it is set once");
+        directory.put(LIST, 0o644, GOOD);
+        let path = directory.path().join(LIST);
+        let list = crate::access::read(&path).unwrap_or_else(|faults| panic!("{faults}"));
+        let access = Access::new(stores.node, path, list, stores.refusals.clone());
+        assert!(stores.access.set(Arc::new(access)).is_ok(), "it is set once");
+        (stores, directory)
+    }
+
+    // spec: INSPECT-7
+    #[test]
+    fn a_long_list_of_other_faults_does_not_hide_that_the_deny_list_was_not_taken() {
+        let (stores, directory) = node();
+        directory.put(LIST, 0o644, &format!("{GOOD}classes = ['fast']\n").repeat(1_000));
+        directory.put(files::DENIED, 0o644, "hip\n");
+        let said = read_again(&stores).refused.expect("both have faults");
+        assert!(said.chars().count() <= FAULTS_MAX, "{}", said.len());
+        assert!(said.contains("deny list") && said.contains("access list"), "{said}");
+    }
+
+    // spec: INSPECT-7
+    #[test]
+    fn what_is_in_force_is_told_also_where_a_list_was_not_taken_or_there_is_more_to_do() {
+        let (stores, directory) = node();
+        directory.put(files::DENIED, 0o644, "2d6f\n2d70\n");
+        let said = read_again(&stores);
+        assert_eq!((said.rules, said.denied, said.refused), (1, Some(2), None));
+        // One list is good, and the other one is not
+        directory.put(LIST, 0o644, &GOOD.repeat(2));
+        directory.put(files::DENIED, 0o644, "hip\n");
+        let said = read_again(&stores);
+        assert!(said.refused.is_some());
+        assert_eq!((said.rules, said.denied), (2, Some(2)));
+        // The node's own certificate is on it
+        let own = stores.secured.get().expect("it has keys").serial.to_string();
+        directory.put(files::DENIED, 0o644, &format!("{own}\n2d6f\n2d70\n"));
+        let said = read_again(&stores);
+        assert!(said.refused.is_some_and(|why| why.contains("own certificate")));
+        assert_eq!((said.denied, said.readmitted), (Some(3), 0));
+    }
+
+    // spec: INSPECT-7
+    #[test]
+    fn how_many_certificates_went_off_the_deny_list_is_told() {
+        let (stores, directory) = node();
+        let own = stores.secured.get().expect("it has keys").serial.to_string();
+        for (list, readmitted) in [
+            ("2d6f\n2d70\n2d71\n".to_owned(), 0),
+            // What half a copy may be.
+            ("2d6f\n2d\n".to_owned(), 2),
+            (own, 2),
+            (String::new(), 1),
+            (String::new(), 0),
+        ] {
+            directory.put(files::DENIED, 0o644, &list);
+            assert_eq!(read_again(&stores).readmitted, readmitted, "{list:?}");
+        }
+    }
 
     #[test]
     fn lists_are_read_again_a_few_times_at_once_and_then_once_a_second() {

@@ -62,7 +62,7 @@ use crate::{
     log,
     ndl::{KnownNode, OwnStalls},
     outlet::OutletCounts,
-    secured::{Denied, DenyListError},
+    secured::{Denied, DenyListError, DenyListSummary},
     stores::{Stores, lock},
     sync::{BarrierStatus, DirectoryEntry, Waiting},
 };
@@ -319,21 +319,23 @@ impl NodeHandle {
     }
 
     /// Reads the node's deny list again and puts it in force: connections that stand with nodes whose certificates are on it end, in words,
-    /// and none is made. How many certificates are on it. Such a node is lost when it is silent; what is sent to it waits, and expires.
+    /// and none is made. Such a node is lost when it is silent; what is sent to it waits, and expires.
     ///
     /// # Errors
     /// The node was started without keys, the file cannot be used, or there is more to do: each says what is in force. It is logged too.
-    pub fn reload_deny_list(&self) -> Result<usize, DenyListError> {
+    pub fn reload_deny_list(&self) -> Result<DenyListSummary, DenyListError> {
         let secured = self.stores.secured.get().ok_or(DenyListError::None)?;
         let read =
-            secured.reload_deny_list().map_err(DenyListError::from).and_then(|Denied { count, own }| {
+            secured.reload_deny_list().map_err(DenyListError::from).and_then(|Denied { summary, own }| {
                 // After the list is in force: who comes meanwhile is judged by it.
                 let told = self.stores.posts.gncl.post(gncl::Event::DenyListChanged);
-                told.map_err(|_| DenyListError::NotTold)?;
-                own.map_or(Ok(count), |serial| Err(DenyListError::Own { serial }))
+                told.map_err(|_| DenyListError::NotTold { summary })?;
+                own.map_or(Ok(summary), |serial| Err(DenyListError::Own { serial, summary }))
             });
         match &read {
-            Ok(count) => log::info!(count, "another deny list is in force"),
+            Ok(DenyListSummary { denied, readmitted }) => {
+                log::info!(denied, readmitted, "another deny list is in force")
+            }
             Err(why) => {
                 let why: String = why.to_string().chars().take(LOGGED_MAX).collect();
                 log::error!(why, "the deny list was read again");

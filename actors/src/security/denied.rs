@@ -76,6 +76,12 @@ impl DenyList {
         self.0.contains(serial)
     }
 
+    /// How many of these are not on the list `later`.
+    #[must_use]
+    pub fn not_on(&self, later: &Self) -> usize {
+        self.0.difference(&later.0).count()
+    }
+
     /// How many are revoked.
     #[must_use]
     pub fn len(&self) -> usize {

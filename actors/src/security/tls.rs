@@ -143,6 +143,12 @@ impl Tls {
         self.believed.denied.store(Arc::new(denied));
     }
 
+    /// The deny list that is in force.
+    #[must_use]
+    pub fn denied(&self) -> Arc<DenyList> {
+        self.believed.denied.load_full()
+    }
+
     /// Why `peer`, who was taken before, would not be taken any more: its certificate is on the deny list.
     #[must_use]
     pub fn denies(&self, peer: &Peer) -> Option<PeerFault> {

@@ -60,10 +60,13 @@ payload!("sinew.inspect.reload_report" =>
         /// Whether the node has an access list: without one everything is allowed.
         #[serde(default = "has_list")]
         pub has_list: bool,
-        /// How many certificates are on the deny list, if that was read again; `None` of a node without keys, too.
+        /// How many certificates are on the deny list that is in force; `None` of a node without keys.
         #[serde(default)]
         pub denied: Option<u64>,
-        /// Why a list is the one that was in force before, or that there is none; in words.
+        /// How many of those that were on the one before are not any more: they count again.
+        #[serde(default)]
+        pub readmitted: u64,
+        /// Why a list is the one that was in force before, or that there is none, or what else is to be done; in words, one fault a line.
         pub refused: Option<String>,
     }
 );
