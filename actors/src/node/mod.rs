@@ -321,6 +321,9 @@ impl NodeHandle {
     /// Reads the node's deny list again and puts it in force: connections that stand with nodes whose certificates are on it end, in words,
     /// and none is made. Such a node is lost when it is silent; what is sent to it waits, and expires.
     ///
+    /// Blocks: a file of up to 8 MiB is read and looked through on the caller's thread, which is to be none that a control loop or an actor
+    /// runs on. Whoever else has the list read waits for that long.
+    ///
     /// # Errors
     /// The node was started without keys, the file cannot be used, or there is more to do: each says what is in force. It is logged too.
     pub fn reload_deny_list(&self) -> Result<DenyListSummary, DenyListError> {
