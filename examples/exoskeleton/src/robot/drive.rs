@@ -12,12 +12,15 @@
 //! so until central's gait asks for it ([`Arm`]), in a state in which no torque comes of central's word. When the drive is told
 //! to stop, the torque ramps to zero first.
 
+mod order;
+
 use std::path::{Path, PathBuf};
 
 use sinew::ReadyGate;
 use sinew::prelude::*;
 use sinew::protection::{Cause, Guard, State};
 
+use self::order::Order;
 use super::PERIOD;
 use super::device::{Damper, DriveCommand, JointDevice};
 use super::edges::{
@@ -60,6 +63,8 @@ pub struct Drive {
     sample: Option<JointSample>,
     /// Central's newest word, for as long as all that comes from there is good.
     word: Option<Word>,
+    /// Whether the device was last told a torque by this drive: it may hold that for as long as it is told nothing else.
+    gives: bool,
     /// Whether it was said that central's word cannot be guarded.
     unguarded: bool,
     /// Whether central was heard in this life.
@@ -129,6 +134,7 @@ impl Drive {
             parts,
             sample: None,
             word: None,
+            gives: false,
             unguarded: false,
             central_heard: false,
             ticked_at: None,
@@ -199,34 +205,41 @@ impl Drive {
     /// Gives the device its command, and returns what it is to give, Nm; `None` when it is told nothing, or to damp by itself.
     ///
     /// What may assist goes through the open guard, so that none follows the order to damp, however long this thread was held up
-    /// before it came here. With a shut one the device is left to damp by itself; what is on its way to zero goes on.
+    /// before it came here. With a shut one the device is left to damp by itself; what is on its way to zero goes on while it is young.
     fn command(&mut self, now: Time, output: &DriveOutput, gait: Option<&GaitState>) -> Option<f64> {
         let released = gait.is_some_and(|gait| !matches!(gait.mode, GaitMode::Hold | GaitMode::Stop));
-        let (saturated, state) = (output.saturated, output.state);
-        let command = |torque_nm| DriveCommand { torque_nm, released, saturated, state };
-        let Self { word, device, .. } = self;
-        let through = word.as_ref().map(|word| {
-            word.guard.apply(|to| {
-                let torque_nm = output.command_nm?;
-                to.gives = torque_nm != 0.0;
-                device.command(now, &command(torque_nm));
+        let (saturated, state, command_nm) = (output.saturated, output.state, output.command_nm);
+        let was_giving = self.gives;
+        let Self { word, device, damper, gives, core, .. } = self;
+        let mut tell = |order| match order {
+            Order::Torque(torque_nm) => {
+                device.command(now, &DriveCommand { torque_nm, released, saturated, state });
+                *gives = torque_nm != 0.0;
                 Some(torque_nm)
-            })
-        });
-        match (through, state) {
-            (Some(Ok(given)), _) => given,
-            // Again and again, as one may be lost.
-            (_, DriveState::Walk | DriveState::Safe) => {
-                self.damper.damp(now, state);
-                self.core.let_device_damp();
+            }
+            Order::Damp => {
+                damper.damp(now, state);
                 None
             }
-            (_, DriveState::Init | DriveState::Ready | DriveState::EStop) => {
-                let torque_nm = output.command_nm?;
-                device.command(now, &command(torque_nm));
-                Some(torque_nm)
-            }
+            Order::Nothing => None,
+        };
+        let through = word.as_ref().map(|word| {
+            word.guard.apply(|to| {
+                let order = Order::through_open(command_nm, to.gives || was_giving);
+                if let Order::Torque(torque_nm) = order {
+                    to.gives = torque_nm != 0.0;
+                }
+                tell(order)
+            })
+        });
+        if let Some(Ok(given)) = through {
+            return given;
         }
+        let order = Order::past_shut(state, command_nm, was_giving, Time::now().since(now));
+        if order == Order::Damp {
+            core.let_device_damp();
+        }
+        tell(order)
     }
 
     /// Tells central that its word does not count, though it comes; what becomes of that is central's to say.
