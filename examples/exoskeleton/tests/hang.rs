@@ -118,7 +118,7 @@ impl Handler<Delivery<Shut>> for Gait {
 
     fn handle(&mut self, shut: Delivery<Shut>, context: &mut Self::Context) {
         if self.will.arms.load(Ordering::Relaxed) {
-            let _ = context.send(shut.source, &Arm {});
+            let _ = context.send(shut.source, &Arm { suspect: shut.suspect });
         }
     }
 }

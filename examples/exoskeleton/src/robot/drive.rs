@@ -13,14 +13,16 @@
 //! to stop, the torque ramps to zero first.
 
 mod order;
+mod suspicion;
 
 use std::path::{Path, PathBuf};
 
 use sinew::ReadyGate;
 use sinew::prelude::*;
-use sinew::protection::{Cause, Guard, State};
+use sinew::protection::{Guard, State};
 
 use self::order::Order;
+use self::suspicion::Suspicion;
 use super::PERIOD;
 use super::device::{Damper, DriveCommand, JointDevice};
 use super::edges::{
@@ -84,8 +86,7 @@ struct Word {
     /// Whose word it is.
     central: Tid,
     guard: Guard<Output>,
-    /// Words that were damaged or not central's, until it counted last.
-    corrupt: u64,
+    suspicion: Suspicion,
 }
 
 /// What is taken away as soon as central's word does not count: by whoever notices first.
@@ -146,8 +147,12 @@ impl Drive {
     fn tick(&mut self, tick: Tick, context: &mut AppContext<Self>) {
         let now = Time::now();
         let gait = self.word(now, context);
-        if self.is_shut() {
+        let is_shut = self.is_shut();
+        if is_shut {
             self.core.disbelieve_gait();
+        }
+        if let Some(Word { guard, suspicion, .. }) = &mut self.word {
+            suspicion.note(&guard.tally(), !is_shut);
         }
         let mut output = self.core.tick(now.as_nanos(), self.sample.as_ref(), gait.as_ref());
         output.command_nm = self.command(now, &output, gait.as_ref());
@@ -185,7 +190,7 @@ impl Drive {
             let output = Output { word: None, device: self.device.damper(), gives: false };
             let guard = context.guard::<GaitState, _>(central, output, |output, _| output.make_safe());
             match guard {
-                Ok(guard) => self.word = Some(Word { central, guard, corrupt: 0 }),
+                Ok(guard) => self.word = Some(Word { central, guard, suspicion: Suspicion::default() }),
                 // Tried again in the next tick, and said once.
                 Err(error) if !std::mem::replace(&mut self.unguarded, true) => {
                     let joint = self.parts.joint;
@@ -244,13 +249,11 @@ impl Drive {
 
     /// Tells central that its word does not count, though it comes; what becomes of that is central's to say.
     fn ask_to_be_armed(&self, context: &AppContext<Self>) {
-        let Some(Word { central, guard, corrupt }) = self.word.as_ref().filter(|_| self.is_shut()) else {
+        let Some(Word { central, suspicion, .. }) = self.word.as_ref().filter(|_| self.is_shut()) else {
             return;
         };
-        let is_meddled_with =
-            guard.state() == State::Safe(Cause::TooManyBad) && guard.tally().corrupt > *corrupt;
         // It is asked again.
-        let _ = context.send(*central, &Shut { suspect: is_meddled_with });
+        let _ = context.send(*central, &Shut { suspect: suspicion.is_there() });
     }
 
     fn at_rest(&self, output: &DriveOutput) -> bool {
@@ -420,11 +423,14 @@ impl Handler<Delivery<Arm>> for Drive {
         }
         // In WALK the tick is still to come that makes the drive safe, and what central meant long ago may not be so any more. Refused, too,
         // until eight good words have come in a row.
-        if state == DriveState::Walk || arm.age > SILENCE_MAX || word.guard.arm().is_err() {
+        // So is one that was sent before central knew that somebody meddles.
+        word.suspicion.note(&word.guard.tally(), false);
+        let is_known = arm.suspect || !word.suspicion.is_there();
+        if state == DriveState::Walk || arm.age > SILENCE_MAX || !is_known || word.guard.arm().is_err() {
             context.reject();
             return;
         }
-        word.corrupt = word.guard.tally().corrupt;
+        word.suspicion.forget();
         // A ramp to zero may be under way.
         let _ = word.guard.apply(|output| output.gives = true);
         self.note_event("armed", &arm.source.to_string(), String::new());

@@ -79,7 +79,8 @@ payload!("exo.shut", Stream =>
     /// From a drive to central's gait, 200 times a second while it is so: your word does not count here, though it comes.
     #[derive(Debug, Clone, Copy)]
     pub struct Shut {
-        /// Whether words came that were damaged, or not central's at all.
+        /// Whether words came that were damaged, or not central's at all, since the last good stretch: 64 good ones through an open guard.
+        /// Whatever the guard was shut for.
         pub suspect: bool,
     }
 );
@@ -87,7 +88,10 @@ payload!("exo.shut", Stream =>
 payload!("exo.arm", Stream =>
     /// From central's gait to a drive, as an answer to [`Shut`]: let my word count again. A drive never does that by itself.
     #[derive(Debug, Clone, Copy)]
-    pub struct Arm {}
+    pub struct Arm {
+        /// What [`Shut::suspect`] said. A drive that has become suspicious since then refuses.
+        pub suspect: bool,
+    }
 );
 
 payload!("exo.gait_status", Stream =>

@@ -306,7 +306,7 @@ impl Handler<Delivery<Shut>> for Gait {
             context.reject();
         } else if may_arm(self.mode, shut.suspect) {
             // One that cannot be reached asks again.
-            let _ = context.send(shut.source, &Arm {});
+            let _ = context.send(shut.source, &Arm { suspect: shut.suspect });
         }
     }
 }
