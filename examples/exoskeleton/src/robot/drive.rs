@@ -8,19 +8,23 @@
 //! runtime's input watchdogs, which write it down. What central says is protected from end to end, by `PROTECTION` of
 //! [`GaitState`]: a guard lets through what is central's, whole, in order and young; else it is shut. When it shuts, the
 //! device is told at once to damp by itself, by a thread that is there for that: also when this application hangs, or the
-//! thread on which it runs. Torque goes to the device through the open guard, or is on its way to zero. A shut guard stays
+//! thread on which it runs. Another one repeats it, as it may be lost. No device can do without a watchdog of its own for all that: both
+//! threads end, or stand still, with the process. Torque goes to the device through the open guard, or is on its way to zero. A shut guard stays
 //! so until central's gait asks for it ([`Arm`]), in a state in which no torque comes of central's word. When the drive is told
 //! to stop, the torque ramps to zero first.
 
+mod lookout;
 mod order;
 mod suspicion;
 
+use std::io;
 use std::path::{Path, PathBuf};
 
 use sinew::ReadyGate;
 use sinew::prelude::*;
 use sinew::protection::{Guard, State};
 
+use self::lookout::{Lookout, Watch};
 use self::order::Order;
 use self::suspicion::Suspicion;
 use super::PERIOD;
@@ -67,6 +71,8 @@ pub struct Drive {
     word: Option<Word>,
     /// Whether the device was last told a torque by this drive: it may hold that for as long as it is told nothing else.
     gives: bool,
+    /// Who repeats the order to damp when this thread does not; there before any torque of central's word.
+    lookout: Option<Lookout>,
     /// Whether it was said that central's word cannot be guarded.
     unguarded: bool,
     /// Whether central was heard in this life.
@@ -95,6 +101,7 @@ struct Output {
     device: Box<dyn Damper>,
     /// Whether the device was told to give a torque: one that gives nothing on purpose is left as it is.
     gives: bool,
+    again: Watch,
 }
 
 impl Output {
@@ -102,6 +109,8 @@ impl Output {
         self.word = None;
         if std::mem::take(&mut self.gives) {
             self.device.damp(Time::now(), DriveState::Safe);
+            // One may be lost, and the drive's thread may hang.
+            self.again.damps();
         }
     }
 }
@@ -136,6 +145,7 @@ impl Drive {
             sample: None,
             word: None,
             gives: false,
+            lookout: None,
             unguarded: false,
             central_heard: false,
             ticked_at: None,
@@ -187,9 +197,7 @@ impl Drive {
         if self.word.as_ref().is_none_or(|word| word.central != central) {
             // What another life of central has said is worth nothing any more.
             self.word = None;
-            let output = Output { word: None, device: self.device.damper(), gives: false };
-            let guard = context.guard::<GaitState, _>(central, output, |output, _| output.make_safe());
-            match guard {
+            match self.guard(central, context) {
                 Ok(guard) => self.word = Some(Word { central, guard, suspicion: Suspicion::default() }),
                 // Tried again in the next tick, and said once.
                 Err(error) if !std::mem::replace(&mut self.unguarded, true) => {
@@ -200,6 +208,17 @@ impl Drive {
             }
         }
         self.word.as_ref()?.guard.apply(|output| output.word).ok().flatten()
+    }
+
+    /// The only way to the device for what may assist, with who repeats the order to damp.
+    fn guard(&mut self, central: Tid, context: &mut AppContext<Self>) -> io::Result<Guard<Output>> {
+        let lookout = match self.lookout.take() {
+            Some(lookout) => lookout,
+            None => Lookout::start(self.device.damper())?,
+        };
+        let again = self.lookout.insert(lookout).watch().clone();
+        let output = Output { word: None, device: self.device.damper(), gives: false, again };
+        context.guard::<GaitState, _>(central, output, |output, _| output.make_safe())
     }
 
     /// Whether central's word does not count, though it is known whose it is.
@@ -215,7 +234,7 @@ impl Drive {
         let released = gait.is_some_and(|gait| !matches!(gait.mode, GaitMode::Hold | GaitMode::Stop));
         let (saturated, state, command_nm) = (output.saturated, output.state, output.command_nm);
         let was_giving = self.gives;
-        let Self { word, device, damper, gives, core, .. } = self;
+        let Self { word, device, damper, gives, core, lookout, .. } = self;
         let mut tell = |order| match order {
             Order::Torque(torque_nm) => {
                 device.command(now, &DriveCommand { torque_nm, released, saturated, state });
@@ -233,6 +252,7 @@ impl Drive {
                 let order = Order::through_open(command_nm, to.gives || was_giving);
                 if let Order::Torque(torque_nm) = order {
                     to.gives = torque_nm != 0.0;
+                    to.again.rests();
                 }
                 tell(order)
             })
@@ -241,8 +261,12 @@ impl Drive {
             return given;
         }
         let order = Order::past_shut(state, command_nm, was_giving, Time::now().since(now));
-        if order == Order::Damp {
-            core.let_device_damp();
+        let again = lookout.as_ref().map(Lookout::watch);
+        match order {
+            Order::Damp => core.let_device_damp(),
+            Order::Torque(0.0) => again.into_iter().for_each(Watch::rests),
+            Order::Torque(_) => again.into_iter().for_each(Watch::ramps),
+            Order::Nothing => {}
         }
         tell(order)
     }
@@ -319,8 +343,8 @@ impl Drive {
     }
 }
 
-fn write_json(path: &Path, value: &impl serde::Serialize) -> std::io::Result<()> {
-    std::fs::write(path, serde_json::to_string_pretty(value).map_err(std::io::Error::other)?)
+fn write_json(path: &Path, value: &impl serde::Serialize) -> io::Result<()> {
+    std::fs::write(path, serde_json::to_string_pretty(value).map_err(io::Error::other)?)
 }
 
 /// Whole microseconds; more than an hour is an hour and a bit.
