@@ -19,6 +19,9 @@ const PRIORITY: u8 = 89;
 const PERIOD: Duration = Duration::from_millis(2);
 /// Silence of a drive that ramps a torque to zero past a shut guard, after which its device is told to damp.
 const RAMP_SILENT_MAX: Duration = Duration::from_millis(5);
+/// Orders that are said in a row, over 100 ms: enough against loss. A hung life of the drive must not go on for ever, as the device hears
+/// a new one only when the old one is silent.
+const ORDERS_MAX: u32 = 50;
 /// Orders that are still said when the drive has ended while one was due.
 const LAST_ORDERS: u32 = 3;
 /// Nothing is due.
@@ -96,19 +99,19 @@ impl Watch {
 }
 
 impl Due {
-    /// How long nothing is to be said; `None` while nothing is due.
-    fn left(&self) -> Option<Duration> {
-        // SYNC: Relaxed, see `due_from`.
-        let from_ns = self.from_ns.load(Ordering::Relaxed);
-        (from_ns != NEVER).then(|| Time::from_nanos(from_ns).since(Time::now()))
-    }
-
     fn keep(&self, damper: &dyn Damper) {
+        let (mut said, mut said_of_ns) = (0, NEVER);
         // SYNC: Acquire, with the Release in `drop`.
         while !self.has_ended.load(Ordering::Acquire) {
-            match self.left() {
+            // SYNC: Relaxed, see `due_from`.
+            let from_ns = self.from_ns.load(Ordering::Relaxed);
+            if from_ns != std::mem::replace(&mut said_of_ns, from_ns) {
+                said = 0;
+            }
+            match left(from_ns).filter(|_| said < ORDERS_MAX) {
                 None => thread::park(),
                 Some(Duration::ZERO) => {
+                    said += 1;
                     damper.damp(Time::now(), DriveState::Safe);
                     thread::park_timeout(PERIOD);
                 }
@@ -117,13 +120,19 @@ impl Due {
         }
         // The next life of the drive is heard only when this one is silent.
         for _ in 0..LAST_ORDERS {
-            if self.left().is_none() {
+            // SYNC: Relaxed, see `due_from`.
+            if self.from_ns.load(Ordering::Relaxed) == NEVER {
                 return;
             }
             damper.damp(Time::now(), DriveState::Safe);
             thread::sleep(PERIOD);
         }
     }
+}
+
+/// How long nothing is to be said yet; `None` while nothing is due.
+fn left(from_ns: u64) -> Option<Duration> {
+    (from_ns != NEVER).then(|| Time::from_nanos(from_ns).since(Time::now()))
 }
 
 #[cfg(test)]
@@ -142,7 +151,7 @@ mod tests {
     }
 
     fn lookout() -> (Lookout, Receiver<()>) {
-        let (damper, told) = sync_channel(10);
+        let (damper, told) = sync_channel(ORDERS_MAX as usize);
         (Lookout::start(Box::new(damper)).expect("a thread"), told)
     }
 
@@ -154,10 +163,14 @@ mod tests {
     }
 
     #[test]
-    fn device_is_told_to_damp_again_and_again_while_its_drive_says_nothing() {
+    fn device_is_told_to_damp_again_and_again_while_its_drive_says_nothing_but_not_for_ever() {
         let (lookout, told) = lookout();
         lookout.watch().damps();
-        is_told(&told, 30);
+        is_told(&told, ORDERS_MAX);
+        // Long enough for many more: the next life of the drive would not be heard.
+        assert!(told.recv_timeout(PERIOD * ORDERS_MAX).is_err());
+        lookout.watch().damps();
+        is_told(&told, ORDERS_MAX);
     }
 
     #[test]
