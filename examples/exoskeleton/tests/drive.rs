@@ -329,25 +329,48 @@ fn drive_that_was_frozen_uses_nothing_stale_and_goes_on_from_what_its_device_giv
     assert!((first + 1.5).abs() <= 2.0, "{first}");
 }
 
+#[test]
+fn tick_that_comes_late_says_nothing_and_the_next_one_goes_on_from_a_sample_of_after_the_pause() {
+    // Given: a drive whose torque rises as fast as it may, with a device that is 10 Nm behind
+    let mut drive = walking();
+    drive.emergency_stop();
+    let before = feed(&mut drive, 1000..1010, GaitMode::Hold).command_nm.expect("it is heard");
+    let of_before = JointSample { torque_nm: before as f32 - 10.0, ..sample(1010) };
+    // When: its tick is late, with a sample of before it
+    let late = drive.tick(1016 * MS, Some(&of_before), None);
+    assert_eq!(late.command_nm, None);
+    // Then: nothing comes of that sample, nor of another one of before
+    assert_eq!(drive.tick(1017 * MS, Some(&of_before), None).command_nm, None);
+    let at_that_time = JointSample { t_ns: 1016 * MS, ..sample(1011) };
+    assert_eq!(drive.tick(1017 * MS, Some(&at_that_time), None).command_nm, None);
+    let of_after = JointSample { torque_nm: before as f32, ..sample(1017) };
+    let torque_nm = drive.tick(1018 * MS, Some(&of_after), None).command_nm.expect("it is known");
+    assert!((torque_nm - before).abs() <= 2.0 + 1e-5, "{torque_nm} after {before}");
+}
+
 fn any_mode() -> impl Strategy<Value = GaitMode> {
     prop_oneof![
-        Just(GaitMode::Hold),
-        Just(GaitMode::Sync),
-        Just(GaitMode::Walk),
-        Just(GaitMode::Safe),
-        Just(GaitMode::Stop)
+        1 => Just(GaitMode::Hold),
+        1 => Just(GaitMode::Sync),
+        60 => Just(GaitMode::Walk),
+        1 => Just(GaitMode::Safe),
+        1 => Just(GaitMode::Stop)
     ]
 }
+
+/// Lag of the proptest's device, ns: as long as the plant's.
+const DEVICE_LAG_NS: f64 = 5e6;
 
 /// Step of time (ns), a sample and a gait state that may be garbage, and a die for stop and reset.
 type AnyTick = (u64, Option<[f32; 2]>, Option<(f32, f32, GaitMode, u32)>, u8);
 
 /// A tick with anything in it.
 fn any_tick() -> impl Strategy<Value = AnyTick> {
-    let rough = prop_oneof![4 => -1.0f32..2.0, 1 => any::<f32>()];
+    let rough = prop_oneof![30 => 0.0f32..1.0, 2 => -1.0f32..2.0, 1 => any::<f32>()];
     let values = [rough.clone(), rough.clone()];
     (
-        0u64..12 * MS,
+        // Just over what counts as a pause is where the least is allowed.
+        prop_oneof![12 => 0..2 * MS, 1 => 0..12 * MS, 1 => 6 * MS..7 * MS],
         prop::option::weighted(0.8, values),
         prop::option::weighted(0.8, (rough.clone(), rough, any_mode(), 1u32..3)),
         any::<u8>(),
@@ -359,16 +382,28 @@ proptest! {
 
     #[test]
     fn whatever_comes_in_the_torque_stays_within_limit_and_rate(
-        ticks in prop::collection::vec(any_tick(), 1..200)
+        ticks in prop::collection::vec(any_tick(), 1..500),
+        mut walked in any::<bool>()
     ) {
-        let mut drive = drive();
+        let mut drive = if walked { walking() } else { drive() };
         let config = DriveConfig::standard(Joint::Ankle);
-        let (mut now_ns, mut walked, mut before) = (0, false, None::<f64>);
-        for (seq, (step_ns, values, gait_values, chance)) in (0u32..).zip(ticks) {
+        let mut now_ns = if walked { 999 * MS } else { 0 };
+        let mut before = walked.then(|| f64::from(drive.status(now_ns).torque_nm));
+        // What the device gives lags behind what it is told, by a first order as in the plant.
+        let (mut given_nm, mut told_at_ns) = (before.unwrap_or(0.0), now_ns);
+        for (seq, (step_ns, values, gait_values, chance)) in (1000u32..).zip(ticks) {
             now_ns += step_ns;
-            if chance < 4 { drive.emergency_stop() } else if chance < 8 { let _ = drive.reset(now_ns); }
+            let told_nm = before.unwrap_or(0.0);
+            let gives_after = |ns: u64, from_nm: f64| {
+                told_nm + (from_nm - told_nm) * (-(ns as f64) / DEVICE_LAG_NS).exp()
+            };
+            // The sample was made some time between the last tick and this one.
+            let age_ns = step_ns * u64::from(chance >> 4) / 15;
+            let read_nm = gives_after(step_ns - age_ns, given_nm);
+            given_nm = gives_after(step_ns, given_nm);
+            if chance < 2 { drive.emergency_stop() } else if chance < 40 { let _ = drive.reset(now_ns); }
             let sample = values.map(|[angle_rad, velocity_rad_s]| JointSample {
-                seq, t_ns: now_ns, angle_rad, velocity_rad_s, torque_nm: before.unwrap_or(0.0) as f32, ..sample(0)
+                seq, t_ns: now_ns - age_ns, angle_rad, velocity_rad_s, torque_nm: read_nm as f32, ..sample(0)
             });
             let gait = gait_values.map(|(phase, phase_rate_hz, mode, epoch)| GaitState {
                 seq, t_ns: now_ns, phase, phase_rate_hz, epoch, ..gait(0, mode)
@@ -379,7 +414,8 @@ proptest! {
                 prop_assert!(torque.abs() <= config.law.limit_nm);
                 prop_assert!(walked || torque == 0.0);
                 let change = (torque - before.unwrap_or(0.0)).abs();
-                prop_assert!(change <= config.rate_limit_nm_s * step_ns as f64 * 1e-9 + 1e-5, "{change}");
+                let since_ns = now_ns - std::mem::replace(&mut told_at_ns, now_ns);
+                prop_assert!(change <= config.rate_limit_nm_s * since_ns as f64 * 1e-9 + 1e-5, "{change}");
             }
             before = output.command_nm.or(before);
         }

@@ -113,6 +113,8 @@ pub struct DriveCore {
     ramp: AssistRamp,
     last_tick_ns: Option<u64>,
     device_heard: bool,
+    /// End of the last pause, ns: what the device gave before it says nothing of what it gives after it.
+    paused_until_ns: Option<u64>,
     /// Whether assistance was interrupted by central since it was last full; else only this drive was away.
     interrupted: bool,
     counters: DriveCounters,
@@ -135,6 +137,7 @@ impl DriveCore {
             ramp: AssistRamp::new(config.reentry_s),
             last_tick_ns: None,
             device_heard: false,
+            paused_until_ns: None,
             interrupted: false,
             counters: DriveCounters {
                 ticks: 0,
@@ -161,7 +164,7 @@ impl DriveCore {
         gait: Option<&GaitState>,
     ) -> DriveOutput {
         let elapsed_s = self.elapsed_s(now_ns);
-        self.doubt_after_pause(elapsed_s);
+        self.doubt_after_pause(now_ns, elapsed_s);
         self.admit(now_ns, sample, gait);
         let dt_s = elapsed_s.min(TICK_LONGEST_S);
         let fresh_sample = self.samples.fresh(now_ns).copied();
@@ -283,10 +286,13 @@ impl DriveCore {
     }
 
     /// After a pause the device may have damped by itself: what it gives is asked anew, and until it is known nothing
-    /// is commanded.
-    fn doubt_after_pause(&mut self, elapsed_s: f64) {
-        if self.device_heard && elapsed_s > self.config.pause_max_ns as f64 * 1e-9 {
-            self.device_heard = false;
+    /// is commanded; in this tick neither, as what is known in it lags behind.
+    fn doubt_after_pause(&mut self, now_ns: u64, elapsed_s: f64) {
+        if elapsed_s <= self.config.pause_max_ns as f64 * 1e-9 {
+            return;
+        }
+        self.paused_until_ns = Some(now_ns);
+        if std::mem::take(&mut self.device_heard) {
             self.counters.pauses = self.counters.pauses.saturating_add(1);
         }
     }
@@ -301,7 +307,8 @@ impl DriveCore {
     fn admit(&mut self, now_ns: u64, sample: Option<&JointSample>, gait: Option<&GaitState>) {
         if let Some(sample) = sample {
             let admitted = self.samples.offer(now_ns, sample);
-            if admitted && !self.device_heard {
+            let of_now = self.paused_until_ns.is_none_or(|ns| now_ns > ns && sample.t_ns > ns);
+            if admitted && of_now && !self.device_heard {
                 self.device_heard = true;
                 self.go_on_from(f64::from(sample.torque_nm));
             }
