@@ -28,22 +28,29 @@ use sinew_tests::{DEADLINE, Ground, OwnDirectory};
 /// Trials of each error; those of a delay take its time.
 const TRIALS: u32 = 50;
 const DELAYS: u32 = 5;
+/// Greatest age where something else than age is to be found: a busy machine may stand still between the message's making and its
+/// arrival.
+const PATIENT_MS: u64 = 20_000;
+/// Greatest age where that is to be found.
+const BRIEF_MS: u64 = 1_000;
 /// The first bad one makes the output safe; for the rest as patient as a busy machine needs.
-const PROTECTION: Protection =
-    Protection { within: DEADLINE, age_max: Duration::from_secs(1), lost_max: 1, bad_max: 0, good_min: 4 };
+const fn protection(age_max_ms: u64) -> Protection {
+    let age_max = Duration::from_millis(age_max_ms);
+    Protection { within: DEADLINE, age_max, lost_max: 1, bad_max: 0, good_min: 4 }
+}
 /// By its name: the type is the runtime's own.
 const ECHO: Kind = Kind::named("sinew.echo");
 
 #[derive(Debug, sinew::serde::Serialize, sinew::serde::Deserialize)]
 #[serde(crate = "sinew::serde")]
-struct Torque {
+struct Torque<const AGE_MAX_MS: u64> {
     number: u64,
 }
 
-impl Payload for Torque {
+impl<const AGE_MAX_MS: u64> Payload for Torque<AGE_MAX_MS> {
     const NAME: &'static str = "black_channel.torque";
     const CLASS: Class = Class::Control;
-    const PROTECTION: Option<Protection> = Some(PROTECTION);
+    const PROTECTION: Option<Protection> = Some(protection(AGE_MAX_MS));
 }
 
 payload!("black_channel.go", Control =>
@@ -74,20 +81,20 @@ fn other_drive() -> Tid {
 }
 
 #[derive(Default)]
-struct Central {
+struct Central<const AGE_MAX_MS: u64> {
     number: u64,
 }
 
-impl Actor for Central {
+impl<const AGE_MAX_MS: u64> Actor for Central<AGE_MAX_MS> {
     type Context = AppContext<Self>;
 }
 
-impl Handler<Delivery<Go>> for Central {
+impl<const AGE_MAX_MS: u64> Handler<Delivery<Go>> for Central<AGE_MAX_MS> {
     type Result = ();
 
     fn handle(&mut self, go: Delivery<Go>, context: &mut Self::Context) {
         self.number += 1;
-        context.send(go.source, &Torque { number: self.number }).expect("the relay is there");
+        context.send(go.source, &Torque::<AGE_MAX_MS> { number: self.number }).expect("the relay is there");
     }
 }
 
@@ -98,28 +105,29 @@ enum Seen {
     Safe(Cause),
 }
 
-struct Drive {
+struct Drive<const AGE_MAX_MS: u64> {
     motor: SyncSender<Seen>,
     guards: SyncSender<Guard<SyncSender<Seen>>>,
     guard: Option<Guard<SyncSender<Seen>>>,
 }
 
-impl Actor for Drive {
+impl<const AGE_MAX_MS: u64> Actor for Drive<AGE_MAX_MS> {
     type Context = AppContext<Self>;
 
     fn started(&mut self, context: &mut Self::Context) {
         let safe =
             |motor: &mut SyncSender<Seen>, cause| motor.send(Seen::Safe(cause)).expect("the test looks");
-        let guard = context.guard::<Torque, _>(central(), self.motor.clone(), safe).expect("a thread");
+        let guard =
+            context.guard::<Torque<AGE_MAX_MS>, _>(central(), self.motor.clone(), safe).expect("a thread");
         self.guards.send(guard.clone()).expect("the test waits");
         self.guard = Some(guard);
     }
 }
 
-impl Handler<Delivery<Torque>> for Drive {
+impl<const AGE_MAX_MS: u64> Handler<Delivery<Torque<AGE_MAX_MS>>> for Drive<AGE_MAX_MS> {
     type Result = ();
 
-    fn handle(&mut self, torque: Delivery<Torque>, _: &mut Self::Context) {
+    fn handle(&mut self, torque: Delivery<Torque<AGE_MAX_MS>>, _: &mut Self::Context) {
         let guard = self.guard.as_ref().expect("it was made first");
         let moved = guard.apply(|motor| motor.send(Seen::Moved(torque.number)));
         moved.expect("it was live when the torque was let through").expect("the test looks");
@@ -127,7 +135,7 @@ impl Handler<Delivery<Torque>> for Drive {
 }
 
 /// All four nodes, and what the relay does between them.
-struct Scene {
+struct Scene<const AGE_MAX_MS: u64> {
     to_central: Endpoint,
     to_central_as_another: Endpoint,
     to_drive: Endpoint,
@@ -152,7 +160,7 @@ fn relay(name: &str, own: Tid, directory: &OwnDirectory) -> Endpoint {
     api.register_transport_address(registration).expect("the address is free")
 }
 
-impl Scene {
+impl<const AGE_MAX_MS: u64> Scene<AGE_MAX_MS> {
     fn start() -> Self {
         let directory = OwnDirectory::new();
         let (one, two) = (Ground::new(), Ground::new());
@@ -160,17 +168,19 @@ impl Scene {
         let ends = Mutex::new(Some((motor, guards)));
         let drive_app = AppSpec::new("drive", move || {
             let (motor, guards) = ends.lock().expect("nobody panics with it").take().expect("one life");
-            Drive { motor, guards, guard: None }
+            Drive::<AGE_MAX_MS> { motor, guards, guard: None }
         });
-        let central_app =
-            |name, tid: Tid| AppSpec::new(name, Central::default).address(tid.app).handles::<Go>();
+        let central_app = |name, tid: Tid| {
+            AppSpec::new(name, Central::<AGE_MAX_MS>::default).address(tid.app).handles::<Go>()
+        };
         let centrals = [central_app("central", central()), central_app("stranger", stranger())];
         let [first, second] = centrals;
         let nodes = [
             node(&one, 1, "one.central", &directory).app(first).app(second),
             node(&one, 2, "one.relay", &directory),
             node(&two, 1, "two.relay", &directory),
-            node(&two, 2, "two.drive", &directory).app(drive_app.address(drive().app).handles::<Torque>()),
+            node(&two, 2, "two.drive", &directory)
+                .app(drive_app.address(drive().app).handles::<Torque<AGE_MAX_MS>>()),
         ];
         let nodes = nodes.map(|node| node.start().expect("a node"));
         sinew_tests::all_run(&[&nodes[0], &nodes[3]]);
@@ -192,7 +202,7 @@ impl Scene {
     /// The bytes of central's next torque, which quotes an echo of just now.
     fn next(&mut self) -> Vec<u8> {
         self.pass_echoes();
-        next_of(&mut self.to_central, central())
+        next_of::<AGE_MAX_MS>(&mut self.to_central, central())
     }
 
     /// What the drive says passes as it is.
@@ -206,7 +216,7 @@ impl Scene {
 
     /// The way of all bytes to the drive.
     fn pass(&mut self, bytes: &[u8]) -> Outcome {
-        pass(&mut self.to_drive, drive(), Torque::KIND, bytes)
+        pass(&mut self.to_drive, drive(), Torque::<AGE_MAX_MS>::KIND, bytes)
     }
 
     /// Good ones until the output is armed and has been moved by one, whatever the machine is busy with.
@@ -227,7 +237,7 @@ impl Scene {
     }
 
     /// An error in a channel whose commands are applied: found, not applied, and the output is safe.
-    fn inject(&mut self, figures: &mut Figures, error: &Error) {
+    fn inject(&mut self, figures: &mut Figures, error: &Error<AGE_MAX_MS>) {
         let deadline = Instant::now() + DEADLINE;
         let bytes = loop {
             assert!(Instant::now() < deadline, "good ones are applied before: {:?}", self.guard.tally());
@@ -265,10 +275,10 @@ fn pass(by: &mut Endpoint, to: Tid, kind: Kind, bytes: &[u8]) -> Outcome {
 }
 
 /// The bytes of the next torque of `source` for who asks.
-fn next_of(asks: &mut Endpoint, source: Tid) -> Vec<u8> {
+fn next_of<const AGE_MAX_MS: u64>(asks: &mut Endpoint, source: Tid) -> Vec<u8> {
     assert_eq!(asks.send_confirmed(source, &Go, DEADLINE).expect("it is sent"), Outcome::Delivered);
     let torque = asks.receive(DEADLINE).expect("it is connected").expect("it sends one");
-    assert_eq!((torque.source(), torque.kind()), (source, Torque::KIND));
+    assert_eq!((torque.source(), torque.kind()), (source, Torque::<AGE_MAX_MS>::KIND));
     torque.bytes().to_vec()
 }
 
@@ -281,17 +291,17 @@ struct Figures {
 }
 
 /// One class of errors.
-struct Error {
+struct Error<const AGE_MAX_MS: u64> {
     class: &'static str,
     trials: u32,
     /// Makes the bytes that are passed on then; `None`: a good one before them came too late, as the machine is busy.
-    make: fn(&mut Scene) -> Option<Vec<u8>>,
+    make: fn(&mut Scene<AGE_MAX_MS>) -> Option<Vec<u8>>,
     rejection: Rejection,
     counted: fn(&Tally) -> u64,
     cause: Cause,
 }
 
-const CORRUPT: Error = Error {
+const CORRUPT: Error<PATIENT_MS> = Error {
     class: "corruption",
     trials: TRIALS,
     make: |scene| {
@@ -308,7 +318,21 @@ const CORRUPT: Error = Error {
     cause: Cause::TooManyBad,
 };
 
-const ERRORS: [Error; 9] = [
+const DELAY: Error<BRIEF_MS> = Error {
+    class: "unacceptable delay",
+    trials: DELAYS,
+    make: |scene| {
+        let bytes = scene.next();
+        // Only time makes it old.
+        std::thread::sleep(protection(BRIEF_MS).age_max);
+        Some(bytes)
+    },
+    rejection: Rejection::ByHandler,
+    counted: |tally| tally.too_old,
+    cause: Cause::TooManyBad,
+};
+
+const ERRORS: [Error<PATIENT_MS>; 8] = [
     CORRUPT,
     Error {
         class: "unintended repetition",
@@ -346,24 +370,15 @@ const ERRORS: [Error; 9] = [
         ..CORRUPT
     },
     Error {
-        class: "unacceptable delay",
-        trials: DELAYS,
-        make: |scene| {
-            let bytes = scene.next();
-            // Only time makes it old.
-            std::thread::sleep(PROTECTION.age_max);
-            Some(bytes)
-        },
-        rejection: Rejection::ByHandler,
-        counted: |tally| tally.too_old,
+        class: "insertion",
+        make: |scene| Some(next_of::<PATIENT_MS>(&mut scene.to_central, stranger())),
         ..CORRUPT
     },
-    Error { class: "insertion", make: |scene| Some(next_of(&mut scene.to_central, stranger())), ..CORRUPT },
     Error {
         class: "masquerade as the command of another type",
         make: |scene| {
             let bytes = scene.next();
-            let own = Codename::of::<Torque>(central(), drive());
+            let own = Codename::of::<Torque<PATIENT_MS>>(central(), drive());
             let (stamp, payload) = open(&own, &bytes.into()).expect("it is central's");
             Some(seal(&Codename { name: "black_channel.speed", ..own }, stamp, &payload).to_vec())
         },
@@ -372,23 +387,23 @@ const ERRORS: [Error; 9] = [
     Error {
         class: "masquerade as a command without protection",
         make: |scene| {
-            let own = Codename::of::<Torque>(central(), drive());
+            let own = Codename::of::<Torque<PATIENT_MS>>(central(), drive());
             Some(open(&own, &scene.next().into()).expect("it is central's").1.to_vec())
         },
         ..CORRUPT
     },
     Error {
         class: "addressing",
-        make: |scene| Some(next_of(&mut scene.to_central_as_another, central())),
+        make: |scene| Some(next_of::<PATIENT_MS>(&mut scene.to_central_as_another, central())),
         ..CORRUPT
     },
 ];
 
-#[test]
-fn whatever_a_relay_does_to_commands_is_found_and_makes_the_output_safe() {
-    let mut scene = Scene::start();
+/// Injects each of these, in a channel of their own, and sees that all of it is found.
+fn inject<const AGE_MAX_MS: u64>(errors: &[Error<AGE_MAX_MS>]) {
+    let mut scene = Scene::<AGE_MAX_MS>::start();
     assert_eq!(scene.motor.recv_timeout(DEADLINE), Ok(Seen::Safe(Cause::NotArmed)), "before anything else");
-    for error in &ERRORS {
+    for error in errors {
         let mut figures = Figures::default();
         for _ in 0..error.trials {
             scene.inject(&mut figures, error);
@@ -400,4 +415,10 @@ fn whatever_a_relay_does_to_commands_is_found_and_makes_the_output_safe() {
     }
     // Behind all of them commands are applied as before, once somebody arms.
     scene.come_alive();
+}
+
+#[test]
+fn whatever_a_relay_does_to_commands_is_found_and_makes_the_output_safe() {
+    inject(&ERRORS);
+    inject(&[DELAY]);
 }
