@@ -283,25 +283,20 @@ impl Evidence {
             + commanded.filter_map(|row| row.torque_nm).filter(|torque| !torque.is_finite()).count()
     }
 
-    /// Ticks of a safe drive, once its ramp is over, with more than soft damping and 1 Nm.
+    /// Samples of what the devices of these drives gave, once the ramps are over of drives that are safe from the beginning of the span
+    /// on, with more than soft damping and 1 Nm; without those around a stall of the host, in which a device holds its torque. What a
+    /// drive said is no proof: it says nothing of a device that it has told to damp.
     pub(super) fn undamped(&self, joints: &[Joint], span: &Span) -> usize {
-        joints.iter().map(|joint| self.undamped_ticks(*joint, span)).sum()
-    }
-
-    fn undamped_ticks(&self, joint: Joint, span: &Span) -> usize {
-        let mut since = None;
-        let mut count = 0;
-        for row in self.drive(joint, span.clone()) {
-            if row.state != DriveState::Safe {
-                since = None;
-                continue;
-            }
-            let safe_since = *since.get_or_insert(row.t_ns);
-            let ramp_is_over = row.t_ns - safe_since > SAFE_RAMP_NS;
-            let torque_nm = row.torque_nm.unwrap_or(0.0).abs();
-            count += usize::from(ramp_is_over && torque_nm > self.damping_max_nm(joint, row.t_ns));
+        let rows = self.plant(span.start.saturating_add(SAFE_RAMP_NS)..span.end);
+        if rows.is_empty() {
+            // Nothing seen is no proof either.
+            return joints.len();
         }
-        count
+        let rows = rows.iter().filter(|row| !self.stalled_around(row.t_ns));
+        let exceeds = |row: &PlantRow, joint: Joint| {
+            row.applied_nm[joint.index()].abs() > self.damping_max_nm(joint, row.t_ns)
+        };
+        rows.map(|row| joints.iter().filter(|joint| exceeds(row, **joint)).count()).sum()
     }
 
     /// Samples of a device that damps by itself, once its ramp is over, with more than soft damping and 1 Nm.
@@ -373,6 +368,59 @@ fn cut<R>(rows: &[R], span: Span, t_ns: impl Fn(&R) -> u64) -> &[R] {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A second of a plant whose knee gives a torque, while its drive is safe and has told it to damp by itself.
+    fn knee_gives(torque_nm: f64) -> Evidence {
+        let plant = |ms: u64| PlantRow {
+            t_ns: ms * 1_000_000,
+            late_us: 0,
+            strides: 0.0,
+            walking: true,
+            angle_rad: [0.0; 3],
+            velocity_rad_s: [2.0; 3],
+            intended_rad: [0.0; 3],
+            applied_nm: [0.0, torque_nm, 0.0],
+            commanded_nm: [None; 3],
+            state: [Some(DriveState::Safe); 3],
+            saturated: [false; 3],
+            watchdog: [true; 3],
+        };
+        let drive = |ms: u64| DriveRow {
+            t_ns: ms * 1_000_000,
+            late_us: 0,
+            period_us: 1_000,
+            sample_age_us: None,
+            gait_age_us: None,
+            state: DriveState::Safe,
+            torque_nm: None,
+            assist_gain: 0.0,
+            faults: 0,
+            commands_taken: 0,
+            refused_not_finite: 0,
+            refused_out_of_range: 0,
+            refused_old: 0,
+            refused_opposed: 0,
+        };
+        let drives = [(); 3].map(|()| vec![(0..1_000).map(drive).collect()]);
+        let plant = (0..1_000).map(plant).collect();
+        Evidence {
+            traces: Traces { plant, gait: Vec::new(), drives, events: Default::default() },
+            stalls: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn torque_that_a_device_gives_while_its_safe_drive_says_nothing_is_no_damping() {
+        let second = 0..1_000_000_000;
+        assert_eq!(knee_gives(20.0).undamped(&[Joint::Knee], &second), 920);
+        assert_eq!(knee_gives(20.0).undamped(&[Joint::Hip, Joint::Ankle], &second), 0);
+        assert_eq!(knee_gives(-2.5).undamped(&Joint::ALL, &second), 0);
+        assert_ne!(
+            knee_gives(0.0).undamped(&Joint::ALL, &(second.end..2 * second.end)),
+            0,
+            "nothing was seen"
+        );
+    }
 
     #[test]
     fn a_loss_is_read_as_the_watch_writes_it_and_one_in_other_words_has_no_bound() {

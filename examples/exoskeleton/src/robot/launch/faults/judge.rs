@@ -247,7 +247,11 @@ fn stay_safe(claims: &mut Claims<'_>, evidence: &Evidence, drives: &[Joint], awa
     let safe = away.start + SAFE_AT_LATEST_NS..away.end;
     let left = evidence.ticks_not_in(DriveState::Safe, drives, &safe);
     claims.exactly("ticks out of SAFE from 50 ms on, while it is away", 0, left);
-    claims.exactly("their ticks with more than b*qd + 1 Nm", 0, evidence.undamped(drives, &safe));
+    claims.exactly(
+        "samples of their devices with more than b*qd + 1 Nm",
+        0,
+        evidence.undamped(drives, &safe),
+    );
 }
 
 fn join_link(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection) {
