@@ -154,8 +154,10 @@ impl Cast {
             self.present[killed].as_ref().is_some_and(waits).then_some(())
         });
         self.kill(killed);
-        // From then on it must not count.
-        std::thread::sleep(HEARSAY);
+        let killed_at = Time::now();
+        // From then on it must not count: for all who live, and for the judge, who bears hearsay for a while.
+        self.wait_until_unknown(killed);
+        std::thread::sleep(HEARSAY.saturating_sub(Time::now().since(killed_at)));
         self.tell(away, COME);
         let arrived = |process: &Process| matches!(process.said().0.events.last(), Some(Event::Arrived(_)));
         until(&format!("{} has come", PARTIES[away].0), || {
@@ -203,6 +205,17 @@ impl Cast {
         for index in present {
             until(&format!("the directory of {} is {expected}", PARTIES[index].0), || {
                 (self.directory_of(index) == expected).then_some(())
+            });
+        }
+    }
+
+    /// Waits until nobody who lives has this party in its directory.
+    fn wait_until_unknown(&mut self, lost: usize) {
+        let entry = format!("{}=", PARTIES[lost].0);
+        let living: Vec<usize> = (0..PARTIES.len()).filter(|index| self.present[*index].is_some()).collect();
+        for index in living {
+            until(&format!("{} knows that {} is lost", PARTIES[index].0, PARTIES[lost].0), || {
+                (!self.directory_of(index).split(' ').any(|known| known.starts_with(&entry))).then_some(())
             });
         }
     }
