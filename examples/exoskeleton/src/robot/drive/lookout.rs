@@ -1,7 +1,7 @@
 //! Who tells a device to damp again while the thread of its drive says nothing.
 //!
 //! An order is one datagram, and may be lost. A drive repeats its own in each tick; one that hangs does not, and the thread
-//! `safe-output` says it once, as it may not wait. This thread repeats it until the drive gives a torque again that counts.
+//! `safe-output` says it once, as it may not wait. This thread repeats it, a bounded number of times, until the drive gives a torque again that counts.
 
 use std::io;
 use std::sync::Arc;
@@ -118,10 +118,12 @@ impl Due {
                 Some(left) => thread::park_timeout(left),
             }
         }
-        // The next life of the drive is heard only when this one is silent.
+        // The next life of the drive is heard only when this one is silent; and where all orders of this were said it may walk by now, its
+        // drive having hung for longer than a supervisor lets it.
         for _ in 0..LAST_ORDERS {
             // SYNC: Relaxed, see `due_from`.
-            if self.from_ns.load(Ordering::Relaxed) == NEVER {
+            let from_ns = self.from_ns.load(Ordering::Relaxed);
+            if from_ns == NEVER || from_ns == said_of_ns && said >= ORDERS_MAX {
                 return;
             }
             damper.damp(Time::now(), DriveState::Safe);
@@ -186,6 +188,15 @@ mod tests {
         lookout.watch().rests();
         drop(lookout);
         // The thread has the only sender: it is gone when this returns.
+        assert_eq!(told.recv_timeout(DEADLINE), Err(std::sync::mpsc::RecvTimeoutError::Disconnected));
+    }
+
+    #[test]
+    fn life_that_ends_long_after_its_orders_says_nothing_to_the_device_of_the_next_one() {
+        let (lookout, told) = lookout();
+        lookout.watch().damps();
+        is_told(&told, ORDERS_MAX);
+        drop(lookout);
         assert_eq!(told.recv_timeout(DEADLINE), Err(std::sync::mpsc::RecvTimeoutError::Disconnected));
     }
 
