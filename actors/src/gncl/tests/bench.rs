@@ -32,11 +32,6 @@ use crate::{
         peer::frame,
     },
     ndl::{self, LossReason, MembershipFact},
-    secured::Secured,
-    security::{
-        Identity,
-        tests::ground::{self, Authority},
-    },
     session::Ack,
     stores::Stores,
 };
@@ -100,40 +95,8 @@ impl Node {
         Self::begin(Stores::for_test(config, Incarnation(1))).await
     }
 
-    /// One that has keys of this project, made for a node of this number.
-    pub(super) async fn start_secured(number: u32, keys: &Authority, made_for: u32) -> Self {
-        Self::start_secured_with(number, keys, made_for, |_| {}).await
-    }
-
-    pub(super) async fn start_secured_with(
-        number: u32,
-        keys: &Authority,
-        made_for: u32,
-        set: impl FnOnce(&mut NodeConfig),
-    ) -> Self {
-        Self::start_secured_in(Incarnation(1), number, (keys, made_for), set).await
-    }
-
-    /// The same in that life.
-    pub(super) async fn start_secured_in(
-        life: Incarnation,
-        number: u32,
-        (keys, made_for): (&Authority, u32),
-        set: impl FnOnce(&mut NodeConfig),
-    ) -> Self {
-        let mut config = NodeConfig::new(format!("node-{number}"));
-        config.address = Some(NodeAddress::new(number));
-        set(&mut config);
-        let (project, name) = (config.project.clone(), format!("node-{made_for}"));
-        let made_for = Identity { project, address: NodeAddress::new(made_for), name };
-        let stores = Stores::for_test(config, life);
-        let credentials = keys.credentials_of(&made_for);
-        let secured = Secured::new(ground::tls(&credentials), &credentials, 8, life);
-        assert!(stores.secured.set(secured).is_ok(), "it is set once");
-        Self::begin(stores).await
-    }
-
-    async fn begin(stores: Arc<Stores>) -> Self {
+    /// One that has these stores.
+    pub(super) async fn begin(stores: Arc<Stores>) -> Self {
         let outcomes = Post::new(10_000);
         let settled = outcomes.attach();
         let facts = stores.posts.ndl.attach();

@@ -11,11 +11,52 @@ use tokio::net::TcpListener;
 
 use super::bench::{ByHand, Cable, NINE, Node, introduction, next, run, within};
 use crate::{
+    config::NodeConfig,
     gncl::{Event, LinkFact, core::write, peer::frame, secure::is_sealed},
     ndl::{LossReason, MembershipFact},
-    security::{DenyList, tests::ground::Authority},
+    secured::Secured,
+    security::{
+        DenyList, Identity,
+        tests::ground::{self, Authority},
+    },
+    stores::Stores,
 };
 use sinew_runtime::wire::Kind;
+
+impl Node {
+    /// One that has keys of this project, made for a node of this number.
+    async fn start_secured(number: u32, keys: &Authority, made_for: u32) -> Self {
+        Self::start_secured_with(number, keys, made_for, |_| {}).await
+    }
+
+    async fn start_secured_with(
+        number: u32,
+        keys: &Authority,
+        made_for: u32,
+        set: impl FnOnce(&mut NodeConfig),
+    ) -> Self {
+        Self::start_secured_in(Incarnation(1), number, (keys, made_for), set).await
+    }
+
+    /// The same in that life.
+    async fn start_secured_in(
+        life: Incarnation,
+        number: u32,
+        (keys, made_for): (&Authority, u32),
+        set: impl FnOnce(&mut NodeConfig),
+    ) -> Self {
+        let mut config = NodeConfig::new(format!("node-{number}"));
+        config.address = Some(NodeAddress::new(number));
+        set(&mut config);
+        let (project, name) = (config.project.clone(), format!("node-{made_for}"));
+        let made_for = Identity { project, address: NodeAddress::new(made_for), name };
+        let stores = Stores::for_test(config, life);
+        let credentials = keys.credentials_of(&made_for);
+        let secured = Secured::new(ground::tls(&credentials), &credentials, 8, life);
+        assert!(stores.secured.set(secured).is_ok(), "it is set once");
+        Self::begin(stores).await
+    }
+}
 
 /// As the name of its test nodes' project.
 fn keys() -> Authority {

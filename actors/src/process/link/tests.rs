@@ -42,6 +42,13 @@ impl ReceiptSink for SendsAgain {
     }
 }
 
+/// A node's end of an application that has no process yet, and whose mailbox takes 8 messages.
+fn begun() -> (Arc<Stores>, Arc<Link>, Tid) {
+    let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+    let link = Link::new(&stores, Mailbox::new(8));
+    (stores, link, Tid::new(NodeAddress::HERE, AppAddress::fixed(1).expect("a fixed one")))
+}
+
 /// A process behind `link`, and its end of the connection; it has read the welcome.
 async fn connected(stores: &Stores, link: &Link) -> (LinkNumber, UnixStream) {
     let (socket, mut process) = UnixStream::pair().expect("a pair of sockets");
@@ -57,9 +64,7 @@ async fn connected(stores: &Stores, link: &Link) -> (LinkNumber, UnixStream) {
 
 #[test]
 fn a_process_cannot_count_beyond_its_reach_step_by_step_either() {
-    let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
-    let link = Link::new(&stores, Mailbox::new(8));
-    let tid = Tid::new(NodeAddress::HERE, AppAddress::fixed(1).expect("a fixed one"));
+    let (stores, link, tid) = begun();
     let sender = Sender::new(tid, stores.router.clone(), Arc::new(Nobody), Pending::new(1), 1_024);
     assert!(link.sender.set(sender).is_ok());
     let says = |sequence| {
@@ -76,9 +81,7 @@ fn a_process_cannot_count_beyond_its_reach_step_by_step_either() {
 
 #[test]
 fn a_message_does_not_overtake_the_change_of_the_directory_behind_which_it_came() {
-    let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
-    let link = Link::new(&stores, Mailbox::new(8));
-    let tid = Tid::new(NodeAddress::HERE, AppAddress::fixed(1).expect("a fixed one"));
+    let (stores, link, tid) = begun();
     let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().expect("a reactor");
     let _entered = runtime.enter();
     let (socket, mut process) = UnixStream::pair().expect("a pair of sockets");
@@ -196,9 +199,7 @@ fn what_ends_a_pause_is_handed_over_however_many_events_wait_behind_messages_of_
 
 #[test]
 fn a_message_that_waits_for_names_is_told_to_who_waits_for_this_child_whoever_waited_for_the_former() {
-    let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
-    let link = Link::new(&stores, Mailbox::new(8));
-    let tid = Tid::new(NodeAddress::HERE, AppAddress::fixed(1).expect("a fixed one"));
+    let (stores, link, tid) = begun();
     let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().expect("a reactor");
     let _entered = runtime.enter();
     let (former, _process) = runtime.block_on(connected(&stores, &link));
@@ -216,9 +217,7 @@ fn a_message_that_waits_for_names_is_told_to_who_waits_for_this_child_whoever_wa
 #[test]
 fn what_is_said_for_a_former_child_neither_reaches_the_next_one_nor_counts_as_said_to_it() {
     // Given: a child that has followed another one, and names that have changed
-    let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
-    let link = Link::new(&stores, Mailbox::new(8));
-    let tid = Tid::new(NodeAddress::HERE, AppAddress::fixed(1).expect("a fixed one"));
+    let (stores, link, tid) = begun();
     let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().expect("a reactor");
     let _entered = runtime.enter();
     let (former, _process) = runtime.block_on(connected(&stores, &link));
