@@ -3,7 +3,10 @@
 use std::{
     io::{Read, Write},
     net::Shutdown,
-    os::unix::net::{UnixListener, UnixStream},
+    os::{
+        fd::AsFd,
+        unix::net::{UnixListener, UnixStream},
+    },
     path::{Path, PathBuf},
     sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel},
     thread::{self, JoinHandle},
@@ -12,7 +15,7 @@ use std::{
 
 use bytes::BytesMut;
 use rustix::{
-    event::PollFlags,
+    event::{PollFd, PollFlags, Timespec, poll},
     net::{RecvFlags, recv},
 };
 use sinew_runtime::{
@@ -35,6 +38,8 @@ use crate::{
 /// Bytes of its ring: messages are longer.
 pub(super) const RING_BYTES: u32 = 4_096;
 const PAYLOAD_MAX: usize = 4 << 20;
+/// Time in which somebody connects, also on a machine that is busy.
+const CALLED_WITHIN: Duration = Duration::from_secs(60);
 
 pub(super) struct PlayedNode {
     directory: TestDirectory,
@@ -133,11 +138,20 @@ fn socket_in(directory: &Path) -> PathBuf {
 /// The first that connects and says something. C looks whether anybody listens before it registers, on a connection of its own.
 fn caller(listener: &UnixListener) -> UnixStream {
     loop {
+        is_readable(listener, "somebody connects");
         let (socket, _) = listener.accept().unwrap();
+        is_readable(&socket, "who has connected says something, or hangs up");
         if recv(&socket, &mut [0; 1][..], RecvFlags::PEEK).unwrap().0 > 0 {
             return socket;
         }
     }
+}
+
+/// Waits until there is something to be had.
+fn is_readable(from: &impl AsFd, what: &str) {
+    let within = Timespec::try_from(CALLED_WITHIN).unwrap();
+    let there = poll(&mut [PollFd::new(from, PollFlags::IN)], Some(&within)).unwrap();
+    assert!(there > 0, "not within {CALLED_WITHIN:?}: {what}");
 }
 
 /// Registers whoever has connected.
