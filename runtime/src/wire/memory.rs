@@ -19,8 +19,9 @@ const BUFFER_BYTES: usize = 4 * 1024 + 256;
 const BUFFERS_MAX: usize = 64;
 /// Buffers that are looked at first: with few payloads under way, the same few are used, which are in the cache.
 const FIRST: usize = 4;
-/// Buffers that are looked at beyond those, each time others: payloads end in the order in which they began, mostly.
-const IN_TURN: usize = 2;
+/// Buffers that are looked at beyond those, each time others. Payloads end in the order in which they began, mostly: two are enough
+/// for those that leave one by one, and where bursts end out of their order, runs of some in use lie between free ones.
+const IN_TURN: usize = 8;
 /// Bytes to begin with where memory is allocated for one payload.
 const SHORT: usize = 128;
 
@@ -163,6 +164,8 @@ impl Buffers {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::HashSet;
+
     use super::*;
 
     fn payload(byte: u8, length: usize) -> Bytes {
@@ -210,6 +213,24 @@ mod tests {
             in_hand = payload(n, in_hand.len());
         }
         assert_eq!(buffers(), 2);
+    }
+
+    #[test]
+    fn a_free_buffer_is_found_between_runs_of_those_in_use() {
+        let mut all: Vec<_> = (0..BUFFERS_MAX).map(|_| payload(1, 1000)).collect();
+        let places: HashSet<_> = all.iter().map(|payload| payload.as_ptr()).collect();
+        let mut place = 0;
+        all.retain(|_| {
+            place += 1;
+            place <= FIRST || place % IN_TURN != 0
+        });
+        for _ in all.len()..BUFFERS_MAX {
+            all.push(payload(2, 1000));
+        }
+        assert!(
+            all.iter().all(|payload| places.contains(&payload.as_ptr())),
+            "memory was allocated while a buffer was free"
+        );
     }
 
     #[test]
