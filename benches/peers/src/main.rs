@@ -18,6 +18,9 @@
 mod applications;
 mod flood;
 mod iceoryx2;
+#[path = "../../../actors/benches/gncl/keys.rs"]
+#[allow(dead_code, reason = "nobody has keys here: the others have none either")]
+mod keys;
 #[path = "../../../actors/benches/gncl/nodes.rs"]
 #[allow(dead_code, reason = "the bench has cases in namespaces besides")]
 mod nodes;
