@@ -15,8 +15,8 @@ use super::{
 impl Gncl {
     /// Binds a socket for datagrams beside each of these, if they are wanted and may go as they are.
     pub(super) fn bind_datagrams(&self, listeners: &[TcpListener]) {
-        let config = &self.stores.config.gncl;
-        if config.datagrams && self.stores.secured.get().is_none() {
+        let config = &self.stores.config;
+        if config.gncl.datagrams && self.stores.secured.get().is_none() {
             let addresses: Vec<_> =
                 listeners.iter().filter_map(|listener| listener.local_addr().ok()).collect();
             let Store { datagrams, refusals, .. } = &self.stores.gncl;

@@ -11,7 +11,7 @@ use sinew_runtime::time::Time;
 use socket2::{Domain, Protocol, Socket, Type};
 
 use super::super::marks;
-use crate::{config::GnclConfig, refusals::Refusals, stores::lock};
+use crate::{config::NodeConfig, refusals::Refusals, stores::lock};
 
 /// Room for what comes while the IO thread does something else, where the system grants it (`net.core.rmem_max`): 30 ms of a gigabit.
 const RECEIVE_BUFFER: usize = 4 << 20;
@@ -42,13 +42,14 @@ pub(in crate::gncl) struct Door {
 pub(in crate::gncl) struct Sockets(Mutex<Vec<Door>>);
 
 impl Sockets {
-    /// Binds one beside each listener, at the same port if that is free.
-    pub(in crate::gncl) fn bind(&self, listeners: &[SocketAddr], gncl: &GnclConfig, refusals: &Refusals) {
-        let mut doors = lock(&self.0);
+    /// Binds one beside each listener, at the same port if that is free, and not to be NDL's.
+    pub(in crate::gncl) fn bind(&self, listeners: &[SocketAddr], config: &NodeConfig, refusals: &Refusals) {
+        let (gncl, mut doors) = (&config.gncl, lock(&self.0));
         for (nth, listener) in listeners.iter().enumerate() {
             // The first one is that of the interface.
             let outer = gncl.announce.filter(|_| nth == 0);
-            match door(*listener, gncl.marks) {
+            let port = if listener.port() == config.ndl.port { 0 } else { listener.port() };
+            match door(*listener, port, gncl.marks) {
                 Ok(door) => doors.push(Door { outer, ..door }),
                 // Values go by the connection then.
                 Err(error) => {
@@ -112,7 +113,8 @@ impl Announcement {
     }
 }
 
-fn door(listener: SocketAddr, is_marked: bool) -> io::Result<Door> {
+/// One at the listener's address, at this port if that is free.
+fn door(listener: SocketAddr, port: u16, is_marked: bool) -> io::Result<Door> {
     let bound = |port| -> io::Result<Socket> {
         let socket = Socket::new(
             Domain::for_address(listener),
@@ -132,7 +134,7 @@ fn door(listener: SocketAddr, is_marked: bool) -> io::Result<Door> {
         Ok(socket)
     };
     // Who opens a firewall needs one number. Where another has that port, any will do: peers are told which.
-    let socket = bound(listener.port()).or_else(|_| bound(0))?;
+    let socket = bound(port).or_else(|_| bound(0))?;
     // The system may grant less; then a burst loses datagrams, which are sent again.
     let _ = socket.set_recv_buffer_size(RECEIVE_BUFFER);
     if is_marked {
@@ -169,12 +171,23 @@ mod tests {
     #[test]
     fn beside_a_connection_is_the_socket_of_its_address_or_one_of_its_family() {
         let sockets = Sockets::default();
-        let config = crate::config::NodeConfig::new("test").gncl;
+        let config = NodeConfig::new("test");
         let listeners = ["127.0.0.1:0", "0.0.0.0:0"].map(|at| at.parse().unwrap());
         sockets.bind(&listeners, &config, &Refusals::default());
         let beside = |at: &str| sockets.beside(at.parse().unwrap()).map(|door| door.at.ip().to_string());
         assert_eq!(beside("127.0.0.1:5").as_deref(), Some("127.0.0.1"));
         assert_eq!(beside("127.0.0.2:5").as_deref(), Some("127.0.0.1"));
         assert_eq!(beside("[fe80::1%3]:5"), None, "none of this node's gets there");
+    }
+    #[test]
+    fn the_port_that_ndl_is_to_have_is_left_to_it() {
+        let listener = std::net::TcpListener::bind(("127.0.0.1", 0)).unwrap().local_addr().unwrap();
+        let mut config = NodeConfig::new("test");
+        config.ndl.port = listener.port();
+        let sockets = Sockets::default();
+        sockets.bind(&[listener], &config, &Refusals::default());
+        let door = sockets.beside(listener).unwrap();
+        assert_eq!(door.at.ip(), listener.ip());
+        assert_ne!(door.at.port(), listener.port());
     }
 }
