@@ -53,7 +53,7 @@ mod nodes;
 
 use std::process::ExitCode;
 
-use sinew_figures::process;
+use sinew_figures::{Asked, process};
 
 use crate::{
     newcomer::First,
@@ -101,13 +101,11 @@ impl Case {
         }
     }
 
-    fn is_wanted(self, words: &[String]) -> bool {
-        let name = self.name();
-        let is_named = match self {
-            Self::Gone(..) | Self::New(..) | Self::AppKill => true,
-            Self::Spin(..) => words.iter().any(|word| word.contains("spin")),
-        };
-        is_named && words.iter().all(|word| name.contains(word.as_str()))
+    fn is_long(self) -> bool {
+        match self {
+            Self::Gone(..) | Self::New(..) | Self::AppKill => false,
+            Self::Spin(..) => true,
+        }
     }
 
     /// Runs it in a process of its own. Returns whether that went well.
@@ -141,15 +139,17 @@ fn main() -> ExitCode {
     if let Some(role) = process::role() {
         return play(&role);
     }
-    let (options, words): (Vec<_>, Vec<_>) = std::env::args().skip(1).partition(|arg| arg.starts_with('-'));
-    let is_short = options.iter().any(|option| option == "--short");
-    let seed = options.iter().find_map(|option| option.strip_prefix("--seed=")?.parse().ok()).unwrap_or(SEED);
-    let wanted: Vec<_> = Case::all().into_iter().filter(|case| case.is_wanted(&words)).collect();
-    if wanted.is_empty() {
-        let names: Vec<_> = Case::all().into_iter().map(Case::name).collect();
-        eprintln!("no case has {} in its name; there are {}", words.join(" and "), names.join(", "));
-        return ExitCode::from(2);
-    }
+    let asked = Asked::read(include_str!("main.rs"), &["--short", "--seed="]);
+    let is_short = asked.is_short();
+    let seed = match asked.value("--seed=").map_or(Ok(SEED), str::parse) {
+        Ok(seed) => seed,
+        Err(error) => {
+            eprintln!("--seed= is followed by a whole number, such as --seed=7: {error}");
+            return ExitCode::from(2);
+        }
+    };
+    let offered = Case::all().into_iter().filter(|case| !case.is_long() || asked.names("spin"));
+    let wanted = asked.wanted(offered, |case| case.name());
     sinew_figures::head();
     let failed = wanted.into_iter().filter(|case| !case.run(is_short, seed)).count();
     if failed == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }

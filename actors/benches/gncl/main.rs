@@ -41,7 +41,7 @@ mod stream_ways;
 
 use std::{process::ExitCode, time::Duration};
 
-use sinew_figures::{Beside, End, Pace, Pinning, Rounds, process};
+use sinew_figures::{Asked, Beside, End, Pace, Pinning, Rounds, process};
 use sinew_hosts::Queue;
 
 use crate::{
@@ -252,13 +252,12 @@ fn main() -> ExitCode {
     if let Some(role) = process::role() {
         return play(&role);
     }
+    let asked = Asked::read(include_str!("main.rs"), &["--short"]);
+    let is_short = asked.is_short();
+    let wanted = asked.wanted(Case::all(is_short), |case| case.name());
     sinew_figures::head();
     Beside::head();
-    let words: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with('-')).collect();
-    let is_short = std::env::args().any(|arg| arg == "--short");
-    let cases = Case::all(is_short).into_iter();
-    let wanted = cases.filter(|case| words.iter().all(|word| case.name().contains(word.as_str())));
-    let failed = wanted.filter(|case| !case.run(is_short)).count();
+    let failed = wanted.into_iter().filter(|case| !case.run(is_short)).count();
     if failed == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 

@@ -39,7 +39,7 @@ fn node(name: &str, host: u8) -> NodeBuilder {
 }
 
 fn main() {
-    let is_short = std::env::args().any(|arg| arg == "--short");
+    let is_short = sinew_figures::Asked::read(include_str!("stream_allocations.rs"), &["--short"]).is_short();
     let values = if is_short { 1_000 } else { 10_000 };
     for by in By::ALL {
         for channels in [1, 16] {

@@ -33,13 +33,12 @@ fn main() -> std::process::ExitCode {
     if let Some(role) = sinew_figures::process::role() {
         return case::play(&role);
     }
+    let asked = sinew_figures::Asked::read(include_str!("main.rs"), &["--short"]);
+    let is_short = asked.is_short();
+    let wanted = asked.wanted(case::all(is_short), |case| case.name());
     eprintln!("machine: {}", sinew_figures::machine());
     sinew_figures::Beside::head();
-    let words: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with('-')).collect();
-    let is_short = std::env::args().any(|arg| arg == "--short");
-    let wanted =
-        case::all(is_short).filter(|case| words.iter().all(|word| case.name().contains(word.as_str())));
-    let failed = wanted.filter(|case| !case.run(is_short)).count();
+    let failed = wanted.into_iter().filter(|case| !case.run(is_short)).count();
     if failed == 0 { std::process::ExitCode::SUCCESS } else { std::process::ExitCode::FAILURE }
 }
 

@@ -1,6 +1,6 @@
 //! Round trips on each path a message can take within one node, beside a raw reference of the same run.
 //!
-//! `cargo bench -p sinew --bench paths [-- CASE...]` prints one JSON line a case. Every case runs in fresh processes,
+//! `cargo bench -p sinew --bench paths [-- WORD...]` prints one JSON line a case, of those whose name holds every WORD. Every case runs in fresh processes,
 //! three times: wherever the scheduler likes, with everything on one CPU, and with one CPU for each end. Times are
 //! microseconds, there and back. Nothing here asserts a time.
 
@@ -13,7 +13,7 @@ mod sinew_ends;
 use std::process::ExitCode;
 
 use case::{CASES, Case};
-use sinew_figures::{Pace, Pinning, Rounds, process};
+use sinew_figures::{Asked, Pace, Pinning, Rounds, process};
 
 /// The environment variable that says another number: a profile needs more.
 const ROUNDS_WANTED: &str = "SINEW_PATHS_ROUNDS";
@@ -22,11 +22,10 @@ fn main() -> ExitCode {
     if let Some(role) = process::role() {
         return play(&role);
     }
-    let wanted: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with('-')).collect();
+    let wanted = Asked::read(include_str!("main.rs"), &[]).wanted(CASES, |case| case.name.to_owned());
     eprintln!("machine: {}", sinew_figures::machine());
     let mut failed = false;
-    for case in CASES.iter().filter(|case| wanted.is_empty() || wanted.iter().any(|w| case.name.contains(w)))
-    {
+    for case in wanted {
         for pinning in Pinning::ALL {
             failed |= !run(case, pinning);
         }

@@ -1,6 +1,6 @@
 //! How soon a hang is noticed and a successor ready, and how soon after a panic.
 //!
-//! `cargo bench -p sinew-runtime --bench hangs [-- CASE...]`: 200 hangs of each sort, each in a new life, and 1,000 panics.
+//! `cargo bench -p sinew-runtime --bench hangs [-- WORD...]`: 200 hangs of each sort, each in a new life, and 1,000 panics.
 //! A hang's time is that past its budget. The supervisor and its victim run under SCHED_FIFO where that is granted, as on a
 //! robot. One JSON line for each figure on the standard output, a table on the other.
 //! Nothing here asserts a time.
@@ -20,7 +20,7 @@ use std::{
 };
 
 use actix::{Actor, AsyncContext, Handler, fut::WrapFuture};
-use sinew_figures::{Alone, Figures, head};
+use sinew_figures::{Alone, Asked, Figures, head};
 use sinew_runtime::{
     app::{AppContext, AppSpec, Delivery},
     supervision::{ChildId, Place, Reason, SupervisorFact},
@@ -118,15 +118,11 @@ const CASES: [Case; 5] = [
 ];
 
 fn main() {
-    let wanted: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with('-')).collect();
+    let wanted = Asked::read(include_str!("main.rs"), &[]).wanted(&CASES, |case| case.name.to_owned());
     // A thousand panics on the terminal say nothing.
     std::panic::set_hook(Box::new(|_| {}));
     head();
-    for case in &CASES {
-        if wanted.is_empty() || wanted.iter().any(|wanted| case.name.contains(wanted)) {
-            run(case);
-        }
-    }
+    wanted.into_iter().for_each(run);
 }
 
 fn run(case: &Case) {

@@ -1,6 +1,6 @@
 //! A real-time actor's queue, beside actix's own: fed from its own CPU, under a backlog, and when it is to stop.
 //!
-//! `cargo bench -p sinew-runtime --bench mailbox [-- CASE...]`. The reader runs under SCHED_FIFO 50 on one CPU. On the same CPU
+//! `cargo bench -p sinew-runtime --bench mailbox [-- WORD...]`. The reader runs under SCHED_FIFO 50 on one CPU. On the same CPU
 //! an ordinary thread sends, as fast as it can or 10,000 a second; from another CPU a third thread sends one message each
 //! 100 us, which is timed from its sending to its handling. In the cases with `medium` a SCHED_FIFO 30 thread takes that CPU
 //! for 5 ms of each 20: who holds a lock without priority inheritance is kept from letting it go. One JSON line for each figure
@@ -23,7 +23,7 @@ use std::{
 };
 
 use reader::{Queue, READER_CPU, Reader, Seen};
-use sinew_figures::{Alone, Figures, head};
+use sinew_figures::{Alone, Asked, Figures, head};
 use sinew_runtime::{supervision::Place, time::Time};
 
 /// Time of one case.
@@ -42,23 +42,22 @@ enum Load {
 }
 
 fn main() {
-    let wanted: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with('-')).collect();
-    let is_wanted = |case: &str| wanted.is_empty() || wanted.iter().any(|wanted| case.contains(wanted));
+    let loads = [Some(Load::Flood), Some(Load::TenThousand), Some(Load::FloodAndMedium), None];
+    let cases = [Queue::Sinew, Queue::Actix].into_iter().flat_map(|queue| loads.map(|load| (queue, load)));
+    let name = |(queue, load): &(Queue, Option<Load>)| {
+        format!("{}_{}", queue.name(), load.map_or("backlog", Load::name))
+    };
+    let wanted = Asked::read(include_str!("main.rs"), &[]).wanted(cases, name);
     if std::thread::available_parallelism().map_or(1, usize::from) < 2 {
         eprintln!("this needs two CPUs");
         return;
     }
     head();
-    for queue in [Queue::Sinew, Queue::Actix] {
-        for load in [Load::Flood, Load::TenThousand, Load::FloodAndMedium] {
-            let case = format!("{}_{}", queue.name(), load.name());
-            if is_wanted(&case) {
-                fed(&case, queue, load);
-            }
-        }
-        let case = format!("{}_backlog", queue.name());
-        if is_wanted(&case) {
-            backlog(&case, queue);
+    for case in wanted {
+        let name = name(&case);
+        match case {
+            (queue, Some(load)) => fed(&name, queue, load),
+            (queue, None) => backlog(&name, queue),
         }
     }
 }

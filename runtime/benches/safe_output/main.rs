@@ -1,6 +1,6 @@
 //! How soon after its watchdog's time an output is safe whose commands have stopped.
 //!
-//! `cargo bench -p sinew-runtime --bench safe_output [-- CASE...]`: a command each millisecond, `within` 3 ms, 1,000 trials of each
+//! `cargo bench -p sinew-runtime --bench safe_output [-- WORD...]`: a command each millisecond, `within` 3 ms, 1,000 trials of each
 //! case. A trial's time is that from the end of the watchdog's time, counted from the last good command's handler, to the
 //! call that makes the output safe: so it lacks what lies between the look at a command and its handler, some microseconds. Sender,
 //! receiver and watchdog run under SCHED_FIFO where that is granted, as on a robot; in the cases that end in `_busy` as many threads
@@ -25,7 +25,7 @@ use std::{
 
 use actix::{Actor, Handler};
 use serde::{Deserialize, Serialize};
-use sinew_figures::{Alone, Figures, head};
+use sinew_figures::{Alone, Asked, Figures, head};
 use sinew_runtime::{
     app::{AppContext, AppSpec, Delivery},
     protection::{Cause, Guard, Protection},
@@ -165,13 +165,9 @@ const CASES: [Case; 6] = [
 ];
 
 fn main() {
-    let wanted: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with('-')).collect();
+    let wanted = Asked::read(include_str!("main.rs"), &[]).wanted(&CASES, |case| case.name.to_owned());
     head();
-    for case in &CASES {
-        if wanted.is_empty() || wanted.iter().any(|wanted| case.name.contains(wanted)) {
-            run(case);
-        }
-    }
+    wanted.into_iter().for_each(run);
 }
 
 fn run(case: &Case) {

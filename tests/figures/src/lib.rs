@@ -1,10 +1,11 @@
 //! Times of many runs, and the lines in which Sinew's benches say them: [`Beside`] where a reference of the same run stands
 //! next to the case, [`Alone`] where none does. JSON lines are on the standard output, all else is on the standard error.
 //!
-//! And what benches share besides: the processes that they start ([`process`]), how many round trips at which pace
+//! And what benches share besides: what they are asked for ([`Asked`]), the processes that they start ([`process`]), how many round trips at which pace
 //! ([`Rounds`]), and the streams of the system beside which they measure ([`stream`]).
 
 mod alone;
+mod asked;
 mod beside;
 mod pinning;
 pub mod process;
@@ -12,6 +13,7 @@ mod rounds;
 pub mod stream;
 
 pub use alone::{Alone, head};
+pub use asked::Asked;
 pub use beside::Beside;
 pub use pinning::{End, Pinning};
 pub use rounds::{Pace, Rounds};

@@ -23,11 +23,10 @@ fn main() {
     if let Ok(role) = std::env::var(case::ROLE) {
         return case::echo(&role);
     }
+    let wanted =
+        sinew_figures::Asked::read(include_str!("main.rs"), &[]).wanted(case::all(), |case| case.name());
     eprintln!("machine: {}", sinew_figures::machine());
-    let words: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with('-')).collect();
-    case::all()
-        .filter(|case| words.iter().all(|word| case.name().contains(word.as_str())))
-        .for_each(case::run);
+    wanted.into_iter().for_each(case::run);
 }
 
 #[cfg(not(target_os = "linux"))]
