@@ -26,6 +26,20 @@ const OF_A_NODE: usize = 3;
 /// How old may be what is known of where nodes were found, as a look through all their addresses takes a millisecond where there are a thousand.
 const FOUND_FOR: Duration = Duration::from_millis(100);
 
+/// Strangers that are closed at once where many are to go: as many as are accepted without a pause. Links that stand share the thread, and wait
+/// for a system call or more for each.
+const CLOSED_AT_ONCE: usize = 4;
+/// Time between two such handfuls.
+const CLOSED_EACH: Duration = Duration::from_millis(1);
+
+/// Strangers that are to go because there were no descriptors left.
+#[derive(Debug)]
+pub(super) struct Clearing {
+    left: usize,
+    /// When the next ones go.
+    pub(super) next: Time,
+}
+
 /// How many nodes NDL has found at each address.
 #[derive(Debug, Default)]
 pub(super) struct FoundAt {
@@ -50,10 +64,29 @@ impl Core {
             .insert(connection, Connection { stage: Stage::Stranger, from: Some(from), deadline });
     }
 
-    /// There are no descriptors left, or no memory: what strangers hold is needed for peers. spec: GNCL-2
+    /// There are no descriptors left, or no memory: what strangers hold is needed for peers. Half of them go, [`CLOSED_AT_ONCE`] each
+    /// [`CLOSED_EACH`]. spec: GNCL-2
     pub(super) fn starved(&mut self, now: Time) {
         let half = self.strangers().count().div_ceil(2);
-        self.close_strangers(now, half);
+        match &mut self.clearing {
+            // It goes on at its pace, however often that is said meanwhile.
+            Some(clearing) => clearing.left = clearing.left.max(half),
+            None => self.clear(now, half),
+        }
+    }
+
+    /// The next of the strangers that are to go are due.
+    pub(super) fn clear_further(&mut self, now: Time) {
+        if let Some(Clearing { left, .. }) = self.clearing.take_if(|clearing| clearing.next <= now) {
+            self.clear(now, left);
+        }
+    }
+
+    fn clear(&mut self, now: Time, count: usize) {
+        let at_once = count.min(CLOSED_AT_ONCE);
+        self.close_strangers(now, at_once);
+        let left = count - at_once;
+        self.clearing = (left > 0).then(|| Clearing { left, next: now + CLOSED_EACH });
     }
 
     /// Connections whose peer is not known, or was refused and has not closed, and from where they were made: oldest first.

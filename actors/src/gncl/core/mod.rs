@@ -34,7 +34,7 @@ use sinew_runtime::{
 
 use super::LinkFact;
 use acquaintance::Acquaintance;
-use connections::FoundAt;
+use connections::{Clearing, FoundAt};
 pub(super) use handshake::{
     CANCEL, CLASSES, DATAGRAMS, Decline, GUARD, HANDSHAKE_PAYLOAD_MAX, Introduction, Lane, OUTCOMES, Refusal,
     read, write,
@@ -215,6 +215,8 @@ pub(super) struct Core {
     outputs: VecDeque<Output>,
     /// Where connections of strangers may be those of nodes that were found.
     found_at: FoundAt,
+    /// Strangers that are to go, if there are any.
+    clearing: Option<Clearing>,
     opened: u64,
     chance: fastrand::Rng,
     leaving: bool,
@@ -229,6 +231,7 @@ impl Core {
             peers: BTreeMap::new(),
             outputs: VecDeque::new(),
             found_at: FoundAt::default(),
+            clearing: None,
             opened: 0,
             chance: fastrand::Rng::with_seed(seed),
             leaving: false,
@@ -289,11 +292,13 @@ impl Core {
     pub(super) fn next_wake(&self) -> Option<Time> {
         let deadlines = self.connections.values().map(|connection| connection.deadline);
         let peers = self.peers.values().filter_map(|peer| peer.next_wake(&self.settings));
-        deadlines.chain(peers).filter(|at| *at != Time::MAX).min()
+        let clearing = self.clearing.as_ref().map(|clearing| clearing.next);
+        deadlines.chain(peers).chain(clearing).filter(|at| *at != Time::MAX).min()
     }
 
     fn time_passed(&mut self, now: Time) {
         self.forgive_our_own_lateness(now);
+        self.clear_further(now);
         let over = self.connections.iter().filter(|(_, connection)| connection.deadline <= now);
         let over: Vec<_> = over.map(|(id, connection)| (*id, connection.stage)).collect();
         for (connection, stage) in over {

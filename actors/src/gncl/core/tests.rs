@@ -8,6 +8,7 @@ mod dials;
 mod lost;
 mod proven;
 mod sides;
+mod starved;
 mod virtual_wire;
 
 use virtual_wire::{Mishap, World, millis};
@@ -351,24 +352,6 @@ fn who_is_refused_counts_where_it_came_from() {
         [Output::Close(refused)],
         "two came from there, and it is the older one, not {other:?}"
     );
-}
-
-#[test]
-fn half_of_the_strangers_give_their_descriptors_back_when_there_are_none_left() {
-    let mut core = core();
-    let (link, _) = greet(&mut core, millis(0), hello_from(HIGH, 1, 1));
-    let strangers: Vec<_> = (0..3).map(|_| core.open()).collect();
-    for stranger in &strangers {
-        core.handle(millis(0), Input::Accepted(*stranger, SOMEWHERE));
-    }
-    for gone in [&strangers[..2], &strangers[2..], &[]] {
-        core.handle(millis(1), Input::Starved);
-        assert_eq!(
-            outputs(&mut core),
-            gone.iter().map(|stranger| Output::Close(*stranger)).collect::<Vec<_>>()
-        );
-    }
-    assert!(core.linked(link).is_some(), "no link is touched");
 }
 
 #[test]

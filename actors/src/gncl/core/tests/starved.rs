@@ -1,0 +1,49 @@
+//! Scenarios: there are no descriptors left.
+
+use super::*;
+
+#[test]
+fn half_of_the_strangers_give_their_descriptors_back_when_there_are_none_left() {
+    let mut core = core();
+    let (link, _) = greet(&mut core, millis(0), hello_from(HIGH, 1, 1));
+    let strangers: Vec<_> = (0..3).map(|_| core.open()).collect();
+    for stranger in &strangers {
+        core.handle(millis(0), Input::Accepted(*stranger, SOMEWHERE));
+    }
+    for gone in [&strangers[..2], &strangers[2..], &[]] {
+        core.handle(millis(1), Input::Starved);
+        assert_eq!(
+            outputs(&mut core),
+            gone.iter().map(|stranger| Output::Close(*stranger)).collect::<Vec<_>>()
+        );
+    }
+    assert!(core.linked(link).is_some(), "no link is touched");
+}
+
+#[test]
+fn many_strangers_that_give_their_descriptors_back_go_a_few_each_millisecond_as_links_share_the_thread() {
+    let mut core = Core::new(Settings { strangers_max: 20, ..settings(LOW, 1) }, 7);
+    let strangers: Vec<_> = (0..20).map(|_| core.open()).collect();
+    for stranger in &strangers {
+        core.handle(millis(0), Input::Accepted(*stranger, SOMEWHERE));
+    }
+    core.handle(millis(10), Input::Starved);
+    let mut gone = Vec::new();
+    for (at, count) in [(10, 4), (11, 4), (12, 4)] {
+        let closed = outputs(&mut core);
+        assert_eq!(closed.len(), count, "at {at} ms: {closed:?}");
+        gone.extend(closed);
+        // Said again meanwhile, it makes nobody go sooner, and of the 16 that are left 8 go in all.
+        if at == 10 {
+            core.handle(millis(at), Input::Starved);
+            assert_eq!(outputs(&mut core), []);
+        }
+        if gone.len() < 12 {
+            assert_eq!(core.next_wake(), Some(millis(at + 1)));
+        }
+        core.handle(millis(at + 1), Input::TimePassed);
+    }
+    assert_eq!(outputs(&mut core), []);
+    let oldest = strangers[..12].iter().map(|stranger| Output::Close(*stranger));
+    assert_eq!(gone, oldest.collect::<Vec<_>>());
+}
