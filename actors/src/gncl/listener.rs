@@ -17,8 +17,8 @@ use crate::{config::NodeConfig, refusals::Refusals};
 
 /// Connections that wait to be accepted at most; the kernel refuses further ones.
 const BACKLOG: i32 = 1_024;
-/// Connections that are accepted without a pause: each takes some 50 us of the thread, so that no message waits longer for them than for
-/// another one of 64 KiB.
+/// Connections that are accepted without a pause, each in a turn of its own, which takes some 50 us of the thread: so no message waits longer
+/// for one than for another one of 64 KiB, and a flood of them has a sixth of the thread.
 const AT_ONCE_MAX: u32 = 4;
 /// The pause: 300 nodes that dial all their connections at once are accepted within a third of a second.
 const REST: Duration = Duration::from_millis(1);
@@ -161,7 +161,8 @@ fn begin_to_listen(socket: &Socket, address: SocketAddr) -> io::Result<std::net:
 }
 
 /// Each connection that is made to `listener`, and each error that made it wait. See [`tune`](super::link::tune). Links that stand share
-/// the thread: after [`AT_ONCE_MAX`] connections without a pause it [rests](REST), and whoever floods the port waits in the kernel.
+/// the thread: they have their turn between two connections, after [`AT_ONCE_MAX`] without a pause it [rests](REST), and whoever floods the
+/// port waits in the kernel.
 pub(super) fn accepted(
     listener: TcpListener,
     give_up: Duration,
@@ -172,6 +173,8 @@ pub(super) fn accepted(
         } else if at_once >= AT_ONCE_MAX {
             tokio::time::sleep(REST).await;
             at_once = 0;
+        } else if at_once > 0 {
+            tokio::task::yield_now().await;
         }
         let accepted = poll_fn(|cx| {
             let accepted = listener.poll_accept(cx);
@@ -214,7 +217,13 @@ fn wait_after(error: &io::Error, before: Duration) -> Duration {
 
 #[cfg(test)]
 mod tests {
-    use std::pin::pin;
+    use std::{
+        pin::pin,
+        sync::{
+            Arc,
+            atomic::{AtomicU32, Ordering},
+        },
+    };
 
     use futures_util::{FutureExt, StreamExt};
 
@@ -317,14 +326,40 @@ mod tests {
         while all < DIALLED {
             accepted.next().await.expect("it listens").unwrap();
             let mut at_once = 1;
-            while let Some(next) = accepted.next().now_or_never() {
+            // The first look may find that others have their turn. The second one is behind that, and no time has passed for the timer.
+            while let Some(next) = accepted.next().now_or_never().or_else(|| accepted.next().now_or_never()) {
                 next.expect("it listens").unwrap();
                 at_once += 1;
             }
             longest = at_once.max(longest);
             all += at_once;
         }
-        assert!(longest <= AT_ONCE_MAX, "{longest} without a pause");
+        assert!((2..=AT_ONCE_MAX).contains(&longest), "{longest} without a pause");
+    }
+
+    #[tokio::test]
+    async fn between_two_connections_that_wait_the_others_on_the_thread_have_their_turn() {
+        let listener = listen(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
+        let address = listener.local_addr().unwrap();
+        let _dialled: Vec<_> =
+            (0..AT_ONCE_MAX).map(|_| std::net::TcpStream::connect(address).unwrap()).collect();
+        let mut accepted = pin!(accepted(TcpListener::from_std(listener).unwrap(), Duration::from_secs(1)));
+        let turns = Arc::new(AtomicU32::new(0));
+        let counting = turns.clone();
+        let other = tokio::spawn(async move {
+            loop {
+                counting.fetch_add(1, Ordering::Relaxed);
+                tokio::task::yield_now().await;
+            }
+        });
+        accepted.next().await.expect("it listens").unwrap();
+        for number in 1..AT_ONCE_MAX {
+            let before = turns.load(Ordering::Relaxed);
+            accepted.next().await.expect("it listens").unwrap();
+            let turns = turns.load(Ordering::Relaxed) - before;
+            assert!(turns > 0, "nobody had a turn between connections {number} and {}", number + 1);
+        }
+        other.abort();
     }
 
     #[test]
