@@ -41,6 +41,12 @@ impl BulkThread {
         &self.runtime
     }
 
+    /// Turns that have ended on it.
+    #[cfg(test)]
+    pub(super) fn turns(&self) -> u64 {
+        self.courtesy.turns()
+    }
+
     /// The same for those that may have a next turn at once.
     pub(super) fn place(&self) -> Place {
         Place::There(self.runtime.clone(), self.courtesy.clone())

@@ -22,13 +22,24 @@ const RUN_MAX: Duration = Duration::from_millis(20);
 pub(super) struct Courtesy {
     /// It does not before this, in nanoseconds. The thread's tasks have it in common, and nobody else has it.
     not_before: AtomicU64,
+    /// Turns that have ended.
+    #[cfg(test)]
+    turns: AtomicU64,
 }
 
 impl Courtesy {
     /// A turn has ended at `now`: whether the CPU is to be given away. [`was_away`](Self::was_away) follows, if it was.
     pub(super) fn gives_way(&self, now: Time) -> bool {
+        #[cfg(test)]
+        self.turns.fetch_add(1, Ordering::Relaxed);
         // SYNC: Relaxed; one thread reads and writes it.
         now.as_nanos() >= self.not_before.load(Ordering::Relaxed)
+    }
+
+    /// Turns that have ended.
+    #[cfg(test)]
+    pub(super) fn turns(&self) -> u64 {
+        self.turns.load(Ordering::Relaxed)
     }
 
     /// It was given away at `from`, and is back at `now`.

@@ -1,9 +1,10 @@
 //! Who is at the other end, proven before a word is believed: the handshake of TLS on a connection between nodes.
 //!
 //! It takes a fraction of a millisecond of a CPU, and whoever can reach the port can ask for one: so it is a thread of its own that does
-//! it, nicer than those that carry messages.
+//! it, nicer than those that carry messages, and it gives its CPU away after each step of one. Being nicer is not enough: the system lets who
+//! computes go on to the end of a slice of milliseconds, whoever has been woken meanwhile.
 
-use std::{fmt, io};
+use std::{fmt, future::poll_fn, io, pin::pin};
 
 use rustls::{Connection, pki_types::UnixTime};
 use tokio::net::TcpStream;
@@ -111,10 +112,22 @@ impl Secure {
             }
         }
         let socket = self.thread.adopt(transport.socket())?;
-        let shaken = self.thread.runtime().spawn(shake(self.tls.clone(), socket, end));
+        let (shaking, place) = (shake(self.tls.clone(), socket, end), self.thread.place());
+        let shaken = self.thread.runtime().spawn(by_turns(shaking, move || place.end_turn()));
         let (tls, peer) = AbortOnDropHandle::new(shaken).await.map_err(io::Error::other)??;
         Ok((transport.sealed(tls), peer))
     }
+}
+
+/// The same, and after each turn of it this.
+async fn by_turns<T>(work: impl Future<Output = T>, mut end_turn: impl FnMut()) -> T {
+    let mut work = pin!(work);
+    poll_fn(|cx| {
+        let polled = work.as_mut().poll(cx);
+        end_turn();
+        polled
+    })
+    .await
 }
 
 async fn shake(tls: Tls, socket: TcpStream, end: End) -> Result<(Connection, Box<Peer>), Unproven> {
@@ -128,4 +141,52 @@ async fn shake(tls: Tls, socket: TcpStream, end: End) -> Result<(Connection, Box
     // Whom the dialler wanted, and who is there, is compared when it says hello.
     let peer = tls.peer(&connection, None, UnixTime::now())?;
     Ok((connection, Box::new(peer)))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{cell::Cell, io::Write as _, time::Duration};
+
+    use rustls::ClientConnection;
+
+    use super::*;
+    use crate::security::tests::ground::Authority;
+
+    #[tokio::test]
+    async fn the_cpu_is_given_away_after_what_a_handshake_that_nobody_ends_has_cost() {
+        const PATIENCE: Duration = Duration::from_secs(20);
+        let tls = Authority::new("walker").tls("knee", 1);
+        let secure = Secure::begin(tls.clone()).unwrap();
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let mut stranger = std::net::TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+        let mut beginning = Vec::new();
+        let mut client = ClientConnection::new(tls.client(), Tls::server_name()).unwrap();
+        client.write_tls(&mut beginning).unwrap();
+        stranger.write_all(&beginning).unwrap();
+        let (socket, _) = listener.accept().await.unwrap();
+        let given_away = async {
+            while secure.thread.turns() == 0 {
+                tokio::time::sleep(Duration::from_millis(1)).await;
+            }
+        };
+        tokio::select! {
+            greeted = secure.greet(Transport::open(socket), End::IsDialled) => panic!("{:?}", greeted.map(drop)),
+            looked = tokio::time::timeout(PATIENCE, given_away) => looked.expect("a turn of it has ended"),
+        }
+    }
+
+    #[tokio::test]
+    async fn each_step_of_a_handshake_is_a_turn_also_of_one_that_waits_for_the_other_end() {
+        let turns = Cell::new(0);
+        let mut before = Vec::new();
+        let work = async {
+            for _ in 0..2 {
+                before.push(turns.get());
+                tokio::task::yield_now().await;
+            }
+            before.push(turns.get());
+        };
+        by_turns(work, || turns.set(turns.get() + 1)).await;
+        assert_eq!((before, turns.get()), (vec![0, 1, 2], 3));
+    }
 }
