@@ -2,22 +2,27 @@
 //! the node's memory stays within its bounds.
 //!
 //! Two nodes with keys on hosts of their own, each a process: `hip` asks `knee` a thousand times a second. An attacker on a third host does one
-//! thing to `knee`. Meanwhile, where that is the question, an honest peer that `knee` does not know comes from a fourth host, and a node `ankle`
-//! is started there. Hosts are network namespaces joined by veth pairs, which the program makes and removes.
+//! thing to `knee`. First live traffic is timed by turns: left alone, with that done to a decoy on `knee`'s host, and to `knee`. Then it is
+//! looked who gets in and who is lost; meanwhile, where that is the question, an honest peer that `knee` does not know comes from a fourth
+//! host, and a node `ankle` is started there. Hosts are network namespaces joined by veth pairs, which the program makes and removes.
 //!
 //! | file | what it is |
 //! | --- | --- |
+//! | `decoy` | the role of the one that is attacked instead of the node |
 //! | `keys` | the robot's authority, and another one |
 //! | `node` | the role of each node |
+//! | `rounds` | live traffic's times by turns |
 //! | `robot` | the nodes, as the director sees them |
 //! | `stranger` | a peer by hand: TLS, HELLO, a session |
 //! | `tried/` | what is done, one file each |
 //! | `report` | what was seen |
 
+mod decoy;
 mod keys;
 mod node;
 mod report;
 mod robot;
+mod rounds;
 mod stranger;
 mod tried;
 
@@ -31,12 +36,15 @@ use std::{
 
 use rustix::process::{Resource, Rlimit, getrlimit, setpriority_process, setrlimit};
 
-pub use self::report::{Report, Row};
 use self::{
     keys::{Keys, Who},
-    robot::Robot,
+    robot::{Decoys, Robot, Target},
     stranger::Stranger,
     tried::Recording,
+};
+pub use self::{
+    report::{Report, Row},
+    rounds::{Attacked, Done, Rounds},
 };
 use crate::{DEADLINE, Host, Hosts};
 
@@ -68,8 +76,12 @@ const DESCRIPTORS: u64 = 16_384;
 pub struct Plan {
     /// A program whose `main` calls [`play`] first.
     pub program: PathBuf,
-    /// How long each attack lasts, and the time before that is compared with it.
+    /// How long each attack lasts while it is looked who gets in.
     pub lasts: Duration,
+    /// How long live traffic is timed left alone, with the decoy attacked, and with the node attacked, each in all rounds together.
+    pub timed: Duration,
+    /// How often these three take turns: once at least.
+    pub rounds: u32,
     /// The names of those that are tried; none: all.
     pub only: Vec<String>,
 }
@@ -92,6 +104,8 @@ struct Attack {
     own: Who,
     /// Does it until the scene is over.
     run: fn(&Scene<'_>) -> Happened,
+    /// What of it goes on all the time, and can be done to a decoy, for times; `None`: all of it.
+    goes_on: Option<fn(&Scene<'_>) -> Happened>,
 }
 
 /// What came of it, as far as the attacker knows.
@@ -99,12 +113,16 @@ struct Attack {
 struct Happened {
     /// In words.
     what: String,
-    /// What must not have been.
+    /// What must not have been: for so long a time as the whole of an attack takes.
     broken: Vec<String>,
+    /// Who was let in, which must not have been for however short a time.
+    let_in: Vec<String>,
     /// What the node must have refused meanwhile, by cause, and how often at least: an attack that never reached it shows nothing.
     refused: Vec<(&'static str, u64)>,
     /// Messages that were sent in the sender's own name, and are to arrive.
     own_sent: u64,
+    /// How often what was done.
+    done: Done,
 }
 
 impl Happened {
@@ -114,14 +132,16 @@ impl Happened {
 }
 
 /// Where an attack takes place.
+#[derive(Clone, Copy)]
 struct Scene<'a> {
     robot: &'a Robot,
+    target: Target,
     keys: &'a Keys,
     hosts: &'a [Host],
     program: &'a PathBuf,
     lasts: Duration,
     /// Datagrams of the robot that the attacker has heard before.
-    recorded: Recording,
+    recorded: &'a Recording,
     over: &'a AtomicBool,
 }
 
@@ -167,6 +187,7 @@ pub fn play() -> Option<ExitCode> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     match &arguments[..] {
         [flag, role, rest @ ..] if flag == "--role" && role == "robot-node" => node::play(rest),
+        [flag, role, rest @ ..] if flag == "--role" && role == "decoy" => decoy::play(rest),
         // That of a client at the door.
         _ => return crate::clients::play(),
     }
@@ -196,7 +217,7 @@ pub fn run(plan: &Plan) -> Result<Report, String> {
     let is_meant =
         |attack: &&Attack| plan.only.is_empty() || plan.only.iter().any(|name| name == attack.name);
     let rows = tried::ATTACKS.iter().filter(is_meant).map(|attack| one(attack, plan, &hosts)).collect();
-    Ok(Report { rows })
+    Ok(Report { rows, timed: plan.timed, rounds: plan.rounds })
 }
 
 /// For connections that are held by thousands.
@@ -214,35 +235,76 @@ fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
     let hosts = hosts.all();
     let keys = Keys::make();
     let mut robot = Robot::start(&plan.program, hosts, &keys, attack.descriptors);
+    // Nobody stands in for the door.
+    let decoys = (!attack.inside).then(|| Decoys::start(&plan.program, hosts, &keys));
     thread::sleep(SETTLING);
     let mut recorded = Recording::default();
     if attack.records {
         (robot, recorded) = record(robot, hosts);
         thread::sleep(SETTLING);
     }
-    robot.window();
-    thread::sleep(plan.lasts);
-    let before = robot.window();
-    let (refused_before, seen_before, dials_before) = (robot.refused(), robot.seen(), robot.dials());
-    let (held_before, over) = (robot.held_bytes(), AtomicBool::new(false));
-    let (mut held_most, mut came, mut dials) = (held_before, None, dials_before);
+    let (seen_before, dials_before, held_before) = (robot.seen(), robot.dials(), robot.held_bytes());
+    let over = AtomicBool::new(false);
     let scene = Scene {
         robot: &robot,
+        target: robot.target(),
         keys: &keys,
         hosts,
         program: &plan.program,
         lasts: plan.lasts,
-        recorded,
+        recorded: &recorded,
         over: &over,
     };
-    let (happened, by_hand) = thread::scope(|scope| {
-        let _ends = EndsIt(&over);
-        let attacking = scope.spawn(|| (attack.run)(&scene));
-        let knocking = attack.others_come.then(|| scope.spawn(|| knock(&scene)));
-        let until = Instant::now() + plan.lasts;
+    let rounds = rounds::play(attack, plan, &scene, decoys.as_ref());
+    let (held_then, refused_before) = (robot.held_bytes(), robot.refused());
+    robot.window(rounds::BETWEEN);
+    let meanwhile = go_through(attack, &scene);
+    let lived = robot.window("whole");
+    let held_most =
+        [held_then, meanwhile.held_most, robot.held_bytes()].into_iter().max().unwrap_or_default();
+    let mut happened = meanwhile.happened;
+    happened.own_sent += rounds.own_sent;
+    happened.let_in.extend_from_slice(&rounds.let_in);
+    let outcome = report::Outcome {
+        happened,
+        rounds,
+        lived,
+        answers_again: robot.answers_again(),
+        growth: held_most.saturating_sub(held_before),
+        refused: since(&refused_before, robot.refused()),
+        seen: robot.seen_since(&seen_before),
+        dials: [0, 1].map(|node| meanwhile.dials[node] - dials_before[node]),
+        came: meanwhile.came,
+        by_hand: meanwhile.by_hand,
+    };
+    robot.end();
+    decoys.into_iter().for_each(Decoys::end);
+    Row::of(attack, outcome)
+}
+
+/// What was seen while the whole of an attack took place.
+struct Meanwhile {
+    happened: Happened,
+    by_hand: Option<Knocked>,
+    /// Until the node that was started in the middle of it had an answer.
+    came: Option<Duration>,
+    /// Connections that each node had begun.
+    dials: [u64; 2],
+    held_most: u64,
+}
+
+/// The whole of an attack, with those who want to come in meanwhile.
+fn go_through(attack: &Attack, scene: &Scene<'_>) -> Meanwhile {
+    let Scene { robot, hosts, lasts, over, .. } = *scene;
+    let (mut held_most, mut came) = (robot.held_bytes(), None);
+    thread::scope(|scope| {
+        let _ends = EndsIt(over);
+        let attacking = scope.spawn(|| (attack.run)(scene));
+        let knocking = attack.others_come.then(|| scope.spawn(|| knock(scene)));
+        let until = Instant::now() + lasts;
         let ankle = attack.others_come.then(|| {
             // In the middle of it.
-            thread::sleep(plan.lasts / 4);
+            thread::sleep(lasts / 4);
             let began = Instant::now();
             let ankle = robot.start_newcomer(&hosts[NEWCOMER]);
             came = Some(began.elapsed());
@@ -253,30 +315,14 @@ fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
             thread::sleep(LOOK);
         }
         // Who goes is dialled again until it is lost: that is no attacker's doing.
-        dials = robot.dials();
+        let dials = robot.dials();
         drop(ankle);
         over.store(true, Ordering::Relaxed);
         let happened = attacking.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
         let by_hand =
             knocking.map(|knocking| knocking.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
-        (happened, by_hand)
-    });
-    let during = robot.window();
-    held_most = held_most.max(robot.held_bytes());
-    let outcome = report::Outcome {
-        happened,
-        before,
-        during,
-        answers_again: robot.answers_again(),
-        growth: held_most.saturating_sub(held_before),
-        refused: since(&refused_before, robot.refused()),
-        seen: robot.seen_since(&seen_before),
-        dials: [0, 1].map(|node| dials[node] - dials_before[node]),
-        came,
-        by_hand,
-    };
-    robot.end();
-    Row::of(attack, outcome)
+        Meanwhile { happened, by_hand, came, dials, held_most }
+    })
 }
 
 /// What the robot says of discovery while `ankle` comes and goes, and the attacked node goes and comes again.
@@ -334,7 +380,7 @@ fn knock(scene: &Scene<'_>) -> Knocked {
             let began = Instant::now();
             loop {
                 knocked.attempts += 1;
-                let greeted = Stranger::dial(scene.robot.knee(), Some(&tls))
+                let greeted = Stranger::dial(scene.target.connections, Some(&tls))
                     .and_then(|mut stranger| stranger.hello(keys::SPARE, scene.robot.knee_address()));
                 if matches!(greeted, Ok(stranger::Answer::Welcome)) {
                     break;

@@ -9,7 +9,13 @@ use sinew_tests::{
 
 #[test]
 fn nobody_gets_in_is_lost_or_fills_memory_whatever_somebody_on_the_network_does() {
-    let report = run(&Plan { program: program("attacks"), lasts: Duration::from_secs(2), only: Vec::new() });
+    let report = run(&Plan {
+        program: program("attacks"),
+        lasts: Duration::from_secs(2),
+        timed: Duration::from_millis(500),
+        rounds: 1,
+        only: Vec::new(),
+    });
     match report {
         Ok(report) => {
             println!("{report}");

@@ -47,7 +47,7 @@ impl Who {
         self.address().into()
     }
 
-    fn identity(self) -> Identity {
+    pub(super) fn identity(self) -> Identity {
         Identity { project: PROJECT.to_owned(), address: self.node(), name: self.name.to_owned() }
     }
 }

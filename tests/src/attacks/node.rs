@@ -2,6 +2,7 @@
 
 use std::{
     collections::BTreeMap,
+    fmt,
     io::BufRead,
     sync::{
         Arc, Mutex, MutexGuard, PoisonError,
@@ -53,51 +54,83 @@ impl Echo {
 /// silence has waited, too.
 struct Measured {
     since: Instant,
-    times: Times,
-    failed: u64,
-    /// Questions that were asked more than a pace after they were due, because the one before had no answer.
-    late: u64,
+    /// In the window that began then.
+    window: Window,
     /// When the oldest question was due that has no answer yet.
     due: Instant,
     /// Answers in all.
     answers: u64,
 }
 
+/// What was measured in a window, or in several.
+#[derive(Default)]
+struct Window {
+    times: Times,
+    count: u64,
+    failed: u64,
+    /// Questions that were asked more than a pace after they were due, because the one before had no answer.
+    late: u64,
+    /// Questions that were due and had no answer at the end.
+    waiting: u64,
+    lasted: Duration,
+}
+
+impl Window {
+    /// What was measured in another one is measured in this one, too.
+    fn add(&mut self, other: Self) {
+        let Self { times, count, failed, late, waiting, lasted } = other;
+        self.times.add(times);
+        self.count += count;
+        self.failed += failed;
+        self.late += late;
+        self.waiting += waiting;
+        self.lasted += lasted;
+    }
+}
+
+impl fmt::Display for Window {
+    /// `COUNT FAILED LATE WAITING P50 P99 MAX LASTED`, times in nanoseconds.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { times, count, failed, late, waiting, lasted } = self;
+        let [p50, p99, max] = [0.5, 0.99, 1.0].map(|share| times.percentile(share).as_nanos());
+        write!(f, "{count} {failed} {late} {waiting} {p50} {p99} {max} {}", lasted.as_nanos())
+    }
+}
+
 impl Measured {
     fn new(now: Instant) -> Self {
-        Self { since: now, times: Times::default(), failed: 0, late: 0, due: now, answers: 0 }
+        Self { since: now, window: Window::default(), due: now, answers: 0 }
     }
 
     /// The question that was due has been asked.
     fn asked(&mut self, now: Instant) {
-        self.late += u64::from(now.saturating_duration_since(self.due) > PACE);
+        self.window.late += u64::from(now.saturating_duration_since(self.due) > PACE);
     }
 
     /// It has its answer, or will never have one. Of those that were due before this window began none is asked any more: they were counted there.
     fn ended(&mut self, now: Instant, is_answered: bool) {
         if is_answered {
-            self.times.note(now.saturating_duration_since(self.due));
+            self.window.times.note(now.saturating_duration_since(self.due));
+            self.window.count += 1;
             self.answers += 1;
         } else {
-            self.failed += 1;
+            self.window.failed += 1;
         }
         self.due = (self.due + PACE).max(self.since);
     }
 
-    /// `COUNT FAILED LATE WAITING P50 P99 MAX LASTED`, times in nanoseconds. Questions that were due and have no answer count with the time
-    /// that they have waited: else silence would look like no traffic at all.
-    fn window(&mut self, now: Instant) -> String {
-        let mut times = std::mem::take(&mut self.times);
-        let (count, mut due) = (times.count(), self.due);
+    /// Ends the window, and begins the next one. Questions that were due and have no answer count with the time that they have waited: else
+    /// silence would look like no traffic at all.
+    fn window(&mut self, now: Instant) -> Window {
+        let mut window = std::mem::take(&mut self.window);
+        let mut due = self.due;
         while due < now {
-            times.note(now - due);
+            window.times.note(now - due);
+            window.waiting += 1;
             due += PACE;
         }
-        let waiting = times.count() - count;
-        let (failed, late) = (std::mem::take(&mut self.failed), std::mem::take(&mut self.late));
-        let lasted = (now - std::mem::replace(&mut self.since, now)).as_nanos();
-        let [p50, p99, max] = [0.5, 0.99, 1.0].map(|share| times.percentile(share).as_nanos());
-        format!("{count} {failed} {late} {waiting} {p50} {p99} {max} {lasted}")
+        window.lasted = now - std::mem::replace(&mut self.since, now);
+        window
     }
 }
 
@@ -129,7 +162,7 @@ impl Handler<Delivery<NodeEvent>> for Echo {
     }
 }
 
-/// `CONFIGURATION [ASKS]`: says `up` when all runs. `window`: what was measured since the last one; `again`: whether questions are answered
+/// `CONFIGURATION [ASKS]`: says `up` when all runs. `window NAME`: what was measured since the last one, with all that was called so before; `again`: whether questions are answered
 /// from now on; `seen`: who was lost, who was found, and what came unasked; `refused`: what the node refused, for each cause; `tid`: that of
 /// the application that answers.
 pub(super) fn play(arguments: &[String]) {
@@ -159,9 +192,9 @@ pub(super) fn play(arguments: &[String]) {
         until("the first answer", || (lock(&measured).answers > 0).then_some(()));
     }
     println!("up");
+    let mut windows: BTreeMap<String, Window> = BTreeMap::new();
     for line in std::io::stdin().lock().lines().map_while(Result::ok) {
         match &*line {
-            "window" => println!("{}", lock(&measured).window(Instant::now())),
             "again" => println!("{}", u8::from(is_answered(&measured))),
             "seen" => {
                 let counts = lock(&counts);
@@ -177,7 +210,15 @@ pub(super) fn play(arguments: &[String]) {
                 println!("refused{}", words.collect::<String>());
             }
             "tid" => println!("{}", echo.bits()),
-            _ => panic!("{line:?} is nothing that a node is told"),
+            _ => {
+                let name = line.strip_prefix("window ");
+                let name = name.unwrap_or_else(|| panic!("{line:?} is nothing that a node is told"));
+                let all = windows.entry(name.to_owned()).or_default();
+                // Whoever asks waits for no reckoning.
+                let window = lock(&measured).window(Instant::now());
+                all.add(window);
+                println!("{all}");
+            }
         }
     }
     over.store(true, Ordering::Relaxed);
@@ -227,7 +268,7 @@ mod tests {
     use super::*;
 
     fn window(measured: &mut Measured, at: Instant) -> Vec<u128> {
-        measured.window(at).split(' ').map(|word| word.parse().expect("a number")).collect()
+        measured.window(at).to_string().split(' ').map(|word| word.parse().expect("a number")).collect()
     }
 
     #[test]
@@ -268,5 +309,25 @@ mod tests {
         let seen = window(&mut measured, begin + PACE * 26);
         // The one that came late, one that failed, and of six that are due one and four that have no answer.
         assert_eq!(seen[..4], [1, 1, 1, 5]);
+    }
+
+    #[test]
+    fn windows_of_one_name_are_one_whose_percentiles_are_those_of_all_their_answers() {
+        let (begin, mut all) = (Instant::now(), Window::default());
+        // Given: three windows of 100 answers each, of which the second alone has slow ones
+        for (at, slow) in [(0, 0), (1_000, 4), (2_000, 0)] {
+            let mut measured = Measured::new(begin + PACE * at);
+            for number in 0..100 {
+                let time = if number < slow { PACE / 2 } else { PACE / 10 };
+                measured.ended(measured.due + time, true);
+            }
+            let window = measured.window(measured.due);
+            all.add(window);
+        }
+        // Then: 4 of 300 are slow, so one of a hundred is
+        let numbers: Vec<u128> = all.to_string().split(' ').map(|word| word.parse().unwrap()).collect();
+        let quick = (PACE / 10).as_nanos();
+        assert_eq!(numbers[..4], [300, 0, 0, 0]);
+        assert_eq!(numbers[4..], [quick, (PACE / 2).as_nanos(), (PACE / 2).as_nanos(), 300_000_000]);
     }
 }

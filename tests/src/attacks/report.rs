@@ -1,6 +1,6 @@
 //! What was seen, as a table and as JSON.
 
-use std::{fmt, time::Duration};
+use std::{collections::BTreeMap, fmt, time::Duration};
 
 use serde_json::{Value, json};
 
@@ -8,6 +8,7 @@ use super::{
     ANSWERED_MIN, Attack, DIALS_OF_A_NEWCOMER, GROWTH_MAX, Happened, Knocked, LATE_AT_REST, SLOWER_MAX,
     keys::{self, ANKLE},
     robot::{Refused, Seen, Window},
+    rounds::{Attacked, Rounds},
 };
 
 /// What came of all attacks.
@@ -15,6 +16,10 @@ use super::{
 pub struct Report {
     /// One each.
     pub rows: Vec<Row>,
+    /// How long live traffic was timed in each of its three states.
+    pub timed: Duration,
+    /// In so many rounds.
+    pub rounds: u32,
 }
 
 /// What came of one attack.
@@ -26,10 +31,10 @@ pub struct Row {
     pub tried: &'static str,
     /// What happened.
     pub happened: String,
-    /// Live traffic before.
-    pub before: Window,
-    /// And during it.
-    pub during: Window,
+    /// Live traffic left alone, with the decoy attacked, and with the node attacked.
+    pub rounds: Rounds,
+    /// And while it was looked who gets in.
+    pub lived: Window,
     /// The most of the attacked node's memory above that before, in bytes.
     pub growth: u64,
     /// What must not be, apart from times: none of that if the node has held.
@@ -39,7 +44,8 @@ pub struct Row {
 impl Row {
     pub(super) fn of(attack: &Attack, outcome: Outcome) -> Self {
         let mut said = vec![outcome.happened.what.clone()];
-        let mut broken = outcome.happened.broken.clone();
+        let Happened { broken, let_in, .. } = &outcome.happened;
+        let mut broken = [&broken[..], let_in].concat();
         if let Some(came) = outcome.came {
             said.push(format!("ankle talks after {} ms", came.as_millis()));
         }
@@ -55,18 +61,34 @@ impl Row {
         outcome.service(&mut broken);
         outcome.refusals(&mut said, &mut broken);
         outcome.dials(attack.inside, &mut said, &mut broken);
-        let Outcome { before, during, growth, .. } = outcome;
+        let Outcome { rounds, lived, growth, .. } = outcome;
         if growth > GROWTH_MAX {
             broken.push(format!("memory grew by {} MiB", growth >> 20));
         }
         let (name, tried, happened) = (attack.name, attack.tried, said.join("; "));
-        Self { name, tried, happened, before, during, growth, broken }
+        Self { name, tried, happened, rounds, lived, growth, broken }
     }
 
-    /// How much longer 99 of 100 answers took, whatever they took before.
+    /// How much longer 99 of 100 answers took with the node attacked, whatever they took left alone.
     #[must_use]
     pub fn ratio(&self) -> f64 {
-        self.during.p99.as_secs_f64() / self.before.p99.as_secs_f64().max(f64::MIN_POSITIVE)
+        ratio(&self.rounds.node.window, &self.rounds.before)
+    }
+
+    /// The same with the decoy attacked: that much is the machine's.
+    #[must_use]
+    pub fn decoy_ratio(&self) -> Option<f64> {
+        self.rounds.decoy.as_ref().map(|decoy| ratio(&decoy.window, &self.rounds.before))
+    }
+
+    /// Of what 99 of 100 answers took longer with the node attacked, the share that they took longer with the decoy attacked: 0 to 1.
+    /// `None`: without a decoy, or where they took no longer.
+    #[must_use]
+    pub fn decoy_share(&self) -> Option<f64> {
+        let Rounds { before, decoy, node, .. } = &self.rounds;
+        let longer = |attacked: &Attacked| attacked.window.p99.as_secs_f64() - before.p99.as_secs_f64();
+        let (all, machine) = (longer(node), longer(decoy.as_ref()?));
+        (all > 0.0).then(|| (machine / all).clamp(0.0, 1.0))
     }
 
     /// All that has to hold on every machine holds: nobody got in, nobody was lost, memory is bounded.
@@ -75,16 +97,38 @@ impl Row {
         self.broken.is_empty()
     }
 
-    /// The machine was at rest before it: else times say nothing.
+    /// The machine was at rest where nobody was attacked: else times say nothing.
     #[must_use]
     pub fn was_at_rest(&self) -> bool {
-        self.before.missed() as f64 <= LATE_AT_REST * self.before.asked() as f64
+        let before = &self.rounds.before;
+        before.missed() as f64 <= LATE_AT_REST * before.asked() as f64
+    }
+
+    /// The attacker came to do something in the rounds, to each: else times say nothing.
+    #[must_use]
+    pub fn was_timed(&self) -> bool {
+        let Rounds { decoy, node, .. } = &self.rounds;
+        node.is_attack() && decoy.as_ref().is_none_or(Attacked::is_attack)
     }
 
     /// Live traffic did not feel it, on a machine that would have shown it.
     #[must_use]
     pub fn is_unfelt(&self) -> bool {
-        self.was_at_rest() && self.ratio() <= SLOWER_MAX
+        self.was_at_rest() && self.was_timed() && self.ratio() <= SLOWER_MAX
+    }
+
+    /// In words, in one column.
+    fn verdict(&self) -> String {
+        match (self.has_held(), self.is_unfelt()) {
+            (false, _) => "NO".to_owned(),
+            (true, true) => "yes".to_owned(),
+            (true, false) if !self.was_at_rest() => "yes, not at rest".to_owned(),
+            (true, false) if !self.was_timed() => "yes, not timed".to_owned(),
+            (true, false) => match self.decoy_share() {
+                Some(share) => format!("yes, and felt: {:.0} % of it with the decoy, too", share * 100.0),
+                None => "yes, and felt".to_owned(),
+            },
+        }
     }
 
     fn json(&self) -> Value {
@@ -96,10 +140,14 @@ impl Row {
                 "p50_us": us(window.p50), "p99_us": us(window.p99), "max_us": us(window.max),
             })
         };
+        let Rounds { before, decoy, node, .. } = &self.rounds;
         json!({
             "attack": self.name, "tried": self.tried, "happened": self.happened,
-            "before": window(&self.before), "during": window(&self.during), "p99_ratio": self.ratio(),
-            "growth_kib": self.growth >> 10, "held": self.has_held(), "at_rest": self.was_at_rest(), "unfelt": self.is_unfelt(), "broken": self.broken,
+            "before": window(before), "decoy": decoy.as_ref().map(|decoy| window(&decoy.window)), "during": window(&node.window),
+            "p99_ratio": self.ratio(), "p99_ratio_decoy": self.decoy_ratio(), "decoy_share": self.decoy_share(),
+            "done_per_s": { "decoy": decoy.as_ref().map(Attacked::done_per_s), "node": node.done_per_s() },
+            "whole": window(&self.lived),
+            "growth_kib": self.growth >> 10, "held": self.has_held(), "at_rest": self.was_at_rest(), "timed": self.was_timed(), "unfelt": self.is_unfelt(), "broken": self.broken,
         })
     }
 }
@@ -108,9 +156,9 @@ impl Row {
 pub(super) struct Outcome {
     /// By the attacker.
     pub(super) happened: Happened,
-    /// By the node that asks, before and meanwhile.
-    pub(super) before: Window,
-    pub(super) during: Window,
+    /// By the node that asks, in the rounds and while the whole of it took place.
+    pub(super) rounds: Rounds,
+    pub(super) lived: Window,
     /// A question that was asked afterwards has an answer.
     pub(super) answers_again: bool,
     /// Of the attacked node's memory, in bytes.
@@ -167,12 +215,14 @@ impl Outcome {
 
     /// Answers go on meanwhile, and afterwards.
     fn service(&self, broken: &mut Vec<String>) {
-        let Self { before, during, .. } = self;
-        if before.count == 0 || during.failed > 0 {
-            broken.push(format!("{} questions without an answer, {} before", during.failed, before.count));
+        let Self { rounds: Rounds { before, decoy, node, .. }, lived, .. } = self;
+        let attacked = [Some(lived), Some(&node.window), decoy.as_ref().map(|decoy| &decoy.window)];
+        let failed: u64 = attacked.into_iter().flatten().map(|window| window.failed).sum();
+        if before.count == 0 || failed > 0 {
+            broken.push(format!("{failed} questions without an answer, and {} answers before", before.count));
         }
-        if during.rate() < ANSWERED_MIN * before.rate() {
-            let [before, during] = [before.rate(), during.rate()];
+        if lived.rate() < ANSWERED_MIN * before.rate() {
+            let [before, during] = [before.rate(), lived.rate()];
             broken.push(format!("{during:.1} answers in a second, and {before:.1} before"));
         }
         if !self.answers_again {
@@ -182,8 +232,7 @@ impl Outcome {
 
     /// Nobody has a node dial whom it would not: one that comes is dialled, and again as seldom as GNCL-8 says.
     fn dials(&self, inside: bool, said: &mut Vec<String>, broken: &mut Vec<String>) {
-        let most =
-            if self.came.is_some() { DIALS_OF_A_NEWCOMER + dials_again(self.during.lasted) } else { 0 };
+        let most = if self.came.is_some() { DIALS_OF_A_NEWCOMER + dials_again(self.lived.lasted) } else { 0 };
         let hosts = if inside { 1 } else { 2 };
         for (dials, name) in self.dials.iter().zip(["hip", "knee"]).take(hosts) {
             said.push(format!("{name} dialled {dials} times"));
@@ -244,44 +293,67 @@ fn dials_again(within: Duration) -> u64 {
     }
 }
 
+/// How much longer 99 of 100 answers took.
+fn ratio(attacked: &Window, before: &Window) -> f64 {
+    attacked.p99.as_secs_f64() / before.p99.as_secs_f64().max(f64::MIN_POSITIVE)
+}
+
+fn us(time: Duration) -> String {
+    format!("{} us", time.as_micros())
+}
+
+/// What was done in a second, in words.
+fn words(done: &BTreeMap<&'static str, f64>) -> String {
+    let words: Vec<_> = done.iter().map(|(what, rate)| format!("{rate:.0} {what}")).collect();
+    words.join(", ")
+}
+
+impl fmt::Display for Row {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { name, tried, happened, rounds, lived, growth, broken } = self;
+        let Rounds { before, decoy, node, .. } = rounds;
+        let during = &node.window;
+        let missed = format!("{} of {}", during.missed(), during.asked());
+        let (longest, kib) = (format!("{} ms", during.max.as_millis()), growth >> 10);
+        let with_decoy = decoy.as_ref().map_or_else(|| "-".to_owned(), |decoy| us(decoy.window.p99));
+        let decoy_ratio = self.decoy_ratio().map_or_else(|| "-".to_owned(), |ratio| format!("{ratio:.2}"));
+        writeln!(
+            f,
+            "{name:<20} {:>10} {with_decoy:>10} {:>10} {decoy_ratio:>6} {:>6.2} {longest:>9} {missed:>14} {kib:>6} KiB  {}",
+            us(before.p99),
+            us(during.p99),
+            self.ratio(),
+            self.verdict()
+        )?;
+        if let Some(decoy) = decoy {
+            writeln!(f, "    in a second, to the decoy: {}", words(&decoy.done_per_s()))?;
+        }
+        writeln!(f, "    in a second, to the node: {}", words(&node.done_per_s()))?;
+        let [was, is, then] = [before, during, lived].map(Window::rate);
+        writeln!(
+            f,
+            "    answers in a second: {was:.0} before, {is:.0} during, {then:.0} while others came; before the longest took {} ms, {} were missed",
+            before.max.as_millis(),
+            before.missed()
+        )?;
+        writeln!(f, "    tried: {tried}\n    happened: {happened}")?;
+        broken.iter().try_for_each(|what| writeln!(f, "    BROKEN: {what}"))
+    }
+}
+
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
             f,
-            "{:<20} {:>10} {:>10} {:>6} {:>10} {:>14} {:>10}  held",
-            "attack", "p99 before", "during", "ratio", "longest", "missed", "grown"
+            "{:<20} {:>10} {:>10} {:>10} {:>6} {:>6} {:>9} {:>14} {:>10}  held",
+            "attack", "p99 before", "decoy", "during", "decoy", "ratio", "longest", "missed", "grown"
         )?;
-        for row in &self.rows {
-            let Row { name, tried, happened, before, during, growth, broken } = row;
-            let us = |time: Duration| format!("{} us", time.as_micros());
-            let missed = format!("{} of {}", during.missed(), during.asked());
-            let (longest, kib) = (format!("{} ms", during.max.as_millis()), growth >> 10);
-            let held = match (row.has_held(), row.is_unfelt()) {
-                (true, true) => "yes",
-                (true, false) if !row.was_at_rest() => "yes, not at rest",
-                (true, false) => "yes, and felt",
-                (false, _) => "NO",
-            };
-            writeln!(
-                f,
-                "{name:<20} {:>10} {:>10} {:>6.2} {longest:>10} {missed:>14} {kib:>6} KiB  {held}",
-                us(before.p99),
-                us(during.p99),
-                row.ratio()
-            )?;
-            let [was, is] = [before.rate(), during.rate()];
-            writeln!(
-                f,
-                "    answers in a second: {was:.0} before, {is:.0} during it; before it the longest took {} ms, {} were missed",
-                before.max.as_millis(),
-                before.missed()
-            )?;
-            writeln!(f, "    tried: {tried}\n    happened: {happened}")?;
-            broken.iter().try_for_each(|what| writeln!(f, "    BROKEN: {what}"))?;
-        }
+        self.rows.iter().try_for_each(|row| write!(f, "{row}"))?;
+        let Self { timed, rounds, .. } = self;
         write!(
             f,
             "A question is due each millisecond, and its answer timed from then on. Missed: asked late, or without an answer at the end.\n\
+             p99: of {timed:.1?} each in {rounds} rounds by turns, left alone (before), with the same attack on a decoy on the node's host, on the node (during).\n\
              limits: p99 {SLOWER_MAX} times that before, where at most {} % were missed then (at rest), memory {} MiB",
             LATE_AT_REST * 100.0,
             GROWTH_MAX >> 20
@@ -298,5 +370,54 @@ mod tests {
         // 10, 20, 40 ... 640 ms are 1.27 s, and then one a second, all a fifth less.
         let [second, ten] = [1, 10].map(|seconds| dials_again(Duration::from_secs(seconds)));
         assert_eq!((dials_again(Duration::from_millis(7)), second, ten), (0, 6, 18));
+    }
+
+    /// A row with these 99th percentiles, in microseconds.
+    fn row(before: u64, decoy: Option<u64>, during: u64) -> Row {
+        let window = |us| Window { count: 1_000, p99: Duration::from_micros(us), ..Window::default() };
+        let attacked = |us| Attacked { window: window(us), done: BTreeMap::from([("connections", 1)]) };
+        let rounds = Rounds {
+            before: window(before),
+            decoy: decoy.map(attacked),
+            node: attacked(during),
+            ..Rounds::default()
+        };
+        Row {
+            name: "",
+            tried: "",
+            happened: String::new(),
+            rounds,
+            lived: Window::default(),
+            growth: 0,
+            broken: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn an_attack_that_is_felt_says_how_much_of_it_the_decoy_shows() {
+        // Given: what took 500 us takes 2000, of which the decoy costs 900
+        let felt = row(500, Some(1_400), 2_000);
+        assert_eq!((felt.ratio(), felt.decoy_ratio()), (4.0, Some(2.8)));
+        assert_eq!(felt.verdict(), "yes, and felt: 60 % of it with the decoy, too");
+        // Then: it is felt, however much of it is the machine's
+        let machine = row(500, Some(2_500), 2_000);
+        assert!(!machine.is_unfelt());
+        assert_eq!(machine.verdict(), "yes, and felt: 100 % of it with the decoy, too");
+        assert_eq!(row(500, Some(400), 2_000).decoy_share(), Some(0.0));
+        assert_eq!(row(500, None, 2_000).verdict(), "yes, and felt");
+        assert_eq!(row(500, Some(2_000), 400).decoy_share(), None);
+        assert_eq!(row(500, Some(400), 1_000).verdict(), "yes");
+    }
+
+    #[test]
+    fn times_without_an_attack_or_without_one_on_the_decoy_say_nothing() {
+        let mut none = row(500, Some(500), 500);
+        none.rounds.node.done.clear();
+        assert!(!none.is_unfelt());
+        assert_eq!(none.verdict(), "yes, not timed");
+        let mut none = row(500, Some(500), 500);
+        none.rounds.decoy =
+            Some(Attacked { done: BTreeMap::from([("connections", 0)]), ..none.rounds.node.clone() });
+        assert_eq!(none.verdict(), "yes, not timed");
     }
 }

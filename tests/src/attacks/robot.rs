@@ -2,11 +2,11 @@
 
 use std::{
     collections::BTreeMap,
-    net::SocketAddr,
+    net::{Ipv4Addr, SocketAddr},
     path::{Path, PathBuf},
     process::Command,
     sync::{
-        Mutex, PoisonError,
+        Mutex, MutexGuard, PoisonError,
         mpsc::{Receiver, sync_channel},
     },
     time::Duration,
@@ -14,7 +14,10 @@ use std::{
 
 use sinew::{NodeAddress, Tid};
 
-use super::keys::{self, Keys, PROJECT, Who};
+use super::{
+    decoy,
+    keys::{self, Keys, PROJECT, Who},
+};
 use crate::{
     DEADLINE, Host,
     clients::{Held, Performer},
@@ -90,27 +93,83 @@ impl Seen {
     }
 }
 
+/// Who is attacked.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Is {
+    Node,
+    /// It answers nothing but what TLS wants.
+    Decoy,
+}
+
+/// Whom an attack is against.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Target {
+    pub(super) is: Is,
+    /// Where it takes connections.
+    pub(super) connections: SocketAddr,
+    /// Where it takes datagrams of discovery, where the one in the other node's place does, and the group.
+    pub(super) datagrams: [SocketAddr; 3],
+}
+
+/// Decoys on the hosts of both nodes, which may be attacked instead of the nodes.
+pub(super) struct Decoys {
+    group: Ipv4Addr,
+    members: [Member; 2],
+}
+
+impl Decoys {
+    /// Starts both, and returns when they can be attacked. The group is one that no node hears.
+    pub(super) fn start(program: &Path, hosts: &[Host], keys: &Keys) -> Self {
+        let group = *own_group().ip();
+        let start = |who: Who, host: usize| {
+            let mut command = Command::new(program);
+            command.args(["--role", "decoy", who.name]).arg(keys.of(who)).arg(group.to_string());
+            let member = Member::start(hosts[host].moved(&command), "decoy");
+            member.answer("up");
+            member
+        };
+        Self { group, members: [start(keys::KNEE, super::KNEE), start(keys::HIP, super::HIP)] }
+    }
+
+    /// The decoy in the place of the attacked node, as its attackers see it.
+    pub(super) fn target(&self) -> Target {
+        let datagrams = [keys::KNEE.address(), keys::HIP.address(), self.group];
+        let connections = (keys::KNEE.address(), decoy::CONNECTIONS_PORT).into();
+        let datagrams = datagrams.map(|to| SocketAddr::from((to, decoy::DATAGRAMS_PORT)));
+        Target { is: Is::Decoy, connections, datagrams }
+    }
+
+    /// Ends both in order.
+    pub(super) fn end(self) {
+        self.members.into_iter().for_each(Member::end);
+    }
+}
+
 /// What a node refused, for each cause.
 pub(super) type Refused = BTreeMap<String, u64>;
 
 /// A node in its process.
 pub(super) struct Member {
-    performer: Performer,
+    performer: Mutex<Performer>,
     /// Nobody but the director reads them; attackers look at the rest of the robot.
     answers: Mutex<Receiver<String>>,
 }
 
 impl Member {
-    fn start(command: Command) -> Self {
+    fn start(command: Command, role: &str) -> Self {
         let (say, answers) = sync_channel(16);
         let hear = move |line: &str| {
             // Nobody waits for its answers any more when the director is done.
             let _ = say.send(line.to_owned());
         };
         Self {
-            performer: Performer::start_command(command, "robot-node", hear),
+            performer: Mutex::new(Performer::start_command(command, role, hear)),
             answers: Mutex::new(answers),
         }
+    }
+
+    fn performer(&self) -> MutexGuard<'_, Performer> {
+        self.performer.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn answer(&self, to: &str) -> String {
@@ -120,13 +179,13 @@ impl Member {
 
     /// Ends it in order.
     pub(super) fn end(self) {
-        let status = self.performer.end();
+        let status = self.performer.into_inner().unwrap_or_else(PoisonError::into_inner).end();
         assert!(status.success(), "a node ended with {status}");
     }
 
     /// How often its host has begun a connection since there is one.
     fn dials(&self) -> u64 {
-        let path = format!("/proc/{}/net/snmp", self.performer.id());
+        let path = format!("/proc/{}/net/snmp", self.performer().id());
         let text = std::fs::read_to_string(path).expect("the kernel counts what hosts do");
         let mut lines = text.lines().filter(|line| line.starts_with("Tcp:"));
         let [names, counts] = [lines.next(), lines.next()].map(|line| line.unwrap_or_default().split(' '));
@@ -135,12 +194,13 @@ impl Member {
         count.parse().expect("a number")
     }
 
-    fn ask(&mut self, question: &str) -> String {
-        self.performer.tell(question);
+    fn ask(&self, question: &str) -> String {
+        let mut performer = self.performer();
+        performer.tell(question);
         self.answer(question)
     }
 
-    fn seen(&mut self) -> Seen {
+    fn seen(&self) -> Seen {
         let (line, mut seen) = (self.ask("seen"), Seen::default());
         let words: Vec<&str> = line.split_whitespace().skip(1).collect();
         for entry in words.chunks_exact(3) {
@@ -155,7 +215,7 @@ impl Member {
         seen
     }
 
-    fn refused(&mut self) -> Refused {
+    fn refused(&self) -> Refused {
         let line = self.ask("refused");
         let words: Vec<&str> = line.split('\t').skip(1).collect();
         let entry = |entry: &[&str]| (entry[0].to_owned(), entry[1].parse().expect("a number"));
@@ -188,8 +248,10 @@ impl Robot {
         let knee_gncl = if descriptors.is_some() { "strangers_max = 1024\n" } else { "" };
         let knee_config = config(keys::KNEE, knee_gncl);
         let (knee, echo) = start_knee(program, &hosts[super::KNEE], &knee_config, descriptors);
-        let hip =
-            Member::start(hosts[super::HIP].moved(&as_role(program, &config(keys::HIP, ""), &["asks"])));
+        let hip = Member::start(
+            hosts[super::HIP].moved(&as_role(program, &config(keys::HIP, ""), &["asks"])),
+            "robot-node",
+        );
         hip.answer("up");
         let newcomer_keys = keys.of(keys::ANKLE);
         Self { program: program.to_owned(), directory, group, hip, knee, knee_config, newcomer_keys, echo }
@@ -199,7 +261,7 @@ impl Robot {
     pub(super) fn with_knee_anew(self, host: &Host) -> Self {
         self.knee.end();
         let (knee, echo) = start_knee(&self.program, host, &self.knee_config, None);
-        let mut robot = Self { knee, echo, ..self };
+        let robot = Self { knee, echo, ..self };
         assert!(robot.answers_again(), "the next life of the attacked node gives no answer");
         robot
     }
@@ -207,7 +269,8 @@ impl Robot {
     /// A node of the robot's that was not there; returns when it has an answer of the attacked one.
     pub(super) fn start_newcomer(&self, host: &Host) -> Member {
         let config = configuration(&self.directory, self.group, (keys::ANKLE, Some(&self.newcomer_keys)), "");
-        let ankle = Member::start(host.moved(&as_role(&self.program, &config, &["asks"])));
+        let asks = as_role(&self.program, &config, &["asks"]);
+        let ankle = Member::start(host.moved(&asks), "robot-node");
         ankle.answer("up");
         ankle
     }
@@ -218,27 +281,16 @@ impl Robot {
         host.moved(&as_role(&self.program, &config, &["asks"]))
     }
 
-    /// Where the attacked node takes connections.
-    #[expect(clippy::unused_self, reason = "it is the robot's, whichever is attacked")]
-    pub(super) fn knee(&self) -> SocketAddr {
-        (keys::KNEE.address(), GNCL_PORT).into()
-    }
-
     #[expect(clippy::unused_self, reason = "it is the robot's, whichever is attacked")]
     pub(super) fn knee_address(&self) -> NodeAddress {
         keys::KNEE.node()
     }
 
-    /// Where it takes datagrams of discovery.
-    #[expect(clippy::unused_self, reason = "it is the robot's, whichever is attacked")]
-    pub(super) fn discovery(&self) -> SocketAddr {
-        (keys::KNEE.address(), NDL_PORT).into()
-    }
-
-    /// Where the other node does.
-    #[expect(clippy::unused_self, reason = "it is the robot's")]
-    pub(super) fn discovery_beside(&self) -> SocketAddr {
-        (keys::HIP.address(), NDL_PORT).into()
+    /// The attacked node, as its attackers see it.
+    pub(super) fn target(&self) -> Target {
+        let [knee, hip] = [keys::KNEE, keys::HIP].map(|who| SocketAddr::from((who.address(), NDL_PORT)));
+        let connections = (keys::KNEE.address(), GNCL_PORT).into();
+        Target { is: Is::Node, connections, datagrams: [knee, hip, self.group.into()] }
     }
 
     /// How often each of both has begun a connection, since there is its host.
@@ -260,10 +312,10 @@ impl Robot {
         self.echo
     }
 
-    /// What the asking node measured since the last one.
-    pub(super) fn window(&mut self) -> Window {
-        let [count, failed, late, waiting, p50, p99, max, lasted] = numbers(&self.hip.ask("window"))[..]
-        else {
+    /// What the asking node measured since the last one: from now on a part of all that is called so, which is returned.
+    pub(super) fn window(&self, name: &str) -> Window {
+        let line = self.hip.ask(&format!("window {name}"));
+        let [count, failed, late, waiting, p50, p99, max, lasted] = numbers(&line)[..] else {
             panic!("eight numbers")
         };
         let [p50, p99, max, lasted] = [p50, p99, max, lasted].map(Duration::from_nanos);
@@ -271,29 +323,29 @@ impl Robot {
     }
 
     /// Whether a question that is asked from now on is answered in time.
-    pub(super) fn answers_again(&mut self) -> bool {
+    pub(super) fn answers_again(&self) -> bool {
         self.hip.ask("again") == "1"
     }
 
     /// What the attacked node refused in its life.
-    pub(super) fn refused(&mut self) -> Refused {
+    pub(super) fn refused(&self) -> Refused {
         self.knee.refused()
     }
 
     /// What both have seen since then.
-    pub(super) fn seen_since(&mut self, before: &[Seen; 2]) -> [Seen; 2] {
+    pub(super) fn seen_since(&self, before: &[Seen; 2]) -> [Seen; 2] {
         let [hip, knee] = self.seen();
         [hip.since(&before[0]), knee.since(&before[1])]
     }
 
     /// What both have seen.
-    pub(super) fn seen(&mut self) -> [Seen; 2] {
+    pub(super) fn seen(&self) -> [Seen; 2] {
         [self.hip.seen(), self.knee.seen()]
     }
 
     /// Memory of the attacked node, in bytes.
     pub(super) fn held_bytes(&self) -> u64 {
-        Held::of(self.knee.performer.id()).own_kib << 10
+        Held::of(self.knee.performer().id()).own_kib << 10
     }
 
     /// Ends both in order.
@@ -309,7 +361,7 @@ fn start_knee(program: &Path, host: &Host, config: &Path, descriptors: Option<u3
         Some(descriptors) => limited(&knee, descriptors),
         None => knee,
     };
-    let mut knee = Member::start(host.moved(&knee));
+    let knee = Member::start(host.moved(&knee), "robot-node");
     knee.answer("up");
     let echo = Tid::from_bits(numbers(&knee.ask("tid"))[0]);
     (knee, echo)

@@ -113,6 +113,8 @@ pub(super) enum Answer {
 /// A connection to the node that is attacked.
 pub(super) struct Stranger {
     wire: Wire,
+    /// As which life of its node it says hello.
+    life: u64,
     codec: FrameCodec,
     read: BytesMut,
 }
@@ -168,25 +170,17 @@ impl Stranger {
                 Wire::Sealed(Box::new(StreamOwned::new(tls, socket)))
             }
         };
-        Ok(Self { wire, codec: FrameCodec::new(PAYLOAD_MAX), read: BytesMut::new() })
+        Ok(Self { wire, life: 1, codec: FrameCodec::new(PAYLOAD_MAX), read: BytesMut::new() })
+    }
+
+    /// The same as a life of its node that is later than all before: one that has forgotten what passed on former connections.
+    pub(super) fn in_a_new_life(self) -> Self {
+        Self { life: next_dial(), ..self }
     }
 
     /// Says that it is this node, and reads what is answered.
     pub(super) fn hello(&mut self, says: Who, peer: NodeAddress) -> io::Result<Answer> {
-        let node = says.node();
-        let hello = Hello {
-            project: PROJECT,
-            node,
-            name: says.name,
-            incarnation: 1,
-            peer,
-            dial: next_dial(),
-            payload_max: PAYLOAD_MAX as u64,
-            features: [],
-        };
-        let header =
-            Header::new(Kind::GNCL_HELLO, Tid::new(node, AppAddress::GNCL), Tid::new(peer, AppAddress::GNCL));
-        self.send(&header, &words(&hello))?;
+        self.say_hello(says, peer)?;
         let answer = self.receive()?;
         match answer.header.kind {
             Kind::GNCL_WELCOME => Ok(Answer::Welcome),
@@ -196,6 +190,24 @@ impl Stranger {
             }
             other => Err(io::Error::other(format!("a frame of kind {other} is no answer to a HELLO"))),
         }
+    }
+
+    /// Says that it is this node.
+    pub(super) fn say_hello(&mut self, says: Who, peer: NodeAddress) -> io::Result<()> {
+        let node = says.node();
+        let hello = Hello {
+            project: PROJECT,
+            node,
+            name: says.name,
+            incarnation: self.life,
+            peer,
+            dial: next_dial(),
+            payload_max: PAYLOAD_MAX as u64,
+            features: [],
+        };
+        let header =
+            Header::new(Kind::GNCL_HELLO, Tid::new(node, AppAddress::GNCL), Tid::new(peer, AppAddress::GNCL));
+        self.send(&header, &words(&hello))
     }
 
     /// Begins the session: says that it has taken nothing, and waits for the node to say the same. Messages from 1 on may follow.

@@ -11,6 +11,8 @@ mod sources;
 
 pub(super) use datagrams::{Recording, listen};
 
+use std::collections::BTreeMap;
+
 use super::{
     Attack, Happened, Scene,
     keys::{KNEE, SPARE},
@@ -28,8 +30,14 @@ const COMMON: Attack = Attack {
     others_come: false,
     inside: false,
     own: SPARE,
-    run: |_| Happened { what: String::new(), broken: Vec::new(), refused: Vec::new(), own_sent: 0 },
+    run: |_| Happened::new(String::new(), Vec::new()),
+    goes_on: None,
 };
+
+/// So much of it was done.
+fn done(what: &'static str, count: u64) -> BTreeMap<&'static str, u64> {
+    BTreeMap::from([(what, count)])
+}
 
 /// All of them, the quietest first.
 pub(super) const ATTACKS: &[Attack] = &[
@@ -37,12 +45,14 @@ pub(super) const ATTACKS: &[Attack] = &[
         name: "wrong-authority",
         tried: "a whole node, and handshakes by hand, with certificates of another authority of the same project name",
         run: credentials::wrong_authority,
+        goes_on: Some(credentials::wrong_authority_by_hand),
         ..COMMON
     },
     Attack {
         name: "no-certificate",
         tried: "a whole node without keys, handshakes of TLS without a certificate, and HELLO without TLS",
         run: credentials::none,
+        goes_on: Some(credentials::none_by_hand),
         ..COMMON
     },
     Attack {
@@ -85,6 +95,7 @@ pub(super) const ATTACKS: &[Attack] = &[
         tried: "256 connections that send a byte of a right handshake each 100 ms, and come again; 48 that are to be closed",
         others_come: true,
         run: slow_loris::drip,
+        goes_on: Some(slow_loris::drip_from_many),
         ..COMMON
     },
     Attack {

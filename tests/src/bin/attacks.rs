@@ -1,6 +1,6 @@
 //! Attacks a secured robot in every way of the threat model, on hosts of network namespaces, and says what came of it.
 //!
-//! `cargo run --release -p sinew-tests --bin attacks [-- --only NAME --seconds N --json]`; `--help` names the options. As root.
+//! `cargo run --release -p sinew-tests --bin attacks [-- --only NAME --seconds N --rounds N --json]`; `--help` names the options. As root.
 //!
 //! Exit code 1: an attack was not held off. 3: all were, and live traffic felt one, or the machine was not at rest, so that nobody knows. 2: no hosts can be made here.
 
@@ -15,9 +15,13 @@ struct Arguments {
     /// Only these; several times for several.
     #[arg(long)]
     only: Vec<String>,
-    /// How long each attack lasts, and the time before that it is compared with.
-    #[arg(long, default_value_t = 10.0)]
+    /// How long live traffic is timed left alone, with the decoy attacked, and with the node attacked, each in all rounds together. It is
+    /// looked for half as long who gets in.
+    #[arg(long, default_value_t = 8.0)]
     seconds: f64,
+    /// How often these three take turns.
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..))]
+    rounds: u32,
     /// Writes JSON instead of a table.
     #[arg(long)]
     json: bool,
@@ -30,13 +34,14 @@ fn main() -> ExitCode {
     if let Some(code) = play() {
         return code;
     }
-    let Arguments { only, seconds, json, list } = Arguments::parse();
+    let Arguments { only, seconds, rounds, json, list } = Arguments::parse();
     if list {
         known().iter().for_each(|(name, tried)| println!("{name:<20} {tried}"));
         return ExitCode::SUCCESS;
     }
     let program = std::env::current_exe().expect("a program has a path");
-    let report = match run(&Plan { program, lasts: Duration::from_secs_f64(seconds), only }) {
+    let timed = Duration::from_secs_f64(seconds);
+    let report = match run(&Plan { program, lasts: timed / 2, timed, rounds, only }) {
         Ok(report) => report,
         Err(why) => {
             println!("skipped: {why}");

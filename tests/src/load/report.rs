@@ -14,6 +14,11 @@ impl Times {
         self.0.push(time);
     }
 
+    /// All of these, too.
+    pub fn add(&mut self, others: Self) {
+        self.0.extend(others.0);
+    }
+
     /// How many there are.
     #[must_use]
     pub fn count(&self) -> usize {

@@ -6,7 +6,7 @@ use std::{
     thread,
 };
 
-use super::{super::KNEE, Happened, Scene};
+use super::{super::KNEE, Happened, Scene, done};
 use crate::clients::{Performer, hostile::Keeper};
 
 const ATTACKERS: usize = 2;
@@ -41,5 +41,11 @@ pub(super) fn at_the_door(scene: &Scene<'_>) -> Happened {
     let said = said.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let sum = |at: usize| said.iter().skip(at).step_by(4).sum::<u64>();
     let broken = if sum(0) == 0 { vec!["no trick was played".to_owned()] } else { Vec::new() };
-    Happened::new(format!("{} tricks on {} connections, {} refused in words", sum(0), sum(1), sum(3)), broken)
+    Happened {
+        done: done("tricks", sum(0)),
+        ..Happened::new(
+            format!("{} tricks on {} connections, {} refused in words", sum(0), sum(1), sum(3)),
+            broken,
+        )
+    }
 }

@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::{Happened, Scene};
+use super::{Happened, Scene, done};
 
 const THREADS: usize = 4;
 /// Connections that are held at once, of all threads together.
@@ -19,7 +19,7 @@ pub(super) fn ten_thousand(scene: &Scene<'_>) -> Happened {
         let (mut made, mut held, mut most, mut longest) = (0_u64, VecDeque::new(), 0, Duration::ZERO);
         while !scene.is_over() {
             let began = Instant::now();
-            if let Ok(silent) = TcpStream::connect_timeout(&scene.robot.knee(), PATIENCE) {
+            if let Ok(silent) = TcpStream::connect_timeout(&scene.target.connections, PATIENCE) {
                 made += 1;
                 held.push_back(silent);
                 longest = longest.max(began.elapsed());
@@ -42,10 +42,13 @@ pub(super) fn ten_thousand(scene: &Scene<'_>) -> Happened {
     if made == 0 {
         broken.push("no connection was made".to_owned());
     }
-    Happened::new(
-        format!("{made} made, {most} of {HELD} open at this end at once; the longest took {longest:.0?}"),
-        broken,
-    )
+    Happened {
+        done: done("connections", made),
+        ..Happened::new(
+            format!("{made} made, {most} of {HELD} open at this end at once; the longest took {longest:.0?}"),
+            broken,
+        )
+    }
 }
 
 /// The same to a node that has no descriptors for them: it has run out of them, else this shows nothing.

@@ -14,10 +14,12 @@ use super::{
     super::{
         ATTACKER,
         keys::{self, Who},
+        robot::Is,
         stranger::{Answer, Client, Stranger, client},
     },
     Happened, Scene,
     datagrams::NOT_OURS,
+    done,
 };
 use crate::clients::Performer;
 
@@ -85,9 +87,9 @@ impl Tally {
 
     fn happened(self, who: &str, expected: Expected) -> Happened {
         let Self { tried, came_in, as_expected, cut, words, otherwise } = self;
-        let mut broken = Vec::new();
+        let (mut broken, mut let_in) = (Vec::new(), Vec::new());
         if came_in > 0 {
-            broken.push(format!("{who}: {came_in} of {tried} came in"));
+            let_in.push(format!("{who}: {came_in} of {tried} came in"));
         }
         if as_expected == 0 {
             broken.push(format!("{who}: none of {tried} was refused as it is to be, {cut} were cut"));
@@ -95,7 +97,12 @@ impl Tally {
         broken.extend(otherwise.map(|words| format!("{who}: one ended otherwise: {words}")));
         let words = words.unwrap_or_else(|| "nothing".to_owned());
         let what = format!("{who}: {tried} tried, {came_in} came in, {cut} cut; told: {words}");
-        Happened { refused: vec![(expected.cause(), tried)], ..Happened::new(what, broken) }
+        Happened {
+            let_in,
+            refused: vec![(expected.cause(), tried)],
+            done: done("handshakes", tried),
+            ..Happened::new(what, broken)
+        }
     }
 }
 
@@ -124,9 +131,19 @@ fn shake(scene: &Scene<'_>, lasts: Duration, attempt: &Attempt<'_>) -> Happened 
     let mut tallies = scene.on_threads(1, |_| {
         let mut tally = Tally::default();
         while !scene.is_over() && Instant::now() < until {
-            let answer = Stranger::dial(scene.robot.knee(), shows)
-                .and_then(|mut stranger| stranger.hello(says, scene.robot.knee_address()));
-            tally.note(answer, expected);
+            let dialled = Stranger::dial(scene.target.connections, shows);
+            match scene.target.is {
+                Is::Node => {
+                    let peer = scene.robot.knee_address();
+                    let answer = dialled.and_then(|mut stranger| stranger.hello(says, peer));
+                    tally.note(answer, expected);
+                }
+                Is::Decoy => {
+                    // Nothing is said in return, and whether what is said there still arrives is all the same.
+                    let _ = dialled.and_then(|mut it| it.say_hello(says, scene.robot.knee_address()));
+                    tally.tried += 1;
+                }
+            }
             scene.rest(PACE);
         }
         tally
@@ -141,8 +158,12 @@ fn together(parts: Vec<Happened>) -> Happened {
     for part in parts {
         what.push(part.what);
         all.broken.extend(part.broken);
+        all.let_in.extend(part.let_in);
         for (cause, count) in part.refused {
             *refused.entry(cause).or_default() += count;
+        }
+        for (what, count) in part.done {
+            *all.done.entry(what).or_default() += count;
         }
     }
     Happened { what: what.join("; "), refused: refused.into_iter().collect(), ..all }
@@ -168,41 +189,55 @@ fn beside_a_node(scene: &Scene<'_>, keys: Option<&Path>, tries: impl FnOnce() ->
 
 pub(super) fn wrong_authority(scene: &Scene<'_>) -> Happened {
     let theirs = scene.keys.of_others(keys::MALLORY);
+    beside_a_node(scene, Some(&theirs), || shake_as_others(scene))
+}
+
+/// By hand alone.
+pub(super) fn wrong_authority_by_hand(scene: &Scene<'_>) -> Happened {
+    together(shake_as_others(scene))
+}
+
+fn shake_as_others(scene: &Scene<'_>) -> Vec<Happened> {
     let [own, hip] = [keys::MALLORY, keys::HIP].map(|who| scene.keys.tls_of_others(who));
     let expected = Expected::Alert(NOT_TAKEN);
-    beside_a_node(scene, Some(&theirs), || {
-        let attempts = [
-            Attempt { who: "as itself", shows: Some(&own), says: keys::MALLORY, expected },
-            Attempt {
-                who: "as hip, with a certificate that says so",
-                shows: Some(&hip),
-                says: keys::HIP,
-                expected,
-            },
-        ];
-        attempts.iter().map(|attempt| shake(scene, scene.lasts / 2, attempt)).collect()
-    })
+    let attempts = [
+        Attempt { who: "as itself", shows: Some(&own), says: keys::MALLORY, expected },
+        Attempt {
+            who: "as hip, with a certificate that says so",
+            shows: Some(&hip),
+            says: keys::HIP,
+            expected,
+        },
+    ];
+    attempts.iter().map(|attempt| shake(scene, scene.lasts / 2, attempt)).collect()
 }
 
 pub(super) fn none(scene: &Scene<'_>) -> Happened {
+    beside_a_node(scene, None, || shake_without_keys(scene))
+}
+
+/// By hand alone.
+pub(super) fn none_by_hand(scene: &Scene<'_>) -> Happened {
+    together(shake_without_keys(scene))
+}
+
+fn shake_without_keys(scene: &Scene<'_>) -> Vec<Happened> {
     let nothing = client(None);
-    beside_a_node(scene, None, || {
-        let attempts = [
-            Attempt {
-                who: "TLS",
-                shows: Some(&nothing),
-                says: keys::MALLORY,
-                expected: Expected::Alert(AlertDescription::CertificateRequired),
-            },
-            Attempt {
-                who: "without TLS",
-                shows: None,
-                says: keys::MALLORY,
-                expected: Expected::Refusal("you do not speak TLS"),
-            },
-        ];
-        attempts.iter().map(|attempt| shake(scene, scene.lasts / 2, attempt)).collect()
-    })
+    let attempts = [
+        Attempt {
+            who: "TLS",
+            shows: Some(&nothing),
+            says: keys::MALLORY,
+            expected: Expected::Alert(AlertDescription::CertificateRequired),
+        },
+        Attempt {
+            who: "without TLS",
+            shows: None,
+            says: keys::MALLORY,
+            expected: Expected::Refusal("you do not speak TLS"),
+        },
+    ];
+    attempts.iter().map(|attempt| shake(scene, scene.lasts / 2, attempt)).collect()
 }
 
 pub(super) fn stolen(scene: &Scene<'_>) -> Happened {

@@ -11,7 +11,7 @@ use socket2::{Domain, Protocol, Socket, Type};
 
 use super::{
     super::{keys::MALLORY, robot::NDL_PORT},
-    Happened, Scene,
+    Happened, Scene, done,
 };
 use crate::dice::Dice;
 
@@ -59,7 +59,12 @@ pub(super) fn replayed_and_forged(scene: &Scene<'_>) -> Happened {
             }
         }
     }
-    Happened { refused: vec![(NOT_OURS, 1)], ..Happened::new(what.join(", "), broken) }
+    let all = sent.counts.iter().flatten().sum();
+    Happened {
+        refused: vec![(NOT_OURS, 1)],
+        done: done("datagrams", all),
+        ..Happened::new(what.join(", "), broken)
+    }
 }
 
 fn send(scene: &Scene<'_>) -> Sent {
@@ -83,10 +88,8 @@ fn send(scene: &Scene<'_>) -> Sent {
                 datagram[at] ^= 1 << (dice.roll() % 8);
             }
             let to = (dice.roll() % 3) as usize;
-            let robot = scene.robot;
-            let address = [robot.discovery(), robot.discovery_beside(), robot.group().into()][to];
             // What the network does not take is not sent again.
-            match socket.send_to(&datagram, address) {
+            match socket.send_to(&datagram, scene.target.datagrams[to]) {
                 Ok(_) => sent.counts[kind][to] += 1,
                 Err(error) => sent.errors[to] = Some(error),
             }

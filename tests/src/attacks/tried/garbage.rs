@@ -1,6 +1,7 @@
 //! Who pours random bytes on every port, as fast as they go.
 
 use std::{
+    collections::BTreeMap,
     io::Write as _,
     net::{Ipv4Addr, TcpStream, UdpSocket},
     time::Duration,
@@ -38,6 +39,7 @@ pub(super) fn pour(scene: &Scene<'_>) -> Happened {
     Happened {
         // What is no TLS; what looked like it and was none; what is no datagram of the project.
         refused: vec![(SECURITY, 1), (NOT_PROVEN, 1), (NOT_OURS, 1)],
+        done: BTreeMap::from([("MiB by TCP", bytes >> 20), ("datagrams", datagrams)]),
         ..Happened::new(
             format!("{} MiB by TCP, {datagrams} datagrams of {DATAGRAM} bytes", bytes >> 20),
             broken,
@@ -51,7 +53,7 @@ fn by_udp(scene: &Scene<'_>, garbage: &[u8]) -> u64 {
     let mut sent = 0_u64;
     while !scene.is_over() {
         let at = sent as usize * 7 % (garbage.len() - DATAGRAM);
-        sent += u64::from(socket.send_to(&garbage[at..at + DATAGRAM], scene.robot.discovery()).is_ok());
+        sent += u64::from(socket.send_to(&garbage[at..at + DATAGRAM], scene.target.datagrams[0]).is_ok());
     }
     sent
 }
@@ -60,7 +62,9 @@ fn by_udp(scene: &Scene<'_>, garbage: &[u8]) -> u64 {
 fn by_tcp(scene: &Scene<'_>, first: &[u8], garbage: &[u8], dice: &mut Dice) -> u64 {
     let mut bytes = 0;
     while !scene.is_over() {
-        let Ok(mut socket) = TcpStream::connect_timeout(&scene.robot.knee(), PATIENCE) else { continue };
+        let Ok(mut socket) = TcpStream::connect_timeout(&scene.target.connections, PATIENCE) else {
+            continue;
+        };
         // Whom nobody reads any more does not wait for ever.
         if socket.set_write_timeout(Some(PATIENCE)).is_err() {
             continue;

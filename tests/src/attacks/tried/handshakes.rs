@@ -12,7 +12,7 @@ use sinew::security::{Tls, rustls::ClientConnection};
 
 use super::{
     super::stranger::{Client, client},
-    Happened, Scene,
+    Happened, Scene, done,
 };
 
 const THREADS: usize = 2;
@@ -33,7 +33,7 @@ pub(super) fn begun(scene: &Scene<'_>) -> Happened {
     let begun = scene.on_threads(THREADS, |_| {
         let (mut begun, mut answered, mut held) = (0_u64, 0_u64, VecDeque::new());
         while !scene.is_over() {
-            let connected = TcpStream::connect_timeout(&scene.robot.knee(), PATIENCE);
+            let connected = TcpStream::connect_timeout(&scene.target.connections, PATIENCE);
             if let Ok(mut socket) = connected {
                 // It may have been closed already.
                 begun += u64::from(socket.write_all(&beginning).is_ok());
@@ -50,7 +50,10 @@ pub(super) fn begun(scene: &Scene<'_>) -> Happened {
     if begun == 0 || answered == 0 {
         broken.push(format!("{begun} handshakes were begun, and {answered} answered: the node had no work"));
     }
-    Happened::new(format!("{begun} begun, {answered} answered with the node's own beginning"), broken)
+    Happened {
+        done: done("handshakes", begun),
+        ..Happened::new(format!("{begun} begun, {answered} answered with the node's own beginning"), broken)
+    }
 }
 
 /// Whether the node has done its part, and has sent its ServerHello.

@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::{super::stranger::client, Happened, Scene, handshakes::beginning};
+use super::{super::stranger::client, Happened, Scene, done, handshakes::beginning};
 
 const CONNECTIONS: usize = 256;
 /// Of a node that takes 64 strangers.
@@ -46,6 +46,15 @@ pub(super) fn drip(scene: &Scene<'_>) -> Happened {
     }
 }
 
+/// The many alone, for as long as the scene lasts.
+pub(super) fn drip_from_many(scene: &Scene<'_>) -> Happened {
+    let (beginning, until) = (beginning(&client(None)), Instant::now() + scene.lasts);
+    let seen = scene.on_threads(1, |_| come_again(scene, &beginning, until));
+    let (made, bytes) = seen[0];
+    let what = format!("{made} connections, {bytes} bytes, one at a time");
+    Happened { done: done("connections", made), ..Happened::new(what, Vec::new()) }
+}
+
 /// So many that the node has to choose whom it closes. Returns the connections and the bytes.
 fn come_again(scene: &Scene<'_>, beginning: &[u8], until: Instant) -> (u64, u64) {
     let mut connections: Vec<Option<(TcpStream, usize)>> = (0..CONNECTIONS).map(|_| None).collect();
@@ -53,8 +62,9 @@ fn come_again(scene: &Scene<'_>, beginning: &[u8], until: Instant) -> (u64, u64)
     while !scene.is_over() && Instant::now() < until {
         for place in &mut connections {
             if place.is_none() {
-                *place =
-                    TcpStream::connect_timeout(&scene.robot.knee(), PATIENCE).ok().map(|socket| (socket, 0));
+                *place = TcpStream::connect_timeout(&scene.target.connections, PATIENCE)
+                    .ok()
+                    .map(|socket| (socket, 0));
                 made += u64::from(place.is_some());
             }
             let Some((socket, said)) = place else { continue };
@@ -88,7 +98,7 @@ fn few(scene: &Scene<'_>, beginning: &[u8]) -> Few {
     let mut seen = Few::default();
     let mut connections = Vec::new();
     for _ in 0..FEW {
-        match TcpStream::connect_timeout(&scene.robot.knee(), CLOSED).and_then(|socket| {
+        match TcpStream::connect_timeout(&scene.target.connections, CLOSED).and_then(|socket| {
             socket.set_nonblocking(true)?;
             Ok(socket)
         }) {

@@ -2,15 +2,16 @@
 
 use std::{io, time::Duration};
 
-use sinew::{AppAddress, Payload as _, Tid};
+use sinew::{AppAddress, NodeAddress, Payload as _, Tid};
 use sinew_runtime::wire::{Header, Kind};
 
 use super::{
     super::{
         keys::{self, SPARE, Who},
+        robot::Is,
         stranger::{Answer, Stranger, words},
     },
-    Happened, Scene,
+    Happened, Scene, done,
 };
 use crate::puppet::Order;
 
@@ -30,6 +31,7 @@ pub(super) fn forged(scene: &Scene<'_>) -> Happened {
             let what = format!("{own} messages in its own name, {forged} in that of hip and of knee");
             Happened {
                 own_sent: own,
+                done: done("messages", own + forged),
                 refused: vec![("forged source", forged)],
                 ..Happened::new(what, broken)
             }
@@ -43,11 +45,14 @@ pub(super) fn forged(scene: &Scene<'_>) -> Happened {
 /// Returns how many were sent in its own name, and in others'.
 fn speak(scene: &Scene<'_>) -> io::Result<[u64; 2]> {
     let (peer, echo) = (scene.robot.knee_address(), scene.robot.echo());
-    let mut stranger = Stranger::dial(scene.robot.knee(), Some(&scene.keys.tls(SPARE)))?;
-    if let Answer::Refused(why) = stranger.hello(SPARE, peer)? {
-        return Err(io::Error::other(why));
+    // It comes several times, and numbers its messages from 1 each time.
+    let mut stranger =
+        Stranger::dial(scene.target.connections, Some(&scene.keys.tls(SPARE)))?.in_a_new_life();
+    match scene.target.is {
+        Is::Node => begin(&mut stranger, peer)?,
+        // It takes what comes, and says nothing.
+        Is::Decoy => {}
     }
-    stranger.begin_session(SPARE, peer)?;
     let (mut sent, mut number) = ([0; 2], 0_u64);
     while !scene.is_over() {
         for says in [SPARE, keys::HIP, keys::KNEE, keys::HIP, keys::KNEE].into_iter().take(AT_ONCE as usize) {
@@ -57,8 +62,17 @@ fn speak(scene: &Scene<'_>) -> io::Result<[u64; 2]> {
         }
         std::thread::sleep(Duration::from_millis(1));
     }
-    stranger.wait_for_taken(number)?;
+    if scene.target.is == Is::Node {
+        stranger.wait_for_taken(number)?;
+    }
     Ok(sent)
+}
+
+fn begin(stranger: &mut Stranger, peer: NodeAddress) -> io::Result<()> {
+    if let Answer::Refused(why) = stranger.hello(SPARE, peer)? {
+        return Err(io::Error::other(why));
+    }
+    stranger.begin_session(SPARE, peer)
 }
 
 fn header(says: Who, to: Tid, number: u64) -> Header {
