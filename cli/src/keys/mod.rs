@@ -20,7 +20,8 @@ pub(crate) enum Order {
     /// Makes a project's authority, and a key and a certificate for each of its nodes, in a new directory; says what is to be copied where
     ///
     /// A node is NAME=ADDRESS, or the configuration file of the node (`hip.toml`), or its name: then its address is that in NAME.toml in this
-    /// directory, where there is such a file, else the next free one from 127.0.0.1 on, for nodes that share one machine.
+    /// directory, where there is such a file, else the next free one from 127.0.0.1 on, for nodes that share one machine. Where all others have
+    /// addresses of a network, it has to be said.
     ///
     /// What exists is not touched: a directory that is not empty is refused.
     Init {
@@ -37,7 +38,8 @@ pub(crate) enum Order {
     },
     /// Makes a key and a certificate for further nodes, or new ones for nodes that have some
     ///
-    /// Those before them count until they end, or are revoked. A node that has an address keeps it, unless another one is named.
+    /// Those before them count until they end, or are revoked. A node that has an address keeps it, unless another one is named; also one whose
+    /// certificates are all revoked.
     Issue {
         /// The nodes, each as for `init`
         #[arg(required = true, value_name = "NODE")]
@@ -90,7 +92,7 @@ pub(crate) fn show(order: &Order) -> Result<Said, Fault> {
         Order::Init { project, nodes, out, time } => {
             let clock = authority::Clock::new(now, time.days)?;
             let wanted = whom::wanted(project, nodes)?;
-            let wanted = whom::placed(wanted, &[], now)?;
+            let wanted = whom::placed(wanted, &[], &[])?;
             let made = Project::init(project, out, &wanted, clock)?;
             Ok(said::made(&made, &wanted))
         }
@@ -98,7 +100,7 @@ pub(crate) fn show(order: &Order) -> Result<Said, Fault> {
             let clock = authority::Clock::new(now, time.days)?;
             let project = Project::open(&place.keys)?;
             let wanted = whom::wanted(project.name(), nodes)?;
-            let wanted = whom::placed(wanted, &project.counting(now)?, now)?;
+            let wanted = whom::placed(wanted, &project.counting(now)?, &project.issued()?)?;
             let made = project.issue(&wanted, clock)?;
             Ok(said::made(&made, &wanted))
         }

@@ -159,11 +159,16 @@ impl Project {
         &self.name
     }
 
+    /// Every certificate that was ever made.
+    pub(super) fn issued(&self) -> Result<Vec<Issued>, Fault> {
+        issued(&self.directory)
+    }
+
     /// Those certificates that are not revoked and have not ended.
     pub(super) fn counting(&self, now: UnixTime) -> Result<Vec<Issued>, Fault> {
         let denied = denied(&self.directory)?.1;
         let counts = |issued: &Issued| issued.validity().until >= now && !denied.has(issued.serial());
-        Ok(issued(&self.directory)?.into_iter().filter(counts).collect())
+        Ok(self.issued()?.into_iter().filter(counts).collect())
     }
 
     /// A key and a certificate for each node, in its directory. Each node's is there whole or not at all.

@@ -126,13 +126,22 @@ fn is_here(issued: &Issued) -> bool {
 
 /// What copies a node's directory to its machine, over one that is there, for root whoever made it; `None` where it stays.
 fn copy(made: &Made, issued: &Issued) -> Option<String> {
-    let unpack = format!("mkdir -p {INSTALLED} && tar -C {INSTALLED} -xp --no-same-owner");
-    sent(&directory_of(made, issued), ".", issued, &unpack)
+    sent(
+        &directory_of(made, issued),
+        ".",
+        issued,
+        &format!("mkdir -p {INSTALLED} && chmod 700 {INSTALLED} && "),
+    )
 }
 
-/// What has `what` of this directory unpacked on the node's machine; `None` where that is this one.
-fn sent(directory: &str, what: &str, issued: &Issued, unpack: &str) -> Option<String> {
+/// What has `what` of this directory unpacked on the node's machine, prepared by this; `None` where that is this one.
+///
+/// Each file gets its name when all have come whole: the beginning of a deny list is one, too, and a node may read it at any time.
+fn sent(directory: &str, what: &str, issued: &Issued, prepared: &str) -> Option<String> {
     let (from, host) = (quoted(directory), issued.identity.address);
+    let unpack = format!(
+        "{prepared}cd {INSTALLED} && rm -rf new && mkdir new && tar -C new -xp --no-same-owner && sync && mv new/* . && rmdir new"
+    );
     (!is_here(issued)).then(|| format!("  tar -C {from} -c {what} | ssh root@{host} '{unpack}'\n"))
 }
 
@@ -167,9 +176,8 @@ pub(super) fn revoked(revoked: &Revoked, directory: &Path) -> Said {
         list.display(),
         directory.join("nodes").display()
     );
-    let unpack = format!("tar -C {INSTALLED} -xp --no-same-owner");
     let shown = directory.display().to_string();
-    let copies = revoked.left.iter().filter_map(|issued| sent(&shown, "denied.txt", issued, &unpack));
+    let copies = revoked.left.iter().filter_map(|issued| sent(&shown, "denied.txt", issued, ""));
     let copies: Vec<_> = copies.collect();
     if !copies.is_empty() {
         let _ = write!(text, "\nTo the nodes that are left, for example:\n{}", copies.concat());

@@ -6,10 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use sinew::{
-    NodeAddress, NodeConfig,
-    security::{Identity, UnixTime},
-};
+use sinew::{NodeAddress, NodeConfig, security::Identity};
 
 use super::project::Issued;
 use crate::system::Fault;
@@ -28,7 +25,7 @@ pub(super) enum AddressFrom {
     Said,
     /// In its configuration.
     File(PathBuf),
-    /// In its last certificate.
+    /// In its last certificate, revoked or not.
     Before,
     /// The next free one of this machine.
     Order,
@@ -99,15 +96,19 @@ fn configured(project: &str, file: &Path) -> Result<(String, (NodeAddress, Addre
     Ok((config.name, (address, AddressFrom::File(file.to_owned()))))
 }
 
-/// Gives an address to each that has none, and refuses an address or a name that two have. `counting` are those that count already.
-pub(super) fn placed(named: Vec<Named>, counting: &[Issued], now: UnixTime) -> Result<Vec<Wanted>, Fault> {
-    // They come by their age: of several certificates of a node the newest says where it is.
-    let before: Vec<_> = counting.iter().filter(|issued| issued.validity().until >= now).collect();
-    let newest: BTreeMap<_, _> =
-        before.iter().map(|issued| (issued.identity.name.clone(), issued.identity.address)).collect();
+/// Gives an address to each that has none, and refuses an address or a name that two have. `counting` are those of `all` earlier ones that count
+/// still.
+pub(super) fn placed(named: Vec<Named>, counting: &[Issued], all: &[Issued]) -> Result<Vec<Wanted>, Fault> {
+    // They come by their age: of several certificates of a node the newest says where it is, and of those that count before all others. A
+    // node that has none any more, as they are revoked or have ended, is where it was.
+    let newest: BTreeMap<_, _> = all
+        .iter()
+        .chain(counting)
+        .map(|issued| (issued.identity.name.clone(), issued.identity.address))
+        .collect();
     let mut taken: BTreeMap<NodeAddress, String> = BTreeMap::new();
     let is_wanted = |name: &str| named.iter().any(|named| named.name == name);
-    let others = before.iter().filter(|issued| !is_wanted(&issued.identity.name));
+    let others = counting.iter().filter(|issued| !is_wanted(&issued.identity.name));
     taken.extend(others.map(|issued| (issued.identity.address, issued.identity.name.clone())));
     let known = |named: &Named| {
         let earlier = newest.get(&named.name).map(|address| (*address, AddressFrom::Before));
@@ -127,7 +128,10 @@ pub(super) fn placed(named: Vec<Named>, counting: &[Issued], now: UnixTime) -> R
     }
     let mut wanted: Vec<Wanted> = Vec::new();
     for named in named {
-        let (address, address_from) = known(&named).unwrap_or_else(|| next_free(&taken));
+        let (address, address_from) = match known(&named) {
+            Some(known) => known,
+            None => next_free(&named.name, &taken)?,
+        };
         taken.insert(address, named.name.clone());
         if wanted.iter().any(|wanted| wanted.identity.name == named.name) {
             return Err(Fault::Usage(format!("'{}' is named twice; a node has one key", named.name)));
@@ -139,12 +143,19 @@ pub(super) fn placed(named: Vec<Named>, counting: &[Issued], now: UnixTime) -> R
     Ok(wanted)
 }
 
-/// The next address for one more node of this machine.
-fn next_free(taken: &BTreeMap<NodeAddress, String>) -> (NodeAddress, AddressFrom) {
+/// The next address for one more node of this machine. Where all others are elsewhere, so will it be: then it has to be said where.
+fn next_free(name: &str, taken: &BTreeMap<NodeAddress, String>) -> Result<(NodeAddress, AddressFrom), Fault> {
+    let is_here = |address: &NodeAddress| Ipv4Addr::from(address.bits()).is_loopback();
+    if let Some((address, other)) = taken.first_key_value().filter(|_| !taken.keys().any(is_here)) {
+        return Err(Fault::Usage(format!(
+            "which address '{name}' has is not known, and the others have addresses of a network, as '{other}' has {address}: write {name}=ADDRESS \
+             with that of its machine, or with one from 127.0.0.1 on if it is to run on this one alone"
+        )));
+    }
     let first = u32::from(Ipv4Addr::LOCALHOST);
     let mut all = (first..).map(NodeAddress::new);
     let free = all.find(|address| !taken.contains_key(address));
-    (free.unwrap_or_else(|| NodeAddress::new(first)), AddressFrom::Order)
+    Ok((free.unwrap_or_else(|| NodeAddress::new(first)), AddressFrom::Order))
 }
 
 /// A node with this project, name and address could be configured.

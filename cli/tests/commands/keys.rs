@@ -164,6 +164,7 @@ fn names_and_addresses_that_cannot_be_are_refused_before_anything_is_made() {
         (&["hip=10.0.0.2", "knee=10.0.0.2"][..], &["'hip' and 'knee' have the same address, 10.0.0.2"][..]),
         (&["hip", "hip"], &["'hip' is named twice"]),
         (&["hip=10.0.0.2", "hip=10.0.0.2"], &["'hip' is named twice"]),
+        (&["hip=10.0.0.2", "knee"], &["which address 'knee' has", "'hip' has 10.0.0.2", "knee=ADDRESS"]),
         (&["hip=10.0.0"], &["'10.0.0' is no address", "hip=192.168.0.11"]),
         (&["hip=0.0.0.0"], &["node.address"]),
         (&["../hip"], &["cannot be the name of a directory"]),
@@ -186,11 +187,11 @@ fn an_address_comes_from_the_nodes_configuration_where_there_is_one() {
     config("left.toml", "[node]\nname = 'ankle'\nproject = 'walker'\n[ndl]\ninterface = '192.168.0.14'\n");
     config("other.toml", "[node]\nname = 'other'\nproject = 'runner'\n");
     config("wrong.toml", "[node]\nname = 'right'\nproject = 'walker'\n");
-    let said = good(&directory, &["init", "walker", "knee", "left.toml", "hip"]);
+    let said = good(&directory, &["init", "walker", "knee", "left.toml", "wrist=127.0.0.1", "hip"]);
     for (name, address, from) in [
         ("knee", "10.0.0.3", "from knee.toml"),
         ("ankle", "192.168.0.14", "from left.toml"),
-        ("hip", "127.0.0.1", "next free here"),
+        ("hip", "127.0.0.2", "next free here"),
     ] {
         let node = named(&said["nodes"], name).expect("it");
         assert_eq!((&node["address"], &node["address_from"]), (&address.into(), &from.into()), "{node}");
@@ -207,7 +208,7 @@ fn an_address_comes_from_the_nodes_configuration_where_there_is_one() {
 #[test]
 fn what_is_said_secures_a_node() {
     let directory = OwnDirectory::new();
-    let answer = keys(&directory, &["init", "walker", "hip=10.0.0.9", "knee"]);
+    let answer = keys(&directory, &["init", "walker", "hip=10.0.0.9", "knee=127.0.0.1"]);
     for part in [
         "keep it off the robot",
         "tar -C keys/nodes/hip -c . | ssh root@10.0.0.9",
@@ -239,7 +240,7 @@ fn what_is_said_secures_a_node() {
 #[test]
 fn issue_adds_nodes_and_renews_them_and_says_what_still_counts() {
     let directory = OwnDirectory::new();
-    good(&directory, &["init", "walker", "hip", "knee=10.0.0.3"]);
+    good(&directory, &["init", "walker", "hip=127.0.0.1", "knee=10.0.0.3"]);
     let first = credentials(&directory, "knee", [10, 0, 0, 3]).serial().to_string();
     // When: one more, and the knee again
     let said = good(&directory, &["issue", "ankle", "knee", "--days", "30"]);
@@ -300,15 +301,71 @@ fn revoke_says_how_the_list_comes_to_each_node_that_is_left() {
     let directory = OwnDirectory::new();
     good(&directory, &["init", "walker", "hip=10.0.0.2", "knee=10.0.0.3", "ankle=127.0.0.4"]);
     let answer = keys(&directory, &["revoke", "hip"]);
-    let line = "  tar -C keys -c denied.txt | ssh root@10.0.0.3 'tar -C /etc/sinew/keys -xp --no-same-owner'";
     let copies: Vec<_> = answer.out.lines().filter(|line| line.contains("ssh")).collect();
     // Not to the one that was revoked, and not to one of this machine, which has its directory here.
-    assert_eq!(copies, [line], "{}", answer.out);
-    // And: a node that has a new certificate is left, too
-    good(&directory, &["issue", "hip=10.0.0.2"]);
+    assert_eq!(copies.len(), 1, "{}", answer.out);
+    assert!(copies[0].starts_with("  tar -C keys -c denied.txt | ssh root@10.0.0.3 '"), "{}", answer.out);
+    // And: a node that has a new certificate is left, too; it is where it was
+    let said = good(&directory, &["issue", "hip"]);
+    let hip = named(&said["nodes"], "hip").expect("it");
+    assert_eq!((&hip["address"], &hip["address_from"]), (&"10.0.0.2".into(), &"as before".into()));
     let answer = keys(&directory, &["revoke", "knee"]);
     let copies: Vec<_> = answer.out.lines().filter(|line| line.contains("ssh")).collect();
     assert!(copies.len() == 1 && copies[0].contains("root@10.0.0.2"), "{}", answer.out);
+}
+
+/// A machine that is reached by `ssh` as the commands that are printed do: its `/etc/sinew/keys`, and what stands between.
+struct Robot<'a> {
+    directory: &'a OwnDirectory,
+    keys: PathBuf,
+}
+
+impl<'a> Robot<'a> {
+    fn new(directory: &'a OwnDirectory) -> Self {
+        fs::create_dir(directory.join("bin")).expect("it");
+        Self { directory, keys: directory.join("robot/etc/keys") }
+    }
+
+    /// Runs the line of `said` that goes there, whose bytes come as `way` has them; whether all went well.
+    fn takes(&self, said: &str, way: &str) -> bool {
+        let ssh = self.directory.join("bin/ssh");
+        fs::write(&ssh, format!("#!/bin/sh\n{way} | sh -c \"$2\"\n")).expect("it");
+        fs::set_permissions(&ssh, fs::Permissions::from_mode(0o755)).expect("it");
+        let line = said.lines().find(|line| line.contains("| ssh root@")).expect("a command");
+        let line = line.replace("/etc/sinew/keys", self.keys.to_str().expect("a path of the test's own"));
+        let path =
+            format!("{}:{}", self.directory.join("bin").display(), std::env::var("PATH").expect("one"));
+        let mut shell = Command::new("sh");
+        shell.args(["-c", &line]).env("PATH", path).current_dir(self.directory.join("."));
+        shell.output().expect("a shell").status.success()
+    }
+
+    fn denied(&self) -> String {
+        fs::read_to_string(self.keys.join("denied.txt")).expect("it")
+    }
+}
+
+#[test]
+fn what_is_cut_on_its_way_to_a_node_leaves_what_is_there() {
+    let directory = OwnDirectory::new();
+    let robot = Robot::new(&directory);
+    // Given: a node whose keys are where they have to be
+    let made = keys(&directory, &["init", "walker", "hip=10.0.0.2", "knee=10.0.0.3"]);
+    assert!(robot.takes(&made.out, "cat"), "{}", made.out);
+    assert_eq!(mode(&robot.keys), 0o700);
+    assert_eq!(everything(&robot.keys).len(), 5);
+    let empty = robot.denied();
+    // When: a list comes of which a part is lost
+    let revoked = keys(&directory, &["revoke", "hip"]);
+    assert!(!robot.takes(&revoked.out, "head -c 600"), "it is said that it did not come");
+    // Then: it has the former one
+    assert_eq!(robot.denied(), empty);
+    // And: the new one, when that comes whole, and nothing that was left over
+    assert!(robot.takes(&revoked.out, "cat"));
+    assert_eq!(robot.denied(), fs::read_to_string(directory.join("keys/denied.txt")).expect("it"));
+    assert_ne!(robot.denied(), empty);
+    assert_eq!(everything(&robot.keys).len(), 5);
+    assert_eq!(mode(&robot.keys.join("node.key")), 0o600);
 }
 
 #[test]
