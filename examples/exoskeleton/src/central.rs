@@ -247,8 +247,8 @@ impl CentralCore {
     }
 
     /// A drive has told how it is; its stamp is in the clock of the ticks.
-    pub const fn drive_heard(&mut self, joint: Joint, status: &DriveStatus) {
-        self.drives.heard(joint, status);
+    pub fn drive_heard(&mut self, now_ns: u64, joint: Joint, status: &DriveStatus) {
+        self.drives.heard(now_ns, joint, status);
     }
 
     /// Joints that walk without their drive's help: bit 0 hip, bit 1 knee, bit 2 ankle.
@@ -413,6 +413,7 @@ impl CentralCore {
         GaitState {
             seq,
             t_ns: now_ns,
+            t_error_ns: 0,
             phase: self.estimate.phase as f32,
             phase_rate_hz: self.estimate.rate_hz as f32,
             stance: if loaded { Stance::Stance } else { Stance::Swing },
@@ -440,7 +441,7 @@ fn load_bw(load: &FootLoad) -> f64 {
 
 impl Stamped for FootLoad {
     fn stamp(&self) -> Stamp {
-        Stamp { t_ns: self.t_ns, seq: self.seq, epoch: 0 }
+        Stamp { t_ns: self.t_ns, t_error_ns: self.t_error_ns, seq: self.seq, epoch: 0 }
     }
     fn is_finite(&self) -> bool {
         self.heel_n.is_finite() && self.toe_n.is_finite()

@@ -1,8 +1,13 @@
 //! The messages between sensors, drives and the central unit: what crosses an edge, with units.
 //!
-//! Plain values; the nodes decide how they travel. Times are nanoseconds of one common clock.
+//! Plain values; the nodes decide how they travel. Times are nanoseconds of one common clock, as far as it is known.
 
 use serde::{Deserialize, Serialize};
+
+/// The error of a time that nobody has vouched for: beyond every limit.
+const fn unknown_ns() -> u64 {
+    u64::MAX
+}
 
 /// From a joint's sensor to its own drive and to central, each millisecond.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -11,6 +16,10 @@ pub struct JointSample {
     pub seq: u32,
     /// When the device was read, ns.
     pub t_ns: u64,
+    /// How much earlier it may have been, at most, ns: the error of the clocks between where it was made and here. Not sent; whoever receives it
+    /// says it, as before that nobody knows.
+    #[serde(skip, default = "unknown_ns")]
+    pub t_error_ns: u64,
     /// Joint angle, rad.
     pub angle_rad: f32,
     /// Joint velocity, rad/s.
@@ -30,6 +39,10 @@ pub struct FootLoad {
     pub seq: u32,
     /// When the sole was read, ns.
     pub t_ns: u64,
+    /// How much earlier it may have been, at most, ns: the error of the clocks between where it was made and here. Not sent; whoever receives it
+    /// says it, as before that nobody knows.
+    #[serde(skip, default = "unknown_ns")]
+    pub t_error_ns: u64,
     /// Vertical load under the heel, N.
     pub heel_n: f32,
     /// Vertical load under the forefoot, N.
@@ -69,6 +82,10 @@ pub struct GaitState {
     pub seq: u32,
     /// When the state was computed, ns.
     pub t_ns: u64,
+    /// How much earlier it may have been, at most, ns: the error of the clocks between where it was made and here. Not sent; whoever receives it
+    /// says it, as before that nobody knows.
+    #[serde(skip, default = "unknown_ns")]
+    pub t_error_ns: u64,
     /// Estimated phase, cycles 0..1; 0 is heel strike.
     pub phase: f32,
     /// Estimated phase rate, cycles per second.
@@ -94,6 +111,10 @@ pub struct TorqueSet {
     pub seq: u32,
     /// When it was computed, ns.
     pub t_ns: u64,
+    /// How much earlier it may have been, at most, ns: the error of the clocks between where it was made and here. Not sent; whoever receives it
+    /// says it, as before that nobody knows.
+    #[serde(skip, default = "unknown_ns")]
+    pub t_error_ns: u64,
     /// Moment to feed forward, Nm.
     pub torque_nm: f32,
     /// Grows with each new start of its sender; older ones are refused.
@@ -123,6 +144,10 @@ pub struct DriveStatus {
     pub seq: u32,
     /// When the status was taken, ns.
     pub t_ns: u64,
+    /// How much earlier it may have been, at most, ns: the error of the clocks between where it was made and here. Not sent; whoever receives it
+    /// says it, as before that nobody knows.
+    #[serde(skip, default = "unknown_ns")]
+    pub t_error_ns: u64,
     /// State of the drive.
     pub state: DriveState,
     /// Bits of [`crate::control::faults::FaultBits`].

@@ -1,5 +1,5 @@
 //! A drive whose thread hangs while it assists: its device is told to damp all the same, and nothing but central's gait makes it give
-//! a torque again.
+//! a torque again; nor does what only looks like its word.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -12,8 +12,9 @@ use exoskeleton::robot::datagram::Reading;
 use exoskeleton::robot::device::{Damper, DriveCommand, JointDevice};
 use exoskeleton::robot::drive::{self, DriveParts};
 use exoskeleton::robot::edges::{Arm, GAIT, Shut, drive_name, sensor_name};
-use exoskeleton::robot::trace::Recording;
+use exoskeleton::robot::trace::{DriveRow, EventRow, Recording};
 use sinew::prelude::*;
+use sinew::protection::{Codename, Stamp, seal};
 
 /// How long one thing may take on a machine that is busy with other tests.
 const DEADLINE: Duration = Duration::from_secs(60);
@@ -77,11 +78,12 @@ impl Damper for Device {
     }
 }
 
-/// Whether central says walk, and whether it asks shut drives to hear it again.
+/// Whether central says walk, and whether it asks shut drives to hear it again, or somebody in its place who can do all but that.
 #[derive(Default)]
 struct Will {
     walks: AtomicBool,
     arms: AtomicBool,
+    forges: AtomicBool,
     /// How often the drive has said that central's word does not count.
     shuts: AtomicU64,
 }
@@ -102,6 +104,7 @@ impl Actor for Gait {
             let state = GaitState {
                 seq: gait.seq,
                 t_ns: Time::now().as_nanos(),
+                t_error_ns: 0,
                 phase: 0.5,
                 phase_rate_hz: 0.75,
                 stance: Stance::Stance,
@@ -123,7 +126,35 @@ impl Handler<Delivery<Shut>> for Gait {
         if self.will.arms.load(Ordering::Relaxed) {
             let _ = context.send(shut.source, &Arm { suspect: shut.suspect });
         }
+        if self.will.forges.load(Ordering::Relaxed) {
+            forge(shut.source, context);
+        }
     }
+}
+
+/// As an [`Arm`], by somebody who does not seal it.
+#[derive(serde::Serialize, serde::Deserialize)]
+struct Unsealed {
+    suspect: bool,
+}
+
+impl Payload for Unsealed {
+    const NAME: &'static str = Arm::NAME;
+    const CLASS: Class = Arm::CLASS;
+}
+
+/// Sends `drive` what looks like an [`Arm`] from central's own address: one without an envelope, and one in an envelope that is right but for
+/// the time that it quotes, as one that was kept from another day.
+fn forge(drive: Tid, context: &AppContext<Gait>) {
+    let _ = context.send(drive, &Unsealed { suspect: true });
+    let codename = Codename::of::<Arm>(context.tid(), drive);
+    let counter = Time::now().as_nanos();
+    let stamp = Stamp { counter, incarnation: 1, echo: Time::from_nanos(1) };
+    let sealed = seal(&codename, stamp, b"\x81\xa7suspect\xc3");
+    let sender = context.sender();
+    let mut message = sender.create_message(drive, Arm::KIND, sealed.len()).expect("it is short");
+    message.copy_from_slice(&sealed);
+    let _ = sender.send_message(message);
 }
 
 #[derive(Default)]
@@ -141,6 +172,7 @@ impl Actor for Sensor {
             let sample = JointSample {
                 seq: sensor.seq,
                 t_ns: Time::now().as_nanos(),
+                t_error_ns: 0,
                 angle_rad: 0.2,
                 velocity_rad_s: 1.5,
                 torque_nm: 0.0,
@@ -173,16 +205,13 @@ impl Actor for Neighbour {
     }
 }
 
-#[test]
-fn drive_whose_thread_hangs_has_a_device_that_damps_and_assists_again_only_when_it_is_asked_to() {
-    // Given: a drive that assists
-    let device = Device::default();
-    let will = Arc::new(Will { walks: false.into(), arms: true.into(), shuts: 0.into() });
-    let hangs = Arc::new(AtomicBool::new(false));
-    let ((hung, is_hung), (let_go, go_on)) = (sync_channel(1), sync_channel(1));
-    let go_on = Arc::new(Mutex::new(go_on));
-    let (rows, events) = (Recording::begin(None, "").unwrap(), Recording::begin(None, "").unwrap());
-    let (own, of_will, to_hang) = (device.clone(), will.clone(), hangs.clone());
+type Recordings = (Recording<DriveRow>, Recording<EventRow>);
+
+/// A node at 127.0.0.`host` with all that the drive needs, and what has to outlive it.
+fn joint_node(host: u8, device: &Device, will: &Arc<Will>) -> (NodeBuilder, Recordings) {
+    let (rows, events) =
+        (Recording::begin(None, "").expect("no file"), Recording::begin(None, "").expect("no file"));
+    let (own, of_will) = (device.clone(), will.clone());
     let parts = DriveParts {
         joint: JOINT,
         device: Arc::new(move || Box::new(own.clone())),
@@ -191,16 +220,28 @@ fn drive_whose_thread_hangs_has_a_device_that_damps_and_assists_again_only_when_
         figures: None,
     };
     let gait = AppSpec::new(GAIT, move || Gait { will: of_will.clone(), seq: 0 }).handles::<Shut>();
-    let neighbour = move || Neighbour { hangs: to_hang.clone(), hung: hung.clone(), go_on: go_on.clone() };
     let node = Node::builder("ankle")
-        .address([127, 0, 0, 1])
+        .address([127, 0, 0, host])
         .configure(|config| (config.ndl.multicast, config.ndl.mdns_port) = (None, None))
         .app(AppSpec::new(sensor_name(JOINT), Sensor::default).own_thread())
         .app(gait.own_thread())
-        .app(AppSpec::new("neighbour", neighbour).place(Place::thread("control")))
-        .app(drive::spec(parts, Place::thread("control")))
-        .start()
-        .unwrap();
+        .app(drive::spec(parts, Place::thread("control")));
+    (node, (rows, events))
+}
+
+#[test]
+fn drive_whose_thread_hangs_has_a_device_that_damps_and_assists_again_only_when_it_is_asked_to() {
+    // Given: a drive that assists
+    let device = Device::default();
+    let will = Arc::new(Will { arms: true.into(), ..Will::default() });
+    let hangs = Arc::new(AtomicBool::new(false));
+    let ((hung, is_hung), (let_go, go_on)) = (sync_channel(1), sync_channel(1));
+    let go_on = Arc::new(Mutex::new(go_on));
+    let (node, _recordings) = joint_node(1, &device, &will);
+    let to_hang = hangs.clone();
+    let neighbour = move || Neighbour { hangs: to_hang.clone(), hung: hung.clone(), go_on: go_on.clone() };
+    let node =
+        node.app(AppSpec::new("neighbour", neighbour).place(Place::thread("control"))).start().unwrap();
     device.wait("the leg is held", |told| told.last() == Some(&Told::Torque(0.0)));
     will.walks.store(true, Ordering::Relaxed);
     device.wait("it assists", |told| told.last().is_some_and(|told| told.is_assistance()));
@@ -223,5 +264,32 @@ fn drive_whose_thread_hangs_has_a_device_that_damps_and_assists_again_only_when_
     assert_eq!(device.told()[before..].iter().find(|told| told.is_assistance()), None);
     will.arms.store(true, Ordering::Relaxed);
     device.wait("it assists again", |told| told.last().is_some_and(|told| told.is_assistance()));
+    drop(node);
+}
+
+#[test]
+fn what_only_looks_like_central_asking_makes_no_drive_assist() {
+    // Given: a drive whose guard was never opened, and whatever has the address of central's gait and asks it to without being that
+    let device = Device::default();
+    let will = Arc::new(Will { forges: true.into(), ..Will::default() });
+    let (node, _recordings) = joint_node(2, &device, &will);
+    let node = node.start().unwrap();
+    let refuses = |told: &[Told], shuts: u64| {
+        told.iter().any(|told| told.is_assistance()) || will.shuts.load(Ordering::Relaxed) > shuts
+    };
+    device.wait("it was asked in a state in which it may be", |told| refuses(told, 100));
+
+    // When: the gait says walk, sealed as it has to be
+    will.walks.store(true, Ordering::Relaxed);
+    let shuts = will.shuts.load(Ordering::Relaxed);
+    device.wait("it is asked again, or assists", |told| refuses(told, shuts + 100));
+
+    // Then: it does not
+    assert_eq!(device.told().iter().find(|told| told.is_assistance()), None);
+
+    // And: it does when central's gait itself asks
+    will.forges.store(false, Ordering::Relaxed);
+    will.arms.store(true, Ordering::Relaxed);
+    device.wait("it assists", |told| told.last().is_some_and(|told| told.is_assistance()));
     drop(node);
 }

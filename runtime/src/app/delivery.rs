@@ -59,6 +59,12 @@ impl<P> Delivery<P> {
         self.age_error
     }
 
+    /// The greatest age that it can have had: `age` and its error; [`Duration::MAX`] where it is not known. For whoever uses only what is young.
+    #[must_use]
+    pub fn age_at_most(&self) -> Duration {
+        self.age_error.map_or(Duration::MAX, |error| self.age.saturating_add(error))
+    }
+
     /// Where the sender waits for a reply; `None` if it does not.
     #[must_use]
     pub const fn reply_to(&self) -> Option<ReplyTo> {

@@ -11,17 +11,17 @@ const TICK_LONGEST_S: f64 = 0.005;
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Drives {
     silence_max_s: f64,
-    /// Time since a drive said that it assists, seconds.
+    /// Time since a drive said that it assists, at most, seconds.
     unassisted_s: PerJoint<f64>,
-    /// Whether it said that its e-stop was pressed.
-    stopped: PerJoint<bool>,
+    /// When it was heard last to say that its e-stop was pressed, ns; `None`: it has said since that it is not.
+    stopped_ns: PerJoint<Option<u64>>,
     /// When its last life is known to have ended, ns: what it said before is no sign of the next one.
     ended_ns: PerJoint<u64>,
 }
 
 impl Drives {
     pub(super) const fn new(silence_max_s: f64) -> Self {
-        Self { silence_max_s, unassisted_s: [0.0; 3], stopped: [false; 3], ended_ns: [0; 3] }
+        Self { silence_max_s, unassisted_s: [0.0; 3], stopped_ns: [None; 3], ended_ns: [0; 3] }
     }
 
     /// The life of a drive has ended; it is degraded until its next one says that it assists.
@@ -31,13 +31,23 @@ impl Drives {
     }
 
     /// A drive has told how it is.
-    pub(super) const fn heard(&mut self, joint: Joint, status: &DriveStatus) {
-        if status.t_ns <= self.ended_ns[joint.index()] {
+    ///
+    /// That it was stopped counts however old the word is, and of whichever life, also where no age is known: it stops once too often. All
+    /// else counts only if it was surely said after the end of the life before, and after the last such word had come.
+    pub(super) fn heard(&mut self, now_ns: u64, joint: Joint, status: &DriveStatus) {
+        let index = joint.index();
+        if FaultBits(status.faults).contains(FaultBits::STOPPED) {
+            self.stopped_ns[index] = Some(now_ns);
             return;
         }
-        self.stopped[joint.index()] = FaultBits(status.faults).contains(FaultBits::STOPPED);
+        let earliest_ns = status.t_ns.saturating_sub(status.t_error_ns);
+        if earliest_ns <= self.ended_ns[index].max(self.stopped_ns[index].unwrap_or(0)) {
+            return;
+        }
+        self.stopped_ns[index] = None;
         if matches!(status.state, DriveState::Walk) {
-            self.unassisted_s[joint.index()] = 0.0;
+            let silent_s = now_ns.saturating_sub(earliest_ns) as f64 * 1e-9;
+            self.unassisted_s[index] = self.unassisted_s[index].min(silent_s);
         }
     }
 
@@ -57,7 +67,7 @@ impl Drives {
     }
 
     pub(super) fn any_stopped(&self) -> bool {
-        self.stopped.contains(&true)
+        self.stopped_ns.iter().any(Option::is_some)
     }
 }
 

@@ -17,10 +17,26 @@ const PHASE_RATE_LARGEST_HZ: f32 = 5.0;
 pub struct Stamp {
     /// When it was made, ns.
     pub t_ns: u64,
+    /// How much earlier that may have been, at most, ns; `u64::MAX` where nobody knows.
+    pub t_error_ns: u64,
     /// Its number; wraps.
     pub seq: u32,
     /// Life of its sender; newer lives beat older ones whatever the sequence. 0 where the sender does not tell.
     pub epoch: u32,
+}
+
+impl Stamp {
+    /// The earliest time at which it can have been made, ns; 0 where nobody knows.
+    #[must_use]
+    pub const fn earliest_ns(&self) -> u64 {
+        self.t_ns.saturating_sub(self.t_error_ns)
+    }
+
+    /// The greatest age that it can have, ns: beyond every limit where nobody knows.
+    #[must_use]
+    pub const fn age_at_most_ns(&self, now_ns: u64) -> u64 {
+        now_ns.saturating_sub(self.t_ns).saturating_add(self.t_error_ns)
+    }
 }
 
 /// Something that can be judged before use.
@@ -96,11 +112,11 @@ impl<T: Stamped> Admission<T> {
         self.is_believed = false;
     }
 
-    /// The newest admitted input if it is not older than the limit now, and still believed.
+    /// The newest admitted input if it is surely not older than the limit now, and still believed.
     #[must_use]
     pub fn fresh(&self, now_ns: u64) -> Option<&T> {
         let newest = self.newest.as_ref().filter(|_| self.is_believed);
-        newest.filter(|input| now_ns.saturating_sub(input.stamp().t_ns) <= self.age_max_ns)
+        newest.filter(|input| input.stamp().age_at_most_ns(now_ns) <= self.age_max_ns)
     }
 
     /// The newest admitted input, however old.
@@ -109,7 +125,7 @@ impl<T: Stamped> Admission<T> {
         self.newest.as_ref()
     }
 
-    /// Age of the newest admitted input, ns.
+    /// Age of the newest admitted input, ns, as far as it is known.
     #[must_use]
     pub fn age_ns(&self, now_ns: u64) -> Option<u64> {
         self.newest.as_ref().map(|input| now_ns.saturating_sub(input.stamp().t_ns))
@@ -132,11 +148,11 @@ impl<T: Stamped> Admission<T> {
         if !input.is_plausible() {
             return Err(Refusal::OutOfRange);
         }
-        let made_ns = input.stamp().t_ns;
-        if made_ns > now_ns.saturating_add(self.age_max_ns) {
+        let stamp = input.stamp();
+        if stamp.t_ns > now_ns.saturating_add(self.age_max_ns) {
             return Err(Refusal::FromFuture);
         }
-        if now_ns.saturating_sub(made_ns) > self.age_max_ns {
+        if stamp.age_at_most_ns(now_ns) > self.age_max_ns {
             return Err(Refusal::TooOld);
         }
         if self.follows(now_ns, input) { Ok(()) } else { Err(Refusal::OldSequence) }
@@ -169,7 +185,7 @@ impl<T: Stamped> Admission<T> {
 
 impl Stamped for JointSample {
     fn stamp(&self) -> Stamp {
-        Stamp { t_ns: self.t_ns, seq: self.seq, epoch: 0 }
+        Stamp { t_ns: self.t_ns, t_error_ns: self.t_error_ns, seq: self.seq, epoch: 0 }
     }
     fn is_finite(&self) -> bool {
         self.angle_rad.is_finite() && self.velocity_rad_s.is_finite() && self.torque_nm.is_finite()
@@ -183,7 +199,7 @@ impl Stamped for JointSample {
 
 impl Stamped for GaitState {
     fn stamp(&self) -> Stamp {
-        Stamp { t_ns: self.t_ns, seq: self.seq, epoch: self.epoch }
+        Stamp { t_ns: self.t_ns, t_error_ns: self.t_error_ns, seq: self.seq, epoch: self.epoch }
     }
     fn is_finite(&self) -> bool {
         self.phase.is_finite() && self.phase_rate_hz.is_finite() && self.confidence.is_finite()
@@ -197,7 +213,7 @@ impl Stamped for GaitState {
 
 impl Stamped for TorqueSet {
     fn stamp(&self) -> Stamp {
-        Stamp { t_ns: self.t_ns, seq: self.seq, epoch: self.epoch }
+        Stamp { t_ns: self.t_ns, t_error_ns: self.t_error_ns, seq: self.seq, epoch: self.epoch }
     }
     fn is_finite(&self) -> bool {
         self.torque_nm.is_finite()

@@ -272,6 +272,7 @@ impl DriveCore {
         let status = DriveStatus {
             seq: self.status_seq,
             t_ns: now_ns,
+            t_error_ns: 0,
             state: self.state,
             faults: self.faults.0,
             torque_nm: self.limiter.torque_nm() as f32,
@@ -307,7 +308,8 @@ impl DriveCore {
     fn admit(&mut self, now_ns: u64, sample: Option<&JointSample>, gait: Option<&GaitState>) {
         if let Some(sample) = sample {
             let admitted = self.samples.offer(now_ns, sample);
-            let of_now = self.paused_until_ns.is_none_or(|ns| now_ns > ns && sample.t_ns > ns);
+            let of_now =
+                self.paused_until_ns.is_none_or(|ns| now_ns > ns && sample.stamp().earliest_ns() > ns);
             if admitted && of_now && !self.device_heard {
                 self.device_heard = true;
                 self.go_on_from(f64::from(sample.torque_nm));

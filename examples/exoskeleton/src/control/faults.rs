@@ -39,7 +39,7 @@ pub struct RefusedCount {
     pub out_of_range: u32,
     /// Sequence number before or far after the one expected, or an epoch that is over.
     pub old_sequence: u32,
-    /// Made longer ago than the age limit.
+    /// Made longer ago than the age limit, or perhaps: its age is not known well enough.
     pub too_old: u32,
     /// Stamped later than now: clocks disagree.
     pub from_future: u32,

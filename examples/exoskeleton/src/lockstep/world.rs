@@ -190,7 +190,7 @@ impl<'a> World<'a> {
         };
         for joint in Joint::ALL {
             if let Some(status) = &arrived.statuses[joint.index()] {
-                central.drive_heard(joint, status);
+                central.drive_heard(now_ns, joint, status);
             }
         }
         self.last_gait = central.tick(now_ns, &input);

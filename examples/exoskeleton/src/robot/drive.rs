@@ -16,22 +16,23 @@
 mod lookout;
 mod order;
 mod suspicion;
+mod word;
 
 use std::io;
 use std::path::{Path, PathBuf};
 
 use sinew::ReadyGate;
 use sinew::prelude::*;
-use sinew::protection::{Guard, State};
+use sinew::protection::Guard;
 
 use self::lookout::{Lookout, Watch};
 use self::order::Order;
-use self::suspicion::Suspicion;
+use self::word::{Armed, Output, Word};
 use super::PERIOD;
 use super::device::{Damper, DriveCommand, JointDevice};
 use super::edges::{
     AS_LONG_AS_IT_TAKES, Addressee, Arm, EmergencyStop, GAIT, Reset, STATUS, STOP, Shut, drive_name,
-    sensor_name,
+    sensor_name, sent,
 };
 use super::figures::LoopFigures;
 use super::sensor::DeviceMaker;
@@ -40,7 +41,7 @@ use crate::control::drive::{DriveConfig, DriveCore, DriveOutput};
 use crate::joint::Joint;
 use crate::message::{DriveState, GaitMode, GaitState, JointSample, TorqueSet};
 
-/// Silence of an input that is noticed.
+/// Silence of an input that is noticed, and the greatest age of what asks for central's word to count.
 const SILENCE_MAX: Duration = Duration::from_millis(10);
 /// Ticks between two statuses: 200 statuses a second.
 const STATUS_TICKS: u64 = 5;
@@ -85,34 +86,6 @@ pub struct Drive {
     central: Addressee,
     /// Reached when all inputs are there for the first time.
     ready: Option<ReadyGate>,
-}
-
-/// What central says, behind the guard that lets nothing else through.
-struct Word {
-    /// Whose word it is.
-    central: Tid,
-    guard: Guard<Output>,
-    suspicion: Suspicion,
-}
-
-/// What is taken away as soon as central's word does not count: by whoever notices first.
-struct Output {
-    word: Option<GaitState>,
-    device: Box<dyn Damper>,
-    /// Whether the device was told to give a torque: one that gives nothing on purpose is left as it is.
-    gives: bool,
-    again: Watch,
-}
-
-impl Output {
-    fn make_safe(&mut self) {
-        self.word = None;
-        if std::mem::take(&mut self.gives) {
-            self.device.damp(Time::now(), DriveState::Safe);
-            // One may be lost, and the drive's thread may hang.
-            self.again.damps();
-        }
-    }
 }
 
 /// Declares the drive of a joint.
@@ -161,8 +134,8 @@ impl Drive {
         if is_shut {
             self.core.disbelieve_gait();
         }
-        if let Some(Word { guard, suspicion, .. }) = &mut self.word {
-            suspicion.note(&guard.tally(), !is_shut);
+        if let Some(Err(error)) = self.word.as_mut().map(|word| word.look(context)) {
+            self.tell_unguarded(&error);
         }
         let mut output = self.core.tick(now.as_nanos(), self.sample.as_ref(), gait.as_ref());
         output.command_nm = self.command(now, &output, gait.as_ref());
@@ -198,16 +171,19 @@ impl Drive {
             // What another life of central has said is worth nothing any more.
             self.word = None;
             match self.guard(central, context) {
-                Ok(guard) => self.word = Some(Word { central, guard, suspicion: Suspicion::default() }),
-                // Tried again in the next tick, and said once.
-                Err(error) if !std::mem::replace(&mut self.unguarded, true) => {
-                    let joint = self.parts.joint;
-                    tracing::error!(%joint, %error, "central's word cannot be guarded: no torque comes of it");
-                }
-                Err(_) => {}
+                Ok(guard) => self.word = Some(Word::new(central, guard)),
+                Err(error) => self.tell_unguarded(&error),
             }
         }
         self.word.as_ref()?.guard.apply(|output| output.word).ok().flatten()
+    }
+
+    /// Says once that a guard cannot be had; it is tried again in the next tick.
+    fn tell_unguarded(&mut self, error: &io::Error) {
+        if !std::mem::replace(&mut self.unguarded, true) {
+            let joint = self.parts.joint;
+            tracing::error!(%joint, %error, "central's word cannot be guarded: no torque comes of it");
+        }
     }
 
     /// The only way to the device for what may assist, with who repeats the order to damp.
@@ -217,13 +193,13 @@ impl Drive {
             None => Lookout::start(self.device.damper())?,
         };
         let again = self.lookout.insert(lookout).watch().clone();
-        let output = Output { word: None, device: self.device.damper(), gives: false, again };
+        let output = Output::new(self.device.damper(), again);
         context.guard::<GaitState, _>(central, output, |output, _| output.make_safe())
     }
 
     /// Whether central's word does not count, though it is known whose it is.
     fn is_shut(&self) -> bool {
-        self.word.as_ref().is_some_and(|word| word.guard.state() != State::Live)
+        self.word.as_ref().is_some_and(Word::is_shut)
     }
 
     /// Gives the device its command, and returns what it is to give, Nm; `None` when it is told nothing, or to damp by itself.
@@ -273,11 +249,9 @@ impl Drive {
 
     /// Tells central that its word does not count, though it comes; what becomes of that is central's to say.
     fn ask_to_be_armed(&self, context: &AppContext<Self>) {
-        let Some(Word { central, suspicion, .. }) = self.word.as_ref().filter(|_| self.is_shut()) else {
-            return;
-        };
+        let Some(word) = self.word.as_ref().filter(|word| word.is_shut()) else { return };
         // It is asked again.
-        let _ = context.send(*central, &Shut { suspect: suspicion.is_there() });
+        let _ = context.send(word.central, &Shut { suspect: word.is_suspect() });
     }
 
     fn at_rest(&self, output: &DriveOutput) -> bool {
@@ -390,7 +364,8 @@ impl Handler<Delivery<JointSample>> for Drive {
                 this.note_silence("joint sample", silence);
             });
         }
-        self.sample = Some(JointSample { t_ns: sample.sent.as_nanos(), ..sample.payload });
+        let (t_ns, t_error_ns) = sent(&sample);
+        self.sample = Some(JointSample { t_ns, t_error_ns, ..sample.payload });
     }
 }
 
@@ -403,7 +378,8 @@ impl Handler<Delivery<GaitState>> for Drive {
             context.reject();
             return;
         };
-        let gait = GaitState { t_ns: gait.sent.as_nanos(), ..gait.payload };
+        let (t_ns, t_error_ns) = sent(&gait);
+        let gait = GaitState { t_ns, t_error_ns, ..gait.payload };
         if word.guard.apply(|output| output.word = Some(gait)).is_err() {
             context.reject();
             return;
@@ -426,7 +402,8 @@ impl Handler<Delivery<TorqueSet>> for Drive {
             context.reject();
             return;
         }
-        let set = TorqueSet { t_ns: command.sent.as_nanos(), ..command.payload };
+        let (t_ns, t_error_ns) = sent(&command);
+        let set = TorqueSet { t_ns, t_error_ns, ..command.payload };
         if !self.core.command(now.as_nanos(), &set) {
             context.reject();
         }
@@ -442,21 +419,14 @@ impl Handler<Delivery<Arm>> for Drive {
             context.reject();
             return;
         };
-        if word.guard.state() == State::Live {
-            return;
+        match word.arm(&arm, state) {
+            Armed::Now => {}
+            Armed::Before => return,
+            Armed::Refused => {
+                context.reject();
+                return;
+            }
         }
-        // In WALK the tick is still to come that makes the drive safe, and what central meant long ago may not be so any more. Refused, too,
-        // until eight good words have come in a row.
-        // So is one that was sent before central knew that somebody meddles.
-        word.suspicion.note(&word.guard.tally(), false);
-        let is_known = arm.suspect || !word.suspicion.is_there();
-        if state == DriveState::Walk || arm.age > SILENCE_MAX || !is_known || word.guard.arm().is_err() {
-            context.reject();
-            return;
-        }
-        word.suspicion.forget();
-        // A ramp to zero may be under way.
-        let _ = word.guard.apply(|output| output.gives = true);
         self.note_event("armed", &arm.source.to_string(), String::new());
     }
 }

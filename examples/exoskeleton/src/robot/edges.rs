@@ -1,6 +1,7 @@
 //! What crosses an edge between applications: classes and names of the messages, names of applications and groups.
 
-use sinew::prelude::{Actor, AppContext, Class, Duration, Payload, Tid, Time, payload};
+use serde::{Deserialize, Serialize};
+use sinew::prelude::{Actor, AppContext, Class, Delivery, Duration, Payload, Tid, Time, payload};
 use sinew::protection::Protection;
 
 use crate::joint::Joint;
@@ -85,14 +86,26 @@ payload!("exo.shut", Stream =>
     }
 );
 
-payload!("exo.arm", Stream =>
-    /// From central's gait to a drive, as an answer to [`Shut`]: let my word count again. A drive never does that by itself.
-    #[derive(Debug, Clone, Copy)]
-    pub struct Arm {
-        /// What [`Shut::suspect`] said. A drive that has become suspicious since then refuses.
-        pub suspect: bool,
-    }
-);
+/// From central's gait to a drive, as an answer to [`Shut`]: let my word count again. A drive never does that by itself.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+pub struct Arm {
+    /// What [`Shut::suspect`] said. A drive that has become suspicious since then refuses.
+    pub suspect: bool,
+}
+
+impl Payload for Arm {
+    const NAME: &'static str = "exo.arm";
+    const CLASS: Class = Class::Stream;
+    /// A torque may come of it, so it is protected like [`GaitState`]. A drive asks five times in `within`; the first answer begins the
+    /// count, the second one is counted. One that is lost is asked for again, so many may be.
+    const PROTECTION: Option<Protection> = Some(Protection {
+        within: Duration::from_millis(25),
+        age_max: Duration::from_millis(40),
+        lost_max: 9,
+        bad_max: 1,
+        good_min: 1,
+    });
+}
 
 payload!("exo.gait_status", Stream =>
     /// From central to the group `exo.status`, 20 times a second.
@@ -119,6 +132,12 @@ payload!("exo.barrier_status", Stream =>
         pub waiting: Vec<String>,
     }
 );
+
+/// When a message was sent, ns of this host's clock, and how much earlier that may have been: `u64::MAX` where nobody knows.
+pub(super) fn sent<P>(message: &Delivery<P>) -> (u64, u64) {
+    let error_ns = message.age_error().map(|error| u64::try_from(error.as_nanos()).unwrap_or(u64::MAX));
+    (message.sent.as_nanos(), error_ns.unwrap_or(u64::MAX))
+}
 
 /// Name of a joint's sensor.
 #[must_use]

@@ -13,7 +13,7 @@ use super::PERIOD;
 use super::drive::micros;
 use super::edges::{
     AS_LONG_AS_IT_TAKES, Addressee, Arm, EmergencyStop, GAIT, GaitStatus, Release, Reset, STATUS, STOP, Shut,
-    drive_name, joint_of_sensor, sensor_name,
+    drive_name, joint_of_sensor, sensor_name, sent,
 };
 use super::trace::{EventRow, GaitRow, Trace};
 use crate::central::{CentralConfig, CentralCore, CentralInput, Resume, bit};
@@ -200,7 +200,8 @@ impl Handler<Delivery<JointSample>> for Gait {
     fn handle(&mut self, sample: Delivery<JointSample>, context: &mut Self::Context) {
         match self.joint_at(sample.source.node) {
             Some(joint) => {
-                let sample = JointSample { t_ns: sample.sent.as_nanos(), ..sample.payload };
+                let (t_ns, t_error_ns) = sent(&sample);
+                let sample = JointSample { t_ns, t_error_ns, ..sample.payload };
                 self.samples[joint.index()] = Some(sample);
             }
             None => context.reject(),
@@ -213,7 +214,8 @@ impl Handler<Delivery<FootLoad>> for Gait {
 
     fn handle(&mut self, load: Delivery<FootLoad>, context: &mut Self::Context) {
         if self.joint_at(load.source.node) == Some(Joint::Ankle) {
-            self.load = Some(FootLoad { t_ns: load.sent.as_nanos(), ..load.payload });
+            let (t_ns, t_error_ns) = sent(&load);
+            self.load = Some(FootLoad { t_ns, t_error_ns, ..load.payload });
         } else {
             context.reject();
         }
@@ -274,8 +276,9 @@ impl Handler<Delivery<DriveStatus>> for Gait {
                 let monitored = &mut self.monitored[joint.index()];
                 // Without a monitor its silence is noticed all the same, 25 ms later.
                 *monitored = *monitored || context.monitor(status.source).is_ok();
-                let t_ns = status.sent.as_nanos();
-                self.core.drive_heard(joint, &DriveStatus { t_ns, ..status.payload });
+                let (t_ns, t_error_ns) = sent(&status);
+                let status = DriveStatus { t_ns, t_error_ns, ..status.payload };
+                self.core.drive_heard(Time::now().as_nanos(), joint, &status);
             }
             None => context.reject(),
         }

@@ -7,9 +7,9 @@
 //!   |   requires the sensors      |   FootLoad       |   requires nothing;             |
 //!   |                             |                  |   ready at its first reading    |
 //!   |                             |                  |      | JointSample              |
-//!   |                             |   GaitState      |      v                          |
+//!   |                             |  GaitState, Arm  |      v                          |
 //!   |                             | ---------------> | X.drive   1 kHz                 |
-//!   |                             |  protected; Arm  |   requires the three sensors    |
+//!   |                             |    (protected)   |   requires the three sensors    |
 //!   | central.coordinator         |                  |   and central.gait              |
 //!   |   requires the drives,      | <--------------- |                                 |
 //!   |   then releases             | DriveStatus, Shut|                                 |
