@@ -142,7 +142,7 @@ impl AsyncEndpoint {
     /// # Errors
     /// It was not sent.
     pub async fn send<P: Payload>(&mut self, destination: Tid, value: &P) -> Result<(), ApiError> {
-        let message = Message::typed(self.tid(), destination, value);
+        let message = self.endpoint.typed(destination, value)?;
         self.endpoint.dispatch(message.into(), self.endpoint.patience()).await.map(drop)
     }
 
@@ -156,7 +156,7 @@ impl AsyncEndpoint {
         value: &P,
         within: Duration,
     ) -> Result<Outcome, ApiError> {
-        let message = Message::typed(self.tid(), destination, value);
+        let message = self.endpoint.typed(destination, value)?;
         self.endpoint.confirm(message.into(), within).await
     }
 
@@ -170,6 +170,7 @@ impl AsyncEndpoint {
         request: &P,
         within: Duration,
     ) -> Result<R, ApiError> {
+        const { assert!(R::PROTECTION.is_none(), "a protected payload is sent, not asked for") };
         let message = Message::typed(self.tid(), destination, request);
         Ok(self.endpoint.await_reply(message.into(), within).await?.decode()?)
     }

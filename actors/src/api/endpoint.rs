@@ -4,6 +4,7 @@ use std::{path::Path, sync::Arc, time::Duration};
 
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
+    protection::Ends,
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     wire::{Flags, Header, Kind, Message, Payload},
@@ -51,6 +52,8 @@ pub struct Endpoint {
     pub(super) home: Home,
     pub(super) form: Form,
     pub(super) lender: Lender,
+    /// What it sends and receives of protected payloads.
+    pub(super) ends: Ends,
     /// What is left of a frame of which a part is in the ring to the node.
     pub(super) rest: Option<Rest>,
     /// What the node had taken when a sender's patience with it was over.
@@ -99,6 +102,7 @@ impl Endpoint {
             home: Home::new(path.to_owned(), register, options, returning),
             form,
             lender: Lender::default(),
+            ends: Ends::new(Time::now()),
             rest: None,
             stalled: None,
         }
@@ -159,12 +163,14 @@ impl Endpoint {
         at_once(self.dispatch(message.into(), self.patience())).map(drop)
     }
 
-    /// Sends a value, in the class of its type. Returns when the way to the node, or the ring of a direct link, has taken it.
+    /// Sends a value, in the class of its type; in an envelope if its type is [protected](crate::protection), see [`guard`](Self::guard).
+    /// Returns when the way to the node, or the ring of a direct link, has taken it.
     ///
     /// # Errors
     /// It was not sent.
     pub fn send<P: Payload>(&mut self, destination: Tid, value: &P) -> Result<(), ApiError> {
-        at_once(self.dispatch(Message::typed(self.tid, destination, value).into(), self.patience())).map(drop)
+        let message = self.typed(destination, value)?;
+        at_once(self.dispatch(message.into(), self.patience())).map(drop)
     }
 
     /// Sends a value and waits for what becomes of it: [`Outcome::Unknown`] when nobody has said so `within` this
@@ -182,7 +188,8 @@ impl Endpoint {
         value: &P,
         within: Duration,
     ) -> Result<Outcome, ApiError> {
-        at_once(self.confirm(Message::typed(self.tid, destination, value).into(), within))
+        let message = self.typed(destination, value)?;
+        at_once(self.confirm(message.into(), within))
     }
 
     /// Sends a request and waits for the reply.
@@ -195,6 +202,7 @@ impl Endpoint {
         request: &P,
         within: Duration,
     ) -> Result<R, ApiError> {
+        const { assert!(R::PROTECTION.is_none(), "a protected payload is sent, not asked for") };
         Ok(at_once(self.await_reply(Message::typed(self.tid, destination, request).into(), within))?
             .decode()?)
     }
@@ -230,14 +238,12 @@ impl Endpoint {
         loop {
             // The socket first: what came just now may be more urgent or newer than what waits.
             self.take_in(None, WhenFull::Leave, now)?;
+            let echo_due = self.echo(now).await;
             if let Some(message) = self.inbox.pop(now) {
-                let is_ping = message.header.kind == Kind::PING;
-                let received = Received::new(message);
-                if !is_ping {
+                if let Some(received) = self.received(message) {
                     return Ok(Some(received));
                 }
-                // It has come to it: that is the answer. A flood of them keeps nobody beyond its deadline.
-                drop(received);
+                // A flood of what is not for the program keeps nobody beyond its deadline.
                 now = Time::now();
                 if now < deadline {
                     continue;
@@ -253,7 +259,7 @@ impl Endpoint {
             }
             match ended {
                 Some(_) => self.await_return(deadline).await,
-                None => self.wait(deadline, now).await,
+                None => self.wait(deadline.min(echo_due), now).await,
             }
             now = Time::now();
         }

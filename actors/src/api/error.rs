@@ -4,6 +4,7 @@ use std::{io, path::PathBuf, time::Duration};
 
 use sinew_runtime::{
     outcome::Outcome,
+    protection::SealError,
     tid::Tid,
     wire::{DecodeError, FrameError, Kind},
 };
@@ -89,6 +90,9 @@ pub enum ApiError {
     /// The endpoint is a member of as many groups as it may. The caller is at fault; nothing was joined.
     #[error("this endpoint is a member of 256 groups, which is the most; leave one first")]
     TooManyGroups,
+    /// A protected payload cannot be sealed. The caller is at fault; nothing was sent.
+    #[error("the message was not sent: {0}")]
+    NotSealed(#[from] SealError),
     /// No reply came in time. The request may have been handled.
     #[error(
         "no reply came within {0:?}, the request may have been handled; is its receiver slow, or does it not reply to this kind?"
@@ -165,6 +169,8 @@ mod tests {
             ApiError::NotAsked,
             ApiError::OthersRequest(Tid::NONE),
             ApiError::TooManyGroups,
+            ApiError::NotSealed(SealError::ToMany),
+            ApiError::NotSealed(SealError::TooManyFlows),
         ];
         let outcomes =
             (0..=u8::MAX).filter_map(Outcome::from_code).filter(|outcome| *outcome != Outcome::Delivered);

@@ -26,6 +26,7 @@
 //! | receive, with a deadline (ReceiveMessage) | [`receive`](Endpoint::receive), [`Received`] | `sinew_receive_message`, `sinew_settle_message` |
 //! | speak to many at once (groups) | [`join`](Endpoint::join), [`leave`](Endpoint::leave), [`Tid::group`](crate::Tid::group) | `sinew_join_group`, `sinew_group` |
 //! | take only the newest value of a sensor | [`Class::Stream`](crate::Class), at the type | `SINEW_STREAM` |
+//! | protect commands from end to end, and make an output safe without them ([`protection`](crate::protection)) | [`Endpoint::guard`] | not there: `bindings/c/README.md` |
 //! | hear of nodes that come and go | [`Registration::subscribe`] | `events` of `sinew_options` |
 //! | go on when the node was restarted | nothing to do; [`ApiError::Away`] says so once | `SINEW_ERROR_AWAY` |
 //! | the shortest way to another process | [`Registration::direct`], [`Registration::spin`] | `SINEW_DIRECT`, `spin_ns` |
@@ -175,6 +176,7 @@ mod lent;
 mod link;
 mod outgoing;
 mod patience;
+mod protected;
 mod raw;
 mod reactor;
 mod received;

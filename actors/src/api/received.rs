@@ -19,11 +19,17 @@ use sinew_runtime::{
 #[must_use = "a received message that is dropped counts as handled"]
 pub struct Received {
     message: Message,
+    /// It came through a guard, and is without its envelope.
+    is_guarded: bool,
 }
 
 impl Received {
     pub(super) const fn new(message: Message) -> Self {
-        Self { message }
+        Self { message, is_guarded: false }
+    }
+
+    pub(super) const fn guarded(message: Message) -> Self {
+        Self { message, is_guarded: true }
     }
 
     /// Who sent it; the sender's node answers for it.
@@ -76,13 +82,19 @@ impl Received {
         self.message.header.sent_error()
     }
 
+    /// The greatest age that it can have: `age` and its error; [`Duration::MAX`] where it is not known. For whoever uses only what is young.
+    #[must_use]
+    pub fn age_at_most(&self, now: Time) -> Duration {
+        self.age_error().map_or(Duration::MAX, |error| self.age(now).saturating_add(error))
+    }
+
     /// Whether the sender waits for a [`reply`](super::Endpoint::reply).
     #[must_use]
     pub const fn wants_reply(&self) -> bool {
         self.message.header.flags.has(Flags::ASK)
     }
 
-    /// The payload as it came, without a copy.
+    /// The payload as it came, without a copy; of what came through a guard, without its envelope.
     #[must_use]
     pub fn bytes(&self) -> &[u8] {
         &self.message.payload
@@ -91,8 +103,11 @@ impl Received {
     /// Reads the payload as a `P`. Compare [`kind`](Self::kind) with `P::KIND` first.
     ///
     /// # Errors
-    /// The bytes are not a `P`.
+    /// The bytes are not a `P`, or it is [protected](crate::protection) and did not come through a [`guard`](super::Endpoint::guard).
     pub fn decode<P: Payload>(&self) -> Result<P, DecodeError> {
+        if P::PROTECTION.is_some() && !self.is_guarded {
+            return Err(DecodeError::unguarded::<P>());
+        }
         self.message.decode()
     }
 

@@ -48,7 +48,7 @@ impl Endpoint {
         value: &P,
         within: Duration,
     ) -> Result<(), ApiError> {
-        let message = Message::typed(self.tid, destination, value);
+        let message = self.typed(destination, value)?;
         at_once(self.dispatch(message.into(), Limit::in_all(within))).map(drop)
     }
 
@@ -100,7 +100,7 @@ impl AsyncEndpoint {
         value: &P,
         within: Duration,
     ) -> Result<(), ApiError> {
-        let message = Message::typed(self.tid(), destination, value);
+        let message = self.endpoint.typed(destination, value)?;
         self.endpoint.dispatch(message.into(), Limit::in_all(within)).await.map(drop)
     }
 

@@ -206,7 +206,8 @@ impl From<ApiError> for Fault {
             ApiError::NotAsked => Status::SinewErrorNotAsked,
             ApiError::OthersRequest(_) => Status::SinewErrorNoSuchMessage,
             ApiError::Lent => Status::SinewErrorLent,
-            ApiError::NotYours(_) => Status::SinewErrorInvalidArgument,
+            // The second one: of protected payloads, which C does not send.
+            ApiError::NotYours(_) | ApiError::NotSealed(_) => Status::SinewErrorInvalidArgument,
         };
         Self::new(status, sentence)
     }
@@ -242,6 +243,7 @@ fn in_c(error: &ApiError) -> String {
         | ApiError::Stalled(_)
         | ApiError::TooLong { .. }
         | ApiError::TooManyGroups
+        | ApiError::NotSealed(_)
         | ApiError::NoReply(_)
         | ApiError::OthersRequest(_)
         | ApiError::Malformed(_)

@@ -256,6 +256,8 @@ pub(crate) trait Guarded: Send + Sync {
     fn echo(&self) -> Time;
     /// The one that it was told last.
     fn last_echo(&self) -> Time;
+    /// Time between two of them.
+    fn echo_period(&self) -> Duration;
 }
 
 impl<O: Send + 'static> Guarded for Shared<O> {
@@ -277,6 +279,10 @@ impl<O: Send + 'static> Guarded for Shared<O> {
 
     fn last_echo(&self) -> Time {
         self.lock().receiver.last_echo()
+    }
+
+    fn echo_period(&self) -> Duration {
+        self.lock().receiver.echo_period()
     }
 }
 

@@ -1,7 +1,7 @@
 //! End-to-end protection of commands: from the application that sends to the output that it moves, whatever lies between.
 //!
-//! Marked on the payload's type ([`Payload::PROTECTION`]): the sender's context puts each value
-//! into an envelope, the receiver's context lets nothing else through. Queues, rings, sockets, layers and networks between them
+//! Marked on the payload's type ([`Payload::PROTECTION`]): the sender's context, or its endpoint, puts each value
+//! into an envelope, the receiver's lets nothing else through. Queues, rings, sockets, layers and networks between them
 //! are a black channel, of which nothing is believed.
 //!
 //! | error | counter | watchdog | age by echo | codename | CRC-64 |
@@ -27,7 +27,9 @@
 //! | `sender` | counters and echoes of those who send |
 //! | `receiver` | what is believed, and when the output has to be safe |
 //! | `guard` | the output, and its thread |
+//! | `ends` | both ends for an endpoint of NodeAPI |
 
+mod ends;
 mod envelope;
 #[cfg(any(test, feature = "fuzzing"))]
 #[doc(hidden)]
@@ -43,6 +45,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 pub use self::{
+    ends::{Came, Ends, SealError},
     envelope::{Codename, OVERHEAD, Stamp, open, seal},
     guard::Guard,
 };

@@ -77,6 +77,10 @@ impl Receiver {
         self.echoes[0]
     }
 
+    pub(crate) const fn echo_period(&self) -> std::time::Duration {
+        self.protection.echo_period()
+    }
+
     /// The output is safe if the watchdog's time is over.
     pub(crate) fn expire(&mut self, now: Time) {
         if self.deadline().is_some_and(|deadline| now >= deadline) {

@@ -54,6 +54,12 @@ impl Flows {
         Some(seal(&Codename::of::<P>(source, destination), stamp, &encode(value)))
     }
 
+    /// Whether there are flows to `receiver`.
+    pub(crate) fn are_to(&self, receiver: Tid) -> bool {
+        let flows = self.flows.lock().unwrap_or_else(PoisonError::into_inner);
+        flows.keys().any(|(destination, _)| *destination == receiver)
+    }
+
     /// `from` is to find these times in the next messages that are sent to it.
     pub(crate) fn heard(&self, from: Tid, echo: Echo) {
         let mut flows = self.flows.lock().unwrap_or_else(PoisonError::into_inner);

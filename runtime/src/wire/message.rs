@@ -44,6 +44,15 @@ pub struct DecodeError {
     cause: rmp_serde::decode::Error,
 }
 
+impl DecodeError {
+    /// Of a `P` that is protected and came through no guard.
+    #[must_use]
+    pub fn unguarded<P: Payload>() -> Self {
+        let words = "it is protected, and did not come through a guard; make one for its sender".to_owned();
+        Self { name: P::NAME, cause: rmp_serde::decode::Error::Uncategorized(words) }
+    }
+}
+
 /// A message on its way.
 #[derive(Debug)]
 pub struct Message {

@@ -210,6 +210,7 @@ impl Letters {
             | ApiError::TooLong { .. }
             | ApiError::Ended(_)
             | ApiError::TooManyGroups
+            | ApiError::NotSealed(_)
             | ApiError::NoReply(_)
             | ApiError::Lent
             | ApiError::NotYours(_)

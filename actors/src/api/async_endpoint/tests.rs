@@ -1,6 +1,7 @@
 //! What only a task can see: other tasks that run while it waits, and futures that are dropped half way.
 
 mod links;
+mod protected;
 
 use std::{
     cell::Cell,

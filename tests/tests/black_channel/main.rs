@@ -8,7 +8,10 @@
 //!                              relay: the drive, to central | central, to the drive
 //! ```
 //!
-//! Neither end can tell: each knows the other by the address that the relay has in its place.
+//! Neither end can tell: each knows the other by the address that the relay has in its place. In `endpoints.rs` the ends are programs of other
+//! processes.
+
+mod endpoints;
 
 use std::{
     sync::{

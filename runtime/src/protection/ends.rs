@@ -1,0 +1,237 @@
+//! Both ends of protected messages for who has no context and no timers: an endpoint of NodeAPI, which says what came, and when.
+
+use std::{io, sync::Arc};
+
+use super::{Cause, Echo, Fault, Flows, Guard, Guarded, Verdict};
+use crate::{
+    outcome::{Outcome, Rejection},
+    tid::Tid,
+    time::Time,
+    wire::{Kind, Message, Payload, decode, encode},
+};
+
+/// The flows of protected messages that one endpoint sends, and the guards of those that it receives.
+#[derive(Debug)]
+pub struct Ends {
+    flows: Flows,
+    held: Vec<Held>,
+}
+
+struct Held {
+    guard: Arc<dyn Guarded>,
+    kind: Kind,
+    /// When its sender is to be told the next time to quote.
+    echo_at: Time,
+}
+
+impl std::fmt::Debug for Held {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Held({:?})", self.guard.codename())
+    }
+}
+
+/// What a message that has come is.
+#[derive(Debug)]
+pub enum Came {
+    /// It is for the receiver, as it came: nothing here guards its kind.
+    Plain(Message),
+    /// It is for the receiver, without its envelope: it is good, and its output is live.
+    Good(Message),
+    /// It is refused, or was not for the receiver; its sender is told.
+    Settled,
+}
+
+/// Why a protected payload cannot be sent. The caller is at fault; nothing was sent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum SealError {
+    /// It is for many: each receiver has an echo and a codename of its own.
+    #[error(
+        "it is protected, and so for one application, not for a group or for all; send it to each by itself"
+    )]
+    ToMany,
+    /// There are 1,024 flows of protected messages, of one type to one receiver each.
+    #[error("this sender has 1024 flows of protected messages, which is the most; register another endpoint")]
+    TooManyFlows,
+}
+
+impl Ends {
+    /// Those of a life that began at `now`.
+    #[must_use]
+    pub const fn new(now: Time) -> Self {
+        Self { flows: Flows::new(now), held: Vec::new() }
+    }
+
+    /// A message of the value, in its envelope if its type is protected. `source` and `receiver` are absolute; `destination` is
+    /// `receiver` as the caller has said it.
+    ///
+    /// # Errors
+    /// Its type is protected, and it cannot be sealed. One that is sealed and not sent then uses up a number.
+    pub fn message<P: Payload>(
+        &self,
+        source: Tid,
+        destination: Tid,
+        receiver: Tid,
+        value: &P,
+    ) -> Result<Message, SealError> {
+        if P::PROTECTION.is_none() {
+            return Ok(Message::of_type::<P>(source, destination, encode(value)));
+        }
+        if !receiver.is_single() {
+            return Err(SealError::ToMany);
+        }
+        let payload = self.flows.seal(source, receiver, value).ok_or(SealError::TooManyFlows)?;
+        Ok(Message::of_type::<P>(source, destination, payload))
+    }
+
+    /// Has `output` moved by what `source` sends to `receiver` of type `P`; see [`Guard::new`]. From `now` on its sender is to be told
+    /// [echoes](Self::echo).
+    ///
+    /// # Errors
+    /// The thread that keeps the watchdogs cannot be started, or this is guarded already.
+    pub fn guard<P: Payload, O: Send + 'static>(
+        &mut self,
+        (source, receiver): (Tid, Tid),
+        now: Time,
+        output: O,
+        safe: impl FnMut(&mut O, Cause) + Send + 'static,
+    ) -> io::Result<Guard<O>> {
+        let is_same = |held: &Held| held.kind == P::KIND && held.guard.codename().source == source;
+        if self.held.iter().any(|held| is_same(held) && !held.guard.is_orphan()) {
+            let words = format!(
+                "what {source} sends of '{}' is guarded already: keep that guard, or clone it",
+                P::NAME
+            );
+            return Err(io::Error::new(io::ErrorKind::AlreadyExists, words));
+        }
+        let guard = Guard::new::<P>(source, receiver, output, safe)?;
+        // The kinds of guards that are gone stay guarded: what is protected is not for who asks for anything.
+        self.held.retain(|held| !is_same(held));
+        self.held.push(Held { guard: guard.guarded(), kind: P::KIND, echo_at: now });
+        Ok(guard)
+    }
+
+    /// Takes a message in that has come.
+    pub fn take(&mut self, mut message: Message) -> Came {
+        let (source, kind) = (message.header.source, message.header.kind);
+        if kind == Echo::KIND && self.flows.are_to(source) {
+            let settled = match decode::<Echo>(&message.payload) {
+                Ok(echo) => {
+                    self.flows.heard(source, echo);
+                    Outcome::Delivered
+                }
+                Err(_) => Outcome::Rejected(Rejection::Malformed),
+            };
+            message.settle(settled);
+            return Came::Settled;
+        }
+        let mut guards = self.held.iter().filter(|held| held.kind == kind).peekable();
+        if guards.peek().is_none() {
+            return Came::Plain(message);
+        }
+        let why = match guards.find(|held| held.guard.codename().source == source) {
+            None => Rejection::Unsupported,
+            Some(held) => match held.guard.take(&message.payload) {
+                Verdict::Apply(payload) => {
+                    message.payload = payload;
+                    return Came::Good(message);
+                }
+                Verdict::Refused(Fault::Corrupt) => Rejection::Malformed,
+                Verdict::Hold | Verdict::Refused(_) => Rejection::ByHandler,
+            },
+        };
+        message.reject(why);
+        Came::Settled
+    }
+
+    /// When [`echo`](Self::echo) has something to say next.
+    #[must_use]
+    pub fn echo_due(&self) -> Option<Time> {
+        self.live().map(|held| held.echo_at).min()
+    }
+
+    /// The next echo that is due, from `own`; its sender is told it whenever it can be.
+    pub fn echo(&mut self, own: Tid, now: Time) -> Option<Message> {
+        let held = self.held.iter_mut().filter(|held| !held.guard.is_orphan());
+        let held = held.min_by_key(|held| held.echo_at).filter(|held| held.echo_at <= now)?;
+        // Not on a grid: who looks late says one and not many.
+        held.echo_at = now + held.guard.echo_period();
+        let (source, kind, at) = (held.guard.codename().source, held.kind, held.guard.echo());
+        let others = self.live().filter(|held| held.kind != kind && held.guard.codename().source == source);
+        let others = others.map(|held| (held.kind, held.guard.last_echo().as_nanos())).collect();
+        Some(Message::typed(own, source, &Echo { others, ..Echo::new(kind, at) }))
+    }
+
+    fn live(&self) -> impl Iterator<Item = &Held> {
+        self.held.iter().filter(|held| !held.guard.is_orphan())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use serde::{Deserialize, Serialize};
+
+    use super::*;
+    use crate::{
+        protection::Protection,
+        tid::{AppAddress, NodeAddress},
+        wire::Header,
+    };
+
+    const NOW: Time = Time::from_nanos(1_000_000_000);
+    const PROTECTION: Protection = Protection::of_period(Duration::from_millis(1));
+
+    #[derive(Serialize, Deserialize)]
+    struct Torque(f32);
+
+    impl Payload for Torque {
+        const NAME: &'static str = "test.torque_of_an_endpoint";
+        const PROTECTION: Option<Protection> = Some(PROTECTION);
+    }
+
+    fn tid(app: u32) -> Tid {
+        Tid::new(NodeAddress::from([127, 0, 0, 1]), AppAddress::fixed(app).expect("a fixed one"))
+    }
+
+    fn from(app: u32, kind: Kind) -> Message {
+        Message::new(Header::new(kind, tid(app), tid(9)), encode(&Torque(1.0)))
+    }
+
+    fn guard(ends: &mut Ends) -> io::Result<Guard<()>> {
+        ends.guard::<Torque, _>((tid(1), tid(9)), NOW, (), |_, _| {})
+    }
+
+    #[test]
+    fn what_a_guard_was_made_for_is_for_nobody_without_it() {
+        let mut ends = Ends::new(NOW);
+        assert!(matches!(ends.take(from(1, Torque::KIND)), Came::Plain(_)), "nothing is guarded yet");
+        let first = guard(&mut ends).expect("a thread");
+        assert_eq!(guard(&mut ends).expect_err("it is guarded").kind(), io::ErrorKind::AlreadyExists);
+        for app in [1, 2] {
+            assert!(matches!(ends.take(from(app, Torque::KIND)), Came::Settled), "not sealed, from {app}");
+        }
+        assert!(matches!(ends.take(from(1, Kind::named("test.other"))), Came::Plain(_)));
+        drop(first);
+        assert!(matches!(ends.take(from(1, Torque::KIND)), Came::Settled), "it is still not sealed");
+        assert_eq!(ends.echo_due(), None, "nobody is told to go on");
+        let _second = guard(&mut ends).expect("the first one is gone");
+    }
+
+    #[test]
+    fn echoes_are_said_when_they_are_due_and_heard_by_who_sends() {
+        let (mut sender, mut receiver) = (Ends::new(NOW), Ends::new(NOW));
+        let _guard = guard(&mut receiver).expect("a thread");
+        let mut echo = || receiver.echo(tid(9), NOW);
+        let (first, none) = (echo().expect("at once"), echo());
+        assert!(none.is_none() && first.header.destination == tid(1));
+        assert_eq!(receiver.echo_due(), Some(NOW + PROTECTION.echo_period()));
+        // Who sends it nothing that is protected has no use for it, and does not know it.
+        assert!(matches!(sender.take(first), Came::Plain(_)));
+        sender.message(tid(1), tid(9), tid(9), &Torque(1.0)).expect("it is for one");
+        let second = receiver.echo(tid(9), NOW + PROTECTION.echo_period()).expect("it is due");
+        assert!(matches!(sender.take(second), Came::Settled));
+        let group = Tid::group("test.all");
+        assert_eq!(sender.message(tid(1), group, group, &Torque(1.0)).err(), Some(SealError::ToMany));
+    }
+}
