@@ -53,6 +53,8 @@ pub(crate) struct Stores {
     pub(crate) gncl: gncl::Store,
     /// NDL's sockets for queries and answers. They stay open while this layer is restarted.
     pub(crate) ndl_sockets: Mutex<ndl::Sockets>,
+    /// Held by who writes the file of remembered peers: one after the other, each what is so then.
+    pub(crate) ndl_file: Mutex<()>,
     /// What is to be told of nodes' ends behind their last messages.
     pub(crate) aftermath: Aftermath,
     /// Which nodes are there; a restarted NDL goes on with them.
@@ -106,6 +108,7 @@ impl Stores {
             refusals: Arc::default(),
             gncl: gncl::Store::default(),
             ndl_sockets: Mutex::default(),
+            ndl_file: Mutex::default(),
             aftermath: Aftermath::default(),
             ndl: Mutex::new(ndl::new_core(&config, node, incarnation)),
             door: lncl::Door::default(),

@@ -151,6 +151,11 @@ impl NodeConfig {
             let remedy = "give the node an address of its own: an IPv6 address is too long for one, and an interface that is chosen by its name may have none, or another one tomorrow";
             faults.push(fault("node.address", "nothing".to_owned(), legal, remedy));
         }
+        if let Some(state) = self.state.as_deref().filter(|state| !is_path(state)) {
+            let legal = format!("the path of a directory, 1 to {DIRECTORY_BYTES_MAX} bytes, or false");
+            let remedy = "name a directory of the node's user, as in /var/lib/sinew";
+            faults.push(fault("node.state", quoted(&state.to_string_lossy()), legal, remedy));
+        }
         MAILBOX_CAPACITY.count(faults, self.mailbox_capacity);
         MAILBOX_BYTES.count(faults, self.mailbox_bytes);
         PAYLOAD_MAX.count(faults, self.payload_max);
@@ -172,10 +177,6 @@ impl NodeConfig {
     }
 
     fn check_security(&self, faults: &mut Vec<ConfigFault>) {
-        let is_path = |path: &&Path| {
-            let bytes = path.as_os_str().as_encoded_bytes();
-            (1..=DIRECTORY_BYTES_MAX).contains(&bytes.len()) && !bytes.contains(&0)
-        };
         if let Some(keys) = self.security.keys.as_deref().filter(|keys| !is_path(keys)) {
             let legal = format!("the path of a directory, 1 to {DIRECTORY_BYTES_MAX} bytes, or false");
             let remedy = "name the directory that `sinew keys` made for this node, as in /etc/sinew/keys";
@@ -292,6 +293,11 @@ fn check_name(faults: &mut Vec<ConfigFault>, key: &str, name: &str) {
         let legal = format!("a text of 1 to {NAME_BYTES_MAX} bytes without control characters");
         faults.push(fault(key, found, legal, format!("set {key} to a short name, as in \"knee\"")));
     }
+}
+
+fn is_path(path: &Path) -> bool {
+    let bytes = path.as_os_str().as_encoded_bytes();
+    (1..=DIRECTORY_BYTES_MAX).contains(&bytes.len()) && !bytes.contains(&0)
 }
 
 fn is_socket_path(path: &Path) -> bool {

@@ -29,10 +29,11 @@ const FILE_BYTES_MAX: u64 = 1 << 20;
 const SECTIONS: [&str; 7] = ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 46] = [
+pub(super) const KEYS: [&str; 47] = [
     "node.name",
     "node.project",
     "node.address",
+    "node.state",
     "node.mailbox_capacity",
     "node.mailbox_bytes",
     "node.payload_max",
@@ -332,6 +333,7 @@ impl Reader<'_> {
         let mut address: Found<NodeAddress> = Found(None);
         self.text("node.address", "\"10.0.0.7\"", &mut address);
         config.address = address.0;
+        self.text_or_off("node.state", "\"/var/lib/sinew\" or false", &mut config.state);
         self.number(&check::MAILBOX_CAPACITY, &mut config.mailbox_capacity);
         self.number(&check::MAILBOX_BYTES, &mut config.mailbox_bytes);
         self.number(&check::PAYLOAD_MAX, &mut config.payload_max);

@@ -44,6 +44,9 @@ pub struct NodeConfig {
     /// address of [`NdlConfig::interface`], the first one's; set it by hand where several nodes share a host, or where that one is
     /// chosen by its name.
     pub address: Option<NodeAddress>,
+    /// Directory for what the node keeps from one start to the next, which is where its peers answered; 1 to 4,096 bytes. It is made if only
+    /// itself is missing, with mode 0700. Nodes of one user may share one. Default: none, the node keeps nothing.
+    pub state: Option<PathBuf>,
     /// Messages that an application's mailbox holds at most, each class by itself. 1 to 65,536; default 256.
     pub mailbox_capacity: usize,
     /// Bytes of the payloads in it at most, each class by itself; one message is held where nothing else waits, however
@@ -254,6 +257,7 @@ impl NodeConfig {
             name: name.into(),
             project: "sinew".to_owned(),
             address: None,
+            state: None,
             mailbox_capacity: 256,
             mailbox_bytes: 4 << 20,
             payload_max: 1 << 20,

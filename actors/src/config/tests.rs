@@ -229,7 +229,7 @@ fn groups_of_nodes_are_legal_at_both_ends_and_not_beyond() {
 }
 
 #[test]
-fn security_is_a_directory_or_off_and_a_policy_that_exists() {
+fn state_and_security_are_directories_or_off_and_times_a_policy_that_exists() {
     let path = |bytes| format!("{:?}", "k".repeat(bytes));
     let cases = [
         ("security.keys", "false".to_owned(), true),
@@ -245,6 +245,11 @@ fn security_is_a_directory_or_off_and_a_policy_that_exists() {
         ("security.times", "'ignored'".to_owned(), true),
         ("security.times", "'never'".to_owned(), false),
         ("security.times", "false".to_owned(), false),
+        ("node.state", "false".to_owned(), true),
+        ("node.state", "true".to_owned(), false),
+        ("node.state", path(0), false),
+        ("node.state", path(4_096), true),
+        ("node.state", path(4_097), false),
         ("security.access", "false".to_owned(), true),
         ("security.access", "true".to_owned(), false),
         ("security.access", path(0), false),

@@ -229,6 +229,7 @@ const fn word(source: Source) -> &'static str {
         Source::Multicast => "multicast",
         Source::Mdns => "mdns",
         Source::Query => "query",
+        Source::Remembered => "remembered",
     }
 }
 

@@ -1,5 +1,6 @@
 //! The thin shell around the membership core: sockets, timer, mDNS, and the ways to other layers.
 
+mod memory;
 mod paths;
 mod receiving;
 mod telling;
@@ -104,6 +105,7 @@ impl Actor for NdlActor {
         if let Some(probes) = shell.probes.borrow_mut().take() {
             ctx.spawn(try_hosts(shell.clone(), probes).into_actor(self));
         }
+        ctx.spawn(memory::keep(shell.clone()).into_actor(self));
         ctx.spawn(watch_progress(shell.clone()).into_actor(self));
         ctx.spawn(aftermath::carry_on(self.stores.clone()).into_actor(self));
         ctx.spawn(keep_time(shell.clone()).into_actor(self));

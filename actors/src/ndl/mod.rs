@@ -16,6 +16,7 @@
 //! | NDL-2.2 | Whoever is heard for the first time is asked at once. |
 //! | NDL-2.3 | So is whoever mDNS resolves. |
 //! | NDL-2.4 | Members of a group of `ndl.watch` are asked at that group's pace instead. |
+//! | NDL-2.5 | After a restart also who was a member before, where it answered. |
 //! | NDL-3 | A query is answered at once, to where it came from; a member's query to the group is not. |
 //! | NDL-3.1 | An answer counts once, if it comes from the address that was asked and quotes the query's correlation id. |
 //! | NDL-3.2 | Such an answer, and nothing else, makes a member. |
@@ -53,6 +54,7 @@ mod facts;
 pub(crate) mod fuzzing;
 mod interfaces;
 mod mdns;
+mod peers_file;
 mod probe;
 mod progress;
 mod socket;

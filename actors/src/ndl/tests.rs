@@ -1,5 +1,7 @@
 //! Real NDL actors over the loopback interface, each test in a multicast group and on ports of its own.
 
+mod remembered;
+
 use std::{
     net::{Ipv4Addr, SocketAddr, SocketAddrV4, UdpSocket},
     sync::{
@@ -86,6 +88,11 @@ impl Node {
         config.address = Some(NodeAddress::new(number));
         alone(&mut config.ndl);
         set(&mut config.ndl);
+        Self::of(config, incarnation)
+    }
+
+    fn of(config: NodeConfig, incarnation: u64) -> Self {
+        let number = config.node_address().bits();
         let stores = Stores::for_test(config, Incarnation(incarnation));
         stores.gncl_listen.set(gncl_of(number)).unwrap();
         let (inbox, facts) = (Post::new(1_000), stores.posts.gncl.attach());

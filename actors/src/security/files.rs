@@ -192,6 +192,17 @@ pub(super) fn denied(path: &Path) -> Result<Zeroizing<Vec<u8>>, FileFault> {
     read(path, Guarded::Public, DENIED_BYTES_MAX)
 }
 
+/// Reads a file of at most `bytes_max` bytes in which nobody else can have written, whoever may read it; `None` if there is none.
+///
+/// # Errors
+/// It cannot be had, or somebody else can write there.
+pub(crate) fn own(path: &Path, bytes_max: u64) -> Result<Option<Zeroizing<Vec<u8>>>, FileFault> {
+    match read(path, Guarded::Public, bytes_max) {
+        Err(FileFault::Unreadable { cause, .. }) if cause.kind() == io::ErrorKind::NotFound => Ok(None),
+        read => read.map(Some),
+    }
+}
+
 /// Whether `path` is a directory in which nobody else can put another file in the place of one.
 ///
 /// # Errors

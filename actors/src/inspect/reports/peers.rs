@@ -30,7 +30,7 @@ pub struct LostReport {
     /// Time after its last sign of life within which its loss was to be known.
     #[serde(default)]
     pub bound_us: Option<u64>,
-    /// How it had been found: `seed`, `multicast`, `mdns`, `query`.
+    /// How it had been found: `seed`, `multicast`, `mdns`, `query`, `remembered`.
     #[serde(deserialize_with = "at_most::<_, _, LINKS_MAX>")]
     pub found_by: Vec<String>,
 }
@@ -101,7 +101,7 @@ pub struct PeerReport {
     pub is_there: bool,
     /// Time since it was found.
     pub found_us: Option<u64>,
-    /// How it was found: `seed`, `multicast`, `mdns`, `query`.
+    /// How it was found: `seed`, `multicast`, `mdns`, `query`, `remembered`.
     #[serde(deserialize_with = "at_most::<_, _, LINKS_MAX>")]
     pub found_by: Vec<String>,
     /// Time since its last sign of life.

@@ -104,6 +104,21 @@ impl Contact {
         Self { role, ..Self::announced(now) }
     }
 
+    /// Where a node was before this one was started anew.
+    pub(super) fn remembered(now: Time, node: NodeAddress) -> Self {
+        Self { sources: BTreeMap::from([(Source::Remembered, now)]), ..Self::former(now, node) }
+    }
+
+    /// Nothing else speaks for this address: nobody was heard there since, and it is not listed.
+    pub(super) fn is_remembered_alone(&self) -> bool {
+        let is_asked_for_it = matches!(self.role, Role::Candidate { .. } | Role::Former { .. });
+        is_asked_for_it && !self.is_seed && self.sources.keys().eq(&[Source::Remembered])
+    }
+
+    pub(super) fn is_former_of(&self, node: NodeAddress) -> bool {
+        matches!(self.role, Role::Former { node: former, .. } if former == node)
+    }
+
     pub(super) fn is_candidate(&self) -> bool {
         matches!(self.role, Role::Candidate { .. }) && !self.is_seed && !self.is_announced_only()
     }

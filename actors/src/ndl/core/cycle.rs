@@ -30,6 +30,8 @@ impl Core {
     /// A shell starts, the first one or one after it: what came while there was none is its own fault, not the peers'.
     pub(super) fn begin(&mut self, now: Time) {
         self.meet_seeds(now);
+        self.memory.seek_all();
+        self.meet_remembered(now);
         for member in self.members.values_mut() {
             member.is_awaited = false;
             member.routes.forgive();
@@ -155,6 +157,7 @@ impl Core {
 
     // spec: NDL-2.1
     fn ask_everybody(&mut self, now: Time) {
+        self.count_start(now);
         self.seek_all(now);
         self.tell_moves(now);
         // Also who cannot be asked at all: none of our addresses leads there any more.

@@ -19,6 +19,7 @@
 //! | `troubles` | what of a member does not get on |
 //! | `audience` | who is told, and what of it has not been taken |
 //! | `clock` | how far a peer's clock is from ours |
+//! | `memory` | where members are asked first after a restart |
 //! | `recall` | what is told to whoever asks, and decides nothing |
 
 mod audience;
@@ -30,6 +31,7 @@ mod duplicates;
 mod heard;
 mod lives;
 mod member;
+mod memory;
 mod pace;
 mod proven;
 mod recall;
@@ -55,6 +57,7 @@ use sinew_runtime::{
 };
 
 pub use self::recall::OwnStalls;
+pub(crate) use self::memory::{REMEMBERED_MAX, RememberedPeer, UNANSWERED_MAX};
 pub(crate) use self::recall::{LostNode, Neighbour};
 pub(crate) use self::routes::Place;
 pub use self::view::{KnownNode, KnownRoute, TroubledApp};
@@ -65,6 +68,7 @@ use self::{
     duplicates::{Claimant, Trial},
     lives::{Contest, Gone},
     member::Member,
+    memory::Memory,
     pace::{Pace, REST},
     proven::Proven,
     recall::Recall,
@@ -86,6 +90,8 @@ pub(crate) enum Input {
     LeaveReceived { from: Place, announcement: Announcement },
     /// Multicast DNS knows a node of this project at this address.
     MdnsResolved { address: SocketAddr },
+    /// Where members of earlier lives of this node answered, as far as that was kept; said once, also if there are none.
+    PeersRemembered(Vec<RememberedPeer>),
     /// A connection of GNCL changed.
     Link(LinkFact),
     /// The host of a node that missed answers was tried, as [`Output::Probe`] asked.
@@ -214,6 +220,8 @@ pub enum Source {
     Mdns,
     /// It found this node first and asked it.
     Query,
+    /// It was a member there before this node, or its NDL, was started anew.
+    Remembered,
 }
 
 /// Counts as an instance of the shell: an older one that still runs is not listened to.
@@ -260,6 +268,7 @@ pub(crate) struct Core {
     audience: Audience,
     outputs: VecDeque<Output>,
     refusals: Refusals,
+    memory: Memory,
     recall: Recall,
 }
 
@@ -315,6 +324,7 @@ impl Core {
             audience: Audience::new(ndl.nodes_max),
             outputs: VecDeque::new(),
             refusals: Refusals::default(),
+            memory: Memory::default(),
             recall: Recall::default(),
         }
     }
@@ -378,6 +388,7 @@ impl Core {
                 }
             }
             Input::MdnsResolved { address } => self.resolved(now, address),
+            Input::PeersRemembered(peers) => self.recalled(now, peers),
             Input::Link(fact) => self.linked(now, fact),
             Input::Probed { node, incarnation, host } => self.probed(node, incarnation, host),
             Input::SignSeen { node, incarnation, at } => self.sign_seen(now, node, incarnation, at),

@@ -86,6 +86,7 @@ impl Core {
         if self.proven.is_asked() && self.members.get(&node).is_some_and(is_other) {
             self.lose(now, node, LossReason::Duplicate);
         }
+        self.note_all_met(node);
     }
 
     /// Whether what was answered contradicts a connection that stands: another life of its node has it, or the node that was asked there.
@@ -112,6 +113,11 @@ impl Core {
     fn proven_member_at(&self, place: Place) -> Option<NodeAddress> {
         let Role::Member(node) = self.contacts.get(&place)?.role else { return None };
         self.is_proven(node).then_some(node)
+    }
+
+    /// Whether connections prove who is at their other end.
+    pub(super) const fn proves_peers(&self) -> bool {
+        self.proven.is_asked()
     }
 
     /// Whether the member at `node` is the life whose connection stands.

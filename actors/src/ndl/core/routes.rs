@@ -266,6 +266,7 @@ impl Core {
         };
         self.contacts.retain(|place, contact| !is_vain(place, contact));
         self.meet_seeds(now);
+        self.meet_remembered(now);
         self.look_for_the_gone(now, &new);
         let members: Vec<_> = self.members.keys().copied().collect();
         members.into_iter().for_each(|node| self.seek(now, node));
@@ -394,6 +395,7 @@ impl Core {
             member.routes.add(place);
         }
         self.contact_at(now, place).role = Role::Member(node);
+        self.note_met(node, place);
         true
     }
 

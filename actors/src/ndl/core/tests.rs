@@ -2,6 +2,7 @@
 
 mod duplicates;
 mod lives;
+mod memory;
 mod paces;
 mod properties;
 mod proven;

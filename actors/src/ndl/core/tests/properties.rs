@@ -16,7 +16,7 @@ use crate::{
     gncl::LinkFact,
     ndl::{
         MembershipFact,
-        core::{Core, Input, Output, Place, Query, Way, contact::Role},
+        core::{Core, Input, Output, Place, Query, RememberedPeer, Way, contact::Role},
         datagram::{Announcement, Answer},
     },
 };
@@ -42,7 +42,7 @@ fn any_input() -> impl Strategy<Value = (u64, Input)> {
             ndl,
             ..stranger(address)
         });
-    let input = (place(), announcement, 0..7, any::<bool>()).prop_map(|(from, announcement, what, flag)| {
+    let input = (place(), announcement, 0..8, any::<bool>()).prop_map(|(from, announcement, what, flag)| {
         let Announcement { node, incarnation, .. } = announcement;
         match what {
             0 => {
@@ -62,6 +62,7 @@ fn any_input() -> impl Strategy<Value = (u64, Input)> {
             4 => Input::MdnsResolved { address: from.there },
             5 if flag => Input::Link(LinkFact::LinkBroken { node, incarnation }),
             5 => Input::Link(LinkFact::DialRefused { node, incarnation }),
+            7 => Input::PeersRemembered(vec![RememberedPeer { address: from.there, node, unanswered: 7 }]),
             6 if flag => Input::SignSeen { node, incarnation, at: Time::from_nanos(1) },
             _ => Input::TimePassed,
         }

@@ -1,0 +1,179 @@
+//! What a node remembers of its peers, and where that leads.
+
+use std::time::Duration;
+
+use sinew_runtime::tid::Incarnation;
+
+use super::world::{PERIOD, Spec, World, ms, node, udp};
+use crate::{
+    gncl::LinkFact,
+    ndl::{
+        LossReason,
+        core::{Input, RememberedPeer, Source, UNANSWERED_MAX},
+    },
+};
+
+/// A node that no source tells of others.
+fn alone(address: u32, incarnation: u64) -> Spec {
+    Spec { multicast: false, incarnation, ..Spec::of(address) }
+}
+
+fn knowing(address: u32, incarnation: u64, seed: u16) -> Spec {
+    Spec { seeds: vec![udp(seed)], ..alone(address, incarnation) }
+}
+
+fn sources(world: &World, index: u16) -> Vec<Source> {
+    let members = world.at(index).core.members(world.now);
+    members.iter().flat_map(|member| member.sources.keys().copied()).collect()
+}
+
+fn remembered(world: &World, index: u16) -> Vec<RememberedPeer> {
+    world.at(index).core.remembered()
+}
+
+/// Where nobody is.
+fn nobody() -> RememberedPeer {
+    RememberedPeer { address: udp(9), node: node(9), unanswered: 0 }
+}
+
+// spec: NDL-2.5
+#[test]
+fn a_node_finds_those_that_its_earlier_life_knew_where_nothing_else_tells_of_them() {
+    // given: they met, and nothing of that is left but what one of them remembers
+    let mut world = World::new();
+    world.start(1, &knowing(1, 1, 2));
+    world.start(2, &alone(2, 1));
+    world.run_until(ms(1), |world| world.knows(1, 2) && world.knows(2, 1));
+    let kept = remembered(&world, 1);
+    assert_eq!(kept, [RememberedPeer { address: udp(2), node: node(2), unanswered: 0 }]);
+    world.start(1, &alone(1, 2));
+    world.start(2, &alone(2, 2));
+    world.run(PERIOD * 20);
+    assert!(!world.knows(1, 2) && !world.knows(2, 1));
+    // when
+    world.input(1, Input::PeersRemembered(kept));
+    // then
+    world.run_until(ms(1), |world| world.knows(1, 2) && world.knows(2, 1));
+    // Who was asked asks on his part.
+    assert_eq!(sources(&world, 1), [Source::Query, Source::Remembered]);
+    assert_eq!(sources(&world, 2), [Source::Query]);
+}
+
+// spec: NDL-2.5
+#[test]
+fn a_layer_that_is_started_anew_asks_those_that_had_left_too() {
+    let mut world = World::new();
+    world.start(1, &knowing(1, 1, 2));
+    world.start(2, &alone(2, 1));
+    world.run_until(ms(1), |world| world.knows(1, 2) && world.knows(2, 1));
+    let now = world.now;
+    world.process(1).core.use_seeds(now, Vec::new());
+    world.input(2, Input::Stopping);
+    world.run_until(ms(1), |world| world.losses(1) == [(2, LossReason::Left)]);
+    world.start(2, &alone(2, 2));
+    world.run(PERIOD * 40);
+    assert!(!world.knows(1, 2), "who has left is not asked");
+    world.restart_shell(1);
+    world.run_until(ms(1), |world| world.knows(1, 2) && world.knows(2, 1));
+    assert!(sources(&world, 1).contains(&Source::Remembered));
+}
+
+// spec: NDL-2.5
+#[test]
+fn an_address_where_nobody_answers_is_asked_ever_more_seldom_and_never_given_up() {
+    let mut world = World::new();
+    world.start(1, &alone(1, 1));
+    world.input(1, Input::PeersRemembered(vec![nobody()]));
+    world.run(PERIOD * 100);
+    let asked = world.at(1).datagrams_sent;
+    assert!((8..=12).contains(&asked), "{asked} of 100 periods");
+    world.start(9, &alone(9, 1));
+    world.run_until(PERIOD * 18, |world| world.knows(1, 9) && world.knows(9, 1));
+}
+
+// spec: NDL-2.5
+#[test]
+fn an_address_is_forgotten_after_so_many_starts_without_an_answer_that_lasted_while_others_answered() {
+    // given: a start for each of these lives of 1, beside 2 or alone, and this long
+    let start = |kept: Vec<RememberedPeer>, lives: (u64, bool), lasts: Duration| {
+        let (incarnation, is_beside_another) = lives;
+        let mut world = World::new();
+        if is_beside_another {
+            world.start(2, &alone(2, 1));
+        }
+        world.start(1, &knowing(1, incarnation, 2));
+        world.input(1, Input::PeersRemembered(kept));
+        world.run(lasts);
+        world
+    };
+    let of_nobody = |world: &World| {
+        remembered(world, 1).iter().find(|peer| peer.node == node(9)).map(|peer| peer.unanswered)
+    };
+    let minutes = Duration::from_secs(121);
+    let kept = || vec![nobody()];
+    // then: neither a short start counts nor one in which nobody answers at all
+    assert_eq!(of_nobody(&start(kept(), (1, true), Duration::from_secs(59))), Some(0));
+    assert_eq!(of_nobody(&start(kept(), (1, false), minutes)), Some(0));
+    // and: one counts once
+    let mut world = start(kept(), (1, true), minutes);
+    for life in 2..u64::from(UNANSWERED_MAX) {
+        assert_eq!(u64::from(of_nobody(&world).expect("it is remembered")), life - 1);
+        let changes = world.at(1).core.memory_changes();
+        assert!(changes > 0, "it is to be kept");
+        world = start(remembered(&world, 1), (life, true), minutes);
+    }
+    world = start(remembered(&world, 1), (9, true), Duration::from_secs(59));
+    assert_eq!(of_nobody(&world), Some(UNANSWERED_MAX - 1));
+    world.run(minutes);
+    assert_eq!(of_nobody(&world), None);
+    assert_eq!(remembered(&world, 1).len(), 1, "who answers is remembered");
+    assert!(world.at(1).core.contacts.keys().all(|place| place.there != udp(9)), "it is not asked any more");
+}
+
+// spec: NDL-2.5
+#[test]
+fn an_answer_clears_what_was_counted_against_an_address() {
+    let mut world = World::new();
+    world.start(1, &alone(1, 1));
+    world.start(2, &alone(2, 1));
+    let kept = RememberedPeer { address: udp(2), node: node(2), unanswered: UNANSWERED_MAX - 1 };
+    world.input(1, Input::PeersRemembered(vec![kept]));
+    world.run(Duration::from_secs(121));
+    assert_eq!(remembered(&world, 1), [RememberedPeer { unanswered: 0, ..kept }]);
+}
+
+// spec: NDL-2.5, NDL-3.2
+#[test]
+fn a_remembered_address_is_a_hint_and_whoever_answers_there_says_who_he_is() {
+    let mut world = World::new();
+    world.start(1, &alone(1, 1));
+    world.start(2, &alone(3, 1));
+    world.input(
+        1,
+        Input::PeersRemembered(vec![
+            RememberedPeer { address: udp(2), node: node(2), unanswered: 0 },
+            // Our own address was another's once.
+            RememberedPeer { address: udp(1), node: node(4), unanswered: 0 },
+        ]),
+    );
+    world.run(PERIOD * 4);
+    assert!(world.knows(1, 3) && !world.knows(1, 2));
+    assert_eq!(world.at(1).core.members.len(), 1);
+    assert!(remembered(&world, 1).contains(&RememberedPeer {
+        address: udp(2),
+        node: node(3),
+        unanswered: 0
+    }));
+}
+
+// spec: NDL-2.5
+#[test]
+fn where_nodes_have_keys_only_who_has_proven_himself_is_remembered() {
+    let mut world = World::new();
+    world.start(1, &Spec { has_keys: true, ..knowing(1, 1, 2) });
+    world.start(2, &alone(2, 1));
+    world.run_until(ms(1), |world| world.knows(1, 2));
+    assert_eq!(remembered(&world, 1), []);
+    world.link(1, LinkFact::LinkUp { node: node(2), incarnation: Incarnation(1) });
+    assert_eq!(remembered(&world, 1).iter().map(|peer| peer.address).collect::<Vec<_>>(), [udp(2)]);
+}

@@ -1,0 +1,108 @@
+//! A node that is started again finds its peers by what it has kept in a file.
+
+use std::path::{Path, PathBuf};
+
+use super::{Node, Source, alone, free_port, lock, run, within};
+use crate::config::NodeConfig;
+use sinew_runtime::tid::NodeAddress;
+
+/// Time between two looks at a file.
+const LOOK: std::time::Duration = std::time::Duration::from_millis(10);
+
+fn config(number: u32, port: u16, state: Option<&Path>) -> NodeConfig {
+    let mut config = NodeConfig::new(format!("node-{number}"));
+    config.address = Some(NodeAddress::new(number));
+    config.state = state.map(Path::to_owned);
+    alone(&mut config.ndl);
+    config.ndl.port = port;
+    config
+}
+
+async fn started(config: NodeConfig, life: u64) -> Node {
+    let mut node = Node::of(config, life);
+    node.start_layer().await;
+    node
+}
+
+fn ended(mut node: Node) {
+    node.end_layer();
+    node.stores.close();
+}
+
+struct Own(PathBuf);
+
+impl Own {
+    fn new(name: &str) -> Self {
+        let path = std::env::temp_dir().join(format!("sinew-remembered-{name}-{}", std::process::id()));
+        let _ = std::fs::remove_dir_all(&path);
+        Self(path)
+    }
+}
+
+impl Drop for Own {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}
+
+/// Both meet by a seed; the second keeps that, in `state`. Then both end.
+async fn meet(ports: [u16; 2], state: &Path) {
+    let mut first = started(config(1, ports[0], None), 1).await;
+    let mut config = config(2, ports[1], Some(state));
+    config.ndl.seeds = vec![first.udp().into()];
+    let mut second = started(config, 1).await;
+    first.finds(&second).await;
+    second.finds(&first).await;
+    let file = state.join("peers-0.0.0.2");
+    let expected = format!("sinew peers 1\n127.0.0.1:{} 0.0.0.1 0\n", ports[0]);
+    within("the file of peers", async {
+        while std::fs::read_to_string(&file).ok().as_ref() != Some(&expected) {
+            tokio::time::sleep(LOOK).await;
+        }
+    })
+    .await;
+    ended(second);
+    ended(first);
+}
+
+#[test]
+fn a_node_that_is_started_again_finds_its_peers_where_no_source_tells_of_them() {
+    run(async {
+        let (own, ports) = (Own::new("found"), [free_port(), free_port()]);
+        meet(ports, &own.0).await;
+        let mut first = started(config(1, ports[0], None), 2).await;
+        let mut second = started(config(2, ports[1], Some(&own.0)), 2).await;
+        second.finds(&first).await;
+        first.finds(&second).await;
+        assert!(second.sources().contains(&Source::Remembered), "{:?}", second.sources());
+        assert_eq!(first.sources(), [Source::Query]);
+    });
+}
+
+#[test]
+fn rubbish_in_the_file_stops_nobody_and_what_can_be_read_of_it_counts() {
+    run(async {
+        let (own, ports) = (Own::new("rubbish"), [free_port(), free_port()]);
+        meet(ports, &own.0).await;
+        let file = own.0.join("peers-0.0.0.2");
+        let mut bytes = std::fs::read(&file).unwrap();
+        bytes.extend(b"\xff\xfe\0 0 0\n10.0.0.1:1 10.0.0.1 99999999999999999999\n");
+        std::fs::write(&file, &bytes).unwrap();
+        let mut first = started(config(1, ports[0], None), 2).await;
+        let mut second = started(config(2, ports[1], Some(&own.0)), 2).await;
+        second.finds(&first).await;
+        first.finds(&second).await;
+        ended(second);
+        // And: nothing of it.
+        std::fs::write(&file, b"\0\xff").unwrap();
+        let mut second = started(config(2, ports[1], Some(&own.0)), 3).await;
+        // It is the first, which knows it still, that asks.
+        second.finds(&first).await;
+        within("the file to be looked at", async {
+            while !lock(&second.stores).has_recalled() {
+                tokio::time::sleep(LOOK).await;
+            }
+        })
+        .await;
+    });
+}
