@@ -1,10 +1,12 @@
-//! `sinew doctor`: whether this machine gives a node what it needs, and whether its nodes are closed to others; each finding with the command
+//! `sinew doctor`: whether this machine gives a node what it needs, whether its nodes are closed to others, and whether other hosts see
+//! them; each finding with the command
 //! that mends it.
 //!
 //! Every check tries the thing itself where it can, and undoes it.
 
 mod clock;
 mod network;
+mod reach;
 mod rights;
 mod security;
 mod sockets;
@@ -62,6 +64,7 @@ pub(crate) fn show(chosen: Vec<Interface>, socket: Option<&Path>, within: Durati
         sockets::node(socket),
     ]);
     checks.extend(security::checks(&nodes));
+    checks.extend(reach::checks(&nodes, &interfaces));
     let is_fine = checks.iter().all(|check| check.mend.is_none());
     let json = json!({ "checks": checks.iter().map(check_json).collect::<Vec<_>>() });
     let mut table = Table::new(["CHECK", "", "WHAT IS SO"]);

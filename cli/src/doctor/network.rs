@@ -34,12 +34,12 @@ pub(super) struct Interface {
 }
 
 impl Interface {
-    fn is_loopback(&self) -> bool {
+    pub(super) fn is_loopback(&self) -> bool {
         self.addresses.iter().any(IpAddr::is_loopback)
     }
 
     /// What it lacks to carry nodes' words to other hosts, and what mends that.
-    fn lacks(&self) -> Option<(&'static str, String)> {
+    pub(super) fn lacks(&self) -> Option<(&'static str, String)> {
         let name = &self.name;
         if self.flags & UP == 0 {
             return Some(("down", format!("sudo ip link set dev {name} up")));

@@ -343,7 +343,8 @@ fn the_doctor_tries_each_thing_and_every_finding_has_what_mends_it() {
             "socket directory",
             "leftover sockets",
             "node",
-            "security"
+            "security",
+            "reach"
         ]
     );
     assert!(checks.iter().all(|check| check["fine"] == check["mend"].is_null()), "{said}");
@@ -357,6 +358,10 @@ fn the_doctor_tries_each_thing_and_every_finding_has_what_mends_it() {
     for name in ["multicast", "shared memory", "node", "security"] {
         assert!(is_fine(&said, name), "{name}: {said}");
     }
+    // So no other host sees it, either.
+    let reach = checks.iter().find(|check| check["check"] == "reach").expect("it is there");
+    let mend = reach["mend"].as_str().expect("a finding");
+    assert!(mend.contains("[ndl]") && mend.contains("interface = \""), "{mend}");
     // What cannot be is a finding: nobody has this address.
     let said = scenario.sinew("hip", &["doctor", "--interface", "192.0.2.1", "--json"]).json();
     assert!(!is_fine(&said, "multicast"), "{said}");
