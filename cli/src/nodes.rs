@@ -4,7 +4,8 @@ use std::fmt::Display;
 
 use serde_json::{Value, json};
 use sinew::inspect::{
-    AskNode, LinkReport, LostReport, NodeReport, PeerReport, RouteReport, StallReport, TroubleReport,
+    AskNode, LinkReport, LostReport, NodeReport, PeerReport, RouteReport, SourceReport, StallReport,
+    TroubleReport,
 };
 
 use crate::{
@@ -31,6 +32,7 @@ pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
         "through": system.path,
         "here": here.node.to_string(),
         "nodes": rows.iter().map(Row::json).collect::<Vec<_>>(),
+        "sources": here.sources.iter().map(source_json).collect::<Vec<_>>(),
         "lost": here.lost.iter().map(lost_json).collect::<Vec<_>>(),
         "left_out": here.left_out,
     });
@@ -209,6 +211,27 @@ fn lost_json(lost: &LostReport) -> Value {
     })
 }
 
+fn source_json(of: &SourceReport) -> Value {
+    let SourceReport { source, is_on, places, found } = of;
+    json!({ "source": source, "on": is_on, "places": places, "found": found })
+}
+
+/// Who tells the node through which we came where to ask, and what came of that.
+fn sources(here: &NodeReport) -> Option<String> {
+    let source = |of: &SourceReport| {
+        let SourceReport { source, is_on, places, found } = of;
+        let source = clean(source);
+        match (is_on, places, found) {
+            (false, 0, 0) => format!("{source} off"),
+            (true, 1.., 0) => format!("{source} 0 (asks at {places})"),
+            _ => format!("{source} {found}"),
+        }
+    };
+    let all: Vec<_> = here.sources.iter().map(source).collect();
+    (!all.is_empty())
+        .then(|| format!("{} {} finds others by: {}\n", here.node, clean(&here.name), all.join(", ")))
+}
+
 fn stalls_json(of: &StallReport) -> Value {
     let StallReport { count, longest_us, last_us } = of;
     json!({ "count": count, "longest_us": longest_us, "last_us": last_us })
@@ -270,6 +293,7 @@ fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport]) -> String {
     rows.iter().for_each(|row| table.row(row.cells()));
     lost.iter().for_each(|lost| table.row(lost_cells(lost)));
     let mut text = table.text();
+    text.extend(sources(here));
     for lost in &here.lost {
         let (seen, mend) = lost_in_words(lost);
         text += &format!("{} {}: {seen}; {mend}\n", lost.node, clean(&lost.name));
@@ -313,6 +337,27 @@ mod tests {
             "10.0.0.7 knee: 2 further ones do not get on\n".to_owned(),
         ];
         assert_eq!(troubles(&seen), lines.concat());
+    }
+
+    #[test]
+    fn each_source_says_what_came_of_it_and_what_is_off_is_told_from_what_has_found_nobody() {
+        let source = |source: &str, is_on, places, found| SourceReport {
+            source: source.to_owned(),
+            is_on,
+            places,
+            found,
+        };
+        let sources = vec![
+            source("seed", false, 0, 0),
+            source("multicast", true, 3, 3),
+            source("mdns", true, 0, 0),
+            source("remembered", true, 2, 0),
+        ];
+        let here = NodeReport { sources, ..security::tests::said("knee", 7, None) };
+        let words =
+            "192.168.0.7 knee finds others by: seed off, multicast 3, mdns 0, remembered 0 (asks at 2)\n";
+        assert_eq!(super::sources(&here).as_deref(), Some(words));
+        assert_eq!(super::sources(&security::tests::said("old", 7, None)), None);
     }
 
     #[test]

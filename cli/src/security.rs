@@ -133,6 +133,7 @@ pub(crate) mod tests {
             gncl: None,
             group: None,
             seeds: Vec::new(),
+            sources: Vec::new(),
             lost: Vec::new(),
             foreign: Vec::new(),
             refusals: Vec::new(),

@@ -18,15 +18,15 @@ use sinew_runtime::{
 use super::reports::{
     APPS_MAX, AppReport, AppsReport, AuditReport, BarrierReport, CertificateReport, DialReport,
     ForeignReport, LinkReport, LostReport, MISSING_MAX, Missing, NodeReport, PEERS_MAX, PeerReport,
-    RefusalReport, RouteReport, SecurityReport, SeenMessage, StallReport, StreamReport, TOLD_MAX, TREE_MAX,
-    TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
+    RefusalReport, RouteReport, SecurityReport, SeenMessage, SourceReport, StallReport, StreamReport,
+    TOLD_MAX, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
 };
 use super::watches::{Fetched, Sight};
 use crate::{
     audit,
     config::NdlConfig,
     gncl::{self, ByDatagram, Peer},
-    ndl::{KnownNode, KnownRoute, LossReason, LostNode, Source, Trouble, TroubledApp},
+    ndl::{KnownNode, KnownRoute, LossReason, LostNode, Source, SourceCounts, Trouble, TroubledApp},
     node::{CommandError, NodeHandle, Supervised},
     security::UnixTime,
     stores::{Stores, lock},
@@ -83,6 +83,7 @@ impl Answers {
             gncl: ndl.gncl,
             group: group(&stores.config.ndl),
             seeds: stores.config.ndl.seeds.iter().take(TOLD_MAX).map(ToString::to_string).collect(),
+            sources: ndl.sources,
             lost: ndl.lost,
             own_stalls: Some(ndl.stalls),
             foreign: ndl.foreign,
@@ -146,6 +147,7 @@ fn security(stores: &Stores, clock: UnixTime) -> SecurityReport {
 struct Discovery {
     udp: Option<String>,
     gncl: Option<String>,
+    sources: Vec<SourceReport>,
     lost: Vec<LostReport>,
     foreign: Vec<ForeignReport>,
     stalls: StallReport,
@@ -163,10 +165,10 @@ fn group(ndl: &NdlConfig) -> Option<String> {
 
 impl Discovery {
     fn of(stores: &Stores, now: Time) -> Self {
-        let (udp, me, lost, foreign, stalls) = {
+        let (udp, me, sources, lost, foreign, stalls) = {
             let core = lock(&stores.ndl);
             let (udp, me) = (core.paths().first().copied(), core.announcement().clone());
-            (udp, me, core.lost_nodes(), core.neighbours(), core.own_stalls())
+            (udp, me, core.source_counts(), core.lost_nodes(), core.neighbours(), core.own_stalls())
         };
         let stalls = StallReport {
             count: stalls.count,
@@ -183,7 +185,26 @@ impl Discovery {
             ago_us: micros(now.since(other.heard)),
         });
         let gncl = udp.and_then(|udp| me.gncl_addresses(None, [(udp, udp)]).first().map(ToString::to_string));
-        Self { udp: udp.map(|udp| udp.to_string()), gncl, lost, foreign: foreign.collect(), stalls }
+        let source = |(source, SourceCounts { places, members })| SourceReport {
+            source: Source::name(source).to_owned(),
+            is_on: is_on(stores, source),
+            places: places as u64,
+            found: members as u64,
+        };
+        let sources = sources.into_iter().map(source).collect();
+        Self { udp: udp.map(|udp| udp.to_string()), gncl, sources, lost, foreign: foreign.collect(), stalls }
+    }
+}
+
+/// Whether the configuration lets a source of addresses say anything.
+fn is_on(stores: &Stores, source: Source) -> bool {
+    let config = &stores.config;
+    match source {
+        Source::Seed => !config.ndl.seeds.is_empty(),
+        Source::Multicast => config.ndl.multicast.is_some(),
+        Source::Mdns => config.ndl.mdns_port.is_some(),
+        Source::Query => true,
+        Source::Remembered => config.state.is_some(),
     }
 }
 
@@ -205,7 +226,7 @@ fn lost_report(node: NodeAddress, lost: LostNode, now: Time) -> LostReport {
         why: why.to_owned(),
         silent_us: micros(lost.silent),
         bound_us: Some(micros(lost.bound)),
-        found_by: lost.sources.iter().map(|source| word(*source).to_owned()).collect(),
+        found_by: lost.sources.iter().map(|source| source.name().to_owned()).collect(),
     }
 }
 
@@ -221,16 +242,6 @@ fn refusals(stores: &Stores, now: Time) -> Vec<RefusalReport> {
         ago_us: micros(now.since(told.at)),
     });
     reports.collect()
-}
-
-const fn word(source: Source) -> &'static str {
-    match source {
-        Source::Seed => "seed",
-        Source::Multicast => "multicast",
-        Source::Mdns => "mdns",
-        Source::Query => "query",
-        Source::Remembered => "remembered",
-    }
 }
 
 /// Those that answer, and those that GNCL still has something for.
@@ -261,7 +272,7 @@ fn peer_report(known: &KnownNode, now: Time) -> PeerReport {
         name: Some(known.name.clone()),
         is_there: true,
         found_us: known.sources.values().min().map(|found| micros(now.since(*found))),
-        found_by: known.sources.keys().map(|source| word(*source).to_owned()).collect(),
+        found_by: known.sources.keys().map(|source| source.name().to_owned()).collect(),
         silent_us: Some(micros(now.since(known.heard))),
         missed: known.missed,
         asked_every_us: Some(micros(known.asked_every)),

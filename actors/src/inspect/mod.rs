@@ -28,8 +28,8 @@ pub use reports::{
     APPS_MAX, AccessReport, AccessVerdict, AppReport, AppsReport, AskAccess, AskApps, AskAudit, AskNode,
     AskReload, AskTree, AskWatch, AuditReport, BarrierReport, CertificateReport, DialReport, ForeignReport,
     LinkReport, LostReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping, RefusalReport, ReloadReport,
-    RouteReport, SEEN_BYTES_MAX, SEEN_MAX, SecurityReport, SeenMessage, StallReport, StreamReport, TREE_MAX,
-    TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
+    RouteReport, SEEN_BYTES_MAX, SEEN_MAX, SecurityReport, SeenMessage, SourceReport, StallReport,
+    StreamReport, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
 };
 
 #[cfg(doc)]

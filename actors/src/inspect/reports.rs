@@ -6,8 +6,8 @@ mod security;
 
 pub use access::{AccessReport, AccessVerdict, AskAccess, AskReload, ReloadReport};
 pub use peers::{
-    DialReport, ForeignReport, LinkReport, LostReport, PeerReport, RouteReport, StallReport, StreamReport,
-    TroubleReport,
+    DialReport, ForeignReport, LinkReport, LostReport, PeerReport, RouteReport, SourceReport, StallReport,
+    StreamReport, TroubleReport,
 };
 pub use security::{CertificateReport, SecurityReport};
 
@@ -30,6 +30,8 @@ pub const PEERS_MAX: usize = 1_024;
 pub const APPS_MAX: usize = 1_024;
 /// Lines of a tree in one answer at most.
 pub const TREE_MAX: usize = 1_024;
+/// Sources of addresses in one answer at most.
+const SOURCES_MAX: usize = 16;
 /// Lost nodes, or causes of refusals, in one answer at most.
 pub(super) const TOLD_MAX: usize = 64;
 /// Names that one application lacks at most: as many as it may require.
@@ -125,6 +127,9 @@ payload!("sinew.inspect.node_report" =>
         /// The addresses that it was told to ask.
         #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
         pub seeds: Vec<String>,
+        /// Who tells it where to ask for others, and what came of that.
+        #[serde(default, deserialize_with = "at_most::<_, _, SOURCES_MAX>")]
+        pub sources: Vec<SourceReport>,
         /// Nodes that it knew and that have not come back, as far as it remembers.
         #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
         pub lost: Vec<LostReport>,

@@ -32,7 +32,7 @@ use self::paths::{Paths, Reader};
 use super::{
     Event,
     address::LocalAddress,
-    core::{Core, Epoch, Input, Output, Place},
+    core::{Core, Epoch, Input, Output, Place, Source},
     datagram::{Answer, Body, Datagram, encode},
     interfaces::{self, Usable},
     mdns::{Mdns, MdnsError},
@@ -461,7 +461,7 @@ fn resolved(shell: &Shell, mdns: &Mdns, event: &ServiceEvent) -> bool {
     let addresses = mdns.addresses(service);
     addresses
         .into_iter()
-        .all(|address| shell.feed(|core, now| core.handle(now, Input::MdnsResolved { address })))
+        .all(|address| shell.feed(|core, now| core.handle(now, Input::AddressNamed { source: Source::Mdns, address })))
 }
 
 /// mdns-sd binds its socket in its own thread and reports what fails there.

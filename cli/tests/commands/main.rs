@@ -49,8 +49,9 @@ fn both_nodes_are_seen_from_either_of_them_with_their_links_and_lives() {
     let table = scenario.sinew("hip", &["nodes"]);
     // On a machine that has no time for it a node says below the table that it was starved.
     let lines = table.out.lines().filter(|line| !line.contains("got no processor")).count();
-    assert_eq!((table.code, lines), (Some(0), 3), "{}{}", table.out, table.err);
+    assert_eq!((table.code, lines), (Some(0), 4), "{}{}", table.out, table.err);
     assert!(table.out.contains("127.0.0.2") && table.out.contains("3 up"), "{}", table.out);
+    assert!(table.out.contains("hip finds others by: seed off, multicast 1"), "{}", table.out);
 }
 
 #[test]

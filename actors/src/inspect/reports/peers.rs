@@ -35,6 +35,19 @@ pub struct LostReport {
     pub found_by: Vec<String>,
 }
 
+/// What a source of addresses has come to: who says to NDL where to ask.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SourceReport {
+    /// `seed`, `multicast`, `mdns`, `query`, `remembered`.
+    pub source: String,
+    /// Whether the configuration lets it say anything.
+    pub is_on: bool,
+    /// Places that it named and that are asked now: an address, from each of this node's that leads there.
+    pub places: u64,
+    /// Nodes that are there and that it found, perhaps beside others.
+    pub found: u64,
+}
+
 /// How often the timer of a node's NDL came so late that it counted nobody as silent: it got no processor, or its host slept. Each of these puts
 /// a loss off by as much and one period.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

@@ -167,17 +167,21 @@ impl Core {
     }
 
     // spec: NDL-2.3
-    pub(super) fn resolved(&mut self, now: Time, address: SocketAddr) {
+    pub(super) fn named(&mut self, now: Time, source: Source, address: SocketAddr) {
         if self.paths.contains(&address) {
             return;
         }
         let places = self.places_of(address);
         let is_known = places.iter().all(|place| self.contacts.contains_key(place));
         if !is_known && !self.strangers.admit_any(now) {
-            self.refusals.count(now, "more addresses from mDNS than can be asked", &address);
+            self.refusals.count(
+                now,
+                "more addresses named than can be asked",
+                &format_args!("{address}, by {}", source.name()),
+            );
             return;
         }
-        places.into_iter().for_each(|place| self.look_at(now, place, Source::Mdns));
+        places.into_iter().for_each(|place| self.look_at(now, place, source));
     }
 
     /// Asks at `place` at once, unless it was asked just now.

@@ -7,6 +7,7 @@
 //! | --- | --- |
 //! | `budget` | what a flood may cost |
 //! | `contact` | an address that is talked to |
+//! | `sources` | who says where to ask |
 //! | `cycle` | who is asked when, and who missed too much |
 //! | `heard` | what a datagram means, and what it proves |
 //! | `member` | what is known of a node that answers |
@@ -39,6 +40,7 @@ mod routes;
 mod signs;
 #[cfg(test)]
 mod simulation;
+mod sources;
 #[cfg(test)]
 mod tests;
 mod troubles;
@@ -56,10 +58,12 @@ use sinew_runtime::{
     time::Time,
 };
 
-pub use self::recall::OwnStalls;
 pub(crate) use self::memory::{REMEMBERED_MAX, RememberedPeer, UNANSWERED_MAX};
+pub use self::recall::OwnStalls;
 pub(crate) use self::recall::{LostNode, Neighbour};
 pub(crate) use self::routes::Place;
+pub use self::sources::Source;
+pub(crate) use self::sources::SourceCounts;
 pub use self::view::{KnownNode, KnownRoute, TroubledApp};
 use self::{
     audience::Audience,
@@ -88,8 +92,8 @@ pub(crate) enum Input {
     AnswerReceived { from: Place, correlation: u64, sent: Time, answer: Answer },
     /// Somebody said goodbye.
     LeaveReceived { from: Place, announcement: Announcement },
-    /// Multicast DNS knows a node of this project at this address.
-    MdnsResolved { address: SocketAddr },
+    /// A source outside of the core says that a node of this project is at this address.
+    AddressNamed { source: Source, address: SocketAddr },
     /// Where members of earlier lives of this node answered, as far as that was kept; said once, also if there are none.
     PeersRemembered(Vec<RememberedPeer>),
     /// A connection of GNCL changed.
@@ -207,21 +211,6 @@ pub(crate) enum Host {
     Refuses,
     /// Nothing, in the time that it had; or it cannot be sent to.
     IsSilent,
-}
-
-/// How a node was found.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Source {
-    /// It is listed in this node's configuration.
-    Seed,
-    /// It spoke in the multicast group, or answered a query there.
-    Multicast,
-    /// Multicast DNS resolved its service.
-    Mdns,
-    /// It found this node first and asked it.
-    Query,
-    /// It was a member there before this node, or its NDL, was started anew.
-    Remembered,
 }
 
 /// Counts as an instance of the shell: an older one that still runs is not listened to.
@@ -387,7 +376,7 @@ impl Core {
                     self.taken_leave_of(now, from, &announcement);
                 }
             }
-            Input::MdnsResolved { address } => self.resolved(now, address),
+            Input::AddressNamed { source, address } => self.named(now, source, address),
             Input::PeersRemembered(peers) => self.recalled(now, peers),
             Input::Link(fact) => self.linked(now, fact),
             Input::Probed { node, incarnation, host } => self.probed(node, incarnation, host),

@@ -67,6 +67,7 @@ fn report(number: u8, name: &str, other: u8) -> NodeReport {
         gncl: Some(format!("{}:7001", node(number))),
         group: Some("239.0.0.1:7000".to_owned()),
         seeds: Vec::new(),
+        sources: Vec::new(),
         lost: Vec::new(),
         own_stalls: None,
         foreign: Vec::new(),

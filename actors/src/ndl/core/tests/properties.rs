@@ -16,7 +16,7 @@ use crate::{
     gncl::LinkFact,
     ndl::{
         MembershipFact,
-        core::{Core, Input, Output, Place, Query, RememberedPeer, Way, contact::Role},
+        core::{Core, Input, Output, Place, Query, RememberedPeer, Source, Way, contact::Role},
         datagram::{Announcement, Answer},
     },
 };
@@ -59,7 +59,7 @@ fn any_input() -> impl Strategy<Value = (u64, Input)> {
                 Input::AnswerReceived { from, correlation: 0, sent: Time::ZERO, answer }
             }
             3 => Input::LeaveReceived { from, announcement },
-            4 => Input::MdnsResolved { address: from.there },
+            4 => Input::AddressNamed { source: Source::Mdns, address: from.there },
             5 if flag => Input::Link(LinkFact::LinkBroken { node, incarnation }),
             5 => Input::Link(LinkFact::DialRefused { node, incarnation }),
             7 => Input::PeersRemembered(vec![RememberedPeer { address: from.there, node, unanswered: 7 }]),

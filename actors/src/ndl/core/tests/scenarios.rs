@@ -87,9 +87,22 @@ fn an_address_from_mdns_is_asked_at_once() {
     let mut world = World::new();
     world.start(1, &Spec { multicast: false, ..Spec::of(1) });
     world.start(2, &Spec { multicast: false, ..Spec::of(2) });
-    world.input(1, Input::MdnsResolved { address: udp(2) });
+    world.input(1, Input::AddressNamed { source: Source::Mdns, address: udp(2) });
     world.run_until(ms(1), |world| world.knows(1, 2) && world.knows(2, 1));
     assert!(world.at(1).core.members(world.now)[0].sources.contains_key(&Source::Mdns));
+}
+
+#[test]
+fn each_source_is_counted_by_itself_also_where_two_found_one_node() {
+    let mut world = World::new();
+    world.start(1, &Spec { multicast: false, seeds: vec![udp(9)], ..Spec::of(1) });
+    world.start(2, &Spec { multicast: false, ..Spec::of(2) });
+    world.input(1, Input::AddressNamed { source: Source::Mdns, address: udp(2) });
+    world.run(ms(10));
+    let counts = world.at(1).core.source_counts();
+    let of = |source| counts.get(&source).map(|counts| (counts.places, counts.members));
+    // Who was found by mDNS asks on his part.
+    assert_eq!(Source::ALL.map(of), [(1, 0), (0, 0), (1, 1), (1, 1), (0, 0)].map(Some));
 }
 
 // spec: NDL-4.1
@@ -228,7 +241,7 @@ fn nodes_that_the_network_parted_find_each_other_again_without_any_source() {
     let mut world = World::new();
     world.start(1, &Spec { multicast: false, ..Spec::of(1) });
     world.start(2, &Spec { multicast: false, ..Spec::of(2) });
-    world.input(1, Input::MdnsResolved { address: udp(2) });
+    world.input(1, Input::AddressNamed { source: Source::Mdns, address: udp(2) });
     world.run(ms(1));
     world.cut(1, 2);
     world.cut(2, 1);

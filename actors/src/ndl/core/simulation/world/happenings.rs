@@ -224,7 +224,10 @@ impl World {
     fn resolve(&mut self, process: usize, other: usize) {
         let at = self.now + self.chance.between(Duration::ZERO, WORD_MAX);
         let address = self.processes[other].addresses[0];
-        self.push(at, Event::Tell(process, Input::MdnsResolved { address }));
+        self.push(
+            at,
+            Event::Tell(process, Input::AddressNamed { source: crate::ndl::core::Source::Mdns, address }),
+        );
     }
 
     fn kill(&mut self, node: usize, refuses: bool) {
