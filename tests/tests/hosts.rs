@@ -197,3 +197,34 @@ fn an_interface_that_is_chosen_by_its_name_is_used_from_when_it_is_there() {
     counts_in_order(&hip);
     has_lost_nobody([&central, &hip]);
 }
+
+/// A node that finds others by multicast DNS alone.
+fn start_by_mdns(hosts: &Hosts, directory: &OwnDirectory, index: usize, interface: &str) -> Program {
+    let (name, address) = (NAMES[index], index + 1);
+    let path = directory.join(&format!("{name}.toml"));
+    let text = format!(
+        "[node]\nname = \"{name}\"\nproject = \"hosts\"\naddress = \"10.77.0.{address}\"\n\
+         [ndl]\ninterface = {interface}\nmulticast = false\nperiod_ms = 100\n"
+    );
+    std::fs::write(&path, text).expect("the test's own directory");
+    node_under_test(Some(&hosts.all()[index]), &path, &["--logs-info"])
+}
+
+#[test]
+fn mdns_finds_a_node_over_whichever_interface_leads_to_it_also_one_that_comes_later() {
+    let Some(hosts) = or_say(Hosts::in_networks(3, 2)) else { return };
+    let directory = OwnDirectory::new();
+    // The other one is in the second network alone.
+    let mut central = start_by_mdns(&hosts, &directory, 0, "[\"eth0/ipv4\", \"eth1/ipv4\"]");
+    let mut hip = start_by_mdns(&hosts, &directory, 1, "\"eth1/ipv4\"");
+    central.wait_for(&["NodeFound", "hip"]);
+    hip.wait_for(&["NodeFound", "central"]);
+    // Whose second interface is not there yet.
+    hosts.take_down(2, 1);
+    let mut knee = start_by_mdns(&hosts, &directory, 2, "[\"eth0/ipv4\", \"eth1/ipv4\"]");
+    knee.wait_for(&["NodeFound", "central"]);
+    hosts.bring_up(2, 1);
+    for (node, other) in [(&mut knee, "hip"), (&mut hip, "knee")] {
+        node.wait_for(&["NodeFound", other]);
+    }
+}

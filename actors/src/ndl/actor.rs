@@ -91,7 +91,7 @@ impl Actor for NdlActor {
         let chosen = &self.stores.config.ndl.interface;
         if chosen.are_ipv4_addresses() && chosen.iter().count() == 1 {
             // Nothing comes and goes.
-            if let Some(mdns) = shell.start_mdns() {
+            if let Some(mdns) = shell.paths.here().first().and_then(|here| shell.start_mdns(*here)) {
                 ctx.spawn(watch_mdns(mdns.clone()).into_actor(self));
                 ctx.spawn(browse(shell.clone(), mdns).into_actor(self));
             }
@@ -195,13 +195,9 @@ impl Shell {
         Ok((Self { stores, epoch, paths, rewind, refusals, to_probe, probes }, readers))
     }
 
-    fn start_mdns(&self) -> Option<Rc<Mdns>> {
+    fn start_mdns(&self, here: SocketAddr) -> Option<Rc<Mdns>> {
         let port = self.stores.config.ndl.mdns_port?;
-        let (udp, me) = {
-            let core = lock(&self.stores);
-            (*core.paths().first()?, core.announcement().clone())
-        };
-        Mdns::start(port, udp, &me).inspect_err(|error| warn_of_mdns(port, error)).ok().map(Rc::new)
+        Mdns::start(port, here, &self.me()).inspect_err(|error| warn_of_mdns(port, error)).ok().map(Rc::new)
     }
 
     /// Gives the core an input and does what it says; `false` when a later instance has taken over.
@@ -459,9 +455,9 @@ fn resolved(shell: &Shell, mdns: &Mdns, event: &ServiceEvent) -> bool {
     // Its other events say what mdns-sd is doing, or that a record is gone: liveness is not its business.
     let ServiceEvent::ServiceResolved(service) = event else { return true };
     let addresses = mdns.addresses(service);
-    addresses
-        .into_iter()
-        .all(|address| shell.feed(|core, now| core.handle(now, Input::AddressNamed { source: Source::Mdns, address })))
+    addresses.into_iter().all(|address| {
+        shell.feed(|core, now| core.handle(now, Input::AddressNamed { source: Source::Mdns, address }))
+    })
 }
 
 /// mdns-sd binds its socket in its own thread and reports what fails there.

@@ -1,11 +1,14 @@
 //! Discovery through multicast DNS (RFC 6762, RFC 6763): the node's service is published, those of others are found.
 //!
 //! What mDNS says is a hint where to ask, never a membership: records outlive the process that published them.
-//! mdns-sd has a thread of its own, which ends when [`Mdns`] is dropped.
+//! Each of the node's paths has a service of its own: the address there, and the port that its socket has there. So what is found is where
+//! it was heard of, and one that goes takes nothing of another one with it. mdns-sd has a thread of its own for each, which ends when its
+//! [`Mdns`] is dropped.
 
 use std::{
     collections::HashMap,
     net::{IpAddr, SocketAddr},
+    thread,
 };
 
 use mdns_sd::{
@@ -14,19 +17,22 @@ use mdns_sd::{
 use sinew_runtime::wire::fnv1a;
 
 use super::{address::seen_from, datagram::Announcement};
+use crate::nicer::give_way;
 
 /// The type of Sinew's service.
-const SERVICE: &str = "_sinew._udp.local.";
+pub(super) const SERVICE: &str = "_sinew._udp.local.";
 /// Addresses of one service that are asked, at most.
 const ADDRESSES_MAX: usize = 4;
 /// Bytes of a node's name in the service's instance name, which has 63 at most.
-const NAME_MAX: usize = 40;
+const NAME_MAX: usize = 38;
 
-/// The node's presence in multicast DNS; ends when dropped.
+/// The node's presence in multicast DNS on one of its paths; ends when dropped.
 pub(super) struct Mdns {
     daemon: ServiceDaemon,
     fullname: String,
     project: String,
+    /// As its services on other paths say, too.
+    own: [(&'static str, String); 2],
     /// Our address, where the service is published.
     here: SocketAddr,
 }
@@ -38,12 +44,12 @@ impl Mdns {
     /// Publishes the node's service at `udp` and no other interface, through the given mDNS port.
     pub(super) fn start(port: u16, udp: SocketAddr, me: &Announcement) -> Result<Self, MdnsError> {
         let service = service(udp, me)?;
-        let daemon = ServiceDaemon::new_with_port(port)?;
+        let daemon = daemon(port)?;
         let (fullname, project) = (service.get_fullname().to_owned(), me.project.clone());
-        let mdns = Self { daemon, fullname, project, here: udp };
+        let mdns = Self { daemon, fullname, project, own: life(me), here: udp };
         // Commands are obeyed in order: nothing leaves by another interface.
         mdns.daemon.disable_interface(IfKind::All)?;
-        mdns.daemon.enable_interface(interface(udp.ip()))?;
+        mdns.daemon.enable_interface(interface(udp))?;
         mdns.daemon.register(service)?;
         Ok(mdns)
     }
@@ -61,7 +67,8 @@ impl Mdns {
     /// Where the node of a resolved service can be asked, by the family in which it was looked for; nothing if it is our own or of another
     /// project.
     pub(super) fn addresses(&self, service: &ResolvedService) -> Vec<SocketAddr> {
-        let is_own = service.get_fullname().eq_ignore_ascii_case(&self.fullname);
+        let is_own =
+            self.own.iter().all(|(key, value)| service.get_property_val_str(key) == Some(value.as_str()));
         if is_own || service.get_property_val_str("project") != Some(self.project.as_str()) {
             return Vec::new();
         }
@@ -83,24 +90,43 @@ impl Drop for Mdns {
     }
 }
 
-/// 127.0.0.0/8 is one interface with one address, whichever of its addresses the node has.
-fn interface(ip: IpAddr) -> IfKind {
-    match ip {
-        IpAddr::V4(ip) if ip.is_loopback() => IfKind::LoopbackV4,
-        IpAddr::V6(ip) if ip.is_loopback() => IfKind::LoopbackV6,
-        ip @ (IpAddr::V4(_) | IpAddr::V6(_)) => IfKind::Addr(ip),
+/// mdns-sd's thread begins with the priority of who makes it, and takes no rest: under NDL's own, which is a real-time one, whoever floods its
+/// port would hold up all that is none.
+fn daemon(port: u16) -> Result<ServiceDaemon, MdnsError> {
+    let maker = thread::Builder::new().name("ndl-mdns".to_owned()).spawn(move || {
+        give_way();
+        ServiceDaemon::new_with_port(port)
+    });
+    let maker = maker.map_err(|error| MdnsError::Msg(format!("there is no thread for it: {error}")))?;
+    maker.join().unwrap_or_else(|_| Err(MdnsError::Msg("mdns-sd panicked".to_owned())))
+}
+
+/// 127.0.0.0/8 is one interface with one address, whichever of its addresses the node has. Two interfaces may have one link-local address.
+fn interface(here: SocketAddr) -> IfKind {
+    match here {
+        here if here.ip().is_ipv4() && here.ip().is_loopback() => IfKind::LoopbackV4,
+        here if here.ip().is_loopback() => IfKind::LoopbackV6,
+        SocketAddr::V6(here) if here.scope_id() != 0 => IfKind::IndexV6(here.scope_id()),
+        SocketAddr::V4(_) | SocketAddr::V6(_) => IfKind::Addr(here.ip()),
     }
+}
+
+/// Which life of which node it is.
+fn life(me: &Announcement) -> [(&'static str, String); 2] {
+    [("node", me.node.to_string()), ("incarnation", me.incarnation.to_string())]
 }
 
 fn service(udp: SocketAddr, me: &Announcement) -> Result<ServiceInfo, MdnsError> {
     let cut = (0..=NAME_MAX.min(me.name.len())).rev().find(|at| me.name.is_char_boundary(*at)).unwrap_or(0);
-    // Node addresses are unique in a project; its hash keeps projects apart.
-    let unique = format!("{:08x}{:08x}", me.node.bits(), fnv1a(me.project.as_bytes()));
-    let properties = HashMap::from([
-        ("project".to_owned(), me.project.clone()),
-        ("node".to_owned(), me.node.to_string()),
-        ("incarnation".to_owned(), me.incarnation.to_string()),
-    ]);
+    // Node addresses are unique in a project; its hash keeps projects apart, and that of the address the node's services on one link.
+    let at = match udp {
+        SocketAddr::V4(udp) => udp.ip().to_string(),
+        SocketAddr::V6(udp) => format!("{}%{}", udp.ip(), udp.scope_id()),
+    };
+    let (project, path) = (fnv1a(me.project.as_bytes()), fnv1a(at.as_bytes()));
+    let unique = format!("{:08x}{project:08x}{path:08x}", me.node.bits());
+    let mut properties = HashMap::from([("project".to_owned(), me.project.clone())]);
+    properties.extend(life(me).map(|(key, value)| (key.to_owned(), value)));
     let instance = format!("{} {unique}", &me.name[..cut]);
     let host = format!("sinew-{unique}.local.");
     let mut service = ServiceInfo::new(SERVICE, &instance, &host, udp.ip(), udp.port(), properties)?;
@@ -117,14 +143,11 @@ mod tests {
 
     use super::*;
 
-    #[test]
-    fn the_daemons_thread_ends_when_its_owner_does() {
-        // given
-        let port = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-        let me = Announcement {
+    fn me() -> Announcement {
+        Announcement {
             project: "sinew".to_owned(),
             node: NodeAddress::new(1),
-            // Cut to its 40 bytes within a character.
+            // Cut to its 38 bytes within a character.
             name: "x".to_owned() + &"ä".repeat(31),
             incarnation: Incarnation(1),
             boot_nonce: 1,
@@ -136,8 +159,14 @@ mod tests {
             ndl6: Vec::new(),
             gncl_port6: 0,
             claim: crate::ndl::datagram::Claim::Held,
-        };
-        let mdns = Mdns::start(port, "127.0.0.1:9".parse().unwrap(), &me).unwrap();
+        }
+    }
+
+    #[test]
+    fn the_daemons_thread_ends_when_its_owner_does() {
+        // given
+        let port = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        let mdns = Mdns::start(port, "127.0.0.1:9".parse().unwrap(), &me()).unwrap();
         let events = mdns.monitor().unwrap();
         // when
         drop(mdns);
@@ -146,5 +175,26 @@ mod tests {
             assert!(!matches!(event, DaemonEvent::Error(_)), "{event:?}");
         }
         assert!(events.is_disconnected(), "waited 10 s for the daemon to end");
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn the_daemons_thread_gives_way_to_those_that_carry_messages() {
+        let port = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        let mdns = Mdns::start(port, "127.0.0.1:9".parse().unwrap(), &me()).unwrap();
+        // It has done something: it runs, and has its name.
+        let said = mdns.daemon.status().unwrap().recv_timeout(Duration::from_secs(10));
+        assert!(said.is_ok(), "waited 10 s for the daemon");
+        // Of all threads of this process, and of other tests' daemons the ones that were made so.
+        let niceness = |task: std::fs::DirEntry| {
+            let read = |what| std::fs::read_to_string(task.path().join(what)).ok();
+            let stat = read("stat").filter(|_| read("comm").is_some_and(|name| name.starts_with("mDNS")))?;
+            // Behind the name, which may have spaces: field 19 of proc_pid_stat(5), of which the third is the first here.
+            stat.rsplit_once(") ")?.1.split(' ').nth(16)?.parse::<i32>().ok()
+        };
+        let own = rustix::process::getpriority_process(None).unwrap();
+        let tasks = std::fs::read_dir("/proc/self/task").unwrap();
+        let seen: Vec<_> = tasks.flatten().filter_map(niceness).collect();
+        assert!(seen.iter().any(|nice| *nice > own || own == 19), "{seen:?}, and this one has {own}");
     }
 }

@@ -5,7 +5,7 @@
 
 use std::{
     cell::{Cell, RefCell},
-    collections::BTreeSet,
+    collections::{BTreeMap, BTreeSet},
     future::pending,
     io,
     net::{SocketAddr, UdpSocket},
@@ -308,32 +308,27 @@ impl Shell {
     }
 }
 
-/// mDNS speaks at the first path, for as long as there is that, or until one of IPv4 goes before one of IPv6.
+/// Where mDNS speaks: at every path, for as long as there is that.
 #[derive(Default)]
-pub(super) struct MdnsAt(Option<(SocketAddr, Vec<AbortHandle>)>);
+pub(super) struct MdnsAt(BTreeMap<SocketAddr, Vec<AbortHandle>>);
 
 impl MdnsAt {
-    /// Begins, if there is a path and it has not begun there.
+    /// Begins where it has not begun, ends where there is no path any more.
     fn look(&mut self, shell: &Rc<Shell>, tasks: &FuturesUnordered<Task>) {
         let here = shell.paths.here();
-        if self.0.as_ref().is_some_and(|(at, _)| stays_at(*at, &here)) {
-            return;
+        self.0.retain(|at, tasks| {
+            let is_there = here.contains(at);
+            tasks.iter().filter(|_| !is_there).for_each(AbortHandle::abort);
+            is_there
+        });
+        for at in here {
+            // Where it does not start, that is said, and tried again only when the path is back.
+            self.0.entry(at).or_insert_with(|| {
+                let mdns = shell.start_mdns(at);
+                mdns.into_iter().flat_map(|mdns| begin_mdns(shell, &mdns, tasks)).collect()
+            });
         }
-        for task in self.0.take().into_iter().flat_map(|(_, tasks)| tasks) {
-            task.abort();
-        }
-        let Some(at) = here.first().copied() else { return };
-        let mdns = shell.start_mdns();
-        let handles = mdns.into_iter().flat_map(|mdns| begin_mdns(shell, &mdns, tasks)).collect();
-        // Where it does not start, that is said, and tried again only elsewhere.
-        self.0 = Some((at, handles));
     }
-}
-
-/// Whether mDNS goes on where it is, now that these are our addresses. A link-local address is there before a lease of IPv4 is: who is
-/// published at that alone is not found by those that look by IPv4, so it goes over as soon as IPv4 is what is preferred.
-fn stays_at(at: SocketAddr, here: &[SocketAddr]) -> bool {
-    here.contains(&at) && (at.is_ipv4() || here.first().is_some_and(SocketAddr::is_ipv6))
 }
 
 fn begin_mdns(shell: &Rc<Shell>, mdns: &Rc<Mdns>, tasks: &FuturesUnordered<Task>) -> [AbortHandle; 2] {
@@ -425,16 +420,6 @@ mod tests {
         let reasons: Vec<_> = unopened.iter().map(|(local, error)| (*local, error.kind())).collect();
         let expected = [io::ErrorKind::AddrInUse, io::ErrorKind::AddrNotAvailable];
         assert_eq!(reasons, wanted.into_iter().zip(expected).collect::<Vec<_>>());
-    }
-
-    #[test]
-    fn mdns_goes_over_to_ipv4_when_that_comes_after_ipv6_and_stays_where_it_is_otherwise() {
-        let [ipv4, link, other] =
-            ["10.0.0.1:7", "[fe80::1%2]:7", "[fe80::1%3]:7"].map(|at| at.parse().unwrap());
-        assert!(stays_at(link, &[link]) && stays_at(link, &[other, link]));
-        assert!(!stays_at(link, &[ipv4, link]), "a lease comes later than a link-local address");
-        assert!(stays_at(ipv4, &[ipv4, link]) && stays_at(ipv4, &[link, ipv4]));
-        assert!(!stays_at(ipv4, &[link]) && !stays_at(link, &[]));
     }
 
     #[test]
