@@ -24,7 +24,7 @@ pub(super) struct BulkThread {
 impl BulkThread {
     /// # Errors
     /// The system gives no thread, or no descriptors for its reactor.
-    pub(super) fn begin(name: &str) -> io::Result<Self> {
+    pub(super) fn begin(name: &str, courtesy: Courtesy) -> io::Result<Self> {
         let runtime = Builder::new_current_thread().enable_io().build()?;
         let handle = runtime.handle().clone();
         let (is_wanted, is_to_end) = oneshot::channel();
@@ -33,7 +33,7 @@ impl BulkThread {
             // Nothing is ever said but that nobody wants it any more.
             let _: Result<(), _> = runtime.block_on(is_to_end);
         })?;
-        Ok(Self { runtime: handle, courtesy: Arc::default(), _is_wanted: is_wanted })
+        Ok(Self { runtime: handle, courtesy: Arc::new(courtesy), _is_wanted: is_wanted })
     }
 
     /// Where its tasks are.

@@ -4,6 +4,9 @@
 //! them takes a slice of milliseconds whenever it is given away, and nobody's wait becomes shorter by it: four of them took 22 ms after each turn of 64
 //! short frames, which took 0.07 ms, and 3,000 messages of Bulk a second were left of 100,000. So after such an absence the thread goes on without
 //! giving way for as long as it was away; the system takes the CPU from it as from everybody else.
+//!
+//! The thread of handshakes, whose turns are longer and wait for nobody, runs for a millisecond before it gives way again, however soon it was back: where
+//! others compute on all CPUs, it would have one step of a handshake for each of their slices.
 
 use std::{
     sync::atomic::{AtomicU64, Ordering},
@@ -20,6 +23,8 @@ const RUN_MAX: Duration = Duration::from_millis(20);
 /// Whether to give way, of one thread.
 #[derive(Debug, Default)]
 pub(super) struct Courtesy {
+    /// When it is back it goes on for so long at least.
+    run_min: Duration,
     /// It does not before this, in nanoseconds. The thread's tasks have it in common, and nobody else has it.
     not_before: AtomicU64,
     /// Turns that have ended.
@@ -28,6 +33,11 @@ pub(super) struct Courtesy {
 }
 
 impl Courtesy {
+    /// Of a thread that goes on for so long at least when it is back.
+    pub(super) fn after_runs_of(run_min: Duration) -> Self {
+        Self { run_min, ..Self::default() }
+    }
+
     /// A turn has ended at `now`: whether the CPU is to be given away. [`was_away`](Self::was_away) follows, if it was.
     pub(super) fn gives_way(&self, now: Time) -> bool {
         #[cfg(test)]
@@ -45,10 +55,9 @@ impl Courtesy {
     /// It was given away at `from`, and is back at `now`.
     pub(super) fn was_away(&self, from: Time, now: Time) {
         let away = now.since(from);
-        if away >= LATE {
-            // SYNC: see `gives_way`.
-            self.not_before.store((now + away.min(RUN_MAX)).as_nanos(), Ordering::Relaxed);
-        }
+        let run = if away >= LATE { away.min(RUN_MAX) } else { Duration::ZERO };
+        // SYNC: see `gives_way`.
+        self.not_before.store((now + run.max(self.run_min)).as_nanos(), Ordering::Relaxed);
     }
 }
 
@@ -79,6 +88,16 @@ mod tests {
         // Whatever kept it away so long: a debugger, a host that slept.
         courtesy.was_away(at(16_000), at(90_000_000));
         assert!(!courtesy.gives_way(at(90_019_999)) && courtesy.gives_way(at(90_020_000)));
+    }
+
+    #[test]
+    fn who_has_runs_of_a_length_does_not_give_way_within_one() {
+        let courtesy = Courtesy::after_runs_of(Duration::from_millis(1));
+        assert!(courtesy.gives_way(at(0)), "it has run for long");
+        courtesy.was_away(at(0), at(10));
+        assert!(!courtesy.gives_way(at(1_009)) && courtesy.gives_way(at(1_010)));
+        courtesy.was_away(at(1_010), at(9_010));
+        assert!(!courtesy.gives_way(at(17_009)) && courtesy.gives_way(at(17_010)));
     }
 
     #[test]

@@ -29,6 +29,7 @@ use tokio::sync::Notify;
 use super::{
     bulk::BulkThread,
     core::{Attach, Lane},
+    courtesy::Courtesy,
     datagrams::{Alarm, Channel, HandedOn, Position, Sockets},
     notes::Notes,
     owed::Owed,
@@ -423,7 +424,7 @@ impl Store {
     fn bulk_place(&self, transport: &Transport) -> io::Result<Move> {
         let mut bulk = lock(&self.bulk);
         if bulk.is_none() {
-            *bulk = Some(BulkThread::begin("bulk")?);
+            *bulk = Some(BulkThread::begin("bulk", Courtesy::default())?);
         }
         let thread = bulk.as_ref().expect("it was made if there was none");
         Ok(Move {

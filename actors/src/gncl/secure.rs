@@ -1,21 +1,23 @@
 //! Who is at the other end, proven before a word is believed: the handshake of TLS on a connection between nodes.
 //!
 //! It takes a fraction of a millisecond of a CPU, and whoever can reach the port can ask for one: so it is a thread of its own that does
-//! it, nicer than those that carry messages, and it gives its CPU away after each step of one. Being nicer is not enough: the system lets who
+//! it, nicer than those that carry messages, and it gives its CPU away after each [`RUN`]. Being nicer is not enough: the system lets who
 //! computes go on to the end of a slice of milliseconds, whoever has been woken meanwhile.
 
-use std::{fmt, future::poll_fn, io, pin::pin};
+use std::{fmt, future::poll_fn, io, pin::pin, time::Duration};
 
 use rustls::{Connection, pki_types::UnixTime};
 use tokio::net::TcpStream;
 use tokio_rustls::{TlsAcceptor, TlsConnector};
 use tokio_util::task::AbortOnDropHandle;
 
-use super::{bulk::BulkThread, transport::Transport};
+use super::{bulk::BulkThread, courtesy::Courtesy, transport::Transport};
 use crate::security::{Peer, PeerFault, Tls, words};
 
 /// How a connection begins on which TLS is spoken: the type of its first record, which is no frame's first byte.
 const HANDSHAKE_RECORD: u8 = 0x16;
+/// How long the thread computes between two times that it gives its CPU away: two or three steps of handshakes, and less than others wait for a slice of it.
+const RUN: Duration = Duration::from_millis(1);
 
 /// What a node without keys says to one that has them.
 pub(super) const SEALED_WORDS: &str = "you speak TLS, and this node has no keys: it is open to everybody on its network; give it those of your project \
@@ -93,7 +95,7 @@ impl Secure {
     /// # Errors
     /// The system gives no thread, or no descriptors for its reactor.
     pub(super) fn begin(tls: Tls) -> io::Result<Self> {
-        Ok(Self { tls, thread: BulkThread::begin("handshakes")? })
+        Ok(Self { tls, thread: BulkThread::begin("handshakes", Courtesy::after_runs_of(RUN))? })
     }
 
     /// Has both ends prove who they are. Takes as long as the other end: whoever waits gives it up.
@@ -145,7 +147,7 @@ async fn shake(tls: Tls, socket: TcpStream, end: End) -> Result<(Connection, Box
 
 #[cfg(test)]
 mod tests {
-    use std::{cell::Cell, io::Write as _, time::Duration};
+    use std::{cell::Cell, io::Write as _};
 
     use rustls::ClientConnection;
 
