@@ -78,7 +78,8 @@ impl Core {
     /// The next of the strangers that are to go are due.
     pub(super) fn clear_further(&mut self, now: Time) {
         if let Some(Clearing { left, .. }) = self.clearing.take_if(|clearing| clearing.next <= now) {
-            self.clear(now, left);
+            // Some have gone by themselves: of those that are left at least half stay, as where it begins.
+            self.clear(now, left.min(self.strangers().count().div_ceil(2)));
         }
     }
 

@@ -47,3 +47,27 @@ fn many_strangers_that_give_their_descriptors_back_go_a_few_each_millisecond_as_
     let oldest = strangers[..12].iter().map(|stranger| Output::Close(*stranger));
     assert_eq!(gone, oldest.collect::<Vec<_>>());
 }
+
+#[test]
+fn no_more_go_than_half_of_those_who_are_there_where_others_have_gone_by_themselves() {
+    let mut core = Core::new(Settings { strangers_max: 40, ..settings(LOW, 1) }, 7);
+    let strangers: Vec<_> = (0..40).map(|_| core.open()).collect();
+    for stranger in &strangers {
+        core.handle(millis(0), Input::Accepted(*stranger, SOMEWHERE));
+    }
+    core.handle(millis(10), Input::Starved);
+    assert_eq!(outputs(&mut core).len(), 4);
+    // All others hang up, and two come in.
+    for stranger in &strangers[4..] {
+        core.handle(millis(10), Input::Ended(*stranger));
+    }
+    let newcomers = [core.open(), core.open()];
+    for newcomer in newcomers {
+        core.handle(millis(10), Input::Accepted(newcomer, SOMEWHERE));
+    }
+    outputs(&mut core);
+    for at in 11..40 {
+        core.handle(millis(at), Input::TimePassed);
+    }
+    assert_eq!(outputs(&mut core), [Output::Close(newcomers[0])], "half of the two, and it ends there");
+}
