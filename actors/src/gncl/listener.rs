@@ -174,7 +174,7 @@ pub(super) fn accepted(
             tokio::time::sleep(REST).await;
             at_once = 0;
         } else if at_once > 0 {
-            tokio::task::yield_now().await;
+            others_turn().await;
         }
         let accepted = poll_fn(|cx| {
             let accepted = listener.poll_accept(cx);
@@ -192,6 +192,13 @@ pub(super) fn accepted(
         let wait = accepted.as_ref().err().map_or(Duration::ZERO, |error| wait_after(error, wait));
         Some((accepted, (listener, wait, at_once)))
     })
+}
+
+/// Waits until what else is ready on the thread has had its turn. An actor looks at its streams again and again in one turn as long as there is
+/// something new, so that it is not enough to say once that nothing is ready: a task that the runtime begins runs behind the others.
+async fn others_turn() {
+    // It ends in no other way than by running, but where the runtime is being shut down.
+    let _ = tokio::spawn(async {}).await;
 }
 
 /// Whether this socket does not listen any more.
@@ -222,9 +229,12 @@ mod tests {
         sync::{
             Arc,
             atomic::{AtomicU32, Ordering},
+            mpsc::{SyncSender, sync_channel},
         },
+        time::Instant,
     };
 
+    use actix::{Actor, AsyncContext, Context, StreamHandler, System};
     use futures_util::{FutureExt, StreamExt};
 
     use super::*;
@@ -322,44 +332,64 @@ mod tests {
         let address = listener.local_addr().unwrap();
         let _dialled: Vec<_> = (0..DIALLED).map(|_| std::net::TcpStream::connect(address).unwrap()).collect();
         let mut accepted = pin!(accepted(TcpListener::from_std(listener).unwrap(), Duration::from_secs(1)));
-        let (mut all, mut longest) = (0, 0);
-        while all < DIALLED {
+        let (mut longest, mut at_once, mut before) = (0, 0, Instant::now());
+        for _ in 0..DIALLED {
             accepted.next().await.expect("it listens").unwrap();
-            let mut at_once = 1;
-            // The first look may find that others have their turn. The second one is behind that, and no time has passed for the timer.
-            while let Some(next) = accepted.next().now_or_never().or_else(|| accepted.next().now_or_never()) {
-                next.expect("it listens").unwrap();
-                at_once += 1;
-            }
+            // A slow machine may make pauses of its own, and takes none away.
+            let now = Instant::now();
+            at_once = if now.duration_since(before) < REST { at_once + 1 } else { 1 };
+            before = now;
             longest = at_once.max(longest);
-            all += at_once;
         }
-        assert!((2..=AT_ONCE_MAX).contains(&longest), "{longest} without a pause");
+        assert!(longest <= AT_ONCE_MAX, "{longest} without a pause");
     }
 
-    #[tokio::test]
-    async fn between_two_connections_that_wait_the_others_on_the_thread_have_their_turn() {
-        let listener = listen(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
-        let address = listener.local_addr().unwrap();
-        let _dialled: Vec<_> =
-            (0..AT_ONCE_MAX).map(|_| std::net::TcpStream::connect(address).unwrap()).collect();
-        let mut accepted = pin!(accepted(TcpListener::from_std(listener).unwrap(), Duration::from_secs(1)));
-        let turns = Arc::new(AtomicU32::new(0));
-        let counting = turns.clone();
-        let other = tokio::spawn(async move {
-            loop {
-                counting.fetch_add(1, Ordering::Relaxed);
+    /// Has a stream more for each connection, as the layer's shell has.
+    struct Shell(Option<TcpListener>, SyncSender<u32>, Arc<AtomicU32>);
+
+    impl Actor for Shell {
+        type Context = Context<Self>;
+
+        fn started(&mut self, context: &mut Self::Context) {
+            let listener = self.0.take().unwrap();
+            context.add_stream(accepted(listener, Duration::from_secs(1)));
+        }
+    }
+
+    impl StreamHandler<io::Result<TcpStream>> for Shell {
+        fn handle(&mut self, accepted: io::Result<TcpStream>, context: &mut Self::Context) {
+            accepted.unwrap();
+            self.1.send(self.2.load(Ordering::Relaxed)).unwrap();
+            context.add_stream(stream::pending());
+        }
+    }
+
+    #[test]
+    fn between_two_connections_that_wait_the_others_on_the_thread_have_their_turn() {
+        System::new().block_on(async {
+            let listener = listen(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
+            let address = listener.local_addr().unwrap();
+            let _dialled: Vec<_> =
+                (0..AT_ONCE_MAX).map(|_| std::net::TcpStream::connect(address).unwrap()).collect();
+            let (say, said) = sync_channel(AT_ONCE_MAX as usize);
+            let turns = Arc::new(AtomicU32::new(0));
+            let counting = turns.clone();
+            let _shell = Shell(Some(TcpListener::from_std(listener).unwrap()), say, turns).start();
+            let other = tokio::task::spawn_local(async move {
+                loop {
+                    counting.fetch_add(1, Ordering::Relaxed);
+                    tokio::task::yield_now().await;
+                }
+            });
+            let mut seen = Vec::new();
+            while seen.len() < AT_ONCE_MAX as usize {
+                seen.extend(said.try_iter());
                 tokio::task::yield_now().await;
             }
+            other.abort();
+            let have_turns = seen.windows(2).all(|pair| pair[0] < pair[1]);
+            assert!(have_turns, "turns of another task before each connection: {seen:?}");
         });
-        accepted.next().await.expect("it listens").unwrap();
-        for number in 1..AT_ONCE_MAX {
-            let before = turns.load(Ordering::Relaxed);
-            accepted.next().await.expect("it listens").unwrap();
-            let turns = turns.load(Ordering::Relaxed) - before;
-            assert!(turns > 0, "nobody had a turn between connections {number} and {}", number + 1);
-        }
-        other.abort();
     }
 
     #[test]
