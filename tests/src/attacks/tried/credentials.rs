@@ -139,9 +139,9 @@ fn shake(scene: &Scene<'_>, lasts: Duration, attempt: &Attempt<'_>) -> Happened 
                     tally.note(answer, expected);
                 }
                 Is::Decoy => {
-                    // Nothing is said in return, and whether what is said there still arrives is all the same.
+                    // Where nobody listens nothing was tried. Nothing is said in return, and whether what is said there still arrives is all the same.
+                    tally.tried += u64::from(dialled.is_ok());
                     let _ = dialled.and_then(|mut it| it.say_hello(says, scene.robot.knee_address()));
-                    tally.tried += 1;
                 }
             }
             scene.rest(PACE);
