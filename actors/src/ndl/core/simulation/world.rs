@@ -8,9 +8,10 @@ use std::{
     hash::{DefaultHasher, Hash, Hasher},
     net::{Ipv4Addr, SocketAddr, SocketAddrV4},
     rc::Rc,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
+use rustix::time::{ClockId, clock_gettime};
 use sinew_runtime::{
     tid::{AppAddress, Incarnation, NodeAddress},
     time::Time,
@@ -402,9 +403,9 @@ impl World {
 
     fn with(&mut self, process: usize, act: impl FnOnce(&mut Patient, Time)) {
         let now = self.local(process);
-        let began = Instant::now();
+        let began = on_the_cpu();
         act(&mut self.processes[process].patient, now);
-        self.in_cores += began.elapsed();
+        self.in_cores += on_the_cpu().saturating_sub(began);
         while let Some(output) = self.processes[process].patient.poll() {
             self.obey(process, now, output);
         }
@@ -427,4 +428,10 @@ impl World {
             self.push(wake, Event::Wake(process));
         }
     }
+}
+
+/// What this thread has had of a CPU: others may want it, too.
+fn on_the_cpu() -> Duration {
+    let time = clock_gettime(ClockId::ThreadCPUTime);
+    Duration::new(time.tv_sec as u64, time.tv_nsec as u32)
 }
