@@ -142,7 +142,7 @@ impl AsyncEndpoint {
     /// # Errors
     /// It was not sent.
     pub async fn send<P: Payload>(&mut self, destination: Tid, value: &P) -> Result<(), ApiError> {
-        let message = self.endpoint.typed(destination, value)?;
+        let message = self.endpoint.typed(destination, value, self.endpoint.patience())?;
         self.endpoint.dispatch(message.into(), self.endpoint.patience()).await.map(drop)
     }
 
@@ -156,7 +156,7 @@ impl AsyncEndpoint {
         value: &P,
         within: Duration,
     ) -> Result<Outcome, ApiError> {
-        let message = self.endpoint.typed(destination, value)?;
+        let message = self.endpoint.typed(destination, value, self.endpoint.patience())?;
         self.endpoint.confirm(message.into(), within).await
     }
 

@@ -164,12 +164,13 @@ impl Endpoint {
     }
 
     /// Sends a value, in the class of its type; in an envelope if its type is [protected](crate::protection), see [`guard`](Self::guard).
+    /// Whoever guards that may have sent an echo before: a message of kind `sinew.echo`, which who has sent nothing protected to it yet receives, and leaves alone.
     /// Returns when the way to the node, or the ring of a direct link, has taken it.
     ///
     /// # Errors
     /// It was not sent.
     pub fn send<P: Payload>(&mut self, destination: Tid, value: &P) -> Result<(), ApiError> {
-        let message = self.typed(destination, value)?;
+        let message = self.typed(destination, value, self.patience())?;
         at_once(self.dispatch(message.into(), self.patience())).map(drop)
     }
 
@@ -188,7 +189,7 @@ impl Endpoint {
         value: &P,
         within: Duration,
     ) -> Result<Outcome, ApiError> {
-        let message = self.typed(destination, value)?;
+        let message = self.typed(destination, value, self.patience())?;
         at_once(self.confirm(message.into(), within))
     }
 
@@ -235,17 +236,22 @@ impl Endpoint {
         deadline: Time,
         mut now: Time,
     ) -> Result<Option<Received>, ApiError> {
+        // The deadline bounds waiting. What is there at the first look is taken, or who never waits would be late for ever with what is not
+        // for the program.
+        let mut left = None;
         loop {
             // The socket first: what came just now may be more urgent or newer than what waits.
             self.take_in(None, WhenFull::Leave, now)?;
             let echo_due = self.echo(now).await;
+            let left = left.get_or_insert(self.inbox.len());
             if let Some(message) = self.inbox.pop(now) {
                 if let Some(received) = self.received(message) {
                     return Ok(Some(received));
                 }
-                // A flood of what is not for the program keeps nobody beyond its deadline.
+                // A flood of that keeps nobody much beyond its deadline.
+                *left = left.saturating_sub(1);
                 now = Time::now();
-                if now < deadline {
+                if *left > 0 || now < deadline {
                     continue;
                 }
             }

@@ -87,6 +87,11 @@ impl Inbox {
         self.queue.len() < self.capacity && self.queue.bytes() < BYTES_ENOUGH
     }
 
+    /// How many wait.
+    pub(super) fn len(&self) -> usize {
+        self.queue.len()
+    }
+
     /// Sorts a frame of the node in. One that finds its class full is refused, and its sender told so if it asked.
     pub(super) fn sort(&mut self, message: Message, awaited: Option<(u64, Awaited)>) -> Sorted {
         let sink = self.sink.clone();

@@ -124,6 +124,16 @@ impl Endpoint {
         Ok(LentMessage::new(loan, header, room, length))
     }
 
+    /// Comes back first, where `limit` leaves the time for it.
+    pub(super) fn be_ready(&mut self, limit: Limit) -> Result<(), ApiError> {
+        self.lender.be_free()?;
+        if !limit.is_in_all() {
+            // To register takes as long as it takes.
+            self.try_return();
+        }
+        Ok(())
+    }
+
     /// Sends `message` the way that is right now, and waits for room as long as `limit` allows; the link, if it did not go
     /// through the node.
     pub(super) async fn dispatch(
@@ -131,11 +141,7 @@ impl Endpoint {
         mut draft: Draft,
         limit: Limit,
     ) -> Result<Option<LinkNumber>, ApiError> {
-        self.lender.be_free()?;
-        if !limit.is_in_all() {
-            // To register takes as long as it takes.
-            self.try_return();
-        }
+        self.be_ready(limit)?;
         self.check_length(draft.payload.len())?;
         // A new connection may have another address.
         draft.header.source = self.tid;

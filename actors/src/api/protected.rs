@@ -66,7 +66,7 @@ impl Endpoint {
     /// ```
     ///
     /// # Errors
-    /// The thread that keeps the watchdogs cannot be started, or this is guarded already.
+    /// The thread that keeps the watchdogs cannot be started, this is guarded already, or the type bears no age at all.
     pub fn guard<P: Payload, O: Send + 'static>(
         &mut self,
         source: Tid,
@@ -78,7 +78,16 @@ impl Endpoint {
     }
 
     /// A message of the value, in its envelope if its type is protected.
-    pub(super) fn typed<P: Payload>(&self, destination: Tid, value: &P) -> Result<Message, ApiError> {
+    pub(super) fn typed<P: Payload>(
+        &mut self,
+        destination: Tid,
+        value: &P,
+        limit: Limit,
+    ) -> Result<Message, ApiError> {
+        if P::PROTECTION.is_some() {
+            // It may come back to another address, and it is sealed for the one that it has.
+            self.be_ready(limit)?;
+        }
         Ok(self.ends.message(self.tid, destination, self.absolute(destination), value)?)
     }
 
@@ -113,7 +122,7 @@ impl AsyncEndpoint {
     /// Has `output` moved by what `source` sends of type `P`, as [`Endpoint::guard`].
     ///
     /// # Errors
-    /// The thread that keeps the watchdogs cannot be started, or this is guarded already.
+    /// The thread that keeps the watchdogs cannot be started, this is guarded already, or the type bears no age at all.
     pub fn guard<P: Payload, O: Send + 'static>(
         &mut self,
         source: Tid,

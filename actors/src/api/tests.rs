@@ -77,6 +77,7 @@ macro_rules! on_every_transport {
 
 mod awaiting;
 mod loans;
+mod protected;
 mod registration;
 mod returns;
 mod room;

@@ -48,8 +48,9 @@ impl Endpoint {
         value: &P,
         within: Duration,
     ) -> Result<(), ApiError> {
-        let message = self.typed(destination, value)?;
-        at_once(self.dispatch(message.into(), Limit::in_all(within))).map(drop)
+        let limit = Limit::in_all(within);
+        let message = self.typed(destination, value, limit)?;
+        at_once(self.dispatch(message.into(), limit)).map(drop)
     }
 
     /// As [`send_message`](Self::send_message), for `within` at most: see [`send_within`](Self::send_within). Memory that
@@ -100,8 +101,9 @@ impl AsyncEndpoint {
         value: &P,
         within: Duration,
     ) -> Result<(), ApiError> {
-        let message = self.endpoint.typed(destination, value)?;
-        self.endpoint.dispatch(message.into(), Limit::in_all(within)).await.map(drop)
+        let limit = Limit::in_all(within);
+        let message = self.endpoint.typed(destination, value, limit)?;
+        self.endpoint.dispatch(message.into(), limit).await.map(drop)
     }
 
     /// As [`Endpoint::send_message_within`].
