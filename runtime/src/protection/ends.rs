@@ -1,6 +1,6 @@
 //! Both ends of protected messages for who has no context and no timers: an endpoint of NodeAPI, which says what came, and when.
 
-use std::{io, sync::Arc};
+use std::{collections::BTreeSet, io, sync::Arc};
 
 use super::{Cause, Echo, Fault, Flows, Guard, Guarded, Verdict};
 use crate::{
@@ -15,6 +15,8 @@ use crate::{
 pub struct Ends {
     flows: Flows,
     held: Vec<Held>,
+    /// What has ever been guarded stays so: what is protected is not for who asks for anything.
+    kinds: BTreeSet<Kind>,
 }
 
 struct Held {
@@ -58,7 +60,7 @@ impl Ends {
     /// Those of a life that began at `now`.
     #[must_use]
     pub const fn new(now: Time) -> Self {
-        Self { flows: Flows::new(now), held: Vec::new() }
+        Self { flows: Flows::new(now), held: Vec::new(), kinds: BTreeSet::new() }
     }
 
     /// A message of the value, in its envelope if its type is protected. `source` and `receiver` are absolute; `destination` is
@@ -87,7 +89,8 @@ impl Ends {
     /// [echoes](Self::echo).
     ///
     /// # Errors
-    /// The thread that keeps the watchdogs cannot be started, or this is guarded already.
+    /// The thread that keeps the watchdogs cannot be started, this is guarded already, or [`age_max`](super::Protection::age_max) of the
+    /// type is below 4 ns, so that no echo could be quoted in time.
     pub fn guard<P: Payload, O: Send + 'static>(
         &mut self,
         (source, receiver): (Tid, Tid),
@@ -95,8 +98,16 @@ impl Ends {
         output: O,
         safe: impl FnMut(&mut O, Cause) + Send + 'static,
     ) -> io::Result<Guard<O>> {
+        if P::PROTECTION.is_some_and(|protection| protection.echo_period().is_zero()) {
+            let words = format!(
+                "each '{}' is too old: the age_max of its Payload::PROTECTION is below 4 ns; take that of a period above zero",
+                P::NAME
+            );
+            return Err(io::Error::new(io::ErrorKind::InvalidInput, words));
+        }
+        self.forget_orphans();
         let is_same = |held: &Held| held.kind == P::KIND && held.guard.codename().source == source;
-        if self.held.iter().any(|held| is_same(held) && !held.guard.is_orphan()) {
+        if self.held.iter().any(is_same) {
             let words = format!(
                 "what {source} sends of '{}' is guarded already: keep that guard, or clone it",
                 P::NAME
@@ -104,8 +115,7 @@ impl Ends {
             return Err(io::Error::new(io::ErrorKind::AlreadyExists, words));
         }
         let guard = Guard::new::<P>(source, receiver, output, safe)?;
-        // The kinds of guards that are gone stay guarded: what is protected is not for who asks for anything.
-        self.held.retain(|held| !is_same(held));
+        self.kinds.insert(P::KIND);
         self.held.push(Held { guard: guard.guarded(), kind: P::KIND, echo_at: now });
         Ok(guard)
     }
@@ -124,11 +134,12 @@ impl Ends {
             message.settle(settled);
             return Came::Settled;
         }
-        let mut guards = self.held.iter().filter(|held| held.kind == kind).peekable();
-        if guards.peek().is_none() {
+        if !self.kinds.contains(&kind) {
             return Came::Plain(message);
         }
-        let why = match guards.find(|held| held.guard.codename().source == source) {
+        self.forget_orphans();
+        let is_of_it = |held: &&Held| held.kind == kind && held.guard.codename().source == source;
+        let why = match self.held.iter().find(is_of_it) {
             None => Rejection::Unsupported,
             Some(held) => match held.guard.take(&message.payload) {
                 Verdict::Apply(payload) => {
@@ -147,6 +158,11 @@ impl Ends {
     #[must_use]
     pub fn echo_due(&self) -> Option<Time> {
         self.live().map(|held| held.echo_at).min()
+    }
+
+    /// Lets go of the outputs of guards that nobody has any more: a sender that comes back has a TID of its own each time.
+    fn forget_orphans(&mut self) {
+        self.held.retain(|held| !held.guard.is_orphan());
     }
 
     /// The next echo that is due, from `own`; its sender is told it whenever it can be.
@@ -216,6 +232,37 @@ mod tests {
         assert!(matches!(ends.take(from(1, Torque::KIND)), Came::Settled), "it is still not sealed");
         assert_eq!(ends.echo_due(), None, "nobody is told to go on");
         let _second = guard(&mut ends).expect("the first one is gone");
+    }
+
+    #[test]
+    fn an_output_goes_with_its_guard_whatever_its_sender_is_called_later() {
+        let (mut ends, output) = (Ends::new(NOW), Arc::new(()));
+        for app in 1..=3 {
+            let moved = output.clone();
+            let guard = ends.guard::<Torque, _>((tid(app), tid(9)), NOW, moved, |_, _| {});
+            drop(guard.expect("a thread"));
+            assert_eq!((ends.held.len(), Arc::strong_count(&output)), (1, 2), "{app}");
+        }
+        // And: the next message of the kind is enough, which is for nobody
+        assert!(matches!(ends.take(from(3, Torque::KIND)), Came::Settled));
+        assert_eq!((ends.held.len(), Arc::strong_count(&output)), (0, 1));
+        assert!(matches!(ends.take(from(4, Torque::KIND)), Came::Settled));
+    }
+
+    #[test]
+    fn a_guard_that_would_have_to_be_told_echoes_all_the_time_is_refused() {
+        #[derive(Serialize, Deserialize)]
+        struct Instant;
+
+        impl Payload for Instant {
+            const NAME: &'static str = "test.instant";
+            const PROTECTION: Option<Protection> = Some(Protection::of_period(Duration::ZERO));
+        }
+
+        let mut ends = Ends::new(NOW);
+        let refused = ends.guard::<Instant, _>((tid(1), tid(9)), NOW, (), |_, _| {}).map(drop);
+        assert_eq!(refused.expect_err("no age is small enough").kind(), io::ErrorKind::InvalidInput);
+        assert!(ends.echo(tid(9), NOW).is_none());
     }
 
     #[test]
