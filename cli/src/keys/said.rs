@@ -3,7 +3,10 @@
 use std::{fmt::Write as _, net::Ipv4Addr, path::Path};
 
 use serde_json::{Value, json};
-use sinew::security::{UnixTime, date};
+use sinew::security::{
+    UnixTime, date,
+    files::{AUTHORITY, DENIED, DISCOVERY_KEY, NODE_CERTIFICATE, NODE_KEY},
+};
 
 use super::{
     project::{Issued, Look, Made, Revoked},
@@ -17,6 +20,8 @@ use crate::{
 
 /// Where a node's directory is on its machine, unless somebody decides otherwise.
 const INSTALLED: &str = "/etc/sinew/keys";
+/// What is in it.
+const FILES: [&str; 5] = [NODE_KEY, NODE_CERTIFICATE, AUTHORITY, DISCOVERY_KEY, DENIED];
 
 /// Of `init` and `issue`.
 pub(super) fn made(made: &Made, wanted: &[Wanted]) -> Said {
@@ -128,19 +133,22 @@ fn is_here(issued: &Issued) -> bool {
 fn copy(made: &Made, issued: &Issued) -> Option<String> {
     sent(
         &directory_of(made, issued),
-        ".",
+        (".", &FILES),
         issued,
         &format!("mkdir -p {INSTALLED} && chmod 700 {INSTALLED} && "),
     )
 }
 
-/// What has `what` of this directory unpacked on the node's machine, prepared by this; `None` where that is this one.
+/// What has `what` of this directory, which are these files, unpacked on the node's machine, prepared by this; `None` where that is this one.
 ///
-/// Each file gets its name when all have come whole: the beginning of a deny list is one, too, and a node may read it at any time.
-fn sent(directory: &str, what: &str, issued: &Issued, prepared: &str) -> Option<String> {
+/// Each file gets its name when all have come whole: the beginning of a deny list is one, too, and a node may read it at any time. An archive
+/// that is cut where a file begins is one of fewer files to `tar`.
+fn sent(directory: &str, (what, files): (&str, &[&str]), issued: &Issued, prepared: &str) -> Option<String> {
     let (from, host) = (quoted(directory), issued.identity.address);
+    let files = files.iter().fold(String::new(), |all, file| all + " new/" + file);
     let unpack = format!(
-        "{prepared}cd {INSTALLED} && rm -rf new && mkdir new && tar -C new -xp --no-same-owner && sync && mv new/* . && rmdir new"
+        "{prepared}cd {INSTALLED} && rm -rf new && mkdir new && tar -C new -xp --no-same-owner && ls{files} >/dev/null && sync && \
+         mv -f new/* . && rmdir new && sync"
     );
     (!is_here(issued)).then(|| format!("  tar -C {from} -c {what} | ssh root@{host} '{unpack}'\n"))
 }
@@ -177,7 +185,7 @@ pub(super) fn revoked(revoked: &Revoked, directory: &Path) -> Said {
         directory.join("nodes").display()
     );
     let shown = directory.display().to_string();
-    let copies = revoked.left.iter().filter_map(|issued| sent(&shown, "denied.txt", issued, ""));
+    let copies = revoked.left.iter().filter_map(|issued| sent(&shown, (DENIED, &[DENIED]), issued, ""));
     let copies: Vec<_> = copies.collect();
     if !copies.is_empty() {
         let _ = write!(text, "\nTo the nodes that are left, for example:\n{}", copies.concat());

@@ -368,6 +368,38 @@ fn what_is_cut_on_its_way_to_a_node_leaves_what_is_there() {
     assert_eq!(mode(&robot.keys.join("node.key")), 0o600);
 }
 
+/// Length of what `tar` makes of `directory` up to the second file in it.
+fn length_of_the_first_file_of(directory: &Path) -> usize {
+    const BLOCK: usize = 512;
+    let mut tar = Command::new("tar");
+    let archive = tar.arg("-C").arg(directory).args(["-c", "."]).output().expect("tar").stdout;
+    // The directory itself is first. POSIX, pax, "ustar Interchange Format": the size in octal at 124.
+    let size = std::str::from_utf8(&archive[BLOCK + 124..BLOCK + 135]).expect("digits");
+    let size = usize::from_str_radix(size, 8).expect("octal digits");
+    assert!(2 * BLOCK + size < archive.len(), "there are more");
+    2 * BLOCK + size.next_multiple_of(BLOCK)
+}
+
+#[test]
+fn a_directory_that_is_cut_where_a_file_begins_leaves_what_is_there() {
+    let directory = OwnDirectory::new();
+    let robot = Robot::new(&directory);
+    let made = keys(&directory, &["init", "walker", "hip=10.0.0.2"]);
+    assert!(robot.takes(&made.out, "cat"), "{}", made.out);
+    let before = everything(&robot.keys);
+    // When: a new certificate's directory comes, cut so that it is whole to `tar`
+    let issued = keys(&directory, &["issue", "hip"]);
+    let length = length_of_the_first_file_of(&directory.join("keys/nodes/hip"));
+    assert!(!robot.takes(&issued.out, &format!("head -c {length}")), "it is said that it did not come");
+    // Then
+    let after: Vec<_> = everything(&robot.keys);
+    assert!(before.iter().all(|file| after.contains(file)), "{after:?}");
+    // And: the whole one, which is another one
+    assert!(robot.takes(&issued.out, "cat"), "{}", issued.out);
+    let after = everything(&robot.keys);
+    assert!(after.len() == before.len() && after != before);
+}
+
 #[test]
 fn show_tells_who_has_what_until_when_also_on_the_robot() {
     let directory = OwnDirectory::new();
