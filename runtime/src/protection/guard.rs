@@ -82,7 +82,7 @@ impl<O> Inner<O> {
         if catch_unwind(AssertUnwindSafe(|| safe(output, cause))).is_ok() {
             *owes = None;
             if cause != Cause::NotArmed && cause != Cause::Dropped {
-                crate::log::warn!(%source, of = *name, %cause, "an output is safe");
+                crate::log::warn!(%source, of = *name, %cause, "a guard is shut; its output, if it has one, is safe");
             }
             return;
         }
