@@ -18,7 +18,7 @@ use std::{
 };
 
 use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, WrapFuture};
-use futures_util::{StreamExt as _, stream::FuturesUnordered};
+use futures_util::{StreamExt as _, future::join, stream::FuturesUnordered};
 use mdns_sd::{DaemonEvent, ServiceEvent};
 use sinew_runtime::{
     alarm::Alarm,
@@ -91,9 +91,8 @@ impl Actor for NdlActor {
         let chosen = &self.stores.config.ndl.interface;
         if chosen.are_ipv4_addresses() && chosen.iter().count() == 1 {
             // Nothing comes and goes.
-            if let Some(mdns) = shell.paths.here().first().and_then(|here| shell.start_mdns(*here)) {
-                ctx.spawn(watch_mdns(mdns.clone()).into_actor(self));
-                ctx.spawn(browse(shell.clone(), mdns).into_actor(self));
+            if let Some(here) = shell.paths.here().first() {
+                ctx.spawn(speak_mdns(shell.clone(), *here).into_actor(self));
             }
         } else {
             let news = (!chosen.are_ipv4_addresses()).then(|| interfaces::watch(chosen.clone()));
@@ -193,11 +192,6 @@ impl Shell {
         let (to_probe, probes) = mpsc::channel(PROBES_MAX);
         let probes = RefCell::new(Some(probes));
         Ok((Self { stores, epoch, paths, rewind, refusals, to_probe, probes }, readers))
-    }
-
-    fn start_mdns(&self, here: SocketAddr) -> Option<Rc<Mdns>> {
-        let port = self.stores.config.ndl.mdns_port?;
-        Mdns::start(port, here, &self.me()).inspect_err(|error| warn_of_mdns(port, error)).ok().map(Rc::new)
     }
 
     /// Gives the core an input and does what it says; `false` when a later instance has taken over.
@@ -433,12 +427,23 @@ async fn reached(alarm: &mut Alarm, at: Time) {
     .await;
 }
 
-async fn browse(shell: Rc<Shell>, mdns: Rc<Mdns>) {
+/// Publishes the node there and looks for others, if the configuration says so.
+async fn speak_mdns(shell: Rc<Shell>, here: SocketAddr) {
+    let Some(port) = shell.stores.config.ndl.mdns_port else { return };
+    match Mdns::start(port, here, shell.me()).await {
+        Ok(mdns) => {
+            join(watch_mdns(&mdns), browse(&shell, &mdns)).await;
+        }
+        Err(error) => warn_of_mdns(port, &error),
+    }
+}
+
+async fn browse(shell: &Shell, mdns: &Mdns) {
     loop {
         match mdns.browse() {
             Ok(events) => {
                 while let Ok(event) = events.recv_async().await {
-                    if !resolved(&shell, &mdns, &event) {
+                    if !resolved(shell, mdns, &event) {
                         return;
                     }
                 }
@@ -461,7 +466,7 @@ fn resolved(shell: &Shell, mdns: &Mdns, event: &ServiceEvent) -> bool {
 }
 
 /// mdns-sd binds its socket in its own thread and reports what fails there.
-async fn watch_mdns(mdns: Rc<Mdns>) {
+async fn watch_mdns(mdns: &Mdns) {
     let Ok(events) = mdns.monitor() else { return };
     let failures = Refusals::default();
     while let Ok(event) = events.recv_async().await {

@@ -9,12 +9,14 @@ use std::{
     collections::HashMap,
     net::{IpAddr, SocketAddr},
     thread,
+    time::Duration,
 };
 
 use mdns_sd::{
     DaemonEvent, IfKind, Receiver, ResolvedService, ScopedIp, ServiceDaemon, ServiceEvent, ServiceInfo,
 };
 use sinew_runtime::wire::fnv1a;
+use tokio::sync::oneshot;
 
 use super::{address::seen_from, datagram::Announcement};
 use crate::nicer::give_way;
@@ -25,6 +27,8 @@ pub(super) const SERVICE: &str = "_sinew._udp.local.";
 const ADDRESSES_MAX: usize = 4;
 /// Bytes of a node's name in the service's instance name, which has 63 at most.
 const NAME_MAX: usize = 38;
+/// Time after which it is said that it does not begin.
+const SLOW: Duration = Duration::from_secs(10);
 
 /// The node's presence in multicast DNS on one of its paths; ends when dropped.
 pub(super) struct Mdns {
@@ -41,10 +45,15 @@ pub(super) struct Mdns {
 pub(super) type MdnsError = mdns_sd::Error;
 
 impl Mdns {
-    /// Publishes the node's service at `udp` and no other interface, through the given mDNS port.
-    pub(super) fn start(port: u16, udp: SocketAddr, me: &Announcement) -> Result<Self, MdnsError> {
+    /// Publishes the node's service at `udp` and no other interface, through the given mDNS port. Whoever does not wait for it to the end
+    /// has no service.
+    pub(super) async fn start(port: u16, udp: SocketAddr, me: Announcement) -> Result<Self, MdnsError> {
+        made(move || Self::publish(port, udp, &me)).await
+    }
+
+    fn publish(port: u16, udp: SocketAddr, me: &Announcement) -> Result<Self, MdnsError> {
         let service = service(udp, me)?;
-        let daemon = daemon(port)?;
+        let daemon = ServiceDaemon::new_with_port(port)?;
         let (fullname, project) = (service.get_fullname().to_owned(), me.project.clone());
         let mdns = Self { daemon, fullname, project, own: life(me), here: udp };
         // Commands are obeyed in order: nothing leaves by another interface.
@@ -91,14 +100,24 @@ impl Drop for Mdns {
 }
 
 /// mdns-sd's thread begins with the priority of who makes it, and takes no rest: under NDL's own, which is a real-time one, whoever floods its
-/// port would hold up all that is none.
-fn daemon(port: u16) -> Result<ServiceDaemon, MdnsError> {
+/// port would hold up all that is none. So a thread that gives way makes it, for which NDL's never stands still: it would be as late as that
+/// one is, and lose members that are there.
+async fn made(make: impl FnOnce() -> Result<Mdns, MdnsError> + Send + 'static) -> Result<Mdns, MdnsError> {
+    let (give, mut given) = oneshot::channel();
     let maker = thread::Builder::new().name("ndl-mdns".to_owned()).spawn(move || {
         give_way();
-        ServiceDaemon::new_with_port(port)
+        // Where nobody waits any more it is dropped here, which ends its daemon.
+        drop(give.send(make()));
     });
-    let maker = maker.map_err(|error| MdnsError::Msg(format!("there is no thread for it: {error}")))?;
-    maker.join().unwrap_or_else(|_| Err(MdnsError::Msg("mdns-sd panicked".to_owned())))
+    maker.map_err(|error| MdnsError::Msg(format!("there is no thread for it: {error}")))?;
+    let panicked = |_| Err(MdnsError::Msg("mdns-sd panicked".to_owned()));
+    if let Ok(made) = tokio::time::timeout(SLOW, &mut given).await {
+        return made.unwrap_or_else(panicked);
+    }
+    crate::log::warn!(
+        "mDNS has not begun after {SLOW:?}: its thread, which gives way to others, gets no processor; see which thread takes it (`top -H`)"
+    );
+    given.await.unwrap_or_else(panicked)
 }
 
 /// 127.0.0.0/8 is one interface with one address, whichever of its addresses the node has. Two interfaces may have one link-local address.
@@ -137,8 +156,9 @@ fn service(udp: SocketAddr, me: &Announcement) -> Result<ServiceInfo, MdnsError>
 
 #[cfg(test)]
 mod tests {
-    use std::{net::UdpSocket, time::Duration};
+    use std::{net::UdpSocket, sync::mpsc};
 
+    use futures_util::FutureExt as _;
     use sinew_runtime::tid::{Incarnation, NodeAddress};
 
     use super::*;
@@ -162,26 +182,87 @@ mod tests {
         }
     }
 
-    #[test]
-    fn the_daemons_thread_ends_when_its_owner_does() {
-        // given
-        let port = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-        let mdns = Mdns::start(port, "127.0.0.1:9".parse().unwrap(), &me()).unwrap();
-        let events = mdns.monitor().unwrap();
-        // when
-        drop(mdns);
-        // then
+    fn free_port() -> u16 {
+        UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
+    }
+
+    fn publish(port: u16) -> Result<Mdns, MdnsError> {
+        Mdns::publish(port, "127.0.0.1:9".parse().unwrap(), &me())
+    }
+
+    fn run<T>(future: impl Future<Output = T>) -> T {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap();
+        runtime.block_on(future)
+    }
+
+    fn started() -> Mdns {
+        let port = free_port();
+        run(Mdns::start(port, "127.0.0.1:9".parse().unwrap(), me())).unwrap()
+    }
+
+    /// The daemon says nothing more, as it has ended.
+    fn ends(events: &Receiver<DaemonEvent>) {
         while let Ok(event) = events.recv_timeout(Duration::from_secs(10)) {
             assert!(!matches!(event, DaemonEvent::Error(_)), "{event:?}");
         }
         assert!(events.is_disconnected(), "waited 10 s for the daemon to end");
     }
 
+    #[test]
+    fn whoever_waits_for_a_maker_that_is_held_up_does_something_else_meanwhile() {
+        run(async {
+            // given
+            let (open, gate) = mpsc::channel::<()>();
+            let making = made(move || {
+                gate.recv_timeout(Duration::from_secs(10)).expect("the gate is opened");
+                publish(free_port())
+            });
+            tokio::pin!(making);
+            // when
+            let held_up = making.as_mut().now_or_never();
+            // then
+            assert!(held_up.is_none(), "it waited for the gate, which nobody had opened");
+            open.send(()).unwrap();
+            assert!(making.await.is_ok());
+        });
+    }
+
+    #[test]
+    fn a_daemon_that_nobody_waits_for_any_more_ends() {
+        // given
+        let (open, gate) = mpsc::channel::<()>();
+        let (tell, told) = mpsc::channel();
+        run(async {
+            let making = made(move || {
+                let mdns = publish(free_port())?;
+                tell.send(mdns.monitor()?).expect("the test waits");
+                gate.recv_timeout(Duration::from_secs(10)).expect("the gate is opened");
+                Ok(mdns)
+            });
+            // when
+            assert!(making.now_or_never().is_none());
+        });
+        let events = told.recv_timeout(Duration::from_secs(10)).expect("the daemon runs");
+        open.send(()).unwrap();
+        // then
+        ends(&events);
+    }
+
+    #[test]
+    fn the_daemons_thread_ends_when_its_owner_does() {
+        // given
+        let mdns = started();
+        let events = mdns.monitor().unwrap();
+        // when
+        drop(mdns);
+        // then
+        ends(&events);
+    }
+
     #[cfg(target_os = "linux")]
     #[test]
     fn the_daemons_thread_gives_way_to_those_that_carry_messages() {
-        let port = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-        let mdns = Mdns::start(port, "127.0.0.1:9".parse().unwrap(), &me()).unwrap();
+        let mdns = started();
         // It has done something: it runs, and has its name.
         let said = mdns.daemon.status().unwrap().recv_timeout(Duration::from_secs(10));
         assert!(said.is_ok(), "waited 10 s for the daemon");

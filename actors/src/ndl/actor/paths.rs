@@ -20,7 +20,7 @@ use futures_util::{
 };
 use tokio::sync::watch;
 
-use super::{Shell, browse, lock, receiving::receive, watch_mdns};
+use super::{Shell, lock, receiving::receive, speak_mdns};
 use crate::{
     config::Interfaces,
     ndl::{
@@ -28,7 +28,6 @@ use crate::{
         address::LocalAddress,
         core::Way,
         interfaces::{Flags, Usable},
-        mdns::Mdns,
         socket,
     },
     stores::{self, Stores},
@@ -310,33 +309,28 @@ impl Shell {
 
 /// Where mDNS speaks: at every path, for as long as there is that.
 #[derive(Default)]
-pub(super) struct MdnsAt(BTreeMap<SocketAddr, Vec<AbortHandle>>);
+pub(super) struct MdnsAt(BTreeMap<SocketAddr, AbortHandle>);
 
 impl MdnsAt {
     /// Begins where it has not begun, ends where there is no path any more.
     fn look(&mut self, shell: &Rc<Shell>, tasks: &FuturesUnordered<Task>) {
         let here = shell.paths.here();
-        self.0.retain(|at, tasks| {
+        self.0.retain(|at, task| {
             let is_there = here.contains(at);
-            tasks.iter().filter(|_| !is_there).for_each(AbortHandle::abort);
+            if !is_there {
+                task.abort();
+            }
             is_there
         });
         for at in here {
             // Where it does not start, that is said, and tried again only when the path is back.
             self.0.entry(at).or_insert_with(|| {
-                let mdns = shell.start_mdns(at);
-                mdns.into_iter().flat_map(|mdns| begin_mdns(shell, &mdns, tasks)).collect()
+                let (task, handle) = abortable(speak_mdns(shell.clone(), at));
+                tasks.push(task.map(drop).boxed_local());
+                handle
             });
         }
     }
-}
-
-fn begin_mdns(shell: &Rc<Shell>, mdns: &Rc<Mdns>, tasks: &FuturesUnordered<Task>) -> [AbortHandle; 2] {
-    let (watched, watching) = abortable(watch_mdns(mdns.clone()));
-    let (browsed, browsing) = abortable(browse(shell.clone(), mdns.clone()));
-    tasks.push(watched.map(drop).boxed_local());
-    tasks.push(browsed.map(drop).boxed_local());
-    [watching, browsing]
 }
 
 /// Follows the interfaces for as long as this instance is the current one.
