@@ -53,8 +53,8 @@ pub(crate) struct Stores {
     pub(crate) gncl: gncl::Store,
     /// NDL's sockets for queries and answers. They stay open while this layer is restarted.
     pub(crate) ndl_sockets: Mutex<ndl::Sockets>,
-    /// Held by who writes the file of remembered peers: one after the other, each what is so then.
-    pub(crate) ndl_file: Mutex<()>,
+    /// After how many changes that was so what the file of remembered peers has. Held by who writes it, and never by a layer's own thread.
+    pub(crate) ndl_file: Mutex<u64>,
     /// What is to be told of nodes' ends behind their last messages.
     pub(crate) aftermath: Aftermath,
     /// Which nodes are there; a restarted NDL goes on with them.

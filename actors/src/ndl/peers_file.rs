@@ -41,9 +41,14 @@ pub(super) struct Kept {
 }
 
 impl PeersFile {
-    /// That of the node with this address.
-    pub(super) fn of(directory: &Path, node: NodeAddress) -> Self {
-        Self(directory.join(format!("peers-{node}")))
+    /// That of the project's node with this address: another project's node may have the same address, and the same directory.
+    pub(super) fn of(directory: &Path, project: &str, node: NodeAddress) -> Self {
+        let letter = |byte: u8| match byte {
+            b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'_' => char::from(byte).to_string(),
+            other => format!("%{other:02x}"),
+        };
+        let project: String = project.bytes().map(letter).collect();
+        Self(directory.join(format!("peers-{project}-{node}")))
     }
 
     pub(super) fn path(&self) -> &Path {
@@ -97,8 +102,8 @@ impl PeersFile {
 
 fn replace(path: &Path, directory: &Path, bytes: &[u8]) -> io::Result<()> {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let beside = directory.join(format!(".{name}.{}.new", std::process::id()));
-    // What a process of this number left that was killed.
+    let beside = directory.join(format!(".{name}.new"));
+    // What a process left that was killed.
     let _ = std::fs::remove_file(&beside);
     let written = (|| {
         let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&beside)?;
@@ -182,7 +187,7 @@ mod tests {
         }
 
         fn file(&self) -> PeersFile {
-            PeersFile::of(&self.0.join("state"), NodeAddress::from([10, 0, 0, 1]))
+            PeersFile::of(&self.0.join("state"), "sinew", NodeAddress::from([10, 0, 0, 1]))
         }
     }
 
@@ -221,7 +226,7 @@ mod tests {
         file.write(&some()).unwrap();
         let first = std::fs::metadata(file.path()).unwrap();
         // What was begun by one that was killed.
-        let left = file.path().with_file_name(format!(".peers-10.0.0.1.{}.new", std::process::id()));
+        let left = file.path().with_file_name(".peers-sinew-10.0.0.1.new");
         std::fs::write(left, "half").unwrap();
         file.write(&some()[..1]).unwrap();
         let second = std::fs::metadata(file.path()).unwrap();
@@ -231,6 +236,18 @@ mod tests {
         assert_eq!(std::fs::metadata(directory).unwrap().mode() & 0o7777, 0o700);
         assert_eq!(std::fs::read_dir(directory).unwrap().count(), 1);
         assert_eq!(file.read().unwrap().peers.len(), 1);
+    }
+
+    #[test]
+    fn each_project_has_a_file_of_its_own_in_one_directory_whatever_its_name() {
+        let name = |project: &str| {
+            let file = PeersFile::of(Path::new("/s"), project, NodeAddress::from([10, 0, 0, 1]));
+            assert_eq!(file.path().parent(), Some(Path::new("/s")));
+            file.path().file_name().unwrap().to_str().unwrap().to_owned()
+        };
+        assert_eq!(name("arm-2"), "peers-arm-2-10.0.0.1");
+        assert_eq!(name("../ä%"), "peers-%2e%2e%2f%c3%a4%25-10.0.0.1");
+        assert!(name(&"\u{1}".repeat(63)).len() < 255 - ".".len() - ".new".len());
     }
 
     #[test]
@@ -281,7 +298,7 @@ mod tests {
         set(directory, 0o777);
         let said = file.write(&some()).unwrap_err();
         assert!(said.contains("chmod go-w"), "{said}");
-        let said = PeersFile::of(Path::new("/proc/none/such"), NodeAddress::from([10, 0, 0, 1]))
+        let said = PeersFile::of(Path::new("/proc/none/such"), "sinew", NodeAddress::from([10, 0, 0, 1]))
             .write(&[])
             .unwrap_err();
         assert!(said.contains("`node.state`"), "{said}");

@@ -1,6 +1,10 @@
 //! A node that is started again finds its peers by what it has kept in a file.
 
-use std::path::{Path, PathBuf};
+use std::{
+    fs::Permissions,
+    os::unix::fs::PermissionsExt as _,
+    path::{Path, PathBuf},
+};
 
 use super::{Node, Source, alone, free_port, lock, run, within};
 use crate::config::NodeConfig;
@@ -53,7 +57,7 @@ async fn meet(ports: [u16; 2], state: &Path) {
     let mut second = started(config, 1).await;
     first.finds(&second).await;
     second.finds(&first).await;
-    let file = state.join("peers-0.0.0.2");
+    let file = state.join("peers-sinew-0.0.0.2");
     let expected = format!("sinew peers 1\n127.0.0.1:{} 0.0.0.1 0\n", ports[0]);
     within("the file of peers", async {
         while std::fs::read_to_string(&file).ok().as_ref() != Some(&expected) {
@@ -84,7 +88,7 @@ fn rubbish_in_the_file_stops_nobody_and_what_can_be_read_of_it_counts() {
     run(async {
         let (own, ports) = (Own::new("rubbish"), [free_port(), free_port()]);
         meet(ports, &own.0).await;
-        let file = own.0.join("peers-0.0.0.2");
+        let file = own.0.join("peers-sinew-0.0.0.2");
         let mut bytes = std::fs::read(&file).unwrap();
         bytes.extend(b"\xff\xfe\0 0 0\n10.0.0.1:1 10.0.0.1 99999999999999999999\n");
         std::fs::write(&file, &bytes).unwrap();
@@ -100,6 +104,36 @@ fn rubbish_in_the_file_stops_nobody_and_what_can_be_read_of_it_counts() {
         second.finds(&first).await;
         within("the file to be looked at", async {
             while !lock(&second.stores).has_recalled() {
+                tokio::time::sleep(LOOK).await;
+            }
+        })
+        .await;
+    });
+}
+
+#[test]
+fn a_file_that_cannot_be_read_for_a_while_loses_nothing_to_who_is_met_meanwhile() {
+    run(async {
+        // given
+        let (own, ports) = (Own::new("unreadable"), [free_port(), free_port()]);
+        meet(ports, &own.0).await;
+        let file = own.0.join("peers-sinew-0.0.0.2");
+        let kept = std::fs::read_to_string(&file).unwrap();
+        // Others could have written it: it is not read.
+        std::fs::set_permissions(&file, Permissions::from_mode(0o622)).unwrap();
+        // when
+        let mut third = started(config(3, free_port(), None), 1).await;
+        let mut config = config(2, ports[1], Some(&own.0));
+        config.ndl.seeds = vec![third.udp().into()];
+        let mut second = started(config, 2).await;
+        second.finds(&third).await;
+        third.finds(&second).await;
+        // It is mended in its place: whoever has replaced it meanwhile has lost what it has.
+        std::fs::set_permissions(&file, Permissions::from_mode(0o600)).unwrap();
+        // then
+        let expected = format!("{kept}127.0.0.1:{} 0.0.0.3 0\n", third.udp().port());
+        within("the file to have both", async {
+            while std::fs::read_to_string(&file).ok().as_ref() != Some(&expected) {
                 tokio::time::sleep(LOOK).await;
             }
         })
