@@ -212,7 +212,7 @@ mod tests {
     fn whoever_waits_for_a_maker_that_is_held_up_does_something_else_meanwhile() {
         run(async {
             // given
-            let (open, gate) = mpsc::channel::<()>();
+            let (open, gate) = mpsc::sync_channel::<()>(1);
             let making = made(move || {
                 gate.recv_timeout(Duration::from_secs(10)).expect("the gate is opened");
                 publish(free_port())
@@ -230,8 +230,8 @@ mod tests {
     #[test]
     fn a_daemon_that_nobody_waits_for_any_more_ends() {
         // given
-        let (open, gate) = mpsc::channel::<()>();
-        let (tell, told) = mpsc::channel();
+        let (open, gate) = mpsc::sync_channel::<()>(1);
+        let (tell, told) = mpsc::sync_channel(1);
         run(async {
             let making = made(move || {
                 let mdns = publish(free_port())?;
