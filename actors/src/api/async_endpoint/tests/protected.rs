@@ -24,7 +24,9 @@ fn commands_come_through_the_guard_of_a_task_when_it_is_armed_and_no_sooner() {
         let mut drive = endpoint(&node, Transport::Ring).await;
         // Sealed: whoever has no guard cannot read it.
         control.send(drive.tid(), &Speed(0)).await.unwrap();
-        assert!(drive.receive().await.unwrap().decode::<Speed>().is_err());
+        let sealed =
+            timeout(WATCHDOG, drive.receive()).await.expect("the first command, which is for nobody's guard");
+        assert!(sealed.unwrap().decode::<Speed>().is_err());
         let guard = drive.guard::<Speed, _>(control.tid(), 1_u64, |speed, _| *speed = 0).unwrap();
         let deadline = Time::now() + WATCHDOG;
         let (mut sent, mut is_armed) = (0, false);
