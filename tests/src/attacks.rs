@@ -121,6 +121,8 @@ struct Happened {
     refused: Vec<(&'static str, u64)>,
     /// Messages that were sent in the sender's own name, and are to arrive.
     own_sent: u64,
+    /// The same on a link that broke: some of them may arrive.
+    own_perhaps: u64,
     /// How often what was done.
     done: Done,
 }
@@ -244,6 +246,7 @@ fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
         thread::sleep(SETTLING);
     }
     let (seen_before, dials_before, held_before) = (robot.seen(), robot.dials(), robot.held_bytes());
+    let began = Instant::now();
     let over = AtomicBool::new(false);
     let scene = Scene {
         robot: &robot,
@@ -264,6 +267,7 @@ fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
         [held_then, meanwhile.held_most, robot.held_bytes()].into_iter().max().unwrap_or_default();
     let mut happened = meanwhile.happened;
     happened.own_sent += rounds.own_sent;
+    happened.own_perhaps += rounds.own_perhaps;
     happened.let_in.extend_from_slice(&rounds.let_in);
     let outcome = report::Outcome {
         happened,
@@ -274,6 +278,7 @@ fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
         refused: since(&refused_before, robot.refused()),
         seen: robot.seen_since(&seen_before),
         dials: [0, 1].map(|node| meanwhile.dials[node] - dials_before[node]),
+        dialled_for: meanwhile.dialled_by - began,
         came: meanwhile.came,
         by_hand: meanwhile.by_hand,
     };
@@ -288,8 +293,9 @@ struct Meanwhile {
     by_hand: Option<Knocked>,
     /// Until the node that was started in the middle of it had an answer.
     came: Option<Duration>,
-    /// Connections that each node had begun.
+    /// Connections that each node had begun, and when they were counted.
     dials: [u64; 2],
+    dialled_by: Instant,
     held_most: u64,
 }
 
@@ -315,13 +321,13 @@ fn go_through(attack: &Attack, scene: &Scene<'_>) -> Meanwhile {
             thread::sleep(LOOK);
         }
         // Who goes is dialled again until it is lost: that is no attacker's doing.
-        let dials = robot.dials();
+        let (dials, dialled_by) = (robot.dials(), Instant::now());
         drop(ankle);
         over.store(true, Ordering::Relaxed);
         let happened = attacking.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
         let by_hand =
             knocking.map(|knocking| knocking.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
-        Meanwhile { happened, by_hand, came, dials, held_most }
+        Meanwhile { happened, by_hand, came, dials, dialled_by, held_most }
     })
 }
 

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use super::{
     ANSWERED_MIN, Attack, DIALS_OF_A_NEWCOMER, GROWTH_MAX, Happened, Knocked, LATE_AT_REST, SLOWER_MAX,
     keys::{self, ANKLE},
-    robot::{Refused, Seen, Window},
+    robot::{NDL_PERIOD, Refused, Seen, Window},
     rounds::{Attacked, Rounds},
 };
 
@@ -170,8 +170,9 @@ pub(super) struct Outcome {
     /// The node that was started in the middle of it, after so long.
     pub(super) came: Option<Duration>,
     pub(super) by_hand: Option<Knocked>,
-    /// Connections that both nodes have begun meanwhile.
+    /// Connections that both nodes have begun in the rounds and in the whole of it, and how long that took.
     pub(super) dials: [u64; 2],
+    pub(super) dialled_for: Duration,
 }
 
 impl Outcome {
@@ -202,13 +203,13 @@ impl Outcome {
                 broken.push(format!("{name} took {forged} messages in the name of others"));
             }
         }
-        let (sent, [_, knee]) = (self.happened.own_sent, &self.seen);
+        let (Happened { own_sent: sent, own_perhaps: perhaps, .. }, [_, knee]) = (&self.happened, &self.seen);
         let taken = knee.sent.get(&own).copied().unwrap_or_default();
         if taken > 0 {
             said.push(format!("{taken} taken in the sender's own name"));
         }
         // All but a tenth: what is under way when the link ends is nobody's promise.
-        if sent > 0 && (taken > sent || taken < sent - sent / 10) {
+        if sent + perhaps > 0 && (taken > sent + perhaps || taken < sent - sent / 10) {
             broken.push(format!("{taken} messages were taken in the sender's own name, of {sent}"));
         }
     }
@@ -230,9 +231,12 @@ impl Outcome {
         }
     }
 
-    /// Nobody has a node dial whom it would not: one that comes is dialled, and again as seldom as GNCL-8 says.
+    /// Nobody has a node dial whom it would not: one that comes is dialled, and again as seldom as GNCL-8 says; and of a member that misses an
+    /// answer, as happens where a flood leaves it no CPU, the host is tried, once a period (NDL-4.6).
     fn dials(&self, inside: bool, said: &mut Vec<String>, broken: &mut Vec<String>) {
-        let most = if self.came.is_some() { DIALS_OF_A_NEWCOMER + dials_again(self.lived.lasted) } else { 0 };
+        let newcomers = u64::from(self.came.is_some());
+        let of_newcomers = newcomers * (DIALS_OF_A_NEWCOMER + dials_again(self.lived.lasted));
+        let most = of_newcomers + (1 + newcomers) * hosts_tried(self.dialled_for);
         let hosts = if inside { 1 } else { 2 };
         for (dials, name) in self.dials.iter().zip(["hip", "knee"]).take(hosts) {
             said.push(format!("{name} dialled {dials} times"));
@@ -291,6 +295,11 @@ fn dials_again(within: Duration) -> u64 {
         dials += 1;
         wait = (wait * 2).min(Duration::from_secs(1));
     }
+}
+
+/// How often the host of one member is tried within this time at most.
+fn hosts_tried(within: Duration) -> u64 {
+    within.as_nanos().div_ceil(NDL_PERIOD.as_nanos()) as u64
 }
 
 /// How much longer 99 of 100 answers took.

@@ -27,6 +27,8 @@ use crate::{
 /// Ports that the attacked nodes listen at: each has a host of its own.
 const GNCL_PORT: u16 = 7_700;
 pub(super) const NDL_PORT: u16 = 7_701;
+/// How often they ask each other whether they are there.
+pub(super) const NDL_PERIOD: Duration = Duration::from_millis(100);
 
 /// How long answers took.
 #[derive(Clone, Copy, Debug, Default)]
@@ -391,10 +393,11 @@ fn configuration(
     let path = directory.join(format!("{}.toml", who.name));
     let (name, address, socket) = (who.name, who.address(), directory.join(format!("{}.sock", who.name)));
     let keys = keys.map_or_else(|| "false".to_owned(), |keys| format!("{keys:?}"));
+    let period = NDL_PERIOD.as_millis();
     let text = format!(
         "[node]\nname = \"{name}\"\naddress = \"{address}\"\nproject = \"{PROJECT}\"\n[lncl]\nsocket = {socket:?}\n\
          [gncl]\nport = {GNCL_PORT}\n{gncl}[ndl]\ninterface = \"{address}\"\nport = {NDL_PORT}\nmulticast = \"{group}\"\n\
-         mdns_port = false\nperiod_ms = 100\n[security]\nkeys = {keys}\n"
+         mdns_port = false\nperiod_ms = {period}\n[security]\nkeys = {keys}\n"
     );
     std::fs::write(&path, text).expect("the scene's own directory");
     path

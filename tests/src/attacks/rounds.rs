@@ -57,6 +57,8 @@ pub struct Rounds {
     pub node: Attacked,
     /// Messages to the node in the sender's own name.
     pub(super) own_sent: u64,
+    /// The same on links that broke.
+    pub(super) own_perhaps: u64,
     /// Who was let in by the node, and must not have been.
     pub(super) let_in: Vec<String>,
 }
@@ -75,6 +77,7 @@ pub(super) fn play(attack: &Attack, plan: &Plan, scene: &Scene<'_>, decoys: Opti
         let at_node = aimed(scene, scene.robot.target(), lasts);
         let happened = go_on(attack, "node", &at_node, &mut rounds.node);
         rounds.own_sent += happened.own_sent;
+        rounds.own_perhaps += happened.own_perhaps;
         rounds.let_in.extend(happened.let_in);
     }
     rounds

@@ -21,9 +21,13 @@ const AT_ONCE: u64 = 5;
 const OWN: AppAddress = AppAddress::new(0x8000_0001);
 
 pub(super) fn forged(scene: &Scene<'_>) -> Happened {
-    let sent = scene.on_threads(1, |_| speak(scene)).pop().unwrap_or(Ok([0; 2]));
-    match sent {
-        Ok([own, forged]) => {
+    let mut sent = scene.on_threads(1, |_| {
+        let mut sent = [0; 2];
+        (speak(scene, &mut sent), sent)
+    });
+    let (ended, [own, forged]) = sent.pop().unwrap_or((Ok(()), [0; 2]));
+    match ended {
+        Ok(()) => {
             let mut broken = Vec::new();
             if own == 0 || forged == 0 {
                 broken.push("nothing was sent".to_owned());
@@ -36,14 +40,15 @@ pub(super) fn forged(scene: &Scene<'_>) -> Happened {
                 ..Happened::new(what, broken)
             }
         }
-        Err(error) => {
-            Happened::new(format!("its link broke: {error}"), vec!["no link to try it on".to_owned()])
-        }
+        Err(error) => Happened {
+            own_perhaps: own,
+            ..Happened::new(format!("its link broke: {error}"), vec!["no link to try it on".to_owned()])
+        },
     }
 }
 
-/// Returns how many were sent in its own name, and in others'.
-fn speak(scene: &Scene<'_>) -> io::Result<[u64; 2]> {
+/// Counts how many were `sent` in its own name, and in others'.
+fn speak(scene: &Scene<'_>, sent: &mut [u64; 2]) -> io::Result<()> {
     let (peer, echo) = (scene.robot.knee_address(), scene.robot.echo());
     // It comes several times, and numbers its messages from 1 each time.
     let mut stranger =
@@ -53,7 +58,7 @@ fn speak(scene: &Scene<'_>) -> io::Result<[u64; 2]> {
         // It takes what comes, and says nothing.
         Is::Decoy => {}
     }
-    let (mut sent, mut number) = ([0; 2], 0_u64);
+    let mut number = 0_u64;
     while !scene.is_over() {
         for says in [SPARE, keys::HIP, keys::KNEE, keys::HIP, keys::KNEE].into_iter().take(AT_ONCE as usize) {
             number += 1;
@@ -65,7 +70,7 @@ fn speak(scene: &Scene<'_>) -> io::Result<[u64; 2]> {
     if scene.target.is == Is::Node {
         stranger.wait_for_taken(number)?;
     }
-    Ok(sent)
+    Ok(())
 }
 
 fn begin(stranger: &mut Stranger, peer: NodeAddress) -> io::Result<()> {
