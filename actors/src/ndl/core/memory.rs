@@ -3,17 +3,17 @@
 //!
 //! A remembered address is a hint, as a seed is: only an answer makes a member. It is asked as that of a lost node is, ever more seldom.
 
-use std::{net::SocketAddr, time::Duration};
+use std::{collections::BTreeMap, net::SocketAddr, time::Duration};
 
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
 use super::{
-    Core, Place, Source,
+    Core, Member, Place, Source,
     contact::{Contact, Role},
 };
 use crate::ndl::{address::unscoped, datagram::Announcement};
 
-/// Addresses that are remembered; the one at which a node was met longest ago makes room.
+/// Addresses that are remembered; the one at which a node was met longest ago makes room, and none where a member answers.
 pub(crate) const REMEMBERED_MAX: usize = 64;
 /// Those of one node: in two networks it is found when one of them is gone.
 const OF_ONE_MAX: usize = 2;
@@ -40,10 +40,27 @@ struct Entry {
     is_sought: bool,
 }
 
+/// Where the node of a remembered address is now; who stands first makes room first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Standing {
+    /// It is no member.
+    Gone,
+    /// It is a member that does not answer there now.
+    Elsewhere,
+    /// It is a member, and answers there.
+    Here,
+}
+
+fn standing(members: &BTreeMap<NodeAddress, Member>, peer: &RememberedPeer) -> Standing {
+    let Some(member) = members.get(&peer.node) else { return Standing::Gone };
+    let answers = member.routes.places().any(|place| unscoped(place.there) == peer.address);
+    if answers { Standing::Here } else { Standing::Elsewhere }
+}
+
 /// All that is remembered so.
 #[derive(Debug, Default)]
 pub(super) struct Memory {
-    /// The one that was met longest ago first.
+    /// The one that was met longest ago first, as far as it is no member.
     entries: Vec<Entry>,
     /// When what earlier lives remembered was taken in.
     recalled: Option<Time>,
@@ -53,25 +70,43 @@ pub(super) struct Memory {
 }
 
 impl Memory {
-    /// A member answers there, and on all these `routes`.
-    fn met(&mut self, node: NodeAddress, address: SocketAddr, routes: &[SocketAddr]) {
+    /// A member answers there. How each of those that are remembered stands now decides which makes room, if one must.
+    fn met(
+        &mut self,
+        node: NodeAddress,
+        address: SocketAddr,
+        standing: impl Fn(&RememberedPeer) -> Standing,
+    ) {
         let known = self.entries.iter().position(|entry| entry.peer.address == address);
         let known = known.map(|at| self.entries.remove(at).peer);
         let is_its = known.is_some_and(|peer| peer.node == node);
+        if !is_its && !self.makes_room(node, standing) {
+            self.changes += u64::from(known.is_some());
+            return;
+        }
         self.changes += u64::from(known.is_none_or(|peer| !is_its || peer.unanswered > 0));
-        if !is_its && self.entries.iter().filter(|entry| entry.peer.node == node).count() >= OF_ONE_MAX {
-            // Where it does not answer now makes room, not where it does.
-            let is_left = |entry: &Entry| entry.peer.node == node && !routes.contains(&entry.peer.address);
-            let Some(left) = self.entries.iter().position(is_left) else {
-                self.changes -= u64::from(known.is_none());
-                return;
-            };
-            self.entries.remove(left);
-        }
-        if self.entries.len() >= REMEMBERED_MAX {
-            self.entries.remove(0);
-        }
         self.entries.push(Entry { peer: RememberedPeer { address, node, unanswered: 0 }, is_sought: false });
+    }
+
+    /// Whether there is room for one more of this node. Where a node has all its places, one of its own makes it; where a member answers,
+    /// none does.
+    fn makes_room(&mut self, node: NodeAddress, standing: impl Fn(&RememberedPeer) -> Standing) -> bool {
+        let is_own = |entry: &Entry| entry.peer.node == node;
+        let has_all = self.entries.iter().filter(|entry| is_own(entry)).count() >= OF_ONE_MAX;
+        if !has_all && self.entries.len() < REMEMBERED_MAX {
+            return true;
+        }
+        // Of those that stand alike the first one: that which was met longest ago.
+        let leaves = self.entries.iter().enumerate().filter(|(_, entry)| !has_all || is_own(entry));
+        let leaves = leaves.map(|(at, entry)| (standing(&entry.peer), at)).min();
+        let Some((Standing::Gone | Standing::Elsewhere, at)) = leaves else { return false };
+        self.entries.remove(at);
+        true
+    }
+
+    /// A node was a member until now: it was met last at this moment, not when it came.
+    pub(super) fn parted(&mut self, node: NodeAddress) {
+        self.entries.sort_by_key(|entry| entry.peer.node == node);
     }
 
     /// Earlier lives remembered these, the one that was met longest ago first. Who was met in this life goes before them.
@@ -97,9 +132,11 @@ impl Memory {
 }
 
 impl Core {
-    /// What is remembered, the one that was met longest ago first.
+    /// What is remembered, the one that was met longest ago first: members are met at this moment.
     pub(crate) fn remembered(&self) -> Vec<RememberedPeer> {
-        self.memory.entries.iter().map(|entry| entry.peer).collect()
+        let mut all: Vec<_> = self.memory.entries.iter().map(|entry| entry.peer).collect();
+        all.sort_by_key(|peer| standing(&self.members, peer) != Standing::Gone);
+        all
     }
 
     /// How often that has changed.
@@ -142,14 +179,16 @@ impl Core {
         met
     }
 
-    /// A member answers there. Where nodes have keys it is remembered when it has proven itself, too. // spec: NDL-2.5
+    /// Whether a member is taken for what it says that it is: where nodes have keys, when it has proven itself, too. // spec: NDL-2.5
+    fn is_believed(&self, node: NodeAddress) -> bool {
+        self.members.contains_key(&node) && (!self.proves_peers() || self.is_proven(node))
+    }
+
+    /// A member answers there; it is remembered when it is believed.
     pub(super) fn note_met(&mut self, node: NodeAddress, place: Place) {
-        let Some(member) = self.members.get(&node) else { return };
-        if self.proves_peers() && !self.is_proven(node) {
-            return;
+        if self.is_believed(node) {
+            self.memory.met(node, unscoped(place.there), |peer| standing(&self.members, peer));
         }
-        let routes: Vec<_> = member.routes.places().map(|route| unscoped(route.there)).collect();
-        self.memory.met(node, unscoped(place.there), &routes);
     }
 
     /// The same of each place where it answers.
@@ -190,12 +229,7 @@ impl Core {
             return;
         }
         self.memory.has_counted = true;
-        let answers = |peer: &RememberedPeer| {
-            let member = self.members.get(&peer.node);
-            member.is_some_and(|member| {
-                member.routes.places().any(|place| unscoped(place.there) == peer.address)
-            })
-        };
+        let answers = |peer: &RememberedPeer| standing(&self.members, peer) == Standing::Here;
         let mut forgotten = Vec::new();
         for entry in &mut self.memory.entries {
             if entry.is_sought && !answers(&entry.peer) {
@@ -233,35 +267,69 @@ mod tests {
         memory.entries.iter().map(|entry| entry.peer.address).collect()
     }
 
+    fn has(memory: &Memory, last: u8) -> bool {
+        kept(memory).contains(&at(last))
+    }
+
+    fn here(_: &RememberedPeer) -> Standing {
+        Standing::Here
+    }
+
+    fn gone(_: &RememberedPeer) -> Standing {
+        Standing::Gone
+    }
+
     #[test]
     fn the_one_that_was_met_longest_ago_makes_room() {
         let mut memory = Memory::default();
-        (1..=64).for_each(|last| memory.met(node(last), at(last), &[at(last)]));
-        memory.met(node(1), at(1), &[at(1)]);
-        memory.met(node(65), at(65), &[at(65)]);
-        let kept = kept(&memory);
-        assert_eq!(kept.len(), REMEMBERED_MAX);
-        assert!(kept.contains(&at(1)) && !kept.contains(&at(2)) && kept.contains(&at(65)));
+        (1..=64).for_each(|last| memory.met(node(last), at(last), here));
+        memory.met(node(1), at(1), here);
+        memory.met(node(65), at(65), gone);
+        assert_eq!(kept(&memory).len(), REMEMBERED_MAX);
+        assert!(has(&memory, 1) && !has(&memory, 2) && has(&memory, 65));
+    }
+
+    #[test]
+    fn who_is_a_member_stays_and_of_the_others_the_one_that_was_a_member_longest_ago_goes() {
+        let mut memory = Memory::default();
+        (1..=64).for_each(|last| memory.met(node(last), at(last), here));
+        // All but 1, 2 and 64 are members, 64 nowhere that it is remembered; 1 was one longer than 2.
+        memory.parted(node(2));
+        memory.parted(node(1));
+        let standing = |peer: &RememberedPeer| match peer.node {
+            other if [node(1), node(2)].contains(&other) => Standing::Gone,
+            other if other == node(64) => Standing::Elsewhere,
+            _ => Standing::Here,
+        };
+        for (last, left) in [(65, 2), (66, 1), (67, 64)] {
+            assert!(has(&memory, left));
+            memory.met(node(last), at(last), standing);
+            assert!(!has(&memory, left) && has(&memory, last), "{left} makes room for {last}");
+        }
+        let (before, changes) = (kept(&memory), memory.changes);
+        memory.met(node(68), at(68), standing);
+        assert_eq!((kept(&memory), memory.changes), (before, changes), "a member answers at each");
     }
 
     #[test]
     fn one_node_with_many_addresses_leaves_room_for_others_and_keeps_those_where_it_answers() {
         let mut memory = Memory::default();
-        let routes: Vec<_> = (1..=8).map(at).collect();
-        (1..=8).for_each(|last| memory.met(node(1), at(last), &routes));
+        (1..=8).for_each(|last| memory.met(node(1), at(last), here));
         assert_eq!(kept(&memory), [at(1), at(2)]);
         let before = memory.changes;
-        memory.met(node(1), at(3), &routes);
+        memory.met(node(1), at(3), here);
         assert_eq!(memory.changes, before, "nothing was kept, so nothing has changed");
         // It is elsewhere now.
-        memory.met(node(1), at(9), &[at(9), at(2)]);
+        let moved =
+            |peer: &RememberedPeer| if peer.address == at(1) { Standing::Elsewhere } else { Standing::Here };
+        memory.met(node(1), at(9), moved);
         assert_eq!(kept(&memory), [at(2), at(9)]);
     }
 
     #[test]
     fn what_this_life_has_met_goes_before_what_earlier_ones_did() {
         let mut memory = Memory::default();
-        memory.met(node(1), at(1), &[at(1)]);
+        memory.met(node(1), at(1), here);
         memory.recall(Time::ZERO, (1..=80).map(|last| peer(last, 3)).collect());
         let kept = kept(&memory);
         assert_eq!((kept.len(), kept.last()), (REMEMBERED_MAX, Some(&at(1))));
@@ -274,11 +342,11 @@ mod tests {
         let mut memory = Memory::default();
         memory.recall(Time::ZERO, vec![peer(1, 0), peer(2, 3)]);
         assert_eq!(memory.changes, 0);
-        memory.met(node(1), at(1), &[at(1)]);
+        memory.met(node(1), at(1), here);
         assert_eq!(memory.changes, 0, "it was there already");
-        memory.met(node(2), at(2), &[at(2)]);
+        memory.met(node(2), at(2), here);
         assert_eq!(memory.changes, 1, "it answers again");
-        memory.met(node(3), at(2), &[at(2)]);
+        memory.met(node(3), at(2), here);
         assert_eq!(memory.changes, 2, "another node has its address");
     }
 }

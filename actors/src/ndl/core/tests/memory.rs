@@ -9,7 +9,7 @@ use crate::{
     gncl::LinkFact,
     ndl::{
         LossReason,
-        core::{Input, RememberedPeer, Source, UNANSWERED_MAX},
+        core::{Input, REMEMBERED_MAX, RememberedPeer, Source, UNANSWERED_MAX},
     },
 };
 
@@ -140,6 +140,32 @@ fn an_answer_clears_what_was_counted_against_an_address() {
     world.input(1, Input::PeersRemembered(vec![kept]));
     world.run(Duration::from_secs(121));
     assert_eq!(remembered(&world, 1), [RememberedPeer { unanswered: 0, ..kept }]);
+}
+
+// spec: NDL-2.5
+#[test]
+fn where_all_places_are_taken_members_keep_theirs_and_who_was_one_longest_ago_makes_room() {
+    // given: more members than places, one after the other
+    let mut world = World::new();
+    world.start(1, &Spec { nodes_max: 128, ..Spec::of(1) });
+    let meet = |world: &mut World, index: u16| {
+        world.start(index, &alone(index.into(), 1));
+        world.run_until(PERIOD * 2, |world| world.knows(1, index.into()));
+    };
+    let last = u16::try_from(REMEMBERED_MAX).expect("a few") + 1;
+    (2..=last + 1).for_each(|index| meet(&mut world, index));
+    // then
+    let nodes = |world: &World| remembered(world, 1).iter().map(|peer| peer.node.bits()).collect::<Vec<_>>();
+    assert_eq!(nodes(&world), (2..=u32::from(last)).collect::<Vec<_>>());
+    // when: two leave, who came first last
+    for left in [3_u16, 2] {
+        world.input(left, Input::Stopping);
+        world.run_until(ms(1), |world| !world.knows(1, left.into()));
+    }
+    meet(&mut world, last + 2);
+    // then: what is kept begins with who is no member
+    assert_eq!(nodes(&world)[0], 2);
+    assert!(!nodes(&world).contains(&3) && nodes(&world).contains(&u32::from(last + 2)));
 }
 
 // spec: NDL-2.5, NDL-3.2
