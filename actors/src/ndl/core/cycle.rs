@@ -158,6 +158,7 @@ impl Core {
     // spec: NDL-2.1
     fn ask_everybody(&mut self, now: Time) {
         self.count_start(now);
+        self.meet_remembered_again(now);
         self.seek_all(now);
         self.tell_moves(now);
         // Also who cannot be asked at all: none of our addresses leads there any more.

@@ -238,7 +238,6 @@ impl Core {
             former.into_iter().for_each(|place| self.forget_former(place, node));
             sought.extend(announced.into_iter().filter(|place| self.seeks_former(*place, node)));
         }
-        sought.extend(self.settle_remembered(from, &announcement));
         self.contact_at(now, from).role = Role::Member(node);
         let pace = self.pace_for(now, &name);
         let member = Member {
@@ -261,6 +260,7 @@ impl Core {
             fence,
         };
         self.members.insert(node, member);
+        sought.extend(self.settle_remembered(node));
         self.recall.found(node);
         self.note_met(node, from);
         // Before the fact, so that GNCL knows the clock of a peer when it connects.

@@ -11,7 +11,7 @@ use super::{
     Core, Member, Place, Source,
     contact::{Contact, Role},
 };
-use crate::ndl::{address::unscoped, datagram::Announcement};
+use crate::ndl::address::unscoped;
 
 /// Addresses that are remembered; the one at which a node was met longest ago makes room, and none where a member answers.
 pub(crate) const REMEMBERED_MAX: usize = 64;
@@ -159,24 +159,38 @@ impl Core {
 
     /// Makes contacts of those that are sought, from every address of ours; returns where they are.
     pub(super) fn meet_remembered(&mut self, now: Time) -> Vec<Place> {
-        let sought = self.memory.entries.iter().filter(|entry| entry.is_sought).map(|entry| entry.peer);
         let mut met = Vec::new();
-        for RememberedPeer { address, node, .. } in sought.collect::<Vec<_>>() {
-            let places = self.paths.iter().map(|here| Place::between(*here, address));
-            // An address that was another node's may be our own by now.
-            let places = places.filter(|place| place.is_a_way() && !self.paths.contains(&place.there));
-            for place in places.collect::<Vec<_>>() {
-                let contact = self.contacts.entry(place).or_insert_with(|| Contact::remembered(now, node));
-                match &mut contact.role {
-                    Role::Member(_) => continue,
-                    Role::Candidate { .. } => {}
-                    Role::Former { wait, left, .. } => (*wait, *left) = (1, 0),
-                }
-                contact.sources.entry(Source::Remembered).or_insert(now);
-                met.push(place);
+        for (place, node) in self.sought_places() {
+            let contact = self.contacts.entry(place).or_insert_with(|| Contact::remembered(now, node));
+            match &mut contact.role {
+                Role::Member(_) => continue,
+                // Another source named it. When that one's time is over, it is met anew.
+                Role::Candidate { .. } => {}
+                Role::Former { wait, left, .. } => (*wait, *left) = (1, 0),
             }
+            contact.sources.entry(Source::Remembered).or_insert(now);
+            met.push(place);
         }
         met
+    }
+
+    /// The same of those that have none any more: other sources named them and nobody answered, too many others were named, or somebody
+    /// answered there, or elsewhere in their node's name, and is gone. // spec: NDL-2.5
+    pub(super) fn meet_remembered_again(&mut self, now: Time) {
+        for (place, node) in self.sought_places() {
+            self.contacts.entry(place).or_insert_with(|| Contact::remembered(now, node));
+        }
+    }
+
+    /// Where those are asked that are sought. A member says itself where else it is.
+    fn sought_places(&self) -> Vec<(Place, NodeAddress)> {
+        let sought = self.memory.entries.iter().filter(|entry| entry.is_sought).map(|entry| entry.peer);
+        let sought = sought.filter(|peer| !self.is_believed(peer.node));
+        let places = sought.flat_map(|RememberedPeer { address, node, .. }| {
+            self.paths.iter().map(move |here| (Place::between(*here, address), node))
+        });
+        // An address that was another node's may be our own by now.
+        places.filter(|(place, _)| place.is_a_way() && !self.paths.contains(&place.there)).collect()
     }
 
     /// Whether a member is taken for what it says that it is: where nodes have keys, when it has proven itself, too. // spec: NDL-2.5
@@ -197,20 +211,27 @@ impl Core {
         places.into_iter().flatten().for_each(|place| self.note_met(node, place));
     }
 
-    /// A node is found at `from`. Of the other places where it was remembered it is asked at those that it announces, as at any that it
-    /// announces; at the others it is not any more. Returns the former.
-    pub(super) fn settle_remembered(&mut self, from: Place, found: &Announcement) -> Vec<Place> {
-        if !self.memory.has(found.node) {
+    /// A node is found. Of the other places where it was remembered it is asked at those that it announces, as at any that it announces; at
+    /// the others not any more, until it is lost. Returns the former.
+    ///
+    /// Anybody may have answered in its name. Where nodes have keys that leads away from none of the others before he has proven himself.
+    /// Where they have none he is the node until he is lost, as wherever he is met; what is remembered of the others stays, and they are
+    /// asked again then.
+    pub(super) fn settle_remembered(&mut self, node: NodeAddress) -> Vec<Place> {
+        let Some(found) = self.members.get(&node).map(|member| &member.announcement) else {
+            return Vec::new();
+        };
+        if !self.memory.has(node) {
             return Vec::new();
         }
-        let is_its = |(place, contact): &(&Place, &Contact)| {
-            **place != from && contact.is_remembered_alone() && contact.is_former_of(found.node)
-        };
-        let places: Vec<_> = self.contacts.iter().filter(is_its).map(|(place, _)| *place).collect();
-        let (announced, others): (Vec<_>, Vec<_>) =
-            places.into_iter().partition(|place| found.has_ndl_at(place.there));
-        for place in others {
-            self.contacts.remove(&place);
+        let is_its =
+            |(_, contact): &(&Place, &Contact)| contact.is_remembered_alone() && contact.is_former_of(node);
+        let places = self.contacts.iter().filter(is_its).map(|(place, _)| *place);
+        let (announced, others): (Vec<_>, Vec<_>) = places.partition(|place| found.has_ndl_at(place.there));
+        if self.is_believed(node) {
+            for place in others {
+                self.contacts.remove(&place);
+            }
         }
         for place in &announced {
             if let Some(contact) = self.contacts.get_mut(place) {

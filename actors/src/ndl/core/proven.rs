@@ -87,6 +87,9 @@ impl Core {
             self.lose(now, node, LossReason::Duplicate);
         }
         self.note_all_met(node);
+        for place in self.settle_remembered(node) {
+            self.ask_unless_just_asked(now, place);
+        }
     }
 
     /// Whether what was answered contradicts a connection that stands: another life of its node has it, or the node that was asked there.

@@ -9,7 +9,7 @@ use crate::{
     gncl::LinkFact,
     ndl::{
         LossReason,
-        core::{Input, REMEMBERED_MAX, RememberedPeer, Source, UNANSWERED_MAX},
+        core::{Input, Output, REMEMBERED_MAX, RememberedPeer, Source, UNANSWERED_MAX},
     },
 };
 
@@ -89,6 +89,70 @@ fn an_address_where_nobody_answers_is_asked_ever_more_seldom_and_never_given_up(
     assert!((8..=12).contains(&asked), "{asked} of 100 periods");
     world.start(9, &alone(9, 1));
     world.run_until(PERIOD * 18, |world| world.knows(1, 9) && world.knows(9, 1));
+}
+
+// spec: NDL-2.5
+#[test]
+fn an_address_that_another_source_names_just_before_it_is_remembered_is_asked_for_as_long_as_any() {
+    let mut world = World::new();
+    world.start(1, &alone(1, 1));
+    world.input(1, Input::AddressNamed { source: Source::Mdns, address: udp(9) });
+    world.input(1, Input::PeersRemembered(vec![nobody()]));
+    world.run(PERIOD * 100);
+    world.start(9, &alone(9, 1));
+    world.run_until(PERIOD * 18, |world| world.knows(1, 9) && world.knows(9, 1));
+}
+
+// spec: NDL-2.5
+#[test]
+fn who_answers_in_a_nodes_name_and_goes_leaves_the_other_addresses_where_it_is_remembered() {
+    let remembered_at = |index| RememberedPeer { address: udp(index), node: node(2), unanswered: 0 };
+    let leave = |world: &mut World| world.input(2, Input::Stopping);
+    let crash = |world: &mut World| world.kill(2);
+    for go in [&leave as &dyn Fn(&mut World), &crash] {
+        // given: another machine has one of its addresses, and its node address
+        let mut world = World::new();
+        world.start(1, &alone(1, 1));
+        world.start(2, &alone(2, 1));
+        world.input(1, Input::PeersRemembered(vec![remembered_at(2), remembered_at(3)]));
+        world.run_until(ms(1), |world| world.knows(1, 2));
+        assert!(world.at(1).core.contacts.keys().all(|place| place.there != udp(3)), "it is found");
+        // when
+        go(&mut world);
+        world.run_until(PERIOD * 6, |world| !world.knows(1, 2));
+        world.start(3, &alone(2, 2));
+        // then
+        world.run_until(PERIOD * 18, |world| world.knows(1, 2) && world.knows(3, 1));
+    }
+}
+
+// spec: NDL-2.5, NDL-5.8
+#[test]
+fn where_nodes_have_keys_who_has_not_proven_himself_leads_away_from_no_address() {
+    // given: somebody without a key answers in the name of 2 where that was
+    let remembered_at = |index| RememberedPeer { address: udp(index), node: node(2), unanswered: 0 };
+    let asks_there = |world: &World| world.at(1).core.contacts.keys().any(|place| place.there == udp(3));
+    let with_a_stranger = || {
+        let mut world = World::new();
+        world.start(1, &Spec { has_keys: true, ..alone(1, 1) });
+        world.start(2, &alone(2, 1));
+        world.input(1, Input::PeersRemembered(vec![remembered_at(2), remembered_at(3)]));
+        world.run_until(ms(1), |world| world.knows(1, 2));
+        world.run(PERIOD * 20);
+        assert!(asks_there(&world));
+        world
+    };
+    // when, then: the node itself is found where else it was, and with it that there are two
+    let mut world = with_a_stranger();
+    world.start(3, &alone(2, 2));
+    let is_collision = |other: &Output| matches!(other, Output::Collision { .. });
+    world.run_until(PERIOD * 18, |world| world.at(1).others.iter().any(is_collision));
+    // when, then: it was no stranger
+    let mut world = with_a_stranger();
+    world.link(1, LinkFact::LinkUp { node: node(2), incarnation: Incarnation(1) });
+    assert!(!asks_there(&world));
+    world.run(PERIOD * 20);
+    assert!(!asks_there(&world), "it says itself where it is");
 }
 
 // spec: NDL-2.5
