@@ -33,6 +33,12 @@ pub fn discovery(bytes: &[u8]) -> bool {
     crate::ndl::fuzzing::discovery(bytes)
 }
 
+/// The file in which a node keeps where its peers answered.
+#[must_use]
+pub fn peers(bytes: &[u8]) -> bool {
+    crate::ndl::fuzzing::peers(bytes)
+}
+
 /// A script of sealed datagrams of discovery, honest, forged, damaged and sent again, played to a live checker of seals.
 #[must_use]
 pub fn seals(script: &[u8]) -> bool {
@@ -81,6 +87,7 @@ pub fn seeds(format: &str) -> Vec<Vec<u8>> {
         "session" => vec![crate::session::fuzzing::A_SESSION.to_vec()],
         "datagrams" => crate::gncl::fuzzing::some_datagrams(),
         "discovery" => crate::ndl::fuzzing::some_datagrams(),
+        "peers" => crate::ndl::fuzzing::some_peers(),
         "seals" => vec![crate::secured::fuzzing::SOME_SEALS.to_vec()],
         "protected" => vec![sinew_runtime::protection::fuzzing::SOME_MESSAGES.to_vec()],
         "access" => crate::access::fuzzing::some_lists(),

@@ -1,4 +1,6 @@
-//! Any datagram of discovery, against what is promised.
+//! Any datagram of discovery, and any file of remembered peers, against what is promised.
+
+use std::net::SocketAddr;
 
 use sinew_runtime::{
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
@@ -6,10 +8,15 @@ use sinew_runtime::{
     wire::{HEADER_LEN, Header, MAGIC, VERSION},
 };
 
-use super::Progress;
-use super::datagram::{
-    Announcement, Answer, Body, Claim, DATAGRAM_MAX, Datagram, encode, maker_of, parse, peek_answer,
+use super::{
+    Progress,
+    core::{Core, Input, REMEMBERED_MAX, RememberedPeer, UNANSWERED_MAX},
+    datagram::{
+        Announcement, Answer, Body, Claim, DATAGRAM_MAX, Datagram, encode, maker_of, parse, peek_answer,
+    },
+    peers_file,
 };
+use crate::config::NodeConfig;
 
 const HERE: NodeAddress = NodeAddress::new(5);
 
@@ -96,4 +103,53 @@ fn mend(bytes: &mut [u8]) {
     if let Ok(header) = Header::decode_in_memory(head) {
         *head = header.encode(payload);
     }
+}
+
+pub(crate) fn some_peers() -> Vec<Vec<u8>> {
+    let lines = "10.0.0.7:6911 10.0.0.7 0\n[fd00::9]:6911 10.0.0.9 3\n[fe80::9]:1 10.0.0.9 7\n";
+    let full: String = (1..=80).map(|last| format!("10.0.0.{last}:1 10.0.0.{last} 0\n")).collect();
+    // A line of each, and one that is none.
+    let damaged = format!("{lines}10.0.0.8:0 10.0.0.8 0\n");
+    [lines, &full, &damaged].map(|lines| [peers_file::FIRST_LINE, "\n", lines].concat().into_bytes()).into()
+}
+
+pub(crate) fn peers(bytes: &[u8]) -> bool {
+    let is_read = are_read(bytes);
+    // No fuzzer guesses what the file begins with.
+    are_read(&[peers_file::FIRST_LINE.as_bytes(), b"\n", bytes].concat()) || is_read
+}
+
+fn are_read(bytes: &[u8]) -> bool {
+    let kept = peers_file::parse(bytes);
+    assert!(kept.peers.len() <= REMEMBERED_MAX);
+    assert!(kept.unreadable.is_none_or(|(count, first)| count > 0 && first > 0), "{:?}", kept.unreadable);
+    for RememberedPeer { address, node, unanswered } in &kept.peers {
+        assert!(node.is_single() && *unanswered < UNANSWERED_MAX, "{node} {unanswered}");
+        assert!(address.port() != 0 && !address.ip().is_unspecified() && !address.ip().is_multicast());
+    }
+    let written = peers_file::text(&kept.peers);
+    assert!(written.len() as u64 <= peers_file::BYTES_MAX, "what is written can be read");
+    let again = peers_file::parse(written.as_bytes());
+    assert!(again.peers == kept.peers && again.unreadable.is_none(), "{again:?}");
+    are_taken(kept.peers)
+}
+
+/// A core takes them within its bounds, and asks at each of them at most once from its one address.
+fn are_taken(peers: Vec<RememberedPeer>) -> bool {
+    let is_any = !peers.is_empty();
+    let ours = SocketAddr::from(([10, 0, 0, 1], 6_911));
+    let mut core = Core::new(&NodeConfig::new("hip"), HERE, Incarnation(1), 1, 1);
+    core.start(Time::ZERO, &[ours]);
+    while core.poll().is_some() {}
+    core.handle(Time::ZERO, Input::PeersRemembered(peers));
+    let remembered = core.remembered();
+    assert!(remembered.len() <= REMEMBERED_MAX);
+    for peer in &remembered {
+        let of_one = remembered.iter().filter(|other| other.node == peer.node).count();
+        let at_one = remembered.iter().filter(|other| other.address == peer.address).count();
+        assert!(of_one <= 2 && at_one == 1, "{remembered:?}");
+    }
+    let asked = std::iter::from_fn(|| core.poll()).count();
+    assert!(asked <= remembered.len(), "{asked} {remembered:?}");
+    is_any
 }

@@ -23,9 +23,9 @@ use super::{
 use crate::security::files::{self, FileFault};
 
 /// What the file begins with; another number is another form.
-const FIRST_LINE: &str = "sinew peers 1";
+pub(super) const FIRST_LINE: &str = "sinew peers 1";
 /// Longest file in bytes: twice what 64 peers take.
-const BYTES_MAX: u64 = 16 << 10;
+pub(super) const BYTES_MAX: u64 = 16 << 10;
 
 /// Where a node keeps its peers.
 #[derive(Clone, Debug)]
@@ -120,7 +120,7 @@ fn replace(path: &Path, directory: &Path, bytes: &[u8]) -> io::Result<()> {
     File::open(directory)?.sync_all()
 }
 
-fn text(peers: &[RememberedPeer]) -> String {
+pub(super) fn text(peers: &[RememberedPeer]) -> String {
     let line = |peer: &RememberedPeer| {
         let RememberedPeer { address, node, unanswered } = peer;
         format!("{address} {node} {unanswered}\n")
@@ -129,7 +129,7 @@ fn text(peers: &[RememberedPeer]) -> String {
 }
 
 /// What of these bytes can be read: anybody may have written them, or half of them.
-fn parse(bytes: &[u8]) -> Kept {
+pub(super) fn parse(bytes: &[u8]) -> Kept {
     let text = String::from_utf8_lossy(bytes);
     let mut lines = text.lines();
     if lines.next() != Some(FIRST_LINE) {

@@ -25,7 +25,7 @@ pub struct Format {
 }
 
 /// All of them.
-pub const FORMATS: [Format; 17] = [
+pub const FORMATS: [Format; 18] = [
     Format {
         name: "header",
         from: "a peer, by TCP or UDP",
@@ -62,6 +62,12 @@ pub const FORMATS: [Format; 17] = [
         from: "anybody, by UDP and multicast",
         play: sinew::fuzzing::discovery,
         seeds: || sinew::fuzzing::seeds("discovery"),
+    },
+    Format {
+        name: "peers",
+        from: "a disk, or who can write to it",
+        play: sinew::fuzzing::peers,
+        seeds: || sinew::fuzzing::seeds("peers"),
     },
     Format {
         name: "seals",

@@ -1,0 +1,10 @@
+//! The format `peers` of `sinew-formats`, with bytes that libFuzzer chooses by what they reach.
+
+#![no_main]
+
+use sinew_formats::Format;
+
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
+    let format = Format::named("peers").expect("it has this name");
+    (format.play)(bytes);
+});
