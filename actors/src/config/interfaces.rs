@@ -13,6 +13,8 @@ const ALL: &str = "all";
 /// What stands behind a name, or `all`, to choose one family of its addresses.
 const IPV4_ONLY: &str = "/ipv4";
 const IPV6_ONLY: &str = "/ipv6";
+/// What the system calls the interface of loopback.
+const LOOPBACK: &str = if cfg!(any(target_os = "linux", target_os = "android")) { "lo" } else { "lo0" };
 
 /// A choice of network interfaces.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -83,6 +85,19 @@ impl fmt::Display for Families {
      /ipv4 or /ipv6 may stand"
 )]
 pub struct NoInterface;
+
+impl Interface {
+    /// Whether nothing that goes there leaves the host: an address of loopback, or the name of its interface, of which no other address is used.
+    #[must_use]
+    pub fn is_loopback(&self) -> bool {
+        match self {
+            Self::Address(address) => address.is_loopback(),
+            Self::Address6 { address, .. } => address.is_loopback(),
+            Self::Name(name, _) => name == LOOPBACK,
+            Self::All(_) => false,
+        }
+    }
+}
 
 impl FromStr for Interface {
     type Err = NoInterface;
@@ -155,13 +170,16 @@ impl fmt::Display for Interface {
 /// let both = Interfaces::from(["eth0", "wlan0/ipv4"].map(|name| name.parse::<Interface>().unwrap()).to_vec());
 /// assert_eq!((cable.to_string(), both.to_string()), ("192.168.1.7".into(), "eth0, wlan0/ipv4".into()));
 /// ```
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Interfaces(Vec<Interface>);
+#[derive(Clone, Debug)]
+pub struct Interfaces {
+    chosen: Vec<Interface>,
+    is_default: bool,
+}
 
 impl Interfaces {
     /// Each choice.
     pub fn iter(&self) -> impl Iterator<Item = &Interface> {
-        self.0.iter()
+        self.chosen.iter()
     }
 
     /// Those that are chosen by their IPv4 addresses.
@@ -175,7 +193,7 @@ impl Interfaces {
     /// Whether each is chosen by its IPv4 address: nobody has to look which there are.
     #[must_use]
     pub fn are_ipv4_addresses(&self) -> bool {
-        self.addresses().count() == self.0.len()
+        self.addresses().count() == self.chosen.len()
     }
 
     /// Whether any of them may have an IPv4 address that is used.
@@ -201,29 +219,47 @@ impl Interfaces {
     /// The IPv4 address of the first one, if that is what it is chosen by.
     #[must_use]
     pub fn first_address(&self) -> Option<Ipv4Addr> {
-        self.addresses().next().filter(|_| matches!(self.0.first(), Some(Interface::Address(_))))
+        self.addresses().next().filter(|_| matches!(self.chosen.first(), Some(Interface::Address(_))))
+    }
+
+    /// Whether nobody has chosen any. Who writes 127.0.0.1 means that, and is not told that other hosts do not see the node.
+    #[must_use]
+    pub const fn are_default(&self) -> bool {
+        self.is_default
     }
 
     /// Whether nothing leaves the host.
     #[must_use]
     pub fn are_loopback(&self) -> bool {
-        self.iter().all(|interface| match interface {
-            Interface::Address(address) => address.is_loopback(),
-            Interface::Address6 { address, .. } => address.is_loopback(),
-            Interface::Name(..) | Interface::All(_) => false,
-        })
+        self.iter().all(Interface::is_loopback)
     }
 }
 
+impl Default for Interfaces {
+    /// Loopback alone, as long as nobody chooses.
+    fn default() -> Self {
+        Self { chosen: vec![Interface::Address(Ipv4Addr::LOCALHOST)], is_default: true }
+    }
+}
+
+/// Who chooses what is the default anyway has the same interfaces.
+impl PartialEq for Interfaces {
+    fn eq(&self, other: &Self) -> bool {
+        self.chosen == other.chosen
+    }
+}
+
+impl Eq for Interfaces {}
+
 impl From<Vec<Interface>> for Interfaces {
-    fn from(interfaces: Vec<Interface>) -> Self {
-        Self(interfaces)
+    fn from(chosen: Vec<Interface>) -> Self {
+        Self { chosen, is_default: false }
     }
 }
 
 impl From<Ipv4Addr> for Interfaces {
     fn from(address: Ipv4Addr) -> Self {
-        Self(vec![Interface::Address(address)])
+        vec![Interface::Address(address)].into()
     }
 }
 
@@ -288,6 +324,13 @@ mod tests {
     }
 
     #[test]
+    fn loopback_that_somebody_chose_is_told_from_the_default_and_is_the_same_otherwise() {
+        let chosen = Interfaces::from(Ipv4Addr::LOCALHOST);
+        assert_eq!(chosen, Interfaces::default());
+        assert!(Interfaces::default().are_default() && !chosen.are_default());
+    }
+
+    #[test]
     fn a_choice_says_which_families_it_may_have_and_whether_it_leaves_the_host() {
         let of = |choices: &[&str]| {
             let chosen: Vec<Interface> = choices.iter().map(|choice| choice.parse().unwrap()).collect();
@@ -296,6 +339,8 @@ mod tests {
         };
         assert_eq!(of(&["127.0.0.1"]), (true, false, true, true));
         assert_eq!(of(&["127.0.0.1", "::1"]), (true, true, true, false));
+        assert_eq!(of(&[LOOPBACK, "::1"]), (true, true, true, false));
+        assert_eq!(of(&[LOOPBACK, "eth0"]), (true, true, false, false));
         assert_eq!(of(&["fe80::1%eth0"]), (false, true, false, false));
         assert_eq!(of(&["eth0"]), (true, true, false, false));
         assert_eq!(of(&["all/ipv6"]), (false, true, false, false));

@@ -287,7 +287,7 @@ impl NodeConfig {
                 give_up: Duration::from_secs(5),
             },
             ndl: NdlConfig {
-                interface: Ipv4Addr::LOCALHOST.into(),
+                interface: Interfaces::default(),
                 port: 0,
                 multicast: Some(SocketAddrV4::new(Ipv4Addr::new(239, 255, 83, 119), 6910)),
                 // Link-local and transient (RFC 4291, section 2.7), with a number that is free to choose (RFC 3307, section 4.3).

@@ -54,7 +54,8 @@ fn first_of(config: &NodeConfig) -> SocketAddr {
     } else {
         chosen.first_address().filter(|_| chosen.are_ipv4_addresses())
     };
-    (first.unwrap_or(Ipv4Addr::UNSPECIFIED), port).into()
+    let all = if chosen.are_loopback() { Ipv4Addr::LOCALHOST } else { Ipv4Addr::UNSPECIFIED };
+    (first.unwrap_or(all), port).into()
 }
 
 /// Why this node cannot [listen](listen_first), and what to do.
@@ -239,11 +240,16 @@ mod tests {
 
     use super::*;
 
+    const LOOPBACK: &str = if cfg!(target_os = "linux") { "lo" } else { "lo0" };
+
     #[test]
     fn a_node_that_is_on_loopback_alone_listens_nowhere_else() {
-        for (choices, ipv6_too) in
-            [(&["::1"][..], false), (&["127.0.0.1", "::1"], true), (&["127.0.0.1"], false)]
-        {
+        for (choices, ipv6_too) in [
+            (&["::1"][..], false),
+            (&["127.0.0.1", "::1"], true),
+            (&["127.0.0.1"], false),
+            (&[LOOPBACK], true),
+        ] {
             let mut config = NodeConfig::new("test");
             let chosen: Vec<_> = choices.iter().map(|choice| choice.parse().unwrap()).collect();
             config.ndl.interface = chosen.into();

@@ -92,7 +92,12 @@ fn chosen_by<'a>(choice: &Interface, all: &'a [Local]) -> Vec<&'a Local> {
         Interface::Address6 { address, zone } => {
             local.address.ip == *address && zone.as_ref().is_none_or(|zone| local.is_called(zone))
         }
-        Interface::Name(name, families) => local.name == *name && local.is_of(*families),
+        // A host may have others on its loopback interface, which are told to the network by routing.
+        Interface::Name(name, families) => {
+            local.name == *name
+                && local.is_of(*families)
+                && (local.address.ip.is_loopback() || !choice.is_loopback())
+        }
         Interface::All(families) => !local.address.ip.is_loopback() && local.is_of(*families),
     };
     let mut chosen: Vec<_> = all.iter().filter(is_chosen).collect();

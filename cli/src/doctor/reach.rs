@@ -9,28 +9,35 @@ use crate::table::quoted;
 
 const NAME: &str = "reach";
 
-/// One check for those that are on loopback only, and one for the others.
+/// One check for those that are on loopback only because nobody said anything else, one for those that are to be, and one for the others.
 pub(super) fn checks(nodes: &[NodeReport], interfaces: &[Interface]) -> Vec<Check> {
     // An older node says nothing of it.
     let is_alone =
         |node: &&NodeReport| node.security.as_ref().is_some_and(|security| !security.is_beyond_host);
     let (alone, others): (Vec<_>, Vec<_>) = nodes.iter().partition(is_alone);
+    let (left, meant): (Vec<_>, Vec<_>) = alone.into_iter().partition(|node| node.is_interface_default);
     let mut checks = Vec::new();
-    if !alone.is_empty() {
-        checks.push(finding(&alone, interfaces));
+    if !left.is_empty() {
+        checks.push(finding(&left, interfaces));
+    }
+    if !meant.is_empty() {
+        let what = "on loopback only, as they are told: no other host sees them, and they see none";
+        checks.push(Check::fine(NAME, format!("{what}: {}", in_words(&meant))));
     }
     if !others.is_empty() {
-        let seen: Vec<_> = others.iter().map(|node| format!("{} ({})", node.name, node.interface)).collect();
-        checks.push(Check::fine(NAME, format!("not on loopback alone: {}", seen.join(", "))));
+        checks.push(Check::fine(NAME, format!("not on loopback alone: {}", in_words(&others))));
     }
     checks
 }
 
+fn in_words(nodes: &[&NodeReport]) -> String {
+    nodes.iter().map(|node| format!("{} ({})", node.name, node.interface)).collect::<Vec<_>>().join(", ")
+}
+
 fn finding(alone: &[&NodeReport], interfaces: &[Interface]) -> Check {
-    let seen: Vec<_> = alone.iter().map(|node| format!("{} ({})", node.name, node.interface)).collect();
     let seen = format!(
-        "on loopback only, which is the default: no other host sees them, and they see none: {}",
-        seen.join(", ")
+        "on loopback only, as nobody has said where else: no other host sees them, and they see none: {}",
+        in_words(alone)
     );
     let line = match interfaces.iter().find_map(Interface::outward) {
         Some(address) => format!("interface = \"{address}\""),
@@ -55,7 +62,7 @@ fn finding(alone: &[&NodeReport], interfaces: &[Interface]) -> Check {
         )
     };
     let mend = format!(
-        "where they are to be seen: {keys}below [ndl] in each one's configuration: {line}{several}; then start them again. Where they are not, nothing"
+        "where they are to be seen: {keys}below [ndl] in each one's configuration: {line}{several}; then start them again. Where they are not: interface = \"127.0.0.1\" there says so"
     );
     Check::finding(NAME, seen, mend)
 }
@@ -87,14 +94,14 @@ mod tests {
     }
 
     #[test]
-    fn a_node_on_loopback_only_is_a_finding_with_the_line_that_takes_it_to_the_network() {
+    fn a_node_that_nobody_took_off_loopback_is_a_finding_with_the_line_that_takes_it_to_the_network() {
         let here = [
             interface("lo", &["127.0.0.1"]),
             interface("eth0", &["fe80::5", "10.0.0.5"]),
             interface("eth1", &["10.0.1.5"]),
         ];
-        let [found, fine] = &checks(&[said("desk", 3, open(false)), said("knee", 2, open(true))], &here)[..]
-        else {
+        let desk = NodeReport { is_interface_default: true, ..said("desk", 3, open(false)) };
+        let [found, fine] = &checks(&[desk, said("knee", 2, open(true))], &here)[..] else {
             panic!("that which is alone, and the other")
         };
         assert!(found.seen.contains("no other host sees") && found.seen.contains("desk"), "{}", found.seen);
@@ -108,12 +115,23 @@ mod tests {
     }
 
     #[test]
+    fn a_node_that_was_put_on_loopback_is_shown_and_is_no_finding() {
+        let desk = NodeReport { interface: "lo".to_owned(), ..said("desk", 3, open(false)) };
+        let [fine] = &checks(&[desk], &[interface("lo", &["127.0.0.1"])])[..] else { panic!("one") };
+        assert!(fine.mend.is_none(), "{:?}", fine.mend);
+        assert!(
+            fine.seen.contains("no other host sees") && fine.seen.ends_with("desk (lo)"),
+            "{}",
+            fine.seen
+        );
+    }
+
+    #[test]
     fn who_has_keys_needs_none_and_a_host_without_a_network_is_told_so() {
         let security =
             secured(NOW_S, "until-set").map(|keys| SecurityReport { is_beyond_host: false, ..keys });
-        let [found] = &checks(&[said("desk", 3, security)], &[interface("lo", &["127.0.0.1"])])[..] else {
-            panic!("one")
-        };
+        let desk = NodeReport { is_interface_default: true, ..said("desk", 3, security) };
+        let [found] = &checks(&[desk], &[interface("lo", &["127.0.0.1"])])[..] else { panic!("one") };
         let mend = found.mend.as_ref().expect("a finding");
         assert!(!mend.contains("sinew keys") && mend.contains("this host has none"), "{mend}");
     }

@@ -45,6 +45,20 @@ fn a_choice_takes_what_it_names_in_order_and_once_and_loopback_only_where_it_is_
 }
 
 #[test]
+fn of_loopback_by_its_name_nothing_is_taken_that_other_hosts_may_reach() {
+    let name = if cfg!(target_os = "linux") { "lo" } else { "lo0" };
+    let all = [
+        local(name, [10, 9, 9, 9], true),
+        local(name, [127, 0, 0, 1], true),
+        local6(name, "fd00::9", 1),
+        local6(name, "::1", 1),
+    ];
+    let of = |choices: &[&str]| in_words(&Usable::of(&chosen(choices), &all).running);
+    assert_eq!(of(&[name]), "127.0.0.1 ::1");
+    assert_eq!(of(&["10.9.9.9"]), "10.9.9.9", "who means it says it");
+}
+
+#[test]
 fn a_name_takes_both_families_or_the_one_that_is_asked_for_and_of_ipv6_what_lasts() {
     let mut all = vec![
         local("eth0", [10, 0, 0, 1], true),
