@@ -369,6 +369,18 @@ fn the_doctor_tries_each_thing_and_every_finding_has_what_mends_it() {
 }
 
 #[test]
+fn a_node_that_was_put_on_loopback_by_its_name_is_no_finding_of_the_doctor() {
+    let scenario = Scenario::new();
+    let _hip = scenario.start_changed("hip", 1, &[("[ndl]", "[ndl]\ninterface = \"lo\"")], &[]);
+    let said = scenario.sinew("hip", &["doctor", "--json"]).json();
+    for name in ["security", "reach"] {
+        let check = said["checks"].as_array().expect("a list").iter().find(|check| check["check"] == name);
+        let seen = check.expect("it is there")["seen"].as_str().expect("a text");
+        assert!(check.is_some_and(|check| check["fine"] == true) && seen.contains("hip"), "{said}");
+    }
+}
+
+#[test]
 fn the_socket_of_a_node_that_was_killed_is_a_finding_and_one_of_a_node_that_lives_is_none() {
     // Given
     let scenario = Scenario::new();
