@@ -17,7 +17,7 @@ pub(crate) struct Arguments {
     /// /run/sinew/*.sock, /tmp/sinew-*.sock
     #[arg(long, global = true, value_name = "PATH")]
     pub(crate) socket: Option<PathBuf>,
-    /// Print JSON instead of tables
+    /// Print JSON instead of tables; where the command cannot be carried out, an object whose `fault` says why, beside the words on stderr
     #[arg(long, global = true)]
     pub(crate) json: bool,
     /// How long each node has for its answer

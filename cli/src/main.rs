@@ -22,7 +22,7 @@ mod tree;
 mod watch;
 mod why;
 
-use std::process::ExitCode;
+use std::{ffi::OsString, process::ExitCode};
 
 use clap::{CommandFactory, Parser};
 
@@ -49,7 +49,10 @@ struct Said {
 }
 
 fn main() -> ExitCode {
-    let arguments = Arguments::parse();
+    let arguments = match Arguments::try_parse() {
+        Ok(arguments) => arguments,
+        Err(error) => return refused(&error),
+    };
     match run(&arguments) {
         Ok(said) => {
             let json = || if said.json.is_null() { String::new() } else { format!("{:#}\n", said.json) };
@@ -61,11 +64,36 @@ fn main() -> ExitCode {
         Err(error) => {
             eprintln!("sinew: {error}");
             if arguments.json {
-                println!("{:#}", serde_json::json!({ "fault": error.to_string() }));
+                print_fault(&error.to_string());
             }
             ExitCode::from(error.code())
         }
     }
+}
+
+/// For programs, beside the words for people.
+fn print_fault(why: &str) {
+    let text = format!("{:#}\n", serde_json::json!({ "fault": why }));
+    // Nobody may read any more.
+    let _ = std::io::Write::write_all(&mut std::io::stdout(), text.as_bytes());
+}
+
+/// A wrong command line, or one that asks for help or the version.
+fn refused(error: &clap::Error) -> ExitCode {
+    let _ = error.print();
+    if !error.use_stderr() {
+        return ExitCode::from(FINE);
+    }
+    if ask_for_json(std::env::args_os().skip(1)) {
+        let why = error.render().to_string();
+        print_fault(why.strip_prefix("error: ").unwrap_or(&why).trim_end());
+    }
+    ExitCode::from(USAGE)
+}
+
+/// Whether a command line that cannot be read asks for JSON. What stands behind `--` is no option.
+fn ask_for_json(words: impl IntoIterator<Item = OsString>) -> bool {
+    words.into_iter().take_while(|word| word != "--").any(|word| word == "--json")
 }
 
 fn run(arguments: &Arguments) -> Result<Said, Fault> {

@@ -156,9 +156,20 @@ fn a_wrong_command_line_is_2_and_help_names_the_exit_codes() {
     for words in
         [&["nodse"][..], &["send", "knee"], &["ping", "knee", "--count", "0"], &["completions", "tcsh"]]
     {
-        assert_eq!(sinew(words, Path::new("/")).code, Some(2), "{words:?}");
+        let answer = sinew(words, Path::new("/"));
+        assert_eq!((answer.code, answer.out.as_str()), (Some(2), ""), "{words:?}");
+        // And: a program is told why, too, wherever it asks for that.
+        for asking in [[words, &["--json"]].concat(), [&["--json"], words].concat()] {
+            let answer = sinew(&asking, Path::new("/"));
+            assert_eq!(answer.code, Some(2), "{asking:?}");
+            let why = answer.json()["fault"].as_str().expect("a text").to_owned();
+            let is_told = !why.is_empty() && !why.starts_with("error") && answer.err.contains(&why);
+            assert!(is_told, "{why}: {}", answer.err);
+        }
     }
-    let help = sinew(&["--help"], Path::new("/"));
+    let answer = sinew(&["nodse", "--", "--json"], Path::new("/"));
+    assert_eq!((answer.code, answer.out.as_str()), (Some(2), ""), "what is behind -- is no option");
+    let help = sinew(&["--help", "--json"], Path::new("/"));
     assert_eq!(help.code, Some(0));
     for words in [
         "nodes",
