@@ -28,6 +28,21 @@ pub struct Window {
     pub most: [u64; 2],
 }
 
+impl Window {
+    /// With one that follows it; of the times of both the longer ones.
+    pub(super) fn and(self, next: Self) -> Self {
+        Self {
+            count: self.count + next.count,
+            failed: self.failed + next.failed,
+            p50: self.p50.max(next.p50),
+            p99: self.p99.max(next.p99),
+            max: self.max.max(next.max),
+            before: self.before,
+            most: [0, 1].map(|node: usize| self.most[node].max(next.most[node])),
+        }
+    }
+}
+
 /// What was seen.
 #[derive(Clone, Debug)]
 pub struct Report {
