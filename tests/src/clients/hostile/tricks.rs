@@ -57,6 +57,13 @@ pub(super) struct Tally {
     pub(super) lingering_came: u64,
 }
 
+impl Tally {
+    /// Whether something of each sort was done: which, is left to chance, and how much, to the machine.
+    pub(super) fn has_all_sorts(&self) -> bool {
+        [self.refused, self.rings, self.lies, self.links, self.lingering].iter().all(|done| *done > 0)
+    }
+}
+
 /// A hostile client of the node at a socket.
 pub(super) struct Attacker {
     socket: PathBuf,
