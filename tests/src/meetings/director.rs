@@ -12,7 +12,7 @@ use sinew::{Requirement, Time};
 
 use super::{
     node::{COME, DIRECTORY, KEPT_BACK, STAY_AWAY, UP},
-    verdict::{Event, HEARSAY, Life, Verdict},
+    verdict::{Event, Life, Verdict},
 };
 use crate::{own_group, until};
 
@@ -154,10 +154,11 @@ impl Cast {
             self.present[killed].as_ref().is_some_and(waits).then_some(())
         });
         self.kill(killed);
-        let killed_at = Time::now();
-        // From then on it must not count: for all who live, and for the judge, who bears hearsay for a while.
+        // From then on it must not count.
         self.wait_until_unknown(killed);
-        std::thread::sleep(HEARSAY.saturating_sub(Time::now().since(killed_at)));
+        if let Some(life) = self.former[killed].last_mut() {
+            life.unknown = Some(Time::now().as_nanos());
+        }
         self.tell(away, COME);
         let arrived = |process: &Process| matches!(process.said().0.events.last(), Some(Event::Arrived(_)));
         until(&format!("{} has come", PARTIES[away].0), || {

@@ -5,10 +5,9 @@ use std::{collections::BTreeMap, time::Duration};
 use super::PARTIES;
 use crate::load::Times;
 
-/// So long after a process was killed its arrival may still count: the connection that breaks tells of it, within 20 ms on a quiet machine;
-/// the rest is for one that is busy. (A node that is only silent is known to be lost after four periods of 500 ms; nobody is only
-/// silent here.)
-pub(super) const HEARSAY: Duration = Duration::from_millis(500);
+/// So long after a process was killed its arrival may still count, where nobody has looked when its loss was known: the connection that
+/// breaks tells of it, within 20 ms on a quiet machine; the rest is for one that is busy.
+pub(super) const HEARSAY: Duration = Duration::from_secs(10);
 
 /// What a party wrote down, with the host's monotonic time in nanoseconds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -52,6 +51,8 @@ pub struct Life {
     pub events: Vec<Event>,
     /// By the same clock.
     pub killed: Option<u64>,
+    /// When all others were seen to know that it is lost, if that was looked at: from then on it counts for nobody.
+    pub unknown: Option<u64>,
 }
 
 /// A wait of one life.
@@ -88,7 +89,8 @@ impl Life {
 
     /// Whether what it did at `then` may count at `at`.
     fn counts(&self, then: u64, at: u64) -> bool {
-        let end = self.killed.map_or(u64::MAX, |killed| killed.saturating_add(HEARSAY.as_nanos() as u64));
+        let hearsay = |killed: u64| killed.saturating_add(HEARSAY.as_nanos() as u64);
+        let end = self.unknown.or_else(|| self.killed.map(hearsay)).unwrap_or(u64::MAX);
         then <= at && at <= end
     }
 
@@ -229,7 +231,7 @@ mod tests {
     use super::*;
 
     fn life(events: &[Event]) -> Life {
-        Life { events: events.to_vec(), killed: None }
+        Life { events: events.to_vec(), ..Life::default() }
     }
 
     /// All start and pass the first generation together; `change` makes it wrong.
@@ -289,6 +291,18 @@ mod tests {
         let verdict = played(|parties| killed_while_it_waits(parties, in_time));
         assert_eq!((verdict.violations.as_slice(), verdict.hearsay.percentile(1.0)), (&[][..], HEARSAY));
         assert!(!played(|parties| killed_while_it_waits(parties, in_time + 1)).violations.is_empty());
+    }
+
+    #[test]
+    fn what_a_killed_process_did_counts_no_more_once_all_were_seen_to_know_of_its_loss() {
+        let passed_at = |at| {
+            played(|parties| {
+                killed_while_it_waits(parties, at);
+                parties[0][0].unknown = Some(60);
+            })
+        };
+        assert_eq!(passed_at(60).violations, [""; 0]);
+        assert!(!passed_at(61).violations.is_empty());
     }
 
     #[test]
