@@ -13,8 +13,8 @@ use rustix::{
 use sinew::prelude::Duration;
 use sinew_tests::{Ground, OwnDirectory, Program, program};
 
-/// Time for what follows a panic: generous, and less than any deadline that would bring it about by itself.
-const SOON: Duration = Duration::from_secs(10);
+/// Time for what follows a panic: generous, as a backtrace is looked up in it, and less than the deadline that each of the three words has.
+const SOON: Duration = Duration::from_secs(45);
 
 /// A pipe that takes nothing, and its other end, from which nobody reads.
 fn full_pipe() -> (PipeWriter, PipeReader) {
