@@ -5,6 +5,8 @@ use std::{fmt::Write, net::SocketAddrV4};
 use sinew_tests::{Hosts, OwnDirectory, Program, node_under_test, own_group};
 
 const NAMES: [&str; 4] = ["central", "hip", "knee", "ankle"];
+/// Four of them make a loss: quicker than what is watched for it lasts, and slower than a busy machine stands still.
+const PERIOD_MS: u32 = 250;
 
 /// A node on `host` that discovers by multicast on the hosts' own network.
 fn configuration(directory: &OwnDirectory, index: usize, group: SocketAddrV4) -> std::path::PathBuf {
@@ -14,7 +16,7 @@ fn configuration(directory: &OwnDirectory, index: usize, group: SocketAddrV4) ->
     write!(
         text,
         "[node]\nname = \"{name}\"\nproject = \"hosts\"\n\
-         [ndl]\ninterface = \"10.77.0.{address}\"\nmulticast = \"{group}\"\nperiod_ms = 100\n"
+         [ndl]\ninterface = \"10.77.0.{address}\"\nmulticast = \"{group}\"\nperiod_ms = {PERIOD_MS}\n"
     )
     .expect("a string takes any text");
     std::fs::write(&path, text).expect("the test's own directory");
@@ -85,7 +87,7 @@ fn start_in_both(hosts: &Hosts, directory: &OwnDirectory, index: usize, more: &[
         "[node]\nname = \"{name}\"\nproject = \"hosts\"\n\
          [gncl]\nfurther = [\"10.78.0.{address}\"]\n\
          [ndl]\ninterface = \"10.77.0.{address}\"\nport = 6911\nseeds = [\"10.77.0.{other}:6911\"]\n\
-         multicast = false\nmdns_port = false\nperiod_ms = 100\n"
+         multicast = false\nmdns_port = false\nperiod_ms = {PERIOD_MS}\n"
     );
     std::fs::write(&path, text).expect("the test's own directory");
     node_under_test(Some(&hosts.all()[index]), &path, more)
@@ -134,7 +136,7 @@ fn start_on(
     let path = directory.join(&format!("{name}.toml"));
     let text = format!(
         "[node]\nname = \"{name}\"\nproject = \"hosts\"\naddress = \"10.77.0.{address}\"\n\
-         [ndl]\ninterface = {interfaces}\nmulticast = \"{group}\"\nmdns_port = false\nperiod_ms = 100\n"
+         [ndl]\ninterface = {interfaces}\nmulticast = \"{group}\"\nmdns_port = false\nperiod_ms = {PERIOD_MS}\n"
     );
     std::fs::write(&path, text).expect("the test's own directory");
     node_under_test(Some(&hosts.all()[index]), &path, more)
@@ -204,7 +206,7 @@ fn start_by_mdns(hosts: &Hosts, directory: &OwnDirectory, index: usize, interfac
     let path = directory.join(&format!("{name}.toml"));
     let text = format!(
         "[node]\nname = \"{name}\"\nproject = \"hosts\"\naddress = \"10.77.0.{address}\"\n\
-         [ndl]\ninterface = {interface}\nmulticast = false\nperiod_ms = 100\n"
+         [ndl]\ninterface = {interface}\nmulticast = false\nperiod_ms = {PERIOD_MS}\n"
     );
     std::fs::write(&path, text).expect("the test's own directory");
     node_under_test(Some(&hosts.all()[index]), &path, &["--logs-info"])

@@ -27,7 +27,7 @@ impl Scenario {
         let hosts =
             hosts.inspect_err(|why| println!("skipped: no hosts with IPv6 can be made here: {why}")).ok()?;
         let directory = OwnDirectory::new();
-        Some(Self { hosts, directory, group: own_group(), is_one_host: false, period_ms: 100 })
+        Some(Self { hosts, directory, group: own_group(), is_one_host: false, period_ms: 250 })
     }
 
     fn ip(&self, host: usize, arguments: &str) {

@@ -34,7 +34,7 @@ impl Scenario {
         let path = self.directory.join(&format!("{name}.toml"));
         let text = format!(
             "[node]\nname = \"{name}\"\naddress = \"127.0.0.{address}\"\nproject = \"unheard\"\n\
-             [ndl]\nmulticast = false\nmdns_port = false\nperiod_ms = 250\n{ndl}\n"
+             [ndl]\nmulticast = false\nmdns_port = false\nperiod_ms = 500\n{ndl}\n"
         );
         std::fs::write(&path, text).expect("the test's own directory");
         path

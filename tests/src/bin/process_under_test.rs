@@ -2,7 +2,7 @@
 //!
 //! `process_under_test CONFIG.toml [--place thread|process|io] [--requires NAME] [--on-lost pause|restart]
 //! [--dies-at-start CODE] [--neighbour-hangs MILLIS] [--talks] [--stays]
-//! [--swells-at-start MIB] [--starts-in MILLIS] [--starts-within MILLIS] [--ramps-for MILLIS]
+//! [--swells-at-start MIB] [--starts-in MILLIS] [--starts-within MILLIS] [--ramps-for MILLIS] [--stops-within MILLIS]
 //! [--tree rest-for-one|escalation] [--hangs-in started|factory TOKEN] [--audits]`
 //!
 //! The application `drive` does as it is told (`Order`), and says what it sees, one line each. With a neighbour there is another
@@ -36,7 +36,7 @@ struct Drive {
     starts_in: Option<Duration>,
     /// Its first life does not come back from `started`.
     hangs: Option<Token>,
-    /// How long it takes to stop; it has half a second.
+    /// How long it takes to stop; it has half a second, unless said otherwise.
     ramps_for: Duration,
 }
 
@@ -278,7 +278,8 @@ impl Actor for Neighbour {
     fn started(&mut self, context: &mut Self::Context) {
         static LIVES: AtomicU64 = AtomicU64::new(0);
         let (time, is_first) = (self.0, LIVES.fetch_add(1, Ordering::Relaxed) == 0);
-        context.after(Duration::from_millis(200), move |_, _, _| {
+        // The drive is heard by then.
+        context.after(Duration::from_millis(500), move |_, _, _| {
             if time.is_zero() {
                 say("hangs");
                 std::thread::park_timeout(Duration::MAX);
@@ -387,6 +388,7 @@ fn main() -> ExitCode {
     if swells.is_some() || starts_in.is_some() {
         drive = drive.start_within(time("--starts-within").unwrap_or(Duration::from_secs(1)));
     }
+    drive = time("--stops-within").into_iter().fold(drive, AppSpec::stop_within);
     drive = time("--turns-within").into_iter().fold(drive, AppSpec::progress_within);
     drive = match after("--on-lost").as_deref() {
         None => drive,
