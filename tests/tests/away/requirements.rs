@@ -61,12 +61,15 @@ fn position(log: &Log<Seen>, of: &Seen) -> usize {
 
 #[test]
 fn an_application_that_pauses_handles_no_message_and_no_period_until_all_is_met_again() {
-    const LIMIT: Duration = Duration::from_secs(2);
+    const LIMIT: Duration = Duration::from_secs(4);
+    const PERIOD: Duration = Duration::from_millis(1);
+    // As many as the pause has; a machine that is busy misses fewer.
+    const MADE_UP_FOR: u64 = (LIMIT.as_millis() / PERIOD.as_millis()) as u64;
     // Given: a period, and an input watchdog that would accuse within the pause
     let (walker, log) = Stage::new()
         .started(|_, context| {
-            context.every(Duration::from_millis(1), |puppet, tick, _| {
-                puppet.say(if tick.missed < 100 { "tick" } else { "made up for" });
+            context.every(PERIOD, |puppet, tick, _| {
+                puppet.say(if tick.missed < MADE_UP_FOR { "tick" } else { "made up for" });
             });
             context.expect::<Job>(None, LIMIT, |puppet, _, _| puppet.say("accused"));
         })
