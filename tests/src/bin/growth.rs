@@ -4,7 +4,10 @@
 //!
 //! Exit code 1: something grew beyond its bound.
 
-use std::{process::ExitCode, time::Duration};
+use std::{
+    process::ExitCode,
+    time::{Duration, Instant},
+};
 
 use clap::Parser;
 use serde_json::json;
@@ -18,6 +21,8 @@ use sinew_tests::{
 
 /// Growth of resident memory over all restarts that the allocator and the kernel may have for themselves.
 const GROWTH_MAX_KIB: u64 = 4 * 1024;
+/// What has not changed for so long has come to rest.
+const AT_REST: Duration = Duration::from_secs(1);
 /// Applications that fail at once.
 const APPS: usize = 8;
 
@@ -147,7 +152,15 @@ impl Field {
                 (now.descriptors <= before.descriptors && now.threads <= before.threads).then_some(())
             });
         } else {
-            std::thread::sleep(Duration::from_millis(200)); // what is counted first may only be too small
+            // What is counted first may only be too small: a link that is not back yet, a thread that has not begun.
+            let (mut last, mut since) = (Held::now(), Instant::now());
+            until("descriptors and threads stay as many for a while", || {
+                let now = Held::now();
+                if (now.descriptors, now.threads) != (last.descriptors, last.threads) {
+                    (last, since) = (now, Instant::now());
+                }
+                (since.elapsed() >= AT_REST).then_some(())
+            });
         }
         Held::now()
     }
