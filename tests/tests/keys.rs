@@ -35,8 +35,8 @@ const NAMES: [&str; 2] = ["hip", "knee"];
 const AT_THE_BEGINNING: &str = "30000000";
 /// For so long a lost life bars an earlier one (NDL-5.2).
 const BARRED: Duration = Duration::from_secs(15);
-/// Time in which a machine that is busy otherwise starts a node and has it found.
-const FOUND: Duration = Duration::from_secs(10);
+/// Time in which a machine that is slow and busy otherwise starts a node and has it found.
+const FOUND: Duration = Duration::from_secs(45);
 
 /// Two nodes with keys of one project, each with an address of its own on loopback.
 struct Robot {
@@ -150,10 +150,13 @@ fn who_is_revoked_reaches_nobody_from_when_the_deny_list_is_read_again() {
     // When: the hip is revoked
     robot.revoke(0, 1);
     assert_eq!(knee.handle().reload_deny_list().expect("it is good").denied, 1);
-    // Then: the link ends, and there is no other one
+    // Then: the link ends, and there is no other one; a message may be late before, on a machine that is slow
     let soon = Duration::from_millis(500);
-    until("it reaches nobody", || (send(&mut gait, drive, soon) != Outcome::Delivered).then_some(()));
-    assert_ne!(send(&mut gait, drive, soon), Outcome::Delivered);
+    let mut missed = 0;
+    until("it reaches nobody any more", || {
+        missed = if send(&mut gait, drive, soon) == Outcome::Delivered { 0 } else { missed + 1 };
+        (missed == 4).then_some(())
+    });
     // When: the knee itself
     robot.revoke(1, 1);
     let own = knee.handle().reload_deny_list();

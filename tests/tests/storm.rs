@@ -121,7 +121,10 @@ fn a_peer_is_served_and_a_new_one_taken_while_thousands_say_nothing_and_no_descr
     ankle.wait_for(&["started"]);
     knee.wait_for(&["count 1 from 127.0.0.3"]);
     storm.wait();
-    knee.wait_for(&["count 1000 from 127.0.0.3"]);
+    // Each with a deadline of its own: how many a second come is the machine's affair.
+    for count in [250, 500, 750, 1_000] {
+        knee.wait_for(&[&format!("count {count} from 127.0.0.3")]);
+    }
     assert!(knee.said().iter().all(|line| !line.contains("NodeLost")), "nobody was lost meanwhile");
     hip.signal(Signal::TERM);
     knee.wait_for(&["NodeLost", "hip", "Left"]);
