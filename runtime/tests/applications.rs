@@ -29,7 +29,7 @@ use sinew_runtime::{
 
 const NODE: NodeAddress = NodeAddress::new(0x7f00_0001);
 /// No test waits longer than this for anything.
-const DEADLINE: Duration = Duration::from_secs(10);
+const DEADLINE: Duration = Duration::from_secs(60);
 
 struct Nobody;
 
@@ -254,6 +254,9 @@ fn outcomes_come_as_messages_once_each_to_who_wants_them_so() {
     assert!(told.try_recv().is_err(), "each is told once");
 }
 
+/// How long a watcher waits for numbers: an actor that gets no CPU for a while ticks five times before.
+const SILENCE: Duration = Duration::from_millis(500);
+
 /// Ticks each millisecond, and waits for numbers that stay away.
 struct Watcher(SyncSender<&'static str>);
 
@@ -266,8 +269,8 @@ impl Actor for Watcher {
                 this.0.send("five ticks").unwrap();
             }
         });
-        context.expect::<Number>(None, Duration::from_millis(20), |this, silence, _| {
-            assert!(silence.silent >= Duration::from_millis(20));
+        context.expect::<Number>(None, SILENCE, |this, silence, _| {
+            assert!(silence.silent >= SILENCE);
             this.0.send("silence").unwrap();
         });
     }
@@ -425,7 +428,8 @@ fn bytes_that_are_no_payload_do_not_feed_the_input_watchdog() {
             while !stop.load(std::sync::atomic::Ordering::Relaxed) {
                 let mut garbage = sender.create_message(sender.tid(), Number::KIND, 3).unwrap();
                 garbage.fill(0xc1); // the one byte that MessagePack never uses
-                sender.send_message(garbage).unwrap();
+                // An actor that gets no CPU for a while has no room for it.
+                let _ = sender.send_message(garbage);
                 std::thread::sleep(Duration::from_millis(1)); // the pace of the rubbish
             }
         })

@@ -12,7 +12,7 @@ use sinew_runtime::log;
 use tracing::{Level, Metadata, subscriber::with_default};
 
 const INFO: fn(&Metadata<'_>) -> bool = |metadata| *metadata.level() <= Level::INFO;
-const DEADLINE: Duration = Duration::from_secs(20);
+const DEADLINE: Duration = Duration::from_secs(60);
 
 /// One test, because there is one log in a process.
 #[test]
