@@ -11,7 +11,7 @@ use std::{
 
 use sinew::{ApiError, AppAddress, NodeApi, Registration, Transport, prelude::*};
 
-const WATCHDOG: Duration = Duration::from_secs(20);
+const WATCHDOG: Duration = Duration::from_secs(60);
 const SOCKET: &str = "SINEW_TEST_SOCKET";
 
 payload!("test.angle" => struct Angle { degrees: f32 });

@@ -87,7 +87,7 @@ fn an_answer_has_its_maximum_of_entries_and_not_one_more() {
 }
 
 /// The watchdog of a test that waits.
-const DEADLINE: Duration = Duration::from_secs(10);
+const DEADLINE: Duration = Duration::from_secs(60);
 
 struct Ledger(SyncSender<Outcome>);
 

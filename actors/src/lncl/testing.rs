@@ -37,7 +37,7 @@ use super::{
 use crate::{NodeConfig, access::Access, stores::Stores, sync};
 
 /// How long a test waits for what must come; it fails then with what it waited for.
-pub(crate) const WATCHDOG: Duration = Duration::from_secs(10);
+pub(crate) const WATCHDOG: Duration = Duration::from_secs(60);
 
 /// A directory of its own, removed at the end.
 pub(crate) struct TestDirectory(PathBuf);

@@ -163,6 +163,8 @@ mod tests {
 
     use super::*;
 
+    const WATCHDOG: Duration = Duration::from_secs(60);
+
     fn me() -> Announcement {
         Announcement {
             project: "sinew".to_owned(),
@@ -202,10 +204,10 @@ mod tests {
 
     /// The daemon says nothing more, as it has ended.
     fn ends(events: &Receiver<DaemonEvent>) {
-        while let Ok(event) = events.recv_timeout(Duration::from_secs(10)) {
+        while let Ok(event) = events.recv_timeout(WATCHDOG) {
             assert!(!matches!(event, DaemonEvent::Error(_)), "{event:?}");
         }
-        assert!(events.is_disconnected(), "waited 10 s for the daemon to end");
+        assert!(events.is_disconnected(), "waited 60 s for the daemon to end");
     }
 
     #[test]
@@ -214,7 +216,7 @@ mod tests {
             // given
             let (open, gate) = mpsc::sync_channel::<()>(1);
             let making = made(move || {
-                gate.recv_timeout(Duration::from_secs(10)).expect("the gate is opened");
+                gate.recv_timeout(WATCHDOG).expect("the gate is opened");
                 publish(free_port())
             });
             tokio::pin!(making);
@@ -236,13 +238,13 @@ mod tests {
             let making = made(move || {
                 let mdns = publish(free_port())?;
                 tell.send(mdns.monitor()?).expect("the test waits");
-                gate.recv_timeout(Duration::from_secs(10)).expect("the gate is opened");
+                gate.recv_timeout(WATCHDOG).expect("the gate is opened");
                 Ok(mdns)
             });
             // when
             assert!(making.now_or_never().is_none());
         });
-        let events = told.recv_timeout(Duration::from_secs(10)).expect("the daemon runs");
+        let events = told.recv_timeout(WATCHDOG).expect("the daemon runs");
         open.send(()).unwrap();
         // then
         ends(&events);
@@ -264,8 +266,8 @@ mod tests {
     fn the_daemons_thread_gives_way_to_those_that_carry_messages() {
         let mdns = started();
         // It has done something: it runs, and has its name.
-        let said = mdns.daemon.status().unwrap().recv_timeout(Duration::from_secs(10));
-        assert!(said.is_ok(), "waited 10 s for the daemon");
+        let said = mdns.daemon.status().unwrap().recv_timeout(WATCHDOG);
+        assert!(said.is_ok(), "waited 60 s for the daemon");
         // Of all threads of this process, and of other tests' daemons the ones that were made so.
         let niceness = |task: std::fs::DirEntry| {
             let read = |what| std::fs::read_to_string(task.path().join(what)).ok();

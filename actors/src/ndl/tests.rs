@@ -35,8 +35,8 @@ use crate::{
 const LOOPBACK: Ipv4Addr = Ipv4Addr::LOCALHOST;
 
 async fn within<T>(what: &str, future: impl Future<Output = T>) -> T {
-    let waited = tokio::time::timeout(Duration::from_secs(10), future).await;
-    waited.unwrap_or_else(|_| panic!("waited 10 s for {what}"))
+    let waited = tokio::time::timeout(Duration::from_secs(60), future).await;
+    waited.unwrap_or_else(|_| panic!("waited 60 s for {what}"))
 }
 
 /// A UDP port that is free now.

@@ -460,7 +460,7 @@ fn threads_that_send_at_once_through_a_narrow_socket_keep_their_order_and_lose_n
                 }
             }
         };
-        let deadline = tokio::time::timeout(Duration::from_secs(10), reading);
+        let deadline = tokio::time::timeout(Duration::from_secs(60), reading);
         tokio::select! {
             read = deadline => read.expect("waited for all frames"),
             end = outlet.drain(link) => panic!("the drainer ended: {end}"),

@@ -111,8 +111,8 @@ fn directory(from: Tid, payload: Bytes) -> Message {
 }
 
 async fn within<F: Future>(what: &str, future: F) -> F::Output {
-    let waited = tokio::time::timeout(Duration::from_secs(10), future).await;
-    waited.unwrap_or_else(|_| panic!("waited 10 s for: {what}"))
+    let waited = tokio::time::timeout(Duration::from_secs(60), future).await;
+    waited.unwrap_or_else(|_| panic!("waited 60 s for: {what}"))
 }
 
 fn run(test: impl Future<Output = ()>) {

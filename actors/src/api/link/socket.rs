@@ -297,7 +297,7 @@ mod tests {
     use super::*;
     use crate::api::Registration;
 
-    const WATCHDOG: Duration = Duration::from_secs(10);
+    const WATCHDOG: Duration = Duration::from_secs(60);
 
     #[test]
     fn an_outcome_that_finds_no_room_is_said_later_and_nobody_waits_for_that() {

@@ -47,8 +47,8 @@ pub(super) fn run(test: impl Future<Output = ()>) {
 
 /// Waits for what a test needs; says what that was if it does not come.
 pub(super) async fn within<T>(what: &str, future: impl Future<Output = T>) -> T {
-    let waited = tokio::time::timeout(Duration::from_secs(10), future).await;
-    waited.unwrap_or_else(|_| panic!("waited 10 s for {what}"))
+    let waited = tokio::time::timeout(Duration::from_secs(60), future).await;
+    waited.unwrap_or_else(|_| panic!("waited 60 s for {what}"))
 }
 
 pub(super) async fn next<T>(what: &str, stream: &mut (impl Stream<Item = T> + Unpin)) -> T {

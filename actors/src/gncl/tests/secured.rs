@@ -300,7 +300,7 @@ fn a_secured_node_says_nothing_to_whom_it_dials_before_that_one_has_proven_who_i
 fn who_does_not_end_its_handshake_is_hung_up_on_without_a_word_that_is_no_record() {
     run(async {
         let secured = Node::start_secured_with(1, &keys(), 1, |config| {
-            config.gncl.handshake = Duration::from_millis(50);
+            config.gncl.handshake = Duration::from_millis(500);
         })
         .await;
         let mut stranger = ByHand::dial(&secured).await;

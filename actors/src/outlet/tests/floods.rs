@@ -59,7 +59,7 @@ impl Flood {
                 tokio::time::sleep(Duration::from_millis(1)).await;
             }
         };
-        tokio::time::timeout(Duration::from_secs(10), come).await.expect("all frames within 10 s");
+        tokio::time::timeout(Duration::from_secs(60), come).await.expect("all frames within 60 s");
     }
 
     fn seen(&self) -> Vec<u8> {

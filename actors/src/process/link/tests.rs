@@ -156,7 +156,7 @@ fn whoever_is_told_that_a_former_process_failed_may_send_to_it_at_once() {
         connect(second);
         say.send(()).expect("it is waited for");
     });
-    said.recv_timeout(Duration::from_secs(10)).expect("whoever is told is told without a lock");
+    said.recv_timeout(Duration::from_secs(60)).expect("whoever is told is told without a lock");
 }
 
 #[test]

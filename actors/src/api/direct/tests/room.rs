@@ -272,7 +272,7 @@ fn when_the_rings_of_a_process_have_their_most_in_bytes_messages_go_through_the_
 #[test]
 fn a_peer_that_takes_nothing_costs_a_sender_its_patience_once_and_not_with_each_message() {
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let patience = WATCHDOG / 20;
+    let patience = WATCHDOG / 30;
     let mut one = register(&node, Registration::new().direct(true).patience(patience));
     let (mut other, mut third) = (endpoint(&node), endpoint(&node));
     link(&mut one, &mut other);
