@@ -77,12 +77,14 @@ impl Scenario {
         node
     }
 
-    /// Runs `sinew` through the socket of the node called `name`.
+    /// Runs `sinew` through the socket of the node called `name`. A node of a machine that is slow has more time for its answer than the
+    /// command gives it by itself.
     pub(crate) fn sinew(&self, name: &str, words: &[&str]) -> Answer {
-        sinew(
-            &[&["--socket", self.socket(name).to_str().expect("a short path")], words].concat(),
-            Path::new("/"),
-        )
+        let socket = self.socket(name);
+        let door = ["--socket", socket.to_str().expect("a short path")];
+        let patience: &[&str] =
+            if words.contains(&"--deadline-ms") { &[] } else { &["--deadline-ms", "10000"] };
+        sinew(&[&door, patience, words].concat(), Path::new("/"))
     }
 
     /// Asks again until the JSON that comes is as it is to be.
