@@ -8,7 +8,7 @@ use std::{
 use sinew_hosts::Hosts;
 
 /// Nothing that arrives takes longer.
-const PATIENCE: Duration = Duration::from_secs(10);
+const PATIENCE: Duration = Duration::from_secs(60);
 /// What is swallowed is not waited for longer.
 const SILENCE: Duration = Duration::from_millis(300);
 

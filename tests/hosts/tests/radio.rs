@@ -12,9 +12,9 @@ use sinew_hosts::{Hosts, Weather};
 /// As many as a socket keeps for whoever reads later.
 const SENT: u32 = 200;
 /// Nothing that arrives takes longer.
-const PATIENCE: Duration = Duration::from_secs(10);
-/// What is lost is not waited for longer.
-const SILENCE: Duration = Duration::from_millis(300);
+const PATIENCE: Duration = Duration::from_secs(60);
+/// What is lost is not waited for longer; what is not is there by then, though the network's own thread gets no CPU for a while.
+const SILENCE: Duration = Duration::from_secs(2);
 
 fn hosts() -> Option<Hosts> {
     Hosts::on_radio(2, 7).inspect_err(|why| println!("skipped: no hosts can be made here, {why}")).ok()

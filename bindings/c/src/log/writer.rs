@@ -175,7 +175,7 @@ mod tests {
     use super::*;
 
     /// Time for what has to happen anyway.
-    const WATCHDOG: Duration = Duration::from_secs(10);
+    const WATCHDOG: Duration = Duration::from_secs(60);
 
     #[test]
     fn who_says_something_does_not_wait_for_one_who_takes_nothing_and_what_is_lost_is_counted() {
