@@ -17,7 +17,7 @@ use thread_priority::{
 };
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_exoskeleton");
-const DEADLINE: Duration = Duration::from_secs(180);
+const DEADLINE: Duration = Duration::from_secs(600);
 
 /// A folder of this test's own.
 fn folder(name: &str) -> PathBuf {

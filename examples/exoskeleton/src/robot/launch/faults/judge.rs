@@ -52,7 +52,7 @@ const STRIKES_MIN: f64 = 3.0;
 const STOPPED_BELOW_NM: f64 = 0.1;
 /// From a moment that the operator sees to the last word that is still on its way, ns.
 const SETTLED_NS: u64 = 50_000_000;
-/// From an e-stop to torques that are exactly zero, ns.
+/// From an e-stop that all have heard to torques that are exactly zero, ns.
 const STOPPED_NS: u64 = 200_000_000;
 /// How much worse the leg may follow the person on a rough network, degrees.
 const ROUGH_GROWS_DEG: f64 = 0.3;
@@ -177,37 +177,40 @@ fn pull_node(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection
     let knee = Part::Joint(Joint::Knee);
     let away = span(injection.at, injection.until);
     let others = [Joint::Hip, Joint::Ankle];
-    loss_of(claims, evidence, (knee, LossReason::Crashed), &others, &away);
+    let known_ms = loss_of(claims, evidence, (knee, LossReason::Crashed), &others, &away);
     let damped = evidence.watchdog_after_ms(Joint::Knee, away.clone());
     claims.timing("the knee's device damps by itself after, ms", LOST_MS, damped);
-    stay_safe(claims, evidence, &others, &away);
+    stay_safe(claims, evidence, &others, (&away, known_ms));
     claims.exactly("samples with more than that, knee", 0, evidence.undamped_device(Joint::Knee, away));
 }
 
-/// A node is gone: who notices and why they say it is so, and who damps.
+/// A node is gone: who notices and why they say it is so, and who damps. Returns after how many milliseconds all knew.
 fn loss_of(
     claims: &mut Claims<'_>,
     evidence: &Evidence,
     (lost, why): (Part, LossReason),
     drives: &[Joint],
     away: &Span,
-) {
+) -> Option<f64> {
     let peers = Part::ALL.into_iter().filter(|part| *part != lost);
     let losses: Vec<_> = peers.map(|part| evidence.node_lost(part, lost, away.clone())).collect();
-    noticed(claims, "NODE_LOST at every other node after, ms", why, &losses);
+    let known_ms = noticed(claims, "NODE_LOST at every other node after, ms", why, &losses);
     let from = Time::from_nanos(away.start);
     let safe = all(drives.iter().map(|joint| evidence.safe_after_ms(*joint, from)));
     claims.timing("their drives SAFE after, ms", SAFE_MS, safe);
+    known_ms
 }
 
-/// When and how each of these nodes noticed the loss of another one.
-fn noticed(claims: &mut Claims<'_>, name: &str, why: LossReason, losses: &[Option<Loss<'_>>]) {
-    claims.timing(name, LOST_MS, all(losses.iter().map(|loss| Some(loss.as_ref()?.after_ms))));
+/// When and how each of these nodes noticed the loss of another one. Returns after how many milliseconds all had.
+fn noticed(claims: &mut Claims<'_>, name: &str, why: LossReason, losses: &[Option<Loss<'_>>]) -> Option<f64> {
+    let known_ms = all(losses.iter().map(|loss| Some(loss.as_ref()?.after_ms)));
+    claims.timing(name, LOST_MS, known_ms);
     let bound = all(losses.iter().map(|loss| loss.as_ref()?.bound_ms));
     claims.told("its bound, by the settings of discovery, ms", bound);
     let why = format!("{why:?}");
     let others = losses.iter().flatten().filter(|loss| loss.why != why).count();
     claims.exactly(&format!("nodes that give another reason than {why}"), 0, others);
+    known_ms
 }
 
 fn return_node(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection) {
@@ -232,21 +235,30 @@ fn epochs_of_the_knee(evidence: &Evidence, injection: &Injection) -> [Option<u64
 fn cut_link(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection) {
     let knee = Part::Joint(Joint::Knee);
     let away = span(injection.at, injection.until);
-    loss_of(claims, evidence, (knee, LossReason::LinkDown), &[Joint::Hip, Joint::Ankle], &away);
+    let known_there_ms =
+        loss_of(claims, evidence, (knee, LossReason::LinkDown), &[Joint::Hip, Joint::Ankle], &away);
     let alone = evidence.safe_after_ms(Joint::Knee, injection.at);
     claims.timing("the isolated knee SAFE by its own timer after, ms", LOST_MS, alone);
     let others = Part::ALL.into_iter().filter(|part| *part != knee);
     let losses: Vec<_> = others.map(|part| evidence.node_lost(knee, part, away.clone())).collect();
-    noticed(claims, "NODE_LOST of every other at the knee after, ms", LossReason::LinkDown, &losses);
-    stay_safe(claims, evidence, &Joint::ALL, &away);
+    let known_here_ms =
+        noticed(claims, "NODE_LOST of every other at the knee after, ms", LossReason::LinkDown, &losses);
+    stay_safe(claims, evidence, &Joint::ALL, (&away, all([known_there_ms, known_here_ms])));
     claims.exactly("drives that were started anew", 0, evidence.lives_begun(&away));
 }
 
-/// These drives are safe and stay so for as long as somebody is away.
-fn stay_safe(claims: &mut Claims<'_>, evidence: &Evidence, drives: &[Joint], away: &Span) {
-    let safe = away.start + SAFE_AT_LATEST_NS..away.end;
+/// These drives are safe, and stay so for as long as somebody is away: soon after all nodes knew, which is so many milliseconds after it
+/// happened. How soon they know is a time, and no claim about function.
+fn stay_safe(
+    claims: &mut Claims<'_>,
+    evidence: &Evidence,
+    drives: &[Joint],
+    (away, known_ms): (&Span, Option<f64>),
+) {
+    let known = later(Time::from_nanos(away.start), known_ms).as_nanos();
+    let safe = (known + SAFE_AT_LATEST_NS).min(away.end)..away.end;
     let left = evidence.ticks_not_in(DriveState::Safe, drives, &safe);
-    claims.exactly("ticks out of SAFE from 50 ms on, while it is away", 0, left);
+    claims.exactly("ticks out of SAFE, from 50 ms after all nodes knew", 0, left);
     claims.exactly(
         "samples of their devices with more than b*qd + 1 Nm",
         0,
@@ -321,7 +333,8 @@ fn emergency_stop(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Inje
     let latched = span(later(at, heard), reset);
     let left = evidence.ticks_not_in(DriveState::EStop, &Joint::ALL, &latched);
     claims.exactly("ticks of a drive that is not stopped, until reset", 0, left);
-    let stopped = at.as_nanos() + STOPPED_NS..latched.end;
+    // How soon they hear is a time.
+    let stopped = (latched.start + STOPPED_NS).min(latched.end)..latched.end;
     claims.at_most("torque once stopped, Nm", 0.0, evidence.torque_max_nm(&stopped));
     let other = evidence.gait(stopped).iter().filter(|row| row.mode != Some(GaitMode::Stop)).count();
     claims.exactly("ticks in which central says anything else", 0, other);
@@ -398,8 +411,8 @@ fn rough_network(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injec
 fn kill_central(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection) {
     let started = injection.when(Mark::Started).unwrap_or(injection.until);
     let (at, away) = (injection.at, span(injection.at, started));
-    loss_of(claims, evidence, (Part::Central, LossReason::Crashed), &Joint::ALL, &away);
-    stay_safe(claims, evidence, &Joint::ALL, &away);
+    let known_ms = loss_of(claims, evidence, (Part::Central, LossReason::Crashed), &Joint::ALL, &away);
+    stay_safe(claims, evidence, &Joint::ALL, (&away, known_ms));
     claims.exactly("drives that were started anew", 0, evidence.lives_begun(&span(at, injection.until)));
     let held = injection.when(Mark::Held).map(|held| held.since(started).as_secs_f64());
     claims.timing("barrier passed again after its start, s", REJOIN_S, held);

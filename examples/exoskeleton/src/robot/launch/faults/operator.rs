@@ -12,10 +12,10 @@ use crate::message::{GaitMode, GaitState, Stance, TorqueSet};
 use crate::robot::edges::{EmergencyStop, GAIT, Release, Reset, STOP, drive_name};
 
 /// Time to reach central after it was started again.
-const CONNECT_PATIENCE: Duration = Duration::from_secs(10);
+const CONNECT_PATIENCE: Duration = Duration::from_secs(60);
 const RETRY_PERIOD: Duration = Duration::from_millis(50);
 /// Time for an answer.
-const PATIENCE: Duration = Duration::from_secs(2);
+const PATIENCE: Duration = Duration::from_secs(10);
 /// A reset that comes too early is refused; then it is pressed again.
 const RESETS_MAX: usize = 40;
 

@@ -22,8 +22,8 @@ use crate::robot::topology::Topology;
 
 /// Time between two looks at how things stand.
 const LOOK_PERIOD: Duration = Duration::from_millis(5);
-/// From the release to assistance: four strides as a rule, more when the phase is hard to find.
-const WALK_PATIENCE: Duration = Duration::from_secs(40);
+/// From the release to assistance: four strides as a rule, more when the phase is hard to find or others have the CPUs for a while.
+const WALK_PATIENCE: Duration = Duration::from_secs(120);
 /// Time for which the leg is held before the operator wonders.
 const HELD_PATIENCE: Duration = Duration::from_secs(1);
 /// Strides that are walked until everything is well at a phase.

@@ -56,7 +56,11 @@ const AFTERMATH: Duration = Duration::from_millis(300);
 const WORDS: u32 = 10;
 const WORDS_MAX: u32 = 500;
 const WORD_PERIOD: Duration = Duration::from_millis(3);
-const RESET_PATIENCE: Duration = Duration::from_secs(10);
+const RESET_PATIENCE: Duration = Duration::from_secs(60);
+/// From [`PUSH_PHASE`] on, how long the same with the other sign is insane for sure.
+const PUSHES: Duration = Duration::from_millis(150);
+/// Strides in which it is tried, at most: where the host has no time for the operator there are few words in each.
+const PUSHES_MAX: u32 = 20;
 
 /// One injected fault and what came of it, in the host's clock.
 #[derive(Debug, Clone)]
@@ -346,7 +350,7 @@ fn insane_commands(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), Fa
     robot.walk_to_phase(PUSH_PHASE)?;
     give(robot, injection, Mark::NotANumber, &[Word::Torque(f32::NAN)])?;
     give(robot, injection, Mark::TooMuch, &[Word::Torque(500.0)])?;
-    give(robot, injection, Mark::Reversed, &[Word::Torque(40.0)])?;
+    give_reversed(robot, injection)?;
     injection.mark(Mark::Stranger, Time::now());
     for _ in 0..WORDS {
         robot.operator()?.pretend_to_be_central()?;
@@ -362,10 +366,7 @@ fn insane_commands(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), Fa
 /// Gives the words over and over until the drive has counted one of the kind: of a stream the newest wins, so that a
 /// word may be overtaken by the next.
 fn give(robot: &mut Robot, injection: &mut Injection, kind: Mark, words: &[Word]) -> Result<(), FaultError> {
-    let counted = |robot: &Robot| {
-        let drive = robot.view().drive(Joint::Ankle);
-        drive.map(|drive| if kind == Mark::Sane { drive.commands_taken } else { drive.commands_refused })
-    };
+    let counted = |robot: &Robot| counted(robot, kind);
     let before = counted(robot);
     injection.mark(kind, Time::now());
     for number in 1..=WORDS_MAX {
@@ -378,6 +379,38 @@ fn give(robot: &mut Robot, injection: &mut Injection, kind: Mark, words: &[Word]
         }
     }
     robot.pass_until(Time::now() + 4 * WORD_PERIOD)
+}
+
+/// How many words of a kind the drive has counted.
+fn counted(robot: &Robot, kind: Mark) -> Option<u32> {
+    let drive = robot.view().drive(Joint::Ankle);
+    drive.map(|drive| if kind == Mark::Sane { drive.commands_taken } else { drive.commands_refused })
+}
+
+/// The same with the sign that is wrong as long as the ankle pushes, and no longer; in as many strides as it takes.
+fn give_reversed(robot: &mut Robot, injection: &mut Injection) -> Result<(), FaultError> {
+    let mut before = None;
+    for _ in 0..PUSHES_MAX {
+        robot.walk_to_phase(PUSH_PHASE)?;
+        let pushes = Time::now();
+        if before.is_none() {
+            // A stride after the words before: all of them are counted.
+            before = counted(robot, Mark::Reversed);
+            injection.mark(Mark::Reversed, pushes);
+        }
+        for _ in 0..WORDS {
+            if Time::now().since(pushes) > PUSHES {
+                break;
+            }
+            robot.operator()?.set_torque(Joint::Ankle, Word::Torque(40.0))?;
+            robot.pass_until(Time::now() + WORD_PERIOD)?;
+        }
+        robot.pass_until(Time::now() + AFTERMATH)?;
+        if counted(robot, Mark::Reversed) > before {
+            break;
+        }
+    }
+    Ok(())
 }
 
 fn kill_central(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), FaultError> {
