@@ -1,16 +1,18 @@
 //! What must hold after quiet, by what each application's own node knows of it: nothing of the cores but what they say.
 
-use std::collections::{BTreeMap, BTreeSet};
-
-use super::{super::reason::Reason, APPS, Core, Fault, Life, NODES, Wanted, World, app_address, name};
+use super::{super::reason::Reason, world::Life, *};
 use crate::sync::facts::Absence;
 
 impl World {
     /// The applications that can run: all that they require can.
     fn possible(&self) -> BTreeSet<usize> {
-        let mut possible = BTreeSet::new();
-        for index in 0..NODES * APPS {
-            let is_met = |wanted: &Wanted| wanted.is_met_by(|index| possible.contains(&index));
+        let is_shared = |index: &usize| index % SLOTS == SHARED;
+        let all = 0..self.nodes * SLOTS;
+        // Who is required by the shared name requires nobody.
+        let shared = all.clone().filter(is_shared).filter(|index| self.life_of(*index).is_some());
+        let mut possible: BTreeSet<usize> = shared.collect();
+        for index in all.filter(|index| !is_shared(index)) {
+            let is_met = |wanted: &Wanted| wanted.is_met_by(self.nodes, |index| possible.contains(&index));
             if self.life_of(index).is_some_and(|life| life.requires.iter().all(is_met)) {
                 possible.insert(index);
             }
@@ -19,7 +21,7 @@ impl World {
     }
 
     fn life_of(&self, index: usize) -> Option<&Life> {
-        self.apps[index / APPS].get(&(index % APPS))
+        self.apps[index / SLOTS].get(&(index % SLOTS))
     }
 
     /// All links are up, and everything that could happen has.
@@ -27,20 +29,20 @@ impl World {
         // Who was released and lost a requirement since is not stopped, so it may run without being possible.
         for index in self.possible() {
             let is_well = self.life_of(index).is_some_and(|life| life.released == 1 && life.running);
-            require(is_well, || format!("{} can run, and does not", name(index)))?;
+            require(is_well, || format!("{} of node {} can run, and does not", name(index), index / SLOTS))?;
         }
-        (0..NODES * APPS).try_for_each(|index| self.check_reasons(index))?;
+        (0..self.nodes * SLOTS).try_for_each(|index| self.check_reasons(index))?;
         self.check_directories()
     }
 
     /// Who waits is told for whom and why, and that is so.
     fn check_reasons(&self, index: usize) -> Result<(), String> {
         let Some(life) = self.life_of(index).filter(|life| life.released == 0) else { return Ok(()) };
-        let (core, who) = (&self.cores[index / APPS], name(index));
+        let (core, who) = (&self.cores[index / SLOTS], name(index));
         let missing: Vec<Absence> = if self.fault == Some(Fault::ReasonsKept) {
             Vec::new()
         } else {
-            core.missing(self.now, app_address(index % APPS))
+            core.missing(self.now, app_address(index % SLOTS))
         };
         require(!missing.is_empty(), || format!("{who} waits, and no reason is given"))?;
         // Of a requirement with several names each that is not ready is told behind it.
@@ -48,7 +50,8 @@ impl World {
             .iter()
             .map(|Absence { name, why, .. }| (name.rsplit(": ").next().unwrap_or(name), &**why))
             .collect();
-        for other in 0..NODES * APPS {
+        // The shared name is not that of one application.
+        for other in (0..self.nodes * SLOTS).filter(|other| other % SLOTS != SHARED) {
             let other_name = name(other);
             let life = self.life_of(other);
             let Some(why) = named.get(&*other_name) else { continue };
@@ -75,22 +78,44 @@ impl World {
 
     /// All nodes have the same directory, which says what is so, and their watchers were told of it.
     fn check_directories(&self) -> Result<(), String> {
-        let directories: Vec<_> = self.cores.iter().map(Core::directory).collect();
-        let is_one = directories.iter().all(|directory| *directory == directories[0]);
-        require(is_one, || format!("nodes have different directories: {directories:?}"))?;
-        for (core, view) in self.cores.iter().zip(&self.views) {
-            let known = core.directory().into_iter().map(|entry| ((entry.name, entry.tid), entry.ready));
-            let known: BTreeMap<_, _> = known.collect();
-            require(known == *view, || format!("a watcher was told {view:?}, and {known:?} is there"))?;
+        let first = self.cores[0].directory();
+        for (node, core) in self.cores.iter().enumerate().skip(1) {
+            let other = core.directory();
+            require(other == first, || {
+                format!("nodes 0 and {node} have different directories: {first:?} and {other:?}")
+            })?;
         }
-        let said: BTreeMap<String, bool> =
-            directories[0].iter().map(|entry| (entry.name.clone(), entry.ready)).collect();
-        let there: BTreeMap<String, bool> =
-            (0..NODES * APPS).filter_map(|index| Some((name(index), self.life_of(index)?.running))).collect();
+        let known: BTreeMap<_, _> =
+            first.iter().map(|entry| ((entry.name.clone(), entry.tid), entry.ready)).collect();
+        for (node, view) in self.views.iter().enumerate().filter(|(node, _)| self.is_watched(*node)) {
+            require(known == *view, || {
+                format!("a watcher of node {node} was told {view:?}, and {known:?} is there")
+            })?;
+        }
+        let said: BTreeMap<usize, bool> =
+            first.iter().map(|entry| (index_of(entry.tid), entry.ready)).collect();
+        let there = (0..self.nodes * SLOTS).filter_map(|index| Some((index, self.life_of(index)?.running)));
+        let there: BTreeMap<usize, bool> = there.collect();
         require(said == there, || format!("the directory has {said:?}, and {there:?} is there"))?;
-        for entry in &directories[0] {
-            let is_one = self.cores.iter().all(|core| core.called(&entry.name).first() == Some(&entry.tid));
-            require(is_one, || format!("{} is not the same for all", entry.name))?;
+        self.check_names(&there)
+    }
+
+    /// A name is its own node's first, then that of the lowest address, for all nodes.
+    fn check_names(&self, there: &BTreeMap<usize, bool>) -> Result<(), String> {
+        let mut names: BTreeMap<String, Vec<usize>> = BTreeMap::new();
+        for index in there.keys() {
+            names.entry(name(*index)).or_default().push(index / SLOTS);
+        }
+        for (node, core) in self.cores.iter().enumerate() {
+            for (name, nodes) in &names {
+                let others = nodes.iter().filter(|other| **other != node);
+                let own = nodes.iter().filter(|other| **other == node);
+                let right: Vec<NodeAddress> = own.chain(others).map(|node| address(*node)).collect();
+                let called: Vec<NodeAddress> = core.called(name).iter().map(|tid| tid.node).collect();
+                require(called == right, || {
+                    format!("for node {node} {name} is of {called:?}, and is to be of {right:?}")
+                })?;
+            }
         }
         Ok(())
     }

@@ -1,0 +1,387 @@
+//! The cores, their applications, and what becomes of what cores order.
+
+use super::{judge::require, *};
+
+/// Of each node; so large that clocks can begin anew.
+const FIRST_LIFE: u64 = 1_000_000;
+
+/// An application as its own node's root sees it.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Life {
+    pub(super) requires: Vec<Wanted>,
+    pub(super) released: u32,
+    pub(super) running: bool,
+}
+
+/// How often what happened, so that a quiet simulation is noticed.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct Seen(BTreeMap<&'static str, u64>);
+
+impl Seen {
+    const WHAT: [&'static str; 15] = [
+        "nodes",
+        "lists",
+        "lists lost",
+        "links cut",
+        "breaks heard late",
+        "losses one way",
+        "losses",
+        "parts",
+        "restarts",
+        "clocks anew",
+        "goodbyes",
+        "pauses",
+        "released",
+        "shared names",
+        "crowds",
+    ];
+
+    pub(super) fn count(&mut self, what: &'static str, times: u64) {
+        debug_assert!(Self::WHAT.contains(&what), "{what}");
+        *self.0.entry(what).or_default() += times;
+    }
+
+    pub(super) fn add(&mut self, other: &Self) {
+        other.0.iter().for_each(|(what, times)| self.count(what, *times));
+    }
+
+    pub(super) fn must_cover_everything(&self) {
+        let is_tried = |what: &&str| self.0.get(what).is_some_and(|times| *times >= 3);
+        assert!(Self::WHAT.iter().all(is_tried), "something was hardly tried: {self:?}");
+    }
+}
+
+pub(super) struct World {
+    pub(super) nodes: usize,
+    pub(super) now: Time,
+    pub(super) chance: fastrand::Rng,
+    pub(super) cores: Vec<Core>,
+    pub(super) incarnations: Vec<u64>,
+    /// The earliest life of each node.
+    pub(super) earliest: Vec<u64>,
+    /// Which life of the second a node's link led to last.
+    pub(super) met: BTreeMap<Ends, u64>,
+    pub(super) apps: Vec<BTreeMap<usize, Life>>,
+    /// Links that carry lists, the smaller end first.
+    pub(super) up: BTreeSet<Ends>,
+    /// Which life of the second was linked with the first, which has not heard yet that it is not any more.
+    pub(super) unheard: BTreeMap<Ends, u64>,
+    pub(super) paused: BTreeSet<usize>,
+    /// Lists on their way, from and to.
+    pub(super) flying: BTreeMap<Ends, VecDeque<Bytes>>,
+    /// What an application of each node knows of the directory, by what it was told and took.
+    pub(super) views: Vec<BTreeMap<(String, Tid), bool>>,
+    told: u64,
+    pub(super) takes_all: bool,
+    /// Applications that have run in any life.
+    has_run: BTreeSet<usize>,
+    pub(super) fault: Option<Fault>,
+    /// Orders that a fault may strike.
+    struck: u64,
+    /// The list that went last, from and to.
+    pub(super) last: BTreeMap<Ends, Bytes>,
+    /// The newest version that a node has heard of anybody.
+    pub(super) newest: BTreeMap<usize, u64>,
+    is_traced: bool,
+    pub(super) seen: Seen,
+    pub(super) violations: Vec<String>,
+}
+
+impl World {
+    pub(super) fn new(plan: &Plan, fault: Option<Fault>, is_traced: bool) -> Self {
+        let nodes = plan.nodes;
+        let mut world = Self {
+            nodes,
+            now: Time::from_nanos(1),
+            chance: fastrand::Rng::with_seed(!plan.seed),
+            cores: Vec::new(),
+            incarnations: vec![FIRST_LIFE; nodes],
+            earliest: vec![FIRST_LIFE; nodes],
+            met: BTreeMap::new(),
+            apps: vec![BTreeMap::new(); nodes],
+            up: BTreeSet::new(),
+            unheard: BTreeMap::new(),
+            paused: BTreeSet::new(),
+            flying: BTreeMap::new(),
+            views: vec![BTreeMap::new(); nodes],
+            told: 0,
+            takes_all: false,
+            has_run: BTreeSet::new(),
+            fault,
+            struck: 0,
+            last: BTreeMap::new(),
+            newest: BTreeMap::new(),
+            is_traced,
+            seen: Seen::default(),
+            violations: Vec::new(),
+        };
+        world.seen.count("nodes", nodes as u64);
+        world.seen.count("crowds", u64::from(nodes > 8));
+        world.cores = (0..nodes).map(|node| world.new_core(node)).collect();
+        (0..nodes).for_each(|node| world.watch(node));
+        world
+    }
+
+    pub(super) fn say(&self, what: impl FnOnce() -> String) {
+        if self.is_traced {
+            println!("{:>9.3} ms  {}", self.now.as_nanos() as f64 / 1e6, what());
+        }
+    }
+
+    /// All that happens. What is found to be wrong.
+    pub(super) fn run(mut self, steps: Vec<Step>) -> (Vec<String>, Seen) {
+        self.say(|| format!("{} nodes", self.nodes));
+        steps.into_iter().for_each(|step| self.step(step));
+        self.settle();
+        if self.violations.is_empty() {
+            self.violations.extend(self.verdict().err());
+        }
+        (self.violations, self.seen)
+    }
+
+    /// Whether an application there is told of the directory: on each node of a few, on some of many, for it is read whole for each change.
+    pub(super) const fn is_watched(&self, node: usize) -> bool {
+        node.is_multiple_of(self.nodes.div_ceil(8))
+    }
+
+    /// An application without a name wants to hear of the directory.
+    pub(super) fn watch(&mut self, node: usize) {
+        self.views[node].clear();
+        if !self.is_watched(node) {
+            return;
+        }
+        let app = app_address(WATCHER);
+        self.tell(node, Input::AppChanged(AppFact::Registered { app, name: None, requires: Vec::new() }));
+        self.tell(node, Input::AppChanged(AppFact::Ready { app }));
+        self.tell(node, Input::DirectoryWanted { app });
+    }
+
+    /// It takes two of three events, and in the end all.
+    fn told_of_directory(&mut self, node: usize, event: DirectoryEvent) {
+        self.told += 1;
+        if self.told.is_multiple_of(3) && !self.takes_all {
+            return self.cores[node]
+                .handle(self.now, Input::DirectoryNotTaken { app: app_address(WATCHER), event });
+        }
+        match event {
+            DirectoryEvent::Is(entry) => drop(self.views[node].insert((entry.name, entry.tid), entry.ready)),
+            DirectoryEvent::Gone { .. } if self.fault == Some(Fault::GoneNotTold) => {}
+            DirectoryEvent::Gone { name, tid } => drop(self.views[node].remove(&(name, tid))),
+        }
+    }
+
+    pub(super) fn new_core(&self, node: usize) -> Core {
+        let mut config = NodeConfig::new("n");
+        // Room for all others, and for nobody else.
+        config.ndl.nodes_max = self.nodes - 1;
+        Core::new(&config, address(node), Incarnation(self.incarnations[node]))
+    }
+
+    pub(super) fn tell(&mut self, node: usize, input: Input) {
+        self.cores[node].handle(self.now, input);
+        let mut lists = 0;
+        while let Some(output) = self.cores[node].poll() {
+            lists += usize::from(matches!(output, Output::Publish { .. }));
+            let is_lost = matches!(output, Output::Publish { .. })
+                && lists > 2
+                && self.fault == Some(Fault::TwoListsATurn);
+            if !is_lost {
+                self.carry_out(node, output);
+            }
+        }
+    }
+
+    /// Whether a fault strikes now: one time in three.
+    fn strikes(&mut self, fault: Fault) -> bool {
+        self.struck += u64::from(self.fault == Some(fault));
+        self.fault == Some(fault) && self.struck.is_multiple_of(3)
+    }
+
+    fn violate(&mut self, is_so: bool, words: impl FnOnce() -> String) {
+        self.violations.extend(require(is_so, words).err());
+    }
+
+    fn carry_out(&mut self, node: usize, output: Output) {
+        match output {
+            Output::Release { app } if app == app_address(WATCHER) => {}
+            Output::Release { .. } if self.strikes(Fault::ReleaseLost) => {}
+            Output::Release { app } => self.released(node, app),
+            Output::TellDirectory { event, .. } => self.told_of_directory(node, event),
+            Output::Publish { to, list } => self.fly(node, to, list),
+            Output::Tell { app, event, .. } => {
+                let released = self.life(node, app).1.released;
+                self.violate(released == 1, || format!("told before it was released: {event:?}"));
+            }
+            Output::Refused { cause, detail } => {
+                self.violations.push(format!("node {node} refuses because of {cause}: {detail}"));
+            }
+            Output::PublishArrivals { .. }
+            | Output::AnswerBarrier { .. }
+            | Output::RouteGroups { .. }
+            | Output::Cycle { .. }
+            | Output::Overdue(_)
+            | Output::SameName { .. } => {}
+        }
+    }
+
+    fn life(&mut self, node: usize, app: AppAddress) -> (usize, &mut Life) {
+        let slot = (0..SLOTS).find(|slot| app_address(*slot) == app).unwrap();
+        (slot, self.apps[node].get_mut(&slot).expect("a release for who is not registered"))
+    }
+
+    /// No release before all is ready, and one for each life.
+    fn released(&mut self, node: usize, app: AppAddress) {
+        let directory = self.cores[node].directory();
+        let ready = directory.iter().filter(|entry| entry.ready).map(|entry| index_of(entry.tid));
+        let ready: BTreeSet<usize> = ready.collect();
+        let (slot, life) = self.life(node, app);
+        life.released += 1;
+        let (released, requires) = (life.released, life.requires.clone());
+        let who = format!("{} of node {node}", name(node * SLOTS + slot));
+        self.say(|| format!("{who} is released"));
+        self.seen.count("released", 1);
+        self.violate(released == 1, || format!("{who} is released twice in one life"));
+        for wanted in requires {
+            let is_met = wanted.is_met_by(self.nodes, |index| ready.contains(&index));
+            self.violate(is_met, || {
+                format!("{who} is released early: {wanted:?} is not met, as its node sees it")
+            });
+            // What was heard last may be out of date, and was so once.
+            let has_been = wanted.is_met_by(self.nodes, |index| self.has_run.contains(&index));
+            self.violate(has_been, || format!("{who} is released early: {wanted:?} has never run"));
+        }
+    }
+
+    fn step(&mut self, step: Step) {
+        self.say(|| format!("{step:?}"));
+        match step {
+            // Nothing of a process that is stopped goes on.
+            Step::Register { node, .. }
+            | Step::Start { node, .. }
+            | Step::Fail { node, .. }
+            | Step::Unregister { node, .. }
+            | Step::Leave { node }
+            | Step::HearOfBreaks { node }
+                if self.paused.contains(&node) => {}
+            Step::Register { node, slot, requires } => self.register(node, slot, requires),
+            Step::Start { node, slot } => drop(self.start(node, slot)),
+            Step::Fail { node, slot } => self.fail(node, slot),
+            Step::Unregister { node, slot } => self.unregister(node, slot),
+            Step::Cut { ends, loss } => self.cut(ends, loss),
+            Step::Restore { ends } => self.restore(ends),
+            Step::Part { side, loss } => self.part(side, loss),
+            Step::Join { node } => self.join(node),
+            Step::Restart { node, clock } => self.restart(node, clock),
+            Step::Leave { node } => self.leave(node),
+            Step::Pause { node } => self.pause(node),
+            Step::Resume { node } => drop(self.paused.remove(&node)),
+            Step::HearOfBreaks { node } => self.hear_of_breaks(node),
+            Step::Drop { ends } => {
+                let lost = self.flying.get_mut(&ends).and_then(VecDeque::pop_front);
+                self.seen.count("lists lost", u64::from(lost.is_some()));
+            }
+            Step::Deliver { ends: (one, other), count } => {
+                for ends in [(one, other), (other, one)] {
+                    for _ in 0..count {
+                        self.deliver(ends);
+                    }
+                }
+            }
+            Step::Hear { node, count } => {
+                for other in 0..self.nodes {
+                    for _ in 0..count {
+                        self.deliver((other, node));
+                    }
+                }
+            }
+            Step::Pass { millis } => self.pass(Duration::from_millis(millis)),
+        }
+    }
+
+    fn register(&mut self, node: usize, slot: usize, wanted: Vec<Wanted>) {
+        // Requirements point to smaller numbers only, so that there is no cycle.
+        let index = node * SLOTS + slot;
+        let mut requires: Vec<Wanted> = wanted.into_iter().filter_map(|wanted| wanted.below(index)).collect();
+        requires.dedup();
+        self.seen.count("shared names", u64::from(slot == SHARED));
+        // Told again, it is no new life.
+        if self.apps[node].get(&slot).is_none_or(|life| life.requires != requires) {
+            let life = Life { requires: requires.clone(), released: 0, running: false };
+            self.apps[node].insert(slot, life);
+        }
+        let requires = requires.iter().map(|wanted| wanted.requirement().to_string()).collect();
+        let address = app_address(slot);
+        let fact = AppFact::Registered { app: address, name: Some(name(index)), requires };
+        self.tell(node, Input::AppChanged(fact));
+        if self.fault == Some(Fault::ReadyTooEarly) {
+            self.tell(node, Input::AppChanged(AppFact::Ready { app: address }));
+        }
+        if self.fault == Some(Fault::ReleasedAtOnce) && self.apps[node][&slot].released == 0 {
+            self.released(node, address);
+        }
+    }
+
+    /// Whether it starts: one that was released.
+    fn start(&mut self, node: usize, slot: usize) -> bool {
+        let life = self.apps[node].get_mut(&slot).filter(|life| life.released == 1 && !life.running);
+        let Some(life) = life else { return false };
+        life.running = true;
+        self.has_run.insert(node * SLOTS + slot);
+        self.tell(node, Input::AppChanged(AppFact::Ready { app: app_address(slot) }));
+        true
+    }
+
+    fn fail(&mut self, node: usize, slot: usize) {
+        let Some(life) = self.apps[node].get_mut(&slot) else { return };
+        // One that waits goes on waiting in the same life.
+        if life.released == 1 {
+            (life.released, life.running) = (0, false);
+        }
+        if self.fault != Some(Fault::FailureNotTold) {
+            self.tell(node, Input::AppChanged(AppFact::Down { app: app_address(slot) }));
+        }
+    }
+
+    fn unregister(&mut self, node: usize, slot: usize) {
+        self.apps[node].remove(&slot);
+        if self.fault != Some(Fault::EndNotTold) {
+            self.tell(node, Input::AppChanged(AppFact::Unregistered { app: app_address(slot) }));
+        }
+    }
+
+    pub(super) fn pass(&mut self, time: Duration) {
+        self.now = self.now + time;
+        for node in 0..self.nodes {
+            if !self.paused.contains(&node) {
+                self.tell(node, Input::TimePassed);
+            }
+        }
+    }
+
+    /// Heals everything and lets everything happen that can; twice, with time for what was lost to be said again.
+    fn settle(&mut self) {
+        self.say(|| "all is well from now on".to_owned());
+        self.paused.clear();
+        (0..self.nodes).for_each(|node| self.join(node));
+        self.takes_all = true;
+        self.come_to_rest();
+        self.pass(peers::REPEAT);
+        self.come_to_rest();
+    }
+
+    /// Until nothing has happened for as long as anything may take. Each round starts somebody, or ends what was begun.
+    fn come_to_rest(&mut self) {
+        let mut idle = Duration::ZERO;
+        for _ in 0..self.nodes * SLOTS + 20 {
+            self.pass(barrier::RETRY);
+            let is_heard = self.hear_all();
+            let slots = (0..self.nodes).flat_map(|node| (0..SLOTS).map(move |slot| (node, slot)));
+            let started = slots.filter(|(node, slot)| self.start(*node, *slot)).count();
+            idle = if is_heard || started > 0 { Duration::ZERO } else { idle + barrier::RETRY };
+            if idle > barrier::SILENCE {
+                return;
+            }
+        }
+        self.violations.push("it does not come to rest".to_owned());
+    }
+}
