@@ -53,7 +53,7 @@ fn a_crowd_that_starts_at_once_knows_each_other_and_its_cost_is_told() {
 fn measure(nodes: usize) {
     let plan = crowd(nodes);
     let period = plan.period;
-    let mut world = World::new(plan, None);
+    let mut world = World::new(plan, None).measured();
     let begin = world.now;
     let known_after = (1..=100_u32).find(|tenths| {
         world.run_until(begin + period * *tenths / 10);

@@ -83,6 +83,8 @@ pub(super) struct Judge {
     watched: Option<(NodeAddress, Duration, u32)>,
     lateness: Duration,
     lives: Vec<Life>,
+    /// Which of them is whose.
+    numbers: BTreeMap<(NodeAddress, Incarnation), usize>,
     pub(super) violations: Vec<String>,
 }
 
@@ -96,6 +98,7 @@ impl Judge {
                 .map(|(node, period, missed)| (super::world::node_address(node), period, missed)),
             lateness: plan.lateness,
             lives: Vec::new(),
+            numbers: BTreeMap::new(),
             violations: Vec::new(),
         }
     }
@@ -115,6 +118,7 @@ impl Judge {
         incarnation: Incarnation,
         addresses: Vec<SocketAddr>,
     ) {
+        self.numbers.insert((node, incarnation), self.lives.len());
         self.lives.push(Life {
             node,
             incarnation,
@@ -191,6 +195,7 @@ impl Judge {
         let questions = life.questions.entry(from).or_default();
         let Some(question) = questions
             .iter_mut()
+            .rev()
             .find(|question| question.correlation == correlation && !question.is_answered)
         else {
             return;
@@ -459,8 +464,9 @@ impl Judge {
         }
     }
 
-    fn life(&self, node: NodeAddress, incarnation: Incarnation) -> Option<usize> {
-        self.lives.iter().position(|life| life.node == node && life.incarnation == incarnation)
+    /// Which life that is: the number of its process.
+    pub(super) fn life(&self, node: NodeAddress, incarnation: Incarnation) -> Option<usize> {
+        self.numbers.get(&(node, incarnation)).copied()
     }
 
     fn violate(&mut self, now: Time, process: usize, other: usize, words: &str) {

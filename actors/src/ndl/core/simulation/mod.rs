@@ -90,7 +90,7 @@ fn crowds_get_over_faults(nodes: usize, variable: &'static str, test: &'static s
     let mut seen = world::Seen::default();
     for number in only.map_or(0..CROWDS, |only| only..only + 1) {
         let seed = Seed { number, variable, package: "sinew", test };
-        let outcome = seed.run(|| World::new(Plan::crowd(number, nodes), None).run());
+        let outcome = seed.run(|| World::new(Plan::crowd(number, nodes), None).run_and_tell());
         assert!(outcome.violations.is_empty(), "{nodes} nodes: {}\n{seed}", outcome.violations.join("\n"));
         seen.add(&outcome.seen);
     }

@@ -8,7 +8,7 @@ use std::{
     hash::{DefaultHasher, Hash, Hasher},
     net::{Ipv4Addr, SocketAddr, SocketAddrV4},
     rc::Rc,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use rustix::time::{ClockId, clock_gettime};
@@ -156,12 +156,19 @@ pub(super) struct World {
     changed: BTreeMap<(usize, usize), Time>,
     seen: Seen,
     digest: DefaultHasher,
+    /// Whether the time is taken that cores take: to ask for it takes as long as to handle a datagram.
+    is_measured: bool,
     /// Time of the host that cores have taken, reading of datagrams included.
     pub(super) in_cores: Duration,
 }
 
 pub(super) fn node_address(node: usize) -> NodeAddress {
     NodeAddress::new(0x0a00_0001 + u32::try_from(node).expect("few nodes"))
+}
+
+/// The node that has this address, if there is one.
+fn node_at(address: NodeAddress) -> usize {
+    (address.bits() - node_address(0).bits()) as usize
 }
 
 /// The address of a node in a network.
@@ -197,6 +204,7 @@ impl World {
             changed: BTreeMap::new(),
             seen: Seen::default(),
             digest: DefaultHasher::new(),
+            is_measured: false,
             in_cores: Duration::ZERO,
             plan,
         };
@@ -213,10 +221,36 @@ impl World {
         self
     }
 
+    /// Takes the time that cores take.
+    pub(super) const fn measured(mut self) -> Self {
+        self.is_measured = true;
+        self
+    }
+
     fn trace(&self, words: impl FnOnce() -> String) {
         if self.is_traced {
             println!("{:>12.3} ms  {}", self.now.since(BEGIN).as_secs_f64() * 1e3, words());
         }
+    }
+
+    /// As [`World::run`], and tells on standard output after each period how far it is.
+    pub(super) fn run_and_tell(mut self) -> Outcome {
+        let (began, end, period) = (Instant::now(), BEGIN + self.plan.end, self.plan.period);
+        while self.now < end && self.judge.violations.is_empty() {
+            self.run_until(end.min(self.now + period));
+            println!(
+                "crowd {} of {}: {:.1} s of {:.1} s, {} datagrams, {} members found, {} events ahead, after {:.0} s",
+                self.plan.seed,
+                self.plan.nodes,
+                self.now.since(BEGIN).as_secs_f64(),
+                self.plan.end.as_secs_f64(),
+                self.seen.datagrams,
+                self.seen.found,
+                self.events.len(),
+                began.elapsed().as_secs_f64()
+            );
+        }
+        self.run()
     }
 
     pub(super) fn run(mut self) -> Outcome {
@@ -403,9 +437,9 @@ impl World {
 
     fn with(&mut self, process: usize, act: impl FnOnce(&mut Patient, Time)) {
         let now = self.local(process);
-        let began = on_the_cpu();
+        let began = self.is_measured.then(on_the_cpu);
         act(&mut self.processes[process].patient, now);
-        self.in_cores += on_the_cpu().saturating_sub(began);
+        self.in_cores += began.map_or(Duration::ZERO, |began| on_the_cpu().saturating_sub(began));
         while let Some(output) = self.processes[process].patient.poll() {
             self.obey(process, now, output);
         }

@@ -80,8 +80,7 @@ impl World {
 
     /// Has the other's GNCL give a sign within this time, if the connection delivers.
     pub(super) fn ask_for_a_sign(&mut self, process: usize, node: NodeAddress, within: Duration) {
-        let other = self.current.values().copied().find(|other| self.is_of(*other, node));
-        let Some(other) = other.filter(|other| !self.is_stalled(*other)) else { return };
+        let Some(other) = self.current_of(node).filter(|other| !self.is_stalled(*other)) else { return };
         let is_up =
             self.plan.connections && self.host_of(process, self.processes[other].node) == Host::Accepts;
         if is_up {
@@ -105,11 +104,7 @@ impl World {
     /// What GNCL knows of those that a process is about to lose.
     pub(super) fn signs_in_doubt(&self, process: usize) -> Vec<Input> {
         let sign = |(node, incarnation)| {
-            let is_it = |of: &usize| {
-                let announcement = self.processes[*of].patient.core.announcement();
-                (announcement.node, announcement.incarnation) == (node, incarnation)
-            };
-            let of = (0..self.processes.len()).rev().find(is_it)?;
+            let of = self.judge.life(node, incarnation)?;
             let at = *self.signs.get(&(process, of))?;
             Some(Input::SignSeen { node, incarnation, at })
         };
@@ -122,9 +117,7 @@ impl World {
         process: usize,
         (node, incarnation): (NodeAddress, Incarnation),
     ) -> bool {
-        let Some(other) = self.current.values().copied().find(|other| self.is_of(*other, node)) else {
-            return false;
-        };
+        let Some(other) = self.current_of(node) else { return false };
         let Process { node: index, stalled_until, ref patient, .. } = self.processes[other];
         let runs = stalled_until + (self.plan.period + self.plan.lateness) * 4 <= self.now;
         let is_that_life = patient.core.announcement().incarnation == incarnation;

@@ -35,10 +35,7 @@ impl World {
                 self.send(from, to, What::Leave, &datagram);
             }
             Output::Probe { node, incarnation, within, .. } => {
-                let Some(index) = (0..self.plan.nodes).find(|index| node_address(*index) == node) else {
-                    return;
-                };
-                let host = self.host_of(from, index);
+                let host = self.host_of(from, node_at(node));
                 let takes = if host == Host::IsSilent { within } else { WORD_MAX.min(within / 2) };
                 self.ask_for_a_sign(from, node, WORD_MAX.min(within / 2));
                 let at = self.now + self.chance.between(Duration::ZERO, takes);
@@ -46,9 +43,7 @@ impl World {
             }
             Output::Fact(fact) => self.told(from, fact),
             Output::ClockMeasured { node, offset } => {
-                let Some(peer) = self.current.values().find(|peer| self.is_of(**peer, node)).copied() else {
-                    return;
-                };
+                let Some(peer) = self.current_of(node) else { return };
                 let truth =
                     self.local(peer).as_nanos().cast_signed() - self.local(from).as_nanos().cast_signed();
                 self.judge.measured(self.now, from, (node, offset), truth);
@@ -67,8 +62,9 @@ impl World {
         }
     }
 
-    pub(super) fn is_of(&self, process: usize, node: NodeAddress) -> bool {
-        node_address(self.processes[process].node) == node
+    /// The process that is this node now.
+    pub(super) fn current_of(&self, node: NodeAddress) -> Option<usize> {
+        self.current.get(&node_at(node)).copied()
     }
 
     fn told_to_application(&mut self, process: usize, event: &NodeEvent) {
@@ -84,11 +80,8 @@ impl World {
             NodeEvent::NodeFound { .. } | NodeEvent::AppResumed { .. } => {}
         }
         let truth = |node: NodeAddress, incarnation: Incarnation| {
-            let life = self.processes.iter().find(|process| {
-                let announcement = process.patient.core.announcement();
-                (announcement.node, announcement.incarnation) == (node, incarnation)
-            });
-            life.map(|process| process.troubles.clone()).unwrap_or_default()
+            let life = self.judge.life(node, incarnation);
+            life.map(|process| self.processes[process].troubles.clone()).unwrap_or_default()
         };
         if let Err(words) = self.listeners.told(process, event, truth) {
             let words = format!("{:?}: to the application of {process}, {event:?}: {words}", self.now);
@@ -103,7 +96,7 @@ impl World {
         match fact {
             MembershipFact::NodeFound { node, incarnation, .. } => {
                 self.seen.found += 1;
-                if let Some(other) = self.current.values().copied().find(|other| self.is_of(*other, node)) {
+                if let Some(other) = self.current_of(node) {
                     let address = self.processes[other].addresses[0];
                     self.processes[process].met.insert(address);
                 }
@@ -129,8 +122,7 @@ impl World {
                         self.now
                     ));
                 }
-                let index = (0..self.plan.nodes).find(|index| node_address(*index) == node);
-                let host = index.and_then(|index| self.settled_host_of(process, index));
+                let host = self.settled_host_of(process, node_at(node));
                 self.judge.check_class(self.now, process, (node, incarnation), (why, host));
             }
         }
