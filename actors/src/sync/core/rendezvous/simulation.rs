@@ -23,16 +23,20 @@ use crate::{
 use judge::Judge;
 
 /// Seeds in an ordinary run.
-const SEEDS: u64 = 400;
+const SEEDS: u64 = 250;
 /// How many instead; `docs/TESTING.md` has the command.
 const SEEDS_VARIABLE: &str = "SINEW_SYNC_SEEDS";
+/// So many nodes, 3 and more, whatever the seed says.
+const NODES_VARIABLE: &str = "SINEW_SYNC_NODES";
 /// The one seed that is to be replayed.
 const SEED_VARIABLE: &str = "SINEW_SYNC_SEED";
 /// Seeds within which each planted fault must be found.
 const SEEDS_FOR_A_FAULT: u64 = 1_000;
-/// Steps of one seed.
-const STEPS: u64 = 150;
+/// Steps of one seed, where there are three nodes or four; in proportion, where there are more.
+const STEPS: usize = 150;
 const APPS: usize = 2;
+/// Nodes in most seeds, at most.
+const FEW_NODES: usize = 4;
 /// Barriers that a node knows at most, in crowded seeds.
 const FEW: usize = 4;
 /// Of barriers that never open, so many are there to fill that.
@@ -146,7 +150,7 @@ fn heard_generations(input: &Input) -> Vec<u64> {
 impl World {
     fn new(seed: u64, fault: Option<Fault>, trace: bool) -> Self {
         let mut chance = Chance::new(seed);
-        let nodes = 3 + chance.below(2);
+        let nodes = links::nodes(&mut chance);
         let mut world = Self {
             chance,
             now: Time::from_nanos(1),
@@ -262,7 +266,8 @@ impl World {
     fn step(&mut self) {
         let (node, other) = (self.any_process(None), self.chance.below(APPS));
         let (app, other) = (other, self.any_process(Some(node)));
-        match self.chance.below(44) {
+        let more = if self.nodes() > FEW_NODES { 8 } else { 0 };
+        match self.chance.below(44 + more) {
             0..=13 => self.arrive(node, app),
             14 if !self.is_calm => self.leave(node, app),
             15 if !self.is_calm => self.die(node, app),
@@ -279,6 +284,8 @@ impl World {
             37 if !self.is_calm => self.begin_double(node),
             38 => self.end_double(),
             39..=40 if self.is_crowded => self.arrive_elsewhere(node, app),
+            44..=47 => self.join(node),
+            48..=51 => self.hear_all(node),
             _ => {
                 let millis = [1, 3, 10, 60, 700][self.chance.below(5)];
                 self.pass(Duration::from_millis(millis));
@@ -408,7 +415,7 @@ impl World {
 
     /// All that happens in a seed. Returns what the judge found.
     fn run(mut self) -> (Vec<String>, judge::Seen) {
-        for _ in 0..STEPS {
+        for _ in 0..STEPS * self.nodes().max(FEW_NODES) / FEW_NODES {
             self.step();
         }
         self.settle();
@@ -435,7 +442,9 @@ impl World {
 
 fn seed(number: u64) -> Seed {
     let test = "sync::core::rendezvous::simulation::a_seed_is_replayed";
-    Seed { number, variable: SEED_VARIABLE, package: "sinew", test }
+    let variable = crate::seeded::number(NODES_VARIABLE)
+        .map_or(SEED_VARIABLE, |nodes| format!("{NODES_VARIABLE}={nodes} {SEED_VARIABLE}").leak());
+    Seed { number, variable, package: "sinew", test }
 }
 
 fn run(number: u64, fault: Option<Fault>, trace: bool) -> (Vec<String>, judge::Seen) {

@@ -3,7 +3,32 @@
 use super::*;
 use crate::sync::arrivals::Arrival;
 
+/// Mostly three or four, in an eighth of the seeds more, and in one of a hundred many; or as many as are asked for.
+pub(super) fn nodes(chance: &mut Chance) -> usize {
+    let own = match chance.below(96) {
+        0 => 9 + chance.below(16),
+        1..=12 => 5 + chance.below(4),
+        _ => 3 + chance.below(2),
+    };
+    let asked_for = number(NODES_VARIABLE).map(|nodes| usize::try_from(nodes).expect("a small number"));
+    asked_for.inspect(|nodes| assert!(*nodes >= 3, "{NODES_VARIABLE}: three and more")).unwrap_or(own)
+}
+
 impl World {
+    /// A process is linked with all others.
+    pub(super) fn join(&mut self, process: usize) {
+        for other in (0..self.cores.len()).filter(|other| !self.ended.contains(other)).collect::<Vec<_>>() {
+            self.restore(process, other);
+        }
+    }
+
+    /// A process hears one word of each other one, if there is one.
+    pub(super) fn hear_all(&mut self, process: usize) {
+        for other in 0..self.cores.len() {
+            self.deliver(other, process);
+        }
+    }
+
     pub(super) fn fly(
         &mut self,
         from: usize,
