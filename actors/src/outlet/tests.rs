@@ -29,7 +29,6 @@ mod holding;
 mod outcomes;
 mod requests;
 mod room;
-mod taking;
 
 /// A wire that takes `room` more bytes and keeps them.
 #[derive(Default)]

@@ -4,6 +4,5 @@ mod conservation;
 mod crowd;
 mod direct;
 mod hostile;
-mod idle;
 mod kills;
 mod stopped;
