@@ -34,14 +34,15 @@ pub(super) fn listen(address: SocketAddr) -> io::Result<std::net::TcpListener> {
 }
 
 /// Listens at the first interface; where one is chosen by its name, at all addresses that this host has or will have: of IPv4, and of IPv6
-/// only where no interface can have one of IPv4. Where all are of loopback, nowhere else.
+/// only where no interface can have one of IPv4. Where all are of loopback, nowhere else. Where NDL waits for its addresses, as they come and
+/// go, this host need not have the one to listen at yet.
 ///
 /// # Errors
 /// What the system says.
 pub(super) fn listen_first(config: &NodeConfig) -> io::Result<std::net::TcpListener> {
     let (address, chosen) = (first_of(config), &config.ndl.interface);
-    let is_one_of_many = chosen.have_ipv4() && chosen.iter().count() > 1;
-    if is_one_of_many { listen_also_without(address) } else { listen(address) }
+    let may_come = !chosen.are_ipv4_addresses() || chosen.iter().count() > 1;
+    if may_come { listen_also_without(address) } else { listen(address) }
 }
 
 fn first_of(config: &NodeConfig) -> SocketAddr {
@@ -81,7 +82,11 @@ fn all_of_ipv6(config: &NodeConfig) -> Ipv6Addr {
 fn listen_also_without(address: SocketAddr) -> io::Result<std::net::TcpListener> {
     let socket = new_socket(address)?;
     #[cfg(target_os = "linux")]
-    socket.set_freebind_v4(true)?;
+    if address.is_ipv4() {
+        socket.set_freebind_v4(true)?;
+    } else {
+        socket.set_freebind_v6(true)?;
+    }
     begin_to_listen(&socket, address)
 }
 
@@ -304,6 +309,26 @@ mod tests {
         assert!(listen_at_ipv6(&both, ipv4.local_addr().unwrap()).is_none());
         assert!(!has_no_ipv6(&io::ErrorKind::AddrInUse.into()));
         assert!(has_no_ipv6(&Errno::AFNOSUPPORT.into()));
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn loopback_that_is_down_keeps_no_node_from_its_start() {
+        for choices in [&[LOOPBACK][..], &["lo/ipv6"], &["127.0.0.1", "::1"], &["::1"]] {
+            let mut config = NodeConfig::new("test");
+            let chosen: Vec<_> = choices.iter().map(|choice| choice.parse().unwrap()).collect();
+            config.ndl.interface = chosen.into();
+            // The kernel asks this before it looks whether the host has the address.
+            let waits = |listener: &std::net::TcpListener| match listener.local_addr().unwrap() {
+                SocketAddr::V4(_) => SockRef::from(listener).freebind_v4().unwrap(),
+                SocketAddr::V6(_) => SockRef::from(listener).freebind_v6().unwrap(),
+            };
+            let first = match listen_first(&config) {
+                Err(error) if has_no_ipv6(&error) && !config.ndl.interface.have_ipv4() => continue,
+                listened => listened.unwrap_or_else(|error| panic!("{choices:?}: {error}")),
+            };
+            assert!(waits(&first), "{choices:?}");
+        }
     }
 
     #[test]
