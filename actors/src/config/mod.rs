@@ -331,4 +331,10 @@ impl NodeConfig {
         further.extend(&self.gncl.further);
         further
     }
+
+    /// Whether others than programs of this host may reach the node: where it looks for others, or GNCL listens or is announced besides.
+    pub(crate) fn is_beyond_host(&self) -> bool {
+        let mut besides = self.gncl.further.iter().chain(self.gncl.announce.as_ref().map(SocketAddrV4::ip));
+        !self.ndl.interface.are_loopback() || besides.any(|ip| !ip.is_loopback())
+    }
 }

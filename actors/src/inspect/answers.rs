@@ -141,7 +141,7 @@ fn security(stores: &Stores, clock: UnixTime) -> SecurityReport {
         clock_s: clock.as_secs(),
         times: stores.config.security.times.word().to_owned(),
     });
-    SecurityReport { is_beyond_host: !stores.config.ndl.interface.are_loopback(), certificate }
+    SecurityReport { is_beyond_host: stores.config.is_beyond_host(), certificate }
 }
 
 /// What NDL says of itself, and of those that are no members.

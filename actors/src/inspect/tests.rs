@@ -1,7 +1,7 @@
 //! What becomes of questions: answered within bounds, refused, or too many.
 
 use std::{
-    net::Ipv4Addr,
+    net::{Ipv4Addr, SocketAddrV4},
     sync::{
         Arc,
         mpsc::{Receiver, SyncSender, sync_channel},
@@ -177,6 +177,16 @@ fn a_node_says_whether_it_is_open_to_whom_and_until_when_its_certificate_counts(
     assert_eq!((certificate.from_s, certificate.until_s), (from, until));
     assert_eq!(certificate.times, "strict");
     assert!(certificate.clock_s > 0, "by its own clock");
+    // And: one that looks for others on its own host, and listens or is announced on a network besides
+    let [mut further, mut forwarded] = [NodeConfig::new("knee"), NodeConfig::new("knee")];
+    further.gncl.further = vec![Ipv4Addr::new(192, 0, 2, 7)];
+    forwarded.gncl.announce = Some(SocketAddrV4::new(Ipv4Addr::new(192, 0, 2, 7), 7_000));
+    for config in [further, forwarded] {
+        assert!(of(&Bench::new(config)).is_beyond_host);
+    }
+    let mut beside = NodeConfig::new("knee");
+    beside.gncl.further = vec![Ipv4Addr::new(127, 0, 0, 2)];
+    assert!(!of(&Bench::new(beside)).is_beyond_host);
     // And: who says nothing of it is of an older version, which is not the same as open
     let mut bytes = encode(&said(&open)).to_vec();
     let key = b"security";

@@ -304,7 +304,7 @@ fn wall_clock() -> Incarnation {
 fn secure(stores: &Stores, secured: Option<Secured>) {
     match secured {
         Some(secured) => drop(stores.secured.set(secured)),
-        None if stores.config.ndl.interface.are_loopback() => {}
+        None if !stores.config.is_beyond_host() => {}
         None => log::warn!(
             interface = %stores.config.ndl.interface,
             "this node is OPEN: whoever is on its network can send to its applications, and pose as any node. Make keys with \

@@ -5,7 +5,8 @@ use serde::{Deserialize, Serialize};
 /// Whether a node is secured or open, and who can reach it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SecurityReport {
-    /// Whether it looks for nodes beyond its own host (`ndl.interface`): if it is open, anybody there can pose as any node.
+    /// Whether it looks for nodes beyond its own host (`ndl.interface`), or listens or is announced there besides (`gncl.further`,
+    /// `gncl.announce`): if it is open, anybody there can pose as any node.
     pub is_beyond_host: bool,
     /// What it proves itself with (`security.keys`); `None`: it is open.
     pub certificate: Option<CertificateReport>,
