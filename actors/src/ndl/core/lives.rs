@@ -383,7 +383,7 @@ impl Core {
         self.proven.lost(node, member.announcement.incarnation);
         let bound = self.paces[member.pace].bound();
         self.recall.lost(now, &member, sources, Loss { why, bound });
-        self.memory.parted(node);
+        self.note_parted(node);
         self.is_lonely |= self.members.is_empty() && matches!(why, LossReason::Hung | LossReason::LinkDown);
         if why == LossReason::Duplicate {
             // An elder life has its address: this one is no bar to that.

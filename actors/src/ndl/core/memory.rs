@@ -3,7 +3,11 @@
 //!
 //! A remembered address is a hint, as a seed is: only an answer makes a member. It is asked as that of a lost node is, ever more seldom.
 
-use std::{collections::BTreeMap, net::SocketAddr, time::Duration};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    net::SocketAddr,
+    time::Duration,
+};
 
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
@@ -89,7 +93,7 @@ impl Memory {
     }
 
     /// Whether there is room for one more of this node. Where a node has all its places, one of its own makes it; where a member answers,
-    /// none does.
+    /// none does, but for the second one of a node where this one has none.
     fn makes_room(&mut self, node: NodeAddress, standing: impl Fn(&RememberedPeer) -> Standing) -> bool {
         let is_own = |entry: &Entry| entry.peer.node == node;
         let has_all = self.entries.iter().filter(|entry| is_own(entry)).count() >= OF_ONE_MAX;
@@ -99,9 +103,17 @@ impl Memory {
         // Of those that stand alike the first one: that which was met longest ago.
         let leaves = self.entries.iter().enumerate().filter(|(_, entry)| !has_all || is_own(entry));
         let leaves = leaves.map(|(at, entry)| (standing(&entry.peer), at)).min();
-        let Some((Standing::Gone | Standing::Elsewhere, at)) = leaves else { return false };
+        let left = leaves.filter(|(standing, _)| *standing != Standing::Here).map(|(_, at)| at);
+        let given = || if self.has(node) { None } else { self.second_of_one() };
+        let Some(at) = left.or_else(given) else { return false };
         self.entries.remove(at);
         true
+    }
+
+    /// Where the second address of any node is.
+    fn second_of_one(&self) -> Option<usize> {
+        let mut firsts = BTreeSet::new();
+        self.entries.iter().position(|entry| !firsts.insert(entry.peer.node))
     }
 
     /// A node was a member until now: it was met last at this moment, not when it came.
@@ -211,6 +223,28 @@ impl Core {
         places.into_iter().flatten().for_each(|place| self.note_met(node, place));
     }
 
+    /// A node was a member until now. The room that it leaves is for those that were met while there was none.
+    pub(super) fn note_parted(&mut self, node: NodeAddress) {
+        self.memory.parted(node);
+        if self.memory.has(node) {
+            self.note_the_unnoted();
+        }
+    }
+
+    /// Notes members of which no address is remembered, as long as there is room for one more.
+    fn note_the_unnoted(&mut self) {
+        let noted: BTreeSet<_> = self.memory.entries.iter().map(|entry| entry.peer.node).collect();
+        let unnoted =
+            self.members.iter().filter(|(node, _)| !noted.contains(node) && self.is_believed(**node));
+        let unnoted = unnoted.filter_map(|(node, member)| Some((*node, member.routes.places().next()?)));
+        for (node, place) in unnoted.collect::<Vec<_>>() {
+            self.note_met(node, place);
+            if !self.memory.has(node) {
+                return;
+            }
+        }
+    }
+
     /// A node is found. Of the other places where it was remembered it is asked at those that it announces, as at any that it announces; at
     /// the others not any more, until it is lost. Returns the former.
     ///
@@ -265,6 +299,9 @@ impl Core {
         self.contacts.retain(|place, contact| {
             !contact.is_remembered_alone() || !forgotten.contains(&unscoped(place.there))
         });
+        if !forgotten.is_empty() {
+            self.note_the_unnoted();
+        }
     }
 }
 
@@ -345,6 +382,22 @@ mod tests {
             |peer: &RememberedPeer| if peer.address == at(1) { Standing::Elsewhere } else { Standing::Here };
         memory.met(node(1), at(9), moved);
         assert_eq!(kept(&memory), [at(2), at(9)]);
+    }
+
+    #[test]
+    fn the_second_address_of_a_node_makes_room_for_the_only_one_of_another_and_for_no_second() {
+        let mut memory = Memory::default();
+        for last in 1..=32 {
+            memory.met(node(last), at(last), here);
+            memory.met(node(last), at(last + 100), here);
+        }
+        memory.met(node(33), at(33), here);
+        assert_eq!(kept(&memory).len(), REMEMBERED_MAX);
+        assert!(has(&memory, 33) && has(&memory, 1) && !has(&memory, 101) && has(&memory, 102));
+        let before = kept(&memory);
+        memory.met(node(33), at(133), here);
+        memory.met(node(1), at(101), here);
+        assert_eq!(kept(&memory), before, "each has one");
     }
 
     #[test]

@@ -221,11 +221,16 @@ fn where_all_places_are_taken_members_keep_theirs_and_who_was_one_longest_ago_ma
     // then
     let nodes = |world: &World| remembered(world, 1).iter().map(|peer| peer.node.bits()).collect::<Vec<_>>();
     assert_eq!(nodes(&world), (2..=u32::from(last)).collect::<Vec<_>>());
-    // when: two leave, who came first last
-    for left in [3_u16, 2] {
+    // when: one leaves, then: who was met while there was no place has his
+    let leave = |world: &mut World, left: u16| {
         world.input(left, Input::Stopping);
         world.run_until(ms(1), |world| !world.knows(1, left.into()));
-    }
+    };
+    leave(&mut world, 4);
+    assert!(!nodes(&world).contains(&4) && nodes(&world).contains(&u32::from(last + 1)));
+    // when: two more leave, who came first last
+    leave(&mut world, 3);
+    leave(&mut world, 2);
     meet(&mut world, last + 2);
     // then: what is kept begins with who is no member
     assert_eq!(nodes(&world)[0], 2);
