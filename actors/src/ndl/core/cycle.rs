@@ -158,8 +158,9 @@ impl Core {
     // spec: NDL-2.1
     fn ask_everybody(&mut self, now: Time) {
         self.count_start(now);
-        self.meet_remembered_again(now);
+        // What a member announces is asked as that, whoever is remembered there.
         self.seek_all(now);
+        self.meet_remembered_again(now);
         self.tell_moves(now);
         // Also who cannot be asked at all: none of our addresses leads there any more.
         let members = self.members.values_mut().filter(|member| member.pace == REST);

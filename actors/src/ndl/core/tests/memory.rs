@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use sinew_runtime::tid::Incarnation;
 
-use super::world::{PERIOD, Spec, World, ms, node, udp};
+use super::world::{PERIOD, Spec, World, ms, node, place, udp};
 use crate::{
     gncl::LinkFact,
     ndl::{
@@ -76,6 +76,27 @@ fn a_layer_that_is_started_anew_asks_those_that_had_left_too() {
     world.restart_shell(1);
     world.run_until(ms(1), |world| world.knows(1, 2) && world.knows(2, 1));
     assert!(sources(&world, 1).contains(&Source::Remembered));
+}
+
+// spec: NDL-2.5
+#[test]
+fn where_nodes_have_keys_an_address_that_a_member_announces_is_asked_as_one_before_it_has_proven_itself() {
+    // given: nobody answers at one of its addresses, which is remembered too
+    let mut world = World::new();
+    world.start(1, &Spec { has_keys: true, ..alone(1, 1) });
+    world.start(2, &alone(2, 1));
+    world.with(udp(2), |core, now| {
+        core.start(now, &[udp(2), udp(3)]);
+    });
+    let at = |index| RememberedPeer { address: udp(index), node: node(2), unanswered: 0 };
+    world.input(1, Input::PeersRemembered(vec![at(2), at(3)]));
+    world.run_until(ms(1), |world| world.knows(1, 2));
+    // then
+    for _ in 0..40 {
+        world.run(PERIOD);
+        let contact = world.at(1).core.contacts.get(&place(1, udp(3)));
+        assert!(contact.is_none_or(|contact| !contact.is_former_of(node(2))));
+    }
 }
 
 // spec: NDL-2.5
