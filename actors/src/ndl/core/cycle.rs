@@ -30,8 +30,7 @@ impl Core {
     /// A shell starts, the first one or one after it: what came while there was none is its own fault, not the peers'.
     pub(super) fn begin(&mut self, now: Time) {
         self.meet_seeds(now);
-        self.memory.seek_all();
-        self.meet_remembered(now);
+        self.seek_remembered(now);
         for member in self.members.values_mut() {
             member.is_awaited = false;
             member.routes.forgive();

@@ -40,7 +40,7 @@ pub(crate) struct RememberedPeer {
 #[derive(Debug)]
 struct Entry {
     peer: RememberedPeer,
-    /// Nobody has become a member there since it was read, or since this layer was started anew.
+    /// Nobody has become a member there since it was read, or was one when this layer was started anew.
     is_sought: bool,
 }
 
@@ -133,9 +133,11 @@ impl Memory {
         }
     }
 
-    /// This layer is started anew: all are asked again.
-    pub(super) fn seek_all(&mut self) {
-        self.entries.iter_mut().for_each(|entry| entry.is_sought = true);
+    /// This layer is started anew: all are asked again but those where members answer, who say goodbye when they leave.
+    fn seek_all(&mut self, standing: impl Fn(&RememberedPeer) -> Standing) {
+        for entry in &mut self.entries {
+            entry.is_sought |= standing(&entry.peer) != Standing::Here;
+        }
     }
 
     fn has(&self, node: NodeAddress) -> bool {
@@ -167,6 +169,12 @@ impl Core {
         for place in self.meet_remembered(now) {
             self.ask_unless_just_asked(now, place);
         }
+    }
+
+    /// A shell starts: where nobody is now is asked.
+    pub(super) fn seek_remembered(&mut self, now: Time) {
+        self.memory.seek_all(|peer| standing(&self.members, peer));
+        self.meet_remembered(now);
     }
 
     /// Makes contacts of those that are sought, from every address of ours; returns where they are.

@@ -80,6 +80,23 @@ fn a_layer_that_is_started_anew_asks_those_that_had_left_too() {
 
 // spec: NDL-2.5
 #[test]
+fn who_leaves_after_this_layer_was_started_anew_is_not_asked_any_more() {
+    let mut world = World::new();
+    world.start(1, &alone(1, 1));
+    world.start(2, &knowing(2, 1, 1));
+    world.run_until(ms(1), |world| world.knows(1, 2) && world.knows(2, 1));
+    world.restart_shell(1);
+    world.run(PERIOD * 2);
+    assert!(world.knows(1, 2));
+    world.input(2, Input::Stopping);
+    world.run_until(ms(1), |world| world.losses(1) == [(2, LossReason::Left)]);
+    world.forget_the_past();
+    world.run(PERIOD * 40);
+    assert_eq!(world.at(1).datagrams_sent, 0);
+}
+
+// spec: NDL-2.5
+#[test]
 fn where_nodes_have_keys_an_address_that_a_member_announces_is_asked_as_one_before_it_has_proven_itself() {
     // given: nobody answers at one of its addresses, which is remembered too
     let mut world = World::new();
