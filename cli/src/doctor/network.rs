@@ -153,7 +153,7 @@ fn multicast_at(choice: &Choice, all: &[Interface]) -> Vec<Check> {
     let checks: Vec<_> = at
         .iter()
         .copied()
-        .flat_map(|interface| tried(interface, families).map(|address| heard_at(address, interface)))
+        .flat_map(|interface| tried(interface, choice, families).map(|address| heard_at(address, interface)))
         .collect();
     if !checks.is_empty() {
         return checks.into_iter().chain(without_ipv4(choice, families, &at)).collect();
@@ -180,11 +180,13 @@ fn without_ipv4(choice: &Choice, families: Families, at: &[&Interface]) -> Optio
     Some(Check::finding(MULTICAST_NAME, seen, mend))
 }
 
-/// Addresses of an interface at which groups are tried: each of IPv4, and of IPv6 one, as the group belongs to the link.
-fn tried(interface: &Interface, families: Families) -> impl Iterator<Item = IpAddr> {
-    let of_ipv6 = interface.addresses.iter().copied().filter(|_| families.has_ipv6()).find(IpAddr::is_ipv6);
-    let of_ipv4 = interface.addresses.iter().copied().filter(move |ip| families.has_ipv4() && ip.is_ipv4());
-    of_ipv4.chain(of_ipv6)
+/// Addresses of an interface at which groups are tried: each of IPv4, and of IPv6 one, as the group belongs to the link. Of loopback those
+/// that nodes use there.
+fn tried(interface: &Interface, choice: &Choice, families: Families) -> impl Iterator<Item = IpAddr> {
+    let is_on_loopback = choice.is_loopback();
+    let used = interface.addresses.iter().copied().filter(move |ip| ip.is_loopback() || !is_on_loopback);
+    let of_ipv6 = used.clone().filter(|_| families.has_ipv6()).find(IpAddr::is_ipv6);
+    used.filter(move |ip| families.has_ipv4() && ip.is_ipv4()).chain(of_ipv6)
 }
 
 /// Whether a datagram to a group comes back at the interface that has this address.
@@ -343,9 +345,16 @@ mod tests {
     fn each_address_of_an_interface_is_tried() {
         let mut lo = interface("lo", Some([127, 0, 0, 1]), UP, true);
         lo.addresses.extend(["127.0.0.2", "::1"].map(|ip| ip.parse::<IpAddr>().unwrap()));
-        let count = |choice: &str| {
-            multicast(&vec![choice.parse::<Choice>().unwrap()].into(), std::slice::from_ref(&lo)).len()
-        };
+        let all = [lo.clone()];
+        let count = |choice: &str| multicast(&vec![choice.parse::<Choice>().unwrap()].into(), &all).len();
         assert_eq!((count("lo"), count("lo/ipv4"), count("lo/ipv6"), count("::1%lo")), (3, 2, 1, 1));
+        // Where nodes do not look: one that is told to the network by routing.
+        lo.addresses.insert(0, [10, 9, 9, 9].into());
+        lo.addresses.insert(0, Ipv6Addr::new(0xfd00, 0, 0, 0, 0, 0, 0, 7).into());
+        let tried: Vec<_> = tried(&lo, &"lo".parse().unwrap(), Families::Both).collect();
+        assert_eq!(
+            tried.iter().map(IpAddr::to_string).collect::<Vec<_>>(),
+            ["127.0.0.1", "127.0.0.2", "::1"]
+        );
     }
 }

@@ -4,16 +4,7 @@ use sinew::config::{Interface, Seed};
 
 /// Whether a node looks for others on its own host only: none of its interfaces leads out of it.
 pub(super) fn is_on_loopback(interfaces: &str) -> bool {
-    let is_loopback = |interface: &str| {
-        let interface = interface.trim_end_matches("/ipv4").trim_end_matches("/ipv6");
-        let is_loopback = |choice| match choice {
-            Interface::Address(address) => address.is_loopback(),
-            Interface::Address6 { address, .. } => address.is_loopback(),
-            Interface::Name(..) | Interface::All(_) => false,
-        };
-        interface == "lo" || interface.parse().is_ok_and(is_loopback)
-    };
-    interfaces.split(", ").all(is_loopback)
+    interfaces.split(", ").all(|choice| choice.parse().is_ok_and(|choice: Interface| choice.is_loopback()))
 }
 
 /// Whether a seed is where a node says that it is. The interface behind a link-local address is each host's own: one calls it by its name,
