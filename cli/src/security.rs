@@ -129,7 +129,7 @@ pub(crate) mod tests {
             project: "walker".to_owned(),
             security,
             interface: "192.168.0.0".to_owned(),
-            is_interface_default: false,
+            is_interface_default: Some(false),
             udp: None,
             gncl: None,
             group: None,

@@ -79,7 +79,7 @@ impl Answers {
             project: stores.config.project.clone(),
             security: Some(security(stores, UnixTime::now())),
             interface: stores.config.ndl.interface.to_string(),
-            is_interface_default: stores.config.ndl.interface.are_default(),
+            is_interface_default: Some(stores.config.ndl.interface.are_default()),
             udp: ndl.udp,
             gncl: ndl.gncl,
             group: group(&stores.config.ndl),

@@ -115,9 +115,9 @@ payload!("sinew.inspect.node_report" =>
         /// Address of the interface where it looks for others.
         #[serde(default)]
         pub interface: String,
-        /// Whether nobody has chosen that; `false` also of a version that does not say.
+        /// Whether nobody has chosen that; `None`: it is of a version that does not say.
         #[serde(default)]
-        pub is_interface_default: bool,
+        pub is_interface_default: Option<bool>,
         /// Where its NDL answers.
         #[serde(default)]
         pub udp: Option<String>,

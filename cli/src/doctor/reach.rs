@@ -15,14 +15,20 @@ pub(super) fn checks(nodes: &[NodeReport], interfaces: &[Interface]) -> Vec<Chec
     let is_alone =
         |node: &&NodeReport| node.security.as_ref().is_some_and(|security| !security.is_beyond_host);
     let (alone, others): (Vec<_>, Vec<_>) = nodes.iter().partition(is_alone);
-    let (left, meant): (Vec<_>, Vec<_>) = alone.into_iter().partition(|node| node.is_interface_default);
+    let of = |is_default: Option<bool>| {
+        alone.iter().copied().filter(|node| node.is_interface_default == is_default).collect::<Vec<_>>()
+    };
+    let left = of(Some(true));
     let mut checks = Vec::new();
     if !left.is_empty() {
         checks.push(finding(&left, interfaces));
     }
-    if !meant.is_empty() {
-        let what = "on loopback only, as they are told: no other host sees them, and they see none";
-        checks.push(Check::fine(NAME, format!("{what}: {}", in_words(&meant))));
+    for (known, why) in [(Some(false), ", as they are told"), (None, "")] {
+        let some = of(known);
+        if !some.is_empty() {
+            let what = format!("on loopback only{why}: no other host sees them, and they see none");
+            checks.push(Check::fine(NAME, format!("{what}: {}", in_words(&some))));
+        }
     }
     if !others.is_empty() {
         checks.push(Check::fine(NAME, format!("not on loopback alone: {}", in_words(&others))));
@@ -100,7 +106,7 @@ mod tests {
             interface("eth0", &["fe80::5", "10.0.0.5"]),
             interface("eth1", &["10.0.1.5"]),
         ];
-        let desk = NodeReport { is_interface_default: true, ..said("desk", 3, open(false)) };
+        let desk = NodeReport { is_interface_default: Some(true), ..said("desk", 3, open(false)) };
         let [found, fine] = &checks(&[desk, said("knee", 2, open(true))], &here)[..] else {
             panic!("that which is alone, and the other")
         };
@@ -124,13 +130,22 @@ mod tests {
             "{}",
             fine.seen
         );
+        assert!(fine.seen.contains("as they are told"), "{}", fine.seen);
+    }
+
+    #[test]
+    fn who_does_not_say_whether_anybody_chose_loopback_is_not_said_to_be_told_so() {
+        let desk = NodeReport { is_interface_default: None, ..said("desk", 3, open(false)) };
+        let [fine] = &checks(&[desk], &[])[..] else { panic!("one") };
+        assert!(fine.mend.is_none() && fine.seen.contains("desk"), "{}", fine.seen);
+        assert!(!fine.seen.contains("told"), "{}", fine.seen);
     }
 
     #[test]
     fn who_has_keys_needs_none_and_a_host_without_a_network_is_told_so() {
         let security =
             secured(NOW_S, "until-set").map(|keys| SecurityReport { is_beyond_host: false, ..keys });
-        let desk = NodeReport { is_interface_default: true, ..said("desk", 3, security) };
+        let desk = NodeReport { is_interface_default: Some(true), ..said("desk", 3, security) };
         let [found] = &checks(&[desk], &[interface("lo", &["127.0.0.1"])])[..] else { panic!("one") };
         let mend = found.mend.as_ref().expect("a finding");
         assert!(!mend.contains("sinew keys") && mend.contains("this host has none"), "{mend}");

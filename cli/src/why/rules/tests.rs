@@ -63,7 +63,7 @@ fn report(number: u8, name: &str, other: u8) -> NodeReport {
         security: None,
         project: "leg".to_owned(),
         interface: node(number).to_string(),
-        is_interface_default: false,
+        is_interface_default: Some(false),
         udp: Some(format!("{}:7000", node(number))),
         gncl: Some(format!("{}:7001", node(number))),
         group: Some("239.0.0.1:7000".to_owned()),
