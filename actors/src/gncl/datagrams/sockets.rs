@@ -125,6 +125,8 @@ fn door(listener: SocketAddr, port: u16, is_marked: bool) -> io::Result<Door> {
         #[cfg(target_os = "linux")]
         if listener.is_ipv4() {
             socket.set_freebind_v4(true)?;
+        } else {
+            socket.set_freebind_v6(true)?;
         }
         if listener.is_ipv6() {
             // Beside one of IPv4 at the same port.
@@ -166,6 +168,19 @@ mod tests {
             Some("10.0.0.1:9".parse().unwrap())
         );
         assert_eq!(Announcement { port: 0, ..said(0) }.target(remote), None);
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn an_address_that_this_host_does_not_have_yet_has_its_socket() {
+        for at in ["192.0.2.7:0", "[2001:db8::7]:0"] {
+            match door(at.parse().unwrap(), 0, false) {
+                Err(error) if error.raw_os_error() == Some(rustix::io::Errno::AFNOSUPPORT.raw_os_error()) => {
+                    println!("skipped: this host has no IPv6");
+                }
+                bound => assert!(bound.is_ok_and(|door| door.at.port() != 0), "{at}"),
+            }
+        }
     }
 
     #[test]
