@@ -84,7 +84,7 @@ fn listen_also_without(address: SocketAddr) -> io::Result<std::net::TcpListener>
     #[cfg(target_os = "linux")]
     if address.is_ipv4() {
         socket.set_freebind_v4(true)?;
-    } else {
+    } else if !address.ip().is_unspecified() {
         socket.set_freebind_v6(true)?;
     }
     begin_to_listen(&socket, address)

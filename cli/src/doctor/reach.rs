@@ -11,9 +11,12 @@ const NAME: &str = "reach";
 
 /// One check for those that are on loopback only because nobody said anything else, one for those that are to be, and one for the others.
 pub(super) fn checks(nodes: &[NodeReport], interfaces: &[Interface]) -> Vec<Check> {
-    // An older node says nothing of it.
-    let is_alone =
-        |node: &&NodeReport| node.security.as_ref().is_some_and(|security| !security.is_beyond_host);
+    // Where GNCL is reached from elsewhere (`gncl.further`, `gncl.announce`) nobody finds the node there as long as it looks on loopback. An
+    // older node says nothing of it.
+    let is_alone = |node: &&NodeReport| {
+        node.is_interface_default == Some(true)
+            || node.security.as_ref().is_some_and(|security| !security.is_beyond_host)
+    };
     let (alone, others): (Vec<_>, Vec<_>) = nodes.iter().partition(is_alone);
     let of = |is_default: Option<bool>| {
         alone.iter().copied().filter(|node| node.is_interface_default == is_default).collect::<Vec<_>>()
@@ -106,7 +109,8 @@ mod tests {
             interface("eth0", &["fe80::5", "10.0.0.5"]),
             interface("eth1", &["10.0.1.5"]),
         ];
-        let desk = NodeReport { is_interface_default: Some(true), ..said("desk", 3, open(false)) };
+        // Also where it listens elsewhere besides: nobody finds it there.
+        let desk = NodeReport { is_interface_default: Some(true), ..said("desk", 3, open(true)) };
         let [found, fine] = &checks(&[desk, said("knee", 2, open(true))], &here)[..] else {
             panic!("that which is alone, and the other")
         };

@@ -239,13 +239,15 @@ impl Core {
         }
     }
 
-    /// Notes members of which no address is remembered, as long as there is room for one more.
+    /// Notes members of which no address is remembered, as long as there is room for one more. Of those that are lost together each gives
+    /// its room to the next one, so no more are looked at than are noted.
     fn note_the_unnoted(&mut self) {
-        let noted: BTreeSet<_> = self.memory.entries.iter().map(|entry| entry.peer.node).collect();
-        let unnoted =
-            self.members.iter().filter(|(node, _)| !noted.contains(node) && self.is_believed(**node));
-        let unnoted = unnoted.filter_map(|(node, member)| Some((*node, member.routes.places().next()?)));
-        for (node, place) in unnoted.collect::<Vec<_>>() {
+        for _ in 0..REMEMBERED_MAX {
+            let unnoted = self.members.iter().find_map(|(node, member)| {
+                let is_unnoted = !self.memory.has(*node) && self.is_believed(*node);
+                member.routes.places().next().filter(|_| is_unnoted).map(|place| (*node, place))
+            });
+            let Some((node, place)) = unnoted else { return };
             self.note_met(node, place);
             if !self.memory.has(node) {
                 return;
