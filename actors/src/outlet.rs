@@ -50,7 +50,7 @@ use tokio::net::UnixStream;
 
 use crate::session::{Ack, Sent};
 
-pub(crate) use account::OutletAccount;
+pub(crate) use account::{Left, OutletAccount, Taking};
 use after::After;
 pub(crate) use batch::Gathering;
 use draining::Drained;
@@ -376,6 +376,11 @@ impl<S: Socket> StreamOutlet<S> {
     /// Where every message is that it has taken, and how far its session is, if it has one.
     pub(crate) fn account(&self) -> (OutletAccount, Option<Sent>) {
         self.lock().account()
+    }
+
+    /// How far the peer has come with what it was sent; `None` without a connection.
+    pub(crate) fn taking(&self) -> Option<Taking> {
+        self.lock().taking()
     }
 
     /// Messages that wait to be sent.

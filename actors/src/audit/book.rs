@@ -10,7 +10,7 @@ use sinew_runtime::{mailbox::Mailbox, tid::AppAddress, wire::Class};
 use super::account::{Account, Place};
 use crate::{
     lncl::ClientId,
-    outlet::{OutletAccount, Socket, StreamOutlet},
+    outlet::{OutletAccount, Socket, StreamOutlet, Taking},
     stores::lock,
 };
 
@@ -21,12 +21,29 @@ const CLOSING_MAX: usize = 64;
 pub(crate) trait Accounted: Send + Sync {
     /// Where every message is that it has taken.
     fn account(&self) -> OutletAccount;
+
+    /// How far the one behind it has come with what it was sent; `None` if nobody is there yet, or any more.
+    fn taking(&self) -> Option<Taking>;
 }
 
 impl<S: Socket> Accounted for StreamOutlet<S> {
     fn account(&self) -> OutletAccount {
         self.account().0
     }
+
+    fn taking(&self) -> Option<Taking> {
+        self.taking()
+    }
+}
+
+/// A client to which messages flow, and how far it has come with them.
+#[derive(Clone, Debug)]
+pub(crate) struct ClientTaking {
+    pub(crate) id: ClientId,
+    pub(crate) app: AppAddress,
+    /// Its address in words, if it has no name.
+    pub(crate) name: Arc<str>,
+    pub(crate) taking: Taking,
 }
 
 /// The places of a node. It outlives every layer.
@@ -77,6 +94,17 @@ impl Book {
         if let Some(Client { outlet, .. }) = places.clients.remove(&id) {
             places.former_clients = places.former_clients + Account::of_outlet(&outlet.account()).over();
         }
+    }
+
+    /// How far each client has come, as many as there are. Each is read at one moment, under its outlet's own lock: who sends to it
+    /// meanwhile waits as long as for another sender's message.
+    pub(crate) fn takings(&self) -> Vec<ClientTaking> {
+        let clients = lock(&self.0).clients.clone();
+        let taking = |(id, client): (ClientId, Client)| {
+            let Client { app, name, outlet } = client;
+            Some(ClientTaking { id, app, name, taking: outlet.taking()? })
+        };
+        clients.into_iter().filter_map(taking).collect()
     }
 
     /// The accounts of all places, now.

@@ -29,7 +29,7 @@ mod words;
 
 pub use account::{Account, Place};
 pub(crate) use asking::{Questions, audit, receive};
-pub(crate) use book::Book;
+pub(crate) use book::{Book, ClientTaking};
 pub(crate) use reading::read;
 pub use reading::{Entry, NodeAudit, Receiving, Sending, Session};
 pub use system::{At, Audit, Link, LinkState, Unexplained};

@@ -16,7 +16,7 @@ pub(crate) struct Progress {
     /// How many there are, also those that are not named.
     #[serde(default)]
     pub(crate) troubled: u32,
-    /// The first of them: layers, then applications by their addresses.
+    /// The first of them: layers, then applications by their addresses, then clients.
     #[serde(default)]
     pub(crate) parts: Vec<Part>,
 }
@@ -63,10 +63,19 @@ impl From<Told> for u8 {
 }
 
 impl Progress {
-    /// That of these parts, of which the first are named.
-    pub(crate) fn of(mut parts: Vec<Part>) -> Self {
-        let troubled = u32::try_from(parts.len()).unwrap_or(u32::MAX);
+    /// That of a node with these parts, of which the first are named.
+    #[cfg(test)]
+    pub(crate) fn of(parts: Vec<Part>) -> Self {
+        Self::with_clients(parts, Vec::new())
+    }
+
+    /// That of a node with these parts of its own and these clients. A client, which anybody may start whom the node lets in, takes no
+    /// place from a layer or an application of the node, whichever address it has chosen.
+    pub(crate) fn with_clients(mut parts: Vec<Part>, mut clients: Vec<Part>) -> Self {
+        let troubled = u32::try_from(parts.len() + clients.len()).unwrap_or(u32::MAX);
         parts.sort_by_key(|part| part.app);
+        clients.sort_by_key(|part| part.app);
+        parts.extend(clients);
         parts.truncate(PARTS_MAX);
         for part in &mut parts {
             let end = part.name.floor_char_boundary(NAME_MAX);
@@ -93,5 +102,26 @@ impl Progress {
 
     pub(crate) fn part(&self, app: AppAddress) -> Option<&Part> {
         self.parts.iter().find(|part| part.app == app)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn part(app: u32) -> Part {
+        let name = format!("app-{app:x}");
+        Part { app: AppAddress::new(app), name, trouble: Told(Trouble::Stalled), since_ms: 300 }
+    }
+
+    #[test]
+    fn clients_take_no_place_from_what_is_the_nodes_own_whichever_addresses_they_have() {
+        let own = || [0x9000_0000, 3].map(part).to_vec();
+        let clients = || (0x1000..0x1010).rev().map(part).collect();
+        let progress = Progress::with_clients(own(), clients());
+        let named: Vec<_> = progress.parts.iter().map(|part| part.app.bits()).collect();
+        assert_eq!((progress.troubled, &named[..]), (18, &[3, 0x9000_0000, 0x1000, 0x1001][..]));
+        assert!(progress.is_fit() && !progress.is_whole());
+        assert!(Progress::with_clients(own(), Vec::new()).is_whole());
     }
 }

@@ -1,5 +1,8 @@
 //! What of this node does not get on, for the nodes that watch it: asked by NDL, answered by the root, which waits for nobody.
-//! What an application in a process of its own does its process sees, and says.
+//! What an application in a process of its own does its process sees, and says. Of a client (`NodeApi`) it is seen whether it takes what
+//! waits for it.
+
+mod clients;
 
 use std::{collections::BTreeMap, time::Duration};
 
@@ -9,10 +12,15 @@ use sinew_runtime::{
     time::Time,
 };
 
-use super::{layers::LAYERS, root::Root};
-use crate::ndl::{Part, Progress, Told, Trouble};
+pub(super) use self::clients::IdleClients;
 
-/// A turn that lasts longer is told of. Below the watchdog's default of 1 s, after which the actor is replaced, and above what a
+use super::{layers::LAYERS, root::Root};
+use crate::{
+    audit::ClientTaking,
+    ndl::{Part, Progress, Told, Trouble},
+};
+
+/// A turn that lasts longer is told of, and a client that takes nothing for longer. Below the watchdog's default of 1 s, after which the actor is replaced, and above what a
 /// loaded machine makes of a short one.
 const STALLED_AFTER: Duration = Duration::from_millis(250);
 /// The layers' addresses, in the order of their names.
@@ -30,8 +38,23 @@ impl Root {
         for roster in [&self.layer_supervisor, &self.app_supervisor].into_iter().flatten() {
             collect(now, roster, roster.view(now), &stalled, &mut parts);
         }
-        Progress::of(parts)
+        Progress::with_clients(parts, self.idle_clients(now))
     }
+
+    /// The clients that take nothing of what waits for them.
+    fn idle_clients(&mut self, now: Time) -> Vec<Part> {
+        let clients = self.stores.book.takings();
+        let idle = self.clients.look(now, clients.iter().map(|client| (client.id, client.taking)));
+        let part = |ClientTaking { id, app, name, .. }: ClientTaking| {
+            let since_ms = millis_since(now, *idle.get(&id)?);
+            Some(Part { app, name: name.to_string(), trouble: Told(Trouble::Stalled), since_ms })
+        };
+        clients.into_iter().filter_map(part).collect()
+    }
+}
+
+fn millis_since(now: Time, since: Time) -> u32 {
+    u32::try_from(now.since(since).as_millis()).unwrap_or(u32::MAX)
 }
 
 /// Turns that lasted when they were looked at: the number of each, and since when it lasts at least.
@@ -70,7 +93,7 @@ fn collect(
         let layer = LAYERS.iter().position(|layer| *layer == who.name).map(|at| ADDRESSES[at]);
         let Some(app) = who.tid.map(|tid| tid.app).or(layer) else { continue };
         if let Some((trouble, since)) = trouble(&child, stalled.get(&who.name).copied()) {
-            let since_ms = u32::try_from(now.since(since).as_millis()).unwrap_or(u32::MAX);
+            let since_ms = millis_since(now, since);
             parts.push(Part { app, name: who.name, trouble: Told(trouble), since_ms });
         }
     }

@@ -36,7 +36,7 @@ use super::{
     commands::Answers,
     directory::NodeDirectory,
     layers,
-    progress::Stalls,
+    progress::{IdleClients, Stalls},
     supervisor_spec::{Member, SupervisorSpec},
     wind_up::{self, Branch, Heirs},
 };
@@ -78,6 +78,7 @@ pub(super) struct Root {
     pub(super) absences: Absences,
     pub(super) answers: Answers,
     pub(super) turns: Stalls,
+    pub(super) clients: IdleClients,
     /// The applications in processes of their own, which say themselves whether they stall.
     pub(super) hosted: BTreeMap<String, Weak<process::Link>>,
     pub(super) layer_supervisor: Option<Roster>,
@@ -116,6 +117,7 @@ pub(super) fn run(
         absences: Absences::new(stores.clone()),
         answers: Answers::default(),
         turns: Stalls::default(),
+        clients: IdleClients::default(),
         hosted: BTreeMap::new(),
         layer_supervisor: None,
         app_supervisor: None,

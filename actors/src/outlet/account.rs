@@ -1,8 +1,8 @@
 //! Where every message is that an outlet has taken: for an audit.
 
 use super::{
-    Socket,
-    half::Half,
+    Account, Socket,
+    half::{Half, Link},
     partial::{Partial, Sort},
 };
 use crate::session::Sent;
@@ -48,7 +48,46 @@ pub(crate) struct OutletAccount {
     pub(crate) unacknowledged: u64,
 }
 
+/// How far the peer has come with what it was sent, at one moment. A part of this the peer writes itself, and may write what it likes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Taking {
+    /// Another one whenever the peer has taken something; nothing else is to be read from it.
+    pub(crate) mark: (u64, u64),
+    pub(crate) left: Left,
+    /// Messages that were ever accepted for it, frames of the layers and outcomes aside.
+    pub(crate) messages: u64,
+}
+
+/// What there is that a peer has not taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Left {
+    /// Nothing. Where nobody can say what the peer has taken: nothing waits here.
+    Nothing,
+    /// It has taken all that it was given. More waits here, which is not the peer's fault.
+    Ungiven,
+    /// Something that the peer only has to take; where nobody can say that, something for which its socket has no room.
+    Untaken,
+}
+
 impl<S: Socket> Half<S> {
+    /// `None` without a connection. Reads only what is counted anyway.
+    pub(super) fn taking(&mut self) -> Option<Taking> {
+        let Link::Up(socket) = &mut self.link else { return None };
+        let Account { written, taken } = socket.account();
+        let waits = self.waiting() > 0;
+        let is_known = taken <= written;
+        let left = if is_known && taken < written || !is_known && waits {
+            Left::Untaken
+        } else if waits {
+            Left::Ungiven
+        } else {
+            Left::Nothing
+        };
+        let begun = self.partial.as_ref().map_or(0, |partial| partial.written as u64);
+        let mark = if is_known { (taken, 0) } else { (self.counts.sent, begun) };
+        Some(Taking { mark, left, messages: self.tally.taken.saturating_sub(self.tally.own) })
+    }
+
     pub(super) fn account(&self) -> (OutletAccount, Option<Sent>) {
         let (counts, tally) = (self.counts, self.tally);
         let begun = self.partial.as_ref().is_some_and(is_a_message) && self.session.is_none();

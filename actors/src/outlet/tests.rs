@@ -29,6 +29,7 @@ mod holding;
 mod outcomes;
 mod requests;
 mod room;
+mod taking;
 
 /// A wire that takes `room` more bytes and keeps them.
 #[derive(Default)]

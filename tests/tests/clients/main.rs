@@ -4,5 +4,6 @@ mod conservation;
 mod crowd;
 mod direct;
 mod hostile;
+mod idle;
 mod kills;
 mod stopped;

@@ -1,6 +1,7 @@
 //! What a client costs that does not read, and what is said of what it does not get.
 
 use super::*;
+use crate::outlet::Left;
 
 #[test]
 fn a_client_that_never_reads_costs_a_bounded_queue() {
@@ -16,6 +17,34 @@ fn a_client_that_never_reads_costs_a_bounded_queue() {
     }
     assert!(refused > 0);
     assert_alive(&node);
+}
+
+#[test]
+fn of_a_client_that_does_not_read_it_is_known_that_something_waits_until_it_reads_or_is_gone() {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let (mut client, tid) = RawClient::register(&node, &Register { name: Some("hand".to_owned()), ..Register::default() });
+    let left = || {
+        let clients = node.stores.book.takings();
+        clients.into_iter().find(|client| client.app == tid.app && &*client.name == "hand").map(|client| client.taking.left)
+    };
+    assert_eq!(left(), Some(Left::Nothing));
+    // When: more is sent than its socket takes.
+    let deadline = Time::now() + WATCHDOG;
+    while left() != Some(Left::Untaken) {
+        assert!(Time::now() < deadline, "waited for the client's socket to be full");
+        node.stores.router.send(filler(app.tid, tid)).expect("the queue is empty");
+    }
+    // When: it reads. What waits comes.
+    while left() != Some(Left::Nothing) {
+        client.next().expect("the connection stands");
+    }
+    drop(client);
+    // Then
+    while left().is_some() {
+        assert!(Time::now() < deadline, "waited for the client's end");
+        std::thread::yield_now();
+    }
 }
 
 #[test]

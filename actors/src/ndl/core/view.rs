@@ -43,7 +43,8 @@ pub struct KnownNode {
     pub bound: Duration,
     /// How many of its layers and applications do not get on, as it says; and its NDL where that is not heard.
     pub troubled: usize,
-    /// The first of them: its NDL where that is not heard; then, as it says, layers, then applications by their addresses, four at most.
+    /// The first of them: its NDL where that is not heard; then, as it says, layers, then applications by their addresses, then
+    /// clients, four at most.
     pub troubles: Vec<TroubledApp>,
     /// Time of the last query and its answer on the network.
     pub round_trip: Option<Duration>,
