@@ -38,7 +38,8 @@ impl Scene {
         let (watcher, heard) = Stage::new().app("watcher");
         let here = watched(ground.node("here")).app(watcher.handles::<NodeEvent>()).start().expect("a node");
         let (desk, key) = desk("desk");
-        let opened = watched(ground.node("there")).configure(|config| config.lncl.socket = Some(socket.clone()));
+        let opened =
+            watched(ground.node("there")).configure(|config| config.lncl.socket = Some(socket.clone()));
         let there = opened.app(desk).start().expect("a node");
         all_run(&[&here, &there]);
         sees(&here.handle(), there.address());

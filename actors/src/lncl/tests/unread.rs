@@ -23,10 +23,14 @@ fn a_client_that_never_reads_costs_a_bounded_queue() {
 fn of_a_client_that_does_not_read_it_is_known_that_something_waits_until_it_reads_or_is_gone() {
     let node = TestNode::start();
     let app = node.local(1);
-    let (mut client, tid) = RawClient::register(&node, &Register { name: Some("hand".to_owned()), ..Register::default() });
+    let (mut client, tid) =
+        RawClient::register(&node, &Register { name: Some("hand".to_owned()), ..Register::default() });
     let left = || {
         let clients = node.stores.book.takings();
-        clients.into_iter().find(|client| client.app == tid.app && &*client.name == "hand").map(|client| client.taking.left)
+        clients
+            .into_iter()
+            .find(|client| client.app == tid.app && &*client.name == "hand")
+            .map(|client| client.taking.left)
     };
     assert_eq!(left(), Some(Left::Nothing));
     // When: more is sent than its socket takes.

@@ -34,7 +34,8 @@ impl IdleClients {
         clients: impl IntoIterator<Item = (ClientId, Taking)>,
     ) -> BTreeMap<ClientId, Time> {
         let known = std::mem::take(&mut self.0);
-        self.0 = clients.into_iter().map(|(id, taking)| (id, Seen::of(now, taking, known.get(&id)))).collect();
+        self.0 =
+            clients.into_iter().map(|(id, taking)| (id, Seen::of(now, taking, known.get(&id)))).collect();
         let waited = self.0.iter().filter_map(|(id, seen)| Some((*id, seen.since?)));
         waited.filter(|(_, since)| now.since(*since) >= STALLED_AFTER).collect()
     }
@@ -90,7 +91,11 @@ mod tests {
         for ms in [0, 1_000, 100_000] {
             assert_eq!(look(&mut clients, ms, 96, Left::Nothing, 1), None);
         }
-        assert_eq!(look(&mut clients, 200_000, 96, Left::Untaken, 2), None, "what waits came after the last look");
+        assert_eq!(
+            look(&mut clients, 200_000, 96, Left::Untaken, 2),
+            None,
+            "what waits came after the last look"
+        );
     }
 
     #[test]
