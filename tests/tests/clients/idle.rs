@@ -114,8 +114,13 @@ const ANSWERS: usize = 20;
 
 #[test]
 fn a_client_for_which_nothing_waits_is_well_also_where_it_is_stopped() {
+    // Given: one that has taken what came for it.
     let mut scene = Scene::new();
+    send_jobs(&scene.sender, CLIENT, [1]);
+    scene.client.wait_for(&["bulk 1"]);
+    // When
     scene.client.freeze();
+    // Then
     let mut before = None;
     for answer in 0..ANSWERS {
         before = until(&format!("answer {answer} of the client's node"), || {
@@ -125,6 +130,6 @@ fn a_client_for_which_nothing_waits_is_well_also_where_it_is_stopped() {
     }
     assert_eq!(told_of_client(&scene.heard.all()), []);
     scene.client.signal(Signal::CONT);
-    send_jobs(&scene.sender, CLIENT, [1]);
-    scene.client.wait_for(&["bulk 1"]);
+    send_jobs(&scene.sender, CLIENT, [2]);
+    scene.client.wait_for(&["bulk 2"]);
 }
