@@ -80,7 +80,9 @@ pub use audit::{Audit, NodeAudit};
 pub use clocks::{ClockDrift, ClockOffset};
 pub use config::{ConfigFaults, NodeConfig};
 pub use lncl::RegisterError;
-pub use ndl::{KnownNode, KnownRoute, LossReason, NodeEvent, OwnStalls, Source, Trouble, TroubledApp};
+pub use ndl::{
+    IdleApp, KnownNode, KnownRoute, LossReason, NodeEvent, OwnStalls, Source, Trouble, TroubledApp,
+};
 pub use node::{
     AuditError, CommandError, LifeState, MailboxState, Node, NodeBuilder, NodeEnd, NodeHandle, StartError,
     Supervised, Supervises, SupervisionTree, SupervisorSpec, Traffic,

@@ -50,7 +50,7 @@ use tokio::net::UnixStream;
 
 use crate::session::{Ack, Sent};
 
-pub(crate) use account::{Left, OutletAccount, Taking};
+pub(crate) use account::{OutletAccount, Taking};
 use after::After;
 pub(crate) use batch::Gathering;
 use draining::Drained;
@@ -76,6 +76,11 @@ pub(crate) trait Socket: Send + 'static {
     /// # Errors
     /// [`io::ErrorKind::WouldBlock`] if it takes nothing now; anything else ends the connection.
     fn try_write_vectored(&mut self, parts: &[IoSlice<'_>]) -> io::Result<usize>;
+
+    /// Bytes that were ever written, as [`account`](Self::account) counts them: cheap, the peer's count is not looked at.
+    fn written(&self) -> u64 {
+        0
+    }
 
     /// Bytes that were ever written and bytes that the peer has taken, in one count, where that can be known.
     fn account(&mut self) -> Account {

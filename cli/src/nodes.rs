@@ -4,8 +4,8 @@ use std::fmt::Display;
 
 use serde_json::{Value, json};
 use sinew::inspect::{
-    AskNode, LinkReport, LostReport, NodeReport, PeerReport, RouteReport, SourceReport, StallReport,
-    TroubleReport,
+    AskNode, IdleReport, LinkReport, LostReport, NodeReport, PeerReport, RouteReport, SourceReport,
+    StallReport, TroubleReport,
 };
 
 use crate::{
@@ -150,6 +150,8 @@ impl<'a> Row<'a> {
             "bound_us": seen.and_then(|seen| seen.bound_us),
             "troubled": seen.map(|seen| seen.troubled),
             "troubles": seen.map(|seen| seen.troubles.iter().map(trouble_json).collect::<Vec<_>>()),
+            "idle_clients": seen.map(|seen| seen.idle_clients),
+            "idle": seen.map(|seen| seen.idle.iter().map(idle_json).collect::<Vec<_>>()),
             "routes": seen.map(|seen| seen.routes.iter().map(route_json).collect::<Vec<_>>()),
             "round_trip_ns": seen.and_then(|seen| seen.round_trip_ns),
             "clock_offset_ns": seen.and_then(|seen| seen.offset_ns),
@@ -180,6 +182,11 @@ fn route_json(of: &RouteReport) -> Value {
 fn trouble_json(of: &TroubleReport) -> Value {
     let TroubleReport { app, name, trouble, since_us } = of;
     json!({ "app": app.to_string(), "name": name, "trouble": trouble, "since_us": since_us })
+}
+
+fn idle_json(of: &IdleReport) -> Value {
+    let IdleReport { app, name, since_us } = of;
+    json!({ "app": app.to_string(), "name": name, "since_us": since_us })
 }
 
 fn lost_cells(lost: &LostReport) -> [String; COLUMNS] {
@@ -272,6 +279,25 @@ fn troubles(of: &PeerReport) -> String {
     lines
 }
 
+/// Which clients of a node take nothing, a line each.
+fn idle(of: &PeerReport) -> String {
+    let name = clean(of.name.as_deref().unwrap_or_default());
+    let mut lines = String::new();
+    for IdleReport { app, name: who, since_us } in &of.idle {
+        let (who, since) = (clean(who), time(*since_us));
+        lines += &format!(
+            "{} {name}: client {who} ({app}) takes nothing of what waits for it, for {since}\n",
+            of.node
+        );
+    }
+    let unnamed = (of.idle_clients as usize).saturating_sub(of.idle.len());
+    if unnamed > 0 {
+        lines +=
+            &format!("{} {name}: {unnamed} further clients take nothing of what waits for them\n", of.node);
+    }
+    lines
+}
+
 fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport]) -> String {
     let heading: [_; COLUMNS] = [
         "NODE",
@@ -303,7 +329,7 @@ fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport]) -> String {
             text += &format!("{} {}: {}\n", row.answer.node, clean(row.name()), clean(why));
         }
     }
-    rows.iter().filter_map(|row| row.seen).for_each(|seen| text += &troubles(seen));
+    rows.iter().filter_map(|row| row.seen).for_each(|seen| text += &(troubles(seen) + &idle(seen)));
     let said = rows.iter().filter_map(|row| row.answer.said.as_ref().ok());
     text.extend(said.filter_map(own_stalls));
     if here.left_out > 0 {
@@ -330,8 +356,15 @@ mod tests {
             bound_us: Some(2_000_000),
             troubled: 3,
             troubles: vec![TroubleReport { app, name, trouble, since_us: 2_500_000 }],
+            idle_clients: 4,
+            idle: vec![IdleReport { app, name: "hand".to_owned(), since_us: 2_900_000 }],
             ..PeerReport::lost(node, Incarnation(1))
         };
+        let takes_nothing = [
+            format!("10.0.0.7 knee: client hand ({app}) takes nothing of what waits for it, for 2.9 s\n"),
+            "10.0.0.7 knee: 3 further clients take nothing of what waits for them\n".to_owned(),
+        ];
+        assert_eq!(idle(&seen), takes_nothing.concat());
         let lines = [
             format!("10.0.0.7 knee: drive ({app}) does not get on: stalled for 2.5 s\n"),
             "10.0.0.7 knee: 2 further ones do not get on\n".to_owned(),

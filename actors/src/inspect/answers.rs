@@ -17,16 +17,16 @@ use sinew_runtime::{
 
 use super::reports::{
     APPS_MAX, AppReport, AppsReport, AuditReport, BarrierReport, CertificateReport, DialReport,
-    ForeignReport, LinkReport, LostReport, MISSING_MAX, Missing, NodeReport, PEERS_MAX, PeerReport,
-    RefusalReport, RouteReport, SecurityReport, SeenMessage, SourceReport, StallReport, StreamReport,
-    TOLD_MAX, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
+    ForeignReport, IdleReport, LinkReport, LostReport, MISSING_MAX, Missing, NodeReport, PEERS_MAX,
+    PeerReport, RefusalReport, RouteReport, SecurityReport, SeenMessage, SourceReport, StallReport,
+    StreamReport, TOLD_MAX, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
 };
 use super::watches::{Fetched, Sight};
 use crate::{
     audit,
     config::NdlConfig,
     gncl::{self, ByDatagram, Peer},
-    ndl::{KnownNode, KnownRoute, LossReason, LostNode, Source, SourceCounts, Trouble, TroubledApp},
+    ndl::{IdleApp, KnownNode, KnownRoute, LossReason, LostNode, Source, SourceCounts, Trouble, TroubledApp},
     node::{CommandError, NodeHandle, Supervised},
     security::UnixTime,
     stores::{Stores, lock},
@@ -61,10 +61,12 @@ impl Answers {
         let mut peers: Vec<_> = peers(stores, now).into_values().collect();
         let left_out = peers.len().saturating_sub(PEERS_MAX) as u64;
         peers.truncate(PEERS_MAX);
-        let mut room = TOLD_MAX;
+        let (mut room, mut idle_room) = (TOLD_MAX, TOLD_MAX);
         for peer in &mut peers {
             peer.troubles.truncate(room);
             room -= peer.troubles.len();
+            peer.idle.truncate(idle_room);
+            idle_room -= peer.idle.len();
         }
         let ndl = Discovery::of(stores, now);
         Ok(NodeReport {
@@ -280,6 +282,8 @@ fn peer_report(known: &KnownNode, now: Time) -> PeerReport {
         bound_us: Some(micros(known.bound)),
         troubled: u32::try_from(known.troubled).unwrap_or(u32::MAX),
         troubles: known.troubles.iter().map(trouble).collect(),
+        idle_clients: u32::try_from(known.idle_clients).unwrap_or(u32::MAX),
+        idle: known.idle.iter().map(idle).collect(),
         routes: known.routes.iter().map(route).collect(),
         round_trip_ns: known.round_trip.map(nanos),
         offset_ns: known.offset.map(|offset| offset.theirs_minus_ours_ns),
@@ -309,6 +313,11 @@ fn trouble(part: &TroubledApp) -> TroubleReport {
     };
     let TroubledApp { app, ref name, since, .. } = *part;
     TroubleReport { app, name: name.clone(), trouble: word.to_owned(), since_us: micros(since) }
+}
+
+fn idle(client: &IdleApp) -> IdleReport {
+    let IdleApp { app, ref name, since } = *client;
+    IdleReport { app, name: name.clone(), since_us: micros(since) }
 }
 
 fn links(peer: &Peer) -> Vec<LinkReport> {
@@ -451,6 +460,8 @@ mod tests {
             bound: Duration::from_millis(40),
             troubled: 5,
             troubles: vec![TroubledApp { app, name: "drive".to_owned(), trouble, since }],
+            idle_clients: 3,
+            idle: vec![IdleApp { app, name: "hand".to_owned(), since }],
             round_trip: None,
             offset: None,
         };
@@ -458,5 +469,7 @@ mod tests {
         assert_eq!((said.asked_every_us, said.bound_us, said.troubled), (Some(10_000), Some(40_000), 5));
         let (name, trouble) = ("drive".to_owned(), "given up".to_owned());
         assert_eq!(said.troubles, [TroubleReport { app, name, trouble, since_us: 3_000 }]);
+        let hand = IdleReport { app, name: "hand".to_owned(), since_us: 3_000 };
+        assert_eq!((said.idle_clients, said.idle), (3, vec![hand]));
     }
 }

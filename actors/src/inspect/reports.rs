@@ -6,8 +6,8 @@ mod security;
 
 pub use access::{AccessReport, AccessVerdict, AskAccess, AskReload, ReloadReport};
 pub use peers::{
-    DialReport, ForeignReport, LinkReport, LostReport, PeerReport, RouteReport, SourceReport, StallReport,
-    StreamReport, TroubleReport,
+    DialReport, ForeignReport, IdleReport, LinkReport, LostReport, PeerReport, RouteReport, SourceReport,
+    StallReport, StreamReport, TroubleReport,
 };
 pub use security::{CertificateReport, SecurityReport};
 

@@ -139,6 +139,13 @@ impl Socket for ClientSocket {
         }
     }
 
+    fn written(&self) -> u64 {
+        match self {
+            Self::Plain(stream) => stream.written(),
+            Self::Ring(ring) => ring.written,
+        }
+    }
+
     fn account(&mut self) -> Account {
         match self {
             Self::Plain(stream) => stream.account(),

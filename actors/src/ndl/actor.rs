@@ -35,6 +35,7 @@ use super::{
     core::{Core, Epoch, Input, Output, Place, Source},
     datagram::{Answer, Body, Datagram, encode},
     interfaces::{self, Usable},
+    look_period,
     mdns::{Mdns, MdnsError},
     probe::{PROBES_MAX, Probe},
 };
@@ -46,8 +47,6 @@ use crate::{
     stores::{self, Stores},
 };
 
-/// Time between two questions to the root at least.
-const PROGRESS_PERIOD_MIN: Duration = Duration::from_millis(100);
 /// Time between two attempts to listen to mDNS again.
 const MDNS_REST: Duration = Duration::from_secs(1);
 
@@ -359,7 +358,7 @@ fn seeds(stores: &Stores, usable: Option<&Usable>) -> Vec<SocketAddr> {
 
 /// Asks the root, every period, what of this node does not get on. The root waits for nobody, and NDL not for the root.
 async fn watch_progress(shell: Rc<Shell>) {
-    let period = shell.stores.config.ndl.period.max(PROGRESS_PERIOD_MIN);
+    let period = look_period(&shell.stores.config.ndl);
     loop {
         tokio::time::sleep(period).await;
         let (answer, answered) = oneshot::channel();

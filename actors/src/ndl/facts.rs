@@ -96,8 +96,7 @@ impl Payload for NodeEvent {
 /// Why a layer or an application does not get on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum Trouble {
-    /// One turn of it (a handler, a timer, a future) has lasted for 250 ms and more. Of a client (`NodeApi`): messages wait for it at its
-    /// node, or in its ring, and it has taken none for as long.
+    /// One turn of it (a handler, a timer, a future) has lasted for 250 ms and more.
     Stalled,
     /// It has failed and is started again, or waits for that.
     Away,

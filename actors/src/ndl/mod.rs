@@ -40,7 +40,7 @@
 //! | NDL-6 | Each answer measures the peer's clock; the smallest bound counts, grown by the drift since then. |
 //! | NDL-6.1 | Answers some time apart measure how fast that clock drifts; an offset moves on with it, ever less exactly, while nobody answers. |
 //! | NDL-9 | Answers say what of the node does not get on; a change is told to applications. |
-//! | NDL-9.1 | Also which clients take nothing of what waits for them. |
+//! | NDL-9.1 | They say, too, which clients take nothing of what waits for them; of that nobody is told, it is known. |
 //! | NDL-7 | All memory and all work is bounded. |
 //! | NDL-7.1 | `nodes_max` members, as many candidates, as many that are gone; the oldest candidate makes room. |
 //! | NDL-7.2 | 50 datagrams/s from a stranger's address, 1,000 from all of them, 500 from each member or seed. |
@@ -65,12 +65,12 @@ mod tests;
 pub(crate) use actor::{NdlActor, new_core};
 pub(crate) use address::is_same_host;
 pub(crate) use core::Core;
-pub use core::{KnownNode, KnownRoute, OwnStalls, Source, TroubledApp};
+pub use core::{IdleApp, KnownNode, KnownRoute, OwnStalls, Source, TroubledApp};
 pub(crate) use core::{LostNode, SourceCounts};
 pub(crate) use datagram::{FURTHER_MAX, PATHS_MAX};
 pub(crate) use facts::MembershipFact;
 pub use facts::{LossReason, NodeEvent, Trouble};
-pub(crate) use progress::{Part, Progress, Told};
+pub(crate) use progress::{IdleClient, Part, Progress, Told, look_period};
 pub(crate) use socket::Sockets;
 
 use crate::{gncl::LinkFact, lncl::AppFact};

@@ -1,24 +1,74 @@
 //! What of a node does not get on: written by the node about itself into its answers, read by those who watch it.
 
+use std::time::Duration;
+
 use serde::{Deserialize, Serialize};
 use sinew_runtime::tid::AppAddress;
 
 use super::Trouble;
+use crate::config::NdlConfig;
 
-/// Parts that are named at most: with the longest names they have 320 of a datagram's 1,200 bytes.
+/// Time between two looks of a node at itself at least.
+const LOOK_MIN: Duration = Duration::from_millis(100);
+/// Parts that are named at most: with the longest names they have 420 of a datagram's 1,200 bytes.
 pub(crate) const PARTS_MAX: usize = 4;
 /// Longest name of a part in bytes; a longer one is cut.
 const NAME_MAX: usize = 63;
+/// Clients that are named at most: with the longest names they have 70 bytes, with those above and the longest announcement all that there are.
+pub(crate) const CLIENTS_MAX: usize = 2;
+/// Longest name of a client in bytes; a longer one is cut.
+const CLIENT_NAME_MAX: usize = 24;
 
-/// Layers and applications that do not get on.
+/// Time between two looks of a node at what of it does not get on.
+pub(crate) fn look_period(config: &NdlConfig) -> Duration {
+    config.period.max(LOOK_MIN)
+}
+
+/// Layers and applications that do not get on, and clients that take nothing. The latter are told apart, as anybody may start one whom the
+/// node lets in: they take no place from what is the node's own, whichever addresses they choose and however many they are.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Progress {
     /// How many there are, also those that are not named.
     #[serde(default)]
     pub(crate) troubled: u32,
-    /// The first of them: layers, then applications by their addresses, then clients.
+    /// The first of them: layers, then applications by their addresses.
     #[serde(default)]
     pub(crate) parts: Vec<Part>,
+    /// How many clients take nothing of what waits for them, also those that are not named. // spec: NDL-9.1
+    #[serde(default, skip_serializing_if = "is_none")]
+    pub(crate) idle: u32,
+    /// The first of them, by their addresses.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(crate) clients: Vec<IdleClient>,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde calls it so")]
+const fn is_none(count: &u32) -> bool {
+    *count == 0
+}
+
+/// A client (`NodeApi`) that takes nothing of what waits for it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "(AppAddress, String, u32)", into = "(AppAddress, String, u32)")]
+pub(crate) struct IdleClient {
+    /// Its application address.
+    pub(crate) app: AppAddress,
+    /// Its name.
+    pub(crate) name: String,
+    /// For how long at least, in milliseconds before the answer.
+    pub(crate) since_ms: u32,
+}
+
+impl From<(AppAddress, String, u32)> for IdleClient {
+    fn from((app, name, since_ms): (AppAddress, String, u32)) -> Self {
+        Self { app, name, since_ms }
+    }
+}
+
+impl From<IdleClient> for (AppAddress, String, u32) {
+    fn from(IdleClient { app, name, since_ms }: IdleClient) -> Self {
+        (app, name, since_ms)
+    }
 }
 
 /// A layer or an application that does not get on.
@@ -63,36 +113,35 @@ impl From<Told> for u8 {
 }
 
 impl Progress {
-    /// That of a node with these parts, of which the first are named.
-    #[cfg(test)]
-    pub(crate) fn of(parts: Vec<Part>) -> Self {
-        Self::with_clients(parts, Vec::new())
+    /// That of these parts, of which the first are named.
+    pub(crate) fn of(mut parts: Vec<Part>) -> Self {
+        let troubled = u32::try_from(parts.len()).unwrap_or(u32::MAX);
+        parts.sort_by_key(|part| part.app);
+        parts.truncate(PARTS_MAX);
+        parts.iter_mut().for_each(|part| cut(&mut part.name, NAME_MAX));
+        Self { troubled, parts, ..Self::default() }
     }
 
-    /// That of a node with these parts of its own and these clients. A client, which anybody may start whom the node lets in, takes no
-    /// place from a layer or an application of the node, whichever address it has chosen.
-    pub(crate) fn with_clients(mut parts: Vec<Part>, mut clients: Vec<Part>) -> Self {
-        let troubled = u32::try_from(parts.len() + clients.len()).unwrap_or(u32::MAX);
-        parts.sort_by_key(|part| part.app);
-        clients.sort_by_key(|part| part.app);
-        parts.extend(clients);
-        parts.truncate(PARTS_MAX);
-        for part in &mut parts {
-            let end = part.name.floor_char_boundary(NAME_MAX);
-            part.name.truncate(end);
-            part.name.retain(|letter| !letter.is_control());
-        }
-        Self { troubled, parts }
+    /// The same with these clients, of which the first are named.
+    pub(crate) fn with_clients(mut self, mut clients: Vec<IdleClient>) -> Self {
+        self.idle = u32::try_from(clients.len()).unwrap_or(u32::MAX);
+        clients.sort_by_key(|client| client.app);
+        clients.truncate(CLIENTS_MAX);
+        clients.iter_mut().for_each(|client| cut(&mut client.name, CLIENT_NAME_MAX));
+        Self { clients, ..self }
     }
 
     pub(crate) const fn is_nothing(&self) -> bool {
-        self.troubled == 0
+        self.troubled == 0 && self.idle == 0
     }
 
     /// Whether it can be what a node says.
     pub(crate) fn is_fit(&self) -> bool {
-        let is_fit = |part: &Part| part.name.len() <= NAME_MAX && !part.name.contains(char::is_control);
-        self.parts.len() <= PARTS_MAX.min(self.troubled as usize) && self.parts.iter().all(is_fit)
+        let are_fit = self.parts.iter().all(|part| is_fit(&part.name, NAME_MAX))
+            && self.clients.iter().all(|client| is_fit(&client.name, CLIENT_NAME_MAX));
+        self.parts.len() <= PARTS_MAX.min(self.troubled as usize)
+            && self.clients.len() <= CLIENTS_MAX.min(self.idle as usize)
+            && are_fit
     }
 
     /// Whether all are named.
@@ -105,23 +154,56 @@ impl Progress {
     }
 }
 
+fn cut(name: &mut String, max: usize) {
+    name.truncate(name.floor_char_boundary(max));
+    name.retain(|letter| !letter.is_control());
+}
+
+fn is_fit(name: &str, max: usize) -> bool {
+    name.len() <= max && !name.contains(char::is_control)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ndl::Told;
 
     fn part(app: u32) -> Part {
         let name = format!("app-{app:x}");
         Part { app: AppAddress::new(app), name, trouble: Told(Trouble::Stalled), since_ms: 300 }
     }
 
+    fn client(app: u32) -> IdleClient {
+        IdleClient { app: AppAddress::new(app), name: "ü".repeat(40), since_ms: 1_300 }
+    }
+
+    // spec: NDL-9.1
     #[test]
-    fn clients_take_no_place_from_what_is_the_nodes_own_whichever_addresses_they_have() {
-        let own = || [0x9000_0000, 3].map(part).to_vec();
-        let clients = || (0x1000..0x1010).rev().map(part).collect();
-        let progress = Progress::with_clients(own(), clients());
-        let named: Vec<_> = progress.parts.iter().map(|part| part.app.bits()).collect();
-        assert_eq!((progress.troubled, &named[..]), (18, &[3, 0x9000_0000, 0x1000, 0x1001][..]));
-        assert!(progress.is_fit() && !progress.is_whole());
-        assert!(Progress::with_clients(own(), Vec::new()).is_whole());
+    fn clients_take_no_place_from_what_is_the_nodes_own_whichever_addresses_they_have_and_however_many() {
+        let own = || Progress::of([0x9000_0000, 3, 4, 5].map(part).to_vec());
+        let progress = own().with_clients((0x1000..0x9000).rev().map(client).collect());
+        assert_eq!((progress.troubled, &progress.parts), (4, &own().parts));
+        assert!(progress.is_fit() && progress.is_whole(), "so that it is told who gets on again");
+        let named: Vec<_> = progress.clients.iter().map(|client| client.app.bits()).collect();
+        assert_eq!((progress.idle, &named[..]), (0x8000, &[0x1000, 0x1001][..]));
+        assert!(!Progress::default().with_clients(vec![client(1)]).is_nothing());
+    }
+
+    #[test]
+    fn more_clients_than_are_counted_or_with_names_that_nobody_writes_are_refused() {
+        let said = Progress::default().with_clients([1, 2].map(client).to_vec());
+        assert!(said.is_fit());
+        let named = |name: &str| vec![IdleClient { name: name.to_owned(), ..client(1) }];
+        let unfit = [
+            Progress { idle: 1, ..said.clone() },
+            Progress {
+                idle: 9,
+                clients: [1, 2, 3].map(|app| IdleClient { name: String::new(), ..client(app) }).to_vec(),
+                ..Progress::default()
+            },
+            Progress { clients: named(&"x".repeat(25)), ..said.clone() },
+            Progress { clients: named("two\nlines"), ..said },
+        ];
+        unfit.iter().for_each(|said| assert!(!said.is_fit(), "{said:?}"));
     }
 }

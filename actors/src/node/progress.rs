@@ -17,10 +17,10 @@ pub(super) use self::clients::IdleClients;
 use super::{layers::LAYERS, root::Root};
 use crate::{
     audit::ClientTaking,
-    ndl::{Part, Progress, Told, Trouble},
+    ndl::{IdleClient, Part, Progress, Told, Trouble, look_period},
 };
 
-/// A turn that lasts longer is told of, and a client that takes nothing for longer. Below the watchdog's default of 1 s, after which the actor is replaced, and above what a
+/// A turn that lasts longer is told of. Below the watchdog's default of 1 s, after which the actor is replaced, and above what a
 /// loaded machine makes of a short one.
 const STALLED_AFTER: Duration = Duration::from_millis(250);
 /// The layers' addresses, in the order of their names.
@@ -38,18 +38,18 @@ impl Root {
         for roster in [&self.layer_supervisor, &self.app_supervisor].into_iter().flatten() {
             collect(now, roster, roster.view(now), &stalled, &mut parts);
         }
-        Progress::with_clients(parts, self.idle_clients(now))
+        Progress::of(parts).with_clients(self.idle_clients(now))
     }
 
     /// The clients that take nothing of what waits for them.
-    fn idle_clients(&mut self, now: Time) -> Vec<Part> {
-        let clients = self.stores.book.takings();
-        let idle = self.clients.look(now, clients.iter().map(|client| (client.id, client.taking)));
-        let part = |ClientTaking { id, app, name, .. }: ClientTaking| {
+    fn idle_clients(&mut self, now: Time) -> Vec<IdleClient> {
+        let (clients, every) = (self.stores.book.takings(), look_period(&self.stores.config.ndl));
+        let idle = self.clients.look(now, every, clients.iter().map(|client| (client.id, client.taking)));
+        let said = |ClientTaking { id, app, name, .. }: ClientTaking| {
             let since_ms = millis_since(now, *idle.get(&id)?);
-            Some(Part { app, name: name.to_string(), trouble: Told(Trouble::Stalled), since_ms })
+            Some(IdleClient { app, name: name.to_string(), since_ms })
         };
-        clients.into_iter().filter_map(part).collect()
+        clients.into_iter().filter_map(said).collect()
     }
 }
 

@@ -1,4 +1,6 @@
-//! Where every message is that an outlet has taken: for an audit.
+//! Where every message is that an outlet has taken: for an audit. And whether the peer takes what is for it.
+
+use sinew_runtime::wire::{Header, Kind};
 
 use super::{
     Account, Socket,
@@ -53,20 +55,18 @@ pub(crate) struct OutletAccount {
 pub(crate) struct Taking {
     /// Another one whenever the peer has taken something; nothing else is to be read from it.
     pub(crate) mark: (u64, u64),
-    pub(crate) left: Left,
-    /// Messages that were ever accepted for it, frames of the layers and outcomes aside.
-    pub(crate) messages: u64,
+    /// Whether a message of an application waits that the peer only has to take; where nobody can say what it has taken, one for which its
+    /// socket has no room.
+    pub(crate) leaves_some: bool,
 }
 
-/// What there is that a peer has not taken.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Left {
-    /// Nothing. Where nobody can say what the peer has taken: nothing waits here.
-    Nothing,
-    /// It has taken all that it was given. More waits here, which is not the peer's fault.
-    Ungiven,
-    /// Something that the peer only has to take; where nobody can say that, something for which its socket has no room.
-    Untaken,
+/// What a receiver of protected messages says to their sender (`sinew_runtime::protection`).
+const ECHO: Kind = Kind::named("sinew.echo");
+
+/// Whether this is an application's message for the program at the other end. Who only sends need not read what is not: frames and events of
+/// the layers, outcomes, and what a `NodeApi` answers or keeps by itself.
+pub(super) fn is_for_the_program(header: &Header) -> bool {
+    header.kind.is_user() && ![Kind::PING, ECHO].contains(&header.kind) && !header.source.app.is_layer()
 }
 
 impl<S: Socket> Half<S> {
@@ -74,18 +74,20 @@ impl<S: Socket> Half<S> {
     pub(super) fn taking(&mut self) -> Option<Taking> {
         let Link::Up(socket) = &mut self.link else { return None };
         let Account { written, taken } = socket.account();
-        let waits = self.waiting() > 0;
         let is_known = taken <= written;
-        let left = if is_known && taken < written || !is_known && waits {
-            Left::Untaken
-        } else if waits {
-            Left::Ungiven
-        } else {
-            Left::Nothing
-        };
+        // While it has taken all that it was given, what waits here is not its fault.
+        let leaves_some =
+            is_known && taken < self.due || taken != written && self.holds_any_for_the_program();
         let begun = self.partial.as_ref().map_or(0, |partial| partial.written as u64);
         let mark = if is_known { (taken, 0) } else { (self.counts.sent, begun) };
-        Some(Taking { mark, left, messages: self.tally.taken.saturating_sub(self.tally.own) })
+        Some(Taking { mark, leaves_some })
+    }
+
+    /// Whether an application's message waits here, or has been begun.
+    fn holds_any_for_the_program(&self) -> bool {
+        let begun = self.partial.as_ref().filter(|partial| partial.sort != Sort::Frill);
+        let first = begun.map(|partial| &partial.message).into_iter().chain(&self.interrupted);
+        first.chain(self.queue.iter()).any(|message| is_for_the_program(&message.header))
     }
 
     pub(super) fn account(&self) -> (OutletAccount, Option<Sent>) {

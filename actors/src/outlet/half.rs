@@ -13,7 +13,7 @@ use sinew_runtime::{
 
 use super::{
     LinkNumber, OutletCounts, OutletLimits, Socket,
-    account::Tally,
+    account::{Tally, is_for_the_program},
     after::After,
     batch::{Pace, is_left_to_the_drainer, is_patient},
     outcomes::messages_in,
@@ -79,6 +79,8 @@ pub(super) struct Half<S> {
     pub(super) counts: OutletCounts,
     /// The rest of what an audit needs.
     pub(super) tally: Tally,
+    /// What the socket had written when it had the last message for the program at the other end.
+    pub(super) due: u64,
 }
 
 impl<S: Socket> Half<S> {
@@ -103,6 +105,7 @@ impl<S: Socket> Half<S> {
             pace: Pace::new(),
             counts: OutletCounts::default(),
             tally: Tally::default(),
+            due: 0,
         }
     }
 
@@ -131,6 +134,7 @@ impl<S: Socket> Half<S> {
         self.number += 1;
         if !matches!(self.link, Link::Closed(_)) {
             self.link = Link::Up(socket);
+            self.due = 0;
             self.payload_max = self.limits.payload_max.min(payload_max);
             self.partial = preface.map(|message| self.frill(message));
         }
@@ -450,6 +454,11 @@ impl<S: Socket> Half<S> {
     pub(super) fn sent(&mut self, frame: Partial) {
         if frame.sort == Sort::Message {
             self.counts.sent += messages_in(&frame.message);
+            if let Link::Up(socket) = &self.link
+                && is_for_the_program(&frame.message.header)
+            {
+                self.due = socket.written();
+            }
         }
         let expiry = frame.message.header.expiry();
         if let Some(receipt) = frame.message.receipt {

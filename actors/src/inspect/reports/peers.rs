@@ -101,6 +101,17 @@ pub struct TroubleReport {
     pub since_us: u64,
 }
 
+/// A client of a node (an application with `NodeApi`) that takes nothing of what waits for it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct IdleReport {
+    /// Its address.
+    pub app: Tid,
+    /// The first 24 bytes of its name.
+    pub name: String,
+    /// For how long at least that has been so, as its node said last.
+    pub since_us: u64,
+}
+
 /// A node as another one sees it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PeerReport {
@@ -133,6 +144,12 @@ pub struct PeerReport {
     /// The first of them: four at most, and 64 of all peers.
     #[serde(default, deserialize_with = "at_most::<_, _, TROUBLES_MAX>")]
     pub troubles: Vec<TroubleReport>,
+    /// How many of its clients take nothing of what waits for them, as it says.
+    #[serde(default)]
+    pub idle_clients: u32,
+    /// The first of them: two at most, and 64 of all peers.
+    #[serde(default, deserialize_with = "at_most::<_, _, TROUBLES_MAX>")]
+    pub idle: Vec<IdleReport>,
     /// The ways on which NDL asks it, the one that is used first.
     #[serde(default, deserialize_with = "at_most::<_, _, LINKS_MAX>")]
     pub routes: Vec<RouteReport>,
@@ -208,6 +225,8 @@ impl PeerReport {
             bound_us: None,
             troubled: 0,
             troubles: Vec::new(),
+            idle_clients: 0,
+            idle: Vec::new(),
             routes: Vec::new(),
             round_trip_ns: None,
             offset_ns: None,

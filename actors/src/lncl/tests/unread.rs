@@ -1,7 +1,6 @@
 //! What a client costs that does not read, and what is said of what it does not get.
 
 use super::*;
-use crate::outlet::Left;
 
 #[test]
 fn a_client_that_never_reads_costs_a_bounded_queue() {
@@ -25,27 +24,27 @@ fn of_a_client_that_does_not_read_it_is_known_that_something_waits_until_it_read
     let app = node.local(1);
     let (mut client, tid) =
         RawClient::register(&node, &Register { name: Some("hand".to_owned()), ..Register::default() });
-    let left = || {
+    let leaves_some = || {
         let clients = node.stores.book.takings();
         clients
             .into_iter()
             .find(|client| client.app == tid.app && &*client.name == "hand")
-            .map(|client| client.taking.left)
+            .map(|client| client.taking.leaves_some)
     };
-    assert_eq!(left(), Some(Left::Nothing));
+    assert_eq!(leaves_some(), Some(false));
     // When: more is sent than its socket takes.
     let deadline = Time::now() + WATCHDOG;
-    while left() != Some(Left::Untaken) {
+    while leaves_some() != Some(true) {
         assert!(Time::now() < deadline, "waited for the client's socket to be full");
         node.stores.router.send(filler(app.tid, tid)).expect("the queue is empty");
     }
     // When: it reads. What waits comes.
-    while left() != Some(Left::Nothing) {
+    while leaves_some() != Some(false) {
         client.next().expect("the connection stands");
     }
     drop(client);
     // Then
-    while left().is_some() {
+    while leaves_some().is_some() {
         assert!(Time::now() < deadline, "waited for the client's end");
         std::thread::yield_now();
     }

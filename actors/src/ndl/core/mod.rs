@@ -64,7 +64,7 @@ pub(crate) use self::recall::{LostNode, Neighbour};
 pub(crate) use self::routes::Place;
 pub use self::sources::Source;
 pub(crate) use self::sources::SourceCounts;
-pub use self::view::{KnownNode, KnownRoute, TroubledApp};
+pub use self::view::{IdleApp, KnownNode, KnownRoute, TroubledApp};
 use self::{
     audience::Audience,
     budget::Strangers,

@@ -10,7 +10,7 @@ use sinew_runtime::{
 use super::{Core, LostNode, Member, Neighbour, OwnStalls, Place, Source, routes::Route};
 use crate::{
     clocks::ClockOffset,
-    ndl::{Part, Trouble},
+    ndl::{IdleClient, Part, Trouble},
 };
 
 /// A node that is there.
@@ -43,9 +43,13 @@ pub struct KnownNode {
     pub bound: Duration,
     /// How many of its layers and applications do not get on, as it says; and its NDL where that is not heard.
     pub troubled: usize,
-    /// The first of them: its NDL where that is not heard; then, as it says, layers, then applications by their addresses, then
-    /// clients, four at most.
+    /// The first of them: its NDL where that is not heard; then, as it says, layers, then applications by their addresses, four at most.
     pub troubles: Vec<TroubledApp>,
+    /// How many of its clients (applications with [`NodeApi`](crate::NodeApi), in any language) take nothing of what waits for them, as it
+    /// says. No [`NodeEvent`](crate::NodeEvent) tells of it.
+    pub idle_clients: usize,
+    /// The first of them by their addresses, two at most.
+    pub idle: Vec<IdleApp>,
     /// Time of the last query and its answer on the network.
     pub round_trip: Option<Duration>,
     /// How far its clock is from ours, now, and how fast that changes.
@@ -85,6 +89,23 @@ pub struct TroubledApp {
     pub since: Duration,
 }
 
+/// A client that takes nothing of what waits for it: messages of applications have waited for it at its node, and it has taken nothing,
+/// for a second and more. It hangs, is stopped, does not receive, or needs that long for what it took last.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct IdleApp {
+    /// Its address.
+    pub app: Tid,
+    /// The first 24 bytes of its name.
+    pub name: String,
+    /// For how long at least that has been so, as its node said last.
+    pub since: Duration,
+}
+
+fn idle(node: NodeAddress, client: &IdleClient) -> IdleApp {
+    let since = Duration::from_millis(client.since_ms.into());
+    IdleApp { app: Tid::new(node, client.app), name: client.name.clone(), since }
+}
+
 fn troubled(node: NodeAddress, part: &Part) -> TroubledApp {
     TroubledApp {
         app: Tid::new(node, part.app),
@@ -112,6 +133,8 @@ impl Core {
             troubles: (member.troubles.unheard().into_iter().chain(&member.progress.parts))
                 .map(|part| troubled(*node, part))
                 .collect(),
+            idle_clients: member.progress.idle as usize,
+            idle: member.progress.clients.iter().map(|client| idle(*node, client)).collect(),
             asked_every: self.paces[member.pace].period,
             bound: self.paces[member.pace].bound(),
             round_trip: member.clock.round_trip(),

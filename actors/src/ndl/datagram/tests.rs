@@ -3,7 +3,7 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::ndl::{Part, Told, Trouble};
+use crate::ndl::{IdleClient, Part, Told, Trouble};
 
 fn any_announcement() -> impl Strategy<Value = Announcement> {
     let names = ("[a-zäöü ]{1,30}", "[a-z.-]{1,63}");
@@ -61,7 +61,10 @@ fn any_progress(number: u64) -> Progress {
         trouble: Told(Trouble::GivenUp),
         since_ms: u32::MAX,
     };
-    Progress::of((0..(number % 7) as u32).map(part).collect())
+    let client =
+        |at| IdleClient { app: AppAddress::new(0xffff_0000 + at), name: "x".repeat(63), since_ms: u32::MAX };
+    let clients = (0..(number / 7 % 4) as u32).map(client).collect();
+    Progress::of((0..(number % 7) as u32).map(part).collect()).with_clients(clients)
 }
 
 fn any_datagram() -> impl Strategy<Value = Datagram> {
@@ -145,6 +148,66 @@ fn sound() -> Announcement {
         gncl_port6: 0,
         claim: Claim::Held,
     }
+}
+
+#[test]
+fn the_longest_answer_fits() {
+    let longest = Announcement {
+        project: "p".repeat(63),
+        node: NodeAddress::new(u32::MAX - 1),
+        name: "n".repeat(63),
+        incarnation: Incarnation(u64::MAX),
+        boot_nonce: u64::MAX,
+        gncl_ip: 0xdfff_ffff,
+        gncl_port: u16::MAX,
+        period_us: u32::MAX,
+        gncl_further: vec![(0xdfff_ffff, u16::MAX); FURTHER_MAX],
+        // Those of IPv6 are longer, and eight of both at most.
+        ndl: Vec::new(),
+        ndl6: vec![(0xfe80 << 48, u64::MAX, u16::MAX); PATHS_MAX],
+        gncl_port6: u16::MAX,
+        claim: Claim::Settling,
+    };
+    // As many of all as there can be.
+    let progress = any_progress(6 + 7 * 3);
+    let (query_sent_ns, query_received_ns) = (u64::MAX, u64::MAX);
+    let body = Body::Answer(Answer { announcement: longest, query_sent_ns, query_received_ns, progress });
+    let answer = Datagram { correlation: u64::MAX, sent: Time::from_nanos(u64::MAX), body };
+    let bytes = encode(&answer, HERE);
+    assert!(bytes.len() <= DATAGRAM_MAX, "{} bytes", bytes.len());
+    assert_eq!(parse(HERE, &bytes).expect("it is sound"), answer);
+}
+
+/// What an answer looks like to a node that knows nothing of clients.
+#[derive(Debug, PartialEq, Deserialize)]
+struct FormerProgress {
+    troubled: u32,
+    parts: Vec<Part>,
+}
+
+#[test]
+fn a_node_that_knows_nothing_of_clients_reads_the_rest_and_one_that_does_reads_a_former_ones() {
+    let clients = |progress: &Progress| rmp_serde::to_vec_named(progress).expect("strings and numbers");
+    let said = any_progress(2 + 7 * 3);
+    let former: FormerProgress =
+        rmp_serde::from_slice(&clients(&said)).expect("it skips what it does not know");
+    assert_eq!(former, FormerProgress { troubled: 2, parts: said.parts });
+    let without = any_progress(2);
+    let bytes = clients(&without);
+    assert!(!bytes.windows(4).any(|word| word == b"idle"), "left out");
+    assert_eq!(rmp_serde::from_slice::<Progress>(&bytes).expect("as before"), without);
+}
+
+#[test]
+fn an_answer_with_clients_that_cannot_be_so_is_refused() {
+    let answer = |idle| {
+        let progress = Progress { idle, ..any_progress(7 * 3) };
+        let (query_sent_ns, query_received_ns) = (1, 2);
+        let said = Answer { announcement: sound(), query_sent_ns, query_received_ns, progress };
+        parse(HERE, &frame(Kind::NDL_ANSWER, &rmp_serde::to_vec_named(&said).expect("strings and numbers")))
+    };
+    assert!(answer(3).is_ok());
+    assert!(matches!(answer(1), Err(DatagramError::Announcement(_))));
 }
 
 fn refusal(announcement: &Announcement) -> DatagramError {

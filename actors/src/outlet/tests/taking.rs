@@ -22,6 +22,10 @@ impl Socket for Arc<Memory> {
         Ok(taken)
     }
 
+    fn written(&self) -> u64 {
+        self.written.load(Ordering::Relaxed) as u64
+    }
+
     fn account(&mut self) -> Account {
         let count = |of: &AtomicUsize| of.load(Ordering::Relaxed) as u64;
         Account { written: count(&self.written), taken: count(&self.taken) }
@@ -32,32 +36,43 @@ impl Socket for Arc<Memory> {
     }
 }
 
-fn seen<S: Socket>(outlet: &StreamOutlet<S>) -> (Left, u64) {
-    let Taking { left, messages, .. } = outlet.taking().expect("there is a connection");
-    (left, messages)
+fn leaves_some<S: Socket>(outlet: &StreamOutlet<S>) -> bool {
+    outlet.taking().expect("there is a connection").leaves_some
+}
+
+/// An outlet to memory with so much room.
+fn to_memory(room: usize) -> (StreamOutlet<Arc<Memory>>, Arc<Memory>, LinkNumber) {
+    let (outlet, memory) = (StreamOutlet::new(LIMITS), Arc::new(Memory::default()));
+    memory.room.store(room, Ordering::Relaxed);
+    let link = outlet.connect(memory.clone(), usize::MAX, None);
+    (outlet, memory, link)
+}
+
+impl Memory {
+    fn take_all(&self) {
+        self.taken.store(self.written.load(Ordering::Relaxed), Ordering::Relaxed);
+    }
 }
 
 #[test]
 fn what_lies_in_memory_untaken_waits_for_the_peer_and_what_finds_no_room_there_does_too() {
-    let (outlet, memory) = (StreamOutlet::new(LIMITS), Arc::new(Memory::default()));
-    assert_eq!(outlet.taking(), None, "nobody is there");
-    let link = outlet.connect(memory.clone(), usize::MAX, None);
-    assert_eq!(seen(&outlet), (Left::Nothing, 0));
+    assert_eq!(StreamOutlet::<Arc<Memory>>::new(LIMITS).taking(), None, "nobody is there");
     // When: one message has room, and the next one has not.
-    memory.room.store(message(Class::Bulk, 1).size(), Ordering::Relaxed);
+    let (outlet, memory, link) = to_memory(message(Class::Bulk, 1).size());
+    assert!(!leaves_some(&outlet));
     outlet.submit(message(Class::Bulk, 1)).expect("there is room");
     outlet.submit(message(Class::Bulk, 2)).expect("it waits");
     // Then
-    assert_eq!(seen(&outlet), (Left::Untaken, 2));
+    assert!(leaves_some(&outlet));
     let before = outlet.taking();
     assert_eq!(outlet.taking(), before, "nothing was taken");
     // When: the peer takes a part of it, then all that it was given.
     memory.taken.store(1, Ordering::Relaxed);
-    assert_eq!(seen(&outlet).0, Left::Untaken);
+    assert!(leaves_some(&outlet));
     assert_ne!(outlet.taking().map(|taking| taking.mark), before.map(|taking| taking.mark));
-    memory.taken.store(memory.written.load(Ordering::Relaxed), Ordering::Relaxed);
+    memory.take_all();
     // Then: the rest waits for us, not for it.
-    assert_eq!(seen(&outlet), (Left::Ungiven, 2));
+    assert!(!leaves_some(&outlet));
     outlet.disconnect(link);
     assert_eq!(outlet.taking(), None, "nobody is there any more");
 }
@@ -67,28 +82,85 @@ fn of_a_socket_what_it_has_no_room_for_waits_for_the_peer_and_each_byte_that_goe
     let length = message(Class::Bulk, 1).size();
     let bench = Bench::new(length);
     bench.submit(message(Class::Bulk, 1));
-    assert_eq!(seen(&bench.outlet), (Left::Nothing, 1), "nobody knows who has it");
+    assert!(!leaves_some(&bench.outlet), "nobody knows who has it");
     bench.submit(message(Class::Bulk, 2));
     let mut before = bench.outlet.taking();
-    assert_eq!(seen(&bench.outlet), (Left::Untaken, 2));
+    assert!(leaves_some(&bench.outlet));
     // When it takes a part, and the rest but for one byte.
     for room in [1, length - 2] {
         bench.make_room(room);
         let now = bench.outlet.taking();
         assert_ne!(now, before);
-        assert_eq!(now.map(|taking| taking.left), Some(Left::Untaken));
+        assert!(leaves_some(&bench.outlet));
         before = now;
     }
     bench.make_room(1);
-    assert_eq!(seen(&bench.outlet), (Left::Nothing, 2));
+    assert!(!leaves_some(&bench.outlet));
+}
+
+/// What a program that only sends need not read, or that its `NodeApi` keeps.
+fn not_for_the_program() -> [Message; 4] {
+    let mut event = message(Class::Bulk, 1);
+    event.header.source.app = AppAddress::NDL;
+    let [ping, echo] = ["sinew.ping", "sinew.echo"].map(|name| {
+        let mut message = message(Class::Bulk, 2);
+        message.header.kind = Kind::named(name);
+        message
+    });
+    let ticket = Ticket { source: tid(1), destination: tid(0), correlation: 1 };
+    [event, ping, echo, Message::outcome(ticket, Outcome::Delivered)]
 }
 
 #[test]
-fn frames_of_the_layers_and_outcomes_are_no_messages() {
-    let bench = Bench::new(0);
-    let ticket = Ticket { source: tid(1), destination: tid(0), correlation: 1 };
-    bench.submit(Message::outcome(ticket, Outcome::Delivered));
-    assert_eq!(seen(&bench.outlet), (Left::Untaken, 0));
-    bench.submit(message(Class::Control, 1));
-    assert_eq!(seen(&bench.outlet), (Left::Untaken, 1));
+fn pings_echoes_events_of_layers_and_outcomes_wait_for_no_program_wherever_they_wait() {
+    for (number, message) in not_for_the_program().into_iter().enumerate() {
+        let (outlet, _memory, _) = to_memory(PLENTY);
+        outlet.submit(message).expect("there is room");
+        assert!(!leaves_some(&outlet), "number {number} in memory");
+    }
+    for (number, message) in not_for_the_program().into_iter().enumerate() {
+        let bench = Bench::new(1);
+        bench.submit(message);
+        assert!(!leaves_some(&bench.outlet), "number {number} begun on a socket");
+        bench.submit(super::message(Class::Control, 1));
+        assert!(leaves_some(&bench.outlet), "and a message behind it");
+    }
+}
+
+#[test]
+fn who_has_taken_the_last_message_need_not_take_the_outcomes_behind_it() {
+    let (outlet, memory, _) = to_memory(PLENTY);
+    outlet.submit(message(Class::Bulk, 1)).expect("there is room");
+    // When: it takes the reply, and the outcome comes after that.
+    memory.take_all();
+    for message in not_for_the_program() {
+        outlet.submit(message).expect("there is room");
+    }
+    // Then
+    assert!(!leaves_some(&outlet));
+    // When: a message is behind them.
+    outlet.submit(message(Class::Bulk, 2)).expect("there is room");
+    assert!(leaves_some(&outlet));
+    memory.take_all();
+    assert!(!leaves_some(&outlet));
+}
+
+#[test]
+fn a_message_for_which_memory_that_is_full_of_other_frames_has_no_room_waits_for_the_peer() {
+    let [event, ..] = not_for_the_program();
+    let (outlet, memory, _) = to_memory(event.size());
+    outlet.submit(event).expect("there is room");
+    outlet.submit(message(Class::Bulk, 1)).expect("it waits");
+    assert!(leaves_some(&outlet));
+    memory.take_all();
+    assert!(!leaves_some(&outlet), "it has taken all that it was given");
+}
+
+#[test]
+fn what_one_connection_had_written_is_not_due_on_the_next() {
+    let (outlet, _memory, link) = to_memory(PLENTY);
+    outlet.submit(message(Class::Bulk, 1)).expect("there is room");
+    outlet.disconnect(link);
+    outlet.connect(Arc::new(Memory::default()), usize::MAX, None);
+    assert!(!leaves_some(&outlet));
 }

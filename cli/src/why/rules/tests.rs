@@ -31,6 +31,8 @@ fn peer(number: u8) -> PeerReport {
         bound_us: Some(2_000_000),
         troubled: 0,
         troubles: Vec::new(),
+        idle_clients: 0,
+        idle: Vec::new(),
         routes: Vec::new(),
         round_trip_ns: None,
         offset_ns: None,

@@ -3,7 +3,7 @@
 use sinew_runtime::tid::{AppAddress, Tid};
 
 use super::world::{PERIOD, World, ms, node};
-use crate::ndl::{NodeEvent, Part, Progress, Told, Trouble, core::Input};
+use crate::ndl::{IdleClient, NodeEvent, Part, Progress, Told, Trouble, core::Input};
 
 fn part(app: u32, trouble: Trouble) -> Part {
     Part { app: AppAddress::new(app), name: format!("app-{app:x}"), trouble: Told(trouble), since_ms: 300 }
@@ -98,4 +98,39 @@ fn an_application_that_comes_late_hears_what_does_not_get_on() {
     world.input(1, Input::AppChanged(late));
     let events = std::mem::take(&mut world.process(1).events);
     assert!(matches!(events[..], [NodeEvent::NodeFound { .. }, NodeEvent::AppStalled { .. }]), "{events:?}");
+}
+
+// spec: NDL-9.1
+#[test]
+fn clients_that_take_nothing_are_known_as_said_last_and_nobody_is_told_of_them_or_of_fewer_others() {
+    let mut world = World::of_members(2);
+    let stalled = Trouble::Stalled;
+    let client = |app| IdleClient { app: AppAddress::new(app), name: "hand".to_owned(), since_ms: 2_900 };
+    let idle = |world: &World| {
+        let known = &world.at(1).core.members(world.now)[0];
+        (
+            known.idle_clients,
+            known.idle.iter().map(|client| (client.app.app.bits(), client.since)).collect::<Vec<_>>(),
+        )
+    };
+    // When: many clients take nothing, each time others, and then an application of the node stalls, too.
+    for first in (0..100).map(|round| 0x1000 + 100 * round) {
+        let clients = (first..first + 100).map(client).collect();
+        world.input(2, Input::ProgressSeen(Progress::default().with_clients(clients)));
+        world.run(PERIOD + ms(1));
+        assert_eq!(idle(&world), (100, vec![(first, ms(2_900)), (first + 1, ms(2_900))]));
+    }
+    let own = Progress::of(vec![part(0x9000_0000, stalled)]);
+    world.input(2, Input::ProgressSeen(own.with_clients((0x1000..0x1064).map(client).collect())));
+    world.run(PERIOD + ms(1));
+    // Then
+    assert_eq!(told(&mut world), [(0x9000_0000, Some(stalled))]);
+    world.input(
+        2,
+        Input::ProgressSeen(Progress::default().with_clients((0x1000..0x1064).map(client).collect())),
+    );
+    world.run(PERIOD + ms(1));
+    assert_eq!(told(&mut world), [(0x9000_0000, None)], "though clients are not all named");
+    says(&mut world, vec![]);
+    assert_eq!((told(&mut world), idle(&world)), (vec![], (0, vec![])));
 }
