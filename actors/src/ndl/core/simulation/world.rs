@@ -106,7 +106,7 @@ enum Event {
     Land(Flying),
     Wake(usize),
     Resume(usize),
-    Tell(usize, Input),
+    Tell(usize, Box<Input>),
     /// What GNCL reads of the second process is a sign of it for the first.
     Sign(usize, usize),
     Happen(Happening),
@@ -332,7 +332,7 @@ impl World {
             Event::Land(flying) => self.land(flying),
             Event::Wake(process) => self.wake(process),
             Event::Resume(process) => self.resume(process),
-            Event::Tell(process, input) => self.tell(process, input),
+            Event::Tell(process, input) => self.tell(process, *input),
             Event::Sign(process, of) => self.read_a_sign(process, of),
             Event::Happen(what) => self.strike(what),
         }
@@ -379,7 +379,7 @@ impl World {
     fn tell(&mut self, process: usize, input: Input) {
         if self.is_stalled(process) {
             let until = self.processes[process].stalled_until;
-            self.push(until, Event::Tell(process, input));
+            self.push(until, Event::Tell(process, Box::new(input)));
         } else if self.processes[process].is_alive {
             self.trace(|| format!("{process} is told {input:?}"));
             self.with(process, |patient, now| patient.told(now, input));

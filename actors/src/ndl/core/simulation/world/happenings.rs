@@ -219,7 +219,10 @@ impl World {
         let address = self.processes[other].addresses[0];
         self.push(
             at,
-            Event::Tell(process, Input::AddressNamed { source: crate::ndl::core::Source::Mdns, address }),
+            Event::Tell(
+                process,
+                Box::new(Input::AddressNamed { source: crate::ndl::core::Source::Mdns, address }),
+            ),
         );
     }
 
@@ -239,8 +242,8 @@ impl World {
             let at = self.now + self.chance.between(Duration::ZERO, WORD_MAX);
             let broken = LinkFact::LinkBroken { node: node_address, incarnation };
             let refused = LinkFact::DialRefused { node: node_address, incarnation };
-            self.push(at, Event::Tell(index, Input::Link(broken)));
-            self.push(at + WORD_MAX, Event::Tell(index, Input::Link(refused)));
+            self.push(at, Event::Tell(index, Box::new(Input::Link(broken))));
+            self.push(at + WORD_MAX, Event::Tell(index, Box::new(Input::Link(refused))));
         }
     }
 

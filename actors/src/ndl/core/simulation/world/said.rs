@@ -39,7 +39,7 @@ impl World {
                 let takes = if host == Host::IsSilent { within } else { WORD_MAX.min(within / 2) };
                 self.ask_for_a_sign(from, node, WORD_MAX.min(within / 2));
                 let at = self.now + self.chance.between(Duration::ZERO, takes);
-                self.push(at, Event::Tell(from, Input::Probed { node, incarnation, host }));
+                self.push(at, Event::Tell(from, Box::new(Input::Probed { node, incarnation, host })));
             }
             Output::Fact(fact) => self.told(from, fact),
             Output::ClockMeasured { node, offset } => {
