@@ -1,6 +1,6 @@
 //! Where every message is that an outlet has taken: for an audit. And whether the peer takes what is for it.
 
-use sinew_runtime::wire::{Header, Kind};
+use sinew_runtime::wire::{Flags, Header, Kind};
 
 use super::{
     Account, Socket,
@@ -64,9 +64,10 @@ pub(crate) struct Taking {
 const ECHO: Kind = Kind::named("sinew.echo");
 
 /// Whether this is an application's message for the program at the other end. Who only sends need not read what is not: frames and events of
-/// the layers, outcomes, and what a `NodeApi` answers or keeps by itself.
+/// the layers, outcomes, what a `NodeApi` answers or keeps by itself, and replies, which may come when nobody waits for them any more.
 pub(super) fn is_for_the_program(header: &Header) -> bool {
-    header.kind.is_user() && ![Kind::PING, ECHO].contains(&header.kind) && !header.source.app.is_layer()
+    let is_kept = [Kind::PING, ECHO].contains(&header.kind) || header.flags.has(Flags::REPLY);
+    header.kind.is_user() && !is_kept && !header.source.app.is_layer()
 }
 
 impl<S: Socket> Half<S> {

@@ -99,7 +99,7 @@ fn of_a_socket_what_it_has_no_room_for_waits_for_the_peer_and_each_byte_that_goe
 }
 
 /// What a program that only sends need not read, or that its `NodeApi` keeps.
-fn not_for_the_program() -> [Message; 4] {
+fn not_for_the_program() -> [Message; 5] {
     let mut event = message(Class::Bulk, 1);
     event.header.source.app = AppAddress::NDL;
     let [ping, echo] = ["sinew.ping", "sinew.echo"].map(|name| {
@@ -107,12 +107,14 @@ fn not_for_the_program() -> [Message; 4] {
         message.header.kind = Kind::named(name);
         message
     });
+    let mut reply = message(Class::Bulk, 3);
+    reply.header.flags = Flags::REPLY;
     let ticket = Ticket { source: tid(1), destination: tid(0), correlation: 1 };
-    [event, ping, echo, Message::outcome(ticket, Outcome::Delivered)]
+    [event, ping, echo, reply, Message::outcome(ticket, Outcome::Delivered)]
 }
 
 #[test]
-fn pings_echoes_events_of_layers_and_outcomes_wait_for_no_program_wherever_they_wait() {
+fn pings_echoes_replies_events_of_layers_and_outcomes_wait_for_no_program_wherever_they_wait() {
     for (number, message) in not_for_the_program().into_iter().enumerate() {
         let (outlet, _memory, _) = to_memory(PLENTY);
         outlet.submit(message).expect("there is room");
