@@ -36,6 +36,9 @@ const READ_LEN: usize = 16 << 10;
 /// Bytes that are taken from one connection before others have their turn, however long its frames are: about 20 us of
 /// copying and checking.
 const BYTES_PER_TURN: usize = 64 << 10;
+/// The pause after as many bytes of one that was refused: who pours on all the same has a twentieth of the thread. To say that others have
+/// their turn is not enough, as the layer looks at its connections again and again as long as one of them has something new.
+const REFUSED_REST: Duration = Duration::from_millis(1);
 
 /// Bytes at most that the kernel takes and cannot send at once: about 0.5 ms of a gigabit.
 #[cfg(target_os = "linux")]
@@ -386,9 +389,10 @@ impl Reader {
     }
 
     async fn fill(&mut self) -> io::Result<()> {
-        let room = match *lock(&self.reading.mode) {
-            Mode::Linked(_) => self.asked,
-            Mode::Handshake | Mode::Moves(..) | Mode::Discard => HANDSHAKE_PAYLOAD_MAX,
+        let (room, is_refused) = match *lock(&self.reading.mode) {
+            Mode::Linked(_) => (self.asked, false),
+            Mode::Handshake | Mode::Moves(..) => (HANDSHAKE_PAYLOAD_MAX, false),
+            Mode::Discard => (HANDSHAKE_PAYLOAD_MAX, true),
         };
         let left = self.buffer.capacity() - self.buffer.len();
         // A quarter of room left is room enough: copying the rest of a frame for each read would cost more. A larger buffer
@@ -396,7 +400,10 @@ impl Reader {
         if left == 0 || left < room / 4 && self.buffer.capacity() <= FrameCodec::BUFFER_KEPT {
             self.buffer.reserve(room);
         }
-        if self.turn >= BYTES_PER_TURN {
+        if self.turn >= BYTES_PER_TURN && is_refused {
+            self.turn = 0;
+            tokio::time::sleep(REFUSED_REST).await;
+        } else if self.turn >= BYTES_PER_TURN {
             self.give_way().await;
         }
         let room = (self.buffer.capacity() - self.buffer.len()).min(BYTES_PER_TURN);
@@ -441,6 +448,31 @@ fn decline(error: &FrameError) -> Decline {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[tokio::test]
+    async fn who_is_refused_and_pours_on_is_read_with_a_pause_after_each_turn() {
+        const POURED: usize = 16 * BYTES_PER_TURN;
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let mut stranger = TcpStream::connect(listener.local_addr().unwrap()).await.unwrap();
+        let (socket, _) = listener.accept().await.unwrap();
+        let reading = Reading {
+            mode: Arc::new(Mutex::new(Mode::Discard)),
+            payload_max: HANDSHAKE_PAYLOAD_MAX,
+            give_up: Duration::from_secs(5),
+            secure: None,
+        };
+        let mut reader = Reader::new(Transport::open(socket), reading);
+        let began = tokio::time::Instant::now();
+        let pouring = async {
+            tokio::io::AsyncWriteExt::write_all(&mut stranger, &vec![7; POURED]).await.unwrap();
+            drop(stranger);
+        };
+        let (end, ()) = tokio::join!(reader.next(), pouring);
+        assert!(end.is_none() && reader.buffer.is_empty());
+        // A slow machine makes it longer, and never shorter.
+        let least = REFUSED_REST * (POURED / BYTES_PER_TURN - 1) as u32;
+        assert!(began.elapsed() >= least, "{POURED} bytes within {:?}", began.elapsed());
+    }
 
     #[test]
     fn a_dial_goes_out_from_the_announced_address_that_is_in_the_same_network_and_else_from_where_the_system_says()
