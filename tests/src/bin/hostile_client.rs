@@ -43,6 +43,7 @@ fn main() -> ExitCode {
         lasts: Duration::from_secs((minutes * 60 + seconds).max(5)),
         seed,
         kernel: if old_kernel { Kernel::WithoutPassRights } else { Kernel::Present },
+        held_up_max: Duration::from_secs(1),
     });
     println!("{report}");
     if report.holds() { ExitCode::SUCCESS } else { ExitCode::FAILURE }

@@ -49,9 +49,6 @@ const ATTACKERS: u64 = 2;
 const LIFE: Duration = Duration::from_secs(2);
 /// Sentences that are kept of those that newcomers are told.
 const TOLD_MAX: usize = 8;
-/// Nobody else's round trip takes longer. Whoever waits for what does not close waits for [`lingering::KEPT`]: as questions follow each
-/// other at once, one of them for nearly all of that. What is below it a busy machine takes as well.
-const HELD_UP_MAX: Duration = Duration::from_millis(2_500);
 /// How often the node's memory is looked at.
 const LOOK: Duration = Duration::from_millis(50);
 const LIMITS: StageLimits = StageLimits { mailbox_capacity: 32, payload_max: 16 * 1024, clients_max: 64 };
@@ -67,12 +64,16 @@ pub struct Plan {
     pub seed: u64,
     /// What the node and the hosts run on.
     pub kernel: Kernel,
+    /// Nobody else's round trip takes longer. Whoever waits for what does not close waits for [`lingering::KEPT`], 3 s: as questions follow
+    /// each other at once, one of them for nearly all of that.
+    pub held_up_max: Duration,
 }
 
 /// What was seen.
 #[derive(Debug)]
 pub struct Report {
     seconds: f64,
+    held_up_max: Duration,
     kernel: Kernel,
     tally: Tally,
     /// What the node refused.
@@ -136,7 +137,7 @@ impl Report {
             && self.grown_kib <= Self::bound_kib()
             && is_given_back(&self.held)
             && self.windows.iter().all(|window| window.failed == 0)
-            && self.longest() <= HELD_UP_MAX
+            && self.longest() <= self.held_up_max
             && self.hosts.iter().all(Host::holds)
             && self.tally.has_all_sorts()
             && self.newcomers.served > 0
@@ -173,7 +174,8 @@ impl fmt::Display for Host {
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { seconds, kernel, tally, refused, grown_kib, held, windows, hosts, newcomers } = self;
+        let Self { seconds, held_up_max, kernel, tally, refused, grown_kib, held, windows, hosts, newcomers } =
+            self;
         let Tally {
             tricks,
             connections,
@@ -200,7 +202,7 @@ impl fmt::Display for Report {
         hosts.iter().try_for_each(|host| write!(f, "{host}"))?;
         writeln!(
             f,
-            "longest round trip of the others under attack: {:?}; at most {HELD_UP_MAX:?}",
+            "longest round trip of the others under attack: {:?}; at most {held_up_max:?}",
             self.longest()
         )?;
         write!(
@@ -407,7 +409,7 @@ fn come(socket: &Path, over: &AtomicBool) -> Newcomers {
 /// If the node or one of the others ends.
 #[must_use]
 pub fn run(plan: Plan) -> Report {
-    let kernel = plan.kernel;
+    let (kernel, held_up_max) = (plan.kernel, plan.held_up_max);
     let mut cast = Cast::new(plan);
     cast.windows();
     thread::sleep(cast.plan.lasts / 8);
@@ -440,5 +442,5 @@ pub fn run(plan: Plan) -> Report {
     let hosts = (1..=HOSTS.len()).map(seen).collect();
     let tally = *cast.tally.lock().unwrap_or_else(PoisonError::into_inner);
     cast.end();
-    Report { seconds, kernel, tally, refused, grown_kib, held, windows, hosts, newcomers }
+    Report { seconds, held_up_max, kernel, tally, refused, grown_kib, held, windows, hosts, newcomers }
 }

@@ -125,7 +125,7 @@ fn door(listener: SocketAddr, port: u16, is_marked: bool) -> io::Result<Door> {
         #[cfg(target_os = "linux")]
         if listener.is_ipv4() {
             socket.set_freebind_v4(true)?;
-        } else {
+        } else if !listener.ip().is_unspecified() {
             socket.set_freebind_v6(true)?;
         }
         if listener.is_ipv6() {
