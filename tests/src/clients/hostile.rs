@@ -64,8 +64,8 @@ pub struct Plan {
     pub seed: u64,
     /// What the node and the hosts run on.
     pub kernel: Kernel,
-    /// Nobody else's round trip takes longer. Whoever waits for what does not close waits for [`lingering::KEPT`], 3 s: as questions follow
-    /// each other at once, one of them for nearly all of that.
+    /// Nobody else's round trip takes longer. What does not close holds up whoever waits for it until it is closed, 3 s: as questions
+    /// follow each other at once, one of them for nearly all of that.
     pub held_up_max: Duration,
 }
 
