@@ -134,12 +134,13 @@ impl Consumer {
     }
 
     fn spin_or_sleep(&mut self, wait: &Wait<'_>) -> Result<Record, ReceiveError> {
-        if spin(self.spinner.begin(), || self.core.has_moved())
+        let now = Instant::now();
+        let waiting = wait.begin(now);
+        if spin(self.spinner.begin().min(waiting.left(now)), || self.core.has_moved())
             && let Some(record) = self.core.next()?
         {
             return Ok(record);
         }
-        let waiting = wait.begin(Instant::now());
         loop {
             let heard = self.message.listen();
             let ended = match self.core.arm()? {

@@ -178,12 +178,13 @@ impl Producer {
     }
 
     fn spin_or_sleep(&mut self, length: usize, wait: &Wait<'_>) -> Result<Reserved, RoomError> {
-        if spin(self.spinner.begin(), || self.core.has_moved())
+        let now = Instant::now();
+        let waiting = wait.begin(now);
+        if spin(self.spinner.begin().min(waiting.left(now)), || self.core.has_moved())
             && let Some(reserved) = self.room_now(length)?
         {
             return Ok(reserved);
         }
-        let waiting = wait.begin(Instant::now());
         loop {
             let heard = self.room.listen();
             let ended = match self.core.arm(length) {

@@ -8,7 +8,8 @@ pub enum Spin {
     /// Sleeps at once. Right when CPUs are shared or power counts.
     #[default]
     Off,
-    /// Looks for this long. Right when the thread has a CPU of its own.
+    /// Looks for this long, and never beyond the deadline of the wait. Right when the thread has a CPU of its own. That the peer has ended
+    /// is seen after the look.
     For(Duration),
     /// Looks about twice as long as messages lately took to come, and not at all when they take longer than `max`.
     Adaptive {

@@ -136,19 +136,26 @@ fn a_full_ring_says_what_would_fit_and_no_message_is_longer_than_half_of_it() {
 }
 
 #[test]
-fn waiting_ends_at_its_deadline_with_every_bell() {
-    for bell in BELLS {
+fn waiting_ends_at_its_deadline_with_every_bell_however_long_it_looks_before_it_sleeps() {
+    let max = Duration::from_secs(60);
+    for (bell, spin) in BELLS
+        .into_iter()
+        .flat_map(|bell| [Spin::Off, Spin::For(max), Spin::Adaptive { max }].map(|spin| (bell, spin)))
+    {
         let (mut producer, mut consumer, _rest) = pair(4096, bell);
+        producer.set_spin(spin);
+        consumer.set_spin(spin);
         let wait = || Wait::until(Instant::now() + Duration::from_millis(30));
         let start = Instant::now();
         assert!(matches!(consumer.receive_before(&wait()), Err(ReceiveError::TimedOut)), "{bell}");
         assert!(start.elapsed() >= Duration::from_millis(30), "not before: {bell}");
         producer.send(&[0; 2040]).expect("room");
         producer.send(&[0; 2040]).expect("room");
-        let start = Instant::now();
+        let began_to_send = Instant::now();
         assert!(matches!(producer.loan_before(1, &wait()), Err(RoomError::TimedOut)), "{bell}");
-        assert!(start.elapsed() >= Duration::from_millis(30), "not before: {bell}");
+        assert!(began_to_send.elapsed() >= Duration::from_millis(30), "not before: {bell}");
         assert!(matches!(producer.loan_before(9999, &wait()), Err(RoomError::TooLong { .. })), "{bell}");
+        assert!(start.elapsed() < max, "the look went on beyond the deadline: {bell}, {spin:?}");
     }
 }
 
