@@ -113,7 +113,7 @@ pub struct DriveCore {
     ramp: AssistRamp,
     last_tick_ns: Option<u64>,
     device_heard: bool,
-    /// End of the last pause, ns: what the device gave before it says nothing of what it gives after it.
+    /// End of the last pause, or when the device was last left to damp, ns: what it gave before says nothing of what it gives after.
     paused_until_ns: Option<u64>,
     /// Whether assistance was interrupted by central since it was last full; else only this drive was away.
     interrupted: bool,
@@ -222,9 +222,10 @@ impl DriveCore {
         self.gait.disbelieve();
     }
 
-    /// The device was left to damp by itself: what it gives is asked anew, and until it is known nothing is commanded.
-    pub const fn let_device_damp(&mut self) {
+    /// The device is left to damp by itself from `now_ns` on: what it gives then is asked anew, and until it is known nothing is commanded.
+    pub const fn let_device_damp(&mut self, now_ns: u64) {
         self.device_heard = false;
+        self.paused_until_ns = Some(now_ns);
     }
 
     /// Takes a moment to feed forward in place of its own for the next 10 ms; returns whether it is believed.

@@ -239,7 +239,7 @@ impl Drive {
         let order = Order::past_shut(state, command_nm, was_giving, Time::now().since(now));
         let again = lookout.as_ref().map(Lookout::watch);
         match order {
-            Order::Damp => core.let_device_damp(),
+            Order::Damp => core.let_device_damp(now.as_nanos()),
             Order::Torque(0.0) => again.into_iter().for_each(Watch::rests),
             Order::Torque(_) => again.into_iter().for_each(Watch::ramps),
             Order::Nothing => {}
