@@ -36,9 +36,12 @@ const READ_LEN: usize = 16 << 10;
 /// Bytes that are taken from one connection before others have their turn, however long its frames are: about 20 us of
 /// copying and checking.
 const BYTES_PER_TURN: usize = 64 << 10;
-/// The pause after as many bytes of one that was refused: who pours on all the same has a twentieth of the thread. To say that others have
-/// their turn is not enough, as the layer looks at its connections again and again as long as one of them has something new.
+/// The first pause after as many bytes of one that was refused, twice as long each time: who pours on all the same soon waits, and costs
+/// nothing but what the kernel holds for it. To say that others have their turn is not enough, as the layer looks at its connections again
+/// and again as long as one of them has something new.
 const REFUSED_REST: Duration = Duration::from_millis(1);
+/// The longest of these pauses: 1 MiB a second of each.
+const REFUSED_REST_MAX: Duration = Duration::from_millis(64);
 
 /// Bytes at most that the kernel takes and cannot send at once: about 0.5 ms of a gigabit.
 #[cfg(target_os = "linux")]
@@ -263,6 +266,8 @@ pub(super) struct Reader {
     carried: bool,
     /// Bytes that were taken since others had their turn.
     turn: usize,
+    /// The next pause of one that was refused.
+    rest: Duration,
     /// Bytes that are asked for next, on a link: more where the last ones came all at once.
     asked: usize,
     /// Why it is over was said.
@@ -289,6 +294,7 @@ impl Reader {
             greeted: false,
             carried: false,
             turn: 0,
+            rest: REFUSED_REST,
             asked: READ_LEN,
             is_over: false,
         }
@@ -402,7 +408,8 @@ impl Reader {
         }
         if self.turn >= BYTES_PER_TURN && is_refused {
             self.turn = 0;
-            tokio::time::sleep(REFUSED_REST).await;
+            let longer = (2 * self.rest).min(REFUSED_REST_MAX);
+            tokio::time::sleep(std::mem::replace(&mut self.rest, longer)).await;
         } else if self.turn >= BYTES_PER_TURN {
             self.give_way().await;
         }
@@ -450,8 +457,8 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn who_is_refused_and_pours_on_is_read_with_a_pause_after_each_turn() {
-        const POURED: usize = 16 * BYTES_PER_TURN;
+    async fn who_is_refused_and_pours_on_is_read_with_ever_longer_pauses() {
+        const POURED: usize = 10 * BYTES_PER_TURN;
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         let mut stranger = TcpStream::connect(listener.local_addr().unwrap()).await.unwrap();
         let (socket, _) = listener.accept().await.unwrap();
@@ -470,7 +477,8 @@ mod tests {
         let (end, ()) = tokio::join!(reader.next(), pouring);
         assert!(end.is_none() && reader.buffer.is_empty());
         // A slow machine makes it longer, and never shorter.
-        let least = REFUSED_REST * (POURED / BYTES_PER_TURN - 1) as u32;
+        let pauses = 0..POURED / BYTES_PER_TURN - 1;
+        let least: Duration = pauses.map(|pause| (REFUSED_REST * (1 << pause)).min(REFUSED_REST_MAX)).sum();
         assert!(began.elapsed() >= least, "{POURED} bytes within {:?}", began.elapsed());
     }
 
