@@ -388,6 +388,10 @@ impl<S: Socket> Half<S> {
         let expiry = message.header.expiry();
         match bound {
             Bound::Waived => self.queue.push_beyond(message),
+            Bound::Kept if !self.has_room_beside_lines(&message) => {
+                self.counts.refused += 1;
+                return Err(Refused::new(message, Rejection::QueueFull));
+            }
             Bound::Kept => match self.queue.push(message) {
                 Ok(superseded) => self.counts.superseded += u64::from(superseded.is_some()),
                 Err(refused) => {

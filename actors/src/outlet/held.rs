@@ -1,4 +1,8 @@
 //! What waits for destinations that take nothing now, so that what is for others passes it. spec: CREDIT-3
+//!
+//! What is taken is never given up for want of room: what was in the queue when its destination became held moves to that one's line,
+//! whatever the bounds of lines. So that destinations that are held one after the other do not each bring a whole queue there, the queue takes
+//! less as long as there is more in lines than they may hold. spec: CREDIT-4
 
 use sinew_runtime::{
     outcome::{Rejection, Ticket},
@@ -8,13 +12,27 @@ use sinew_runtime::{
     wire::{Class, Flags, Header, Kind, Message},
 };
 
-use super::{Socket, after::After, half::Half};
+use super::{OutletLimits, Socket, after::After, batch::SHORT, half::Half};
 use crate::session::{ShelfLimits, Turn};
 
 /// What waits in lines at the sender: as many lines as a receiver has. In messages the bound of a session's queue holds, and a quarter of it
 /// for each line.
 pub(super) const LIMITS_OF_LINES: ShelfLimits =
     ShelfLimits { lines: 256, line_messages: 0, line_bytes: 1 << 20, messages: 0, bytes: 4 << 20 };
+
+/// Each of them has the queue's bounds for itself.
+const CLASSES: usize = 3;
+
+/// What lines that hold so much `beyond` their bounds leave of twice the queue's `bound`.
+const fn left_beside(beyond: usize, bound: usize) -> usize {
+    bound.saturating_mul(2).saturating_sub(beyond)
+}
+
+/// How much of that the queue may hold: half, so that each further destination brings less; and always a little, at `least` this, for those
+/// that take something.
+fn room_of(left: usize, bound: usize, least: usize) -> usize {
+    (left / 2).max(bound / LIMITS_OF_LINES.lines).max(least)
+}
 
 /// The name of a destination that may be held, by class: an application's mailbox, and not where the newest value is all that
 /// waits.
@@ -52,8 +70,30 @@ impl<S: Socket> Half<S> {
         self.session.as_ref().map_or(0, |session| session.held.messages())
     }
 
+    /// Whether what waits in lines leaves room in the queue for this message, which may come into a line one day. spec: CREDIT-4
+    pub(super) fn has_room_beside_lines(&self, message: &Message) -> bool {
+        let beyond = self.session.as_ref().and_then(|session| session.held.beyond());
+        let Some(beyond) = beyond.filter(|_| line_of(&message.header).is_some()) else { return true };
+        let OutletLimits { queue_capacity, queue_bytes, payload_max, .. } = self.limits;
+        let (held, length) = (self.queue.bytes(), message.payload.len());
+        // One may reach beyond the bounds of lines that it began in.
+        let left = left_beside(beyond.bytes.saturating_sub(payload_max), queue_bytes);
+        // As in any queue, one waits alone however long it is.
+        let has_bytes = held == 0 && left > 0 || held + length <= room_of(left, queue_bytes, SHORT);
+        let left = left_beside(beyond.messages, queue_capacity);
+        has_bytes && self.queue.len() < room_of(left, queue_capacity, 1)
+    }
+
+    /// Whether the queue holds no more than it may, all classes together: what waited in lines comes back to it whatever its bounds.
+    fn is_within_bounds(&self) -> bool {
+        let OutletLimits { queue_capacity, queue_bytes, .. } = self.limits;
+        self.queue.len() <= CLASSES * queue_capacity && self.queue.bytes() <= CLASSES * queue_bytes
+    }
+
     pub(super) fn put_in_line(&mut self, key: u64, message: Message) -> Result<(), Refused> {
-        let Some(session) = &mut self.session else {
+        let has_room = self.is_within_bounds();
+        let Some(session) = self.session.as_mut().filter(|_| has_room) else {
+            self.counts.refused += 1;
             return Err(Refused::new(message, Rejection::QueueFull));
         };
         let (expiry, confirmed, bytes) = (message.header.expiry(), message.receipt.is_some(), message.size());

@@ -26,6 +26,7 @@ mod anew;
 mod audits;
 mod floods;
 mod holding;
+mod many_held;
 mod outcomes;
 mod requests;
 mod room;

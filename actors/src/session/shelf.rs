@@ -158,6 +158,14 @@ impl<K: Copy + Ord, M: Waits> Shelf<K, M> {
         self.bytes
     }
 
+    /// How much more waits than the bounds of all lines say; `None` if it is not more.
+    fn beyond(&self) -> Option<Window> {
+        let Self { limits, messages, bytes, .. } = self;
+        let messages = messages.saturating_sub(limits.messages);
+        let bytes = bytes.saturating_sub(limits.bytes);
+        (messages > 0 || bytes > 0).then_some(Window { messages, bytes })
+    }
+
     /// Puts a message of `bytes` behind all others of its line. spec: CREDIT-1
     ///
     /// # Errors
@@ -349,6 +357,11 @@ impl<K: Copy + Ord, M: Waits> Held<K, M> {
         self.change = None;
     }
 
+    /// How much more waits than the bounds of all lines say, as it was [put beyond](Self::put_beyond) them; `None` if it is not more.
+    pub(crate) fn beyond(&self) -> Option<Window> {
+        self.shelf.beyond()
+    }
+
     /// The peer has said who is held. spec: CREDIT-2
     pub(crate) fn heard(&mut self, change: u64, keys: impl IntoIterator<Item = K>) -> Turn<M> {
         if self.change.is_some_and(|heard| change <= heard) {
@@ -373,7 +386,8 @@ impl<K: Copy + Ord, M: Waits> Held<K, M> {
         self.shelf.put(key, message, bytes)
     }
 
-    /// As [`put`](Self::put), whatever the bounds: it was taken before its destination was held.
+    /// As [`put`](Self::put), whatever the bounds: it was taken before its destination was held. Who takes messages takes fewer while there is
+    /// more than [they say](Self::beyond).
     pub(crate) fn put_beyond(&mut self, key: K, message: M, bytes: usize) {
         self.shelf.append(key, message, bytes);
     }
