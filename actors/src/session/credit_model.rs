@@ -10,6 +10,10 @@ use super::{Ack, Arrival, Heard, Held, Receiving, Sending, Shelf, ShelfLimits, T
 const WINDOW: Window = Window { messages: 2, bytes: 1_000 };
 const LIMITS: ShelfLimits =
     ShelfLimits { lines: 2, line_messages: 9, line_bytes: 1_000, messages: 9, bytes: 1_000 };
+/// So few that a window finds no room: what the receiver says of it is all that keeps the sender from being refused. In messages, and in bytes,
+/// of which each message has one.
+const FEW_MESSAGES: ShelfLimits = ShelfLimits { messages: 2, ..LIMITS };
+const FEW_BYTES: ShelfLimits = ShelfLimits { bytes: 2, ..LIMITS };
 /// The application that takes when it likes, one message at a time.
 const SLOW: u64 = 1;
 /// The one that takes at once.
@@ -88,10 +92,15 @@ enum Planted {
     AllWait,
     /// What waits for one when it becomes held stays where it is.
     NotMoved,
+    /// It is not said how many messages may come.
+    MessagesUnsaid,
+    /// Nor how many bytes of them.
+    BytesUnsaid,
 }
 
 struct Pair {
     planted: Planted,
+    limits: ShelfLimits,
     slow: u8,
     quick: u8,
     cuts: u8,
@@ -99,9 +108,24 @@ struct Pair {
 
 impl Pair {
     fn say(&self, receiver: &mut Receiver) -> Ack {
-        let ack = receiver.receiving.ack(1, None);
+        let ack = receiver.receiving.ack(1, Some(self.room(receiver)));
         let (held, change) = (receiver.shelf.held(), receiver.shelf.change());
         if self.planted == Planted::Unsaid { ack } else { Ack { change, held, ..ack } }
+    }
+
+    fn room(&self, receiver: &Receiver) -> Window {
+        let room = receiver.shelf.room(WINDOW, 1);
+        match self.planted {
+            Planted::MessagesUnsaid => Window { messages: WINDOW.messages, ..room },
+            Planted::BytesUnsaid => Window { bytes: WINDOW.bytes, ..room },
+            Planted::Nothing
+            | Planted::Unsaid
+            | Planted::NoRelease
+            | Planted::LastWordCounts
+            | Planted::Overtaking
+            | Planted::AllWait
+            | Planted::NotMoved => room,
+        }
     }
 
     fn write(&self, sender: &mut Sender) -> Option<(u16, Value)> {
@@ -213,7 +237,7 @@ impl Model for Pair {
             },
             receiver: Receiver {
                 receiving: Receiving::new(1),
-                shelf: Shelf::new(LIMITS),
+                shelf: Shelf::new(self.limits),
                 link: 0,
                 mailbox: None,
                 handed: BTreeMap::new(),
@@ -331,22 +355,26 @@ fn check(pair: Pair) -> impl Checker<Pair> {
 
 #[test]
 fn every_order_of_a_slow_application_and_a_cut_keeps_every_promise() {
-    let checker = check(Pair { planted: Planted::Nothing, slow: 5, quick: 1, cuts: 1 });
-    println!("{} states", checker.unique_state_count());
-    checker.assert_properties();
+    for limits in [LIMITS, FEW_MESSAGES, FEW_BYTES] {
+        let checker = check(Pair { planted: Planted::Nothing, limits, slow: 5, quick: 1, cuts: 1 });
+        println!("{limits:?}: {} states", checker.unique_state_count());
+        checker.assert_properties();
+    }
 }
 
 #[test]
 fn each_planted_fault_of_the_credit_is_found() {
-    for planted in [
-        Planted::Unsaid,
-        Planted::NoRelease,
-        Planted::LastWordCounts,
-        Planted::Overtaking,
-        Planted::AllWait,
-        Planted::NotMoved,
+    for (planted, limits) in [
+        (Planted::Unsaid, LIMITS),
+        (Planted::NoRelease, LIMITS),
+        (Planted::LastWordCounts, LIMITS),
+        (Planted::Overtaking, LIMITS),
+        (Planted::AllWait, LIMITS),
+        (Planted::NotMoved, LIMITS),
+        (Planted::MessagesUnsaid, FEW_MESSAGES),
+        (Planted::BytesUnsaid, FEW_BYTES),
     ] {
-        let checker = check(Pair { planted, slow: 5, quick: 1, cuts: 0 });
+        let checker = check(Pair { planted, limits, slow: 5, quick: 1, cuts: 0 });
         let is_promise = |name: &&str| !matches!(*name, "somebody is held" | "all arrives after all faults");
         let broken: Vec<_> = checker.discoveries().into_keys().filter(is_promise).collect();
         println!("{planted:?} breaks: {broken:?}");

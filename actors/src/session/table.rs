@@ -20,7 +20,8 @@ impl Waits for char {}
 #[test]
 fn every_state_of_the_session_answers_every_input_as_the_table_says() {
     let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(FILE);
-    let table = [sending(), receiving(), shelf(), held()].concat();
+    let table =
+        [sending(), sending_with_room(), receiving(), receiving_with_room(), shelf(), held()].concat();
     if std::env::var_os(WRITE_VARIABLE).is_some() {
         std::fs::write(&path, &table).expect("the source tree can be written");
     }
@@ -121,6 +122,63 @@ fn sending() -> String {
     )
 }
 
+/// What the peer says of the room that it has, in messages and in bytes. spec: CREDIT-5
+fn sending_with_room() -> String {
+    let with_room = |next, messages, bytes| Ack { room: Some((messages, bytes)), ..ack(MEMORY, EPOCH, next) };
+    let mut of_one_message = Sending::new(EPOCH, WINDOW);
+    of_one_message.heard(&with_room(1, 1, 1_000));
+    let mut of_ten_bytes = Sending::new(EPOCH, WINDOW);
+    of_ten_bytes.heard(&with_room(1, 9, 10));
+    let [mut one_full, mut ten_full, mut ten_begun] =
+        [of_one_message.clone(), of_ten_bytes.clone(), of_ten_bytes.clone()];
+    one_full.keep('a', 10);
+    ten_full.keep('a', 10);
+    ten_begun.keep('a', 9);
+    let mut paused = one_full.clone();
+    paused.link_ended();
+    let states = [
+        ("room for 1 message", of_one_message),
+        ("room for 1 message, 1 kept", one_full),
+        ("room for 10 bytes", of_ten_bytes),
+        ("room for 10 bytes, 9 kept", ten_begun),
+        ("room for 10 bytes, 10 kept", ten_full),
+        ("room for 1 message, 1 kept, paused", paused),
+    ];
+    rows(
+        "Sending, room said: state + input -> kept, room: answer",
+        &states,
+        &[
+            ("Ack, takes 1 next, no room said", |half| format!("{:?}", half.heard(&ack(MEMORY, EPOCH, 1)))),
+            ("Ack, takes 1 next, room for 1 message", |half| heard_with_room(half, 1, (1, 1_000))),
+            ("Ack, takes 1 next, room for 2 messages", |half| heard_with_room(half, 1, (2, 1_000))),
+            ("Ack, takes 1 next, room for 10 bytes", |half| heard_with_room(half, 1, (9, 10))),
+            ("Ack, takes 1 next, room for 11 bytes", |half| heard_with_room(half, 1, (9, 11))),
+            ("Ack, takes 2 next, no room said", |half| format!("{:?}", half.heard(&ack(MEMORY, EPOCH, 2)))),
+            ("Ack, takes 2 next, room for 1 message", |half| heard_with_room(half, 2, (1, 1_000))),
+            ("Ack, takes 2 next, room for 1 byte", |half| heard_with_room(half, 2, (9, 1))),
+            ("Ack of another memory, room for 1 message", |half| {
+                let room = Some((1, 1_000));
+                let heard = half.heard(&Ack { room, ..ack(MEMORY + 1, EPOCH, 1) });
+                half.told(EPOCH + 1);
+                format!("{heard:?}, then told of epoch 8")
+            }),
+            ("void of the oldest", |half| format!("{:?}", half.void(|message| *message == 'a'))),
+            ("take_back", |half| {
+                half.take_back();
+                String::new()
+            }),
+        ],
+        |half| {
+            let kept = half.clone().drain().into_iter().collect::<String>();
+            format!("kept '{kept}', room {}", half.has_room())
+        },
+    )
+}
+
+fn heard_with_room(half: &mut Sending<char>, next: u64, room: (u64, u64)) -> String {
+    format!("{:?}", half.heard(&Ack { room: Some(room), ..ack(MEMORY, EPOCH, next) }))
+}
+
 fn receiving() -> String {
     let fresh = Receiving::new(MEMORY);
     let mut attached = fresh.clone();
@@ -161,6 +219,46 @@ fn receiving() -> String {
             format!("memory {memory}, of {of}, next {next}, owes {}", half.owes_ack())
         },
     )
+}
+
+/// When a sender is told of room, and how soon it is acknowledged that has little. spec: CREDIT-5
+fn receiving_with_room() -> String {
+    let told = |room| {
+        let mut half = Receiving::new(MEMORY);
+        half.attach(5);
+        half.heard(5, 20);
+        half.ack(1, room);
+        half
+    };
+    let window = |messages, bytes| Some(Window { messages, bytes });
+    let states = [
+        ("no room said", told(None)),
+        ("said 1 message, 1 byte", told(window(1, 1))),
+        ("said 4 messages, 100 bytes", told(window(4, 100))),
+        ("said 100 messages, 1 MB", told(window(100, 1_000_000))),
+    ];
+    rows(
+        "Receiving, room said: state + input -> owes an Ack: answer",
+        &states,
+        &[
+            ("room for 1 message, 1 byte", |half| owes_room(half, 1, 1)),
+            ("room for 4 messages, 100 bytes", |half| owes_room(half, 4, 100)),
+            ("room for 7 messages, 199 bytes", |half| owes_room(half, 7, 199)),
+            ("room for 8 messages, 100 bytes", |half| owes_room(half, 8, 100)),
+            ("room for 4 messages, 200 bytes", |half| owes_room(half, 4, 200)),
+            ("message 1 of 10 bytes", |half| format!("{:?}", half.arrive(5, 1, 10))),
+            ("message 1 of 50 bytes", |half| format!("{:?}", half.arrive(5, 1, 50))),
+            ("messages 1 and 2 of 10 bytes", |half| {
+                half.arrive(5, 1, 10);
+                format!("{:?}", half.arrive(5, 2, 10))
+            }),
+        ],
+        |half| half.owes_ack().to_string(),
+    )
+}
+
+fn owes_room(half: &Receiving, messages: usize, bytes: usize) -> String {
+    half.owes_room(Window { messages, bytes }).to_string()
 }
 
 fn shelf() -> String {
