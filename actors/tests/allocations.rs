@@ -56,6 +56,15 @@ impl<const N: usize> Payload for Load<N> {
     const CLASS: Class = Class::Bulk;
 }
 
+/// A payload of `N` bytes in class Stream, which goes by datagram where it fits into one.
+#[derive(Serialize, Deserialize)]
+struct Setpoint<const N: usize>(ByteArray<N>);
+
+impl<const N: usize> Payload for Setpoint<N> {
+    const NAME: &'static str = "test.setpoint";
+    const CLASS: Class = Class::Stream;
+}
+
 /// Made of bytes.
 trait Filled: Payload {
     fn filled() -> Self;
@@ -68,6 +77,12 @@ impl<const N: usize> Filled for Order<N> {
 }
 
 impl<const N: usize> Filled for Load<N> {
+    fn filled() -> Self {
+        Self(ByteArray::new([7; N]))
+    }
+}
+
+impl<const N: usize> Filled for Setpoint<N> {
     fn filled() -> Self {
         Self(ByteArray::new([7; N]))
     }
@@ -265,10 +280,26 @@ fn windows<P: Filled>(how: How) -> Vec<usize> {
     let there = node("there", 2).app(there).start().unwrap();
     let here = node("here", 1).app(here).start().unwrap();
     let mut windows = windows.recv_timeout(DEADLINE).expect("all windows are counted");
+    assert_goes_by_datagram::<P>(&here);
     here.stop();
     there.stop();
     windows.sort_unstable();
     windows
+}
+
+/// Values of class Stream went by datagram, but for those before the way of datagrams was known: else the connection was measured, of which
+/// the session counts what goes.
+fn assert_goes_by_datagram<P: Payload>(here: &Node) {
+    if P::CLASS == Class::Stream {
+        let sessions = here.handle().audit_here().sessions;
+        let by_connection: u64 = sessions
+            .iter()
+            .filter(|session| session.class == Some(P::CLASS))
+            .map(|session| session.sending.next)
+            .sum();
+        let sent = (WARM_UP + WINDOWS) * WINDOW / 2;
+        assert!(by_connection < sent as u64 / 2, "{sessions:?}");
+    }
 }
 
 /// The least that is allocated in a window, at most `bound`. With `--nocapture` the rest is shown, layers' own work in it.
@@ -294,6 +325,13 @@ fn assert_all_at_most(bound: usize, how: How) {
 fn an_unconfirmed_message_between_nodes_costs_no_memory() {
     assert_all_at_most(0, How::ThereAndBack(1));
     assert_all_at_most(0, How::ThereAndBack(16));
+}
+
+#[test]
+fn a_value_by_datagram_costs_no_memory() {
+    // Two values of a flow under way are one: the newer takes the place of the older.
+    assert_at_most::<Setpoint<64>>(0, 64, How::ThereAndBack(1));
+    assert_at_most::<Setpoint<1000>>(0, 1000, How::ThereAndBack(1));
 }
 
 #[test]

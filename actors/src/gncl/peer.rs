@@ -372,6 +372,11 @@ impl Store {
         self.lock().values().cloned().collect()
     }
 
+    /// The same, in a list that its owner uses again.
+    pub(super) fn list_peers(&self, list: &mut Vec<Arc<Peer>>) {
+        list.extend(self.lock().values().cloned());
+    }
+
     /// The accounts of those that are gone, all together.
     pub(crate) fn buried(&self) -> Buried {
         *lock(&self.buried)

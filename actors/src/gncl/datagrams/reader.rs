@@ -53,10 +53,13 @@ impl Alarm {
 pub(in crate::gncl) async fn keep_time(stores: Arc<Stores>) {
     let (store, alarm) = (&stores.gncl, &stores.gncl.alarm);
     take_over(&alarm.earlier);
+    let mut peers = Vec::new();
     loop {
         alarm.set.store(u64::MAX, Ordering::Release);
         let now = Time::now();
-        let due = store.peers().iter().filter_map(|peer| peer.look_at_the_time(now)).min();
+        store.list_peers(&mut peers);
+        // Nobody is kept while this waits.
+        let due = peers.drain(..).filter_map(|peer| peer.look_at_the_time(now)).min();
         match due {
             None => alarm.earlier.notified().await,
             Some(due) => {
