@@ -22,7 +22,7 @@
 //! | be told what became of it (confirm) | [`send_confirmed`](Endpoint::send_confirmed): one [`Outcome`](crate::Outcome) | `sinew_send_message_confirmed` |
 //! | ask, and wait for the reply | [`ask`](Endpoint::ask), [`reply`](Endpoint::reply) | `sinew_ask`, `sinew_reply` |
 //! | wait for room 200 us at most, or not at all | [`send_within`](Endpoint::send_within), [`reply_within`](Endpoint::reply_within) | `sinew_send_message_within` |
-//! | write a payload where it is read, without a copy (loan: CreateMessage, SendMessage) | [`create_message`](Endpoint::create_message), [`LentMessage`], [`send_message`](Endpoint::send_message) | `sinew_create_message`, `sinew_send_message` |
+//! | write a payload where it travels from, so that sending it copies nothing (loan: CreateMessage, SendMessage) | [`create_message`](Endpoint::create_message), [`LentMessage`], [`send_message`](Endpoint::send_message) | `sinew_create_message`, `sinew_send_message` |
 //! | receive, with a deadline (ReceiveMessage) | [`receive`](Endpoint::receive), [`Received`] | `sinew_receive_message`, `sinew_settle_message` |
 //! | speak to many at once (groups) | [`join`](Endpoint::join), [`leave`](Endpoint::leave), [`Tid::group`](crate::Tid::group) | `sinew_join_group`, `sinew_group` |
 //! | take only the newest value of a sensor | [`Class::Stream`](crate::Class), at the type | `SINEW_STREAM` |

@@ -38,8 +38,9 @@ pub(super) const CONNECT: Duration = Duration::from_secs(2);
 /// What carries an endpoint's messages to its node and back.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Transport {
-    /// A ring in shared memory for each direction: one copy and, at most, one wake a message. Where the system or the
-    /// node has none it is the socket, which a line of the log says.
+    /// A ring in shared memory for each direction: at most one wake a message. Whoever reads a message copies it out of the
+    /// ring; one below 8 KiB, or that came with many others, a second time, into memory of its own. Where the system or the
+    /// node has no rings it is the socket, which a line of the log says.
     #[default]
     Ring,
     /// The unix socket alone.
