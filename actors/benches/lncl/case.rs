@@ -12,8 +12,8 @@ use crate::{
 
 /// The environment variable that makes a run short.
 const SHORT: &str = "SINEW_LNCL_SHORT";
-/// The mean of the paper's Table 1, in nanoseconds.
-const PAPER_MEAN_NS: u64 = 46_200;
+/// The mean of the paper's Table 1, in microseconds.
+const PAPER_MEAN_US: f64 = 46.2;
 
 /// How messages travel between the two applications.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -178,8 +178,8 @@ impl Case {
         match self.what {
             What::RoundTrips { bytes, pace } => self.round_trips(bytes, pace, is_short),
             What::Loan { bytes } => self.loan(bytes, is_short),
-            What::TableOne => self.table_one("echo"),
-            What::TableOneCpp => self.table_one("cpp_echo"),
+            What::TableOne => self.table_one("table_1", "echo"),
+            What::TableOneCpp => self.table_one("table_1_cpp", "cpp_echo"),
             What::FanIn => self.fan_in(if is_short { 150 } else { 1_500 }),
             What::Flood => self.flood(if is_short { 20_480 } else { 204_800 }),
         }
@@ -232,10 +232,32 @@ impl Case {
         .report();
     }
 
-    fn table_one(self, echo: &str) {
-        let crowds::Ages { figures, mean_ns, first_ns } = ends::table_one(self.way, self.pinning, echo);
-        let counts = [("mean_ns", mean_ns), ("first_ns", first_ns), ("paper_mean_ns", PAPER_MEAN_NS)];
-        self.report("one way", &figures, &counts);
+    fn table_one(self, table: &str, echo: &str) {
+        let raws: Vec<_> = (self.way.references().iter())
+            .map(|reference| (reference.name(), raw::table_one(*reference, self.pinning)))
+            .collect();
+        let seen = ends::table_one(self.way, self.pinning, echo);
+        for (reference, raw) in &raws {
+            Beside {
+                bench: "lncl",
+                case: &format!("{}_{table}", self.way.name()),
+                payload_bytes: crowds::PACKET,
+                pinning: self.pinning.name(),
+                pace: Pace::BackToBack.name(),
+                seen: &seen.figures,
+                reference,
+                raw: &raw.figures,
+                counts: &[
+                    ("mean_us", seen.mean_us()),
+                    ("first_us", seen.first_us()),
+                    ("reference_mean_us", raw.mean_us()),
+                    ("reference_first_us", raw.first_us()),
+                    ("ratio_mean", seen.mean_us() / raw.mean_us()),
+                    ("paper_mean_us", PAPER_MEAN_US),
+                ],
+            }
+            .report();
+        }
     }
 
     fn fan_in(self, packets: u64) {
@@ -310,9 +332,11 @@ pub(crate) fn play(role: &str) -> ExitCode {
         }
         ["raw_echo", reference, bytes, pinning] => {
             raw::pin(pinning, End::Echoing);
-            let found = Reference::ALL.into_iter().find(|known| known.name() == reference);
-            let reference = found.expect("a name that this program wrote itself");
-            raw::echo(reference, number(bytes) as usize);
+            raw::echo(reference_named(reference), number(bytes) as usize);
+        }
+        ["raw_aged_echo", reference, pinning] => {
+            raw::pin(pinning, End::Echoing);
+            raw::aged_echo(reference_named(reference));
         }
         ["raw_sink", pinning] => {
             raw::pin(pinning, End::Echoing);
@@ -336,6 +360,11 @@ fn number(word: &str) -> u64 {
 
 fn way_named(name: &str) -> Way {
     Way::ALL.into_iter().find(|way| way.name() == name).expect("a name that this program wrote itself")
+}
+
+fn reference_named(name: &str) -> Reference {
+    let found = Reference::ALL.into_iter().find(|reference| reference.name() == name);
+    found.expect("a name that this program wrote itself")
 }
 
 /// The words by which another process plays this way's part.

@@ -32,8 +32,8 @@ const BEGIN: Kind = Kind::named("lncl.begin");
 /// How old packets were when they were received.
 pub(crate) struct Ages {
     pub(crate) figures: Figures,
-    pub(crate) mean_ns: u64,
-    pub(crate) first_ns: u64,
+    mean_ns: u64,
+    first_ns: u64,
 }
 
 impl Ages {
@@ -43,6 +43,14 @@ impl Ages {
         ages.iter().for_each(|age| figures.record(Duration::from_nanos(*age)));
         let mean_ns = ages.iter().sum::<u64>() / ages.len().max(1) as u64;
         Self { figures, mean_ns, first_ns: ages.first().copied().unwrap_or_default() }
+    }
+
+    pub(crate) fn mean_us(&self) -> f64 {
+        self.mean_ns as f64 / 1_000.0
+    }
+
+    pub(crate) fn first_us(&self) -> f64 {
+        self.first_ns as f64 / 1_000.0
     }
 }
 

@@ -27,7 +27,7 @@ pub(crate) const BLOCK: Kind = Kind::named("lncl.block");
 /// What is sent back with its age in its first bytes.
 const AGED: Kind = Kind::named("lncl.aged");
 /// Packets of the paper's Table 1.
-const TABLE_ONE: usize = 1024;
+pub(crate) const TABLE_ONE: usize = 1024;
 
 /// The node of a case, in a process of its own.
 pub(crate) struct Home {

@@ -3,7 +3,7 @@
 use std::{
     io::{Read, Write},
     os::unix::net::UnixStream,
-    time::Instant,
+    time::{Duration, Instant},
 };
 
 use rustix::{
@@ -20,7 +20,8 @@ use sinew_shm::bare::{self, Waiting};
 
 use crate::{
     case::Reference,
-    crowds::{ANSWERED_EACH, PACKET, SENDERS, WINDOW, paced},
+    crowds::{ANSWERED_EACH, Ages, PACKET, SENDERS, WINDOW, paced},
+    ends::TABLE_ONE,
 };
 
 /// Round trips of a reference.
@@ -59,6 +60,87 @@ pub(crate) fn echo(reference: Reference, bytes: usize) {
         }
         Reference::UnixStream => stream::echo(bytes),
     }
+}
+
+/// The paper's test by a reference: how old each of the first 1024 packets is when it is received.
+pub(crate) fn table_one(reference: Reference, pinning: Pinning) -> Ages {
+    let role = format!("raw_aged_echo {} {}", reference.name(), pinning.name());
+    match reference {
+        Reference::BareFutex | Reference::BarePoll => {
+            let memory = bare::memory(PACKET);
+            let mut end = bare::End::first(&memory, PACKET, waiting(reference));
+            let _echo = Process::start_on(&role, memory);
+            ages(|packet| {
+                end.send(packet);
+                end.receive(packet);
+            })
+        }
+        Reference::UnixStream => {
+            let (mut socket, theirs) = UnixStream::pair().expect("a pair of sockets");
+            let _echo = Process::start_on(&role, theirs.into());
+            ages(|packet| {
+                socket.write_all(packet).expect("the echo reads");
+                socket.read_exact(packet).expect("the echo answers");
+            })
+        }
+    }
+}
+
+/// What the other end says of the ages of packets that are sent to it one after the other.
+fn ages(mut round_trip: impl FnMut(&mut [u8])) -> Ages {
+    let mut packet = [7; PACKET];
+    let ages = (0..TABLE_ONE).map(|_| {
+        stamp(&mut packet);
+        round_trip(&mut packet);
+        word(&packet)
+    });
+    Ages::of(&ages.collect::<Vec<_>>())
+}
+
+/// The end that says how old what it receives is: until the measuring end ends this process.
+pub(crate) fn aged_echo(reference: Reference) {
+    let mut packet = [0; PACKET];
+    match reference {
+        Reference::BareFutex | Reference::BarePoll => {
+            let mut end = bare::End::second(stdin(), PACKET, waiting(reference));
+            say_there();
+            loop {
+                end.receive(&mut packet);
+                put_age(&mut packet);
+                end.send(&packet);
+            }
+        }
+        Reference::UnixStream => {
+            let mut socket = input();
+            say_there();
+            while socket.read_exact(&mut packet).is_ok() {
+                put_age(&mut packet);
+                if socket.write_all(&packet).is_err() {
+                    return;
+                }
+            }
+        }
+    }
+}
+
+/// Puts the time into a packet's first eight bytes.
+fn stamp(packet: &mut [u8]) {
+    packet[..8].copy_from_slice(&Time::now().as_nanos().to_le_bytes());
+}
+
+/// Its age in the place of that time, in nanoseconds.
+fn put_age(packet: &mut [u8]) {
+    let age = age(packet).as_nanos() as u64;
+    packet[..8].copy_from_slice(&age.to_le_bytes());
+}
+
+/// How old a packet is that was stamped.
+fn age(packet: &[u8]) -> Duration {
+    Time::now().since(Time::from_nanos(word(packet)))
+}
+
+fn word(packet: &[u8]) -> u64 {
+    packet.first_chunk().map_or(0, |bytes| u64::from_le_bytes(*bytes))
 }
 
 const fn waiting(reference: Reference) -> Waiting {
@@ -135,8 +217,7 @@ fn read_packet(socket: &mut UnixStream, figures: &mut Figures) -> bool {
     let mut packet = [0; PACKET];
     let is_there = socket.read_exact(&mut packet).is_ok();
     if is_there {
-        let sent = packet.first_chunk().map_or(0, |bytes| u64::from_le_bytes(*bytes));
-        figures.record(Time::now().since(Time::from_nanos(sent)));
+        figures.record(age(&packet));
     }
     is_there
 }
@@ -147,7 +228,7 @@ pub(crate) fn send(packets: u64) {
     say_there();
     socket.read_exact(&mut [0; 2]).expect("the word to begin");
     paced(packets, || {
-        packet[..8].copy_from_slice(&Time::now().as_nanos().to_le_bytes());
+        stamp(&mut packet);
         socket.write_all(&packet).expect("the sink reads");
     });
 }
