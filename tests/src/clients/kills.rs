@@ -4,6 +4,8 @@
 //! Times in which nobody ends, in which processes end in order, and in which they are killed follow each other in short segments of one
 //! length, each first as often as the others: what the machine does besides is in all of them alike.
 
+mod felt;
+
 use std::{
     collections::BTreeSet,
     fmt,
@@ -25,6 +27,8 @@ use super::{
     steady::{ECHO, PARTS, SINK, Window},
 };
 use crate::{DEADLINE, dice::Dice, until};
+
+pub use felt::{Felt, Verdict};
 
 /// Processes that are killed.
 const VICTIMS: u16 = 4;
@@ -77,7 +81,7 @@ pub struct Report {
 }
 
 impl Report {
-    /// Everything was given back, nothing was left, and everybody was served.
+    /// Everything was given back, nothing was left, and everybody was served. How fast is not asked: that is [`felt`](Self::felt).
     #[must_use]
     pub fn holds(&self) -> bool {
         let is_back = |(_, before, after): &(&str, Held, Held)| {
@@ -89,12 +93,17 @@ impl Report {
             && self.held.iter().all(is_back)
             && self.windows.iter().all(|window| window.failed == 0)
     }
+
+    /// Whether others felt the kills.
+    #[must_use]
+    pub fn felt(&self) -> Felt {
+        Felt::new(&self.windows, &self.halves)
+    }
 }
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { kills, seconds, held_loans, ended_by_themselves, held, windows, halves, left, spacing } =
-            self;
+        let Self { kills, seconds, held_loans, ended_by_themselves, held, windows, left, spacing, .. } = self;
         writeln!(
             f,
             "{kills} kills, one in {spacing:?}, in {seconds:.1} s; {held_loans} of them while every address held loans"
@@ -106,16 +115,7 @@ impl fmt::Display for Report {
         for (what, window) in ["nobody ends", "they end in order", "they are killed"].iter().zip(windows) {
             writeln!(f, "{what:<18} {window}")?;
         }
-        let ratio = |index: usize| windows[2].p99_us as f64 / windows[index].p99_us.max(1) as f64;
-        writeln!(
-            f,
-            "p99 with kills: {:.2} of that while nobody ends, {:.2} of that with orderly ends; while nobody ends, in every \
-             other segment: {} and {} us",
-            ratio(0),
-            ratio(1),
-            halves[0].p99_us,
-            halves[1].p99_us
-        )?;
+        writeln!(f, "{}", self.felt())?;
         write!(
             f,
             "expected: descriptors and mappings back to the start, at most {GROWTH_MAX_KIB} KiB more, no file left, no \
