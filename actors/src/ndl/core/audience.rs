@@ -66,7 +66,7 @@ struct Queue {
 }
 
 impl Queue {
-    /// Keeps `event`, unless there are `most` already.
+    /// Keeps `event`; of more than `most` one is left out.
     fn push(&mut self, event: NodeEvent, most: usize) -> Result<(), ()> {
         if self.events.is_empty() {
             // It took all that it was offered.
@@ -75,20 +75,28 @@ impl Queue {
         }
         let (number, subject) = (self.numbered, subject(&event));
         self.numbered += 1;
-        if !self.is_behind {
-            if self.events.len() >= most {
-                return Err(());
-            }
+        if self.is_behind {
+            self.replace(number, event);
+        } else {
             self.events.insert(number, event);
+        }
+        if self.events.len() <= most {
             return Ok(());
         }
-        self.replace(number, event);
-        if self.events.len() > most {
-            self.events.remove(&number);
-            self.latest.remove(&subject);
-            return Err(());
-        }
-        Ok(())
+        let is_of_node = subject.1.is_none();
+        self.leave_out(if is_of_node { self.newest_of_a_part().unwrap_or(number) } else { number });
+        Err(())
+    }
+
+    /// That a node is there, or is not, goes before what is said of parts of others.
+    fn newest_of_a_part(&self) -> Option<u64> {
+        let mut parts = self.events.iter().filter(|(_, event)| subject(event).1.is_some());
+        parts.next_back().map(|(number, _)| *number)
+    }
+
+    fn leave_out(&mut self, number: u64) {
+        self.events.remove(&number);
+        self.latest.retain(|_, latest| *latest != number);
     }
 
     /// Puts `event` in the place of what it makes out of date: one about a node that of its parts, too.
@@ -331,6 +339,25 @@ mod tests {
         audience.not_taken(at(0), APP);
         audience.offer_again(at(10));
         assert_eq!(takes_all(&mut audience), [found(1), lost(2)]);
+    }
+
+    #[test]
+    fn that_a_node_is_lost_is_kept_however_much_is_said_of_parts_of_others() {
+        for is_behind in [false, true] {
+            // given
+            let mut audience = Audience::new(1);
+            audience.add(APP);
+            if is_behind {
+                audience = behind(lost(3));
+            }
+            (0..100).for_each(|app| audience.tell_all(&stalled(2, app)));
+            // when
+            audience.tell_all(&lost(1));
+            // then
+            audience.offer_again(at(10));
+            let told = takes_all(&mut audience);
+            assert_eq!((told.len(), told.last()), (PER_NODE_MAX + MORE_MAX, Some(&lost(1))));
+        }
     }
 
     #[test]
