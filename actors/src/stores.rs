@@ -81,7 +81,7 @@ pub(crate) struct Stores {
 }
 
 /// Events that wait for a layer at most. A layer that falls this far behind has a fault of its own.
-const POST_CAPACITY: usize = 8_192;
+pub(crate) const POST_CAPACITY: usize = 8_192;
 
 impl Stores {
     /// The stores of a node that has not started yet.

@@ -74,6 +74,14 @@ impl<E> Post<E> {
     /// # Errors
     /// The event itself, if the post is full (it is counted), if it is closed, or if the actor that posts it was replaced.
     pub fn post(&self, event: E) -> Result<(), E> {
+        self.post_below(usize::MAX, event)
+    }
+
+    /// Posts an event if fewer than `most` wait: what its sender hears the refusal of leaves room for what must not be lost.
+    ///
+    /// # Errors
+    /// As of [`Self::post`].
+    pub fn post_below(&self, most: usize, event: E) -> Result<(), E> {
         if Vitals::is_present_over() {
             // A layer that was replaced has nothing more to say.
             return Err(event);
@@ -83,7 +91,7 @@ impl<E> Post<E> {
             if shared.is_closed {
                 return Err(event);
             }
-            if shared.queue.len() >= shared.capacity {
+            if shared.queue.len() >= shared.capacity.min(most) {
                 shared.refused += 1;
                 return Err(event);
             }

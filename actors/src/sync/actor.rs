@@ -21,7 +21,7 @@ use super::{
     facts::DirectoryEvent,
     words::{ArriveAtBarrier, BarrierAnswer, LeaveBarrier},
 };
-use crate::{audit, lncl::AppFact, monitors, node::RootEvent, refusals::Refusals, stores::Stores, wills};
+use crate::{audit, lncl::AppFact, monitors, node::RootEvent, refusals::Refusals, stores::{POST_CAPACITY, Stores}, wills};
 
 /// The sync manager of a node: a new one after each fault, on the same core.
 pub(crate) struct SyncManager {
@@ -385,12 +385,16 @@ impl SyncManager {
     }
 }
 
+/// So many events wait where another message is refused: whoever sends more than is read must not keep out what layers have to say, which is
+/// told once.
+const MESSAGES_MAX: usize = POST_CAPACITY / 2;
+
 /// Puts messages for the sync manager's TID into its post.
 struct PostOutlet(Post<Event>);
 
 impl Outlet for PostOutlet {
     fn submit(&self, message: Message) -> Result<(), Refused> {
-        match self.0.post(Event::Message(message)) {
+        match self.0.post_below(MESSAGES_MAX, Event::Message(message)) {
             Err(Event::Message(message)) => Err(Refused::new(message, Rejection::QueueFull)),
             // A full post hands back what it was given: a message.
             Ok(()) | Err(Event::App(_) | Event::Membership(_) | Event::Link(_) | Event::Monitors) => Ok(()),

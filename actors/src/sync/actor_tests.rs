@@ -208,6 +208,18 @@ fn an_answer_about_a_barrier_that_a_full_mailbox_did_not_take_comes_when_there_i
 }
 
 #[test]
+fn more_messages_than_it_reads_do_not_keep_out_what_layers_tell_it() {
+    run(async {
+        let bench = Bench::new().await;
+        let message = || directory(Tid::new(KNEE, AppAddress::SYNC), Bytes::new());
+        // when: it comes to none of them, as this has its thread
+        while bench.stores.router.deliver(message()).is_ok() {}
+        // then
+        bench.tells(Event::Link(LinkFact::LinkUp { node: KNEE, incarnation: LIFE }));
+    });
+}
+
+#[test]
 fn a_restarted_sync_manager_goes_on_where_the_former_one_ended() {
     run(async {
         let mut bench = Bench::new().await;
