@@ -59,6 +59,8 @@ pub(crate) struct Stores {
     pub(crate) aftermath: Aftermath,
     /// Which nodes are there; a restarted NDL goes on with them.
     pub(crate) ndl: Mutex<ndl::Core>,
+    /// What other layers have not been told of that, because their posts were full.
+    pub(crate) untold: ndl::Untold,
     /// Where other processes come in.
     pub(crate) door: lncl::Door,
     /// Who is registered on this node.
@@ -111,6 +113,7 @@ impl Stores {
             ndl_file: Mutex::default(),
             aftermath: Aftermath::default(),
             ndl: Mutex::new(ndl::new_core(&config, node, incarnation)),
+            untold: ndl::Untold::new(config.ndl.nodes_max),
             door: lncl::Door::default(),
             registry: Mutex::new(lncl::Registry::counting_links_from(RandomState::new().hash_one(()))),
             directory_changes: watch::Sender::default(),

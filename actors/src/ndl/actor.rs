@@ -107,6 +107,7 @@ impl Actor for NdlActor {
         ctx.spawn(watch_progress(shell.clone()).into_actor(self));
         ctx.spawn(aftermath::carry_on(self.stores.clone()).into_actor(self));
         ctx.spawn(keep_time(shell.clone()).into_actor(self));
+        ctx.spawn(telling::tell_again(shell.clone()).into_actor(self));
         self.shell = Some(shell);
         if let Some(ready) = self.ready.take() {
             ready.reached();
@@ -154,6 +155,8 @@ struct Shell {
     paths: Paths,
     /// The core's next wake is not the one that the timer sleeps for.
     rewind: Notify,
+    /// A layer had no room for what it was to be told.
+    untold: Notify,
     refusals: Arc<Refusals>,
     /// Hosts to be tried; one too many is not.
     to_probe: mpsc::Sender<Probe>,
@@ -187,10 +190,10 @@ impl Shell {
             core.use_seeds(Time::now(), seeds(&stores, None));
             core.start(Time::now(), &paths.here())
         };
-        let (rewind, refusals) = (Notify::new(), stores.refusals.clone());
+        let (rewind, untold, refusals) = (Notify::new(), Notify::new(), stores.refusals.clone());
         let (to_probe, probes) = mpsc::channel(PROBES_MAX);
         let probes = RefCell::new(Some(probes));
-        Ok((Self { stores, epoch, paths, rewind, refusals, to_probe, probes }, readers))
+        Ok((Self { stores, epoch, paths, rewind, untold, refusals, to_probe, probes }, readers))
     }
 
     /// Gives the core an input and does what it says; `false` when a later instance has taken over.
@@ -214,8 +217,7 @@ impl Shell {
     fn carry_out(&self) {
         loop {
             // The lock is not held while an order is carried out.
-            let next = lock(&self.stores).poll();
-            let Some(output) = next else { return };
+            let Some(output) = self.next_order() else { return };
             self.obey(output);
         }
     }
@@ -246,14 +248,14 @@ impl Shell {
                 // Where too many are silent at once it is not their hosts that are to be doubted.
                 let _ = self.to_probe.try_send(Probe { node, incarnation, to, within });
             }
-            Output::Fact(fact) => self.tell_layers(fact),
-            Output::Moved { node, incarnation, gncl } => {
+            Output::Fact(fact) => self.tell_layers(&fact),
+            Output::Moved { node, gncl, .. } => {
                 crate::log::info!(%node, ?gncl, "the node listens there now");
-                self.tell_gncl(gncl::Event::Moved { node, incarnation, gncl });
+                self.tell();
             }
             Output::Forgotten { node, incarnation } => {
                 crate::log::warn!(%node, life = %incarnation, "the node is there in an earlier life than this one: its clock went back");
-                self.tell_gncl(gncl::Event::Forgotten { node, incarnation });
+                self.tell();
             }
             Output::Event { to, event } => self.tell_application(to, &event),
             Output::ClockMeasured { node, offset } => self.stores.clocks.set(node, offset),

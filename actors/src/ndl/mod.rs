@@ -61,6 +61,7 @@ mod progress;
 mod socket;
 #[cfg(test)]
 mod tests;
+mod untold;
 
 pub(crate) use actor::{NdlActor, new_core};
 pub(crate) use address::is_same_host;
@@ -72,6 +73,7 @@ pub(crate) use facts::MembershipFact;
 pub use facts::{LossReason, NodeEvent, Trouble};
 pub(crate) use progress::{IdleClient, Part, Progress, Told, look_period};
 pub(crate) use socket::Sockets;
+pub(crate) use untold::Untold;
 
 use crate::{gncl::LinkFact, lncl::AppFact};
 

@@ -30,6 +30,7 @@ use crate::{
     gncl::{self, LinkFact},
     lncl,
     stores::Stores,
+    sync,
 };
 
 const LOOPBACK: Ipv4Addr = Ipv4Addr::LOCALHOST;
@@ -304,6 +305,53 @@ fn an_event_that_finds_a_full_mailbox_is_told_when_there_is_room() {
             let event: NodeEvent = first.event().await.decode().unwrap();
             assert!(matches!(event, NodeEvent::NodeFound { node: found, .. } if found == node), "{event:?}");
         }
+    });
+}
+
+#[test]
+fn layers_whose_posts_are_full_learn_who_came_and_went_when_they_have_room() {
+    run(async {
+        // given
+        let mut first = Node::start(1, |ndl| ndl.period = Duration::from_millis(50)).await;
+        let posts = &first.stores.posts;
+        while posts.gncl.post(gncl::Event::DenyListChanged).is_ok() {}
+        while posts.sync.post(sync::Event::Monitors).is_ok() {}
+        let mut told = posts.sync.attach();
+        let seed = first.udp();
+        let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed.into()]).await;
+        let mut third = Node::start(3, |ndl| ndl.seeds = vec![seed.into()]).await;
+        drop([first.event().await, first.event().await]);
+        second.end_layer();
+        let lost: NodeEvent = first.event().await.decode().unwrap();
+        assert!(matches!(lost, NodeEvent::NodeLost { .. }), "{lost:?}");
+        assert!(first.stores.refusals.of("a layer's post is full") > 0);
+        // when: both layers read on
+        let (mut to_gncl, mut to_sync) = (Vec::new(), Vec::new());
+        within("both layers to be told of both nodes", async {
+            while to_gncl.len() < 2 || to_sync.len() < 2 {
+                tokio::select! {
+                    Some(event) = first.facts.next(), if to_gncl.len() < 2 => {
+                        if let gncl::Event::Membership(fact) = event { to_gncl.push(fact) }
+                    }
+                    Some(event) = told.next(), if to_sync.len() < 2 => {
+                        if let sync::Event::Membership(fact) = event { to_sync.push(fact) }
+                    }
+                }
+            }
+        })
+        .await;
+        // then: the second came and went
+        let has_lost = |facts: &[MembershipFact]| {
+            let lost = |fact: &MembershipFact| matches!(fact, MembershipFact::NodeLost { node, .. } if *node == second.stores.node);
+            facts.iter().any(lost)
+        };
+        let has_found = |facts: &[MembershipFact]| {
+            let found = |fact: &MembershipFact| matches!(fact, MembershipFact::NodeFound { node, .. } if *node == third.stores.node);
+            facts.iter().any(found)
+        };
+        assert!(has_lost(&to_gncl) && has_lost(&to_sync), "{to_gncl:?} {to_sync:?}");
+        assert!(has_found(&to_gncl) && has_found(&to_sync), "{to_gncl:?} {to_sync:?}");
+        third.end_layer();
     });
 }
 

@@ -1,5 +1,7 @@
 //! What the core has to say to layers and applications.
 
+use std::{rc::Rc, time::Duration};
+
 use sinew_runtime::{
     mailbox::About,
     outcome::Rejection,
@@ -10,15 +12,27 @@ use sinew_runtime::{
 
 use super::{Shell, lock};
 use crate::{
-    aftermath, gncl,
-    ndl::{LossReason, MembershipFact, NodeEvent, core::Input},
-    sync,
+    aftermath,
+    ndl::{
+        LossReason, MembershipFact, NodeEvent,
+        core::{Input, Output},
+    },
 };
 
+/// Time until a layer whose post was full is offered again what it had no room for.
+const RETRY: Duration = Duration::from_millis(10);
+
 impl Shell {
+    /// What the core orders next.
+    pub(super) fn next_order(&self) -> Option<Output> {
+        let mut core = lock(&self.stores);
+        // With the lock in hand: where a later instance takes over here, it tells this before what it has to say itself.
+        core.poll().inspect(|order| self.stores.untold.note(order))
+    }
+
     /// A life that is over is fenced before anybody hears of that: who does gets no message of it afterwards.
-    pub(super) fn tell_layers(&self, fact: MembershipFact) {
-        if let MembershipFact::NodeLost { node, incarnation, why } = fact {
+    pub(super) fn tell_layers(&self, fact: &MembershipFact) {
+        if let MembershipFact::NodeLost { node, incarnation, why } = *fact {
             self.stores.clocks.forget(node);
             match why {
                 LossReason::Left => self.stores.gncl.leaves(Time::now(), node, incarnation),
@@ -30,17 +44,16 @@ impl Shell {
             }
         }
         crate::log::info!(?fact, "membership");
-        let posts = &self.stores.posts;
-        self.tell_gncl(gncl::Event::Membership(fact.clone()));
-        if let Err(event) = posts.sync.post(sync::Event::Membership(fact)) {
-            crate::log::error!(?event, "the sync manager's post is full: it does not learn this");
-        }
+        self.tell();
     }
 
-    pub(super) fn tell_gncl(&self, event: gncl::Event) {
-        if let Err(event) = self.stores.posts.gncl.post(event) {
-            crate::log::error!(?event, "GNCL's post is full: it does not learn this");
-        }
+    /// Tells other layers what they have not been told yet. Returns whether they have room for all of it.
+    pub(super) fn tell(&self) -> bool {
+        let Some(layer) = self.stores.untold.offer(&self.stores.posts) else { return true };
+        let what = format_args!("{layer} does not read its events: it is told later who is there");
+        self.refusals.count(Time::now(), "a layer's post is full", &what);
+        self.untold.notify_one();
+        false
     }
 
     pub(super) fn tell_application(&self, app: AppAddress, event: &NodeEvent) {
@@ -56,6 +69,17 @@ impl Shell {
             lock(&self.stores).handle(now, Input::EventNotTaken { app });
             self.rewind.notify_one();
         }
+    }
+}
+
+/// Offers other layers again what they had no room for, for as long as there is something.
+pub(super) async fn tell_again(shell: Rc<Shell>) {
+    loop {
+        // A former instance may have left something, too.
+        if shell.tell() {
+            shell.untold.notified().await;
+        }
+        tokio::time::sleep(RETRY).await;
     }
 }
 
