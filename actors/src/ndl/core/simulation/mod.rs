@@ -35,7 +35,7 @@ use crate::seeded::{Seed, number};
 /// Seeds in an ordinary run.
 const SEEDS: u64 = 300;
 /// How many instead; `docs/TESTING.md` has the command.
-const SEEDS_VARIABLE: &str = "SINEW_NDL_SEEDS";
+pub(super) const SEEDS_VARIABLE: &str = "SINEW_NDL_SEEDS";
 /// The most nodes that are looked at: what they cost at 10, 100 and so on, how they get over faults if there are more than 100.
 const CROWD_VARIABLE: &str = "SINEW_NDL_CROWD";
 /// The one crowd that is to be replayed.
