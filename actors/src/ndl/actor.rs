@@ -3,6 +3,7 @@
 mod memory;
 mod paths;
 mod receiving;
+mod speaking;
 mod telling;
 
 use std::{
@@ -14,12 +15,10 @@ use std::{
     rc::Rc,
     sync::{Arc, MutexGuard, PoisonError, atomic::Ordering},
     task::Poll,
-    time::Duration,
 };
 
 use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, WrapFuture};
-use futures_util::{StreamExt as _, future::join, stream::FuturesUnordered};
-use mdns_sd::{DaemonEvent, ServiceEvent};
+use futures_util::{StreamExt as _, stream::FuturesUnordered};
 use sinew_runtime::{
     alarm::Alarm,
     supervision::ReadyGate,
@@ -32,11 +31,10 @@ use self::paths::{Paths, Reader};
 use super::{
     Event,
     address::LocalAddress,
-    core::{Core, Epoch, Input, Output, Place, Source},
+    core::{Core, Epoch, Input, Output, Place},
     datagram::{Answer, Body, Datagram, encode},
     interfaces::{self, Usable},
     look_period,
-    mdns::{Mdns, MdnsError},
     probe::{PROBES_MAX, Probe},
 };
 use crate::{
@@ -46,9 +44,6 @@ use crate::{
     refusals::Refusals,
     stores::{self, Stores},
 };
-
-/// Time between two attempts to listen to mDNS again.
-const MDNS_REST: Duration = Duration::from_secs(1);
 
 /// The core of a node that has just been started: it knows nobody. For the node's stores.
 pub(crate) fn new_core(config: &NodeConfig, node: NodeAddress, incarnation: Incarnation) -> Core {
@@ -91,7 +86,7 @@ impl Actor for NdlActor {
         if chosen.are_ipv4_addresses() && chosen.iter().count() == 1 {
             // Nothing comes and goes.
             if let Some(here) = shell.paths.here().first() {
-                ctx.spawn(speak_mdns(shell.clone(), *here).into_actor(self));
+                ctx.spawn(speaking::speak_mdns(shell.clone(), *here).into_actor(self));
             }
         } else {
             let news = (!chosen.are_ipv4_addresses()).then(|| interfaces::watch(chosen.clone()));
@@ -426,62 +421,6 @@ async fn reached(alarm: &mut Alarm, at: Time) {
         Poll::Pending
     })
     .await;
-}
-
-/// Publishes the node there and looks for others, if the configuration says so.
-async fn speak_mdns(shell: Rc<Shell>, here: SocketAddr) {
-    let Some(port) = shell.stores.config.ndl.mdns_port else { return };
-    match Mdns::start(port, here, shell.me()).await {
-        Ok(mdns) => {
-            join(watch_mdns(&mdns), browse(&shell, &mdns)).await;
-        }
-        Err(error) => warn_of_mdns(port, &error),
-    }
-}
-
-async fn browse(shell: &Shell, mdns: &Mdns) {
-    loop {
-        match mdns.browse() {
-            Ok(events) => {
-                while let Ok(event) = events.recv_async().await {
-                    if !resolved(shell, mdns, &event) {
-                        return;
-                    }
-                }
-                // mdns-sd drops a listener that is a thousand events behind.
-                crate::log::warn!("NDL missed events of mDNS; listening again");
-            }
-            Err(error) => crate::log::warn!("NDL cannot look for nodes through mDNS: {error}; trying again"),
-        }
-        tokio::time::sleep(MDNS_REST).await;
-    }
-}
-
-fn resolved(shell: &Shell, mdns: &Mdns, event: &ServiceEvent) -> bool {
-    // Its other events say what mdns-sd is doing, or that a record is gone: liveness is not its business.
-    let ServiceEvent::ServiceResolved(service) = event else { return true };
-    let addresses = mdns.addresses(service);
-    addresses.into_iter().all(|address| {
-        shell.feed(|core, now| core.handle(now, Input::AddressNamed { source: Source::Mdns, address }))
-    })
-}
-
-/// mdns-sd binds its socket in its own thread and reports what fails there.
-async fn watch_mdns(mdns: &Mdns) {
-    let Ok(events) = mdns.monitor() else { return };
-    let failures = Refusals::default();
-    while let Ok(event) = events.recv_async().await {
-        if let DaemonEvent::Error(error) = event {
-            failures.count(Time::now(), "mDNS reports a fault", &error);
-        }
-    }
-}
-
-fn warn_of_mdns(port: u16, error: &MdnsError) {
-    crate::log::warn!(
-        "NDL does not use mDNS on port {port}: {error}; nodes are found through multicast and seeds only. Set \
-         `ndl.mdns_port` to a port that this process may share, or switch it off"
-    );
 }
 
 /// Binds what a start binds, for its words.

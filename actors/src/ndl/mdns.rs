@@ -7,13 +7,15 @@
 
 use std::{
     collections::HashMap,
+    fmt,
     net::{IpAddr, SocketAddr},
     thread,
     time::Duration,
 };
 
 use mdns_sd::{
-    DaemonEvent, IfKind, Receiver, ResolvedService, ScopedIp, ServiceDaemon, ServiceEvent, ServiceInfo,
+    DaemonEvent, IfKind, Metrics, Receiver, ResolvedService, ScopedIp, ServiceDaemon, ServiceEvent,
+    ServiceInfo,
 };
 use sinew_runtime::wire::fnv1a;
 use tokio::sync::oneshot;
@@ -29,6 +31,37 @@ const ADDRESSES_MAX: usize = 4;
 const NAME_MAX: usize = 38;
 /// Time after which it is said that it does not begin.
 const SLOW: Duration = Duration::from_secs(10);
+
+/// Time between two looks at how much mdns-sd keeps.
+const LOOK_GAP: Duration = Duration::from_secs(1);
+
+/// What mdns-sd has in memory of what others sent. It sets no bound to that itself, and whoever is on the network sends what he likes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Kept {
+    /// Records, some hundred bytes each as a rule, and 9,000 at most.
+    records: usize,
+    /// When they are looked at: two for each time that one was heard, also again, until it would be out of date, 16 bytes each.
+    timers: usize,
+}
+
+impl Kept {
+    /// What may be kept where there are `nodes_max` nodes: four records for each of their addresses, and as many of other projects.
+    pub(super) const fn most(nodes_max: usize) -> Self {
+        Self { records: 256 + nodes_max.saturating_mul(16), timers: 1 << 22 }
+    }
+
+    fn of(metrics: &Metrics) -> Self {
+        let count = |of: &str| metrics.get(of).map_or(0, |count| usize::try_from(*count).unwrap_or(0));
+        let records = metrics.keys().filter(|what| what.starts_with("cached-")).map(|what| count(what)).sum();
+        Self { records, timers: count("timer") }
+    }
+}
+
+impl fmt::Display for Kept {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} records, {} timers", self.records, self.timers)
+    }
+}
 
 /// The node's presence in multicast DNS on one of its paths; ends when dropped.
 pub(super) struct Mdns {
@@ -71,6 +104,20 @@ impl Mdns {
     /// What the daemon has to say about itself.
     pub(super) fn monitor(&self) -> Result<Receiver<DaemonEvent>, MdnsError> {
         self.daemon.monitor()
+    }
+
+    /// Waits until mdns-sd keeps more than `most`. It is not asked again before it has answered: one that is flooded without a pause, or gets
+    /// no processor, does so when it comes to it.
+    pub(super) async fn keeps_more_than(&self, most: Kept) -> Kept {
+        loop {
+            tokio::time::sleep(LOOK_GAP).await;
+            let Ok(asked) = self.daemon.get_metrics() else { continue };
+            let Ok(metrics) = asked.recv_async().await else { continue };
+            let kept = Kept::of(&metrics);
+            if kept.records > most.records || kept.timers > most.timers {
+                return kept;
+            }
+        }
     }
 
     /// Where the node of a resolved service can be asked, by the family in which it was looked for; nothing if it is our own or of another

@@ -20,7 +20,7 @@ use futures_util::{
 };
 use tokio::sync::watch;
 
-use super::{Shell, lock, receiving::receive, speak_mdns};
+use super::{Shell, lock, receiving::receive, speaking::speak_mdns};
 use crate::{
     config::Interfaces,
     ndl::{

@@ -3,12 +3,50 @@
 use std::{
     collections::BTreeSet,
     net::{IpAddr, Ipv4Addr},
+    time::Duration,
 };
 
-use mdns_sd::{IfKind, ScopedIp, ServiceDaemon, ServiceEvent};
+use mdns_sd::{IfKind, ScopedIp, ServiceDaemon, ServiceEvent, ServiceInfo};
 
 use super::{LOOPBACK, Node, free_port, run, within};
 use crate::{config::Interface, ndl::mdns::SERVICE};
+
+#[test]
+fn whoever_fills_the_memory_of_mdns_is_forgotten_and_nodes_find_each_other_by_it_afterwards() {
+    run(async {
+        // given
+        let port = free_port();
+        let mut first = Node::start(1, |ndl| {
+            ndl.mdns_port = Some(port);
+            ndl.nodes_max = 1;
+        })
+        .await;
+        // when: more services than there may be nodes
+        let daemon = ServiceDaemon::new_with_port(port).unwrap();
+        daemon.disable_interface(IfKind::All).unwrap();
+        daemon.enable_interface(IfKind::LoopbackV4).unwrap();
+        for number in 0..100 {
+            let (instance, host) = (format!("forged {number}"), format!("forged-{number}.local."));
+            let mut forged =
+                ServiceInfo::new(SERVICE, &instance, &host, "127.0.0.1", 9, &[("a", "b")][..]).unwrap();
+            forged.set_requires_probe(false);
+            // Its queue has room for a hundred commands.
+            while daemon.register(forged.clone()).is_err() {
+                tokio::task::yield_now().await;
+            }
+        }
+        // then
+        within("the records to be too many", async {
+            while first.stores.refusals.of("more records of mDNS than are kept") == 0 {
+                tokio::time::sleep(Duration::from_millis(1)).await;
+            }
+        })
+        .await;
+        drop(daemon.shutdown());
+        let second = Node::start(2, |ndl| ndl.mdns_port = Some(port)).await;
+        first.finds(&second).await;
+    });
+}
 
 #[test]
 fn a_node_is_published_at_each_of_its_addresses() {
