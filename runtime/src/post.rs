@@ -119,6 +119,18 @@ impl<E> Post<E> {
         lock(&self.shared).is_closed
     }
 
+    /// How many events wait.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        lock(&self.shared).queue.len()
+    }
+
+    /// Whether none waits.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
     /// How many events were refused because the post was full.
     #[must_use]
     pub fn refused(&self) -> u64 {

@@ -21,7 +21,15 @@ use super::{
     facts::DirectoryEvent,
     words::{ArriveAtBarrier, BarrierAnswer, LeaveBarrier},
 };
-use crate::{audit, lncl::AppFact, monitors, node::RootEvent, refusals::Refusals, stores::{POST_CAPACITY, Stores}, wills};
+use crate::{
+    audit,
+    lncl::AppFact,
+    monitors,
+    node::RootEvent,
+    refusals::Refusals,
+    stores::{POST_CAPACITY, Stores},
+    wills,
+};
 
 /// The sync manager of a node: a new one after each fault, on the same core.
 pub(crate) struct SyncManager {
@@ -118,8 +126,9 @@ impl SyncManager {
     fn handle(&mut self, input: Input, ctx: &mut Context<Self>) {
         {
             let mut core = self.core();
-            let named = input.may_name();
-            core.handle(Time::now(), input);
+            let (named, now) = (input.may_name(), Time::now());
+            core.woken(now, self.stores.posts.sync.len());
+            core.handle(now, input);
             self.tell_access(&core, named);
             // Counted before anybody can see it: who is told of a name by whoever saw it first must find that it has changed.
             self.stores.directory_has_changed();

@@ -21,6 +21,7 @@
 //! | SYNC-13 | A named party that is missing and has failed, was stopped, or whose node is lost, for 50 ms, ends the wait of those who do not want to wait for it. |
 //! | SYNC-14 | An application that subscribed to it is told of every entry of the directory when it is ready, then of each change, until its life ends. What its mailbox does not take is told 10 ms later, as it is then. |
 //! | SYNC-15 | What an application says it has reached, a phase, counts until its life ends, and goes to all nodes in its node's list. It waits there until all parties have reached the phase in their present lives, its deadline, its leave or its end; a lost party ends the wait as in SYNC-13. A requirement on a phase is met by whoever has reached it, ready or not. |
+//! | SYNC-16 | As long as something waits in its post, and where its own timer was late by more than 10 ms, a node tells nobody that something is lost, over or overdue before it has read that, or has had as long to read what waits for it, 50 ms at most; three times in a row at most. |
 
 mod actor;
 #[cfg(test)]

@@ -15,6 +15,7 @@ use super::{
     Core, Output, Reason,
     apps::{App, State},
     cycles::Graph,
+    respite::Moment,
 };
 use crate::sync::facts::Waiting;
 
@@ -26,21 +27,21 @@ pub(super) const RETRY: Duration = Duration::from_millis(10);
 
 impl Core {
     /// Releases whoever has all that it requires, and tells running applications what they lost or got back.
-    pub(super) fn evaluate(&mut self, now: Time) {
+    pub(super) fn evaluate(&mut self, moment: Moment) {
         self.find_cycles();
         let mut missing = self.find_missing();
         let in_cycle: BTreeSet<&str> = self.cycles.iter().flatten().map(String::as_str).collect();
         let mut released = Vec::new();
         for (address, app) in self.apps.iter_mut() {
             let unready = missing.remove(&address).unwrap_or_default();
-            app.note_absent(now, &unready);
+            app.note_absent(moment.now, &unready);
             if app.wait().is_none() {
-                for (event, why) in changes(now, app, &unready) {
+                for (event, why) in changes(moment, app, &unready) {
                     // What it did not take about this name before is out of date.
                     self.not_taken.remove(&(address, Some(event.name().to_owned())));
                     self.outputs.push_back(Output::Tell { app: address, event, why });
                 }
-            } else if is_free(now, app, &unready)
+            } else if is_free(moment.judged, app, &unready)
                 && !app.name.as_deref().is_some_and(|name| in_cycle.contains(name))
             {
                 // spec: SYNC-5
@@ -102,12 +103,12 @@ impl Core {
     }
 
     /// Reports who has waited for its deadline, and each time that it passes again. spec: SYNC-9
-    pub(super) fn report_overdue(&mut self, now: Time) {
+    pub(super) fn report_overdue(&mut self, Moment { now, judged }: Moment) {
         let deadline = self.requirement_deadline;
         let mut overdue = Vec::new();
         for (address, app) in self.apps.iter_mut() {
             if let State::Waiting(wait) = &mut app.state
-                && wait.overdue <= now
+                && wait.overdue <= judged
             {
                 wait.overdue = now + deadline;
                 overdue.push(address);
@@ -159,7 +160,7 @@ impl Core {
 
 /// Whether nothing keeps a waiting application: what it lacks it can do without, and has waited for long enough. Sets when to look
 /// again. spec: SYNC-5
-fn is_free(now: Time, app: &mut App, unready: &[(String, Reason)]) -> bool {
+fn is_free(judged: Time, app: &mut App, unready: &[(String, Reason)]) -> bool {
     let Some(since) = app.wait().map(|wait| wait.since) else { return false };
     let lacks = |requirement: &&Requirement| unready.iter().any(|(text, _)| text == requirement.as_str());
     let limits: Vec<Option<Time>> = app
@@ -167,7 +168,7 @@ fn is_free(now: Time, app: &mut App, unready: &[(String, Reason)]) -> bool {
         .iter()
         .filter(lacks)
         .map(|requirement| requirement.wait_max().map(|wait| since + wait))
-        .filter(|limit| limit.is_none_or(|limit| now < limit))
+        .filter(|limit| limit.is_none_or(|limit| judged < limit))
         .collect();
     app.patience = limits.iter().flatten().min().copied();
     limits.is_empty()
@@ -184,7 +185,7 @@ fn absence(requirement: &Requirement) -> RequirementEvent {
 
 /// What a running application is told: each requirement whose state differs from what it knows. spec: SYNC-8
 fn changes(
-    now: Time,
+    Moment { now, judged }: Moment,
     app: &mut App,
     unready: &[(String, Reason)],
 ) -> Vec<(RequirementEvent, Option<Reason>)> {
@@ -197,7 +198,8 @@ fn changes(
         match reason {
             Some(_) if is_told => {}
             Some(reason)
-                if reason.is_silence() && now < *silent.entry(name.to_owned()).or_insert(now + SILENCE) => {}
+                if reason.is_silence()
+                    && judged < *silent.entry(name.to_owned()).or_insert(now + SILENCE) => {}
             Some(reason) => {
                 silent.remove(name);
                 lost.insert(name.to_owned());

@@ -25,18 +25,18 @@ fn idle(text: &str, generation: u64) -> BarrierSaid {
 }
 
 /// One at which the knee waits behind this generation.
-fn awaited(text: &str, generation: u64) -> BarrierSaid {
+pub(super) fn awaited(text: &str, generation: u64) -> BarrierSaid {
     let knee = Arrival { party: 1, app: app(0), name: Some(name("knee")), after: generation };
     BarrierSaid { arrivals: vec![knee], ..idle(text, generation) }
 }
 
-fn answered(correlation: u64, answer: BarrierAnswer) -> Output {
+pub(super) fn answered(correlation: u64, answer: BarrierAnswer) -> Output {
     Output::AnswerBarrier { app: app(0), correlation, answer }
 }
 
 impl Bench {
     /// Application 0 is "hip".
-    fn of_the_hip() -> Self {
+    pub(super) fn of_the_hip() -> Self {
         let mut bench = Self::new();
         bench.registers(0, "hip", &[]);
         bench.ready(0);
@@ -54,7 +54,7 @@ impl Bench {
         bench
     }
 
-    fn is_told(
+    pub(super) fn is_told(
         &mut self,
         from: NodeAddress,
         incarnation: Incarnation,
@@ -66,7 +66,7 @@ impl Bench {
     }
 
     /// The hip arrives, and does not wait for a lost party's return.
-    fn arrives(&mut self, barrier: &str, correlation: u64) -> Vec<Output> {
+    pub(super) fn arrives(&mut self, barrier: &str, correlation: u64) -> Vec<Output> {
         let asked = ArriveAtBarrier {
             kind: BarrierKind::Meeting,
             barrier: barrier.to_owned(),

@@ -11,6 +11,7 @@ use sinew_runtime::{
 use super::{
     Core, Output,
     rendezvous::{Arrived, Key, Known, Rendezvous, WhoWaits},
+    respite::Moment,
 };
 use crate::sync::{
     arrivals::{Arrivals, PARTIES_MAX, fault_of_parties},
@@ -88,19 +89,19 @@ impl Core {
     }
 
     /// Opens what can be opened, answers whose wait is over, and tells the other nodes.
-    pub(super) fn meet(&mut self, now: Time) {
+    pub(super) fn meet(&mut self, moment: Moment) {
         // It is taken out while it asks about names.
         let empty = Rendezvous::new(self.node, self.incarnation, self.list_bytes_max);
         let mut rendezvous = std::mem::replace(&mut self.rendezvous, empty);
         rendezvous.retain(|node| self.peers.knows(node));
-        rendezvous.evaluate(now, |node| self.peers.current(node), |name| self.why_not(name));
+        rendezvous.evaluate(moment, |node| self.peers.current(node), |name| self.why_not(name));
         let mut answers = rendezvous.take_answers();
-        answers.extend(self.pass_phases(now));
+        answers.extend(self.pass_phases(moment));
         for (app, correlation, answer) in answers {
             let answer = within(answer, self.list_bytes_max);
             self.outputs.push_back(Output::AnswerBarrier { app, correlation, answer });
         }
-        for to in rendezvous.take_due(now, |node| self.peers.linked(node).is_some()) {
+        for to in rendezvous.take_due(moment.now, |node| self.peers.linked(node).is_some()) {
             let (said, left_out) = rendezvous.encoded();
             if left_out > 0 {
                 let limit = self.list_bytes_max;

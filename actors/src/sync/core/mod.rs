@@ -19,6 +19,7 @@ mod publish;
 mod reason;
 mod rendezvous;
 mod requirements;
+mod respite;
 #[cfg(test)]
 mod simulation;
 #[cfg(test)]
@@ -45,6 +46,7 @@ use self::{
     peers::Peers,
     phases::Phases,
     rendezvous::Rendezvous,
+    respite::Respite,
 };
 use super::{
     facts::{Absence, DirectoryEntry, DirectoryEvent, OwnApp, Waiting},
@@ -139,6 +141,7 @@ pub(crate) struct Core {
     /// Outputs that were not taken: the release of an application, or its event about a name.
     not_taken: BTreeSet<(AppAddress, Option<String>)>,
     retry: Option<Time>,
+    respite: Respite,
     outputs: VecDeque<Output>,
     sequence: u64,
 }
@@ -166,6 +169,7 @@ impl Core {
             encoded: None,
             not_taken: BTreeSet::new(),
             retry: None,
+            respite: Respite::default(),
             outputs: VecDeque::new(),
             sequence: 0,
         }
@@ -200,10 +204,11 @@ impl Core {
         }
         self.offer_again(now);
         self.answer_again(now);
-        self.evaluate(now);
-        self.report_overdue(now);
+        let moment = self.respite.moment(now);
+        self.evaluate(moment);
+        self.report_overdue(moment);
         self.publish(now);
-        self.meet(now);
+        self.meet(moment);
         self.tell_watchers(now);
     }
 
@@ -217,13 +222,13 @@ impl Core {
         let overdue = self.apps.waiting().map(|(_, _, wait)| wait.overdue).min();
         let silent =
             self.apps.iter().flat_map(|(_, app)| app.silent.values().chain(&app.patience).copied()).min();
+        let judged = [overdue, silent, self.rendezvous.next_over(), self.phases.next_wake()];
+        let judged = judged.into_iter().flatten().min().map(|over| self.respite.judges(over));
         [
+            judged,
             self.peers.next_due(),
-            overdue,
             self.retry,
-            silent,
-            self.rendezvous.next_wake(),
-            self.phases.next_wake(),
+            self.rendezvous.next_due(),
             self.untaken.next_wake(),
             self.watchers.next_wake(),
         ]

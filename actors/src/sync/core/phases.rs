@@ -15,6 +15,7 @@ use sinew_runtime::{
 use super::{
     Core, Output,
     rendezvous::{Arrived, GRACE},
+    respite::Moment,
 };
 use crate::sync::{
     facts::Absence,
@@ -86,7 +87,7 @@ impl Wait {
     }
 
     /// Its answer, if its time has come.
-    fn judge(&mut self, now: Time, standing: Standing) -> Option<BarrierAnswer> {
+    fn judge(&mut self, Moment { now, judged }: Moment, standing: Standing) -> Option<BarrierAnswer> {
         let Standing { missing, has_lost } = standing;
         for (party, absent) in self.absent.iter_mut().enumerate() {
             let is_missing = missing.iter().any(|(other, ..)| *other == party);
@@ -100,10 +101,10 @@ impl Wait {
             (OnPartyLoss::Fail, true) => drop(self.lost.get_or_insert(now)),
             (OnPartyLoss::Fail, false) | (OnPartyLoss::Wait, _) => self.lost = None,
         }
-        if self.until <= now {
+        if self.until <= judged {
             Some(BarrierAnswer::TimedOut { missing })
         } else {
-            (self.next() <= now).then_some(BarrierAnswer::Lost { missing })
+            (self.next() <= judged).then_some(BarrierAnswer::Lost { missing })
         }
     }
 }
@@ -147,13 +148,13 @@ impl Core {
     }
 
     /// Answers those at phases who may go on, or whose wait is over. spec: SYNC-15
-    pub(super) fn pass_phases(&mut self, now: Time) -> Vec<(AppAddress, u64, BarrierAnswer)> {
+    pub(super) fn pass_phases(&mut self, moment: Moment) -> Vec<(AppAddress, u64, BarrierAnswer)> {
         let standings: Vec<Standing> =
             self.phases.0.values().map(|wait| self.standing_at_phase(wait)).collect();
         let mut answers = Vec::new();
         let mut standings = standings.into_iter();
         self.phases.0.retain(|(app, _), wait| {
-            let answer = standings.next().and_then(|standing| wait.judge(now, standing));
+            let answer = standings.next().and_then(|standing| wait.judge(moment, standing));
             let is_over = answer.is_some();
             answers.extend(answer.map(|answer| (*app, wait.correlation, answer)));
             !is_over

@@ -32,7 +32,7 @@ use sinew_runtime::{
 
 pub(super) use self::{known::Known, who_waits::WhoWaits};
 use self::{known::Wait, voices::Voices};
-use super::Reason;
+use super::{Reason, respite::Moment};
 use crate::sync::{
     arrivals::{ARRIVALS_MAX, Arrival, Arrivals, BARRIERS_MAX, BarrierSaid, GENERATION_MAX, Member, Passed},
     facts::Absence,
@@ -307,9 +307,13 @@ impl Rendezvous {
         self.known.values().filter(|known| !known.waiting.is_empty()).flat_map(|known| &known.parties)
     }
 
-    /// When there is something to do without news.
-    pub(super) fn next_wake(&self) -> Option<Time> {
-        let waits = self.known.values().flat_map(|known| known.waiting.values());
-        self.voices.next_due().into_iter().chain(waits.map(Wait::next)).min()
+    /// When somebody's wait is over without news.
+    pub(super) fn next_over(&self) -> Option<Time> {
+        self.known.values().flat_map(|known| known.waiting.values()).map(Wait::next).min()
+    }
+
+    /// When our word goes out next.
+    pub(super) fn next_due(&self) -> Option<Time> {
+        self.voices.next_due()
     }
 }

@@ -12,6 +12,8 @@ mod forms;
 mod lives;
 #[path = "phases_tests.rs"]
 mod phases;
+#[path = "stalls_tests.rs"]
+mod stalls;
 
 use self::forms::in_words;
 use super::{

@@ -37,25 +37,25 @@ impl Rendezvous {
     /// life of a node that can be heard, `why_not` why an application of a name is not ready.
     pub(in crate::sync::core) fn evaluate(
         &mut self,
-        now: Time,
+        moment: Moment,
         linked: impl Fn(NodeAddress) -> Option<Incarnation>,
         why_not: impl Fn(&str) -> Option<Reason>,
     ) {
         let awaited = self.known.iter().filter(|(_, known)| !known.waiting.is_empty());
         let standings: Vec<(Key, Standing)> = awaited
-            .map(|(key, known)| (key.clone(), self.standing(now, (key, known), &linked, &why_not)))
+            .map(|(key, known)| (key.clone(), self.standing(moment, (key, known), &linked, &why_not)))
             .collect();
         for (key, standing) in standings {
             match standing {
-                Standing::Complete(present) => self.open(now, &key, present),
-                Standing::Lacks(lack) => self.end_waits(now, &key, lack),
+                Standing::Complete(present) => self.open(moment.now, &key, present),
+                Standing::Lacks(lack) => self.end_waits(moment, &key, lack),
             }
         }
     }
 
     fn standing(
         &self,
-        now: Time,
+        moment: Moment,
         (key, known): (&Key, &Known),
         linked: &impl Fn(NodeAddress) -> Option<Incarnation>,
         why_not: &impl Fn(&str) -> Option<Reason>,
@@ -66,7 +66,7 @@ impl Rendezvous {
         }
         let asks = known.waiting.values().any(|wait| wait.on_loss == OnPartyLoss::Fail);
         let has_lost = asks && known.parties.iter().any(|party| is_lost(party, &present, why_not));
-        let over = known.waiting.iter().filter(|(_, wait)| wait.is_over(now, has_lost));
+        let over = known.waiting.iter().filter(|(_, wait)| wait.is_over(moment, has_lost));
         let over: Vec<AppAddress> = over.map(|(app, _)| *app).collect();
         let missing = if over.is_empty() { Vec::new() } else { missing(&known.parties, &present, why_not) };
         let missing = missing.into_iter().map(|(_, name, why)| (name, why)).collect();
@@ -87,7 +87,12 @@ impl Rendezvous {
         self.changed(now);
     }
 
-    fn end_waits(&mut self, now: Time, key: &Key, Lack { missing, has_lost, over, there }: Lack) {
+    fn end_waits(
+        &mut self,
+        Moment { now, judged }: Moment,
+        key: &Key,
+        Lack { missing, has_lost, over, there }: Lack,
+    ) {
         let Some(known) = self.known.get_mut(key) else { return };
         known.note_absent(now, &there);
         for wait in known.waiting.values_mut() {
@@ -99,7 +104,7 @@ impl Rendezvous {
         for app in &over {
             let Some(wait) = known.waiting.remove(app) else { continue };
             let missing = missing.clone();
-            let answer = if wait.until <= now {
+            let answer = if wait.until <= judged {
                 BarrierAnswer::TimedOut { missing }
             } else {
                 BarrierAnswer::Lost { missing }
@@ -137,9 +142,9 @@ impl Wait {
     }
 
     /// Whether its time is over, or that of a lost party's return.
-    fn is_over(&self, now: Time, has_lost: bool) -> bool {
+    fn is_over(&self, Moment { now, judged }: Moment, has_lost: bool) -> bool {
         let patience = self.lost_since(now, has_lost).map(|lost| lost + GRACE);
-        patience.map_or(self.until, |patience| self.until.min(patience)) <= now
+        patience.map_or(self.until, |patience| self.until.min(patience)) <= judged
     }
 }
 
