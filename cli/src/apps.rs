@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::{Value, json};
-use sinew::inspect::{AppReport, AppsReport, AskApps, BarrierReport, Missing};
+use sinew::inspect::{AppReport, AppsReport, AskApps, BarrierReport, KindReport, Missing};
 
 use crate::{
     Said,
@@ -11,10 +11,15 @@ use crate::{
     table::{Table, clean, or_dash, time},
 };
 
+/// Payloads of one application that stand in the table.
+const KINDS_SHOWN: usize = 2;
+/// Characters of the name of each.
+const KIND_WIDTH: usize = 32;
+
 /// Asks every node for its applications.
 pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
     let answers = ask(system)?;
-    let mut table = Table::new(["TID", "NAME", "NODE", "STATE", "WHY"]);
+    let mut table = Table::new(["TID", "NAME", "NODE", "STATE", "HANDLES", "WHY"]);
     let mut rows = Vec::new();
     for (node, app) in all(&answers) {
         table.row([
@@ -22,6 +27,7 @@ pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
             or_dash(app.name.clone()),
             node.to_owned(),
             state(app).to_owned(),
+            or_dash(handles(app)),
             why(app),
         ]);
         rows.push(app_json(node, app));
@@ -146,6 +152,26 @@ const fn state(app: &AppReport) -> &'static str {
     }
 }
 
+/// What it handles, as much of it as a table has room for.
+fn handles(app: &AppReport) -> Option<String> {
+    let shown = app.kinds.iter().take(KINDS_SHOWN).map(|kind| {
+        let name = kind_name(kind);
+        let cut = name
+            .char_indices()
+            .nth(KIND_WIDTH)
+            .map(|_| name.chars().take(KIND_WIDTH - 3).collect::<String>());
+        cut.map_or(name, |cut| cut + "...")
+    });
+    let mut words: Vec<_> = shown.collect();
+    let more = app.kinds.len().saturating_sub(KINDS_SHOWN) as u64 + app.kinds_left_out;
+    words.extend((more > 0).then(|| format!("{more} more")));
+    (!words.is_empty()).then(|| words.join(", "))
+}
+
+fn kind_name(of: &KindReport) -> String {
+    of.name.clone().unwrap_or_else(|| of.kind.to_string())
+}
+
 /// Why it is not ready, in words.
 pub(crate) fn why(app: &AppReport) -> String {
     let mut parts = Vec::new();
@@ -183,6 +209,8 @@ fn app_json(node: &str, app: &AppReport) -> Value {
         "waits_us": app.waits_us,
         "missing": missing.collect::<Vec<_>>(),
         "ended": app.ended,
+        "kinds": app.kinds.iter().map(|of| json!({ "kind": kind_name(of), "kind_id": of.kind.to_string() })).collect::<Vec<_>>(),
+        "kinds_left_out": app.kinds_left_out,
     })
 }
 
@@ -204,4 +232,43 @@ fn silent_json(answers: &[Answer<AppsReport>]) -> Value {
         Some(json!({ "node": answer.node.to_string(), "why": answer.said.as_ref().err()? }))
     };
     answers.iter().filter_map(line).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew::{AppAddress, Kind, NodeAddress, Tid};
+
+    use super::*;
+
+    fn app(names: &[&str], kinds_left_out: u64) -> AppReport {
+        let kind = |name: &&str| KindReport {
+            kind: Kind::named(name),
+            name: (!name.is_empty()).then(|| (*name).to_owned()),
+        };
+        AppReport {
+            tid: Tid::new(NodeAddress::new(2), AppAddress::new(0x1001)),
+            name: None,
+            ready: true,
+            waits_us: None,
+            missing: Vec::new(),
+            ended: None,
+            kinds: names.iter().map(kind).collect(),
+            kinds_left_out,
+        }
+    }
+
+    #[test]
+    fn what_an_application_handles_has_a_bounded_place_in_the_table_and_all_of_it_in_json() {
+        assert_eq!(handles(&app(&[], 0)), None);
+        assert_eq!(handles(&app(&[], 7)).as_deref(), Some("7 more"));
+        assert_eq!(handles(&app(&["gait.step"], 0)).as_deref(), Some("gait.step"));
+        let unnamed = Kind::named("").to_string();
+        assert_eq!(handles(&app(&[""], 0)), Some(unnamed));
+        let many = app(&["gait.step", "gait.a_name_that_is_longer_than_a_cell", "c", "d"], 1);
+        let expected = "gait.step, gait.a_name_that_is_longer_th..., 3 more";
+        assert_eq!(handles(&many).as_deref(), Some(expected));
+        let said = app_json("knee", &many);
+        assert_eq!(said["kinds"].as_array().map(Vec::len), Some(4));
+        assert_eq!((&said["kinds"][3]["kind"], &said["kinds_left_out"]), (&"d".into(), &1.into()));
+    }
 }

@@ -12,14 +12,15 @@ use sinew_runtime::{
     supervision::Strategy,
     tid::{NodeAddress, Tid},
     time::Time,
-    wire::Flags,
+    wire::{Flags, Kind},
 };
 
 use super::reports::{
     APPS_MAX, AppReport, AppsReport, AuditReport, BarrierReport, CertificateReport, DialReport,
-    ForeignReport, IdleReport, LinkReport, LostReport, MISSING_MAX, Missing, NodeReport, PEERS_MAX,
-    PeerReport, RefusalReport, RouteReport, SecurityReport, SeenMessage, SourceReport, StallReport,
-    StreamReport, TOLD_MAX, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
+    ForeignReport, IdleReport, KindReport, LinkReport, LostReport, MISSING_MAX, Missing, NodeReport,
+    PEERS_MAX, PeerReport, RefusalReport, RouteReport, SecurityReport, SeenMessage, SourceReport,
+    StallReport, StreamReport, TOLD_MAX, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport,
+    WatchReport,
 };
 use super::watches::{Fetched, Sight};
 use crate::{
@@ -102,7 +103,10 @@ impl Answers {
         let (apps, more) = sync.own_apps(now, APPS_MAX);
         let barriers = sync.barriers(now);
         drop(sync);
-        let apps = apps.into_iter().map(|app| app_report(stores.node, app)).collect();
+        let registry = lock(&stores.registry);
+        let name_of = |kind| registry.kind_name(kind).map(str::to_owned);
+        let apps = apps.into_iter().map(|app| app_report(stores.node, app, name_of)).collect();
+        drop(registry);
         let barriers = barriers.into_iter().take(TOLD_MAX).map(barrier_report).collect();
         Ok(AppsReport { name: stores.config.name.clone(), apps, left_out: more as u64, barriers })
     }
@@ -381,7 +385,8 @@ fn seen_message(now: Time, sight: Sight, name: Option<String>) -> SeenMessage {
     }
 }
 
-fn app_report(node: NodeAddress, app: OwnApp) -> AppReport {
+fn app_report(node: NodeAddress, app: OwnApp, name_of: impl Fn(Kind) -> Option<String>) -> AppReport {
+    let kinds = app.kinds.into_iter().map(|kind| KindReport { kind, name: name_of(kind) });
     let missing = app.missing.into_iter().map(missing_report);
     AppReport {
         tid: Tid::new(node, app.app),
@@ -390,6 +395,8 @@ fn app_report(node: NodeAddress, app: OwnApp) -> AppReport {
         waits_us: app.waits.map(micros),
         missing: missing.collect(),
         ended: app.ended.map(str::to_owned),
+        kinds: kinds.collect(),
+        kinds_left_out: 0,
     }
 }
 

@@ -27,9 +27,10 @@ pub(crate) use inspector::begin;
 pub use reports::{
     APPS_MAX, AccessReport, AccessVerdict, AppReport, AppsReport, AskAccess, AskApps, AskAudit, AskNode,
     AskReload, AskTree, AskWatch, AuditReport, BarrierReport, CertificateReport, DialReport, ForeignReport,
-    IdleReport, LinkReport, LostReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping, RefusalReport,
-    ReloadReport, RouteReport, SEEN_BYTES_MAX, SEEN_MAX, SecurityReport, SeenMessage, SourceReport,
-    StallReport, StreamReport, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
+    IdleReport, KindReport, LinkReport, LostReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping,
+    RefusalReport, ReloadReport, RouteReport, SEEN_BYTES_MAX, SEEN_MAX, SecurityReport, SeenMessage,
+    SourceReport, StallReport, StreamReport, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport,
+    WatchReport,
 };
 
 #[cfg(doc)]

@@ -36,6 +36,8 @@ const SOURCES_MAX: usize = 16;
 pub(super) const TOLD_MAX: usize = 64;
 /// Names that one application lacks at most: as many as it may require.
 pub(super) const MISSING_MAX: usize = 64;
+/// Payloads that one application is said to handle at most: as many as stand in the directory.
+pub(super) const KINDS_MAX: usize = 64;
 /// Messages of an application that is watched in one answer, at most.
 pub const SEEN_MAX: usize = 256;
 /// Longest payload that is shown to a watcher, in bytes; of a longer one only its length is.
@@ -199,6 +201,21 @@ pub struct AppReport {
     pub missing: Vec<Missing>,
     /// How its former life ended, while this one is not ready.
     pub ended: Option<String>,
+    /// The payloads that it handles, as far as it tells: of one in a process of its own those that it named when it registered.
+    #[serde(default, deserialize_with = "at_most::<_, _, KINDS_MAX>")]
+    pub kinds: Vec<KindReport>,
+    /// Further ones that had no room.
+    #[serde(default)]
+    pub kinds_left_out: u64,
+}
+
+/// A type of payload.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct KindReport {
+    /// Its kind.
+    pub kind: Kind,
+    /// Its name, where the node knows that.
+    pub name: Option<String>,
 }
 
 /// A run-time barrier at which somebody waits.
@@ -371,8 +388,15 @@ impl Report for NodeReport {
 }
 
 impl Report for AppsReport {
+    /// Before an application what they handle is left out.
     fn halve(&mut self) -> bool {
-        halve(&mut self.apps, &mut self.left_out)
+        let mut had_kinds = false;
+        for app in &mut self.apps {
+            had_kinds |= !app.kinds.is_empty();
+            app.kinds_left_out += app.kinds.len() as u64;
+            app.kinds.clear();
+        }
+        had_kinds || halve(&mut self.apps, &mut self.left_out)
     }
 }
 

@@ -18,7 +18,9 @@ use sinew_runtime::{
 
 use super::{
     inspector::{Inbox, WAITING_MAX},
-    reports::{AppReport, AppsReport, AskApps, AskNode, AskTree, NodeReport, Report as _, SecurityReport},
+    reports::{
+        AppReport, AppsReport, AskApps, AskNode, AskTree, KindReport, NodeReport, Report as _, SecurityReport,
+    },
 };
 use crate::{
     config::NodeConfig,
@@ -42,6 +44,8 @@ fn report(count: u32) -> AppsReport {
         waits_us: None,
         missing: Vec::new(),
         ended: None,
+        kinds: Vec::new(),
+        kinds_left_out: 0,
     };
     AppsReport {
         name: "knee".to_owned(),
@@ -78,6 +82,15 @@ fn what_has_no_room_in_an_answer_is_counted() {
     assert!(apps.halve() && apps.halve());
     assert_eq!((apps.apps.len(), apps.left_out), (0, 5));
     assert!(!apps.halve());
+    // What they handle goes before one of them does.
+    let mut apps = report(5);
+    let kind = KindReport { kind: Kind::PING, name: None };
+    apps.apps[0].kinds = vec![kind.clone(), kind];
+    assert!(apps.halve());
+    assert_eq!((apps.apps.len(), apps.left_out), (5, 0));
+    assert_eq!((apps.apps[0].kinds.len(), apps.apps[0].kinds_left_out), (0, 2));
+    assert!(apps.halve());
+    assert_eq!((apps.apps.len(), apps.left_out), (2, 3));
 }
 
 #[test]

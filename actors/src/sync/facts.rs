@@ -96,4 +96,6 @@ pub(crate) struct OwnApp {
     pub(crate) waits: Option<Duration>,
     /// How its former life ended, while this one is not ready.
     pub(crate) ended: Option<&'static str>,
+    /// The payloads that it handles, as far as it tells.
+    pub(crate) kinds: Vec<Kind>,
 }

@@ -280,6 +280,7 @@ impl Core {
                 .map(|wait| now.since(wait.since))
                 .or_else(|| Some(self.lacks_at_phases(now, address)?.0)),
             ended: app.ended.map(|ended| Reason::from(ended).words()),
+            kinds: app.kinds.clone(),
         };
         let apps: Vec<_> = self.apps.iter().take(max).map(view).collect();
         let more = self.apps.iter().count() - apps.len();

@@ -60,14 +60,16 @@ fn stand_still_again_and_again(seed: u64) -> Vec<Output> {
     let mut chance = fastrand::Rng::with_seed(seed);
     let mut bench = where_gait_runs_with_a_drive_elsewhere();
     let mut news = VecDeque::from(news(&mut chance, bench.now));
-    let (mut told, mut in_a_row) = (Vec::new(), 0);
+    let (mut told, mut in_a_row, mut calm) = (Vec::new(), 0, bench.now);
     while let Some((next, _)) = news.front() {
         let wake = bench.core.next_wake().map_or(*next, |wake| wake.min(*next));
         bench.now = bench.now.max(wake);
         let stalls = in_a_row < IN_A_ROW_MAX && chance.u8(..4) == 0;
-        in_a_row = if stalls { in_a_row + 1 } else { 0 };
         if stalls {
             bench.now = bench.now + Duration::from_millis(chance.u64(1..1_000));
+            (in_a_row, calm) = (in_a_row + 1, bench.now + RESPITE_MAX);
+        } else if bench.now > calm {
+            in_a_row = 0;
         }
         // The timer comes first: it is the worst that a reactor can do.
         let unread = |bench: &Bench, news: &VecDeque<(Time, Input)>| {

@@ -89,6 +89,8 @@ fn app(name: &str) -> App {
         waits_us: None,
         missing: Vec::new(),
         ended: None,
+        kinds: Vec::new(),
+        kinds_left_out: 0,
     };
     let line = TreeLine {
         depth: 1,
