@@ -109,6 +109,19 @@ impl Contact {
         Self { sources: BTreeMap::from([(Source::Remembered, now)]), ..Self::former(now, node) }
     }
 
+    /// A source names it, perhaps anew, also while it was about to be forgotten.
+    pub(super) fn heard_of(&mut self, now: Time, source: Source) {
+        self.sources.entry(source).or_insert(now);
+        if let Role::Candidate { asked } = &mut self.role {
+            *asked = 0;
+        }
+    }
+
+    /// A candidate that was asked so often since it was heard of last; a seed is asked for ever.
+    pub(super) const fn has_missed(&self, missed_max: u32) -> bool {
+        matches!(self.role, Role::Candidate { asked } if asked >= missed_max) && !self.is_seed
+    }
+
     /// Nothing else speaks for this address: nobody was heard there since, and it is not listed.
     pub(super) fn is_remembered_alone(&self) -> bool {
         let is_asked_for_it = matches!(self.role, Role::Candidate { .. } | Role::Former { .. });

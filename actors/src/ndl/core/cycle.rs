@@ -9,7 +9,7 @@ use sinew_runtime::{
 
 use super::{
     Core, Host, Member, Output, Place,
-    contact::{Question, Role},
+    contact::{Contact, Question, Role},
     pace::REST,
 };
 use crate::ndl::LossReason;
@@ -210,12 +210,13 @@ impl Core {
 
     fn ask_in_cycle(&mut self, now: Time, place: Place) {
         let missed_max = self.rest().missed_max;
-        let Some(contact) = self.contacts.get_mut(&place) else { return };
-        match &mut contact.role {
-            Role::Candidate { asked } if *asked >= missed_max && !contact.is_seed => {
-                self.contacts.remove(&place);
-                return;
-            }
+        if self.contacts.get(&place).is_some_and(|contact| contact.has_missed(missed_max)) {
+            self.contacts.remove(&place);
+            return;
+        }
+        let Some(mut contact) = self.contacts.get_mut(&place) else { return };
+        let Contact { role, is_seed, .. } = &mut *contact;
+        match role {
             Role::Candidate { asked } => *asked = asked.saturating_add(1),
             Role::Member(node) => {
                 let Some(member) = self.members.get_mut(node) else { return };
@@ -225,7 +226,7 @@ impl Core {
                 }
                 member.routes.asked(now, place);
             }
-            Role::Former { left, .. } if *left > 0 && !contact.is_seed => {
+            Role::Former { left, .. } if *left > 0 && !*is_seed => {
                 *left -= 1;
                 return;
             }
@@ -234,6 +235,7 @@ impl Core {
                 *wait = (*wait * 2).min(FORMER_WAIT_MAX);
             }
         }
+        drop(contact);
         self.ask(now, place);
     }
 

@@ -55,7 +55,7 @@ impl Core {
     }
 
     fn admits(&mut self, now: Time, from: Place, bytes: &[u8]) -> bool {
-        if let Some(contact) = self.contacts.get_mut(&from) {
+        if let Some(mut contact) = self.contacts.get_mut(&from) {
             let is_expected = peek_answer(bytes).is_some_and(|id| contact.questions.has(id));
             // What we asked for has a budget apart, so that noise with a member's address on it does not make its
             // answers unheard.
@@ -98,7 +98,8 @@ impl Core {
         (correlation, answer_sent): (u64, Time),
         answer: Answer,
     ) {
-        let question = self.contacts.get_mut(&from).and_then(|contact| contact.questions.take(correlation));
+        let contact = self.contacts.get_mut(&from);
+        let question = contact.and_then(|mut contact| contact.questions.take(correlation));
         if let Some(question) = question {
             let exchange = self.exchange(now, question, answer_sent, &answer);
             let Answer { announcement, progress, .. } = answer;
@@ -161,7 +162,7 @@ impl Core {
                 member.sign = now;
             }
         }
-        if let Some(contact) = self.contacts.get_mut(&from) {
+        if let Some(mut contact) = self.contacts.get_mut(&from) {
             contact.sources.entry(source).or_insert(now);
         }
     }
@@ -189,12 +190,7 @@ impl Core {
         if !self.contacts.contains_key(&place) {
             self.make_room_for_a_candidate(now);
         }
-        let contact = self.contacts.entry(place).or_insert_with(|| Contact::new(now, source));
-        contact.sources.entry(source).or_insert(now);
-        if let Role::Candidate { asked } = &mut contact.role {
-            // Heard of anew, also while it was about to be forgotten.
-            *asked = 0;
-        }
+        self.contacts.get_or_insert_with(place, || Contact::new(now, source)).heard_of(now, source);
         self.ask_unless_just_asked(now, place);
     }
 
@@ -208,7 +204,7 @@ impl Core {
 
     /// The oldest candidate makes room: one that answers does so within milliseconds. // spec: NDL-7.1
     fn make_room_for_a_candidate(&mut self, now: Time) {
-        if self.has_room_for_a_candidate() {
+        if self.contacts.candidates() < self.nodes_max {
             return;
         }
         let candidates = self.contacts.iter().filter(|(_, contact)| contact.is_candidate());
@@ -216,10 +212,6 @@ impl Core {
             self.refusals.count(now, "more addresses than can be asked", &oldest.there);
             self.contacts.remove(&oldest);
         }
-    }
-
-    pub(super) fn has_room_for_a_candidate(&self) -> bool {
-        self.contacts.values().filter(|contact| contact.is_candidate()).count() < self.nodes_max
     }
 
     // spec: NDL-4.4

@@ -11,6 +11,7 @@ use super::{
     Core, Member, Output, Place, Source,
     clock::{Exchange, Measured, PeerClock},
     contact::{Contact, Role},
+    contacts::ContactMut,
     recall::Loss,
     routes::Routes,
     troubles::Troubles,
@@ -399,7 +400,7 @@ impl Core {
                 self.drop_contact(now, place);
                 continue;
             }
-            let contact = self.contact_at(now, place);
+            let mut contact = self.contact_at(now, place);
             contact.role = Role::Former { node, wait: 1, left: 0 };
             contact.questions.clear();
         }
@@ -436,8 +437,8 @@ impl Core {
         self.gone.insert(node, Gone { since: now, places, incarnation, boot_nonce });
     }
 
-    pub(super) fn contact_at(&mut self, now: Time, place: Place) -> &mut Contact {
-        self.contacts.entry(place).or_insert_with(|| Contact::new(now, Source::Query))
+    pub(super) fn contact_at(&mut self, now: Time, place: Place) -> ContactMut<'_> {
+        self.contacts.get_or_insert_with(place, || Contact::new(now, Source::Query))
     }
 
     /// A node is not there any more: what was asked at addresses that it announced is answered too late.
@@ -478,7 +479,7 @@ impl Core {
     /// A node that is back says that it is also where it was asked last: what it is asked there already may make a route. Returns whether
     /// it is asked there.
     fn seeks_former(&mut self, place: Place, node: NodeAddress) -> bool {
-        let Some(contact) = self.contacts.get_mut(&place) else { return false };
+        let Some(mut contact) = self.contacts.get_mut(&place) else { return false };
         let is_its = matches!(contact.role, Role::Former { node: former, .. } if former == node);
         if is_its {
             contact.role = Role::Candidate { asked: 0 };

@@ -181,7 +181,8 @@ impl Core {
     pub(super) fn meet_remembered(&mut self, now: Time) -> Vec<Place> {
         let mut met = Vec::new();
         for (place, node) in self.sought_places() {
-            let contact = self.contacts.entry(place).or_insert_with(|| Contact::remembered(now, node));
+            let mut contact =
+                self.contacts.get_or_insert_with(place, || Contact::remembered(now, node));
             match &mut contact.role {
                 Role::Member(_) => continue,
                 // Another source named it. When that one's time is over, it is met anew.
@@ -198,7 +199,7 @@ impl Core {
     /// answered there, or elsewhere in their node's name, and is gone. // spec: NDL-2.5
     pub(super) fn meet_remembered_again(&mut self, now: Time) {
         for (place, node) in self.sought_places() {
-            self.contacts.entry(place).or_insert_with(|| Contact::remembered(now, node));
+            self.contacts.get_or_insert_with(place, || Contact::remembered(now, node));
         }
     }
 
@@ -278,7 +279,7 @@ impl Core {
             }
         }
         for place in &announced {
-            if let Some(contact) = self.contacts.get_mut(place) {
+            if let Some(mut contact) = self.contacts.get_mut(place) {
                 contact.role = Role::Candidate { asked: 0 };
             }
         }

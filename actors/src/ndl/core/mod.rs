@@ -7,6 +7,7 @@
 //! | --- | --- |
 //! | `budget` | what a flood may cost |
 //! | `contact` | an address that is talked to |
+//! | `contacts` | all of them, and how many are candidates |
 //! | `sources` | who says where to ask |
 //! | `cycle` | who is asked when, and who missed too much |
 //! | `heard` | what a datagram means, and what it proves |
@@ -27,6 +28,7 @@ mod audience;
 mod budget;
 mod clock;
 mod contact;
+mod contacts;
 mod cycle;
 mod duplicates;
 mod heard;
@@ -69,6 +71,7 @@ use self::{
     audience::Audience,
     budget::Strangers,
     contact::{Contact, Question, Questions, Role},
+    contacts::Contacts,
     duplicates::{Claimant, Trial},
     lives::{Contest, Gone},
     member::Member,
@@ -248,7 +251,7 @@ pub(crate) struct Core {
     gone: BTreeMap<NodeAddress, Gone>,
     proven: Proven,
     contests: BTreeMap<NodeAddress, Contest>,
-    contacts: BTreeMap<Place, Contact>,
+    contacts: Contacts,
     group_questions: Questions,
     strangers: Strangers,
     collisions_reported: BTreeMap<NodeAddress, Time>,
@@ -306,7 +309,7 @@ impl Core {
             gone: BTreeMap::new(),
             proven: Proven::new(config),
             contests: BTreeMap::new(),
-            contacts: BTreeMap::new(),
+            contacts: Contacts::default(),
             group_questions: Questions::default(),
             strangers: Strangers::new(Time::ZERO),
             collisions_reported: BTreeMap::new(),
@@ -453,7 +456,7 @@ impl Core {
     /// Asks `to`, whom there is a contact for.
     fn ask(&mut self, now: Time, to: Place) {
         let correlation = self.next_correlation();
-        if let Some(contact) = self.contacts.get_mut(&to) {
+        if let Some(mut contact) = self.contacts.get_mut(&to) {
             let pace = match contact.role {
                 Role::Member(node) => self.members.get(&node).map_or(REST, |member| member.pace),
                 Role::Candidate { .. } | Role::Former { .. } => REST,

@@ -281,7 +281,7 @@ impl Core {
             return;
         }
         self.seeds = seeds;
-        self.contacts.values_mut().for_each(|contact| contact.is_seed = false);
+        self.contacts.change_all(|contact| contact.is_seed = false);
         if self.rest().due.is_some() {
             self.meet_seeds(now);
         }
@@ -298,8 +298,7 @@ impl Core {
         let seeds: Vec<_> = self.seeds.iter().copied().filter(|seed| !is_own(seed)).collect();
         for seed in seeds {
             for place in self.places_of(seed) {
-                let contact = self.contacts.entry(place).or_insert_with(|| Contact::seed(now));
-                contact.is_seed = true;
+                self.contacts.get_or_insert_with(place, || Contact::seed(now)).is_seed = true;
             }
         }
     }
@@ -323,7 +322,7 @@ impl Core {
             let there = places.iter().map(|place| place.there);
             let at = there.flat_map(|there| new.iter().map(move |here| Place::between(*here, there)));
             for place in at.filter(Place::is_a_way) {
-                self.contacts.entry(place).or_insert_with(|| Contact::former(now, node));
+                self.contacts.get_or_insert_with(place, || Contact::former(now, node));
             }
         }
     }
@@ -340,7 +339,7 @@ impl Core {
     pub(super) fn seek_all(&mut self, now: Time) {
         let members: Vec<_> = self.members.keys().copied().collect();
         for place in members.into_iter().flat_map(|node| self.unknown_places_of(node)).collect::<Vec<_>>() {
-            self.contacts.entry(place).or_insert_with(|| Contact::announced(now));
+            self.contacts.get_or_insert_with(place, || Contact::announced(now));
         }
     }
 

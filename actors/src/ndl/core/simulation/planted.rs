@@ -164,7 +164,7 @@ impl Patient {
 
     fn ask_again(&mut self, now: Time, flying: &Flying) {
         if let What::Answer(correlation) = flying.what
-            && let Some(contact) = self.core.contacts.get_mut(&place(flying))
+            && let Some(mut contact) = self.core.contacts.get_mut(&place(flying))
             && !contact.questions.has(correlation)
         {
             contact.questions.push(Question { correlation, asked: now }, 4);

@@ -114,6 +114,8 @@ proptest! {
             }
             prop_assert!(core.members.keys().eq(there.keys()));
             prop_assert!(core.members.len() <= 3 && core.gone.len() <= 3 && core.contacts.len() <= 3 + 3 * 2 * 8 * 2);
+            // Which asserts that they are counted right.
+            prop_assert!(core.contacts.candidates() <= core.contacts.len());
             prop_assert!(core.contacts.keys().all(|place| core.paths().contains(&place.here)));
             prop_assert!(core.contests.keys().all(|node| core.members.contains_key(node)));
             prop_assert!(core.members.keys().all(|node| !core.gone.contains_key(node)));
