@@ -13,8 +13,8 @@ use crate::{lncl::ClientId, outlet::Taking};
 /// any before it is through with them, and a socket is seen to have room when three quarters of it are free: who is slow and lives has this
 /// long for that.
 const IDLE_AFTER: Duration = Duration::from_secs(1);
-/// After a pause longer than so many of the usual ones between two looks, nobody is told for what was before it: the host has stood still,
-/// or this process, and the clients perhaps with it.
+/// After a pause longer than so many of the usual ones between two looks, nobody is told anew for what was before it: the host has stood
+/// still, or this process, and the clients perhaps with it. Who was told before it, and has taken nothing, is told still.
 const LOOKS_MISSED: u32 = 3;
 
 /// What was seen of each client at the last look: of those that there were then.
@@ -39,12 +39,13 @@ impl IdleClients {
         every: Duration,
         clients: impl IntoIterator<Item = (ClientId, Taking)>,
     ) -> BTreeMap<ClientId, Time> {
-        let known = std::mem::take(&mut self.seen);
-        let is_late = self.looked.replace(now).is_some_and(|last| now.since(last) > every * LOOKS_MISSED);
-        let known = |id: &ClientId| known.get(id).filter(|_| !is_late);
+        let before = std::mem::take(&mut self.seen);
+        let last = self.looked.replace(now);
+        let was_told = |seen: &Seen| last.is_some_and(|last| seen.idle_since(last).is_some());
+        let is_late = last.is_some_and(|last| now.since(last) > every * LOOKS_MISSED);
+        let known = |id: &ClientId| before.get(id).filter(|seen| !is_late || was_told(seen));
         self.seen = clients.into_iter().map(|(id, taking)| (id, Seen::of(now, taking, known(&id)))).collect();
-        let waited = self.seen.iter().filter_map(|(id, seen)| Some((*id, seen.since?)));
-        waited.filter(|(_, since)| now.since(*since) >= IDLE_AFTER).collect()
+        self.seen.iter().filter_map(|(id, seen)| Some((*id, seen.idle_since(now)?))).collect()
     }
 }
 
@@ -54,6 +55,11 @@ impl Seen {
         let unmoved = known.filter(|known| known.mark == mark).and_then(|known| known.since);
         Self { mark, since: leaves_some.then(|| unmoved.unwrap_or(now)) }
     }
+
+    /// Since when it has taken nothing, if that is too long at this look.
+    fn idle_since(&self, now: Time) -> Option<Time> {
+        self.since.filter(|since| now.since(*since) >= IDLE_AFTER)
+    }
 }
 
 #[cfg(test)]
@@ -61,6 +67,7 @@ mod tests {
     use super::*;
 
     const KNEE: ClientId = ClientId(7);
+    const HIP: ClientId = ClientId(8);
     const EVERY: Duration = Duration::from_millis(500);
 
     fn at(ms: u64) -> Time {
@@ -108,14 +115,34 @@ mod tests {
     }
 
     #[test]
-    fn after_a_pause_of_the_looks_nobody_is_told_for_what_was_before_it() {
+    fn after_a_pause_of_the_looks_nobody_is_told_anew_for_what_was_before_it() {
         let mut clients = IdleClients::default();
         assert_eq!(look(&mut clients, 500, 96, true), None);
         assert_eq!(look(&mut clients, 60_500, 96, true), None, "the client may have stood still as long");
         assert_eq!(look(&mut clients, 61_000, 96, true), None);
         assert_eq!(look(&mut clients, 61_500, 96, true), Some(at(60_500)));
-        assert_eq!(look(&mut clients, 63_000, 96, true), Some(at(60_500)), "three of the usual looks");
-        assert_eq!(look(&mut clients, 64_501, 96, true), None);
+        // When: another one leaves what came a moment before a pause.
+        let both = [(KNEE, taking(96, true)), (HIP, taking(5, true))];
+        assert_eq!(clients.look(at(62_000), EVERY, both).get(&HIP), None);
+        assert_eq!(clients.look(at(63_500), EVERY, both).get(&HIP), Some(&at(62_000)), "three of the usual looks");
+        let later = [(KNEE, taking(96, true)), (HIP, taking(6, true))];
+        assert_eq!(clients.look(at(63_600), EVERY, later).get(&HIP), None);
+        assert_eq!(clients.look(at(65_101), EVERY, later).get(&HIP), None, "a pause that is longer by a moment");
+    }
+
+    // spec: NDL-9.1
+    #[test]
+    fn who_is_told_stays_so_through_any_pause_of_the_looks_until_it_takes_some() {
+        let mut clients = IdleClients::default();
+        assert_eq!(look(&mut clients, 500, 96, true), None);
+        assert_eq!(look(&mut clients, 1_500, 96, true), Some(at(500)));
+        for ms in [61_500, 62_000, 90_000, 120_000] {
+            assert_eq!(look(&mut clients, ms, 96, true), Some(at(500)), "it has taken nothing at {ms} ms either");
+        }
+        assert_eq!(look(&mut clients, 180_000, 97, true), None, "it has taken some meanwhile");
+        assert_eq!(look(&mut clients, 240_000, 97, true), None, "and was not told before this pause");
+        assert_eq!(look(&mut clients, 241_000, 97, true), Some(at(240_000)));
+        assert_eq!(look(&mut clients, 300_000, 97, false), None, "nothing waits for it any more");
     }
 
     #[test]
@@ -124,10 +151,10 @@ mod tests {
         // A mark that goes anywhere is one that moves, forwards or backwards.
         for (look_number, taken) in [u64::MAX, 0, 96, 95, u64::MAX - 1].into_iter().enumerate() {
             let ms = look_number as u64 * 1_000;
-            let both = [(KNEE, taking(taken, true)), (ClientId(8), taking(5, true))];
+            let both = [(KNEE, taking(taken, true)), (HIP, taking(5, true))];
             let told = clients.look(at(ms), EVERY, both);
             assert_eq!(told.get(&KNEE), None);
-            assert_eq!(told.get(&ClientId(8)).copied(), (ms > 0).then_some(at(0)));
+            assert_eq!(told.get(&HIP).copied(), (ms > 0).then_some(at(0)));
         }
     }
 
