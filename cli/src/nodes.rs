@@ -107,6 +107,12 @@ impl<'a> Row<'a> {
         or_dash(self.seen.map(|seen| seen.found_by.join(", ")).filter(|words| !words.is_empty()))
     }
 
+    /// How many of its clients take nothing, and the first of them: as the node knows through which we came, and of that one as it says.
+    fn idle(&self) -> Option<(u32, &[IdleReport])> {
+        let seen = self.seen.map(|seen| (seen.idle_clients, &seen.idle[..]));
+        seen.or_else(|| self.answer.said.as_ref().ok().map(|said| (said.idle_clients, &said.idle[..])))
+    }
+
     fn cells(&self) -> [String; COLUMNS] {
         let said = self.answer.said.as_ref().ok();
         [
@@ -150,8 +156,8 @@ impl<'a> Row<'a> {
             "bound_us": seen.and_then(|seen| seen.bound_us),
             "troubled": seen.map(|seen| seen.troubled),
             "troubles": seen.map(|seen| seen.troubles.iter().map(trouble_json).collect::<Vec<_>>()),
-            "idle_clients": seen.map(|seen| seen.idle_clients),
-            "idle": seen.map(|seen| seen.idle.iter().map(idle_json).collect::<Vec<_>>()),
+            "idle_clients": self.idle().map(|(count, _)| count),
+            "idle": self.idle().map(|(_, named)| named.iter().map(idle_json).collect::<Vec<_>>()),
             "routes": seen.map(|seen| seen.routes.iter().map(route_json).collect::<Vec<_>>()),
             "round_trip_ns": seen.and_then(|seen| seen.round_trip_ns),
             "clock_offset_ns": seen.and_then(|seen| seen.offset_ns),
@@ -280,20 +286,18 @@ fn troubles(of: &PeerReport) -> String {
 }
 
 /// Which clients of a node take nothing, a line each.
-fn idle(of: &PeerReport) -> String {
-    let name = clean(of.name.as_deref().unwrap_or_default());
+fn idle(row: &Row<'_>) -> String {
+    let Some((count, named)) = row.idle() else { return String::new() };
+    let (node, name) = (row.answer.node, clean(row.name()));
     let mut lines = String::new();
-    for IdleReport { app, name: who, since_us } in &of.idle {
+    for IdleReport { app, name: who, since_us } in named {
         let (who, since) = (clean(who), time(*since_us));
-        lines += &format!(
-            "{} {name}: client {who} ({app}) takes nothing of what waits for it, for {since}\n",
-            of.node
-        );
-    }
-    let unnamed = (of.idle_clients as usize).saturating_sub(of.idle.len());
-    if unnamed > 0 {
         lines +=
-            &format!("{} {name}: {unnamed} further clients take nothing of what waits for them\n", of.node);
+            &format!("{node} {name}: client {who} ({app}) takes nothing of what waits for it, for {since}\n");
+    }
+    let unnamed = (count as usize).saturating_sub(named.len());
+    if unnamed > 0 {
+        lines += &format!("{node} {name}: {unnamed} further clients take nothing of what waits for them\n");
     }
     lines
 }
@@ -329,7 +333,10 @@ fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport]) -> String {
             text += &format!("{} {}: {}\n", row.answer.node, clean(row.name()), clean(why));
         }
     }
-    rows.iter().filter_map(|row| row.seen).for_each(|seen| text += &(troubles(seen) + &idle(seen)));
+    for row in rows {
+        text.extend(row.seen.map(troubles));
+        text += &idle(row);
+    }
     let said = rows.iter().filter_map(|row| row.answer.said.as_ref().ok());
     text.extend(said.filter_map(own_stalls));
     if here.left_out > 0 {
@@ -356,20 +363,46 @@ mod tests {
             bound_us: Some(2_000_000),
             troubled: 3,
             troubles: vec![TroubleReport { app, name, trouble, since_us: 2_500_000 }],
-            idle_clients: 4,
-            idle: vec![IdleReport { app, name: "hand".to_owned(), since_us: 2_900_000 }],
             ..PeerReport::lost(node, Incarnation(1))
         };
-        let takes_nothing = [
-            format!("10.0.0.7 knee: client hand ({app}) takes nothing of what waits for it, for 2.9 s\n"),
-            "10.0.0.7 knee: 3 further clients take nothing of what waits for them\n".to_owned(),
-        ];
-        assert_eq!(idle(&seen), takes_nothing.concat());
         let lines = [
             format!("10.0.0.7 knee: drive ({app}) does not get on: stalled for 2.5 s\n"),
             "10.0.0.7 knee: 2 further ones do not get on\n".to_owned(),
         ];
         assert_eq!(troubles(&seen), lines.concat());
+    }
+
+    #[test]
+    fn clients_that_take_nothing_have_a_line_each_those_of_the_node_through_which_we_came_too() {
+        let node = NodeAddress::from([192, 168, 0, 7]);
+        let app = Tid::new(node, AppAddress::new(0x1000));
+        let (idle_clients, named) =
+            (4, vec![IdleReport { app, name: "hand".to_owned(), since_us: 2_900_000 }]);
+        let answer = |said: NodeReport| Answer {
+            node: said.node,
+            name: "as others call it".to_owned(),
+            said: Ok(said),
+        };
+        let lines = [
+            format!("192.168.0.7 knee: client hand ({app}) takes nothing of what waits for it, for 2.9 s\n"),
+            "192.168.0.7 knee: 3 further clients take nothing of what waits for them\n".to_owned(),
+        ];
+        // As another node knows it, and as it says itself.
+        let plain = answer(security::tests::said("knee", 7, None));
+        let seen = PeerReport { idle_clients, idle: named.clone(), ..PeerReport::lost(node, Incarnation(1)) };
+        let of_peer = Row { answer: &plain, seen: Some(&seen) };
+        let own = answer(NodeReport { idle_clients, idle: named, ..security::tests::said("knee", 7, None) });
+        for row in [of_peer, Row { answer: &own, seen: None }] {
+            assert_eq!(idle(&row), lines.concat());
+            assert_eq!(
+                (&row.json()["idle_clients"], &row.json()["idle"][0]["name"]),
+                (&json!(4), &json!("hand"))
+            );
+        }
+        assert_eq!(idle(&Row { answer: &plain, seen: None }), "");
+        let silent = Answer { node, name: "knee".to_owned(), said: Err("no answer".to_owned()) };
+        let row = Row { answer: &silent, seen: None };
+        assert_eq!((idle(&row), &row.json()["idle_clients"]), (String::new(), &Value::Null));
     }
 
     #[test]

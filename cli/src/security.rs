@@ -140,6 +140,8 @@ pub(crate) mod tests {
             refusals: Vec::new(),
             peers: Vec::new(),
             own_stalls: None,
+            idle_clients: 0,
+            idle: Vec::new(),
             left_out: 0,
         }
     }

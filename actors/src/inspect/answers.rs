@@ -90,6 +90,8 @@ impl Answers {
             sources: ndl.sources,
             lost: ndl.lost,
             own_stalls: Some(ndl.stalls),
+            idle_clients: ndl.idle_clients,
+            idle: ndl.idle,
             foreign: ndl.foreign,
             refusals: refusals(stores, now),
             peers,
@@ -158,6 +160,8 @@ struct Discovery {
     lost: Vec<LostReport>,
     foreign: Vec<ForeignReport>,
     stalls: StallReport,
+    idle_clients: u32,
+    idle: Vec<IdleReport>,
 }
 
 /// The group that is asked: that of IPv6 where there is nothing else.
@@ -172,11 +176,11 @@ fn group(ndl: &NdlConfig) -> Option<String> {
 
 impl Discovery {
     fn of(stores: &Stores, now: Time) -> Self {
-        let (udp, me, sources, lost, foreign, stalls) = {
-            let core = lock(&stores.ndl);
-            let (udp, me) = (core.paths().first().copied(), core.announcement().clone());
-            (udp, me, core.source_counts(), core.lost_nodes(), core.neighbours(), core.own_stalls())
-        };
+        let core = lock(&stores.ndl);
+        let (udp, me) = (core.paths().first().copied(), core.announcement().clone());
+        let (sources, lost, foreign) = (core.source_counts(), core.lost_nodes(), core.neighbours());
+        let (stalls, (idle_clients, idle_apps)) = (core.own_stalls(), core.own_idle());
+        drop(core);
         let stalls = StallReport {
             count: stalls.count,
             longest_us: micros(stalls.longest),
@@ -199,7 +203,16 @@ impl Discovery {
             found: members as u64,
         };
         let sources = sources.into_iter().map(source).collect();
-        Self { udp: udp.map(|udp| udp.to_string()), gncl, sources, lost, foreign: foreign.collect(), stalls }
+        Self {
+            udp: udp.map(|udp| udp.to_string()),
+            gncl,
+            sources,
+            lost,
+            foreign: foreign.collect(),
+            stalls,
+            idle_clients: u32::try_from(idle_clients).unwrap_or(u32::MAX),
+            idle: idle_apps.iter().map(idle).collect(),
+        }
     }
 }
 

@@ -141,6 +141,12 @@ payload!("sinew.inspect.node_report" =>
         /// How often its own NDL was starved, so that it counted nobody as silent.
         #[serde(default)]
         pub own_stalls: Option<StallReport>,
+        /// How many of its clients take nothing of what waits for them.
+        #[serde(default)]
+        pub idle_clients: u32,
+        /// The first of them: two at most.
+        #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
+        pub idle: Vec<IdleReport>,
         /// Nodes of other projects that it hears.
         #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
         pub foreign: Vec<ForeignReport>,

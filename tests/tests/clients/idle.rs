@@ -3,7 +3,11 @@
 use std::process::Command;
 
 use rustix::process::Signal;
-use sinew::{Outcome, Sender, Tid, inspect::Ping, prelude::*};
+use sinew::{
+    Outcome, Sender, Tid,
+    inspect::{AskNode, NodeReport, Ping},
+    prelude::*,
+};
 use sinew_tests::{
     DEADLINE, Ground, Log, OwnDirectory, Program, all_run, program,
     puppet::{Seen, Stage, desk, send_jobs, wait},
@@ -17,7 +21,7 @@ struct Scene {
     here: Node,
     /// What an application on the other node heard.
     heard: Log<Seen>,
-    _there: Node,
+    there: Node,
     directory: OwnDirectory,
 }
 
@@ -38,7 +42,7 @@ impl Scene {
         let there = opened.app(desk).start().expect("a node");
         all_run(&[&here, &there]);
         sees(&here.handle(), there.address());
-        Self { sender: key.sender(), here, heard, _there: there, directory }
+        Self { sender: key.sender(), here, heard, there, directory }
     }
 
     /// A client that runs, and that the sender knows.
@@ -63,6 +67,15 @@ impl Scene {
         until("a client that takes nothing is known", || self.idle().filter(|idle| !idle.is_empty()))
     }
 
+    /// The same, as their own node says.
+    fn idle_of_itself(&self) -> Vec<(Tid, String)> {
+        let inspection = Tid::new(self.there.address(), AppAddress::INSPECT);
+        let asked = self.sender.ask::<_, NodeReport>(inspection, &AskNode {}, DEADLINE);
+        let said = wait(asked.expect("it has a place")).expect("an answer");
+        assert_eq!(said.idle_clients as usize, said.idle.len(), "there are fewer than can be named");
+        said.idle.into_iter().map(|client| (client.app, client.name)).collect()
+    }
+
     /// Waits until it knows of none any more.
     fn wait_for_none(&self) {
         until("no client that takes nothing is known", || self.idle().filter(Vec::is_empty));
@@ -80,6 +93,7 @@ fn a_client_that_takes_nothing_is_known_to_other_nodes_until_it_does_or_is_gone_
     send_jobs(&scene.sender, "hand", [1, 2]);
     // Then
     assert_eq!(scene.wait_for_idle(), shown);
+    assert_eq!(scene.idle_of_itself(), shown);
     // When: it goes on.
     hand.signal(Signal::CONT);
     // Then

@@ -10,7 +10,7 @@ use sinew_runtime::{
 use super::{Core, LostNode, Member, Neighbour, OwnStalls, Place, Source, routes::Route};
 use crate::{
     clocks::ClockOffset,
-    ndl::{IdleClient, Part, Trouble},
+    ndl::{IdleClient, Part, Progress, Trouble},
 };
 
 /// A node that is there.
@@ -152,6 +152,12 @@ impl Core {
             *first = (*at).min(*first);
         }
         sources
+    }
+
+    /// How many clients of this node take nothing of what waits for them, and the first of them. // spec: NDL-9.1
+    pub(crate) fn own_idle(&self) -> (usize, Vec<IdleApp>) {
+        let Progress { idle: count, clients, .. } = &self.progress;
+        (*count as usize, clients.iter().map(|client| idle(self.me.node, client)).collect())
     }
 
     /// Who was there and has not come back, as far as is remembered.

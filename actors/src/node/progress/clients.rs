@@ -124,10 +124,18 @@ mod tests {
         // When: another one leaves what came a moment before a pause.
         let both = [(KNEE, taking(96, true)), (HIP, taking(5, true))];
         assert_eq!(clients.look(at(62_000), EVERY, both).get(&HIP), None);
-        assert_eq!(clients.look(at(63_500), EVERY, both).get(&HIP), Some(&at(62_000)), "three of the usual looks");
+        assert_eq!(
+            clients.look(at(63_500), EVERY, both).get(&HIP),
+            Some(&at(62_000)),
+            "three of the usual looks"
+        );
         let later = [(KNEE, taking(96, true)), (HIP, taking(6, true))];
         assert_eq!(clients.look(at(63_600), EVERY, later).get(&HIP), None);
-        assert_eq!(clients.look(at(65_101), EVERY, later).get(&HIP), None, "a pause that is longer by a moment");
+        assert_eq!(
+            clients.look(at(65_101), EVERY, later).get(&HIP),
+            None,
+            "a pause that is longer by a moment"
+        );
     }
 
     // spec: NDL-9.1
@@ -137,7 +145,11 @@ mod tests {
         assert_eq!(look(&mut clients, 500, 96, true), None);
         assert_eq!(look(&mut clients, 1_500, 96, true), Some(at(500)));
         for ms in [61_500, 62_000, 90_000, 120_000] {
-            assert_eq!(look(&mut clients, ms, 96, true), Some(at(500)), "it has taken nothing at {ms} ms either");
+            assert_eq!(
+                look(&mut clients, ms, 96, true),
+                Some(at(500)),
+                "it has taken nothing at {ms} ms either"
+            );
         }
         assert_eq!(look(&mut clients, 180_000, 97, true), None, "it has taken some meanwhile");
         assert_eq!(look(&mut clients, 240_000, 97, true), None, "and was not told before this pause");

@@ -73,6 +73,8 @@ fn report(number: u8, name: &str, other: u8) -> NodeReport {
         sources: Vec::new(),
         lost: Vec::new(),
         own_stalls: None,
+        idle_clients: 0,
+        idle: Vec::new(),
         foreign: Vec::new(),
         refusals: Vec::new(),
         peers: vec![peer(other)],

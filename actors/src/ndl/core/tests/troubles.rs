@@ -119,6 +119,8 @@ fn clients_that_take_nothing_are_known_as_said_last_and_nobody_is_told_of_them_o
         world.input(2, Input::ProgressSeen(Progress::default().with_clients(clients)));
         world.run(PERIOD + ms(1));
         assert_eq!(idle(&world), (100, vec![(first, ms(2_900)), (first + 1, ms(2_900))]));
+        let (own, known) = (world.at(2).core.own_idle(), &world.at(1).core.members(world.now)[0]);
+        assert_eq!(own, (known.idle_clients, known.idle.clone()), "it knows itself what it says");
     }
     let own = Progress::of(vec![part(0x9000_0000, stalled)]);
     world.input(2, Input::ProgressSeen(own.with_clients((0x1000..0x1064).map(client).collect())));
