@@ -51,16 +51,6 @@ pub(super) struct Contest {
     pub(super) newcomer: Proof,
 }
 
-/// The last life of a node that is gone.
-#[derive(Debug)]
-pub(super) struct Gone {
-    since: Time,
-    /// Where it was asked.
-    pub(super) places: Vec<Place>,
-    incarnation: Incarnation,
-    boot_nonce: u64,
-}
-
 /// How a node that becomes a member is announced to applications.
 #[derive(Clone, Copy, Debug)]
 enum Arrival {
@@ -421,22 +411,6 @@ impl Core {
         }
     }
 
-    /// Keeps the last life of a lost node, so that a former one never comes back. // spec: NDL-7.1
-    fn remember(&mut self, now: Time, member: &Member) {
-        if self.gone.len() >= self.nodes_max
-            && let Some(node) = self.gone.iter().min_by_key(|(_, gone)| gone.since).map(|(node, _)| *node)
-            && let Some(oldest) = self.gone.remove(&node)
-        {
-            oldest.places.into_iter().for_each(|place| self.forget_former(place, node));
-        }
-        let Announcement { node, incarnation, boot_nonce, .. } = member.announcement;
-        let mut places: Vec<_> = member.routes.places().collect();
-        if places.is_empty() {
-            places.push(member.routes.best());
-        }
-        self.gone.insert(node, Gone { since: now, places, incarnation, boot_nonce });
-    }
-
     pub(super) fn contact_at(&mut self, now: Time, place: Place) -> ContactMut<'_> {
         self.contacts.get_or_insert_with(place, || Contact::new(now, Source::Query))
     }
@@ -454,46 +428,11 @@ impl Core {
         places.into_iter().for_each(|place| self.drop_contact(now, place));
     }
 
-    /// Whether this is the last life of a lost node, which is still asked where it was.
-    pub(super) fn is_former_at(&self, place: Place, announcement: &Announcement) -> bool {
-        let Announcement { node, incarnation, boot_nonce, .. } = *announcement;
-        let is_asked = self.contacts.get(&place).is_some_and(
-            |contact| matches!(contact.role, Role::Former { node: former, .. } if former == node),
-        );
-        let Some(gone) = self.gone.get(&node) else { return false };
-        let is_it = (gone.incarnation, gone.boot_nonce) == (incarnation, boot_nonce);
-        // It says goodbye on each of its routes, and may have had one that this node did not.
-        let is_announced = announcement.has_ndl_at(place.there)
-            && gone.places.iter().any(|known| announcement.has_ndl_at(known.there));
-        is_it && (is_asked || is_announced)
-    }
-
     /// Nobody that we know is at `place` any more; a seed is still asked.
     pub(super) fn drop_contact(&mut self, now: Time, place: Place) {
         let Some(contact) = self.contacts.remove(&place) else { return };
         if contact.is_seed {
             self.contacts.insert(place, Contact::seed(now));
-        }
-    }
-
-    /// A node that is back says that it is also where it was asked last: what it is asked there already may make a route. Returns whether
-    /// it is asked there.
-    fn seeks_former(&mut self, place: Place, node: NodeAddress) -> bool {
-        let Some(mut contact) = self.contacts.get_mut(&place) else { return false };
-        let is_its = matches!(contact.role, Role::Former { node: former, .. } if former == node);
-        if is_its {
-            contact.role = Role::Candidate { asked: 0 };
-            contact.sources.clear();
-        }
-        is_its
-    }
-
-    fn forget_former(&mut self, place: Place, node: NodeAddress) {
-        if let Some(contact) = self.contacts.get(&place)
-            && matches!(contact.role, Role::Former { node: former, .. } if former == node)
-            && !contact.is_seed
-        {
-            self.contacts.remove(&place);
         }
     }
 }

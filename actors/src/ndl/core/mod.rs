@@ -13,6 +13,7 @@
 //! | `heard` | what a datagram means, and what it proves |
 //! | `member` | what is known of a node that answers |
 //! | `lives` | who comes, goes, comes again |
+//! | `gone` | who has gone, and where he is asked |
 //! | `duplicates` | which of two processes has a node address |
 //! | `proven` | whom no datagram ends, where nodes have keys |
 //! | `routes` | from where to where a member is asked |
@@ -31,6 +32,7 @@ mod contact;
 mod contacts;
 mod cycle;
 mod duplicates;
+mod gone;
 mod heard;
 mod lives;
 mod member;
@@ -73,7 +75,8 @@ use self::{
     contact::{Contact, Question, Questions, Role},
     contacts::Contacts,
     duplicates::{Claimant, Trial},
-    lives::{Contest, Gone},
+    gone::Gone,
+    lives::Contest,
     member::Member,
     memory::Memory,
     pace::{Pace, REST},

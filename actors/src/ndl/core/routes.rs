@@ -315,18 +315,6 @@ impl Core {
         if ways.is_empty() { places().collect() } else { ways }
     }
 
-    /// Who was lost may be in reach from an address that we did not have.
-    fn look_for_the_gone(&mut self, now: Time, new: &[SocketAddr]) {
-        let gone: Vec<_> = self.gone.iter().map(|(node, gone)| (*node, gone.places.clone())).collect();
-        for (node, places) in gone {
-            let there = places.iter().map(|place| place.there);
-            let at = there.flat_map(|there| new.iter().map(move |here| Place::between(*here, there)));
-            for place in at.filter(Place::is_a_way) {
-                self.contacts.get_or_insert_with(place, || Contact::former(now, node));
-            }
-        }
-    }
-
     /// Asks a member wherever it says that it is and has not answered.
     pub(super) fn seek(&mut self, now: Time, node: NodeAddress) {
         for place in self.unknown_places_of(node) {
