@@ -30,7 +30,7 @@ impl Core {
             && let Some(node) = self.gone.iter().min_by_key(|(_, gone)| gone.since).map(|(node, _)| *node)
             && let Some(oldest) = self.gone.remove(&node)
         {
-            oldest.places.into_iter().for_each(|place| self.forget_former(place, node));
+            self.asked_for(node, &oldest).into_iter().for_each(|place| self.forget_former(place));
         }
         let Announcement { node, incarnation, boot_nonce, .. } = member.announcement;
         let mut places: Vec<_> = member.routes.places().collect();
@@ -55,9 +55,7 @@ impl Core {
     /// Whether this is the last life of a lost node, which is still asked where it was.
     pub(super) fn is_former_at(&self, place: Place, announcement: &Announcement) -> bool {
         let Announcement { node, incarnation, boot_nonce, .. } = *announcement;
-        let is_asked = self.contacts.get(&place).is_some_and(
-            |contact| matches!(contact.role, Role::Former { node: former, .. } if former == node),
-        );
+        let is_asked = self.contacts.get(&place).is_some_and(|contact| contact.is_former_of(node));
         let Some(gone) = self.gone.get(&node) else { return false };
         let is_it = (gone.incarnation, gone.boot_nonce) == (incarnation, boot_nonce);
         // It says goodbye on each of its routes, and may have had one that this node did not.
@@ -66,23 +64,33 @@ impl Core {
         is_it && (is_asked || is_announced)
     }
 
-    /// A node that is back says that it is also where it was asked last: what it is asked there already may make a route. Returns whether
-    /// it is asked there.
-    pub(super) fn seeks_former(&mut self, place: Place, node: NodeAddress) -> bool {
-        let Some(mut contact) = self.contacts.get_mut(&place) else { return false };
-        let is_its = matches!(contact.role, Role::Former { node: former, .. } if former == node);
-        if is_its {
-            contact.role = Role::Candidate { asked: 0 };
-            contact.sources.clear();
+    /// A node that was gone is back, and answers at `from`. Where else it was asked for that, it is asked as a member if it says that it is
+    /// there, as what it is asked already may make a route, and else no more. Returns where it is. // spec: NDL-2.1
+    pub(super) fn settle_gone(&mut self, gone: &Gone, from: Place, back: &Announcement) -> Vec<Place> {
+        let others = self.asked_for(back.node, gone).into_iter().filter(|place| *place != from);
+        let (announced, former): (Vec<_>, Vec<_>) = others.partition(|place| back.has_ndl_at(place.there));
+        former.into_iter().for_each(|place| self.forget_former(place));
+        for place in &announced {
+            if let Some(mut contact) = self.contacts.get_mut(place) {
+                contact.role = Role::Candidate { asked: 0 };
+                contact.sources.clear();
+            }
         }
-        is_its
+        announced
     }
 
-    pub(super) fn forget_former(&mut self, place: Place, node: NodeAddress) {
-        if let Some(contact) = self.contacts.get(&place)
-            && matches!(contact.role, Role::Former { node: former, .. } if former == node)
-            && !contact.is_seed
-        {
+    /// Where a node is asked because it is gone: where it was, and the same from addresses of ours that came since. Where it is only
+    /// remembered it is asked for that.
+    fn asked_for(&self, node: NodeAddress, gone: &Gone) -> Vec<Place> {
+        let is_asked = |(place, contact): &(&Place, &Contact)| {
+            contact.is_former_of(node) && (gone.places.contains(place) || !contact.is_remembered_alone())
+        };
+        self.contacts.iter().filter(is_asked).map(|(place, _)| *place).collect()
+    }
+
+    /// Nobody is asked for at `place` any more; a seed still is.
+    fn forget_former(&mut self, place: Place) {
+        if self.contacts.get(&place).is_some_and(|contact| !contact.is_seed) {
             self.contacts.remove(&place);
         }
     }

@@ -221,14 +221,9 @@ impl Core {
         let Announcement { node, incarnation, ref name, .. } = announcement;
         let name = name.clone();
         let gncl = announcement.gncl_addresses(Some(from.there), [(from.here, from.there)]);
-        let mut sought = Vec::new();
-        if let Some(gone) = self.gone.remove(&node) {
-            let others = gone.places.into_iter().filter(|place| *place != from);
-            let (announced, former): (Vec<_>, Vec<_>) =
-                others.partition(|place| announcement.has_ndl_at(place.there));
-            former.into_iter().for_each(|place| self.forget_former(place, node));
-            sought.extend(announced.into_iter().filter(|place| self.seeks_former(*place, node)));
-        }
+        let gone = self.gone.remove(&node);
+        let mut sought =
+            gone.map_or_else(Vec::new, |gone| self.settle_gone(&gone, from, &announcement));
         self.contact_at(now, from).role = Role::Member(node);
         let pace = self.pace_for(now, &name);
         let member = Member {

@@ -360,5 +360,6 @@ fn a_member_has_no_more_routes_than_there_are_paths_however_much_it_says() {
     }
 }
 
+mod gone;
 mod ipv6;
 mod redundancy;
