@@ -11,12 +11,14 @@ use super::{
     Core, Member, Place,
     contact::{Contact, Role},
 };
-use crate::ndl::datagram::Announcement;
+use crate::ndl::{LossReason, datagram::Announcement};
 
 /// The last life of a node that is gone.
 #[derive(Debug)]
 pub(super) struct Gone {
     pub(super) since: Time,
+    /// It said so, and is asked no more.
+    has_left: bool,
     /// Where it was asked.
     pub(super) places: Vec<Place>,
     pub(super) incarnation: Incarnation,
@@ -25,7 +27,7 @@ pub(super) struct Gone {
 
 impl Core {
     /// Keeps the last life of a lost node, so that a former one never comes back. // spec: NDL-7.1
-    pub(super) fn remember(&mut self, now: Time, member: &Member) {
+    pub(super) fn remember(&mut self, now: Time, member: &Member, why: LossReason) {
         if self.gone.len() >= self.nodes_max
             && let Some(node) = self.gone.iter().min_by_key(|(_, gone)| gone.since).map(|(node, _)| *node)
             && let Some(oldest) = self.gone.remove(&node)
@@ -37,13 +39,15 @@ impl Core {
         if places.is_empty() {
             places.push(member.routes.best());
         }
-        self.gone.insert(node, Gone { since: now, places, incarnation, boot_nonce });
+        let has_left = why == LossReason::Left;
+        self.gone.insert(node, Gone { since: now, has_left, places, incarnation, boot_nonce });
     }
 
-    /// Who was lost may be in reach from an address that we did not have.
+    /// Who was lost may be in reach from an address that we did not have; who has left is looked for nowhere.
     pub(super) fn look_for_the_gone(&mut self, now: Time, new: &[SocketAddr]) {
-        let gone: Vec<_> = self.gone.iter().map(|(node, gone)| (*node, gone.places.clone())).collect();
-        for (node, places) in gone {
+        let lost = self.gone.iter().filter(|(_, gone)| !gone.has_left);
+        let lost: Vec<_> = lost.map(|(node, gone)| (*node, gone.places.clone())).collect();
+        for (node, places) in lost {
             let there = places.iter().map(|place| place.there);
             let at = there.flat_map(|there| new.iter().map(move |here| Place::between(*here, there)));
             for place in at.filter(Place::is_a_way) {

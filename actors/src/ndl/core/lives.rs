@@ -376,7 +376,7 @@ impl Core {
         } else if !self.bars_earlier(&member) {
             // It may never have been there.
         } else {
-            self.remember(now, &member);
+            self.remember(now, &member, why);
         }
         self.void_questions(now, &member.announcement);
         let places: Vec<_> = member.routes.places().collect();

@@ -66,6 +66,17 @@ fn who_is_back_is_asked_from_an_address_that_came_meanwhile_where_it_says_that_i
     assert!(asked >= 12, "ever more seldom would be 5 times at most, not {asked}");
 }
 
+// spec: NDL-2.1
+#[test]
+fn who_has_left_is_asked_from_no_address_that_comes_later() {
+    let mut bench = alone();
+    bench.speak(way(0), single());
+    bench.core.handle(bench.now, Input::LeaveReceived { from: way(0), announcement: single() });
+    assert!(bench.life().is_none(), "it said goodbye");
+    bench.joins_the_second_network();
+    assert!(bench.asked.is_empty() && bench.core.contacts.is_empty(), "{:?}", bench.asked);
+}
+
 // spec: NDL-7.1
 #[test]
 fn who_was_gone_longest_and_makes_room_is_asked_from_no_address_any_more() {
