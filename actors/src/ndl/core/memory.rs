@@ -203,15 +203,19 @@ impl Core {
         }
     }
 
-    /// Where those are asked that are sought. A member says itself where else it is.
+    /// Where those are asked that are sought. A member says itself where else it is, and is asked there as that, whoever is remembered there.
     fn sought_places(&self) -> Vec<(Place, NodeAddress)> {
         let sought = self.memory.entries.iter().filter(|entry| entry.is_sought).map(|entry| entry.peer);
         let sought = sought.filter(|peer| !self.is_believed(peer.node));
         let places = sought.flat_map(|RememberedPeer { address, node, .. }| {
             self.paths.iter().map(move |here| (Place::between(*here, address), node))
         });
+        let is_announced = |place: Place, node| {
+            self.members.get(&node).is_some_and(|member: &Member| member.announces(place))
+        };
+        let places = places.filter(|(place, node)| place.is_a_way() && !is_announced(*place, *node));
         // An address that was another node's may be our own by now.
-        places.filter(|(place, _)| place.is_a_way() && !self.paths.contains(&place.there)).collect()
+        places.filter(|(place, _)| !self.paths.contains(&place.there)).collect()
     }
 
     /// Whether a member is taken for what it says that it is: where nodes have keys, when it has proven itself, too. // spec: NDL-2.5

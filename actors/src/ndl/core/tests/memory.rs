@@ -116,6 +116,38 @@ fn where_nodes_have_keys_an_address_that_a_member_announces_is_asked_as_one_befo
     }
 }
 
+// spec: NDL-2.5, NDL-3.3
+#[test]
+fn where_nodes_have_keys_such_an_address_is_asked_as_announced_also_from_an_address_that_comes_later() {
+    let comes = |world: &mut World| world.with(udp(1), |core, now| core.use_paths(now, &[udp(1), udp(7)]));
+    let comes_with_a_restart = |world: &mut World| {
+        world.with(udp(1), |core, now| {
+            core.start(now, &[udp(1), udp(7)]);
+        });
+    };
+    for come in [&comes as &dyn Fn(&mut World), &comes_with_a_restart] {
+        // given
+        let mut world = World::new();
+        world.start(1, &Spec { has_keys: true, ..alone(1, 1) });
+        world.start(2, &alone(2, 1));
+        world.with(udp(2), |core, now| {
+            core.start(now, &[udp(2), udp(3)]);
+        });
+        let at = |index| RememberedPeer { address: udp(index), node: node(2), unanswered: 0 };
+        world.input(1, Input::PeersRemembered(vec![at(2), at(3)]));
+        world.run_until(ms(1), |world| world.knows(1, 2));
+        // when
+        come(&mut world);
+        // then
+        for _ in 0..40 {
+            let contact = world.at(1).core.contacts.get(&place(7, udp(3)));
+            assert!(contact.is_none_or(|contact| !contact.is_former_of(node(2))));
+            world.run(PERIOD);
+        }
+        assert!(world.knows(1, 2));
+    }
+}
+
 // spec: NDL-2.5
 #[test]
 fn an_address_where_nobody_answers_is_asked_ever_more_seldom_and_never_given_up() {
