@@ -222,6 +222,9 @@ impl Core {
             let what = format_args!("{} says that {} gives its address up", from.there, announcement.node);
             self.refusals.count(now, "NDL leave of a node that is connected", &what);
         } else if self.is_said_by_member(from, announcement) {
+            if !yields {
+                self.note_goodbye(announcement.node, announcement.incarnation);
+            }
             let why = if yields { LossReason::Duplicate } else { LossReason::Left };
             self.lose(now, announcement.node, why);
         } else if self.is_former_at(from, announcement) {

@@ -329,6 +329,10 @@ impl Core {
         | LinkFact::LinkBroken { node, incarnation }
         | LinkFact::DialRefused { node, incarnation }
         | LinkFact::PeerLeft { node, incarnation }) = fact;
+        if let LinkFact::PeerLeft { .. } = fact {
+            // Before the connection is over that proves who says so.
+            self.note_goodbye(node, incarnation);
+        }
         self.note_proof(now, fact);
         let Some(member) = self.members.get_mut(&node).filter(|m| m.announcement.incarnation == incarnation)
         else {

@@ -9,7 +9,10 @@ use std::{
     time::Duration,
 };
 
-use sinew_runtime::{tid::NodeAddress, time::Time};
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
 
 use super::{
     Core, Member, Place, Source,
@@ -140,6 +143,14 @@ impl Memory {
         }
     }
 
+    /// A node has said goodbye at each of its addresses: it is at none of them.
+    fn left(&mut self, node: NodeAddress, is_its: impl Fn(SocketAddr) -> bool) {
+        let entries = self.entries.iter_mut().filter(|entry| entry.peer.node == node);
+        for entry in entries.filter(|entry| is_its(entry.peer.address)) {
+            entry.is_sought = false;
+        }
+    }
+
     fn has(&self, node: NodeAddress) -> bool {
         self.entries.iter().any(|entry| entry.peer.node == node)
     }
@@ -234,6 +245,17 @@ impl Core {
     pub(super) fn note_all_met(&mut self, node: NodeAddress) {
         let places = self.members.get(&node).map(|member| member.routes.places().collect::<Vec<_>>());
         places.into_iter().flatten().for_each(|place| self.note_met(node, place));
+    }
+
+    /// This life of a node says goodbye, for all addresses that it announces. Where else it is remembered it may be all the same: somebody may
+    /// have answered in its name. So may he have who says goodbye unproven where nodes have keys. // spec: NDL-2.5
+    pub(super) fn note_goodbye(&mut self, node: NodeAddress, incarnation: Incarnation) {
+        if let Some(member) = self.members.get(&node)
+            && member.announcement.incarnation == incarnation
+            && self.is_believed(node)
+        {
+            self.memory.left(node, |address| member.announcement.has_ndl_at(address));
+        }
     }
 
     /// A node was a member until now. The room that it leaves is for those that were met while there was none.

@@ -95,12 +95,10 @@ fn who_leaves_after_this_layer_was_started_anew_is_not_asked_any_more() {
     assert_eq!(world.at(1).datagrams_sent, 0);
 }
 
-// spec: NDL-2.5
-#[test]
-fn where_nodes_have_keys_an_address_that_a_member_announces_is_asked_as_one_before_it_has_proven_itself() {
-    // given: nobody answers at one of its addresses, which is remembered too
+/// A node that remembers another one at two addresses, of which it announces both and answers at one.
+fn beside_one_of_two_addresses(has_keys: bool) -> World {
     let mut world = World::new();
-    world.start(1, &Spec { has_keys: true, ..alone(1, 1) });
+    world.start(1, &Spec { has_keys, ..alone(1, 1) });
     world.start(2, &alone(2, 1));
     world.with(udp(2), |core, now| {
         core.start(now, &[udp(2), udp(3)]);
@@ -108,7 +106,46 @@ fn where_nodes_have_keys_an_address_that_a_member_announces_is_asked_as_one_befo
     let at = |index| RememberedPeer { address: udp(index), node: node(2), unanswered: 0 };
     world.input(1, Input::PeersRemembered(vec![at(2), at(3)]));
     world.run_until(ms(1), |world| world.knows(1, 2));
-    // then
+    world
+}
+
+// spec: NDL-2.5, NDL-4.4
+#[test]
+fn who_leaves_is_asked_no_more_at_any_address_that_it_announced() {
+    let (node, incarnation) = (node(2), Incarnation(1));
+    let says_so = |world: &mut World| world.input(2, Input::Stopping);
+    let says_so_on_its_connection = |world: &mut World| {
+        world.kill(2);
+        world.run(ms(1));
+        world.link(1, LinkFact::PeerLeft { node, incarnation });
+    };
+    for has_keys in [false, true] {
+        for leave in [&says_so as &dyn Fn(&mut World), &says_so_on_its_connection] {
+            // given
+            let mut world = beside_one_of_two_addresses(has_keys);
+            world.link(1, LinkFact::LinkUp { node, incarnation });
+            world.run(PERIOD * 2);
+            // when
+            leave(&mut world);
+            world.run_until(ms(1), |world| world.losses(1) == [(2, LossReason::Left)]);
+            world.forget_the_past();
+            // then
+            world.run(PERIOD * 40);
+            assert_eq!(world.at(1).datagrams_sent, 0);
+        }
+    }
+    // But who has proven nothing speaks for nobody.
+    let mut world = beside_one_of_two_addresses(true);
+    says_so(&mut world);
+    world.run_until(ms(1), |world| !world.knows(1, 2));
+    world.run(PERIOD * 2);
+    assert!([udp(2), udp(3)].iter().all(|at| world.at(1).core.contacts.contains_key(&place(1, *at))));
+}
+
+// spec: NDL-2.5
+#[test]
+fn where_nodes_have_keys_an_address_that_a_member_announces_is_asked_as_one_before_it_has_proven_itself() {
+    let mut world = beside_one_of_two_addresses(true);
     for _ in 0..40 {
         world.run(PERIOD);
         let contact = world.at(1).core.contacts.get(&place(1, udp(3)));
@@ -126,16 +163,7 @@ fn where_nodes_have_keys_such_an_address_is_asked_as_announced_also_from_an_addr
         });
     };
     for come in [&comes as &dyn Fn(&mut World), &comes_with_a_restart] {
-        // given
-        let mut world = World::new();
-        world.start(1, &Spec { has_keys: true, ..alone(1, 1) });
-        world.start(2, &alone(2, 1));
-        world.with(udp(2), |core, now| {
-            core.start(now, &[udp(2), udp(3)]);
-        });
-        let at = |index| RememberedPeer { address: udp(index), node: node(2), unanswered: 0 };
-        world.input(1, Input::PeersRemembered(vec![at(2), at(3)]));
-        world.run_until(ms(1), |world| world.knows(1, 2));
+        let mut world = beside_one_of_two_addresses(true);
         // when
         come(&mut world);
         // then
