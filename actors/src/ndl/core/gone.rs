@@ -25,6 +25,13 @@ pub(super) struct Gone {
     pub(super) boot_nonce: u64,
 }
 
+impl Gone {
+    /// Whether it is asked there because it is gone.
+    pub(super) fn is_asked_at(&self, place: &Place) -> bool {
+        !self.has_left && self.places.contains(place)
+    }
+}
+
 impl Core {
     /// Keeps the last life of a lost node, so that a former one never comes back. // spec: NDL-7.1
     pub(super) fn remember(&mut self, now: Time, member: &Member, why: LossReason) {
@@ -87,7 +94,7 @@ impl Core {
     /// remembered it is asked for that.
     fn asked_for(&self, node: NodeAddress, gone: &Gone) -> Vec<Place> {
         let is_asked = |(place, contact): &(&Place, &Contact)| {
-            contact.is_former_of(node) && (gone.places.contains(place) || !contact.is_remembered_alone())
+            contact.is_former_of(node) && (gone.is_asked_at(place) || !contact.is_remembered_alone())
         };
         self.contacts.iter().filter(is_asked).map(|(place, _)| *place).collect()
     }

@@ -74,6 +74,8 @@ pub(super) struct Memory {
     has_counted: bool,
     /// Changes so far of what is to be kept.
     changes: u64,
+    /// Where nobody is remembered any more who was sought, since that was taken out last.
+    forgotten: Vec<SocketAddr>,
 }
 
 impl Memory {
@@ -85,8 +87,8 @@ impl Memory {
         standing: impl Fn(&RememberedPeer) -> Standing,
     ) {
         let known = self.entries.iter().position(|entry| entry.peer.address == address);
-        let known = known.map(|at| self.entries.remove(at).peer);
-        let is_its = known.is_some_and(|peer| peer.node == node);
+        let is_its = known.is_some_and(|at| self.entries[at].peer.node == node);
+        let known = known.map(|at| if is_its { self.entries.remove(at).peer } else { self.forget(at) });
         if !is_its && !self.makes_room(node, standing) {
             self.changes += u64::from(known.is_some());
             return;
@@ -109,8 +111,17 @@ impl Memory {
         let left = leaves.filter(|(standing, _)| *standing != Standing::Here).map(|(_, at)| at);
         let given = || if self.has(node) { None } else { self.second_of_one() };
         let Some(at) = left.or_else(given) else { return false };
-        self.entries.remove(at);
+        self.forget(at);
         true
+    }
+
+    /// One entry less.
+    fn forget(&mut self, at: usize) -> RememberedPeer {
+        let Entry { peer, is_sought } = self.entries.remove(at);
+        if is_sought {
+            self.forgotten.push(peer.address);
+        }
+        peer
     }
 
     /// Where the second address of any node is.
@@ -221,7 +232,7 @@ impl Core {
         let places = sought.flat_map(|RememberedPeer { address, node, .. }| {
             self.paths.iter().map(move |here| (Place::between(*here, address), node))
         });
-        let is_announced = |place: Place, node| {
+        let is_announced = |place: Place, node: NodeAddress| {
             self.members.get(&node).is_some_and(|member: &Member| member.announces(place))
         };
         let places = places.filter(|(place, node)| place.is_a_way() && !is_announced(*place, *node));
@@ -238,7 +249,25 @@ impl Core {
     pub(super) fn note_met(&mut self, node: NodeAddress, place: Place) {
         if self.is_believed(node) {
             self.memory.met(node, unscoped(place.there), |peer| standing(&self.members, peer));
+            self.drop_forgotten();
         }
+    }
+
+    /// Where nobody is remembered any more nobody is asked for that. One that was lost there is asked for that. // spec: NDL-2.5
+    fn drop_forgotten(&mut self) {
+        let forgotten = std::mem::take(&mut self.memory.forgotten);
+        if forgotten.is_empty() {
+            return;
+        }
+        let gone = &self.gone;
+        let is_lost_there = |place: &Place, contact: &Contact| match contact.role {
+            Role::Former { node, .. } => gone.get(&node).is_some_and(|gone| gone.is_asked_at(place)),
+            Role::Candidate { .. } | Role::Member(_) => false,
+        };
+        self.contacts.retain(|place, contact| {
+            let is_forgotten = contact.is_remembered_alone() && forgotten.contains(&unscoped(place.there));
+            !is_forgotten || is_lost_there(place, contact)
+        });
     }
 
     /// The same of each place where it answers.
@@ -322,21 +351,19 @@ impl Core {
         }
         self.memory.has_counted = true;
         let answers = |peer: &RememberedPeer| standing(&self.members, peer) == Standing::Here;
-        let mut forgotten = Vec::new();
         for entry in &mut self.memory.entries {
             if entry.is_sought && !answers(&entry.peer) {
                 entry.peer.unanswered += 1;
                 self.memory.changes += 1;
-                if entry.peer.unanswered >= UNANSWERED_MAX {
-                    forgotten.push(entry.peer.address);
-                }
             }
         }
-        self.memory.entries.retain(|entry| !forgotten.contains(&entry.peer.address));
-        self.contacts.retain(|place, contact| {
-            !contact.is_remembered_alone() || !forgotten.contains(&unscoped(place.there))
-        });
-        if !forgotten.is_empty() {
+        let before = self.memory.entries.len();
+        let is_over = |entry: &Entry| entry.peer.unanswered >= UNANSWERED_MAX;
+        while let Some(at) = self.memory.entries.iter().position(is_over) {
+            self.memory.forget(at);
+        }
+        self.drop_forgotten();
+        if self.memory.entries.len() < before {
             self.note_the_unnoted();
         }
     }

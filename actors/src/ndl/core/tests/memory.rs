@@ -335,6 +335,67 @@ fn where_all_places_are_taken_members_keep_theirs_and_who_was_one_longest_ago_ma
     assert!(!nodes(&world).contains(&3) && nodes(&world).contains(&u32::from(last + 2)));
 }
 
+// spec: NDL-2.5
+#[test]
+fn where_nobody_is_remembered_any_more_nobody_is_asked_for_that() {
+    // given: all places are taken by nodes that are not there
+    let mut world = World::new();
+    world.start(1, &knowing(1, 1, 2));
+    let absent = |index: u16| RememberedPeer { address: udp(index), node: node(index.into()), unanswered: 0 };
+    let most = u16::try_from(REMEMBERED_MAX).expect("a few");
+    world.input(1, Input::PeersRemembered((100..100 + most).map(absent).collect()));
+    let asked = |world: &World| {
+        let there = world.at(1).core.contacts.keys().map(|place| place.there);
+        there.filter(|there| *there >= udp(100)).collect::<Vec<_>>()
+    };
+    assert_eq!(asked(&world).len(), REMEMBERED_MAX);
+    // when: another one takes the place of the one that was met longest ago
+    world.start(2, &alone(2, 1));
+    world.run_until(PERIOD * 2, |world| world.knows(1, 2));
+    // then
+    assert_eq!(asked(&world), (101..100 + most).map(udp).collect::<Vec<_>>());
+    world.run(PERIOD * 20);
+    assert_eq!(asked(&world).len(), REMEMBERED_MAX - 1);
+}
+
+// spec: NDL-2.5
+#[test]
+fn whose_address_is_another_nodes_by_now_is_asked_there_from_no_address() {
+    let mut world = World::new();
+    world.start(1, &alone(1, 1));
+    world.with(udp(1), |core, now| core.use_paths(now, &[udp(1), udp(7)]));
+    world.input(1, Input::PeersRemembered(vec![nobody()]));
+    world.start(9, &alone(3, 1));
+    world.run_until(PERIOD * 4, |world| world.knows(1, 3));
+    assert!(world.at(1).core.contacts.values().all(|contact| !contact.is_former_of(node(9))));
+}
+
+// spec: NDL-2.5, NDL-4.3
+#[test]
+fn who_was_lost_is_asked_where_it_was_also_when_its_place_in_the_memory_is_anothers() {
+    // given: a node that was found where it was remembered, that was lost, and that is sought again
+    let mut world = World::new();
+    world.start(1, &Spec { nodes_max: 128, ..alone(1, 1) });
+    world.start(9, &alone(9, 1));
+    world.input(1, Input::PeersRemembered(vec![nobody()]));
+    world.run_until(ms(1), |world| world.knows(1, 9));
+    world.kill(9);
+    world.run_until(PERIOD * 5, |world| !world.knows(1, 9));
+    // It never asked on its part.
+    world.process(1).core.contacts.get_mut(&place(1, udp(9))).unwrap().sources.remove(&Source::Query);
+    world.restart_shell(1);
+    // when: so many others come that there is no room for it
+    let most = u16::try_from(REMEMBERED_MAX).expect("a few");
+    for index in 100..100 + most {
+        world.start(index, &knowing(index.into(), 1, 1));
+    }
+    world.run_until(PERIOD * 2, |world| world.at(1).core.members.len() == REMEMBERED_MAX);
+    assert!(remembered(&world, 1).iter().all(|peer| peer.node != node(9)));
+    // then
+    world.start(9, &alone(9, 1));
+    world.run_until(PERIOD * 18, |world| world.knows(1, 9));
+}
+
 // spec: NDL-2.5, NDL-3.2
 #[test]
 fn a_remembered_address_is_a_hint_and_whoever_answers_there_says_who_he_is() {
