@@ -70,11 +70,17 @@ pub(crate) fn seen_from(here: SocketAddr, there: SocketAddr) -> SocketAddr {
 
 /// Whether both are addresses of one interface of one host, whatever their ports are.
 pub(crate) fn is_same_host(one: SocketAddr, other: SocketAddr) -> bool {
-    let scope = |of: SocketAddr| match of {
-        SocketAddr::V6(of) if of.ip().is_unicast_link_local() => of.scope_id(),
-        SocketAddr::V4(_) | SocketAddr::V6(_) => 0,
-    };
-    one.ip() == other.ip() && scope(one) == scope(other)
+    host_at(one) == host_at(other)
+}
+
+/// The same for all ports of one address.
+pub(crate) fn host_at(address: SocketAddr) -> SocketAddr {
+    match address {
+        SocketAddr::V6(v6) if v6.ip().is_unicast_link_local() => {
+            SocketAddrV6::new(*v6.ip(), 0, 0, v6.scope_id()).into()
+        }
+        SocketAddr::V4(_) | SocketAddr::V6(_) => (address.ip(), 0).into(),
+    }
 }
 
 #[cfg(test)]

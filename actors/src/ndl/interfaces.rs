@@ -5,7 +5,13 @@
 
 mod flags;
 
-use std::{collections::BTreeMap, io, net::IpAddr, thread, time::Duration};
+use std::{
+    collections::BTreeMap,
+    io,
+    net::{IpAddr, SocketAddr},
+    thread,
+    time::Duration,
+};
 
 use tokio::sync::watch;
 
@@ -46,6 +52,8 @@ pub(super) struct Usable {
     pub(super) in_doubt: Vec<(LocalAddress, Flags)>,
     /// The numbers of this host's interfaces, by their names.
     pub(super) numbers: BTreeMap<String, u32>,
+    /// All addresses of this host, used or not.
+    pub(super) own: Vec<SocketAddr>,
     /// Whether any interface has an IPv6 address, be it that of loopback.
     pub(super) has_ipv6: bool,
     /// Whether a look has succeeded.
@@ -58,7 +66,8 @@ impl Usable {
         let numbers = all.iter().filter(|local| local.address.interface != 0);
         let numbers = numbers.map(|local| (local.name.clone(), local.address.interface)).collect();
         let has_ipv6 = all.iter().any(|local| local.address.ip.is_ipv6());
-        let mut usable = Self { numbers, has_ipv6, is_known: true, ..Self::default() };
+        let own = all.iter().filter(|local| !local.is_in_doubt()).map(|local| local.address.at(0)).collect();
+        let mut usable = Self { numbers, own, has_ipv6, is_known: true, ..Self::default() };
         // Where there is no room for all, no IPv6 address of one choice takes the only path of another: first the first one of each, and
         // each of IPv4, then the others in turn.
         let turn = |(nth, local): (usize, &'_ Local)| if local.address.ip.is_ipv4() { 0 } else { nth };

@@ -31,7 +31,8 @@ pub(super) struct Probe {
 }
 
 impl Probe {
-    /// Tries the addresses, the first ones at once; what the host said is known in time, whatever it is.
+    /// Tries the addresses, the first ones at once; what the host said is known in time, whatever it is. It refuses only if it does so at
+    /// each of them.
     pub(super) async fn carry_out(self) -> (NodeAddress, Incarnation, Host) {
         self.carry_out_with(TcpStream::connect).await
     }
@@ -41,19 +42,23 @@ impl Probe {
         T: Future<Output = io::Result<TcpStream>>,
     {
         let mut tries = stream::iter(&self.to).map(|to| connect(*to)).buffer_unordered(AT_ONCE_MAX);
-        let mut host = Host::IsSilent;
+        // Who has said nothing when the time is over is silent.
+        let mut said = Vec::new();
         let all = async {
             while let Some(tried) = tries.next().await {
-                match tried {
-                    Ok(_) => return host = Host::Accepts,
-                    Err(error) if error.kind() == ErrorKind::ConnectionRefused => host = Host::Refuses,
+                said.push(match tried {
+                    Ok(_) => Host::Accepts,
+                    Err(error) if error.kind() == ErrorKind::ConnectionRefused => Host::Refuses,
                     // No way there, or no descriptor here: nothing is known of the host.
-                    Err(_) => {}
+                    Err(_) => Host::IsSilent,
+                });
+                if said.contains(&Host::Accepts) {
+                    return;
                 }
             }
         };
-        // What was said before the time was over counts.
-        let _ = timeout(self.within, all).await;
+        let has_ended = timeout(self.within, all).await;
+        let host = Host::by(said.into_iter().chain(has_ended.err().map(|_| Host::IsSilent)));
         (self.node, self.incarnation, host)
     }
 }
@@ -90,8 +95,31 @@ mod tests {
             }
         };
         let host = of(to, Duration::ZERO).carry_out_with(connect).await.2;
-        assert_eq!(host, Host::Refuses);
+        assert_eq!(host, Host::IsSilent);
         assert!(tried.into_inner().into_iter().eq(1..=9));
+    }
+
+    /// What is said of a host when its first address, or whoever else has that, refuses, and this is what the second one does.
+    async fn with_one_that_refuses<T>(second: impl Fn() -> T) -> Host
+    where
+        T: Future<Output = io::Result<TcpStream>>,
+    {
+        let to: Vec<SocketAddr> = vec![([172, 17, 0, 1], 5_000).into(), ([10, 0, 0, 2], 5_000).into()];
+        let connect = |at: SocketAddr| {
+            let (is_first, second) = (at == to[0], second());
+            async move { if is_first { Err(ErrorKind::ConnectionRefused.into()) } else { second.await } }
+        };
+        of(to.clone(), Duration::ZERO).carry_out_with(connect).await.2
+    }
+
+    // spec: NDL-4.6
+    #[tokio::test]
+    async fn a_host_refuses_only_if_it_does_at_each_of_its_addresses() {
+        let refused = || async { Err(ErrorKind::ConnectionRefused.into()) };
+        let unreachable = || async { Err(ErrorKind::HostUnreachable.into()) };
+        assert_eq!(with_one_that_refuses(refused).await, Host::Refuses);
+        assert_eq!(with_one_that_refuses(unreachable).await, Host::IsSilent);
+        assert_eq!(with_one_that_refuses(std::future::pending).await, Host::IsSilent);
     }
 
     #[test]

@@ -297,9 +297,13 @@ impl Shell {
         self.paths.say_what_is_missing(stores, usable);
         let here = self.paths.here();
         let seeds = super::seeds(stores, Some(usable));
-        let has_seeds = lock(stores).has_seeds(&seeds);
-        (here == before && has_seeds)
+        let is_known = {
+            let core = lock(stores);
+            core.has_seeds(&seeds) && core.has_own(&usable.own)
+        };
+        (here == before && is_known)
             || self.feed(|core, now| {
+                core.use_own(&usable.own);
                 core.announce_gncl(super::announced(stores, &here));
                 core.use_seeds(now, seeds);
                 core.use_paths(now, &here);

@@ -124,7 +124,7 @@ impl Core {
         let probes = suspected.map(|(node, member)| Output::Probe {
             node: *node,
             incarnation: member.announcement.incarnation,
-            to: member.probed_addresses(),
+            to: member.probed_addresses(&self.own),
             within,
         });
         self.outputs.extend(probes);

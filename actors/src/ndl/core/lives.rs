@@ -220,17 +220,16 @@ impl Core {
         let Proof { from, announcement, exchange, progress, .. } = proof;
         let Announcement { node, incarnation, ref name, .. } = announcement;
         let name = name.clone();
-        let gncl = announcement.gncl_addresses(Some(from.there), [(from.here, from.there)]);
         let gone = self.gone.remove(&node);
         let mut sought =
             gone.map_or_else(Vec::new, |gone| self.settle_gone(&gone, from, &announcement));
         self.contact_at(now, from).role = Role::Member(node);
         let pace = self.pace_for(now, &name);
-        let member = Member {
+        let mut member = Member {
             announcement,
             met: from.there,
             routes: Routes::new(from),
-            gncl_told: (gncl.clone(), now),
+            gncl_told: (Vec::new(), now),
             heard: now,
             sign: now,
             pace,
@@ -245,6 +244,8 @@ impl Core {
             since: now,
             fence,
         };
+        let gncl = member.gncl_addresses(&self.own);
+        member.gncl_told.0.clone_from(&gncl);
         self.members.insert(node, member);
         sought.extend(self.settle_remembered(node));
         self.recall.found(node);

@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 
 use sinew_runtime::{tid::Incarnation, time::Time};
 
-use super::{Host, clock::PeerClock, pace::Pace, routes::Routes, troubles::Troubles};
+use super::{Host, clock::PeerClock, own::Own, pace::Pace, routes::Routes, troubles::Troubles};
 use crate::ndl::{
     Progress,
     address::is_same_host,
@@ -52,18 +52,34 @@ pub(super) struct Member {
 }
 
 impl Member {
-    /// Where its GNCL can be reached, the address that it prefers first.
-    pub(super) fn gncl_addresses(&self) -> Vec<SocketAddr> {
+    /// Where its GNCL can be reached, the address that it prefers first: at none that leads to this host instead. One that says no other
+    /// ones may have set up that they lead to it. // spec: NDL-3.6
+    pub(super) fn gncl_addresses(&self, own: &Own) -> Vec<SocketAddr> {
+        let (its, ours): (Vec<_>, Vec<_>) =
+            self.announced_gncl().into_iter().partition(|at| self.may_be_at(own, *at));
+        if its.is_empty() { ours } else { its }
+    }
+
+    fn announced_gncl(&self) -> Vec<SocketAddr> {
         let routes = self.routes.places().map(|place| (place.here, place.there));
         self.announcement.gncl_addresses(Some(self.met), routes)
     }
 
-    /// Where its host is tried when it is silent: first where its NDL answered, as its host was in reach there. // spec: NDL-4.6
-    pub(super) fn probed_addresses(&self) -> Vec<SocketAddr> {
-        let mut all = self.gncl_addresses();
-        all.sort_by_key(|at| !self.routes.places().any(|place| is_same_host(place.there, *at)));
-        all.truncate(PROBED_MAX);
-        all
+    /// Where its host is tried when it is silent: where its NDL answered last, as its host was there; only where its GNCL is nowhere there at
+    /// the others, which may be another host's. // spec: NDL-4.6
+    pub(super) fn probed_addresses(&self, own: &Own) -> Vec<SocketAddr> {
+        // A route that failed before the others did says nothing of what has happened now.
+        let missed = self.routes.iter().map(|route| route.missed).min();
+        let last = || self.routes.iter().filter(|route| Some(route.missed) == missed);
+        let has_answered = |at: &SocketAddr| last().any(|route| is_same_host(route.place.there, *at));
+        let (proven, others): (Vec<_>, Vec<_>) = self.announced_gncl().into_iter().partition(has_answered);
+        let mut tried = proven;
+        if tried.is_empty() {
+            tried = others;
+            tried.retain(|at| self.may_be_at(own, *at));
+        }
+        tried.truncate(PROBED_MAX);
+        tried
     }
 
     /// Whether it is to be counted as lost for its silence. One with several addresses that is asked at one of them alone may only be out

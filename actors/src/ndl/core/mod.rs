@@ -12,12 +12,14 @@
 //! | `cycle` | who is asked when, and who missed too much |
 //! | `heard` | what a datagram means, and what it proves |
 //! | `member` | what is known of a node that answers |
+//! | `own` | which addresses lead to this host |
 //! | `lives` | who comes, goes, comes again |
 //! | `gone` | who has gone, and where he is asked |
 //! | `duplicates` | which of two processes has a node address |
 //! | `proven` | whom no datagram ends, where nodes have keys |
 //! | `routes` | from where to where a member is asked |
 //! | `pace` | how often which members are asked |
+//! | `host` | what the host of a silent member says |
 //! | `signs` | what GNCL heard of a member that does not answer |
 //! | `troubles` | what of a member does not get on |
 //! | `audience` | who is told, and what of it has not been taken |
@@ -34,9 +36,11 @@ mod cycle;
 mod duplicates;
 mod gone;
 mod heard;
+mod host;
 mod lives;
 mod member;
 mod memory;
+mod own;
 mod pace;
 mod proven;
 mod recall;
@@ -62,6 +66,7 @@ use sinew_runtime::{
     time::Time,
 };
 
+pub(crate) use self::host::Host;
 pub(crate) use self::memory::{REMEMBERED_MAX, RememberedPeer, UNANSWERED_MAX};
 pub use self::recall::OwnStalls;
 pub(crate) use self::recall::{LostNode, Neighbour};
@@ -79,6 +84,7 @@ use self::{
     lives::Contest,
     member::Member,
     memory::Memory,
+    own::Own,
     pace::{Pace, REST},
     proven::Proven,
     recall::Recall,
@@ -143,7 +149,7 @@ pub(crate) enum Output {
         to: Place,
         node: NodeAddress,
     },
-    /// Try to connect to the host of this node, at any of these addresses of its GNCL, and tell what it said within this time. Have its
+    /// Try to connect to the host of this node, at these addresses of its GNCL, and tell what it [said](Host::by) within this time. Have its
     /// GNCL give a sign on the connections that stand.
     Probe {
         node: NodeAddress,
@@ -208,17 +214,6 @@ pub(crate) enum Way {
     Multicast,
 }
 
-/// What a host says when a connection to a node on it is tried.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Host {
-    /// The connection is made: by the host, whether or not the node's process runs.
-    Accepts,
-    /// Nobody listens there: the process has ended.
-    Refuses,
-    /// Nothing, in the time that it had; or it cannot be sent to.
-    IsSilent,
-}
-
 /// Counts as an instance of the shell: an older one that still runs is not listened to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Epoch(u64);
@@ -242,6 +237,7 @@ pub(crate) struct Core {
     epoch: u64,
     /// Our own UDP addresses, one for each path; none before the first start.
     paths: Vec<SocketAddr>,
+    own: Own,
     /// Until then, a living node with our address means that we are the newcomer.
     settles: Option<Time>,
     /// It had members and has none any more: others may have given its address to a later life.
@@ -304,6 +300,7 @@ impl Core {
             questions_asked: 0,
             epoch: 0,
             paths: Vec::new(),
+            own: Own::default(),
             settles: None,
             is_lonely: false,
             trial: None,

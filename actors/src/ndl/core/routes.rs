@@ -251,6 +251,7 @@ impl Core {
         let paths = &paths[..paths.len().min(PATHS_MAX)];
         let new: Vec<_> = paths.iter().copied().filter(|path| !self.paths.contains(path)).collect();
         self.paths = paths.to_vec();
+        self.own.use_paths(paths);
         self.me.announce_ndl(paths);
         self.contacts.retain(|place, _| paths.contains(&place.here));
         for member in self.members.values_mut() {
@@ -412,7 +413,7 @@ impl Core {
     pub(super) fn tell_moves(&mut self, now: Time) {
         for (node, member) in &mut self.members {
             let (told, at) = &member.gncl_told;
-            let gncl = member.gncl_addresses();
+            let gncl = member.gncl_addresses(&self.own);
             // Where nothing of it is known at all, what was known last may still hold.
             if *told != gncl && !gncl.is_empty() && now.since(*at) >= MOVE_GAP {
                 member.gncl_told = (gncl.clone(), now);

@@ -124,7 +124,7 @@ impl Core {
             incarnation: member.announcement.incarnation,
             udp: member.routes.best().there,
             routes: member.routes.iter().map(KnownRoute::of).collect(),
-            gncl: member.gncl_addresses(),
+            gncl: member.gncl_addresses(&self.own),
             period: Duration::from_micros(member.announcement.period_us.into()),
             sources: self.sources(member),
             heard: member.heard,

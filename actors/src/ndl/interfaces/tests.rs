@@ -45,6 +45,21 @@ fn a_choice_takes_what_it_names_in_order_and_once_and_loopback_only_where_it_is_
 }
 
 #[test]
+fn all_addresses_of_this_host_are_known_whichever_are_chosen_but_those_that_another_host_may_have() {
+    let asked = Flags { is_tentative: true, ..Flags::default() };
+    let all = [
+        local("lo", [127, 0, 0, 1], true),
+        local("eth0", [10, 0, 0, 1], true),
+        local("docker0", [172, 17, 0, 1], false),
+        local6("eth0", "fe80::1", 2),
+        Local { flags: asked, ..local6("eth0", "fd00::1", 2) },
+    ];
+    let own = Usable::of(&chosen(&["eth0/ipv4"]), &all).own;
+    let words: Vec<_> = own.iter().map(ToString::to_string).collect();
+    assert_eq!(words, ["127.0.0.1:0", "10.0.0.1:0", "172.17.0.1:0", "[fe80::1%2]:0"]);
+}
+
+#[test]
 fn of_loopback_by_its_name_nothing_is_taken_that_other_hosts_may_reach() {
     let name = if cfg!(target_os = "linux") { "lo" } else { "lo0" };
     let all = [

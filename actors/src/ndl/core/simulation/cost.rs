@@ -25,6 +25,7 @@ fn crowd(nodes: usize) -> Plan {
         finding: Finding::Group,
         connections: false,
         networks: 1,
+        shared: None,
         quality: Quality {
             lost_per_mille: 0,
             twice_per_mille: 0,

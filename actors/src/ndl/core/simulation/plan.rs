@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::chance::Chance;
-use crate::ndl::Trouble;
+use crate::ndl::{Trouble, core::Host};
 
 /// Faults of a crowd; one that parts it is a million cuts among 1,000.
 const FAULTS_OF_A_CROWD: usize = 20;
@@ -99,6 +99,9 @@ pub(super) struct Plan {
     pub(super) connections: bool,
     /// Networks in which each node has an address.
     pub(super) networks: usize,
+    /// Each host has one further address that all others have, too, as that of a bridge for containers, and each node says that its GNCL is
+    /// there: what one's own host says to whoever tries it.
+    pub(super) shared: Option<Host>,
     pub(super) quality: Quality,
     /// How late a timer wakes a node that is not stalled, at most.
     pub(super) lateness: Duration,
@@ -124,6 +127,8 @@ impl Plan {
             finding,
             connections: false,
             networks: 1,
+            // Of the seed alone, so that nothing else of it changes.
+            shared: [None, Some(Host::Refuses), Some(Host::Accepts)][(seed % 3) as usize],
             quality: quality(&mut chance, period),
             lateness: chance.of(&[Duration::ZERO, period / 50, period / 4]),
             clocks: (0..nodes).map(|_| clock(&mut chance)).collect(),
@@ -168,6 +173,7 @@ impl Plan {
             finding: Finding::Group,
             connections: chance.happens(700),
             networks: 1,
+            shared: None,
             quality,
             lateness: chance.of(&[Duration::ZERO, period / 50]),
             clocks: (0..nodes).map(|_| clock(&mut chance)).collect(),

@@ -34,6 +34,8 @@ pub(super) enum Fault {
     LosesLate,
     /// What a host says of a silent node is not heard.
     IgnoresHosts,
+    /// A host is tried at addresses that other hosts have, too, and what any one of them says counts.
+    TakesAnybodysWord,
     /// What GNCL hears is not heard.
     IgnoresSigns,
     /// What GNCL heard once counts for ever.
@@ -63,7 +65,7 @@ pub(super) enum Fault {
 }
 
 impl Fault {
-    pub(super) const ALL: [Self; 22] = [
+    pub(super) const ALL: [Self; 23] = [
         Self::ForgetsAnAnswer,
         Self::CountsItsOwnStall,
         Self::IgnoresIncarnation,
@@ -74,6 +76,7 @@ impl Fault {
         Self::LosesLate,
         Self::HasOnePaceForAll,
         Self::IgnoresHosts,
+        Self::TakesAnybodysWord,
         Self::IgnoresSigns,
         Self::TakesOldSignsForNew,
         Self::ForgetsTheFormer,
@@ -201,6 +204,10 @@ impl Patient {
             }
             match (self.fault, &mut output) {
                 (Some(Fault::SaysNoGoodbye), Output::SendLeave { .. }) => {}
+                (Some(Fault::TakesAnybodysWord), Output::Probe { node, to, .. }) => {
+                    *to = self.core.members[node].announcement.gncl_addresses(None, []);
+                    return Some(output);
+                }
                 (Some(Fault::BoastsOfItsClock), Output::ClockMeasured { offset, .. }) => {
                     offset.bound /= 2;
                     return Some(output);

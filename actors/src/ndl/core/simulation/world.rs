@@ -39,6 +39,9 @@ use crate::{
 /// Later than any clock is behind.
 const BEGIN: Time = Time::from_nanos(1_000_000_000_000);
 const PORT: u16 = 7_400;
+const GNCL_PORT: u16 = 5_000;
+/// An address that each host has.
+const SHARED: Ipv4Addr = Ipv4Addr::new(172, 17, 0, 1);
 /// Datagrams that wait in a socket, at most: about what Linux keeps of this size by default.
 const SOCKET_MAX: usize = 256;
 /// Longest time until mDNS tells of a node, or a peer's host refuses a connection.

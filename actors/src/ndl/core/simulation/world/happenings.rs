@@ -63,6 +63,20 @@ impl World {
         }
     }
 
+    /// What is said at these addresses of its GNCL.
+    pub(super) fn said_of(&self, process: usize, node: usize, to: &[SocketAddr]) -> Host {
+        let said = to.iter().map(|at| match self.plan.shared {
+            Some(host) if at.ip() == SHARED => host,
+            Some(_) | None => self.host_of(process, node),
+        });
+        if self.fault == Some(Fault::TakesAnybodysWord) {
+            let said: Vec<_> = said.collect();
+            let is_said = |host: &Host| said.contains(host);
+            return [Host::Accepts, Host::Refuses].into_iter().find(is_said).unwrap_or(Host::IsSilent);
+        }
+        Host::by(said)
+    }
+
     /// The same, if that has been so for long enough to be known.
     pub(super) fn settled_host_of(&self, process: usize, node: usize) -> Option<Host> {
         let Process { node: here, stalled_since, stalled_until, .. } = self.processes[process];
@@ -187,9 +201,13 @@ impl World {
 
     fn begin(&mut self, process: usize) {
         let Process { ref addresses, node, .. } = self.processes[process];
-        let (paths, gncl) = (addresses.clone(), SocketAddrV4::new(ip(node, 0), 5_000));
+        let shared = self.plan.shared.map(|_| SocketAddrV4::new(SHARED, GNCL_PORT));
+        let own: Vec<_> = shared.into_iter().map(SocketAddr::from).collect();
+        let gncl = std::iter::once(SocketAddrV4::new(ip(node, 0), GNCL_PORT)).chain(shared).collect();
+        let paths = addresses.clone();
         self.with(process, |patient, now| {
-            patient.core.announce_gncl((vec![gncl], None));
+            patient.core.use_own(&own);
+            patient.core.announce_gncl((gncl, None));
             patient.core.start(now, &paths);
         });
     }

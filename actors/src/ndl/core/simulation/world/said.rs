@@ -34,8 +34,8 @@ impl World {
                 self.processes[from].goodbyes.insert(to.there);
                 self.send(from, to, What::Leave, &datagram);
             }
-            Output::Probe { node, incarnation, within, .. } => {
-                let host = self.host_of(from, node_at(node));
+            Output::Probe { node, incarnation, to, within } => {
+                let host = self.said_of(from, node_at(node), &to);
                 let takes = if host == Host::IsSilent { within } else { WORD_MAX.min(within / 2) };
                 self.ask_for_a_sign(from, node, WORD_MAX.min(within / 2));
                 let at = self.now + self.chance.between(Duration::ZERO, takes);
