@@ -1,6 +1,5 @@
-//! `sinew doctor`: whether this machine gives a node what it needs, whether its nodes are closed to others, and whether other hosts see
-//! them; each finding with the command
-//! that mends it.
+//! `sinew doctor`: whether this machine gives a node what it needs, whether its nodes are closed to others, whether other hosts see
+//! them, and whether those of one host keep each other without a network; each finding with the command that mends it.
 //!
 //! Every check tries the thing itself where it can, and undoes it.
 
@@ -10,6 +9,7 @@ mod reach;
 mod rights;
 mod security;
 mod sockets;
+mod together;
 
 use std::{net::Ipv4Addr, path::Path, time::Duration};
 
@@ -65,6 +65,7 @@ pub(crate) fn show(chosen: Vec<Interface>, socket: Option<&Path>, within: Durati
     ]);
     checks.extend(security::checks(&nodes));
     checks.extend(reach::checks(&nodes, &interfaces));
+    checks.extend(together::checks(&nodes));
     let is_fine = checks.iter().all(|check| check.mend.is_none());
     let json = json!({ "checks": checks.iter().map(check_json).collect::<Vec<_>>() });
     let mut table = Table::new(["CHECK", "", "WHAT IS SO"]);

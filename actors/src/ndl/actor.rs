@@ -1,5 +1,6 @@
 //! The thin shell around the membership core: sockets, timer, mDNS, and the ways to other layers.
 
+mod announcing;
 mod memory;
 mod paths;
 mod receiving;
@@ -11,7 +12,7 @@ use std::{
     collections::BTreeSet,
     future::poll_fn,
     hash::{BuildHasher, RandomState},
-    net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4, SocketAddrV6},
+    net::{SocketAddr, SocketAddrV6},
     rc::Rc,
     sync::{Arc, MutexGuard, PoisonError, atomic::Ordering},
     task::Poll,
@@ -27,7 +28,10 @@ use sinew_runtime::{
 };
 use tokio::sync::{Notify, mpsc, oneshot};
 
-use self::paths::{Paths, Reader};
+use self::{
+    announcing::announced,
+    paths::{Paths, Reader},
+};
 use super::{
     Event,
     address::LocalAddress,
@@ -311,30 +315,6 @@ fn signs(stores: &Stores) -> Vec<Input> {
         Some(Input::SignSeen { node, incarnation, at })
     };
     in_doubt.into_iter().filter_map(sign).collect()
-}
-
-/// Where the others reach GNCL of a node that has these addresses: at all of IPv4 at which it listens, the one that is preferred first; and at
-/// which port at those of IPv6, which NDL announces as its own.
-fn announced(stores: &Stores, here: &[SocketAddr]) -> (Vec<SocketAddrV4>, Option<u16>) {
-    let port6 = stores.gncl_port6.get().copied();
-    let Some(SocketAddr::V4(listens)) = stores.gncl_listen.get().copied() else { return (Vec::new(), port6) };
-    let mut all: Vec<_> = if listens.ip().is_unspecified() {
-        // Other hosts would find themselves at a loopback address.
-        let ips = here.iter().filter_map(|here| match here.ip() {
-            IpAddr::V4(ip) => Some(ip),
-            IpAddr::V6(_) => None,
-        });
-        let ips: Vec<_> = ips.collect();
-        let is_told = |ip: &&Ipv4Addr| !ip.is_loopback() || here.iter().all(|here| here.ip().is_loopback());
-        ips.iter().filter(is_told).map(|ip| SocketAddrV4::new(*ip, listens.port())).collect()
-    } else {
-        let further = stores.gncl_further.get().into_iter().flatten();
-        std::iter::once(&listens).chain(further).copied().collect()
-    };
-    if let Some(outer) = stores.config.gncl.announce {
-        all.splice(..all.len().min(1), [outer]);
-    }
-    (all, port6)
 }
 
 /// Whom to ask in any case. A seed on the link of an interface that is not there waits for it; where nobody looks for interfaces, or the

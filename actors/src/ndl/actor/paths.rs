@@ -304,7 +304,7 @@ impl Shell {
         (here == before && is_known)
             || self.feed(|core, now| {
                 core.use_own(&usable.own);
-                core.announce_gncl(super::announced(stores, &here));
+                core.announce_gncl(super::announcing::announced(stores, &here));
                 core.use_seeds(now, seeds);
                 core.use_paths(now, &here);
             })
