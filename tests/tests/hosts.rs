@@ -200,6 +200,67 @@ fn an_interface_that_is_chosen_by_its_name_is_used_from_when_it_is_there() {
     has_lost_nobody([&central, &hip]);
 }
 
+#[test]
+fn nodes_of_one_host_that_have_loopback_beside_an_interface_go_on_without_its_address() {
+    go_on_without_the_address(["eth0/ipv4", "eth0/ipv4"]);
+}
+
+#[test]
+fn nodes_of_one_host_that_have_loopback_beside_an_address_go_on_without_it() {
+    go_on_without_the_address(["10.77.0.1", "10.77.0.2"]);
+}
+
+/// Two nodes on the first host and one on the second, which are on the network so; the first host loses its address there for a while.
+fn go_on_without_the_address(networks: [&str; 2]) {
+    let Some(hosts) = or_say(Hosts::new(2)) else { return };
+    let (directory, group) = (OwnDirectory::new(), own_group());
+    let file = |index: usize| {
+        let (name, address, network) = (NAMES[index], index + 1, networks[index / 2]);
+        let path = directory.join(&format!("{name}.toml"));
+        let text = format!(
+            "[node]\nname = \"{name}\"\nproject = \"hosts\"\naddress = \"10.77.0.{address}\"\n\
+             [ndl]\ninterface = [\"{network}\", \"lo\"]\nmulticast = \"{group}\"\nmdns_port = false\nperiod_ms = {PERIOD_MS}\n"
+        );
+        std::fs::write(&path, text).expect("the test's own directory");
+        path
+    };
+    let (here, there) = (&hosts.all()[0], &hosts.all()[1]);
+    let sends = ["--requires", "hip", "--sends-to", "hip", "--logs"];
+    let mut central = node_under_test(Some(here), &file(0), &sends);
+    let mut hip = node_under_test(Some(here), &file(1), &["--logs"]);
+    let mut knee = node_under_test(Some(there), &file(2), &[]);
+    central.wait_for(&["started"]);
+    for node in [&mut central, &mut hip] {
+        node.wait_for(&["NodeFound", "knee"]);
+    }
+    for other in ["central", "hip"] {
+        knee.wait_for(&["NodeFound", other]);
+    }
+    hip.wait_for(&["count 50 from 10.77.0.1"]);
+    // When: their host has no network any more
+    here.ip("address del 10.77.0.1/24 dev eth0").expect("it has that address");
+    // Then: the other host is lost, and they are not, and what one sends the other gets
+    for node in [&mut central, &mut hip] {
+        node.wait_for(&["NodeLost", "knee", "LinkDown"]);
+    }
+    for other in ["central", "hip"] {
+        knee.wait_for(&["NodeLost", other, "LinkDown"]);
+    }
+    let last = hip.said().iter().filter_map(|line| count_in(line)).map(|(number, _)| number).max();
+    let last = last.expect("some have come");
+    hip.wait_for(&[&format!("count {} from 10.77.0.1", last + 300)]);
+    counts_in_order(&hip);
+    // And when it is back
+    here.ip("address add 10.77.0.1/24 dev eth0").expect("it has it not");
+    for node in [&mut central, &mut hip] {
+        node.wait_for(&["NodeFound", "knee"]);
+    }
+    for (node, other) in [(&central, "hip"), (&hip, "central")] {
+        let is_lost = |line: &&String| line.contains("NodeLost") && line.contains(other);
+        assert!(!node.said().iter().any(|line| is_lost(&line)), "{:?}", node.said());
+    }
+}
+
 /// A node that finds others by multicast DNS alone.
 fn start_by_mdns(hosts: &Hosts, directory: &OwnDirectory, index: usize, interface: &str) -> Program {
     let (name, address) = (NAMES[index], index + 1);
