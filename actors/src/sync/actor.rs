@@ -120,7 +120,9 @@ impl SyncManager {
 
     fn take_groups(&self) {
         let groups = self.stores.router.groups();
-        self.core().handle(Time::now(), Input::GroupsChanged(groups));
+        let (mut core, now) = (self.core(), Time::now());
+        core.woken(now, self.stores.posts.sync.len());
+        core.handle(now, Input::GroupsChanged(groups));
     }
 
     fn handle(&mut self, input: Input, ctx: &mut Context<Self>) {

@@ -145,6 +145,41 @@ fn an_application_is_released_by_a_list_from_another_node_and_hears_of_its_loss(
     });
 }
 
+// spec: SYNC-16
+#[test]
+fn a_manager_that_stood_still_reads_that_a_link_is_back_before_it_tells_of_a_loss_whatever_it_reads_first() {
+    run(async {
+        let mut bench = Bench::new().await;
+        let mailbox = Post::new(4);
+        let events: Arc<[Kind]> = Arc::new([RequirementEvent::KIND]);
+        bench
+            .stores
+            .router
+            .set_local(GAIT, LocalRoute { outlet: Arc::new(Mailbox(mailbox.clone())), events });
+        let mut inbox = mailbox.attach();
+        bench.registers_gait();
+        let _sent = bench.links_knee();
+        bench.knee_says(1, true);
+        assert_eq!(bench.released().await, GAIT);
+        bench.tells(Event::App(AppFact::Ready { app: GAIT }));
+        // given: the link is broken, and the manager gets no processor for longer than it would wait for that
+        bench.tells(Event::Link(LinkFact::LinkBroken { node: KNEE, incarnation: LIFE }));
+        let second = AppAddress::new(0x1001);
+        bench.tells(Event::App(AppFact::Registered { app: second, name: None, requires: Vec::new() }));
+        assert_eq!(bench.released().await, second);
+        std::thread::sleep(Duration::from_millis(100));
+        // when: groups have changed, and behind that the link is back
+        bench.tells(Event::App(AppFact::GroupsChanged));
+        let _sent = bench.links_knee();
+        bench.knee_says(1, true);
+        // then: all that is read, and the next that is told is a true loss
+        let third = AppAddress::new(0x1002);
+        bench.tells(Event::App(AppFact::Registered { app: third, name: None, requires: Vec::new() }));
+        assert_eq!(bench.released().await, third);
+        assert!(futures_util::poll!(inbox.next()).is_pending(), "nobody was lost");
+    });
+}
+
 #[test]
 fn an_event_that_a_full_mailbox_did_not_take_comes_when_there_is_room() {
     run(async {
