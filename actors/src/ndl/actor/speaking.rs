@@ -24,13 +24,22 @@ const PAUSE_MAX: Duration = Duration::from_secs(600);
 /// Publishes the node there and looks for others, if the configuration says so.
 pub(super) async fn speak_mdns(shell: Rc<Shell>, here: SocketAddr) {
     let Some(port) = shell.stores.config.ndl.mdns_port else { return };
-    let mut pause = PAUSE_MIN;
+    let (mut pause, mut has_spoken) = (PAUSE_MIN, false);
     while lock(&shell.stores).is_current(shell.epoch) {
         let begun = Time::now();
         let mdns = match Mdns::start(port, here, shell.me()).await {
             Ok(mdns) => mdns,
+            Err(error) if has_spoken => {
+                crate::log::warn!(
+                    "NDL does not get mDNS back on port {port}: {error}; it is tried again in {pause:?}"
+                );
+                tokio::time::sleep(pause).await;
+                pause = PAUSE_MAX.min(pause * 2);
+                continue;
+            }
             Err(error) => return warn_of_mdns(port, &error),
         };
+        has_spoken = true;
         let most = Kept::most(shell.stores.config.ndl.nodes_max);
         let kept = tokio::select! {
             ((), ()) = join(watch_mdns(&mdns), browse(&shell, &mdns)) => return,
