@@ -312,7 +312,7 @@ fn an_event_that_finds_a_full_mailbox_is_told_when_there_is_room() {
 fn layers_whose_posts_are_full_learn_who_came_and_went_when_they_have_room() {
     run(async {
         // given
-        let mut first = Node::start(1, |ndl| ndl.period = Duration::from_millis(50)).await;
+        let mut first = Node::start(1, |ndl| ndl.period = Duration::from_millis(200)).await;
         let posts = &first.stores.posts;
         while posts.gncl.post(gncl::Event::DenyListChanged).is_ok() {}
         while posts.sync.post(sync::Event::Monitors).is_ok() {}

@@ -35,6 +35,8 @@ struct Word {
     event: Event,
     /// The layer was not told that this life was there.
     is_of_unknown: bool,
+    /// The life that is over by it is fenced.
+    is_fenced: bool,
 }
 
 /// What a word says of a node.
@@ -79,10 +81,17 @@ impl Untold {
         }
     }
 
-    /// Tells both layers what they have room for. Returns who had none for all of it.
-    pub(super) fn offer(&self, posts: &Posts) -> Option<&'static str> {
-        let gncl = lock(&self.gncl).offer(|event| posts.gncl.post(event));
-        let sync = lock(&self.sync).offer(|event| {
+    /// This life of the node is over, and fenced.
+    pub(super) fn is_fenced(&self, node: NodeAddress, life: Incarnation) {
+        lock(&self.gncl).is_fenced(node, life);
+        lock(&self.sync).is_fenced(node, life);
+    }
+
+    /// Tells both layers what they have room for, each loss behind a `fence`, if an instance of NDL has ended between the two. Returns who had
+    /// no room for all of it.
+    pub(super) fn offer(&self, posts: &Posts, fence: impl Fn(&MembershipFact)) -> Option<&'static str> {
+        let gncl = lock(&self.gncl).offer(&fence, |event| posts.gncl.post(event));
+        let sync = lock(&self.sync).offer(&fence, |event| {
             let Event::Membership(fact) = event else { return Ok(()) };
             let told = posts.sync.post(sync::Event::Membership(fact.clone()));
             told.map_err(|_| Event::Membership(fact))
@@ -107,8 +116,11 @@ impl Words {
             }
             What::Over(life) => {
                 let is_of_unknown = self.drop_those(|of, what| (of, what) == (node, What::There(life)));
-                if self.has(node, what) {
-                    // It was back for a while, of which the layer was not told.
+                if let Some(word) =
+                    self.words.iter_mut().find(|word| about(&word.event) == Some((node, what)))
+                {
+                    // It was back for a while, of which the layer was not told. Why it is over now counts.
+                    (word.event, word.is_fenced) = (event, false);
                     return;
                 }
                 if is_of_unknown {
@@ -121,7 +133,7 @@ impl Words {
                 false
             }
         };
-        self.words.push_back(Word { event, is_of_unknown });
+        self.words.push_back(Word { event, is_of_unknown, is_fenced: false });
         if self.words.len() > self.most {
             self.make_room();
         }
@@ -138,24 +150,35 @@ impl Words {
         has_unknown
     }
 
-    fn has(&self, node: NodeAddress, what: What) -> bool {
-        self.words.iter().any(|word| about(&word.event) == Some((node, what)))
-    }
-
     /// So many are kept only where nodes come and go that the layer does not know: that the oldest of these is gone has to be told least.
     fn make_room(&mut self) {
         let is_gone = |word: &Word| {
             word.is_of_unknown && about(&word.event).is_some_and(|(node, _)| word.is_over(node))
         };
-        let place = self.words.iter().position(is_gone).unwrap_or(0);
-        self.words.remove(place);
+        let is_no_bar = |word: &Word| matches!(about(&word.event), Some((_, What::NoBar)));
+        let place = self.words.iter().position(is_gone).or_else(|| self.words.iter().position(is_no_bar));
+        self.words.remove(place.unwrap_or(0));
+    }
+
+    fn is_fenced(&mut self, node: NodeAddress, life: Incarnation) {
+        let of_it = self.words.iter_mut().filter(|word| about(&word.event) == Some((node, What::Over(life))));
+        of_it.for_each(|word| word.is_fenced = true);
     }
 
     /// Offers one after the other, until one is not taken.
-    fn offer(&mut self, mut post: impl FnMut(Event) -> Result<(), Event>) -> Result<(), ()> {
-        while let Some(Word { event, is_of_unknown }) = self.words.pop_front() {
+    fn offer(
+        &mut self,
+        fence: impl Fn(&MembershipFact),
+        mut post: impl FnMut(Event) -> Result<(), Event>,
+    ) -> Result<(), ()> {
+        while let Some(Word { event, is_of_unknown, is_fenced }) = self.words.pop_front() {
+            if let Event::Membership(fact @ MembershipFact::NodeLost { .. }) = &event
+                && !is_fenced
+            {
+                fence(fact);
+            }
             if let Err(event) = post(event) {
-                self.words.push_front(Word { event, is_of_unknown });
+                self.words.push_front(Word { event, is_of_unknown, is_fenced: true });
                 return Err(());
             }
         }
@@ -187,6 +210,9 @@ mod tests {
         Event::Membership(MembershipFact::NodeLost { node, incarnation, why })
     }
 
+    /// A fence that nobody looks at.
+    fn fenced(_: &MembershipFact) {}
+
     fn moved(life: u64) -> Event {
         Event::Moved { node: NODE, incarnation: Incarnation(life), gncl: Vec::new() }
     }
@@ -196,7 +222,7 @@ mod tests {
         events.into_iter().for_each(|event| words.note(event));
         let mut told = Vec::new();
         words
-            .offer(|event| {
+            .offer(fenced, |event| {
                 told.push(format!("{event:?}"));
                 Ok(())
             })
@@ -212,17 +238,48 @@ mod tests {
     fn what_is_not_taken_is_offered_again_before_what_came_later() {
         let mut words = Words::new(4);
         words.note(found(NODE, 1));
-        assert_eq!(words.offer(Err), Err(()));
+        assert_eq!(words.offer(fenced, Err), Err(()));
         words.note(found(NodeAddress::new(8), 1));
         let mut told = Vec::new();
         assert_eq!(
-            words.offer(|event| {
+            words.offer(fenced, |event| {
                 told.push(format!("{event:?}"));
                 Ok(())
             }),
             Ok(())
         );
         assert_eq!(told, written([found(NODE, 1), found(NodeAddress::new(8), 1)]));
+    }
+
+    #[test]
+    fn a_loss_is_fenced_once_before_it_is_offered_and_not_if_it_was() {
+        let mut words = Words::new(4);
+        words.note(lost(NODE, 1));
+        words.note(lost(NodeAddress::new(8), 1));
+        words.is_fenced(NODE, Incarnation(1));
+        let done = std::cell::RefCell::new(Vec::new());
+        let fence = |fact: &MembershipFact| done.borrow_mut().push(format!("fence {fact:?}"));
+        let room = std::cell::Cell::new(1);
+        let offer = |words: &mut Words| {
+            words.offer(fence, |event| {
+                done.borrow_mut().push(format!("{event:?}"));
+                if room.replace(0) > 0 { Ok(()) } else { Err(event) }
+            })
+        };
+        assert_eq!(offer(&mut words), Err(()));
+        room.set(1);
+        assert_eq!(offer(&mut words), Ok(()));
+        let (first, second) = (format!("{:?}", lost(NODE, 1)), format!("{:?}", lost(NodeAddress::new(8), 1)));
+        let Event::Membership(fact) = lost(NodeAddress::new(8), 1) else { unreachable!("it is one") };
+        assert_eq!(*done.borrow(), [first, format!("fence {fact:?}"), second.clone(), second]);
+    }
+
+    #[test]
+    fn the_reason_of_a_loss_is_the_last_one() {
+        let (node, incarnation, why) = (NODE, Incarnation(5), LossReason::Duplicate);
+        let as_duplicate = || Event::Membership(MembershipFact::NodeLost { node, incarnation, why });
+        let told = kept(4, [lost(NODE, 5), found(NODE, 5), as_duplicate(), found(NODE, 3)]);
+        assert_eq!(told, written([as_duplicate(), found(NODE, 3)]));
     }
 
     #[test]

@@ -23,33 +23,43 @@ use crate::{
 const RETRY: Duration = Duration::from_millis(10);
 
 impl Shell {
-    /// What the core orders next.
+    /// What the core orders next; nothing, if a later instance carries that out.
     pub(super) fn next_order(&self) -> Option<Output> {
         let mut core = lock(&self.stores);
+        if !core.is_current(self.epoch) {
+            return None;
+        }
         // With the lock in hand: where a later instance takes over here, it tells this before what it has to say itself.
         core.poll().inspect(|order| self.stores.untold.note(order))
     }
 
     /// A life that is over is fenced before anybody hears of that: who does gets no message of it afterwards.
     pub(super) fn tell_layers(&self, fact: &MembershipFact) {
-        if let MembershipFact::NodeLost { node, incarnation, why } = *fact {
-            self.stores.clocks.forget(node);
-            match why {
-                LossReason::Left => self.stores.gncl.leaves(Time::now(), node, incarnation),
-                LossReason::Crashed
-                | LossReason::Hung
-                | LossReason::LinkDown
-                | LossReason::Restarted
-                | LossReason::Duplicate => self.stores.gncl.fence(node, incarnation),
-            }
+        self.fence(fact);
+        if let MembershipFact::NodeLost { node, incarnation, .. } = *fact {
+            self.stores.untold.is_fenced(node, incarnation);
         }
         crate::log::info!(?fact, "membership");
         self.tell();
     }
 
+    fn fence(&self, fact: &MembershipFact) {
+        let MembershipFact::NodeLost { node, incarnation, why } = *fact else { return };
+        self.stores.clocks.forget(node);
+        match why {
+            LossReason::Left => self.stores.gncl.leaves(Time::now(), node, incarnation),
+            LossReason::Crashed
+            | LossReason::Hung
+            | LossReason::LinkDown
+            | LossReason::Restarted
+            | LossReason::Duplicate => self.stores.gncl.fence(node, incarnation),
+        }
+    }
+
     /// Tells other layers what they have not been told yet. Returns whether they have room for all of it.
     pub(super) fn tell(&self) -> bool {
-        let Some(layer) = self.stores.untold.offer(&self.stores.posts) else { return true };
+        let told = self.stores.untold.offer(&self.stores.posts, |fact| self.fence(fact));
+        let Some(layer) = told else { return true };
         let what = format_args!("{layer} does not read its events: it is told later who is there");
         self.refusals.count(Time::now(), "a layer's post is full", &what);
         self.untold.notify_one();
