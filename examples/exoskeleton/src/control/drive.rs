@@ -113,6 +113,8 @@ pub struct DriveCore {
     ramp: AssistRamp,
     last_tick_ns: Option<u64>,
     device_heard: bool,
+    /// It was left to damp, and has not been heard since.
+    damps: bool,
     /// End of the last pause, or when the device was last left to damp, ns: what it gave before says nothing of what it gives after.
     paused_until_ns: Option<u64>,
     /// Whether assistance was interrupted by central since it was last full; else only this drive was away.
@@ -137,6 +139,7 @@ impl DriveCore {
             ramp: AssistRamp::new(config.reentry_s),
             last_tick_ns: None,
             device_heard: false,
+            damps: false,
             paused_until_ns: None,
             interrupted: false,
             counters: DriveCounters {
@@ -223,9 +226,13 @@ impl DriveCore {
     }
 
     /// The device is left to damp by itself from `now_ns` on: what it gives then is asked anew, and until it is known nothing is commanded.
+    /// Told so again before it was heard, it damps since the first time: a reading may be on its way for longer than a period.
     pub const fn let_device_damp(&mut self, now_ns: u64) {
         self.device_heard = false;
-        self.paused_until_ns = Some(now_ns);
+        if !self.damps {
+            self.damps = true;
+            self.paused_until_ns = Some(now_ns);
+        }
     }
 
     /// Takes a moment to feed forward in place of its own for the next 10 ms; returns whether it is believed.
@@ -312,7 +319,7 @@ impl DriveCore {
             let of_now =
                 self.paused_until_ns.is_none_or(|ns| now_ns > ns && sample.stamp().earliest_ns() > ns);
             if admitted && of_now && !self.device_heard {
-                self.device_heard = true;
+                (self.device_heard, self.damps) = (true, false);
                 self.go_on_from(f64::from(sample.torque_nm));
             }
         }

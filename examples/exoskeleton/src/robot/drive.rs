@@ -230,16 +230,24 @@ impl Drive {
                     to.gives = torque_nm != 0.0;
                     to.again.rests();
                 }
-                tell(order)
+                (tell(order), order)
             })
         });
-        if let Some(Ok(given)) = through {
+        if let Some(Ok((given, order))) = through {
+            if order == Order::Damp {
+                // It was told so now, and not when this tick began.
+                core.let_device_damp(Time::now().as_nanos());
+            }
             return given;
         }
         let order = Order::past_shut(state, command_nm, was_giving, Time::now().since(now));
         let again = lookout.as_ref().map(Lookout::watch);
         match order {
-            Order::Damp => core.let_device_damp(now.as_nanos()),
+            Order::Damp => {
+                let given = tell(order);
+                core.let_device_damp(Time::now().as_nanos());
+                return given;
+            }
             Order::Torque(0.0) => again.into_iter().for_each(Watch::rests),
             Order::Torque(_) => again.into_iter().for_each(Watch::ramps),
             Order::Nothing => {}
