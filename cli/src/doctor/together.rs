@@ -10,6 +10,8 @@ use sinew::{config::Interface, inspect::NodeReport};
 use super::Check;
 
 const NAME: &str = "one host";
+/// What loopback is called here.
+const LOOPBACK: &str = if cfg!(target_os = "macos") { "lo0" } else { "lo" };
 
 /// One check for each host that has several nodes on its network.
 pub(super) fn checks(nodes: &[NodeReport]) -> Vec<Check> {
@@ -58,7 +60,7 @@ fn has_loopback(node: &NodeReport) -> bool {
 
 fn line(node: &NodeReport) -> String {
     let chosen: Vec<_> =
-        node.interface.split(", ").chain(["lo"]).map(|choice| format!("\"{choice}\"")).collect();
+        node.interface.split(", ").chain([LOOPBACK]).map(|choice| format!("\"{choice}\"")).collect();
     format!("interface = [{}]", chosen.join(", "))
 }
 
