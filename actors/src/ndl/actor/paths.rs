@@ -299,11 +299,13 @@ impl Shell {
         let seeds = super::seeds(stores, Some(usable));
         let is_known = {
             let core = lock(stores);
-            core.has_seeds(&seeds) && core.has_own(&usable.own)
+            core.has_seeds(&seeds) && (!usable.is_known || core.has_own(&usable.own))
         };
         (here == before && is_known)
             || self.feed(|core, now| {
-                core.use_own(&usable.own);
+                if usable.is_known {
+                    core.use_own(&usable.own);
+                }
                 core.announce_gncl(super::announcing::announced(stores, &here));
                 core.use_seeds(now, seeds);
                 core.use_paths(now, &here);

@@ -18,7 +18,7 @@ use crate::ndl::{LossReason, datagram::Announcement};
 pub(super) struct Gone {
     pub(super) since: Time,
     /// It said so, and is asked no more.
-    has_left: bool,
+    pub(super) has_left: bool,
     /// Where it was asked.
     pub(super) places: Vec<Place>,
     pub(super) incarnation: Incarnation,

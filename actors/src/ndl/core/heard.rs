@@ -235,6 +235,9 @@ impl Core {
                 self.drop_contact(now, from);
             }
             self.void_questions(now, announcement);
+            if let Some(gone) = self.gone.get_mut(&announcement.node) {
+                gone.has_left = true;
+            }
         } else {
             let what = format_args!(
                 "{} says that {} leaves, which is no member there",

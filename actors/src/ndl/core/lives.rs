@@ -221,8 +221,7 @@ impl Core {
         let Announcement { node, incarnation, ref name, .. } = announcement;
         let name = name.clone();
         let gone = self.gone.remove(&node);
-        let mut sought =
-            gone.map_or_else(Vec::new, |gone| self.settle_gone(&gone, from, &announcement));
+        let mut sought = gone.map_or_else(Vec::new, |gone| self.settle_gone(&gone, from, &announcement));
         self.contact_at(now, from).role = Role::Member(node);
         let pace = self.pace_for(now, &name);
         let mut member = Member {
@@ -376,11 +375,9 @@ impl Core {
         self.recall.lost(now, &member, sources, Loss { why, bound });
         self.note_parted(node);
         self.is_lonely |= self.members.is_empty() && matches!(why, LossReason::Hung | LossReason::LinkDown);
-        if why == LossReason::Duplicate {
-            // An elder life has its address: this one is no bar to that.
-        } else if !self.bars_earlier(&member) {
-            // It may never have been there.
-        } else {
+        // An elder life has the address of a duplicate, which is no bar to that; one that nobody proves may never have been there.
+        let is_remembered = why != LossReason::Duplicate && self.bars_earlier(&member);
+        if is_remembered {
             self.remember(now, &member, why);
         }
         self.void_questions(now, &member.announcement);
@@ -391,7 +388,12 @@ impl Core {
                 continue;
             }
             let mut contact = self.contact_at(now, place);
-            contact.role = Role::Former { node, wait: 1, left: 0 };
+            // Whom nobody remembers is forgotten there as any address is that does not answer.
+            contact.role = if is_remembered {
+                Role::Former { node, wait: 1, left: 0 }
+            } else {
+                Role::Candidate { asked: 0 }
+            };
             contact.questions.clear();
         }
         let Announcement { incarnation, name, .. } = member.announcement;

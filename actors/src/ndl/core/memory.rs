@@ -203,8 +203,7 @@ impl Core {
     pub(super) fn meet_remembered(&mut self, now: Time) -> Vec<Place> {
         let mut met = Vec::new();
         for (place, node) in self.sought_places() {
-            let mut contact =
-                self.contacts.get_or_insert_with(place, || Contact::remembered(now, node));
+            let mut contact = self.contacts.get_or_insert_with(place, || Contact::remembered(now, node));
             match &mut contact.role {
                 Role::Member(_) => continue,
                 // Another source named it. When that one's time is over, it is met anew.
@@ -233,7 +232,12 @@ impl Core {
             self.paths.iter().map(move |here| (Place::between(*here, address), node))
         });
         let is_announced = |place: Place, node: NodeAddress| {
-            self.members.get(&node).is_some_and(|member: &Member| member.announces(place))
+            // One with a single address need not say it: it is asked where it was met as long as it has no route.
+            let is_its = |member: &Member| {
+                member.announces(place)
+                    || member.routes.places().next().is_none() && member.routes.best().there == place.there
+            };
+            self.members.get(&node).is_some_and(is_its)
         };
         let places = places.filter(|(place, node)| place.is_a_way() && !is_announced(*place, *node));
         // An address that was another node's may be our own by now.

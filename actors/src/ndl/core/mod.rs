@@ -77,7 +77,7 @@ pub use self::view::{IdleApp, KnownNode, KnownRoute, TroubledApp};
 use self::{
     audience::Audience,
     budget::Strangers,
-    contact::{Contact, Question, Questions, Role},
+    contact::{Question, Questions, Role},
     contacts::Contacts,
     duplicates::{Claimant, Trial},
     gone::Gone,
@@ -238,6 +238,8 @@ pub(crate) struct Core {
     /// Our own UDP addresses, one for each path; none before the first start.
     paths: Vec<SocketAddr>,
     own: Own,
+    /// One of them has gone since another one came: who left while we were there knows us at that one.
+    has_moved: bool,
     /// Until then, a living node with our address means that we are the newcomer.
     settles: Option<Time>,
     /// It had members and has none any more: others may have given its address to a later life.
@@ -301,6 +303,7 @@ impl Core {
             epoch: 0,
             paths: Vec::new(),
             own: Own::default(),
+            has_moved: false,
             settles: None,
             is_lonely: false,
             trial: None,

@@ -250,6 +250,7 @@ impl Core {
     pub(crate) fn use_paths(&mut self, now: Time, paths: &[SocketAddr]) {
         let paths = &paths[..paths.len().min(PATHS_MAX)];
         let new: Vec<_> = paths.iter().copied().filter(|path| !self.paths.contains(path)).collect();
+        self.has_moved |= self.paths.iter().any(|path| !paths.contains(path));
         self.paths = paths.to_vec();
         self.own.use_paths(paths);
         self.me.announce_ndl(paths);
@@ -267,7 +268,12 @@ impl Core {
         };
         self.contacts.retain(|place, contact| !is_vain(place, contact));
         self.meet_seeds(now);
-        self.meet_remembered(now);
+        if std::mem::take(&mut self.has_moved) {
+            // Who has left, and is back, asks for us where we are no more. // spec: NDL-2.5
+            self.seek_remembered(now);
+        } else {
+            self.meet_remembered(now);
+        }
         self.look_for_the_gone(now, &new);
         let members: Vec<_> = self.members.keys().copied().collect();
         members.into_iter().for_each(|node| self.seek(now, node));

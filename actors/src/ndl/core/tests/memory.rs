@@ -136,6 +136,7 @@ fn who_leaves_is_asked_no_more_at_any_address_that_it_announced() {
     }
     // But who has proven nothing speaks for nobody.
     let mut world = beside_one_of_two_addresses(true);
+    world.run_until(PERIOD, |world| world.knows(2, 1));
     says_so(&mut world);
     world.run_until(ms(1), |world| !world.knows(1, 2));
     world.run(PERIOD * 2);

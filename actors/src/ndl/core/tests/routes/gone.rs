@@ -77,6 +77,44 @@ fn who_has_left_is_asked_from_no_address_that_comes_later() {
     assert!(bench.asked.is_empty() && bench.core.contacts.is_empty(), "{:?}", bench.asked);
 }
 
+// spec: NDL-2.1
+#[test]
+fn who_says_goodbye_when_it_is_lost_already_is_asked_from_no_address_that_comes_later() {
+    let mut bench = alone();
+    bench.speak(way(0), single());
+    bench.pass(PERIOD * 5);
+    bench.core.handle(bench.now, Input::LeaveReceived { from: way(0), announcement: single() });
+    bench.joins_the_second_network();
+    assert!(!bench.asked.contains(&across()), "{:?}", bench.asked);
+}
+
+// spec: NDL-2.5
+#[test]
+fn who_has_left_is_asked_again_when_it_can_know_none_of_our_addresses_any_more() {
+    let mut bench = alone();
+    bench.speak(way(0), single());
+    bench.core.handle(bench.now, Input::LeaveReceived { from: way(0), announcement: single() });
+    bench.pass(PERIOD * 5);
+    bench.asked.clear();
+    bench.core.use_paths(bench.now, &[]);
+    bench.core.use_paths(bench.now, &[way(1).here]);
+    bench.drain();
+    assert!(bench.asked.contains(&across()), "{:?}", bench.asked);
+    assert!(bench.answer(across(), single()) && bench.life().is_some());
+}
+
+// spec: NDL-2.1
+#[test]
+fn whose_life_nothing_is_kept_of_is_forgotten_where_it_was() {
+    let mut bench = alone();
+    bench.speak(way(0), single());
+    let announcement = Announcement { claim: Claim::Yielded, ..single() };
+    bench.core.handle(bench.now, Input::LeaveReceived { from: way(0), announcement });
+    assert!(bench.life().is_none() && bench.core.gone.is_empty(), "it gave its address up");
+    bench.pass(PERIOD * 6);
+    assert!(bench.core.contacts.is_empty(), "{:?}", bench.core.contacts);
+}
+
 // spec: NDL-7.1
 #[test]
 fn who_was_gone_longest_and_makes_room_is_asked_from_no_address_any_more() {
