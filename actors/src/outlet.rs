@@ -31,6 +31,7 @@ mod resume;
 mod rouser;
 #[cfg(test)]
 mod tests;
+mod waiting;
 
 use std::{
     future::poll_fn,

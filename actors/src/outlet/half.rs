@@ -20,6 +20,7 @@ use super::{
     outstanding::{Outstanding, Sent},
     partial::{Partial, Sort, Written},
     resume::Session,
+    waiting::Waiting,
 };
 
 /// Of a session: times the bound for one destination, so many messages may be unconfirmed for all.
@@ -60,7 +61,7 @@ pub(super) struct Half<S> {
     pub(super) partial: Option<Partial>,
     /// The frame that was being written when the last connection ended. No peer can have handled it: it goes first.
     pub(super) interrupted: Option<Message>,
-    pub(super) queue: ClassQueue,
+    pub(super) queue: Waiting,
     /// Frames that go ahead of the queue, in their order.
     pub(super) urgent: VecDeque<Message>,
     /// What is sent when nothing waits any more, on whichever connection there is then; nothing is taken after it.
@@ -93,7 +94,7 @@ impl<S: Socket> Half<S> {
             session,
             partial: None,
             interrupted: None,
-            queue: ClassQueue::new(bounds(limits)),
+            queue: Waiting::new(ClassQueue::new(bounds(limits))),
             urgent: VecDeque::new(),
             last: None,
             finishing: false,
@@ -111,7 +112,7 @@ impl<S: Socket> Half<S> {
 
     /// What waits counts in `budget`, too. Before anything waits.
     pub(super) fn share(&mut self, budget: Arc<Budget>) {
-        self.queue = ClassQueue::sharing(bounds(self.limits), budget);
+        self.queue = Waiting::new(ClassQueue::sharing(bounds(self.limits), budget));
     }
 
     /// Whether this is the latest connection.

@@ -13,7 +13,7 @@ use sinew_runtime::{
 };
 
 use super::{OutletLimits, Socket, after::After, batch::SHORT, half::Half};
-use crate::session::{ShelfLimits, Turn};
+use crate::session::{ShelfLimits, Turn, Window};
 
 /// What waits in lines at the sender: as many lines as a receiver has. In messages the bound of a session's queue holds, and a quarter of it
 /// for each line.
@@ -75,19 +75,24 @@ impl<S: Socket> Half<S> {
         let beyond = self.session.as_ref().and_then(|session| session.held.beyond());
         let Some(beyond) = beyond.filter(|_| line_of(&message.header).is_some()) else { return true };
         let OutletLimits { queue_capacity, queue_bytes, payload_max, .. } = self.limits;
-        let (held, length) = (self.queue.bytes(), message.payload.len());
+        let (Window { messages, bytes }, length) = (self.queue.for_lines(), message.payload.len());
         // One may reach beyond the bounds of lines that it began in.
-        let left = left_beside(beyond.bytes.saturating_sub(payload_max), queue_bytes);
-        // As in any queue, one waits alone however long it is.
-        let has_bytes = held == 0 && left > 0 || held + length <= room_of(left, queue_bytes, SHORT);
+        let bytes_beyond = beyond.bytes.saturating_sub(payload_max);
+        let left = left_beside(bytes_beyond, queue_bytes);
+        // As in any queue, one waits alone however long it is. It may come into a line, and then the next one waits alone: so that ends, as far
+        // beyond as the least of the room for each line leads, too.
+        let waits_alone = bytes == 0 && bytes_beyond < queue_bytes.saturating_mul(3);
+        let has_bytes = waits_alone || bytes + length <= room_of(left, queue_bytes, SHORT);
         let left = left_beside(beyond.messages, queue_capacity);
-        has_bytes && self.queue.len() < room_of(left, queue_capacity, 1)
+        has_bytes && messages < room_of(left, queue_capacity, 1)
     }
 
-    /// Whether the queue holds no more than it may, all classes together: what waited in lines comes back to it whatever its bounds.
+    /// Whether the queue holds no more than it may of what may come into a line, all classes together: what waited in lines comes back to it
+    /// whatever its bounds.
     fn is_within_bounds(&self) -> bool {
         let OutletLimits { queue_capacity, queue_bytes, .. } = self.limits;
-        self.queue.len() <= CLASSES * queue_capacity && self.queue.bytes() <= CLASSES * queue_bytes
+        let Window { messages, bytes } = self.queue.for_lines();
+        messages <= CLASSES * queue_capacity && bytes <= CLASSES * queue_bytes
     }
 
     pub(super) fn put_in_line(&mut self, key: u64, message: Message) -> Result<(), Refused> {

@@ -110,6 +110,54 @@ fn many_that_are_held_after_each_has_filled_the_queue_hold_no_queue_each() {
 }
 
 #[test]
+fn one_that_takes_is_sent_long_messages_beside_many_that_are_held_after_each_has_filled_the_queue() {
+    let long = &payloads()[1];
+    let mut world = World::new();
+    for number in 1..=64 {
+        world.fill(number, long);
+        world.hold(1..=number);
+        assert!(world.send(OTHER, long), "{number} are held, and another one is sent nothing long");
+        world.write();
+    }
+    assert_eq!(world.taken[&OTHER].len(), 64);
+    world.end();
+}
+
+/// So many outcomes wait, which go into no line.
+fn say_outcomes(world: &World, count: usize) {
+    for correlation in 0..count {
+        let (source, destination) = (tid(OTHER), tid(1));
+        let ticket = Ticket { source, destination, correlation: correlation as u64 };
+        world.bench.outlet.submit_beyond(Message::outcome(ticket, Outcome::Delivered)).unwrap();
+    }
+}
+
+#[test]
+fn outcomes_that_wait_take_no_room_from_what_is_for_others() {
+    let short = &payloads()[0];
+    let mut world = World::new();
+    for number in 1..=64 {
+        world.fill(number, short);
+        world.hold(1..=number);
+        world.write();
+    }
+    world.fill(OTHER, short);
+    assert_eq!(world.taken[&OTHER].len(), 1, "lines leave the queue no more than its least");
+    world.write();
+    // The queue's own bound has room for that.
+    say_outcomes(&world, MANY.queue_capacity / 2);
+    assert!(world.send(OTHER, short), "outcomes are all that waits, and another one is not sent to");
+}
+
+#[test]
+fn outcomes_that_wait_take_no_room_from_the_line_of_one_that_is_held() {
+    let mut world = World::new();
+    world.hold([1]);
+    say_outcomes(&world, 3 * MANY.queue_capacity + 1);
+    assert!(world.send(1, &payloads()[0]), "a line in which nothing waits takes nothing");
+}
+
+#[test]
 fn many_that_are_held_one_after_the_other_leave_no_line_each_in_the_queue() {
     for payload in payloads() {
         let mut world = World::new();
