@@ -5,8 +5,8 @@
 //!
 //! Exit code 1: something was not given back, a file was left, or a message of others was lost. 3: none of that, and others felt it:
 //! their p99 with kills was more than 1.1 times as long as with orderly ends, or while nobody ends, and more than noise makes of that.
-//! That limit is for about one end a second (`--spacing-ms 1000 --reference-each 5`, 25 minutes): what comes faster keeps two CPUs
-//! busy with newcomers.
+//! That limit is for one end a second (`--spacing-ms 1000 --reference-each 5`, 25 minutes), and is told and not judged where they come
+//! faster: that keeps two CPUs busy with newcomers.
 
 use std::{process::ExitCode, time::Duration};
 

@@ -97,7 +97,7 @@ impl Report {
     /// Whether others felt the kills.
     #[must_use]
     pub fn felt(&self) -> Felt {
-        Felt::new(&self.windows, &self.halves)
+        Felt::new(&self.windows, &self.halves, self.spacing)
     }
 }
 

@@ -1,6 +1,6 @@
 //! Whether others felt the kills: their p99 beside that of segments in which nobody ends, and in which as many end in order.
 
-use std::fmt;
+use std::{fmt, time::Duration};
 
 use crate::clients::steady::Window;
 
@@ -8,6 +8,10 @@ use crate::clients::steady::Window;
 const RATIO_MAX: f64 = 1.1;
 /// Round trips below which a p99 is not believed: a hundred are above it.
 const COUNT_MIN: u64 = 10_000;
+/// What is noise in any case: two halves that happen to be alike do not say that there is none.
+const NOISE_MIN: f64 = 1.05;
+/// The limit is for ends that follow each other no sooner.
+const SPACING_MIN: Duration = Duration::from_secs(1);
 
 /// What the p99 of others says.
 #[derive(Clone, Copy, Debug)]
@@ -17,6 +21,8 @@ pub struct Felt {
     /// While nobody ends, in every other segment, and in those between, in microseconds.
     halves: [u64; 2],
     is_enough: bool,
+    /// One process ended in each such time.
+    spacing: Duration,
 }
 
 /// Whether the limit is kept.
@@ -28,26 +34,29 @@ pub enum Verdict {
     Noise,
     /// It is broken by more than that.
     Broken,
+    /// The same, where processes ended faster than the limit is for.
+    Crowded,
     /// Nobody knows: there were too few round trips.
     TooFew,
 }
 
 impl Felt {
-    /// Of the round trips while nobody ends, with orderly ends, and with kills; and of two halves of the first.
-    pub(super) fn new(windows: &[Window; 3], halves: &[Window; 2]) -> Self {
+    /// Of the round trips while nobody ends, with orderly ends, and with kills, one in each `spacing`; and of two halves of the first.
+    pub(super) fn new(windows: &[Window; 3], halves: &[Window; 2], spacing: Duration) -> Self {
         let [quiet, in_order, killed] = windows;
         let ratio = |reference: &Window| killed.p99_us as f64 / reference.p99_us.max(1) as f64;
         Self {
             ratios: [ratio(quiet), ratio(in_order)],
             halves: halves.map(|half| half.p99_us),
             is_enough: windows.iter().chain(halves).all(|window| window.count >= COUNT_MIN),
+            spacing,
         }
     }
 
-    /// How much longer one half's p99 is than the other's: they would be one, were there no chance.
+    /// How much longer one half's p99 is than the other's: they would be one, were there no chance. One draw of it: at least [`NOISE_MIN`].
     fn noise(&self) -> f64 {
         let [one, other] = self.halves;
-        one.max(other) as f64 / one.min(other).max(1) as f64
+        (one.max(other) as f64 / one.min(other).max(1) as f64).max(NOISE_MIN)
     }
 
     /// Whether the p99 with kills is within 10 % of both others, as far as can be said.
@@ -60,6 +69,8 @@ impl Felt {
             Verdict::Kept
         } else if worst <= RATIO_MAX * self.noise() {
             Verdict::Noise
+        } else if self.spacing < SPACING_MIN {
+            Verdict::Crowded
         } else {
             Verdict::Broken
         }
@@ -72,7 +83,7 @@ impl fmt::Display for Felt {
         writeln!(
             f,
             "p99 with kills: {:.2} of that while nobody ends, {:.2} of that with orderly ends; while nobody ends, in every \
-             other segment: {} and {} us, so {noise:.2} is noise",
+             other segment: {} and {} us, so {noise:.2} is noise (at least {NOISE_MIN:.2})",
             ratios[0], ratios[1], halves[0], halves[1]
         )?;
         let limit = RATIO_MAX * noise;
@@ -83,6 +94,11 @@ impl fmt::Display for Felt {
                 write!(f, "more, but not beyond {limit:.2}, which is that with noise: nobody knows")
             }
             Verdict::Broken => write!(f, "NOT SO, beyond {limit:.2}, which is that with noise"),
+            Verdict::Crowded => write!(
+                f,
+                "more, beyond {limit:.2}, which is that with noise; but the limit is for one end a second, and here one came in {:?}",
+                self.spacing
+            ),
             Verdict::TooFew => write!(f, "nobody knows: it takes {COUNT_MIN} round trips of each sort"),
         }
     }
@@ -97,7 +113,7 @@ mod tests {
     }
 
     fn felt(windows: [u64; 3], halves: [u64; 2]) -> Felt {
-        Felt::new(&windows.map(window), &halves.map(window))
+        Felt::new(&windows.map(window), &halves.map(window), SPACING_MIN)
     }
 
     #[test]
@@ -109,7 +125,7 @@ mod tests {
 
     #[test]
     fn more_than_a_tenth_longer_than_either_reference_is_felt() {
-        for windows in [[200, 230, 230], [230, 200, 230], [163, 1_605, 1_858]] {
+        for windows in [[200, 240, 240], [240, 200, 240], [163, 1_605, 1_858]] {
             let felt = felt(windows, [201, 199]);
             assert_eq!(felt.verdict(), Verdict::Broken, "{felt}");
             assert!(felt.to_string().contains("NOT SO"), "{felt}");
@@ -129,10 +145,27 @@ mod tests {
         for index in 0..3 {
             let mut windows = [200, 200, 900].map(window);
             windows[index] = few(windows[index].p99_us);
-            assert_eq!(Felt::new(&windows, &[200, 200].map(window)).verdict(), Verdict::TooFew);
+            assert_eq!(Felt::new(&windows, &[200, 200].map(window), SPACING_MIN).verdict(), Verdict::TooFew);
         }
         // The other half has no segment in the suite's short form.
         let halves = [window(200), Window::default()];
-        assert_eq!(Felt::new(&[200, 200, 900].map(window), &halves).verdict(), Verdict::TooFew);
+        assert_eq!(Felt::new(&[200, 200, 900].map(window), &halves, SPACING_MIN).verdict(), Verdict::TooFew);
+    }
+
+    #[test]
+    fn halves_that_happen_to_be_alike_do_not_say_that_there_is_no_noise() {
+        assert_eq!(felt([200, 200, 230], [200, 200]).verdict(), Verdict::Noise);
+        assert_eq!(felt([200, 200, 232], [200, 200]).verdict(), Verdict::Broken);
+    }
+
+    #[test]
+    fn ends_that_come_faster_than_the_limit_is_for_are_not_judged_by_it() {
+        let felt =
+            |p99_us, spacing| Felt::new(&[200, 200, p99_us].map(window), &[200, 200].map(window), spacing);
+        let fast = SPACING_MIN - Duration::from_millis(1);
+        assert_eq!(felt(900, fast).verdict(), Verdict::Crowded);
+        assert!(felt(900, fast).to_string().contains("the limit is for one end a second"));
+        assert_eq!(felt(900, SPACING_MIN).verdict(), Verdict::Broken);
+        assert_eq!(felt(200, fast).verdict(), Verdict::Kept);
     }
 }
