@@ -53,6 +53,8 @@ impl Core {
     /// The address is ours from then on, if nobody else shows that it is his. // spec: NDL-5.5
     pub(super) fn settle(&mut self, now: Time) {
         self.settles = Some(now + self.loss_bound());
+        // One that settles and was heard by the regular end has settled itself by then.
+        self.settles_at_latest = now + self.loss_bound() * 2 + self.rest().period;
         self.me.claim = Claim::Settling;
     }
 
@@ -111,8 +113,16 @@ impl Core {
             // Two that start together: the later life gives up at once, the earlier one only if the other stays.
             let is_later =
                 (theirs.incarnation, theirs.boot_nonce) < (self.me.incarnation, self.me.boot_nonce);
-            if is_later || now + self.rest().period > settles {
+            let period = self.rest().period;
+            let is_over = now + period > settles;
+            // It may not have heard of us yet, and gives up when it does; if it never does, it settles. Were both to give up, nobody would
+            // be left.
+            let may_give_up = theirs.claim == Claim::Settling && settles + period <= self.settles_at_latest;
+            if is_later || is_over && !may_give_up {
                 return self.give_address_up(other);
+            }
+            if is_over {
+                self.settles = Some(settles + period);
             }
         }
         if !theirs.precedes(&self.me) {

@@ -242,6 +242,8 @@ pub(crate) struct Core {
     has_moved: bool,
     /// Until then, a living node with our address means that we are the newcomer.
     settles: Option<Time>,
+    /// To then at most that is put off, while another one with our address settles, too.
+    settles_at_latest: Time,
     /// It had members and has none any more: others may have given its address to a later life.
     is_lonely: bool,
     /// Another process is about to be believed that our address is its own.
@@ -305,6 +307,7 @@ impl Core {
             own: Own::default(),
             has_moved: false,
             settles: None,
+            settles_at_latest: Time::ZERO,
             is_lonely: false,
             trial: None,
             stall_reported: None,

@@ -12,6 +12,7 @@ use crate::{
             Output,
             simulation::{Chance, SEED_VARIABLE, SEEDS_VARIABLE},
         },
+        datagram::Claim,
     },
     seeded::{Seed, number},
 };
@@ -116,6 +117,51 @@ fn who_was_frozen_for_so_long_that_a_later_life_took_over_gives_up_when_it_goes_
     assert!(gave_up(&world, ELDER) && !gave_up(&world, LATER));
     assert_eq!((has(&world, 1), has(&world, 2)), (Some(Incarnation(2)), Some(Incarnation(2))));
     assert_eq!((world.losses(1), world.losses(2)), (vec![], vec![]), "nobody doubted the later life");
+}
+
+/// Both settle, and hear of each other for the first time when the elder's last period begins, while the later life has 77 ms more.
+fn two_that_meet_in_the_last_period_of_settling() -> World {
+    let mut world = World::new();
+    part(&mut world, ELDER, LATER);
+    world.start(ELDER, &Spec { incarnation: 1, ..Spec::of(BOTH) });
+    world.run(ms(77));
+    world.start(LATER, &Spec { incarnation: 2, ..Spec::of(BOTH) });
+    world.run(PERIOD * 3 - ms(78));
+    world.mend();
+    world
+}
+
+// spec: NDL-5.5
+#[test]
+fn of_two_that_meet_when_the_elder_has_almost_settled_the_later_life_gives_up_alone() {
+    let mut world = two_that_meet_in_the_last_period_of_settling();
+    world.run(PERIOD * 8);
+    assert!(gave_up(&world, LATER) && !gave_up(&world, ELDER));
+    assert_eq!(world.at(ELDER).core.announcement().claim, Claim::Held);
+}
+
+// spec: NDL-5.5
+#[test]
+fn who_settles_gives_up_when_a_later_life_that_does_not_hear_it_has_settled_or_settles_without_end() {
+    for is_endless in [false, true] {
+        let mut world = two_that_meet_in_the_last_period_of_settling();
+        let begin = world.now;
+        while !gave_up(&world, ELDER) {
+            assert!(world.now.since(begin) <= PERIOD * 6, "it waits for ever");
+            assert_eq!(world.at(ELDER).core.announcement().claim, Claim::Settling);
+            // No answer finds its question any more: a datagram takes twice as long.
+            world.run(world.flight / 2);
+            let now = world.now;
+            let later = &mut world.process(LATER).core;
+            (later.contacts, later.group_questions) = Default::default();
+            if is_endless {
+                later.settle(now);
+            }
+        }
+        assert!(!gave_up(&world, LATER));
+        let claim = if is_endless { Claim::Settling } else { Claim::Held };
+        assert_eq!(world.at(LATER).core.announcement().claim, claim);
+    }
 }
 
 #[test]
