@@ -37,11 +37,14 @@ use std::{
 /// No scenario waits longer than this for one thing. It is generous: the machine may be busy with other tests.
 pub const DEADLINE: Duration = Duration::from_secs(60);
 
-/// A number that no other test of this run has: this process's id and a count.
+/// Numbers that one process has; beyond them it takes its first ones again. An id of a process has 22 bits at most (`proc(5)`, `pid_max`).
+const NUMBERS: u32 = 1 << 10;
+
+/// A number that no other test of this host has: this process's id and a count.
 #[must_use]
 pub fn unique() -> u32 {
     static COUNT: AtomicU32 = AtomicU32::new(0);
-    std::process::id().wrapping_mul(64).wrapping_add(COUNT.fetch_add(1, Ordering::Relaxed))
+    std::process::id() * NUMBERS + COUNT.fetch_add(1, Ordering::Relaxed) % NUMBERS
 }
 
 /// A multicast group and port of this test's own, never routed.
