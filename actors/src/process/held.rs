@@ -1,6 +1,14 @@
 //! One process, held by its descriptor: killed, waited for, and how it ended in words.
 
-use std::{io, os::fd::OwnedFd, sync::Arc, time::Duration};
+use std::{
+    io,
+    os::fd::OwnedFd,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::Duration,
+};
 
 use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
@@ -11,18 +19,37 @@ use tokio::{io::unix::AsyncFd, time::timeout};
 
 use super::{group::Group, spawn};
 
+/// Whether a process has been killed. Nothing is handed over to it from then on, so that it waits for the next one: of what a killed process
+/// has been handed over nobody may be able to say whether it was handled.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Doom(Arc<AtomicBool>);
+
+impl Doom {
+    /// Said before the process is killed, by whoever kills it.
+    pub(super) fn comes(&self) {
+        self.0.store(true, Ordering::Release);
+    }
+
+    pub(super) fn has_come(&self) -> bool {
+        self.0.load(Ordering::Acquire)
+    }
+}
+
 /// The process itself. Dropping it kills it, and what it has started.
 pub(super) struct Process {
     group: Arc<Group>,
+    doom: Doom,
     pidfd: AsyncFd<Arc<OwnedFd>>,
 }
 
 impl Process {
     pub(super) fn new(group: Arc<Group>) -> io::Result<Self> {
         let doomed = group.clone();
-        let fenced = group.clone();
+        let (fenced, doom) = (group.clone(), Doom::default());
+        let said = doom.clone();
         // Its supervisor does not wait for the thread that listens to it: that may hang on somebody else's account.
         supervision::at_fence(move || {
+            said.comes();
             fenced.kill();
             spawn::reap(fenced);
         });
@@ -30,14 +57,19 @@ impl Process {
             deprecated,
             reason = "sound for an OwnedFd, whose descriptor never changes; its successor is an unsafe fn, and unsafe code lives in sinew-shm and the C binding alone"
         )]
-        AsyncFd::new(group.pidfd().clone()).map(|pidfd| Self { group, pidfd }).inspect_err(|_| {
+        AsyncFd::new(group.pidfd().clone()).map(|pidfd| Self { group, doom, pidfd }).inspect_err(|_| {
             doomed.kill();
             spawn::reap(doomed);
         })
     }
 
     pub(super) fn kill(&self) {
+        self.doom.comes();
         self.group.kill();
+    }
+
+    pub(super) fn doom(&self) -> Doom {
+        self.doom.clone()
     }
 
     /// What holds it, for who waits for its end after it was killed.

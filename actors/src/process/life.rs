@@ -183,7 +183,7 @@ impl Child {
             names: known,
         };
         let welcome = words::frame(Kind::HOST_WELCOME, node, tid, &welcome);
-        let number = hosted.link.connect(stream.clone(), welcome, (directory, told));
+        let number = hosted.link.connect(stream.clone(), welcome, (directory, told), process.doom());
         let mut session = Session::new();
         session.released(tid);
         let reader = Reader::new(hosted.stores.config.payload_max.max(WORDS_BYTES_MAX));

@@ -28,6 +28,7 @@ use tokio::{
 };
 
 use super::{
+    held::Doom,
     life::{Hosted, process_life},
     window::{Left, NoSuchMessage, Room, Window},
     words::{Fate, Turn},
@@ -81,6 +82,7 @@ struct Present {
     /// A message waits until the child knows which names have changed. Of this child alone: who waits for a former one may not be polled
     /// any more, and would be told first.
     nudge: Arc<Notify>,
+    doom: Doom,
 }
 
 /// A message that came behind changes that the child has not been told of: its sender may know of them, so the child must. It waits for one
@@ -180,6 +182,7 @@ impl Link {
         socket: Arc<UnixStream>,
         welcome: Message,
         (directory, told): (watch::Receiver<u64>, u64),
+        doom: Doom,
     ) -> LinkNumber {
         // A former process whose supervisor did not wait for its end.
         let former = lock(&self.present).take();
@@ -187,7 +190,8 @@ impl Link {
         self.end(former, LastWords::Unheard);
         let number = self.outlet.connect(socket, self.payload_max, Some(welcome));
         let (lender, window, nudge) = (self.mailbox.lend(), Window::default(), Arc::default());
-        *lock(&self.present) = Some(Present { number, lender, window, directory, told, held: None, nudge });
+        *lock(&self.present) =
+            Some(Present { number, lender, window, directory, told, held: None, nudge, doom });
         self.pump();
         number
     }
@@ -256,7 +260,7 @@ impl Link {
         if let Some(present) = &mut *lock(&self.present)
             && let Some(held) = present.held.take()
         {
-            if held.changes <= present.told {
+            if held.changes <= present.told && !present.doom.has_come() {
                 self.hand_over(present, held.message);
             } else {
                 present.held = Some(held);
@@ -318,7 +322,7 @@ impl Link {
     fn pump(&self) {
         let mut present = lock(&self.present);
         let Some(present) = &mut *present else { return };
-        while present.held.is_none() && self.outlet.urgent_left() == 0 {
+        while !present.doom.has_come() && present.held.is_none() && self.outlet.urgent_left() == 0 {
             let next = match present.window.room() {
                 Room::Any => present.lender.take(),
                 Room::Events => present.lender.take_event(),

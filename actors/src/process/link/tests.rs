@@ -53,7 +53,8 @@ fn begun() -> (Arc<Stores>, Arc<Link>, Tid) {
 async fn connected(stores: &Stores, link: &Link) -> (LinkNumber, UnixStream) {
     let (socket, mut process) = UnixStream::pair().expect("a pair of sockets");
     let welcome = words::bare(Kind::HOST_WELCOME, Tid::NONE, Tid::NONE);
-    let number = link.connect(Arc::new(socket), welcome, (stores.directory_changes.subscribe(), 0));
+    let number =
+        link.connect(Arc::new(socket), welcome, (stores.directory_changes.subscribe(), 0), Doom::default());
     let mut frame = [0; HEADER_LEN];
     tokio::select! {
         error = link.drain(number) => panic!("the process reads: {error}"),
@@ -86,7 +87,8 @@ fn a_message_does_not_overtake_the_change_of_the_directory_behind_which_it_came(
     let _entered = runtime.enter();
     let (socket, mut process) = UnixStream::pair().expect("a pair of sockets");
     let welcome = words::bare(Kind::HOST_WELCOME, Tid::NONE, tid);
-    let number = link.connect(Arc::new(socket), welcome, (stores.directory_changes.subscribe(), 0));
+    let number =
+        link.connect(Arc::new(socket), welcome, (stores.directory_changes.subscribe(), 0), Doom::default());
     let mut frame = [0; HEADER_LEN];
     runtime.block_on(async {
         tokio::select! {
@@ -137,7 +139,12 @@ fn whoever_is_told_that_a_former_process_failed_may_send_to_it_at_once() {
         let (second, _other) = UnixStream::pair().expect("another");
         let connect = |socket| {
             let welcome = words::bare(Kind::HOST_WELCOME, Tid::NONE, tid);
-            link.connect(Arc::new(socket), welcome, (stores.directory_changes.subscribe(), 0))
+            link.connect(
+                Arc::new(socket),
+                welcome,
+                (stores.directory_changes.subscribe(), 0),
+                Doom::default(),
+            )
         };
         let number = connect(first);
         let mut message = Message::new(Header::new(Kind::named("first"), tid, tid), Bytes::new());
@@ -239,4 +246,30 @@ fn what_is_said_for_a_former_child_neither_reaches_the_next_one_nor_counts_as_sa
     let ended = || Turn { done: Some((1, Fate::Ended(Outcome::Delivered))), taken: None };
     link.turn(former, ended()).expect("it counts for nothing");
     link.turn(present, ended()).expect("it has the message still");
+}
+
+#[test]
+fn what_is_sent_to_a_child_that_is_killed_next_waits_for_the_one_after_it() {
+    // Given: a child that has been handed over a message, is killed, and whose end is not noticed yet
+    let (stores, link, tid) = begun();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a reactor");
+    let _entered = runtime.enter();
+    let (killed, _process) = runtime.block_on(connected(&stores, &link));
+    let send = |kind| {
+        let message = Message::new(Header::new(Kind::named(kind), tid, tid), Bytes::new());
+        link.submit(message).expect("there is room");
+    };
+    send("before");
+    lock(&link.present).as_ref().expect("it is connected").doom.comes();
+    // When: it is sent another one, and ends without having been heard
+    send("behind");
+    link.disconnect(killed, LastWords::Unheard);
+    // Then
+    let (_, mut next) = runtime.block_on(connected(&stores, &link));
+    let mut frame = [0; HEADER_LEN];
+    let handed_over =
+        async { tokio::time::timeout(Duration::from_secs(60), next.read_exact(&mut frame)).await };
+    runtime.block_on(handed_over).expect("it is handed over within a minute").expect("it is read");
+    let header = Header::decode(&frame, &[]).expect("a header");
+    assert_eq!(header.kind, Kind::named("behind"), "of the one before it nobody knows what became");
 }
