@@ -177,7 +177,7 @@ impl Verdict {
     }
 
     /// Whether a party had arrived before `at` and passed just this generation; or had arrived, was killed before it could pass, and counts
-    /// for no other one.
+    /// for no other one, nor has a later life of it passed one before this.
     fn was_there(
         &mut self,
         lives: &Visits<'_>,
@@ -190,7 +190,8 @@ impl Verdict {
         if lives.iter().flat_map(|(_, of_life)| of_life).any(has_passed) {
             return true;
         }
-        for (number, (life, of_life)) in lives.iter().enumerate() {
+        // The latest first: whoever was there before it counts for no generation behind one that it has passed.
+        for (number, (life, of_life)) in lives.iter().enumerate().rev() {
             let pending = of_life.last().filter(|visit| visit.passed.is_none());
             let counts = pending.is_some_and(|visit| life.counts(visit.at, at));
             if counts && *counted.entry((party, number)).or_insert(generation) == generation {
@@ -198,6 +199,10 @@ impl Verdict {
                     self.hearsay.note(Duration::from_nanos(at.saturating_sub(killed)));
                 }
                 return true;
+            }
+            let mut passed = of_life.iter().filter_map(|visit| visit.passed);
+            if passed.any(|(_, passed)| passed < generation) {
+                return false;
             }
         }
         false
@@ -311,6 +316,23 @@ mod tests {
             killed_while_it_waits(parties, 60);
             for party in &mut parties[1..] {
                 party[0].events.extend([Event::Arrived(70), Event::Passed(80, 3)]);
+            }
+        });
+        assert_eq!(verdict.violations.len(), 3, "{:?}", verdict.violations);
+        assert!(verdict.violations.iter().all(|violation| violation.contains("passed 3")));
+    }
+
+    #[test]
+    fn a_killed_process_counts_no_more_once_the_next_life_of_its_party_has_passed() {
+        let verdict = played(|parties| {
+            // The first of these lives was killed, and nobody has counted it; the next one passes.
+            parties[0][0].events.push(Event::Arrived(40));
+            parties[0][0].killed = Some(50);
+            parties[0].push(life(&[Event::Started(60), Event::Arrived(70), Event::Passed(80, 2)]));
+            for party in &mut parties[1..] {
+                let passes =
+                    [Event::Arrived(71), Event::Passed(81, 2), Event::Arrived(90), Event::Passed(91, 3)];
+                party[0].events.extend(passes);
             }
         });
         assert_eq!(verdict.violations.len(), 3, "{:?}", verdict.violations);
