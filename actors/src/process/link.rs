@@ -257,10 +257,11 @@ impl Link {
     /// The message that waits may go, if the child knows all that had changed when it came. It may have come, behind a further
     /// change, while the child was told of the one before: then it waits for the next time.
     pub(super) fn hand_over_held(&self) {
-        if let Some(present) = &mut *lock(&self.present)
+        // Of one that is killed it is given back when its link ends; to be told again and again that it waits would take its thread's whole time.
+        if let Some(present) = lock(&self.present).as_mut().filter(|present| !present.doom.has_come())
             && let Some(held) = present.held.take()
         {
-            if held.changes <= present.told && !present.doom.has_come() {
+            if held.changes <= present.told {
                 self.hand_over(present, held.message);
             } else {
                 present.held = Some(held);

@@ -1,6 +1,6 @@
 //! What a hosted application gets, and when.
 
-use std::{pin::pin, sync::mpsc::sync_channel, time::Duration};
+use std::{pin::pin, sync::mpsc::sync_channel, task::Context, time::Duration};
 
 use bytes::Bytes;
 use sinew_runtime::{
@@ -272,4 +272,30 @@ fn what_is_sent_to_a_child_that_is_killed_next_waits_for_the_one_after_it() {
     runtime.block_on(handed_over).expect("it is handed over within a minute").expect("it is read");
     let header = Header::decode(&frame, &[]).expect("a header");
     assert_eq!(header.kind, Kind::named("behind"), "of the one before it nobody knows what became");
+}
+
+#[test]
+fn a_message_that_waits_for_names_keeps_nobody_busy_when_its_child_is_killed() {
+    // Given: a message waits until the child has been told of a change
+    let (stores, link, tid) = begun();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a reactor");
+    let _entered = runtime.enter();
+    let (killed, _process) = runtime.block_on(connected(&stores, &link));
+    stores.directory_has_changed();
+    link.submit(Message::new(Header::new(Kind::named("behind"), tid, tid), Bytes::new()))
+        .expect("there is room");
+    let is_nudged = || {
+        let nudged = pin!(link.nudged(killed));
+        nudged.poll(&mut Context::from_waker(Waker::noop())).is_ready()
+    };
+    assert!(is_nudged(), "who listens to the child is to tell it");
+    // When: the child is killed before that
+    lock(&link.present).as_ref().expect("it is connected").doom.comes();
+    link.hand_over_held();
+    // Then
+    assert!(!is_nudged(), "there is nobody to be told");
+    assert!(lock(&link.present).as_ref().expect("it is connected").held.is_some());
+    // And: the next one gets it
+    link.disconnect(killed, LastWords::Unheard);
+    assert_eq!(link.mailbox.lend().take().expect("it waits").header.kind, Kind::named("behind"));
 }
