@@ -40,7 +40,7 @@ pub const DEADLINE: Duration = Duration::from_secs(60);
 /// Numbers that one process has; beyond them it takes its first ones again. An id of a process has 22 bits at most (`proc(5)`, `pid_max`).
 const NUMBERS: u32 = 1 << 10;
 
-/// A number that no other test of this host has: this process's id and a count.
+/// A number that no other test of this host has at the same time: this process's id and a count.
 #[must_use]
 pub fn unique() -> u32 {
     static COUNT: AtomicU32 = AtomicU32::new(0);

@@ -304,7 +304,7 @@ impl Pair {
     }
 }
 
-/// A loopback address that no other test of this host has.
+/// A loopback address that no other test of this host has at the same time, but for one whose process's id is 4,096 further, or a multiple of that.
 fn own_interface() -> Ipv4Addr {
     let [_, b, c, d] = unique().to_be_bytes();
     // Any of them is a host's: the network's ends are not among these.
