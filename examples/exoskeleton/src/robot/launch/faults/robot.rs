@@ -166,7 +166,10 @@ impl Robot {
                 held_since = None;
             }
             if now > deadline {
-                return Err(FaultError::Never("all drives assist".to_owned(), WALK_PATIENCE));
+                return Err(FaultError::Never(
+                    format!("all drives assist ({})", states(&view)),
+                    WALK_PATIENCE,
+                ));
             }
         }
     }
@@ -264,6 +267,19 @@ impl Robot {
 fn is_held(view: &View) -> bool {
     let ready = |joint| view.drive(joint).is_some_and(|drive| drive.state == DriveState::Ready);
     view.gait().is_some_and(|gait| gait.mode == Some(GaitMode::Hold)) && Joint::ALL.into_iter().all(ready)
+}
+
+/// The state of each drive, for whoever asks why it does not walk.
+fn states(view: &View) -> String {
+    let state = |joint| match view.drive(joint) {
+        Some(drive) => format!("{joint} {:?}", drive.state),
+        None => format!("{joint} not heard"),
+    };
+    format!(
+        "at last {}; where they go from Walk to Safe and back, this host has too little time for a leg at 1 kHz: build \
+         with --release, or end what else runs here",
+        Joint::ALL.map(state).join(", ")
+    )
 }
 
 fn is_walking(view: &View) -> bool {
