@@ -103,7 +103,8 @@ impl Core {
     fn lose_the_silent(&mut self, now: Time, at: usize, late: Duration, allowed: Duration) {
         let pace = &self.paces[at];
         let period = pace.period;
-        let is_silent = |member: &Member| member.pace == at && member.is_silent(now, pace);
+        let own = &self.own;
+        let is_silent = |member: &Member| member.pace == at && member.is_silent(now, pace, own);
         let silent: Vec<NodeAddress> =
             self.members.iter().filter(|(_, member)| is_silent(member)).map(|(node, _)| *node).collect();
         if late > allowed && !silent.is_empty() {

@@ -1,6 +1,6 @@
 //! What is known of a node that answers.
 
-use std::net::SocketAddr;
+use std::net::{Ipv4Addr, SocketAddr};
 
 use sinew_runtime::{tid::Incarnation, time::Time};
 
@@ -84,10 +84,15 @@ impl Member {
 
     /// Whether it is to be counted as lost for its silence. One with several addresses that is asked at one of them alone may only be out
     /// of reach there; as long as its connection stands, it is there. // spec: NDL-4.1, NDL-4.5, NDL-4.7
-    pub(super) fn is_silent(&self, now: Time, pace: &Pace) -> bool {
+    pub(super) fn is_silent(&self, now: Time, pace: &Pace, own: &Own) -> bool {
         let Announcement { gncl_further, ndl, ndl6, .. } = &self.announcement;
-        let has_another_way =
-            !gncl_further.is_empty() && ndl.is_empty() && ndl6.is_empty() && now < self.link_until;
-        self.missed >= pace.missed_max && !has_another_way && !self.has_given_a_sign(now, pace)
+        let is_another_way = |(ip, port): &(_, u16)| self.may_be_at(own, (Ipv4Addr::from(*ip), *port).into());
+        let has_another_way = || {
+            ndl.is_empty()
+                && ndl6.is_empty()
+                && now < self.link_until
+                && gncl_further.iter().any(is_another_way)
+        };
+        self.missed >= pace.missed_max && !has_another_way() && !self.has_given_a_sign(now, pace)
     }
 }

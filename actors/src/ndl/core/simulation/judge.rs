@@ -3,8 +3,7 @@
 //! 1. No false loss: who is called silent did not answer `missed_max` questions in a row, each of which had half a
 //!    period, at each address where it has answered since it was found. An answer counts from when it is in the asker's socket: that it
 //!    was not read yet is the asker's own stall.
-//! 2. A loss is seen within `missed_max` plus one periods of the last sign, and the asker's own stalls. Whose GNCL has further addresses may
-//!    only be out of reach where it is asked: where its connection broke meanwhile, when the host has refused the next one.
+//! 2. A loss is seen within `missed_max` plus one periods of the last sign, and the asker's own stalls.
 //! 3. A goodbye counts when it is heard, and is said to everybody who is known.
 //! 4. A life that ended never comes back after its loss or its goodbye, a former life never after a later one.
 //! 5. Found and lost alternate. Refused, left and restarted are said of lives that ended.
@@ -25,7 +24,7 @@ use sinew_runtime::{
     time::Time,
 };
 
-use super::{plan::Plan, world::WORD_MAX};
+use super::plan::Plan;
 use crate::{
     clocks::ClockOffset,
     ndl::{LossReason, core::Host},
@@ -60,8 +59,6 @@ struct Sight {
     heard: Time,
     /// The last one that was read on a connection.
     sign: Option<Time>,
-    /// When it was told that the connection broke.
-    broke: Option<Time>,
 }
 
 struct Life {
@@ -85,8 +82,6 @@ pub(super) struct Judge {
     /// The node that is watched at another pace.
     watched: Option<(NodeAddress, Duration, u32)>,
     lateness: Duration,
-    /// Whether nodes say that their GNCL is at further addresses, at which NDL asks nobody.
-    has_further: bool,
     lives: Vec<Life>,
     /// Which of them is whose.
     numbers: BTreeMap<(NodeAddress, Incarnation), usize>,
@@ -102,7 +97,6 @@ impl Judge {
                 .watched
                 .map(|(node, period, missed)| (super::world::node_address(node), period, missed)),
             lateness: plan.lateness,
-            has_further: plan.shared.is_some(),
             lives: Vec::new(),
             numbers: BTreeMap::new(),
             violations: Vec::new(),
@@ -155,13 +149,6 @@ impl Judge {
         for other in forgotten {
             self.violate(now, process, other, "is not told goodbye");
         }
-    }
-
-    /// A process is told that its connection with a life of a node broke.
-    pub(super) fn link_broke(&mut self, now: Time, process: usize, life: (NodeAddress, Incarnation)) {
-        let other = self.life(life.0, life.1);
-        let sights = &mut self.lives[process].sights;
-        other.and_then(|other| sights.get_mut(&other)).into_iter().for_each(|sight| sight.broke = Some(now));
     }
 
     pub(super) fn shell_restarted(&mut self, process: usize, now: Time) {
@@ -270,7 +257,6 @@ impl Judge {
             read: now,
             heard: now,
             sign: None,
-            broke: None,
         });
         let was_member = std::mem::replace(&mut sight.is_member, true);
         let came_back = sight.is_over;
@@ -423,12 +409,7 @@ impl Judge {
         let periods = period * (missed_max + 1);
         // Respites: each is more than twice as long as the one before, and none is longer than a timer was late.
         let respites = self.lateness * 5;
-        let own = own + shells;
-        let bound = periods + periods * DRIFT_PER_MILLE / 1_000 + respites + own;
-        // spec: NDL-4.5
-        let refused = |broke: Time| broke.since(sight.read) + WORD_MAX + own;
-        let broke = sight.broke.filter(|broke| self.has_further && *broke >= sight.read);
-        let bound = broke.map_or(bound, |broke| bound.max(refused(broke)));
+        let bound = periods + periods * DRIFT_PER_MILLE / 1_000 + respites + own + shells;
         let silent = now.since(sight.read);
         if silent > bound {
             let words = format!("was silent for {silent:?} and is lost only now; the bound is {bound:?}");

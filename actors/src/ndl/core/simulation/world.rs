@@ -45,7 +45,7 @@ const SHARED: Ipv4Addr = Ipv4Addr::new(172, 17, 0, 1);
 /// Datagrams that wait in a socket, at most: about what Linux keeps of this size by default.
 const SOCKET_MAX: usize = 256;
 /// Longest time until mDNS tells of a node, or a peer's host refuses a connection.
-pub(super) const WORD_MAX: Duration = Duration::from_millis(5);
+const WORD_MAX: Duration = Duration::from_millis(5);
 /// The application of each process that listens, and one that has trouble now and then.
 const LISTENER: AppAddress = AppAddress::new(0x1000);
 const TROUBLED: AppAddress = AppAddress::new(0x2000);
@@ -385,9 +385,6 @@ impl World {
             self.push(until, Event::Tell(process, Box::new(input)));
         } else if self.processes[process].is_alive {
             self.trace(|| format!("{process} is told {input:?}"));
-            if let Input::Link(LinkFact::LinkBroken { node, incarnation }) = input {
-                self.judge.link_broke(self.now, process, (node, incarnation));
-            }
             self.with(process, |patient, now| patient.told(now, input));
         }
     }

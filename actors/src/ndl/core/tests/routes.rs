@@ -8,10 +8,13 @@ use super::{
     scenarios::stranger,
     world::{PERIOD, Spec, ms, node},
 };
-use crate::ndl::{
-    LossReason, MembershipFact,
-    core::{Core, Input, Output, Place, Query, Way},
-    datagram::{Announcement, Answer, Claim},
+use crate::{
+    gncl::LinkFact,
+    ndl::{
+        LossReason, MembershipFact,
+        core::{Core, Input, Output, Place, Query, Way},
+        datagram::{Announcement, Answer, Claim},
+    },
 };
 
 /// The networks that both nodes are in; a third one is of whoever means no good.

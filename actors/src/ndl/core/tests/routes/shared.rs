@@ -104,3 +104,17 @@ fn a_host_is_tried_where_its_node_answered_last_and_not_where_it_had_failed_befo
     bench.pass(PERIOD * 2);
     assert_eq!(bench.probed(), sockets(&both[1..]));
 }
+
+// spec: NDL-4.5
+#[test]
+fn a_silent_member_whose_link_stands_is_lost_unless_it_can_be_reached_at_another_address() {
+    for (further, is_there) in [(BRIDGE, false), ([10, 9, 0, 2], true)] {
+        let mut bench = Bench::new();
+        bench.core.use_own(&sockets(&[BRIDGE]));
+        bench.answer(way(0), Announcement { ndl: vec![], ..listening_at(&[[10, 0, 0, 2], further]) });
+        let incarnation = member().incarnation;
+        bench.core.handle(bench.now, Input::Link(LinkFact::LinkUp { node: node(2), incarnation }));
+        bench.pass(PERIOD * 5);
+        assert_eq!(bench.life().is_some(), is_there, "GNCL is at {further:?} besides");
+    }
+}

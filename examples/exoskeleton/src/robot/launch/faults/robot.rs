@@ -269,15 +269,19 @@ fn is_held(view: &View) -> bool {
     view.gait().is_some_and(|gait| gait.mode == Some(GaitMode::Hold)) && Joint::ALL.into_iter().all(ready)
 }
 
-/// The state of each drive, for whoever asks why it does not walk.
+/// What there is to see of the walk, for whoever asks why not all drives assist.
 fn states(view: &View) -> String {
     let state = |joint| match view.drive(joint) {
         Some(drive) => format!("{joint} {:?}", drive.state),
         None => format!("{joint} not heard"),
     };
+    let gait = view.gait().map_or("not heard".to_owned(), |gait| match gait.mode {
+        Some(mode) => format!("{mode:?}, {} degraded", gait.degraded),
+        None => "not begun".to_owned(),
+    });
     format!(
-        "at last {}; where they go from Walk to Safe and back, this host has too little time for a leg at 1 kHz: build \
-         with --release, or end what else runs here",
+        "at last {}, gait {gait}; if drives change between Walk and Safe and no part is missing, this host may have too \
+         little time for a leg at 1 kHz: build with --release, or end what else runs here",
         Joint::ALL.map(state).join(", ")
     )
 }
