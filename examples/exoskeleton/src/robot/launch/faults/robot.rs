@@ -275,10 +275,11 @@ fn states(view: &View) -> String {
         Some(drive) => format!("{joint} {:?}", drive.state),
         None => format!("{joint} not heard"),
     };
-    let gait = view.gait().map_or("not heard".to_owned(), |gait| match gait.mode {
-        Some(mode) => format!("{mode:?}, {} degraded", gait.degraded),
-        None => "not begun".to_owned(),
-    });
+    let gait = match view.gait().map(|gait| (gait.mode, gait.degraded)) {
+        Some((Some(mode), degraded)) => format!("{mode:?}, {degraded:03b} degraded"),
+        Some((None, _)) => "not begun".to_owned(),
+        None => "not heard".to_owned(),
+    };
     format!(
         "at last {}, gait {gait}; if drives change between Walk and Safe and no part is missing, this host may have too \
          little time for a leg at 1 kHz: build with --release, or end what else runs here",
