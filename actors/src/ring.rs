@@ -193,8 +193,8 @@ impl RingFrames {
         Header::payload_len(head).map_or(true, |length| self.buffer.len() >= HEADER_LEN + length as usize)
     }
 
-    /// Takes records, without waiting, until there are about `enough` bytes, or half a ring's. Each byte is read once. The peer gets
-    /// their room back together: one that waits for it is woken once, and not for each.
+    /// Takes records, without waiting, until there are about `enough` bytes, or half a ring's, or the long frame that comes is whole.
+    /// Each byte is read once. The peer gets their room back together: one that waits for it is woken once, and not for each.
     pub(crate) fn take(&mut self, consumer: &mut Consumer, enough: usize) -> Result<Taken, Corrupt> {
         let half = consumer.payload_max() - MARK_BYTES;
         let (enough, before) = (enough.max(half.min(ENOUGH_MIN)), self.buffer.len());
@@ -209,12 +209,18 @@ impl RingFrames {
             lent.copy_to(&mut self.buffer[start..]);
             lent.keep();
             taken = Taken::Some;
-            if self.buffer.len().saturating_sub(before) >= enough {
+            if self.buffer.len().saturating_sub(before) >= enough || self.has_filled() {
                 break;
             }
         }
         consumer.give_back();
         Ok(taken)
+    }
+
+    /// Whether a frame is whole that has a buffer of its own: with what comes behind it that would grow, and each payload in it keep
+    /// all of it.
+    fn has_filled(&self) -> bool {
+        self.buffer.capacity() > FrameCodec::BUFFER_KEPT && self.has_frame()
     }
 
     /// Forgets the frame that has begun and is not whole.
@@ -269,6 +275,35 @@ mod tests {
         assert_eq!(frames.take(&mut consumer, 1).expect("an honest peer"), Taken::Some);
         let taken = Capacity::MIN.bytes() - producer.untaken().expect("an honest peer");
         assert_eq!(taken, Capacity::MIN.bytes() / 2);
+    }
+
+    #[test]
+    fn long_frames_right_behind_each_other_keep_their_own_length_each() {
+        // Given: a writer that is ahead as far as there is room.
+        const LENGTH: usize = 1_500_000;
+        let ((mut producer, mut consumer), mut frames) = (ring(), RingFrames::new(LENGTH));
+        let long = frame(LENGTH);
+        let (mut left, mut written, mut came) = (&long[..], 0, Vec::new());
+        while came.len() < 4 {
+            while let Ok(count) = write(&mut producer, &[IoSlice::new(left)]) {
+                left = &left[count..];
+                if left.is_empty() {
+                    written += 1;
+                    left = if written < 4 { &long } else { break };
+                }
+            }
+            // When: it is read.
+            assert_eq!(frames.take(&mut consumer, usize::MAX).expect("an honest peer"), Taken::Some);
+            while let Some(message) = frames.next().expect("a frame") {
+                came.push(message.payload);
+            }
+        }
+        // Then:
+        for payload in came {
+            let mut memory = payload.try_into_mut().expect("nobody else has it");
+            memory.clear();
+            assert!(!memory.try_reclaim(2 * LENGTH), "it keeps twice its length");
+        }
     }
 
     #[test]

@@ -77,14 +77,11 @@ impl Reader {
                 return Ok(Some(message));
             }
             stream.readable().await?;
-            // A long buffer is one that the codec has made for the frame that is coming, and is filled to its end.
-            if self.buffer.capacity() <= FrameCodec::BUFFER_KEPT
-                || self.buffer.len() == self.buffer.capacity()
-            {
-                self.buffer.reserve(READ_CHUNK);
-            }
             let read = match self.guard(stream) {
-                Guard::System => stream.try_read_buf(&mut self.buffer),
+                Guard::System => {
+                    self.buffer.reserve(FrameCodec::room(&self.buffer, READ_CHUNK));
+                    stream.try_read_buf(&mut self.buffer)
+                }
                 Guard::Unknown | Guard::Soon | Guard::Look => {
                     stream.try_io(Interest::READABLE, || self.read_guarded(stream))
                 }
@@ -113,7 +110,8 @@ impl Reader {
     /// Reads what is there, unless a descriptor is beside it: that stays where it is.
     fn read_guarded(&mut self, stream: &UnixStream) -> io::Result<usize> {
         let mut chunk = [0; READ_CHUNK];
-        let Seen { count, beside } = look(stream, &mut chunk)?;
+        let room = FrameCodec::room(&self.buffer, READ_CHUNK);
+        let Seen { count, beside } = look(stream, &mut chunk[..room])?;
         // spec: LNCL-18
         if beside {
             return Err(io::Error::new(io::ErrorKind::InvalidData, STRAY_DESCRIPTORS));
@@ -154,6 +152,52 @@ fn retried<T>(mut call: impl FnMut() -> Result<T, Errno>) -> io::Result<T> {
         match call() {
             Err(Errno::INTR) => {}
             other => return other.map_err(io::Error::from),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use sinew_runtime::{
+        tid::Tid,
+        wire::{Header, Kind, encode_frame},
+    };
+
+    use super::*;
+
+    #[test]
+    fn long_frames_right_behind_each_other_keep_their_own_length_each_however_it_is_read() {
+        const LENGTH: usize = 1_500_000;
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+        for guard in [Guard::Look, Guard::System] {
+            runtime.block_on(async {
+                // Given: a writer that is ahead as far as there is room.
+                let (ours, mut theirs) = std::os::unix::net::UnixStream::pair().expect("a pair");
+                ours.set_nonblocking(true).expect("it is ours");
+                let ours = UnixStream::from_std(ours).expect("it is a socket");
+                let mut bytes = BytesMut::new();
+                for _ in 0..4 {
+                    let header = Header::new(Kind::named("test"), Tid::NONE, Tid::BROADCAST);
+                    encode_frame(&header, &[7; LENGTH], &mut bytes);
+                }
+                let writing = std::thread::spawn(move || theirs.write_all(&bytes));
+                // When: it is read.
+                let mut reader = Reader { guard, ..Reader::new(LENGTH) };
+                let mut came = Vec::new();
+                while let Some(message) = reader.next(&ours).await.expect("frames") {
+                    came.push(message.payload);
+                }
+                writing.join().expect("no panic").expect("it is read");
+                // Then:
+                assert_eq!(came.len(), 4);
+                for payload in came {
+                    let mut memory = payload.try_into_mut().expect("nobody else has it");
+                    memory.clear();
+                    assert!(!memory.try_reclaim(2 * LENGTH), "it keeps twice its length: {guard:?}");
+                }
+            });
         }
     }
 }

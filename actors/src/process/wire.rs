@@ -233,7 +233,8 @@ impl Wire {
         let mut incoming = lock(&self.incoming);
         let Incoming { chunk, buffer, codec } = &mut *incoming;
         for _ in 0..READS_PER_LOOK {
-            match recv(&*self.socket, &mut chunk[..], RecvFlags::DONTWAIT) {
+            let room = FrameCodec::room(buffer, chunk.len());
+            match recv(&*self.socket, &mut chunk[..room], RecvFlags::DONTWAIT) {
                 Ok((_, 0)) => die(),
                 Ok((_, count)) => buffer.extend_from_slice(&chunk[..count]),
                 Err(Errno::AGAIN) => return true,

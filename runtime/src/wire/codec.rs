@@ -136,6 +136,17 @@ impl FrameCodec {
     /// A longer frame has a buffer of its own, which goes with it, and a longer buffer that nothing is left in is given back.
     pub const BUFFER_KEPT: usize = 256 * 1024;
 
+    /// How much to read next at the end of `buffer`, `most` bytes at most: a longer buffer than [`BUFFER_KEPT`](Self::BUFFER_KEPT) was
+    /// made for the frame that is coming, and is filled to its end. With what comes behind that it would grow, and each payload in
+    /// it keep all of it.
+    #[must_use]
+    pub fn room(buffer: &BytesMut, most: usize) -> usize {
+        match buffer.capacity() - buffer.len() {
+            left @ 1.. if buffer.capacity() > Self::BUFFER_KEPT => left.min(most),
+            _ => most,
+        }
+    }
+
     /// Sees how large the allocation is that payloads would keep.
     fn watch(&mut self, source: &BytesMut) {
         let end = source.as_ptr().addr() + source.capacity();

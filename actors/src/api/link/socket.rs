@@ -221,8 +221,9 @@ impl Reader {
 
     /// Reads what is there, without waiting.
     pub(in crate::api) fn read(&mut self) -> Read {
+        let room = FrameCodec::room(&self.buffer, self.chunk.len());
         loop {
-            match recv(&self.socket, &mut self.chunk[..], RecvFlags::DONTWAIT) {
+            match recv(&self.socket, &mut self.chunk[..room], RecvFlags::DONTWAIT) {
                 Ok((0, _)) => return Read::Ended(Ended::silently()),
                 Ok((count, _)) => {
                     self.buffer.extend_from_slice(&self.chunk[..count]);
