@@ -1,6 +1,7 @@
 //! A process of the cast, as its director sees it.
 
 use std::{
+    ffi::OsStr,
     io::{BufRead, BufReader, Write},
     path::Path,
     process::{Child, ChildStdin, Command, ExitStatus, Stdio},
@@ -43,11 +44,12 @@ impl Performer {
         program: &Path,
         role: &str,
         arguments: &[String],
-        environment: &[(&str, &Path)],
+        environment: &[(&str, impl AsRef<OsStr>)],
         hear: impl FnMut(&str) + Send + 'static,
     ) -> Self {
         let mut command = Command::new(program);
-        command.arg("--role").arg(role).args(arguments).envs(environment.iter().copied());
+        command.arg("--role").arg(role).args(arguments);
+        command.envs(environment.iter().map(|(variable, value)| (variable, value)));
         Self::start_command(command, role, hear)
     }
 

@@ -32,6 +32,19 @@ pub enum Kernel {
     WithoutPassRights,
 }
 
+impl Kernel {
+    /// What makes it this one for a process.
+    fn environment(self, directory: &OwnDirectory) -> Environment {
+        match self {
+            Self::Present => Vec::new(),
+            Self::WithoutPassRights => {
+                let library = Preload::build(&directory.join(""), "old_kernel", include_str!("old_kernel.c"));
+                vec![(Preload::VARIABLE, library.path().to_owned())]
+            }
+        }
+    }
+}
+
 impl fmt::Display for Kernel {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
@@ -41,12 +54,19 @@ impl fmt::Display for Kernel {
     }
 }
 
+/// Variables of the environment of every process of a stage.
+type Environment = Vec<(&'static str, PathBuf)>;
+
+/// Has glibc's allocator take each buffer of 128 KiB or more from the host, and give it back when it is freed: with any value set
+/// the threshold stays where it is, and does not grow with what is freed (mallopt(3), `M_MMAP_THRESHOLD`). Else each arena keeps
+/// up to twice the longest that was freed, which nobody holds.
+const GIVE_BACK: (&str, &str) = ("GLIBC_TUNABLES", "glibc.malloc.mmap_threshold=131072");
+
 /// Where a proof takes place.
 #[derive(Debug)]
 pub struct Stage {
     program: PathBuf,
-    /// What makes the kernel another one.
-    preload: Option<Preload>,
+    environment: Environment,
     residents: Vec<String>,
     /// Ends before its directory does.
     node: Performer,
@@ -66,7 +86,17 @@ impl Stage {
 
     /// The same on this kernel.
     pub(super) fn on(kernel: Kernel, program: &Path, limits: StageLimits) -> Self {
-        Self::begin(kernel, program, limits, &[], |_| {})
+        Self::begin(program, limits, &[], |directory| kernel.environment(directory), |_| {})
+    }
+
+    /// The same, with processes whose allocator keeps nothing of long messages: their growth is what they hold.
+    ///
+    /// # Panics
+    /// If it does not start.
+    #[must_use]
+    pub fn that_gives_back(program: &Path, limits: StageLimits) -> Self {
+        let (variable, value) = GIVE_BACK;
+        Self::begin(program, limits, &[], |_| vec![(variable, value.into())], |_| {})
     }
 
     /// The same, with posters in the node's own process: these arguments, and whoever hears what they tell.
@@ -76,14 +106,14 @@ impl Stage {
         residents: &[String],
         hear: impl FnMut(&str) + Send + 'static,
     ) -> Self {
-        Self::begin(Kernel::Present, program, limits, residents, hear)
+        Self::begin(program, limits, residents, |_| Vec::new(), hear)
     }
 
     fn begin(
-        kernel: Kernel,
         program: &Path,
         limits: StageLimits,
         residents: &[String],
+        environment: impl FnOnce(&OwnDirectory) -> Environment,
         hear: impl FnMut(&str) + Send + 'static,
     ) -> Self {
         let directory = OwnDirectory::new();
@@ -99,11 +129,11 @@ impl Stage {
              [lncl]\nsocket = {socket:?}\nclients_max = {clients_max}\nclients_per_process_max = {share}\n[ndl]\nmulticast = false\nmdns_port = false\n"
         );
         std::fs::write(&config, text).expect("the test's own directory");
-        let preload = (kernel == Kernel::WithoutPassRights)
-            .then(|| Preload::build(&directory.join(""), "old_kernel", include_str!("old_kernel.c")));
-        let (node, answers) = open((program, preload.as_ref()), &directory, residents, hear);
+        let mut environment = environment(&directory);
+        environment.push(("TMPDIR", directory.join("tmp")));
+        let (node, answers) = open(program, &environment, &directory, residents, hear);
         let (program, residents) = (program.to_owned(), residents.to_owned());
-        let stage = Self { program, preload, residents, node, answers, directory };
+        let stage = Self { program, environment, residents, node, answers, directory };
         stage.wait_for("open");
         stage
     }
@@ -115,7 +145,7 @@ impl Stage {
     pub fn replace_node(&mut self) {
         self.node.kill_now();
         (self.node, self.answers) =
-            open((&self.program, self.preload.as_ref()), &self.directory, &self.residents, |_| {});
+            open(&self.program, &self.environment, &self.directory, &self.residents, |_| {});
         self.wait_for("open");
     }
 
@@ -142,8 +172,7 @@ impl Stage {
     ) -> Performer {
         let socket = self.socket().display().to_string();
         let arguments: Vec<String> = [socket].into_iter().chain(arguments.iter().cloned()).collect();
-        let program = (&*self.program, self.preload.as_ref());
-        start(program, role, &arguments, &self.directory, hear)
+        Performer::start_with(&self.program, role, &arguments, &self.environment, hear)
     }
 
     /// The path of the node's socket.
@@ -205,25 +234,10 @@ impl Stage {
     }
 }
 
-/// A program, and what it loads before its C library.
-type Loaded<'a> = (&'a Path, Option<&'a Preload>);
-
-fn start(
-    (program, preload): Loaded<'_>,
-    role: &str,
-    arguments: &[String],
-    directory: &OwnDirectory,
-    hear: impl FnMut(&str) + Send + 'static,
-) -> Performer {
-    let temporary = directory.join("tmp");
-    let preload = preload.map(|library| (Preload::VARIABLE, library.path()));
-    let environment: Vec<_> = [("TMPDIR", &*temporary)].into_iter().chain(preload).collect();
-    Performer::start_with(program, role, arguments, &environment, hear)
-}
-
 /// Starts a node with the stage's configuration: its process, and what it says to its director.
 fn open(
-    program: Loaded<'_>,
+    program: &Path,
+    environment: &Environment,
     directory: &OwnDirectory,
     residents: &[String],
     mut hear: impl FnMut(&str) + Send + 'static,
@@ -231,7 +245,7 @@ fn open(
     let (say, answers) = sync_channel(64);
     let config = directory.join("node.toml").display().to_string();
     let arguments: Vec<_> = [config].into_iter().chain(residents.iter().cloned()).collect();
-    let node = start(program, "door", &arguments, directory, move |line| {
+    let node = Performer::start_with(program, "door", &arguments, environment, move |line| {
         if line.starts_with(|first: char| first.is_ascii_digit()) {
             return hear(line);
         }
