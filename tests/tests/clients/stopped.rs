@@ -170,8 +170,8 @@ const LONG: usize = 1 << 20;
 const LONG_WAIT: u64 = 4;
 /// What it keeps of them in any case: two buffers of the thread that takes them, four rings, and a MiB of all else.
 const LONG_KEPT_KIB: u64 = 2 * 1_024 + 4 * 260 + 1_024;
-/// What it may hold for one that takes nothing: those that wait in each class, and one that is written in part; one of
-/// the sender's that has come in part, and what it keeps.
+/// What it may hold for one that takes nothing: those that wait in each class, one that is written in part, one of the sender's
+/// that has come in part; and what it keeps.
 const LONG_BOUND_KIB: u64 = (3 * LONG_WAIT + 1 + 1) * 1_028 + LONG_KEPT_KIB;
 const LONG_ROUNDS: u64 = 256;
 
