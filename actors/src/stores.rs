@@ -5,7 +5,10 @@ use std::{
     net::{SocketAddr, SocketAddrV4},
     os::unix::net::UnixListener,
     path::Path,
-    sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, atomic::AtomicBool},
+    sync::{
+        Arc, Mutex, MutexGuard, OnceLock, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
 };
 
 use sinew_runtime::{
@@ -69,6 +72,8 @@ pub(crate) struct Stores {
     pub(crate) directory_changes: watch::Sender<u64>,
     /// Who is known on other nodes, and what waits for whom.
     pub(crate) sync: Mutex<sync::Core>,
+    /// The sync manager was told that groups have changed, and has not looked yet.
+    groups_told: AtomicBool,
     /// Where messages are counted, beside GNCL's peers.
     pub(crate) book: audit::Book,
     /// Who was asked for an audit, and who has asked.
@@ -118,6 +123,7 @@ impl Stores {
             registry: Mutex::new(lncl::Registry::counting_links_from(RandomState::new().hash_one(()))),
             directory_changes: watch::Sender::default(),
             sync: Mutex::new(sync::Core::new(&config, node, incarnation)),
+            groups_told: AtomicBool::new(false),
             book: audit::Book::default(),
             questions: audit::Questions::default(),
             monitors: Mutex::new(monitors::Core::new(
@@ -140,6 +146,18 @@ impl Stores {
         self.gncl.close();
         self.gncl.end_bulk();
         lock(&self.ndl_sockets).close_all();
+    }
+
+    /// Groups have changed: whether the sync manager has to be told. It looks at all groups, so one word does for all changes until then,
+    /// and whoever joins and leaves without end cannot fill its post.
+    pub(crate) fn groups_are_to_be_told(&self) -> bool {
+        !self.groups_told.swap(true, Ordering::AcqRel)
+    }
+
+    /// The sync manager is about to look at the groups, or could not be told: the next change is to be told.
+    pub(crate) fn groups_are_looked_at(&self) {
+        // Not a store: what was changed before a word that was saved must be seen by whoever looks now.
+        self.groups_told.swap(false, Ordering::AcqRel);
     }
 
     /// Somebody has a name that he had not, or has it no more, on this node or another. Said after the change and before

@@ -100,8 +100,11 @@ pub(crate) fn resolve(stores: &Stores, name: &str) -> Option<Tid> {
 
 /// Makes `app` a member of `group`, or no longer one.
 pub(crate) fn set_member(stores: &Stores, app: AppAddress, group: AppAddress, member: bool) {
-    if stores.router.set_member(group, app, member) {
-        tell_sync(stores, AppFact::GroupsChanged);
+    if stores.router.set_member(group, app, member)
+        && stores.groups_are_to_be_told()
+        && !tell_sync(stores, AppFact::GroupsChanged)
+    {
+        stores.groups_are_looked_at();
     }
 }
 
@@ -182,12 +185,15 @@ fn tell(stores: &Stores, fact: AppFact) {
     tell_sync(stores, fact);
 }
 
-fn tell_sync(stores: &Stores, fact: AppFact) {
+/// Whether there was room for it.
+fn tell_sync(stores: &Stores, fact: AppFact) -> bool {
     stores.directory_has_changed();
-    if let Err(event) = stores.posts.sync.post(sync::Event::App(fact)) {
+    let told = stores.posts.sync.post(sync::Event::App(fact));
+    if let Err(event) = &told {
         // Thousands of events wait for it then, so it has stood still for long.
         crate::log::error!(?event, "the sync manager's post is full and this was not told: does it hang?");
     }
+    told.is_ok()
 }
 
 #[cfg(test)]
@@ -200,7 +206,7 @@ mod tests {
     };
 
     use super::*;
-    use crate::NodeConfig;
+    use crate::{NodeConfig, stores::POST_CAPACITY};
 
     #[test]
     fn a_name_is_free_when_its_address_is_given_back_whenever_the_sync_manager_hears_of_it() {
@@ -225,5 +231,34 @@ mod tests {
         // then: though the sync manager has not heard of it
         assert_eq!(lock(&stores.sync).called("drive"), [tid]);
         assert_eq!(resolve(&stores, "drive"), None);
+    }
+
+    #[test]
+    fn whoever_joins_and_leaves_without_end_takes_one_place_in_the_sync_managers_post() {
+        // given: a sync manager that reads nothing for now
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let (app, group) = (AppAddress::new(0x1000), AppAddress::group("drives"));
+        // when: more changes than its post has room for
+        for turn in 0..=POST_CAPACITY {
+            set_member(&stores, app, group, turn % 2 == 0);
+        }
+        // then
+        assert_eq!(stores.posts.sync.len(), 1);
+        // and when it has looked, the next change is told
+        stores.groups_are_looked_at();
+        set_member(&stores, app, group, false);
+        assert_eq!(stores.posts.sync.len(), 2);
+    }
+
+    #[test]
+    fn a_change_of_groups_that_found_no_room_is_told_with_the_next_one() {
+        // given: a post that is full
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let (app, group) = (AppAddress::new(0x1000), AppAddress::group("drives"));
+        while stores.posts.sync.post(sync::Event::Monitors).is_ok() {}
+        // when
+        set_member(&stores, app, group, true);
+        // then
+        assert!(stores.groups_are_to_be_told(), "it is not taken for told");
     }
 }

@@ -154,7 +154,12 @@ impl TestNode {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap();
         let next = runtime.block_on(async { tokio::time::timeout(WATCHDOG, self.facts.next()).await });
         match next.expect("LNCL tells the sync manager something").expect("the post lives") {
-            sync::Event::App(fact) => fact,
+            sync::Event::App(fact) => {
+                if fact == AppFact::GroupsChanged {
+                    self.stores.groups_are_looked_at();
+                }
+                fact
+            }
             other @ (sync::Event::Membership(_)
             | sync::Event::Link(_)
             | sync::Event::Monitors

@@ -56,6 +56,7 @@ impl Actor for SyncManager {
         let outlet = Arc::new(PostOutlet(self.stores.posts.sync.clone()));
         self.stores.router.set_local(AppAddress::SYNC, LocalRoute { outlet, events: Arc::new([]) });
         // A predecessor may have failed between two of the core's orders, or before it heard of the groups.
+        self.stores.groups_are_looked_at();
         self.take_groups();
         monitors::feed(&self.stores, monitors::Input::TimePassed);
         wills::feed(&self.stores, wills::Input::TimePassed);
@@ -70,6 +71,9 @@ impl StreamHandler<Event> for SyncManager {
     fn handle(&mut self, event: Event, ctx: &mut Self::Context) {
         match event {
             Event::App(fact) => {
+                if matches!(fact, AppFact::GroupsChanged) {
+                    self.stores.groups_are_looked_at();
+                }
                 // Who goes leaves its groups, too.
                 let groups_may_differ = matches!(fact, AppFact::GroupsChanged | AppFact::Unregistered { .. });
                 if groups_may_differ {
