@@ -52,6 +52,23 @@ pub(crate) enum ExchangeError {
     Budget,
 }
 
+impl ExchangeError {
+    /// Whether the peer has nothing to do with it: this side had no descriptor or no memory left, or has a fault.
+    pub(crate) const fn is_of_this_side(&self) -> bool {
+        match self {
+            Self::Create(_)
+            | Self::Pass(PassError::System(_))
+            | Self::Refused(RefusedOffer::System { .. })
+            | Self::Fault
+            | Self::Budget => true,
+            Self::Pass(PassError::Closed | PassError::Broken { .. })
+            | Self::Refused(_)
+            | Self::Missing
+            | Self::Stray => false,
+        }
+    }
+}
+
 /// The exchange of offers over a socket, on which nothing else comes meanwhile. Both ends do the same, in any order.
 #[derive(Debug)]
 pub(crate) struct Exchange {

@@ -187,8 +187,10 @@ impl Direct {
         match self.routes.way(destination, now) {
             Way::Direct(number) => Some(number),
             Way::Through => None,
-            Way::ThroughAndAsk if !self.terms.budget.has_room(self.terms.ring_bytes) => {
-                self.routes.no_memory(destination, now);
+            Way::ThroughAndAsk
+                if !self.terms.budget.has_room(self.terms.ring_bytes) || !foreign::is_room() =>
+            {
+                self.routes.no_room(destination, now);
                 None
             }
             Way::ThroughAndAsk => {

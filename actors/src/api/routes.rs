@@ -200,8 +200,8 @@ impl Routes {
         self.refuse(peer, now + ASK_AGAIN);
     }
 
-    /// This process has no memory for one more link.
-    pub(super) fn no_memory(&mut self, peer: Tid, now: Time) {
+    /// This process has no memory for one more link, or cannot close any more what peers pass wrongly.
+    pub(super) fn no_room(&mut self, peer: Tid, now: Time) {
         self.refuse(peer, now + HARDLY_EVER);
     }
 

@@ -306,6 +306,7 @@ impl Client {
         let (socket, reader) = match tokio::time::timeout(HANDSHAKE, exchange).await {
             Ok(Ok(both)) => both,
             Ok(Err(ExchangeError::Pass(PassError::Closed))) => return Err(End::HungUp(None)),
+            Ok(Err(why)) if why.is_of_this_side() => return Err(End::Late(format!("{why}; register again"))),
             Ok(Err(why)) => return Err(End::Refused(why.to_string())),
             Err(_) => {
                 return Err(End::Late(format!(

@@ -5,10 +5,15 @@
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
+use sinew_shm::Offer;
+
+use super::worker::WAITING_MAX;
 use crate::config::LnclConfig;
 
 /// Of a client: its socket, its process, and the node's two bells; a task's own two besides, which a thread has in memory.
 const PER_CLIENT: usize = 6;
+/// What waits to be given back behind a descriptor that does not close: as many things as may, each with a peer's offer.
+const LEFT: usize = WAITING_MAX * Offer::DESCRIPTORS_MAX;
 /// The node's own, introductions that are not answered, and what the applications in its process may open.
 const OWN: usize = 256;
 
@@ -23,7 +28,7 @@ pub(super) fn make_room(lncl: &LnclConfig) {
 }
 
 fn needed(lncl: &LnclConfig) -> u64 {
-    let needed = PER_CLIENT * lncl.clients_max + lncl.strangers_max + OWN;
+    let needed = PER_CLIENT * lncl.clients_max + lncl.strangers_max + LEFT + OWN;
     u64::try_from(needed).unwrap_or(u64::MAX)
 }
 

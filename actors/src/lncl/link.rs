@@ -83,9 +83,9 @@ pub(super) async fn exchange(
         let theirs = Exchange::take(&*stream);
         let _ = sinew_shm::set_descriptors(&*stream, Descriptors::Refused);
         // What a hostile client has passed may take for ever to close. Whatever becomes of it here, that is not its last close.
-        let theirs = keeper.keep(theirs?);
-        let _copies = keeper.keep(theirs.copies().map_err(PassError::System)?);
-        let theirs = theirs.into_inner().into_offer()??;
+        let mut theirs = theirs?;
+        let _copies = keeper.keep(theirs.copies());
+        let theirs = theirs.into_offer()?;
         let (producer, consumer) = exchange.into_inner().finish(theirs)?;
         Ok::<_, ExchangeError>((keeper.keep(producer), keeper.keep(consumer)))
     };

@@ -236,17 +236,18 @@ pub enum PassError {
     /// The peer closed the socket.
     #[error("the peer closed the socket")]
     Closed,
-    /// The peer's fault: what came is shorter than an offer, or its descriptors were cut.
-    #[error("what came is no whole offer: {bytes} bytes, {descriptors} descriptors, cut: {cut}")]
+    /// The peer's fault: what came is shorter than an offer, or has more descriptors than one can have. It is left in the socket.
+    #[error("what came is no whole offer: {bytes} bytes, {descriptors} descriptors, more than that: {cut}")]
     Broken {
-        /// How many bytes came.
+        /// How many bytes were looked at.
         bytes: usize,
-        /// How many descriptors came.
+        /// How many descriptors were looked at.
         descriptors: usize,
-        /// Whether the system says that something did not fit.
+        /// Whether there are more.
         cut: bool,
     },
-    /// The environment's fault; `WouldBlock` on a socket that does not block.
+    /// The environment's fault; `WouldBlock` on a socket that does not block, "too many open files" where this process has no descriptor
+    /// left.
     #[error("passing an offer: {0}")]
     System(#[source] io::Error),
 }

@@ -69,14 +69,14 @@ impl Offer {
         platform::send(self, socket.as_fd())
     }
 
-    /// Takes one from a unix socket, on which nothing else may come before it. Descriptors that do not belong to an offer
+    /// Takes one from a unix socket, on which nothing else may come before it. The descriptors of what is no offer
     /// are closed; closing what a peer has sent can block (a file on a file system of the peer's own), so this is not for
     /// a thread that may not.
     ///
     /// # Errors
-    /// The outer one when nothing whole came; the inner one when it is no offer.
+    /// The outer one as of [`Received::receive`]; the inner one when it is no offer.
     pub fn receive(socket: impl AsFd) -> Result<Result<Self, RefusedOffer>, PassError> {
-        Received::receive(socket)?.into_offer()
+        Ok(Received::receive(socket)?.into_offer())
     }
 
     /// An offer from what the peer sent. The descriptors are looked at when it is connected.
@@ -106,42 +106,34 @@ impl Offer {
 #[derive(Debug)]
 pub struct Received {
     pub(crate) bytes: [u8; OFFER_BYTES],
-    /// Bytes that came.
-    pub(crate) count: usize,
-    /// The system says that something did not fit.
-    pub(crate) cut: bool,
+    /// As many as an offer can have, at most.
     pub(crate) descriptors: Vec<OwnedFd>,
+    pub(crate) copies: Vec<OwnedFd>,
 }
 
 impl Received {
-    /// Takes what is there, with as many descriptors as one message can carry. Nothing is closed, unless this process
-    /// has no room for them all: then the system closes the rest, here, which can block.
+    /// Takes what has an offer's length and no more descriptors than one can have. What has not is left in the socket, as it came: it
+    /// costs this process nothing until the socket is emptied or closed, which can block. Nothing that this closes can.
     ///
     /// # Errors
-    /// [`PassError::Closed`], and [`PassError::System`]: also when a socket that does not block has nothing.
+    /// [`PassError::Closed`], [`PassError::Broken`], and [`PassError::System`]: also when a socket that does not block has nothing, and
+    /// when this process has no descriptor left; then the offer is still there.
     pub fn receive(socket: impl AsFd) -> Result<Self, PassError> {
         platform::receive(socket.as_fd())
     }
 
-    /// Further copies of the descriptors. While they live nothing that becomes of this is the last close of what the peer
-    /// has passed, the only one that can block.
-    ///
-    /// # Errors
-    /// This process has no descriptor left.
-    pub fn copies(&self) -> io::Result<Vec<OwnedFd>> {
-        self.descriptors.iter().map(OwnedFd::try_clone).collect()
+    /// Further copies of the descriptors; none the second time. While they live nothing that becomes of this is the last close of what
+    /// the peer has passed, the only one that can block.
+    pub fn copies(&mut self) -> Vec<OwnedFd> {
+        std::mem::take(&mut self.copies)
     }
 
     /// The offer that it is. What does not belong to one is closed.
     ///
     /// # Errors
-    /// As [`Offer::receive`].
-    pub fn into_offer(self) -> Result<Result<Offer, RefusedOffer>, PassError> {
-        let Self { bytes, count, cut, descriptors } = self;
-        if count == OFFER_BYTES && !cut {
-            return Ok(Offer::from_parts(&bytes, descriptors));
-        }
-        Err(PassError::Broken { bytes: count, descriptors: descriptors.len(), cut })
+    /// As [`Offer::from_parts`].
+    pub fn into_offer(self) -> Result<Offer, RefusedOffer> {
+        Offer::from_parts(&self.bytes, self.descriptors)
     }
 }
 

@@ -261,14 +261,52 @@ fn what_is_no_whole_offer_is_refused() {
         Offer::receive(&right),
         Err(PassError::Broken { bytes: 8, descriptors: 0, cut: false })
     ));
-    left.write_all(&[0; 24]).expect("room");
-    assert!(matches!(Offer::receive(&right), Ok(Err(RefusedOffer::Magic))));
+    // It was left there, and has an offer's length with what comes now.
+    left.write_all(&[0; 16]).expect("room");
+    assert!(matches!(
+        Offer::receive(&right),
+        Ok(Err(RefusedOffer::Capacity(0) | RefusedOffer::Version { .. }))
+    ));
     let (_region, offer) = Region::create(Capacity::MIN, BellKind::Socket).expect("a region");
     left.write_all(&offer.to_bytes()).expect("room");
     let refused = Offer::receive(&right).expect("whole").expect_err("without its descriptors");
     assert!(matches!(refused, RefusedOffer::Descriptors { got: 0, expected: 3 }), "{refused}");
     drop(left);
     assert!(matches!(Offer::receive(&right), Err(PassError::Closed)));
+}
+
+#[test]
+fn what_has_more_descriptors_than_an_offer_stays_in_the_socket() {
+    use std::{io::IoSlice, mem::MaybeUninit, os::fd::AsFd};
+
+    use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
+
+    let (left, right) = UnixStream::pair().expect("a pair");
+    let (_region, offer) = Region::create(Capacity::MIN, BellKind::Socket).expect("a region");
+    let pass = |count| {
+        let descriptors = vec![left.as_fd(); count];
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(253))];
+        let mut control = SendAncillaryBuffer::new(&mut space);
+        assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)), "room for 253");
+        sendmsg(&left, &[IoSlice::new(&offer.to_bytes())], &mut control, SendFlags::empty()).expect("room");
+    };
+    for count in [Offer::DESCRIPTORS_MAX + 1, 253] {
+        pass(count);
+        // Each time: nothing of it is taken.
+        for _ in 0..2 {
+            let broken = Offer::receive(&right).expect_err("too many");
+            assert!(
+                matches!(broken, PassError::Broken { bytes: 24, descriptors: 3..=6, cut: true }),
+                "{broken}"
+            );
+        }
+        let taken = rustix::net::recv(&right, &mut [0; 64][..], rustix::net::RecvFlags::DONTWAIT);
+        assert_eq!(taken.expect("still there").0, 24);
+    }
+    pass(Offer::DESCRIPTORS_MAX);
+    let mut received = sinew_shm::Received::receive(&right).expect("as many as an offer has");
+    assert_eq!(received.copies().len(), Offer::DESCRIPTORS_MAX);
+    assert!(received.into_offer().is_ok(), "what they are is looked at later");
 }
 
 #[test]

@@ -2,10 +2,9 @@
 //! thread of the application's does.
 
 use std::{
-    io,
     ops::Deref,
     os::{
-        fd::{AsFd, BorrowedFd, OwnedFd},
+        fd::{BorrowedFd, OwnedFd},
         unix::net::UnixStream,
     },
     sync::{
@@ -72,32 +71,35 @@ fn empty(bell: BorrowedFd<'_>) {
 
 /// Further copies of what a peer has passed, and of the socket over which it did. While they live nothing that becomes of the others is the
 /// last close, the only one that can block.
-pub(super) struct Foreign(Vec<OwnedFd>);
+pub(super) struct Foreign(Option<(Vec<OwnedFd>, Arc<UnixStream>)>);
 
 impl Foreign {
-    pub(super) fn of(received: &Received, socket: &Arc<UnixStream>) -> io::Result<Self> {
-        let mut copies = received.copies()?;
-        copies.push(socket.as_fd().try_clone_to_owned()?);
-        Ok(Self(copies))
+    pub(super) fn of(received: &mut Received, socket: &Arc<UnixStream>) -> Self {
+        Self(Some((received.copies(), socket.clone())))
     }
 
     /// All is what was to come, and in use: to close a copy of it waits for nobody.
     pub(super) fn are_good(mut self) {
-        self.0.clear();
+        self.0 = None;
     }
 }
 
 impl Drop for Foreign {
     fn drop(&mut self) {
-        if !self.0.is_empty() {
-            close(Left::Copies(std::mem::take(&mut self.0)));
+        if let Some((copies, socket)) = self.0.take() {
+            close(Left::Copies(copies, socket));
         }
     }
 }
 
+/// Whether what a peer passes wrongly would be closed. Where it would stay open no peer is let pass anything.
+pub(super) fn is_room() -> bool {
+    CLOSING.load(Ordering::Relaxed) < CLOSING_MAX
+}
+
 /// What may take long to be rid of.
 enum Left {
-    Copies(Vec<OwnedFd>),
+    Copies(Vec<OwnedFd>, Arc<UnixStream>),
     /// What is unread in a socket to which nothing more comes.
     In(Arc<UnixStream>),
 }
@@ -105,7 +107,7 @@ enum Left {
 impl Left {
     fn close(self) {
         match self {
-            Self::Copies(copies) => drop(copies),
+            Self::Copies(copies, socket) => drop((copies, socket)),
             Self::In(socket) => {
                 let mut chunk = [0; CHUNK];
                 // Without room for descriptors: the system closes them here.
@@ -138,7 +140,7 @@ fn close(left: Left) {
 
 #[cfg(all(test, target_os = "linux"))]
 mod tests {
-    use std::sync::mpsc::sync_channel;
+    use std::{os::fd::AsFd, sync::mpsc::sync_channel};
 
     use super::*;
     use crate::{

@@ -5,7 +5,7 @@ use std::io;
 use sinew_shm::{Descriptors, PassError, Received, set_descriptors};
 
 use super::{
-    foreign::{Foreign, LinkEnd},
+    foreign::{self, Foreign, LinkEnd},
     *,
 };
 
@@ -18,7 +18,7 @@ struct Theirs {
 impl Theirs {
     /// Takes it. Nothing more may be passed over `socket` from then on, where the system knows that.
     fn take(socket: &Arc<UnixStream>) -> Result<Self, ExchangeError> {
-        let received = Exchange::take(socket).map_err(|error| {
+        let mut received = Exchange::take(socket).map_err(|error| {
             let is_there = !matches!(
                 &error,
                 ExchangeError::Pass(PassError::System(cause)) if cause.kind() == io::ErrorKind::WouldBlock
@@ -26,8 +26,8 @@ impl Theirs {
             if is_there { error } else { ExchangeError::Missing }
         })?;
         let _ = set_descriptors(socket, Descriptors::Refused);
-        let copies = Foreign::of(&received, socket);
-        let theirs = Self { received, copies: copies.map_err(PassError::System)? };
+        let copies = Foreign::of(&mut received, socket);
+        let theirs = Self { received, copies };
         if descriptors::holds_something(socket) { Err(ExchangeError::Stray) } else { Ok(theirs) }
     }
 }
@@ -65,7 +65,7 @@ impl Direct {
 
     fn offer(&mut self, peer: Tid, number: LinkNumber) -> Result<(), Rejection> {
         let socket = self.take_end(number).ok_or(Rejection::QueueFull)?;
-        if !self.terms.budget.has_room(self.terms.ring_bytes) {
+        if !self.terms.budget.has_room(self.terms.ring_bytes) || !foreign::is_room() {
             return Err(Rejection::Unsupported);
         }
         let (exchange, share) = self.prepare(&socket).map_err(|why| {
@@ -120,7 +120,7 @@ impl Direct {
         // Dropped in the other order: the copies last.
         let Theirs { received, copies } = theirs;
         let Offered { peer, number, socket, exchange, share } = offered;
-        let (producer, consumer) = exchange.finish(received.into_offer()??)?;
+        let (producer, consumer) = exchange.finish(received.into_offer()?)?;
         copies.are_good();
         let writer = ring::Writer::new(Arc::clone(&socket), producer, &self.terms.options);
         let pair = Pair { own: self.terms.own, peer, number, socket };
@@ -233,7 +233,7 @@ mod tests {
         std::thread::spawn(move || {
             let ours = Arc::new(ours);
             let Theirs { received, copies } = Theirs::take(&ours).map_err(|why| why.to_string()).unwrap();
-            let is_refused = matches!(received.into_offer(), Ok(Err(_)));
+            let is_refused = received.into_offer().is_err();
             drop(copies);
             // The test has ended, where this comes too late.
             let _ = say.send(is_refused);

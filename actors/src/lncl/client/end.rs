@@ -32,7 +32,8 @@ pub(super) enum End {
     HungUp(Option<io::Error>),
     /// It was refused.
     Refused(String),
-    /// Its rings were not there in time, which is nobody's fault: it may register again.
+    /// Its rings were not there in time, or this node had no descriptor or memory left for them, which is not its fault: it may register
+    /// again.
     Late(String),
 }
 
@@ -99,7 +100,7 @@ impl Client {
             }
             // spec: LNCL-9
             End::Late(sentence) => {
-                self.count("rings too late", &sentence);
+                self.count("no rings in time", &sentence);
                 self.say_last(sentence, true);
             }
         }

@@ -10,7 +10,7 @@ use rustix::{
     io::Errno,
     net::{
         RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, ReturnFlags, SendAncillaryBuffer,
-        SendAncillaryMessage, SendFlags, recvmsg, sendmsg,
+        SendAncillaryMessage, SendFlags, recv, recvmsg, sendmsg,
     },
 };
 
@@ -34,22 +34,32 @@ pub(crate) fn send(offer: &Offer, socket: BorrowedFd<'_>) -> Result<(), PassErro
     }
 }
 
-/// Descriptors that one message can carry: SCM_MAX_FD of the kernel.
-const MESSAGE_DESCRIPTORS_MAX: usize = 253;
-
+/// Looks at it first: the kernel installs a copy of each descriptor then, and keeps its own in the queue, so that nothing that is closed
+/// before the bytes are taken is the last one. What is more than an offer, or less, is left where it is.
 pub(crate) fn receive(socket: BorrowedFd<'_>) -> Result<Received, PassError> {
     let mut bytes = [0; OFFER_BYTES];
-    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(MESSAGE_DESCRIPTORS_MAX))];
+    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(Offer::DESCRIPTORS_MAX))];
     let mut control = RecvAncillaryBuffer::new(&mut space);
-    let got = retried(|| {
-        recvmsg(socket, &mut [IoSliceMut::new(&mut bytes)], &mut control, RecvFlags::CMSG_CLOEXEC)
-    })?;
-    let cut = got.flags.intersects(ReturnFlags::CTRUNC | ReturnFlags::TRUNC);
+    let flags = RecvFlags::CMSG_CLOEXEC | RecvFlags::PEEK;
+    let seen = retried(|| recvmsg(socket, &mut [IoSliceMut::new(&mut bytes)], &mut control, flags))?;
+    let cut = seen.flags.intersects(ReturnFlags::CTRUNC | ReturnFlags::TRUNC);
     let descriptors = taken(&mut control);
-    if got.bytes == 0 && descriptors.is_empty() {
+    if seen.bytes == 0 {
         return Err(PassError::Closed);
     }
-    Ok(Received { bytes, count: got.bytes, cut, descriptors })
+    if cut && descriptors.len() < Offer::DESCRIPTORS_MAX {
+        return Err(PassError::System(Errno::MFILE.into()));
+    }
+    // The space is aligned, and has room for a few more than was asked for.
+    let cut = cut || descriptors.len() > Offer::DESCRIPTORS_MAX;
+    if cut || seen.bytes != OFFER_BYTES {
+        return Err(PassError::Broken { bytes: seen.bytes, descriptors: descriptors.len(), cut });
+    }
+    let copies = descriptors.iter().map(OwnedFd::try_clone).collect::<Result<_, _>>();
+    let copies = copies.map_err(PassError::System)?;
+    // Without room for descriptors: the kernel lets go of its own.
+    retried(|| recv(socket, &mut bytes[..], RecvFlags::DONTWAIT))?;
+    Ok(Received { bytes, descriptors, copies })
 }
 
 fn taken(control: &mut RecvAncillaryBuffer<'_>) -> Vec<OwnedFd> {
