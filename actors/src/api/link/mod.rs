@@ -70,18 +70,26 @@ pub(super) struct Link {
 /// Connects to the node that listens at `path`, until `deadline` at most.
 pub(super) fn connect(path: &Path, deadline: Time) -> Result<UnixStream, ApiError> {
     // To the system no time at all is as long as it takes.
-    let within = deadline.since(Time::now()).clamp(Duration::from_millis(1), CONNECT);
+    let least = Duration::from_millis(1);
+    let within = deadline.since(Time::now()).clamp(least, CONNECT);
+    let end = Time::now() + within;
     let address = address_of(path)?;
     let try_to = || -> std::io::Result<UnixStream> {
         let socket = Socket::new(Domain::UNIX, Type::STREAM, None)?;
-        // Linux bounds a unix socket's `connect` by the time allowed for sending.
-        socket.set_write_timeout(Some(within))?;
-        socket.connect(&address)?;
+        loop {
+            // Linux bounds a unix socket's `connect` by the time allowed for sending.
+            socket.set_write_timeout(Some(end.since(Time::now()).max(least)))?;
+            match socket.connect(&address) {
+                // A signal is no reason to give up.
+                Err(cause) if cause.kind() == ErrorKind::Interrupted && Time::now() < end => {}
+                came => break came?,
+            }
+        }
         socket.set_nonblocking(true)?;
         Ok(UnixStream::from(OwnedFd::from(socket)))
     };
     try_to().map_err(|cause| {
-        if matches!(cause.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) {
+        if matches!(cause.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) {
             // Somebody listens, and takes nobody.
             return ApiError::NoAnswer(within);
         }

@@ -42,9 +42,9 @@ pub(in crate::api) use writing::{Begun, Rest};
 /// Bytes that are taken from a ring at once.
 pub(in crate::api) const ENOUGH: usize = 64 * 1024;
 /// Outcomes that wait for room at most: as many as the largest `node.mailbox_capacity`, which is how many confirmed messages
-/// a node has with one client at most. So none is left out on the way through a node. Of a direct link one more is not
-/// said: its sender counts it as Unknown at its own deadline.
-pub(super) const OWED_MAX: usize = 65_536;
+/// a node has with one client at most, with the marks of 1,024 links and 16 introductions that this side has not answered. So none is left
+/// out on the way through a node. Of a direct link one more is not said: its sender counts it as Unknown at its own deadline.
+pub(super) const OWED_MAX: usize = 65_536 + 1_024 + 16;
 /// Longest sentence, with its frame, that a node takes leave with.
 const LAST_WORDS_BYTES_MAX: usize = 4_096;
 /// Longest sleep at a ring: then what other threads owe is paid, and the socket is looked at.
