@@ -92,8 +92,19 @@ impl Lingering {
 
 /// Passes one with `bytes`, and keeps no copy.
 pub(super) fn pass_lingering(keeper: u16, socket: &UnixStream, bytes: &[u8]) -> io::Result<Passed> {
+    pass_copies(keeper, socket, bytes, 1)
+}
+
+/// Passes one with `bytes` in so many copies, and keeps none.
+pub(super) fn pass_copies(
+    keeper: u16,
+    socket: &UnixStream,
+    bytes: &[u8],
+    count: usize,
+) -> io::Result<Passed> {
     let lingering = Lingering::connect(keeper)?.0;
-    let copies = [lingering.try_clone()?.into()];
+    let copies: Vec<OwnedFd> =
+        (0..count).map(|_| Ok(lingering.try_clone()?.into())).collect::<io::Result<_>>()?;
     let passed = pass(socket, bytes, &copies);
     let is_refused = |error: &io::Error| error.raw_os_error() == Some(rustix::io::Errno::PERM.raw_os_error());
     let became = match passed {

@@ -18,8 +18,8 @@ use sinew_runtime::wire::{Header, encode};
 /// Nothing is waited for longer than this: whoever is hostile has more to do.
 const PATIENCE: Duration = Duration::from_millis(300);
 const HEADER_BYTES: usize = 64;
-/// Descriptors that are passed at once, at most.
-const DESCRIPTORS_MAX: usize = 16;
+/// Descriptors that are passed at once, at most: SCM_MAX_FD of the kernel.
+pub(super) const DESCRIPTORS_MAX: usize = 253;
 
 /// A frame that may be wrong.
 #[derive(Clone, Debug)]

@@ -89,7 +89,7 @@ impl Attacker {
 
     /// Plays one trick. What the node answers to it, or that it closes, is no error.
     pub(super) fn play_one(&mut self) {
-        const TRICKS: [Trick; 23] = [
+        const TRICKS: [Trick; 25] = [
             Attacker::garbage,
             Attacker::mutants,
             Attacker::forged_sources,
@@ -98,6 +98,7 @@ impl Attacker {
             Attacker::crowd,
             Attacker::half_a_frame,
             Attacker::wishes,
+            Attacker::restless,
             Attacker::too_early,
             Attacker::false_outcomes,
             Attacker::lying_ring,
@@ -113,6 +114,7 @@ impl Attacker {
             Attacker::lingering_bell,
             Attacker::lingering_link,
             Attacker::lingering_offer,
+            Attacker::lingering_crowd,
         ];
         self.tally.tricks += 1;
         let trick = TRICKS[self.dice.below(TRICKS.len() as u32) as usize];
@@ -329,6 +331,18 @@ impl Attacker {
             } else {
                 Frame::of_lncl(Kind::LNCL_RESOLVE, me, &Name { name: "witness".repeat(3) })
             };
+            self.write(&mut stranger, &frame.bytes())?;
+        }
+        self.listen(&mut stranger)
+    }
+
+    /// Joins groups and leaves them again, as fast as it can write.
+    fn restless(&mut self) -> io::Result<()> {
+        let mut stranger = self.register()?;
+        let end = Instant::now() + TRICK;
+        for step in (0..100_000_u32).take_while(|_| Instant::now() < end) {
+            let membership = Membership { group: 0xF000_0000 | (step / 2 % 256), member: step % 2 == 0 };
+            let frame = Frame::of_lncl(Kind::LNCL_GROUP, stranger.tid, &membership);
             self.write(&mut stranger, &frame.bytes())?;
         }
         self.listen(&mut stranger)

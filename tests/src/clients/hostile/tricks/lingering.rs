@@ -6,8 +6,8 @@ use sinew_shm::{BellKind, Region};
 
 use super::{Attacker, Stranger, ask_for_rings};
 use crate::clients::hostile::{
-    lingering::{Passed, offer_with_full_bells, pass_lingering},
-    stranger::Frame,
+    lingering::{Passed, offer_with_full_bells, pass_copies, pass_lingering},
+    stranger::{DESCRIPTORS_MAX, Frame},
 };
 
 impl Attacker {
@@ -60,6 +60,16 @@ impl Attacker {
         let socket = if is_bell { link.end.bell(bell)? } else { link.met.socket.try_clone()? };
         self.linger_on(&socket, &[1])?;
         link.end.take()
+    }
+
+    /// Where an offer is due: in as many copies as one message can carry.
+    pub(super) fn lingering_crowd(&mut self) -> io::Result<()> {
+        self.tally.connections += 1;
+        let (stranger, theirs, _) = ask_for_rings(&self.socket)?;
+        let passed = pass_copies(self.keeper, &stranger.stream, &theirs.to_bytes(), DESCRIPTORS_MAX)?;
+        self.tally.lingering += 1;
+        self.tally.lingering_came += u64::from(passed == Passed::Came);
+        self.wait_or_go(stranger)
     }
 
     /// Where an offer is due: in place of it, or in its bell.
