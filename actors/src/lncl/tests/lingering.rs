@@ -75,9 +75,11 @@ fn where_descriptors_come_one_that_does_not_close_holds_nobody_up_and_is_refused
     node.stores.door.let_descriptors_come();
     // Given: one that was read with a descriptor beside it, and one that went before it was read.
     // The node refuses them itself as soon as it listens to a connection; so they come only to one that it has not seen yet.
-    let (mut stranger, first) = std::iter::repeat_with(|| (RawClient::connect(&node), Lingering::new()))
+    // What is passed is made before the connection: that takes longer than the node.
+    let (mut stranger, first) = std::iter::repeat_with(Lingering::new)
         .take(100)
-        .find_map(|(mut stranger, mut lingering)| {
+        .find_map(|mut lingering| {
+            let mut stranger = RawClient::connect(&node);
             lingering.pass(&mut stranger, b"S").then_some((stranger, lingering))
         })
         .expect("one comes");
