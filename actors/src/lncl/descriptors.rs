@@ -4,7 +4,6 @@
 //! clients that the default configuration admits a node needs more.
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
-
 use sinew_shm::Offer;
 
 use super::worker::WAITING_MAX;
@@ -12,7 +11,8 @@ use crate::config::LnclConfig;
 
 /// Of a client: its socket, its process, and the node's two bells; a task's own two besides, which a thread has in memory.
 const PER_CLIENT: usize = 6;
-/// What waits to be given back behind a descriptor that does not close: as many things as may, each with a peer's offer.
+/// What waits to be given back behind a descriptor that does not close: as many things as may, each with what a client has
+/// passed as its offer.
 const LEFT: usize = WAITING_MAX * Offer::DESCRIPTORS_MAX;
 /// The node's own, introductions that are not answered, and what the applications in its process may open.
 const OWN: usize = 256;
