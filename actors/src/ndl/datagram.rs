@@ -402,11 +402,13 @@ pub(crate) fn encode(datagram: &Datagram, to: NodeAddress) -> BytesMut {
     bytes
 }
 
-/// Which node says that it made a datagram, of which nothing else is believed yet.
+/// Which node's NDL says that it made a datagram, of which nothing else is believed yet. What says nothing like it is not worth the time that it takes to look
+/// at a seal.
 pub(crate) fn maker_of(bytes: &[u8]) -> Option<NodeAddress> {
     const SOURCE_AT: usize = 16;
     let source = bytes.get(SOURCE_AT..)?.first_chunk()?;
-    Some(Tid::from_bits(u64::from_le_bytes(*source)).node)
+    let source = Tid::from_bits(u64::from_le_bytes(*source));
+    (source.app == AppAddress::NDL).then_some(source.node)
 }
 
 #[cfg(test)]

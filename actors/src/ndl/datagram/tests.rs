@@ -248,6 +248,17 @@ fn an_announcement_that_cannot_be_used_is_refused() {
 }
 
 #[test]
+fn of_what_names_no_ndl_as_its_maker_no_seal_is_looked_at() {
+    let datagram = Datagram { correlation: 1, sent: Time::ZERO, body: Body::Query(sound()) };
+    let mut bytes = encode(&datagram, NodeAddress::ALL);
+    assert_eq!(maker_of(&bytes), Some(sound().node));
+    // Nor of noise: one in 2^32 looks like one.
+    bytes[16] ^= 1;
+    assert_eq!(maker_of(&bytes), None);
+    assert_eq!(maker_of(&bytes[..23]), None);
+}
+
+#[test]
 fn a_source_that_is_not_the_announced_node_is_refused() {
     let forged = refusal(&Announcement { node: NodeAddress::new(10), ..sound() });
     assert!(matches!(forged, DatagramError::Forged { .. }));
