@@ -1,7 +1,6 @@
 //! The accepting socket: waits when the system has no more to give, and never spins.
 
 use std::{
-    future::poll_fn,
     io,
     net::{Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4},
     time::Duration,
@@ -13,15 +12,11 @@ use sinew_runtime::time::Time;
 use socket2::{Domain, SockRef, Socket, Type};
 use tokio::net::{TcpListener, TcpStream};
 
+use super::pace::Pace;
 use crate::{config::NodeConfig, refusals::Refusals};
 
 /// Connections that wait to be accepted at most; the kernel refuses further ones.
 const BACKLOG: i32 = 1_024;
-/// Connections that are accepted without a pause, each in a turn of its own, which takes some 50 us of the thread: so no message waits longer
-/// for one than for another one of 64 KiB, and a flood of them has a sixth of the thread.
-const AT_ONCE_MAX: u32 = 4;
-/// The pause: 300 nodes that dial all their connections at once are accepted within a third of a second.
-const REST: Duration = Duration::from_millis(1);
 const BACK_OFF_MIN: Duration = Duration::from_millis(10);
 const BACK_OFF_MAX: Duration = Duration::from_millis(100);
 
@@ -169,27 +164,24 @@ fn begin_to_listen(socket: &Socket, address: SocketAddr) -> io::Result<std::net:
 }
 
 /// Each connection that is made to `listener`, and each error that made it wait. See [`tune`](super::link::tune). Links that stand share
-/// the thread: they have their turn between two connections, after [`AT_ONCE_MAX`] without a pause it [rests](REST), and whoever floods the
+/// the thread: they have their turn between two connections, it rests at a [pace](Pace) that whoever connects cannot quicken, and who floods the
 /// port waits in the kernel.
 pub(super) fn accepted(
     listener: TcpListener,
     give_up: Duration,
 ) -> impl Stream<Item = io::Result<TcpStream>> {
-    stream::unfold((listener, Duration::ZERO, 0), move |(listener, wait, mut at_once)| async move {
+    let pace = Pace::new(Time::now());
+    stream::unfold((listener, Duration::ZERO, pace), move |(listener, wait, mut pace)| async move {
         if wait > Duration::ZERO {
             tokio::time::sleep(wait).await;
-        } else if at_once >= AT_ONCE_MAX {
-            tokio::time::sleep(REST).await;
-            at_once = 0;
-        } else if at_once > 0 {
-            others_turn().await;
         }
-        let accepted = poll_fn(|cx| {
-            let accepted = listener.poll_accept(cx);
-            at_once = if accepted.is_pending() { 0 } else { at_once + 1 };
-            accepted
-        });
-        let accepted = accepted.await.and_then(|(socket, _)| {
+        while let Some(rest) = pace.rest(Time::now()) {
+            tokio::time::sleep(rest).await;
+        }
+        others_turn().await;
+        let accepted = listener.accept().await;
+        pace.took_one(Time::now());
+        let accepted = accepted.and_then(|(socket, _)| {
             super::link::tune(&socket, give_up)?;
             Ok(socket)
         });
@@ -198,7 +190,7 @@ pub(super) fn accepted(
             std::future::pending::<()>().await;
         }
         let wait = accepted.as_ref().err().map_or(Duration::ZERO, |error| wait_after(error, wait));
-        Some((accepted, (listener, wait, at_once)))
+        Some((accepted, (listener, wait, pace)))
     })
 }
 
@@ -245,7 +237,10 @@ mod tests {
     use actix::{Actor, AsyncContext, Context, StreamHandler, System};
     use futures_util::{FutureExt, StreamExt};
 
-    use super::*;
+    use super::{
+        super::pace::{IN_A_ROW_MAX, REST},
+        *,
+    };
 
     const LOOPBACK: &str = if cfg!(target_os = "linux") { "lo" } else { "lo0" };
 
@@ -360,22 +355,20 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn after_some_connections_without_a_pause_the_thread_is_left_to_others_and_all_are_accepted() {
-        const DIALLED: u32 = 5 * AT_ONCE_MAX;
+    async fn each_row_of_connections_is_followed_by_a_rest_also_where_none_waits_when_the_next_one_comes() {
+        const ROWS: u32 = 5;
         let listener = listen(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
         let address = listener.local_addr().unwrap();
-        let _dialled: Vec<_> = (0..DIALLED).map(|_| std::net::TcpStream::connect(address).unwrap()).collect();
         let mut accepted = pin!(accepted(TcpListener::from_std(listener).unwrap(), Duration::from_secs(1)));
-        let (mut longest, mut at_once, mut before) = (0, 0, Instant::now());
-        for _ in 0..DIALLED {
-            accepted.next().await.expect("it listens").unwrap();
-            // A slow machine may make pauses of its own, and takes none away.
-            let now = Instant::now();
-            at_once = if now.duration_since(before) < REST { at_once + 1 } else { 1 };
-            before = now;
-            longest = at_once.max(longest);
+        let began = Instant::now();
+        for _ in 0..ROWS * IN_A_ROW_MAX {
+            // The one before has been accepted, and is closed.
+            let next = async { TcpStream::connect(address).await.unwrap() };
+            let (accepted, _dialled) = tokio::join!(accepted.next(), next);
+            accepted.expect("it listens").unwrap();
         }
-        assert!(longest <= AT_ONCE_MAX, "{longest} without a pause");
+        // A slow machine may make pauses of its own, and takes none away.
+        assert!(began.elapsed() >= REST * (ROWS - 1), "{:?}", began.elapsed());
     }
 
     /// Has a stream more for each connection, as the layer's shell has.
@@ -404,8 +397,8 @@ mod tests {
             let listener = listen(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
             let address = listener.local_addr().unwrap();
             let _dialled: Vec<_> =
-                (0..AT_ONCE_MAX).map(|_| std::net::TcpStream::connect(address).unwrap()).collect();
-            let (say, said) = sync_channel(AT_ONCE_MAX as usize);
+                (0..IN_A_ROW_MAX).map(|_| std::net::TcpStream::connect(address).unwrap()).collect();
+            let (say, said) = sync_channel(IN_A_ROW_MAX as usize);
             let turns = Arc::new(AtomicU32::new(0));
             let counting = turns.clone();
             let _shell = Shell(Some(TcpListener::from_std(listener).unwrap()), say, turns).start();
@@ -416,7 +409,7 @@ mod tests {
                 }
             });
             let mut seen = Vec::new();
-            while seen.len() < AT_ONCE_MAX as usize {
+            while seen.len() < IN_A_ROW_MAX as usize {
                 seen.extend(said.try_iter());
                 tokio::task::yield_now().await;
             }

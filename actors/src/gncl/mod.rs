@@ -43,6 +43,7 @@
 //! | `ticks.rs` | looks at what has a time, only as long as there is something |
 //! | `marks.rs` | what the network is told about a class |
 //! | `listener.rs` | the accepting socket |
+//! | `pace.rs` | how fast it accepts |
 //! | `actor.rs`, `actor/` | the shell that ties them together; how it ends |
 
 mod actor;
@@ -62,6 +63,7 @@ mod listener;
 mod marks;
 mod notes;
 mod owed;
+mod pace;
 mod peer;
 mod proofs;
 mod secure;

@@ -6,13 +6,12 @@
 
 use std::{
     collections::VecDeque,
-    future::poll_fn,
     io::{self, Read as _},
     net::{Ipv4Addr, SocketAddr, UdpSocket},
     path::Path,
     sync::Arc,
     thread,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use rustix::process::{getpriority_process, setpriority_process};
@@ -36,16 +35,17 @@ use super::keys::{self, Who};
 pub(super) const CONNECTIONS_PORT: u16 = 7_710;
 pub(super) const DATAGRAMS_PORT: u16 = 7_711;
 
-/// As a node's, whose pace its attackers are to have here, too: connections that wait in the kernel, that are taken without a pause, the
-/// pause with what four of them take a node's thread, those that may be open, time for a handshake, how much nicer the thread of handshakes
-/// is, datagrams without a pause, and that pause.
+/// As a node's, whose pace its attackers are to have here, too: connections that wait in the kernel, that are taken without a pause, the pause,
+/// in which one is saved up, those that are saved up at most, those that may be open, time for a handshake, how much nicer the thread of handshakes
+/// is, datagrams that are none of the project's and are read without a pause in the long run, and that pause.
 const BACKLOG: i32 = 1_024;
 const AT_ONCE_MAX: u32 = 4;
-const REST: Duration = Duration::from_micros(1_200);
+const REST: Duration = Duration::from_millis(1);
+const SAVED_MAX: u32 = 64;
 const STRANGERS_MAX: usize = 64;
 const HANDSHAKE: Duration = Duration::from_secs(2);
 const NICER: i32 = 5;
-const DATAGRAMS_AT_ONCE: u32 = 128;
+const DATAGRAMS_AT_ONCE: u32 = 16;
 const DATAGRAMS_REST: Duration = Duration::from_millis(1);
 
 /// Bytes that are read at once.
@@ -113,20 +113,12 @@ struct Handshakes {
 
 async fn take(listener: std::net::TcpListener, handshakes: Handshakes) {
     let listener = TcpListener::from_std(listener).expect("a reactor");
-    let (mut at_once, mut open) = (0, VecDeque::<AbortOnDropHandle<()>>::new());
+    let (mut pace, mut open) = (Pace::new(), VecDeque::<AbortOnDropHandle<()>>::new());
     loop {
-        if at_once >= AT_ONCE_MAX {
-            sleep(REST).await;
-            at_once = 0;
-        } else if at_once > 0 {
-            yield_now().await;
-        }
-        let accepted = poll_fn(|cx| {
-            let accepted = listener.poll_accept(cx);
-            at_once = if accepted.is_pending() { 0 } else { at_once + 1 };
-            accepted
-        });
-        let Ok((socket, _)) = accepted.await else {
+        pace.keep().await;
+        let accepted = listener.accept().await;
+        pace.took_one();
+        let Ok((socket, _)) = accepted else {
             // Whoever came has gone, or there are no descriptors left.
             sleep(REST).await;
             continue;
@@ -140,6 +132,51 @@ async fn take(listener: std::net::TcpListener, handshakes: Handshakes) {
             // However it ends, that is the attacker's business.
             let _ = hear(socket, handshakes).await;
         })));
+    }
+}
+
+/// How fast connections are taken.
+struct Pace {
+    saved: u32,
+    as_of: Instant,
+    at_once: u32,
+    last: Instant,
+}
+
+impl Pace {
+    fn new() -> Self {
+        let now = Instant::now();
+        Self { saved: SAVED_MAX, as_of: now, at_once: 0, last: now }
+    }
+
+    /// Returns when the next one may be taken.
+    async fn keep(&mut self) {
+        loop {
+            self.pass_time();
+            if self.saved > 0 && self.at_once < AT_ONCE_MAX {
+                break;
+            }
+            sleep(REST).await;
+        }
+        if self.at_once > 0 {
+            yield_now().await;
+        }
+    }
+
+    fn took_one(&mut self) {
+        self.pass_time();
+        (self.at_once, self.last) = (self.at_once + 1, Instant::now());
+        self.saved = self.saved.saturating_sub(1);
+    }
+
+    fn pass_time(&mut self) {
+        if self.last.elapsed() >= REST {
+            self.at_once = 0;
+        }
+        while self.as_of.elapsed() >= REST {
+            self.as_of += REST;
+            self.saved = SAVED_MAX.min(self.saved + 1);
+        }
     }
 }
 

@@ -15,9 +15,9 @@ use super::{
 
 /// What is measured in no round.
 pub(super) const BETWEEN: &str = "between";
-/// Time after each attack, in which a node has done with the connections that still wait for it in the kernel: 1,024 at most, three each
+/// Time after each attack, in which a node has done with the connections that still wait for it in the kernel: 1,024 at most, one each
 /// millisecond.
-const PAUSE: Duration = Duration::from_millis(500);
+const PAUSE: Duration = Duration::from_millis(1_100);
 
 /// How often each thing was done.
 pub type Done = BTreeMap<&'static str, u64>;
