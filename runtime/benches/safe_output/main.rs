@@ -4,8 +4,12 @@
 //! case. A trial's time is that from the end of the watchdog's time, counted from the last good command's handler, to the
 //! call that makes the output safe: so it lacks what lies between the look at a command and its handler, some microseconds. Sender,
 //! receiver and watchdog run under SCHED_FIFO where that is granted, as on a robot; in the cases that end in `_busy` as many threads
-//! as there are CPUs, and one more, compute at ordinary priority. One JSON line for each case on the standard output, a table on the
-//! other. Nothing here asserts a time.
+//! as there are CPUs, and one more, compute at ordinary priority. Two JSON lines for each case on the standard output, a table on
+//! the other. Nothing here asserts a time.
+//!
+//! In the same case a thread with the watchdog's priority that has no part in all this sleeps for `within` again and again: how late it wakes
+//! is what the machine does to any such thread, whatever it is to do (a host that takes the CPU away, a kernel that finishes what it does
+//! for an ordinary thread first, as one that was built without preemption does).
 
 #![expect(clippy::unwrap_used, reason = "a bench says what failed by failing")]
 
@@ -195,6 +199,10 @@ fn run(case: &Case) {
             })
         })
         .collect();
+    let witness = {
+        let ends = ends.clone();
+        thread::spawn(move || bear_witness(&ends))
+    };
     let (mut late, mut over, mut early) = (Figures::new(), 0, 0);
     for _ in 0..TRIALS {
         while !matches!(next(&seen), Seen::Moved) {}
@@ -218,10 +226,30 @@ fn run(case: &Case) {
     let figure = "made safe past the watchdog's time";
     Alone { bench: "safe_output", case: case.name, figure, seen: &late, counts: &counts }.report();
     ends.store(true, Ordering::Relaxed);
+    let (woken, over) = witness.join().unwrap();
+    let (figure, counts) = ("a bare sleep of as long is late", [("over_1_ms", over)]);
+    Alone { bench: "safe_output", case: case.name, figure, seen: &woken, counts: &counts }.report();
     for spinner in spinners {
         spinner.join().unwrap();
     }
     stage.stop();
+}
+
+/// How late a thread wakes that only sleeps, and how often it is late by more than [`LATE`].
+fn bear_witness(ends: &AtomicBool) -> (Figures, u64) {
+    Place::layer("witness").realtime(90).prepare();
+    let (mut late, mut over) = (Figures::new(), 0);
+    while !ends.load(Ordering::Relaxed) {
+        let due = Time::now() + PROTECTION.within;
+        thread::park_timeout(PROTECTION.within);
+        let now = Time::now();
+        // One that was woken for nothing has slept for less.
+        if now >= due {
+            late.record(now.since(due));
+            over += u64::from(now.since(due) > LATE);
+        }
+    }
+    (late, over)
 }
 
 fn next(seen: &Receiver<Seen>) -> Seen {
