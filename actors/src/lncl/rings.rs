@@ -32,14 +32,16 @@ struct Threads {
 }
 
 impl Rings {
-    /// Begins the threads.
-    pub(super) fn begin() -> Self {
+    /// Begins the threads, for so many connections at once.
+    pub(super) fn begin(connections: usize) -> Self {
         let making = Worker::begin(
+            connections,
             "rings",
             "who registers meanwhile gets a plain socket",
             "each newcomer holds up others",
         );
         let closing = Worker::begin(
+            connections,
             "closing",
             "what other clients leave waits behind it",
             "who passes a descriptor that does not close holds up others",
@@ -186,7 +188,7 @@ mod tests {
 
     #[test]
     fn what_is_made_is_made_on_a_thread_of_its_own_and_given_back_on_another() {
-        let rings = Rings::begin();
+        let rings = Rings::begin(1);
         let thread: Thread = block_on(rings.run(current)).expect("no panic");
         assert_eq!(thread.name(), Some("rings"));
         assert!(![thread.id(), current().id()].contains(&closing(&rings)));
@@ -195,7 +197,7 @@ mod tests {
     #[test]
     fn who_has_gone_meanwhile_leaves_nothing() {
         // Given: somebody whose thing is not made yet.
-        let rings = Rings::begin();
+        let rings = Rings::begin(1);
         let held = hold(&rings.0.making);
         let (what, dropped) = remains();
         let what = rings.keep(what);
@@ -211,7 +213,7 @@ mod tests {
     #[test]
     fn so_much_waits_and_nothing_more_is_made_nor_done_by_who_asks() {
         // Given: threads that hang, and as much as may wait for them.
-        let rings = Rings::begin();
+        let rings = Rings::begin(1);
         let closing = closing(&rings);
         let held = [&rings.0.making, &rings.0.closing].map(hold);
         (0..WAITING_MAX).for_each(|_| rings.0.making.give(Box::new(|| ())));
@@ -229,8 +231,23 @@ mod tests {
     }
 
     #[test]
+    fn what_all_leave_at_once_is_given_back_however_many_they_are_and_however_long_the_first_takes() {
+        // Given: as many connections as can be configured, and a thread that is held up.
+        const CONNECTIONS: usize = 4_096 + 1_024;
+        let rings = Rings::begin(CONNECTIONS);
+        let held = hold(&rings.0.closing);
+        let left = Arc::new(());
+        // When: all end, with both halves of their rings and an unread socket each.
+        (0..3 * CONNECTIONS).for_each(|_| drop(rings.keep(left.clone())));
+        drop(held);
+        // Then:
+        closing(&rings);
+        assert_eq!(Arc::strong_count(&left), 1, "something is never given back");
+    }
+
+    #[test]
     fn who_makes_the_thread_hang_that_gives_back_costs_newcomers_no_rings() {
-        let rings = Rings::begin();
+        let rings = Rings::begin(1);
         let _held = hold(&rings.0.closing);
         drop(rings.keep(()));
         assert!(block_on(rings.run(current)).is_some());
@@ -238,7 +255,7 @@ mod tests {
 
     #[test]
     fn what_takes_long_is_said_once() {
-        let rings = Rings::begin();
+        let rings = Rings::begin(1);
         let _held = hold(&rings.0.making);
         assert!(!rings.0.making.queue.say_if_slow(), "it has just begun");
         *lock(&rings.0.making.queue.since) = Instant::now().checked_sub(SLOW);
@@ -248,7 +265,7 @@ mod tests {
 
     #[test]
     fn a_fault_in_one_thing_is_told_and_the_thread_does_the_next_one() {
-        let rings = Rings::begin();
+        let rings = Rings::begin(1);
         let thread = block_on(rings.run(current)).expect("no panic");
         let fault = || -> u8 { std::panic::panic_any("planted") };
         assert_eq!(block_on(rings.run(fault)), None);

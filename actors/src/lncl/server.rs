@@ -92,7 +92,8 @@ impl Server {
 
     /// What makes the rings of clients.
     pub(super) fn rings(&self) -> &Rings {
-        self.rings.get_or_init(Rings::begin)
+        let lncl = &self.stores.config.lncl;
+        self.rings.get_or_init(|| Rings::begin(lncl.clients_max + lncl.strangers_max))
     }
 
     /// Resolves when there is room for what one connection more may leave.

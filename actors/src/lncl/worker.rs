@@ -15,8 +15,8 @@ use crate::{nicer::give_way, stores::lock};
 
 /// Things that may wait, at most: four for each of 64 addresses that come or go at once.
 pub(super) const WAITING_MAX: usize = 256;
-/// Things that wait in all, with what those leave who are served already: four for each of 1,280 clients.
-const GIVEN_MAX: usize = 1_280 * 4 + WAITING_MAX;
+/// Things that one connection leaves, at most.
+const LEFT_BY_ONE: usize = 4;
 /// What takes longer is said.
 pub(super) const SLOW: Duration = Duration::from_secs(1);
 
@@ -35,16 +35,26 @@ pub(super) struct Queue {
     waiting: AtomicUsize,
     /// Since when the task at hand is done, unless that was said to be long.
     pub(super) since: Mutex<Option<Instant>>,
+    /// What it may have to do in all, with what those leave who are served already.
+    given_max: usize,
     name: &'static str,
     /// What it means that a task takes long.
     slow: &'static str,
 }
 
 impl Worker {
-    /// Begins the thread. `slow` says what it means that one thing takes it long, `without` that there is no such thread.
-    pub(super) fn begin(name: &'static str, slow: &'static str, without: &'static str) -> Self {
-        let (sender, tasks) = sync_channel(GIVEN_MAX);
-        let queue = Arc::new(Queue { waiting: AtomicUsize::default(), since: Mutex::default(), name, slow });
+    /// Begins the thread, for what so many connections may leave at once. `slow` says what it means that one thing takes it long, `without`
+    /// that there is no such thread.
+    pub(super) fn begin(
+        connections: usize,
+        name: &'static str,
+        slow: &'static str,
+        without: &'static str,
+    ) -> Self {
+        let given_max = LEFT_BY_ONE * connections + WAITING_MAX;
+        let (sender, tasks) = sync_channel(given_max);
+        let (waiting, since) = (AtomicUsize::default(), Mutex::default());
+        let queue = Arc::new(Queue { waiting, since, given_max, name, slow });
         let its_queue = queue.clone();
         let tasks = thread::Builder::new().name(name.to_owned()).spawn(move || work(tasks, &its_queue));
         let tasks = tasks.inspect_err(|cause| {
@@ -69,8 +79,9 @@ impl Worker {
         if let Err(TrySendError::Full(task) | TrySendError::Disconnected(task)) = tasks.try_send(task) {
             queue.waiting.fetch_sub(1, Ordering::Relaxed);
             crate::log::error!(
-                "the thread `{}` has {GIVEN_MAX} things to do: one is never done, and what it holds stays until the node ends",
-                queue.name
+                "the thread `{}` has {} things to do: one is never done, and what it holds stays until the node ends",
+                queue.name,
+                queue.given_max
             );
             // The caller must not wait for what may take for ever.
             std::mem::forget(task);
