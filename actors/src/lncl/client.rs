@@ -18,7 +18,7 @@ use sinew_runtime::{
     time::Time,
     wire::{Kind, Message, encode_frame},
 };
-use sinew_shm::{Capacity, PassError};
+use sinew_shm::Capacity;
 use tokio::net::{UnixStream, unix::UCred};
 
 pub(super) use self::notices::Notices;
@@ -44,7 +44,7 @@ use crate::{
     access::{Access, Applicant},
     monitors::Cause,
     outlet::{LinkNumber, OutletLimits, StreamOutlet},
-    ring::{Exchange, ExchangeError},
+    ring::Exchange,
     stores::{Stores, lock},
 };
 
@@ -305,9 +305,7 @@ impl Client {
         let exchange = link::exchange(exchange, &self.peer.stream, payload_max, self.server.rings());
         let (socket, reader) = match tokio::time::timeout(HANDSHAKE, exchange).await {
             Ok(Ok(both)) => both,
-            Ok(Err(ExchangeError::Pass(PassError::Closed))) => return Err(End::HungUp(None)),
-            Ok(Err(why)) if why.is_of_this_side() => return Err(End::Late(format!("{why}; register again"))),
-            Ok(Err(why)) => return Err(End::Refused(why.to_string())),
+            Ok(Err(why)) => return Err(why.into()),
             Err(_) => {
                 return Err(End::Late(format!(
                     "its rings were not there within {HANDSHAKE:?}: it was stopped or slow to offer its half, or this node was slow to map it"

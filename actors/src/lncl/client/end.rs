@@ -9,6 +9,7 @@ use sinew_runtime::{
     time::Time,
     wire::{FrameError, Kind, Message},
 };
+use sinew_shm::PassError;
 
 use super::{
     super::{
@@ -18,7 +19,10 @@ use super::{
     },
     Client, Ring, write_now,
 };
-use crate::{monitors::Cause, ring::RingError};
+use crate::{
+    monitors::Cause,
+    ring::{ExchangeError, RingError},
+};
 
 /// Time that a client has to take its refusal when earlier messages fill its socket.
 pub(super) const LAST_WORDS: Duration = Duration::from_millis(100);
@@ -70,6 +74,29 @@ impl From<LinkError> for End {
             }
         }
     }
+}
+
+impl From<ExchangeError> for End {
+    fn from(error: ExchangeError) -> Self {
+        let (sentence, is_of_this_side) = (error.to_string(), error.is_of_this_side());
+        if matches!(error, ExchangeError::Pass(PassError::Closed)) {
+            return Self::HungUp(None);
+        }
+        if let ExchangeError::Pass(PassError::System(cause)) = error
+            && has_gone(&cause)
+        {
+            return Self::HungUp(Some(cause));
+        }
+        if is_of_this_side {
+            return Self::Late(format!("{sentence}; register again"));
+        }
+        Self::Refused(sentence)
+    }
+}
+
+/// Whether it says that nobody is at the other end any more.
+fn has_gone(cause: &io::Error) -> bool {
+    matches!(cause.kind(), io::ErrorKind::BrokenPipe | io::ErrorKind::ConnectionReset)
 }
 
 impl From<FrameError> for End {
@@ -162,5 +189,26 @@ impl Drop for Client {
         // spec: LNCL-7. A peer that sleeps at a ring is woken by its end.
         self.outlet.end(Outcome::Failed, Rejection::Closed);
         self.server.stores.book.remove_client(self.peer.id);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rustix::io::Errno;
+    use sinew_shm::RefusedOffer;
+
+    use super::*;
+
+    #[test]
+    fn who_has_gone_before_its_rings_were_made_is_neither_refused_nor_told_to_come_again() {
+        let ended = |errno: Errno| End::from(ExchangeError::Pass(PassError::System(errno.into())));
+        for errno in [Errno::PIPE, Errno::CONNRESET] {
+            assert_eq!(ended(errno).cause().class, DownClass::ProcessEnded, "{errno}");
+        }
+        // What this node is short of is no fault of the client's; what it offers is.
+        for errno in [Errno::MFILE, Errno::NFILE, Errno::NOMEM] {
+            assert!(matches!(ended(errno), End::Late(_)), "{errno}");
+        }
+        assert!(matches!(End::from(ExchangeError::Refused(RefusedOffer::Kind)), End::Refused(_)));
     }
 }
