@@ -7,7 +7,7 @@ pub(super) mod ring;
 pub(super) mod socket;
 
 use std::{
-    io::ErrorKind,
+    io::{self, ErrorKind},
     os::{fd::OwnedFd, unix::net::UnixStream},
     path::Path,
     sync::Arc,
@@ -74,17 +74,13 @@ pub(super) fn connect(path: &Path, deadline: Time) -> Result<UnixStream, ApiErro
     let within = deadline.since(Time::now()).clamp(least, CONNECT);
     let end = Time::now() + within;
     let address = address_of(path)?;
-    let try_to = || -> std::io::Result<UnixStream> {
+    let try_to = || -> io::Result<UnixStream> {
         let socket = Socket::new(Domain::UNIX, Type::STREAM, None)?;
-        loop {
+        whatever_signals_come(end, |left| {
             // Linux bounds a unix socket's `connect` by the time allowed for sending.
-            socket.set_write_timeout(Some(end.since(Time::now()).max(least)))?;
-            match socket.connect(&address) {
-                // A signal is no reason to give up.
-                Err(cause) if cause.kind() == ErrorKind::Interrupted && Time::now() < end => {}
-                came => break came?,
-            }
-        }
+            socket.set_write_timeout(Some(left.max(least)))?;
+            socket.connect(&address)
+        })?;
         socket.set_nonblocking(true)?;
         Ok(UnixStream::from(OwnedFd::from(socket)))
     };
@@ -95,6 +91,16 @@ pub(super) fn connect(path: &Path, deadline: Time) -> Result<UnixStream, ApiErro
         }
         ApiError::NoNode { path: path.to_owned(), cause }
     })
+}
+
+/// Has a call tried that has so much time left: a signal is no reason to give up before `end`.
+fn whatever_signals_come(end: Time, mut call: impl FnMut(Duration) -> io::Result<()>) -> io::Result<()> {
+    loop {
+        match call(end.since(Time::now())) {
+            Err(cause) if cause.kind() == ErrorKind::Interrupted && Time::now() < end => {}
+            came => return came,
+        }
+    }
 }
 
 fn address_of(path: &Path) -> Result<SockAddr, ApiError> {
@@ -365,4 +371,38 @@ impl Reader {
 fn asked(register: &Register, transport: Transport) -> Register {
     let ring = transport == Transport::Ring && ring::is_available();
     Register { ring, waits: !register.requires.is_empty(), ..register.clone() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn signals_at_a_full_door_cost_who_registers_nothing_but_its_time() {
+        let interrupted = || Err(ErrorKind::Interrupted.into());
+        // Given: three signals, before there is room.
+        let (mut calls, mut left) = (0, Vec::new());
+        let end = Time::now() + CONNECT;
+        let came = whatever_signals_come(end, |within| {
+            left.push(within);
+            calls += 1;
+            if calls <= 3 { interrupted() } else { Ok(()) }
+        });
+        // Then: it has come, and each try had what the others had left.
+        assert!(came.is_ok());
+        assert!(
+            left.len() == 4 && left.is_sorted_by(|one, next| one >= next) && left[0] <= CONNECT,
+            "{left:?}"
+        );
+        // When: its time is over. Then: it gives up, whatever comes.
+        let gave_up = whatever_signals_come(Time::now(), |_| interrupted());
+        assert_eq!(gave_up.unwrap_err().kind(), ErrorKind::Interrupted);
+        // What else fails is told at once.
+        let mut calls = 0;
+        let refused = whatever_signals_come(end, |_| {
+            calls += 1;
+            Err(ErrorKind::ConnectionRefused.into())
+        });
+        assert_eq!((refused.unwrap_err().kind(), calls), (ErrorKind::ConnectionRefused, 1));
+    }
 }
