@@ -6,14 +6,14 @@
 
 use std::{
     io::{self, IoSlice},
-    os::fd::AsFd,
+    os::fd::{AsFd, BorrowedFd},
 };
 
 use bytes::BytesMut;
 use sinew_runtime::wire::{FrameCodec, FrameError, HEADER_LEN, Header, Message};
 use sinew_shm::{
-    Bell, Capacity, Consumer, Corrupt, CreateError, LoanError, Offer, PassError, Producer, Received,
-    RefusedOffer, Region, Terms,
+    Accepted, Bell, Capacity, Consumer, Corrupt, CreateError, LoanError, Offer, PassError, Producer,
+    Received, RefusedOffer, Region, Terms,
 };
 use tokio_util::codec::Decoder;
 
@@ -73,13 +73,13 @@ impl ExchangeError {
 #[derive(Debug)]
 pub(crate) struct Exchange {
     region: Region,
-    offer: Offer,
     terms: Terms,
 }
 
 impl Exchange {
-    /// Makes this side's memory. The peer's ring may be as large as this side's.
-    pub(crate) fn prepare(capacity: Capacity, bell: impl Into<Bell>) -> Result<Self, ExchangeError> {
+    /// Makes this side's memory, and what is to be sent to the peer of it: once that is on its way, this side has two descriptors, its bells,
+    /// or none where they are futexes. The peer's ring may be as large as this side's.
+    pub(crate) fn prepare(capacity: Capacity, bell: impl Into<Bell>) -> Result<(Self, Offer), ExchangeError> {
         Self::prepare_for(capacity, bell, capacity)
     }
 
@@ -88,14 +88,9 @@ impl Exchange {
         capacity: Capacity,
         bell: impl Into<Bell>,
         theirs: Capacity,
-    ) -> Result<Self, ExchangeError> {
+    ) -> Result<(Self, Offer), ExchangeError> {
         let (region, offer) = Region::create(capacity, bell)?;
-        Ok(Self { region, offer, terms: Terms { capacity_max: theirs, ..Terms::default() } })
-    }
-
-    /// Offers it to the peer.
-    pub(crate) fn offer(&self, socket: impl AsFd) -> Result<(), ExchangeError> {
-        Ok(self.offer.send(socket)?)
+        Ok((Self { region, terms: Terms { capacity_max: theirs, ..Terms::default() } }, offer))
     }
 
     /// Takes the peer's offer from a socket that does not block; `None` if it is not there yet.
@@ -112,9 +107,20 @@ impl Exchange {
         Ok(Received::receive(socket)?)
     }
 
-    /// Maps what the peer has offered.
-    pub(crate) fn finish(self, theirs: Offer) -> Result<(Producer, Consumer), ExchangeError> {
-        Ok(self.region.connect(theirs, &self.terms)?)
+    /// Maps what the peer has offered. If it is refused, this side's bells are still there: it may have passed something in them that takes
+    /// for ever to close.
+    pub(crate) fn accept(&self, theirs: Offer) -> Result<Accepted, ExchangeError> {
+        Ok(self.region.accept(theirs, &self.terms)?)
+    }
+
+    /// Both rings.
+    pub(crate) fn join(self, theirs: Accepted) -> (Producer, Consumer) {
+        self.region.join(theirs)
+    }
+
+    /// The descriptors of this side's bells, if they have some.
+    pub(crate) fn bells(&self) -> [Option<BorrowedFd<'_>>; 2] {
+        self.region.bells()
     }
 }
 

@@ -47,7 +47,7 @@ use crate::{
 use budget::{Budget, PROCESS, Share};
 use early::Early;
 pub(super) use early::InTurn;
-use foreign::LinkEnd;
+use foreign::{CLOSING, Closing, Half, LinkEnd};
 pub(super) use room::Room;
 use standing::{Alone, Pair, Put};
 pub(super) use standing::{Came, Everything, Standing};
@@ -70,6 +70,8 @@ pub(super) struct Terms {
     pub(super) options: LinkOptions,
     /// What all rings together may take.
     budget: &'static Budget,
+    /// What closes what peers pass wrongly.
+    closing: &'static Closing,
 }
 
 /// A link of which the peer knows our half.
@@ -77,7 +79,7 @@ struct Offered {
     peer: Tid,
     number: LinkNumber,
     socket: LinkEnd,
-    exchange: Exchange,
+    half: Half,
     share: Share,
 }
 
@@ -141,6 +143,7 @@ impl Terms {
             payload_max: registered.payload_max as usize,
             options: options.clone(),
             budget: &PROCESS,
+            closing: &CLOSING,
         }
     }
 }
@@ -187,9 +190,7 @@ impl Direct {
         match self.routes.way(destination, now) {
             Way::Direct(number) => Some(number),
             Way::Through => None,
-            Way::ThroughAndAsk
-                if !self.terms.budget.has_room(self.terms.ring_bytes) || !foreign::is_room() =>
-            {
+            Way::ThroughAndAsk if !self.has_room() => {
                 self.routes.no_room(destination, now);
                 None
             }
@@ -204,6 +205,11 @@ impl Direct {
                 None
             }
         }
+    }
+
+    /// Whether this process may have one more link, and what comes on it.
+    fn has_room(&self) -> bool {
+        self.terms.budget.has_room(self.terms.ring_bytes) && self.terms.closing.is_room()
     }
 
     /// The link on which a message to `destination` would go now. Nobody is asked for one.

@@ -31,11 +31,10 @@ use self::{
 use super::{
     core::{Address, ClientId, Owner, Request},
     introductions::{Leaves, Party},
-    link::{self, ClientReader, ClientSocket},
+    link::{self, ClientReader, ClientSocket, Half},
     payload::{self, REGISTER_BYTES_MAX, Register, Registered},
     reader::Reader,
     registrar,
-    rings::Kept,
     server::{Server, refuse, say_why},
     session::{Order, Session},
     strangers::Place,
@@ -44,7 +43,6 @@ use crate::{
     access::{Access, Applicant},
     monitors::Cause,
     outlet::{LinkNumber, OutletLimits, StreamOutlet},
-    ring::Exchange,
     stores::{Stores, lock},
 };
 
@@ -292,7 +290,7 @@ impl Client {
         let payload_max = config.payload_max;
         let ring_bytes = config.lncl.ring_bytes;
         let ring = if self.ring == Ring::Asked { self.prepare(ring_bytes).await } else { None };
-        let Some((capacity, exchange)) = ring else {
+        let Some((capacity, half)) = ring else {
             reader.set_payload_max(payload_max);
             self.server.introductions.expect_no_more(self.tid);
             let socket = ClientSocket::Plain(self.peer.stream.clone());
@@ -302,7 +300,7 @@ impl Client {
         // spec: LNCL-9
         write_soon(&self.peer.stream, encoded(&self.registered(Some(capacity.bytes())))).await?;
         self.ring = Ring::Told;
-        let exchange = link::exchange(exchange, &self.peer.stream, payload_max, self.server.rings());
+        let exchange = link::exchange(half, &self.peer.stream, payload_max, self.server.rings());
         let (socket, reader) = match tokio::time::timeout(HANDSHAKE, exchange).await {
             Ok(Ok(both)) => both,
             Ok(Err(why)) => return Err(why.into()),
@@ -318,7 +316,7 @@ impl Client {
     }
 
     /// The node's half of its rings; `None` if it is to have none.
-    async fn prepare(&self, ring_bytes: usize) -> Option<(Capacity, Kept<Exchange>)> {
+    async fn prepare(&self, ring_bytes: usize) -> Option<(Capacity, Half)> {
         let prepare = link::prepare(ring_bytes, &self.peer.stream, self.server.rings());
         tokio::time::timeout(HANDSHAKE, prepare).await.unwrap_or_else(|_| {
             let tid = self.tid;

@@ -8,7 +8,7 @@ use std::{
 };
 
 use sinew_runtime::wire::{Checksum, FrameError, Message};
-use sinew_shm::{Armed, BellKind, Capacity, Consumer, Descriptors, LoanError, PassError, Producer};
+use sinew_shm::{Armed, BellKind, Capacity, Consumer, Descriptors, LoanError, Offer, PassError, Producer};
 use tokio::{
     io::{Interest, unix::AsyncFd},
     net::UnixStream,
@@ -44,6 +44,12 @@ impl From<FrameError> for LinkError {
     }
 }
 
+/// The node's half of a client's rings, which nobody else has yet.
+pub(super) struct Half {
+    exchange: Kept<Exchange>,
+    offer: Offer,
+}
+
 /// Makes the node's half of the rings; `None` where the system has no memory for it, which is said once a link, or where the thread `rings`
 /// has too much to do. The caller has a
 /// deadline.
@@ -53,14 +59,17 @@ pub(super) async fn prepare(
     ring_bytes: usize,
     stream: &UnixStream,
     rings: &Rings,
-) -> Option<(Capacity, Kept<Exchange>)> {
+) -> Option<(Capacity, Half)> {
     let (capacity, keeper) = (ring::capacity(ring_bytes), rings.clone());
-    let make = move || Exchange::prepare(capacity, BellKind::Socket).map(|exchange| keeper.keep(exchange));
+    let make = move || {
+        let (exchange, offer) = Exchange::prepare(capacity, BellKind::Socket)?;
+        Ok::<_, ExchangeError>(Half { exchange: keeper.keep(exchange), offer })
+    };
     match rings.run(make).await? {
-        Ok(exchange) => {
+        Ok(half) => {
             // Before the client hears that it may offer its half. Where the system does not know it they come anyway.
             let _ = sinew_shm::set_descriptors(stream, Descriptors::Taken);
-            Some((capacity, exchange))
+            Some((capacity, half))
         }
         Err(why) => {
             crate::log::warn!(%why, "a client that asked for rings gets a plain socket");
@@ -71,12 +80,15 @@ pub(super) async fn prepare(
 
 /// Exchanges offers with the client. Ends with its offer, or never; the caller has a deadline.
 pub(super) async fn exchange(
-    exchange: Kept<Exchange>,
+    half: Half,
     stream: &Arc<UnixStream>,
     payload_max: usize,
     rings: &Rings,
 ) -> Result<(ClientSocket, ClientReader), ExchangeError> {
-    exchange.offer(stream)?;
+    let Half { exchange, offer } = half;
+    offer.send(stream)?;
+    // On its way it has descriptors of its own.
+    drop(offer);
     something_is_there(stream).await?;
     let (keeper, stream) = (rings.clone(), stream.clone());
     let map = move || {
@@ -84,9 +96,12 @@ pub(super) async fn exchange(
         let _ = sinew_shm::set_descriptors(&*stream, Descriptors::Refused);
         // What a hostile client has passed may take for ever to close. Whatever becomes of it here, that is not its last close.
         let mut theirs = theirs?;
-        let _copies = keeper.keep(theirs.copies());
-        let theirs = theirs.into_offer()?;
-        let (producer, consumer) = exchange.into_inner().finish(theirs)?;
+        let copies = keeper.keep(theirs.copies());
+        // Nor are this side's bells closed here: it may have passed something in them since they were offered.
+        let theirs = exchange.accept(theirs.into_offer()?)?;
+        // All of it is in use: to close a copy of it waits for nobody.
+        drop(copies.into_inner());
+        let (producer, consumer) = exchange.into_inner().join(theirs);
         Ok::<_, ExchangeError>((keeper.keep(producer), keeper.keep(consumer)))
     };
     let (producer, consumer) = rings.run(map).await.ok_or(ExchangeError::Fault)??;
@@ -323,5 +338,70 @@ async fn hear(stream: &UnixStream) -> Result<(), LinkError> {
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
             Err(_) => return Ok(()),
         }
+    }
+}
+
+#[cfg(all(test, target_os = "linux"))]
+mod tests {
+    use std::{os::unix::net::UnixStream as Plain, sync::mpsc::sync_channel, thread};
+
+    use sinew_shm::OFFER_BYTES;
+
+    use super::*;
+    use crate::{
+        lingering::{self, Lingering},
+        lncl::testing::WATCHDOG,
+    };
+
+    /// The node's half, for a client at the other end of the socket that is returned. Its bells take descriptors, as all do before Linux 6.16.
+    async fn half_for(rings: &Rings) -> (Half, Arc<UnixStream>, Plain) {
+        let (ours, theirs) = Plain::pair().expect("a pair");
+        ours.set_nonblocking(true).expect("it is ours");
+        let stream = Arc::new(UnixStream::from_std(ours).expect("it is a socket"));
+        let (_, half) = prepare(4_096, &stream, rings).await.expect("there is memory");
+        for bell in half.exchange.bells().into_iter().flatten() {
+            let _ = sinew_shm::set_descriptors(bell, Descriptors::Taken);
+        }
+        (half, stream, theirs)
+    }
+
+    // spec: LNCL-18
+    #[test]
+    fn a_client_whose_offer_is_refused_after_it_has_passed_what_does_not_close_in_a_bell_costs_nobody_else_his_rings()
+     {
+        let (say, said) = sync_channel(1);
+        let (mut first, mut second) = (Lingering::new(), Lingering::new());
+        let passed =
+            [&mut first, &mut second].map(|lingering| lingering.ours.take().expect("it is passed once"));
+        thread::spawn(move || {
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+            runtime.block_on(async {
+                // Given: a client that takes the node's offer, and passes something in each of its bells.
+                let rings = Rings::begin(1);
+                let (mine, stream, client) = half_for(&rings).await;
+                let client = thread::spawn(move || {
+                    let theirs = Offer::receive(&client).unwrap().unwrap();
+                    for (bell, passed) in theirs.descriptors()[1..].iter().zip(passed) {
+                        lingering::pass(bell, b"1", &passed).unwrap();
+                    }
+                    // When: what it offers is the node's own memory, with what are no bells.
+                    let memory = theirs.descriptors()[0].try_clone().unwrap();
+                    let others = [(); 2].map(|()| theirs.descriptors()[0].try_clone().unwrap());
+                    let offer = [memory].into_iter().chain(others).collect();
+                    let bytes: [u8; OFFER_BYTES] = theirs.to_bytes();
+                    Offer::from_parts(&bytes, offer).unwrap().send(&client).unwrap();
+                    client
+                });
+                let refused = exchange(mine, &stream, 4_096, &rings).await;
+                assert!(matches!(refused, Err(ExchangeError::Refused(_))));
+                // Then: another one gets rings.
+                let next = half_for(&rings).await;
+                // The test has ended, where this comes too late.
+                let _ = say.send(());
+                drop((next, client.join()));
+            });
+        });
+        assert_eq!(said.recv_timeout(WATCHDOG), Ok(()));
+        [first, second].into_iter().for_each(Lingering::let_go);
     }
 }

@@ -70,7 +70,7 @@ pub use error::{
 pub use layout::{Capacity, CapacityError};
 pub use offer::{Descriptors, OFFER_BYTES, Offer, Received, set_descriptors};
 pub use producer::{Loan, Producer};
-pub use region::{Region, Terms};
+pub use region::{Accepted, Region, Terms};
 pub use spin::Spin;
 pub use wait::{Armed, HangUp, Wait};
 

@@ -1,5 +1,7 @@
 //! A side's own memory, and how two sides come together.
 
+use std::os::fd::BorrowedFd;
+
 use crate::{
     bell::{Bell, BellKind, Bells, Doorbell},
     consumer::Consumer,
@@ -58,6 +60,16 @@ impl Region {
     /// # Errors
     /// Whose fault and what; then nothing of the offer is kept.
     pub fn connect(self, peer: Offer, terms: &Terms) -> Result<(Producer, Consumer), RefusedOffer> {
+        let accepted = self.accept(peer, terms)?;
+        Ok(self.join(accepted))
+    }
+
+    /// Maps what the peer offers, if it is what it has to be. The region stays, for a caller who may not close it: what a peer that
+    /// knows this side's bells has passed in them goes with them, which can block.
+    ///
+    /// # Errors
+    /// As of [`connect`](Self::connect).
+    pub fn accept(&self, peer: Offer, terms: &Terms) -> Result<Accepted, RefusedOffer> {
         let Offer { capacity: theirs, bell, descriptors } = peer;
         if theirs > terms.capacity_max {
             return Err(RefusedOffer::TooLarge { offered: theirs, allowed: terms.capacity_max });
@@ -68,14 +80,24 @@ impl Region {
         let mut descriptors = descriptors.into_iter();
         let memory = descriptors.next().ok_or(RefusedOffer::Descriptors { got: 0, expected: 1 })?;
         let peer = platform::adopt(memory, theirs)?;
-        let (message_button, room_button) = platform::buttons(bell, descriptors.collect())?;
+        let (message, room) = platform::buttons(bell, descriptors.collect())?;
+        Ok(Accepted { peer, capacity: theirs, message, room })
+    }
+
+    /// Both rings, this side's and the one that was accepted.
+    #[must_use]
+    pub fn join(self, peer: Accepted) -> (Producer, Consumer) {
+        let Accepted { peer, capacity: theirs, message, room } = peer;
         let (header, ring) = self.own.split();
         let producer = ProducerCore::new(ring, peer.clone(), self.capacity);
         let consumer = ConsumerCore::new(header, peer, theirs);
-        Ok((
-            Producer::new(producer, self.room, message_button),
-            Consumer::new(consumer, self.message, room_button),
-        ))
+        (Producer::new(producer, self.room, message), Consumer::new(consumer, self.message, room))
+    }
+
+    /// The descriptors of this side's bells, for messages and for room; `None` for a futex.
+    #[must_use]
+    pub fn bells(&self) -> [Option<BorrowedFd<'_>>; 2] {
+        [self.message.fd(), self.room.fd()]
     }
 
     /// Writes any value at any place: what a hostile peer does. `place` counts 32-bit words from the region's beginning
@@ -83,6 +105,20 @@ impl Region {
     #[cfg(any(test, feature = "hostile-peer"))]
     pub fn scribble(&mut self, place: u32, value: u32) {
         self.own.scribble(place, value);
+    }
+}
+
+/// A peer's memory, mapped, and its bells: what it has offered, and was all right. To be used by [`Region::join`].
+pub struct Accepted {
+    peer: platform::PeerMemory,
+    capacity: Capacity,
+    message: Box<dyn Doorbell>,
+    room: Box<dyn Doorbell>,
+}
+
+impl std::fmt::Debug for Accepted {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Accepted").field("capacity", &self.capacity).finish_non_exhaustive()
     }
 }
 

@@ -15,13 +15,15 @@ use std::{
 };
 
 use rustix::net::{RecvFlags, recv};
-use sinew_shm::{Descriptors, Received, set_descriptors};
+use sinew_shm::{Consumer, Descriptors, Offer, Producer, Received, set_descriptors};
 
 use super::{descriptors::holds_something, hang_up};
+use crate::ring::{Exchange, ExchangeError};
 
 /// Threads at most that close such things at once. What comes while all are at it stays open until the process ends.
-const CLOSING_MAX: usize = 16;
-static CLOSING: AtomicUsize = AtomicUsize::new(0);
+pub(super) const CLOSING_MAX: usize = 16;
+/// Those of this process.
+pub(super) static CLOSING: Closing = Closing::new(0);
 /// Bytes that are read at once from a socket that is emptied.
 const CHUNK: usize = 4 * 1024;
 
@@ -49,7 +51,7 @@ impl Drop for LinkEnd {
         hang_up(&self.0);
         // spec: LNCL-18
         if holds_something(&self.0) {
-            close(Left::In(self.0.clone()));
+            CLOSING.close(Left::In(self.0.clone()));
         }
     }
 }
@@ -87,14 +89,37 @@ impl Foreign {
 impl Drop for Foreign {
     fn drop(&mut self) {
         if let Some((copies, socket)) = self.0.take() {
-            close(Left::Copies(copies, socket));
+            CLOSING.close(Left::Copies(copies, socket));
         }
     }
 }
 
-/// Whether what a peer passes wrongly would be closed. Where it would stay open no peer is let pass anything.
-pub(super) fn is_room() -> bool {
-    CLOSING.load(Ordering::Relaxed) < CLOSING_MAX
+/// This side's half of a link that does not stand yet. Dropped, it leaves nothing in its bells that could hold up who closes them: the peer
+/// has them from the moment in which they are offered.
+pub(super) struct Half {
+    /// There until it is joined, or dropped.
+    exchange: Option<Exchange>,
+}
+
+impl Half {
+    pub(super) const fn new(exchange: Exchange) -> Self {
+        Self { exchange: Some(exchange) }
+    }
+
+    /// Both rings, if the peer's half is what it has to be.
+    pub(super) fn join(mut self, theirs: Offer) -> Result<(Producer, Consumer), ExchangeError> {
+        let theirs = self.exchange.as_ref().expect("it is there until it is joined").accept(theirs)?;
+        Ok(self.exchange.take().expect("it is there until it is joined").join(theirs))
+    }
+}
+
+impl Drop for Half {
+    fn drop(&mut self) {
+        if let Some(exchange) = &self.exchange {
+            // spec: LNCL-18
+            exchange.bells().into_iter().flatten().for_each(empty);
+        }
+    }
 }
 
 /// What may take long to be rid of.
@@ -117,24 +142,46 @@ impl Left {
     }
 }
 
-fn close(left: Left) {
-    // Not in the thread's closure alone: where there is no thread that is dropped here.
-    let held = Arc::new(Mutex::new(Some(left)));
-    let its = held.clone();
-    let is_room = CLOSING.fetch_add(1, Ordering::Relaxed) < CLOSING_MAX;
-    let closing = is_room.then(|| {
-        thread::Builder::new().name("sinew-closing".to_owned()).spawn(move || {
-            let left = its.lock().unwrap_or_else(PoisonError::into_inner).take();
-            left.into_iter().for_each(Left::close);
-            CLOSING.fetch_sub(1, Ordering::Relaxed);
-        })
-    });
-    if !matches!(closing, Some(Ok(_))) {
-        CLOSING.fetch_sub(1, Ordering::Relaxed);
-        tracing::error!(
-            "a peer has passed descriptors that were not asked for; they stay open until this process ends"
-        );
-        std::mem::forget(held);
+/// Threads that are rid of something.
+pub(super) struct Closing {
+    threads: AtomicUsize,
+}
+
+impl Closing {
+    /// So many are at it already.
+    pub(super) const fn new(threads: usize) -> Self {
+        Self { threads: AtomicUsize::new(threads) }
+    }
+
+    /// Whether what a peer passes wrongly would be closed. Where it would stay open no peer is let pass anything.
+    pub(super) fn is_room(&self) -> bool {
+        self.threads.load(Ordering::Relaxed) < CLOSING_MAX
+    }
+
+    /// One of them is done.
+    pub(super) fn done(&self) {
+        self.threads.fetch_sub(1, Ordering::Relaxed);
+    }
+
+    fn close(&'static self, left: Left) {
+        // Not in the thread's closure alone: where there is no thread that is dropped here.
+        let held = Arc::new(Mutex::new(Some(left)));
+        let its = held.clone();
+        let is_room = self.threads.fetch_add(1, Ordering::Relaxed) < CLOSING_MAX;
+        let closing = is_room.then(|| {
+            thread::Builder::new().name("sinew-closing".to_owned()).spawn(move || {
+                let left = its.lock().unwrap_or_else(PoisonError::into_inner).take();
+                left.into_iter().for_each(Left::close);
+                self.done();
+            })
+        });
+        if !matches!(closing, Some(Ok(_))) {
+            self.done();
+            tracing::error!(
+                "a peer has passed descriptors that were not asked for; they stay open until this process ends"
+            );
+            std::mem::forget(held);
+        }
     }
 }
 
@@ -142,10 +189,15 @@ fn close(left: Left) {
 mod tests {
     use std::{os::fd::AsFd, sync::mpsc::sync_channel};
 
+    use rustix::io::Errno;
+    use sinew_runtime::time::Time;
+    use sinew_shm::BellKind;
+
     use super::*;
     use crate::{
         lingering::{self, Lingering},
         lncl::testing::WATCHDOG,
+        ring,
     };
 
     /// Passes it, with one byte, and keeps no copy.
@@ -174,6 +226,56 @@ mod tests {
         pass(&mut lingering, &theirs);
         let ours = LinkEnd::new(ours);
         is_done_with(lingering, move || drop(ours));
+    }
+
+    // spec: LNCL-18
+    #[test]
+    fn who_gives_up_a_link_does_not_wait_for_what_its_peer_has_passed_in_the_bells_that_it_was_offered() {
+        // Given: a half whose bells take descriptors, as all do before Linux 6.16, and a peer that has been offered them.
+        let (ours, theirs) = UnixStream::pair().unwrap();
+        let (exchange, offer) = Exchange::prepare(ring::capacity(4_096), BellKind::Socket).unwrap();
+        for bell in exchange.bells().into_iter().flatten() {
+            let _ = set_descriptors(bell, Descriptors::Taken);
+        }
+        offer.send(&ours).unwrap();
+        let offered = Exchange::receive(&theirs).unwrap().expect("it has come");
+        let mut lingering = [Lingering::new(), Lingering::new()];
+        for (lingering, bell) in lingering.iter_mut().zip(&offered.descriptors()[1..]) {
+            pass(lingering, &bell.try_clone().unwrap().into());
+        }
+        // When:
+        let [first, second] = lingering;
+        let half = Half::new(exchange);
+        is_done_with(first, move || drop(half));
+        second.let_go();
+    }
+
+    // spec: LNCL-18
+    #[test]
+    fn what_comes_while_as_many_things_do_not_close_as_may_stays_open_and_nobody_waits_for_it() {
+        // Given: as many threads as may be that wait for a close.
+        let closing: &Closing = Box::leak(Box::new(Closing::new(0)));
+        let socket = || Arc::new(UnixStream::pair().unwrap().0);
+        let mut held: Vec<_> = std::iter::repeat_with(Lingering::new).take(CLOSING_MAX).collect();
+        for lingering in &mut held {
+            assert!(closing.is_room());
+            let passed = lingering.ours.take().expect("it is passed once");
+            closing.close(Left::Copies(vec![passed.into()], socket()));
+        }
+        assert!(!closing.is_room());
+        // When: one thing more comes.
+        let (open, passed) = UnixStream::pair().unwrap();
+        closing.close(Left::Copies(vec![passed.into()], socket()));
+        // Then: it stays open, and the others are closed when they can be.
+        held.into_iter().for_each(Lingering::let_go);
+        let deadline = Time::now() + WATCHDOG;
+        while closing.threads.load(Ordering::Relaxed) > 0 {
+            assert!(Time::now() < deadline, "waited for the threads");
+            thread::yield_now();
+        }
+        assert!(closing.is_room());
+        let unread = recv(&open, &mut [0; 1][..], RecvFlags::DONTWAIT);
+        assert_eq!(unread.err(), Some(Errno::AGAIN), "nobody has closed the other end");
     }
 
     // spec: LNCL-18

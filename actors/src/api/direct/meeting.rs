@@ -5,7 +5,7 @@ use std::io;
 use sinew_shm::{Descriptors, PassError, Received, set_descriptors};
 
 use super::{
-    foreign::{self, Foreign, LinkEnd},
+    foreign::{Foreign, Half, LinkEnd},
     *,
 };
 
@@ -65,24 +65,24 @@ impl Direct {
 
     fn offer(&mut self, peer: Tid, number: LinkNumber) -> Result<(), Rejection> {
         let socket = self.take_end(number).ok_or(Rejection::QueueFull)?;
-        if !self.terms.budget.has_room(self.terms.ring_bytes) || !foreign::is_room() {
+        if !self.has_room() {
             return Err(Rejection::Unsupported);
         }
-        let (exchange, share) = self.prepare(&socket).map_err(|why| {
+        let (half, share) = self.prepare(&socket).map_err(|why| {
             tracing::warn!(%peer, %why, "a direct link was not made");
             Rejection::QueueFull
         })?;
         self.routes.offered(peer, number);
-        self.offered.push(Offered { peer, number, socket, exchange, share });
+        self.offered.push(Offered { peer, number, socket, half, share });
         Ok(())
     }
 
-    fn prepare(&self, socket: &UnixStream) -> Result<(Exchange, Share), ExchangeError> {
+    fn prepare(&self, socket: &UnixStream) -> Result<(Half, Share), ExchangeError> {
         let share = self.terms.budget.take(self.terms.ring_bytes).ok_or(ExchangeError::Budget)?;
         let [own, theirs] = [self.terms.ring_bytes, RING_BYTES_MAX].map(rings::capacity);
-        let exchange = Exchange::prepare_for(own, self.terms.options.bell.clone(), theirs)?;
-        exchange.offer(socket)?;
-        Ok((exchange, share))
+        let (exchange, offer) = Exchange::prepare_for(own, self.terms.options.bell.clone(), theirs)?;
+        offer.send(socket)?;
+        Ok((Half::new(exchange), share))
     }
 
     fn take_end(&self, number: LinkNumber) -> Option<LinkEnd> {
@@ -100,8 +100,8 @@ impl Direct {
         }
         let connected = socket.ok_or(ExchangeError::Missing).and_then(|socket| {
             let theirs = Theirs::take(&socket)?;
-            let (exchange, share) = self.prepare(&socket)?;
-            self.connect(Offered { peer, number, socket, exchange, share }, theirs)
+            let (half, share) = self.prepare(&socket)?;
+            self.connect(Offered { peer, number, socket, half, share }, theirs)
         });
         match connected {
             Ok(link) => {
@@ -119,8 +119,8 @@ impl Direct {
     fn connect(&self, offered: Offered, theirs: Theirs) -> Result<Standing, ExchangeError> {
         // Dropped in the other order: the copies last.
         let Theirs { received, copies } = theirs;
-        let Offered { peer, number, socket, exchange, share } = offered;
-        let (producer, consumer) = exchange.finish(received.into_offer()?)?;
+        let Offered { peer, number, socket, half, share } = offered;
+        let (producer, consumer) = half.join(received.into_offer()?)?;
         copies.are_good();
         let writer = ring::Writer::new(Arc::clone(&socket), producer, &self.terms.options);
         let pair = Pair { own: self.terms.own, peer, number, socket };
@@ -245,8 +245,8 @@ mod tests {
 
     /// The offer of a ring, with what else is passed beside it.
     fn offer_to(socket: &UnixStream) {
-        let exchange = Exchange::prepare(rings::capacity(4_096), BellKind::Futex).expect("a ring");
-        exchange.offer(socket).expect("it comes");
+        let (_, offer) = Exchange::prepare(rings::capacity(4_096), BellKind::Futex).expect("a ring");
+        offer.send(socket).expect("it comes");
     }
 
     fn pass(socket: &UnixStream, descriptor: impl AsFd) -> Result<usize, Errno> {

@@ -159,8 +159,8 @@ impl Greeting {
 
     fn offer(&self, registered: Registered, ring_bytes: u32) -> Result<Offered, ApiError> {
         let capacity = rings::capacity(ring_bytes as usize);
-        let exchange = Exchange::prepare(capacity, self.options.bell.clone()).map_err(no_rings)?;
-        exchange.offer(&self.socket).map_err(no_rings)?;
+        let (exchange, offer) = Exchange::prepare(capacity, self.options.bell.clone()).map_err(no_rings)?;
+        offer.send(&self.socket).map_err(|error| no_rings(error.into()))?;
         Ok(Offered { registered, exchange: Mutex::new(exchange), until: Time::now() + EXCHANGE })
     }
 
@@ -181,7 +181,8 @@ impl Greeting {
         };
         let Some(Offered { registered, exchange, .. }) = self.offered.take() else { return Ok(None) };
         let exchange = exchange.into_inner().unwrap_or_else(PoisonError::into_inner);
-        let (producer, consumer) = exchange.finish(theirs).map_err(no_rings)?;
+        let theirs = exchange.accept(theirs).map_err(no_rings)?;
+        let (producer, consumer) = exchange.join(theirs);
         let (socket, options, payload_max) =
             (self.socket.clone(), &self.options, registered.payload_max as usize);
         let reader = ring::Reader::new(socket.clone(), consumer, payload_max, options.spin);
@@ -283,7 +284,8 @@ mod tests {
         let node = answer(&listener);
         assert!(greeting.wait(Time::now() + SHORT).unwrap().is_none(), "it has offered nothing");
         // when
-        Exchange::prepare(rings::capacity(4_096), BellKind::Socket).unwrap().offer(&node).unwrap();
+        let (_, offer) = Exchange::prepare(rings::capacity(4_096), BellKind::Socket).unwrap();
+        offer.send(&node).unwrap();
         // then
         let link = greeting.wait(Time::now() + WATCHDOG).unwrap().expect("both have offered");
         assert_eq!(link.registered.node_name, "played");
@@ -314,7 +316,7 @@ mod tests {
             let nodes = RefCell::new(Vec::new());
             let plays = || {
                 let mut node = answer(&listener);
-                exchange().offer(&node).unwrap();
+                exchange().1.send(&node).unwrap();
                 let is_first = nodes.borrow().is_empty();
                 if is_first {
                     let refusal = Refusal { sentence: "too late".to_owned(), again };

@@ -182,12 +182,13 @@ fn greet(socket: &UnixStream) -> Option<(Producer, Consumer)> {
 
 /// Exchanges offers with the client.
 fn exchange(socket: &UnixStream, ring_bytes: u32) -> (Producer, Consumer) {
-    let exchange = Exchange::prepare(ring::capacity(ring_bytes as usize), BellKind::Futex).unwrap();
-    exchange.offer(socket).unwrap();
+    let (exchange, offer) = Exchange::prepare(ring::capacity(ring_bytes as usize), BellKind::Futex).unwrap();
+    offer.send(socket).unwrap();
     let until = Time::now() + WATCHDOG;
     loop {
         if let Some(theirs) = Exchange::receive(socket).unwrap() {
-            return exchange.finish(theirs).unwrap();
+            let theirs = exchange.accept(theirs).unwrap();
+            return exchange.join(theirs);
         }
         assert!(socket::wait(socket, PollFlags::IN, until).unwrap(), "waited for the client's offer");
     }

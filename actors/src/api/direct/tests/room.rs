@@ -7,7 +7,12 @@ use sinew_runtime::{
 
 use super::*;
 use crate::api::{
-    direct::{InTurn, budget::Budget, early::Early},
+    direct::{
+        InTurn,
+        budget::Budget,
+        early::Early,
+        foreign::{CLOSING_MAX, Closing},
+    },
     routes::LINKS_MAX,
 };
 
@@ -267,6 +272,31 @@ fn when_the_rings_of_a_process_have_their_most_in_bytes_messages_go_through_the_
         assert!(other.receive(Duration::from_millis(1)).unwrap().is_none());
     }
     assert_eq!(budgets.map(Budget::held), [0, 0], "what a link took is given back");
+}
+
+// spec: LNCL-18
+#[test]
+fn an_application_that_can_close_no_more_of_what_peers_pass_wrongly_has_no_further_links_until_it_can() {
+    let node = TestNode::start();
+    let (mut one, mut third) = (endpoint(&node), endpoint(&node));
+    let [mut asked, mut asking] = [endpoint(&node), endpoint(&node)];
+    // Given: one whose threads for that all wait.
+    let closing: &Closing = Box::leak(Box::new(Closing::new(CLOSING_MAX)));
+    one.direct.terms.closing = closing;
+    // When: it sends, and is sent to.
+    for _ in 0..20 {
+        one.send(third.tid(), &Counted(1)).unwrap();
+        drop(third.receive(WATCHDOG).unwrap().expect("a message"));
+        third.send(one.tid(), &Counted(1)).unwrap();
+        drop(one.receive(WATCHDOG).unwrap().expect("a message"));
+    }
+    // Then: all of it goes through the node.
+    assert!(one.direct.is_empty() && third.direct.is_empty());
+    // When: one of them is done.
+    closing.done();
+    // Then:
+    link(&mut one, &mut asked);
+    link(&mut asking, &mut one);
 }
 
 #[test]
