@@ -9,10 +9,14 @@ use sinew_shm::Offer;
 use super::worker::WAITING_MAX;
 use crate::config::LnclConfig;
 
-/// Of a client: its socket, its process, and the node's two bells; a task's own two besides, which a thread has in memory.
-const PER_CLIENT: usize = 6;
-/// What waits to be given back behind a descriptor that does not close: as many things as may, each with what a client has
-/// passed as its offer.
+/// Of a client: its socket, its process, and the node's two bells. Until it is offered them the node has its memory and their other ends
+/// besides: three. Of a task, its own two bells come in place of those; a thread has them in memory.
+///
+/// One that has gone leaves six at most: the socket; of rings that were made four bells; of an exchange that was refused the node's two, and
+/// the three of the client's offer.
+const PER_CLIENT: usize = 7;
+/// What waits to be given back behind a descriptor that does not close, of those whose places others have by now: as many things as may.
+/// None has more than an offer: a producer and a consumer have two each, what was not made both bells, a socket is one.
 const LEFT: usize = WAITING_MAX * Offer::DESCRIPTORS_MAX;
 /// The node's own, introductions that are not answered, and what the applications in its process may open.
 const OWN: usize = 256;
@@ -28,7 +32,8 @@ pub(super) fn make_room(lncl: &LnclConfig) {
 }
 
 fn needed(lncl: &LnclConfig) -> u64 {
-    let needed = PER_CLIENT * lncl.clients_max + lncl.strangers_max + LEFT + OWN;
+    // A stranger is a client with its next frame, when others have left: no connection more is taken before that is given back.
+    let needed = PER_CLIENT * (lncl.clients_max + lncl.strangers_max) + LEFT + OWN;
     u64::try_from(needed).unwrap_or(u64::MAX)
 }
 
