@@ -103,7 +103,7 @@ pub use sinew_runtime::{
     supervision::{AutoShutdown, Place, ReadyGate, Reason, Refusal, Restart, Strategy},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
-    wire::{Class, Kind, MessageBuffer, Payload},
+    wire::{Class, Kind, MessageBuffer, Payload, TIME_TO_LIVE_MAX},
 };
 pub use sinew_shm::Spin;
 pub use sync::{

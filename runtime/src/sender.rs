@@ -244,7 +244,8 @@ impl Sender {
 
     /// Sends a value and wants to know what becomes of it: the returned future ends in exactly one [`Outcome`]. The
     /// message expires where it waits once it is older than `within`; the future ends as [`Outcome::Unknown`] when
-    /// nobody has said anything by then, whenever it is polled first.
+    /// nobody has said anything by then, whenever it is polled first. No message lives longer than [`TIME_TO_LIVE_MAX`], 71 minutes and
+    /// 35 s: a longer `within` counts as that.
     ///
     /// # Errors
     /// Nobody took it.
@@ -259,12 +260,13 @@ impl Sender {
             // Newest wins, so an older one has no fate of its own.
             return Err(Rejection::Unsupported.into());
         }
-        let wait = self.expect_answer(&mut message, Awaited::Outcome, within)?;
+        let (wait, within) = self.expect_answer(&mut message, Awaited::Outcome, within)?;
         let sent = self.dispatch(message)?;
         Ok(Confirmation::new(Deadline::new(wait, sent + within)))
     }
 
-    /// Sends a request; the returned future ends with the reply, an error, or at the deadline.
+    /// Sends a request; the returned future ends with the reply, an error, or at the deadline. A longer `within` than
+    /// [`TIME_TO_LIVE_MAX`], 71 minutes and 35 s, counts as that.
     ///
     /// # Errors
     /// Nobody took it.
@@ -278,7 +280,7 @@ impl Sender {
         let mut message = Message::typed(self.shared.tid, self.find(destination.into())?, request);
         message.header.class = Class::Control;
         message.header.flags = Flags::ASK;
-        let wait = self.expect_answer(&mut message, Awaited::Reply, within)?;
+        let (wait, within) = self.expect_answer(&mut message, Awaited::Reply, within)?;
         let destination = self.shared.router.absolute(message.header.destination);
         let ticket = Ticket { source: self.shared.tid, destination, correlation: wait.correlation() };
         let sent = self.dispatch(message)?;
@@ -385,20 +387,21 @@ impl Sender {
         }
     }
 
+    /// Returns how long it is waited for, too: no longer than the message lives.
     fn expect_answer(
         &self,
         message: &mut Message,
         awaited: Awaited,
         within: Duration,
-    ) -> Result<Wait, SendError> {
+    ) -> Result<(Wait, Duration), SendError> {
         let destination = self.shared.router.absolute(message.header.destination);
         let wait = self.shared.pending.open(awaited, destination).ok_or(SendError::TooManyWaits)?;
         message.header.flags = message.header.flags.with(Flags::CONFIRM);
         message.header.correlation = wait.correlation();
-        message.header.time_to_live_us = u32::try_from(within.as_micros()).unwrap_or(u32::MAX).max(1);
+        let within = message.header.set_time_to_live(within);
         let ticket = Ticket { source: self.shared.tid, destination, correlation: wait.correlation() };
         message.receipt = Some(Receipt::new(self.shared.pending.clone(), ticket));
-        Ok(wait)
+        Ok((wait, within))
     }
 
     /// Returns when it was sent.

@@ -175,7 +175,8 @@ impl Endpoint {
     }
 
     /// Sends a value and waits for what becomes of it: [`Outcome::Unknown`] when nobody has said so `within` this
-    /// time. The message expires where it waits when it is older. Messages that come meanwhile wait to be
+    /// time. The message expires where it waits when it is older. A longer `within` than
+    /// [`TIME_TO_LIVE_MAX`](sinew_runtime::wire::TIME_TO_LIVE_MAX), 71 minutes and 35 s, counts as that. Messages that come meanwhile wait to be
     /// [received](Self::receive), beyond the inbox's capacity too: 16,384 of each class, 4 MiB of payloads and one message. What
     /// comes then is refused: who sent it confirmed is told, the others are [counted](Self::untaken). The same holds for
     /// whatever else waits for an answer: [`ask`](Self::ask), [`resolve`](Self::resolve), [`join`](Self::join),
@@ -193,7 +194,8 @@ impl Endpoint {
         at_once(self.confirm(message.into(), within))
     }
 
-    /// Sends a request and waits for the reply.
+    /// Sends a request and waits for the reply. A longer `within` than [`TIME_TO_LIVE_MAX`](sinew_runtime::wire::TIME_TO_LIVE_MAX),
+    /// 71 minutes and 35 s, counts as that.
     ///
     /// # Errors
     /// It was not sent or not handled, no reply came `within` this time, or the reply is not an `R`.

@@ -27,7 +27,7 @@ const LAST_LOOKS: usize = 64;
 const ROOM_PAUSE: Duration = Duration::from_millis(1);
 
 impl Endpoint {
-    /// Sends `message` and waits for its outcome.
+    /// Sends `message` and waits for its outcome, no longer than a message can live.
     pub(super) async fn confirm(
         &mut self,
         mut message: Draft,
@@ -37,21 +37,21 @@ impl Endpoint {
             // Of a Stream the newest wins, so an older one has no outcome of its own.
             return Ok(Outcome::Rejected(Rejection::Unsupported));
         }
-        message.header.time_to_live_us = in_micros(within);
+        let within = message.header.set_time_to_live(within);
         match self.request(message, Awaited::Outcome, Flags::CONFIRM, within).await? {
             Some(Answer::Outcome(outcome)) => Ok(outcome),
             Some(Answer::Reply(_) | Answer::Resolved(_)) | None => Ok(Outcome::Unknown),
         }
     }
 
-    /// Sends `message` as a request and waits for the reply.
+    /// Sends `message` as a request and waits for the reply, no longer than a message can live.
     pub(super) async fn await_reply(
         &mut self,
         mut message: Draft,
         within: Duration,
     ) -> Result<Message, ApiError> {
         message.header.class = Class::Control;
-        message.header.time_to_live_us = in_micros(within);
+        let within = message.header.set_time_to_live(within);
         match self.request(message, Awaited::Reply, Flags::CONFIRM.with(Flags::ASK), within).await? {
             Some(Answer::Reply(reply)) => Ok(reply),
             Some(Answer::Outcome(outcome)) => Err(ApiError::Ended(outcome)),
@@ -306,9 +306,4 @@ impl Request {
         }
         Ok(Self { source: received.source(), correlation: received.correlation() })
     }
-}
-
-/// At least one: zero would mean for ever.
-fn in_micros(within: Duration) -> u32 {
-    u32::try_from(within.as_micros()).unwrap_or(u32::MAX).max(1)
 }

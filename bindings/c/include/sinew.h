@@ -720,8 +720,8 @@ sinew_status sinew_send_bytes_within(struct sinew_endpoint *endpoint,
 /**
  * Sends a message and waits for what becomes of it; `SINEW_UNKNOWN` when nobody has said so after `within_ns`. The message
  * expires where it waits when it is older. `*outcome` is set if this returns `SINEW_OK`. The message is gone as with
- * `sinew_send_message`. What comes meanwhile waits to be received. Blocks for `within_ns` at most, room included. The endpoint's
- * thread.
+ * `sinew_send_message`. What comes meanwhile waits to be received. Blocks for `within_ns` at most, room included; a longer one
+ * counts as the longest time to live of a message, 71 minutes and 35 s. The endpoint's thread.
  */
 sinew_status sinew_send_message_confirmed(struct sinew_endpoint *endpoint,
                                           struct sinew_message *message,
@@ -732,7 +732,8 @@ sinew_status sinew_send_message_confirmed(struct sinew_endpoint *endpoint,
  * Sends a message as a request, in class Control, and waits for the reply, `within_ns` at most, room included. `*reply` is
  * set if this returns `SINEW_OK`; settle it when it has been read. If it returns `SINEW_ERROR_NOT_HANDLED` and `outcome` is not
  * NULL, `*outcome` says what became of the request. With 1024 received messages in hand there is no place for a reply:
- * `SINEW_ERROR_TOO_MANY`, and nothing was sent. The message is gone as with `sinew_send_message`. The endpoint's thread.
+ * `SINEW_ERROR_TOO_MANY`, and nothing was sent. The message is gone as with `sinew_send_message`. A longer `within_ns` counts as
+ * the longest time to live of a message, 71 minutes and 35 s. The endpoint's thread.
  */
 sinew_status sinew_ask(struct sinew_endpoint *endpoint,
                        struct sinew_message *message,

@@ -26,7 +26,7 @@ impl Message for Told {
 
 impl<A: Actor<Context = Self>> AppContext<A> {
     /// Sends a value; what becomes of it comes to this actor as a [`Told`] with `tag`, once, in a turn of its own. Else as
-    /// [`send_confirmed`](Self::send_confirmed). The next life of the application is not told.
+    /// [`send_confirmed`](Self::send_confirmed), its longest `within` included. The next life of the application is not told.
     ///
     /// # Errors
     /// Nobody took it; no `Told` comes.

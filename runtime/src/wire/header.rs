@@ -34,6 +34,8 @@ pub const MAGIC: [u8; 2] = *b"Sw";
 pub const VERSION: u8 = 1;
 /// Length of the header in bytes.
 pub const HEADER_LEN: usize = 64;
+/// The longest time to live, as it travels in 32 bits of microseconds: 71 minutes and 35 s.
+pub const TIME_TO_LIVE_MAX: Duration = Duration::from_micros(u32::MAX as u64);
 
 /// Where a guarded frame has the guard of its length: the upper 16 bits of the sequence.
 const GUARD_AT: usize = 38;
@@ -129,7 +131,7 @@ pub struct Header {
     /// When it was sent. On the wire in the sender's clock; a receiving layer turns it into its own. Where that is not known it is when it
     /// arrived, and [`sent_error`](Self::sent_error) says so.
     pub sent: Time,
-    /// How long after `sent` it is still worth handling, in microseconds; 0 = for ever.
+    /// How long after `sent` it is still worth handling, in microseconds; 0 = for ever. [`TIME_TO_LIVE_MAX`] is the longest.
     pub time_to_live_us: u32,
 }
 
@@ -149,6 +151,16 @@ impl Header {
             sent: Time::ZERO,
             time_to_live_us: 0,
         }
+    }
+
+    /// Has it expire when it is older than `within`, which is cut to what the wire has room for: a microsecond to [`TIME_TO_LIVE_MAX`].
+    /// Returns how long whoever waits for what becomes of it is to wait: as long, and no longer than the longest of these.
+    #[must_use = "who waits longer waits for what nobody says any more"]
+    pub fn set_time_to_live(&mut self, within: Duration) -> Duration {
+        let within = within.min(TIME_TO_LIVE_MAX);
+        // Zero would be for ever.
+        self.time_to_live_us = u32::try_from(within.as_micros()).unwrap_or(u32::MAX).max(1);
+        within
     }
 
     /// Whether the time to live has run out at `now`.
@@ -425,6 +437,36 @@ mod tests {
         let mut bytes = Header::new(Kind::OUTCOME, Tid::NONE, Tid::NONE).encode(&[]);
         bytes[2] = 9;
         assert_eq!(Header::decode(&bytes, &[]), Err(HeaderError::Version { theirs: 9 }));
+    }
+
+    #[test]
+    fn a_time_to_live_is_never_for_ever_nor_another_one_where_it_is_too_long_for_the_wire() {
+        let (micro, most) = (Duration::from_micros(1), TIME_TO_LIVE_MAX);
+        assert_eq!(
+            most.as_secs(),
+            71 * 60 + 34,
+            "and 0.967 s: 71 minutes and 35 s, as the documentation says"
+        );
+        let cases = [
+            (Duration::ZERO, 1, Duration::ZERO),
+            (Duration::from_nanos(1), 1, Duration::from_nanos(1)),
+            (Duration::from_secs(3_600), 3_600_000_000, Duration::from_secs(3_600)),
+            (most - micro, u32::MAX - 1, most - micro),
+            (most, u32::MAX, most),
+            (most + micro, u32::MAX, most),
+            // Cut to 32 bits these would be 1 us and 2 us.
+            (micro * 2 + most, u32::MAX, most),
+            (Duration::from_secs(48 * 3_600), u32::MAX, most),
+            (Duration::MAX, u32::MAX, most),
+        ];
+        for (within, micros, waits) in cases {
+            let mut header = Header::new(Kind::OUTCOME, Tid::NONE, Tid::NONE);
+            assert_eq!(
+                (header.set_time_to_live(within), header.time_to_live_us),
+                (waits, micros),
+                "{within:?}"
+            );
+        }
     }
 
     #[test]

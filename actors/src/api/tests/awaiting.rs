@@ -2,7 +2,10 @@
 
 use std::{thread, time::Duration};
 
-use sinew_runtime::{outcome::Ticket, wire::Header};
+use sinew_runtime::{
+    outcome::Ticket,
+    wire::{Header, TIME_TO_LIVE_MAX},
+};
 
 use super::{
     Class, Doubled, Flags, Message, Outcome, Rejection, TORQUE, TestNode, Time, Transport, WATCHDOG,
@@ -15,6 +18,7 @@ use crate::lncl::{
 };
 
 on_every_transport! {
+    a_time_that_is_longer_than_any_message_lives_counts_as_that
     nobody_answers_for_another_by_guessing_the_number
     what_comes_while_an_answer_is_awaited_is_kept_beyond_the_capacity
     what_is_not_kept_while_an_answer_is_awaited_is_counted
@@ -59,6 +63,31 @@ fn nobody_answers_for_another_by_guessing_the_number(under: Under) {
         endpoint.ask::<_, Doubled>(app.tid, &TORQUE, WATCHDOG).unwrap()
     });
     assert_eq!(asked, Doubled { newton_metres: 5.0 });
+}
+
+fn a_time_that_is_longer_than_any_message_lives_counts_as_that(under: Under) {
+    let node = TestNode::start();
+    let app = node.local(1);
+    let mut endpoint = register(under, &node, on(under));
+    // One that would be 10 us if its upper bits were cut off, and for ever as C says it.
+    for within in [TIME_TO_LIVE_MAX + Duration::from_micros(11), Duration::from_nanos(u64::MAX)] {
+        thread::scope(|scope| {
+            scope.spawn(|| {
+                let mut asked = app.next();
+                assert_eq!(asked.header.time_to_live_us, u32::MAX);
+                asked.settle(Outcome::Delivered);
+                let request = app.next();
+                assert_eq!(request.header.time_to_live_us, u32::MAX);
+                let doubled = Doubled { newton_metres: 5.0 };
+                let mut reply = Message::typed(app.tid, request.header.source, &doubled);
+                reply.header.flags = Flags::REPLY;
+                reply.header.correlation = request.header.correlation;
+                node.stores.router.send(reply).unwrap();
+            });
+            assert_eq!(endpoint.send_confirmed(app.tid, &TORQUE, within).unwrap(), Outcome::Delivered);
+            endpoint.ask::<_, Doubled>(app.tid, &TORQUE, within).unwrap()
+        });
+    }
 }
 
 /// Sends so many messages while `endpoint` waits for an outcome, each as soon as the node has room for it. They are Bulk: the
