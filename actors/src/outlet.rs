@@ -300,16 +300,16 @@ impl<S: Socket> StreamOutlet<S> {
     /// # Errors
     /// The frame: there will be no further connection.
     pub(crate) fn submit_beyond(&self, message: Message) -> Result<(), Refused> {
-        self.submit_beyond_up_to(usize::MAX, message)
+        self.submit_outcome(message, usize::MAX)
     }
 
-    /// The same as long as fewer than `waiting_max` wait; then the bounds hold.
+    /// The same of an outcome, as long as fewer than `waiting_max` outcomes wait, whatever else does; then the bounds hold.
     ///
     /// # Errors
     /// The frame: too many wait, or there will be no further connection.
-    pub(crate) fn submit_beyond_up_to(&self, waiting_max: usize, message: Message) -> Result<(), Refused> {
+    pub(crate) fn submit_outcome(&self, message: Message, waiting_max: usize) -> Result<(), Refused> {
         let step = self.with(|half, after| {
-            let is_waived = half.waiting() + half.in_lines() < waiting_max;
+            let is_waived = half.queue.outcomes() < waiting_max;
             half.submit(message, if is_waived { Bound::Waived } else { Bound::Kept }, after)
         })?;
         if step == Step::More {

@@ -104,7 +104,9 @@ pub struct GnclConfig {
     /// Further addresses of this host at which GNCL listens, one for each interface beside [`NdlConfig::interface`], the one that is
     /// preferred first; at most 7. The others dial all of them, and again when a link breaks. Default: none.
     pub further: Vec<Ipv4Addr>,
-    /// Messages that wait for one peer at most, each class by itself. 1 to 65,536; default 1,024.
+    /// Messages that wait for one peer at most, each class by itself. 1 to 65,536; default 1,024. So many confirmed ones of one destination, and
+    /// eight times as many of all of a class, may be without an outcome; and no more than the peer has room for the outcomes of, which is
+    /// eight times its own capacity, 8,192 at least.
     pub queue_capacity: usize,
     /// Bytes of their payloads at most, each class by itself; one message waits however long it is. 4 KiB to 1 GiB;
     /// default 16 MiB.

@@ -41,6 +41,7 @@ use super::{
     secure::Secure,
     spin::Spin,
     task::{self, Move},
+    way::answers_max,
 };
 use crate::{
     config::NodeConfig,
@@ -341,6 +342,7 @@ fn settings(stores: &Stores) -> Settings {
             peer: NodeAddress::HERE,
             dial: 0,
             payload_max: payload_max as u64,
+            answers_max: answers_max(gncl.queue_capacity) as u64,
             features: features.map(str::to_owned).collect(),
             lane: Lane::Control,
             link: 0,

@@ -99,8 +99,14 @@ impl Drop for Peer {
 impl Peer {
     /// `now` numbers what is remembered of the peer: a later peer of the same life has a larger number.
     fn new(now: Time, attach: &Attach, stores: &Stores) -> Self {
-        let ends = Ends { here: stores.node, node: attach.node, takes_outcomes: attach.takes_outcomes };
         let ways = if attach.by_class { Lane::ALL.len() } else { 1 };
+        let ends = Ends {
+            here: stores.node,
+            node: attach.node,
+            takes_outcomes: attach.takes_outcomes,
+            answers_there: usize::try_from(attach.answers_max).unwrap_or(usize::MAX),
+            ways,
+        };
         let Store { refusals, acks, fewer_owed, held_up, .. } = &stores.gncl;
         let told = Told {
             refusals: refusals.clone(),

@@ -47,9 +47,17 @@ const WORDS_MAX: usize = 32;
 const LINES_MAX: usize = 256;
 /// Windows that may wait for applications, all together.
 const SHELF_WINDOWS: usize = 4;
-/// Times `gncl.queue_capacity`: so many outcomes may wait to be sent. They answer confirmed messages of the peer, of which it can
-/// have that many.
-const OUTCOMES_MAX: usize = 8;
+/// Times `gncl.queue_capacity`: confirmed messages of a peer, of each connection, for whose outcomes there is room. It is told so, for how
+/// many it may have open its own capacity does not say here.
+const ANSWERS_OF_CAPACITY: usize = 8;
+/// At least: a node whose queue is short refuses nothing of a peer that has the defaults.
+const ANSWERS_MIN: usize = 8_192;
+
+/// Confirmed messages of a peer, of each connection, for whose outcomes a node has room whose queues hold so many messages. spec: GNCL-12
+pub(super) const fn answers_max(queue_capacity: usize) -> usize {
+    let answers = ANSWERS_OF_CAPACITY * queue_capacity;
+    if answers > ANSWERS_MIN { answers } else { ANSWERS_MIN }
+}
 
 /// What is to be done with a message that has come.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -120,6 +128,10 @@ pub(super) struct Ends {
     pub(super) node: NodeAddress,
     /// Whether the peer takes several outcomes in one frame.
     pub(super) takes_outcomes: bool,
+    /// Confirmed messages of this session at most for whose outcomes the peer has room.
+    pub(super) answers_there: usize,
+    /// How many sessions there are between the two.
+    pub(super) ways: usize,
 }
 
 /// What a session tells others of.
@@ -163,7 +175,8 @@ impl Way {
         let header = |kind| frame(ends.here, ends.node, kind, Bytes::new()).header;
         let void = header(Kind::GNCL_VOID);
         let outcomes = ends.takes_outcomes.then(|| header(Kind::GNCL_OUTCOMES));
-        let outlet = StreamOutlet::with_session(limits, Session::new(memory, window, void, outcomes));
+        let session = Session::new(memory, window, void, outcomes).answered_up_to(ends.answers_there);
+        let outlet = StreamOutlet::with_session(limits, session);
         let longest = HEADER_LEN + config.payload_max;
         // A message may be acknowledged before it is known that its destination is full: one more than a window.
         let (line_messages, line_bytes) = (messages + 1, WINDOW_BYTES + longest);
@@ -184,7 +197,9 @@ impl Way {
             is_fenced: false,
             is_abandoned: false,
         });
-        let outcomes_max = OUTCOMES_MAX * config.gncl.queue_capacity;
+        // Those that the peer has given up waiting for (their time to live was over long ago) it does not count any more: hence twice as
+        // many at least.
+        let outcomes_max = ends.ways.max(2) * answers_max(config.gncl.queue_capacity);
         Self { outlet, inbox, window, longest, outcomes_max, ends, told: told.clone() }
     }
 
@@ -355,9 +370,10 @@ impl Way {
         }
     }
 
-    /// Sends an outcome: more of them than other messages may wait, for one that is lost leaves its sender waiting.
+    /// Sends an outcome: more of them than other messages may wait, for one that is lost leaves its sender waiting. The peer has no more
+    /// messages open than it was told that there is room for; of one that has, the rest is counted and dropped.
     pub(super) fn send_outcome(&self, message: Message) {
-        if let Err(refused) = self.outlet.submit_beyond_up_to(self.outcomes_max, message) {
+        if let Err(refused) = self.outlet.submit_outcome(message, self.outcomes_max) {
             let kind = refused.message.header.kind;
             let detail = format!("a frame of kind {kind} for node {}: {}", self.ends.node, refused.why);
             self.told.refusals.count(Time::now(), "own frame not sent", &detail);

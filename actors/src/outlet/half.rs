@@ -343,15 +343,13 @@ impl<S: Socket> Half<S> {
         self.wake_drainer(after);
     }
 
-    /// Where there is a session, a destination may have as many as the bound says, and all together a few times that: one that
-    /// says nothing for long stops nobody else.
+    /// Where there is a session, a destination may have as many as the bound says, and all together a few times that, as far as the peer
+    /// has room for their outcomes: one that says nothing for long stops nobody else.
     fn has_too_many_unconfirmed(&self, destination: Tid) -> bool {
         let unconfirmed_max = self.limits.unconfirmed_max;
-        if self.session.is_none() {
-            return self.unconfirmed() >= unconfirmed_max;
-        }
+        let Some(session) = &self.session else { return self.unconfirmed() >= unconfirmed_max };
         self.sent_receipts.of(destination) >= unconfirmed_max
-            || self.unconfirmed() >= UNCONFIRMED_DESTINATIONS * unconfirmed_max
+            || self.unconfirmed() >= (UNCONFIRMED_DESTINATIONS * unconfirmed_max).min(session.answers_there)
     }
 
     /// A frame that was to be written at once and could not be: it waits like any other.

@@ -27,6 +27,8 @@ pub(crate) struct Session {
     void: Header,
     /// That of several outcomes in one frame, where the peer takes them.
     pub(super) outcomes: Option<Header>,
+    /// Confirmed messages at most for whose outcomes the peer has room.
+    pub(super) answers_there: usize,
 }
 
 impl Session {
@@ -37,7 +39,13 @@ impl Session {
             messages: window.messages,
             ..LIMITS_OF_LINES
         };
-        Self { sending: Sending::new(epoch, window), held: Held::new(lines), void, outcomes }
+        let sending = Sending::new(epoch, window);
+        Self { sending, held: Held::new(lines), void, outcomes, answers_there: usize::MAX }
+    }
+
+    /// The peer has room for the outcomes of so many confirmed messages: no more are open, whatever our own bounds say.
+    pub(crate) fn answered_up_to(self, answers_there: usize) -> Self {
+        Self { answers_there, ..self }
     }
 }
 

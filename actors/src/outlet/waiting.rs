@@ -7,7 +7,7 @@ use sinew_runtime::{
     outcome::Ticket,
     router::Refused,
     time::Time,
-    wire::{Class, Message},
+    wire::{Class, Kind, Message},
 };
 
 use super::held::line_of;
@@ -20,12 +20,13 @@ const NONE: Window = Window { messages: 0, bytes: 0 };
 pub(super) struct Waiting {
     queue: ClassQueue,
     for_lines: Window,
+    outcomes: usize,
 }
 
 impl Waiting {
     /// Of a queue in which nothing waits.
     pub(super) const fn new(queue: ClassQueue) -> Self {
-        Self { queue, for_lines: NONE }
+        Self { queue, for_lines: NONE, outcomes: 0 }
     }
 
     /// How much waits that may come into a line: messages, and bytes of their payloads.
@@ -33,15 +34,22 @@ impl Waiting {
         self.for_lines
     }
 
-    fn add(&mut self, share: Window) {
-        self.for_lines.messages += share.messages;
-        self.for_lines.bytes += share.bytes;
+    /// How many of them are outcomes.
+    pub(super) const fn outcomes(&self) -> usize {
+        self.outcomes
+    }
+
+    fn add(&mut self, Share { for_lines: Window { messages, bytes }, outcomes }: Share) {
+        self.for_lines.messages += messages;
+        self.for_lines.bytes += bytes;
+        self.outcomes += outcomes;
     }
 
     fn take(&mut self, message: &Message) {
-        let share = share_of(message);
-        self.for_lines.messages -= share.messages;
-        self.for_lines.bytes -= share.bytes;
+        let Share { for_lines: Window { messages, bytes }, outcomes } = share_of(message);
+        self.for_lines.messages -= messages;
+        self.for_lines.bytes -= bytes;
+        self.outcomes -= outcomes;
     }
 
     pub(super) fn push(&mut self, message: Message) -> Result<Option<Message>, Refused> {
@@ -85,7 +93,7 @@ impl Waiting {
     }
 
     pub(super) fn drain_all(&mut self) -> impl Iterator<Item = Message> + use<> {
-        self.for_lines = NONE;
+        (self.for_lines, self.outcomes) = (NONE, 0);
         self.queue.drain_all()
     }
 
@@ -111,6 +119,15 @@ impl Deref for Waiting {
 }
 
 /// What a message counts for.
-fn share_of(message: &Message) -> Window {
-    line_of(&message.header).map_or(NONE, |_| Window { messages: 1, bytes: message.payload.len() })
+struct Share {
+    for_lines: Window,
+    outcomes: usize,
+}
+
+fn share_of(message: &Message) -> Share {
+    let window = Window { messages: 1, bytes: message.payload.len() };
+    Share {
+        for_lines: line_of(&message.header).map_or(NONE, |_| window),
+        outcomes: usize::from(message.header.kind == Kind::OUTCOME),
+    }
 }

@@ -330,6 +330,7 @@ impl Core {
             takes_datagrams: by_class && theirs.knows(DATAGRAMS) && self.settings.ours.knows(DATAGRAMS),
             is_guarded: theirs.knows(GUARD) && self.settings.ours.knows(GUARD),
             payload_max: theirs.payload_max,
+            answers_max: theirs.answers_max,
             welcome,
         }));
         self.fact(LinkFact::LinkUp { node, incarnation });

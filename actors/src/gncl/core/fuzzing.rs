@@ -53,6 +53,7 @@ fn ours() -> Introduction {
         peer: NodeAddress::HERE,
         dial: 0,
         payload_max: 1 << 20,
+        answers_max: 8_192,
         features: [CLASSES, CANCEL, GUARD, OUTCOMES, DATAGRAMS].map(str::to_owned).into(),
         lane: Lane::Control,
         link: 0,

@@ -12,6 +12,9 @@ pub(crate) const HANDSHAKE_PAYLOAD_MAX: usize = 4_096;
 /// Longest name of a node or a project, in bytes.
 const NAME_MAX: usize = 63;
 
+/// How many answers a node keeps that does not say it: one from before it was said, with its defaults.
+const ANSWERS_UNSAID: u64 = 8_192;
+
 /// The ability to have a connection for each class.
 pub(crate) const CLASSES: &str = "classes";
 
@@ -70,6 +73,9 @@ pub(crate) struct Introduction {
     /// Optional abilities of the sender; what both have may be used: [`CLASSES`], [`CANCEL`], [`GUARD`], [`OUTCOMES`],
     /// [`DATAGRAMS`].
     #[serde(default)]
+    /// Confirmed messages of the receiver, of each connection, for whose outcomes the sender has room.
+    #[serde(default = "unsaid", skip_serializing_if = "is_unsaid")]
+    pub(crate) answers_max: u64,
     pub(crate) features: Vec<String>,
     /// What travels on this connection.
     #[serde(default, skip_serializing_if = "Lane::is_control")]
@@ -90,6 +96,15 @@ const fn is_zero(number: &u64) -> bool {
 impl Introduction {
     /// Whether the sender can have a connection for each class.
     pub(crate) fn knows_classes(&self) -> bool {
+const fn unsaid() -> u64 {
+    ANSWERS_UNSAID
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde calls it with a reference")]
+const fn is_unsaid(answers_max: &u64) -> bool {
+    *answers_max == ANSWERS_UNSAID
+}
+
         self.knows(CLASSES)
     }
 
@@ -279,6 +294,7 @@ mod tests {
     }
 
     fn ours() -> Introduction {
+            answers_max: ANSWERS_UNSAID,
         Introduction { node: NodeAddress::new(1), peer: NodeAddress::new(2), ..introduction() }
     }
 
@@ -316,6 +332,7 @@ mod tests {
         let page = include_str!("../../../../docs/protocol/gncl.md");
         let shown = page.split("```text").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
         // Each line has bytes, then at least two spaces, then what they mean.
+            answers_max: ANSWERS_UNSAID,
         let bytes = shown.lines().map(|line| line.trim_start().split("  ").next().unwrap_or_default());
         let bytes: Vec<&str> = bytes.flat_map(str::split_whitespace).collect();
         let written: Vec<_> = write(&hello).iter().map(|byte| format!("{byte:02x}")).collect();

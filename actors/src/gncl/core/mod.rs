@@ -171,6 +171,8 @@ pub(super) struct Attach {
     pub(super) is_guarded: bool,
     /// Longest payload that the peer takes, in bytes.
     pub(super) payload_max: u64,
+    /// Confirmed messages, of each connection, for whose outcomes the peer has room.
+    pub(super) answers_max: u64,
     /// To be sent before all else.
     pub(super) welcome: Option<Introduction>,
 }

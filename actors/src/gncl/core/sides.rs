@@ -206,6 +206,7 @@ impl Core {
             takes_datagrams: theirs.knows(DATAGRAMS) && self.settings.ours.knows(DATAGRAMS),
             is_guarded: theirs.knows(GUARD) && self.settings.ours.knows(GUARD),
             payload_max: theirs.payload_max,
+            answers_max: theirs.answers_max,
             welcome,
         }));
     }

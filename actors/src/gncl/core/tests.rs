@@ -80,6 +80,7 @@ fn settings(node: NodeAddress, incarnation: u64) -> Settings {
             peer: NodeAddress::HERE,
             dial: 0,
             payload_max: 1 << 20,
+            answers_max: 8_192,
             features: vec![CLASSES.to_owned()],
             lane: Lane::Control,
             link: 0,

@@ -403,6 +403,7 @@ pub(super) fn introduction(to: NodeAddress) -> Introduction {
         peer: to,
         dial: 1,
         payload_max: 1 << 20,
+        answers_max: 8_192,
         features: Vec::new(),
         lane: Lane::Control,
         link: 0,

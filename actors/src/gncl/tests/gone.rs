@@ -42,6 +42,7 @@ fn life(node: &Node, number: u64) -> Arc<Peer> {
         takes_datagrams: false,
         is_guarded: false,
         payload_max: 1 << 20,
+        answers_max: 8_192,
         welcome: None,
     };
     let peer = node.stores.gncl.meet(Time::now(), &attach, &node.stores);

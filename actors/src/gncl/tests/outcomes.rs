@@ -7,8 +7,8 @@ use sinew_runtime::{
     wire::{Kind, Message},
 };
 
-use super::bench::{ByHand, NINE, Node, introduction, next, pair, run};
-use crate::gncl::{core::Introduction, peer::frame};
+use super::bench::{ByHand, NINE, Node, introduction, next, pair, run, within};
+use crate::gncl::{core::Introduction, peer::frame, way::answers_max};
 
 /// What peer 9 says of messages from the application 1 of node 1 to its own application 1: one frame, its bytes by hand.
 fn said(outcomes: &[(u64, u8)]) -> Message {
@@ -123,4 +123,100 @@ fn a_flood_of_confirmed_messages_between_two_nodes_has_each_outcome_once() {
         }
         assert_eq!(told, (1..=1_000).collect::<Vec<_>>(), "in the order in which they were said");
     });
+}
+
+/// What is said to the sender of each of `count` confirmed messages, to two applications in turn, if all that come are handled while there
+/// is no connection: by correlation, all that was said of it.
+async fn told_by_nodes_with_queues_of(sender: usize, receiver: usize, count: u64) -> Vec<Vec<Outcome>> {
+    let with =
+        |number, capacity| Node::start_with(number, move |config| config.gncl.queue_capacity = capacity);
+    let (mut a, mut b) = (with(1, sender).await, with(2, receiver).await);
+    a.find(b.address(), b.listens_at());
+    b.find(a.address(), a.listens_at());
+    a.up().await;
+    b.up().await;
+    let mut inboxes = [b.app(1), b.app(2)];
+    let mut taken = Vec::new();
+    for correlation in 0..count {
+        let to = correlation as usize % 2;
+        let confirmed = a.confirmed(b.tid(1 + to as u32), correlation);
+        if a.stores.router.send(confirmed).is_ok() {
+            taken.push(next("a message", &mut inboxes[to]).await);
+        }
+    }
+    b.stop_layer();
+    for mut message in taken {
+        message.settle(Outcome::Delivered);
+    }
+    b.start_layer().await;
+    b.find(a.address(), a.listens_at());
+    let mut told = vec![Vec::new(); count as usize];
+    for _ in 0..count {
+        let (correlation, outcome) = next("an outcome", &mut a.settled).await;
+        told[correlation as usize].push(outcome);
+    }
+    let dropped = b.stores.gncl.refusals.of("own frame not sent");
+    assert_eq!(dropped, 0, "outcomes of a queue of {sender} at one of {receiver}");
+    let peer = a.stores.gncl.peer(b.address()).expect("it is linked");
+    assert_eq!(peer.unconfirmed(), 0);
+    told
+}
+
+// spec: GNCL-12
+#[test]
+fn each_confirmed_message_has_one_outcome_also_where_two_nodes_queues_are_not_equal() {
+    const COUNT: u64 = 1_500;
+    run(async {
+        for (sender, receiver) in [(1_024, 1), (1, 1_024), (1, 1), (65_536, 1), (1_024, 1_024)] {
+            let told = told_by_nodes_with_queues_of(sender, receiver, COUNT).await;
+            let full = Outcome::Rejected(Rejection::QueueFull);
+            let is_one = |told: &Vec<Outcome>| *told == [Outcome::Delivered] || *told == [full];
+            assert!(told.iter().all(is_one), "{sender} to {receiver}: {told:?}");
+            let delivered = told.iter().filter(|told| **told == [Outcome::Delivered]).count() as u64;
+            // A queue of one has one of each destination open.
+            assert_eq!(delivered, if sender == 1 { 2 } else { COUNT }, "{sender} to {receiver}");
+        }
+    });
+}
+
+// spec: GNCL-12
+#[test]
+fn no_more_is_open_than_the_peer_has_room_for_answers() {
+    run(async {
+        let node = Node::start(1).await;
+        let hello = Introduction { answers_max: 3, ..introduction(node.address()) };
+        let mut peer = ByHand::greeting(&node, &hello).await;
+        let send = |correlation: u64| {
+            // To several applications: of each alone there would be room for more.
+            let to = Tid::new(NINE, AppAddress::new(0x1000 + correlation as u32));
+            node.stores.router.send(node.confirmed(to, correlation))
+        };
+        within("the peer to be known", async {
+            while node.stores.gncl.peer(NINE).is_none() {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        for correlation in 1..=3 {
+            send(correlation).expect("there is room for its answer");
+        }
+        assert!(send(4).is_err(), "there is none");
+        let first = peer.hear().await;
+        peer.say(&ByHand::outcome(&first, Outcome::Delivered)).await;
+        within("the outcome", async {
+            while node.stores.gncl.peer(NINE).is_some_and(|peer| peer.unconfirmed() == 3) {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        send(5).expect("there is room for its answer");
+        assert!(send(6).is_err(), "there is none again");
+    });
+}
+
+#[test]
+fn a_node_says_for_how_many_answers_it_has_room_which_are_not_fewer_where_its_queue_is_short() {
+    for (capacity, answers) in [(1, 8_192), (1_024, 8_192), (2_048, 16_384), (65_536, 524_288)] {
+        assert_eq!(answers_max(capacity), answers, "a queue of {capacity}");
+    }
 }

@@ -114,7 +114,7 @@ mod tests {
     fn who_is_always_outrun_by_another_thread_leaves_it_to_who_looks_for_what_is_owed() {
         // Given: each time that one is said, another thread has made a newer one.
         let [here, node] = [1, 2].map(NodeAddress::new);
-        let ends = Ends { here, node, takes_outcomes: true };
+        let ends = Ends { here, node, takes_outcomes: true, answers_there: 100, ways: 1 };
         let way = Way::new(Time::now(), ends, &NodeConfig::new("hip"), &Told::default());
         let mut rounds = 0;
         let mut outrun = || {
@@ -146,7 +146,7 @@ mod tests {
             filled += count;
         }
         let [here, node] = [1, 2].map(NodeAddress::new);
-        let ends = Ends { here, node, takes_outcomes: true };
+        let ends = Ends { here, node, takes_outcomes: true, answers_there: 100, ways: 1 };
         let config = NodeConfig::new("hip");
         let way = Way::new(Time::now(), ends, &config, &Told::default());
         let link = way.outlet.connect(Gathering::new(Transport::open(ours), Checksum::Crc), 1 << 16, None);

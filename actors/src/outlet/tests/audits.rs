@@ -114,7 +114,7 @@ impl World {
             Step::Outcome => {
                 (self.submitted, self.outcomes) = (self.submitted + 1, self.outcomes + 1);
                 let outcome = Message::outcome(message(Class::Control, 0).ticket(), Outcome::Delivered);
-                let _ = self.bench.outlet.submit_beyond_up_to(8, outcome);
+                let _ = self.bench.outlet.submit_outcome(outcome, 8);
             }
             Step::Forget => {
                 self.bench.outlet.disconnect(self.bench.link);
