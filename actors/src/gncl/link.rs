@@ -343,7 +343,7 @@ impl Reader {
         let mode = lock(&self.reading.mode);
         let (payload_max, checksum) = match &*mode {
             Mode::Handshake => (HANDSHAKE_PAYLOAD_MAX, Checksum::Crc),
-            // What GNCL itself says is never longer than in a handshake, and not bound by what messages may have: see `is_too_long`.
+            // What GNCL itself says is never longer than in a handshake, and not bound by what messages may have: see `longest`.
             Mode::Linked(inbound) => (self.reading.payload_max.max(HANDSHAKE_PAYLOAD_MAX), inbound.checksum),
             Mode::Moves(..) => return Look::Moves,
             Mode::Discard => {
@@ -363,8 +363,8 @@ impl Reader {
         let _batch = if let Mode::Linked(inbound) = &*mode { Some(inbound.batch(now)) } else { None };
         for _ in 0..FRAMES_PER_WAKE {
             match (self.codec.decode(&mut self.buffer), &*mode) {
-                (Ok(Some(message)), Mode::Linked(_)) if is_too_long(&message, self.reading.payload_max) => {
-                    let (said, limit) = (message.payload.len(), self.reading.payload_max);
+                (Ok(Some(message)), Mode::Linked(_)) if message.payload.len() > self.longest(&message) => {
+                    let (said, limit) = (message.payload.len(), self.longest(&message));
                     return Look::Tell(What::Violated(decline(&FrameError::TooLong { said, limit })));
                 }
                 (Ok(Some(message)), Mode::Linked(inbound)) if !is_for_the_shell(&message) => {
@@ -385,6 +385,12 @@ impl Reader {
             }
         }
         Look::Again
+    }
+
+    /// The longest payload that this may have on a link: GNCL's own words have a bound of their own, whatever messages may have.
+    fn longest(&self, message: &Message) -> usize {
+        let is_a_word = message.header.destination.app == AppAddress::GNCL && !message.header.kind.is_user();
+        if is_a_word { HANDSHAKE_PAYLOAD_MAX } else { self.reading.payload_max }
     }
 
     /// Lets others have their turn, and what has come meanwhile be seen.
@@ -423,11 +429,6 @@ impl Reader {
             }
         }
     }
-}
-
-/// Whether this is no word of GNCL itself, and longer than this node takes.
-fn is_too_long(message: &Message, payload_max: usize) -> bool {
-    message.header.destination.app != AppAddress::GNCL && message.payload.len() > payload_max
 }
 
 /// Whether this is about the link itself.

@@ -17,7 +17,7 @@ use super::{
     OUTCOMES, Output, Refusal, Stage,
     acquaintance::{Acquaintance, Link, Pulse},
     dials::Dial,
-    handshake::check,
+    handshake::{check, printable},
     sides::Side,
 };
 
@@ -361,13 +361,14 @@ impl Core {
         if stage == Stage::Leaving {
             return;
         }
-        self.count(decline.cause(), decline.to_string());
+        let refusal = decline.to_refusal();
+        self.count(decline.cause(), refusal.sentence.clone());
         // Who is refused stays from where it came.
         let from = self.connections.get(&connection).and_then(|known| known.from);
         self.leave_stage(now, connection, stage);
         let deadline = now + self.settings.handshake;
         self.connections.insert(connection, Connection { stage: Stage::Leaving, from, deadline });
-        self.outputs.push_back(Output::Refuse(connection, decline.to_refusal()));
+        self.outputs.push_back(Output::Refuse(connection, refusal));
     }
 
     pub(super) fn ended(&mut self, now: Time, connection: ConnectionId) {
@@ -431,9 +432,4 @@ fn network_of(ip: IpAddr) -> IpAddr {
         IpAddr::V4(_) => ip,
         IpAddr::V6(ip) => Ipv6Addr::from_bits(ip.to_bits() >> 64 << 64).into(),
     }
-}
-
-/// A peer's words for our log: at most a few lines, and nothing that a terminal would obey.
-fn printable(words: &str) -> String {
-    words.chars().filter(|c| !c.is_control()).take(400).collect()
 }

@@ -12,6 +12,9 @@ pub(crate) const HANDSHAKE_PAYLOAD_MAX: usize = 4_096;
 /// Longest name of a node or a project, in bytes.
 const NAME_MAX: usize = 63;
 
+/// Longest words of a REFUSAL, in characters: whatever they are, they have room in a payload.
+const WORDS_MAX: usize = 800;
+
 /// How many answers a node keeps that does not say it: one from before it was said, with its defaults.
 const ANSWERS_UNSAID: u64 = 8_192;
 
@@ -70,12 +73,12 @@ pub(crate) struct Introduction {
     pub(crate) dial: u64,
     /// Longest payload that the sender takes, in bytes.
     pub(crate) payload_max: u64,
-    /// Optional abilities of the sender; what both have may be used: [`CLASSES`], [`CANCEL`], [`GUARD`], [`OUTCOMES`],
-    /// [`DATAGRAMS`].
-    #[serde(default)]
     /// Confirmed messages of the receiver, of each connection, for whose outcomes the sender has room.
     #[serde(default = "unsaid", skip_serializing_if = "is_unsaid")]
     pub(crate) answers_max: u64,
+    /// Optional abilities of the sender; what both have may be used: [`CLASSES`], [`CANCEL`], [`GUARD`], [`OUTCOMES`],
+    /// [`DATAGRAMS`].
+    #[serde(default)]
     pub(crate) features: Vec<String>,
     /// What travels on this connection.
     #[serde(default, skip_serializing_if = "Lane::is_control")]
@@ -93,9 +96,6 @@ const fn is_zero(number: &u64) -> bool {
     *number == 0
 }
 
-impl Introduction {
-    /// Whether the sender can have a connection for each class.
-    pub(crate) fn knows_classes(&self) -> bool {
 const fn unsaid() -> u64 {
     ANSWERS_UNSAID
 }
@@ -105,6 +105,9 @@ const fn is_unsaid(answers_max: &u64) -> bool {
     *answers_max == ANSWERS_UNSAID
 }
 
+impl Introduction {
+    /// Whether the sender can have a connection for each class.
+    pub(crate) fn knows_classes(&self) -> bool {
         self.knows(CLASSES)
     }
 
@@ -185,9 +188,9 @@ impl Decline {
         }
     }
 
-    /// The frame's payload.
+    /// The frame's payload. Its sentence may quote what a stranger has said: it is [`printable`].
     pub(crate) fn to_refusal(&self) -> Refusal {
-        Refusal { cause: self.cause().to_owned(), sentence: self.to_string() }
+        Refusal { cause: self.cause().to_owned(), sentence: printable(&self.to_string()) }
     }
 }
 
@@ -258,6 +261,11 @@ pub(crate) fn check(theirs: &Introduction, ours: &Introduction) -> Result<(), De
     }
 }
 
+/// Words that a peer may have chosen, for a log or for another node: at most a few lines, and nothing that a terminal would obey.
+pub(super) fn printable(words: &str) -> String {
+    words.chars().filter(|c| !c.is_control()).take(WORDS_MAX).collect()
+}
+
 /// The MessagePack form of a payload of this layer.
 pub(crate) fn write<T: Serialize>(value: &T) -> Bytes {
     // Structs of strings and numbers, which can be written. An acknowledgement is one, and each 32 messages at most have one: in memory that
@@ -286,6 +294,7 @@ mod tests {
             peer: NodeAddress::new(1),
             dial: 1,
             payload_max: 1 << 20,
+            answers_max: ANSWERS_UNSAID,
             features: Vec::new(),
             lane: Lane::Control,
             link: 0,
@@ -294,7 +303,6 @@ mod tests {
     }
 
     fn ours() -> Introduction {
-            answers_max: ANSWERS_UNSAID,
         Introduction { node: NodeAddress::new(1), peer: NodeAddress::new(2), ..introduction() }
     }
 
@@ -324,6 +332,7 @@ mod tests {
             peer: NodeAddress::new(0x0a00_0008),
             dial: 1_000_000,
             payload_max: 1 << 20,
+            answers_max: ANSWERS_UNSAID,
             features: Vec::new(),
             lane: Lane::Control,
             link: 0,
@@ -332,7 +341,6 @@ mod tests {
         let page = include_str!("../../../../docs/protocol/gncl.md");
         let shown = page.split("```text").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
         // Each line has bytes, then at least two spaces, then what they mean.
-            answers_max: ANSWERS_UNSAID,
         let bytes = shown.lines().map(|line| line.trim_start().split("  ").next().unwrap_or_default());
         let bytes: Vec<&str> = bytes.flat_map(str::split_whitespace).collect();
         let written: Vec<_> = write(&hello).iter().map(|byte| format!("{byte:02x}")).collect();
@@ -347,6 +355,19 @@ mod tests {
         };
         map.extend(known);
         assert_eq!(read::<Introduction>(&rmp_serde::to_vec_named(&map).unwrap()), Ok(introduction()));
+    }
+
+    #[test]
+    fn the_words_of_a_refusal_have_room_and_no_controls_whatever_the_stranger_has_said() {
+        let mut strange = serde_json::to_value(introduction()).unwrap();
+        strange["lane"] = "\u{1b}[2J\u{1f980}".repeat(450).into();
+        let strange = rmp_serde::to_vec_named(&strange).unwrap();
+        assert!(strange.len() <= HANDSHAKE_PAYLOAD_MAX, "{} bytes are taken", strange.len());
+        let refusal = read::<Introduction>(&strange).unwrap_err().to_refusal();
+        assert!(refusal.sentence.contains("[2J"), "it quotes what is wrong: {}", refusal.sentence);
+        assert!(!refusal.sentence.contains(char::is_control), "{:?}", refusal.sentence);
+        let length = write(&refusal).len();
+        assert!(length <= HANDSHAKE_PAYLOAD_MAX, "{length} bytes");
     }
 
     proptest! {

@@ -10,7 +10,10 @@ use sinew_runtime::{
 use socket2::SockRef;
 
 use super::bench::{ByHand, Cable, NINE, Node, next, pair, run};
-use crate::gncl::{LinkFact, link, listener, peer::frame};
+use crate::{
+    gncl::{LinkFact, core::write, link, listener, peer::frame},
+    session::Ack,
+};
 
 #[test]
 fn two_nodes_that_find_each_other_at_once_have_one_link_and_use_it_both_ways() {
@@ -181,6 +184,19 @@ fn a_message_that_is_longer_than_this_node_takes_is_refused_also_where_gncls_own
         peer.say(&message(257)).await;
         let refusal = peer.refusal().await;
         assert!(refusal.sentence.contains("257 bytes"), "{}", refusal.sentence);
+    });
+}
+
+#[test]
+fn gncls_own_words_have_a_bound_of_their_own_where_messages_may_be_longer() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut peer = ByHand::linked_to(&mut node).await;
+        let held = (0..5_000).collect();
+        let ack = Ack { memory: 1, epoch: 1, of: 0, next: 1, change: 9, held, room: None };
+        peer.say(&frame(NINE, node.address(), Kind::GNCL_ACK, write(&ack))).await;
+        let refusal = peer.refusal().await;
+        assert!(refusal.sentence.contains("4096"), "{}", refusal.sentence);
     });
 }
 
