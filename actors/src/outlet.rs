@@ -347,9 +347,10 @@ impl<S: Socket> StreamOutlet<S> {
     }
 
     /// Says what was taken, ahead of all that waits: `ack` names `epoch` as that in which this outlet counts. Returns whether it does; if a
-    /// later one has begun since, `ack` is not said.
-    pub(crate) fn acknowledge(&self, ack: Message, epoch: u64) -> bool {
-        self.with(|half, after| half.acknowledge(ack, epoch, after))
+    /// later one has begun since, `ack` is not said. Nor is it if the n-th connection, `link`, is not the present one: each begins with
+    /// another, and to one that is older than what the peer has heard it would say that all was forgotten.
+    pub(crate) fn acknowledge(&self, ack: Message, link: u64, epoch: u64) -> bool {
+        self.with(|half, after| half.acknowledge(ack, LinkNumber(link), epoch, after))
     }
 
     /// Urgent frames that the socket has not taken to their last byte. They end with the connection.

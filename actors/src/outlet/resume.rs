@@ -159,9 +159,18 @@ impl<S: Socket> Half<S> {
 
     /// An ACK that names `epoch` goes ahead of all that waits; what was held back until the peer knows of that epoch follows it. Returns
     /// whether that is the present one: if not, the frame is dropped, and another one is to be made.
-    pub(super) fn acknowledge(&mut self, ack: Message, epoch: u64, after: &mut After) -> bool {
+    pub(super) fn acknowledge(
+        &mut self,
+        ack: Message,
+        link: LinkNumber,
+        epoch: u64,
+        after: &mut After,
+    ) -> bool {
         if epoch != self.epoch() {
             return false;
+        }
+        if !self.is_present(link) {
+            return true;
         }
         // Without a connection nobody needs it, and the next one begins with another.
         if self.submit_urgent(ack, usize::MAX, after).is_ok()

@@ -49,6 +49,11 @@ impl Receiving {
         self.knows_epoch = false;
     }
 
+    /// The latest connection; 0 before the first.
+    pub(crate) const fn link(&self) -> u64 {
+        self.link
+    }
+
     /// Whether this is the latest connection.
     pub(crate) const fn is_present(&self, link: u64) -> bool {
         link == self.link

@@ -17,6 +17,8 @@ struct Acknowledgement {
     number: u64,
     /// That in which the peer's messages from here are counted.
     epoch: u64,
+    /// The latest connection when it was made: it is said on no other.
+    link: u64,
     message: Message,
 }
 
@@ -56,7 +58,7 @@ impl Way {
     /// what is owed, who is one thread.
     fn say_acks(&self, mut ack: Acknowledgement, mut next: impl FnMut() -> Acknowledgement) {
         for _ in 0..ROUNDS_MAX {
-            let is_of_now = self.outlet.acknowledge(ack.message, ack.epoch);
+            let is_of_now = self.outlet.acknowledge(ack.message, ack.link, ack.epoch);
             // What another thread has made meanwhile may have been said before this one, which has taken its place then: in an outlet one waits.
             if is_of_now && self.inbox().acks_made == ack.number {
                 return;
@@ -70,17 +72,18 @@ impl Way {
 
     fn next_ack(&self) -> Acknowledgement {
         let epoch = self.outlet.epoch();
-        let (ack, number) = {
+        let (ack, number, link) = {
             let Inbox { receiving, shelf, ack_is_due, acks_made, .. } = &mut *self.inbox();
             *ack_is_due = false;
             *acks_made += 1;
             let room = shelf.room(self.window, self.longest);
             let ack = receiving.ack(epoch, Some(room));
-            (Ack { change: shelf.change(), held: shelf.held(), ..ack }, *acks_made)
+            (Ack { change: shelf.change(), held: shelf.held(), ..ack }, *acks_made, receiving.link())
         };
         Acknowledgement {
             number,
             epoch,
+            link,
             message: frame(self.ends.here, self.ends.node, Kind::GNCL_ACK, write(&ack)),
         }
     }
@@ -130,6 +133,38 @@ mod tests {
         // Then
         assert!(way.acknowledge_if_owed(), "the last word is still to be said");
         assert!(!way.acknowledge_if_owed(), "it is");
+    }
+
+    // spec: SESSION-3
+    #[tokio::test]
+    async fn one_that_was_made_for_a_connection_that_has_ended_is_not_the_first_word_on_the_next() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+        let address = listener.local_addr().expect("it is bound");
+        let [here, node] = [1, 2].map(NodeAddress::new);
+        let ends = Ends { here, node, takes_outcomes: true, answers_there: 100, ways: 1 };
+        let way = Way::new(Time::now(), ends, &NodeConfig::new("hip"), &Told::default());
+        // Given: a thread has made one, and is held up before it says it.
+        let older = way.next_ack();
+        // When: the next connection is there, and the thread goes on before that one has its first word.
+        let (ours, theirs) = tokio::join!(TcpStream::connect(address), listener.accept());
+        let (ours, mut theirs) = (ours.expect("it listens"), theirs.expect("it dials").0);
+        ours.writable().await.expect("it takes something");
+        let link = way.outlet.connect(Gathering::new(Transport::open(ours), Checksum::Crc), 1 << 16, None);
+        way.say_ack(older);
+        let mut held = frame(node, here, Kind::named("held"), Bytes::new());
+        held.header.class = Class::Bulk;
+        way.inbox().shelf.put(7, held, 100).expect("there is room");
+        way.attach(link);
+        // Then: what the peer reads first knows all that was taken. An older word would have it begin anew.
+        let (mut codec, mut bytes) = (FrameCodec::new(1 << 16), BytesMut::new());
+        let first = loop {
+            if let Some(message) = codec.decode(&mut bytes).expect("a frame") {
+                break message;
+            }
+            theirs.read_buf(&mut bytes).await.expect("it is on its way");
+        };
+        let first: Ack = read(&first.payload).expect("an acknowledgement");
+        assert_eq!(first.held, [7]);
     }
 
     // spec: CREDIT-2

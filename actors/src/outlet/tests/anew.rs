@@ -30,7 +30,7 @@ impl Bench {
     fn tells(&self, epoch: u64) -> bool {
         let mut ack = message(Class::Control, epoch as u8);
         ack.header.kind = Kind::GNCL_ACK;
-        self.outlet.acknowledge(ack, epoch)
+        self.outlet.acknowledge(ack, self.link.number(), epoch)
     }
 }
 
