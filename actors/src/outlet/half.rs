@@ -179,21 +179,10 @@ impl<S: Socket> Half<S> {
         };
         self.next_expiry = self.next_expiry.min(message.header.expiry());
         if message.header.class == Class::Stream {
-            self.put_back(message);
+            // A newer value that waits takes its place; nothing that waits makes room for it.
+            self.counts.superseded += u64::from(self.queue.put_back(message).is_some());
         } else {
             self.interrupted = Some(message);
-        }
-    }
-
-    /// Puts a Stream message back before all others, so that a newer value takes its place.
-    fn put_back(&mut self, oldest: Message) {
-        let rest: Vec<_> = self.queue.drain_all().collect();
-        for message in std::iter::once(oldest).chain(rest) {
-            match self.queue.push(message) {
-                Ok(superseded) => self.counts.superseded += u64::from(superseded.is_some()),
-                // Only Stream can be one too many here, and Stream has no receipts.
-                Err(_) => self.counts.lost += 1,
-            }
         }
     }
 

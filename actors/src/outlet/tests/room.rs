@@ -74,3 +74,32 @@ fn who_keeps_a_message_for_an_outlet_that_ends_is_woken() {
     bench.outlet.close(Rejection::Closed);
     assert_eq!(woken.0.load(Ordering::Relaxed), 1);
 }
+
+#[test]
+fn a_value_whose_writing_was_interrupted_takes_the_place_of_nothing_that_waits() {
+    // Given: a value of which a part is written, and behind it as many others as may wait, and more.
+    let mut bench = Bench::new(70);
+    let value = |flow: u8| {
+        let mut value = message(Class::Stream, flow);
+        value.header.destination = tid(flow.into());
+        value
+    };
+    (1..=5).for_each(|flow| bench.submit(value(flow)));
+    for number in 6..=10 {
+        bench.outlet.submit_beyond(message(Class::Control, number)).unwrap();
+    }
+    bench.outlet.disconnect(bench.link);
+    bench.reconnect(PLENTY);
+    let mut seen = bench.seen();
+    seen.sort_unstable();
+    assert_eq!(seen, (1..=10).collect::<Vec<u8>>());
+    let counts = OutletCounts { sent: 10, ..OutletCounts::default() };
+    assert_eq!(bench.outlet.counts(), counts);
+    // And: of two values of one flow the newer one.
+    let mut bench = Bench::new(70);
+    bench.submit(value(1));
+    bench.submit(value(1));
+    bench.outlet.disconnect(bench.link);
+    bench.reconnect(PLENTY);
+    assert_eq!(bench.outlet.counts(), OutletCounts { sent: 1, superseded: 1, ..OutletCounts::default() });
+}
