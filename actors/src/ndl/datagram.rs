@@ -3,11 +3,12 @@
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
 use bytes::BytesMut;
+use rmp_serde::encode::write_named;
 use serde::{Deserialize, Serialize};
 use sinew_runtime::{
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
-    wire::{Flags, Header, HeaderError, Kind, decode, decode_datagram, encode_frame},
+    wire::{Flags, HEADER_LEN, Header, HeaderError, Kind, decode, encode_frame},
 };
 
 use super::{
@@ -344,23 +345,25 @@ pub(crate) fn parse(here: NodeAddress, bytes: &[u8]) -> Result<Datagram, Datagra
     if bytes.len() > DATAGRAM_MAX {
         return Err(DatagramError::TooLong);
     }
-    let message = decode_datagram(bytes)?;
-    let Header { kind, source, destination, correlation, sent, .. } = message.header;
+    // It is read where it lies: no byte of it is kept.
+    let head = bytes.first_chunk::<HEADER_LEN>().ok_or(HeaderError::NotAFrame)?;
+    let payload = &bytes[HEADER_LEN..];
+    let Header { kind, source, destination, correlation, sent, .. } = Header::decode(head, payload)?;
     let is_for_us =
         destination.app == AppAddress::NDL && [here, NodeAddress::ALL].contains(&destination.node);
     if !is_for_us {
         return Err(DatagramError::Misdirected(destination));
     }
     let body = match kind {
-        Kind::NDL_QUERY => Body::Query(announcement(&message.payload)?),
+        Kind::NDL_QUERY => Body::Query(announcement(payload)?),
         Kind::NDL_ANSWER => {
-            let answer: Answer = decode(&message.payload)?;
+            let answer: Answer = decode(payload)?;
             if !answer.progress.is_fit() {
                 return Err(DatagramError::Announcement("what it says does not get on cannot be so"));
             }
             Body::Answer(Answer { announcement: answer.announcement.check()?, ..answer })
         }
-        Kind::NDL_LEAVE => Body::Leave(announcement(&message.payload)?),
+        Kind::NDL_LEAVE => Body::Leave(announcement(payload)?),
         other => return Err(DatagramError::Kind(other)),
     };
     let announced = body.announcement().node;
@@ -387,12 +390,14 @@ impl Body {
 /// The bytes of a datagram to `to`.
 pub(crate) fn encode(datagram: &Datagram, to: NodeAddress) -> BytesMut {
     let source = Tid::new(datagram.body.announcement().node, AppAddress::NDL);
-    let (kind, flags, payload) = match &datagram.body {
-        Body::Query(announcement) => (Kind::NDL_QUERY, Flags::ASK, rmp_serde::to_vec_named(announcement)),
-        Body::Answer(answer) => (Kind::NDL_ANSWER, Flags::REPLY, rmp_serde::to_vec_named(answer)),
-        Body::Leave(announcement) => (Kind::NDL_LEAVE, Flags::NONE, rmp_serde::to_vec_named(announcement)),
+    // With all the room that it may need: what grows step by step is copied at each.
+    let mut payload = Vec::with_capacity(DATAGRAM_MAX);
+    let (kind, flags, written) = match &datagram.body {
+        Body::Query(announcement) => (Kind::NDL_QUERY, Flags::ASK, write_named(&mut payload, announcement)),
+        Body::Answer(answer) => (Kind::NDL_ANSWER, Flags::REPLY, write_named(&mut payload, answer)),
+        Body::Leave(announcement) => (Kind::NDL_LEAVE, Flags::NONE, write_named(&mut payload, announcement)),
     };
-    let payload = payload.expect("strings and numbers can be written as MessagePack");
+    written.expect("strings and numbers can be written as MessagePack");
     let mut header = Header::new(kind, source, Tid::new(to, AppAddress::NDL));
     header.flags = flags;
     header.correlation = datagram.correlation;

@@ -5,10 +5,10 @@
 
 use std::net::SocketAddr;
 
-use sinew_runtime::time::Time;
+use sinew_runtime::{tid::NodeAddress, time::Time};
 
 use super::{
-    Core, Input, Member, Output, Place, Query, Source, Way,
+    Core, Input, Output, Place, Query, Source, Way,
     clock::Exchange,
     contact::{Contact, Question, Role},
     lives::Proof,
@@ -17,6 +17,17 @@ use crate::ndl::{
     LossReason,
     datagram::{Announcement, Answer, Body, Claim, parse, peek_answer},
 };
+
+/// Whose word a datagram is, if it is not forged.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Speaker {
+    /// A member's life, where there is a route to it.
+    MemberOnItsRoute,
+    /// The same at another address where it says that it is.
+    MemberWhereItSays,
+    /// Anybody else's.
+    Stranger,
+}
 
 /// Time between two questions to one address outside the cycle, so that nobody makes us flood a third.
 const ASK_GAP_MS: u64 = 10;
@@ -72,8 +83,9 @@ impl Core {
     // spec: NDL-3
     pub(super) fn queried(&mut self, now: Time, query: &Query) {
         let Query { from, way, correlation, sent: query_sent, ref announcement } = *query;
+        let speaker = self.speaker(from, announcement);
         // A member's question to everybody is not for us: it asks us by ourselves, too.
-        if way == Way::Unicast || !self.is_member_at(from, announcement) {
+        if way == Way::Unicast || speaker != Speaker::MemberOnItsRoute {
             let (to, node) = (from, announcement.node);
             self.outputs.push_back(Output::SendAnswer {
                 to,
@@ -87,7 +99,7 @@ impl Core {
             Way::Unicast => Source::Query,
             Way::Multicast => Source::Multicast,
         };
-        self.heard(now, from, source, announcement);
+        self.heard(now, from, source, (announcement.node, speaker));
     }
 
     // spec: NDL-3.1
@@ -106,7 +118,8 @@ impl Core {
             self.confirmed(now, Proof { from, asked: question.asked, announcement, exchange, progress });
         } else if self.group_questions.has(correlation) {
             // Who answers the group's question is asked by himself: only that proves his address.
-            self.heard(now, from, Source::Multicast, &answer.announcement);
+            let speaker = self.speaker(from, &answer.announcement);
+            self.heard(now, from, Source::Multicast, (answer.announcement.node, speaker));
         } else {
             let what = format_args!("{} answers what it was not asked, or twice, or too late", from.there);
             self.refusals.count(now, "NDL answer without a question", &what);
@@ -132,30 +145,28 @@ impl Core {
         Some(Exchange { query_sent, query_received, answer_sent, answer_received: now })
     }
 
-    fn is_member_at(&self, from: Place, announcement: &Announcement) -> bool {
-        self.members
-            .get(&announcement.node)
-            .is_some_and(|member| member.routes.has(from) && member.announcement.is_same_life(announcement))
+    /// Whom what was said at `from` is of. It may hear us on fewer routes than we hear it on.
+    fn speaker(&self, from: Place, announcement: &Announcement) -> Speaker {
+        let member = self.members.get(&announcement.node);
+        match member.filter(|member| member.announcement.is_same_life(announcement)) {
+            Some(member) if member.routes.has(from) => Speaker::MemberOnItsRoute,
+            Some(member) if member.announces(from) => Speaker::MemberWhereItSays,
+            Some(_) | None => Speaker::Stranger,
+        }
     }
 
-    /// The same, or at an address where the member says that it is: it may hear us on fewer routes than we hear it on.
     fn is_said_by_member(&self, from: Place, announcement: &Announcement) -> bool {
-        let is_it = |member: &Member| {
-            member.announcement.is_same_life(announcement)
-                && (member.routes.has(from) || member.announces(from))
-        };
-        self.members.get(&announcement.node).is_some_and(is_it)
+        self.speaker(from, announcement) != Speaker::Stranger
     }
 
     /// Somebody spoke who may be a node. // spec: NDL-2.2
-    fn heard(&mut self, now: Time, from: Place, source: Source, announcement: &Announcement) {
-        if !self.is_member_at(from, announcement) {
-            self.look_at(now, from, source);
+    fn heard(&mut self, now: Time, from: Place, source: Source, (node, speaker): (NodeAddress, Speaker)) {
+        match speaker {
+            Speaker::MemberOnItsRoute => {}
+            Speaker::MemberWhereItSays => self.look_at(now, from, source),
+            Speaker::Stranger => return self.look_at(now, from, source),
         }
-        if !self.is_said_by_member(from, announcement) {
-            return;
-        }
-        if let Some(member) = self.members.get_mut(&announcement.node) {
+        if let Some(member) = self.members.get_mut(&node) {
             member.heard = now;
             if source == Source::Query {
                 // Who asks us lives, whatever becomes of our questions; he asks us as long as he hears our answers. spec: NDL-4.7

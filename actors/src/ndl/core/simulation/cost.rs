@@ -1,7 +1,10 @@
 //! What a node costs among 10, 100 and 1,000 that all know each other.
 
+mod alone;
+
 use std::time::{Duration, Instant};
 
+use self::alone::Alone;
 use super::{
     CROWD_VARIABLE,
     plan::{Clock, Finding, Happening, Plan, Quality},
@@ -78,4 +81,25 @@ fn measure(nodes: usize) {
         per_node(in_cores),
         began.1.elapsed()
     );
+}
+
+/// One core, with nothing else in its processor's caches than on a host of its own.
+#[test]
+fn a_core_among_many_is_told_by_its_cost() {
+    const MEASURED: u32 = 20;
+    let period = Duration::from_millis(500);
+    let most = number(CROWD_VARIABLE).map_or(CROWD, |most| usize::try_from(most).expect("a small number"));
+    let mut nodes = 10;
+    while nodes <= most {
+        let mut alone = Alone::among(nodes, period);
+        (0..MEASURED).for_each(|_| alone.play_a_period());
+        let seconds = (period * MEASURED).as_secs_f64();
+        println!(
+            "{nodes} nodes at {period:?}, all but one of them puppets: its core reads and writes {:.0} datagrams/s and takes {:.3} ms/s \
+             of a CPU",
+            alone.datagrams as f64 / seconds,
+            alone.in_core.as_secs_f64() * 1e3 / seconds
+        );
+        nodes *= 10;
+    }
 }

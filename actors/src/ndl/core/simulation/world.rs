@@ -468,7 +468,7 @@ impl World {
 }
 
 /// What this thread has had of a CPU: others may want it, too.
-fn on_the_cpu() -> Duration {
+pub(super) fn on_the_cpu() -> Duration {
     let time = clock_gettime(ClockId::ThreadCPUTime);
     Duration::new(time.tv_sec as u64, time.tv_nsec as u32)
 }
