@@ -55,6 +55,9 @@ impl Core {
         self.settles = Some(now + self.loss_bound());
         // One that settles and was heard by the regular end has settled itself by then.
         self.settles_at_latest = now + self.loss_bound() * 2 + self.rest().period;
+        if self.me.claim == Claim::Held {
+            self.settles_anew = Some(now);
+        }
         self.me.claim = Claim::Settling;
     }
 
@@ -114,11 +117,14 @@ impl Core {
             let is_later =
                 (theirs.incarnation, theirs.boot_nonce) < (self.me.incarnation, self.me.boot_nonce);
             let period = self.rest().period;
+            // It may have heard just before that we had settled, and make way for that. Were we to give up at once, nobody would be left.
+            let may_make_way = theirs.claim == Claim::Settling
+                && self.settles_anew.is_some_and(|since| now.since(since) < period);
             let is_over = now + period > settles;
             // It may not have heard of us yet, and gives up when it does; if it never does, it settles. Were both to give up, nobody would
             // be left.
             let may_give_up = theirs.claim == Claim::Settling && settles + period <= self.settles_at_latest;
-            if is_later || is_over && !may_give_up {
+            if is_later && !may_make_way || is_over && !may_give_up {
                 return self.give_address_up(other);
             }
             if is_over {

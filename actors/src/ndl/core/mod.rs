@@ -244,6 +244,8 @@ pub(crate) struct Core {
     settles: Option<Time>,
     /// To then at most that is put off, while another one with our address settles, too.
     settles_at_latest: Time,
+    /// Since when it settles that had settled before: others may have heard that last.
+    settles_anew: Option<Time>,
     /// It had members and has none any more: others may have given its address to a later life.
     is_lonely: bool,
     /// Another process is about to be believed that our address is its own.
@@ -308,6 +310,7 @@ impl Core {
             has_moved: false,
             settles: None,
             settles_at_latest: Time::ZERO,
+            settles_anew: None,
             is_lonely: false,
             trial: None,
             stall_reported: None,

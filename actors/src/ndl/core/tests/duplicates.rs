@@ -164,6 +164,31 @@ fn who_settles_gives_up_when_a_later_life_that_does_not_hear_it_has_settled_or_s
     }
 }
 
+// spec: NDL-5.7
+#[test]
+fn who_was_alone_and_meets_an_elder_life_that_makes_way_for_it_keeps_the_address() {
+    // given: the later life has settled, and has lost everybody; the elder, whose clock was behind, comes into the last period of its settling
+    let mut world = World::new();
+    world.start(1, &Spec::of(1));
+    world.start(LATER, &Spec { incarnation: 2, ..Spec::of(BOTH) });
+    world.run(PERIOD * 6);
+    let parted = [(1, LATER), (1, ELDER)];
+    parted.into_iter().chain([(ELDER, LATER)]).for_each(|(one, other)| part(&mut world, one, other));
+    world.run(PERIOD * 6);
+    assert_eq!(world.losses(LATER), [(1, LossReason::LinkDown)]);
+    world.start(ELDER, &Spec { incarnation: 1, ..Spec::of(BOTH) });
+    world.run(PERIOD * 3 - ms(1));
+    // when: each asks the other in the same moment
+    world.mend();
+    parted.into_iter().for_each(|(one, other)| part(&mut world, one, other));
+    world.run(ms(2));
+    // then: the elder has heard that the other had settled
+    assert!(gave_up(&world, ELDER) && !gave_up(&world, LATER));
+    world.run(PERIOD * 8);
+    assert!(!gave_up(&world, LATER));
+    assert_eq!(world.at(LATER).core.announcement().claim, Claim::Held);
+}
+
 #[test]
 fn reports_of_addresses_used_twice_are_remembered_for_as_long_as_they_hold_others_back() {
     let mut world = World::of_members(2);
